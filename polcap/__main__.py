@@ -1,0 +1,5 @@
+"""`python -m polcap` is the `polcap` command."""
+
+from polcap.cli import main
+
+main()

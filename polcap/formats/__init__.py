@@ -1,0 +1,1 @@
+"""A path on one side, a value of `images.py` on the other."""

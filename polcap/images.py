@@ -1,0 +1,309 @@
+"""The values that flow from room to room: frozen dataclasses of NumPy arrays.
+
+Shapes: K polarizer shots, E exposures of one bracket, H×W pixels (row 0 on top,
+pixel centres on whole numbers), C = 3 channels. A monochrome sensor's one channel
+stands in all three, each with three times its variance, so that sums over channels
+keep their true variance. Arrays may be read-only memory maps: never write into one.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import IntFlag
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating[Any]]
+Bits = NDArray[np.uint8]
+Role = Literal["shot", "ambient", "repeat", "chart", "cross"]
+
+
+class Quality(IntFlag):
+    """What is wrong with a pixel; bits of a uint8 map, 0 = nothing known."""
+
+    CLIPPED = 1  # at or near sensor saturation in every exposure that could serve
+    DARK = 2  # radiance below twice its standard deviation
+    OUTSIDE = 4  # not seen by every shot after registration
+    ILL_POSED = 8  # DoLP above the physical maximum, or S0 ≤ 0
+    METAL = 16  # channels disagree on the AoLP or DoLP as conductors' do
+    GHOST = 32  # exposures of one bracket disagree beyond their noise
+
+
+@dataclass(frozen=True)
+class Exif:
+    """The facts of one photograph's metadata that polcap uses; None where the file does not say."""
+
+    make: str = ""
+    model: str = ""
+    lens: str = ""
+    exposure_time: float | None = None  # s
+    f_number: float | None = None
+    iso: float | None = None
+    focal_length_mm: float | None = None
+    focal_length_35mm: float | None = None  # mm, full-frame equivalent
+    pixel_pitch_um: float | None = None  # from FocalPlaneResolution, of the visible RAW pixels
+    taken: str = ""  # ISO 8601 with sub-seconds where known
+    flash_fired: bool | None = None
+    width: int | None = None  # visible RAW pixels
+    height: int | None = None
+    color_matrix: tuple[float, ...] | None = None  # 9, XYZ (D65 or the nearest illuminant given) → camera
+
+    @property
+    def relative_exposure(self) -> float | None:
+        """Exposure that the settings promise [s · ISO/100 / f-number²]; wrong under flash."""
+        if self.exposure_time is None:
+            return None
+        aperture = self.f_number if self.f_number else 1.0  # an unchipped lens reports 0
+        return self.exposure_time * (self.iso or 100.0) / 100.0 / aperture**2
+
+
+@dataclass(frozen=True)
+class SensorImage:
+    """One decoded frame, linear, nothing subtracted."""
+
+    value: Floats | NDArray[np.uint16]  # (H, W) mosaic, or (H, W, 3) where the file holds no mosaic; counts
+    black: Floats  # (2, 2) of the mosaic's phase, or (1, 1); counts
+    white: float  # counts at which the sensor saturates
+    cfa: Bits | None  # (2, 2) of 0 R, 1 G, 2 B; None where value has three channels
+    camera_matrix: Floats | None = None  # (3, 3) camera RGB → linear Rec.709 at the camera's white balance
+    white_balance: Floats | None = None  # (3,) multipliers as shot, green = 1
+    lossy: bool = False  # decoded from 8 bits or a display encoding
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One photograph of a capture, read when asked for."""
+
+    path: str
+    exif: Exif
+    role: Role
+    digest: str  # of the file's bytes
+    load: Callable[[], SensorImage] = field(compare=False, repr=False)
+    exposure: float | None = None  # stated in capture.toml; relative; overrides EXIF
+
+
+@dataclass(frozen=True)
+class Shot:
+    """The bracket taken at one polarizer angle."""
+
+    angle: float  # rad, from image x towards image up, as the photographer sees the picture
+    frames: tuple[Frame, ...]  # (E,), darkest first as far as the metadata tells
+    ambient: tuple[Frame, ...] = ()  # flash off, same settings
+
+    @property
+    def name(self) -> str:
+        return f"{np.degrees(self.angle):g}°"
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A folder of photographs as understood."""
+
+    name: str
+    folder: str
+    shots: tuple[Shot, ...]  # (K,), the first is the reference
+    layout: Literal["folders", "toml", "flat", "sensor"]
+    focal_px: float  # in visible RAW pixels
+    focal_known: bool
+    principal_px: tuple[float, float]  # in visible RAW pixels
+    size_px: tuple[int, int]  # width, height, visible RAW pixels
+    chart_frames: tuple[Frame, ...] = ()
+    notes: tuple[str, ...] = ()  # what was assumed, one line each
+
+    @property
+    def angle(self) -> Floats:
+        return np.array([shot.angle for shot in self.shots])  # (K,) rad
+
+
+@dataclass(frozen=True)
+class View:
+    """A pinhole camera over one pixel grid."""
+
+    focal: float  # px of this grid
+    center: tuple[float, float]  # (x, y) px of this grid
+    scale: float  # visible RAW pixels per pixel of this grid (2 after superpixel binning)
+    origin: tuple[float, float] = (0.0, 0.0)  # full-frame grid coordinates of this grid's pixel (0, 0)
+    known: bool = True  # False: the focal length is an assumption
+
+
+@dataclass(frozen=True)
+class MaskedImage:
+    """Radiance with its doubt."""
+
+    value: Floats  # (H, W, 3) sensor white at the reference exposure = 1; negatives kept
+    variance: Floats  # (H, W, 3)
+    quality: Bits  # (H, W) Quality bits
+
+
+@dataclass(frozen=True)
+class AngleStack:
+    """The merged shots of a capture in camera channels, not yet registered."""
+
+    value: Floats  # (K, H, W, 3) sensor white at the reference exposure = 1
+    variance: Floats  # (K, H, W, 3)
+    quality: Bits  # (K, H, W)
+    angle: Floats  # (K,) rad
+    view: View
+    exposure_ratio: Floats  # (K, E, 3) of every frame to the shot's reference frame, estimated from pixels
+    exif_ratio: Floats  # (K, E) the same as the metadata tell it; NaN where they do not
+    ghost_fraction: Floats  # (K,) share of pixels whose exposures disagree beyond noise
+    lossy: bool  # a source was 8-bit or display-encoded
+    camera_matrix: Floats | None  # (3, 3) camera → linear Rec.709, white balanced as shot; None if unknown
+    white_balance: Floats | None  # (3,) multipliers as shot
+
+
+@dataclass(frozen=True)
+class ChartReference:
+    """The patches of a colour chart as measured by its maker."""
+
+    name: str
+    rec709: Floats  # (24, 3) linear Rec.709/D65 reflectance, row by row from dark skin
+    size_m: tuple[float, float]  # width, height between the outer patch corners
+
+
+@dataclass(frozen=True)
+class ColorCalibration:
+    """From camera channels to linear Rec.709 on the scale of the chart's white patch."""
+
+    matrix: Floats  # (3, 3) camera radiance (S0 scale: I₀ + I₉₀) → linear Rec.709 reflectance
+    quads: Floats | None  # (24, 4, 2) inner patch quads (x, y), full-frame grid px of the reference shot
+    corners: Floats | None  # (4, 2) outer patch corners, same grid
+    delta_e: Floats | None  # (24,) CIEDE2000 residual per patch
+    source: Literal["chart", "corners", "profile", "camera", "none"]
+    cost: float  # the detector's; NaN without a chart
+    metres_per_px: float | None  # at the chart's distance, on this grid; None without a known chart size
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Where each shot sees what the reference shot sees."""
+
+    transform: Floats  # (K, 3, 3) reference grid px → shot grid px, homogeneous (x, y, 1)
+    residual_px: Floats  # (K,) estimated 1σ error of the transform over the object
+    correlation: Floats  # (K,) zero-mean correlation of the compared detail after registration, 1 = the same
+
+
+@dataclass(frozen=True)
+class ObjectMask:
+    """Which pixels of the full-frame grid are the object."""
+
+    mask: NDArray[np.bool_]  # (H, W) full-frame grid
+    crop: tuple[int, int, int, int]  # x0, y0, x1, y1 full-frame grid px, end exclusive
+    source: Literal["automatic", "user"]
+
+
+@dataclass(frozen=True)
+class Gains:
+    """What each shot's radiance is divided by, and how far it may be trusted."""
+
+    gain: Floats  # (K, 3) relative to the reference shot
+    sigma: Floats  # (K, 3) 1σ
+    anchor: Floats  # (K, 3) the same from the brightest object pixels, the cross-check
+    source: Literal["grey patches", "brightest pixels", "none"]
+    disagreement: float  # largest |gain/anchor − 1| of the channel means
+    angle_offset: float  # rad, common turn of the polarizer ring seen against the silhouette (not applied)
+    angle_offset_sigma: float  # rad
+    concentration: float  # 0…1, how well AoLP follows the silhouette
+    order: tuple[int, ...]  # the order of the shots that the silhouette supports best
+    mirrored: bool  # the silhouette supports angles counted the other way
+
+
+@dataclass(frozen=True)
+class StokesImage:
+    """Linear Stokes parameters of the crop in camera channels."""
+
+    stokes: Floats  # (3, H, W, 3) S0, S1, S2
+    covariance: Floats  # (6, H, W, 3) 00 01 02 11 12 22
+    quality: Bits  # (H, W)
+    mask: NDArray[np.bool_]  # (H, W)
+    view: View  # of the crop
+    residual: Floats | None  # (H, W) |measured − fitted| / S0 where K > 3
+
+
+@dataclass(frozen=True)
+class Cues:
+    """What the estimators see, all on the crop's grid; see stages/cues.py for each formula."""
+
+    radiance: Floats  # (H, W, 3) S0 in linear Rec.709, chart white = its reflectance
+    ratio: Floats  # (2, H, W) S1/S0 and S2/S0 over all channels
+    ratio_sigma: Floats  # (H, W) 1σ of each of them
+    dolp: Floats  # (H, W) debiased
+    normalized_stokes: Floats  # (2, H, W) (S1, S2)/√(S1² + S2²)
+    diffuse_color: Floats  # (H, W, 3) unit length, 0 where dark
+    rays: Floats  # (H, W, 3) unit vectors from the surface to the camera
+    mask: NDArray[np.bool_]  # (H, W)
+    quality: Bits  # (H, W)
+    view: View
+
+
+@dataclass(frozen=True)
+class Network:
+    """A loaded model: what it computes, and what its file says of itself."""
+
+    run: Callable[[Floats], dict[str, Floats]] = field(compare=False, repr=False)  # (1, N, H, W) → name → (1, n, H, W)
+    digest: str
+    channels: tuple[str, ...]  # names of stages/cues.py, in order
+    metadata: Mapping[str, str]
+    provider: str
+
+
+@dataclass(frozen=True)
+class SurfaceMaps:
+    """The appearance and shape of the object on the crop's grid, camera frame."""
+
+    normal: Floats  # (H, W, 3) unit, x right, y up, z to the camera
+    diffuse: Floats  # (H, W, 3) albedo ρ_d, linear Rec.709
+    specular: Floats  # (H, W, 3) F0, linear Rec.709
+    roughness: Floats  # (H, W) perceptual, α = roughness²
+    depth_prior: Floats | None  # (H, W) coarse depth along the optical axis, relative; None: no prior
+    confidence: Floats  # (H, W) expected normal error, degrees
+    mask: NDArray[np.bool_]  # (H, W)
+    view: View
+    estimator: str
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """The visible surface, as a renderer wants it."""
+
+    vertices: Floats  # (V, 3) camera frame; metres where scaled, else the object's depth is 1 focal length
+    normals: Floats  # (V, 3) unit
+    uv: Floats  # (V, 2) 0…1, v down (glTF)
+    tangents: Floats  # (V, 4) unit, w = handedness
+    faces: NDArray[np.int32]  # (F, 3) counter-clockwise seen from the camera
+    depth: Floats  # (H, W) along the optical axis, growing away from the camera; NaN outside
+    metric: bool
+
+
+@dataclass(frozen=True)
+class Asset:
+    """Textures and factors in glTF's terms, with the mesh they belong to."""
+
+    mesh: Mesh
+    base_color: NDArray[np.uint8]  # (H, W, 3) sRGB
+    occlusion_roughness_metallic: NDArray[np.uint8]  # (H, W, 3) linear
+    normal: NDArray[np.uint8]  # (H, W, 3) tangent space, +Y
+    specular_color: NDArray[np.uint8]  # (H, W, 3) sRGB, to be multiplied by the factor
+    specular_factor: tuple[float, float, float]  # KHR_materials_specular specularColorFactor
+    ior: float
+
+
+@dataclass(frozen=True)
+class ChartRequest:
+    """Where the colour calibration is to come from."""
+
+    mode: Literal["auto", "corners", "profile", "none"]
+    corners: Floats | None = None  # (4, 2) outer patch corners, visible RAW px, dark-skin corner first, clockwise
+    profile: ColorCalibration | None = None  # of another capture of the same set-up
+
+
+@dataclass(frozen=True)
+class GBuffer:
+    """What a ray through each pixel meets, before any material."""
+
+    normal: Floats  # (H, W, 3) unit, camera frame; 0 outside
+    depth: Floats  # (H, W) along the optical axis, growing away from the camera, m; NaN outside
+    mask: NDArray[np.bool_]  # (H, W)
+    position: Floats  # (H, W, 3) in the object's own frame, for solid textures; 0 outside
+    view: View

@@ -1,0 +1,64 @@
+"""Fresnel's equations for a dielectric in air, and the zenith angle they hide in the DoLP.
+
+c = cos θ is the angle in air, n the refractive index, g = √(n² − sin²θ). `plus` is the mean of the
+s and p coefficients and `minus` half their difference: what unpolarized light keeps, and what of it
+turns linear. Works on NumPy and torch.
+
+References
+----------
+Atkinson & Hancock, Recovery of surface orientation from diffuse polarization, IEEE TIP 2006.
+"""
+
+from typing import Any
+
+from array_api_compat import array_namespace
+
+
+def transmission(c: Any, ior: Any) -> tuple[Any, Any]:
+    """T₊, T₋ = (T_p ± T_s)/2 ≥ 0; the same in both directions through the surface. Broadcasts c and ior."""
+    g = _refracted(c, ior)
+    n2 = ior * ior
+    t_s = 4 * c * g / (c + g) ** 2
+    t_p = 4 * n2 * c * g / (n2 * c + g) ** 2
+    return (t_p + t_s) / 2, (t_p - t_s) / 2
+
+
+def reflection(c: Any, ior: Any) -> tuple[Any, Any]:
+    """R₊, R₋ = (R_s ± R_p)/2 ≥ 0. Broadcasts c and ior."""
+    g = _refracted(c, ior)
+    n2 = ior * ior
+    r_s = ((c - g) / (c + g)) ** 2
+    r_p = ((n2 * c - g) / (n2 * c + g)) ** 2
+    return (r_s + r_p) / 2, (r_s - r_p) / 2
+
+
+def normal_reflectance(ior: Any) -> Any:
+    """F0 = ((n − 1)/(n + 1))²."""
+    return ((ior - 1) / (ior + 1)) ** 2
+
+
+def diffuse_dolp(c: Any, ior: Any) -> Any:
+    """ρ(θ) = T₋/T₊: the degree of linear polarization of light that left the body at angle θ."""
+    plus, minus = transmission(c, ior)
+    return minus / plus
+
+
+def greatest_diffuse_dolp(ior: float) -> float:
+    """ρ at grazing emission, (n² − 1)/(n² + 1)."""
+    return (ior**2 - 1) / (ior**2 + 1)
+
+
+def cos_zenith_from_dolp(dolp: Any, ior: float) -> Any:
+    """The exact inverse of `diffuse_dolp`: cos θ = (n − S)/√(S((1 + n²)S − 2n)), S = √((1 + ρ)/(1 − ρ)).
+
+    dolp (...,) is clipped to what the material can emit, so the answer is always in 0…1.
+    """
+    xp = array_namespace(dolp)
+    rho = xp.clip(dolp, 0.0, greatest_diffuse_dolp(ior) - 1e-6)
+    s = xp.sqrt((1 + rho) / (1 - rho))
+    return xp.clip((ior - s) / xp.sqrt(s * ((1 + ior * ior) * s - 2 * ior)), 0.0, 1.0)
+
+
+def _refracted(c: Any, ior: Any) -> Any:
+    """g = √(n² − sin²θ) = n cos θ_t."""
+    return (ior * ior - 1 + c * c) ** 0.5

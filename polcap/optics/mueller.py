@@ -1,0 +1,26 @@
+"""Stokes parameters seen through linear polarizers: the analyzer's weights and the turn of a frame.
+
+Signs: angles run from image x towards image up, counter-clockwise as the photographer
+sees the picture, so S1 > 0 is horizontal and S2 > 0 is 45° up-right. Works on NumPy and torch.
+"""
+
+from typing import Any
+
+from array_api_compat import array_namespace
+
+
+def analyzer(angle: Any, extinction_ratio: float = float("inf")) -> Any:
+    """Intensity weights of linear polarizers on (S0, S1, S2).
+
+    Rows ½ (1, c cos 2θ, c sin 2θ), (..., 3), for axes θ (...,) rad; c = (E − 1)/(E + 1) for an
+    extinction ratio E, 1 for an ideal polarizer: the first row of the polarizer's Mueller matrix
+    over the greatest transmittance, up to the factor (E + 1)/E that a white balance takes out.
+
+    References
+    ----------
+    Collett, Polarized Light, ch. 5 eq. (13).
+    """
+    xp = array_namespace(angle)
+    contrast = 1.0 if extinction_ratio == float("inf") else (extinction_ratio - 1) / (extinction_ratio + 1)
+    one = xp.ones_like(angle)
+    return 0.5 * xp.stack([one, contrast * xp.cos(2 * angle), contrast * xp.sin(2 * angle)], axis=-1)

@@ -1,0 +1,107 @@
+"""Stage 7: turn Stokes parameters into what the estimators see.
+
+Training calls `compute` and `channels` too, so nothing here may know NumPy from torch: the array
+namespace comes from the arguments, no cv2, no torch. Pixel axes are (..., H, W).
+"""
+
+from typing import Any
+
+from array_api_compat import array_namespace
+
+from polcap.images import ColorCalibration, Cues, Quality, StokesImage
+from polcap.optics import fresnel, frames
+from polcap.stages import stage
+
+NOMINAL_IOR = 1.5
+CHANNELS = (
+    "log_r", "log_g", "log_b",  # ln(S0 + 0.02)
+    "s1", "s2",  # 10 S1/S0, 10 S2/S0
+    "zenith_x", "zenith_y",  # θ(DoLP, n = 1.5) (cos 2φ, sin 2φ) [rad]
+    "cos_2phi", "sin_2phi",  # normalised Stokes map
+    "noise",  # zenith that the noise alone would fake [rad]
+    "mask", "clipped", "ray_x", "ray_y",
+)  # fmt: skip
+
+
+@stage(version=1, keep=False)
+def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
+    """All cues of a crop.
+
+    The colour matrix acts on S0 only; DoLP and AoLP are taken in camera channels, summed over them
+    before any ratio. A capture without a chart has no absolute scale: its 99th percentile is set to 0.8.
+    """
+    import numpy as np
+
+    ratio, sigma, dolp, normalized = polarization(stokes.stokes, stokes.covariance)
+    radiance = np.asarray(stokes.stokes[0] @ color.matrix.T, dtype=np.float32)
+    if color.source in ("camera", "none") and stokes.mask.any():
+        radiance = radiance * np.float32(0.8 / max(float(np.percentile(radiance[stokes.mask], 99)), 1e-9))
+    height, width = stokes.mask.shape
+    return Cues(
+        radiance=radiance,
+        ratio=ratio,
+        ratio_sigma=sigma,
+        dolp=dolp,
+        normalized_stokes=normalized,
+        diffuse_color=least_intensity_color(stokes.stokes, color.matrix),
+        rays=frames.rays(stokes.view, height, width),
+        mask=stokes.mask,
+        quality=stokes.quality,
+        view=stokes.view,
+    )
+
+
+def polarization(stokes: Any, covariance: Any) -> tuple[Any, Any, Any, Any]:
+    """S1/S0 and S2/S0 (2, ...), their 1σ (...), debiased DoLP (...), normalised Stokes map (2, ...).
+
+    stokes (3, ..., C) and covariance (6, ..., C) in camera channels. The DoLP of noise is not zero:
+    E[ρ̂²] = ρ² + 2σ², and √(ρ̂² − σ²) has the least bias where ρ > σ (Wardle & Kronberg, ApJ 1974).
+    """
+    xp = array_namespace(stokes)
+    total = xp.sum(stokes, axis=-1)  # (3, ...)
+    s0 = xp.where(total[0] > 1e-6, total[0], 1e-6 * xp.ones_like(total[0]))
+    ratio = total[1:] / s0
+    variance = xp.sum(covariance[3] + covariance[5], axis=-1) / 2
+    sigma = variance**0.5 / s0
+    squared = ratio[0] ** 2 + ratio[1] ** 2
+    dolp = xp.clip(squared - sigma * sigma, 0.0, 1.0) ** 0.5
+    return ratio, sigma, dolp, ratio / (squared + 1e-12) ** 0.5
+
+
+def least_intensity_color(stokes: Any, matrix: Any) -> Any:
+    """The paper's diffuse colour: ½(S0 − √(S1² + S2²)) per channel, in Rec.709, unit length; 0 where dark."""
+    xp = array_namespace(stokes)
+    least = (stokes[0] - (stokes[1] ** 2 + stokes[2] ** 2) ** 0.5) / 2
+    color = xp.clip(least @ matrix.T, 0.0, None)
+    length = xp.sum(color * color, axis=-1)[..., None] ** 0.5
+    return xp.where(length > 1e-4, color / (length + 1e-12), 0.0 * color)
+
+
+def zenith(dolp: Any, ior: float = NOMINAL_IOR) -> Any:
+    """Zenith angle that a diffuse DoLP means, rad."""
+    xp = array_namespace(dolp)
+    return xp.acos(xp.clip(fresnel.cos_zenith_from_dolp(dolp, ior), 0.0, 1.0))
+
+
+def channels(cues: Any) -> Any:
+    """The network's input in the order of CHANNELS, (..., N, H, W) float32, 0 outside the mask.
+
+    `cues` has the fields of `Cues`; in training they are torch tensors with a leading batch axis
+    on each pixel map ((B, H, W), (B, H, W, 3), (2, B, H, W)).
+    """
+    xp = array_namespace(cues.radiance)
+    dtype = cues.radiance.dtype
+    inside = xp.astype(cues.mask, dtype) if hasattr(xp, "astype") else cues.mask.to(dtype)
+    clipped = (cues.quality & int(Quality.CLIPPED)) > 0
+    clipped = xp.astype(clipped, dtype) if hasattr(xp, "astype") else clipped.to(dtype)
+    log = xp.log(xp.clip(cues.radiance, 0.0, 50.0) + 0.02)
+    tilt = zenith(cues.dolp)
+    maps = [
+        log[..., 0], log[..., 1], log[..., 2],
+        xp.clip(10 * cues.ratio[0], -5.0, 5.0), xp.clip(10 * cues.ratio[1], -5.0, 5.0),
+        tilt * cues.normalized_stokes[0], tilt * cues.normalized_stokes[1],
+        cues.normalized_stokes[0], cues.normalized_stokes[1],
+        zenith(xp.clip(cues.ratio_sigma, 0.0, 0.2)),
+        inside, clipped, cues.rays[..., 0], cues.rays[..., 1],
+    ]  # fmt: skip
+    return xp.stack([inside * m for m in maps], axis=-3)

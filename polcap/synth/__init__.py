@@ -1,0 +1,1 @@
+"""The camera run backwards: shapes, materials, light and a sensor, written as a real capture is."""
