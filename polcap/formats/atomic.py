@@ -1,0 +1,108 @@
+"""In: a final path. Out: a file or folder that is there whole, or not at all.
+
+Written beside, fsynced, renamed: whoever finds the final name finds a complete file.
+"""
+
+import errno
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from polcap.errors import StorageError
+
+REASONS = {
+    errno.ENOSPC: "the disk is full; free some space",
+    errno.EDQUOT: "the disk quota is used up; free some space",
+    errno.EROFS: "the file system is read-only; choose another folder",
+    errno.EACCES: "permission denied; choose a folder that may be written",
+    errno.EPERM: "permission denied; choose a folder that may be written",
+    errno.EEXIST: "a file stands where a folder is needed; choose another path",
+    errno.ENOTDIR: "a file stands where a folder is needed; choose another path",
+    errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
+    errno.EFBIG: "the file is larger than the file system allows; choose another folder",
+    errno.EIO: "the disk reports an input/output error; check the disk",
+}
+
+
+def failure(target: Path, error: OSError) -> StorageError:
+    """The one line for a write that the system refused."""
+    reason = REASONS.get(error.errno or 0, error.strerror or str(error))
+    return StorageError(f"cannot write {target}: {reason}")
+
+
+@contextmanager
+def path(final: str | Path) -> Iterator[Path]:
+    """A temporary path beside `final`, which becomes `final` when the block ends well.
+
+    Parent folders are made. The temporary keeps the suffix, so that writers which choose
+    their format by name see the right one. On any exception it is removed and whatever stood
+    under `final` is untouched.
+
+    Raises
+    ------
+    StorageError
+        Any OSError of making, writing, syncing or renaming, inside the block too.
+    """
+    final = Path(final)
+    temporary = final.with_name(f".{final.stem}.{os.getpid()}.part{final.suffix}")
+    try:
+        final.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        sync(temporary)
+        os.replace(temporary, final)
+        sync(final.parent)
+    except OSError as error:
+        raise failure(final, error) from error
+    finally:
+        discard(temporary)
+
+
+@contextmanager
+def folder(final: str | Path) -> Iterator[Path]:
+    """The same for a folder; a folder that stood under `final` is replaced as a whole.
+
+    Raises
+    ------
+    StorageError
+        Any OSError of making, writing, syncing or renaming, inside the block too.
+    """
+    final = Path(final)
+    temporary = final.with_name(f".{final.name}.{os.getpid()}.part")
+    aside = final.with_name(f".{final.name}.{os.getpid()}.old")
+    try:
+        final.parent.mkdir(parents=True, exist_ok=True)
+        temporary.mkdir()
+        yield temporary
+        for file in sorted(temporary.rglob("*")):
+            sync(file)
+        sync(temporary)
+        if final.exists():
+            os.replace(final, aside)
+        os.replace(temporary, final)
+        sync(final.parent)
+    except OSError as error:
+        if aside.exists() and not final.exists():
+            os.replace(aside, final)
+        raise failure(final, error) from error
+    finally:
+        discard(temporary)
+        discard(aside)
+
+
+def sync(target: Path) -> None:
+    """Bring a file's bytes, or a folder's names, to the disk."""
+    handle = os.open(target, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def discard(target: Path) -> None:
+    if target.is_dir():
+        shutil.rmtree(target, ignore_errors=True)
+    else:
+        with suppress(OSError):  # the failure that led here is the one to tell
+            target.unlink()

@@ -1,0 +1,74 @@
+"""Atomic writing: a final name never stands for half a file."""
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from polcap.errors import StorageError
+from polcap.formats import atomic
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+def test_file_appears_whole_under_its_final_name(tmp_path: Path) -> None:
+    final = tmp_path / "new" / "a.bin"
+    with atomic.path(final) as temporary:
+        temporary.write_bytes(b"abc")
+        assert not final.exists()
+        assert temporary.suffix == ".bin"
+    assert final.read_bytes() == b"abc"
+    assert names(final.parent) == ["a.bin"]
+
+
+def test_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    final = tmp_path / "a.bin"
+    final.write_bytes(b"old")
+    with pytest.raises(RuntimeError), atomic.path(final) as temporary:
+        temporary.write_bytes(b"half")
+        raise RuntimeError("killed")
+    assert final.read_bytes() == b"old"
+    assert names(tmp_path) == ["a.bin"]
+
+
+@pytest.mark.parametrize(("code", "words"), [(errno.ENOSPC, "full"), (errno.EROFS, "read-only")])
+def test_refusals_of_the_disk_are_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, words: str
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    with pytest.raises(StorageError, match=words) as caught, atomic.path(tmp_path / "a.bin") as temporary:
+        temporary.write_bytes(b"abc")
+    assert "\n" not in str(caught.value)
+    assert names(tmp_path) == []
+
+
+def test_file_in_place_of_a_folder_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(StorageError, match="file"), atomic.path(tmp_path / "file" / "a.bin") as temporary:
+        temporary.write_bytes(b"abc")
+
+
+def test_folder_replaces_the_old_one_as_a_whole(tmp_path: Path) -> None:
+    final = tmp_path / "stage"
+    for text in ("one", "two"):
+        with atomic.folder(final) as temporary:
+            (temporary / text).write_text(text)
+    assert names(final) == ["two"]
+    assert names(tmp_path) == ["stage"]
+
+
+def test_failed_folder_leaves_the_old_one(tmp_path: Path) -> None:
+    final = tmp_path / "stage"
+    with atomic.folder(final) as temporary:
+        (temporary / "one").write_text("1")
+    with pytest.raises(StorageError), atomic.folder(final) as temporary:
+        (temporary / "two").write_text("2")
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert names(final) == ["one"]
+    assert names(tmp_path) == ["stage"]
