@@ -1,0 +1,82 @@
+"""From one colour per photosite to three per pixel: 2×2 binning, or linear interpolation.
+
+Both are linear and the same for every picture, so that they add no polarization of their own and a
+pixel's variance follows from its photosites'. The CFA is a (2, 2) of 0 R, 1 G, 2 B.
+"""
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from polcap.images import Bits, Floats
+
+
+def superpixel(mosaic: Any, cfa: Bits) -> Floats:
+    """Each 2×2 quad as one pixel, (H, W) → (H//2, W//2, 3) float32; green is the mean of its two.
+
+    An odd last row or column is dropped.
+    """
+    h, w = mosaic.shape[0] // 2, mosaic.shape[1] // 2
+    out = np.zeros((h, w, 3), np.float32)
+    share = np.bincount(np.ravel(cfa), minlength=3)  # photosites per colour
+    for i, j in np.ndindex(2, 2):
+        color = int(cfa[i, j])
+        out[..., color] += mosaic[i : 2 * h : 2, j : 2 * w : 2] * np.float32(1 / share[color])
+    return out
+
+
+def interpolate(mosaic: Floats, cfa: Bits) -> Floats:
+    """All three colours at every photosite, (H, W) → (H, W, 3) float32.
+
+    Green from its four neighbours, corrected by the curvature of the colour on the spot; red and blue
+    from bilinear differences to green. Measured values are kept.
+
+    References
+    ----------
+    Hamilton and Adams, US patent 5,629,734 (1997, expired), both directions averaged.
+    """
+    m = np.asarray(mosaic, np.float32)
+    p = np.pad(m, 2, mode="reflect")  # keeps the phase of the CFA
+    green = (_at(p, 2, -1, 0) + _at(p, 2, 1, 0) + _at(p, 2, 0, -1) + _at(p, 2, 0, 1)) / 4
+    far = _at(p, 2, -2, 0) + _at(p, 2, 2, 0) + _at(p, 2, 0, -2) + _at(p, 2, 0, 2)
+    green += (4 * m - far) / 8
+    for i, j in np.argwhere(cfa == 1):
+        green[i::2, j::2] = m[i::2, j::2]
+    out = np.empty((*m.shape, 3), np.float32)
+    out[..., 1] = green
+    for color in (0, 2):
+        sparse = np.zeros_like(m)
+        for i, j in np.argwhere(cfa == color):
+            sparse[i::2, j::2] = m[i::2, j::2] - green[i::2, j::2]
+        p = np.pad(sparse, 1, mode="reflect")
+        rows = p[:-2] + 2 * p[1:-1] + p[2:]
+        out[..., color] = green + (rows[:, :-2] + 2 * rows[:, 1:-1] + rows[:, 2:]) / 4
+    return out
+
+
+def variance_gain(cfa: Bits) -> Floats:
+    """What `interpolate` makes of noise: (2, 2, 3, 3) = [row phase, column phase, colour out, colour in].
+
+    Variance of a colour at a phase = Σ over colours in of gain · variance of one such photosite.
+    """
+    return _variance_gain(tuple(int(c) for c in np.ravel(cfa)))
+
+
+@lru_cache(maxsize=8)
+def _variance_gain(colors: tuple[int, ...]) -> Floats:
+    cfa = np.array(colors, np.uint8).reshape(2, 2)
+    size, middle = 16, 8
+    gain = np.zeros((2, 2, 3, 3), np.float32)
+    for i, j in np.ndindex(size, size):
+        impulse = np.zeros((size, size), np.float32)
+        impulse[i, j] = 1
+        response = interpolate(impulse, cfa)[middle : middle + 2, middle : middle + 2]
+        gain[..., cfa[i % 2, j % 2]] += response**2
+    return gain
+
+
+def _at(padded: Floats, margin: int, dy: int, dx: int) -> Floats:
+    """The unpadded picture as seen (dy, dx) px further down and right."""
+    h, w = padded.shape[0] - 2 * margin, padded.shape[1] - 2 * margin
+    return padded[margin + dy : margin + dy + h, margin + dx : margin + dx + w]
