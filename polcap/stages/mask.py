@@ -1,0 +1,163 @@
+"""Stage 4: decide which pixels are the object.
+
+Under a flash beside the lens the object, near, is bright and the backdrop, far or black, is dark. The
+backdrop's brightness is read off the picture's border, the chart is cut out, and what stands above the
+backdrop in brightness or colour is refined with graph cuts (GrabCut).
+
+References
+----------
+Rother, Kolmogorov, Blake, GrabCut, SIGGRAPH 2004.
+"""
+
+from typing import Annotated
+
+import cv2
+import msgspec
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from polcap.errors import ObjectError
+from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, ObjectMask
+from polcap.optics.warp import warp
+from polcap.stages import stage
+
+_WORK_PIXELS = 3e5  # graph cuts run on an image averaged down to about this
+
+
+class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    margin: Annotated[
+        float, Meta(ge=0, le=1, description="border added around the object's box [share of its longer side]")
+    ] = 0.04
+    min_area: Annotated[
+        float, Meta(gt=0, le=1, description="least part of the picture that an object covers")
+    ] = 0.002
+    chart_margin: Annotated[
+        float, Meta(ge=0, le=2, description="border around the chart that is not the object [patch widths]")
+    ] = 0.7
+
+
+@stage(version=1)
+def segment(
+    radiance: AngleStack,
+    alignment: Alignment,
+    color: ColorCalibration,
+    user_mask: NDArray[np.bool_] | None,
+    settings: Settings,
+) -> ObjectMask:
+    """The object on the sum of the aligned shots, and a crop around it.
+
+    user_mask (H, W) on the full-frame grid replaces the search. Raises ObjectError where nothing stands out.
+    """
+    if user_mask is not None:
+        if user_mask.shape != radiance.value.shape[1:3]:
+            raise ObjectError(
+                f"mask is {user_mask.shape[1]}×{user_mask.shape[0]} px, the picture's grid "
+                f"{radiance.value.shape[2]}×{radiance.value.shape[1]}; draw it on the RAW picture or this grid"
+            )
+        if not user_mask.any():
+            raise ObjectError("mask is empty: no pixel is 128 or brighter; paint the object white")
+        return ObjectMask(user_mask, _crop(user_mask, settings.margin), "user")
+    mask = _search(_picture(radiance, alignment, color), _chart_zone(radiance, color, settings), settings)
+    return ObjectMask(mask, _crop(mask, settings.margin), "automatic")
+
+
+def _picture(radiance: AngleStack, alignment: Alignment, color: ColorCalibration) -> Floats:
+    """Mean of the registered shots in linear Rec.709, (H, W, 3)."""
+    total = sum(warp(radiance.value[k], alignment.transform[k], order=1) for k in range(len(radiance.angle)))
+    return np.asarray((2 / len(radiance.angle)) * total @ color.matrix.T, dtype=np.float32)
+
+
+def _chart_zone(radiance: AngleStack, color: ColorCalibration, settings: Settings) -> NDArray[np.uint8]:
+    """(H, W) 1 where the chart with its frame lies."""
+    zone = np.zeros(radiance.value.shape[1:3], np.uint8)
+    if color.corners is not None:
+        corners = np.asarray(color.corners, np.float64)
+        center = corners.mean(0)
+        across = np.linalg.norm(corners[1] - corners[0]) / 6  # one patch pitch
+        outward = corners - center
+        grown = center + outward * (1 + settings.chart_margin * across / np.linalg.norm(outward, axis=1))[:, None] * 1.0
+        cv2.fillConvexPoly(zone, np.round(grown).astype(np.int32), 1)
+    return zone
+
+
+def _search(picture: Floats, chart: NDArray[np.uint8], settings: Settings) -> NDArray[np.bool_]:
+    height, width = picture.shape[:2]
+    shrink = max(1.0, float(np.sqrt(height * width / _WORK_PIXELS)))
+    size = (round(width / shrink), round(height / shrink))
+    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    outside = cv2.resize(chart, size, interpolation=cv2.INTER_NEAREST) > 0
+
+    log = np.log2(np.maximum(small, 0).mean(-1) + 1e-4)
+    log = cv2.GaussianBlur(log.astype(np.float32), (0, 0), 1.5)
+    level, spread = _backdrop(log, outside)
+    seed = (log > level + max(4 * spread, 0.8)) & ~outside
+    seed = _filled(_sizeable(cv2.morphologyEx(seed.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), settings.min_area))
+    if seed.mean() < settings.min_area:
+        raise ObjectError(
+            f"no object stands out from the backdrop: {100 * seed.mean():.2f} % of the picture, "
+            f"less than mask.min_area = {100 * settings.min_area:g} %; use a darker backdrop, or give --mask PNG"
+        )
+    cut = _graph_cut(small, seed, outside)
+    mask = cv2.resize(cut, (width, height), interpolation=cv2.INTER_LINEAR) if shrink > 1 else cut
+    return np.asarray((mask > 0.5) & (chart == 0))
+
+
+def _backdrop(log: Floats, outside: NDArray[np.bool_]) -> tuple[float, float]:
+    """Level and spread of the border's log brightness; robust, for the object may touch the border."""
+    height, width = log.shape
+    rim = max(3, min(height, width) // 20)
+    border = np.ones_like(outside)
+    border[rim:-rim, rim:-rim] = False
+    sample = log[border & ~outside]
+    level = float(np.percentile(sample, 40))
+    below = level - sample[sample < level]
+    return level, 1.4826 * float(np.median(below)) if below.size else 0.1
+
+
+def _sizeable(mask: NDArray[np.uint8], min_area: float) -> NDArray[np.uint8]:
+    """The connected parts at least a twentieth of the largest (an object may be in pieces)."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    if count < 2:
+        return mask
+    area = stats[1:, cv2.CC_STAT_AREA]
+    keep = 1 + np.flatnonzero(area >= max(area.max() / 20, min_area * mask.size / 20))
+    return np.isin(labels, keep).astype(np.uint8)
+
+
+def _filled(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Holes smaller than a hundredth of the mask closed (dark texture is still the object)."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(1 - mask, connectivity=4)
+    small = 1 + np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] < mask.sum() / 100) if count > 1 else []
+    return np.maximum(mask, np.isin(labels, small).astype(np.uint8))
+
+
+def _graph_cut(picture: Floats, seed: NDArray[np.uint8], outside: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """The seed's outline moved to the picture's edges."""
+    tone = np.log2(np.clip(picture, 0, 4) + 0.002)
+    display = (255 * (tone - tone.min()) / (np.ptp(tone) + 1e-9)).astype(np.uint8)
+    reach = max(3, round(0.006 * max(seed.shape)))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    sure, possible = cv2.erode(seed, kernel), cv2.dilate(seed, kernel)
+    labels = np.full(seed.shape, cv2.GC_BGD, np.uint8)
+    labels[possible > 0] = cv2.GC_PR_BGD
+    labels[seed > 0] = cv2.GC_PR_FGD
+    labels[sure > 0] = cv2.GC_FGD
+    labels[outside] = cv2.GC_BGD
+    if sure.any() and (labels == cv2.GC_BGD).any():
+        cv2.setRNGSeed(1)
+        cv2.grabCut(display, labels, None, np.zeros((1, 65)), np.zeros((1, 65)), 3, cv2.GC_INIT_WITH_MASK)
+    found = ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).astype(np.uint8)
+    found = _filled(_sizeable(found if found.any() else seed, 0.0))
+    return found.astype(np.float32)
+
+
+def _crop(mask: NDArray[np.bool_], margin: float) -> tuple[int, int, int, int]:
+    """The mask's box with a border, within the picture."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    add = max(4, round(margin * max(np.ptp(rows), np.ptp(columns))))
+    height, width = mask.shape
+    return (
+        max(int(columns[0]) - add, 0), max(int(rows[0]) - add, 0),
+        min(int(columns[-1]) + 1 + add, width), min(int(rows[-1]) + 1 + add, height),
+    )  # fmt: skip
