@@ -1,0 +1,153 @@
+"""In: a TOML file and `--set` assignments. Out: one frozen `Config`, a section per stage.
+
+Defaults < file < assignments. Strict: an unknown key or a value out of range is an error that
+names it, its value and its limit. The settings themselves stand in the stages that use them.
+"""
+
+import difflib
+import tomllib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
+
+import msgspec
+from msgspec import Meta
+
+from polcap.errors import SettingError
+from polcap.stages import align, asset, hdr, infer, mask, selfcal, stokes, surface, whitebalance
+
+
+class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a run must keep to; beyond a limit the asset is written and the exit code is 3."""
+
+    max_delta_e: Annotated[float, Meta(gt=0, description="mean residual of the chart [CIEDE2000]")] = 5.0
+    max_gain_disagreement: Annotated[
+        float, Meta(gt=0, le=1, description="between the two estimates of a shot's gain; 1 % costs 6° [1]")
+    ] = 0.003
+    max_align_residual_px: Annotated[
+        float, Meta(gt=0, description="estimated 1σ error of a shot's registration [px of the grid]")
+    ] = 0.15
+    max_clipped: Annotated[float, Meta(ge=0, le=1, description="share of the object that is clipped [1]")] = (
+        0.02
+    )
+    max_ill_posed: Annotated[
+        float, Meta(ge=0, le=1, description="share of the object whose DoLP no dielectric can have [1]")
+    ] = 0.05
+    max_ghost: Annotated[
+        float, Meta(ge=0, le=1, description="share of a shot whose exposures disagree beyond noise [1]")
+    ] = 0.02
+    max_normal_error_deg: Annotated[
+        float, Meta(gt=0, le=90, description="median expected error of the normals [degrees]")
+    ] = 20.0
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Every setting of a run."""
+
+    hdr: hdr.Settings = hdr.Settings()
+    whitebalance: whitebalance.Settings = whitebalance.Settings()
+    align: align.Settings = align.Settings()
+    mask: mask.Settings = mask.Settings()
+    selfcal: selfcal.Settings = selfcal.Settings()
+    stokes: stokes.Settings = stokes.Settings()
+    infer: infer.Settings = infer.Settings()
+    surface: surface.Settings = surface.Settings()
+    asset: asset.Settings = asset.Settings()
+    gates: Gates = Gates()
+
+
+class Setting(NamedTuple):
+    """One row of the settings page."""
+
+    key: str
+    kind: str
+    default: Any
+    limits: str
+    description: str
+
+
+def load(file: Path | None = None, assignments: Sequence[str] = ()) -> Config:
+    """Read the settings of a run.
+
+    Raises
+    ------
+    SettingError
+        The file is not TOML, or a key is unknown, of the wrong type or out of its range.
+    """
+    given = _read(file) if file else {}
+    for section, values in given.items():
+        if not isinstance(values, dict):
+            raise SettingError(
+                f"{file}: `{section}` is not a section; write [stage] and below it name = value"
+            )
+    for assignment in assignments:
+        key, equals, text = assignment.partition("=")
+        section, dot, name = key.strip().partition(".")
+        if not equals or not dot:
+            raise SettingError(f"--set {assignment}: not of the form stage.name=value, as in hdr.clip=0.95")
+        given.setdefault(section, {})[name] = _parse(text.strip())
+    known = {setting.key: setting for setting in settings()}
+    for section, values in given.items():
+        for name, value in values.items():
+            _check_known(f"{section}.{name}", value, known)
+    try:
+        return msgspec.convert(given, Config)
+    except msgspec.ValidationError as error:
+        raise _explain(error, given, known) from error
+
+
+def settings() -> Iterator[Setting]:
+    """Every setting in the order of the stages, as the settings page lists them."""
+    for section in msgspec.structs.fields(Config):
+        hints = get_type_hints(section.type, include_extras=True)
+        for field in msgspec.structs.fields(section.type):
+            hint = hints[field.name]
+            meta = next((extra for extra in get_args(hint)[1:] if isinstance(extra, Meta)), Meta())
+            kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+            word = str(kind).replace("typing.", "") if get_args(kind) else kind.__name__
+            yield Setting(
+                f"{section.name}.{field.name}", word, field.default, _limits(meta), meta.description or ""
+            )
+
+
+def _limits(meta: Meta) -> str:
+    signs = {"gt": "> ", "ge": "≥ ", "lt": "< ", "le": "≤ ", "multiple_of": "multiple of "}
+    return ", ".join(
+        f"{sign}{getattr(meta, name)}" for name, sign in signs.items() if getattr(meta, name) is not None
+    )
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SettingError(f"--config {file}: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingError(f"--config {file} is not TOML: {error}") from error
+
+
+def _parse(text: str) -> Any:
+    """A TOML value; a bare word is a string."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _check_known(key: str, value: Any, known: dict[str, Setting]) -> None:
+    if key in known:
+        return
+    near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+    hint = f"; did you mean {near[0]}?" if near else f"; sections are {', '.join(Config.__struct_fields__)}"
+    raise SettingError(f"{key} = {value!r}: there is no such setting{hint}")
+
+
+def _explain(
+    error: msgspec.ValidationError, given: dict[str, Any], known: dict[str, Setting]
+) -> SettingError:
+    message, _, path = str(error).partition(" - at `$.")
+    key = path.rstrip("`").split("[")[0]
+    section, _, name = key.partition(".")
+    value = given.get(section, {}).get(name)
+    about = known[key].description if key in known else ""
+    return SettingError(f"{key} = {value!r}: {message[:1].lower()}{message[1:]} ({about})")
