@@ -1,0 +1,97 @@
+"""A model is taken for what its file says, or refused with the reason."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polcap.errors import ModelError
+from polcap.formats.onnx import ENCODING, load
+
+onnx = pytest.importorskip("onnx", reason="writing test models needs the extra [train]")
+SAID = {"channels": "s1,s2", "encoding": ENCODING, "multiple": "8", "licence": "Apache-2.0"}
+
+
+def write(path: Path, metadata: dict[str, str], opset: int = 17, channels: int = 2) -> Path:
+    """A model whose one output is twice its input."""
+    from onnx import TensorProto, helper
+
+    shape = ["n", channels, "h", "w"]
+    node = helper.make_node("Add", ["input", "input"], ["normal"])
+    graph = helper.make_graph(
+        [node],
+        "double",
+        [helper.make_tensor_value_info("input", TensorProto.FLOAT, shape)],
+        [helper.make_tensor_value_info("normal", TensorProto.FLOAT, shape)],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=9)
+    helper.set_model_props(model, metadata)
+    onnx.save(model, path)
+    return path
+
+
+def test_a_model_runs_and_tells_what_it_eats(tmp_path: Path) -> None:
+    network = load(write(tmp_path / "m.onnx", SAID), "cpu", 1)
+    assert network.channels == ("s1", "s2") and network.metadata["licence"] == "Apache-2.0"
+    x = np.random.default_rng(0).normal(size=(1, 2, 8, 16)).astype(np.float32)
+    np.testing.assert_array_equal(network.run(x)["normal"], 2 * x)
+
+
+def test_digest_is_of_the_file(tmp_path: Path) -> None:
+    one, two = (
+        load(write(tmp_path / f"{name}.onnx", {**SAID, "licence": name})) for name in ("CC0-1.0", "MIT")
+    )
+    assert one.digest != two.digest
+
+
+@pytest.mark.parametrize("missing", SAID)
+def test_silent_metadata_is_refused(tmp_path: Path, missing: str) -> None:
+    said = {name: value for name, value in SAID.items() if name != missing}
+    with pytest.raises(ModelError, match=f"does not state {missing}"):
+        load(write(tmp_path / "m.onnx", said))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"encoding": "99"}, "encoding 99"),
+        ({"multiple": "0"}, "multiple = '0'"),
+        ({"channels": "s1,s2,mask"}, "names 3 channels"),
+    ],
+)
+def test_wrong_metadata_is_refused(tmp_path: Path, change: dict[str, str], words: str) -> None:
+    with pytest.raises(ModelError, match=words):
+        load(write(tmp_path / "m.onnx", {**SAID, **change}))
+
+
+@pytest.mark.parametrize("content", [b"", b"not a model", None], ids=["empty", "garbage", "truncated"])
+def test_broken_file_is_one_line(tmp_path: Path, content: bytes | None) -> None:
+    path = write(tmp_path / "m.onnx", SAID)
+    path.write_bytes(path.read_bytes()[:60] if content is None else content)
+    with pytest.raises(ModelError) as caught:
+        load(path)
+    assert "\n" not in str(caught.value) and "m.onnx" in str(caught.value)
+
+
+def test_missing_file_and_too_new_opset(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="--model"):
+        load(tmp_path / "none.onnx")
+    with pytest.raises(ModelError, match="opset"):
+        load(write(tmp_path / "m.onnx", SAID, opset=99))
+
+
+def test_wrong_input_is_one_line(tmp_path: Path) -> None:
+    network = load(write(tmp_path / "m.onnx", SAID))
+    with pytest.raises(ModelError, match=r"shape \(1, 3, 8, 8\)"):
+        network.run(np.zeros((1, 3, 8, 8), np.float32))
+
+
+def test_cuda_is_never_replaced_silently(tmp_path: Path) -> None:
+    import onnxruntime
+
+    if "CUDAExecutionProvider" in onnxruntime.get_available_providers():
+        pytest.skip("this machine's onnxruntime has CUDA")
+    path = write(tmp_path / "m.onnx", SAID)
+    with pytest.raises(ModelError, match="--device cuda"):
+        load(path, "cuda")
+    assert load(path, "auto").provider == "CPUExecutionProvider"
