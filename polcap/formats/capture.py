@@ -1,0 +1,275 @@
+"""A folder in, the capture it holds out: shots, brackets, camera, and a table of what was understood."""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from hashlib import blake2b
+from pathlib import Path
+
+import numpy as np
+
+from polcap.errors import CaptureError, DecodeError
+from polcap.formats import capture_toml, exif, focal, layouts, photo, raw, sniff
+from polcap.formats.capture_toml import CaptureFile
+from polcap.formats.layouts import Source
+from polcap.images import Capture, Exif, Frame, SensorImage, Shot
+
+_ZOOM = 0.01  # relative change of the focal length that is more than rounding
+LOSS = ": normals and albedo lose accuracy against RAW"
+Loader = Callable[[], SensorImage]
+
+
+def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Capture:
+    """Understand a capture folder: pol000/ pol045/ …, capture.toml, flat, or polarization-sensor frames.
+
+    Every file's metadata and bytes are read, no pixel is decoded. `angles_deg` is the order of
+    the brackets of a flat folder (0, 45, 90 by default); elsewhere it picks from the angles that
+    the folder states, the first being the reference.
+
+    Raises
+    ------
+    CaptureError
+        What does not add up, naming the file, the reason and the remedy.
+    DecodeError
+        A file that is cut short, or that no decoder recognises.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise CaptureError(f"{folder}: no such folder; give the folder that holds the photographs")
+    stated = capture_toml.load(folder)
+    if angles_deg is not None:
+        _check_angles(folder, angles_deg, "--angles names")
+    plan = layouts.plan(folder, stated, angles_deg)
+    _check_angles(folder, [angle for angle, _ in plan.shots], "the shots' angles are")
+
+    used: dict[Path, Source] = {}
+    for source in (source for _, bracket in plan.shots for source in bracket):
+        used.setdefault(source.path, source)
+    if plan.layout != "sensor" and len(used) < sum(len(bracket) for _, bracket in plan.shots):
+        raise CaptureError(f"{folder / capture_toml.NAME}: names a file twice; give each frame one entry")
+    every = used | {source.path: source for source in plan.others}
+    if len(every) < len(used) + len(plan.others):
+        raise CaptureError(f"{folder / capture_toml.NAME}: names a file twice; give each frame one entry")
+    facts = {path: _facts(source) for path, source in every.items()}
+    _check_one_camera(facts)
+    digests = {path: _digest(path) for path in every}
+    _check_no_duplicate(digests)
+
+    def frame(source: Source, angle_deg: float) -> Frame:
+        mosaic = (
+            angle_deg if plan.layout == "sensor" and source.role in ("shot", "repeat", "ambient") else None
+        )
+        load, manner = _loader(source, stated, mosaic)
+        fact = facts[source.path]
+        return Frame(
+            path=str(source.path),
+            exif=fact,
+            role=source.role,
+            digest=" ".join([digests[source.path], *manner]),
+            load=load,
+            exposure=_stated_exposure(source, fact),
+        )
+
+    def shot(angle_deg: float, bracket: Sequence[Source]) -> Shot:
+        ambient = [s for s in plan.others if s.role == "ambient" and s.angle_deg in (None, angle_deg)]
+        return Shot(
+            angle=math.radians(angle_deg),
+            frames=_darkest_first(frame(source, angle_deg) for source in bracket),
+            ambient=_darkest_first(frame(source, angle_deg) for source in ambient),
+        )
+
+    shots = tuple(shot(angle, bracket) for angle, bracket in plan.shots)
+    _check_brackets(shots)
+    reference = shots[0].frames[0].exif
+    lens = focal.find(reference, stated.focal_length_mm, stated.sensor_width_mm)
+    step = 2 if plan.layout == "sensor" else 1  # a plane of a sensor mosaic has half its sides
+    width, height = (reference.width or 0) // step, (reference.height or 0) // step
+    return Capture(
+        name=stated.name or folder.resolve().name,
+        folder=str(folder),
+        shots=shots,
+        layout=plan.layout,
+        focal_px=lens.px / step,
+        focal_known=lens.known,
+        principal_px=((width - 1) / 2, (height - 1) / 2),
+        size_px=(width, height),
+        chart_frames=tuple(frame(source, 0.0) for source in plan.others if source.role == "chart"),
+        notes=(*plan.notes, *_notes(plan.layout, plan.others, shots, stated), f"focal length {lens.note}"),
+    )
+
+
+def table(capture: Capture) -> str:
+    """What was understood, as text: one line per frame, then camera, lens, focal length and notes."""
+    rows = [["angle", "file", "role", "exposure", "ISO", "f/", "flash", "taken"]]
+    for shot in capture.shots:
+        for frame in (*shot.frames, *shot.ambient):
+            rows.append([shot.name, *_row(frame, capture.folder)])
+    rows += [["", *_row(frame, capture.folder)] for frame in capture.chart_frames]
+    widths = [max(map(len, column)) for column in zip(*rows)]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows]
+    fact = capture.shots[0].frames[0].exif
+    width, height = capture.size_px
+    frames = " + ".join(str(len(shot.frames)) for shot in capture.shots)
+    lines += [
+        "",
+        f"capture  {capture.name} ({capture.layout}): {len(capture.shots)} shots, {frames} frames",
+        f"camera   {' '.join(filter(None, (fact.make, fact.model))) or 'not stated'}, {width}×{height} px",
+        f"lens     {fact.lens or 'not stated'}",
+        f"focal    {capture.focal_px:.0f} px" + ("" if capture.focal_known else " (assumed)"),
+    ]
+    return "\n".join([*lines, *(f"note     {note}" for note in capture.notes)])
+
+
+def _row(frame: Frame, folder: str) -> list[str]:
+    fact = frame.exif
+    path = Path(frame.path)
+    name = str(path.relative_to(folder)) if path.is_relative_to(folder) else frame.path
+    flash = {True: "fired", False: "off", None: "?"}[fact.flash_fired]
+    stated = f"{frame.exposure:.4g} (stated)" if frame.exposure else _seconds(fact.exposure_time)
+    numbers = [f"{value:g}" if value else "?" for value in (fact.iso, fact.f_number)]
+    return [name, frame.role, stated, *numbers, flash, fact.taken.replace("T", " ") or "?"]
+
+
+def _seconds(time: float | None) -> str:
+    if not time:
+        return "?"
+    return f"1/{1 / time:.0f} s" if time < 0.3 else f"{time:.3g} s"
+
+
+def _facts(source: Source) -> Exif:
+    with source.path.open("rb") as file:
+        structure = sniff.tiff(file) if file.read(4) in (b"II*\0", b"MM\0*") else None
+    if structure and structure.truncated:
+        raise DecodeError(
+            f"{source.path}: is cut short, its image runs past the end of the file; copy it again"
+        )
+    return exif.read(source.path)
+
+
+def _loader(source: Source, stated: CaptureFile, mosaic_deg: float | None) -> tuple[Loader, list[str]]:
+    """How to read a frame, and whatever beside the file's bytes decides its values."""
+    manner = [f"{stated.white:g}"] if stated.white else []
+    manner += [f"-{stated.black:g}"] if stated.black else []
+    if mosaic_deg is not None:
+        read_plane = partial(photo.read_mosaic, source.path, mosaic_deg, stated.white, stated.black)
+        return read_plane, [f"sensor {mosaic_deg:g}", *manner]
+    if source.kind == "raw":
+        return partial(raw.read, source.path), []
+    read_photo = partial(photo.read, source.path, stated.encoding, stated.white, stated.black)
+    return read_photo, [stated.encoding or "default", *manner]
+
+
+def _stated_exposure(source: Source, fact: Exif) -> float | None:
+    if source.flash_energy:
+        return source.flash_energy * (fact.iso or 100.0) / 100.0 / (fact.f_number or 1.0) ** 2
+    return source.exposure
+
+
+def _exposure(frame: Frame) -> float | None:
+    return frame.exposure or frame.exif.relative_exposure
+
+
+def _darkest_first(frames: Iterable[Frame]) -> tuple[Frame, ...]:
+    listed = sorted(frames, key=lambda frame: layouts.natural(Path(frame.path).name))
+    exposures = [_exposure(frame) for frame in listed]
+    if None in exposures:
+        return tuple(listed)
+    return tuple(sorted(listed, key=lambda frame: _exposure(frame) or 0.0))
+
+
+def _digest(path: Path) -> str:
+    digest = blake2b(digest_size=20)
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _check_angles(folder: Path, angles_deg: Sequence[float], who: str) -> None:
+    count = layouts.different(angles_deg)
+    if count < 3:
+        listed = ", ".join(f"{angle:g}" for angle in angles_deg) or "none"
+        raise CaptureError(
+            f"{folder}: {who} {listed}: {count} different polarizer angles where 3 are needed; "
+            "add the missing shot"
+        )
+
+
+def _check_one_camera(facts: dict[Path, Exif]) -> None:
+    first_path, first = next(iter(facts.items()))
+    for path, fact in facts.items():
+        what = ""
+        if (fact.make, fact.model) != (first.make, first.model):
+            what = f"was taken with {fact.make} {fact.model}, not {first.make} {first.model}"
+        elif fact.lens and first.lens and fact.lens != first.lens:
+            what = f"was taken through {fact.lens}, not {first.lens}"
+        elif (fact.width, fact.height) != (first.width, first.height):
+            what = f"has {fact.width}×{fact.height} px, not {first.width}×{first.height}"
+        elif fact.focal_length_mm and first.focal_length_mm:
+            ratio = fact.focal_length_mm / first.focal_length_mm
+            if abs(ratio - 1) > _ZOOM:
+                what = f"was taken at {fact.focal_length_mm:g} mm, not {first.focal_length_mm:g} mm"
+        if what:
+            raise CaptureError(
+                f"{path}: {what} as {first_path.name}; keep one set-up per capture, or remove the file"
+            )
+
+
+def _check_no_duplicate(digests: dict[Path, str]) -> None:
+    seen: dict[str, Path] = {}
+    for path, digest in digests.items():
+        if digest in seen:
+            raise CaptureError(
+                f"{path}: is the same photograph as {seen[digest]}; remove one, and shoot what is missing"
+            )
+        seen[digest] = path
+
+
+def _check_brackets(shots: Sequence[Shot]) -> None:
+    counts = [len(shot.frames) for shot in shots]
+    usual = max(set(counts), key=counts.count)
+    model = next(shot for shot in shots if len(shot.frames) == usual)
+    for shot in shots:
+        where = Path(shot.frames[0].path).parent
+        if len(shot.frames) != usual:
+            raise CaptureError(
+                f"{where}: {shot.name} has {len(shot.frames)} frames where {model.name} has {usual}; "
+                "shoot equal brackets, or remove the surplus"
+            )
+        for frame, other in zip(shot.frames, model.frames):
+            if not layouts.equal(_exposure(frame), _exposure(other)):
+                raise CaptureError(
+                    f"{frame.path}: {_settings(frame)} where {model.name} has {_settings(other)} "
+                    f"({Path(other.path).name}); shoot equal brackets at every angle"
+                )
+
+
+def _settings(frame: Frame) -> str:
+    if frame.exposure:
+        return f"exposure {frame.exposure:.4g} stated"
+    fact = frame.exif
+    parts = [_seconds(fact.exposure_time), f"f/{fact.f_number or '?'}", f"ISO {fact.iso or '?'}"]
+    return " ".join(parts) if fact.exposure_time else "no exposure in EXIF"
+
+
+def _notes(layout: str, others: Sequence[Source], shots: Sequence[Shot], stated: CaptureFile) -> list[str]:
+    notes = []
+    cross = sum(source.role == "cross" for source in others)
+    if cross:
+        notes.append(f"not used: {cross} cross-polarised frames")
+    first = shots[0].frames[0]
+    if layout != "sensor" and sniff.kind(Path(first.path)) == "photo":
+        encoding, bits = photo.encoding_of(first.path, stated.encoding)
+        notes.append(f"finished pictures of {bits} bits, taken as {encoding}" + LOSS * (bits == 8))
+    if stated.rotator:
+        notes.append(
+            f"rotator {stated.rotator.model or 'of unknown model'}, log {stated.rotator.log or 'none'}"
+        )
+    exposures = [_exposure(frame) for frame in shots[0].frames]
+    if (
+        len(exposures) > 1
+        and None not in exposures
+        and np.ptp(np.log2(np.array(exposures, float))) < layouts.EQUAL_STOPS
+    ):
+        notes.append("the frames of a bracket state equal exposures; their ratios come from the pixels")
+    return notes

@@ -1,0 +1,203 @@
+"""A photograph's path in, the facts of its EXIF out: every maker's RAW, and finished pictures.
+
+Only tags are read, a millisecond a file; the pixel count comes from the decoder's
+header, which unpacks nothing.
+"""
+
+import io
+import logging
+import math
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import exifread
+
+from polcap.errors import DecodeError
+from polcap.formats import sniff, worker
+from polcap.images import Exif
+
+_D65_FIRST = (21, 20, 22, 23, 1, 4, 9, 10, 11, 12, 13, 14, 15)  # EXIF LightSource, the daylights
+_UNIT_MM = {
+    1: 25.4,
+    2: 25.4,
+    3: 10.0,
+    4: 1.0,
+    5: 1e-3,
+}  # FocalPlaneResolutionUnit; 1 "none" means inch in practice
+_SENSOR_MM = (2.0, 70.0)  # width; what is outside comes from a wrong unit
+_RESIZED = 1.05  # pixel counts that differ more than margins do
+
+logging.getLogger("exifread").setLevel(logging.CRITICAL)  # its warnings are about tags that are not used here
+
+
+def read(path: str | Path) -> Exif:
+    """The metadata of a RAW file or picture, with its size in visible RAW pixels.
+
+    Raises DecodeError where no decoder recognises the file.
+    """
+    path = Path(path)
+    exif, reference_width = _tags(path)
+    if sniff.kind(path) == "photo":
+        header, _ = worker.call("polcap.formats.photo:header", path)
+    else:
+        bare = exif.exposure_time is None and not exif.make  # CRW: the decoder knows more, but has to unpack
+        header, _ = worker.call("polcap.formats.raw:header", path, unpack=bare)
+    exif = replace(exif, width=header["width"], height=header["height"], **header.get("exif", {}))
+    return replace(exif, pixel_pitch_um=_pitch(exif.pixel_pitch_um, reference_width, header["width"]))
+
+
+def tags(path: str | Path) -> Exif:
+    """What the tags alone say; `width` and `height` stay None. A file without EXIF gives an empty Exif."""
+    return _tags(Path(path))[0]
+
+
+def _tags(path: Path) -> tuple[Exif, float | None]:
+    found: dict[str, Any] = {}
+    try:
+        with path.open("rb") as file:
+            for prefix, part in _parts(file):
+                try:
+                    read_tags = exifread.process_file(part, details=False, extract_thumbnail=False)
+                except Exception:  # exifread raises whatever a damaged tag leads to: as if it were absent
+                    continue
+                found |= {
+                    name.replace("Image ", prefix, 1) if prefix else name: tag
+                    for name, tag in read_tags.items()
+                }
+    except OSError as error:
+        raise DecodeError(
+            f"{path}: cannot be read ({error.strerror}); check the file and its permissions"
+        ) from None
+    return _exif(found), _number(found, "Image Tag 0xC791", "EXIF ExifImageWidth")
+
+
+def _parts(file: io.BufferedReader) -> Iterator[tuple[str, io.BufferedIOBase]]:
+    """Where the EXIF lies: (prefix for names of the first directory, bytes that exifread understands)."""
+    head = file.read(92)
+    if head[:15] == b"FUJIFILMCCD-RAW" and len(head) == 92:  # in the preview
+        offset, length = struct.unpack_from(">II", head, 84)
+        file.seek(offset)
+        yield "", io.BytesIO(file.read(length))
+    elif head[4:12] == b"ftypcrx ":  # in boxes of their own
+        top = head + file.read(1 << 20)
+        for box, prefix in ((b"CMT1", ""), (b"CMT2", "EXIF ")):
+            at = top.find(box)
+            if at >= 4:
+                (length,) = struct.unpack_from(">I", top, at - 4)
+                yield prefix, io.BytesIO(top[at + 4 : at - 4 + length])
+    elif head[:4] == b"\0MRM":  # in a block among the first
+        (length,) = struct.unpack_from(">I", head, 4)
+        file.seek(8)
+        top = file.read(min(length, 1 << 24))
+        at = 0
+        while at + 8 <= len(top):
+            (length,) = struct.unpack_from(">I", top, at + 4)
+            if top[at : at + 4] == b"\0TTW":
+                yield "", io.BytesIO(top[at + 8 : at + 8 + length])
+            at += 8 + length
+    else:
+        file.seek(0)
+        yield "", file
+
+
+def _exif(found: Mapping[str, Any]) -> Exif:
+    time = _number(found, "EXIF ExposureTime", "Image ExposureTime")
+    speed = _number(found, "EXIF ShutterSpeedValue", "Image ShutterSpeedValue")
+    if not time and speed is not None and abs(speed) < 30:
+        time = 2.0**-speed  # APEX
+    flash = _number(found, "EXIF Flash", "Image Flash")
+    iso = _number(
+        found, "EXIF ISOSpeedRatings", "Image ISOSpeedRatings", "Image Tag 0x0017"
+    )  # the last is RW2's
+    if iso in (None, 0.0, 65535.0):  # too large for its 16 bits
+        iso = _number(
+            found, "EXIF RecommendedExposureIndex", "EXIF StandardOutputSensitivity", "EXIF ISOSpeed"
+        )
+    return Exif(
+        make=_text(found, "Image Make"),
+        model=_text(found, "Image Model"),
+        lens=_text(found, "EXIF LensModel", "Image LensModel"),
+        exposure_time=time or None,
+        f_number=_number(found, "EXIF FNumber", "Image FNumber") or None,
+        iso=iso or None,
+        focal_length_mm=_number(found, "EXIF FocalLength", "Image FocalLength") or None,
+        focal_length_35mm=_number(found, "EXIF FocalLengthIn35mmFilm", "Image FocalLengthIn35mmFilm") or None,
+        pixel_pitch_um=_plane_pitch(found),
+        taken=_taken(found),
+        flash_fired=None if flash is None else bool(int(flash) & 1),
+        color_matrix=_color_matrix(found),
+    )
+
+
+def _plane_pitch(found: Mapping[str, Any]) -> float | None:
+    resolution = _number(found, "EXIF FocalPlaneXResolution", "Image FocalPlaneXResolution")
+    unit = _number(found, "EXIF FocalPlaneResolutionUnit", "Image FocalPlaneResolutionUnit")
+    millimetres = _UNIT_MM.get(int(unit) if unit is not None else 2)
+    return 1e3 * millimetres / resolution if resolution and millimetres else None
+
+
+def _pitch(pitch: float | None, reference_width: float | None, width: int) -> float | None:
+    """The pitch of the file's pixels, where the tag speaks of the picture before it was resized."""
+    if pitch is None:
+        return None
+    ratio = (reference_width or width) / width
+    if max(ratio, 1 / ratio) > _RESIZED:
+        pitch *= ratio
+    return pitch if _SENSOR_MM[0] < pitch * width / 1e3 < _SENSOR_MM[1] else None
+
+
+def _taken(found: Mapping[str, Any]) -> str:
+    stamp = _text(found, "EXIF DateTimeOriginal", "Image DateTimeOriginal", "Image DateTime")
+    fraction = _text(found, "EXIF SubSecTimeOriginal", "Image SubSecTimeOriginal")
+    date, _, clock = stamp.partition(" ")
+    stamp = f"{date.replace(':', '-')}T{clock}" + (f".{fraction}" if fraction.isdecimal() else "")
+    try:
+        datetime.fromisoformat(stamp)
+    except ValueError:  # an unset clock
+        return ""
+    return stamp
+
+
+def _color_matrix(found: Mapping[str, Any]) -> tuple[float, ...] | None:
+    """DNG ColorMatrix of the illuminant nearest to D65."""
+    choices = {}
+    for matrix, illuminant in (("C621", "C65A"), ("C622", "C65B")):
+        numbers = _numbers(found, f"Image Tag 0x{matrix}")
+        if len(numbers) == 9:
+            choices[int(_number(found, f"Image Tag 0x{illuminant}") or 0)] = tuple(numbers)
+    for light in (*_D65_FIRST, *choices):
+        if light in choices:
+            return choices[light]
+    return None
+
+
+def _number(found: Mapping[str, Any], *names: str) -> float | None:
+    for name in names:
+        numbers = _numbers(found, name)
+        if numbers:
+            return numbers[0]
+    return None
+
+
+def _numbers(found: Mapping[str, Any], name: str) -> list[float]:
+    if name not in found:
+        return []
+    values = found[name].values
+    try:
+        numbers = [float(value) for value in (values if isinstance(values, list | tuple) else [values])]
+    except (ValueError, TypeError, ZeroDivisionError):  # "unknown" is written 0/0
+        return []
+    return numbers if all(map(math.isfinite, numbers)) else []
+
+
+def _text(found: Mapping[str, Any], *names: str) -> str:
+    for name in names:
+        if name in found:
+            text = str(found[name].values).strip("\0 ")
+            if text:
+                return text
+    return ""

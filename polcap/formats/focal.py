@@ -1,0 +1,53 @@
+"""A photograph's EXIF in, its focal length in pixels out, and how it was come by."""
+
+import math
+import tomllib
+from functools import cache
+from typing import NamedTuple
+
+from polcap.formats import calib
+from polcap.images import Exif
+
+FULL_FRAME_MM = (36.0, 24.0)
+NORMAL_MM = 50.0  # full-frame equivalent that is assumed where nothing is known
+
+
+class Focal(NamedTuple):
+    px: float  # visible RAW pixels
+    known: bool
+    note: str
+
+
+def find(exif: Exif, stated_mm: float | None, stated_width_mm: float | None) -> Focal:
+    """Focal length in visible RAW pixels; `stated` is what the user says, and wins."""
+    width, height = exif.width or 0, exif.height or 0
+    diagonal = math.hypot(width, height)
+    equivalent = exif.focal_length_35mm  # by its definition of equal diagonals, in whole millimetres
+    focal = stated_mm or exif.focal_length_mm
+    sensor = stated_width_mm or (exif.pixel_pitch_um and exif.pixel_pitch_um * width / 1e3)
+    sensor = sensor or sensor_widths().get(exif.model)
+    if focal and sensor:
+        source = "capture.toml" if stated_mm or stated_width_mm else "EXIF"
+        return Focal(
+            focal / sensor * width, True, f"{focal:g} mm on a sensor {sensor:.1f} mm wide ({source})"
+        )
+    if equivalent and not stated_mm:
+        px = equivalent / math.hypot(*FULL_FRAME_MM) * diagonal
+        return Focal(px, True, f"{equivalent:g} mm full-frame equivalent (EXIF, to about 2 %)")
+    if focal:
+        return Focal(
+            focal / FULL_FRAME_MM[0] * width,
+            False,
+            f"{focal:g} mm, sensor size unknown: full frame assumed; state sensor_width_mm in capture.toml",
+        )
+    px = NORMAL_MM / math.hypot(*FULL_FRAME_MM) * diagonal
+    return Focal(
+        px, False, "unknown: 50 mm full-frame equivalent assumed; state focal_length_mm in capture.toml"
+    )
+
+
+@cache
+def sensor_widths() -> dict[str, float]:
+    """Width of the imaging area [mm] by EXIF model, of the cameras in calib/cameras/sensors.toml."""
+    table = tomllib.loads(calib.data_path("cameras/sensors.toml").read_text(encoding="utf-8"))
+    return {model: float(width) for model, width in table["width_mm"].items()}

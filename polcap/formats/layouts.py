@@ -1,0 +1,315 @@
+"""A capture's folder in, which photograph was taken at which angle out: the four layouts.
+
+Nothing is decoded here; `capture.py` reads the metadata, checks and builds the `Capture`.
+"""
+
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal
+
+from polcap.errors import CaptureError, DecodeError
+from polcap.formats import capture_toml, exif, photo, sniff
+from polcap.formats.capture_toml import CaptureFile
+from polcap.images import Exif, Role
+
+OUTPUT = "polcap"  # where results go by default
+DEFAULT_DEG = (0.0, 45.0, 90.0)
+APART_DEG = 5.0  # closer angles do not count as different
+EQUAL_STOPS = 0.15  # EXIF rounds times to a sixth of a stop at worst
+_POL_FOLDER = re.compile(r"pol[ _-]?(\d+(?:\.\d+)?)", re.IGNORECASE)
+_NUMBER = re.compile(r"\d+(?:\.\d+)?")
+
+
+@dataclass(frozen=True)
+class Source:
+    """One photograph and its part in the capture."""
+
+    path: Path
+    kind: sniff.Kind
+    role: Role = "shot"
+    angle_deg: float | None = None
+    exposure: float | None = None  # stated
+    flash_energy: float | None = None  # stated
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Which photograph is which."""
+
+    layout: Literal["folders", "toml", "flat", "sensor"]
+    shots: tuple[tuple[float, tuple[Source, ...]], ...]  # degrees, bracket; in the order of the capture
+    others: tuple[Source, ...] = ()  # ambient, chart, cross
+    notes: tuple[str, ...] = ()
+
+
+@dataclass
+class _Listing:
+    pictures: list[Source] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def plan(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None) -> Plan:
+    """Understand a folder.
+
+    `angles_deg` is the order of a flat folder; where folders, names or capture.toml give the
+    angles, it says which of them to use, the first being the reference.
+
+    Raises CaptureError.
+    """
+    if stated.frame:
+        return _toml(folder, stated, angles_deg)
+    sub_folders = _pol_folders(folder)
+    if sub_folders:
+        return _folders(folder, sub_folders, angles_deg)
+    listing = _list(folder)
+    if not listing.pictures:
+        inside = [path.name for path in _children(folder) if path.is_dir()]
+        hint = (
+            f"; its sub-folders are {', '.join(inside[:4])}, but polcap looks for pol000, pol045, …"
+            if inside
+            else ""
+        )
+        raise CaptureError(f"{folder}: holds no photograph{hint}")
+    if stated.sensor or _is_sensor(listing.pictures, angles_deg):
+        return _sensor(listing, angles_deg)
+    return _named(folder, listing, angles_deg) or _by_time(folder, listing, angles_deg or DEFAULT_DEG)
+
+
+def _toml(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None) -> Plan:
+    sources = []
+    for entry in stated.frame:
+        path = folder / entry.file
+        if not path.resolve().is_relative_to(folder.resolve()):
+            raise CaptureError(
+                f"{folder / capture_toml.NAME}: {entry.file} lies outside the folder; move it inside"
+            )
+        if not path.is_file():
+            raise CaptureError(
+                f"{folder / capture_toml.NAME}: {entry.file} is not there; correct or remove its entry"
+            )
+        kind = _picture_kind(path)
+        if kind == "other":
+            raise CaptureError(
+                f"{folder / capture_toml.NAME}: {entry.file} is not a photograph; remove its entry"
+            )
+        sources.append(Source(path, kind, entry.role, entry.angle, entry.exposure, entry.flash_energy))
+    shots = [source for source in sources if source.role == "shot"]
+    others = tuple(source for source in sources if source.role not in ("shot", "repeat"))
+    if stated.sensor:
+        return Plan("sensor", _sensor_shots(shots, angles_deg), others)
+    repeats = [source for source in sources if source.role == "repeat"]
+    brackets = _select(folder, _group(shots), angles_deg)
+    again = tuple((angle, bracket) for angle, bracket in _group(repeats).items() if angle in dict(brackets))
+    return Plan("toml", (*brackets, *((angle, tuple(bracket)) for angle, bracket in again)), others)
+
+
+def _group(sources: Iterable[Source]) -> dict[float, list[Source]]:
+    groups: dict[float, list[Source]] = defaultdict(list)
+    for source in sources:
+        if source.angle_deg is not None:
+            groups[source.angle_deg].append(source)
+    return groups
+
+
+def _folders(folder: Path, sub_folders: dict[float, Path], angles_deg: Sequence[float] | None) -> Plan:
+    groups: dict[float, list[Source]] = {}
+    notes = []
+    for angle, sub_folder in sub_folders.items():
+        listing = _list(sub_folder)
+        if not listing.pictures:
+            raise CaptureError(
+                f"{sub_folder}: holds no photograph; shoot this angle again, or remove the folder"
+            )
+        groups[angle] = listing.pictures
+        notes += [f"{sub_folder.name}: {note}" for note in listing.notes]
+    beside = sorted(
+        path.name
+        for path in _children(folder)
+        if path.is_dir() and path not in sub_folders.values() and path.name != OUTPUT
+    )
+    notes += [f"not used: the folders {', '.join(beside)}"] if beside else []
+    loose = _list(folder).pictures
+    notes += [f"not used: {len(loose)} photographs beside the folders"] if loose else []
+    return Plan("folders", _select(folder, groups, angles_deg), notes=tuple(notes))
+
+
+def _pol_folders(folder: Path) -> dict[float, Path]:
+    found: dict[float, Path] = {}
+    for path in _children(folder):
+        match = _POL_FOLDER.fullmatch(path.name) if path.is_dir() else None
+        if match:
+            angle = float(match[1])
+            if angle > 360:
+                raise CaptureError(
+                    f"{path}: {angle:g}° is not an angle of a polarizer; name it by 0 to 360 degrees"
+                )
+            if angle in found:
+                raise CaptureError(
+                    f"{path}: {angle:g}° is also in {found[angle].name}; keep one of the two folders"
+                )
+            found[angle] = path
+    return dict(sorted(found.items()))
+
+
+def _is_sensor(pictures: list[Source], angles_deg: Sequence[float] | None) -> bool:
+    """One or two grey pictures, of which no three angles can come in another way."""
+    return len(pictures) <= 2 and not angles_deg and all(_is_grey(source) for source in pictures)
+
+
+def _is_grey(source: Source) -> bool:
+    return source.kind == "photo" and photo.channels(source.path) == 1
+
+
+def _sensor(listing: _Listing, angles_deg: Sequence[float] | None) -> Plan:
+    shots = _sensor_shots(listing.pictures, angles_deg)
+    return Plan(
+        "sensor", shots, notes=(*listing.notes, "frames taken as a polarization sensor's, 90 45 / 135 0")
+    )
+
+
+def _sensor_shots(
+    sources: Sequence[Source], angles_deg: Sequence[float] | None
+) -> tuple[tuple[float, tuple[Source, ...]], ...]:
+    groups = {angle: list(sources) for angle, _ in photo.SENSOR_DEG}
+    return _select(sources[0].path.parent, groups, angles_deg) if sources else ()
+
+
+def _named(folder: Path, listing: _Listing, angles_deg: Sequence[float] | None) -> Plan | None:
+    """Finished pictures whose names differ in one number, which can only be an angle."""
+    pictures = listing.pictures
+    if any(source.kind == "raw" for source in pictures):  # a camera's file numbers
+        return None
+    stems = [source.path.stem for source in pictures]
+    if len({_NUMBER.sub("#", stem) for stem in stems}) != 1:
+        return None
+    columns = [column for column in zip(*(_NUMBER.findall(stem) for stem in stems)) if len(set(column)) > 1]
+    if len(columns) != 1 or any(len(text.partition(".")[0]) > 3 for text in columns[0]):
+        return None
+    angles = [float(text) for text in columns[0]]
+    if max(angles) >= 180 or len(set(angles)) < len(angles) or different(angles) < max(3, len(angles)):
+        return None
+    groups = {angle: [source] for angle, source in sorted(zip(angles, pictures), key=lambda pair: pair[0])}
+    notes = (*listing.notes, "angles read from the file names")
+    return Plan("flat", _select(folder, groups, angles_deg), notes=notes)
+
+
+def _by_time(folder: Path, listing: _Listing, angles_deg: Sequence[float]) -> Plan:
+    """K equal brackets one after the other."""
+    facts = {source.path: exif.read(source.path) for source in listing.pictures}
+    timed = all(fact.taken for fact in facts.values())
+    order = sorted(
+        listing.pictures,
+        key=lambda source: (facts[source.path].taken if timed else "", natural(source.path.name)),
+    )
+    count, shots = len(order), len(angles_deg)
+    by = "by their EXIF times" if timed else "by name"
+    listed = ", ".join(f"{angle:g}" for angle in angles_deg)
+    remedy = "give the order with --angles, or sort the frames into pol000, pol045, … or capture.toml"
+    if count % shots:
+        raise CaptureError(
+            f"{folder}: {count} frames do not make {shots} equal brackets (angles {listed}); {remedy}"
+        )
+    size = count // shots
+    if not timed and size > 1:
+        raise CaptureError(f"{folder}: {count} frames without EXIF times cannot be told apart; {remedy}")
+    brackets = [order[at : at + size] for at in range(0, count, size)]
+    first = [exposure(facts[source.path]) for source in brackets[0]]
+    for angle, bracket in zip(angles_deg, brackets):
+        for source, reference in zip(bracket, first):
+            value = exposure(facts[source.path])
+            if not equal(value, reference):
+                raise CaptureError(
+                    f"{source.path}: is exposed {_times(value, reference)} as the first bracket's frame in its "
+                    f"place, so that the {count} frames {by} are not {shots} equal brackets "
+                    f"(it would be {angle:g}°); {remedy}"
+                )
+    note = f"{count} frames {by} taken as {shots} brackets of {size}, in the order {listed}°"
+    shots_ = tuple((angle, tuple(bracket)) for angle, bracket in zip(angles_deg, brackets))
+    return Plan("flat", shots_, notes=(*listing.notes, note))
+
+
+def exposure(fact: Exif) -> float | None:
+    return fact.relative_exposure
+
+
+def equal(value: float | None, reference: float | None) -> bool:
+    """Two exposures are the same as far as the camera states them."""
+    if not value or not reference:
+        return value == reference
+    return max(value / reference, reference / value) < 2**EQUAL_STOPS
+
+
+def _times(value: float | None, reference: float | None) -> str:
+    return f"{value / reference:.3g} times" if value and reference else "not as clearly stated"
+
+
+def _select(
+    folder: Path, groups: dict[float, list[Source]], angles_deg: Sequence[float] | None
+) -> tuple[tuple[float, tuple[Source, ...]], ...]:
+    wanted = list(groups) if angles_deg is None else list(angles_deg)
+    for angle in wanted:
+        if angle not in groups:
+            listed = ", ".join(f"{known:g}" for known in groups) or "none"
+            raise CaptureError(
+                f"{folder}: holds no shot at {angle:g}° (there are {listed}); correct --angles"
+            )
+    return tuple((angle, tuple(groups[angle])) for angle in wanted)
+
+
+def different(angles_deg: Iterable[float]) -> int:
+    """How many angles differ as polarizer axes do, modulo 180 degrees."""
+    axes = sorted(angle % 180 for angle in angles_deg)
+    gaps = [b - a for a, b in pairwise([*axes, axes[0] + 180])] if axes else []
+    return max(sum(gap >= APART_DEG for gap in gaps), 1 if axes else 0)
+
+
+def _list(folder: Path) -> _Listing:
+    """The photographs of one folder; where a RAW is there, the finished pictures stand back."""
+    listing = _Listing()
+    found = [Source(path, _picture_kind(path)) for path in _children(folder) if path.is_file()]
+    pictures = [source for source in found if source.kind in ("raw", "photo")]
+    raws = [source for source in pictures if source.kind == "raw"]
+    if raws and len(raws) < len(pictures):
+        stems = {source.path.stem.lower() for source in raws}
+        extra = [source.path for source in pictures if source.kind == "photo"]
+        paired = sum(path.stem.lower() in stems for path in extra)
+        if paired:
+            listing.notes.append(f"{paired} pictures beside a RAW of the same name: the RAW is used")
+        if paired < len(extra):
+            listing.notes.append(f"not used: {len(extra) - paired} finished pictures among RAW files")
+    listing.pictures = sorted(raws or pictures, key=lambda source: natural(source.path.name))
+    return listing
+
+
+def _picture_kind(path: Path) -> sniff.Kind:
+    """As `sniff.kind`; unknown bytes are a RAW if LibRaw says so, and an error if not."""
+    kind = sniff.kind(path)
+    if kind != "unknown":
+        return kind
+    if not path.stat().st_size:
+        raise CaptureError(f"{path}: is empty; copy it from the card again, or remove it")
+    try:
+        exif.read(path)
+    except DecodeError:
+        raise CaptureError(
+            f"{path}: no picture, no RAW that LibRaw knows and no text; restore it, or remove it from the folder"
+        ) from None
+    return "raw"
+
+
+def _children(folder: Path) -> list[Path]:
+    try:
+        return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+    except OSError as error:
+        raise CaptureError(f"{folder}: cannot be listed ({error.strerror}); check the folder") from None
+
+
+def natural(name: str) -> tuple[tuple[int, str], ...]:
+    """Sorting key under which frame 9 comes before frame 10."""
+    return tuple(
+        (int(part), "") if part.isdecimal() else (-1, part.lower()) for part in re.split(r"(\d+)", name)
+    )

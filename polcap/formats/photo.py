@@ -1,0 +1,181 @@
+"""A finished picture's path in, linear values out: TIFF, PNG, EXR, JPEG, by OpenImageIO in the worker.
+
+16-bit and floating-point files are taken as linear, 8-bit ones as sRGB-encoded, unless the
+caller states the encoding. RAW never comes here: OpenImageIO opens a DNG as its thumbnail.
+"""
+
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.errors import DecodeError
+from polcap.formats import raw, sniff, worker
+from polcap.images import Floats, SensorImage
+
+Encoding = Literal["linear", "srgb"]
+SENSOR_DEG: tuple[tuple[float, tuple[int, int]], ...] = (  # where each angle lies in the 2×2 of the sensor
+    (0.0, (1, 1)),
+    (45.0, (0, 1)),
+    (90.0, (0, 0)),
+    (135.0, (1, 0)),
+)
+_COLOR_LEVELS = 0.05  # neighbouring 2×2 cells of a monochrome sensor differ less, averaged over the frame
+
+
+def read(
+    path: str | Path, encoding: Encoding | None = None, white: float | None = None, black: float = 0.0
+) -> SensorImage:
+    """A picture as (H, W, 3); a grey one stands in all three channels.
+
+    Linear integers stay counts, `white` being the type's maximum unless stated; floating point
+    has white 1. An sRGB-encoded picture becomes linear 0…1 and `lossy`, as every 8-bit one is.
+
+    Raises DecodeError.
+    """
+    pixels = _pixels(path)
+    lossy = pixels.dtype == np.uint8
+    full = float(np.iinfo(pixels.dtype).max) if np.issubdtype(pixels.dtype, np.integer) else 1.0
+    encoding = encoding or ("srgb" if lossy else "linear")  # as encoding_of
+    if pixels.shape[2] == 1:
+        pixels = np.repeat(pixels, 3, axis=2)
+    if encoding == "srgb":
+        return SensorImage(_decoded(pixels, full), np.zeros((1, 1)), 1.0, None, lossy=True)
+    return SensorImage(_counts(pixels), np.full((1, 1), black), white or full, None, lossy=lossy)
+
+
+def read_mosaic(
+    path: str | Path, angle_deg: float, white: float | None = None, black: float = 0.0
+) -> SensorImage:
+    """One angle of a monochrome polarization sensor's raw frame, (H/2, W/2, 3), linear.
+
+    `path` may be a RAW or a picture; the frame's 2×2 cell is 90 45 / 135 0 degrees.
+
+    Raises DecodeError where the frame is in colour.
+    """
+    y, x = dict(SENSOR_DEG)[angle_deg]
+    if sniff.kind(Path(path)) == "photo":
+        pixels = _pixels(path)
+        if pixels.shape[2] != 1:
+            raise DecodeError(
+                f"{path}: has {pixels.shape[2]} channels, but the frame of a polarization sensor has one; "
+                "save the camera's raw frame, or give one picture per angle"
+            )
+        mosaic, lossy, level = pixels[..., 0], pixels.dtype == np.uint8, black
+        full = float(np.iinfo(pixels.dtype).max) if np.issubdtype(pixels.dtype, np.integer) else 1.0
+    else:
+        sensor = raw.read(path)
+        mosaic = sensor.value if sensor.value.ndim == 2 else sensor.value[..., 0]
+        lossy, full = False, sensor.white
+        level = black or float(np.broadcast_to(sensor.black, (2, 2))[y, x])
+    _check_monochrome(path, mosaic)
+    height, width = mosaic.shape
+    plane = mosaic[y : height // 2 * 2 : 2, x : width // 2 * 2 : 2]
+    value = np.repeat(_counts(plane)[..., None], 3, axis=2)
+    return SensorImage(value, np.full((1, 1), level), white or full, None, lossy=lossy)
+
+
+def channels(path: str | Path) -> int:
+    """1 of a grey picture, 3 of a coloured one. Raises DecodeError."""
+    meta, _ = worker.call("polcap.formats.photo:header", path)
+    return int(meta["channels"])
+
+
+def encoding_of(path: str | Path, stated: Encoding | None) -> tuple[Encoding, int]:
+    """How `read` takes a picture, and its bits per channel. Raises DecodeError."""
+    meta, _ = worker.call("polcap.formats.photo:header", path)
+    return stated or ("srgb" if meta["bits"] == 8 else "linear"), int(meta["bits"])
+
+
+def _decoded(pixels: NDArray[Any], full: float) -> Floats:
+    if pixels.dtype.kind == "f":
+        return srgb_to_linear(pixels)
+    table = srgb_to_linear(np.arange(full + 1) / full)
+    return np.asarray(table[pixels])  # twenty times faster than the formula per pixel
+
+
+def srgb_to_linear(value: Floats) -> Floats:
+    """IEC 61966-2-1."""
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def header(path: str) -> worker.Answer:
+    """Size, channels and type of a picture; no pixel is read. In the worker."""
+    file, _ = _open(path)
+    spec = file.spec()
+    count, bits = len(_channels(path, spec)), 8 * spec.format.size()
+    return {"width": spec.width, "height": spec.height, "channels": count, "bits": bits}, {}
+
+
+def decode(path: str) -> worker.Answer:
+    """The stored values, (H, W, 1 or 3), of the type they are stored in. In the worker."""
+    import OpenImageIO as oiio
+
+    file, _ = _open(path)
+    spec = file.spec()
+    channels = _channels(path, spec)
+    kind = "float" if spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE) else str(spec.format)
+    pixels = file.read_image(0, 0, 0, spec.nchannels, kind)
+    if pixels is None:
+        raise DecodeError(
+            f"{path}: truncated or damaged ({_one_line(file.geterror())}); copy it from the card again"
+        )
+    pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)[..., channels]
+    if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
+        bad = int((~np.isfinite(pixels)).sum())
+        raise DecodeError(
+            f"{path}: {bad} values are not finite numbers; write the file without NaN and infinity"
+        )
+    return {}, {"pixels": pixels}
+
+
+def _pixels(path: str | Path) -> NDArray[Any]:
+    _, arrays = worker.call("polcap.formats.photo:decode", path)
+    return arrays["pixels"]
+
+
+def _open(path: str) -> tuple[Any, Any]:
+    import OpenImageIO as oiio
+
+    options = oiio.ImageSpec()
+    options["oiio:UnassociatedAlpha"] = 1  # else a PNG's colours come multiplied by its alpha
+    file = oiio.ImageInput.open(path, options)
+    if file is None:
+        raise DecodeError(
+            f"{path}: not a readable picture ({_one_line(oiio.geterror())}); is the file complete?"
+        )
+    return file, options
+
+
+def _channels(path: str, spec: Any) -> list[int]:
+    """The channels that are R, G and B, or the grey one."""
+    names = [name.rpartition(".")[2].upper() for name in spec.channelnames]
+    if sum(name in ("R", "G", "B") for name in names) == 3:
+        return [names.index(name) for name in "RGB"]
+    grey = [i for i, name in enumerate(names) if i != spec.alpha_channel]
+    if len(grey) == 1:
+        return grey
+    raise DecodeError(
+        f"{path}: has the channels {', '.join(spec.channelnames)}; polcap reads R, G, B or one grey"
+    )
+
+
+def _counts(pixels: NDArray[Any]) -> Any:
+    return pixels if pixels.dtype == np.uint16 else pixels.astype(np.float32)
+
+
+def _check_monochrome(path: str | Path, mosaic: NDArray[Any]) -> None:
+    """Refuse a colour polarization sensor: there, neighbouring 2×2 cells have different filters."""
+    height, width = (size // 4 * 4 for size in mosaic.shape)
+    cells = mosaic[:height, :width].reshape(height // 4, 2, 2, width // 4, 2, 2)
+    levels = cells.mean(axis=(0, 2, 3, 5), dtype=np.float64)  # (2, 2)
+    if levels.max() > (1 + _COLOR_LEVELS) * levels.min():
+        raise DecodeError(
+            f"{path}: neighbouring 2×2 cells differ by {levels.max() / levels.min() - 1:.0%}, as on a colour "
+            "polarization sensor, which is not supported; give one demosaiced picture per angle"
+        )
+
+
+def _one_line(message: str) -> str:
+    return " ".join(message.split()) or "no reason given"

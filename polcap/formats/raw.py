@@ -1,0 +1,172 @@
+"""A RAW file's path in, its sensor counts out: decoded by LibRaw in the worker.
+
+The only module that imports rawpy, and only in the child process.
+"""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.errors import DecodeError
+from polcap.formats import exif, worker
+from polcap.images import Bits, Exif, Floats, SensorImage
+
+XYZ_FROM_REC709 = np.array(  # IEC 61966-2-1, D65
+    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
+)
+_COPY_AGAIN = "copy it from the card again"
+
+
+def read(path: str | Path) -> SensorImage:
+    """Decode one RAW file, nothing subtracted, without the masked border.
+
+    A Bayer file gives its mosaic (H, W) with `black` (2, 2) and `cfa` in the phase of its
+    first visible pixel. A file of finished linear channels, or of a monochrome sensor, gives
+    (H, W, 3) and no `cfa`. `camera_matrix` holds the white balance: it takes the camera's
+    answer to a grey in the light of the shot, 1/`white_balance`, to (1, 1, 1).
+
+    Raises
+    ------
+    DecodeError
+        Not a RAW, damaged, X-Trans or Foveon; or the decoder crashed, hung or ran out of memory.
+    """
+    meta, arrays = worker.call("polcap.formats.raw:decode", path)
+    balance = None if meta["balance"] is None else np.array(meta["balance"])
+    xyz_to_camera = exif.tags(path).color_matrix or meta["xyz_to_camera"]
+    return SensorImage(
+        value=arrays["value"],
+        black=np.array(meta["black"]),
+        white=meta["white"],
+        cfa=arrays.get("cfa"),
+        camera_matrix=None
+        if xyz_to_camera is None
+        else camera_matrix(np.reshape(xyz_to_camera, (3, 3)), balance),
+        white_balance=balance,
+    )
+
+
+def camera_matrix(xyz_to_camera: Floats, balance: Floats | None) -> Floats | None:
+    """Camera RGB → linear Rec.709 (3, 3), with the white balance (3,) in it; daylight's where None.
+
+    References
+    ----------
+    Adobe, Digital Negative Specification 1.4, ch. 6; dcraw's normalisation to the white of D65.
+    """
+    camera = xyz_to_camera @ XYZ_FROM_REC709
+    daylight = camera.sum(axis=1)  # the camera's answer to D65
+    if (daylight <= 0).any() or abs(np.linalg.det(camera)) < 1e-9:
+        return None
+    to_rec709 = np.linalg.inv(camera / daylight[:, None])
+    gain = daylight[1] / daylight if balance is None else balance
+    return np.asarray(to_rec709 * gain)
+
+
+def header(path: str, unpack: bool) -> worker.Answer:
+    """Size in visible pixels, and with `unpack` LibRaw's own reading of the metadata. In the worker."""
+    import rawpy
+
+    try:
+        with rawpy.RawPy() as raw:
+            raw.open_file(path)
+            sizes = raw.sizes  # unpacks nothing, unlike every other property
+            meta: dict[str, Any] = {
+                "width": sizes.width,
+                "height": sizes.height,
+                "aspect": sizes.pixel_aspect,
+            }
+            if unpack:
+                meta["exif"] = _known(raw.other, raw.lens)
+    except rawpy.LibRawError as error:
+        raise _refused(path, error) from None
+    return meta, {}
+
+
+def _known(other: Any, lens: Any) -> dict[str, Any]:
+    stamp = other.timestamp
+    known = Exif(
+        lens=(lens.model or "").strip(),
+        exposure_time=other.shutter_speed or None,
+        f_number=other.aperture or None,
+        iso=other.iso_speed or None,
+        focal_length_mm=other.focal_length or None,
+        taken=stamp.isoformat() if stamp and stamp.year > 1970 else "",
+    )
+    return {name: value for name, value in asdict(known).items() if value}
+
+
+def decode(path: str) -> worker.Answer:
+    """The counts and what they mean. In the worker."""
+    import rawpy
+
+    try:
+        with rawpy.imread(path) as raw:
+            meta: dict[str, Any] = {"balance": _balance(raw), "xyz_to_camera": _xyz_to_camera(raw)}
+            value = raw.raw_image_visible.copy()  # a view kept past the block is a crash
+            if value.ndim == 3 and value.shape[2] >= 3:
+                if raw.num_colors != 3:
+                    raise DecodeError(f"{path}: has {raw.num_colors} colour channels where 3 are supported")
+                arrays = {"value": value[..., :3]}
+                black = [[float(np.mean(raw.black_level_per_channel[:3]))]]
+            elif value.ndim == 2 and raw.num_colors == 1:
+                arrays = {"value": np.repeat(value[..., None], 3, axis=2)}
+                black = [[float(raw.black_level_per_channel[0])]]
+            else:
+                cfa, black = _mosaic(raw, path)
+                arrays = {"value": value, "cfa": cfa}
+            meta |= {"black": black, "white": _white(raw, float(np.max(black)))}
+    except (rawpy.LibRawError, NotImplementedError) as error:
+        raise _refused(path, error) from None
+    return meta, arrays
+
+
+def _mosaic(raw: Any, path: str) -> tuple[Bits, list[list[float]]]:
+    """The 2×2 colours and black levels from the first visible pixel on."""
+    pattern = raw.raw_pattern
+    if pattern is None or pattern.shape != (2, 2):
+        raise DecodeError(
+            f"{path}: its colour filter is not a 2×2 Bayer mosaic (X-Trans, Foveon or another), which polcap "
+            "does not support; develop it to linear 16-bit TIFF"
+        )
+    top, left = raw.sizes.top_margin, raw.sizes.left_margin
+    index = [[raw.raw_color(top + y, left + x) for x in (0, 1)] for y in (0, 1)]
+    names = raw.color_desc.decode()
+    letters = [[names[i] for i in row] for row in index]
+    if sorted(letters[0] + letters[1]) != ["B", "G", "G", "R"]:
+        raise DecodeError(
+            f"{path}: its mosaic is {letters}, not of red, green and blue; polcap does not support it"
+        )
+    cfa = np.array([["RGB".index(letter) for letter in row] for row in letters], np.uint8)
+    levels = raw.black_level_per_channel  # in the order of the colour index
+    return cfa, [[float(levels[i]) for i in row] for row in index]
+
+
+def _white(raw: Any, black: float) -> float:
+    """Saturation: LibRaw's maximum, or the camera's own lower statement of it."""
+    stated = [level for level in raw.camera_white_level_per_channel or () if level > black]
+    lowest = min([raw.white_level, *stated])
+    return float(lowest if lowest > raw.white_level / 2 else raw.white_level)
+
+
+def _balance(raw: Any) -> list[float] | None:
+    balance = raw.camera_whitebalance[:3]
+    return [value / balance[1] for value in balance] if min(balance) > 0 else None
+
+
+def _xyz_to_camera(raw: Any) -> list[list[float]] | None:
+    matrix: NDArray[Any] = raw.rgb_xyz_matrix[:3]
+    return matrix.tolist() if matrix.any() else None
+
+
+def _refused(path: str, error: Exception) -> DecodeError:
+    import rawpy
+
+    reason = error.args[0] if error.args else type(error).__name__
+    reason = reason.decode(errors="replace") if isinstance(reason, bytes) else str(reason)
+    if isinstance(error, rawpy.LibRawFileUnsupportedError):
+        return DecodeError(f"{path}: no RAW format that LibRaw knows ({reason}); is the file complete?")
+    if isinstance(error, NotImplementedError):
+        return DecodeError(f"{path}: a RAW layout that is not supported ({reason}); convert it to DNG")
+    return DecodeError(f"{path}: truncated or damaged ({reason}); {_COPY_AGAIN}")

@@ -1,0 +1,164 @@
+"""A path in, what kind of file it is out, judged by its content and never by its name."""
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, Literal, NamedTuple
+
+from polcap.errors import CaptureError
+
+Kind = Literal["raw", "photo", "other", "unknown"]
+
+SUBTYPE, WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, MAKE = 254, 256, 257, 258, 259, 262, 271
+STRIP_OFFSETS, SAMPLES, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS = 273, 277, 279, 324, 325, 330
+DNG_VERSION, ACTIVE_AREA = 50706, 50829
+CFA, LINEAR_RAW = 32803, 34892
+
+_RAW_COMPRESSION = {
+    32767,
+    32769,
+    32770,
+    32867,
+    34316,
+    34713,
+    65000,
+    65535,
+}  # Sony, Samsung, Kodak, Nikon, Pentax
+_WANTED = {
+    SUBTYPE, WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, MAKE, STRIP_OFFSETS, SAMPLES, STRIP_BYTES,
+    TILE_OFFSETS, TILE_BYTES, SUB_IFDS, DNG_VERSION, ACTIVE_AREA,
+}  # fmt: skip
+_INTEGERS = {1: "B", 3: "H", 4: "I", 13: "I"}
+_MOST_DIRECTORIES, _MOST_VALUES = 64, 1 << 20  # a loop or a forged count ends here
+_SIDECARS = {".db", ".ini", ".cos", ".thm", ".wav", ".mov", ".mp4", ".avi", ".pdf", ".zip"}  # not text
+
+Directory = dict[int, tuple[int, ...]]
+
+
+class Tiff(NamedTuple):
+    """The image directories of a TIFF-structured file, the first, its siblings and their children."""
+
+    directories: tuple[Directory, ...]
+    size: int  # bytes of the file
+
+    @property
+    def truncated(self) -> bool:
+        """Some strip or tile lies beyond the end of the file."""
+        for directory in self.directories:
+            for starts, counts in ((STRIP_OFFSETS, STRIP_BYTES), (TILE_OFFSETS, TILE_BYTES)):
+                ends = (a + b for a, b in zip(directory.get(starts, ()), directory.get(counts, ())))
+                if max(ends, default=0) > self.size:
+                    return True
+        return False
+
+    @property
+    def largest(self) -> Directory:
+        """The directory of the most pixels: the RAW image, or a plain TIFF's only one."""
+        return max(self.directories, key=lambda d: d.get(WIDTH, (0,))[0] * d.get(HEIGHT, (0,))[0], default={})
+
+
+def kind(path: Path) -> Kind:
+    """Whether a file is a RAW, a finished picture, something beside the pictures, or unknown bytes.
+
+    Raises CaptureError where the file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(512)
+            return _kind(path, head, file)
+    except OSError as error:
+        raise CaptureError(
+            f"{path}: cannot be read ({error.strerror}); check the file and its permissions"
+        ) from None
+
+
+def _kind(path: Path, head: bytes, file: BinaryIO) -> Kind:
+    if head[:3] == b"\xff\xd8\xff" or head[:8] == b"\x89PNG\r\n\x1a\n" or head[:4] == b"\x76\x2f\x31\x01":
+        return "photo"
+    if is_raw_magic(head):
+        return "raw"
+    if head[:4] in (b"II*\0", b"MM\0*"):
+        return "raw" if _is_raw(tiff(file)) else "photo"
+    if path.suffix.lower() in _SIDECARS:  # asked only of what is no picture
+        return "other"
+    text = head.strip(b"\0") and not any(byte < 9 or 13 < byte < 27 for byte in head)
+    return "other" if text else "unknown"
+
+
+def is_raw_magic(head: bytes) -> bool:
+    """The first bytes are those of a RAW format of its own (not a TIFF among TIFFs)."""
+    return (
+        head[:15] == b"FUJIFILMCCD-RAW"
+        or head[4:12] == b"ftypcrx "  # Canon CR3
+        or head[6:14] == b"HEAPCCDR"  # Canon CRW
+        or head[:4]
+        in (b"\0MRM", b"FOVb", b"IIRO", b"IIRS", b"MMOR", b"IIU\0")  # Minolta, Sigma, Olympus, Panasonic
+        or (
+            head[:2] in (b"II", b"MM") and (head[8:10] == b"CR" or head[8:12] in (b"IIII", b"MMMM"))
+        )  # CR2, IIQ
+    )
+
+
+def _is_raw(structure: Tiff) -> bool:
+    for directory in structure.directories:
+        if DNG_VERSION in directory or directory.get(PHOTOMETRIC, (0,))[0] in (CFA, LINEAR_RAW):
+            return True
+        if directory.get(COMPRESSION, (0,))[0] in _RAW_COMPRESSION:
+            return True
+    first = structure.directories[0] if structure.directories else {}
+    return (
+        MAKE in first and SUB_IFDS in first and first.get(SUBTYPE) == (1,)
+    )  # a preview in front of sensor data
+
+
+def tiff(file: BinaryIO) -> Tiff:
+    """The image directories of a TIFF; a damaged one yields what can be read of it."""
+    size = file.seek(0, 2)
+    file.seek(0)
+    head = file.read(8)
+    order = "<" if head[:2] == b"II" else ">"
+    directories: list[Directory] = []
+    if len(head) == 8:
+        pending = [struct.unpack(order + "I", head[4:])[0]]
+        seen: set[int] = set()
+        while pending and len(directories) < _MOST_DIRECTORIES:
+            offset = pending.pop(0)
+            if offset in seen or not 8 <= offset < size:
+                continue
+            seen.add(offset)
+            file.seek(offset)
+            directory, following = _directory(file, order, size)
+            directories.append(directory)
+            pending += [*directory.get(SUB_IFDS, ()), following]
+    return Tiff(tuple(directories), size)
+
+
+def _directory(file: BinaryIO, order: str, size: int) -> tuple[Directory, int]:
+    count = _unpack(file.read(2), order + "H")
+    body = file.read(12 * count + 4)
+    following = _unpack(body[12 * count :], order + "I")
+    return dict(_entries(body[: 12 * count], file, order, size)), following
+
+
+def _entries(body: bytes, file: BinaryIO, order: str, size: int) -> Iterator[tuple[int, tuple[int, ...]]]:
+    for at in range(0, len(body) - 11, 12):
+        tag, form, count = struct.unpack_from(order + "HHI", body, at)
+        if tag not in _WANTED or count > _MOST_VALUES:
+            continue
+        if form not in _INTEGERS:
+            yield tag, ()  # there, of a type that is not read here
+            continue
+        code = f"{order}{count}{_INTEGERS[form]}"
+        length = struct.calcsize(code)
+        if length <= 4:
+            yield tag, struct.unpack_from(code, body, at + 8)
+            continue
+        (offset,) = struct.unpack_from(order + "I", body, at + 8)
+        if offset + length <= size:
+            file.seek(offset)
+            yield tag, struct.unpack(code, file.read(length))
+
+
+def _unpack(data: bytes, code: str) -> int:
+    length = struct.calcsize(code)
+    return int(struct.unpack(code, data[:length])[0]) if len(data) >= length else 0
