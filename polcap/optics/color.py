@@ -1,0 +1,123 @@
+"""Colour: sRGB, Rec.709, the difference an eye would see, and the matrix of a camera.
+
+The curves and matrices work on NumPy and torch; colours on the last axis. White is D65 throughout.
+"""
+
+import sys
+import unittest.mock
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from array_api_compat import array_namespace
+from numpy.typing import NDArray
+
+from polcap.images import Floats
+
+# Linear Rec.709 → CIE XYZ (white: Y = 1), IEC 61966-2-1:1999.
+REC709_TO_XYZ = np.array(
+    [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]], dtype=np.float64
+)
+XYZ_TO_REC709 = np.linalg.inv(REC709_TO_XYZ)
+LUMINANCE = REC709_TO_XYZ[1]  # Y of linear Rec.709
+_D65 = (0.3127, 0.3290)  # xy
+
+
+def encode_srgb(linear: Any) -> Any:
+    """Linear Rec.709 → sRGB, odd in its argument so that negative values survive; 1 stays 1.
+
+    References
+    ----------
+    IEC 61966-2-1:1999, eq. (5)–(7).
+    """
+    xp = array_namespace(linear)
+    size = xp.abs(linear)
+    power = 1.055 * xp.where(size > 0.0031308, size, xp.ones_like(size)) ** (1 / 2.4) - 0.055
+    return xp.sign(linear) * xp.where(size > 0.0031308, power, 12.92 * size)
+
+
+def decode_srgb(encoded: Any) -> Any:
+    """sRGB → linear Rec.709, the inverse of `encode_srgb`."""
+    xp = array_namespace(encoded)
+    size = xp.abs(encoded)
+    return xp.sign(encoded) * xp.where(size > 0.04045, ((size + 0.055) / 1.055) ** 2.4, size / 12.92)
+
+
+def luminance(rgb: Any) -> Any:
+    """Y of linear Rec.709 (..., 3) → (...,)."""
+    return LUMINANCE[0] * rgb[..., 0] + LUMINANCE[1] * rgb[..., 1] + LUMINANCE[2] * rgb[..., 2]
+
+
+def delta_e(rgb: Floats, reference: Floats) -> Floats:
+    """CIEDE2000 (kL = kC = kH = 1) between linear Rec.709 colours (..., 3) → (...,), white = D65.
+
+    About 1 is just noticeable side by side. Loads colour-science.
+    """
+    colour = load_colour_science()
+    lab = [colour.XYZ_to_Lab(np.asarray(c, np.float64) @ REC709_TO_XYZ.T, _D65) for c in (rgb, reference)]
+    return np.asarray(colour.delta_E(lab[0], lab[1], method="CIE 2000"), dtype=np.float64)
+
+
+def load_colour_science() -> Any:
+    """The `colour` package, imported when first needed (0.3–0.9 s).
+
+    colour-science 0.4.7 puts MagicMock objects into sys.modules for each optional package it does not
+    find, and trimesh then takes them for the real ones: they are removed again.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import colour
+    for name in [n for n, module in sys.modules.items() if isinstance(module, unittest.mock.MagicMock)]:
+        del sys.modules[name]
+    return colour
+
+
+@dataclass(frozen=True)
+class MatrixFit:
+    matrix: Floats  # (3, 3) camera channels → linear Rec.709 reflectance, at the patch where the light is 1
+    slope: Floats  # (2,) relative change of the light per unit of position
+    delta_e: Floats  # (N,) CIEDE2000; NaN for patches not used
+
+
+def fit_matrix(
+    color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_], rounds: int = 4
+) -> MatrixFit:
+    """Least squares for a camera's matrix M under a light of slope e: M c = (1 + e·x) r.
+
+    Parameters
+    ----------
+    color, reference : (N, 3) patches in camera channels c and linear Rec.709 r; 12 usable ones or more.
+    position : (N, 2) x of each patch, from the patch at which the matrix is to hold.
+
+    Notes
+    -----
+    A patch weighs 1/Y^⅔, the slope of L*, so that errors count as they are seen; neutral ones double.
+    Huber weights take out what a label or a highlight spoiled. Linear in M, so it commutes with
+    exposure, as HDR needs (a polynomial does not: Finlayson et al., IEEE TIP 2015).
+    """
+    exposure = float(np.mean(color[usable])) + 1e-12
+    chroma = reference.max(axis=1) - reference.min(axis=1)
+    base = (1 + (chroma < 0.1 * reference.max(axis=1))) / np.maximum(luminance(reference), 0.02) ** (2 / 3)
+    base = np.where(usable, base, 0.0)
+    weight = base
+    for _ in range(rounds):
+        matrix, slope = _solve(color / exposure, reference, position, weight)
+        seen = color / exposure @ matrix.T / (1 + position @ slope)[:, None]
+        error = np.linalg.norm(base[:, None] * (seen - reference), axis=1)
+        limit = 2.5 * float(np.median(error[usable])) + 1e-9
+        weight = base * np.sqrt(np.minimum(1.0, limit / np.maximum(error, 1e-12)))
+    residual = np.where(usable, delta_e(seen, reference), np.nan)
+    return MatrixFit(matrix=matrix / exposure, slope=slope, delta_e=residual)
+
+
+def _solve(color: Floats, reference: Floats, position: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """(3, 3) and (2,) by one linear least squares over N patches × 3 channels."""
+    system = np.zeros((3, len(color), 11))
+    for channel in range(3):
+        system[channel, :, 3 * channel : 3 * channel + 3] = color
+        system[channel, :, 9:] = -position * reference[:, channel, None]
+    rows = (weight[None, :, None] * system).reshape(-1, 11)
+    right = (weight[None, :] * reference.T).ravel()
+    solution = np.linalg.lstsq(rows, right, rcond=None)[0]
+    return solution[:9].reshape(3, 3), solution[9:]
