@@ -19,9 +19,7 @@ from polcap.optics import brdf, fresnel
 _LEAST_COSINE = 1e-4
 
 
-def stokes(
-    normal: Any, diffuse: Any, specular: Any, roughness: Any, ior: Any, to_light: Any, irradiance: Any
-) -> Any:
+def stokes(normal: Any, diffuse: Any, specular: Any, roughness: Any, ior: Any, to_light: Any, irradiance: Any) -> Any:
     """Stokes parameters (3, ..., 3) towards the camera, in the frame of `optics/frames.py` on each ray.
 
     Parameters

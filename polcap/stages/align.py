@@ -41,7 +41,8 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float, Meta(ge=0, le=1, description="least correlation of detail after registration")
     ] = 0.5
     detail_px: Annotated[
-        float, Meta(ge=1, le=50, description="structure coarser than this Gaussian sigma is ignored [grid px]")
+        float,
+        Meta(ge=1, le=50, description="structure coarser than this Gaussian sigma is ignored [grid px]"),
     ] = 4.0
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from array_api_compat import array_namespace
 
 from polcap.images import ColorCalibration, Cues, Quality, StokesImage
-from polcap.optics import fresnel, frames
+from polcap.optics import frames, fresnel
 from polcap.stages import stage
 
 NOMINAL_IOR = 1.5

@@ -29,9 +29,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     margin: Annotated[
         float, Meta(ge=0, le=1, description="border added around the object's box [share of its longer side]")
     ] = 0.04
-    min_area: Annotated[
-        float, Meta(gt=0, le=1, description="least part of the picture that an object covers")
-    ] = 0.002
+    min_area: Annotated[float, Meta(gt=0, le=1, description="least part of the picture that an object covers")] = 0.002
     chart_margin: Annotated[
         float, Meta(ge=0, le=2, description="border around the chart that is not the object [patch widths]")
     ] = 0.7
@@ -92,7 +90,12 @@ def _search(picture: Floats, chart: NDArray[np.uint8], settings: Settings) -> ND
     log = cv2.GaussianBlur(log.astype(np.float32), (0, 0), 1.5)
     level, spread = _backdrop(log, outside)
     seed = (log > level + max(4 * spread, 0.8)) & ~outside
-    seed = _filled(_sizeable(cv2.morphologyEx(seed.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), settings.min_area))
+    seed = _filled(
+        _sizeable(
+            cv2.morphologyEx(seed.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)),
+            settings.min_area,
+        )
+    )
     if seed.mean() < settings.min_area:
         raise ObjectError(
             f"no object stands out from the backdrop: {100 * seed.mean():.2f} % of the picture, "

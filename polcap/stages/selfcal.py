@@ -28,20 +28,25 @@ _MOST_ORDERS = 4  # with more shots the permutations are too many and too alike 
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    brightest: Annotated[
-        float, Meta(gt=0, le=0.2, description="share of the object's pixels that serve as anchor")
-    ] = 0.03
+    brightest: Annotated[float, Meta(gt=0, le=0.2, description="share of the object's pixels that serve as anchor")] = (
+        0.03
+    )
     check_order: Annotated[
         bool, Meta(description="refuse a capture whose outline contradicts the order or sense of its angles")
     ] = True
     order_margin: Annotated[
-        float, Meta(ge=0, le=2, description="how much better another order must fit the outline to be believed")
+        float,
+        Meta(ge=0, le=2, description="how much better another order must fit the outline to be believed"),
     ] = 0.2
 
 
 @stage(version=1)
 def solve(
-    radiance: AngleStack, alignment: Alignment, object_: ObjectMask, color: ColorCalibration, settings: Settings
+    radiance: AngleStack,
+    alignment: Alignment,
+    object_: ObjectMask,
+    color: ColorCalibration,
+    settings: Settings,
 ) -> Gains:
     """Gain of every shot and channel relative to the first, with the outline's verdict on the angles.
 
@@ -77,18 +82,14 @@ def solve(
     )
 
 
-def _registered(
-    radiance: AngleStack, alignment: Alignment, crop: tuple[int, int, int, int]
-) -> tuple[Floats, Bits]:
+def _registered(radiance: AngleStack, alignment: Alignment, crop: tuple[int, int, int, int]) -> tuple[Floats, Bits]:
     """Shots on the reference grid, linear interpolation being enough for means: (K, h, w, 3), (h, w)."""
     value = np.stack([warp(v, t, crop, order=1) for v, t in zip(radiance.value, alignment.transform)])
     flagged = [warp(q.astype(np.float32), t, crop, order=1) > 0 for q, t in zip(radiance.quality, alignment.transform)]
     return value, np.where(np.any(flagged, axis=0), np.uint8(Quality.CLIPPED), np.uint8(0))
 
 
-def _grey_patches(
-    radiance: AngleStack, alignment: Alignment, color: ColorCalibration
-) -> tuple[Floats, Floats] | None:
+def _grey_patches(radiance: AngleStack, alignment: Alignment, color: ColorCalibration) -> tuple[Floats, Floats] | None:
     """Gains (K, 3) and 1σ from the light grey patches, or None without a chart.
 
     Each patch is summed in every shot's own pixels; unclipped patches are pooled by their light.
@@ -185,7 +186,9 @@ def _outline_verdict(
     for order in orders:
         for mirrored in (False, True):
             turned = angle[list(order)] * (-1 if mirrored else 1)
-            s0, s1, s2 = np.linalg.lstsq(mueller.analyzer(turned), light, rcond=None)[0] if rim.any() else np.zeros((3, 1))
+            s0, s1, s2 = (
+                np.linalg.lstsq(mueller.analyzer(turned), light, rcond=None)[0] if rim.any() else np.zeros((3, 1))
+            )
             polarization = (s1 + 1j * s2) / np.maximum(s0, 1e-9)  # DoLP e^{2iφ}
             weight = np.minimum(np.abs(polarization), 0.4)
             phasor = polarization / np.maximum(np.abs(polarization), 1e-12) * np.exp(-2j * contour[rim])

@@ -18,7 +18,8 @@ from polcap.stages import stage
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     greatest_ior: Annotated[
-        float, Meta(ge=1.2, le=3, description="a DoLP no dielectric up to this refractive index emits is flagged")
+        float,
+        Meta(ge=1.2, le=3, description="a DoLP no dielectric up to this refractive index emits is flagged"),
     ] = 1.8
     dark_sigma: Annotated[
         float, Meta(ge=0, le=100, description="S0 below this many standard deviations is flagged dark")

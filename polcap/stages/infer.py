@@ -1,0 +1,284 @@
+"""Stage 8: estimate the surface's normals and material from the cues, by network or by inversion.
+
+Both estimators work in the frame of each view ray, where polarization speaks of the surface alone, and
+hand back camera-frame maps.
+"""
+
+from dataclasses import replace
+from typing import Annotated
+
+import cv2
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from polcap.errors import ModelError
+from polcap.images import Cues, Floats, Network, Quality, SurfaceMaps
+from polcap.optics import azimuth, brdf, frames, fresnel
+from polcap.stages import stage
+from polcap.stages.cues import CHANNELS, channels
+
+_BLURS_PX = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0)
+_SAME = 2.0  # standard deviations that two averages of the same thing may differ by
+_MODEL_ERROR_DEG = 4.0  # interreflection, highlights, unknown index: measured on path-traced objects
+
+
+class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    ior: Annotated[float, Meta(ge=1.2, le=2.5, description="refractive index assumed by the analytic estimator")] = 1.5
+    tile_px: Annotated[int, Meta(ge=128, le=4096, description="largest side the network sees at once [px]")] = 1024
+
+
+@stage(version=1)
+def estimate(cues: Cues, network: Network | None, settings: Settings) -> SurfaceMaps:
+    """Normal, diffuse, specular, roughness and expected error; network None means analytic."""
+    return _analytic(cues, settings) if network is None else _learned(cues, network, settings)
+
+
+# --- analytic -----------------------------------------------------------------------------------
+
+
+def _analytic(cues: Cues, settings: Settings) -> SurfaceMaps:
+    """Zenith by the exact DoLP inversion, half-turn of the azimuth by `optics/azimuth.py`."""
+    ratio, sigma = _smoothed(cues)
+    squared = ratio[0] ** 2 + ratio[1] ** 2
+    dolp = np.sqrt(np.maximum(squared - sigma**2, 0))
+    cos_zenith = fresnel.cos_zenith_from_dolp(dolp, settings.ior)
+    zenith = np.arccos(cos_zenith)
+    phi, certainty = azimuth.resolve(ratio / np.sqrt(squared + 1e-12), np.sin(zenith), cues.mask)
+
+    normal = _from_angles(cos_zenith, phi, cues.rays)
+    diffuse, highlight = _albedo(cues, cos_zenith, settings.ior)
+    roughness, specular = _gloss(highlight, cos_zenith, cues)
+    shape = cues.mask.shape
+    return SurfaceMaps(
+        normal=(normal * cues.mask[..., None]).astype(np.float32),
+        diffuse=diffuse,
+        specular=np.full((*shape, 3), specular, np.float32) * cues.mask[..., None],
+        roughness=np.full(shape, roughness, np.float32) * cues.mask,
+        depth_prior=None,
+        confidence=_expected_error(zenith, dolp, sigma, certainty, cues, settings.ior),
+        mask=cues.mask,
+        view=cues.view,
+        estimator="analytic",
+    )
+
+
+def _smoothed(cues: Cues) -> tuple[Floats, Floats]:
+    """S1/S0 and S2/S0 averaged, light-weighted, as widely as they stay the same within their noise; and 1σ.
+
+    Each pixel takes the widest Gaussian whose average differs from no narrower one's by more than its
+    noise explains (Lepski's rule), so creases stay and flat noise goes. S1, S2 and S0 are averaged, never
+    the angle. A Gaussian of s px divides white noise by √(4π) s.
+
+    References
+    ----------
+    Lepski, Mammen, Spokoiny, Optimal spatial adaptation, Annals of Statistics 1997.
+    """
+    light = np.maximum(cues.radiance.sum(-1), 1e-6) * cues.mask
+    kept: list[tuple[Floats, Floats]] = []
+    ratio, sigma = cues.ratio, cues.ratio_sigma
+    growing = cues.mask
+    for blur in _BLURS_PX:
+        weight = cv2.GaussianBlur(light.astype(np.float32), (0, 0), blur) + 1e-9
+        wider = np.stack([cv2.GaussianBlur((r * light).astype(np.float32), (0, 0), blur) / weight for r in cues.ratio])
+        spread = cv2.GaussianBlur((cues.ratio_sigma * light).astype(np.float32), (0, 0), blur) / weight
+        spread = spread / (np.sqrt(4 * np.pi) * blur)
+        for narrower, noise in kept:
+            growing = growing & (np.hypot(*(wider - narrower)) < _SAME * noise)
+        ratio, sigma = np.where(growing, wider, ratio), np.where(growing, spread, sigma)
+        kept.append((wider, spread))
+    return ratio, sigma
+
+
+def _from_angles(cos_zenith: Floats, phi: Floats, rays: Floats) -> Floats:
+    """Unit normals (H, W, 3) in the camera frame from zenith and image azimuth about each ray."""
+    turned = frames.axis_on_ray(phi, rays)
+    sin_zenith = np.sqrt(np.maximum(1 - cos_zenith**2, 0))
+    local = np.stack([sin_zenith * np.cos(turned), sin_zenith * np.sin(turned), cos_zenith], axis=-1)
+    return np.asarray(frames.from_ray_frame(local, rays))
+
+
+def _albedo(cues: Cues, cos_zenith: Floats, ior: float) -> tuple[Floats, Floats]:
+    """Diffuse albedo (H, W, 3) and the highlight's radiance (H, W).
+
+    A highlight is white, small, and faces the camera: what a grey-scale opening of the darkest channel
+    removes where the zenith is under 35°. The rest over cos θ T₊² is the albedo.
+    """
+    size = max(5, round(0.12 * np.sqrt(max(cues.mask.sum(), 1)))) | 1
+    darkest = cv2.GaussianBlur(cues.radiance.min(-1).astype(np.float32), (0, 0), 1.0)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    opened = cv2.GaussianBlur(cv2.morphologyEx(darkest, cv2.MORPH_OPEN, kernel), (0, 0), size / 6)
+    facing = np.clip((cos_zenith - np.cos(np.radians(35))) / 0.1, 0, 1)
+    highlight = np.maximum(darkest - opened, 0) * facing * cues.mask
+    plus, _ = fresnel.transmission(np.maximum(cos_zenith, 0.2), ior)
+    shading = np.maximum(cos_zenith, 0.2) * plus * fresnel.transmission(1.0, ior)[0]
+    diffuse = (cues.radiance - highlight[..., None]) / shading[..., None]
+    return (np.clip(diffuse, 0, 1) * cues.mask[..., None]).astype(np.float32), highlight.astype(np.float32)
+
+
+def _gloss(highlight: Floats, cos_zenith: Floats, cues: Cues) -> tuple[float, float]:
+    """One roughness and one F0 for the object: the GGX lobe that best draws the highlight against the zenith.
+
+    A common dielectric (0.5, 0.04) where there is no highlight to speak of.
+    """
+    roughness, f0 = 0.5, 0.04
+    usable = cues.mask & ((cues.quality & Quality.CLIPPED) == 0) & (cos_zenith > np.cos(np.radians(45)))
+    if usable.sum() < 200 or np.quantile(highlight[usable], 0.99) < 0.02:
+        return roughness, f0
+    edges = np.cos(np.radians(np.arange(0, 46, 3)))
+    which = np.digitize(cos_zenith[usable], edges)
+    count = np.bincount(which, minlength=len(edges) + 1)[1 : len(edges)]
+    light = np.bincount(which, highlight[usable], len(edges) + 1)[1 : len(edges)] / np.maximum(count, 1)
+    c = (edges[:-1] + edges[1:]) / 2
+    weight = np.sqrt(count)
+    best = np.inf
+    for candidate in np.linspace(0.15, 0.8, 27):
+        alpha = candidate**2
+        lobe = np.pi * brdf.ggx_distribution(c, alpha) * brdf.smith_masking(c, c, alpha) / (4 * c)
+        scale = float((weight * lobe * light).sum() / (weight * lobe**2).sum())
+        misfit = float((weight * (light - scale * lobe) ** 2).sum())
+        if misfit < best:
+            best, roughness, f0 = misfit, float(candidate), float(np.clip(scale, 0.02, 0.12))
+    return roughness, f0
+
+
+def _expected_error(zenith: Floats, dolp: Floats, sigma: Floats, certainty: Floats, cues: Cues, ior: float) -> Floats:
+    """Expected normal error (H, W), degrees: noise through the inversion, the half-turn's doubt, the model's.
+
+    A wrong half-turn costs 2θ and happens with probability (1 − certainty)/2.
+    """
+    step = np.maximum(sigma, 1e-5)
+    low, high = (np.arccos(fresnel.cos_zenith_from_dolp(dolp + s * step, ior)) for s in (-1, 1))
+    zenith_error = (high - low) / 2
+    azimuth_error = np.sin(zenith) * np.minimum(sigma / (2 * np.maximum(dolp, 1e-5)), np.pi / 4)
+    flip = (1 - certainty) / 2 * 2 * zenith
+    noise = np.degrees(np.hypot(zenith_error, azimuth_error))
+    doubtful = (cues.quality & (Quality.ILL_POSED | Quality.METAL | Quality.OUTSIDE | Quality.CLIPPED)) > 0
+    error = np.hypot(noise, _MODEL_ERROR_DEG) + np.degrees(flip) + np.where(doubtful, 15.0, 0.0)
+    return np.asarray(np.where(cues.mask, error, 0), dtype=np.float32)
+
+
+# --- learned ------------------------------------------------------------------------------------
+
+
+def _learned(cues: Cues, network: Network, settings: Settings) -> SurfaceMaps:
+    """A coarse pass that sees the whole object, a fine pass that sees its detail, and their blend."""
+    _check(network)
+    height, width = cues.mask.shape
+    native = int(network.metadata["native_size"])
+    shrink = max(height, width) / native
+    coarse = _run(_resized(cues, min(1.0, 1 / shrink)), network, settings)
+    maps = {name: cv2.resize(m, (width, height)) if m.shape[:2] != (height, width) else m for name, m in coarse.items()}
+    if shrink > 1.0:
+        maps = _blend(maps, _run(cues, network, settings))
+    local = maps["normal"] / np.maximum(np.linalg.norm(maps["normal"], axis=-1, keepdims=True), 1e-6)
+    inside = cues.mask[..., None]
+    return SurfaceMaps(
+        normal=(np.asarray(frames.from_ray_frame(local, cues.rays)) * inside).astype(np.float32),
+        diffuse=(np.clip(maps["diffuse"], 0, 1) * inside).astype(np.float32),
+        specular=(np.clip(maps["specular"], 0, 1) * inside).astype(np.float32),
+        roughness=(np.clip(maps["roughness"], 0.02, 1) * cues.mask).astype(np.float32),
+        depth_prior=(maps["depth"] * cues.mask).astype(np.float32),
+        confidence=(maps["sigma"] * cues.mask).astype(np.float32),
+        mask=cues.mask,
+        view=cues.view,
+        estimator=f"network {network.metadata.get('version', network.digest[:8])}",
+    )
+
+
+def _check(network: Network) -> None:
+    if network.channels != CHANNELS:
+        raise ModelError(
+            f"model {network.digest[:8]} expects channels {', '.join(network.channels)}; "
+            f"this version makes {', '.join(CHANNELS)}; use a model of this version, or --estimator analytic"
+        )
+
+
+def _resized(cues: Cues, scale: float) -> Cues:
+    """The cues of a picture taken with fewer pixels: light is averaged, ratios with their light."""
+    if scale >= 1.0:
+        return cues
+    height, width = cues.mask.shape
+    size = (max(16, round(width * scale)), max(16, round(height * scale)))
+
+    def mean(image: Floats) -> Floats:
+        return np.asarray(cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA))
+
+    light = np.maximum(cues.radiance.sum(-1), 1e-6) * cues.mask
+    weight = np.maximum(mean(light), 1e-9)
+    ratio = np.stack([mean(r * light) / weight for r in cues.ratio])
+    sigma = mean(cues.ratio_sigma * light) / weight * min(1.0, scale * np.sqrt(width / size[0] * scale))
+    share = mean(cues.mask)
+    mask = share > 0.5
+    radiance = mean(cues.radiance * cues.mask[..., None]) / np.maximum(share, 1e-3)[..., None]
+    squared = ratio[0] ** 2 + ratio[1] ** 2
+    view = replace(
+        cues.view,
+        focal=cues.view.focal * scale,
+        center=((cues.view.center[0] + 0.5) * scale - 0.5, (cues.view.center[1] + 0.5) * scale - 0.5),
+        scale=cues.view.scale / scale,
+    )
+    clipped = mean((cues.quality & Quality.CLIPPED).astype(np.float32)) > 0.5 * Quality.CLIPPED
+    return replace(
+        cues,
+        radiance=radiance,
+        ratio=ratio,
+        ratio_sigma=sigma,
+        dolp=np.sqrt(np.clip(squared - sigma**2, 0, 1)),
+        normalized_stokes=ratio / np.sqrt(squared + 1e-12),
+        diffuse_color=mean(cues.diffuse_color),
+        rays=frames.rays(view, *mask.shape),
+        mask=mask,
+        quality=np.where(clipped, np.uint8(Quality.CLIPPED), np.uint8(0)),
+        view=view,
+    )
+
+
+def _run(cues: Cues, network: Network, settings: Settings) -> dict[str, Floats]:
+    """All maps (H, W[, 3]) of one pass; a crop larger than a tile in overlapping tiles, blended by a ramp."""
+    picture = channels(cues)  # (N, H, W)
+    _, height, width = picture.shape
+    multiple = int(network.metadata["size_multiple"])
+    tile, overlap = settings.tile_px // multiple * multiple, settings.tile_px // 4
+    total: dict[str, Floats] = {}
+    weight = np.zeros((height, width, 1), np.float32)
+    for y in _starts(height, tile, overlap):
+        for x in _starts(width, tile, overlap):
+            part = picture[:, y : y + tile, x : x + tile]
+            rows, columns = part.shape[1:]
+            pad = ((0, 0), (0, -rows % multiple), (0, -columns % multiple))
+            output = network.run(np.pad(part, pad)[None].astype(np.float32))
+            ramp = np.minimum.outer(_ramp(rows, overlap), _ramp(columns, overlap))[..., None].astype(np.float32)
+            weight[y : y + rows, x : x + columns] += ramp
+            for name, value in output.items():
+                image = np.moveaxis(value[0], 0, -1)[:rows, :columns]
+                target = total.setdefault(name, np.zeros((height, width, image.shape[-1]), np.float32))
+                target[y : y + rows, x : x + columns] += ramp * image
+    return {
+        name: np.squeeze(value / weight, -1) if value.shape[-1] == 1 else value / weight
+        for name, value in total.items()
+    }
+
+
+def _starts(length: int, tile: int, overlap: int) -> list[int]:
+    """First pixels of tiles that cover `length`."""
+    if length <= tile:
+        return [0]
+    count = int(np.ceil((length - overlap) / (tile - overlap)))
+    return [round(i * (length - tile) / (count - 1)) for i in range(count)]
+
+
+def _ramp(length: int, overlap: int) -> Floats:
+    """Blending weight along one side of a tile, falling to near nothing at its ends."""
+    edge = np.minimum(np.arange(length), np.arange(length)[::-1]) + 1.0
+    return np.minimum(edge / max(overlap, 1), 1.0)
+
+
+def _blend(coarse: dict[str, Floats], fine: dict[str, Floats]) -> dict[str, Floats]:
+    """Fine normals and colours where they agree with the coarse pass, coarse depth and half-turn."""
+    agree = np.clip((coarse["normal"] * fine["normal"]).sum(-1), 0, 1)
+    share = (agree**2)[..., None]
+    mixed = {name: share * fine[name] + (1 - share) * coarse[name] for name in ("normal", "diffuse", "specular")}
+    for name in ("roughness", "sigma"):
+        mixed[name] = share[..., 0] * fine[name] + (1 - share[..., 0]) * coarse[name]
+    return mixed | {"depth": coarse["depth"]}
