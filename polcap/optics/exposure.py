@@ -1,0 +1,69 @@
+"""The exposure ratio of two frames, from their pixels."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Floats
+
+TILE = 16  # px
+_LEAST_TILES = 30
+_DIM, _DIMMEST = 4e-3, 4e-4  # of the sensor's range: tiles below are left to black-level errors
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """Exposure of one frame over that of another."""
+
+    value: Floats  # (C,)
+    sigma: Floats  # (C,) 1σ, relative
+
+
+def ratio(reference: Floats, other: Floats, usable: NDArray[np.bool_]) -> Ratio | None:
+    """other / reference of registered signals (H, W, C), channel by channel; None where they cannot tell.
+
+    The quotient of sums over tiles: of Poisson counts the maximum-likelihood estimate, and free of the
+    bias that a mean of quotients or of logarithms has. Tiles that disagree (something moved) are dropped.
+    A channel too dim to say better than 1 % takes the ratio of all channels together.
+    """
+    inside = _tiles(usable[..., None].astype(np.float32))[..., 0] > 0.999
+    a, b = (_tiles(picture)[inside].astype(np.float64) for picture in (reference, other))
+    found = [_quotient(a[:, c], b[:, c]) for c in range(a.shape[1])]
+    sums = _quotient(a.sum(axis=1), b.sum(axis=1))
+    if sums is None or sums[1] > 0.03:
+        return None
+    value, sigma = np.array([one if one is not None and one[1] < 0.01 else sums for one in found]).T
+    return Ratio(value, sigma)
+
+
+def _quotient(a: Floats, b: Floats) -> tuple[float, float] | None:
+    """Σb / Σa over the tiles that agree, and its relative 1σ."""
+    for dim in (_DIM, _DIMMEST):
+        bright = (a > dim) & (b > dim)
+        if bright.sum() >= _LEAST_TILES:
+            break
+    else:
+        return None
+    a, b = a[bright], b[bright]
+    order = np.argsort(b / a)
+    weight = np.cumsum(a[order])
+    r = float((b / a)[order][np.searchsorted(weight, weight[-1] / 2)])  # weighted median
+    keep = np.ones(len(a), bool)
+    for _ in range(6):
+        error = (b - r * a) / np.sqrt(b)  # even noise, were it photons alone
+        scale = 1.4826 * float(np.median(np.abs(error)))
+        keep = np.abs(error) <= 4 * scale + 0.003 * np.sqrt(b)
+        if keep.sum() < _LEAST_TILES / 2:
+            return None
+        r = float(b[keep].sum() / a[keep].sum())
+    rest = b[keep] - r * a[keep]
+    return r, float(np.sqrt(np.sum(rest**2)) / b[keep].sum())
+
+
+def _tiles(picture: Floats) -> Floats:
+    h, w = picture.shape[0] // TILE, picture.shape[1] // TILE
+    rows = [
+        picture[TILE * i : TILE * (i + 1), : TILE * w].reshape(TILE, w, TILE, -1).mean(axis=(0, 2)) for i in range(h)
+    ]
+    return np.stack(rows) if rows else np.zeros((0, w, picture.shape[2]), np.float32)

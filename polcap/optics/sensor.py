@@ -1,0 +1,82 @@
+"""From a sensor's counts to signals, and which of them can be believed."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Floats, SensorImage
+from polcap.optics import demosaic
+
+Bools = NDArray[np.bool_]
+
+
+def signal(image: SensorImage, full: bool = False) -> Floats:
+    """Linear signal (H, W, C) float32, black = 0 and white = 1; negative noise is kept.
+
+    A mosaic is binned to half size, or interpolated if `full`. C = 1 where the three channels of a
+    file without a mosaic are one and the same (a monochrome sensor).
+    """
+    span = np.float32(image.white - float(image.black.mean()))
+    if image.cfa is None:
+        value = image.value[..., :1] if monochrome(image) else image.value
+        return np.asarray((value - np.float32(image.black.mean())) / span, np.float32)
+    black = np.broadcast_to(image.black, (2, 2))  # of each phase
+    if full:
+        h, w = (2 * (n // 2) for n in image.value.shape)
+        mosaic = image.value[:h, :w].astype(np.float32)
+        for i, j in np.ndindex(2, 2):
+            mosaic[i::2, j::2] -= np.float32(black[i, j])
+        mosaic /= span
+        return demosaic.interpolate(mosaic, image.cfa)
+    binned = demosaic.superpixel(image.value, image.cfa)
+    binned -= np.array([black[image.cfa == color].mean() for color in range(3)], np.float32)
+    binned /= span
+    return binned
+
+
+def monochrome(image: SensorImage) -> bool:
+    """Whether three channels repeat one."""
+    v = image.value
+    return image.cfa is None and np.array_equal(v[..., 0], v[..., 1]) and np.array_equal(v[..., 0], v[..., 2])
+
+
+def usable(image: SensorImage, clip: float, full: bool = False) -> Bools:
+    """Pixels (H, W) of `signal` with no clipped photosite in them nor in their eight neighbours.
+
+    Judged on raw counts over whole 2×2 quads, so that all colours of a pixel go together; a single noisy
+    photosite at the limit rules out its surroundings, which keeps the choice from favouring low noise.
+    """
+    value, level = image.value, clip * saturation(image)
+    if image.cfa is None:
+        over = np.asarray((value >= level).any(axis=2))
+    else:
+        h, w = value.shape[0] // 2, value.shape[1] // 2
+        over = np.zeros((h, w), bool)
+        for i, j in np.ndindex(2, 2):
+            over |= value[i : 2 * h : 2, j : 2 * w : 2] >= level
+    over = _grown(over)
+    return ~(np.repeat(np.repeat(over, 2, axis=0), 2, axis=1) if full and image.cfa is not None else over)
+
+
+def saturation(image: SensorImage) -> float:
+    """The stated white, or the plateau below it that the picture's highest count shows."""
+    part = image.value[::3, ::3]
+    top = float(part.max())
+    crowded = np.count_nonzero(part == top) > max(1e-3 * part.size, 20)
+    return top if crowded and 0.6 * image.white < top < image.white else image.white
+
+
+def rounding(image: SensorImage) -> float:
+    """Variance of whole counts in units of `signal`; as good as none for floats."""
+    step = 1.0 if np.issubdtype(image.value.dtype, np.integer) else 1e-3
+    return float(step**2 / 12 / (image.white - float(image.black.mean())) ** 2)
+
+
+def _grown(mask: Bools) -> Bools:
+    """Grown by one pixel in all eight directions."""
+    rows = mask.copy()
+    rows[1:] |= mask[:-1]
+    rows[:-1] |= mask[1:]
+    grown = rows.copy()
+    grown[:, 1:] |= rows[:, :-1]
+    grown[:, :-1] |= rows[:, 1:]
+    return grown
