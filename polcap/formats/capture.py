@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from polcap.errors import CaptureError, DecodeError
+from polcap.errors import CaptureError
 from polcap.formats import capture_toml, exif, focal, layouts, photo, raw, sniff
 from polcap.formats.capture_toml import CaptureFile
 from polcap.formats.layouts import Source
@@ -56,9 +56,7 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
     _check_no_duplicate(digests)
 
     def frame(source: Source, angle_deg: float) -> Frame:
-        mosaic = (
-            angle_deg if plan.layout == "sensor" and source.role in ("shot", "repeat", "ambient") else None
-        )
+        mosaic = angle_deg if plan.layout == "sensor" and source.role in ("shot", "repeat", "ambient") else None
         load, manner = _loader(source, stated, mosaic)
         fact = facts[source.path]
         return Frame(
@@ -137,13 +135,10 @@ def _seconds(time: float | None) -> str:
 
 
 def _facts(source: Source) -> Exif:
-    with source.path.open("rb") as file:
-        structure = sniff.tiff(file) if file.read(4) in (b"II*\0", b"MM\0*") else None
-    if structure and structure.truncated:
-        raise DecodeError(
-            f"{source.path}: is cut short, its image runs past the end of the file; copy it again"
-        )
-    return exif.read(source.path)
+    fact = exif.read(source.path)
+    if sniff.structure(source.path).truncated:  # decoding tells; some cameras note odd places for previews
+        raw.read(source.path) if source.kind == "raw" else photo.read(source.path)
+    return fact
 
 
 def _loader(source: Source, stated: CaptureFile, mosaic_deg: float | None) -> tuple[Loader, list[str]]:
@@ -190,8 +185,7 @@ def _check_angles(folder: Path, angles_deg: Sequence[float], who: str) -> None:
     if count < 3:
         listed = ", ".join(f"{angle:g}" for angle in angles_deg) or "none"
         raise CaptureError(
-            f"{folder}: {who} {listed}: {count} different polarizer angles where 3 are needed; "
-            "add the missing shot"
+            f"{folder}: {who} {listed}: {count} different polarizer angles where 3 are needed; add the missing shot"
         )
 
 
@@ -210,9 +204,7 @@ def _check_one_camera(facts: dict[Path, Exif]) -> None:
             if abs(ratio - 1) > _ZOOM:
                 what = f"was taken at {fact.focal_length_mm:g} mm, not {first.focal_length_mm:g} mm"
         if what:
-            raise CaptureError(
-                f"{path}: {what} as {first_path.name}; keep one set-up per capture, or remove the file"
-            )
+            raise CaptureError(f"{path}: {what} as {first_path.name}; keep one set-up per capture, or remove the file")
 
 
 def _check_no_duplicate(digests: dict[Path, str]) -> None:
@@ -262,9 +254,7 @@ def _notes(layout: str, others: Sequence[Source], shots: Sequence[Shot], stated:
         encoding, bits = photo.encoding_of(first.path, stated.encoding)
         notes.append(f"finished pictures of {bits} bits, taken as {encoding}" + LOSS * (bits == 8))
     if stated.rotator:
-        notes.append(
-            f"rotator {stated.rotator.model or 'of unknown model'}, log {stated.rotator.log or 'none'}"
-        )
+        notes.append(f"rotator {stated.rotator.model or 'of unknown model'}, log {stated.rotator.log or 'none'}")
     exposures = [_exposure(frame) for frame in shots[0].frames]
     if (
         len(exposures) > 1

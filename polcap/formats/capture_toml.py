@@ -20,9 +20,7 @@ class FrameEntry(Struct, frozen=True, forbid_unknown_fields=True):
     angle: Annotated[float, Meta(ge=-360, le=360)] | None = None  # degrees; of shots and repeats
     role: Role = "shot"
     exposure: Positive | None = None  # relative, any unit; instead of EXIF
-    flash_energy: Positive | None = (
-        None  # relative; the exposure is this times ISO/100 over the f-number squared
-    )
+    flash_energy: Positive | None = None  # relative; the exposure is this times ISO/100 over the f-number squared
 
 
 class Rotator(Struct, frozen=True, forbid_unknown_fields=True):
@@ -40,9 +38,7 @@ class CaptureFile(Struct, frozen=True, forbid_unknown_fields=True):
     sensor_width_mm: Positive | None = None  # of the visible pixels
     sensor: Literal["polarization"] | None = None  # every frame is a 2×2 mosaic of 90 45 / 135 0 degrees
     encoding: Literal["linear", "srgb"] | None = None  # of finished pictures; by default 8 bits are sRGB
-    white: Positive | None = (
-        None  # stored value at which linear pictures saturate; by default the type's largest
-    )
+    white: Positive | None = None  # stored value at which linear pictures saturate; by default the type's largest
     black: Annotated[float, Meta(ge=0)] = 0.0  # stored value of darkness, linear pictures
     rotator: Rotator | None = None
     frame: tuple[FrameEntry, ...] = ()
@@ -61,15 +57,9 @@ def load(folder: Path) -> CaptureFile:
         raise CaptureError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
     for entry in stated.frame:
         if entry.role in ("shot", "repeat") and entry.angle is None and stated.sensor is None:
-            raise CaptureError(
-                f"{path}: {entry.file} has role {entry.role} and no angle; give its angle in degrees"
-            )
+            raise CaptureError(f"{path}: {entry.file} has role {entry.role} and no angle; give its angle in degrees")
         if entry.exposure and entry.flash_energy:
-            raise CaptureError(
-                f"{path}: {entry.file} states both exposure and flash_energy; give one of them"
-            )
+            raise CaptureError(f"{path}: {entry.file} states both exposure and flash_energy; give one of them")
     if stated.rotator and stated.rotator.log and not (folder / stated.rotator.log).is_file():
-        raise CaptureError(
-            f"{path}: rotator log {stated.rotator.log} is not there; correct or remove the line"
-        )
+        raise CaptureError(f"{path}: rotator log {stated.rotator.log} is not there; correct or remove the line")
     return stated

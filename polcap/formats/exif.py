@@ -64,14 +64,9 @@ def _tags(path: Path) -> tuple[Exif, float | None]:
                     read_tags = exifread.process_file(part, details=False, extract_thumbnail=False)
                 except Exception:  # exifread raises whatever a damaged tag leads to: as if it were absent
                     continue
-                found |= {
-                    name.replace("Image ", prefix, 1) if prefix else name: tag
-                    for name, tag in read_tags.items()
-                }
+                found |= {name.replace("Image ", prefix, 1) if prefix else name: tag for name, tag in read_tags.items()}
     except OSError as error:
-        raise DecodeError(
-            f"{path}: cannot be read ({error.strerror}); check the file and its permissions"
-        ) from None
+        raise DecodeError(f"{path}: cannot be read ({error.strerror}); check the file and its permissions") from None
     return _exif(found), _number(found, "Image Tag 0xC791", "EXIF ExifImageWidth")
 
 
@@ -110,13 +105,9 @@ def _exif(found: Mapping[str, Any]) -> Exif:
     if not time and speed is not None and abs(speed) < 30:
         time = 2.0**-speed  # APEX
     flash = _number(found, "EXIF Flash", "Image Flash")
-    iso = _number(
-        found, "EXIF ISOSpeedRatings", "Image ISOSpeedRatings", "Image Tag 0x0017"
-    )  # the last is RW2's
+    iso = _number(found, "EXIF ISOSpeedRatings", "Image ISOSpeedRatings", "Image Tag 0x0017")  # the last is RW2's
     if iso in (None, 0.0, 65535.0):  # too large for its 16 bits
-        iso = _number(
-            found, "EXIF RecommendedExposureIndex", "EXIF StandardOutputSensitivity", "EXIF ISOSpeed"
-        )
+        iso = _number(found, "EXIF RecommendedExposureIndex", "EXIF StandardOutputSensitivity", "EXIF ISOSpeed")
     return Exif(
         make=_text(found, "Image Make"),
         model=_text(found, "Image Model"),

@@ -28,9 +28,7 @@ def find(exif: Exif, stated_mm: float | None, stated_width_mm: float | None) -> 
     sensor = sensor or sensor_widths().get(exif.model)
     if focal and sensor:
         source = "capture.toml" if stated_mm or stated_width_mm else "EXIF"
-        return Focal(
-            focal / sensor * width, True, f"{focal:g} mm on a sensor {sensor:.1f} mm wide ({source})"
-        )
+        return Focal(focal / sensor * width, True, f"{focal:g} mm on a sensor {sensor:.1f} mm wide ({source})")
     if equivalent and not stated_mm:
         px = equivalent / math.hypot(*FULL_FRAME_MM) * diagonal
         return Focal(px, True, f"{equivalent:g} mm full-frame equivalent (EXIF, to about 2 %)")
@@ -41,9 +39,7 @@ def find(exif: Exif, stated_mm: float | None, stated_width_mm: float | None) -> 
             f"{focal:g} mm, sensor size unknown: full frame assumed; state sensor_width_mm in capture.toml",
         )
     px = NORMAL_MM / math.hypot(*FULL_FRAME_MM) * diagonal
-    return Focal(
-        px, False, "unknown: 50 mm full-frame equivalent assumed; state focal_length_mm in capture.toml"
-    )
+    return Focal(px, False, "unknown: 50 mm full-frame equivalent assumed; state focal_length_mm in capture.toml")
 
 
 @cache

@@ -14,7 +14,7 @@ from typing import Literal
 from polcap.errors import CaptureError, DecodeError
 from polcap.formats import capture_toml, exif, photo, sniff
 from polcap.formats.capture_toml import CaptureFile
-from polcap.images import Exif, Role
+from polcap.images import Role
 
 OUTPUT = "polcap"  # where results go by default
 DEFAULT_DEG = (0.0, 45.0, 90.0)
@@ -69,9 +69,7 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None) 
     if not listing.pictures:
         inside = [path.name for path in _children(folder) if path.is_dir()]
         hint = (
-            f"; its sub-folders are {', '.join(inside[:4])}, but polcap looks for pol000, pol045, …"
-            if inside
-            else ""
+            f"; its sub-folders are {', '.join(inside[:4])}, but polcap looks for pol000, pol045, …" if inside else ""
         )
         raise CaptureError(f"{folder}: holds no photograph{hint}")
     if stated.sensor or _is_sensor(listing.pictures, angles_deg):
@@ -84,18 +82,12 @@ def _toml(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None)
     for entry in stated.frame:
         path = folder / entry.file
         if not path.resolve().is_relative_to(folder.resolve()):
-            raise CaptureError(
-                f"{folder / capture_toml.NAME}: {entry.file} lies outside the folder; move it inside"
-            )
+            raise CaptureError(f"{folder / capture_toml.NAME}: {entry.file} lies outside the folder; move it inside")
         if not path.is_file():
-            raise CaptureError(
-                f"{folder / capture_toml.NAME}: {entry.file} is not there; correct or remove its entry"
-            )
+            raise CaptureError(f"{folder / capture_toml.NAME}: {entry.file} is not there; correct or remove its entry")
         kind = _picture_kind(path)
         if kind == "other":
-            raise CaptureError(
-                f"{folder / capture_toml.NAME}: {entry.file} is not a photograph; remove its entry"
-            )
+            raise CaptureError(f"{folder / capture_toml.NAME}: {entry.file} is not a photograph; remove its entry")
         sources.append(Source(path, kind, entry.role, entry.angle, entry.exposure, entry.flash_energy))
     shots = [source for source in sources if source.role == "shot"]
     others = tuple(source for source in sources if source.role not in ("shot", "repeat"))
@@ -121,9 +113,7 @@ def _folders(folder: Path, sub_folders: dict[float, Path], angles_deg: Sequence[
     for angle, sub_folder in sub_folders.items():
         listing = _list(sub_folder)
         if not listing.pictures:
-            raise CaptureError(
-                f"{sub_folder}: holds no photograph; shoot this angle again, or remove the folder"
-            )
+            raise CaptureError(f"{sub_folder}: holds no photograph; shoot this angle again, or remove the folder")
         groups[angle] = listing.pictures
         notes += [f"{sub_folder.name}: {note}" for note in listing.notes]
     beside = sorted(
@@ -144,13 +134,9 @@ def _pol_folders(folder: Path) -> dict[float, Path]:
         if match:
             angle = float(match[1])
             if angle > 360:
-                raise CaptureError(
-                    f"{path}: {angle:g}° is not an angle of a polarizer; name it by 0 to 360 degrees"
-                )
+                raise CaptureError(f"{path}: {angle:g}° is not an angle of a polarizer; name it by 0 to 360 degrees")
             if angle in found:
-                raise CaptureError(
-                    f"{path}: {angle:g}° is also in {found[angle].name}; keep one of the two folders"
-                )
+                raise CaptureError(f"{path}: {angle:g}° is also in {found[angle].name}; keep one of the two folders")
             found[angle] = path
     return dict(sorted(found.items()))
 
@@ -166,9 +152,7 @@ def _is_grey(source: Source) -> bool:
 
 def _sensor(listing: _Listing, angles_deg: Sequence[float] | None) -> Plan:
     shots = _sensor_shots(listing.pictures, angles_deg)
-    return Plan(
-        "sensor", shots, notes=(*listing.notes, "frames taken as a polarization sensor's, 90 45 / 135 0")
-    )
+    return Plan("sensor", shots, notes=(*listing.notes, "frames taken as a polarization sensor's, 90 45 / 135 0"))
 
 
 def _sensor_shots(
@@ -210,30 +194,23 @@ def _by_time(folder: Path, listing: _Listing, angles_deg: Sequence[float]) -> Pl
     listed = ", ".join(f"{angle:g}" for angle in angles_deg)
     remedy = "give the order with --angles, or sort the frames into pol000, pol045, … or capture.toml"
     if count % shots:
-        raise CaptureError(
-            f"{folder}: {count} frames do not make {shots} equal brackets (angles {listed}); {remedy}"
-        )
+        raise CaptureError(f"{folder}: {count} frames do not make {shots} equal brackets (angles {listed}); {remedy}")
     size = count // shots
     if not timed and size > 1:
         raise CaptureError(f"{folder}: {count} frames without EXIF times cannot be told apart; {remedy}")
     brackets = [order[at : at + size] for at in range(0, count, size)]
-    first = [exposure(facts[source.path]) for source in brackets[0]]
+    first = [facts[source.path].relative_exposure for source in brackets[0]]
     for angle, bracket in zip(angles_deg, brackets):
         for source, reference in zip(bracket, first):
-            value = exposure(facts[source.path])
+            value = facts[source.path].relative_exposure
             if not equal(value, reference):
                 raise CaptureError(
                     f"{source.path}: is exposed {_times(value, reference)} as the first bracket's frame in its "
-                    f"place, so that the {count} frames {by} are not {shots} equal brackets "
-                    f"(it would be {angle:g}°); {remedy}"
+                    f"place; these {count} frames {by} are no {shots} equal brackets ({angle:g}°); {remedy}"
                 )
     note = f"{count} frames {by} taken as {shots} brackets of {size}, in the order {listed}°"
     shots_ = tuple((angle, tuple(bracket)) for angle, bracket in zip(angles_deg, brackets))
     return Plan("flat", shots_, notes=(*listing.notes, note))
-
-
-def exposure(fact: Exif) -> float | None:
-    return fact.relative_exposure
 
 
 def equal(value: float | None, reference: float | None) -> bool:
@@ -254,9 +231,7 @@ def _select(
     for angle in wanted:
         if angle not in groups:
             listed = ", ".join(f"{known:g}" for known in groups) or "none"
-            raise CaptureError(
-                f"{folder}: holds no shot at {angle:g}° (there are {listed}); correct --angles"
-            )
+            raise CaptureError(f"{folder}: holds no shot at {angle:g}° (there are {listed}); correct --angles")
     return tuple((angle, tuple(groups[angle])) for angle in wanted)
 
 
@@ -296,7 +271,7 @@ def _picture_kind(path: Path) -> sniff.Kind:
         exif.read(path)
     except DecodeError:
         raise CaptureError(
-            f"{path}: no picture, no RAW that LibRaw knows and no text; restore it, or remove it from the folder"
+            f"{path}: no picture, no RAW that LibRaw knows and no text; restore it, or remove it"
         ) from None
     return "raw"
 
@@ -310,6 +285,4 @@ def _children(folder: Path) -> list[Path]:
 
 def natural(name: str) -> tuple[tuple[int, str], ...]:
     """Sorting key under which frame 9 comes before frame 10."""
-    return tuple(
-        (int(part), "") if part.isdecimal() else (-1, part.lower()) for part in re.split(r"(\d+)", name)
-    )
+    return tuple((int(part), "") if part.isdecimal() else (-1, part.lower()) for part in re.split(r"(\d+)", name))

@@ -45,9 +45,7 @@ def read(
     return SensorImage(_counts(pixels), np.full((1, 1), black), white or full, None, lossy=lossy)
 
 
-def read_mosaic(
-    path: str | Path, angle_deg: float, white: float | None = None, black: float = 0.0
-) -> SensorImage:
+def read_mosaic(path: str | Path, angle_deg: float, white: float | None = None, black: float = 0.0) -> SensorImage:
     """One angle of a monochrome polarization sensor's raw frame, (H/2, W/2, 3), linear.
 
     `path` may be a RAW or a picture; the frame's 2×2 cell is 90 45 / 135 0 degrees.
@@ -118,15 +116,11 @@ def decode(path: str) -> worker.Answer:
     kind = "float" if spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE) else str(spec.format)
     pixels = file.read_image(0, 0, 0, spec.nchannels, kind)
     if pixels is None:
-        raise DecodeError(
-            f"{path}: truncated or damaged ({_one_line(file.geterror())}); copy it from the card again"
-        )
+        raise DecodeError(f"{path}: truncated or damaged ({_one_line(file.geterror())}); copy it from the card again")
     pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)[..., channels]
     if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
         bad = int((~np.isfinite(pixels)).sum())
-        raise DecodeError(
-            f"{path}: {bad} values are not finite numbers; write the file without NaN and infinity"
-        )
+        raise DecodeError(f"{path}: {bad} values are not finite numbers; write the file without NaN and infinity")
     return {}, {"pixels": pixels}
 
 
@@ -142,9 +136,7 @@ def _open(path: str) -> tuple[Any, Any]:
     options["oiio:UnassociatedAlpha"] = 1  # else a PNG's colours come multiplied by its alpha
     file = oiio.ImageInput.open(path, options)
     if file is None:
-        raise DecodeError(
-            f"{path}: not a readable picture ({_one_line(oiio.geterror())}); is the file complete?"
-        )
+        raise DecodeError(f"{path}: not a readable picture ({_one_line(oiio.geterror())}); is the file complete?")
     return file, options
 
 
@@ -156,9 +148,7 @@ def _channels(path: str, spec: Any) -> list[int]:
     grey = [i for i, name in enumerate(names) if i != spec.alpha_channel]
     if len(grey) == 1:
         return grey
-    raise DecodeError(
-        f"{path}: has the channels {', '.join(spec.channelnames)}; polcap reads R, G, B or one grey"
-    )
+    raise DecodeError(f"{path}: has the channels {', '.join(spec.channelnames)}; polcap reads R, G, B or one grey")
 
 
 def _counts(pixels: NDArray[Any]) -> Any:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import DecodeError
-from polcap.formats import exif, worker
+from polcap.formats import exif, sniff, worker
 from polcap.images import Bits, Exif, Floats, SensorImage
 
 XYZ_FROM_REC709 = np.array(  # IEC 61966-2-1, D65
@@ -33,6 +33,9 @@ def read(path: str | Path) -> SensorImage:
     DecodeError
         Not a RAW, damaged, X-Trans or Foveon; or the decoder crashed, hung or ran out of memory.
     """
+    structure = sniff.structure(Path(path))
+    if structure.dng and structure.truncated:  # LibRaw may return whatever lay in memory
+        raise DecodeError(f"{path}: its image data run past the end of the file; {_COPY_AGAIN}")
     meta, arrays = worker.call("polcap.formats.raw:decode", path)
     balance = None if meta["balance"] is None else np.array(meta["balance"])
     xyz_to_camera = exif.tags(path).color_matrix or meta["xyz_to_camera"]
@@ -41,9 +44,7 @@ def read(path: str | Path) -> SensorImage:
         black=np.array(meta["black"]),
         white=meta["white"],
         cfa=arrays.get("cfa"),
-        camera_matrix=None
-        if xyz_to_camera is None
-        else camera_matrix(np.reshape(xyz_to_camera, (3, 3)), balance),
+        camera_matrix=None if xyz_to_camera is None else camera_matrix(np.reshape(xyz_to_camera, (3, 3)), balance),
         white_balance=balance,
     )
 
@@ -135,9 +136,7 @@ def _mosaic(raw: Any, path: str) -> tuple[Bits, list[list[float]]]:
     names = raw.color_desc.decode()
     letters = [[names[i] for i in row] for row in index]
     if sorted(letters[0] + letters[1]) != ["B", "G", "G", "R"]:
-        raise DecodeError(
-            f"{path}: its mosaic is {letters}, not of red, green and blue; polcap does not support it"
-        )
+        raise DecodeError(f"{path}: its mosaic is {letters}, not of red, green and blue; polcap does not support it")
     cfa = np.array([["RGB".index(letter) for letter in row] for row in letters], np.uint8)
     levels = raw.black_level_per_channel  # in the order of the colour index
     return cfa, [[float(levels[i]) for i in row] for row in index]

@@ -5,28 +5,20 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Literal, NamedTuple
 
-from polcap.errors import CaptureError
+from polcap.errors import DecodeError
 
 Kind = Literal["raw", "photo", "other", "unknown"]
 
-SUBTYPE, WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, MAKE = 254, 256, 257, 258, 259, 262, 271
-STRIP_OFFSETS, SAMPLES, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS = 273, 277, 279, 324, 325, 330
-DNG_VERSION, ACTIVE_AREA = 50706, 50829
+SUBTYPE, COMPRESSION, PHOTOMETRIC, MAKE, DNG_VERSION = 254, 259, 262, 271, 50706
+STRIP_OFFSETS, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS = 273, 279, 324, 325, 330
 CFA, LINEAR_RAW = 32803, 34892
 
-_RAW_COMPRESSION = {
-    32767,
-    32769,
-    32770,
-    32867,
-    34316,
-    34713,
-    65000,
-    65535,
-}  # Sony, Samsung, Kodak, Nikon, Pentax
+_TIFF_MAGIC = (b"II*\0", b"MM\0*")
+# Sony, Samsung, Kodak, Panasonic, Nikon, Kodak, Pentax
+_RAW_COMPRESSION = {32767, 32769, 32770, 32867, 34316, 34713, 65000, 65535}
 _WANTED = {
-    SUBTYPE, WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, MAKE, STRIP_OFFSETS, SAMPLES, STRIP_BYTES,
-    TILE_OFFSETS, TILE_BYTES, SUB_IFDS, DNG_VERSION, ACTIVE_AREA,
+    SUBTYPE, COMPRESSION, PHOTOMETRIC, MAKE, DNG_VERSION,
+    STRIP_OFFSETS, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS,
 }  # fmt: skip
 _INTEGERS = {1: "B", 3: "H", 4: "I", 13: "I"}
 _MOST_DIRECTORIES, _MOST_VALUES = 64, 1 << 20  # a loop or a forged count ends here
@@ -42,6 +34,10 @@ class Tiff(NamedTuple):
     size: int  # bytes of the file
 
     @property
+    def dng(self) -> bool:
+        return any(DNG_VERSION in directory for directory in self.directories)
+
+    @property
     def truncated(self) -> bool:
         """Some strip or tile lies beyond the end of the file."""
         for directory in self.directories:
@@ -51,25 +47,31 @@ class Tiff(NamedTuple):
                     return True
         return False
 
-    @property
-    def largest(self) -> Directory:
-        """The directory of the most pixels: the RAW image, or a plain TIFF's only one."""
-        return max(self.directories, key=lambda d: d.get(WIDTH, (0,))[0] * d.get(HEIGHT, (0,))[0], default={})
+
+def structure(path: Path) -> Tiff:
+    """The image directories of a file; none where it is not a TIFF. Raises DecodeError."""
+    try:
+        with path.open("rb") as file:
+            return tiff(file) if file.read(4) in _TIFF_MAGIC else Tiff((), file.seek(0, 2))
+    except OSError as error:
+        raise _unreadable(path, error) from None
 
 
 def kind(path: Path) -> Kind:
     """Whether a file is a RAW, a finished picture, something beside the pictures, or unknown bytes.
 
-    Raises CaptureError where the file cannot be read.
+    Raises DecodeError where the file cannot be read.
     """
     try:
         with path.open("rb") as file:
             head = file.read(512)
             return _kind(path, head, file)
     except OSError as error:
-        raise CaptureError(
-            f"{path}: cannot be read ({error.strerror}); check the file and its permissions"
-        ) from None
+        raise _unreadable(path, error) from None
+
+
+def _unreadable(path: Path, error: OSError) -> DecodeError:
+    return DecodeError(f"{path}: cannot be read ({error.strerror}); check the file and its permissions")
 
 
 def _kind(path: Path, head: bytes, file: BinaryIO) -> Kind:
@@ -77,7 +79,7 @@ def _kind(path: Path, head: bytes, file: BinaryIO) -> Kind:
         return "photo"
     if is_raw_magic(head):
         return "raw"
-    if head[:4] in (b"II*\0", b"MM\0*"):
+    if head[:4] in _TIFF_MAGIC:
         return "raw" if _is_raw(tiff(file)) else "photo"
     if path.suffix.lower() in _SIDECARS:  # asked only of what is no picture
         return "other"
@@ -91,24 +93,21 @@ def is_raw_magic(head: bytes) -> bool:
         head[:15] == b"FUJIFILMCCD-RAW"
         or head[4:12] == b"ftypcrx "  # Canon CR3
         or head[6:14] == b"HEAPCCDR"  # Canon CRW
-        or head[:4]
-        in (b"\0MRM", b"FOVb", b"IIRO", b"IIRS", b"MMOR", b"IIU\0")  # Minolta, Sigma, Olympus, Panasonic
-        or (
-            head[:2] in (b"II", b"MM") and (head[8:10] == b"CR" or head[8:12] in (b"IIII", b"MMMM"))
-        )  # CR2, IIQ
+        or head[:4] in (b"\0MRM", b"FOVb", b"IIRO", b"IIRS", b"MMOR", b"IIU\0")  # Minolta, Sigma, Olympus, Panasonic
+        or (head[:2] in (b"II", b"MM") and (head[8:10] == b"CR" or head[8:12] in (b"IIII", b"MMMM")))  # CR2, IIQ
     )
 
 
 def _is_raw(structure: Tiff) -> bool:
+    if structure.dng:
+        return True
     for directory in structure.directories:
-        if DNG_VERSION in directory or directory.get(PHOTOMETRIC, (0,))[0] in (CFA, LINEAR_RAW):
+        if directory.get(PHOTOMETRIC, (0,))[0] in (CFA, LINEAR_RAW):
             return True
         if directory.get(COMPRESSION, (0,))[0] in _RAW_COMPRESSION:
             return True
     first = structure.directories[0] if structure.directories else {}
-    return (
-        MAKE in first and SUB_IFDS in first and first.get(SUBTYPE) == (1,)
-    )  # a preview in front of sensor data
+    return MAKE in first and SUB_IFDS in first and first.get(SUBTYPE) == (1,)  # a preview in front of sensor data
 
 
 def tiff(file: BinaryIO) -> Tiff:

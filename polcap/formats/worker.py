@@ -30,10 +30,7 @@ MEMORY_GIB = 8.0  # address space of the child
 Arrays = dict[str, NDArray[Any]]
 Answer = tuple[dict[str, Any], Arrays]
 _LENGTH = struct.Struct("<Q")
-_START = (
-    "import sys; sys.path[:] = sys.argv[2:]; "
-    "from polcap.formats import worker; worker.serve(float(sys.argv[1]))"
-)
+_START = "import sys; sys.path[:] = sys.argv[2:]; from polcap.formats import worker; worker.serve(float(sys.argv[1]))"
 
 
 class Worker:
@@ -175,9 +172,7 @@ def _limit(memory_gib: float) -> None:
     import resource
 
     size = int(memory_gib * 2**30)
-    with contextlib.suppress(
-        ValueError, OSError
-    ):  # macOS refuses RLIMIT_AS; a tighter limit may already stand
+    with contextlib.suppress(ValueError, OSError):  # macOS refuses RLIMIT_AS; a tighter limit may already stand
         resource.setrlimit(resource.RLIMIT_AS, (size, size))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
