@@ -1,0 +1,116 @@
+"""G-buffers of triangle meshes: what a ray through each pixel of a pinhole camera meets.
+
+One ray through each pixel centre, traced by Embree. Closed meshes that overlap are seen as their
+union, so shapes can be combined by putting them together.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.errors import InputError
+from polcap.images import Floats, GBuffer, View
+from polcap.optics import frames
+
+_LEAST_FACING = 0.01  # shading normals that smoothing turned away from the camera are brought back to here
+
+
+@dataclass(frozen=True)
+class Triangles:
+    """A triangle mesh with a shading normal at every corner."""
+
+    vertices: Floats  # (V, 3)
+    faces: NDArray[np.int32]  # (F, 3)
+    corner_normals: Floats  # (F, 3, 3) unit, of each face's three corners
+
+
+def smooth(vertices: Floats, faces: NDArray[np.integer], crease: float = 0.75) -> Triangles:
+    """Give a mesh area-weighted normals, smooth across edges flatter than `crease` rad.
+
+    Vertices at the same place count as one, so seams of a texture atlas do not show.
+    """
+    vertices = np.ascontiguousarray(vertices, dtype=np.float32)
+    faces = np.ascontiguousarray(faces, dtype=np.int32)
+    _, place = np.unique(vertices, axis=0, return_inverse=True)
+    place = place.reshape(-1)[faces]  # (F, 3)
+    corner = vertices[faces]
+    area = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])  # (F, 3) twice the area
+    total = np.zeros((place.max() + 1, 3), dtype=np.float64)
+    for k in range(3):
+        for axis in range(3):
+            total[:, axis] += np.bincount(place[:, k], weights=area[:, axis], minlength=len(total))
+    flat = _unit(area)[:, None, :]
+    shared = _unit(total)[place]  # (F, 3, 3)
+    sharp = np.sum(shared * flat, axis=-1, keepdims=True) < np.cos(crease)
+    return Triangles(vertices, faces, np.where(sharp, flat, shared).astype(np.float32))
+
+
+def union(parts: Sequence[Triangles]) -> Triangles:
+    """Several meshes in one; where closed ones overlap a ray meets the outer surface."""
+    offset = np.cumsum([0] + [len(p.vertices) for p in parts[:-1]])
+    return Triangles(
+        np.concatenate([p.vertices for p in parts]),
+        np.concatenate([p.faces + o for p, o in zip(parts, offset)]).astype(np.int32),
+        np.concatenate([p.corner_normals for p in parts]),
+    )
+
+
+class Tracer:
+    """A mesh made ready for tracing; build once, look from many sides."""
+
+    def __init__(self, mesh: Triangles) -> None:
+        try:
+            from embreex.mesh_construction import TriangleMesh
+            from embreex.rtcore_scene import EmbreeScene
+        except ImportError:
+            raise InputError("tracing meshes needs embreex; pip install 'polcap[train]'") from None
+        self.mesh = mesh
+        self._scene = EmbreeScene()
+        TriangleMesh(self._scene, mesh.vertices, mesh.faces)
+
+    def trace(self, rotation: Floats, translation: Floats, view: View, height: int, width: int) -> GBuffer:
+        """See the mesh at camera position = rotation @ vertex + translation [m].
+
+        rotation (3, 3) from the object's frame to the camera's, translation (3,).
+        """
+        v = frames.rays(view, height, width).reshape(-1, 3)  # surface to camera, camera frame
+        origin = np.broadcast_to(-translation @ rotation, v.shape).astype(np.float32)
+        direction = np.ascontiguousarray(-v @ rotation, dtype=np.float32)
+        hit = self._scene.run(np.ascontiguousarray(origin), direction, query="INTERSECT", output=True)
+        seen = np.flatnonzero(hit["primID"] >= 0)
+        face = hit["primID"][seen]
+        b, c = hit["u"][seen, None], hit["v"][seen, None]
+        weight = np.stack([1 - b - c, b, c], axis=1)  # (N, 3, 1)
+        position = np.sum(self.mesh.vertices[self.mesh.faces[face]] * weight, axis=1)
+        normal = _unit(np.sum(self.mesh.corner_normals[face] * weight, axis=1)) @ rotation.T
+        normal = _face_camera(normal, v[seen])
+        size = (height, width)
+        depth = np.full(height * width, np.nan, dtype=np.float32)
+        depth[seen] = -(position @ rotation.T + translation)[:, 2]
+        return GBuffer(
+            normal=_scatter(normal, seen, size),
+            depth=depth.reshape(size),
+            mask=np.isfinite(depth).reshape(size),
+            position=_scatter(position, seen, size),
+            view=view,
+        )
+
+
+def _face_camera(normal: Floats, v: Floats) -> Floats:
+    """Turn round normals of faces seen from behind; lift those that smoothing bent just past the limb."""
+    facing = np.sum(normal * v, axis=-1, keepdims=True)
+    normal = np.where(facing < -0.3, -normal, normal)
+    facing = np.where(facing < -0.3, -facing, facing)
+    return _unit(normal + np.maximum(_LEAST_FACING - facing, 0.0) * v)
+
+
+def _scatter(value: Floats, seen: NDArray[np.intp], size: tuple[int, int]) -> Floats:
+    out = np.zeros((size[0] * size[1], value.shape[-1]), dtype=np.float32)
+    out[seen] = value
+    return out.reshape(*size, -1)
+
+
+def _unit(v: Floats) -> Floats:
+    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-20))

@@ -1,0 +1,144 @@
+"""The camera in training: Stokes parameters -> what three imperfect photographs would have measured.
+
+Each error is drawn per object. Shot noise and read noise of a merged bracket, flash energy that is
+left after self-calibration, polarizer angle errors, misregistration and blur, stray and reflected
+light, depolarization, saturation.
+"""
+
+from dataclasses import dataclass
+from math import pi
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+ANGLES = (0.0, pi / 4, pi / 2)  # rad
+
+
+@dataclass(frozen=True)
+class Errors:
+    """What befalls the photographs of each object; all (B,) unless said."""
+
+    full_well: Tensor  # electrons at radiance 1 in the middle exposure, where it saturates
+    bracket: Tensor  # ratio of the longer and of the shorter exposure to the middle one
+    read_noise: Tensor  # electrons
+    gain: Tensor  # (3, B) factor on each shot
+    angle: Tensor  # (3, B) rad
+    shift: Tensor  # (3, B, 2) px
+    blur: Tensor  # px, 1σ
+    depolarization: Tensor  # factor on S1, S2
+    ambient: Tensor  # S0 of stray light on a white surface
+    reflected: Tensor  # strength of light between parts of the object
+    noise_belief: Tensor  # factor on the variance that the solver believes in
+
+    @staticmethod
+    def draw(count: int, device: torch.device) -> "Errors":
+        def u(low: float, high: float, *shape: int) -> Tensor:
+            return low + (high - low) * torch.rand(*shape, count, device=device)
+
+        def sometimes(share: float) -> Tensor:
+            return (u(0, 1) < share).float()
+
+        gain = u(0, 0.005) * torch.randn(3, count, device=device)
+        turn = torch.randn(3, count, device=device) * 0.5 + torch.randn(count, device=device) * 0.3
+        moved = u(0, 0.1) * sometimes(0.7) * torch.randn(2, 3, count, device=device)
+        moved[:, 0] = 0.0
+        return Errors(
+            full_well=torch.exp(u(9.2, 11.0)),
+            bracket=u(1, 5),
+            read_noise=u(2, 8),
+            gain=1 + gain,
+            angle=turn * pi / 180,
+            shift=moved.permute(1, 2, 0),
+            blur=u(0, 0.5),
+            depolarization=1 - u(0, 0.2) * sometimes(0.6),
+            ambient=u(0, 0.03) * sometimes(0.5),
+            reflected=u(0, 0.3) * sometimes(0.7),
+            noise_belief=torch.exp(0.3 * torch.randn(count, device=device)),
+        )
+
+    @staticmethod
+    def none(count: int, device: torch.device) -> "Errors":
+        one, zero = torch.ones(count, device=device), torch.zeros(count, device=device)
+        three = torch.zeros(3, count, device=device)
+        return Errors(
+            1e9 * one, 1e3 * one, zero, three + 1, three, torch.zeros(3, count, 2, device=device), zero, one, zero, zero, one
+        )
+
+    @staticmethod
+    def stated(count: int, device: torch.device) -> "Errors":
+        """The fixed conditions of the evaluation: 20 ke⁻, 5 e⁻, three exposures ×4 apart, gain 0.3 %, angle 0.5°."""
+        from dataclasses import replace
+
+        clean = Errors.none(count, device)
+        return replace(
+            clean,
+            full_well=2e4 * torch.ones(count, device=device),
+            bracket=4 * torch.ones(count, device=device),
+            read_noise=5 * torch.ones(count, device=device),
+            gain=1 + 0.003 * torch.randn(3, count, device=device),
+            angle=torch.randn(3, count, device=device) * 0.5 * pi / 180,
+            reflected=0.15 * torch.ones(count, device=device),
+        )
+
+
+def photograph(
+    stokes: Tensor, diffuse: Tensor, facing: Tensor, mask: Tensor, errors: Errors
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Measured Stokes parameters (3, B, H, W, 3), their covariance (6, ...) and the clipped pixels (B, H, W).
+
+    stokes (3, B, H, W, 3); diffuse (B, H, W, 3); facing (B, H, W) cosine between normal and ray; mask (B, H, W).
+    """
+    count = mask.shape[0]
+    wide = (count, 1, 1, 1)
+    inside = mask[..., None].to(stokes.dtype)
+    stray = errors.ambient.view(wide) + errors.reflected.view(wide) * _hollow(facing, mask)[..., None]
+    background = torch.rand(count, 1, 1, 3, device=stokes.device) * torch.rand(wide, device=stokes.device) * 0.3
+    s0 = stokes[0] + diffuse * stray + (1 - inside) * background
+    s1, s2 = (stokes[k] * errors.depolarization.view(wide) for k in (1, 2))
+
+    shots, variance, clipped = [], [], torch.zeros_like(mask)
+    for k, angle in enumerate(ANGLES):
+        turned = 2 * (angle + errors.angle[k]).view(wide)
+        light = (s0 + s1 * torch.cos(turned) + s2 * torch.sin(turned)) / 2
+        light = errors.gain[k].view(wide) * _moved(light, errors.shift[k], errors.blur)
+        brightest = errors.bracket.view(wide)  # the shortest exposure saturates here
+        clipped = clipped | (light > brightest).any(dim=-1)
+        light = torch.minimum(light, brightest)
+        noise = _merged_variance(light.clamp(min=0), errors)
+        shots.append(light + noise.sqrt() * torch.randn_like(light))
+        variance.append(noise * errors.noise_belief.view(wide))
+    i0, i45, i90 = shots
+    v0, v45, v90 = variance
+    measured = torch.stack([i0 + i90, i0 - i90, 2 * i45 - i0 - i90])
+    both = v0 + v90
+    covariance = torch.stack([both, v0 - v90, -both, both, v90 - v0, 4 * v45 + both])
+    return measured, covariance, clipped & mask
+
+
+def _merged_variance(light: Tensor, errors: Errors) -> Tensor:
+    """Variance of radiance (B, H, W, C) merged from the unsaturated ones of three exposures, by exposure time."""
+    wide = (-1, 1, 1, 1)
+    ratio, well, read = (x.view(wide) for x in (errors.bracket, errors.full_well, errors.read_noise))
+    long, middle = (light * ratio < 1).to(light.dtype), (light < 1).to(light.dtype)
+    time = 1 / ratio + middle + ratio * long
+    return light / (well * time) + (read / (well * time)) ** 2 * (1 + middle + long)
+
+
+def _moved(image: Tensor, shift: Tensor, blur: Tensor) -> Tensor:
+    """Shift by less than a pixel and blur with three taps per axis, right to second order; (B, H, W, C)."""
+    for axis, d in ((2, shift[:, 0]), (1, shift[:, 1])):
+        spread = (blur**2 + d**2).view(-1, 1, 1, 1) / 2
+        slope = d.view(-1, 1, 1, 1) / 2
+        before, after = torch.roll(image, 1, axis), torch.roll(image, -1, axis)
+        image = image + spread * (before + after - 2 * image) + slope * (before - after)
+    return image
+
+
+def _hollow(facing: Tensor, mask: Tensor) -> Tensor:
+    """Share of the neighbourhood that is turned away: a cheap stand-in for interreflection, (B, H, W)."""
+    height, width = facing.shape[-2:]
+    tilted = ((1 - facing) * mask)[:, None]
+    small = F.avg_pool2d(tilted, 4)
+    smooth = F.avg_pool2d(small, 5, stride=1, padding=2, count_include_pad=False)
+    return F.interpolate(smooth, size=(height, width), mode="bilinear", align_corners=False)[:, 0]

@@ -1,0 +1,84 @@
+"""What training minimizes: each map against truth, and pictures rendered from all maps together.
+
+The rendering loss is the paper's: the polarized renderer (`optics/shade.py`, the same that made the
+input) draws truth and estimate under new random lights and from new sides, and compares S0 in log and
+the linear polarization relative to it. It couples the maps where each alone is ambiguous.
+"""
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from polcap.optics import shade
+from polcap.stages.cues import NOMINAL_IOR
+from polcap.training.dataset import Batch
+
+WEIGHTS = {
+    "normal": 2.0, "depth": 1.0, "diffuse": 1.0, "specular": 6.0, "roughness": 1.5, "sigma": 0.05, "render": 0.3,
+}  # fmt: skip
+
+
+def total(maps: dict[str, Tensor], truth: Batch, *, render: bool = True) -> tuple[Tensor, dict[str, float]]:
+    """The weighted sum, and each part as a number. maps and truth (B, ·, H, W)."""
+    mask = truth.mask
+    inside = mask[:, None].float()
+    area = inside.sum().clamp(min=1)
+
+    def mean(error: Tensor) -> Tensor:
+        return (error * inside).sum() / (area * error.shape[1])
+
+    cosine = (maps["normal"] * truth.normal).sum(dim=1, keepdim=True)
+    angle = torch.rad2deg(2 * torch.asin((maps["normal"] - truth.normal).norm(dim=1, keepdim=True).clamp(max=2) / 2))
+    parts = {
+        "normal": mean(1 - cosine) + 0.25 * mean((maps["normal"] - truth.normal).abs()),
+        "depth": mean((_centred(maps["depth"], inside) - _centred(truth.depth, inside)).abs()),
+        "diffuse": mean((maps["diffuse"] - truth.diffuse).abs()),
+        "specular": mean((maps["specular"] - truth.specular).abs()),
+        "roughness": mean((maps["roughness"] - truth.roughness).abs()),
+        "sigma": mean(torch.log(maps["sigma"]) + angle.detach() / maps["sigma"]),  # least where sigma = E[angle]
+    }
+    if render:
+        parts["render"] = _rendered(maps, truth)
+    loss = sum((WEIGHTS[name] * value for name, value in parts.items()), torch.zeros((), device=mask.device))
+    figures = {name: float(value.detach()) for name, value in parts.items()}
+    return loss, figures | {"degrees": float(mean(angle).detach()), "loss": float(loss.detach())}
+
+
+def _centred(depth: Tensor, inside: Tensor) -> Tensor:
+    return depth - (depth * inside).sum(dim=(2, 3), keepdim=True) / inside.sum(dim=(2, 3), keepdim=True).clamp(min=1)
+
+
+def _rendered(maps: dict[str, Tensor], truth: Batch) -> Tensor:
+    """Polarized rendering loss on every second pixel of every second row, a new light and side for each pixel."""
+    at = truth.mask[:, ::2, ::2].reshape(-1).nonzero()[:, 0]
+
+    def flat(image: Tensor) -> Tensor:
+        return image[:, :, ::2, ::2].permute(0, 2, 3, 1).reshape(-1, image.shape[1])[at]
+
+    # a side: turn the truth by up to ~30° about a random axis across the ray, as long as it stays visible
+    turn = _small_rotations(len(at), truth.normal.device)
+    light = F.normalize(torch.randn(len(at), 3, device=turn.device) * 0.6 + torch.tensor([0.0, 0.0, 1.0], device=turn.device), dim=1)
+    ones = torch.ones(len(at), device=turn.device)
+    pictures = []
+    for source in (maps, {name: getattr(truth, name) for name in ("normal", "diffuse", "specular", "roughness")}):
+        normal = torch.einsum("mij,mj->mi", turn, flat(source["normal"]))
+        rough = flat(source["roughness"])[:, 0].clamp(min=0.08)
+        pictures.append(
+            shade.stokes(normal, flat(source["diffuse"]), flat(source["specular"]), rough, NOMINAL_IOR * ones, light, ones)
+        )
+    estimate, goal = pictures
+    intensity = (torch.log(estimate[0] + 0.05) - torch.log(goal[0] + 0.05)).abs().mean()
+    polarization = (estimate[1:] - goal[1:]).abs() / (goal[0] + 0.05)
+    return intensity + 2.0 * polarization.clamp(max=1.0).mean()
+
+
+def _small_rotations(count: int, device: torch.device) -> Tensor:
+    way = 2 * torch.pi * torch.rand(count, device=device)
+    c, s = torch.cos(way), torch.sin(way)
+    tilt = 0.5 * torch.rand(count, device=device)
+    ct, st = torch.cos(tilt), torch.sin(tilt)
+    zero = torch.zeros_like(c)
+    x = torch.stack([ct * c * c + s * s, (ct - 1) * c * s, st * c], dim=1)
+    y = torch.stack([(ct - 1) * c * s, ct * s * s + c * c, st * s], dim=1)
+    z = torch.stack([-st * c, -st * s, ct + zero], dim=1)
+    return torch.stack([x, y, z], dim=1)

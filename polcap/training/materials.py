@@ -1,0 +1,211 @@
+"""Random materials on traced views: diffuse, specular, roughness, refractive index and bumped normals.
+
+Works on flat lists of the object's pixels (M, ·), because two thirds of a view are background. An
+object wears one to three materials in regions of solid noise. Each takes its pattern from a texture
+set, projected along the nearest axis, or from solid noise; specular reflectance and roughness follow
+the pattern of the albedo as in real materials, around levels drawn per material.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+_MATERIALS = 3  # slots per object
+_SIDE = 48  # of the noise volume
+_TEXELS = 256
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Per pixel of the object; camera frame."""
+
+    normal: Tensor  # (M, 3) with bumps
+    diffuse: Tensor  # (M, 3)
+    specular: Tensor  # (M, 3) F0
+    roughness: Tensor  # (M,)
+    ior: Tensor  # (M,)
+
+
+class Library:
+    """Texture sets and a volume of tileable noise on one device."""
+
+    def __init__(self, folder: Path | None, device: torch.device, seed: int = 3) -> None:
+        sets = sorted(p for p in folder.iterdir() if (p / "albedo.jpg").exists()) if folder else []
+        self.names = [p.name for p in sets]
+        stack = [read_textures(p) for p in sets] or [np.full((6, _TEXELS, _TEXELS), 0.5, dtype=np.float32)]
+        self.texture = torch.from_numpy(np.stack(stack, axis=1)).to(device)[None]  # (1, 6, T, 256, 256)
+        self.has_textures = bool(sets)
+        self.noise = _noise_volume(seed).to(device)  # (1, 7, D, D, D)
+
+    def sample_textures(self, which: Tensor, u: Tensor, v: Tensor) -> Tensor:
+        """(M, 6): albedo, roughness, slope along u and v; mirrored at each whole number of u, v."""
+        count = self.texture.shape[2]
+        slot = which.float() * (2.0 / max(count - 1, 1)) - 1.0
+        grid = torch.stack([_mirror(u), _mirror(v), slot], dim=-1)[None, None, None]
+        taken = F.grid_sample(self.texture, grid, mode="bilinear", padding_mode="border", align_corners=True)
+        return taken[0, :, 0, 0].T
+
+    def sample_noise(self, position: Tensor) -> Tensor:
+        """(M, 7): four noises of unit deviation, then the gradient of the fourth."""
+        grid = _mirror(position)[None, None, None]
+        return F.grid_sample(self.noise, grid, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0, 0].T
+
+
+def read_textures(folder: Path) -> np.ndarray[Any, np.dtype[np.float32]]:
+    """Linear albedo, roughness and two slopes of a texture set, (6, 256, 256)."""
+    size = (_TEXELS, _TEXELS)
+    albedo = _picture(folder / "albedo.jpg", size)[..., ::-1]
+    linear = np.where(albedo <= 0.04045, albedo / 12.92, ((albedo + 0.055) / 1.055) ** 2.4)
+    rough = _picture(folder / "roughness.jpg", size).mean(axis=-1)
+    slope = np.zeros((*size, 2), dtype=np.float32)
+    if (folder / "normal.jpg").exists():
+        n = _picture(folder / "normal.jpg", size)[..., ::-1] * 2 - 1
+        slope = -n[..., :2] / np.maximum(n[..., 2:], 0.3)
+    elif (folder / "height.jpg").exists():
+        height = _picture(folder / "height.jpg", size).mean(axis=-1)
+        slope = np.stack([np.roll(height, -1, a) - np.roll(height, 1, a) for a in (1, 0)], axis=-1) * 4
+    maps = np.concatenate([linear, rough[..., None], np.clip(slope, -2, 2)], axis=-1)
+    return np.ascontiguousarray(maps.transpose(2, 0, 1), dtype=np.float32)
+
+
+def dress(
+    library: Library, normal: Tensor, position: Tensor, turn: Tensor, owner: Tensor, count: int
+) -> Surface:
+    """Draw a material for each of `count` objects and evaluate it at their pixels.
+
+    normal (M, 3) camera frame, position (M, 3) object frame, turn (B, 3, 3) object → camera,
+    owner (M,) the object of each pixel.
+    """
+    device = normal.device
+    frame = _rotations(count, device)  # object → pattern
+    inner = _turned(frame, position, owner)
+    facing = _turned(frame @ turn.transpose(1, 2), normal, owner)
+
+    coarse = library.sample_noise(inner * _log_uniform((count, 1), 0.5, 2.5, device)[owner] + _u((count, 3), device)[owner])
+    fine = library.sample_noise(inner * _log_uniform((count, 1), 2.0, 9.0, device)[owner] + _u((count, 3), device)[owner])
+
+    used = torch.randint(1, _MATERIALS + 1, (count,), device=device) * (_u((count,), device) < 0.6) + 1
+    active = torch.arange(_MATERIALS, device=device)[None] < used.clamp(max=_MATERIALS)[:, None]
+    score = torch.where(active[owner], coarse[:, :_MATERIALS], -9.0)
+    table = _draw(library, count, device)
+    flat = owner * _MATERIALS + score.argmax(dim=1)
+    own = {name: value.reshape(count * _MATERIALS, -1)[flat].squeeze(-1) for name, value in table.items()}
+
+    axis = facing.abs().argmax(dim=1)
+    scale = _log_uniform((count,), 0.4, 3.0, device)[owner]
+    u = inner.gather(1, ((axis + 1) % 3)[:, None])[:, 0] * scale + own["shift"]
+    v = inner.gather(1, ((axis + 2) % 3)[:, None])[:, 0] * scale
+    picture = library.sample_textures(own["texture"].long(), u, v)
+
+    pattern = torch.sigmoid(own["contrast"] * (fine[:, 0] + own["level"]))
+    painted = own["color"] * (1 - pattern[:, None]) + own["color2"] * pattern[:, None]
+    textured = own["from_texture"] > 0.5
+    diffuse = torch.where(textured[:, None], picture[:, :3] * own["tint"], painted).clamp(0.005, 0.95)
+    lightness = diffuse.mean(dim=1) ** 0.45
+    deviation = (lightness - own["mid"]) * own["follow"] + 0.5 * own["speckle"] * fine[:, 1]
+    rough = torch.where(textured, picture[:, 3] * own["rough_gain"] + own["rough_shift"], own["rough"] + deviation)
+    reflectance = own["f0"] * (1 + own["f0_follow"] * (lightness - own["mid"]) + own["speckle"] * fine[:, 2])
+    specular = (reflectance[:, None] * own["f0_tint"]).clamp(0.015, 0.4)
+
+    bump = _turned(frame.transpose(1, 2), fine[:, 4:7], owner)  # gradient in the object's frame
+    slope = torch.zeros_like(facing).scatter(1, ((axis + 1) % 3)[:, None], picture[:, 4:5])
+    slope = slope.scatter(1, ((axis + 2) % 3)[:, None], picture[:, 5:6])
+    slope = torch.where(textured[:, None], _turned(frame.transpose(1, 2), slope, owner), bump)
+    bent = normal + own["bump"][:, None] * _turned(turn, slope, owner)
+    return Surface(
+        normal=F.normalize(bent, dim=1),
+        diffuse=diffuse,
+        specular=specular,
+        roughness=rough.clamp(0.08, 1.0),
+        ior=own["ior"],
+    )
+
+
+def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tensor]:
+    """Levels of each material slot, (B, 3, ·)."""
+    shape = (count, _MATERIALS)
+
+    def u(low: float, high: float) -> Tensor:
+        return low + (high - low) * _u(shape, device)
+
+    def normal(deviation: float) -> Tensor:
+        return deviation * torch.randn(shape, device=device)
+
+    common = u(0, 1) < 0.65
+    f0 = torch.where(common, 0.042 * torch.exp(normal(0.2)), u(0.02, 0.25))
+    glossy = u(0, 1)
+    rough = torch.where(glossy < 0.45, u(0.1, 0.4), u(0.3, 0.9))
+    color, color2 = _colors(shape, device), _colors(shape, device)
+    near = (u(0, 1) < 0.5)[..., None]
+    color2 = torch.where(near, color * (0.4 + 1.2 * _u((*shape, 1), device)), color2)
+    tint = torch.exp(normal(0.4))[..., None] * torch.exp(0.15 * torch.randn((*shape, 3), device=device))
+    from_texture = (u(0, 1) < 0.5) if library.has_textures else torch.zeros(shape, device=device)
+    coloured = (f0 > 0.08) & (u(0, 1) < 0.3)
+    f0_tint = torch.where(coloured[..., None], 1 + 0.4 * (_u((*shape, 3), device) - 0.5), torch.ones(1, device=device))
+    bumpy = u(0, 1) < 0.5
+    return {
+        "color": color, "color2": color2, "tint": tint, "f0_tint": f0_tint,
+        "from_texture": from_texture.float(),
+        "texture": torch.randint(0, max(len(library.names), 1), shape, device=device).float(),
+        "shift": u(0, 2), "contrast": torch.exp(u(-1, 3)), "level": u(-1.5, 1.5),
+        "mid": color.mean(dim=-1) ** 0.45,
+        "rough": rough, "follow": normal(0.3), "speckle": u(0, 0.25) * (u(0, 1) < 0.5),
+        "rough_gain": u(0.3, 1.0), "rough_shift": u(-0.3, 0.4),
+        "f0": f0, "f0_follow": normal(0.5),
+        "ior": u(1.35, 1.7), "bump": u(0.0, 0.5) * bumpy,
+    }  # fmt: skip
+
+
+def _colors(shape: tuple[int, int], device: torch.device) -> Tensor:
+    """Reflectances (B, 3, 3): grey to saturated, dark to light."""
+    value = 0.02 + 0.88 * _u((*shape, 1), device) ** 1.3
+    hue = _u((*shape, 3), device)
+    saturation = _u((*shape, 1), device) ** 1.5
+    return (value * (1 - saturation * hue)).clamp(0.01, 0.95)
+
+
+def _noise_volume(seed: int) -> Tensor:
+    """Four multi-octave noises and the gradient of the last, (1, 7, D, D, D)."""
+    generator = torch.Generator().manual_seed(seed)
+    volume = torch.zeros(1, 4, _SIDE, _SIDE, _SIDE)
+    for cells, weight in ((4, 1.0), (8, 0.55), (16, 0.3), (24, 0.15)):
+        octave = torch.randn(1, 4, cells, cells, cells, generator=generator)
+        volume += weight * F.interpolate(octave, size=(_SIDE,) * 3, mode="trilinear", align_corners=True)
+    volume = volume / volume.std(dim=(2, 3, 4), keepdim=True)
+    steps = [torch.gradient(volume[0, 3], dim=d)[0] for d in (2, 1, 0)]  # x runs along the last axis
+    gradient = torch.stack(steps)[None]
+    return torch.cat([volume, gradient / gradient.std()], dim=1)
+
+
+def _picture(path: Path, size: tuple[int, int]) -> np.ndarray[Any, np.dtype[np.float32]]:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+
+
+def _mirror(x: Tensor) -> Tensor:
+    """Fold all numbers into −1…1, mirrored at the whole odd ones."""
+    return (torch.remainder(x + 1, 4) - 2).abs() - 1
+
+
+def _turned(matrix: Tensor, vector: Tensor, owner: Tensor) -> Tensor:
+    return torch.einsum("mij,mj->mi", matrix[owner], vector)
+
+
+def _rotations(count: int, device: torch.device) -> Tensor:
+    q, _ = torch.linalg.qr(torch.randn(count, 3, 3, device=device))
+    return q
+
+
+def _u(shape: tuple[int, ...], device: torch.device) -> Tensor:
+    return torch.rand(shape, device=device)
+
+
+def _log_uniform(shape: tuple[int, ...], low: float, high: float, device: torch.device) -> Tensor:
+    return torch.exp(math.log(low) + (math.log(high) - math.log(low)) * _u(shape, device))

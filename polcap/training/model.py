@@ -1,0 +1,145 @@
+"""The network: cue channels of a crop -> normal, depth, diffuse, specular, roughness and expected error.
+
+One encoder, three decoder branches (normal + depth + error; diffuse; specular + roughness), each with
+residual blocks and a convolution of its own on every skip, as the paper. No normalization layers: the
+absolute level of radiance and DoLP is information. At the bottom every place sees every other (attention
+over the object's cells and their mean), so that a highlight here can tell the roughness there.
+
+References
+----------
+Deschaintre, Lin & Ghosh, Deep polarization imaging for 3D shape and SVBRDF acquisition, CVPR 2021.
+"""
+
+from dataclasses import asdict, dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from polcap.stages.cues import CHANNELS
+
+SIZE_MULTIPLE = 32
+OUTPUTS = ("normal", "depth", "diffuse", "specular", "roughness", "sigma")
+_MASK = CHANNELS.index("mask")
+_COLOR = slice(CHANNELS.index("log_r"), CHANNELS.index("log_b") + 1)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Widths per level, from half resolution down."""
+
+    encoder: tuple[int, ...] = (32, 64, 128, 192, 256)
+    geometry: tuple[int, ...] = (32, 64, 96, 128)  # decoder widths, from half resolution down
+    color: tuple[int, ...] = (32, 32, 64, 96)
+    gloss: tuple[int, ...] = (32, 32, 64, 96)
+    blocks: tuple[int, ...] = (1, 2, 2, 2, 1)  # residual blocks per encoder level
+    skip_blocks: int = 1
+
+    def describe(self) -> dict[str, object]:
+        return asdict(self)
+
+
+SMALL = Shape()
+LARGE = Shape((64, 128, 256, 384, 512), (64, 128, 192, 256), (64, 64, 128, 192), (64, 64, 128, 192), (2, 2, 3, 3, 3), 2)
+
+
+class Network(nn.Module):
+    """Channels (B, 14, H, W) -> maps (B, ·, H, W) by name; H and W multiples of 32.
+
+    normal: unit, in the frame of each pixel's ray. depth: growing away from the camera, mean about 0, in
+    units of `gbuffers.depth_unit`. diffuse, specular: ρ_d and F0, linear. roughness: perceptual.
+    sigma: expected angle between this normal and the true one, degrees.
+    """
+
+    def __init__(self, shape: Shape = SMALL) -> None:
+        super().__init__()
+        self.shape = shape
+        widths = shape.encoder
+        self.stem = nn.Conv2d(4 * len(CHANNELS), widths[0], 3, padding=1)
+        self.levels = nn.ModuleList(nn.Sequential(*[Residual(w) for _ in range(n)]) for w, n in zip(widths, shape.blocks))
+        self.down = nn.ModuleList(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in zip(widths, widths[1:]))
+        self.context = Context(widths[-1])
+        self.geometry = Branch(widths, shape.geometry, shape.skip_blocks, 5)
+        self.color = Branch(widths, shape.color, shape.skip_blocks, 3)
+        self.gloss = Branch(widths, shape.gloss, shape.skip_blocks, 4)
+
+    def forward(self, x: Tensor) -> dict[str, Tensor]:
+        features = [self.levels[0](self.stem(F.pixel_unshuffle(x, 2)))]
+        for down, level in zip(self.down, list(self.levels)[1:]):
+            features.append(level(down(features[-1])))
+        features[-1] = self.context(features[-1], F.avg_pool2d(x[:, _MASK : _MASK + 1], SIZE_MULTIPLE))
+        shape, color, gloss = (branch(features, x).float() for branch in (self.geometry, self.color, self.gloss))
+        level = x[:, _COLOR].float()
+        return {
+            "normal": F.normalize(shape[:, :3] + shape.new_tensor([0.0, 0.0, 0.5]).view(1, 3, 1, 1), dim=1, eps=1e-6),
+            "depth": shape[:, 3:4],
+            "diffuse": torch.sigmoid(level + color + 0.7),
+            "specular": 0.4 * torch.sigmoid(gloss[:, :3] - 1.7),
+            "roughness": torch.sigmoid(gloss[:, 3:4]),
+            "sigma": 60 * torch.sigmoid(shape[:, 4:5] - 1.5),
+        }
+
+
+class Residual(nn.Module):
+    """x + conv(relu(conv(relu(x)))), the second convolution born as zero."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(width, width, 3, padding=1)
+        self.second = nn.Conv2d(width, width, 3, padding=1)
+        nn.init.zeros_(self.second.weight)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.second(F.relu(self.first(F.relu(x))))
+
+
+class Context(nn.Module):
+    """Each cell of the coarsest level looks at all the object's cells, and at their mean."""
+
+    def __init__(self, width: int, heads: int = 4) -> None:
+        super().__init__()
+        self.heads = heads
+        self.ask = nn.Conv2d(width, 3 * width, 1)
+        self.tell = nn.Conv2d(2 * width, width, 1)
+        nn.init.zeros_(self.tell.weight)
+
+    def forward(self, x: Tensor, inside: Tensor) -> Tensor:
+        batch, width, height, across = x.shape
+        query, key, value = (
+            part.flatten(2).reshape(batch, self.heads, width // self.heads, -1).transpose(2, 3)
+            for part in self.ask(F.relu(x)).chunk(3, dim=1)
+        )
+        weight = inside.flatten(2)  # (B, 1, cells)
+        score = query @ key.transpose(2, 3) / (width // self.heads) ** 0.5
+        attention = torch.softmax(score.float() + torch.log(weight[:, :, None].float() + 1e-4), dim=-1)
+        seen = (attention.to(value.dtype) @ value).transpose(2, 3).reshape(batch, width, height, across)
+        mean = (x.flatten(2) * weight).sum(dim=2) / (weight.sum(dim=2) + 1e-4)
+        return x + self.tell(torch.cat([seen, mean[:, :, None, None].expand_as(x).to(seen.dtype)], dim=1))
+
+
+class Branch(nn.Module):
+    """One decoder: from the coarsest level up to full resolution."""
+
+    def __init__(self, encoder: tuple[int, ...], widths: tuple[int, ...], blocks: int, outputs: int) -> None:
+        super().__init__()
+        coarse = (*widths[1:], encoder[-1])  # what each level receives from below
+        self.up = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in zip(coarse, widths))
+        self.skip = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in zip(encoder, widths))
+        self.block = nn.ModuleList(nn.Sequential(*[Residual(w) for _ in range(blocks)]) for w in widths)
+        self.skip_block = nn.ModuleList(nn.Sequential(*[Residual(w) for _ in range(blocks)]) for w in widths)
+        self.fine = nn.Conv2d(widths[0], 64, 3, padding=1)  # 16 channels at full resolution
+        self.raw = nn.Conv2d(len(CHANNELS), 16, 3, padding=1)
+        self.mix = nn.Conv2d(16, 16, 3, padding=1)
+        self.out = nn.Conv2d(16, outputs, 3, padding=1)  # a smoothing kernel after the shuffle: no grid
+        nn.init.normal_(self.out.weight, std=1e-2)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, features: list[Tensor], x: Tensor) -> Tensor:
+        y = features[-1]
+        for level in reversed(range(len(self.up))):
+            skip = self.skip_block[level](self.skip[level](features[level]))
+            lifted = F.interpolate(self.up[level](y), scale_factor=2.0, mode="bilinear", align_corners=False)
+            y = self.block[level](skip + lifted)
+        y = F.pixel_shuffle(self.fine(F.relu(y)), 2) + self.raw(x)
+        y = y + self.mix(F.relu(y))
+        return self.out(F.relu(y))

@@ -1,0 +1,132 @@
+"""Random closed meshes: displaced spheres, superquadrics, turned profiles, tubes, and unions of them."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Floats
+from polcap.synth.mesh import Triangles, smooth, union
+
+_RINGS, _SECTORS = 96, 128
+
+
+def compose(rng: np.random.Generator) -> Triangles:
+    """A random object of one to seven parts, longest side 1, centred."""
+    count = 1 if rng.random() < 0.35 else int(rng.integers(2, 8))
+    parts = []
+    centre = np.zeros(3)
+    for index in range(count):
+        vertices, faces = _PARTS[rng.integers(len(_PARTS))](rng)
+        size = 1.0 if index == 0 else rng.uniform(0.25, 0.9)
+        vertices = size * vertices @ rotation(rng).T + centre
+        parts.append(smooth(vertices, faces))
+        anchor = vertices[rng.integers(len(vertices))]  # the next part grows out of this one's surface
+        centre = centre * 0.2 + anchor * 0.8 if rng.random() < 0.6 else anchor * 0.5
+    whole = union(parts)
+    low, high = whole.vertices.min(axis=0), whole.vertices.max(axis=0)
+    placed = (whole.vertices - (low + high) / 2) / float((high - low).max())
+    return Triangles(placed.astype(np.float32), whole.faces, whole.corner_normals)
+
+
+def rotation(rng: np.random.Generator) -> Floats:
+    """A uniformly random rotation, (3, 3)."""
+    w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _displaced(rng: np.random.Generator) -> tuple[Floats, NDArray[np.int32]]:
+    """An ellipsoid with waves."""
+    unit, faces = _sphere(_RINGS, _SECTORS)
+    field = np.zeros(len(unit))
+    for _ in range(int(rng.integers(2, 9))):
+        frequency = np.exp(rng.uniform(np.log(1.5), np.log(14)))
+        wave = unit @ (rng.normal(size=3) * frequency)
+        field = field + rng.normal() * np.sin(wave + rng.uniform(0, 6.28)) / frequency
+    radius = 0.5 * (1 + rng.uniform(0.2, 0.9) * np.tanh(field))
+    return unit * radius[:, None] * rng.uniform(0.4, 1.0, 3), faces
+
+
+def _superquadric(rng: np.random.Generator) -> tuple[Floats, NDArray[np.int32]]:
+    """Box, cylinder, ellipsoid, star and all between."""
+    unit, faces = _sphere(_RINGS, _SECTORS)
+    east, north = np.exp(rng.uniform(np.log(0.12), np.log(2.2), 2))
+    latitude = np.arcsin(np.clip(unit[:, 2], -1, 1))
+    longitude = np.arctan2(unit[:, 1], unit[:, 0])
+    ring = _power(np.cos(latitude), north)
+    xyz = [
+        ring * _power(np.cos(longitude), east),
+        ring * _power(np.sin(longitude), east),
+        _power(unit[:, 2], north),
+    ]
+    return 0.5 * np.stack(xyz, axis=1) * rng.uniform(0.25, 1.0, 3), faces
+
+
+def _turned(rng: np.random.Generator) -> tuple[Floats, NDArray[np.int32]]:
+    """A turned profile, with lobes or a twist now and then."""
+    unit, faces = _sphere(_RINGS, _SECTORS)
+    height = np.linspace(1, -1, _RINGS)
+    profile = np.full(_RINGS, rng.uniform(0.3, 0.6))
+    for k in range(1, 7):
+        profile = profile + rng.normal() * 0.3 / k * np.cos(k * np.pi * (height + 1) / 2 + rng.uniform(0, 6.28))
+    profile = np.clip(np.abs(profile), 0.05, 1.2) * (1 - np.abs(height) ** rng.uniform(4, 40)) ** 0.5
+    ring = np.repeat(profile, _SECTORS)
+    longitude = np.arctan2(unit[:, 1], unit[:, 0])
+    if rng.random() < 0.4:
+        lobes = rng.integers(2, 14) * longitude + rng.uniform(-4, 4) * np.repeat(height, _SECTORS)
+        ring = ring * (1 + rng.uniform(0.02, 0.2) * np.cos(lobes))
+    stretch = rng.uniform(0.4, 1.2)
+    xyz = [ring * np.cos(longitude), ring * np.sin(longitude), stretch * np.repeat(height, _SECTORS)]
+    return 0.45 * np.stack(xyz, axis=1), faces
+
+
+def _tube(rng: np.random.Generator) -> tuple[Floats, NDArray[np.int32]]:
+    """A closed random curve with thickness: handles, knots, rings."""
+    t = np.linspace(0, 2 * np.pi, 160, endpoint=False)
+    around = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    curve = np.zeros((len(t), 3))
+    for k in range(1, int(rng.integers(2, 5))):
+        curve += (np.outer(np.cos(k * t), rng.normal(size=3)) + np.outer(np.sin(k * t), rng.normal(size=3))) / k**1.5
+    curve /= 2 * np.abs(curve).max()
+    tangent = np.roll(curve, -1, 0) - np.roll(curve, 1, 0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    side = np.cross(tangent, rng.normal(size=3))
+    side /= np.linalg.norm(side, axis=1, keepdims=True) + 1e-9
+    other = np.cross(tangent, side)
+    radius = rng.uniform(0.05, 0.18) * (1 + rng.uniform(0, 0.4) * np.sin(rng.integers(1, 6) * t))
+    offset = side[:, None] * np.cos(around)[None, :, None] + other[:, None] * np.sin(around)[None, :, None]
+    vertices = (curve[:, None] + radius[:, None, None] * offset).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(len(t)), np.arange(len(around)), indexing="ij")
+    a, b = i * len(around) + j, (i + 1) % len(t) * len(around) + j
+    j1 = (j + 1) % len(around)
+    c, d = (i + 1) % len(t) * len(around) + j1, i * len(around) + j1
+    quads = np.stack([a, d, c, a, c, b], axis=-1).reshape(-1, 3)
+    return vertices, quads.astype(np.int32)
+
+
+_PARTS: list[Callable[[np.random.Generator], tuple[Floats, NDArray[np.int32]]]] = [
+    _displaced, _displaced, _superquadric, _superquadric, _turned, _tube,
+]  # fmt: skip
+
+
+def _sphere(rings: int, sectors: int) -> tuple[Floats, NDArray[np.int32]]:
+    """Latitude-longitude sphere from the north pole down, faces counter-clockwise from outside."""
+    polar = np.linspace(0, np.pi, rings)
+    around = np.linspace(0, 2 * np.pi, sectors, endpoint=False)
+    p, a = np.meshgrid(polar, around, indexing="ij")
+    vertices = np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)], axis=-1).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(rings - 1), np.arange(sectors), indexing="ij")
+    j1 = (j + 1) % sectors
+    a0, b0, c0, d0 = i * sectors + j, (i + 1) * sectors + j, (i + 1) * sectors + j1, i * sectors + j1
+    faces = np.stack([a0, b0, c0, a0, c0, d0], axis=-1).reshape(-1, 3)
+    return vertices, faces.astype(np.int32)
+
+
+def _power(value: Floats, exponent: float) -> Floats:
+    return np.asarray(np.sign(value) * np.abs(value) ** exponent)

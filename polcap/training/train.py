@@ -1,0 +1,203 @@
+"""Train the network with one command: cache of views, loop, checkpoints, metrics.
+
+The budget is a length of time, so that a run ends when it is meant to on any machine: the learning
+rate holds for 60 % of it and falls to nothing over the rest. A run that was stopped goes on from its
+last checkpoint with the time that was left. Same seed, same machine, same number of steps: same weights.
+"""
+
+import csv
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from polcap.errors import InputError
+from polcap.training import evaluate, gbuffers, loss, materials, model
+from polcap.training.dataset import Simulator
+
+_HOLD = 0.6  # share of the budget at the full learning rate
+_WARM = 200  # steps
+
+
+@dataclass(frozen=True)
+class Params:
+    """What one training run is told."""
+
+    preset: str = "cpu"  # cpu | gpu: size of the network, of the views and of a batch
+    data: Path = Path("data")  # holds meshes/ and materials/
+    out: Path = Path("runs/train")  # cache of views, checkpoints, metrics
+    minutes: float = 90.0  # training time, all resumed parts together; building the cache is extra
+    resume: bool = False  # go on from out/last.pt
+    threads: int = 2
+    seed: int = 1
+    rate: float = 1e-3
+
+
+@dataclass(frozen=True)
+class Preset:
+    shape: model.Shape
+    views: int  # per training mesh
+    procedural: int  # random shapes, 8 views each
+    size: int  # of cached views, px
+    sizes: tuple[int, ...]  # that a batch may have, drawn with the weights below
+    weights: tuple[float, ...]
+    pixels: int  # of a batch
+
+
+PRESETS = {
+    "cpu": Preset(model.SMALL, 60, 480, 192, (96, 128, 160, 192), (0.2, 0.5, 0.15, 0.15), 8 * 128**2),
+    "gpu": Preset(model.LARGE, 400, 3000, 256, (128, 192, 256), (0.3, 0.3, 0.4), 64 * 256**2),
+}
+
+
+def main(params: Params) -> Path:
+    """Train, and leave out/last.pt (all that resuming needs, EMA weights included) and out/metrics.csv."""
+    if params.preset not in PRESETS:
+        raise InputError(f"preset {params.preset!r} is not one of {', '.join(PRESETS)}")
+    preset = PRESETS[params.preset]
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    torch.set_num_threads(params.threads)
+    torch.manual_seed(params.seed)
+    params.out.mkdir(parents=True, exist_ok=True)
+    simulator = Simulator(views(params, preset), library(params, "train", device), device)
+    watch = evaluate.Watch(params.data, params.out / "watch", device)
+    run = Run(preset.shape, device, params.rate)
+    if params.resume:
+        run.load(params.out / "last.pt")
+    chooser = np.random.default_rng([params.seed, run.step])
+    budget = params.minutes * 60
+    saved = looked = run.elapsed
+    parts: list[dict[str, float]] = []
+    before = time.monotonic()
+    while run.elapsed < budget:
+        size = int(chooser.choice(preset.sizes, p=preset.weights))
+        batch = simulator.draw(max(preset.pixels // size**2, 1), size)
+        parts.append(run.advance(batch, run.elapsed / budget))
+        now = time.monotonic()
+        run.elapsed, before = run.elapsed + now - before, now
+        if run.step % 50 == 0:
+            _record(params.out / "metrics.csv", run, {k: float(np.mean([p[k] for p in parts])) for k in parts[0]})
+            parts = []
+        if run.elapsed - looked > 240 or (run.elapsed >= budget):
+            looked = run.elapsed
+            with run.averaged() as network:
+                _record(params.out / "watch.csv", run, watch.look(network))
+            before = time.monotonic()
+        if run.elapsed - saved > 60:
+            saved = run.elapsed
+            run.save(params.out / "last.pt")
+    run.save(params.out / "last.pt")
+    return params.out / "last.pt"
+
+
+def views(params: Params, preset: Preset) -> dict[str, Any]:
+    """The cache of training views, traced now where it is not there yet."""
+    folder = params.out / "views"
+    if not (folder / "index.json").exists():
+        meshes = sorted((params.data / "meshes" / "train").glob("*.npz"))
+        gbuffers.build(folder, meshes, views=preset.views, procedural=preset.procedural, size=preset.size, seed=11)
+    return gbuffers.load(folder)
+
+
+def library(params: Params, split: str, device: torch.device) -> materials.Library:
+    folder = params.data / "materials" / split
+    return materials.Library(folder if folder.exists() else None, device)
+
+
+class Run:
+    """Network, its moving average, optimizer and how far they are."""
+
+    def __init__(self, shape: model.Shape, device: torch.device, rate: float) -> None:
+        self.device, self.rate = device, rate
+        self.network = model.Network(shape).to(device, memory_format=torch.channels_last)
+        self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
+        decay = [p for p in self.network.parameters() if p.ndim > 1]
+        plain = [p for p in self.network.parameters() if p.ndim <= 1]
+        self.optimizer = torch.optim.AdamW(
+            [{"params": decay, "weight_decay": 1e-2}, {"params": plain, "weight_decay": 0.0}], rate, betas=(0.9, 0.98)
+        )
+        self.step, self.samples, self.elapsed, self.skipped = 0, 0, 0.0, 0
+
+    def advance(self, batch: Any, progress: float) -> dict[str, float]:
+        """One step; progress 0…1 of the budget sets the rate."""
+        fall = min(1.0, (1 - min(progress, 1.0)) / (1 - _HOLD))
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.rate * min(1.0, (self.step + 1) / _WARM) * fall
+        self.network.train()
+        with torch.autocast(self.device.type, torch.bfloat16):
+            maps = self.network(batch.channels.contiguous(memory_format=torch.channels_last))
+        value, figures = loss.total(maps, batch)
+        self.optimizer.zero_grad(set_to_none=False)
+        value.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        if torch.isfinite(norm):
+            self.optimizer.step()
+        else:
+            self.skipped += 1
+        self.step += 1
+        self.samples += len(batch.mask)
+        keep = min(0.999, (1 + self.step) / (10 + self.step))
+        with torch.no_grad():
+            weights = list(self.network.state_dict().values())
+            torch._foreach_lerp_(list(self.average.values()), weights, 1 - keep)
+        return figures | {"gradient": float(norm)}
+
+    @contextmanager
+    def averaged(self) -> Iterator[model.Network]:
+        """The network with its EMA weights, for as long as the block lasts."""
+        held = {k: v.clone() for k, v in self.network.state_dict().items()}
+        self.network.load_state_dict(self.average)
+        try:
+            yield self.network.eval()
+        finally:
+            self.network.load_state_dict(held)
+
+    def save(self, path: Path) -> None:
+        state = {
+            "network": self.network.state_dict(), "average": self.average, "optimizer": self.optimizer.state_dict(),
+            "shape": asdict(self.network.shape), "step": self.step, "samples": self.samples, "elapsed": self.elapsed,
+            "skipped": self.skipped, "random": torch.get_rng_state(),
+        }  # fmt: skip
+        beside = path.with_suffix(".part")
+        torch.save(state, beside)
+        os.replace(beside, path)
+
+    def load(self, path: Path) -> None:
+        if not path.exists():
+            raise InputError(f"{path} is not there: nothing to resume; train without resume first")
+        state = torch.load(path, map_location=self.device, weights_only=True)
+        self.network.load_state_dict(state["network"])
+        self.average = {k: v.clone() for k, v in state["average"].items()}
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.step, self.samples, self.elapsed = state["step"], state["samples"], state["elapsed"]
+        self.skipped = state["skipped"]
+        torch.set_rng_state(state["random"].cpu())
+
+
+def load_average(path: Path) -> tuple[model.Network, dict[str, Any]]:
+    """The network with the EMA weights of a checkpoint, on the CPU, and the checkpoint's other facts."""
+    state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+    shape = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in state["shape"].items()}
+    network = model.Network(model.Shape(**shape))
+    average: dict[str, Tensor] = state["average"]
+    network.load_state_dict(average)
+    return network.eval(), {k: state[k] for k in ("step", "samples", "elapsed")}
+
+
+def _record(path: Path, run: Run, figures: dict[str, float]) -> None:
+    row = {"step": run.step, "samples": run.samples, "seconds": round(run.elapsed, 1)} | {
+        k: f"{v:.5g}" for k, v in figures.items()
+    }
+    fresh = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, row.keys())
+        if fresh:
+            writer.writeheader()
+        writer.writerow(row)
