@@ -1,0 +1,278 @@
+"""A scene and a way of shooting it -> a capture folder: DNG brackets per polarizer angle, and the truth beside.
+
+::
+
+    FOLDER/pol000/IMG_0001.DNG …   what `formats/capture.py` reads
+    FOLDER/truth.json              scene, shoot, and what was done to every file
+    FOLDER/truth.npz               maps at the pixel centres of the first angle's shots
+"""
+
+from datetime import datetime, timedelta
+from math import sqrt
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from scipy.ndimage import gaussian_filter
+
+from polcap.errors import CaptureError
+from polcap.formats import atomic, dng
+from polcap.images import Exif, Floats, GBuffer, View
+from polcap.synth import camera, materials, render
+from polcap.synth import chart as charts
+from polcap.synth.camera import Sensor
+from polcap.synth.render import Scene
+from polcap.synth.scenes import Kind, random_scene
+
+__all__ = ["Kind", "Scene", "Shoot", "random_scene", "transform", "write"]
+
+_SENSOR_MM = 36.0  # width
+_SRGB_TO_XYZ = np.array(
+    [[0.4123908, 0.3575843, 0.1804808], [0.2126390, 0.7151687, 0.0721923], [0.0193308, 0.1191948, 0.9505322]]
+)
+_CFA = {"RGGB": (0, 1, 1, 2), "BGGR": (2, 1, 1, 0), "GRBG": (1, 0, 2, 1), "GBRG": (1, 2, 0, 1)}
+_CONVENTIONS = (
+    "pixel (i, j) of the visible RAW has its centre at column i, row j; camera at the origin, x right, y up, "
+    "z towards the camera; depth = -z [m]; polarizer and AoLP angles from image x towards image up; "
+    "transform: reference RAW px (x, y, 1) -> px of this file; S in linear Rec.709 in the frame of each "
+    "ray, S0 of the chart's white patch = its reference; specular = F0; roughness = sqrt(GGX alpha)"
+)
+
+
+class Shoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The camera, the polarizer and the photographer's hand."""
+
+    seed: int = 0
+    width: Annotated[int, Meta(ge=64, multiple_of=2)] = 1152  # visible RAW px
+    height: Annotated[int, Meta(ge=64, multiple_of=2)] = 864
+    focal_mm: float = 60.0  # on a sensor 36 mm wide
+    angles_deg: tuple[float, ...] = (0.0, 45.0, 90.0)  # nominal
+    exposures: Annotated[int, Meta(ge=1, le=9)] = 3
+    step: Annotated[float, Meta(gt=1)] = 4.0  # from one exposure to the next
+    bracket: Literal["time", "aperture", "iso", "flash"] = "time"  # time: steady light, else a flash fired
+    gain_jitter: float = 0.01  # 1σ of the light's energy from frame to frame, relative
+    nudge_px: float = 1.5  # the camera moves by up to this between angles
+    nudge_deg: float = 0.05  # and rolls by up to this
+    angle_error_deg: float = 0.5  # 1σ of the polarizer's angle
+    extinction_ratio: float = 1000.0
+    blur_px: float = 0.4  # 1σ of the lens's point spread
+    samples: Annotated[int, Meta(ge=1, le=4)] = 2  # rays per pixel side
+    sensor: Sensor = Sensor()
+    cfa: Literal["RGGB", "BGGR", "GRBG", "GBRG"] = "RGGB"
+    color_matrix: tuple[float, ...] = (0.87, -0.27, -0.075, -0.44, 1.23, 0.235, -0.09, 0.19, 0.69)  # XYZ → camera
+
+    @property
+    def view(self) -> View:
+        """The camera over its own RAW pixels."""
+        center = (self.width - 1) / 2, (self.height - 1) / 2
+        return View(self.focal_mm / _SENSOR_MM * self.width, center, scale=1)
+
+
+def write(folder: Path, scene: Scene, shoot: Shoot) -> None:
+    """Photograph `scene` into `folder`, which is made; the same arguments give the same bytes.
+
+    Raises
+    ------
+    CaptureError
+        `folder` holds something already.
+    StorageError
+        It cannot be written; then nothing is left of it.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise CaptureError(f"{folder} is not an empty folder; choose another place for the capture")
+    buffer = render.gbuffer(scene, shoot.view, shoot.height, shoot.width)
+    to_camera, color_matrix, neutral = _camera(shoot)
+    reference = _box(shoot, np.eye(3), lambda x, y: render.stokes(scene, shoot.view, x, y, render.guide(buffer)))
+    middle = _middle_exposure(scene, shoot, buffer, reference[0] @ to_camera.T)
+    with atomic.folder(folder) as place:
+        files = []
+        for shot, angle in enumerate(shoot.angles_deg):
+            pose = _pose(shoot, shot)
+            radiance = _expose_shot(scene, shoot, buffer, pose) @ to_camera.T
+            for frame in range(shoot.exposures):
+                number = shot * shoot.exposures + frame
+                name = f"{_folder_name(angle)}/IMG_{number + 1:04d}.DNG"
+                exif, light, amplification = _setting(shoot, frame, number, middle)
+                random = np.random.default_rng([shoot.seed, 1 + shot, frame])
+                energy = float(1 + shoot.gain_jitter * random.normal())
+                mosaic = camera.mosaic(radiance, np.reshape(_CFA[shoot.cfa], (2, 2)).astype(np.uint8))
+                counts = camera.expose(mosaic * (light * energy), shoot.sensor, amplification, random)
+                dng.write(
+                    place / name,
+                    counts,
+                    cfa=np.reshape(_CFA[shoot.cfa], (2, 2)).astype(np.uint8),
+                    black=shoot.sensor.black,
+                    white=shoot.sensor.white,
+                    exif=exif,
+                    color_matrix=color_matrix,
+                    as_shot_neutral=neutral,
+                )
+                files.append(
+                    {
+                        "file": name,
+                        "nominal_deg": angle,
+                        **pose,
+                        "exposure_index": frame,
+                        "time": exif.exposure_time,
+                        "fnumber": exif.f_number,
+                        "iso": exif.iso,
+                        "relative_exposure": light * amplification,
+                        "flash_factor": energy,
+                        "clipped_fraction_object": float((counts[buffer.mask] >= shoot.sensor.white).mean()),
+                        "time_stamp": exif.taken,
+                    }
+                )
+        _write_truth(place, scene, shoot, buffer, reference, to_camera, files)
+
+
+def transform(shoot: Shoot, shift_px: tuple[float, float], rot_deg: float) -> Floats:
+    """Reference RAW px (x, y, 1) -> RAW px of a shot, (3, 3): the picture is rolled by `rot_deg`, counter-clockwise
+    as seen, about the principal point and moved by `shift_px` (right, down)."""
+    c, s = np.cos(np.radians(rot_deg)), np.sin(np.radians(rot_deg))
+    roll = np.array([[c, s], [-s, c]])  # rows run down, so counter-clockwise is the transpose
+    center = np.array(shoot.view.center)
+    out = np.eye(3)
+    out[:2, :2] = roll
+    out[:2, 2] = center + shift_px - roll @ center
+    return out
+
+
+def _pose(shoot: Shoot, shot: int) -> dict[str, Any]:
+    """What the hand did to the camera and to the polarizer before one shot; the first defines the frame."""
+    random = np.random.default_rng([shoot.seed, 0, shot])
+    shift = shoot.nudge_px * random.uniform(-1, 1, 2) * (shot > 0)
+    roll = float(shoot.nudge_deg * random.uniform(-1, 1) * (shot > 0))
+    actual = shoot.angles_deg[shot] + shoot.angle_error_deg * random.normal()
+    return {
+        "actual_deg": float(actual),
+        "shift_px": shift.tolist(),
+        "rot_deg": roll,
+        "transform": transform(shoot, (shift[0], shift[1]), roll).tolist(),
+    }
+
+
+def _expose_shot(scene: Scene, shoot: Shoot, buffer: GBuffer, pose: dict[str, Any]) -> Floats:
+    """What one shot's polarizer passes, (H, W, 3) linear Rec.709: a camera rolled by r turns the polarizer too."""
+    weights = np.radians(pose["actual_deg"] - pose["rot_deg"]), shoot.extinction_ratio
+    start = render.guide(buffer)
+    back = np.linalg.inv(np.array(pose["transform"]))
+    return _box(shoot, back, lambda x, y: render.photograph(scene, shoot.view, x, y, weights, start))
+
+
+def _box(shoot: Shoot, back: Floats, picture: Any) -> Floats:
+    """Mean of `picture(x, y)` over each pixel's square, (..., H, W, 3), then the lens's blur.
+
+    `back` (3, 3) takes the pixels to the reference shot's, where the scene stands still.
+    """
+    y, x = np.mgrid[: shoot.height, : shoot.width].astype(np.float64)
+    offsets = (np.arange(shoot.samples) + 0.5) / shoot.samples - 0.5
+    total: Any = 0.0
+    for dy in offsets:
+        for dx in offsets:
+            px, py = x + dx, y + dy
+            total = total + picture(
+                back[0, 0] * px + back[0, 1] * py + back[0, 2], back[1, 0] * px + back[1, 1] * py + back[1, 2]
+            )
+    mean = total / shoot.samples**2
+    return np.asarray(gaussian_filter(mean, shoot.blur_px, axes=(-3, -2))) if shoot.blur_px else np.asarray(mean)
+
+
+def _camera(shoot: Shoot) -> tuple[Floats, Floats, Floats]:
+    """Linear Rec.709 → camera (3, 3) with green of white = 1, XYZ → camera (3, 3), camera values of white (3,)."""
+    matrix = np.reshape(shoot.color_matrix, (3, 3)) @ _SRGB_TO_XYZ
+    green = matrix[1].sum()
+    return matrix / green, np.reshape(shoot.color_matrix, (3, 3)), matrix.sum(axis=1) / green
+
+
+def _middle_exposure(scene: Scene, shoot: Shoot, buffer: GBuffer, s0: Floats) -> float:
+    """Exposure of the middle frame: most of the object and the white patch at 0.35 of the white level there,
+    and all but the sharpest highlights below it in the darkest frame. s0 (H, W, 3) in camera channels."""
+    bright = s0[buffer.mask].max(axis=-1) / 2
+    if not bright.size:
+        raise CaptureError("the object is outside the picture; move scene.position towards (0, 0, -0.7)")
+    level = float(np.percentile(bright, 90))
+    peak = float(np.percentile(bright, 99.9))
+    if scene.chart is not None:
+        white = render.white_level(scene) / 2
+        level, peak = max(level, white), max(peak, white)
+    return min(0.35 / level, 0.95 / peak * shoot.step ** (shoot.exposures // 2))
+
+
+def _setting(shoot: Shoot, frame: int, number: int, middle: float) -> tuple[Exif, float, float]:
+    """What the camera writes about a frame, the light it gets and its amplification."""
+    stops = shoot.step ** (frame - shoot.exposures // 2)
+    taken = datetime(2026, 3, 14, 12) + timedelta(seconds=4.25 * number + 20 * (number // shoot.exposures))
+    exif: dict[str, Any] = {
+        "make": "Polcap",
+        "model": "Synthetic",
+        "lens": f"Synthetic {shoot.focal_mm:g}mm",
+        "exposure_time": 1 / 160,
+        "f_number": 11.0,
+        "iso": 100.0,
+        "focal_length_mm": shoot.focal_mm,
+        "focal_length_35mm": shoot.focal_mm,
+        "pixel_pitch_um": 1000 * _SENSOR_MM / shoot.width,
+        "taken": taken.isoformat(timespec="milliseconds"),
+        "flash_fired": shoot.bracket != "time",
+    }
+    light, amplification = middle * stops, 1.0
+    if shoot.bracket == "time":
+        exif["exposure_time"] = 0.02 * stops
+    elif shoot.bracket == "aperture":
+        exif["f_number"] = round(11.0 / sqrt(stops), 1)
+    elif shoot.bracket == "iso":
+        amplification = shoot.step**frame
+        light = middle / shoot.step ** (shoot.exposures // 2)
+        exif["iso"] = 100.0 * amplification
+    return Exif(**exif), light, amplification
+
+
+def _folder_name(angle: float) -> str:
+    return f"pol{angle:03.0f}" if angle == round(angle) else f"pol{angle:05.1f}"
+
+
+def _write_truth(
+    place: Path,
+    scene: Scene,
+    shoot: Shoot,
+    buffer: GBuffer,
+    reference: Floats,
+    to_camera: Floats,
+    files: list[dict[str, Any]],
+) -> None:
+    view, white = shoot.view, render.white_level(scene)
+    chart = scene.chart and {
+        "corners_px": render.project(view, charts.corners(scene.chart)).tolist(),
+        "patch_corners_px": render.project(view, charts.patches(scene.chart)).tolist(),
+        "size_m": scene.chart.size_m,
+    }
+    document = {
+        "conventions": _CONVENTIONS,
+        "focal_px": view.focal,
+        "principal_px": view.center,
+        "camera_matrix_from_linear_srgb": to_camera.tolist(),
+        "white_S0": white,
+        "chart": chart,
+        "files": files,
+        "scene": msgspec.to_builtins(scene),
+        "shoot": msgspec.to_builtins(shoot),
+    }
+    with atomic.path(place / "truth.json") as temporary:
+        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(document), indent=1))
+
+    diffuse, specular, roughness, ior = materials.evaluate(scene.coat, buffer.position)
+    mask = buffer.mask
+    with atomic.path(place / "truth.npz") as temporary:
+        np.savez_compressed(
+            temporary,
+            normal=buffer.normal.astype(np.float16),
+            depth=buffer.depth,
+            mask=mask,
+            diffuse=(diffuse * mask[..., None]).astype(np.float16),
+            specular=(specular * mask[..., None]).astype(np.float16),
+            roughness=(roughness * mask).astype(np.float16),
+            ior=(ior * mask).astype(np.float16),
+            S=(reference / white * mask[..., None]).astype(np.float16),
+        )

@@ -1,0 +1,65 @@
+"""A ColorChecker Classic in the scene: flat, matt, unpolarized patches in a black frame."""
+
+import msgspec
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from polcap.formats import calib
+from polcap.images import Floats
+
+_PATCH, _FRAME, _FRAME_ALBEDO = 0.88, 0.18, 0.03  # side of a patch and width of the frame, in patch pitches
+_MIDDLE = np.array([3, 2]) - (1 - _PATCH) / 2  # column and row of the chart's middle
+
+
+class Chart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where it hangs. Unturned it faces the lens, dark skin at the top left."""
+
+    center: tuple[float, float, float] = (0.105, 0.0, -0.70)  # m, camera frame
+    turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # rotation vector
+    pitch: float = 0.0155  # m from patch to patch
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Width and height between the outer corners of the patches."""
+        return self.pitch * (5 + _PATCH), self.pitch * (3 + _PATCH)
+
+    @property
+    def axes(self) -> tuple[Floats, Floats, Floats]:
+        """Unit vectors out of the chart, along its rows and down its columns."""
+        turn = Rotation.from_rotvec(self.turn_deg, degrees=True)
+        return turn.apply([0.0, 0.0, 1.0]), turn.apply([1.0, 0.0, 0.0]), turn.apply([0.0, -1.0, 0.0])
+
+
+def corners(chart: Chart) -> Floats:
+    """The outer corners of the patches (4, 3) [m, camera frame], dark skin first, clockwise."""
+    return _points(chart, np.array([[0, 0], [5 + _PATCH, 0], [5 + _PATCH, 3 + _PATCH], [0, 3 + _PATCH]]))
+
+
+def patches(chart: Chart, margin: float = 0.0) -> Floats:
+    """The corners of every patch (24, 4, 3) [m, camera frame], `margin` of its side cut off all round."""
+    origin = np.stack(np.meshgrid(np.arange(6), np.arange(4)), axis=-1).reshape(24, 1, 2)
+    near, far = _PATCH * margin, _PATCH * (1 - margin)
+    return _points(chart, origin + np.array([[near, near], [far, near], [far, far], [near, far]]))
+
+
+def seen(chart: Chart, v: Floats) -> tuple[Floats, Floats, Floats]:
+    """Which rays v (P, 3) meet the chart: their indices (N,), the distance along them [m] and albedo (N, 3)."""
+    facing, across, down = chart.axes
+    center = np.array(chart.center)
+    near = np.flatnonzero(-(v @ center) > np.linalg.norm(center) * np.cos(5 * chart.pitch / np.linalg.norm(center)))
+    distance = -(center @ facing) / (v[near] @ facing)
+    point = -v[near] * distance[:, None] - center
+    column = point @ across / chart.pitch + _MIDDLE[0]
+    row = point @ down / chart.pitch + _MIDDLE[1]
+    on = (np.abs(column - _MIDDLE[0]) < 3 + _FRAME) & (np.abs(row - _MIDDLE[1]) < 2 + _FRAME) & (distance > 0)
+    column, row = column[on], row[on]
+    patch = (column >= 0) & (row >= 0) & (column % 1 < _PATCH) & (row % 1 < _PATCH) & (column < 6) & (row < 4)
+    number = np.where(patch, row.astype(int) * 6 + column.astype(int), 24)
+    colors = np.vstack([calib.colorchecker().rec709, np.full((1, 3), _FRAME_ALBEDO)])
+    return near[on], distance[on], colors[number]
+
+
+def _points(chart: Chart, column_row: Floats) -> Floats:
+    """Points (..., 3) of the chart's plane at (..., 2) columns and rows from its first patch corner."""
+    _, across, down = chart.axes
+    return np.array(chart.center) + (column_row - _MIDDLE) @ (chart.pitch * np.stack([across, down]))

@@ -1,0 +1,172 @@
+"""A scene -> what a polarizer passes at every pixel, its Stokes parameters, and the surface seen there.
+
+Everything is rendered where a shot's own pixels look; nothing is ever resampled. Camera frame of
+`optics/frames.py`, metres, the lens at the origin. Radiance is in linear Rec.709.
+"""
+
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from scipy.ndimage import minimum_filter
+from scipy.spatial.transform import Rotation
+
+from polcap.images import Floats, GBuffer, View
+from polcap.optics import frames, mueller, shade
+from polcap.synth import chart as charts
+from polcap.synth import materials, trace
+from polcap.synth.chart import Chart
+from polcap.synth.materials import Coat
+from polcap.synth.shapes import Shape
+from polcap.synth.trace import Hits, Indices, Vector
+
+
+class Scene(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One object under one flash, in front of a dark backdrop, with a chart beside it."""
+
+    shape: Shape
+    coat: Coat
+    position: Vector = (-0.065, 0.0, -0.70)  # m, of the object's origin
+    turn_deg: Vector = (0.0, 0.0, 0.0)  # rotation vector of the object
+    light: Vector = (0.0, 0.05, 0.0)  # m, of the flash
+    chart: Chart | None = Chart()
+    backdrop: float = 1.3  # m before the lens
+    backdrop_albedo: float = 0.03
+    shadows: bool = True  # of the object on itself
+
+    @property
+    def turn(self) -> Rotation:
+        return Rotation.from_rotvec(self.turn_deg, degrees=True)
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """One ray per pixel: unpolarized surroundings, and the object in front of them."""
+
+    surroundings: Floats  # (P, 3) S0
+    index: Indices  # (N,) the pixels that see the object
+    stokes: Floats  # (3, N, 3)
+    ray: Floats  # (N, 3)
+
+
+def stokes(scene: Scene, view: View, x: Floats, y: Floats, start: Floats | None = None) -> Floats:
+    """Stokes parameters (3, H, W, 3) at pixel positions x, y (H, W) of `view`, in the frame of each ray.
+
+    A white matt plane at the object's distance that faces the flash has S0 = 1. `start` is of `guide`.
+    """
+    sample = _sample(scene, view, x, y, start)
+    out = np.zeros((3, x.size, 3), np.float32)
+    out[0] = sample.surroundings
+    out[:, sample.index] = sample.stokes
+    return out.reshape(3, *x.shape, 3)
+
+
+def photograph(
+    scene: Scene, view: View, x: Floats, y: Floats, weights: tuple[float, float], start: Floats | None = None
+) -> Floats:
+    """What a polarizer passes at pixel positions x, y (H, W) of `view`, (H, W, 3).
+
+    `weights` are its angle [rad] in the frame of `view` and its extinction ratio.
+    """
+    angle, extinction_ratio = weights
+    sample = _sample(scene, view, x, y, start)
+    out = sample.surroundings / 2
+    axis = frames.axis_on_ray(np.asarray(angle), sample.ray)
+    out[sample.index] = np.einsum("ns,snc->nc", mueller.analyzer(axis, extinction_ratio), sample.stokes)
+    return out.reshape(*x.shape, 3)
+
+
+def gbuffer(scene: Scene, view: View, height: int, width: int) -> GBuffer:
+    """What the ray through each pixel's centre meets of the object."""
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    hits, _ = _visible(scene, view_rays(view, x, y).reshape(-1, 3))
+    normal, position = np.zeros((2, height * width, 3), np.float32)
+    depth = np.full(height * width, np.nan, np.float32)
+    mask = np.zeros(height * width, bool)
+    at = hits.index
+    normal[at], position[at], depth[at], mask[at] = hits.normal, hits.local, -hits.point[:, 2], True
+    return GBuffer(
+        normal=normal.reshape(height, width, 3),
+        depth=depth.reshape(height, width),
+        mask=mask.reshape(height, width),
+        position=position.reshape(height, width, 3),
+        view=view,
+    )
+
+
+def guide(buffer: GBuffer) -> Floats:
+    """Where rays close to each pixel's may begin (H, W) [m]; infinite where none can meet the object."""
+    height, width = buffer.mask.shape
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    distance = buffer.depth / view_rays(buffer.view, x, y)[..., 2]
+    return np.asarray(minimum_filter(np.where(buffer.mask, distance, np.inf), 5))
+
+
+def view_rays(view: View, x: Floats, y: Floats) -> Floats:
+    """`frames.rays` at any pixel positions: unit vectors from the surface to the lens, (..., 3) float64."""
+    across, down = (view.center[0] - x) / view.focal, (y - view.center[1]) / view.focal
+    along = 1 / np.sqrt(across * across + down * down + 1)
+    return np.stack([across * along, down * along, along], axis=-1)
+
+
+def white_level(scene: Scene) -> float:
+    """S0 of a perfect matt white at the chart's white patch; 1 without a chart."""
+    if scene.chart is None:
+        return 1.0
+    point = charts.patches(scene.chart)[18].mean(axis=0, keepdims=True)
+    return float(_irradiance(scene, point, scene.chart.axes[0])[0])
+
+
+def project(view: View, point: Floats) -> Floats:
+    """Pixel positions (..., 2) of points (..., 3) of the camera frame."""
+    x = view.center[0] - view.focal * point[..., 0] / point[..., 2]
+    y = view.center[1] + view.focal * point[..., 1] / point[..., 2]
+    return np.stack([x, y], axis=-1)
+
+
+def _sample(scene: Scene, view: View, x: Floats, y: Floats, start: Floats | None) -> _Sample:
+    v = view_rays(view, x, y).reshape(-1, 3)
+    begin = None
+    if start is not None:
+        row = np.clip(np.rint(y), 0, start.shape[0] - 1).astype(np.intp)
+        column = np.clip(np.rint(x), 0, start.shape[1] - 1).astype(np.intp)
+        begin = start[row, column].ravel()
+    hits, surroundings = _visible(scene, v, begin)
+    return _Sample(surroundings, hits.index, _shade(scene, v[hits.index], hits), v[hits.index])
+
+
+def _visible(scene: Scene, v: Floats, start: Floats | None = None) -> tuple[Hits, Floats]:
+    """The object where nothing stands before it, and S0 (P, 3) of the matt, unpolarized surroundings."""
+    out = np.empty((len(v), 3))
+    distance = scene.backdrop / v[:, 2]
+    wall = scene.backdrop_albedo * _irradiance(scene, -v * distance[:, None], np.array([0.0, 0.0, 1.0]))
+    out[:] = wall[:, None]
+    hits = trace.trace(scene.shape, scene.position, scene.turn, v, start)
+    if scene.chart is not None:
+        at, to_chart, albedo = charts.seen(scene.chart, v)
+        distance[at] = to_chart
+        out[at] = albedo * _irradiance(scene, -v[at] * distance[at, None], scene.chart.axes[0])[:, None]
+    return hits.take(np.flatnonzero(hits.distance < distance[hits.index])), out
+
+
+def _irradiance(scene: Scene, point: Floats, normal: Floats) -> Floats:
+    """On surfaces at points (N, 3) with `normal`, (N,): 1 facing the flash at the object's distance from it."""
+    to_light = np.array(scene.light) - point
+    squared = np.einsum("ni,ni->n", to_light, to_light)
+    reference = np.sum((np.array(scene.light) - np.array(scene.position)) ** 2)
+    cosine = np.einsum("ni,ni->n", to_light, np.broadcast_to(normal, point.shape)) / np.sqrt(squared)
+    return np.asarray(np.maximum(cosine, 0.0) * reference / squared)
+
+
+def _shade(scene: Scene, ray: Floats, hits: Hits) -> Floats:
+    """Stokes parameters (3, N, 3) of the object's surface."""
+    to_light = np.array(scene.light) - hits.point
+    to_light /= np.linalg.norm(to_light, axis=-1, keepdims=True)
+    irradiance = _irradiance(scene, hits.point, to_light)
+    if scene.shadows:
+        lit = np.flatnonzero(np.einsum("ni,ni->n", hits.normal, to_light) > 0)
+        hidden = trace.shadowed(scene.shape, scene.position, scene.turn, hits.take(lit), scene.light)
+        irradiance[lit[hidden]] = 0.0
+    diffuse, specular, roughness, ior = materials.evaluate(scene.coat, hits.local)
+    normal, light = frames.to_ray_frame(hits.normal, ray), frames.to_ray_frame(to_light, ray)
+    return np.asarray(shade.stokes(normal, diffuse, specular, roughness, ior, light, irradiance))

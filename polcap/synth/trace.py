@@ -1,0 +1,96 @@
+"""Sphere tracing: rays of the camera -> where they meet a shape that stands somewhere before it.
+
+References
+----------
+Hart, Sphere tracing, The Visual Computer 1996.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from polcap.images import Floats
+from polcap.synth.shapes import Shape
+
+Vector = tuple[float, float, float]
+Indices = NDArray[np.integer[Any]]
+_TOLERANCE = 1e-6  # m, a ray this near has arrived
+_LIFT = 5e-4  # m above the surface, where a shadow ray starts
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Where rays meet a shape, in the order of their index."""
+
+    index: Indices  # (N,) of the ray
+    distance: Floats  # (N,) along it, m
+    point: Floats  # (N, 3) camera frame, m
+    local: Floats  # (N, 3) shape's own frame, m
+    normal: Floats  # (N, 3) camera frame, unit
+
+    def take(self, which: Indices) -> "Hits":
+        return Hits(*(value[which] for value in vars(self).values()))
+
+
+def trace(shape: Shape, position: Vector, turn: Rotation, v: Floats, start: Floats | None = None) -> Hits:
+    """What the rays that leave the lens along −v (P, 3) meet of a shape turned by `turn` and put at `position` [m].
+
+    `start` (P,) [m] is where to begin, nearer than the surface; infinite where a ray is known to miss.
+    """
+    to_middle = -(v @ np.array(position))
+    near = to_middle**2 > np.dot(position, position) - shape.radius**2
+    if start is not None:
+        near &= np.isfinite(start)
+    candidates = np.flatnonzero(near)
+    direction = turn.inv().apply(-v[candidates])
+    origin = turn.inv().apply(-np.array(position))
+    first = 0.0 if start is None else start[candidates]
+    index, distance = _march(shape, np.broadcast_to(origin, direction.shape), direction, first)
+    local = origin + direction[index] * distance[:, None]
+    at = candidates[index]
+    return Hits(at, distance, -v[at] * distance[:, None], local, turn.apply(_gradient(shape, local)))
+
+
+def shadowed(shape: Shape, position: Vector, turn: Rotation, hits: Hits, light: Vector) -> NDArray[np.bool_]:
+    """Which of the hits (N,) the shape itself hides from a light [m, camera frame]."""
+    source = turn.inv().apply(np.array(light) - np.array(position))
+    lifted = hits.local + _LIFT * turn.inv().apply(hits.normal)
+    direction = source - lifted
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    out = np.zeros(len(lifted), bool)
+    out[_march(shape, lifted, direction, 0.0)[0]] = True
+    return out
+
+
+def _march(shape: Shape, origin: Floats, direction: Floats, start: Floats | float) -> tuple[Indices, Floats]:
+    """Indices of the rays (P, 3) that arrive at the shape, and how far they travelled."""
+    middle = -np.einsum("pi,pi->p", origin, direction)
+    missed = np.einsum("pi,pi->p", origin, origin) - middle**2
+    half = np.sqrt(np.maximum(shape.radius**2 - missed, 0.0))
+    alive = np.flatnonzero((half > 0) & (middle + half > 0))
+    travelled = np.maximum(middle - half, start)[alive]
+    end = (middle + half)[alive]
+    arrived_index, arrived_at = [alive[:0]], [travelled[:0]]
+    for _ in range(200):
+        step = shape.distance(origin[alive] + direction[alive] * travelled[:, None])
+        travelled = travelled + step
+        there = np.abs(step) < _TOLERANCE
+        arrived_index.append(alive[there])
+        arrived_at.append(travelled[there])
+        going = ~there & (travelled < end)
+        alive, travelled, end = alive[going], travelled[going], end[going]
+        if not len(alive):
+            break
+    index = np.concatenate(arrived_index)
+    order = np.argsort(index)
+    return index[order], np.concatenate(arrived_at)[order]
+
+
+def _gradient(shape: Shape, p: Floats) -> Floats:
+    """Unit normals (N, 3) by central differences."""
+    steps = 1e-4 * np.eye(3)  # m
+    slope = np.stack([shape.distance(p + step) - shape.distance(p - step) for step in steps], axis=-1)
+    return np.asarray(slope / np.linalg.norm(slope, axis=-1, keepdims=True))
