@@ -260,7 +260,7 @@ class SurfaceMaps:
     roughness: Floats  # (H, W) perceptual, α = roughness²
     depth_prior: (
         Floats | None
-    )  # (H, W) coarse depth, growing away, in radii √(mask pixels/π) px; mean about 0; or None
+    )  # (H, W) coarse depth, growing away, mean about 0; unit: √(mask pixels/π) px
     confidence: Floats  # (H, W) expected normal error, degrees
     mask: NDArray[np.bool_]  # (H, W)
     view: View

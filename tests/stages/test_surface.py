@@ -1,0 +1,194 @@
+"""Normals to depth to mesh: scenes whose depth is known in closed form."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from polcap.errors import ObjectError
+from polcap.images import Floats, Mesh, SurfaceMaps, View
+from polcap.stages import surface
+
+SETTINGS = surface.Settings()
+VIEW = View(focal=400.0, center=(63.5, 55.5), scale=2.0)
+SHAPE = (112, 128)
+
+
+def slopes(view: View = VIEW, shape: tuple[int, int] = SHAPE) -> tuple[Floats, Floats]:
+    """a, b of every pixel: its point is d (a, b, −1)."""
+    row, column = np.mgrid[: shape[0], : shape[1]]
+    return (column - view.center[0]) / view.focal, -(row - view.center[1]) / view.focal
+
+
+def maps(normal: Floats, mask: NDArray[np.bool_], view: View = VIEW) -> SurfaceMaps:
+    flat = np.ones((*mask.shape, 3), dtype=np.float32)
+    return SurfaceMaps(
+        normal=normal.astype(np.float32),
+        diffuse=0.5 * flat,
+        specular=0.04 * flat,
+        roughness=0.5 * flat[..., 0],
+        depth_prior=None,
+        confidence=5 * flat[..., 0],
+        mask=mask,
+        view=view,
+        estimator="truth",
+    )
+
+
+def sphere(
+    view: View = VIEW,
+    shape: tuple[int, int] = SHAPE,
+    center: tuple[float, float, float] = (0.02, 0.01, -1.0),
+    radius: float = 0.1,
+) -> tuple[SurfaceMaps, Floats]:
+    """A sphere about 1 m away, and its depth [m]."""
+    a, b = slopes(view, shape)
+    ray = np.stack([a, b, -np.ones_like(a)], axis=-1)
+    along, square = ray @ np.array(center), np.sum(ray * ray, axis=-1)
+    root = along**2 - square * (np.dot(center, center) - radius**2)
+    mask = root > 1e-4 * radius**2
+    depth = (along - np.sqrt(np.maximum(root, 0))) / square
+    normal = (ray * depth[..., None] - center) / radius
+    return maps(np.where(mask[..., None], normal, 0), mask, view), np.where(mask, depth, np.nan)
+
+
+def from_depth(d: Floats, view: View = VIEW) -> Floats:
+    """Normals of a depth map by central differences."""
+    a, b = slopes(view, d.shape)
+    point = d[..., None] * np.stack([a, b, -np.ones_like(a)], axis=-1)
+    down, right = np.gradient(point, axis=(0, 1))
+    normal = np.cross(right, -down)
+    return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
+
+
+def error_share(mesh: Mesh, truth: Floats, mask: NDArray[np.bool_]) -> float:
+    """RMSE after the best scale, over the depth range."""
+    d, t = mesh.depth[mask].astype(np.float64), truth[mask]
+    scale = (d @ t) / (d @ d)
+    return float(np.sqrt(np.mean((scale * d - t) ** 2)) / np.ptp(t))
+
+
+def test_sphere_in_perspective() -> None:
+    truth_maps, truth = sphere()
+    mesh = surface.integrate(truth_maps, 0.95, SETTINGS)
+    assert error_share(mesh, truth, truth_maps.mask) < 0.01  # the limb is a pixel wide and infinitely steep
+    assert np.isnan(mesh.depth[~truth_maps.mask]).all()
+
+
+def test_bumps_are_recovered_to_a_thousandth() -> None:
+    a, b = slopes()
+    truth = 1 + 0.01 * np.sin(40 * a) * np.cos(35 * b) + 0.1 * a
+    mask = (a / 0.14) ** 2 + (b / 0.12) ** 2 < 1
+    mesh = surface.integrate(maps(from_depth(truth), mask), None, SETTINGS)
+    assert error_share(mesh, truth, mask) < 0.001
+
+
+def test_pyramid_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    truth_maps, truth = sphere()
+    monkeypatch.setattr(surface, "_DIRECT", 500)
+    mesh = surface.integrate(truth_maps, 0.95, SETTINGS)
+    assert error_share(mesh, truth, truth_maps.mask) < 0.01
+
+
+def ball_in_a_ramp() -> tuple[SurfaceMaps, Floats, NDArray[np.bool_]]:
+    """A ball sunk into a plane that recedes upwards: it hides the plane above, and meets it below."""
+    _, b = slopes()
+    ball, near = sphere(center=(0.0, 0.0, -1.0), radius=0.06)
+    ramp = 1 / (1 - 0.8 * b)
+    front = ball.mask & (np.nan_to_num(near, nan=9.0) < ramp)
+    normal = np.where(front[..., None], ball.normal, from_depth(ramp))
+    return maps(normal, np.ones(SHAPE, dtype=bool)), np.where(front, near, ramp), front
+
+
+def test_jump_is_kept_as_a_jump_and_cut() -> None:
+    scene, truth, front = ball_in_a_ramp()
+    offset = []  # of the ball against the ramp, px of depth
+    for settings in (SETTINGS, surface.Settings(stiffness=0.0)):
+        depth = surface.integrate(scene, None, settings).depth
+        error = depth / np.median(depth) - truth / np.median(truth)
+        offset.append(abs(np.median(error[front]) - np.median(error[~front])) * VIEW.focal)
+    assert offset[0] < 1 < 5 < offset[1]
+
+    mesh = surface.integrate(scene, None, SETTINGS)
+    assert error_share(mesh, truth, scene.mask) < 0.015
+    log = VIEW.focal * np.log(-mesh.vertices[..., 2])[mesh.faces]
+    assert np.ptp(log, axis=1).max() < 14  # px: what the steepest normal explains; the jump is 24
+    joints = np.diff(np.nan_to_num(mesh.depth, nan=0.0), axis=0) * VIEW.focal
+    assert np.abs(joints).max() > 20  # it is there, in the depth map
+
+
+def test_prior_sets_the_offset_between_separate_pieces() -> None:
+    a, b = slopes()
+    left = a < 0
+    mask = np.abs(a) > 0.01
+    truth = np.where(left, 1.0, 1.1) + 0.01 * np.sin(60 * b)
+    normal = np.where(left[..., None], *(from_depth(d + 0.01 * np.sin(60 * b)) for d in (1.0 + 0 * a, 1.1 + 0 * a)))
+    scene = maps(normal, mask)
+    alone = error_share(surface.integrate(scene, None, SETTINGS), truth, mask)
+    radius = np.sqrt(mask.sum() / np.pi) / VIEW.focal
+    coarse = (np.where(left, 1.0, 1.1) / 1.05 - 1) / radius
+    guided = replace(scene, depth_prior=coarse.astype(np.float32))
+    assert alone > 0.2
+    assert error_share(surface.integrate(guided, None, SETTINGS), truth, mask) < 0.05
+
+
+def test_doubtful_normals_count_less() -> None:
+    truth_maps, truth = sphere()
+    rng = np.random.default_rng(3)
+    bad = np.zeros(SHAPE, dtype=bool)
+    bad[40:60, 40:90] = True
+    normal = truth_maps.normal + np.where(bad[..., None], rng.normal(0, 0.5, (*SHAPE, 3)), 0)
+    normal[bad] += [0.5, 0, 0]
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
+    blind = replace(truth_maps, normal=normal.astype(np.float32))
+    warned = replace(blind, confidence=np.where(bad, 60, 2).astype(np.float32))
+    errors = [error_share(surface.integrate(m, None, SETTINGS), truth, truth_maps.mask) for m in (blind, warned)]
+    assert errors[1] < 0.7 * errors[0]
+
+
+def test_distance_is_the_median_depth_in_metres() -> None:
+    truth_maps, _ = sphere()
+    known, unknown = (surface.integrate(truth_maps, distance, SETTINGS) for distance in (0.7, None))
+    assert known.metric and not unknown.metric
+    assert np.nanmedian(known.depth) == pytest.approx(0.7, rel=1e-5)
+    assert np.nanmedian(unknown.depth) == pytest.approx(1.0, rel=1e-5)
+    assert np.allclose(known.vertices, 0.7 * unknown.vertices, rtol=1e-5)
+
+
+def test_mesh_faces_the_camera_and_keeps_its_frames() -> None:
+    truth_maps, _ = sphere()
+    mesh = surface.integrate(truth_maps, 0.95, SETTINGS)
+    p, q, r = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    facing = np.sum(np.cross(q - p, r - p) * -p, axis=-1)  # the camera is at the origin
+    assert (facing > 0).all()
+    u, v = (mesh.uv * [SHAPE[1], SHAPE[0]] - 0.5).T
+    assert np.allclose(-mesh.vertices[:, 0] / mesh.vertices[:, 2], (u - VIEW.center[0]) / VIEW.focal, atol=1e-5)
+    assert np.allclose(-mesh.vertices[:, 1] / mesh.vertices[:, 2], (VIEW.center[1] - v) / VIEW.focal, atol=1e-5)
+    row, column = np.rint(v).astype(int), np.rint(u).astype(int)
+    agreement = np.sum(mesh.normals * truth_maps.normal[row, column], axis=-1)
+    assert np.percentile(agreement, 5) > np.cos(np.radians(5))
+    tangent = mesh.tangents[:, :3]
+    assert np.abs(np.sum(tangent * mesh.normals, axis=-1)).max() < 1e-5
+    assert np.allclose(np.linalg.norm(tangent, axis=-1), 1, atol=1e-5)
+    assert (tangent[:, 0] > 0).all() and (mesh.tangents[:, 3] == 1).all()
+    assert (np.cross(mesh.normals, tangent)[:, 1] > 0).mean() > 0.99  # the bitangent points up the picture
+
+
+def test_vertices_are_thinned_to_the_limit() -> None:
+    view = View(800.0, (127.5, 111.5), 1.0)
+    truth_maps, _ = sphere(view, (224, 256))
+    mesh = surface.integrate(truth_maps, None, surface.Settings(max_vertices=3000))
+    assert 1500 < len(mesh.vertices) <= 3000
+    assert mesh.depth.shape == (224, 256)
+    assert len(np.unique(mesh.faces)) == len(mesh.vertices)
+
+
+def test_empty_object_is_refused() -> None:
+    truth_maps, _ = sphere()
+    with pytest.raises(ObjectError, match="--mask"):
+        surface.integrate(replace(truth_maps, mask=np.zeros(SHAPE, dtype=bool)), None, SETTINGS)
+    lonely = np.zeros(SHAPE, dtype=bool)
+    lonely[::4, ::4] = True
+    with pytest.raises(ObjectError, match="--mask"):
+        surface.integrate(replace(truth_maps, mask=lonely), None, SETTINGS)
