@@ -56,7 +56,7 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
     _check_no_duplicate(digests)
 
     def frame(source: Source, angle_deg: float) -> Frame:
-        mosaic = angle_deg if plan.layout == "sensor" and source.role in ("shot", "repeat", "ambient") else None
+        mosaic = angle_deg if plan.layout == "sensor" else None
         load, manner = _loader(source, stated, mosaic)
         fact = facts[source.path]
         return Frame(

@@ -71,7 +71,7 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None) 
         hint = (
             f"; its sub-folders are {', '.join(inside[:4])}, but polcap looks for pol000, pol045, …" if inside else ""
         )
-        raise CaptureError(f"{folder}: holds no photograph{hint}")
+        raise CaptureError(f"{folder}: holds no photograph that polcap reads{hint}")
     if stated.sensor or _is_sensor(listing.pictures, angles_deg):
         return _sensor(listing, angles_deg)
     return _named(folder, listing, angles_deg) or _by_time(folder, listing, angles_deg or DEFAULT_DEG)
@@ -113,7 +113,9 @@ def _folders(folder: Path, sub_folders: dict[float, Path], angles_deg: Sequence[
     for angle, sub_folder in sub_folders.items():
         listing = _list(sub_folder)
         if not listing.pictures:
-            raise CaptureError(f"{sub_folder}: holds no photograph; shoot this angle again, or remove the folder")
+            raise CaptureError(
+                f"{sub_folder}: holds no photograph that polcap reads; shoot this angle again, or remove the folder"
+            )
         groups[angle] = listing.pictures
         notes += [f"{sub_folder.name}: {note}" for note in listing.notes]
     beside = sorted(

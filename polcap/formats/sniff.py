@@ -22,7 +22,7 @@ _WANTED = {
 }  # fmt: skip
 _INTEGERS = {1: "B", 3: "H", 4: "I", 13: "I"}
 _MOST_DIRECTORIES, _MOST_VALUES = 64, 1 << 20  # a loop or a forged count ends here
-_SIDECARS = {".db", ".ini", ".cos", ".thm", ".wav", ".mov", ".mp4", ".avi", ".pdf", ".zip"}  # not text
+_SIDECARS = {".db", ".cos", ".thm", ".pdf", ".zip", ".txt", ".xmp"}  # not text, or in UTF-16
 
 Directory = dict[int, tuple[int, ...]]
 
@@ -81,6 +81,8 @@ def _kind(path: Path, head: bytes, file: BinaryIO) -> Kind:
         return "raw"
     if head[:4] in _TIFF_MAGIC:
         return "raw" if _is_raw(tiff(file)) else "photo"
+    if head[4:8] == b"ftyp" or head[:4] == b"RIFF":  # HEIC, AVIF, WebP beside a RAW; films; sounds
+        return "other"
     if path.suffix.lower() in _SIDECARS:  # asked only of what is no picture
         return "other"
     text = head.strip(b"\0") and not any(byte < 9 or 13 < byte < 27 for byte in head)
