@@ -208,7 +208,7 @@ def _resized(cues: Cues, scale: float) -> Cues:
     weight = np.maximum(mean(light), 1e-9)
     ratio = np.stack([mean(r * light) / weight for r in cues.ratio])
     sigma = mean(cues.ratio_sigma * light) / weight * min(1.0, scale * np.sqrt(width / size[0] * scale))
-    share = mean(cues.mask)
+    share = mean(cues.mask.astype(np.float32))
     mask = share > 0.5
     radiance = mean(cues.radiance * cues.mask[..., None]) / np.maximum(share, 1e-3)[..., None]
     squared = ratio[0] ** 2 + ratio[1] ** 2

@@ -130,9 +130,9 @@ def _sizeable(mask: NDArray[np.uint8], min_area: float) -> NDArray[np.uint8]:
 
 def _filled(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Holes smaller than a hundredth of the mask closed (dark texture is still the object)."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(1 - mask, connectivity=4)
-    small = 1 + np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] < mask.sum() / 100) if count > 1 else []
-    return np.maximum(mask, np.isin(labels, small).astype(np.uint8))
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(1 - mask, connectivity=4)
+    small = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] < mask.sum() / 100)
+    return np.asarray(np.maximum(mask, (np.isin(labels, small) & (labels > 0)).astype(np.uint8)))
 
 
 def _graph_cut(picture: Floats, seed: NDArray[np.uint8], outside: NDArray[np.bool_]) -> NDArray[np.float32]:

@@ -135,7 +135,7 @@ def _polygon(quad: Floats, transform: Floats, shape: tuple[int, ...]) -> NDArray
     corners = transform @ np.column_stack([quad, np.ones(4)]).T
     inside = np.zeros(shape[:2], np.uint8)
     cv2.fillConvexPoly(inside, np.round((corners[:2] / corners[2]).T * 16).astype(np.int32), 1, shift=4)
-    return cv2.erode(inside, np.ones((3, 3), np.uint8)) > 0
+    return np.asarray(cv2.erode(inside, np.ones((3, 3), np.uint8)) > 0)
 
 
 def _brightest_pixels(value: Floats, quality: Bits, mask: NDArray[np.bool_], share: float) -> tuple[Floats, Floats]:

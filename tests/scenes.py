@@ -1,0 +1,110 @@
+"""A textured ball beside a flat board, known everywhere, to try the stages on: evaluated, never resampled."""
+
+import numpy as np
+
+from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Gains, ObjectMask, View
+from polcap.optics import frames, mueller, shade
+
+HEIGHT, WIDTH, FOCAL = 240, 320, 900.0
+CENTER, RADIUS = (120.0, 118.0), 84.0  # px; x, y of the ball's outline
+VIEW = View(focal=FOCAL, center=((WIDTH - 1) / 2, (HEIGHT - 1) / 2), scale=2.0)
+ANGLES = np.radians([0.0, 45.0, 90.0])
+
+
+def normals(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Ball normals in the frame of each ray (H, W, 3) and its mask (H, W) at pixel coordinates."""
+    u, v = (x - CENTER[0]) / RADIUS, -(y - CENTER[1]) / RADIUS
+    inside = u * u + v * v < 0.995
+    z = np.sqrt(np.maximum(1 - u * u - v * v, 0.005))
+    n = np.stack([u, v, z], axis=-1)
+    return n / np.linalg.norm(n, axis=-1, keepdims=True), inside
+
+
+def texture(x: Floats, y: Floats) -> Floats:
+    """Albedo (H, W, 3) with detail of a few pixels, smooth enough for the sampling."""
+    waves = np.sin(0.42 * x + 0.13 * y) + np.sin(0.11 * x - 0.37 * y + 1) + np.sin(0.21 * x + 0.23 * y + 2)
+    grey = 0.4 + 0.09 * waves
+    return np.stack([grey * 1.1, grey, grey * 0.8], axis=-1)
+
+
+def stokes(x: Floats, y: Floats, textured: bool = True) -> tuple[Floats, Floats]:
+    """Noise-free Stokes parameters (3, H, W, 3) in the ray frames, and the ball's mask."""
+    n, inside = normals(x, y)
+    albedo = texture(x, y) if textured else np.full((*x.shape, 3), 0.5)
+    light = np.zeros_like(n)
+    light[..., 2] = 1
+    ones = np.ones(x.shape)
+    ball = shade.stokes(n, albedo, 0.04 * np.ones_like(albedo), 0.5 * ones, 1.5 * ones, light, ones)
+    board = (x > 224) & (x < 300) & (y > 30) & (y < 200)
+    backdrop = np.where(board, texture(2 * x, 2 * y)[..., 1], 0.004)[..., None] * np.ones(3)
+    flat = np.stack([backdrop, 0 * backdrop, 0 * backdrop])
+    return np.where(inside[..., None], ball, flat), inside
+
+
+def stack(
+    transforms: list[Floats] | None = None,
+    gain: Floats | None = None,
+    noise: float = 0.0,
+    angles: Floats = ANGLES,
+    textured: bool = True,
+    seed: int = 0,
+    scale: float = 0.5,
+) -> AngleStack:
+    """The shots of the scene, each evaluated where its own camera pose puts its pixels.
+
+    transforms: reference px → shot px. noise: 1σ at radiance 1, growing with √radiance.
+    """
+    rng = np.random.default_rng(seed)
+    sub = (np.arange(3) - 1) / 3  # 3 × 3 samples a pixel: a sensor's own low pass
+    values = []
+    for k, angle in enumerate(angles):
+        total = 0.0
+        back = np.linalg.inv(transforms[k]) if transforms else np.eye(3)
+        for dy in sub:
+            for dx in sub:
+                y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
+                x, y = x + dx, y + dy
+                w = back[2, 0] * x + back[2, 1] * y + back[2, 2]
+                u = (back[0, 0] * x + back[0, 1] * y + back[0, 2]) / w
+                v = (back[1, 0] * x + back[1, 1] * y + back[1, 2]) / w
+                s, _ = stokes(u, v, textured)
+                rays = frames.rays(VIEW, HEIGHT, WIDTH)
+                turned = mueller.analyzer(frames.axis_on_ray(float(angle), rays))  # (H, W, 3)
+                total = total + np.einsum("hwj,jhwc->hwc", turned, s)
+        values.append(total / 9 * scale * (1.0 if gain is None else gain[k]))
+    value = np.stack(values)
+    variance = noise**2 * np.maximum(value, 1e-3) + 1e-12
+    value = value + rng.normal(size=value.shape) * np.sqrt(variance) * (noise > 0)
+    return AngleStack(
+        value=value.astype(np.float32), variance=variance.astype(np.float32),
+        quality=np.zeros(value.shape[:3], np.uint8), angle=np.asarray(angles), view=VIEW,
+        exposure_ratio=np.ones((len(angles), 1, 3)), exif_ratio=np.ones((len(angles), 1)),
+        ghost_fraction=np.zeros(len(angles)), lossy=False, camera_matrix=None, white_balance=None,
+    )  # fmt: skip
+
+
+def no_color(scale: float = 0.5) -> ColorCalibration:
+    """The colour calibration of these shots, which are Rec.709 at `scale`; as from another capture's chart."""
+    return ColorCalibration(np.eye(3) / scale, None, None, None, "profile", float("nan"), None)
+
+
+def still(shots: int = 3) -> Alignment:
+    return Alignment(np.tile(np.eye(3), (shots, 1, 1)), np.zeros(shots), np.ones(shots))
+
+
+def equal(shots: int = 3) -> Gains:
+    ones = np.ones((shots, 3))
+    return Gains(ones, 0 * ones, ones, "none", 0.0, 0.0, 0.0, 1.0, tuple(range(shots)), False)
+
+
+def ball_object() -> ObjectMask:
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
+    inside = normals(x, y)[1]
+    return ObjectMask(inside, (30, 28, 212, 210), "user")
+
+
+def truth() -> tuple[Floats, Floats]:
+    """Ray-frame normals and mask on the crop of `ball_object`."""
+    x0, y0, x1, y1 = ball_object().crop
+    y, x = np.mgrid[y0:y1, x0:x1].astype(float)
+    return normals(x, y)

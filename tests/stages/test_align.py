@@ -1,0 +1,68 @@
+"""Registration of polarizer shots against poses the scene was evaluated at."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from polcap.errors import AlignmentError
+from polcap.stages import align
+from tests import scenes
+
+
+def pose(dx: float, dy: float, degrees: float) -> np.ndarray:
+    """Reference px → shot px of a camera nudged about the picture's centre."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    to_center = np.array([[1, 0, -scenes.WIDTH / 2], [0, 1, -scenes.HEIGHT / 2], [0, 0, 1.0]])
+    return np.linalg.inv(to_center) @ np.array([[c, -s, dx], [s, c, dy], [0, 0, 1.0]]) @ to_center
+
+
+def errors_px(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Distance between two transforms over the ball, px."""
+    rows, columns = np.nonzero(scenes.ball_object().mask)
+    at = np.stack([columns, rows, np.ones(len(rows))])
+    a, b = found @ at, true @ at
+    return np.hypot(*(a[:2] / a[2] - b[:2] / b[2]))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_polarized_textured_shots_are_registered_to_a_twentieth_of_a_pixel(seed):
+    rng = np.random.default_rng(seed)
+    true = [np.eye(3)] + [pose(*rng.uniform(-20, 20, 2), rng.uniform(-0.5, 0.5)) for _ in range(2)]
+    radiance = scenes.stack(true, noise=0.004, seed=seed)
+    found = align.register(radiance, scenes.no_color(), align.Settings())
+    error = np.concatenate([errors_px(found.transform[k], true[k]) for k in (1, 2)])
+    assert np.median(error) < 0.05
+    assert error.max() < 0.15
+
+
+def test_a_shift_of_a_quarter_pixel_is_not_pulled_to_a_whole_one():
+    true = [np.eye(3), pose(0.25, -0.25, 0), pose(-0.25, 0.25, 0)]
+    found = align.register(scenes.stack(true, noise=0.002), scenes.no_color(), align.Settings())
+    for k in (1, 2):
+        assert errors_px(found.transform[k], true[k]).max() < 0.03
+
+
+def test_flash_energy_does_not_move_a_shot():
+    radiance = scenes.stack(gain=np.array([1.0, 0.9, 1.1]), noise=0.002)
+    found = align.register(radiance, scenes.no_color(), align.Settings())
+    assert errors_px(found.transform[2], np.eye(3)).max() < 0.03
+
+
+def test_another_scene_is_refused_by_name():
+    radiance = scenes.stack(noise=0.002)
+    value = radiance.value.copy()
+    value[1] = np.random.default_rng(0).uniform(0, 0.5, value[1].shape)
+    with pytest.raises(AlignmentError, match="shot 45° shows another scene"):
+        align.register(dataclasses.replace(radiance, value=value), scenes.no_color(), align.Settings())
+
+
+def test_a_shot_that_moved_too_far_is_refused_by_name_and_limit():
+    radiance = scenes.stack([np.eye(3), np.eye(3), pose(12, 0, 0)], noise=0.002)
+    with pytest.raises(AlignmentError, match=r"shot 90° moved by 1\d\.\d px, more than align.max_shift_px = 5"):
+        align.register(radiance, scenes.no_color(), align.Settings(max_shift_px=5))
+
+
+def test_a_locked_camera_is_left_alone():
+    found = align.register(scenes.stack(noise=0.01), scenes.no_color(), align.Settings(model="none"))
+    assert np.array_equal(found.transform, np.tile(np.eye(3), (3, 1, 1)))

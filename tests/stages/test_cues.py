@@ -1,0 +1,89 @@
+"""The cues: the paper's sphere figure, and one code for NumPy and torch."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from polcap.images import Quality
+from polcap.optics import fresnel
+from polcap.stages import cues, stokes
+from tests import scenes
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """Cues of a plain ball, as the pipeline makes them."""
+    radiance = scenes.stack(textured=False)
+    solved = stokes.solve(radiance, scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
+    return cues.compute(solved, scenes.no_color())
+
+
+def test_the_normalised_stokes_map_of_a_sphere_turns_twice_around_it(ball):
+    """The paper's figure: green (S1) peaks left and right, blue (S2) up-right and down-left."""
+    normal, mask = scenes.truth()
+    phi = np.arctan2(normal[..., 1], normal[..., 0])
+    tilted = mask & (normal[..., 2] < 0.8) & (normal[..., 2] > 0.3)
+    assert np.abs(ball.normalized_stokes[0] - np.cos(2 * phi))[tilted].max() < 0.06  # 1.7° of AoLP off axis
+    assert np.abs(ball.normalized_stokes[1] - np.sin(2 * phi))[tilted].max() < 0.06
+
+
+def test_dolp_of_a_sphere_follows_atkinson_and_hancock(ball):
+    normal, mask = scenes.truth()
+    ring = mask & (normal[..., 2] < np.cos(np.radians(40))) & (normal[..., 2] > np.cos(np.radians(70)))
+    law = fresnel.diffuse_dolp(normal[..., 2], 1.5)
+    assert np.abs(ball.dolp[ring] / law[ring] - 1).max() < 0.03  # the shared highlight dilutes by up to 2 %
+
+
+def test_dolp_of_noise_is_not_mistaken_for_tilt():
+    rng = np.random.default_rng(0)
+    sigma, rho = 0.01, 0.03
+    values = np.zeros((3, 200, 200, 1))
+    values[0] = 1
+    values[1] = rho + sigma * rng.normal(size=(200, 200, 1))
+    values[2] = sigma * rng.normal(size=(200, 200, 1))
+    covariance = np.zeros((6, 200, 200, 1))
+    covariance[[3, 5]] = sigma**2
+    _, found, dolp, _ = cues.polarization(values, covariance)
+    assert np.allclose(found, sigma)
+    assert abs(dolp.mean() - rho) < 0.0004  # 0.0017 without the correction
+
+
+def test_diffuse_color_is_the_fitted_least_intensity(ball):
+    expected = np.array([1, 1, 1]) / np.sqrt(3)
+    inside = ball.mask & (ball.quality == 0)
+    assert np.allclose(ball.diffuse_color[inside], expected, atol=1e-3)
+
+
+def test_radiance_of_a_frontal_patch_is_its_albedo(ball):
+    """White balance is on S0: ρ T₊(0)² at the middle, plus the highlight's π F0 D/4 (α = ¼: 4 F0)."""
+    front = ball.radiance[90, 90]
+    lobe = 0.04 / (4 * 0.25**2)
+    assert front == pytest.approx(0.5 * fresnel.transmission(1.0, 1.5)[0] ** 2 + lobe, rel=0.02)
+
+
+def test_torch_and_numpy_give_the_same_channels(ball):
+    torch = pytest.importorskip("torch", reason="torch comes with the [train] extra")
+    fields = {f.name: getattr(ball, f.name) for f in dataclasses.fields(ball) if f.name != "view"}
+    batch = SimpleNamespace(
+        **{
+            name: torch.as_tensor(np.asarray(value))[:, None] if name in ("ratio", "normalized_stokes")
+            else torch.as_tensor(np.asarray(value))[None]
+            for name, value in fields.items()
+        }
+    )  # fmt: skip
+    found = cues.channels(batch)
+    expected = cues.channels(ball)
+    assert found.shape == (1, len(cues.CHANNELS), *ball.mask.shape)
+    assert np.allclose(found[0].numpy(), expected, atol=1e-4)
+
+
+def test_nothing_outside_the_mask_reaches_the_network(ball):
+    assert (cues.channels(ball)[:, ~ball.mask] == 0).all()
+
+
+def test_clipping_reaches_the_network(ball):
+    clipped = dataclasses.replace(ball, quality=np.full_like(ball.quality, Quality.CLIPPED))
+    channel = cues.channels(clipped)[cues.CHANNELS.index("clipped")]
+    assert (channel[ball.mask] == 1).all()

@@ -1,0 +1,88 @@
+"""The analytic estimator against a ball whose normals are known."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from polcap.errors import ModelError
+from polcap.images import Network
+from polcap.optics import frames
+from polcap.stages import cues, infer, stokes
+from tests import scenes
+
+
+def seen(noise: float, textured: bool = True):
+    radiance = scenes.stack(noise=noise, textured=textured)
+    solved = stokes.solve(radiance, scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
+    return cues.compute(solved, scenes.no_color())
+
+
+def errors_deg(maps, cues_) -> np.ndarray:
+    local, mask = scenes.truth()
+    true = frames.from_ray_frame(local, cues_.rays)
+    inside = mask & maps.mask
+    return np.degrees(np.arccos(np.clip((maps.normal * true).sum(-1), -1, 1)))[inside]
+
+
+def test_a_clean_ball_is_recovered():
+    found = seen(noise=1e-5)
+    error = errors_deg(infer.estimate(found, None, infer.Settings()), found)
+    assert np.median(error) < 1.0
+    assert error.mean() < 2.0  # the outline's last pixel is half backdrop
+
+
+def test_a_noisy_textured_ball_is_recovered_and_its_error_foretold():
+    found = seen(noise=0.004)
+    maps = infer.estimate(found, None, infer.Settings())
+    error = errors_deg(maps, found)
+    assert error.mean() < 5.0
+    expected = maps.confidence[scenes.truth()[1] & maps.mask].mean()
+    assert error.mean() < expected < error.mean() + 5  # no interreflection here, for which 4° stand
+
+
+def test_no_half_turn_is_lost_on_a_convex_object():
+    found = seen(noise=0.002)
+    maps = infer.estimate(found, None, infer.Settings())
+    local, mask = scenes.truth()
+    true = frames.from_ray_frame(local, found.rays)
+    tilted = mask & maps.mask & (local[..., 2] < 0.9)
+    outward = (maps.normal[..., :2] * true[..., :2]).sum(-1)[tilted]
+    assert (outward > 0).mean() > 0.995
+
+
+def test_albedo_is_free_of_shading():
+    found = seen(noise=1e-4, textured=False)
+    maps = infer.estimate(found, None, infer.Settings())
+    local, mask = scenes.truth()
+    ring = mask & (local[..., 2] > 0.5) & (local[..., 2] < 0.85)
+    assert np.abs(maps.diffuse[ring] - 0.5).mean() < 0.03
+
+
+def network(channels=cues.CHANNELS) -> Network:
+    """A network that answers with the zenith channels' own normal: its maps are known in closed form."""
+
+    def run(picture):
+        x, y = picture[:, 5:6], picture[:, 6:7]
+        tilt = np.sqrt(x * x + y * y)
+        phi = np.arctan2(y, x) / 2
+        normal = np.concatenate([np.sin(tilt) * np.cos(phi), np.sin(tilt) * np.sin(phi), np.cos(tilt)], axis=1)
+        one = np.ones_like(x)
+        return {"normal": normal, "depth": 0 * one, "diffuse": np.repeat(0.3 * one, 3, 1),
+                "specular": np.repeat(0.04 * one, 3, 1), "roughness": 0.4 * one, "sigma": 5 * one}  # fmt: skip
+
+    return Network(run, "0123456789", channels, {"native_size": "256", "size_multiple": "32"}, "CPU")
+
+
+def test_a_pointwise_network_sees_no_seams_between_tiles():
+    found = seen(noise=0.002)
+    wide = network()
+    wide = dataclasses.replace(wide, metadata={"native_size": "1024", "size_multiple": "32"})
+    whole = infer.estimate(found, wide, infer.Settings(tile_px=1024))
+    tiled = infer.estimate(found, wide, infer.Settings(tile_px=128))
+    assert np.allclose(whole.normal, tiled.normal, atol=1e-5)
+
+
+def test_a_model_for_other_channels_is_refused():
+    with pytest.raises(ModelError, match="expects channels red"):
+        infer.estimate(seen(noise=0.002), network(("red",)), infer.Settings())

@@ -1,0 +1,112 @@
+"""Stokes parameters from polarizer shots, against Malus's law and their own noise."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from polcap.errors import CaptureError
+from polcap.images import AngleStack, Gains, ObjectMask, Quality
+from polcap.stages import stokes
+from tests import scenes
+
+WHOLE = ObjectMask(np.ones((8, 9), bool), (0, 0, 9, 8), "user")
+
+
+def seen(angles_deg, dolp, aolp_deg, noise=0.0, seed=0) -> AngleStack:
+    """Malus's law: I(θ) = ½ S0 (1 + ρ cos 2(θ − φ)), S0 = 1."""
+    angles = np.radians(angles_deg)
+    rng = np.random.default_rng(seed)
+    law = 0.5 * (1 + dolp * np.cos(2 * (angles - np.radians(aolp_deg))))
+    value = law[:, None, None, None] * np.ones((1, 8, 9, 3))
+    value = value + noise * rng.normal(size=value.shape)
+    return dataclasses.replace(
+        scenes_stack(len(angles)), value=value.astype(np.float32),
+        variance=np.full(value.shape, max(noise, 1e-6) ** 2, np.float32), angle=angles,
+    )  # fmt: skip
+
+
+def scenes_stack(shots: int) -> AngleStack:
+    blank = np.zeros((shots, 8, 9, 3), np.float32)
+    none = np.zeros((shots, 1, 3))
+    return AngleStack(
+        blank, blank, np.zeros((shots, 8, 9), np.uint8), np.zeros(shots), scenes.VIEW, none, none[..., 0],
+        np.zeros(shots), False, None, None,
+    )  # fmt: skip
+
+
+def solve(radiance: AngleStack, gains: Gains | None = None):
+    shots = len(radiance.angle)
+    return stokes.solve(radiance, scenes.still(shots), gains or scenes.equal(shots), WHOLE, stokes.Settings())
+
+
+@pytest.mark.parametrize("angles", [(0, 45, 90), (0, 60, 120), (0, 45, 90, 135), (10, 37, 101, 140, 170)])
+def test_malus_law_is_inverted(angles):
+    found = solve(seen(angles, dolp=0.3, aolp_deg=25)).stokes[:, 4, 4, 1]
+    assert np.allclose(found, [1, 0.3 * np.cos(np.radians(50)), 0.3 * np.sin(np.radians(50))], atol=2e-6)  # float32
+
+
+def test_light_through_a_horizontal_polarizer_has_positive_s1_and_up_right_light_positive_s2():
+    assert solve(seen((0, 45, 90), 1.0, 0)).stokes[1, 0, 0, 0] > 0.99
+    assert solve(seen((0, 45, 90), 1.0, 45)).stokes[2, 0, 0, 0] > 0.99
+
+
+def test_three_angles_follow_the_textbook_sum():
+    radiance = seen((0, 45, 90), 0.2, 70, noise=0.01)
+    i0, i45, i90 = radiance.value.astype(float)
+    found = solve(radiance).stokes
+    assert np.allclose(found, [i0 + i90, i0 - i90, 2 * i45 - i0 - i90], atol=1e-5)
+
+
+@pytest.mark.parametrize("angles", [(0, 45, 90), (0, 45, 90, 135), (0, 60, 120)])
+def test_covariance_is_the_scatter_of_repeated_captures(angles):
+    sigma = 0.01
+    results = [solve(seen(angles, 0.2, 30, sigma, seed)) for seed in range(40)]
+    samples = np.stack([r.stokes for r in results])  # (N, 3, H, W, C)
+    expected = results[0].covariance[[0, 3, 5]].mean((1, 2, 3))
+    actual = samples.var(0, ddof=1).mean((1, 2, 3))
+    assert np.allclose(actual / expected, 1, atol=0.05)  # 8640 values: 1.6 % of a variance
+
+
+def test_gains_divide_each_shot():
+    gain = np.array([[1.0] * 3, [1.1] * 3, [0.9] * 3])
+    radiance = seen((0, 45, 90), 0.3, 25)
+    brighter = dataclasses.replace(radiance, value=radiance.value * gain[:, None, None].astype(np.float32))
+    gains = dataclasses.replace(scenes.equal(), gain=gain)
+    assert np.allclose(solve(brighter, gains).stokes, solve(radiance).stokes, atol=1e-6)
+
+
+def test_a_fourth_angle_leaves_a_residual_where_a_shot_lies():
+    radiance = seen((0, 45, 90, 135), 0.3, 25)
+    assert solve(radiance).residual.max() < 1e-6
+    value = radiance.value.copy()
+    value[3] *= 1.05
+    assert solve(dataclasses.replace(radiance, value=value)).residual.min() > 0.002
+
+
+def test_angles_that_leave_s2_open_are_refused():
+    with pytest.raises(CaptureError, match="do not determine the Stokes parameters"):
+        solve(seen((0, 90, 180), 0.3, 25))
+
+
+def test_impossible_polarization_and_darkness_are_flagged():
+    assert (solve(seen((0, 45, 90), 0.9, 20)).quality & Quality.ILL_POSED).all()
+    assert not (solve(seen((0, 45, 90), 0.3, 20)).quality & Quality.ILL_POSED).any()
+    noisy = seen((0, 45, 90), 0.1, 20, noise=0.4)
+    assert (solve(noisy).quality & Quality.DARK).mean() > 0.9
+
+
+def test_clipping_in_one_angle_spoils_the_pixel():
+    radiance = seen((0, 45, 90), 0.3, 20)
+    quality = radiance.quality.copy()
+    quality[2, 3, 4] = Quality.CLIPPED
+    found = solve(dataclasses.replace(radiance, quality=quality)).quality
+    assert found[3, 4] & Quality.CLIPPED and not found[0, 0] & Quality.CLIPPED
+
+
+def test_colors_polarized_across_each_other_are_called_metal():
+    radiance = seen((0, 45, 90), 0.3, 20, noise=1e-4)
+    value = radiance.value.copy()
+    value[..., 2] = seen((0, 45, 90), 0.3, 60).value[..., 2]
+    assert (solve(dataclasses.replace(radiance, value=value)).quality & Quality.METAL).all()
+    assert not (solve(radiance).quality & Quality.METAL).any()
