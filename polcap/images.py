@@ -173,6 +173,8 @@ class ColorCalibration:
     source: Literal["chart", "corners", "profile", "camera", "none"]
     cost: float  # the detector's; NaN without a chart
     metres_per_px: float | None  # at the chart's distance, on this grid; None without a known chart size
+    falloff: tuple[float, float] = (0.0, 0.0)  # relative change of the light per patch, to the chart's right, down
+    glare: float = 0.0  # white light that the chart's gloss and the lens add to every patch [reflectance]
 
 
 @dataclass(frozen=True)

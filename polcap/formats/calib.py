@@ -75,6 +75,8 @@ class _Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     metres_per_px: float | None = None
     quads: list[list[list[float]]] | None = None
     corners: list[list[float]] | None = None
+    falloff: tuple[float, float] = (0.0, 0.0)
+    glare: float = 0.0
 
 
 def write_profile(path: Path, color: ColorCalibration) -> None:
@@ -87,6 +89,8 @@ def write_profile(path: Path, color: ColorCalibration) -> None:
         "metres_per_px": color.metres_per_px,
         "quads": _rounded(color.quads, 3),
         "corners": _rounded(color.corners, 3),
+        "falloff": list(color.falloff),
+        "glare": color.glare,
     }
     text = (
         "# polcap colour profile. matrix: camera radiance (I0 + I90) -> linear Rec.709 reflectance.\n"
@@ -118,6 +122,8 @@ def read_profile(path: Path) -> ColorCalibration:
         source=profile.source,
         cost=profile.cost,
         metres_per_px=profile.metres_per_px,
+        falloff=profile.falloff,
+        glare=profile.glare,
     )
 
 

@@ -23,6 +23,8 @@ from polcap.images import Floats
 ROWS, COLUMNS = 4, 6
 USUAL_PATCH = 0.88  # side of a patch / pitch
 _LEAST_BLUR, _GREATEST_BLUR = 0.004, 0.12  # 1σ of the edges [pitch]
+_GAMMA = 2.2
+_DARKEST = 1e-3  # of white; darker counts as this
 _MARGIN = 0.045  # how far beyond the outer patches the card is compared [pitch]
 
 
@@ -102,7 +104,8 @@ def refine(image: Floats, start: Placement, steps: int = 12) -> Placement:
 
     Parameters
     ----------
-    image : (H, W, 3), perceptually even (a gamma curve), white about 1. Pixels per patch: 10 or more.
+    image : (H, W, 3) linear, white about 1. Pixels per patch: 8 or more. Light mixes linearly at an edge,
+        but the difference is judged through a gamma of 2.2, so that dark patches count.
     """
     frame = _frame(start)  # image px → about the chart's own, so that the steps are well scaled
     at = _pixels(image.shape[:2], start)
@@ -155,7 +158,9 @@ def _draw(
     cover = across * along
     colors, card = _colors(value, cover, cell)
     contrast = (colors - card)[cell]  # (N, 3)
-    drawn = card + contrast * cover[:, None]
+    linear = np.maximum(card + contrast * cover[:, None], _DARKEST)
+    drawn = linear ** (1 / _GAMMA)
+    contrast = contrast * drawn / linear / _GAMMA
     du, dv = along * across_du, across * along_dv
     turn = homogeneous / depth[:, None]  # ∂u/∂h₁ = x/w, ∂u/∂h₃ = −u x/w
     cover_by = np.concatenate(
@@ -168,8 +173,9 @@ def _draw(
         ],
         axis=1,
     )  # (N, 10)
-    residual = value - drawn
-    spread = value - np.median(value, axis=0)
+    seen = np.maximum(value, _DARKEST) ** (1 / _GAMMA)
+    residual = seen - drawn
+    spread = seen - np.median(seen, axis=0)
     explained = 1 - float(np.mean(np.minimum(residual**2, 0.25)) / max(np.mean(spread**2), 1e-9))
     return residual, contrast[:, :, None] * cover_by[:, None, :], explained
 

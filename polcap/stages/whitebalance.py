@@ -37,13 +37,9 @@ _REMEDY = "give its corners with --chart x0,y0,…,x3,y3, a profile with --chart
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     chart_width_m: Annotated[
         float | None,
-        Meta(
-            gt=0, le=2, description="width of the chart between its outer patch corners [m]; unset: unknown"
-        ),
+        Meta(gt=0, le=2, description="width of the chart between its outer patch corners [m]; unset: unknown"),
     ] = None
-    max_cost: Annotated[
-        float, Meta(gt=0, le=1, description="greatest accepted cost of the chart detector")
-    ] = 0.06
+    max_cost: Annotated[float, Meta(gt=0, le=1, description="greatest accepted cost of the chart detector")] = 0.06
     max_delta_e: Annotated[
         float, Meta(gt=0, le=100, description="greatest accepted mean residual of the patches [CIEDE2000]")
     ] = 15.0
@@ -51,9 +47,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float,
         Meta(ge=0, le=1, description="least share of the chart's variance that 24 flat patches explain"),
     ] = 0.8
-    patch_share: Annotated[float, Meta(ge=0.2, le=0.95, description="sampled share of each patch's side")] = (
-        0.6
-    )
+    patch_share: Annotated[float, Meta(ge=0.2, le=0.95, description="sampled share of each patch's side")] = 0.6
 
 
 @stage(version=1)
@@ -63,6 +57,7 @@ def measure(
     """The colour matrix of a capture, on the scale of S0 = I₀ + I₉₀, with the chart's place and residuals.
 
     The patches of the reference shot give 2·I = S0, for a matt chart that faces the camera is unpolarized.
+    The matrix holds at the white patch, less the chart's glare: matrix @ S0 = reflectance + glare there.
     `delta_e` is NaN for patches left out because they are over-exposed. `metres_per_px` needs
     `settings.chart_width_m`: nothing is assumed about the chart's size.
 
@@ -89,6 +84,8 @@ def measure(
         source="corners" if request.mode == "corners" else "chart",
         cost=found.cost,
         metres_per_px=_scale(found.place, radiance.view, settings.chart_width_m),
+        falloff=(float(found.fit.slope[0]), float(found.fit.slope[1])),
+        glare=found.fit.glare,
     )
 
 
@@ -141,9 +138,7 @@ def _search(radiance: AngleStack, reference: ChartReference, settings: Settings)
         why = f"best detector cost {cheapest:.3f}, limit whitebalance.max_cost = {settings.max_cost:g}"
     else:
         why = f"best candidate (cost {cheapest:.3f}) does not look like 6 × 4 patches on a dark card"
-    raise ChartError(
-        f"no ColorChecker Classic in the reference shot ({tried} pictures of it tried; {why}); {_REMEDY}"
-    )
+    raise ChartError(f"no ColorChecker Classic in the reference shot ({tried} pictures of it tried; {why}); {_REMEDY}")
 
 
 def _at_corners(
@@ -151,9 +146,7 @@ def _at_corners(
 ) -> _Find:
     """The chart where the user says it is, placed more finely where the image allows it."""
     if corners_px is None or np.shape(corners_px) != (4, 2):
-        raise ChartError(
-            "--chart needs the four outer patch corners x0,y0,…,x3,y3, dark skin first, clockwise"
-        )
+        raise ChartError("--chart needs the four outer patch corners x0,y0,…,x3,y3, dark skin first, clockwise")
     height, width = radiance.value.shape[1:3]
     scale = radiance.view.scale
     corners = (np.asarray(corners_px, np.float64) - (scale - 1) / 2) / scale
@@ -162,9 +155,7 @@ def _at_corners(
     if not chart.is_view(given.homography):
         raise ChartError(f"{said} do not go round clockwise; start at the dark-skin patch, go along its row")
     if (corners < -0.5).any() or (corners > np.array([width, height]) - 0.5).any():
-        raise ChartError(
-            f"{said} reach outside the image of {width * scale:g} × {height * scale:g} px; check them"
-        )
+        raise ChartError(f"{said} reach outside the image of {width * scale:g} × {height * scale:g} px; check them")
     if given.pitch_px < _LEAST_PITCH_PX:
         raise ChartError(
             f"{said} put the patches {given.pitch_px:.1f} px apart on the merged image, at least "
@@ -248,7 +239,7 @@ def _among(places: list[Placement], start: Placement) -> bool:
 
 
 def _refine(value: Floats, start: Placement) -> Placement:
-    """Place the chart on a perceptual picture of its surroundings, averaged down where they are large."""
+    """Place the chart on its surroundings, averaged down where they are large."""
     around = chart.project(start.homography, np.array([[-1.0, -1], [7, -1], [7, 5], [-1, 5]]))
     x0, y0 = np.maximum(np.floor(around.min(axis=0)).astype(int), 0)
     x1, y1 = np.minimum(np.ceil(around.max(axis=0)).astype(int) + 1, [value.shape[1], value.shape[0]])
@@ -257,7 +248,7 @@ def _refine(value: Floats, start: Placement) -> Placement:
     crop = value[y0:y1, x0:x1]
     small = _resized(crop, min(1.0, _WORK_PITCH_PX / start.pitch_px))
     transform = _scaling(small.shape, crop.shape) @ np.array([[1.0, 0, -x0], [0, 1, -y0], [0, 0, 1]])
-    seen = np.clip(small / _white(small), 0.0, 2.0) ** (1 / 2.2)
+    seen = np.clip(small / _white(small), 0.0, 4.0)
     return chart.refine(seen, start.moved(transform)).moved(np.linalg.inv(transform))
 
 
@@ -345,16 +336,15 @@ def _from_camera(radiance: AngleStack) -> ColorCalibration:
 
 
 def _scale(place: Placement, view: View, width_m: float | None) -> float | None:
-    """Metres per pixel in the plane across the optical axis through the chart's centre: Z/f of its pose."""
+    """Metres per pixel in the plane across the optical axis through the chart's centre: Z/f.
+
+    With K the camera and H the homography from metres along the chart's width, K⁻¹H ∝ (r₁, r₂, t) and
+    |r₁| = 1 (Zhang, IEEE PAMI 2000): neither the chart's height nor its tilt is needed.
+    """
     if width_m is None:
         return None
-    corners = place.corners()
-    height_m = width_m * (chart.ROWS - 1 + place.patch) / (chart.COLUMNS - 1 + place.patch)
-    flat = np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) * [width_m / 2, height_m / 2, 0]
     camera = np.array([[view.focal, 0, view.center[0]], [0, view.focal, view.center[1]], [0, 0, 1]])
-    found, _, position = cv2.solvePnP(flat, corners, camera, None, flags=cv2.SOLVEPNP_IPPE)
-    if not found:
-        raise ChartError(
-            f"no flat chart {width_m:g} m wide fits its corners; check whitebalance.chart_width_m"
-        )
-    return float(position[2, 0] / view.focal)
+    middle = np.array([[1.0, 0, chart.COLUMNS / 2], [0, 1, chart.ROWS / 2], [0, 0, 1]])
+    pose = np.linalg.solve(camera, place.homography @ middle)
+    pitch_m = width_m / (chart.COLUMNS - 1 + place.patch)
+    return float(pitch_m * abs(pose[2, 2]) / np.linalg.norm(pose[:, 0]) / view.focal)
