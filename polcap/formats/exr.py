@@ -1,0 +1,78 @@
+"""In: named channels. Out: one OpenEXR file, lossless; and back. The only writer through OpenImageIO."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+
+from polcap.errors import DecodeError, StorageError
+from polcap.formats import atomic
+from polcap.images import Floats
+
+Attribute = str | int | float
+
+
+def write(
+    path: Path,
+    channels: Mapping[str, Floats],
+    attributes: Mapping[str, Attribute] | None = None,
+    *,
+    half: bool = False,
+) -> None:
+    """Write maps (H, W) under their channel names ("R", "normal.x", "S0.R"); ZIP, float32 or half.
+
+    Values beyond the range of half become its greatest. The same input gives the same bytes.
+
+    Raises
+    ------
+    StorageError
+        The file cannot be written.
+    """
+    names = list(channels)
+    pixels = np.stack([np.asarray(channels[name], dtype=np.float32) for name in names], axis=-1)
+    if half:
+        greatest = np.float32(np.finfo(np.float16).max)
+        pixels = np.clip(pixels, -greatest, greatest)  # NaN stays
+    height, width, count = pixels.shape
+    spec = oiio.ImageSpec(width, height, count, oiio.HALF if half else oiio.FLOAT)
+    spec.channelnames = names
+    spec.attribute("compression", "zip")
+    for key, value in (attributes or {}).items():
+        spec.attribute(key, value)
+    with atomic.path(path) as temporary:
+        temporary.touch()  # an OSError here says more than OpenImageIO's text
+        output = oiio.ImageOutput.create(str(temporary))
+        if output is None:
+            raise StorageError(f"cannot write {path}: {_line(oiio.geterror())}; end its name in .exr")
+        done = output.open(str(temporary), spec) and output.write_image(pixels)
+        if not (output.close() and done):
+            raise StorageError(f"cannot write {path}: {_line(output.geterror())}; check the disk's free space")
+
+
+def read(path: Path) -> tuple[dict[str, Floats], dict[str, object]]:
+    """Channels by name, each (H, W) float32, and the file's attributes.
+
+    Raises
+    ------
+    DecodeError
+        The file is missing, cut short or no OpenEXR file.
+    """
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        raise DecodeError(f"cannot read {path}: {_line(oiio.geterror())}; check the path")
+    try:
+        spec = source.spec()
+        pixels = source.read_image(oiio.FLOAT)
+        if pixels is None:
+            raise DecodeError(f"{path} is cut short: {_line(source.geterror())}; write it again")
+        names = tuple(spec.channelnames)
+        attributes = {item.name: item.value for item in spec.extra_attribs}
+    finally:
+        source.close()
+    pixels = np.asarray(pixels, dtype=np.float32).reshape(spec.height, spec.width, len(names))
+    return {name: pixels[..., k] for k, name in enumerate(names)}, attributes
+
+
+def _line(message: str) -> str:
+    return " ".join(message.split()) or "no reason given"

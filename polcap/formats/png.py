@@ -1,0 +1,79 @@
+"""In: an array of 8 or 16 bits. Out: a PNG; and back.
+
+No gamma or colour chunk is written: glTF ignores them, and viewers disagree on them. What the
+numbers mean is said beside the file (maps.json, the material).
+"""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.errors import DecodeError, StorageError
+from polcap.formats import atomic
+from polcap.images import Floats
+
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+def write(path: Path, array: Pixels) -> None:
+    """Write (H, W), (H, W, 3) RGB or (H, W, 4) RGBA, uint8 or uint16; the same array gives the same bytes.
+
+    Raises
+    ------
+    StorageError
+        The file cannot be written.
+    """
+    with atomic.path(path) as temporary:
+        temporary.write_bytes(encode(array))
+
+
+def encode(array: Pixels) -> bytes:
+    """The bytes of the PNG."""
+    if array.dtype not in (np.uint8, np.uint16):
+        raise TypeError(f"PNG holds uint8 or uint16, not {array.dtype}")
+    done, data = cv2.imencode(".png", _swapped(array), [cv2.IMWRITE_PNG_COMPRESSION, 4])
+    if not done:
+        raise StorageError(f"cannot encode a picture of {array.shape} as PNG; report this as a bug")
+    return bytes(data.tobytes())
+
+
+def read(path: Path) -> Pixels:
+    """Read a PNG as written above; channels in RGB(A) order.
+
+    Raises
+    ------
+    DecodeError
+        The file is missing, cut short or no picture.
+    """
+    try:
+        data = np.frombuffer(Path(path).read_bytes(), dtype=np.uint8)
+    except OSError as error:
+        raise DecodeError(f"cannot read {path}: {error.strerror}; check the path") from error
+    try:
+        array = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    except cv2.error:
+        array = None
+    if array is None:
+        raise DecodeError(f"{path} is not a whole PNG ({len(data)} bytes); write it again")
+    return np.asarray(_swapped(array))
+
+
+def sixteen_bits(value: Floats) -> NDArray[np.uint16]:
+    """0…1 as 0…65535, clipped."""
+    return np.asarray(np.rint(np.clip(np.asarray(value, dtype=np.float64), 0.0, 1.0) * 65535), dtype=np.uint16)
+
+
+def encode_srgb(linear: Floats) -> Floats:
+    """Linear 0…1 → sRGB 0…1, clipped (IEC 61966-2-1)."""
+    value = np.clip(linear, 0.0, 1.0)
+    return np.asarray(np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055))
+
+
+def _swapped(array: Any) -> Any:
+    """RGB ↔ BGR."""
+    if array.ndim == 2:
+        return np.ascontiguousarray(array)
+    return np.ascontiguousarray(array[..., [2, 1, 0, 3][: array.shape[-1]]])
