@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-DATA = Path(os.environ.get("POLCAP_DATA", "/nonexistent"))
+DATA = Path(os.environ.get("POLCAP_DATA") or "/nonexistent")
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="POLCAP_DATA names no folder of real captures")
 
 _FORMS = {1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 7: "s", 10: "ii"}
