@@ -84,13 +84,13 @@ def write(folder: Path, scene: Scene, shoot: Shoot) -> None:
         raise CaptureError(f"{folder} is not an empty folder; choose another place for the capture")
     buffer = render.gbuffer(scene, shoot.view, shoot.height, shoot.width)
     to_camera, color_matrix, neutral = _camera(shoot)
-    reference = _box(shoot, np.eye(3), lambda x, y: render.stokes(scene, shoot.view, x, y, render.guide(buffer)))
+    reference = _light(scene, shoot, buffer, np.eye(3))
     middle = _middle_exposure(scene, shoot, buffer, reference[0] @ to_camera.T)
     with atomic.folder(folder) as place:
         files = []
         for shot, angle in enumerate(shoot.angles_deg):
             pose = _pose(shoot, shot)
-            radiance = _expose_shot(scene, shoot, buffer, pose) @ to_camera.T
+            radiance = _passed(scene, shoot, buffer, pose, reference if shot == 0 else None) @ to_camera.T
             for frame in range(shoot.exposures):
                 number = shot * shoot.exposures + frame
                 name = f"{_folder_name(angle)}/IMG_{number + 1:04d}.DNG"
@@ -153,30 +153,43 @@ def _pose(shoot: Shoot, shot: int) -> dict[str, Any]:
     }
 
 
-def _expose_shot(scene: Scene, shoot: Shoot, buffer: GBuffer, pose: dict[str, Any]) -> Floats:
-    """What one shot's polarizer passes, (H, W, 3) linear Rec.709: a camera rolled by r turns the polarizer too."""
-    weights = np.radians(pose["actual_deg"] - pose["rot_deg"]), shoot.extinction_ratio
-    start = render.guide(buffer)
+def _passed(scene: Scene, shoot: Shoot, buffer: GBuffer, pose: dict[str, Any], reference: Floats | None) -> Floats:
+    """What one shot's polarizer passes, (H, W, 3) linear Rec.709; `reference`, where known, is the shot's light.
+
+    A camera that rolls turns its polarizer too.
+    """
     back = np.linalg.inv(np.array(pose["transform"]))
-    return _box(shoot, back, lambda x, y: render.photograph(scene, shoot.view, x, y, weights, start))
+    stokes = _light(scene, shoot, buffer, back) if reference is None else reference
+    y, x = np.mgrid[: shoot.height, : shoot.width].astype(np.float64)
+    v = render.view_rays(shoot.view, *_moved(back, x, y))
+    angle = np.radians(pose["actual_deg"] - pose["rot_deg"])
+    passed = render.polarize(stokes, v, angle, shoot.extinction_ratio)
+    return _blurred(shoot, passed)
 
 
-def _box(shoot: Shoot, back: Floats, picture: Any) -> Floats:
-    """Mean of `picture(x, y)` over each pixel's square, (..., H, W, 3), then the lens's blur.
+def _light(scene: Scene, shoot: Shoot, buffer: GBuffer, back: Floats) -> Floats:
+    """Mean Stokes parameters over each pixel's square, (3, H, W, 3).
 
     `back` (3, 3) takes the pixels to the reference shot's, where the scene stands still.
     """
     y, x = np.mgrid[: shoot.height, : shoot.width].astype(np.float64)
+    start = render.guide(buffer)
     offsets = (np.arange(shoot.samples) + 0.5) / shoot.samples - 0.5
-    total: Any = 0.0
+    total = np.zeros((3, shoot.height, shoot.width, 3), np.float32)
     for dy in offsets:
         for dx in offsets:
-            px, py = x + dx, y + dy
-            total = total + picture(
-                back[0, 0] * px + back[0, 1] * py + back[0, 2], back[1, 0] * px + back[1, 1] * py + back[1, 2]
-            )
-    mean = total / shoot.samples**2
-    return np.asarray(gaussian_filter(mean, shoot.blur_px, axes=(-3, -2))) if shoot.blur_px else np.asarray(mean)
+            total += render.stokes(scene, shoot.view, *_moved(back, x + dx, y + dy), start)
+    return total / shoot.samples**2
+
+
+def _moved(matrix: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    a, b = matrix[:2]
+    return a[0] * x + a[1] * y + a[2], b[0] * x + b[1] * y + b[2]
+
+
+def _blurred(shoot: Shoot, image: Floats) -> Floats:
+    """Through the lens, (..., H, W, C)."""
+    return np.asarray(gaussian_filter(image, shoot.blur_px, axes=(-3, -2))) if shoot.blur_px else image
 
 
 def _camera(shoot: Shoot) -> tuple[Floats, Floats, Floats]:
@@ -274,5 +287,5 @@ def _write_truth(
             specular=(specular * mask[..., None]).astype(np.float16),
             roughness=(roughness * mask).astype(np.float16),
             ior=(ior * mask).astype(np.float16),
-            S=(reference / white * mask[..., None]).astype(np.float16),
+            S=(_blurred(shoot, reference) / white * mask[..., None]).astype(np.float16),
         )

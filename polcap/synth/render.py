@@ -4,8 +4,6 @@ Everything is rendered where a shot's own pixels look; nothing is ever resampled
 `optics/frames.py`, metres, the lens at the origin. Radiance is in linear Rec.709.
 """
 
-from dataclasses import dataclass
-
 import msgspec
 import numpy as np
 from scipy.ndimage import minimum_filter
@@ -18,7 +16,7 @@ from polcap.synth import materials, trace
 from polcap.synth.chart import Chart
 from polcap.synth.materials import Coat
 from polcap.synth.shapes import Shape
-from polcap.synth.trace import Hits, Indices, Vector
+from polcap.synth.trace import Hits, Vector
 
 
 class Scene(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -39,41 +37,27 @@ class Scene(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return Rotation.from_rotvec(self.turn_deg, degrees=True)
 
 
-@dataclass(frozen=True)
-class _Sample:
-    """One ray per pixel: unpolarized surroundings, and the object in front of them."""
-
-    surroundings: Floats  # (P, 3) S0
-    index: Indices  # (N,) the pixels that see the object
-    stokes: Floats  # (3, N, 3)
-    ray: Floats  # (N, 3)
-
-
 def stokes(scene: Scene, view: View, x: Floats, y: Floats, start: Floats | None = None) -> Floats:
     """Stokes parameters (3, H, W, 3) at pixel positions x, y (H, W) of `view`, in the frame of each ray.
 
     A white matt plane at the object's distance that faces the flash has S0 = 1. `start` is of `guide`.
     """
-    sample = _sample(scene, view, x, y, start)
+    v = view_rays(view, x, y).reshape(-1, 3)
+    if start is not None:
+        row = np.clip(np.rint(y), 0, start.shape[0] - 1).astype(np.intp)
+        column = np.clip(np.rint(x), 0, start.shape[1] - 1).astype(np.intp)
+        start = start[row, column].ravel()
+    hits, surroundings = _visible(scene, v, start)
     out = np.zeros((3, x.size, 3), np.float32)
-    out[0] = sample.surroundings
-    out[:, sample.index] = sample.stokes
+    out[0] = surroundings
+    out[:, hits.index] = _shade(scene, v[hits.index], hits)
     return out.reshape(3, *x.shape, 3)
 
 
-def photograph(
-    scene: Scene, view: View, x: Floats, y: Floats, weights: tuple[float, float], start: Floats | None = None
-) -> Floats:
-    """What a polarizer passes at pixel positions x, y (H, W) of `view`, (H, W, 3).
-
-    `weights` are its angle [rad] in the frame of `view` and its extinction ratio.
-    """
-    angle, extinction_ratio = weights
-    sample = _sample(scene, view, x, y, start)
-    out = sample.surroundings / 2
-    axis = frames.axis_on_ray(np.asarray(angle), sample.ray)
-    out[sample.index] = np.einsum("ns,snc->nc", mueller.analyzer(axis, extinction_ratio), sample.stokes)
-    return out.reshape(*x.shape, 3)
+def polarize(stokes: Floats, v: Floats, angle: float, extinction_ratio: float) -> Floats:
+    """What a polarizer at `angle` [rad, in the picture] passes of (3, H, W, 3) along the rays v (H, W, 3)."""
+    weights = mueller.analyzer(frames.axis_on_ray(np.asarray(angle), v), extinction_ratio)
+    return np.asarray(np.einsum("hws,shwc->hwc", weights.astype(np.float32), stokes))
 
 
 def gbuffer(scene: Scene, view: View, height: int, width: int) -> GBuffer:
@@ -122,17 +106,6 @@ def project(view: View, point: Floats) -> Floats:
     x = view.center[0] - view.focal * point[..., 0] / point[..., 2]
     y = view.center[1] + view.focal * point[..., 1] / point[..., 2]
     return np.stack([x, y], axis=-1)
-
-
-def _sample(scene: Scene, view: View, x: Floats, y: Floats, start: Floats | None) -> _Sample:
-    v = view_rays(view, x, y).reshape(-1, 3)
-    begin = None
-    if start is not None:
-        row = np.clip(np.rint(y), 0, start.shape[0] - 1).astype(np.intp)
-        column = np.clip(np.rint(x), 0, start.shape[1] - 1).astype(np.intp)
-        begin = start[row, column].ravel()
-    hits, surroundings = _visible(scene, v, begin)
-    return _Sample(surroundings, hits.index, _shade(scene, v[hits.index], hits), v[hits.index])
 
 
 def _visible(scene: Scene, v: Floats, start: Floats | None = None) -> tuple[Hits, Floats]:
