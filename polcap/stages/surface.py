@@ -76,7 +76,7 @@ def integrate(maps: SurfaceMaps, distance_m: float | None, settings: Settings) -
     depth = np.full(maps.mask.shape, np.nan)
     depth[maps.mask] = np.exp((z - np.median(z)) / maps.view.focal)
     depth *= 1.0 if distance_m is None else distance_m
-    return _mesh(depth, maps, distance_m is not None, settings)
+    return triangulate(depth, maps, distance_m is not None, settings)
 
 
 @dataclass(frozen=True)
@@ -236,8 +236,16 @@ class _Grid:
         return sparse.coo_matrix((np.concatenate([-link, -link, total]), (row, column)), (size, size)).tocsr()
 
 
-def _mesh(depth: Floats, maps: SurfaceMaps, metric: bool, settings: Settings) -> Mesh:
-    """One vertex per pixel of a regular grid in the mask; triangles where the surface holds together."""
+def triangulate(depth: Floats, maps: SurfaceMaps, metric: bool, settings: Settings) -> Mesh:
+    """The mesh of a depth map (H, W): for an export from stored maps, without integrating again.
+
+    One vertex per pixel of a regular grid in the mask; triangles where the surface holds together.
+
+    Raises
+    ------
+    ObjectError
+        No triangle fits into the mask.
+    """
     height, width = maps.mask.shape
     step = max(1, int(np.ceil(np.sqrt(maps.mask.sum() / settings.max_vertices))))
     rows, columns = np.arange(0, height, step), np.arange(0, width, step)

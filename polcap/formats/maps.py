@@ -1,0 +1,192 @@
+"""In: the maps of an object. Out: the folder maps/ of a result, as docs/reference/result.md says; and back."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.errors import DecodeError
+from polcap.formats import atomic, exr, png
+from polcap.images import Cues, Floats, Mesh, StokesImage, SurfaceMaps, View
+
+CONVENTIONS = {
+    "frame": "camera: x right, y up, z toward the camera; a normal facing the camera is (0, 0, 1)",
+    "normals": "+Y (OpenGL)",
+    "pixels": "row 0 on top; pixel centres on whole numbers",
+    "raw_pixel": "map pixel (i, j) is centred on visible RAW pixel crop[0:2] + scale * (i, j) + (scale - 1) / 2",
+    "point": "map pixel (i, j) at depth d is d * ((i - cx) / f, -(j - cy) / f, -1), f and (cx, cy) of camera",
+    "angles": "polarizer and AoLP from image x toward image up, counter-clockwise as the photographer sees it",
+    "color": "linear Rec.709, D65; PNG of colours is sRGB-encoded",
+    "outside": "values outside mask.png mean nothing; they are 0, and (0, 0, 1) in normal.png",
+}
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a result's maps/ tells."""
+
+    maps: SurfaceMaps
+    depth: Floats  # (H, W) NaN outside the mask
+    metric: bool
+
+
+def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues: Cues) -> None:
+    """Write every map as EXR, the main ones as PNG too, and maps.json last.
+
+    The same values give the same bytes.
+
+    Raises
+    ------
+    StorageError
+        A file cannot be written.
+    """
+    folder = Path(folder)
+    inside = np.asarray(maps.mask, dtype=bool)
+    depth = np.where(inside & np.isfinite(mesh.depth), mesh.depth, 0.0).astype(np.float32)
+    seen = depth[depth > 0]
+    near, far = (float(seen.min()), float(seen.max())) if seen.size else (0.0, 1.0)
+    normal, flat = _kept(maps.normal, inside), np.where(inside[..., None], maps.normal, [0.0, 0.0, 1.0])
+
+    exr.write(folder / "normal.exr", _channels("RGB", normal))
+    exr.write(folder / "depth.exr", {"Z": depth})
+    exr.write(folder / "diffuse.exr", _channels("RGB", _kept(maps.diffuse, inside)), half=True)
+    exr.write(folder / "specular.exr", _channels("RGB", _kept(maps.specular, inside)), half=True)
+    exr.write(folder / "roughness.exr", {"Y": _kept(maps.roughness, inside)}, half=True)
+    exr.write(folder / "confidence.exr", {"Y": _kept(maps.confidence, inside)}, half=True)
+    exr.write(folder / "stokes.exr", _stokes_channels(stokes), half=True)
+    exr.write(folder / "cues.exr", _cue_channels(cues), half=True)
+
+    png.write(folder / "normal.png", png.sixteen_bits(flat / 2 + 0.5))
+    png.write(folder / "depth.png", png.sixteen_bits(np.where(depth > 0, (depth - near) / max(far - near, 1e-9), 0)))
+    png.write(folder / "diffuse.png", _picture(_kept(maps.diffuse, inside)))
+    png.write(folder / "specular.png", _picture(_kept(maps.specular, inside)))
+    png.write(folder / "roughness.png", png.sixteen_bits(_kept(maps.roughness, inside)))
+    png.write(folder / "mask.png", np.where(inside, 255, 0).astype(np.uint8))
+    with atomic.path(folder / "maps.json") as temporary:
+        temporary.write_text(
+            json.dumps(_description(maps, mesh.metric, near, far), indent=2, ensure_ascii=False) + "\n", "utf-8"
+        )
+
+
+def read(folder: Path) -> Stored:
+    """Read back what `write` wrote, from the EXRs, mask.png and maps.json.
+
+    Raises
+    ------
+    DecodeError
+        A file is missing, damaged, or of another size than maps.json says.
+    """
+    folder = Path(folder)
+    try:
+        said = json.loads((folder / "maps.json").read_text("utf-8"))
+        width, height = said["size"]
+        camera = said["camera"]
+        x0, y0 = (value / said["scale"] for value in said["crop"][:2])
+        center = (float(camera["center_px"][0]), float(camera["center_px"][1]))
+        view = View(camera["focal_px"], center, said["scale"], (x0, y0), camera["focal_known"])
+        metric, estimator = said["depth"]["unit"] == "m", str(said["estimator"])
+    except OSError as error:
+        raise DecodeError(f"{folder} holds no maps.json ({error.strerror}); give a result's folder") from error
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        raise DecodeError(f"{folder / 'maps.json'} is not as polcap wrote it ({error}); process again") from error
+
+    def channels(name: str, letters: str) -> Floats:
+        found, _ = exr.read(folder / f"{name}.exr")
+        planes = [found[letter] for letter in letters if letter in found]
+        if len(planes) != len(letters) or planes[0].shape != (height, width):
+            raise DecodeError(f"{folder / name}.exr is not {width} × {height} of {letters}; process again")
+        return np.stack(planes, axis=-1) if len(letters) > 1 else planes[0]
+
+    mask = png.read(folder / "mask.png")
+    if mask.shape != (height, width):
+        raise DecodeError(f"{folder / 'mask.png'} is not {width} × {height}; process again")
+    inside = mask > 127
+    return Stored(
+        maps=SurfaceMaps(
+            normal=channels("normal", "RGB"),
+            diffuse=channels("diffuse", "RGB"),
+            specular=channels("specular", "RGB"),
+            roughness=channels("roughness", "Y"),
+            depth_prior=None,
+            confidence=channels("confidence", "Y"),
+            mask=inside,
+            view=view,
+            estimator=estimator,
+        ),
+        depth=np.where(inside, channels("depth", "Z"), np.nan).astype(np.float32),
+        metric=metric,
+    )
+
+
+def _description(maps: SurfaceMaps, metric: bool, near: float, far: float) -> dict[str, Any]:
+    """maps.json."""
+    view = maps.view
+    height, width = maps.mask.shape
+    x, y = view.origin
+    unit = "m" if metric else "relative"
+    linear, encoded = "linear Rec.709", "8 bit, sRGB"
+    return {
+        "format": "polcap maps 1",
+        "crop": [_plain(v * view.scale) for v in (x, y, x + width, y + height)],
+        "size": [width, height],
+        "scale": _plain(view.scale),
+        "camera": {
+            "focal_px": float(view.focal),
+            "center_px": [float(v) for v in view.center],
+            "focal_known": view.known,
+            "unit": "map pixels",
+        },
+        "depth": {"unit": unit, "near": near, "far": far},
+        "estimator": maps.estimator,
+        "conventions": CONVENTIONS,
+        "maps": {
+            "normal.exr": "unit vectors: R x, G y, B z; float",
+            "normal.png": "16 bit, n * 0.5 + 0.5",
+            "depth.exr": f"Z: distance along the optical axis, growing away from the camera, {unit}; float",
+            "depth.png": "16 bit, (depth - near) / (far - near)",
+            "diffuse.exr": f"diffuse albedo rho_d, {linear}; half",
+            "diffuse.png": encoded,
+            "specular.exr": f"specular albedo F0, {linear}; half",
+            "specular.png": encoded,
+            "roughness.exr": "perceptual roughness, alpha = roughness squared, linear; half",
+            "roughness.png": "16 bit, linear",
+            "mask.png": "8 bit, 255 on the object",
+            "confidence.exr": "expected error of the normal, degrees; half",
+            "stokes.exr": "S0.R ... S2.B in camera channels, linear, sensor white at the reference exposure = 1; half",
+            "cues.exr": "dolp; aolp in degrees, 0 ... 180; normalized.S1, normalized.S2; diffuse_color.R, .G, .B; half",
+        },
+    }
+
+
+def _plain(value: float) -> int | float:
+    return int(value) if float(value).is_integer() else float(value)
+
+
+def _kept(values: Floats, inside: NDArray[np.bool_]) -> Floats:
+    return np.where(inside if values.ndim == 2 else inside[..., None], values, 0).astype(np.float32)
+
+
+def _channels(names: str, values: Floats) -> dict[str, Floats]:
+    return {name: values[..., k] for k, name in enumerate(names)}
+
+
+def _picture(linear: Floats) -> NDArray[np.uint8]:
+    return np.rint(255 * png.encode_srgb(linear)).astype(np.uint8)
+
+
+def _stokes_channels(stokes: StokesImage) -> dict[str, Floats]:
+    return {f"S{s}.{c}": stokes.stokes[s, ..., k] for s in range(3) for k, c in enumerate("RGB")}
+
+
+def _cue_channels(cues: Cues) -> dict[str, Floats]:
+    aolp = np.degrees(np.arctan2(cues.normalized_stokes[1], cues.normalized_stokes[0]) / 2) % 180.0
+    return {
+        "dolp": cues.dolp,
+        "aolp": aolp,
+        "normalized.S1": cues.normalized_stokes[0],
+        "normalized.S2": cues.normalized_stokes[1],
+        **{f"diffuse_color.{c}": cues.diffuse_color[..., k] for k, c in enumerate("RGB")},
+    }
