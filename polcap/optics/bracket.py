@@ -94,7 +94,7 @@ class FirstEstimate:
             x = np.where(served, self._number[rows] / np.maximum(exposure, 1e-20), otherwise[rows])
             mean = box(x)
             spread = box((x - mean) ** 2)
-            e = np.where(served, exposure, 1e20)
+            e = np.where(served, exposure, np.float32(1e15))
             noise = np.maximum(mean, 0) / e + self._floor[rows] / (e * e)
             keep = np.clip(1 - 1.5 * noise / np.maximum(spread, 1e-20), 0, 1)
             out[target] = (mean + keep * (x - mean))[inner]

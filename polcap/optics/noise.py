@@ -116,28 +116,41 @@ def misfit(
     """How two registered frames (H, W, C) differ beyond noise: variance per squared gradient, (C,) px².
 
     Registration errors and aliasing show at edges. second = ratio · first; gain: what resampling made of
-    the second frame's noise. The median over tiles with edges; 0 where it is not significant.
+    the second frame's noise. From the tiles that have edges; 0 where it is not significant.
     """
     r = np.asarray(ratio, np.float32)
-    excess, edge = [], []
+    columns: tuple[list[Floats], ...] = ([], [], [])
     for rows in strips(*usable.shape):
         a, d = first[rows], second[rows][1:-1, 1:-1] / r - first[rows][1:-1, 1:-1]
         gx, gy = a[1:-1, 2:] - a[1:-1, :-2], a[2:, 1:-1] - a[:-2, 1:-1]
         level, offset = _tiles(a[1:-1, 1:-1], usable[rows]), _tiles(d, usable[rows])
-        own, other = lines[0].variance(level), lines[1].variance(level * r) / r**2 * gain
-        excess.append(_tiles(d * d, usable[rows]) - offset**2 - own - other)
-        gradient = _tiles((gx * gx + gy * gy) / 4, usable[rows]) - own
-        edge.append(np.where(gradient > own + other, gradient, np.nan))
+        own = lines[0].variance(level)
+        columns[0].append(own + lines[1].variance(level * r) / r**2 * gain)
+        columns[1].append(_tiles(d * d, usable[rows]) - offset**2)
+        columns[2].append(_tiles((gx * gx + gy * gy) / 4, usable[rows]) - own)
     out = np.zeros(first.shape[2], np.float32)
-    quotient = np.concatenate(excess) / np.concatenate(edge) if excess else np.zeros((0, len(out)))
-    for c in range(len(out)):
-        q = quotient[np.isfinite(quotient[:, c]), c]
-        if len(q) < _LEAST_TILES:
-            continue
-        middle = float(np.median(q))
-        sigma = 1.25 * 1.4826 * float(np.median(np.abs(q - middle))) / len(q) ** 0.5
-        out[c] = middle if middle > 3 * sigma else 0.0
+    if columns[0]:
+        expected, seen, edge = (np.concatenate(column) for column in columns)
+        for c in range(len(out)):
+            out[c] = _per_edge(expected[:, c], seen[:, c], edge[:, c])
     return out
+
+
+def _per_edge(expected: Floats, seen: Floats, edge: Floats) -> float:
+    """k of seen = expected + k · edge by relative least squares, the worst 3 % of the tiles left out."""
+    good = np.isfinite(seen) & (edge > 0.5 * expected)
+    if good.sum() < _LEAST_TILES:
+        return 0.0
+    expected, excess, edge = expected[good], seen[good] - expected[good], edge[good]
+    k = sigma = 0.0
+    for _ in range(8):
+        model = expected + k * edge
+        z = excess / model
+        inner = z <= np.quantile(z, 0.97)
+        x, y = (edge / model)[inner], z[inner]
+        k = max(float(np.sum(x * y) / np.sum(x * x)), 0.0)
+        sigma = float(np.sqrt(np.sum((x * (y - k * x)) ** 2)) / np.sum(x * x))
+    return k if k > 3 * sigma else 0.0
 
 
 class Lines:
