@@ -38,6 +38,7 @@ def write(
     spec = oiio.ImageSpec(width, height, count, oiio.HALF if half else oiio.FLOAT)
     spec.channelnames = names
     spec.attribute("compression", "zip")
+    spec.attribute("DateTime", "")  # else the hour of writing goes in, and no two files are equal
     for key, value in (attributes or {}).items():
         spec.attribute(key, value)
     with atomic.path(path) as temporary:

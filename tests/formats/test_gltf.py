@@ -1,0 +1,76 @@
+"""GLB: judged by the Khronos validator and by a second reader, not by its writer."""
+
+import json
+import shutil
+import struct
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from polcap.formats import gltf
+from polcap.images import Asset
+from tests import surfaces
+
+NODE = Path(__file__).parents[1] / "gltf"
+
+
+@pytest.fixture(scope="module")
+def asset() -> Asset:
+    maps = surfaces.maps(ripple=0.1, roughness=0.5, specular=0.05)
+    return surfaces.built(maps, surfaces.mesh(maps))
+
+
+def document(data: bytes) -> dict[str, Any]:
+    magic, version, size = struct.unpack_from("<4sII", data)
+    assert (magic, version, size) == (b"glTF", 2, len(data))
+    length, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON"
+    return dict(json.loads(data[20 : 20 + length]))
+
+
+def test_khronos_validator_finds_nothing(asset: Asset, tmp_path: Path) -> None:
+    node = shutil.which("node")
+    if node is None or not (NODE / "node_modules" / "gltf-validator").is_dir():
+        pytest.skip("needs node, and `npm ci` in tests/gltf")
+    gltf.write(tmp_path / "ball.glb", asset, "ball")
+    done = subprocess.run(
+        [node, str(NODE / "validate.js"), str(tmp_path / "ball.glb")],
+        capture_output=True, check=True, timeout=60,
+    )  # fmt: skip
+    report = json.loads(done.stdout)
+    issues = report["issues"]
+    assert (issues["numErrors"], issues["numWarnings"], issues["numHints"]) == (0, 0, 0), issues["messages"]
+    assert {message["code"] for message in issues["messages"]} <= {"IMAGE_NPOT_DIMENSIONS"}  # fine since WebGL 2
+    assert report["info"]["totalTriangleCount"] == len(asset.mesh.faces)
+
+
+def test_second_reader_finds_the_same_geometry(asset: Asset, tmp_path: Path) -> None:
+    gltf.write(tmp_path / "ball.glb", asset, "ball")
+    read = trimesh.load(tmp_path / "ball.glb", force="mesh", process=False, skip_materials=True)
+    middle = gltf.center(asset.mesh.vertices)
+    assert np.allclose(read.vertices, asset.mesh.vertices - middle, atol=1e-6)
+    assert np.array_equal(read.faces, asset.mesh.faces)
+    assert np.allclose(read.bounds.sum(axis=0), 0, atol=1e-6)  # the object stands at the origin
+    assert np.allclose(np.ptp(read.bounds, axis=0)[:2], 2 * surfaces.RADIUS, rtol=0.1)  # metres
+
+
+def test_extensions_carry_index_and_reflectance(asset: Asset) -> None:
+    said = document(gltf.encode(asset, "ball"))
+    extensions = said["materials"][0]["extensions"]
+    assert extensions["KHR_materials_ior"] == {"ior": 1.5}
+    factor = extensions["KHR_materials_specular"]["specularColorFactor"]
+    assert np.allclose(factor, 0.05 / 0.04, rtol=1e-5)  # F0 = 0.04 · factor; may exceed 1
+    assert said["asset"]["extras"]["unit"] == "metre"
+    assert said["asset"]["extras"]["origin_in_camera"][2] < -0.5
+
+
+def test_same_asset_gives_the_same_bytes(asset: Asset) -> None:
+    assert gltf.encode(asset, "ball") == gltf.encode(asset, "ball")
+
+
+def test_names_outside_ascii_survive(asset: Asset) -> None:
+    assert document(gltf.encode(asset, "Krug “ø”"))["nodes"][0]["name"] == "Krug “ø”"

@@ -1,0 +1,76 @@
+"""Maps and mesh to textures: glTF's own formulas, read backwards, give the maps again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from polcap.images import Asset, Floats, SurfaceMaps
+from polcap.optics import color
+from polcap.stages import asset, surface
+from tests import surfaces
+
+
+def rendered_normals(of: Asset, maps: SurfaceMaps) -> Floats:
+    """A renderer's normals at the vertices' pixels: texture in the vertex's own frame."""
+    mesh = of.mesh
+    column, row = np.rint(mesh.uv * [surfaces.WIDTH, surfaces.HEIGHT] - 0.5).astype(int).T
+    x, y, z = (of.normal[row, column] / 127.5 - 1).T[..., None]
+    bitangent = np.cross(mesh.normals, mesh.tangents[:, :3]) * mesh.tangents[:, 3:]
+    normal = x * mesh.tangents[:, :3] + y * bitangent + z * mesh.normals
+    return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True)), (row, column)
+
+
+@pytest.mark.parametrize("flat", [False, True])
+@pytest.mark.parametrize("thinned", [False, True])
+def test_renderer_sees_the_maps_normals_whatever_the_mesh(flat: bool, thinned: bool) -> None:
+    maps = surfaces.maps(ripple=0.2)
+    mesh = surfaces.flat_mesh(maps) if flat else surfaces.mesh(surfaces.maps())
+    if thinned:
+        mesh = surfaces.mesh(surfaces.maps(), surface.Settings(max_vertices=2000))
+    built = surfaces.built(maps, mesh)
+    seen, (row, column) = rendered_normals(built, maps)
+    cosine = np.sum(seen * maps.normal[row, column], axis=-1)
+    error = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    steep = maps.normal[row, column][:, 2] < 0.1  # a flat mesh cannot show normals that leave it backwards
+    assert np.percentile(error[~steep], 99) < 0.6  # 8 bits: 0.22° per component
+    assert np.median(error) < 0.3
+
+
+def test_shape_is_not_counted_twice() -> None:
+    maps = surfaces.maps()
+    built = surfaces.built(maps, surfaces.mesh(maps))
+    inner = maps.mask & (maps.normal[..., 2] > 0.5)
+    tilt = np.hypot(*(built.normal[inner][:, :2] / 127.5 - 1).T)
+    assert np.degrees(np.median(tilt)) < 1.5  # the mesh carries the ball, the texture only what is left
+
+
+def test_diffuse_and_specular_come_back_through_gltf_formulas() -> None:
+    rng = np.random.default_rng(5)
+    maps = surfaces.maps(roughness=0.37)
+    shape = maps.mask.shape
+    maps = replace(
+        maps,
+        diffuse=rng.uniform(0.05, 0.9, (*shape, 3)).astype(np.float32),
+        specular=rng.uniform(0.02, 0.08, (*shape, 3)).astype(np.float32),
+    )
+    built = surfaces.built(maps, surfaces.mesh(surfaces.maps()))
+    base = color.decode_srgb(built.base_color[maps.mask] / 255)
+    f0 = 0.04 * np.array(built.specular_factor) * color.decode_srgb(built.specular_color[maps.mask] / 255)
+    frontal = base * (1 - f0.max(axis=-1, keepdims=True))  # glTF: (1 − max F) base
+    assert np.allclose(frontal, 0.96**2 * maps.diffuse[maps.mask], atol=0.006)  # half a step of sRGB at white
+    assert np.allclose(f0, maps.specular[maps.mask], atol=0.0006)
+    assert (built.occlusion_roughness_metallic[maps.mask] == [255, 94, 0]).all()
+
+
+def test_textures_reach_past_the_mask() -> None:
+    maps = surfaces.maps()
+    maps = replace(maps, diffuse=np.where(maps.mask[..., None], maps.diffuse, 0).astype(np.float32))
+    built = surfaces.built(maps, surfaces.mesh(maps))
+    assert built.base_color.max(axis=-1).min() > 80
+    assert (built.normal[..., 2] > 127).all()
+
+
+def test_black_specular_is_allowed() -> None:
+    maps = surfaces.maps(specular=0.0)
+    assert asset.build(maps, surfaces.mesh(maps), asset.Settings()).specular_factor == (0.0, 0.0, 0.0)
