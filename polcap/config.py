@@ -14,7 +14,15 @@ import msgspec
 from msgspec import Meta
 
 from polcap.errors import SettingError
-from polcap.stages import align, asset, hdr, infer, mask, selfcal, stokes, surface, whitebalance
+from polcap.stages.align import Settings as Align
+from polcap.stages.asset import Settings as Asset
+from polcap.stages.hdr import Settings as Hdr
+from polcap.stages.infer import Settings as Infer
+from polcap.stages.mask import Settings as Mask
+from polcap.stages.selfcal import Settings as Selfcal
+from polcap.stages.stokes import Settings as Stokes
+from polcap.stages.surface import Settings as Surface
+from polcap.stages.whitebalance import Settings as Whitebalance
 
 
 class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -27,9 +35,7 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_align_residual_px: Annotated[
         float, Meta(gt=0, description="estimated 1σ error of a shot's registration [px of the grid]")
     ] = 0.15
-    max_clipped: Annotated[float, Meta(ge=0, le=1, description="share of the object that is clipped [1]")] = (
-        0.02
-    )
+    max_clipped: Annotated[float, Meta(ge=0, le=1, description="share of the object that is clipped [1]")] = 0.02
     max_ill_posed: Annotated[
         float, Meta(ge=0, le=1, description="share of the object whose DoLP no dielectric can have [1]")
     ] = 0.05
@@ -44,15 +50,15 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Every setting of a run."""
 
-    hdr: hdr.Settings = hdr.Settings()
-    whitebalance: whitebalance.Settings = whitebalance.Settings()
-    align: align.Settings = align.Settings()
-    mask: mask.Settings = mask.Settings()
-    selfcal: selfcal.Settings = selfcal.Settings()
-    stokes: stokes.Settings = stokes.Settings()
-    infer: infer.Settings = infer.Settings()
-    surface: surface.Settings = surface.Settings()
-    asset: asset.Settings = asset.Settings()
+    hdr: Hdr = Hdr()
+    whitebalance: Whitebalance = Whitebalance()
+    align: Align = Align()
+    mask: Mask = Mask()
+    selfcal: Selfcal = Selfcal()
+    stokes: Stokes = Stokes()
+    infer: Infer = Infer()
+    surface: Surface = Surface()
+    asset: Asset = Asset()
     gates: Gates = Gates()
 
 
@@ -77,9 +83,7 @@ def load(file: Path | None = None, assignments: Sequence[str] = ()) -> Config:
     given = _read(file) if file else {}
     for section, values in given.items():
         if not isinstance(values, dict):
-            raise SettingError(
-                f"{file}: `{section}` is not a section; write [stage] and below it name = value"
-            )
+            raise SettingError(f"{file}: `{section}` is not a section; write [stage] and below it name = value")
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         section, dot, name = key.strip().partition(".")
@@ -105,16 +109,12 @@ def settings() -> Iterator[Setting]:
             meta = next((extra for extra in get_args(hint)[1:] if isinstance(extra, Meta)), Meta())
             kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
             word = str(kind).replace("typing.", "") if get_args(kind) else kind.__name__
-            yield Setting(
-                f"{section.name}.{field.name}", word, field.default, _limits(meta), meta.description or ""
-            )
+            yield Setting(f"{section.name}.{field.name}", word, field.default, _limits(meta), meta.description or "")
 
 
 def _limits(meta: Meta) -> str:
     signs = {"gt": "> ", "ge": "≥ ", "lt": "< ", "le": "≤ ", "multiple_of": "multiple of "}
-    return ", ".join(
-        f"{sign}{getattr(meta, name)}" for name, sign in signs.items() if getattr(meta, name) is not None
-    )
+    return ", ".join(f"{sign}{getattr(meta, name)}" for name, sign in signs.items() if getattr(meta, name) is not None)
 
 
 def _read(file: Path) -> dict[str, Any]:
@@ -142,9 +142,7 @@ def _check_known(key: str, value: Any, known: dict[str, Setting]) -> None:
     raise SettingError(f"{key} = {value!r}: there is no such setting{hint}")
 
 
-def _explain(
-    error: msgspec.ValidationError, given: dict[str, Any], known: dict[str, Setting]
-) -> SettingError:
+def _explain(error: msgspec.ValidationError, given: dict[str, Any], known: dict[str, Setting]) -> SettingError:
     message, _, path = str(error).partition(" - at `$.")
     key = path.rstrip("`").split("[")[0]
     section, _, name = key.partition(".")

@@ -25,7 +25,7 @@ from enum import IntEnum, IntFlag
 from hashlib import blake2b
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Generic, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Generic, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import msgspec
 import numpy as np
@@ -37,10 +37,10 @@ from polcap.stages import Stage
 T = TypeVar("T")
 FORMAT = 1  # of work/; raised when older folders can no longer be read
 WHERE = ("path", "folder", "name", "notes")  # fields that say where or how, not what: never part of a key
-Progress = Callable[[str, float, bool], None]  # stage, seconds, found in the cache
+Progress = Callable[[str, float | None, bool], None]  # stage, seconds (None: begins), found in the cache
 
 
-def silent(stage: str, seconds: float, cached: bool) -> None:
+def silent(stage: str, seconds: float | None, cached: bool) -> None:
     """The progress of someone who does not look."""
 
 
@@ -80,7 +80,6 @@ class Store:
         self.force = force
         self.steps: list[Kept[Any]] = []
         self._fresh: set[str] = set()  # keys that --force has declared stale in this process
-        self._announced: set[str] = set()
 
     @contextmanager
     def lock(self) -> Iterator[None]:
@@ -132,16 +131,17 @@ class Store:
 
         def compute() -> T:
             values = [value.value if isinstance(value, Kept) else value for value in inputs]
+            self.progress(stage.name, None, False)
             start = time.perf_counter()
             result = stage(*values, *given)
             if stage.keep:
                 seconds = time.perf_counter() - start
                 self._write(place, stage, key, config, inputs, result, seconds)
                 self._fresh.discard(key)
-                result = read(place, returns(stage))
+                result = read(place, returns(stage), check=False)
             else:
                 freeze(result)
-            self._announce(stage.name, time.perf_counter() - start, False)
+            self.progress(stage.name, time.perf_counter() - start, False)
             return result
 
         def stored() -> bool:
@@ -149,13 +149,11 @@ class Store:
 
         def find() -> T:
             if stored():
-                start = time.perf_counter()
                 try:
                     result: T = read(place, returns(stage))
-                except StorageError:
-                    return compute()
-                self._announce(stage.name, time.perf_counter() - start, True)
-                return result
+                    return result
+                except StorageError:  # damaged: nothing is lost but time
+                    pass
             return compute()
 
         kept = Kept(stage.name, key, config, find, stored, stage.keep)
@@ -176,17 +174,12 @@ class Store:
     def settle(self, until: str | None = None) -> None:
         """Compute what is missing, in order, up to and with the stage `until`."""
         for kept in self.steps:
-            if kept.ready and kept.keep:
-                self._announce(kept.name, 0.0, True)
+            if kept.keep and kept.ready:
+                self.progress(kept.name, 0.0, True)
             kept.settle()
             if kept.name == until:
                 _ = kept.value  # also where it is not kept, so that its errors show
                 return
-
-    def _announce(self, name: str, seconds: float, cached: bool) -> None:
-        if name not in self._announced:
-            self._announced.add(name)
-            self.progress(name, seconds, cached)
 
     def _write(
         self,
@@ -228,7 +221,7 @@ def manifest(place: Path) -> dict[str, Any]:
     return about if isinstance(about, dict) else {}
 
 
-def read(place: Path, hint: Any) -> Any:
+def read(place: Path, hint: Any, check: bool = True) -> Any:
     """The value in a result folder, its arrays as read-only memory maps.
 
     Raises
@@ -237,7 +230,7 @@ def read(place: Path, hint: Any) -> Any:
         A file is missing or its bytes are not those that were written.
     """
     about = manifest(place)
-    for name, expected in about.get("files", {}).items():
+    for name, expected in about.get("files", {}).items() if check else ():
         try:
             found = checksum(place / name)
         except OSError:
@@ -371,3 +364,16 @@ def contents(folder: Path) -> list[dict[str, Any]]:
             size = sum(entry.stat().st_size for entry in place.iterdir())
             found.append({**about, "folder": place.name, "bytes": size})
     return found
+
+
+class Archive(Store):
+    """A finished result folder opened again without its capture: what was kept is taken as it is."""
+
+    def step(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> Kept[T]:
+        """The stored result whatever its key; what is never kept is computed from the stored ones."""
+        kept = super().step(stage, *inputs, config=config)
+        if stage.keep:
+            place = self.work / f"{len(self.steps):02d}-{stage.name}"
+            kept.find = lambda: cast(T, read(place, returns(stage)))
+            kept.stored = lambda: bool(manifest(place))
+        return kept

@@ -2,10 +2,11 @@
 
 A model says in its metadata what it eats and under which terms it may be used:
 
-    channels   names of its input channels, in order, separated by commas
-    encoding   version of the channels' formulas, `ENCODING`
-    multiple   height and width must be multiples of this
-    licence    SPDX name of the weights' licence
+    channels       names of its input channels, in order, separated by commas
+    encoding       version of the channels' formulas, `ENCODING`
+    native_size    side of the pictures it was trained on, px
+    size_multiple  height and width must be multiples of this
+    licence        SPDX name of the weights' licence
 
 A file that does not say so is refused. The only module that imports onnxruntime.
 """
@@ -20,7 +21,8 @@ from polcap.errors import ModelError
 from polcap.images import Floats, Network
 
 ENCODING = "1"
-REQUIRED = ("channels", "encoding", "multiple", "licence")
+NUMBERS = ("native_size", "size_multiple")
+REQUIRED = ("channels", "encoding", *NUMBERS, "licence")
 CUDA, CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 Device = Literal["cpu", "cuda", "auto"]
 
@@ -44,16 +46,12 @@ def load(path: str | Path, device: Device = "cpu", threads: int = 0) -> Network:
     except OSError as error:
         raise ModelError(f"{path}: {error.strerror or error}; name a model file with --model") from error
     if device == "cuda" and CUDA not in onnxruntime.get_available_providers():
-        raise ModelError(
-            "--device cuda: this onnxruntime has no CUDA; install onnxruntime-gpu, or use --device cpu"
-        )
+        raise ModelError("--device cuda: this onnxruntime has no CUDA; install onnxruntime-gpu, or use --device cpu")
     wanted = [CPU] if device == "cpu" or CUDA not in onnxruntime.get_available_providers() else [CUDA, CPU]
     session = _open(path, data, wanted, threads)
     provider = session.get_providers()[0]
     if device == "cuda" and provider != CUDA:
-        raise ModelError(
-            "--device cuda: CUDA does not start; make driver, CUDA and cuDNN fit, or use --device cpu"
-        )
+        raise ModelError("--device cuda: CUDA does not start; make driver, CUDA and cuDNN fit, or use --device cpu")
     metadata = {str(k): str(v) for k, v in session.get_modelmeta().custom_metadata_map.items()}
     channels = _check(path, session, metadata)
     return Network(
@@ -89,10 +87,9 @@ def _check(path: Path, session: Any, metadata: dict[str, str]) -> tuple[str, ...
             f"{path}: input encoding {metadata['encoding']}, this polcap makes {ENCODING}; "
             "take a model of the same release"
         )
-    if not metadata["multiple"].isdigit() or int(metadata["multiple"]) < 1:
-        raise ModelError(
-            f"{path}: multiple = {metadata['multiple']!r} in its metadata is not a whole number ≥ 1"
-        )
+    for name in NUMBERS:
+        if not metadata[name].isdigit() or int(metadata[name]) < 1:
+            raise ModelError(f"{path}: {name} = {metadata[name]!r} in its metadata is not a whole number ≥ 1")
     channels = tuple(name.strip() for name in metadata["channels"].split(","))
     entry = session.get_inputs()
     shape = entry[0].shape if entry else []

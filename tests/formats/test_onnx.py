@@ -9,7 +9,9 @@ from polcap.errors import ModelError
 from polcap.formats.onnx import ENCODING, load
 
 onnx = pytest.importorskip("onnx", reason="writing test models needs the extra [train]")
-SAID = {"channels": "s1,s2", "encoding": ENCODING, "multiple": "8", "licence": "Apache-2.0"}
+SAID = {"channels": "s1,s2", "encoding": ENCODING, "native_size": "128", "size_multiple": "8"} | {
+    "licence": "Apache-2.0"
+}
 
 
 def write(path: Path, metadata: dict[str, str], opset: int = 17, channels: int = 2) -> Path:
@@ -38,9 +40,7 @@ def test_a_model_runs_and_tells_what_it_eats(tmp_path: Path) -> None:
 
 
 def test_digest_is_of_the_file(tmp_path: Path) -> None:
-    one, two = (
-        load(write(tmp_path / f"{name}.onnx", {**SAID, "licence": name})) for name in ("CC0-1.0", "MIT")
-    )
+    one, two = (load(write(tmp_path / f"{name}.onnx", {**SAID, "licence": name})) for name in ("CC0-1.0", "MIT"))
     assert one.digest != two.digest
 
 
@@ -55,7 +55,7 @@ def test_silent_metadata_is_refused(tmp_path: Path, missing: str) -> None:
     ("change", "words"),
     [
         ({"encoding": "99"}, "encoding 99"),
-        ({"multiple": "0"}, "multiple = '0'"),
+        ({"size_multiple": "0"}, "size_multiple = '0'"),
         ({"channels": "s1,s2,mask"}, "names 3 channels"),
     ],
 )

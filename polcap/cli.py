@@ -1,0 +1,338 @@
+"""In: a command line. Out: one call into polcap, its answer on stdout, an exit code.
+
+stdout carries data only; progress and messages go to stderr. Exit codes: 0 done, 2 the input or a
+setting is at fault, 3 the asset was written but a gate failed, 4 hardware, 130 interrupted (run again
+to go on), 1 a bug. Heavy imports happen inside the commands, so that `--help` answers at once.
+"""
+
+import functools
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from polcap import __version__
+from polcap.errors import GateError, PolcapError, SettingError
+
+if TYPE_CHECKING:
+    from polcap.images import Capture, ChartRequest
+    from polcap.store import Progress
+
+app = typer.Typer(
+    help="Photographs through a turned polarizer, under a flash: in. A relightable 3-D asset: out.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,  # plain help: half the start-up time
+    pretty_exceptions_enable=False,
+)
+Device = Literal["cpu", "cuda", "auto"]
+Result = Annotated[Path, typer.Argument(help="Result folder of `polcap process`.")]
+Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
+
+
+def main() -> None:
+    """The `polcap` command."""
+    arguments = sys.argv[1:]
+    if "--debug" in arguments:  # wherever it stands
+        arguments = ["--debug", *(argument for argument in arguments if argument != "--debug")]
+    app(arguments)
+
+
+@app.callback()
+def front(
+    context: typer.Context,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of a failure.")] = False,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and end.")] = False,
+) -> None:
+    context.obj = debug
+    if version:
+        print(__version__)
+        raise typer.Exit
+
+
+def _reported(command: Callable[..., None]) -> Callable[..., None]:
+    """Turn what a command raises into one line on stderr and an exit code."""
+
+    @functools.wraps(command)
+    def run(context: typer.Context, *args: Any, **kwargs: Any) -> None:
+        try:
+            command(context, *args, **kwargs)
+        except BrokenPipeError:  # whoever read stdout has seen enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            code = 0
+        except KeyboardInterrupt:
+            print("polcap: interrupted; run the same command again to go on", file=sys.stderr)
+            code = 130
+        except PolcapError as error:
+            if context.obj:
+                raise
+            print(f"polcap: error: {_line(error)}", file=sys.stderr)
+            code = error.exit_code
+        except (typer.Exit, typer.Abort):
+            raise
+        except MemoryError:
+            if context.obj:
+                raise
+            print("polcap: error: out of memory; raise --memory or take a larger machine", file=sys.stderr)
+            code = SettingError.exit_code
+        except Exception as error:
+            if context.obj:
+                raise
+            kind = type(error).__name__
+            print(f"polcap: bug: {kind}: {_line(error)}; run with --debug and report it", file=sys.stderr)
+            code = 1
+        else:
+            return
+        raise typer.Exit(code)
+
+    return run
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+@app.command()
+@_reported
+def process(
+    context: typer.Context,
+    capture: Annotated[Path, typer.Argument(help="Folder with the photographs.")],
+    out: Annotated[Path | None, typer.Option(help="Result folder; by default CAPTURE/polcap.")] = None,
+    config: Annotated[Path | None, typer.Option(help="TOML file of settings, a section per stage.")] = None,
+    assignments: Annotated[
+        list[str] | None, typer.Option("--set", metavar="K=V", help="A setting, as hdr.clip=0.95; repeatable.")
+    ] = None,
+    until: Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")] = None,
+    force: Annotated[
+        str | None, typer.Option(metavar="STAGE", help="Compute this stage and all after it again.")
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what was understood, and stop.")] = False,
+    json: Json = False,
+    device: Annotated[Device, typer.Option(help="Where the network runs; cuda never falls back.")] = "cpu",
+    threads: Annotated[int, typer.Option(min=0, help="Threads to use; 0 is all.")] = 0,
+    memory: Annotated[float, typer.Option(min=0, help="Most memory to take, GB; 0 is no limit.")] = 0,
+    angles: Annotated[
+        str | None, typer.Option(metavar="DEG,…", help="Angles of the shots in order, as 0,45,90.")
+    ] = None,
+    chart: Annotated[
+        str | None,
+        typer.Option(metavar="X0,Y0,…|FILE", help="Chart corners in RAW px, dark skin first, clockwise; or a profile."),
+    ] = None,
+    no_chart: Annotated[bool, typer.Option("--no-chart", help="Use the camera's own colours.")] = False,
+    mask: Annotated[Path | None, typer.Option(metavar="PNG", help="White where the object is.")] = None,
+    estimator: Annotated[
+        Literal["network", "analytic"] | None, typer.Option(help="By default the network where one is shipped.")
+    ] = None,
+    model: Annotated[Path | None, typer.Option(metavar="ONNX", help="Another model than the shipped one.")] = None,
+) -> None:
+    """Turn a capture into maps and a 3-D asset."""
+    _limit(threads, memory)
+    from polcap import config as settings
+    from polcap import pipeline
+    from polcap.formats import capture as captures
+
+    for flag, stage in (("--until", until), ("--force", force)):
+        if stage is not None and stage not in pipeline.STAGES:
+            raise SettingError(f"{flag} {stage}: no such stage; choose one of {', '.join(pipeline.STAGES)}")
+    chosen = settings.load(config, assignments or ())
+    request = _chart(chart, no_chart)
+    found = captures.read(capture, _angles(angles))
+    target = out or capture / "polcap"
+    given = pipeline.Given(
+        chart=request,
+        mask=None if mask is None else _mask(mask),
+        network=pipeline.load_network(estimator, model, device, threads),
+    )
+    if dry_run:
+        _print_plan(found, pipeline.plan(found, given, chosen, target, force), json)
+        return
+    print(captures.table(found), file=sys.stderr)
+    with _progress(len(pipeline.STAGES) + 1) as told:
+        about = pipeline.process(found, given, chosen, target, until, force, told)
+    if about is None:
+        return
+    _print(about if json else str(target / "asset" / f"{found.name}.glb"))
+    _judge(about)
+
+
+@app.command()
+@_reported
+def export(
+    context: typer.Context,
+    result: Result,
+    gltf: Annotated[bool, typer.Option("--gltf", help="asset/NAME.glb")] = False,
+    obj: Annotated[bool, typer.Option("--obj", help="asset/NAME.obj, .mtl and textures")] = False,
+    json: Json = False,
+) -> None:
+    """Write the asset again from the maps of a result; without a flag, in every format."""
+    from polcap import pipeline
+
+    formats = tuple(name for name, wanted in (("gltf", gltf), ("obj", obj)) if wanted) or ("gltf", "obj")
+    written = [str(file) for file in pipeline.export(result, formats)]
+    _print({"written": written} if json else "\n".join(written))
+
+
+@app.command()
+@_reported
+def show(
+    context: typer.Context,
+    result: Result,
+    stage: Annotated[str, typer.Argument(help="hdr, whitebalance, align, mask, selfcal, stokes, cues, …")],
+) -> None:
+    """Draw what a stage made; prints the picture's path."""
+    from polcap import pipeline
+
+    _print(str(pipeline.show(result, stage)))
+
+
+@app.command()
+@_reported
+def status(context: typer.Context, result: Result, json: Json = False) -> None:
+    """What a result folder holds, stage by stage."""
+    from polcap import store
+
+    found = store.contents(result)
+    if not found:
+        raise SettingError(f"{result} holds no stage cache; give the result folder of `polcap process`")
+    rows = [{name: about[name] for name in ("stage", "version", "key", "seconds", "bytes")} for about in found]
+    complete = (result / "report.json").exists()
+    if json:
+        _print({"stages": rows, "complete": complete})
+        return
+    lines = [f"{r['stage']:14}{r['seconds']:8.2f} s {r['bytes'] / 1e6:9.2f} MB   {r['key'][:12]}" for r in rows]
+    _print("\n".join([*lines, "complete" if complete else "not complete: run `polcap process` to go on"]))
+
+
+@app.command()
+@_reported
+def report(
+    context: typer.Context,
+    result: Result,
+    compare: Annotated[Path | None, typer.Option(metavar="OTHER", help="Another result folder.")] = None,
+    json: Json = False,
+) -> None:
+    """Judge a result again from its stage cache, or show in which figures two results differ."""
+    from polcap import report as reports
+
+    if compare is not None:
+        rows = reports.compare(reports.read(result), reports.read(compare))
+        named = [{"name": name, "here": here, "there": there} for name, here, there in rows]
+        _print(named if json else "\n".join(f"{name}: {here}  |  {there}" for name, here, there in rows))
+        return
+    from polcap import pipeline
+
+    about = pipeline.judge_again(result)
+    _print(about if json else str(result / "report.html"))
+    _judge(about)
+
+
+def _limit(threads: int, memory: float) -> None:
+    """Set the process's limits before any numerical library starts."""
+    if memory:
+        import resource
+
+        size = int(memory * 1e9)
+        resource.setrlimit(resource.RLIMIT_DATA, (size, resource.getrlimit(resource.RLIMIT_DATA)[1]))
+    if threads:
+        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+            os.environ[name] = str(threads)
+        import cv2
+
+        cv2.setNumThreads(threads)
+
+
+def _angles(text: str | None) -> tuple[float, ...] | None:
+    return None if text is None else _numbers("--angles", text)
+
+
+def _numbers(flag: str, text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise SettingError(f"{flag} {text}: not numbers separated by commas") from None
+
+
+def _chart(text: str | None, no_chart: bool) -> "ChartRequest":
+    import numpy as np
+
+    from polcap.formats import calib
+    from polcap.images import ChartRequest
+
+    if text is None:
+        return ChartRequest("none" if no_chart else "auto")
+    if no_chart:
+        raise SettingError("--chart and --no-chart exclude each other; leave one out")
+    if Path(text).suffix == ".toml":
+        return ChartRequest("profile", profile=calib.read_profile(Path(text)))
+    corners = _numbers("--chart", text)
+    if len(corners) != 8:
+        raise SettingError(f"--chart gives {len(corners)} numbers; four corners have 8, a profile ends in .toml")
+    return ChartRequest("corners", corners=np.reshape(corners, (4, 2)))
+
+
+def _mask(file: Path) -> Any:
+    from polcap.formats import png
+
+    picture = png.read(file)
+    half = 128 if picture.dtype.itemsize == 1 else 32768
+    return (picture if picture.ndim == 2 else picture[..., :3].max(-1)) >= half
+
+
+def _print(data: Any) -> None:
+    """Data on stdout: text as it is, all else as one JSON document."""
+    if not isinstance(data, str):
+        import json
+
+        data = json.dumps(data, ensure_ascii=False, indent=1)
+    print(data, flush=True)
+
+
+def _print_plan(found: "Capture", stages: dict[str, str], json: bool) -> None:
+    from polcap import report as reports
+    from polcap.formats import capture as captures
+
+    if json:
+        _print({"capture": reports.capture_facts(found), "stages": stages})
+        return
+    _print("\n".join([captures.table(found), "", *(f"{name:14}{state}" for name, state in stages.items())]))
+
+
+def _judge(about: dict[str, Any]) -> None:
+    """Tell failed gates and assumptions; a failed gate ends with exit code 3."""
+    failed = 0
+    for gate in about["gates"]:
+        if gate["state"] in ("fail", "warn"):
+            word = "gate failed" if gate["state"] == "fail" else "warning"
+            value, limit = gate["value"], gate["limit"]
+            print(f"polcap: {word}: {gate['name']} {value} (limit {limit}): {gate['says']}", file=sys.stderr)
+            failed += gate["state"] == "fail"
+    if failed:
+        raise GateError(f"{failed} of {len(about['gates'])} gates failed; the asset was written, see report.html")
+
+
+@contextmanager
+def _progress(total: int) -> Iterator["Progress"]:
+    """A bar on a terminal, else a line per finished stage."""
+    if not sys.stderr.isatty():
+        yield _tell
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description:14}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=total)
+
+        def told(stage: str, seconds: float | None, cached: bool) -> None:
+            bar.update(task, description=stage, advance=0 if seconds is None else 1)
+
+        yield told
+
+
+def _tell(stage: str, seconds: float | None, cached: bool) -> None:
+    if seconds is not None:
+        print(f"{stage:14}{'cached' if cached else f'{seconds:.2f} s'}", file=sys.stderr, flush=True)

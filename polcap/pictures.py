@@ -1,0 +1,237 @@
+"""In: a value of images.py. Out: a picture of it, (H, W, 3) uint8 sRGB, for a person to judge.
+
+Colour codes, the same everywhere: normals n·½+½ (x right red, y up green); AoLP as hue, 0° red, a turn
+of 180° once around the wheel; DoLP, depth and errors from dark (small) to bright (large).
+"""
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import (
+    Alignment,
+    AngleStack,
+    Asset,
+    ColorCalibration,
+    Cues,
+    Floats,
+    Gains,
+    Mesh,
+    ObjectMask,
+    Quality,
+    StokesImage,
+    SurfaceMaps,
+)
+from polcap.optics.warp import warp
+
+Picture = NDArray[np.uint8]
+WIDTH = 640  # px of one tile
+
+
+def reference(radiance: AngleStack, color: ColorCalibration) -> Picture:
+    """The reference shot in the calibrated colours, brightest parts just below white."""
+    return display(2 * radiance.value[0] @ color.matrix.T)
+
+
+def merged(radiance: AngleStack) -> Picture:
+    """Every shot; clipped pixels red, ghosts magenta."""
+    top = _top(radiance.value[0])
+    tiles = []
+    for value, quality in zip(radiance.value, radiance.quality, strict=True):
+        tile = display(value, top)
+        tile[(quality & int(Quality.CLIPPED)) > 0] = (255, 40, 40)
+        tile[(quality & int(Quality.GHOST)) > 0] = (255, 0, 255)
+        tiles.append(tile)
+    names = [f"{angle:g} deg" for angle in np.degrees(radiance.angle)]
+    return sheet(tiles, names)
+
+
+def chart(radiance: AngleStack, color: ColorCalibration) -> Picture:
+    """The reference shot with the chart's patches as they were read."""
+    picture = reference(radiance, color)
+    for quad in color.quads if color.quads is not None else ():
+        cv2.polylines(picture, [np.round(quad).astype(np.int32)], True, (0, 255, 0), 2)
+    if color.corners is not None:
+        cv2.polylines(picture, [np.round(color.corners).astype(np.int32)], True, (255, 255, 0), 2)
+    return picture
+
+
+def alignment(radiance: AngleStack, found: Alignment) -> Picture:
+    """Brightness of each shot after registration (green) over the reference (magenta): grey where they agree."""
+    first = _grey(radiance.value[0])
+    tiles = []
+    for value, transform in zip(radiance.value[1:], found.transform[1:], strict=True):
+        moved = warp(_grey(value), transform)
+        tiles.append(display(np.stack([first, moved, first], -1), _top(first)))
+    names = [
+        f"{angle:g} deg  ({t[0, 2]:+.2f}, {t[1, 2]:+.2f}) px  1 sigma {residual:.3f} px"
+        for angle, t, residual in zip(
+            np.degrees(radiance.angle[1:]), found.transform[1:], found.residual_px[1:], strict=True
+        )
+    ]
+    return sheet(tiles, names)
+
+
+def outline(radiance: AngleStack, color: ColorCalibration, object_: ObjectMask) -> Picture:
+    """The reference shot, darkened outside the mask, with the crop's box."""
+    picture = reference(radiance, color)
+    picture[~object_.mask] = picture[~object_.mask] // 3
+    x0, y0, x1, y1 = object_.crop
+    cv2.rectangle(picture, (x0, y0), (x1 - 1, y1 - 1), (255, 255, 0), 2)
+    return picture
+
+
+def gains(found: Gains, angle: Floats) -> Picture:
+    """Gains of the shots with their 1σ; crosses are the cross-check."""
+    height, left = 60 * len(found.gain) + 40, 120
+    picture = np.full((height, WIDTH, 3), 255, np.uint8)
+    span = max(0.02, 1.2 * float(np.abs(np.stack([found.gain, found.anchor]) - 1).max()))
+
+    def column(gain: float) -> int:
+        return int(left + (WIDTH - left - 20) * (0.5 + 0.5 * np.clip((gain - 1) / span, -1, 1)))
+
+    cv2.line(picture, (column(1), 10), (column(1), height - 30), (180, 180, 180), 1)
+    for shot, degrees in enumerate(np.degrees(angle)):
+        _write(picture, f"{degrees:g} deg", (10, 45 + 60 * shot), (0, 0, 0))
+        for channel, paint in enumerate([(200, 0, 0), (0, 140, 0), (0, 0, 200)]):
+            row = 25 + 60 * shot + 14 * channel
+            gain, sigma = float(found.gain[shot, channel]), float(found.sigma[shot, channel])
+            cv2.line(picture, (column(gain - sigma), row), (column(gain + sigma), row), paint, 2)
+            cv2.circle(picture, (column(gain), row), 4, paint, -1)
+            anchor = (column(float(found.anchor[shot, channel])), row)
+            cv2.drawMarker(picture, anchor, paint, cv2.MARKER_CROSS, 10, 1)
+    _write(picture, f"1 +- {span:.3f}   from {found.source}", (left, height - 8), (0, 0, 0))
+    return picture
+
+
+def stokes(image: StokesImage) -> Picture:
+    """S0, DoLP and AoLP in camera channels."""
+    total = image.stokes.sum(-1)
+    s0 = np.maximum(total[0], 1e-6)
+    dolp = np.hypot(total[1], total[2]) / s0
+    aolp = np.arctan2(total[2], total[1]) / 2
+    tiles = [display(image.stokes[0]), scale(dolp, 0, 0.4, image.mask), hue(aolp, image.mask)]
+    return sheet(tiles, ["S0", "DoLP 0 ... 0.4", "AoLP"])
+
+
+def cues(found: Cues) -> Picture:
+    """What the estimators see: DoLP, AoLP, the paper's normalised Stokes map and diffuse colour."""
+    cos, sin = found.normalized_stokes
+    tiles = [
+        display(found.radiance),
+        scale(found.dolp, 0, 0.4, found.mask),
+        hue(np.arctan2(sin, cos) / 2, found.mask),
+        _eight(np.stack([np.full_like(cos, 0.5), cos / 2 + 0.5, sin / 2 + 0.5], -1) * found.mask[..., None]),
+        display(found.diffuse_color * found.mask[..., None], 1.0),
+        scale(found.ratio_sigma, 0, 0.01, found.mask),
+    ]
+    names = ["radiance", "DoLP 0 ... 0.4", "AoLP", "normalised Stokes", "diffuse colour", "1 sigma 0 ... 0.01"]
+    return sheet(tiles, names)
+
+
+def maps(found: SurfaceMaps) -> Picture:
+    """Normal, diffuse albedo, specular albedo, roughness and expected error."""
+    tiles = [
+        normal(found),
+        display(found.diffuse * found.mask[..., None], 1.0),
+        display(found.specular * found.mask[..., None], 0.16),
+        scale(found.roughness, 0, 1, found.mask),
+        scale(found.confidence, 0, 30, found.mask),
+    ]
+    names = ["normal", "diffuse albedo", "specular albedo 0 ... 0.16", "roughness 0 ... 1", "error 0 ... 30 deg"]
+    return sheet(tiles, names)
+
+
+def normal(found: SurfaceMaps) -> Picture:
+    return _eight((found.normal / 2 + 0.5) * found.mask[..., None])
+
+
+def surface(mesh: Mesh, found: SurfaceMaps) -> Picture:
+    """The depth map, and the surface it makes under a light from the upper left."""
+    inside = np.isfinite(mesh.depth)
+    near, far = np.percentile(mesh.depth[inside], [1, 99]) if inside.any() else (0.0, 1.0)
+    return sheet([scale(-mesh.depth, -far, -near, inside), shaded(mesh, found)], ["depth, near bright", "shape"])
+
+
+def shaded(mesh: Mesh, found: SurfaceMaps) -> Picture:
+    """The shape alone: its depth's own normals under one light, no colour of the object."""
+    inside = np.isfinite(mesh.depth)
+    depth = np.where(inside, mesh.depth, np.nan)
+    footprint = np.nanmedian(depth) / found.view.focal if inside.any() else 1.0  # size of a pixel there
+    down, right = np.gradient(depth / footprint)
+    facing = np.stack([right, -down, np.ones_like(depth)], -1)  # z towards the camera, y up
+    facing = facing / np.linalg.norm(facing, axis=-1, keepdims=True)
+    light = np.array([-0.5, 0.6, 0.62])
+    shade = np.clip(np.nan_to_num(facing) @ (light / np.linalg.norm(light)), 0, 1)
+    return _eight(np.repeat((0.1 + 0.85 * shade)[..., None], 3, -1) * inside[..., None])
+
+
+def asset(built: Asset) -> Picture:
+    """The textures as they stand in the file."""
+    tiles = [built.base_color, built.normal, built.occlusion_roughness_metallic, built.specular_color]
+    names = ["base colour", "normal (tangent)", "occlusion roughness metallic", "specular colour"]
+    return sheet([np.array(tile) for tile in tiles], names)
+
+
+def display(linear: Floats, top: float | None = None) -> Picture:
+    """Linear light as sRGB; `top` becomes white, by default the 99.5th percentile."""
+    value = np.clip(np.nan_to_num(linear) / (top or _top(linear)), 0, 1)
+    return _eight(np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055))
+
+
+def scale(value: Floats, low: float, high: float, inside: NDArray[np.bool_]) -> Picture:
+    """A number per pixel as a colour from dark to bright, black outside."""
+    level = _eight((np.nan_to_num(value, nan=low) - low) / max(high - low, 1e-12))
+    picture = cv2.cvtColor(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
+    picture[~inside] = 0
+    return np.asarray(picture, np.uint8)
+
+
+def hue(aolp: Floats, inside: NDArray[np.bool_]) -> Picture:
+    """An angle mod π as a hue."""
+    turn = np.asarray(np.round(np.mod(aolp, np.pi) / np.pi * 180) % 180, np.uint8)
+    wheel = cv2.cvtColor(np.stack([turn, np.full_like(turn, 200), np.full_like(turn, 255)], -1), cv2.COLOR_HSV2RGB)
+    wheel[~inside] = 0
+    return np.asarray(wheel, np.uint8)
+
+
+def sheet(tiles: list[Picture], names: list[str]) -> Picture:
+    """Pictures side by side, three in a row, each under its name."""
+    framed = []
+    for tile, name in zip(tiles, names, strict=True):
+        height = max(1, round(tile.shape[0] * WIDTH / tile.shape[1]))
+        way = cv2.INTER_AREA if tile.shape[1] > WIDTH else cv2.INTER_NEAREST
+        head = np.full((28, WIDTH, 3), 32, np.uint8)
+        _write(head, name, (6, 20), (255, 255, 255))
+        framed.append(np.vstack([head, cv2.resize(tile, (WIDTH, height), interpolation=way)]))
+    columns = min(3, len(framed))
+    while len(framed) % columns:
+        framed.append(np.zeros_like(framed[0]))
+    rows = [np.hstack(framed[start : start + columns]) for start in range(0, len(framed), columns)]
+    return np.asarray(np.vstack(rows), np.uint8)
+
+
+def shrink(picture: Picture, width: int) -> Picture:
+    """A picture no wider than `width`."""
+    if picture.shape[1] <= width:
+        return picture
+    height = max(1, round(picture.shape[0] * width / picture.shape[1]))
+    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _top(linear: Floats) -> float:
+    return max(float(np.percentile(linear[::4, ::4], 99.5)), 1e-6)
+
+
+def _grey(value: Floats) -> Floats:
+    return np.asarray(value.mean(-1), np.float32)
+
+
+def _eight(value: Any) -> Picture:
+    return np.asarray(np.round(np.clip(value, 0, 1) * 255), np.uint8)
+
+
+def _write(picture: Picture, text: str, at: tuple[int, int], paint: tuple[int, int, int]) -> None:
+    cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, paint, 1, cv2.LINE_AA)

@@ -1,0 +1,230 @@
+"""READ FIRST. In: a capture. Out: its maps, its asset and the verdict on them.
+
+The whole path is `path`, one line per stage; each line's work is the file of the same name in
+`stages/`. Measure, then apply once: white balance, alignment and self-calibration return small values;
+`stokes` applies gains and transforms, `cues` the colour matrix. Images are resampled once.
+
+A line declares its step and computes nothing: the store computes what somebody asks for, or finds it.
+"""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap import report
+from polcap.config import Config
+from polcap.errors import ModelError, ObjectError, SettingError, StorageError
+from polcap.formats import atomic, calib, gltf, obj, onnx, png
+from polcap.formats import maps as maps_folder
+from polcap.images import AngleStack, Asset, Capture, ChartRequest, ColorCalibration, Network
+from polcap.report import Results
+from polcap.stages import align, asset, cues, hdr, infer, mask, selfcal, stokes, surface, whitebalance
+from polcap.store import Archive, Progress, Store, silent
+
+STAGES = ("hdr", "whitebalance", "align", "mask", "selfcal", "stokes", "cues", "infer", "surface", "asset")
+AUTO = ChartRequest("auto")
+
+
+@dataclass(frozen=True)
+class Given:
+    """What the user gives beside the photographs."""
+
+    chart: ChartRequest = AUTO
+    mask: NDArray[np.bool_] | None = None  # on the RAW pixels or on the grid of the merged picture
+    network: Network | None = None  # None: the analytic estimator
+
+
+def path(capture: Capture | None, given: Given, config: Config, store: Store) -> Results:
+    """From RAW brackets to the asset."""
+    reference = calib.colorchecker()
+    radiance = store.step(hdr.merge, capture, config=config.hdr)
+    color = store.step(whitebalance.measure, radiance, reference, given.chart, config=config.whitebalance)
+    alignment = store.step(align.register, radiance, color, config=config.align)
+    marked = store.derive(on_grid, given.mask, radiance)
+    object_ = store.step(mask.segment, radiance, alignment, color, marked, config=config.mask)
+    gains = store.step(selfcal.solve, radiance, alignment, object_, color, config=config.selfcal)
+    stokes_ = store.step(stokes.solve, radiance, alignment, gains, object_, config=config.stokes)
+    cues_ = store.step(cues.compute, stokes_, color)
+    maps = store.step(infer.estimate, cues_, given.network, config=config.infer)
+    distance = store.derive(distance_m, color, radiance)
+    mesh = store.step(surface.integrate, maps, distance, config=config.surface)
+    asset_ = store.step(asset.build, maps, mesh, config=config.asset)
+    return Results(radiance, color, alignment, object_, gains, stokes_, cues_, maps, mesh, asset_)
+
+
+def on_grid(drawn: NDArray[np.bool_] | None, radiance: AngleStack) -> NDArray[np.bool_] | None:
+    """The user's mask on the grid of the merged picture; drawn there, or on the RAW pixels."""
+    if drawn is None:
+        return None
+    height, width = radiance.value.shape[1:3]
+    step = round(radiance.view.scale)
+    tall, wide = drawn.shape
+    if (tall, wide) == (height, width):
+        return drawn
+    if abs(tall - step * height) < step and abs(wide - step * width) < step:
+        return np.asarray(drawn[::step, ::step][:height, :width])
+    raise ObjectError(
+        f"--mask is {wide}×{tall} px; draw it on the picture's {step * width}×{step * height} or {width}×{height} px"
+    )
+
+
+def distance_m(color: ColorCalibration, radiance: AngleStack) -> float | None:
+    """Distance of the chart, and so about that of the object beside it [m]; None where no chart tells."""
+    return None if color.metres_per_px is None else color.metres_per_px * radiance.view.focal
+
+
+def process(
+    capture: Capture,
+    given: Given,
+    config: Config,
+    out: Path,
+    until: str | None = None,
+    force: str | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any] | None:
+    """Run the path and write the result folder; returns report.json's content, None with `until`.
+
+    Raises
+    ------
+    InputError
+        Anything at fault with what the user gave, from the stage that saw it.
+    """
+    _apart(out, Path(capture.folder))
+    store = Store(out, progress, force)
+    with store.lock():
+        sweep(out)
+        results = path(capture, given, config, store)
+        _remember(out, capture, config, given.network)
+        store.settle(until)
+        if until is not None:
+            return None
+        progress("write", None, False)
+        about = report.document(report.capture_facts(capture), results, config, given.network)
+        maps_folder.write(
+            out / "maps", results.maps.value, results.mesh.value, results.stokes.value, results.cues.value
+        )
+        write_asset(out, capture.name, results.asset.value)
+        report.write(out, about, results)
+        progress("write", 0.0, False)
+    return about
+
+
+def plan(capture: Capture, given: Given, config: Config, out: Path, force: str | None = None) -> dict[str, str]:
+    """What `process` would do with each stage, without doing it: cached, compute, or on demand."""
+    store = Store(out, force=force)
+    path(capture, given, config, store)
+    return {kept.name: "on demand" if not kept.keep else "cached" if kept.ready else "compute" for kept in store.steps}
+
+
+def write_asset(out: Path, name: str, built: Asset, formats: tuple[str, ...] = ("gltf", "obj")) -> list[Path]:
+    """asset/NAME.glb, .obj and what the OBJ names."""
+    writers: dict[str, tuple[str, Callable[[Path, Asset, str], None]]] = {
+        "gltf": (".glb", gltf.write),
+        "obj": (".obj", obj.write),
+    }
+    written = []
+    for kind in formats:
+        suffix, write = writers[kind]
+        file = out / "asset" / f"{name}{suffix}"
+        write(file, built, name)
+        written.append(file)
+    return written
+
+
+def export(out: Path, formats: tuple[str, ...]) -> list[Path]:
+    """The asset again, from maps/ alone."""
+    about = report.read(out)
+    config = msgspec.convert(about["settings"], Config)
+    with Store(out).lock():
+        stored = maps_folder.read(out / "maps")
+        mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, config.surface)
+        return write_asset(out, about["capture"]["name"], asset.build(stored.maps, mesh, config.asset), formats)
+
+
+def reopen(out: Path) -> tuple[Results, dict[str, Any]]:
+    """The results of an earlier run, without its photographs, and what was remembered of that run.
+
+    Raises
+    ------
+    StorageError
+        `out` holds no stage cache.
+    """
+    try:
+        about = json.loads((out / "work" / "run.json").read_text(encoding="utf-8"))
+        config = msgspec.convert(about["settings"], Config)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise StorageError(f"{out} holds no stage cache of this polcap; run `polcap process` again") from error
+    return path(None, Given(), config, Archive(out)), about
+
+
+def show(out: Path, stage: str) -> Path:
+    """Draw what a stage made; returns the PNG's path."""
+    if stage not in STAGES:
+        raise SettingError(f"{stage!r} is no stage; choose one of {', '.join(STAGES)}")
+    results, _ = reopen(out)
+    file = out / "work" / f"{stage}.png"
+    png.write(file, results.picture(stage))
+    return file
+
+
+def judge_again(out: Path) -> dict[str, Any]:
+    """report.json and report.html anew from the stage cache."""
+    with Store(out).lock():
+        results, about = reopen(out)
+        config = msgspec.convert(about["settings"], Config)
+        again = report.document(about["capture"], results, config, None) | {"model": about["model"]}
+        if (out / "report.json").exists():
+            again["keys"] = report.read(out)["keys"]
+        report.write(out, again, results)
+    return again
+
+
+def load_network(
+    estimator: Literal["network", "analytic"] | None, model: Path | None, device: onnx.Device, threads: int
+) -> Network | None:
+    """The model to use: the one named, else the one shipped; None is the analytic estimator.
+
+    Raises
+    ------
+    ModelError
+        The network was asked for and there is none, or it cannot be used.
+    """
+    if estimator == "analytic":
+        if model is not None:
+            raise SettingError("--model and --estimator analytic exclude each other; leave one out")
+        return None
+    if model is None:
+        shipped = sorted(calib.data_path("colorchecker").parent.glob("models/*.onnx"))
+        if not shipped and (estimator == "network" or device == "cuda"):
+            raise ModelError("this polcap ships no model; name one with --model, or use --estimator analytic")
+        if not shipped:
+            return None
+        model = shipped[-1]
+    return onnx.load(model, device, threads)
+
+
+def sweep(out: Path) -> None:
+    """Remove what a killed run left half written; final names are whole by construction."""
+    for place in (out, out / "maps", out / "asset"):
+        for left in place.glob(".*.part*"):
+            atomic.discard(left)
+
+
+def _apart(out: Path, photographs: Path) -> None:
+    """The result never lands among the photographs."""
+    if out.resolve() == photographs.resolve():
+        raise SettingError(f"--out {out} is the capture itself; choose a folder of its own")
+
+
+def _remember(out: Path, capture: Capture, config: Config, network: Network | None) -> None:
+    """work/run.json: what `show` and `report` need when the photographs are gone."""
+    model = None if network is None else {**network.metadata, "digest": network.digest}
+    about = {"capture": report.capture_facts(capture), "settings": msgspec.to_builtins(config), "model": model}
+    with atomic.path(out / "work" / "run.json") as temporary:
+        temporary.write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -1,0 +1,348 @@
+"""In: the results of a run. Out: its figures and the verdict of its gates, report.json and report.html.
+
+A gate that fails means: the asset was written, do not trust it unseen (exit code 3). A gate that warns
+states an assumption. A gate that could not be measured says so.
+"""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from polcap import __version__, pictures
+from polcap.config import Config, Gates
+from polcap.errors import StorageError
+from polcap.formats import atomic, html
+from polcap.images import (
+    Alignment,
+    AngleStack,
+    Asset,
+    Capture,
+    ColorCalibration,
+    Cues,
+    Floats,
+    Frame,
+    Gains,
+    Mesh,
+    Network,
+    ObjectMask,
+    Quality,
+    StokesImage,
+    SurfaceMaps,
+)
+from polcap.store import Kept
+
+State = Literal["pass", "fail", "warn", "not measured"]
+
+
+@dataclass(frozen=True)
+class Results:
+    """Every result of the path; each is found or computed when its value is asked for."""
+
+    radiance: Kept[AngleStack]
+    color: Kept[ColorCalibration]
+    alignment: Kept[Alignment]
+    object_: Kept[ObjectMask]
+    gains: Kept[Gains]
+    stokes: Kept[StokesImage]
+    cues: Kept[Cues]
+    maps: Kept[SurfaceMaps]
+    mesh: Kept[Mesh]
+    asset: Kept[Asset]
+
+    def picture(self, stage: str) -> pictures.Picture:
+        """What a stage made, for a person to look at."""
+        paint: dict[str, Callable[[], pictures.Picture]] = {
+            "hdr": lambda: pictures.merged(self.radiance.value),
+            "whitebalance": lambda: pictures.chart(self.radiance.value, self.color.value),
+            "align": lambda: pictures.alignment(self.radiance.value, self.alignment.value),
+            "mask": lambda: pictures.outline(self.radiance.value, self.color.value, self.object_.value),
+            "selfcal": lambda: pictures.gains(self.gains.value, self.radiance.value.angle),
+            "stokes": lambda: pictures.stokes(self.stokes.value),
+            "cues": lambda: pictures.cues(self.cues.value),
+            "infer": lambda: pictures.maps(self.maps.value),
+            "surface": lambda: pictures.surface(self.mesh.value, self.maps.value),
+            "asset": lambda: pictures.asset(self.asset.value),
+        }
+        return paint[stage]()
+
+
+class Gate(msgspec.Struct, frozen=True):
+    """One judgement."""
+
+    name: str
+    state: State
+    value: float | str | None
+    limit: float | str | None
+    says: str  # what it means and what to do
+
+
+def capture_facts(capture: Capture) -> dict[str, Any]:
+    """What was understood of the folder."""
+
+    def frame(one: Frame) -> dict[str, Any]:
+        return {"file": Path(one.path).name, "exposure_time": one.exif.exposure_time, "digest": one.digest}
+
+    camera = capture.shots[0].frames[0].exif
+    return {
+        "name": capture.name,
+        "folder": capture.folder,
+        "layout": capture.layout,
+        "camera": f"{camera.make} {camera.model}".strip(),
+        "size_px": list(capture.size_px),
+        "focal_px": capture.focal_px,
+        "focal_known": capture.focal_known,
+        "shots": [
+            {"angle_deg": float(np.degrees(shot.angle)), "frames": [frame(one) for one in shot.frames]}
+            for shot in capture.shots
+        ],
+        "notes": list(capture.notes),
+    }
+
+
+def figures(results: Results) -> dict[str, dict[str, Any]]:
+    """Every measured figure, by the part of the path that it tells of."""
+    radiance, color = results.radiance.value, results.color.value
+    found, gains, image = results.alignment.value, results.gains.value, results.stokes.value
+    cues, maps, mesh = results.cues.value, results.maps.value, results.mesh.value
+    turn = np.degrees(np.arctan2(found.transform[:, 1, 0], found.transform[:, 0, 0]))
+    extent = mesh.vertices.max(0) - mesh.vertices.min(0)
+    return {
+        "merge": {
+            "exposure_ratio": _list(radiance.exposure_ratio.mean(-1)),
+            "exif_ratio": _list(radiance.exif_ratio),
+            "ghost_fraction": _list(radiance.ghost_fraction),
+            "lossy_source": radiance.lossy,
+        },
+        "chart": {
+            "source": color.source,
+            "delta_e_mean": None if color.delta_e is None else _number(np.nanmean(color.delta_e)),
+            "delta_e_max": None if color.delta_e is None else _number(np.nanmax(color.delta_e)),
+            "delta_e": None if color.delta_e is None else _list(color.delta_e, 2),
+            "detector_cost": _number(color.cost),
+            "metres_per_px": color.metres_per_px,
+            "matrix": _list(color.matrix),
+        },
+        "alignment": {
+            "shift_px": _list(found.transform[:, :2, 2], 3),
+            "turn_deg": _list(turn, 4),
+            "residual_px": _list(found.residual_px, 4),
+            "correlation": _list(found.correlation, 4),
+        },
+        "gains": {
+            "source": gains.source,
+            "gain": _list(gains.gain, 5),
+            "sigma": _list(gains.sigma, 5),
+            "anchor": _list(gains.anchor, 5),
+            "disagreement": _number(gains.disagreement),
+        },
+        "angles": {
+            "offset_deg": _number(np.degrees(gains.angle_offset)),
+            "offset_sigma_deg": _number(np.degrees(gains.angle_offset_sigma)),
+            "concentration": _number(gains.concentration),
+            "best_order": list(gains.order),
+            "mirrored": gains.mirrored,
+        },
+        "object": {
+            "pixels": int(image.mask.sum()),
+            "crop": list(results.object_.value.crop),
+            "source": results.object_.value.source,
+            **{
+                f"{bit.name}_fraction".lower(): _share(image, bit)
+                for bit in (Quality.CLIPPED, Quality.DARK, Quality.ILL_POSED, Quality.METAL, Quality.GHOST)
+            },
+        },
+        "polarization": {
+            "dolp_median": _inside(cues.dolp, image, 50),
+            "dolp_95": _inside(cues.dolp, image, 95),
+            "dolp_sigma_median": _inside(cues.ratio_sigma, image, 50),
+            "residual_median": None if image.residual is None else _inside(image.residual, image, 50),
+        },
+        "maps": {
+            "estimator": maps.estimator,
+            "normal_error_deg_median": _inside(maps.confidence, image, 50),
+            "normal_error_deg_90": _inside(maps.confidence, image, 90),
+            "diffuse_mean": _list(maps.diffuse[maps.mask].mean(0), 4),
+            "specular_median": _list(np.median(maps.specular[maps.mask], axis=0), 4),
+            "roughness_median": _inside(maps.roughness, image, 50),
+        },
+        "mesh": {
+            "vertices": len(mesh.vertices),
+            "faces": len(mesh.faces),
+            "metric": mesh.metric,
+            "extent": _list(extent, 5),
+        },
+    }
+
+
+def judge(found: dict[str, dict[str, Any]], focal_known: bool, limits: Gates) -> list[Gate]:
+    """The gates, in the order of the path."""
+    gains, angles, object_ = found["gains"], found["angles"], found["object"]
+    nominal = angles["best_order"] == sorted(angles["best_order"]) and not angles["mirrored"]
+    return [
+        _least(
+            "ghosts",
+            max(found["merge"]["ghost_fraction"]),
+            limits.max_ghost,
+            "share of a shot whose exposures disagree: something moved between the frames of a bracket",
+        ),
+        _least(
+            "chart",
+            found["chart"]["delta_e_mean"],
+            limits.max_delta_e,
+            "mean ΔE2000 of the chart: light the chart as the object, or give its corners with --chart",
+        ),
+        _least(
+            "alignment",
+            max(found["alignment"]["residual_px"]),
+            limits.max_align_residual_px,
+            "1σ registration error, px: fix the camera, or turn the polarizer with less force",
+        ),
+        _least(
+            "gains",
+            gains["disagreement"] if gains["source"] == "grey patches" else None,
+            limits.max_gain_disagreement,
+            "grey patches and brightest object pixels disagree on a shot's flash energy; 1 % costs about 6°",
+        ),
+        Gate(
+            "angles",
+            "pass" if nominal else "fail",
+            f"order {angles['best_order']}{', mirrored' if angles['mirrored'] else ''}",
+            "as stated",
+            "the outline supports this order of the shots: check names, --angles and the ring's sense of turn",
+        ),
+        _least(
+            "clipped",
+            object_["clipped_fraction"],
+            limits.max_clipped,
+            "share of the object clipped in every exposure: add a darker frame to the bracket",
+        ),
+        _least(
+            "ill-posed",
+            object_["ill_posed_fraction"],
+            limits.max_ill_posed,
+            "share of the object with an impossible DoLP: ambient light, metal, or shots out of order",
+        ),
+        _least(
+            "normal error",
+            found["maps"]["normal_error_deg_median"],
+            limits.max_normal_error_deg,
+            "median expected error of the normals, degrees: more light or frames, or four angles",
+        ),
+        Gate(
+            "focal length",
+            "pass" if focal_known else "warn",
+            "known" if focal_known else "assumed",
+            "known",
+            "a wrong focal length bends the depth: state focal_length_mm in capture.toml",
+        ),
+    ]
+
+
+def document(capture: dict[str, Any], results: Results, config: Config, network: Network | None) -> dict[str, Any]:
+    """report.json: what was understood, measured and judged."""
+    found = figures(results)
+    gates = judge(found, bool(capture["focal_known"]), config.gates)
+    return {
+        "polcap": __version__,
+        "verdict": verdict(gates),
+        "capture": capture,
+        "gates": msgspec.to_builtins(gates),
+        "figures": found,
+        "model": None if network is None else {**network.metadata, "digest": network.digest},
+        "keys": {kept.name: kept.key for kept in vars(results).values()},
+        "settings": msgspec.to_builtins(config),
+    }
+
+
+def verdict(gates: list[Gate]) -> State:
+    states = {gate.state for gate in gates}
+    return "fail" if "fail" in states else "warn" if "warn" in states else "pass"
+
+
+def write(folder: Path, about: dict[str, Any], results: Results) -> None:
+    """report.json and report.html with its pictures, in a result folder.
+
+    Raises
+    ------
+    StorageError
+        The folder cannot be written.
+    """
+    with atomic.path(folder / "report.json") as temporary:
+        temporary.write_text(json.dumps(about, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
+    radiance, color = results.radiance.value, results.color.value
+    maps, mesh = results.maps.value, results.mesh.value
+    shown = {
+        "Reference shot, with the chart as it was read": pictures.chart(radiance, color),
+        "What was taken for the object": pictures.outline(radiance, color, results.object_.value),
+        "Polarization": pictures.stokes(results.stokes.value),
+        "Maps": pictures.maps(maps),
+        "Surface": pictures.surface(mesh, maps),
+        "Registration: grey is good": results.picture("align"),
+        "Gains of the shots": results.picture("selfcal"),
+    }
+    html.write(folder / "report.html", about, {name: pictures.shrink(p, 1280) for name, p in shown.items()})
+
+
+def read(folder: Path) -> dict[str, Any]:
+    """The report.json of a result folder.
+
+    Raises
+    ------
+    StorageError
+        There is none, or it is not one.
+    """
+    try:
+        about = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise StorageError(f"{folder} holds no report.json; run `polcap process` first") from error
+    if not isinstance(about, dict) or "figures" not in about:
+        raise StorageError(f"{folder / 'report.json'} is no report of polcap; run `polcap process` again")
+    return about
+
+
+def compare(one: dict[str, Any], other: dict[str, Any]) -> list[tuple[str, Any, Any]]:
+    """The figures and settings in which two reports differ: name, here, there."""
+    rows = []
+    for part in ("figures", "settings"):
+        here, there = _flat(one[part]), _flat(other[part])
+        for name in dict.fromkeys([*here, *there]):
+            if here.get(name) != there.get(name):
+                rows.append((f"{part}.{name}", here.get(name), there.get(name)))
+    return rows
+
+
+def _flat(tree: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    return {f"{section}.{name}": value for section, part in tree.items() for name, value in part.items()}
+
+
+def _least(name: str, value: float | None, limit: float, says: str) -> Gate:
+    """A gate whose value must not exceed its limit."""
+    state: State = "not measured" if value is None else "pass" if value <= limit else "fail"
+    return Gate(name, state, value, limit, says)
+
+
+def _share(image: StokesImage, bit: Quality) -> float:
+    inside = image.quality[image.mask]
+    return round(float(((inside & int(bit)) > 0).mean()), 5) if inside.size else 0.0
+
+
+def _inside(value: Floats, image: StokesImage, percentile: float) -> float | None:
+    return _number(np.percentile(value[image.mask], percentile)) if image.mask.any() else None
+
+
+def _number(value: Any, digits: int = 6) -> float | None:
+    """A figure for JSON; None where it could not be measured."""
+    return round(float(value), digits) if math.isfinite(value) else None
+
+
+def _list(values: Floats, digits: int = 5) -> list[Any]:
+    return [
+        _list(value, digits) if isinstance(value, np.ndarray) else _number(value, digits)
+        for value in np.asarray(values)
+    ]
