@@ -142,14 +142,15 @@ def transform(shoot: Shoot, shift_px: tuple[float, float], rot_deg: float) -> Fl
 def _pose(shoot: Shoot, shot: int) -> dict[str, Any]:
     """What the hand did to the camera and to the polarizer before one shot; the first defines the frame."""
     random = np.random.default_rng([shoot.seed, 0, shot])
-    shift = shoot.nudge_px * random.uniform(-1, 1, 2) * (shot > 0)
-    roll = float(shoot.nudge_deg * random.uniform(-1, 1) * (shot > 0))
+    x, y, roll = (random.uniform(-1, 1, 3) if shot else np.zeros(3)).tolist()
+    shift = x * shoot.nudge_px, y * shoot.nudge_px
+    roll *= shoot.nudge_deg
     actual = shoot.angles_deg[shot] + shoot.angle_error_deg * random.normal()
     return {
         "actual_deg": float(actual),
-        "shift_px": shift.tolist(),
+        "shift_px": shift,
         "rot_deg": roll,
-        "transform": transform(shoot, (shift[0], shift[1]), roll).tolist(),
+        "transform": transform(shoot, shift, roll).tolist(),
     }
 
 

@@ -18,6 +18,7 @@ from polcap.synth.shapes import Shape
 Vector = tuple[float, float, float]
 Indices = NDArray[np.integer[Any]]
 _TOLERANCE = 1e-6  # m, a ray this near has arrived
+_STEPS, _GRAZING = 300, 1e-4  # m, a ray that has crawled along the surface for so long has arrived too
 _LIFT = 5e-4  # m above the surface, where a shadow ray starts
 
 
@@ -74,10 +75,10 @@ def _march(shape: Shape, origin: Floats, direction: Floats, start: Floats | floa
     travelled = np.maximum(middle - half, start)[alive]
     end = (middle + half)[alive]
     arrived_index, arrived_at = [alive[:0]], [travelled[:0]]
-    for _ in range(200):
+    for left in reversed(range(_STEPS)):
         step = shape.distance(origin[alive] + direction[alive] * travelled[:, None])
         travelled = travelled + step
-        there = np.abs(step) < _TOLERANCE
+        there = np.abs(step) < (_TOLERANCE if left else _GRAZING)
         arrived_index.append(alive[there])
         arrived_at.append(travelled[there])
         going = ~there & (travelled < end)
