@@ -32,10 +32,10 @@ def smooth(vertices: Floats, faces: NDArray[np.integer], crease: float = 0.75) -
     Vertices at the same place count as one, so seams of a texture atlas do not show.
     """
     vertices = np.ascontiguousarray(vertices, dtype=np.float32)
-    faces = np.ascontiguousarray(faces, dtype=np.int32)
+    index = np.ascontiguousarray(faces, dtype=np.int32)
     _, place = np.unique(vertices, axis=0, return_inverse=True)
-    place = place.reshape(-1)[faces]  # (F, 3)
-    corner = vertices[faces]
+    place = place.reshape(-1)[index]  # (F, 3)
+    corner = vertices[index]
     area = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])  # (F, 3) twice the area
     total = np.zeros((place.max() + 1, 3), dtype=np.float64)
     for k in range(3):
@@ -44,7 +44,7 @@ def smooth(vertices: Floats, faces: NDArray[np.integer], crease: float = 0.75) -
     flat = _unit(area)[:, None, :]
     shared = _unit(total)[place]  # (F, 3, 3)
     sharp = np.sum(shared * flat, axis=-1, keepdims=True) < np.cos(crease)
-    return Triangles(vertices, faces, np.where(sharp, flat, shared).astype(np.float32))
+    return Triangles(vertices, index, np.where(sharp, flat, shared).astype(np.float32))
 
 
 def union(parts: Sequence[Triangles]) -> Triangles:
@@ -84,7 +84,7 @@ class Tracer:
         b, c = hit["u"][seen, None], hit["v"][seen, None]
         weight = np.stack([1 - b - c, b, c], axis=1)  # (N, 3, 1)
         position = np.sum(self.mesh.vertices[self.mesh.faces[face]] * weight, axis=1)
-        normal = _unit(np.sum(self.mesh.corner_normals[face] * weight, axis=1)) @ rotation.T
+        normal: Floats = _unit(np.sum(self.mesh.corner_normals[face] * weight, axis=1)) @ rotation.T
         normal = _face_camera(normal, v[seen])
         size = (height, width)
         depth = np.full(height * width, np.nan, dtype=np.float32)

@@ -62,8 +62,9 @@ class Errors:
         one, zero = torch.ones(count, device=device), torch.zeros(count, device=device)
         three = torch.zeros(3, count, device=device)
         return Errors(
-            1e9 * one, 1e3 * one, zero, three + 1, three, torch.zeros(3, count, 2, device=device), zero, one, zero, zero, one
-        )
+            1e9 * one, 1e3 * one, zero, three + 1, three, torch.zeros(3, count, 2, device=device),
+            zero, one, zero, zero, one,
+        )  # fmt: skip
 
     @staticmethod
     def stated(count: int, device: torch.device) -> "Errors":
@@ -83,43 +84,54 @@ class Errors:
 
 
 def photograph(
-    stokes: Tensor, diffuse: Tensor, facing: Tensor, mask: Tensor, errors: Errors
+    stokes: Tensor, diffuse: Tensor, facing: Tensor, mask: Tensor, rays: Tensor, at: Tensor, errors: Errors
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Measured Stokes parameters (3, B, H, W, 3), their covariance (6, ...) and the clipped pixels (B, H, W).
+    """Measured Stokes parameters (3, M, 3), their covariance (6, M, 3) and clipped pixels (M,) at pixels `at`.
 
-    stokes (3, B, H, W, 3); diffuse (B, H, W, 3); facing (B, H, W) cosine between normal and ray; mask (B, H, W).
+    stokes (3, B, H, W, 3) in the frame of each ray; diffuse (B, H, W, 3); facing (B, H, W) cosine between
+    normal and ray; mask (B, H, W); rays (B, H, W, 3); at (M,) indices into B·H·W. The solve takes the
+    angles as they are in the image, as `stages/stokes.py` does.
     """
-    count = mask.shape[0]
+    count, height, width = mask.shape
     wide = (count, 1, 1, 1)
+    owner = at // (height * width)
     inside = mask[..., None].to(stokes.dtype)
     stray = errors.ambient.view(wide) + errors.reflected.view(wide) * _hollow(facing, mask)[..., None]
     background = torch.rand(count, 1, 1, 3, device=stokes.device) * torch.rand(wide, device=stokes.device) * 0.3
     s0 = stokes[0] + diffuse * stray + (1 - inside) * background
     s1, s2 = (stokes[k] * errors.depolarization.view(wide) for k in (1, 2))
 
-    shots, variance, clipped = [], [], torch.zeros_like(mask)
+    shots, variance, clipped = [], [], torch.zeros_like(at, dtype=torch.bool)
+    brightest = errors.bracket[owner, None]  # where the shortest exposure saturates
     for k, angle in enumerate(ANGLES):
-        turned = 2 * (angle + errors.angle[k]).view(wide)
-        light = (s0 + s1 * torch.cos(turned) + s2 * torch.sin(turned)) / 2
-        light = errors.gain[k].view(wide) * _moved(light, errors.shift[k], errors.blur)
-        brightest = errors.bracket.view(wide)  # the shortest exposure saturates here
+        cos, sin = _double_axis((angle + errors.angle[k]).view(count, 1, 1), rays)
+        light = (s0 + s1 * cos[..., None] + s2 * sin[..., None]) / 2
+        light = _moved(light, errors.shift[k], errors.blur).reshape(-1, 3)[at] * errors.gain[k][owner, None]
         clipped = clipped | (light > brightest).any(dim=-1)
         light = torch.minimum(light, brightest)
-        noise = _merged_variance(light.clamp(min=0), errors)
+        noise = _merged_variance(light.clamp(min=0), errors, owner)
         shots.append(light + noise.sqrt() * torch.randn_like(light))
-        variance.append(noise * errors.noise_belief.view(wide))
+        variance.append(noise * errors.noise_belief[owner, None])
     i0, i45, i90 = shots
     v0, v45, v90 = variance
     measured = torch.stack([i0 + i90, i0 - i90, 2 * i45 - i0 - i90])
     both = v0 + v90
     covariance = torch.stack([both, v0 - v90, -both, both, v90 - v0, 4 * v45 + both])
-    return measured, covariance, clipped & mask
+    return measured, covariance, clipped
 
 
-def _merged_variance(light: Tensor, errors: Errors) -> Tensor:
-    """Variance of radiance (B, H, W, C) merged from the unsaturated ones of three exposures, by exposure time."""
-    wide = (-1, 1, 1, 1)
-    ratio, well, read = (x.view(wide) for x in (errors.bracket, errors.full_well, errors.read_noise))
+def _double_axis(angle: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+    """cos and sin of twice `frames.axis_on_ray`, without the arc: on the ray the axis is (x, y)."""
+    vx, vy, vz = rays.unbind(dim=-1)
+    x = torch.cos(angle) * (1 - vx * vx) - torch.sin(angle) * vx * vy
+    y = torch.sin(angle) * vz
+    length = x * x + y * y
+    return (x * x - y * y) / length, 2 * x * y / length
+
+
+def _merged_variance(light: Tensor, errors: Errors, owner: Tensor) -> Tensor:
+    """Variance of radiance (M, C) merged from the unsaturated ones of three exposures, by exposure time."""
+    ratio, well, read = (x[owner, None] for x in (errors.bracket, errors.full_well, errors.read_noise))
     long, middle = (light * ratio < 1).to(light.dtype), (light < 1).to(light.dtype)
     time = 1 / ratio + middle + ratio * long
     return light / (well * time) + (read / (well * time)) ** 2 * (1 + middle + long)

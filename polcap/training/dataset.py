@@ -3,7 +3,7 @@
 The cues are computed by `stages/cues.py`, the same code that a capture goes through.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -132,21 +132,30 @@ class Simulator:
             "specular": image(surface.specular), "roughness": image(surface.roughness[:, None]),
         }  # fmt: skip
         scene = torch.stack([image(part) for part in stokes])
-        measured, covariance, clipped = photograph(
-            scene, truth["diffuse"], truth["normal"][..., 2], view.mask, errors
-        )
         given = view.mask if jitter is None else _redrawn(view.mask, jitter)
-        quality = clipped.to(torch.uint8) * int(Quality.CLIPPED)
-        ratio, sigma, dolp, normalized = cues.polarization(measured, covariance)
-        seen = SimpleNamespace(
-            radiance=measured[0], ratio=ratio, ratio_sigma=sigma, dolp=dolp, normalized_stokes=normalized,
-            rays=view.rays, mask=given, quality=quality,
-        )  # fmt: skip
+        at = given.reshape(-1).nonzero()[:, 0]
+        measured, covariance, clipped = photograph(
+            scene, truth["diffuse"], truth["normal"][..., 2], view.mask, view.rays, at, errors
+        )
         return Batch(
-            channels=cues.channels(seen),
+            channels=_channels(measured, covariance, clipped, view.rays, at),
             mask=given & view.mask,
             **{name: value.permute(0, 3, 1, 2) for name, value in truth.items()},
         )
+
+
+def _channels(measured: Tensor, covariance: Tensor, clipped: Tensor, rays: Tensor, at: Tensor) -> Tensor:
+    """What `stages/cues.py` makes of the measured pixels `at`, (B, N, H, W), 0 elsewhere; channels last in memory."""
+    count, height, width = rays.shape[:3]
+    ratio, sigma, dolp, normalized = cues.polarization(measured, covariance)
+    row = SimpleNamespace(  # all pixels as one row
+        radiance=measured[0][None], ratio=ratio[:, None], ratio_sigma=sigma[None], dolp=dolp[None],
+        normalized_stokes=normalized[:, None], rays=rays.reshape(1, -1, 3)[:, at],
+        mask=torch.ones_like(clipped)[None], quality=(clipped.to(torch.uint8) * int(Quality.CLIPPED))[None],
+    )  # fmt: skip
+    flat = cues.channels(row)[:, 0].T  # (M, N)
+    out = flat.new_zeros(count * height * width, flat.shape[1]).index_copy(0, at, flat)
+    return out.reshape(count, height, width, -1).permute(0, 3, 1, 2)
 
 
 def _mirrored(view: SimpleNamespace) -> SimpleNamespace:
@@ -178,6 +187,3 @@ def _redrawn(mask: Tensor, jitter: Tensor) -> Tensor:
     thinner = -F.max_pool2d(-solid, 3, 1, 1)[:, 0] > 0.5
     part = jitter[:, None, None]
     return torch.where(part < 0.33, wider, torch.where(part < 0.66, thinner, mask))
-
-
-__all__ = ["Batch", "Light", "Simulator", "replace"]

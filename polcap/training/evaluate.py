@@ -17,7 +17,8 @@ class Watch:
 
     def __init__(self, data: Path, folder: Path, device: torch.device, *, count: int = 48, size: int = 128) -> None:
         if not (folder / "index.json").exists():
-            gbuffers.build(folder, sorted((data / "meshes" / "test").glob("*.npz")), views=20, procedural=0, size=size, seed=99)
+            meshes = sorted((data / "meshes" / "test").glob("*.npz"))
+            gbuffers.build(folder, meshes, views=20, procedural=0, size=size, seed=99)
         held_out = data / "materials" / "test"
         library = materials.Library(held_out if held_out.exists() else None, device, seed=4)
         simulator = Simulator(gbuffers.load(folder), library, device)

@@ -48,14 +48,14 @@ def build(
     return total
 
 
-def load(folder: Path) -> dict[str, NDArray]:  # type: ignore[type-arg]
-    """The cache as memory maps: normal, depth, position, mask (N, S, S, ·) and camera (N, 14).
+def load(folder: Path, *, mapped: bool = True) -> dict[str, NDArray]:  # type: ignore[type-arg]
+    """The cache, as memory maps or in memory: normal, depth, position, mask (N, S, S, ·) and camera (N, 14).
 
     camera: focal, centre x, y [px]; middle depth [m]; depth unit [m]; object → camera rotation, 9.
     """
     if not (folder / "index.json").exists():
         raise InputError(f"{folder} holds no complete G-buffer cache; build it with `polcap train`")
-    arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in ARRAYS}
+    arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r" if mapped else None) for name in ARRAYS}
     return arrays | {"camera": np.load(folder / "camera.npy")}
 
 
@@ -87,7 +87,9 @@ def _traced(
         yield from _look(shapes.compose(rng), per_shape, size, rng)
 
 
-def _look(mesh: Triangles, count: int, size: int, rng: np.random.Generator) -> Iterator[tuple[GBuffer, Floats, float, float]]:
+def _look(
+    mesh: Triangles, count: int, size: int, rng: np.random.Generator
+) -> Iterator[tuple[GBuffer, Floats, float, float]]:
     tracer = Tracer(mesh)
     while count:
         rotation, translation, view = pose(mesh, size, rng)

@@ -18,8 +18,8 @@ WEIGHTS = {
 }  # fmt: skip
 
 
-def total(maps: dict[str, Tensor], truth: Batch, *, render: bool = True) -> tuple[Tensor, dict[str, float]]:
-    """The weighted sum, and each part as a number. maps and truth (B, ·, H, W)."""
+def total(maps: dict[str, Tensor], truth: Batch, random: torch.Generator | None) -> tuple[Tensor, dict[str, float]]:
+    """The weighted sum, and each part as a number. maps and truth (B, ·, H, W); `random` draws the lights."""
     mask = truth.mask
     inside = mask[:, None].float()
     area = inside.sum().clamp(min=1)
@@ -37,8 +37,7 @@ def total(maps: dict[str, Tensor], truth: Batch, *, render: bool = True) -> tupl
         "roughness": mean((maps["roughness"] - truth.roughness).abs()),
         "sigma": mean(torch.log(maps["sigma"]) + angle.detach() / maps["sigma"]),  # least where sigma = E[angle]
     }
-    if render:
-        parts["render"] = _rendered(maps, truth)
+    parts["render"] = _rendered(maps, truth, random)
     loss = sum((WEIGHTS[name] * value for name, value in parts.items()), torch.zeros((), device=mask.device))
     figures = {name: float(value.detach()) for name, value in parts.items()}
     return loss, figures | {"degrees": float(mean(angle).detach()), "loss": float(loss.detach())}
@@ -48,7 +47,7 @@ def _centred(depth: Tensor, inside: Tensor) -> Tensor:
     return depth - (depth * inside).sum(dim=(2, 3), keepdim=True) / inside.sum(dim=(2, 3), keepdim=True).clamp(min=1)
 
 
-def _rendered(maps: dict[str, Tensor], truth: Batch) -> Tensor:
+def _rendered(maps: dict[str, Tensor], truth: Batch, random: torch.Generator | None) -> Tensor:
     """Polarized rendering loss on every second pixel of every second row, a new light and side for each pixel."""
     at = truth.mask[:, ::2, ::2].reshape(-1).nonzero()[:, 0]
 
@@ -56,26 +55,26 @@ def _rendered(maps: dict[str, Tensor], truth: Batch) -> Tensor:
         return image[:, :, ::2, ::2].permute(0, 2, 3, 1).reshape(-1, image.shape[1])[at]
 
     # a side: turn the truth by up to ~30° about a random axis across the ray, as long as it stays visible
-    turn = _small_rotations(len(at), truth.normal.device)
-    light = F.normalize(torch.randn(len(at), 3, device=turn.device) * 0.6 + torch.tensor([0.0, 0.0, 1.0], device=turn.device), dim=1)
+    turn = _small_rotations(len(at), truth.normal.device, random)
     ones = torch.ones(len(at), device=turn.device)
+    light = 0.6 * torch.randn(len(at), 3, device=turn.device, generator=random)
+    light = F.normalize(torch.cat([light[:, :2], light[:, 2:] + 1], dim=1), dim=1)
     pictures = []
     for source in (maps, {name: getattr(truth, name) for name in ("normal", "diffuse", "specular", "roughness")}):
         normal = torch.einsum("mij,mj->mi", turn, flat(source["normal"]))
         rough = flat(source["roughness"])[:, 0].clamp(min=0.08)
-        pictures.append(
-            shade.stokes(normal, flat(source["diffuse"]), flat(source["specular"]), rough, NOMINAL_IOR * ones, light, ones)
-        )
+        diffuse, specular = flat(source["diffuse"]), flat(source["specular"])
+        pictures.append(shade.stokes(normal, diffuse, specular, rough, NOMINAL_IOR * ones, light, ones))
     estimate, goal = pictures
     intensity = (torch.log(estimate[0] + 0.05) - torch.log(goal[0] + 0.05)).abs().mean()
     polarization = (estimate[1:] - goal[1:]).abs() / (goal[0] + 0.05)
     return intensity + 2.0 * polarization.clamp(max=1.0).mean()
 
 
-def _small_rotations(count: int, device: torch.device) -> Tensor:
-    way = 2 * torch.pi * torch.rand(count, device=device)
+def _small_rotations(count: int, device: torch.device, random: torch.Generator | None) -> Tensor:
+    way = 2 * torch.pi * torch.rand(count, device=device, generator=random)
     c, s = torch.cos(way), torch.sin(way)
-    tilt = 0.5 * torch.rand(count, device=device)
+    tilt = 0.5 * torch.rand(count, device=device, generator=random)
     ct, st = torch.cos(tilt), torch.sin(tilt)
     zero = torch.zeros_like(c)
     x = torch.stack([ct * c * c + s * s, (ct - 1) * c * s, st * c], dim=1)

@@ -17,6 +17,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from polcap.images import Floats
+
 _MATERIALS = 3  # slots per object
 _SIDE = 48  # of the noise volume
 _TEXELS = 256
@@ -64,7 +66,7 @@ def read_textures(folder: Path) -> np.ndarray[Any, np.dtype[np.float32]]:
     albedo = _picture(folder / "albedo.jpg", size)[..., ::-1]
     linear = np.where(albedo <= 0.04045, albedo / 12.92, ((albedo + 0.055) / 1.055) ** 2.4)
     rough = _picture(folder / "roughness.jpg", size).mean(axis=-1)
-    slope = np.zeros((*size, 2), dtype=np.float32)
+    slope: Floats = np.zeros((*size, 2), dtype=np.float32)
     if (folder / "normal.jpg").exists():
         n = _picture(folder / "normal.jpg", size)[..., ::-1] * 2 - 1
         slope = -n[..., :2] / np.maximum(n[..., 2:], 0.3)
@@ -88,8 +90,12 @@ def dress(
     inner = _turned(frame, position, owner)
     facing = _turned(frame @ turn.transpose(1, 2), normal, owner)
 
-    coarse = library.sample_noise(inner * _log_uniform((count, 1), 0.5, 2.5, device)[owner] + _u((count, 3), device)[owner])
-    fine = library.sample_noise(inner * _log_uniform((count, 1), 2.0, 9.0, device)[owner] + _u((count, 3), device)[owner])
+    coarse, fine = (
+        library.sample_noise(
+            inner * _log_uniform((count, 1), low, high, device)[owner] + _u((count, 3), device)[owner]
+        )
+        for low, high in ((0.5, 2.5), (2.0, 9.0))
+    )
 
     used = torch.randint(1, _MATERIALS + 1, (count,), device=device) * (_u((count,), device) < 0.6) + 1
     active = torch.arange(_MATERIALS, device=device)[None] < used.clamp(max=_MATERIALS)[:, None]
@@ -186,7 +192,7 @@ def _noise_volume(seed: int) -> Tensor:
 
 def _picture(path: Path, size: tuple[int, int]) -> np.ndarray[Any, np.dtype[np.float32]]:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.float32) / 255
 
 
 def _mirror(x: Tensor) -> Tensor:

@@ -10,7 +10,8 @@ References
 Deschaintre, Lin & Ghosh, Deep polarization imaging for 3D shape and SVBRDF acquisition, CVPR 2021.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -35,15 +36,12 @@ class Shape:
     blocks: tuple[int, ...] = (1, 2, 2, 2, 1)  # residual blocks per encoder level
     skip_blocks: int = 1
 
-    def describe(self) -> dict[str, object]:
-        return asdict(self)
-
 
 SMALL = Shape()
 LARGE = Shape((64, 128, 256, 384, 512), (64, 128, 192, 256), (64, 64, 128, 192), (64, 64, 128, 192), (2, 2, 3, 3, 3), 2)
 
 
-class Network(nn.Module):
+class Network(nn.Module):  # type: ignore[misc]  # torch comes without types here
     """Channels (B, 14, H, W) -> maps (B, ·, H, W) by name; H and W multiples of 32.
 
     normal: unit, in the frame of each pixel's ray. depth: growing away from the camera, mean about 0, in
@@ -56,8 +54,8 @@ class Network(nn.Module):
         self.shape = shape
         widths = shape.encoder
         self.stem = nn.Conv2d(4 * len(CHANNELS), widths[0], 3, padding=1)
-        self.levels = nn.ModuleList(nn.Sequential(*[Residual(w) for _ in range(n)]) for w, n in zip(widths, shape.blocks))
-        self.down = nn.ModuleList(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in zip(widths, widths[1:]))
+        self.levels = nn.ModuleList(_residuals(w, n) for w, n in zip(widths, shape.blocks))
+        self.down = nn.ModuleList(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(widths))
         self.context = Context(widths[-1])
         self.geometry = Branch(widths, shape.geometry, shape.skip_blocks, 5)
         self.color = Branch(widths, shape.color, shape.skip_blocks, 3)
@@ -80,7 +78,7 @@ class Network(nn.Module):
         }
 
 
-class Residual(nn.Module):
+class Residual(nn.Module):  # type: ignore[misc]  # torch comes without types here
     """x + conv(relu(conv(relu(x)))), the second convolution born as zero."""
 
     def __init__(self, width: int) -> None:
@@ -93,7 +91,11 @@ class Residual(nn.Module):
         return x + self.second(F.relu(self.first(F.relu(x))))
 
 
-class Context(nn.Module):
+def _residuals(width: int, count: int) -> nn.Sequential:
+    return nn.Sequential(*[Residual(width) for _ in range(count)])
+
+
+class Context(nn.Module):  # type: ignore[misc]  # torch comes without types here
     """Each cell of the coarsest level looks at all the object's cells, and at their mean."""
 
     def __init__(self, width: int, heads: int = 4) -> None:
@@ -117,7 +119,7 @@ class Context(nn.Module):
         return x + self.tell(torch.cat([seen, mean[:, :, None, None].expand_as(x).to(seen.dtype)], dim=1))
 
 
-class Branch(nn.Module):
+class Branch(nn.Module):  # type: ignore[misc]  # torch comes without types here
     """One decoder: from the coarsest level up to full resolution."""
 
     def __init__(self, encoder: tuple[int, ...], widths: tuple[int, ...], blocks: int, outputs: int) -> None:
@@ -125,8 +127,8 @@ class Branch(nn.Module):
         coarse = (*widths[1:], encoder[-1])  # what each level receives from below
         self.up = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in zip(coarse, widths))
         self.skip = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in zip(encoder, widths))
-        self.block = nn.ModuleList(nn.Sequential(*[Residual(w) for _ in range(blocks)]) for w in widths)
-        self.skip_block = nn.ModuleList(nn.Sequential(*[Residual(w) for _ in range(blocks)]) for w in widths)
+        self.block = nn.ModuleList(_residuals(w, blocks) for w in widths)
+        self.skip_block = nn.ModuleList(_residuals(w, blocks) for w in widths)
         self.fine = nn.Conv2d(widths[0], 64, 3, padding=1)  # 16 channels at full resolution
         self.raw = nn.Conv2d(len(CHANNELS), 16, 3, padding=1)
         self.mix = nn.Conv2d(16, 16, 3, padding=1)

@@ -7,6 +7,8 @@ last checkpoint with the time that was left. Same seed, same machine, same numbe
 
 import csv
 import os
+import queue
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,7 +22,7 @@ from torch import Tensor
 
 from polcap.errors import InputError
 from polcap.training import evaluate, gbuffers, loss, materials, model
-from polcap.training.dataset import Simulator
+from polcap.training.dataset import Batch, Simulator
 
 _HOLD = 0.6  # share of the budget at the full learning rate
 _WARM = 200  # steps
@@ -35,7 +37,7 @@ class Params:
     out: Path = Path("runs/train")  # cache of views, checkpoints, metrics
     minutes: float = 90.0  # training time, all resumed parts together; building the cache is extra
     resume: bool = False  # go on from out/last.pt
-    threads: int = 2
+    threads: int = 2  # half of them make batches
     seed: int = 1
     rate: float = 1e-3
 
@@ -63,26 +65,24 @@ def main(params: Params) -> Path:
         raise InputError(f"preset {params.preset!r} is not one of {', '.join(PRESETS)}")
     preset = PRESETS[params.preset]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    torch.set_num_threads(params.threads)
-    torch.manual_seed(params.seed)
     params.out.mkdir(parents=True, exist_ok=True)
     simulator = Simulator(views(params, preset), library(params, "train", device), device)
     watch = evaluate.Watch(params.data, params.out / "watch", device)
     run = Run(preset.shape, device, params.rate)
     if params.resume:
         run.load(params.out / "last.pt")
-    chooser = np.random.default_rng([params.seed, run.step])
+    share = max(params.threads // 2, 1)
+    torch.set_num_threads(share)
+    ready = _ahead(simulator, preset, params.seed + run.step, share)
     budget = params.minutes * 60
     saved = looked = run.elapsed
     parts: list[dict[str, float]] = []
     before = time.monotonic()
     while run.elapsed < budget:
-        size = int(chooser.choice(preset.sizes, p=preset.weights))
-        batch = simulator.draw(max(preset.pixels // size**2, 1), size)
-        parts.append(run.advance(batch, run.elapsed / budget))
+        parts.append(run.advance(next(ready), run.elapsed / budget))
         now = time.monotonic()
         run.elapsed, before = run.elapsed + now - before, now
-        if run.step % 50 == 0:
+        if run.step % 50 == 0 or run.step == 10:
             _record(params.out / "metrics.csv", run, {k: float(np.mean([p[k] for p in parts])) for k in parts[0]})
             parts = []
         if run.elapsed - looked > 240 or (run.elapsed >= budget):
@@ -103,12 +103,39 @@ def views(params: Params, preset: Preset) -> dict[str, Any]:
     if not (folder / "index.json").exists():
         meshes = sorted((params.data / "meshes" / "train").glob("*.npz"))
         gbuffers.build(folder, meshes, views=preset.views, procedural=preset.procedural, size=preset.size, seed=11)
-    return gbuffers.load(folder)
+    return gbuffers.load(folder, mapped=False)  # random access to a map is slow
 
 
 def library(params: Params, split: str, device: torch.device) -> materials.Library:
     folder = params.data / "materials" / split
     return materials.Library(folder if folder.exists() else None, device)
+
+
+def _ahead(simulator: Simulator, preset: Preset, seed: int, threads: int) -> Iterator[Batch]:
+    """Batches without end, made in a thread of their own while the network learns from the one before.
+
+    Two threads that meet once per step waste less of a busy machine than two that meet in every operation.
+    The thread alone draws from torch's global random state, so the batches follow from the seed.
+    """
+    waiting: queue.Queue[Batch | BaseException] = queue.Queue(maxsize=2)
+
+    def make() -> None:
+        try:
+            torch.set_num_threads(threads)
+            torch.manual_seed(seed)
+            chooser = np.random.default_rng(seed)
+            while True:
+                size = int(chooser.choice(preset.sizes, p=preset.weights))
+                waiting.put(simulator.draw(max(preset.pixels // size**2, 1), size))
+        except BaseException as error:  # told to the loop, which raises it
+            waiting.put(error)
+
+    threading.Thread(target=make, daemon=True).start()
+    while True:
+        batch = waiting.get()
+        if isinstance(batch, BaseException):
+            raise batch
+        yield batch
 
 
 class Run:
@@ -121,11 +148,13 @@ class Run:
         decay = [p for p in self.network.parameters() if p.ndim > 1]
         plain = [p for p in self.network.parameters() if p.ndim <= 1]
         self.optimizer = torch.optim.AdamW(
-            [{"params": decay, "weight_decay": 1e-2}, {"params": plain, "weight_decay": 0.0}], rate, betas=(0.9, 0.98)
-        )
+            [{"params": decay, "weight_decay": 1e-2}, {"params": plain, "weight_decay": 0.0}],
+            rate, betas=(0.9, 0.98), fused=True,
+        )  # fmt: skip
+        self.lights = torch.Generator(device).manual_seed(5)  # of the rendering loss
         self.step, self.samples, self.elapsed, self.skipped = 0, 0, 0.0, 0
 
-    def advance(self, batch: Any, progress: float) -> dict[str, float]:
+    def advance(self, batch: Batch, progress: float) -> dict[str, float]:
         """One step; progress 0…1 of the budget sets the rate."""
         fall = min(1.0, (1 - min(progress, 1.0)) / (1 - _HOLD))
         for group in self.optimizer.param_groups:
@@ -133,10 +162,10 @@ class Run:
         self.network.train()
         with torch.autocast(self.device.type, torch.bfloat16):
             maps = self.network(batch.channels.contiguous(memory_format=torch.channels_last))
-        value, figures = loss.total(maps, batch)
+        value, figures = loss.total(maps, batch, self.lights)
         self.optimizer.zero_grad(set_to_none=False)
         value.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0, foreach=True)
         if torch.isfinite(norm):
             self.optimizer.step()
         else:
@@ -163,7 +192,7 @@ class Run:
         state = {
             "network": self.network.state_dict(), "average": self.average, "optimizer": self.optimizer.state_dict(),
             "shape": asdict(self.network.shape), "step": self.step, "samples": self.samples, "elapsed": self.elapsed,
-            "skipped": self.skipped, "random": torch.get_rng_state(),
+            "skipped": self.skipped, "lights": self.lights.get_state(),
         }  # fmt: skip
         beside = path.with_suffix(".part")
         torch.save(state, beside)
@@ -178,14 +207,13 @@ class Run:
         self.optimizer.load_state_dict(state["optimizer"])
         self.step, self.samples, self.elapsed = state["step"], state["samples"], state["elapsed"]
         self.skipped = state["skipped"]
-        torch.set_rng_state(state["random"].cpu())
+        self.lights.set_state(state["lights"].cpu())
 
 
 def load_average(path: Path) -> tuple[model.Network, dict[str, Any]]:
     """The network with the EMA weights of a checkpoint, on the CPU, and the checkpoint's other facts."""
     state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-    shape = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in state["shape"].items()}
-    network = model.Network(model.Shape(**shape))
+    network = model.Network(model.Shape(**state["shape"]))
     average: dict[str, Tensor] = state["average"]
     network.load_state_dict(average)
     return network.eval(), {k: state[k] for k in ("step", "samples", "elapsed")}

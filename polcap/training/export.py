@@ -1,0 +1,76 @@
+"""Write EMA weights as the ONNX file that `formats/onnx.py` loads: any size, weights stored in fp16.
+
+The stored halves are widened when the model is opened, so arithmetic stays fp32.
+"""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from onnx import TensorProto, helper, numpy_helper
+from torch import Tensor, nn
+
+from polcap.stages.cues import CHANNELS
+from polcap.training import model
+
+OPSET = 17
+ENCODING = "1"  # of the input channels; formats/onnx.py checks it
+NATIVE_SIZE = 160  # px on which the weights were trained, about the middle of the sizes
+_GREATEST_IR = 10  # what onnxruntime 1.20 and later read
+
+
+def write(network: model.Network, path: Path, facts: Mapping[str, str]) -> int:
+    """Export to `path`; `facts` joins the metadata (licence, version, training…). Returns its bytes."""
+    beside = path.with_suffix(".part")
+    side = 2 * model.SIZE_MULTIPLE
+    dynamic = {name: {2: "height", 3: "width"} for name in ("channels", *model.OUTPUTS)}
+    torch.onnx.export(
+        _Ordered(network.eval().float()), (torch.zeros(1, len(CHANNELS), side, side),), str(beside),
+        input_names=["channels"], output_names=list(model.OUTPUTS), dynamic_axes=dynamic,
+        opset_version=OPSET, dynamo=False,
+    )  # fmt: skip
+    graph = onnx.load(str(beside))
+    _halve(graph)
+    graph.ir_version = min(graph.ir_version, _GREATEST_IR)
+    metadata = {
+        "channels": ",".join(CHANNELS), "encoding": ENCODING, "native_size": str(NATIVE_SIZE),
+        "multiple": str(model.SIZE_MULTIPLE), "size_multiple": str(model.SIZE_MULTIPLE),
+        "outputs": "normal: unit, frame of each pixel's ray; depth: growing away from the camera, mean about 0, "
+        "in radii of the disc that covers as many pixels as the object; diffuse, specular: linear; "
+        "roughness: perceptual; sigma: expected normal error, degrees",
+    }  # fmt: skip
+    helper.set_model_props(graph, metadata | dict(facts))
+    onnx.checker.check_model(graph)
+    onnx.save(graph, str(beside))
+    os.replace(beside, path)
+    return path.stat().st_size
+
+
+class _Ordered(nn.Module):  # type: ignore[misc]  # torch comes without types here
+    """The network's maps as a tuple, in the order of OUTPUTS."""
+
+    def __init__(self, network: model.Network) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, x: Tensor) -> tuple[Tensor, ...]:
+        maps = self.network(x)
+        return tuple(maps[name] for name in model.OUTPUTS)
+
+
+def _halve(graph: Any) -> None:
+    """Store each large fp32 initializer as fp16 behind a Cast."""
+    casts = []
+    for tensor in graph.graph.initializer:
+        if tensor.data_type != TensorProto.FLOAT or np.prod(tensor.dims) < 256:
+            continue
+        name, half = tensor.name, numpy_helper.to_array(tensor).astype(np.float16)
+        tensor.CopyFrom(numpy_helper.from_array(half, f"{name}.half"))
+        casts.append(helper.make_node("Cast", [f"{name}.half"], [name], to=TensorProto.FLOAT))
+    nodes = [*casts, *graph.graph.node]
+    del graph.graph.node[:]
+    graph.graph.node.extend(nodes)
