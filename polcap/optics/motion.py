@@ -152,13 +152,18 @@ def _match(a: Floats, b: Floats, ok_b: NDArray[np.bool_], corner: NDArray[np.int
     target = inner.reshape(len(corner), -1, 1) * usable.reshape(len(corner), -1, 1)
     solution = np.linalg.solve(normal, basis @ target)[..., 0]
     residual = target[..., 0] - np.einsum("tk,tkp->tp", solution, basis)
-    freedom = np.maximum(usable.sum(axis=(1, 2)) - 4, 1)
-    variance = (residual**2).sum(axis=1) / freedom + 1e-12
-    information = np.linalg.inv(np.linalg.inv(normal)[:, :2, :2] * variance[:, None, None])
-    # reference(x) = gain · other(x + s + δ) ≈ gain · (seen + ∇ · δ): the first two unknowns are δ
-    missing = solution[:, :2]
-    good = np.all(np.abs(missing) < _REACH, axis=1)
-    good &= np.all(np.isfinite(information), axis=(1, 2))
+    count = usable.sum(axis=(1, 2))
+    variance = (residual**2).sum(axis=1) / np.maximum(count - 4, 1) + 1e-12
+    # reference(x) = gain · other(x + s + δ) ≈ gain · (seen + ∇ · δ): the first two unknowns are δ; their own
+    # normal matrix, gain and offset eliminated, is that of the scene's gradients plus that of the noise's
+    both = np.linalg.inv(np.linalg.inv(normal)[:, :2, :2])
+    power, axes = np.linalg.eigh(both)
+    scene = power - 0.5 * (count * variance)[:, None]
+    share = np.where(scene > 0.5 * power, scene, 0)
+    along = np.einsum("tik,ti->tk", axes, solution[:, :2]) * power / np.maximum(scene, 0.5 * power)
+    missing = np.einsum("tik,tk->ti", axes, np.where(share > 0, along, 0))
+    information = np.einsum("tik,tk,tjk->tij", axes, share / variance[:, None], axes)
+    good = np.all(np.abs(missing) < _REACH, axis=1) & np.any(share > 0, axis=1)
     good &= (solution[:, 2] > 0.2) & (solution[:, 2] < 5)
     return _Matches(center[good], missing[good], information[good])
 
@@ -203,7 +208,8 @@ def _fit(matches: _Matches, shape: tuple[int, ...]) -> tuple[Floats, float]:
     offset = np.array([(w - 1) / 2, (h - 1) / 2])
     design = _design((matches.point - offset) / scale)
     # tiles of rich detail are sure of more than any tile can know: 0.02 px of interpolation and aliasing
-    information = np.linalg.inv(np.linalg.inv(matches.information) + 0.02**2 * np.eye(2))
+    power, axes = np.linalg.eigh(matches.information)
+    information = np.einsum("tik,tk,tjk->tij", axes, 1 / (1 / np.maximum(power, 1e-9) + 0.02**2), axes)
     best = None
     spread = 0.0
     for k in (8, 4, 2):

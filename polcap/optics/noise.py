@@ -34,6 +34,10 @@ class Noise:
         """Of pixels whose expected signal (..., C) is known; a negative one counts as 0."""
         return np.maximum(signal, 0) * self.slope + self.floor
 
+    def lit(self, level: Floats) -> "Noise":
+        """The same sensor where light of a level (C,) was subtracted: its noise stays."""
+        return Noise(self.slope, self.floor + self.slope * np.maximum(level, 0))
+
 
 @dataclass(frozen=True)
 class Samples:
@@ -185,20 +189,29 @@ class Lines:
 def _line(samples: list[Samples], channel: int, iso: float | None, least: float) -> tuple[float, float]:
     electrons = _TYPICAL_ELECTRONS * 100 / max(iso or 100.0, 1.0)
     typical = 1 / electrons, max(least, (_TYPICAL_READ / electrons) ** 2)
-    x, y, n = [], [], []
+    parts: list[tuple[Floats, Floats, bool]] = []
     for sample in samples:
         good = np.isfinite(sample.signal[:, channel])
         if good.sum() < _LEAST_TILES:
             continue
         signal, variance = sample.signal[good, channel], sample.variance[good, channel]
-        order = np.argsort(signal)
-        for part in np.array_split(order, int(np.clip(len(order) // 25, 2, 32))):
-            x.append(float(signal[part].mean()))
-            y.append(float(_low_quantile(variance[part]) if sample.flat else np.median(variance[part])))
-            n.append(len(part))
-    if len(x) < 2:
-        return typical
-    return _solve(np.array(x), np.maximum(y, least), np.array(n, float), least) or typical
+        for part in np.array_split(np.argsort(signal), int(np.clip(good.sum() // 25, 2, 32))):
+            parts.append((signal[part], variance[part], sample.flat))
+    line = typical
+    for _ in range(3):  # within a bin the signal varies: compare each tile with the line so far
+        x, y, n = [], [], []
+        for signal, variance, flat in parts:
+            level = float(signal.mean())
+            model = line[0] * np.maximum(signal, 0) + line[1]
+            quotient = _low_quantile(variance / model) if flat else float(np.median(variance / model))
+            x.append(level)
+            y.append(quotient * (line[0] * max(level, 0) + line[1]))
+            n.append(len(signal))
+        solved = _solve(np.array(x), np.maximum(y, least), np.array(n, float), least) if len(x) > 1 else None
+        if solved is None:
+            return typical
+        line = solved
+    return line
 
 
 def _solve(x: Floats, y: Floats, n: Floats, least: float) -> tuple[float, float] | None:

@@ -94,15 +94,17 @@ def merge(capture: Capture, settings: Settings) -> AngleStack:
     read = _Reader()
     order = _by_brightness(shots[0], read)
     reference = order[(len(order) - 1) // 2]
-    first = read(shots[0].frames[reference])
+    image = read(shots[0].frames[reference])
+    camera = image.camera_matrix, image.white_balance
+    binned = image.cfa is not None and settings.demosaic == "superpixel"
+    del image  # the reader alone decides how long a frame is held
     lines = noise.Lines()
     merged: list[_Merged] = []
     for shot in shots:
         merged.append(_merge_shot(shot, order, reference, lines, read, settings))
-        _same_size(shot.name, merged[-1].value.shape, merged[0].value.shape)
+        _same_size(f"shot {shot.name}", merged[-1].value.shape, merged[0].value.shape)
         lines.close()
     repeat = 3 // merged[0].value.shape[2]  # one monochrome channel stands in three, of 3 × its variance
-    binned = first.cfa is not None and settings.demosaic == "superpixel"
     x, y = capture.principal_px
     scale = 2.0 if binned else 1.0
     return AngleStack(
@@ -120,8 +122,8 @@ def merge(capture: Capture, settings: Settings) -> AngleStack:
         exif_ratio=np.array([[_told(f, shot.frames[reference]) for f in shot.frames] for shot in shots]),
         ghost_fraction=np.array([np.mean((m.quality & Quality.GHOST) > 0) for m in merged]),
         lossy=read.lossy,
-        camera_matrix=first.camera_matrix,
-        white_balance=first.white_balance,
+        camera_matrix=camera[0],
+        white_balance=camera[1],
     )
 
 
@@ -185,13 +187,17 @@ def _promised(frame: Frame, reference: Frame) -> float:
 
 def _by_brightness(shot: Shot, read: _Reader) -> list[int]:
     """Indices of the frames, darkest first, by their pixels."""
-    level = []
-    for frame in shot.frames if len(shot.frames) > 1 else ():
+
+    def level(frame: Frame) -> float:
         image = read(frame)
         black = float(image.black.mean())
-        part = np.asarray(image.value[: image.value.shape[0] // 2 * 2], np.float32)
-        level.append((float(part[::8].mean() + part[1::8].mean()) / 2 - black) / (image.white - black))
-    return [int(e) for e in np.argsort(level, kind="stable")] if level else [0]
+        value = image.value[: image.value.shape[0] // 2 * 2]
+        rows = value[::8].mean(dtype=np.float64) + value[1::8].mean(dtype=np.float64)  # of both phases
+        return (float(rows) / 2 - black) / (image.white - black)
+
+    if len(shot.frames) == 1:
+        return [0]
+    return [int(e) for e in np.argsort([level(frame) for frame in shot.frames], kind="stable")]
 
 
 # ---------------------------------------------------------------- one shot
@@ -229,7 +235,10 @@ def _merge_shot(
         served = served | (serves & usable)
         trust = np.maximum(serves, np.float32(1e-9 if e == reference else 0))  # some value for every pixel
         for _, _, rows in bracket.blocks(len(num), 0):
-            v = _variance(estimate[rows] * link.ratio, noises[e], image.cfa if full else None)
+            light = estimate[rows] * link.ratio
+            if ambient is not None:
+                light = light + lit * np.maximum(ambient.value[rows], 0)
+            v = _variance(light, noises[e], image.cfa if full else None)
             v = v if blur is None else v * blur[rows][..., None]
             v = v / link.ratio**2 + _misfit(estimate, rows, link.misfit * (4 if full else 1))
             w = trust[rows][..., None] / v
@@ -240,6 +249,7 @@ def _merge_shot(
             var[rows] += w * w * v
             if ambient is not None:
                 share[rows] += w * (lit / link.ratio)
+        del image
     num /= den
     var /= den
     var /= den
@@ -294,18 +304,27 @@ def _measure(
 ) -> tuple[list[_Link], list[noise.Noise], Bools, Floats]:
     """Links and noise of all frames, ghosts (h, w) and the smoothed first estimate (h, w, C), all binned."""
     iso = [frame.exif.iso or f"frame {e}" for e, frame in enumerate(shot.frames)]
+    raw_px = 1.0 if read(shot.frames[reference]).cfa is None else 2.0  # of one pixel
     least = sensor.rounding(read(shot.frames[reference])) / 2  # of a binned green
     ambient = _ambient(shot, reference, lines, read, False)
 
+    room = [np.float32(_lit(frame, shot.frames[reference])) for frame in shot.frames]
+
     def expose(e: int) -> tuple[Floats, Bools]:
         image = read(shot.frames[e])
-        value = sensor.signal(image)
+        value, usable = sensor.signal(image), sensor.usable(image, settings.clip)
         if ambient is not None:
-            value -= np.float32(_lit(shot.frames[e], shot.frames[reference])) * ambient.value
-        return value, sensor.usable(image, settings.clip)
+            if not lines.knows(iso[e]):
+                lines.learn(iso[e], noise.alone(value, usable))
+            value -= room[e] * ambient.value
+        return value, usable
+
+    def line(e: int) -> noise.Noise:
+        known = lines.line(iso[e], least)
+        return known if ambient is None else known.lit(room[e] * ambient.value.mean(axis=(0, 1)))
 
     still, clear = expose(reference)
-    if len(order) == 1:
+    if len(order) == 1 and ambient is None:
         lines.learn(iso[reference], noise.alone(still, clear))
     same = _Link(np.ones(still.shape[2], np.float32), None, np.zeros(still.shape[2], np.float32))
     links = {reference: same}
@@ -316,21 +335,21 @@ def _measure(
         name = f"frame {e + 1} of shot {shot.name}"
         value, usable = expose(e)
         _same_size(name, value.shape, still.shape)
-        scale = 1.0 if read(shot.frames[e]).cfa is None else 2.0
-        moved = _moved(name, still, clear, value, usable, settings.max_motion_px / scale)
+        moved = _moved(name, still, clear, value, usable, settings.max_motion_px / raw_px)
+        news = ambient is None and not (lines.knows(iso[e]) and lines.knows(iso[reference]))
         blur = 1.0
-        if moved is not None:  # the scene's detail does not cancel between the raw frames
-            if not lines.knows(iso[e]):
+        if moved is not None:  # the scene's detail does not cancel between the frames as they are
+            if news:
                 lines.learn(iso[e], noise.alone(value, usable))
                 lines.learn(iso[reference], noise.alone(still, clear))
             value, usable, gain = _resample(value, usable, moved)
             blur = float(gain.mean())
         both = clear & usable
         ratio = _ratio(name, still, value, both, shot.frames[e], shot.frames[reference])
-        if moved is None and not lines.knows(iso[e]):
+        if moved is None and news:
             for key, samples in zip((iso[reference], iso[e]), noise.paired(still, value, ratio, both)):
                 lines.learn(key, samples)
-        own, other = lines.line(iso[reference], least), lines.line(iso[e], least)
+        own, other = line(reference), line(e)
         misfit = noise.misfit(still, value, ratio, (own, other), blur, both)
         links[e] = _Link(ratio, moved, misfit)
         anchor = anchor or bracket.Anchor(still, clear, own)
@@ -339,7 +358,7 @@ def _measure(
         ghost |= new
         if e == order[0]:
             anchor.fill(value, usable, ratio, other)
-    estimate.add(still, clear, same.ratio, lines.line(iso[reference], least))
+    estimate.add(still, clear, same.ratio, line(reference))
     first = estimate.smoothed(still if anchor is None else anchor.value, ghost)
     noises = [lines.line(key, least) for key in iso]
     return [links[e] for e in range(len(iso))], noises, ghost, first
