@@ -15,11 +15,13 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from polcap.errors import CaptureError
 from polcap.formats import atomic, dng
 from polcap.images import Exif, Floats, GBuffer, View
+from polcap.optics.color import REC709_TO_XYZ
 from polcap.synth import camera, materials, render
 from polcap.synth import chart as charts
 from polcap.synth.camera import Sensor
@@ -29,9 +31,6 @@ from polcap.synth.scenes import Kind, random_scene
 __all__ = ["Kind", "Scene", "Shoot", "random_scene", "transform", "write"]
 
 _SENSOR_MM = 36.0  # width
-_SRGB_TO_XYZ = np.array(
-    [[0.4123908, 0.3575843, 0.1804808], [0.2126390, 0.7151687, 0.0721923], [0.0193308, 0.1191948, 0.9505322]]
-)
 _CFA = {"RGGB": (0, 1, 1, 2), "BGGR": (2, 1, 1, 0), "GRBG": (1, 0, 2, 1), "GBRG": (1, 2, 0, 1)}
 _CONVENTIONS = (
     "pixel (i, j) of the visible RAW has its centre at column i, row j; camera at the origin, x right, y up, "
@@ -83,7 +82,7 @@ def write(folder: Path, scene: Scene, shoot: Shoot) -> None:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise CaptureError(f"{folder} is not an empty folder; choose another place for the capture")
     buffer = render.gbuffer(scene, shoot.view, shoot.height, shoot.width)
-    to_camera, color_matrix, neutral = _camera(shoot)
+    to_camera = _to_camera(shoot)
     reference = _light(scene, shoot, buffer, np.eye(3))
     middle = _middle_exposure(scene, shoot, buffer, reference[0] @ to_camera.T)
     with atomic.folder(folder) as place:
@@ -92,38 +91,9 @@ def write(folder: Path, scene: Scene, shoot: Shoot) -> None:
             pose = _pose(shoot, shot)
             radiance = _passed(scene, shoot, buffer, pose, reference if shot == 0 else None) @ to_camera.T
             for frame in range(shoot.exposures):
-                number = shot * shoot.exposures + frame
-                name = f"{_folder_name(angle)}/IMG_{number + 1:04d}.DNG"
-                exif, light, amplification = _setting(shoot, frame, number, middle)
-                random = np.random.default_rng([shoot.seed, 1 + shot, frame])
-                energy = float(1 + shoot.gain_jitter * random.normal())
-                mosaic = camera.mosaic(radiance, np.reshape(_CFA[shoot.cfa], (2, 2)).astype(np.uint8))
-                counts = camera.expose(mosaic * (light * energy), shoot.sensor, amplification, random)
-                dng.write(
-                    place / name,
-                    counts,
-                    cfa=np.reshape(_CFA[shoot.cfa], (2, 2)).astype(np.uint8),
-                    black=shoot.sensor.black,
-                    white=shoot.sensor.white,
-                    exif=exif,
-                    color_matrix=color_matrix,
-                    as_shot_neutral=neutral,
-                )
-                files.append(
-                    {
-                        "file": name,
-                        "nominal_deg": angle,
-                        **pose,
-                        "exposure_index": frame,
-                        "time": exif.exposure_time,
-                        "fnumber": exif.f_number,
-                        "iso": exif.iso,
-                        "relative_exposure": light * amplification,
-                        "flash_factor": energy,
-                        "clipped_fraction_object": float((counts[buffer.mask] >= shoot.sensor.white).mean()),
-                        "time_stamp": exif.taken,
-                    }
-                )
+                name = f"{_folder_name(angle)}/IMG_{shot * shoot.exposures + frame + 1:04d}.DNG"
+                done = _write_frame(place / name, shoot, radiance, shot, frame, middle, buffer.mask)
+                files.append({"file": name, "nominal_deg": angle, **pose, **done})
         _write_truth(place, scene, shoot, buffer, reference, to_camera, files)
 
 
@@ -193,11 +163,10 @@ def _blurred(shoot: Shoot, image: Floats) -> Floats:
     return np.asarray(gaussian_filter(image, shoot.blur_px, axes=(-3, -2))) if shoot.blur_px else image
 
 
-def _camera(shoot: Shoot) -> tuple[Floats, Floats, Floats]:
-    """Linear Rec.709 → camera (3, 3) with green of white = 1, XYZ → camera (3, 3), camera values of white (3,)."""
-    matrix = np.reshape(shoot.color_matrix, (3, 3)) @ _SRGB_TO_XYZ
-    green = matrix[1].sum()
-    return matrix / green, np.reshape(shoot.color_matrix, (3, 3)), matrix.sum(axis=1) / green
+def _to_camera(shoot: Shoot) -> Floats:
+    """Linear Rec.709 → camera (3, 3), green of white = 1."""
+    matrix = np.reshape(shoot.color_matrix, (3, 3)) @ REC709_TO_XYZ
+    return np.asarray(matrix / matrix[1].sum())
 
 
 def _middle_exposure(scene: Scene, shoot: Shoot, buffer: GBuffer, s0: Floats) -> float:
@@ -212,6 +181,38 @@ def _middle_exposure(scene: Scene, shoot: Shoot, buffer: GBuffer, s0: Floats) ->
         white = render.white_level(scene) / 2
         level, peak = max(level, white), max(peak, white)
     return min(0.35 / level, 0.95 / peak * shoot.step ** (shoot.exposures // 2))
+
+
+def _write_frame(
+    path: Path, shoot: Shoot, radiance: Floats, shot: int, frame: int, middle: float, mask: NDArray[np.bool_]
+) -> dict[str, Any]:
+    """One file of `radiance` (H, W, 3) in camera channels, and what was done to it."""
+    exif, light, amplification = _setting(shoot, frame, shot * shoot.exposures + frame, middle)
+    random = np.random.default_rng([shoot.seed, 1 + shot, frame])
+    energy = float(1 + shoot.gain_jitter * random.normal())
+    cfa = np.reshape(_CFA[shoot.cfa], (2, 2)).astype(np.uint8)
+    mosaic = camera.mosaic(radiance, cfa) * (light * energy)
+    counts = camera.expose(mosaic, shoot.sensor, amplification, random)
+    dng.write(
+        path,
+        counts,
+        cfa=cfa,
+        black=shoot.sensor.black,
+        white=shoot.sensor.white,
+        exif=exif,
+        color_matrix=np.reshape(shoot.color_matrix, (3, 3)),
+        as_shot_neutral=_to_camera(shoot).sum(axis=1),
+    )
+    return {
+        "exposure_index": frame,
+        "time": exif.exposure_time,
+        "fnumber": exif.f_number,
+        "iso": exif.iso,
+        "relative_exposure": light * amplification,
+        "flash_factor": energy,
+        "clipped_fraction_object": float((counts[mask] >= shoot.sensor.white).mean()),
+        "time_stamp": exif.taken,
+    }
 
 
 def _setting(shoot: Shoot, frame: int, number: int, middle: float) -> tuple[Exif, float, float]:
