@@ -230,6 +230,72 @@ def report(
     _judge(about)
 
 
+@app.command()
+@_reported
+def synth(
+    context: typer.Context,
+    folder: Annotated[Path, typer.Argument(help="Folder to make; must be new or empty.")],
+    scene: Annotated[Literal["bumps", "clusters", "vase"], typer.Option(help="What stands there.")] = "bumps",
+    seed: Annotated[int, typer.Option(min=0, help="Draws shape, material, light and noise.")] = 0,
+    assignments: Annotated[
+        list[str] | None, typer.Option("--set", metavar="K=V", help="How it is shot, as width=768; repeatable.")
+    ] = None,
+) -> None:
+    """Photograph an object that does not exist: RAW brackets, with the truth beside them."""
+    from polcap import config as settings
+    from polcap.synth import capture as synthetic
+    from polcap.synth import scenes
+
+    shoot = settings.fill(synthetic.Shoot, {"seed": seed}, assignments or ())
+    synthetic.write(folder, scenes.random_scene(seed, scene), shoot)
+    _print(str(folder))
+
+
+@app.command()
+@_reported
+def train(
+    context: typer.Context,
+    data: Annotated[Path, typer.Argument(help="Folder with meshes/ and materials/.")],
+    out: Annotated[Path, typer.Option(help="Checkpoints and metrics.")] = Path("runs/train"),
+    preset: Annotated[Literal["cpu", "gpu"], typer.Option(help="Size of the network and of a batch.")] = "cpu",
+    minutes: Annotated[float, typer.Option(min=0.1, help="Training time, resumed parts together.")] = 90,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint.")] = False,
+    threads: Annotated[int, typer.Option(min=1)] = 2,
+    seed: Annotated[int, typer.Option(min=0)] = 1,
+) -> None:
+    """Train the network (extra [train])."""
+    trainer = _extra("train")
+    told = trainer.Params(preset=preset, data=data, out=out, minutes=minutes, resume=resume, threads=threads, seed=seed)
+    _print(str(trainer.main(told)))
+
+
+@app.command()
+@_reported
+def evaluate(
+    context: typer.Context,
+    model: Annotated[Path, typer.Argument(help="ONNX model.")],
+    data: Annotated[Path, typer.Argument(help="Folder with meshes/ and materials/.")],
+    out: Annotated[Path, typer.Option(help="evaluation.json and evaluation.md.")] = Path("runs/evaluate"),
+    count: Annotated[int, typer.Option(min=1, help="Pictures to judge.")] = 48,
+    size: Annotated[int, typer.Option(min=64, help="Their side, px.")] = 256,
+    seed: Annotated[int, typer.Option(min=0)] = 7,
+) -> None:
+    """Score a model beside the analytic estimator and the baselines (extra [train])."""
+    judge = _extra("evaluate")
+    judge.main(judge.Params(model=model, data=data, out=out, count=count, size=size, seed=seed))
+    _print(str(out / "evaluation.md"))
+
+
+def _extra(module: str) -> Any:
+    """A module of polcap.training; an error with the remedy where torch is not installed."""
+    import importlib
+
+    try:
+        return importlib.import_module(f"polcap.training.{module}")
+    except ModuleNotFoundError as error:
+        raise SettingError(f"{error.name} is not installed; pip install 'polcap[train]'") from error
+
+
 def _limit(threads: int, memory: float) -> None:
     """Set the process's limits before any numerical library starts."""
     if memory:

@@ -8,7 +8,7 @@ import difflib
 import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 from msgspec import Meta
@@ -23,6 +23,8 @@ from polcap.stages.selfcal import Settings as Selfcal
 from polcap.stages.stokes import Settings as Stokes
 from polcap.stages.surface import Settings as Surface
 from polcap.stages.whitebalance import Settings as Whitebalance
+
+S = TypeVar("S", bound=msgspec.Struct)
 
 
 class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -100,14 +102,28 @@ def load(file: Path | None = None, assignments: Sequence[str] = ()) -> Config:
         raise _explain(error, given, known) from error
 
 
+def fill(kind: type[S], given: dict[str, Any], assignments: Sequence[str]) -> S:
+    """A single struct from given values and name=value assignments, as strict as `load`."""
+    for assignment in assignments:
+        name, equals, text = assignment.partition("=")
+        if not equals or name not in kind.__struct_fields__:
+            raise SettingError(f"--set {assignment}: give one of {', '.join(kind.__struct_fields__)} as name=value")
+        given = {**given, name: _parse(text.strip())}
+    try:
+        return msgspec.convert(given, kind)
+    except msgspec.ValidationError as error:
+        raise SettingError(f"--set: {error}") from error
+
+
 def settings() -> Iterator[Setting]:
     """Every setting in the order of the stages, as the settings page lists them."""
     for section in msgspec.structs.fields(Config):
         hints = get_type_hints(section.type, include_extras=True)
         for field in msgspec.structs.fields(section.type):
             hint = hints[field.name]
-            meta = next((extra for extra in get_args(hint)[1:] if isinstance(extra, Meta)), Meta())
-            kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+            arms = [hint] if get_origin(hint) is Annotated else [*get_args(hint)] or [hint]
+            meta = next((extra for arm in arms for extra in get_args(arm)[1:] if isinstance(extra, Meta)), Meta())
+            kind = get_type_hints(section.type)[field.name]
             word = str(kind).replace("typing.", "") if get_args(kind) else kind.__name__
             yield Setting(f"{section.name}.{field.name}", word, field.default, _limits(meta), meta.description or "")
 

@@ -51,10 +51,14 @@ def merged(radiance: AngleStack) -> Picture:
 def chart(radiance: AngleStack, color: ColorCalibration) -> Picture:
     """The reference shot with the chart's patches as they were read."""
     picture = reference(radiance, color)
-    for quad in color.quads if color.quads is not None else ():
-        cv2.polylines(picture, [np.round(quad).astype(np.int32)], True, (0, 255, 0), 2)
+    zoom = max(1, round(2 * WIDTH / picture.shape[1]))
+    picture = np.asarray(np.repeat(np.repeat(picture, zoom, 0), zoom, 1), np.uint8)
+    outlines = [(quad, (0, 255, 0)) for quad in (color.quads if color.quads is not None else ())]
     if color.corners is not None:
-        cv2.polylines(picture, [np.round(color.corners).astype(np.int32)], True, (255, 255, 0), 2)
+        outlines.append((color.corners, (255, 255, 0)))
+    for corners, paint in outlines:
+        points = np.round((corners + 0.5) * zoom - 0.5).astype(np.int32)
+        cv2.polylines(picture, [points], True, paint, 1, cv2.LINE_AA)
     return picture
 
 
