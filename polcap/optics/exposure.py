@@ -63,7 +63,8 @@ def _quotient(a: Floats, b: Floats) -> tuple[float, float] | None:
 
 def _tiles(picture: Floats) -> Floats:
     h, w = picture.shape[0] // TILE, picture.shape[1] // TILE
-    rows = [
-        picture[TILE * i : TILE * (i + 1), : TILE * w].reshape(TILE, w, TILE, -1).mean(axis=(0, 2)) for i in range(h)
-    ]
+    rows = []
+    for i in range(h):
+        columns = picture[TILE * i : TILE * (i + 1), : TILE * w].sum(axis=0, dtype=np.float64)
+        rows.append(columns.reshape(w, TILE, -1).sum(axis=1) / TILE**2)
     return np.stack(rows) if rows else np.zeros((0, w, picture.shape[2]), np.float32)

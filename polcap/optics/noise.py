@@ -243,8 +243,8 @@ def _low_quantile(variance: Floats) -> float:
 def _tiles(values: Floats, usable: NDArray[np.bool_]) -> Floats:
     """Means over the tiles of one strip, (T, C); NaN where a pixel the tile touches is not usable."""
     count = values.shape[1] // TILE
-    cut = values[:TILE, : count * TILE].reshape(TILE, count, TILE, -1)
-    mean = np.asarray(cut.mean(axis=(0, 2)), np.float64)  # (T, C)
+    columns = values[:TILE, : count * TILE].sum(axis=0, dtype=np.float64)
+    mean = np.asarray(columns.reshape(count, TILE, -1).sum(axis=1) / TILE**2)  # (T, C)
     bad = np.asarray(~usable.all(axis=0))  # (W,)
     touched = [bad[TILE * t : TILE * t + TILE + 2].any() for t in range(count)]
     mean[np.array(touched, bool)] = np.nan

@@ -259,7 +259,7 @@ def _merge_shot(
     quality = np.zeros(ghost.shape, np.uint8)
     quality[~served] |= np.uint8(Quality.CLIPPED)
     quality[ghost] |= np.uint8(Quality.GHOST)
-    quality[num.sum(axis=2) < 2 * np.sqrt(var.sum(axis=2))] |= np.uint8(Quality.DARK)
+    quality[_summed(num) < 2 * np.sqrt(_summed(var))] |= np.uint8(Quality.DARK)
     return _Merged(num, var, quality, np.stack([link.ratio for link in links]).astype(np.float64))
 
 
@@ -286,8 +286,13 @@ def _misfit(estimate: Floats, rows: slice, misfit: Floats) -> Floats:
 
 def _ramp(predicted: Floats, clip: float) -> Floats:
     """1 well below saturation, falling to 0 at it, so that no frame drops out in a step; (h, w, 1)."""
-    peak = predicted.max(axis=2, keepdims=True)
+    peak = np.maximum.reduce([predicted[..., c : c + 1] for c in range(predicted.shape[2])])
     return np.asarray(np.clip((clip - peak) / 0.15, 1e-3, 1))
+
+
+def _summed(picture: Floats) -> Floats:
+    """Over channels, (H, W); much faster than numpy's sum over a short last axis."""
+    return np.asarray(picture @ np.ones(picture.shape[2], picture.dtype))
 
 
 def _twice(picture: Floats) -> Floats:
@@ -368,7 +373,7 @@ def _moved(name: str, still: Floats, clear: Bools, value: Floats, usable: Bools,
     """Reference px → frame px, or None where the frame did not move measurably."""
 
     def prepared(picture: Floats) -> Floats:
-        smooth = cv2.GaussianBlur(picture.mean(axis=2), (0, 0), 0.8)
+        smooth = cv2.GaussianBlur(_summed(picture), (0, 0), 0.8)
         return np.asarray(np.sqrt(np.maximum(smooth, 0) + np.float32(1e-4)))
 
     found = motion.estimate(prepared(still), prepared(value), clear, usable)
@@ -447,11 +452,15 @@ def _resample(sample: Floats, usable: Bools, matrix: Floats) -> tuple[Floats, Bo
     seen = cv2.warpPerspective(inner, matrix, (w, h), flags=inverse | cv2.INTER_LINEAR, borderValue=0) == 255
     gain = np.empty((h, w), np.float32)
     table = _kernel_gain()
+    x = np.arange(w, dtype=np.float32)
+    m = matrix.astype(np.float32)
     for _, _, rows in bracket.blocks(h, 0):
-        y, x = np.mgrid[rows, 0:w]
-        point = np.stack([x, y, np.ones_like(x)], axis=-1) @ matrix.T
-        index = np.rint((point[..., :2] / point[..., 2:]) % 1 * 32).astype(np.intp)
-        gain[rows] = table[index[..., 0]] * table[index[..., 1]]
+        y = np.arange(h, dtype=np.float32)[rows, None]
+        depth = m[2, 0] * x + (m[2, 1] * y + m[2, 2])
+        px = (m[0, 0] * x + (m[0, 1] * y + m[0, 2])) / depth
+        py = (m[1, 0] * x + (m[1, 1] * y + m[1, 2])) / depth
+        gain[rows] = table[((px - np.floor(px)) * 32 + 0.5).astype(np.int8)]
+        gain[rows] *= table[((py - np.floor(py)) * 32 + 0.5).astype(np.int8)]
     return value, seen, gain
 
 
