@@ -27,21 +27,24 @@ class Triangles:
 
 
 def smooth(vertices: Floats, faces: NDArray[np.integer], crease: float = 0.75) -> Triangles:
-    """Give a mesh area-weighted normals, smooth across edges flatter than `crease` rad.
+    """Give a mesh angle-weighted normals, smooth across edges flatter than `crease` rad.
 
     Vertices at the same place count as one, so seams of a texture atlas do not show.
     """
     vertices = np.ascontiguousarray(vertices, dtype=np.float32)
     index = np.ascontiguousarray(faces, dtype=np.int32)
-    _, place = np.unique(vertices, axis=0, return_inverse=True)
+    grain = max(float(np.ptp(vertices, axis=0).max()), 1e-20) * 1e-6
+    _, place = np.unique(np.round(vertices / grain).astype(np.int64), axis=0, return_inverse=True)
     place = place.reshape(-1)[index]  # (F, 3)
     corner = vertices[index]
-    area = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])  # (F, 3) twice the area
+    flat = _unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
     total = np.zeros((place.max() + 1, 3), dtype=np.float64)
     for k in range(3):
+        ahead, back = (_unit(corner[:, (k + j) % 3] - corner[:, k]) for j in (1, 2))
+        angle = np.arccos(np.clip(np.sum(ahead * back, axis=1), -1, 1))
         for axis in range(3):
-            total[:, axis] += np.bincount(place[:, k], weights=area[:, axis], minlength=len(total))
-    flat = _unit(area)[:, None, :]
+            total[:, axis] += np.bincount(place[:, k], weights=angle * flat[:, axis], minlength=len(total))
+    flat = flat[:, None, :]
     shared = _unit(total)[place]  # (F, 3, 3)
     sharp = np.sum(shared * flat, axis=-1, keepdims=True) < np.cos(crease)
     return Triangles(vertices, index, np.where(sharp, flat, shared).astype(np.float32))

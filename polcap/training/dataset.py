@@ -34,6 +34,20 @@ class Batch:
 
 
 @dataclass(frozen=True)
+class Photo:
+    """What the camera measured at the M pixels `at` of the mask it was given, and the truth of every pixel."""
+
+    stokes: Tensor  # (3, M, 3)
+    covariance: Tensor  # (6, M, 3)
+    clipped: Tensor  # (M,) bool
+    at: Tensor  # (M,) indices into B·H·W
+    given: Tensor  # (B, H, W) bool, the mask
+    rays: Tensor  # (B, H, W, 3)
+    mask: Tensor  # (B, H, W) bool, the object
+    truth: dict[str, Tensor]  # (B, H, W, ·): normal (ray frame), depth, diffuse, specular, roughness
+
+
+@dataclass(frozen=True)
 class Light:
     """The flash of each object."""
 
@@ -58,9 +72,7 @@ class Light:
 class Simulator:
     """Views and materials on one device; draws batches from torch's global random state."""
 
-    def __init__(
-        self, views: dict[str, NDArray[Any]], library: materials.Library, device: torch.device
-    ) -> None:
+    def __init__(self, views: dict[str, NDArray[Any]], library: materials.Library, device: torch.device) -> None:
         self.views, self.library, self.device = views, library, device
         self.size = views["mask"].shape[1]
 
@@ -69,7 +81,7 @@ class Simulator:
         pick = torch.randint(len(self.views["camera"]), (count,)).numpy()
         view = self.look(pick, size, flip=True)
         jitter = torch.rand(count, device=self.device)
-        return self.render(view, Light.draw(count, self.device), Errors.draw(count, self.device), jitter)
+        return batch(self.shoot(view, Light.draw(count, self.device), Errors.draw(count, self.device), jitter))
 
     def look(self, pick: NDArray[np.integer[Any]], size: int, *, flip: bool) -> SimpleNamespace:
         """Some of the traced views, thinned out to size² pixels and, with `flip`, mirrored at random."""
@@ -94,24 +106,14 @@ class Simulator:
         )  # fmt: skip
         return _mirrored(out) if flip else out
 
-    def render(
-        self,
-        view: SimpleNamespace,
-        light: Light,
-        errors: Errors,
-        jitter: Tensor | None = None,
-        surface: materials.Surface | None = None,
-    ) -> Batch:
-        """Dress, light and photograph; `jitter` (B,) in 0…1 thins or widens the mask the network is given."""
+    def shoot(self, view: SimpleNamespace, light: Light, errors: Errors, jitter: Tensor | None = None) -> Photo:
+        """Dress, light and photograph; `jitter` (B,) in 0…1 thins or widens the mask that is given."""
         count, height, width = view.mask.shape
         inside = view.mask.reshape(-1).nonzero()[:, 0]
         owner = inside // (height * width)
         v = view.rays.reshape(-1, 3)[inside]
-        if surface is None:
-            bare = view.normal.reshape(-1, 3)[inside]
-            surface = materials.dress(
-                self.library, bare, view.position.reshape(-1, 3)[inside], view.turn, owner, count
-            )
+        bare, position = (image.reshape(-1, 3)[inside] for image in (view.normal, view.position))
+        surface = materials.dress(self.library, bare, position, view.turn, owner, count)
         normal = frames.to_ray_frame(surface.normal, v)
         normal = F.normalize(torch.cat([normal[:, :2], normal[:, 2:].clamp(min=0.02)], dim=1), dim=1)
         place = -v * (view.far.reshape(-1)[inside] / v[:, 2])[:, None]
@@ -137,20 +139,26 @@ class Simulator:
         measured, covariance, clipped = photograph(
             scene, truth["diffuse"], truth["normal"][..., 2], view.mask, view.rays, at, errors
         )
-        return Batch(
-            channels=_channels(measured, covariance, clipped, view.rays, at),
-            mask=given & view.mask,
-            **{name: value.permute(0, 3, 1, 2) for name, value in truth.items()},
-        )
+        return Photo(measured, covariance, clipped, at, given, view.rays, view.mask, truth)
 
 
-def _channels(measured: Tensor, covariance: Tensor, clipped: Tensor, rays: Tensor, at: Tensor) -> Tensor:
-    """What `stages/cues.py` makes of the measured pixels `at`, (B, N, H, W), 0 elsewhere; channels last in memory."""
-    count, height, width = rays.shape[:3]
-    ratio, sigma, dolp, normalized = cues.polarization(measured, covariance)
+def batch(photo: Photo) -> Batch:
+    """What the network is given of photographs, and what it should say."""
+    return Batch(
+        channels=channels(photo),
+        mask=photo.given & photo.mask,
+        **{name: value.permute(0, 3, 1, 2) for name, value in photo.truth.items()},
+    )
+
+
+def channels(photo: Photo) -> Tensor:
+    """What `stages/cues.py` makes of the measured pixels, (B, N, H, W), 0 elsewhere; channels last in memory."""
+    count, height, width = photo.rays.shape[:3]
+    ratio, sigma, dolp, normalized = cues.polarization(photo.stokes, photo.covariance)
+    clipped, at = photo.clipped, photo.at
     row = SimpleNamespace(  # all pixels as one row
-        radiance=measured[0][None], ratio=ratio[:, None], ratio_sigma=sigma[None], dolp=dolp[None],
-        normalized_stokes=normalized[:, None], rays=rays.reshape(1, -1, 3)[:, at],
+        radiance=photo.stokes[0][None], ratio=ratio[:, None], ratio_sigma=sigma[None], dolp=dolp[None],
+        normalized_stokes=normalized[:, None], rays=photo.rays.reshape(1, -1, 3)[:, at],
         mask=torch.ones_like(clipped)[None], quality=(clipped.to(torch.uint8) * int(Quality.CLIPPED))[None],
     )  # fmt: skip
     flat = cues.channels(row)[:, 0].T  # (M, N)

@@ -9,7 +9,6 @@ the pattern of the albedo as in real materials, around levels drawn per material
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -60,7 +59,7 @@ class Library:
         return F.grid_sample(self.noise, grid, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0, 0].T
 
 
-def read_textures(folder: Path) -> np.ndarray[Any, np.dtype[np.float32]]:
+def read_textures(folder: Path) -> Floats:
     """Linear albedo, roughness and two slopes of a texture set, (6, 256, 256)."""
     size = (_TEXELS, _TEXELS)
     albedo = _picture(folder / "albedo.jpg", size)[..., ::-1]
@@ -77,9 +76,7 @@ def read_textures(folder: Path) -> np.ndarray[Any, np.dtype[np.float32]]:
     return np.ascontiguousarray(maps.transpose(2, 0, 1), dtype=np.float32)
 
 
-def dress(
-    library: Library, normal: Tensor, position: Tensor, turn: Tensor, owner: Tensor, count: int
-) -> Surface:
+def dress(library: Library, normal: Tensor, position: Tensor, turn: Tensor, owner: Tensor, count: int) -> Surface:
     """Draw a material for each of `count` objects and evaluate it at their pixels.
 
     normal (M, 3) camera frame, position (M, 3) object frame, turn (B, 3, 3) object → camera,
@@ -91,9 +88,7 @@ def dress(
     facing = _turned(frame @ turn.transpose(1, 2), normal, owner)
 
     coarse, fine = (
-        library.sample_noise(
-            inner * _log_uniform((count, 1), low, high, device)[owner] + _u((count, 3), device)[owner]
-        )
+        library.sample_noise(inner * _log_uniform((count, 1), low, high, device)[owner] + _u((count, 3), device)[owner])
         for low, high in ((0.5, 2.5), (2.0, 9.0))
     )
 
@@ -190,7 +185,7 @@ def _noise_volume(seed: int) -> Tensor:
     return torch.cat([volume, gradient / gradient.std()], dim=1)
 
 
-def _picture(path: Path, size: tuple[int, int]) -> np.ndarray[Any, np.dtype[np.float32]]:
+def _picture(path: Path, size: tuple[int, int]) -> Floats:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.float32) / 255
 

@@ -21,8 +21,9 @@ import torch
 from torch import Tensor
 
 from polcap.errors import InputError
-from polcap.training import evaluate, gbuffers, loss, materials, model
+from polcap.training import gbuffers, loss, materials, model
 from polcap.training.dataset import Batch, Simulator
+from polcap.training.watch import Watch
 
 _HOLD = 0.6  # share of the budget at the full learning rate
 _WARM = 200  # steps
@@ -67,7 +68,7 @@ def main(params: Params) -> Path:
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     params.out.mkdir(parents=True, exist_ok=True)
     simulator = Simulator(views(params, preset), library(params, "train", device), device)
-    watch = evaluate.Watch(params.data, params.out / "watch", device)
+    watch = Watch(params.data, params.out / "watch", device)
     run = Run(preset.shape, device, params.rate)
     if params.resume:
         run.load(params.out / "last.pt")
@@ -82,7 +83,7 @@ def main(params: Params) -> Path:
         parts.append(run.advance(next(ready), run.elapsed / budget))
         now = time.monotonic()
         run.elapsed, before = run.elapsed + now - before, now
-        if run.step % 50 == 0 or run.step == 10:
+        if run.step % 50 == 0 or run.step == 10 or run.elapsed >= budget:
             _record(params.out / "metrics.csv", run, {k: float(np.mean([p[k] for p in parts])) for k in parts[0]})
             parts = []
         if run.elapsed - looked > 240 or (run.elapsed >= budget):

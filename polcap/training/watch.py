@@ -1,0 +1,85 @@
+"""A look at held-out pictures while training runs; nothing is chosen by it."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from polcap.training import gbuffers, materials
+from polcap.training.camera import Errors
+from polcap.training.dataset import Batch, Light, Simulator, batch
+
+
+class Watch:
+    """A fixed set of pictures of test meshes with test materials, in the stated conditions."""
+
+    def __init__(self, data: Path, folder: Path, device: torch.device, *, count: int = 48, size: int = 128) -> None:
+        simulator = held_out(data, folder, device, views=20, size=size)
+        total = len(simulator.views["camera"])
+        order = np.random.default_rng(5).permutation(total)[:count]
+        self.batches = []
+        with torch.random.fork_rng():
+            torch.manual_seed(6)
+            for first in range(0, len(order), 8):
+                view = simulator.look(order[first : first + 8], size, flip=False)
+                number = len(view.mask)
+                photo = simulator.shoot(view, Light.stated(number, device), Errors.stated(number, device))
+                self.batches.append(batch(photo))
+
+    def look(self, network: nn.Module) -> dict[str, float]:
+        """Mean figures over all pixels of all pictures."""
+        rows = [figures(run(network, batch), batch) for batch in self.batches]
+        return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+
+
+def held_out(data: Path, folder: Path, device: torch.device, *, views: int, size: int) -> Simulator:
+    """Test meshes, test texture sets and a noise volume that training never saw; traced once into `folder`."""
+    if not (folder / "index.json").exists():
+        meshes = sorted((data / "meshes" / "test").glob("*.npz"))
+        gbuffers.build(folder, meshes, views=views, procedural=0, size=size, seed=99)
+    textures = data / "materials" / "test"
+    library = materials.Library(textures if textures.exists() else None, device, seed=4)
+    return Simulator(gbuffers.load(folder), library, device)
+
+
+def run(network: nn.Module, batch: Batch) -> dict[str, Tensor]:
+    """The maps of a batch, without gradients."""
+    device = batch.channels.device
+    with torch.no_grad(), torch.autocast(device.type, torch.bfloat16):
+        maps: dict[str, Tensor] = network(batch.channels.contiguous(memory_format=torch.channels_last))
+    return maps
+
+
+def figures(maps: dict[str, Tensor], batch: Batch) -> dict[str, float]:
+    """Errors over the masked pixels of one batch; `·_constant` is what the best constant map would score."""
+    mask = batch.mask
+    half = (maps["normal"] - batch.normal).norm(dim=1).clamp(max=2) / 2
+    error = torch.rad2deg(2 * torch.asin(half))[mask]
+    out = {
+        "normal_mean": float(error.mean()),
+        "normal_median": float(error.median()),
+        "depth_rmse": float(_depth_error(maps["depth"], batch).square().mean().sqrt()),
+        "sigma_mean": float(maps["sigma"][:, 0][mask].mean()),
+    }
+    for name in ("diffuse", "specular", "roughness"):
+        truth = getattr(batch, name).permute(0, 2, 3, 1)[mask]
+        difference = maps[name].permute(0, 2, 3, 1)[mask] - truth
+        out[f"{name}_rmse"] = float(difference.square().mean().sqrt())
+        out[f"{name}_l1"] = float(difference.abs().mean())
+        out[f"{name}_constant"] = float((truth - truth.mean(dim=0)).square().mean().sqrt())
+    return out
+
+
+def _depth_error(depth: Tensor, batch: Batch) -> Tensor:
+    """Difference of depths centred within each mask, by the truth's greatest minus least; masked pixels."""
+    mask = batch.mask[:, None]
+    inside = mask.float()
+    area = inside.sum(dim=(2, 3), keepdim=True).clamp(min=1)
+
+    def centred(image: Tensor) -> Tensor:
+        return image - (image * inside).sum(dim=(2, 3), keepdim=True) / area
+
+    low = torch.where(mask, batch.depth, torch.inf).amin(dim=(2, 3), keepdim=True)
+    high = torch.where(mask, batch.depth, -torch.inf).amax(dim=(2, 3), keepdim=True)
+    return ((centred(depth) - centred(batch.depth)) / (high - low))[mask]

@@ -1,0 +1,48 @@
+"""The model file: what torch computes, onnxruntime computes, at any size; and it says what it is."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("onnx")
+
+from polcap.formats import onnx
+from polcap.stages.cues import CHANNELS
+from polcap.training import export, model
+from tests.training.test_model import TINY
+
+
+def settled(shape: model.Shape) -> model.Network:
+    """A network with no zero weights, all of them exact in fp16."""
+    torch.manual_seed(0)
+    network = model.Network(shape).eval()
+    for parameter in network.parameters():
+        if float(parameter.abs().sum()) == 0:
+            torch.nn.init.normal_(parameter, std=0.02)
+        parameter.data = parameter.data.half().float()
+    return network
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning", "ignore::UserWarning")
+def test_onnxruntime_agrees_with_torch_at_any_size(tmp_path: Path) -> None:
+    network = settled(TINY)
+    path = tmp_path / "m.onnx"
+    assert export.write(network, path, {"licence": "Apache-2.0", "version": "test"}) == path.stat().st_size
+    loaded = onnx.load(path, threads=1)
+    assert loaded.channels == CHANNELS and loaded.metadata["licence"] == "Apache-2.0"
+    for size in ((64, 64), (160, 96), (32, 224)):
+        x = torch.randn(1, len(CHANNELS), *size)
+        x[:, CHANNELS.index("mask")] = (x[:, CHANNELS.index("mask")] > 0).float()
+        with torch.no_grad():
+            expected = network(x)
+        got = loaded.run(x.numpy())
+        assert tuple(got) == model.OUTPUTS
+        for name, value in expected.items():
+            np.testing.assert_allclose(got[name], value.numpy(), atol=1e-3)
+
+
+def test_stored_in_halves_the_small_network_fits_the_limit() -> None:
+    weights = sum(p.numel() for p in model.Network().parameters())
+    assert 2 * weights < 16e6  # bytes; the limit for a shipped file is 24 MB

@@ -1,0 +1,42 @@
+"""The cache of views: whole, reproducible, and true to its own conventions."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polcap.errors import InputError
+from polcap.training import gbuffers
+
+
+def test_same_seed_traces_the_same_views(data: Path, views: Path, tmp_path: Path) -> None:
+    meshes = [data / "meshes" / "train" / "one.npz"]
+    gbuffers.build(tmp_path / "again", meshes, views=6, procedural=2, per_shape=3, size=64, seed=5)
+    first, second = gbuffers.load(views), gbuffers.load(tmp_path / "again")
+    for name in first:
+        np.testing.assert_array_equal(first[name], second[name])
+
+
+def test_depth_is_centred_and_in_units_of_the_equivalent_disc(views: Path) -> None:
+    cache = gbuffers.load(views)
+    for index, camera in enumerate(cache["camera"]):
+        mask = cache["mask"][index, ..., 0]
+        assert abs(cache["depth"][index, ..., 0][mask].astype(float).mean()) < 2e-3  # fp16
+        assert camera[4] == pytest.approx(np.sqrt(mask.sum() / np.pi) * camera[3] / camera[0], rel=1e-5)
+
+
+def test_objects_lie_inside_the_frame_and_turns_are_rotations(views: Path) -> None:
+    cache = gbuffers.load(views)
+    border = np.ones((64, 64), bool)
+    border[1:-1, 1:-1] = False
+    assert (cache["mask"][..., 0] & border).mean() < 0.002
+    assert cache["mask"].mean(axis=(1, 2, 3)).min() > 0.05
+    turn = cache["camera"][:, 5:].reshape(-1, 3, 3)
+    np.testing.assert_allclose(turn @ turn.transpose(0, 2, 1), np.broadcast_to(np.eye(3), turn.shape), atol=1e-5)
+
+
+def test_interrupted_build_is_not_taken_for_a_cache(views: Path, tmp_path: Path) -> None:
+    for file in views.glob("*.npy"):
+        (tmp_path / file.name).symlink_to(file)
+    with pytest.raises(InputError, match="no complete G-buffer cache"):
+        gbuffers.load(tmp_path)

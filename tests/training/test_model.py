@@ -1,0 +1,52 @@
+"""The network: any size, outputs in their units, and ready to learn."""
+
+import pytest
+import torch
+
+from polcap.stages.cues import CHANNELS
+from polcap.training import model
+
+TINY = model.Shape((8, 16, 16, 16, 16), (8, 8, 16, 16), (8, 8, 8, 8), (8, 8, 8, 8), (1, 1, 1, 1, 1), 1)
+
+
+def inputs(height: int, width: int) -> torch.Tensor:
+    torch.manual_seed(0)
+    x = torch.randn(2, len(CHANNELS), height, width)
+    x[:, CHANNELS.index("mask")] = 1
+    return x
+
+
+@pytest.mark.parametrize("size", [(32, 32), (64, 160), (96, 32)])
+def test_any_multiple_of_32_gives_every_map_its_range(size: tuple[int, int]) -> None:
+    maps = model.Network(TINY)(inputs(*size))
+    assert set(maps) == set(model.OUTPUTS)
+    for name, count in {"normal": 3, "depth": 1, "diffuse": 3, "specular": 3, "roughness": 1, "sigma": 1}.items():
+        assert maps[name].shape == (2, count, *size) and maps[name].isfinite().all()
+    torch.testing.assert_close(maps["normal"].norm(dim=1), torch.ones(2, *size))
+    assert maps["sigma"].min() > 0 and maps["sigma"].max() < 60
+
+
+def test_every_weight_gets_a_gradient_once_the_zero_born_ones_moved() -> None:
+    torch.manual_seed(1)
+    network = model.Network(TINY)
+    optimizer = torch.optim.Adam(network.parameters(), 1e-3)
+    for _ in range(3):
+        optimizer.zero_grad()
+        maps = network(inputs(64, 64))
+        sum(((m - 0.3) ** 2).mean() for m in maps.values()).backward()
+        optimizer.step()
+    still = [name for name, p in network.named_parameters() if p.grad is None or float(p.grad.abs().sum()) == 0]
+    assert not still
+
+
+def test_a_far_pixel_reaches_the_whole_object() -> None:
+    """Global context: a change in one corner is felt in the other, as sharing a highlight's meaning needs."""
+    torch.manual_seed(2)
+    network = model.Network(TINY).eval()
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.15)
+    x = inputs(256, 256)
+    changed = x.clone()
+    changed[:, :, :16, :16] += 1
+    difference = (network(x)["roughness"] - network(changed)["roughness"]).abs()
+    assert difference[:, :, -16:, -16:].max() > 0

@@ -1,0 +1,74 @@
+"""Training: one command that learns, stops in time, and goes on where it stopped."""
+
+import csv
+from pathlib import Path
+
+import pytest
+import torch
+
+from polcap.errors import InputError
+from polcap.training import train
+from polcap.training.dataset import Simulator
+from tests.training.test_model import TINY
+
+PRESET = train.Preset(TINY, 4, 1, 64, (32, 64), (0.5, 0.5), 4 * 64**2)
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_run_stops_in_time_and_resumes(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(train.PRESETS, "cpu", PRESET)
+    params = train.Params(data=data, out=tmp_path, minutes=0.07, threads=1)
+    last = train.main(params)
+    first, facts = train.load_average(last)
+    assert 4.0 < facts["elapsed"] < 20 and facts["samples"] > facts["step"] > 0
+    assert {"step", "loss", "normal", "render"} <= set(rows(tmp_path / "metrics.csv")[0])
+    assert float(rows(tmp_path / "watch.csv")[-1]["normal_mean"]) < 90
+
+    train.main(train.Params(data=data, out=tmp_path, minutes=0.1, threads=1, resume=True))
+    second, later = train.load_average(last)
+    assert later["step"] > facts["step"] and later["elapsed"] > facts["elapsed"]
+    moved = [not torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters())]
+    assert any(moved)
+
+
+def test_steps_on_one_batch_lower_its_loss(simulator: Simulator) -> None:
+    torch.manual_seed(0)
+    run, batch = train.Run(TINY, torch.device("cpu"), 3e-3), simulator.draw(4, 64)
+    run.step = 200  # past the warm-up
+    losses = [run.advance(batch, 0.0)["loss"] for _ in range(25)]
+    assert losses[-1] < 0.8 * losses[0] and run.skipped == 0
+
+
+def test_resume_without_a_checkpoint_says_so(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(train.PRESETS, "cpu", PRESET)
+    with pytest.raises(InputError, match="nothing to resume"):
+        train.main(train.Params(data=data, out=tmp_path, resume=True))
+
+
+def test_unknown_preset_is_named() -> None:
+    with pytest.raises(InputError, match="'tpu' is not one of cpu, gpu"):
+        train.main(train.Params(preset="tpu"))
+
+
+def test_rate_falls_to_nothing_over_the_last_part_of_the_budget(data: Path) -> None:
+    from polcap.training.dataset import Batch
+
+    device = torch.device("cpu")
+    run = train.Run(TINY, device, 1e-3)
+    run.step = 1000
+    torch.manual_seed(0)
+    size = (1, 1, 32, 32)
+    batch = Batch(
+        torch.rand(1, 14, 32, 32), torch.ones(1, 32, 32, dtype=torch.bool),
+        torch.nn.functional.normalize(torch.ones(1, 3, 32, 32), dim=1), torch.rand(size), *torch.rand(2, 1, 3, 32, 32),
+        torch.rand(size),
+    )  # fmt: skip
+    rates = []
+    for progress in (0.1, 0.6, 0.8, 1.0):
+        run.advance(batch, progress)
+        rates.append(run.optimizer.param_groups[0]["lr"])
+    assert rates == pytest.approx([1e-3, 1e-3, 5e-4, 0.0])
