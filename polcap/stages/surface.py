@@ -28,6 +28,8 @@ from polcap.stages import stage
 _DIRECT = 60_000  # pixels; larger objects start from their solution at half the resolution
 _ANNEAL = 1.15  # growth of the stiffness per iteration, from a quarter of it: few early errors are kept as jumps
 _OFF_PLANE = 0.5  # sine between an edge and its ends' tangent planes: beyond, a depth step is a jump
+_TIRED = 9  # iterations of a linear solution that call for a new multigrid hierarchy
+_ACCURACY = 1e-3  # of each linear solution, relative
 _PROXIMITY = 1e-8  # pulls towards the last estimate: fixes what the normals leave free (one offset per piece)
 
 
@@ -180,7 +182,7 @@ def _reweighted(problem: _Problem, z: Floats, settings: Settings, soften: float)
     """
     facing, right, down = _equations(problem)
     grid = _Grid(problem.mask)
-    before = np.inf
+    before, taken = np.inf, _TIRED + 1
     for step in range(settings.iterations):
         stiffness = settings.stiffness * min(1.0, soften * _ANNEAL**step)
         diagonal = np.full(len(z), _PROXIMITY)
@@ -203,7 +205,9 @@ def _reweighted(problem: _Problem, z: Floats, settings: Settings, soften: float)
             break
         before = energy
         matrix = grid.laplacian(np.concatenate(link), diagonal)
-        z, _ = conjugate_gradients(matrix, b, z, Multigrid(matrix, grid.pixel), 1e-4, 30)
+        if taken > _TIRED:  # until then, an older matrix's multigrid still serves
+            multigrid = Multigrid(matrix, grid.pixel)
+        z, taken = conjugate_gradients(matrix, b, z, multigrid, _ACCURACY, 30)
     return z
 
 
@@ -220,6 +224,11 @@ class _Grid:
         self.pixel = np.stack(np.nonzero(mask), axis=-1)  # (N, 2) row, column
         self.right = self._links(number[:, :-1], number[:, 1:])
         self.down = self._links(number[:-1], number[1:])
+        size = len(self.pixel)
+        self.p, self.q = (np.concatenate(ends) for ends in zip(self.right, self.down))
+        row, column = (np.concatenate([*ends, np.arange(size)]) for ends in ((self.p, self.q), (self.q, self.p)))
+        self.pattern = sparse.coo_matrix((np.arange(1.0, len(row) + 1), (row, column)), (size, size)).tocsr()
+        self.order = self.pattern.data.astype(np.int64) - 1  # which link or pixel each stored value belongs to
 
     @staticmethod
     def _links(first: NDArray[np.int64], second: NDArray[np.int64]) -> tuple[Any, Any]:
@@ -227,13 +236,10 @@ class _Grid:
         return first[both], second[both]
 
     def laplacian(self, link: Floats, diagonal: Floats) -> Any:
-        size = len(diagonal)
-        p = np.concatenate([self.right[0], self.down[0]])
-        q = np.concatenate([self.right[1], self.down[1]])
-        total = diagonal + np.bincount(p, link, size) + np.bincount(q, link, size)
-        own = np.arange(size)
-        row, column = np.concatenate([p, q, own]), np.concatenate([q, p, own])
-        return sparse.coo_matrix((np.concatenate([-link, -link, total]), (row, column)), (size, size)).tocsr()
+        """Matrix (N, N) of the links' weights, right ones first, plus a diagonal (N,)."""
+        total = diagonal + np.bincount(self.p, link, len(diagonal)) + np.bincount(self.q, link, len(diagonal))
+        values = np.concatenate([-link, -link, total])[self.order]
+        return sparse.csr_matrix((values, self.pattern.indices, self.pattern.indptr), self.pattern.shape)
 
 
 def triangulate(depth: Floats, maps: SurfaceMaps, metric: bool, settings: Settings) -> Mesh:
