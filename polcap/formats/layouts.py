@@ -124,8 +124,8 @@ def _folders(folder: Path, sub_folders: dict[float, Path], angles_deg: Sequence[
         if path.is_dir() and path not in sub_folders.values() and path.name != OUTPUT
     )
     notes += [f"not used: the folders {', '.join(beside)}"] if beside else []
-    loose = _list(folder).pictures
-    notes += [f"not used: {len(loose)} photographs beside the folders"] if loose else []
+    loose = sorted(path.name for path in _children(folder) if path.is_file() and path.name != capture_toml.NAME)
+    notes += [f"not used: the files {', '.join(loose[:4])}{', …' if len(loose) > 4 else ''}"] if loose else []
     return Plan("folders", _select(folder, groups, angles_deg), notes=tuple(notes))
 
 

@@ -22,6 +22,8 @@ from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Objec
 from polcap.optics.warp import warp
 from polcap.stages import stage
 
+_STANDS_OUT = (0.8, 1.6)  # stops above the backdrop that make an object, however even or uneven that is
+_OTHER_CHROMA = 0.15  # |Δr| + |Δg| + |Δb| of r + g + b = 1 that makes another colour
 _WORK_PIXELS = 3e5  # graph cuts run on an image averaged down to about this
 
 
@@ -89,7 +91,8 @@ def _search(picture: Floats, chart: NDArray[np.uint8], settings: Settings) -> ND
     log = np.log2(np.maximum(small, 0).mean(-1) + 1e-4)
     log = cv2.GaussianBlur(log.astype(np.float32), (0, 0), 1.5)
     level, spread = _backdrop(log, outside)
-    seed = (log > level + max(4 * spread, 0.8)) & ~outside
+    bright = log > level + np.clip(4 * spread, *_STANDS_OUT)
+    seed = (bright | _otherwise_colored(small, log, level, outside)) & ~outside
     seed = _filled(
         _sizeable(
             cv2.morphologyEx(seed.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)),
@@ -118,13 +121,34 @@ def _backdrop(log: Floats, outside: NDArray[np.bool_]) -> tuple[float, float]:
     return level, 1.4826 * float(np.median(below)) if below.size else 0.1
 
 
+def _otherwise_colored(picture: Floats, log: Floats, level: float, outside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(H, W) where the colour is not the backdrop's, in pixels at least as bright as it."""
+    smooth = cv2.GaussianBlur(np.maximum(picture, 0), (0, 0), 1.5)
+    chroma = smooth / (smooth.sum(-1, keepdims=True) + 1e-4)
+    backdrop = np.median(chroma[(np.abs(log - level) < 0.5) & ~outside], axis=0) if (np.abs(log - level) < 0.5).any() else 1 / 3
+    return np.asarray((np.abs(chroma - backdrop).sum(-1) > _OTHER_CHROMA) & (log > level))
+
+
 def _sizeable(mask: NDArray[np.uint8], min_area: float) -> NDArray[np.uint8]:
-    """The connected parts at least a twentieth of the largest (an object may be in pieces)."""
+    """The connected parts at least a twentieth of the largest (an object may be in pieces).
+
+    A wall or a table runs out of the picture, the object stands in it: parts that lie along the picture's
+    edge for more than a tenth of their outline go where others remain.
+    """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     if count < 2:
         return mask
-    area = stats[1:, cv2.CC_STAT_AREA]
-    keep = 1 + np.flatnonzero(area >= max(area.max() / 20, min_area * mask.size / 20))
+    area = stats[:, cv2.CC_STAT_AREA].astype(float)
+    area[0] = 0
+    inner = cv2.erode(mask, np.ones((3, 3), np.uint8), borderValue=0)
+    outline = np.bincount(labels[(mask > 0) & (inner == 0)], minlength=count)
+    frame = np.ones_like(mask)
+    frame[1:-1, 1:-1] = 0
+    at_edge = np.bincount(labels[(mask > 0) & (frame > 0)], minlength=count)
+    standing = (area >= min_area * mask.size) & (at_edge <= 0.1 * outline)
+    if standing.any():
+        area[at_edge > 0.1 * outline] = 0
+    keep = np.flatnonzero(area >= max(area.max() / 20, min_area * mask.size / 20))
     return np.isin(labels, keep).astype(np.uint8)
 
 
