@@ -94,7 +94,8 @@ class _Problem:
 
 
 def _problem(maps: SurfaceMaps, settings: Settings) -> _Problem:
-    sigma = np.maximum(maps.confidence[maps.mask].astype(np.float64), 1.0)
+    normal = np.nan_to_num(maps.normal[maps.mask].astype(np.float64))  # 0 is no normal: neighbours bridge it
+    sigma = np.maximum(np.nan_to_num(maps.confidence[maps.mask].astype(np.float64), nan=90.0, posinf=90.0), 1.0)
     prior = None
     if maps.depth_prior is not None and settings.prior_weight > 0:
         radius = np.sqrt(maps.mask.sum() / np.pi) / maps.view.focal  # the prior's unit over the distance
@@ -102,7 +103,7 @@ def _problem(maps: SurfaceMaps, settings: Settings) -> _Problem:
     return _Problem(
         mask=np.asarray(maps.mask, dtype=bool),
         view=maps.view,
-        normal=_capped(maps.normal[maps.mask].astype(np.float64), maps.mask, maps.view, settings),
+        normal=_capped(normal, maps.mask, maps.view, settings),
         weight=np.clip((np.median(sigma) / sigma) ** 2, 0.02, 50.0),
         prior=None if prior is None else prior.astype(np.float64),
         pull=settings.prior_weight,

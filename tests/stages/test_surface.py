@@ -1,10 +1,14 @@
 """Normals to depth to mesh: scenes whose depth is known in closed form."""
 
+import json
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from polcap.errors import ObjectError
 from polcap.images import Floats, Mesh, SurfaceMaps, View
@@ -192,3 +196,38 @@ def test_empty_object_is_refused() -> None:
     lonely[::4, ::4] = True
     with pytest.raises(ObjectError, match="--mask"):
         surface.integrate(replace(truth_maps, mask=lonely), None, SETTINGS)
+
+
+def test_pixels_without_a_normal_are_bridged() -> None:
+    truth_maps, truth = sphere()
+    normal, confidence = truth_maps.normal.copy(), truth_maps.confidence.copy()
+    normal[50:54, 60:66] = np.nan
+    normal[70:73, 60:66] = 0
+    confidence[50:54, 60:66] = np.nan
+    mesh = surface.integrate(replace(truth_maps, normal=normal, confidence=confidence), None, SETTINGS)
+    assert error_share(mesh, truth, truth_maps.mask) < 0.02
+
+
+@pytest.mark.skipif("POLCAP_DATA" not in os.environ, reason="needs $POLCAP_DATA/rendered")
+@pytest.mark.parametrize(("name", "alone", "guided"), [("d21_spot", 0.02, 0.015), ("d23_penguin", 0.04, 0.02)])
+def test_rendered_normals_give_the_rendered_depth(name: str, alone: float, guided: float) -> None:
+    """Half resolution; the share is of the depth range, occlusions included; the prior is blurred over 8 px."""
+    folder = Path(os.environ["POLCAP_DATA"]) / "rendered"
+    stored, camera = np.load(folder / f"{name}.truth.npz"), json.loads((folder / f"{name}.meta.json").read_text())
+    height, width = stored["mask"].shape
+
+    def halved(values: Floats) -> Floats:
+        return np.asarray(values.reshape(height // 2, 2, width // 2, 2, *values.shape[2:]).mean(axis=(1, 3)))
+
+    mask = halved(stored["mask"].astype(np.float64)) == 1
+    normal = halved(stored["normal"].astype(np.float64))
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
+    truth = np.where(mask, halved(np.nan_to_num(stored["depth"].astype(np.float64))), 0)
+    view = View(camera["fx"] / 2, (camera["cx"] / 2 - 0.5, camera["cy"] / 2 - 0.5), 2.0)
+    scene = maps(normal, mask, view)
+    assert error_share(surface.integrate(scene, None, SETTINGS), truth, mask) < alone
+    blurred = ndimage.gaussian_filter(truth, 8) / np.maximum(ndimage.gaussian_filter(mask.astype(float), 8), 1e-3)
+    radius = np.sqrt(mask.sum() / np.pi) / view.focal
+    prior = (blurred / truth[mask].mean() - 1) / radius
+    mesh = surface.integrate(replace(scene, depth_prior=prior.astype(np.float32)), None, SETTINGS)
+    assert error_share(mesh, truth, mask) < guided
