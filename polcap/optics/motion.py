@@ -19,6 +19,7 @@ from polcap.images import Floats
 TILE = 32  # px
 _CELLS, _PER_CELL = 10, 3  # tiles are spread over the picture: the best few of each cell
 _REACH = 2.0  # px a tile may move in one step
+_SETTLED = 0.005  # px; a smaller step ends the search
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,9 @@ def estimate(
             flow, sigma = _fit(matches, a.shape)
             matrix = matrix @ flow
             points, used = matches.point, len(matches.point)
+            step = apply(flow, points) - points
+            if float(np.abs(step).max()) < _SETTLED * (4 if level else 1):
+                break
         if level:
             matrix = np.diag([2.0, 2.0, 1.0]) @ matrix @ np.diag([0.5, 0.5, 1.0])
             half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # a coarse px's centre lies half a px in

@@ -242,12 +242,13 @@ def _low_quantile(variance: Floats) -> float:
 
 def _tiles(values: Floats, usable: NDArray[np.bool_]) -> Floats:
     """Means over the tiles of one strip, (T, C); NaN where a pixel the tile touches is not usable."""
-    count = values.shape[1] // TILE
+    count = (usable.shape[1] - 2) // TILE
     columns = values[:TILE, : count * TILE].sum(axis=0, dtype=np.float64)
     mean = np.asarray(columns.reshape(count, TILE, -1).sum(axis=1) / TILE**2)  # (T, C)
     bad = np.asarray(~usable.all(axis=0))  # (W,)
-    touched = [bad[TILE * t : TILE * t + TILE + 2].any() for t in range(count)]
-    mean[np.array(touched, bool)] = np.nan
+    before = np.concatenate([[0], np.cumsum(bad)])
+    first = TILE * np.arange(count)
+    mean[before[first + TILE + 2] > before[first]] = np.nan
     return mean
 
 

@@ -287,7 +287,7 @@ def _misfit(estimate: Floats, rows: slice, misfit: Floats) -> Floats:
 def _ramp(predicted: Floats, clip: float) -> Floats:
     """1 well below saturation, falling to 0 at it, so that no frame drops out in a step; (h, w, 1)."""
     peak = np.maximum.reduce([predicted[..., c : c + 1] for c in range(predicted.shape[2])])
-    return np.asarray(np.clip((clip - peak) / 0.15, 1e-3, 1))
+    return np.asarray(np.clip((clip - peak) / 0.05, 1e-3, 1))
 
 
 def _summed(picture: Floats) -> Floats:

@@ -10,6 +10,8 @@ import pytest
 
 from polcap.errors import CaptureError
 from polcap.images import Capture, Exif, Frame, Quality, SensorImage, Shot
+from polcap.optics import bracket as bracket_pixels
+from polcap.optics import noise, sensor
 from polcap.stages import hdr
 
 RGGB = np.array([[0, 1], [1, 2]], np.uint8)
@@ -450,3 +452,20 @@ def test_hand_held_nikon_bracket():
     ghost = (stack.quality[0] & Quality.GHOST) > 0
     assert 0.005 < ghost.mean() < 0.03
     assert ghost[:1150].mean() < 0.001
+    # frame against frame, registered and on one scale, where nothing moved
+    shot = Shot(0.0, tuple(frames))
+    links, lines, _, first = hdr._measure(shot, [0, 1, 2], 1, noise.Lines(), hdr._Reader(), hdr.Settings())
+    own = frames[1].load()
+    mid, clear = sensor.signal(own), sensor.usable(own, 0.98)
+    for e in (0, 2):
+        image = frames[e].load()
+        assert links[e].moved is not None
+        value, usable, gain = hdr._resample(sensor.signal(image), sensor.usable(image, 0.98), links[e].moved)
+        variance = lines[1].variance(first)
+        variance = variance + lines[e].variance(first * links[e].ratio) / links[e].ratio ** 2 * gain[..., None]
+        variance = variance + bracket_pixels.edges(first) * links[e].misfit
+        z = ((value / links[e].ratio - mid) / np.sqrt(variance))[usable & clear & ~ghost]
+        assert np.all(np.abs(z.mean(axis=0)) < 0.1)
+        assert np.all(np.abs(1.4826 * np.median(np.abs(z), axis=0) - 1.05) < 0.25)
+        assert 0.8 < z.std() < 1.3
+        print(e, z.mean(axis=0), z.std(axis=0), 1.4826 * np.median(np.abs(z), axis=0))
