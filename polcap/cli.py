@@ -74,17 +74,16 @@ def _reported(command: Callable[..., None]) -> Callable[..., None]:
             code = error.exit_code
         except (typer.Exit, typer.Abort):
             raise
-        except MemoryError:
-            if context.obj:
-                raise
-            print("polcap: error: out of memory; raise --memory or take a larger machine", file=sys.stderr)
-            code = SettingError.exit_code
         except Exception as error:
             if context.obj:
                 raise
-            kind = type(error).__name__
-            print(f"polcap: bug: {kind}: {_line(error)}; run with --debug and report it", file=sys.stderr)
-            code = 1
+            if isinstance(error, MemoryError) or "Insufficient memory" in str(error):  # OpenCV has its own
+                print("polcap: error: out of memory; raise --memory or take a larger machine", file=sys.stderr)
+                code = SettingError.exit_code
+            else:
+                kind = type(error).__name__
+                print(f"polcap: bug: {kind}: {_line(error)}; run with --debug and report it", file=sys.stderr)
+                code = 1
         else:
             return
         raise typer.Exit(code)
@@ -130,11 +129,12 @@ def process(
     model: Annotated[Path | None, typer.Option(metavar="ONNX", help="Another model than the shipped one.")] = None,
 ) -> None:
     """Turn a capture into maps and a 3-D asset."""
-    _limit(threads, memory)
+    _use_threads(threads)
     from polcap import config as settings
     from polcap import pipeline
     from polcap.formats import capture as captures
 
+    _limit_memory(memory)
     for flag, stage in (("--until", until), ("--force", force)):
         if stage is not None and stage not in pipeline.STAGES:
             raise SettingError(f"{flag} {stage}: no such stage; choose one of {', '.join(pipeline.STAGES)}")
@@ -296,19 +296,23 @@ def _extra(module: str) -> Any:
         raise SettingError(f"{error.name} is not installed; pip install 'polcap[train]'") from error
 
 
-def _limit(threads: int, memory: float) -> None:
-    """Set the process's limits before any numerical library starts."""
-    if memory:
-        import resource
-
-        size = int(memory * 1e9)
-        resource.setrlimit(resource.RLIMIT_DATA, (size, resource.getrlimit(resource.RLIMIT_DATA)[1]))
-    if threads:
+def _use_threads(count: int) -> None:
+    """Set the number of threads before any numerical library starts its own."""
+    if count:
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-            os.environ[name] = str(threads)
+            os.environ[name] = str(count)
         import cv2
 
-        cv2.setNumThreads(threads)
+        cv2.setNumThreads(count)
+
+
+def _limit_memory(gigabytes: float) -> None:
+    """Beyond this much of its own memory (mapped files apart) the process fails at once, and says so."""
+    if gigabytes:
+        import resource
+
+        size = int(gigabytes * 1e9)
+        resource.setrlimit(resource.RLIMIT_DATA, (size, resource.getrlimit(resource.RLIMIT_DATA)[1]))
 
 
 def _angles(text: str | None) -> tuple[float, ...] | None:

@@ -175,8 +175,8 @@ def show(out: Path, stage: str) -> Path:
 
 def judge_again(out: Path) -> dict[str, Any]:
     """report.json and report.html anew from the stage cache."""
+    results, about = reopen(out)
     with Store(out).lock():
-        results, about = reopen(out)
         config = msgspec.convert(about["settings"], Config)
         again = report.document(about["capture"], results, config, None) | {"model": about["model"]}
         if (out / "report.json").exists():

@@ -1,0 +1,69 @@
+"""What several tests share: the bundled capture, the `polcap` command, and one finished run of the two."""
+
+import fcntl
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run beside each other
+
+ROOT = Path(__file__).parents[1]
+EXAMPLE = ROOT / "examples" / "capture"
+
+
+class Done(NamedTuple):
+    """What a command left."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+Command = Callable[..., Done]
+
+
+@pytest.fixture(scope="session")
+def example() -> Path:
+    """The capture bundled with polcap; never written to."""
+    return EXAMPLE
+
+
+def shell(*arguments: object) -> Done:
+    """`polcap …` as a user's shell runs it, in a process of its own."""
+    command = [sys.executable, "-m", "polcap", *map(str, arguments)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=500)
+    return Done(done.returncode, done.stdout, done.stderr)
+
+
+@pytest.fixture
+def polcap(capsys: pytest.CaptureFixture[str]) -> Command:
+    """`polcap …` in this process, which saves the imports."""
+    from polcap import cli
+
+    def run(*arguments: object) -> Done:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            cli.app([*map(str, arguments)])
+        return Done(ended.value.code or 0, *capsys.readouterr())  # type: ignore[arg-type]
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def result(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
+    """The result folder of the bundled capture with the analytic estimator, made once for all workers; read only."""
+    shared = tmp_path_factory.getbasetemp()
+    shared = shared if worker_id == "master" else shared.parent
+    folder = shared / "bundled"
+    with (shared / "bundled.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "report.json").exists():
+            done = shell("process", EXAMPLE, "--out", folder, "--estimator", "analytic")
+            assert done.returncode == 0, done.stderr
+    return folder

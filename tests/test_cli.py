@@ -1,0 +1,175 @@
+"""The contract of the command line: data on stdout, one line per fault, exit codes."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from polcap import cli, pipeline
+from tests.conftest import Command, shell
+
+
+def test_help_answers_in_a_quarter_of_a_second() -> None:
+    """Time on the processor, least of five: a busy machine must not fail it."""
+    spent = []
+    for _ in range(5):
+        before = os.times()
+        done = subprocess.run([sys.executable, "-m", "polcap", "--help"], capture_output=True, text=True)
+        after = os.times()
+        spent.append(after.children_user + after.children_system - before.children_user - before.children_system)
+    assert done.returncode == 0 and "process" in done.stdout
+    assert min(spent) < 0.25
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = "import sys; import polcap.cli; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert not {"numpy", "cv2", "scipy", "colour", "onnxruntime", "torch", "trimesh"} & set(done.stdout.split())
+
+
+def test_stdout_carries_data_only(result: Path, example: Path, polcap: Command, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy)
+    plain = polcap("process", example, "--out", copy, "--estimator", "analytic")
+    assert plain.stdout == f"{copy / 'asset' / 'capture.glb'}\n"
+    document = json.loads(polcap("process", example, "--out", copy, "--estimator", "analytic", "--json").stdout)
+    assert document["verdict"] == "pass"
+
+
+def test_dry_run_prints_the_table_and_writes_nothing(example: Path, polcap: Command, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = polcap("process", example, "--out", out, "--dry-run")
+    assert done.returncode == 0 and not out.exists()
+    assert "pol045/IMG_0005.DNG" in done.stdout and "surface       compute" in done.stdout
+    document = json.loads(polcap("process", example, "--out", out, "--dry-run", "--json").stdout)
+    assert document["stages"]["cues"] == "on demand" and len(document["capture"]["shots"]) == 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--until", "polish"], "--until polish"),
+        (["--force", "polish"], "--force polish"),
+        (["--set", "hdr.clip=7"], "hdr.clip = 7"),
+        (["--angles", "0,x"], "--angles 0,x"),
+        (["--angles", "0,60"], "3"),
+        (["--chart", "1,2,3"], "3 numbers"),
+        (["--chart", "none.toml"], "none.toml"),
+        (["--chart", "1,2,3,4,5,6,7,8", "--no-chart"], "exclude each other"),
+        (["--mask", "none.png"], "none.png"),
+        (["--model", "none.onnx"], "none.onnx"),
+        (["--model", "none.onnx", "--estimator", "analytic"], "exclude each other"),
+        (["--config", "none.toml"], "none.toml"),
+    ],
+)
+def test_wrong_flag_is_one_line_and_exit_2(
+    example: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path, arguments: list[str], words: str
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.app(["process", str(example), "--out", str(tmp_path / "out"), *arguments])
+    out, err = capsys.readouterr()
+    assert ended.value.code == 2 and out == ""
+    assert err.count("\n") == 1 and err.startswith("polcap: error: ") and words in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_unknown_option_is_exit_2(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.app(["process", "x", "--wath"])
+    assert ended.value.code == 2 and "--wath" in capsys.readouterr().err
+
+
+def test_bug_is_exit_1_with_a_traceback_only_under_debug(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("a bug\nof two lines")
+
+    monkeypatch.setattr(pipeline, "show", fail)
+    with pytest.raises(SystemExit) as ended:
+        cli.app(["show", "x", "hdr"])
+    assert ended.value.code == 1
+    assert (
+        capsys.readouterr().err
+        == "polcap: bug: ZeroDivisionError: a bug of two lines; run with --debug and report it\n"
+    )
+    with pytest.raises(ZeroDivisionError):
+        cli.app(["--debug", "show", "x", "hdr"])
+
+
+def test_failed_gate_is_exit_3_after_everything_is_written(
+    result: Path, example: Path, polcap: Command, tmp_path: Path
+) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy)
+    (copy / "asset" / "capture.glb").unlink()
+    options = ("--estimator", "analytic", "--set", "gates.max_normal_error_deg=0.1")
+    done = polcap("process", example, "--out", copy, *options)
+    assert done.returncode == 3 and (copy / "asset" / "capture.glb").exists()
+    assert "gate failed: normal error" in done.stderr
+    assert json.loads((copy / "report.json").read_text())["verdict"] == "fail"
+
+
+@pytest.mark.parametrize("stage", pipeline.STAGES)
+def test_every_stage_can_be_looked_at(result: Path, tmp_path: Path, stage: str) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy)
+    picture = cv2.imread(str(pipeline.show(copy, stage)))
+    assert picture is not None and picture.std() > 5  # there is something to see
+
+
+def test_export_needs_the_maps_alone_and_tells_what_it_wrote(result: Path, polcap: Command, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy)
+    shutil.rmtree(copy / "work")
+    shutil.rmtree(copy / "asset")
+    done = polcap("export", copy, "--gltf")
+    assert done.stdout == f"{copy / 'asset' / 'capture.glb'}\n", done.stderr
+    assert [file.name for file in (copy / "asset").iterdir()] == ["capture.glb"]
+
+
+def test_status_and_report_speak_json(result: Path, polcap: Command, tmp_path: Path) -> None:
+    about = json.loads(polcap("status", result, "--json").stdout)
+    assert about["complete"] and about["stages"][0]["stage"] == "hdr"
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy)
+    again = json.loads(polcap("report", copy, "--json").stdout)
+    assert again == json.loads((result / "report.json").read_text())
+    assert polcap("report", result, "--compare", copy).stdout == "\n"
+
+
+@pytest.mark.parametrize("command", [["status"], ["report"], ["export"], ["show"]])
+def test_folder_that_is_no_result_is_exit_2(tmp_path: Path, polcap: Command, command: list[str]) -> None:
+    done = polcap(*command, tmp_path, *(["hdr"] if command == ["show"] else []))
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert not (tmp_path / "work").exists()
+
+
+def test_user_mask_replaces_the_search(result: Path, example: Path, polcap: Command, tmp_path: Path) -> None:
+    copy, drawn = tmp_path / "copy", np.zeros((288, 384), np.uint8)
+    shutil.copytree(result, copy)
+    drawn[80:200, 70:160] = 255
+    cv2.imwrite(str(tmp_path / "mask.png"), drawn)
+    done = polcap("process", example, "--out", copy, "--mask", tmp_path / "mask.png", "--until", "mask", "--json")
+    assert done.returncode == 0, done.stderr
+    results, _ = pipeline.reopen(copy)
+    assert results.object_.value.source == "user" and np.array_equal(results.object_.value.mask, drawn > 0)
+
+
+def test_memory_limit_ends_with_one_line(example: Path, tmp_path: Path) -> None:
+    done = shell("process", example, "--out", tmp_path, "--memory", "0.12")
+    assert done.returncode == 2 and "memory" in done.stderr.splitlines()[-1], done.stderr
+
+
+def test_synth_makes_a_capture_that_reads(polcap: Command, tmp_path: Path) -> None:
+    small = [f"--set={text}" for text in ("width=128", "height=96", "samples=1", "exposures=1")]
+    made = polcap("synth", tmp_path / "c", "--seed", 5, *small)
+    assert made.stdout == f"{tmp_path / 'c'}\n", made.stderr
+    assert "3 shots" in polcap("process", tmp_path / "c", "--dry-run").stdout
+    assert polcap("synth", tmp_path / "d", "--set", "widht=3").returncode == 2

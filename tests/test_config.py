@@ -1,0 +1,75 @@
+"""Settings: defaults < file < assignments, and strict."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from polcap.config import Config, load, settings
+from polcap.errors import SettingError
+
+
+def test_defaults_come_from_the_stages() -> None:
+    assert load() == Config()
+
+
+def test_assignment_beats_file_beats_default(tmp_path: Path) -> None:
+    file = tmp_path / "polcap.toml"
+    file.write_text("[hdr]\nclip = 0.9\n[align]\nmax_shift_px = 12\n")
+    config = load(file, ["hdr.clip=0.95"])
+    assert (config.hdr.clip, config.align.max_shift_px) == (0.95, 12.0)
+    assert config.mask == Config().mask
+
+
+def test_words_need_no_quotes() -> None:
+    assert load(None, ["align.model=homography", "selfcal.check_order=false"]).align.model == "homography"
+
+
+@pytest.mark.parametrize(
+    ("assignment", "words"),
+    [
+        ("hdr.clip=1.5", ["hdr.clip", "1.5", "1.0"]),
+        ("hdr.clib=0.9", ["hdr.clib", "0.9", "did you mean hdr.clip"]),
+        ("hrd.clip=0.9", ["hrd.clip", "no such setting"]),
+        ("hdr.clip=much", ["hdr.clip", "much", "float"]),
+        ("align.model=affine", ["align.model", "affine"]),
+        ("hdr.clip", ["stage.name=value"]),
+        ("clip=0.9", ["stage.name=value"]),
+    ],
+)
+def test_wrong_assignment_is_named_with_value_and_limit(assignment: str, words: list[str]) -> None:
+    with pytest.raises(SettingError) as caught:
+        load(None, [assignment])
+    assert all(word in str(caught.value) for word in words) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[hdr]\nclip = 2", "hdr.clip = 2"),
+        ("clip = 0.9", "not a section"),
+        ("[hdr", "not TOML"),
+        ("[colour]\nx = 1", "colour.x"),
+        ("[hdr]\nclip = '0.9'", "hdr.clip"),
+    ],
+)
+def test_wrong_file_is_one_line(tmp_path: Path, text: str, words: str) -> None:
+    file = tmp_path / "polcap.toml"
+    file.write_text(text)
+    with pytest.raises(SettingError, match=words) as caught:
+        load(file)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_file_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="--config"):
+        load(tmp_path / "none.toml")
+
+
+def test_every_setting_is_described() -> None:
+    assert [setting.key for setting in settings() if not setting.description] == []
+
+
+def test_config_survives_its_own_dump() -> None:
+    config = load(None, ["hdr.clip=0.95"])
+    assert msgspec.convert(msgspec.to_builtins(config), Config) == config

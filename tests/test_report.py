@@ -1,0 +1,84 @@
+"""The report tells what was measured, and its gates mean what they say."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from polcap import report
+from polcap.config import Gates
+from polcap.errors import StorageError
+
+
+@pytest.fixture
+def figures(result: Path) -> dict[str, Any]:
+    return dict(report.read(result)["figures"])
+
+
+def test_report_is_plain_json_with_figures_gates_and_settings(result: Path) -> None:
+    about = json.loads((result / "report.json").read_text(), parse_constant=pytest.fail)  # no NaN, no Infinity
+    assert {"capture", "gates", "figures", "settings", "keys", "verdict"} <= about.keys()
+    assert about["verdict"] == "pass" and all(gate["state"] == "pass" for gate in about["gates"])
+    assert len(about["figures"]["chart"]["delta_e"]) == 24
+
+
+def test_page_stands_alone_and_shows_the_pictures(result: Path) -> None:
+    page = (result / "report.html").read_text()
+    assert len(re.findall(r'src="data:image/jpeg;base64,', page)) == 7
+    assert re.findall(r'(?:src|href)="(?!data:)', page) == [] and "<script" not in page
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "value", "gate"),
+    [
+        ("chart", "delta_e_mean", 5.5, "chart"),
+        ("gains", "disagreement", 0.0031, "gains"),
+        ("alignment", "residual_px", [0.0, 0.02, 0.2], "alignment"),
+        ("object", "clipped_fraction", 0.03, "clipped"),
+        ("object", "ill_posed_fraction", 0.06, "ill-posed"),
+        ("merge", "ghost_fraction", [0.0, 0.05, 0.0], "ghosts"),
+        ("angles", "best_order", [1, 0, 2], "angles"),
+        ("angles", "mirrored", True, "angles"),
+        ("maps", "normal_error_deg_median", 25.0, "normal error"),
+    ],
+)
+def test_gate_fails_beyond_its_limit_and_alone(
+    figures: dict[str, Any], part: str, name: str, value: Any, gate: str
+) -> None:
+    assert name in figures[part]
+    changed = {**figures, part: {**figures[part], name: value}}
+    states = {one.name: one.state for one in report.judge(changed, True, Gates())}
+    assert [name for name, state in states.items() if state == "fail"] == [gate]
+    assert report.verdict(report.judge(changed, True, Gates())) == "fail"
+
+
+def test_what_could_not_be_measured_neither_passes_nor_fails(figures: dict[str, Any]) -> None:
+    changed = {**figures, "chart": {**figures["chart"], "delta_e_mean": None}}
+    states = {gate.name: gate.state for gate in report.judge(changed, True, Gates())}
+    assert states["chart"] == "not measured"
+
+
+def test_assumed_focal_length_warns_and_does_not_fail(figures: dict[str, Any]) -> None:
+    gates = report.judge(figures, False, Gates())
+    assert report.verdict(gates) == "warn"
+
+
+def test_comparison_names_figures_and_settings_that_differ(result: Path) -> None:
+    one = report.read(result)
+    other = json.loads(json.dumps(one))
+    other["figures"]["maps"]["estimator"] = "network"
+    other["settings"]["hdr"]["clip"] = 0.9
+    rows = {name: (here, there) for name, here, there in report.compare(one, other)}
+    assert rows["figures.maps.estimator"] == ("analytic", "network")
+    assert set(rows) == {"figures.maps.estimator", "settings.hdr.clip"}
+    assert report.compare(one, one) == []
+
+
+@pytest.mark.parametrize("text", [None, "{", "[]", "{}"])
+def test_missing_or_foreign_report_is_one_line(tmp_path: Path, text: str | None) -> None:
+    if text is not None:
+        (tmp_path / "report.json").write_text(text)
+    with pytest.raises(StorageError, match="polcap process"):
+        report.read(tmp_path)
