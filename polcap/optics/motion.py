@@ -22,6 +22,9 @@ _REACH = 2.0  # px a tile may move in one step
 _SETTLED = 0.005  # px; a smaller step ends the search
 
 
+_Level = tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]]  # two pictures, their usable pixels
+
+
 @dataclass(frozen=True)
 class Motion:
     """Reference px (x, y, 1) → px of the other picture, with how far it may be trusted."""
@@ -46,36 +49,48 @@ def estimate(
 
     usable: which pixels are exposed well enough to be compared.
     """
-    pyramid = [(reference, other, usable_reference, usable_other)]
+    pyramid: list[_Level] = [(reference, other, usable_reference, usable_other)]
     while min(pyramid[-1][0].shape) >= 8 * TILE:
         a, b, ok_a, ok_b = pyramid[-1]
         pyramid.append((_half(a), _half(b), _half(ok_a) > 0.99, _half(ok_b) > 0.99))
-    matrix: Floats = _coarse(*pyramid[-1])
-    sigma, used = 0.0, 0
+    start = _coarse(*pyramid[-1])
+    tried = [_refine(pyramid, np.eye(3))]
+    if not np.array_equal(start, np.eye(3)):
+        tried.append(_refine(pyramid, start))
+    return max(tried, key=lambda one: one[1])[0]
+
+
+def _refine(pyramid: list[_Level], matrix: Floats) -> tuple[Motion, float]:
+    """Coarse to fine from a first guess on the coarsest level; with it the number of tiles that agree.
+
+    No motion is reported where fewer than two in five do.
+    """
+    sigma, agree = np.inf, 0.0
     points: Floats = np.zeros((0, 2))
     for level in range(len(pyramid) - 1, -1, -1):
         a, b, ok_a, ok_b = pyramid[level]
         tiles = _choose(a, ok_a)
-        for _ in range(4):
+        points = np.zeros((0, 2))
+        for _ in range(4 if level else 6):
             matches = _match(a, b, ok_b, tiles, matrix)
             if len(matches.point) < 6:
                 break
             flow, sigma = _fit(matches, a.shape)
             matrix = matrix @ flow
-            points, used = matches.point, len(matches.point)
+            points = matches.point
+            rest = matches.shift - (apply(flow, points) - points)
+            agree = float(np.sum(np.hypot(rest[:, 0], rest[:, 1]) < 0.3))
             step = apply(flow, points) - points
             if float(np.abs(step).max()) < _SETTLED * (4 if level else 1):
                 break
-        if level:
-            matrix = np.diag([2.0, 2.0, 1.0]) @ matrix @ np.diag([0.5, 0.5, 1.0])
-            half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # a coarse px's centre lies half a px in
-            matrix = half @ matrix @ np.linalg.inv(half)
-            used = 0
-    if not used:
-        return Motion(np.eye(3), 0.0, np.inf, 0)
+        if level:  # a coarse pixel's centre lies half a pixel in
+            finer = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1.0]])
+            matrix = finer @ matrix @ np.linalg.inv(finer)
+    if not len(points) or agree < 0.4 * len(points):
+        return Motion(np.eye(3), 0.0, np.inf, 0), 0.0
     matrix = matrix / matrix[2, 2]
     moved = apply(matrix, points) - points
-    return Motion(matrix, float(np.sqrt(np.mean(np.sum(moved**2, axis=1)))), sigma, used)
+    return Motion(matrix, float(np.sqrt(np.mean(np.sum(moved**2, axis=1)))), sigma, len(points)), agree
 
 
 def apply(matrix: Floats, point: Floats) -> Floats:
