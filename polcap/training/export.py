@@ -15,7 +15,7 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
 from polcap.stages.cues import CHANNELS
-from polcap.training import model
+from polcap.training import model, train
 
 OPSET = 17
 ENCODING = "1"  # of the input channels; formats/onnx.py checks it
@@ -48,6 +48,13 @@ def write(network: model.Network, path: Path, facts: Mapping[str, str]) -> int:
     onnx.save(graph, str(beside))
     os.replace(beside, path)
     return path.stat().st_size
+
+
+def ship(checkpoint: Path, path: Path, version: str, licence: str = "Apache-2.0") -> int:
+    """Export a checkpoint's EMA weights with what is known of their training. Returns the file's bytes."""
+    network, facts = train.load_average(checkpoint)
+    training = f"{facts['samples']} samples in {facts['step']} steps, {facts['elapsed'] / 60:.0f} minutes"
+    return write(network, path, {"version": version, "licence": licence, "training": training})
 
 
 class _Ordered(nn.Module):  # type: ignore[misc]  # torch comes without types here
