@@ -29,6 +29,7 @@ app = typer.Typer(
     rich_markup_mode=None,  # plain help: half the start-up time
     pretty_exceptions_enable=False,
 )
+OUT_OF_MEMORY = ("Insufficient memory", "can't start new thread")  # how OpenCV and Python's threads say it
 Device = Literal["cpu", "cuda", "auto"]
 Result = Annotated[Path, typer.Argument(help="Result folder of `polcap process`.")]
 Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
@@ -77,7 +78,7 @@ def _reported(command: Callable[..., None]) -> Callable[..., None]:
         except Exception as error:
             if context.obj:
                 raise
-            if isinstance(error, MemoryError) or "Insufficient memory" in str(error):  # OpenCV has its own
+            if isinstance(error, MemoryError) or any(word in str(error) for word in OUT_OF_MEMORY):
                 print("polcap: error: out of memory; raise --memory or take a larger machine", file=sys.stderr)
                 code = SettingError.exit_code
             else:

@@ -48,3 +48,20 @@ def test_one_licence() -> None:
         "Apache License" in (ROOT / "LICENSE").read_text()
         and 'license = "Apache-2.0"' in (ROOT / "pyproject.toml").read_text()
     )
+
+
+def test_every_option_stands_on_the_commands_page() -> None:
+    from typer.main import get_command
+
+    from polcap.cli import app
+
+    page = (ROOT / "docs" / "reference" / "commands.md").read_text(encoding="utf-8")
+    commands = get_command(app).commands  # type: ignore[attr-defined]
+    missing = [
+        f"{name} {option}"
+        for name, command in commands.items()
+        for parameter in command.params
+        for option in parameter.opts
+        if option.startswith("--") and option != "--help" and option not in page
+    ]
+    assert missing == [] and all(f"polcap {name}" in page for name in commands)

@@ -72,7 +72,7 @@ def test_killed_run_resumes_and_gives_the_same_bytes(result: Path, example: Path
     command += ["--estimator", "analytic"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     random = np.random.default_rng(0)
-    for _ in range(4):
+    for _ in range(3):
         process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
         assert process.stderr is not None
         for line in process.stderr:  # killed a moment after a stage that this run had to compute
