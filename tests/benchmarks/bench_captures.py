@@ -1,0 +1,120 @@
+"""Rendered captures in, polcap's error against their truth out: the yardstick of the whole path.
+
+    python tests/benchmarks/bench_captures.py $POLCAP_DATA/rendered [--estimator analytic] [--model ONNX]
+
+Prints a Markdown row per capture. Truth comes with the captures, from another renderer.
+"""
+
+import argparse
+import json
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from polcap import pipeline
+from polcap.config import Config
+from polcap.formats import capture as captures
+from polcap.images import Capture, Floats, Network
+from polcap.report import Results
+from polcap.store import Store
+
+COLUMNS = ("capture", "normal mean", "median", "chart px", "align px", "gain %", "ratio %", "diffuse", "roughness", "F0", "depth")  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--estimator", choices=("network", "analytic"))
+    parser.add_argument("--model", type=Path)
+    options = parser.parse_args()
+    network = pipeline.load_network(options.estimator, options.model, "cpu", 2)
+    print("|", " | ".join(COLUMNS), "|\n|", " | ".join("---" for _ in COLUMNS), "|")
+    rows = []
+    for truth in sorted(options.folder.glob("*.truth.json")):
+        rows.append(measure(truth, network))
+        print(f"| {truth.name.split('.')[0]} |", " | ".join(f"{value:.3g}" for value in rows[-1]), "|", flush=True)
+    print("| mean |", " | ".join(f"{value:.3g}" for value in np.mean(rows, axis=0)), "|")
+
+
+def measure(truth_file: Path, network: Network | None) -> list[float]:
+    """One capture's figures, in the order of COLUMNS."""
+    stem = str(truth_file)[: -len(".truth.json")]
+    told = json.loads(truth_file.read_text())
+    meta = json.loads(Path(stem + ".meta.json").read_text())
+    capture = captures.read(Path(stem), None)
+    with tempfile.TemporaryDirectory() as out:
+        found = pipeline.path(capture, pipeline.Given(network=network), Config(), Store(Path(out)))
+        with np.load(stem + ".truth.npz") as maps:
+            surface = surface_errors(found, dict(maps))
+        return [*surface[:2], *capture_errors(found, capture, told, meta), *surface[2:]]
+
+
+def capture_errors(found: Results, capture: Capture, told: dict, meta: dict) -> list[float]:  # type: ignore[type-arg]
+    """Chart centres and alignment [RAW px, worst], gains and bracket ratios [%, worst]."""
+    centers = (np.array(meta["chart"]["patch_corners_px"]) - 1).mean(1) / 2  # their pixel centres lie at .5
+    chart = 2 * np.linalg.norm(found.color.value.quads.mean(1) - centers, axis=1).max()
+
+    files = {shot["file"].split("/", 1)[1]: shot for shot in told["shots"]}
+    frames = [
+        [files[str(Path(frame.path).relative_to(capture.folder))] for frame in shot.frames] for shot in capture.shots
+    ]
+    exposure = np.array([[f["relative_exposure"] * f["flash_factor"] for f in shot] for shot in frames])
+    ratio = found.radiance.value.exposure_ratio.mean(-1)
+    reference = int(np.abs(ratio[0] - 1).argmin())
+    flash = np.array([shot[reference]["flash_factor"] for shot in frames])
+    gain = found.gains.value.gain.mean(1) / (flash / flash[0]) - 1
+    ratios = ratio / (exposure / exposure[:, [reference]]) - 1
+
+    rows, columns = np.nonzero(found.object_.value.mask)
+    at = np.stack([columns, rows, np.ones(len(rows))])
+    grid = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1.0]])  # binned px → RAW px
+    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # RAW px with centres on whole numbers → at .5
+    worst = 0.0
+    for shot, transform in zip(frames, found.alignment.value.transform):
+        true = np.vstack([shot[0]["affine_ref_to_shot"], [0, 0, 1]])
+        expected = np.linalg.inv(grid) @ np.linalg.inv(half) @ true @ half @ grid @ at
+        seen = transform @ at
+        worst = max(worst, 2 * np.hypot(*(seen[:2] / seen[2] - expected[:2])).max())
+    return [float(chart), worst, float(100 * np.abs(gain).max()), float(100 * np.abs(ratios).max())]
+
+
+def surface_errors(found: Results, truth: dict[str, Floats]) -> list[float]:
+    """Normal mean and median [degrees], RMSE of diffuse, roughness and F0, of depth [share of its range]."""
+    maps, depth = found.maps.value, found.mesh.value.depth
+    x0, y0, x1, y1 = found.object_.value.crop
+    crop = np.s_[y0:y1, x0:x1]
+
+    def binned(image: Floats) -> Floats:
+        full = image.astype(np.float32)
+        return np.asarray(
+            cv2.resize(full, (full.shape[1] // 2, full.shape[0] // 2), interpolation=cv2.INTER_AREA)[crop]
+        )
+
+    normal = binned(truth["normal"])
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+    inside = (binned(truth["mask"]) == 1) & maps.mask
+    angle = np.degrees(np.arccos(np.clip((normal * maps.normal).sum(-1), -1, 1)))[inside]
+    ior = np.maximum(binned(truth["ior"]), 1)
+    f0 = ((ior - 1) / (ior + 1)) ** 2
+
+    def rmse(a: Floats, b: Floats) -> float:
+        return float(np.sqrt(np.mean((a[inside] - b[inside]) ** 2)))
+
+    z = binned(truth["depth"])
+    inside &= np.isfinite(z) & np.isfinite(depth)
+    true, ours = z[inside] - z[inside].mean(), depth[inside] * np.mean(z[inside]) / np.mean(depth[inside])
+    relative = float(np.sqrt(np.mean((ours - ours.mean() - true) ** 2)) / np.ptp(true))
+    return [
+        float(angle.mean()),
+        float(np.median(angle)),
+        rmse(maps.diffuse, binned(truth["albedo"])),
+        rmse(maps.roughness, np.sqrt(binned(truth["alpha"]))),
+        rmse(maps.specular[..., 1], f0),
+        relative,
+    ]
+
+
+if __name__ == "__main__":
+    main()
