@@ -20,7 +20,9 @@ from polcap.images import Capture, Floats, Network
 from polcap.report import Results
 from polcap.store import Store
 
-COLUMNS = ("capture", "normal mean", "median", "chart px", "align px", "gain %", "ratio %", "diffuse", "roughness", "F0", "depth")  # fmt: skip
+COLUMNS = (
+    "capture", "normal mean", "median", "chart px", "align px", "gain %", "ratio %", "diffuse", "roughness", "F0", "depth",
+)  # fmt: skip
 
 
 def main() -> None:
