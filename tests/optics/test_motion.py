@@ -69,6 +69,16 @@ def test_noise_alone_shows_no_motion(ramp):
     assert found.shift_px < max(0.05, 3 * found.sigma_px)
 
 
+def test_repeated_detail_is_matched_in_the_nearest_place():
+    """A staircase of equal steps in the logarithm looks the same, but for its gain, one step on."""
+    rng = np.random.default_rng(3)
+    stairs = np.exp(np.arange(600) // 30 / 3)[None] * np.ones((480, 1))
+    a, b = (np.sqrt(rng.poisson(100 * stairs * e) / 100).astype(np.float32) for e in (1, 0.25))
+    usable = np.ones(a.shape, bool)
+    found = motion.estimate(a, b, usable, usable)
+    assert found.shift_px < max(0.05, 3 * found.sigma_px)
+
+
 def test_nothing_usable_means_no_motion():
     a = np.ones((300, 400), np.float32)
     found = motion.estimate(a, a, np.zeros(a.shape, bool), np.zeros(a.shape, bool))
