@@ -468,4 +468,3 @@ def test_hand_held_nikon_bracket():
         assert np.all(np.abs(z.mean(axis=0)) < 0.1)
         assert np.all(np.abs(1.4826 * np.median(np.abs(z), axis=0) - 1.05) < 0.25)
         assert 0.8 < z.std() < 1.3
-        print(e, z.mean(axis=0), z.std(axis=0), 1.4826 * np.median(np.abs(z), axis=0))
