@@ -30,15 +30,17 @@ from polcap.stages import stage
 _WORK_PITCH_PX = 32.0  # the chart is placed at no more pixels per patch than this
 _LEAST_PITCH_PX = 8.0  # below, a patch has too few pixels to be sampled
 _LEAST_PATCHES = 12  # unclipped, for 9 + 2 unknowns per three channels
+_TILE_PX, _TILE_STEP_PX = 900, 600
+_CANDIDATES = 3  # per picture: texture may look more like a chart than the chart
 _WHITE = 18  # index of the white patch, the first of six greys
 _REMEDY = "give its corners with --chart x0,y0,…,x3,y3, a profile with --chart FILE, or --no-chart"
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    chart_width_m: Annotated[
-        float | None,
-        Meta(gt=0, le=2, description="width of the chart between its outer patch corners [m]; unset: unknown"),
-    ] = None
+    chart_width_m: (
+        Annotated[float, Meta(gt=0, le=2, description="chart between its outer patch corners, unset: unknown [m]")]
+        | None
+    ) = None
     max_cost: Annotated[float, Meta(gt=0, le=1, description="greatest accepted cost of the chart detector")] = 0.06
     max_delta_e: Annotated[
         float, Meta(gt=0, le=100, description="greatest accepted mean residual of the patches [CIEDE2000]")
@@ -104,15 +106,11 @@ def _search(radiance: AngleStack, reference: ChartReference, settings: Settings)
     """The first candidate that passes every test; ChartError with the best of the rest."""
     value = radiance.value[0]
     refused: list[Placement] = []  # for their colours
-    tried, cheapest, nearest = 0, np.inf, np.inf
+    cheapest = nearest = np.inf
     exposed: ChartError | None = None
-    for picture, transform in _pictures(value):
-        tried += 1
-        centers, cost = _detect(picture)
-        if centers is None:
-            continue
+    for centers, cost in _candidates(value):
         cheapest = min(cheapest, cost)
-        start = chart.from_centers(chart.project(np.linalg.inv(transform), centers))
+        start = chart.from_centers(centers)
         if cost > settings.max_cost or not chart.is_view(start.homography) or _among(refused, start):
             continue
         place = _refine(value, start)
@@ -134,11 +132,13 @@ def _search(radiance: AngleStack, reference: ChartReference, settings: Settings)
         raise exposed
     if nearest < np.inf:
         why = f"best mean residual ΔE {nearest:.1f}, whitebalance.max_delta_e = {settings.max_delta_e:g}"
+    elif cheapest == np.inf:
+        why = "the detector saw nothing like one"
     elif cheapest > settings.max_cost:
         why = f"best detector cost {cheapest:.3f}, limit whitebalance.max_cost = {settings.max_cost:g}"
     else:
         why = f"best candidate (cost {cheapest:.3f}) does not look like 6 × 4 patches on a dark card"
-    raise ChartError(f"no ColorChecker Classic in the reference shot ({tried} pictures of it tried; {why}); {_REMEDY}")
+    raise ChartError(f"no ColorChecker Classic in the reference shot, at any scale or exposure ({why}); {_REMEDY}")
 
 
 def _at_corners(
@@ -252,45 +252,41 @@ def _refine(value: Floats, start: Placement) -> Placement:
     return chart.refine(seen, start.moved(transform)).moved(np.linalg.inv(transform))
 
 
-def _detect(picture: NDArray[np.uint8]) -> tuple[Floats | None, float]:
-    """Patch centres (24, 2) px of the likeliest chart in a BGR picture and the detector's cost."""
+def _candidates(value: Floats) -> Iterator[tuple[Floats, float]]:
+    """Patch centres (24, 2) px of whatever the detector takes for a chart, and its cost."""
     detector: Any = cv2.mcc.CCheckerDetector.create()
     detector.setColorChartType(cv2.mcc.MCC24)
-    if not detector.process(picture, 1):
-        return None, float("inf")
-    checker = detector.getBestColorChecker()
-    quads = np.asarray(checker.getColorCharts(), dtype=np.float64).reshape(24, 4, 2)
-    return quads.mean(axis=1), float(checker.getCost())
+    for picture, transform in _pictures(value):
+        if not detector.process(picture, _CANDIDATES):
+            continue
+        for checker in detector.getListColorChecker():
+            quads = np.asarray(checker.getColorCharts(), dtype=np.float64).reshape(24, 4, 2)
+            yield chart.project(np.linalg.inv(transform), quads.mean(axis=1)), float(checker.getCost())
 
 
 def _pictures(value: Floats) -> Iterator[tuple[NDArray[np.uint8], Floats]]:
     """8-bit BGR pictures to search, likeliest first, each with the transform radiance px → picture px.
 
-    Whole frames at several scales and exposures, channels balanced or not; then, of large images,
-    overlapping tiles at full size, where a small chart has pixels enough.
+    Whole frames at several scales and exposures, channels balanced or not; last, for small charts,
+    the frame enlarged, or overlapping enlarged tiles of a large frame: the detector shrinks what is large.
     """
     height, width = value.shape[:2]
     longest, white = max(height, width), _white(value)
-    for side, gains, alike in (
-        (1000, (1.0, 2.5, 0.3), (False, True)),
-        (600, (1.0, 0.3), (False,)),
-        (1600, (1.0, 2.5, 0.3), (False,)),
-        (2400, (1.0, 2.5), (False,)),
-    ):
-        if side > 4.5 * longest:
-            continue
-        small = _resized(value, side / longest)
-        for same in alike:
-            for gain in gains:
-                picture = _picture(small, (np.full(3, white.max()) if same else white) / gain)
-                yield picture, _scaling(small.shape, value.shape)
-    if longest <= 2400:
-        return
-    size, step = 1200, 900
-    for y in range(0, max(height - size + step, 1), step):
-        for x in range(0, max(width - size + step, 1), step):
-            tile = value[y : y + size, x : x + size]
-            yield _picture(tile, _white(tile)), np.array([[1.0, 0, -x], [0, 1.0, -y], [0, 0, 1]])
+    alike = np.full(3, white.max())
+    looks = [(1000, white, gain) for gain in (1.0, 2.5, 0.3)] + [(1000, alike, gain) for gain in (1.0, 2.5, 0.3)]
+    looks += [(600, white, 1.0), (1600, white, 1.0), (1600, white, 2.5), (1600, white, 0.3)]
+    looks += [(2400, white, 1.0), (2400, white, 2.5)] if longest <= 2400 else []
+    for side, one, gain in looks:
+        if side <= 4.5 * longest:
+            small = _resized(value, side / longest)
+            yield _picture(small, one / gain), _scaling(small.shape, value.shape)
+    if longest > 2400:
+        for y in range(0, max(height - _TILE_PX, 0) + _TILE_STEP_PX, _TILE_STEP_PX):
+            for x in range(0, max(width - _TILE_PX, 0) + _TILE_STEP_PX, _TILE_STEP_PX):
+                tile = value[y : y + _TILE_PX, x : x + _TILE_PX]
+                large = _resized(tile, 1.5)
+                transform = _scaling(large.shape, tile.shape) @ np.array([[1.0, 0, -x], [0, 1, -y], [0, 0, 1]])
+                yield _picture(large, _white(tile)), transform
 
 
 def _white(value: Floats) -> Floats:
