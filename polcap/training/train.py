@@ -1,7 +1,7 @@
 """Train the network with one command: cache of views, loop, checkpoints, metrics.
 
 The budget is a length of time, so that a run ends when it is meant to on any machine: the learning
-rate holds for 60 % of it and falls to nothing over the rest. A run that was stopped goes on from its
+rate holds for 45 % of it and falls to nothing over the rest. A run that was stopped goes on from its
 last checkpoint with the time that was left. Same seed, same machine, same number of steps: same weights.
 """
 
@@ -26,7 +26,7 @@ from polcap.training import gbuffers, loss, materials, model
 from polcap.training.dataset import Batch, Simulator
 from polcap.training.watch import Watch
 
-_HOLD = 0.6  # share of the budget at the full learning rate
+_HOLD = 0.45  # share of the budget at the full learning rate
 _WARM = 200  # steps
 
 
@@ -56,7 +56,7 @@ class Preset:
 
 
 PRESETS = {
-    "cpu": Preset(model.SMALL, 60, 480, 192, (96, 128, 160, 192), (0.2, 0.5, 0.15, 0.15), 8 * 128**2),
+    "cpu": Preset(model.SMALL, 60, 480, 192, (96, 128, 160, 192), (0.3, 0.45, 0.15, 0.1), 8 * 128**2),
     "gpu": Preset(model.LARGE, 400, 3000, 256, (128, 192, 256), (0.3, 0.3, 0.4), 64 * 256**2),
 }
 
