@@ -8,6 +8,7 @@ A line declares its step and computes nothing: the store computes what somebody 
 """
 
 import json
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -105,13 +106,14 @@ def process(
         if until is not None:
             return None
         progress("write", None, False)
+        start = time.perf_counter()
         about = report.document(report.capture_facts(capture), results, config, given.network)
         maps_folder.write(
             out / "maps", results.maps.value, results.mesh.value, results.stokes.value, results.cues.value
         )
         write_asset(out, capture.name, results.asset.value)
         report.write(out, about, results)
-        progress("write", 0.0, False)
+        progress("write", time.perf_counter() - start, False)
     return about
 
 
