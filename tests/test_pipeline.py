@@ -249,3 +249,12 @@ def test_distance_follows_from_the_size_of_the_chart() -> None:
     """Similar triangles: 1 mm per pixel at a focal length of 100 px is 0.1 m away."""
     color = ColorCalibration(np.eye(3), None, None, None, "chart", 0.0, 1e-3)
     assert pipeline.distance_m(color, stack(2, 2, 1.0)) == pytest.approx(0.1)
+
+
+def test_the_example_from_python_runs(result: Path, example: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy)
+    script = ROOT / "examples" / "from_python.py"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, script, example, copy], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0 and "gates: ghosts pass" in done.stdout, done.stderr

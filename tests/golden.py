@@ -1,0 +1,54 @@
+"""Fingerprints of what each stage makes of the bundled capture, tolerant of rounding, not of a change.
+
+    python -m tests.golden RESULT > tests/golden.json
+
+RESULT is made by `polcap process examples/capture --estimator analytic`. An array is told by four
+projections on fixed random signs, relative to its length: a change δ moves each by about |δ|/|x|.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+
+from polcap import pipeline, stages, store
+
+MODULES = (
+    pipeline.hdr, pipeline.whitebalance, pipeline.align, pipeline.mask, pipeline.selfcal,
+    pipeline.stokes, pipeline.cues, pipeline.infer, pipeline.surface, pipeline.asset,
+)  # fmt: skip
+
+
+def versions() -> dict[str, int]:
+    found = [value for module in MODULES for value in vars(module).values() if isinstance(value, stages.Stage)]
+    return {stage.name: stage.version for stage in found}
+
+
+def fingerprints(result: Path) -> dict[str, dict[str, Any]]:
+    """Stage → version and array → shape and projections."""
+    opened, _ = pipeline.reopen(result)
+    version = versions()
+    made = {}
+    for kept in vars(opened).values():
+        arrays: dict[str, Any] = {}
+        store.encode(kept.value, kept.name, arrays)
+        made[kept.name] = {
+            "version": version[kept.name],
+            "arrays": {name: _told(name, a) for name, a in arrays.items()},
+        }
+    return made
+
+
+def _told(name: str, array: Any) -> dict[str, Any]:
+    value = np.nan_to_num(np.asarray(array, np.float64)).ravel()
+    length = float(np.linalg.norm(value))
+    signs = np.random.default_rng(crc32(name.encode())).choice([-1.0, 1.0], (4, value.size))
+    return {"shape": list(array.shape), "length": length, "projections": [float(x) for x in signs @ value]}
+
+
+if __name__ == "__main__":
+    json.dump(fingerprints(Path(sys.argv[1])), sys.stdout, indent=1)
+    print()

@@ -1,0 +1,43 @@
+"""When a stage's pixels change, its version is raised: else caches would hand out what the old code made."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polcap.pipeline import STAGES
+from tests import golden
+
+FILE = Path(golden.__file__).with_suffix(".json")
+TOLERANCE = 2e-3  # of an array's length; other processors round otherwise, and an outline pixel may flip
+REMEDY = "raise its version, then run `python -m tests.golden RESULT > tests/golden.json`"
+
+
+@pytest.fixture(scope="module")
+def made(result: Path) -> dict[str, dict]:
+    return golden.fingerprints(result)
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_changed_pixels_have_a_new_version(made: dict[str, dict], stage: str) -> None:
+    expected, found = json.loads(FILE.read_text())[stage], made[stage]
+    assert found["version"] == expected["version"], f"{stage}: golden of another version; {REMEDY}"
+    changed = [
+        name
+        for name, told in found["arrays"].items()
+        if (before := expected["arrays"].get(name)) is None
+        or told["shape"] != before["shape"]
+        or np.abs(np.subtract(told["projections"], before["projections"])).max()
+        > TOLERANCE * max(before["length"], 1e-9)
+    ]
+    assert changed == [], f"{stage} makes other pixels of the same input; {REMEDY}"
+
+
+def test_fingerprint_sees_a_small_change_and_no_rounding() -> None:
+    value = np.random.default_rng(0).normal(1, 0.3, (200, 200)).astype(np.float32)
+    same, other = value * np.float32(1 + 1e-6), value.copy()
+    other[:20, :20] *= 1.1
+    told = [np.array(golden._told("x", array)["projections"]) for array in (value, same, other)]
+    length = golden._told("x", value)["length"]
+    assert np.abs(told[1] - told[0]).max() < TOLERANCE * length < np.abs(told[2] - told[0]).max()
