@@ -108,6 +108,12 @@ class _Detail(msgspec.Struct, frozen=True):
         weight[cv2.dilate(clipped, np.ones((reach, reach), np.uint8)) > 0] = 0
         return _Detail(value, weight)
 
+    def shrunk(self, step: int) -> "_Detail":
+        """The same of an image averaged down."""
+        if step == 1:
+            return self
+        return _Detail(_averaged(self.value.astype(np.float32), step), _averaged(self.weight, step))
+
 
 def _averaged(image: Floats, step: int) -> Floats:
     """Means of step × step blocks; an incomplete last block is dropped."""
@@ -118,8 +124,8 @@ def _averaged(image: Floats, step: int) -> Floats:
     return np.asarray(blocks.mean((1, 3), dtype=np.float32))
 
 
-def _to_full_grid(transform: Floats, step: int) -> Floats:
-    """A transform of the averaged grid on the grid it was averaged from."""
+def _to_full_grid(transform: Floats, step: float) -> Floats:
+    """A transform of a grid averaged by `step` on the grid it was averaged from (1/step: the other way)."""
     up = np.array([[step, 0, (step - 1) / 2], [0, step, (step - 1) / 2], [0, 0, 1.0]])
     return np.asarray(up @ transform @ np.linalg.inv(up))
 
@@ -137,15 +143,18 @@ def _refine(reference: _Detail, shot: _Detail, start: Floats, model: str) -> tup
     """Coarse-to-fine robust Gauss–Newton; the transform and its 1σ at the weighted pixels, px."""
     transform = start
     error = np.inf
-    for blur in (4.0, 1.5, 0.0):
-        a, b = (cv2.GaussianBlur(d.value, (0, 0), blur) if blur else d.value for d in (reference, shot))
-        coarse = "translation" if blur > 2 and model != "translation" else model
-        for _ in range(30):
-            step, error = _step(a, b, reference.weight, shot.weight, transform, coarse)
-            transform = transform @ step
-            transform = transform / transform[2, 2]
-            if np.abs(step - np.eye(3))[:2].dot([a.shape[1], a.shape[0], 1]).max() < 0.002:
+    for shrink in (4, 2, 1):
+        a, b = reference.shrunk(shrink), shot.shrunk(shrink)
+        height, width = a.value.shape
+        level = _to_full_grid(transform, 1 / shrink)
+        coarse = "translation" if shrink == 4 and model != "translation" else model
+        for _ in range(15):
+            step, error = _step(a.value, b.value, a.weight, b.weight, level, coarse)
+            level = level @ step
+            level = level / level[2, 2]
+            if np.abs(step - np.eye(3))[:2].dot([width, height, 1]).max() < 0.002:
                 break
+        transform = _to_full_grid(level, shrink)
     return transform, float(np.hypot(error, _FLOOR_PX))
 
 
