@@ -31,6 +31,7 @@ _WORK_PITCH_PX = 32.0  # the chart is placed at no more pixels per patch than th
 _LEAST_PITCH_PX = 8.0  # below, a patch has too few pixels to be sampled
 _LEAST_PATCHES = 12  # unclipped, for 9 + 2 unknowns per three channels
 _TILE_PX, _TILE_STEP_PX = 900, 600
+_GAMMA = (255 * np.linspace(0, 1, 2**14) ** (1 / 2.2)).astype(np.uint8)
 _CANDIDATES = 3  # per picture: texture may look more like a chart than the chart
 _WHITE = 18  # index of the white patch, the first of six greys
 _REMEDY = "give its corners with --chart x0,y0,…,x3,y3, a profile with --chart FILE, or --no-chart"
@@ -273,12 +274,17 @@ def _pictures(value: Floats) -> Iterator[tuple[NDArray[np.uint8], Floats]]:
     height, width = value.shape[:2]
     longest, white = max(height, width), _white(value)
     alike = np.full(3, white.max())
-    looks = [(1000, white, gain) for gain in (1.0, 2.5, 0.3)] + [(1000, alike, gain) for gain in (1.0, 2.5, 0.3)]
-    looks += [(600, white, 1.0), (1600, white, 1.0), (1600, white, 2.5), (1600, white, 0.3)]
-    looks += [(2400, white, 1.0), (2400, white, 2.5)] if longest <= 2400 else []
-    for side, one, gain in looks:
-        if side <= 4.5 * longest:
-            small = _resized(value, side / longest)
+    looks = {
+        1000: [(white, 1.0), (white, 2.5), (white, 0.3), (alike, 1.0), (alike, 2.5), (alike, 0.3)],
+        600: [(white, 1.0)],
+        1600: [(white, 1.0), (white, 2.5)],
+        2400: [(white, 1.0)] if longest <= 2400 else [],
+    }
+    for side, exposures in looks.items():
+        if side > 4.5 * longest:
+            continue
+        small = _resized(value, side / longest)
+        for one, gain in exposures:
             yield _picture(small, one / gain), _scaling(small.shape, value.shape)
     if longest > 2400:
         for y in range(0, max(height - _TILE_PX, 0) + _TILE_STEP_PX, _TILE_STEP_PX):
@@ -296,8 +302,8 @@ def _white(value: Floats) -> Floats:
 
 
 def _picture(value: Floats, white: Floats) -> NDArray[np.uint8]:
-    shown = np.clip(value / white, 0.0, 1.0) ** (1 / 2.2)
-    return np.ascontiguousarray((255 * shown).astype(np.uint8)[..., ::-1])
+    level = np.clip(value * np.asarray((len(_GAMMA) - 1) / white, np.float32), 0, len(_GAMMA) - 1)
+    return np.ascontiguousarray(_GAMMA[level.astype(np.uint16)][..., ::-1])
 
 
 def _resized(image: Floats, factor: float) -> Floats:
