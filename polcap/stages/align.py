@@ -148,23 +148,20 @@ def _refine(reference: _Detail, shot: _Detail, start: Floats, model: str) -> tup
         height, width = a.value.shape
         level = _to_full_grid(transform, 1 / shrink)
         coarse = "translation" if shrink == 4 and model != "translation" else model
+        shared = 1 / (1 / np.maximum(a.weight, 1e-12) + 1 / np.maximum(warp(b.weight, level, order=1), 1e-12))
         for _ in range(15):
-            step, error = _step(a.value, b.value, a.weight, b.weight, level, coarse)
+            step, error = _step(a.value, b.value, shared, level, coarse)
             level = level @ step
             level = level / level[2, 2]
-            if np.abs(step - np.eye(3))[:2].dot([width, height, 1]).max() < 0.002:
+            if np.abs(step - np.eye(3))[:2].dot([width / 2, height / 2, 1]).max() < 0.004:
                 break
         transform = _to_full_grid(level, shrink)
     return transform, float(np.hypot(error, _FLOOR_PX))
 
 
-def _step(
-    a: Floats, b: Floats, weight_a: Floats, weight_b: Floats, transform: Floats, model: str
-) -> tuple[Floats, float]:
+def _step(a: Floats, b: Floats, weight: Floats, transform: Floats, model: str) -> tuple[Floats, float]:
     """One compositional update (3, 3) that brings b∘transform closer to a, and its 1σ, px."""
     warped = warp(b, transform)
-    inverse = 1 / np.maximum(weight_a, 1e-12) + 1 / np.maximum(warp(weight_b, transform, order=1), 1e-12)
-    weight = np.where(inverse < 1e9, 1 / inverse, 0)
     gx_a, gy_a = _gradient(a)
     gx_b, gy_b = _gradient(warped)
     gx, gy = (gx_a + gx_b) / 2, (gy_a + gy_b) / 2
@@ -174,7 +171,8 @@ def _step(
     y = ((np.arange(height) - height / 2) / size)[:, None]
     margin = np.zeros_like(a, dtype=bool)
     margin[4:-4, 4:-4] = True
-    use = margin & (weight > 0) & (gx * gx + gy * gy > 1e-8)
+    told = weight * (gx * gx + gy * gy)  # what a pixel says of the movement; most say nothing
+    use = margin & (weight > 1e-9) & (told > 0.05 * told.mean())
     columns = [gx, gy]
     if model in ("similarity", "homography"):
         columns += [gx * x + gy * y, gy * x - gx * y]
