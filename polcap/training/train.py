@@ -12,6 +12,7 @@ import queue
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -39,7 +40,7 @@ class Params:
     out: Path = Path("runs/train")  # cache of views, checkpoints, metrics
     minutes: float = 90.0  # training time, all resumed parts together; building the cache is extra
     resume: bool = False  # go on from out/last.pt
-    threads: int = 2  # half of them make batches
+    threads: int = 2  # learners on a CPU, each with a batch of its own; one more thread makes the batches
     seed: int = 1
     rate: float = 1e-3
 
@@ -70,19 +71,19 @@ def main(params: Params) -> Path:
     params.out.mkdir(parents=True, exist_ok=True)
     simulator = Simulator(views(params, preset), library(params, "train", device), device)
     watch = Watch(params.data, params.out / "watch", device)
-    run = Run(preset.shape, device, params.rate)
+    learners = params.threads if device.type == "cpu" else 1
+    run = Run(preset.shape, device, params.rate, learners)
     if params.resume:
         run.load(params.out / "last.pt")
     _keep_memory()
-    share = max(params.threads // 2, 1)
-    torch.set_num_threads(share)
-    ready = _ahead(simulator, preset, params.seed + run.step, share)
+    torch.set_num_threads(1)
+    ready = _ahead(simulator, preset, params.seed + run.step)
     budget = params.minutes * 60
     saved = looked = run.elapsed
     parts: list[dict[str, float]] = []
     before = time.monotonic()
     while run.elapsed < budget:
-        parts.append(run.advance(next(ready), run.elapsed / budget))
+        parts.append(run.advance([next(ready) for _ in range(learners)], run.elapsed / budget))
         now = time.monotonic()
         run.elapsed, before = run.elapsed + now - before, now
         if run.step % 50 == 0 or run.step == 10 or run.elapsed >= budget:
@@ -122,17 +123,16 @@ def library(params: Params, split: str, device: torch.device) -> materials.Libra
     return materials.Library(folder if folder.exists() else None, device)
 
 
-def _ahead(simulator: Simulator, preset: Preset, seed: int, threads: int) -> Iterator[Batch]:
-    """Batches without end, made in a thread of their own while the network learns from the one before.
+def _ahead(simulator: Simulator, preset: Preset, seed: int) -> Iterator[Batch]:
+    """Batches without end, made in a thread of their own while the network learns from those before.
 
-    Two threads that meet once per step waste less of a busy machine than two that meet in every operation.
-    The thread alone draws from torch's global random state, so the batches follow from the seed.
+    That thread alone draws from torch's global random state, so the batches follow from the seed.
     """
-    waiting: queue.Queue[Batch | BaseException] = queue.Queue(maxsize=2)
+    waiting: queue.Queue[Batch | BaseException] = queue.Queue(maxsize=4)
 
     def make() -> None:
         try:
-            torch.set_num_threads(threads)
+            torch.set_num_threads(1)
             torch.manual_seed(seed)
             chooser = np.random.default_rng(seed)
             while True:
@@ -150,9 +150,13 @@ def _ahead(simulator: Simulator, preset: Preset, seed: int, threads: int) -> Ite
 
 
 class Run:
-    """Network, its moving average, optimizer and how far they are."""
+    """Network, its moving average, optimizer and how far they are.
 
-    def __init__(self, shape: model.Shape, device: torch.device, rate: float) -> None:
+    Each learner is a thread that works out the gradient of one batch; a step follows their mean. Threads
+    that meet once a step waste less of a busy machine than threads that meet in every operation.
+    """
+
+    def __init__(self, shape: model.Shape, device: torch.device, rate: float, learners: int = 1) -> None:
         self.device, self.rate = device, rate
         self.network = model.Network(shape).to(device, memory_format=torch.channels_last)
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
@@ -162,32 +166,40 @@ class Run:
             [{"params": decay, "weight_decay": 1e-2}, {"params": plain, "weight_decay": 0.0}],
             rate, betas=(0.9, 0.98), fused=True,
         )  # fmt: skip
-        self.lights = torch.Generator(device).manual_seed(5)  # of the rendering loss
+        self.weights = list(self.network.parameters())
+        self.lights = [torch.Generator(device).manual_seed(k) for k in range(learners)]  # of the rendering loss
+        self.pool = ThreadPoolExecutor(learners, initializer=torch.set_num_threads, initargs=(1,))
         self.step, self.samples, self.elapsed, self.skipped = 0, 0, 0.0, 0
 
-    def advance(self, batch: Batch, progress: float) -> dict[str, float]:
-        """One step; progress 0…1 of the budget sets the rate."""
+    def advance(self, batches: list[Batch], progress: float) -> dict[str, float]:
+        """One step on a batch per learner; progress 0…1 of the budget sets the rate."""
         fall = min(1.0, (1 - min(progress, 1.0)) / (1 - _HOLD))
         for group in self.optimizer.param_groups:
             group["lr"] = self.rate * min(1.0, (self.step + 1) / _WARM) * fall
         self.network.train()
-        with torch.autocast(self.device.type, torch.bfloat16):
-            maps = self.network(batch.channels.contiguous(memory_format=torch.channels_last))
-        value, figures = loss.total(maps, batch, self.lights)
-        self.optimizer.zero_grad(set_to_none=False)
-        value.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0, foreach=True)
+        learned = list(self.pool.map(self._learn, batches, self.lights))
+        for weight, *gradients in zip(self.weights, *(gradient for gradient, _ in learned)):
+            weight.grad = sum(gradients[1:], gradients[0]) / len(gradients)
+        norm = torch.nn.utils.clip_grad_norm_(self.weights, 1.0, foreach=True)
         if torch.isfinite(norm):
             self.optimizer.step()
         else:
             self.skipped += 1
         self.step += 1
-        self.samples += len(batch.mask)
+        self.samples += sum(len(batch.mask) for batch in batches)
         keep = min(0.999, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
             weights = list(self.network.state_dict().values())
             torch._foreach_lerp_(list(self.average.values()), weights, 1 - keep)
-        return figures | {"gradient": float(norm)}
+        parts = [figures for _, figures in learned]
+        return {k: float(np.mean([p[k] for p in parts])) for k in parts[0]} | {"gradient": float(norm)}
+
+    def _learn(self, batch: Batch, lights: torch.Generator) -> tuple[tuple[Tensor, ...], dict[str, float]]:
+        """Gradient of the loss of one batch, and its parts."""
+        with torch.autocast(self.device.type, torch.bfloat16, cache_enabled=False):  # threads share that cache
+            maps = self.network(batch.channels.contiguous(memory_format=torch.channels_last))
+        value, figures = loss.total(maps, batch, lights)
+        return torch.autograd.grad(value, self.weights), figures
 
     @contextmanager
     def averaged(self) -> Iterator[model.Network]:
@@ -203,7 +215,7 @@ class Run:
         state = {
             "network": self.network.state_dict(), "average": self.average, "optimizer": self.optimizer.state_dict(),
             "shape": asdict(self.network.shape), "step": self.step, "samples": self.samples, "elapsed": self.elapsed,
-            "skipped": self.skipped, "lights": self.lights.get_state(),
+            "skipped": self.skipped,
         }  # fmt: skip
         beside = path.with_suffix(".part")
         torch.save(state, beside)
@@ -218,7 +230,8 @@ class Run:
         self.optimizer.load_state_dict(state["optimizer"])
         self.step, self.samples, self.elapsed = state["step"], state["samples"], state["elapsed"]
         self.skipped = state["skipped"]
-        self.lights.set_state(state["lights"].cpu())
+        for k, generator in enumerate(self.lights):  # other lights than before
+            generator.manual_seed(1000 * self.step + k)
 
 
 def load_average(path: Path) -> tuple[model.Network, dict[str, Any]]:

@@ -37,9 +37,9 @@ def test_run_stops_in_time_and_resumes(data: Path, tmp_path: Path, monkeypatch: 
 
 def test_steps_on_one_batch_lower_its_loss(simulator: Simulator) -> None:
     torch.manual_seed(0)
-    run, batch = train.Run(TINY, torch.device("cpu"), 3e-3), simulator.draw(4, 64)
+    run, batch = train.Run(TINY, torch.device("cpu"), 3e-3, 2), simulator.draw(4, 64)
     run.step = 200  # past the warm-up
-    losses = [run.advance(batch, 0.0)["loss"] for _ in range(25)]
+    losses = [run.advance([batch, batch], 0.0)["loss"] for _ in range(25)]
     assert losses[-1] < 0.8 * losses[0] and run.skipped == 0
 
 
@@ -69,6 +69,6 @@ def test_rate_falls_to_nothing_over_the_last_part_of_the_budget(data: Path) -> N
     )  # fmt: skip
     rates = []
     for progress in (0.1, 0.45, 0.725, 1.0):
-        run.advance(batch, progress)
+        run.advance([batch], progress)
         rates.append(run.optimizer.param_groups[0]["lr"])
     assert rates == pytest.approx([1e-3, 1e-3, 5e-4, 0.0])
