@@ -11,6 +11,7 @@ from tests import golden
 
 FILE = Path(golden.__file__).with_suffix(".json")
 TOLERANCE = 2e-3  # of an array's length; other processors round otherwise, and an outline pixel may flip
+CHOOSING = 1e-2  # where pixels choose between hypotheses: 1e-3 px of registration moves the error map by 0.3 %
 REMEDY = "raise its version, then run `python -m tests.golden RESULT > tests/golden.json`"
 
 
@@ -23,13 +24,14 @@ def made(result: Path) -> dict[str, dict]:
 def test_changed_pixels_have_a_new_version(made: dict[str, dict], stage: str) -> None:
     expected, found = json.loads(FILE.read_text())[stage], made[stage]
     assert found["version"] == expected["version"], f"{stage}: golden of another version; {REMEDY}"
+    tolerance = CHOOSING if stage in ("infer", "surface", "asset") else TOLERANCE
     changed = [
         name
         for name, told in found["arrays"].items()
         if (before := expected["arrays"].get(name)) is None
         or told["shape"] != before["shape"]
         or np.abs(np.subtract(told["projections"], before["projections"])).max()
-        > TOLERANCE * max(before["length"], 1e-9)
+        > tolerance * max(before["length"], 1e-9)
     ]
     assert changed == [], f"{stage} makes other pixels of the same input; {REMEDY}"
 
