@@ -22,7 +22,8 @@ from polcap.images import Floats
 
 ROWS, COLUMNS = 4, 6
 USUAL_PATCH = 0.88  # side of a patch / pitch
-_LEAST_BLUR, _GREATEST_BLUR = 0.004, 0.12  # 1σ of the edges [pitch]
+_GREATEST_BLUR = 0.12  # 1σ of the edges [pitch]
+_PIXEL_BLUR_PX = 0.29  # 1σ of a pixel's own width, 1/√12: no edge is sharper
 _GAMMA = 2.2
 _DARKEST = 1e-3  # of white; darker counts as this
 _MARGIN = 0.045  # how far beyond the outer patches the card is compared [pitch]
@@ -115,6 +116,7 @@ def refine(image: Floats, start: Placement, steps: int = 12) -> Placement:
     point = project(frame, at.astype(np.float64))
     inverse = np.linalg.inv(frame @ start.homography)
     inverse = inverse / inverse[2, 2]
+    least_blur = min(_PIXEL_BLUR_PX / start.pitch_px, _GREATEST_BLUR)
     patch, blur, explained = start.patch, max(start.blur, 0.04), 0.0
     for step in range(steps):
         drawing = _draw(point, value, inverse, patch, blur)
@@ -129,7 +131,7 @@ def refine(image: Floats, start: Placement, steps: int = 12) -> Placement:
         change = np.linalg.solve(normal + np.diag(damping), right)
         inverse = inverse + np.append(change[:8], 0.0).reshape(3, 3)
         patch = float(np.clip(patch + change[8], 0.6, 0.97))
-        blur = float(np.clip(blur + change[9], _LEAST_BLUR, _GREATEST_BLUR))
+        blur = float(np.clip(blur + change[9], least_blur, _GREATEST_BLUR))
         if step > 3 and np.abs(change[:8]).max() < 1e-5:
             break
     homography = np.linalg.inv(frame) @ np.linalg.inv(inverse)

@@ -82,7 +82,7 @@ class MatrixFit:
 
 
 def fit_matrix(
-    color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_], rounds: int = 4
+    color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_], rounds: int = 20
 ) -> MatrixFit:
     """Least squares for a camera's matrix M under sloping light and a veil: M c = (1 + e·x) r + b (1, 1, 1).
 
