@@ -20,7 +20,7 @@ def rays(view: View, height: int, width: int) -> Floats:
     y = (np.arange(height, dtype=np.float32) - view.center[1]) / view.focal
     xx, yy = np.meshgrid(x, y)
     v = np.stack([-xx, yy, np.ones_like(xx)], axis=-1)
-    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
 
 
 def basis(v: Any) -> tuple[Any, Any]:

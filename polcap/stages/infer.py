@@ -162,28 +162,52 @@ def _expected_error(zenith: Floats, dolp: Floats, sigma: Floats, certainty: Floa
 
 
 def _learned(cues: Cues, network: Network, settings: Settings) -> SurfaceMaps:
-    """A coarse pass that sees the whole object, a fine pass that sees its detail, and their blend."""
+    """The network's maps, its normals joined with the analytic ones by their expected errors.
+
+    The network sees the whole object at the size it was trained on, which settles half-turns, shape and
+    gloss; colour, which has detail, it sees at full size. What pixels say of a normal by themselves it has
+    no need to learn: the inversion adds it at full size, where noise and interreflection leave it a say.
+    """
     _check(network)
     height, width = cues.mask.shape
-    native = int(network.metadata["native_size"])
-    shrink = max(height, width) / native
-    coarse = _run(_resized(cues, min(1.0, 1 / shrink)), network, settings)
-    maps = {name: cv2.resize(m, (width, height)) if m.shape[:2] != (height, width) else m for name, m in coarse.items()}
-    if shrink > 1.0:
-        maps = _blend(maps, _run(cues, network, settings))
-    local = maps["normal"] / np.maximum(np.linalg.norm(maps["normal"], axis=-1, keepdims=True), 1e-6)
+    shrink = max(height, width) / int(network.metadata["native_size"])
+    whole = _run(_resized(cues, min(1.0, 1 / shrink)), network, settings)
+    maps = {n: m if m.shape[:2] == (height, width) else cv2.resize(m, (width, height)) for n, m in whole.items()}
+    diffuse = _run(cues, network, settings)["diffuse"] if shrink > 1.0 else maps["diffuse"]
+    by_pixel = _analytic(cues, settings)
+    normal, expected = _joined(
+        (np.asarray(frames.from_ray_frame(maps["normal"], cues.rays)), maps["sigma"]),
+        (by_pixel.normal, by_pixel.confidence),
+    )
     inside = cues.mask[..., None]
     return SurfaceMaps(
-        normal=(np.asarray(frames.from_ray_frame(local, cues.rays)) * inside).astype(np.float32),
-        diffuse=(np.clip(maps["diffuse"], 0, 1) * inside).astype(np.float32),
+        normal=(normal * inside).astype(np.float32),
+        diffuse=(np.clip(diffuse, 0, 1) * inside).astype(np.float32),
         specular=(np.clip(maps["specular"], 0, 1) * inside).astype(np.float32),
         roughness=(np.clip(maps["roughness"], 0.02, 1) * cues.mask).astype(np.float32),
         depth_prior=(maps["depth"] * cues.mask).astype(np.float32),
-        confidence=(maps["sigma"] * cues.mask).astype(np.float32),
+        confidence=(expected * cues.mask).astype(np.float32),
         mask=cues.mask,
         view=cues.view,
         estimator=f"network {network.metadata.get('version', network.digest[:8])}",
     )
+
+
+def _joined(*estimates: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
+    """Mean direction of normals (H, W, 3) weighed by 1/σ² of their expected errors (H, W), and its own.
+
+    Where the estimates agree the error is that of independent ones; where they part, their distance adds.
+    """
+    weights = [1 / np.maximum(sigma, 1.0) ** 2 for _, sigma in estimates]
+    total = sum(w[..., None] * n / np.maximum(_length(n), 1e-6) for w, (n, _) in zip(weights, estimates))
+    length = _length(np.asarray(total))
+    share = np.clip(length[..., 0] / sum(weights), 1e-3, 1)  # 1 where all point the same way
+    apart = np.degrees(np.arccos(share))
+    return np.asarray(total / np.maximum(length, 1e-12)), np.hypot(1 / np.sqrt(sum(weights)), apart)
+
+
+def _length(vectors: Floats) -> Floats:
+    return np.asarray(np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
 def _check(network: Network) -> None:
@@ -272,13 +296,3 @@ def _ramp(length: int, overlap: int) -> Floats:
     """Blending weight along one side of a tile, falling to near nothing at its ends."""
     edge = np.minimum(np.arange(length), np.arange(length)[::-1]) + 1.0
     return np.minimum(edge / max(overlap, 1), 1.0)
-
-
-def _blend(coarse: dict[str, Floats], fine: dict[str, Floats]) -> dict[str, Floats]:
-    """Fine normals and colours where they agree with the coarse pass, coarse depth and half-turn."""
-    agree = np.clip((coarse["normal"] * fine["normal"]).sum(-1), 0, 1)
-    share = (agree**2)[..., None]
-    mixed = {name: share * fine[name] + (1 - share) * coarse[name] for name in ("normal", "diffuse", "specular")}
-    for name in ("roughness", "sigma"):
-        mixed[name] = share[..., 0] * fine[name] + (1 - share[..., 0]) * coarse[name]
-    return mixed | {"depth": coarse["depth"]}

@@ -125,7 +125,8 @@ def _otherwise_colored(picture: Floats, log: Floats, level: float, outside: NDAr
     """(H, W) where the colour is not the backdrop's, in pixels at least as bright as it."""
     smooth = cv2.GaussianBlur(np.maximum(picture, 0), (0, 0), 1.5)
     chroma = smooth / (smooth.sum(-1, keepdims=True) + 1e-4)
-    backdrop = np.median(chroma[(np.abs(log - level) < 0.5) & ~outside], axis=0) if (np.abs(log - level) < 0.5).any() else 1 / 3
+    like = (np.abs(log - level) < 0.5) & ~outside
+    backdrop = np.median(chroma[like], axis=0) if like.any() else np.full(3, 1 / 3)
     return np.asarray((np.abs(chroma - backdrop).sum(-1) > _OTHER_CHROMA) & (log > level))
 
 

@@ -21,7 +21,8 @@ from polcap.report import Results
 from polcap.store import Store
 
 COLUMNS = (
-    "capture", "normal mean", "median", "chart px", "align px", "gain %", "ratio %", "diffuse", "roughness", "F0", "depth",
+    "capture", "normal mean", "median", "chart px", "align px", "gain %", "ratio %",
+    "diffuse", "roughness", "F0", "depth",
 )  # fmt: skip
 
 
