@@ -201,8 +201,8 @@ class Gains:
 
     gain: Floats  # (K, 3) relative to the reference shot
     sigma: Floats  # (K, 3) 1σ
-    anchor: Floats  # (K, 3) the same from the brightest object pixels, the cross-check
-    source: Literal["grey patches", "brightest pixels", "none"]
+    anchor: Floats  # (K, 3) the same from the object's facing pixels, the cross-check
+    source: Literal["grey patches", "facing pixels", "none"]
     disagreement: float  # largest |gain/anchor − 1| of the channel means beyond twice the anchor's own error
     angle_offset: float  # rad, common turn of the polarizer ring seen against the silhouette (not applied)
     angle_offset_sigma: float  # rad

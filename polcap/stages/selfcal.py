@@ -2,7 +2,7 @@
 
 One per cent of flash energy fakes as much polarization as a surface tilted by 24°. A matt grey patch
 is unpolarized, so its brightness must be the same in every shot; where there is no chart, the object's
-brightest pixels serve, which under a flash beside the lens face the camera. At the outline the surface
+pixels that face the camera serve, which are the most alike. At the outline the surface
 turns edge-on: there the polarization of diffuse light points across the contour, which tells whether
 the angles are in order, counted the right way, and clocked.
 """
@@ -23,14 +23,12 @@ from polcap.optics.warp import warp
 from polcap.stages import stage
 
 _GREY_PATCHES = (18, 19, 20, 21)  # white to neutral 5; the darker two are mostly noise
-_ANCHOR_ERROR = 0.0025  # what brightest pixels were wrong by on path-traced objects, whatever the noise
+_ANCHOR_ERROR = 0.0025  # what facing pixels were wrong by on path-traced objects, whatever the noise
+_KERNELS = (0.04, 0.02, 0.014, 0.01)  # of the mean shift, in units of S1/S0
 _MOST_ORDERS = 4  # with more shots the permutations are too many and too alike to judge
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    brightest: Annotated[float, Meta(gt=0, le=0.2, description="share of the object's pixels that serve as anchor")] = (
-        0.03
-    )
     check_order: Annotated[
         bool, Meta(description="refuse a capture whose outline contradicts the order or sense of its angles")
     ] = True
@@ -40,7 +38,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.2
 
 
-@stage(version=1)
+@stage(version=2)
 def solve(
     radiance: AngleStack,
     alignment: Alignment,
@@ -54,12 +52,12 @@ def solve(
     """
     value, quality = _registered(radiance, alignment, object_.crop)
     mask = object_.mask[object_.crop[1] : object_.crop[3], object_.crop[0] : object_.crop[2]]
-    anchor, anchor_sigma = _brightest_pixels(value, quality, mask, settings.brightest)
+    anchor, anchor_sigma = _facing_pixels(value, quality, mask)
     grey = _grey_patches(radiance, alignment, color)
     if grey is not None:
         (gain, sigma), source = grey, "grey patches"
     else:
-        gain, source = anchor, "brightest pixels"
+        gain, source = anchor, "facing pixels"
         sigma = np.hypot(anchor_sigma, _ANCHOR_ERROR) * (np.arange(len(gain)) > 0)[:, None]
     channel = gain.mean(1) / anchor.mean(1)
     verdict = _outline_verdict(value / gain[:, None, None], quality, mask, radiance.angle, object_.crop, radiance)
@@ -139,28 +137,38 @@ def _polygon(quad: Floats, transform: Floats, shape: tuple[int, ...]) -> NDArray
     return np.asarray(cv2.erode(inside, np.ones((3, 3), np.uint8)) > 0)
 
 
-def _brightest_pixels(value: Floats, quality: Bits, mask: NDArray[np.bool_], share: float) -> tuple[Floats, Floats]:
-    """Gains (K, 3) and 1σ from the object's brightest unclipped pixels.
+def _facing_pixels(value: Floats, quality: Bits, mask: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    """Gains (K, 3) and 1σ from the object's own unclipped pixels.
 
-    The median of per-pixel ratios: a sharp highlight falls differently on the pixels of every shot, and
-    a sum would follow it. The error is what the medians of a 4 × 4 grid of parts of the object disagree by.
+    A surface that faces the camera is unpolarized, and most of a picture's pixels per unit of polarization
+    are such: over a rounded object the density of (S1, S2)/S0 grows as 1/θ² towards its zero. So the ratios of
+    the shots pile up where the gains are; mean shift with a shrinking kernel climbs there from their median.
+    Albedo does not matter. The error is what the last kernels disagree by. A large flat tilted face misleads.
+
+    References
+    ----------
+    Comaniciu & Meer, Mean shift, IEEE TPAMI 2002.
     """
     solid = cv2.erode(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     usable = (solid if solid.sum() > 100 else mask) & (quality == 0)
     if not usable.any():
         return np.ones((len(value), 3)), np.ones((len(value), 3))
     smooth = np.stack([cv2.GaussianBlur(v.astype(np.float32), (0, 0), 2.0) for v in value])
-    total = smooth.sum((0, -1))
-    chosen = usable & (total >= np.quantile(total[usable], 1 - share))
-    light = smooth[:, chosen].astype(np.float64)
-    ratio = light / np.maximum(light[0], 1e-12)  # (K, N, 3)
-    rows, columns = np.nonzero(chosen)
-    part = 4 * (4 * rows // mask.shape[0]) + 4 * columns // mask.shape[1]
-    each = np.stack([np.median(ratio[:, part == p], axis=1) for p in np.unique(part)])  # (P, K, 3)
-    weight = np.unique(part, return_counts=True)[1] / part.size
-    middle = np.median(ratio, axis=1)
-    spread = np.sqrt(np.tensordot(weight, (each - middle) ** 2, axes=1) * np.maximum((weight**2).sum(), 1 / 16))
-    return np.asarray(middle), np.asarray(spread)
+    total = smooth.sum(-1)  # (K, H, W)
+    usable &= total.sum(0) > np.quantile(total.sum(0)[usable], 0.2)  # the darkest fifth is noise
+    ratio = total[:, usable] / np.maximum(total[0, usable], 1e-12)  # (K, N)
+    light = smooth[:, usable]
+    at = np.median(ratio, axis=1)
+    found = []
+    for width in _KERNELS:
+        for _ in range(50):
+            weight = np.exp(-((ratio - at[:, None]) ** 2).sum(0) / (2 * width**2))
+            before, at = at, ratio @ weight / max(float(weight.sum()), 1e-12)
+            if np.abs(at - before).max() < 1e-6:
+                break
+        colored = np.einsum("knc,n->kc", light, weight / np.maximum(total[0, usable], 1e-12))
+        found.append(colored / np.maximum(colored[0], 1e-12))
+    return np.asarray(found[-1]), np.std(found[1:], axis=0)
 
 
 def _outline_verdict(

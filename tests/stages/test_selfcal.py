@@ -35,9 +35,9 @@ def test_grey_patches_give_the_gains_within_their_error():
     assert np.abs(z).max() < 4
 
 
-def test_without_a_chart_the_brightest_pixels_serve():
+def test_without_a_chart_the_facing_pixels_serve():
     found = solve(scenes.stack(gain=GAIN, noise=0.004), scenes.no_color())
-    assert found.source == "brightest pixels"
+    assert found.source == "facing pixels"
     assert np.abs(found.gain.mean(1) / GAIN - 1).max() < 0.005
 
 
