@@ -24,7 +24,7 @@ from polcap.stages import stage
 
 _GREY_PATCHES = (18, 19, 20, 21)  # white to neutral 5; the darker two are mostly noise
 _ANCHOR_ERROR = 0.0025  # what facing pixels were wrong by on path-traced objects, whatever the noise
-_KERNELS = (0.04, 0.02, 0.014, 0.01)  # of the mean shift, in units of S1/S0
+_KERNELS = (0.04, 0.02, 0.01, 0.007, 0.005)  # of the mean shift, in units of S1/S0
 _MOST_ORDERS = 4  # with more shots the permutations are too many and too alike to judge
 
 
