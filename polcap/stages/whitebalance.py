@@ -49,7 +49,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_explained: Annotated[
         float,
         Meta(ge=0, le=1, description="least share of the chart's variance that 24 flat patches explain"),
-    ] = 0.8
+    ] = 0.9
     patch_share: Annotated[float, Meta(ge=0.2, le=0.95, description="sampled share of each patch's side")] = 0.6
 
 
@@ -104,20 +104,21 @@ class _Find:
 
 
 def _search(radiance: AngleStack, reference: ChartReference, settings: Settings) -> _Find:
-    """The first candidate that passes every test; ChartError with the best of the rest."""
+    """The first candidate that passes every test with ease, else the best; ChartError says what it lacks."""
     value = radiance.value[0]
-    refused: list[Placement] = []  # for their colours
-    cheapest = nearest = np.inf
+    known: list[Placement] = []
+    best: _Find | None = None
+    cheapest = np.inf
     exposed: ChartError | None = None
     for centers, cost in _candidates(value):
         cheapest = min(cheapest, cost)
         start = chart.from_centers(centers)
-        if cost > settings.max_cost or not chart.is_view(start.homography) or _among(refused, start):
+        if cost > settings.max_cost or not chart.is_view(start.homography) or _among(known, start):
             continue
         place = _refine(value, start)
         if not _plausible(place, settings):
             continue
-        refused.append(place)
+        known.append(place)
         try:
             ways = [  # a detector may read the chart upside down
                 _Find(way, _fit(radiance, way, reference, settings), cost) for way in (place, place.turned())
@@ -125,14 +126,15 @@ def _search(radiance: AngleStack, reference: ChartReference, settings: Settings)
         except ChartError as error:
             exposed = error
             continue
-        find = min(ways, key=lambda way: way.error)
-        if find.error <= settings.max_delta_e:
-            return find
-        nearest = min(nearest, find.error)
+        best = min(ways if best is None else [*ways, best], key=lambda find: find.error)
+        if best.error <= settings.max_delta_e / 2:  # beyond, a later picture may place the chart better
+            return best
+    if best is not None and best.error <= settings.max_delta_e:
+        return best
     if exposed is not None:
         raise exposed
-    if nearest < np.inf:
-        why = f"best mean residual ΔE {nearest:.1f}, whitebalance.max_delta_e = {settings.max_delta_e:g}"
+    if best is not None:
+        why = f"best mean residual ΔE {best.error:.1f}, whitebalance.max_delta_e = {settings.max_delta_e:g}"
     elif cheapest == np.inf:
         why = "the detector saw nothing like one"
     elif cheapest > settings.max_cost:
@@ -229,13 +231,12 @@ def _plausible(place: Placement, settings: Settings) -> bool:
 
 
 def _among(places: list[Placement], start: Placement) -> bool:
-    """Whether a start leads to a place that is known already: centres within half a patch."""
-    middle = np.array([chart.COLUMNS / 2, chart.ROWS / 2])
-    here = chart.project(start.homography, middle)
+    """Whether a start leads to a place that is known already: all centres within a quarter of a patch."""
+    here = chart.project(start.homography, chart.centers())
     return any(
-        np.linalg.norm(chart.project(place.homography, middle) - here) < 0.5 * place.pitch_px
-        and 0.8 < place.pitch_px / start.pitch_px < 1.25
+        np.abs(chart.project(way.homography, chart.centers()) - here).max() < 0.25 * place.pitch_px
         for place in places
+        for way in (place, place.turned())
     )
 
 
