@@ -73,7 +73,7 @@ def main(params: Params) -> dict[str, Score]:
             rows.append(score(maps, case))
             if name == "network":
                 calibration.append((maps.confidence[maps.mask], angle(maps, case)[maps.mask]))
-        table[name] = {key: float(np.nanmean([row[key] for row in rows])) for key in rows[0]}
+        table[name] = {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
     result = {"conditions": _conditions(params, network), "table": table, "calibration": deciles(calibration)}
     params.out.mkdir(parents=True, exist_ok=True)
     (params.out / "evaluation.json").write_text(json.dumps(result, indent=1))
@@ -137,7 +137,6 @@ def score(maps: SurfaceMaps, case: Case) -> Score:
         difference = (getattr(maps, name) - getattr(case.truth, name))[mask]
         out[name] = float(np.sqrt(np.mean(difference**2)))
         out[f"{name}_l1"] = float(np.abs(difference).mean())
-    out["depth"] = np.nan
     if maps.depth_prior is not None:
         ahead, truth = maps.depth_prior[mask], case.depth[mask]
         difference = (ahead - ahead.mean()) - (truth - truth.mean())
@@ -244,5 +243,6 @@ def _markdown(table: dict[str, Score]) -> str:
     names = list(table)
     lines = ["| | " + " | ".join(names) + " |", "| --- |" + " --- |" * len(names)]
     for row in next(iter(table.values())):
-        lines.append(f"| {row} | " + " | ".join(f"{table[name][row]:.4g}" for name in names) + " |")
+        cells = (f"{table[name][row]:.4g}" if row in table[name] else "–" for name in names)
+        lines.append(f"| {row} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
