@@ -8,7 +8,7 @@ the angles are in order, counted the right way, and clocked.
 """
 
 from itertools import permutations
-from typing import Annotated
+from typing import Annotated, Literal
 
 import cv2
 import msgspec
@@ -54,6 +54,7 @@ def solve(
     mask = object_.mask[object_.crop[1] : object_.crop[3], object_.crop[0] : object_.crop[2]]
     anchor, anchor_sigma = _facing_pixels(value, quality, mask)
     grey = _grey_patches(radiance, alignment, color)
+    source: Literal["grey patches", "facing pixels"]
     if grey is not None:
         (gain, sigma), source = grey, "grey patches"
     else:
@@ -71,7 +72,7 @@ def solve(
         gain=gain,
         sigma=sigma,
         anchor=anchor,
-        source=source,  # type: ignore[arg-type]
+        source=source,
         disagreement=float(np.maximum(np.abs(channel - 1) - 2 * anchor_sigma.mean(1), 0).max()),
         angle_offset=angle_offset,
         angle_offset_sigma=offset_sigma,
