@@ -25,10 +25,12 @@ _MODEL_ERROR_DEG = 4.0  # interreflection, highlights, unknown index: measured o
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ior: Annotated[float, Meta(ge=1.2, le=2.5, description="refractive index assumed by the analytic estimator")] = 1.5
-    tile_px: Annotated[int, Meta(ge=128, le=4096, description="largest side the network sees at once [px]")] = 1024
+    tile_px: Annotated[
+        int, Meta(ge=128, le=4096, description="largest side the network sees at once; bounds its memory [px]")
+    ] = 512
 
 
-@stage(version=1)
+@stage(version=2)
 def estimate(cues: Cues, network: Network | None, settings: Settings) -> SurfaceMaps:
     """Normal, diffuse, specular, roughness and expected error; network None means analytic."""
     return _analytic(cues, settings) if network is None else _learned(cues, network, settings)
@@ -171,9 +173,9 @@ def _learned(cues: Cues, network: Network, settings: Settings) -> SurfaceMaps:
     _check(network)
     height, width = cues.mask.shape
     shrink = max(height, width) / int(network.metadata["native_size"])
-    whole = _run(_resized(cues, min(1.0, 1 / shrink)), network, settings)
+    whole = _run(channels(_resized(cues, min(1.0, 1 / shrink))), network, settings)
     maps = {n: m if m.shape[:2] == (height, width) else cv2.resize(m, (width, height)) for n, m in whole.items()}
-    diffuse = _run(cues, network, settings)["diffuse"] if shrink > 1.0 else maps["diffuse"]
+    diffuse = _color(cues, network, settings)
     by_pixel = _analytic(cues, settings)
     normal, expected = _joined(
         (np.asarray(frames.from_ray_frame(maps["normal"], cues.rays)), maps["sigma"]),
@@ -258,9 +260,25 @@ def _resized(cues: Cues, scale: float) -> Cues:
     )
 
 
-def _run(cues: Cues, network: Network, settings: Settings) -> dict[str, Floats]:
-    """All maps (H, W[, 3]) of one pass; a crop larger than a tile in overlapping tiles, blended by a ramp."""
-    picture = channels(cues)  # (N, H, W)
+def _color(cues: Cues, network: Network, settings: Settings) -> Floats:
+    """Diffuse albedo (H, W, 3): the mean of two passes a pixel apart, in which the network's 2 px grid cancels.
+
+    A crop larger than two tiles is seen at that size, and the rest of its detail taken from S0.
+    """
+    height, width = cues.mask.shape
+    seen = _resized(cues, min(1.0, 2 * settings.tile_px / max(height, width)))
+    picture = channels(seen)
+    moved = np.pad(picture, ((0, 0), (1, 0), (1, 0)))
+    here, there = (_run(p, network, settings)["diffuse"] for p in (picture, moved))
+    albedo = np.asarray((here + there[1:, 1:]) / 2, np.float32)
+    if seen is cues:
+        return albedo
+    finer = cues.radiance / np.maximum(cv2.resize(seen.radiance, (width, height)), 1e-3)
+    return np.asarray(cv2.resize(albedo, (width, height)) * np.clip(finer, 0.25, 4))
+
+
+def _run(picture: Floats, network: Network, settings: Settings) -> dict[str, Floats]:
+    """All maps (H, W[, 3]) of channels (N, H, W); more than a tile in overlapping tiles, blended by a ramp."""
     _, height, width = picture.shape
     multiple = int(network.metadata["size_multiple"])
     tile, overlap = settings.tile_px // multiple * multiple, settings.tile_px // 4

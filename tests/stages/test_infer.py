@@ -86,3 +86,24 @@ def test_a_pointwise_network_sees_no_seams_between_tiles():
 def test_a_model_for_other_channels_is_refused():
     with pytest.raises(ModelError, match="expects channels red"):
         infer.estimate(seen(noise=0.002), network(("red",)), infer.Settings())
+
+
+def test_a_crop_larger_than_two_tiles_keeps_its_texture():
+    """The network says grey 0.3 everywhere; the detail it cannot see comes from S0."""
+    found = seen(noise=1e-4)
+    twice = dataclasses.replace(
+        found,
+        **{
+            name: np.repeat(np.repeat(getattr(found, name), 2, axis), 2, axis + 1)
+            for name, axis in (
+                ("radiance", 0), ("ratio", 1), ("ratio_sigma", 0), ("dolp", 0), ("normalized_stokes", 1),
+                ("diffuse_color", 0), ("rays", 0), ("mask", 0), ("quality", 0),
+            )
+        },
+    )  # fmt: skip
+    middle = np.s_[120:240, 120:240]
+    seen_whole = infer.estimate(twice, network(), infer.Settings(tile_px=256)).diffuse[middle]
+    seen_small = infer.estimate(twice, network(), infer.Settings(tile_px=128)).diffuse[middle]
+    assert np.allclose(seen_whole, 0.3, atol=1e-5)
+    assert seen_small.std() > 0.005
+    assert seen_small.mean() == pytest.approx(0.3, rel=0.05)
