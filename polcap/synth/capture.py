@@ -7,6 +7,7 @@
     FOLDER/truth.npz               maps at the pixel centres of the first angle's shots
 """
 
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from math import sqrt
 from pathlib import Path
@@ -28,8 +29,9 @@ from polcap.synth.camera import Sensor
 from polcap.synth.render import Scene
 from polcap.synth.scenes import Kind, random_scene
 
-__all__ = ["Kind", "Scene", "Shoot", "random_scene", "transform", "write"]
+__all__ = ["MIDDLE_S", "Kind", "Scene", "Shoot", "Studio", "Take", "random_scene", "transform", "write"]
 
+MIDDLE_S = 0.02  # exposure time of the middle frame of a bracket by time
 _SENSOR_MM = 36.0  # width
 _CFA = {"RGGB": (0, 1, 1, 2), "BGGR": (2, 1, 1, 0), "GRBG": (1, 0, 2, 1), "GBRG": (1, 2, 0, 1)}
 _CONVENTIONS = (
@@ -81,20 +83,53 @@ def write(folder: Path, scene: Scene, shoot: Shoot) -> None:
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise CaptureError(f"{folder} is not an empty folder; choose another place for the capture")
-    buffer = render.gbuffer(scene, shoot.view, shoot.height, shoot.width)
-    to_camera = _to_camera(shoot)
-    reference = _light(scene, shoot, buffer, np.eye(3))
-    middle = _middle_exposure(scene, shoot, buffer, reference[0] @ to_camera.T)
+    studio = Studio(scene, shoot)
     with atomic.folder(folder) as place:
         files = []
         for shot, angle in enumerate(shoot.angles_deg):
             pose = _pose(shoot, shot)
-            radiance = _passed(scene, shoot, buffer, pose, reference if shot == 0 else None) @ to_camera.T
+            radiance = studio.radiance(pose, first=shot == 0)
             for frame in range(shoot.exposures):
                 name = f"{_folder_name(angle)}/IMG_{shot * shoot.exposures + frame + 1:04d}.DNG"
-                done = _write_frame(place / name, shoot, radiance, shot, frame, middle, buffer.mask)
+                done = studio.photograph(place / name, radiance, Take(shot, frame, _stops(shoot, frame)))
                 files.append({"file": name, "nominal_deg": angle, **pose, **done})
-        _write_truth(place, scene, shoot, buffer, reference, to_camera, files)
+        _write_truth(place, scene, shoot, studio.buffer, studio.reference, studio.to_camera, files)
+
+
+@dataclass(frozen=True)
+class Take:
+    """Which photograph of a capture; each has noise and a time stamp of its own."""
+
+    shot: int
+    frame: int  # within the bracket
+    stops: float  # exposure relative to the middle frame's, as a factor
+    again: int = 0  # how often it was taken before
+    lit: bool = True  # False: with the light off
+
+
+class Studio:
+    """A scene before the camera, lit: what `write` photographs, and the simulated rig."""
+
+    def __init__(self, scene: Scene, shoot: Shoot) -> None:
+        self.scene, self.shoot = scene, shoot
+        self.buffer = render.gbuffer(scene, shoot.view, shoot.height, shoot.width)
+        self.to_camera = _to_camera(shoot)
+        self.reference = _light(scene, shoot, self.buffer, np.eye(3))
+        self.middle = _middle_exposure(scene, shoot, self.buffer, self.reference[0] @ self.to_camera.T)
+
+    def through(self, angle_deg: float) -> Floats:
+        """What the polarizer at this angle passes to a camera that stands still, (H, W, 3) camera channels."""
+        still = {"actual_deg": angle_deg, "rot_deg": 0.0, "transform": np.eye(3).tolist()}
+        return self.radiance(still, first=True)
+
+    def radiance(self, pose: dict[str, Any], first: bool) -> Floats:
+        """The same for a camera moved to `pose`; the `first` shot defines where it stood."""
+        passed = _passed(self.scene, self.shoot, self.buffer, pose, self.reference if first else None)
+        return np.asarray(passed @ self.to_camera.T)
+
+    def photograph(self, path: Path, radiance: Floats, take: Take) -> dict[str, Any]:
+        """One DNG of `radiance` (H, W, 3), and what was done to it. Raises StorageError."""
+        return _write_frame(path, self.shoot, self.to_camera, radiance, take, self.middle, self.buffer.mask)
 
 
 def transform(shoot: Shoot, shift_px: tuple[float, float], rot_deg: float) -> Floats:
@@ -183,12 +218,23 @@ def _middle_exposure(scene: Scene, shoot: Shoot, buffer: GBuffer, s0: Floats) ->
     return min(0.35 / level, 0.95 / peak * shoot.step ** (shoot.exposures // 2))
 
 
+def _stops(shoot: Shoot, frame: int) -> float:
+    """Exposure of a frame of the bracket, times the middle one's."""
+    return float(shoot.step ** (frame - shoot.exposures // 2))
+
+
 def _write_frame(
-    path: Path, shoot: Shoot, radiance: Floats, shot: int, frame: int, middle: float, mask: NDArray[np.bool_]
+    path: Path,
+    shoot: Shoot,
+    to_camera: Floats,
+    radiance: Floats,
+    take: Take,
+    middle: float,
+    mask: NDArray[np.bool_],
 ) -> dict[str, Any]:
-    """One file of `radiance` (H, W, 3) in camera channels, and what was done to it."""
-    exif, light, amplification = _setting(shoot, frame, shot * shoot.exposures + frame, middle)
-    random = np.random.default_rng([shoot.seed, 1 + shot, frame])
+    exif, light, amplification = _setting(shoot, take, middle)
+    light *= take.lit
+    random = np.random.default_rng([shoot.seed, 1 + take.shot, take.frame, *(() if not take.again else (take.again,))])
     energy = float(1 + shoot.gain_jitter * random.normal())
     cfa = np.reshape(_CFA[shoot.cfa], (2, 2)).astype(np.uint8)
     mosaic = camera.mosaic(radiance, cfa) * (light * energy)
@@ -201,10 +247,10 @@ def _write_frame(
         white=shoot.sensor.white,
         exif=exif,
         color_matrix=np.reshape(shoot.color_matrix, (3, 3)),
-        as_shot_neutral=_to_camera(shoot).sum(axis=1),
+        as_shot_neutral=to_camera.sum(axis=1),
     )
     return {
-        "exposure_index": frame,
+        "exposure_index": take.frame,
         "time": exif.exposure_time,
         "fnumber": exif.f_number,
         "iso": exif.iso,
@@ -215,9 +261,9 @@ def _write_frame(
     }
 
 
-def _setting(shoot: Shoot, frame: int, number: int, middle: float) -> tuple[Exif, float, float]:
+def _setting(shoot: Shoot, take: Take, middle: float) -> tuple[Exif, float, float]:
     """What the camera writes about a frame, the light it gets and its amplification."""
-    stops = shoot.step ** (frame - shoot.exposures // 2)
+    stops, number = take.stops, take.shot * shoot.exposures + take.frame
     taken = datetime(2026, 3, 14, 12) + timedelta(seconds=4.25 * number + 20 * (number // shoot.exposures))
     exif: dict[str, Any] = {
         "make": "Polcap",
@@ -230,15 +276,15 @@ def _setting(shoot: Shoot, frame: int, number: int, middle: float) -> tuple[Exif
         "focal_length_35mm": shoot.focal_mm,
         "pixel_pitch_um": 1000 * _SENSOR_MM / shoot.width,
         "taken": taken.isoformat(timespec="milliseconds"),
-        "flash_fired": shoot.bracket != "time",
+        "flash_fired": shoot.bracket != "time" and take.lit,
     }
     light, amplification = middle * stops, 1.0
     if shoot.bracket == "time":
-        exif["exposure_time"] = 0.02 * stops
+        exif["exposure_time"] = MIDDLE_S * stops
     elif shoot.bracket == "aperture":
         exif["f_number"] = round(11.0 / sqrt(stops), 1)
     elif shoot.bracket == "iso":
-        amplification = shoot.step**frame
+        amplification = shoot.step**take.frame
         light = middle / shoot.step ** (shoot.exposures // 2)
         exif["iso"] = 100.0 * amplification
     return Exif(**exif), light, amplification
