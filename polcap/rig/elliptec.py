@@ -163,6 +163,12 @@ class Elliptec:
         return f"{round(angle_deg / 360.0 * self._pulses) & 0xFFFFFFFF:08X}"
 
 
+def recognize(line: str) -> str | None:
+    """The name of what sent this line, if it was an Elliptec telling what it is."""
+    match = _ANSWER.fullmatch(line)
+    return f"Elliptec ELL{int(match[3][:2], 16)} at address {match[1]}" if match and match[2] == "IN" else None
+
+
 def open_motor(port: str, settings: Settings, limit_s: float, log: Log) -> Elliptec:
     """Raises HardwareError where no Elliptec answers."""
     opened = Port(port, baud=BAUD, log=log, name="rotator")

@@ -91,7 +91,7 @@ class Grbl:
         else:
             self._command("$X")
             manual.ask("turn the polarizer's ring to 0°, then Enter: ", self._log)
-            self._zero = self._position()
+        self._zero = self._position()  # the switch's may be any number: -499 for a travel of 500
 
     def go(self, angle_deg: float) -> None:
         target = self._zero + angle_deg * self._per_degree
@@ -226,6 +226,13 @@ class Grbl:
             f"{self.model} on {self._port.url}: {doing} takes more than timeout = {self._limit_s:g} s; "
             "free the ring, or raise timeout in the rotator's URL"
         )
+
+
+def recognize(line: str) -> str | None:
+    """The name of what sent this line, if it was GRBL."""
+    if match := _BANNER.fullmatch(line):
+        return f"GRBL {match[1]}"
+    return "GRBL" if _STATUS.fullmatch(line) else None
 
 
 def open_motor(port: str, settings: Settings, limit_s: float, log: Log) -> Grbl:

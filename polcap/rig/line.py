@@ -103,6 +103,12 @@ class Line:
         )
 
 
+def recognize(line: str) -> str | None:
+    """The name of what sent this line, if it was such a board."""
+    match = _HELLO.fullmatch(line)
+    return match and f"polcap-rotator {match[1]}"
+
+
 def open_motor(port: str, settings: Settings, limit_s: float, log: Log) -> Line:
     """Raises HardwareError where no such board answers."""
     opened = Port(port, baud=BAUD, log=log, name="rotator")

@@ -15,14 +15,18 @@ import msgspec
 from msgspec import Meta, Struct
 
 from polcap.errors import HardwareError, PolcapError, SettingError
-from polcap.rig import manual
+from polcap.rig import elliptec, grbl, line, manual
 from polcap.rig.log import Log
-from polcap.rig.transport import Silent
+from polcap.rig.transport import Port, Silent
 
 T = TypeVar("T")
 
 MOTORS = ("elliptec", "grbl", "line", "simulated")  # a module each: Settings, BACKLASH_DEG, open_motor
 _ASKED_AGAIN = 2  # times, of a silent device
+_QUESTIONS = (  # baud, question, s, who may answer
+    (elliptec.BAUD, b"0in", 0.5, (elliptec,)),
+    (grbl.BAUD, b"\n?\n", 3.0, (grbl, line)),
+)
 _APPROACHES = 2  # a wrong position is approached once more
 
 
@@ -112,6 +116,32 @@ def open_rotator(url: str, log: Log) -> Rotator:
         )
     motor: Motor = driver.open_motor(port, settings, drive.timeout, log)
     return Driven(motor, drive, driver.BACKLASH_DEG if drive.backlash is None else drive.backlash)
+
+
+def probe(url: str) -> str | None:
+    """What answers on a serial port, within four seconds; asks for names only, and nothing moves.
+
+    Opening its port restarts many an Arduino, which then tells its name by itself.
+
+    Raises
+    ------
+    HardwareError
+        The port cannot be opened.
+    """
+    for baud, question, limit_s, drivers in _QUESTIONS:
+        port = Port(url, baud=baud, log=Log(None), name="port")
+        try:
+            port.send(question)
+            end = time.monotonic() + limit_s
+            while (left := end - time.monotonic()) > 0:
+                with suppress(Silent):
+                    said = port.read_line(left)
+                    for name in (driver.recognize(said) for driver in drivers):
+                        if name:
+                            return name
+        finally:
+            port.close()
+    return None
 
 
 class Driven:

@@ -1,0 +1,428 @@
+"""Rotators at the far end of a pseudo-terminal, as far as their protocol goes, with faults on order.
+
+    with Elliptec(fault="half-line", at=3) as device:
+        rotator = open_rotator(f"elliptec:{device.port}", Log(None))
+
+`fault` is one of the class's FAULTS, `at` the moment, `times` for how many moments in a row (`ALWAYS`: for ever).
+
+    moments are answers:    no-answer, garbage, half-line
+    moments are movements:  busy (never ends), mechanical-timeout, wrong-position (stops 5° off, and says so);
+                            halfway: unplug (the port vanishes), alarm (a limit switch), restart (power lost)
+
+Homing is a movement; the first moment is 1. What happened: `heard` lists the commands, `angle_deg` is where the ring
+truly stands, `moves` and `answers` count. `unplug()` pulls the cable now.
+
+GRBL counts steps and cannot feel the ring: its wrong-position is one it reports, as after a stray jog.
+"""
+
+import os
+import re
+import select
+import threading
+import time
+import tty
+from collections.abc import Callable
+from typing import ClassVar, Self
+
+ALWAYS = 1 << 30
+SPOKEN = ("no-answer", "garbage", "half-line")
+_OFF_DEG = 5.0  # of a wrong position
+
+
+class Device:
+    """A port, a thread that answers on it, a ring that takes time to turn."""
+
+    FAULTS: ClassVar[tuple[str, ...]] = ()
+    END = b"\r\n"
+
+    def __init__(
+        self, *, fault: str = "", at: int = 1, times: int = 1, speed_deg_s: float = 2000.0, start_deg: float = 37.0
+    ) -> None:
+        assert not fault or fault in self.FAULTS, f"{fault} is none of {self.FAULTS}"
+        self.fault, self.at, self.times = fault, at, times
+        self.speed_deg_s = speed_deg_s
+        self.angle_deg = start_deg
+        self.heard: list[str] = []
+        self.moves = 0
+        self.answers = 0
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        self.port = os.ttyname(self._slave)
+        self._target_deg = start_deg
+        self._struck = ""  # the fault of this movement
+        self._ends: float | None = None  # monotonic; None: the ring stands
+        self._then: Callable[[], None] = lambda: None
+        self._gone = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.unplug()
+
+    def unplug(self) -> None:
+        """Pull the cable."""
+        self._gone.set()
+        self._thread.join(5)
+
+    def receive(self, data: bytes) -> None:
+        """Bytes have come."""
+        raise NotImplementedError
+
+    def halfway(self) -> None:
+        """The planted fault of a movement strikes: mechanical-timeout, alarm, restart."""
+        raise NotImplementedError
+
+    def say(self, text: str) -> None:
+        """Answer a line, unless a fault is due."""
+        self.answers += 1
+        data = text.encode() + self.END
+        if self.fault in SPOKEN and self.at <= self.answers < self.at + self.times:
+            data = {"no-answer": b"", "garbage": b"\xff\x00\x87~\xf3" + self.END, "half-line": data[: len(text) // 2]}[
+                self.fault
+            ]
+        os.write(self._master, data)
+
+    def tick(self) -> None:
+        """Called every few milliseconds."""
+
+    @property
+    def moving(self) -> bool:
+        return self._ends is not None
+
+    def turn(self, target_deg: float, then: Callable[[], None]) -> None:
+        """Start turning; `then` when the ring stands."""
+        self.moves += 1
+        due = self.fault not in SPOKEN and self.at <= self.moves < self.at + self.times
+        self._struck = self.fault if due else ""
+        seconds = abs(target_deg - self.angle_deg) / self.speed_deg_s
+        if self._struck == "wrong-position":
+            target_deg += _OFF_DEG
+        elif self._struck:
+            target_deg, seconds = (target_deg + self.angle_deg) / 2, seconds / 2
+        self._target_deg, self._then = target_deg, then
+        self._ends = time.monotonic() + seconds
+
+    def freeze(self) -> None:
+        """Stop where the ring is about now, without `then`."""
+        if self._ends is not None:
+            left = max(0.0, self._ends - time.monotonic()) * self.speed_deg_s
+            away = self._target_deg - self.angle_deg
+            self.angle_deg = self._target_deg - (left if away > 0 else -left) if abs(away) > left else self.angle_deg
+        self._ends = None
+
+    def _run(self) -> None:
+        while not self._gone.is_set():
+            ready = select.select([self._master], [], [], 0.002 if self.moving else 0.02)[0]
+            if ready:
+                self.receive(os.read(self._master, 4096))
+            self.tick()
+            if self._ends is not None and time.monotonic() >= self._ends:
+                self._arrive()
+        os.close(self._master)
+        os.close(self._slave)
+
+    def _arrive(self) -> None:
+        self.angle_deg = self._target_deg
+        if self._struck == "busy":
+            self._ends = float("inf")
+        elif self._struck == "unplug":
+            self._ends = None
+            self._gone.set()
+        elif self._struck in ("mechanical-timeout", "alarm", "restart"):
+            self._ends = None
+            self.halfway()
+        else:
+            self._ends = None
+            self._then()
+
+
+class Elliptec(Device):
+    """ELL14: 9600 8N1, `0in gs ho ma mr gp so go sv gv us st`, with or without CR LF behind a command."""
+
+    FAULTS = (*SPOKEN, "busy", "mechanical-timeout", "wrong-position", "unplug")
+    PULSES = 143360  # per revolution
+    JITTER = 3  # pulses between the position asked for and the one reached
+    LENGTH: ClassVar[dict[str, int]] = {"ho": 1, "ma": 8, "mr": 8, "so": 8, "sv": 2}  # digits of data
+    KNOWN = ("in", "gs", "gp", "go", "gv", "us", "st", *LENGTH)
+
+    def __init__(self, *, address: str = "0", kind: int = 14, travel: int = 360, **planted: object) -> None:
+        super().__init__(**planted)  # type: ignore[arg-type]
+        self.address = address
+        self.identity = f"{kind:02X}1234567820241701{travel:04X}{self.PULSES:08X}"
+        self.saved_offset = self.offset = 0  # pulses
+        self.velocity = 100
+        self._zero_deg = self.angle_deg  # until homed, it counts from where it woke
+        self._status = 0
+        self._kept = ""
+
+    def receive(self, data: bytes) -> None:
+        self._kept += data.decode("latin-1").replace("\r", "").replace("\n", "")
+        while len(self._kept) >= 3:
+            letters = self._kept[1:3]
+            need = 3 + self.LENGTH.get(letters, 0)
+            if len(self._kept) < need:
+                return
+            command, self._kept = self._kept[:need], self._kept[need:]
+            self.heard.append(command)
+            if command[0] == self.address:
+                self.obey(letters, command[3:])
+
+    def obey(self, letters: str, data: str) -> None:
+        if letters == "st":
+            self.freeze()
+            self.status(0)
+        elif letters == "gs":
+            self.status(9 if self.moving else self._status)
+            self._status = 0
+        elif self.moving:
+            self.status(9)
+        elif letters == "in":
+            self.reply("IN" + self.identity)
+        elif letters == "gp":
+            self.reply(f"PO{self.number(self.pulses)}")
+        elif letters == "go":
+            self.reply(f"HO{self.number(self.offset)}")
+        elif letters == "gv":
+            self.reply(f"GV{self.velocity:02X}")
+        elif letters == "us":
+            self.saved_offset = self.offset
+            self.status(0)
+        elif letters == "so":
+            self.offset = self.signed(data)
+            self.status(0)
+        elif letters == "sv":
+            self.velocity = int(data, 16)
+            self.status(0)
+        elif letters == "ho":
+            home_deg = self.offset / self.PULSES * 360
+            self.turn(home_deg, lambda: self.home(home_deg))
+        elif letters in ("ma", "mr"):
+            pulses = self.signed(data) + self.JITTER + (self.pulses if letters == "mr" else 0)
+            self.turn(self._zero_deg + pulses / self.PULSES * 360, self.arrived)
+        else:
+            self.status(3)
+
+    def home(self, home_deg: float) -> None:
+        self._zero_deg = home_deg
+        self.arrived()
+
+    def arrived(self) -> None:
+        self.reply(f"PO{self.number(self.pulses)}")
+
+    def halfway(self) -> None:
+        self._status = 2
+        self.status(2)
+
+    @property
+    def pulses(self) -> int:
+        return round((self.angle_deg - self._zero_deg) / 360 * self.PULSES)
+
+    def status(self, code: int) -> None:
+        self.reply(f"GS{code:02X}")
+
+    def reply(self, text: str) -> None:
+        self.say(self.address + text)
+
+    @staticmethod
+    def number(pulses: int) -> str:
+        return f"{pulses & 0xFFFFFFFF:08X}"
+
+    @staticmethod
+    def signed(data: str) -> int:
+        value = int(data, 16)
+        return value - (1 << 32) if value >> 31 else value
+
+
+class Grbl(Device):
+    """GRBL 1.1: one axis, X, in units of which `$100` states the steps; `homing` wires a switch."""
+
+    FAULTS = (*SPOKEN, "busy", "wrong-position", "unplug", "alarm", "restart")
+    BANNER = "Grbl 1.1h ['$' for help]"
+    HOMED_AT = -499.0  # units: travel 500 to the negative side, pull-off 1
+
+    def __init__(self, *, homing: bool = True, steps: float = 10.0, degrees: float = 1.0, **planted: object) -> None:
+        """`degrees` per unit: where the unit is not a degree."""
+        super().__init__(**planted)  # type: ignore[arg-type]
+        self.settings = {10: 1.0, 22: float(homing), 100: steps, 110: self.speed_deg_s * 60 / degrees, 130: 500.0}
+        self.degrees = degrees
+        self.state = "Alarm" if homing else "Idle"
+        self._critical = False  # a limit switch was hit: only reset helps
+        self._zero_deg = self.angle_deg  # machine zero
+        self._kept = b""
+        self._lines: list[str] = []
+        self._planned: list[float] = []  # ring degrees
+        self._waiting = False  # a line whose ok comes when the ring stands
+
+    def receive(self, data: bytes) -> None:
+        for byte in data:
+            character = bytes([byte])
+            if character == b"\x18":
+                self.heard.append("reset")
+                self.reset()
+            elif character == b"?":
+                self.heard.append("?")
+                if self.state != "Home":
+                    self.report()
+            elif character == b"!":
+                self.heard.append("!")
+                self.freeze()
+                self._planned = []
+                self.state = "Hold" if self.state in ("Run", "Idle") else self.state
+            elif character in b"\r\n":
+                line, self._kept = self._kept.decode("ascii", "replace"), b""
+                self.heard.extend([line] if line else [])
+                self._lines.append(line)
+            else:
+                self._kept += character
+
+    def tick(self) -> None:
+        """Obey lines in order, while none waits for the ring."""
+        while self._lines and not self._waiting and self.state != "Hold":
+            self.obey(self._lines.pop(0))
+
+    def obey(self, line: str) -> None:
+        text = line.replace(" ", "").upper()
+        axis = re.search(r"X(-?\d+\.?\d*)", text)
+        if self._critical or self.state == "Sleep":
+            return
+        if text == "":
+            self.say("ok")
+        elif text == "$$":
+            for number, value in self.settings.items():
+                self.say(f"${number}={value:.3f}")
+            self.say("ok")
+        elif text == "$X":
+            self.state = "Idle"
+            self.say("[MSG:Caution: Unlocked]")
+            self.say("ok")
+        elif text == "$SLP":
+            self.state = "Sleep"
+            self.say("ok")
+            self.say("[MSG:Sleeping]")
+        elif text == "$H" and not self.settings[22]:
+            self.say("error:5")
+        elif text == "$H":
+            self.state, self._waiting = "Home", True
+            self.turn(0.0, self.homed)
+        elif text.startswith("$"):
+            self.say("error:3")
+        elif self.state == "Alarm":
+            self.say("error:9")
+        elif text.startswith("G4"):
+            self._waiting = self.moving
+            if not self.moving:
+                self.say("ok")
+        elif "G0" in text and "G53" in text and axis:
+            self.say("ok")
+            self._planned.append(self._zero_deg + float(axis[1]) * self.degrees)
+            if not self.moving:
+                self.arrived()
+        else:
+            self.say("error:20")
+
+    def homed(self) -> None:
+        self._zero_deg = self.angle_deg - self.HOMED_AT * self.degrees
+        self.arrived()
+
+    def arrived(self) -> None:
+        self.state = "Run" if self._planned else "Idle"
+        if self._planned:
+            self.turn(self._planned.pop(0), self.arrived)
+        elif self._waiting:
+            self._waiting = False
+            self.say("ok")
+
+    def halfway(self) -> None:
+        if self._struck == "alarm":
+            self.state, self._critical, self._waiting = "Alarm", True, False
+            self.say("ALARM:1")
+            self.say("[MSG:Reset to continue]")
+        else:  # restart
+            self._zero_deg = self.angle_deg
+            self.state, self._waiting = "Alarm" if self.settings[22] else "Idle", False
+            self._lines, self._planned = [], []
+            self.say(self.BANNER)
+
+    def reset(self) -> None:
+        lost = self.state in ("Run", "Home")
+        self.freeze()
+        self._kept, self._lines, self._planned, self._waiting, self._critical = b"", [], [], False, False
+        if lost:
+            self.say("ALARM:3")
+        self.state = "Alarm" if lost or self.state in ("Alarm", "Sleep") else "Idle"
+        self.say(f"\r\n{self.BANNER}")
+        if self.state == "Alarm":
+            self.say("[MSG:'$H'|'$X' to unlock]")
+
+    def report(self) -> None:
+        position = (self.angle_deg - self._zero_deg) / self.degrees
+        state = "Hold:0" if self.state == "Hold" else self.state
+        self.say(f"<{state}|MPos:{position:.3f},0.000,0.000|FS:0,0>")
+
+
+class Line(Device):
+    """A board with the sketch of `examples/rotator_firmware`; steps of 0.09°."""
+
+    FAULTS = (*SPOKEN, "busy", "mechanical-timeout", "wrong-position", "unplug", "restart")
+    END = b"\n"
+    STEP = 0.09  # degrees
+    HELLO = "polcap-rotator 1 simulated 60"
+
+    def __init__(self, *, switch: bool = True, **planted: object) -> None:
+        super().__init__(**planted)  # type: ignore[arg-type]
+        self.switch = switch
+        self.homed = False
+        self.released = True
+        self._zero_deg = self.angle_deg
+        self._kept = ""
+        self._beat = 0.0
+
+    def receive(self, data: bytes) -> None:
+        *lines, self._kept = (self._kept + data.decode("latin-1")).split("\n")
+        for line in lines:
+            self.heard.append(line.strip())
+            self.obey(line.strip())
+
+    def obey(self, line: str) -> None:
+        word, _, number = line.partition(" ")
+        if word == "?":
+            self.say(self.HELLO)
+        elif word == "stop":
+            self.freeze()
+            self.homed, self.released = False, True
+            self.position()
+        elif word == "home" and not self.switch:
+            self.say("error there is no switch; use home=ask")
+        elif word == "home":
+            self.released = False
+            self.turn(0.0, self.zero)
+        elif word == "zero":
+            self.zero()
+        elif word in ("go", "where") and not self.homed:
+            self.say("error home first")
+        elif word == "where":
+            self.position()
+        elif word == "go" and re.fullmatch(r"-?\d+(\.\d+)?", number):
+            self.released = False
+            self.turn(self._zero_deg + round(float(number) / self.STEP) * self.STEP, self.position)
+        else:
+            self.say("error unknown command")
+
+    def zero(self) -> None:
+        self._zero_deg, self.homed = self.angle_deg, True
+        self.position()
+
+    def position(self) -> None:
+        self.say(f"ok {self.angle_deg - self._zero_deg:.3f}")
+
+    def halfway(self) -> None:
+        self.homed, self.released = False, True
+        self.say("error the motor stalled; free the ring" if self._struck == "mechanical-timeout" else self.HELLO)
+
+    def tick(self) -> None:
+        if self.moving and time.monotonic() - self._beat > 0.2:
+            self._beat = time.monotonic()
+            os.write(self._master, f"busy {self.angle_deg - self._zero_deg:.3f}\n".encode())
