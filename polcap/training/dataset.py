@@ -31,6 +31,7 @@ class Batch:
     diffuse: Tensor  # (B, 3, H, W)
     specular: Tensor  # (B, 3, H, W)
     roughness: Tensor  # (B, 1, H, W)
+    highlight: Tensor  # (B, 1, H, W) share of S0 that the surface reflects
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Photo:
     given: Tensor  # (B, H, W) bool, the mask
     rays: Tensor  # (B, H, W, 3)
     mask: Tensor  # (B, H, W) bool, the object
-    truth: dict[str, Tensor]  # (B, H, W, ·): normal (ray frame), depth, diffuse, specular, roughness
+    truth: dict[str, Tensor]  # (B, H, W, ·): normal (ray frame), depth, diffuse, specular, roughness, highlight
 
 
 @dataclass(frozen=True)
@@ -120,10 +121,12 @@ class Simulator:
         to_light = light.position[owner] - place
         squared = (to_light * to_light).sum(dim=1)
         to_light = frames.to_ray_frame(to_light / squared.sqrt()[:, None], v)
-        stokes = shade.stokes(
-            normal, surface.diffuse, surface.specular, surface.roughness, surface.ior, to_light,
-            light.strength[owner] / squared,
-        )  # fmt: skip
+        specular, irradiance = surface.specular, light.strength[owner] / squared
+        stokes, body = (
+            shade.stokes(normal, surface.diffuse, part, surface.roughness, surface.ior, to_light, irradiance)
+            for part in (specular, torch.zeros_like(specular))
+        )
+        highlight = 1 - (body[0].sum(dim=1) + 1e-4) / (stokes[0].sum(dim=1) + 1e-4)
 
         def image(flat: Tensor) -> Tensor:
             out = flat.new_zeros(count * height * width, flat.shape[1])
@@ -131,7 +134,8 @@ class Simulator:
 
         truth = {
             "normal": image(normal), "depth": view.depth[..., None], "diffuse": image(surface.diffuse),
-            "specular": image(surface.specular), "roughness": image(surface.roughness[:, None]),
+            "specular": image(specular), "roughness": image(surface.roughness[:, None]),
+            "highlight": image(highlight[:, None]),
         }  # fmt: skip
         scene = torch.stack([image(part) for part in stokes])
         given = view.mask if jitter is None else _redrawn(view.mask, jitter)

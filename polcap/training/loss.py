@@ -14,7 +14,8 @@ from polcap.stages.cues import NOMINAL_IOR
 from polcap.training.dataset import Batch
 
 WEIGHTS = {
-    "normal": 2.0, "depth": 1.0, "diffuse": 1.0, "specular": 6.0, "roughness": 1.5, "sigma": 0.05, "render": 0.3,
+    "normal": 2.0, "depth": 1.0, "diffuse": 1.0, "specular": 40.0, "roughness": 4.0, "highlight": 2.0,
+    "sigma": 0.05, "render": 0.3,
 }  # fmt: skip
 
 
@@ -32,9 +33,11 @@ def total(maps: dict[str, Tensor], truth: Batch, random: torch.Generator | None)
     parts = {
         "normal": mean(1 - cosine) + 0.25 * mean((maps["normal"] - truth.normal).abs()),
         "depth": mean((_centred(maps["depth"], inside) - _centred(truth.depth, inside)).abs()),
-        "diffuse": mean((maps["diffuse"] - truth.diffuse).abs()),
-        "specular": mean((maps["specular"] - truth.specular).abs()),
-        "roughness": mean((maps["roughness"] - truth.roughness).abs()),
+        "diffuse": mean((maps["diffuse"] - truth.diffuse).abs() + 2 * (maps["diffuse"] - truth.diffuse) ** 2),
+        # squares: of what a picture leaves open the mean is wanted; the median of F0 ignores its long tail
+        "specular": mean((maps["specular"] - truth.specular) ** 2),
+        "roughness": mean((maps["roughness"] - truth.roughness) ** 2),
+        "highlight": mean((maps["highlight"] - truth.highlight) ** 2),
         "sigma": mean(torch.log(maps["sigma"]) + angle.detach() / maps["sigma"]),  # least where sigma = E[angle]
     }
     parts["render"] = _rendered(maps, truth, random)

@@ -3,7 +3,9 @@
 One encoder, three decoder branches (normal + depth + error; diffuse; specular + roughness), each with
 residual blocks and a convolution of its own on every skip, as the paper. No normalization layers: the
 absolute level of radiance and DoLP is information. At the bottom every place sees every other (attention
-over the object's cells and their mean), so that a highlight here can tell the roughness there.
+over the object's cells and their mean). Gloss comes last: it is shown the other branches' normal and
+diffuse color and how much brighter the picture is than they explain, and shares what it finds among all
+places that look alike, so that a highlight here tells the roughness there.
 
 References
 ----------
@@ -21,6 +23,7 @@ from polcap.stages.cues import CHANNELS
 
 SIZE_MULTIPLE = 32
 OUTPUTS = ("normal", "depth", "diffuse", "specular", "roughness", "sigma")
+_SHARED = (2, 1)  # decoder levels of 1/8 and 1/4 of the resolution
 _MASK = CHANNELS.index("mask")
 _COLOR = slice(CHANNELS.index("log_r"), CHANNELS.index("log_b") + 1)
 
@@ -32,7 +35,7 @@ class Shape:
     encoder: tuple[int, ...] = (32, 64, 128, 192, 256)
     geometry: tuple[int, ...] = (32, 64, 96, 128)  # decoder widths, from half resolution down
     color: tuple[int, ...] = (32, 32, 64, 96)
-    gloss: tuple[int, ...] = (32, 32, 64, 96)
+    gloss: tuple[int, ...] = (32, 48, 64, 96)
     blocks: tuple[int, ...] = (1, 2, 2, 2, 1)  # residual blocks per encoder level
     skip_blocks: int = 1
 
@@ -46,7 +49,8 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
 
     normal: unit, in the frame of each pixel's ray. depth: growing away from the camera, mean about 0, in
     units of `gbuffers.depth_unit`. diffuse, specular: ρ_d and F0, linear. roughness: perceptual.
-    sigma: expected angle between this normal and the true one, degrees.
+    sigma: expected angle between this normal and the true one, degrees. highlight: share of S0 that the
+    surface reflects; it is learned for what it teaches the rest and is not exported.
     """
 
     def __init__(self, shape: Shape = SMALL) -> None:
@@ -59,22 +63,28 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
         self.context = Context(widths[-1])
         self.geometry = Branch(widths, shape.geometry, shape.skip_blocks, 5)
         self.color = Branch(widths, shape.color, shape.skip_blocks, 3)
-        self.gloss = Branch(widths, shape.gloss, shape.skip_blocks, 4)
+        self.gloss = Branch(widths, shape.gloss, shape.skip_blocks, 5, hints=9)
 
     def forward(self, x: Tensor) -> dict[str, Tensor]:
         features = [self.levels[0](self.stem(F.pixel_unshuffle(x, 2)))]
         for down, level in zip(self.down, list(self.levels)[1:]):
             features.append(level(down(features[-1])))
         features[-1] = self.context(features[-1], F.avg_pool2d(x[:, _MASK : _MASK + 1], SIZE_MULTIPLE))
-        shape, color, gloss = (branch(features, x).float() for branch in (self.geometry, self.color, self.gloss))
+        shape, color = (branch(features, x).float() for branch in (self.geometry, self.color))
         level = x[:, _COLOR].float()
+        normal = F.normalize(shape[:, :3] + shape.new_tensor([0.0, 0.0, 0.5]).view(1, 3, 1, 1), dim=1, eps=1e-6)
+        diffuse = torch.sigmoid(level + color + 0.7)
+        body = torch.log(0.9 * diffuse * normal[:, 2:].clamp(min=0) + 0.02)  # what the diffuse light would be
+        hints = torch.cat([normal, diffuse, level - body], dim=1).detach() * x[:, _MASK : _MASK + 1]
+        gloss = self.gloss(features, x, hints).float()
         return {
-            "normal": F.normalize(shape[:, :3] + shape.new_tensor([0.0, 0.0, 0.5]).view(1, 3, 1, 1), dim=1, eps=1e-6),
+            "normal": normal,
             "depth": shape[:, 3:4],
-            "diffuse": torch.sigmoid(level + color + 0.7),
+            "diffuse": diffuse,
             "specular": 0.4 * torch.sigmoid(gloss[:, :3] - 1.7),
             "roughness": torch.sigmoid(gloss[:, 3:4]),
             "sigma": 60 * torch.sigmoid(shape[:, 4:5] - 1.5),
+            "highlight": torch.sigmoid(gloss[:, 4:5] - 1.0),
         }
 
 
@@ -119,10 +129,39 @@ class Context(nn.Module):  # type: ignore[misc]  # torch comes without types her
         return x + self.tell(torch.cat([seen, mean[:, :, None, None].expand_as(x).to(seen.dtype)], dim=1))
 
 
-class Branch(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """One decoder: from the coarsest level up to full resolution."""
+class Share(nn.Module):  # type: ignore[misc]  # torch comes without types here
+    """Places sort themselves softly into groups, and each is told the mean of its groups: cost linear in area.
 
-    def __init__(self, encoder: tuple[int, ...], widths: tuple[int, ...], blocks: int, outputs: int) -> None:
+    References
+    ----------
+    Shen et al., Efficient attention: attention with linear complexities, WACV 2021.
+    """
+
+    def __init__(self, width: int, heads: int = 4, groups: int = 16) -> None:
+        super().__init__()
+        self.heads, self.groups = heads, groups
+        self.ask = nn.Conv2d(width, heads * groups * 2 + width, 1)
+        self.tell = nn.Conv2d(width, width, 1)
+        nn.init.zeros_(self.tell.weight)
+
+    def forward(self, x: Tensor, inside: Tensor) -> Tensor:
+        batch, width, height, across = x.shape
+        sorts = self.heads * self.groups
+        member, weight, value = self.ask(F.relu(x)).split([sorts, sorts, width], dim=1)
+        group = (batch, self.heads, self.groups, -1)
+        member = torch.softmax(member.float().reshape(group), dim=2)
+        weight = torch.softmax(weight.float().reshape(group) + torch.log(inside.flatten(2)[:, :, None] + 1e-4), dim=3)
+        value = value.float().reshape(batch, self.heads, width // self.heads, -1)
+        means = value @ weight.transpose(2, 3)  # (B, heads, width/heads, groups)
+        return x + self.tell((means @ member).reshape(batch, width, height, across).to(x.dtype))
+
+
+class Branch(nn.Module):  # type: ignore[misc]  # torch comes without types here
+    """One decoder: from the coarsest level up to full resolution; `hints` more channels are seen at every level."""
+
+    def __init__(
+        self, encoder: tuple[int, ...], widths: tuple[int, ...], blocks: int, outputs: int, hints: int = 0
+    ) -> None:
         super().__init__()
         coarse = (*widths[1:], encoder[-1])  # what each level receives from below
         self.up = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in zip(coarse, widths))
@@ -130,18 +169,31 @@ class Branch(nn.Module):  # type: ignore[misc]  # torch comes without types here
         self.block = nn.ModuleList(_residuals(w, blocks) for w in widths)
         self.skip_block = nn.ModuleList(_residuals(w, blocks) for w in widths)
         self.fine = nn.Conv2d(widths[0], 64, 3, padding=1)  # 16 channels at full resolution
-        self.raw = nn.Conv2d(len(CHANNELS), 16, 3, padding=1)
+        self.raw = nn.Conv2d(len(CHANNELS) + hints, 16, 3, padding=1)
         self.mix = nn.Conv2d(16, 16, 3, padding=1)
         self.out = nn.Conv2d(16, outputs, 3, padding=1)  # a smoothing kernel after the shuffle: no grid
         nn.init.normal_(self.out.weight, std=1e-2)
         nn.init.zeros_(self.out.bias)
+        self.hint = nn.ModuleList()
+        self.share = nn.ModuleDict()
+        if hints:
+            self.hint.append(nn.Conv2d(4 * (hints + len(CHANNELS)), widths[0], 3, padding=1))
+            self.hint.extend(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(widths))
+            self.share = nn.ModuleDict({str(level): Share(widths[level]) for level in _SHARED})
 
-    def forward(self, features: list[Tensor], x: Tensor) -> Tensor:
+    def forward(self, features: list[Tensor], x: Tensor, hints: Tensor | None = None) -> Tensor:
+        seen = x if hints is None else torch.cat([x, hints.to(x.dtype)], dim=1)
+        hinted: list[Tensor] = []
+        for hint in self.hint:
+            hinted.append(hint(F.relu(hinted[-1]) if hinted else F.pixel_unshuffle(seen, 2)))
         y = features[-1]
         for level in reversed(range(len(self.up))):
-            skip = self.skip_block[level](self.skip[level](features[level]))
+            skip = self.skip[level](features[level])
+            skip = self.skip_block[level](skip + hinted[level] if hinted else skip)
             lifted = F.interpolate(self.up[level](y), scale_factor=2.0, mode="bilinear", align_corners=False)
             y = self.block[level](skip + lifted)
-        y = F.pixel_shuffle(self.fine(F.relu(y)), 2) + self.raw(x)
+            if str(level) in self.share:
+                y = self.share[str(level)](y, F.avg_pool2d(x[:, _MASK : _MASK + 1], 2 << level))
+        y = F.pixel_shuffle(self.fine(F.relu(y)), 2) + self.raw(seen)
         y = y + self.mix(F.relu(y))
         return self.out(F.relu(y))

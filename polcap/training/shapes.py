@@ -1,4 +1,4 @@
-"""Random closed meshes: displaced spheres, superquadrics, turned profiles, tubes, and unions of them."""
+"""Random closed meshes: displaced spheres, superquadrics, turned profiles, vessels, tubes, and unions of them."""
 
 from collections.abc import Callable
 
@@ -86,6 +86,26 @@ def _turned(rng: np.random.Generator) -> tuple[Floats, NDArray[np.int32]]:
     return 0.45 * np.stack(xyz, axis=1), faces
 
 
+def _vessel(rng: np.random.Generator) -> tuple[Floats, NDArray[np.int32]]:
+    """Plate, bowl, cup or vase: an open turned profile with an inside, a wall and a rim."""
+    unit, faces = _sphere(_RINGS, _SECTORS)
+    outside = _RINGS // 2
+    rise = np.linspace(0, 1, outside)  # from the foot up
+    mouth, waist = rng.uniform(0.25, 0.6), rng.normal() * 0.12
+    radius = mouth * rise ** rng.uniform(0.15, 0.9) + waist * np.sin(np.pi * rise) * rise
+    radius = np.clip(radius + rng.normal() * 0.03 * np.sin(rng.uniform(2, 9) * rise), 0.02, 0.7)
+    radius[0] = 0.0
+    wall, tall = rng.uniform(0.01, 0.06), np.exp(rng.uniform(np.log(0.12), np.log(1.3)))
+    inner = np.clip(radius[::-1] - wall, 0.0, None)
+    height = np.concatenate([rise * tall, np.maximum(rise[::-1] * tall, wall)])
+    ring = np.repeat(np.concatenate([radius, inner]), _SECTORS)
+    around = np.arctan2(unit[:, 1], unit[:, 0])
+    lobes = 1 + (rng.random() < 0.3) * rng.uniform(0, 0.15) * np.cos(rng.integers(3, 13) * around)
+    squash = rng.uniform(0.7, 1.0)
+    xyz = [ring * lobes * np.cos(around), squash * ring * lobes * np.sin(around), np.repeat(height, _SECTORS)]
+    return np.stack(xyz, axis=1) - [0, 0, tall / 2], faces[:, ::-1]
+
+
 def _tube(rng: np.random.Generator) -> tuple[Floats, NDArray[np.int32]]:
     """A closed random curve with thickness: handles, knots, rings."""
     t = np.linspace(0, 2 * np.pi, 160, endpoint=False)
@@ -111,7 +131,7 @@ def _tube(rng: np.random.Generator) -> tuple[Floats, NDArray[np.int32]]:
 
 
 _PARTS: list[Callable[[np.random.Generator], tuple[Floats, NDArray[np.int32]]]] = [
-    _displaced, _displaced, _superquadric, _superquadric, _turned, _tube,
+    _displaced, _displaced, _superquadric, _superquadric, _turned, _vessel, _tube,
 ]  # fmt: skip
 
 

@@ -15,7 +15,7 @@ def batch(simulator: Simulator) -> Batch:
 
 
 def maps_of(batch: Batch, sigma: float = 10.0) -> dict[str, Tensor]:
-    names = ("normal", "depth", "diffuse", "specular", "roughness")
+    names = ("normal", "depth", "diffuse", "specular", "roughness", "highlight")
     return {n: getattr(batch, n).clone() for n in names} | {"sigma": torch.full_like(batch.depth, sigma)}
 
 
@@ -25,7 +25,7 @@ def parts(maps: dict[str, Tensor], batch: Batch) -> dict[str, float]:
 
 def test_truth_costs_nothing(batch: Batch) -> None:
     cost = parts(maps_of(batch), batch)
-    for name in ("normal", "depth", "diffuse", "specular", "roughness", "render", "degrees"):
+    for name in ("normal", "depth", "diffuse", "specular", "roughness", "highlight", "render", "degrees"):
         assert cost[name] == pytest.approx(0, abs=1e-4 if name != "degrees" else 0.05), name
 
 

@@ -19,7 +19,7 @@ def inputs(height: int, width: int) -> torch.Tensor:
 @pytest.mark.parametrize("size", [(32, 32), (64, 160), (96, 32)])
 def test_any_multiple_of_32_gives_every_map_its_range(size: tuple[int, int]) -> None:
     maps = model.Network(TINY)(inputs(*size))
-    assert set(maps) == set(model.OUTPUTS)
+    assert set(maps) == {*model.OUTPUTS, "highlight"}
     for name, count in {"normal": 3, "depth": 1, "diffuse": 3, "specular": 3, "roughness": 1, "sigma": 1}.items():
         assert maps[name].shape == (2, count, *size) and maps[name].isfinite().all()
     torch.testing.assert_close(maps["normal"].norm(dim=1), torch.ones(2, *size))
@@ -50,3 +50,27 @@ def test_a_far_pixel_reaches_the_whole_object() -> None:
     changed[:, :, :16, :16] += 1
     difference = (network(x)["roughness"] - network(changed)["roughness"]).abs()
     assert difference[:, :, -16:, -16:].max() > 0
+
+
+def test_groups_tell_alike_places_the_same() -> None:
+    """What `Share` adds depends on a place's own features and the whole picture's, not on where it lies."""
+    torch.manual_seed(3)
+    share = model.Share(16, heads=2, groups=4)
+    torch.nn.init.normal_(share.tell.weight)
+    x, inside = torch.randn(1, 16, 6, 6), torch.ones(1, 1, 6, 6)
+    order = torch.randperm(36)
+    mixed = x.flatten(2)[:, :, order].reshape(x.shape)
+    expected = share(x, inside).flatten(2)[:, :, order].reshape(x.shape)
+    torch.testing.assert_close(share(mixed, inside), expected, rtol=1e-4, atol=1e-5)
+    assert (share(x, inside) - x).abs().max() > 1e-3
+
+
+def test_groups_do_not_see_what_is_outside_the_mask() -> None:
+    torch.manual_seed(4)
+    share = model.Share(16, heads=2, groups=4)
+    torch.nn.init.normal_(share.tell.weight)
+    x, inside = torch.randn(1, 16, 8, 8), torch.ones(1, 1, 8, 8)
+    inside[..., 4:] = 0
+    changed = x.clone()
+    changed[..., 4:] += 1
+    assert (share(x, inside) - share(changed, inside))[..., :4].abs().max() < 1e-2

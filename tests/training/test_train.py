@@ -65,10 +65,27 @@ def test_rate_falls_to_nothing_over_the_last_part_of_the_budget(data: Path) -> N
     batch = Batch(
         torch.rand(1, 14, 32, 32), torch.ones(1, 32, 32, dtype=torch.bool),
         torch.nn.functional.normalize(torch.ones(1, 3, 32, 32), dim=1), torch.rand(size), *torch.rand(2, 1, 3, 32, 32),
-        torch.rand(size),
+        *torch.rand(2, *size),
     )  # fmt: skip
     rates = []
     for progress in (0.1, 0.45, 0.725, 1.0):
         run.advance([batch], progress)
-        rates.append(run.optimizer.param_groups[0]["lr"])
+        rates.append(run.optimizers[0].param_groups[0]["lr"])
     assert rates == pytest.approx([1e-3, 1e-3, 5e-4, 0.0])
+
+
+@pytest.mark.parametrize("shape", [(16, 144), (96, 32), (64, 128)])
+def test_orthogonal_keeps_directions_and_levels_strengths(shape: tuple[int, int]) -> None:
+    """Against LAPACK's singular value decomposition."""
+    matrix = torch.randn(shape, generator=torch.Generator().manual_seed(3))
+    left, strength, right = torch.linalg.svd(train.orthogonal(matrix), full_matrices=False)
+    assert strength.min() > 0.5 and strength.max() < 1.35
+    u, _, v = torch.linalg.svd(matrix, full_matrices=False)
+    nearest = u @ v
+    assert float(((left * strength) @ right * nearest).sum() / nearest.norm() ** 2) > 0.8
+
+
+def test_every_weight_is_in_one_optimizer() -> None:
+    network = train.model.Network(TINY)
+    held = [w for o in train._optimizers(network, 1e-3) for g in o.param_groups for w in g["params"]]
+    assert sorted(map(id, held)) == sorted(map(id, network.parameters()))
