@@ -1,0 +1,149 @@
+"""The synthetic camera's renderer against Mitsuba 3 `pplastic`: same shapes, same flash, off axis, direct light only.
+
+Both are Baek's model, and nothing is fitted: index, k_s, α and the light's intensity are the same numbers.
+Mitsuba's S1, S2 stand on the horizontal across each ray (view × up); ours on the projected x axis.
+"""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from polcap.images import Floats, View
+from polcap.optics import frames
+from polcap.synth import render, shapes, trace
+from polcap.synth.materials import Coat, Material
+from polcap.synth.render import Scene
+
+SIDE, SAMPLES, FINE, FOV = 96, 256, 6, 36.0
+ALBEDO, ALPHA, IOR, STRENGTH = 0.6, 0.16, 1.55, 0.8
+VIEW = View(SIDE / 2 / np.tan(np.radians(FOV / 2)), ((SIDE - 1) / 2,) * 2, 1)
+LIGHT = (0.04, 0.06, 0.0)
+BALL, BALL_AT = shapes.Cluster(((0, 0, 0, 0.085),)), (0.11, 0.09, -0.7)
+WAVES = ((0.07, 5.0, 1.0, 2.0, 0.3), (0.05, -2.0, 6.0, 1.0, 1.1), (0.04, 1.0, -3.0, 7.0, 2.0))
+BUMPS, BUMPS_AT = shapes.Bumps((0.09, 0.075, 0.08), WAVES), (-0.11, -0.1, -0.72)
+COAT = Coat((Material((ALBEDO,) * 3, (ALBEDO,) * 3, "plain", roughness=(ALPHA**0.5,) * 2, specular=STRENGTH, ior=IOR),))
+
+
+def scene(shape: shapes.Shape, position: trace.Vector) -> Scene:
+    return Scene(shape, COAT, position, light=LIGHT, chart=None, backdrop_albedo=0.0)
+
+
+@pytest.fixture(scope="module")
+def mi() -> Any:
+    mitsuba = pytest.importorskip("mitsuba", reason="mitsuba is not installed (extra [test])")
+    mitsuba.set_variant("llvm_ad_mono_polarized")
+    import drjit
+
+    try:
+        drjit.eval(mitsuba.Float([1.0]) + 1)
+    except RuntimeError as error:
+        pytest.skip(f"Mitsuba finds no LLVM library here: {error}")
+    return mitsuba
+
+
+def theirs(mi: Any, body: Any, reference: float) -> Floats:
+    """(3, H, W) in our frame. `reference` is the squared distance at which a white plane is to have S0 = 1."""
+    found = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "stokes", "nested": {"type": "direct"}},
+            "sensor": {
+                "type": "perspective",
+                "fov": FOV,
+                "near_clip": 0.01,
+                "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, 0], target=[0, 0, -1], up=[0, 1, 0]),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": SIDE,
+                    "height": SIDE,
+                    "rfilter": {"type": "box"},
+                    "component_format": "float32",
+                },
+                "sampler": {"type": "stratified", "sample_count": SAMPLES},
+            },
+            "light": {"type": "point", "position": list(LIGHT), "intensity": np.pi * reference},
+            "body": body,
+        }
+    )
+    image = np.array(mi.render(found))[..., -12::3]  # S0.R … S3.R stand last
+    assert np.abs(image[..., 3]).max() < 1e-3 * image[..., 0].max()  # no circular part
+    v = frames.rays(VIEW, SIDE, SIDE).astype(float)
+    e_x, e_y = frames.basis(v)
+    across = np.cross(-v, [0.0, 1.0, 0.0])
+    turn = np.arctan2((across * e_y).sum(-1), (across * e_x).sum(-1))
+    linear = (image[..., 1] + 1j * image[..., 2]) * np.exp(2j * turn)
+    return np.stack([image[..., 0], linear.real, linear.imag])
+
+
+def ours(which: Scene) -> tuple[Floats, Floats]:
+    """Every sample of every pixel's square: Stokes parameters (F², 3, H, W), and cos of the zenith, 0 beside."""
+    y, x = np.mgrid[:SIDE, :SIDE].astype(float)
+    offsets = (np.arange(FINE) + 0.5) / FINE - 0.5
+    stokes, facing = [], []
+    for dy in offsets:
+        for dx in offsets:
+            v = render.view_rays(VIEW, x + dx, y + dy)
+            stokes.append(render.stokes(which, VIEW, x + dx, y + dy)[..., 0])
+            hits = trace.trace(which.shape, which.position, which.turn, v.reshape(-1, 3))
+            cosine = np.zeros(SIDE * SIDE)
+            cosine[hits.index] = np.einsum("ni,ni->n", hits.normal, v.reshape(-1, 3)[hits.index])
+            facing.append(cosine.reshape(SIDE, SIDE))
+    return np.array(stokes), np.array(facing)
+
+
+def material(mi: Any) -> dict[str, Any]:
+    return {
+        "type": "pplastic",
+        "distribution": "ggx",
+        "alpha": ALPHA,
+        "int_ior": IOR,
+        "ext_ior": 1.0,
+        "diffuse_reflectance": ALBEDO,
+        "specular_reflectance": STRENGTH,
+    }
+
+
+def tessellated(mi: Any, shape: shapes.Bumps, at: trace.Vector, rings: int = 500) -> Any:
+    """The waved ellipsoid as triangles half a millimetre across, with its own normals at their corners."""
+    polar, around = np.meshgrid(np.linspace(0, np.pi, rings), np.linspace(0, 2 * np.pi, 2 * rings), indexing="ij")
+    unit = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], -1).reshape(-1, 3)
+    raised = sum(a * np.sin(unit @ [x, y, z] + phase) for a, x, y, z, phase in shape.waves)
+    point = unit * (1 + raised)[:, None] * shape.size
+    step = 1e-5 * np.eye(3)
+    slope = np.stack([shape.distance(point + s) - shape.distance(point - s) for s in step], -1)
+    normal = slope / np.linalg.norm(slope, axis=-1, keepdims=True)
+    i, j = np.meshgrid(np.arange(rings - 1), np.arange(2 * rings - 1), indexing="ij")
+    a, b = i * 2 * rings + j, (i + 1) * 2 * rings + j
+    faces = np.stack([a, b, b + 1, a, b + 1, a + 1], -1).reshape(-1, 3)
+    settings = mi.Properties()
+    settings["bsdf"] = mi.load_dict(material(mi))
+    mesh = mi.Mesh("bumps", len(point), len(faces), has_vertex_normals=True, props=settings)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = (point + at).astype(np.float32).ravel()
+    parameters["vertex_normals"] = normal.astype(np.float32).ravel()
+    parameters["faces"] = faces.astype(np.uint32).ravel()
+    parameters.update()
+    return mesh
+
+
+@pytest.mark.parametrize("kind", ["ball", "bumps"])
+def test_stokes_parameters_are_those_of_another_renderer(mi: Any, kind: str) -> None:
+    if kind == "ball":
+        which = scene(BALL, BALL_AT)
+        body = {"type": "sphere", "center": list(BALL_AT), "radius": 0.085, "bsdf": material(mi)}
+    else:
+        which, body = scene(BUMPS, BUMPS_AT), tessellated(mi, BUMPS, BUMPS_AT)
+    reference = float(np.sum((np.array(LIGHT) - which.position) ** 2))
+    other = theirs(mi, body, reference)
+    fine, facing = ours(which)
+    here = fine.mean(axis=0)
+    limb = np.cos(np.radians(70))
+    lit = (facing > limb).all(axis=0) & (fine[:, 0] > 0).all(axis=0)
+    assert lit.sum() > 250
+    s0 = other[0][lit] / here[0][lit] - 1
+    polarized = np.maximum(np.hypot(here[1], here[2]), 0.003 * here[0])  # S0·DoLP, which is 0 where n = v
+    linear = np.hypot(*(other - here)[1:, lit]) / polarized[lit]
+    print(f"{kind}: {lit.sum()} px; worst of S0 {np.abs(s0).max():.5f}, of S1, S2 {linear.max():.4f}")
+    assert np.abs(s0).max() < 0.01
+    assert linear.max() < 0.03
