@@ -19,6 +19,7 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 
 from polcap.errors import HardwareError
+from polcap.rig import transport
 from polcap.rig.log import Log
 from polcap.rig.transport import Port, Silent
 
@@ -40,7 +41,6 @@ STATUS = {
     0x0D: "over-current; free the ring, check the supply",
 }
 _OK, _BUSY = 0x00, 0x09
-_QUIET_S = 1.0  # without a word from a moving device: ask it
 _FULL_SPEED = 430.0  # degrees/s, nominal
 _ANSWER = re.compile(r"([0-9A-F])(IN|GS|PO|HO)([0-9A-F]+)")
 _LENGTH = {"IN": 30, "GS": 2, "PO": 8, "HO": 8}  # digits of data
@@ -103,9 +103,9 @@ class Elliptec:
         self._port.send(f"{self._address}{command}".encode())
         end = time.monotonic() + self._limit_s
         asked = False
-        while (left := end - time.monotonic()) > 0:
+        while time.monotonic() < end:
             try:
-                kind, data = self._answer(min(_QUIET_S, left))
+                kind, data = self._answer()
             except Silent:
                 if asked:
                     raise
@@ -137,16 +137,16 @@ class Elliptec:
     def _ask(self, command: str, expected: str) -> str:
         """The data of the answer. Raises Silent, HardwareError."""
         self._port.send(f"{self._address}{command}".encode())
-        kind, data = self._answer(self._port.timeout_s)
+        kind, data = self._answer()
         if kind == "GS" != expected:
             raise self._fault(int(data, 16))
         if kind != expected:
             raise self._port.strange(kind + data)
         return data
 
-    def _answer(self, timeout_s: float) -> tuple[str, str]:
+    def _answer(self) -> tuple[str, str]:
         """Kind and data of this device's next answer; other addresses of the bus are passed over."""
-        end = time.monotonic() + timeout_s
+        end = time.monotonic() + transport.ANSWER_S
         while True:
             line = self._port.read_line(max(0.0, end - time.monotonic()))
             match = _ANSWER.fullmatch(line)

@@ -11,12 +11,13 @@ gnea/grbl, doc/markdown/interface.md
 import re
 import time
 from contextlib import suppress
+from math import inf
 from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
 from polcap.errors import HardwareError
-from polcap.rig import manual
+from polcap.rig import manual, transport
 from polcap.rig.log import Log
 from polcap.rig.transport import Port, Silent
 
@@ -52,7 +53,6 @@ ERROR = {
 }
 _START_S = 3.0  # a board that restarts when its port is opened
 _HOLD_S = 2.0  # to slow down in
-_QUIET_S = 1.0  # without a word while it moves: ask it
 _RESET = b"\x18"
 _BANNER = re.compile(r"Grbl(?:HAL)? (1\.1\S*) .*")
 _STATUS = re.compile(r"<(\w+)(?::\d+)?\|MPos:(-?\d+\.?\d*),(-?\d+\.?\d*),(-?\d+\.?\d*).*>")
@@ -87,7 +87,7 @@ class Grbl:
         """Reset, then seek the switch or ask a person; ends an alarm."""
         self._wake()
         if self._settings.home == "switch":
-            self._homed()
+            self._until_done("$H", silent_s=inf)  # no state while it homes
         else:
             self._command("$X")
             manual.ask("turn the polarizer's ring to 0°, then Enter: ", self._log)
@@ -96,7 +96,7 @@ class Grbl:
     def go(self, angle_deg: float) -> None:
         target = self._zero + angle_deg * self._per_degree
         self._command(f"G21G90G53G0{self._settings.axis}{target:.4f}")
-        self._finish()
+        self._until_done("G4P0.01", silent_s=1.5 * transport.ANSWER_S)  # a dwell waits for the movement
 
     def where(self) -> float:
         return (self._position() - self._zero) / self._per_degree
@@ -125,21 +125,6 @@ class Grbl:
                     return match[1]
         raise Silent(f"no GRBL 1.1 answers on {self._port.url}; check the cable, the power and the firmware")
 
-    def _homed(self) -> None:
-        """$H: no status while it runs."""
-        self._port.send(b"$H\n")
-        end = time.monotonic() + self._limit_s
-        while (left := end - time.monotonic()) > 0:
-            try:
-                line = self._port.read_line(left)
-            except Silent as error:
-                if time.monotonic() < end:
-                    raise
-                raise self._busy("homing") from error
-            if self._says_ok(line):
-                return
-        raise self._busy("homing")
-
     def _stored(self) -> dict[int, float]:
         """The settings that $$ lists."""
         stored: dict[int, float] = {}
@@ -149,83 +134,86 @@ class Grbl:
                 stored[int(number)] = float(value.split()[0])
         for key in (100 + self._axis, 110 + self._axis):
             if not stored.get(key, 0.0) > 0.0:
-                raise HardwareError(f"{self.model} on {self._port.url} states no ${key}; set it in GRBL")
+                raise Silent(f"{self.model} on {self._port.url} did not state ${key}; set it in GRBL, or try again")
         return stored
 
     def _command(self, text: str) -> list[str]:
         """Send a line, return what came before its ok. Raises Silent, HardwareError."""
         self._port.send(f"{text}\n".encode())
         said: list[str] = []
-        end = time.monotonic() + self._port.timeout_s
+        end = time.monotonic() + transport.ANSWER_S
         while True:
             line = self._port.read_line(max(0.0, end - time.monotonic()))
             if self._says_ok(line):
                 return said
             said.append(line)
 
-    def _finish(self) -> None:
-        """Wait until all movement has ended: a dwell is answered only then. Raises Silent, HardwareError."""
-        self._port.send(b"G4P0.01\n")
-        end = time.monotonic() + self._limit_s
-        asked = False
-        while (left := end - time.monotonic()) > 0:
+    def _until_done(self, text: str, silent_s: float) -> None:
+        """Send a line whose ok comes once the ring stands, and wait for it.
+
+        A board that is quiet for long is asked for its state; one that is for longer than `silent_s` is lost.
+
+        Raises
+        ------
+        Silent, HardwareError
+        """
+        self._port.send(f"{text}\n".encode())
+        heard = time.monotonic()
+        end = heard + self._limit_s
+        while time.monotonic() < end:
             try:
-                line = self._port.read_line(min(_QUIET_S, left))
+                line = self._port.read_line()
             except Silent:
-                if asked:
+                if time.monotonic() > heard + silent_s:
                     raise
                 self._port.add(b"?")
-                asked = True
                 continue
-            asked = False
+            heard = time.monotonic()
             if self._says_ok(line):
                 return
             status = _STATUS.fullmatch(line)
             if status and status[1] == "Idle":  # its ok was lost
                 return
             if status and status[1] in ("Hold", "Door", "Check", "Sleep"):
-                raise HardwareError(
-                    f"{self.model} on {self._port.url} does not move: state {status[1]}; resume or reset it"
-                )
-        raise self._busy("a movement")
+                raise self._error(f"does not move: state {status[1]}; resume or reset it")
+        raise self._error(
+            f"takes more than timeout = {self._limit_s:g} s for {text}; free the ring, or raise timeout in the "
+            "rotator's URL"
+        )
 
     def _position(self) -> float:
         state, at = self._status()
         if state == "Alarm":
-            raise HardwareError(f"{self.model} on {self._port.url} is locked by an alarm; home it")
+            raise self._error("is locked by an alarm; home it")
         return at
 
     def _status(self) -> tuple[str, float]:
         """State and machine position of the axis."""
         self._port.send(b"?")
-        end = time.monotonic() + self._port.timeout_s
+        end = time.monotonic() + transport.ANSWER_S
         while True:
             line = self._port.read_line(max(0.0, end - time.monotonic()))
             if match := _STATUS.fullmatch(line):
                 return match[1], float(match[2 + self._axis])
             if "|WPos:" in line:
-                raise HardwareError(f"{self.model} on {self._port.url} reports work positions; set $10=1")
+                raise self._error("reports work positions; set $10=1")
             self._says_ok(line)
 
     def _says_ok(self, line: str) -> bool:
         """Whether a line ends a command well; reports and messages do not. Raises Silent, HardwareError."""
-        where = f"{self.model} on {self._port.url}"
         if line == "ok":
             return True
         if match := re.fullmatch(r"(error|ALARM):(\d+)", line):
             words = (ERROR if match[1] == "error" else ALARM).get(int(match[2]), "see GRBL's list of codes")
-            raise HardwareError(f"{where}: {line}, {words}")
+            raise self._error(f"says {line}: {words}")
         if _BANNER.fullmatch(line):
-            raise HardwareError(f"{where} restarted and lost its position; check its supply, then --resume")
+            raise self._error("restarted and lost its position; check its supply, then --resume")
         if line[0] not in "<[$>":
             raise self._port.strange(line)
         return False
 
-    def _busy(self, doing: str) -> HardwareError:
-        return HardwareError(
-            f"{self.model} on {self._port.url}: {doing} takes more than timeout = {self._limit_s:g} s; "
-            "free the ring, or raise timeout in the rotator's URL"
-        )
+    def _error(self, text: str) -> HardwareError:
+        return HardwareError(f"{self.model} on {self._port.url} {text}")
 
 
 def recognize(line: str) -> str | None:

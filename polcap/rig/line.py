@@ -84,8 +84,8 @@ class Line:
         """Send, wait for the end, return the position."""
         self._port.send(f"{command}\n".encode())
         end = time.monotonic() + self._limit_s
-        while (left := end - time.monotonic()) > 0:
-            said = self._port.read_line(min(left, self._port.timeout_s))
+        while time.monotonic() < end:
+            said = self._port.read_line()
             if said.startswith("error "):
                 raise HardwareError(f"{self.model} on {self._port.url}: {said[6:]}")
             if _HELLO.fullmatch(said):

@@ -23,9 +23,10 @@ T = TypeVar("T")
 
 MOTORS = ("elliptec", "grbl", "line", "simulated")  # a module each: Settings, BACKLASH_DEG, open_motor
 _ASKED_AGAIN = 2  # times, of a silent device
-_QUESTIONS = (  # baud, question, s, who may answer
-    (elliptec.BAUD, b"0in", 0.5, (elliptec,)),
-    (grbl.BAUD, b"\n?\n", 3.0, (grbl, line)),
+_Names = tuple[Callable[[str], str | None], ...]
+_QUESTIONS: tuple[tuple[int, bytes, float, _Names], ...] = (  # baud, question, s, whose answer it may be
+    (elliptec.BAUD, b"0in", 0.5, (elliptec.recognize,)),
+    (grbl.BAUD, b"\n?\n", 3.0, (grbl.recognize, line.recognize)),
 )
 _APPROACHES = 2  # a wrong position is approached once more
 
@@ -128,7 +129,7 @@ def probe(url: str) -> str | None:
     HardwareError
         The port cannot be opened.
     """
-    for baud, question, limit_s, drivers in _QUESTIONS:
+    for baud, question, limit_s, names in _QUESTIONS:
         port = Port(url, baud=baud, log=Log(None), name="port")
         try:
             port.send(question)
@@ -136,8 +137,8 @@ def probe(url: str) -> str | None:
             while (left := end - time.monotonic()) > 0:
                 with suppress(Silent):
                     said = port.read_line(left)
-                    for name in (driver.recognize(said) for driver in drivers):
-                        if name:
+                    for recognize in names:
+                        if name := recognize(said):
                             return name
         finally:
             port.close()
@@ -222,9 +223,10 @@ def _unsigned(angle_deg: float) -> float:
 
 def _pairs(url: str, query: str) -> dict[str, str]:
     try:
-        return dict(parse_qsl(query.replace("+", "%2B"), keep_blank_values=True, strict_parsing=bool(query)))
+        pairs = parse_qsl(query.replace("+", "%2B"), keep_blank_values=True, strict_parsing=bool(query))
     except ValueError as error:
         raise SettingError(f"rotator {url!r}: {error}; write settings as ?offset=12&settle=0.5") from None
+    return {key: text.removeprefix("+") for key, text in pairs}
 
 
 def _convert(url: str, given: dict[str, str], settings: type[T]) -> T:

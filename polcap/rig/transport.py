@@ -20,6 +20,7 @@ with suppress(ImportError):  # Windows
 
     _FAILURES += (termios.error,)  # a pulled cable; neither SerialException nor OSError
 
+ANSWER_S = 1.0  # for one answer
 _SLICE_S = 0.05  # longest single read
 _LONGEST_LINE = 1024  # bytes; more without a line's end is noise
 _REFUSED = {
@@ -47,17 +48,16 @@ def ports() -> list[tuple[str, str]]:
 class Port:
     """Lines of ASCII over a port nobody else may open meanwhile."""
 
-    def __init__(self, url: str, *, baud: int, log: Log, name: str, timeout_s: float = 1.0) -> None:
+    def __init__(self, url: str, *, baud: int, log: Log, name: str) -> None:
         """Raises HardwareError where the port cannot be opened, SettingError where the URL is none."""
         self.url = url
-        self.timeout_s = timeout_s  # for one answer
         self._log = log
         self._name = name
         self._kept = b""  # received and not yet read
         self._asked = ""
         try:
             self._serial = serial.serial_for_url(
-                url, baudrate=baud, timeout=_SLICE_S, write_timeout=timeout_s, exclusive=True
+                url, baudrate=baud, timeout=_SLICE_S, write_timeout=ANSWER_S, exclusive=True
             )
         except ValueError as error:
             raise SettingError(
@@ -90,7 +90,7 @@ class Port:
         Unplugged
             The port is gone.
         """
-        limit = self.timeout_s if timeout_s is None else timeout_s
+        limit = ANSWER_S if timeout_s is None else timeout_s
         end = time.monotonic() + limit
         while True:
             line, found, rest = self._kept.partition(b"\n")

@@ -1,0 +1,149 @@
+"""What goes over the wire is the ELLx protocol: literal bytes from the manual's examples and its arithmetic."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from polcap.errors import HardwareError
+from polcap.rig import transport
+from polcap.rig.elliptec import STATUS, Elliptec, Settings, open_motor
+from polcap.rig.log import Log
+from polcap.rig.transport import Silent
+from tests.rig import devices
+
+pytestmark = pytest.mark.timeout(60)
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transport, "ANSWER_S", 0.3)
+
+
+@pytest.fixture
+def device() -> Iterator[devices.Elliptec]:
+    with devices.Elliptec() as device:
+        yield device
+
+
+def motor(device: devices.Elliptec, settings: Settings | None = None, limit_s: float = 2.0) -> Elliptec:
+    return open_motor(device.port, settings or Settings(), limit_s, Log(None))
+
+
+def test_degrees_become_pulses_in_eight_upper_case_digits(device: devices.Elliptec) -> None:
+    ell = motor(device)
+    ell.home()
+    for angle in (0.0, 45.0, 90.0, 359.999):
+        ell.go(angle)
+    # 143360 pulses a turn: 45° is 17920 = 0x4600, 90° is 35840 = 0x8C00
+    assert device.heard == ["0gs", "0in", "0ho0", "0ma00000000", "0ma00004600", "0ma00008C00", "0ma00023000"]
+    assert ell.model == "Elliptec ELL14"
+
+
+def test_pulses_per_revolution_are_the_device_s() -> None:
+    class Coarse(devices.Elliptec):
+        PULSES = 36000
+
+    with Coarse(kind=18) as device:
+        ell = motor(device)
+        ell.home()
+        ell.go(45)
+        assert device.heard[-1] == "0ma00001194"  # 4500
+        assert ell.where() == pytest.approx(45.03)  # 3 pulses beside
+        assert ell.model == "Elliptec ELL18"
+
+
+def test_below_zero_is_a_relative_move_in_two_s_complement(device: devices.Elliptec) -> None:
+    ell = motor(device)
+    ell.home()
+    ell.go(-2.0)
+    assert device.heard[-1] == "0mrFFFFFCE4"  # -796
+    assert ell.where() == pytest.approx(-2.0, abs=0.01)
+
+
+def test_only_its_own_address_is_asked_and_heard() -> None:
+    class Chatty(devices.Elliptec):
+        def reply(self, text: str) -> None:
+            self.say("3GS00")  # a neighbour on the bus
+            super().reply(text)
+
+    with Chatty(address="B") as device:
+        ell = motor(device, Settings(address="b", home="ccw"))
+        ell.home()
+        assert device.heard == ["Bgs", "Bin", "Bho1"]
+    with devices.Elliptec(address="B") as device, pytest.raises(Silent, match="answered '0gs' with nothing"):
+        motor(device)
+
+
+def test_a_linear_stage_is_refused() -> None:
+    with (
+        devices.Elliptec(kind=20, travel=60) as device,
+        pytest.raises(HardwareError, match=r"ELL20 at .* is no rotation mount"),
+    ):
+        motor(device)
+
+
+def test_a_fault_of_the_day_before_is_cleared(device: devices.Elliptec) -> None:
+    device._status = 2
+    motor(device).home()
+
+
+@pytest.mark.parametrize("status", [code for code in STATUS if code != 9])
+def test_every_status_has_its_words_and_ends_the_move(status: int) -> None:
+    class Failing(devices.Elliptec):
+        def halfway(self) -> None:
+            self.status(status)
+
+    with Failing(fault="mechanical-timeout", at=2) as device:
+        ell = motor(device)
+        ell.home()
+        with pytest.raises(HardwareError) as raised:
+            ell.go(45)
+        assert STATUS[status] in str(raised.value)
+
+
+def test_the_protocol_s_status_numbers() -> None:
+    assert "mechanical timeout" in STATUS[0x02]
+    assert "out of range" in STATUS[0x04]
+    assert "hot" in STATUS[0x08]
+    assert STATUS[0x09] == "busy"
+    assert "over-current" in STATUS[0x0D]
+
+
+def test_busy_for_ever_ends_with_the_limit() -> None:
+    with devices.Elliptec(fault="busy", at=2) as device:
+        ell = motor(device, limit_s=1.0)
+        ell.home()
+        with pytest.raises(HardwareError, match=r"busy for more than timeout = 1 s"):
+            ell.go(45)
+        assert "0gs" in device.heard[3:]
+        ell.halt()
+        assert device.heard[-1] == "0st"
+        assert not device.moving
+
+
+def test_a_move_longer_than_one_answer_is_waited_for() -> None:
+    with devices.Elliptec(speed_deg_s=45) as device:  # a second for 45°
+        device.angle_deg = 0.0
+        ell = motor(device, limit_s=10)
+        ell.go(45)
+        assert ell.where() == pytest.approx(45, abs=0.02)
+
+
+def test_velocity_is_set_and_slows_the_plan(device: devices.Elliptec) -> None:
+    ell = motor(device, Settings(velocity=60))
+    assert device.heard[-1] == "0sv3C"
+    assert ell.speed_deg_s == pytest.approx(0.6 * motor_speed())
+
+
+def motor_speed() -> float:
+    with devices.Elliptec() as device:
+        return motor(device).speed_deg_s
+
+
+def test_zero_is_kept_in_the_device_and_written_only_when_new(device: devices.Elliptec) -> None:
+    first = motor(device, Settings(zero=45.0))
+    assert device.heard[2:] == ["0go", "0so00004600", "0us"]
+    assert device.saved_offset == 17920
+    first.close()
+    motor(device, Settings(zero=45.0))
+    assert device.heard[5:] == ["0gs", "0in", "0go"]

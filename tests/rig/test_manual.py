@@ -1,0 +1,67 @@
+"""A person turns the ring: Enter is yes, a number is the truth, nobody is an error."""
+
+import io
+import os
+import sys
+
+import pytest
+
+from polcap.errors import HardwareError, SettingError
+from polcap.rig.log import Log
+from polcap.rig.rotator import open_rotator
+
+
+def typed(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setattr(sys, "stdin", Terminal(text))
+
+
+@pytest.mark.parametrize(
+    ("text", "angle"),
+    [
+        ("\n", 45),
+        ("44.5\n", 44.5),
+        (" 44,5° \n", 44.5),
+        ("-10\n", 350),
+        ("405\n", 45),
+        ("what?\nnan\n46\n", 46),
+        ("oops\n\n", 45),
+    ],
+)
+def test_enter_or_the_angle_it_stands_at(monkeypatch: pytest.MonkeyPatch, text: str, angle: float) -> None:
+    typed(monkeypatch, text)
+    assert open_rotator("manual", Log(None)).move(45) == angle
+
+
+def test_the_question_goes_to_stderr(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    typed(monkeypatch, "\n")
+    open_rotator("manual", Log(None)).move(22.5)
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "turn the polarizer to 22.5°" in said.err
+
+
+def test_the_end_of_input_is_an_error_with_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    typed(monkeypatch, "what?\n")
+    with pytest.raises(HardwareError, match="the input has ended; run in a terminal, then --resume"):
+        open_rotator("manual", Log(None)).move(45)
+
+
+@pytest.mark.parametrize("stdin", [io.StringIO("\n"), None])
+def test_without_a_terminal_nobody_is_asked(monkeypatch: pytest.MonkeyPatch, stdin: io.StringIO | None) -> None:
+    monkeypatch.setattr(sys, "stdin", stdin)
+    with pytest.raises(SettingError, match="there is no terminal"):
+        open_rotator("manual", Log(None))
+
+
+def test_a_real_terminal_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    person, terminal = os.openpty()
+    with os.fdopen(terminal, "r") as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        rotator = open_rotator("manual", Log(None))
+        os.write(person, b"91\n")
+        assert rotator.move(90) == 91
+    os.close(person)

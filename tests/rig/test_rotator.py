@@ -1,0 +1,212 @@
+"""Whatever the motor: the angle returned is the angle that is, or there is an error."""
+
+from collections.abc import Iterator
+
+import pytest
+from msgspec import convert
+
+from polcap.errors import HardwareError, SettingError
+from polcap.rig import grbl, line, transport
+from polcap.rig.log import Log
+from polcap.rig.rotator import Drive, Driven, Rotator, open_rotator, probe
+from polcap.rig.transport import Silent, Unplugged
+from tests.rig.devices import ALWAYS, SPOKEN, Device, Elliptec, Grbl, Line
+
+pytestmark = pytest.mark.timeout(120)
+KINDS = {"elliptec": Elliptec, "grbl": Grbl, "line": Line}
+QUICK = "settle=0&timeout=1"
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transport, "ANSWER_S", 0.3)
+    monkeypatch.setattr(grbl, "_START_S", 0.5)
+    monkeypatch.setattr(line, "_START_S", 0.5)
+
+
+@pytest.fixture
+def rotators() -> Iterator[list[Rotator]]:
+    """Closed at the end."""
+    opened: list[Rotator] = []
+    yield opened
+    for rotator in opened:
+        rotator.close()
+
+
+def off(a: float, b: float) -> float:
+    return abs((a - b + 180) % 360 - 180)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("drive", "axis"), [("", 1), ("&offset=12.5", 1), ("&offset=100&reverse=1", -1)])
+def test_angles_are_reached_with_offset_and_sense(kind: str, drive: str, axis: int, rotators: list[Rotator]) -> None:
+    with KINDS[kind]() as device:
+        rotator = open_rotator(f"{kind}:{device.port}?{QUICK}{drive}", Log(None))
+        rotators.append(rotator)
+        offset = {"": 0.0, "&offset=12.5": 12.5}.get(drive, 100.0)
+        for angle in (0.0, 45.0, 90.0, 30.0, 0.0, 300.0):
+            read = rotator.move(angle)
+            assert 0 <= read < 360
+            assert off(read, angle) <= 0.06  # the coarsest device steps 0.09°
+            assert off(device.angle_deg, offset + axis * angle) <= 0.06
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("at", [2, 3, 5, 8, 12])
+@pytest.mark.parametrize("fault", SPOKEN)
+def test_a_lost_or_spoilt_answer_is_asked_again(kind: str, at: int, fault: str, rotators: list[Rotator]) -> None:
+    with KINDS[kind](fault=fault, at=at) as device:
+        try:
+            rotators.append(open_rotator(f"{kind}:{device.port}?{QUICK}", Log(None)))
+            for angle in (0.0, 45.0, 90.0):
+                assert off(rotators[0].move(angle), angle) < 0.06
+                assert off(device.angle_deg, angle) < 0.06
+        except Silent:
+            assert not rotators  # only the first questions are not asked again
+
+
+@pytest.mark.parametrize(
+    ("kind", "fault"), [(kind, fault) for kind, device in KINDS.items() for fault in device.FAULTS]
+)
+@pytest.mark.parametrize("at", [1, 6])
+def test_a_lasting_fault_is_one_error_and_no_wrong_angle(
+    kind: str, fault: str, at: int, rotators: list[Rotator]
+) -> None:
+    with KINDS[kind](fault=fault, at=at, times=ALWAYS) as device:
+        with pytest.raises(HardwareError, match=r"rotator|GRBL|ELL14") as raised:
+            rotators.append(open_rotator(f"{kind}:{device.port}?{QUICK}", Log(None)))
+            for angle in (10.0, 45.0, 90.0, 0.0, 45.0, 90.0):
+                read = rotators[0].move(angle)
+                assert off(read, angle) < 0.06
+                assert off(device.angle_deg, angle) < 0.06 or device.moves == 1
+        assert "\n" not in str(raised.value)
+        assert isinstance(raised.value, Unplugged) == (fault == "unplug")
+        for rotator in rotators:
+            rotator.stop()
+            rotator.close()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_wrong_position_is_approached_once_more(kind: str, rotators: list[Rotator]) -> None:
+    with KINDS[kind](fault="wrong-position", at=4) as device:
+        rotators.append(open_rotator(f"{kind}:{device.port}?{QUICK}", Log(None)))
+        for angle in (10.0, 45.0, 90.0):
+            assert off(rotators[0].move(angle), angle) < 0.06
+            assert off(device.angle_deg, angle) < 0.06
+        assert device.moves >= 5
+
+
+class Recorder:
+    """A motor that notes what it is told and stands `beside` what it is told."""
+
+    model, speed_deg_s, wraps = "noted", 90.0, False
+
+    def __init__(self, beside: float = 0.0) -> None:
+        self.told: list[object] = []
+        self.beside = beside
+
+    def home(self) -> None:
+        self.told.append("home")
+
+    def go(self, angle_deg: float) -> None:
+        self.told.append(angle_deg)
+
+    def where(self) -> float:
+        return float(self.told[-1]) + self.beside  # type: ignore[arg-type]
+
+    def halt(self) -> None:
+        self.told.append("halt")
+        raise Unplugged("pulled")
+
+    def close(self) -> None:
+        self.told.append("close")
+
+
+def driven(motor: Recorder, query: str) -> Driven:
+    drive = convert(dict(pair.split("=") for pair in query.split("&")), Drive, strict=False)
+    return Driven(motor, drive, drive.backlash or 0.0)
+
+
+def test_the_last_stretch_is_always_upwards() -> None:
+    motor = Recorder()
+    rotator = driven(motor, "settle=0&backlash=2")
+    for angle in (0, 45, 90, 30, 30):
+        rotator.move(angle)
+    assert motor.told == ["home", -2, 0, 45, 90, 28, 30, 30]
+
+
+def test_a_reversed_motor_comes_from_its_own_side() -> None:
+    motor = Recorder()
+    rotator = driven(motor, "settle=0&backlash=2&reverse=1")
+    for angle in (0, 45):
+        rotator.move(angle)
+    assert motor.told == ["home", -2, 0, -47, -45]
+
+
+@pytest.mark.parametrize(("beside", "reverse", "read"), [(0.2, 0, 45.2), (0.2, 1, 44.8), (-0.25, 0, 44.75)])
+def test_what_was_read_back_is_returned(beside: float, reverse: int, read: float) -> None:
+    assert driven(Recorder(beside), f"settle=0&reverse={reverse}").move(45) == pytest.approx(read)
+
+
+def test_just_below_zero_is_not_360() -> None:
+    assert driven(Recorder(-1e-14), "settle=0").move(0) == 0.0
+
+
+def test_beyond_the_tolerance_is_an_error_that_says_how_far() -> None:
+    with pytest.raises(HardwareError, match=r"\+0\.40° off 45°, more than tolerance = 0\.3°"):
+        driven(Recorder(0.4), "settle=0").move(45)
+    assert driven(Recorder(0.4), "settle=0&tolerance=0.5").move(45) == pytest.approx(45.4)
+
+
+def test_stop_never_raises_and_the_ring_is_homed_again() -> None:
+    motor = Recorder()
+    rotator = driven(motor, "settle=0")
+    rotator.move(10)
+    rotator.stop()
+    rotator.move(20)
+    rotator.close()
+    assert motor.told == ["home", 10, "halt", "home", 20, "halt", "close"]
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("piezo:/dev/x", "choose one of elliptec, grbl, line, simulated, manual"),
+        ("elliptec", "names no port"),
+        ("elliptec:/dev/x?adress=1", "'adress' is no setting of elliptec; it knows address, home"),
+        ("elliptec:/dev/x?address=G", "regex"),
+        ("elliptec:/dev/x?steps=4", "'steps' is no setting of elliptec"),
+        ("grbl:/dev/x?backlash=-1", "backlash"),
+        ("grbl:/dev/x?offset=north", "offset"),
+        ("line:/dev/x?offset", "write settings as"),
+        ("manual:/dev/x", "no port"),
+        ("manual?settle=1", "no settings"),
+        ("simulated:/dev/x", "no port"),
+    ],
+)
+def test_a_wrong_url_says_what_is_right(url: str, words: str) -> None:
+    with pytest.raises(SettingError, match=words):
+        open_rotator(url, Log(None))
+
+
+def test_the_simulated_motor_needs_no_port() -> None:
+    rotator = open_rotator("simulated?settle=0&speed=100000&offset=+3", Log(None))
+    assert rotator.move(45) == pytest.approx(45, abs=0.3)
+    rotator.close()
+
+
+@pytest.mark.parametrize(
+    ("device", "name"),
+    [(Elliptec(), "Elliptec ELL14 at address 0"), (Grbl(), "GRBL"), (Line(), "polcap-rotator simulated")],
+)
+def test_probe_names_what_answers_and_moves_nothing(device: Device, name: str) -> None:
+    with device:
+        assert probe(device.port) == name
+        assert device.moves == 0
+
+
+def test_probe_of_a_port_where_nothing_answers_is_none() -> None:
+    with Elliptec(address="7") as device:
+        assert probe(device.port) is None
+    with pytest.raises(HardwareError):
+        probe("/dev/no-such-port")
