@@ -254,6 +254,56 @@ def synth(
 
 @app.command()
 @_reported
+def capture(
+    context: typer.Context,
+    folder: Annotated[Path, typer.Argument(help="Folder to shoot into; new, or begun with --resume.")],
+    rotator: Annotated[
+        str | None, typer.Option(metavar="URL", help="elliptec:PORT, grbl:PORT, line:PORT, manual or simulated.")
+    ] = None,
+    camera: Annotated[
+        str | None, typer.Option(metavar="NAME", help="gphoto2, gphoto2:MODEL, folder:PATH or simulated.")
+    ] = None,
+    angles: Annotated[str | None, typer.Option(metavar="DEG,…", help="By default 0,45,90.")] = None,
+    bracket: Annotated[
+        str | None, typer.Option(metavar="1/200,1/50,…", help="Exposures; also as f/11, iso100, flash1/16.")
+    ] = None,
+    repeat: Annotated[
+        str | None,
+        typer.Option(metavar="DEG,…", help="Angles whose bracket is taken twice, to see the flash's spread."),
+    ] = None,
+    ambient: Annotated[bool, typer.Option("--ambient", help="Also frames without the flash.")] = False,
+    chart: Annotated[bool, typer.Option("--chart", help="Also a frame of the chart alone.")] = False,
+    tries: Annotated[int, typer.Option(min=0, help="How often a bad frame is taken again.")] = 2,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on: take what is missing.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan with its times, and stop.")] = False,
+    json: Json = False,
+) -> None:
+    """Shoot a capture: turn the polarizer, take the bracket, check every frame as it lands."""
+    from polcap.rig import camera as cameras
+    from polcap.rig import plan, sequence
+
+    given = {
+        "rotator": rotator,
+        "camera": camera,
+        "angles_deg": _angles(angles),
+        "bracket": None if bracket is None else cameras.parse_bracket(bracket),
+        "repeat_deg": None if repeat is None else _numbers("--repeat", repeat),
+        "ambient": ambient or None,
+        "chart": chart or None,
+    }
+    wanted = sequence.order(folder, given, resume)
+    if dry_run:
+        planned = plan.dry_run(wanted)
+        _print(planned if json else plan.table(planned))
+        return
+    done = sequence.shoot(
+        folder, wanted, resume=resume, tries=tries, tell=lambda line: print(line, file=sys.stderr, flush=True)
+    )
+    _print(done if json else str(folder))
+
+
+@app.command()
+@_reported
 def train(
     context: typer.Context,
     data: Annotated[Path, typer.Argument(help="Folder with meshes/ and materials/.")],
@@ -276,14 +326,18 @@ def evaluate(
     context: typer.Context,
     model: Annotated[Path, typer.Argument(help="ONNX model.")],
     data: Annotated[Path, typer.Argument(help="Folder with meshes/ and materials/.")],
-    out: Annotated[Path, typer.Option(help="evaluation.json and evaluation.md.")] = Path("runs/evaluate"),
-    count: Annotated[int, typer.Option(min=1, help="Pictures to judge.")] = 48,
-    size: Annotated[int, typer.Option(min=64, help="Their side, px.")] = 256,
-    seed: Annotated[int, typer.Option(min=0)] = 7,
+    out: Annotated[Path, typer.Option(help="Tables, picture panel and what is done so far.")] = Path("runs/evaluate"),
+    ablations: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Networks to compare, DIR/NAME/last.pt of `polcap train`.")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="50 pictures at 256² instead of 250 at 512².")] = False,
+    count: Annotated[int | None, typer.Option(min=1, help="Pictures to judge.")] = None,
+    size: Annotated[int | None, typer.Option(min=64, help="Their side, px.")] = None,
 ) -> None:
-    """Score a model beside the analytic estimator and the baselines (extra [train])."""
-    judge = _extra("evaluate")
-    judge.main(judge.Params(model=model, data=data, out=out, count=count, size=size, seed=seed))
+    """Score a model on test meshes and materials beside baselines and published figures (extra [train])."""
+    judge, fixed = _extra("evaluate"), _extra("protocol")
+    usual = (fixed.QUICK_COUNT, fixed.QUICK_SIZE) if quick else (fixed.COUNT, fixed.SIZE)
+    judge.main(judge.Params(model, data, out, ablations, count or usual[0], size or usual[1]))
     _print(str(out / "evaluation.md"))
 
 

@@ -1,0 +1,142 @@
+"""A camera's name in, the camera out: what every camera of the rig does."""
+
+import re
+from dataclasses import dataclass
+from math import log2
+from typing import Annotated, Protocol
+
+import msgspec
+from msgspec import Meta
+
+from polcap.errors import SettingError
+from polcap.images import Role
+from polcap.rig.log import Log
+
+Positive = Annotated[float, Meta(gt=0)]
+_WORD = re.compile(
+    r"(?P<kind>f/|iso|flash)?(?P<over>\d+(?:\.\d+)?/)?(?P<value>\d+(?:\.\d+)?)s?", re.IGNORECASE
+)  # f/11, iso100, flash1/16, 1/200, 0.5s
+_SNAP_STOPS = 0.5  # a camera's nearest setting may lie this far from the one asked for
+
+
+class Exposure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What one frame is taken with; None leaves the camera as it stands."""
+
+    time_s: Positive | None = None
+    f_number: Positive | None = None
+    iso: Positive | None = None
+    flash: Positive | None = None  # power, full = 1
+
+    def __str__(self) -> str:
+        """As `--bracket` takes it."""
+        words = []
+        if self.time_s:
+            words.append(f"1/{1 / self.time_s:.4g}s" if self.time_s < 0.3 else f"{self.time_s:.3g}s")
+        words += [f"f/{self.f_number:g}"] if self.f_number else []
+        words += [f"iso{self.iso:g}"] if self.iso else []
+        words += [f"flash1/{1 / self.flash:.4g}"] if self.flash else []
+        return " ".join(words) or "as set on the camera"
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One photograph as the camera made it."""
+
+    data: bytes
+    name: str  # the camera's own
+    exposure: Exposure  # what was really set
+
+
+class Camera(Protocol):
+    """What takes the photographs."""
+
+    model: str
+    frame_bytes: int  # about, for the disk
+    switches_flash: bool  # can take a frame without flash by itself
+
+    def bracket(self) -> tuple[Exposure, ...]:
+        """The exposures of a bracket where the user gave none."""
+        ...
+
+    def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:
+        """Told before every frame: the angle asked for, and which exposure of the bracket comes."""
+        ...
+
+    def shoot(self, exposure: Exposure, flash: bool) -> Shot:
+        """Take one photograph, with the light or without it. HardwareError; never hangs past its timeout."""
+        ...
+
+    def close(self) -> None:
+        """Give the camera back; never raises."""
+        ...
+
+
+def open_camera(name: str, log: Log) -> Camera:
+    """`gphoto2`, `gphoto2:MODEL or PORT`, `folder:PATH` or `simulated?width=768`.
+
+    Raises
+    ------
+    SettingError
+        There is no such camera, or a query names an unknown setting.
+    HardwareError
+        It does not answer.
+    """
+    kind, _, rest = name.partition(":")
+    if kind == "gphoto2":
+        from polcap.rig import camera_gphoto2
+
+        return camera_gphoto2.Gphoto2(rest, log)
+    if kind == "folder" and rest:
+        from polcap.rig import camera_folder
+
+        return camera_folder.WatchedFolder(rest, log)
+    if name.partition("?")[0] == "simulated":
+        from polcap.rig import simulated
+
+        return simulated.Camera(name.partition("?")[2], log)
+    raise SettingError(f"--camera {name}: no such camera; give gphoto2, gphoto2:MODEL, folder:PATH or simulated")
+
+
+def parse_bracket(text: str) -> tuple[Exposure, ...]:
+    """`1/200,1/50,1/13`, or with all words `1/160 f/11 iso100 flash1/64, flash1/16, flash1/4`.
+
+    A frame keeps what it does not state of the frame before. Raises SettingError.
+    """
+    found: list[Exposure] = []
+    for part in text.split(","):
+        stated: dict[str, float] = {} if not found else msgspec.structs.asdict(found[-1])
+        for word in part.split():
+            match = _WORD.fullmatch(word)
+            value = float(match["value"]) if match else 0.0
+            if match is None or not value:
+                raise SettingError(f"--bracket {word}: no exposure; write 1/200, f/11, iso100 or flash1/16")
+            if match["over"]:
+                value = float(match["over"][:-1]) / value
+            names = {"f/": "f_number", "iso": "iso", "flash": "flash"}
+            stated[names.get((match["kind"] or "").lower(), "time_s")] = value
+        found.append(Exposure(**stated))
+    if len(set(found)) < len(found):
+        raise SettingError(f"--bracket {text}: two frames are exposed alike; give each frame its own exposure")
+    return tuple(found)
+
+
+def light(exposure: Exposure) -> float:
+    """Relative exposure: time × ISO × flash power / f-number²."""
+    values = exposure.time_s or 1.0, exposure.iso or 100.0, exposure.flash or 1.0
+    return values[0] * values[1] * values[2] / (exposure.f_number or 1.0) ** 2
+
+
+def spread(middle: Exposure) -> tuple[Exposure, ...]:
+    """Three frames two stops apart by time, around the camera's own setting."""
+    if not middle.time_s:
+        raise SettingError("the camera states no shutter speed; give the exposures with --bracket")
+    return tuple(msgspec.structs.replace(middle, time_s=middle.time_s * stops) for stops in (0.25, 1.0, 4.0))
+
+
+def nearest(what: str, asked: float, offered: list[float], power: float = 1.0) -> float:
+    """The offered value nearest in stops; `power` is 2 for f-numbers. SettingError beyond half a stop."""
+    best = min(offered, key=lambda value: abs(log2(value / asked)))
+    if power * abs(log2(best / asked)) > _SNAP_STOPS:
+        listed = ", ".join(f"{value:g}" for value in sorted(offered))
+        raise SettingError(f"--bracket: {what} {asked:g} is not among the camera's ({listed}); give one of them")
+    return best

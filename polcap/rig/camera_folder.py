@@ -1,0 +1,93 @@
+"""A folder that a tethering application fills: in come new RAW files, out their bytes.
+
+What lies there belongs to the photographer: files are read, never moved, renamed or removed.
+"""
+
+import time
+from pathlib import Path
+
+from polcap.errors import DecodeError, HardwareError, SettingError
+from polcap.formats import exif, sniff
+from polcap.images import Role
+from polcap.rig.camera import Exposure, Shot
+from polcap.rig.log import Log
+
+_POLL_S = 0.1
+_STABLE_S = 0.5  # a file that has not grown for this long is complete
+
+
+class WatchedFolder:
+    """`folder:PATH`: somebody, or some application, presses the release."""
+
+    model = "tethering folder"
+    switches_flash = False
+    frame_bytes = 60_000_000
+
+    def __init__(self, path: str, log: Log, timeout_s: float = 600.0, stable_s: float = _STABLE_S) -> None:
+        self._folder = Path(path)
+        if not self._folder.is_dir():
+            raise SettingError(f"--camera folder:{path}: no such folder; give the one the tethering program writes to")
+        self._log = log
+        self._timeout_s = timeout_s
+        self._stable_s = stable_s
+        self._seen = set(self._files())
+        self._angle: float | None = None
+
+    def bracket(self) -> tuple[Exposure, ...]:
+        raise SettingError("--camera folder cannot ask the camera; give its exposures with --bracket 1/200,1/50,1/13")
+
+    def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:
+        """What was taken at another angle is left where it is."""
+        if angle_deg != self._angle:
+            for file in sorted(set(self._files()) - self._seen):
+                self._log.write("camera", "!", f"{file.name}: taken before the polarizer turned; not used")
+                self._seen.add(file)
+        self._angle = angle_deg
+
+    def shoot(self, exposure: Exposure, flash: bool) -> Shot:
+        """The next new RAW, once it is whole; a bracket that arrives at once is taken in order of its names."""
+        self._log.write("camera", ">", f"{exposure}, {'lit' if flash else 'dark'}: waiting")
+        end = time.monotonic() + self._timeout_s
+        sizes: dict[Path, tuple[int, float]] = {}  # and since when
+        why = ""
+        while time.monotonic() < end:
+            for file in sorted(set(self._files()) - self._seen):
+                size, now = _size(file), time.monotonic()
+                if file not in sizes or sizes[file][0] != size:
+                    sizes[file] = size, now
+                elif size and now - sizes[file][1] >= self._stable_s:
+                    try:
+                        kind = sniff.kind(file)
+                        if kind == "raw":
+                            exif.read(file)
+                            data = file.read_bytes()
+                            self._seen.add(file)
+                            self._log.write("camera", "<", f"{file.name}, {len(data)} bytes")
+                            return Shot(data, file.name, exposure)
+                        if kind != "unknown":  # a JPEG beside the RAW, a sidecar
+                            self._seen.add(file)
+                    except (DecodeError, OSError) as error:  # half written, or gone again
+                        why = f" ({error})"
+            time.sleep(_POLL_S)
+        raise HardwareError(
+            f"no new RAW file in {self._folder} within {self._timeout_s:g} s{why}; "
+            "check that the tethering program writes RAW files there"
+        )
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def _files(self) -> list[Path]:
+        try:
+            return [path for path in self._folder.iterdir() if path.is_file() and not path.name.startswith(".")]
+        except OSError as error:
+            raise HardwareError(
+                f"{self._folder} cannot be listed ({error.strerror}); is its disk still there?"
+            ) from None
+
+
+def _size(file: Path) -> int:
+    try:
+        return file.stat().st_size
+    except OSError:
+        return 0

@@ -1,0 +1,32 @@
+"""In: the middle exposures of a capture, small and grey, and their angles. Out: a first look at the polarization."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from polcap import pictures
+from polcap.formats import png
+from polcap.images import Floats
+from polcap.optics import mueller
+
+NAME = "preview.png"
+_FADE = 0.02  # of the brightest, below which no angle is drawn
+
+
+def write(folder: Path, angle_deg: Sequence[float], small: Sequence[Floats]) -> Path:
+    """S0, DoLP and AoLP side by side as FOLDER/preview.png; small (K, h, w). Raises StorageError."""
+    light = np.stack(small)  # (K, h, w)
+    weights = mueller.analyzer(np.radians(angle_deg))  # (K, 3)
+    s0, s1, s2 = np.tensordot(np.linalg.pinv(weights), light, axes=1)
+    inside = s0 > _FADE * np.percentile(s0, 99.5)
+    dolp = np.hypot(s1, s2) / np.maximum(s0, 1e-6)
+    aolp = np.arctan2(s2, s1) / 2
+    tiles = [
+        pictures.display(np.repeat(s0[..., None], 3, -1)),
+        pictures.scale(dolp, 0, 0.4, inside),
+        pictures.hue(aolp, inside),
+    ]
+    file = folder / NAME
+    png.write(file, pictures.sheet(tiles, ["S0", "DoLP 0 ... 0.4", "AoLP"]))
+    return file
