@@ -233,6 +233,34 @@ def report(
 
 @app.command()
 @_reported
+def check(
+    context: typer.Context,
+    capture: Annotated[Path, typer.Argument(help="Folder with the photographs.")],
+    config: Annotated[Path | None, typer.Option(help="TOML file of settings, a section per stage.")] = None,
+    assignments: Annotated[
+        list[str] | None, typer.Option("--set", metavar="K=V", help="A setting, as check.max_blur_px=2; repeatable.")
+    ] = None,
+    angles: Annotated[
+        str | None, typer.Option(metavar="DEG,…", help="Angles of the shots in order, as 0,45,90.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Keep a capture or reshoot it, and why: seconds after its last frame. Writes nothing."""
+    from polcap import check as checks
+    from polcap import config as settings
+    from polcap import pipeline
+    from polcap.formats import capture as captures
+
+    chosen = settings.load(config, assignments or ())
+    network = pipeline.load_network(None, None, "cpu", 0)
+    verdict = checks.inspect(captures.read(capture, _angles(angles)), network, chosen)
+    _print(checks.shown(verdict) if json else checks.table(verdict))
+    if not verdict.keep:
+        raise typer.Exit(GateError.exit_code)
+
+
+@app.command()
+@_reported
 def synth(
     context: typer.Context,
     folder: Annotated[Path, typer.Argument(help="Folder to make; must be new or empty.")],

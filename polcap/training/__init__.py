@@ -11,5 +11,7 @@ In the order a sample meets them:
     loss        maps against truth
     train       the loop, checkpoints, metrics
     export      weights -> ONNX
-    evaluate    error of every map on held-out meshes and materials
+    evaluate    error of every map on fixed pictures of held-out meshes and materials, of which
+                protocol makes one at a time (patterns: its materials, transport: its light), baselines
+                estimates without a network, score judges, and tables and panel tell
 """

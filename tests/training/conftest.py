@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -10,7 +11,7 @@ pytest.importorskip("embreex")
 
 import torch
 
-from polcap.training import gbuffers, materials, shapes
+from polcap.training import gbuffers, materials, patterns, protocol, shapes
 from polcap.training.dataset import Simulator
 
 
@@ -23,6 +24,26 @@ def write_mesh(path: Path, seed: int) -> None:
         path, vq=np.round((mesh.vertices - low) / scale * 65535).astype(np.uint16), vmin=low, vscale=np.float32(scale),
         faces=mesh.faces,
     )  # fmt: skip
+
+
+def write_textures(folder: Path, seed: int) -> None:
+    """A texture set of the data folder."""
+    rng = np.random.default_rng(seed)
+    folder.mkdir(parents=True)
+    for name, channels in (("albedo", 3), ("roughness", 1), ("height", 1)):
+        coarse = rng.integers(30, 220, (8, 8, channels), dtype=np.uint8)
+        cv2.imwrite(str(folder / f"{name}.jpg"), cv2.resize(coarse, (64, 64)))
+
+
+@pytest.fixture(scope="session")
+def test_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """As many test meshes and texture sets as the evaluation takes."""
+    folder = tmp_path_factory.mktemp("test-data")
+    for k in range(protocol.MESHES):
+        write_mesh(folder / "meshes" / "test" / f"shape-{k}.npz", 10 + k)
+    for k in range(patterns.TEXTURES):
+        write_textures(folder / "materials" / "test" / f"set-{k}", k)
+    return folder
 
 
 @pytest.fixture(scope="session")

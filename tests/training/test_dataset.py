@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from polcap.images import ColorCalibration, View
 from polcap.stages import cues
-from polcap.training import dataset, evaluate
+from polcap.training import dataset, protocol
 from polcap.training.camera import Errors
 from polcap.training.dataset import Light, Simulator
 
@@ -17,7 +18,11 @@ def test_channels_are_those_of_the_cue_stage(simulator: Simulator) -> None:
     view = simulator.look(np.array([3]), 64, flip=False)
     photo = simulator.shoot(view, Light.stated(1, CPU), Errors.stated(1, CPU))
     ours = dataset.channels(photo)[0].numpy()
-    theirs = cues.channels(evaluate.case(photo, evaluate._view(simulator, 3)).cues)
+    focal, x, y = (float(a) for a in simulator.views["camera"][3, :3])
+    measured = (photo.stokes, photo.covariance, photo.clipped)
+    image = protocol.stokes_image(measured, photo.at.numpy(), photo.given[0].numpy(), View(focal, (x, y), 1.0))
+    chart = ColorCalibration(np.eye(3, dtype=np.float32), None, None, None, "chart", 0.0, None)
+    theirs = cues.channels(cues.compute(image, chart))
     np.testing.assert_allclose(ours, theirs, atol=2e-4)  # float32 in another order; arccos near 1 is touchy
 
 

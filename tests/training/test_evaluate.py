@@ -1,70 +1,82 @@
-"""Scores: zero for the truth, known values for known errors, and the shipped model held to its card."""
+"""The evaluation from end to end: all columns, resumed runs, the command, and the shipped model held to its card."""
 
+import json
 import os
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
-from polcap.training import evaluate
-from polcap.training.camera import Errors
-from polcap.training.dataset import Light, Simulator
+from polcap.cli import app
+from polcap.errors import InputError
+from polcap.training import evaluate, model, tables, train
 
 MODEL = Path(__file__).parents[2] / "calib" / "models" / "polcap.onnx"
+TINY = model.Shape((8, 8, 8, 8, 8), (8, 8, 8, 8), (8, 8, 8, 8), (8, 8, 8, 8), (1, 1, 1, 1, 1))
+shipped = pytest.mark.skipif(not MODEL.exists(), reason="no model is shipped")
 
 
 @pytest.fixture(scope="module")
-def case(simulator: Simulator) -> evaluate.Case:
-    torch.manual_seed(0)
-    view = simulator.look(np.array([2]), 64, flip=False)
-    device = torch.device("cpu")
-    photo = simulator.shoot(view, Light.stated(1, device), Errors.stated(1, device))
-    return evaluate.case(photo, evaluate._view(simulator, 2))
+def networks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("networks")
+    for name in ("ours", "rgb"):
+        (folder / name).mkdir()
+        train.Run(TINY, torch.device("cpu"), 1e-3).save(folder / name / "last.pt")
+    return folder
 
 
-def test_truth_scores_zero_and_all_within(case: evaluate.Case) -> None:
-    score = evaluate.score(case.truth, case)
-    for name in ("diffuse", "specular", "roughness", "depth", "rendering", "normal_mean"):
-        assert score[name] == pytest.approx(0, abs=0.1 if name == "normal_mean" else 1e-5), name  # arccos near 1
-    assert score["normal_within_11.25"] == 1
+@shipped
+def test_the_command_judges_all_columns(test_data: Path, networks: Path, tmp_path: Path) -> None:
+    told = ["--count", "2", "--size", "96", "--ablations", str(networks), "--out", str(tmp_path)]
+    done = CliRunner().invoke(app, ["evaluate", str(MODEL), str(test_data), *told])
+    assert done.exit_code == 0, done.output
+    result = json.loads((tmp_path / "evaluation.json").read_text())
+    assert list(result["table"]) == [
+        "ours", "ours, noise-free", "analytic", "frontal", "silhouette", "mean of each map",
+    ]  # fmt: skip
+    assert list(result["ablations"]) == ["ours", "rgb"]
+    for figures in (*result["table"].values(), *result["ablations"].values()):
+        assert {"normal_mean", "diffuse", "roughness", "specular", "rendering"} <= figures.keys()
+    assert result["of_mean_maps"].keys() == {"diffuse", "specular", "roughness"} and len(result["calibration"]) == 10
+    page = (tmp_path / "evaluation.md").read_text()
+    assert "| 12.00 | 42.23 | 47.69 |" in page and "as published" in page and "| 24.14 |" in page
+    assert (tmp_path / "panel.png").stat().st_size > 10_000
+    assert "2/2" in done.stderr and "min left" in done.stderr
 
 
-def test_known_errors_score_what_they_are(case: evaluate.Case) -> None:
-    c, s = np.cos(np.radians(15)), np.sin(np.radians(15))
-    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    wrong = replace(
-        case.truth,
-        normal=case.truth.normal @ turn.T,
-        roughness=case.truth.roughness + 0.1,
-        depth_prior=2 * case.depth + 5,
-    )
-    score = evaluate.score(wrong, case)
-    zenith = np.sqrt(np.maximum(1 - case.truth.normal[case.truth.mask][:, 2] ** 2, 0))
-    expected = np.degrees(2 * np.arcsin(zenith * np.sin(np.radians(7.5)))).mean()
-    assert score["normal_mean"] == pytest.approx(expected, rel=1e-3)
-    assert score["roughness"] == pytest.approx(0.1, rel=1e-4)
-    inside = case.depth[case.truth.mask]
-    assert score["depth"] == pytest.approx(inside.std() / np.ptp(inside), rel=1e-4)
-    assert score["rendering"] > 0
+@shipped
+def test_a_stopped_run_goes_on(test_data: Path, tmp_path: Path) -> None:
+    params = evaluate.Params(MODEL, test_data, tmp_path, count=2, size=64)
+    whole = evaluate.main(params)
+    journal = tmp_path / "pictures.jsonl"
+    head, first, second = journal.read_text().splitlines()
+    kept = json.loads(first)
+    kept["scores"]["ours"]["normal_mean"] += 10
+    journal.write_text("\n".join([head, json.dumps(kept), second[:50]]))
+    assert evaluate.main(params)["ours"]["normal_mean"] == pytest.approx(whole["ours"]["normal_mean"] + 5)
+    journal.write_text("\n".join(["another run", json.dumps(kept)]))
+    assert evaluate.main(params) == whole
 
 
-def test_deciles_pair_predicted_with_actual() -> None:
-    predicted = np.linspace(1, 20, 1000)
-    rows = evaluate.deciles([(predicted, 2 * predicted)])
-    assert len(rows) == 10 and all(r["actual"] == pytest.approx(2 * r["predicted"]) for r in rows)
+def test_published_figures_stand_only_in_rows_that_exist() -> None:
+    for table in (tables.PUBLISHED, tables.PUBLISHED_ABLATIONS):
+        assert all(figures.keys() <= tables.ROWS.keys() for figures in table.values())
 
 
+@shipped
+def test_a_folder_without_networks_is_named(test_data: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"holds no NAME/last\.pt"):
+        evaluate.main(evaluate.Params(MODEL, test_data, tmp_path, ablations=tmp_path, count=1, size=64))
+
+
+@shipped
 @pytest.mark.skipif(not os.environ.get("POLCAP_DATA"), reason="POLCAP_DATA is not set")
-@pytest.mark.skipif(not MODEL.exists(), reason="no model is shipped")
-def test_shipped_model_holds_what_its_card_says(tmp_path: Path) -> None:
+def test_shipped_model_beats_what_needs_no_network(tmp_path: Path) -> None:
     data = Path(os.environ["POLCAP_DATA"])
-    table = evaluate.main(evaluate.Params(MODEL, data=data, out=tmp_path, count=12, size=160))
-    ours = table["network"]
-    assert ours["normal_mean"] < 14 and ours["normal_mean"] < table["analytic"]["normal_mean"] + 1.5  # 10.6 on 36
-    assert ours["diffuse"] < table["analytic"]["diffuse"]
-    for baseline in ("frontal, mean maps", "silhouette, mean maps"):
+    table = evaluate.main(evaluate.Params(MODEL, data, tmp_path, count=6, size=128))
+    ours = table["ours"]
+    assert ours["normal_mean"] < table["analytic"]["normal_mean"] + 1.5
+    for baseline in ("frontal", "silhouette", "mean of each map"):
         for row in ("normal_mean", "diffuse", "depth", "rendering"):
             assert ours[row] < table[baseline][row], (baseline, row)
-    assert (tmp_path / "evaluation.md").read_text().count("|") > 50

@@ -1,0 +1,92 @@
+"""Errors of one picture's maps against its truth, over the truth's mask."""
+
+import cv2
+import numpy as np
+
+from polcap.images import Floats, Quality, SurfaceMaps
+from polcap.optics import frames, shade
+from polcap.training.protocol import Case, lights
+
+MAPS = ("diffuse", "specular", "roughness")
+_IOR = 1.5  # of the rendering error: the maps do not say it
+_FLASH = np.array([0.0, 0.0, 1.0])  # where the light that sets white stands
+_LEAST_CLIPPED = 10  # pixels, for a highlight's error to count
+
+Score = dict[str, float]
+
+
+class Judge:
+    """Scores estimates of one picture; what depends on the truth alone is worked out once."""
+
+    def __init__(self, case: Case) -> None:
+        self.case, self.mask = case, case.truth.mask
+        self.core = cv2.erode(self.mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        clipped = self.mask & ((case.cues.quality & Quality.CLIPPED) > 0)
+        self.clipped = clipped if clipped.sum() >= _LEAST_CLIPPED else None
+        self.white = float(np.percentile(drawn(case.truth, case, _FLASH), 99))
+        self.rendered = self._rendered(case.truth)
+
+    def score(self, maps: SurfaceMaps) -> Score:
+        """RMSE unless said, angles in degrees, shares of pixels in 0…1. `·_core`: mask eroded by 2 px.
+
+        depth: both centred in the mask, over the truth's greatest minus least; `depth_fitted`: after the best
+        scale and shift. diffuse_clipped: where every exposure is saturated; absent where nothing is.
+        """
+        case, mask, error = self.case, self.mask, angle(maps, self.case)
+        out = {}
+        for suffix, inside in (("", mask), ("_core", self.core)):
+            out[f"normal_mean{suffix}"] = float(error[inside].mean())
+            out[f"normal_median{suffix}"] = float(np.median(error[inside]))
+            for limit in (11.25, 22.5, 30.0):
+                out[f"normal_within_{limit:g}{suffix}"] = float((error[inside] < limit).mean())
+        for name in MAPS:
+            difference = (getattr(maps, name) - getattr(case.truth, name))[mask]
+            out[name], out[f"{name}_l1"] = _rmse(difference), float(np.abs(difference).mean())
+        if self.clipped is not None:
+            out["diffuse_clipped"] = _rmse((maps.diffuse - case.truth.diffuse)[self.clipped])
+        if maps.depth_prior is not None:
+            out |= _depth(maps.depth_prior[mask], case.depth[mask])
+        difference = self._rendered(maps) - self.rendered
+        return out | {"rendering": _rmse(difference), "rendering_l1": float(np.abs(difference).mean())}
+
+    def _rendered(self, maps: SurfaceMaps) -> Floats:
+        """S0 (20, M, 3) under the stored lights, clipped to 0…1; 1 is the flash-lit truth's 99th percentile."""
+        return np.stack([np.clip(drawn(maps, self.case, light) / self.white, 0, 1) for light in lights()])
+
+
+def angle(maps: SurfaceMaps, case: Case) -> Floats:
+    """Degrees between estimated and true normal, (H, W)."""
+    half = np.linalg.norm(maps.normal.astype(np.float64) - case.truth.normal, axis=-1) / 2
+    return np.asarray(np.degrees(2 * np.arcsin(np.clip(half, 0, 1))))
+
+
+def deciles(predicted: Floats, actual: Floats) -> list[dict[str, float]]:
+    """Mean predicted and mean actual normal error in each tenth of the pixels, by predicted error."""
+    order = np.argsort(predicted)
+    return [
+        {"predicted": float(predicted[part].mean()), "actual": float(actual[part].mean())}
+        for part in np.array_split(order, 10)
+    ]
+
+
+def drawn(maps: SurfaceMaps, case: Case, light: Floats) -> Floats:
+    """S0 (M, 3) of the masked pixels under a distant light (3,), camera frame; as `optics/shade.py`, no shadow."""
+    mask = case.truth.mask
+    rays = case.cues.rays[mask].astype(np.float32)
+    normal = frames.to_ray_frame(maps.normal[mask], rays).astype(np.float32)
+    toward = frames.to_ray_frame(np.broadcast_to(light.astype(np.float32), rays.shape), rays)
+    one = np.ones(len(normal), np.float32)
+    rough = np.maximum(maps.roughness[mask], 0.08)
+    stokes = shade.stokes(normal, maps.diffuse[mask], maps.specular[mask], rough, _IOR * one, toward, one)
+    return np.asarray(stokes[0])
+
+
+def _rmse(difference: Floats) -> float:
+    return float(np.sqrt(np.mean(np.square(difference, dtype=np.float64))))
+
+
+def _depth(ahead: Floats, truth: Floats) -> Score:
+    ahead, truth = (x.astype(np.float64) - x.mean(dtype=np.float64) for x in (ahead, truth))
+    scale = (ahead @ truth) / max(float(ahead @ ahead), 1e-12)
+    span = float(np.ptp(truth))
+    return {"depth": _rmse(ahead - truth) / span, "depth_fitted": _rmse(scale * ahead - truth) / span}
