@@ -49,6 +49,34 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 20.0
 
 
+class Check(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where `polcap check` says reshoot, beside the gates."""
+
+    max_gain_change: Annotated[
+        float, Meta(gt=0, le=1, description="of a shot's light against the other shots'; more is no ordinary pop [1]")
+    ] = 0.1
+    max_energy_drift: Annotated[
+        float, Meta(gt=0, le=1, description="of one frame's light against its shot's and the other brackets' [1]")
+    ] = 0.06
+    max_blur_px: Annotated[
+        float,
+        Meta(gt=0, le=20, description="1σ beyond the sharpest shot's; 0.6 px of the merged picture [RAW px]"),
+    ] = 1.2
+    max_turn_deg: Annotated[
+        float,
+        Meta(ge=3, le=45, description="of the polarizer away from the stated angle, told by the outline [degrees]"),
+    ] = 8.0
+    max_turn_fit: Annotated[
+        float, Meta(gt=0, lt=1, description="misfit of the outline with that turn over without, to be believed [1]")
+    ] = 0.68
+    max_side_light: Annotated[
+        float, Meta(gt=0, le=1, description="one side of the outline brighter in one shot than in the others [1]")
+    ] = 0.05
+    max_ambient: Annotated[
+        float, Meta(gt=0, le=1, description="share of the object's light that is there without the flash [1]")
+    ] = 0.1
+
+
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Every setting of a run."""
 
@@ -62,6 +90,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     surface: Surface = Surface()
     asset: Asset = Asset()
     gates: Gates = Gates()
+    check: Check = Check()
 
 
 class Setting(NamedTuple):

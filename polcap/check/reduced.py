@@ -1,0 +1,91 @@
+"""A capture in, the same of about a megapixel out, with what the averaging would hide: clipping and sharpness."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Capture, Floats, Frame, SensorImage
+from polcap.optics import sensor, sharpness
+
+_MOST_PIXELS = 1e6  # of the pictures that the stages see: they take three seconds on two cores
+_LEAST_LIGHT = 0.01  # of the sensor's range; in darker tiles noise is detail
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A capture averaged down, and what the averaging would hide."""
+
+    capture: Capture  # loads from memory
+    step: int  # visible RAW px per px
+    clipped: Floats  # (K, E, h, w) share of each pixel that is clipped
+    tiles: Floats  # (K, E, T, n, n) of the half-size pictures
+    tiles_usable: NDArray[np.bool_]  # (K, E, T)
+    tile_px: float  # visible RAW px per px of the tiles
+
+
+def take(capture: Capture, clip: float) -> Taken:
+    """Every frame decoded once: one thread waits for the decoder while another averages."""
+    frames = [frame for shot in capture.shots for frame in (*shot.frames, *shot.ambient)]
+    first = capture.shots[0].frames[(len(capture.shots[0].frames) - 1) // 2]
+    image = first.load()
+    usable = sensor.usable(image, clip)
+    corners = sharpness.choose(_half(image)[1], usable)
+    times = max(1, int(np.ceil(np.sqrt(usable.size / _MOST_PIXELS))))
+    half = 1 if image.cfa is None else 2
+
+    def seen(frame: Frame) -> tuple[SensorImage, Floats, Floats, NDArray[np.bool_]]:
+        whole = image if frame is first else frame.load()
+        signal, light = _half(whole)
+        usable = sensor.usable(whole, clip)
+        shares = _averaged((~usable).astype(np.float32), times)
+        value = _averaged(signal, times)
+        value[shares > 0] = 1  # the stages drop a pixel of which a part is clipped
+        tiles = sharpness.cut(light, corners)
+        clear = sharpness.cut(usable.astype(np.float32), corners).all((1, 2)) & (tiles.mean((1, 2)) > _LEAST_LIGHT)
+        small = SensorImage(value, np.zeros((1, 1)), 1.0, None, whole.camera_matrix, whole.white_balance, whole.lossy)
+        return small, shares, tiles, clear
+
+    with ThreadPoolExecutor(2) as pool:
+        found = dict(zip(map(id, frames), pool.map(seen, frames)))
+
+    def smaller(frame: Frame) -> Frame:
+        small = found[id(frame)][0]
+        return replace(frame, load=lambda: small)
+
+    step = half * times
+    (x, y), (width, height) = capture.principal_px, capture.size_px
+    return Taken(
+        capture=replace(
+            capture,
+            shots=tuple(
+                replace(s, frames=tuple(map(smaller, s.frames)), ambient=tuple(map(smaller, s.ambient)))
+                for s in capture.shots
+            ),
+            focal_px=capture.focal_px / step,
+            principal_px=((x - (step - 1) / 2) / step, (y - (step - 1) / 2) / step),
+            size_px=(width // step, height // step),
+        ),
+        step=step,
+        clipped=np.stack([[found[id(frame)][1] for frame in shot.frames] for shot in capture.shots]),
+        tiles=np.stack([[found[id(frame)][2] for frame in shot.frames] for shot in capture.shots]),
+        tiles_usable=np.stack([[found[id(frame)][3] for frame in shot.frames] for shot in capture.shots]),
+        tile_px=half,
+    )
+
+
+def _half(image: SensorImage) -> tuple[Floats, Floats]:
+    """A frame's signal (h, w, 3), mosaics binned, and the mean of its photosites (h, w)."""
+    signal = sensor.signal(image)
+    if signal.shape[2] == 1:
+        return np.repeat(signal, 3, axis=2), signal[..., 0]
+    return signal, cv2.transform(signal, np.array([[0.25, 0.5, 0.25]]))
+
+
+def _averaged(picture: Floats, times: int) -> Floats:
+    """Means of times × times pixels; an incomplete last block is dropped."""
+    height, width = picture.shape[0] // times, picture.shape[1] // times
+    whole = picture[: height * times, : width * times]
+    return np.array(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)

@@ -1,0 +1,99 @@
+"""What the object's outline says of the polarizer: where it turns edge-on, the polarization is known.
+
+There the surface's azimuth φ is the outline's own direction, so a shot at θ sees ½ S₀ (1 + ρ cos 2(θ − φ)) with
+two unknowns per pixel. Three shots leave one residual per pixel, and its pattern along the outline tells which
+angle was not what it is called, or that another light shone from one side. How well it tells depends on how
+much of the outline is a contour of shape, and how well the mask follows it.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Floats
+from polcap.optics import mueller
+
+Bools = NDArray[np.bool_]
+
+_INNER_PX, _DEPTH = 3.0, 0.08  # the band: px from the outline, and up to this share of the object's radius
+_SMOOTH_PX = 1.0
+_STEP_DEG, _MOST_DEG = 3.0, 48.0  # of the angles tried; beyond, order and sense are in question
+
+
+@dataclass(frozen=True)
+class Rim:
+    """The band inside the outline."""
+
+    light: Floats  # (K, N) of each shot, mean of the shots = 1
+    azimuth: Floats  # (N,) rad, outward direction of the outline, from image x towards image up
+
+    @property
+    def length(self) -> int:
+        return len(self.azimuth)
+
+
+@dataclass(frozen=True)
+class Turn:
+    """The turn of one shot, or of all, that explains the rim best."""
+
+    shot: int | None  # None: all alike
+    angle: float  # rad, true minus stated
+    misfit: float  # residual with that turn, relative to the residual without; 1: nothing is better
+
+
+def rim(light: Floats, mask: Bools, usable: Bools) -> Rim:
+    """The rim of registered shots (K, H, W) of equal gain; usable: pixels to be believed."""
+    ok = (mask & usable).astype(np.float32)
+    weight = cv2.GaussianBlur(ok, (0, 0), _SMOOTH_PX) + 1e-6
+    smooth = np.stack([cv2.GaussianBlur(shot.astype(np.float32) * ok, (0, 0), _SMOOTH_PX) / weight for shot in light])
+    depth = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    reach = max(_DEPTH * float(np.sqrt(mask.sum() / np.pi)), _INNER_PX + 3)
+    soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), max(3.0, reach / 2))
+    dx, dy = cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1)
+    band = (depth > _INNER_PX) & (depth < reach) & (ok > 0) & (np.hypot(dx, dy) > 1e-4)
+    for edge in (band[:3], band[-3:], band[:, :3], band[:, -3:]):  # where a picture ends is no contour
+        edge[:] = False
+    inside = smooth[:, band]
+    return Rim(inside / np.maximum(inside.mean(0), 1e-9), np.arctan2(dy, -dx)[band])  # rows run down
+
+
+def turn(at: Rim, angle: Floats, least: float) -> Turn:
+    """The best of all turns of one shot, or of all, by at least `least` rad; angle (K,) rad as stated."""
+    stated = _misfit(at, angle)
+    best = Turn(None, 0.0, 1.0)
+    steps = np.radians(np.arange(_STEP_DEG, _MOST_DEG + 1, _STEP_DEG))
+    for step in (s for size in steps if size >= least for s in (-size, size)):
+        for shot in (*range(len(angle)), None):
+            turned = angle + step * (1 if shot is None else np.arange(len(angle)) == shot)
+            misfit = _misfit(at, turned) / max(stated, 1e-9)
+            if misfit < best.misfit:
+                best = Turn(shot, float(step), misfit)
+    return best
+
+
+def _misfit(at: Rim, angle: Floats) -> float:
+    """Median over the rim of what 1 and cos 2(θ − φ) leave of the shots' light."""
+    wave = np.cos(2 * (angle[:, None] - at.azimuth))
+    wave = wave - wave.mean(0)
+    light = at.light - at.light.mean(0)
+    share = (wave * light).sum(0) / np.maximum((wave * wave).sum(0), 1e-9)
+    return float(np.median(np.linalg.norm(light - share * wave, axis=0)))
+
+
+def dolp(at: Rim, angle: Floats) -> Floats:
+    """Degree of linear polarization along the rim, (N,)."""
+    s0, s1, s2 = np.linalg.lstsq(mueller.analyzer(angle), at.light, rcond=None)[0]
+    return np.asarray(np.hypot(s1, s2) / np.maximum(s0, 1e-9))
+
+
+def side_light(at: Rim) -> Floats:
+    """How much brighter one side of the rim is than the other in each shot, against all shots together, (K,).
+
+    Polarization is the same on opposite sides, a lamp is not: the amplitude of the first harmonic in φ.
+    """
+    phi = at.azimuth
+    basis = np.stack([np.ones_like(phi), *(f(n * phi) for n in (1, 2) for f in (np.cos, np.sin))], axis=1)
+    found = np.linalg.lstsq(basis, at.light.T, rcond=None)[0]  # (5, K)
+    return np.asarray(np.hypot(found[1], found[2]))

@@ -1,0 +1,84 @@
+"""How much more one photograph is blurred than another of the same scene, from small tiles of both.
+
+Blur takes fine detail and leaves coarse: the energy of differences over one pixel against that over four, in
+four directions, so that a motion along one of them shows. What blur that means is read off by blurring the
+sharper one's own tiles until they look alike: the measure needs no knowledge of the scene.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Floats
+
+TILE = 32  # px
+_CELLS = (8, 12)  # of the picture; each gives its tiles of most detail
+_PER_CELL = 3
+_FINE, _COARSE = 1, 4  # px
+_WAYS = ((0, 1), (1, 0), (1, 1), (1, -1))
+_LADDER = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # px, 1σ
+_LEAST_TILES = 4
+_DETAIL = -0.5  # log of fine over coarse energy: noise has 0, detail less
+
+
+def choose(light: Floats, usable: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Corners (T, 2) = (row, column) of the tiles with most detail, spread over the picture (H, W)."""
+    rows, columns = light.shape[0] // TILE, light.shape[1] // TILE
+    if not rows or not columns:
+        return np.zeros((0, 2), np.int64)
+    cut = (slice(0, rows * TILE), slice(0, columns * TILE))
+    tiled = (rows, TILE, columns, TILE)
+    picture = cv2.GaussianBlur(light[cut], (0, 0), 1.0)
+    detail = cv2.Sobel(picture, cv2.CV_32F, 1, 0) ** 2 + cv2.Sobel(picture, cv2.CV_32F, 0, 1) ** 2
+    score = detail.reshape(tiled).mean((1, 3)) / np.maximum(picture.reshape(tiled).mean((1, 3)), 1e-3)
+    score *= usable[cut].reshape(tiled).all((1, 3))
+    found = []
+    for some_rows in np.array_split(np.arange(rows), min(_CELLS[0], rows)):
+        for some_columns in np.array_split(np.arange(columns), min(_CELLS[1], columns)):
+            cell = score[np.ix_(some_rows, some_columns)]
+            for k in np.argsort(cell, axis=None)[::-1][:_PER_CELL]:
+                i, j = np.unravel_index(k, cell.shape)
+                if cell[i, j] > 0:
+                    found.append((TILE * some_rows[i], TILE * some_columns[j]))
+    return np.array(found, np.int64).reshape(-1, 2)
+
+
+def cut(light: Floats, corners: NDArray[np.int64]) -> Floats:
+    """(T, TILE, TILE) out of (H, W)."""
+    return np.array([light[y : y + TILE, x : x + TILE] for y, x in corners], np.float32).reshape(-1, TILE, TILE)
+
+
+def extra_blur(tiles: Floats, usable: NDArray[np.bool_]) -> Floats:
+    """1σ of the Gaussian that each photograph is blurred by beyond the sharpest, (K,) px; NaN: cannot tell.
+
+    tiles (K, T, n, n) of K photographs of equal exposure; usable (K, T).
+    """
+    fineness = np.stack([_fineness(shot) for shot in tiles])  # (K, 4, T)
+    every = usable.all(0) & (fineness.mean((0, 1)) < _DETAIL)
+    if every.sum() < _LEAST_TILES:
+        return np.full(len(tiles), np.nan)
+    fineness = fineness[..., every]
+    sharpest = int(np.argmax(np.median(fineness, axis=2).mean(1)))
+    ladder = np.stack([_fineness(_blurred(tiles[sharpest][every], sigma)) for sigma in _LADDER])  # (L, 4, T)
+    fall = np.median(ladder[0] - ladder, axis=2)  # (L, 4), growing
+    lost = np.median(fineness[sharpest] - fineness, axis=2)  # (K, 4)
+    return np.array([max(np.interp(lost[k, w], fall[:, w], _LADDER) for w in range(4)) for k in range(len(tiles))])
+
+
+def _fineness(tiles: Floats) -> Floats:
+    """Logarithm of fine over coarse energy in four directions, (4, T)."""
+    return np.stack([np.log(_energy(tiles, way, _FINE) / _energy(tiles, way, _COARSE)) for way in _WAYS])
+
+
+def _energy(tiles: Floats, way: tuple[int, int], lag: int) -> Floats:
+    down, across = way[0] * lag, abs(way[1]) * lag
+    flipped = tiles[:, :, ::-1] if way[1] < 0 else tiles
+    n = tiles.shape[-1]
+    difference = flipped[:, down:, across:] - flipped[:, : n - down, : n - across]
+    return np.asarray((difference**2).mean((1, 2)) + 1e-12)
+
+
+def _blurred(tiles: Floats, sigma: float) -> Floats:
+    if not sigma:
+        return tiles
+    return np.stack([cv2.GaussianBlur(tile, (0, 0), sigma, borderType=cv2.BORDER_REFLECT) for tile in tiles])
