@@ -3,7 +3,7 @@
 115200 8N1, lines of ASCII; the reference page on rotators has it in full.
 ::
 
-    ?          polcap-rotator 1 NAME SPEED     also sent unasked when the board starts; degrees/s
+    ?          polcap-rotator 1 NAME SPEED     degrees/s; unasked, with ` started` behind, when the board starts
     home       ok 0.000                        once the switch is found
     zero       ok 0.000                        where it stands is zero
     go 45.000  ok 45.010                       once it stands; until then `busy 12.300` twice a second
@@ -15,7 +15,6 @@
 import math
 import re
 import time
-from contextlib import suppress
 from typing import Literal
 
 from msgspec import Struct
@@ -28,7 +27,7 @@ from polcap.rig.transport import Port, Silent
 BACKLASH_DEG = 2.0
 BAUD = 115200
 _START_S = 3.0  # a board that restarts when its port is opened
-_HELLO = re.compile(r"polcap-rotator 1 (\S+) (\d+(?:\.\d+)?)")
+_HELLO = re.compile(r"polcap-rotator 1 (\S+) (\d+(?:\.\d+)?)( started)?")
 _SAYS = re.compile(r"(ok|busy) (-?\d+(?:\.\d+)?)")
 
 
@@ -73,11 +72,13 @@ class Line:
 
     def _hello(self) -> tuple[str, float]:
         end = time.monotonic() + _START_S
+        self._port.add(b"?\n")
         while (left := end - time.monotonic()) > 0:
-            self._port.add(b"?\n")
-            with suppress(Silent):
+            try:
                 if match := _HELLO.fullmatch(self._port.read_line(min(left, 0.5))):
                     return match[1], float(match[2])
+            except Silent:
+                self._port.add(b"?\n")
         raise Silent(f"no polcap-rotator answers on {self._port.url}; load examples/rotator_firmware, check the cable")
 
     def _do(self, command: str) -> float:
@@ -88,7 +89,9 @@ class Line:
             said = self._port.read_line()
             if said.startswith("error "):
                 raise HardwareError(f"{self.model} on {self._port.url}: {said[6:]}")
-            if _HELLO.fullmatch(said):
+            if hello := _HELLO.fullmatch(said):
+                if not hello[3]:  # asked for earlier
+                    continue
                 raise HardwareError(
                     f"{self.model} on {self._port.url} restarted and lost its zero; check its supply, then --resume"
                 )

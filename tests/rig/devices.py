@@ -420,7 +420,11 @@ class Line(Device):
 
     def halfway(self) -> None:
         self.homed, self.released = False, True
-        self.say("error the motor stalled; free the ring" if self._struck == "mechanical-timeout" else self.HELLO)
+        self.say(
+            "error the motor stalled; free the ring"
+            if self._struck == "mechanical-timeout"
+            else f"{self.HELLO} started"
+        )
 
     def tick(self) -> None:
         if self.moving and time.monotonic() - self._beat > 0.2:
