@@ -1,0 +1,291 @@
+"""Path-traced test scenes by Mitsuba 3, with interreflection: noise-free Stokes parameters and the truth of every map.
+
+    python tests/benchmarks/make_mitsuba.py FOLDER [--data $POLCAP_DATA] [--scenes 12] [--size 256] [--depth 5]
+
+Test meshes in turn, posed as `polcap evaluate` poses them, under a flash 5 % of the distance above the lens. Each
+wears two regions of plastic, each of three grades: albedo from a test texture set or solid noise, a face at a time;
+one index per region, one k_s and roughness per grade. One .npz per scene; a scene that stands there already is
+kept. Every scene is rendered until the Monte-Carlo error of its DoLP, from two halves of independent seeds, is
+below 0.1 %.
+"""
+
+import argparse
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from polcap.formats import atomic
+from polcap.images import Floats, View
+from polcap.optics import frames, fresnel
+from polcap.synth import materials, render
+from polcap.synth.mesh import Triangles
+from polcap.training import gbuffers
+from polcap.training.materials import read_textures
+
+FACES = 200_000  # at least, after subdivision: each has one colour
+TEXELS = 1024  # side of the bitmap that holds the faces' colours
+PASS, LEAST, MOST = 16, 8, 64  # samples per pixel of a pass, passes
+GOAL = 1e-3  # DoLP, 1σ over the object
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--data", type=Path, default=os.environ.get("POLCAP_DATA"))
+    parser.add_argument("--scenes", type=int, default=12)
+    parser.add_argument("--size", type=int, default=256)
+    parser.add_argument("--depth", type=int, default=5, help="longest path; 2 is direct light only")
+    options = parser.parse_args()
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_mono_polarized")
+    mi.set_log_level(mi.LogLevel.Error)
+    meshes = sorted((options.data / "meshes" / "test").glob("*.npz"))
+    textures = sorted(p.parent for p in (options.data / "materials" / "test").glob("*/albedo.jpg"))
+    for index in range(options.scenes):
+        mesh = meshes[index % len(meshes)]
+        file = options.folder / f"{index:02d}_{mesh.stem}.npz"
+        if file.exists():
+            continue
+        random = np.random.default_rng([2026, index])
+        texture = textures[index // 2 % len(textures)] if index % 2 else None
+        began = time.monotonic()
+        made, about = build(mi, gbuffers.read_mesh(mesh), texture, options.size, options.depth, random)
+        with atomic.path(file) as temporary:
+            np.savez_compressed(temporary, about=json.dumps(about), **made)
+        print(file.name, json.dumps(about), f"{time.monotonic() - began:.0f} s", flush=True)
+
+
+def build(
+    mi: Any, mesh: Triangles, texture: Path | None, size: int, depth: int, random: np.random.Generator
+) -> tuple[dict[str, Floats], dict[str, Any]]:
+    """Stokes parameters (3, H, W, 3) in the frame of each ray, truth maps, camera; and how it was made."""
+    rotation, translation, view = gbuffers.pose(mesh, size, random)
+    corner, normal = subdivided(mesh)
+    coat = dressed(corner, texture, random)
+    if not trimesh.Trimesh(mesh.vertices, mesh.faces).is_watertight:
+        corner, normal = facing(corner, normal, -translation @ rotation)
+    far = float(-translation[2] - np.mean(corner @ rotation[2]))
+    light = [0.0, 0.05 * far, 0.0]
+    parts = [
+        {
+            "position": corner[which] @ rotation.T + translation,
+            "normal": normal[which] @ rotation.T,
+            **{name: coat[name][which] for name in "rgb"},
+            **grade,
+        }
+        for number, grade in enumerate(coat["grades"])
+        if (which := coat["grade"] == number).any()
+    ]
+    truth = seen(mi, parts, view, size)
+    mask = truth["mask"]
+    middle, unit = gbuffers.depth_unit(mask, truth["depth"], view.focal)
+    halves = np.zeros((2, 3, size, size, 3))
+    passes, error = 0, np.inf
+    scenes = [scene(mi, parts, channel, light, np.pi * middle**2, view, size, depth) for channel in "rgb"]
+    while passes < LEAST or (error > GOAL and passes < MOST):
+        for k, one in enumerate(scenes):
+            halves[passes % 2, ..., k] += shot(mi, one, view, size, seed=3 * passes + k)
+        passes += 1
+        if passes % 2 == 0:
+            error = dolp_error(halves, mask)
+    about = {
+        "texture": texture.name if texture else "noise",
+        "grades": coat["grades"],
+        "light": light,
+        "depth": depth,
+        "samples": passes * PASS,
+        "dolp_error": error,
+    }
+    camera = {"focal": view.focal, "center": view.center, "middle": middle, "unit": unit}
+    stokes = (halves.sum(axis=0) / passes).astype(np.float32)
+    return {"stokes": stokes, **truth, **{k: np.array(v) for k, v in camera.items()}}, about
+
+
+def subdivided(mesh: Triangles) -> tuple[Floats, Floats]:
+    """Corners (F, 3, 3) and their normals, each triangle cut in four until there are enough."""
+    corner, normal = mesh.vertices[mesh.faces].astype(np.float64), mesh.corner_normals.astype(np.float64)
+    while len(corner) < FACES:
+        corner, normal = (_quartered(value) for value in (corner, normal))
+    return corner, normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
+
+def facing(corner: Floats, normal: Floats, camera: Floats) -> tuple[Floats, Floats]:
+    """Turn triangles that show the camera their back: `pplastic` has none, and `twosided` mirrors its Stokes frame."""
+    across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    away = np.einsum("fi,fi->f", across, camera - corner[:, 0]) < 0
+    corner, normal = corner.copy(), normal.copy()
+    corner[away], normal[away] = corner[away, ::-1], -normal[away, ::-1]
+    return corner, normal
+
+
+def _quartered(value: Floats) -> Floats:
+    a, b, c = value[:, 0], value[:, 1], value[:, 2]
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+    return np.concatenate([np.stack(part, axis=1) for part in parts])
+
+
+def dressed(corner: Floats, texture: Path | None, random: np.random.Generator) -> dict[str, Any]:
+    """Albedo r, g, b of every face (F,) and the number of its grade; k_s, α and n of the six grades."""
+    middle = corner.mean(axis=1)
+    noise = [materials.solid_noise(middle * scale, int(random.integers(1 << 30))) for scale in (3.0, 12.0, 25.0)]
+    second = noise[0] > random.uniform(-0.6, 0.6)
+    base = random.uniform(0.08, 0.85, 3) * random.uniform(0.5, 1)
+    if texture is None:
+        other = np.clip(base * random.uniform(0.4, 1.6, 3), 0.03, 0.9)
+        albedo = base + (other - base) / (1 + np.exp(-3 * noise[1][:, None]))
+    else:
+        albedo = projected(read_textures(texture)[:3], corner, random.uniform(1, 2.5))
+    if random.random() < 0.5:
+        paint = random.uniform(0.08, 0.8, 3)
+        albedo = np.where(second[:, None], paint * (1 + 0.15 * noise[2][:, None]), albedo)
+    level = np.digitize(noise[1], (-0.5, 0.5))
+    grades = []
+    for rough in random.uniform((0.2, 0.4), (0.5, 0.8)):
+        ior = float(random.uniform(1.4, 1.6))
+        f0 = random.choice([0.042 * np.exp(0.2 * random.normal()), random.uniform(0.02, 0.2)])
+        follow, gloss = random.uniform(-0.3, 0.3, 2)
+        for step in (-1, 0, 1):
+            strength = float(f0 * (1 + step * follow) / fresnel.normal_reflectance(ior))
+            grades.append({"strength": strength, "alpha": float((rough * (1 + step * gloss)) ** 2), "ior": ior})
+    maps = {name: np.clip(albedo[:, k], 0.02, 0.9) for k, name in enumerate("rgb")}
+    return {**maps, "grade": 3 * second + level, "grades": grades}
+
+
+def projected(picture: Floats, corner: Floats, scale: float) -> Floats:
+    """A picture (3, T, T), mirrored at its sides, on faces (F, 3, 3) along the nearest axis; (F, 3)."""
+    axis = np.abs(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])).argmax(axis=1)
+    middle = corner.mean(axis=1) * scale
+    u, v = (np.take_along_axis(middle, ((axis + k) % 3)[:, None], 1)[:, 0] for k in (1, 2))
+    column, row = (np.rint(np.abs((x + 1) % 4 - 2) * (picture.shape[-1] - 1) / 2).astype(int) for x in (u, v))
+    return np.asarray(picture[:, row, column].T)
+
+
+def scene(
+    mi: Any, parts: list[Any], channel: str, light: list[float], power: float, view: View, size: int, depth: int
+) -> Any:
+    """What Mitsuba renders of one colour channel."""
+    offset = [((size - 1) / 2 - c) / size for c in view.center]
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "stokes", "nested": {"type": "path", "max_depth": depth}},
+            "sensor": {
+                "type": "perspective",
+                "fov": float(np.degrees(2 * np.arctan(size / 2 / view.focal))),
+                "principal_point_offset_x": offset[0],
+                "principal_point_offset_y": offset[1],
+                "near_clip": 0.01,
+                "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, 0], target=[0, 0, -1], up=[0, 1, 0]),
+                "film": {
+                    "type": "hdrfilm",
+                    "pixel_format": "luminance",
+                    "width": size,
+                    "height": size,
+                    "rfilter": {"type": "box"},
+                    "component_format": "float32",
+                },
+                "sampler": {"type": "independent", "sample_count": PASS},
+            },
+            "light": {"type": "point", "position": light, "intensity": power},
+            **{f"part{k}": body(mi, part, channel) for k, part in enumerate(parts)},
+        }
+    )
+
+
+def body(mi: Any, part: dict[str, Any], channel: str) -> Any:
+    """One region's triangles: a texel for each face, and its material as attributes for the truth."""
+    count = len(part["position"])
+    settings = mi.Properties()
+    settings["bsdf"] = mi.load_dict(
+        {
+            "type": "pplastic",
+            "distribution": "ggx",
+            "alpha": part["alpha"],
+            "int_ior": part["ior"],
+            "ext_ior": 1.0,
+            "diffuse_reflectance": texels(mi, part[channel]),
+            "specular_reflectance": part["strength"],
+        }
+    )
+    mesh = mi.Mesh("part", 3 * count, count, has_vertex_normals=True, has_vertex_texcoords=True, props=settings)
+    for name in ("r", "g", "b", "strength", "alpha", "ior"):
+        mesh.add_attribute(f"face_{name}", 1, np.broadcast_to(part[name], count).astype(np.float32))
+    row, column = np.divmod(np.arange(count), TEXELS)
+    at = (np.stack([column, row], axis=1) + 0.5) / TEXELS  # v runs down the rows
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = part["position"].astype(np.float32).ravel()
+    parameters["vertex_normals"] = part["normal"].astype(np.float32).ravel()
+    parameters["vertex_texcoords"] = np.repeat(at, 3, axis=0).astype(np.float32).ravel()
+    parameters["faces"] = np.arange(3 * count, dtype=np.uint32)
+    parameters.update()
+    return mesh
+
+
+def texels(mi: Any, value: Floats) -> dict[str, Any]:
+    """One number per face, row by row."""
+    image = np.zeros(TEXELS * TEXELS, np.float32)
+    image[: len(value)] = value
+    bitmap = mi.Bitmap(image.reshape(TEXELS, TEXELS, 1))
+    return {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
+
+
+def shot(mi: Any, one: Any, view: View, size: int, seed: int) -> Floats:
+    """One pass of one channel: (3, H, W) in the frame of each ray.
+
+    Mitsuba's S1, S2 stand on the horizontal across each ray (view × up), ours on the projected x axis.
+    """
+    image = np.array(mi.render(one, seed=seed))[..., -12::3]
+    v = frames.rays(view, size, size).astype(float)
+    e_x, e_y = frames.basis(v)
+    across = np.cross(-v, [0.0, 1.0, 0.0])
+    turn = np.arctan2((across * e_y).sum(-1), (across * e_x).sum(-1))
+    linear = (image[..., 1] + 1j * image[..., 2]) * np.exp(2j * turn)
+    return np.stack([image[..., 0], linear.real, linear.imag])
+
+
+def seen(mi: Any, parts: list[Any], view: View, size: int) -> dict[str, Any]:
+    """Truth at the pixel centres: normal (camera frame, facing it), depth, mask and the material."""
+    y, x = np.mgrid[:size, :size].astype(np.float64)
+    v = render.view_rays(view, x, y).reshape(-1, 3)
+    found = mi.load_dict({"type": "scene", **{f"part{k}": body(mi, p, "r") for k, p in enumerate(parts)}})
+    ray = mi.Ray3f(mi.Point3f(0, 0, 0), mi.Vector3f(np.ascontiguousarray(-v.T, np.float32)))
+    hit = found.ray_intersect(ray)
+    mask = np.array(hit.is_valid())
+    value = {
+        name: np.where(mask, np.array(hit.shape.eval_attribute_1(f"face_{name}", hit, hit.is_valid())), 0)
+        for name in ("r", "g", "b", "strength", "alpha", "ior")
+    }
+    normal = np.array(hit.sh_frame.n).T
+    normal = np.where(mask[:, None], normal * np.sign((normal * v).sum(-1, keepdims=True)), 0)
+    f0 = value["strength"] * fresnel.normal_reflectance(np.maximum(value["ior"], 1))
+    flat = {
+        "normal": normal,
+        "depth": np.where(mask, np.array(hit.t) * v[:, 2], np.nan),
+        "mask": mask,
+        "diffuse": np.stack([value[c] for c in "rgb"], axis=-1),
+        "specular": np.repeat(f0[:, None], 3, axis=1),
+        "roughness": np.sqrt(value["alpha"]),
+        "ior": value["ior"],
+    }
+    shaped = {name: image.reshape(size, size, *image.shape[1:]) for name, image in flat.items()}
+    return {name: image if image.dtype == bool else image.astype(np.float32) for name, image in shaped.items()}
+
+
+def dolp_error(halves: Floats, mask: Any) -> float:
+    """1σ of the DoLP of both halves together, from their difference; (2, 3, H, W, 3) -> rms over the mask."""
+    total = halves.sum(axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        dolp = np.hypot(total[:, 1], total[:, 2]) / total[:, 0]
+    inside = mask & (total[:, 0].min(axis=0) > 0)
+    return float(np.sqrt(np.mean((dolp[0] - dolp[1])[inside] ** 2)) / 2)
+
+
+if __name__ == "__main__":
+    main()
