@@ -21,7 +21,7 @@ from msgspec import Meta, Struct
 from polcap.errors import HardwareError
 from polcap.rig import transport
 from polcap.rig.log import Log
-from polcap.rig.transport import Port, Silent
+from polcap.rig.transport import Port, Silent, patiently
 
 BACKLASH_DEG = 0.0  # the piezo drives the ring itself
 BAUD = 9600
@@ -66,8 +66,8 @@ class Elliptec:
         self._address = settings.address.upper()
         self._limit_s = limit_s
         self.model = "Elliptec"
-        self._ask("gs", "GS")  # clears a fault of the day before
-        told = self._ask("in", "IN")
+        patiently(lambda: self._ask("gs", "GS"))  # clears a fault of the day before
+        told = patiently(lambda: self._ask("in", "IN"))
         self.model = f"Elliptec ELL{int(told[0:2], 16)}"
         self._pulses = int(told[22:30], 16)  # per revolution
         if int(told[18:22], 16) != 360 or self._pulses < 360:
@@ -125,12 +125,12 @@ class Elliptec:
         )
 
     def _set(self, command: str) -> None:
-        status = int(self._ask(command, "GS"), 16)
+        status = int(patiently(lambda: self._ask(command, "GS")), 16)
         if status != _OK:
             raise self._fault(status)
 
     def _keep_zero(self, data: str) -> None:
-        if self._ask("go", "HO") != data:
+        if patiently(lambda: self._ask("go", "HO")) != data:
             self._set("so" + data)
             self._set("us")
 

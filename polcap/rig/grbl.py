@@ -19,7 +19,7 @@ from msgspec import Meta, Struct
 from polcap.errors import HardwareError
 from polcap.rig import manual, transport
 from polcap.rig.log import Log
-from polcap.rig.transport import Port, Silent
+from polcap.rig.transport import Port, Silent, patiently
 
 BACKLASH_DEG = 2.0
 BAUD = 115200
@@ -51,10 +51,11 @@ ERROR = {
     20: "the command is not supported",
     33: "the target is invalid",
 }
-_START_S = 3.0  # a board that restarts when its port is opened
+_START_S = 2.5  # a board that restarts when its port is opened
 _HOLD_S = 2.0  # to slow down in
 _RESET = b"\x18"
 _BANNER = re.compile(r"Grbl(?:HAL)? (1\.1\S*) .*")
+_STORED = re.compile(r"\$(\d+)=(\d+(?:\.\d+)?)(?: .*)?")
 _STATUS = re.compile(r"<(\w+)(?::\d+)?\|MPos:(-?\d+\.?\d*),(-?\d+\.?\d*),(-?\d+\.?\d*).*>")
 
 
@@ -78,8 +79,8 @@ class Grbl:
         self._log = log
         self._axis = "XYZ".index(settings.axis)
         self._zero = 0.0  # machine units
-        self.model = f"GRBL {self._wake()}"
-        stored = self._stored()
+        self.model = f"GRBL {patiently(self._wake)}"
+        stored = patiently(self._stored)
         self._per_degree = 1.0 if settings.steps is None else settings.steps / stored[100 + self._axis]
         self.speed_deg_s = stored[110 + self._axis] / 60.0 / self._per_degree
 
@@ -129,9 +130,8 @@ class Grbl:
         """The settings that $$ lists."""
         stored: dict[int, float] = {}
         for line in self._command("$$"):
-            number, _, value = line.removeprefix("$").partition("=")
-            with suppress(ValueError):
-                stored[int(number)] = float(value.split()[0])
+            if match := _STORED.fullmatch(line):
+                stored[int(match[1])] = float(match[2])
         for key in (100 + self._axis, 110 + self._axis):
             if not stored.get(key, 0.0) > 0.0:
                 raise Silent(f"{self.model} on {self._port.url} did not state ${key}; set it in GRBL, or try again")

@@ -17,12 +17,11 @@ from msgspec import Meta, Struct
 from polcap.errors import HardwareError, PolcapError, SettingError
 from polcap.rig import elliptec, grbl, line, manual
 from polcap.rig.log import Log
-from polcap.rig.transport import Port, Silent
+from polcap.rig.transport import Port, Silent, Unplugged, patiently
 
 T = TypeVar("T")
 
 MOTORS = ("elliptec", "grbl", "line", "simulated")  # a module each: Settings, BACKLASH_DEG, open_motor
-_ASKED_AGAIN = 2  # times, of a silent device
 _Names = tuple[Callable[[str], str | None], ...]
 _QUESTIONS: tuple[tuple[int, bytes, float, _Names], ...] = (  # baud, question, s, whose answer it may be
     (elliptec.BAUD, b"0in", 0.5, (elliptec.recognize,)),
@@ -116,7 +115,7 @@ def open_rotator(url: str, log: Log) -> Rotator:
             f"rotator {url!r} names no port; write {kind}:/dev/ttyUSB0, {kind}:COM3 or {kind}:socket://…"
         )
     motor: Motor = driver.open_motor(port, settings, drive.timeout, log)
-    return Driven(motor, drive, driver.BACKLASH_DEG if drive.backlash is None else drive.backlash)
+    return Driven(motor, drive, driver.BACKLASH_DEG if drive.backlash is None else drive.backlash, log)
 
 
 def probe(url: str) -> str | None:
@@ -150,7 +149,7 @@ class Driven:
 
     unattended = True
 
-    def __init__(self, motor: Motor, drive: Drive, backlash_deg: float) -> None:
+    def __init__(self, motor: Motor, drive: Drive, backlash_deg: float, log: Log) -> None:
         self.model = motor.model
         self.speed_deg_s = motor.speed_deg_s
         self.settle_s = drive.settle
@@ -158,16 +157,17 @@ class Driven:
         self._motor = motor
         self._drive = drive
         self._backlash_deg = backlash_deg
+        self._log = log
         self._homed = False
-        self._from: float | None = None  # where the last upward approach ended, motor degrees
+        self._at: float | None = None  # where it was left, coming from below; motor degrees
 
     def home(self) -> None:
-        self._from = None
-        _patiently(self._motor.home)
+        self._at = None
+        patiently(self._motor.home)
         self._homed = True
 
     def move(self, angle_deg: float) -> float:
-        if not self._homed:
+        if not self._homed or self._lost():
             self.home()
         target = self._drive.offset + (-angle_deg if self._drive.reverse else angle_deg)
         if self._motor.wraps:
@@ -176,22 +176,38 @@ class Driven:
         for _ in range(_APPROACHES):
             self._approach(target)
             time.sleep(self._drive.settle)
-            off = _signed(_patiently(self._motor.where) - target)
+            off = _signed(patiently(self._motor.where) - target)
             if abs(off) <= self._drive.tolerance:
-                self._from = target
+                self._at = target
                 return _unsigned(angle_deg + (-off if self._drive.reverse else off))
         raise HardwareError(
             f"{self.model} stands {off:+.2f}° off {angle_deg:g}°, more than tolerance = {self._drive.tolerance:g}°; "
             "free the ring, check the mount, or raise tolerance in the rotator's URL"
         )
 
+    def _lost(self) -> bool:
+        """Whether it no longer stands where it was left: restarted, locked, or turned by hand."""
+        if self._at is None:
+            return False
+        try:
+            away = _signed(patiently(self._motor.where) - self._at)
+            if abs(away) <= self._drive.tolerance:
+                return False
+            reason = f"stands {away:+.2f}° off where it was left"
+        except (Silent, Unplugged):
+            raise
+        except HardwareError as error:
+            reason = str(error)
+        self._log.write("rotator", "!", f"{reason}; homed again")
+        return True
+
     def _approach(self, target: float) -> None:
         """Turn to motor degrees, the last stretch upwards."""
-        came, self._from = self._from, None
+        came, self._at = self._at, None
         if self._backlash_deg and (came is None or target < came):
             below = target - self._backlash_deg
-            _patiently(lambda: self._motor.go(below))
-        _patiently(lambda: self._motor.go(target))
+            patiently(lambda: self._motor.go(below))
+        patiently(lambda: self._motor.go(target))
 
     def stop(self) -> None:
         self._homed = False  # released, the ring may be turned by hand
@@ -201,14 +217,6 @@ class Driven:
     def close(self) -> None:
         self.stop()
         self._motor.close()
-
-
-def _patiently(ask: Callable[[], T]) -> T:
-    """Ask a silent device again."""
-    for _ in range(_ASKED_AGAIN):
-        with suppress(Silent):
-            return ask()
-    return ask()
 
 
 def _signed(angle_deg: float) -> float:

@@ -5,8 +5,9 @@ URLs are pyserial's: `/dev/ttyUSB0`, `COM3`, `socket://host:port`, `loop://`. Al
 
 import errno
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from typing import TypeVar
 
 import serial
 from serial.tools import list_ports
@@ -14,6 +15,7 @@ from serial.tools import list_ports
 from polcap.errors import HardwareError, SettingError
 from polcap.rig.log import Log
 
+T = TypeVar("T")
 _FAILURES: tuple[type[Exception], ...] = (OSError, TypeError)  # TypeError: pyserial, closed meanwhile
 with suppress(ImportError):  # Windows
     import termios
@@ -38,6 +40,14 @@ class Silent(HardwareError):
 
 class Unplugged(HardwareError):
     """The port is gone."""
+
+
+def patiently(ask: Callable[[], T]) -> T:
+    """Ask a silent device up to three times."""
+    for _ in range(2):
+        with suppress(Silent):
+            return ask()
+    return ask()
 
 
 def ports() -> list[tuple[str, str]]:
