@@ -261,6 +261,19 @@ def check(
 
 @app.command()
 @_reported
+def doctor(context: typer.Context, json: Json = False) -> None:
+    """What works on this machine, what does not, and the remedy. Asks every serial port who answers."""
+    from polcap import doctor as doctors
+    from polcap.rig import camera_gphoto2, rotator, transport
+
+    found = doctors.examine(doctors.Rig(transport.ports, rotator.probe, camera_gphoto2.connected), Path.cwd())
+    _print(doctors.shown(found) if json else doctors.table(found))
+    if any(one.state == "fault" for one in found):
+        raise typer.Exit(SettingError.exit_code)
+
+
+@app.command()
+@_reported
 def synth(
     context: typer.Context,
     folder: Annotated[Path, typer.Argument(help="Folder to make; must be new or empty.")],
@@ -338,13 +351,18 @@ def train(
     out: Annotated[Path, typer.Option(help="Checkpoints and metrics.")] = Path("runs/train"),
     preset: Annotated[Literal["cpu", "gpu"], typer.Option(help="Size of the network and of a batch.")] = "cpu",
     minutes: Annotated[float, typer.Option(min=0.1, help="Training time, resumed parts together.")] = 90,
+    samples: Annotated[int | None, typer.Option(min=1, help="Pictures to learn from, instead of minutes.")] = None,
+    variant: Annotated[str, typer.Option(help="The network with one thing taken away, as the ablations.")] = "ours",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint.")] = False,
     threads: Annotated[int, typer.Option(min=1)] = 2,
     seed: Annotated[int, typer.Option(min=0)] = 1,
 ) -> None:
     """Train the network (extra [train])."""
     trainer = _extra("train")
-    told = trainer.Params(preset=preset, data=data, out=out, minutes=minutes, resume=resume, threads=threads, seed=seed)
+    told = trainer.Params(
+        preset=preset, data=data, out=out, minutes=minutes, samples=samples, variant=variant, resume=resume,
+        threads=threads, seed=seed,
+    )  # fmt: skip
     _print(str(trainer.main(told)))
 
 

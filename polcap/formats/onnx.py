@@ -24,6 +24,7 @@ ENCODING = "1"
 NUMBERS = ("native_size", "size_multiple")
 REQUIRED = ("channels", "encoding", *NUMBERS, "licence")
 CUDA, CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
+_REMOTE = "AzureExecutionProvider"  # calls a service; computes nothing here
 Device = Literal["cpu", "cuda", "auto"]
 
 
@@ -61,6 +62,25 @@ def load(path: str | Path, device: Device = "cpu", threads: int = 0) -> Network:
         metadata=metadata,
         provider=provider,
     )
+
+
+def providers(path: Path) -> dict[str, str]:
+    """Every provider this onnxruntime has for this machine, and why it does not run the model; "" where it does."""
+    import onnxruntime
+
+    found = {}
+    for name in onnxruntime.get_available_providers():
+        if name == _REMOTE:
+            continue
+        try:
+            session = _open(path, path.read_bytes(), [name], 0)
+            shape = session.get_inputs()[0].shape
+            sides = [side if isinstance(side, int) else 64 for side in shape[2:]]
+            _run(path, session, np.zeros((1, shape[1], *sides), np.float32))
+            found[name] = "" if session.get_providers()[0] == name else "does not start"
+        except ModelError as error:
+            found[name] = str(error)
+    return found
 
 
 def _open(path: Path, data: bytes, providers: list[str], threads: int) -> Any:

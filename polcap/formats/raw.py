@@ -98,6 +98,18 @@ def _known(other: Any, lens: Any) -> dict[str, Any]:
     return {name: value for name, value in asdict(known).items() if value}
 
 
+def version() -> str:
+    """LibRaw's version, asked in the worker; raises DecodeError where that does not run."""
+    return str(worker.call("polcap.formats.raw:about", "LibRaw")[0]["version"])
+
+
+def about(path: str) -> worker.Answer:
+    """In the worker."""
+    import rawpy
+
+    return {"version": ".".join(map(str, rawpy.libraw_version))}, {}
+
+
 def decode(path: str) -> worker.Answer:
     """The counts and what they mean. In the worker."""
     import rawpy

@@ -102,7 +102,8 @@ class Gphoto2:
 
     def _connect(self) -> Any:
         gp = self._gp
-        found = [(str(name), str(port)) for name, port in gp.Camera.autodetect()]
+        every = gp.Camera.autodetect()
+        found = [(str(every.get_name(at)), str(every.get_value(at))) for at in range(every.count())]
         fitting = [(name, port) for name, port in found if self._which.lower() in name.lower() or port == self._which]
         if not fitting:
             listed = ", ".join(f"{name} at {port}" for name, port in found) or "none"
@@ -193,6 +194,18 @@ class Gphoto2:
             raise HardwareError(f"{self.model}: {what}: {error.string} ({error.code}); {remedy}") from None
         self._log.write("camera", "<", _shown(answer))
         return answer
+
+
+def connected() -> list[tuple[str, str]]:
+    """Model and port of every camera on a cable. Raises HardwareError; SettingError without gphoto2."""
+    try:
+        import gphoto2
+    except ModuleNotFoundError:
+        raise SettingError("gphoto2 is not installed; pip install 'polcap[rig]'") from None
+    try:
+        return [(str(name), str(port)) for name, port in gphoto2.Camera.autodetect()]
+    except gphoto2.GPhoto2Error as error:
+        raise HardwareError(f"cameras cannot be listed: {error.string} ({error.code}); check the cables") from None
 
 
 def _number(text: str) -> float | None:

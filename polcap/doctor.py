@@ -1,0 +1,182 @@
+"""In: this machine. Out: what polcap needs and finds here, each with ok, warning or fault, and the remedy.
+
+A fault is what keeps `polcap process` from working; the rest of the world may lack something without it.
+"""
+
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from polcap import __version__
+from polcap.errors import PolcapError
+from polcap.formats import calib, dng, onnx, raw
+from polcap.images import Exif
+
+_ENOUGH_GB, _LEAST_GB = 10.0, 1.0  # free disk: a capture of 24 MP with its result takes about 2
+_EDGE_PX = 64  # of the RAW that is written and decoded as a trial
+_CFA = np.array([[0, 1], [1, 2]], np.uint8)
+
+State = Literal["ok", "warning", "fault"]
+
+
+class Finding(msgspec.Struct, frozen=True):
+    """One thing looked at."""
+
+    name: str
+    state: State
+    says: str
+    remedy: str = ""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """How to ask for devices; each may raise a PolcapError."""
+
+    ports: Callable[[], list[tuple[str, str]]]  # device and description of every serial port
+    probe: Callable[[str], str | None]  # what answers there
+    cameras: Callable[[], list[tuple[str, str]]]  # model and port
+
+
+def examine(rig: Rig, folder: Path) -> tuple[Finding, ...]:
+    """Look at everything; `folder` says which disk."""
+    model = next(iter(sorted(calib.data_path("colorchecker").parent.glob("models/*.onnx"), reverse=True)), None)
+    return (
+        _libraries(),
+        _decoder(),
+        _model(model),
+        *(_providers(model) if model else ()),
+        _disk(folder),
+        *_ports(rig),
+        *_cameras(rig),
+    )
+
+
+def table(found: tuple[Finding, ...]) -> str:
+    """The findings for a person."""
+    rows = []
+    for one in found:
+        rows.append(f"{one.state:9}{one.name:16}{one.says}")
+        if one.remedy:
+            rows.append(f"{'':25}→ {one.remedy}")
+    return "\n".join(rows)
+
+
+def shown(found: tuple[Finding, ...]) -> dict[str, object]:
+    """The findings for a program."""
+    works = all(one.state != "fault" for one in found)
+    return {"polcap": __version__, "process_works": works, "findings": msgspec.to_builtins(found)}
+
+
+def _libraries() -> Finding:
+    import cv2
+
+    told = ", ".join(f"{name} {module}" for name, module in (("numpy", np.__version__), ("OpenCV", cv2.__version__)))
+    return Finding("polcap", "ok", f"{__version__}, Python {sys.version.split()[0]}, {told}")
+
+
+def _decoder() -> Finding:
+    """LibRaw's version, and whether it decodes a RAW file that was written for the purpose."""
+    try:
+        name = raw.version()
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "trial.dng"
+            counts = np.arange(_EDGE_PX**2, dtype=np.uint16).reshape(_EDGE_PX, _EDGE_PX)
+            dng.write(
+                file,
+                counts,
+                cfa=_CFA,
+                black=0,
+                white=16383,
+                exif=Exif(make="Polcap", model="Doctor"),
+                color_matrix=np.eye(3),
+                as_shot_neutral=np.ones(3),
+            )
+            same = np.array_equal(raw.read(file).value, counts)
+    except (PolcapError, OSError) as error:
+        return Finding("LibRaw", "fault", str(error), "pip install --force-reinstall rawpy")
+    if not same:
+        return Finding("LibRaw", "fault", f"{name} decodes a RAW wrongly", "pip install --force-reinstall rawpy")
+    return Finding("LibRaw", "ok", f"{name}, decodes a RAW in a process of its own")
+
+
+def _model(file: Path | None) -> Finding:
+    if file is None:
+        remedy = "name one with --model; without, the analytic estimator serves"
+        return Finding("model", "warning", "none is shipped with this polcap", remedy)
+    try:
+        network = onnx.load(file)
+    except PolcapError as error:
+        return Finding("model", "fault", str(error), "install polcap again, or use --estimator analytic")
+    told = network.metadata.get("version", network.digest[:8])
+    return Finding("model", "ok", f"{file.name}, version {told}, {file.stat().st_size / 1e6:.1f} MB, loads")
+
+
+def _providers(model: Path) -> Iterator[Finding]:
+    """Each provider of onnxruntime, with the shipped model really run on it."""
+    try:
+        found = onnx.providers(model)
+    except ImportError as error:
+        yield Finding("onnxruntime", "fault", str(error), "pip install onnxruntime")
+        return
+    for name, failure in found.items():
+        short = name.removesuffix("ExecutionProvider")
+        if not failure:
+            yield Finding(f"on {short}", "ok", f"onnxruntime {version('onnxruntime')} runs the model")
+        elif name == onnx.CPU:
+            yield Finding(f"on {short}", "fault", failure, "pip install --force-reinstall onnxruntime")
+        else:
+            remedy = "make driver, CUDA and cuDNN fit, or stay with --device cpu"
+            yield Finding(f"on {short}", "warning", failure, remedy)
+
+
+def _disk(folder: Path) -> Finding:
+    free = shutil.disk_usage(folder).free / 1e9
+    says = f"{free:.1f} GB free at {folder}"
+    if free >= _ENOUGH_GB:
+        return Finding("disk", "ok", says)
+    state: State = "fault" if free < _LEAST_GB else "warning"
+    return Finding("disk", state, says, "a capture of 24 MP with its result takes 2 GB: make room, or use --out")
+
+
+def _ports(rig: Rig) -> Iterator[Finding]:
+    try:
+        ports = rig.ports()
+    except PolcapError as error:
+        yield Finding("serial ports", "warning", str(error))
+        return
+    if not ports:
+        remedy = "plug the rotator in; under Linux its cable appears as /dev/ttyUSB0 or /dev/ttyACM0"
+        yield Finding("serial ports", "warning", "none", remedy)
+    for device, description in ports:
+        try:
+            answer = rig.probe(device)
+        except PolcapError as error:
+            remedy = "close what else uses the port; under Linux join the group `dialout`"
+            yield Finding(device, "warning", str(error), remedy)
+            continue
+        if answer:
+            yield Finding(device, "ok", f"{description}: {answer}")
+        else:
+            yield Finding(device, "warning", f"{description}: no rotator that polcap knows answers", "switch it on")
+
+
+def _cameras(rig: Rig) -> Iterator[Finding]:
+    try:
+        cameras = rig.cameras()
+    except PolcapError as error:
+        says, _, remedy = str(error).partition("; ")
+        yield Finding("cameras", "warning", says, remedy)
+        return
+    if not cameras:
+        remedy = "plug it in, switch it on, set it to PTP; or tether with another program and --camera folder:PATH"
+        yield Finding("cameras", "warning", "none", remedy)
+    for name, port in cameras:
+        yield Finding("camera", "ok", f"{name} at {port}")
