@@ -207,7 +207,7 @@ class Grbl:
             words = (ERROR if match[1] == "error" else ALARM).get(int(match[2]), "see GRBL's list of codes")
             raise self._error(f"says {line}: {words}")
         if _BANNER.fullmatch(line):
-            raise self._error("restarted and lost its position; check its supply, then --resume")
+            raise self._error("restarted and lost its position; check its supply")
         if line[0] not in "<[$>":
             raise self._port.strange(line)
         return False

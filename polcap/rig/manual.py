@@ -57,6 +57,6 @@ def ask(question: str, log: Log) -> str:
     log.write("person", ">", question.strip())
     answer = sys.stdin.readline() if sys.stdin else ""
     if not answer:
-        raise HardwareError("nobody turns the polarizer: the input has ended; run in a terminal, then --resume")
+        raise HardwareError("nobody turns the polarizer: the input has ended; run in a terminal")
     log.write("person", "<", answer.strip())
     return answer.strip()

@@ -154,7 +154,7 @@ class Port:
         except serial.SerialTimeoutException as error:
             raise Silent(f"{self._name} on {self.url} takes no data; check its power") from error
         except _FAILURES as error:
-            raise Unplugged(f"{self._name} on {self.url} is gone ({error}); plug it in again, then --resume") from error
+            raise Unplugged(f"{self._name} on {self.url} is gone ({error}); plug it in again") from error
 
 
 def shown(data: bytes) -> str:

@@ -46,7 +46,7 @@ def test_the_question_goes_to_stderr(monkeypatch: pytest.MonkeyPatch, capsys: py
 
 def test_the_end_of_input_is_an_error_with_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     typed(monkeypatch, "what?\n")
-    with pytest.raises(HardwareError, match="the input has ended; run in a terminal, then --resume"):
+    with pytest.raises(HardwareError, match="the input has ended; run in a terminal"):
         open_rotator("manual", Log(None)).move(45)
 
 
