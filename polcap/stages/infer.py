@@ -11,6 +11,7 @@ import cv2
 import msgspec
 import numpy as np
 from msgspec import Meta
+from scipy.special import erf
 
 from polcap.errors import ModelError
 from polcap.images import Cues, Floats, Network, Quality, SurfaceMaps
@@ -39,14 +40,21 @@ def estimate(cues: Cues, network: Network | None, settings: Settings) -> Surface
 # --- analytic -----------------------------------------------------------------------------------
 
 
-def _analytic(cues: Cues, settings: Settings) -> SurfaceMaps:
-    """Zenith by the exact DoLP inversion, half-turn of the azimuth by `optics/azimuth.py`."""
+def _analytic(cues: Cues, settings: Settings, guide: tuple[Floats, Floats] | None = None) -> SurfaceMaps:
+    """Zenith by the exact DoLP inversion; half-turn of the azimuth by `optics/azimuth.py`, or as `guide` has it.
+
+    guide : normals (H, W, 3) in the frame of each ray and their expected error (H, W), degrees.
+    """
     ratio, sigma = _smoothed(cues)
     squared = ratio[0] ** 2 + ratio[1] ** 2
     dolp = np.sqrt(np.maximum(squared - sigma**2, 0))
     cos_zenith = fresnel.cos_zenith_from_dolp(dolp, settings.ior)
     zenith = np.arccos(cos_zenith)
-    phi, certainty = azimuth.resolve(ratio / np.sqrt(squared + 1e-12), np.sin(zenith), cues.mask)
+    axis = ratio / np.sqrt(squared + 1e-12)
+    if guide is None:
+        phi, certainty = azimuth.resolve(axis, np.sin(zenith), cues.mask)
+    else:
+        phi, certainty = _guided(axis, cues.rays, *guide)
 
     normal = _from_angles(cos_zenith, phi, cues.rays)
     diffuse, highlight = _albedo(cues, cos_zenith, settings.ior)
@@ -63,6 +71,18 @@ def _analytic(cues: Cues, settings: Settings) -> SurfaceMaps:
         view=cues.view,
         estimator="analytic",
     )
+
+
+def _guided(axis: Floats, rays: Floats, normal: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+    """Azimuth (H, W) rad of axes (cos 2φ, sin 2φ) on the side of a known normal, and the half-turn's certainty.
+
+    The normal's error is taken as Gaussian across the axis; certainty is P(right side) − P(wrong side).
+    """
+    phi = np.arctan2(axis[1], axis[0]) / 2
+    turned = frames.axis_on_ray(phi, rays)
+    along = normal[..., 0] * np.cos(turned) + normal[..., 1] * np.sin(turned)
+    spread = np.radians(np.maximum(sigma, 1.0))
+    return phi + np.where(along < 0, np.pi, 0.0), np.asarray(erf(np.abs(along) / (np.sqrt(2) * spread)))
 
 
 def _smoothed(cues: Cues) -> tuple[Floats, Floats]:
@@ -176,7 +196,7 @@ def _learned(cues: Cues, network: Network, settings: Settings) -> SurfaceMaps:
     whole = _run(channels(_resized(cues, min(1.0, 1 / shrink))), network, settings)
     maps = {n: m if m.shape[:2] == (height, width) else cv2.resize(m, (width, height)) for n, m in whole.items()}
     diffuse = _color(cues, network, settings)
-    by_pixel = _analytic(cues, settings)
+    by_pixel = _analytic(cues, settings, (maps["normal"], maps["sigma"]))
     normal, expected = _joined(
         (np.asarray(frames.from_ray_frame(maps["normal"], cues.rays)), maps["sigma"]),
         (by_pixel.normal, by_pixel.confidence),

@@ -8,6 +8,7 @@ In the order a sample meets them:
     camera      Stokes parameters -> what three noisy photographs would have measured of them
     dataset     all of these -> a batch: network channels and truth
     model       channels -> maps
+    variants    the network with one thing taken away
     loss        maps against truth
     train       the loop, checkpoints, metrics
     export      weights -> ONNX

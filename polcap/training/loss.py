@@ -19,7 +19,9 @@ WEIGHTS = {
 }  # fmt: skip
 
 
-def total(maps: dict[str, Tensor], truth: Batch, random: torch.Generator | None) -> tuple[Tensor, dict[str, float]]:
+def total(
+    maps: dict[str, Tensor], truth: Batch, random: torch.Generator | None, *, polarized: bool = True
+) -> tuple[Tensor, dict[str, float]]:
     """The weighted sum, and each part as a number. maps and truth (B, ·, H, W); `random` draws the lights."""
     mask = truth.mask
     inside = mask[:, None].float()
@@ -40,7 +42,7 @@ def total(maps: dict[str, Tensor], truth: Batch, random: torch.Generator | None)
         "highlight": mean((maps["highlight"] - truth.highlight) ** 2),
         "sigma": mean(torch.log(maps["sigma"]) + angle.detach() / maps["sigma"]),  # least where sigma = E[angle]
     }
-    parts["render"] = _rendered(maps, truth, random)
+    parts["render"] = _rendered(maps, truth, random, polarized)
     loss = sum((WEIGHTS[name] * value for name, value in parts.items()), torch.zeros((), device=mask.device))
     figures = {name: float(value.detach()) for name, value in parts.items()}
     return loss, figures | {"degrees": float(mean(angle).detach()), "loss": float(loss.detach())}
@@ -50,7 +52,7 @@ def _centred(depth: Tensor, inside: Tensor) -> Tensor:
     return depth - (depth * inside).sum(dim=(2, 3), keepdim=True) / inside.sum(dim=(2, 3), keepdim=True).clamp(min=1)
 
 
-def _rendered(maps: dict[str, Tensor], truth: Batch, random: torch.Generator | None) -> Tensor:
+def _rendered(maps: dict[str, Tensor], truth: Batch, random: torch.Generator | None, polarized: bool) -> Tensor:
     """Polarized rendering loss on every second pixel of every second row, a new light and side for each pixel."""
     at = truth.mask[:, ::2, ::2].reshape(-1).nonzero()[:, 0]
 
@@ -70,6 +72,8 @@ def _rendered(maps: dict[str, Tensor], truth: Batch, random: torch.Generator | N
         pictures.append(shade.stokes(normal, diffuse, specular, rough, NOMINAL_IOR * ones, light, ones))
     estimate, goal = pictures
     intensity = (torch.log(estimate[0] + 0.05) - torch.log(goal[0] + 0.05)).abs().mean()
+    if not polarized:
+        return intensity
     polarization = (estimate[1:] - goal[1:]).abs() / (goal[0] + 0.05)
     return intensity + 2.0 * polarization.clamp(max=1.0).mean()
 

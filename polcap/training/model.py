@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from polcap.stages.cues import CHANNELS
+from polcap.training.variants import VARIANTS
 
 SIZE_MULTIPLE = 32
 OUTPUTS = ("normal", "depth", "diffuse", "specular", "roughness", "sigma")
@@ -53,30 +54,34 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
     surface reflects; it is learned for what it teaches the rest and is not exported.
     """
 
-    def __init__(self, shape: Shape = SMALL) -> None:
+    def __init__(self, shape: Shape = SMALL, variant: str = "ours") -> None:
         super().__init__()
-        self.shape = shape
+        self.shape, self.variant = shape, variant
+        self.inputs = VARIANTS[variant].inputs
+        skips = shape.skip_blocks if VARIANTS[variant].skip_convolutions else 0
         widths = shape.encoder
         self.stem = nn.Conv2d(4 * len(CHANNELS), widths[0], 3, padding=1)
         self.levels = nn.ModuleList(_residuals(w, n) for w, n in zip(widths, shape.blocks))
         self.down = nn.ModuleList(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(widths))
         self.context = Context(widths[-1])
-        self.geometry = Branch(widths, shape.geometry, shape.skip_blocks, 5)
-        self.color = Branch(widths, shape.color, shape.skip_blocks, 3)
-        self.gloss = Branch(widths, shape.gloss, shape.skip_blocks, 5, hints=9)
+        self.geometry = Branch(widths, shape.geometry, shape.skip_blocks, skips, 5)
+        self.color = Branch(widths, shape.color, shape.skip_blocks, skips, 3)
+        self.gloss = Branch(widths, shape.gloss, shape.skip_blocks, skips, 5, hints=9)
 
     def forward(self, x: Tensor) -> dict[str, Tensor]:
-        features = [self.levels[0](self.stem(F.pixel_unshuffle(x, 2)))]
+        seen = self.inputs(x)
+        features = [self.levels[0](self.stem(F.pixel_unshuffle(seen, 2)))]
         for down, level in zip(self.down, list(self.levels)[1:]):
             features.append(level(down(features[-1])))
-        features[-1] = self.context(features[-1], F.avg_pool2d(x[:, _MASK : _MASK + 1], SIZE_MULTIPLE))
-        shape, color = (branch(features, x).float() for branch in (self.geometry, self.color))
+        inside = x[:, _MASK : _MASK + 1]
+        features[-1] = self.context(features[-1], F.avg_pool2d(inside, SIZE_MULTIPLE))
+        shape, color = (branch(features, seen, inside).float() for branch in (self.geometry, self.color))
         level = x[:, _COLOR].float()
         normal = F.normalize(shape[:, :3] + shape.new_tensor([0.0, 0.0, 0.5]).view(1, 3, 1, 1), dim=1, eps=1e-6)
         diffuse = torch.sigmoid(level + color + 0.7)
         body = torch.log(0.9 * diffuse * normal[:, 2:].clamp(min=0) + 0.02)  # what the diffuse light would be
-        hints = torch.cat([normal, diffuse, level - body], dim=1).detach() * x[:, _MASK : _MASK + 1]
-        gloss = self.gloss(features, x, hints).float()
+        hints = torch.cat([normal, diffuse, level - body], dim=1).detach() * inside
+        gloss = self.gloss(features, torch.cat([seen, hints.to(seen.dtype)], dim=1), inside).float()
         return {
             "normal": normal,
             "depth": shape[:, 3:4],
@@ -160,14 +165,20 @@ class Branch(nn.Module):  # type: ignore[misc]  # torch comes without types here
     """One decoder: from the coarsest level up to full resolution; `hints` more channels are seen at every level."""
 
     def __init__(
-        self, encoder: tuple[int, ...], widths: tuple[int, ...], blocks: int, outputs: int, hints: int = 0
+        self,
+        encoder: tuple[int, ...],
+        widths: tuple[int, ...],
+        blocks: int,
+        skip_blocks: int,
+        outputs: int,
+        hints: int = 0,
     ) -> None:
         super().__init__()
         coarse = (*widths[1:], encoder[-1])  # what each level receives from below
         self.up = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in zip(coarse, widths))
         self.skip = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in zip(encoder, widths))
         self.block = nn.ModuleList(_residuals(w, blocks) for w in widths)
-        self.skip_block = nn.ModuleList(_residuals(w, blocks) for w in widths)
+        self.skip_block = nn.ModuleList(_residuals(w, skip_blocks) for w in widths)
         self.fine = nn.Conv2d(widths[0], 64, 3, padding=1)  # 16 channels at full resolution
         self.raw = nn.Conv2d(len(CHANNELS) + hints, 16, 3, padding=1)
         self.mix = nn.Conv2d(16, 16, 3, padding=1)
@@ -181,8 +192,7 @@ class Branch(nn.Module):  # type: ignore[misc]  # torch comes without types here
             self.hint.extend(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(widths))
             self.share = nn.ModuleDict({str(level): Share(widths[level]) for level in _SHARED})
 
-    def forward(self, features: list[Tensor], x: Tensor, hints: Tensor | None = None) -> Tensor:
-        seen = x if hints is None else torch.cat([x, hints.to(x.dtype)], dim=1)
+    def forward(self, features: list[Tensor], seen: Tensor, inside: Tensor) -> Tensor:
         hinted: list[Tensor] = []
         for hint in self.hint:
             hinted.append(hint(F.relu(hinted[-1]) if hinted else F.pixel_unshuffle(seen, 2)))
@@ -193,7 +203,7 @@ class Branch(nn.Module):  # type: ignore[misc]  # torch comes without types here
             lifted = F.interpolate(self.up[level](y), scale_factor=2.0, mode="bilinear", align_corners=False)
             y = self.block[level](skip + lifted)
             if str(level) in self.share:
-                y = self.share[str(level)](y, F.avg_pool2d(x[:, _MASK : _MASK + 1], 2 << level))
+                y = self.share[str(level)](y, F.avg_pool2d(inside, 2 << level))
         y = F.pixel_shuffle(self.fine(F.relu(y)), 2) + self.raw(seen)
         y = y + self.mix(F.relu(y))
         return self.out(F.relu(y))

@@ -1,8 +1,9 @@
 """Train the network with one command: cache of views, loop, checkpoints, metrics.
 
-The budget is a length of time, so that a run ends when it is meant to on any machine: the learning
-rate holds for 45 % of it and falls to nothing over the rest. A run that was stopped goes on from its
-last checkpoint with the time that was left. Same seed, same machine, same number of steps: same weights.
+The budget is a length of time, so that a run ends when it is meant to on any machine, or a number of
+pictures, so that runs can be compared. The learning rate holds for 45 % of it and falls to nothing over the
+rest. A run that was stopped goes on from its last checkpoint with what was left. Same seed, same machine,
+same number of steps: same weights.
 """
 
 import csv
@@ -25,6 +26,7 @@ from torch import Tensor
 from polcap.errors import InputError
 from polcap.training import gbuffers, loss, materials, model
 from polcap.training.dataset import Batch, Simulator
+from polcap.training.variants import VARIANTS
 from polcap.training.watch import Watch
 
 _HOLD = 0.45  # share of the budget at the full learning rate
@@ -40,10 +42,12 @@ class Params:
     data: Path = Path("data")  # holds meshes/ and materials/
     out: Path = Path("runs/train")  # cache of views, checkpoints, metrics
     minutes: float = 90.0  # training time, all resumed parts together; building the cache is extra
+    samples: int | None = None  # the budget in pictures instead, where runs are to be compared
     resume: bool = False  # go on from out/last.pt
     threads: int = 2  # learners on a CPU, each with a batch of its own; one more thread makes the batches
     seed: int = 1
-    rate: float = 6e-3  # of Muon
+    rate: float = 2e-3  # of Muon
+    variant: str = "ours"  # of variants.py
 
 
 @dataclass(frozen=True)
@@ -65,32 +69,37 @@ PRESETS = {
 
 def main(params: Params) -> Path:
     """Train, and leave out/last.pt (all that resuming needs, EMA weights included) and out/metrics.csv."""
-    if params.preset not in PRESETS:
-        raise InputError(f"preset {params.preset!r} is not one of {', '.join(PRESETS)}")
+    for name, value, known in (("preset", params.preset, PRESETS), ("variant", params.variant, VARIANTS)):
+        if value not in known:
+            raise InputError(f"{name} {value!r} is not one of {', '.join(known)}")
     preset = PRESETS[params.preset]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     params.out.mkdir(parents=True, exist_ok=True)
     simulator = Simulator(views(params, preset), library(params, "train", device), device)
     watch = Watch(params.data, params.out / "watch", device)
     learners = params.threads if device.type == "cpu" else 1
-    run = Run(preset.shape, device, params.rate, learners)
+    run = Run(preset.shape, device, params.rate, learners, params.variant)
     if params.resume:
         run.load(params.out / "last.pt")
     _keep_memory()
     torch.set_num_threads(1)
     ready = _ahead(simulator, preset, params.seed + run.step)
-    budget = params.minutes * 60
+
+    def progress() -> float:
+        """Share of the budget that is spent."""
+        return run.samples / params.samples if params.samples else run.elapsed / (params.minutes * 60)
+
     saved = looked = run.elapsed
     parts: list[dict[str, float]] = []
     before = time.monotonic()
-    while run.elapsed < budget:
-        parts.append(run.advance([next(ready) for _ in range(learners)], run.elapsed / budget))
+    while progress() < 1:
+        parts.append(run.advance([next(ready) for _ in range(learners)], progress()))
         now = time.monotonic()
         run.elapsed, before = run.elapsed + now - before, now
-        if run.step % 50 == 0 or run.step == 10 or run.elapsed >= budget:
+        if run.step % 50 == 0 or run.step == 10 or progress() >= 1:
             _record(params.out / "metrics.csv", run, {k: float(np.mean([p[k] for p in parts])) for k in parts[0]})
             parts = []
-        if run.elapsed - looked > 240 or (run.elapsed >= budget):
+        if run.elapsed - looked > 240 or progress() >= 1:
             looked = run.elapsed
             with run.averaged() as network:
                 _record(params.out / "watch.csv", run, watch.look(network))
@@ -157,9 +166,11 @@ class Run:
     that meet once a step waste less of a busy machine than threads that meet in every operation.
     """
 
-    def __init__(self, shape: model.Shape, device: torch.device, rate: float, learners: int = 1) -> None:
+    def __init__(
+        self, shape: model.Shape, device: torch.device, rate: float, learners: int = 1, variant: str = "ours"
+    ) -> None:
         self.device = device
-        self.network = model.Network(shape).to(device, memory_format=torch.channels_last)
+        self.network = model.Network(shape, variant).to(device, memory_format=torch.channels_last)
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.optimizers = _optimizers(self.network, rate)
         self.weights = list(self.network.parameters())
@@ -174,8 +185,10 @@ class Run:
             group["lr"] = group["full"] * min(1.0, (self.step + 1) / _WARM) * fall
         self.network.train()
         learned = list(self.pool.map(self._learn, batches, self.lights))
-        for weight, *gradients in zip(self.weights, *(gradient for gradient, _ in learned)):
-            weight.grad = sum(gradients[1:], gradients[0]) / len(gradients)
+        for weight, gradient in zip(self.weights, learned[0][0]):
+            weight.grad = gradient
+        for number, (others, _) in enumerate(learned[1:], start=2):  # their mean
+            torch._foreach_lerp_([weight.grad for weight in self.weights], list(others), 1 / number)
         norm = torch.nn.utils.clip_grad_norm_(self.weights, 1.0, foreach=True)
         if torch.isfinite(norm):
             for optimizer in self.optimizers:
@@ -195,7 +208,8 @@ class Run:
         """Gradient of the loss of one batch, and its parts."""
         with torch.autocast(self.device.type, torch.bfloat16, cache_enabled=False):  # threads share that cache
             maps = self.network(batch.channels.contiguous(memory_format=torch.channels_last))
-        value, figures = loss.total(maps, batch, lights)
+        polarized = VARIANTS[self.network.variant].polarized_loss
+        value, figures = loss.total(maps, batch, lights, polarized=polarized)
         return torch.autograd.grad(value, self.weights), figures
 
     @contextmanager
@@ -212,6 +226,7 @@ class Run:
         state = {
             "network": self.network.state_dict(), "average": self.average,
             "optimizers": [o.state_dict() for o in self.optimizers], "shape": asdict(self.network.shape),
+            "variant": self.network.variant,
             "step": self.step, "samples": self.samples, "elapsed": self.elapsed, "skipped": self.skipped,
         }  # fmt: skip
         beside = path.with_suffix(".part")
@@ -250,23 +265,36 @@ class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without 
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def step(self) -> None:
         for group in self.param_groups:
+            alike: dict[torch.Size, list[tuple[Tensor, Tensor]]] = {}  # weights and where they should go, by shape
             for weight in group["params"]:
-                mean = self.state[weight].setdefault("mean", torch.zeros_like(weight))
-                mean.lerp_(weight.grad, 1 - group["momentum"])
-                matrix = weight.grad.lerp(mean, group["momentum"]).flatten(1)  # Nesterov's look ahead
-                step = 0.2 * max(matrix.shape) ** 0.5 * orthogonal(matrix)  # rms 0.2 per weight
-                weight.mul_(1 - group["lr"] * group["decay"])
-                weight.add_(step.view_as(weight), alpha=-group["lr"])
+                gradient = _matrix(weight.grad.contiguous(memory_format=torch.channels_last))
+                mean = self.state[weight].setdefault("mean", torch.zeros_like(gradient))
+                mean.lerp_(gradient, 1 - group["momentum"])
+                ahead = gradient.lerp(mean, group["momentum"])  # Nesterov's look ahead
+                alike.setdefault(ahead.shape, []).append((_matrix(weight), ahead))
+            for shape, pairs in alike.items():
+                steps = orthogonal(torch.stack([ahead for _, ahead in pairs]))
+                length = 0.2 * max(shape) ** 0.5 * group["lr"]  # of rms 0.2 rate per weight
+                for (matrix, _), step in zip(pairs, steps):
+                    matrix.mul_(1 - group["lr"] * group["decay"]).add_(step, alpha=-length)
+
+
+def _matrix(weight: Tensor) -> Tensor:
+    """(out, kh·kw·in) of a convolution's channels-last weights, sharing their memory."""
+    return weight.permute(0, 2, 3, 1).view(len(weight), -1)
 
 
 def orthogonal(matrix: Tensor) -> Tensor:
-    """About U Vᵀ of the singular value decomposition: singular values within 0.7…1.2, by five Newton-Schulz steps."""
-    wide = matrix if matrix.shape[0] <= matrix.shape[1] else matrix.T
-    x = (wide / (wide.norm() + 1e-7)).bfloat16()
+    """About U Vᵀ of matrices' singular value decompositions, (N, rows, columns), by five Newton-Schulz steps.
+
+    Singular values end within 0.7…1.2, not at 1, where fewer steps would be needed.
+    """
+    wide = matrix if matrix.shape[-2] <= matrix.shape[-1] else matrix.mT
+    x = (wide / (torch.linalg.matrix_norm(wide, keepdim=True) + 1e-7)).bfloat16()
     for _ in range(5):
-        square = x @ x.T
-        x = 3.4445 * x + (2.0315 * square @ square - 4.7750 * square) @ x
-    return (x if matrix.shape[0] <= matrix.shape[1] else x.T).to(matrix.dtype)
+        square = x @ x.mT
+        x = torch.baddbmm(x, torch.baddbmm(square, square, square, beta=-4.7750, alpha=2.0315), x, beta=3.4445)
+    return (x if matrix.shape[-2] <= matrix.shape[-1] else x.mT).to(matrix.dtype)
 
 
 def _optimizers(network: model.Network, rate: float) -> list[torch.optim.Optimizer]:
@@ -290,7 +318,7 @@ def _optimizers(network: model.Network, rate: float) -> list[torch.optim.Optimiz
 def load_average(path: Path) -> tuple[model.Network, dict[str, Any]]:
     """The network with the EMA weights of a checkpoint, on the CPU, and the checkpoint's other facts."""
     state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-    network = model.Network(model.Shape(**state["shape"]))
+    network = model.Network(model.Shape(**state["shape"]), state["variant"])
     average: dict[str, Tensor] = state["average"]
     network.load_state_dict(average)
     return network.eval(), {k: state[k] for k in ("step", "samples", "elapsed")}

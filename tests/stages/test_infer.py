@@ -107,3 +107,24 @@ def test_a_crop_larger_than_two_tiles_keeps_its_texture():
     assert np.allclose(seen_whole, 0.3, atol=1e-5)
     assert seen_small.std() > 0.005
     assert seen_small.mean() == pytest.approx(0.3, rel=0.05)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_guide_settles_the_half_turn(side: float):
+    """Guided by the truth or by its opposite, the inversion returns that side of every clear axis."""
+    found = seen(noise=1e-5)
+    local, mask = scenes.truth()
+    guide = local * [side, side, 1]
+    maps = infer._analytic(found, infer.Settings(), (guide, np.full(mask.shape, 5.0)))
+    error = np.degrees(np.arccos(np.clip((frames.to_ray_frame(maps.normal, found.rays) * guide).sum(-1), -1, 1)))
+    assert np.median(error[mask & maps.mask]) < 1.0
+
+
+def test_a_guide_is_as_sure_as_its_error_is_small():
+    """P(right) − P(wrong) of a Gaussian: 68.3 % at one standard deviation from the axis."""
+    axis, rays = np.zeros((2, 1, 2)) + [[[1.0]], [[0.0]]], np.zeros((1, 2, 3)) + [0, 0, 1]
+    tilt = np.radians(10.0)
+    normal = np.zeros((1, 2, 3)) + [-tilt, 0, 1]
+    phi, certainty = infer._guided(axis, rays, normal, np.array([[10.0, 2.0]]))
+    np.testing.assert_allclose(np.cos(phi), -1)
+    np.testing.assert_allclose(certainty, [[0.6827, 1.0]], atol=1e-3)

@@ -5,6 +5,7 @@ import torch
 
 from polcap.stages.cues import CHANNELS
 from polcap.training import model
+from polcap.training.variants import VARIANTS
 
 TINY = model.Shape((8, 16, 16, 16, 16), (8, 8, 16, 16), (8, 8, 8, 8), (8, 8, 8, 8), (1, 1, 1, 1, 1), 1)
 
@@ -74,3 +75,28 @@ def test_groups_do_not_see_what_is_outside_the_mask() -> None:
     changed = x.clone()
     changed[..., 4:] += 1
     assert (share(x, inside) - share(changed, inside))[..., :4].abs().max() < 1e-2
+
+
+@pytest.mark.parametrize("name", [name for name, v in VARIANTS.items() if v.inputs is not VARIANTS["ours"].inputs])
+def test_variants_see_no_more_than_their_inputs(name: str) -> None:
+    """Without polarization, changing it changes nothing; the published inputs do not hold DoLP beyond the pictures."""
+    torch.manual_seed(5)
+    x = inputs(32, 32)
+    changed = x.clone()
+    blind = ["noise", "zenith_x"] if name == "published inputs" else ["s1", "s2", "zenith_x", "cos_2phi", "noise"]
+    for channel in blind:
+        changed[:, CHANNELS.index(channel)] += 1
+    network = model.Network(TINY, name)
+    for a, b in zip(network(x).values(), network(changed).values()):
+        torch.testing.assert_close(a, b)
+
+
+def test_published_pictures_are_what_an_analyzer_lets_through() -> None:
+    """Malus: the pictures at 0° and 90° add up to S0, and their difference is S1."""
+    x = inputs(32, 32)
+    at = {name: x[:, CHANNELS.index(name)] for name in CHANNELS}
+    seen = VARIANTS["published inputs"].inputs(x)
+    s0 = torch.exp(at["log_g"]) - 0.02
+    torch.testing.assert_close(seen[:, 1] + seen[:, 7], s0)
+    torch.testing.assert_close(seen[:, 1] - seen[:, 7], s0 * at["s1"] / 10)
+    assert seen.shape == x.shape

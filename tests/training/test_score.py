@@ -43,6 +43,14 @@ def test_known_errors_score_what_they_are(case: Case) -> None:
     assert score["rendering"] > 0
 
 
+def test_true_normals_integrate_to_less_than_flat_depth(case: Case) -> None:
+    judge = Judge(case)
+    inside = case.depth[case.truth.mask]
+    found = judge.integrated(replace(case.truth, depth_prior=None))["depth_integrated"]
+    assert found < 0.7 * inside.std() / np.ptp(inside)
+    assert judge.integrated(case.truth)["depth_integrated"] < 0.5 * found  # the true depth as prior
+
+
 def test_clipped_highlights_are_judged_alone(case: Case) -> None:
     quality = np.zeros_like(case.cues.quality)
     y, x = np.nonzero(case.truth.mask)

@@ -1,0 +1,58 @@
+"""The network with one thing taken away: what the ablations of the paper ask, and what the inputs are worth.
+
+All are trained by the same code on the same pictures. Inputs are functions of the channels, so that a
+variant sees the very pictures that the others see.
+
+References
+----------
+Deschaintre, Lin & Ghosh, Deep polarization imaging for 3D shape and SVBRDF acquisition, CVPR 2021, §6.
+Deschaintre et al., Single-image SVBRDF capture with a rendering-aware deep network, SIGGRAPH 2018 (loss).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from polcap.stages.cues import CHANNELS
+
+_AT = {name: CHANNELS.index(name) for name in CHANNELS}
+_UNPOLARIZED = ("log_r", "log_g", "log_b", "mask", "clipped", "ray_x", "ray_y")
+
+
+@dataclass(frozen=True)
+class Variant:
+    inputs: Callable[[Tensor], Tensor] = lambda x: x  # channels (B, N, H, W) -> what the layers see, as many
+    skip_convolutions: bool = True  # a convolution and residual blocks on every skip, else its projection alone
+    polarized_loss: bool = True  # Stokes parameters in the rendering loss, else S0 alone
+
+
+def _unpolarized(x: Tensor) -> Tensor:
+    """One picture under the flash: radiance, mask, saturation and rays."""
+    keep = x.new_tensor([float(name in _UNPOLARIZED) for name in CHANNELS])
+    return x * keep.view(1, -1, 1, 1)
+
+
+def _published(x: Tensor) -> Tensor:
+    """The paper's five inputs: pictures at 0°, 45° and 90°, normalised Stokes map, diffuse color; linear.
+
+    The pictures' polarization is the mean over the color channels, which are alike but for noise.
+    """
+    s0 = torch.exp(x[:, _AT["log_r"] : _AT["log_b"] + 1]) - 0.02
+    s1, s2 = (x[:, _AT[name]].unsqueeze(1) / 10 for name in ("s1", "s2"))
+    pictures = [s0 * (1 + part) / 2 for part in (s1, s2, -s1)]
+    stokes = x[:, _AT["cos_2phi"] : _AT["sin_2phi"] + 1]
+    both = torch.cat([*pictures, stokes, F.normalize(s0, dim=1, eps=1e-4)], dim=1)
+    return both * x[:, _AT["mask"]].unsqueeze(1)
+
+
+VARIANTS = {
+    "ours": Variant(),
+    "published inputs": Variant(_published),
+    "unpolarized inputs": Variant(_unpolarized),
+    "plain skips": Variant(skip_convolutions=False),
+    "unpolarized loss": Variant(polarized_loss=False),
+    "no polarization": Variant(_unpolarized, polarized_loss=False),
+}
