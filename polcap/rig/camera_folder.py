@@ -48,26 +48,25 @@ class WatchedFolder:
         """The next new RAW, once it is whole; a bracket that arrives at once is taken in order of its names."""
         self._log.write("camera", ">", f"{exposure}, {'lit' if flash else 'dark'}: waiting")
         end = time.monotonic() + self._timeout_s
-        sizes: dict[Path, tuple[int, float]] = {}  # and since when
+        grown: dict[Path, tuple[int, float]] = {}  # size, and since when
+        refused: dict[Path, int] = {}  # size at which a file was no RAW
         why = ""
         while time.monotonic() < end:
             for file in sorted(set(self._files()) - self._seen):
                 size, now = _size(file), time.monotonic()
-                if file not in sizes or sizes[file][0] != size:
-                    sizes[file] = size, now
-                elif size and now - sizes[file][1] >= self._stable_s:
-                    try:
-                        kind = sniff.kind(file)
-                        if kind == "raw":
-                            exif.read(file)
-                            data = file.read_bytes()
-                            self._seen.add(file)
-                            self._log.write("camera", "<", f"{file.name}, {len(data)} bytes")
-                            return Shot(data, file.name, exposure)
-                        if kind != "unknown":  # a JPEG beside the RAW, a sidecar
-                            self._seen.add(file)
-                    except (DecodeError, OSError) as error:  # half written, or gone again
-                        why = f" ({error})"
+                if file not in grown or grown[file][0] != size:
+                    grown[file] = size, now
+                if not size or now - grown[file][1] < self._stable_s or refused.get(file) == size:
+                    continue
+                try:
+                    if _whole(file):
+                        data = file.read_bytes()
+                        self._seen.add(file)
+                        self._log.write("camera", "<", f"{file.name}, {len(data)} bytes")
+                        return Shot(data, file.name, exposure)
+                except (DecodeError, OSError) as error:  # gone again, or damaged
+                    why = f" ({error})"
+                refused[file] = size
             time.sleep(_POLL_S)
         raise HardwareError(
             f"no new RAW file in {self._folder} within {self._timeout_s:g} s{why}; "
@@ -84,6 +83,14 @@ class WatchedFolder:
             raise HardwareError(
                 f"{self._folder} cannot be listed ({error.strerror}); is its disk still there?"
             ) from None
+
+
+def _whole(file: Path) -> bool:
+    """A RAW with all its data; not the JPEG beside it, nor one that is still being written. Raises DecodeError."""
+    if sniff.kind(file) != "raw" or sniff.structure(file).truncated:
+        return False
+    exif.read(file)
+    return True
 
 
 def _size(file: Path) -> int:

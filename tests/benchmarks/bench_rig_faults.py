@@ -1,0 +1,76 @@
+"""A hundred captures with one random fault each, resumed: did anything hang, get lost, or come out otherwise?
+
+python tests/benchmarks/bench_rig_faults.py [COUNT]
+
+The rotators are simulated on a pseudo-terminal at the protocol level, the camera hands out photographs made beforehand
+and sees the ring's true angle. Each trial checks: an end in time, every delivered frame on disk, every frame in
+capture.toml whole, no angle off by more than 0.06°, `--resume` takes exactly what is missing, and every frame of the
+finished capture equals the undisturbed one's. One capture per class is then processed beside the undisturbed one.
+"""
+
+import sys
+import tempfile
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from polcap import pipeline
+from polcap.config import Config
+from polcap.formats import capture as captures
+from polcap.images import ChartRequest
+from tests.rig import faults
+from tests.rig import pool as pools
+
+
+def main() -> None:
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else 6 * len(faults.CLASSES)
+    pool = pools.photographs(width=256, height=192)
+    with tempfile.TemporaryDirectory() as place:
+        root = Path(place)
+        expected = {}
+        for kind in faults.KINDS:
+            faults.undisturbed(kind, pool, root / kind.__name__)
+            expected[kind.__name__] = _processed(root / kind.__name__)
+        print("| class | seed | rotator | ended | kept | then taken | s | asset |\n|---|---|---|---|---|---|---|---|")
+        outcomes, broken, alike = [], 0, 0
+        for number in range(count):
+            fault, seed = faults.CLASSES[number % len(faults.CLASSES)], number // len(faults.CLASSES)
+            folder = root / f"{fault}-{seed}"
+            try:
+                outcome = faults.trial(fault, seed, pool, folder)
+            except AssertionError as error:
+                broken += 1
+                print(f"| {fault} | {seed} | | BROKEN: {error} | | | | |", flush=True)
+                continue
+            outcomes.append(outcome)
+            asset = ""
+            if seed == 0:
+                pairs = zip(expected[outcome.rotator], _processed(folder), strict=True)
+                same = all(np.array_equal(a, b) for a, b in pairs)
+                asset, alike = ("same", alike + 1) if same else ("DIFFERS", alike)
+                broken += not same
+            cells = (*outcome[:-1], f"{outcome.seconds:.1f}", asset)
+            print(f"| {' | '.join(map(str, cells))} |", flush=True)
+        ends = Counter(outcome.first for outcome in outcomes).most_common()
+        slowest = max(outcomes, key=lambda outcome: outcome.seconds)
+        print(
+            f"\n{count} faults of {len(faults.CLASSES)} classes, {broken} promises broken; {alike} processed to the "
+            f"undisturbed asset; slowest end {slowest.seconds:.1f} s ({slowest.fault}); "
+            f"ended: {', '.join(f'{end} {times} times' for end, times in ends)}"
+        )
+    raise SystemExit(broken > 0)
+
+
+def _processed(folder: Path) -> list[np.ndarray]:
+    """Normals, albedo and vertices of the analytic estimator."""
+    found = captures.read(folder)
+    out = folder / "polcap"
+    pipeline.process(found, pipeline.Given(chart=ChartRequest("none")), Config(), out)
+    results, _ = pipeline.reopen(out)
+    maps, mesh = results.maps.value, results.mesh.value
+    return [np.asarray(maps.normal), np.asarray(maps.diffuse), np.asarray(mesh.vertices)]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,133 @@
+"""A camera that hands out photographs made beforehand, with a fault on order; far quicker than rendering each."""
+
+import os
+import resource
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from polcap.errors import HardwareError
+from polcap.formats import dng
+from polcap.images import Exif, Role
+from polcap.rig import watchdog
+from polcap.rig.camera import Exposure, Shot
+from polcap.rig.frames import digest
+from polcap.rig.plan import Order
+from polcap.synth.capture import Shoot, Studio, Take, random_scene
+
+ANGLES = (0.0, 45.0, 90.0)
+BRACKET = tuple(Exposure(time_s=time, f_number=11.0, iso=100.0) for time in (0.005, 0.02, 0.08))
+ORDER = Order(angles_deg=ANGLES, bracket=BRACKET, repeat_deg=(45.0,), ambient=True, camera="simulated")
+CAMERA_FAULTS = ("stall", "disconnect", "card-full", "disk-full", "corrupt", "stale", "ctrl-c", "kill")
+
+Key = tuple[str, float, int]  # role, angle, step
+
+
+def photographs(width: int = 192, height: int = 144, scene_seed: int = 1) -> dict[Key, bytes]:
+    """Every frame of `ORDER`, and 45 degrees beside each: what a camera sees where the ring is wrong."""
+    shoot = Shoot(width=width, height=height, samples=1)
+    studio = Studio(random_scene(scene_seed, "bumps"), shoot)
+    found: dict[Key, bytes] = {}
+    file = Path(f"/tmp/.polcap-pool-{os.getpid()}.dng")
+    for number, angle in enumerate((*ANGLES, 135.0)):
+        light = studio.through(angle)
+        for again, role in enumerate(("shot", "repeat")):
+            for step, exposure in enumerate(BRACKET):
+                studio.photograph(file, light, Take(number, step, (exposure.time_s or 1) / 0.02, again))
+                found[role, angle, step] = file.read_bytes()
+        studio.photograph(file, light, Take(number, 7, 4.0, lit=False))
+        found["ambient", angle, 2] = file.read_bytes()
+    file.unlink()
+    return found
+
+
+def tiny(path: Path, **exif: object) -> bytes:
+    """A RAW of noise, 32×24 px, for tests that look at bytes and tags alone."""
+    facts = {"make": "Tiny", "model": "One", "lens": "L", "exposure_time": 0.02, "f_number": 11.0, "iso": 100.0}
+    random = np.random.default_rng([*repr(exif).encode()])
+    mosaic = random.integers(600, 9000, (24, 32)).astype(np.uint16)
+    dng.write(
+        path,
+        mosaic,
+        cfa=np.array([[0, 1], [1, 2]], np.uint8),
+        black=512,
+        white=15871,
+        exif=Exif(**{**facts, **exif}),  # type: ignore[arg-type]
+        color_matrix=np.eye(3),
+        as_shot_neutral=np.ones(3),
+        compression="none",
+    )
+    return path.read_bytes()
+
+
+class PoolCamera:
+    """Takes what the ring's true angle shows; `fault` strikes at the frame number `at`, once."""
+
+    model = "Polcap Synthetic"
+    frame_bytes = 100_000
+    switches_flash = True
+
+    def __init__(
+        self,
+        pool: dict[Key, bytes],
+        true_deg: Callable[[], float] | None = None,
+        fault: str = "",
+        at: int = 1,
+        timeout_s: float = 0.5,
+    ) -> None:
+        assert not fault or fault in CAMERA_FAULTS
+        self.pool, self.true_deg, self.fault, self.at, self.timeout_s = pool, true_deg, fault, at, timeout_s
+        self.delivered: list[tuple[Key, str]] = []
+        self.closed = False
+        self._last = b""
+
+    def bracket(self) -> tuple[Exposure, ...]:
+        return BRACKET
+
+    def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:
+        assert angle_deg is not None
+        if self.true_deg is not None:
+            here = self.true_deg() % 180
+            assert min(abs(here - angle_deg), 180 - abs(here - angle_deg)) < 0.1, "a frame at a wrong angle"
+        self._key = role, angle_deg, step
+
+    def shoot(self, exposure: Exposure, flash: bool) -> Shot:
+        data = self.pool[self._key]
+        if len(self.delivered) + 1 == self.at and self.fault:
+            fault, self.fault = self.fault, ""
+            if fault == "stall":
+                watchdog.within(self.timeout_s, "camera: capture", threading.Event().wait)
+            if fault in ("disconnect", "card-full"):
+                raise HardwareError(f"camera: capture: {fault}")
+            if fault == "corrupt":
+                data = data[: len(data) // 2]
+            if fault == "stale":
+                data = self._last or bytes(len(data))
+            if fault == "disk-full":
+                resource.setrlimit(resource.RLIMIT_FSIZE, (8192, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+            if fault == "ctrl-c":
+                signal.raise_signal(signal.SIGINT)
+            if fault == "kill":
+                os.kill(os.getpid(), signal.SIGKILL)
+        self._last = data
+        self.delivered.append((self._key, digest(data)))
+        return Shot(data, "POOL.DNG", exposure)
+
+    def close(self) -> None:
+        self.closed = True
+        limit = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+
+def saved(pool: dict[Key, bytes], file: Path) -> None:
+    """The pool as a file, for another process."""
+    file.write_bytes(msgspec.msgpack.encode([[*key, data] for key, data in pool.items()]))
+
+
+def loaded(file: Path) -> dict[Key, bytes]:
+    rows = msgspec.msgpack.decode(file.read_bytes())
+    return {(role, float(angle), step): data for role, angle, step, data in rows}

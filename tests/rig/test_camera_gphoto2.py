@@ -1,0 +1,133 @@
+"""libgphoto2's own virtual camera: settings really turned, RAW bytes end to end, and what a failing body becomes."""
+
+import importlib.util
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from polcap.errors import HardwareError, SettingError
+from polcap.rig import camera_gphoto2, frames
+from polcap.rig.camera import Exposure, open_camera
+from polcap.rig.camera_gphoto2 import Gphoto2
+from polcap.rig.log import Log
+from polcap.rig.watchdog import Stalled
+from tests.rig.pool import tiny
+
+gphoto2 = pytest.importorskip("gphoto2")
+
+
+@pytest.fixture
+def card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The virtual camera's card: it photographs what lies there."""
+    spec = importlib.util.find_spec("gphoto2")
+    assert spec is not None and spec.origin is not None
+    monkeypatch.setenv("IOLIBS", os.path.join(os.path.dirname(spec.origin), "libgphoto2", "vusb"))
+    card = tmp_path / "card"
+    card.mkdir()
+    monkeypatch.setenv("VCAMERADIR", f"{card}/")
+    tiny(card / "x.jpg")
+    return card
+
+
+@pytest.fixture
+def camera(card: Path, tmp_path: Path) -> Iterator[Gphoto2]:
+    log = Log(tmp_path / "rig.log")
+    camera = Gphoto2("", log, timeout_s=5.0)
+    yield camera
+    camera.close()
+    log.close()
+
+
+def test_raw_bytes_are_identical_and_named_by_content(camera: Gphoto2, card: Path) -> None:
+    shot = camera.shoot(Exposure(time_s=0.02), flash=True)
+    assert shot.data == (card / "x.jpg").read_bytes()
+    assert shot.name.endswith(".JPG") and frames.suffix(shot.data, shot.name) == ".dng"
+
+
+def test_dials_go_to_the_nearest_in_stops_and_say_where(camera: Gphoto2, tmp_path: Path) -> None:
+    shot = camera.shoot(Exposure(time_s=1 / 60, f_number=10.5, iso=100.0), flash=True)
+    assert shot.exposure == Exposure(time_s=0.02, f_number=11.0)  # of 0.02 s and 0.01 s; the body has no ISO
+    assert camera._value("shutterspeed") == "0.0200s" and camera._value("f-number") == "f/11"
+    told = (tmp_path / "rig.log").read_text()
+    assert "camera > shutterspeed = 0.0200s" in told and "camera > f-number = f/11" in told
+
+
+def test_a_value_the_dial_lacks_is_an_error_that_lists_the_others(camera: Gphoto2) -> None:
+    with pytest.raises(SettingError, match=r"time_s 0.4 .*0.1, 1\)"):
+        camera.shoot(Exposure(time_s=0.4), flash=True)
+
+
+def test_its_own_bracket_is_two_stops_around_its_shutter(camera: Gphoto2) -> None:
+    assert [exposure.time_s for exposure in camera.bracket()] == [0.0025, 0.01, 0.04]
+    assert not camera.switches_flash
+
+
+def test_a_body_that_fails_once_is_connected_anew(camera: Gphoto2, monkeypatch: pytest.MonkeyPatch) -> None:
+    real, calls = camera._capture, []
+
+    def fails_once() -> tuple[bytes, str]:
+        calls.append(1)
+        if len(calls) == 1:
+            raise gphoto2.GPhoto2Error(-7)
+        return real()
+
+    monkeypatch.setattr(camera, "_capture", fails_once)
+    assert camera.shoot(Exposure(), flash=True).data and len(calls) == 2
+
+
+def test_a_body_that_is_gone_is_one_error(camera: Gphoto2, monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone() -> tuple[bytes, str]:
+        raise gphoto2.GPhoto2Error(-52)
+
+    monkeypatch.setattr(camera, "_capture", gone)
+    with pytest.raises(HardwareError, match=r"Nikon DSC D750: capture: .* \(-52\); plug it in"):
+        camera.shoot(Exposure(), flash=True)
+
+
+def test_a_full_card_says_so(camera: Gphoto2, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full() -> tuple[bytes, str]:
+        raise gphoto2.GPhoto2Error(-115)
+
+    monkeypatch.setattr(camera, "_capture", full)
+    with pytest.raises(HardwareError, match="card is full"):
+        camera.shoot(Exposure(), flash=True)
+
+
+def test_a_stalled_body_is_left_alone_in_time(card: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = Gphoto2("D750", Log(None))
+    monkeypatch.setattr(camera, "_timeout_s", 0.3)
+    release, calls = threading.Event(), []
+
+    def stall() -> tuple[bytes, str]:
+        calls.append(1)
+        release.wait(20)
+        return b"", ""
+
+    monkeypatch.setattr(camera, "_capture", stall)
+    with pytest.raises(Stalled, match=r"capture took more than 0.3 s"):
+        camera.shoot(Exposure(), flash=True)
+    camera.close()  # returns, though the call hangs
+    assert len(calls) == 1
+    release.set()
+
+
+@pytest.mark.parametrize("which", ["Leica", "usb:009,009"])
+def test_another_camera_than_the_one_there_is_named(card: Path, which: str) -> None:
+    with pytest.raises(HardwareError, match="Nikon DSC D750 at usb:001,001"):
+        open_camera(f"gphoto2:{which}", Log(None))
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("1/200", 0.005), ("0.0050s", 0.005), ("f/11", 11.0), ("2,5", 2.5), ("30", 30.0), ("1/3.2 s", 1 / 3.2)],
+)
+def test_dials_are_read_in_every_makers_spelling(text: str, value: float) -> None:
+    assert camera_gphoto2._number(text) == pytest.approx(value)
+
+
+@pytest.mark.parametrize("text", ["Auto", "bulb", "0", "implicit auto", ""])
+def test_positions_without_a_value_are_left_out(text: str) -> None:
+    assert camera_gphoto2._number(text) is None

@@ -1,0 +1,27 @@
+"""Whatever fails: an end in time, no frame lost, no wrong angle, and a resume that completes the same capture."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.rig import faults
+from tests.rig.devices import Device
+from tests.rig.pool import Key, photographs
+
+
+@pytest.fixture(scope="module")
+def pool() -> dict[Key, bytes]:
+    return photographs(width=96, height=72)
+
+
+@pytest.mark.parametrize("fault", faults.CLASSES)
+def test_a_fault_costs_no_frame_and_the_capture_is_completed(
+    fault: str, pool: dict[Key, bytes], tmp_path: Path
+) -> None:
+    outcome = faults.trial(fault, 0, pool, tmp_path / "capture")
+    assert outcome.kept + outcome.taken == 15
+
+
+@pytest.mark.parametrize("kind", faults.KINDS)
+def test_every_rotator_shoots_a_whole_capture(kind: type[Device], pool: dict[Key, bytes], tmp_path: Path) -> None:
+    faults.undisturbed(kind, pool, tmp_path / "capture")
