@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import InputError
+from polcap.formats import mesh as mesh_files
 from polcap.images import Floats, GBuffer, View
 from polcap.synth.mesh import Tracer, Triangles, smooth
 from polcap.training import shapes
@@ -60,10 +61,8 @@ def load(folder: Path, *, mapped: bool = True) -> dict[str, NDArray]:  # type: i
 
 
 def read_mesh(path: Path) -> Triangles:
-    """A mesh of the data folder: `vq` uint16 (V, 3) with position = vq/65535·vscale + vmin, `faces`."""
-    with np.load(path) as data:
-        vertices = data["vq"].astype(np.float64) / 65535 * data["vscale"] + data["vmin"]
-        return smooth(vertices, data["faces"])
+    """A mesh file with shading normals."""
+    return smooth(*mesh_files.read(path))
 
 
 def depth_unit(mask: NDArray[np.bool_], depth: Floats, focal: float) -> tuple[float, float]:

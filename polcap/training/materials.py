@@ -10,13 +10,12 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from polcap.images import Floats
+from polcap.formats import textures
 
 _MATERIALS = 3  # slots per object
 _SIDE = 48  # of the noise volume
@@ -40,7 +39,7 @@ class Library:
     def __init__(self, folder: Path | None, device: torch.device, seed: int = 3) -> None:
         sets = sorted(p for p in folder.iterdir() if (p / "albedo.jpg").exists()) if folder else []
         self.names = [p.name for p in sets]
-        stack = [read_textures(p) for p in sets] or [np.full((6, _TEXELS, _TEXELS), 0.5, dtype=np.float32)]
+        stack = [textures.read(p, _TEXELS) for p in sets] or [np.full((6, _TEXELS, _TEXELS), 0.5, dtype=np.float32)]
         self.texture = torch.from_numpy(np.stack(stack, axis=1)).to(device)[None]  # (1, 6, T, 256, 256)
         self.has_textures = bool(sets)
         self.noise = _noise_volume(seed).to(device)  # (1, 7, D, D, D)
@@ -57,23 +56,6 @@ class Library:
         """(M, 7): four noises of unit deviation, then the gradient of the fourth."""
         grid = _mirror(position)[None, None, None]
         return F.grid_sample(self.noise, grid, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0, 0].T
-
-
-def read_textures(folder: Path) -> Floats:
-    """Linear albedo, roughness and two slopes of a texture set, (6, 256, 256)."""
-    size = (_TEXELS, _TEXELS)
-    albedo = _picture(folder / "albedo.jpg", size)[..., ::-1]
-    linear = np.where(albedo <= 0.04045, albedo / 12.92, ((albedo + 0.055) / 1.055) ** 2.4)
-    rough = _picture(folder / "roughness.jpg", size).mean(axis=-1)
-    slope: Floats = np.zeros((*size, 2), dtype=np.float32)
-    if (folder / "normal.jpg").exists():
-        n = _picture(folder / "normal.jpg", size)[..., ::-1] * 2 - 1
-        slope = -n[..., :2] / np.maximum(n[..., 2:], 0.3)
-    elif (folder / "height.jpg").exists():
-        height = _picture(folder / "height.jpg", size).mean(axis=-1)
-        slope = np.stack([np.roll(height, -1, a) - np.roll(height, 1, a) for a in (1, 0)], axis=-1) * 4
-    maps = np.concatenate([linear, rough[..., None], np.clip(slope, -2, 2)], axis=-1)
-    return np.ascontiguousarray(maps.transpose(2, 0, 1), dtype=np.float32)
 
 
 def dress(library: Library, normal: Tensor, position: Tensor, turn: Tensor, owner: Tensor, count: int) -> Surface:
@@ -184,11 +166,6 @@ def _noise_volume(seed: int) -> Tensor:
     steps = [torch.gradient(volume[0, 3], dim=d)[0] for d in (2, 1, 0)]  # x runs along the last axis
     gradient = torch.stack(steps)[None]
     return torch.cat([volume, gradient / gradient.std()], dim=1)
-
-
-def _picture(path: Path, size: tuple[int, int]) -> Floats:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.float32) / 255
 
 
 def _mirror(x: Tensor) -> Tensor:

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from polcap.errors import InputError
+from polcap.formats import textures
 from polcap.images import Floats
-from polcap.training import materials
 
 TEXTURES, PATTERNS = 10, 20
 _SEED = 2021
@@ -75,7 +75,7 @@ def _levels(number: int) -> tuple[np.random.Generator, float, float]:
 def _textured(folder: Path, number: int) -> Material:
     """A texture set projected along the nearest axis, mirrored at its edges."""
     rng, ior, level = _levels(number)
-    maps = np.ascontiguousarray(materials.read_textures(folder).transpose(1, 2, 0))  # albedo, roughness, two slopes
+    maps = np.ascontiguousarray(textures.read(folder).transpose(1, 2, 0))  # albedo, roughness, two slopes
     mean = float((maps[..., :3].mean(axis=-1) ** 0.45).mean())
     scale, follow, relief = rng.uniform(0.8, 2.0), rng.uniform(-0.5, 0.5), rng.uniform(0.2, 0.5)
 

@@ -19,13 +19,12 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from polcap.formats import atomic
+from polcap.formats import atomic, textures
 from polcap.images import Floats, View
 from polcap.optics import frames, fresnel
 from polcap.synth import materials, render
 from polcap.synth.mesh import Triangles
 from polcap.training import gbuffers
-from polcap.training.materials import read_textures
 
 FACES = 200_000  # at least, after subdivision: each has one colour
 TEXELS = 1024  # side of the bitmap that holds the faces' colours
@@ -46,14 +45,14 @@ def main() -> None:
     mi.set_variant("llvm_ad_mono_polarized")
     mi.set_log_level(mi.LogLevel.Error)
     meshes = sorted((options.data / "meshes" / "test").glob("*.npz"))
-    textures = sorted(p.parent for p in (options.data / "materials" / "test").glob("*/albedo.jpg"))
+    sets = sorted(p.parent for p in (options.data / "materials" / "test").glob("*/albedo.jpg"))
     for index in range(options.scenes):
         mesh = meshes[index % len(meshes)]
         file = options.folder / f"{index:02d}_{mesh.stem}.npz"
         if file.exists():
             continue
         random = np.random.default_rng([2026, index])
-        texture = textures[index // 2 % len(textures)] if index % 2 else None
+        texture = sets[index // 2 % len(sets)] if index % 2 else None
         began = time.monotonic()
         made, about = build(mi, gbuffers.read_mesh(mesh), texture, options.size, options.depth, random)
         with atomic.path(file) as temporary:
@@ -141,7 +140,7 @@ def dressed(corner: Floats, texture: Path | None, random: np.random.Generator) -
         other = np.clip(base * random.uniform(0.4, 1.6, 3), 0.03, 0.9)
         albedo = base + (other - base) / (1 + np.exp(-3 * noise[1][:, None]))
     else:
-        albedo = projected(read_textures(texture)[:3], corner, random.uniform(1, 2.5))
+        albedo = projected(textures.read(texture)[:3], corner, random.uniform(1, 2.5))
     if random.random() < 0.5:
         paint = random.uniform(0.08, 0.8, 3)
         albedo = np.where(second[:, None], paint * (1 + 0.15 * noise[2][:, None]), albedo)
