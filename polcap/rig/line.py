@@ -92,9 +92,7 @@ class Line:
             if hello := _HELLO.fullmatch(said):
                 if not hello[3]:  # asked for earlier
                     continue
-                raise HardwareError(
-                    f"{self.model} on {self._port.url} restarted and lost its zero; check its supply"
-                )
+                raise HardwareError(f"{self.model} on {self._port.url} restarted and lost its zero; check its supply")
             match = _SAYS.fullmatch(said)
             if match is None or not math.isfinite(float(match[2])):
                 raise self._port.strange(said)

@@ -116,8 +116,10 @@ class Port:
         half, self._kept = self._kept, b""
         if half.strip():
             self._log.write(self._name, "<", shown(half) + " …")
-            raise Silent(f"{self.where} only '{shown(half):.40}' within {limit:g} s; check the cable and the baud rate")
-        raise Silent(f"{self.where} nothing within {limit:g} s; check the cable, the power and the URL")
+            raise Silent(
+                f"{self.where} only '{shown(half):.40}' within {limit:.3g} s; check the cable and the baud rate"
+            )
+        raise Silent(f"{self.where} nothing within {limit:.3g} s; check the cable, the power and the URL")
 
     def drain(self) -> None:
         """Forget what has come and was not read. Raises Unplugged."""
@@ -154,7 +156,9 @@ class Port:
         except serial.SerialTimeoutException as error:
             raise Silent(f"{self._name} on {self.url} takes no data; check its power") from error
         except _FAILURES as error:
-            raise Unplugged(f"{self._name} on {self.url} is gone ({error}); plug it in again") from error
+            raise Unplugged(
+                f"{self._name} on {self.url} is gone: unplugged, or without power; plug it in again"
+            ) from error
 
 
 def shown(data: bytes) -> str:
