@@ -105,11 +105,11 @@ def parse_bracket(text: str) -> tuple[Exposure, ...]:
     found: list[Exposure] = []
     for part in text.split(","):
         stated: dict[str, float] = {} if not found else msgspec.structs.asdict(found[-1])
-        for word in part.split():
+        for word in part.split() or [part]:
             match = _WORD.fullmatch(word)
             value = float(match["value"]) if match else 0.0
             if match is None or not value:
-                raise SettingError(f"--bracket {word}: no exposure; write 1/200, f/11, iso100 or flash1/16")
+                raise SettingError(f"--bracket: {word!r} is no exposure; write 1/200, f/11, iso100 or flash1/16")
             if match["over"]:
                 value = float(match["over"][:-1]) / value
             names = {"f/": "f_number", "iso": "iso", "flash": "flash"}

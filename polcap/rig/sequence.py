@@ -162,7 +162,7 @@ def _photograph(slot: Slot, camera: Camera, log: Log) -> cameras.Shot:
 
 def _beside(angle_deg: float, asked_deg: float) -> float:
     """An angle modulo 360 as the number next to the one asked for."""
-    return asked_deg + (angle_deg - asked_deg + 180.0) % 360.0 - 180.0
+    return round(asked_deg + (angle_deg - asked_deg + 180.0) % 360.0 - 180.0, 4)
 
 
 def _finished(book: Record, landing: Landing) -> dict[str, Any]:
@@ -231,7 +231,7 @@ def _check_room(folder: Path, needed: int) -> None:
     free = shutil.disk_usage(folder).free
     if free < _SPARE * needed:
         raise StorageError(
-            f"{folder}: {free / 1e9:.2f} GB are free, and the frames need about {_SPARE * needed / 1e9:.2f} GB; "
+            f"{folder}: {free / 1e6:.0f} MB are free, and the frames need about {_SPARE * needed / 1e6:.0f} MB; "
             "free some space"
         )
 

@@ -8,6 +8,7 @@ capture.toml whole, no angle off by more than 0.06°, `--resume` takes exactly w
 finished capture equals the undisturbed one's. One capture per class is then processed beside the undisturbed one.
 """
 
+import signal
 import sys
 import tempfile
 from collections import Counter
@@ -25,6 +26,7 @@ from tests.rig import pool as pools
 
 def main() -> None:
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 6 * len(faults.CLASSES)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
     pool = pools.photographs(width=256, height=192)
     with tempfile.TemporaryDirectory() as place:
         root = Path(place)

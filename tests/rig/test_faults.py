@@ -6,12 +6,7 @@ import pytest
 
 from tests.rig import faults
 from tests.rig.devices import Device
-from tests.rig.pool import Key, photographs
-
-
-@pytest.fixture(scope="module")
-def pool() -> dict[Key, bytes]:
-    return photographs(width=96, height=72)
+from tests.rig.pool import Key
 
 
 @pytest.mark.parametrize("fault", faults.CLASSES)

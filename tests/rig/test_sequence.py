@@ -1,0 +1,343 @@
+"""What is taken in which order, what is kept, and how a run that was stopped goes on."""
+
+import itertools
+import shutil
+import signal
+import tomllib
+from collections import namedtuple
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from polcap.errors import CaptureError, HardwareError, SettingError, StorageError
+from polcap.formats import capture as captures
+from polcap.images import Role
+from polcap.rig import plan, record, sequence
+from polcap.rig.camera import Exposure, Shot, nearest, parse_bracket
+from polcap.rig.plan import Order, Slot
+from tests.rig import pool as pools
+from tests.rig.pool import BRACKET, Key, PoolCamera
+
+ORDER = msgspec.structs.replace(pools.ORDER, rotator="simulated")
+
+
+class Turner:
+    """A rotator that moves at once, `beside` what it is asked for."""
+
+    model, speed_deg_s, settle_s, tolerance_deg, unattended = "turner", 100.0, 0.0, 0.3, True
+
+    def __init__(self, beside: float = 0.0) -> None:
+        self.beside = beside
+        self.moves: list[float] = []
+        self.ended: list[str] = []
+
+    def home(self) -> None: ...
+
+    def move(self, angle_deg: float) -> float:
+        self.moves.append(angle_deg)
+        return (angle_deg + self.beside) % 360
+
+    def stop(self) -> None:
+        self.ended.append("stop")
+
+    def close(self) -> None:
+        self.ended.append("close")
+
+
+class Rig:
+    """The two devices, and the sequence on them."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, pool: dict[Key, bytes], folder: Path) -> None:
+        self.pool, self.folder = pool, folder
+        self.camera, self.turner = PoolCamera(pool), Turner()
+        self.said: list[str] = []
+        monkeypatch.setattr("polcap.rig.camera.open_camera", lambda name, log: self.camera)
+        monkeypatch.setattr("polcap.rig.rotator.open_rotator", lambda url, log: self.turner)
+
+    def shoot(self, order: Order = ORDER, resume: bool = False, **options: int) -> dict[str, object]:
+        return sequence.shoot(self.folder, order, resume=resume, tell=self.said.append, **options)  # type: ignore[arg-type]
+
+    def again(self) -> dict[str, object]:
+        self.camera, self.turner = PoolCamera(self.pool), Turner()
+        return self.shoot(resume=True)
+
+    @property
+    def taken(self) -> list[Key]:
+        return [key for key, _ in self.camera.delivered]
+
+
+@pytest.fixture
+def rig(monkeypatch: pytest.MonkeyPatch, pool: dict[Key, bytes], tmp_path: Path) -> Rig:
+    return Rig(monkeypatch, pool, tmp_path / "capture")
+
+
+def test_every_angle_is_visited_once_and_the_capture_reads_as_ordered(rig: Rig) -> None:
+    rig.turner.beside = -0.01
+    done = rig.shoot()
+    assert rig.turner.moves == [0.0, 45.0, 90.0]
+    assert rig.turner.ended == ["stop", "close"] and rig.camera.closed
+    understood = captures.read(rig.folder)
+    assert [shot.name for shot in understood.shots] == ["-0.01°", "44.99°", "89.99°", "44.99°"]
+    assert [len(shot.frames) for shot in understood.shots] == [3, 3, 3, 3]
+    assert [len(shot.ambient) for shot in understood.shots] == [1, 1, 1, 1]
+    assert done["frames"] == 15 and done["rejected"] == []
+    assert done["angles"][1] == {"asked_deg": 45.0, "read_deg": 44.99, "stated_deg": 44.99}  # type: ignore[index]
+    assert (rig.folder / "preview.png").exists()
+    stated = tomllib.loads((rig.folder / "capture.toml").read_text())
+    assert stated["rotator"] == {"model": "turner", "log": "rig.log"}
+
+
+def test_the_way_through_the_angles_is_the_shortest() -> None:
+    bracket = (BRACKET[0],)
+    for start in (0.0, 50.0, 170.0):
+        slots = [Slot("shot", angle, 0, exposure) for angle in (90.0, 30.0, 150.0, 60.0) for exposure in bracket]
+        ordered = [slot.angle_deg or 0.0 for slot in plan.schedule(slots, start)]
+        ways = itertools.permutations([30.0, 60.0, 90.0, 150.0])
+        least = min(_way(start, way) for way in ways)
+        assert _way(start, ordered) == pytest.approx(least), start
+
+
+def _way(start: float, angles: object) -> float:
+    return sum(abs(b - a) for a, b in itertools.pairwise([start, *angles]))  # type: ignore[misc]
+
+
+def test_chart_comes_first_and_what_a_person_switches_last() -> None:
+    slots = plan.slots(msgspec.structs.replace(ORDER, chart=True), switches_flash=False)
+    names = [slot.name for slot in plan.schedule(slots)]
+    assert names[0] == "chart/chart" and names[-1] == "ambient/ambient"
+    assert names[4:10] == [f"{place}frame_{n}" for place in ("pol045/", "repeat/pol045_") for n in (1, 2, 3)]
+
+
+def test_time_of_a_plan_is_the_sum_of_its_parts() -> None:
+    """0.84 s home, two turns of 45° at 430°/s and three settlings of 0.2 s, nine frames of 2 s + 0.105 s a bracket."""
+    order = Order((0.0, 45.0, 90.0), BRACKET, rotator="elliptec:/dev/ttyUSB0?settle=0.2", camera="gphoto2")
+    planned = plan.dry_run(order)
+    assert planned["frames"] == 9
+    assert planned["seconds"] == pytest.approx(360 / 430 + 90 / 430 + 2 * 0.2 + 9 * 2 + 3 * 0.105 + 1.0)
+    assert "about a minute" in plan.table(planned)
+
+
+def test_a_bad_frame_is_taken_again_at_once_and_kept_aside(rig: Rig) -> None:
+    rig.camera = PoolCamera(rig.pool, fault="corrupt", at=5)
+    done = rig.shoot()
+    assert len(rig.taken) == 16 and done["frames"] == 15
+    (bad,) = done["rejected"]  # type: ignore[misc]
+    assert bad["slot"] == "ambient/pol000" or bad["slot"].startswith("pol")
+    assert (rig.folder / bad["file"]).stat().st_size > 0
+
+
+class Stubborn(PoolCamera):
+    """Underexposes one slot for ever."""
+
+    def shoot(self, exposure: Exposure, flash: bool) -> Shot:
+        shot = super().shoot(exposure, flash)
+        if self._key == ("shot", 45.0, 2):
+            shot = Shot(self.pool["shot", 135.0, 1], shot.name, exposure)
+        return shot
+
+
+def test_a_frame_that_stays_bad_ends_the_run_with_its_reason(rig: Rig) -> None:
+    rig.camera = Stubborn(rig.pool)
+    with pytest.raises(CaptureError, match=r"pol045/frame_3 .*exposure time.* \(1 times\); what was taken is kept"):
+        rig.shoot(tries=0)
+    assert rig.turner.ended == ["stop", "close"]
+    rig.again()
+    assert ("shot", 45.0, 2) in rig.taken
+
+
+class Shaken(PoolCamera):
+    """Its first frame of the middle exposure is blurred."""
+
+    def shoot(self, exposure: Exposure, flash: bool) -> Shot:
+        shot = super().shoot(exposure, flash)
+        first = self._key == ("shot", 0.0, 1) and len(self.delivered) < 5
+        return Shot(self.pool["blurred", 0.0, 1], shot.name, exposure) if first else shot  # type: ignore[index]
+
+
+def test_an_early_frame_is_judged_by_its_later_neighbours(rig: Rig, tmp_path: Path) -> None:
+    from tests.rig.test_frames import _blur
+
+    (tmp_path / "sharp.dng").write_bytes(rig.pool["shot", 0.0, 1])
+    _blur(tmp_path / "sharp.dng", tmp_path / "blurred.dng", 2.0)
+    blurred = {("blurred", 0.0, 1): (tmp_path / "blurred.dng").read_bytes()}
+    rig.camera = Shaken({**rig.pool, **blurred})  # type: ignore[dict-item]
+    done = rig.shoot(msgspec.structs.replace(ORDER, repeat_deg=(), ambient=False))
+    (bad,) = done["rejected"]  # type: ignore[misc]
+    assert bad["slot"] == "pol000/frame_2" and "less sharp" in bad["reason"]
+    assert rig.taken.count(("shot", 0.0, 1)) == 2 and rig.turner.moves.count(0.0) == 2
+
+
+def _stopped(rig: Rig, at: int = 9) -> None:
+    rig.camera = PoolCamera(rig.pool, fault="disconnect", at=at)
+    with pytest.raises(HardwareError, match="--resume goes on"):
+        rig.shoot()
+
+
+def test_resume_takes_what_is_missing_and_nothing_else(rig: Rig) -> None:
+    _stopped(rig)
+    assert len(tomllib.loads((rig.folder / "capture.toml").read_text())["frame"]) == 8
+    rig.again()
+    assert len(rig.taken) == 7
+
+
+def test_resume_of_a_finished_capture_touches_no_device(rig: Rig) -> None:
+    rig.shoot()
+    rig.again()
+    assert rig.taken == [] and rig.turner.moves == []
+
+
+def test_a_frame_that_changed_meanwhile_is_put_aside_and_taken_again(rig: Rig) -> None:
+    _stopped(rig)
+    (rig.folder / "pol000/frame_2.dng").write_bytes(b"overwritten")
+    (rig.folder / "pol000/frame_3.dng").unlink()
+    rig.again()
+    assert {("shot", 0.0, 1), ("shot", 0.0, 2)} <= set(rig.taken)
+    assert (rig.folder / "rejected/pol000_frame_2.try1.dng").read_bytes() == b"overwritten"
+    assert any("frame_3.dng: is gone" in line for line in rig.said)
+
+
+def test_a_file_that_was_never_checked_is_put_aside(rig: Rig) -> None:
+    _stopped(rig)
+    (rig.folder / "pol090").mkdir(exist_ok=True)
+    (rig.folder / "pol090/frame_3.dng").write_bytes(b"landed, not judged")
+    (rig.folder / "pol090/.frame_1.7.part.dng").write_bytes(b"half")
+    rig.again()
+    assert (rig.folder / "rejected/pol090_frame_3.try1.dng").exists()
+    assert not list(rig.folder.rglob(".*.part*"))
+
+
+def test_a_bracket_is_of_one_angle_even_if_the_ring_comes_back_elsewhere(rig: Rig) -> None:
+    _stopped(rig, at=7)  # in the middle of 45°
+    rig.camera, rig.turner = PoolCamera(rig.pool), Turner(beside=0.25)
+    rig.shoot(resume=True)
+    content = record.load(rig.folder)
+    assert content is not None
+    for angle in (45.0, 90.0):
+        read = {good.read_deg for good in content.frames.values() if good.angle_deg == angle and good.role == "shot"}
+        assert read == {angle + 0.25}
+    assert all("came back" in bad.reason for bad in content.rejected) and len(content.rejected) > 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "flag"),
+    [
+        ({"angles_deg": (0.0, 60.0, 120.0), "repeat_deg": ()}, "--angles; give 0, 45, 90"),
+        ({"bracket": BRACKET[:2]}, r"--bracket; give 1/200s f/11 iso100, "),
+        ({"ambient": False}, "--ambient"),
+        ({"rotator": "simulated?offset=3"}, "--rotator"),
+    ],
+)
+def test_resume_with_other_settings_is_one_line(rig: Rig, changes: dict[str, object], flag: str) -> None:
+    _stopped(rig)
+    with pytest.raises(CaptureError, match=f"begun with another {flag}"):
+        rig.shoot(msgspec.structs.replace(ORDER, **changes), resume=True)
+
+
+def test_resume_without_settings_has_those_it_was_begun_with(rig: Rig) -> None:
+    _stopped(rig)
+    assert sequence.order(rig.folder, {"angles_deg": None, "camera": None}, resume=True) == ORDER
+    with pytest.raises(SettingError, match="--rotator is missing"):
+        sequence.order(rig.folder, {"camera": "simulated"}, resume=False)
+
+
+def test_the_port_may_be_another_after_the_cable_was_plugged_in_again(rig: Rig) -> None:
+    old, new = (msgspec.structs.replace(ORDER, rotator=f"elliptec:/dev/ttyUSB{n}?settle=1") for n in (0, 1))
+    rig.camera = PoolCamera(rig.pool, fault="disconnect", at=4)
+    with pytest.raises(HardwareError):
+        rig.shoot(old)
+    rig.shoot(new, resume=True)
+
+
+def test_a_folder_in_use_is_left_alone(rig: Rig) -> None:
+    rig.folder.mkdir()
+    (rig.folder / "holiday.jpg").write_text("mine")
+    with pytest.raises(CaptureError, match=r"is not empty \(holiday.jpg\)"):
+        rig.shoot()
+    assert [file.name for file in rig.folder.iterdir()] == ["holiday.jpg"]
+
+
+def test_a_begun_capture_asks_for_resume(rig: Rig) -> None:
+    _stopped(rig)
+    with pytest.raises(CaptureError, match="go on with --resume"):
+        rig.shoot()
+
+
+def test_a_disk_too_small_is_told_before_the_first_frame(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**9, 10**9, 10**6))
+    with pytest.raises(StorageError, match="1 MB are free, and the frames need about 2 MB"):
+        rig.shoot()
+    assert rig.taken == []
+
+
+def test_two_polcaps_do_not_share_a_folder(rig: Rig) -> None:
+    rig.folder.mkdir()
+    with sequence._alone(rig.folder), pytest.raises(StorageError, match="another polcap"):
+        rig.shoot()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_whatever_ends_a_run_the_motor_stops(rig: Rig, number: int) -> None:
+    class Ended(PoolCamera):
+        def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:
+            super().prepare(angle_deg, role, step)
+            if len(self.delivered) == 4:
+                signal.raise_signal(number)
+
+    rig.camera = Ended(rig.pool)
+    with pytest.raises(KeyboardInterrupt):
+        rig.shoot()
+    assert rig.turner.ended == ["stop", "close"] and rig.camera.closed
+    assert len(tomllib.loads((rig.folder / "capture.toml").read_text())["frame"]) == 4  # saved on the way out
+
+
+def test_dials_that_cannot_tell_two_exposures_apart_end_the_run(rig: Rig) -> None:
+    class Coarse(PoolCamera):
+        def shoot(self, exposure: Exposure, flash: bool) -> Shot:
+            shot = super().shoot(exposure, flash)
+            return Shot(self.pool["shot", 0.0, 1], shot.name, BRACKET[1]) if self._key[2] else shot
+
+    rig.camera = Coarse(rig.pool)
+    with pytest.raises(SettingError, match="give exposures that it can tell apart"):
+        rig.shoot()
+
+
+def test_what_needs_a_person_is_refused_where_there_is_none(rig: Rig) -> None:
+    with pytest.raises(SettingError, match="need a person at a terminal"):
+        rig.shoot(msgspec.structs.replace(ORDER, chart=True))
+    assert rig.taken == []
+
+
+@pytest.mark.parametrize(
+    ("angles", "repeat", "words"),
+    [
+        ((0.0, 45.0), (), "fewer than 3"),
+        ((0.0, 90.0, 180.0), (), "fewer than 3"),
+        ((0.0, 45.0, 400.0), (), "--angles 400"),
+        ((0.0, 45.0, 90.0, 45.0), (), "twice"),
+        ((0.0, 45.0, 90.0), (30.0,), "--repeat 30"),
+    ],
+)
+def test_an_order_no_capture_can_come_of_is_refused(
+    angles: tuple[float, ...], repeat: tuple[float, ...], words: str
+) -> None:
+    with pytest.raises(SettingError, match=words):
+        Order(angles, BRACKET, repeat_deg=repeat)
+
+
+def test_a_bracket_is_read_as_photographers_write_it() -> None:
+    assert [frame.time_s for frame in parse_bracket("1/200,1/50,0.5s")] == [0.005, 0.02, 0.5]
+    flash = parse_bracket("1/160 f/11 iso100 flash1/64, flash1/16")
+    assert flash[1] == Exposure(time_s=1 / 160, f_number=11.0, iso=100.0, flash=1 / 16)
+    assert parse_bracket(", ".join(map(str, flash))) == flash
+    for wrong in ("fast", "1/50,1/50", "f/0", ""):
+        with pytest.raises(SettingError, match="--bracket"):
+            parse_bracket(wrong)
+
+
+def test_the_nearest_setting_is_so_in_stops() -> None:
+    assert nearest("time_s", 1 / 60, [0.1, 0.02, 0.01]) == 0.02
+    assert nearest("f_number", 9.5, [8.0, 11.0], power=2.0) == 11.0
+    with pytest.raises(SettingError, match=r"f_number 9\.5"):
+        nearest("f_number", 9.5, [5.6, 16.0], power=2.0)
