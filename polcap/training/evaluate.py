@@ -27,7 +27,8 @@ from polcap.training.score import MAPS, Judge, Score, angle, deciles
 _PANEL = 8  # pictures shown
 _SAMPLE = 500  # pixels of a picture that the calibration is judged by
 _QUIET = 20  # s between two lines of progress
-OURS, MEAN = "ours", "mean of each map"
+OURS, CLEAN, ANALYTIC, MEAN = "ours", "ours, noise-free", "analytic", "mean of each map"
+_INTEGRATED = (OURS, CLEAN, ANALYTIC)  # columns whose normals are integrated
 
 Row = dict[str, Any]
 
@@ -74,8 +75,8 @@ def _head(params: Params, network: Network, found: dict[str, Path]) -> dict[str,
 def _columns(params: Params, made: Protocol, network: Network, found: dict[str, Path]) -> dict[str, Estimator]:
     return {
         OURS: lambda case: _estimated(case.cues, network),
-        "ours, noise-free": lambda case: _estimated(case.clean, network),
-        "analytic": lambda case: _estimated(case.cues, None),
+        CLEAN: lambda case: _estimated(case.clean, network),
+        ANALYTIC: lambda case: _estimated(case.cues, None),
         "frontal": lambda case: baselines.frontal(case.cues),
         "silhouette": lambda case: baselines.inflated(case.cues),
         MEAN: baselines.mean_maps(made, params.count),
@@ -143,7 +144,7 @@ def _row(number: int, made: Protocol, columns: dict[str, Estimator]) -> Row:
         maps = estimator(case)
         seconds[name] = time.monotonic() - before
         before = time.monotonic()
-        scores[name] = judge.score(maps)
+        scores[name] = judge.score(maps) | (judge.integrated(maps) if name in _INTEGRATED else {})
         judging += time.monotonic() - before
         if name == OURS:
             some = np.random.default_rng(number).permutation(int(mask.sum()))[:_SAMPLE]

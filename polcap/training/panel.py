@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap import pictures
-from polcap.images import SurfaceMaps
+from polcap.images import Floats, SurfaceMaps
 from polcap.pictures import Picture
 from polcap.training.protocol import Case
 from polcap.training.score import angle, drawn
@@ -26,14 +26,14 @@ _LIGHT = np.array([-0.6, 0.5, 0.62])
 
 
 def row(case: Case, maps: SurfaceMaps) -> Picture:
-    """Truth above, estimate below; in the second column DoLP above AoLP, in the last the error above its forecast."""
+    """Truth above, estimate below; in the last column the error above its forecast."""
     seen, mask = case.cues, case.truth.mask
     s1, s2 = seen.ratio
     depth = [case.depth, case.depth * 0 if maps.depth_prior is None else maps.depth_prior]
     centred = [d - d[mask].mean() for d in depth]
     span = float(np.abs(centred[0][mask]).max())
     columns = [
-        [pictures.display(seen.radiance, 1.0), np.zeros((*mask.shape, 3), np.uint8)],
+        [pictures.display(seen.radiance, 1.0), pictures.display(_lit(case, maps, np.array([0.0, 0.0, 1.0])), 1.0)],
         [pictures.scale(seen.dolp, 0, 0.4, mask), pictures.hue(np.arctan2(s2, s1) / 2, mask)],
         *(
             [draw(one) for one in (case.truth, maps)]
@@ -55,13 +55,15 @@ def row(case: Case, maps: SurfaceMaps) -> Picture:
 
 def _relit(case: Case, maps: SurfaceMaps) -> list[Picture]:
     """Truth and estimate under a light from the upper left."""
-    tiles = []
-    for one in (case.truth, maps):
-        image = np.zeros((*case.truth.mask.shape, 3), np.float32)
-        image[case.truth.mask] = drawn(one, case, _LIGHT / np.linalg.norm(_LIGHT))
-        tiles.append(image)
-    white = float(np.percentile(tiles[0][case.truth.mask], 99))
-    return [pictures.display(tile, white) for tile in tiles]
+    images = [_lit(case, one, _LIGHT / np.linalg.norm(_LIGHT)) for one in (case.truth, maps)]
+    white = float(np.percentile(images[0][case.truth.mask], 99))
+    return [pictures.display(image, white) for image in images]
+
+
+def _lit(case: Case, maps: SurfaceMaps, light: Floats) -> Floats:
+    image = np.zeros((*case.truth.mask.shape, 3), np.float32)
+    image[case.truth.mask] = drawn(maps, case, case.truth.mask, light)
+    return image
 
 
 def sheet(rows: list[Picture]) -> Picture:

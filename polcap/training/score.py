@@ -1,18 +1,25 @@
 """Errors of one picture's maps against its truth, over the truth's mask."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from polcap.images import Floats, Quality, SurfaceMaps
 from polcap.optics import frames, shade
+from polcap.stages import surface
 from polcap.training.protocol import Case, lights
 
 MAPS = ("diffuse", "specular", "roughness")
 _IOR = 1.5  # of the rendering error: the maps do not say it
+_DRAWN = 20_000  # pixels of the rendering error, at most: every second, third... of the mask
+_INTEGRATED = 128  # px, about: integrating 512² takes longer than all else
 _FLASH = np.array([0.0, 0.0, 1.0])  # where the light that sets white stands
 _LEAST_CLIPPED = 10  # pixels, for a highlight's error to count
 
 Score = dict[str, float]
+Bools = NDArray[np.bool_]
 
 
 class Judge:
@@ -23,7 +30,9 @@ class Judge:
         self.core = cv2.erode(self.mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         clipped = self.mask & ((case.cues.quality & Quality.CLIPPED) > 0)
         self.clipped = clipped if clipped.sum() >= _LEAST_CLIPPED else None
-        self.white = float(np.percentile(drawn(case.truth, case, _FLASH), 99))
+        self.drawn = np.zeros_like(self.mask)
+        self.drawn.flat[np.flatnonzero(self.mask)[:: -(-int(self.mask.sum()) // _DRAWN)]] = True
+        self.white = float(np.percentile(drawn(case.truth, case, self.drawn, _FLASH), 99))
         self.rendered = self._rendered(case.truth)
 
     def score(self, maps: SurfaceMaps) -> Score:
@@ -49,9 +58,18 @@ class Judge:
         difference = self._rendered(maps) - self.rendered
         return out | {"rendering": _rmse(difference), "rendering_l1": float(np.abs(difference).mean())}
 
+    def integrated(self, maps: SurfaceMaps) -> Score:
+        """depth_integrated: depth's error once stage 9 has made a surface of the maps, on every n-th pixel."""
+        by = max(1, round(max(self.mask.shape) / _INTEGRATED))
+        thin = _thinned(maps, by)
+        mask = thin.mask & self.mask[::by, ::by]
+        depth = surface.integrate(replace(thin, mask=mask), None, surface.Settings()).depth[mask]
+        unit = float(depth.mean() * np.sqrt(mask.sum() / np.pi) / thin.view.focal)
+        return {"depth_integrated": _depth(depth / unit, self.case.depth[::by, ::by][mask])["depth"]}
+
     def _rendered(self, maps: SurfaceMaps) -> Floats:
         """S0 (20, M, 3) under the stored lights, clipped to 0…1; 1 is the flash-lit truth's 99th percentile."""
-        return np.stack([np.clip(drawn(maps, self.case, light) / self.white, 0, 1) for light in lights()])
+        return np.stack([np.clip(drawn(maps, self.case, self.drawn, light) / self.white, 0, 1) for light in lights()])
 
 
 def angle(maps: SurfaceMaps, case: Case) -> Floats:
@@ -69,9 +87,20 @@ def deciles(predicted: Floats, actual: Floats) -> list[dict[str, float]]:
     ]
 
 
-def drawn(maps: SurfaceMaps, case: Case, light: Floats) -> Floats:
+def _thinned(maps: SurfaceMaps, by: int) -> SurfaceMaps:
+    """Every by-th pixel of every by-th row."""
+    thin = np.s_[::by, ::by]
+    x, y = maps.view.center
+    return replace(
+        maps, normal=maps.normal[thin], diffuse=maps.diffuse[thin], specular=maps.specular[thin],
+        roughness=maps.roughness[thin], confidence=maps.confidence[thin], mask=maps.mask[thin],
+        depth_prior=None if maps.depth_prior is None else maps.depth_prior[thin],
+        view=replace(maps.view, focal=maps.view.focal / by, center=(x / by, y / by), scale=maps.view.scale * by),
+    )  # fmt: skip
+
+
+def drawn(maps: SurfaceMaps, case: Case, mask: Bools, light: Floats) -> Floats:
     """S0 (M, 3) of the masked pixels under a distant light (3,), camera frame; as `optics/shade.py`, no shadow."""
-    mask = case.truth.mask
     rays = case.cues.rays[mask].astype(np.float32)
     normal = frames.to_ray_frame(maps.normal[mask], rays).astype(np.float32)
     toward = frames.to_ray_frame(np.broadcast_to(light.astype(np.float32), rays.shape), rays)

@@ -98,9 +98,11 @@ def stokes(scene: Scene, places: Places, pose: Pose, albedo: Albedo, rng: np.ran
     return np.asarray(direct + gather.diffuse(rng) + gather.mirrored(rng))
 
 
-def _shaded(places: Places, diffuse: Floats, specular: Floats, toward: Floats, irradiance: Floats) -> Floats:
-    ior = np.full(len(toward), places.ior)
-    return np.asarray(shade.stokes(places.normal, diffuse, specular, places.roughness, ior, toward, irradiance))
+def _shaded(
+    places: Places, diffuse: Floats, specular: Floats, toward: Floats, irradiance: Floats, ior: Floats | None = None
+) -> Floats:
+    index = np.full(len(toward), places.ior) if ior is None else ior
+    return np.asarray(shade.stokes(places.normal, diffuse, specular, places.roughness, index, toward, irradiance))
 
 
 class _Gather:
@@ -127,8 +129,14 @@ class _Gather:
         return _shaded(places, places.diffuse * received, 0 * places.specular, places.normal, one)
 
     def mirrored(self, rng: np.random.Generator) -> Floats:
-        """Reflected by facets drawn from the GGX distribution."""
+        """Reflected by facets drawn from the GGX distribution.
+
+        Where F0 is more than the body's index gives, facets have the index that gives it: a multiple of Fresnel's
+        curve would send back more light than comes, at grazing angles, where most of this light is.
+        """
         places, count = self.places, len(self.places.normal)
+        root = np.sqrt(np.maximum(places.specular.mean(axis=1), fresnel.normal_reflectance(places.ior)))
+        ior = (1 + root) / (1 - root)
         alpha = places.roughness**2
         turn, total = rng.uniform(0, 1, (count, 2)), np.zeros((3, count, 3))
         for k in range(_MIRRORED):
@@ -141,7 +149,9 @@ class _Gather:
             met, came = self.light(way, np.flatnonzero(possible))
             density = pi * brdf.ggx_distribution(cos_h[met], alpha[met]) * cos_h[met] / (4 * cos_d[met])
             irradiance = 1 / np.maximum(density * _MIRRORED, 1e-9)
-            total[:, met] += _shaded(places.take(met), 0 * came, places.specular[met] * came, way[met], irradiance)
+            total[:, met] += _shaded(
+                places.take(met), 0 * came, places.specular[met] * came, way[met], irradiance, ior[met]
+            )
         return np.stack([self.smooth(part) for part in total])
 
     def light(self, way: Floats, which: Indices) -> tuple[Indices, Floats]:
