@@ -53,11 +53,11 @@ ROWS = {
 }
 _AVERAGED = (
     "RMSE is the root of the mean square over a picture's masked pixels and channels (for renderings over the 20 "
-    "lights too); each figure is the mean of the pictures, as the paper's tables suggest. Depth is the estimator's "
-    "map, centred within the mask and divided by the truth's greatest minus least, no scale fitted; after "
-    "integration: the surface that stage 9 makes of the normals with it, at about 128 px. Renderings are linear, the flash-lit truth's "
-    "99th percentile is 1, clipped to 0…1, drawn with refractive index 1.5 and without cast shadows. The eroded mask "
-    "is 2 px thinner."
+    "lights too); each figure is the mean of the pictures, as the paper's tables suggest. Depth is the "
+    "estimator's map, centred within the mask and divided by the truth's greatest minus least, no scale fitted; "
+    "after integration: the surface that stage 9 makes of the normals with it, at about 128 px. Renderings are "
+    "linear, the flash-lit truth's 99th percentile is 1, clipped to 0…1, drawn with refractive index 1.5 and "
+    "without cast shadows. The eroded mask is 2 px thinner."
 )
 Table = Mapping[str, Mapping[str, float]]
 
