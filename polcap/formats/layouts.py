@@ -95,8 +95,13 @@ def _toml(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None)
         return Plan("sensor", _sensor_shots(shots, angles_deg), others)
     repeats = [source for source in sources if source.role == "repeat"]
     brackets = _select(folder, _group(shots), angles_deg)
-    again = tuple((angle, bracket) for angle, bracket in _group(repeats).items() if angle in dict(brackets))
-    return Plan("toml", (*brackets, *((angle, tuple(bracket)) for angle, bracket in again)), others)
+    again = [(angle, tuple(bracket)) for angle, bracket in _group(repeats).items() if _near(angle, dict(brackets))]
+    return Plan("toml", (*brackets, *again), others)
+
+
+def _near(angle_deg: float, known_deg: Iterable[float]) -> bool:
+    """A motor comes back to an angle by a hair's breadth."""
+    return any(abs((angle_deg - known + 90) % 180 - 90) < APART_DEG for known in known_deg)
 
 
 def _group(sources: Iterable[Source]) -> dict[float, list[Source]]:

@@ -149,6 +149,17 @@ def test_a_repeat_is_a_shot_of_its_own(tmp_path):
     assert understood.shots[3].frames[0].role == "repeat"
 
 
+def test_a_repeat_may_stand_a_little_beside_its_angle(tmp_path):
+    """A motor that comes back to 45° reads 45.02°; and 179.99° for 0°."""
+    text = ""
+    for name, angle in {"a": 0, "b": 45, "c": 90, "d": 45.02, "e": 179.99, "f": 60}.items():
+        shoot(tmp_path / f"{name}.dng")
+        role = '\nrole = "repeat"' if name in "def" else ""
+        text += f'[[frame]]\nfile = "{name}.dng"\nangle = {angle}{role}\n'
+    (tmp_path / "capture.toml").write_text(text)
+    assert degrees(capture.read(tmp_path)) == pytest.approx([0, 45, 90, 45.02, 179.99])
+
+
 def test_capture_toml_without_frames_only_adds_facts(tmp_path):
     folder = pictures(tmp_path, [f"pol_{angle}.tif" for angle in (0, 45, 90)])
     (folder / "capture.toml").write_text('encoding = "srgb"\nfocal_length_mm = 50\nsensor_width_mm = 36\n')
