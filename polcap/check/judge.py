@@ -8,13 +8,14 @@ import numpy as np
 
 from polcap.check.reduced import Taken
 from polcap.config import Config
-from polcap.errors import InputError
+from polcap.errors import ChartError, InputError
 from polcap.formats import calib
 from polcap.images import (
     Alignment,
     AngleStack,
     Capture,
     ChartRequest,
+    ColorCalibration,
     Floats,
     Gains,
     Network,
@@ -58,13 +59,8 @@ def lines(taken: Taken, network: Network | None, config: Config) -> Iterator[Lin
         motion = max(config.hdr.max_motion_px / taken.step, 1.0)
         radiance = hdr.merge(capture, msgspec.structs.replace(config.hdr, max_motion_px=motion))
         yield _exposures(capture, radiance)
-        stage = "chart"
-        color = whitebalance.measure(radiance, calib.colorchecker(), ChartRequest("auto"), config.whitebalance)
-        told = "found" if color.source == "chart" else "not found"
-        remedy = (
-            "" if color.source == "chart" else "colours and scale come from the camera alone; let the chart be seen"
-        )
-        yield Line("chart", "warning" if remedy else "ok", None, None, told, remedy)
+        color, line = _chart(radiance, config)
+        yield line
         stage = "alignment"
         free = msgspec.structs.replace(config.align, max_shift_px=500.0, min_correlation=0.0)
         alignment = align.register(radiance, color, free)
@@ -127,6 +123,18 @@ def _exposures(capture: Capture, radiance: AngleStack) -> Line:
         remedy = "a gap between two exposures: shoot one between"
         return Line("exposures", "warning", round(float(steps.max()), 3), most, says, remedy)
     return Line("exposures", "ok", round(float(steps.max()), 3), most, says)
+
+
+def _chart(radiance: AngleStack, config: Config) -> tuple[ColorCalibration, Line]:
+    """The colours; without a chart the rest can still be judged."""
+    reference = calib.colorchecker()
+    try:
+        color = whitebalance.measure(radiance, reference, ChartRequest("auto"), config.whitebalance)
+        return color, Line("chart", "ok", None, None, "found")
+    except ChartError:
+        remedy = "let it be seen whole, or give --chart or --no-chart to `polcap process`"
+        color = whitebalance.measure(radiance, reference, ChartRequest("none"), config.whitebalance)
+        return color, Line("chart", "warning", None, None, "not found", remedy)
 
 
 def _alignment(found: Alignment, radiance: AngleStack, taken: Taken, config: Config, names: list[str]) -> Line:
