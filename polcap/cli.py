@@ -282,14 +282,37 @@ def synth(
     assignments: Annotated[
         list[str] | None, typer.Option("--set", metavar="K=V", help="How it is shot, as width=768; repeatable.")
     ] = None,
+    mesh: Annotated[Path | None, typer.Option(metavar="FILE", help="A mesh stands there: PLY, OBJ, GLB, …")] = None,
+    material: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Texture set it wears: albedo.jpg, roughness.jpg, …")
+    ] = None,
+    cast_shadow: Annotated[
+        bool, typer.Option("--cast-shadow", help="The object's shadow falls on chart and backdrop; a mesh's always.")
+    ] = False,
+    interreflection: Annotated[
+        bool, typer.Option("--interreflection", help="Light goes once from part to part of the mesh.")
+    ] = False,
 ) -> None:
     """Photograph an object that does not exist: RAW brackets, with the truth beside them."""
+    from msgspec.structs import replace
+
     from polcap import config as settings
     from polcap.synth import capture as synthetic
     from polcap.synth import scenes
 
+    if interreflection and mesh is None:
+        raise SettingError("--interreflection is traced between triangles; give the object with --mesh")
     shoot = settings.fill(synthetic.Shoot, {"seed": seed}, assignments or ())
-    synthetic.write(folder, scenes.random_scene(seed, scene), shoot)
+    what = scenes.random_scene(seed, scene)
+    if mesh is not None:
+        what = scenes.with_model(what, mesh, seed)
+    if material is not None:
+        what = scenes.with_textures(what, material)
+    if cast_shadow:
+        what = replace(what, cast_shadows=True)
+    if interreflection:
+        what = replace(what, interreflection=True)
+    synthetic.write(folder, what, shoot)
     _print(str(folder))
 
 

@@ -28,7 +28,7 @@ def read(folder: Path, side: int = 256) -> Floats:
         slope = -n[..., :2] / np.maximum(n[..., 2:], 0.3)
     elif (folder / "height.jpg").exists():
         height = _picture(folder / "height.jpg", side).mean(axis=-1)
-        slope = np.stack([np.roll(height, -1, a) - np.roll(height, 1, a) for a in (1, 0)], axis=-1) * 4
+        slope = np.stack([np.roll(height, -1, a) - np.roll(height, 1, a) for a in (1, 0)], axis=-1) * side / 64
     maps = np.concatenate([linear, rough[..., None], np.clip(slope, -2, 2)], axis=-1)
     return np.ascontiguousarray(maps.transpose(2, 0, 1), dtype=np.float32)
 

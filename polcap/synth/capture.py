@@ -26,7 +26,7 @@ from polcap.optics.color import REC709_TO_XYZ
 from polcap.synth import camera, materials, render
 from polcap.synth import chart as charts
 from polcap.synth.camera import Sensor
-from polcap.synth.render import Scene
+from polcap.synth.render import Scene, Seen
 from polcap.synth.scenes import Kind, random_scene
 
 __all__ = ["MIDDLE_S", "Kind", "Scene", "Shoot", "Studio", "Take", "random_scene", "transform", "write"]
@@ -298,7 +298,7 @@ def _write_truth(
     place: Path,
     scene: Scene,
     shoot: Shoot,
-    buffer: GBuffer,
+    buffer: Seen,
     reference: Floats,
     to_camera: Floats,
     files: list[dict[str, Any]],
@@ -323,7 +323,7 @@ def _write_truth(
     with atomic.path(place / "truth.json") as temporary:
         temporary.write_bytes(msgspec.json.format(msgspec.json.encode(document), indent=1))
 
-    diffuse, specular, roughness, ior = materials.evaluate(scene.coat, buffer.position)
+    diffuse, specular, roughness, ior = materials.evaluate(scene.coat, buffer.position, buffer.facing)
     mask = buffer.mask
     with atomic.path(place / "truth.npz") as temporary:
         np.savez_compressed(

@@ -1,31 +1,40 @@
-"""Solid textures: position in the object's own frame -> albedo, F0, roughness and refractive index.
+"""Solid textures and texture sets: position in the object's own frame -> albedo, F0, roughness, index, relief.
 
-Every pattern is smooth at the scale of a pixel, so that a few samples per pixel do not alias.
+Every pattern is smooth at the scale of a pixel, so that a few samples per pixel do not alias. A texture
+set is laid on along the axis nearest to the bare surface's normal, and mirrored at its sides.
 """
 
-from typing import Annotated, Literal
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 
+from polcap.formats import textures
 from polcap.images import Floats
 from polcap.optics import fresnel
 
 Color = tuple[float, float, float]  # linear Rec.709
+_TEXELS = 512  # side of a texture
 
 
 class Material(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Two colours mixed by a pattern; the second one's share moves the roughness as well."""
+    """Two colours mixed by a pattern; the second one's share moves the roughness as well.
+
+    With a texture set its albedo times `first` is the colour, and its roughness the share.
+    """
 
     first: Color
     second: Color
     pattern: Literal["plain", "noise", "chequer", "veins"] = "noise"
-    size: Annotated[float, Meta(gt=0)] = 0.02  # m, of the pattern's features
+    size: Annotated[float, Meta(gt=0)] = 0.02  # m, of the pattern's features; side of the texture
     roughness: tuple[float, float] = (0.4, 0.4)  # perceptual, of the first and of the second
     specular: Annotated[float, Meta(ge=0)] = 1.0  # k_s: F0 = k_s ((n − 1)/(n + 1))²
     ior: Annotated[float, Meta(gt=1)] = 1.5
     seed: int = 0
+    texture: str | UnsetType = UNSET  # folder of a texture set
 
 
 class Coat(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -36,12 +45,15 @@ class Coat(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seed: int = 0
 
 
-def evaluate(coat: Coat, position: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Diffuse albedo (..., 3), specular F0 (..., 3), roughness (...,) and index (...,) at positions (..., 3) [m]."""
-    parts = [_one(material, position) for material in coat.materials]
+def evaluate(coat: Coat, position: Floats, facing: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Diffuse albedo (..., 3), specular F0 (..., 3), roughness (...,) and index (...,) at positions (..., 3) [m].
+
+    facing (..., 3): the bare surface's normal in the object's own frame.
+    """
+    parts = [_one(material, position, facing) for material in coat.materials]
     if len(parts) == 1:
         return parts[0]
-    second = solid_noise(position / coat.region_size, coat.seed) > 0
+    second = _is_second(coat, position)
     a, b = parts
     return (
         np.where(second[..., None], b[0], a[0]),
@@ -49,6 +61,16 @@ def evaluate(coat: Coat, position: Floats) -> tuple[Floats, Floats, Floats, Floa
         np.where(second, b[2], a[2]),
         np.where(second, b[3], a[3]),
     )
+
+
+def relieved(coat: Coat, position: Floats, facing: Floats) -> Floats:
+    """The normals that the relief of the texture sets makes of the bare ones; those where there is none."""
+    if all(material.texture is UNSET for material in coat.materials):
+        return facing
+    slopes = [_slope(material, position, facing) for material in coat.materials]
+    slope = slopes[0] if len(slopes) == 1 else np.where(_is_second(coat, position)[..., None], slopes[1], slopes[0])
+    bent = facing - slope + np.sum(slope * facing, axis=-1, keepdims=True) * facing
+    return np.asarray(bent / np.maximum(np.linalg.norm(bent, axis=-1, keepdims=True), 1e-12))
 
 
 def solid_noise(p: Floats, seed: int) -> Floats:
@@ -64,13 +86,51 @@ def solid_noise(p: Floats, seed: int) -> Floats:
     return np.asarray(total / np.sqrt(2.5 * sum(0.49**octave for octave in range(3))))
 
 
-def _one(material: Material, position: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    share = _pattern(material, position / material.size)
+def _is_second(coat: Coat, position: Floats) -> Floats:
+    return np.asarray(solid_noise(position / coat.region_size, coat.seed) > 0)
+
+
+def _one(material: Material, position: Floats, facing: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     first, second = np.array(material.first), np.array(material.second)
-    diffuse = first + (second - first) * share[..., None]
+    if material.texture is UNSET:
+        share = _pattern(material, position / material.size)
+        diffuse = first + (second - first) * share[..., None]
+    else:
+        picture, _, _ = _laid(material, position, facing)
+        diffuse, share = first * picture[..., :3], picture[..., 3]
     f0 = material.specular * fresnel.normal_reflectance(material.ior)
     roughness = material.roughness[0] + (material.roughness[1] - material.roughness[0]) * share
     return diffuse, np.full_like(diffuse, f0), roughness, np.full_like(share, material.ior)
+
+
+def _slope(material: Material, position: Floats, facing: Floats) -> Floats:
+    """Slope of the relief along the object's axes, (..., 3)."""
+    out = np.zeros_like(facing)
+    if material.texture is not UNSET:
+        picture, axis, sign = _laid(material, position, facing)
+        for k in (0, 1):
+            np.put_along_axis(out, (axis + k + 1) % 3, picture[..., 4 + k, None] * sign[..., k, None], axis=-1)
+    return out
+
+
+def _laid(material: Material, position: Floats, facing: Floats) -> tuple[Floats, Any, Floats]:
+    """The texture's six numbers (..., 6), the axis it is laid on along (..., 1), and whether u, v run back (..., 2)."""
+    texture = _texture(str(material.texture))
+    axis = np.abs(facing).argmax(axis=-1)[..., None]
+    across = np.concatenate([np.take_along_axis(position, (axis + k) % 3, axis=-1) for k in (1, 2)], axis=-1)
+    turned = np.mod(across / material.size, 2)
+    at = np.where(turned < 1, turned, 2 - turned) * (_TEXELS - 1)
+    corner = np.minimum(at.astype(np.intp), _TEXELS - 2)
+    column, row = corner[..., 0], corner[..., 1]
+    u, v = (at - corner)[..., :1], (at - corner)[..., 1:]
+    upper = texture[row, column] * (1 - u) + texture[row, column + 1] * u
+    lower = texture[row + 1, column] * (1 - u) + texture[row + 1, column + 1] * u
+    return upper * (1 - v) + lower * v, axis, np.where(turned < 1, 1.0, -1.0)
+
+
+@lru_cache(maxsize=4)
+def _texture(folder: str) -> Floats:
+    return np.ascontiguousarray(np.moveaxis(textures.read(Path(folder), _TEXELS), 0, -1))
 
 
 def _pattern(material: Material, p: Floats) -> Floats:

@@ -6,11 +6,14 @@ union, so shapes can be combined by putting them together.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import InputError
+from polcap.formats import mesh as files
 from polcap.images import Floats, GBuffer, View
 from polcap.optics import frames
 
@@ -60,6 +63,17 @@ def union(parts: Sequence[Triangles]) -> Triangles:
     )
 
 
+@dataclass(frozen=True)
+class Met:
+    """Where rays first meet a mesh, in the order of their index; the mesh's own frame."""
+
+    index: NDArray[np.intp]  # (N,) of the ray
+    position: Floats  # (N, 3)
+    normal: Floats  # (N, 3) unit, smooth, as the mesh has it
+    face: NDArray[np.integer]  # (N,)
+    weight: Floats  # (N, 3) of the face's corners
+
+
 class Tracer:
     """A mesh made ready for tracing; build once, look from many sides."""
 
@@ -79,16 +93,12 @@ class Tracer:
         rotation (3, 3) from the object's frame to the camera's, translation (3,).
         """
         v = frames.rays(view, height, width).reshape(-1, 3)  # surface to camera, camera frame
-        origin = np.broadcast_to(-translation @ rotation, v.shape).astype(np.float32)
-        direction = np.ascontiguousarray(-v @ rotation, dtype=np.float32)
-        hit = self._scene.run(np.ascontiguousarray(origin), direction, query="INTERSECT", output=True)
-        seen = np.flatnonzero(hit["primID"] >= 0)
-        face = hit["primID"][seen]
-        b, c = hit["u"][seen, None], hit["v"][seen, None]
-        weight = np.stack([1 - b - c, b, c], axis=1)  # (N, 3, 1)
-        position = np.sum(self.mesh.vertices[self.mesh.faces[face]] * weight, axis=1)
-        normal: Floats = _unit(np.sum(self.mesh.corner_normals[face] * weight, axis=1)) @ rotation.T
-        normal = _face_camera(normal, v[seen])
+        origin = np.broadcast_to(-translation @ rotation, v.shape)
+        direction = -v @ rotation
+        met = self.meet(origin, direction)
+        seen, position = met.index, met.position
+        normal: Floats = met.normal @ rotation.T
+        normal = face_camera(normal, v[seen])
         size = (height, width)
         depth = np.full(height * width, np.nan, dtype=np.float32)
         depth[seen] = -(position @ rotation.T + translation)[:, 2]
@@ -100,8 +110,39 @@ class Tracer:
             view=view,
         )
 
+    def meet(self, origin: Floats, direction: Floats) -> Met:
+        """First hits of rays (P, 3)."""
+        start, way = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, direction))
+        hit = self._scene.run(start, way, query="INTERSECT", output=True)
+        index = np.flatnonzero(hit["primID"] >= 0)
+        face = hit["primID"][index]
+        b, c = hit["u"][index], hit["v"][index]
+        weight = np.stack([1 - b - c, b, c], axis=1)
+        position = np.sum(self.mesh.vertices[self.mesh.faces[face]] * weight[..., None], axis=1)
+        normal = _unit(np.sum(self.mesh.corner_normals[face] * weight[..., None], axis=1))
+        return Met(index, position, normal, face, weight)
 
-def _face_camera(normal: Floats, v: Floats) -> Floats:
+    def hidden(self, origin: Floats, target: Floats) -> NDArray[np.bool_]:
+        """Whether the mesh stands between points (P, 3) and another (3,)."""
+        way = target - origin
+        far = np.linalg.norm(way, axis=1)
+        ray = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, way / far[:, None], far))
+        return np.asarray(self._scene.run(*ray, query="OCCLUDED") >= 0)
+
+
+@lru_cache(maxsize=2)
+def tracer(file: str, radius: float) -> Tracer:
+    """A mesh file about its middle, scaled so that a sphere of `radius` just holds it."""
+    vertices, faces = files.read(Path(file))
+    used = vertices[np.unique(faces)]
+    vertices = vertices - (used.min(axis=0) + used.max(axis=0)) / 2
+    largest = np.linalg.norm(vertices[np.unique(faces)], axis=1).max()
+    if not largest > 0:
+        raise InputError(f"{file} has no extent; give a mesh that is not one point")
+    return Tracer(smooth(vertices * (radius / largest), faces))
+
+
+def face_camera(normal: Floats, v: Floats) -> Floats:
     """Turn round normals of faces seen from behind; lift those that smoothing bent just past the limb."""
     facing = np.sum(normal * v, axis=-1, keepdims=True)
     normal = np.where(facing < -0.3, -normal, normal)

@@ -4,25 +4,30 @@ Everything is rendered where a shot's own pixels look; nothing is ever resampled
 `optics/frames.py`, metres, the lens at the origin. Radiance is in linear Rec.709.
 """
 
+from dataclasses import dataclass
+from functools import lru_cache
+
 import msgspec
 import numpy as np
+from msgspec import UNSET, UnsetType
 from scipy.ndimage import minimum_filter
 from scipy.spatial.transform import Rotation
 
+from polcap.errors import SettingError
 from polcap.images import Floats, GBuffer, View
-from polcap.optics import frames, mueller, shade
+from polcap.optics import frames, fresnel, mueller, shade
+from polcap.synth import bounce, materials, mesh, trace
 from polcap.synth import chart as charts
-from polcap.synth import materials, trace
 from polcap.synth.chart import Chart
 from polcap.synth.materials import Coat
-from polcap.synth.shapes import Shape
+from polcap.synth.shapes import Model, Shape
 from polcap.synth.trace import Hits, Vector
 
 
 class Scene(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One object under one flash, in front of a dark backdrop, with a chart beside it."""
 
-    shape: Shape
+    shape: Shape | Model
     coat: Coat
     position: Vector = (-0.065, 0.0, -0.70)  # m, of the object's origin
     turn_deg: Vector = (0.0, 0.0, 0.0)  # rotation vector of the object
@@ -31,6 +36,8 @@ class Scene(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     backdrop: float = 1.3  # m before the lens
     backdrop_albedo: float = 0.03
     shadows: bool = True  # of the object on itself
+    cast_shadows: bool | UnsetType = UNSET  # of the object on chart and backdrop
+    interreflection: bool | UnsetType = UNSET  # one diffuse bounce between parts of the object; meshes only
 
     @property
     def turn(self) -> Rotation:
@@ -60,21 +67,30 @@ def polarize(stokes: Floats, v: Floats, angle: float, extinction_ratio: float) -
     return np.asarray(np.einsum("hws,shwc->hwc", weights.astype(np.float32), stokes))
 
 
-def gbuffer(scene: Scene, view: View, height: int, width: int) -> GBuffer:
+@dataclass(frozen=True)
+class Seen(GBuffer):
+    """With the relief in `normal`, and what it was laid on."""
+
+    facing: Floats  # (H, W, 3) unit, normals of the bare shape in the object's own frame; 0 outside
+
+
+def gbuffer(scene: Scene, view: View, height: int, width: int) -> Seen:
     """What the ray through each pixel's centre meets of the object."""
     y, x = np.mgrid[:height, :width].astype(np.float64)
     hits, _ = _visible(scene, view_rays(view, x, y).reshape(-1, 3))
-    normal, position = np.zeros((2, height * width, 3), np.float32)
+    normal, position, facing = np.zeros((3, height * width, 3), np.float32)
     depth = np.full(height * width, np.nan, np.float32)
     mask = np.zeros(height * width, bool)
     at = hits.index
-    normal[at], position[at], depth[at], mask[at] = hits.normal, hits.local, -hits.point[:, 2], True
-    return GBuffer(
+    bare, bent = _normals(scene, hits)
+    normal[at], position[at], depth[at], mask[at], facing[at] = bent, hits.local, -hits.point[:, 2], True, bare
+    return Seen(
         normal=normal.reshape(height, width, 3),
         depth=depth.reshape(height, width),
         mask=mask.reshape(height, width),
         position=position.reshape(height, width, 3),
         view=view,
+        facing=facing.reshape(height, width, 3),
     )
 
 
@@ -112,14 +128,22 @@ def _visible(scene: Scene, v: Floats, start: Floats | None = None) -> tuple[Hits
     """The object where nothing stands before it, and S0 (P, 3) of the matt, unpolarized surroundings."""
     out = np.empty((len(v), 3))
     distance = scene.backdrop / v[:, 2]
-    wall = scene.backdrop_albedo * _irradiance(scene, -v * distance[:, None], np.array([0.0, 0.0, 1.0]))
+    wall = scene.backdrop_albedo * _arriving(scene, -v * distance[:, None], np.array([0.0, 0.0, 1.0]))
     out[:] = wall[:, None]
     hits = trace.trace(scene.shape, scene.position, scene.turn, v, start)
     if scene.chart is not None:
         at, to_chart, albedo = charts.seen(scene.chart, v)
         distance[at] = to_chart
-        out[at] = albedo * _irradiance(scene, -v[at] * distance[at, None], scene.chart.axes[0])[:, None]
+        out[at] = albedo * _arriving(scene, -v[at] * distance[at, None], scene.chart.axes[0])[:, None]
     return hits.take(np.flatnonzero(hits.distance < distance[hits.index])), out
+
+
+def _arriving(scene: Scene, point: Floats, normal: Floats) -> Floats:
+    """`_irradiance`, none of it where the object stands before the flash."""
+    light = _irradiance(scene, point, normal)
+    if scene.cast_shadows:
+        light[trace.behind(scene.shape, scene.position, scene.turn, point, scene.light)] = 0.0
+    return light
 
 
 def _irradiance(scene: Scene, point: Floats, normal: Floats) -> Floats:
@@ -140,6 +164,44 @@ def _shade(scene: Scene, ray: Floats, hits: Hits) -> Floats:
         lit = np.flatnonzero(np.einsum("ni,ni->n", hits.normal, to_light) > 0)
         hidden = trace.shadowed(scene.shape, scene.position, scene.turn, hits.take(lit), scene.light)
         irradiance[lit[hidden]] = 0.0
-    diffuse, specular, roughness, ior = materials.evaluate(scene.coat, hits.local)
-    normal, light = frames.to_ray_frame(hits.normal, ray), frames.to_ray_frame(to_light, ray)
-    return np.asarray(shade.stokes(normal, diffuse, specular, roughness, ior, light, irradiance))
+    facing, bent = _normals(scene, hits)
+    diffuse, specular, roughness, ior = materials.evaluate(scene.coat, hits.local, facing)
+    normal, light = frames.to_ray_frame(bent, ray), frames.to_ray_frame(to_light, ray)
+    direct = shade.stokes(normal, diffuse, specular, roughness, ior, light, irradiance)
+    if not scene.interreflection:
+        return np.asarray(direct)
+    came = np.einsum("nkc,nk->nc", _bounced(scene)[hits.face], hits.weight)
+    entered, _ = fresnel.transmission(1.0, ior)  # already in what came
+    return np.asarray(direct + shade.stokes(normal, diffuse * came, 0 * specular, roughness, ior, normal, 1 / entered))
+
+
+def _normals(scene: Scene, hits: Hits) -> tuple[Floats, Floats]:
+    """Bare normals (N, 3) in the object's frame; normals with relief, still towards the lens, in the camera's."""
+    facing = scene.turn.inv().apply(hits.normal)
+    bent = materials.relieved(scene.coat, hits.local, facing)
+    if bent is facing:
+        return facing, hits.normal
+    return facing, mesh.face_camera(scene.turn.apply(bent), -hits.point / hits.distance[:, None])
+
+
+@lru_cache(maxsize=2)
+def _bounced(scene: Scene) -> Floats:
+    """Light that other parts of a mesh throw on the corners of each face, (F, 3, 3)."""
+    if not isinstance(scene.shape, Model):
+        raise SettingError("interreflection is traced between triangles; give the object as a mesh")
+    tracer = mesh.tracer(scene.shape.file, scene.shape.radius)
+    source, lens = (scene.turn.inv().apply(np.array(at) - scene.position) for at in (scene.light, (0.0, 0.0, 0.0)))
+    reference = np.sum((np.array(scene.light) - scene.position) ** 2)
+
+    def lit(point: Floats, normal: Floats, towards: Floats) -> Floats:
+        to_light = source - point
+        squared = np.sum(to_light**2, axis=1)
+        cos_i = np.sum(to_light * normal, axis=1) / np.sqrt(squared)
+        hidden = tracer.hidden(point + trace.LIFT * normal, source) | (cos_i <= 0)
+        diffuse, _, _, ior = materials.evaluate(scene.coat, point, normal)
+        into, _ = fresnel.transmission(np.clip(cos_i, 1e-3, 1), ior)
+        out, _ = fresnel.transmission(np.clip(np.sum(towards * normal, axis=1), 1e-2, 1), ior)
+        return diffuse * np.where(hidden, 0, reference / squared * cos_i * into * out)[:, None]
+
+    ior = scene.coat.materials[0].ior
+    return np.asarray(bounce.received(tracer, lit, lens, ior)[tracer.mesh.faces])

@@ -1,15 +1,18 @@
-"""A seed -> a scene: textured bumps, clusters of balls that hide one another, vases."""
+"""A seed -> a scene: textured bumps, clusters of balls that hide one another, vases, or what a file holds."""
 
 import colorsys
+from pathlib import Path
 from typing import Literal, get_args
 
+import msgspec
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from polcap.errors import SettingError
 from polcap.synth.chart import Chart
 from polcap.synth.materials import Coat, Color, Material
 from polcap.synth.render import Scene
-from polcap.synth.shapes import Bumps, Cluster, Shape, Vase, Wave
+from polcap.synth.shapes import Bumps, Cluster, Model, Shape, Vase, Wave
 
 Kind = Literal["bumps", "clusters", "vase"]
 
@@ -38,6 +41,23 @@ def random_scene(seed: int, kind: Kind) -> Scene:
             turn_deg=_vector(random.uniform(-1, 1, 3) * (6, 6, 3)),
         ),
     )
+
+
+def with_model(scene: Scene, file: Path, seed: int) -> Scene:
+    """A mesh in the place of the scene's object, turned at random, casting its shadow."""
+    turn = np.random.default_rng([seed, 0x3E54]).normal(size=4)
+    vector = _vector(Rotation.from_quat(turn).as_rotvec(degrees=True))
+    model = Model(str(file), radius=0.08)
+    return msgspec.structs.replace(scene, shape=model, turn_deg=vector, cast_shadows=True)
+
+
+def with_textures(scene: Scene, folder: Path) -> Scene:
+    """A texture set in the place of the scene's first material, over all of the object."""
+    material = scene.coat.materials[0]
+    laid = msgspec.structs.replace(
+        material, first=(1.0, 1.0, 1.0), second=(1.0, 1.0, 1.0), size=0.1, roughness=(0.0, 1.0), texture=str(folder)
+    )
+    return msgspec.structs.replace(scene, coat=Coat((laid,)))
 
 
 def _bumps(random: np.random.Generator) -> Shape:

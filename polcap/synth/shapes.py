@@ -100,6 +100,13 @@ class Vase(msgspec.Struct, frozen=True, tag="vase", forbid_unknown_fields=True):
         return -_blend(-side, self.height / 2 - np.abs(p[..., 1]), 0.06 * self.height)
 
 
+class Model(msgspec.Struct, frozen=True, tag="model", forbid_unknown_fields=True):
+    """Triangles of a file, their middle at the origin. No distance field: `mesh.py` traces it."""
+
+    file: str
+    radius: float  # m, of the sphere about the origin that just holds it
+
+
 Shape = Cluster | Bumps | Superquadric | Vase
 
 

@@ -1,4 +1,4 @@
-"""Sphere tracing: rays of the camera -> where they meet a shape that stands somewhere before it.
+"""Rays of the camera -> where they meet a shape that stands somewhere before it: sphere tracing, Embree for meshes.
 
 References
 ----------
@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from polcap.images import Floats
-from polcap.synth.shapes import Shape
+from polcap.synth import mesh
+from polcap.synth.shapes import Model, Shape
 
 Vector = tuple[float, float, float]
 Indices = NDArray[np.integer[Any]]
 _TOLERANCE = 1e-6  # m, a ray this near has arrived
 _STEPS, _GRAZING = 300, 1e-4  # m, a ray that has crawled along the surface for so long has arrived too
-_LIFT = 5e-4  # m above the surface, where a shadow ray starts
+LIFT = 5e-4  # m above the surface, where a shadow ray starts
 
 
 @dataclass(frozen=True)
@@ -31,12 +32,14 @@ class Hits:
     point: Floats  # (N, 3) camera frame, m
     local: Floats  # (N, 3) shape's own frame, m
     normal: Floats  # (N, 3) camera frame, unit
+    face: Indices  # (N,) of a mesh, else −1
+    weight: Floats  # (N, 3) of the face's corners
 
     def take(self, which: Indices) -> "Hits":
         return Hits(*(value[which] for value in vars(self).values()))
 
 
-def trace(shape: Shape, position: Vector, turn: Rotation, v: Floats, start: Floats | None = None) -> Hits:
+def trace(shape: Shape | Model, position: Vector, turn: Rotation, v: Floats, start: Floats | None = None) -> Hits:
     """What the rays that leave the lens along −v (P, 3) meet of a shape turned by `turn` and put at `position` [m].
 
     `start` (P,) [m] is where to begin, nearer than the surface; infinite where a ray is known to miss.
@@ -48,21 +51,40 @@ def trace(shape: Shape, position: Vector, turn: Rotation, v: Floats, start: Floa
     candidates = np.flatnonzero(near)
     direction = turn.inv().apply(-v[candidates])
     origin = turn.inv().apply(-np.array(position))
+    if isinstance(shape, Model):
+        met = mesh.tracer(shape.file, shape.radius).meet(np.broadcast_to(origin, direction.shape), direction)
+        at = candidates[met.index]
+        point = turn.apply(met.position) + position
+        normal = mesh.face_camera(turn.apply(met.normal), v[at])
+        return Hits(at, np.linalg.norm(point, axis=1), point, met.position, normal, met.face, met.weight)
     first = 0.0 if start is None else start[candidates]
     index, distance = _march(shape, np.broadcast_to(origin, direction.shape), direction, first)
     local = origin + direction[index] * distance[:, None]
     at = candidates[index]
-    return Hits(at, distance, -v[at] * distance[:, None], local, turn.apply(_gradient(shape, local)))
+    point, normal = -v[at] * distance[:, None], turn.apply(_gradient(shape, local))
+    return Hits(at, distance, point, local, normal, np.full(len(at), -1), np.zeros((len(at), 3)))
 
 
-def shadowed(shape: Shape, position: Vector, turn: Rotation, hits: Hits, light: Vector) -> NDArray[np.bool_]:
+def shadowed(shape: Shape | Model, position: Vector, turn: Rotation, hits: Hits, light: Vector) -> NDArray[np.bool_]:
     """Which of the hits (N,) the shape itself hides from a light [m, camera frame]."""
+    lifted = hits.local + LIFT * turn.inv().apply(hits.normal)
+    return _hidden(shape, lifted, turn.inv().apply(np.array(light) - np.array(position)))
+
+
+def behind(shape: Shape | Model, position: Vector, turn: Rotation, point: Floats, light: Vector) -> NDArray[np.bool_]:
+    """Which of the points (N, 3) elsewhere [m, camera frame] the shape hides from a light."""
     source = turn.inv().apply(np.array(light) - np.array(position))
-    lifted = hits.local + _LIFT * turn.inv().apply(hits.normal)
-    direction = source - lifted
+    return _hidden(shape, turn.inv().apply(point - np.array(position)), source)
+
+
+def _hidden(shape: Shape | Model, origin: Floats, source: Floats) -> NDArray[np.bool_]:
+    """The same in the shape's own frame; the light lies outside the shape."""
+    if isinstance(shape, Model):
+        return mesh.tracer(shape.file, shape.radius).hidden(origin, source)
+    direction = source - origin
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-    out = np.zeros(len(lifted), bool)
-    out[_march(shape, lifted, direction, 0.0)[0]] = True
+    out = np.zeros(len(origin), bool)
+    out[_march(shape, origin, direction, 0.0)[0]] = True
     return out
 
 

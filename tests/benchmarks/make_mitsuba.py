@@ -26,9 +26,9 @@ from polcap.synth import materials, render
 from polcap.synth.mesh import Triangles
 from polcap.training import gbuffers
 
-FACES = 200_000  # at least, after subdivision: each has one colour
+FACES = 100_000  # at least, after subdivision: each has one colour
 TEXELS = 1024  # side of the bitmap that holds the faces' colours
-PASS, LEAST, MOST = 16, 8, 64  # samples per pixel of a pass, passes
+PASS, LEAST, MOST = 16, 2, 64  # samples per pixel of a pass, passes
 GOAL = 1e-3  # DoLP, 1σ over the object
 
 
