@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from polcap import __version__
-from polcap.errors import GateError, PolcapError, SettingError
+from polcap.errors import GateError, InputError, PolcapError, SettingError
 
 if TYPE_CHECKING:
     from polcap.images import Capture, ChartRequest
@@ -292,6 +292,10 @@ def synth(
     interreflection: Annotated[
         bool, typer.Option("--interreflection", help="Light goes once from part to part of the mesh.")
     ] = False,
+    dataset: Annotated[
+        int | None,
+        typer.Option(min=1, metavar="N", help="Make N samples of a data set instead (extra [train]); goes on."),
+    ] = None,
 ) -> None:
     """Photograph an object that does not exist: RAW brackets, with the truth beside them."""
     from msgspec.structs import replace
@@ -300,6 +304,12 @@ def synth(
     from polcap.synth import capture as synthetic
     from polcap.synth import scenes
 
+    if dataset is not None:
+        corpus = _extra("corpus")
+        named = {"seed": seed, "mesh": str(mesh or ""), "material": str(material or "")}
+        corpus.main(folder, dataset, settings.fill(corpus.Recipe, named, assignments or ()))
+        _print(str(folder / "dataset.json"))
+        return
     if interreflection and mesh is None:
         raise SettingError("--interreflection is traced between triangles; give the object with --mesh")
     shoot = settings.fill(synthetic.Shoot, {"seed": seed}, assignments or ())
@@ -339,6 +349,7 @@ def capture(
     chart: Annotated[bool, typer.Option("--chart", help="Also a frame of the chart alone.")] = False,
     tries: Annotated[int, typer.Option(min=0, help="How often a bad frame is taken again.")] = 2,
     resume: Annotated[bool, typer.Option("--resume", help="Go on: take what is missing.")] = False,
+    no_check: Annotated[bool, typer.Option("--no-check", help="Leave out the verdict at the end.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan with its times, and stop.")] = False,
     json: Json = False,
 ) -> None:
@@ -363,7 +374,26 @@ def capture(
     done = sequence.shoot(
         folder, wanted, resume=resume, tries=tries, tell=lambda line: print(line, file=sys.stderr, flush=True)
     )
-    _print(done if json else str(folder))
+    verdict = None if no_check else _verdict(folder)
+    _print(done | {"check": verdict} if json else str(folder))
+    if verdict and verdict["verdict"] != "keep":
+        raise typer.Exit(GateError.exit_code)
+
+
+def _verdict(folder: Path) -> dict[str, Any] | None:
+    """What `polcap check` says of a capture, told on stderr; None where it cannot be judged."""
+    from polcap import check as checks
+    from polcap import pipeline
+    from polcap.config import Config
+    from polcap.formats import capture as captures
+
+    try:
+        verdict = checks.inspect(captures.read(folder), pipeline.load_network(None, None, "cpu", 0), Config())
+    except InputError as error:
+        print(f"polcap: not judged: {_line(error)}", file=sys.stderr)
+        return None
+    print(checks.table(verdict), file=sys.stderr)
+    return checks.shown(verdict)
 
 
 @app.command()
