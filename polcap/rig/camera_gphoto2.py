@@ -102,8 +102,7 @@ class Gphoto2:
 
     def _connect(self) -> Any:
         gp = self._gp
-        every = gp.Camera.autodetect()
-        found = [(str(every.get_name(at)), str(every.get_value(at))) for at in range(every.count())]
+        found = connected()
         fitting = [(name, port) for name, port in found if self._which.lower() in name.lower() or port == self._which]
         if not fitting:
             listed = ", ".join(f"{name} at {port}" for name, port in found) or "none"
@@ -203,7 +202,8 @@ def connected() -> list[tuple[str, str]]:
     except ModuleNotFoundError:
         raise SettingError("gphoto2 is not installed; pip install 'polcap[rig]'") from None
     try:
-        return [(str(name), str(port)) for name, port in gphoto2.Camera.autodetect()]
+        found = gphoto2.Camera.autodetect()
+        return [(str(found.get_name(at)), str(found.get_value(at))) for at in range(found.count())]
     except gphoto2.GPhoto2Error as error:
         raise HardwareError(f"cameras cannot be listed: {error.string} ({error.code}); check the cables") from None
 

@@ -16,7 +16,7 @@ from tests.conftest import ROOT, Command
 from tests.rig.devices import Elliptec
 from tests.rig.pool import Key
 
-SIMULATED = ("--rotator", "simulated?settle=0", "--camera", "simulated?width=96&height=72&samples=1")
+SIMULATED = ("--rotator", "simulated?settle=0", "--camera", "simulated?width=96&height=72&samples=1", "--no-check")
 
 
 def test_a_simulated_capture_is_shot_and_read(polcap: Command, tmp_path: Path) -> None:
@@ -33,6 +33,18 @@ def test_a_simulated_capture_is_shot_and_read(polcap: Command, tmp_path: Path) -
     assert again.returncode == 2 and "--resume" in again.stderr and again.stderr.count("\n") == 1
     resumed = json.loads(polcap("capture", folder, "--resume", "--json").stdout)
     assert resumed["taken"] == 0 and resumed["frames"] == 15 and len(resumed["angles"]) == 3
+
+
+@pytest.mark.parametrize("verdict", ["keep", "reshoot"])
+def test_the_verdict_ends_a_capture(
+    polcap: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verdict: str
+) -> None:
+    monkeypatch.setattr("polcap.check.inspect", lambda found, network, config: found.shots[2].name)
+    monkeypatch.setattr("polcap.check.table", lambda judged: f"{verdict} {judged}")
+    monkeypatch.setattr("polcap.check.shown", lambda judged: {"verdict": verdict})
+    done = polcap("capture", tmp_path / "c", *SIMULATED[:4], "--json")
+    assert done.returncode == (0 if verdict == "keep" else 3)
+    assert json.loads(done.stdout)["check"] == {"verdict": verdict} and f"{verdict} 90°" in done.stderr
 
 
 def test_dry_run_prints_the_times_and_makes_nothing(polcap: Command, tmp_path: Path) -> None:
@@ -63,7 +75,7 @@ def test_wrong_flag_is_one_line_and_exit_2(
 
 
 def test_a_port_that_is_not_there_is_exit_4(polcap: Command, tmp_path: Path) -> None:
-    done = polcap("capture", tmp_path / "c", "--rotator", "elliptec:/dev/ttyNONE", *SIMULATED[2:])
+    done = polcap("capture", tmp_path / "c", "--rotator", "elliptec:/dev/ttyNONE", *SIMULATED[2:4])
     assert done.returncode == 4 and done.stderr.count("\n") == 1 and "/dev/ttyNONE" in done.stderr
 
 
@@ -90,7 +102,9 @@ def test_a_motor_on_a_port_and_a_camera_on_a_cable_make_a_capture(
     folder = tmp_path / "capture"
     with Elliptec() as device:
         url = f"elliptec:{device.port}?settle=0"
-        done = polcap("capture", folder, "--rotator", url, "--camera", "gphoto2", "--bracket", "1/200,1/50,1/13")
+        done = polcap(
+            "capture", folder, "--rotator", url, "--camera", "gphoto2", "--bracket", "1/200,1/50,1/13", "--no-check"
+        )
         assert done.returncode == 0, done.stderr
         assert not device.moving and "0ma" in " ".join(device.heard)
     understood = captures.read(folder)
