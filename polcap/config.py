@@ -71,7 +71,7 @@ class Check(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.68
     max_side_light: Annotated[
         float, Meta(gt=0, le=1, description="one side of the outline brighter in one shot than in the others [1]")
-    ] = 0.05
+    ] = 0.07
     max_ambient: Annotated[
         float, Meta(gt=0, le=1, description="share of the object's light that is there without the flash [1]")
     ] = 0.1

@@ -1,6 +1,7 @@
 """Simulated captures in which one thing, and only one, went wrong; or nothing."""
 
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 
 import msgspec
@@ -31,9 +32,8 @@ _KINDS: tuple[synthetic.Kind, ...] = ("bumps", "clusters", "vase")
 def shoot(folder: Path, seed: int, fault: str, width: int) -> str:
     """Write a 3 × 3 capture with the ordinary jitter and nudges, and `fault` ("" for none); tells what was done."""
     random = np.random.default_rng([seed, 4])
-    scene = random_scene(seed, _KINDS[seed % 3])
-    how = Shoot(seed=seed, width=width, height=width * 3 // 4, samples=1)
-    studio = Studio(scene, how)
+    studio = _studio(seed, width)
+    scene, how = studio.scene, studio.shoot
     victim, frame = (int(random.integers(n)) for n in (3, 3))
     actual = np.array(_ANGLES) + how.angle_error_deg * random.normal(size=3)
     shift = random.uniform(-1, 1, (3, 2)) * how.nudge_px
@@ -42,7 +42,9 @@ def shoot(folder: Path, seed: int, fault: str, width: int) -> str:
     change: Callable[[Floats, int, int], Floats] = lambda light, k, e: light  # noqa: E731
     names, done = [0, 1, 2], f"shot {victim}"
     if fault == "clipped":
-        change, done = lambda light, k, e: 14 * light, "14 times the light"
+        lit = studio.through(0)[studio.buffer.mask].max(-1) * studio.middle / how.step
+        times = 1.1 / float(np.percentile(lit, 85))
+        change, done = lambda light, k, e: times * light, f"{times:.0f} times the light"
     elif fault == "swapped":
         other = (victim + 1) % 3
         names[victim], names[other] = other, victim
@@ -58,7 +60,7 @@ def shoot(folder: Path, seed: int, fault: str, width: int) -> str:
         done = f"shot {victim} frame {frame}, {length} px along {'yx'[axis]}"
     elif fault == "moved":
         victim = 1 + victim % 2
-        shift[victim] = random.choice([-1, 1], 2) * random.uniform(0.15, 0.2, 2) * width
+        shift[victim] = random.choice([-1, 1], 2) * random.uniform(90, 120, 2)
         done = f"shot {victim} by {np.round(shift[victim])} px"
     elif fault == "misfire":
         whole = bool(random.integers(2))
@@ -98,3 +100,9 @@ def shoot(folder: Path, seed: int, fault: str, width: int) -> str:
                 file.unlink()
                 done = f"shot {victim} frame {frame}"
     return done
+
+
+@lru_cache(maxsize=1)
+def _studio(seed: int, width: int) -> Studio:
+    how = Shoot(seed=seed, width=width, height=width * 3 // 4, samples=1)
+    return Studio(random_scene(seed, _KINDS[seed % 3]), how)

@@ -75,9 +75,9 @@ def lines(taken: Taken, network: Network | None, config: Config) -> Iterator[Lin
         gains = selfcal.solve(radiance, alignment, object_, color, unchecked)
         yield from _energy(gains, radiance, config, names)
         ordered = _order(gains, names)
-        if ordered.state == "warning":
-            selfcal.solve(radiance, alignment, object_, color, config.selfcal)
         yield ordered
+        if ordered.state == "reshoot":
+            return  # in another order all that follows is another capture's
         stage = "angles"
         image = stokes.solve(radiance, alignment, gains, object_, config.stokes)
         yield from _outline(image, radiance, config, names)
@@ -212,7 +212,8 @@ def _order(gains: Gains, names: list[str]) -> Line:
     if gains.order == tuple(range(len(names))) and not gains.mirrored:
         return Line("order", "ok", None, None, f"as stated (the outline fits to {gains.concentration:.2f})")
     best = ", ".join(names[i] for i in gains.order) + (", counted the other way" if gains.mirrored else "")
-    return Line("order", "warning", None, None, f"the outline fits {best} a little better", "look at the shots' names")
+    remedy = "name the shots by the angles they had (folders, or --angles), or take them again in order"
+    return Line("order", "reshoot", None, None, f"the outline fits {best} better than the stated order", remedy)
 
 
 def _outline(image: StokesImage, radiance: AngleStack, config: Config, names: list[str]) -> Iterator[Line]:
