@@ -109,7 +109,7 @@ def _mirror(x: Floats) -> Floats:
 def _sampled(image: Floats, u: Floats, v: Floats) -> Floats:
     """Bilinear, (M, C)."""
     side = 2**14  # remap takes pictures under 2^15 px a side
-    wide = -(-len(u) // side) * side
+    wide = (len(u) // side + 1) * side
     x, y = (np.pad(a, (0, wide - len(u))).astype(np.float32).reshape(-1, side) for a in (u, v))
     parts = [cv2.remap(part, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for part in _halves(image)]
     return np.concatenate([p.reshape(wide, 3)[: len(u)] for p in parts], axis=1)

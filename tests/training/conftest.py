@@ -10,7 +10,9 @@ pytest.importorskip("torch")
 pytest.importorskip("embreex")
 
 import torch
+from numpy.typing import NDArray
 
+from polcap.images import Floats
 from polcap.training import gbuffers, materials, patterns, protocol, shapes
 from polcap.training.dataset import Simulator
 
@@ -18,12 +20,22 @@ from polcap.training.dataset import Simulator
 def write_mesh(path: Path, seed: int) -> None:
     """A mesh in the data folder's format."""
     mesh = shapes.compose(np.random.default_rng(seed))
-    low, scale = mesh.vertices.min(axis=0), float(np.ptp(mesh.vertices, axis=0).max())
+    write(path, mesh.vertices, mesh.faces)
+
+
+def write_blob(path: Path, seed: int) -> None:
+    """A coarse lumpy ellipsoid, soon traced."""
+    unit, faces = shapes._sphere(24, 32)
+    rng = np.random.default_rng(seed)
+    lumps = 1 + 0.15 * np.sin(unit @ rng.normal(size=(3, 3)) * 4).sum(axis=1, keepdims=True)
+    write(path, unit * lumps * rng.uniform(0.5, 1, 3), faces)
+
+
+def write(path: Path, vertices: Floats, faces: NDArray[np.int32]) -> None:
+    low, scale = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
     path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(
-        path, vq=np.round((mesh.vertices - low) / scale * 65535).astype(np.uint16), vmin=low, vscale=np.float32(scale),
-        faces=mesh.faces,
-    )  # fmt: skip
+    quantized = np.round((vertices - low) / scale * 65535).astype(np.uint16)
+    np.savez(path, vq=quantized, vmin=low, vscale=np.float32(scale), faces=faces)
 
 
 def write_textures(folder: Path, seed: int) -> None:
@@ -40,7 +52,7 @@ def test_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """As many test meshes and texture sets as the evaluation takes."""
     folder = tmp_path_factory.mktemp("test-data")
     for k in range(protocol.MESHES):
-        write_mesh(folder / "meshes" / "test" / f"shape-{k}.npz", 10 + k)
+        write_blob(folder / "meshes" / "test" / f"shape-{k}.npz", k)
     for k in range(patterns.TEXTURES):
         write_textures(folder / "materials" / "test" / f"set-{k}", k)
     return folder

@@ -48,6 +48,12 @@ def test_slope_is_the_relief_s_and_bounded(library: list[patterns.Material], pla
         assert 0 < np.sqrt(np.mean(steep**2)) < 0.4 and steep.max() < 0.61, material.name
 
 
+def test_no_places_have_no_looks(library: list[patterns.Material]) -> None:
+    none = np.zeros((0, 3))
+    for material in library:
+        assert material.at(none, none).diffuse.shape == material.slope(none, none).shape == (0, 3), material.name
+
+
 def test_missing_texture_sets_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds 0 texture sets"):
         patterns.library(tmp_path)
