@@ -173,3 +173,21 @@ def test_synth_makes_a_capture_that_reads(polcap: Command, tmp_path: Path) -> No
     assert made.stdout == f"{tmp_path / 'c'}\n", made.stderr
     assert "3 shots" in polcap("process", tmp_path / "c", "--dry-run").stdout
     assert polcap("synth", tmp_path / "d", "--set", "widht=3").returncode == 2
+
+
+def test_synth_photographs_a_mesh_and_makes_data_sets(polcap: Command, tmp_path: Path) -> None:
+    pytest.importorskip("embreex", reason="embreex is not installed (extra [train])")
+    pytest.importorskip("torch", reason="torch is not installed (extra [train])")
+    import trimesh
+
+    trimesh.creation.box((3, 2, 1)).export(tmp_path / "box.stl")
+    mesh = ("--mesh", tmp_path / "box.stl")
+    small = [f"--set={text}" for text in ("width=96", "height=72", "samples=1", "exposures=1")]
+    assert polcap("synth", tmp_path / "c", *mesh, "--interreflection", *small).returncode == 0
+    assert json.loads((tmp_path / "c" / "truth.json").read_text())["scene"]["interreflection"] is True
+    assert polcap("synth", tmp_path / "d", "--interreflection", *small).returncode == 2
+    assert polcap("synth", tmp_path / "d", "--material", tmp_path, *small).returncode == 2
+    assert not (tmp_path / "d").exists()
+    made = polcap("synth", tmp_path / "set", *mesh, "--dataset", 1, "--set=size=64")
+    assert made.returncode == 0 and made.stdout == f"{tmp_path / 'set' / 'dataset.json'}\n", made.stderr
+    assert (tmp_path / "set" / "000000" / "sample.json").exists()
