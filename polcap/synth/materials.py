@@ -17,7 +17,7 @@ from polcap.images import Floats
 from polcap.optics import fresnel
 
 Color = tuple[float, float, float]  # linear Rec.709
-_TEXELS = 512  # side of a texture
+_TEXELS = 256  # side of a texture: of 0.1 m, about a pixel each, so that it does not alias
 
 
 class Material(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
