@@ -20,12 +20,16 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from polcap.stages.cues import CHANNELS
+from polcap.training.profiles import Profiles, figures_of
 from polcap.training.variants import VARIANTS
 
 SIZE_MULTIPLE = 32
 OUTPUTS = ("normal", "depth", "diffuse", "specular", "roughness", "sigma")
+_GLOSS = 5  # specular, roughness, highlight
 _SHARED = (2, 1)  # decoder levels of 1/8 and 1/4 of the resolution
 _MASK = CHANNELS.index("mask")
+_CLIPPED = CHANNELS.index("clipped")
+_RATIO = slice(CHANNELS.index("s1"), CHANNELS.index("s2") + 1)
 _COLOR = slice(CHANNELS.index("log_r"), CHANNELS.index("log_b") + 1)
 
 
@@ -57,7 +61,7 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
     def __init__(self, shape: Shape = SMALL, variant: str = "ours") -> None:
         super().__init__()
         self.shape, self.variant = shape, variant
-        self.inputs = VARIANTS[variant].inputs
+        self.inputs, self.sees_dolp = VARIANTS[variant].inputs, float(VARIANTS[variant].sees_dolp)
         skips = shape.skip_blocks if VARIANTS[variant].skip_convolutions else 0
         widths = shape.encoder
         self.stem = nn.Conv2d(4 * len(CHANNELS), widths[0], 3, padding=1)
@@ -66,7 +70,8 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
         self.context = Context(widths[-1])
         self.geometry = Branch(widths, shape.geometry, shape.skip_blocks, skips, 5)
         self.color = Branch(widths, shape.color, shape.skip_blocks, skips, 3)
-        self.gloss = Branch(widths, shape.gloss, shape.skip_blocks, skips, 5, hints=9)
+        self.profiles = Profiles(widths[1], shape.gloss[1] + _GLOSS)
+        self.gloss = Branch(widths, shape.gloss, shape.skip_blocks, skips, _GLOSS, hints=9)
 
     def forward(self, x: Tensor) -> dict[str, Tensor]:
         seen = self.inputs(x)
@@ -81,7 +86,11 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
         diffuse = torch.sigmoid(level + color + 0.7)
         body = torch.log(0.9 * diffuse * normal[:, 2:].clamp(min=0) + 0.02)  # what the diffuse light would be
         hints = torch.cat([normal, diffuse, level - body], dim=1).detach() * inside
-        gloss = self.gloss(features, torch.cat([seen, hints.to(seen.dtype)], dim=1), inside).float()
+        figures = figures_of(level, self.sees_dolp * x[:, _RATIO].float() / 10, normal, diffuse)
+        thinned = [part[:, :, ::2, ::2].detach() for part in (figures, normal[:, 2:], _usable(x))]
+        told, itself = self.profiles(features[1], *thinned).split([self.shape.gloss[1], _GLOSS], dim=1)
+        gloss = self.gloss(features, torch.cat([seen, hints.to(seen.dtype)], dim=1), inside, told).float()
+        gloss = gloss + F.interpolate(itself, scale_factor=4.0, mode="bilinear", align_corners=False)
         return {
             "normal": normal,
             "depth": shape[:, 3:4],
@@ -91,6 +100,11 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
             "sigma": 60 * torch.sigmoid(shape[:, 4:5] - 1.5),
             "highlight": torch.sigmoid(gloss[:, 4:5] - 1.0),
         }
+
+
+def _usable(x: Tensor) -> Tensor:
+    """1 where the object is seen unclipped, (B, 1, H, W)."""
+    return x[:, _MASK : _MASK + 1] * (1 - x[:, _CLIPPED : _CLIPPED + 1])
 
 
 class Residual(nn.Module):  # type: ignore[misc]  # torch comes without types here
@@ -192,10 +206,14 @@ class Branch(nn.Module):  # type: ignore[misc]  # torch comes without types here
             self.hint.extend(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(widths))
             self.share = nn.ModuleDict({str(level): Share(widths[level]) for level in _SHARED})
 
-    def forward(self, features: list[Tensor], seen: Tensor, inside: Tensor) -> Tensor:
+    def forward(
+        self, features: list[Tensor], seen: Tensor, inside: Tensor, told: Tensor | None = None
+    ) -> Tensor:
         hinted: list[Tensor] = []
         for hint in self.hint:
             hinted.append(hint(F.relu(hinted[-1]) if hinted else F.pixel_unshuffle(seen, 2)))
+            if told is not None and len(hinted) == 2:
+                hinted[-1] = hinted[-1] + told
         y = features[-1]
         for level in reversed(range(len(self.up))):
             skip = self.skip[level](features[level])

@@ -1,7 +1,7 @@
 """Train the network with one command: cache of views, loop, checkpoints, metrics.
 
 The budget is a length of time, so that a run ends when it is meant to on any machine, or a number of
-pictures, so that runs can be compared. The learning rate holds for 45 % of it and falls to nothing over the
+pictures, so that runs can be compared. The learning rate holds for 20 % of it and falls to nothing over the
 rest. A run that was stopped goes on from its last checkpoint with what was left. Same seed, same machine,
 same number of steps: same weights.
 """
@@ -29,8 +29,9 @@ from polcap.training.dataset import Batch, Simulator
 from polcap.training.variants import VARIANTS
 from polcap.training.watch import Watch
 
-_HOLD = 0.45  # share of the budget at the full learning rate
+_HOLD = 0.2  # share of the budget at the full learning rate
 _WARM = 100  # steps
+_BURST = 200.0  # norm of a gradient that is not followed
 _OUTER_RATE = 0.5  # AdamW's rate by Muon's
 
 
@@ -46,7 +47,7 @@ class Params:
     resume: bool = False  # go on from out/last.pt
     threads: int = 2  # learners on a CPU, each with a batch of its own; one more thread makes the batches
     seed: int = 1
-    rate: float = 2e-3  # of Muon
+    rate: float = 1e-3  # of Muon; at twice that, weights without norms grew until training burst
     variant: str = "ours"  # of variants.py
 
 
@@ -190,7 +191,7 @@ class Run:
         for number, (others, _) in enumerate(learned[1:], start=2):  # their mean
             torch._foreach_lerp_([weight.grad for weight in self.weights], list(others), 1 / number)
         norm = torch.nn.utils.clip_grad_norm_(self.weights, 1.0, foreach=True)
-        if torch.isfinite(norm):
+        if norm < _BURST:
             for optimizer in self.optimizers:
                 optimizer.step()
         else:
@@ -259,7 +260,7 @@ class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without 
     Liu et al., Muon is scalable for LLM training, 2025 (length of the step).
     """
 
-    def __init__(self, weights: list[Tensor], rate: float, momentum: float = 0.95, decay: float = 0.01) -> None:
+    def __init__(self, weights: list[Tensor], rate: float, momentum: float = 0.95, decay: float = 0.1) -> None:
         super().__init__(weights, {"lr": rate, "momentum": momentum, "decay": decay})
 
     @torch.no_grad()  # type: ignore[untyped-decorator]
@@ -267,7 +268,7 @@ class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without 
         for group in self.param_groups:
             alike: dict[torch.Size, list[tuple[Tensor, Tensor]]] = {}  # weights and where they should go, by shape
             for weight in group["params"]:
-                gradient = _matrix(weight.grad.contiguous(memory_format=torch.channels_last))
+                gradient = _matrix(_lying(weight.grad))
                 mean = self.state[weight].setdefault("mean", torch.zeros_like(gradient))
                 mean.lerp_(gradient, 1 - group["momentum"])
                 ahead = gradient.lerp(mean, group["momentum"])  # Nesterov's look ahead
@@ -280,8 +281,13 @@ class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without 
 
 
 def _matrix(weight: Tensor) -> Tensor:
-    """(out, kh·kw·in) of a convolution's channels-last weights, sharing their memory."""
-    return weight.permute(0, 2, 3, 1).view(len(weight), -1)
+    """(out, in) of a layer's weights, (out, kh·kw·in) of a convolution's that lie channels last, sharing memory."""
+    return weight if weight.ndim == 2 else weight.permute(0, 2, 3, 1).view(len(weight), -1)
+
+
+def _lying(weight: Tensor) -> Tensor:
+    """The same values with channels last."""
+    return weight if weight.ndim == 2 else weight.contiguous(memory_format=torch.channels_last)
 
 
 def orthogonal(matrix: Tensor) -> Tensor:

@@ -25,6 +25,7 @@ _UNPOLARIZED = ("log_r", "log_g", "log_b", "mask", "clipped", "ray_x", "ray_y")
 @dataclass(frozen=True)
 class Variant:
     inputs: Callable[[Tensor], Tensor] = lambda x: x  # channels (B, N, H, W) -> what the layers see, as many
+    sees_dolp: bool = True  # in the profiles of gloss
     skip_convolutions: bool = True  # a convolution and residual blocks on every skip, else its projection alone
     polarized_loss: bool = True  # Stokes parameters in the rendering loss, else S0 alone
 
@@ -51,8 +52,8 @@ def _published(x: Tensor) -> Tensor:
 VARIANTS = {
     "ours": Variant(),
     "published inputs": Variant(_published),
-    "unpolarized inputs": Variant(_unpolarized),
+    "unpolarized inputs": Variant(_unpolarized, sees_dolp=False),
     "plain skips": Variant(skip_convolutions=False),
     "unpolarized loss": Variant(polarized_loss=False),
-    "no polarization": Variant(_unpolarized, polarized_loss=False),
+    "no polarization": Variant(_unpolarized, sees_dolp=False, polarized_loss=False),
 }

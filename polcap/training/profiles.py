@@ -1,0 +1,70 @@
+"""How the light of each material falls with the angle: radiance over zenith, gathered from soft groups of places.
+
+A material's gloss shows wherever it faces the flash, and nowhere else. Places sort themselves into groups
+by learned features; each group's light is averaged in bins of the estimated zenith, and what that profile
+says of gloss is told to every place of the group.
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from polcap.optics import fresnel
+from polcap.stages.cues import NOMINAL_IOR
+
+_GROUPS = 16
+_EDGES_DEG = (0.0, 4.0, 8.0, 12.0, 17.0, 23.0, 30.0, 40.0, 52.0, 66.0, 90.0)
+_BINS = len(_EDGES_DEG) - 1
+_FIGURES = 6  # per bin
+
+
+class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types here
+    """Features of each place (B, C, H, W) and what the picture shows -> messages (B, outputs, H, W)."""
+
+    def __init__(self, features: int, outputs: int) -> None:
+        super().__init__()
+        self.sort = nn.Conv2d(features, _GROUPS, 1)
+        self.read = nn.Sequential(nn.Linear(_BINS * _FIGURES, 96), nn.ReLU(), nn.Linear(96, outputs))
+
+    def forward(self, features: Tensor, figures: Tensor, zenith: Tensor, usable: Tensor) -> Tensor:
+        """figures (B, ·, ·, ·) of `figures_of`, cosine of the zenith and usable (B, 1, ·, ·), twice as fine."""
+        batch, _, height, width = features.shape
+        member = torch.softmax(self.sort(features).float(), dim=1)
+        weight = F.interpolate(member, scale_factor=2.0, mode="bilinear", align_corners=False) * usable
+        told = self.read(_profile(weight.flatten(2), figures.flatten(2), zenith.flatten(2)))  # (B, groups, outputs)
+        return (told.transpose(1, 2) @ member.flatten(2)).reshape(batch, -1, height, width)
+
+
+def figures_of(level: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) -> Tensor:
+    """What is averaged, (B, 5, H, W): log of light over shading, its excess over the diffuse light, the excess
+    squared and as a factor, and the share by which the DoLP falls short of the diffuse one.
+
+    level (B, 3, H, W) log radiance, ratio (B, 2, H, W) S1/S0 and S2/S0, normal and diffuse (B, 3, H, W).
+    """
+    cosine = normal[:, 2:].clamp(0.03, 1.0)
+    plus, minus = fresnel.transmission(cosine, NOMINAL_IOR)
+    shading = 0.96 * cosine * plus
+    light = (torch.exp(level) - 0.02).clamp(0, 50).mean(dim=1, keepdim=True)
+    body = diffuse.mean(dim=1, keepdim=True) * shading
+    excess = torch.log((light + 0.02) / (body + 0.02)).clamp(-3, 4)
+    dolp = ratio.square().sum(dim=1, keepdim=True).sqrt()
+    short = (1 - dolp / (minus / plus + 0.005)).clamp(-1, 1)
+    return torch.cat([torch.log(light / shading + 0.02), excess, excess**2, torch.exp(2 * excess), short], dim=1)
+
+
+def _profile(weight: Tensor, figures: Tensor, cosine: Tensor) -> Tensor:
+    """weight (B, groups, N), figures (B, 5, N), cosine (B, 1, N) -> per group and bin: log share of the group,
+    then the figures' means, 0 where there is nothing; (B, groups, bins · 6)."""
+    edges = torch.cos(torch.deg2rad(torch.tensor(_EDGES_DEG, device=cosine.device))).view(1, -1, 1)
+    at = ((cosine <= edges[:, :-1]) & (cosine > edges[:, 1:])).to(weight.dtype)  # (B, bins, N)
+    seen = torch.cat([torch.ones_like(cosine), figures], dim=1)
+    sums = weight @ (at[:, :, None] * seen[:, None]).flatten(1, 2).transpose(1, 2)
+    sums = sums.unflatten(2, (_BINS, _FIGURES))
+    share, total = sums[..., :1], sums[..., :1].sum(dim=2, keepdim=True) + 1e-3
+    mean = sums[..., 1:] / (share + 1e-4 * total)
+    light, excess, square, factor, short = mean.unbind(dim=-1)
+    whole = sums[..., 1].sum(dim=2, keepdim=True) / total[..., 0]  # of the light over shading
+    columns = (
+        torch.log(share[..., 0] / total[..., 0] + 1e-3) / 3, light - whole, excess, torch.log1p(factor), square, short,
+    )  # fmt: skip
+    return torch.stack(columns, dim=-1).flatten(2)

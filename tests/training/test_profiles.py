@@ -1,0 +1,52 @@
+"""Light over zenith: what the profile says is what was rendered."""
+
+import numpy as np
+import torch
+
+from polcap.optics import brdf, fresnel, shade
+from polcap.stages.cues import NOMINAL_IOR
+from polcap.training import profiles
+
+DIFFUSE, F0, ROUGHNESS = 0.4, 0.06, 0.5
+
+
+def ball(side: int = 96) -> tuple[torch.Tensor, torch.Tensor]:
+    """Normals (1, 3, H, W) of a sphere seen along the axis, and its mask (1, 1, H, W)."""
+    x = torch.linspace(-1, 1, side)
+    y, x = torch.meshgrid(x, x, indexing="ij")
+    z = (1 - x * x - y * y).clamp(min=0).sqrt()
+    return torch.stack([x, y, z])[None], (z > 0.05).float()[None, None]
+
+
+def profile(specular: float) -> torch.Tensor:
+    """(bins, figures) of the ball as one group."""
+    normal, inside = ball()
+    flat = normal[0].permute(1, 2, 0)
+    one = torch.ones(flat.shape[:2])
+    light = torch.zeros_like(flat) + torch.tensor([0.0, 0, 1])
+    white = torch.ones_like(flat)
+    stokes = shade.stokes(flat, DIFFUSE * white, specular * white, ROUGHNESS * one, NOMINAL_IOR * one, light, one)
+    level = torch.log(stokes[0] + 0.02).permute(2, 0, 1)[None]
+    ratio = (stokes[1:].sum(-1) / stokes[0].sum(-1).clamp(min=1e-6))[None]
+    figures = profiles.figures_of(level, ratio, normal, torch.full_like(normal, DIFFUSE))
+    table = profiles._profile(inside.flatten(2), (figures * inside).flatten(2), normal[:, 2:].flatten(2))
+    return table.reshape(profiles._BINS, profiles._FIGURES)
+
+
+def test_a_matte_ball_has_no_excess_and_its_whole_polarization() -> None:
+    table = profile(0.0)
+    assert table[:8, 2].abs().max() < 0.05  # excess
+    assert table[7:, 5].abs().max() < 0.12  # missing DoLP, where there is any to miss
+
+
+def test_the_excess_at_the_pole_is_the_lobe() -> None:
+    """ln(1 + F0 π D G/(4 cos) / (ρ cos T₊²)) at normal incidence, from the textbook formulas alone."""
+    alpha = ROUGHNESS**2
+    lobe = np.pi * (1 / (np.pi * alpha**2)) / 4
+    body = DIFFUSE * 0.96**2
+    expected = np.log(1 + F0 * lobe / body)
+    assert abs(brdf.ggx_distribution(1.0, alpha) * np.pi / 4 - lobe) < 1e-9 * lobe
+    assert abs(fresnel.transmission(1.0, NOMINAL_IOR)[0] - 0.96) < 1e-6
+    found = profile(F0)[:, 2]
+    assert abs(float(found[0]) - expected) < 0.15 * expected  # the bin reaches to 4°, where the lobe has fallen
+    assert float(found[0]) > float(found[1]) > float(found[2]) > float(found[4])
