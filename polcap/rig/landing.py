@@ -13,7 +13,7 @@ from polcap.rig.log import Log
 from polcap.rig.plan import Slot
 from polcap.rig.record import Good, Record
 
-AHEAD = 2  # photographs that may wait
+AHEAD = 4  # photographs that may wait, in memory
 _BRACKETED = ("shot", "repeat")
 
 

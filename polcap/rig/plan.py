@@ -167,8 +167,9 @@ def dry_run(order: Order) -> dict[str, Any]:
 
 def document(order: Order, ordered: Sequence[Slot], pace: Pace) -> dict[str, Any]:
     """The plan with the time of each part [s]."""
-    at, home = 0.0, 360.0 / pace.speed_deg_s
-    parts: list[dict[str, Any]] = [{"part": "home", "frames": 0, "seconds": home}]
+    at = 0.0
+    home_s = 0.0 if order.rotator == "manual" else 360.0 / pace.speed_deg_s
+    parts: list[dict[str, Any]] = [{"part": "home", "frames": 0, "seconds": home_s}]
     for slot in ordered:
         turn = pace.turn_s(at, slot.angle_deg)
         at = at if slot.angle_deg is None else slot.angle_deg

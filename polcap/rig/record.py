@@ -182,7 +182,10 @@ def without_port(url: str) -> str:
 
 
 def told(value: Any) -> str:
-    """A setting as the command line takes it."""
+    """How to have a setting so again."""
+    if isinstance(value, bool):
+        return "give it" if value else "leave it out"
     if isinstance(value, tuple):
-        return ", ".join(f"{one:g}" if isinstance(one, float) else str(one) for one in value) or "none"
-    return str(value)
+        listed = ", ".join(f"{one:g}" if isinstance(one, float) else str(one) for one in value)
+        return f"give {listed}" if listed else "leave it out"
+    return f"give {value}"

@@ -199,7 +199,7 @@ def _begun(folder: Path, wanted: Order, resume: bool) -> Content | None:
             here = record.without_port(value) if name in ("rotator", "camera") else value
             if here != (record.without_port(was) if name in ("rotator", "camera") else was):
                 flag = {"angles_deg": "--angles", "repeat_deg": "--repeat"}.get(name, f"--{name}")
-                raise CaptureError(f"{folder} was begun with another {flag}; give {record.told(was)}, or a new folder")
+                raise CaptureError(f"{folder} was begun with another {flag}; {record.told(was)}, or a new folder")
         return content
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -127,6 +127,38 @@ def test_a_bad_frame_is_taken_again_at_once_and_kept_aside(rig: Rig) -> None:
     assert (rig.folder / bad["file"]).stat().st_size > 0
 
 
+def test_a_person_at_the_ring_is_not_sent_back(rig: Rig) -> None:
+    rig.camera, rig.turner.unattended = PoolCamera(rig.pool, fault="corrupt", at=4), False  # the last at 0°
+    rig.shoot()
+    assert rig.turner.moves == [0.0, 45.0, 90.0] and len(rig.taken) == 16
+
+
+def test_a_person_is_asked_for_what_no_device_can(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr("polcap.rig.manual.ask", lambda question, log: asked.append(question))
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+
+    class Plain(PoolCamera):
+        switches_flash = False
+
+        def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:
+            if angle_deg is None:
+                self._key = ("shot", 135.0, 1) if role == "chart" else ("ambient", 0.0, 2)
+            else:
+                super().prepare(angle_deg, role, step)
+
+    rig.camera = Plain(rig.pool)
+    rig.shoot(msgspec.structs.replace(ORDER, chart=True))
+    assert [question.partition(",")[0] for question in asked] == [
+        "put the chart where the object is",
+        "take the chart away again",
+        "switch the flash off",
+        "switch the flash on again",
+    ]
+    understood = captures.read(rig.folder)
+    assert len(understood.chart_frames) == 1 and {len(shot.ambient) for shot in understood.shots} == {1}
+
+
 class Stubborn(PoolCamera):
     """Underexposes one slot for ever."""
 
@@ -224,7 +256,7 @@ def test_a_bracket_is_of_one_angle_even_if_the_ring_comes_back_elsewhere(rig: Ri
     [
         ({"angles_deg": (0.0, 60.0, 120.0), "repeat_deg": ()}, "--angles; give 0, 45, 90"),
         ({"bracket": BRACKET[:2]}, r"--bracket; give 1/200s f/11 iso100, "),
-        ({"ambient": False}, "--ambient"),
+        ({"ambient": False}, "--ambient; give it"),
         ({"rotator": "simulated?offset=3"}, "--rotator"),
     ],
 )
