@@ -3,6 +3,7 @@
 import os
 import resource
 import signal
+import tempfile
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +18,7 @@ from polcap.rig import watchdog
 from polcap.rig.camera import Exposure, Shot
 from polcap.rig.frames import digest
 from polcap.rig.plan import Order
-from polcap.synth.capture import Shoot, Studio, Take, random_scene
+from polcap.synth.capture import MIDDLE_S, Shoot, Studio, Take, random_scene
 
 ANGLES = (0.0, 45.0, 90.0)
 BRACKET = tuple(Exposure(time_s=time, f_number=11.0, iso=100.0) for time in (0.005, 0.02, 0.08))
@@ -32,16 +33,16 @@ def photographs(width: int = 192, height: int = 144, scene_seed: int = 1) -> dic
     shoot = Shoot(width=width, height=height, samples=1)
     studio = Studio(random_scene(scene_seed, "bumps"), shoot)
     found: dict[Key, bytes] = {}
-    file = Path(f"/tmp/.polcap-pool-{os.getpid()}.dng")
-    for number, angle in enumerate((*ANGLES, 135.0)):
-        light = studio.through(angle)
-        for again, role in enumerate(("shot", "repeat")):
-            for step, exposure in enumerate(BRACKET):
-                studio.photograph(file, light, Take(number, step, (exposure.time_s or 1) / 0.02, again))
-                found[role, angle, step] = file.read_bytes()
-        studio.photograph(file, light, Take(number, 7, 4.0, lit=False))
-        found["ambient", angle, 2] = file.read_bytes()
-    file.unlink()
+    with tempfile.TemporaryDirectory() as place:
+        file = Path(place) / "frame.dng"
+        for number, angle in enumerate((*ANGLES, 135.0)):
+            light = studio.through(angle)
+            for again, role in enumerate(("shot", "repeat")):
+                for step, exposure in enumerate(BRACKET):
+                    studio.photograph(file, light, Take(number, step, (exposure.time_s or 1) / MIDDLE_S, again))
+                    found[role, angle, step] = file.read_bytes()
+            studio.photograph(file, light, Take(number, 7, 4.0, lit=False))
+            found["ambient", angle, 2] = file.read_bytes()
     return found
 
 
