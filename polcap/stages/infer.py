@@ -29,9 +29,12 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tile_px: Annotated[
         int, Meta(ge=128, le=4096, description="largest side the network sees at once; bounds its memory [px]")
     ] = 512
+    turns: Annotated[
+        bool, Meta(description="average what the network says of the object in all 8 turned and mirrored positions")
+    ] = True
 
 
-@stage(version=2)
+@stage(version=3)
 def estimate(cues: Cues, network: Network | None, settings: Settings) -> SurfaceMaps:
     """Normal, diffuse, specular, roughness and expected error; network None means analytic."""
     return _analytic(cues, settings) if network is None else _learned(cues, network, settings)
@@ -193,14 +196,12 @@ def _learned(cues: Cues, network: Network, settings: Settings) -> SurfaceMaps:
     _check(network)
     height, width = cues.mask.shape
     shrink = max(height, width) / int(network.metadata["native_size"])
-    whole = _run(channels(_resized(cues, min(1.0, 1 / shrink))), network, settings)
+    whole = _whole(_resized(cues, min(1.0, 1 / shrink)), network, settings)
     maps = {n: m if m.shape[:2] == (height, width) else cv2.resize(m, (width, height)) for n, m in whole.items()}
     diffuse = _color(cues, network, settings)
-    by_pixel = _analytic(cues, settings, (maps["normal"], maps["sigma"]))
-    normal, expected = _joined(
-        (np.asarray(frames.from_ray_frame(maps["normal"], cues.rays)), maps["sigma"]),
-        (by_pixel.normal, by_pixel.confidence),
-    )
+    seen = maps["normal"] / np.maximum(_length(maps["normal"]), 1e-6)
+    by_pixel = _analytic(cues, settings, (np.asarray(frames.to_ray_frame(seen, cues.rays)), maps["sigma"]))
+    normal, expected = _joined((seen, maps["sigma"]), (by_pixel.normal, by_pixel.confidence))
     inside = cues.mask[..., None]
     return SurfaceMaps(
         normal=(normal * inside).astype(np.float32),
@@ -213,6 +214,57 @@ def _learned(cues: Cues, network: Network, settings: Settings) -> SurfaceMaps:
         view=cues.view,
         estimator=f"network {network.metadata.get('version', network.digest[:8])}",
     )
+
+
+def _whole(cues: Cues, network: Network, settings: Settings) -> dict[str, Floats]:
+    """The network's maps of the whole object, normals in the camera frame; the mean over the square's symmetries.
+
+    A turn or mirror of the picture is one of the scene: polarization turns twice as fast, rays with it.
+    """
+    picture, rays = np.moveaxis(channels(cues), 0, -1), cues.rays
+    total: dict[str, Floats] = {}
+    positions = (
+        [(quarters, mirror) for mirror in (False, True) for quarters in range(4)] if settings.turns else [(0, False)]
+    )
+    for quarters, mirror in positions:
+        turned = _turned(picture, quarters, mirror)
+        maps = _run(np.moveaxis(_with_axes_turned(turned, quarters, mirror), -1, 0), network, settings)
+        own = np.array(_turned(rays, quarters, mirror))
+        own[..., :2] = _vector_turned(own[..., :2], quarters, mirror)
+        maps["normal"] = np.array(frames.from_ray_frame(maps["normal"], own))
+        for name, image in maps.items():
+            back = np.rot90(image, -quarters)
+            back = back[:, ::-1] if mirror else back
+            if name == "normal":
+                upright = _vector_turned(back[..., :2], -quarters, False) * [-1.0 if mirror else 1.0, 1.0]
+                back = np.concatenate([upright, back[..., 2:]], axis=-1)
+            total[name] = total.get(name, 0) + np.asarray(back, np.float32) / len(positions)
+    return total
+
+
+def _turned(image: Floats, quarters: int, mirror: bool) -> Floats:
+    """Pixels mirrored left to right, then turned counter-clockwise."""
+    return np.asarray(np.rot90(image[:, ::-1] if mirror else image, quarters))
+
+
+def _vector_turned(vector: Floats, quarters: int, mirror: bool) -> Floats:
+    """Vectors (..., 2), y up, mirrored and turned likewise."""
+    x, y = (-vector[..., 0] if mirror else vector[..., 0]), vector[..., 1]
+    for _ in range(quarters % 4):
+        x, y = -y, x
+    return np.stack([x, y], axis=-1)
+
+
+def _with_axes_turned(picture: Floats, quarters: int, mirror: bool) -> Floats:
+    """Channels (H, W, N) whose pixels were turned, their directions turned too."""
+    out = np.array(picture)
+    for first in ("s1", "zenith_x", "cos_2phi"):  # twice the angle: a quarter negates, a mirror conjugates
+        at = CHANNELS.index(first)
+        out[..., at : at + 2] *= (-1.0) ** quarters
+        out[..., at + 1] *= -1.0 if mirror else 1.0
+    at = CHANNELS.index("ray_x")
+    out[..., at : at + 2] = _vector_turned(picture[..., at : at + 2], quarters, mirror)
+    return out
 
 
 def _joined(*estimates: tuple[Floats, Floats]) -> tuple[Floats, Floats]:

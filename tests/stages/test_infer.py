@@ -78,8 +78,8 @@ def test_a_pointwise_network_sees_no_seams_between_tiles():
     found = seen(noise=0.002)
     wide = network()
     wide = dataclasses.replace(wide, metadata={"native_size": "1024", "size_multiple": "32"})
-    whole = infer.estimate(found, wide, infer.Settings(tile_px=1024))
-    tiled = infer.estimate(found, wide, infer.Settings(tile_px=128))
+    whole = infer.estimate(found, wide, infer.Settings(tile_px=1024, turns=False))
+    tiled = infer.estimate(found, wide, infer.Settings(tile_px=128, turns=False))
     assert np.allclose(whole.normal, tiled.normal, atol=1e-5)
 
 
@@ -103,7 +103,7 @@ def test_a_crop_larger_than_two_tiles_keeps_its_texture():
     )  # fmt: skip
     middle = np.s_[120:240, 120:240]
     seen_whole = infer.estimate(twice, network(), infer.Settings(tile_px=256)).diffuse[middle]
-    seen_small = infer.estimate(twice, network(), infer.Settings(tile_px=128)).diffuse[middle]
+    seen_small = infer.estimate(twice, network(), infer.Settings(tile_px=128, turns=False)).diffuse[middle]
     assert np.allclose(seen_whole, 0.3, atol=1e-5)
     assert seen_small.std() > 0.005
     assert seen_small.mean() == pytest.approx(0.3, rel=0.05)
@@ -122,9 +122,51 @@ def test_a_guide_settles_the_half_turn(side: float):
 
 def test_a_guide_is_as_sure_as_its_error_is_small():
     """P(right) − P(wrong) of a Gaussian: 68.3 % at one standard deviation from the axis."""
-    axis, rays = np.zeros((2, 1, 2)) + [[[1.0]], [[0.0]]], np.zeros((1, 2, 3)) + [0, 0, 1]
+    axis, rays = np.array([[[1.0, 1.0]], [[0.0, 0.0]]]), np.full((1, 2, 3), [0.0, 0.0, 1.0])
     tilt = np.radians(10.0)
-    normal = np.zeros((1, 2, 3)) + [-tilt, 0, 1]
+    normal = np.full((1, 2, 3), [-tilt, 0.0, 1.0])
     phi, certainty = infer._guided(axis, rays, normal, np.array([[10.0, 2.0]]))
     np.testing.assert_allclose(np.cos(phi), -1)
     np.testing.assert_allclose(certainty, [[0.6827, 1.0]], atol=1e-3)
+
+
+def lopsided() -> Network:
+    """A network without symmetry: its maps depend on where things lie in the picture and on each channel apart."""
+
+    def run(picture):
+        y, x = np.mgrid[: picture.shape[2], : picture.shape[3]] / 100.0
+        a = picture[:, 3:4] + 0.3 * picture[:, 5:6] + 0.1 * x
+        b = picture[:, 4:5] - 0.2 * picture[:, 12:13] + 0.1 * y
+        c = 1.5 + 0.1 * picture[:, 6:7] + 0.2 * picture[:, 13:14]
+        normal = np.concatenate([a, b, c], axis=1)
+        normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        return {"normal": normal, "depth": a * b, "diffuse": 0.3 + 0 * normal,
+                "specular": 0.04 + 0.01 * normal, "roughness": 0.5 + 0.1 * b, "sigma": 5 + a}  # fmt: skip
+
+    return dataclasses.replace(network(), run=run)
+
+
+@pytest.mark.parametrize(("quarters", "mirror"), [(1, False), (2, False), (0, True), (3, True)])
+def test_averaged_over_turns_a_turned_object_gets_the_turned_maps(quarters: int, mirror: bool):
+    """The symmetry holds exactly whatever the network, also for oblique rays."""
+    found = seen(noise=1e-4)
+    moved = dataclasses.replace(
+        found,
+        **{
+            name: np.ascontiguousarray(infer._turned(getattr(found, name), quarters, mirror))
+            for name in ("radiance", "ratio_sigma", "dolp", "mask", "quality", "rays")
+        },
+        **{
+            name: (-1.0) ** quarters * np.stack([
+                infer._turned(getattr(found, name)[0], quarters, mirror),
+                (-1 if mirror else 1) * infer._turned(getattr(found, name)[1], quarters, mirror),
+            ])
+            for name in ("ratio", "normalized_stokes")
+        },
+    )  # fmt: skip
+    moved.rays[..., :2] = infer._vector_turned(moved.rays[..., :2], quarters, mirror)
+    whole, turned = (infer._whole(c, lopsided(), infer.Settings()) for c in (found, moved))
+    np.testing.assert_allclose(turned["depth"], infer._turned(whole["depth"], quarters, mirror), atol=1e-4)
+    expected = np.array(infer._turned(whole["normal"], quarters, mirror))
+    expected[..., :2] = infer._vector_turned(expected[..., :2], quarters, mirror)
+    np.testing.assert_allclose(turned["normal"], expected, atol=1e-4)
