@@ -1,0 +1,109 @@
+"""`polcap check` keeps what is good, and of what is not it names the fault and the shot."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polcap import check
+from polcap.check import Verdict
+from polcap.check.reduced import take
+from polcap.config import Config
+from polcap.errors import CaptureError
+from polcap.formats import capture as captures
+from polcap.formats import dng, exif, raw
+from tests import faulty
+from tests.conftest import Command
+
+WIDTH = 512  # the chart must be found: without its greys order and angles are told less well
+
+
+def verdict(folder: Path) -> Verdict:
+    return check.inspect(captures.read(folder), None, Config())
+
+
+def failed(found: Verdict) -> set[str]:
+    return {line.name for line in found.lines if line.state == "reshoot"}
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_ordinary_jitter_and_nudges_are_kept(tmp_path: Path, seed: int) -> None:
+    faulty.shoot(tmp_path / "good", seed, "", WIDTH)
+    found = verdict(tmp_path / "good")
+    assert found.keep, check.table(found)
+
+
+@pytest.mark.parametrize("fault", [name for name, lines in faulty.FAULTS.items() if lines])
+def test_planted_fault_is_named(tmp_path: Path, fault: str) -> None:
+    faulty.shoot(tmp_path / "bad", 1, fault, WIDTH)
+    found = verdict(tmp_path / "bad")
+    assert failed(found) & set(faulty.FAULTS[fault]), check.table(found)
+    assert all(line.remedy for line in found.lines if line.state in ("warning", "reshoot"))
+
+
+def test_missing_frame_is_bad_input(tmp_path: Path) -> None:
+    faulty.shoot(tmp_path / "bad", 1, "missing", 128)
+    with pytest.raises(CaptureError, match=r"2 frames where .* has 3"):
+        captures.read(tmp_path / "bad")
+
+
+def test_command_tells_keep_and_writes_nothing(example: Path, polcap: Command, tmp_path: Path) -> None:
+    folder = tmp_path / "capture"
+    shutil.copytree(example, folder)
+    before = {file: file.stat().st_mtime_ns for file in folder.rglob("*")}
+    done = polcap("check", folder)
+    assert done.returncode == 0, done.stdout
+    assert done.stdout.startswith("keep")
+    assert len(done.stdout.splitlines()) <= 24  # one screen
+    assert {file: file.stat().st_mtime_ns for file in folder.rglob("*")} == before
+
+
+def test_command_ends_with_3_and_one_document(example: Path, polcap: Command, tmp_path: Path) -> None:
+    for name, other in (("pol000", "pol045"), ("pol045", "pol000"), ("pol090", "pol090")):
+        shutil.copytree(example / name, tmp_path / "capture" / other)
+    done = polcap("check", tmp_path / "capture", "--json")
+    about = json.loads(done.stdout)
+    assert done.returncode == 3
+    assert about["verdict"] == "reshoot" and not about["keep"]
+    assert [line["name"] for line in about["lines"] if line["state"] == "reshoot"] == ["order"]
+
+
+def test_ambient_light_is_measured(example: Path, tmp_path: Path) -> None:
+    frames = []
+    for angle in (0, 45, 90):
+        files = sorted((example / f"pol{angle:03d}").glob("*.DNG"))
+        for file in files:
+            shutil.copy(file, tmp_path)
+            frames.append(f'[[frame]]\nfile = "{file.name}"\nangle = {angle}\n')
+        middle = raw.read(files[1])
+        dark = middle.value.astype(float) - middle.black.mean()
+        dng.write(
+            tmp_path / f"dark{angle}.dng",
+            (middle.black.mean() + dark / 5).astype(np.uint16),
+            cfa=middle.cfa,  # type: ignore[arg-type]
+            black=float(middle.black.mean()),
+            white=middle.white,
+            exif=exif.read(files[1]),
+            color_matrix=np.eye(3),
+            as_shot_neutral=np.ones(3),
+        )
+        frames.append(f'[[frame]]\nfile = "dark{angle}.dng"\nrole = "ambient"\nangle = {angle}\n')
+    (tmp_path / "capture.toml").write_text("".join(frames))
+    line = next(line for line in verdict(tmp_path).lines if line.name == "ambient")
+    assert line.state == "reshoot"
+    # hdr subtracts it: a fifth of the middle frame against the four fifths that are left
+    assert line.figure == pytest.approx(0.25, rel=0.05)
+
+
+def test_reduced_picture_keeps_what_is_clipped(example: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("polcap.check.reduced._MOST_PIXELS", 3e4)
+    capture = captures.read(example)
+    taken = take(capture, clip=0.98)
+    assert taken.step == 4
+    assert taken.capture.size_px == (192, 144)
+    brightest = taken.capture.shots[0].frames[2].load()
+    assert brightest.cfa is None and brightest.value.shape == (144, 192, 3)
+    assert ((taken.clipped[0, 2] > 0) == (brightest.value == 1).all(-1)).all()
+    assert taken.clipped[0, 2].mean() > 0.001
