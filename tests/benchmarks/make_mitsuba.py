@@ -111,7 +111,7 @@ def subdivided(mesh: Triangles) -> tuple[Floats, Floats]:
     corner, normal = mesh.vertices[mesh.faces].astype(np.float64), mesh.corner_normals.astype(np.float64)
     while len(corner) < FACES:
         corner, normal = (_quartered(value) for value in (corner, normal))
-    return corner, normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+    return corner, normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
 
 
 def facing(corner: Floats, normal: Floats, camera: Floats) -> tuple[Floats, Floats]:
