@@ -23,17 +23,25 @@ CHANNELS = (
 )  # fmt: skip
 
 
-@stage(version=1, keep=False)
+_BULGE = 0.5  # how far the visible surface comes forward on average, in radii: a cone's 1/3 to a ball's 2/3
+
+
+@stage(version=2, keep=False)
 def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
     """All cues of a crop.
 
     The colour matrix acts on S0 only; DoLP and AoLP are taken in camera channels, summed over them
-    before any ratio. A capture without a chart has no absolute scale: its 99th percentile is set to 0.8.
+    before any ratio. The chart stands beside the object's middle, so that the visible surface, nearer to
+    the flash, gets more light than the chart. A capture without a chart has no absolute scale: its 99th
+    percentile is set to 0.8.
     """
     import numpy as np
 
     ratio, sigma, dolp, normalized = polarization(stokes.stokes, stokes.covariance)
     radiance = np.asarray(stokes.stokes[0] @ color.matrix.T, dtype=np.float32)
+    if color.source in ("chart", "corners"):
+        radius = float(np.sqrt(stokes.mask.sum() / np.pi)) / stokes.view.focal  # of the object, in distances
+        radiance = radiance * np.float32((1 - _BULGE * min(radius, 0.5)) ** 2)
     if color.source in ("camera", "none") and stokes.mask.any():
         radiance = radiance * np.float32(0.8 / max(float(np.percentile(radiance[stokes.mask], 99)), 1e-9))
     height, width = stokes.mask.shape

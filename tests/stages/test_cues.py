@@ -87,3 +87,21 @@ def test_clipping_reaches_the_network(ball):
     clipped = dataclasses.replace(ball, quality=np.full_like(ball.quality, Quality.CLIPPED))
     channel = cues.channels(clipped)[cues.CHANNELS.index("clipped")]
     assert (channel[ball.mask] == 1).all()
+
+
+@pytest.mark.parametrize("size", [0.05, 0.1, 0.2])
+def test_the_chart_stands_beside_the_middle_of_what_bulges_forward(size: float):
+    """Irradiance of the chart by that of the visible surface lies between those of a cone and of a ball.
+
+    size: radius over distance; inverse-square law, both solids as deep as half their width.
+    """
+    found = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
+    focal = float(np.sqrt(found.mask.sum() / np.pi)) / size
+    stokes_ = dataclasses.replace(found, view=dataclasses.replace(found.view, focal=focal))
+    free, charted = (
+        cues.compute(stokes_, dataclasses.replace(scenes.no_color(), source=source)) for source in ("profile", "chart")
+    )
+    factor = float(np.median(charted.radiance[found.mask] / free.radiance[found.mask]))
+    r = np.sqrt((np.arange(1000) + 0.5) / 1000)  # evenly over the disc
+    cone, ball = (1 / np.mean(1 / (1 - size * height) ** 2) for height in (1 - r, np.sqrt(1 - r * r)))
+    assert ball < factor < cone
