@@ -98,7 +98,8 @@ def _disturbed(
     planted: dict[str, Any] = {}
     if fault in ROTATOR_FAULTS:
         most = 12 if fault in ("no-answer", "garbage", "half-line") else 4
-        planted = {"fault": fault, "at": chance.randint(1, most), "times": chance.choice((1, ALWAYS))}
+        least = 2 if fault == "wrong-position" else 1  # a zero that is off shows in no position read back
+        planted = {"fault": fault, "at": chance.randint(least, most), "times": chance.choice((1, ALWAYS))}
     with kind(**planted) as device:
         own = fault if fault in pools.CAMERA_FAULTS else ""
         camera = PoolCamera(pool, lambda: device.angle_deg, own, chance.randint(1, _FRAMES))
