@@ -14,6 +14,7 @@ def inputs(height: int, width: int) -> torch.Tensor:
     torch.manual_seed(0)
     x = torch.randn(2, len(CHANNELS), height, width)
     x[:, CHANNELS.index("mask")] = 1
+    x[:, CHANNELS.index("clipped")] = (x[:, CHANNELS.index("clipped")] > 2).float()
     return x
 
 
