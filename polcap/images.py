@@ -243,9 +243,7 @@ class Cues:
 class Network:
     """A loaded model: what it computes, and what its file says of itself."""
 
-    run: Callable[[Floats], dict[str, Floats]] = field(
-        compare=False, repr=False
-    )  # (1, N, H, W) → name → (1, n, H, W)
+    run: Callable[[Floats], dict[str, Floats]] = field(compare=False, repr=False)  # (1, N, H, W) → name → (1, n, H, W)
     digest: str
     channels: tuple[str, ...]  # names of stages/cues.py, in order
     metadata: Mapping[str, str]
@@ -260,9 +258,7 @@ class SurfaceMaps:
     diffuse: Floats  # (H, W, 3) albedo ρ_d, linear Rec.709
     specular: Floats  # (H, W, 3) F0, linear Rec.709
     roughness: Floats  # (H, W) perceptual, α = roughness²
-    depth_prior: (
-        Floats | None
-    )  # (H, W) coarse depth, growing away, mean about 0; unit: √(mask pixels/π) px
+    depth_prior: Floats | None  # (H, W) coarse depth, growing away, mean about 0; unit: √(mask pixels/π) px
     confidence: Floats  # (H, W) expected normal error, degrees
     mask: NDArray[np.bool_]  # (H, W)
     view: View
@@ -300,9 +296,7 @@ class ChartRequest:
     """Where the colour calibration is to come from."""
 
     mode: Literal["auto", "corners", "profile", "none"]
-    corners: Floats | None = (
-        None  # (4, 2) outer patch corners, visible RAW px, dark-skin corner first, clockwise
-    )
+    corners: Floats | None = None  # (4, 2) outer patch corners, visible RAW px, dark-skin corner first, clockwise
     profile: ColorCalibration | None = None  # of another capture of the same set-up
 
 

@@ -153,9 +153,7 @@ def _huffman_lengths(frequency: NDArray[np.intp]) -> NDArray[np.int64]:
     total keeps d ≤ 14. A category that never occurs, 17, adds one bit and takes the code of all ones.
     """
     floor = int(frequency.sum()) // 1000 + 1
-    heap: list[tuple[int, int, tuple[int, ...]]] = [
-        (max(int(f), floor), s, (s,)) for s, f in enumerate(frequency) if f
-    ]
+    heap: list[tuple[int, int, tuple[int, ...]]] = [(max(int(f), floor), s, (s,)) for s, f in enumerate(frequency) if f]
     heap.append((1, 17, (17,)))
     heapq.heapify(heap)
     lengths = np.zeros(18, np.int64)

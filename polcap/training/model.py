@@ -206,9 +206,7 @@ class Branch(nn.Module):  # type: ignore[misc]  # torch comes without types here
             self.hint.extend(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(widths))
             self.share = nn.ModuleDict({str(level): Share(widths[level]) for level in _SHARED})
 
-    def forward(
-        self, features: list[Tensor], seen: Tensor, inside: Tensor, told: Tensor | None = None
-    ) -> Tensor:
+    def forward(self, features: list[Tensor], seen: Tensor, inside: Tensor, told: Tensor | None = None) -> Tensor:
         hinted: list[Tensor] = []
         for hint in self.hint:
             hinted.append(hint(F.relu(hinted[-1]) if hinted else F.pixel_unshuffle(seen, 2)))

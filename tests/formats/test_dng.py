@@ -33,9 +33,7 @@ PHASES = {
 MATRIX = np.array([[0.9, -0.29, -0.07], [-0.45, 1.24, 0.23], [-0.09, 0.19, 0.71]])
 
 
-def write(
-    path: Path, mosaic: np.ndarray, phase: str = "RGGB", compression: str = "ljpeg", **exif: object
-) -> Path:
+def write(path: Path, mosaic: np.ndarray, phase: str = "RGGB", compression: str = "ljpeg", **exif: object) -> Path:
     dng.write(
         path,
         mosaic,
