@@ -21,6 +21,10 @@ from polcap.stages.cues import CHANNELS, channels
 
 _BLURS_PX = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0)
 _SAME = 2.0  # standard deviations that two averages of the same thing may differ by
+_INVERSION = 2.0  # factor on the inversion's expected error in the join: the network has seen what it has seen
+_CALIBRATION = (0.3, 1.65, 45.0)  # actual error = min(a·expectedᵇ, c), degrees: path-traced pictures of training meshes
+_BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
+_DARK = 0.02  # radiance below which a ratio means little, as in the channels' logarithm
 _MODEL_ERROR_DEG = 4.0  # interreflection, highlights, unknown index: measured on path-traced objects
 
 
@@ -201,7 +205,9 @@ def _learned(cues: Cues, network: Network, settings: Settings) -> SurfaceMaps:
     diffuse = _color(cues, network, settings)
     seen = maps["normal"] / np.maximum(_length(maps["normal"]), 1e-6)
     by_pixel = _analytic(cues, settings, (np.asarray(frames.to_ray_frame(seen, cues.rays)), maps["sigma"]))
-    normal, expected = _joined((seen, maps["sigma"]), (by_pixel.normal, by_pixel.confidence))
+    normal, stated = _joined((seen, maps["sigma"]), (by_pixel.normal, _INVERSION * by_pixel.confidence))
+    scale, power, most = _CALIBRATION
+    expected = np.minimum(scale * stated**power, most)
     inside = cues.mask[..., None]
     return SurfaceMaps(
         normal=(normal * inside).astype(np.float32),
@@ -333,20 +339,22 @@ def _resized(cues: Cues, scale: float) -> Cues:
 
 
 def _color(cues: Cues, network: Network, settings: Settings) -> Floats:
-    """Diffuse albedo (H, W, 3): the mean of two passes a pixel apart, in which the network's 2 px grid cancels.
+    """Diffuse albedo (H, W, 3): S0 times a smooth factor, the network's albedo over S0.
 
-    A crop larger than two tiles is seen at that size, and the rest of its detail taken from S0.
+    The factor, not the albedo, is smoothed, by a kernel in which the network's 2 px grid vanishes: texture
+    is S0's own. A crop larger than two tiles is seen at that size, and the factor enlarged.
     """
     height, width = cues.mask.shape
     seen = _resized(cues, min(1.0, 2 * settings.tile_px / max(height, width)))
-    picture = channels(seen)
-    moved = np.pad(picture, ((0, 0), (1, 0), (1, 0)))
-    here, there = (_run(p, network, settings)["diffuse"] for p in (picture, moved))
-    albedo = np.asarray((here + there[1:, 1:]) / 2, np.float32)
-    if seen is cues:
-        return albedo
-    finer = cues.radiance / np.maximum(cv2.resize(seen.radiance, (width, height)), 1e-3)
-    return np.asarray(cv2.resize(albedo, (width, height)) * np.clip(finer, 0.25, 4))
+    albedo = _run(channels(seen), network, settings)["diffuse"]
+    inside = seen.mask.astype(np.float32)
+    factor = np.log((albedo + _DARK) / (np.maximum(seen.radiance, 0) + _DARK)) * inside[..., None]
+    smooth, share = (
+        cv2.sepFilter2D(part.astype(np.float32), -1, _BINOMIAL, _BINOMIAL, borderType=cv2.BORDER_CONSTANT)
+        for part in (factor, inside)
+    )
+    factor = cv2.resize(smooth / np.maximum(share, 0.1)[..., None], (width, height))
+    return np.asarray((np.maximum(cues.radiance, 0) + _DARK) * np.exp(factor) - _DARK)
 
 
 def _run(picture: Floats, network: Network, settings: Settings) -> dict[str, Floats]:

@@ -104,9 +104,27 @@ def test_a_crop_larger_than_two_tiles_keeps_its_texture():
     middle = np.s_[120:240, 120:240]
     seen_whole = infer.estimate(twice, network(), infer.Settings(tile_px=256)).diffuse[middle]
     seen_small = infer.estimate(twice, network(), infer.Settings(tile_px=128, turns=False)).diffuse[middle]
-    assert np.allclose(seen_whole, 0.3, atol=1e-5)
-    assert seen_small.std() > 0.005
+    assert np.abs(seen_whole - 0.3).mean() < 0.01  # texture finer than the smoothing of the factor stays
+    assert seen_small.std() > max(0.005, 1.2 * seen_whole.std())
     assert seen_small.mean() == pytest.approx(0.3, rel=0.05)
+
+
+def test_a_grid_of_the_network_does_not_reach_the_albedo():
+    """An albedo with a 2 px pattern of ±10 % comes out without it."""
+    found = seen(noise=1e-4, textured=False)
+    plain = network()
+
+    def gridded(picture):
+        maps = plain.run(picture)
+        y, x = np.mgrid[: picture.shape[2], : picture.shape[3]]
+        return maps | {"diffuse": maps["diffuse"] * np.where((x + y) % 2, 1.1, 0.9).astype(np.float32)}
+
+    albedo = infer.estimate(found, dataclasses.replace(plain, run=gridded), infer.Settings()).diffuse.mean(-1)
+    rows, columns = np.nonzero(found.mask)
+    inner = np.s_[rows.min() + 60 : rows.max() - 60, columns.min() + 60 : columns.max() - 60]
+    part = albedo[inner]
+    y, x = np.mgrid[: part.shape[0], : part.shape[1]]
+    assert abs(part[(x + y) % 2 == 0].mean() / part[(x + y) % 2 == 1].mean() - 1) < 2e-3
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
