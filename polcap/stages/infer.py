@@ -22,7 +22,7 @@ from polcap.stages.cues import CHANNELS, channels
 _BLURS_PX = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0)
 _SAME = 2.0  # standard deviations that two averages of the same thing may differ by
 _INVERSION = 2.0  # factor on the inversion's expected error in the join: the network has seen what it has seen
-_CALIBRATION = (0.33, 1.68, 45.0)  # actual error = min(a·expectedᵇ, c), degrees: path-traced pictures of training meshes
+_CALIBRATION = (0.33, 1.68, 45.0)  # error = min(a·expectedᵇ, c), degrees: traced pictures of training meshes
 _BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 _DARK = 0.02  # radiance below which a ratio means little, as in the channels' logarithm
 _MODEL_ERROR_DEG = 4.0  # interreflection, highlights, unknown index: measured on path-traced objects
