@@ -1,6 +1,6 @@
 """In: a capture, seconds after its last frame. Out: keep or reshoot, and why.
 
-The path's own stages judge, on pictures averaged down to about a megapixel; what that would hide is taken from
+The path's own stages judge, on pictures averaged down to at most 0.6 MP; what that would hide is taken from
 the full pictures as they are read. Nothing is written.
 """
 

@@ -1,4 +1,4 @@
-"""A capture in, the same of about a megapixel out, with what the averaging would hide: clipping and sharpness."""
+"""A capture in, the same of at most 0.6 MP out, with what the averaging would hide: clipping and sharpness."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from polcap.images import Capture, Floats, Frame, SensorImage
 from polcap.optics import sensor, sharpness
 
-_MOST_PIXELS = 1e6  # of the pictures that the stages see: they take three seconds on two cores
+_MOST_PIXELS = 0.6e6  # of the pictures that the stages see: they take three to four seconds on two cores
 _LEAST_LIGHT = 0.01  # of the sensor's range; in darker tiles noise is detail
 
 

@@ -122,17 +122,30 @@ def _kill(child: subprocess.Popen[bytes], overdue: threading.Event) -> None:
     child.kill()
 
 
-_worker: Worker | None = None
+_idle: list[Worker] = []
 _owner = 0
+_hold = threading.Lock()
 
 
 def call(function: str, path: str | os.PathLike[str], **options: Any) -> Answer:
-    """`Worker.call` on this process's own worker, started when first needed."""
-    global _worker, _owner
-    if _worker is None or _owner != os.getpid():  # a fork must not share the pipe
-        _worker, _owner = Worker(), os.getpid()
-        atexit.register(_worker.close)
-    return _worker.call(function, path, **options)
+    """`Worker.call` on a child that is idle, or on a new one: as many as threads call at a time."""
+    global _owner
+    with _hold:
+        if _owner != os.getpid():  # a fork must not share the pipes
+            _idle.clear()
+            _owner = os.getpid()
+            atexit.register(_close)
+        worker = _idle.pop() if _idle else Worker()
+    try:
+        return worker.call(function, path, **options)
+    finally:
+        with _hold:
+            _idle.append(worker)
+
+
+def _close() -> None:
+    for worker in _idle:
+        worker.close()
 
 
 def serve(memory_gib: float) -> None:
