@@ -64,7 +64,7 @@ def read(file: Path, clean: bool, seed: int) -> Case:
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         seen = photograph(scene[0][:, None], diffuse, facing, given, v, torch.from_numpy(at), errors)
-    white = ColorCalibration(np.eye(3, dtype=np.float32), None, None, None, "chart", 0.0, None)
+    white = ColorCalibration(np.eye(3, dtype=np.float32), None, None, None, "profile", 0.0, None)
     measured = cues.compute(stokes_image(seen, at, mask, view), white)
     depth = np.where(mask, (made["depth"] - made["middle"]) / made["unit"], 0).astype(np.float32)
     truth = SurfaceMaps(
