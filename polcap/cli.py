@@ -246,14 +246,18 @@ def check(
     json: Json = False,
 ) -> None:
     """Keep a capture or reshoot it, and why: seconds after its last frame. Writes nothing."""
+    from concurrent.futures import ThreadPoolExecutor
+
     from polcap import check as checks
     from polcap import config as settings
     from polcap import pipeline
     from polcap.formats import capture as captures
 
     chosen = settings.load(config, assignments or ())
-    network = pipeline.load_network(None, None, "cpu", 0)
-    verdict = checks.inspect(captures.read(capture, _angles(angles)), network, chosen)
+    with ThreadPoolExecutor(1) as beside:  # the model loads while the headers are read
+        network = beside.submit(pipeline.load_network, None, None, "cpu", 0)
+        found = captures.read(capture, _angles(angles))
+    verdict = checks.inspect(found, network.result(), chosen)
     _print(checks.shown(verdict) if json else checks.table(verdict))
     if not verdict.keep:
         raise typer.Exit(GateError.exit_code)

@@ -27,29 +27,38 @@ class Taken:
 
 
 def take(capture: Capture, clip: float) -> Taken:
-    """Every frame decoded once: one thread waits for the decoder while another averages."""
+    """Every frame decoded once, two at a time; the reference frame says how far to reduce and where to look."""
     frames = [frame for shot in capture.shots for frame in (*shot.frames, *shot.ambient)]
     first = capture.shots[0].frames[(len(capture.shots[0].frames) - 1) // 2]
-    image = first.load()
-    usable = sensor.usable(image, clip)
-    corners = sharpness.choose(_half(image)[1], usable)
-    times = max(1, int(np.ceil(np.sqrt(usable.size / _MOST_PIXELS))))
-    half = 1 if image.cfa is None else 2
 
-    def seen(frame: Frame) -> tuple[SensorImage, Floats, Floats, NDArray[np.bool_]]:
-        whole = image if frame is first else frame.load()
-        signal, light = _half(whole)
-        usable = sensor.usable(whole, clip)
-        shares = _averaged((~usable).astype(np.float32), times)
-        value = _averaged(signal, times)
-        value[shares > 0] = 1  # the stages drop a pixel of which a part is clipped
-        tiles = sharpness.cut(light, corners)
-        clear = sharpness.cut(usable.astype(np.float32), corners).all((1, 2)) & (tiles.mean((1, 2)) > _LEAST_LIGHT)
-        small = SensorImage(value, np.zeros((1, 1)), 1.0, None, whole.camera_matrix, whole.white_balance, whole.lossy)
-        return small, shares, tiles, clear
+    def looked_over() -> tuple[SensorImage, NDArray[np.int64], int]:
+        image = first.load()
+        usable = sensor.usable(image, clip)
+        times = max(1, int(np.ceil(np.sqrt(usable.size / _MOST_PIXELS))))
+        return image, sharpness.choose(_half(image)[1], usable), times
 
     with ThreadPoolExecutor(2) as pool:
+        reference = pool.submit(looked_over)  # before all others, which wait for it
+
+        def seen(frame: Frame) -> tuple[SensorImage, Floats, Floats, NDArray[np.bool_]]:
+            loaded = None if frame is first else frame.load()
+            image, corners, times = reference.result()
+            whole = loaded or image
+            signal, light = _half(whole)
+            usable = sensor.usable(whole, clip)
+            shares = _averaged((~usable).astype(np.float32), times)
+            value = _averaged(signal, times)
+            value[shares > 0] = 1  # the stages drop a pixel of which a part is clipped
+            tiles = sharpness.cut(light, corners)
+            clear = sharpness.cut(usable.astype(np.float32), corners).all((1, 2)) & (tiles.mean((1, 2)) > _LEAST_LIGHT)
+            small = SensorImage(
+                value, np.zeros((1, 1)), 1.0, None, whole.camera_matrix, whole.white_balance, whole.lossy
+            )
+            return small, shares, tiles, clear
+
         found = dict(zip(map(id, frames), pool.map(seen, frames)))
+    image, _, times = reference.result()
+    half = 1 if image.cfa is None else 2
 
     def smaller(frame: Frame) -> Frame:
         small = found[id(frame)][0]
