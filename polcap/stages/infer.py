@@ -47,10 +47,32 @@ def estimate(cues: Cues, network: Network | None, settings: Settings) -> Surface
 # --- analytic -----------------------------------------------------------------------------------
 
 
-def _analytic(cues: Cues, settings: Settings, guide: tuple[Floats, Floats] | None = None) -> SurfaceMaps:
-    """Zenith by the exact DoLP inversion; half-turn of the azimuth by `optics/azimuth.py`, or as `guide` has it.
+def _analytic(cues: Cues, settings: Settings) -> SurfaceMaps:
+    """Normals by the inversion; albedo and gloss as the highlights have them."""
+    normal, error, cos_zenith = _inverted(cues, settings)
+    diffuse, highlight = _albedo(cues, cos_zenith, settings.ior)
+    roughness, specular = _gloss(highlight, cos_zenith, cues)
+    shape = cues.mask.shape
+    return SurfaceMaps(
+        normal=(normal * cues.mask[..., None]).astype(np.float32),
+        diffuse=diffuse,
+        specular=np.full((*shape, 3), specular, np.float32) * cues.mask[..., None],
+        roughness=np.full(shape, roughness, np.float32) * cues.mask,
+        depth_prior=None,
+        confidence=error,
+        mask=cues.mask,
+        view=cues.view,
+        estimator="analytic",
+    )
 
-    guide : normals (H, W, 3) in the frame of each ray and their expected error (H, W), degrees.
+
+def _inverted(
+    cues: Cues, settings: Settings, guide: tuple[Floats, Floats] | None = None
+) -> tuple[Floats, Floats, Floats]:
+    """Normals (H, W, 3), their expected error (H, W) in degrees and cosines of the zenith (H, W).
+
+    Zenith by the exact DoLP inversion; half-turn of the azimuth by `optics/azimuth.py`, or as `guide` has it:
+    normals (H, W, 3) in the frame of each ray and their expected error (H, W), degrees.
     """
     ratio, sigma = _smoothed(cues)
     squared = ratio[0] ** 2 + ratio[1] ** 2
@@ -62,22 +84,8 @@ def _analytic(cues: Cues, settings: Settings, guide: tuple[Floats, Floats] | Non
         phi, certainty = azimuth.resolve(axis, np.sin(zenith), cues.mask)
     else:
         phi, certainty = _guided(axis, cues.rays, *guide)
-
-    normal = _from_angles(cos_zenith, phi, cues.rays)
-    diffuse, highlight = _albedo(cues, cos_zenith, settings.ior)
-    roughness, specular = _gloss(highlight, cos_zenith, cues)
-    shape = cues.mask.shape
-    return SurfaceMaps(
-        normal=(normal * cues.mask[..., None]).astype(np.float32),
-        diffuse=diffuse,
-        specular=np.full((*shape, 3), specular, np.float32) * cues.mask[..., None],
-        roughness=np.full(shape, roughness, np.float32) * cues.mask,
-        depth_prior=None,
-        confidence=_expected_error(zenith, dolp, sigma, certainty, cues, settings.ior),
-        mask=cues.mask,
-        view=cues.view,
-        estimator="analytic",
-    )
+    error = _expected_error(zenith, dolp, sigma, certainty, cues, settings.ior)
+    return _from_angles(cos_zenith, phi, cues.rays), error, cos_zenith
 
 
 def _guided(axis: Floats, rays: Floats, normal: Floats, sigma: Floats) -> tuple[Floats, Floats]:
@@ -204,8 +212,9 @@ def _learned(cues: Cues, network: Network, settings: Settings) -> SurfaceMaps:
     maps = {n: m if m.shape[:2] == (height, width) else cv2.resize(m, (width, height)) for n, m in whole.items()}
     diffuse = _color(cues, network, settings)
     seen = maps["normal"] / np.maximum(_length(maps["normal"]), 1e-6)
-    by_pixel = _analytic(cues, settings, (np.asarray(frames.to_ray_frame(seen, cues.rays)), maps["sigma"]))
-    normal, stated = _joined((seen, maps["sigma"]), (by_pixel.normal, _INVERSION * by_pixel.confidence))
+    guide = np.asarray(frames.to_ray_frame(seen, cues.rays)), maps["sigma"]
+    by_pixel, doubt, _ = _inverted(cues, settings, guide)
+    normal, stated = _joined((seen, maps["sigma"]), (by_pixel, _INVERSION * doubt))
     scale, power, most = _CALIBRATION
     expected = np.minimum(scale * stated**power, most)
     inside = cues.mask[..., None]

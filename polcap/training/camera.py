@@ -1,8 +1,8 @@
 """The camera in training: Stokes parameters -> what three imperfect photographs would have measured.
 
 Each error is drawn per object. Shot noise and read noise of a merged bracket, flash energy that is
-left after self-calibration, polarizer angle errors, misregistration and blur, stray and reflected
-light, depolarization, saturation.
+left after self-calibration, polarizer angle errors, misregistration and blur, stray light,
+depolarization, saturation.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,6 @@ from math import pi
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 ANGLES = (0.0, pi / 4, pi / 2)  # rad
 
@@ -28,7 +27,6 @@ class Errors:
     blur: Tensor  # px, 1σ
     depolarization: Tensor  # factor on S1, S2
     ambient: Tensor  # S0 of stray light on a white surface
-    reflected: Tensor  # strength of light between parts of the object
     noise_belief: Tensor  # factor on the variance that the solver believes in
 
     @staticmethod
@@ -51,9 +49,8 @@ class Errors:
             angle=turn * pi / 180,
             shift=moved.permute(1, 2, 0),
             blur=u(0, 0.5),
-            depolarization=1 - u(0, 0.2) * sometimes(0.6),
+            depolarization=1 - u(0, 0.15) * sometimes(0.3),
             ambient=u(0, 0.03) * sometimes(0.5),
-            reflected=u(0, 0.3) * sometimes(0.7),
             noise_belief=torch.exp(0.3 * torch.randn(count, device=device)),
         )
 
@@ -63,7 +60,7 @@ class Errors:
         three = torch.zeros(3, count, device=device)
         return Errors(
             1e9 * one, 1e3 * one, zero, three + 1, three, torch.zeros(3, count, 2, device=device),
-            zero, one, zero, zero, one,
+            zero, one, zero, one,
         )  # fmt: skip
 
     @staticmethod
@@ -79,26 +76,23 @@ class Errors:
             read_noise=5 * torch.ones(count, device=device),
             gain=1 + 0.003 * torch.randn(3, count, device=device),
             angle=torch.randn(3, count, device=device) * 0.5 * pi / 180,
-            reflected=0.15 * torch.ones(count, device=device),
         )
 
 
 def photograph(
-    stokes: Tensor, diffuse: Tensor, facing: Tensor, mask: Tensor, rays: Tensor, at: Tensor, errors: Errors
+    stokes: Tensor, diffuse: Tensor, mask: Tensor, rays: Tensor, at: Tensor, errors: Errors
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Measured Stokes parameters (3, M, 3), their covariance (6, M, 3) and clipped pixels (M,) at pixels `at`.
 
-    stokes (3, B, H, W, 3) in the frame of each ray; diffuse (B, H, W, 3); facing (B, H, W) cosine between
-    normal and ray; mask (B, H, W); rays (B, H, W, 3); at (M,) indices into B·H·W. The solve takes the
-    angles as they are in the image, as `stages/stokes.py` does.
+    stokes (3, B, H, W, 3) in the frame of each ray; diffuse (B, H, W, 3); mask (B, H, W); rays (B, H, W, 3); at (M,)
+    indices into B·H·W. The solve takes the angles as they are in the image, as `stages/stokes.py` does.
     """
     count, height, width = mask.shape
     wide = (count, 1, 1, 1)
     owner = at // (height * width)
     inside = mask[..., None].to(stokes.dtype)
-    stray = errors.ambient.view(wide) + errors.reflected.view(wide) * _hollow(facing, mask)[..., None]
     background = torch.rand(count, 1, 1, 3, device=stokes.device) * torch.rand(wide, device=stokes.device) * 0.3
-    s0 = stokes[0] + diffuse * stray + (1 - inside) * background
+    s0 = stokes[0] + diffuse * errors.ambient.view(wide) + (1 - inside) * background
     s1, s2 = (stokes[k] * errors.depolarization.view(wide) for k in (1, 2))
 
     shots, variance, clipped = [], [], torch.zeros_like(at, dtype=torch.bool)
@@ -145,12 +139,3 @@ def _moved(image: Tensor, shift: Tensor, blur: Tensor) -> Tensor:
         before, after = torch.roll(image, 1, axis), torch.roll(image, -1, axis)
         image = image + spread * (before + after - 2 * image) + slope * (before - after)
     return image
-
-
-def _hollow(facing: Tensor, mask: Tensor) -> Tensor:
-    """Share of the neighbourhood that is turned away: a cheap stand-in for interreflection, (B, H, W)."""
-    height, width = facing.shape[-2:]
-    tilted = ((1 - facing) * mask)[:, None]
-    small = F.avg_pool2d(tilted, 4)
-    smooth = F.avg_pool2d(small, 5, stride=1, padding=2, count_include_pad=False)
-    return F.interpolate(smooth, size=(height, width), mode="bilinear", align_corners=False)[:, 0]

@@ -4,6 +4,7 @@ The cues are computed by `stages/cues.py`, the same code that a capture goes thr
 """
 
 from dataclasses import dataclass
+from math import isqrt
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,8 +17,10 @@ from torch.nn import functional as F
 from polcap.images import Quality
 from polcap.optics import frames, shade
 from polcap.stages import cues
-from polcap.training import materials
+from polcap.training import bounce, gbuffers, materials
 from polcap.training.camera import Errors, photograph
+
+Indices = NDArray[np.integer[Any]]
 
 
 @dataclass(frozen=True)
@@ -49,101 +52,124 @@ class Photo:
 
 
 @dataclass(frozen=True)
-class Light:
-    """The flash of each object."""
+class Seen:
+    """Some of the traced views at one size; M pixels of objects, one after the other."""
 
-    position: Tensor  # (B, 3) camera frame, in units of the object's distance
-    strength: Tensor  # (B,) S0 of a white plane facing it at the object's distance
-
-    @staticmethod
-    def draw(count: int, device: torch.device) -> "Light":
-        """Up to 10 % of the distance beside the lens; scale of the chart within 15 %."""
-        way = 2 * torch.pi * torch.rand(count, device=device)
-        off = 0.1 * torch.rand(count, device=device)
-        position = torch.stack([off * torch.cos(way), off * torch.sin(way), torch.zeros_like(off)], dim=1)
-        return Light(position, 0.85 + 0.3 * torch.rand(count, device=device))
-
-    @staticmethod
-    def stated(count: int, device: torch.device) -> "Light":
-        """The evaluation's: 5 % of the distance above the lens."""
-        position = torch.tensor([0.0, 0.05, 0.0], device=device).repeat(count, 1)
-        return Light(position, torch.ones(count, device=device))
+    mask: Tensor  # (B, H, W) bool
+    rays: Tensor  # (B, H, W, 3) camera frame, surface to camera
+    inside: Tensor  # (M,) indices of the object's pixels into B·H·W
+    owner: Tensor  # (M,) object of each
+    v: Tensor  # (M, 3) their rays
+    normal: Tensor  # (M, 3) camera frame, without bumps
+    position: Tensor  # (M, 3) object frame
+    place: Tensor  # (M, 3) camera frame, in units of the object's distance
+    depth: Tensor  # (M,) units of gbuffers.depth_unit, mean 0
+    lit: Tensor  # (M,) 1 where the flash reaches
+    met: Tensor  # (M, bounce.RAYS) rows among the M of the pixels that each sees, −1 for none
+    turn: Tensor  # (B, 3, 3) object → camera
+    flash: Tensor  # (B, 3) camera frame, in units of the object's distance
 
 
 class Simulator:
     """Views and materials on one device; draws batches from torch's global random state."""
 
     def __init__(self, views: dict[str, NDArray[Any]], library: materials.Library, device: torch.device) -> None:
-        self.views, self.library, self.device = views, library, device
+        self.library, self.device = library, device
         self.size = views["mask"].shape[1]
+        self.camera = views["camera"]
+        self.views = {name: views[name].reshape(-1, views[name].shape[-1]) for name in gbuffers.ARRAYS}  # a row a pixel
 
     def draw(self, count: int, size: int) -> Batch:
         """`count` random objects at size² pixels (≤ the cache's), with every augmentation."""
-        pick = torch.randint(len(self.views["camera"]), (count,)).numpy()
-        view = self.look(pick, size, flip=True)
+        pick = torch.randint(len(self.camera), (count,)).numpy()
+        seen = self.look(pick, size, flip=True)
+        strength = 0.92 + 0.16 * torch.rand(count, device=self.device)  # what the chart leaves open
         jitter = torch.rand(count, device=self.device)
-        return batch(self.shoot(view, Light.draw(count, self.device), Errors.draw(count, self.device), jitter))
+        return batch(self.shoot(seen, strength, Errors.draw(count, self.device), jitter))
 
-    def look(self, pick: NDArray[np.integer[Any]], size: int, *, flip: bool) -> SimpleNamespace:
+    def look(self, pick: NDArray[np.integer[Any]], size: int, *, flip: bool) -> Seen:
         """Some of the traced views, thinned out to size² pixels and, with `flip`, mirrored at random."""
-        step = self.size / size
-        where = np.floor((np.arange(size) + 0.5) * step).astype(np.int64)  # pixels that stay
-        data = {}
-        for name in ("normal", "depth", "position", "mask"):
-            array = self.views[name]
-            taken = np.stack([array[i][where[:, None], where[None, :]] for i in pick])
-            data[name] = torch.from_numpy(taken).to(self.device)
-        camera = torch.from_numpy(self.views["camera"][pick]).to(self.device)
-        normal, depth, position = (data[k].float() for k in ("normal", "depth", "position"))
-        focal, middle, unit = camera[:, 0], camera[:, 3], camera[:, 4]
-        at = torch.from_numpy(where.astype(np.float32)).to(self.device)
-        x = ((at[None] - camera[:, 1:2]) / focal[:, None])[:, None, :].expand(-1, size, -1)
-        y = ((at[None] - camera[:, 2:3]) / focal[:, None])[:, :, None].expand(-1, -1, size)
-        v = F.normalize(torch.stack([-x, y, torch.ones_like(x)], dim=-1), dim=-1)
-        turn = camera[:, 5:].reshape(-1, 3, 3)
-        out = SimpleNamespace(
-            normal=normal, depth=depth[..., 0], position=position, mask=data["mask"][..., 0], rays=v, turn=turn,
-            far=1 + depth[..., 0] * (unit / middle)[:, None, None],
-        )  # fmt: skip
-        return _mirrored(out) if flip else out
+        full, area = self.size, size * size
+        pixels, change = _mirrored(np.arange(area).reshape(size, size), flip)
+        order = pixels.reshape(-1)  # the thinned pixels in their new places
+        where = np.floor((np.arange(size) + 0.5) * (full / size)).astype(np.int64)  # pixels that stay
+        y, x = where[order // size], where[order % size]
+        mask = self.views["mask"].reshape(-1, full * full)[pick][:, y * full + x]
+        inside = np.flatnonzero(mask)
+        owner, at = np.divmod(inside, area)
+        first = pick[owner]  # view of each pixel
+        met = self._met(first, y[at], x[at], order, mask, owner)
+        kept = (first * full + y[at]) * full + x[at]
 
-    def shoot(self, view: SimpleNamespace, light: Light, errors: Errors, jitter: Tensor | None = None) -> Photo:
-        """Dress, light and photograph; `jitter` (B,) in 0…1 thins or widens the mask that is given."""
-        count, height, width = view.mask.shape
-        inside = view.mask.reshape(-1).nonzero()[:, 0]
-        owner = inside // (height * width)
-        v = view.rays.reshape(-1, 3)[inside]
-        bare, position = (image.reshape(-1, 3)[inside] for image in (view.normal, view.position))
-        surface = materials.dress(self.library, bare, position, view.turn, owner, count)
-        normal = frames.to_ray_frame(surface.normal, v)
+        def tensor(array: NDArray[Any]) -> Tensor:
+            return torch.from_numpy(array).to(self.device)
+
+        def taken(name: str) -> Tensor:
+            return tensor(self.views[name].take(kept, axis=0)).float()
+
+        camera, mirror, rows = tensor(self.camera[pick]), tensor(change), tensor(owner)
+        focal, middle, unit = camera[:, 0, None], camera[:, 3], camera[:, 4]
+        right, low = ((tensor(a).float() - camera[:, k : k + 1]) / focal for a, k in ((x, 1), (y, 2)))
+        rays = F.normalize(torch.stack([-right, low, torch.ones_like(low)], dim=-1), dim=-1) @ mirror.T
+        v, depth = rays.reshape(-1, 3)[tensor(inside)], taken("depth")[:, 0]
+        far = 1 + depth * (unit / middle)[rows]
+        return Seen(
+            mask=tensor(mask).reshape(-1, size, size), rays=rays.reshape(-1, size, size, 3), inside=tensor(inside),
+            owner=rows, v=v, normal=taken("normal") @ mirror.T, position=taken("position"),
+            place=-v * (far / v[:, 2])[:, None], depth=depth, lit=taken("lit")[:, 0], met=tensor(met),
+            turn=mirror @ camera[:, 5:14].reshape(-1, 3, 3), flash=F.pad(camera[:, 14:16], (0, 1)) @ mirror.T,
+        )  # fmt: skip
+
+    def _met(
+        self, first: Indices, y: Indices, x: Indices, order: Indices, mask: NDArray[np.bool_], owner: Indices
+    ) -> Indices:
+        """Seen.met of pixels (y, x) of views `first`, whose thinned pixels lie in `order` with masks (B, H·W)."""
+        full, area = self.size, len(order)
+        size, coarse = isqrt(area), full // bounce.COARSE
+        there = np.full(2**16, -1, np.int64)  # place in the thinned and mirrored view of each pixel of the cache
+        thinned = np.arange(full) * size // full
+        there[: full * full] = np.argsort(order)[(thinned[:, None] * size + thinned).reshape(-1)]
+        there[bounce.NOWHERE] = -1
+        row = np.where(mask.reshape(-1), np.cumsum(mask) - 1, -1)
+        cell = (first * coarse + y // bounce.COARSE) * coarse + x // bounce.COARSE
+        to = there[self.views["met"].take(cell, axis=0)]  # (M, RAYS)
+        return np.where(to >= 0, row[to + owner[:, None] * area], -1)
+
+    def shoot(self, seen: Seen, strength: Tensor, errors: Errors, jitter: Tensor | None = None) -> Photo:
+        """Dress, light and photograph.
+
+        strength (B,) S0 of a white plane facing the flash at the object's distance; `jitter` (B,) in 0…1 thins or
+        widens the mask that is given.
+        """
+        count, height, width = seen.mask.shape
+        surface = materials.dress(self.library, seen.normal, seen.position, seen.turn, seen.owner, count)
+        normal = frames.to_ray_frame(surface.normal, seen.v)
         normal = F.normalize(torch.cat([normal[:, :2], normal[:, 2:].clamp(min=0.02)], dim=1), dim=1)
-        place = -v * (view.far.reshape(-1)[inside] / v[:, 2])[:, None]
-        to_light = light.position[owner] - place
-        squared = (to_light * to_light).sum(dim=1)
-        to_light = frames.to_ray_frame(to_light / squared.sqrt()[:, None], v)
-        specular, irradiance = surface.specular, light.strength[owner] / squared
+        to_flash = seen.flash[seen.owner] - seen.place
+        squared = (to_flash * to_flash).sum(dim=1)
+        to_flash = frames.to_ray_frame(to_flash / squared.sqrt()[:, None], seen.v)
+        irradiance = seen.lit * strength[seen.owner] / squared
         stokes, body = (
-            shade.stokes(normal, surface.diffuse, part, surface.roughness, surface.ior, to_light, irradiance)
-            for part in (specular, torch.zeros_like(specular))
+            shade.stokes(normal, surface.diffuse, part, surface.roughness, surface.ior, to_flash, irradiance)
+            for part in (surface.specular, torch.zeros_like(surface.specular))
         )
         highlight = 1 - (body[0].sum(dim=1) + 1e-4) / (stokes[0].sum(dim=1) + 1e-4)
 
         def image(flat: Tensor) -> Tensor:
             out = flat.new_zeros(count * height * width, flat.shape[1])
-            return out.index_copy(0, inside, flat).reshape(count, height, width, -1)
+            return out.index_copy(0, seen.inside, flat).reshape(count, height, width, -1)
 
         truth = {
-            "normal": image(normal), "depth": view.depth[..., None], "diffuse": image(surface.diffuse),
-            "specular": image(specular), "roughness": image(surface.roughness[:, None]),
+            "normal": image(normal), "depth": image(seen.depth[:, None]), "diffuse": image(surface.diffuse),
+            "specular": image(surface.specular), "roughness": image(surface.roughness[:, None]),
             "highlight": image(highlight[:, None]),
         }  # fmt: skip
-        scene = torch.stack([image(part) for part in stokes])
-        given = view.mask if jitter is None else _redrawn(view.mask, jitter)
+        bounced = torch.stack([image(part) for part in bounce.arriving(seen, normal, surface, body[0])])
+        scene = torch.stack([image(part) for part in stokes]) + bounce.smooth(bounced, seen.mask)
+        given = seen.mask if jitter is None else _redrawn(seen.mask, jitter)
         at = given.reshape(-1).nonzero()[:, 0]
-        measured, covariance, clipped = photograph(
-            scene, truth["diffuse"], truth["normal"][..., 2], view.mask, view.rays, at, errors
-        )
-        return Photo(measured, covariance, clipped, at, given, view.rays, view.mask, truth)
+        measured, covariance, clipped = photograph(scene, truth["diffuse"], seen.mask, seen.rays, at, errors)
+        return Photo(measured, covariance, clipped, at, given, seen.rays, seen.mask, truth)
 
 
 def batch(photo: Photo) -> Batch:
@@ -170,26 +196,17 @@ def channels(photo: Photo) -> Tensor:
     return out.reshape(count, height, width, -1).permute(0, 3, 1, 2)
 
 
-def _mirrored(view: SimpleNamespace) -> SimpleNamespace:
-    """Each half of the time: left for right, top for bottom, x for y; one draw for the whole batch."""
-    out = view.__dict__.copy()
-    images = ("normal", "depth", "position", "mask", "rays", "far")
-    for operation in range(3):
-        if torch.rand(()) < 0.5:
+def _mirrored(pixels: Indices, flip: bool) -> tuple[Indices, NDArray[np.float32]]:
+    """Each half of the time: left for right, top for bottom, x for y; and what that does to vectors, (3, 3)."""
+    change = np.eye(3, dtype=np.float32)
+    for axis in range(3):
+        if not flip or torch.rand(()) < 0.5:
             continue
-        change = torch.eye(3, device=view.normal.device)
-        if operation < 2:
-            change[operation, operation] = -1
-            for name in images:
-                out[name] = out[name].flip(2 - operation)
+        if axis < 2:
+            pixels, change[axis] = np.flip(pixels, 1 - axis), -change[axis]
         else:  # transposing the array takes (x, y up) to (−y, −x)
-            change[:2, :2] = torch.tensor([[0.0, -1.0], [-1.0, 0.0]])
-            for name in images:
-                out[name] = out[name].transpose(1, 2)
-        for name in ("normal", "rays"):
-            out[name] = out[name] @ change.T
-        out["turn"] = change @ out["turn"]
-    return SimpleNamespace(**out)
+            pixels, change[:2] = pixels.T, -change[1::-1]
+    return pixels, change
 
 
 def _redrawn(mask: Tensor, jitter: Tensor) -> Tensor:

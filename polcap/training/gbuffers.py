@@ -1,4 +1,4 @@
-"""The cache of traced views: normals, depth and positions of training meshes, before any material.
+"""The cache of traced views of training meshes before any material: geometry, the flash's reach, who sees whom.
 
 Views are square, fp16, one array per quantity, readable as memory maps. Everything is fixed by the seed.
 """
@@ -6,6 +6,7 @@ Views are square, fp16, one array per quantity, readable as memory maps. Everyth
 import json
 import zlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,32 +16,41 @@ from polcap.errors import InputError
 from polcap.formats import mesh as mesh_files
 from polcap.images import Floats, GBuffer, View
 from polcap.synth.mesh import Tracer, Triangles, smooth
-from polcap.training import shapes
+from polcap.training import bounce, shapes, transport
 
-ARRAYS = {"normal": (3, np.float16), "depth": (1, np.float16), "position": (3, np.float16), "mask": (1, np.bool_)}
+ARRAYS = {  # pixels from one entry to the next, channels, kind
+    "normal": (1, 3, np.float16), "depth": (1, 1, np.float16), "position": (1, 3, np.float16),
+    "mask": (1, 1, np.bool_), "lit": (1, 1, np.bool_), "met": (bounce.COARSE, bounce.RAYS, np.uint16),
+}  # fmt: skip
+_ASIDE = 0.1  # of the distance: how far from the lens a random flash stands at most
 
 
 def build(
-    folder: Path, meshes: list[Path], *, views: int, procedural: int, per_shape: int = 8, size: int = 192, seed: int = 1
-) -> int:
+    folder: Path, meshes: list[Path], *, views: int, procedural: int, per_shape: int = 6, size: int = 192,
+    seed: int = 1, flash: tuple[float, float] | None = None,
+) -> int:  # fmt: skip
     """Trace `views` views of each mesh and `per_shape` of each of `procedural` random shapes; returns how many.
 
+    flash : how far right of the lens and above it, in object distances; None puts it elsewhere for each view.
     Written so that an interrupted build leaves no cache that looks whole: index.json comes last.
     """
     folder.mkdir(parents=True, exist_ok=True)
     total = views * len(meshes) + per_shape * procedural
     out = {
-        name: np.lib.format.open_memmap(folder / f"{name}.npy", "w+", kind, (total, size, size, channels))
-        for name, (channels, kind) in ARRAYS.items()
+        name: np.lib.format.open_memmap(folder / f"{name}.npy", "w+", kind, (total, size // by, size // by, channels))
+        for name, (by, channels, kind) in ARRAYS.items()
     }
-    cameras = np.zeros((total, 14), dtype=np.float32)
-    for index, (buffer, rotation, middle, unit) in enumerate(_traced(meshes, views, procedural, per_shape, size, seed)):
+    cameras = np.zeros((total, 16), dtype=np.float32)
+    recipe = Recipe(views, procedural, per_shape, size, seed, flash)
+    for index, (buffer, pose, lit, met) in enumerate(_traced(meshes, recipe)):
         inside = buffer.mask
+        middle, unit = depth_unit(inside, buffer.depth, buffer.view.focal)
         out["normal"][index] = buffer.normal
         out["depth"][index, ..., 0] = np.where(inside, (buffer.depth - middle) / unit, 0.0)
         out["position"][index] = buffer.position
-        out["mask"][index, ..., 0] = inside
-        cameras[index] = [buffer.view.focal, *buffer.view.center, middle, unit, *rotation.reshape(-1)]
+        out["mask"][index, ..., 0], out["lit"][index, ..., 0], out["met"][index] = inside, lit, met
+        aside = pose.flash[:2] / middle
+        cameras[index] = [buffer.view.focal, *buffer.view.center, middle, unit, *pose.rotation.reshape(-1), *aside]
     for array in out.values():
         array.flush()
     np.save(folder / "camera.npy", cameras)
@@ -50,9 +60,10 @@ def build(
 
 
 def load(folder: Path, *, mapped: bool = True) -> dict[str, NDArray]:  # type: ignore[type-arg]
-    """The cache, as memory maps or in memory: normal, depth, position, mask (N, S, S, ·) and camera (N, 14).
+    """The cache, as memory maps or in memory: what ARRAYS lists (N, S, S, ·) and camera (N, 16).
 
-    camera: focal, centre x, y [px]; middle depth [m]; depth unit [m]; object → camera rotation, 9.
+    camera: focal, centre x, y [px]; middle depth [m]; depth unit [m]; object → camera rotation, 9; flash right of
+    the lens and above it [middle depths].
     """
     if not (folder / "index.json").exists():
         raise InputError(f"{folder} holds no complete G-buffer cache; build it with `polcap train`")
@@ -75,28 +86,43 @@ def depth_unit(mask: NDArray[np.bool_], depth: Floats, focal: float) -> tuple[fl
     return middle, float(np.sqrt(mask.sum() / np.pi) * middle / focal)
 
 
-def _traced(
-    meshes: list[Path], views: int, procedural: int, per_shape: int, size: int, seed: int
-) -> Iterator[tuple[GBuffer, Floats, float, float]]:
+@dataclass(frozen=True)
+class Recipe:
+    """What is traced; as `build` takes it."""
+
+    views: int
+    procedural: int
+    per_shape: int
+    size: int
+    seed: int
+    flash: tuple[float, float] | None
+
+
+Seen = tuple[GBuffer, transport.Pose, NDArray[np.bool_], NDArray[np.uint16]]  # and `bounce.visibility`
+
+
+def _traced(meshes: list[Path], recipe: Recipe) -> Iterator[Seen]:
     for path in meshes:
-        rng = np.random.default_rng([seed, zlib.crc32(path.stem.encode())])
-        yield from _look(read_mesh(path), views, size, rng)
-    for shape in range(procedural):
-        rng = np.random.default_rng([seed, 7, shape])
-        yield from _look(shapes.compose(rng), per_shape, size, rng)
+        rng = np.random.default_rng([recipe.seed, zlib.crc32(path.stem.encode())])
+        yield from _look(read_mesh(path), recipe.views, recipe, rng)
+    for shape in range(recipe.procedural):
+        rng = np.random.default_rng([recipe.seed, 7, shape])
+        yield from _look(shapes.compose(rng), recipe.per_shape, recipe, rng)
 
 
-def _look(
-    mesh: Triangles, count: int, size: int, rng: np.random.Generator
-) -> Iterator[tuple[GBuffer, Floats, float, float]]:
-    tracer = Tracer(mesh)
+def _look(mesh: Triangles, count: int, recipe: Recipe, rng: np.random.Generator) -> Iterator[Seen]:
+    tracer, scene = Tracer(mesh), transport.Scene(mesh)
     while count:
-        rotation, translation, view = pose(mesh, size, rng)
-        buffer = tracer.trace(rotation, translation, view, size, size)
+        rotation, translation, view = pose(mesh, recipe.size, rng)
+        buffer = tracer.trace(rotation, translation, view, recipe.size, recipe.size)
         if buffer.mask.mean() < 0.06:  # a sheet seen from its edge teaches nothing
             continue
         count -= 1
-        yield buffer, rotation, *depth_unit(buffer.mask, buffer.depth, view.focal)
+        way, off = rng.uniform(0, 2 * np.pi), rng.uniform(0, _ASIDE)
+        aside = (off * np.cos(way), off * np.sin(way)) if recipe.flash is None else recipe.flash
+        middle = float(buffer.depth[buffer.mask].mean(dtype=np.float64))
+        placed = transport.Pose(rotation, translation, middle * np.array([*aside, 0.0]), middle**2)
+        yield buffer, placed, *bounce.visibility(scene, buffer, placed, rng)
 
 
 def pose(mesh: Triangles, size: int, rng: np.random.Generator) -> tuple[Floats, Floats, View]:

@@ -121,10 +121,9 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
     def normal(deviation: float) -> Tensor:
         return deviation * torch.randn(shape, device=device)
 
-    common = u(0, 1) < 0.65
-    f0 = torch.where(common, 0.042 * torch.exp(normal(0.2)), u(0.02, 0.25))
-    glossy = u(0, 1)
-    rough = torch.where(glossy < 0.45, u(0.1, 0.4), u(0.3, 0.9))
+    common = u(0, 1) < 0.55
+    f0 = torch.where(common, 0.042 * torch.exp(normal(0.2)), 0.05 * torch.exp(u(0, 1.65)))  # up to .26
+    rough = torch.where(u(0, 1) < 0.3, u(0.1, 0.4), u(0.25, 0.95))
     color, color2 = _colors(shape, device), _colors(shape, device)
     near = (u(0, 1) < 0.5)[..., None]
     color2 = torch.where(near, color * (0.4 + 1.2 * _u((*shape, 1), device)), color2)
@@ -143,7 +142,7 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
         "rough": rough, "follow": normal(0.3), "speckle": u(0, 0.25) * (u(0, 1) < 0.5),
         "rough_gain": u(0.3, 1.0), "rough_shift": u(-0.3, 0.4),
         "f0": f0, "f0_follow": normal(0.5),
-        "ior": u(1.35, 1.7), "bump": bump,
+        "ior": (1.5 + normal(0.06)).clamp(1.35, 1.7), "bump": bump,
     }  # fmt: skip
 
 

@@ -85,7 +85,7 @@ class Protocol:
         with torch.random.fork_rng():
             torch.manual_seed(_SEED + number)
             one = torch.ones(1)
-            stated = _measured(light, places, buffer.view, replace(Errors.stated(1, one.device), reflected=0 * one))
+            stated = _measured(light, places, buffer.view, Errors.stated(1, one.device))
             clean = _measured(light, places, buffer.view, Errors.none(1, one.device))
         return Case(
             name=subject.name,
@@ -190,9 +190,8 @@ def _measured(light: Floats, places: transport.Places, view: View, errors: Error
 
     scene = torch.stack([image(part) for part in light])
     rays = torch.from_numpy(frames.rays(view, *mask.shape))[None]
-    facing = image(places.normal)[..., 2]
     given = torch.from_numpy(mask)[None]
-    seen = photograph(scene, image(places.diffuse), facing, given, rays, torch.from_numpy(at), errors)
+    seen = photograph(scene, image(places.diffuse), given, rays, torch.from_numpy(at), errors)
     return stokes_image(seen, at, mask, view)
 
 

@@ -131,7 +131,7 @@ def _tube(rng: np.random.Generator) -> tuple[Floats, NDArray[np.int32]]:
 
 
 _PARTS: list[Callable[[np.random.Generator], tuple[Floats, NDArray[np.int32]]]] = [
-    _displaced, _displaced, _superquadric, _superquadric, _turned, _vessel, _tube,
+    _displaced, _displaced, _superquadric, _superquadric, _turned, _vessel, _vessel, _tube,
 ]  # fmt: skip
 
 

@@ -55,7 +55,7 @@ class Params:
 class Preset:
     shape: model.Shape
     views: int  # per training mesh
-    procedural: int  # random shapes, 8 views each
+    procedural: int  # random shapes, 6 views each
     size: int  # of cached views, px
     sizes: tuple[int, ...]  # that a batch may have, drawn with the weights below
     weights: tuple[float, ...]
@@ -63,7 +63,7 @@ class Preset:
 
 
 PRESETS = {
-    "cpu": Preset(model.SMALL, 90, 800, 192, (96, 128, 160, 192), (0.3, 0.45, 0.15, 0.1), 8 * 128**2),
+    "cpu": Preset(model.SMALL, 80, 1200, 192, (96, 128, 160, 192), (0.4, 0.35, 0.15, 0.1), 10 * 128**2),
     "gpu": Preset(model.LARGE, 400, 3000, 256, (128, 192, 256), (0.3, 0.3, 0.4), 64 * 256**2),
 }
 

@@ -20,7 +20,7 @@ from polcap.images import Floats
 from polcap.optics import brdf, frames, fresnel, shade
 from polcap.synth.mesh import Triangles
 
-_LIFT = 1e-3  # longest sides of the mesh, from the surface to where a ray starts; nearer hits are the place itself
+LIFT = 1e-3  # longest sides of the mesh, from the surface to where a ray starts; nearer hits are the place itself
 _AROUND, _MIRRORED = 12, 6  # rays per place over the hemisphere, and about the mirror direction
 _SMOOTH = 0.004  # picture sides, 1σ, over which traced light is averaged
 
@@ -83,8 +83,8 @@ class Scene:
         to_flash = (pose.flash - pose.translation) @ pose.rotation - place
         far = np.linalg.norm(to_flash, axis=1)
         to_flash = to_flash / far[:, None]
-        start = place + _LIFT * self.size * flat
-        ray = (np.ascontiguousarray(a, dtype=np.float32) for a in (start, to_flash, far - _LIFT * self.size))
+        start = place + LIFT * self.size * flat
+        ray = (np.ascontiguousarray(a, dtype=np.float32) for a in (start, to_flash, far - LIFT * self.size))
         hidden = self.scene.run(*ray, query="OCCLUDED") >= 0
         return to_flash, np.where(hidden, 0, pose.strength / far**2)
 
@@ -158,9 +158,9 @@ class _Gather:
         """Those of the places `which` that see another one along `way` (M, 3, rays' frames), and its S0 (·, 3)."""
         scene, places, pose = self.scene, self.places, self.pose
         direction = frames.from_ray_frame(way[which], places.rays[which]) @ pose.rotation
-        origin = (places.position + _LIFT * scene.size * places.flat)[which]
+        origin = (places.position + LIFT * scene.size * places.flat)[which]
         distance, flat = scene.facing(origin, direction)
-        met = np.flatnonzero(np.isfinite(distance) & (distance > _LIFT * scene.size))
+        met = np.flatnonzero(np.isfinite(distance) & (distance > LIFT * scene.size))
         origin, direction, distance, flat = origin[met], direction[met], distance[met, None], flat[met]
         there = origin + distance * direction
         to_flash, irradiance = scene.lit(there, flat, pose)

@@ -8,7 +8,9 @@ from torch import Tensor, nn
 
 from polcap.training import gbuffers, materials
 from polcap.training.camera import Errors
-from polcap.training.dataset import Batch, Light, Simulator, batch
+from polcap.training.dataset import Batch, Simulator, batch
+
+_FLASH = (0.0, 0.05)  # of the distance, as in protocol.py
 
 
 class Watch:
@@ -16,15 +18,15 @@ class Watch:
 
     def __init__(self, data: Path, folder: Path, device: torch.device, *, count: int = 48, size: int = 128) -> None:
         simulator = held_out(data, folder, device, views=20, size=size)
-        total = len(simulator.views["camera"])
+        total = len(simulator.camera)
         order = np.random.default_rng(5).permutation(total)[:count]
         self.batches = []
         with torch.random.fork_rng():
             torch.manual_seed(6)
             for first in range(0, len(order), 8):
-                view = simulator.look(order[first : first + 8], size, flip=False)
-                number = len(view.mask)
-                photo = simulator.shoot(view, Light.stated(number, device), Errors.stated(number, device))
+                seen = simulator.look(order[first : first + 8], size, flip=False)
+                number = len(seen.mask)
+                photo = simulator.shoot(seen, torch.ones(number, device=device), Errors.stated(number, device))
                 self.batches.append(batch(photo))
 
     def look(self, network: nn.Module) -> dict[str, float]:
@@ -37,7 +39,7 @@ def held_out(data: Path, folder: Path, device: torch.device, *, views: int, size
     """Test meshes, test texture sets and a noise volume that training never saw; traced once into `folder`."""
     if not (folder / "index.json").exists():
         meshes = sorted((data / "meshes" / "test").glob("*.npz"))
-        gbuffers.build(folder, meshes, views=views, procedural=0, size=size, seed=99)
+        gbuffers.build(folder, meshes, views=views, procedural=0, size=size, seed=99, flash=_FLASH)
     textures = data / "materials" / "test"
     library = materials.Library(textures if textures.exists() else None, device, seed=4)
     return Simulator(gbuffers.load(folder), library, device)

@@ -8,7 +8,6 @@ of it. Light, interreflection and shadows are Mitsuba's. Prints a Markdown row p
 
 import argparse
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -53,17 +52,15 @@ def read(file: Path, clean: bool, seed: int) -> Case:
     mask = made["mask"]
     view = View(float(made["focal"]), (float(made["center"][0]), float(made["center"][1])), 1.0)
     rays = frames.rays(view, *mask.shape)
-    normal = frames.to_ray_frame(made["normal"], rays)
-    scene, diffuse, facing, given, v = (
-        torch.from_numpy(np.asarray(value, order="C"))[None]
-        for value in (made["stokes"], made["diffuse"], normal[..., 2], mask, rays)
+    scene, diffuse, given, v = (
+        torch.from_numpy(np.asarray(value, order="C"))[None] for value in (made["stokes"], made["diffuse"], mask, rays)
     )
     one = torch.ones(1)
-    errors = Errors.none(1, one.device) if clean else replace(Errors.stated(1, one.device), reflected=0 * one)
+    errors = Errors.none(1, one.device) if clean else Errors.stated(1, one.device)
     at = np.flatnonzero(mask)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        seen = photograph(scene[0][:, None], diffuse, facing, given, v, torch.from_numpy(at), errors)
+        seen = photograph(scene[0][:, None], diffuse, given, v, torch.from_numpy(at), errors)
     white = ColorCalibration(np.eye(3, dtype=np.float32), None, None, None, "profile", 0.0, None)
     measured = cues.compute(stokes_image(seen, at, mask, view), white)
     depth = np.where(mask, (made["depth"] - made["middle"]) / made["unit"], 0).astype(np.float32)

@@ -19,7 +19,7 @@ def scene(s1: float = 0.05, s2: float = -0.03) -> tuple[Tensor, ...]:
     stokes[0], stokes[1], stokes[2] = 0.5, 0.5 * s1, 0.5 * s2
     rays = torch.zeros(B, S, S, 3)
     rays[..., 2] = 1
-    return stokes, torch.full((B, S, S, 3), 0.4), torch.ones(B, S, S), torch.ones(B, S, S, dtype=torch.bool), rays
+    return stokes, torch.full((B, S, S, 3), 0.4), torch.ones(B, S, S, dtype=torch.bool), rays
 
 
 def shoot(errors: Errors, *images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -35,11 +35,11 @@ def test_perfect_camera_returns_the_stokes_parameters() -> None:
 
 def test_off_axis_the_angles_of_the_image_are_carried_to_the_ray() -> None:
     """A DoLP of 1 along the ray-frame axis of a polarizer at 0° dies behind one at 90°… whose axis is across."""
-    stokes, diffuse, facing, mask, _ = scene()
+    stokes, diffuse, mask, _ = scene()
     rays = torch.nn.functional.normalize(torch.tensor([0.2, 0.15, 1.0]), dim=0).expand(B, S, S, 3)
     axis = frames.axis_on_ray(torch.tensor(torch.pi / 4), rays)
     stokes[1], stokes[2] = (0.5 * f(2 * axis)[..., None] for f in (torch.cos, torch.sin))
-    measured, _, _ = shoot(Errors.none(B, CPU), stokes, diffuse, facing, mask, rays)
+    measured, _, _ = shoot(Errors.none(B, CPU), stokes, diffuse, mask, rays)
     through_45 = (measured[0] + measured[2]) / 2
     torch.testing.assert_close(through_45, torch.full_like(through_45, 0.5), atol=1e-4, rtol=0)
 

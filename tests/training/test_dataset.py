@@ -8,17 +8,17 @@ from polcap.images import ColorCalibration, View
 from polcap.stages import cues
 from polcap.training import dataset, protocol
 from polcap.training.camera import Errors
-from polcap.training.dataset import Light, Simulator
+from polcap.training.dataset import Simulator
 
 CPU = torch.device("cpu")
 
 
 def test_channels_are_those_of_the_cue_stage(simulator: Simulator) -> None:
     torch.manual_seed(0)
-    view = simulator.look(np.array([3]), 64, flip=False)
-    photo = simulator.shoot(view, Light.stated(1, CPU), Errors.stated(1, CPU))
+    seen = simulator.look(np.array([3]), 64, flip=False)
+    photo = simulator.shoot(seen, torch.ones(1), Errors.stated(1, CPU))
     ours = dataset.channels(photo)[0].numpy()
-    focal, x, y = (float(a) for a in simulator.views["camera"][3, :3])
+    focal, x, y = (float(a) for a in simulator.camera[3, :3])
     measured = (photo.stokes, photo.covariance, photo.clipped)
     image = protocol.stokes_image(measured, photo.at.numpy(), photo.given[0].numpy(), View(focal, (x, y), 1.0))
     chart = ColorCalibration(np.eye(3, dtype=np.float32), None, None, None, "profile", 0.0, None)
@@ -31,15 +31,32 @@ def test_mirrored_views_are_still_views_of_the_object(simulator: Simulator, seed
     """Camera-frame points turned back to the object's frame differ from its positions by one translation."""
     torch.manual_seed(seed)
     pick = np.array([0, 7])
-    view = simulator.look(pick, 64, flip=True)
-    middle = torch.from_numpy(simulator.views["camera"][pick, 3])
-    place = -view.rays * (view.far / view.rays[..., 2])[..., None] * middle[:, None, None, None]
-    back = torch.einsum("bji,bhwj->bhwi", view.turn, place) - view.position
+    seen = simulator.look(pick, 64, flip=True)
+    middle = torch.from_numpy(simulator.camera[pick, 3])[seen.owner]
+    back = torch.einsum("mji,mj->mi", seen.turn[seen.owner], seen.place * middle[:, None]) - seen.position
     for k in range(2):
-        assert back[k][view.mask[k]].std(dim=0).max() < 2e-3  # fp16
+        assert back[seen.owner == k].std(dim=0).max() < 2e-3  # fp16
     original = simulator.look(pick, 64, flip=False)
-    turned = [torch.einsum("bji,bhwj->bhwi", v.turn, v.normal)[v.mask].sum(dim=0) for v in (view, original)]
+    turned = [torch.einsum("mji,mj->mi", v.turn[v.owner], v.normal).sum(dim=0) for v in (seen, original)]
     torch.testing.assert_close(*turned, atol=1e-2, rtol=1e-4)
+    flash = [torch.einsum("bji,bj->bi", v.turn, v.flash) for v in (seen, original)]
+    torch.testing.assert_close(*flash)
+
+
+@pytest.mark.parametrize("flip", [False, True])
+@pytest.mark.parametrize("size", [32, 48, 64])
+def test_pixels_that_see_each_other_face_each_other(simulator: Simulator, size: int, flip: bool) -> None:
+    """Rays leave on the outside and arrive on the outside, whatever the size and the mirroring."""
+    torch.manual_seed(3)
+    seen = simulator.look(np.arange(12), size, flip=flip)
+    here, ray = (seen.met >= 0).nonzero(as_tuple=True)
+    there = seen.met[here, ray]
+    assert len(here) > 100 and (seen.owner[here] == seen.owner[there]).all()
+    way = seen.place[there] - seen.place[here]
+    far = way.norm(dim=1) > 6 / size  # nearer ones are decided by the grid
+    leaves = (way * seen.normal[here]).sum(dim=1)[far] > 0
+    arrives = (way * seen.normal[there]).sum(dim=1)[far] < 0
+    assert leaves.float().mean() > 0.85 and arrives.float().mean() > 0.85  # of a wrong pixel: half
 
 
 @pytest.mark.parametrize("size", [32, 64])

@@ -31,7 +31,7 @@ def test_objects_lie_inside_the_frame_and_turns_are_rotations(views: Path) -> No
     border[1:-1, 1:-1] = False
     assert (cache["mask"][..., 0] & border).mean() < 0.002
     assert cache["mask"].mean(axis=(1, 2, 3)).min() > 0.05
-    turn = cache["camera"][:, 5:].reshape(-1, 3, 3)
+    turn = cache["camera"][:, 5:14].reshape(-1, 3, 3)
     np.testing.assert_allclose(turn @ turn.transpose(0, 2, 1), np.broadcast_to(np.eye(3), turn.shape), atol=1e-5)
 
 
