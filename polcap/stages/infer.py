@@ -30,15 +30,12 @@ _MODEL_ERROR_DEG = 4.0  # interreflection, highlights, unknown index: measured o
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ior: Annotated[float, Meta(ge=1.2, le=2.5, description="refractive index assumed by the analytic estimator")] = 1.5
-    tile_px: Annotated[
-        int, Meta(ge=128, le=4096, description="largest side the network sees at once; bounds its memory [px]")
-    ] = 512
     turns: Annotated[
         bool, Meta(description="average what the network says of the object in all 8 turned and mirrored positions")
-    ] = True
+    ] = False
 
 
-@stage(version=3)
+@stage(version=4)
 def estimate(cues: Cues, network: Network | None, settings: Settings) -> SurfaceMaps:
     """Normal, diffuse, specular, roughness and expected error; network None means analytic."""
     return _analytic(cues, settings) if network is None else _learned(cues, network, settings)
@@ -201,20 +198,21 @@ def _expected_error(zenith: Floats, dolp: Floats, sigma: Floats, certainty: Floa
 def _learned(cues: Cues, network: Network, settings: Settings) -> SurfaceMaps:
     """The network's maps, its normals joined with the analytic ones by their expected errors.
 
-    The network sees the whole object at the size it was trained on, which settles half-turns, shape and
-    gloss; colour, which has detail, it sees at full size. What pixels say of a normal by themselves it has
-    no need to learn: the inversion adds it at full size, where noise and interreflection leave it a say.
+    The network sees the whole object at the size it was made for, which settles half-turns, shape and gloss.
+    Detail comes from the pixels: of color by the picture itself, which the network's albedo only divides by its
+    shading; of normals by the inversion at full size, where noise and interreflection leave it a say.
     """
     _check(network)
-    height, width = cues.mask.shape
-    shrink = max(height, width) / int(network.metadata["native_size"])
-    whole = _whole(_resized(cues, min(1.0, 1 / shrink)), network, settings)
-    maps = {n: m if m.shape[:2] == (height, width) else cv2.resize(m, (width, height)) for n, m in whole.items()}
-    diffuse = _color(cues, network, settings)
-    seen = maps["normal"] / np.maximum(_length(maps["normal"]), 1e-6)
-    guide = np.asarray(frames.to_ray_frame(seen, cues.rays)), maps["sigma"]
+    size = cues.mask.shape[::-1]
+    seen = _resized(cues, min(1.0, int(network.metadata["native_size"]) / max(size)))
+    small = _whole(seen, network, settings)
+    small["factor"] = _factor(small["diffuse"], seen)
+    maps = {name: np.asarray(cv2.resize(image, size)) for name, image in small.items()}
+    ahead = maps["normal"] / np.maximum(_length(maps["normal"]), 1e-6)
+    guide = np.asarray(frames.to_ray_frame(ahead, cues.rays)), maps["sigma"]
     by_pixel, doubt, _ = _inverted(cues, settings, guide)
-    normal, stated = _joined((seen, maps["sigma"]), (by_pixel, _INVERSION * doubt))
+    normal, stated = _joined((ahead, maps["sigma"]), (by_pixel, _INVERSION * doubt))
+    diffuse = (np.maximum(cues.radiance, 0) + _DARK) * np.exp(maps["factor"]) - _DARK
     scale, power, most = _CALIBRATION
     expected = np.minimum(scale * stated**power, most)
     inside = cues.mask[..., None]
@@ -243,7 +241,7 @@ def _whole(cues: Cues, network: Network, settings: Settings) -> dict[str, Floats
     )
     for quarters, mirror in positions:
         turned = _turned(picture, quarters, mirror)
-        maps = _run(np.moveaxis(_with_axes_turned(turned, quarters, mirror), -1, 0), network, settings)
+        maps = _run(np.moveaxis(_with_axes_turned(turned, quarters, mirror), -1, 0), network)
         own = np.array(_turned(rays, quarters, mirror))
         own[..., :2] = _vector_turned(own[..., :2], quarters, mirror)
         maps["normal"] = np.array(frames.from_ray_frame(maps["normal"], own))
@@ -347,59 +345,28 @@ def _resized(cues: Cues, scale: float) -> Cues:
     )
 
 
-def _color(cues: Cues, network: Network, settings: Settings) -> Floats:
-    """Diffuse albedo (H, W, 3): S0 times a smooth factor, the network's albedo over S0.
+def _factor(albedo: Floats, seen: Cues) -> Floats:
+    """Logarithm of albedo over S0 (H, W, 3), without the network's 2 px grid: a kernel in which that vanishes.
 
-    The factor, not the albedo, is smoothed, by a kernel in which the network's 2 px grid vanishes: texture
-    is S0's own. A crop larger than two tiles is seen at that size, and the factor enlarged.
+    Beside the object it goes on as at the edge, for the pixels there when it is enlarged.
     """
-    height, width = cues.mask.shape
-    seen = _resized(cues, min(1.0, 2 * settings.tile_px / max(height, width)))
-    albedo = _run(channels(seen), network, settings)["diffuse"]
     inside = seen.mask.astype(np.float32)
-    factor = np.log((albedo + _DARK) / (np.maximum(seen.radiance, 0) + _DARK)) * inside[..., None]
-    smooth, share = (
-        cv2.sepFilter2D(part.astype(np.float32), -1, _BINOMIAL, _BINOMIAL, borderType=cv2.BORDER_CONSTANT)
-        for part in (factor, inside)
-    )
-    factor = cv2.resize(smooth / np.maximum(share, 0.1)[..., None], (width, height))
-    return np.asarray((np.maximum(cues.radiance, 0) + _DARK) * np.exp(factor) - _DARK)
+    factor = (np.log((albedo + _DARK) / (np.maximum(seen.radiance, 0) + _DARK)) * inside[..., None]).astype(np.float32)
+
+    def mean(kernel: Floats) -> Floats:
+        smooth, share = (
+            cv2.sepFilter2D(part, -1, kernel, kernel, borderType=cv2.BORDER_CONSTANT) for part in (factor, inside)
+        )
+        return np.asarray(smooth / np.maximum(share, 1e-3)[..., None])
+
+    return np.where(seen.mask[..., None], mean(_BINOMIAL), mean(cv2.getGaussianKernel(9, 2).astype(np.float32)))
 
 
-def _run(picture: Floats, network: Network, settings: Settings) -> dict[str, Floats]:
-    """All maps (H, W[, 3]) of channels (N, H, W); more than a tile in overlapping tiles, blended by a ramp."""
+def _run(picture: Floats, network: Network) -> dict[str, Floats]:
+    """All maps (H, W[, 3]) of channels (N, H, W)."""
     _, height, width = picture.shape
     multiple = int(network.metadata["size_multiple"])
-    tile, overlap = settings.tile_px // multiple * multiple, settings.tile_px // 4
-    total: dict[str, Floats] = {}
-    weight = np.zeros((height, width, 1), np.float32)
-    for y in _starts(height, tile, overlap):
-        for x in _starts(width, tile, overlap):
-            part = picture[:, y : y + tile, x : x + tile]
-            rows, columns = part.shape[1:]
-            pad = ((0, 0), (0, -rows % multiple), (0, -columns % multiple))
-            output = network.run(np.pad(part, pad)[None].astype(np.float32))
-            ramp = np.minimum.outer(_ramp(rows, overlap), _ramp(columns, overlap))[..., None].astype(np.float32)
-            weight[y : y + rows, x : x + columns] += ramp
-            for name, value in output.items():
-                image = np.moveaxis(value[0], 0, -1)[:rows, :columns]
-                target = total.setdefault(name, np.zeros((height, width, image.shape[-1]), np.float32))
-                target[y : y + rows, x : x + columns] += ramp * image
-    return {
-        name: np.squeeze(value / weight, -1) if value.shape[-1] == 1 else value / weight
-        for name, value in total.items()
-    }
-
-
-def _starts(length: int, tile: int, overlap: int) -> list[int]:
-    """First pixels of tiles that cover `length`."""
-    if length <= tile:
-        return [0]
-    count = int(np.ceil((length - overlap) / (tile - overlap)))
-    return [round(i * (length - tile) / (count - 1)) for i in range(count)]
-
-
-def _ramp(length: int, overlap: int) -> Floats:
-    """Blending weight along one side of a tile, falling to near nothing at its ends."""
-    edge = np.minimum(np.arange(length), np.arange(length)[::-1]) + 1.0
-    return np.minimum(edge / max(overlap, 1), 1.0)
+    pad = ((0, 0), (0, -height % multiple), (0, -width % multiple))
+    output = network.run(np.pad(picture, pad)[None].astype(np.float32))
+    images = {name: np.moveaxis(value[0], 0, -1)[:height, :width] for name, value in output.items()}
+    return {name: image[..., 0] if image.shape[-1] == 1 else image for name, image in images.items()}
