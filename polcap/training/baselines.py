@@ -45,7 +45,10 @@ def inflated(seen: Cues) -> SurfaceMaps:
     )  # fmt: skip
 
 
-def mean_maps(protocol: Protocol, count: int) -> Estimator:
+Means = tuple[Floats, Floats, Floats, Floats]  # normal in the frame of a ray, diffuse, specular, roughness
+
+
+def means(protocol: Protocol, count: int) -> Means:
     """The mean of each map over the pictures to be judged, each counting once: the hardest constants to beat."""
     rows = []
     for number in range(count):
@@ -54,17 +57,18 @@ def mean_maps(protocol: Protocol, count: int) -> Estimator:
         local = frames.to_ray_frame(truth.normal, frames.rays(truth.view, *mask.shape))
         rows.append([image[mask].mean(axis=0) for image in (local, truth.diffuse, truth.specular, truth.roughness)])
     normal, diffuse, specular, roughness = (np.mean(part, axis=0) for part in zip(*rows))
+    return normal / np.linalg.norm(normal), diffuse, specular, roughness
 
-    def estimate(case: Case) -> SurfaceMaps:
-        base, shape = frontal(case.cues), (*case.cues.mask.shape, 3)
-        local = np.broadcast_to(normal / np.linalg.norm(normal), shape)
-        return replace(
-            base, normal=np.asarray(frames.from_ray_frame(local, case.cues.rays)),
-            diffuse=np.broadcast_to(diffuse, shape), specular=np.broadcast_to(specular, shape),
-            roughness=np.full(shape[:2], roughness), estimator="mean",
-        )  # fmt: skip
 
-    return estimate
+def constant(seen: Cues, values: Means) -> SurfaceMaps:
+    """These values everywhere."""
+    normal, diffuse, specular, roughness = values
+    shape = (*seen.mask.shape, 3)
+    return replace(
+        frontal(seen), normal=np.asarray(frames.from_ray_frame(np.broadcast_to(normal, shape), seen.rays)),
+        diffuse=np.broadcast_to(diffuse, shape), specular=np.broadcast_to(specular, shape),
+        roughness=np.full(shape[:2], roughness), estimator="mean",
+    )  # fmt: skip
 
 
 def checkpoints(folder: Path) -> dict[str, Path]:

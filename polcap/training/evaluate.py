@@ -1,14 +1,18 @@
 """Error of every map on the protocol's pictures: the shipped way of estimating beside its baselines.
 
 What is measured is what a capture gets: the same cues, the same inference stage, the model file itself.
-Pictures are made one at a time; what is done is kept in out/pictures.jsonl, so that a run that was
+Every core judges pictures of its own; what is done is kept in out/pictures.jsonl, so that a run that was
 stopped goes on.
 """
 
 import hashlib
 import json
+import multiprocessing
+import os
 import sys
 import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,13 +24,14 @@ from polcap.formats import atomic, onnx, png
 from polcap.images import Cues, Network, SurfaceMaps
 from polcap.stages import infer
 from polcap.training import baselines, panel, protocol, tables
-from polcap.training.baselines import Estimator
+from polcap.training.baselines import Estimator, Means
 from polcap.training.protocol import Protocol
 from polcap.training.score import MAPS, Judge, Score, angle, deciles
 
 _PANEL = 8  # pictures shown
 _SAMPLE = 500  # pixels of a picture that the calibration is judged by
 _QUIET = 20  # s between two lines of progress
+_SHARE = 3  # pictures that a process of its own is worth, at least
 OURS, CLEAN, ANALYTIC, MEAN = "ours", "ours, noise-free", "analytic", "mean of each map"
 _INTEGRATED = (OURS, CLEAN, ANALYTIC)  # columns whose normals are integrated
 
@@ -50,9 +55,9 @@ def main(params: Params) -> dict[str, Score]:
     torch.set_num_threads(1)
     network = onnx.load(params.model)
     found = {} if params.ablations is None else baselines.checkpoints(params.ablations)
-    made = Protocol(params.data, params.size)
     head = _head(params, network, found)
-    rows = _judged(params, made, _columns(params, made, network, found), head)
+    made = Protocol(params.data, params.size)
+    rows = _judged(params, baselines.means(made, params.count), head)
     result = _summary(head, rows, list(found))
     shown = (made.case(number) for number in range(min(_PANEL, params.count)))
     strips = [panel.row(case, _estimated(case.cues, network)) for case in shown]
@@ -72,17 +77,6 @@ def _head(params: Params, network: Network, found: dict[str, Path]) -> dict[str,
     }  # fmt: skip
 
 
-def _columns(params: Params, made: Protocol, network: Network, found: dict[str, Path]) -> dict[str, Estimator]:
-    return {
-        OURS: lambda case: _estimated(case.cues, network),
-        CLEAN: lambda case: _estimated(case.clean, network),
-        ANALYTIC: lambda case: _estimated(case.cues, None),
-        "frontal": lambda case: baselines.frontal(case.cues),
-        "silhouette": lambda case: baselines.inflated(case.cues),
-        MEAN: baselines.mean_maps(made, params.count),
-    } | {_alone(name): baselines.alone(path) for name, path in found.items()}
-
-
 def _alone(name: str) -> str:
     """A column of the second table; "ours" stands in both."""
     return f"{name}, network alone"
@@ -92,7 +86,7 @@ def _estimated(seen: Cues, network: Network | None) -> SurfaceMaps:
     return infer.estimate(seen, network, infer.Settings())
 
 
-def _judged(params: Params, made: Protocol, columns: dict[str, Estimator], head: dict[str, Any]) -> list[Row]:
+def _judged(params: Params, means: Means, head: dict[str, Any]) -> list[Row]:
     """A row per picture, those of an earlier run with the same head first."""
     path = params.out / "pictures.jsonl"
     rows = _kept(path, head)
@@ -101,22 +95,48 @@ def _judged(params: Params, made: Protocol, columns: dict[str, Estimator], head:
     started = told = time.monotonic()
     first = len(rows)
     with path.open("a") as file:
-        for number in range(first, params.count):
-            rows.append(_row(number, made, columns))
-            file.write(json.dumps(rows[-1]) + "\n")
+        for row in _made(params, means, range(first, params.count)):
+            rows.append(row)
+            file.write(json.dumps(row) + "\n")
             file.flush()
             now = time.monotonic()
-            if now - told > _QUIET or number + 1 == params.count:
+            if now - told > _QUIET or len(rows) == params.count:
                 told = now
-                each = (now - started) / (number + 1 - first)
-                left = each * (params.count - number - 1) / 60
+                each = (now - started) / (len(rows) - first)
+                left = each * (params.count - len(rows)) / 60
                 mean = np.mean([row["scores"][OURS]["normal_mean"] for row in rows])
                 print(
-                    f"{number + 1}/{params.count}  {each:.1f} s per picture, {left:.0f} min left; "
+                    f"{len(rows)}/{params.count}  {each:.1f} s per picture, {left:.0f} min left; "
                     f"{OURS}: normals {mean:.2f}° on average",
                     file=sys.stderr, flush=True,
                 )  # fmt: skip
     return rows
+
+
+def _made(params: Params, means: Means, numbers: range) -> Iterator[Row]:
+    """Rows in order, by as many processes as there are cores and work for."""
+    workers = min(os.cpu_count() or 1, len(numbers) // _SHARE)
+    if workers < 2:
+        bench = Bench(params, means)
+        yield from map(bench.row, numbers)
+        return
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, spawn, initializer=_begin, initargs=(params, means)) as pool:
+        yield from pool.map(_row, numbers)
+
+
+_bench: "Bench | None" = None  # of this worker
+
+
+def _begin(params: Params, means: Means) -> None:
+    global _bench
+    torch.set_num_threads(1)
+    _bench = Bench(params, means)
+
+
+def _row(number: int) -> Row:
+    assert _bench is not None
+    return _bench.row(number)
 
 
 def _kept(path: Path, head: dict[str, Any]) -> list[Row]:
@@ -133,28 +153,44 @@ def _kept(path: Path, head: dict[str, Any]) -> list[Row]:
     return rows
 
 
-def _row(number: int, made: Protocol, columns: dict[str, Estimator]) -> Row:
-    """Scores, seconds and what else is needed of one picture."""
-    before = time.monotonic()
-    case = made.case(number)
-    seconds, scores, calibration = {"making the picture": time.monotonic() - before}, {}, []
-    mask, judge, judging = case.truth.mask, Judge(case), 0.0
-    for name, estimator in columns.items():
+class Bench:
+    """Pictures and all ways of estimating, ready to judge."""
+
+    def __init__(self, params: Params, means: Means) -> None:
+        self.made = Protocol(params.data, params.size)
+        network = onnx.load(params.model, threads=1)
+        found = {} if params.ablations is None else baselines.checkpoints(params.ablations)
+        self.columns: dict[str, Estimator] = {
+            OURS: lambda case: _estimated(case.cues, network),
+            CLEAN: lambda case: _estimated(case.clean, network),
+            ANALYTIC: lambda case: _estimated(case.cues, None),
+            "frontal": lambda case: baselines.frontal(case.cues),
+            "silhouette": lambda case: baselines.inflated(case.cues),
+            MEAN: lambda case: baselines.constant(case.cues, means),
+        } | {_alone(name): baselines.alone(path) for name, path in found.items()}
+
+    def row(self, number: int) -> Row:
+        """Scores, seconds and what else is needed of one picture."""
         before = time.monotonic()
-        maps = estimator(case)
-        seconds[name] = time.monotonic() - before
-        before = time.monotonic()
-        scores[name] = judge.score(maps) | (judge.integrated(maps) if name in _INTEGRATED else {})
-        judging += time.monotonic() - before
-        if name == OURS:
-            some = np.random.default_rng(number).permutation(int(mask.sum()))[:_SAMPLE]
-            calibration = [np.round(x[mask][some], 2).tolist() for x in (maps.confidence, angle(maps, case))]
-    f0 = case.truth.specular[mask].astype(np.float64)
-    return {
-        "picture": number, "name": case.name, "scores": scores, "seconds": seconds | {"scoring all": judging},
-        "calibration": calibration,
-        "f0": [float(f0.mean()), float((f0**2).mean())],
-    }  # fmt: skip
+        case = self.made.case(number)
+        seconds, scores, calibration = {"making the picture": time.monotonic() - before}, {}, []
+        mask, judge, judging = case.truth.mask, Judge(case), 0.0
+        for name, estimator in self.columns.items():
+            before = time.monotonic()
+            maps = estimator(case)
+            seconds[name] = time.monotonic() - before
+            before = time.monotonic()
+            scores[name] = judge.score(maps) | (judge.integrated(maps) if name in _INTEGRATED else {})
+            judging += time.monotonic() - before
+            if name == OURS:
+                some = np.random.default_rng(number).permutation(int(mask.sum()))[:_SAMPLE]
+                calibration = [np.round(x[mask][some], 2).tolist() for x in (maps.confidence, angle(maps, case))]
+        f0 = case.truth.specular[mask].astype(np.float64)
+        return {
+            "picture": number, "name": case.name, "scores": scores, "seconds": seconds | {"scoring all": judging},
+            "calibration": calibration,
+            "f0": [float(f0.mean()), float((f0**2).mean())],
+        }  # fmt: skip
 
 
 def _summary(head: dict[str, Any], rows: list[Row], alone: list[str]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -58,13 +58,16 @@ class Preset:
     procedural: int  # random shapes, 6 views each
     size: int  # of cached views, px
     sizes: tuple[int, ...]  # that a batch may have, drawn with the weights below
-    weights: tuple[float, ...]
+    early: tuple[float, ...]  # in the first half of the budget: many objects
+    late: tuple[float, ...]  # in the second: detail
     pixels: int  # of a batch
 
 
 PRESETS = {
-    "cpu": Preset(model.SMALL, 80, 1200, 192, (96, 128, 160, 192), (0.4, 0.35, 0.15, 0.1), 10 * 128**2),
-    "gpu": Preset(model.LARGE, 400, 3000, 256, (128, 192, 256), (0.3, 0.3, 0.4), 64 * 256**2),
+    "cpu": Preset(
+        model.SMALL, 80, 1200, 192, (96, 128, 160, 192), (0.4, 0.35, 0.15, 0.1), (0.1, 0.25, 0.3, 0.35), 10 * 128**2
+    ),
+    "gpu": Preset(model.LARGE, 400, 3000, 256, (128, 192, 256), (0.5, 0.3, 0.2), (0.1, 0.4, 0.5), 64 * 256**2),
 }
 
 
@@ -84,12 +87,12 @@ def main(params: Params) -> Path:
         run.load(params.out / "last.pt")
     _keep_memory()
     torch.set_num_threads(1)
-    ready = _ahead(simulator, preset, params.seed + run.step)
 
     def progress() -> float:
         """Share of the budget that is spent."""
         return run.samples / params.samples if params.samples else run.elapsed / (params.minutes * 60)
 
+    ready = _ahead(simulator, preset, params.seed + run.step, progress)
     saved = looked = run.elapsed
     parts: list[dict[str, float]] = []
     before = time.monotonic()
@@ -134,10 +137,11 @@ def library(params: Params, split: str, device: torch.device) -> materials.Libra
     return materials.Library(folder if folder.exists() else None, device)
 
 
-def _ahead(simulator: Simulator, preset: Preset, seed: int) -> Iterator[Batch]:
+def _ahead(simulator: Simulator, preset: Preset, seed: int, progress: Callable[[], float]) -> Iterator[Batch]:
     """Batches without end, made in a thread of their own while the network learns from those before.
 
-    That thread alone draws from torch's global random state, so the batches follow from the seed.
+    That thread alone draws from torch's global random state, so the batches follow from the seed and from when
+    the sizes change.
     """
     waiting: queue.Queue[Batch | BaseException] = queue.Queue(maxsize=4)
 
@@ -147,7 +151,7 @@ def _ahead(simulator: Simulator, preset: Preset, seed: int) -> Iterator[Batch]:
             torch.manual_seed(seed)
             chooser = np.random.default_rng(seed)
             while True:
-                size = int(chooser.choice(preset.sizes, p=preset.weights))
+                size = int(chooser.choice(preset.sizes, p=preset.early if progress() < 0.5 else preset.late))
                 waiting.put(simulator.draw(max(preset.pixels // size**2, 1), size))
         except BaseException as error:  # told to the loop, which raises it
             waiting.put(error)

@@ -46,7 +46,8 @@ def test_the_command_judges_all_columns(test_data: Path, networks: Path, tmp_pat
 
 
 @shipped
-def test_a_stopped_run_goes_on(test_data: Path, tmp_path: Path) -> None:
+def test_a_stopped_run_goes_on(test_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And judging by several processes changes nothing."""
     params = evaluate.Params(MODEL, test_data, tmp_path, count=2, size=64)
     whole = evaluate.main(params)
     journal = tmp_path / "pictures.jsonl"
@@ -56,6 +57,8 @@ def test_a_stopped_run_goes_on(test_data: Path, tmp_path: Path) -> None:
     journal.write_text("\n".join([head, json.dumps(kept), second[:50]]))
     assert evaluate.main(params)["ours"]["normal_mean"] == pytest.approx(whole["ours"]["normal_mean"] + 5)
     journal.write_text("\n".join(["another run", json.dumps(kept)]))
+    monkeypatch.setattr(evaluate, "_SHARE", 1)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
     assert evaluate.main(params) == whole
 
 

@@ -11,7 +11,7 @@ from polcap.training import train
 from polcap.training.dataset import Simulator
 from tests.training.test_model import TINY
 
-PRESET = train.Preset(TINY, 4, 1, 64, (32, 64), (0.5, 0.5), 4 * 64**2)
+PRESET = train.Preset(TINY, 4, 1, 64, (32, 64), (0.5, 0.5), (0.2, 0.8), 4 * 64**2)
 
 
 def rows(path: Path) -> list[dict[str, str]]:
