@@ -24,6 +24,7 @@ _SAME = 2.0  # standard deviations that two averages of the same thing may diffe
 _INVERSION = 2.0  # factor on the inversion's expected error in the join: the network has seen what it has seen
 _CALIBRATION = (0.33, 1.68, 45.0)  # error = min(a·expectedᵇ, c), degrees: traced pictures of training meshes
 _BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
+_REACHED = 0.05  # share of known pixels under a Gaussian from which a mean is taken
 _DARK = 0.02  # radiance below which a ratio means little, as in the channels' logarithm
 _MODEL_ERROR_DEG = 4.0  # interreflection, highlights, unknown index: measured on path-traced objects
 
@@ -139,15 +140,31 @@ def _albedo(cues: Cues, cos_zenith: Floats, ior: float) -> tuple[Floats, Floats]
     removes where the zenith is under 35°. The rest over cos θ T₊² is the albedo.
     """
     size = max(5, round(0.12 * np.sqrt(max(cues.mask.sum(), 1)))) | 1
-    darkest = cv2.GaussianBlur(cues.radiance.min(-1).astype(np.float32), (0, 0), 1.0)
+    radiance = _filled(cues.radiance, cues)
+    darkest = cv2.GaussianBlur(radiance.min(-1), (0, 0), 1.0)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     opened = cv2.GaussianBlur(cv2.morphologyEx(darkest, cv2.MORPH_OPEN, kernel), (0, 0), size / 6)
     facing = np.clip((cos_zenith - np.cos(np.radians(35))) / 0.1, 0, 1)
     highlight = np.maximum(darkest - opened, 0) * facing * cues.mask
     plus, _ = fresnel.transmission(np.maximum(cos_zenith, 0.2), ior)
     shading = np.maximum(cos_zenith, 0.2) * plus * fresnel.transmission(1.0, ior)[0]
-    diffuse = (cues.radiance - highlight[..., None]) / shading[..., None]
+    diffuse = (radiance - highlight[..., None]) / shading[..., None]
     return (np.clip(diffuse, 0, 1) * cues.mask[..., None]).astype(np.float32), highlight.astype(np.float32)
+
+
+def _filled(image: Floats, cues: Cues) -> Floats:
+    """An image (H, W, 3) that goes on from around into highlights which saturate the shortest exposure."""
+    clipped = cues.mask & ((cues.quality & Quality.CLIPPED) > 0)
+    hole = cues.mask & (cv2.dilate(clipped.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+    known = cues.mask & ~hole
+    out, blur = np.array(image, np.float32), 2.0
+    while hole.any() and known.any():
+        share = cv2.GaussianBlur(known.astype(np.float32), (0, 0), blur)
+        mean = cv2.GaussianBlur(out * known[..., None], (0, 0), blur) / np.maximum(share, 1e-6)[..., None]
+        reached = hole & (share > _REACHED)
+        out[reached] = mean[reached]
+        hole, blur = hole & ~reached, 2 * blur
+    return out
 
 
 def _gloss(highlight: Floats, cos_zenith: Floats, cues: Cues) -> tuple[float, float]:
@@ -212,7 +229,7 @@ def _learned(cues: Cues, network: Network, settings: Settings) -> SurfaceMaps:
     guide = np.asarray(frames.to_ray_frame(ahead, cues.rays)), maps["sigma"]
     by_pixel, doubt, _ = _inverted(cues, settings, guide)
     normal, stated = _joined((ahead, maps["sigma"]), (by_pixel, _INVERSION * doubt))
-    diffuse = (np.maximum(cues.radiance, 0) + _DARK) * np.exp(maps["factor"]) - _DARK
+    diffuse = _filled((np.maximum(cues.radiance, 0) + _DARK) * np.exp(maps["factor"]) - _DARK, cues)
     scale, power, most = _CALIBRATION
     expected = np.minimum(scale * stated**power, most)
     inside = cues.mask[..., None]
@@ -348,9 +365,10 @@ def _resized(cues: Cues, scale: float) -> Cues:
 def _factor(albedo: Floats, seen: Cues) -> Floats:
     """Logarithm of albedo over S0 (H, W, 3), without the network's 2 px grid: a kernel in which that vanishes.
 
-    Beside the object it goes on as at the edge, for the pixels there when it is enlarged.
+    Beside the object and in saturated highlights it goes on from around, for the pixels there when it is enlarged.
     """
-    inside = seen.mask.astype(np.float32)
+    known = seen.mask & ((seen.quality & Quality.CLIPPED) == 0)
+    inside = known.astype(np.float32)
     factor = (np.log((albedo + _DARK) / (np.maximum(seen.radiance, 0) + _DARK)) * inside[..., None]).astype(np.float32)
 
     def mean(kernel: Floats) -> Floats:
@@ -359,7 +377,7 @@ def _factor(albedo: Floats, seen: Cues) -> Floats:
         )
         return np.asarray(smooth / np.maximum(share, 1e-3)[..., None])
 
-    return np.where(seen.mask[..., None], mean(_BINOMIAL), mean(cv2.getGaussianKernel(9, 2).astype(np.float32)))
+    return np.where(known[..., None], mean(_BINOMIAL), mean(cv2.getGaussianKernel(9, 2).astype(np.float32)))
 
 
 def _run(picture: Floats, network: Network) -> dict[str, Floats]:
