@@ -1,0 +1,83 @@
+"""Seconds and memory of the inference stage on crops of 512² and 2048², beside the network alone.
+
+    python tests/benchmarks/bench_infer.py DATA [--model MODEL.onnx] [--turns]
+
+The first picture of the evaluation at 512², and the same with each pixel four by four times. Each size in a
+process of its own, for its peak memory; best of three.
+"""
+
+import argparse
+import dataclasses
+import multiprocessing
+import resource
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from polcap.formats import onnx
+from polcap.images import Cues
+from polcap.optics import frames
+from polcap.stages import infer
+from polcap.stages.cues import channels
+from polcap.training.protocol import Protocol
+
+_SHIPPED = Path(__file__).parents[2] / "calib" / "models" / "polcap.onnx"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data", type=Path, help="folder with meshes/ and materials/")
+    parser.add_argument("--model", type=Path, default=_SHIPPED)
+    parser.add_argument("--turns", action="store_true", help="averaged over eight positions")
+    options = parser.parse_args()
+    seen = Protocol(options.data, 512).case(0).cues
+    print("| crop | stage [s] | network once [s] | ratio | peak memory [GB] |\n| --- | --- | --- | --- | --- |")
+    for times in (1, 4):
+        with multiprocessing.get_context("spawn").Pool(1) as pool:
+            stage, floor, peak = pool.apply(_measured, (_enlarged(seen, times), options.model, options.turns))
+        print(f"| {512 * times}² | {stage:.2f} | {floor:.2f} | {stage / floor:.1f} | {peak:.2f} |", flush=True)
+
+
+def _measured(seen: Cues, model: Path, turns: bool) -> tuple[float, float, float]:
+    """Best seconds of the stage, of one run of the network at its own size; greatest resident memory, GB."""
+    network = onnx.load(model)
+    small = infer._resized(seen, int(network.metadata["native_size"]) / max(seen.mask.shape))
+    settings = infer.Settings(turns=turns)
+    floor = _best(lambda: infer._run(channels(small), network))
+    stage = _best(lambda: infer.estimate(seen, network, settings))
+    return stage, floor, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
+def _best(work: Callable[[], object]) -> float:
+    seconds = []
+    for _ in range(3):
+        before = time.perf_counter()
+        work()
+        seconds.append(time.perf_counter() - before)
+    return min(seconds)
+
+
+def _enlarged(seen: Cues, times: int) -> Cues:
+    """The same picture with `times`² pixels for each."""
+    side = times * seen.mask.shape[0]
+
+    def larger(image: np.ndarray) -> np.ndarray:
+        return cv2.resize(image, (side, side), interpolation=cv2.INTER_NEAREST)
+
+    x, y = seen.view.center
+    centre = ((x + 0.5) * times - 0.5, (y + 0.5) * times - 0.5)
+    view = dataclasses.replace(seen.view, focal=seen.view.focal * times, center=centre)
+    single = ("radiance", "ratio_sigma", "dolp", "diffuse_color", "quality")
+    double = ("ratio", "normalized_stokes")
+    return dataclasses.replace(
+        seen, mask=larger(seen.mask.astype(np.uint8)) > 0, view=view, rays=frames.rays(view, side, side),
+        **{name: larger(getattr(seen, name)) for name in single},
+        **{name: np.stack([larger(part) for part in getattr(seen, name)]) for name in double},
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
