@@ -5,7 +5,7 @@ hand back camera-frame maps.
 """
 
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Literal
 
 import cv2
 import msgspec
@@ -21,8 +21,11 @@ from polcap.stages.cues import CHANNELS, channels
 
 _BLURS_PX = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0)
 _SAME = 2.0  # standard deviations that two averages of the same thing may differ by
-_INVERSION = 2.0  # factor on the inversion's expected error in the join: the network has seen what it has seen
-_CALIBRATION = (0.33, 1.68, 45.0)  # error = min(a·expectedᵇ, c), degrees: traced pictures of training meshes
+_INVERSION = 4.0  # factor on the inversion's expected error in the join: the network has seen what it has seen
+_CALIBRATION = (0.82, 1.1, 40.0)  # error = min(a·expectedᵇ, c), degrees: traced pictures of training meshes
+_POSITIONS = tuple(
+    (quarters, mirror) for first in (0, 1) for mirror in (False, True) for quarters in (first, first + 2)
+)
 _BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 _REACHED = 0.05  # share of known pixels under a Gaussian from which a mean is taken
 _DARK = 0.02  # radiance below which a ratio means little, as in the channels' logarithm
@@ -32,8 +35,9 @@ _MODEL_ERROR_DEG = 4.0  # interreflection, highlights, unknown index: measured o
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ior: Annotated[float, Meta(ge=1.2, le=2.5, description="refractive index assumed by the analytic estimator")] = 1.5
     turns: Annotated[
-        bool, Meta(description="average what the network says of the object in all 8 turned and mirrored positions")
-    ] = False
+        Literal[1, 2, 4, 8],
+        Meta(description="turned and mirrored positions in which the network sees the object; their mean is taken"),
+    ] = 2
 
 
 @stage(version=4)
@@ -247,16 +251,13 @@ def _learned(cues: Cues, network: Network, settings: Settings) -> SurfaceMaps:
 
 
 def _whole(cues: Cues, network: Network, settings: Settings) -> dict[str, Floats]:
-    """The network's maps of the whole object, normals in the camera frame; the mean over the square's symmetries.
+    """The network's maps of the whole object, normals in the camera frame; the mean over symmetries of the square.
 
     A turn or mirror of the picture is one of the scene: polarization turns twice as fast, rays with it.
     """
     picture, rays = np.moveaxis(channels(cues), 0, -1), cues.rays
     total: dict[str, Floats] = {}
-    positions = (
-        [(quarters, mirror) for mirror in (False, True) for quarters in range(4)] if settings.turns else [(0, False)]
-    )
-    for quarters, mirror in positions:
+    for quarters, mirror in _POSITIONS[: settings.turns]:
         turned = _turned(picture, quarters, mirror)
         maps = _run(np.moveaxis(_with_axes_turned(turned, quarters, mirror), -1, 0), network)
         own = np.array(_turned(rays, quarters, mirror))
@@ -268,7 +269,7 @@ def _whole(cues: Cues, network: Network, settings: Settings) -> dict[str, Floats
             if name == "normal":
                 upright = _vector_turned(back[..., :2], -quarters, False) * [-1.0 if mirror else 1.0, 1.0]
                 back = np.concatenate([upright, back[..., 2:]], axis=-1)
-            total[name] = total.get(name, 0) + np.asarray(back, np.float32) / len(positions)
+            total[name] = total.get(name, 0) + np.asarray(back, np.float32) / settings.turns
     return total
 
 

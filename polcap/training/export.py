@@ -19,7 +19,7 @@ from polcap.training import model, train
 
 OPSET = 17
 ENCODING = "1"  # of the input channels; formats/onnx.py checks it
-NATIVE_SIZE = 224  # px of the longer side that inference shows it: a little more than trained on; measured best
+NATIVE_SIZE = 256  # px of the longer side that inference shows it: more than it was trained on; measured best
 _GREATEST_IR = 10  # what onnxruntime 1.20 and later read
 
 

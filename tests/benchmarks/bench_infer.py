@@ -1,6 +1,6 @@
 """Seconds and memory of the inference stage on crops of 512² and 2048², beside the network alone.
 
-    python tests/benchmarks/bench_infer.py DATA [--model MODEL.onnx] [--turns]
+    python tests/benchmarks/bench_infer.py DATA [--model MODEL.onnx] [--turns N]
 
 The first picture of the evaluation at 512², and the same with each pixel four by four times. Each size in a
 process of its own, for its peak memory; best of three.
@@ -31,7 +31,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path, help="folder with meshes/ and materials/")
     parser.add_argument("--model", type=Path, default=_SHIPPED)
-    parser.add_argument("--turns", action="store_true", help="averaged over eight positions")
+    parser.add_argument("--turns", type=int, default=infer.Settings().turns, help="positions averaged")
     options = parser.parse_args()
     seen = Protocol(options.data, 512).case(0).cues
     print("| crop | stage [s] | network once [s] | ratio | peak memory [GB] |\n| --- | --- | --- | --- | --- |")
@@ -41,7 +41,7 @@ def main() -> None:
         print(f"| {512 * times}² | {stage:.2f} | {floor:.2f} | {stage / floor:.1f} | {peak:.2f} |", flush=True)
 
 
-def _measured(seen: Cues, model: Path, turns: bool) -> tuple[float, float, float]:
+def _measured(seen: Cues, model: Path, turns: int) -> tuple[float, float, float]:
     """Best seconds of the stage, of one run of the network at its own size; greatest resident memory, GB."""
     network = onnx.load(model)
     small = infer._resized(seen, int(network.metadata["native_size"]) / max(seen.mask.shape))

@@ -185,7 +185,7 @@ def test_averaged_over_turns_a_turned_object_gets_the_turned_maps(quarters: int,
         },
     )  # fmt: skip
     moved.rays[..., :2] = infer._vector_turned(moved.rays[..., :2], quarters, mirror)
-    every = infer.Settings(turns=True)
+    every = infer.Settings(turns=8)
     whole, turned = (infer._whole(c, lopsided(), every) for c in (found, moved))
     np.testing.assert_allclose(turned["depth"], infer._turned(whole["depth"], quarters, mirror), atol=1e-4)
     expected = np.array(infer._turned(whole["normal"], quarters, mirror))
