@@ -193,4 +193,6 @@ def _explain(error: msgspec.ValidationError, given: dict[str, Any], known: dict[
     section, _, name = key.partition(".")
     value = given.get(section, {}).get(name)
     about = known[key].description if key in known else ""
+    if message.startswith("Invalid enum value"):
+        message = f"not one of {known[key].kind.removeprefix('Literal').strip('[]')}"
     return SettingError(f"{key} = {value!r}: {message[:1].lower()}{message[1:]} ({about})")
