@@ -11,6 +11,7 @@ import cv2
 import msgspec
 import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 from scipy.special import erf
 
 from polcap.errors import ModelError
@@ -21,8 +22,9 @@ from polcap.stages.cues import CHANNELS, channels
 
 _BLURS_PX = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0)
 _SAME = 2.0  # standard deviations that two averages of the same thing may differ by
-_INVERSION = 4.0  # factor on the inversion's expected error in the join: the network has seen what it has seen
-_CALIBRATION = (0.82, 1.1, 40.0)  # error = min(a·expectedᵇ, c), degrees: traced pictures of training meshes
+_INVERSION = 1.5  # factor on the inversion's expected error in the join: the network has seen what it has seen
+_DETAIL = 2.0  # pixels that the network sees, 1σ: what is finer is the inversion's to tell
+_CALIBRATION = (0.552, 1.52, 30.0)  # error = min(a·expectedᵇ, c), degrees: traced pictures of training meshes
 _POSITIONS = tuple(
     (quarters, mirror) for first in (0, 1) for mirror in (False, True) for quarters in (first, first + 2)
 )
@@ -221,18 +223,20 @@ def _learned(cues: Cues, network: Network, settings: Settings) -> SurfaceMaps:
 
     The network sees the whole object at the size it was made for, which settles half-turns, shape and gloss.
     Detail comes from the pixels: of color by the picture itself, which the network's albedo only divides by its
-    shading; of normals by the inversion at full size, where noise and interreflection leave it a say.
+    shading; of normals by what the inversion shows that is finer than the network sees, where noise leaves it a say.
     """
     _check(network)
     size = cues.mask.shape[::-1]
-    seen = _resized(cues, min(1.0, int(network.metadata["native_size"]) / max(size)))
+    shrink = max(1.0, max(size) / int(network.metadata["native_size"]))
+    seen = _resized(cues, 1 / shrink)
     small = _whole(seen, network, settings)
     small["factor"] = _factor(small["diffuse"], seen)
     maps = {name: np.asarray(cv2.resize(image, size)) for name, image in small.items()}
     ahead = maps["normal"] / np.maximum(_length(maps["normal"]), 1e-6)
     guide = np.asarray(frames.to_ray_frame(ahead, cues.rays)), maps["sigma"]
     by_pixel, doubt, _ = _inverted(cues, settings, guide)
-    normal, stated = _joined((ahead, maps["sigma"]), (by_pixel, _INVERSION * doubt))
+    detailed = _detailed(ahead, by_pixel, cues.mask, _DETAIL * shrink)
+    normal, stated = _joined((ahead, maps["sigma"]), (detailed, _INVERSION * doubt))
     diffuse = _filled((np.maximum(cues.radiance, 0) + _DARK) * np.exp(maps["factor"]) - _DARK, cues)
     scale, power, most = _CALIBRATION
     expected = np.minimum(scale * stated**power, most)
@@ -296,6 +300,18 @@ def _with_axes_turned(picture: Floats, quarters: int, mirror: bool) -> Floats:
     at = CHANNELS.index("ray_x")
     out[..., at : at + 2] = _vector_turned(picture[..., at : at + 2], quarters, mirror)
     return out
+
+
+def _detailed(coarse: Floats, fine: Floats, mask: NDArray[np.bool_], blur: float) -> Floats:
+    """Normals (H, W, 3) of one kind with what is finer than `blur` pixels (1σ) of another.
+
+    Interreflection, index and half-turns bend the inversion's normals over whole regions; relief is finer.
+    """
+    inside = mask.astype(np.float32)
+    share = np.maximum(cv2.GaussianBlur(inside, (0, 0), blur), 1e-3)[..., None]
+    change = cv2.GaussianBlur(((coarse - fine) * inside[..., None]).astype(np.float32), (0, 0), blur) / share
+    moved = fine + change
+    return np.asarray(moved / np.maximum(_length(moved), 1e-6))
 
 
 def _joined(*estimates: tuple[Floats, Floats]) -> tuple[Floats, Floats]:

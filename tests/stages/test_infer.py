@@ -140,6 +140,21 @@ def test_a_guide_settles_the_half_turn(side: float):
     assert np.median(error[mask & found.mask]) < 1.0
 
 
+def test_detail_is_kept_and_a_bend_is_not():
+    """Relief of a few pixels comes from the fine normals, tilts of whole regions from the coarse ones."""
+    y, x = np.mgrid[:128, :128]
+    tilt = np.tile([0.0, 0.0, 1.0], (128, 128, 1))
+    coarse, fine, truth = (tilt + np.array(aside) for aside in ([0.2, 0, 0], [-0.3, 0.1, 0], [0.2, 0, 0]))
+    relief = 0.2 * np.sin(x / 2)
+    fine[..., 1] += relief
+    truth[..., 1] += relief
+    coarse, fine, truth = (n / np.linalg.norm(n, axis=-1, keepdims=True) for n in (coarse, fine, truth))
+    mask = np.hypot(x - 64, y - 64) < 55
+    found = infer._detailed(coarse, fine, mask, 8.0)
+    error = np.degrees(np.arccos(np.clip((found * truth).sum(-1), -1, 1)))
+    assert np.median(error[mask]) < 1.0 and np.quantile(error[mask], 0.99) < 6.0
+
+
 def test_a_guide_is_as_sure_as_its_error_is_small():
     """P(right) − P(wrong) of a Gaussian: 68.3 % at one standard deviation from the axis."""
     axis, rays = np.array([[[1.0, 1.0]], [[0.0, 0.0]]]), np.full((1, 2, 3), [0.0, 0.0, 1.0])
