@@ -56,10 +56,10 @@ def read(file: Path, clean: bool, seed: int) -> Case:
         torch.from_numpy(np.asarray(value, order="C"))[None] for value in (made["stokes"], made["diffuse"], mask, rays)
     )
     one = torch.ones(1)
-    errors = Errors.none(1, one.device) if clean else Errors.stated(1, one.device)
     at = np.flatnonzero(mask)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
+        errors = Errors.none(1, one.device) if clean else Errors.stated(1, one.device)
         seen = photograph(scene[0][:, None], diffuse, given, v, torch.from_numpy(at), errors)
     white = ColorCalibration(np.eye(3, dtype=np.float32), None, None, None, "profile", 0.0, None)
     measured = cues.compute(stokes_image(seen, at, mask, view), white)
