@@ -22,9 +22,9 @@ from polcap.stages.cues import CHANNELS, channels
 
 _BLURS_PX = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0)
 _SAME = 2.0  # standard deviations that two averages of the same thing may differ by
-_INVERSION = 3.0  # factor on the inversion's expected error in the join: the network has seen what it has seen
+_INVERSION = 4.0  # factor on the inversion's expected error in the join: the network has seen what it has seen
 _DETAIL = 2.0  # pixels that the network sees, 1σ: what is finer is the inversion's to tell
-_CALIBRATION = (0.629, 1.28, 30.0)  # error = min(a·expectedᵇ, c), degrees: traced pictures of training meshes
+_CALIBRATION = (0.718, 1.16, 50.0)  # error = min(a·expectedᵇ, c), degrees: traced pictures of training meshes
 _POSITIONS = tuple(
     (quarters, mirror) for first in (0, 1) for mirror in (False, True) for quarters in (first, first + 2)
 )
