@@ -235,7 +235,7 @@ def _learned(cues: Cues, network: Network, settings: Settings) -> SurfaceMaps:
     ahead = maps["normal"] / np.maximum(_length(maps["normal"]), 1e-6)
     guide = np.asarray(frames.to_ray_frame(ahead, cues.rays)), maps["sigma"]
     by_pixel, doubt, _ = _inverted(cues, settings, guide)
-    detailed = _detailed(ahead, by_pixel, cues.mask, _DETAIL * shrink)
+    detailed = _detailed(ahead, by_pixel, cues.mask, shrink)
     normal, stated = _joined((ahead, maps["sigma"]), (detailed, _INVERSION * doubt))
     diffuse = _filled((np.maximum(cues.radiance, 0) + _DARK) * np.exp(maps["factor"]) - _DARK, cues)
     scale, power, most = _CALIBRATION
@@ -302,15 +302,19 @@ def _with_axes_turned(picture: Floats, quarters: int, mirror: bool) -> Floats:
     return out
 
 
-def _detailed(coarse: Floats, fine: Floats, mask: NDArray[np.bool_], blur: float) -> Floats:
-    """Normals (H, W, 3) of one kind with what is finer than `blur` pixels (1σ) of another.
+def _detailed(coarse: Floats, fine: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:
+    """Normals (H, W, 3) of one kind with what is finer than 2 px (1σ), seen `shrink` times smaller, of another.
 
     Interreflection, index and half-turns bend the inversion's normals over whole regions; relief is finer.
     """
+    height, width = mask.shape
+    size = (round(width / shrink), round(height / shrink))
     inside = mask.astype(np.float32)
-    share = np.maximum(cv2.GaussianBlur(inside, (0, 0), blur), 1e-3)[..., None]
-    change = cv2.GaussianBlur(((coarse - fine) * inside[..., None]).astype(np.float32), (0, 0), blur) / share
-    moved = fine + change
+    apart, share = (
+        cv2.GaussianBlur(cv2.resize(image, size, interpolation=cv2.INTER_AREA), (0, 0), _DETAIL)
+        for image in ((coarse - fine).astype(np.float32) * inside[..., None], inside)
+    )
+    moved = fine + cv2.resize(apart / np.maximum(share, 1e-3)[..., None], (width, height))
     return np.asarray(moved / np.maximum(_length(moved), 1e-6))
 
 

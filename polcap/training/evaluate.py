@@ -10,6 +10,7 @@ import json
 import multiprocessing
 import os
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -130,8 +131,17 @@ _bench: "Bench | None" = None  # of this worker
 
 def _begin(params: Params, means: Means) -> None:
     global _bench
+    threading.Thread(target=_follow, daemon=True).start()
     torch.set_num_threads(1)
     _bench = Bench(params, means)
+
+
+def _follow() -> None:
+    """End with the process that asked, however that ends."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _row(number: int) -> Row:

@@ -150,7 +150,7 @@ def test_detail_is_kept_and_a_bend_is_not():
     truth[..., 1] += relief
     coarse, fine, truth = (n / np.linalg.norm(n, axis=-1, keepdims=True) for n in (coarse, fine, truth))
     mask = np.hypot(x - 64, y - 64) < 55
-    found = infer._detailed(coarse, fine, mask, 8.0)
+    found = infer._detailed(coarse, fine, mask, 4.0)
     error = np.degrees(np.arccos(np.clip((found * truth).sum(-1), -1, 1)))
     assert np.median(error[mask]) < 1.0 and np.quantile(error[mask], 0.99) < 6.0
 
