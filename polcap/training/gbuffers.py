@@ -65,8 +65,11 @@ def load(folder: Path, *, mapped: bool = True) -> dict[str, NDArray]:  # type: i
     camera: focal, centre x, y [px]; middle depth [m]; depth unit [m]; object → camera rotation, 9; flash right of
     the lens and above it [middle depths].
     """
-    if not (folder / "index.json").exists():
-        raise InputError(f"{folder} holds no complete G-buffer cache; build it with `polcap train`")
+    missing = [n for n in ("index.json", *(f"{name}.npy" for name in ARRAYS)) if not (folder / n).exists()]
+    if missing:
+        raise InputError(
+            f"{folder} holds no complete G-buffer cache: {missing[0]} is missing; remove it and run `polcap train`"
+        )
     arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r" if mapped else None) for name in ARRAYS}
     return arrays | {"camera": np.load(folder / "camera.npy")}
 
