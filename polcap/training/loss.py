@@ -14,7 +14,7 @@ from polcap.stages.cues import NOMINAL_IOR
 from polcap.training.dataset import Batch
 
 WEIGHTS = {
-    "normal": 2.0, "depth": 1.0, "diffuse": 1.0, "specular": 40.0, "roughness": 4.0, "highlight": 2.0,
+    "normal": 2.0, "depth": 1.0, "diffuse": 1.0, "specular": 60.0, "roughness": 8.0, "highlight": 2.0,
     "sigma": 0.05, "render": 0.3,
 }  # fmt: skip
 

@@ -3,7 +3,8 @@
 Works on flat lists of the object's pixels (M, ·), because two thirds of a view are background. An
 object wears one to three materials in regions of solid noise. Each takes its pattern from a texture
 set, projected along the nearest axis, or from solid noise; specular reflectance and roughness follow
-the pattern of the albedo as in real materials, around levels drawn per material.
+the pattern of the albedo as in real materials, around levels drawn per material. Many patterns are two
+surfaces in one, as print, glaze, inlay and wear are: two glosses a few pixels apart, often in relief.
 """
 
 import math
@@ -69,9 +70,14 @@ def dress(library: Library, normal: Tensor, position: Tensor, turn: Tensor, owne
     inner = _turned(frame, position, owner)
     facing = _turned(frame @ turn.transpose(1, 2), normal, owner)
 
-    coarse, fine = (
-        library.sample_noise(inner * _log_uniform((count, 1), low, high, device)[owner] + _u((count, 3), device)[owner])
-        for low, high in ((0.5, 2.5), (2.0, 9.0))
+    grain = torch.where(_u((count, 1), device) < 0.3, _log_uniform((count, 3), 0.08, 1.0, device), 1.0)
+    coarse, fine, printed = (
+        library.sample_noise(inner * (_log_uniform((count, 1), low, high, device) * stretch)[owner] + shift[owner])
+        for low, high, stretch, shift in (
+            (0.5, 2.5, 1.0, _u((count, 3), device)),
+            (2.0, 9.0, grain, _u((count, 3), device)),
+            (4.0, 28.0, grain, _u((count, 3), device)),
+        )
     )
 
     used = torch.randint(1, _MATERIALS + 1, (count,), device=device) * (_u((count,), device) < 0.6) + 1
@@ -87,17 +93,21 @@ def dress(library: Library, normal: Tensor, position: Tensor, turn: Tensor, owne
     v = inner.gather(1, ((axis + 2) % 3)[:, None])[:, 0] * scale
     picture = library.sample_textures(own["texture"].long(), u, v)
 
-    pattern = torch.sigmoid(own["contrast"] * (fine[:, 0] + own["level"]))
+    raised = own["raised"] > 0.5  # the pattern is the relief's
+    pattern = torch.sigmoid(own["contrast"] * (torch.where(raised, fine[:, 3], printed[:, 0]) + own["level"]))
     painted = own["color"] * (1 - pattern[:, None]) + own["color2"] * pattern[:, None]
     textured = own["from_texture"] > 0.5
     diffuse = torch.where(textured[:, None], picture[:, :3] * own["tint"], painted).clamp(0.005, 0.95)
     lightness = diffuse.mean(dim=1) ** 0.45
     deviation = (lightness - own["mid"]) * own["follow"] + 0.5 * own["speckle"] * fine[:, 1]
     rough = torch.where(textured, picture[:, 3] * own["rough_gain"] + own["rough_shift"], own["rough"] + deviation)
+    rough = rough + own["rough_step"] * pattern
     reflectance = own["f0"] * (1 + own["f0_follow"] * (lightness - own["mid"]) + own["speckle"] * fine[:, 2])
+    reflectance = reflectance * torch.exp(own["f0_step"] * pattern)
     specular = (reflectance[:, None] * own["f0_tint"]).clamp(0.015, 0.4)
 
-    bump = _turned(frame.transpose(1, 2), fine[:, 4:7], owner)  # gradient in the object's frame
+    relief = fine[:, 4:7] * grain[owner] * torch.where(raised, 4 * pattern * (1 - pattern), 1.0)[:, None]
+    bump = _turned(frame.transpose(1, 2), relief, owner)  # gradient in the object's frame
     slope = torch.zeros_like(facing).scatter(1, ((axis + 1) % 3)[:, None], picture[:, 4:5])
     slope = slope.scatter(1, ((axis + 2) % 3)[:, None], picture[:, 5:6])
     slope = torch.where(textured[:, None], _turned(frame.transpose(1, 2), slope, owner), bump)
@@ -123,7 +133,8 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
 
     common = u(0, 1) < 0.55
     f0 = torch.where(common, 0.042 * torch.exp(normal(0.2)), 0.05 * torch.exp(u(0, 1.65)))  # up to .26
-    rough = torch.where(u(0, 1) < 0.3, u(0.1, 0.4), u(0.25, 0.95))
+    rough, other = (torch.where(u(0, 1) < 0.3, u(0.1, 0.4), u(0.25, 0.95)) for _ in range(2))
+    two = u(0, 1) < 0.6  # surfaces in one pattern
     color, color2 = _colors(shape, device), _colors(shape, device)
     near = (u(0, 1) < 0.5)[..., None]
     color2 = torch.where(near, color * (0.4 + 1.2 * _u((*shape, 1), device)), color2)
@@ -132,16 +143,18 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
     coloured = (f0 > 0.08) & (u(0, 1) < 0.3)
     f0_tint = torch.where(coloured[..., None], 1 + 0.4 * (_u((*shape, 3), device) - 0.5), torch.ones(1, device=device))
     # solid noise has a slope of unit deviation: 11° at most; textures slope less, so theirs are raised
-    bump = 0.2 * u(0, 1) ** 2 * torch.where(from_texture > 0.5, 3.0, 1.0) * (u(0, 1) < 0.6)
+    bump = 0.25 * torch.exp(u(-3, 0)) * torch.sign(u(-1, 1)) * (u(0, 1) < 0.7)
+    bump = bump * torch.where(from_texture > 0.5, 2.5, 1.0)
     return {
         "color": color, "color2": color2, "tint": tint, "f0_tint": f0_tint,
         "from_texture": from_texture.float(),
         "texture": torch.randint(0, max(len(library.names), 1), shape, device=device).float(),
-        "shift": u(0, 2), "contrast": torch.exp(u(-1, 3)), "level": u(-1.5, 1.5),
+        "shift": u(0, 2), "contrast": torch.exp(u(-0.5, 3.2)), "level": u(-1.5, 1.5),
         "mid": color.mean(dim=-1) ** 0.45,
         "rough": rough, "follow": normal(0.3), "speckle": u(0, 0.25) * (u(0, 1) < 0.5),
-        "rough_gain": u(0.3, 1.0), "rough_shift": u(-0.3, 0.4),
+        "rough_gain": u(0.4, 1.0), "rough_shift": u(-0.2, 0.4),
         "f0": f0, "f0_follow": normal(0.5),
+        "rough_step": two * (other - rough), "f0_step": two * normal(0.4), "raised": (u(0, 1) < 0.4).float(),
         "ior": (1.5 + normal(0.06)).clamp(1.35, 1.7), "bump": bump,
     }  # fmt: skip
 
