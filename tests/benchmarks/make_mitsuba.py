@@ -17,11 +17,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import plastic
 import trimesh
 
 from polcap.formats import atomic, textures
 from polcap.images import Floats, View
-from polcap.optics import frames, fresnel
+from polcap.optics import fresnel
 from polcap.synth import materials, render
 from polcap.synth.mesh import Triangles
 from polcap.training import gbuffers
@@ -89,7 +90,7 @@ def build(
     scenes = [scene(mi, parts, channel, light, np.pi * middle**2, view, size, depth) for channel in "rgb"]
     while passes < LEAST or (error[1] > 2 * GOAL and passes < MOST):
         for k, one in enumerate(scenes):
-            halves[passes % 2, ..., k] += shot(mi, one, view, size, seed=3 * passes + k)
+            halves[passes % 2, ..., k] += shot(mi, one, view, seed=3 * passes + k)
         passes += 1
         if passes % 2 == 0:
             error = dolp_error(halves, mask)
@@ -170,27 +171,13 @@ def scene(
     mi: Any, parts: list[Any], channel: str, light: list[float], power: float, view: View, size: int, depth: int
 ) -> Any:
     """What Mitsuba renders of one colour channel."""
-    offset = [((size - 1) / 2 - c) / size for c in view.center]
     return mi.load_dict(
         {
             "type": "scene",
             "integrator": {"type": "stokes", "nested": {"type": "path", "max_depth": depth}},
             "sensor": {
-                "type": "perspective",
-                "fov": float(np.degrees(2 * np.arctan(size / 2 / view.focal))),
-                "principal_point_offset_x": offset[0],
-                "principal_point_offset_y": offset[1],
-                "near_clip": 0.01,
-                "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, 0], target=[0, 0, -1], up=[0, 1, 0]),
-                "film": {
-                    "type": "hdrfilm",
-                    "pixel_format": "luminance",
-                    "width": size,
-                    "height": size,
-                    "rfilter": {"type": "box"},
-                    "component_format": "float32",
-                },
-                "sampler": {"type": "independent", "sample_count": PASS},
+                **(sensor := plastic.camera(mi, view, size, "independent", PASS)),
+                "film": {**sensor["film"], "pixel_format": "luminance"},
             },
             "light": {"type": "point", "position": light, "intensity": power},
             **{f"part{k}": body(mi, part, channel) for k, part in enumerate(parts)},
@@ -202,17 +189,8 @@ def body(mi: Any, part: dict[str, Any], channel: str) -> Any:
     """One region's triangles: a texel for each face, and its material as attributes for the truth."""
     count = len(part["position"])
     settings = mi.Properties()
-    settings["bsdf"] = mi.load_dict(
-        {
-            "type": "pplastic",
-            "distribution": "ggx",
-            "alpha": part["alpha"],
-            "int_ior": part["ior"],
-            "ext_ior": 1.0,
-            "diffuse_reflectance": texels(mi, part[channel]),
-            "specular_reflectance": part["strength"],
-        }
-    )
+    look = plastic.plastic(part["alpha"], part["ior"], texels(mi, part[channel]), part["strength"])
+    settings["bsdf"] = mi.load_dict(look)
     mesh = mi.Mesh("part", 3 * count, count, has_vertex_normals=True, has_vertex_texcoords=True, props=settings)
     for name in ("r", "g", "b", "strength", "alpha", "ior"):
         mesh.add_attribute(f"face_{name}", 1, np.broadcast_to(part[name], count).astype(np.float32))
@@ -235,18 +213,9 @@ def texels(mi: Any, value: Floats) -> dict[str, Any]:
     return {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
 
 
-def shot(mi: Any, one: Any, view: View, size: int, seed: int) -> Floats:
-    """One pass of one channel: (3, H, W) in the frame of each ray.
-
-    Mitsuba's S1, S2 stand on the horizontal across each ray (view × up), ours on the projected x axis.
-    """
-    image = np.array(mi.render(one, seed=seed))[..., -12::3]
-    v = frames.rays(view, size, size).astype(float)
-    e_x, e_y = frames.basis(v)
-    across = np.cross(-v, [0.0, 1.0, 0.0])
-    turn = np.arctan2((across * e_y).sum(-1), (across * e_x).sum(-1))
-    linear = (image[..., 1] + 1j * image[..., 2]) * np.exp(2j * turn)
-    return np.stack([image[..., 0], linear.real, linear.imag])
+def shot(mi: Any, one: Any, view: View, seed: int) -> Floats:
+    """One pass of one channel: (3, H, W) in the frame of each ray."""
+    return plastic.in_ray_frame(np.array(mi.render(one, seed=seed))[..., -12::3], view)
 
 
 def seen(mi: Any, parts: list[Any], view: View, size: int) -> dict[str, Any]:

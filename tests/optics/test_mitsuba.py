@@ -1,6 +1,7 @@
 """The material model and the signs against Mitsuba 3's polarized plastic, which knows nothing of ours."""
 
 import numpy as np
+import plastic
 import pytest
 
 from polcap.optics import fresnel, shade
@@ -21,27 +22,16 @@ def stokes() -> np.ndarray:
             "sensor": {
                 "type": "orthographic",
                 "to_world": view,
-                "film": {
-                    "type": "hdrfilm",
-                    "width": SIDE,
-                    "height": SIDE,
-                    "rfilter": {"type": "box"},
-                    "component_format": "float32",
-                },
+                "film": plastic.film(SIDE),
                 "sampler": {"type": "independent", "sample_count": SAMPLES},
             },
             "light": {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "d65", "scale": 1.0}},
             "ball": {
                 "type": "sphere",
                 "radius": RADIUS,
-                "bsdf": {
-                    "type": "pplastic",
-                    "distribution": "ggx",
-                    "alpha": ALPHA,
-                    "int_ior": 1.5,
-                    "diffuse_reflectance": {"type": "uniform", "value": ALBEDO},
-                    "specular_reflectance": {"type": "uniform", "value": 1.0},
-                },
+                "bsdf": plastic.plastic(
+                    ALPHA, 1.5, {"type": "uniform", "value": ALBEDO}, {"type": "uniform", "value": 1.0}
+                ),
             },
         }
     )

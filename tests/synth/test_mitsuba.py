@@ -1,16 +1,15 @@
 """The synthetic camera's renderer against Mitsuba 3 `pplastic`: same shapes, same flash, off axis, direct light only.
 
 Both are Baek's model, and nothing is fitted: index, k_s, α and the light's intensity are the same numbers.
-Mitsuba's S1, S2 stand on the horizontal across each ray (view × up); ours on the projected x axis.
 """
 
 from typing import Any
 
 import numpy as np
+import plastic
 import pytest
 
 from polcap.images import Floats, View
-from polcap.optics import frames
 from polcap.synth import render, shapes, trace
 from polcap.synth.materials import Coat, Material
 from polcap.synth.render import Scene
@@ -23,6 +22,7 @@ BALL, BALL_AT = shapes.Cluster(((0, 0, 0, 0.085),)), (0.11, 0.09, -0.7)
 WAVES = ((0.07, 5.0, 1.0, 2.0, 0.3), (0.05, -2.0, 6.0, 1.0, 1.1), (0.04, 1.0, -3.0, 7.0, 2.0))
 BUMPS, BUMPS_AT = shapes.Bumps((0.09, 0.075, 0.08), WAVES), (-0.11, -0.1, -0.72)
 COAT = Coat((Material((ALBEDO,) * 3, (ALBEDO,) * 3, "plain", roughness=(ALPHA**0.5,) * 2, specular=STRENGTH, ior=IOR),))
+MATERIAL = plastic.plastic(ALPHA, IOR, ALBEDO, STRENGTH)
 
 
 def scene(shape: shapes.Shape, position: trace.Vector) -> Scene:
@@ -48,32 +48,14 @@ def theirs(mi: Any, body: Any, reference: float) -> Floats:
         {
             "type": "scene",
             "integrator": {"type": "stokes", "nested": {"type": "direct"}},
-            "sensor": {
-                "type": "perspective",
-                "fov": FOV,
-                "near_clip": 0.01,
-                "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, 0], target=[0, 0, -1], up=[0, 1, 0]),
-                "film": {
-                    "type": "hdrfilm",
-                    "width": SIDE,
-                    "height": SIDE,
-                    "rfilter": {"type": "box"},
-                    "component_format": "float32",
-                },
-                "sampler": {"type": "stratified", "sample_count": SAMPLES},
-            },
+            "sensor": plastic.camera(mi, VIEW, SIDE, "stratified", SAMPLES),
             "light": {"type": "point", "position": list(LIGHT), "intensity": np.pi * reference},
             "body": body,
         }
     )
     image = np.array(mi.render(found))[..., -12::3]  # S0.R … S3.R stand last
     assert np.abs(image[..., 3]).max() < 1e-3 * image[..., 0].max()  # no circular part
-    v = frames.rays(VIEW, SIDE, SIDE).astype(float)
-    e_x, e_y = frames.basis(v)
-    across = np.cross(-v, [0.0, 1.0, 0.0])
-    turn = np.arctan2((across * e_y).sum(-1), (across * e_x).sum(-1))
-    linear = (image[..., 1] + 1j * image[..., 2]) * np.exp(2j * turn)
-    return np.stack([image[..., 0], linear.real, linear.imag])
+    return plastic.in_ray_frame(image, VIEW)
 
 
 def ours(which: Scene) -> tuple[Floats, Floats]:
@@ -92,18 +74,6 @@ def ours(which: Scene) -> tuple[Floats, Floats]:
     return np.array(stokes), np.array(facing)
 
 
-def material(mi: Any) -> dict[str, Any]:
-    return {
-        "type": "pplastic",
-        "distribution": "ggx",
-        "alpha": ALPHA,
-        "int_ior": IOR,
-        "ext_ior": 1.0,
-        "diffuse_reflectance": ALBEDO,
-        "specular_reflectance": STRENGTH,
-    }
-
-
 def tessellated(mi: Any, shape: shapes.Bumps, at: trace.Vector, rings: int = 500) -> Any:
     """The waved ellipsoid as triangles half a millimetre across, with its own normals at their corners."""
     polar, around = np.meshgrid(np.linspace(0, np.pi, rings), np.linspace(0, 2 * np.pi, 2 * rings), indexing="ij")
@@ -117,7 +87,7 @@ def tessellated(mi: Any, shape: shapes.Bumps, at: trace.Vector, rings: int = 500
     a, b = i * 2 * rings + j, (i + 1) * 2 * rings + j
     faces = np.stack([a, b, b + 1, a, b + 1, a + 1], -1).reshape(-1, 3)
     settings = mi.Properties()
-    settings["bsdf"] = mi.load_dict(material(mi))
+    settings["bsdf"] = mi.load_dict(MATERIAL)
     mesh = mi.Mesh("bumps", len(point), len(faces), has_vertex_normals=True, props=settings)
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = (point + at).astype(np.float32).ravel()
@@ -131,7 +101,7 @@ def tessellated(mi: Any, shape: shapes.Bumps, at: trace.Vector, rings: int = 500
 def test_stokes_parameters_are_those_of_another_renderer(mi: Any, kind: str) -> None:
     if kind == "ball":
         which = scene(BALL, BALL_AT)
-        body = {"type": "sphere", "center": list(BALL_AT), "radius": 0.085, "bsdf": material(mi)}
+        body = {"type": "sphere", "center": list(BALL_AT), "radius": 0.085, "bsdf": MATERIAL}
     else:
         which, body = scene(BUMPS, BUMPS_AT), tessellated(mi, BUMPS, BUMPS_AT)
     reference = float(np.sum((np.array(LIGHT) - which.position) ** 2))
