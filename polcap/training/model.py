@@ -30,7 +30,7 @@ _SHARED = (2, 1)  # decoder levels of 1/8 and 1/4 of the resolution
 _MASK = CHANNELS.index("mask")
 _CLIPPED = CHANNELS.index("clipped")
 _RATIO = slice(CHANNELS.index("s1"), CHANNELS.index("s2") + 1)
-_COLOR = slice(CHANNELS.index("log_r"), CHANNELS.index("log_b") + 1)
+COLOR = slice(CHANNELS.index("log_r"), CHANNELS.index("log_b") + 1)
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
         inside = x[:, _MASK : _MASK + 1]
         features[-1] = self.context(features[-1], F.avg_pool2d(inside, SIZE_MULTIPLE))
         shape, color = (branch(features, seen, inside).float() for branch in (self.geometry, self.color))
-        level = x[:, _COLOR].float()
+        level = x[:, COLOR].float()
         normal = F.normalize(shape[:, :3] + shape.new_tensor([0.0, 0.0, 0.5]).view(1, 3, 1, 1), dim=1, eps=1e-6)
         diffuse = torch.sigmoid(level + color + 0.7)
         body = torch.log(0.9 * diffuse * normal[:, 2:].clamp(min=0) + 0.02)  # what the diffuse light would be

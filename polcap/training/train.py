@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from polcap.errors import InputError
+from polcap.formats import png
 from polcap.training import gbuffers, loss, materials, model
 from polcap.training.dataset import Batch, Simulator
 from polcap.training.variants import VARIANTS
@@ -72,7 +73,7 @@ PRESETS = {
 
 
 def main(params: Params) -> Path:
-    """Train, and leave out/last.pt (all that resuming needs, EMA weights included) and out/metrics.csv."""
+    """Train; leaves out/last.pt (all that resuming needs, EMA weights included), metrics.csv, watch.csv, watch.png."""
     for name, value, known in (("preset", params.preset, PRESETS), ("variant", params.variant, VARIANTS)):
         if value not in known:
             raise InputError(f"{name} {value!r} is not one of {', '.join(known)}")
@@ -107,6 +108,7 @@ def main(params: Params) -> Path:
             looked = run.elapsed
             with run.averaged() as network:
                 _record(params.out / "watch.csv", run, watch.look(network))
+                png.write(params.out / "watch.png", watch.picture(network))
             before = time.monotonic()
         if run.elapsed - saved > 60:
             saved = run.elapsed

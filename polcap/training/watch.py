@@ -6,9 +6,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from polcap import pictures
+from polcap.images import Floats
+from polcap.pictures import Picture
 from polcap.training import gbuffers, materials
 from polcap.training.camera import Errors
 from polcap.training.dataset import Batch, Simulator, batch
+from polcap.training.model import COLOR
 
 _FLASH = (0.0, 0.05)  # of the distance, as in protocol.py
 
@@ -33,6 +37,36 @@ class Watch:
         """Mean figures over all pixels of all pictures."""
         rows = [figures(run(network, batch), batch) for batch in self.batches]
         return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+
+    def picture(self, network: nn.Module) -> Picture:
+        """The first batch, a row each: S0, then normal, diffuse, F0, roughness and depth, truth left of estimate."""
+        seen = self.batches[0]
+        truth = {name: getattr(seen, name) for name in ("normal", "diffuse", "specular", "roughness", "depth")}
+        sides = [_drawn(maps, seen.mask) for maps in (truth, run(network, seen))]
+        light = torch.exp(seen.channels[:, COLOR].float()) * seen.mask[:, None]
+        columns = [[pictures.display(s0, 1.0) for s0 in _arrays(light)]]
+        columns += [tiles for pair in zip(*sides) for tiles in pair]
+        return np.hstack([np.vstack(tiles) for tiles in columns])
+
+
+def _drawn(maps: dict[str, Tensor], mask: Tensor) -> list[list[Picture]]:
+    """Normal (in each ray's frame), diffuse, F0 0…0.3, roughness and depth of every picture."""
+    inside = mask.cpu().numpy()
+    normal, diffuse, specular, roughness, depth = (
+        _arrays(maps[name] * mask[:, None]) for name in ("normal", "diffuse", "specular", "roughness", "depth")
+    )
+    return [
+        [np.asarray(np.rint(127.5 * (n + 1)) * m[..., None], np.uint8) for n, m in zip(normal, inside)],
+        [pictures.display(d, 1.0) for d in diffuse],
+        [pictures.scale(f.mean(-1), 0, 0.3, m) for f, m in zip(specular, inside)],
+        [pictures.scale(r[..., 0], 0, 1, m) for r, m in zip(roughness, inside)],
+        [pictures.scale(-d[..., 0], -1.5, 1.5, m) for d, m in zip(depth, inside)],
+    ]
+
+
+def _arrays(images: Tensor) -> Floats:
+    """(B, ·, H, W) -> (B, H, W, ·)."""
+    return np.asarray(images.float().permute(0, 2, 3, 1).cpu().numpy())
 
 
 def held_out(data: Path, folder: Path, device: torch.device, *, views: int, size: int) -> Simulator:

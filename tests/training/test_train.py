@@ -3,6 +3,7 @@
 import csv
 from pathlib import Path
 
+import cv2
 import pytest
 import torch
 
@@ -27,6 +28,8 @@ def test_run_stops_in_time_and_resumes(data: Path, tmp_path: Path, monkeypatch: 
     assert 4.0 < facts["elapsed"] < 20 and facts["samples"] > facts["step"] > 0
     assert {"step", "loss", "normal", "render"} <= set(rows(tmp_path / "metrics.csv")[0])
     assert float(rows(tmp_path / "watch.csv")[-1]["normal_mean"]) < 90
+    panel = cv2.imread(str(tmp_path / "watch.png"))
+    assert panel.shape == (8 * 128, 11 * 128, 3) and panel[:, :128].max() > 100  # S0, truth and estimate of five maps
 
     train.main(train.Params(data=data, out=tmp_path, minutes=0.1, threads=1, resume=True))
     second, later = train.load_average(last)
