@@ -111,6 +111,9 @@ def process(
         str | None, typer.Option(metavar="STAGE", help="Compute this stage and all after it again.")
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what was understood, and stop.")] = False,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Stay: process again whenever the folder has changed; Ctrl-C ends.")
+    ] = False,
     json: Json = False,
     device: Annotated[Device, typer.Option(help="Where the network runs; cuda never falls back.")] = "cpu",
     threads: Annotated[int, typer.Option(min=0, help="Threads to use; 0 is all.")] = 0,
@@ -141,23 +144,44 @@ def process(
             raise SettingError(f"{flag} {stage}: no such stage; choose one of {', '.join(pipeline.STAGES)}")
     chosen = settings.load(config, assignments or ())
     request = _chart(chart, no_chart)
-    found = captures.read(capture, _angles(angles))
     target = out or capture / "polcap"
     given = pipeline.Given(
         chart=request,
         mask=None if mask is None else _mask(mask),
         network=pipeline.load_network(estimator, model, device, threads),
     )
-    if dry_run:
-        _print_plan(found, pipeline.plan(found, given, chosen, target, force), json)
-        return
-    print(captures.table(found), file=sys.stderr)
-    with _progress(len(pipeline.STAGES) + 1) as told:
-        about = pipeline.process(found, given, chosen, target, until, force, told)
-    if about is None:
-        return
-    _print(about if json else str(target / "asset" / f"{found.name}.glb"))
-    _judge(about)
+
+    def once() -> None:
+        found = captures.read(capture, _angles(angles))
+        if dry_run:
+            _print_plan(found, pipeline.plan(found, given, chosen, target, force), json)
+            return
+        print(captures.table(found), file=sys.stderr)
+        with _progress(len(pipeline.STAGES) + 1) as told:
+            about = pipeline.process(found, given, chosen, target, until, force, told)
+        if about is None:
+            return
+        _print(about if json else str(target / "asset" / f"{found.name}.glb"))
+        _judge(about)
+
+    if watch:
+        _whenever_settled(capture, target, once)
+    else:
+        once()
+
+
+def _whenever_settled(capture: Path, target: Path, once: Callable[[], None]) -> None:
+    """Process a folder as it is and after each change; what is wrong with it is said, and it is looked at further."""
+    from polcap.formats import arrivals
+
+    if not capture.is_dir():
+        raise SettingError(f"{capture} is no folder; --watch needs the one that the photographs go to")
+    for _ in arrivals.settled(capture, target):
+        try:
+            once()
+        except (InputError, GateError) as error:
+            print(f"polcap: {_line(error)}", file=sys.stderr)
+        print(f"watching {capture}; Ctrl-C ends", file=sys.stderr, flush=True)
 
 
 @app.command()

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -160,6 +161,28 @@ def test_user_mask_replaces_the_search(result: Path, example: Path, polcap: Comm
     assert done.returncode == 0, done.stderr
     results, _ = pipeline.reopen(copy)
     assert results.object_.value.source == "user" and np.array_equal(results.object_.value.mask, drawn > 0)
+
+
+def test_watch_goes_on_as_the_photographs_come_in(example: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "c"
+    shutil.copytree(example / "pol000", folder / "pol000")
+    command = [sys.executable, "-m", "polcap", "process", folder, "--watch", "--dry-run", "--json"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None and process.stderr is not None
+        refused = process.stderr.readline()
+        assert "add the missing shot" in refused and refused.startswith("polcap: "), refused
+        assert process.stderr.readline() == f"watching {folder}; Ctrl-C ends\n"
+        for name in ("pol045", "pol090"):
+            shutil.copytree(example / name, folder / name)
+        plan = ""
+        while not plan.endswith("\n}\n"):
+            plan += process.stdout.readline()
+        assert len(json.loads(plan)["capture"]["shots"]) == 3
+        process.send_signal(signal.SIGINT)
+        assert process.wait(20) == 130
+    finally:
+        process.kill()
 
 
 def test_memory_limit_ends_with_one_line(example: Path, tmp_path: Path) -> None:
