@@ -29,7 +29,7 @@ app = typer.Typer(
     rich_markup_mode=None,  # plain help: half the start-up time
     pretty_exceptions_enable=False,
 )
-OUT_OF_MEMORY = ("Insufficient memory", "can't start new thread")  # how OpenCV and Python's threads say it
+OUT_OF_MEMORY = ("Insufficient memory", "can't start new thread", "failed to map segment")  # OpenCV, threads, loader
 Device = Literal["cpu", "cuda", "auto"]
 Result = Annotated[Path, typer.Argument(help="Result folder of `polcap process`.")]
 Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
