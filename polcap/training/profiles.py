@@ -17,7 +17,7 @@ _EDGES_DEG = (0.0, 4.0, 8.0, 12.0, 17.0, 23.0, 30.0, 40.0, 52.0, 66.0, 90.0)
 _BINS = len(_EDGES_DEG) - 1
 _FIGURES = 6  # per bin
 _COLORS = 8  # groups by color
-_ALIKE = 0.2  # 1σ within a group, ln of albedo
+_ALIKE = 0.15  # 1σ within a group, ln of albedo
 _ROUNDS = 2  # of k-means
 
 
@@ -62,12 +62,14 @@ def by_color(diffuse: Tensor, inside: Tensor) -> Tensor:
     """
     color = torch.log(diffuse.float() + 0.02)
     some, weight = (image[:, :, 1::4, 1::4].flatten(2) for image in (color, inside.float()))
-    centers = [(some * weight).sum(dim=2, keepdim=True) / (weight.sum(dim=2, keepdim=True) + 1e-4)]
-    distance = _square(some, centers[0]) * weight
+    mean = (some * weight).sum(dim=2, keepdim=True) / (weight.sum(dim=2, keepdim=True) + 1e-4)
+    centers: list[Tensor] = []
+    distance = _square(some, mean) * weight
     while len(centers) < _COLORS:
         farthest = distance.argmax(dim=2, keepdim=True)
         centers.append(some.gather(2, farthest.expand(-1, 3, -1)))
-        distance = torch.minimum(distance, _square(some, centers[-1]) * weight)
+        nearer = _square(some, centers[-1]) * weight
+        distance = nearer if len(centers) == 1 else torch.minimum(distance, nearer)
     center = torch.cat(centers, dim=2)  # (B, 3, groups)
     for _ in range(_ROUNDS):
         share = (_nearness(some, center) * weight)[:, None]  # (B, 1, groups, N)
