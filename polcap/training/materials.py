@@ -80,8 +80,8 @@ def dress(library: Library, normal: Tensor, position: Tensor, turn: Tensor, owne
         )
     )
 
-    used = torch.randint(1, _MATERIALS + 1, (count,), device=device) * (_u((count,), device) < 0.6) + 1
-    active = torch.arange(_MATERIALS, device=device)[None] < used.clamp(max=_MATERIALS)[:, None]
+    used = 1 + torch.bucketize(_u((count,), device), torch.tensor([0.5, 0.85], device=device))  # most wear one or two
+    active = torch.arange(_MATERIALS, device=device)[None] < used[:, None]
     score = torch.where(active[owner], coarse[:, :_MATERIALS], -9.0)
     table = _draw(library, count, device)
     flat = owner * _MATERIALS + score.argmax(dim=1)
