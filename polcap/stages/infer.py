@@ -42,7 +42,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 2
 
 
-@stage(version=4)
+@stage(version=5)
 def estimate(cues: Cues, network: Network | None, settings: Settings) -> SurfaceMaps:
     """Normal, diffuse, specular, roughness and expected error; network None means analytic."""
     return _analytic(cues, settings) if network is None else _learned(cues, network, settings)
@@ -115,19 +115,20 @@ def _smoothed(cues: Cues) -> tuple[Floats, Floats]:
     ----------
     Lepski, Mammen, Spokoiny, Optimal spatial adaptation, Annals of Statistics 1997.
     """
-    light = np.maximum(cues.radiance.sum(-1), 1e-6) * cues.mask
+    light = (np.maximum(cues.radiance.sum(-1), 1e-6) * cues.mask).astype(np.float32)
     kept: list[tuple[Floats, Floats]] = []
     ratio, sigma = cues.ratio, cues.ratio_sigma
+    weighted, weighted_sigma = ((image * light).astype(np.float32) for image in (ratio, sigma))
     growing = cues.mask
     for blur in _BLURS_PX:
-        weight = cv2.GaussianBlur(light.astype(np.float32), (0, 0), blur) + 1e-9
-        wider = np.stack([cv2.GaussianBlur((r * light).astype(np.float32), (0, 0), blur) / weight for r in cues.ratio])
-        spread = cv2.GaussianBlur((cues.ratio_sigma * light).astype(np.float32), (0, 0), blur) / weight
-        spread = spread / (np.sqrt(4 * np.pi) * blur)
-        for narrower, noise in kept:
-            growing = growing & (np.hypot(*(wider - narrower)) < _SAME * noise)
+        weight = cv2.GaussianBlur(light, (0, 0), blur) + np.float32(1e-9)
+        wider = np.stack([cv2.GaussianBlur(part, (0, 0), blur) / weight for part in weighted])
+        spread = cv2.GaussianBlur(weighted_sigma, (0, 0), blur) / weight / np.float32(np.sqrt(4 * np.pi) * blur)
+        for narrower, apart in kept:
+            moved = wider - narrower
+            growing = growing & (moved[0] ** 2 + moved[1] ** 2 < apart)
         ratio, sigma = np.where(growing, wider, ratio), np.where(growing, spread, sigma)
-        kept.append((wider, spread))
+        kept.append((wider, (_SAME * spread) ** 2))
     return ratio, sigma
 
 
