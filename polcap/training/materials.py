@@ -134,7 +134,8 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
     common = u(0, 1) < 0.55
     f0 = torch.where(common, 0.042 * torch.exp(normal(0.2)), 0.05 * torch.exp(u(0, 1.65)))  # up to .26
     rough, other = (torch.where(u(0, 1) < 0.3, u(0.1, 0.4), u(0.25, 0.95)) for _ in range(2))
-    two = u(0, 1) < 0.6  # surfaces in one pattern
+    two = u(0, 1) < 0.7  # surfaces in one pattern
+    as_is = u(0, 1) < 0.5  # roughness of the texture set
     color, color2 = _colors(shape, device), _colors(shape, device)
     near = (u(0, 1) < 0.5)[..., None]
     color2 = torch.where(near, color * (0.4 + 1.2 * _u((*shape, 1), device)), color2)
@@ -152,7 +153,7 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
         "shift": u(0, 2), "contrast": torch.exp(u(-0.5, 3.2)), "level": u(-1.5, 1.5),
         "mid": color.mean(dim=-1) ** 0.45,
         "rough": rough, "follow": normal(0.3), "speckle": u(0, 0.25) * (u(0, 1) < 0.5),
-        "rough_gain": u(0.4, 1.0), "rough_shift": u(-0.2, 0.4),
+        "rough_gain": torch.where(as_is, 1.0, u(0.5, 1.0)), "rough_shift": torch.where(as_is, 0.0, u(-0.1, 0.4)),
         "f0": f0, "f0_follow": normal(0.5),
         "rough_step": two * (other - rough), "f0_step": two * normal(0.4), "raised": (u(0, 1) < 0.4).float(),
         "ior": (1.5 + normal(0.06)).clamp(1.35, 1.7), "bump": bump,

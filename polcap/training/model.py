@@ -5,7 +5,7 @@ residual blocks and a convolution of its own on every skip, as the paper. No nor
 absolute level of radiance and DoLP is information. At the bottom every place sees every other (attention
 over the object's cells and their mean). Gloss comes last: it is shown the other branches' normal and
 diffuse color and how much brighter the picture is than they explain, and shares what it finds among all
-places that look alike or are of one color, so that a highlight here tells the roughness there.
+places that look alike, so that a highlight here tells the roughness there.
 
 References
 ----------
@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from polcap.stages.cues import CHANNELS
-from polcap.training.profiles import ColorProfiles, Profiles, by_color, figures_of
+from polcap.training.profiles import Profiles, figures_of
 from polcap.training.variants import VARIANTS
 
 SIZE_MULTIPLE = 32
@@ -72,7 +72,6 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
         self.color = Branch(widths, shape.color, shape.skip_blocks, skips, 3)
         self.profiles = Profiles(widths[1], shape.gloss[1] + _GLOSS)
         self.gloss = Branch(widths, shape.gloss, shape.skip_blocks, skips, _GLOSS, hints=9)
-        self.prints = ColorProfiles(shape.gloss[1] + _GLOSS)
 
     def forward(self, x: Tensor) -> dict[str, Tensor]:
         seen = self.inputs(x)
@@ -89,14 +88,9 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
         hints = torch.cat([normal, diffuse, level - body], dim=1).detach() * inside
         figures = figures_of(level, self.sees_dolp * x[:, _RATIO].float() / 10, normal, diffuse)
         thinned = [part[:, :, ::2, ::2].detach() for part in (figures, normal[:, 2:], _usable(x))]
-        parts = [self.shape.gloss[1], _GLOSS]
-        told, itself = self.profiles(features[1], *thinned).split(parts, dim=1)
-        member = by_color(diffuse, inside)
-        told_color, itself_color = self.prints(member[:, :, ::2, ::2], *thinned).split(parts, dim=1)
-        told = told + _spread(told_color, F.avg_pool2d(member, 4))
+        told, itself = self.profiles(features[1], *thinned).split([self.shape.gloss[1], _GLOSS], dim=1)
         gloss = self.gloss(features, torch.cat([seen, hints.to(seen.dtype)], dim=1), inside, told).float()
         gloss = gloss + F.interpolate(itself, scale_factor=4.0, mode="bilinear", align_corners=False)
-        gloss = gloss + _spread(itself_color, member)
         return {
             "normal": normal,
             "depth": shape[:, 3:4],
@@ -106,12 +100,6 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
             "sigma": 60 * torch.sigmoid(shape[:, 4:5] - 1.5),
             "highlight": torch.sigmoid(gloss[:, 4:5] - 1.0),
         }
-
-
-def _spread(told: Tensor, member: Tensor) -> Tensor:
-    """What each group is told (B, C, groups), at the places of its members (B, groups, H, W)."""
-    batch, _, height, width = member.shape
-    return (told @ member.flatten(2)).reshape(batch, -1, height, width)
 
 
 def _usable(x: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
 """How the light of each material falls with the angle: radiance over zenith, gathered from soft groups of places.
 
-A material's gloss shows wherever it faces the flash, and nowhere else. Places are sorted into groups, by
-learned features and, each picture anew, by diffuse color; each group's light is averaged in bins of the
-estimated zenith, and what that profile says of gloss is told to every place of the group.
+A material's gloss shows wherever it faces the flash, and nowhere else. Places sort themselves into groups
+by learned features; each group's light is averaged in bins of the estimated zenith, and what that profile
+says of gloss is told to every place of the group.
 """
 
 import torch
@@ -16,9 +16,6 @@ _GROUPS = 16
 _EDGES_DEG = (0.0, 4.0, 8.0, 12.0, 17.0, 23.0, 30.0, 40.0, 52.0, 66.0, 90.0)
 _BINS = len(_EDGES_DEG) - 1
 _FIGURES = 6  # per bin
-_COLORS = 8  # groups by color
-_ALIKE = 0.15  # 1σ within a group, ln of albedo
-_ROUNDS = 2  # of k-means
 
 
 class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types here
@@ -36,55 +33,6 @@ class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types he
         weight = F.interpolate(member, scale_factor=2.0, mode="bilinear", align_corners=False) * usable
         told = self.read(_profile(weight.flatten(2), figures.flatten(2), zenith.flatten(2)))  # (B, groups, outputs)
         return (told.transpose(1, 2) @ member.flatten(2)).reshape(batch, -1, height, width)
-
-
-class ColorProfiles(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """What is told to each group of `by_color`; a print's colors lie side by side, too fine for coarse features."""
-
-    def __init__(self, outputs: int) -> None:
-        super().__init__()
-        self.read = nn.Sequential(nn.Linear(_BINS * _FIGURES, 96), nn.ReLU(), nn.Linear(96, outputs))
-        nn.init.zeros_(self.read[2].weight)
-        nn.init.zeros_(self.read[2].bias)
-
-    def forward(self, member: Tensor, figures: Tensor, zenith: Tensor, usable: Tensor) -> Tensor:
-        """member (B, groups, H, W), the others (B, ·, H, W) as for `Profiles` -> (B, outputs, groups)."""
-        profile = _profile((member * usable).flatten(2), figures.flatten(2), zenith.flatten(2))
-        told: Tensor = self.read(profile).transpose(1, 2)
-        return told
-
-
-@torch.no_grad()  # type: ignore[untyped-decorator]
-def by_color(diffuse: Tensor, inside: Tensor) -> Tensor:
-    """Soft groups of like color in each picture, (B, groups, H, W): k-means from colors that lie far apart.
-
-    diffuse (B, 3, H, W) linear; inside (B, 1, H, W) 1 on the object.
-    """
-    color = torch.log(diffuse.float() + 0.02)
-    some, weight = (image[:, :, 1::4, 1::4].flatten(2) for image in (color, inside.float()))
-    mean = (some * weight).sum(dim=2, keepdim=True) / (weight.sum(dim=2, keepdim=True) + 1e-4)
-    centers: list[Tensor] = []
-    distance = _square(some, mean) * weight
-    while len(centers) < _COLORS:
-        farthest = distance.argmax(dim=2, keepdim=True)
-        centers.append(some.gather(2, farthest.expand(-1, 3, -1)))
-        nearer = _square(some, centers[-1]) * weight
-        distance = nearer if len(centers) == 1 else torch.minimum(distance, nearer)
-    center = torch.cat(centers, dim=2)  # (B, 3, groups)
-    for _ in range(_ROUNDS):
-        share = (_nearness(some, center) * weight)[:, None]  # (B, 1, groups, N)
-        center = ((share * some[:, :, None]).sum(dim=3) + 1e-3 * center) / (share.sum(dim=3) + 1e-3)
-    return _nearness(color.flatten(2), center).reshape(len(color), _COLORS, *color.shape[2:])
-
-
-def _nearness(color: Tensor, center: Tensor) -> Tensor:
-    """Share (B, groups, N) that each center (B, 3, groups) has of each color (B, 3, N)."""
-    square = torch.cat([_square(color, one) for one in center.split(1, dim=2)], dim=1)
-    return torch.softmax(-square / (2 * _ALIKE**2), dim=1)
-
-
-def _square(color: Tensor, center: Tensor) -> Tensor:
-    return (color - center).square().mean(dim=1, keepdim=True)
 
 
 def figures_of(level: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) -> Tensor:
