@@ -31,6 +31,7 @@ _POSITIONS = tuple(
 _BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 _REACHED = 0.05  # share of known pixels under a Gaussian from which a mean is taken
 _DARK = 0.02  # radiance below which a ratio means little, as in the channels' logarithm
+_BRIGHTEST = 2.0  # S0, which is 1 where white paper faces the flash beside the chart; what no body reflects
 _MODEL_ERROR_DEG = 4.0  # interreflection, highlights, unknown index: measured on path-traced objects
 
 
@@ -229,7 +230,8 @@ def _learned(cues: Cues, network: Network, settings: Settings) -> SurfaceMaps:
     _check(network)
     size = cues.mask.shape[::-1]
     shrink = max(1.0, max(size) / int(network.metadata["native_size"]))
-    seen = _resized(cues, 1 / shrink)
+    bounded = _bounded(cues)
+    seen = _resized(bounded, 1 / shrink)
     small = _whole(seen, network, settings)
     small["factor"] = _factor(small["diffuse"], seen)
     maps = {name: np.asarray(cv2.resize(image, size)) for name, image in small.items()}
@@ -238,7 +240,7 @@ def _learned(cues: Cues, network: Network, settings: Settings) -> SurfaceMaps:
     by_pixel, doubt, _ = _inverted(cues, settings, guide)
     detailed = _detailed(ahead, by_pixel, cues.mask, shrink)
     normal, stated = _joined((ahead, maps["sigma"]), (detailed, _INVERSION * doubt))
-    diffuse = _filled((np.maximum(cues.radiance, 0) + _DARK) * np.exp(maps["factor"]) - _DARK, cues)
+    diffuse = _filled((np.maximum(cues.radiance, 0) + _DARK) * np.exp(maps["factor"]) - _DARK, bounded)
     scale, power, most = _CALIBRATION
     expected = np.minimum(scale * stated**power, most)
     inside = cues.mask[..., None]
@@ -253,6 +255,13 @@ def _learned(cues: Cues, network: Network, settings: Settings) -> SurfaceMaps:
         view=cues.view,
         estimator=f"network {network.metadata.get('version', network.digest[:8])}",
     )
+
+
+def _bounded(cues: Cues) -> Cues:
+    """What no body reflects counts as saturated, as in the pictures that the network learned from."""
+    beyond = (cues.radiance > _BRIGHTEST).any(axis=-1)
+    quality = np.where(beyond, cues.quality | np.uint8(Quality.CLIPPED), cues.quality)
+    return replace(cues, radiance=np.minimum(cues.radiance, _BRIGHTEST), quality=quality)
 
 
 def _whole(cues: Cues, network: Network, settings: Settings) -> dict[str, Floats]:

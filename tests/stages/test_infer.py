@@ -76,6 +76,22 @@ def test_albedo_goes_on_into_saturated_highlights(known: bool):
             assert np.abs(albedo - whole)[spot].mean() < 0.03, estimator
 
 
+def test_what_is_brighter_than_any_body_is_not_painted_on_it():
+    """A highlight that no exposure lost, and a network that takes all light for the body's."""
+    found = seen(noise=1e-4, textured=False)
+    rows, columns = np.nonzero(found.mask)
+    y, x = round(rows.mean()) + 25, round(columns.mean())
+    spot = np.s_[y - 6 : y + 7, x - 9 : x + 10]
+    radiance = found.radiance.copy()
+    radiance[spot] = 30.0
+    believing = dataclasses.replace(
+        network(), run=lambda picture: network().run(picture) | {"diffuse": np.exp(picture[:, :3]).clip(0, 1)}
+    )
+    shining = dataclasses.replace(found, radiance=radiance)
+    albedo, whole = (infer.estimate(c, believing, infer.Settings()).diffuse for c in (shining, found))
+    assert np.abs(albedo - whole)[spot].mean() < 0.05
+
+
 def network(channels=cues.CHANNELS) -> Network:
     """A network that answers with the zenith channels' own normal: its maps are known in closed form."""
 
