@@ -111,7 +111,9 @@ def dress(library: Library, normal: Tensor, position: Tensor, turn: Tensor, owne
     slope = torch.zeros_like(facing).scatter(1, ((axis + 1) % 3)[:, None], picture[:, 4:5])
     slope = slope.scatter(1, ((axis + 2) % 3)[:, None], picture[:, 5:6])
     slope = torch.where(textured[:, None], _turned(frame.transpose(1, 2), slope, owner), bump)
-    bent = normal + own["bump"][:, None] * _turned(turn, slope, owner)
+    slope = _turned(turn, slope, owner)
+    along = (slope * normal).sum(dim=1, keepdim=True)
+    bent = normal + own["bump"][:, None] * (slope - along * normal)
     return Surface(
         normal=F.normalize(bent, dim=1),
         diffuse=diffuse,

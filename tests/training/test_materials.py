@@ -1,0 +1,36 @@
+"""What random materials are like: within bounds, and with the correlations that real ones have."""
+
+import torch
+
+from polcap.training import materials
+
+OBJECTS, PLACES = 150, 1500
+
+
+def dressed() -> tuple[materials.Surface, torch.Tensor]:
+    """Spheres in random materials of solid noise, and their own normals."""
+    torch.manual_seed(0)
+    normal = torch.nn.functional.normalize(torch.randn(OBJECTS * PLACES, 3), dim=1)
+    owner = torch.arange(OBJECTS).repeat_interleave(PLACES)
+    library = materials.Library(None, torch.device("cpu"))
+    return materials.dress(library, normal, normal / 2, torch.eye(3).expand(OBJECTS, 3, 3), owner, OBJECTS), normal
+
+
+def test_materials_stay_within_their_bounds() -> None:
+    surface, normal = dressed()
+    assert surface.diffuse.min() >= 0.005 and surface.diffuse.max() <= 0.95
+    assert surface.specular.min() >= 0.015 and surface.specular.max() <= 0.4
+    assert surface.roughness.min() >= 0.08 and surface.roughness.max() <= 1
+    assert surface.ior.min() >= 1.35 and surface.ior.max() <= 1.7
+    tilt = torch.rad2deg(torch.acos((surface.normal * normal).sum(dim=1).clamp(-1, 1))).view(OBJECTS, PLACES)
+    assert tilt.mean(dim=1).median() < 5 < tilt.max() < 60
+
+
+def test_levels_spread_between_objects_and_gloss_follows_the_pattern_on_many() -> None:
+    surface, _ = dressed()
+    rough, f0 = surface.roughness.view(OBJECTS, PLACES), surface.specular.mean(dim=1).view(OBJECTS, PLACES)
+    light = surface.diffuse.mean(dim=1).log().view(OBJECTS, PLACES)
+    assert rough.mean(dim=1).std() > 0.12 and f0.mean(dim=1).std() > 0.03
+    together = torch.stack([torch.corrcoef(torch.stack(pair))[0, 1] for pair in zip(rough, light)]).abs()
+    print(f"|correlation of roughness and lightness| by object: median {float(together.median()):.2f}")
+    assert 0.3 < (together > 0.5).float().mean() < 0.9  # many patterns are two surfaces, not all
