@@ -5,6 +5,8 @@ by learned features; each group's light is averaged in bins of the estimated zen
 says of gloss is told to every place of the group.
 """
 
+from math import cos, radians
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -55,7 +57,7 @@ def figures_of(level: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) ->
 def _profile(weight: Tensor, figures: Tensor, cosine: Tensor) -> Tensor:
     """weight (B, groups, N), figures (B, 5, N), cosine (B, 1, N) -> per group and bin: log share of the group,
     then the figures' means, 0 where there is nothing; (B, groups, bins · 6)."""
-    edges = torch.cos(torch.deg2rad(torch.tensor(_EDGES_DEG, device=cosine.device))).view(1, -1, 1)
+    edges = cosine.new_tensor([cos(radians(angle)) for angle in _EDGES_DEG]).view(1, -1, 1)
     at = ((cosine <= edges[:, :-1]) & (cosine > edges[:, 1:])).to(weight.dtype)  # (B, bins, N)
     seen = torch.cat([torch.ones_like(cosine), figures], dim=1)
     sums = weight @ (at[:, :, None] * seen[:, None]).flatten(1, 2).transpose(1, 2)

@@ -12,9 +12,9 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -113,6 +113,7 @@ def main(params: Params) -> Path:
         if run.elapsed - saved > 60:
             saved = run.elapsed
             run.save(params.out / "last.pt")
+    ready.close()
     run.save(params.out / "last.pt")
     return params.out / "last.pt"
 
@@ -139,31 +140,41 @@ def library(params: Params, split: str, device: torch.device) -> materials.Libra
     return materials.Library(folder if folder.exists() else None, device)
 
 
-def _ahead(simulator: Simulator, preset: Preset, seed: int, progress: Callable[[], float]) -> Iterator[Batch]:
+def _ahead(
+    simulator: Simulator, preset: Preset, seed: int, progress: Callable[[], float]
+) -> Generator[Batch, None, None]:
     """Batches without end, made in a thread of their own while the network learns from those before.
 
     That thread alone draws from torch's global random state, so the batches follow from the seed and from when
     the sizes change.
     """
     waiting: queue.Queue[Batch | BaseException] = queue.Queue(maxsize=4)
+    ended = threading.Event()
 
     def make() -> None:
         try:
             torch.set_num_threads(1)
             torch.manual_seed(seed)
             chooser = np.random.default_rng(seed)
-            while True:
+            while not ended.is_set():
                 size = int(chooser.choice(preset.sizes, p=preset.early if progress() < 0.5 else preset.late))
                 waiting.put(simulator.draw(max(preset.pixels // size**2, 1), size))
         except BaseException as error:  # told to the loop, which raises it
             waiting.put(error)
 
-    threading.Thread(target=make, daemon=True).start()
-    while True:
-        batch = waiting.get()
-        if isinstance(batch, BaseException):
-            raise batch
-        yield batch
+    maker = threading.Thread(target=make, daemon=True)
+    maker.start()
+    try:
+        while True:
+            batch = waiting.get()
+            if isinstance(batch, BaseException):
+                raise batch
+            yield batch
+    finally:
+        ended.set()
+        while maker.is_alive():
+            with suppress(queue.Empty):
+                waiting.get(timeout=0.1)
 
 
 class Run:

@@ -1,5 +1,8 @@
 """The model file: what torch computes, onnxruntime computes, at any size; and it says what it is."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +14,7 @@ pytest.importorskip("onnx")
 from polcap.formats import onnx
 from polcap.stages.cues import CHANNELS
 from polcap.training import export, model
+from tests.conftest import ROOT
 from tests.training.test_model import TINY
 
 
@@ -46,3 +50,11 @@ def test_onnxruntime_agrees_with_torch_at_any_size(tmp_path: Path) -> None:
 def test_stored_in_halves_the_small_network_fits_the_limit() -> None:
     weights = sum(p.numel() for p in model.Network().parameters())
     assert 2 * weights < 16e6  # bytes; the limit for a shipped file is 24 MB
+
+
+def test_the_example_trains_a_network_and_uses_it(example: Path, tmp_path: Path) -> None:
+    script = ROOT / "examples" / "own_network.py"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, script, example, tmp_path], env=environment, capture_output=True, text=True)
+    assert done.returncode in (0, 3), done.stderr  # so short a training may fail the gate on expected error
+    assert "network mine" in (tmp_path / "result" / "report.json").read_text()
