@@ -70,14 +70,9 @@ def dress(library: Library, normal: Tensor, position: Tensor, turn: Tensor, owne
     inner = _turned(frame, position, owner)
     facing = _turned(frame @ turn.transpose(1, 2), normal, owner)
 
-    grain = torch.where(_u((count, 1), device) < 0.3, _log_uniform((count, 3), 0.08, 1.0, device), 1.0)
     coarse, fine, printed = (
-        library.sample_noise(inner * (_log_uniform((count, 1), low, high, device) * stretch)[owner] + shift[owner])
-        for low, high, stretch, shift in (
-            (0.5, 2.5, 1.0, _u((count, 3), device)),
-            (2.0, 9.0, grain, _u((count, 3), device)),
-            (4.0, 28.0, grain, _u((count, 3), device)),
-        )
+        library.sample_noise(inner * _log_uniform((count, 1), low, high, device)[owner] + _u((count, 3), device)[owner])
+        for low, high in ((0.5, 2.5), (2.0, 9.0), (4.0, 28.0))
     )
 
     used = 1 + torch.bucketize(_u((count,), device), torch.tensor([0.5, 0.85], device=device))  # most wear one or two
@@ -106,7 +101,7 @@ def dress(library: Library, normal: Tensor, position: Tensor, turn: Tensor, owne
     reflectance = reflectance * torch.exp(own["f0_step"] * pattern)
     specular = (reflectance[:, None] * own["f0_tint"]).clamp(0.015, 0.4)
 
-    relief = fine[:, 4:7] * grain[owner] * torch.where(raised, 4 * pattern * (1 - pattern), 1.0)[:, None]
+    relief = fine[:, 4:7] * torch.where(raised, 4 * pattern * (1 - pattern), 1.0)[:, None]
     bump = _turned(frame.transpose(1, 2), relief, owner)  # gradient in the object's frame
     slope = torch.zeros_like(facing).scatter(1, ((axis + 1) % 3)[:, None], picture[:, 4:5])
     slope = slope.scatter(1, ((axis + 2) % 3)[:, None], picture[:, 5:6])
