@@ -15,6 +15,7 @@ def settled(folder: Path, apart: Path, still_s: float = 2.0) -> Iterator[None]:
 
     `apart` is not looked at (what is made of the folder may lie in it), nor is what begins with a dot.
     """
+    folder, apart = folder.resolve(), apart.resolve()
     done: Seen | None = None
     last, since = _seen(folder, apart), time.monotonic()
     while True:
