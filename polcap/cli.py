@@ -29,7 +29,9 @@ app = typer.Typer(
     rich_markup_mode=None,  # plain help: half the start-up time
     pretty_exceptions_enable=False,
 )
-OUT_OF_MEMORY = ("Insufficient memory", "can't start new thread", "failed to map segment")  # OpenCV, threads, loader
+OUT_OF_MEMORY = (  # as OpenCV, threads, the loader of libraries and the system say it
+    "Insufficient memory", "can't start new thread", "failed to map segment", "Cannot allocate memory",
+)  # fmt: skip
 Device = Literal["cpu", "cuda", "auto"]
 Result = Annotated[Path, typer.Argument(help="Result folder of `polcap process`.")]
 Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
@@ -145,20 +147,24 @@ def process(
     chosen = settings.load(config, assignments or ())
     request = _chart(chart, no_chart)
     target = out or capture / "polcap"
-    given = pipeline.Given(
-        chart=request,
-        mask=None if mask is None else _mask(mask),
-        network=pipeline.load_network(estimator, model, device, threads),
-    )
+
+    @functools.cache
+    def given() -> pipeline.Given:
+        return pipeline.Given(
+            chart=request,
+            mask=None if mask is None else _mask(mask),
+            network=pipeline.load_network(estimator, model, device, threads),
+        )
 
     def once() -> None:
         found = captures.read(capture, _angles(angles))
         if dry_run:
-            _print_plan(found, pipeline.plan(found, given, chosen, target, force), json)
+            _print_plan(found, pipeline.plan(found, given(), chosen, target, force), json)
             return
+        known = given()
         print(captures.table(found), file=sys.stderr)
         with _progress(len(pipeline.STAGES) + 1) as told:
-            about = pipeline.process(found, given, chosen, target, until, force, told)
+            about = pipeline.process(found, known, chosen, target, until, force, told)
         if about is None:
             return
         _print(about if json else str(target / "asset" / f"{found.name}.glb"))
