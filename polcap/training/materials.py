@@ -102,11 +102,10 @@ def dress(library: Library, normal: Tensor, position: Tensor, turn: Tensor, owne
     specular = (reflectance[:, None] * own["f0_tint"]).clamp(0.015, 0.4)
 
     relief = fine[:, 4:7] * torch.where(raised, 4 * pattern * (1 - pattern), 1.0)[:, None]
-    bump = _turned(frame.transpose(1, 2), relief, owner)  # gradient in the object's frame
     slope = torch.zeros_like(facing).scatter(1, ((axis + 1) % 3)[:, None], picture[:, 4:5])
     slope = slope.scatter(1, ((axis + 2) % 3)[:, None], picture[:, 5:6])
-    slope = torch.where(textured[:, None], _turned(frame.transpose(1, 2), slope, owner), bump)
-    slope = _turned(turn, slope, owner)
+    slope = torch.where(textured[:, None], slope, relief)  # in the pattern's frame
+    slope = _turned(turn, _turned(frame.transpose(1, 2), slope, owner), owner)
     along = (slope * normal).sum(dim=1, keepdim=True)
     bent = normal + own["bump"][:, None] * (slope - along * normal)
     return Surface(
@@ -140,7 +139,7 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
     from_texture = (u(0, 1) < 0.5) if library.has_textures else torch.zeros(shape, device=device)
     coloured = (f0 > 0.08) & (u(0, 1) < 0.3)
     f0_tint = torch.where(coloured[..., None], 1 + 0.4 * (_u((*shape, 3), device) - 0.5), torch.ones(1, device=device))
-    # solid noise has a slope of unit deviation: 11° at most; textures slope less, so theirs are raised
+    # solid noise has a slope of unit deviation: 14° at most; textures slope less, so theirs are raised
     bump = 0.25 * torch.exp(u(-3, 0)) * torch.sign(u(-1, 1)) * (u(0, 1) < 0.7)
     bump = bump * torch.where(from_texture > 0.5, 2.5, 1.0)
     return {

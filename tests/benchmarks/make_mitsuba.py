@@ -171,14 +171,13 @@ def scene(
     mi: Any, parts: list[Any], channel: str, light: list[float], power: float, view: View, size: int, depth: int
 ) -> Any:
     """What Mitsuba renders of one colour channel."""
+    sensor = plastic.camera(mi, view, size, "independent", PASS)
+    sensor["film"]["pixel_format"] = "luminance"
     return mi.load_dict(
         {
             "type": "scene",
             "integrator": {"type": "stokes", "nested": {"type": "path", "max_depth": depth}},
-            "sensor": {
-                **(sensor := plastic.camera(mi, view, size, "independent", PASS)),
-                "film": {**sensor["film"], "pixel_format": "luminance"},
-            },
+            "sensor": sensor,
             "light": {"type": "point", "position": light, "intensity": power},
             **{f"part{k}": body(mi, part, channel) for k, part in enumerate(parts)},
         }
