@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from polcap.training import export, model, shapes, train
+from polcap.training import model, shapes, train
 
 source, out = map(Path, sys.argv[1:3])
 for seed, split in enumerate(("train", "test")):  # training looks at pictures of the latter as it goes
@@ -23,8 +23,7 @@ for seed, split in enumerate(("train", "test")):  # training looks at pictures o
 
 tiny = model.Shape((8, 16, 16, 16, 16), (8, 8, 16, 16), (8, 8, 8, 8), (8, 8, 8, 8), (1, 1, 1, 1, 1))
 train.PRESETS["cpu"] = train.Preset(tiny, 4, 1, 64, (32, 64), (0.5, 0.5), (0.2, 0.8), 4 * 64**2)
-last = train.main(train.Params(data=out / "data", out=out / "runs", minutes=10 / 60, threads=1))
-export.ship(last, out / "own.onnx", version="mine")
+own = train.main(train.Params(data=out / "data", out=out / "mine", minutes=10 / 60, threads=1))
 
-polcap = [sys.executable, "-m", "polcap", "process", source, "--model", out / "own.onnx", "--out", out / "result"]
+polcap = [sys.executable, "-m", "polcap", "process", source, "--model", own, "--out", out / "result"]
 sys.exit(subprocess.run(polcap).returncode)

@@ -441,6 +441,7 @@ def train(
     samples: Annotated[int | None, typer.Option(min=1, help="Pictures to learn from, instead of minutes.")] = None,
     variant: Annotated[str, typer.Option(help="The network with one thing taken away, as the ablations.")] = "ours",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint.")] = False,
+    start: Annotated[Path | None, typer.Option(metavar="ONNX", help="Begin with this model's weights.")] = None,
     threads: Annotated[int, typer.Option(min=1)] = 2,
     seed: Annotated[int, typer.Option(min=0)] = 1,
 ) -> None:
@@ -448,7 +449,7 @@ def train(
     trainer = _extra("train")
     told = trainer.Params(
         preset=preset, data=data, out=out, minutes=minutes, samples=samples, variant=variant, resume=resume,
-        threads=threads, seed=seed,
+        start=start, threads=threads, seed=seed,
     )  # fmt: skip
     _print(str(trainer.main(told)))
 

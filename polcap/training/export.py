@@ -1,4 +1,4 @@
-"""Write EMA weights as the ONNX file that `formats/onnx.py` loads: any size, weights stored in fp16.
+"""Write a network as the ONNX file that `formats/onnx.py` loads, any size, weights in fp16; read its weights back.
 
 The stored halves are widened when the model is opened, so arithmetic stays fp32.
 """
@@ -11,15 +11,18 @@ from typing import Any
 import numpy as np
 import onnx
 import torch
+from google.protobuf.message import DecodeError
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
+from polcap.errors import InputError
 from polcap.stages.cues import CHANNELS
-from polcap.training import model, train
+from polcap.training import model
 
 OPSET = 17
 ENCODING = "1"  # of the input channels; formats/onnx.py checks it
 NATIVE_SIZE = 256  # px of the longer side that inference shows it: more than it was trained on; measured best
+_OWNER, _HALF = "network.", ".half"  # around the names of stored weights
 _GREATEST_IR = 10  # what onnxruntime 1.20 and later read
 
 
@@ -31,7 +34,7 @@ def write(network: model.Network, path: Path, facts: Mapping[str, str]) -> int:
     torch.onnx.export(
         _Ordered(network.eval().float()), (torch.zeros(1, len(CHANNELS), side, side),), str(beside),
         input_names=["channels"], output_names=list(model.OUTPUTS), dynamic_axes=dynamic,
-        opset_version=OPSET, dynamo=False,
+        opset_version=OPSET, dynamo=False, do_constant_folding=False,  # that would take weights' names
     )  # fmt: skip
     graph = onnx.load(str(beside))
     _halve(graph)
@@ -50,11 +53,26 @@ def write(network: model.Network, path: Path, facts: Mapping[str, str]) -> int:
     return path.stat().st_size
 
 
-def ship(checkpoint: Path, path: Path, version: str, licence: str = "Apache-2.0") -> int:
-    """Export a checkpoint's EMA weights with what is known of their training. Returns the file's bytes."""
-    network, facts = train.load_average(checkpoint)
-    training = f"{facts['samples']} samples in {facts['step']} steps, {facts['elapsed'] / 60:.0f} minutes"
-    return write(network, path, {"version": version, "licence": licence, "training": training})
+def read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Weights of a model that `write` wrote, as the network's state, and its metadata.
+
+    The file holds equal tensors once, so what has not learned yet may be missing.
+
+    Raises
+    ------
+    InputError
+        Not there, or not such a model.
+    """
+    try:
+        graph = onnx.load(str(path))
+    except (OSError, DecodeError) as error:
+        raise InputError(f"{path}: cannot be read as an ONNX model ({error}); name one that polcap wrote") from error
+    state = {
+        tensor.name.removeprefix(_OWNER).removesuffix(_HALF): torch.tensor(numpy_helper.to_array(tensor)).float()
+        for tensor in graph.graph.initializer
+        if tensor.name.startswith(_OWNER)
+    }
+    return state, {entry.key: entry.value for entry in graph.metadata_props}
 
 
 class _Ordered(nn.Module):  # type: ignore[misc]  # torch comes without types here
@@ -76,8 +94,8 @@ def _halve(graph: Any) -> None:
         if tensor.data_type != TensorProto.FLOAT or np.prod(tensor.dims) < 256:
             continue
         name, half = tensor.name, numpy_helper.to_array(tensor).astype(np.float16)
-        tensor.CopyFrom(numpy_helper.from_array(half, f"{name}.half"))
-        casts.append(helper.make_node("Cast", [f"{name}.half"], [name], to=TensorProto.FLOAT))
+        tensor.CopyFrom(numpy_helper.from_array(half, name + _HALF))
+        casts.append(helper.make_node("Cast", [name + _HALF], [name], to=TensorProto.FLOAT))
     nodes = [*casts, *graph.graph.node]
     del graph.graph.node[:]
     graph.graph.node.extend(nodes)

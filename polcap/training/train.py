@@ -25,7 +25,7 @@ from torch import Tensor
 
 from polcap.errors import InputError
 from polcap.formats import png
-from polcap.training import gbuffers, loss, materials, model
+from polcap.training import export, gbuffers, loss, materials, model
 from polcap.training.dataset import Batch, Simulator
 from polcap.training.variants import VARIANTS
 from polcap.training.watch import Watch
@@ -46,6 +46,7 @@ class Params:
     minutes: float = 90.0  # training time, all resumed parts together; building the cache is extra
     samples: int | None = None  # the budget in pictures instead, where runs are to be compared
     resume: bool = False  # go on from out/last.pt
+    start: Path | None = None  # ONNX model whose weights are the first; else random ones
     threads: int = 2  # learners on a CPU, each with a batch of its own; one more thread makes the batches
     seed: int = 1
     rate: float = 1e-3  # of Muon; at twice that, weights without norms grew until training burst
@@ -73,7 +74,7 @@ PRESETS = {
 
 
 def main(params: Params) -> Path:
-    """Train; leaves out/last.pt (all that resuming needs, EMA weights included), metrics.csv, watch.csv, watch.png."""
+    """Train; leaves out/model.onnx and last.pt (all that resuming needs), metrics.csv, watch.csv, watch.png."""
     for name, value, known in (("preset", params.preset, PRESETS), ("variant", params.variant, VARIANTS)):
         if value not in known:
             raise InputError(f"{name} {value!r} is not one of {', '.join(known)}")
@@ -86,6 +87,8 @@ def main(params: Params) -> Path:
     run = Run(preset.shape, device, params.rate, learners, params.variant)
     if params.resume:
         run.load(params.out / "last.pt")
+    elif params.start:
+        run.begin(params.start)
     _keep_memory()
     torch.set_num_threads(1)
 
@@ -115,7 +118,8 @@ def main(params: Params) -> Path:
             run.save(params.out / "last.pt")
     ready.close()
     run.save(params.out / "last.pt")
-    return params.out / "last.pt"
+    ship(params.out / "last.pt", params.out / "model.onnx", version=params.out.resolve().name)
+    return params.out / "model.onnx"
 
 
 def _keep_memory() -> None:
@@ -195,6 +199,7 @@ class Run:
         self.lights = [torch.Generator(device).manual_seed(k) for k in range(learners)]  # of the rendering loss
         self.pool = ThreadPoolExecutor(learners, initializer=torch.set_num_threads, initargs=(1,))
         self.step, self.samples, self.elapsed, self.skipped = 0, 0, 0.0, 0
+        self.begun = ""  # what the first weights had learned from
 
     def advance(self, batches: list[Batch], progress: float) -> dict[str, float]:
         """One step on a batch per learner; progress 0…1 of the budget sets the rate."""
@@ -246,10 +251,21 @@ class Run:
             "optimizers": [o.state_dict() for o in self.optimizers], "shape": asdict(self.network.shape),
             "variant": self.network.variant,
             "step": self.step, "samples": self.samples, "elapsed": self.elapsed, "skipped": self.skipped,
+            "begun": self.begun,
         }  # fmt: skip
         beside = path.with_suffix(".part")
         torch.save(state, beside)
         os.replace(beside, path)
+
+    def begin(self, path: Path) -> None:
+        """Take a model's weights as the first, from `export.write`; InputError where they are another network's."""
+        weights, metadata = export.read(path)
+        try:
+            self.network.load_state_dict(weights)
+        except RuntimeError as error:
+            raise InputError(f"{path} is not a network of this preset; start from one that is, or without") from error
+        self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
+        self.begun = metadata.get("training", "unknown")
 
     def load(self, path: Path) -> None:
         if not path.exists():
@@ -260,7 +276,7 @@ class Run:
         for optimizer, held in zip(self.optimizers, state["optimizers"]):
             optimizer.load_state_dict(held)
         self.step, self.samples, self.elapsed = state["step"], state["samples"], state["elapsed"]
-        self.skipped = state["skipped"]
+        self.skipped, self.begun = state["skipped"], state["begun"]
         for k, generator in enumerate(self.lights):  # other lights than before
             generator.manual_seed(1000 * self.step + k)
 
@@ -344,7 +360,16 @@ def load_average(path: Path) -> tuple[model.Network, dict[str, Any]]:
     network = model.Network(model.Shape(**state["shape"]), state["variant"])
     average: dict[str, Tensor] = state["average"]
     network.load_state_dict(average)
-    return network.eval(), {k: state[k] for k in ("step", "samples", "elapsed")}
+    return network.eval(), {k: state[k] for k in ("step", "samples", "elapsed", "begun")}
+
+
+def ship(checkpoint: Path, path: Path, version: str, licence: str = "Apache-2.0") -> int:
+    """Export a checkpoint's EMA weights with what is known of their training. Returns the file's bytes."""
+    network, facts = load_average(checkpoint)
+    training = f"{facts['samples']} samples in {facts['step']} steps, {facts['elapsed'] / 60:.0f} minutes"
+    if facts["begun"]:
+        training += f", after {facts['begun']}"
+    return export.write(network, path, {"version": version, "licence": licence, "training": training})
 
 
 def _record(path: Path, run: Run, figures: dict[str, float]) -> None:

@@ -11,11 +11,16 @@ import torch
 
 pytest.importorskip("onnx")
 
+from polcap.errors import InputError
 from polcap.formats import onnx
 from polcap.stages.cues import CHANNELS
 from polcap.training import export, model
 from tests.conftest import ROOT
 from tests.training.test_model import TINY
+
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning", "ignore::UserWarning"
+)
 
 
 def settled(shape: model.Shape) -> model.Network:
@@ -29,7 +34,6 @@ def settled(shape: model.Shape) -> model.Network:
     return network
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning", "ignore::UserWarning")
 def test_onnxruntime_agrees_with_torch_at_any_size(tmp_path: Path) -> None:
     network = settled(TINY)
     path = tmp_path / "m.onnx"
@@ -45,6 +49,25 @@ def test_onnxruntime_agrees_with_torch_at_any_size(tmp_path: Path) -> None:
         assert tuple(got) == model.OUTPUTS
         for name, value in ((name, expected[name]) for name in model.OUTPUTS):
             np.testing.assert_allclose(got[name], value.numpy(), atol=1e-3)
+
+
+def test_weights_and_facts_are_read_back(tmp_path: Path) -> None:
+    network = settled(TINY)
+    export.write(network, tmp_path / "m.onnx", {"licence": "Apache-2.0", "training": "3 samples"})
+    weights, facts = export.read(tmp_path / "m.onnx")
+    assert facts["training"] == "3 samples"
+    state = network.state_dict()
+    assert weights.keys() == state.keys()
+    assert all(torch.equal(value, state[name]) for name, value in weights.items())
+
+
+@pytest.mark.parametrize("content", [None, b"not a model"])
+def test_what_is_no_model_is_named(content: bytes | None, tmp_path: Path) -> None:
+    path = tmp_path / "m.onnx"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match="cannot be read as an ONNX model"):
+        export.read(path)
 
 
 def test_stored_in_halves_the_small_network_fits_the_limit() -> None:

@@ -8,10 +8,14 @@ import pytest
 import torch
 
 from polcap.errors import InputError
-from polcap.training import train
+from polcap.training import export, model, train
 from polcap.training.dataset import Simulator
+from tests.training.test_export import settled
 from tests.training.test_model import TINY
 
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning", "ignore::UserWarning"
+)
 PRESET = train.Preset(TINY, 4, 1, 64, (32, 64), (0.5, 0.5), (0.2, 0.8), 4 * 64**2)
 
 
@@ -23,8 +27,11 @@ def rows(path: Path) -> list[dict[str, str]]:
 def test_run_stops_in_time_and_resumes(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(train.PRESETS, "cpu", PRESET)
     params = train.Params(data=data, out=tmp_path, minutes=0.07, threads=1)
-    last = train.main(params)
+    made, last = train.main(params), tmp_path / "last.pt"
     first, facts = train.load_average(last)
+    weights, told = export.read(made)
+    assert told["training"].startswith(f"{facts['samples']} samples") and told["version"] == tmp_path.name
+    assert all(torch.allclose(w, weights[k], rtol=1e-3, atol=1e-4) for k, w in first.state_dict().items())  # halves
     assert 4.0 < facts["elapsed"] < 20 and facts["samples"] > facts["step"] > 0
     assert {"step", "loss", "normal", "render"} <= set(rows(tmp_path / "metrics.csv")[0])
     assert float(rows(tmp_path / "watch.csv")[-1]["normal_mean"]) < 90
@@ -36,6 +43,25 @@ def test_run_stops_in_time_and_resumes(data: Path, tmp_path: Path, monkeypatch: 
     assert later["step"] > facts["step"] and later["elapsed"] > facts["elapsed"]
     moved = [not torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters())]
     assert any(moved)
+
+
+def test_training_starts_from_a_shipped_model(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(train.PRESETS, "cpu", PRESET)
+    export.write(settled(TINY), tmp_path / "first.onnx", {"training": "10 samples", "licence": "x"})
+    weights, _ = export.read(tmp_path / "first.onnx")
+    run = train.Run(TINY, torch.device("cpu"), 1e-3)
+    run.begin(tmp_path / "first.onnx")
+    for state in (run.network.state_dict(), run.average):
+        assert all(torch.equal(value, weights[name]) for name, value in state.items())
+    params = train.Params(data=data, out=tmp_path / "out", samples=8, threads=1, start=tmp_path / "first.onnx")
+    _, facts = export.read(train.main(params))
+    assert facts["training"].endswith("minutes, after 10 samples")
+
+
+def test_a_model_of_another_size_cannot_start_it(tmp_path: Path) -> None:
+    export.write(model.Network(TINY), tmp_path / "tiny.onnx", {"licence": "x"})
+    with pytest.raises(InputError, match="not a network of this preset"):
+        train.Run(model.SMALL, torch.device("cpu"), 1e-3).begin(tmp_path / "tiny.onnx")
 
 
 def test_steps_on_one_batch_lower_its_loss(simulator: Simulator) -> None:
