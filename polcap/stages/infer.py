@@ -28,6 +28,7 @@ _CALIBRATION = (0.718, 1.16, 50.0)  # error = min(a·expectedᵇ, c), degrees: t
 _POSITIONS = tuple(
     (quarters, mirror) for first in (0, 1) for mirror in (False, True) for quarters in (first, first + 2)
 )
+_CELLS = 2.0  # cells of the network's grid, 1σ, over which its pattern is taken as the same
 _BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 _REACHED = 0.05  # share of known pixels under a Gaussian from which a mean is taken
 _DARK = 0.02  # radiance below which a ratio means little, as in the channels' logarithm
@@ -43,7 +44,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 2
 
 
-@stage(version=5)
+@stage(version=6)
 def estimate(cues: Cues, network: Network | None, settings: Settings) -> SurfaceMaps:
     """Normal, diffuse, specular, roughness and expected error; network None means analytic."""
     return _analytic(cues, settings) if network is None else _learned(cues, network, settings)
@@ -233,6 +234,7 @@ def _learned(cues: Cues, network: Network, settings: Settings) -> SurfaceMaps:
     bounded = _bounded(cues)
     seen = _resized(bounded, 1 / shrink)
     small = _whole(seen, network, settings)
+    small["normal"] = _evened(small["normal"], seen.mask)
     small["factor"] = _factor(small["diffuse"], seen)
     maps = {name: np.asarray(cv2.resize(image, size)) for name, image in small.items()}
     ahead = maps["normal"] / np.maximum(_length(maps["normal"]), 1e-6)
@@ -310,6 +312,22 @@ def _with_axes_turned(picture: Floats, quarters: int, mirror: bool) -> Floats:
     at = CHANNELS.index("ray_x")
     out[..., at : at + 2] = _vector_turned(picture[..., at : at + 2], quarters, mirror)
     return out
+
+
+def _evened(normal: Floats, mask: NDArray[np.bool_]) -> Floats:
+    """Normals (H, W, 3) without the network's 2 px grid: what pixels in the same place of its cells have in common.
+
+    Relief does not keep step with the cells, so it stays.
+    """
+    whole = (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0).astype(np.float32)
+    out = normal.astype(np.float32)
+    uneven = (out - cv2.sepFilter2D(out, -1, _BINOMIAL, _BINOMIAL)) * whole[..., None]
+    for place in (np.s_[y::2, x::2] for y in (0, 1) for x in (0, 1)):
+        common, share = (
+            cv2.GaussianBlur(np.ascontiguousarray(part[place]), (0, 0), _CELLS) for part in (uneven, whole)
+        )
+        out[place] -= common / np.maximum(share, _REACHED)[..., None]
+    return out * mask[..., None]
 
 
 def _detailed(coarse: Floats, fine: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:

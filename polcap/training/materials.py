@@ -157,11 +157,16 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
 
 
 def _colors(shape: tuple[int, int], device: torch.device) -> Tensor:
-    """Reflectances (B, 3, 3): grey to saturated, dark to light."""
+    """Reflectances (B, 3, 3): grey to saturated, dark to light; every second one a pure hue mixed as on a display,
+    which leaves vivid colors a channel with hardly any light, as paints and plastics have.
+    """
     value = 0.02 + 0.88 * _u((*shape, 1), device) ** 1.3
     hue = _u((*shape, 3), device)
     saturation = _u((*shape, 1), device) ** 1.5
-    return (value * (1 - saturation * hue)).clamp(0.01, 0.95)
+    low, high = hue.amin(dim=-1, keepdim=True), hue.amax(dim=-1, keepdim=True)
+    pure = value * (1 - saturation * (hue - low) / (high - low)) ** 2.2
+    mixed = value * (1 - saturation * hue)
+    return torch.where(_u((*shape, 1), device) < 0.5, pure, mixed).clamp(0.01, 0.95)
 
 
 def _noise_volume(seed: int) -> Tensor:

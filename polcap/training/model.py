@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from polcap.stages.cues import CHANNELS
-from polcap.training.profiles import Profiles, figures_of
+from polcap.training.profiles import Profiles, Seen, figures_of
 from polcap.training.variants import VARIANTS
 
 SIZE_MULTIPLE = 32
@@ -70,7 +70,7 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
         self.context = Context(widths[-1])
         self.geometry = Branch(widths, shape.geometry, shape.skip_blocks, skips, 5)
         self.color = Branch(widths, shape.color, shape.skip_blocks, skips, 3)
-        self.profiles = Profiles(widths[1], shape.gloss[1] + _GLOSS)
+        self.profiles = Profiles(widths[1], widths[0], shape.gloss[1] + _GLOSS)
         self.gloss = Branch(widths, shape.gloss, shape.skip_blocks, skips, _GLOSS, hints=9)
 
     def forward(self, x: Tensor) -> dict[str, Tensor]:
@@ -87,10 +87,11 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
         body = torch.log(0.9 * diffuse * normal[:, 2:].clamp(min=0) + 0.02)  # what the diffuse light would be
         hints = torch.cat([normal, diffuse, level - body], dim=1).detach() * inside
         figures = figures_of(level, self.sees_dolp * x[:, _RATIO].float() / 10, normal, diffuse)
-        thinned = [part[:, :, ::2, ::2].detach() for part in (figures, normal[:, 2:], _usable(x))]
-        told, itself = self.profiles(features[1], *thinned).split([self.shape.gloss[1], _GLOSS], dim=1)
-        gloss = self.gloss(features, torch.cat([seen, hints.to(seen.dtype)], dim=1), inside, told).float()
-        gloss = gloss + F.interpolate(itself, scale_factor=4.0, mode="bilinear", align_corners=False)
+        thinned = Seen(*(part[:, :, ::2, ::2].detach() for part in (figures, normal[:, 2:], diffuse, _usable(x))))
+        told, itself = self.profiles(features[1], features[0], thinned).split([self.shape.gloss[1], _GLOSS], dim=1)
+        shown = torch.cat([seen, hints.to(seen.dtype)], dim=1)
+        gloss = self.gloss(features, shown, inside, F.avg_pool2d(told, 2)).float()
+        gloss = gloss + F.interpolate(itself, scale_factor=2.0, mode="bilinear", align_corners=False)
         return {
             "normal": normal,
             "depth": shape[:, 3:4],

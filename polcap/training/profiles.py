@@ -5,6 +5,7 @@ by learned features; each group's light is averaged in bins of the estimated zen
 says of gloss is told to every place of the group.
 """
 
+from dataclasses import dataclass
 from math import cos, radians
 
 import torch
@@ -20,21 +21,37 @@ _BINS = len(_EDGES_DEG) - 1
 _FIGURES = 6  # per bin
 
 
+@dataclass(frozen=True)
+class Seen:
+    """What is known of each place when gloss is asked for, (B, ·, H, W)."""
+
+    figures: Tensor  # 5 channels of `figures_of`
+    zenith: Tensor  # cosine
+    diffuse: Tensor  # 3 channels
+    usable: Tensor  # 1 on the object where it is not clipped
+
+
 class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """Features of each place (B, C, H, W) and what the picture shows -> messages (B, outputs, H, W)."""
+    """Features of each place and what the picture shows there -> messages (B, outputs, H, W)."""
 
-    def __init__(self, features: int, outputs: int) -> None:
+    def __init__(self, coarse: int, fine: int, outputs: int) -> None:
         super().__init__()
-        self.sort = nn.Conv2d(features, _GROUPS, 1)
+        self.sort = nn.Conv2d(coarse, _GROUPS, 1)
+        self.part = nn.Sequential(nn.Conv2d(fine + 6, 32, 1), nn.ReLU(), nn.Conv2d(32, _GROUPS, 1))
         self.read = nn.Sequential(nn.Linear(_BINS * _FIGURES, 96), nn.ReLU(), nn.Linear(96, outputs))
+        nn.init.zeros_(self.part[-1].weight)
+        nn.init.zeros_(self.part[-1].bias)
 
-    def forward(self, features: Tensor, figures: Tensor, zenith: Tensor, usable: Tensor) -> Tensor:
-        """figures (B, ·, ·, ·) of `figures_of`, cosine of the zenith and usable (B, 1, ·, ·), twice as fine."""
-        batch, _, height, width = features.shape
-        member = torch.softmax(self.sort(features).float(), dim=1)
-        weight = F.interpolate(member, scale_factor=2.0, mode="bilinear", align_corners=False) * usable
-        told = self.read(_profile(weight.flatten(2), figures.flatten(2), zenith.flatten(2)))  # (B, groups, outputs)
-        return (told.transpose(1, 2) @ member.flatten(2)).reshape(batch, -1, height, width)
+    def forward(self, coarse: Tensor, fine: Tensor, seen: Seen) -> Tensor:
+        """coarse (B, ·, H/2, W/2) and fine features (B, ·, H, W) sort the places: a region, and what in it is alike."""
+        color = torch.log(seen.diffuse + 0.02)
+        weight = seen.usable + 1e-4
+        apart = color - (color * weight).sum(dim=(2, 3), keepdim=True) / weight.sum(dim=(2, 3), keepdim=True)
+        region = F.interpolate(self.sort(coarse).float(), scale_factor=2.0, mode="bilinear", align_corners=False)
+        kind = self.part(torch.cat([fine, color.to(fine.dtype), apart.to(fine.dtype)], dim=1)).float()
+        member = torch.softmax(region + kind, dim=1)
+        told = self.read(_profile((member * seen.usable).flatten(2), seen.figures.flatten(2), seen.zenith.flatten(2)))
+        return (told.transpose(1, 2) @ member.flatten(2)).unflatten(2, member.shape[2:])  # told (B, groups, outputs)
 
 
 def figures_of(level: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) -> Tensor:

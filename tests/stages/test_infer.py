@@ -145,6 +145,23 @@ def test_a_grid_of_the_network_does_not_reach_the_albedo():
     assert abs(part[(x + y) % 2 == 0].mean() / part[(x + y) % 2 == 1].mean() - 1) < 2e-3
 
 
+def test_a_grid_of_the_network_does_not_reach_the_normals_and_relief_does():
+    """A 2 px pattern of ±3° that fades across the object goes; relief of 7 and of 3 px a wave stays."""
+    y, x = np.mgrid[:160, :160]
+    mask = np.hypot(x - 80, y - 80) < 70
+    relief = 0.15 * np.sin(2 * np.pi * x / 7) + 0.05 * np.sin(2 * np.pi * y / 3)
+    grid = 0.05 * np.where((x % 2 == 0) & (y % 2 == 1), 1.0, -0.3) * (x / 160)
+    clean, seen_ = (np.stack([relief + part, 0 * x, 1 + 0 * x], axis=-1) * mask[..., None] for part in (0 * x, grid))
+    found = infer._evened(seen_, mask)
+    core = cv2.erode(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    before, after = (np.sqrt(np.mean((n - clean)[core] ** 2)) for n in (seen_, found))
+    pattern = (np.bincount(((x % 2) + 2 * (y % 2))[core], (n - clean)[..., 0][core]) for n in (seen_, found))
+    uneven, even = (np.ptp(sums) for sums in pattern)
+    assert even < 0.1 * uneven and after < before
+    bare = infer._evened(clean, mask)
+    assert np.sqrt(np.mean((bare - clean)[core] ** 2)) < 0.02 * np.std(relief)
+
+
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_guide_settles_the_half_turn(side: float):
     """Guided by the truth or by its opposite, the inversion returns that side of every clear axis."""

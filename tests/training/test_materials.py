@@ -34,3 +34,11 @@ def test_levels_spread_between_objects_and_gloss_follows_the_pattern_on_many() -
     together = torch.stack([torch.corrcoef(torch.stack(pair))[0, 1] for pair in zip(rough, light)]).abs()
     print(f"|correlation of roughness and lightness| by object: median {float(together.median()):.2f}")
     assert 0.3 < (together > 0.5).float().mean() < 0.9  # many patterns are two surfaces, not all
+
+
+def test_some_colors_leave_a_channel_dark_and_most_do_not() -> None:
+    torch.manual_seed(0)
+    colors = materials._colors((2000, 3), torch.device("cpu")).reshape(-1, 3)
+    purity = colors.amin(dim=1) / colors.amax(dim=1)
+    assert 0.02 < (purity < 0.05).float().mean() < 0.15 and (purity > 0.5).float().mean() > 0.4
+    assert colors.min() >= 0.01 and colors.max() <= 0.95
