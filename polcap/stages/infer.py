@@ -360,7 +360,7 @@ def _joined(*estimates: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
 
 
 def _length(vectors: Floats) -> Floats:
-    return np.asarray(np.linalg.norm(vectors, axis=-1, keepdims=True))
+    return np.asarray(frames.dot(vectors, vectors)[..., None] ** 0.5)
 
 
 def _check(network: Network) -> None:
