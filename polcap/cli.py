@@ -8,19 +8,17 @@ to go on), 1 a bug. Heavy imports happen inside the commands, so that `--help` a
 import functools
 import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from polcap import __version__
-from polcap.errors import GateError, InputError, PolcapError, SettingError
+from polcap import __version__, terminal
+from polcap.errors import GateError, InputError, SettingError
 
 if TYPE_CHECKING:
     from polcap.images import Capture, ChartRequest
-    from polcap.store import Progress
 
 app = typer.Typer(
     help="Photographs through a turned polarizer, under a flash: in. A relightable 3-D asset: out.",
@@ -29,9 +27,6 @@ app = typer.Typer(
     rich_markup_mode=None,  # plain help: half the start-up time
     pretty_exceptions_enable=False,
 )
-OUT_OF_MEMORY = (  # as OpenCV, threads, the loader of libraries and the system say it
-    "Insufficient memory", "can't start new thread", "failed to map segment", "Cannot allocate memory",
-)  # fmt: skip
 Device = Literal["cpu", "cuda", "auto"]
 Result = Annotated[Path, typer.Argument(help="Result folder of `polcap process`.")]
 Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
@@ -57,49 +52,8 @@ def front(
         raise typer.Exit
 
 
-def _reported(command: Callable[..., None]) -> Callable[..., None]:
-    """Turn what a command raises into one line on stderr and an exit code."""
-
-    @functools.wraps(command)
-    def run(context: typer.Context, *args: Any, **kwargs: Any) -> None:
-        try:
-            command(context, *args, **kwargs)
-        except BrokenPipeError:  # whoever read stdout has seen enough
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            code = 0
-        except KeyboardInterrupt:
-            print("polcap: interrupted; run the same command again to go on", file=sys.stderr)
-            code = 130
-        except PolcapError as error:
-            if context.obj:
-                raise
-            print(f"polcap: error: {_line(error)}", file=sys.stderr)
-            code = error.exit_code
-        except (typer.Exit, typer.Abort):
-            raise
-        except Exception as error:
-            if context.obj:
-                raise
-            if isinstance(error, MemoryError) or any(word in str(error) for word in OUT_OF_MEMORY):
-                print("polcap: error: out of memory; raise --memory or take a larger machine", file=sys.stderr)
-                code = SettingError.exit_code
-            else:
-                kind = type(error).__name__
-                print(f"polcap: bug: {kind}: {_line(error)}; run with --debug and report it", file=sys.stderr)
-                code = 1
-        else:
-            return
-        raise typer.Exit(code)
-
-    return run
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split())
-
-
 @app.command()
-@_reported
+@terminal.reported
 def process(
     context: typer.Context,
     capture: Annotated[Path, typer.Argument(help="Folder with the photographs.")],
@@ -163,12 +117,12 @@ def process(
             return
         known = given()
         print(captures.table(found), file=sys.stderr)
-        with _progress(len(pipeline.STAGES) + 1) as told:
+        with terminal.progress(len(pipeline.STAGES) + 1) as told:
             about = pipeline.process(found, known, chosen, target, until, force, told)
         if about is None:
             return
-        _print(about if json else str(target / "asset" / f"{found.name}.glb"))
-        _judge(about)
+        terminal.say(about if json else str(target / "asset" / f"{found.name}.glb"))
+        terminal.tell_gates(about)
 
     if watch:
         _whenever_settled(capture, target, once)
@@ -186,12 +140,12 @@ def _whenever_settled(capture: Path, target: Path, once: Callable[[], None]) -> 
         try:
             once()
         except (InputError, GateError) as error:
-            print(f"polcap: {_line(error)}", file=sys.stderr)
+            print(f"polcap: {terminal.line(error)}", file=sys.stderr)
         print(f"watching {capture}; Ctrl-C ends", file=sys.stderr, flush=True)
 
 
 @app.command()
-@_reported
+@terminal.reported
 def export(
     context: typer.Context,
     result: Result,
@@ -204,11 +158,11 @@ def export(
 
     formats = tuple(name for name, wanted in (("gltf", gltf), ("obj", obj)) if wanted) or ("gltf", "obj")
     written = [str(file) for file in pipeline.export(result, formats)]
-    _print({"written": written} if json else "\n".join(written))
+    terminal.say({"written": written} if json else "\n".join(written))
 
 
 @app.command()
-@_reported
+@terminal.reported
 def show(
     context: typer.Context,
     result: Result,
@@ -217,11 +171,11 @@ def show(
     """Draw what a stage made; prints the picture's path."""
     from polcap import pipeline
 
-    _print(str(pipeline.show(result, stage)))
+    terminal.say(str(pipeline.show(result, stage)))
 
 
 @app.command()
-@_reported
+@terminal.reported
 def status(context: typer.Context, result: Result, json: Json = False) -> None:
     """What a result folder holds, stage by stage."""
     from polcap import store
@@ -232,14 +186,14 @@ def status(context: typer.Context, result: Result, json: Json = False) -> None:
     rows = [{name: about[name] for name in ("stage", "version", "key", "seconds", "bytes")} for about in found]
     complete = (result / "report.json").exists()
     if json:
-        _print({"stages": rows, "complete": complete})
+        terminal.say({"stages": rows, "complete": complete})
         return
     lines = [f"{r['stage']:14}{r['seconds']:8.2f} s {r['bytes'] / 1e6:9.2f} MB   {r['key'][:12]}" for r in rows]
-    _print("\n".join([*lines, "complete" if complete else "not complete: run `polcap process` to go on"]))
+    terminal.say("\n".join([*lines, "complete" if complete else "not complete: run `polcap process` to go on"]))
 
 
 @app.command()
-@_reported
+@terminal.reported
 def report(
     context: typer.Context,
     result: Result,
@@ -252,17 +206,17 @@ def report(
     if compare is not None:
         rows = reports.compare(reports.read(result), reports.read(compare))
         named = [{"name": name, "here": here, "there": there} for name, here, there in rows]
-        _print(named if json else "\n".join(f"{name}: {here}  |  {there}" for name, here, there in rows))
+        terminal.say(named if json else "\n".join(f"{name}: {here}  |  {there}" for name, here, there in rows))
         return
     from polcap import pipeline
 
     about = pipeline.judge_again(result)
-    _print(about if json else str(result / "report.html"))
-    _judge(about)
+    terminal.say(about if json else str(result / "report.html"))
+    terminal.tell_gates(about)
 
 
 @app.command()
-@_reported
+@terminal.reported
 def check(
     context: typer.Context,
     capture: Annotated[Path, typer.Argument(help="Folder with the photographs.")],
@@ -288,26 +242,26 @@ def check(
         network = beside.submit(pipeline.load_network, None, None, "cpu", 0)
         found = captures.read(capture, _angles(angles))
     verdict = checks.inspect(found, network.result(), chosen)
-    _print(checks.shown(verdict) if json else checks.table(verdict))
+    terminal.say(checks.shown(verdict) if json else checks.table(verdict))
     if not verdict.keep:
         raise typer.Exit(GateError.exit_code)
 
 
 @app.command()
-@_reported
+@terminal.reported
 def doctor(context: typer.Context, json: Json = False) -> None:
     """What works on this machine, what does not, and the remedy. Asks every serial port who answers."""
     from polcap import doctor as doctors
     from polcap.rig import camera_gphoto2, rotator, transport
 
     found = doctors.examine(doctors.Rig(transport.ports, rotator.probe, camera_gphoto2.connected), Path.cwd())
-    _print(doctors.shown(found) if json else doctors.table(found))
+    terminal.say(doctors.shown(found) if json else doctors.table(found))
     if any(one.state == "fault" for one in found):
         raise typer.Exit(SettingError.exit_code)
 
 
 @app.command()
-@_reported
+@terminal.reported
 def synth(
     context: typer.Context,
     folder: Annotated[Path, typer.Argument(help="Folder to make; must be new or empty.")],
@@ -342,7 +296,7 @@ def synth(
         corpus = _extra("corpus")
         named = {"seed": seed, "mesh": str(mesh or ""), "material": str(material or "")}
         corpus.main(folder, dataset, settings.fill(corpus.Recipe, named, assignments or ()))
-        _print(str(folder / "dataset.json"))
+        terminal.say(str(folder / "dataset.json"))
         return
     if interreflection and mesh is None:
         raise SettingError("--interreflection is traced between triangles; give the object with --mesh")
@@ -357,11 +311,11 @@ def synth(
     if interreflection:
         what = replace(what, interreflection=True)
     synthetic.write(folder, what, shoot)
-    _print(str(folder))
+    terminal.say(str(folder))
 
 
 @app.command()
-@_reported
+@terminal.reported
 def capture(
     context: typer.Context,
     folder: Annotated[Path, typer.Argument(help="Folder to shoot into; new, or begun with --resume.")],
@@ -403,13 +357,13 @@ def capture(
     wanted = sequence.order(folder, given, resume)
     if dry_run:
         planned = plan.dry_run(wanted)
-        _print(planned if json else plan.table(planned))
+        terminal.say(planned if json else plan.table(planned))
         return
     done = sequence.shoot(
         folder, wanted, resume=resume, tries=tries, tell=lambda line: print(line, file=sys.stderr, flush=True)
     )
     verdict = None if no_check else _verdict(folder)
-    _print(done | {"check": verdict} if json else str(folder))
+    terminal.say(done | {"check": verdict} if json else str(folder))
     if verdict and verdict["verdict"] != "keep":
         raise typer.Exit(GateError.exit_code)
 
@@ -424,14 +378,14 @@ def _verdict(folder: Path) -> dict[str, Any] | None:
     try:
         verdict = checks.inspect(captures.read(folder), pipeline.load_network(None, None, "cpu", 0), Config())
     except InputError as error:
-        print(f"polcap: not judged: {_line(error)}", file=sys.stderr)
+        print(f"polcap: not judged: {terminal.line(error)}", file=sys.stderr)
         return None
     print(checks.table(verdict), file=sys.stderr)
     return checks.shown(verdict)
 
 
 @app.command()
-@_reported
+@terminal.reported
 def train(
     context: typer.Context,
     data: Annotated[Path, typer.Argument(help="Folder with meshes/ and materials/.")],
@@ -451,11 +405,11 @@ def train(
         preset=preset, data=data, out=out, minutes=minutes, samples=samples, variant=variant, resume=resume,
         start=start, threads=threads, seed=seed,
     )  # fmt: skip
-    _print(str(trainer.main(told)))
+    terminal.say(str(trainer.main(told)))
 
 
 @app.command()
-@_reported
+@terminal.reported
 def evaluate(
     context: typer.Context,
     model: Annotated[Path, typer.Argument(help="ONNX model.")],
@@ -472,7 +426,7 @@ def evaluate(
     judge, fixed = _extra("evaluate"), _extra("protocol")
     usual = (fixed.QUICK_COUNT, fixed.QUICK_SIZE) if quick else (fixed.COUNT, fixed.SIZE)
     judge.main(judge.Params(model, data, out, ablations, count or usual[0], size or usual[1]))
-    _print(str(out / "evaluation.md"))
+    terminal.say(str(out / "evaluation.md"))
 
 
 def _extra(module: str) -> Any:
@@ -541,57 +495,11 @@ def _mask(file: Path) -> Any:
     return (picture if picture.ndim == 2 else picture[..., :3].max(-1)) >= half
 
 
-def _print(data: Any) -> None:
-    """Data on stdout: text as it is, all else as one JSON document."""
-    if not isinstance(data, str):
-        import json
-
-        data = json.dumps(data, ensure_ascii=False, indent=1)
-    print(data, flush=True)
-
-
 def _print_plan(found: "Capture", stages: dict[str, str], json: bool) -> None:
     from polcap import report as reports
     from polcap.formats import capture as captures
 
     if json:
-        _print({"capture": reports.capture_facts(found), "stages": stages})
+        terminal.say({"capture": reports.capture_facts(found), "stages": stages})
         return
-    _print("\n".join([captures.table(found), "", *(f"{name:14}{state}" for name, state in stages.items())]))
-
-
-def _judge(about: dict[str, Any]) -> None:
-    """Tell failed gates and assumptions; a failed gate ends with exit code 3."""
-    failed = 0
-    for gate in about["gates"]:
-        if gate["state"] in ("fail", "warn"):
-            word = "gate failed" if gate["state"] == "fail" else "warning"
-            value, limit = gate["value"], gate["limit"]
-            print(f"polcap: {word}: {gate['name']} {value} (limit {limit}): {gate['says']}", file=sys.stderr)
-            failed += gate["state"] == "fail"
-    if failed:
-        raise GateError(f"{failed} of {len(about['gates'])} gates failed; the asset was written, see report.html")
-
-
-@contextmanager
-def _progress(total: int) -> Iterator["Progress"]:
-    """A bar on a terminal, else a line per finished stage."""
-    if not sys.stderr.isatty():
-        yield _tell
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description:14}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=total)
-
-        def told(stage: str, seconds: float | None, cached: bool) -> None:
-            bar.update(task, description=stage, advance=0 if seconds is None else 1)
-
-        yield told
-
-
-def _tell(stage: str, seconds: float | None, cached: bool) -> None:
-    if seconds is not None:
-        print(f"{stage:14}{'cached' if cached else f'{seconds:.2f} s'}", file=sys.stderr, flush=True)
+    terminal.say("\n".join([captures.table(found), "", *(f"{name:14}{state}" for name, state in stages.items())]))

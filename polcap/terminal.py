@@ -1,0 +1,107 @@
+"""In: what a command found, or what befell it. Out: data on stdout, all else on stderr, an exit code."""
+
+import functools
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from polcap.errors import GateError, PolcapError, SettingError
+
+if TYPE_CHECKING:
+    from polcap.store import Progress
+
+OUT_OF_MEMORY = (  # as OpenCV, threads, the loader of libraries and the system say it
+    "Insufficient memory", "can't start new thread", "failed to map segment", "Cannot allocate memory",
+)  # fmt: skip
+
+
+def reported(command: Callable[..., None]) -> Callable[..., None]:
+    """Turn what a command raises into one line on stderr and an exit code."""
+
+    @functools.wraps(command)
+    def run(context: typer.Context, *args: Any, **kwargs: Any) -> None:
+        try:
+            command(context, *args, **kwargs)
+        except BrokenPipeError:  # whoever read stdout has seen enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            code = 0
+        except KeyboardInterrupt:
+            print("polcap: interrupted; run the same command again to go on", file=sys.stderr)
+            code = 130
+        except PolcapError as error:
+            if context.obj:
+                raise
+            print(f"polcap: error: {line(error)}", file=sys.stderr)
+            code = error.exit_code
+        except (typer.Exit, typer.Abort):
+            raise
+        except Exception as error:
+            if context.obj:
+                raise
+            if isinstance(error, MemoryError) or any(word in str(error) for word in OUT_OF_MEMORY):
+                print("polcap: error: out of memory; raise --memory or take a larger machine", file=sys.stderr)
+                code = SettingError.exit_code
+            else:
+                kind = type(error).__name__
+                print(f"polcap: bug: {kind}: {line(error)}; run with --debug and report it", file=sys.stderr)
+                code = 1
+        else:
+            return
+        raise typer.Exit(code)
+
+    return run
+
+
+def line(error: BaseException) -> str:
+    """What an error says, on one line."""
+    return " ".join(str(error).split())
+
+
+def say(data: Any) -> None:
+    """Data on stdout: text as it is, all else as one JSON document."""
+    if not isinstance(data, str):
+        import json
+
+        data = json.dumps(data, ensure_ascii=False, indent=1)
+    print(data, flush=True)
+
+
+def tell_gates(about: dict[str, Any]) -> None:
+    """Tell failed gates and assumptions; a failed gate ends with exit code 3."""
+    failed = 0
+    for gate in about["gates"]:
+        if gate["state"] in ("fail", "warn"):
+            word = "gate failed" if gate["state"] == "fail" else "warning"
+            value, limit = gate["value"], gate["limit"]
+            print(f"polcap: {word}: {gate['name']} {value} (limit {limit}): {gate['says']}", file=sys.stderr)
+            failed += gate["state"] == "fail"
+    if failed:
+        raise GateError(f"{failed} of {len(about['gates'])} gates failed; the asset was written, see report.html")
+
+
+@contextmanager
+def progress(total: int) -> Iterator["Progress"]:
+    """A bar on a terminal, else a line per finished stage."""
+    if not sys.stderr.isatty():
+        yield tell_stage
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description:14}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=total)
+
+        def told(stage: str, seconds: float | None, cached: bool) -> None:
+            bar.update(task, description=stage, advance=0 if seconds is None else 1)
+
+        yield told
+
+
+def tell_stage(stage: str, seconds: float | None, cached: bool) -> None:
+    if seconds is not None:
+        print(f"{stage:14}{'cached' if cached else f'{seconds:.2f} s'}", file=sys.stderr, flush=True)
