@@ -10,6 +10,7 @@ import torch
 from polcap.errors import InputError
 from polcap.training import export, model, train
 from polcap.training.dataset import Simulator
+from tests.conftest import ROOT
 from tests.training.test_export import settled
 from tests.training.test_model import TINY
 
@@ -56,6 +57,12 @@ def test_training_starts_from_a_shipped_model(data: Path, tmp_path: Path, monkey
     params = train.Params(data=data, out=tmp_path / "out", samples=8, threads=1, start=tmp_path / "first.onnx")
     _, facts = export.read(train.main(params))
     assert facts["training"].endswith("minutes, after 10 samples")
+
+
+def test_the_shipped_model_can_start_training() -> None:
+    run = train.Run(model.SMALL, torch.device("cpu"), 1e-3)
+    run.begin(ROOT / "calib" / "models" / "polcap.onnx")
+    assert run.begun.split()[1] == "samples"
 
 
 def test_a_model_of_another_size_cannot_start_it(tmp_path: Path) -> None:
