@@ -234,7 +234,8 @@ def _learned(cues: Cues, network: Network, settings: Settings) -> SurfaceMaps:
     bounded = _bounded(cues)
     seen = _resized(bounded, 1 / shrink)
     small = _whole(seen, network, settings)
-    small["normal"] = _evened(small["normal"], seen.mask)
+    # beside the object the network guesses: zeros there leave an edge's direction to the object's own pixels
+    small["normal"] = _evened(small["normal"], seen.mask) * seen.mask[..., None]
     small["factor"] = _factor(small["diffuse"], seen)
     maps = {name: np.asarray(cv2.resize(image, size)) for name, image in small.items()}
     ahead = maps["normal"] / np.maximum(_length(maps["normal"]), 1e-6)
@@ -326,8 +327,8 @@ def _evened(normal: Floats, mask: NDArray[np.bool_]) -> Floats:
         common, share = (
             cv2.GaussianBlur(np.ascontiguousarray(part[place]), (0, 0), _CELLS) for part in (uneven, whole)
         )
-        out[place] -= common / np.maximum(share, _REACHED)[..., None]
-    return out * mask[..., None]
+        out[place] -= common / np.maximum(share, _REACHED)[..., None] * mask[place][..., None]
+    return out
 
 
 def _detailed(coarse: Floats, fine: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:

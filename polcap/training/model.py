@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from polcap.stages.cues import CHANNELS
-from polcap.training.profiles import Profiles, Seen, figures_of
+from polcap.training.profiles import Evidence, Profiles, figures_of
 from polcap.training.variants import VARIANTS
 
 SIZE_MULTIPLE = 32
@@ -87,7 +87,7 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
         body = torch.log(0.9 * diffuse * normal[:, 2:].clamp(min=0) + 0.02)  # what the diffuse light would be
         hints = torch.cat([normal, diffuse, level - body], dim=1).detach() * inside
         figures = figures_of(level, self.sees_dolp * x[:, _RATIO].float() / 10, normal, diffuse)
-        thinned = Seen(*(part[:, :, ::2, ::2].detach() for part in (figures, normal[:, 2:], diffuse, _usable(x))))
+        thinned = Evidence(*(part[:, :, ::2, ::2].detach() for part in (figures, normal[:, 2:], diffuse, _usable(x))))
         told, itself = self.profiles(features[1], features[0], thinned).split([self.shape.gloss[1], _GLOSS], dim=1)
         shown = torch.cat([seen, hints.to(seen.dtype)], dim=1)
         gloss = self.gloss(features, shown, inside, F.avg_pool2d(told, 2)).float()

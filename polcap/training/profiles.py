@@ -22,7 +22,7 @@ _FIGURES = 6  # per bin
 
 
 @dataclass(frozen=True)
-class Seen:
+class Evidence:
     """What is known of each place when gloss is asked for, (B, ·, H, W)."""
 
     figures: Tensor  # 5 channels of `figures_of`
@@ -42,7 +42,7 @@ class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types he
         nn.init.zeros_(self.part[-1].weight)
         nn.init.zeros_(self.part[-1].bias)
 
-    def forward(self, coarse: Tensor, fine: Tensor, seen: Seen) -> Tensor:
+    def forward(self, coarse: Tensor, fine: Tensor, seen: Evidence) -> Tensor:
         """coarse (B, ·, H/2, W/2) and fine features (B, ·, H, W) sort the places: a region, and what in it is alike."""
         color = torch.log(seen.diffuse + 0.02)
         weight = seen.usable + 1e-4

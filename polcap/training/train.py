@@ -78,17 +78,19 @@ def main(params: Params) -> Path:
     for name, value, known in (("preset", params.preset, PRESETS), ("variant", params.variant, VARIANTS)):
         if value not in known:
             raise InputError(f"{name} {value!r} is not one of {', '.join(known)}")
+    if params.resume and params.start:
+        raise InputError(f"resume goes on from {params.out / 'last.pt'}, start begins with {params.start}; take one")
     preset = PRESETS[params.preset]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     params.out.mkdir(parents=True, exist_ok=True)
-    simulator = Simulator(views(params, preset), library(params, "train", device), device)
-    watch = Watch(params.data, params.out / "watch", device)
     learners = params.threads if device.type == "cpu" else 1
     run = Run(preset.shape, device, params.rate, learners, params.variant)
     if params.resume:
         run.load(params.out / "last.pt")
     elif params.start:
         run.begin(params.start)
+    simulator = Simulator(views(params, preset), library(params, "train", device), device)
+    watch = Watch(params.data, params.out / "watch", device)
     _keep_memory()
     torch.set_num_threads(1)
 

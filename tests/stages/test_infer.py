@@ -158,6 +158,7 @@ def test_a_grid_of_the_network_does_not_reach_the_normals_and_relief_does():
     pattern = (np.bincount(((x % 2) + 2 * (y % 2))[core], (n - clean)[..., 0][core]) for n in (seen_, found))
     uneven, even = (np.ptp(sums) for sums in pattern)
     assert even < 0.1 * uneven and after < before
+    assert np.array_equal(infer._evened(seen_ + 1, mask)[~mask], (seen_ + 1)[~mask].astype(np.float32))
     bare = infer._evened(clean, mask)
     assert np.sqrt(np.mean((bare - clean)[core] ** 2)) < 0.02 * np.std(relief)
 

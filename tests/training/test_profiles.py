@@ -73,7 +73,7 @@ def test_two_colors_in_a_fine_print_are_told_apart() -> None:
 
     def told(usable: torch.Tensor) -> torch.Tensor:
         with torch.no_grad():
-            return reader(coarse, fine, profiles.Seen(figures, zenith, diffuse, usable))
+            return reader(coarse, fine, profiles.Evidence(figures, zenith, diffuse, usable))
 
     both = told(one)
     for kind in (light, ~light):

@@ -65,6 +65,11 @@ def test_the_shipped_model_can_start_training() -> None:
     assert run.begun.split()[1] == "samples"
 
 
+def test_resume_and_start_exclude_each_other(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="take one"):
+        train.main(train.Params(out=tmp_path, resume=True, start=tmp_path / "m.onnx"))
+
+
 def test_a_model_of_another_size_cannot_start_it(tmp_path: Path) -> None:
     export.write(model.Network(TINY), tmp_path / "tiny.onnx", {"licence": "x"})
     with pytest.raises(InputError, match="not a network of this preset"):
