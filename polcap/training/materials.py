@@ -43,6 +43,8 @@ class Library:
         stack = [textures.read(p, _TEXELS) for p in sets] or [np.full((6, _TEXELS, _TEXELS), 0.5, dtype=np.float32)]
         self.texture = torch.from_numpy(np.stack(stack, axis=1)).to(device)[None]  # (1, 6, T, 256, 256)
         self.has_textures = bool(sets)
+        lightness = self.texture[0, :3].mean(dim=0).flatten(1) ** 0.45  # (T, texels)
+        self.middle, self.spread = lightness.mean(dim=1), lightness.std(dim=1) + 0.02
         self.noise = _noise_volume(seed).to(device)  # (1, 7, D, D, D)
 
     def sample_textures(self, which: Tensor, u: Tensor, v: Tensor) -> Tensor:
@@ -86,12 +88,16 @@ def dress(library: Library, normal: Tensor, position: Tensor, turn: Tensor, owne
     scale = _log_uniform((count,), 0.4, 3.0, device)[owner]
     u = inner.gather(1, ((axis + 1) % 3)[:, None])[:, 0] * scale + own["shift"]
     v = inner.gather(1, ((axis + 2) % 3)[:, None])[:, 0] * scale
-    picture = library.sample_textures(own["texture"].long(), u, v)
+    slot = own["texture"].long()
+    picture = library.sample_textures(slot, u, v)
 
     raised = own["raised"] > 0.5  # the pattern is the relief's
     pattern = torch.sigmoid(own["contrast"] * (torch.where(raised, fine[:, 3], printed[:, 0]) + own["level"]))
     painted = own["color"] * (1 - pattern[:, None]) + own["color2"] * pattern[:, None]
     textured = own["from_texture"] > 0.5
+    tone = (picture[:, :3].mean(dim=1) ** 0.45 - library.middle[slot]) / library.spread[slot]
+    toned = textured & (own["toned"] > 0.5)  # two surfaces that go with the texture set's own light and dark
+    pattern = torch.where(toned, torch.sigmoid(own["contrast"] * (tone + 0.5 * own["level"])), pattern)
     diffuse = torch.where(textured[:, None], picture[:, :3] * own["tint"], painted).clamp(0.005, 0.95)
     lightness = diffuse.mean(dim=1) ** 0.45
     deviation = (lightness - own["mid"]) * own["follow"] + 0.5 * own["speckle"] * fine[:, 1]
@@ -130,13 +136,13 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
     common = u(0, 1) < 0.55
     f0 = torch.where(common, 0.042 * torch.exp(normal(0.2)), 0.05 * torch.exp(u(0, 1.65)))  # up to .26
     rough, other = (torch.where(u(0, 1) < 0.3, u(0.1, 0.4), u(0.25, 0.95)) for _ in range(2))
-    two = u(0, 1) < 0.7  # surfaces in one pattern
+    two = u(0, 1) < 0.8  # surfaces in one pattern
     as_is = u(0, 1) < 0.5  # roughness of the texture set
     color, color2 = _colors(shape, device), _colors(shape, device)
     near = (u(0, 1) < 0.5)[..., None]
     color2 = torch.where(near, color * (0.4 + 1.2 * _u((*shape, 1), device)), color2)
     tint = torch.exp(normal(0.4))[..., None] * torch.exp(0.15 * torch.randn((*shape, 3), device=device))
-    from_texture = (u(0, 1) < 0.5) if library.has_textures else torch.zeros(shape, device=device)
+    from_texture = (u(0, 1) < 0.4) if library.has_textures else torch.zeros(shape, device=device)
     coloured = (f0 > 0.08) & (u(0, 1) < 0.3)
     f0_tint = torch.where(coloured[..., None], 1 + 0.4 * (_u((*shape, 3), device) - 0.5), torch.ones(1, device=device))
     # solid noise has a slope of unit deviation: 14° at most; textures slope less, so theirs are raised
@@ -152,6 +158,7 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
         "rough_gain": torch.where(as_is, 1.0, u(0.5, 1.0)), "rough_shift": torch.where(as_is, 0.0, u(-0.1, 0.4)),
         "f0": f0, "f0_follow": normal(0.5),
         "rough_step": two * (other - rough), "f0_step": two * normal(0.4), "raised": (u(0, 1) < 0.4).float(),
+        "toned": (u(0, 1) < 0.6).float(),
         "ior": (1.5 + normal(0.06)).clamp(1.35, 1.7), "bump": bump,
     }  # fmt: skip
 

@@ -19,6 +19,7 @@ _GROUPS = 16
 _EDGES_DEG = (0.0, 4.0, 8.0, 12.0, 17.0, 23.0, 30.0, 40.0, 52.0, 66.0, 90.0)
 _BINS = len(_EDGES_DEG) - 1
 _FIGURES = 6  # per bin
+PROFILE = _BINS * _FIGURES
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types he
         super().__init__()
         self.sort = nn.Conv2d(coarse, _GROUPS, 1)
         self.part = nn.Sequential(nn.Conv2d(fine + 6, 32, 1), nn.ReLU(), nn.Conv2d(32, _GROUPS, 1))
-        self.read = nn.Sequential(nn.Linear(_BINS * _FIGURES, 96), nn.ReLU(), nn.Linear(96, outputs))
+        self.read = nn.Sequential(nn.Linear(PROFILE, 96), nn.ReLU(), nn.Linear(96, outputs))
         nn.init.zeros_(self.part[-1].weight)
         nn.init.zeros_(self.part[-1].bias)
 
@@ -50,7 +51,7 @@ class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types he
         region = F.interpolate(self.sort(coarse).float(), scale_factor=2.0, mode="bilinear", align_corners=False)
         kind = self.part(torch.cat([fine, color.to(fine.dtype), apart.to(fine.dtype)], dim=1)).float()
         member = torch.softmax(region + kind, dim=1)
-        told = self.read(_profile((member * seen.usable).flatten(2), seen.figures.flatten(2), seen.zenith.flatten(2)))
+        told = self.read(profile((member * seen.usable).flatten(2), seen.figures.flatten(2), seen.zenith.flatten(2)))
         return (told.transpose(1, 2) @ member.flatten(2)).unflatten(2, member.shape[2:])  # told (B, groups, outputs)
 
 
@@ -71,7 +72,7 @@ def figures_of(level: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) ->
     return torch.cat([torch.log(light / shading + 0.02), excess, excess**2, torch.exp(2 * excess), short], dim=1)
 
 
-def _profile(weight: Tensor, figures: Tensor, cosine: Tensor) -> Tensor:
+def profile(weight: Tensor, figures: Tensor, cosine: Tensor) -> Tensor:
     """weight (B, groups, N), figures (B, 5, N), cosine (B, 1, N) -> per group and bin: log share of the group,
     then the figures' means, 0 where there is nothing; (B, groups, bins · 6)."""
     edges = cosine.new_tensor([cos(radians(angle)) for angle in _EDGES_DEG]).view(1, -1, 1)

@@ -29,7 +29,7 @@ def profile(specular: float) -> torch.Tensor:
     level = torch.log(stokes[0] + 0.02).permute(2, 0, 1)[None]
     ratio = (stokes[1:].sum(-1) / stokes[0].sum(-1).clamp(min=1e-6))[None]
     figures = profiles.figures_of(level, ratio, normal, torch.full_like(normal, DIFFUSE))
-    table = profiles._profile(inside.flatten(2), (figures * inside).flatten(2), normal[:, 2:].flatten(2))
+    table = profiles.profile(inside.flatten(2), (figures * inside).flatten(2), normal[:, 2:].flatten(2))
     return table.reshape(profiles._BINS, profiles._FIGURES)
 
 
