@@ -22,6 +22,7 @@ _LIGHT_DOUBT = (0.4, 0.35, 0.3, 0.2, 0.17, 0.17, 0.27, 0.37, 0.48, 0.6, 0.7, 0.8
 _HUE_DOUBT = 0.3  # of that
 _CLIPPED = 0.5  # 1σ more
 _MOST = 3.0  # that a place's doubt may differ from what its zenith lets expect, in the logarithm
+_SURE = 0.2  # doubt of lightness under which a place has its whole say in what the colors are
 _WIDTH = 0.2  # of a color before its own is known
 _FINEST = 0.05
 _ROUNDS = (5, 7)  # with that width, with their own
@@ -53,14 +54,13 @@ class Recolor(nn.Module):  # type: ignore[misc]  # torch comes without types her
         doubt (B, 2, H, W) is added to the logarithm of what the zenith lets expect, for light and for hue; cosine of
         the zenith, inside and clipped (B, 1, H, W).
         """
-        color = _opponent(diffuse).flatten(2)
-        sigma = torch.exp(
-            (_hats(cosine.flatten(2)) @ self.knots.T).transpose(1, 2) + doubt.flatten(2).clamp(-_MOST, _MOST)
-        )
-        weight = (inside * (1 - clipped)).flatten(2) * (0.2 / sigma[:, :1]).square().clamp(max=1)
-        colors = mixture(color.detach(), weight.detach() + 1e-6)
-        spread = (sigma + _CLIPPED * clipped.flatten(2))[:, [0, 1, 1]].square()
-        moved, member = _drawn(color, spread, colors)
+        color = _opponent(diffuse)
+        zenith = _hats(cosine.flatten(2)) @ self.knots.T
+        sigma = torch.exp(zenith.transpose(1, 2).reshape(doubt.shape) + doubt.clamp(-_MOST, _MOST))
+        weight = inside * (1 - clipped) * (_SURE / sigma[:, :1]).square().clamp(max=1) + 1e-6
+        colors = mixture(*(part[:, :, ::2, ::2].flatten(2).detach() for part in (color, weight)))
+        spread = (sigma + _CLIPPED * clipped)[:, [0, 1, 1]].square()
+        moved, member = _drawn(color.flatten(2), spread.flatten(2), colors)
         axes = color.new_tensor(_AXES)
         out = (torch.exp(axes.T @ moved) - _OFFSET).clamp(1e-3, 1.0)
         batch, _, height, width = diffuse.shape
