@@ -3,9 +3,10 @@
 One encoder, three decoder branches (normal + depth + error; diffuse; specular + roughness), each with
 residual blocks and a convolution of its own on every skip, as the paper. No normalization layers: the
 absolute level of radiance and DoLP is information. At the bottom every place sees every other (attention
-over the object's cells and their mean). Gloss comes last: it is shown the other branches' normal and
-diffuse color and how much brighter the picture is than they explain, and shares what it finds among all
-places that look alike, so that a highlight here tells the roughness there.
+over the object's cells and their mean). Diffuse color that is in doubt is drawn towards the colors that
+recur in the picture. Gloss comes last: it is shown the other branches' normal and diffuse color and how much
+brighter the picture is than they explain, and shares what it finds among all places that look alike or have
+the same color, so that a highlight here tells the roughness there.
 
 References
 ----------
