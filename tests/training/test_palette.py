@@ -8,9 +8,10 @@ RED, BLUE = (0.6, 0.1, 0.1), (0.1, 0.1, 0.6)
 
 
 def print_of(colors: list[tuple[float, float, float]], side: int = 24) -> tuple[torch.Tensor, torch.Tensor]:
-    """A print (1, 3, H, W) whose pixels take the colors in turn, 5 % uneven, and which color each has (H, W)."""
+    """A print (1, 3, H, W) whose squares take the colors in turn, 5 % uneven, and which color each pixel has (H, W)."""
     torch.manual_seed(0)
-    which = (torch.arange(side * side) % len(colors)).reshape(side, side)
+    square = torch.arange(side) // 3
+    which = (square[:, None] + square) % len(colors)
     even = torch.tensor(colors)[which].permute(2, 0, 1)[None]
     return even * torch.exp(0.05 * torch.randn(1, 1, side, side)), which
 
