@@ -30,7 +30,8 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             code = 0
         except KeyboardInterrupt:
-            print("polcap: interrupted; run the same command again to go on", file=sys.stderr)
+            again = " with --resume" if kwargs.get("resume") is False else ""
+            print(f"polcap: interrupted; run the same command again{again} to go on", file=sys.stderr)
             code = 130
         except PolcapError as error:
             if context.obj:

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from polcap import cli, pipeline
 from tests.conftest import Command, shell
@@ -32,6 +33,17 @@ def test_help_imports_nothing_heavy() -> None:
     code = "import sys; import polcap.cli; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert not {"numpy", "cv2", "scipy", "colour", "onnxruntime", "torch", "trimesh"} & set(done.stdout.split())
+
+
+@pytest.mark.parametrize(("command", "how"), [("train", " with --resume"), ("evaluate", "")])
+def test_an_interrupted_command_says_how_to_go_on(command: str, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(module: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "_extra", stop)
+    done = CliRunner().invoke(cli.app, [command, *["x"] * (1 if command == "train" else 2)])
+    assert done.exit_code == 130
+    assert done.stderr == f"polcap: interrupted; run the same command again{how} to go on\n"
 
 
 def test_stdout_carries_data_only(result: Path, example: Path, polcap: Command, tmp_path: Path) -> None:

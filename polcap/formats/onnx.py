@@ -4,7 +4,7 @@ A model says in its metadata what it eats and under which terms it may be used:
 
     channels       names of its input channels, in order, separated by commas
     encoding       version of the channels' formulas, `ENCODING`
-    native_size    side of the pictures it was trained on, px
+    native_size    longer side at which inference shows it a picture, px
     size_multiple  height and width must be multiples of this
     licence        SPDX name of the weights' licence
 

@@ -56,6 +56,14 @@ def from_ray_frame(m: Any, v: Any) -> Any:
     return m[..., 0:1] * e_x + m[..., 1:2] * e_y + m[..., 2:3] * v
 
 
+def lifted(m: Any) -> Any:
+    """Unit vectors m (..., 3) in the frames of rays, those that turn away from the camera brought to where they
+    can be seen: z at least 0.02 before they are made unit again."""
+    xp = array_namespace(m)
+    up = xp.concat([m[..., :2], xp.clip(m[..., 2:], 0.02, None)], axis=-1)
+    return up / (dot(up, up) ** 0.5)[..., None]
+
+
 def axis_on_ray(angle: Any, v: Any) -> Any:
     """Angle in (e_x, e_y) of an image-plane axis at `angle` (broadcast to v's pixels), rad.
 

@@ -22,6 +22,7 @@ CHANNELS = (
     "mask", "clipped", "ray_x", "ray_y",
 )  # fmt: skip
 
+FLOOR = 0.02  # added to a radiance before its logarithm, in the channels and wherever they are undone
 
 _BULGE = 0.5  # how far the visible surface comes forward on average, in radii: a cone's 1/3 to a ball's 2/3
 
@@ -102,7 +103,7 @@ def channels(cues: Any) -> Any:
     inside = xp.astype(cues.mask, dtype) if hasattr(xp, "astype") else cues.mask.to(dtype)
     clipped = (cues.quality & int(Quality.CLIPPED)) > 0
     clipped = xp.astype(clipped, dtype) if hasattr(xp, "astype") else clipped.to(dtype)
-    log = xp.log(xp.clip(cues.radiance, 0.0, 50.0) + 0.02)
+    log = xp.log(xp.clip(cues.radiance, 0.0, 50.0) + FLOOR)
     tilt = zenith(cues.dolp)
     maps = [
         log[..., 0], log[..., 1], log[..., 2],

@@ -18,7 +18,7 @@ from polcap.errors import ModelError
 from polcap.images import Cues, Floats, Network, Quality, SurfaceMaps
 from polcap.optics import azimuth, brdf, frames, fresnel
 from polcap.stages import stage
-from polcap.stages.cues import CHANNELS, channels
+from polcap.stages.cues import CHANNELS, FLOOR, channels
 
 _BLURS_PX = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0)
 _SAME = 2.0  # standard deviations that two averages of the same thing may differ by
@@ -31,7 +31,6 @@ _POSITIONS = tuple(
 _CELLS = 2.0  # cells of the network's grid, 1σ, over which its pattern is taken as the same
 _BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 _REACHED = 0.05  # share of known pixels under a Gaussian from which a mean is taken
-_DARK = 0.02  # radiance below which a ratio means little, as in the channels' logarithm
 _BRIGHTEST = 2.0  # S0, which is 1 where white paper faces the flash beside the chart; what no body reflects
 _MODEL_ERROR_DEG = 4.0  # interreflection, highlights, unknown index: measured on path-traced objects
 
@@ -243,7 +242,7 @@ def _learned(cues: Cues, network: Network, settings: Settings) -> SurfaceMaps:
     by_pixel, doubt, _ = _inverted(cues, settings, guide)
     detailed = _detailed(ahead, by_pixel, cues.mask, shrink)
     normal, stated = _joined((ahead, maps["sigma"]), (detailed, _INVERSION * doubt))
-    diffuse = _filled((np.maximum(cues.radiance, 0) + _DARK) * np.exp(maps["factor"]) - _DARK, bounded)
+    diffuse = _filled((np.maximum(cues.radiance, 0) + FLOOR) * np.exp(maps["factor"]) - FLOOR, bounded)
     scale, power, most = _CALIBRATION
     expected = np.minimum(scale * stated**power, most)
     inside = cues.mask[..., None]
@@ -419,7 +418,7 @@ def _factor(albedo: Floats, seen: Cues) -> Floats:
     """
     known = seen.mask & ((seen.quality & Quality.CLIPPED) == 0)
     inside = known.astype(np.float32)
-    factor = (np.log((albedo + _DARK) / (np.maximum(seen.radiance, 0) + _DARK)) * inside[..., None]).astype(np.float32)
+    factor = (np.log((albedo + FLOOR) / (np.maximum(seen.radiance, 0) + FLOOR)) * inside[..., None]).astype(np.float32)
 
     def mean(kernel: Floats) -> Floats:
         smooth, share = (

@@ -5,7 +5,7 @@ union, so shapes can be combined by putting them together.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -61,6 +61,15 @@ def union(parts: Sequence[Triangles]) -> Triangles:
         np.concatenate([p.faces + o for p, o in zip(parts, offset)]).astype(np.int32),
         np.concatenate([p.corner_normals for p in parts]),
     )
+
+
+def centred(mesh: Triangles) -> Triangles:
+    """The mesh about the origin, its longest side 1; InputError where it has no extent."""
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    longest = (high - low).max()
+    if not 0 < longest < np.inf:
+        raise InputError(f"a mesh's longest side is {longest:g}; give one that has an extent")
+    return replace(mesh, vertices=((mesh.vertices - (low + high) / 2) / longest).astype(np.float32))
 
 
 @dataclass(frozen=True)

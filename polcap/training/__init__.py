@@ -4,14 +4,17 @@ In the order a sample meets them:
 
     shapes      random closed meshes
     gbuffers    meshes -> a cache of views: normal, depth, position
+    bounce      light that one part of a view throws on another
     materials   a view -> diffuse, specular, roughness, refractive index, bumped normal
     camera      Stokes parameters -> what three noisy photographs would have measured of them
     dataset     all of these -> a batch: network channels and truth
-    model       channels -> maps
+    model       channels -> maps; profiles and palette are its parts that read gloss and draw albedo
     variants    the network with one thing taken away
     loss        maps against truth
     train       the loop, checkpoints, metrics
+    watch       a look at held-out pictures as training goes
     export      weights -> ONNX
+    corpus      the same simulator's pictures and truth as files
     evaluate    error of every map on fixed pictures of held-out meshes and materials, of which
                 protocol makes one at a time (patterns: its materials, transport: its light), baselines
                 estimates without a network, score judges, and tables and panel tell

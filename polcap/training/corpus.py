@@ -18,7 +18,6 @@ Deschaintre, Lin, Ghosh, Deep Polarization Imaging for 3D Shape and SVBRDF Acqui
 """
 
 import json
-from dataclasses import replace
 from math import log1p
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,19 +26,17 @@ import msgspec
 import numpy as np
 import torch
 from msgspec import Meta
-from torch.nn import functional as F
 
 from polcap.errors import InputError
 from polcap.formats import atomic, png
-from polcap.images import Bits, Floats, GBuffer
+from polcap.images import Bits, Floats
 from polcap.optics import frames, mueller, shade
 from polcap.stages import cues
-from polcap.synth.mesh import Tracer
+from polcap.synth.mesh import Tracer, centred
 from polcap.training import gbuffers, materials, shapes
 
 ANGLES_DEG = (0, 45, 90, 135)
 _LARGEST, _KNEE = 16.0, 0.01  # of the HDR encoding: radiance at 65535, and where it turns from linear to logarithmic
-_LEAST_SHARE = 0.06  # of the picture, for an object to be worth a sample
 
 
 class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -54,25 +51,27 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(out: Path, count: int, recipe: Recipe) -> int:
     """Make what is missing of samples 0…count − 1; returns how many were made now."""
+    library, files = _library(recipe.material), _meshes(recipe.mesh)
     _describe(out, recipe)
-    library = materials.Library(Path(recipe.material) if recipe.material else None, torch.device("cpu"))
-    if recipe.material and not library.has_textures:
-        raise InputError(f"{recipe.material} holds no texture set; give a folder of folders with albedo.jpg")
     made = 0
     for number in range(count):
         place = out / f"{number:06d}"
         if place.exists():
             continue
         with atomic.folder(place) as folder:
-            _write(folder, *sample(recipe, library, number))
+            _write(folder, *sample(recipe, library, files, number))
         made += 1
     return made
 
 
-def sample(recipe: Recipe, library: materials.Library, number: int) -> tuple[dict[str, Floats], dict[str, Any]]:
-    """Pictures by file name, as numbers, and sample.json."""
+def sample(
+    recipe: Recipe, library: materials.Library, files: list[Path], number: int
+) -> tuple[dict[str, Floats], dict[str, Any]]:
+    """Pictures by file name, as numbers, and sample.json. Without mesh `files` the shape is random."""
     rng = np.random.default_rng([recipe.seed, number])
-    buffer, turn = _seen(recipe, rng)
+    read = gbuffers.read_mesh
+    mesh = centred(read(files[rng.integers(len(files))])) if files else shapes.compose(rng)
+    buffer, turn, _ = gbuffers.seen(Tracer(mesh), recipe.size, rng)
     mask, view = buffer.mask, buffer.view
     middle, unit = gbuffers.depth_unit(mask, buffer.depth, view.focal)
     rays = frames.rays(view, *mask.shape)
@@ -81,8 +80,7 @@ def sample(recipe: Recipe, library: materials.Library, number: int) -> tuple[dic
         torch.manual_seed(int(rng.integers(1 << 62)))
         owner = torch.zeros(len(v), dtype=torch.long)
         surface = materials.dress(library, bare, position, torch.from_numpy(turn).float()[None], owner, 1)
-    normal = frames.to_ray_frame(surface.normal, v)
-    normal = F.normalize(torch.cat([normal[:, :2], normal[:, 2:].clamp(min=0.02)], dim=1), dim=1)
+    normal = frames.lifted(frames.to_ray_frame(surface.normal, v))
     way, off = rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.1)
     flash = [off * np.cos(way) * middle, off * np.sin(way) * middle, 0.0]
     point = -v * (torch.from_numpy(buffer.depth[mask]) / v[:, 2])[:, None]
@@ -124,24 +122,20 @@ def decode(code: Floats) -> Floats:
     return np.asarray(_KNEE * np.expm1(code * log1p(_LARGEST / _KNEE)))
 
 
-def _seen(recipe: Recipe, rng: np.random.Generator) -> tuple[GBuffer, Floats]:
-    """A shape from a random side, and object → camera (3, 3)."""
-    if not recipe.mesh:
-        mesh = shapes.compose(rng)
-    else:
-        place = Path(recipe.mesh)
-        files = sorted(p for p in place.iterdir() if p.suffix != ".json") if place.is_dir() else [place]
-        if not files:
-            raise InputError(f"{place} holds no mesh; give a file or a folder of them")
-        mesh = gbuffers.read_mesh(files[rng.integers(len(files))])
-        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-        mesh = replace(mesh, vertices=((mesh.vertices - (low + high) / 2) / (high - low).max()).astype(np.float32))
-    tracer = Tracer(mesh)
-    while True:
-        rotation, translation, view = gbuffers.pose(mesh, recipe.size, rng)
-        buffer = tracer.trace(rotation, translation, view, recipe.size, recipe.size)
-        if buffer.mask.mean() > _LEAST_SHARE:
-            return buffer, rotation
+def _library(material: str) -> materials.Library:
+    library = materials.Library(Path(material) if material else None, torch.device("cpu"))
+    if material and not library.has_textures:
+        raise InputError(f"{material} holds no texture set; give a folder of folders with albedo.jpg")
+    return library
+
+
+def _meshes(mesh: str) -> list[Path]:
+    """The files to take from; none for random shapes."""
+    place = Path(mesh)
+    files = sorted(p for p in place.iterdir() if p.suffix != ".json") if mesh and place.is_dir() else [place]
+    if not files:
+        raise InputError(f"{place} holds no mesh; give a file or a folder of them")
+    return files if mesh else []
 
 
 def _photographs(light: Floats, rays: Floats, noise: float, rng: np.random.Generator) -> Floats:

@@ -143,8 +143,7 @@ class Simulator:
         """
         count, height, width = seen.mask.shape
         surface = materials.dress(self.library, seen.normal, seen.position, seen.turn, seen.owner, count)
-        normal = frames.to_ray_frame(surface.normal, seen.v)
-        normal = F.normalize(torch.cat([normal[:, :2], normal[:, 2:].clamp(min=0.02)], dim=1), dim=1)
+        normal = frames.lifted(frames.to_ray_frame(surface.normal, seen.v))
         to_flash = seen.flash[seen.owner] - seen.place
         squared = (to_flash * to_flash).sum(dim=1)
         to_flash = frames.to_ray_frame(to_flash / squared.sqrt()[:, None], seen.v)

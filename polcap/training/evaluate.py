@@ -23,7 +23,7 @@ import torch
 
 from polcap.formats import atomic, onnx, png
 from polcap.images import Cues, Network, SurfaceMaps
-from polcap.stages import infer
+from polcap.stages import cues, infer
 from polcap.training import baselines, panel, protocol, tables
 from polcap.training.baselines import Estimator, Means
 from polcap.training.protocol import Protocol
@@ -73,9 +73,18 @@ def _head(params: Params, network: Network, found: dict[str, Path]) -> dict[str,
     """All that the figures depend on."""
     return {
         "pictures": params.count, "size": params.size, "protocol": protocol.VERSION, "camera": protocol.CONDITIONS,
-        "model": network.digest, "version": network.metadata.get("version", ""),
+        "model": network.digest, "version": network.metadata.get("version", ""), "data": _digest(params.data),
+        "stages": {stage.name: stage.version for stage in (cues.compute, infer.estimate)},
         "ablations": {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in found.items()},
     }  # fmt: skip
+
+
+def _digest(data: Path) -> str:
+    """Of all test meshes and texture sets."""
+    digest = hashlib.sha256()
+    for file in sorted([*(data / "meshes" / "test").glob("*.npz"), *(data / "materials" / "test").glob("*/*")]):
+        digest.update(str(file.relative_to(data)).encode() + file.read_bytes())
+    return digest.hexdigest()
 
 
 def _alone(name: str) -> str:

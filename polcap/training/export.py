@@ -16,11 +16,11 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
 from polcap.errors import InputError
+from polcap.formats.onnx import ENCODING
 from polcap.stages.cues import CHANNELS
 from polcap.training import model
 
 OPSET = 17
-ENCODING = "1"  # of the input channels; formats/onnx.py checks it
 NATIVE_SIZE = 256  # px of the longer side that inference shows it: more than it was trained on; measured best
 _OWNER, _HALF = "network.", ".half"  # around the names of stored weights
 _GREATEST_IR = 10  # what onnxruntime 1.20 and later read
@@ -41,7 +41,7 @@ def write(network: model.Network, path: Path, facts: Mapping[str, str]) -> int:
     graph.ir_version = min(graph.ir_version, _GREATEST_IR)
     metadata = {
         "channels": ",".join(CHANNELS), "encoding": ENCODING, "native_size": str(NATIVE_SIZE),
-        "multiple": str(model.SIZE_MULTIPLE), "size_multiple": str(model.SIZE_MULTIPLE),
+        "size_multiple": str(model.SIZE_MULTIPLE),
         "outputs": "normal: unit, frame of each pixel's ray; depth: growing away from the camera, mean about 0, "
         "in radii of the disc that covers as many pixels as the object; diffuse, specular: linear; "
         "roughness: perceptual; sigma: expected normal error, degrees",

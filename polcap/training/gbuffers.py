@@ -6,13 +6,15 @@ Views are square, fp16, one array per quantity, readable as memory maps. Everyth
 import json
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import InputError
+from polcap.formats import atomic
 from polcap.formats import mesh as mesh_files
 from polcap.images import Floats, GBuffer, View
 from polcap.synth.mesh import Tracer, Triangles, smooth
@@ -22,26 +24,54 @@ ARRAYS = {  # pixels from one entry to the next, channels, kind
     "normal": (1, 3, np.float16), "depth": (1, 1, np.float16), "position": (1, 3, np.float16),
     "mask": (1, 1, np.bool_), "lit": (1, 1, np.bool_), "met": (bounce.COARSE, bounce.RAYS, np.uint16),
 }  # fmt: skip
+LEAST_SHARE = 0.06  # of the picture, for an object to be worth a view: a sheet seen from its edge teaches nothing
+_TRIES = 200  # sides from which it may be looked at in vain
 _ASIDE = 0.1  # of the distance: how far from the lens a random flash stands at most
 
 
-def build(
-    folder: Path, meshes: list[Path], *, views: int, procedural: int, per_shape: int = 6, size: int = 192,
-    seed: int = 1, flash: tuple[float, float] | None = None,
-) -> int:  # fmt: skip
-    """Trace `views` views of each mesh and `per_shape` of each of `procedural` random shapes; returns how many.
+@dataclass(frozen=True)
+class Recipe:
+    """What is traced."""
 
-    flash : how far right of the lens and above it, in object distances; None puts it elsewhere for each view.
+    views: int  # of each mesh
+    procedural: int  # random shapes
+    size: int  # px
+    seed: int
+    per_shape: int = 6  # views of each random shape
+    flash: tuple[float, float] | None = None  # right of the lens and above it, in object distances; None: at random
+
+
+def cached(folder: Path, meshes: list[Path], recipe: Recipe, *, mapped: bool = True) -> dict[str, NDArray[Any]]:
+    """`load` of what `build` traces, which is done now where the folder is empty.
+
+    Raises
+    ------
+    InputError
+        The folder holds views of other meshes or another recipe.
+    """
+    index = folder / "index.json"
+    if not index.exists():
+        build(folder, meshes, recipe)
+    elif json.loads(index.read_text()) != _index(meshes, recipe):
+        raise InputError(
+            f"{folder} holds views of other meshes or of another preset; remove it or choose another --out"
+        )
+    return load(folder, mapped=mapped)
+
+
+def build(folder: Path, meshes: list[Path], recipe: Recipe) -> int:
+    """Trace all views; returns how many.
+
     Written so that an interrupted build leaves no cache that looks whole: index.json comes last.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    total = views * len(meshes) + per_shape * procedural
+    size = recipe.size
+    total = recipe.views * len(meshes) + recipe.per_shape * recipe.procedural
     out = {
         name: np.lib.format.open_memmap(folder / f"{name}.npy", "w+", kind, (total, size // by, size // by, channels))
         for name, (by, channels, kind) in ARRAYS.items()
     }
     cameras = np.zeros((total, 16), dtype=np.float32)
-    recipe = Recipe(views, procedural, per_shape, size, seed, flash)
     for index, (buffer, pose, lit, met) in enumerate(_traced(meshes, recipe)):
         inside = buffer.mask
         middle, unit = depth_unit(inside, buffer.depth, buffer.view.focal)
@@ -54,18 +84,24 @@ def build(
     for array in out.values():
         array.flush()
     np.save(folder / "camera.npy", cameras)
-    text = {"views": total, "size": size, "seed": seed, "meshes": [m.stem for m in meshes], "procedural": procedural}
-    (folder / "index.json").write_text(json.dumps(text))
+    with atomic.path(folder / "index.json") as beside:
+        beside.write_text(json.dumps(_index(meshes, recipe)))
     return total
 
 
-def load(folder: Path, *, mapped: bool = True) -> dict[str, NDArray]:  # type: ignore[type-arg]
+def _index(meshes: list[Path], recipe: Recipe) -> dict[str, Any]:
+    """All that the views follow from, as JSON has it."""
+    told: dict[str, Any] = json.loads(json.dumps(asdict(recipe)))
+    return told | {"meshes": [mesh.stem for mesh in meshes]}
+
+
+def load(folder: Path, *, mapped: bool = True) -> dict[str, NDArray[Any]]:
     """The cache, as memory maps or in memory: what ARRAYS lists (N, S, S, ·) and camera (N, 16).
 
     camera: focal, centre x, y [px]; middle depth [m]; depth unit [m]; object → camera rotation, 9; flash right of
     the lens and above it [middle depths].
     """
-    missing = [n for n in ("index.json", *(f"{name}.npy" for name in ARRAYS)) if not (folder / n).exists()]
+    missing = [n for n in ("index.json", *(f"{name}.npy" for name in (*ARRAYS, "camera"))) if not (folder / n).exists()]
     if missing:
         raise InputError(
             f"{folder} holds no complete G-buffer cache: {missing[0]} is missing; remove it and run `polcap train`"
@@ -89,22 +125,10 @@ def depth_unit(mask: NDArray[np.bool_], depth: Floats, focal: float) -> tuple[fl
     return middle, float(np.sqrt(mask.sum() / np.pi) * middle / focal)
 
 
-@dataclass(frozen=True)
-class Recipe:
-    """What is traced; as `build` takes it."""
-
-    views: int
-    procedural: int
-    per_shape: int
-    size: int
-    seed: int
-    flash: tuple[float, float] | None
+Traced = tuple[GBuffer, transport.Pose, NDArray[np.bool_], NDArray[np.uint16]]  # and `bounce.visibility`
 
 
-Seen = tuple[GBuffer, transport.Pose, NDArray[np.bool_], NDArray[np.uint16]]  # and `bounce.visibility`
-
-
-def _traced(meshes: list[Path], recipe: Recipe) -> Iterator[Seen]:
+def _traced(meshes: list[Path], recipe: Recipe) -> Iterator[Traced]:
     for path in meshes:
         rng = np.random.default_rng([recipe.seed, zlib.crc32(path.stem.encode())])
         yield from _look(read_mesh(path), recipe.views, recipe, rng)
@@ -113,14 +137,10 @@ def _traced(meshes: list[Path], recipe: Recipe) -> Iterator[Seen]:
         yield from _look(shapes.compose(rng), recipe.per_shape, recipe, rng)
 
 
-def _look(mesh: Triangles, count: int, recipe: Recipe, rng: np.random.Generator) -> Iterator[Seen]:
+def _look(mesh: Triangles, count: int, recipe: Recipe, rng: np.random.Generator) -> Iterator[Traced]:
     tracer, scene = Tracer(mesh), transport.Scene(mesh)
-    while count:
-        rotation, translation, view = pose(mesh, recipe.size, rng)
-        buffer = tracer.trace(rotation, translation, view, recipe.size, recipe.size)
-        if buffer.mask.mean() < 0.06:  # a sheet seen from its edge teaches nothing
-            continue
-        count -= 1
+    for _ in range(count):
+        buffer, rotation, translation = seen(tracer, recipe.size, rng)
         way, off = rng.uniform(0, 2 * np.pi), rng.uniform(0, _ASIDE)
         aside = (off * np.cos(way), off * np.sin(way)) if recipe.flash is None else recipe.flash
         middle = float(buffer.depth[buffer.mask].mean(dtype=np.float64))
@@ -128,7 +148,25 @@ def _look(mesh: Triangles, count: int, recipe: Recipe, rng: np.random.Generator)
         yield buffer, placed, *bounce.visibility(scene, buffer, placed, rng)
 
 
-def pose(mesh: Triangles, size: int, rng: np.random.Generator) -> tuple[Floats, Floats, View]:
+def seen(tracer: Tracer, size: int, rng: np.random.Generator) -> tuple[GBuffer, Floats, Floats]:
+    """The mesh from a random side, with that side's rotation (3, 3) and translation (3,).
+
+    Raises
+    ------
+    InputError
+        The mesh covers too little of the picture from all sides tried.
+    """
+    for _ in range(_TRIES):
+        rotation, translation, view = _pose(tracer.mesh, size, rng)
+        buffer = tracer.trace(rotation, translation, view, size, size)
+        if buffer.mask.mean() >= LEAST_SHARE:
+            return buffer, rotation, translation
+    raise InputError(
+        f"a mesh covers less than {LEAST_SHARE:.0%} of the picture from each of {_TRIES} sides; give a less thin one"
+    )
+
+
+def _pose(mesh: Triangles, size: int, rng: np.random.Generator) -> tuple[Floats, Floats, View]:
     """Random turn, crop's field of view 5–35°, up to 12° off axis, object filling 60–95 % of the crop."""
     while True:
         rotation = shapes.rotation(rng)
@@ -144,9 +182,9 @@ def pose(mesh: Triangles, size: int, rng: np.random.Generator) -> tuple[Floats, 
             return rotation, translation, _framed(turned + translation, fill, size, rng)
 
 
-def _framed(seen: Floats, fill: float, size: int, rng: np.random.Generator) -> View:
+def _framed(place: Floats, fill: float, size: int, rng: np.random.Generator) -> View:
     """The crop in which points (V, 3) of the camera frame fill that share of its side."""
-    x, y = seen[:, 0] / -seen[:, 2], seen[:, 1] / seen[:, 2]
+    x, y = place[:, 0] / -place[:, 2], place[:, 1] / place[:, 2]
     focal = fill * size / max(np.ptp(x), np.ptp(y))
     slack = (1 - fill) * size / 2
     cx, cy = ((size - 1) / 2 - focal * (a.min() + a.max()) / 2 + rng.uniform(-slack, slack) for a in (x, y))

@@ -34,7 +34,7 @@ def total(
     angle = torch.rad2deg(2 * torch.asin((maps["normal"] - truth.normal).norm(dim=1, keepdim=True).clamp(max=2) / 2))
     parts = {
         "normal": mean(1 - cosine) + 0.25 * mean((maps["normal"] - truth.normal).abs()),
-        "depth": mean((_centred(maps["depth"], inside) - _centred(truth.depth, inside)).abs()),
+        "depth": mean((centred(maps["depth"], inside) - centred(truth.depth, inside)).abs()),
         "diffuse": mean((maps["diffuse"] - truth.diffuse).abs() + 2 * (maps["diffuse"] - truth.diffuse) ** 2),
         # squares: of what a picture leaves open the mean is wanted; the median of F0 ignores its long tail
         "specular": mean((maps["specular"] - truth.specular) ** 2),
@@ -48,7 +48,8 @@ def total(
     return loss, figures | {"degrees": float(mean(angle).detach()), "loss": float(loss.detach())}
 
 
-def _centred(depth: Tensor, inside: Tensor) -> Tensor:
+def centred(depth: Tensor, inside: Tensor) -> Tensor:
+    """Depth (B, 1, H, W) with its mean inside (B, 1, H, W; 0 or 1) taken away."""
     return depth - (depth * inside).sum(dim=(2, 3), keepdim=True) / inside.sum(dim=(2, 3), keepdim=True).clamp(min=1)
 
 

@@ -38,7 +38,7 @@ class Library:
     """Texture sets and a volume of tileable noise on one device."""
 
     def __init__(self, folder: Path | None, device: torch.device, seed: int = 3) -> None:
-        sets = sorted(p for p in folder.iterdir() if (p / "albedo.jpg").exists()) if folder else []
+        sets = sorted(p.parent for p in folder.glob("*/albedo.jpg")) if folder else []
         self.names = [p.name for p in sets]
         stack = [textures.read(p, _TEXELS) for p in sets] or [np.full((6, _TEXELS, _TEXELS), 0.5, dtype=np.float32)]
         self.texture = torch.from_numpy(np.stack(stack, axis=1)).to(device)[None]  # (1, 6, T, 256, 256)

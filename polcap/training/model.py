@@ -20,15 +20,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from polcap.stages.cues import CHANNELS
+from polcap.stages.cues import CHANNELS, FLOOR
 from polcap.training.palette import ColorGloss, Recolor
 from polcap.training.profiles import Evidence, Profiles, figures_of
 from polcap.training.variants import VARIANTS
 
 SIZE_MULTIPLE = 32
 OUTPUTS = ("normal", "depth", "diffuse", "specular", "roughness", "sigma")
-_COLOR = 5  # diffuse, doubt of its lightness and of its hue
-_GLOSS = 5  # specular, roughness, highlight
+_COLOR_OUTPUTS = 5  # diffuse, doubt of its lightness and of its hue
+_GLOSS_OUTPUTS = 5  # specular, roughness, highlight
 _SHARED = (2, 1)  # decoder levels of 1/8 and 1/4 of the resolution
 _MASK = CHANNELS.index("mask")
 _CLIPPED = CHANNELS.index("clipped")
@@ -72,11 +72,11 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
         self.down = nn.ModuleList(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(widths))
         self.context = Context(widths[-1])
         self.geometry = Branch(widths, shape.geometry, shape.skip_blocks, skips, 5)
-        self.color = Branch(widths, shape.color, shape.skip_blocks, skips, _COLOR)
+        self.color = Branch(widths, shape.color, shape.skip_blocks, skips, _COLOR_OUTPUTS)
         self.recolor = Recolor()
-        self.profiles = Profiles(widths[1], widths[0], shape.gloss[1] + _GLOSS)
-        self.color_gloss = ColorGloss(_GLOSS)
-        self.gloss = Branch(widths, shape.gloss, shape.skip_blocks, skips, _GLOSS, hints=9)
+        self.profiles = Profiles(widths[1], widths[0], shape.gloss[1] + _GLOSS_OUTPUTS)
+        self.color_gloss = ColorGloss(_GLOSS_OUTPUTS)
+        self.gloss = Branch(widths, shape.gloss, shape.skip_blocks, skips, _GLOSS_OUTPUTS, hints=9)
 
     def forward(self, x: Tensor) -> dict[str, Tensor]:
         seen = self.inputs(x)
@@ -92,11 +92,12 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
         cosine, clipped = normal[:, 2:].detach(), x[:, _CLIPPED : _CLIPPED + 1].float()
         with torch.autocast(x.device.type, enabled=False):
             diffuse, member, colors = self.recolor(own, color[:, 3:], cosine, inside.float(), clipped)
-        body = torch.log(0.9 * diffuse * normal[:, 2:].clamp(min=0) + 0.02)  # what the diffuse light would be
+        body = torch.log(0.9 * diffuse * normal[:, 2:].clamp(min=0) + FLOOR)  # what the diffuse light would be
         hints = torch.cat([normal, diffuse, level - body], dim=1).detach() * inside
         figures = figures_of(level, self.sees_dolp * x[:, _RATIO].float() / 10, normal, diffuse)
         thinned = Evidence(*(part[:, :, ::2, ::2].detach() for part in (figures, normal[:, 2:], diffuse, _usable(x))))
-        told, itself = self.profiles(features[1], features[0], thinned).split([self.shape.gloss[1], _GLOSS], dim=1)
+        parts = [self.shape.gloss[1], _GLOSS_OUTPUTS]
+        told, itself = self.profiles(features[1], features[0], thinned).split(parts, dim=1)
         shown = torch.cat([seen, hints.to(seen.dtype)], dim=1)
         gloss = self.gloss(features, shown, inside, F.avg_pool2d(told, 2)).float()
         gloss = gloss + F.interpolate(itself, scale_factor=2.0, mode="bilinear", align_corners=False)

@@ -55,8 +55,8 @@ class Recolor(nn.Module):  # type: ignore[misc]  # torch comes without types her
         the zenith, inside and clipped (B, 1, H, W).
         """
         color = _opponent(diffuse)
-        zenith = _hats(cosine.flatten(2)) @ self.knots.T
-        sigma = torch.exp(zenith.transpose(1, 2).reshape(doubt.shape) + doubt.clamp(-_MOST, _MOST))
+        expected = _hats(cosine.flatten(2)) @ self.knots.T
+        sigma = torch.exp(expected.transpose(1, 2).reshape(doubt.shape) + doubt.clamp(-_MOST, _MOST))
         weight = inside * (1 - clipped) * (_SURE / sigma[:, :1]).square().clamp(max=1) + 1e-6
         colors = mixture(*(part[:, :, ::2, ::2].flatten(2).detach() for part in (color, weight)))
         spread = (sigma + _CLIPPED * clipped)[:, [0, 1, 1]].square()
@@ -143,13 +143,13 @@ def described(seen: Evidence, first: Tensor, member: Tensor, colors: Mixture) ->
     """What is known of each color, (B, COLORS, ·): its own profile and the whole object's, the color itself and beside
     the object's mean, its share, the mean of the first reading.
     """
-    usable, figures, zenith = (part.flatten(2) for part in (seen.usable, seen.figures, seen.zenith))
+    usable, figures, cosine = (part.flatten(2) for part in (seen.usable, seen.figures, seen.cosine))
     mine = member.flatten(2) * usable
     area = mine.sum(dim=2, keepdim=True)
     share = area / (area.sum(dim=1, keepdim=True) + 1e-3)
     center = colors.center @ usable.new_tensor(_AXES)  # logarithms of red, green, blue
     mean = (share * center).sum(dim=1, keepdim=True)
-    whole = profile(usable, figures, zenith).expand(-1, COLORS, -1)
+    whole = profile(usable, figures, cosine).expand(-1, COLORS, -1)
     said = (mine @ first.flatten(2).transpose(1, 2)) / (area + 1e-3)
-    known = [profile(mine, figures, zenith), whole, center, center - mean, torch.log(share + 1e-3) / 3, said]
+    known = [profile(mine, figures, cosine), whole, center, center - mean, torch.log(share + 1e-3) / 3, said]
     return torch.cat(known, dim=2)

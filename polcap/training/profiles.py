@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from polcap.optics import fresnel
-from polcap.stages.cues import NOMINAL_IOR
+from polcap.stages.cues import FLOOR, NOMINAL_IOR
 
 _GROUPS = 16
 _EDGES_DEG = (0.0, 4.0, 8.0, 12.0, 17.0, 23.0, 30.0, 40.0, 52.0, 66.0, 90.0)
@@ -27,7 +27,7 @@ class Evidence:
     """What is known of each place when gloss is asked for, (B, ·, H, W)."""
 
     figures: Tensor  # 5 channels of `figures_of`
-    zenith: Tensor  # cosine
+    cosine: Tensor  # of the zenith
     diffuse: Tensor  # 3 channels
     usable: Tensor  # 1 on the object where it is not clipped
 
@@ -51,7 +51,7 @@ class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types he
         region = F.interpolate(self.sort(coarse).float(), scale_factor=2.0, mode="bilinear", align_corners=False)
         kind = self.part(torch.cat([fine, color.to(fine.dtype), apart.to(fine.dtype)], dim=1)).float()
         member = torch.softmax(region + kind, dim=1)
-        told = self.read(profile((member * seen.usable).flatten(2), seen.figures.flatten(2), seen.zenith.flatten(2)))
+        told = self.read(profile((member * seen.usable).flatten(2), seen.figures.flatten(2), seen.cosine.flatten(2)))
         return (told.transpose(1, 2) @ member.flatten(2)).unflatten(2, member.shape[2:])  # told (B, groups, outputs)
 
 
@@ -64,7 +64,7 @@ def figures_of(level: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) ->
     cosine = normal[:, 2:].clamp(0.03, 1.0)
     plus, minus = fresnel.transmission(cosine, NOMINAL_IOR)
     shading = 0.96 * cosine * plus
-    light = (torch.exp(level) - 0.02).clamp(0, 50).mean(dim=1, keepdim=True)
+    light = (torch.exp(level) - FLOOR).clamp(0, 50).mean(dim=1, keepdim=True)
     body = diffuse.mean(dim=1, keepdim=True) * shading
     excess = torch.log((light + 0.02) / (body + 0.02)).clamp(-3, 4)
     dolp = ratio.square().sum(dim=1, keepdim=True).sqrt()

@@ -16,7 +16,7 @@ from polcap.errors import InputError
 from polcap.images import Bits, ColorCalibration, Cues, Floats, GBuffer, Quality, StokesImage, SurfaceMaps, View
 from polcap.optics import frames
 from polcap.stages import cues
-from polcap.synth.mesh import Tracer, Triangles
+from polcap.synth.mesh import Tracer, Triangles, centred
 from polcap.training import gbuffers, patterns, shapes, transport
 from polcap.training.camera import Errors, photograph
 
@@ -27,7 +27,7 @@ MESHES = 6
 LIGHTS = 20
 _SEED = 20211121
 _FIELD_OF_VIEW = 30.0  # degrees, of the picture's side
-_FLASH = 0.05  # of the distance, above the lens
+FLASH = 0.05  # of the distance, above the lens
 _NATIVE = 160  # px: about the size that networks compared with each other are shown
 CONDITIONS = (
     "three exposures ×4 apart of a sensor with a full well of 20 ke⁻ and read noise 5 e⁻; gain error 0.3 % per shot "
@@ -70,7 +70,7 @@ class Protocol:
             raise InputError(f"{data}/meshes/test holds {len(files)} meshes, the evaluation takes {MESHES}")
         self.size = size
         self.names = [file.stem for file in files]
-        self.meshes = [_centred(gbuffers.read_mesh(file)) for file in files]
+        self.meshes = [centred(gbuffers.read_mesh(file)) for file in files]
         self.scenes = [transport.Scene(mesh) for mesh in self.meshes]
         self.tracers = [Tracer(mesh) for mesh in self.meshes]
         self.materials = patterns.library(data / "materials" / "test")
@@ -109,11 +109,11 @@ class Protocol:
             focal = size / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))
             view = View(focal=float(focal), center=((size - 1) / 2, (size - 1) / 2), scale=1.0)
             buffer = self.tracers[index].trace(turn, translation, view, size, size)
-            if buffer.mask.mean() > 0.06:
+            if buffer.mask.mean() > gbuffers.LEAST_SHARE:
                 break
         inside = buffer.mask
         middle, unit = gbuffers.depth_unit(inside, buffer.depth, view.focal)
-        pose = transport.Pose(turn, translation, np.array([0, _FLASH * middle, 0]), middle**2)
+        pose = transport.Pose(turn, translation, np.array([0, FLASH * middle, 0]), middle**2)
         laid, shift = shapes.rotation(rng), rng.uniform(-0.5, 0.5, 3)  # the material's own turn and place
         position, v = buffer.position[inside].astype(np.float64), frames.rays(view, size, size)[inside]
 
@@ -124,8 +124,7 @@ class Protocol:
         pattern = position @ laid.T + shift, normal @ turn @ laid.T  # places and facing directions in its frame
         look, slope = material.at(*pattern), material.slope(*pattern) @ laid @ turn.T
         bent = frames.to_ray_frame(normal - slope + np.sum(slope * normal, axis=1, keepdims=True) * normal, v)
-        bent[:, 2] = np.maximum(bent[:, 2], 0.02)
-        bent /= np.linalg.norm(bent, axis=1, keepdims=True)
+        bent = np.asarray(frames.lifted(bent))
         _, flat = self.scenes[index].facing(position + 0.01 * (v @ turn), -v @ turn)
         places = transport.Places(
             inside, position, flat, bent, v, look.diffuse, look.specular, look.roughness, material.ior
@@ -171,12 +170,6 @@ def _placed(mesh: Triangles, rng: np.random.Generator) -> tuple[Floats, Floats]:
     slope = fill * np.tan(np.radians(_FIELD_OF_VIEW / 2))
     distance = float((np.abs(seen[:, :2]).max(axis=1) / slope + seen[:, 2]).max())
     return turn, np.array([0, 0, -distance]) - middle
-
-
-def _centred(mesh: Triangles) -> Triangles:
-    """The mesh about the origin, its longest side 1."""
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    return replace(mesh, vertices=((mesh.vertices - (low + high) / 2) / (high - low).max()).astype(np.float32))
 
 
 def _measured(light: Floats, places: transport.Places, view: View, errors: Errors) -> StokesImage:

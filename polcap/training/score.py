@@ -39,7 +39,7 @@ class Judge:
         """RMSE unless said, angles in degrees, shares of pixels in 0…1. `·_core`: mask eroded by 2 px.
 
         depth: both centred in the mask, over the truth's greatest minus least; `depth_fitted`: after the best
-        scale and shift. diffuse_clipped: where every exposure is saturated; absent where nothing is.
+        scale and shift. diffuse_clipped: where every exposure is saturated; absent where fewer than ten pixels are.
         """
         case, mask, error = self.case, self.mask, angle(maps, self.case)
         out = {}

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
-from polcap.synth.mesh import Triangles, smooth, union
+from polcap.synth.mesh import Triangles, centred, smooth, union
 
 _RINGS, _SECTORS = 96, 128
 
@@ -23,10 +23,7 @@ def compose(rng: np.random.Generator) -> Triangles:
         parts.append(smooth(vertices, faces))
         anchor = vertices[rng.integers(len(vertices))]  # the next part grows out of this one's surface
         centre = centre * 0.2 + anchor * 0.8 if rng.random() < 0.6 else anchor * 0.5
-    whole = union(parts)
-    low, high = whole.vertices.min(axis=0), whole.vertices.max(axis=0)
-    placed = (whole.vertices - (low + high) / 2) / float((high - low).max())
-    return Triangles(placed.astype(np.float32), whole.faces, whole.corner_normals)
+    return centred(union(parts))
 
 
 def rotation(rng: np.random.Generator) -> Floats:

@@ -2,13 +2,12 @@
 
 The budget is a length of time, so that a run ends when it is meant to on any machine, or a number of
 pictures, so that runs can be compared. The learning rate holds for 20 % of it and falls to nothing over the
-rest. A run that was stopped goes on from its last checkpoint with what was left. Same seed, same machine,
-same number of steps: same weights.
+rest. A run that was stopped goes on from its last checkpoint with what was left. With a budget of pictures
+the weights follow, on one machine, from the seed.
 """
 
 import csv
 import ctypes
-import os
 import queue
 import threading
 import time
@@ -24,7 +23,7 @@ import torch
 from torch import Tensor
 
 from polcap.errors import InputError
-from polcap.formats import png
+from polcap.formats import atomic, png
 from polcap.training import export, gbuffers, loss, materials, model
 from polcap.training.dataset import Batch, Simulator
 from polcap.training.variants import VARIANTS
@@ -80,13 +79,19 @@ def main(params: Params) -> Path:
             raise InputError(f"{name} {value!r} is not one of {', '.join(known)}")
     if params.resume and params.start:
         raise InputError(f"resume goes on from {params.out / 'last.pt'}, start begins with {params.start}; take one")
+    last, looked_at = params.out / "last.pt", params.data / "meshes" / "test"
+    if last.exists() and not params.resume:
+        raise InputError(f"{last} is there already; go on from it with --resume, or choose another --out")
+    if not any(looked_at.glob("*.npz")):
+        raise InputError(f"{looked_at} holds no mesh; training looks at some as it goes, put one there")
     preset = PRESETS[params.preset]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     params.out.mkdir(parents=True, exist_ok=True)
     learners = params.threads if device.type == "cpu" else 1
+    torch.manual_seed(params.seed)
     run = Run(preset.shape, device, params.rate, learners, params.variant)
     if params.resume:
-        run.load(params.out / "last.pt")
+        run.load(last)
     elif params.start:
         run.begin(params.start)
     simulator = Simulator(views(params, preset), library(params, "train", device), device)
@@ -94,22 +99,22 @@ def main(params: Params) -> Path:
     _keep_memory()
     torch.set_num_threads(1)
 
-    def progress() -> float:
-        """Share of the budget that is spent."""
-        return run.samples / params.samples if params.samples else run.elapsed / (params.minutes * 60)
+    def progress(samples: int) -> float:
+        """Share of the budget that is spent with that many pictures made, or learned from."""
+        return samples / params.samples if params.samples else run.elapsed / (params.minutes * 60)
 
-    ready = _ahead(simulator, preset, params.seed + run.step, progress)
+    ready = _ahead(simulator, preset, params.seed + run.step, run.samples, progress)
     saved = looked = run.elapsed
     parts: list[dict[str, float]] = []
     before = time.monotonic()
-    while progress() < 1:
-        parts.append(run.advance([next(ready) for _ in range(learners)], progress()))
+    while progress(run.samples) < 1:
+        parts.append(run.advance([next(ready) for _ in range(learners)], progress(run.samples)))
         now = time.monotonic()
         run.elapsed, before = run.elapsed + now - before, now
-        if run.step % 50 == 0 or run.step == 10 or progress() >= 1:
+        if run.step % 50 == 0 or run.step == 10 or progress(run.samples) >= 1:
             _record(params.out / "metrics.csv", run, {k: float(np.mean([p[k] for p in parts])) for k in parts[0]})
             parts = []
-        if run.elapsed - looked > 240 or progress() >= 1:
+        if run.elapsed - looked > 240 or progress(run.samples) >= 1:
             looked = run.elapsed
             with run.averaged() as network:
                 _record(params.out / "watch.csv", run, watch.look(network))
@@ -117,10 +122,10 @@ def main(params: Params) -> Path:
             before = time.monotonic()
         if run.elapsed - saved > 60:
             saved = run.elapsed
-            run.save(params.out / "last.pt")
+            run.save(last)
     ready.close()
-    run.save(params.out / "last.pt")
-    ship(params.out / "last.pt", params.out / "model.onnx", version=params.out.resolve().name)
+    run.save(last)
+    ship(last, params.out / "model.onnx", version=params.out.resolve().name)
     return params.out / "model.onnx"
 
 
@@ -134,11 +139,9 @@ def _keep_memory() -> None:
 
 def views(params: Params, preset: Preset) -> dict[str, Any]:
     """The cache of training views, traced now where it is not there yet."""
-    folder = params.out / "views"
-    if not (folder / "index.json").exists():
-        meshes = sorted((params.data / "meshes" / "train").glob("*.npz"))
-        gbuffers.build(folder, meshes, views=preset.views, procedural=preset.procedural, size=preset.size, seed=11)
-    return gbuffers.load(folder, mapped=False)  # random access to a map is slow
+    meshes = sorted((params.data / "meshes" / "train").glob("*.npz"))
+    recipe = gbuffers.Recipe(views=preset.views, procedural=preset.procedural, size=preset.size, seed=11)
+    return gbuffers.cached(params.out / "views", meshes, recipe, mapped=False)  # random access to a map is slow
 
 
 def library(params: Params, split: str, device: torch.device) -> materials.Library:
@@ -147,24 +150,27 @@ def library(params: Params, split: str, device: torch.device) -> materials.Libra
 
 
 def _ahead(
-    simulator: Simulator, preset: Preset, seed: int, progress: Callable[[], float]
+    simulator: Simulator, preset: Preset, seed: int, made: int, progress: Callable[[int], float]
 ) -> Generator[Batch, None, None]:
     """Batches without end, made in a thread of their own while the network learns from those before.
 
     That thread alone draws from torch's global random state, so the batches follow from the seed and from when
-    the sizes change.
+    the sizes change. `made` pictures were made before, `progress` says how far that is.
     """
     waiting: queue.Queue[Batch | BaseException] = queue.Queue(maxsize=4)
     ended = threading.Event()
 
     def make() -> None:
+        nonlocal made
         try:
             torch.set_num_threads(1)
             torch.manual_seed(seed)
             chooser = np.random.default_rng(seed)
             while not ended.is_set():
-                size = int(chooser.choice(preset.sizes, p=preset.early if progress() < 0.5 else preset.late))
-                waiting.put(simulator.draw(max(preset.pixels // size**2, 1), size))
+                size = int(chooser.choice(preset.sizes, p=preset.early if progress(made) < 0.5 else preset.late))
+                count = max(preset.pixels // size**2, 1)
+                made += count
+                waiting.put(simulator.draw(count, size))
         except BaseException as error:  # told to the loop, which raises it
             waiting.put(error)
 
@@ -255,9 +261,8 @@ class Run:
             "step": self.step, "samples": self.samples, "elapsed": self.elapsed, "skipped": self.skipped,
             "begun": self.begun,
         }  # fmt: skip
-        beside = path.with_suffix(".part")
-        torch.save(state, beside)
-        os.replace(beside, path)
+        with atomic.path(path) as beside:
+            torch.save(state, beside)
 
     def begin(self, path: Path) -> None:
         """Take a model's weights as the first, from `export.write`; InputError where they are another network's."""
@@ -273,6 +278,8 @@ class Run:
         if not path.exists():
             raise InputError(f"{path} is not there: nothing to resume; train without resume first")
         state = torch.load(path, map_location=self.device, weights_only=True)
+        if (state["shape"], state["variant"]) != (asdict(self.network.shape), self.network.variant):
+            raise InputError(f"{path} began with another preset or as {state['variant']!r}; resume it as it began")
         self.network.load_state_dict(state["network"])
         self.average = {k: v.clone() for k, v in state["average"].items()}
         for optimizer, held in zip(self.optimizers, state["optimizers"]):
@@ -286,7 +293,7 @@ class Run:
 class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without types here
     """Momentum whose matrix is made orthogonal before each step, so that no direction of a filter bank is starved.
 
-    For convolutions: (out, in·kh·kw) matrices. Measured here at 1300 samples from nothing: 15.7° against
+    For convolutions: (out, in·kh·kw) matrices. Measured here at 1,316 samples from nothing: 15.9° against
     AdamW's 20.2° on training pictures.
 
     References
@@ -339,11 +346,11 @@ def orthogonal(matrix: Tensor) -> Tensor:
 
 
 def _optimizers(network: model.Network, rate: float) -> list[torch.optim.Optimizer]:
-    """Muon for what lies between two layers of features; AdamW for stems, outputs and biases."""
+    """Muon for the matrices of convolutions and readers; AdamW for stems, maps' last layers, biases and knots."""
     outer = ("stem", "raw", "out", "hint.0")
     hidden, decay, plain = [], [], []
     for name, weight in network.named_parameters():
-        if weight.ndim <= 1:
+        if weight.ndim <= 1 or "knots" in name:
             plain.append(weight)
         elif any(part in name for part in outer):
             decay.append(weight)
@@ -368,10 +375,11 @@ def load_average(path: Path) -> tuple[model.Network, dict[str, Any]]:
 def ship(checkpoint: Path, path: Path, version: str, licence: str = "Apache-2.0") -> int:
     """Export a checkpoint's EMA weights with what is known of their training. Returns the file's bytes."""
     network, facts = load_average(checkpoint)
+    told = {"version": version, "licence": licence, "variant": network.variant}
     training = f"{facts['samples']} samples in {facts['step']} steps, {facts['elapsed'] / 60:.0f} minutes"
     if facts["begun"]:
         training += f", after {facts['begun']}"
-    return export.write(network, path, {"version": version, "licence": licence, "training": training})
+    return export.write(network, path, told | {"training": training})
 
 
 def _record(path: Path, run: Run, figures: dict[str, float]) -> None:

@@ -59,10 +59,10 @@ class Places:
 
 
 class Scene:
-    """A mesh with its materials' albedo, ready for rays of any kind."""
+    """A mesh, ready for rays of any kind."""
 
     def __init__(self, mesh: Triangles) -> None:
-        self.mesh, self.scene = mesh, EmbreeScene()
+        self.scene = EmbreeScene()
         self.size = float(np.ptp(mesh.vertices, axis=0).max())
         TriangleMesh(self.scene, mesh.vertices, mesh.faces)
         corner = mesh.vertices[mesh.faces].astype(np.float64)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from polcap.stages.cues import CHANNELS
+from polcap.stages.cues import CHANNELS, FLOOR
 
 _AT = {name: CHANNELS.index(name) for name in CHANNELS}
 _UNPOLARIZED = ("log_r", "log_g", "log_b", "mask", "clipped", "ray_x", "ray_y")
@@ -41,7 +41,7 @@ def _published(x: Tensor) -> Tensor:
 
     The pictures' polarization is the mean over the color channels, which are alike but for noise.
     """
-    s0 = torch.exp(x[:, _AT["log_r"] : _AT["log_b"] + 1]) - 0.02
+    s0 = torch.exp(x[:, _AT["log_r"] : _AT["log_b"] + 1]) - FLOOR
     s1, s2 = (x[:, _AT[name]].unsqueeze(1) / 10 for name in ("s1", "s2"))
     pictures = [s0 * (1 + part) / 2 for part in (s1, s2, -s1)]
     stokes = x[:, _AT["cos_2phi"] : _AT["sin_2phi"] + 1]

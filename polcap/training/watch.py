@@ -9,12 +9,13 @@ from torch import Tensor, nn
 from polcap import pictures
 from polcap.images import Floats
 from polcap.pictures import Picture
-from polcap.training import gbuffers, materials
+from polcap.stages.cues import FLOOR
+from polcap.training import gbuffers, loss, materials, protocol
 from polcap.training.camera import Errors
 from polcap.training.dataset import Batch, Simulator, batch
 from polcap.training.model import COLOR
 
-_FLASH = (0.0, 0.05)  # of the distance, as in protocol.py
+_FLASH = (0.0, protocol.FLASH)
 
 
 class Watch:
@@ -43,7 +44,7 @@ class Watch:
         seen = self.batches[0]
         truth = {name: getattr(seen, name) for name in ("normal", "diffuse", "specular", "roughness", "depth")}
         sides = [_drawn(maps, seen.mask) for maps in (truth, run(network, seen))]
-        light = torch.exp(seen.channels[:, COLOR].float()) * seen.mask[:, None]
+        light = (torch.exp(seen.channels[:, COLOR].float()) - FLOOR) * seen.mask[:, None]
         columns = [[pictures.display(s0, 1.0) for s0 in _arrays(light)]]
         columns += [tiles for pair in zip(*sides) for tiles in pair]
         return np.hstack([np.vstack(tiles) for tiles in columns])
@@ -71,12 +72,11 @@ def _arrays(images: Tensor) -> Floats:
 
 def held_out(data: Path, folder: Path, device: torch.device, *, views: int, size: int) -> Simulator:
     """Test meshes, test texture sets and a noise volume that training never saw; traced once into `folder`."""
-    if not (folder / "index.json").exists():
-        meshes = sorted((data / "meshes" / "test").glob("*.npz"))
-        gbuffers.build(folder, meshes, views=views, procedural=0, size=size, seed=99, flash=_FLASH)
+    meshes = sorted((data / "meshes" / "test").glob("*.npz"))
+    cache = gbuffers.cached(folder, meshes, gbuffers.Recipe(views, procedural=0, size=size, seed=99, flash=_FLASH))
     textures = data / "materials" / "test"
     library = materials.Library(textures if textures.exists() else None, device, seed=4)
-    return Simulator(gbuffers.load(folder), library, device)
+    return Simulator(cache, library, device)
 
 
 def run(network: nn.Module, batch: Batch) -> dict[str, Tensor]:
@@ -111,11 +111,6 @@ def _depth_error(depth: Tensor, batch: Batch) -> Tensor:
     """Difference of depths centred within each mask, by the truth's greatest minus least; masked pixels."""
     mask = batch.mask[:, None]
     inside = mask.float()
-    area = inside.sum(dim=(2, 3), keepdim=True).clamp(min=1)
-
-    def centred(image: Tensor) -> Tensor:
-        return image - (image * inside).sum(dim=(2, 3), keepdim=True) / area
-
     low = torch.where(mask, batch.depth, torch.inf).amin(dim=(2, 3), keepdim=True)
     high = torch.where(mask, batch.depth, -torch.inf).amax(dim=(2, 3), keepdim=True)
-    return ((centred(depth) - centred(batch.depth)) / (high - low))[mask]
+    return ((loss.centred(depth, inside) - loss.centred(batch.depth, inside)) / (high - low))[mask]

@@ -16,6 +16,8 @@ from polcap.images import Floats
 from polcap.training import gbuffers, materials, patterns, protocol, shapes
 from polcap.training.dataset import Simulator
 
+RECIPE = gbuffers.Recipe(views=6, procedural=2, size=64, seed=5, per_shape=3)
+
 
 def write_mesh(path: Path, seed: int) -> None:
     """A mesh in the data folder's format."""
@@ -69,7 +71,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def views(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("views")
-    gbuffers.build(folder, [data / "meshes" / "train" / "one.npz"], views=6, procedural=2, per_shape=3, size=64, seed=5)
+    gbuffers.build(folder, [data / "meshes" / "train" / "one.npz"], RECIPE)
     return folder
 
 

@@ -34,7 +34,7 @@ def test_perfect_camera_returns_the_stokes_parameters() -> None:
 
 
 def test_off_axis_the_angles_of_the_image_are_carried_to_the_ray() -> None:
-    """A DoLP of 1 along the ray-frame axis of a polarizer at 0° dies behind one at 90°… whose axis is across."""
+    """Light that vibrates along what the polarizer at 45° is on an oblique ray passes it whole."""
     stokes, diffuse, mask, _ = scene()
     rays = torch.nn.functional.normalize(torch.tensor([0.2, 0.15, 1.0]), dim=0).expand(B, S, S, 3)
     axis = frames.axis_on_ray(torch.tensor(torch.pi / 4), rays)

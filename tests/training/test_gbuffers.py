@@ -1,17 +1,20 @@
 """The cache of views: whole, reproducible, and true to its own conventions."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from polcap.errors import InputError
+from polcap.synth.mesh import Tracer, Triangles
 from polcap.training import gbuffers
+from tests.training.conftest import RECIPE
 
 
 def test_same_seed_traces_the_same_views(data: Path, views: Path, tmp_path: Path) -> None:
     meshes = [data / "meshes" / "train" / "one.npz"]
-    gbuffers.build(tmp_path / "again", meshes, views=6, procedural=2, per_shape=3, size=64, seed=5)
+    gbuffers.build(tmp_path / "again", meshes, RECIPE)
     first, second = gbuffers.load(views), gbuffers.load(tmp_path / "again")
     for name in first:
         np.testing.assert_array_equal(first[name], second[name])
@@ -40,3 +43,18 @@ def test_interrupted_build_is_not_taken_for_a_cache(views: Path, tmp_path: Path)
         (tmp_path / file.name).symlink_to(file)
     with pytest.raises(InputError, match="no complete G-buffer cache"):
         gbuffers.load(tmp_path)
+
+
+def test_a_cache_of_other_views_is_not_taken_for_this_one(data: Path, views: Path) -> None:
+    meshes = [data / "meshes" / "train" / "one.npz"]
+    assert gbuffers.cached(views, meshes, RECIPE)["mask"].shape[1] == RECIPE.size
+    for asked in ((meshes, replace(RECIPE, seed=6)), ([data / "meshes" / "test" / "two.npz"], RECIPE)):
+        with pytest.raises(InputError, match="views of other meshes or of another preset"):
+            gbuffers.cached(views, *asked)
+
+
+def test_a_mesh_that_no_side_shows_is_named_not_waited_for() -> None:
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 0.01, 0]], np.float32)
+    needle = Triangles(corners, np.array([[0, 1, 2]], np.int32), np.tile(np.float32([0, 0, 1]), (1, 3, 1)))
+    with pytest.raises(InputError, match="less than 6% of the picture from each of"):
+        gbuffers.seen(Tracer(needle), 32, np.random.default_rng(0))

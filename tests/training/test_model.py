@@ -54,6 +54,20 @@ def test_a_far_pixel_reaches_the_whole_object() -> None:
     assert difference[:, :, -16:, -16:].max() > 0
 
 
+def test_context_tells_every_cell_of_the_object_of_every_other() -> None:
+    torch.manual_seed(6)
+    context = model.Context(16, heads=2)
+    torch.nn.init.normal_(context.tell.weight)
+    x, inside = torch.randn(1, 16, 4, 4), torch.ones(1, 1, 4, 4)
+    inside[..., 3] = 0
+    before = context(x, inside)
+    for column, seen in ((0, True), (3, False)):  # of the object, beside it
+        changed = x.clone()
+        changed[..., 0, column] += 1
+        moved = (context(changed, inside) - before)[..., 3, 1].abs().max()
+        assert (moved > 1e-2) if seen else (moved < 1e-2)
+
+
 def test_groups_tell_alike_places_the_same() -> None:
     """What `Share` adds depends on a place's own features and the whole picture's, not on where it lies."""
     torch.manual_seed(3)

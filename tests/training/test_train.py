@@ -90,6 +90,40 @@ def test_resume_without_a_checkpoint_says_so(data: Path, tmp_path: Path, monkeyp
         train.main(train.Params(data=data, out=tmp_path, resume=True))
 
 
+def test_a_run_is_not_begun_over_another(data: Path, tmp_path: Path) -> None:
+    train.Run(TINY, torch.device("cpu"), 1e-3).save(tmp_path / "last.pt")
+    with pytest.raises(InputError, match="go on from it with --resume"):
+        train.main(train.Params(data=data, out=tmp_path))
+
+
+def test_a_run_is_resumed_as_it_began(tmp_path: Path) -> None:
+    train.Run(TINY, torch.device("cpu"), 1e-3, variant="published inputs").save(tmp_path / "last.pt")
+    for shape, variant in ((TINY, "ours"), (model.SMALL, "published inputs")):
+        with pytest.raises(InputError, match="as 'published inputs'; resume it as it began"):
+            train.Run(shape, torch.device("cpu"), 1e-3, variant=variant).load(tmp_path / "last.pt")
+
+
+def test_data_without_meshes_to_look_at_is_told_before_anything_is_made(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="meshes/test holds no mesh"):
+        train.main(train.Params(data=tmp_path, out=tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_same_seed_same_weights(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(train.PRESETS, "cpu", PRESET)
+    weights = []
+    for name, seed in (("first", 1), ("again", 1), ("other", 2)):
+        out = tmp_path / name
+        for cache in ("views", "watch"):
+            if (tmp_path / "first").exists() and name != "first":
+                (out / cache).parent.mkdir(exist_ok=True)
+                (out / cache).symlink_to(tmp_path / "first" / cache)
+        train.main(train.Params(data=data, out=out, samples=40, threads=1, seed=seed))
+        weights.append(train.load_average(out / "last.pt")[0].state_dict())
+    same, other = ([bool(torch.equal(w, weights[0][k])) for k, w in state.items()] for state in weights[1:])
+    assert all(same) and not any(other)
+
+
 def test_unknown_preset_is_named() -> None:
     with pytest.raises(InputError, match="'tpu' is not one of cpu, gpu"):
         train.main(train.Params(preset="tpu"))
@@ -128,5 +162,10 @@ def test_orthogonal_keeps_directions_and_levels_strengths(shape: tuple[int, int]
 
 def test_every_weight_is_in_one_optimizer() -> None:
     network = train.model.Network(TINY)
-    held = [w for o in train._optimizers(network, 1e-3) for g in o.param_groups for w in g["params"]]
+    optimizers = train._optimizers(network, 1e-3)
+    held = [w for o in optimizers for g in o.param_groups for w in g["params"]]
     assert sorted(map(id, held)) == sorted(map(id, network.parameters()))
+    name = {id(w): name for name, w in network.named_parameters()}
+    muon = {name[id(w)] for w in optimizers[0].param_groups[0]["params"]}
+    assert {"down.0.weight", "profiles.read.0.weight", "geometry.skip.0.weight"} <= muon
+    assert not muon & {"stem.weight", "recolor.knots", "gloss.out.weight", "gloss.raw.weight", "stem.bias"}
