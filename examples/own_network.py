@@ -25,5 +25,5 @@ tiny = model.Shape((8, 16, 16, 16, 16), (8, 8, 16, 16), (8, 8, 8, 8), (8, 8, 8, 
 train.PRESETS["cpu"] = train.Preset(tiny, 4, 1, 64, (32, 64), (0.5, 0.5), (0.2, 0.8), 4 * 64**2)
 own = train.main(train.Params(data=out / "data", out=out / "mine", minutes=10 / 60, threads=1))
 
-polcap = [sys.executable, "-m", "polcap", "process", source, "--model", own, "--out", out / "result"]
+polcap = [sys.executable, "-m", "polcap", "process", str(source), "--model", str(own), "--out", str(out / "result")]
 sys.exit(subprocess.run(polcap).returncode)

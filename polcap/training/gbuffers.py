@@ -157,7 +157,7 @@ def seen(tracer: Tracer, size: int, rng: np.random.Generator) -> tuple[GBuffer, 
         The mesh covers too little of the picture from all sides tried.
     """
     for _ in range(_TRIES):
-        rotation, translation, view = _pose(tracer.mesh, size, rng)
+        rotation, translation, view = pose(tracer.mesh, size, rng)
         buffer = tracer.trace(rotation, translation, view, size, size)
         if buffer.mask.mean() >= LEAST_SHARE:
             return buffer, rotation, translation
@@ -166,7 +166,7 @@ def seen(tracer: Tracer, size: int, rng: np.random.Generator) -> tuple[GBuffer, 
     )
 
 
-def _pose(mesh: Triangles, size: int, rng: np.random.Generator) -> tuple[Floats, Floats, View]:
+def pose(mesh: Triangles, size: int, rng: np.random.Generator) -> tuple[Floats, Floats, View]:
     """Random turn, crop's field of view 5–35°, up to 12° off axis, object filling 60–95 % of the crop."""
     while True:
         rotation = shapes.rotation(rng)

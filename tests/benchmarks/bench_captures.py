@@ -57,6 +57,7 @@ def measure(truth_file: Path, network: Network | None) -> list[float]:
 def capture_errors(found: Results, capture: Capture, told: dict, meta: dict) -> list[float]:  # type: ignore[type-arg]
     """Chart centres and alignment [RAW px, worst], gains and bracket ratios [%, worst]."""
     centers = (np.array(meta["chart"]["patch_corners_px"]) - 1).mean(1) / 2  # their pixel centres lie at .5
+    assert found.color.value.quads is not None
     chart = 2 * np.linalg.norm(found.color.value.quads.mean(1) - centers, axis=1).max()
 
     files = {shot["file"].split("/", 1)[1]: shot for shot in told["shots"]}

@@ -12,17 +12,21 @@ import importlib
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any, TypeVar
 from unittest.mock import MagicMock
 
 import numpy as np
 import rawpy
 
 from polcap.formats import dng
-from polcap.images import Capture, Exif, Frame, SensorImage, Shot
+from polcap.images import Capture, Exif, Floats, Frame, SensorImage, Shot
 from polcap.optics import demosaic
 from polcap.stages import hdr
 
+T = TypeVar("T")
 RGGB = np.array([[0, 1], [1, 2]], np.uint8)
 BLACK, WHITE, READ, GAIN = 512, 15871, 3.0, 2.0
 SIZE = (1536, 2304)
@@ -42,23 +46,24 @@ def main(folder: str) -> None:
             compare(title, theirs, quads, exposures, jitter, Path(place))
 
 
-def load_hdrutils(folder: str):
+def load_hdrutils(folder: str) -> Any:
     sys.path.insert(0, folder)
     for name in ("imageio", "imageio.v3", "pyexr", "tqdm", "skimage", "matplotlib", "matplotlib.pyplot"):
         try:
             importlib.import_module(name)
         except ImportError:
-            sys.modules[name] = MagicMock()
+            shallow = MagicMock()
             if name == "tqdm":
-                sys.modules[name].tqdm = lambda items, **_: items
-                sys.modules[name].trange = lambda n, **_: range(n)
+                shallow.tqdm = lambda items, **_: items
+                shallow.trange = lambda n, **_: range(n)
+            sys.modules[name] = shallow
     binned = MagicMock()
     binned.demosaicing_CFA_Bayer_bilinear = lambda mosaic, pattern: demosaic.superpixel(mosaic, RGGB)
     sys.modules["colour_demosaicing"] = binned
     return importlib.import_module("HDRutils.merge")
 
 
-def compare(title, theirs, quads, exposures, jitter, place: Path) -> None:
+def compare(title: str, theirs: Any, quads: Floats, exposures: tuple[float, ...], jitter: float, place: Path) -> None:
     rng = np.random.default_rng(1)
     paths, true = [], []
     for k, exposure in enumerate(exposures):
@@ -80,10 +85,10 @@ def compare(title, theirs, quads, exposures, jitter, place: Path) -> None:
     truth = quads * true[reference] / GAIN / (WHITE - BLACK)
     clear = (stack.quality[0] & 1) == 0
     print(f"\n{title}: exposures {exposures}, {SIZE[0] * SIZE[1] / 1e6:.1f} MP")
-    rows = {"polcap": (stack.value[0], ours_s)}
+    rows: dict[str, tuple[Floats, float]] = {"polcap": (stack.value[0], ours_s)}
     for name, estimate in (("HDRutils, EXIF times", None), ("HDRutils, estimated (mst)", "mst")):
         options = {"demosaic_first": False, "color_space": "raw", "estimate_exp": estimate}
-        (image, _), seconds = timed(lambda options=options: theirs.merge([str(p) for p in paths], **options))
+        (image, _), seconds = timed(partial(theirs.merge, [str(p) for p in paths], **options))
         scale = truth[clear].sum() / image[clear].sum()  # its unit is free: the best scale is given to it
         rows[name] = (image * scale, seconds)
     heads = ["from 20 e⁻ up", *(f"{band:g} e⁻" for band in BANDS)]
@@ -112,7 +117,7 @@ def frame(path: Path, seconds: float) -> Frame:
     return Frame(str(path), Exif(exposure_time=seconds, iso=100.0), "shot", "", load)
 
 
-def timed(work):
+def timed(work: Callable[[], T]) -> tuple[T, float]:
     work()  # once for warming up
     start = time.process_time()
     result = work()

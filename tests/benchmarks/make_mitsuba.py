@@ -57,7 +57,7 @@ def main() -> None:
         began = time.monotonic()
         made, about = build(mi, gbuffers.read_mesh(mesh), texture, options.size, options.depth, random)
         with atomic.path(file) as temporary:
-            np.savez_compressed(temporary, about=json.dumps(about), **made)
+            np.savez_compressed(temporary, allow_pickle=False, about=np.array(json.dumps(about)), **made)
         print(file.name, json.dumps(about), f"{time.monotonic() - began:.0f} s", flush=True)
 
 
@@ -109,7 +109,8 @@ def build(
 
 def subdivided(mesh: Triangles) -> tuple[Floats, Floats]:
     """Corners (F, 3, 3) and their normals, each triangle cut in four until there are enough."""
-    corner, normal = mesh.vertices[mesh.faces].astype(np.float64), mesh.corner_normals.astype(np.float64)
+    corner: Floats = mesh.vertices[mesh.faces].astype(np.float64)
+    normal: Floats = mesh.corner_normals.astype(np.float64)
     while len(corner) < FACES:
         corner, normal = (_quartered(value) for value in (corner, normal))
     return corner, normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
