@@ -68,7 +68,7 @@ def compare(title: str, theirs: Any, quads: Floats, exposures: tuple[float, ...]
     paths, true = [], []
     for k, exposure in enumerate(exposures):
         true.append(exposure * (1 + jitter * rng.normal()))
-        light = np.empty(SIZE)
+        light: Floats = np.empty(SIZE)
         for i, j in np.ndindex(2, 2):
             light[i::2, j::2] = quads[..., RGGB[i, j]] * true[-1]
         counts = (rng.poisson(light) + rng.normal(0, READ, SIZE)) / GAIN + BLACK
