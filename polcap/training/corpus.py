@@ -69,9 +69,9 @@ def sample(
 ) -> tuple[dict[str, Floats], dict[str, Any]]:
     """Pictures by file name, as numbers, and sample.json. Without mesh `files` the shape is random."""
     rng = np.random.default_rng([recipe.seed, number])
-    read = gbuffers.read_mesh
-    mesh = centred(read(files[rng.integers(len(files))])) if files else shapes.compose(rng)
-    buffer, turn, _ = gbuffers.seen(Tracer(mesh), recipe.size, rng)
+    file = files[rng.integers(len(files))] if files else None
+    mesh = centred(gbuffers.read_mesh(file)) if file else shapes.compose(rng)
+    buffer, turn, _ = gbuffers.seen(str(file or "a random shape"), Tracer(mesh), recipe.size, rng)
     mask, view = buffer.mask, buffer.view
     middle, unit = gbuffers.depth_unit(mask, buffer.depth, view.focal)
     rays = frames.rays(view, *mask.shape)
@@ -131,11 +131,13 @@ def _library(material: str) -> materials.Library:
 
 def _meshes(mesh: str) -> list[Path]:
     """The files to take from; none for random shapes."""
+    if not mesh:
+        return []
     place = Path(mesh)
-    files = sorted(p for p in place.iterdir() if p.suffix != ".json") if mesh and place.is_dir() else [place]
+    files = sorted(p for p in place.iterdir() if p.suffix != ".json") if place.is_dir() else [place]
     if not files:
         raise InputError(f"{place} holds no mesh; give a file or a folder of them")
-    return files if mesh else []
+    return files
 
 
 def _photographs(light: Floats, rays: Floats, noise: float, rng: np.random.Generator) -> Floats:

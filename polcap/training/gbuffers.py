@@ -131,16 +131,16 @@ Traced = tuple[GBuffer, transport.Pose, NDArray[np.bool_], NDArray[np.uint16]]  
 def _traced(meshes: list[Path], recipe: Recipe) -> Iterator[Traced]:
     for path in meshes:
         rng = np.random.default_rng([recipe.seed, zlib.crc32(path.stem.encode())])
-        yield from _look(read_mesh(path), recipe.views, recipe, rng)
+        yield from _look(str(path), read_mesh(path), recipe.views, recipe, rng)
     for shape in range(recipe.procedural):
         rng = np.random.default_rng([recipe.seed, 7, shape])
-        yield from _look(shapes.compose(rng), recipe.per_shape, recipe, rng)
+        yield from _look(f"random shape {shape}", shapes.compose(rng), recipe.per_shape, recipe, rng)
 
 
-def _look(mesh: Triangles, count: int, recipe: Recipe, rng: np.random.Generator) -> Iterator[Traced]:
+def _look(name: str, mesh: Triangles, count: int, recipe: Recipe, rng: np.random.Generator) -> Iterator[Traced]:
     tracer, scene = Tracer(mesh), transport.Scene(mesh)
     for _ in range(count):
-        buffer, rotation, translation = seen(tracer, recipe.size, rng)
+        buffer, rotation, translation = seen(name, tracer, recipe.size, rng)
         way, off = rng.uniform(0, 2 * np.pi), rng.uniform(0, _ASIDE)
         aside = (off * np.cos(way), off * np.sin(way)) if recipe.flash is None else recipe.flash
         middle = float(buffer.depth[buffer.mask].mean(dtype=np.float64))
@@ -148,7 +148,7 @@ def _look(mesh: Triangles, count: int, recipe: Recipe, rng: np.random.Generator)
         yield buffer, placed, *bounce.visibility(scene, buffer, placed, rng)
 
 
-def seen(tracer: Tracer, size: int, rng: np.random.Generator) -> tuple[GBuffer, Floats, Floats]:
+def seen(name: str, tracer: Tracer, size: int, rng: np.random.Generator) -> tuple[GBuffer, Floats, Floats]:
     """The mesh from a random side, with that side's rotation (3, 3) and translation (3,).
 
     Raises
@@ -162,7 +162,7 @@ def seen(tracer: Tracer, size: int, rng: np.random.Generator) -> tuple[GBuffer, 
         if buffer.mask.mean() >= LEAST_SHARE:
             return buffer, rotation, translation
     raise InputError(
-        f"a mesh covers less than {LEAST_SHARE:.0%} of the picture from each of {_TRIES} sides; give a less thin one"
+        f"{name} covers less than {LEAST_SHARE:.0%} of the picture from each of {_TRIES} sides; give a less thin mesh"
     )
 
 

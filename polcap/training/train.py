@@ -3,7 +3,7 @@
 The budget is a length of time, so that a run ends when it is meant to on any machine, or a number of
 pictures, so that runs can be compared. The learning rate holds for 20 % of it and falls to nothing over the
 rest. A run that was stopped goes on from its last checkpoint with what was left. With a budget of pictures
-the weights follow, on one machine, from the seed.
+the weights of a run in one piece follow, on one machine, from the seed.
 """
 
 import csv
