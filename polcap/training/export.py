@@ -3,7 +3,6 @@
 The stored halves are widened when the model is opened, so arithmetic stays fp32.
 """
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
 from polcap.errors import InputError
+from polcap.formats import atomic
 from polcap.formats.onnx import ENCODING
 from polcap.stages.cues import CHANNELS
 from polcap.training import model
@@ -28,17 +28,8 @@ _GREATEST_IR = 10  # what onnxruntime 1.20 and later read
 
 def write(network: model.Network, path: Path, facts: Mapping[str, str]) -> int:
     """Export to `path`; `facts` joins the metadata (licence, version, training…). Returns its bytes."""
-    beside = path.with_suffix(".part")
     side = 2 * model.SIZE_MULTIPLE
     dynamic = {name: {2: "height", 3: "width"} for name in ("channels", *model.OUTPUTS)}
-    torch.onnx.export(
-        _Ordered(network.eval().float()), (torch.zeros(1, len(CHANNELS), side, side),), str(beside),
-        input_names=["channels"], output_names=list(model.OUTPUTS), dynamic_axes=dynamic,
-        opset_version=OPSET, dynamo=False, do_constant_folding=False,  # that would take weights' names
-    )  # fmt: skip
-    graph = onnx.load(str(beside))
-    _halve(graph)
-    graph.ir_version = min(graph.ir_version, _GREATEST_IR)
     metadata = {
         "channels": ",".join(CHANNELS), "encoding": ENCODING, "native_size": str(NATIVE_SIZE),
         "size_multiple": str(model.SIZE_MULTIPLE),
@@ -46,10 +37,18 @@ def write(network: model.Network, path: Path, facts: Mapping[str, str]) -> int:
         "in radii of the disc that covers as many pixels as the object; diffuse, specular: linear; "
         "roughness: perceptual; sigma: expected normal error, degrees",
     }  # fmt: skip
-    helper.set_model_props(graph, metadata | dict(facts))
-    onnx.checker.check_model(graph)
-    onnx.save(graph, str(beside))
-    os.replace(beside, path)
+    with atomic.path(path) as beside:
+        torch.onnx.export(
+            _Ordered(network.eval().float()), (torch.zeros(1, len(CHANNELS), side, side),), str(beside),
+            input_names=["channels"], output_names=list(model.OUTPUTS), dynamic_axes=dynamic,
+            opset_version=OPSET, dynamo=False, do_constant_folding=False,  # that would take weights' names
+        )  # fmt: skip
+        graph = onnx.load(str(beside))
+        _halve(graph)
+        graph.ir_version = min(graph.ir_version, _GREATEST_IR)
+        helper.set_model_props(graph, metadata | dict(facts))
+        onnx.checker.check_model(graph)
+        onnx.save(graph, str(beside))
     return path.stat().st_size
 
 
