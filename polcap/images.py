@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.floating[Any]]
 Bits = NDArray[np.uint8]
 Role = Literal["shot", "ambient", "repeat", "chart", "cross"]
+NOT_IN_KEY = {"in_key": False}  # metadata of a field that says where or how, not what: two values are one input
 
 
 class Quality(IntFlag):
@@ -75,11 +76,11 @@ class SensorImage:
 class Frame:
     """One photograph of a capture, read when asked for."""
 
-    path: str
+    path: str = field(metadata=NOT_IN_KEY)
     exif: Exif
     role: Role
     digest: str  # of the file's bytes
-    load: Callable[[], SensorImage] = field(compare=False, repr=False)
+    load: Callable[[], SensorImage] = field(compare=False, repr=False, metadata=NOT_IN_KEY)
     exposure: float | None = None  # stated in capture.toml; relative; overrides EXIF
 
 
@@ -100,8 +101,8 @@ class Shot:
 class Capture:
     """A folder of photographs as understood."""
 
-    name: str
-    folder: str
+    name: str = field(metadata=NOT_IN_KEY)
+    folder: str = field(metadata=NOT_IN_KEY)
     shots: tuple[Shot, ...]  # (K,), the first is the reference
     layout: Literal["folders", "toml", "flat", "sensor"]
     focal_px: float  # in visible RAW pixels
@@ -109,7 +110,7 @@ class Capture:
     principal_px: tuple[float, float]  # in visible RAW pixels
     size_px: tuple[int, int]  # width, height, visible RAW pixels
     chart_frames: tuple[Frame, ...] = ()
-    notes: tuple[str, ...] = ()  # what was assumed, one line each
+    notes: tuple[str, ...] = field(default=(), metadata=NOT_IN_KEY)  # what was assumed, one line each
 
     @property
     def angle(self) -> Floats:
@@ -243,7 +244,9 @@ class Cues:
 class Network:
     """A loaded model: what it computes, and what its file says of itself."""
 
-    run: Callable[[Floats], dict[str, Floats]] = field(compare=False, repr=False)  # (1, N, H, W) → name → (1, n, H, W)
+    run: Callable[[Floats], dict[str, Floats]] = field(  # (1, N, H, W) → name → (1, n, H, W)
+        compare=False, repr=False, metadata=NOT_IN_KEY
+    )
     digest: str
     channels: tuple[str, ...]  # names of stages/cues.py, in order
     metadata: Mapping[str, str]

@@ -102,7 +102,7 @@ def process(
         sweep(out)
         results = path(capture, given, config, store)
         _remember(out, capture, config, given.network)
-        store.settle(until)
+        store.materialize(until)
         if until is not None:
             return None
         progress("write", None, False)

@@ -35,7 +35,7 @@ from polcap.images import (
     StokesImage,
     SurfaceMaps,
 )
-from polcap.store import Kept
+from polcap.store import StageResult
 
 State = Literal["pass", "fail", "warn", "not measured"]
 
@@ -44,16 +44,16 @@ State = Literal["pass", "fail", "warn", "not measured"]
 class Results:
     """Every result of the path; each is found or computed when its value is asked for."""
 
-    radiance: Kept[AngleStack]
-    color: Kept[ColorCalibration]
-    alignment: Kept[Alignment]
-    object_: Kept[ObjectMask]
-    gains: Kept[Gains]
-    stokes: Kept[StokesImage]
-    cues: Kept[Cues]
-    maps: Kept[SurfaceMaps]
-    mesh: Kept[Mesh]
-    asset: Kept[Asset]
+    radiance: StageResult[AngleStack]
+    color: StageResult[ColorCalibration]
+    alignment: StageResult[Alignment]
+    object_: StageResult[ObjectMask]
+    gains: StageResult[Gains]
+    stokes: StageResult[StokesImage]
+    cues: StageResult[Cues]
+    maps: StageResult[SurfaceMaps]
+    mesh: StageResult[Mesh]
+    asset: StageResult[Asset]
 
     def picture(self, stage: str) -> pictures.Picture:
         """What a stage made, for a person to look at."""

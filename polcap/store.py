@@ -1,7 +1,7 @@
 """In: a stage and its inputs. Out: its result, computed once and kept in the result folder.
 
-Nothing is computed when a step is declared: a `Kept` knows its key and finds its value when it is
-asked for. So one description of the path serves a run, a dry run, `--until` and `show`.
+Nothing is computed when a step is declared: a `StageResult` knows its key and finds its value when it
+is asked for. So one description of the path serves a run, a dry run, `--until` and `show`.
 
 The key of a result is a digest of the stage's name, its version, its own settings and the keys of
 its inputs, chained back to the bytes of the RAW files and of the model file. Where files lie is not
@@ -9,35 +9,35 @@ part of it: a capture may be moved. A result is one folder, `work/NN-name/`: an 
 a `manifest.json`. Folders are written beside, fsynced and renamed, so a killed run leaves a whole
 result or none. Arrays come back as read-only memory maps, the first time as after a resume.
 
-Each file's size and BLAKE2b digest are checked once per process, when a stage that has to run (or a
-writer) first opens the result; what nobody reads is not hashed. That is one pass at about 1 GB/s.
-A result that fails the check is computed again.
+The manifest carries its own digest, so an edited scalar is seen as an edited pixel is. Each array's size
+and BLAKE2b digest are checked once per process, when a stage that has to run (or a writer) first opens
+the result; what nobody reads is not hashed. That is one pass at about 1 GB/s. A result that fails any
+check is computed again.
 """
 
-import fcntl
-import io
+import inspect
 import json
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass
-from enum import IntEnum, IntFlag
+from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cached_property
 from hashlib import blake2b
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, Generic, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import Any, Generic, TypeVar, get_type_hints
 
 import msgspec
 import numpy as np
+from filelock import FileLock, Timeout
 
 from polcap.errors import StorageError
-from polcap.formats import atomic
+from polcap.formats import atomic, npy_folder
 from polcap.stages import Stage
 
 T = TypeVar("T")
-FORMAT = 1  # of work/; raised when older folders can no longer be read
-WHERE = ("path", "folder", "name", "notes")  # fields that say where or how, not what: never part of a key
+FORMAT = 2  # of work/; raised when older folders can no longer be read
+UNDIGESTED = ("seconds", "digest")  # of a manifest: no two runs take the same time
 Progress = Callable[[str, float | None, bool], None]  # stage, seconds (None: begins), found in the cache
 
 
@@ -45,180 +45,232 @@ def silent(stage: str, seconds: float | None, cached: bool) -> None:
     """The progress of someone who does not look."""
 
 
-@dataclass
-class Kept(Generic[T]):
-    """The result of a step: its key now, its value when asked for."""
+class Result(Generic[T]):
+    """A value of the path: its key now, the value when asked for."""
 
-    name: str
-    key: str
-    settings: msgspec.Struct | None
-    find: Callable[[], T]
-    stored: Callable[[], bool]  # a whole result with this key lies in the folder
-    keep: bool
+    def __init__(self, key: str) -> None:
+        self.key = key
+
+    @cached_property
+    def value(self) -> T:
+        """Found or computed at the first asking."""
+        return self.find()
+
+    def find(self) -> T:
+        raise NotImplementedError
+
+
+class Derived(Result[T]):
+    """A small value made from results; not a stage, never kept."""
+
+    def __init__(self, key: str, function: Callable[..., T], inputs: tuple[Any, ...]) -> None:
+        super().__init__(key)
+        self.function = function
+        self.inputs = inputs
+
+    def find(self) -> T:
+        return self.function(*map(value_of, self.inputs))
+
+
+@dataclass(frozen=True)
+class Run:
+    """What all results of one store share."""
+
+    progress: Progress
+    fresh: set[str] = field(default_factory=set)  # keys that --force has declared stale in this process
+
+
+class StageResult(Result[T]):
+    """The result of a stage, kept in a folder of its own."""
+
+    def __init__(
+        self,
+        key: str,
+        stage: Stage[..., T],
+        inputs: tuple[Any, ...],
+        config: msgspec.Struct | None,
+        place: Path,
+        run: Run,
+    ) -> None:
+        super().__init__(key)
+        self.stage = stage
+        self.inputs = inputs
+        self.config = config
+        self.place = place
+        self.run = run
 
     @property
-    def value(self) -> T:
-        if not hasattr(self, "_value"):
-            self._value = self.find()
-        return self._value
+    def name(self) -> str:
+        return self.stage.name
+
+    @property
+    def keep(self) -> bool:
+        return self.stage.keep
 
     @property
     def ready(self) -> bool:
-        return hasattr(self, "_value") or self.stored()
+        """The value is known, or a whole manifest with this key lies in the folder."""
+        return "value" in vars(self) or self.stored()
 
-    def settle(self) -> None:
-        """See to it that the result exists; a result that is not kept waits until it is needed."""
+    def stored(self) -> bool:
+        return self.keep and self.key not in self.run.fresh and manifest(self.place).get("key") == self.key
+
+    def materialize(self) -> None:
+        """See to it that the result exists; one that is not kept waits until it is needed."""
         if self.keep and not self.ready:
             _ = self.value
+
+    def find(self) -> T:
+        if self.stored():
+            try:
+                result: T = read(self.place, returns(self.stage))
+                return result
+            except StorageError:  # damaged: nothing is lost but time
+                pass
+        return self.compute()
+
+    def compute(self) -> T:
+        values = [*map(value_of, self.inputs), *(() if self.config is None else (self.config,))]
+        self.run.progress(self.name, None, False)
+        start = time.perf_counter()
+        result = self.stage(*values)
+        if self.keep:
+            self.write(result, time.perf_counter() - start)
+            self.run.fresh.discard(self.key)
+            result = read(self.place, returns(self.stage), check=False)
+        else:
+            npy_folder.freeze(result)
+        self.run.progress(self.name, time.perf_counter() - start, False)
+        return result
+
+    def write(self, result: T, seconds: float) -> None:
+        """Put a result into its folder, whole or not at all."""
+        with atomic.folder(self.place) as temporary:
+            arrays: npy_folder.Arrays = {}
+            tree = npy_folder.encode(result, "value", arrays)
+            files = {f"{name}.npy": npy_folder.save(temporary / f"{name}.npy", a) for name, a in arrays.items()}
+            about = {
+                "format": FORMAT,
+                "stage": self.name,
+                "version": self.stage.version,
+                "key": self.key,
+                "settings": msgspec.to_builtins(self.config),
+                "inputs": [key_of(value) for value in self.inputs],
+                "seconds": round(seconds, 3),
+                "files": files,
+                "value": tree,
+            }
+            text = json.dumps({**about, "digest": seal(about)}, indent=1, allow_nan=False)
+            (temporary / "manifest.json").write_text(text, encoding="utf-8")
+
+
+class ArchivedResult(StageResult[T]):
+    """A kept result of a run whose photographs are gone: taken as it is, whatever its key."""
+
+    def stored(self) -> bool:
+        return self.keep and bool(manifest(self.place))
+
+    def find(self) -> T:
+        if self.keep:
+            result: T = read(self.place, returns(self.stage))
+            return result
+        return self.compute()
 
 
 class Store:
     """The stage cache of one result folder, `folder/work`."""
 
+    result: type[StageResult[Any]] = StageResult
+
     def __init__(self, folder: Path, progress: Progress = silent, force: str | None = None) -> None:
         self.work = folder / "work"
-        self.progress = progress
+        self.run = Run(progress)
         self.force = force
-        self.steps: list[Kept[Any]] = []
-        self._fresh: set[str] = set()  # keys that --force has declared stale in this process
+        self.steps: list[StageResult[Any]] = []
 
     @contextmanager
     def lock(self) -> Iterator[None]:
         """Keep other processes out of this result folder.
 
-        The kernel drops the lock when its owner dies, however it dies: there are no stale locks.
+        The system drops the lock when its owner dies, however it dies: there are no stale locks.
 
         Raises
         ------
         StorageError
             Another process works here, or the folder cannot be written.
         """
-        file = self.work / "lock"
+        lock, owner = FileLock(self.work / "lock", timeout=0), self.work / "owner"
         try:
             self.work.mkdir(parents=True, exist_ok=True)
-            handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
-        except OSError as error:
-            raise atomic.failure(file, error) from error
-        try:
-            self._seize(handle)
-            for left in [*self.work.glob(".*.part"), *self.work.glob(".*.old")]:  # of a killed run
-                atomic.discard(left)
-            yield
-        finally:
-            os.close(handle)
-
-    def _seize(self, handle: int) -> None:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            os.ftruncate(handle, 0)
-            os.pwrite(handle, str(os.getpid()).encode(), 0)
-        except BlockingIOError as error:
-            owner = os.pread(handle, 20, 0).decode(errors="replace") or "unknown"
+            lock.acquire()
+        except Timeout as error:
             raise StorageError(
-                f"{self.work.parent}: process {owner} is working here; wait for it or choose another --out"
+                f"{self.work.parent}: process {_first_line(owner)} is working here; wait for it or choose another --out"
             ) from error
         except OSError as error:
             raise atomic.failure(self.work / "lock", error) from error
+        try:
+            with atomic.path(owner) as temporary:
+                temporary.write_text(f"{os.getpid()}\n", encoding="utf-8")
+            for left in [*self.work.glob(".*.part*"), *self.work.glob(".*.old")]:  # of a killed run
+                atomic.discard(left)
+            yield
+        finally:
+            lock.release()
 
-    def step(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> Kept[T]:
-        """Declare the next step of the path; inputs are other steps' results or plain values."""
-        keys = [_key(value) for value in inputs]
-        key = digest([FORMAT, stage.name, stage.version, msgspec.to_builtins(config), keys])
-        upstream = {value.key for value in inputs if isinstance(value, Kept)}
-        if stage.name == self.force or upstream & self._fresh:
-            self._fresh.add(key)
+    def step(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
+        """Declare the next step of the path; inputs are other results or plain values."""
+        key = digest([FORMAT, stage.name, stage.version, msgspec.to_builtins(config), list(map(key_of, inputs))])
+        if stage.name == self.force or self._stale(inputs):
+            self.run.fresh.add(key)
         place = self.work / f"{len(self.steps) + 1:02d}-{stage.name}"
-        given = () if config is None else (config,)
+        result = self.result(key, stage, inputs, config, place, self.run)
+        self.steps.append(result)
+        return result
 
-        def compute() -> T:
-            values = [value.value if isinstance(value, Kept) else value for value in inputs]
-            self.progress(stage.name, None, False)
-            start = time.perf_counter()
-            result = stage(*values, *given)
-            if stage.keep:
-                seconds = time.perf_counter() - start
-                self._write(place, stage, key, config, inputs, result, seconds)
-                self._fresh.discard(key)
-                result = read(place, returns(stage), check=False)
-            else:
-                freeze(result)
-            self.progress(stage.name, time.perf_counter() - start, False)
-            return result
+    def derive(self, function: Callable[..., T], *inputs: Any) -> Derived[T]:
+        """A small value made from results, for the next step to take.
 
-        def stored() -> bool:
-            return stage.keep and key not in self._fresh and manifest(place).get("key") == key
+        Its key holds the function's source text: an edited function makes what follows anew.
+        """
+        key = digest(["derived", function.__qualname__, inspect.getsource(function), list(map(key_of, inputs))])
+        if self._stale(inputs):
+            self.run.fresh.add(key)
+        return Derived(key, function, inputs)
 
-        def find() -> T:
-            if stored():
-                try:
-                    result: T = read(place, returns(stage))
-                    return result
-                except StorageError:  # damaged: nothing is lost but time
-                    pass
-            return compute()
-
-        kept = Kept(stage.name, key, config, find, stored, stage.keep)
-        self.steps.append(kept)
-        return kept
-
-    def derive(self, function: Callable[..., T], *inputs: Any) -> Kept[T]:
-        """A small value made from results, for the next step to take; not a stage, never kept."""
-
-        def find() -> T:
-            return function(*(value.value if isinstance(value, Kept) else value for value in inputs))
-
-        key = digest(["derived", function.__qualname__, [_key(value) for value in inputs]])
-        if {value.key for value in inputs if isinstance(value, Kept)} & self._fresh:
-            self._fresh.add(key)
-        return Kept(function.__name__, key, None, find, lambda: False, False)
-
-    def settle(self, until: str | None = None) -> None:
+    def materialize(self, until: str | None = None) -> None:
         """Compute what is missing, in order, up to and with the stage `until`."""
-        for kept in self.steps:
-            if kept.keep and kept.ready:
-                self.progress(kept.name, 0.0, True)
-            kept.settle()
-            if kept.name == until:
-                _ = kept.value  # also where it is not kept, so that its errors show
+        for result in self.steps:
+            if result.keep and result.ready:
+                self.run.progress(result.name, 0.0, True)
+            result.materialize()
+            if result.name == until:
+                _ = result.value  # also where it is not kept, so that its errors show
                 return
 
-    def _write(
-        self,
-        place: Path,
-        stage: Stage[..., T],
-        key: str,
-        config: msgspec.Struct | None,
-        inputs: tuple[Any, ...],
-        result: T,
-        seconds: float,
-    ) -> None:
-        with atomic.folder(place) as temporary:
-            arrays: dict[str, np.ndarray[Any, Any]] = {}
-            tree = encode(result, "value", arrays)
-            files = {}
-            for name, array in arrays.items():
-                files[f"{name}.npy"] = save(temporary / f"{name}.npy", array)
-            about = {
-                "stage": stage.name,
-                "version": stage.version,
-                "key": key,
-                "settings": msgspec.to_builtins(config),
-                "inputs": [_key(value) for value in inputs],
-                "seconds": round(seconds, 3),
-                "files": files,
-                "value": tree,
-            }
-            text = json.dumps(about, indent=1, allow_nan=False)
-            (temporary / "manifest.json").write_text(text, encoding="utf-8")
+    def _stale(self, inputs: tuple[Any, ...]) -> bool:
+        return any(isinstance(value, Result) and value.key in self.run.fresh for value in inputs)
+
+
+class Archive(Store):
+    """A finished result folder opened again without its capture: what was kept is taken as it is."""
+
+    result = ArchivedResult
 
 
 def manifest(place: Path) -> dict[str, Any]:
-    """What a kept result says of itself; empty where there is none, or it is not whole."""
+    """What a kept result says of itself; empty where there is none, or it is not what was written."""
     try:
         about = json.loads((place / "manifest.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        whole = isinstance(about, dict) and about.get("format") == FORMAT and about.get("digest") == seal(about)
+    except (OSError, ValueError, RecursionError):
         return {}
-    return about if isinstance(about, dict) else {}
+    return about if whole else {}
+
+
+def seal(about: Mapping[str, Any]) -> str:
+    """Digest of a manifest's own text."""
+    return digest({name: value for name, value in about.items() if name not in UNDIGESTED})
 
 
 def read(place: Path, hint: Any, check: bool = True) -> Any:
@@ -227,19 +279,19 @@ def read(place: Path, hint: Any, check: bool = True) -> Any:
     Raises
     ------
     StorageError
-        A file is missing or its bytes are not those that were written.
+        There is none of this cache format, a file is missing, or bytes are not those that were written.
     """
     about = manifest(place)
-    for name, expected in about.get("files", {}).items() if check else ():
+    if not about:
+        raise StorageError(f"{place}: no whole result of this polcap's cache format {FORMAT}; run `polcap process`")
+    for name, expected in about["files"].items() if check else ():
         try:
-            found = checksum(place / name)
+            found = npy_folder.checksum(place / name)
         except OSError:
             found = None
         if found != expected:
             raise StorageError(f"{place / name} is damaged; delete {place} and run again")
-    if "value" not in about:
-        raise StorageError(f"{place}: no result here; run `polcap process` again")
-    return decode(about["value"], hint, place)
+    return npy_folder.decode(about["value"], hint, place)
 
 
 def returns(stage: Stage[..., Any]) -> Any:
@@ -247,22 +299,19 @@ def returns(stage: Stage[..., Any]) -> Any:
     return get_type_hints(stage.function)["return"]
 
 
-def checksum(file: Path) -> list[Any]:
-    """Size in bytes and BLAKE2b digest of a file."""
-    summed = blake2b(digest_size=16)
-    with file.open("rb") as stream:
-        while block := stream.read(1 << 22):
-            summed.update(block)
-    return [file.stat().st_size, summed.hexdigest()]
-
-
 def digest(value: Any) -> str:
     """Key of plain, nested data."""
     return blake2b(json.dumps(value, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
-def _key(value: Any) -> str:
-    return value.key if isinstance(value, Kept) else digest(fingerprint(value))
+def value_of(value: Any) -> Any:
+    """What a stage is given for an input."""
+    return value.value if isinstance(value, Result) else value
+
+
+def key_of(value: Any) -> str:
+    """What an input puts into the keys of what is made from it."""
+    return value.key if isinstance(value, Result) else digest(fingerprint(value))
 
 
 def fingerprint(value: Any) -> Any:
@@ -272,7 +321,7 @@ def fingerprint(value: Any) -> Any:
         summed = blake2b(solid.data.cast("B") if solid.size else b"", digest_size=16)
         return [str(solid.dtype), list(solid.shape), summed.hexdigest()]
     if is_dataclass(value) and not isinstance(value, type):
-        facts = [field.name for field in fields(value) if field.compare and field.name not in WHERE]
+        facts = [one.name for one in fields(value) if one.metadata.get("in_key", True)]
         return [type(value).__name__, {name: fingerprint(getattr(value, name)) for name in facts}]
     if isinstance(value, Mapping):
         return {str(name): fingerprint(item) for name, item in value.items()}
@@ -283,89 +332,6 @@ def fingerprint(value: Any) -> Any:
     if value is None or isinstance(value, (str, int, bool)):
         return value
     raise TypeError(f"a {type(value).__name__} cannot be an input of a stage")
-
-
-def encode(value: Any, name: str, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
-    """JSON for a value of images.py; its arrays go into `arrays` under dotted names."""
-    if isinstance(value, np.ndarray):
-        if value.dtype.hasobject:
-            raise TypeError(f"{name}: an array of Python objects cannot be kept")
-        arrays[name] = value
-        return {"array": f"{name}.npy"}
-    if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: encode(getattr(value, f.name), f"{name}.{f.name}", arrays) for f in fields(value)}
-    if isinstance(value, (tuple, list)):
-        return [encode(item, f"{name}.{index}", arrays) for index, item in enumerate(value)]
-    if isinstance(value, Mapping):
-        return {key: encode(item, f"{name}.{key}", arrays) for key, item in value.items()}
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else str(float(value))  # JSON knows no NaN
-    if isinstance(value, (IntEnum, IntFlag, np.integer)):
-        return int(value)
-    if isinstance(value, np.bool_):
-        return bool(value)
-    if value is None or isinstance(value, (str, int, bool)):
-        return value
-    raise TypeError(f"{name}: a {type(value).__name__} cannot be kept")
-
-
-def decode(tree: Any, hint: Any, place: Path) -> Any:
-    """The value of type `hint` that `encode` made `tree` of."""
-    origin, inner = get_origin(hint), get_args(hint)
-    if origin in (Union, UnionType):
-        if tree is None:
-            return None
-        return decode(tree, next(arm for arm in inner if arm is not NoneType), place)
-    if isinstance(tree, dict) and tree.keys() == {"array"}:
-        return load(place / tree["array"])
-    if is_dataclass(hint) and isinstance(hint, type):
-        hints = get_type_hints(hint)
-        return hint(**{name: decode(item, hints[name], place) for name, item in tree.items()})
-    if origin is tuple:
-        kinds = inner[:1] * len(tree) if inner[1:] == (...,) else inner
-        return tuple(decode(item, kind, place) for item, kind in zip(tree, kinds, strict=True))
-    if origin is not None and isinstance(origin, type) and issubclass(origin, Mapping):
-        return {key: decode(item, inner[1], place) for key, item in tree.items()}
-    if origin is Literal or hint in (Any, NoneType):
-        return tree
-    return hint(tree)  # float, int, bool, str, an Enum
-
-
-def save(file: Path, array: np.ndarray[Any, Any]) -> list[Any]:
-    """Write one .npy; returns its `checksum`. Unlike numpy.save it tells why a write failed."""
-    array = np.asarray(array, order="C")
-    head = io.BytesIO()
-    np.lib.format.write_array_header_2_0(head, np.lib.format.header_data_from_array_1_0(array))
-    summed, size = blake2b(digest_size=16), 0
-    with file.open("wb") as stream:
-        for part in (head.getbuffer(), array.reshape(-1).view(np.uint8).data if array.size else b""):
-            summed.update(part)
-            size += stream.write(part)
-    return [size, summed.hexdigest()]
-
-
-def load(file: Path) -> np.ndarray[Any, Any]:
-    """One array: a read-only memory map, or in memory where it is small."""
-    try:
-        if file.stat().st_size > 1 << 16:
-            return np.asarray(np.load(file, mmap_mode="r", allow_pickle=False))
-        array: np.ndarray[Any, Any] = np.load(file, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise StorageError(f"{file} cannot be read; delete {file.parent} and run again") from error
-    array.flags.writeable = False
-    return array
-
-
-def freeze(value: Any) -> None:
-    """Make the arrays of a result that is not kept read-only, as those that are."""
-    if isinstance(value, np.ndarray):
-        value.flags.writeable = False
-    elif is_dataclass(value) and not isinstance(value, type):
-        for field in fields(value):
-            freeze(getattr(value, field.name))
-    elif isinstance(value, (tuple, list)):
-        for item in value:
-            freeze(item)
 
 
 def contents(folder: Path) -> list[dict[str, Any]]:
@@ -379,14 +345,8 @@ def contents(folder: Path) -> list[dict[str, Any]]:
     return found
 
 
-class Archive(Store):
-    """A finished result folder opened again without its capture: what was kept is taken as it is."""
-
-    def step(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> Kept[T]:
-        """The stored result whatever its key; what is never kept is computed from the stored ones."""
-        kept = super().step(stage, *inputs, config=config)
-        if stage.keep:
-            place = self.work / f"{len(self.steps):02d}-{stage.name}"
-            kept.find = lambda: cast(T, read(place, returns(stage)))
-            kept.stored = lambda: bool(manifest(place))
-        return kept
+def _first_line(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8", errors="replace")[:20].strip() or "unknown"
+    except OSError:
+        return "unknown"

@@ -1,5 +1,7 @@
 """The promises of the stage cache, on toy stages."""
 
+import gc
+import linecache
 import os
 import signal
 import subprocess
@@ -17,8 +19,9 @@ import pytest
 
 from polcap import images
 from polcap.errors import StorageError
+from polcap.formats.npy_folder import checksum, decode, encode, save
 from polcap.stages import Stage, stage
-from polcap.store import Store, checksum, contents, decode, encode, save
+from polcap.store import Archive, Store, contents
 
 
 class Settings(msgspec.Struct, frozen=True):
@@ -107,7 +110,7 @@ def no_calls() -> None:
 
 def snapshot(folder: Path) -> dict[str, bytes]:
     """Every file of the cache; the measured seconds are the one thing that may differ."""
-    files = sorted(file for file in folder.rglob("*") if file.is_file() and file.name != "lock")
+    files = sorted(file for file in folder.rglob("*") if file.is_file() and file.name not in ("lock", "owner"))
     return {
         str(file.relative_to(folder)): b"\n".join(
             line for line in file.read_bytes().split(b"\n") if not line.startswith(b' "seconds"')
@@ -162,7 +165,7 @@ def test_declaring_the_path_computes_nothing_and_writes_nothing(tmp_path: Path) 
 def test_until_stops_after_the_stage_and_computes_it_even_if_it_is_not_kept(tmp_path: Path) -> None:
     store = Store(tmp_path)
     path(store)
-    store.settle(until="passing")
+    store.materialize(until="passing")
     assert calls == ["double", "passing"]
 
 
@@ -192,22 +195,22 @@ def test_key_follows_the_bytes_of_the_photographs_not_their_place(tmp_path: Path
 
 
 def test_force_computes_the_stage_and_what_follows(tmp_path: Path) -> None:
-    path(Store(tmp_path))[2].settle()
+    path(Store(tmp_path))[2].materialize()
     calls.clear()
     store = Store(tmp_path, force="double")
     path(store)
-    store.settle()
+    store.materialize()
     assert calls == ["double", "passing", "total"]
     calls.clear()
     store = Store(tmp_path, force="total")
     path(store)
-    store.settle()
+    store.materialize()
     assert calls == ["passing", "total"]
 
 
 @pytest.mark.parametrize("harm", ["flip", "truncate", "remove"])
 def test_damaged_result_is_noticed_and_computed_again(tmp_path: Path, harm: str) -> None:
-    path(Store(tmp_path))[0].settle()
+    path(Store(tmp_path))[0].materialize()
     file = tmp_path / "work" / "01-double" / "value.array.npy"
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 1
@@ -218,6 +221,76 @@ def test_damaged_result_is_noticed_and_computed_again(tmp_path: Path, harm: str)
     calls.clear()
     assert float(path(Store(tmp_path))[0].value.array[0, 0]) == 6.0
     assert calls == ["double"]
+
+
+def edited(file: Path, old: str, new: str) -> None:
+    text = file.read_text(encoding="utf-8")
+    assert old in text
+    file.write_text(text.replace(old, new), encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("3.0", "4.0"),
+        ('"format": 2', '"format": 1'),
+        ("value.array.npy", "../../value.array.npy"),
+        ('"value": {', '"value": null, "x": {'),
+        ('"files": {', '"files": null, "x": {'),
+        ("{", "[" * 30_000),
+    ],
+)
+def test_an_edited_manifest_is_noticed_and_computed_again(tmp_path: Path, old: str, new: str) -> None:
+    path(Store(tmp_path))[0].materialize()
+    place = tmp_path / "work" / "01-double"
+    edited(place / "manifest.json", old, new)
+    with pytest.raises(StorageError, match=r"run `polcap process`"):
+        _ = path(Archive(tmp_path))[0].value
+    calls.clear()
+    assert path(Store(tmp_path))[0].value.shift == (3.0, 0.0)
+    assert calls == ["double"]
+
+
+@pytest.mark.parametrize(
+    "tree",
+    [
+        None, [], {"array": None, "maybe": None, "shift": [0.0, 1.0]}, {"array": {"array": "../a.npy"}},
+        {"array": {"array": "/a.npy"}, "maybe": None, "shift": [0.0, 1.0]},
+        {"array": {"array": "a.npy"}, "maybe": None, "shift": [0.0]},
+        {"array": {"array": "a.npy"}, "maybe": None, "shift": ["much", 1.0]},
+        {"array": {"array": "a.npy"}, "maybe": None, "shift": [True, 1.0]},
+        {"array": {"array": "gone.npy"}, "maybe": None, "shift": [0.0, 1.0]},
+        {"array": {"array": "a.npy"}, "maybe": None, "shift": [0.0, 1.0], "more": 1},
+    ],
+)  # fmt: skip
+def test_a_tree_of_another_form_is_refused(tmp_path: Path, tree: Any) -> None:
+    save(tmp_path / "a.npy", np.zeros(3))
+    with pytest.raises(StorageError):
+        decode(tree, Inner, tmp_path)
+
+
+def test_an_edited_function_changes_the_key_of_what_it_derives(tmp_path: Path) -> None:
+    source, keys = "def half(inner):\n    return inner.shift[0] / {}\n", []
+    for divisor in (2, 2, 3):
+        file = tmp_path / "toy.py"
+        file.write_text(source.format(divisor), encoding="utf-8")
+        linecache.clearcache()
+        names: dict[str, Any] = {}
+        exec(compile(file.read_text(encoding="utf-8"), str(file), "exec"), names)
+        store = Store(tmp_path)
+        keys.append(store.derive(names["half"], store.step(DOUBLE, 3.0, config=Settings())).key)
+    assert keys[0] == keys[1] != keys[2]
+
+
+def test_a_store_that_is_done_with_leaves_no_memory_map_behind(tmp_path: Path) -> None:
+    gc.collect()
+    gc.disable()  # what is freed here is freed at once
+    try:
+        for _ in range(5):
+            path(Store(tmp_path))[0].value  # noqa: B018
+        assert not any(str(tmp_path) in str(o.filename) for o in gc.get_objects() if isinstance(o, np.memmap))
+    finally:
+        gc.enable()
 
 
 def test_two_processes_never_work_in_one_folder(tmp_path: Path) -> None:
@@ -246,7 +319,7 @@ store = Store(Path(sys.argv[1]))
 print("ready", flush=True)
 with store.lock():
     path(store)
-    store.settle()
+    store.materialize()
 """
 
 
@@ -255,7 +328,7 @@ def test_killed_stage_leaves_no_half_result_and_resumes_to_the_same_bytes(tmp_pa
     store = Store(whole)
     with store.lock():
         path(store)
-        store.settle()
+        store.materialize()
     random = np.random.default_rng(1)
     for attempt in range(6):
         folder = tmp_path / f"killed{attempt}"
@@ -271,7 +344,7 @@ def test_killed_stage_leaves_no_half_result_and_resumes_to_the_same_bytes(tmp_pa
         store = Store(folder)
         with store.lock():
             path(store)
-            store.settle()
+            store.materialize()
         assert snapshot(folder) == snapshot(whole)
 
 
@@ -284,6 +357,6 @@ def test_a_disk_that_refuses_is_one_clear_line(
 
     monkeypatch.setattr(Path, "open", refuse)
     with pytest.raises(StorageError, match=word) as caught:
-        path(Store(tmp_path))[0].settle()
+        path(Store(tmp_path))[0].materialize()
     assert "\n" not in str(caught.value)
     assert list((tmp_path / "work").iterdir()) == []

@@ -1,0 +1,157 @@
+"""In: a value of images.py. Out: plain JSON and an .npy per array in one folder; and back.
+
+The JSON holds the scalars and the names of the array files. Both sides are strict: what does not fit
+the type that is asked for is a `StorageError`, never another value.
+"""
+
+import io
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum, IntEnum, IntFlag
+from hashlib import blake2b
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.errors import StorageError
+
+Arrays = dict[str, NDArray[Any]]
+_MAPPED = 1 << 16  # bytes; smaller files are read, a map costs a page table and a handle
+
+
+def encode(value: Any, name: str, arrays: Arrays) -> Any:
+    """JSON for a value; its arrays go into `arrays` under dotted names."""
+    if isinstance(value, np.ndarray):
+        if value.dtype.hasobject:
+            raise TypeError(f"{name}: an array of Python objects cannot be kept")
+        arrays[name] = value
+        return {"array": f"{name}.npy"}
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: encode(getattr(value, f.name), f"{name}.{f.name}", arrays) for f in fields(value)}
+    if isinstance(value, (tuple, list)):
+        return [encode(item, f"{name}.{index}", arrays) for index, item in enumerate(value)]
+    if isinstance(value, Mapping):
+        return {key: encode(item, f"{name}.{key}", arrays) for key, item in value.items()}
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else str(float(value))  # JSON knows no NaN
+    if isinstance(value, (IntEnum, IntFlag, np.integer)):
+        return int(value)
+    if isinstance(value, np.bool_):
+        return bool(value)
+    if value is None or isinstance(value, (str, int, bool)):
+        return value
+    raise TypeError(f"{name}: a {type(value).__name__} cannot be kept")
+
+
+def decode(tree: Any, hint: Any, folder: Path) -> Any:
+    """The value of type `hint` that `encode` made `tree` of; arrays are read from `folder`.
+
+    Raises
+    ------
+    StorageError
+        The tree is not of that type, or an array file cannot be read.
+    """
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        if tree is None and NoneType in inner:
+            return None
+        return decode(tree, next(arm for arm in inner if arm is not NoneType), folder)
+    if origin is np.ndarray or hint is np.ndarray:
+        return load(_array_file(tree, folder))
+    if is_dataclass(hint) and isinstance(hint, type):
+        hints = get_type_hints(hint)
+        names = {field.name for field in fields(hint)}
+        _expect(isinstance(tree, dict) and tree.keys() == names, tree, hint.__name__, folder)
+        return hint(**{name: decode(item, hints[name], folder) for name, item in tree.items()})
+    if origin is tuple:
+        _expect(isinstance(tree, list), tree, "a list", folder)
+        kinds = inner[:1] * len(tree) if inner[1:] == (...,) else inner
+        _expect(len(tree) == len(kinds), tree, f"{len(kinds)} values", folder)
+        return tuple(decode(item, kind, folder) for item, kind in zip(tree, kinds, strict=True))
+    if origin is not None and isinstance(origin, type) and issubclass(origin, Mapping):
+        _expect(isinstance(tree, dict), tree, "a table", folder)
+        return {key: decode(item, inner[1], folder) for key, item in tree.items()}
+    if origin is Literal:
+        _expect(tree in inner, tree, f"one of {inner}", folder)
+        return tree
+    return _scalar(tree, hint, folder)
+
+
+def _scalar(tree: Any, hint: Any, folder: Path) -> Any:
+    if hint is float and isinstance(tree, str):
+        _expect(tree in ("nan", "inf", "-inf"), tree, "a number", folder)
+        return float(tree)
+    if hint is float:
+        _expect(isinstance(tree, (int, float)) and not isinstance(tree, bool), tree, "a number", folder)
+        return float(tree)
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        _expect(isinstance(tree, int) and tree >= 0, tree, hint.__name__, folder)
+        return hint(tree)
+    _expect(type(tree) is hint, tree, getattr(hint, "__name__", str(hint)), folder)
+    return tree
+
+
+def _array_file(tree: Any, folder: Path) -> Path:
+    name = tree.get("array") if isinstance(tree, dict) else None
+    _expect(isinstance(name, str) and Path(name).name == name, tree, "an array's file", folder)
+    return folder / str(name)
+
+
+def _expect(holds: bool, tree: Any, wanted: str, folder: Path) -> None:
+    if not holds:
+        raise StorageError(f"{folder}: {str(tree)[:60]!r} stands where {wanted} belongs; run `polcap process` again")
+
+
+def save(file: Path, array: NDArray[Any]) -> list[Any]:
+    """Write one .npy; returns its `checksum`. Unlike numpy.save it tells why a write failed."""
+    array = np.asarray(array, order="C")
+    head = io.BytesIO()
+    np.lib.format.write_array_header_2_0(head, np.lib.format.header_data_from_array_1_0(array))
+    summed, size = blake2b(digest_size=16), 0
+    with file.open("wb") as stream:
+        for part in (head.getbuffer(), array.reshape(-1).view(np.uint8).data if array.size else b""):
+            summed.update(part)
+            size += stream.write(part)
+    return [size, summed.hexdigest()]
+
+
+def load(file: Path) -> NDArray[Any]:
+    """One array: a read-only memory map, or in memory where it is small.
+
+    Raises
+    ------
+    StorageError
+        The file is missing or no .npy.
+    """
+    try:
+        if file.stat().st_size > _MAPPED:
+            return np.asarray(np.load(file, mmap_mode="r", allow_pickle=False))
+        array: NDArray[Any] = np.load(file, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise StorageError(f"{file} cannot be read; delete {file.parent} and run again") from error
+    array.flags.writeable = False
+    return array
+
+
+def checksum(file: Path) -> list[Any]:
+    """Size in bytes and BLAKE2b digest of a file."""
+    summed = blake2b(digest_size=16)
+    with file.open("rb") as stream:
+        while block := stream.read(1 << 22):
+            summed.update(block)
+    return [file.stat().st_size, summed.hexdigest()]
+
+
+def freeze(value: Any) -> None:
+    """Make the arrays of a value that was not stored read-only, as those that were."""
+    if isinstance(value, np.ndarray):
+        value.flags.writeable = False
+    elif is_dataclass(value) and not isinstance(value, type):
+        for field in fields(value):
+            freeze(getattr(value, field.name))
+    elif isinstance(value, (tuple, list)):
+        for item in value:
+            freeze(item)
