@@ -26,7 +26,7 @@ from polcap.formats import maps as maps_folder
 from polcap.images import AngleStack, Asset, Capture, ChartRequest, ColorCalibration, Network
 from polcap.report import Results
 from polcap.stages import align, asset, cues, hdr, infer, mask, selfcal, stokes, surface, whitebalance
-from polcap.store import Archive, Progress, Store, silent
+from polcap.store import Archive, Progress, Store, contents, silent
 
 STAGES = ("hdr", "whitebalance", "align", "mask", "selfcal", "stokes", "cues", "infer", "surface", "asset")
 AUTO = ChartRequest("auto")
@@ -107,7 +107,7 @@ def process(
             return None
         progress("write", None, False)
         start = time.perf_counter()
-        about = report.document(report.capture_facts(capture), results, config, given.network)
+        about = report.document(report.capture_facts(capture), results, config, given.network, timings(out))
         maps_folder.write(
             out / "maps", results.maps.value, results.mesh.value, results.stokes.value, results.cues.value
         )
@@ -180,11 +180,16 @@ def judge_again(out: Path) -> dict[str, Any]:
     results, about = reopen(out)
     with Store(out).lock():
         config = msgspec.convert(about["settings"], Config)
-        again = report.document(about["capture"], results, config, None) | {"model": about["model"]}
+        again = report.document(about["capture"], results, config, None, timings(out)) | {"model": about["model"]}
         if (out / "report.json").exists():
             again["keys"] = report.read(out)["keys"]
         report.write(out, again, results)
     return again
+
+
+def timings(out: Path) -> dict[str, float]:
+    """Seconds that each kept stage took when it was computed."""
+    return {about["stage"]: about["seconds"] for about in contents(out)}
 
 
 def load_network(

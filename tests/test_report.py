@@ -2,6 +2,7 @@
 
 import json
 import re
+from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from polcap import report
 from polcap.config import Gates
 from polcap.errors import StorageError
+from polcap.report import labels
 
 
 @pytest.fixture
@@ -24,10 +26,25 @@ def test_report_is_plain_json_with_figures_gates_and_settings(result: Path) -> N
     assert len(about["figures"]["chart"]["delta_e"]) == 24
 
 
-def test_page_stands_alone_and_shows_the_pictures(result: Path) -> None:
+def test_page_needs_no_other_file_and_no_network(result: Path) -> None:
     page = (result / "report.html").read_text()
-    assert len(re.findall(r'src="data:image/jpeg;base64,', page)) == 7
-    assert re.findall(r'(?:src|href)="(?!data:)', page) == [] and "<script" not in page
+    assert [found[:40] for found in re.findall(r'(?:src|href)=["\']?(?!["\']|data:|asset/)[^\s>]*', page)] == []
+    assert re.findall(r"https?://|@import|url\(|fetch\(|XMLHttp", page) == []
+
+
+def test_page_shows_every_figure_with_words_and_unit(result: Path) -> None:
+    page = unescape((result / "report.html").read_text())
+    about = report.read(result)
+    for part, values in about["figures"].items():
+        for name, value in values.items():
+            assert f"{part}.{name}" in labels.LABELS, f"{part}.{name} has no words of its own"
+            assert f"<td>{labels.text(f'{part}.{name}', value)}</td>" in page
+    assert not re.search(r"<td>(?:\[|\{|None|True|False|nan)", page)
+
+
+def test_photographs_and_their_rerendering_agree(result: Path) -> None:
+    found = report.read(result)["figures"]["rerendering"]
+    assert len(found["rms"]) == 3 and max(found["rms"]) < 0.15 and 0.5 < found["scale"] < 2
 
 
 @pytest.mark.parametrize(

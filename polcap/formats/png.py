@@ -4,6 +4,8 @@ No gamma or colour chunk is written: glTF ignores them, and viewers disagree on 
 numbers mean is said beside the file (maps.json, the material).
 """
 
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +40,29 @@ def encode(array: Pixels) -> bytes:
     if not done:
         raise StorageError(f"cannot encode a picture of {array.shape} as PNG; report this as a bug")
     return bytes(data.tobytes())
+
+
+def indexed(level: NDArray[np.uint8], colors: NDArray[np.uint8]) -> bytes:
+    """The bytes of a PNG of levels (H, W): level 0 is transparent, level k has the color k − 1 of (N, 3).
+
+    References
+    ----------
+    W3C, Portable Network Graphics (3rd ed.), §11.2 (chunks IHDR, PLTE, IDAT, IEND) and §11.3.1.1 (tRNS).
+    """
+    height, width = level.shape
+    rows = np.zeros((height, width + 1), np.uint8)  # filter 0 before every row
+    rows[:, 1:] = level
+    chunks = [
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0)),
+        (b"PLTE", bytes(3) + colors.astype(np.uint8).tobytes()),
+        (b"tRNS", b"\0"),
+        (b"IDAT", zlib.compress(rows.tobytes(), 6)),
+        (b"IEND", b""),
+    ]
+    parts = [
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    ]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
 def read(path: Path) -> Pixels:

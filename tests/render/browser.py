@@ -36,11 +36,17 @@ class Job:
     lights: tuple[tuple[float, float, float] | None, ...]
 
 
-def require() -> str:
-    """The browser's path; skips the test where something is missing."""
+def find() -> str:
+    """The browser's path; skips the test where there is none."""
     browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
     if browser is None:
         pytest.skip("needs a Chromium")
+    return browser
+
+
+def require() -> str:
+    """The same; skips the test where three.js is missing, too."""
+    browser = find()
     if not (MODULES / "three").is_dir():
         pytest.skip("needs `npm ci` in tests/gltf")
     return browser

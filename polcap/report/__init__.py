@@ -6,7 +6,7 @@ states an assumption. A gate that could not be measured says so.
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +17,7 @@ import numpy as np
 from polcap import __version__, pictures
 from polcap.config import Config, Gates
 from polcap.errors import StorageError
-from polcap.formats import atomic, html
+from polcap.formats import atomic
 from polcap.images import (
     Alignment,
     AngleStack,
@@ -35,8 +35,10 @@ from polcap.images import (
     StokesImage,
     SurfaceMaps,
 )
+from polcap.report import page, shown
 from polcap.store import StageResult
 
+_COMPARED_PX = 512  # the longest side on which photographs and re-rendering are compared
 State = Literal["pass", "fail", "warn", "not measured"]
 
 
@@ -180,6 +182,14 @@ def figures(results: Results) -> dict[str, dict[str, Any]]:
     }
 
 
+def rerendering(results: Results, ior: float) -> dict[str, Any]:
+    """How far the photographs are from what the maps say they should be."""
+    maps, mesh, angle = results.maps.value, results.mesh.value, results.radiance.value.angle
+    small = shown.reduce(maps, mesh, results.stokes.value, results.cues.value, angle, _COMPARED_PX)
+    again = shown.rerender(small, ior)
+    return {"rms": [_number(one) for one in again.rms(small.maps.mask)], "scale": _number(again.scale)}
+
+
 def judge(found: dict[str, dict[str, Any]], focal_known: bool, limits: Gates) -> list[Gate]:
     """The gates, in the order of the path."""
     gains, angles, object_ = found["gains"], found["angles"], found["object"]
@@ -244,9 +254,15 @@ def judge(found: dict[str, dict[str, Any]], focal_known: bool, limits: Gates) ->
     ]
 
 
-def document(capture: dict[str, Any], results: Results, config: Config, network: Network | None) -> dict[str, Any]:
-    """report.json: what was understood, measured and judged."""
-    found = figures(results)
+def document(
+    capture: dict[str, Any],
+    results: Results,
+    config: Config,
+    network: Network | None,
+    timings: Mapping[str, float],
+) -> dict[str, Any]:
+    """report.json: what was understood, measured and judged; timings [s] of the stages that were kept."""
+    found = {**figures(results), "rerendering": rerendering(results, config.infer.ior)}
     gates = judge(found, bool(capture["focal_known"]), config.gates)
     return {
         "polcap": __version__,
@@ -254,6 +270,7 @@ def document(capture: dict[str, Any], results: Results, config: Config, network:
         "capture": capture,
         "gates": msgspec.to_builtins(gates),
         "figures": found,
+        "timings": dict(timings),
         "model": None if network is None else {**network.metadata, "digest": network.digest},
         "keys": {kept.name: kept.key for kept in vars(results).values()},
         "settings": msgspec.to_builtins(config),
@@ -275,18 +292,7 @@ def write(folder: Path, about: dict[str, Any], results: Results) -> None:
     """
     with atomic.path(folder / "report.json") as temporary:
         temporary.write_text(json.dumps(about, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
-    radiance, color = results.radiance.value, results.color.value
-    maps, mesh = results.maps.value, results.mesh.value
-    shown = {
-        "Reference shot, with the chart as it was read": pictures.chart(radiance, color),
-        "What was taken for the object": pictures.outline(radiance, color, results.object_.value),
-        "Polarization": pictures.stokes(results.stokes.value),
-        "Maps": pictures.maps(maps),
-        "Surface": pictures.surface(mesh, maps),
-        "Registration: grey is good": results.picture("align"),
-        "Gains of the shots": results.picture("selfcal"),
-    }
-    html.write(folder / "report.html", about, {name: pictures.shrink(p, 1280) for name, p in shown.items()})
+    page.write(folder, about, results)
 
 
 def read(folder: Path) -> dict[str, Any]:

@@ -1,0 +1,93 @@
+"""In: the parts of a page. Out: one HTML file that needs nothing else, not even a network.
+
+Beside this module lie what every page carries: its style (`page.css`), the light's law on a graphics
+chip (`law.glsl`, that of `optics/shade.py`) and what answers the pointer (`probe.js`, `relight.js`).
+"""
+
+import gzip
+import json
+from base64 import b64encode
+from collections.abc import Iterable, Mapping
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.formats import atomic, png
+
+_JPEG_QUALITY = 88
+_SCRIPTS = ("probe.js", "relight.js")
+
+
+def write(path: str | Path, title: str, body: Iterable[str], data: Mapping[str, Any]) -> None:
+    """Write a page of body fragments; `data` is what its scripts read.
+
+    Raises
+    ------
+    StorageError
+        The file cannot be written.
+    """
+    here = files(__name__)
+    style = here.joinpath("page.css").read_text("utf-8")
+    scripts = "\n".join(here.joinpath(name).read_text("utf-8") for name in _SCRIPTS)
+    known = {**data, "law": here.joinpath("law.glsl").read_text("utf-8")}
+    with atomic.path(path) as temporary:
+        temporary.write_text(
+            '<!doctype html><html lang="en"><meta charset="utf-8">'
+            '<meta name="viewport" content="width=device-width, initial-scale=1">'
+            '<meta name="color-scheme" content="light dark">'
+            f"<title>{escape(title)}</title><link rel=icon href=data:,>\n<style>\n{style}</style>\n<main>\n"
+            + "\n".join(body)
+            + f'\n</main>\n<script type="application/json" id="data">{_json(known)}</script>'
+            f"\n<script>\n{scripts}</script>\n</html>\n",
+            encoding="utf-8",
+        )
+
+
+def jpeg(picture: NDArray[np.uint8], whole_color: bool = False) -> str:
+    """A picture (H, W, 3) sRGB as a data address; `whole_color` keeps a color per pixel."""
+    ratio = cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444 if whole_color else cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420
+    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY + 6 * whole_color, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, ratio]
+    _, encoded = cv2.imencode(".jpg", picture[..., ::-1], options)
+    return _address("image/jpeg", encoded.tobytes())
+
+
+def lossless(picture: NDArray[np.uint8]) -> str:
+    """A picture (H, W, 3) or (H, W, 4) as the data address of a PNG."""
+    return _address("image/png", png.encode(picture))
+
+
+def indexed(level: NDArray[np.uint8], colors: NDArray[np.uint8]) -> str:
+    """Levels (H, W) in their colors (255, 3) as the data address of a PNG; level 0 is transparent."""
+    return _address("image/png", png.indexed(level, colors))
+
+
+def packed(array: NDArray[Any]) -> str:
+    """An array's little-endian bytes, gzipped, as base64."""
+    solid = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
+    return text(gzip.compress(solid.tobytes(), 6, mtime=0))
+
+
+def text(content: bytes) -> str:
+    """Bytes as base64."""
+    return b64encode(content).decode()
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """A table of text; what it holds is escaped."""
+    top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
+    lines = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
+    return f"<table><tr>{top}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
+
+
+def _address(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{text(content)}"
+
+
+def _json(data: Mapping[str, Any]) -> str:
+    """JSON that may stand in a script element."""
+    return json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")

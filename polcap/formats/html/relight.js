@@ -1,0 +1,302 @@
+'use strict';
+// The maps under a light that the pointer moves, and the surface from where the pointer takes the eye.
+const FLAT = `attribute vec2 corner; varying vec2 at;
+void main() { at = vec2(corner.x, 1.0 - corner.y); gl_Position = vec4(2.0 * corner - 1.0, 0.0, 1.0); }`;
+const SOLID = `attribute vec3 position; attribute vec2 uv; uniform mat4 view; uniform vec3 low, extent;
+varying vec2 at; varying vec3 point;
+void main() { at = uv; point = low + extent * position; gl_Position = view * vec4(point, 1.0); }`;
+const PIXEL = `
+uniform sampler2D normals, diffuse, specular, roughness;
+uniform vec3 light, eye; uniform vec2 size, center; uniform float focal, ior, exposure, top; uniform int mode;
+varying vec2 at;
+#ifdef SOLID
+varying vec3 point;
+#endif
+void main() {
+  vec4 texel = texture2D(normals, at);
+#ifdef SOLID
+  vec3 v = normalize(eye - point);
+#else
+  if (texel.a < 0.5) discard;
+  vec2 pixel = at * size - 0.5 - center;
+  vec3 v = normalize(vec3(-pixel.x, pixel.y, focal));
+#endif
+  vec3 n = normalize(texel.rgb * 2.0 - 1.0), l = light == vec3(0.0) ? v : normalize(light);
+  if (mode == 2) { gl_FragColor = vec4(texel.rgb, 1.0); return; }
+  bool clay = mode == 1;
+  vec3 body = clay ? vec3(0.6) : decoded(texture2D(diffuse, at).rgb);
+  vec3 gloss = clay ? vec3(0.0) : top * decoded(texture2D(specular, at).rgb);
+  vec3 seen = shade(n, v, l, body, gloss, clay ? 1.0 : max(texture2D(roughness, at).r, 0.02), ior);
+#ifdef SOLID
+  seen += 0.04 * body;  // so that the dark side can be told from the backdrop
+  if (!gl_FrontFacing) seen = vec3(0.02);
+#endif
+  gl_FragColor = vec4(encoded(seen * (clay ? 1.0 : exposure)), 1.0);
+}`;
+
+class Painter {
+  constructor(canvas, vertex, prefix) {
+    this.gl = canvas.getContext('webgl', { antialias: true, preserveDrawingBuffer: true });
+    if (!this.gl) throw new Error('no WebGL');
+    const gl = this.gl;
+    this.program = gl.createProgram();
+    this.attach(gl.VERTEX_SHADER, vertex);
+    this.attach(gl.FRAGMENT_SHADER, prefix + DATA.law + PIXEL);
+    gl.linkProgram(this.program);
+    if (!gl.getProgramParameter(this.program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(this.program));
+    gl.useProgram(this.program);
+    this.places = {};
+  }
+
+  attach(kind, source) {
+    const gl = this.gl, shader = gl.createShader(kind);
+    gl.shaderSource(shader, source);
+    gl.compileShader(shader);
+    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+    gl.attachShader(this.program, shader);
+  }
+
+  place(name) { return this.places[name] ??= this.gl.getUniformLocation(this.program, name); }
+
+  texture(slot, name, source) {
+    const gl = this.gl;
+    gl.activeTexture(gl.TEXTURE0 + slot);
+    gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+    gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    if (source.data) {
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.LUMINANCE, source.width, source.height, 0, gl.LUMINANCE, gl.UNSIGNED_BYTE,
+        source.data);
+    } else {
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, source);
+    }
+    for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, side, gl.CLAMP_TO_EDGE);
+    for (const end of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, end, gl.LINEAR);
+    gl.uniform1i(this.place(name), slot);
+  }
+
+  maps(sources) {
+    const gl = this.gl, { size, center, focal, ior, exposure, top } = DATA.view;
+    Object.entries(sources).forEach(([name, source], slot) => this.texture(slot, name, source));
+    gl.uniform2f(this.place('size'), ...size);
+    gl.uniform2f(this.place('center'), ...center);
+    for (const [name, value] of Object.entries({ focal, ior, exposure, top })) gl.uniform1f(this.place(name), value);
+  }
+
+  buffer(name, width, kind, normalized, data) {
+    const gl = this.gl, at = gl.getAttribLocation(this.program, name);
+    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
+    gl.enableVertexAttribArray(at);
+    gl.vertexAttribPointer(at, width, kind, normalized, 0, 0);
+  }
+}
+
+class Later {  // draws at most once a frame
+  constructor(draw) { this.draw = draw; this.due = false; }
+
+  ask() {
+    if (this.due) return;
+    this.due = true;
+    requestAnimationFrame(() => { this.due = false; this.draw(); });
+  }
+}
+
+class Relight {
+  constructor(canvas, sources) {
+    this.canvas = canvas;
+    this.light = [0, 0, 0];  // none: the flash, beside the lens
+    [canvas.width, canvas.height] = DATA.view.size;
+    this.painter = new Painter(canvas, FLAT, '');
+    this.painter.maps(sources);
+    this.painter.buffer('corner', 2, this.painter.gl.FLOAT, false, new Float32Array([0, 0, 1, 0, 0, 1, 1, 1]));
+    this.later = new Later(() => this.draw());
+    for (const kind of ['pointermove', 'pointerdown']) canvas.addEventListener(kind, (event) => this.move(event));
+    canvas.addEventListener('keydown', (event) => this.step(event));
+    this.draw();
+  }
+
+  move(event) {
+    const place = this.canvas.getBoundingClientRect();
+    this.aim((event.clientX - place.left) / place.width * 2 - 1, 1 - (event.clientY - place.top) / place.height * 2);
+  }
+
+  aim(x, y) {  // −1…1 across the picture: a hemisphere of directions
+    const far = Math.hypot(x, y), most = 0.97, shrink = far > most ? most / far : 1;
+    this.light = [x * shrink, y * shrink, Math.sqrt(1 - (Math.min(far, most)) ** 2)];
+    this.later.ask();
+  }
+
+  step(event) {
+    const by = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];
+    if (!by) return;
+    event.preventDefault();
+    this.aim(this.light[0] + by[0], this.light[1] + by[1]);
+  }
+
+  draw() {
+    const gl = this.painter.gl;
+    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+    gl.clearColor(0, 0, 0, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.uniform3f(this.painter.place('light'), ...this.light);
+    gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
+  }
+}
+
+class Solid {
+  constructor(canvas, sources, mesh) {
+    this.canvas = canvas;
+    this.turn = [0.35, 0.15];  // rad about the upright axis, then up
+    this.near = 1;  // of the distance at which the surface fills the picture
+    this.mode = 0;
+    this.pointers = new Map();
+    this.apart = 0;  // between two fingers, px
+    canvas.width = canvas.height = 640;
+    const painter = this.painter = new Painter(canvas, SOLID, '#define SOLID\n'), gl = painter.gl;
+    if (mesh.wide && !gl.getExtension('OES_element_index_uint')) throw new Error('no 32-bit indices');
+    painter.maps(sources);
+    painter.buffer('position', 3, gl.UNSIGNED_SHORT, true, mesh.position);
+    painter.buffer('uv', 2, gl.UNSIGNED_SHORT, true, mesh.uv);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, mesh.faces, gl.STATIC_DRAW);
+    gl.uniform3f(painter.place('low'), ...mesh.low);
+    gl.uniform3f(painter.place('extent'), ...mesh.extent);
+    gl.enable(gl.DEPTH_TEST);
+    this.count = mesh.faces.length;
+    this.middle = mesh.low.map((low, k) => low + mesh.extent[k] / 2);
+    this.radius = Math.hypot(...mesh.extent) / 2;
+    this.later = new Later(() => this.draw());
+    this.listen();
+    this.draw();
+  }
+
+  listen() {
+    const { canvas } = this;
+    canvas.addEventListener('pointerdown', (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      this.pointers.set(event.pointerId, [event.clientX, event.clientY]);
+      this.apart = 0;
+    });
+    for (const kind of ['pointerup', 'pointercancel']) {
+      canvas.addEventListener(kind, (event) => { this.pointers.delete(event.pointerId); this.apart = 0; });
+    }
+    canvas.addEventListener('pointermove', (event) => this.drag(event));
+    canvas.addEventListener('wheel', (event) => { event.preventDefault(); this.zoom(event.deltaY / 600); },
+      { passive: false });
+    canvas.addEventListener('keydown', (event) => this.step(event));
+    for (const button of document.querySelectorAll('[data-mode]')) {
+      button.addEventListener('click', () => {
+        this.mode = Number(button.dataset.mode);
+        for (const other of document.querySelectorAll('[data-mode]')) {
+          other.setAttribute('aria-pressed', String(other === button));
+        }
+        this.later.ask();
+      });
+    }
+  }
+
+  drag(event) {
+    const last = this.pointers.get(event.pointerId);
+    if (!last) return;
+    this.pointers.set(event.pointerId, [event.clientX, event.clientY]);
+    if (this.pointers.size === 2) {
+      const [a, b] = [...this.pointers.values()], apart = Math.hypot(a[0] - b[0], a[1] - b[1]);
+      if (this.apart) this.zoom(Math.log(this.apart / apart));
+      this.apart = apart;
+      return;
+    }
+    this.rotate((event.clientX - last[0]) * 0.008, (event.clientY - last[1]) * 0.008);
+  }
+
+  step(event) {
+    const by = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];
+    if (!by) return;
+    event.preventDefault();
+    this.rotate(...by);
+  }
+
+  rotate(right, up) {
+    const within = (x, most) => Math.max(-most, Math.min(most, x));
+    this.turn = [within(this.turn[0] + right, 1.5), within(this.turn[1] + up, 1.4)];
+    this.later.ask();
+  }
+
+  zoom(by) {
+    this.near = Math.max(0.3, Math.min(3, this.near * Math.exp(by)));
+    this.later.ask();
+  }
+
+  draw() {
+    const gl = this.painter.gl, field = 0.35, [right, up] = this.turn;  // rad, half the field of view
+    const away = this.near * this.radius / Math.sin(field);
+    const [ca, sa, cb, sb] = [Math.cos(right), Math.sin(right), Math.cos(up), Math.sin(up)];
+    // rows of the turn: about y, then about x
+    const rows = [[ca, 0, sa], [sb * sa, cb, -sb * ca], [-cb * sa, sb, cb * ca]];
+    const moved = rows.map((row) => -row.reduce((sum, x, k) => sum + x * this.middle[k], 0));
+    moved[2] -= away;
+    const near = Math.max(away - 2 * this.radius, away * 0.02), far = away + 2 * this.radius, f = 1 / Math.tan(field);
+    const view = new Float32Array(16);
+    for (let k = 0; k < 4; k++) {
+      const [x, y, z] = k < 3 ? rows.map((row) => row[k]) : moved, w = k < 3 ? 0 : 1;
+      view.set([f * x, f * y, (far + near) / (near - far) * z + 2 * far * near / (near - far) * w, -z], 4 * k);
+    }
+    const eye = [0, 1, 2].map((k) => -rows.reduce((sum, row, j) => sum + row[k] * moved[j], 0));
+    // the light stays beside the eye, a little above and to the left
+    const light = [0, 1, 2].map((k) => -0.45 * rows[0][k] + 0.5 * rows[1][k] + 0.75 * rows[2][k]);
+    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+    gl.clearColor(0.05, 0.05, 0.06, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    gl.uniformMatrix4fv(this.painter.place('view'), false, view);
+    gl.uniform3f(this.painter.place('eye'), ...eye);
+    gl.uniform3f(this.painter.place('light'), ...light);
+    gl.uniform1i(this.painter.place('mode'), this.mode);
+    gl.drawElements(gl.TRIANGLES, this.count, this.painter.gl.UNSIGNED_INT, 0);
+  }
+}
+
+async function unpacked(text) {
+  const stream = new Blob([bytes(text)]).stream().pipeThrough(new DecompressionStream('gzip'));
+  return new Response(stream).arrayBuffer();
+}
+
+async function meshed({ position, uv, faces, low, extent }) {
+  const [p, t, f] = await Promise.all([position, uv, faces].map(unpacked));
+  const index = new Int32Array(f);  // differences
+  for (let k = 1; k < index.length; k++) index[k] += index[k - 1];
+  return { position: new Uint16Array(p), uv: new Uint16Array(t), faces: new Uint32Array(index.buffer), low, extent, wide: true };
+}
+
+// levels of a palette's picture as numbers 0…255
+function levels(image, palette) {
+  const canvas = document.createElement('canvas');
+  const [width, height] = [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
+  const context = canvas.getContext('2d', { willReadFrequently: true });
+  context.drawImage(image, 0, 0);
+  const from = context.getImageData(0, 0, width, height).data, data = new Uint8Array(width * height);
+  for (let k = 0; k < data.length; k++) {
+    const level = LEVELS[palette].get((from[4 * k] << 16) | (from[4 * k + 1] << 8) | from[4 * k + 2]) ?? 127;
+    data[k] = Math.round(level / 254 * 255);
+  }
+  return { data, width, height };
+}
+
+async function begin() {
+  const images = Object.fromEntries(['normal', 'diffuse', 'specular', 'roughness'].map(
+    (name) => [name, document.querySelector(`#map-${name} img`)]));
+  await Promise.all(Object.values(images).map((image) => image.decode()));
+  const sources = { normals: images.normal, diffuse: images.diffuse, specular: images.specular,
+    roughness: levels(images.roughness, 'viridis') };
+  window.relight = new Relight(document.getElementById('relight'), sources);
+  document.getElementById('relit').classList.add('live');
+  window.solid = new Solid(document.getElementById('solid'), sources, await meshed(DATA.mesh));
+  document.documentElement.dataset.ready = 'yes';
+}
+
+if (DATA.view) {
+  begin().catch((error) => {
+    document.documentElement.dataset.ready = 'no';
+    for (const note of document.querySelectorAll('.needs-gl')) note.hidden = false;
+    console.warn(`polcap: no moving light here: ${error.message}`);
+  });
+}

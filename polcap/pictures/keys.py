@@ -1,0 +1,98 @@
+"""In: a number per pixel. Out: its colour, and the key that turns the colour back into the number.
+
+A map's picture holds one of 255 levels per pixel; level 0 lies outside the object. Every level has a
+colour of its own, so a program that reads the picture finds the number again.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Floats
+
+Palette = Literal["inferno", "viridis", "wheel", "balance"]
+LEVELS = 255
+_STEPS = np.linspace(0, 1, LEVELS)
+
+
+@dataclass(frozen=True)
+class Key:
+    """How the numbers of one map are shown."""
+
+    low: float
+    high: float
+    unit: str  # as it stands behind a number
+    ticks: tuple[float, ...]
+    palette: Palette = "viridis"
+    power: float = 1.0  # number = low + (high − low)·level^power: 2 leaves small numbers more room
+    digits: int = 2  # behind the decimal point
+
+    def level(self, value: Floats, inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
+        """1…255 for low…high, beyond them the nearest; 0 outside and where there is no number."""
+        known = inside & np.isfinite(value)
+        share = (np.where(known, value, self.low) - self.low) / (self.high - self.low)
+        if self.palette == "wheel":
+            steps = np.rint(np.mod(share, 1.0) * LEVELS) % LEVELS
+        else:
+            steps = np.rint(np.clip(share, 0, 1) ** (1 / self.power) * (LEVELS - 1))
+        return np.where(known, steps + 1, 0).astype(np.uint8)
+
+    def place(self, value: float) -> float:
+        """Where a number stands on the bar, 0…1."""
+        return float(np.clip((value - self.low) / (self.high - self.low), 0, 1) ** (1 / self.power))
+
+    def picture(self, value: Floats, inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
+        """The colours (H, W, 3), black outside."""
+        return np.concatenate([np.zeros((1, 3), np.uint8), colors(self.palette)])[self.level(value, inside)]
+
+    def bar(self, width: int, height: int) -> NDArray[np.uint8]:
+        """The colours from low to high, (height, width, 3)."""
+        steps = np.rint(np.linspace(0, LEVELS - 1, width)).astype(int)
+        return np.broadcast_to(colors(self.palette)[steps], (height, width, 3)).copy()
+
+
+def colors(palette: Palette) -> NDArray[np.uint8]:
+    """The colours (255, 3) of levels 1…255, sRGB, no two alike."""
+    if palette == "wheel":  # one turn of hue, red at both ends
+        hsv = np.stack([360 * np.arange(LEVELS) / LEVELS, np.full(LEVELS, 0.78), np.ones(LEVELS)], axis=-1)
+        rgb: Any = cv2.cvtColor(hsv[None].astype(np.float32), cv2.COLOR_HSV2RGB)[0]
+    elif palette == "balance":  # blue, grey where nothing is, red
+        ends = np.array([[0.10, 0.42, 0.90], [0.16, 0.16, 0.16], [0.95, 0.35, 0.10]])
+        rgb = np.stack([np.interp(_STEPS, [0, 0.5, 1], ends[:, channel]) for channel in range(3)], axis=-1)
+    else:
+        ramp = np.arange(256, dtype=np.uint8)[None]
+        kind = cv2.COLORMAP_INFERNO if palette == "inferno" else cv2.COLORMAP_VIRIDIS
+        rgb = cv2.applyColorMap(ramp, kind)[0, 1:, ::-1] / 255
+    return _distinct(np.rint(np.asarray(rgb) * 255).astype(np.int64))
+
+
+def _distinct(rgb: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """The same colours, a repeated one moved by a step of blue: a colour stands for one level."""
+    seen: set[tuple[int, ...]] = set()
+    out = rgb.copy()
+    for color in out:
+        while tuple(color) in seen:
+            color[2] += 1 if color[2] < 255 else -255
+        seen.add(tuple(color))
+    return out.astype(np.uint8)
+
+
+DOLP = Key(0, 0.2, "", (0, 0.05, 0.1, 0.15, 0.2), "inferno", digits=3)
+AOLP = Key(0, 180, "°", (0, 45, 90, 135, 180), "wheel", digits=0)
+ROUGHNESS = Key(0, 1, "", (0, 0.25, 0.5, 0.75, 1))
+F0 = Key(0, 0.16, "", (0, 0.04, 0.08, 0.12, 0.16), digits=3)
+ERROR = Key(0, 30, "°", (0, 1, 3, 10, 20, 30), "inferno", power=2, digits=1)  # 3° at a third of the bar
+DIFFERENCE = Key(-20, 20, " %", (-20, -10, 0, 10, 20), "balance", digits=1)
+SIGMA = Key(0, 0.01, "", (0, 0.0025, 0.005, 0.01), "inferno", digits=4)
+
+
+def depth(values: Floats, metric: bool) -> Key:
+    """From the nearest to the farthest point of the object, in mm where the scale is known."""
+    low, high = (float(edge) for edge in np.percentile(values, [0.5, 99.5])) if values.size else (0.0, 1.0)
+    if high - low < 1e-9:
+        high = low + 1.0
+    ticks = tuple(float(tick) for tick in np.linspace(low, high, 4))
+    return Key(low, high, " mm" if metric else "", ticks, digits=1 if metric else 3)

@@ -1,0 +1,168 @@
+"""In: the results of a run. Out: what a page shows of them, reduced to the size of a screen."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import AngleStack, ColorCalibration, Cues, Floats, Mesh, StokesImage, SurfaceMaps, View
+from polcap.optics import color, frames, shade
+
+WHITE_PATCH = 18  # of a ColorChecker Classic, row by row from dark skin
+_COLUMNS = 6
+_GREATEST_S0 = 0.995  # percentile of the object's light that becomes white
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Maps, cues and photographs of the object on one grid, no longer than a given side."""
+
+    maps: SurfaceMaps
+    depth: Floats  # (H, W) as the mesh has it; NaN outside
+    radiance: Floats  # (H, W, 3) S0, linear Rec.709
+    dolp: Floats  # (H, W)
+    aolp: Floats  # (H, W) degrees, 0…180
+    ratio: Floats  # (2, H, W) S1/S0, S2/S0
+    angle: Floats  # (K,) rad
+
+
+def reduce(maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues: Cues, angle: Floats, longest: int) -> Shown:
+    """The results with at most `longest` pixels a side; colors and angles are averaged over the object alone."""
+    height, width = maps.mask.shape
+    shrink = min(1.0, longest / max(height, width))
+    size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
+    inside = np.asarray(maps.mask & cues.mask, bool)
+    share = _area(inside.astype(np.float32), size)
+    normal = _mean(maps.normal, inside, share, size)
+    light = np.maximum(cues.radiance.sum(-1), 1e-6)
+    weight = np.maximum(_mean(light, inside, share, size), 1e-9)
+    ratio = np.stack([_mean(part * light, inside, share, size) / weight for part in cues.ratio])
+    axis = [_mean(part, inside, share, size) for part in cues.normalized_stokes]
+    view = replace(
+        maps.view,
+        focal=maps.view.focal * shrink,
+        center=tuple((edge + 0.5) * shrink - 0.5 for edge in maps.view.center),
+        scale=maps.view.scale / shrink,
+        origin=tuple(edge * shrink for edge in maps.view.origin),
+    )
+    small = replace(
+        maps,
+        normal=normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6),
+        diffuse=_mean(maps.diffuse, inside, share, size),
+        specular=_mean(maps.specular, inside, share, size),
+        roughness=_mean(maps.roughness, inside, share, size),
+        confidence=_mean(maps.confidence, inside, share, size),
+        depth_prior=None,
+        mask=share > 0.5,
+        view=view,
+    )
+    known = inside & np.isfinite(mesh.depth)
+    reached = _area(known.astype(np.float32), size)
+    depth = np.where((reached > 0.5) & small.mask, _mean(mesh.depth, known, reached, size), np.nan)
+    return Shown(
+        maps=small,
+        depth=depth,
+        radiance=_mean(cues.radiance, inside, share, size),
+        dolp=_mean(cues.dolp, inside, share, size),
+        aolp=np.degrees(np.arctan2(axis[1], axis[0]) / 2) % 180,
+        ratio=ratio,
+        angle=angle,
+    )
+
+
+@dataclass(frozen=True)
+class Rerendered:
+    """The photographs of each angle, in grey, beside what the maps say they should be."""
+
+    measured: Floats  # (K, H, W) ½(S0 + S1 cos 2θ + S2 sin 2θ), white = 1 where the object is brightest
+    predicted: Floats  # (K, H, W) the same from normals and material under a flash beside the lens
+    flashed: Floats  # (H, W, 3) S0 of the maps under that flash, linear Rec.709
+    scale: float  # brightness of the photographs over that of the re-rendering, least squares
+
+    def rms(self, inside: NDArray[np.bool_]) -> list[float]:
+        """Root mean square of the difference of each angle, of white."""
+        return [float(np.sqrt(np.mean((m - p)[inside] ** 2))) for m, p in zip(self.measured, self.predicted)]
+
+
+def rerender(shown: Shown, ior: float) -> Rerendered:
+    """Light the maps as the photographs were lit, through the same polarizer angles."""
+    maps = shown.maps
+    ray = frames.rays(maps.view, *maps.mask.shape)
+    normal = frames.to_ray_frame(maps.normal, ray)
+    ahead = np.zeros_like(ray)
+    ahead[..., 2] = 1.0
+    index = np.full(maps.mask.shape, ior, np.float32)
+    ones = np.ones_like(index)
+    drawn = shade.stokes(normal, maps.diffuse, maps.specular, np.maximum(maps.roughness, 0.02), index, ahead, ones)
+    flashed = np.asarray(drawn)[0] * maps.mask[..., None]
+    drawn = np.asarray(drawn).mean(axis=-1) * maps.mask
+    seen = shown.radiance.mean(axis=-1) * maps.mask
+    both = seen[maps.mask], drawn[0][maps.mask]
+    scale = float(both[0] @ both[1] / max(float(both[1] @ both[1]), 1e-12)) if maps.mask.any() else 1.0
+    white = max(float(np.quantile(both[0], _GREATEST_S0)), 1e-6) if maps.mask.any() else 1.0
+    measured, predicted = [], []
+    for angle in shown.angle:
+        on_ray = frames.axis_on_ray(np.float32(angle), ray)
+        measured.append(seen * (1 + shown.ratio[0] * np.cos(2 * angle) + shown.ratio[1] * np.sin(2 * angle)) / white)
+        predicted.append(
+            scale * (drawn[0] + drawn[1] * np.cos(2 * on_ray) + drawn[2] * np.sin(2 * on_ray)) * maps.mask / white
+        )
+    return Rerendered(np.stack(measured), np.stack(predicted), flashed, scale)
+
+
+def exposure(shown: Shown) -> float:
+    """What S0 is multiplied by so that the object's brightest parts come just below white."""
+    inside = shown.radiance[shown.maps.mask]
+    return 0.9 / max(float(np.quantile(inside.max(axis=-1), _GREATEST_S0)), 1e-6) if inside.size else 1.0
+
+
+def photograph(radiance: AngleStack, calibration: ColorCalibration, view: View, size: tuple[int, int]) -> Floats:
+    """The reference shot where the maps lie, linear Rec.709 on the scale of S0, (H, W, 3) at `size` (width, height).
+
+    view : of the maps, whose full size on their own grid is that of `size` times what `view.scale` says.
+    """
+    factor = view.scale / radiance.view.scale  # pixels of the merged shot per pixel of the maps
+    x, y = (edge * factor for edge in view.origin)
+    width, height = size[0] * factor, size[1] * factor
+    left, top = round(x), round(y)
+    crop = radiance.value[0][top : top + round(height), left : left + round(width)]
+    return np.asarray(_area(2 * np.asarray(crop, np.float32), size) @ calibration.matrix.T.astype(np.float32))
+
+
+def patches(radiance: AngleStack, found: ColorCalibration) -> Floats | None:
+    """The chart's colors as measured, (24, 3) linear Rec.709, without the light's slope and glare; None: no chart."""
+    if found.quads is None:
+        return None
+    camera = np.zeros((24, 3))
+    for index, quad in enumerate(found.quads):
+        drawn = np.zeros(radiance.value.shape[1:3], np.uint8)
+        cv2.fillConvexPoly(drawn, np.round(quad).astype(np.int32), 1)
+        inside = radiance.value[0][drawn > 0]
+        camera[index] = 2 * np.median(inside, axis=0) if len(inside) else np.nan
+    row, column = np.divmod(np.arange(24), _COLUMNS)
+    white_row, white_column = divmod(WHITE_PATCH, _COLUMNS)
+    offset = np.stack([column - white_column, row - white_row], axis=-1)
+    light = 1 + offset @ np.array(found.falloff)
+    return np.asarray((camera @ found.matrix.T - found.glare) / light[:, None])
+
+
+def srgb(linear: Any) -> NDArray[np.uint8]:
+    """Linear 0…1 as 8-bit sRGB."""
+    encoded = color.encode_srgb(np.clip(np.nan_to_num(np.asarray(linear)), 0, 1))
+    return np.asarray(np.rint(255 * encoded), np.uint8)
+
+
+def _area(image: Floats, size: tuple[int, int]) -> Floats:
+    """Averaged down to (width, height); as it is where the size is the same."""
+    image = np.ascontiguousarray(image, np.float32)
+    return image if image.shape[1::-1] == size else np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+
+
+def _mean(image: Floats, inside: NDArray[np.bool_], share: Floats, size: tuple[int, int]) -> Floats:
+    """Mean over the object's pixels alone; 0 where there are none."""
+    spread = inside if image.ndim == 2 else inside[..., None]
+    total = _area(np.where(spread, image, 0), size)
+    weight = share if image.ndim == 2 else share[..., None]
+    return np.asarray(np.where(weight > 1e-3, total / np.maximum(weight, 1e-3), 0), np.float32)

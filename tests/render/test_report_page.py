@@ -1,0 +1,78 @@
+"""report.html in a browser without network: it opens, the light moves, the pointer reads the maps."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from polcap.formats import maps
+from tests.render import devtools
+
+
+@pytest.fixture(scope="module")
+def page(result: Path) -> Iterator[devtools.Page]:
+    with devtools.opened() as page:
+        page.open(result / "report.html", 1280, 900)
+        yield page
+
+
+def test_page_opens_without_network_or_complaint(page: devtools.Page, result: Path) -> None:
+    for width, height in ((390, 844), (768, 1024), (1280, 900)):
+        page.open(result / "report.html", width, height)
+        assert page.evaluate("document.documentElement.dataset.ready") == "yes"
+        assert page.evaluate("document.documentElement.scrollWidth") == width  # nothing sticks out
+    assert page.complaints == []
+    assert [address for address in page.asked if not address.startswith(("data:", "file:"))] == []
+
+
+def test_page_prints_with_its_pictures(page: devtools.Page) -> None:
+    printed = page.pdf()
+    assert printed.startswith(b"%PDF") and printed.count(b"/Subtype /Image") + printed.count(b"/Subtype/Image") > 10
+
+
+def seen(page: devtools.Page, canvas: str, tmp_path: Path) -> np.ndarray:
+    """The pixels of a canvas, (H, W, 3) 0…255."""
+    text = page.evaluate(f"document.getElementById('{canvas}').toDataURL().split(',')[1]")
+    data = np.frombuffer(devtools.base64.b64decode(text), np.uint8)
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))[..., ::-1].astype(float)
+
+
+def test_light_follows_the_pointer(page: devtools.Page, tmp_path: Path) -> None:
+    left, right = [], []
+    for across, found in ((0.05, left), (0.95, right)):
+        page.evaluate(f"relight.aim({2 * across - 1}, 0); relight.draw()")
+        picture = seen(page, "relight", tmp_path)
+        half = picture.shape[1] // 2
+        found.extend([picture[:, :half].mean(), picture[:, half:].mean()])
+    assert left[0] > 1.5 * left[1] and right[1] > 1.5 * right[0]
+
+
+def test_surface_turns_and_changes_its_clothes(page: devtools.Page, tmp_path: Path) -> None:
+    page.evaluate("solid.turn = [0, 0]; solid.draw()")
+    front = seen(page, "solid", tmp_path)
+    page.evaluate("solid.rotate(0.8, 0); solid.draw()")
+    turned = seen(page, "solid", tmp_path)
+    page.evaluate("document.querySelector('[data-mode=\"2\"]').click(); solid.draw()")
+    normals = seen(page, "solid", tmp_path)
+    assert (front.max(axis=-1) > 40).mean() > 0.05
+    assert np.abs(front - turned).mean() > 2 and np.abs(turned - normals).mean() > 2
+
+
+def test_pointer_reads_the_maps(page: devtools.Page, result: Path) -> None:
+    stored = maps.read(result / "maps")
+    height, width = stored.maps.mask.shape
+    row, column = np.argwhere(stored.maps.mask & (stored.maps.normal[..., 2] > 0.9))[500]
+    page.evaluate(f"point({(column + 0.5) / width}, {(row + 0.5) / height})")
+    texts = {
+        name: page.evaluate(f"document.querySelector('#map-{name} output').textContent")
+        for name in ("normal", "diffuse", "roughness", "error", "depth")
+    }
+    numbers = {name: np.array([float(n) for n in re.findall(r"-?[\d.]+", text)]) for name, text in texts.items()}
+    assert np.allclose(numbers["normal"], stored.maps.normal[row, column], atol=0.011)  # 8 bits, two digits
+    assert np.allclose(numbers["diffuse"], stored.maps.diffuse[row, column], atol=0.04)  # JPEG
+    assert np.allclose(numbers["roughness"], stored.maps.roughness[row, column], atol=0.01)
+    assert np.allclose(numbers["error"], stored.maps.confidence[row, column], atol=0.35)
+    assert np.allclose(numbers["depth"], stored.depth[row, column], rtol=2e-3)
