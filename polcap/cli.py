@@ -146,6 +146,79 @@ def _whenever_settled(capture: Path, target: Path, once: Callable[[], None]) -> 
 
 @app.command()
 @terminal.reported
+def batch(
+    context: typer.Context,
+    root: Annotated[Path, typer.Argument(help="Folder with captures, however deep.")],
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; by default CAPTURE/polcap each.")] = None,
+    config: Annotated[Path | None, typer.Option(help="TOML file of settings, a section per stage.")] = None,
+    assignments: Annotated[
+        list[str] | None, typer.Option("--set", metavar="K=V", help="A setting, as hdr.clip=0.95; repeatable.")
+    ] = None,
+    shard: Annotated[
+        str | None, typer.Option(metavar="K/N", help="The K-th of N parts; else what Slurm, AWS, Kubernetes, PBS say.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, tcp://host:8786 or local (extra [batch]).")
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Captures at a time on this machine.")] = 1,
+    retries: Annotated[int, typer.Option(min=0, help="Tries more for a capture whose process died.")] = 2,
+    keep_going: Annotated[
+        bool, typer.Option("--keep-going/--fail-fast", help="Go on after a failure, or stop at the first.")
+    ] = True,
+    write_jobs: Annotated[
+        Literal["slurm", "openjd", "opencue", "snakemake", "kubernetes"] | None,
+        typer.Option(metavar="KIND", help="Only write the job file for slurm, openjd, opencue, snakemake, kubernetes."),
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=0, help="Shards of the job file; 0 is one per capture, 1000 at most.")] = 0,
+    json: Json = False,
+    device: Annotated[Device, typer.Option(help="Where the network runs; cuda never falls back.")] = "cpu",
+    threads: Annotated[int, typer.Option(min=0, help="Threads per capture; 0 is all.")] = 0,
+    memory: Annotated[float, typer.Option(min=0, help="Most memory per process, GB; 0 is no limit.")] = 0,
+    angles: Annotated[
+        str | None, typer.Option(metavar="DEG,…", help="Angles of the shots in order, as 0,45,90.")
+    ] = None,
+    chart: Annotated[Path | None, typer.Option(metavar="FILE", help="Color profile for all captures.")] = None,
+    no_chart: Annotated[bool, typer.Option("--no-chart", help="Use the camera's own colours.")] = False,
+    estimator: Annotated[
+        Literal["network", "analytic"] | None, typer.Option(help="By default the network where one is shipped.")
+    ] = None,
+    model: Annotated[Path | None, typer.Option(metavar="ONNX", help="Another model than the shipped one.")] = None,
+) -> None:
+    """Process every capture below a folder; what is finished is left alone, what breaks does not stop the rest."""
+    import msgspec
+
+    from polcap import batch as batches
+    from polcap import config as settings
+    from polcap.batch import job_files, shards, unit
+
+    if write_jobs is not None:
+        found = batches.find(root, out)
+        command = job_files.command(root, context.params)
+        job = job_files.Job(command, root.resolve(), jobs or min(len(found), 1000), memory_gb=memory or 4.0)
+        file = job_files.write(write_jobs, job, (out or root).resolve() / unit.FOLDER)
+        print(f"start it: {job_files.SUBMIT[write_jobs].format(file=file)}", file=sys.stderr)
+        terminal.say({"file": str(file), "shards": job.shards} if json else str(file))
+        return
+    order = unit.Order(
+        settings=msgspec.to_builtins(settings.load(config, assignments or ())),
+        chart=_chart(None if chart is None else str(chart), no_chart),
+        estimator=estimator,
+        model=None if model is None else str(model.resolve()),
+        device=device,
+        threads=threads,
+        memory_gb=memory,
+        angles_deg=_angles(angles),
+    )
+    part = shards.from_environment(os.environ) if shard is None else shards.parse(shard)
+    how = batches.How(part, scheduler, workers, retries, keep_going)
+    summary = batches.run(root, out, order, how, lambda line: print(line, file=sys.stderr, flush=True))
+    terminal.say(summary if json else str((out or root) / unit.FOLDER / "summary.html"))
+    if code := batches.exit_code(summary):
+        raise typer.Exit(code)
+
+
+@app.command()
+@terminal.reported
 def export(
     context: typer.Context,
     result: Result,
@@ -177,10 +250,16 @@ def show(
 @app.command()
 @terminal.reported
 def status(context: typer.Context, result: Result, json: Json = False) -> None:
-    """What a result folder holds, stage by stage."""
+    """What a result folder holds, stage by stage; or how far a batch of captures is."""
     from polcap import store
 
     found = store.contents(result)
+    if not found and (result / "polcap-batch").is_dir():
+        from polcap import batch as batches
+
+        about = batches.status(batches.reopen(result))
+        terminal.say(about if json else batches.lines(about))
+        return
     if not found:
         raise SettingError(f"{result} holds no stage cache; give the result folder of `polcap process`")
     rows = [{name: about[name] for name in ("stage", "version", "key", "seconds", "bytes")} for about in found]

@@ -77,6 +77,18 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None) 
     return _named(folder, listing, angles_deg) or _by_time(folder, listing, angles_deg or DEFAULT_DEG)
 
 
+def looks_like_a_capture(folder: Path, inside: Iterable[str], files: Iterable[str]) -> bool:
+    """Whether a folder of these sub-folders and files is one capture, by names and the first bytes of files alone.
+
+    Photographs beside sub-folders are taken for somebody's notes, unless capture.toml says otherwise.
+    """
+    if capture_toml.NAME in files or any(_POL_FOLDER.fullmatch(name) for name in inside):
+        return True
+    if any(name != OUTPUT and not name.startswith(".") for name in inside):
+        return False
+    return any(sniff.kind(folder / name) in ("raw", "photo") for name in sorted(files) if not name.startswith("."))
+
+
 def _toml(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None) -> Plan:
     sources = []
     for entry in stated.frame:

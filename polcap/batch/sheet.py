@@ -1,0 +1,100 @@
+"""In: the records of a batch. Out: its contact sheet and summary tables: summary.html, .csv and .json."""
+
+import csv
+import io
+import json
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict
+from html import escape
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import cv2
+import numpy as np
+
+from polcap.batch.unit import FINISHED, FOLDER, Record, Unit
+from polcap.formats import atomic
+
+_SIDE = 128  # px, of each of the two pictures in a thumbnail
+_STYLE = """
+body { font: 14px/1.4 system-ui, sans-serif; margin: 1.5em; color: #222 } img { background: #000; display: block }
+table { border-collapse: collapse } td, th { text-align: left; padding: .2em .8em .2em 0; vertical-align: top }
+.sheet { display: grid; grid-template-columns: repeat(auto-fill, 256px); gap: 12px } figcaption { font-size: 12px }
+.done { color: #176617 } .gates { color: #9a5b00 } .failed, .bug, .crashed { color: #b00000; font-weight: bold }
+"""
+
+
+def write_thumbnail(unit: Unit) -> None:
+    """Normal and diffuse albedo of a finished unit, side by side."""
+    maps = Path(unit.out) / "maps"
+    pictures = [_small(maps / name) for name in ("normal.png", "diffuse.png")]
+    _, encoded = cv2.imencode(".jpg", np.hstack(pictures), [cv2.IMWRITE_JPEG_QUALITY, 85])
+    with atomic.path(unit.thumbnail_file) as temporary:
+        temporary.write_bytes(encoded.tobytes())
+
+
+def _small(file: Path) -> Any:
+    """(SIDE, SIDE, 3) of a map's PNG, black around it."""
+    out = np.zeros((_SIDE, _SIDE, 3), np.uint8)
+    picture = cv2.imread(str(file), cv2.IMREAD_COLOR)
+    if picture is not None:
+        height, width = picture.shape[:2]
+        scale = _SIDE / max(height, width)
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        out[: size[1], : size[0]] = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    return out
+
+
+def summary(records: Sequence[Record]) -> dict[str, Any]:
+    """Counts and rows, as summary.json has them."""
+    counts = Counter(record.state for record in records)
+    return {
+        "captures": len(records),
+        "finished": sum(counts[state] for state in FINISHED),
+        "states": dict(sorted(counts.items())),
+        "seconds": round(sum(record.seconds for record in records), 3),
+        "rows": [asdict(record) for record in records],
+    }
+
+
+def write(desk: Path, units: Sequence[Unit], records: Sequence[Record]) -> None:
+    """The three summaries into the batch's folder. Raises StorageError."""
+    told = summary(records)
+    text = io.StringIO()
+    table = csv.DictWriter(text, ["name", "state", "seconds", "attempts", "says"], extrasaction="ignore")
+    table.writeheader()
+    table.writerows(told["rows"])
+    written = {
+        "summary.json": json.dumps(told, ensure_ascii=False, indent=1) + "\n",
+        "summary.csv": text.getvalue(),
+        "summary.html": _page(told, units, records),
+    }
+    for name, content in written.items():
+        with atomic.path(desk / name) as temporary:
+            temporary.write_text(content, encoding="utf-8")
+
+
+def _page(told: dict[str, Any], units: Sequence[Unit], records: Sequence[Record]) -> str:
+    states = ", ".join(f"{count} {state}" for state, count in told["states"].items())
+    lines = [
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{FOLDER}</title><style>{_STYLE}</style>',
+        f"<h1>{told['finished']} of {told['captures']} captures finished ({escape(states)})</h1>",
+    ]
+    wrong = [record for record in records if record.state != "done"]
+    if wrong:
+        lines.append("<table><tr><th>capture</th><th></th><th>what and what to do</th></tr>")
+        lines += [
+            f'<tr><td>{escape(r.name)}</td><td class="{r.state}">{r.state}</td><td>{escape(r.says)}</td></tr>'
+            for r in wrong
+        ]
+        lines.append("</table>")
+    lines.append('<div class="sheet">')
+    for unit, record in zip(units, records, strict=True):
+        if unit.thumbnail_file.exists():
+            report = (Path(unit.out) / "report.html").resolve().as_uri()
+            picture = f'<img loading="lazy" width="256" height="128" src="thumbnails/{quote(unit.slug)}.jpg" alt="">'
+            caption = f'<span class="{record.state}">{escape(record.name)}</span> {record.seconds:.1f} s'
+            lines.append(f'<figure><a href="{report}">{picture}</a><figcaption>{caption}</figcaption></figure>')
+    return "\n".join([*lines, "</div></html>", ""])

@@ -1,0 +1,210 @@
+"""One capture of a batch: what decides its result, and the work itself, which never raises.
+
+A unit is idempotent: its result folder is written through the store, so that a unit that was cut off goes on
+where it stopped, and one that is done is known by its stamp without opening a photograph.
+"""
+
+import hashlib
+import json
+import os
+import socket
+import time
+import traceback
+from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from polcap import __version__
+from polcap.errors import InputError, PolcapError, StorageError
+from polcap.formats import atomic
+from polcap.images import ChartRequest, Network
+
+State = Literal["todo", "running", "interrupted", "done", "gates", "failed", "bug", "crashed"]
+FINISHED: tuple[State, ...] = ("done", "gates")  # the asset is there
+FOLDER = "polcap-batch"  # in ROOT or in --out: records, thumbnails, summary, job files; safe to delete
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A capture and where its result goes."""
+
+    name: str  # relative to the root, "/" between folders
+    capture: str
+    out: str
+    desk: str  # the batch's own folder
+
+    @property
+    def slug(self) -> str:
+        """A file name of its own for every capture."""
+        return f"{Path(self.capture).name[:80]}-{hashlib.blake2b(self.name.encode(), digest_size=4).hexdigest()}"
+
+    @property
+    def record_file(self) -> Path:
+        return Path(self.desk) / "records" / f"{self.slug}.json"
+
+    @property
+    def thumbnail_file(self) -> Path:
+        return Path(self.desk) / "thumbnails" / f"{self.slug}.jpg"
+
+
+@dataclass(frozen=True)
+class Order:
+    """What is to be done with every capture; the same for all of a batch."""
+
+    settings: dict[str, Any]  # of polcap.config.Config, as plain data
+    chart: ChartRequest = field(default_factory=lambda: ChartRequest("auto"))
+    estimator: Literal["network", "analytic"] | None = None
+    model: str | None = None
+    device: Literal["cpu", "cuda", "auto"] = "cpu"
+    threads: int = 0
+    memory_gb: float = 0.0
+    angles_deg: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Record:
+    """What became of a unit."""
+
+    name: str
+    state: State = "todo"
+    says: str = ""  # one line: the error with its remedy, or the failed gates
+    seconds: float = 0.0
+    stamp: str = ""
+    host: str = ""
+    pid: int = 0
+    attempts: int = 0
+
+
+def run(unit: Unit, order: Order, attempt: int = 1) -> Record:
+    """Process one capture; whatever goes wrong is in the record."""
+    start = time.perf_counter()
+    record = Record(unit.name, "running", "", 0.0, "", socket.gethostname(), os.getpid(), attempt)
+    try:
+        record = replace(record, stamp=stamp(unit, order))
+        write_record(unit, record)
+        about = _process(unit, order)
+        failed = [gate for gate in about["gates"] if gate["state"] == "fail"]
+        says = "; ".join(f"{gate['name']} {gate['value']} (limit {gate['limit']}): {gate['says']}" for gate in failed)
+        record = replace(record, state="gates" if failed else "done", says=says)
+    except PolcapError as error:
+        record = replace(record, state="failed", says=_line(error))
+    except MemoryError:
+        record = replace(record, state="failed", says="out of memory; raise --memory or run fewer workers")
+    except Exception as error:
+        says = f"{type(error).__name__}: {_line(error)}; its traceback stands in {unit.record_file.with_suffix('.txt')}"
+        record = replace(record, state="bug", says=says)
+        _write_traceback(unit)
+    record = replace(record, seconds=round(time.perf_counter() - start, 3))
+    try:
+        write_record(unit, record)
+    except StorageError as error:
+        record = replace(record, state="failed", says=_line(error))
+    return record
+
+
+def _process(unit: Unit, order: Order) -> dict[str, Any]:
+    from polcap import pipeline
+    from polcap.batch import sheet
+    from polcap.config import Config
+    from polcap.formats import capture as captures
+
+    config = msgspec.convert(order.settings, Config)
+    given = pipeline.Given(
+        chart=order.chart, network=_network(order.estimator, order.model, order.device, order.threads)
+    )
+    found = captures.read(unit.capture, order.angles_deg)
+    about = pipeline.process(found, given, config, Path(unit.out))
+    assert about is not None  # only `until` leaves it out
+    sheet.write_thumbnail(unit)
+    return about
+
+
+@lru_cache(maxsize=1)
+def _network(estimator: Any, model: str | None, device: Any, threads: int) -> Network | None:
+    """Loaded once for all captures of a process."""
+    from polcap import pipeline
+
+    return pipeline.load_network(estimator, None if model is None else Path(model), device, threads)
+
+
+def stamp(unit: Unit, order: Order) -> str:
+    """Digest of all that decides a result: names, sizes and times of the files, settings, model, version."""
+    files = []
+    out = Path(unit.out).resolve()
+    for root, folders, names in os.walk(unit.capture):
+        here = Path(root)
+        folders[:] = sorted(name for name in folders if not name.startswith(".") and (here / name).resolve() != out)
+        for name in sorted(names):
+            if not name.startswith("."):
+                about = (here / name).stat()
+                files.append([os.path.relpath(here / name, unit.capture), about.st_size, about.st_mtime_ns])
+    model = None if order.model is None else [order.model, Path(order.model).stat().st_mtime_ns]
+    wanted = [order.settings, _plain(order.chart), order.estimator, model, order.angles_deg, __version__]
+    text = json.dumps([files, wanted], sort_keys=True, default=str)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def _plain(request: ChartRequest) -> list[Any]:
+    corners = None if request.corners is None else request.corners.tolist()
+    profile = None if request.profile is None else request.profile.matrix.tolist()
+    return [request.mode, corners, profile]
+
+
+def finished(unit: Unit, order: Order) -> Record | None:
+    """The record of an earlier run whose result is there and would come out the same; else None."""
+    record = read_record(unit)
+    if record.state not in FINISHED or not (Path(unit.out) / "report.json").is_file():
+        return None
+    try:
+        return record if record.stamp == stamp(unit, order) else None
+    except OSError:
+        return None
+
+
+def read_record(unit: Unit) -> Record:
+    """What is known of a unit; a running one whose process is gone from this host was interrupted."""
+    try:
+        record = msgspec.convert(json.loads(unit.record_file.read_text(encoding="utf-8")), Record)
+    except (OSError, ValueError, msgspec.ValidationError):
+        return Record(unit.name)
+    if record.state == "running" and record.host == socket.gethostname() and not _alive(record.pid):
+        return replace(record, state="interrupted")
+    return record
+
+
+def write_record(unit: Unit, record: Record) -> None:
+    with atomic.path(unit.record_file) as temporary:
+        temporary.write_text(json.dumps(asdict(record), ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def crashed(unit: Unit, why: str, attempt: int) -> Record:
+    """The record of a unit that took its process down, written for it."""
+    record = Record(unit.name, "crashed", why, 0.0, "", socket.gethostname(), 0, attempt)
+    write_record(unit, record)
+    return record
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _write_traceback(unit: Unit) -> None:
+    text = traceback.format_exc()
+    try:
+        with atomic.path(unit.record_file.with_suffix(".txt")) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    except InputError:
+        pass  # the record says what happened; the disk may be the reason
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split())

@@ -1,0 +1,109 @@
+"""A batch ends whatever breaks in it, and does nothing twice."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from polcap import batch
+from polcap.batch import unit as one
+from polcap.errors import CaptureError
+from tests.batch.conftest import OPTIONS
+from tests.conftest import ROOT, Command, shell
+
+
+def test_captures_are_found_however_deep_and_results_are_not(captures: Path, tmp_path: Path) -> None:
+    assert [unit.name for unit in batch.find(captures)] == ["broken", "deeper/obj1", "obj0"]
+    assert [unit.name for unit in batch.find(captures / "obj0")] == ["obj0"]
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "list.txt").write_text("obj0")
+    with pytest.raises(CaptureError, match="holds no capture"):
+        batch.find(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def finished(captures: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("finished")
+    done = shell("batch", captures, "--out", out, *OPTIONS, "--json")
+    assert done.returncode == 2, done.stderr  # one is broken
+    summary = json.loads(done.stdout)
+    assert summary["captures"] == 3 and summary["finished"] == 2
+    assert "0:00:00 left" in done.stderr
+    return out
+
+
+def test_broken_capture_stops_no_other_and_is_told_with_its_remedy(finished: Path) -> None:
+    rows = {row["name"]: row for row in json.loads((finished / "polcap-batch/summary.json").read_text())["rows"]}
+    assert rows["broken"]["state"] == "failed" and "copy it from the card again" in rows["broken"]["says"]
+    for name in ("obj0", "deeper/obj1"):
+        assert rows[name]["state"] in ("done", "gates")
+        assert (finished / name / "asset" / f"{Path(name).name}.glb").exists()
+    page = (finished / "polcap-batch/summary.html").read_text()
+    assert page.count("<figure>") == 2 and "copy it from the card again" in page
+
+
+def test_second_run_opens_no_finished_capture(captures: Path, finished: Path, polcap: Command) -> None:
+    before = (finished / "obj0/report.json").stat().st_mtime_ns
+    done = polcap("batch", captures, "--out", finished, *OPTIONS, "--shard", "3/3")
+    assert "finished before: 1" in done.stderr and done.returncode in (0, 3)
+    assert (finished / "obj0/report.json").stat().st_mtime_ns == before
+
+
+def test_changed_setting_is_done_again(captures: Path, finished: Path) -> None:
+    units = [unit for unit in batch.find(captures, finished) if unit.name == "obj0"]
+    order = one.Order({"hdr": {}})
+    assert one.finished(units[0], order) is None
+    assert one.stamp(units[0], order) != one.stamp(units[0], one.Order({"hdr": {"clip": 0.9}}))
+
+
+def test_status_tells_every_capture(finished: Path, polcap: Command) -> None:
+    about = json.loads(polcap("status", finished, "--json").stdout)
+    assert about["states"]["failed"] == 1 and about["finished"] == 2
+    assert "2 of 3 finished" in polcap("status", finished).stdout
+
+
+def test_fail_fast_stops(captures: Path, tmp_path: Path, polcap: Command) -> None:
+    done = polcap("batch", captures, "--out", tmp_path, *OPTIONS, "--fail-fast", "--json")
+    assert done.returncode == 2
+    assert json.loads(done.stdout)["states"] == {"failed": 1, "todo": 2}
+
+
+def start(captures: Path, out: Path, *more: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "polcap", "batch", captures / "obj0", "--out", out, *OPTIONS, *more]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+
+
+def kill_worker(out: Path) -> None:
+    """The process that works on the capture now, as its record tells."""
+    for _ in range(1200):
+        for file in (out / "polcap-batch" / "records").glob("*.json"):
+            record = json.loads(file.read_text())
+            if record["state"] == "running" and any((out / "obj0").glob("work/01-hdr")):
+                os.kill(record["pid"], signal.SIGKILL)
+                return
+        time.sleep(0.05)
+    raise AssertionError("no worker began")
+
+
+@pytest.mark.parametrize("how", [(), ("--scheduler", "local", "--workers", "2")], ids=["processes", "dask"])
+def test_killed_worker_costs_nothing_but_time(captures: Path, finished: Path, tmp_path: Path, how: tuple) -> None:
+    if how:
+        pytest.importorskip("distributed")
+    running = start(captures, tmp_path, *how)
+    kill_worker(tmp_path)
+    _, told = running.communicate(timeout=300)
+    assert running.returncode in (0, 3), told
+    again = (tmp_path / "obj0/asset/obj0.glb").read_bytes()
+    assert again == (finished / "obj0/asset/obj0.glb").read_bytes()
+
+
+def test_scheduler_that_does_not_answer_is_named(captures: Path, tmp_path: Path, polcap: Command) -> None:
+    pytest.importorskip("distributed")
+    done = polcap("batch", captures, "--out", tmp_path, *OPTIONS, "--scheduler", "tcp://127.0.0.1:9")
+    assert done.returncode == 2 and "tcp://127.0.0.1:9: no scheduler answers there" in done.stderr

@@ -1,0 +1,64 @@
+"""Job files say what the farms' own rules ask for; their validators are run where they are installed."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from polcap.batch import job_files
+from polcap.batch.job_files import Job
+
+ROOT = Path("/shows/An object's {raw}")
+
+
+@pytest.fixture
+def job() -> Job:
+    return Job(job_files.command(ROOT, {"assignments": ["hdr.clip=0.9"], "keep_going": True}), ROOT, 12)
+
+
+def written(kind: job_files.Kind, job: Job, folder: Path) -> str:
+    return job_files.write(kind, job, folder).read_text()
+
+
+def test_options_reach_the_command(job: Job) -> None:
+    assert job.command == ("polcap", "batch", str(ROOT), "--set", "hdr.clip=0.9")
+
+
+def test_slurm_script_is_shell(job: Job, tmp_path: Path) -> None:
+    text = written("slurm", job, tmp_path)
+    assert "#SBATCH --array=1-12" in text and "--shard" not in text  # the array's variables say it
+    subprocess.run(["sh", "-n"], input=text, text=True, check=True)
+
+
+def test_openjd_template_is_valid(job: Job, tmp_path: Path) -> None:
+    template = json.loads(written("openjd", job, tmp_path))
+    model = pytest.importorskip("openjd.model")
+    assert model.decode_job_template(template=template).name == job.name
+
+
+def test_opencue_specification_is_well_formed(job: Job, tmp_path: Path) -> None:
+    spec = ElementTree.fromstring(written("opencue", job, tmp_path))
+    assert spec.findtext("job/layers/layer/range") == "1-12"
+    assert "--shard #IFRAME#/12" in (spec.findtext("job/layers/layer/cmd") or "").replace("'\"'\"'", "'")
+
+
+def test_kubernetes_job_is_valid(job: Job, tmp_path: Path) -> None:
+    document = json.loads(written("kubernetes", job, tmp_path))
+    assert document["spec"]["completions"] == 12 and document["spec"]["completionMode"] == "Indexed"
+    validate = pytest.importorskip("kubernetes_validate")
+    validate.validate(document, validate.latest_version(), strict=True)
+
+
+def test_snakefile_plans_every_shard(job: Job, tmp_path: Path) -> None:
+    written("snakemake", job, tmp_path)
+    tool = shutil.which("snakemake", path=str(Path(sys.executable).parent)) or shutil.which("snakemake")
+    if tool is None:
+        pytest.skip("snakemake is not installed")
+    file = str(tmp_path / "Snakefile")
+    done = subprocess.run([tool, "-s", file, "--dry-run", "--cores", "1"], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "shard" in done.stdout and "12" in done.stdout

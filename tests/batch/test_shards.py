@@ -1,0 +1,49 @@
+"""Every capture belongs to one shard, whoever numbers the shards."""
+
+import pytest
+
+from polcap.batch import shards
+from polcap.errors import SettingError
+
+
+def test_shards_cover_everything_once() -> None:
+    items = list(range(23))
+    parts = [shards.parse(f"{k}/5").of(items) for k in range(1, 6)]
+    assert sorted(item for part in parts for item in part) == items
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+
+
+@pytest.mark.parametrize("text", ["0/4", "5/4", "1/0", "2", "a/b", "-1/3", "1/2/3"])
+def test_wrong_shard_is_refused(text: str) -> None:
+    with pytest.raises(SettingError, match="give K/N"):
+        shards.parse(text)
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [
+        # Slurm: array=10-40:10
+        {
+            "SLURM_ARRAY_TASK_ID": "30", "SLURM_ARRAY_TASK_MIN": "10",
+            "SLURM_ARRAY_TASK_STEP": "10", "SLURM_ARRAY_TASK_COUNT": "4",
+        },
+        {"AWS_BATCH_JOB_ARRAY_INDEX": "2", "AWS_BATCH_JOB_ARRAY_SIZE": "4"},
+        {"JOB_COMPLETION_INDEX": "2", "POLCAP_SHARDS": "4"},
+        {"PBS_ARRAY_INDEX": "3", "POLCAP_SHARDS": "4"},
+    ],
+)  # fmt: skip
+def test_environment_says_third_of_four(environment: dict[str, str]) -> None:
+    assert str(shards.from_environment(environment)) == "3/4"
+
+
+def test_no_array_is_the_whole() -> None:
+    assert shards.from_environment({"SLURM_JOB_ID": "7"}) == shards.WHOLE
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [{"JOB_COMPLETION_INDEX": "2"}, {"PBS_ARRAY_INDEX": "0", "POLCAP_SHARDS": "4"}, {"PBS_ARRAY_INDEX": "x"}],
+)
+def test_index_without_a_meaning_is_refused(environment: dict[str, str]) -> None:
+    with pytest.raises(SettingError):
+        shards.from_environment(environment)
