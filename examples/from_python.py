@@ -10,11 +10,12 @@ import numpy as np
 
 from polcap import config, pipeline
 from polcap.formats import capture, maps
+from polcap.path import UserInput
 
 source, out = map(Path, sys.argv[1:3])
 report = pipeline.process(
     capture.read(source),
-    pipeline.Given(),  # chart found in the picture, object found by itself, analytic estimator
+    UserInput(),  # chart found in the picture, object found by itself, analytic estimator
     config.load(assignments=["surface.jump_px=3"]),
     out,
 )

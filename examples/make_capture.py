@@ -6,10 +6,10 @@ python examples/make_capture.py FOLDER
 import sys
 from pathlib import Path
 
-from polcap.synth.capture import Scene, Shoot, write
-from polcap.synth.chart import Chart
-from polcap.synth.materials import Coat, Material
-from polcap.synth.shapes import Vase
+from polcap.synth.color_checker import Chart
+from polcap.synth.distance_fields import Vase
+from polcap.synth.scene_materials import Coat, Material
+from polcap.synth.shooting import Scene, Shoot, write
 
 GLAZE = Material((0.05, 0.22, 0.30), (0.62, 0.60, 0.48), "veins", size=0.022, roughness=(0.30, 0.36), ior=1.52, seed=4)
 CLAY = Material((0.52, 0.22, 0.10), (0.66, 0.38, 0.20), "noise", size=0.012, roughness=(0.50, 0.58), ior=1.46, seed=9)

@@ -93,18 +93,19 @@ def process(
     from polcap import config as settings
     from polcap import pipeline
     from polcap.formats import capture as captures
+    from polcap.path import STAGES, UserInput
 
     _limit_memory(memory)
     for flag, stage in (("--until", until), ("--force", force)):
-        if stage is not None and stage not in pipeline.STAGES:
-            raise SettingError(f"{flag} {stage}: no such stage; choose one of {', '.join(pipeline.STAGES)}")
+        if stage is not None and stage not in STAGES:
+            raise SettingError(f"{flag} {stage}: no such stage; choose one of {', '.join(STAGES)}")
     chosen = settings.load(config, assignments or ())
     request = _chart(chart, no_chart)
     target = out or capture / "polcap"
 
     @functools.cache
-    def given() -> pipeline.Given:
-        return pipeline.Given(
+    def supplied() -> UserInput:
+        return UserInput(
             chart=request,
             mask=None if mask is None else _mask(mask),
             network=pipeline.load_network(estimator, model, device, threads),
@@ -113,11 +114,11 @@ def process(
     def once() -> None:
         found = captures.read(capture, _angles(angles))
         if dry_run:
-            _print_plan(found, pipeline.plan(found, given(), chosen, target, force), json)
+            _print_plan(found, pipeline.plan(found, supplied(), chosen, target, force), json)
             return
-        known = given()
+        known = supplied()
         print(captures.table(found), file=sys.stderr)
-        with terminal.progress(len(pipeline.STAGES) + 1) as told:
+        with terminal.progress(len(STAGES) + 1) as told:
             about = pipeline.process(found, known, chosen, target, until, force, told)
         if about is None:
             return
@@ -331,9 +332,9 @@ def check(
 def doctor(context: typer.Context, json: Json = False) -> None:
     """What works on this machine, what does not, and the remedy. Asks every serial port who answers."""
     from polcap import doctor as doctors
-    from polcap.rig import camera_gphoto2, rotator, transport
+    from polcap.rig import camera_gphoto2, rotator, serial_port
 
-    found = doctors.examine(doctors.Rig(transport.ports, rotator.probe, camera_gphoto2.connected), Path.cwd())
+    found = doctors.examine(doctors.Rig(serial_port.ports, rotator.probe, camera_gphoto2.connected), Path.cwd())
     terminal.say(doctors.shown(found) if json else doctors.table(found))
     if any(one.state == "fault" for one in found):
         raise typer.Exit(SettingError.exit_code)
@@ -368,8 +369,8 @@ def synth(
     from msgspec.structs import replace
 
     from polcap import config as settings
-    from polcap.synth import capture as synthetic
     from polcap.synth import scenes
+    from polcap.synth import shooting as synthetic
 
     if dataset is not None:
         corpus = _extra("corpus")

@@ -1,88 +1,30 @@
-"""READ FIRST. In: a capture. Out: its maps, its asset and the verdict on them.
+"""In: a capture and what the user gives with it. Out: its maps, its asset and the verdict on them, in files.
 
-The whole path is `path`, one line per stage; each line's work is the file of the same name in
-`stages/`. Measure, then apply once: white balance, alignment and self-calibration return small values;
-`stokes` applies gains and transforms, `cues` the colour matrix. Images are resampled once.
-
-A line declares its step and computes nothing: the store computes what somebody asks for, or finds it.
+The stages and their order stand in `path.py`; this is what surrounds them: locks, result folders, reports.
 """
 
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
-from polcap import report
+from polcap import pictures, report
 from polcap.config import Config
-from polcap.errors import ModelError, ObjectError, SettingError, StorageError
+from polcap.errors import ModelError, SettingError, StorageError
 from polcap.formats import atomic, calib, gltf, obj, onnx, png
 from polcap.formats import maps as maps_folder
-from polcap.images import AngleStack, Asset, Capture, ChartRequest, ColorCalibration, Network
-from polcap.report import Results
-from polcap.stages import align, asset, cues, hdr, infer, mask, selfcal, stokes, surface, whitebalance
+from polcap.images import Asset, Capture, Network
+from polcap.path import STAGES, Results, UserInput, path
+from polcap.stages import asset, surface
 from polcap.store import Archive, Progress, Store, contents, silent
-
-STAGES = ("hdr", "whitebalance", "align", "mask", "selfcal", "stokes", "cues", "infer", "surface", "asset")
-AUTO = ChartRequest("auto")
-
-
-@dataclass(frozen=True)
-class Given:
-    """What the user gives beside the photographs."""
-
-    chart: ChartRequest = AUTO
-    mask: NDArray[np.bool_] | None = None  # on the RAW pixels or on the grid of the merged picture
-    network: Network | None = None  # None: the analytic estimator
-
-
-def path(capture: Capture | None, given: Given, config: Config, store: Store) -> Results:
-    """From RAW brackets to the asset."""
-    reference = calib.colorchecker()
-    radiance = store.step(hdr.merge, capture, config=config.hdr)
-    color = store.step(whitebalance.measure, radiance, reference, given.chart, config=config.whitebalance)
-    alignment = store.step(align.register, radiance, color, config=config.align)
-    marked = store.derive(on_grid, given.mask, radiance)
-    object_ = store.step(mask.segment, radiance, alignment, color, marked, config=config.mask)
-    gains = store.step(selfcal.solve, radiance, alignment, object_, color, config=config.selfcal)
-    stokes_ = store.step(stokes.solve, radiance, alignment, gains, object_, config=config.stokes)
-    cues_ = store.step(cues.compute, stokes_, color)
-    maps = store.step(infer.estimate, cues_, given.network, config=config.infer)
-    distance = store.derive(distance_m, color, radiance)
-    mesh = store.step(surface.integrate, maps, distance, config=config.surface)
-    asset_ = store.step(asset.build, maps, mesh, config=config.asset)
-    return Results(radiance, color, alignment, object_, gains, stokes_, cues_, maps, mesh, asset_)
-
-
-def on_grid(drawn: NDArray[np.bool_] | None, radiance: AngleStack) -> NDArray[np.bool_] | None:
-    """The user's mask on the grid of the merged picture; drawn there, or on the RAW pixels."""
-    if drawn is None:
-        return None
-    height, width = radiance.value.shape[1:3]
-    step = round(radiance.view.scale)
-    tall, wide = drawn.shape
-    if (tall, wide) == (height, width):
-        return drawn
-    if abs(tall - step * height) < step and abs(wide - step * width) < step:
-        return np.asarray(drawn[::step, ::step][:height, :width])
-    raise ObjectError(
-        f"--mask is {wide}×{tall} px; draw it on the picture's {step * width}×{step * height} or {width}×{height} px"
-    )
-
-
-def distance_m(color: ColorCalibration, radiance: AngleStack) -> float | None:
-    """Distance of the chart, and so about that of the object beside it [m]; None where no chart tells."""
-    return None if color.metres_per_px is None else color.metres_per_px * radiance.view.focal
 
 
 def process(
     capture: Capture,
-    given: Given,
+    supplied: UserInput,
     config: Config,
     out: Path,
     until: str | None = None,
@@ -96,18 +38,18 @@ def process(
     InputError
         Anything at fault with what the user gave, from the stage that saw it.
     """
-    _apart(out, Path(capture.folder))
+    _check_separate(out, Path(capture.folder))
     store = Store(out, progress, force)
     with store.lock():
         sweep(out)
-        results = path(capture, given, config, store)
-        _remember(out, capture, config, given.network)
+        results = path(capture, supplied, config, store)
+        _remember_run(out, capture, config, supplied.network)
         store.materialize(until)
         if until is not None:
             return None
         progress("write", None, False)
         start = time.perf_counter()
-        about = report.document(report.capture_facts(capture), results, config, given.network, timings(out))
+        about = report.document(report.capture_facts(capture), results, config, supplied.network, timings(out))
         maps_folder.write(
             out / "maps", results.maps.value, results.mesh.value, results.stokes.value, results.cues.value
         )
@@ -117,10 +59,10 @@ def process(
     return about
 
 
-def plan(capture: Capture, given: Given, config: Config, out: Path, force: str | None = None) -> dict[str, str]:
+def plan(capture: Capture, supplied: UserInput, config: Config, out: Path, force: str | None = None) -> dict[str, str]:
     """What `process` would do with each stage, without doing it: cached, compute, or on demand."""
     store = Store(out, force=force)
-    path(capture, given, config, store)
+    path(capture, supplied, config, store)
     return {kept.name: "on demand" if not kept.keep else "cached" if kept.ready else "compute" for kept in store.steps}
 
 
@@ -162,7 +104,7 @@ def reopen(out: Path) -> tuple[Results, dict[str, Any]]:
         config = msgspec.convert(about["settings"], Config)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StorageError(f"{out} holds no stage cache of this polcap; run `polcap process` again") from error
-    return path(None, Given(), config, Archive(out)), about
+    return path(None, UserInput(), config, Archive(out)), about
 
 
 def show(out: Path, stage: str) -> Path:
@@ -171,7 +113,7 @@ def show(out: Path, stage: str) -> Path:
         raise SettingError(f"{stage!r} is no stage; choose one of {', '.join(STAGES)}")
     results, _ = reopen(out)
     file = out / "work" / f"{stage}.png"
-    png.write(file, results.picture(stage))
+    png.write(file, pictures.of_stage(results, stage))
     return file
 
 
@@ -223,13 +165,13 @@ def sweep(out: Path) -> None:
             atomic.discard(left)
 
 
-def _apart(out: Path, photographs: Path) -> None:
+def _check_separate(out: Path, photographs: Path) -> None:
     """The result never lands among the photographs."""
     if out.resolve() == photographs.resolve():
         raise SettingError(f"--out {out} is the capture itself; choose a folder of its own")
 
 
-def _remember(out: Path, capture: Capture, config: Config, network: Network | None) -> None:
+def _remember_run(out: Path, capture: Capture, config: Config, network: Network | None) -> None:
     """work/run.json: what `show` and `report` need when the photographs are gone."""
     model = None if network is None else {**network.metadata, "digest": network.digest}
     about = {"capture": report.capture_facts(capture), "settings": msgspec.to_builtins(config), "model": model}

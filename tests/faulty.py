@@ -9,8 +9,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 
 from polcap.images import Floats
-from polcap.synth import capture as synthetic
-from polcap.synth.capture import Shoot, Studio, Take, random_scene
+from polcap.synth import shooting as synthetic
+from polcap.synth.shooting import Shoot, Studio, Take, random_scene
 
 FAULTS = {  # what went wrong: the lines of `polcap check` that tell it; none: the folder cannot be read
     "clipped": ("clipping",),

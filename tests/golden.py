@@ -14,16 +14,12 @@ from zlib import crc32
 
 import numpy as np
 
-from polcap import pipeline, stages, store
-
-MODULES = (
-    pipeline.hdr, pipeline.whitebalance, pipeline.align, pipeline.mask, pipeline.selfcal,
-    pipeline.stokes, pipeline.cues, pipeline.infer, pipeline.surface, pipeline.asset,
-)  # fmt: skip
+from polcap import path, pipeline, stages, store
 
 
 def versions() -> dict[str, int]:
-    found = [value for module in MODULES for value in vars(module).values() if isinstance(value, stages.Stage)]
+    rooms = (vars(path)[name] for name in path.STAGES)
+    found = [value for room in rooms for value in vars(room).values() if isinstance(value, stages.Stage)]
     return {stage.name: stage.version for stage in found}
 
 

@@ -21,7 +21,7 @@ def test_layers_and_strangers() -> None:
 
 def test_stages_stand_in_the_order_of_the_path() -> None:
     from polcap import stages
-    from polcap.pipeline import STAGES
+    from polcap.path import STAGES
 
     listed = re.findall(r"^    (\w+)  ", stages.__doc__ or "", re.M)
     assert tuple(listed) == STAGES

@@ -14,6 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from polcap import cli, pipeline
+from polcap.path import STAGES
 from tests.conftest import Command, shell
 
 
@@ -129,7 +130,7 @@ def test_failed_gate_is_exit_3_after_everything_is_written(
     assert json.loads((copy / "report.json").read_text())["verdict"] == "fail"
 
 
-@pytest.mark.parametrize("stage", pipeline.STAGES)
+@pytest.mark.parametrize("stage", STAGES)
 def test_every_stage_can_be_looked_at(result: Path, tmp_path: Path, stage: str) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(result, copy)

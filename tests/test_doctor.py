@@ -81,9 +81,9 @@ def test_full_disk_is_a_fault_and_a_nearly_full_one_a_warning(tmp_path: Path, mo
 def test_command_prints_one_document_and_ends_with_2_on_a_fault(
     polcap: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from polcap.rig import camera_gphoto2, transport
+    from polcap.rig import camera_gphoto2, serial_port
 
-    monkeypatch.setattr(transport, "ports", list)
+    monkeypatch.setattr(serial_port, "ports", list)
     monkeypatch.setattr(camera_gphoto2, "connected", list)
     done = polcap("doctor", "--json")
     about = json.loads(done.stdout)

@@ -18,6 +18,7 @@ from polcap.errors import ObjectError
 from polcap.formats import capture as captures
 from polcap.formats import maps
 from polcap.images import AngleStack, ColorCalibration, View
+from polcap.path import STAGES, UserInput, distance_m, on_grid
 from tests.conftest import ROOT, Command
 
 
@@ -62,7 +63,7 @@ def test_running_again_computes_nothing_and_gives_the_same_bytes(
     copy = tmp_path / "again"
     shutil.copytree(result, copy)
     again = polcap("process", example, "--out", copy, "--estimator", "analytic")
-    states = [line.split()[1] for line in again.stderr.splitlines() if line.startswith(pipeline.STAGES)]
+    states = [line.split()[1] for line in again.stderr.splitlines() if line.startswith(STAGES)]
     assert states.count("cached") == 8 and again.returncode == 0
     assert product(copy) == product(result)
 
@@ -150,8 +151,8 @@ def test_faulty_capture_is_one_clear_line_and_leaves_nothing(
 
 
 def test_capture_without_chart_says_so_and_passes_with_no_chart(tmp_path: Path, polcap: Command) -> None:
-    from polcap.synth.capture import Shoot, write
     from polcap.synth.scenes import random_scene
+    from polcap.synth.shooting import Shoot, write
 
     scene = random_scene(3, "bumps")
     bare = type(scene)(**{**{f: getattr(scene, f) for f in scene.__struct_fields__}, "chart": None})
@@ -209,9 +210,9 @@ def test_photographs_are_never_touched(example: Path, tmp_path: Path, polcap: Co
 
 def test_plan_tells_what_is_cached(result: Path, example: Path) -> None:
     found = captures.read(example)
-    states = pipeline.plan(found, pipeline.Given(), Config(), result)
+    states = pipeline.plan(found, UserInput(), Config(), result)
     assert set(states.values()) == {"cached", "on demand"}
-    states = pipeline.plan(found, pipeline.Given(), Config(), result, force="mask")
+    states = pipeline.plan(found, UserInput(), Config(), result, force="mask")
     assert states["align"] == "cached" and states["mask"] == states["surface"] == "compute"
 
 
@@ -239,16 +240,16 @@ def test_mask_may_be_drawn_on_either_grid() -> None:
     coarse[1:3, 2:5] = True
     fine = coarse.repeat(2, 0).repeat(2, 1)
     for drawn in (coarse, fine):
-        placed = pipeline.on_grid(drawn, stack(4, 6, 2.0))
+        placed = on_grid(drawn, stack(4, 6, 2.0))
         assert placed is not None and np.array_equal(placed, coarse)
     with pytest.raises(ObjectError, match="5×4 px"):
-        pipeline.on_grid(np.zeros((4, 5), bool), stack(4, 6, 2.0))
+        on_grid(np.zeros((4, 5), bool), stack(4, 6, 2.0))
 
 
 def test_distance_follows_from_the_size_of_the_chart() -> None:
     """Similar triangles: 1 mm per pixel at a focal length of 100 px is 0.1 m away."""
     color = ColorCalibration(np.eye(3), None, None, None, "chart", 0.0, 1e-3)
-    assert pipeline.distance_m(color, stack(2, 2, 1.0)) == pytest.approx(0.1)
+    assert distance_m(color, stack(2, 2, 1.0)) == pytest.approx(0.1)
 
 
 def test_the_example_from_python_runs(result: Path, example: Path, tmp_path: Path) -> None:

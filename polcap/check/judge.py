@@ -6,6 +6,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
+from polcap.check import outline, sharpness
 from polcap.check.reduced import Taken
 from polcap.config import Config
 from polcap.errors import ChartError, InputError
@@ -23,7 +24,7 @@ from polcap.images import (
     Quality,
     StokesImage,
 )
-from polcap.optics import mueller, outline, sharpness
+from polcap.optics import mueller
 from polcap.stages import align, cues, hdr, infer, mask, selfcal, stokes, whitebalance
 
 _LEAST_RIM = 200  # pixels of outline that an angle can be told from

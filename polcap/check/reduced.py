@@ -7,8 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap.check import sharpness
 from polcap.images import Capture, Floats, Frame, SensorImage
-from polcap.optics import sensor, sharpness
+from polcap.optics import sensor
 
 _MOST_PIXELS = 0.6e6  # of the pictures that the stages see: they take three to four seconds on two cores
 _LEAST_LIGHT = 0.01  # of the sensor's range; in darker tiles noise is detail

@@ -4,6 +4,7 @@ Colour codes, the same everywhere: normals n·½+½ (x right red, y up green); A
 of 180° once around the wheel; DoLP, depth and errors from dark (small) to bright (large).
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -25,9 +26,27 @@ from polcap.images import (
     SurfaceMaps,
 )
 from polcap.optics.warp import warp
+from polcap.path import Results
 
 Picture = NDArray[np.uint8]
 WIDTH = 640  # px of one tile
+
+
+def of_stage(results: Results, stage: str) -> Picture:
+    """What a stage made, for a person to look at."""
+    paint: dict[str, Callable[[], Picture]] = {
+        "hdr": lambda: merged(results.radiance.value),
+        "whitebalance": lambda: chart(results.radiance.value, results.color.value),
+        "align": lambda: alignment(results.radiance.value, results.alignment.value),
+        "mask": lambda: outline(results.radiance.value, results.color.value, results.object_.value),
+        "selfcal": lambda: gains(results.gains.value, results.radiance.value.angle),
+        "stokes": lambda: stokes(results.stokes.value),
+        "cues": lambda: cues(results.cues.value),
+        "infer": lambda: maps(results.maps.value),
+        "surface": lambda: surface(results.mesh.value, results.maps.value),
+        "asset": lambda: asset(results.asset.value),
+    }
+    return paint[stage]()
 
 
 def reference(radiance: AngleStack, color: ColorCalibration) -> Picture:

@@ -19,59 +19,18 @@ from polcap.config import Config, Gates
 from polcap.errors import StorageError
 from polcap.formats import atomic
 from polcap.images import (
-    Alignment,
-    AngleStack,
-    Asset,
     Capture,
-    ColorCalibration,
-    Cues,
     Floats,
     Frame,
-    Gains,
-    Mesh,
     Network,
-    ObjectMask,
     Quality,
     StokesImage,
-    SurfaceMaps,
 )
+from polcap.path import Results
 from polcap.report import page, shown
-from polcap.store import StageResult
 
 _COMPARED_PX = 512  # the longest side on which photographs and re-rendering are compared
 State = Literal["pass", "fail", "warn", "not measured"]
-
-
-@dataclass(frozen=True)
-class Results:
-    """Every result of the path; each is found or computed when its value is asked for."""
-
-    radiance: StageResult[AngleStack]
-    color: StageResult[ColorCalibration]
-    alignment: StageResult[Alignment]
-    object_: StageResult[ObjectMask]
-    gains: StageResult[Gains]
-    stokes: StageResult[StokesImage]
-    cues: StageResult[Cues]
-    maps: StageResult[SurfaceMaps]
-    mesh: StageResult[Mesh]
-    asset: StageResult[Asset]
-
-    def picture(self, stage: str) -> pictures.Picture:
-        """What a stage made, for a person to look at."""
-        paint: dict[str, Callable[[], pictures.Picture]] = {
-            "hdr": lambda: pictures.merged(self.radiance.value),
-            "whitebalance": lambda: pictures.chart(self.radiance.value, self.color.value),
-            "align": lambda: pictures.alignment(self.radiance.value, self.alignment.value),
-            "mask": lambda: pictures.outline(self.radiance.value, self.color.value, self.object_.value),
-            "selfcal": lambda: pictures.gains(self.gains.value, self.radiance.value.angle),
-            "stokes": lambda: pictures.stokes(self.stokes.value),
-            "cues": lambda: pictures.cues(self.cues.value),
-            "infer": lambda: pictures.maps(self.maps.value),
-            "surface": lambda: pictures.surface(self.mesh.value, self.maps.value),
-            "asset": lambda: pictures.asset(self.asset.value),
-        }
-        return paint[stage]()
 
 
 class Gate(msgspec.Struct, frozen=True):

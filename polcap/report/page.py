@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +13,11 @@ from scipy import ndimage
 from polcap import pictures
 from polcap.formats import calib, html
 from polcap.images import Floats
+from polcap.path import Results
 from polcap.pictures import keys
 from polcap.pictures.keys import Key, Palette
 from polcap.report import labels, lean, plots, shown
 from polcap.report.shown import Rerendered, Shown
-
-if TYPE_CHECKING:
-    from polcap.report import Results
 
 _LONGEST = 1024  # px of a map on the page
 _RIM = 4  # px that normals go on past the outline, for a texture's filter
@@ -35,7 +33,7 @@ PATCHES = (
 )  # fmt: skip
 
 
-def write(folder: Path, about: Mapping[str, Any], results: "Results") -> None:
+def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
     """report.html in a result folder.
 
     Raises
@@ -247,7 +245,7 @@ def _rerendered(small: Shown, again: Rerendered, about: Mapping[str, Any]) -> It
     yield "</div>"
 
 
-def _measured(results: "Results", about: Mapping[str, Any]) -> Iterator[str]:
+def _measured(results: Results, about: Mapping[str, Any]) -> Iterator[str]:
     radiance, color = results.radiance.value, results.color.value
     gains, moved = results.gains.value, results.alignment.value
     angles = [float(angle) for angle in np.degrees(radiance.angle)]
@@ -283,12 +281,12 @@ def _drawn(title: str, says: str, drawing: str) -> str:
     return f"<figure>{drawing}<figcaption><b>{escape(title)}</b><br><span>{escape(says)}</span></figcaption></figure>"
 
 
-def _pictures(results: "Results") -> Iterator[str]:
+def _pictures(results: Results) -> Iterator[str]:
     radiance, color = results.radiance.value, results.color.value
     told: Sequence[tuple[str, str, NDArray[np.uint8]]] = (
         ("Reference shot", "the chart as it was read", pictures.chart(radiance, color)),
         ("Object", "what was taken for it", pictures.outline(radiance, color, results.object_.value)),
-        ("Registration", "first shot magenta, the other green: grey is good", results.picture("align")),
+        ("Registration", "first shot magenta, the other green: grey is good", pictures.of_stage(results, "align")),
     )
     yield '<h2>What polcap saw</h2><div class="grid">'
     for title, says, picture in told:

@@ -1,4 +1,4 @@
-"""A camera's name in, the camera out: what every camera of the rig does."""
+"""What every camera of the rig does, and the exposures it is asked for."""
 
 import re
 from dataclasses import dataclass
@@ -10,7 +10,6 @@ from msgspec import Meta
 
 from polcap.errors import SettingError
 from polcap.images import Role
-from polcap.rig.log import Log
 
 Positive = Annotated[float, Meta(gt=0)]
 _WORD = re.compile(
@@ -69,32 +68,6 @@ class Camera(Protocol):
     def close(self) -> None:
         """Give the camera back; never raises."""
         ...
-
-
-def open_camera(name: str, log: Log) -> Camera:
-    """`gphoto2`, `gphoto2:MODEL or PORT`, `folder:PATH` or `simulated?width=768`.
-
-    Raises
-    ------
-    SettingError
-        There is no such camera, or a query names an unknown setting.
-    HardwareError
-        It does not answer.
-    """
-    kind, _, rest = name.partition(":")
-    if kind == "gphoto2":
-        from polcap.rig import camera_gphoto2
-
-        return camera_gphoto2.Gphoto2(rest, log)
-    if kind == "folder" and rest:
-        from polcap.rig import camera_folder
-
-        return camera_folder.WatchedFolder(rest, log)
-    if name.partition("?")[0] == "simulated":
-        from polcap.rig import simulated
-
-        return simulated.Camera(name.partition("?")[2], log)
-    raise SettingError(f"--camera {name}: no such camera; give gphoto2, gphoto2:MODEL, folder:PATH or simulated")
 
 
 def parse_bracket(text: str) -> tuple[Exposure, ...]:

@@ -19,9 +19,9 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 
 from polcap.errors import HardwareError
-from polcap.rig import transport
+from polcap.rig import serial_port
 from polcap.rig.log import Log
-from polcap.rig.transport import Port, Silent, patiently
+from polcap.rig.serial_port import Port, Silent, patiently
 
 BACKLASH_DEG = 0.0  # the piezo drives the ring itself
 BAUD = 9600
@@ -146,7 +146,7 @@ class Elliptec:
 
     def _answer(self) -> tuple[str, str]:
         """Kind and data of this device's next answer; other addresses of the bus are passed over."""
-        end = time.monotonic() + transport.ANSWER_S
+        end = time.monotonic() + serial_port.ANSWER_S
         while True:
             line = self._port.read_line(max(0.0, end - time.monotonic()))
             match = _ANSWER.fullmatch(line)

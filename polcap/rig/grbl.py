@@ -17,9 +17,9 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 
 from polcap.errors import HardwareError
-from polcap.rig import manual, transport
+from polcap.rig import manual, serial_port
 from polcap.rig.log import Log
-from polcap.rig.transport import Port, Silent, patiently
+from polcap.rig.serial_port import Port, Silent, patiently
 
 BACKLASH_DEG = 2.0
 BAUD = 115200
@@ -97,7 +97,7 @@ class Grbl:
     def go(self, angle_deg: float) -> None:
         target = self._zero + angle_deg * self._per_degree
         self._command(f"G21G90G53G0{self._settings.axis}{target:.4f}")
-        self._until_done("G4P0.01", silent_s=1.5 * transport.ANSWER_S)  # a dwell waits for the movement
+        self._until_done("G4P0.01", silent_s=1.5 * serial_port.ANSWER_S)  # a dwell waits for the movement
 
     def where(self) -> float:
         return (self._position() - self._zero) / self._per_degree
@@ -141,7 +141,7 @@ class Grbl:
         """Send a line, return what came before its ok. Raises Silent, HardwareError."""
         self._port.send(f"{text}\n".encode())
         said: list[str] = []
-        end = time.monotonic() + transport.ANSWER_S
+        end = time.monotonic() + serial_port.ANSWER_S
         while True:
             line = self._port.read_line(max(0.0, end - time.monotonic()))
             if self._says_ok(line):
@@ -190,7 +190,7 @@ class Grbl:
     def _status(self) -> tuple[str, float]:
         """State and machine position of the axis."""
         self._port.send(b"?")
-        end = time.monotonic() + transport.ANSWER_S
+        end = time.monotonic() + serial_port.ANSWER_S
         while True:
             line = self._port.read_line(max(0.0, end - time.monotonic()))
             if match := _STATUS.fullmatch(line):

@@ -7,7 +7,7 @@ from pathlib import Path
 from polcap.errors import CaptureError, DecodeError
 from polcap.formats import atomic
 from polcap.images import Floats
-from polcap.rig import frames
+from polcap.rig import frame_check
 from polcap.rig.camera import Shot, light
 from polcap.rig.log import Log
 from polcap.rig.plan import Slot
@@ -20,7 +20,7 @@ _BRACKETED = ("shot", "repeat")
 class Landing:
     """One thread that saves and judges, in the order of taking."""
 
-    def __init__(self, book: Record, limits: frames.Limits, tries: int, log: Log) -> None:
+    def __init__(self, book: Record, limits: frame_check.Limits, tries: int, log: Log) -> None:
         self.small: dict[str, Floats] = {}  # every good frame of this run, small and grey
         self._book = book
         self._limits = limits
@@ -50,26 +50,26 @@ class Landing:
         self._thread.shutdown(wait=True)
 
     def _land(self, slot: Slot, read_deg: float | None, shot: Shot) -> None:
-        name = f"{slot.name}{frames.suffix(shot.data, shot.name)}"
+        name = f"{slot.name}{frame_check.suffix(shot.data, shot.name)}"
         file = self._book.folder / name
         with atomic.path(file) as temporary:
             temporary.write_bytes(shot.data)
         others = self._book.good()
         try:
-            facts, small = frames.inspect(file)
+            facts, small = frame_check.inspect(file)
         except DecodeError as error:
             self._reject(slot.name, file, read_deg, str(error).removeprefix(f"{file}: "))
             return
         shortest = slot.role in _BRACKETED and light(slot.exposure) == self._least
         every = [good.facts for good in others.values()]
-        reason = frames.fault(facts, shot.exposure, slot.flash, shortest, every, self._limits)
+        reason = frame_check.fault(facts, shot.exposure, slot.flash, shortest, every, self._limits)
         alike = {
             name: good
             for name, good in others.items()
             if good.step == slot.step and slot.role in _BRACKETED and good.role in _BRACKETED
         }
         sharpest = max((good.facts.sharpness for good in alike.values()), default=0.0)
-        if reason is None and frames.blurred(facts.sharpness, sharpest, self._limits):
+        if reason is None and frame_check.blurred(facts.sharpness, sharpest, self._limits):
             reason = "is less sharp than its neighbours; let the tripod settle"
         if reason is not None:
             self._reject(slot.name, file, read_deg, reason)
@@ -78,7 +78,7 @@ class Landing:
         self._book.keep(slot, good)
         self.small[slot.name] = small
         for earlier, other in alike.items():
-            if frames.blurred(other.facts.sharpness, facts.sharpness, self._limits):
+            if frame_check.blurred(other.facts.sharpness, facts.sharpness, self._limits):
                 reason = "is less sharp than its neighbours; let the tripod settle"
                 self._reject(earlier, self._book.folder / other.file, other.read_deg, reason)
 

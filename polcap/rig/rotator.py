@@ -1,33 +1,45 @@
 """In: a URL as `elliptec:/dev/ttyUSB0?address=0&offset=12`. Out: a Rotator, which turns the polarizer and proves it.
 
 What all motors share lives here: zero offset and sense of turning, approach from one side, settling, reading back,
-asking a silent device again. A motor itself is a small driver (`elliptec`, `grbl`, `line`, `simulated`).
+asking a silent device again. A motor itself is a small driver (`elliptec`, `grbl`, `line_protocol`, `simulated`).
 """
 
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from importlib import import_module
-from typing import Annotated, Protocol, TypeVar
+from typing import Annotated, Any, Protocol, TypeVar
 from urllib.parse import parse_qsl
 
 import msgspec
 from msgspec import Meta, Struct
 
 from polcap.errors import HardwareError, PolcapError, SettingError
-from polcap.rig import elliptec, grbl, line, manual
+from polcap.rig import elliptec, grbl, line_protocol, manual
 from polcap.rig.log import Log
-from polcap.rig.transport import Port, Silent, Unplugged, patiently
+from polcap.rig.serial_port import Port, Silent, Unplugged, patiently
 
 T = TypeVar("T")
 
-MOTORS = ("elliptec", "grbl", "line", "simulated")  # a module each: Settings, BACKLASH_DEG, open_motor
 _Names = tuple[Callable[[str], str | None], ...]
 _QUESTIONS: tuple[tuple[int, bytes, float, _Names], ...] = (  # baud, question, s, whose answer it may be
     (elliptec.BAUD, b"0in", 0.5, (elliptec.recognize,)),
-    (grbl.BAUD, b"\n?\n", 3.0, (grbl.recognize, line.recognize)),
+    (grbl.BAUD, b"\n?\n", 3.0, (grbl.recognize, line_protocol.recognize)),
 )
 _APPROACHES = 2  # a wrong position is approached once more
+
+
+def _simulated() -> Any:
+    from polcap.rig import simulated  # here: it is heavy
+
+    return simulated
+
+
+MOTORS: dict[str, Callable[[], Any]] = {  # by URL; each a module with Settings, BACKLASH_DEG, open_motor
+    "elliptec": lambda: elliptec,
+    "grbl": lambda: grbl,
+    "line": lambda: line_protocol,
+    "simulated": _simulated,
+}
 
 
 class Rotator(Protocol):
@@ -103,7 +115,7 @@ def open_rotator(url: str, log: Log) -> Rotator:
         return manual.Manual(log)
     if kind not in MOTORS:
         raise SettingError(f"rotator {url!r}: {kind!r} is no rotator; choose one of {', '.join(MOTORS)}, manual")
-    driver = import_module(f"polcap.rig.{kind}")  # here: simulated is heavy
+    driver = MOTORS[kind]()
     shared, own = Drive.__struct_fields__, driver.Settings.__struct_fields__
     for key in given:
         if key not in shared + own:

@@ -21,16 +21,15 @@ import msgspec
 from polcap.errors import CaptureError, PolcapError, SettingError, StorageError
 from polcap.formats import atomic, layouts
 from polcap.formats import capture as captures
-from polcap.rig import camera as cameras
-from polcap.rig import frames, manual, plan, preview, record, rotator
-from polcap.rig.camera import Camera
+from polcap.rig import camera_choice, frame_check, manual, plan, preview, record, rotator
+from polcap.rig.camera import Camera, Exposure, Shot
 from polcap.rig.landing import AHEAD, Landing
 from polcap.rig.log import Log
 from polcap.rig.plan import Order, Pace, Slot
 from polcap.rig.record import Content, Record
 from polcap.rig.rotator import Rotator
 
-LIMITS = frames.Limits()
+LIMITS = frame_check.Limits()
 Tell = Callable[[str], None]
 _SPARE = 1.2  # of the room a capture needs
 _BESIDE = {record.LOG, "lock"}  # what a run leaves that was stopped before its first frame
@@ -62,7 +61,7 @@ def shoot(
     wanted: Order,
     *,
     resume: bool = False,
-    limits: frames.Limits = LIMITS,
+    limits: frame_check.Limits = LIMITS,
     tries: int = 2,
     tell: Tell = silent,
 ) -> dict[str, Any]:
@@ -144,7 +143,7 @@ def _loop(book: Record, landing: Landing, turner: Rotator, camera: Camera, log: 
         landing.take(slot, None if slot.angle_deg is None else read_deg, shot)
 
 
-def _photograph(slot: Slot, camera: Camera, log: Log) -> cameras.Shot:
+def _photograph(slot: Slot, camera: Camera, log: Log) -> Shot:
     """One frame; for some a person first does what no device can."""
     camera.prepare(slot.angle_deg, slot.role, slot.step)
     before = after = ""
@@ -170,7 +169,7 @@ def _finished(book: Record, landing: Landing) -> dict[str, Any]:
     middle = len(book.content.order.bracket) // 2
     shots = {name: good for name, good in book.good().items() if good.role == "shot" and good.step == middle}
     small = [
-        landing.small[name] if name in landing.small else frames.inspect(book.folder / good.file)[1]
+        landing.small[name] if name in landing.small else frame_check.inspect(book.folder / good.file)[1]
         for name, good in shots.items()
     ]
     drawn = preview.write(book.folder, [book.stated_deg(good) or 0.0 for good in shots.values()], small)
@@ -213,11 +212,11 @@ def _begun(folder: Path, wanted: Order, resume: bool) -> Content | None:
     return None
 
 
-def _with_bracket(wanted: Order, bracket: tuple[cameras.Exposure, ...]) -> Order:
+def _with_bracket(wanted: Order, bracket: tuple[Exposure, ...]) -> Order:
     return wanted if wanted.bracket else msgspec.structs.replace(wanted, bracket=bracket)
 
 
-def _check_apart(slot: Slot, shot: cameras.Shot, book: Record) -> None:
+def _check_apart(slot: Slot, shot: Shot, book: Record) -> None:
     """The dials could be set so that a bracket has as many exposures as were asked for."""
     for name, good in book.good().items():
         if slot.role == good.role == "shot" and good.step != slot.step and good.exposure == shot.exposure:
@@ -254,7 +253,7 @@ def _log(folder: Path) -> Iterator[Log]:
 
 @contextmanager
 def _held(name: str, log: Log) -> Iterator[Camera]:
-    camera = cameras.open_camera(name, log)
+    camera = camera_choice.open_camera(name, log)
     try:
         yield camera
     finally:

@@ -20,7 +20,7 @@ from polcap.errors import SettingError
 from polcap.images import Floats, Role
 from polcap.rig.camera import Exposure, Shot
 from polcap.rig.log import Log
-from polcap.synth.capture import MIDDLE_S, Kind, Shoot, Studio, Take, random_scene
+from polcap.synth.shooting import MIDDLE_S, Kind, Shoot, Studio, Take, random_scene
 
 BACKLASH_DEG = 2.0
 _NUMBER_OF_ROLE = {"shot": 0, "repeat": 1000, "ambient": 2000, "chart": 3000, "cross": 4000}

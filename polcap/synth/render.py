@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 from polcap.errors import SettingError
 from polcap.images import Floats, GBuffer, View
 from polcap.optics import frames, fresnel, mueller, shade
-from polcap.synth import bounce, materials, mesh, trace
-from polcap.synth import chart as charts
-from polcap.synth.chart import Chart
-from polcap.synth.materials import Coat
-from polcap.synth.shapes import Model, Shape
+from polcap.synth import color_checker as charts
+from polcap.synth import interreflection, mesh_tracer, scene_materials, trace
+from polcap.synth.color_checker import Chart
+from polcap.synth.distance_fields import Model, Shape
+from polcap.synth.scene_materials import Coat
 from polcap.synth.trace import Hits, Vector
 
 
@@ -165,7 +165,7 @@ def _shade(scene: Scene, ray: Floats, hits: Hits) -> Floats:
         hidden = trace.shadowed(scene.shape, scene.position, scene.turn, hits.take(lit), scene.light)
         irradiance[lit[hidden]] = 0.0
     facing, bent = _normals(scene, hits)
-    diffuse, specular, roughness, ior = materials.evaluate(scene.coat, hits.local, facing)
+    diffuse, specular, roughness, ior = scene_materials.evaluate(scene.coat, hits.local, facing)
     normal, light = frames.to_ray_frame(bent, ray), frames.to_ray_frame(to_light, ray)
     direct = shade.stokes(normal, diffuse, specular, roughness, ior, light, irradiance)
     if not scene.interreflection:
@@ -178,10 +178,10 @@ def _shade(scene: Scene, ray: Floats, hits: Hits) -> Floats:
 def _normals(scene: Scene, hits: Hits) -> tuple[Floats, Floats]:
     """Bare normals (N, 3) in the object's frame; normals with relief, still towards the lens, in the camera's."""
     facing = scene.turn.inv().apply(hits.normal)
-    bent = materials.relieved(scene.coat, hits.local, facing)
+    bent = scene_materials.relieved(scene.coat, hits.local, facing)
     if bent is facing:
         return facing, hits.normal
-    return facing, mesh.face_camera(scene.turn.apply(bent), -hits.point / hits.distance[:, None])
+    return facing, mesh_tracer.face_camera(scene.turn.apply(bent), -hits.point / hits.distance[:, None])
 
 
 @lru_cache(maxsize=2)
@@ -189,7 +189,7 @@ def _bounced(scene: Scene) -> Floats:
     """Light that other parts of a mesh throw on the corners of each face, (F, 3, 3)."""
     if not isinstance(scene.shape, Model):
         raise SettingError("interreflection is traced between triangles; give the object as a mesh")
-    tracer = mesh.tracer(scene.shape.file, scene.shape.radius)
+    tracer = mesh_tracer.tracer(scene.shape.file, scene.shape.radius)
     source, lens = (scene.turn.inv().apply(np.array(at) - scene.position) for at in (scene.light, (0.0, 0.0, 0.0)))
     reference = np.sum((np.array(scene.light) - scene.position) ** 2)
 
@@ -198,10 +198,10 @@ def _bounced(scene: Scene) -> Floats:
         squared = np.sum(to_light**2, axis=1)
         cos_i = np.sum(to_light * normal, axis=1) / np.sqrt(squared)
         hidden = tracer.hidden(point + trace.LIFT * normal, source) | (cos_i <= 0)
-        diffuse, _, _, ior = materials.evaluate(scene.coat, point, normal)
+        diffuse, _, _, ior = scene_materials.evaluate(scene.coat, point, normal)
         into, _ = fresnel.transmission(np.clip(cos_i, 1e-3, 1), ior)
         out, _ = fresnel.transmission(np.clip(np.sum(towards * normal, axis=1), 1e-2, 1), ior)
         return diffuse * np.where(hidden, 0, reference / squared * cos_i * into * out)[:, None]
 
     ior = scene.coat.materials[0].ior
-    return np.asarray(bounce.received(tracer, lit, lens, ior)[tracer.mesh.faces])
+    return np.asarray(interreflection.received(tracer, lit, lens, ior)[tracer.mesh.faces])

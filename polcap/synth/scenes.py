@@ -9,10 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from polcap.errors import SettingError
-from polcap.synth.chart import Chart
-from polcap.synth.materials import Coat, Color, Material
+from polcap.synth.color_checker import Chart
+from polcap.synth.distance_fields import Bumps, Cluster, Model, Shape, Vase, Wave
 from polcap.synth.render import Scene
-from polcap.synth.shapes import Bumps, Cluster, Model, Shape, Vase, Wave
+from polcap.synth.scene_materials import Coat, Color, Material
 
 Kind = Literal["bumps", "clusters", "vase"]
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from polcap.images import Floats
-from polcap.synth import mesh
-from polcap.synth.shapes import Model, Shape
+from polcap.synth import mesh_tracer
+from polcap.synth.distance_fields import Model, Shape
 
 Vector = tuple[float, float, float]
 Indices = NDArray[np.integer[Any]]
@@ -52,10 +52,10 @@ def trace(shape: Shape | Model, position: Vector, turn: Rotation, v: Floats, sta
     direction = turn.inv().apply(-v[candidates])
     origin = turn.inv().apply(-np.array(position))
     if isinstance(shape, Model):
-        met = mesh.tracer(shape.file, shape.radius).meet(np.broadcast_to(origin, direction.shape), direction)
+        met = mesh_tracer.tracer(shape.file, shape.radius).meet(np.broadcast_to(origin, direction.shape), direction)
         at = candidates[met.index]
         point = turn.apply(met.position) + position
-        normal = mesh.face_camera(turn.apply(met.normal), v[at])
+        normal = mesh_tracer.face_camera(turn.apply(met.normal), v[at])
         return Hits(at, np.linalg.norm(point, axis=1), point, met.position, normal, met.face, met.weight)
     first = 0.0 if start is None else start[candidates]
     index, distance = _march(shape, np.broadcast_to(origin, direction.shape), direction, first)
@@ -80,7 +80,7 @@ def behind(shape: Shape | Model, position: Vector, turn: Rotation, point: Floats
 def _hidden(shape: Shape | Model, origin: Floats, source: Floats) -> NDArray[np.bool_]:
     """The same in the shape's own frame; the light lies outside the shape."""
     if isinstance(shape, Model):
-        return mesh.tracer(shape.file, shape.radius).hidden(origin, source)
+        return mesh_tracer.tracer(shape.file, shape.radius).hidden(origin, source)
     direction = source - origin
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     out = np.zeros(len(origin), bool)

@@ -4,7 +4,7 @@ comes from there at every step.
 The flash stands next to the lens, so what it lights the camera sees: the light that bounces comes from pixels
 of the same picture. `visibility` traces a few rays from every second pixel of every second row and remembers
 which pixels they meet; `arriving` is the light that takes those ways under the materials of the moment. Left
-out, as in `transport.py`: more bounces, and that bounced light arrives a little polarized.
+out, as in `light_transport.py`: more bounces, and that bounced light arrives a little polarized.
 """
 
 from math import pi
@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 from polcap.images import Floats, GBuffer
 from polcap.optics import brdf, frames, fresnel, shade
-from polcap.training import transport
+from polcap.training import light_transport
 from polcap.training.materials import Surface
 
 COARSE = 2  # pixels of the cache from one place that is traced to the next
@@ -34,7 +34,7 @@ Indices = NDArray[np.integer[Any]]
 
 
 def visibility(
-    scene: transport.Scene, buffer: GBuffer, pose: transport.Pose, rng: np.random.Generator
+    scene: light_transport.Scene, buffer: GBuffer, pose: light_transport.Pose, rng: np.random.Generator
 ) -> tuple[NDArray[np.bool_], NDArray[np.uint16]]:
     """Pixels (H, W) that the flash reaches, and the flat indices (H/2, W/2, RAYS) of pixels that places see.
 
@@ -55,11 +55,11 @@ def visibility(
     places &= mask
     normal = frames.to_ray_frame(buffer.normal[places], v[places])
     way = frames.from_ray_frame(_ways(normal, rng), v[places][:, None])  # (M, RAYS, 3)
-    origin = buffer.position[places] + transport.LIFT * scene.size * above[places]
+    origin = buffer.position[places] + light_transport.LIFT * scene.size * above[places]
     start = np.broadcast_to(origin[:, None], way.shape).reshape(-1, 3)
     direction = way.reshape(-1, 3) @ pose.rotation
     distance, _ = scene.facing(start, direction)
-    met = np.flatnonzero(np.isfinite(distance) & (distance > transport.LIFT * scene.size))
+    met = np.flatnonzero(np.isfinite(distance) & (distance > light_transport.LIFT * scene.size))
     there = start[met] + distance[met, None] * direction[met]
     found = np.full(len(start), NOWHERE, np.uint16)
     found[met] = _pixel(there, np.argwhere(places)[met // RAYS], buffer, pose, scene.size)
@@ -85,7 +85,9 @@ def _ways(normal: Floats, rng: np.random.Generator) -> Floats:
     return np.stack(ways, axis=1)
 
 
-def _pixel(place: Floats, origin: Indices, buffer: GBuffer, pose: transport.Pose, size: float) -> NDArray[np.uint16]:
+def _pixel(
+    place: Floats, origin: Indices, buffer: GBuffer, pose: light_transport.Pose, size: float
+) -> NDArray[np.uint16]:
     """Flat index of the pixel in which the camera sees each of the places (N, 3), NOWHERE if it does not.
 
     Nor where that is next to the pixel `origin` (N, 2) that the ray came from: the grid cannot tell its direction.
@@ -118,7 +120,7 @@ def arriving(seen: Any, normal: Tensor, surface: Surface, body: Tensor) -> Tenso
     irradiance = 1 / (pi * _density(frames.to_ray_frame(seen.normal[here], v), way).clamp(min=1e-3))
     n, rough, ior = normal[here], surface.roughness[here].clamp(min=_SHARPEST), surface.ior[here]
     diffuse, specular = surface.diffuse[here] * light, surface.specular[here]
-    # where F0 is more than the body's index gives, facets have the index that gives it, as in `transport.py`
+    # where F0 is more than the body's index gives, facets have the index that gives it, as in `light_transport.py`
     root = torch.maximum(specular.mean(dim=1), fresnel.normal_reflectance(ior)).sqrt()
     came = shade.stokes(n, diffuse, 0 * specular, rough, ior, way, irradiance)
     came = came + shade.stokes(n, 0 * diffuse, specular * light, rough, (1 + root) / (1 - root), way, irradiance)

@@ -32,7 +32,7 @@ from polcap.formats import atomic, png
 from polcap.images import Bits, Floats
 from polcap.optics import frames, mueller, shade
 from polcap.stages import cues
-from polcap.synth.mesh import Tracer, centred
+from polcap.synth.mesh_tracer import Tracer, centred
 from polcap.training import gbuffers, materials, shapes
 
 ANGLES_DEG = (0, 45, 90, 135)

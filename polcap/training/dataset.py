@@ -18,7 +18,7 @@ from polcap.images import Quality
 from polcap.optics import frames, shade
 from polcap.stages import cues
 from polcap.training import bounce, gbuffers, materials
-from polcap.training.camera import Errors, photograph
+from polcap.training.camera_errors import Errors, photograph
 
 Indices = NDArray[np.integer[Any]]
 

@@ -17,8 +17,8 @@ from polcap.errors import InputError
 from polcap.formats import atomic
 from polcap.formats import mesh as mesh_files
 from polcap.images import Floats, GBuffer, View
-from polcap.synth.mesh import Tracer, Triangles, smooth
-from polcap.training import bounce, shapes, transport
+from polcap.synth.mesh_tracer import Tracer, Triangles, smooth
+from polcap.training import bounce, light_transport, shapes
 
 ARRAYS = {  # pixels from one entry to the next, channels, kind
     "normal": (1, 3, np.float16), "depth": (1, 1, np.float16), "position": (1, 3, np.float16),
@@ -125,7 +125,7 @@ def depth_unit(mask: NDArray[np.bool_], depth: Floats, focal: float) -> tuple[fl
     return middle, float(np.sqrt(mask.sum() / np.pi) * middle / focal)
 
 
-Traced = tuple[GBuffer, transport.Pose, NDArray[np.bool_], NDArray[np.uint16]]  # and `bounce.visibility`
+Traced = tuple[GBuffer, light_transport.Pose, NDArray[np.bool_], NDArray[np.uint16]]  # and `bounce.visibility`
 
 
 def _traced(meshes: list[Path], recipe: Recipe) -> Iterator[Traced]:
@@ -138,13 +138,13 @@ def _traced(meshes: list[Path], recipe: Recipe) -> Iterator[Traced]:
 
 
 def _look(name: str, mesh: Triangles, count: int, recipe: Recipe, rng: np.random.Generator) -> Iterator[Traced]:
-    tracer, scene = Tracer(mesh), transport.Scene(mesh)
+    tracer, scene = Tracer(mesh), light_transport.Scene(mesh)
     for _ in range(count):
         buffer, rotation, translation = seen(name, tracer, recipe.size, rng)
         way, off = rng.uniform(0, 2 * np.pi), rng.uniform(0, _ASIDE)
         aside = (off * np.cos(way), off * np.sin(way)) if recipe.flash is None else recipe.flash
         middle = float(buffer.depth[buffer.mask].mean(dtype=np.float64))
-        placed = transport.Pose(rotation, translation, middle * np.array([*aside, 0.0]), middle**2)
+        placed = light_transport.Pose(rotation, translation, middle * np.array([*aside, 0.0]), middle**2)
         yield buffer, placed, *bounce.visibility(scene, buffer, placed, rng)
 
 

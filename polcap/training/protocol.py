@@ -16,9 +16,9 @@ from polcap.errors import InputError
 from polcap.images import Bits, ColorCalibration, Cues, Floats, GBuffer, Quality, StokesImage, SurfaceMaps, View
 from polcap.optics import frames
 from polcap.stages import cues
-from polcap.synth.mesh import Tracer, Triangles, centred
-from polcap.training import gbuffers, patterns, shapes, transport
-from polcap.training.camera import Errors, photograph
+from polcap.synth.mesh_tracer import Tracer, Triangles, centred
+from polcap.training import gbuffers, light_transport, patterns, shapes
+from polcap.training.camera_errors import Errors, photograph
 
 VERSION = 1  # raise it when the same number gives other pixels
 COUNT, SIZE = 250, 512
@@ -54,10 +54,10 @@ class _Subject:
     """Geometry and material of a picture, before any light."""
 
     name: str
-    pose: transport.Pose
+    pose: light_transport.Pose
     buffer: GBuffer
-    places: transport.Places
-    albedo: transport.Albedo
+    places: light_transport.Places
+    albedo: light_transport.Albedo
     unit: tuple[float, float]  # middle depth and unit of relative depth
 
 
@@ -71,7 +71,7 @@ class Protocol:
         self.size = size
         self.names = [file.stem for file in files]
         self.meshes = [centred(gbuffers.read_mesh(file)) for file in files]
-        self.scenes = [transport.Scene(mesh) for mesh in self.meshes]
+        self.scenes = [light_transport.Scene(mesh) for mesh in self.meshes]
         self.tracers = [Tracer(mesh) for mesh in self.meshes]
         self.materials = patterns.library(data / "materials" / "test")
 
@@ -81,7 +81,7 @@ class Protocol:
         buffer, places = subject.buffer, subject.places
         mesh, _ = combination(number)
         rng = np.random.default_rng([_SEED, number, 1])
-        light = transport.stokes(self.scenes[mesh], places, subject.pose, subject.albedo, rng)
+        light = light_transport.stokes(self.scenes[mesh], places, subject.pose, subject.albedo, rng)
         with torch.random.fork_rng():
             torch.manual_seed(_SEED + number)
             one = torch.ones(1)
@@ -113,7 +113,7 @@ class Protocol:
                 break
         inside = buffer.mask
         middle, unit = gbuffers.depth_unit(inside, buffer.depth, view.focal)
-        pose = transport.Pose(turn, translation, np.array([0, FLASH * middle, 0]), middle**2)
+        pose = light_transport.Pose(turn, translation, np.array([0, FLASH * middle, 0]), middle**2)
         laid, shift = shapes.rotation(rng), rng.uniform(-0.5, 0.5, 3)  # the material's own turn and place
         position, v = buffer.position[inside].astype(np.float64), frames.rays(view, size, size)[inside]
 
@@ -126,7 +126,7 @@ class Protocol:
         bent = frames.to_ray_frame(normal - slope + np.sum(slope * normal, axis=1, keepdims=True) * normal, v)
         bent = np.asarray(frames.lifted(bent))
         _, flat = self.scenes[index].facing(position + 0.01 * (v @ turn), -v @ turn)
-        places = transport.Places(
+        places = light_transport.Places(
             inside, position, flat, bent, v, look.diffuse, look.specular, look.roughness, material.ior
         )
         return _Subject(f"{self.names[index]}, {material.name}", pose, buffer, places, albedo, (middle, unit))
@@ -172,7 +172,7 @@ def _placed(mesh: Triangles, rng: np.random.Generator) -> tuple[Floats, Floats]:
     return turn, np.array([0, 0, -distance]) - middle
 
 
-def _measured(light: Floats, places: transport.Places, view: View, errors: Errors) -> StokesImage:
+def _measured(light: Floats, places: light_transport.Places, view: View, errors: Errors) -> StokesImage:
     mask = places.mask
     at = np.flatnonzero(mask)
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
-from polcap.synth.mesh import Triangles, centred, smooth, union
+from polcap.synth.mesh_tracer import Triangles, centred, smooth, union
 
 _RINGS, _SECTORS = 96, 128
 

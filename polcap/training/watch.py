@@ -11,7 +11,7 @@ from polcap.images import Floats
 from polcap.pictures import Picture
 from polcap.stages.cues import FLOOR
 from polcap.training import gbuffers, loss, materials, protocol
-from polcap.training.camera import Errors
+from polcap.training.camera_errors import Errors
 from polcap.training.dataset import Batch, Simulator, batch
 from polcap.training.model import COLOR
 

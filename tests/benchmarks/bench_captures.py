@@ -17,7 +17,7 @@ from polcap import pipeline
 from polcap.config import Config
 from polcap.formats import capture as captures
 from polcap.images import Capture, Floats, Network
-from polcap.report import Results
+from polcap.path import Results, UserInput, path
 from polcap.store import Store
 
 COLUMNS = (
@@ -48,7 +48,7 @@ def measure(truth_file: Path, network: Network | None) -> list[float]:
     meta = json.loads(Path(stem + ".meta.json").read_text())
     capture = captures.read(Path(stem), None)
     with tempfile.TemporaryDirectory() as out:
-        found = pipeline.path(capture, pipeline.Given(network=network), Config(), Store(Path(out)))
+        found = path(capture, UserInput(network=network), Config(), Store(Path(out)))
         with np.load(stem + ".truth.npz") as maps:
             surface = surface_errors(found, dict(maps))
         return [*surface[:2], *capture_errors(found, capture, told, meta), *surface[2:]]

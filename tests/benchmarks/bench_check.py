@@ -26,7 +26,7 @@ from polcap import check, pipeline
 from polcap.config import Config
 from polcap.errors import InputError
 from polcap.formats import capture as captures
-from polcap.synth.capture import Shoot, Studio, Take, random_scene
+from polcap.synth.shooting import Shoot, Studio, Take, random_scene
 from tests import faulty
 
 

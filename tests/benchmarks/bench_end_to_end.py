@@ -22,11 +22,12 @@ from polcap import pipeline
 from polcap.config import Config
 from polcap.formats import capture as captures
 from polcap.images import ColorCalibration, Floats, Network, StokesImage
+from polcap.path import UserInput, path
 from polcap.stages import cues, infer
 from polcap.store import Store
-from polcap.synth import capture as synthetic
 from polcap.synth import scenes
-from polcap.synth.camera import Sensor
+from polcap.synth import shooting as synthetic
+from polcap.synth.forward_camera import Sensor
 
 
 def main() -> None:
@@ -68,7 +69,7 @@ def make(folder: Path, data: Path, number: int, width: int) -> Path:
 def measure(place: Path, network: Network | None) -> list[float]:
     """Mean normal error [degrees] through the path and from noise-free cues, and their difference."""
     with tempfile.TemporaryDirectory() as out:
-        found = pipeline.path(captures.read(place, None), pipeline.Given(network=network), Config(), Store(Path(out)))
+        found = path(captures.read(place, None), UserInput(network=network), Config(), Store(Path(out)))
         x0, y0, x1, y1 = found.object_.value.crop
         measured, maps = found.stokes.value, found.maps.value
         with np.load(place / "truth.npz") as truth:

@@ -23,6 +23,7 @@ from polcap.images import Cues
 from polcap.optics import frames
 from polcap.stages import infer
 from polcap.stages.cues import channels
+from polcap.stages.infer import augmentation, learned
 from polcap.training.protocol import Protocol
 
 _SHIPPED = Path(__file__).parents[2] / "calib" / "models" / "polcap.onnx"
@@ -32,22 +33,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path, help="folder with meshes/ and materials/")
     parser.add_argument("--model", type=Path, default=_SHIPPED)
-    parser.add_argument("--turns", type=int, default=infer.Settings().turns, help="positions averaged")
+    parser.add_argument("--symmetries", type=int, default=infer.Settings().symmetries, help="positions averaged")
     options = parser.parse_args()
     seen = Protocol(options.data, 512).case(0).cues
     print("| crop | stage [s] | network once [s] | ratio | peak memory [GB] |\n| --- | --- | --- | --- | --- |")
     for times in (1, 4):
         with multiprocessing.get_context("spawn").Pool(1) as pool:
-            stage, floor, peak = pool.apply(_measured, (_enlarged(seen, times), options.model, options.turns))
+            stage, floor, peak = pool.apply(_measured, (_enlarged(seen, times), options.model, options.symmetries))
         print(f"| {512 * times}² | {stage:.2f} | {floor:.2f} | {stage / floor:.1f} | {peak:.2f} |", flush=True)
 
 
-def _measured(seen: Cues, model: Path, turns: Literal[1, 2, 4, 8]) -> tuple[float, float, float]:
+def _measured(seen: Cues, model: Path, symmetries: Literal[1, 2, 4, 8]) -> tuple[float, float, float]:
     """Best seconds of the stage, of one run of the network at its own size; greatest resident memory, GB."""
     network = onnx.load(model)
-    small = infer._resized(seen, int(network.metadata["native_size"]) / max(seen.mask.shape))
-    settings = infer.Settings(turns=turns)
-    floor = _best(lambda: infer._run(channels(small), network))
+    small = learned._resized(seen, int(network.metadata["native_size"]) / max(seen.mask.shape))
+    settings = infer.Settings(symmetries=symmetries)
+    floor = _best(lambda: augmentation._run(channels(small), network))
     stage = _best(lambda: infer.estimate(seen, network, settings))
     return stage, floor, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 

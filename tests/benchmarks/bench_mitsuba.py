@@ -17,7 +17,7 @@ from polcap import pipeline
 from polcap.images import ColorCalibration, SurfaceMaps, View
 from polcap.optics import frames
 from polcap.stages import cues, infer
-from polcap.training.camera import Errors, photograph
+from polcap.training.camera_errors import Errors, photograph
 from polcap.training.protocol import Case, stokes_image
 from polcap.training.score import Judge
 

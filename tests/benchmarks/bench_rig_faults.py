@@ -20,6 +20,7 @@ from polcap import pipeline
 from polcap.config import Config
 from polcap.formats import capture as captures
 from polcap.images import ChartRequest
+from polcap.path import UserInput
 from tests.rig import faults
 from tests.rig import pool as pools
 
@@ -68,7 +69,7 @@ def _processed(folder: Path) -> list[np.ndarray]:
     """Normals, albedo and vertices of the analytic estimator."""
     found = captures.read(folder)
     out = folder / "polcap"
-    pipeline.process(found, pipeline.Given(chart=ChartRequest("none")), Config(), out)
+    pipeline.process(found, UserInput(chart=ChartRequest("none")), Config(), out)
     results, _ = pipeline.reopen(out)
     maps, mesh = results.maps.value, results.mesh.value
     return [np.asarray(maps.normal), np.asarray(maps.diffuse), np.asarray(mesh.vertices)]

@@ -78,7 +78,7 @@ def main() -> None:
         order = Order((0.0, 45.0, 90.0), BRACKET, rotator="simulated", camera="simulated")
         camera = Camera(clock, frames)
         with (
-            mock.patch("polcap.rig.camera.open_camera", lambda name, log: camera),
+            mock.patch("polcap.rig.camera_choice.open_camera", lambda name, log: camera),
             mock.patch("polcap.rig.rotator.open_rotator", lambda url, log: Rotator()),
         ):
             sequence.shoot(Path(place) / "c", order)

@@ -23,8 +23,8 @@ import trimesh
 from polcap.formats import atomic, textures
 from polcap.images import Floats, View
 from polcap.optics import fresnel
-from polcap.synth import materials, render
-from polcap.synth.mesh import Triangles
+from polcap.synth import render, scene_materials
+from polcap.synth.mesh_tracer import Triangles
 from polcap.training import gbuffers
 
 FACES = 100_000  # at least, after subdivision: each has one colour
@@ -135,7 +135,7 @@ def _quartered(value: Floats) -> Floats:
 def dressed(corner: Floats, texture: Path | None, random: np.random.Generator) -> dict[str, Any]:
     """Albedo r, g, b of every face (F,) and the number of its grade; k_s, α and n of the six grades."""
     middle = corner.mean(axis=1)
-    noise = [materials.solid_noise(middle * scale, int(random.integers(1 << 30))) for scale in (3.0, 12.0, 25.0)]
+    noise = [scene_materials.solid_noise(middle * scale, int(random.integers(1 << 30))) for scale in (3.0, 12.0, 25.0)]
     second = noise[0] > random.uniform(-0.6, 0.6)
     base = random.uniform(0.08, 0.85, 3) * random.uniform(0.5, 1)
     if texture is None:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from polcap.formats import calib
-from polcap.optics import chart, color
+from polcap.optics import color
+from polcap.stages.whitebalance import chart
 
 POSITION = chart.centers() - chart.centers()[18]
 CAMERA = np.array([[0.28, 0.10, 0.07], [0.08, 0.71, 0.22], [0.02, 0.18, 0.66]])  # linear Rec.709 → camera

@@ -20,7 +20,7 @@ import msgspec
 
 from polcap.errors import HardwareError, PolcapError, StorageError
 from polcap.rig import record, sequence
-from polcap.rig.frames import digest
+from polcap.rig.frame_check import digest
 from polcap.rig.plan import Order
 from tests.conftest import ROOT
 from tests.rig import pool as pools
@@ -87,7 +87,7 @@ def _order(device: Device) -> Order:
 
 
 def _shoot(device: Device, camera: PoolCamera, folder: Path, resume: bool = False) -> None:
-    with mock.patch("polcap.rig.camera.open_camera", lambda name, log: camera):
+    with mock.patch("polcap.rig.camera_choice.open_camera", lambda name, log: camera):
         sequence.shoot(folder, _order(device), resume=resume)
 
 
@@ -194,7 +194,7 @@ def main() -> None:
     folder, port, file, *at = sys.argv[1:]
     camera = PoolCamera(pools.loaded(Path(file)), fault="kill" if at else "", at=int(at[0]) if at else 1)
     order = msgspec.structs.replace(pools.ORDER, rotator=f"elliptec:{port}?{QUICK}")
-    with mock.patch("polcap.rig.camera.open_camera", lambda name, log: camera):
+    with mock.patch("polcap.rig.camera_choice.open_camera", lambda name, log: camera):
         sequence.shoot(Path(folder), order)
 
 

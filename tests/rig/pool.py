@@ -16,9 +16,9 @@ from polcap.formats import dng
 from polcap.images import Exif, Role
 from polcap.rig import watchdog
 from polcap.rig.camera import Exposure, Shot
-from polcap.rig.frames import digest
+from polcap.rig.frame_check import digest
 from polcap.rig.plan import Order
-from polcap.synth.capture import MIDDLE_S, Shoot, Studio, Take, random_scene
+from polcap.synth.shooting import MIDDLE_S, Shoot, Studio, Take, random_scene
 
 ANGLES = (0.0, 45.0, 90.0)
 BRACKET = tuple(Exposure(time_s=time, f_number=11.0, iso=100.0) for time in (0.005, 0.02, 0.08))

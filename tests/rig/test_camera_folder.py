@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from polcap.errors import HardwareError, SettingError
-from polcap.rig.camera import Exposure, open_camera
+from polcap.rig.camera import Exposure
+from polcap.rig.camera_choice import open_camera
 from polcap.rig.camera_folder import WatchedFolder
 from polcap.rig.log import Log
 from tests.rig.pool import tiny

@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from polcap.errors import HardwareError, SettingError
-from polcap.rig import camera_gphoto2, frames
-from polcap.rig.camera import Exposure, open_camera
+from polcap.rig import camera_gphoto2, frame_check
+from polcap.rig.camera import Exposure
+from polcap.rig.camera_choice import open_camera
 from polcap.rig.camera_gphoto2 import Gphoto2
 from polcap.rig.log import Log
 from polcap.rig.watchdog import Stalled
@@ -44,7 +45,7 @@ def camera(card: Path, tmp_path: Path) -> Iterator[Gphoto2]:
 def test_raw_bytes_are_identical_and_named_by_content(camera: Gphoto2, card: Path) -> None:
     shot = camera.shoot(Exposure(time_s=0.02), flash=True)
     assert shot.data == (card / "x.jpg").read_bytes()
-    assert shot.name.endswith(".JPG") and frames.suffix(shot.data, shot.name) == ".dng"
+    assert shot.name.endswith(".JPG") and frame_check.suffix(shot.data, shot.name) == ".dng"
 
 
 def test_dials_go_to_the_nearest_in_stops_and_say_where(camera: Gphoto2, tmp_path: Path) -> None:

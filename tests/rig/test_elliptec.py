@@ -5,10 +5,10 @@ from collections.abc import Iterator
 import pytest
 
 from polcap.errors import HardwareError
-from polcap.rig import transport
+from polcap.rig import serial_port
 from polcap.rig.elliptec import STATUS, Elliptec, Settings, open_motor
 from polcap.rig.log import Log
-from polcap.rig.transport import Silent
+from polcap.rig.serial_port import Silent
 from tests.rig import devices
 
 pytestmark = pytest.mark.timeout(60)
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.timeout(60)
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transport, "ANSWER_S", 0.3)
+    monkeypatch.setattr(serial_port, "ANSWER_S", 0.3)
 
 
 @pytest.fixture

@@ -7,10 +7,10 @@ import pytest
 from msgspec import convert
 
 from polcap.errors import HardwareError, SettingError
-from polcap.rig import grbl, line, transport
+from polcap.rig import grbl, line_protocol, serial_port
 from polcap.rig.log import Log
 from polcap.rig.rotator import Drive, Driven, Rotator, open_rotator, probe
-from polcap.rig.transport import Unplugged
+from polcap.rig.serial_port import Unplugged
 from tests.rig.devices import ALWAYS, SPOKEN, Device, Elliptec, Grbl, Line
 
 pytestmark = pytest.mark.timeout(120)
@@ -20,9 +20,9 @@ QUICK = "settle=0&timeout=1"
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transport, "ANSWER_S", 0.3)
+    monkeypatch.setattr(serial_port, "ANSWER_S", 0.3)
     monkeypatch.setattr(grbl, "_START_S", 0.5)
-    monkeypatch.setattr(line, "_START_S", 1.2)
+    monkeypatch.setattr(line_protocol, "_START_S", 1.2)
 
 
 @pytest.fixture

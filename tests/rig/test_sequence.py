@@ -52,7 +52,7 @@ class Rig:
         self.pool, self.folder = pool, folder
         self.camera, self.turner = PoolCamera(pool), Turner()
         self.said: list[str] = []
-        monkeypatch.setattr("polcap.rig.camera.open_camera", lambda name, log: self.camera)
+        monkeypatch.setattr("polcap.rig.camera_choice.open_camera", lambda name, log: self.camera)
         monkeypatch.setattr("polcap.rig.rotator.open_rotator", lambda url, log: self.turner)
 
     def shoot(self, order: Order = ORDER, resume: bool = False, **options: int) -> dict[str, object]:
@@ -188,7 +188,7 @@ class Shaken(PoolCamera):
 
 
 def test_an_early_frame_is_judged_by_its_later_neighbours(rig: Rig, tmp_path: Path) -> None:
-    from tests.rig.test_frames import _blur
+    from tests.rig.test_frame_check import _blur
 
     (tmp_path / "sharp.dng").write_bytes(rig.pool["shot", 0.0, 1])
     _blur(tmp_path / "sharp.dng", tmp_path / "blurred.dng", 2.0)

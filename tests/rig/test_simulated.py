@@ -6,12 +6,13 @@ import pytest
 
 from polcap.errors import SettingError
 from polcap.rig import sequence, simulated
-from polcap.rig.camera import Exposure, open_camera
+from polcap.rig.camera import Exposure
+from polcap.rig.camera_choice import open_camera
 from polcap.rig.log import Log
 from polcap.rig.plan import Order
 from polcap.rig.rotator import open_rotator
-from polcap.synth import capture as synthetic
-from polcap.synth.capture import Shoot
+from polcap.synth import shooting as synthetic
+from polcap.synth.shooting import Shoot
 
 SMALL = "width=96&height=72&samples=1"
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polcap.pipeline import STAGES
+from polcap.path import STAGES
 from tests import golden
 
 FILE = Path(golden.__file__).with_suffix(".json")

@@ -12,11 +12,11 @@ pytest.importorskip("embreex")
 
 from polcap.errors import DecodeError, SettingError
 from polcap.images import Floats, View
-from polcap.synth import bounce, mesh, render
-from polcap.synth.materials import Coat, Material, evaluate, relieved
+from polcap.synth import interreflection, mesh_tracer, render
+from polcap.synth.distance_fields import Cluster, Model
 from polcap.synth.render import Scene
+from polcap.synth.scene_materials import Coat, Material, evaluate, relieved
 from polcap.synth.scenes import with_textures
-from polcap.synth.shapes import Cluster, Model
 
 VIEW = View(focal=160.0, center=(47.5, 35.5), scale=1.0)
 GREY = Coat((Material((0.6, 0.6, 0.6), (0.6, 0.6, 0.6), "plain", roughness=(0.5, 0.5)),))
@@ -64,14 +64,14 @@ def test_every_point_of_a_hemispherical_bowl_sees_half_of_a_sphere() -> None:
     """Between any two patches of a sphere the form factor is area/4πR²; a bowl's is ½."""
     whole = trimesh.creation.icosphere(subdivisions=4, radius=0.08)
     bowl = whole.faces[whole.triangles_center[:, 2] < 0]
-    tracer = mesh.Tracer(mesh.smooth(whole.vertices, bowl))
+    tracer = mesh_tracer.Tracer(mesh_tracer.smooth(whole.vertices, bowl))
 
     def shining(point: Floats, normal: Floats, towards: Floats) -> Floats:
         assert (np.einsum("ni,ni->n", point, normal) < 0).all()  # met from inside
         return np.ones((len(point), 3))
 
     inside = np.unique(bowl[whole.vertices[bowl][..., 2].max(axis=1) < -0.03])
-    found = bounce.received(tracer, shining, np.array([0.0, 0.0, 0.01]), 1.0)[inside, 0]
+    found = interreflection.received(tracer, shining, np.array([0.0, 0.0, 0.01]), 1.0)[inside, 0]
     assert abs(found.mean() - 0.5) < 0.01
     assert np.abs(found - 0.5).max() < 0.1  # 48 rays each
 

@@ -8,8 +8,8 @@ import torch
 
 from polcap.images import Floats, View
 from polcap.optics import frames, shade
-from polcap.synth.mesh import Tracer, Triangles, smooth
-from polcap.training import bounce, gbuffers, transport
+from polcap.synth.mesh_tracer import Tracer, Triangles, smooth
+from polcap.training import bounce, gbuffers, light_transport
 from polcap.training.dataset import Simulator
 from polcap.training.materials import Surface
 
@@ -33,12 +33,12 @@ def _bowl() -> Triangles:
 
 
 def _both(turn: Floats) -> tuple[Floats, Floats]:
-    """Once-bounced light (3, M, 3) of training, and as `transport.py` traces it."""
+    """Once-bounced light (3, M, 3) of training, and as `light_transport.py` traces it."""
     mesh = _bowl()
     translation, view = np.array([0, 0, -4.0]), View(3.3 * SIZE, ((SIZE - 1) / 2, (SIZE - 1) / 2), 1.0)
-    scene = transport.Scene(mesh)
+    scene = light_transport.Scene(mesh)
     buffer = Tracer(mesh).trace(turn, translation, view, SIZE, SIZE)
-    pose, mask = transport.Pose(turn, translation, np.zeros(3), 16.0), buffer.mask
+    pose, mask = light_transport.Pose(turn, translation, np.zeros(3), 16.0), buffer.mask
     lit, met = bounce.visibility(scene, buffer, pose, np.random.default_rng(1))
     middle, unit = gbuffers.depth_unit(mask, buffer.depth, view.focal)
     camera = np.array([[view.focal, *view.center, middle, unit, *turn.reshape(-1), 0, 0]], np.float32)
@@ -52,8 +52,8 @@ def _both(turn: Floats) -> tuple[Floats, Floats]:
     normal = frames.to_ray_frame(buffer.normal[mask], v).astype(float)
     look = (ALBEDO * ones, F0 * ones, np.full(len(ones), ROUGHNESS))
     _, flat = scene.facing(np.broadcast_to(-translation @ turn, v.shape), -v @ turn)
-    places = transport.Places(mask, buffer.position[mask].astype(float), flat, normal, v, *look, ior=1.5)
-    gather = transport._Gather(scene, places, pose, lambda place, facing: ALBEDO * np.ones((len(place), 3)))
+    places = light_transport.Places(mask, buffer.position[mask].astype(float), flat, normal, v, *look, ior=1.5)
+    gather = light_transport._Gather(scene, places, pose, lambda place, facing: ALBEDO * np.ones((len(place), 3)))
     traced = gather.diffuse(np.random.default_rng(2)) + gather.mirrored(np.random.default_rng(3))
 
     local = torch.from_numpy(normal).float()

@@ -7,7 +7,7 @@ import torch
 from polcap.images import ColorCalibration, View
 from polcap.stages import cues
 from polcap.training import dataset, protocol
-from polcap.training.camera import Errors
+from polcap.training.camera_errors import Errors
 from polcap.training.dataset import Simulator
 
 CPU = torch.device("cpu")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import InputError
-from polcap.synth.mesh import Tracer, Triangles
+from polcap.synth.mesh_tracer import Tracer, Triangles
 from polcap.training import gbuffers
 from tests.training.conftest import RECIPE
 

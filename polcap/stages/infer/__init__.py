@@ -1,0 +1,41 @@
+"""Stage 8: estimate the surface's normals and material from the cues, by network or by inversion.
+
+Both estimators work in the frame of each view ray, where polarization speaks of the surface alone, and
+hand back camera-frame maps.
+
+    analytic       the inversion: zenith from DoLP, azimuth from AoLP
+        azimuth        which of the two half-turns an AoLP means
+    learned        the network, joined with the inversion
+        augmentation   the network's mean over turned and mirrored pictures
+"""
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from polcap.images import Cues, Network, SurfaceMaps
+from polcap.stages import stage
+from polcap.stages.infer import analytic, learned
+
+
+class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    ior: Annotated[float, Meta(ge=1.2, le=2.5, description="refractive index assumed by the analytic estimator")] = 1.5
+    symmetries: Annotated[
+        Literal[1, 2, 4, 8],
+        Meta(description="turned and mirrored positions in which the network sees the object; their mean is taken"),
+    ] = 2
+
+
+@stage(version=6)
+def estimate(cues: Cues, network: Network | None, settings: Settings) -> SurfaceMaps:
+    """Normal, diffuse, specular, roughness and expected error; network None means analytic.
+
+    Raises
+    ------
+    ModelError
+        The network was made for other channels.
+    """
+    if network is None:
+        return analytic.estimate(cues, settings.ior)
+    return learned.estimate(cues, network, settings.ior, settings.symmetries)

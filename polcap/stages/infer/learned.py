@@ -1,0 +1,186 @@
+"""The learned estimator: the network's maps of the whole object, joined with the inversion's detail.
+
+In: cues and a network. Out: normals, albedo, specular albedo, roughness, depth and expected error.
+"""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.errors import ModelError
+from polcap.images import Cues, Floats, Network, Quality, SurfaceMaps
+from polcap.optics import frames
+from polcap.stages.cues import CHANNELS, FLOOR
+from polcap.stages.infer import augmentation
+from polcap.stages.infer.analytic import fill_highlights, invert
+
+_INVERSION = 4.0  # factor on the inversion's expected error in the join: the network has seen what it has seen
+_DETAIL = 2.0  # pixels that the network sees, 1σ: what is finer is the inversion's to tell
+_CALIBRATION = (0.718, 1.16, 50.0)  # error = min(a·expectedᵇ, c), degrees: traced pictures of training meshes
+_CELLS = 2.0  # cells of the network's grid, 1σ, over which its pattern is taken as the same
+_BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
+_REACHED = 0.05  # share of known pixels under a Gaussian from which a mean is taken
+_BRIGHTEST = 2.0  # S0, which is 1 where white paper faces the flash beside the chart; what no body reflects
+
+
+def estimate(cues: Cues, network: Network, ior: float, symmetries: int) -> SurfaceMaps:
+    """The network's maps, its normals joined with the analytic ones by their expected errors.
+
+    The network sees the whole object at the size it was made for, which settles half-turns, shape and gloss.
+    Detail comes from the pixels: of color by the picture itself, which the network's albedo only divides by its
+    shading; of normals by what the inversion shows that is finer than the network sees, where noise leaves it a say.
+    """
+    _check(network)
+    size = cues.mask.shape[::-1]
+    shrink = max(1.0, max(size) / int(network.metadata["native_size"]))
+    bounded = _bounded(cues)
+    seen = _resized(bounded, 1 / shrink)
+    small = augmentation.mean(seen, network, symmetries)
+    # beside the object the network guesses: zeros there leave an edge's direction to the object's own pixels
+    small["normal"] = _without_grid(small["normal"], seen.mask) * seen.mask[..., None]
+    small["factor"] = _factor(small["diffuse"], seen)
+    maps = {name: np.asarray(cv2.resize(image, size)) for name, image in small.items()}
+    ahead = maps["normal"] / np.maximum(_length(maps["normal"]), 1e-6)
+    guide = np.asarray(frames.to_ray_frame(ahead, cues.rays)), maps["sigma"]
+    by_pixel, doubt, _ = invert(cues, ior, guide)
+    detailed = _detailed(ahead, by_pixel, cues.mask, shrink)
+    normal, stated = _joined((ahead, maps["sigma"]), (detailed, _INVERSION * doubt))
+    diffuse = fill_highlights((np.maximum(cues.radiance, 0) + FLOOR) * np.exp(maps["factor"]) - FLOOR, bounded)
+    scale, power, most = _CALIBRATION
+    expected = np.minimum(scale * stated**power, most)
+    inside = cues.mask[..., None]
+    return SurfaceMaps(
+        normal=(normal * inside).astype(np.float32),
+        diffuse=(np.clip(diffuse, 0, 1) * inside).astype(np.float32),
+        specular=(np.clip(maps["specular"], 0, 1) * inside).astype(np.float32),
+        roughness=(np.clip(maps["roughness"], 0.02, 1) * cues.mask).astype(np.float32),
+        depth_prior=(maps["depth"] * cues.mask).astype(np.float32),
+        confidence=(expected * cues.mask).astype(np.float32),
+        mask=cues.mask,
+        view=cues.view,
+        estimator=f"network {network.metadata.get('version', network.digest[:8])}",
+    )
+
+
+def _bounded(cues: Cues) -> Cues:
+    """What no body reflects counts as saturated, as in the pictures that the network learned from."""
+    beyond = (cues.radiance > _BRIGHTEST).any(axis=-1)
+    quality = np.where(beyond, cues.quality | np.uint8(Quality.CLIPPED), cues.quality)
+    return replace(cues, radiance=np.minimum(cues.radiance, _BRIGHTEST), quality=quality)
+
+
+def _without_grid(normal: Floats, mask: NDArray[np.bool_]) -> Floats:
+    """Normals (H, W, 3) without the network's 2 px grid: what pixels in the same place of its cells have in common.
+
+    Relief does not keep step with the cells, so it stays.
+    """
+    whole = (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0).astype(np.float32)
+    out = normal.astype(np.float32)
+    uneven = (out - cv2.sepFilter2D(out, -1, _BINOMIAL, _BINOMIAL)) * whole[..., None]
+    for place in (np.s_[y::2, x::2] for y in (0, 1) for x in (0, 1)):
+        common, share = (
+            cv2.GaussianBlur(np.ascontiguousarray(part[place]), (0, 0), _CELLS) for part in (uneven, whole)
+        )
+        out[place] -= common / np.maximum(share, _REACHED)[..., None] * mask[place][..., None]
+    return out
+
+
+def _detailed(coarse: Floats, fine: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:
+    """Normals (H, W, 3) of one kind with what is finer than 2 px (1σ), seen `shrink` times smaller, of another.
+
+    Interreflection, index and half-turns bend the inversion's normals over whole regions; relief is finer.
+    """
+    height, width = mask.shape
+    size = (round(width / shrink), round(height / shrink))
+    inside = mask.astype(np.float32)
+    apart, share = (
+        cv2.GaussianBlur(cv2.resize(image, size, interpolation=cv2.INTER_AREA), (0, 0), _DETAIL)
+        for image in ((coarse - fine).astype(np.float32) * inside[..., None], inside)
+    )
+    moved = fine + cv2.resize(apart / np.maximum(share, 1e-3)[..., None], (width, height))
+    return np.asarray(moved / np.maximum(_length(moved), 1e-6))
+
+
+def _joined(*estimates: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
+    """Mean direction of normals (H, W, 3) weighed by 1/σ² of their expected errors (H, W), and its own.
+
+    Where the estimates agree the error is that of independent ones; where they part, their distance adds.
+    """
+    weights = [1 / np.maximum(sigma, 1.0) ** 2 for _, sigma in estimates]
+    total = sum(w[..., None] * n / np.maximum(_length(n), 1e-6) for w, (n, _) in zip(weights, estimates))
+    length = _length(np.asarray(total))
+    share = np.clip(length[..., 0] / sum(weights), 1e-3, 1)  # 1 where all point the same way
+    apart = np.degrees(np.arccos(share))
+    return np.asarray(total / np.maximum(length, 1e-12)), np.hypot(1 / np.sqrt(sum(weights)), apart)
+
+
+def _length(vectors: Floats) -> Floats:
+    return np.asarray(frames.dot(vectors, vectors)[..., None] ** 0.5)
+
+
+def _check(network: Network) -> None:
+    if network.channels != CHANNELS:
+        raise ModelError(
+            f"model {network.digest[:8]} expects channels {', '.join(network.channels)}; "
+            f"this version makes {', '.join(CHANNELS)}; use a model of this version, or --estimator analytic"
+        )
+
+
+def _resized(cues: Cues, scale: float) -> Cues:
+    """The cues of a picture taken with fewer pixels: light is averaged, ratios with their light."""
+    if scale >= 1.0:
+        return cues
+    height, width = cues.mask.shape
+    size = (max(16, round(width * scale)), max(16, round(height * scale)))
+
+    def mean(image: Floats) -> Floats:
+        return np.asarray(cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA))
+
+    light = np.maximum(cues.radiance.sum(-1), 1e-6) * cues.mask
+    weight = np.maximum(mean(light), 1e-9)
+    ratio = np.stack([mean(r * light) / weight for r in cues.ratio])
+    sigma = mean(cues.ratio_sigma * light) / weight * min(1.0, scale * np.sqrt(width / size[0] * scale))
+    share = mean(cues.mask.astype(np.float32))
+    mask = share > 0.5
+    radiance = mean(cues.radiance * cues.mask[..., None]) / np.maximum(share, 1e-3)[..., None]
+    squared = ratio[0] ** 2 + ratio[1] ** 2
+    view = replace(
+        cues.view,
+        focal=cues.view.focal * scale,
+        center=((cues.view.center[0] + 0.5) * scale - 0.5, (cues.view.center[1] + 0.5) * scale - 0.5),
+        scale=cues.view.scale / scale,
+    )
+    clipped = mean((cues.quality & Quality.CLIPPED).astype(np.float32)) > 0.5 * Quality.CLIPPED
+    return replace(
+        cues,
+        radiance=radiance,
+        ratio=ratio,
+        ratio_sigma=sigma,
+        dolp=np.sqrt(np.clip(squared - sigma**2, 0, 1)),
+        normalized_stokes=ratio / np.sqrt(squared + 1e-12),
+        diffuse_color=mean(cues.diffuse_color),
+        rays=frames.rays(view, *mask.shape),
+        mask=mask,
+        quality=np.where(clipped, np.uint8(Quality.CLIPPED), np.uint8(0)),
+        view=view,
+    )
+
+
+def _factor(albedo: Floats, seen: Cues) -> Floats:
+    """Logarithm of albedo over S0 (H, W, 3), without the network's 2 px grid: a kernel in which that vanishes.
+
+    Beside the object and in saturated highlights it goes on from around, for the pixels there when it is enlarged.
+    """
+    known = seen.mask & ((seen.quality & Quality.CLIPPED) == 0)
+    inside = known.astype(np.float32)
+    factor = (np.log((albedo + FLOOR) / (np.maximum(seen.radiance, 0) + FLOOR)) * inside[..., None]).astype(np.float32)
+
+    def mean(kernel: Floats) -> Floats:
+        smooth, share = (
+            cv2.sepFilter2D(part, -1, kernel, kernel, borderType=cv2.BORDER_CONSTANT) for part in (factor, inside)
+        )
+        return np.asarray(smooth / np.maximum(share, 1e-3)[..., None])
+
+    return np.where(known[..., None], mean(_BINOMIAL), mean(cv2.getGaussianKernel(9, 2).astype(np.float32)))

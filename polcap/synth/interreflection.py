@@ -1,0 +1,59 @@
+"""A lit mesh -> the light that its own parts throw on each of its vertices: one diffuse bounce.
+
+Kept at the vertices and interpolated, so that every shot sees the same light and its sampling noise
+cannot fake polarization. Left out: what facets mirror, and that bounced light arrives a little polarized.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from polcap.images import Floats
+from polcap.optics import fresnel
+from polcap.synth.mesh_tracer import Tracer
+
+_RAYS = 48  # per vertex, spread by their cosine
+_LIFT = 5e-4  # m above the surface, where a ray starts
+_SMOOTH = 2  # times that each vertex takes the mean of its faces
+
+Lit = Callable[[Floats, Floats, Floats], Floats]
+
+
+def received(tracer: Tracer, lit: Lit, camera: Floats, ior: float) -> Floats:
+    """What enters the surface at each vertex (V, 3), in units of the light that leaves a white plane.
+
+    lit(point, normal, towards) is S0 (N, 3) that places of the mesh's own frame send `towards` by diffuse
+    reflection; camera (3,) in that frame: an open surface counts as facing it.
+    """
+    mesh = tracer.mesh
+    normal: Floats = np.zeros(mesh.vertices.shape)
+    np.add.at(normal, mesh.faces.ravel(), mesh.corner_normals.reshape(-1, 3))
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    towards = camera - mesh.vertices
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    normal = np.where(np.sum(normal * towards, axis=1, keepdims=True) < -0.3, -normal, normal)
+    e_x = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
+    e_x /= np.maximum(np.linalg.norm(e_x, axis=1, keepdims=True), 1e-12)
+    e_y = np.cross(normal, e_x)
+    turn = np.random.default_rng(0).uniform(0, 2 * np.pi, len(normal))
+    total: Floats = np.zeros(normal.shape)
+    for k in range(_RAYS):
+        cosine = np.sqrt(1 - (k + 0.5) / _RAYS)
+        angle = turn + k * np.pi * (3 - np.sqrt(5))
+        across = np.cos(angle)[:, None] * e_x + np.sin(angle)[:, None] * e_y
+        way = cosine * normal + np.sqrt(1 - cosine**2) * across
+        met = tracer.meet(mesh.vertices + _LIFT * normal, way)
+        back = -way[met.index]
+        there = np.where(np.sum(met.normal * back, axis=1, keepdims=True) < 0, -met.normal, met.normal)
+        entered, _ = fresnel.transmission(np.float64(cosine), ior)
+        total[met.index] += entered * lit(met.position, there, back)
+    return _smoothed(total / _RAYS, tracer)
+
+
+def _smoothed(value: Floats, tracer: Tracer) -> Floats:
+    faces = tracer.mesh.faces
+    count = np.maximum(np.bincount(faces.ravel(), minlength=len(value)), 1)[:, None]
+    for _ in range(_SMOOTH):
+        mean = np.repeat(value[faces].mean(axis=1), 3, axis=0)
+        value = np.stack([np.bincount(faces.ravel(), m, len(value)) for m in mean.T], axis=1) / count
+    return value

@@ -1,0 +1,185 @@
+"""Flash light on a mesh: direct, with cast shadows, and after one diffuse bounce between its parts.
+
+What is traced: which places the flash reaches, and what each place sees of the others by lit diffuse
+light, reflected there diffusely and by the surface's facets. Left out: more bounces, and that bounced
+light is itself a little polarized when it arrives.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import pi
+from typing import Any
+
+import cv2
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from numpy.typing import NDArray
+
+from polcap.images import Floats
+from polcap.optics import brdf, frames, fresnel, shade
+from polcap.synth.mesh_tracer import Triangles
+
+LIFT = 1e-3  # longest sides of the mesh, from the surface to where a ray starts; nearer hits are the place itself
+_AROUND, _MIRRORED = 12, 6  # rays per place over the hemisphere, and about the mirror direction
+_SMOOTH = 0.004  # picture sides, 1σ, over which traced light is averaged
+
+Indices = NDArray[np.integer[Any]]
+Albedo = Callable[[Floats, Floats], Floats]  # places, facing directions (M, 3) -> diffuse albedo (M, 3)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where the mesh and the flash are: camera = rotation @ vertex + translation."""
+
+    rotation: Floats  # (3, 3)
+    translation: Floats  # (3,)
+    flash: Floats  # (3,) camera frame
+    strength: float  # S0 of a white plane facing the flash at distance 1
+
+
+@dataclass(frozen=True)
+class Places:
+    """The M visible pixels of a picture, dressed."""
+
+    mask: NDArray[np.bool_]  # (H, W)
+    position: Floats  # (M, 3) mesh frame
+    flat: Floats  # (M, 3) the triangles' own normals, mesh frame, towards the camera
+    normal: Floats  # (M, 3) in the frame of each ray, with relief
+    rays: Floats  # (M, 3) camera frame, surface to camera
+    diffuse: Floats  # (M, 3)
+    specular: Floats  # (M, 3)
+    roughness: Floats  # (M,)
+    ior: float
+
+    def take(self, which: Indices) -> "Places":
+        """Some of them; the mask stays."""
+        held = {name: value[which] for name, value in vars(self).items() if name not in ("mask", "ior")}
+        return replace(self, **held)
+
+
+class Scene:
+    """A mesh, ready for rays of any kind."""
+
+    def __init__(self, mesh: Triangles) -> None:
+        self.scene = EmbreeScene()
+        self.size = float(np.ptp(mesh.vertices, axis=0).max())
+        TriangleMesh(self.scene, mesh.vertices, mesh.faces)
+        corner = mesh.vertices[mesh.faces].astype(np.float64)
+        flat = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        self.flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
+
+    def facing(self, origin: Floats, direction: Floats) -> tuple[Floats, Floats]:
+        """First hits of rays: distance (M,), infinite for none, and the triangle's normal towards the origin."""
+        start, way = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, direction))
+        hit = self.scene.run(start, way, query="INTERSECT", output=True)
+        struck = hit["primID"] >= 0
+        normal = self.flat[np.where(struck, hit["primID"], 0)]
+        normal = np.where(np.sum(normal * direction, axis=1, keepdims=True) > 0, -normal, normal)
+        return np.where(struck, hit["tfar"], np.inf), normal
+
+    def lit(self, place: Floats, flat: Floats, pose: Pose) -> tuple[Floats, Floats]:
+        """Unit vectors towards the flash (M, 3), mesh frame, and S0 of a white plane facing it (M,), 0 in shadow."""
+        to_flash = (pose.flash - pose.translation) @ pose.rotation - place
+        far = np.linalg.norm(to_flash, axis=1)
+        to_flash = to_flash / far[:, None]
+        start = place + LIFT * self.size * flat
+        ray = (np.ascontiguousarray(a, dtype=np.float32) for a in (start, to_flash, far - LIFT * self.size))
+        hidden = self.scene.run(*ray, query="OCCLUDED") >= 0
+        return to_flash, np.where(hidden, 0, pose.strength / far**2)
+
+
+def stokes(scene: Scene, places: Places, pose: Pose, albedo: Albedo, rng: np.random.Generator) -> Floats:
+    """Stokes parameters (3, M, 3) of the visible pixels, in the frame of each ray."""
+    to_flash, irradiance = scene.lit(places.position, places.flat, pose)
+    toward = frames.to_ray_frame(to_flash @ pose.rotation.T, places.rays)
+    direct = _shaded(places, places.diffuse, places.specular, toward, irradiance)
+    gather = _Gather(scene, places, pose, albedo)
+    return np.asarray(direct + gather.diffuse(rng) + gather.mirrored(rng))
+
+
+def _shaded(
+    places: Places, diffuse: Floats, specular: Floats, toward: Floats, irradiance: Floats, ior: Floats | None = None
+) -> Floats:
+    index = np.full(len(toward), places.ior) if ior is None else ior
+    return np.asarray(shade.stokes(places.normal, diffuse, specular, places.roughness, index, toward, irradiance))
+
+
+class _Gather:
+    """Light that reaches the places from other parts of the mesh."""
+
+    def __init__(self, scene: Scene, places: Places, pose: Pose, albedo: Albedo) -> None:
+        self.scene, self.places, self.pose, self.albedo = scene, places, pose, albedo
+        self.e_x, self.e_y = frames.basis(places.normal)
+
+    def diffuse(self, rng: np.random.Generator) -> Floats:
+        """Reflected diffusely: irradiance from rays spread by their cosine over the hemisphere."""
+        places, count = self.places, len(self.places.normal)
+        turn = rng.uniform(0, 1, (count, 2))
+        received: Floats = np.zeros((count, 3))
+        for k in range(_AROUND):
+            cosine = np.sqrt(1 - (k + turn[:, 0]) / _AROUND)
+            way = self._around(cosine, 2 * pi * (k * 0.618034 + turn[:, 1]))
+            met, came = self.light(way, np.arange(count))
+            received[met] += came * fresnel.transmission(np.maximum(cosine[met], 1e-3), places.ior)[0][:, None]
+        entered = fresnel.transmission(1.0, places.ior)[0]
+        received = self.smooth(received / (_AROUND * entered))
+        # as if all of it had come straight down, which enters through `entered`
+        one = np.ones(count)
+        return _shaded(places, places.diffuse * received, 0 * places.specular, places.normal, one)
+
+    def mirrored(self, rng: np.random.Generator) -> Floats:
+        """Reflected by facets drawn from the GGX distribution.
+
+        Where F0 is more than the body's index gives, facets have the index that gives it: a multiple of Fresnel's
+        curve would send back more light than comes, at grazing angles, where most of this light is.
+        """
+        places, count = self.places, len(self.places.normal)
+        root = np.sqrt(np.maximum(places.specular.mean(axis=1), fresnel.normal_reflectance(places.ior)))
+        ior = (1 + root) / (1 - root)
+        alpha = places.roughness**2
+        turn, total = rng.uniform(0, 1, (count, 2)), np.zeros((3, count, 3))
+        for k in range(_MIRRORED):
+            u = (k + turn[:, 0]) / _MIRRORED
+            cos_h = np.sqrt((1 - u) / (1 + (alpha**2 - 1) * u))
+            half = self._around(cos_h, 2 * pi * (k * 0.618034 + turn[:, 1]))
+            cos_d = half[:, 2]
+            way = 2 * cos_d[:, None] * half - [0, 0, 1]
+            possible = (cos_d > 0.01) & (np.sum(way * places.normal, axis=1) > 0.01)
+            met, came = self.light(way, np.flatnonzero(possible))
+            density = pi * brdf.ggx_distribution(cos_h[met], alpha[met]) * cos_h[met] / (4 * cos_d[met])
+            irradiance = 1 / np.maximum(density * _MIRRORED, 1e-9)
+            total[:, met] += _shaded(
+                places.take(met), 0 * came, places.specular[met] * came, way[met], irradiance, ior[met]
+            )
+        return np.stack([self.smooth(part) for part in total])
+
+    def light(self, way: Floats, which: Indices) -> tuple[Indices, Floats]:
+        """Those of the places `which` that see another one along `way` (M, 3, rays' frames), and its S0 (·, 3)."""
+        scene, places, pose = self.scene, self.places, self.pose
+        direction = frames.from_ray_frame(way[which], places.rays[which]) @ pose.rotation
+        origin = (places.position + LIFT * scene.size * places.flat)[which]
+        distance, flat = scene.facing(origin, direction)
+        met = np.flatnonzero(np.isfinite(distance) & (distance > LIFT * scene.size))
+        origin, direction, distance, flat = origin[met], direction[met], distance[met, None], flat[met]
+        there = origin + distance * direction
+        to_flash, irradiance = scene.lit(there, flat, pose)
+        cos_i = np.clip(np.sum(to_flash * flat, axis=1), 1e-3, 1)
+        cos_o = np.clip(-np.sum(direction * flat, axis=1), 1e-2, 1)
+        into, out = (fresnel.transmission(c, places.ior)[0] for c in (cos_i, cos_o))
+        return which[met], self.albedo(there, flat) * (irradiance * cos_i * into * out)[:, None]
+
+    def smooth(self, value: Floats) -> Floats:
+        """(M, C) averaged over the object's near pixels."""
+        mask = self.places.mask
+        sigma = _SMOOTH * max(mask.shape)
+        image = np.zeros((*mask.shape, value.shape[1]), np.float32)
+        image[mask] = value
+        weight = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), sigma)
+        return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma)[mask] / weight[mask][:, None])
+
+    def _around(self, cosine: Floats, azimuth: Floats) -> Floats:
+        """Directions (M, 3) at an angle about the normals."""
+        sine = np.sqrt(np.maximum(1 - cosine**2, 0))
+        x, y = (a[:, None] for a in (sine * np.cos(azimuth), sine * np.sin(azimuth)))
+        return np.asarray(x * self.e_x + y * self.e_y + cosine[:, None] * self.places.normal)

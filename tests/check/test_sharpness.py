@@ -1,0 +1,41 @@
+"""Blur is measured on the scene's own detail, whatever that is."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, uniform_filter1d
+
+from polcap.check import sharpness
+from polcap.images import Floats
+
+
+def scene(seed: int = 0) -> Floats:
+    random = np.random.default_rng(seed)
+    detail = gaussian_filter(random.normal(size=(256, 384)), 1.2) * 4
+    return np.asarray(np.exp(0.3 * detail), np.float32) / 4
+
+
+def measured(pictures: list[Floats], noise: float = 0.002) -> Floats:
+    random = np.random.default_rng(1)
+    noisy = [np.asarray(p + noise * random.normal(size=p.shape), np.float32) for p in pictures]
+    corners = sharpness.choose(noisy[0], np.ones(noisy[0].shape, bool))
+    tiles = np.stack([sharpness.cut(p, corners) for p in noisy])
+    return sharpness.extra_blur(tiles, np.ones(tiles.shape[:2], bool))
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.0])
+def test_defocus_is_measured_in_pixels(sigma: float) -> None:
+    sharp = scene()
+    blur = measured([sharp, gaussian_filter(sharp, sigma), 0.8 * sharp])
+    assert blur[1] == pytest.approx(sigma, rel=0.15)
+    assert max(blur[0], blur[2]) < 0.4
+
+
+def test_motion_along_one_direction_counts_as_its_standard_deviation() -> None:
+    sharp = scene()
+    blur = measured([sharp, sharp, uniform_filter1d(sharp, 7, axis=0)])
+    assert blur[2] == pytest.approx(7 / np.sqrt(12), rel=0.3)
+
+
+def test_pictures_without_detail_tell_nothing() -> None:
+    flat = np.full((256, 384), 0.3, np.float32)
+    assert np.isnan(measured([flat, flat, flat])).all()

@@ -1,0 +1,242 @@
+"""The analytic estimator against a ball whose normals are known."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from polcap.errors import ModelError
+from polcap.images import Network, Quality
+from polcap.optics import frames
+from polcap.stages import cues, infer, stokes
+from polcap.stages.infer import analytic, augmentation, learned
+from tests import scenes
+
+
+def seen(noise: float, textured: bool = True):
+    radiance = scenes.stack(noise=noise, textured=textured)
+    solved = stokes.solve(radiance, scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
+    return cues.compute(solved, scenes.no_color())
+
+
+def errors_deg(maps, cues_) -> np.ndarray:
+    local, mask = scenes.truth()
+    true = frames.from_ray_frame(local, cues_.rays)
+    inside = mask & maps.mask
+    return np.degrees(np.arccos(np.clip((maps.normal * true).sum(-1), -1, 1)))[inside]
+
+
+def test_a_clean_ball_is_recovered():
+    found = seen(noise=1e-5)
+    error = errors_deg(infer.estimate(found, None, infer.Settings()), found)
+    assert np.median(error) < 1.0
+    assert error.mean() < 2.0  # the outline's last pixel is half backdrop
+
+
+def test_a_noisy_textured_ball_is_recovered_and_its_error_foretold():
+    found = seen(noise=0.004)
+    maps = infer.estimate(found, None, infer.Settings())
+    error = errors_deg(maps, found)
+    assert error.mean() < 5.0
+    expected = maps.confidence[scenes.truth()[1] & maps.mask].mean()
+    assert error.mean() < expected < error.mean() + 5  # no interreflection here, for which 4° stand
+
+
+def test_no_half_turn_is_lost_on_a_convex_object():
+    found = seen(noise=0.002)
+    maps = infer.estimate(found, None, infer.Settings())
+    local, mask = scenes.truth()
+    true = frames.from_ray_frame(local, found.rays)
+    tilted = mask & maps.mask & (local[..., 2] < 0.9)
+    outward = (maps.normal[..., :2] * true[..., :2]).sum(-1)[tilted]
+    assert (outward > 0).mean() > 0.995
+
+
+def test_albedo_is_free_of_shading():
+    found = seen(noise=1e-4, textured=False)
+    maps = infer.estimate(found, None, infer.Settings())
+    local, mask = scenes.truth()
+    ring = mask & (local[..., 2] > 0.5) & (local[..., 2] < 0.85)
+    assert np.abs(maps.diffuse[ring] - 0.5).mean() < 0.03
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_albedo_goes_on_into_saturated_highlights(known: bool):
+    found = seen(noise=1e-4, textured=False)
+    rows, columns = np.nonzero(found.mask)
+    y, x = round(rows.mean()) + 25, round(columns.mean())
+    spot = np.s_[y - 6 : y + 7, x - 9 : x + 10] if known else np.s_[:, :]
+    radiance, quality = found.radiance.copy(), found.quality.copy()
+    radiance[spot], quality[spot] = 4.0, quality[spot] | Quality.CLIPPED
+    burnt = dataclasses.replace(found, radiance=radiance, quality=quality)
+    for estimator in (None, network()):
+        albedo, whole = (infer.estimate(c, estimator, infer.Settings()).diffuse for c in (burnt, found))
+        assert np.isfinite(albedo).all()
+        if known:  # the network of this test says 0.3, the inversion about 0.5
+            assert np.abs(albedo - whole)[spot].mean() < 0.03, estimator
+
+
+def test_what_is_brighter_than_any_body_is_not_painted_on_it():
+    """A highlight that no exposure lost, and a network that takes all light for the body's."""
+    found = seen(noise=1e-4, textured=False)
+    rows, columns = np.nonzero(found.mask)
+    y, x = round(rows.mean()) + 25, round(columns.mean())
+    spot = np.s_[y - 6 : y + 7, x - 9 : x + 10]
+    radiance = found.radiance.copy()
+    radiance[spot] = 30.0
+    believing = dataclasses.replace(
+        network(), run=lambda picture: network().run(picture) | {"diffuse": np.exp(picture[:, :3]).clip(0, 1)}
+    )
+    shining = dataclasses.replace(found, radiance=radiance)
+    albedo, whole = (infer.estimate(c, believing, infer.Settings()).diffuse for c in (shining, found))
+    assert np.abs(albedo - whole)[spot].mean() < 0.05
+
+
+def network(channels=cues.CHANNELS) -> Network:
+    """A network that answers with the zenith channels' own normal: its maps are known in closed form."""
+
+    def run(picture):
+        x, y = picture[:, 5:6], picture[:, 6:7]
+        tilt = np.sqrt(x * x + y * y)
+        phi = np.arctan2(y, x) / 2
+        normal = np.concatenate([np.sin(tilt) * np.cos(phi), np.sin(tilt) * np.sin(phi), np.cos(tilt)], axis=1)
+        one = np.ones_like(x)
+        return {"normal": normal, "depth": 0 * one, "diffuse": np.repeat(0.3 * one, 3, 1),
+                "specular": np.repeat(0.04 * one, 3, 1), "roughness": 0.4 * one, "sigma": 5 * one}  # fmt: skip
+
+    return Network(run, "0123456789", channels, {"native_size": "256", "size_multiple": "32"}, "CPU")
+
+
+def test_a_model_for_other_channels_is_refused():
+    with pytest.raises(ModelError, match="expects channels red"):
+        infer.estimate(seen(noise=0.002), network(("red",)), infer.Settings())
+
+
+def test_a_crop_larger_than_the_network_sees_keeps_its_texture():
+    """The network says grey 0.3 everywhere; the detail it cannot see comes from S0, to the object's very edge."""
+    found = seen(noise=1e-4)
+    half = dataclasses.replace(network(), metadata={"native_size": "128", "size_multiple": "32"})
+    maps = infer.estimate(found, half, infer.Settings())
+    rows, columns = np.nonzero(found.mask)
+    middle = np.s_[rows.min() + 60 : rows.max() - 60, columns.min() + 60 : columns.max() - 60]
+    texture = found.radiance[middle] / cv2.GaussianBlur(found.radiance, (0, 0), 4)[middle]
+    albedo = maps.diffuse[middle]
+    assert albedo.mean() == pytest.approx(0.3, rel=0.05)
+    assert np.corrcoef(albedo.ravel(), texture.ravel())[0, 1] > 0.8
+    edge = found.mask & (cv2.erode(found.mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
+    assert np.median(maps.diffuse[edge]) == pytest.approx(0.3, rel=0.35)  # S0 falls to nothing there
+
+
+def test_a_grid_of_the_network_does_not_reach_the_albedo():
+    """An albedo with a 2 px pattern of ±10 % comes out without it."""
+    found = seen(noise=1e-4, textured=False)
+    plain = network()
+
+    def gridded(picture):
+        maps = plain.run(picture)
+        y, x = np.mgrid[: picture.shape[2], : picture.shape[3]]
+        return maps | {"diffuse": maps["diffuse"] * np.where((x + y) % 2, 1.1, 0.9).astype(np.float32)}
+
+    albedo = infer.estimate(found, dataclasses.replace(plain, run=gridded), infer.Settings()).diffuse.mean(-1)
+    rows, columns = np.nonzero(found.mask)
+    inner = np.s_[rows.min() + 60 : rows.max() - 60, columns.min() + 60 : columns.max() - 60]
+    part = albedo[inner]
+    y, x = np.mgrid[: part.shape[0], : part.shape[1]]
+    assert abs(part[(x + y) % 2 == 0].mean() / part[(x + y) % 2 == 1].mean() - 1) < 2e-3
+
+
+def test_a_grid_of_the_network_does_not_reach_the_normals_and_relief_does():
+    """A 2 px pattern of ±3° that fades across the object goes; relief of 7 and of 3 px a wave stays."""
+    y, x = np.mgrid[:160, :160]
+    mask = np.hypot(x - 80, y - 80) < 70
+    relief = 0.15 * np.sin(2 * np.pi * x / 7) + 0.05 * np.sin(2 * np.pi * y / 3)
+    grid = 0.05 * np.where((x % 2 == 0) & (y % 2 == 1), 1.0, -0.3) * (x / 160)
+    clean, seen_ = (np.stack([relief + part, 0 * x, 1 + 0 * x], axis=-1) * mask[..., None] for part in (0 * x, grid))
+    found = learned._without_grid(seen_, mask)
+    core = cv2.erode(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    before, after = (np.sqrt(np.mean((n - clean)[core] ** 2)) for n in (seen_, found))
+    pattern = (np.bincount(((x % 2) + 2 * (y % 2))[core], (n - clean)[..., 0][core]) for n in (seen_, found))
+    uneven, even = (np.ptp(sums) for sums in pattern)
+    assert even < 0.1 * uneven and after < before
+    assert np.array_equal(learned._without_grid(seen_ + 1, mask)[~mask], (seen_ + 1)[~mask].astype(np.float32))
+    bare = learned._without_grid(clean, mask)
+    assert np.sqrt(np.mean((bare - clean)[core] ** 2)) < 0.02 * np.std(relief)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_guide_settles_the_half_turn(side: float):
+    """Guided by the truth or by its opposite, the inversion returns that side of every clear axis."""
+    found = seen(noise=1e-5)
+    local, mask = scenes.truth()
+    guide = local * [side, side, 1]
+    normal, _, _ = analytic.invert(found, infer.Settings().ior, (guide, np.full(mask.shape, 5.0)))
+    error = np.degrees(np.arccos(np.clip((frames.to_ray_frame(normal, found.rays) * guide).sum(-1), -1, 1)))
+    assert np.median(error[mask & found.mask]) < 1.0
+
+
+def test_detail_is_kept_and_a_bend_is_not():
+    """Relief of a few pixels comes from the fine normals, tilts of whole regions from the coarse ones."""
+    y, x = np.mgrid[:128, :128]
+    tilt = np.tile([0.0, 0.0, 1.0], (128, 128, 1))
+    coarse, fine, truth = (tilt + np.array(aside) for aside in ([0.2, 0, 0], [-0.3, 0.1, 0], [0.2, 0, 0]))
+    relief = 0.2 * np.sin(x / 2)
+    fine[..., 1] += relief
+    truth[..., 1] += relief
+    coarse, fine, truth = (n / np.linalg.norm(n, axis=-1, keepdims=True) for n in (coarse, fine, truth))
+    mask = np.hypot(x - 64, y - 64) < 55
+    found = learned._detailed(coarse, fine, mask, 4.0)
+    error = np.degrees(np.arccos(np.clip((found * truth).sum(-1), -1, 1)))
+    assert np.median(error[mask]) < 1.0 and np.quantile(error[mask], 0.99) < 6.0
+
+
+def test_a_guide_is_as_sure_as_its_error_is_small():
+    """P(right) − P(wrong) of a Gaussian: 68.3 % at one standard deviation from the axis."""
+    axis, rays = np.array([[[1.0, 1.0]], [[0.0, 0.0]]]), np.full((1, 2, 3), [0.0, 0.0, 1.0])
+    tilt = np.radians(10.0)
+    normal = np.full((1, 2, 3), [-tilt, 0.0, 1.0])
+    phi, certainty = analytic._guided(axis, rays, normal, np.array([[10.0, 2.0]]))
+    np.testing.assert_allclose(np.cos(phi), -1)
+    np.testing.assert_allclose(certainty, [[0.6827, 1.0]], atol=1e-3)
+
+
+def lopsided() -> Network:
+    """A network without symmetry: its maps depend on where things lie in the picture and on each channel apart."""
+
+    def run(picture):
+        y, x = np.mgrid[: picture.shape[2], : picture.shape[3]] / 100.0
+        a = picture[:, 3:4] + 0.3 * picture[:, 5:6] + 0.1 * x
+        b = picture[:, 4:5] - 0.2 * picture[:, 12:13] + 0.1 * y
+        c = 1.5 + 0.1 * picture[:, 6:7] + 0.2 * picture[:, 13:14]
+        normal = np.concatenate([a, b, c], axis=1)
+        normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        return {"normal": normal, "depth": a * b, "diffuse": 0.3 + 0 * normal,
+                "specular": 0.04 + 0.01 * normal, "roughness": 0.5 + 0.1 * b, "sigma": 5 + a}  # fmt: skip
+
+    return dataclasses.replace(network(), run=run)
+
+
+@pytest.mark.parametrize(("quarters", "mirror"), [(1, False), (2, False), (0, True), (3, True)])
+def test_averaged_over_turns_a_turned_object_gets_the_turned_maps(quarters: int, mirror: bool):
+    """The symmetry holds exactly whatever the network, also for oblique rays."""
+    found = seen(noise=1e-4)
+    moved = dataclasses.replace(
+        found,
+        **{
+            name: np.ascontiguousarray(augmentation._turn(getattr(found, name), quarters, mirror))
+            for name in ("radiance", "ratio_sigma", "dolp", "mask", "quality", "rays")
+        },
+        **{
+            name: (-1.0) ** quarters * np.stack([
+                augmentation._turn(getattr(found, name)[0], quarters, mirror),
+                (-1 if mirror else 1) * augmentation._turn(getattr(found, name)[1], quarters, mirror),
+            ])
+            for name in ("ratio", "normalized_stokes")
+        },
+    )  # fmt: skip
+    moved.rays[..., :2] = augmentation._turn_vectors(moved.rays[..., :2], quarters, mirror)
+    whole, turned = (augmentation.mean(c, lopsided(), 8) for c in (found, moved))
+    np.testing.assert_allclose(turned["depth"], augmentation._turn(whole["depth"], quarters, mirror), atol=1e-4)
+    expected = np.array(augmentation._turn(whole["normal"], quarters, mirror))
+    expected[..., :2] = augmentation._turn_vectors(expected[..., :2], quarters, mirror)
+    np.testing.assert_allclose(turned["normal"], expected, atol=1e-4)

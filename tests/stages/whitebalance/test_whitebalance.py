@@ -1,0 +1,337 @@
+"""The chart found where it is, refused where it is not, and colours on the scale of its white patch."""
+
+import functools
+import json
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from polcap.errors import ChartError
+from polcap.formats import calib
+from polcap.images import AngleStack, ChartReference, ChartRequest, ColorCalibration, Floats, Quality, View
+from polcap.optics.color import decode_srgb
+from polcap.stages import whitebalance
+from polcap.stages.whitebalance import Settings, chart
+
+CLASSIC = calib.colorchecker()
+CAMERA = np.array([[0.28, 0.10, 0.07], [0.08, 0.71, 0.22], [0.02, 0.18, 0.66]])  # linear Rec.709 → S0 in camera
+WIDTH, HEIGHT = 480, 360
+AUTO = ChartRequest("auto")
+
+
+def pose(pitch: float, turn_deg: float, at: tuple[float, float], tilt: tuple[float, float] = (0, 0)) -> Floats:
+    """Homography chart → px of a chart centred `at`, turned and (by its horizon) tilted."""
+    c, s = pitch * np.cos(np.radians(turn_deg)), pitch * np.sin(np.radians(turn_deg))
+    flat = np.array([[c, -s, 0], [s, c, 0], [tilt[0], tilt[1], 1]]) @ np.array([[1, 0, -3], [0, 1, -2], [0, 0, 1]])
+    return np.array([[1, 0, at[0]], [0, 1, at[1]], [0, 0, 1]]) @ flat
+
+
+def draw(homography: Floats, colors: Floats, patch: float = 0.87, card: float = 0.03, samples: int = 4) -> Floats:
+    """A chart on a softly patterned table (H, W, 3), linear Rec.709: each pixel the mean of many points."""
+    inverse = np.linalg.inv(homography)
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
+    table = 0.2 + 0.05 * np.sin(x / 17)[..., None] * np.cos(y / 23)[..., None] * np.array([1, 0.8, 0.5])
+    total = np.zeros((HEIGHT, WIDTH, 3))
+    for dy in (np.arange(samples) + 0.5) / samples - 0.5:
+        for dx in (np.arange(samples) + 0.5) / samples - 0.5:
+            at = chart.project(inverse, np.stack([x + dx, y + dy], axis=-1))
+            u, v = at[..., 0], at[..., 1]
+            on = (u > -0.1) & (u < 6.1) & (v > -0.1) & (v < 4.1)
+            column, row = np.clip(np.floor(u), 0, 5).astype(int), np.clip(np.floor(v), 0, 3).astype(int)
+            inside = on & (abs(u - column - 0.5) < patch / 2) & (abs(v - row - 0.5) < patch / 2)
+            picture = np.where(on[..., None], card, table)
+            total += np.where(inside[..., None], colors[row * 6 + column], picture)
+    return total / samples**2
+
+
+def stack(image: Floats, view: View | None = None, clip: float = np.inf, **known: Floats) -> AngleStack:
+    """One shot of an image in camera channels."""
+    height, width = image.shape[:2]
+    clipped = (image >= clip).any(axis=-1)
+    return AngleStack(
+        value=np.minimum(image, clip)[None].astype(np.float32),
+        variance=np.full((1, *image.shape), 1e-8, np.float32),
+        quality=np.where(clipped, int(Quality.CLIPPED), 0).astype(np.uint8)[None],
+        angle=np.zeros(1),
+        view=view or View(1000.0, (width / 2, height / 2), 2.0),
+        exposure_ratio=np.ones((1, 1, 3)),
+        exif_ratio=np.ones((1, 1)),
+        ghost_fraction=np.zeros(1),
+        lossy=False,
+        camera_matrix=known.get("camera_matrix"),
+        white_balance=known.get("white_balance"),
+    )
+
+
+def photograph(homography: Floats, colors: Floats = CLASSIC.rec709, seed: int = 0, **drawing: float) -> Floats:
+    """I of one shot: half of S0, through a lens (σ = 0.4 px), with photon noise of 20 000 electrons at white."""
+    light = cv2.GaussianBlur(draw(homography, colors, **drawing) @ CAMERA.T / 2, (0, 0), 0.4)
+    return light + np.random.default_rng(seed).normal(size=light.shape) * np.sqrt(light / 20_000 + 1e-8)
+
+
+@functools.cache
+def plain() -> tuple[Floats, Floats]:
+    place = pose(24, 8, (260, 170), (2e-3, -1e-3))
+    return photograph(place), place
+
+
+def centers_off(color: ColorCalibration, homography: Floats) -> Floats:
+    """Distance of each found patch centre from the true one (24,), px."""
+    assert color.quads is not None
+    found = np.array([_center(quad) for quad in color.quads])
+    return np.linalg.norm(found - chart.project(homography, chart.centers()), axis=-1)
+
+
+def _center(quad: Floats) -> Floats:
+    """Where a quad's diagonals cross: the image of the square's centre."""
+    first, second = quad[2] - quad[0], quad[3] - quad[1]
+    share = np.linalg.solve(np.stack([first, -second], axis=1), quad[1] - quad[0])[0]
+    return quad[0] + share * first
+
+
+@pytest.mark.parametrize(
+    ("pitch", "turn", "tilt"),
+    [(13, 3, (0, 0)), (24, -20, (3e-3, 2e-3)), (24, 95, (0, 4e-3)), (24, 180, (0, 0)), (40, -140, (-2e-3, 1e-3))],
+)
+def test_chart_is_placed_within_a_tenth_of_a_pixel(pitch, turn, tilt):
+    place = pose(pitch, turn, (235, 185), tilt)
+    color = whitebalance.measure(stack(photograph(place)), CLASSIC, AUTO, Settings())
+    assert color.source == "chart"
+    assert centers_off(color, place).max() < 0.1
+    assert np.nanmean(color.delta_e) < 1  # noise only
+
+
+def test_s0_of_the_white_patch_is_its_reflectance():
+    image, place = plain()
+    color = whitebalance.measure(stack(image), CLASSIC, AUTO, Settings())
+    x, y = np.round(chart.project(place, np.array([0.5, 3.5]))).astype(int)
+    s0 = 2 * image[y - 4 : y + 5, x - 4 : x + 5].mean(axis=(0, 1))
+    assert color.matrix @ s0 == pytest.approx(CLASSIC.rec709[18], abs=0.01)
+    assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.02)
+
+
+def test_matrix_ignores_exposure_and_the_place_does_too():
+    image, _ = plain()
+    one, other = (whitebalance.measure(stack(k * image), CLASSIC, AUTO, Settings()) for k in (1.0, 0.01))
+    assert 0.01 * other.matrix == pytest.approx(one.matrix, rel=1e-3)
+    assert other.quads == pytest.approx(one.quads, abs=1e-2)
+
+
+def test_sloping_light_and_glare_are_taken_out_of_the_matrix():
+    image, place = plain()
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
+    u, v = np.moveaxis(chart.project(np.linalg.inv(place), np.stack([x, y], axis=-1)), -1, 0)
+    light = 1 + 0.03 * (u - 0.5) - 0.02 * (v - 3.5)
+    veil = 0.02 * CAMERA.sum(axis=1) / 2
+    color = whitebalance.measure(stack(image * light[..., None] + veil), CLASSIC, AUTO, Settings())
+    assert color.falloff == pytest.approx((0.03, -0.02), abs=0.002)
+    assert color.glare == pytest.approx(0.02, abs=0.002)
+    assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.02)
+
+
+def test_overexposed_patches_are_left_out():
+    image, _ = plain()
+    clip = 0.5 * float((CLASSIC.rec709[19] @ CAMERA.T)[1]) * 0.9  # white and neutral 8 saturate, and more
+    color = whitebalance.measure(stack(image, clip=clip), CLASSIC, AUTO, Settings())
+    assert color.delta_e is not None
+    left_out = np.isnan(color.delta_e)
+    assert left_out[18] and left_out[19] and left_out.sum() < 12
+    assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.03)
+
+
+def test_a_chart_burnt_out_asks_for_a_shorter_exposure():
+    image, place = plain()
+    corners = 2 * chart.from_centers(chart.project(place, chart.centers())).corners() + 0.5
+    with pytest.raises(ChartError, match=r"over-exposed.*shorter exposure"):
+        whitebalance.measure(stack(image, clip=0.02), CLASSIC, ChartRequest("corners", corners=corners), Settings())
+
+
+def test_24_patches_of_other_colours_are_refused():
+    place = pose(24, 8, (260, 170))
+    shuffled = np.random.default_rng(5).permutation(CLASSIC.rec709)
+    with pytest.raises(ChartError, match=r"max_delta_e = 15.*--no-chart"):
+        whitebalance.measure(stack(photograph(place, shuffled)), CLASSIC, AUTO, Settings())
+
+
+def test_a_mirrored_chart_is_refused():
+    image, _ = plain()
+    with pytest.raises(ChartError, match="no ColorChecker Classic"):
+        whitebalance.measure(stack(image[:, ::-1]), CLASSIC, AUTO, Settings())
+
+
+def test_an_image_without_a_chart_is_refused_with_the_remedies():
+    empty = draw(pose(24, 0, (-900, -900)), CLASSIC.rec709, samples=1)
+    with pytest.raises(ChartError, match=r"no ColorChecker Classic.*--chart x0.*--chart FILE.*--no-chart"):
+        whitebalance.measure(stack(empty), CLASSIC, AUTO, Settings())
+
+
+def test_manual_corners_in_raw_pixels_are_drawn_to_the_chart():
+    image, place = plain()
+    exact = chart.Placement(place, 0.87, 0.01, 1.0).corners()
+    rough = exact + np.array([[3.0, -2], [-3, 2], [2, 3], [-2, -3]])  # an unsteady hand
+    request = ChartRequest("corners", corners=2 * rough + 0.5)  # binned px (i, j) ↔ RAW px (2i + ½, 2j + ½)
+    color = whitebalance.measure(stack(image), CLASSIC, request, Settings())
+    assert color.source == "corners" and np.isnan(color.cost)
+    assert centers_off(color, place).max() < 0.1
+    assert color.corners == pytest.approx(exact, abs=0.15)
+
+
+def test_corners_from_the_wrong_end_say_so():
+    image, place = plain()
+    corners = 2 * chart.Placement(place, 0.87, 0.01, 1.0).corners() + 0.5
+    with pytest.raises(ChartError, match="other way up"):
+        request = ChartRequest("corners", corners=np.roll(corners, 2, axis=0))
+        whitebalance.measure(stack(image), CLASSIC, request, Settings())
+
+
+@pytest.mark.parametrize(
+    ("corners", "says"),
+    [
+        (None, "four outer patch corners"),
+        ([[10, 10], [10, 200], [300, 200], [300, 10]], "clockwise"),
+        ([[10, 10], [3000, 10], [3000, 2000], [10, 2000]], "outside the image"),
+        ([[10, 10], [40, 10], [40, 30], [10, 30]], "px apart"),
+        ([[10, 10], [310, 10], [310, 210], [10, 210]], "do not show a ColorChecker Classic"),
+    ],
+)
+def test_impossible_corners_are_one_clear_line(corners, says):
+    request = ChartRequest("corners", corners=None if corners is None else np.array(corners, float))
+    with pytest.raises(ChartError, match=says):
+        whitebalance.measure(stack(plain()[0]), CLASSIC, request, Settings())
+
+
+def test_profile_brings_its_matrix_and_leaves_its_chart_behind():
+    image, _ = plain()
+    profile = whitebalance.measure(stack(image), CLASSIC, AUTO, Settings())
+    color = whitebalance.measure(stack(0 * image), CLASSIC, ChartRequest("profile", profile=profile), Settings())
+    assert color.matrix is profile.matrix
+    assert (color.source, color.quads, color.corners) == ("profile", None, None)
+
+
+def test_without_a_chart_the_camera_is_believed_with_sensor_white_at_one():
+    image, _ = plain()
+    matrix = np.array([[1.9, -0.7, -0.2], [-0.2, 1.5, -0.3], [0.0, -0.5, 1.5]])
+    known = stack(image, camera_matrix=matrix, white_balance=np.array([2.0, 1, 1.5]))
+    color = whitebalance.measure(known, CLASSIC, ChartRequest("none"), Settings())
+    assert color.source == "camera"
+    assert 2 * color.matrix == pytest.approx(matrix)
+    balance = stack(image, white_balance=np.array([2.0, 1, 1.5]))
+    color = whitebalance.measure(balance, CLASSIC, ChartRequest("none"), Settings())
+    assert 2 * color.matrix == pytest.approx(np.diag([2.0, 1, 1.5]))
+    color = whitebalance.measure(stack(image), CLASSIC, ChartRequest("none"), Settings())
+    assert (color.source, color.metres_per_px) == ("none", None)
+    assert 2 * color.matrix == pytest.approx(np.eye(3))
+
+
+def test_scale_comes_from_the_charts_width_and_only_from_it():
+    """A chart of pitch 15.5 mm, 0.7 m away, turned and tilted: Z/f."""
+    view = View(1100.0, (WIDTH / 2, HEIGHT / 2), 2.0)
+    turn = cv2.Rodrigues(np.radians([8.0, -12.0, 10.0]))[0]
+    camera = np.array([[view.focal, 0, view.center[0]], [0, view.focal, view.center[1]], [0, 0, 1]])
+    flat = np.stack([0.0155 * turn[:, 0], 0.0155 * turn[:, 1], [0.04, 0.01, 0.7]], axis=1)
+    place = camera @ flat @ np.array([[1, 0, -3], [0, 1, -2], [0, 0, 1]])
+    radiance = stack(photograph(place / place[2, 2]), view)
+    width = 0.0155 * 5.87
+    color = whitebalance.measure(radiance, CLASSIC, AUTO, Settings(chart_width_m=width))
+    assert color.metres_per_px == pytest.approx(0.7 / 1100, rel=3e-3)
+    assert whitebalance.measure(radiance, CLASSIC, AUTO, Settings()).metres_per_px is None
+
+
+# --- real photographs and path-traced captures ---
+
+DATA = os.environ.get("POLCAP_DATA")
+needs_data = pytest.mark.skipif(not DATA, reason="POLCAP_DATA is not set: no real charts")
+REAL = Path(DATA or ".") / "real"
+RENDERED = Path(DATA or ".") / "rendered"
+PHOTOS = sorted((REAL / "charts").glob("*.jpg"))
+SCENES = ["d21_spot", "d22_demosthenes", "d23_penguin", "d24_scorpion"]
+
+
+def photo(path: Path) -> AngleStack:
+    """An 8-bit photograph as linear light, half size where it is large."""
+    image = cv2.imread(str(path))
+    assert image is not None
+    step = 2 if max(image.shape) > 2000 else 1
+    return stack(decode_srgb(image[::step, ::step, ::-1] / 255.0), clip=decode_srgb(np.array(254 / 255.0)))
+
+
+def superpixels(path: Path) -> Floats:
+    """A RAW file binned 2×2, (counts − black)/(white − black)."""
+    import rawpy
+
+    with rawpy.imread(str(path)) as raw:
+        counts, names = raw.raw_image_visible.astype(np.float32), raw.color_desc.decode()
+        black, white, pattern = raw.black_level_per_channel, raw.white_level, raw.raw_pattern.copy()
+    counts = counts[: counts.shape[0] // 2 * 2, : counts.shape[1] // 2 * 2]
+    binned = np.zeros((counts.shape[0] // 2, counts.shape[1] // 2, 3))
+    for (y, x), index in np.ndenumerate(pattern):
+        channel = "RGB".index(names[index])
+        share = 0.5 if channel == 1 else 1.0
+        binned[..., channel] += share * (counts[y::2, x::2] - black[index]) / (white - black[index])
+    return binned
+
+
+@needs_data
+@pytest.mark.parametrize("path", PHOTOS, ids=lambda path: path.stem)
+def test_classic_is_found_in_every_real_photograph(path):
+    color = whitebalance.measure(photo(path), CLASSIC, AUTO, Settings())
+    linear = path.stem in ("TL84_colorchecker", "exposure30")  # not gamma-encoded: decoding them bends their greys
+    assert np.nanmean(color.delta_e) < (14 if linear else 7)
+
+
+@needs_data
+@pytest.mark.parametrize("name", ["CRW_0101.CRW", "P003910.KDC"])
+def test_classic_is_found_in_real_raw_files(name):
+    color = whitebalance.measure(stack(superpixels(REAL / "raw_chart" / name)), CLASSIC, AUTO, Settings())
+    assert np.nanmean(color.delta_e) < 5
+
+
+@needs_data
+def test_a_chart_of_18_patches_is_refused():
+    with pytest.raises(ChartError, match="no ColorChecker Classic"):
+        whitebalance.measure(photo(REAL / "charts" / "1.png"), CLASSIC, AUTO, Settings())
+
+
+def rendered(name: str) -> tuple[AngleStack, dict, dict]:
+    """The 0° bracket merged on its true exposures, unclipped samples only."""
+    meta = json.loads((RENDERED / f"{name}.meta.json").read_text())
+    truth = json.loads((RENDERED / f"{name}.truth.json").read_text())
+    total, weight = 0.0, 0.0
+    for shot in truth["shots"][:3]:
+        exposure = shot["relative_exposure"] * shot["flash_factor"]
+        frame = superpixels(RENDERED / shot["file"])
+        good = (frame < 0.9).all(axis=-1)[..., None]
+        total, weight = total + good * frame, weight + good * exposure
+    first = truth["shots"][0]["relative_exposure"] * truth["shots"][0]["flash_factor"]
+    view = View(meta["fx"] / 2, ((meta["cx"] - 1) / 2, (meta["cy"] - 1) / 2), 2.0)
+    return stack(first * total / np.maximum(weight, 1e-9), view), meta, truth
+
+
+@needs_data
+@pytest.mark.parametrize("name", SCENES)
+def test_path_traced_chart_is_found_and_its_camera_matrix_recovered(name):
+    radiance, meta, truth = rendered(name)
+    printed = ChartReference("as rendered", np.array(meta["chart"]["reference_linear_srgb"]), CLASSIC.size_m)
+    color = whitebalance.measure(radiance, printed, AUTO, Settings(chart_width_m=0.0165 * 5.862))
+    true = (np.array(meta["chart"]["patch_corners_px"]) - 1) / 2  # RAW px with centres on +½ → binned px
+    error = np.linalg.norm(color.quads.mean(axis=1) - true.mean(axis=1), axis=-1)
+    assert np.median(error) < 0.05 and error.max() < 0.15
+    identity = color.matrix @ np.array(truth["camera_matrix_from_linear_srgb"])
+    assert identity / np.trace(identity) * 3 == pytest.approx(np.eye(3), abs=0.006)
+    assert np.nanmean(color.delta_e) < 0.3
+    assert color.metres_per_px == pytest.approx(-meta["chart"]["c"][2] / radiance.view.focal, rel=3e-3)
+
+
+@needs_data
+@pytest.mark.parametrize("name", SCENES)
+def test_path_traced_scene_without_its_chart_is_refused(name):
+    radiance, meta, _ = rendered(name)
+    x0 = int(np.min(np.array(meta["chart"]["patch_corners_px"])[..., 0]) / 2) - 6
+    x1 = int(np.max(np.array(meta["chart"]["patch_corners_px"])[..., 0]) / 2) + 6
+    image = radiance.value[0]
+    rest = image[:, :x0] if x0 > image.shape[1] - x1 else image[:, x1:]
+    with pytest.raises(ChartError, match="no ColorChecker Classic"):
+        whitebalance.measure(stack(rest), CLASSIC, AUTO, Settings())

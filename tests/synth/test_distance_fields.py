@@ -1,0 +1,89 @@
+"""Distance fields never promise more room than there is, and their surfaces are where geometry says."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from polcap.synth import trace
+from polcap.synth.distance_fields import Bumps, Cluster, Shape, Superquadric, Vase
+from polcap.synth.scenes import random_scene
+
+SHAPES: dict[str, Shape] = {
+    "cluster": Cluster(((0, 0, 0, 0.03), (0.04, 0.01, 0, 0.02), (0, -0.03, 0.02, 0.025))),
+    "melted": Cluster(((0, 0, 0, 0.03), (0.04, 0.01, 0, 0.02)), blend=0.02),
+    "bumps": Bumps((0.05, 0.06, 0.07), ((0.05, 4, 1, 0, 0.3), (0.04, 0, 3, 5, 1.0))),
+    "box": Superquadric((0.05, 0.03, 0.06), 5.0),
+    "vase": Vase(0.14, ((0, 0.03), (0.4, 0.055), (0.85, 0.024), (1, 0.034)), 9, 0.05, ((0.0008, 90, 40, 10, 1.0),)),
+}
+
+
+def rays(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rays from a sphere of 0.3 m to points near the middle."""
+    random = np.random.default_rng(seed)
+    origin = random.normal(size=(count, 3))
+    origin *= 0.3 / np.linalg.norm(origin, axis=-1, keepdims=True)
+    direction = random.uniform(-0.06, 0.06, (count, 3)) - origin
+    return origin, direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+
+
+def surface(shape: Shape, seed: int, count: int) -> np.ndarray:
+    origin, direction = rays(seed, count)
+    index, distance = trace._march(shape, origin, direction, 0.0)
+    return origin[index] + direction[index] * distance[:, None]
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_a_step_of_the_promised_length_never_enters_the_shape(name: str) -> None:
+    shape = SHAPES[name]
+    points = surface(shape, 0, 3000)
+    assert len(points) > 600 and np.linalg.norm(points, axis=-1).max() <= shape.radius
+    outside = (
+        points[:400]
+        + np.random.default_rng(1).normal(size=(400, 3)) * np.repeat([0.003, 0.02, 0.08, 0.2], 100)[:, None]
+    )
+    promised = shape.distance(outside)
+    nearest = np.linalg.norm(outside[:, None] - points[None], axis=-1).min(axis=1)
+    assert (promised <= nearest + 1e-6)[promised > 0].all()
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_rays_that_arrive_stand_on_the_surface_and_see_its_front(name: str) -> None:
+    shape = SHAPES[name]
+    v = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 60), np.linspace(-0.1, 0.1, 60), [1.0]), axis=-1).reshape(-1, 3)
+    v /= np.linalg.norm(v, axis=-1, keepdims=True)
+    hits = trace.trace(shape, (0.0, 0.0, -0.8), Rotation.from_rotvec([20, 30, 0], degrees=True), v)
+    assert len(hits.index) > 300
+    assert np.abs(shape.distance(hits.local)).max() < 2e-6
+    np.testing.assert_allclose(np.linalg.norm(hits.normal, axis=-1), 1.0, rtol=1e-9)
+    facing = np.einsum("ni,ni->n", hits.normal, v[hits.index])
+    assert facing.min() > -0.02  # a ray that grazes within 1 µm may see the far side of the limb
+    np.testing.assert_allclose(hits.point, -v[hits.index] * hits.distance[:, None], atol=1e-12)
+
+
+def test_sphere_is_met_where_the_quadratic_says() -> None:
+    ball, middle = Cluster(((0, 0, 0, 0.06),)), np.array([0.05, -0.02, -0.7])
+    v = -np.array([[0.05, -0.02, -0.7], [0.08, 0.0, -0.7], [0.2, 0.2, -0.7]])
+    v /= np.linalg.norm(v, axis=-1, keepdims=True)
+    hits = trace.trace(ball, tuple(middle), Rotation.from_rotvec([0.0, 40, 0], degrees=True), v)
+    b = -(v @ middle)
+    root = b**2 - middle @ middle + 0.06**2
+    assert hits.index.tolist() == [0, 1] and root[2] < 0
+    np.testing.assert_allclose(hits.distance, b[:2] - np.sqrt(root[:2]), atol=2e-6)
+    expected = (-v[:2] * (b[:2] - np.sqrt(root[:2]))[:, None] - middle) / 0.06
+    np.testing.assert_allclose(hits.normal, expected, atol=1e-4)
+
+
+def test_a_ball_hides_another_from_a_light_behind_it() -> None:
+    front = np.array([0.0, 0.04, 0.06])
+    pair = Cluster(((0, 0, 0, 0.03), (*front, 0.012)))
+    place, still = (0.0, 0.0, -0.7), Rotation.identity()
+    hits = trace.trace(pair, place, still, np.array([[0.0, 0.0, 1.0]]))  # the middle of the rear ball
+    np.testing.assert_allclose(hits.point, [[0, 0, -0.67]], atol=2e-6)
+    behind = hits.point[0] + 5 * (front + place - hits.point[0])
+    assert trace.shadowed(pair, place, still, hits, tuple(behind)).tolist() == [True]
+    assert trace.shadowed(pair, place, still, hits, (behind[0], -behind[1], behind[2])).tolist() == [False]
+
+
+@pytest.mark.parametrize("kind", ["bumps", "clusters", "vase"])
+def test_a_seed_is_a_scene(kind: str) -> None:
+    assert random_scene(4, kind) == random_scene(4, kind) != random_scene(5, kind)

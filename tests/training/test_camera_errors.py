@@ -1,0 +1,89 @@
+"""The camera of training against Malus's law and the statistics it promises."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from polcap.optics import frames
+from polcap.training.camera_errors import Errors, photograph
+
+CPU = torch.device("cpu")
+B, S = 2, 48
+
+
+def scene(s1: float = 0.05, s2: float = -0.03) -> tuple[Tensor, ...]:
+    stokes = torch.zeros(3, B, S, S, 3)
+    stokes[0], stokes[1], stokes[2] = 0.5, 0.5 * s1, 0.5 * s2
+    rays = torch.zeros(B, S, S, 3)
+    rays[..., 2] = 1
+    return stokes, torch.full((B, S, S, 3), 0.4), torch.ones(B, S, S, dtype=torch.bool), rays
+
+
+def shoot(errors: Errors, *images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    return photograph(*images, torch.arange(B * S * S), errors)
+
+
+def test_perfect_camera_returns_the_stokes_parameters() -> None:
+    images = scene()
+    measured, _, clipped = shoot(Errors.none(B, CPU), *images)
+    torch.testing.assert_close(measured, images[0].reshape(3, -1, 3), atol=3e-4, rtol=0)  # 1e9 electrons
+    assert not clipped.any()
+
+
+def test_off_axis_the_angles_of_the_image_are_carried_to_the_ray() -> None:
+    """Light that vibrates along what the polarizer at 45° is on an oblique ray passes it whole."""
+    stokes, diffuse, mask, _ = scene()
+    rays = torch.nn.functional.normalize(torch.tensor([0.2, 0.15, 1.0]), dim=0).expand(B, S, S, 3)
+    axis = frames.axis_on_ray(torch.tensor(torch.pi / 4), rays)
+    stokes[1], stokes[2] = (0.5 * f(2 * axis)[..., None] for f in (torch.cos, torch.sin))
+    measured, _, _ = shoot(Errors.none(B, CPU), stokes, diffuse, mask, rays)
+    through_45 = (measured[0] + measured[2]) / 2
+    torch.testing.assert_close(through_45, torch.full_like(through_45, 0.5), atol=1e-4, rtol=0)
+
+
+def test_noise_has_the_variance_it_states() -> None:
+    torch.manual_seed(0)
+    images = scene()
+    errors = replace(Errors.none(B, CPU), full_well=torch.full((B,), 2e4), read_noise=torch.full((B,), 5.0))
+    errors = replace(errors, bracket=torch.full((B,), 3.0))
+    measured, covariance, _ = shoot(errors, *images)
+    difference = measured - images[0].reshape(3, -1, 3)
+    for k, place in ((0, 0), (1, 3), (2, 5)):
+        z = difference[k] / covariance[place].sqrt()
+        assert abs(float(z.mean())) < 0.05 and float(z.std()) == pytest.approx(1, abs=0.03)
+    product = (difference[0] * difference[2]).mean() / covariance[2].mean()
+    assert float(product) == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_shift_moves_a_ramp_by_what_it_says(axis: int) -> None:
+    stokes, *rest = scene(0, 0)
+    ramp = torch.arange(S) * 0.01
+    stokes[0] = ramp[None, None, :, None] if axis == 0 else ramp[None, :, None, None]
+    none = Errors.none(B, CPU)
+    shift = torch.zeros(3, B, 2)
+    shift[:, :, axis] = 0.1
+    measured, _, _ = shoot(replace(none, shift=shift), stokes, *rest)
+    moved = measured[0].reshape(B, S, S, 3)[:, 8:-8, 8:-8] - stokes[0][:, 8:-8, 8:-8]
+    torch.testing.assert_close(moved, torch.full_like(moved, -0.001), atol=1e-4, rtol=0)
+
+
+def test_saturation_is_flagged_and_stays_finite() -> None:
+    stokes, *rest = scene()
+    stokes[:, 0] *= 20
+    errors = replace(Errors.none(B, CPU), bracket=torch.full((B,), 4.0))
+    measured, _, clipped = shoot(errors, stokes, *rest)
+    assert clipped[: S * S].all() and not clipped[S * S :].any() and measured.isfinite().all()
+
+
+def test_drawn_errors_are_reproducible() -> None:
+    def draw() -> dict[str, Any]:
+        torch.manual_seed(3)
+        return vars(Errors.draw(4, CPU))
+
+    first, second = draw(), draw()
+    for name in first:
+        torch.testing.assert_close(first[name], second[name])
