@@ -6,15 +6,14 @@ states an assumption. A gate that could not be measured says so.
 
 import json
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
-from polcap import __version__, pictures
+from polcap import __version__
 from polcap.config import Config, Gates
 from polcap.errors import StorageError
 from polcap.formats import atomic
