@@ -110,9 +110,10 @@ def _process(unit: Unit, order: Order) -> dict[str, Any]:
     from polcap.batch import sheet
     from polcap.config import Config
     from polcap.formats import capture as captures
+    from polcap.path import UserInput
 
     config = msgspec.convert(order.settings, Config)
-    given = pipeline.Given(
+    given = UserInput(
         chart=order.chart, network=_network(order.estimator, order.model, order.device, order.threads)
     )
     found = captures.read(unit.capture, order.angles_deg)
