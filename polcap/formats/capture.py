@@ -1,15 +1,15 @@
 """A folder in, the capture it holds out: shots, brackets, camera, and a table of what was understood."""
 
 import math
+import os
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from hashlib import blake2b
 from pathlib import Path
 
 import numpy as np
 
 from polcap.errors import CaptureError
-from polcap.formats import capture_toml, exif, focal, layouts, photo, raw, sniff
+from polcap.formats import capture_toml, file_name, focal, layouts, photo, raw
 from polcap.formats.capture_toml import CaptureFile
 from polcap.formats.layouts import Source
 from polcap.images import Capture, Exif, Frame, SensorImage, Shot
@@ -50,40 +50,17 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
     every = used | {source.path: source for source in plan.others}
     if len(every) < len(used) + len(plan.others):
         raise CaptureError(f"{folder / capture_toml.NAME}: names a file twice; give each frame one entry")
-    facts = {path: _facts(source) for path, source in every.items()}
-    _check_one_camera(facts)
-    digests = {path: _digest(path) for path in every}
-    _check_no_duplicate(digests)
-
-    def frame(source: Source, angle_deg: float) -> Frame:
-        mosaic = angle_deg if plan.layout == "sensor" else None
-        load, manner = _loader(source, stated, mosaic)
-        fact = facts[source.path]
-        return Frame(
-            path=str(source.path),
-            exif=fact,
-            role=source.role,
-            digest=" ".join([digests[source.path], *manner]),
-            load=load,
-            exposure=_stated_exposure(source, fact),
-        )
-
-    def shot(angle_deg: float, bracket: Sequence[Source]) -> Shot:
-        ambient = [s for s in plan.others if s.role == "ambient" and s.angle_deg in (None, angle_deg)]
-        return Shot(
-            angle=math.radians(angle_deg),
-            frames=_darkest_first(frame(source, angle_deg) for source in bracket),
-            ambient=_darkest_first(frame(source, angle_deg) for source in ambient),
-        )
-
-    shots = tuple(shot(angle, bracket) for angle, bracket in plan.shots)
+    _check_one_camera({path: source.probe.exif for path, source in every.items()})
+    _check_no_duplicate({path: source.probe.digest for path, source in every.items()})
+    shots = tuple(_shot(plan, stated, angle, bracket) for angle, bracket in plan.shots)
     _check_brackets(shots)
     reference = shots[0].frames[0].exif
     lens = focal.find(reference, stated.focal_length_mm, stated.sensor_width_mm)
     step = 2 if plan.layout == "sensor" else 1  # a plane of a sensor mosaic has half its sides
     width, height = (reference.width or 0) // step, (reference.height or 0) // step
+    notes = _notes(plan.layout, plan.others, plan.shots[0][1][0], shots, stated)
     return Capture(
-        name=stated.name or folder.resolve().name,
+        name=file_name.safe(stated.name or Path(os.path.realpath(folder)).name),
         folder=str(folder),
         shots=shots,
         layout=plan.layout,
@@ -91,8 +68,8 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
         focal_known=lens.known,
         principal_px=((width - 1) / 2, (height - 1) / 2),
         size_px=(width, height),
-        chart_frames=tuple(frame(source, 0.0) for source in plan.others if source.role == "chart"),
-        notes=(*plan.notes, *_notes(plan.layout, plan.others, shots, stated), f"focal length {lens.note}"),
+        chart_frames=tuple(_frame(plan, stated, source, 0.0) for source in plan.others if source.role == "chart"),
+        notes=(*plan.notes, *notes, f"focal length {lens.note}"),
     )
 
 
@@ -134,28 +111,43 @@ def _seconds(time: float | None) -> str:
     return f"1/{1 / time:.0f} s" if time < 0.3 else f"{time:.3g} s"
 
 
-def _facts(source: Source) -> Exif:
-    fact = exif.read(source.path)
-    if sniff.structure(source.path).truncated:  # decoding tells; some cameras note odd places for previews
-        raw.read(source.path) if source.kind == "raw" else photo.read(source.path)
-    return fact
+def _shot(plan: layouts.Plan, stated: CaptureFile, angle_deg: float, bracket: Sequence[Source]) -> Shot:
+    ambient = [s for s in plan.others if s.role == "ambient" and s.angle_deg in (None, angle_deg)]
+    return Shot(
+        angle=math.radians(angle_deg),
+        frames=_darkest_first(_frame(plan, stated, source, angle_deg) for source in bracket),
+        ambient=_darkest_first(_frame(plan, stated, source, angle_deg) for source in ambient),
+    )
+
+
+def _frame(plan: layouts.Plan, stated: CaptureFile, source: Source, angle_deg: float) -> Frame:
+    load, manner = _loader(source, stated, angle_deg if plan.layout == "sensor" else None)
+    return Frame(
+        path=str(source.path),
+        exif=source.probe.exif,
+        role=source.role,
+        digest=" ".join([source.probe.digest, *manner]),
+        load=load,
+        exposure=_stated_exposure(source),
+    )
 
 
 def _loader(source: Source, stated: CaptureFile, mosaic_deg: float | None) -> tuple[Loader, list[str]]:
     """How to read a frame, and whatever beside the file's bytes decides its values."""
+    path, probe = source.path, source.probe
     manner = [f"{stated.white:g}"] if stated.white else []
     manner += [f"-{stated.black:g}"] if stated.black else []
+    levels = (stated.white, stated.black, probe.digest)
     if mosaic_deg is not None:
-        read_plane = partial(photo.read_mosaic, source.path, mosaic_deg, stated.white, stated.black)
-        return read_plane, [f"sensor {mosaic_deg:g}", *manner]
-    if source.kind == "raw":
-        return partial(raw.read, source.path), []
-    read_photo = partial(photo.read, source.path, stated.encoding, stated.white, stated.black)
-    return read_photo, [stated.encoding or "default", *manner]
+        return partial(photo.read_mosaic, path, mosaic_deg, *levels, probe.kind), [f"sensor {mosaic_deg:g}", *manner]
+    if probe.kind == "raw":
+        return partial(raw.read, path, probe.digest), []
+    return partial(photo.read, path, stated.encoding, *levels), [stated.encoding or "default", *manner]
 
 
-def _stated_exposure(source: Source, fact: Exif) -> float | None:
+def _stated_exposure(source: Source) -> float | None:
     if source.flash_energy:
+        fact = source.probe.exif
         return source.flash_energy * (fact.iso or 100.0) / 100.0 / (fact.f_number or 1.0) ** 2
     return source.exposure
 
@@ -170,14 +162,6 @@ def _darkest_first(frames: Iterable[Frame]) -> tuple[Frame, ...]:
     if None in exposures:
         return tuple(listed)
     return tuple(sorted(listed, key=lambda frame: _exposure(frame) or 0.0))
-
-
-def _digest(path: Path) -> str:
-    digest = blake2b(digest_size=20)
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def _check_angles(folder: Path, angles_deg: Sequence[float], who: str) -> None:
@@ -244,15 +228,19 @@ def _settings(frame: Frame) -> str:
     return " ".join(parts) if fact.exposure_time else "no exposure in EXIF"
 
 
-def _notes(layout: str, others: Sequence[Source], shots: Sequence[Shot], stated: CaptureFile) -> list[str]:
+def _notes(
+    layout: str, others: Sequence[Source], reference: Source, shots: Sequence[Shot], stated: CaptureFile
+) -> list[str]:
     notes = []
     cross = sum(source.role == "cross" for source in others)
     if cross:
         notes.append(f"not used: {cross} cross-polarised frames")
-    first = shots[0].frames[0]
-    if layout != "sensor" and sniff.kind(Path(first.path)) == "photo":
-        encoding, bits = photo.encoding_of(first.path, stated.encoding)
+    if layout != "sensor" and reference.probe.kind == "photo":
+        bits = reference.probe.bits
+        encoding = photo.encoding_of(bits, stated.encoding)
         notes.append(f"finished pictures of {bits} bits, taken as {encoding}" + LOSS * (bits == 8))
+    if reference.probe.lossy:
+        notes.append("lossy DNG" + LOSS)
     if stated.rotator:
         notes.append(f"rotator {stated.rotator.model or 'of unknown model'}, log {stated.rotator.log or 'none'}")
     exposures = [_exposure(frame) for frame in shots[0].frames]

@@ -1,5 +1,6 @@
 """A folder in, what its `capture.toml` states out; strict, so that a misspelt key is an error."""
 
+import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -7,6 +8,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from polcap.errors import CaptureError
+from polcap.formats import document
 from polcap.images import Role
 
 NAME = "capture.toml"
@@ -47,11 +49,11 @@ class CaptureFile(Struct, frozen=True, forbid_unknown_fields=True):
 def load(folder: Path) -> CaptureFile:
     """The folder's capture.toml, or an empty one. Raises CaptureError."""
     path = folder / NAME
-    if not path.exists():
+    if not os.path.lexists(path):
         return CaptureFile()
     try:
-        stated = msgspec.toml.decode(path.read_bytes(), type=CaptureFile)
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        stated = msgspec.convert(document.read_toml(path), CaptureFile)
+    except ValueError as error:  # of TOML, of UTF-8, of msgspec
         raise CaptureError(f"{path}: {error}; see the reference page on captures") from None
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None

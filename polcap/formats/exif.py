@@ -1,7 +1,6 @@
-"""A photograph's path in, the facts of its EXIF out: every maker's RAW, and finished pictures.
+"""A photograph's bytes in, the facts of its EXIF out: every maker's RAW, and finished pictures. In the worker.
 
-Only tags are read, a millisecond a file; the pixel count comes from the decoder's
-header, which unpacks nothing.
+Only tags are read, a millisecond a file; the pixel count comes from the decoder's header.
 """
 
 import io
@@ -11,13 +10,10 @@ import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from datetime import datetime
-from pathlib import Path
 from typing import Any
 
 import exifread
 
-from polcap.errors import DecodeError
-from polcap.formats import sniff, worker
 from polcap.images import Exif
 
 _D65_FIRST = (21, 20, 22, 23, 1, 4, 9, 10, 11, 12, 13, 14, 15)  # EXIF LightSource, the daylights
@@ -30,47 +26,37 @@ _UNIT_MM = {
 }  # FocalPlaneResolutionUnit; 1 "none" means inch in practice
 _SENSOR_MM = (2.0, 70.0)  # width; what is outside comes from a wrong unit
 _RESIZED = 1.05  # pixel counts that differ more than margins do
+_TEXT_LENGTH = 100  # of a name; what is longer is no name
 
 logging.getLogger("exifread").setLevel(logging.CRITICAL)  # its warnings are about tags that are not used here
 
 
-def read(path: str | Path) -> Exif:
-    """The metadata of a RAW file or picture, with its size in visible RAW pixels.
-
-    Raises DecodeError where no decoder recognises the file.
-    """
-    path = Path(path)
-    exif, reference_width = _tags(path)
-    if sniff.kind(path) == "photo":
-        header, _ = worker.call("polcap.formats.photo:header", path)
-    else:
-        bare = exif.exposure_time is None and not exif.make  # CRW: the decoder knows more, but has to unpack
-        header, _ = worker.call("polcap.formats.raw:header", path, unpack=bare)
-    exif = replace(exif, width=header["width"], height=header["height"], **header.get("exif", {}))
-    return replace(exif, pixel_pitch_um=_pitch(exif.pixel_pitch_um, reference_width, header["width"]))
+def tags(data: bytes) -> Exif:
+    """What the tags alone say; `width` is that of the picture that they speak of. No EXIF, an empty Exif."""
+    found = _found(data)
+    width = _number(found, "Image Tag 0xC791", "EXIF ExifImageWidth")
+    return replace(_exif(found), width=int(width) if width else None)
 
 
-def tags(path: str | Path) -> Exif:
-    """What the tags alone say; `width` and `height` stay None. A file without EXIF gives an empty Exif."""
-    return _tags(Path(path))[0]
+def sized(stated: Exif, width: int, height: int) -> Exif:
+    """The same with the size in visible RAW pixels, as the decoder counts them, and the pitch of those pixels."""
+    pitch = _pitch(stated.pixel_pitch_um, stated.width, width)
+    return replace(stated, width=width, height=height, pixel_pitch_um=pitch)
 
 
-def _tags(path: Path) -> tuple[Exif, float | None]:
+def _found(data: bytes) -> dict[str, Any]:
+    """The tags by name, those of the first directory as "Image …"."""
     found: dict[str, Any] = {}
-    try:
-        with path.open("rb") as file:
-            for prefix, part in _parts(file):
-                try:
-                    read_tags = exifread.process_file(part, details=False, extract_thumbnail=False)
-                except Exception:  # exifread raises whatever a damaged tag leads to: as if it were absent
-                    continue
-                found |= {name.replace("Image ", prefix, 1) if prefix else name: tag for name, tag in read_tags.items()}
-    except OSError as error:
-        raise DecodeError(f"{path}: cannot be read ({error.strerror}); check the file and its permissions") from None
-    return _exif(found), _number(found, "Image Tag 0xC791", "EXIF ExifImageWidth")
+    for prefix, part in _parts(io.BytesIO(data)):
+        try:
+            read_tags = exifread.process_file(part, details=False, extract_thumbnail=False)
+        except Exception:  # exifread raises whatever a damaged tag leads to: as if it were absent
+            continue
+        found |= {name.replace("Image ", prefix, 1) if prefix else name: tag for name, tag in read_tags.items()}
+    return found
 
 
-def _parts(file: io.BufferedReader) -> Iterator[tuple[str, io.BufferedIOBase]]:
+def _parts(file: io.BytesIO) -> Iterator[tuple[str, io.BytesIO]]:
     """Where the EXIF lies: (prefix for names of the first directory, bytes that exifread understands)."""
     head = file.read(92)
     if head[:15] == b"FUJIFILMCCD-RAW" and len(head) == 92:  # in the preview
@@ -131,7 +117,7 @@ def _plane_pitch(found: Mapping[str, Any]) -> float | None:
     return 1e3 * millimetres / resolution if resolution and millimetres else None
 
 
-def _pitch(pitch: float | None, reference_width: float | None, width: int) -> float | None:
+def _pitch(pitch: float | None, reference_width: int | None, width: int) -> float | None:
     """The pitch of the file's pixels, where the tag speaks of the picture before it was resized."""
     if pitch is None:
         return None
@@ -188,7 +174,7 @@ def _numbers(found: Mapping[str, Any], name: str) -> list[float]:
 def _text(found: Mapping[str, Any], *names: str) -> str:
     for name in names:
         if name in found:
-            text = str(found[name].values).strip("\0 ")
-            if text:
+            text = "".join(c for c in str(found[name].values) if c.isprintable()).strip()[:_TEXT_LENGTH]
+            if text:  # printable: a name goes to the terminal, the report and other files
                 return text
     return ""

@@ -1,8 +1,9 @@
 """A capture's folder in, which photograph was taken at which angle out: the four layouts.
 
-Nothing is decoded here; `capture.py` reads the metadata, checks and builds the `Capture`.
+Nothing is decoded here; `capture.py` checks and builds the `Capture`.
 """
 
+import os
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -11,9 +12,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
-from polcap.errors import CaptureError, DecodeError
-from polcap.formats import capture_toml, exif, photo, sniff
+from polcap.errors import CaptureError
+from polcap.formats import capture_toml, photo, probe
 from polcap.formats.capture_toml import CaptureFile
+from polcap.formats.probe import Probe
 from polcap.images import Role
 
 OUTPUT = "polcap"  # where results go by default
@@ -29,7 +31,7 @@ class Source:
     """One photograph and its part in the capture."""
 
     path: Path
-    kind: sniff.Kind
+    probe: Probe
     role: Role = "shot"
     angle_deg: float | None = None
     exposure: float | None = None  # stated
@@ -86,21 +88,21 @@ def looks_like_a_capture(folder: Path, inside: Iterable[str], files: Iterable[st
         return True
     if any(name != OUTPUT and not name.startswith(".") for name in inside):
         return False
-    return any(sniff.kind(folder / name) in ("raw", "photo") for name in sorted(files) if not name.startswith("."))
+    return any(probe.kind(folder / name) in ("raw", "photo") for name in sorted(files) if not name.startswith("."))
 
 
 def _toml(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None) -> Plan:
     sources = []
     for entry in stated.frame:
         path = folder / entry.file
-        if not path.resolve().is_relative_to(folder.resolve()):
+        if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder)):
             raise CaptureError(f"{folder / capture_toml.NAME}: {entry.file} lies outside the folder; move it inside")
         if not path.is_file():
             raise CaptureError(f"{folder / capture_toml.NAME}: {entry.file} is not there; correct or remove its entry")
-        kind = _picture_kind(path)
-        if kind == "other":
+        found = _probe(path)
+        if found.kind == "other":
             raise CaptureError(f"{folder / capture_toml.NAME}: {entry.file} is not a photograph; remove its entry")
-        sources.append(Source(path, kind, entry.role, entry.angle, entry.exposure, entry.flash_energy))
+        sources.append(Source(path, found, entry.role, entry.angle, entry.exposure, entry.flash_energy))
     shots = [source for source in sources if source.role == "shot"]
     others = tuple(source for source in sources if source.role not in ("shot", "repeat"))
     if stated.sensor:
@@ -166,7 +168,7 @@ def _is_sensor(pictures: list[Source], angles_deg: Sequence[float] | None) -> bo
 
 
 def _is_grey(source: Source) -> bool:
-    return source.kind == "photo" and photo.channels(source.path) == 1
+    return source.probe.kind == "photo" and source.probe.channels == 1
 
 
 def _sensor(listing: _Listing, angles_deg: Sequence[float] | None) -> Plan:
@@ -184,7 +186,7 @@ def _sensor_shots(
 def _named(folder: Path, listing: _Listing, angles_deg: Sequence[float] | None) -> Plan | None:
     """Finished pictures whose names differ in one number, which can only be an angle."""
     pictures = listing.pictures
-    if any(source.kind == "raw" for source in pictures):  # a camera's file numbers
+    if any(source.probe.kind == "raw" for source in pictures):  # a camera's file numbers
         return None
     stems = [source.path.stem for source in pictures]
     if len({_NUMBER.sub("#", stem) for stem in stems}) != 1:
@@ -202,7 +204,7 @@ def _named(folder: Path, listing: _Listing, angles_deg: Sequence[float] | None) 
 
 def _by_time(folder: Path, listing: _Listing, angles_deg: Sequence[float]) -> Plan:
     """K equal brackets one after the other."""
-    facts = {source.path: exif.read(source.path) for source in listing.pictures}
+    facts = {source.path: source.probe.exif for source in listing.pictures}
     timed = all(fact.taken for fact in facts.values())
     order = sorted(
         listing.pictures,
@@ -264,12 +266,12 @@ def different(angles_deg: Iterable[float]) -> int:
 def _list(folder: Path) -> _Listing:
     """The photographs of one folder; where a RAW is there, the finished pictures stand back."""
     listing = _Listing()
-    found = [Source(path, _picture_kind(path)) for path in _children(folder) if path.is_file()]
-    pictures = [source for source in found if source.kind in ("raw", "photo")]
-    raws = [source for source in pictures if source.kind == "raw"]
+    found = [Source(path, _probe(path)) for path in _children(folder) if path.is_file()]
+    pictures = [source for source in found if source.probe.kind in ("raw", "photo")]
+    raws = [source for source in pictures if source.probe.kind == "raw"]
     if raws and len(raws) < len(pictures):
         stems = {source.path.stem.lower() for source in raws}
-        extra = [source.path for source in pictures if source.kind == "photo"]
+        extra = [source.path for source in pictures if source.probe.kind == "photo"]
         paired = sum(path.stem.lower() in stems for path in extra)
         if paired:
             listing.notes.append(f"{paired} pictures beside a RAW of the same name: the RAW is used")
@@ -279,20 +281,14 @@ def _list(folder: Path) -> _Listing:
     return listing
 
 
-def _picture_kind(path: Path) -> sniff.Kind:
-    """As `sniff.kind`; unknown bytes are a RAW if LibRaw says so, and an error if not."""
-    kind = sniff.kind(path)
-    if kind != "unknown":
-        return kind
-    if not path.stat().st_size:
+def _probe(path: Path) -> Probe:
+    """As `probe.read`; bytes that nothing can read are an error."""
+    found = probe.read(path)
+    if found.kind == "unknown" and not path.stat().st_size:
         raise CaptureError(f"{path}: is empty; copy it from the card again, or remove it")
-    try:
-        exif.read(path)
-    except DecodeError:
-        raise CaptureError(
-            f"{path}: no picture, no RAW that LibRaw knows and no text; restore it, or remove it"
-        ) from None
-    return "raw"
+    if found.kind == "unknown":
+        raise CaptureError(f"{path}: no picture, no RAW that LibRaw knows and no text; restore it, or remove it")
+    return found
 
 
 def _children(folder: Path) -> list[Path]:

@@ -4,6 +4,10 @@
 caller states the encoding. RAW never comes here: OpenImageIO opens a DNG as its thumbnail.
 """
 
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import DecodeError
-from polcap.formats import raw, sniff, worker
+from polcap.formats import photo_bytes, plausible, raw, sniff, worker
 from polcap.images import Floats, SensorImage
 
 Encoding = Literal["linear", "srgb"]
@@ -21,20 +25,26 @@ SENSOR_DEG: tuple[tuple[float, tuple[int, int]], ...] = (  # where each angle li
     (90.0, (0, 0)),
     (135.0, (1, 0)),
 )
+_MOST_CHANNELS = 64  # of a layered EXR
 _COLOR_LEVELS = 0.05  # neighbouring 2×2 cells of a monochrome sensor differ less, averaged over the frame
 
 
 def read(
-    path: str | Path, encoding: Encoding | None = None, white: float | None = None, black: float = 0.0
+    path: str | Path,
+    encoding: Encoding | None = None,
+    white: float | None = None,
+    black: float = 0.0,
+    digest: str | None = None,
 ) -> SensorImage:
     """A picture as (H, W, 3); a grey one stands in all three channels.
 
     Linear integers stay counts, `white` being the type's maximum unless stated; floating point
     has white 1. An sRGB-encoded picture becomes linear 0…1 and `lossy`, as every 8-bit one is.
+    With `digest`, of `probe.read`, the bytes that are decoded are those that were probed.
 
     Raises DecodeError.
     """
-    pixels = _pixels(path)
+    pixels = _pixels(path, digest)
     lossy = pixels.dtype == np.uint8
     full = float(np.iinfo(pixels.dtype).max) if np.issubdtype(pixels.dtype, np.integer) else 1.0
     encoding = encoding or ("srgb" if lossy else "linear")  # as encoding_of
@@ -45,16 +55,23 @@ def read(
     return SensorImage(_counts(pixels), np.full((1, 1), black), white or full, None, lossy=lossy)
 
 
-def read_mosaic(path: str | Path, angle_deg: float, white: float | None = None, black: float = 0.0) -> SensorImage:
+def read_mosaic(
+    path: str | Path,
+    angle_deg: float,
+    white: float | None = None,
+    black: float = 0.0,
+    digest: str | None = None,
+    kind: sniff.Kind = "photo",
+) -> SensorImage:
     """One angle of a monochrome polarization sensor's raw frame, (H/2, W/2, 3), linear.
 
-    `path` may be a RAW or a picture; the frame's 2×2 cell is 90 45 / 135 0 degrees.
+    `path` is a RAW or a picture, as `kind` says; the frame's 2×2 cell is 90 45 / 135 0 degrees.
 
     Raises DecodeError where the frame is in colour.
     """
     y, x = dict(SENSOR_DEG)[angle_deg]
-    if sniff.kind(Path(path)) == "photo":
-        pixels = _pixels(path)
+    if kind == "photo":
+        pixels = _pixels(path, digest)
         if pixels.shape[2] != 1:
             raise DecodeError(
                 f"{path}: has {pixels.shape[2]} channels, but the frame of a polarization sensor has one; "
@@ -63,7 +80,7 @@ def read_mosaic(path: str | Path, angle_deg: float, white: float | None = None, 
         mosaic, lossy, level = pixels[..., 0], pixels.dtype == np.uint8, black
         full = float(np.iinfo(pixels.dtype).max) if np.issubdtype(pixels.dtype, np.integer) else 1.0
     else:
-        sensor = raw.read(path)
+        sensor = raw.read(path, digest)
         mosaic = sensor.value if sensor.value.ndim == 2 else sensor.value[..., 0]
         lossy, full = False, sensor.white
         level = black or float(np.broadcast_to(sensor.black, (2, 2))[y, x])
@@ -74,16 +91,9 @@ def read_mosaic(path: str | Path, angle_deg: float, white: float | None = None, 
     return SensorImage(value, np.full((1, 1), level), white or full, None, lossy=lossy)
 
 
-def channels(path: str | Path) -> int:
-    """1 of a grey picture, 3 of a coloured one. Raises DecodeError."""
-    meta, _ = worker.call("polcap.formats.photo:header", path)
-    return int(meta["channels"])
-
-
-def encoding_of(path: str | Path, stated: Encoding | None) -> tuple[Encoding, int]:
-    """How `read` takes a picture, and its bits per channel. Raises DecodeError."""
-    meta, _ = worker.call("polcap.formats.photo:header", path)
-    return stated or ("srgb" if meta["bits"] == 8 else "linear"), int(meta["bits"])
+def encoding_of(bits: int, stated: Encoding | None) -> Encoding:
+    """How `read` takes a picture of so many bits per channel."""
+    return stated or ("srgb" if bits == 8 else "linear")
 
 
 def _decoded(pixels: NDArray[Any], full: float) -> Floats:
@@ -98,25 +108,26 @@ def srgb_to_linear(value: Floats) -> Floats:
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
-def header(path: str) -> worker.Answer:
-    """Size, channels and type of a picture; no pixel is read. In the worker."""
-    file, _ = _open(path)
-    spec = file.spec()
-    count, bits = len(_channels(path, spec)), 8 * spec.format.size()
-    return {"width": spec.width, "height": spec.height, "channels": count, "bits": bits}, {}
+def size(path: str, data: bytes) -> dict[str, int]:
+    """Size, channels and bits of a picture; no pixel is read. In the worker."""
+    with _opened(path, data) as file:
+        spec = file.spec()
+        count, bits = len(_channels(path, spec)), 8 * spec.format.size()
+    return {"width": spec.width, "height": spec.height, "channels": count, "bits": bits}
 
 
-def decode(path: str) -> worker.Answer:
+def decode(path: str, digest: str | None = None) -> worker.Answer:
     """The stored values, (H, W, 1 or 3), of the type they are stored in. In the worker."""
     import OpenImageIO as oiio
 
-    file, _ = _open(path)
-    spec = file.spec()
-    channels = _channels(path, spec)
-    kind = "float" if spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE) else str(spec.format)
-    pixels = file.read_image(0, 0, 0, spec.nchannels, kind)
+    with _opened(path, photo_bytes.load(path, digest)) as file:
+        spec = file.spec()
+        channels = _channels(path, spec)
+        kind = "float" if spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE) else str(spec.format)
+        pixels = file.read_image(0, 0, 0, spec.nchannels, kind)
+        reason = _one_line(file.geterror())
     if pixels is None:
-        raise DecodeError(f"{path}: truncated or damaged ({_one_line(file.geterror())}); copy it from the card again")
+        raise DecodeError(f"{path}: truncated or damaged ({reason}); copy it from the card again")
     pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)[..., channels]
     if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
         bad = int((~np.isfinite(pixels)).sum())
@@ -124,20 +135,54 @@ def decode(path: str) -> worker.Answer:
     return {}, {"pixels": pixels}
 
 
-def _pixels(path: str | Path) -> NDArray[Any]:
-    _, arrays = worker.call("polcap.formats.photo:decode", path)
+def _pixels(path: str | Path, digest: str | None) -> NDArray[Any]:
+    _, arrays = worker.call(decode, path, digest=digest)
     return arrays["pixels"]
 
 
-def _open(path: str) -> tuple[Any, Any]:
+@contextmanager
+def _opened(path: str, data: bytes) -> Iterator[Any]:
+    """OpenImageIO's view of these bytes; it reads by name only."""
     import OpenImageIO as oiio
 
+    if data[:3] == b"\xff\xd8\xff":
+        plausible.check_jpeg(path, data)
     options = oiio.ImageSpec()
     options["oiio:UnassociatedAlpha"] = 1  # else a PNG's colours come multiplied by its alpha
-    file = oiio.ImageInput.open(path, options)
-    if file is None:
-        raise DecodeError(f"{path}: not a readable picture ({_one_line(oiio.geterror())}); is the file complete?")
-    return file, options
+    with _named(data) as name:
+        file = oiio.ImageInput.open(name, options)
+        if file is None:
+            reason = _one_line(oiio.geterror()).replace(name, Path(path).name)
+            raise DecodeError(f"{path}: not a readable picture ({reason}); is the file complete?")
+        try:
+            spec = file.spec()
+            plausible.check_size(path, spec.width, spec.height)
+            if spec.nchannels > _MOST_CHANNELS or spec.depth > 1:
+                raise DecodeError(f"{path}: has {spec.nchannels} channels; polcap reads flat R, G, B")
+            yield file
+        finally:
+            file.close()
+
+
+@contextmanager
+def _named(data: bytes) -> Iterator[str]:
+    """A name under which the bytes can be read: a file in memory under Linux, else a temporary one."""
+    if hasattr(os, "memfd_create"):
+        handle = os.memfd_create("polcap")
+        try:
+            with os.fdopen(os.dup(handle), "wb") as file:
+                file.write(data)
+            yield f"/proc/self/fd/{handle}"
+        finally:
+            os.close(handle)
+        return
+    handle, name = tempfile.mkstemp(prefix="polcap-")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+        yield name
+    finally:
+        os.unlink(name)
 
 
 def _channels(path: str, spec: Any) -> list[int]:

@@ -3,6 +3,7 @@
 The only module that imports rawpy, and only in the child process.
 """
 
+import io
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import DecodeError
-from polcap.formats import exif, sniff, worker
+from polcap.formats import exif, photo_bytes, plausible, sniff, worker
 from polcap.images import Bits, Exif, Floats, SensorImage
 
 XYZ_FROM_REC709 = np.array(  # IEC 61966-2-1, D65
@@ -20,25 +21,23 @@ XYZ_FROM_REC709 = np.array(  # IEC 61966-2-1, D65
 _COPY_AGAIN = "copy it from the card again"
 
 
-def read(path: str | Path) -> SensorImage:
+def read(path: str | Path, digest: str | None = None) -> SensorImage:
     """Decode one RAW file, nothing subtracted, without the masked border.
 
     A Bayer file gives its mosaic (H, W) with `black` (2, 2) and `cfa` in the phase of its
     first visible pixel. A file of finished linear channels, or of a monochrome sensor, gives
     (H, W, 3) and no `cfa`. `camera_matrix` holds the white balance: it takes the camera's
     answer to a grey in the light of the shot, 1/`white_balance`, to (1, 1, 1).
+    With `digest`, of `probe.read`, the bytes that are decoded are those that were probed.
 
     Raises
     ------
     DecodeError
-        Not a RAW, damaged, X-Trans or Foveon; or the decoder crashed, hung or ran out of memory.
+        Not a RAW, damaged, changed since, X-Trans or Foveon; or the decoder crashed, hung or ran out of memory.
     """
-    structure = sniff.structure(Path(path))
-    if structure.dng and structure.truncated:  # LibRaw may return whatever lay in memory
-        raise DecodeError(f"{path}: its image data run past the end of the file; {_COPY_AGAIN}")
-    meta, arrays = worker.call("polcap.formats.raw:decode", path)
+    meta, arrays = worker.call(decode, path, digest=digest)
     balance = None if meta["balance"] is None else np.array(meta["balance"])
-    xyz_to_camera = exif.tags(path).color_matrix or meta["xyz_to_camera"]
+    xyz_to_camera = meta["xyz_to_camera"]
     return SensorImage(
         value=arrays["value"],
         black=np.array(meta["black"]),
@@ -46,6 +45,7 @@ def read(path: str | Path) -> SensorImage:
         cfa=arrays.get("cfa"),
         camera_matrix=None if xyz_to_camera is None else camera_matrix(np.reshape(xyz_to_camera, (3, 3)), balance),
         white_balance=balance,
+        lossy=meta["lossy"],
     )
 
 
@@ -65,24 +65,22 @@ def camera_matrix(xyz_to_camera: Floats, balance: Floats | None) -> Floats | Non
     return np.asarray(to_rec709 * gain)
 
 
-def header(path: str, unpack: bool) -> worker.Answer:
+def size(path: str, data: bytes, unpack: bool) -> dict[str, Any]:
     """Size in visible pixels, and with `unpack` LibRaw's own reading of the metadata. In the worker."""
     import rawpy
 
     try:
         with rawpy.RawPy() as raw:
-            raw.open_file(path)
+            raw.open_buffer(io.BytesIO(data))
             sizes = raw.sizes  # unpacks nothing, unlike every other property
-            meta: dict[str, Any] = {
-                "width": sizes.width,
-                "height": sizes.height,
-                "aspect": sizes.pixel_aspect,
-            }
+            plausible.check_size(path, sizes.width, sizes.height)
+            plausible.check_bytes(path, sizes.width, sizes.height, len(data))
+            meta: dict[str, Any] = {"width": sizes.width, "height": sizes.height}
             if unpack:
                 meta["exif"] = _known(raw.other, raw.lens)
-    except rawpy.LibRawError as error:
+    except (rawpy.LibRawError, NotImplementedError) as error:
         raise _refused(path, error) from None
-    return meta, {}
+    return meta
 
 
 def _known(other: Any, lens: Any) -> dict[str, Any]:
@@ -100,7 +98,7 @@ def _known(other: Any, lens: Any) -> dict[str, Any]:
 
 def version() -> str:
     """LibRaw's version, asked in the worker; raises DecodeError where that does not run."""
-    return str(worker.call("polcap.formats.raw:about", "LibRaw")[0]["version"])
+    return str(worker.call(about, "LibRaw")[0]["version"])
 
 
 def about(path: str) -> worker.Answer:
@@ -110,29 +108,46 @@ def about(path: str) -> worker.Answer:
     return {"version": ".".join(map(str, rawpy.libraw_version))}, {}
 
 
-def decode(path: str) -> worker.Answer:
+def decode(path: str, digest: str | None = None) -> worker.Answer:
     """The counts and what they mean. In the worker."""
     import rawpy
 
+    data = photo_bytes.load(path, digest)
+    structure = sniff.structure(io.BytesIO(data))
+    plausible.check_structure(path, structure, data)
+    if structure.dng and structure.truncated:  # LibRaw may return whatever lay in memory
+        raise DecodeError(f"{path}: its image data run past the end of the file; {_COPY_AGAIN}")
     try:
-        with rawpy.imread(path) as raw:
-            meta: dict[str, Any] = {"balance": _balance(raw), "xyz_to_camera": _xyz_to_camera(raw)}
-            value = raw.raw_image_visible.copy()  # a view kept past the block is a crash
-            if value.ndim == 3 and value.shape[2] >= 3:
-                if raw.num_colors != 3:
-                    raise DecodeError(f"{path}: has {raw.num_colors} colour channels where 3 are supported")
-                arrays = {"value": value[..., :3]}
-                black = [[float(np.mean(raw.black_level_per_channel[:3]))]]
-            elif value.ndim == 2 and raw.num_colors == 1:
-                arrays = {"value": np.repeat(value[..., None], 3, axis=2)}
-                black = [[float(raw.black_level_per_channel[0])]]
-            else:
-                cfa, black = _mosaic(raw, path)
-                arrays = {"value": value, "cfa": cfa}
-            meta |= {"black": black, "white": _white(raw, float(np.max(black)))}
+        with rawpy.RawPy() as raw:
+            raw.open_buffer(io.BytesIO(data))
+            plausible.check_size(path, raw.sizes.raw_width, raw.sizes.raw_height)
+            plausible.check_bytes(path, raw.sizes.width, raw.sizes.height, len(data))
+            meta, arrays = _counts(path, raw)
     except (rawpy.LibRawError, NotImplementedError) as error:
         raise _refused(path, error) from None
-    return meta, arrays
+    lossy = plausible.is_lossy(structure)
+    plausible.check_levels(path, arrays["value"], float(np.max(meta["black"])), meta["white"], lossy)
+    stated = exif.tags(data).color_matrix
+    meta["lossy"] = lossy
+    return meta | ({} if stated is None else {"xyz_to_camera": stated}), arrays
+
+
+def _counts(path: str, raw: Any) -> tuple[dict[str, Any], worker.Arrays]:
+    """The counts as they lie in the file, their levels and colors."""
+    meta: dict[str, Any] = {"balance": _balance(raw), "xyz_to_camera": _xyz_to_camera(raw)}
+    value = raw.raw_image_visible.copy()  # a view kept past the block is a crash
+    if value.ndim == 3 and value.shape[2] >= 3:
+        if raw.num_colors != 3:
+            raise DecodeError(f"{path}: has {raw.num_colors} colour channels where 3 are supported")
+        arrays = {"value": value[..., :3]}
+        black = [[float(np.mean(raw.black_level_per_channel[:3]))]]
+    elif value.ndim == 2 and raw.num_colors == 1:
+        arrays = {"value": np.repeat(value[..., None], 3, axis=2)}
+        black = [[float(raw.black_level_per_channel[0])]]
+    else:
+        cfa, black = _mosaic(raw, path)
+        arrays = {"value": value, "cfa": cfa}
+    return meta | {"black": black, "white": _white(raw, float(np.max(black)))}, arrays
 
 
 def _mosaic(raw: Any, path: str) -> tuple[Bits, list[list[float]]]:

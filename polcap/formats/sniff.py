@@ -1,28 +1,28 @@
-"""A path in, what kind of file it is out, judged by its content and never by its name."""
+"""A file's bytes in, what kind of file it is out, judged by its content and never by its name. In the worker."""
 
 import struct
+from collections import deque
 from collections.abc import Iterator
-from pathlib import Path
 from typing import BinaryIO, Literal, NamedTuple
-
-from polcap.errors import DecodeError
 
 Kind = Literal["raw", "photo", "other", "unknown"]
 
-SUBTYPE, COMPRESSION, PHOTOMETRIC, MAKE, DNG_VERSION = 254, 259, 262, 271, 50706
-STRIP_OFFSETS, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS = 273, 279, 324, 325, 330
+SUBTYPE, WIDTH, LENGTH, BITS, COMPRESSION, PHOTOMETRIC, MAKE = 254, 256, 257, 258, 259, 262, 271
+STRIP_OFFSETS, SAMPLES, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS = 273, 277, 279, 324, 325, 330
+DNG_VERSION = 50706
 CFA, LINEAR_RAW = 32803, 34892
 
 _TIFF_MAGIC = (b"II*\0", b"MM\0*")
 # Sony, Samsung, Kodak, Panasonic, Nikon, Kodak, Pentax
 _RAW_COMPRESSION = {32767, 32769, 32770, 32867, 34316, 34713, 65000, 65535}
 _WANTED = {
-    SUBTYPE, COMPRESSION, PHOTOMETRIC, MAKE, DNG_VERSION,
+    SUBTYPE, WIDTH, LENGTH, BITS, COMPRESSION, PHOTOMETRIC, MAKE, DNG_VERSION, SAMPLES,
     STRIP_OFFSETS, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS,
 }  # fmt: skip
 _INTEGERS = {1: "B", 3: "H", 4: "I", 13: "I"}
-_MOST_DIRECTORIES, _MOST_VALUES = 64, 1 << 20  # a loop or a forged count ends here
+_MOST_DIRECTORIES, _MOST_VALUES = 64, 1 << 18  # a loop or a forged count ends here; of a whole file
 _SIDECARS = {".db", ".cos", ".thm", ".pdf", ".zip", ".txt", ".xmp"}  # not text, or in UTF-16
+_TEXT_BYTES = 1 << 16  # some makers put lines of text in front of their pixels
 
 Directory = dict[int, tuple[int, ...]]
 
@@ -40,41 +40,34 @@ class Tiff(NamedTuple):
     @property
     def truncated(self) -> bool:
         """Some strip or tile lies beyond the end of the file."""
-        for directory in self.directories:
-            for starts, counts in ((STRIP_OFFSETS, STRIP_BYTES), (TILE_OFFSETS, TILE_BYTES)):
-                ends = (a + b for a, b in zip(directory.get(starts, ()), directory.get(counts, ())))
-                if max(ends, default=0) > self.size:
-                    return True
-        return False
+        return any(a + b > self.size for directory in self.directories for a, b in strips(directory))
 
 
-def structure(path: Path) -> Tiff:
-    """The image directories of a file; none where it is not a TIFF. Raises DecodeError."""
-    try:
-        with path.open("rb") as file:
-            return tiff(file) if file.read(4) in _TIFF_MAGIC else Tiff((), file.seek(0, 2))
-    except OSError as error:
-        raise _unreadable(path, error) from None
+def strips(directory: Directory) -> list[tuple[int, int]]:
+    """Offset and length of each strip and tile."""
+    return [
+        pair
+        for starts, counts in ((STRIP_OFFSETS, STRIP_BYTES), (TILE_OFFSETS, TILE_BYTES))
+        for pair in zip(directory.get(starts, ()), directory.get(counts, ()))
+    ]
 
 
-def kind(path: Path) -> Kind:
-    """Whether a file is a RAW, a finished picture, something beside the pictures, or unknown bytes.
-
-    Raises DecodeError where the file cannot be read.
-    """
-    try:
-        with path.open("rb") as file:
-            head = file.read(512)
-            return _kind(path, head, file)
-    except OSError as error:
-        raise _unreadable(path, error) from None
+def first(directory: Directory, tag: int, default: int = 0) -> int:
+    """The first value of a tag; the default where it is absent, empty or of a type that is not read here."""
+    values = directory.get(tag, ())
+    return values[0] if values else default
 
 
-def _unreadable(path: Path, error: OSError) -> DecodeError:
-    return DecodeError(f"{path}: cannot be read ({error.strerror}); check the file and its permissions")
+def structure(file: BinaryIO) -> Tiff:
+    """The image directories of a file; none where it is not a TIFF."""
+    file.seek(0)
+    return tiff(file) if file.read(4) in _TIFF_MAGIC else Tiff((), file.seek(0, 2))
 
 
-def _kind(path: Path, head: bytes, file: BinaryIO) -> Kind:
+def kind(file: BinaryIO, suffix: str) -> Kind:
+    """Whether a file is a RAW, a finished picture, something beside the pictures, or unknown bytes."""
+    file.seek(0)
+    head = file.read(512)
     if head[:3] == b"\xff\xd8\xff" or head[:8] == b"\x89PNG\r\n\x1a\n" or head[:4] == b"\x76\x2f\x31\x01":
         return "photo"
     if is_raw_magic(head):
@@ -83,10 +76,19 @@ def _kind(path: Path, head: bytes, file: BinaryIO) -> Kind:
         return "raw" if _is_raw(tiff(file)) else "photo"
     if head[4:8] == b"ftyp" or head[:4] == b"RIFF":  # HEIC, AVIF, WebP beside a RAW; films; sounds
         return "other"
-    if path.suffix.lower() in _SIDECARS:  # asked only of what is no picture
+    if suffix.lower() in _SIDECARS:  # asked only of what is no picture
         return "other"
-    text = head.strip(b"\0") and not any(byte < 9 or 13 < byte < 27 for byte in head)
-    return "other" if text else "unknown"
+    return "other" if _is_text(file) else "unknown"
+
+
+def _is_text(file: BinaryIO) -> bool:
+    """No byte at the beginning, in the middle or at the end that no text has."""
+    size = file.seek(0, 2)
+    pieces = []
+    for at in (0, size // 2, size - _TEXT_BYTES):
+        file.seek(max(at, 0))
+        pieces.append(file.read(_TEXT_BYTES))
+    return bool(pieces[0]) and not any(byte < 9 or 13 < byte < 27 for byte in set(b"".join(pieces)))
 
 
 def is_raw_magic(head: bytes) -> bool:
@@ -104,12 +106,12 @@ def _is_raw(structure: Tiff) -> bool:
     if structure.dng:
         return True
     for directory in structure.directories:
-        if directory.get(PHOTOMETRIC, (0,))[0] in (CFA, LINEAR_RAW):
+        if first(directory, PHOTOMETRIC) in (CFA, LINEAR_RAW):
             return True
-        if directory.get(COMPRESSION, (0,))[0] in _RAW_COMPRESSION:
+        if first(directory, COMPRESSION) in _RAW_COMPRESSION:
             return True
-    first = structure.directories[0] if structure.directories else {}
-    return MAKE in first and SUB_IFDS in first and first.get(SUBTYPE) == (1,)  # a preview in front of sensor data
+    main = structure.directories[0] if structure.directories else {}
+    return MAKE in main and SUB_IFDS in main and main.get(SUBTYPE) == (1,)  # a preview in front of sensor data
 
 
 def tiff(file: BinaryIO) -> Tiff:
@@ -120,31 +122,33 @@ def tiff(file: BinaryIO) -> Tiff:
     order = "<" if head[:2] == b"II" else ">"
     directories: list[Directory] = []
     if len(head) == 8:
-        pending = [struct.unpack(order + "I", head[4:])[0]]
+        pending = deque(struct.unpack(order + "I", head[4:]))
         seen: set[int] = set()
-        while pending and len(directories) < _MOST_DIRECTORIES:
-            offset = pending.pop(0)
+        left = _MOST_VALUES
+        while pending and len(directories) < _MOST_DIRECTORIES and left > 0:
+            offset = pending.popleft()
             if offset in seen or not 8 <= offset < size:
                 continue
             seen.add(offset)
             file.seek(offset)
-            directory, following = _directory(file, order, size)
+            directory, following = _directory(file, order, size, left)
+            left -= sum(map(len, directory.values()))
             directories.append(directory)
-            pending += [*directory.get(SUB_IFDS, ()), following]
+            pending.extend((*directory.get(SUB_IFDS, ()), following))
     return Tiff(tuple(directories), size)
 
 
-def _directory(file: BinaryIO, order: str, size: int) -> tuple[Directory, int]:
+def _directory(file: BinaryIO, order: str, size: int, most: int) -> tuple[Directory, int]:
     count = _unpack(file.read(2), order + "H")
     body = file.read(12 * count + 4)
     following = _unpack(body[12 * count :], order + "I")
-    return dict(_entries(body[: 12 * count], file, order, size)), following
+    return dict(_entries(body[: 12 * count], file, order, size, most)), following
 
 
-def _entries(body: bytes, file: BinaryIO, order: str, size: int) -> Iterator[tuple[int, tuple[int, ...]]]:
+def _entries(body: bytes, file: BinaryIO, order: str, size: int, most: int) -> Iterator[tuple[int, tuple[int, ...]]]:
     for at in range(0, len(body) - 11, 12):
         tag, form, count = struct.unpack_from(order + "HHI", body, at)
-        if tag not in _WANTED or count > _MOST_VALUES:
+        if tag not in _WANTED or count > most:
             continue
         if form not in _INTEGERS:
             yield tag, ()  # there, of a type that is not read here
@@ -152,10 +156,12 @@ def _entries(body: bytes, file: BinaryIO, order: str, size: int) -> Iterator[tup
         code = f"{order}{count}{_INTEGERS[form]}"
         length = struct.calcsize(code)
         if length <= 4:
+            most -= count
             yield tag, struct.unpack_from(code, body, at + 8)
             continue
         (offset,) = struct.unpack_from(order + "I", body, at + 8)
         if offset + length <= size:
+            most -= count
             file.seek(offset)
             yield tag, struct.unpack(code, file.read(length))
 

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from polcap.errors import DecodeError, HardwareError, SettingError
-from polcap.formats import exif, sniff
+from polcap.formats import probe
 from polcap.images import Role
 from polcap.rig.camera import Exposure, Shot
 from polcap.rig.log import Log
@@ -87,10 +87,7 @@ class WatchedFolder:
 
 def _whole(file: Path) -> bool:
     """A RAW with all its data; not the JPEG beside it, nor one that is still being written. Raises DecodeError."""
-    if sniff.kind(file) != "raw" or sniff.structure(file).truncated:
-        return False
-    exif.read(file)
-    return True
+    return probe.read(file).kind == "raw"
 
 
 def _size(file: Path) -> int:

@@ -5,7 +5,6 @@ Measured in the decoder's process, so that a damaged frame harms nobody and the 
 
 import io
 from collections.abc import Iterable
-from hashlib import blake2b
 from math import log2
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import msgspec
 import numpy as np
 
 from polcap.errors import DecodeError
-from polcap.formats import exif, raw, sniff, worker
+from polcap.formats import probe, raw, sniff, worker
 from polcap.images import Exif, Floats
 from polcap.rig.camera import Exposure
 
@@ -50,16 +49,11 @@ def inspect(path: Path) -> tuple[Facts, Floats]:
     DecodeError
         It is no RAW file, or damaged.
     """
-    if sniff.kind(path) != "raw":
+    found = probe.read(path)
+    if found.kind != "raw":
         raise DecodeError(f"{path}: is no RAW file; set the camera to RAW")
-    if sniff.structure(path).truncated:
-        raise DecodeError(f"{path}: its image data run past the end of the file")
-    about, arrays = worker.call("polcap.rig.frame_check:measure", path)
-    return Facts(exif.read(path), digest(path.read_bytes()), about["clipped"], about["sharpness"]), arrays["small"]
-
-
-def digest(data: bytes) -> str:
-    return blake2b(data, digest_size=20).hexdigest()
+    about, arrays = worker.call(measure, path)
+    return Facts(found.exif, found.digest, about["clipped"], about["sharpness"]), arrays["small"]
 
 
 def measure(path: str) -> worker.Answer:

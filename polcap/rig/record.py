@@ -13,7 +13,7 @@ import msgspec
 import tomli_w
 
 from polcap.errors import CaptureError
-from polcap.formats import atomic, capture_toml
+from polcap.formats import atomic, capture_toml, photo_bytes
 from polcap.images import Role
 from polcap.rig import frame_check
 from polcap.rig.camera import Exposure
@@ -161,7 +161,7 @@ def verify(record: Record) -> list[str]:
         if not file.is_file():
             del record.content.frames[name]
             said.append(f"{good.file}: is gone; it is taken again")
-        elif frame_check.digest(file.read_bytes()) != good.facts.digest:
+        elif photo_bytes.digest(file.read_bytes()) != good.facts.digest:
             record.reject(name, file, good.read_deg, "changed since it was taken")
             said.append(f"{good.file}: changed since it was taken; it is taken again")
     known = {good.file for good in record.content.frames.values()}

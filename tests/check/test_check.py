@@ -13,7 +13,7 @@ from polcap.check.reduced import take
 from polcap.config import Config
 from polcap.errors import CaptureError
 from polcap.formats import capture as captures
-from polcap.formats import dng, exif, raw
+from polcap.formats import dng, probe, raw
 from tests import faulty
 from tests.conftest import Command
 
@@ -85,7 +85,7 @@ def test_ambient_light_is_measured(example: Path, tmp_path: Path) -> None:
             cfa=middle.cfa,  # type: ignore[arg-type]
             black=float(middle.black.mean()),
             white=middle.white,
-            exif=exif.read(files[1]),
+            exif=probe.read(files[1]).exif,
             color_matrix=np.eye(3),
             as_shot_neutral=np.ones(3),
         )

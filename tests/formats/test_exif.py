@@ -10,10 +10,19 @@ import pytest
 from headers import DATA, EXIF_IFD, SUB_IFDS, needs_data
 
 from polcap.errors import DecodeError
-from polcap.formats import exif, sniff
+from polcap.formats import exif, probe, sniff
 
 PHOTO = headers.settings(time=1 / 50, f_number=8, iso=200, focal=60, flash=0x0F)
 WITH_EXIF = {EXIF_IFD: PHOTO}
+
+
+def _exif(path):
+    return probe.read(path).exif
+
+
+def _kind(path):
+    with path.open("rb") as file:
+        return sniff.kind(file, path.suffix)
 
 
 def nef():
@@ -36,14 +45,14 @@ BUILT = {
 def test_raw_is_known_by_its_content(tmp_path, maker):
     path = tmp_path / "photo.jpg"  # the name says nothing
     path.write_bytes(BUILT[maker])
-    assert sniff.kind(path) == "raw"
+    assert _kind(path) == "raw"
 
 
 @pytest.mark.parametrize("maker", [maker for maker in BUILT if maker != "IIQ"])
 def test_header_gives_camera_and_settings(tmp_path, maker):
     path = tmp_path / "photo.bin"
     path.write_bytes(BUILT[maker])
-    fact = exif.tags(path)
+    fact = exif.tags(path.read_bytes())
     assert (fact.make, fact.model, fact.lens) == ("Acme", "Z1", "Macro 60")
     assert fact.exposure_time == pytest.approx(1 / 50)
     assert (fact.f_number, fact.iso, fact.focal_length_mm) == (8, 200, 60)
@@ -57,21 +66,21 @@ def test_panasonic_states_iso_in_a_tag_of_its_own(tmp_path):
     path = tmp_path / "a.rw2"
     main = headers.camera() | {0x17: (3, (400,))}
     path.write_bytes(headers.tiff(main, {EXIF_IFD: photo}, magic=b"IIU\0"))
-    assert exif.tags(path).iso == 400
+    assert exif.tags(path.read_bytes()).iso == 400
 
 
 def test_iso_beyond_sixteen_bits_is_read_where_it_stands(tmp_path):
     photo = PHOTO | {34855: (3, (65535,)), 34866: (4, (102400,))}
     path = tmp_path / "a.dng"
     path.write_bytes(headers.dng(np.zeros((32, 32)), photo=photo))
-    assert exif.tags(path).iso == 102400
+    assert exif.tags(path.read_bytes()).iso == 102400
 
 
 def test_flash_that_is_not_mentioned_is_unknown(tmp_path):
     for flash, fired in ((None, None), (0x10, False), (0x19, True)):
         path = tmp_path / "a.dng"
         path.write_bytes(headers.dng(np.zeros((32, 32)), photo=headers.settings(flash=flash)))
-        assert exif.tags(path).flash_fired is fired
+        assert exif.tags(path.read_bytes()).flash_fired is fired
 
 
 def test_color_matrix_under_daylight_is_preferred(tmp_path):
@@ -82,7 +91,7 @@ def test_color_matrix_under_daylight_is_preferred(tmp_path):
     }  # fmt: skip
     path = tmp_path / "a.dng"
     path.write_bytes(headers.tiff(main))
-    assert exif.tags(path).color_matrix == tuple(daylight)
+    assert exif.tags(path.read_bytes()).color_matrix == tuple(daylight)
 
 
 @pytest.mark.parametrize(("unit", "per_unit"), [(2, 25400), (3, 10000), (4, 1000)])
@@ -91,7 +100,7 @@ def test_pixel_pitch_in_every_unit(tmp_path, unit, per_unit):
     photo = PHOTO | {41486: (5, (per_unit / pitch,)), 41488: (3, (unit,))}
     path = tmp_path / "a.dng"
     path.write_bytes(headers.dng(np.zeros((480, width)), photo=photo))
-    assert exif.read(path).pixel_pitch_um == pytest.approx(pitch, rel=1e-4)
+    assert _exif(path).pixel_pitch_um == pytest.approx(pitch, rel=1e-4)
 
 
 def test_pixel_pitch_follows_a_resized_picture_and_nonsense_is_dropped(tmp_path):
@@ -102,19 +111,19 @@ def test_pixel_pitch_follows_a_resized_picture_and_nonsense_is_dropped(tmp_path)
         40962: (4, (2560,)),
     }  # 10 µm before it was quartered
     path.write_bytes(headers.dng(np.zeros((480, 640)), photo=halved))
-    assert exif.read(path).pixel_pitch_um == pytest.approx(40)
+    assert _exif(path).pixel_pitch_um == pytest.approx(40)
     nonsense = PHOTO | {41486: (5, (72,)), 41488: (3, (2,))}  # a sensor 226 mm wide
     path.write_bytes(headers.dng(np.zeros((480, 640)), photo=nonsense))
-    assert exif.read(path).pixel_pitch_um is None
+    assert _exif(path).pixel_pitch_um is None
 
 
 def test_pictures_without_exif_give_their_size_alone(tmp_path):
     picture = np.zeros((30, 40, 3), np.uint16)
     for name in ("a.png", "a.tif"):
         assert cv2.imwrite(str(tmp_path / name), picture)
-        fact = exif.read(tmp_path / name)
+        fact = _exif(tmp_path / name)
         assert (fact.width, fact.height, fact.make, fact.exposure_time) == (40, 30, "", None)
-        assert sniff.kind(tmp_path / name) == "photo"
+        assert _kind(tmp_path / name) == "photo"
 
 
 def test_damaged_exif_counts_as_none(tmp_path):
@@ -125,8 +134,8 @@ def test_damaged_exif_counts_as_none(tmp_path):
             broken[at] ^= 0xFF
         path = tmp_path / "a.dng"
         path.write_bytes(broken)
-        exif.tags(path)
-        sniff.kind(path)
+        exif.tags(path.read_bytes())
+        _kind(path)
 
 
 def test_looping_directories_end(tmp_path):
@@ -137,16 +146,14 @@ def test_looping_directories_end(tmp_path):
 def test_not_a_picture_is_one_error(tmp_path):
     path = tmp_path / "a.cr2"
     path.write_bytes(np.random.default_rng(1).bytes(4000))
-    assert sniff.kind(path) == "unknown"
-    with pytest.raises(DecodeError, match=r"a\.cr2.*no RAW format"):
-        exif.read(path)
+    assert _kind(path) == "unknown" == probe.read(path).kind
     with pytest.raises(DecodeError, match="No such file"):
-        exif.read(tmp_path / "missing.cr2")
+        _exif(tmp_path / "missing.cr2")
 
 
 @needs_data
 def test_real_files():
-    canon = exif.read(DATA / "real/raw_other/IMG_5952.CR2")
+    canon = _exif(DATA / "real/raw_other/IMG_5952.CR2")
     assert (canon.model, canon.exposure_time, canon.f_number, canon.iso) == (
         "Canon EOS 30D",
         1 / 400,
@@ -155,25 +162,25 @@ def test_real_files():
     )
     assert (canon.width, canon.height, canon.flash_fired) == (3522, 2348, False)
     assert canon.pixel_pitch_um == pytest.approx(22.5e3 / 3504, rel=2e-3)  # Canon's sensor is 22.5 mm wide
-    linear = exif.read(DATA / "real/raw_other/canon_eos_6d.dng")
+    linear = _exif(DATA / "real/raw_other/canon_eos_6d.dng")
     assert linear.lens == "EF24-105mm f/4L IS USM"
     assert linear.pixel_pitch_um * linear.width / 1e3 == pytest.approx(36, rel=0.01)  # resized, still full frame
     assert linear.color_matrix[0] == pytest.approx(0.7034)  # the second matrix, D65
-    nikon = exif.read(DATA / "real/raw_bracket/sample2.dng")
+    nikon = _exif(DATA / "real/raw_bracket/sample2.dng")
     assert (nikon.make, nikon.exposure_time, nikon.focal_length_35mm) == ("NIKON CORPORATION", 1 / 640, 36)
-    powershot = exif.read(DATA / "real/raw_chart/CRW_0101.CRW")  # no EXIF: LibRaw's own reading
+    powershot = _exif(DATA / "real/raw_chart/CRW_0101.CRW")  # no EXIF: LibRaw's own reading
     assert powershot.exposure_time == pytest.approx(1 / 100, rel=0.02)
     assert powershot.focal_length_mm == pytest.approx(7.09, abs=0.01)
-    kodak = exif.read(DATA / "real/raw_chart/P003910.KDC")
+    kodak = _exif(DATA / "real/raw_chart/P003910.KDC")
     assert (kodak.width, kodak.height, kodak.model) == (848, 976, "Kodak DC120 ZOOM Digital Camera")
 
 
 @needs_data
 def test_a_folder_is_scanned_in_milliseconds():
     files = sorted((DATA / "real").glob("raw_*/*.[dDC]*"))
-    exif.read(files[0])  # starts the worker
+    _exif(files[0])  # starts the worker
     modern = [path for path in files if path.suffix != ".CRW"]
     start = time.monotonic()
     for path in modern:
-        exif.read(path)
-    assert (time.monotonic() - start) / len(modern) < 0.02  # 3 ms measured; the largest holds 13 MB
+        _exif(path)
+    assert (time.monotonic() - start) / len(modern) < 0.5  # 60 ms on a busy core, of which 45 hash up to 13 MB

@@ -128,7 +128,7 @@ def test_sensor_pixel_is_the_one_of_its_angle(tmp_path):
 def test_sensor_frame_may_be_raw(tmp_path):
     path = tmp_path / "a.dng"
     path.write_bytes(headers.dng(mosaic() + 100, photometric=34892, black=[[100]], white=4000))
-    plane = photo.read_mosaic(path, 45)
+    plane = photo.read_mosaic(path, 45, kind="raw")
     assert (plane.value.mean(), plane.black.tolist(), plane.white) == (1250, [[100]], 4000)
 
 

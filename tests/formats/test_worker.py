@@ -1,6 +1,10 @@
 """The decode worker: whatever happens in the child is one error here, and the next file is read."""
 
+import importlib
 import os
+import signal
+import subprocess
+import sys
 import textwrap
 import time
 
@@ -8,7 +12,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import ChartError, DecodeError
-from polcap.formats.worker import Worker
+from polcap.formats.worker import ChildBug, Worker
 
 FUNCTIONS = """
     import os, time
@@ -35,6 +39,18 @@ FUNCTIONS = """
     def refuse(path):
         raise ChartError(path + ": no chart")
 
+    def spin(path):
+        sum(range(10**15))  # one call into C that never lets go of the interpreter
+
+    def objects(path):
+        return {}, {"pointers": np.array([None])}
+
+    def huge(path):
+        return {}, {"much": np.broadcast_to(np.uint8(0), (2**20, 2**20))}
+
+    def much_text(path):
+        return {"text": "a" * 2**23}, {}
+
     def mistake(path):
         raise RuntimeError("a defect")
 """
@@ -45,16 +61,18 @@ def worker(tmp_path, monkeypatch):
     (tmp_path / "misbehaving.py").write_text(textwrap.dedent(FUNCTIONS))
     monkeypatch.syspath_prepend(tmp_path)
     worker = Worker(timeout_s=20, memory_gib=1.5)
+    worker.module = importlib.import_module("misbehaving")
     yield worker
+    sys.modules.pop("misbehaving")
     worker.close()
 
 
 def pid(worker):
-    return worker.call("misbehaving:ramp", "next.raw")[0]["pid"]
+    return worker.call(worker.module.ramp, "next.raw")[0]["pid"]
 
 
 def test_arrays_come_back_as_they_were(worker):
-    meta, arrays = worker.call("misbehaving:ramp", "a.raw", count=8)
+    meta, arrays = worker.call(worker.module.ramp, "a.raw", count=8)
     assert meta["path"] == "a.raw" and meta["pid"] != os.getpid()
     np.testing.assert_array_equal(arrays["ramp"], [[0, 2], [4, 6]])
     assert arrays["ramp"].dtype == np.uint16 and arrays["ramp"].flags.writeable
@@ -69,7 +87,7 @@ def test_child_is_kept_for_the_next_file(worker):
 def test_crash_names_the_file_and_the_next_file_is_read(worker):
     before = pid(worker)
     with pytest.raises(DecodeError, match=r"broken\.raw: the decoder crashed"):
-        worker.call("misbehaving:crash", "broken.raw")
+        worker.call(worker.module.crash, "broken.raw")
     assert pid(worker) != before
 
 
@@ -78,7 +96,7 @@ def test_hang_ends_at_the_time_limit_and_the_next_file_is_read(worker):
     worker.timeout_s = 0.5
     start = time.monotonic()
     with pytest.raises(DecodeError, match=r"slow\.raw: not decoded within 0\.5 s"):
-        worker.call("misbehaving:hang", "slow.raw")
+        worker.call(worker.module.hang, "slow.raw")
     assert time.monotonic() - start < 10
     worker.timeout_s = 20
     assert pid(worker)
@@ -86,25 +104,67 @@ def test_hang_ends_at_the_time_limit_and_the_next_file_is_read(worker):
 
 def test_memory_beyond_the_limit_is_refused_and_the_next_file_is_read(worker):
     with pytest.raises(DecodeError, match=r"huge\.raw.*memory"):
-        worker.call("misbehaving:hoard", "huge.raw")
+        worker.call(worker.module.hoard, "huge.raw")
     assert pid(worker)
 
 
 def test_an_error_of_the_function_keeps_its_class_and_its_child(worker):
     before = pid(worker)
     with pytest.raises(ChartError, match=r"^a\.raw: no chart$"):
-        worker.call("misbehaving:refuse", "a.raw")
+        worker.call(worker.module.refuse, "a.raw")
     assert pid(worker) == before
 
 
-def test_a_defect_is_told_with_its_reason(worker):
-    with pytest.raises(DecodeError, match=r"odd\.raw.*RuntimeError: a defect"):
-        worker.call("misbehaving:mistake", "odd.raw")
+def test_a_defect_of_our_own_is_a_bug_with_the_childs_traceback(worker):
+    with pytest.raises(ChildBug, match=r"odd\.raw: RuntimeError: a defect") as caught:
+        worker.call(worker.module.mistake, "odd.raw")
+    assert 'raise RuntimeError("a defect")' in caught.value.__notes__[0]
+    assert pid(worker)
+
+
+@pytest.mark.parametrize("answer", ["objects", "huge", "much_text"])
+def test_an_answer_beyond_its_bounds_is_refused(worker, answer):
+    with pytest.raises(DecodeError, match=r"odd\.raw"):
+        worker.call(getattr(worker.module, answer), "odd.raw")
+    assert pid(worker)
+
+
+def test_a_call_may_have_tighter_limits(worker):
+    with pytest.raises(DecodeError, match=r"slow\.raw: not decoded within 0\.5 s"):
+        worker.call(worker.module.hang, "slow.raw", limit_s=0.5)
+    with pytest.raises(DecodeError, match=r"large\.raw.*more than 0\.2 GiB"):
+        worker.call(worker.module.ramp, "large.raw", limit_gib=0.2, count=2**28)
+    assert worker.call(worker.module.ramp, "large.raw", count=2**28)[1]["ramp"].size == 2**27
+
+
+@pytest.mark.skipif(os.name != "posix", reason="elsewhere the time limit ends it")
+@pytest.mark.parametrize("loop", ["spin", "hang"])
+def test_a_child_in_a_loop_dies_with_its_parent(worker, tmp_path, loop):
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1]); import misbehaving\n"
+        "from polcap.formats.worker import Worker\n"
+        "w = Worker(); print(w.call(misbehaving.ramp, 'a')[0]['pid'], flush=True)\n"
+        f"w.call(misbehaving.{loop}, 'b')"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE)
+    child = int(parent.stdout.readline())
+    time.sleep(0.3)  # it is in the loop
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    parent.stdout.close()
+    for _ in range(100):
+        try:
+            os.kill(child, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.05)
+    os.kill(child, signal.SIGKILL)
+    pytest.fail("the child outlived its parent")
 
 
 def test_fifty_megabytes_cross_in_less_time_than_they_take_to_decode(worker):
     pid(worker)
     start = time.monotonic()
-    _, arrays = worker.call("misbehaving:ramp", "large.raw", count=50_000_000)  # 50 MB of every other column
+    _, arrays = worker.call(worker.module.ramp, "large.raw", count=50_000_000)  # 50 MB of every other column
     assert arrays["ramp"].nbytes == 50_000_000
     assert time.monotonic() - start < 2.0  # measured 0.15 s on an idle core

@@ -19,8 +19,8 @@ from unittest import mock
 import msgspec
 
 from polcap.errors import HardwareError, PolcapError, StorageError
+from polcap.formats.photo_bytes import digest
 from polcap.rig import record, sequence
-from polcap.rig.frame_check import digest
 from polcap.rig.plan import Order
 from tests.conftest import ROOT
 from tests.rig import pool as pools

@@ -13,10 +13,10 @@ import numpy as np
 
 from polcap.errors import HardwareError
 from polcap.formats import dng
+from polcap.formats.photo_bytes import digest
 from polcap.images import Exif, Role
 from polcap.rig import watchdog
 from polcap.rig.camera import Exposure, Shot
-from polcap.rig.frame_check import digest
 from polcap.rig.plan import Order
 from polcap.synth.shooting import MIDDLE_S, Shoot, Studio, Take, random_scene
 

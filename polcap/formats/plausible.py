@@ -1,0 +1,134 @@
+"""In: what a file states and what came out of it. Out: nothing, or an error that says why its pixels cannot be trusted.
+
+Decoders return pixels from files that are cut, stripped or of a form they do not know: black, grey, or whatever
+lay in memory. In the worker.
+"""
+
+import re
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.errors import DecodeError
+from polcap.formats import sniff
+
+MOST_PIXELS = 256_000_000  # the largest sensor has 151 million, a pixel shift of four exposures 240
+_LEAST_BITS = 0.5  # of a file per pixel of a RAW: lossless coding takes one at least, a Kodak's JPEG-RAW about this
+_FORMS = {
+    9: "a GoPro GPR (VC-5 compression 9); convert it to DNG with GoPro's gpr_tools or Adobe DNG Converter",
+    52546: "a DNG of JPEG XL (compression 52546); convert the original RAW without it, to DNG 1.4",
+}
+_LOSSY = 34892  # JPEG of 8 bits under a curve; LibRaw decodes some of them to black
+_COPY_AGAIN = "copy it from the card again"
+_MARKER = re.compile(rb"\xff+[^\x00\xff\xd0-\xd7]")  # ends the coded data of a JPEG scan
+_CLIPPED_SHARE = 0.5  # of a picture; no exposure of use has more at the white level
+_BEYOND = 2.0  # white levels; counts that reach so far deny the level
+
+
+def check_size(path: str, width: int, height: int) -> None:
+    """A picture of no pixels, or of more than any camera takes, is refused before memory is taken for it."""
+    if width < 1 or height < 1:
+        raise DecodeError(f"{path}: states {width}×{height} px; it is damaged, {_COPY_AGAIN}")
+    if width * height > MOST_PIXELS:
+        raise DecodeError(
+            f"{path}: states {width}×{height} px, more than the {MOST_PIXELS / 1e6:.0f} million of any camera; "
+            "it is damaged, or reduce it"
+        )
+
+
+def check_bytes(path: str, width: int, height: int, size: int) -> None:
+    """A file too small for its pixels is a remnant."""
+    if 8 * size < _LEAST_BITS * width * height:
+        raise DecodeError(
+            f"{path}: {size / 1e3:.0f} kB cannot hold {width}×{height} px; only its beginning is there, {_COPY_AGAIN}"
+        )
+
+
+def check_structure(path: str, structure: sniff.Tiff, data: bytes) -> None:
+    """Refuse by name what LibRaw decodes wrongly, and a DNG whose image data are not there."""
+    images = [one for one in structure.directories if _is_sensor(one)]
+    for directory in images:
+        form = _FORMS.get(sniff.first(directory, sniff.COMPRESSION), "")
+        if form and structure.dng:
+            raise DecodeError(f"{path}: is {form}")
+        _check_strips(path, directory, structure.dng)
+        _check_jpeg(path, directory, data)
+    if structure.dng and not images:
+        raise DecodeError(f"{path}: is a DNG without a sensor image, its data were stripped; {_COPY_AGAIN}")
+
+
+def is_lossy(structure: sniff.Tiff) -> bool:
+    """The sensor image is a lossy DNG's."""
+    return any(_is_sensor(one) and sniff.first(one, sniff.COMPRESSION) == _LOSSY for one in structure.directories)
+
+
+def _is_sensor(directory: sniff.Directory) -> bool:
+    return sniff.first(directory, sniff.PHOTOMETRIC) in (sniff.CFA, sniff.LINEAR_RAW)
+
+
+def _check_strips(path: str, directory: sniff.Directory, dng: bool) -> None:
+    """Uncompressed pixels fill the bytes that are stated for them; others have some."""
+    held = sum(length for _, length in sniff.strips(directory))
+    width, height = sniff.first(directory, sniff.WIDTH), sniff.first(directory, sniff.LENGTH)
+    check_size(path, max(width, 1), max(height, 1))
+    bits = sniff.first(directory, sniff.BITS, 8) * sniff.first(directory, sniff.SAMPLES, 1)
+    plain = sniff.first(directory, sniff.COMPRESSION, 1) == 1
+    needed = width * height * (bits if plain else _LEAST_BITS) / 8
+    if dng and held < needed:
+        raise DecodeError(
+            f"{path}: states {held} bytes of image data where {width}×{height} px need {needed:.0f}; "
+            f"it was stripped or damaged, {_COPY_AGAIN}"
+        )
+
+
+def _check_jpeg(path: str, directory: sniff.Directory, data: bytes) -> None:
+    """The last strip of JPEG data, lossless or not, has its end marker."""
+    ends = sorted(sniff.strips(directory))[-1:]
+    for offset, _ in ends:
+        if data[offset : offset + 2] == b"\xff\xd8":
+            check_jpeg(path, data, offset)
+
+
+def check_jpeg(path: str, data: bytes, start: int = 0) -> None:
+    """A JPEG from `start` on goes on until its end marker; a cut one decodes, its rest grey."""
+    at = start + 2
+    while at + 4 <= len(data):
+        if data[at] != 0xFF:
+            break
+        marker = data[at + 1]
+        if marker == 0xD9:
+            return
+        if marker == 0xFF:  # filling
+            at += 1
+            continue
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        if marker == 0xDA:  # coded data follow
+            found = _MARKER.search(data, at)
+            if found is None:
+                break
+            at = found.end() - 2
+    if data[at : at + 2] != b"\xff\xd9":
+        raise DecodeError(f"{path}: is cut short, its JPEG data have no end; {_COPY_AGAIN}")
+
+
+def check_levels(path: str, value: NDArray[Any], black: float, white: float, lossy: bool) -> None:
+    """Counts that stand beyond the white level, rows that were never written, and nothing at all are told."""
+    if lossy and not value.any():
+        raise DecodeError(
+            f"{path}: is a lossy DNG (JPEG compression {_LOSSY}) that LibRaw decodes to black; "
+            "convert the original RAW without lossy compression"
+        )
+    if not value.any():
+        raise DecodeError(f"{path}: decodes to nothing, every count is 0; {_COPY_AGAIN}")
+    if white <= black:
+        raise DecodeError(f"{path}: its black level {black:g} is not below its white level {white:g}; it is damaged")
+    top = float(value.max(initial=0))
+    if top > _BEYOND * white and float(np.mean(value >= white)) > _CLIPPED_SHARE:
+        raise DecodeError(
+            f"{path}: its white level is {white:g}, but its counts reach {top:.0f}; the level is wrong (a scanner's "
+            "file?); convert it to linear 16-bit TIFF"
+        )
+    rows = max(1, len(value) // 50)
+    if black > 0 and top > black and not value[-rows:].any():
+        raise DecodeError(f"{path}: its last rows are empty, below the sensor's black level; it is cut, {_COPY_AGAIN}")
