@@ -91,6 +91,7 @@ class Shot:
     angle: float  # rad, from image x towards image up, as the photographer sees the picture
     frames: tuple[Frame, ...]  # (E,), darkest first as far as the metadata tells
     ambient: tuple[Frame, ...] = ()  # flash off, same settings
+    place_px: tuple[float, float] = (0.0, 0.0)  # x, y of its pixel (0, 0) where shots are cut from one mosaic [its px]
 
     @property
     def name(self) -> str:
@@ -152,6 +153,8 @@ class AngleStack:
     lossy: bool  # a source was 8-bit or display-encoded
     camera_matrix: Floats | None  # (3, 3) camera → linear Rec.709, white balanced as shot; None if unknown
     white_balance: Floats | None  # (3,) multipliers as shot
+    light: Literal["flash", "steady", "one exposure", "unknown"] = "unknown"  # of the shots; one: a polarizer mosaic
+    offset_px: Floats | None = None  # (K, 2) x, y of this grid, exactly known: reference px − offset = shot px
 
 
 @dataclass(frozen=True)
@@ -202,14 +205,16 @@ class Gains:
 
     gain: Floats  # (K, 3) relative to the reference shot
     sigma: Floats  # (K, 3) 1σ
-    anchor: Floats  # (K, 3) the same from the object's facing pixels, the cross-check
-    source: Literal["grey patches", "facing pixels", "none"]
-    disagreement: float  # largest |gain/anchor − 1| of the channel means beyond twice the anchor's own error
+    anchor: Floats  # (K, 3) the same from the object itself, the cross-check
+    source: Literal["grey patches", "object", "one exposure", "none"]
+    disagreement: float  # largest |gain/anchor − 1| of the channel means beyond three times the error of both
     angle_offset: float  # rad, common turn of the polarizer ring seen against the silhouette (not applied)
     angle_offset_sigma: float  # rad
     concentration: float  # 0…1, how well AoLP follows the silhouette
     order: tuple[int, ...]  # the order of the shots that the silhouette supports best
     mirrored: bool  # the silhouette supports angles counted the other way
+    anchor_sigma: Floats  # (K,) 1σ of the anchor's channel means
+    chart_gloss: float  # greatest part of a shot's ratio on the white patch that is the chart's gloss, beyond doubt
 
 
 @dataclass(frozen=True)

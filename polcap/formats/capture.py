@@ -117,6 +117,7 @@ def _shot(plan: layouts.Plan, stated: CaptureFile, angle_deg: float, bracket: Se
         angle=math.radians(angle_deg),
         frames=_darkest_first(_frame(plan, stated, source, angle_deg) for source in bracket),
         ambient=_darkest_first(_frame(plan, stated, source, angle_deg) for source in ambient),
+        place_px=photo.place_px(angle_deg) if plan.layout == "sensor" else (0.0, 0.0),
     )
 
 

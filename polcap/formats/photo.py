@@ -91,6 +91,12 @@ def read_mosaic(
     return SensorImage(value, np.full((1, 1), level), white or full, None, lossy=lossy)
 
 
+def place_px(angle_deg: float) -> tuple[float, float]:
+    """x, y of the first pixel that `read_mosaic` takes, in pixels of the plane it gives: 0 or half a one."""
+    y, x = dict(SENSOR_DEG)[angle_deg]
+    return x / 2, y / 2
+
+
 def encoding_of(bits: int, stated: Encoding | None) -> Encoding:
     """How `read` takes a picture of so many bits per channel."""
     return stated or ("srgb" if bits == 8 else "linear")

@@ -175,7 +175,7 @@ def judge(found: dict[str, dict[str, Any]], focal_known: bool, limits: Gates) ->
             "gains",
             gains["disagreement"] if gains["source"] == "grey patches" else None,
             limits.max_gain_disagreement,
-            "grey patches and the object's facing pixels disagree on a shot's flash energy; 1 % costs about 6°",
+            "grey patches and the object disagree on a shot's light, beyond the error of both; 1 % costs about 6°",
         ),
         Gate(
             "angles",

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from polcap.errors import CaptureError
+from polcap.optics import mueller
 from polcap.stages import selfcal
+from polcap.stages.selfcal import grey_patches, object_gains, order
 from tests import scenes
 
 GAIN = np.array([1.0, 1.013, 0.981])
@@ -35,19 +37,66 @@ def test_grey_patches_give_the_gains_within_their_error():
     assert np.abs(z).max() < 4
 
 
-def test_without_a_chart_the_facing_pixels_serve():
+def test_without_a_chart_the_object_serves():
     found = solve(scenes.stack(gain=GAIN, noise=0.004), scenes.no_color())
-    assert found.source == "facing pixels"
+    assert found.source == "object"
     assert np.abs(found.gain.mean(1) / GAIN - 1).max() < 0.005
 
 
 def test_a_polarized_chart_disagrees_with_the_object():
     radiance = scenes.stack(noise=0.002)
     value = radiance.value.copy()
-    value[2, :, 224:300] *= 1.02  # as a glossy or tilted chart would
+    value[2, :, 224:300] *= 1.05  # as a chart turned away would
     color = dataclasses.replace(scenes.no_color(), quads=board_quads(), source="chart")
-    assert solve(dataclasses.replace(radiance, value=value), color).disagreement > 0.003
-    assert solve(radiance, color).disagreement < 0.003
+    assert solve(dataclasses.replace(radiance, value=value), color).disagreement > 0.02
+    assert solve(radiance, color).disagreement == 0
+
+
+def test_gloss_on_the_chart_shows_on_its_dark_patches():
+    value, variance = np.ones((3, 6)) * (0.9, 0.6, 0.36, 0.2, 0.09, 0.03), np.full((3, 6), 1e-8)
+    assert grey_patches._gloss(value * GAIN[:, None], variance) == 0
+    value[1] += 0.02  # the same light on dark and light ones, in one shot
+    assert grey_patches._gloss(value, variance) == pytest.approx(0.02 / 0.9, rel=0.3)
+
+
+@pytest.mark.parametrize("angles", [(0, 60, 120), (0, 45, 90, 135), (3, 41, 100, 155, 170)])
+def test_orders_that_give_the_same_analyzers_are_one(angles):
+    angle = np.radians(np.array(angles, float))
+    found = order.hypotheses(angle)
+    assert next(iter(found)) == (tuple(range(len(angle))), False)
+    analyzers = [mueller.analyzer(turned) for turned in found.values()]
+    assert all(np.abs(a - b).max() > 0.02 for i, a in enumerate(analyzers) for b in analyzers[:i])
+
+
+@pytest.mark.parametrize("angles", [(0, 60, 120), (0, 45, 90, 135), (10, 37, 80, 121, 163)])
+def test_any_angles_in_order_are_kept_and_swapped_ones_refused(angles):
+    angle = np.radians(np.array(angles, float))
+    radiance = scenes.stack(noise=0.002, angles=angle)
+    found = selfcal.solve(
+        radiance, scenes.still(len(angle)), scenes.ball_object(), scenes.no_color(), selfcal.Settings()
+    )
+    assert found.order == tuple(range(len(angle))) and not found.mirrored
+    swapped = dataclasses.replace(radiance, value=radiance.value[[0, 2, 1, *range(3, len(angle))]])
+    with pytest.raises(CaptureError, match="outline"):
+        selfcal.solve(swapped, scenes.still(len(angle)), scenes.ball_object(), scenes.no_color(), selfcal.Settings())
+
+
+def test_one_exposure_has_one_gain():
+    radiance = dataclasses.replace(scenes.stack(gain=GAIN), light="one exposure")
+    found = solve(radiance, scenes.no_color())
+    assert found.source == "one exposure"
+    assert (found.gain == 1).all() and (found.sigma == 0).all()
+
+
+def test_gains_that_the_object_is_not_sure_of_are_not_applied():
+    far = object_gains.Estimate(np.array([1.0, 0.6, 1.3]), np.array([0.0, 0.2, 0.1]))
+    found = selfcal.supported(far, 0.03)
+    assert np.abs(found.gain - 1).max() <= 0.03
+    wild = object_gains.Estimate(np.array([1.0, 0.6, 1.3]), np.array([0.0, 0.1, 0.08]))
+    assert (selfcal.supported(wild, 0.03).gain == 1).all()
+    assert selfcal.supported(wild, 0.03).sigma[1] >= 0.4
+    misfire = object_gains.Estimate(np.array([1.0, 0.7, 1.0]), np.array([0.0, 0.005, 0.005]))
+    assert selfcal.supported(misfire, 0.03).gain[1] == 0.7
 
 
 @pytest.mark.parametrize("order", [(2, 1, 0), (1, 0, 2), (0, 2, 1)])

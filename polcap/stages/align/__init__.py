@@ -46,13 +46,15 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 4.0
 
 
-@stage(version=1)
+@stage(version=2)
 def register(radiance: AngleStack, color: ColorCalibration, settings: Settings) -> Alignment:
     """One transform per shot, reference grid px → shot grid px.
 
     Raises AlignmentError naming the shot that moved too far or shows another scene.
     """
     shots = len(radiance.angle)
+    if radiance.offset_px is not None:
+        return _as_known(radiance.offset_px)
     step = int(np.ceil(np.sqrt(radiance.value[0, ..., 0].size / _MOST_PIXELS)))
     detail = [_Detail.of(radiance, k, settings.detail_px, step) for k in range(shots)]
     transform = np.tile(np.eye(3), (shots, 1, 1))
@@ -84,6 +86,13 @@ def register(radiance: AngleStack, color: ColorCalibration, settings: Settings) 
                 "reshoot, or raise it"
             )
     return Alignment(transform=transform, residual_px=residual, correlation=correlation)
+
+
+def _as_known(offset_px: Floats) -> Alignment:
+    """Shots cut from one mosaic stand where its pixels stand."""
+    transform = np.tile(np.eye(3), (len(offset_px), 1, 1))
+    transform[:, :2, 2] = -offset_px
+    return Alignment(transform, np.zeros(len(offset_px)), np.ones(len(offset_px)))
 
 
 class _Detail(msgspec.Struct, frozen=True):

@@ -77,7 +77,7 @@ class _Merged:
     ratio: Floats  # (E, C)
 
 
-@stage(version=1)
+@stage(version=2)
 def merge(capture: Capture, settings: Settings) -> AngleStack:
     """Radiance of every shot on the scale of its reference frame.
 
@@ -125,7 +125,17 @@ def merge(capture: Capture, settings: Settings) -> AngleStack:
         lossy=read.lossy,
         camera_matrix=camera[0],
         white_balance=camera[1],
+        light=_light(capture),
+        offset_px=np.array([shot.place_px for shot in shots]) - shots[0].place_px if capture.layout == "sensor" else None,
     )
+
+
+def _light(capture: Capture) -> Literal["flash", "steady", "one exposure", "unknown"]:
+    """What the metadata say of the light of the shots."""
+    if capture.layout == "sensor":
+        return "one exposure"
+    fired = {frame.exif.flash_fired for shot in capture.shots for frame in shot.frames}
+    return "flash" if True in fired else "steady" if fired == {False} else "unknown"
 
 
 def _stack(parts: list[Floats], factor: int) -> Floats:

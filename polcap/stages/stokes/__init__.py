@@ -26,7 +26,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 5.0
 
 
-@stage(version=1)
+@stage(version=2)
 def solve(
     radiance: AngleStack, alignment: Alignment, gains: Gains, object_: ObjectMask, settings: Settings
 ) -> StokesImage:
@@ -81,9 +81,14 @@ def _registered(
     values, variances = [], []
     x0, y0, x1, y1 = crop
     quality: Bits = np.zeros((y1 - y0, x1 - x0), np.uint8)
+    mosaic = radiance.offset_px is not None
+    part = alignment.transform[:, :2, 2] % 1
+    shares = np.prod(part**2 + (1 - part) ** 2, axis=1).mean()  # alike for all, lest the sharpest shot counts least
     for k, transform in enumerate(alignment.transform):
-        values.append(warp(radiance.value[k], transform, crop) / gains.gain[k])
+        values.append(warp(radiance.value[k], transform, crop, order=1 if mosaic else 3) / gains.gain[k])
         spread = np.maximum(warp(radiance.variance[k], transform, crop, order=1), 1e-14)
+        if mosaic:  # the mean of two or four neighbours, as is usual: splines ring at the edges of so coarse a grid
+            spread = spread * shares
         variances.append(spread / gains.gain[k] ** 2)
         for bit in (Quality.CLIPPED, Quality.GHOST):
             flagged = warp((radiance.quality[k] & bit).astype(np.float32), transform, crop, order=1) > 0.01 * bit

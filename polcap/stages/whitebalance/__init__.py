@@ -69,7 +69,7 @@ def measure(
     ChartError
         No ColorChecker Classic found, or corners or exposure that do not show one.
     """
-    if request.mode == "none":
+    if request.mode == "none" or (request.mode == "auto" and _monochrome(radiance.value[0])):
         return _from_camera(radiance)
     if request.mode == "profile":
         if request.profile is None:
@@ -90,6 +90,13 @@ def measure(
         falloff=(float(found.fit.slope[0]), float(found.fit.slope[1])),
         glare=found.fit.glare,
     )
+
+
+def _monochrome(value: Floats) -> bool:
+    """Whether the three channels are one: without colours there is no chart to look for."""
+    step = max(1, int(np.sqrt(value[..., 0].size / 1e5)))
+    few = value[::step, ::step]
+    return bool(np.array_equal(few[..., 0], few[..., 1]) and np.array_equal(few[..., 0], few[..., 2]))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,98 @@
+"""The gains of the shots from a chart's grey patches, and whether the chart shines.
+
+A matt patch is unpolarized: its light is the same in every shot but for the gain. Gloss adds light that is the same
+on dark and light patches alike, and polarized where the chart does not face flash and camera. So the ratio of two
+shots against 1/(light of the patch) is a straight line: its height at 0 is the gain, its slope the chart's gloss.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Quality
+
+_GREYS = (18, 19, 20, 21, 22, 23)  # white to black
+_LIGHT = 4  # the first so many serve for the gains; the darker two are mostly noise
+_SCATTER = 0.001  # between patches, of print, registration and light that falls off
+
+
+@dataclass(frozen=True)
+class GreyPatches:
+    """Gains by the greys."""
+
+    gain: Floats  # (K, 3)
+    sigma: Floats  # (K, 3) 1σ
+    gloss: float  # greatest ratio of a shot on the white patch that is gloss's, not the gain's; 0 where none is sure
+
+
+def measure(radiance: AngleStack, alignment: Alignment, color: ColorCalibration) -> GreyPatches | None:
+    """Gains from the light grey patches, or None without a chart, or where all of it is clipped.
+
+    Each patch is summed in every shot's own pixels; unclipped patches are pooled by their light.
+    """
+    if color.quads is None:
+        return None
+    shots = len(radiance.angle)
+    total = np.zeros((shots, len(_GREYS), 3))
+    variance = np.zeros_like(total)
+    usable = np.zeros(len(_GREYS), bool)
+    for p, patch in enumerate(_GREYS):
+        clipped = False
+        for k in range(shots):
+            inside = _polygon(color.quads[patch], alignment.transform[k], radiance.value.shape[1:3])
+            count = inside.sum()
+            clipped |= count < 9 or bool((radiance.quality[k][inside] & Quality.CLIPPED).any())
+            total[k, p] = radiance.value[k][inside].mean(0) if count else 0
+            variance[k, p] = radiance.variance[k][inside].sum(0) / max(count, 1) ** 2
+        usable[p] = not clipped and bool((total[:, p] > 0).all())
+    light = usable & (np.arange(len(_GREYS)) < _LIGHT)
+    if not light.any():
+        return None
+    pooled, noise = total[:, light].sum(1), variance[:, light].sum(1)
+    gain = pooled / pooled[0]
+    photon = gain * np.sqrt(noise / pooled**2 + (noise / pooled**2)[0])
+    each = total[:, light] / total[:1, light]  # (K, P, 3)
+    scatter = each.std(1) / np.sqrt(light.sum())
+    sigma = np.hypot(photon, scatter)
+    sigma[0] = 0
+    gain, sigma = _alike(gain, sigma)
+    return GreyPatches(gain, sigma, _gloss(total.sum(-1)[:, usable], variance.sum(-1)[:, usable]))
+
+
+def _gloss(total: Floats, variance: Floats) -> float:
+    """What gloss adds to a shot's ratio on the lightest patch, beyond 4σ; total and variance (K, P)."""
+    if total.shape[1] < 4:
+        return 0.0
+    ratio = total / total[0]
+    sigma = np.hypot(ratio * np.sqrt(variance / total**2 + (variance / total**2)[0]), _SCATTER)
+    inverse = total[0].max() / total[0]  # 1 on the lightest patch, ~30 on black
+    worst = 0.0
+    for k in range(1, len(total)):
+        weight = 1 / sigma[k] ** 2
+        at = (weight * inverse).sum() / weight.sum()
+        spread = float((weight * (inverse - at) ** 2).sum())
+        slope = float((weight * (inverse - at) * ratio[k]).sum()) / max(spread, 1e-12)
+        doubt = np.sqrt(1 / max(spread, 1e-12))
+        line = (weight * ratio[k]).sum() / weight.sum() + slope * (inverse - at)
+        doubt *= max(1.0, float(np.sqrt((weight * (ratio[k] - line) ** 2).sum() / (total.shape[1] - 2))))
+        worst = max(worst, abs(slope) - 4 * doubt)
+    return float(worst)
+
+
+def _alike(gain: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+    """One gain for all channels of a shot where they agree within 3σ: most flashes keep their colour."""
+    weight = 1 / np.maximum(sigma, 1e-6) ** 2
+    mean = (gain * weight).sum(1, keepdims=True) / weight.sum(1, keepdims=True)
+    agree = (np.abs(gain - mean) <= 3 * np.maximum(sigma, 1e-6)).all(1, keepdims=True)
+    pooled_sigma = np.sqrt(1 / weight.sum(1, keepdims=True)) * (sigma > 0)
+    return np.where(agree, mean, gain), np.where(agree, pooled_sigma, sigma)
+
+
+def _polygon(quad: Floats, transform: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """(H, W) pixels of a shot inside a reference-grid quad (4, 2), one pixel within its edge."""
+    corners = transform @ np.column_stack([quad, np.ones(4)]).T
+    inside = np.zeros(shape[:2], np.uint8)
+    cv2.fillConvexPoly(inside, np.round((corners[:2] / corners[2]).T * 16).astype(np.int32), 1, shift=4)
+    return np.asarray(cv2.erode(inside, np.ones((3, 3), np.uint8)) > 0)

@@ -1,0 +1,154 @@
+"""Does the object's outline support the order and sense of the angles as stated, or others clearly better?
+
+Orders that give the same analyzers are one: (0°, 120°, 60°) counted clockwise is (0°, 60°, 120°). A common turn of
+all angles is no other order. What is left is compared by what it predicts: AoLP across the contour all round, and,
+with more than three shots, intensities that lie in the space of S0, S1, S2. Ties go to what was stated.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations, permutations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Floats
+from polcap.optics import mueller
+
+Bools = NDArray[np.bool_]
+Order = tuple[tuple[int, ...], bool]  # which stated angle each shot has, and whether they count clockwise
+
+_MOST_PERMUTED = 4  # beyond, only exchanges of two shots, and the reversal, are tried
+_SECTORS = 24  # of the outline; their scatter is the doubt
+_DOLP_CAP = 0.4  # above, it is no body that polarizes
+_CLOSES = 3.0  # factor on the misfit of more than three shots that rules an order out, or in
+_ROUGH = 0.01  # misfit that gains and interpolation leave at most, relative to the light
+
+
+@dataclass(frozen=True)
+class Rim:
+    """The band inside the outline."""
+
+    light: Floats  # (K, N) of the registered shots, gains taken out
+    azimuth: Floats  # (N,) rad, outward direction of the outline
+    sector: NDArray[np.int_]  # (N,) part of the outline, 0…23
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the outline says of the angles."""
+
+    order: Order  # the one that fits best beyond the doubt; else as stated
+    score: float  # of the stated order: mean of w cos 2(φ − φ_contour)
+    best_score: float
+    doubt: float  # 1σ of the difference of the two
+    offset: float  # rad, common turn of the ring against the outline
+    offset_sigma: float  # rad
+    concentration: float  # 0…1, of the AoLP about the turned outline
+
+
+def rim(value: Floats, usable: Bools, mask: Bools, crop: tuple[int, int, int, int], full: tuple[int, ...]) -> Rim:
+    """The rim of shots (K, H, W); where the object leaves the picture its outline is no contour of shape."""
+    padded = np.pad(mask.astype(np.uint8), 1)
+    depth = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
+    smooth = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 3.0)
+    dx, dy = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
+    band = (depth > 1.5) & (depth < max(5.0, 0.02 * max(mask.shape))) & (np.hypot(dx, dy) > 1e-4) & usable
+    x0, y0, x1, y1 = crop
+    edge = 3
+    band[: max(0, edge - y0)] = False
+    band[:, : max(0, edge - x0)] = False
+    band[mask.shape[0] - max(0, y1 - (full[0] - edge)) :] = False
+    band[:, mask.shape[1] - max(0, x1 - (full[1] - edge)) :] = False
+    y, x = np.nonzero(band)
+    around = np.arctan2(y - y.mean(), x - x.mean()) if len(y) else np.zeros(0)
+    sector = np.floor((around + np.pi) / (2 * np.pi) * _SECTORS).astype(int) % _SECTORS
+    return Rim(np.asarray(value[:, band], np.float64), np.arctan2(dy, -dx)[band], sector)  # image rows run down
+
+
+def judge(at: Rim, angle: Floats, margin: float, believable: float, beyond_sigma: float = 3.0) -> Verdict:
+    """The verdict on angles (K,) rad; another order must fit better by `margin` and by `beyond_sigma` σ."""
+    stated: Order = (tuple(range(len(angle))), False)
+    if at.light.shape[1] == 0:
+        return Verdict(stated, 0.0, 0.0, 1.0, 0.0, np.pi / 2, 0.0)
+    total, weight = _phasor(at, angle)
+    mean = complex(total.sum() / max(weight.sum(), 1e-9))
+    here = _misfit(at, angle)
+    best, best_score, doubt = stated, abs(mean), 0.0
+    for order, turned in hypotheses(angle).items():
+        misfit = _misfit(at, turned)
+        if order == stated or misfit > _CLOSES * here:
+            continue
+        least = 0.0 if _CLOSES * misfit < here > _ROUGH else margin  # more than three shots agree in this order alone
+        other, others = _phasor(at, turned)
+        score = float(other.sum().real / max(others.sum(), 1e-9))
+        if score > best_score:
+            sigma = _jackknife(other.real, others, (total * np.exp(-1j * np.angle(mean))).real, weight)
+            if score > believable and score - abs(mean) > max(least, beyond_sigma * sigma * (least > 0)):
+                best, best_score, doubt = order, score, sigma
+    concentration = abs(mean)
+    parts = np.array([t / w for t, w in zip(total, weight) if w > 0])
+    across = (parts * np.exp(-1j * np.angle(mean))).imag
+    sigma = float(across.std() / np.sqrt(max(len(parts), 1)) / max(2 * concentration, 1e-3))
+    return Verdict(
+        best, mean.real, best_score, doubt, float(np.angle(mean) / 2), min(sigma, np.pi / 2), float(concentration)
+    )
+
+
+def hypotheses(angle: Floats) -> dict[Order, Floats]:
+    """Angles (K,) rad of every order and sense that gives analyzers of its own; the stated one first."""
+    shots = len(angle)
+    nominal = tuple(range(shots))
+    orders = list(permutations(nominal)) if shots <= _MOST_PERMUTED else [nominal, *_exchanged(shots), nominal[::-1]]
+    found: dict[Order, Floats] = {}
+    for order in sorted(set(orders), key=lambda one: (one != nominal, one)):
+        for mirrored in (False, True):
+            turned = angle[list(order)] * (-1 if mirrored else 1)
+            weights = mueller.analyzer(turned)
+            if all(np.abs(weights - mueller.analyzer(known)).max() > 0.02 for known in found.values()):
+                found[order, mirrored] = turned
+    return found
+
+
+def _exchanged(shots: int) -> list[tuple[int, ...]]:
+    """Every exchange of two of the shots."""
+    found = []
+    for i, j in combinations(range(shots), 2):
+        order = list(range(shots))
+        order[i], order[j] = j, i
+        found.append(tuple(order))
+    return found
+
+
+def _phasor(at: Rim, angle: Floats) -> tuple[NDArray[np.complex128], Floats]:
+    """Σ w e^{2i(φ − φ_contour)} and Σ w of every sector, (24,) each, w the DoLP up to what a body has."""
+    s0, s1, s2 = np.linalg.lstsq(mueller.analyzer(angle), at.light, rcond=None)[0]
+    polarization = (s1 + 1j * s2) / np.maximum(s0, 1e-9)
+    weight = np.minimum(np.abs(polarization), _DOLP_CAP)
+    phasor = weight * polarization / np.maximum(np.abs(polarization), 1e-12) * np.exp(-2j * at.azimuth)
+    real, imaginary = (np.bincount(at.sector, part, _SECTORS) for part in (phasor.real, phasor.imag))
+    return real + 1j * imaginary, np.bincount(at.sector, weight, _SECTORS)
+
+
+def _misfit(at: Rim, angle: Floats) -> float:
+    """Median relative residual of more than three shots; the noise of a fit that cannot fail is 1."""
+    if len(angle) < 4:
+        return 1.0
+    weights = mueller.analyzer(angle)
+    stokes = np.linalg.lstsq(weights, at.light, rcond=None)[0]
+    residual = np.linalg.norm(at.light - weights @ stokes, axis=0) / np.maximum(at.light.sum(0), 1e-9)
+    return float(np.median(residual)) + 1e-4
+
+
+def _jackknife(one: Floats, one_weight: Floats, other: Floats, other_weight: Floats) -> float:
+    """1σ of Σone/Σone_weight − Σother/Σother_weight from leaving sectors out, (24,) each."""
+    used = np.flatnonzero(one_weight + other_weight)
+    without = np.array(
+        [
+            (one.sum() - one[s]) / max(one_weight.sum() - one_weight[s], 1e-9)
+            - (other.sum() - other[s]) / max(other_weight.sum() - other_weight[s], 1e-9)
+            for s in used
+        ]
+    )
+    count = max(len(used), 1)
+    return float(np.sqrt((count - 1) / count * ((without - without.mean()) ** 2).sum()))
