@@ -32,7 +32,8 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     max_delta_e: Annotated[float, Meta(gt=0, description="mean residual of the chart [CIEDE2000]")] = 5.0
     max_gain_disagreement: Annotated[
-        float, Meta(gt=0, le=1, description="between chart and object on a shot's gain, beyond their errors; 1 % costs 6° [1]")
+        float,
+        Meta(gt=0, le=1, description="between chart and object on a shot's gain beyond their errors; 1 % costs 6° [1]"),
     ] = 0.01
     max_align_residual_px: Annotated[
         float, Meta(gt=0, description="estimated 1σ error of a shot's registration [px of the grid]")

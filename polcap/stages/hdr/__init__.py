@@ -126,7 +126,7 @@ def merge(capture: Capture, settings: Settings) -> AngleStack:
         camera_matrix=camera[0],
         white_balance=camera[1],
         light=_light(capture),
-        offset_px=np.array([shot.place_px for shot in shots]) - shots[0].place_px if capture.layout == "sensor" else None,
+        offset_px=_offsets(shots) if capture.layout == "sensor" else None,
     )
 
 
@@ -136,6 +136,11 @@ def _light(capture: Capture) -> Literal["flash", "steady", "one exposure", "unkn
         return "one exposure"
     fired = {frame.exif.flash_fired for shot in capture.shots for frame in shot.frames}
     return "flash" if True in fired else "steady" if fired == {False} else "unknown"
+
+
+def _offsets(shots: tuple[Shot, ...]) -> Floats:
+    """Where the planes of one mosaic stand against the first, (K, 2) px."""
+    return np.asarray([np.subtract(shot.place_px, shots[0].place_px) for shot in shots])
 
 
 def _stack(parts: list[Floats], factor: int) -> Floats:

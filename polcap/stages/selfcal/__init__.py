@@ -59,6 +59,8 @@ def solve(
     anchor = object_gains.combined([*_by_law(light, mask, quality, radiance, object_.crop), facing])
     greys = grey_patches.measure(radiance, alignment, color)
     source: Source
+    gain: Floats
+    sigma: Floats
     if radiance.light == "one exposure":
         gain, sigma, source = np.ones((shots, 3)), np.zeros((shots, 3)), "one exposure"
     elif greys is not None:

@@ -124,7 +124,8 @@ def facing(light: Floats, usable: Bools) -> Estimate:
     ratio = ratio[:, :: max(1, ratio.shape[1] // 40_000)]
     seeds = ratio[:, np.linspace(0, ratio.shape[1] - 1, _STARTS).astype(int)].T
     climbs = [_climb(ratio, start) for start in (np.median(ratio, axis=1), np.ones(shots), *seeds)]
-    height = np.array([np.exp(-((ratio - path[-1][:, None]) ** 2).sum(0) / (2 * _PEAK_WIDTH**2)).mean() for path in climbs])
+    away = np.stack([((ratio - path[-1][:, None]) ** 2).sum(0) for path in climbs])
+    height = np.exp(-away / (2 * _PEAK_WIDTH**2)).mean(1)
     best = int(np.argmax(height))
     gain = climbs[best][-1]
     odds = (height / max(float(height[best]), 1e-12)) ** 4
@@ -158,16 +159,14 @@ def _cells(light: Floats, usable: Bools) -> tuple[Floats, NDArray[np.int_]]:
     return means[:, bright], np.nonzero(whole)[0][bright]
 
 
-def _null_vector(
-    rows_at: Callable[[Floats], Floats], angle: Floats, part: NDArray[np.int_], floor: float
-) -> Estimate:
+def _null_vector(rows_at: Callable[[Floats], Floats], angle: Floats, part: NDArray[np.int_], floor: float) -> Estimate:
     """The h with h₀ = 1 that rows (P, C, K) take nearest to zero, as gains 1/h, by biweight.
 
     Its doubt: the scatter between parts (jackknife), and what an error of each angle does to it.
     """
     rows = rows_at(angle)
     trust = np.ones(len(rows))
-    h = np.ones(rows.shape[2])
+    h: Floats = np.ones(rows.shape[2])
     for _ in range(4):
         h = _solved(_square(rows, trust))
         residual = np.linalg.norm(rows @ h, axis=1)

@@ -7,6 +7,7 @@ with more than three shots, intensities that lie in the space of S0, S1, S2. Tie
 
 from dataclasses import dataclass
 from itertools import combinations, permutations
+from typing import Any
 
 import cv2
 import numpy as np
@@ -120,14 +121,14 @@ def _exchanged(shots: int) -> list[tuple[int, ...]]:
     return found
 
 
-def _phasor(at: Rim, angle: Floats) -> tuple[NDArray[np.complex128], Floats]:
+def _phasor(at: Rim, angle: Floats) -> tuple[NDArray[Any], Floats]:
     """Σ w e^{2i(φ − φ_contour)} and Σ w of every sector, (24,) each, w the DoLP up to what a body has."""
     s0, s1, s2 = np.linalg.lstsq(mueller.analyzer(angle), at.light, rcond=None)[0]
     polarization = (s1 + 1j * s2) / np.maximum(s0, 1e-9)
     weight = np.minimum(np.abs(polarization), _DOLP_CAP)
     phasor = weight * polarization / np.maximum(np.abs(polarization), 1e-12) * np.exp(-2j * at.azimuth)
     real, imaginary = (np.bincount(at.sector, part, _SECTORS) for part in (phasor.real, phasor.imag))
-    return real + 1j * imaginary, np.bincount(at.sector, weight, _SECTORS)
+    return real + 1j * imaginary, np.asarray(np.bincount(at.sector, weight, _SECTORS), np.float64)
 
 
 def _misfit(at: Rim, angle: Floats) -> float:
