@@ -14,7 +14,8 @@ from zlib import crc32
 
 import numpy as np
 
-from polcap import path, pipeline, stages, store
+from polcap import path, pipeline, stages
+from polcap.formats import npy_folder
 
 
 def versions() -> dict[str, int]:
@@ -30,7 +31,7 @@ def fingerprints(result: Path) -> dict[str, dict[str, Any]]:
     made = {}
     for kept in vars(opened).values():
         arrays: dict[str, Any] = {}
-        store.encode(kept.value, kept.name, arrays)
+        npy_folder.encode(kept.value, kept.name, arrays)
         made[kept.name] = {
             "version": version[kept.name],
             "arrays": {name: _told(name, a) for name, a in arrays.items()},
