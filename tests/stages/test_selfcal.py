@@ -49,7 +49,7 @@ def test_a_polarized_chart_disagrees_with_the_object():
     value[2, :, 224:300] *= 1.05  # as a chart turned away would
     color = dataclasses.replace(scenes.no_color(), quads=board_quads(), source="chart")
     assert solve(dataclasses.replace(radiance, value=value), color).disagreement > 0.02
-    assert solve(radiance, color).disagreement == 0
+    assert solve(radiance, color).disagreement < 1e-4
 
 
 def test_gloss_on_the_chart_shows_on_its_dark_patches():
