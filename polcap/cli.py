@@ -225,13 +225,31 @@ def export(
     result: Result,
     gltf: Annotated[bool, typer.Option("--gltf", help="asset/NAME.glb")] = False,
     obj: Annotated[bool, typer.Option("--obj", help="asset/NAME.obj, .mtl and textures")] = False,
+    usd: Annotated[bool, typer.Option("--usd", help="asset/NAME.usdc and textures (extra [usd])")] = False,
+    materialx: Annotated[bool, typer.Option("--materialx", help="asset/NAME.mtlx and textures")] = False,
+    exr: Annotated[bool, typer.Option("--exr", help="asset/NAME_layers.exr, every map as a layer")] = False,
+    preset: Annotated[
+        str | None, typer.Option(metavar="NAME", help="blender, unreal, unity, web or archive, into asset/NAME/.")
+    ] = None,
+    images: Annotated[
+        Literal["png", "jpeg", "webp", "ktx2"] | None, typer.Option(help="Kind of the pictures in the GLB.")
+    ] = None,
+    color: Annotated[
+        str, typer.Option(metavar="SPACE", help="Colour space or OCIO role of the EXR's colours, as ACEScg.")
+    ] = "lin_rec709",
     json: Json = False,
 ) -> None:
-    """Write the asset again from the maps of a result; without a flag, in every format."""
+    """Write the asset again from the maps of a result; without a flag GLB and OBJ, as `process` does."""
     from polcap import pipeline
+    from polcap.asset_export import Wanted
+    from polcap.formats import presets
 
-    formats = tuple(name for name, wanted in (("gltf", gltf), ("obj", obj)) if wanted) or ("gltf", "obj")
-    written = [str(file) for file in pipeline.export(result, formats)]
+    flags = {"gltf": gltf, "obj": obj, "usd": usd, "materialx": materialx, "exr": exr}
+    formats = tuple(name for name in presets.FORMATS if flags[name])
+    if preset is not None and formats:
+        raise SettingError(f"--preset {preset} brings its formats; leave out --{formats[0]}")
+    wanted = Wanted(formats or ("gltf", "obj"), preset, images, color)
+    written = [str(file) for file in pipeline.export(result, wanted)]
     terminal.say({"written": written} if json else "\n".join(written))
 
 

@@ -5,20 +5,19 @@ The stages and their order stand in `path.py`; this is what surrounds them: lock
 
 import json
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
 
-from polcap import pictures, report
+from polcap import asset_export, pictures, report
+from polcap.asset_export import Wanted
 from polcap.config import Config
 from polcap.errors import ModelError, SettingError, StorageError
-from polcap.formats import atomic, calib, gltf, obj, onnx, png
+from polcap.formats import atomic, calib, onnx, png, provenance
 from polcap.formats import maps as maps_folder
-from polcap.images import Asset, Capture, Network
+from polcap.images import Capture, Network
 from polcap.path import STAGES, Results, UserInput, path
-from polcap.stages import asset, surface
 from polcap.store import Archive, Progress, Store, contents, silent
 
 
@@ -53,7 +52,7 @@ def process(
         maps_folder.write(
             out / "maps", results.maps.value, results.mesh.value, results.stokes.value, results.cues.value
         )
-        write_asset(out, capture.name, results.asset.value)
+        asset_export.export(out, about, Wanted())
         report.write(out, about, results)
         progress("write", time.perf_counter() - start, False)
     return about
@@ -66,29 +65,17 @@ def plan(capture: Capture, supplied: UserInput, config: Config, out: Path, force
     return {kept.name: "on demand" if not kept.keep else "cached" if kept.ready else "compute" for kept in store.steps}
 
 
-def write_asset(out: Path, name: str, built: Asset, formats: tuple[str, ...] = ("gltf", "obj")) -> list[Path]:
-    """asset/NAME.glb, .obj and what the OBJ names."""
-    writers: dict[str, tuple[str, Callable[[Path, Asset, str], None]]] = {
-        "gltf": (".glb", gltf.write),
-        "obj": (".obj", obj.write),
-    }
-    written = []
-    for kind in formats:
-        suffix, write = writers[kind]
-        file = out / "asset" / f"{name}{suffix}"
-        write(file, built, name)
-        written.append(file)
-    return written
+def export(out: Path, wanted: Wanted) -> list[Path]:
+    """The asset again, from maps/ and report.json alone; returns the files.
 
-
-def export(out: Path, formats: tuple[str, ...]) -> list[Path]:
-    """The asset again, from maps/ alone."""
+    Raises
+    ------
+    SettingError
+        What is wanted does not exist, or needs what is not installed.
+    """
     about = report.read(out)
-    config = msgspec.convert(about["settings"], Config)
     with Store(out).lock():
-        stored = maps_folder.read(out / "maps")
-        mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, config.surface)
-        return write_asset(out, about["capture"]["name"], asset.build(stored.maps, mesh, config.asset), formats)
+        return asset_export.export(out, about, wanted)
 
 
 def reopen(out: Path) -> tuple[Results, dict[str, Any]]:
@@ -122,7 +109,8 @@ def judge_again(out: Path) -> dict[str, Any]:
     results, about = reopen(out)
     with Store(out).lock():
         config = msgspec.convert(about["settings"], Config)
-        again = report.document(about["capture"], results, config, None, timings(out)) | {"model": about["model"]}
+        fixed = {name: about[name] for name in ("model", "versions")}
+        again = report.document(about["capture"], results, config, None, timings(out)) | fixed
         if (out / "report.json").exists():
             again["keys"] = report.read(out)["keys"]
         report.write(out, again, results)
@@ -174,6 +162,11 @@ def _check_separate(out: Path, photographs: Path) -> None:
 def _remember_run(out: Path, capture: Capture, config: Config, network: Network | None) -> None:
     """work/run.json: what `show` and `report` need when the photographs are gone."""
     model = None if network is None else {**network.metadata, "digest": network.digest}
-    about = {"capture": report.capture_facts(capture), "settings": msgspec.to_builtins(config), "model": model}
+    about = {
+        "capture": report.capture_facts(capture),
+        "settings": msgspec.to_builtins(config),
+        "model": model,
+        "versions": provenance.versions(),
+    }
     with atomic.path(out / "work" / "run.json") as temporary:
         temporary.write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

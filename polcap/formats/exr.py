@@ -1,6 +1,6 @@
 """In: named channels. Out: one OpenEXR file, lossless; and back. The only writer through OpenImageIO."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,7 @@ from polcap.errors import DecodeError, StorageError
 from polcap.formats import atomic
 from polcap.images import Floats
 
-Attribute = str | int | float
+Attribute = str | int | float | tuple[float, ...]
 
 
 def write(
@@ -18,11 +18,12 @@ def write(
     channels: Mapping[str, Floats],
     attributes: Mapping[str, Attribute] | None = None,
     *,
-    half: bool = False,
+    half: bool | Collection[str] = False,
 ) -> None:
     """Write maps (H, W) under their channel names ("R", "normal.x", "S0.R"); ZIP, float32 or half.
 
-    Values beyond the range of half become its greatest. The same input gives the same bytes.
+    `half` may name the channels that are to be half. Values beyond the range of half become its
+    greatest. The same input gives the same bytes.
 
     Raises
     ------
@@ -31,16 +32,22 @@ def write(
     """
     names = list(channels)
     pixels = np.stack([np.asarray(channels[name], dtype=np.float32) for name in names], axis=-1)
-    if half:
-        greatest = np.float32(np.finfo(np.float16).max)
-        pixels = np.clip(pixels, -greatest, greatest)  # NaN stays
+    small = [half if isinstance(half, bool) else name in half for name in names]
+    if any(small):
+        limit = np.where(small, np.float32(np.finfo(np.float16).max), np.float32(np.inf))
+        pixels = np.clip(pixels, -limit, limit)  # NaN stays
     height, width, count = pixels.shape
-    spec = oiio.ImageSpec(width, height, count, oiio.HALF if half else oiio.FLOAT)
+    spec = oiio.ImageSpec(width, height, count, oiio.HALF if all(small) else oiio.FLOAT)
     spec.channelnames = names
+    if any(small) and not all(small):
+        spec.channelformats = tuple(oiio.TypeDesc("half" if one else "float") for one in small)
     spec.attribute("compression", "zip")
     spec.attribute("DateTime", "")  # else the hour of writing goes in, and no two files are equal
     for key, value in (attributes or {}).items():
-        spec.attribute(key, value)
+        if isinstance(value, tuple):
+            spec.attribute(key, oiio.TypeDesc(f"float[{len(value)}]"), value)
+        else:
+            spec.attribute(key, value)
     with atomic.path(path) as temporary:
         temporary.touch()  # an OSError here says more than OpenImageIO's text
         output = oiio.ImageOutput.create(str(temporary))

@@ -1,109 +1,94 @@
 """In: an Asset. Out: one binary glTF 2.0 file (GLB), written by hand.
 
 The camera frame is already glTF's: right-handed, y up, the viewer on +z, metres. The object is moved
-to the origin; `asset.extras` says from where.
+to the origin; `asset.extras` says from where. What the asset was made from stands in an XMP packet.
 
 References
 ----------
-Khronos, glTF 2.0; KHR_materials_specular; KHR_materials_ior.
+Khronos, glTF 2.0; KHR_materials_specular; KHR_materials_ior; KHR_xmp_json_ld; EXT_texture_webp;
+KHR_texture_basisu.
 """
 
 import json
 import struct
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from polcap import __version__
-from polcap.formats import atomic, png
-from polcap.images import Asset, Floats
+from polcap.formats import atomic, encoders, texture_set
+from polcap.formats.encoders import Kind
+from polcap.images import Asset, Floats, Mesh
 
 _FLOAT, _UINT32 = 5126, 5125
 _ARRAY, _ELEMENTS = 34962, 34963  # bufferView.target
 _LINEAR, _LINEAR_MIPMAP, _CLAMP = 9729, 9987, 33071
+_IMAGE_EXTENSION: dict[Kind, str] = {"webp": "EXT_texture_webp", "ktx2": "KHR_texture_basisu"}
+_CONTEXT = {
+    "rdf": "http://www.w3.org/1999/02/22-rdf-syntax-ns#",
+    "dc": "http://purl.org/dc/elements/1.1/",
+    "xmp": "http://ns.adobe.com/xap/1.0/",
+    "polcap": "urn:polcap:provenance:1",
+}
 
 
-def write(path: Path, asset: Asset, name: str) -> None:
-    """Write a GLB with embedded PNG textures; the same asset gives the same bytes.
+def write(
+    path: Path, asset: Asset, name: str, images: Kind = "png", provenance: Mapping[str, str] | None = None
+) -> None:
+    """Write a GLB with embedded textures; the same asset gives the same bytes.
 
     Raises
     ------
+    SettingError
+        No encoder for the kind of images.
     StorageError
         The file cannot be written.
     """
     with atomic.path(path) as temporary:
-        temporary.write_bytes(encode(asset, name))
+        temporary.write_bytes(encode(asset, name, images, provenance))
 
 
-def encode(asset: Asset, name: str) -> bytes:
-    """The bytes of the GLB."""
-    mesh = asset.mesh
-    middle = center(mesh.vertices)
+def encode(asset: Asset, name: str, images: Kind = "png", provenance: Mapping[str, str] | None = None) -> bytes:
+    """The bytes of the GLB; `provenance` goes into its XMP packet."""
     blob = _Blob()
-    position = blob.accessor((mesh.vertices - middle).astype(np.float32), "VEC3", bounds=True)
-    normal = blob.accessor(mesh.normals, "VEC3")
-    tangent = blob.accessor(mesh.tangents, "VEC4")
-    uv = blob.accessor(mesh.uv, "VEC2")
-    indices = blob.accessor(mesh.faces.reshape(-1).astype(np.uint32), "SCALAR")
-    pictures = {
-        "basecolor": asset.base_color,
-        "orm": asset.occlusion_roughness_metallic,
-        "normal": asset.normal,
-        "specular": asset.specular_color,
+    primitive = _primitive(asset.mesh, blob)
+    textures = {
+        "basecolor": texture_set.base_color(asset),
+        "orm": texture_set.packed(asset),
+        "normal": texture_set.normal(asset),
+        "specular": texture_set.relative_specular(asset),
     }
-    images = [blob.image(f"{name}_{key}", png.encode(value)) for key, value in pictures.items()]
-    material = {
-        "name": name,
-        "pbrMetallicRoughness": {
-            "baseColorTexture": {"index": 0},
-            "metallicRoughnessTexture": {"index": 1},
-            "metallicFactor": 0.0,
-            "roughnessFactor": 1.0,
-        },
-        "normalTexture": {"index": 2},
-        "extensions": {
-            "KHR_materials_specular": {
-                "specularColorFactor": list(asset.specular_factor),
-                "specularColorTexture": {"index": 3},
-            },
-            "KHR_materials_ior": {"ior": asset.ior},
-        },
-    }
+    pictures = [
+        blob.image(f"{name}_{key}", data, encoders.MIME[images])
+        for key, data in encoders.encode_all(textures, images).items()
+    ]
+    used = ["KHR_materials_specular", "KHR_materials_ior", "KHR_xmp_json_ld"]
+    required = [_IMAGE_EXTENSION[images]] if images in _IMAGE_EXTENSION else []
     document = {
         "asset": {
             "version": "2.0",
             "generator": f"polcap {__version__}",
             "extras": {
-                "unit": "metre" if mesh.metric else "relative",
-                "origin_in_camera": [float(x) for x in middle],
+                "unit": "metre" if asset.mesh.metric else "relative",
+                "origin_in_camera": [float(x) for x in center(asset.mesh.vertices)],
+                "textures": {f"{name}_{key}": texture.says for key, texture in textures.items()},
             },
+            "extensions": {"KHR_xmp_json_ld": {"packet": 0}},
         },
-        "extensionsUsed": ["KHR_materials_specular", "KHR_materials_ior"],
+        "extensionsUsed": used + required,
+        **({"extensionsRequired": required} if required else {}),
+        "extensions": {"KHR_xmp_json_ld": {"packets": [_packet(name, provenance or {})]}},
         "scene": 0,
         "scenes": [{"name": name, "nodes": [0]}],
         "nodes": [{"name": name, "mesh": 0}],
-        "meshes": [
-            {
-                "name": name,
-                "primitives": [
-                    {
-                        "attributes": {
-                            "POSITION": position,
-                            "NORMAL": normal,
-                            "TANGENT": tangent,
-                            "TEXCOORD_0": uv,
-                        },
-                        "indices": indices,
-                        "material": 0,
-                    }
-                ],
-            }
-        ],
-        "materials": [material],
-        "textures": [{"sampler": 0, "source": k} for k in range(len(images))],
+        "meshes": [{"name": name, "primitives": [primitive]}],
+        "materials": [_material(asset, name)],
+        "textures": [_texture(k, images) for k in range(len(pictures))],
         "samplers": [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP, "wrapS": _CLAMP, "wrapT": _CLAMP}],
-        "images": images,
+        "images": pictures,
         "accessors": blob.accessors,
         "bufferViews": blob.views,
         "buffers": [{"byteLength": len(blob.data)}],
@@ -122,9 +107,68 @@ def encode(asset: Asset, name: str) -> bytes:
     )
 
 
+def _primitive(mesh: Mesh, blob: "_Blob") -> dict[str, Any]:
+    return {
+        "attributes": {
+            "POSITION": blob.accessor((mesh.vertices - center(mesh.vertices)).astype(np.float32), "VEC3", bounds=True),
+            "NORMAL": blob.accessor(mesh.normals, "VEC3"),
+            "TANGENT": blob.accessor(mesh.tangents, "VEC4"),
+            "TEXCOORD_0": blob.accessor(mesh.uv, "VEC2"),
+        },
+        "indices": blob.accessor(mesh.faces.reshape(-1).astype(np.uint32), "SCALAR"),
+        "material": 0,
+    }
+
+
+def _material(asset: Asset, name: str) -> dict[str, Any]:
+    return {
+        "name": name,
+        "doubleSided": is_open(asset.mesh.faces),
+        "pbrMetallicRoughness": {
+            "baseColorTexture": {"index": 0},
+            "metallicRoughnessTexture": {"index": 1},
+            "metallicFactor": 0.0,
+            "roughnessFactor": 1.0,
+        },
+        "normalTexture": {"index": 2},
+        "extensions": {
+            "KHR_materials_specular": {
+                "specularColorFactor": list(asset.specular_factor),
+                "specularColorTexture": {"index": 3},
+            },
+            "KHR_materials_ior": {"ior": asset.ior},
+        },
+    }
+
+
+def _texture(source: int, images: Kind) -> dict[str, Any]:
+    if images in _IMAGE_EXTENSION:
+        return {"sampler": 0, "extensions": {_IMAGE_EXTENSION[images]: {"source": source}}}
+    return {"sampler": 0, "source": source}
+
+
+def _packet(name: str, provenance: Mapping[str, str]) -> dict[str, Any]:
+    """Dublin Core and polcap's own words, as JSON-LD."""
+    return {
+        "@context": _CONTEXT,
+        "@id": "",
+        "dc:title": {"@type": "rdf:Alt", "rdf:_1": {"@language": "x-default", "@value": name}},
+        "dc:format": "model/gltf-binary",
+        "xmp:CreatorTool": f"polcap {__version__}",
+        **{f"polcap:{key}": said for key, said in provenance.items()},
+    }
+
+
 def center(vertices: Floats) -> Floats:
     """Middle of the bounding box (3,): the asset's origin."""
     return np.asarray((vertices.min(axis=0).astype(np.float64) + vertices.max(axis=0)) / 2)
+
+
+def is_open(faces: NDArray[np.int32]) -> bool:
+    """Some edge belongs to one triangle only: the surface has a back that can be seen."""
+    ends = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
+    _, count = np.unique(ends[:, 0] * (int(faces.max()) + 1) + ends[:, 1], return_counts=True)
+    return bool((count == 1).any())
 
 
 class _Blob:
@@ -150,8 +194,8 @@ class _Blob:
         self.accessors.append(entry)
         return len(self.accessors) - 1
 
-    def image(self, name: str, data: bytes) -> dict[str, Any]:
-        return {"name": name, "bufferView": self._view(data), "mimeType": "image/png"}
+    def image(self, name: str, data: bytes, mime: str) -> dict[str, Any]:
+        return {"name": name, "bufferView": self._view(data), "mimeType": mime}
 
     def _view(self, data: bytes, **fields: int) -> int:
         self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data), **fields})

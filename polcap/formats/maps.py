@@ -1,6 +1,7 @@
 """In: the maps of an object. Out: the folder maps/ of a result, as docs/reference/result.md says; and back."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -64,11 +65,9 @@ def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues
     png.write(folder / "diffuse.png", _picture(_kept(maps.diffuse, inside)))
     png.write(folder / "specular.png", _picture(_kept(maps.specular, inside)))
     png.write(folder / "roughness.png", png.sixteen_bits(_kept(maps.roughness, inside)))
+    png.write(folder / "photograph.png", _picture(cues.radiance))
     png.write(folder / "mask.png", np.where(inside, 255, 0).astype(np.uint8))
-    with atomic.path(folder / "maps.json") as temporary:
-        temporary.write_text(
-            json.dumps(_description(maps, mesh.metric, near, far), indent=2, ensure_ascii=False) + "\n", "utf-8"
-        )
+    _write_json(folder / "maps.json", _description(maps, mesh.metric, near, far))
 
 
 def read(folder: Path) -> Stored:
@@ -121,6 +120,25 @@ def read(folder: Path) -> Stored:
     )
 
 
+def note_export(folder: Path, where: str, said: Mapping[str, Any]) -> None:
+    """Write into maps.json what the export in the result's folder `where` holds.
+
+    Raises
+    ------
+    StorageError
+        The file cannot be written.
+    """
+    file = folder / "maps.json"
+    known = json.loads(file.read_text("utf-8"))
+    known["exports"] = dict(sorted({**known.get("exports", {}), where: said}.items()))
+    _write_json(file, known)
+
+
+def _write_json(file: Path, content: Mapping[str, Any]) -> None:
+    with atomic.path(file) as temporary:
+        temporary.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", "utf-8")
+
+
 def _description(maps: SurfaceMaps, metric: bool, near: float, far: float) -> dict[str, Any]:
     """maps.json."""
     view = maps.view
@@ -153,6 +171,7 @@ def _description(maps: SurfaceMaps, metric: bool, near: float, far: float) -> di
             "specular.png": encoded,
             "roughness.exr": "perceptual roughness, alpha = roughness squared, linear; half",
             "roughness.png": "16 bit, linear",
+            "photograph.png": "S0 of the whole crop, linear Rec.709 with chart white = its reflectance; 8 bit, sRGB",
             "mask.png": "8 bit, 255 on the object",
             "confidence.exr": "expected error of the normal, degrees; half",
             "stokes.exr": "S0.R ... S2.B in camera channels, linear, sensor white at the reference exposure = 1; half",

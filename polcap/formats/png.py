@@ -6,6 +6,7 @@ numbers mean is said beside the file (maps.json, the material).
 
 import struct
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from polcap.formats import atomic
 from polcap.images import Floats
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+_HEADER = 33  # bytes of the signature and of IHDR, which stands first
 
 
 def write(path: Path, array: Pixels) -> None:
@@ -32,14 +34,21 @@ def write(path: Path, array: Pixels) -> None:
         temporary.write_bytes(encode(array))
 
 
-def encode(array: Pixels) -> bytes:
-    """The bytes of the PNG."""
+def encode(array: Pixels, text: Mapping[str, str] | None = None) -> bytes:
+    """The bytes of the PNG; `text` goes into tEXt chunks under its keywords (Latin-1, as PNG has it)."""
     if array.dtype not in (np.uint8, np.uint16):
         raise TypeError(f"PNG holds uint8 or uint16, not {array.dtype}")
     done, data = cv2.imencode(".png", _swapped(array), [cv2.IMWRITE_PNG_COMPRESSION, 4])
     if not done:
         raise StorageError(f"cannot encode a picture of {array.shape} as PNG; report this as a bug")
-    return bytes(data.tobytes())
+    header, rest = bytes(data[:_HEADER]), bytes(data[_HEADER:])
+    chunks = [_text_chunk(key, said) for key, said in (text or {}).items()]
+    return b"".join([header, *chunks, rest])
+
+
+def _text_chunk(key: str, said: str) -> bytes:
+    body = b"tEXt" + key.encode("latin-1") + b"\0" + said.encode("latin-1", "replace")
+    return struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
 
 
 def indexed(level: NDArray[np.uint8], colors: NDArray[np.uint8]) -> bytes:

@@ -16,7 +16,7 @@ import numpy as np
 from polcap import __version__
 from polcap.config import Config, Gates
 from polcap.errors import StorageError
-from polcap.formats import atomic
+from polcap.formats import atomic, provenance
 from polcap.images import (
     Capture,
     Floats,
@@ -224,6 +224,7 @@ def document(
     gates = judge(found, bool(capture["focal_known"]), config.gates)
     return {
         "polcap": __version__,
+        "versions": provenance.versions(),
         "verdict": verdict(gates),
         "capture": capture,
         "gates": msgspec.to_builtins(gates),

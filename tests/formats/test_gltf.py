@@ -12,6 +12,7 @@ import pytest
 import trimesh
 
 from polcap.formats import gltf
+from polcap.formats.encoders import Kind
 from polcap.images import Asset
 from tests import surfaces
 
@@ -32,11 +33,12 @@ def document(data: bytes) -> dict[str, Any]:
     return dict(json.loads(data[20 : 20 + length]))
 
 
-def test_khronos_validator_finds_nothing(asset: Asset, tmp_path: Path) -> None:
+@pytest.mark.parametrize("images", ["png", "jpeg", "webp"])
+def test_khronos_validator_finds_nothing(asset: Asset, tmp_path: Path, images: Kind) -> None:
     node = shutil.which("node")
     if node is None or not (NODE / "node_modules" / "gltf-validator").is_dir():
         pytest.skip("needs node, and `npm ci` in tests/gltf")
-    gltf.write(tmp_path / "ball.glb", asset, "ball")
+    gltf.write(tmp_path / "ball.glb", asset, "ball", images, {"unit": "m"})
     done = subprocess.run(
         [node, str(NODE / "validate.js"), str(tmp_path / "ball.glb")],
         capture_output=True, check=True, timeout=60,
@@ -44,7 +46,8 @@ def test_khronos_validator_finds_nothing(asset: Asset, tmp_path: Path) -> None:
     report = json.loads(done.stdout)
     issues = report["issues"]
     assert (issues["numErrors"], issues["numWarnings"], issues["numHints"]) == (0, 0, 0), issues["messages"]
-    assert {message["code"] for message in issues["messages"]} <= {"IMAGE_NPOT_DIMENSIONS"}  # fine since WebGL 2
+    known = {"IMAGE_NPOT_DIMENSIONS", "UNSUPPORTED_EXTENSION"}  # fine since WebGL 2; XMP, which it does not know
+    assert {message["code"] for message in issues["messages"]} <= known
     assert report["info"]["totalTriangleCount"] == len(asset.mesh.faces)
 
 
@@ -74,3 +77,16 @@ def test_same_asset_gives_the_same_bytes(asset: Asset) -> None:
 
 def test_names_outside_ascii_survive(asset: Asset) -> None:
     assert document(gltf.encode(asset, "Krug “ø”"))["nodes"][0]["name"] == "Krug “ø”"
+
+
+def test_provenance_stands_in_the_packet(asset: Asset) -> None:
+    said = document(gltf.encode(asset, "ball", provenance={"settings": "{}"}))
+    packet = said["extensions"]["KHR_xmp_json_ld"]["packets"][said["asset"]["extensions"]["KHR_xmp_json_ld"]["packet"]]
+    assert packet["polcap:settings"] == "{}" and packet["dc:title"]["rdf:_1"]["@value"] == "ball"
+    assert packet["@context"]["dc"] == "http://purl.org/dc/elements/1.1/"
+
+
+def test_open_surface_is_seen_from_behind_too(asset: Asset) -> None:
+    assert document(gltf.encode(asset, "ball"))["materials"][0]["doubleSided"] is True
+    tetrahedron = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]], dtype=np.int32)
+    assert gltf.is_open(tetrahedron[:3]) and not gltf.is_open(tetrahedron)

@@ -7,7 +7,7 @@ against the maps, not against what the writer believes.
 import numpy as np
 import pytest
 
-from polcap.formats import gltf, obj
+from polcap.formats import encoders, gltf, obj, texture_set
 from polcap.images import Floats, SurfaceMaps
 from tests import surfaces
 from tests.render import browser
@@ -32,7 +32,10 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Pictures:
     for shape, mesh in (("ball", surfaces.mesh(surfaces.maps())), ("plane", surfaces.flat_mesh(RIPPLED))):
         asset = surfaces.built(RIPPLED, mesh)
         gltf.write(folder / f"{shape}.glb", asset, shape)
-        obj.write(folder / f"{shape}.obj", asset, shape)
+        files = {key: f"{shape}_{key}.png" for key in texture_set.LOOSE}
+        obj.write(folder / f"{shape}.obj", asset, shape, files)
+        for key, file in files.items():
+            (folder / file).write_bytes(encoders.encode(texture_set.LOOSE[key](asset), "png"))
         for suffix in ("glb", "obj"):
             file = folder / f"{shape}.{suffix}"
             jobs.append(browser.Job(file.name, file, mesh, RIPPLED.view, tuple(LIGHTS.values())))

@@ -36,9 +36,7 @@ def estimate(cues: Cues, ior: float) -> SurfaceMaps:
     )
 
 
-def invert(
-    cues: Cues, ior: float, guide: tuple[Floats, Floats] | None = None
-) -> tuple[Floats, Floats, Floats]:
+def invert(cues: Cues, ior: float, guide: tuple[Floats, Floats] | None = None) -> tuple[Floats, Floats, Floats]:
     """Normals (H, W, 3), their expected error (H, W) in degrees and cosines of the zenith (H, W).
 
     Zenith by the exact DoLP inversion; half-turn of the azimuth by `stages/infer/azimuth.py`, or as `guide` has it:

@@ -21,7 +21,7 @@ def mean(cues: Cues, network: Network, symmetries: int) -> dict[str, Floats]:
     """
     picture, rays = np.moveaxis(channels(cues), 0, -1), cues.rays
     total: dict[str, Floats] = {}
-    for quarters, mirror in _POSITIONS[: symmetries]:
+    for quarters, mirror in _POSITIONS[:symmetries]:
         turned = _turn(picture, quarters, mirror)
         maps = _run(np.moveaxis(_turn_channels(turned, quarters, mirror), -1, 0), network)
         own = np.array(_turn(rays, quarters, mirror))

@@ -1,0 +1,175 @@
+"""In: the maps of a result. Out: its asset in the formats of a program or purpose, and what it was made from.
+
+Everything comes from the stored maps and report.json, for `process` as for `polcap export`: the same
+result gives the same bytes, whenever and with however many threads.
+"""
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from polcap.config import Config
+from polcap.errors import SettingError
+from polcap.formats import atomic, encoders, exr_layers, gltf, materialx, obj, ocio, provenance, texture_set, usd
+from polcap.formats import maps as maps_folder
+from polcap.formats.encoders import Kind
+from polcap.formats.presets import PRESETS, Format, Preset
+from polcap.formats.texture_set import Key, Texture
+from polcap.images import Asset
+from polcap.stages import asset, surface
+
+_SHARING = {"obj", "usd", "materialx"}  # formats whose textures lie beside them, and are the same
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What an export is to hold; a preset excludes formats."""
+
+    formats: tuple[Format, ...] = ("gltf", "obj")
+    preset: str | None = None
+    images: Kind | None = None  # inside the GLB; by default the preset's, or PNG
+    color: str = ocio.INSIDE  # colour space or role of the colours in the layered EXR
+
+
+def export(out: Path, about: Mapping[str, Any], wanted: Wanted) -> list[Path]:
+    """Write the asset of a result folder again; returns the files, the sidecar last.
+
+    `about` is report.json's content. Without a preset the files go to asset/, with one to asset/PRESET/.
+
+    Raises
+    ------
+    SettingError
+        No such preset or colour space, or a package or an encoder is missing.
+    """
+    preset = _preset(wanted)
+    if "usd" in preset.formats:
+        usd.require()
+    config = msgspec.convert(about["settings"], Config)
+    stored = maps_folder.read(out / "maps")
+    mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, config.surface)
+    job = _Job(
+        folder=out / "asset" / (wanted.preset or ""),
+        maps=out / "maps",
+        asset=asset.build(stored.maps, mesh, config.asset),
+        name=str(about["capture"]["name"]),
+        preset=preset,
+        images=wanted.images or preset.images,
+        color=wanted.color,
+        record=provenance.record(about),
+    )
+    written = job.write()
+    maps_folder.note_export(out / "maps", job.folder.relative_to(out).as_posix(), job.said())
+    return written
+
+
+def _preset(wanted: Wanted) -> Preset:
+    if wanted.preset is None:
+        return Preset(wanted.formats, "normals +Y")
+    if wanted.preset not in PRESETS:
+        raise SettingError(f"--preset {wanted.preset} is none of {', '.join(PRESETS)}")
+    return PRESETS[wanted.preset]
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One export under way."""
+
+    folder: Path
+    maps: Path
+    asset: Asset
+    name: str
+    preset: Preset
+    images: Kind
+    color: str
+    record: Mapping[str, Any]
+
+    def write(self) -> list[Path]:
+        """Every file of the export, in threads, and the sidecar."""
+        writers: dict[Format, Callable[[], list[Path]]] = {
+            "gltf": self._gltf,
+            "obj": self._obj,
+            "usd": self._usd,
+            "materialx": self._materialx,
+            "exr": self._exr,
+        }
+        tasks = [writers[one] for one in self.preset.formats]
+        tasks += [partial(self._texture, file, made) for file, made in self.loose().items()]
+        with ThreadPoolExecutor(len(tasks)) as pool:
+            running = [pool.submit(task) for task in tasks]
+            written = [file for one in running for file in one.result()]
+        sidecar = self.folder / f"{self.stem}.provenance.json"
+        provenance.write(sidecar, self.record, written)
+        return [*written, sidecar]
+
+    def loose(self) -> dict[str, Texture]:
+        """The textures that lie beside the asset, by file name."""
+        named = {pattern.format(obj.stem(self.name)): make for pattern, make in self.preset.textures.items()}
+        textures = {f"{name}.png": make(self.asset) for name, make in named.items()}
+        if _SHARING.intersection(self.preset.formats):
+            textures |= {file: texture_set.LOOSE[key](self.asset) for key, file in self.files.items()}
+        return textures
+
+    def said(self) -> dict[str, Any]:
+        """What maps.json tells of the export."""
+        return {
+            "for": self.preset.says,
+            "unit": self.unit,
+            "glb_images": self.images,
+            "textures": {file: texture.says for file, texture in sorted(self.loose().items())},
+        }
+
+    @property
+    def stem(self) -> str:
+        return self.preset.name.format(self.name)
+
+    @property
+    def files(self) -> dict[Key, str]:
+        """Names of the textures that OBJ, USD and MaterialX share."""
+        return {key: f"{obj.stem(self.stem)}_{key}.png" for key in texture_set.LOOSE}
+
+    @property
+    def unit(self) -> str:
+        return "m" if self.asset.mesh.metric else "relative"
+
+    @property
+    def words(self) -> dict[str, str]:
+        """For formats that hold texts."""
+        return {"unit": self.unit, "normals": "+Y (OpenGL)", **provenance.words(self.record)}
+
+    @property
+    def line(self) -> str:
+        """For formats that hold a comment."""
+        return f"polcap; unit of length: {self.unit}; normals +Y (OpenGL); made from: {self.stem}.provenance.json"
+
+    def _texture(self, file: str, texture: Texture) -> list[Path]:
+        with atomic.path(self.folder / file) as temporary:
+            temporary.write_bytes(encoders.encode(texture, "png", text=True))
+        return [self.folder / file]
+
+    def _gltf(self) -> list[Path]:
+        file = self.folder / f"{self.stem}.glb"
+        gltf.write(file, self.asset, self.stem, self.images, self.words)
+        return [file]
+
+    def _obj(self) -> list[Path]:
+        return obj.write(self.folder / f"{self.stem}.obj", self.asset, self.stem, self.files, self.line)
+
+    def _usd(self) -> list[Path]:
+        file = self.folder / f"{self.stem}.usdc"
+        usd.write(file, self.asset, self.stem, self.files, self.words)
+        return [file]
+
+    def _materialx(self) -> list[Path]:
+        file = self.folder / f"{self.stem}.mtlx"
+        materialx.write(file, self.asset, self.stem, self.files, self.line)
+        return [file]
+
+    def _exr(self) -> list[Path]:
+        file = self.folder / f"{self.stem}_layers.exr"
+        exr_layers.write(file, self.maps, self.color, self.words)
+        return [file]

@@ -1,0 +1,70 @@
+"""In: a result's report and the files of an export. Out: what they were made from, as a sidecar and as words."""
+
+import json
+from collections.abc import Iterable, Mapping
+from hashlib import blake2b
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from polcap import __version__
+from polcap.formats import atomic
+
+_PARTS = (
+    "numpy", "scipy", "opencv-contrib-python-headless", "onnxruntime", "rawpy", "OpenImageIO", "colour-science",
+    "trimesh",
+)  # fmt: skip
+
+
+def versions() -> dict[str, str]:
+    """polcap and the packages that decide on pixels, as installed."""
+    found = {"polcap": __version__}
+    for name in _PARTS:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def record(about: Mapping[str, Any]) -> dict[str, Any]:
+    """What report.json tells of where a result comes from."""
+    capture, model = about["capture"], about["model"]
+    return {
+        "format": "polcap provenance 1",
+        "name": capture["name"],
+        "camera": capture["camera"],
+        "photographs": [
+            {"file": frame["file"], "angle_deg": shot["angle_deg"], "blake2b": frame["digest"]}
+            for shot in capture["shots"]
+            for frame in shot["frames"]
+        ],
+        "versions": about.get("versions", {"polcap": about["polcap"]}),
+        "model": model,  # of the network, as its file tells; its card is calib/models/polcap.md; null: analytic
+        "settings": about["settings"],
+        "stages": about["keys"],
+        "random_seeds": "fixed in the stages, part of their versions",
+    }
+
+
+def words(told: Mapping[str, Any]) -> dict[str, str]:
+    """The same as texts, for formats that keep only those."""
+    return {key: value if isinstance(value, str) else _plain(value) for key, value in told.items()}
+
+
+def write(path: Path, told: Mapping[str, Any], files: Iterable[Path]) -> None:
+    """The sidecar: the record, and the digest of every file of the export.
+
+    Raises
+    ------
+    StorageError
+        The file cannot be written.
+    """
+    digests = {file.name: blake2b(file.read_bytes(), digest_size=20).hexdigest() for file in sorted(files)}
+    with atomic.path(path) as temporary:
+        text = json.dumps({**told, "files": digests}, indent=1, ensure_ascii=False)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def _plain(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=True, separators=(",", ":"))

@@ -1,0 +1,115 @@
+"""`polcap export`: every preset whole and valid, the same bytes whenever, one line where it cannot."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from polcap.formats import encoders, png
+from polcap.formats.presets import PRESETS
+from tests.conftest import Command
+from tests.formats.test_gltf import NODE, document
+
+
+@pytest.fixture(scope="module")
+def exported(result: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The bundled capture's result with every preset exported."""
+    from polcap import pipeline
+    from polcap.asset_export import Wanted
+
+    pytest.importorskip("pxr", reason="needs usd-core")
+    copy = tmp_path_factory.mktemp("export") / "copy"
+    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
+    for preset in PRESETS:
+        pipeline.export(copy, Wanted(preset=preset))
+    return copy
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_validator_finds_no_error_and_no_warning(exported: Path, preset: str) -> None:
+    node = shutil.which("node")
+    if node is None or not (NODE / "node_modules" / "gltf-validator").is_dir():
+        pytest.skip("needs node, and `npm ci` in tests/gltf")
+    (glb,) = (exported / "asset" / preset).glob("*.glb")
+    done = subprocess.run([node, str(NODE / "validate.js"), str(glb)], capture_output=True, check=True, timeout=60)
+    issues = json.loads(done.stdout)["issues"]
+    assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_maps_json_and_the_files_say_what_they_hold(exported: Path, preset: str) -> None:
+    said = json.loads((exported / "maps" / "maps.json").read_text())["exports"][f"asset/{preset}"]
+    assert said["unit"] in ("m", "relative") and "+Y" in said["for"]
+    for name, meaning in said["textures"].items():
+        assert meaning.encode() in (exported / "asset" / preset / name).read_bytes()[:300]
+
+
+def test_unreal_gets_green_down_and_unity_smoothness(exported: Path) -> None:
+    assets = exported / "asset"
+    down, up = (png.read(assets / name) for name in ("unreal/T_capture_N.png", "unity/capture_Normal.png"))
+    assert np.array_equal(down[..., 1], 255 - up[..., 1]) and np.array_equal(down[..., ::2], up[..., ::2])
+    packed, mask = (png.read(assets / name) for name in ("unreal/T_capture_ORM.png", "unity/capture_MaskMap.png"))
+    assert np.array_equal(mask[..., 3], 255 - packed[..., 1]) and mask[..., 0].max() == 0
+
+
+def test_sidecar_knows_photographs_settings_and_files(exported: Path) -> None:
+    told = json.loads((exported / "asset" / "archive" / "capture.provenance.json").read_text())
+    about = json.loads((exported / "report.json").read_text())
+    assert [one["blake2b"] for one in told["photographs"]] == [
+        frame["digest"] for shot in about["capture"]["shots"] for frame in shot["frames"]
+    ]
+    assert told["settings"] == about["settings"] and told["stages"] == about["keys"]
+    assert told["versions"]["polcap"] == about["polcap"] and "numpy" in told["versions"]
+    files = {file.name for file in (exported / "asset" / "archive").iterdir()}
+    assert set(told["files"]) == files - {"capture.provenance.json"}
+    packet = document((exported / "asset/archive/capture.glb").read_bytes())["extensions"]["KHR_xmp_json_ld"][
+        "packets"
+    ][0]
+    assert json.loads(packet["polcap:settings"]) == about["settings"]
+
+
+def test_exporting_again_gives_the_bytes_that_process_wrote(result: Path, polcap: Command, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
+    before = {file.name: file.read_bytes() for file in (copy / "asset").iterdir()}
+    shutil.rmtree(copy / "asset")
+    cv2.setNumThreads(1)
+    try:
+        assert polcap("export", copy).returncode == 0
+    finally:
+        cv2.setNumThreads(-1)
+    assert {file.name: file.read_bytes() for file in (copy / "asset").iterdir()} == before
+    assert (copy / "maps/maps.json").read_bytes() == (result / "maps/maps.json").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        (["--preset", "maya"], "--preset maya is none of blender, unreal, unity, web, archive"),
+        (["--preset", "web", "--obj"], "leave out --obj"),
+        (["--exr", "--color", "ACEScq"], "--color ACEScq is no colour space or role"),
+    ],
+)
+def test_what_does_not_exist_is_one_line(result: Path, polcap: Command, flags: list[str], says: str) -> None:
+    done = polcap("export", result, *flags)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and says in done.stderr
+
+
+def test_ktx2_needs_an_encoder_and_says_so(result: Path, polcap: Command) -> None:
+    if encoders.ktx2_encoder() is not None:
+        pytest.skip("an encoder is here")
+    done = polcap("export", result, "--gltf", "--images", "ktx2")
+    assert done.returncode == 2 and "ktx" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_usd_without_its_package_is_one_line_with_the_remedy(
+    result: Path, polcap: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    done = polcap("export", result, "--usd")
+    assert done.returncode == 2 and "pip install 'polcap[usd]'" in done.stderr and done.stderr.count("\n") == 1
