@@ -144,8 +144,9 @@ def test_export_needs_the_maps_alone_and_tells_what_it_wrote(result: Path, polca
     shutil.rmtree(copy / "work")
     shutil.rmtree(copy / "asset")
     done = polcap("export", copy, "--gltf")
-    assert done.stdout == f"{copy / 'asset' / 'capture.glb'}\n", done.stderr
-    assert [file.name for file in (copy / "asset").iterdir()] == ["capture.glb"]
+    written = [str(copy / "asset" / name) for name in ("capture.glb", "capture.provenance.json")]
+    assert done.stdout.split() == written, done.stderr
+    assert sorted(str(file) for file in (copy / "asset").iterdir()) == written
 
 
 def test_status_and_report_speak_json(result: Path, polcap: Command, tmp_path: Path) -> None:
