@@ -1,7 +1,8 @@
 """The one renderer of maps: normals and material under one light -> Stokes parameters of every pixel.
 
 A dielectric lit by an unpolarized point: diffuse light enters and leaves through two Fresnel
-transmissions, GGX facets reflect with Fresnel's coefficients. Local: no shadow, no interreflection
+transmissions, of a smooth interface or of rough facets (`optics/body.py`), GGX facets reflect with Fresnel's
+coefficients. Local: no shadow, no interreflection
 (those belong to whoever owns the geometry). Works on NumPy and torch.
 
 References
@@ -14,12 +15,22 @@ from typing import Any
 
 from array_api_compat import array_namespace
 
+from polcap.optics import body as bodies
 from polcap.optics import brdf, fresnel
 
 _LEAST_COSINE = 1e-4
 
 
-def stokes(normal: Any, diffuse: Any, specular: Any, roughness: Any, ior: Any, to_light: Any, irradiance: Any) -> Any:
+def stokes(
+    normal: Any,
+    diffuse: Any,
+    specular: Any,
+    roughness: Any,
+    ior: Any,
+    to_light: Any,
+    irradiance: Any,
+    law: bodies.Law = bodies.SMOOTH,
+) -> Any:
     """Stokes parameters (3, ..., 3) towards the camera, in the frame of `optics/frames.py` on each ray.
 
     Parameters
@@ -29,6 +40,7 @@ def stokes(normal: Any, diffuse: Any, specular: Any, roughness: Any, ior: Any, t
     diffuse, specular : (..., 3) ρ_d and F0, linear.
     roughness, ior : (...,) perceptual roughness; refractive index of the body and its surface.
     irradiance : (...,) on a plane facing the light, so that a white Lambertian plane has S0 = irradiance.
+    law : how the body lets light in and out.
 
     Notes
     -----
@@ -40,8 +52,15 @@ def stokes(normal: Any, diffuse: Any, specular: Any, roughness: Any, ior: Any, t
     lit = (cos_i > 0) & (normal[..., 2] > 0)
     cos_i = xp.clip(cos_i, _LEAST_COSINE, 1.0)
 
-    in_plus, _ = fresnel.transmission(cos_i, ior)
-    out_plus, out_minus = fresnel.transmission(cos_o, ior)
+    alpha = roughness * roughness
+    if law is bodies.SMOOTH:
+        in_plus, _ = fresnel.transmission(cos_i, ior)
+        out_plus, out_minus = fresnel.transmission(cos_o, ior)
+    else:
+        in_plus, _ = bodies.leaving(cos_i, law.rough * alpha, ior)
+        out_plus, out_minus = bodies.leaving(cos_o, law.rough * alpha, ior, law.local)
+        in_plus = in_plus * (1 + law.local * (bodies.flatter(cos_i, cos_o, to_light[..., 2], law.rough * alpha) - 1))
+        out_minus = out_minus * law.kept
     body = irradiance * cos_i * in_plus
 
     ray = xp.zeros_like(to_light)
@@ -50,7 +69,6 @@ def stokes(normal: Any, diffuse: Any, specular: Any, roughness: Any, ior: Any, t
     half = half / xp.sum(half * half, axis=-1)[..., None] ** 0.5
     cos_h = xp.clip(xp.sum(normal * half, axis=-1), _LEAST_COSINE, 1.0)
     cos_d = xp.clip(half[..., 2], _LEAST_COSINE, 1.0)  # θ_d = ∠(light, half) = ∠(ray, half)
-    alpha = roughness * roughness
     reflect_plus, reflect_minus = fresnel.reflection(cos_d, ior)
     facets = irradiance * pi * brdf.ggx_distribution(cos_h, alpha) * brdf.smith_masking(cos_i, cos_o, alpha)
     facets = facets / (4 * cos_o) / fresnel.normal_reflectance(ior)  # specular = k_s F0(n)

@@ -5,13 +5,14 @@ In the order a sample meets them:
     shapes      random closed meshes
     gbuffers    meshes -> a cache of views: normal, depth, position
     bounce      light that one part of a view throws on another
-    materials   a view -> diffuse, specular, roughness, refractive index, bumped normal
+    materials   a view -> diffuse, specular, roughness, refractive index, bumped normal; gloss draws how surfaces
+                reflect and by what law their bodies polarize
     camera      Stokes parameters -> what three noisy photographs would have measured of them
     dataset     all of these -> a batch: network channels and truth
     model       channels -> maps; profiles and palette are its parts that read gloss and draw albedo
     variants    the network with one thing taken away
     loss        maps against truth
-    train       the loop, checkpoints, metrics
+    train       the loop, checkpoints, metrics; arithmetic says in which numbers
     watch       a look at held-out pictures as training goes
     export      weights -> ONNX
     corpus      the same simulator's pictures and truth as files

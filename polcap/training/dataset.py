@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from polcap.images import Quality
 from polcap.optics import frames, shade
 from polcap.stages import cues
-from polcap.training import bounce, gbuffers, materials
+from polcap.training import bounce, gbuffers, gloss, materials
 from polcap.training.camera_errors import Errors, photograph
 
 Indices = NDArray[np.integer[Any]]
@@ -35,6 +35,7 @@ class Batch:
     specular: Tensor  # (B, 3, H, W)
     roughness: Tensor  # (B, 1, H, W)
     highlight: Tensor  # (B, 1, H, W) share of S0 that the surface reflects
+    law: Tensor  # (B, 3, H, W) fields of `body.Law`, for the rendering loss
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class Photo:
     given: Tensor  # (B, H, W) bool, the mask
     rays: Tensor  # (B, H, W, 3)
     mask: Tensor  # (B, H, W) bool, the object
-    truth: dict[str, Tensor]  # (B, H, W, ·): normal (ray frame), depth, diffuse, specular, roughness, highlight
+    truth: dict[str, Tensor]  # (B, H, W, ·): normal (ray frame), depth, diffuse, specular, roughness, highlight, law
 
 
 @dataclass(frozen=True)
@@ -135,23 +136,29 @@ class Simulator:
         to = there[self.views["met"].take(cell, axis=0)]  # (M, RAYS)
         return np.where(to >= 0, row[to + owner[:, None] * area], -1)
 
-    def shoot(self, seen: Seen, strength: Tensor, errors: Errors, jitter: Tensor | None = None) -> Photo:
+    def shoot(
+        self,
+        seen: Seen,
+        strength: Tensor,
+        errors: Errors,
+        jitter: Tensor | None = None,
+        smooth_share: float = gloss.SMOOTH_SHARE,
+    ) -> Photo:
         """Dress, light and photograph.
 
         strength (B,) S0 of a white plane facing the flash at the object's distance; `jitter` (B,) in 0…1 thins or
-        widens the mask that is given.
+        widens the mask that is given; smooth_share of objects with the smooth law of the body.
         """
         count, height, width = seen.mask.shape
-        surface = materials.dress(self.library, seen.normal, seen.position, seen.turn, seen.owner, count)
+        surface = materials.dress(self.library, seen.normal, seen.position, seen.turn, seen.owner, count, smooth_share)
         normal = frames.lifted(frames.to_ray_frame(surface.normal, seen.v))
         to_flash = seen.flash[seen.owner] - seen.place
         squared = (to_flash * to_flash).sum(dim=1)
         to_flash = frames.to_ray_frame(to_flash / squared.sqrt()[:, None], seen.v)
         irradiance = seen.lit * strength[seen.owner] / squared
-        stokes, body = (
-            shade.stokes(normal, surface.diffuse, part, surface.roughness, surface.ior, to_flash, irradiance)
-            for part in (surface.specular, torch.zeros_like(surface.specular))
-        )
+        nothing, lit = torch.zeros_like(surface.specular), (surface.roughness, surface.ior, to_flash, irradiance)
+        body = shade.stokes(normal, surface.diffuse, nothing, *lit, surface.law)
+        stokes = body + shade.stokes(normal, nothing, surface.specular, *lit)
         highlight = 1 - (body[0].sum(dim=1) + 1e-4) / (stokes[0].sum(dim=1) + 1e-4)
 
         def image(flat: Tensor) -> Tensor:
@@ -162,6 +169,7 @@ class Simulator:
             "normal": image(normal), "depth": image(seen.depth[:, None]), "diffuse": image(surface.diffuse),
             "specular": image(surface.specular), "roughness": image(surface.roughness[:, None]),
             "highlight": image(highlight[:, None]),
+            "law": image(torch.stack([surface.law.rough, surface.law.local, surface.law.kept], dim=1)),
         }  # fmt: skip
         bounced = torch.stack([image(part) for part in bounce.arriving(seen, normal, surface, body[0])])
         scene = torch.stack([image(part) for part in stokes]) + bounce.smooth(bounced, seen.mask)

@@ -1,8 +1,8 @@
 """What training minimizes: each map against truth, and pictures rendered from all maps together.
 
 The rendering loss is the paper's: the polarized renderer (`optics/shade.py`, the same that made the
-input) draws truth and estimate under new random lights and from new sides, and compares S0 in log and
-the linear polarization relative to it. It couples the maps where each alone is ambiguous.
+input) draws truth and estimate under new random lights and from new sides, by the law of each object's body, and
+compares S0 in log and the linear polarization relative to it. It couples the maps where each alone is ambiguous.
 """
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from polcap.optics import shade
+from polcap.optics.body import Law
 from polcap.stages.cues import NOMINAL_IOR
 from polcap.training.dataset import Batch
 
@@ -65,12 +66,13 @@ def _rendered(maps: dict[str, Tensor], truth: Batch, random: torch.Generator | N
     ones = torch.ones(len(at), device=turn.device)
     light = 0.6 * torch.randn(len(at), 3, device=turn.device, generator=random)
     light = F.normalize(torch.cat([light[:, :2], light[:, 2:] + 1], dim=1), dim=1)
+    law = Law(*flat(truth.law).unbind(dim=1))
     pictures = []
     for source in (maps, {name: getattr(truth, name) for name in ("normal", "diffuse", "specular", "roughness")}):
         normal = torch.einsum("mij,mj->mi", turn, flat(source["normal"]))
         rough = flat(source["roughness"])[:, 0].clamp(min=0.08)
         diffuse, specular = flat(source["diffuse"]), flat(source["specular"])
-        pictures.append(shade.stokes(normal, diffuse, specular, rough, NOMINAL_IOR * ones, light, ones))
+        pictures.append(shade.stokes(normal, diffuse, specular, rough, NOMINAL_IOR * ones, light, ones, law))
     estimate, goal = pictures
     intensity = (torch.log(estimate[0] + 0.05) - torch.log(goal[0] + 0.05)).abs().mean()
     if not polarized:

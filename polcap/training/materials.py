@@ -4,7 +4,8 @@ Works on flat lists of the object's pixels (M, ·), because two thirds of a view
 object wears one to three materials in regions of solid noise. Each takes its pattern from a texture
 set, projected along the nearest axis, or from solid noise; specular reflectance and roughness follow
 the pattern of the albedo as in real materials, around levels drawn per material. Many patterns are two
-surfaces in one, as print, glaze, inlay and wear are: two glosses a few pixels apart, often in relief.
+surfaces in one, as print, glaze, inlay and wear are: two glosses a few pixels apart, often in relief. Gloss and the
+law of the body are drawn by `gloss.py`.
 """
 
 import math
@@ -17,6 +18,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from polcap.formats import textures
+from polcap.optics.body import SMOOTH, Law
+from polcap.training import gloss
 
 _MATERIALS = 3  # slots per object
 _SIDE = 48  # of the noise volume
@@ -32,6 +35,7 @@ class Surface:
     specular: Tensor  # (M, 3) F0
     roughness: Tensor  # (M,)
     ior: Tensor  # (M,)
+    law: Law = SMOOTH  # (M,)
 
 
 class Library:
@@ -61,11 +65,19 @@ class Library:
         return F.grid_sample(self.noise, grid, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0, 0].T
 
 
-def dress(library: Library, normal: Tensor, position: Tensor, turn: Tensor, owner: Tensor, count: int) -> Surface:
+def dress(
+    library: Library,
+    normal: Tensor,
+    position: Tensor,
+    turn: Tensor,
+    owner: Tensor,
+    count: int,
+    smooth_share: float = gloss.SMOOTH_SHARE,
+) -> Surface:
     """Draw a material for each of `count` objects and evaluate it at their pixels.
 
     normal (M, 3) camera frame, position (M, 3) object frame, turn (B, 3, 3) object → camera,
-    owner (M,) the object of each pixel.
+    owner (M,) the object of each pixel; smooth_share of objects with the smooth law of the body.
     """
     device = normal.device
     frame = _rotations(count, device)  # object → pattern
@@ -107,6 +119,9 @@ def dress(library: Library, normal: Tensor, position: Tensor, turn: Tensor, owne
     reflectance = reflectance * torch.exp(own["f0_step"] * pattern)
     specular = (reflectance[:, None] * own["f0_tint"]).clamp(0.015, 0.4)
 
+    law = gloss.laws(count, device, smooth_share).at(owner)
+    fibers = torch.where(law.rough > 0, own["kept"] + own["kept_step"] * pattern, 1.0)
+
     relief = fine[:, 4:7] * torch.where(raised, 4 * pattern * (1 - pattern), 1.0)[:, None]
     slope = torch.zeros_like(facing).scatter(1, ((axis + 1) % 3)[:, None], picture[:, 4:5])
     slope = slope.scatter(1, ((axis + 2) % 3)[:, None], picture[:, 5:6])
@@ -120,6 +135,7 @@ def dress(library: Library, normal: Tensor, position: Tensor, turn: Tensor, owne
         specular=specular,
         roughness=rough.clamp(0.08, 1.0),
         ior=own["ior"],
+        law=Law(law.rough, law.local, law.kept * fibers),
     )
 
 
@@ -133,17 +149,17 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
     def normal(deviation: float) -> Tensor:
         return deviation * torch.randn(shape, device=device)
 
-    common = u(0, 1) < 0.55
-    f0 = torch.where(common, 0.042 * torch.exp(normal(0.2)), 0.05 * torch.exp(u(0, 1.65)))  # up to .26
-    rough, other = (torch.where(u(0, 1) < 0.3, u(0.1, 0.4), u(0.25, 0.95)) for _ in range(2))
+    one, other = gloss.draw(shape, device), gloss.draw(shape, device)
     two = u(0, 1) < 0.8  # surfaces in one pattern
+    stuff = u(0, 1) < 0.5  # of which both are of one stuff
+    f0_step = torch.where(stuff, normal(0.2), torch.log(other.f0 / one.f0))
     as_is = u(0, 1) < 0.5  # roughness of the texture set
     color, color2 = _colors(shape, device), _colors(shape, device)
     near = (u(0, 1) < 0.5)[..., None]
     color2 = torch.where(near, color * (0.4 + 1.2 * _u((*shape, 1), device)), color2)
     tint = torch.exp(normal(0.4))[..., None] * torch.exp(0.15 * torch.randn((*shape, 3), device=device))
     from_texture = (u(0, 1) < 0.4) if library.has_textures else torch.zeros(shape, device=device)
-    coloured = (f0 > 0.08) & (u(0, 1) < 0.3)
+    coloured = (one.f0 > 0.08) & (u(0, 1) < 0.3)
     f0_tint = torch.where(coloured[..., None], 1 + 0.4 * (_u((*shape, 3), device) - 0.5), torch.ones(1, device=device))
     # solid noise has a slope of unit deviation: 14° at most; textures slope less, so theirs are raised
     bump = 0.25 * torch.exp(u(-3, 0)) * torch.sign(u(-1, 1)) * (u(0, 1) < 0.7)
@@ -154,10 +170,11 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
         "texture": torch.randint(0, max(len(library.names), 1), shape, device=device).float(),
         "shift": u(0, 2), "contrast": torch.exp(u(-0.5, 3.2)), "level": u(-1.5, 1.5),
         "mid": color.mean(dim=-1) ** 0.45,
-        "rough": rough, "follow": normal(0.3), "speckle": u(0, 0.25) * (u(0, 1) < 0.5),
+        "rough": one.roughness, "follow": normal(0.3), "speckle": u(0, 0.25) * one.grained,
         "rough_gain": torch.where(as_is, 1.0, u(0.5, 1.0)), "rough_shift": torch.where(as_is, 0.0, u(-0.1, 0.4)),
-        "f0": f0, "f0_follow": normal(0.5),
-        "rough_step": two * (other - rough), "f0_step": two * normal(0.4), "raised": (u(0, 1) < 0.4).float(),
+        "f0": one.f0, "f0_follow": normal(0.3),
+        "rough_step": two * (other.roughness - one.roughness), "f0_step": two * f0_step,
+        "kept": one.kept, "kept_step": two * (other.kept - one.kept), "raised": (u(0, 1) < 0.4).float(),
         "toned": (u(0, 1) < 0.6).float(),
         "ior": (1.5 + normal(0.06)).clamp(1.35, 1.7), "bump": bump,
     }  # fmt: skip

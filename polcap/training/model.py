@@ -6,7 +6,8 @@ absolute level of radiance and DoLP is information. At the bottom every place se
 over the object's cells and their mean). Diffuse color that is in doubt is drawn towards the colors that
 recur in the picture. Gloss comes last: it is shown the other branches' normal and diffuse color and how much
 brighter the picture is than they explain, and shares what it finds among all places that look alike or have
-the same color, so that a highlight here tells the roughness there.
+the same color, so that a highlight here tells the roughness there; where rough bodies polarize less, so does the
+DoLP that is missing.
 
 References
 ----------
@@ -29,6 +30,7 @@ SIZE_MULTIPLE = 32
 OUTPUTS = ("normal", "depth", "diffuse", "specular", "roughness", "sigma")
 _COLOR_OUTPUTS = 5  # diffuse, doubt of its lightness and of its hue
 _GLOSS_OUTPUTS = 5  # specular, roughness, highlight
+_HINTS = 10  # to the gloss branch: normal, diffuse, light over what they explain, DoLP missing from what they explain
 _SHARED = (2, 1)  # decoder levels of 1/8 and 1/4 of the resolution
 _MASK = CHANNELS.index("mask")
 _CLIPPED = CHANNELS.index("clipped")
@@ -76,7 +78,7 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
         self.recolor = Recolor()
         self.profiles = Profiles(widths[1], widths[0], shape.gloss[1] + _GLOSS_OUTPUTS)
         self.color_gloss = ColorGloss(_GLOSS_OUTPUTS)
-        self.gloss = Branch(widths, shape.gloss, shape.skip_blocks, skips, _GLOSS_OUTPUTS, hints=9)
+        self.gloss = Branch(widths, shape.gloss, shape.skip_blocks, skips, _GLOSS_OUTPUTS, hints=_HINTS)
 
     def forward(self, x: Tensor) -> dict[str, Tensor]:
         seen = self.inputs(x)
@@ -93,8 +95,8 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
         with torch.autocast(x.device.type, enabled=False):
             diffuse, member, colors = self.recolor(own, color[:, 3:], cosine, inside.float(), clipped)
         body = torch.log(0.9 * diffuse * normal[:, 2:].clamp(min=0) + FLOOR)  # what the diffuse light would be
-        hints = torch.cat([normal, diffuse, level - body], dim=1).detach() * inside
         figures = figures_of(level, self.sees_dolp * x[:, _RATIO].float() / 10, normal, diffuse)
+        hints = torch.cat([normal, diffuse, level - body, figures[:, -1:]], dim=1).detach() * inside
         thinned = Evidence(*(part[:, :, ::2, ::2].detach() for part in (figures, normal[:, 2:], diffuse, _usable(x))))
         parts = [self.shape.gloss[1], _GLOSS_OUTPUTS]
         told, itself = self.profiles(features[1], features[0], thinned).split(parts, dim=1)

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from polcap.errors import InputError
 from polcap.formats import atomic, png
-from polcap.training import export, gbuffers, loss, materials, model
+from polcap.training import arithmetic, export, gbuffers, loss, materials, model
 from polcap.training.dataset import Batch, Simulator
 from polcap.training.variants import VARIANTS
 from polcap.training.watch import Watch
@@ -237,7 +237,7 @@ class Run:
 
     def _learn(self, batch: Batch, lights: torch.Generator) -> tuple[tuple[Tensor, ...], dict[str, float]]:
         """Gradient of the loss of one batch, and its parts."""
-        with torch.autocast(self.device.type, torch.bfloat16, cache_enabled=False):  # threads share that cache
+        with arithmetic.fast(self.device):
             maps = self.network(batch.channels.contiguous(memory_format=torch.channels_last))
         polarized = VARIANTS[self.network.variant].polarized_loss
         value, figures = loss.total(maps, batch, lights, polarized=polarized)
@@ -267,6 +267,9 @@ class Run:
     def begin(self, path: Path) -> None:
         """Take a model's weights as the first, from `export.write`; InputError where they are another network's."""
         weights, metadata = export.read(path)
+        for name, own in self.network.state_dict().items():
+            if name in weights:
+                weights[name] = _widened(weights[name], own)
         try:
             self.network.load_state_dict(weights)
         except RuntimeError as error:
@@ -288,6 +291,14 @@ class Run:
         self.skipped, self.begun = state["skipped"], state["begun"]
         for k, generator in enumerate(self.lights):  # other lights than before
             generator.manual_seed(1000 * self.step + k)
+
+
+def _widened(weight: Tensor, own: Tensor) -> Tensor:
+    """Of a convolution that came to see more channels, the last of which change nothing yet."""
+    more = own.shape[1] - weight.shape[1] if own.ndim == weight.ndim == 4 else 0
+    if more <= 0 or own.shape[0] != weight.shape[0] or own.shape[2:] != weight.shape[2:]:
+        return weight
+    return torch.cat([weight, weight.new_zeros(len(weight), more, *weight.shape[2:])], dim=1)
 
 
 class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without types here
@@ -338,7 +349,7 @@ def orthogonal(matrix: Tensor) -> Tensor:
     Singular values end within 0.7…1.2, not at 1, where fewer steps would be needed.
     """
     wide = matrix if matrix.shape[-2] <= matrix.shape[-1] else matrix.mT
-    x = (wide / (torch.linalg.matrix_norm(wide, keepdim=True) + 1e-7)).bfloat16()
+    x = (wide / (torch.linalg.matrix_norm(wide, keepdim=True) + 1e-7)).to(arithmetic.kind(matrix.device))
     for _ in range(5):
         square = x @ x.mT
         x = torch.baddbmm(x, torch.baddbmm(square, square, square, beta=-4.7750, alpha=2.0315), x, beta=3.4445)

@@ -10,7 +10,7 @@ from polcap import pictures
 from polcap.images import Floats
 from polcap.pictures import Picture
 from polcap.stages.cues import FLOOR
-from polcap.training import gbuffers, loss, materials, protocol
+from polcap.training import arithmetic, gbuffers, loss, materials, protocol
 from polcap.training.camera_errors import Errors
 from polcap.training.dataset import Batch, Simulator, batch
 from polcap.training.model import COLOR
@@ -82,7 +82,7 @@ def held_out(data: Path, folder: Path, device: torch.device, *, views: int, size
 def run(network: nn.Module, batch: Batch) -> dict[str, Tensor]:
     """The maps of a batch, without gradients."""
     device = batch.channels.device
-    with torch.no_grad(), torch.autocast(device.type, torch.bfloat16):
+    with torch.no_grad(), arithmetic.fast(device):
         maps: dict[str, Tensor] = network(batch.channels.contiguous(memory_format=torch.channels_last))
     return maps
 

@@ -30,7 +30,7 @@ def test_levels_spread_between_objects_and_gloss_follows_the_pattern_on_many() -
     surface, _ = dressed()
     rough, f0 = surface.roughness.view(OBJECTS, PLACES), surface.specular.mean(dim=1).view(OBJECTS, PLACES)
     light = surface.diffuse.mean(dim=1).log().view(OBJECTS, PLACES)
-    assert rough.mean(dim=1).std() > 0.12 and f0.mean(dim=1).std() > 0.03
+    assert rough.mean(dim=1).std() > 0.12 and f0.mean(dim=1).std() > 0.015
     together = torch.stack([torch.corrcoef(torch.stack(pair))[0, 1] for pair in zip(rough, light)]).abs()
     print(f"|correlation of roughness and lightness| by object: median {float(together.median()):.2f}")
     assert 0.3 < (together > 0.5).float().mean() < 0.9  # many patterns are two surfaces, not all

@@ -1,0 +1,93 @@
+"""Gloss as real surfaces have it: roughness, F0 and depolarization by families, and the law of each body.
+
+Families are drawn for each surface, not for each picture: a print and what it is printed on are two. F0 mostly lies
+where plastics, paints, glazes, paper, wood, stone and cloth lie, with a tail of coatings and gems among glossy ones.
+
+References
+----------
+Akenine-Möller et al., Real-time rendering, 4th ed. 2018, table 9.2: F0 of dielectrics: plastics and glass .04–.05,
+fabric .04–.056, stone .035–.056, gems .05–.08, diamond-like .13–.2, water .02.
+Burley, Physically-based shading at Disney, SIGGRAPH 2012 course: F0 .00–.08 covers common materials; roughness of the
+measured MERL materials by kind.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from polcap.optics.body import Law
+
+
+@dataclass(frozen=True)
+class Family:
+    share: float  # of surfaces
+    roughness: tuple[float, float]  # perceptual, evenly between
+    tail: float  # share with an F0 above common dielectrics
+    kept: tuple[float, float] = (1.0, 1.0)  # factor on the body's polarization
+    grain: float = 0.5  # share whose gloss is speckled
+
+
+FAMILIES = {
+    "glossy": Family(0.27, (0.10, 0.35), 0.40),  # plastics, glazes, varnish
+    "satin": Family(0.28, (0.28, 0.60), 0.28),  # paints, leather, waxed wood
+    "matte": Family(0.28, (0.50, 0.95), 0.08),  # plaster, clay, paper, stone
+    "brushed": Family(0.08, (0.25, 0.65), 0.30, grain=1.0),  # sanded, scratched, grained
+    "fibrous": Family(0.09, (0.65, 1.00), 0.00, kept=(0.3, 0.9), grain=1.0),  # cloth, felt, unsized paper
+}
+_F0, _F0_SPREAD = 0.042, 0.13  # common dielectrics: n = 1.45–1.58 within 1σ, in the logarithm
+_TAIL = (0.055, 1.5)  # least F0, and the logarithm of the greatest over it; small ones are commoner
+SMOOTH_SHARE = 0.5  # of objects whose body leaves light through a smooth interface
+_OWN_ROUGHNESS = 0.6  # of rough ones whose body is as rough as their gloss; coats and cores differ in the others
+_DEPOLARIZED = 0.08  # of rough ones that are translucent
+
+
+@dataclass(frozen=True)
+class Gloss:
+    """Of surfaces, any shape."""
+
+    roughness: Tensor
+    f0: Tensor
+    kept: Tensor
+    grained: Tensor  # bool
+
+
+def draw(shape: tuple[int, ...], device: torch.device) -> Gloss:
+    """A family for each surface, and its gloss."""
+    share = torch.tensor([family.share for family in FAMILIES.values()], device=device)
+    which = torch.multinomial(share, torch.Size(shape).numel(), replacement=True).reshape(shape)
+
+    def u() -> Tensor:
+        return torch.rand(shape, device=device)
+
+    def of(name: str) -> Tensor:
+        return torch.tensor([getattr(family, name) for family in FAMILIES.values()], device=device)[which]
+
+    low, high = of("roughness").unbind(dim=-1)
+    least, most = of("kept").unbind(dim=-1)
+    common = (_F0 * torch.exp(_F0_SPREAD * torch.randn(shape, device=device))).clamp(0.028, 0.06)
+    rare = _TAIL[0] * torch.exp(_TAIL[1] * u() ** 1.5)
+    return Gloss(
+        roughness=low + (high - low) * u(),
+        f0=torch.where(u() < of("tail"), rare, common),
+        kept=least + (most - least) * u(),
+        grained=u() < of("grain"),
+    )
+
+
+def laws(count: int, device: torch.device, smooth_share: float = SMOOTH_SHARE) -> Law:
+    """How the bodies of `count` objects polarize, (B,) each: half by the smooth law, half by rough facets.
+
+    What light does inside is not known, so rough ones have either weighting of facets or one between, and a factor
+    of .8–1 on their polarization, far less for a few.
+    """
+
+    def u(low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(count, device=device)
+
+    rough = (u(0, 1) >= smooth_share).float()
+    other = torch.exp(0.25 * torch.randn(count, device=device)).clamp(0.5, 1.6)
+    scale = torch.where(u(0, 1) < _OWN_ROUGHNESS, torch.ones(count, device=device), other)
+    local = u(-1, 2).clamp(0, 1)  # a third each: 0, 1, between
+    kept = torch.where(u(0, 1) < _DEPOLARIZED, u(0.25, 0.8), u(0.8, 1.0))
+    return Law(rough * scale, rough * local, 1 - rough * (1 - kept))
