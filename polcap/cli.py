@@ -378,6 +378,9 @@ def synth(
     interreflection: Annotated[
         bool, typer.Option("--interreflection", help="Light goes once from part to part of the mesh.")
     ] = False,
+    law: Annotated[
+        Literal["smooth", "rough"], typer.Option(help="Interface that light from inside the body leaves through.")
+    ] = "smooth",
     dataset: Annotated[
         int | None,
         typer.Option(min=1, metavar="N", help="Make N samples of a data set instead (extra [train]); goes on."),
@@ -392,7 +395,7 @@ def synth(
 
     if dataset is not None:
         corpus = _extra("corpus")
-        named = {"seed": seed, "mesh": str(mesh or ""), "material": str(material or "")}
+        named = {"seed": seed, "mesh": str(mesh or ""), "material": str(material or ""), "law": law}
         corpus.main(folder, dataset, settings.fill(corpus.Recipe, named, assignments or ()))
         terminal.say(str(folder / "dataset.json"))
         return
@@ -408,6 +411,8 @@ def synth(
         what = replace(what, cast_shadows=True)
     if interreflection:
         what = replace(what, interreflection=True)
+    if law == "rough":
+        what = replace(what, law=law)
     synthetic.write(folder, what, shoot)
     terminal.say(str(folder))
 

@@ -6,6 +6,7 @@ Everything is rendered where a shot's own pixels look; nothing is ever resampled
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -15,13 +16,15 @@ from scipy.spatial.transform import Rotation
 
 from polcap.errors import SettingError
 from polcap.images import Floats, GBuffer, View
-from polcap.optics import frames, fresnel, mueller, shade
+from polcap.optics import body, frames, fresnel, mueller, shade
 from polcap.synth import color_checker as charts
 from polcap.synth import interreflection, mesh_tracer, scene_materials, trace
 from polcap.synth.color_checker import Chart
 from polcap.synth.distance_fields import Model, Shape
 from polcap.synth.scene_materials import Coat
 from polcap.synth.trace import Hits, Vector
+
+_ROUGH = body.Law(rough=1.0)  # facets of the gloss's roughness, counted evenly
 
 
 class Scene(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -38,6 +41,7 @@ class Scene(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shadows: bool = True  # of the object on itself
     cast_shadows: bool | UnsetType = UNSET  # of the object on chart and backdrop
     interreflection: bool | UnsetType = UNSET  # one diffuse bounce between parts of the object; meshes only
+    law: Literal["smooth", "rough"] | UnsetType = UNSET  # interface that body light leaves through; unset: smooth
 
     @property
     def turn(self) -> Rotation:
@@ -167,12 +171,14 @@ def _shade(scene: Scene, ray: Floats, hits: Hits) -> Floats:
     facing, bent = _normals(scene, hits)
     diffuse, specular, roughness, ior = scene_materials.evaluate(scene.coat, hits.local, facing)
     normal, light = frames.to_ray_frame(bent, ray), frames.to_ray_frame(to_light, ray)
-    direct = shade.stokes(normal, diffuse, specular, roughness, ior, light, irradiance)
+    law = _ROUGH if scene.law == "rough" else body.SMOOTH
+    direct = shade.stokes(normal, diffuse, specular, roughness, ior, light, irradiance, law)
     if not scene.interreflection:
         return np.asarray(direct)
     came = np.einsum("nkc,nk->nc", _bounced(scene)[hits.face], hits.weight)
     entered, _ = fresnel.transmission(1.0, ior)  # already in what came
-    return np.asarray(direct + shade.stokes(normal, diffuse * came, 0 * specular, roughness, ior, normal, 1 / entered))
+    once = shade.stokes(normal, diffuse * came, 0 * specular, roughness, ior, normal, 1 / entered, law)
+    return np.asarray(direct + once)
 
 
 def _normals(scene: Scene, hits: Hits) -> tuple[Floats, Floats]:

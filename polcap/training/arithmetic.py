@@ -19,6 +19,7 @@ def kind(device: torch.device) -> torch.dtype:
 
 def fast(device: torch.device) -> AbstractContextManager[None]:
     """Autocast to `kind` for as long as the block lasts."""
-    wanted = kind(device)
+    half = kind(device) == torch.bfloat16
     # threads share the cache of weights
-    return torch.autocast(device.type, torch.bfloat16, enabled=wanted == torch.bfloat16, cache_enabled=False)
+    block: AbstractContextManager[None] = torch.autocast(device.type, torch.bfloat16, enabled=half, cache_enabled=False)
+    return block

@@ -20,7 +20,7 @@ Deschaintre, Lin, Ghosh, Deep Polarization Imaging for 3D Shape and SVBRDF Acqui
 import json
 from math import log1p
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -47,6 +47,7 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     noise: Annotated[float, Meta(ge=0)] = 0.002  # 1σ at radiance 1, growing as its root; a tenth of it in the dark
     mesh: str = ""  # a file, or a folder of them; else random shapes
     material: str = ""  # a folder of texture sets; else solid noise
+    law: Literal["smooth", "rough"] = "smooth"  # of the bodies
 
 
 def main(out: Path, count: int, recipe: Recipe) -> int:
@@ -78,8 +79,8 @@ def sample(
     v, bare, position = (torch.from_numpy(a[mask]) for a in (rays, buffer.normal, buffer.position))
     with torch.random.fork_rng():
         torch.manual_seed(int(rng.integers(1 << 62)))
-        owner = torch.zeros(len(v), dtype=torch.long)
-        surface = materials.dress(library, bare, position, torch.from_numpy(turn).float()[None], owner, 1)
+        owner, smooth = torch.zeros(len(v), dtype=torch.long), float(recipe.law == "smooth")
+        surface = materials.dress(library, bare, position, torch.from_numpy(turn).float()[None], owner, 1, smooth)
     normal = frames.lifted(frames.to_ray_frame(surface.normal, v))
     way, off = rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.1)
     flash = [off * np.cos(way) * middle, off * np.sin(way) * middle, 0.0]
@@ -88,7 +89,14 @@ def sample(
     squared = (to_light**2).sum(dim=1)
     to_light = frames.to_ray_frame(to_light / squared.sqrt()[:, None], v)
     light = shade.stokes(
-        normal, surface.diffuse, surface.specular, surface.roughness, surface.ior, to_light, middle**2 / squared
+        normal,
+        surface.diffuse,
+        surface.specular,
+        surface.roughness,
+        surface.ior,
+        to_light,
+        middle**2 / squared,
+        surface.law,
     ).numpy()
 
     passed = _photographs(light, rays[mask], recipe.noise, rng)
