@@ -258,12 +258,27 @@ def export(
 def show(
     context: typer.Context,
     result: Result,
-    stage: Annotated[str, typer.Argument(help="hdr, whitebalance, align, mask, selfcal, stokes, cues, …")],
+    stage: Annotated[
+        str | None, typer.Argument(help="hdr, whitebalance, align, mask, selfcal, stokes, cues, …")
+    ] = None,
+    all_: Annotated[bool, typer.Option("--all", help="Every stage.")] = False,
+    animate: Annotated[
+        Literal["light", "turntable"] | None,
+        typer.Option(help="WebP, and MP4 where FFmpeg is present: a light that goes round, or the surface turned."),
+    ] = None,
+    json: Json = False,
 ) -> None:
-    """Draw what a stage made; prints the picture's path."""
+    """Draw what a stage made; prints the picture's path, and on a terminal shows it."""
     from polcap import pipeline
 
-    terminal.say(str(pipeline.show(result, stage)))
+    if (stage is None) + (not all_) + (animate is None) != 2:
+        raise SettingError(f"show {result}: give one of a stage ({', '.join(pipeline.STAGES)}), --all or --animate")
+    if animate is not None:
+        drawn = pipeline.animate(result, animate)
+    else:
+        drawn = pipeline.show(result, pipeline.STAGES if stage is None else (stage,))
+    terminal.say({"written": [str(file) for file in drawn]} if json else "\n".join(map(str, drawn)))
+    terminal.preview(drawn)
 
 
 @app.command()

@@ -5,6 +5,7 @@ The stages and their order stand in `path.py`; this is what surrounds them: lock
 
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,10 +15,11 @@ from polcap import asset_export, pictures, report
 from polcap.asset_export import Wanted
 from polcap.config import Config
 from polcap.errors import ModelError, SettingError, StorageError
-from polcap.formats import atomic, calib, onnx, png, provenance
+from polcap.formats import animation, atomic, calib, onnx, png, provenance
 from polcap.formats import maps as maps_folder
 from polcap.images import Capture, Network
 from polcap.path import STAGES, Results, UserInput, path
+from polcap.pictures import moving
 from polcap.store import Archive, Progress, Store, contents, silent
 
 
@@ -94,14 +96,31 @@ def reopen(out: Path) -> tuple[Results, dict[str, Any]]:
     return path(None, UserInput(), config, Archive(out)), about
 
 
-def show(out: Path, stage: str) -> Path:
-    """Draw what a stage made; returns the PNG's path."""
-    if stage not in STAGES:
-        raise SettingError(f"{stage!r} is no stage; choose one of {', '.join(STAGES)}")
+def show(out: Path, stages: Sequence[str]) -> list[Path]:
+    """Draw what stages made; returns the PNGs' paths."""
+    for stage in stages:
+        if stage not in STAGES:
+            raise SettingError(f"{stage!r} is no stage; choose one of {', '.join(STAGES)}")
     results, _ = reopen(out)
-    file = out / "work" / f"{stage}.png"
-    png.write(file, pictures.of_stage(results, stage))
-    return file
+    drawn = []
+    for stage in stages:
+        drawn.append(out / "work" / f"{stage}.png")
+        png.write(drawn[-1], pictures.of_stage(results, stage))
+    return drawn
+
+
+def animate(out: Path, motion: moving.Motion) -> list[Path]:
+    """Move the light or the object; returns the paths of the WebP and, where FFmpeg is present, the MP4."""
+    results, about = reopen(out)
+    ior = float(about["settings"]["infer"]["ior"])
+    maps = results.maps.value
+    frames = moving.light(maps, ior) if motion == "light" else moving.turntable(maps, results.mesh.value, ior)
+    written = [out / "work" / f"{motion}.webp"]
+    animation.webp(written[0], frames, moving.SECONDS)
+    if animation.encoder():
+        written.append(out / "work" / f"{motion}.mp4")
+        animation.mp4(written[1], frames, moving.SECONDS)
+    return written
 
 
 def judge_again(out: Path) -> dict[str, Any]:

@@ -12,6 +12,8 @@ import typer
 from polcap.errors import GateError, PolcapError, SettingError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from polcap.store import Progress
 
 OUT_OF_MEMORY = (  # as OpenCV, threads, the loader of libraries and the system say it
@@ -69,6 +71,27 @@ def say(data: Any) -> None:
 
         data = json.dumps(data, ensure_ascii=False, indent=1)
     print(data, flush=True)
+
+
+def preview(drawn: "list[Path]") -> None:
+    """Pictures on a terminal that knows colors, two pixels a character; on stderr, for stdout carries data."""
+    if not sys.stderr.isatty() or os.environ.get("TERM") in (None, "dumb"):
+        return
+    from rich.console import Console
+    from rich.text import Text
+
+    from polcap.formats import png
+
+    console = Console(stderr=True)
+    for file in drawn:
+        if file.suffix != ".png":
+            continue
+        picture = png.fitted(png.read(file), console.width)
+        for upper, lower in zip(picture[::2], picture[1::2], strict=True):
+            line_ = Text(no_wrap=True)
+            for above, below in zip(upper.tolist(), lower.tolist(), strict=True):
+                line_.append("▀", f"rgb({above[0]},{above[1]},{above[2]}) on rgb({below[0]},{below[1]},{below[2]})")
+            console.print(line_)
 
 
 def tell_gates(about: dict[str, Any]) -> None:

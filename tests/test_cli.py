@@ -134,8 +134,27 @@ def test_failed_gate_is_exit_3_after_everything_is_written(
 def test_every_stage_can_be_looked_at(result: Path, tmp_path: Path, stage: str) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(result, copy)
-    picture = cv2.imread(str(pipeline.show(copy, stage)))
+    picture = cv2.imread(str(pipeline.show(copy, [stage])[0]))
     assert picture is not None and picture.std() > 5  # there is something to see
+
+
+def test_show_draws_all_stages_or_moves_the_light(result: Path, polcap: Command, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy)
+    drawn = polcap("show", copy, "--all").stdout.split()
+    assert [Path(file).stem for file in drawn] == list(pipeline.STAGES) and all(Path(file).exists() for file in drawn)
+    for motion in ("light", "turntable"):
+        file = Path(json.loads(polcap("show", copy, "--animate", motion, "--json").stdout)["written"][0])
+        done, moving = cv2.imdecodeanimation(np.fromfile(file, np.uint8))
+        first, quarter = (np.asarray(moving.frames[k]).astype(float) for k in (0, 12))
+        assert done and len(moving.frames) == 48
+        assert np.abs(first - quarter).mean() > 3  # something moves
+
+
+@pytest.mark.parametrize("options", [(), ("hdr", "--all"), ("--all", "--animate", "light")])
+def test_show_wants_one_thing(result: Path, polcap: Command, options: tuple[str, ...]) -> None:
+    done = polcap("show", result, *options)
+    assert done.returncode == 2 and "give one of a stage" in done.stderr
 
 
 def test_export_needs_the_maps_alone_and_tells_what_it_wrote(result: Path, polcap: Command, tmp_path: Path) -> None:

@@ -95,6 +95,13 @@ def read(path: Path) -> Pixels:
     return np.asarray(_swapped(array))
 
 
+def fitted(picture: Pixels, width: int) -> NDArray[np.uint8]:
+    """An 8-bit picture (H, W, 3) made `width` px wide where it is wider, its rows an even number."""
+    width = min(width, picture.shape[1])
+    height = max(2, 2 * round(picture.shape[0] * width / picture.shape[1] / 2))
+    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
 def sixteen_bits(value: Floats) -> NDArray[np.uint16]:
     """0…1 as 0…65535, clipped."""
     return np.asarray(np.rint(np.clip(np.asarray(value, dtype=np.float64), 0.0, 1.0) * 65535), dtype=np.uint16)

@@ -1,7 +1,7 @@
 """In: a value of images.py. Out: a picture of it, (H, W, 3) uint8 sRGB, for a person to judge.
 
-Colour codes, the same everywhere: normals n·½+½ (x right red, y up green); AoLP as hue, 0° red, a turn
-of 180° once around the wheel; DoLP, depth and errors from dark (small) to bright (large).
+Colour codes, the same everywhere (`keys.py`): normals n·½+½ (x right red, y up green); AoLP as hue, 0° red, a
+turn of 180° once around the wheel; DoLP, depth and errors from dark (small) to bright (large).
 """
 
 from collections.abc import Callable
@@ -27,9 +27,12 @@ from polcap.images import (
 )
 from polcap.optics.warp import warp
 from polcap.path import Results
+from polcap.pictures import keys
+from polcap.pictures.sheets import WIDTH, Tile, sheet, write
+from polcap.pictures.sheets import Picture as Picture
 
-Picture = NDArray[np.uint8]
-WIDTH = 640  # px of one tile
+_AGREE = "first shot magenta, this one green: grey where they agree"
+_DIRECTIONS = "red right, green up, blue toward the camera"
 
 
 def of_stage(results: Results, stage: str) -> Picture:
@@ -58,13 +61,12 @@ def merged(radiance: AngleStack) -> Picture:
     """Every shot; clipped pixels red, ghosts magenta."""
     top = _top(radiance.value[0])
     tiles = []
-    for value, quality in zip(radiance.value, radiance.quality, strict=True):
+    for value, quality, angle in zip(radiance.value, radiance.quality, np.degrees(radiance.angle), strict=True):
         tile = display(value, top)
         tile[(quality & int(Quality.CLIPPED)) > 0] = (255, 40, 40)
         tile[(quality & int(Quality.GHOST)) > 0] = (255, 0, 255)
-        tiles.append(tile)
-    names = [f"{angle:g} deg" for angle in np.degrees(radiance.angle)]
-    return sheet(tiles, names)
+        tiles.append(Tile(tile, f"Polarizer at {angle:g}°", note="red: clipped in every exposure; magenta: moved"))
+    return sheet(tiles)
 
 
 def chart(radiance: AngleStack, color: ColorCalibration) -> Picture:
@@ -85,16 +87,12 @@ def alignment(radiance: AngleStack, found: Alignment) -> Picture:
     """Brightness of each shot after registration (green) over the reference (magenta): grey where they agree."""
     first = _grey(radiance.value[0])
     tiles = []
-    for value, transform in zip(radiance.value[1:], found.transform[1:], strict=True):
-        moved = warp(_grey(value), transform)
-        tiles.append(display(np.stack([first, moved, first], -1), _top(first)))
-    names = [
-        f"{angle:g} deg  ({t[0, 2]:+.2f}, {t[1, 2]:+.2f}) px  1 sigma {residual:.3f} px"
-        for angle, t, residual in zip(
-            np.degrees(radiance.angle[1:]), found.transform[1:], found.residual_px[1:], strict=True
-        )
-    ]
-    return sheet(tiles, names)
+    shots = zip(radiance.value, found.transform, found.residual_px, np.degrees(radiance.angle), strict=True)
+    for value, transform, residual, angle in list(shots)[1:]:
+        moved = display(np.stack([first, warp(_grey(value), transform), first], -1), _top(first))
+        x, y = transform[:2, 2]
+        tiles.append(Tile(moved, f"{angle:g}° on the first: {x:+.2f}, {y:+.2f} px ± {residual:.3f}", note=_AGREE))
+    return sheet(tiles)
 
 
 def outline(radiance: AngleStack, color: ColorCalibration, object_: ObjectMask) -> Picture:
@@ -117,7 +115,7 @@ def gains(found: Gains, angle: Floats) -> Picture:
 
     cv2.line(picture, (column(1), 10), (column(1), height - 30), (180, 180, 180), 1)
     for shot, degrees in enumerate(np.degrees(angle)):
-        _write(picture, f"{degrees:g} deg", (10, 45 + 60 * shot), (0, 0, 0))
+        write(picture, f"{degrees:g}°", (10, 45 + 60 * shot), (0, 0, 0))
         for channel, paint in enumerate([(200, 0, 0), (0, 140, 0), (0, 0, 200)]):
             row = 25 + 60 * shot + 14 * channel
             gain, sigma = float(found.gain[shot, channel]), float(found.sigma[shot, channel])
@@ -125,7 +123,7 @@ def gains(found: Gains, angle: Floats) -> Picture:
             cv2.circle(picture, (column(gain), row), 4, paint, -1)
             anchor = (column(float(found.anchor[shot, channel])), row)
             cv2.drawMarker(picture, anchor, paint, cv2.MARKER_CROSS, 10, 1)
-    _write(picture, f"1 +- {span:.3f}   from {found.source}", (left, height - 8), (0, 0, 0))
+    write(picture, f"1 ± {span:.3f}, from {found.source}; crosses: facing pixels", (left, height - 10), (0, 0, 0), 17)
     return picture
 
 
@@ -135,36 +133,45 @@ def stokes(image: StokesImage) -> Picture:
     s0 = np.maximum(total[0], 1e-6)
     dolp = np.hypot(total[1], total[2]) / s0
     aolp = np.arctan2(total[2], total[1]) / 2
-    tiles = [display(image.stokes[0]), scale(dolp, 0, 0.4, image.mask), hue(aolp, image.mask)]
-    return sheet(tiles, ["S0", "DoLP 0 ... 0.4", "AoLP"])
+    turn = np.degrees(aolp) % 180
+    return sheet(
+        [
+            Tile(display(image.stokes[0]), "S0", note="camera channels, brightest parts white"),
+            Tile(keys.DOLP.picture(dolp, image.mask), "Degree of linear polarization", keys.DOLP),
+            Tile(keys.AOLP.picture(turn, image.mask), "Angle of linear polarization", keys.AOLP),
+        ]
+    )
 
 
 def cues(found: Cues) -> Picture:
     """What the estimators see: DoLP, AoLP, the paper's normalised Stokes map and diffuse colour."""
     cos, sin = found.normalized_stokes
-    tiles = [
-        display(found.radiance),
-        scale(found.dolp, 0, 0.4, found.mask),
-        hue(np.arctan2(sin, cos) / 2, found.mask),
-        _eight(np.stack([np.full_like(cos, 0.5), cos / 2 + 0.5, sin / 2 + 0.5], -1) * found.mask[..., None]),
-        display(found.diffuse_color * found.mask[..., None], 1.0),
-        scale(found.ratio_sigma, 0, 0.01, found.mask),
-    ]
-    names = ["radiance", "DoLP 0 ... 0.4", "AoLP", "normalised Stokes", "diffuse colour", "1 sigma 0 ... 0.01"]
-    return sheet(tiles, names)
+    turn = np.degrees(np.arctan2(sin, cos) / 2) % 180
+    normalized = _eight(np.stack([np.full_like(cos, 0.5), cos / 2 + 0.5, sin / 2 + 0.5], -1) * found.mask[..., None])
+    return sheet(
+        [
+            Tile(display(found.radiance), "S0", note="calibrated colors, brightest parts white"),
+            Tile(keys.DOLP.picture(found.dolp, found.mask), "Degree of linear polarization", keys.DOLP),
+            Tile(keys.AOLP.picture(turn, found.mask), "Angle of linear polarization", keys.AOLP),
+            Tile(normalized, "Normalised Stokes map", note="green S1, blue S2: 0.5 is none"),
+            Tile(display(found.diffuse_color * found.mask[..., None], 1.0), "Diffuse color", note="of unit length"),
+            Tile(keys.SIGMA.picture(found.ratio_sigma, found.mask), "Noise of S1/S0 and S2/S0, 1σ", keys.SIGMA),
+        ]
+    )
 
 
 def maps(found: SurfaceMaps) -> Picture:
     """Normal, diffuse albedo, specular albedo, roughness and expected error."""
-    tiles = [
-        normal(found),
-        display(found.diffuse * found.mask[..., None], 1.0),
-        display(found.specular * found.mask[..., None], 0.16),
-        scale(found.roughness, 0, 1, found.mask),
-        scale(found.confidence, 0, 30, found.mask),
-    ]
-    names = ["normal", "diffuse albedo", "specular albedo 0 ... 0.16", "roughness 0 ... 1", "error 0 ... 30 deg"]
-    return sheet(tiles, names)
+    inside = found.mask[..., None]
+    return sheet(
+        [
+            Tile(normal(found), "Normal", note=_DIRECTIONS),
+            Tile(display(found.diffuse * inside, 1.0), "Diffuse albedo", note="white: 1"),
+            Tile(display(found.specular * inside, keys.F0.high), "Specular albedo F0", note=f"white: {keys.F0.high:g}"),
+            Tile(keys.ROUGHNESS.picture(found.roughness, found.mask), "Roughness", keys.ROUGHNESS),
+            Tile(keys.ERROR.picture(found.confidence, found.mask), "Expected error of the normal", keys.ERROR),
+        ]
+    )
 
 
 def normal(found: SurfaceMaps) -> Picture:
@@ -174,8 +181,14 @@ def normal(found: SurfaceMaps) -> Picture:
 def surface(mesh: Mesh, found: SurfaceMaps) -> Picture:
     """The depth map, and the surface it makes under a light from the upper left."""
     inside = np.isfinite(mesh.depth)
-    near, far = np.percentile(mesh.depth[inside], [1, 99]) if inside.any() else (0.0, 1.0)
-    return sheet([scale(-mesh.depth, -far, -near, inside), shaded(mesh, found)], ["depth, near bright", "shape"])
+    factor = 1000.0 if mesh.metric else 1.0
+    key = keys.depth(factor * mesh.depth[inside], mesh.metric)
+    return sheet(
+        [
+            Tile(key.picture(factor * mesh.depth, inside), "Depth", key),
+            Tile(shaded(mesh, found), "Shape", note="its depth's own normals under a light from the upper left"),
+        ]
+    )
 
 
 def shaded(mesh: Mesh, found: SurfaceMaps) -> Picture:
@@ -193,9 +206,13 @@ def shaded(mesh: Mesh, found: SurfaceMaps) -> Picture:
 
 def asset(built: Asset) -> Picture:
     """The textures as they stand in the file."""
-    tiles = [built.base_color, built.normal, built.occlusion_roughness_metallic, built.specular_color]
-    names = ["base colour", "normal (tangent)", "occlusion roughness metallic", "specular colour"]
-    return sheet([np.array(tile) for tile in tiles], names)
+    tiles = [
+        (built.base_color, "Base color", "sRGB"),
+        (built.normal, "Normal", "tangent space, +Y"),
+        (built.occlusion_roughness_metallic, "Occlusion, roughness, metallic", "red, green, blue"),
+        (built.specular_color, "Specular color", f"of F0 {max(built.specular_factor):.3g} × the index's"),
+    ]
+    return sheet([Tile(np.array(picture), caption, note=note) for picture, caption, note in tiles])
 
 
 def display(linear: Floats, top: float | None = None) -> Picture:
@@ -220,22 +237,6 @@ def hue(aolp: Floats, inside: NDArray[np.bool_]) -> Picture:
     return np.asarray(wheel, np.uint8)
 
 
-def sheet(tiles: list[Picture], names: list[str]) -> Picture:
-    """Pictures side by side, three in a row, each under its name."""
-    framed = []
-    for tile, name in zip(tiles, names, strict=True):
-        height = max(1, round(tile.shape[0] * WIDTH / tile.shape[1]))
-        way = cv2.INTER_AREA if tile.shape[1] > WIDTH else cv2.INTER_NEAREST
-        head = np.full((28, WIDTH, 3), 32, np.uint8)
-        _write(head, name, (6, 20), (255, 255, 255))
-        framed.append(np.vstack([head, cv2.resize(tile, (WIDTH, height), interpolation=way)]))
-    columns = min(3, len(framed))
-    while len(framed) % columns:
-        framed.append(np.zeros_like(framed[0]))
-    rows = [np.hstack(framed[start : start + columns]) for start in range(0, len(framed), columns)]
-    return np.asarray(np.vstack(rows), np.uint8)
-
-
 def shrink(picture: Picture, width: int) -> Picture:
     """A picture no wider than `width`."""
     if picture.shape[1] <= width:
@@ -254,7 +255,3 @@ def _grey(value: Floats) -> Floats:
 
 def _eight(value: Any) -> Picture:
     return np.asarray(np.round(np.clip(value, 0, 1) * 255), np.uint8)
-
-
-def _write(picture: Picture, text: str, at: tuple[int, int], paint: tuple[int, int, int]) -> None:
-    cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, paint, 1, cv2.LINE_AA)

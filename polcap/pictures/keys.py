@@ -54,6 +54,11 @@ class Key:
         return np.broadcast_to(colors(self.palette)[steps], (height, width, 3)).copy()
 
 
+def plain(value: float) -> str:
+    """A tick's number, three significant digits."""
+    return f"{value:.3g}"
+
+
 def colors(palette: Palette) -> NDArray[np.uint8]:
     """The colours (255, 3) of levels 1…255, sRGB, no two alike."""
     if palette == "wheel":  # one turn of hue, red at both ends

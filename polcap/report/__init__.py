@@ -143,7 +143,7 @@ def figures(results: Results) -> dict[str, dict[str, Any]]:
 def rerendering(results: Results, ior: float) -> dict[str, Any]:
     """How far the photographs are from what the maps say they should be."""
     maps, mesh, angle = results.maps.value, results.mesh.value, results.radiance.value.angle
-    small = shown.reduce(maps, mesh, results.stokes.value, results.cues.value, angle, _COMPARED_PX)
+    small = shown.reduce(maps, mesh, results.cues.value, angle, _COMPARED_PX)
     again = shown.rerender(small, ior)
     return {"rms": [_number(one) for one in again.rms(small.maps.mask)], "scale": _number(again.scale)}
 

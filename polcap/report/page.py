@@ -42,7 +42,7 @@ def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
         The file cannot be written.
     """
     radiance, maps, mesh = results.radiance.value, results.maps.value, results.mesh.value
-    small = shown.reduce(maps, mesh, results.stokes.value, results.cues.value, radiance.angle, _LONGEST)
+    small = shown.reduce(maps, mesh, results.cues.value, radiance.angle, _LONGEST)
     ior = float(about["settings"]["infer"]["ior"])
     again = shown.rerender(small, ior)
     bright = shown.exposure(small)

@@ -1,14 +1,15 @@
 """In: the results of a run. Out: what a page shows of them, reduced to the size of a screen."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import AngleStack, ColorCalibration, Cues, Floats, Mesh, StokesImage, SurfaceMaps, View
+from polcap.images import AngleStack, ColorCalibration, Cues, Floats, Mesh, SurfaceMaps, View
 from polcap.optics import color, frames, shade
+from polcap.pictures.smaller import Smaller, area
 
 WHITE_PATCH = 18  # of a ColorChecker Classic, row by row from dark skin
 _COLUMNS = 6
@@ -28,46 +29,21 @@ class Shown:
     angle: Floats  # (K,) rad
 
 
-def reduce(maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues: Cues, angle: Floats, longest: int) -> Shown:
+def reduce(maps: SurfaceMaps, mesh: Mesh, cues: Cues, angle: Floats, longest: int) -> Shown:
     """The results with at most `longest` pixels a side; colors and angles are averaged over the object alone."""
-    height, width = maps.mask.shape
-    shrink = min(1.0, longest / max(height, width))
-    size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
-    inside = np.asarray(maps.mask & cues.mask, bool)
-    share = _area(inside.astype(np.float32), size)
-    normal = _mean(maps.normal, inside, share, size)
+    way = Smaller(np.asarray(maps.mask & cues.mask, bool), longest)
     light = np.maximum(cues.radiance.sum(-1), 1e-6)
-    weight = np.maximum(_mean(light, inside, share, size), 1e-9)
-    ratio = np.stack([_mean(part * light, inside, share, size) / weight for part in cues.ratio])
-    axis = [_mean(part, inside, share, size) for part in cues.normalized_stokes]
-    view = replace(
-        maps.view,
-        focal=maps.view.focal * shrink,
-        center=tuple((edge + 0.5) * shrink - 0.5 for edge in maps.view.center),
-        scale=maps.view.scale / shrink,
-        origin=tuple(edge * shrink for edge in maps.view.origin),
-    )
-    small = replace(
-        maps,
-        normal=normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6),
-        diffuse=_mean(maps.diffuse, inside, share, size),
-        specular=_mean(maps.specular, inside, share, size),
-        roughness=_mean(maps.roughness, inside, share, size),
-        confidence=_mean(maps.confidence, inside, share, size),
-        depth_prior=None,
-        mask=share > 0.5,
-        view=view,
-    )
-    known = inside & np.isfinite(mesh.depth)
-    reached = _area(known.astype(np.float32), size)
-    depth = np.where((reached > 0.5) & small.mask, _mean(mesh.depth, known, reached, size), np.nan)
+    weight = np.maximum(way.mean(light), 1e-9)
+    axis = [way.mean(part) for part in cues.normalized_stokes]
+    small = way.maps(maps)
+    to_depth = Smaller(way.inside & np.isfinite(mesh.depth), longest)
     return Shown(
         maps=small,
-        depth=depth,
-        radiance=_mean(cues.radiance, inside, share, size),
-        dolp=_mean(cues.dolp, inside, share, size),
+        depth=np.where((to_depth.share > 0.5) & small.mask, to_depth.mean(mesh.depth), np.nan),
+        radiance=way.mean(cues.radiance),
+        dolp=way.mean(cues.dolp),
         aolp=np.degrees(np.arctan2(axis[1], axis[0]) / 2) % 180,
-        ratio=ratio,
+        ratio=np.stack([way.mean(part * light) / weight for part in cues.ratio]),
         angle=angle,
     )
 
@@ -128,7 +104,7 @@ def photograph(radiance: AngleStack, calibration: ColorCalibration, view: View, 
     width, height = size[0] * factor, size[1] * factor
     left, top = round(x), round(y)
     crop = radiance.value[0][top : top + round(height), left : left + round(width)]
-    return np.asarray(_area(2 * np.asarray(crop, np.float32), size) @ calibration.matrix.T.astype(np.float32))
+    return np.asarray(area(2 * np.asarray(crop, np.float32), size) @ calibration.matrix.T.astype(np.float32))
 
 
 def patches(radiance: AngleStack, found: ColorCalibration) -> Floats | None:
@@ -152,17 +128,3 @@ def srgb(linear: Any) -> NDArray[np.uint8]:
     """Linear 0…1 as 8-bit sRGB."""
     encoded = color.encode_srgb(np.clip(np.nan_to_num(np.asarray(linear)), 0, 1))
     return np.asarray(np.rint(255 * encoded), np.uint8)
-
-
-def _area(image: Floats, size: tuple[int, int]) -> Floats:
-    """Averaged down to (width, height); as it is where the size is the same."""
-    image = np.ascontiguousarray(image, np.float32)
-    return image if image.shape[1::-1] == size else np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
-
-
-def _mean(image: Floats, inside: NDArray[np.bool_], share: Floats, size: tuple[int, int]) -> Floats:
-    """Mean over the object's pixels alone; 0 where there are none."""
-    spread = inside if image.ndim == 2 else inside[..., None]
-    total = _area(np.where(spread, image, 0), size)
-    weight = share if image.ndim == 2 else share[..., None]
-    return np.asarray(np.where(weight > 1e-3, total / np.maximum(weight, 1e-3), 0), np.float32)

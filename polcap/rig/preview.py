@@ -9,6 +9,8 @@ from polcap import pictures
 from polcap.formats import png
 from polcap.images import Floats
 from polcap.optics import mueller
+from polcap.pictures import keys
+from polcap.pictures.sheets import Tile, sheet
 
 NAME = "preview.png"
 _FADE = 0.02  # of the brightest, below which no angle is drawn
@@ -21,12 +23,12 @@ def write(folder: Path, angle_deg: Sequence[float], small: Sequence[Floats]) -> 
     s0, s1, s2 = np.tensordot(np.linalg.pinv(weights), light, axes=1)
     inside = s0 > _FADE * np.percentile(s0, 99.5)
     dolp = np.hypot(s1, s2) / np.maximum(s0, 1e-6)
-    aolp = np.arctan2(s2, s1) / 2
+    aolp = np.degrees(np.arctan2(s2, s1) / 2) % 180
     tiles = [
-        pictures.display(np.repeat(s0[..., None], 3, -1)),
-        pictures.scale(dolp, 0, 0.4, inside),
-        pictures.hue(aolp, inside),
+        Tile(pictures.display(np.repeat(s0[..., None], 3, -1)), "S0"),
+        Tile(keys.DOLP.picture(dolp, inside), "Degree of linear polarization", keys.DOLP),
+        Tile(keys.AOLP.picture(aolp, inside), "Angle of linear polarization", keys.AOLP),
     ]
     file = folder / NAME
-    png.write(file, pictures.sheet(tiles, ["S0", "DoLP 0 ... 0.4", "AoLP"]))
+    png.write(file, sheet(tiles))
     return file
