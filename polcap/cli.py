@@ -270,13 +270,14 @@ def show(
 ) -> None:
     """Draw what a stage made; prints the picture's path, and on a terminal shows it."""
     from polcap import pipeline
+    from polcap.path import STAGES
 
     if (stage is None) + (not all_) + (animate is None) != 2:
-        raise SettingError(f"show {result}: give one of a stage ({', '.join(pipeline.STAGES)}), --all or --animate")
+        raise SettingError(f"show {result}: give one of a stage ({', '.join(STAGES)}), --all or --animate")
     if animate is not None:
         drawn = pipeline.animate(result, animate)
     else:
-        drawn = pipeline.show(result, pipeline.STAGES if stage is None else (stage,))
+        drawn = pipeline.show(result, STAGES if stage is None else (stage,))
     terminal.say({"written": [str(file) for file in drawn]} if json else "\n".join(map(str, drawn)))
     terminal.preview(drawn)
 

@@ -142,7 +142,7 @@ def test_show_draws_all_stages_or_moves_the_light(result: Path, polcap: Command,
     copy = tmp_path / "copy"
     shutil.copytree(result, copy)
     drawn = polcap("show", copy, "--all").stdout.split()
-    assert [Path(file).stem for file in drawn] == list(pipeline.STAGES) and all(Path(file).exists() for file in drawn)
+    assert [Path(file).stem for file in drawn] == list(STAGES) and all(Path(file).exists() for file in drawn)
     for motion in ("light", "turntable"):
         file = Path(json.loads(polcap("show", copy, "--animate", motion, "--json").stdout)["written"][0])
         done, moving = cv2.imdecodeanimation(np.fromfile(file, np.uint8))
