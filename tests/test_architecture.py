@@ -1,5 +1,6 @@
 """The house stands as the architecture page draws it."""
 
+import ast
 import os
 import re
 import subprocess
@@ -17,6 +18,57 @@ def test_layers_and_strangers() -> None:
         [str(Path(sys.executable).with_name("lint-imports")), "--no-cache"], capture_output=True, text=True, cwd=ROOT
     )
     assert done.returncode == 0, done.stdout
+
+
+MODULES = {  # dotted name → file
+    ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): file
+    for file in sorted((ROOT / "polcap").rglob("*.py"))
+}
+
+
+def imported(name: str) -> set[str]:
+    """The house's modules that one of them names, wherever in the file."""
+    found = set()
+    for node in ast.walk(ast.parse(MODULES[name].read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            deeper = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= (deeper & MODULES.keys()) or {node.module}
+    return (found & MODULES.keys()) - {name}
+
+
+USES = {name: imported(name) for name in MODULES}
+
+
+def test_imports_form_no_circle() -> None:
+    """Also those inside functions; a package and its own modules count as one another's house, not as a circle."""
+    left = {name: {used for used in uses if not name.startswith(f"{used}.")} for name, uses in USES.items()}
+    while free := [name for name, uses in left.items() if not uses & left.keys()]:
+        for name in free:
+            del left[name]
+    assert left == {}
+
+
+def test_what_one_room_uses_stands_in_that_room() -> None:
+    """A module of optics is used by two rooms or more; rooms are stages, and the folders beside them."""
+    single = {}
+    for module in (name for name in MODULES if re.fullmatch(r"polcap\.optics\.\w+", name)):
+        rooms = {_room(name) for name, uses in USES.items() if module in uses and _room(name) != "polcap.optics"}
+        inside = any(module in uses for name, uses in USES.items() if _room(name) == "polcap.optics")
+        if len(rooms) < 2 and not inside:
+            single[module] = rooms
+    assert single == {}
+
+
+def _room(name: str) -> str:
+    parts = name.split(".")
+    return ".".join(parts[: 3 if parts[1:2] == ["stages"] else 2])
+
+
+def test_a_files_name_is_unique_in_the_house() -> None:
+    names = [file.name for file in MODULES.values() if file.name != "__init__.py"]
+    assert sorted(names) == sorted(set(names))
 
 
 def test_stages_stand_in_the_order_of_the_path() -> None:

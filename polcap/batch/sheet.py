@@ -11,40 +11,15 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import cv2
-import numpy as np
-
 from polcap.batch.unit import FINISHED, FOLDER, Record, Unit
 from polcap.formats import atomic
 
-_SIDE = 128  # px, of each of the two pictures in a thumbnail
 _STYLE = """
 body { font: 14px/1.4 system-ui, sans-serif; margin: 1.5em; color: #222 } img { background: #000; display: block }
 table { border-collapse: collapse } td, th { text-align: left; padding: .2em .8em .2em 0; vertical-align: top }
 .sheet { display: grid; grid-template-columns: repeat(auto-fill, 256px); gap: 12px } figcaption { font-size: 12px }
 .done { color: #176617 } .gates { color: #9a5b00 } .failed, .bug, .crashed { color: #b00000; font-weight: bold }
 """
-
-
-def write_thumbnail(unit: Unit) -> None:
-    """Normal and diffuse albedo of a finished unit, side by side."""
-    maps = Path(unit.out) / "maps"
-    pictures = [_small(maps / name) for name in ("normal.png", "diffuse.png")]
-    _, encoded = cv2.imencode(".jpg", np.hstack(pictures), [cv2.IMWRITE_JPEG_QUALITY, 85])
-    with atomic.path(unit.thumbnail_file) as temporary:
-        temporary.write_bytes(encoded.tobytes())
-
-
-def _small(file: Path) -> Any:
-    """(SIDE, SIDE, 3) of a map's PNG, black around it."""
-    out = np.zeros((_SIDE, _SIDE, 3), np.uint8)
-    picture = cv2.imread(str(file), cv2.IMREAD_COLOR)
-    if picture is not None:
-        height, width = picture.shape[:2]
-        scale = _SIDE / max(height, width)
-        size = max(1, round(width * scale)), max(1, round(height * scale))
-        out[: size[1], : size[0]] = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    return out
 
 
 def summary(records: Sequence[Record]) -> dict[str, Any]:

@@ -107,7 +107,7 @@ def run(unit: Unit, order: Order, attempt: int = 1) -> Record:
 
 def _process(unit: Unit, order: Order) -> dict[str, Any]:
     from polcap import pipeline
-    from polcap.batch import sheet
+    from polcap.batch import thumbnail
     from polcap.config import Config
     from polcap.formats import capture as captures
     from polcap.path import UserInput
@@ -117,7 +117,7 @@ def _process(unit: Unit, order: Order) -> dict[str, Any]:
     found = captures.read(unit.capture, order.angles_deg)
     about = pipeline.process(found, given, config, Path(unit.out))
     assert about is not None  # only `until` leaves it out
-    sheet.write_thumbnail(unit)
+    thumbnail.write(unit.thumbnail_file, Path(unit.out))
     return about
 
 

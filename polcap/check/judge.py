@@ -6,7 +6,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from polcap.check import outline, sharpness
+from polcap.check import rim, sharpness
 from polcap.check.reduced import Taken
 from polcap.config import Config
 from polcap.errors import ChartError, InputError
@@ -221,24 +221,24 @@ def _outline(image: StokesImage, radiance: AngleStack, config: Config, names: li
     """What the outline says of the angles and of other light."""
     light = np.einsum("kj,jhw->khw", mueller.analyzer(radiance.angle), image.stokes.sum(-1))
     doubtful = Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST
-    rim = outline.rim(light, image.mask, (image.quality & int(doubtful)) == 0)
+    band = rim.take(light, image.mask, (image.quality & int(doubtful)) == 0)
     limit = config.check.max_turn_deg
-    if rim.length < _LEAST_RIM:
+    if band.length < _LEAST_RIM:
         yield Line("angles", "not measured", None, limit, "too little outline")
         return
-    dolp = float(np.median(outline.dolp(rim, radiance.angle)))
+    dolp = float(np.median(rim.dolp(band, radiance.angle)))
     if dolp < _LEAST_DOLP:
         remedy = "is the polarizer on, and did it turn? A metal object has no diffuse polarization"
         yield Line(
             "polarized", "reshoot", round(dolp, 4), _LEAST_DOLP, f"outline polarized by {100 * dolp:.1f} %", remedy
         )
         return
-    found = outline.turn(rim, radiance.angle, np.radians(limit))
+    found = rim.turn(band, radiance.angle, np.radians(limit))
     if found.misfit < config.check.max_turn_fit:
         yield _turned(found, radiance.angle, limit, names)
     else:
         yield Line("angles", "ok", 0.0, limit, "no other angle fits the outline clearly better")
-    side = outline.side_light(rim)
+    side = rim.side_light(band)
     k = int(np.argmax(side))
     limit = config.check.max_side_light
     remedy = "another light was on in one of the shots: darken the room, and take that shot again"
@@ -246,7 +246,7 @@ def _outline(image: StokesImage, radiance: AngleStack, config: Config, names: li
     yield _least("other light", float(side[k]), limit, says, remedy, (names[k],))
 
 
-def _turned(found: outline.Turn, angle: Floats, limit: float, names: list[str]) -> Line:
+def _turned(found: rim.Turn, angle: Floats, limit: float, names: list[str]) -> Line:
     degrees = float(np.degrees(found.angle))
     remedy = "set the ring to its mark and take the shot again, or name the angle it really had"
     which = "the ring"

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from polcap.errors import DecodeError
 from polcap.formats import atomic, exr, png
 from polcap.images import Cues, Floats, Mesh, StokesImage, SurfaceMaps, View
+from polcap.optics import color
 
 CONVENTIONS = {
     "frame": "camera: x right, y up, z toward the camera; a normal facing the camera is (0, 0, 1)",
@@ -193,7 +194,7 @@ def _channels(names: str, values: Floats) -> dict[str, Floats]:
 
 
 def _picture(linear: Floats) -> NDArray[np.uint8]:
-    return np.rint(255 * png.encode_srgb(linear)).astype(np.uint8)
+    return np.asarray(np.rint(255 * color.encode_srgb(np.clip(linear, 0.0, 1.0))), np.uint8)
 
 
 def _stokes_channels(stokes: StokesImage) -> dict[str, Floats]:

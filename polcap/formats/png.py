@@ -107,12 +107,6 @@ def sixteen_bits(value: Floats) -> NDArray[np.uint16]:
     return np.asarray(np.rint(np.clip(np.asarray(value, dtype=np.float64), 0.0, 1.0) * 65535), dtype=np.uint16)
 
 
-def encode_srgb(linear: Floats) -> Floats:
-    """Linear 0…1 → sRGB 0…1, clipped (IEC 61966-2-1)."""
-    value = np.clip(linear, 0.0, 1.0)
-    return np.asarray(np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055))
-
-
 def _swapped(array: Any) -> Any:
     """RGB ↔ BGR."""
     if array.ndim == 2:

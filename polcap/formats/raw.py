@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 from polcap.errors import DecodeError
 from polcap.formats import exif, photo_bytes, plausible, sniff, worker
 from polcap.images import Bits, Exif, Floats, SensorImage
+from polcap.optics.color import REC709_TO_XYZ
 
-XYZ_FROM_REC709 = np.array(  # IEC 61966-2-1, D65
-    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
-)
 _COPY_AGAIN = "copy it from the card again"
 
 
@@ -56,7 +54,7 @@ def camera_matrix(xyz_to_camera: Floats, balance: Floats | None) -> Floats | Non
     ----------
     Adobe, Digital Negative Specification 1.4, ch. 6; dcraw's normalisation to the white of D65.
     """
-    camera = xyz_to_camera @ XYZ_FROM_REC709
+    camera = xyz_to_camera @ REC709_TO_XYZ
     daylight = camera.sum(axis=1)  # the camera's answer to D65
     if (daylight <= 0).any() or abs(np.linalg.det(camera)) < 1e-9:
         return None

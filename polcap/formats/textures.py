@@ -7,6 +7,7 @@ import numpy as np
 
 from polcap.errors import DecodeError
 from polcap.images import Floats
+from polcap.optics import color
 
 
 def read(folder: Path, side: int = 256) -> Floats:
@@ -20,7 +21,7 @@ def read(folder: Path, side: int = 256) -> Floats:
         A picture is missing or cannot be read.
     """
     albedo = _picture(folder / "albedo.jpg", side)[..., ::-1]
-    linear = np.where(albedo <= 0.04045, albedo / 12.92, ((albedo + 0.055) / 1.055) ** 2.4)
+    linear = color.decode_srgb(albedo)
     rough = _picture(folder / "roughness.jpg", side).mean(axis=-1)
     slope: Floats = np.zeros((side, side, 2), dtype=np.float32)
     if (folder / "normal.jpg").exists():

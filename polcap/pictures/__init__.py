@@ -25,6 +25,7 @@ from polcap.images import (
     StokesImage,
     SurfaceMaps,
 )
+from polcap.optics import color
 from polcap.optics.warp import warp
 from polcap.path import Results
 from polcap.pictures import keys
@@ -218,7 +219,7 @@ def asset(built: Asset) -> Picture:
 def display(linear: Floats, top: float | None = None) -> Picture:
     """Linear light as sRGB; `top` becomes white, by default the 99.5th percentile."""
     value = np.clip(np.nan_to_num(linear) / (top or _top(linear)), 0, 1)
-    return _eight(np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055))
+    return _eight(color.encode_srgb(value))
 
 
 def scale(value: Floats, low: float, high: float, inside: NDArray[np.bool_]) -> Picture:

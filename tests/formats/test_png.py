@@ -5,7 +5,6 @@ import pytest
 
 from polcap.errors import DecodeError, StorageError
 from polcap.formats import png
-from polcap.optics import color
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
@@ -43,8 +42,3 @@ def test_folder_that_is_a_file_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "maps").write_text("")
     with pytest.raises(StorageError, match="stands where a folder is needed"):
         png.write(tmp_path / "maps" / "a.png", np.zeros((2, 2), dtype=np.uint8))
-
-
-def test_srgb_is_the_same_curve_as_in_optics() -> None:
-    linear = np.linspace(0, 1, 4001)
-    assert np.allclose(png.encode_srgb(linear), color.encode_srgb(linear), atol=1e-12)

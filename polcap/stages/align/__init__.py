@@ -21,6 +21,7 @@ from msgspec import Meta
 
 from polcap.errors import AlignmentError
 from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Quality
+from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.optics.warp import warp
 from polcap.stages import stage
 
@@ -195,7 +196,7 @@ def _step(a: Floats, b: Floats, weight: Floats, transform: Floats, model: str) -
     slope = jacobian[:, 0] ** 2 + jacobian[:, 1] ** 2
     w = 1 / (_ALIASING_PX2 * slope + 1 / weight[use].astype(np.float64))
     normalized = np.abs(difference) * np.sqrt(w)
-    scale = 1.4826 * _weighted_median(normalized, w * slope) + 1e-9
+    scale = MAD_TO_SIGMA * _weighted_median(normalized, w * slope) + 1e-9
     w = w * np.maximum(0, 1 - (normalized / (4.685 * scale)) ** 2) ** 2
     normal = jacobian.T @ (jacobian * w[:, None]) + 1e-12 * np.eye(jacobian.shape[1])
     p = np.linalg.solve(normal, jacobian.T @ (w * difference))

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
+from polcap.optics.robust import MAD_TO_SIGMA
 
 TILE = 16  # px
 _LEAST_TILES = 30
@@ -52,7 +53,7 @@ def _quotient(a: Floats, b: Floats) -> tuple[float, float] | None:
     keep = np.ones(len(a), bool)
     for _ in range(6):
         error = (b - r * a) / np.sqrt(b)  # even noise, were it photons alone
-        scale = 1.4826 * float(np.median(np.abs(error)))
+        scale = MAD_TO_SIGMA * float(np.median(np.abs(error)))
         keep = np.abs(error) <= 4 * scale + 0.003 * np.sqrt(b)
         if keep.sum() < _LEAST_TILES / 2:
             return None

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
+from polcap.optics.robust import MAD_TO_SIGMA
 
 TILE = 16  # px; about 68 independent second differences, so that one tile knows its variance to 17 %
 _FREEDOM = TILE * TILE / 3.78  # 3.78 = Σ ρ² over the autocorrelation of [1, −2, 1] ⊗ [1, −2, 1]
@@ -220,7 +221,7 @@ def _solve(x: Floats, y: Floats, n: Floats, least: float) -> tuple[float, float]
     for _ in range(8):
         model = np.maximum(slope * np.maximum(x, 0) + floor, least)
         z = (y / model - 1) * np.sqrt(n * _FREEDOM / 2)
-        scale = max(1.0, 1.4826 * float(np.median(np.abs(z))))
+        scale = max(1.0, MAD_TO_SIGMA * float(np.median(np.abs(z))))
         weight = n / model**2 / np.maximum(1, (np.abs(z) / (2.5 * scale)) ** 2)
         matrix = np.array([[np.sum(weight * x * x), np.sum(weight * x)], [np.sum(weight * x), np.sum(weight)]])
         if np.linalg.cond(matrix / np.trace(matrix)) > 1e10:  # one signal level: no line through it

@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import spsolve
 
 from polcap.images import Floats
+from polcap.optics import outline
 
 _MOST_PIXELS = 90_000  # of the grid the signs are solved on; finer signs follow the coarse direction
 _RIM_PX = 3.0  # anchored band inside the outline, on that grid
+_BLUR_PX = 3.0  # of the depth, for its slope
 _CONVEXITY = 1e-4  # weight of "outward from the outline" everywhere else
 
 
@@ -52,14 +54,6 @@ def resolve(double_angle: Floats, strength: Floats, mask: NDArray[np.bool_]) -> 
     return phi + np.where(along < 0, np.pi, 0.0), np.minimum(np.abs(along), 1.0)
 
 
-def outward(mask: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """Distance to the outline (H, W) px, and the unit direction away from the interior (2, H, W), y up."""
-    distance = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
-    smooth = cv2.GaussianBlur(distance, (0, 0), 3.0)
-    direction = np.stack([-np.gradient(smooth, axis=1), np.gradient(smooth, axis=0)])
-    return distance, direction / (np.linalg.norm(direction, axis=0) + 1e-6)
-
-
 def _walk(phi: Floats, strength: Floats, mask: NDArray[np.bool_]) -> Floats:
     """The relaxed signs (H, W), 0 outside: argmin Σ w (s_i − σ_ij s_j)² + Σ u (s_i − outward_i)²."""
     height, width = mask.shape
@@ -86,7 +80,8 @@ def _walk(phi: Floats, strength: Floats, mask: NDArray[np.bool_]) -> Floats:
         columns += [j, i]
         values += [coupling, coupling]
         diagonal += np.bincount(i, weight, count) + np.bincount(j, weight, count)
-    distance, away = outward(mask)
+    distance = outline.depth(mask)
+    away, _ = outline.outward(distance, _BLUR_PX)
     facing = (axis * away).sum(0)
     anchor = (np.where(distance <= _RIM_PX, confidence, 0) + _CONVEXITY) * np.abs(facing)
     entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from polcap.errors import ObjectError
 from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, ObjectMask
+from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.optics.warp import warp
 from polcap.stages import stage
 
@@ -118,7 +119,7 @@ def _backdrop(log: Floats, outside: NDArray[np.bool_]) -> tuple[float, float]:
     sample = log[border & ~outside]
     level = float(np.percentile(sample, 40))
     below = level - sample[sample < level]
-    return level, 1.4826 * float(np.median(below)) if below.size else 0.1
+    return level, MAD_TO_SIGMA * float(np.median(below)) if below.size else 0.1
 
 
 def _otherwise_colored(picture: Floats, log: Floats, level: float, outside: NDArray[np.bool_]) -> NDArray[np.bool_]:

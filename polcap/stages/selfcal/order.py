@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from itertools import combinations, permutations
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
-from polcap.optics import mueller
+from polcap.optics import mueller, outline
 
 Bools = NDArray[np.bool_]
 Order = tuple[tuple[int, ...], bool]  # which stated angle each shot has, and whether they count clockwise
@@ -50,11 +49,9 @@ class Verdict:
 
 def rim(value: Floats, usable: Bools, mask: Bools, crop: tuple[int, int, int, int], full: tuple[int, ...]) -> Rim:
     """The rim of shots (K, H, W); where the object leaves the picture its outline is no contour of shape."""
-    padded = np.pad(mask.astype(np.uint8), 1)
-    depth = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
-    smooth = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 3.0)
-    dx, dy = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
-    band = (depth > 1.5) & (depth < max(5.0, 0.02 * max(mask.shape))) & (np.hypot(dx, dy) > 1e-4) & usable
+    depth = outline.depth(mask)
+    (x, y), slope = outline.outward(mask.astype(np.float32), 3.0)
+    band = (depth > 1.5) & (depth < max(5.0, 0.02 * max(mask.shape))) & (slope > 1e-4) & usable
     x0, y0, x1, y1 = crop
     edge = 3
     band[: max(0, edge - y0)] = False

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from polcap.images import Floats
+from polcap.optics.robust import MAD_TO_SIGMA
 
 ROWS, COLUMNS = 4, 6
 USUAL_PATCH = 0.88  # side of a patch / pitch
@@ -123,7 +124,7 @@ def refine(image: Floats, start: Placement, steps: int = 12) -> Placement:
         if drawing is None:
             return start
         residual, jacobian, explained = drawing
-        scale = 1.4826 * np.median(np.abs(residual)) + 1e-4
+        scale = MAD_TO_SIGMA * np.median(np.abs(residual)) + 1e-4
         weight = np.minimum(1.0, 2.5 * scale / (np.abs(residual) + 1e-12))  # Huber
         normal = np.einsum("nci,nc,ncj->ij", jacobian, weight, jacobian)
         right = np.einsum("nci,nc,nc->i", jacobian, weight, residual)

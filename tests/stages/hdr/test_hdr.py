@@ -11,6 +11,7 @@ import pytest
 from polcap.errors import CaptureError
 from polcap.images import Capture, Exif, Frame, Quality, SensorImage, Shot
 from polcap.optics import sensor
+from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.stages import hdr
 from polcap.stages.hdr import ghosts as bracket_pixels
 from polcap.stages.hdr import noise
@@ -468,5 +469,5 @@ def test_hand_held_nikon_bracket():
         variance = variance + bracket_pixels.edges(first) * links[e].misfit
         z = ((value / links[e].ratio - mid) / np.sqrt(variance))[usable & clear & ~ghost]
         assert np.all(np.abs(z.mean(axis=0)) < 0.1)
-        assert np.all(np.abs(1.4826 * np.median(np.abs(z), axis=0) - 1.05) < 0.25)
+        assert np.all(np.abs(MAD_TO_SIGMA * np.median(np.abs(z), axis=0) - 1.05) < 0.25)
         assert 0.8 < z.std() < 1.3

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polcap.check import outline
+from polcap.check import rim
 from polcap.optics import mueller
 from tests import scenes
 
@@ -11,40 +11,40 @@ Y, X = np.mgrid[0 : scenes.HEIGHT, 0 : scenes.WIDTH].astype(float)
 STOKES, BALL = scenes.stokes(X, Y)
 
 
-def ball_rim(actual_deg: tuple[float, ...], lamp: float = 0.0) -> outline.Rim:
+def ball_rim(actual_deg: tuple[float, ...], lamp: float = 0.0) -> rim.Rim:
     shots = np.einsum("kj,jhw->khw", mueller.analyzer(np.radians(actual_deg)), STOKES.sum(-1))
     shots *= 1 + 0.004 * np.random.default_rng(0).normal(size=shots.shape)
     shots[1] *= 1 + lamp * scenes.normals(X, Y)[0][..., 0]
-    return outline.rim(shots, BALL, np.ones_like(BALL))
+    return rim.take(shots, BALL, np.ones_like(BALL))
 
 
 @pytest.mark.parametrize("shot", [0, 1, 2])
 def test_wrong_angle_of_one_shot_is_found(shot: int) -> None:
     actual = [0.0, 45.0, 90.0]
     actual[shot] += 15
-    found = outline.turn(ball_rim(tuple(actual)), scenes.ANGLES, np.radians(8))
+    found = rim.turn(ball_rim(tuple(actual)), scenes.ANGLES, np.radians(8))
     assert found.shot == shot
-    assert np.degrees(found.angle) == pytest.approx(15, abs=outline._STEP_DEG)
+    assert np.degrees(found.angle) == pytest.approx(15, abs=rim._STEP_DEG)
     assert found.misfit < 0.5
 
 
 def test_ring_off_its_mark_is_no_single_shots_fault() -> None:
-    found = outline.turn(ball_rim((-12, 33, 78)), scenes.ANGLES, np.radians(8))
+    found = rim.turn(ball_rim((-12, 33, 78)), scenes.ANGLES, np.radians(8))
     assert found.shot is None
-    assert np.degrees(found.angle) == pytest.approx(-12, abs=outline._STEP_DEG)
+    assert np.degrees(found.angle) == pytest.approx(-12, abs=rim._STEP_DEG)
 
 
 def test_true_angles_stand_unchallenged() -> None:
-    assert outline.turn(ball_rim((0.5, 44.6, 90.3)), scenes.ANGLES, np.radians(8)).misfit > 0.9
+    assert rim.turn(ball_rim((0.5, 44.6, 90.3)), scenes.ANGLES, np.radians(8)).misfit > 0.9
 
 
 def test_lamp_at_the_side_is_told_from_polarization() -> None:
-    assert outline.side_light(ball_rim((0, 45, 90))).max() < 0.02
-    side = outline.side_light(ball_rim((0, 45, 90), lamp=0.15))
+    assert rim.side_light(ball_rim((0, 45, 90))).max() < 0.02
+    side = rim.side_light(ball_rim((0, 45, 90), lamp=0.15))
     assert int(np.argmax(side)) == 1
     assert side[1] == pytest.approx(0.15 * 2 / 3, abs=0.03)  # against the mean of all three
 
 
 def test_diffuse_polarization_grows_towards_the_outline() -> None:
-    dolp = np.median(outline.dolp(ball_rim((0, 45, 90)), scenes.ANGLES))
+    dolp = np.median(rim.dolp(ball_rim((0, 45, 90)), scenes.ANGLES))
     assert 0.05 < dolp < 0.4  # Fresnel, n = 1.5: 3 % at 40°, 39 % at 90°

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
-from polcap.optics import mueller
+from polcap.optics import mueller, outline
 
 Bools = NDArray[np.bool_]
 
@@ -43,20 +43,19 @@ class Turn:
     misfit: float  # residual with that turn, relative to the residual without; 1: nothing is better
 
 
-def rim(light: Floats, mask: Bools, usable: Bools) -> Rim:
+def take(light: Floats, mask: Bools, usable: Bools) -> Rim:
     """The rim of registered shots (K, H, W) of equal gain; usable: pixels to be believed."""
     ok = (mask & usable).astype(np.float32)
     weight = cv2.GaussianBlur(ok, (0, 0), _SMOOTH_PX) + 1e-6
     smooth = np.stack([cv2.GaussianBlur(shot.astype(np.float32) * ok, (0, 0), _SMOOTH_PX) / weight for shot in light])
-    depth = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    depth = outline.depth(mask)
     reach = max(_DEPTH * float(np.sqrt(mask.sum() / np.pi)), _INNER_PX + 3)
-    soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), max(3.0, reach / 2))
-    dx, dy = cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1)
-    band = (depth > _INNER_PX) & (depth < reach) & (ok > 0) & (np.hypot(dx, dy) > 1e-4)
+    (x, y), slope = outline.outward(mask.astype(np.float32), max(3.0, reach / 2))
+    band = (depth > _INNER_PX) & (depth < reach) & (ok > 0) & (slope > 1e-4)
     for edge in (band[:3], band[-3:], band[:, :3], band[:, -3:]):  # where a picture ends is no contour
         edge[:] = False
     inside = smooth[:, band]
-    return Rim(inside / np.maximum(inside.mean(0), 1e-9), np.arctan2(dy, -dx)[band])  # rows run down
+    return Rim(inside / np.maximum(inside.mean(0), 1e-9), np.arctan2(y, x)[band])
 
 
 def turn(at: Rim, angle: Floats, least: float) -> Turn:

@@ -1,0 +1,3 @@
+"""Robust statistics shared by the stages."""
+
+MAD_TO_SIGMA = 1.4826  # 1/Φ⁻¹(¾): median absolute deviation → standard deviation of a normal distribution
