@@ -50,7 +50,7 @@ class Verdict:
 def rim(value: Floats, usable: Bools, mask: Bools, crop: tuple[int, int, int, int], full: tuple[int, ...]) -> Rim:
     """The rim of shots (K, H, W); where the object leaves the picture its outline is no contour of shape."""
     depth = outline.depth(mask)
-    (x, y), slope = outline.outward(mask.astype(np.float32), 3.0)
+    out, slope = outline.outward(mask.astype(np.float32), 3.0)
     band = (depth > 1.5) & (depth < max(5.0, 0.02 * max(mask.shape))) & (slope > 1e-4) & usable
     x0, y0, x1, y1 = crop
     edge = 3
@@ -61,7 +61,7 @@ def rim(value: Floats, usable: Bools, mask: Bools, crop: tuple[int, int, int, in
     y, x = np.nonzero(band)
     around = np.arctan2(y - y.mean(), x - x.mean()) if len(y) else np.zeros(0)
     sector = np.floor((around + np.pi) / (2 * np.pi) * _SECTORS).astype(int) % _SECTORS
-    return Rim(np.asarray(value[:, band], np.float64), np.arctan2(dy, -dx)[band], sector)  # image rows run down
+    return Rim(np.asarray(value[:, band], np.float64), np.arctan2(out[1], out[0])[band], sector)
 
 
 def judge(at: Rim, angle: Floats, margin: float, believable: float, beyond_sigma: float = 3.0) -> Verdict:
