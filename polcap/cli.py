@@ -318,9 +318,16 @@ def report(
     from polcap import report as reports
 
     if compare is not None:
-        rows = reports.compare(reports.read(result), reports.read(compare))
+        from polcap.report import compare as pairs
+
+        abouts = reports.read(result), reports.read(compare)
+        file = result / "compare.html"
+        pairs.write(file, (result, compare), abouts)
+        rows = pairs.rows(*abouts)
         named = [{"name": name, "here": here, "there": there} for name, here, there in rows]
-        terminal.say(named if json else "\n".join(f"{name}: {here}  |  {there}" for name, here, there in rows))
+        spoken = (pairs.spoken(row) for row in rows)
+        terminal.say(named if json else "\n".join(f"{title}: {here}  |  {there}" for title, here, there in spoken))
+        print(f"polcap: both side by side: {file}", file=sys.stderr)
         return
     from polcap import pipeline
 

@@ -6,12 +6,14 @@ from html import unescape
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from polcap import report
 from polcap.config import Gates
 from polcap.errors import StorageError
-from polcap.report import labels
+from polcap.report import compare, labels, lean
+from tests import surfaces
 
 
 @pytest.fixture
@@ -87,10 +89,30 @@ def test_comparison_names_figures_and_settings_that_differ(result: Path) -> None
     other = json.loads(json.dumps(one))
     other["figures"]["maps"]["estimator"] = "network"
     other["settings"]["hdr"]["clip"] = 0.9
-    rows = {name: (here, there) for name, here, there in report.compare(one, other)}
+    rows = {name: (here, there) for name, here, there in compare.rows(one, other)}
     assert rows["figures.maps.estimator"] == ("analytic", "network")
     assert set(rows) == {"figures.maps.estimator", "settings.hdr.clip"}
-    assert report.compare(one, one) == []
+    assert compare.rows(one, one) == []
+
+
+def test_comparison_is_a_page_like_the_report(result: Path, tmp_path: Path) -> None:
+    about = report.read(result)
+    changed = json.loads(json.dumps(about))
+    changed["figures"]["maps"]["roughness_median"] = 0.5
+    compare.write(tmp_path / "compare.html", (result, result), (about, changed))
+    page = unescape((tmp_path / "compare.html").read_text())
+    assert "<td>Maps: Median roughness</td>" in page and "<td>0.5</td>" in page
+    assert page.count('class="map"') == 11 and "median 0°" in page
+
+
+def test_mesh_of_a_page_has_few_vertices_where_the_surface_is() -> None:
+    mesh = surfaces.mesh(surfaces.maps())
+    vertices, uv, faces = lean.thinned(mesh, 600)
+    assert 200 < len(vertices) <= 900 and faces.max() < len(vertices) and len(uv) == len(vertices)
+    radius = np.linalg.norm(vertices - mesh.vertices.mean(0), axis=1)
+    assert radius.max() <= np.linalg.norm(mesh.vertices - mesh.vertices.mean(0), axis=1).max()
+    normals = np.cross(*(vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2)))
+    assert (normals[:, 2] > 0).mean() > 0.99  # still seen from the camera
 
 
 @pytest.mark.parametrize("text", [None, "{", "[]", "{}"])

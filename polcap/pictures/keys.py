@@ -87,6 +87,7 @@ def _distinct(rgb: NDArray[np.int64]) -> NDArray[np.uint8]:
 
 DOLP = Key(0, 0.2, "", (0, 0.05, 0.1, 0.15, 0.2), "inferno", digits=3)
 AOLP = Key(0, 180, "°", (0, 45, 90, 135, 180), "wheel", digits=0)
+ALBEDO = Key(0, 1, "", (0, 0.25, 0.5, 0.75, 1))
 ROUGHNESS = Key(0, 1, "", (0, 0.25, 0.5, 0.75, 1))
 F0 = Key(0, 0.16, "", (0, 0.04, 0.08, 0.12, 0.16), digits=3)
 ERROR = Key(0, 30, "°", (0, 1, 3, 10, 20, 30), "inferno", power=2, digits=1)  # 3° at a third of the bar

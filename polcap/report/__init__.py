@@ -271,21 +271,6 @@ def read(folder: Path) -> dict[str, Any]:
     return about
 
 
-def compare(one: dict[str, Any], other: dict[str, Any]) -> list[tuple[str, Any, Any]]:
-    """The figures and settings in which two reports differ: name, here, there."""
-    rows = []
-    for part in ("figures", "settings"):
-        here, there = _flat(one[part]), _flat(other[part])
-        for name in dict.fromkeys([*here, *there]):
-            if here.get(name) != there.get(name):
-                rows.append((f"{part}.{name}", here.get(name), there.get(name)))
-    return rows
-
-
-def _flat(tree: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    return {f"{section}.{name}": value for section, part in tree.items() for name, value in part.items()}
-
-
 def _least(name: str, value: float | None, limit: float, says: str) -> Gate:
     """A gate whose value must not exceed its limit."""
     state: State = "not measured" if value is None else "pass" if value <= limit else "fail"

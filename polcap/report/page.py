@@ -152,7 +152,7 @@ def _maps(small: Shown, metric: bool) -> Iterator[str]:
     yield (
         '<h2>Maps</h2><p class="hint">The pointer over one map reads all of them at that pixel.</p><div class="grid">'
     )
-    yield _normal(maps.normal, inside)
+    yield normal("normal", "Normal", maps.normal, inside)
     yield _color("diffuse", "Diffuse albedo", "ρ_d, linear: red, green, blue", maps.diffuse, inside, 1.0)
     yield _color("specular", "Specular albedo F0", "linear: red, green, blue", maps.specular, inside, keys.F0.high)
     scalars: list[tuple[str, str, str, Floats, Key]] = [
@@ -195,15 +195,16 @@ def bar(key: Key) -> str:
     return f'<div class="bar" style="background:linear-gradient(90deg,{paint})"></div><div class="ticks">{ticks}</div>'
 
 
-def _normal(normal: Floats, inside: NDArray[np.bool_]) -> str:
-    filled = _outwards(np.rint(255 * (normal / 2 + 0.5)).astype(np.uint8), inside)
+def normal(name: str, title: str, vectors: Floats, inside: NDArray[np.bool_]) -> str:
+    """A map of normals with its key; the pointer reads it."""
+    filled = _outwards(np.rint(255 * (vectors / 2 + 0.5)).astype(np.uint8), inside)
     image = np.concatenate([filled, np.where(inside, 255, 0).astype(np.uint8)[..., None]], axis=-1)
     legend = (
         f'<div class="key"><img width="72" height="72" alt="" src="{html.lossless(plots.ball())}">'
         "<span>colors of a ball: red right, green up, blue toward the camera</span></div>"
     )
     about = {"kind": "normal", "unit": "", "digits": 2}
-    return _figure("normal", "Normal", "x right, y up, z toward the camera", about, html.lossless(image), legend)
+    return _figure(name, title, "x right, y up, z toward the camera", about, html.lossless(image), legend)
 
 
 def _color(name: str, title: str, says: str, linear: Floats, inside: NDArray[np.bool_], top: float) -> str:

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from polcap.formats import maps
+from polcap.formats import maps, png
+from polcap.optics import frames, shade
 from tests.render import devtools
 
 
@@ -48,6 +49,26 @@ def test_light_follows_the_pointer(page: devtools.Page, tmp_path: Path) -> None:
         half = picture.shape[1] // 2
         found.extend([picture[:, :half].mean(), picture[:, half:].mean()])
     assert left[0] > 1.5 * left[1] and right[1] > 1.5 * right[0]
+
+
+@pytest.mark.parametrize("light", [(0.0, 0.0), (0.6, 0.3), (-0.5, -0.7)])
+def test_light_obeys_the_law_of_the_maps(
+    page: devtools.Page, result: Path, tmp_path: Path, light: tuple[float, float]
+) -> None:
+    page.evaluate(f"relight.aim({light[0]}, {light[1]}); relight.draw()")
+    drawn = seen(page, "relight", tmp_path)
+    exposure, ior = page.evaluate("[DATA.view.exposure, DATA.view.ior]")
+    stored = maps.read(result / "maps").maps
+    ray = frames.rays(stored.view, *stored.mask.shape)
+    to_light = np.array([*light, np.sqrt(1 - light[0] ** 2 - light[1] ** 2)])
+    local = frames.to_ray_frame(np.broadcast_to(to_light, ray.shape), ray)
+    one = np.ones(stored.mask.shape)
+    normal = frames.to_ray_frame(stored.normal, ray)
+    law = shade.stokes(normal, stored.diffuse, stored.specular, stored.roughness, ior * one, local, one)[0]
+    expected = 255 * png.encode_srgb(exposure * law)
+    inside = stored.mask & (normal[..., 2] > 0.3) & (expected.max(axis=-1) < 250)
+    apart = np.abs(drawn - expected)[inside]
+    assert np.median(apart) < 2 and np.percentile(apart, 95) < 12  # of 255: 8-bit normals, albedos as JPEG
 
 
 def test_surface_turns_and_changes_its_clothes(page: devtools.Page, tmp_path: Path) -> None:
