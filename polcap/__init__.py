@@ -1,3 +1,67 @@
-"""polcap: photographs through a turned polarizer in, a relightable 3-D asset out."""
+"""polcap: photographs through a turned polarizer in, a relightable 3-D asset out.
+
+From Python, what `polcap process` does::
+
+    import polcap
+
+    result = polcap.process("CAPTURE")                  # the folder's photographs -> maps, asset, report
+    maps = polcap.read_maps(result.folder / "maps").maps
+
+Names are loaded when they are first used, so that `import polcap` costs nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from polcap.api import Result, process
+    from polcap.config import Config
+    from polcap.config import load as load_config
+    from polcap.errors import PolcapError
+    from polcap.formats.capture import read as read_capture
+    from polcap.formats.maps import read as read_maps
+    from polcap.images import Asset, Capture, ChartRequest, Cues, Frame, Mesh, Shot, StokesImage, SurfaceMaps, View
 
 __version__ = "0.1.0"
+_HOME = {  # public name → module and its name there
+    "process": ("polcap.api", "process"),
+    "Result": ("polcap.api", "Result"),
+    "Config": ("polcap.config", "Config"),
+    "load_config": ("polcap.config", "load"),
+    "PolcapError": ("polcap.errors", "PolcapError"),
+    "read_capture": ("polcap.formats.capture", "read"),
+    "read_maps": ("polcap.formats.maps", "read"),
+}
+_VALUES = ("Asset", "Capture", "ChartRequest", "Cues", "Frame", "Mesh", "Shot", "StokesImage", "SurfaceMaps", "View")
+_HOME |= {name: ("polcap.images", name) for name in _VALUES}
+__all__ = [
+    "Asset",
+    "Capture",
+    "ChartRequest",
+    "Config",
+    "Cues",
+    "Frame",
+    "Mesh",
+    "PolcapError",
+    "Result",
+    "Shot",
+    "StokesImage",
+    "SurfaceMaps",
+    "View",
+    "load_config",
+    "process",
+    "read_capture",
+    "read_maps",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, from where it lives."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'polcap' has no attribute {name!r}")
+    module, there = _HOME[name]
+    return getattr(import_module(module), there)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

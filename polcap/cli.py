@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 app = typer.Typer(
     help="Photographs through a turned polarizer, under a flash: in. A relightable 3-D asset: out.",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode=None,  # plain help: half the start-up time
     pretty_exceptions_enable=False,
 )
@@ -118,11 +118,14 @@ def process(
             return
         known = supplied()
         print(captures.table(found), file=sys.stderr)
-        with terminal.progress(len(STAGES) + 1) as told:
-            about = pipeline.process(found, known, chosen, target, until, force, told)
+        with terminal.progress(len(STAGES) + 1) as bar:
+            about = pipeline.process(found, known, chosen, target, until, force, bar.stage, bar.frame)
         if about is None:
+            work = str(target / "work")
+            terminal.say({"until": until, "work": work} if json else work)
             return
         terminal.say(about if json else str(target / "asset" / f"{found.name}.glb"))
+        print(f"verdict {about['verdict']}; {target / 'report.html'}", file=sys.stderr)
         terminal.tell_gates(about)
 
     if watch:
@@ -436,7 +439,8 @@ def synth(
         what = replace(what, interreflection=True)
     if law == "rough":
         what = replace(what, law=law)
-    synthetic.write(folder, what, shoot)
+    with terminal.progress(len(shoot.angles_deg) * shoot.exposures) as bar:
+        synthetic.write(folder, what, shoot, bar.frame)
     terminal.say(str(folder))
 
 

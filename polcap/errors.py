@@ -20,6 +20,8 @@ A message is one line: the thing, the value, the limit, the remedy.
 
 
 class PolcapError(Exception):
+    """What polcap tells in one line: the thing, the value, the limit, the remedy."""
+
     exit_code = 1
 
 

@@ -5,7 +5,9 @@ The stages and their order stand in `path.py`; this is what surrounds them: lock
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +19,7 @@ from polcap.config import Config
 from polcap.errors import ModelError, SettingError, StorageError
 from polcap.formats import animation, atomic, calib, onnx, png, provenance
 from polcap.formats import maps as maps_folder
-from polcap.images import Capture, Network
+from polcap.images import Capture, Frame, Network, SensorImage
 from polcap.path import STAGES, Results, UserInput, path
 from polcap.pictures import moving
 from polcap.store import Archive, Progress, Store, contents, silent
@@ -31,8 +33,11 @@ def process(
     until: str | None = None,
     force: str | None = None,
     progress: Progress = silent,
+    frame_read: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any] | None:
     """Run the path and write the result folder; returns report.json's content, None with `until`.
+
+    `frame_read` is told how many of how many photographs have been decoded.
 
     Raises
     ------
@@ -43,7 +48,7 @@ def process(
     store = Store(out, progress, force)
     with store.lock():
         sweep(out)
-        results = path(capture, supplied, config, store)
+        results = path(_counted(capture, frame_read), supplied, config, store)
         _remember_run(out, capture, config, supplied.network)
         store.materialize(until)
         if until is not None:
@@ -176,6 +181,33 @@ def _check_separate(out: Path, photographs: Path) -> None:
     """The result never lands among the photographs."""
     if out.resolve() == photographs.resolve():
         raise SettingError(f"--out {out} is the capture itself; choose a folder of its own")
+
+
+def _counted(capture: Capture, frame_read: Callable[[int, int], None] | None) -> Capture:
+    """The capture with frames that tell when they have been decoded."""
+    if frame_read is None:
+        return capture
+    return _Counted(sum(len(shot.frames) for shot in capture.shots), frame_read).capture(capture)
+
+
+class _Counted:
+    """Counts the photographs of a capture as they are decoded."""
+
+    def __init__(self, total: int, tell: Callable[[int, int], None]) -> None:
+        self._total, self._tell, self._done = total, tell, 0
+
+    def capture(self, capture: Capture) -> Capture:
+        shots = (replace(shot, frames=tuple(map(self._frame, shot.frames))) for shot in capture.shots)
+        return replace(capture, shots=tuple(shots))
+
+    def _frame(self, frame: Frame) -> Frame:
+        return replace(frame, load=partial(self._load, frame.load))
+
+    def _load(self, load: Callable[[], SensorImage]) -> SensorImage:
+        image = load()
+        self._done = min(self._done + 1, self._total)
+        self._tell(self._done, self._total)
+        return image
 
 
 def _remember_run(out: Path, capture: Capture, config: Config, network: Network | None) -> None:

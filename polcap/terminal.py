@@ -3,6 +3,7 @@
 import functools
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -14,8 +15,11 @@ from polcap.errors import GateError, PolcapError, SettingError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from polcap.store import Progress
+    from rich.progress import Progress as RichProgress
+    from rich.progress import TaskID
 
+
+_QUIET_S = 5.0  # between two lines about frames, where there is no terminal to write over
 OUT_OF_MEMORY = (  # as OpenCV, threads, the loader of libraries and the system say it
     "Insufficient memory", "can't start new thread", "failed to map segment", "Cannot allocate memory",
 )  # fmt: skip
@@ -40,6 +44,7 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
                 raise
             print(f"polcap: error: {line(error)}", file=sys.stderr)
             code = error.exit_code
+            tell_program(kwargs, error, code)
         except (typer.Exit, typer.Abort):
             raise
         except Exception as error:
@@ -48,15 +53,23 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
             if isinstance(error, MemoryError) or any(word in str(error) for word in OUT_OF_MEMORY):
                 print("polcap: error: out of memory; raise --memory or take a larger machine", file=sys.stderr)
                 code = SettingError.exit_code
+                tell_program(kwargs, error, code)
             else:
                 kind = type(error).__name__
                 print(f"polcap: bug: {kind}: {line(error)}; run with --debug and report it", file=sys.stderr)
                 code = 1
+                tell_program(kwargs, error, code)
         else:
             return
         raise typer.Exit(code)
 
     return run
+
+
+def tell_program(options: dict[str, Any], error: BaseException, code: int) -> None:
+    """With --json, what befell a command as a document on stdout; a failed gate's report stands there already."""
+    if options.get("json") and not isinstance(error, GateError):
+        say({"error": {"kind": type(error).__name__, "says": line(error), "exit_code": code}})
 
 
 def line(error: BaseException) -> str:
@@ -107,25 +120,55 @@ def tell_gates(about: dict[str, Any]) -> None:
         raise GateError(f"{failed} of {len(about['gates'])} gates failed; the asset was written, see report.html")
 
 
+class Steps:
+    """What a long command tells while it works: a line per finished stage, and now and then one of the frames."""
+
+    def __init__(self) -> None:
+        self._begun = self._last = time.monotonic()
+
+    def stage(self, name: str, seconds: float | None, cached: bool) -> None:
+        """A stage begins (no seconds) or has ended."""
+        if seconds is not None:
+            print(f"{name:14}{'cached' if cached else f'{seconds:.2f} s'}", file=sys.stderr, flush=True)
+
+    def frame(self, done: int, total: int) -> None:
+        """So many of so many photographs are done."""
+        now = time.monotonic()
+        if now - self._last > _QUIET_S:
+            self._last = now
+            print(f"{done} of {total} frames, {self._left(done, total, now)} left", file=sys.stderr, flush=True)
+
+    def _left(self, done: int, total: int, now: float) -> str:
+        seconds = (now - self._begun) / done * (total - done)
+        return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+
+
+class Bar(Steps):
+    """The same on a terminal, in one line that changes."""
+
+    def __init__(self, bar: "RichProgress", task: "TaskID") -> None:
+        super().__init__()
+        self._bar, self._task = bar, task
+
+    def stage(self, name: str, seconds: float | None, cached: bool) -> None:
+        """A stage begins (no seconds) or has ended."""
+        self._bar.update(self._task, description=name, advance=0 if seconds is None else 1)
+
+    def frame(self, done: int, total: int) -> None:
+        """So many of so many photographs are done."""
+        left = self._left(done, total, time.monotonic())
+        self._bar.update(self._task, description=f"{done} of {total} frames, {left} left")
+
+
 @contextmanager
-def progress(total: int) -> Iterator["Progress"]:
+def progress(total: int) -> Iterator[Steps]:
     """A bar on a terminal, else a line per finished stage."""
     if not sys.stderr.isatty():
-        yield tell_stage
+        yield Steps()
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    columns = (TextColumn("{task.description:14}"), BarColumn(), TimeElapsedColumn())
+    columns = (TextColumn("{task.description:28}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=total)
-
-        def told(stage: str, seconds: float | None, cached: bool) -> None:
-            bar.update(task, description=stage, advance=0 if seconds is None else 1)
-
-        yield told
-
-
-def tell_stage(stage: str, seconds: float | None, cached: bool) -> None:
-    if seconds is not None:
-        print(f"{stage:14}{'cached' if cached else f'{seconds:.2f} s'}", file=sys.stderr, flush=True)
+        yield Bar(bar, bar.add_task("", total=total))

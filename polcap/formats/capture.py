@@ -34,6 +34,8 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
         A file that is cut short, or that no decoder recognises.
     """
     folder = Path(folder)
+    if folder.is_file():
+        raise CaptureError(f"{folder} is a file; give the folder that holds all photographs of the object")
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder; give the folder that holds the photographs")
     stated = capture_toml.load(folder)

@@ -7,6 +7,7 @@
     FOLDER/truth.npz               maps at the pixel centres of the first angle's shots
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from math import sqrt
@@ -71,8 +72,12 @@ class Shoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return View(self.focal_mm / _SENSOR_MM * self.width, center, scale=1)
 
 
-def write(folder: Path, scene: Scene, shoot: Shoot) -> None:
+def write(
+    folder: Path, scene: Scene, shoot: Shoot, frame_written: Callable[[int, int], None] | None = None
+) -> None:
     """Photograph `scene` into `folder`, which is made; the same arguments give the same bytes.
+
+    `frame_written` is told how many of how many photographs are there.
 
     Raises
     ------
@@ -93,6 +98,8 @@ def write(folder: Path, scene: Scene, shoot: Shoot) -> None:
                 name = f"{_folder_name(angle)}/IMG_{shot * shoot.exposures + frame + 1:04d}.DNG"
                 done = studio.photograph(place / name, radiance, Take(shot, frame, _stops(shoot, frame)))
                 files.append({"file": name, "nominal_deg": angle, **pose, **done})
+                if frame_written is not None:
+                    frame_written(len(files), len(shoot.angles_deg) * shoot.exposures)
         _write_truth(place, scene, shoot, studio.buffer, studio.reference, studio.to_camera, files)
 
 

@@ -1,0 +1,37 @@
+"""What a command says, where, and with which exit code."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from polcap import terminal
+from tests.conftest import Command
+
+
+def test_short_help_and_completion_are_there(polcap: Command) -> None:
+    text = polcap("-h").stdout
+    assert "--version" in text and "--install-completion" in text
+
+
+def test_with_json_an_error_is_a_document_too(polcap: Command, tmp_path: Path) -> None:
+    done = polcap("process", tmp_path / "none", "--json")
+    said = json.loads(done.stdout)["error"]
+    assert done.returncode == said["exit_code"] == 2 and "no such folder" in said["says"]
+    assert "no such folder" in done.stderr
+
+
+def test_a_photograph_instead_of_its_folder_is_told(polcap: Command, example: Path) -> None:
+    done = polcap("process", next(example.rglob("*.DNG")))
+    assert done.returncode == 2 and "give the folder that holds all photographs" in done.stderr
+
+
+def test_frames_are_told_now_and_then_with_the_time_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = iter([0.0, 2.0, 6.0, 8.0, 12.0])
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: next(clock))
+    steps = terminal.Steps()
+    for done in (1, 2, 3, 4):
+        steps.frame(done, 9)
+    assert capsys.readouterr().err.splitlines() == ["2 of 9 frames, 21 s left", "4 of 9 frames, 15 s left"]
