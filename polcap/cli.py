@@ -109,6 +109,7 @@ def process(
             chart=request,
             mask=None if mask is None else _mask(mask),
             network=pipeline.load_network(estimator, model, device, threads),
+            mask_network=pipeline.load_mask_network(threads),
         )
 
     def once() -> None:
@@ -365,7 +366,7 @@ def check(
     with ThreadPoolExecutor(1) as beside:  # the model loads while the headers are read
         network = beside.submit(pipeline.load_network, None, None, "cpu", 0)
         found = captures.read(capture, _angles(angles))
-    verdict = checks.inspect(found, network.result(), chosen)
+    verdict = checks.inspect(found, network.result(), chosen, pipeline.load_mask_network())
     terminal.say(checks.shown(verdict) if json else checks.table(verdict))
     if not verdict.keep:
         raise typer.Exit(GateError.exit_code)
@@ -506,7 +507,8 @@ def _verdict(folder: Path) -> dict[str, Any] | None:
     from polcap.formats import capture as captures
 
     try:
-        verdict = checks.inspect(captures.read(folder), pipeline.load_network(None, None, "cpu", 0), Config())
+        networks = pipeline.load_network(None, None, "cpu", 0), pipeline.load_mask_network()
+        verdict = checks.inspect(captures.read(folder), networks[0], Config(), networks[1])
     except InputError as error:
         print(f"polcap: not judged: {terminal.line(error)}", file=sys.stderr)
         return None

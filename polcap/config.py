@@ -38,6 +38,18 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_align_residual_px: Annotated[
         float, Meta(gt=0, description="estimated 1σ error of a shot's registration [px of the grid]")
     ] = 0.15
+    max_mask_doubt: Annotated[
+        float, Meta(ge=0, le=1, description="1 − the overlap with the true outline that the mask's network expects [1]")
+    ] = 0.1
+    max_mask_islands: Annotated[
+        float, Meta(ge=0, le=1, description="share of the object outside its largest part, to pass unnoticed [1]")
+    ] = 0.02
+    max_mask_holes: Annotated[
+        float, Meta(ge=0, le=1, description="area of the object's holes, of its own, to pass unnoticed [1]")
+    ] = 0.05
+    max_mask_border: Annotated[
+        float, Meta(ge=0, le=1, description="share of the picture's edge on the object, to pass unnoticed [1]")
+    ] = 0.0
     max_clipped: Annotated[float, Meta(ge=0, le=1, description="share of the object that is clipped [1]")] = 0.02
     max_ill_posed: Annotated[
         float, Meta(ge=0, le=1, description="share of the object whose DoLP no dielectric can have [1]")

@@ -47,7 +47,7 @@ class Rig:
 
 def examine(rig: Rig, folder: Path) -> tuple[Finding, ...]:
     """Look at everything; `folder` says which disk."""
-    model = next(iter(sorted(calib.data_path("colorchecker").parent.glob("models/*.onnx"), reverse=True)), None)
+    model = next(iter(sorted(calib.data_path("colorchecker").parent.glob("models/polcap*.onnx"), reverse=True)), None)
     return (
         _libraries(),
         _decoder(),

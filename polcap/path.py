@@ -44,6 +44,7 @@ class UserInput:
     chart: ChartRequest = AUTO
     mask: NDArray[np.bool_] | None = None  # on the RAW pixels or on the grid of the merged picture
     network: Network | None = None  # None: the analytic estimator
+    mask_network: Network | None = None  # None: the object is what stands out from the backdrop
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ def path(capture: Capture | None, supplied: UserInput, config: Config, store: St
     color = store.step(whitebalance.measure, radiance, reference, supplied.chart, config=config.whitebalance)
     alignment = store.step(align.register, radiance, color, config=config.align)
     user_mask = store.derive(on_grid, supplied.mask, radiance)
-    object_ = store.step(mask.segment, radiance, alignment, color, user_mask, config=config.mask)
+    object_ = store.step(mask.segment, radiance, alignment, color, user_mask, supplied.mask_network, config=config.mask)
     gains = store.step(selfcal.solve, radiance, alignment, object_, color, config=config.selfcal)
     stokes_ = store.step(stokes.solve, radiance, alignment, gains, object_, config=config.stokes)
     cues_ = store.step(cues.compute, stokes_, color)

@@ -22,6 +22,7 @@ from polcap.formats import maps as maps_folder
 from polcap.images import Capture, Frame, Network, SensorImage
 from polcap.path import STAGES, Results, UserInput, path
 from polcap.pictures import moving
+from polcap.stages.mask import mask_channels
 from polcap.store import Archive, Progress, Store, contents, silent
 
 
@@ -161,13 +162,19 @@ def load_network(
             raise SettingError("--model and --estimator analytic exclude each other; leave one out")
         return None
     if model is None:
-        shipped = sorted(calib.data_path("colorchecker").parent.glob("models/*.onnx"))
+        shipped = sorted(calib.data_path("colorchecker").parent.glob("models/polcap*.onnx"))
         if not shipped and (estimator == "network" or device == "cuda"):
             raise ModelError("this polcap ships no model; name one with --model, or use --estimator analytic")
         if not shipped:
             return None
         model = shipped[-1]
     return onnx.load(model, device, threads)
+
+
+def load_mask_network(threads: int = 0) -> Network | None:
+    """The network that finds the object, as shipped; None where this polcap ships none."""
+    shipped = sorted(calib.data_path("colorchecker").parent.glob("models/mask*.onnx"))
+    return onnx.load(shipped[-1], "cpu", threads, mask_channels.ENCODING) if shipped else None
 
 
 def sweep(out: Path) -> None:

@@ -57,6 +57,7 @@ def test_photographs_and_their_rerendering_agree(result: Path) -> None:
         ("alignment", "residual_px", [0.0, 0.02, 0.2], "alignment"),
         ("object", "clipped_fraction", 0.03, "clipped"),
         ("object", "ill_posed_fraction", 0.06, "ill-posed"),
+        ("object", "mask_doubt", 0.11, "mask"),
         ("merge", "ghost_fraction", [0.0, 0.05, 0.0], "ghosts"),
         ("angles", "best_order", [1, 0, 2], "angles"),
         ("angles", "mirrored", True, "angles"),
@@ -77,6 +78,13 @@ def test_what_could_not_be_measured_neither_passes_nor_fails(figures: dict[str, 
     changed = {**figures, "chart": {**figures["chart"], "delta_e_mean": None}}
     states = {gate.name: gate.state for gate in report.judge(changed, True, Gates())}
     assert states["chart"] == "not measured"
+
+
+@pytest.mark.parametrize(("name", "value"), [("mask_border", 0.01), ("mask_islands", 0.03), ("mask_holes", 0.06)])
+def test_a_mask_of_a_doubtful_shape_warns_and_says_mask(figures: dict[str, Any], name: str, value: float) -> None:
+    sure = {**figures["object"], "mask_doubt": 0.01, name: value}
+    gate = next(g for g in report.judge({**figures, "object": sure}, True, Gates()) if g.name == "mask")
+    assert gate.state == "warn" and "--mask" in gate.says
 
 
 def test_assumed_focal_length_warns_and_does_not_fail(figures: dict[str, Any]) -> None:

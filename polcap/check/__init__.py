@@ -24,8 +24,9 @@ class Verdict(msgspec.Struct, frozen=True):
     seconds: float
 
 
-def inspect(capture: Capture, network: Network | None, config: Config) -> Verdict:
-    """Judge a capture; network None expects the errors of the analytic estimator.
+def inspect(capture: Capture, network: Network | None, config: Config, mask_network: Network | None = None) -> Verdict:
+    """Judge a capture; network None expects the errors of the analytic estimator, mask_network None takes for the
+    object what stands out from the backdrop.
 
     Raises
     ------
@@ -33,7 +34,7 @@ def inspect(capture: Capture, network: Network | None, config: Config) -> Verdic
         A frame cannot be decoded.
     """
     start = perf_counter()
-    lines = tuple(judge.lines(reduced.take(capture, config.hdr.clip), network, config))
+    lines = tuple(judge.lines(reduced.take(capture, config.hdr.clip), network, mask_network, config))
     bad = [line for line in lines if line.state == "reshoot"]
     named = {name for line in bad for name in line.shots}
     shots = tuple(shot.name for shot in capture.shots if shot.name in named)

@@ -51,7 +51,7 @@ class Line(msgspec.Struct, frozen=True):
     shots: tuple[str, ...] = ()  # to be taken again
 
 
-def lines(taken: Taken, network: Network | None, config: Config) -> Iterator[Line]:
+def lines(taken: Taken, network: Network | None, mask_network: Network | None, config: Config) -> Iterator[Line]:
     """The figures in the order of the path; where a stage gives up, its error is the last line."""
     capture, gates = taken.capture, config.gates
     names = [shot.name for shot in capture.shots]
@@ -68,7 +68,7 @@ def lines(taken: Taken, network: Network | None, config: Config) -> Iterator[Lin
         moved = _alignment(alignment, radiance, taken, config, names)
         yield moved
         stage = "object"
-        object_ = mask.segment(radiance, alignment, color, None, config.mask)
+        object_ = mask.segment(radiance, alignment, color, None, mask_network, config.mask)
         yield _clipping(taken, object_, gates.max_clipped, names)
         yield _sharpness(taken, config.check.max_blur_px, names, moved)
         stage = "order"

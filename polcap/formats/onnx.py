@@ -3,7 +3,7 @@
 A model says in its metadata what it eats and under which terms it may be used:
 
     channels       names of its input channels, in order, separated by commas
-    encoding       version of the channels' formulas, `ENCODING`
+    encoding       version of the channels' formulas: `ENCODING`, or of `stages/mask/mask_channels.py`
     native_size    longer side at which inference shows it a picture, px
     size_multiple  height and width must be multiples of this
     licence        SPDX name of the weights' licence
@@ -28,8 +28,8 @@ _REMOTE = "AzureExecutionProvider"  # calls a service; computes nothing here
 Device = Literal["cpu", "cuda", "auto"]
 
 
-def load(path: str | Path, device: Device = "cpu", threads: int = 0) -> Network:
-    """Open a model; `threads` 0 leaves their number to the runtime.
+def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: str = ENCODING) -> Network:
+    """Open a model; `threads` 0 leaves their number to the runtime, `encoding` is that of the channels it must eat.
 
     `cuda` fails where the provider is missing or does not start; `auto` takes it where it starts.
 
@@ -54,7 +54,7 @@ def load(path: str | Path, device: Device = "cpu", threads: int = 0) -> Network:
     if device == "cuda" and provider != CUDA:
         raise ModelError("--device cuda: CUDA does not start; make driver, CUDA and cuDNN fit, or use --device cpu")
     metadata = {str(k): str(v) for k, v in session.get_modelmeta().custom_metadata_map.items()}
-    channels = _check(path, session, metadata)
+    channels = _check(path, session, metadata, encoding)
     return Network(
         run=lambda inputs: _run(path, session, inputs),
         digest=blake2b(data, digest_size=16).hexdigest(),
@@ -98,13 +98,13 @@ def _open(path: Path, data: bytes, providers: list[str], threads: int) -> Any:
         ) from error
 
 
-def _check(path: Path, session: Any, metadata: dict[str, str]) -> tuple[str, ...]:
+def _check(path: Path, session: Any, metadata: dict[str, str], encoding: str) -> tuple[str, ...]:
     missing = [name for name in REQUIRED if not metadata.get(name)]
     if missing:
         raise ModelError(f"{path}: its metadata does not state {', '.join(missing)}; export it with polcap")
-    if metadata["encoding"] != ENCODING:
+    if metadata["encoding"] != encoding:
         raise ModelError(
-            f"{path}: input encoding {metadata['encoding']}, this polcap makes {ENCODING}; "
+            f"{path}: input encoding {metadata['encoding']}, this polcap makes {encoding}; "
             "take a model of the same release"
         )
     for name in NUMBERS:

@@ -112,6 +112,10 @@ def figures(results: Results) -> dict[str, dict[str, Any]]:
             "pixels": int(image.mask.sum()),
             "crop": list(results.object_.value.crop),
             "source": results.object_.value.source,
+            "mask_doubt": None if results.object_.value.doubt is None else _number(results.object_.value.doubt),
+            "mask_islands": _number(results.object_.value.islands),
+            "mask_holes": _number(results.object_.value.holes),
+            "mask_border": _number(results.object_.value.border),
             **{
                 f"{bit.name}_fraction".lower(): _share(image, bit)
                 for bit in (Quality.CLIPPED, Quality.DARK, Quality.ILL_POSED, Quality.METAL, Quality.GHOST)
@@ -171,6 +175,7 @@ def judge(found: dict[str, dict[str, Any]], focal_known: bool, limits: Gates) ->
             limits.max_align_residual_px,
             "1σ registration error, px: fix the camera, or turn the polarizer with less force",
         ),
+        _mask(object_, limits),
         _least(
             "gains",
             gains["disagreement"] if gains["source"] == "grey patches" else None,
@@ -210,6 +215,23 @@ def judge(found: dict[str, dict[str, Any]], focal_known: bool, limits: Gates) ->
             "a wrong focal length bends the depth: state focal_length_mm in capture.toml",
         ),
     ]
+
+
+def _mask(object_: dict[str, Any], limits: Gates) -> Gate:
+    """Fails where the network doubts its mask, warns where its shape is none that an object before a lens has."""
+    doubt, found, limit = object_["mask_doubt"], [], limits.max_mask_doubt
+    if object_["mask_border"] > limits.max_mask_border:
+        found.append(f"it covers {object_['mask_border']:.0%} of the picture's edge: what lies beyond is missing")
+    if object_["mask_islands"] > limits.max_mask_islands:
+        found.append(f"{object_['mask_islands']:.0%} of it stands apart")
+    if object_["mask_holes"] > limits.max_mask_holes:
+        found.append(f"holes of {object_['mask_holes']:.0%} of its area")
+    state: State = "warn" if found else "pass" if doubt is not None or object_["source"] == "user" else "not measured"
+    if doubt is not None and doubt > limit:
+        state = "fail"
+        found.insert(0, "which pixels are the object is not clear")
+    what = "; ".join(found) or "share of the object's outline in doubt"
+    return Gate("mask", state, doubt, limit, f"{what}: look at it, and where it is wrong give --mask PNG")
 
 
 def document(

@@ -28,8 +28,6 @@ _GREATEST_IR = 10  # what onnxruntime 1.20 and later read
 
 def write(network: model.Network, path: Path, facts: Mapping[str, str]) -> int:
     """Export to `path`; `facts` joins the metadata (licence, version, training…). Returns its bytes."""
-    side = 2 * model.SIZE_MULTIPLE
-    dynamic = {name: {2: "height", 3: "width"} for name in ("channels", *model.OUTPUTS)}
     metadata = {
         "channels": ",".join(CHANNELS), "encoding": ENCODING, "native_size": str(NATIVE_SIZE),
         "size_multiple": str(model.SIZE_MULTIPLE),
@@ -37,16 +35,24 @@ def write(network: model.Network, path: Path, facts: Mapping[str, str]) -> int:
         "in radii of the disc that covers as many pixels as the object; diffuse, specular: linear; "
         "roughness: perceptual; sigma: expected normal error, degrees",
     }  # fmt: skip
+    return save(_Ordered(network), path, model.OUTPUTS, metadata | dict(facts))
+
+
+def save(network: nn.Module, path: Path, outputs: tuple[str, ...], metadata: Mapping[str, str]) -> int:
+    """Any network of channels (1, N, H, W) to named maps, with what `formats/onnx.py` asks a file to say."""
+    names = metadata["channels"].split(",")
+    side = 2 * int(metadata["size_multiple"])
+    dynamic = {name: {2: "height", 3: "width"} for name in ("channels", *outputs)}
     with atomic.path(path) as beside:
         torch.onnx.export(
-            _Ordered(network.eval().float()), (torch.zeros(1, len(CHANNELS), side, side),), str(beside),
-            input_names=["channels"], output_names=list(model.OUTPUTS), dynamic_axes=dynamic,
+            network.eval().float(), (torch.zeros(1, len(names), side, side),), str(beside),
+            input_names=["channels"], output_names=list(outputs), dynamic_axes=dynamic,
             opset_version=OPSET, dynamo=False, do_constant_folding=False,  # that would take weights' names
         )  # fmt: skip
         graph = onnx.load(str(beside))
         _halve(graph)
         graph.ir_version = min(graph.ir_version, _GREATEST_IR)
-        helper.set_model_props(graph, metadata | dict(facts))
+        helper.set_model_props(graph, dict(metadata))
         onnx.checker.check_model(graph)
         onnx.save(graph, str(beside))
     return path.stat().st_size

@@ -48,7 +48,8 @@ def measure(truth_file: Path, network: Network | None) -> list[float]:
     meta = json.loads(Path(stem + ".meta.json").read_text())
     capture = captures.read(Path(stem), None)
     with tempfile.TemporaryDirectory() as out:
-        found = path(capture, UserInput(network=network), Config(), Store(Path(out)))
+        supplied = UserInput(network=network, mask_network=pipeline.load_mask_network(2))
+        found = path(capture, supplied, Config(), Store(Path(out)))
         with np.load(stem + ".truth.npz") as maps:
             surface = surface_errors(found, dict(maps))
         return [*surface[:2], *capture_errors(found, capture, told, meta), *surface[2:]]

@@ -69,7 +69,8 @@ def main() -> None:
 def judge(place: Path, network: object) -> tuple[str, list[str], list[str]]:
     """What is said, the lines that say it, and their words."""
     try:
-        verdict = check.inspect(captures.read(place), network, Config())  # type: ignore[arg-type]
+        known = captures.read(place)
+        verdict = check.inspect(known, network, Config(), pipeline.load_mask_network(2))  # type: ignore[arg-type]
         (place.parent / f"{place.name}.json").write_text(json.dumps(check.shown(verdict), indent=1))
     except InputError as error:
         return "bad input", [], [str(error).replace(str(place), "…")[:90]]

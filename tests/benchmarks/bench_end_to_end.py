@@ -69,7 +69,8 @@ def make(folder: Path, data: Path, number: int, width: int) -> Path:
 def measure(place: Path, network: Network | None) -> list[float]:
     """Mean normal error [degrees] through the path and from noise-free cues, and their difference."""
     with tempfile.TemporaryDirectory() as out:
-        found = path(captures.read(place, None), UserInput(network=network), Config(), Store(Path(out)))
+        supplied = UserInput(network=network, mask_network=pipeline.load_mask_network(2))
+        found = path(captures.read(place, None), supplied, Config(), Store(Path(out)))
         x0, y0, x1, y1 = found.object_.value.crop
         measured, maps = found.stokes.value, found.maps.value
         with np.load(place / "truth.npz") as truth:

@@ -6,12 +6,25 @@ import numpy as np
 import pytest
 
 from polcap.errors import ObjectError
+from polcap.images import Network
 from polcap.stages import mask
+from polcap.stages.mask import mask_channels, solid, two_looks
 from tests import scenes
 
+CHANNEL = mask_channels.CHANNELS.index
 
-def segment(radiance, color, user=None):
-    return mask.segment(radiance, scenes.still(), color, user, mask.Settings())
+
+def bright_is_object(inputs):
+    """Stands for a trained network: what is brighter than 1/32 of the bright parts, and is no chart."""
+    return {"logit": np.where(inputs[:, CHANNEL("chart")] > 0, -9, 40 * (inputs[:, CHANNEL("log")]))[:, None]}
+
+
+def network(run=bright_is_object):
+    return Network(run, "of the test", mask_channels.CHANNELS, {"native_size": "160"}, "none")
+
+
+def segment(radiance, color, user=None, model=None):
+    return mask.segment(radiance, scenes.still(), color, user, model, mask.Settings())
 
 
 def chart_color():
@@ -19,20 +32,79 @@ def chart_color():
     return dataclasses.replace(scenes.no_color(), corners=corners, source="chart")
 
 
-def test_the_ball_is_found_and_the_chart_is_not_the_object():
-    found = segment(scenes.stack(noise=0.004), chart_color())
+@pytest.mark.parametrize("model", [None, network()])
+def test_the_ball_is_found_and_the_chart_is_not_the_object(model):
+    found = segment(scenes.stack(noise=0.004), chart_color(), model=model)
     true = scenes.ball_object().mask
     overlap = (found.mask & true).sum() / (found.mask | true).sum()
     assert overlap > 0.97
-    assert not found.mask[:, 224:].any()
+    assert not found.mask[:, 230:].any()
     assert found.crop[0] < 36 and found.crop[2] > 204
+    assert (found.chance is None) == (model is None)
+
+
+def test_the_second_look_is_at_what_the_first_found_and_is_told_so():
+    seen = []
+
+    def run(inputs):
+        seen.append(inputs)
+        return bright_is_object(inputs)
+
+    segment(scenes.stack(), chart_color(), model=network(run))
+    first, second = seen
+    assert first.shape[2:] == (128, 160)  # 120 rows, up to a multiple of 16
+    assert not first[0, CHANNEL("looked")].any() and (second[0, CHANNEL("looked")] == 1).all()
+    hint = second[0, CHANNEL("chance")]
+    assert hint.max() > 0.9 and hint.min() < -0.9
+    x = second[0, CHANNEL("x")]
+    assert x.min() > -0.98 and x.max() < 0.6  # the ball's part of the picture
+
+
+def test_channels_know_no_exposure():
+    """Radiance, and what the chart makes of it, in any unit gives the same channels."""
+    chart = np.zeros((scenes.HEIGHT, scenes.WIDTH), np.uint8)
+    box = (0, 0, scenes.WIDTH, scenes.HEIGHT)
+    made = []
+    for scale in (0.5, 0.05):
+        radiance = scenes.stack(scale=scale)
+        look = two_looks.look(radiance, scenes.still(), scenes.no_color(0.5), chart, box, 160)
+        made.append(mask_channels.encode(look, mask_channels.brightness(look.color)))
+    np.testing.assert_allclose(made[0], made[1], atol=2e-5)
+
+
+def test_channels_hold_the_polarization_of_the_aligned_shots():
+    """S1 and S2 of a ball seen by shots that lie three pixels apart, where they are strong."""
+    moved = np.tile(np.eye(3), (3, 1, 1))
+    moved[1, 0, 2], moved[2, 1, 2] = 3.0, -2.0
+    radiance = scenes.stack(list(moved), textured=False)
+    alignment = dataclasses.replace(scenes.still(), transform=moved)
+    chart = np.zeros((scenes.HEIGHT, scenes.WIDTH), np.uint8)
+    box = (40, 30, 200, 210)
+    look = two_looks.look(radiance, alignment, scenes.no_color(), chart, box, 1000)
+    y, x = np.mgrid[30:210, 40:200].astype(float)
+    true, inside = scenes.stokes(x, y, textured=False)
+    solid_ = inside & (np.hypot(x - scenes.CENTER[0], y - scenes.CENTER[1]) < 78)
+    solid_[:, :5], solid_[:, -5:], solid_[:5], solid_[-5:] = False, False, False, False  # the box ends there
+    for k in (1, 2):
+        error = look.stokes[k] / look.stokes[0] - true[k].sum(-1) / true[0].sum(-1)
+        assert np.abs(error[solid_]).max() < 0.01
+
+
+def test_doubtful_holes_are_filled_openings_stay_and_specks_go():
+    chance = np.full((100, 100), 0.01, np.float32)
+    chance[20:80, 20:80] = 0.99
+    chance[30:40, 30:40] = 0.3  # a hollow in shadow
+    chance[50:60, 50:60] = 0.02  # one looks through a handle
+    chance[5:7, 5:7] = 0.9
+    found = solid.body(chance)
+    assert found[30:40, 30:40].all() and not found[50:60, 50:60].any() and not found[5:7, 5:7].any()
 
 
 def test_a_drawn_mask_is_taken_as_drawn():
     drawn = np.zeros((scenes.HEIGHT, scenes.WIDTH), bool)
     drawn[50:100, 60:130] = True
-    found = segment(scenes.stack(), chart_color(), drawn)
-    assert np.array_equal(found.mask, drawn) and found.source == "user"
+    found = segment(scenes.stack(), chart_color(), drawn, network())
+    assert np.array_equal(found.mask, drawn) and found.source == "user" and found.chance is None
 
 
 def test_a_mask_of_another_size_is_refused():
@@ -45,3 +117,25 @@ def test_an_empty_picture_is_refused():
     dark = dataclasses.replace(radiance, value=np.full_like(radiance.value, 0.002))
     with pytest.raises(ObjectError, match="no object stands out"):
         segment(dark, chart_color())
+    nothing = network(lambda inputs: {"logit": np.full((1, 1, *inputs.shape[2:]), -9.0)})
+    with pytest.raises(ObjectError, match=r"no object is seen.*--mask"):
+        segment(dark, chart_color(), model=nothing)
+
+
+def test_shape_counts_islands_holes_and_the_picture_edge():
+    drawn = np.zeros((40, 60), bool)
+    drawn[0:20, 0:20] = True
+    drawn[5:10, 5:10] = False  # 25 of 375
+    drawn[30:35, 40:45] = True  # 25 of 400
+    islands, holes, border = solid.shape(drawn)
+    assert islands == pytest.approx(25 / 400) and holes == pytest.approx(25 / 400)
+    assert border == pytest.approx(39 / (2 * 60 + 2 * 38))
+
+
+def test_doubt_is_one_minus_the_overlap_to_be_expected():
+    """Of masks drawn pixel by pixel with the chances."""
+    rng = np.random.default_rng(0)
+    chance = rng.beta(0.3, 0.3, (200, 200))
+    found = chance > 0.5
+    overlaps = [((t := rng.random(chance.shape) < chance) & found).sum() / (t | found).sum() for _ in range(20)]
+    assert 1 - solid.doubt(found, chance) == pytest.approx(np.mean(overlaps), abs=0.005)

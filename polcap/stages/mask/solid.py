@@ -1,0 +1,55 @@
+"""From chances to a mask, and what there is to doubt about it.
+
+One side or the other at every pixel, specks dropped, doubtful holes filled.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Floats
+
+_SPECK = 0.01  # of the largest part: smaller ones are no parts of their own
+_PINHOLE = 1e-3  # of the mask: smaller holes are dark texture
+_DOUBTED = 0.15  # mean chance of a hole that is a shadowed hollow and no opening
+
+
+def body(chance: Floats) -> NDArray[np.bool_]:
+    """The mask (H, W) of chances (H, W) 0…1."""
+    mask = (chance > 0.5).astype(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    area = stats[:, cv2.CC_STAT_AREA].astype(float)
+    area[0] = 0
+    if not area.any():
+        return mask > 0
+    mask = np.isin(labels, np.flatnonzero(area >= _SPECK * area.max()) if area.max() else []).astype(np.uint8)
+    mask[labels == 0] = 0
+    return _filled(mask, chance)
+
+
+def _filled(mask: NDArray[np.uint8], chance: Floats) -> NDArray[np.bool_]:
+    """Holes filled that are pinholes, or of which the network is not sure that one looks through them."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(1 - mask, connectivity=4)
+    area = stats[:, cv2.CC_STAT_AREA].astype(float)
+    mean = np.bincount(labels.reshape(-1), weights=chance.reshape(-1), minlength=count) / np.maximum(area, 1)
+    outer = np.concatenate([labels[[0, -1]].ravel(), labels[:, [0, -1]].ravel()])
+    fill = (area < _PINHOLE * mask.sum()) | (mean > _DOUBTED)
+    fill[np.unique(outer)] = False
+    return np.asarray((mask > 0) | (fill[labels] & (mask == 0)))
+
+
+def doubt(mask: NDArray[np.bool_], chance: Floats) -> float:
+    """1 − the intersection over union with the true mask that chances (H, W) let expect, both sums as expected."""
+    inside, outside = float(chance[mask].sum()), float(chance[~mask].sum())
+    return 1 - inside / max(float(mask.sum()) + outside, 1e-9)
+
+
+def shape(mask: NDArray[np.bool_]) -> tuple[float, float, float]:
+    """Share of the mask outside its largest part; area of the holes, of its own; share of the picture's edge on it."""
+    area = mask.sum()
+    _, _, parts, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    largest = parts[1:, cv2.CC_STAT_AREA].max()
+    lines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    whole = cv2.drawContours(np.zeros(mask.shape, np.uint8), lines, -1, 1, cv2.FILLED)
+    edge = np.concatenate([mask[[0, -1]].ravel(), mask[1:-1, [0, -1]].ravel()])
+    return float(1 - largest / area), float((whole.sum() - area) / area), float(edge.mean())

@@ -1,0 +1,90 @@
+"""A folder of pictures to find the object in: made once, each by its number, then drawn from with new light and noise.
+
+::
+
+    FOLDER/000017.npy   (H, W, 7) fp16: S0 in linear Rec.709, S1 and S2 summed over colours, object, chart
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from polcap.formats import atomic
+from polcap.images import Floats
+from polcap.stages.mask.mask_channels import Look
+from polcap.synth.mesh_tracer import Tracer, Triangles, centred
+from polcap.training import gbuffers, mask_scenes, mask_views, materials, shapes
+
+SIZE = (288, 384)  # H, W
+_VIEWS, _DRESSES = 4, 2  # of each mesh, of each view
+
+
+def main(out: Path, data: Path, count: int, seed: int = 5) -> None:
+    """Make what is missing of pictures 0…count − 1 from the training meshes and materials."""
+    torch.set_num_threads(1)
+    files = sorted((data / "meshes" / "train").glob("*.npz"))
+    library = materials.Library(data / "materials" / "train", torch.device("cpu"))
+    out.mkdir(parents=True, exist_ok=True)
+    for group in range(-(-count // (_VIEWS * _DRESSES))):
+        first = group * _VIEWS * _DRESSES
+        if all((out / f"{n:06d}.npy").exists() for n in range(first, first + _VIEWS * _DRESSES)):
+            continue
+        for number, picture in enumerate(_group(files, library, seed, group), start=first):
+            with atomic.path(out / f"{number:06d}.npy") as beside, beside.open("wb") as file:
+                np.save(file, picture)
+
+
+def _group(files: list[Path], library: materials.Library, seed: int, group: int) -> Iterator[Floats]:
+    """The pictures of one mesh."""
+    rng = np.random.default_rng([seed, group])
+    torch.manual_seed(int(rng.integers(1 << 62)))
+    tracer = Tracer(_mesh(files, rng))
+    made = 0
+    while made < _VIEWS:
+        traced = mask_views.look(tracer, mask_views.any_kind(rng), SIZE, rng)
+        if traced is None:
+            continue
+        made += 1
+        for _ in range(_DRESSES):
+            mode = rng.choice(list(mask_scenes.MODES), p=list(mask_scenes.MODES.values()))
+            yield packed(mask_scenes.draw(traced, library, mode, rng))
+
+
+def _mesh(files: list[Path], rng: np.random.Generator) -> Triangles:
+    """A scan, a random shape, or two or three of them apart."""
+    kind = rng.random()
+    if kind < 0.4:
+        return centred(gbuffers.read_mesh(files[rng.integers(len(files))]))
+    if kind < 0.75:
+        return shapes.compose(rng)
+    parts = [
+        shapes.compose(rng) if rng.random() < 0.5 else centred(gbuffers.read_mesh(files[rng.integers(len(files))]))
+        for _ in range(rng.integers(2, 4))
+    ]
+    return mask_views.several(parts, rng)
+
+
+def packed(picture: mask_scenes.Picture) -> Floats:
+    """What a file holds; radiance in units of its own 95th percentile."""
+    stokes = picture.stokes / max(float(np.percentile(picture.stokes[0].mean(-1), 95)), 1e-9)
+    sums = np.moveaxis(stokes[1:].sum(-1), 0, -1)
+    layers = [stokes[0], sums, picture.mask[..., None], picture.chart[..., None]]
+    return np.asarray(np.clip(np.concatenate(layers, axis=-1), -6e4, 6e4), np.float16)
+
+
+def drawn(file: Path, rng: np.random.Generator) -> tuple[Look, Floats]:
+    """A picture under new light, turned or mirrored, and measured; and its truth (H, W)."""
+    held = np.load(file).astype(np.float32)
+    stokes, mask, chart = held[..., :5], held[..., 5], held[..., 6] > 0.5
+    if rng.random() < 0.5:
+        stokes, mask, chart = stokes[:, ::-1] * [1, 1, 1, 1, -1], mask[:, ::-1], chart[:, ::-1]
+    if rng.random() < 0.1:  # the camera stood on its head
+        stokes, mask, chart = stokes[::-1] * [1, 1, 1, 1, -1], mask[::-1], chart[::-1]
+    light = np.exp(rng.normal(0, 0.25)) * mask + np.exp(rng.normal(0, 0.25)) * (1 - mask)
+    light = light * (1 - chart) + chart
+    tint = np.exp(rng.normal(0, 0.1, (2, 3)))
+    color = stokes[..., :3] * light[..., None] * np.where((mask > 0)[..., None], tint[0], tint[1])
+    sums = np.stack([color.sum(-1), *(np.moveaxis(stokes[..., 3:], -1, 0) * light * rng.uniform(0.6, 1.1))])
+    return mask_scenes.measured(color, sums, chart, rng), mask

@@ -1,0 +1,229 @@
+"""Train the mask's network: `python -m polcap.training.mask_train DATA OUT MINUTES`; goes on where it was stopped.
+
+Pictures are made first, then learned from in two looks a picture: the whole at a quarter of its pixels, then a
+part of it at its own, hinted by what the first look found. Leaves OUT/mask.onnx, last.pt and metrics.csv.
+"""
+
+import csv
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from polcap.errors import InputError
+from polcap.formats import atomic
+from polcap.images import Floats
+from polcap.stages.mask.mask_channels import CHANNELS, ENCODING, SIZE_MULTIPLE, Look, brightness, encode
+from polcap.training import export, mask_model, mask_pictures
+from polcap.training.train import Muon
+
+_BATCH, _PART = 4, 160  # pictures a step; side of the part, px
+_ZOOM = (0.3, 1.0)  # side of what it shows, of the picture's height
+_HELD = 40  # pictures that are only looked at
+_WARM, _HOLD = 50, 0.35  # steps; share of the budget at the full learning rate
+
+
+@dataclass(frozen=True)
+class Params:
+    """What one training run is told."""
+
+    data: Path  # holds meshes/ and materials/
+    out: Path
+    minutes: float = 40.0  # of training, resumed parts together
+    pictures: int = 1600
+    rate: float = 1.5e-3  # of Muon; half of it for AdamW
+    seed: int = 1
+
+
+def main(params: Params) -> Path:
+    """Make the pictures that are missing, train, export."""
+    mask_pictures.main(params.out / "pictures", params.data, params.pictures)
+    files = sorted((params.out / "pictures").glob("*.npy"))
+    if len(files) <= _HELD:
+        raise InputError(f"{len(files)} pictures; training needs more than the {_HELD} that it looks at")
+    torch.set_num_threads(1)
+    torch.manual_seed(params.seed)
+    run = Run(params.rate)
+    last = params.out / "last.pt"
+    if last.exists():
+        run.load(last)
+    rng = np.random.default_rng([params.seed, run.step])
+    before = saved = time.monotonic()
+    figures: list[tuple[float, float]] = []
+    while run.elapsed < 60 * params.minutes:
+        chosen = [files[n] for n in rng.integers(_HELD, len(files), _BATCH)]
+        figures.append(run.advance(chosen, run.elapsed / (60 * params.minutes), rng))
+        now = time.monotonic()
+        run.elapsed, before = run.elapsed + now - before, now
+        if run.step % 100 == 0:
+            coarse, fine = run.judge(files[:_HELD])
+            _record(params.out / "metrics.csv", run, np.mean(figures, axis=0), coarse, fine)
+            figures, before = [], time.monotonic()
+        if now - saved > 60:
+            run.save(last)
+            saved = now
+    run.save(last)
+    return ship(last, params.out / "mask.onnx")
+
+
+class Run:
+    """Network, moving average of its weights, optimizers."""
+
+    def __init__(self, rate: float) -> None:
+        self.network = mask_model.Network().to(memory_format=torch.channels_last)
+        self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
+        hidden: list[Tensor] = []
+        others: list[Tensor] = []
+        for name, weight in self.network.named_parameters():
+            outer = weight.ndim <= 1 or name.split(".")[0] in ("stem", "raw", "out")
+            (others if outer else hidden).append(weight)
+        self.optimizers = [Muon(hidden, rate), torch.optim.AdamW(others, 0.5 * rate, betas=(0.9, 0.98))]
+        for group in (g for optimizer in self.optimizers for g in optimizer.param_groups):
+            group["full"] = group["lr"]
+        self.step, self.elapsed = 0, 0.0
+
+    def advance(self, files: list[Path], progress: float, rng: np.random.Generator) -> tuple[float, float]:
+        """One step; the two looks' losses."""
+        fall = min(1.0, (1 - min(progress, 1.0)) / (1 - _HOLD)) * min(1.0, (self.step + 1) / _WARM)
+        for group in (g for optimizer in self.optimizers for g in optimizer.param_groups):
+            group["lr"] = group["full"] * fall
+        drawn = [mask_pictures.drawn(file, rng) for file in files]
+        logits = self.network(batch([first(look) for look, _ in drawn]))
+        coarse = mask_model.loss(logits, stacked([halved(truth) for _, truth in drawn]))
+        coarse.backward()
+        chances = torch.sigmoid(logits.detach())[:, 0].numpy()
+        parts = [part(look, truth, chance, rng) for (look, truth), chance in zip(drawn, chances)]
+        fine = mask_model.loss(self.network(batch([seen for seen, _ in parts])), stacked([t for _, t in parts]))
+        fine.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0, foreach=True)
+        for optimizer in self.optimizers:
+            optimizer.step()
+            optimizer.zero_grad()
+        self.step += 1
+        keep = min(0.998, (1 + self.step) / (10 + self.step))
+        with torch.no_grad():
+            torch._foreach_lerp_(list(self.average.values()), list(self.network.state_dict().values()), 1 - keep)
+        return float(coarse.detach()), float(fine.detach())
+
+    def judge(self, files: list[Path]) -> tuple[Floats, Floats]:
+        """IoU of both looks of the averaged weights on pictures never learned from; the second at the whole picture."""
+        network = averaged(self.average)
+        found: tuple[list[float], list[float]] = [], []
+        for number, file in enumerate(files):
+            look, truth = mask_pictures.drawn(file, np.random.default_rng(number))
+            with torch.no_grad():
+                chance = torch.sigmoid(network(batch([first(look)])))[0, 0].numpy()
+                hint = cv2.resize(chance, truth.shape[::-1], interpolation=cv2.INTER_LINEAR)
+                fine = network(batch([encode(look, brightness(look.color), hint)]))[0, 0].numpy()
+            found[0].append(iou(hint > 0.5, truth > 0.5))
+            found[1].append(iou(fine > 0, truth > 0.5))
+        return np.array(found[0]), np.array(found[1])
+
+    def save(self, path: Path) -> None:
+        state = {
+            "network": self.network.state_dict(), "average": self.average, "step": self.step, "elapsed": self.elapsed,
+            "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
+        }  # fmt: skip
+        with atomic.path(path) as beside:
+            torch.save(state, beside)
+
+    def load(self, path: Path) -> None:
+        state = torch.load(path, weights_only=True)
+        self.network.load_state_dict(state["network"])
+        self.average, self.step, self.elapsed = state["average"], state["step"], state["elapsed"]
+        for optimizer, held in zip(self.optimizers, state["optimizers"]):
+            optimizer.load_state_dict(held)
+
+
+def averaged(weights: dict[str, Tensor]) -> mask_model.Network:
+    network = mask_model.Network()
+    network.load_state_dict(weights)
+    network.eval()
+    return network
+
+
+def first(look: Look) -> Floats:
+    """The channels of the whole picture at half its width and height."""
+    smaller = Look(
+        halved(look.color), np.stack([halved(s) for s in look.stokes]), halved(look.chart.astype(np.float32)) > 0.5,
+        np.stack([halved(p) for p in look.place]),
+    )  # fmt: skip
+    return encode(smaller, brightness(smaller.color))
+
+
+def part(look: Look, truth: Floats, chance: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """The channels of a square about a place of the outline, hinted, and its truth."""
+    height, width = truth.shape
+    side = int(height * rng.uniform(*_ZOOM))
+    hint = cv2.resize(chance, (width, height), interpolation=cv2.INTER_LINEAR)
+    solid = (truth > 0.5).astype(np.uint8)
+    rim = np.argwhere((solid > 0) & (cv2.erode(solid, np.ones((3, 3), np.uint8), borderValue=1) == 0))
+    wrong = np.argwhere((hint > 0.5) != (solid > 0))
+    places = wrong if len(wrong) and rng.random() < 0.4 else rim
+    y, x = places[rng.integers(len(places))] if len(places) else (height // 2, width // 2)
+    y, x = (int(np.clip(a - rng.uniform(0.2, 0.8) * side, 0, n - side)) for a, n in ((y, height), (x, width)))
+
+    kind = cv2.INTER_AREA if side > _PART else cv2.INTER_LINEAR
+
+    def cut(image: Floats) -> Floats:
+        shown = np.ascontiguousarray(image[y : y + side, x : x + side])
+        return np.asarray(cv2.resize(shown, (_PART, _PART), interpolation=kind))
+
+    seen = Look(
+        cut(look.color), np.stack([cut(s) for s in look.stokes]), cut(look.chart.astype(np.float32)) > 0.5,
+        np.stack([cut(p) for p in look.place]),
+    )  # fmt: skip
+    return encode(seen, brightness(look.color), cut(hint)), cut(truth)
+
+
+def halved(image: Floats) -> Floats:
+    size = image.shape[1] // 2, image.shape[0] // 2
+    return np.asarray(cv2.resize(np.asarray(image, np.float32), size, interpolation=cv2.INTER_AREA))
+
+
+def batch(channels: list[Floats]) -> Tensor:
+    return torch.from_numpy(np.stack(channels)).contiguous(memory_format=torch.channels_last)
+
+
+def stacked(truths: list[Floats]) -> Tensor:
+    return torch.from_numpy(np.stack(truths)[:, None].astype(np.float32))
+
+
+def iou(found: NDArray[np.bool_], truth: NDArray[np.bool_]) -> float:
+    return float((found & truth).sum() / max((found | truth).sum(), 1))
+
+
+def ship(checkpoint: Path, path: Path) -> Path:
+    """The averaged weights of a checkpoint as the model that `formats/onnx.py` loads."""
+    state = torch.load(checkpoint, weights_only=True)
+    metadata = {
+        "channels": ",".join(CHANNELS), "encoding": ENCODING, "native_size": str(mask_pictures.SIZE[1] // 2),
+        "size_multiple": str(SIZE_MULTIPLE), "licence": "Apache-2.0", "outputs": "logit: of being the object",
+        "training": f"{state['step'] * _BATCH} pictures in {state['step']} steps",
+    }  # fmt: skip
+    export.save(averaged(state["average"]), path, ("logit",), metadata)
+    return path
+
+
+def _record(path: Path, run: Run, losses: Floats, coarse: Floats, fine: Floats) -> None:
+    row = {
+        "step": run.step, "seconds": round(run.elapsed), "loss_whole": losses[0], "loss_part": losses[1],
+        "iou_whole": coarse.mean(), "iou": fine.mean(), "iou_least": fine.min(),
+    }  # fmt: skip
+    fresh = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, row.keys())
+        if fresh:
+            writer.writeheader()
+        writer.writerow({k: f"{v:.4g}" for k, v in row.items()})
+    print(" ".join(f"{k} {v:.4g}" for k, v in row.items()), file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    main(Params(Path(sys.argv[1]), Path(sys.argv[2]), float(sys.argv[3])))

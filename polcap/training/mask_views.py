@@ -1,0 +1,170 @@
+"""Objects before a backdrop, traced once: what the mask's training pictures are dressed from.
+
+Lengths are in longest sides of the object; camera frame of `optics/frames.py`, the lens at the origin. The
+backdrop is one plane or two: a wall behind, a table below with a wall behind, a cloth that the object lies on.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Floats, View
+from polcap.optics import frames
+from polcap.synth.mesh_tracer import Tracer, Triangles, centred, union
+from polcap.training import shapes
+
+Framing = Literal["whole", "small", "cut", "full"]
+Stage = Literal["wall", "table", "cloth"]
+_LIFT = 2e-3  # from a surface to where a ray to the flash starts
+_TRIES = 60  # sides from which an object may be looked at in vain
+_LEAST = 0.004  # of the picture, that an object covers
+_FILL: dict[Framing, tuple[float, float]] = {
+    "whole": (0.35, 0.95), "small": (0.15, 0.35), "cut": (0.6, 1.2), "full": (1.3, 2.2),
+}  # fmt: skip
+_MOST: dict[Framing, float] = {"whole": 0.8, "small": 0.4, "cut": 0.85, "full": 0.97}  # of the picture
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a view is to show."""
+
+    framing: Framing
+    stage: Stage
+    aside: tuple[float, float]  # how far the flash stands from the lens, at least and at most [object distances]
+
+
+@dataclass(frozen=True)
+class Traced:
+    """A view of H×W pixels, of which M show the object."""
+
+    view: View
+    size: tuple[int, int]  # H, W
+    inside: NDArray[np.int32]  # (M,) indices into H·W
+    normal: Floats  # (M, 3) camera frame
+    position: Floats  # (M, 3) object frame
+    depth: Floats  # (M,) along the optical axis
+    lit: NDArray[np.bool_]  # (M,) the flash reaches it
+    turn: Floats  # (3, 3) object → camera
+    flash: Floats  # (3,)
+    distance: float  # of the object's middle
+    planes: Floats  # (P, 4) unit normal towards the camera, and its product with a point of the plane
+    shadow: NDArray[np.bool_]  # (H, W) the object hides the flash from the backdrop there
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        out = np.zeros(self.size, bool)
+        out.reshape(-1)[self.inside] = True
+        return out
+
+
+def any_kind(rng: np.random.Generator) -> Kind:
+    """As photographs come, and the hard ones among them more often."""
+    framing: Framing = rng.choice(["whole", "small", "cut", "full"], p=[0.66, 0.12, 0.16, 0.06])
+    stage: Stage = rng.choice(["wall", "table", "cloth"], p=[0.4, 0.4, 0.2])
+    return Kind(framing, stage, (0.2, 0.7) if rng.random() < 0.2 else (0.0, 0.15))
+
+
+def several(meshes: list[Triangles], rng: np.random.Generator) -> Triangles:
+    """Meshes of longest side 1 beside one another, apart or nearly so."""
+    parts, edge = [], 0.0
+    for mesh in meshes:
+        turned = mesh.vertices @ shapes.rotation(rng).T * rng.uniform(0.4, 1.0)
+        low = turned.min(axis=0)
+        turned = turned - low + [edge, rng.uniform(-0.2, 0.2), rng.uniform(-0.2, 0.2)]
+        edge = float(turned[:, 0].max()) + rng.uniform(-0.05, 0.3)
+        parts.append(Triangles(turned.astype(np.float32), mesh.faces, _corner_normals(turned, mesh.faces)))
+    return centred(union(parts))
+
+
+def _corner_normals(vertices: Floats, faces: NDArray[np.int32]) -> Floats:
+    corner = vertices[faces]
+    flat = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    total = np.zeros_like(vertices)
+    for k in range(3):
+        np.add.at(total, faces[:, k], flat)
+    total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-20)
+    return np.asarray(total[faces], dtype=np.float32)
+
+
+def look(tracer: Tracer, kind: Kind, size: tuple[int, int], rng: np.random.Generator) -> Traced | None:
+    """The object from a random side; None where it cannot be framed so."""
+    for _ in range(_TRIES):
+        turn = shapes.rotation(rng)
+        view, place = _framed(tracer.mesh.vertices @ turn.T, kind.framing, size, rng)
+        if place[2] > -0.8:  # not with the nose in the lens
+            continue
+        buffer = tracer.trace(turn, place, view, *size)
+        share = buffer.mask.mean()
+        edge = np.concatenate([buffer.mask[[0, -1]].ravel(), buffer.mask[:, [0, -1]].ravel()]).mean()
+        if _LEAST < share < _MOST[kind.framing] and (edge > 0.01) == (kind.framing in ("cut", "full")):
+            break
+    else:
+        return None
+    distance = float(np.linalg.norm(place))
+    off, way = rng.uniform(*kind.aside) * distance, rng.normal(np.pi / 2, 0.9)
+    flash = np.array([off * np.cos(way), off * np.sin(way), 0.0])
+    planes = _planes(tracer.mesh.vertices @ turn.T + place, kind.stage, rng)
+    inside = np.flatnonzero(buffer.mask)
+    v = frames.rays(view, *size).reshape(-1, 3)
+    source = (flash - place) @ turn
+    normal = buffer.normal[buffer.mask]
+    point = -v[inside] * (buffer.depth[buffer.mask] / v[inside, 2])[:, None]
+    lit = ~tracer.hidden((point + _LIFT * normal - place) @ turn, source)
+    behind, _, _ = backdrop(planes, v)
+    behind = np.where(np.isfinite(behind), behind, 1e3)
+    outside = np.flatnonzero(~buffer.mask)
+    shadow = np.zeros(size, bool)
+    shadow.reshape(-1)[outside] = tracer.hidden((-v[outside] * behind[outside, None] - place) @ turn, source)
+    return Traced(
+        view, size, inside.astype(np.int32), normal.astype(np.float16), buffer.position[buffer.mask].astype(np.float16),
+        buffer.depth[buffer.mask], lit, turn, flash, distance, planes, shadow,
+    )  # fmt: skip
+
+
+def backdrop(planes: Floats, v: Floats) -> tuple[Floats, Floats, NDArray[np.intp]]:
+    """Distance along each ray −v (N, 3) to the nearest plane (N,), infinite for none, its normal (N, 3) and number."""
+    facing = v @ planes[:, :3].T  # (N, P)
+    with np.errstate(divide="ignore"):
+        distance = np.where(facing > 1e-3, -planes[:, 3] / np.maximum(facing, 1e-3), np.inf)
+    distance = np.where(distance > 0, distance, np.inf)
+    first = distance.argmin(axis=1)
+    return distance[np.arange(len(v)), first], planes[first, :3], first
+
+
+def _framed(turned: Floats, framing: Framing, size: tuple[int, int], rng: np.random.Generator) -> tuple[View, Floats]:
+    """A lens of 35–100 mm on 36 mm, and where the object's origin stands, for vertices (V, 3) turned already."""
+    height, width = size
+    focal = max(size) * float(np.exp(rng.uniform(np.log(35), np.log(100)))) / 36
+    low, high = turned.min(axis=0), turned.max(axis=0)
+    extent, fill = (high - low)[:2], rng.uniform(*_FILL[framing])
+    distance = focal * float((extent / (fill * np.array([width, height]))).max())
+    room = np.array([width, height]) * distance / focal - extent
+    reach = np.abs(room) / 2 if framing in ("whole", "small") else np.abs(room) / 2 + 0.35 * extent
+    aside = rng.uniform(-1, 1, 2) * reach * (0.95 if framing != "full" else 0.4)
+    middle = np.array([*aside, -distance - (high[2] - low[2]) / 2])
+    view = View(focal=focal, center=((width - 1) / 2, (height - 1) / 2), scale=1.0)
+    return view, middle - (low + high) / 2
+
+
+def _planes(place: Floats, stage: Stage, rng: np.random.Generator) -> Floats:
+    """`Traced.planes` for vertices (V, 3) of the object in the camera frame."""
+    tilt = np.radians(rng.uniform(-12, 12, 2))
+    wall = np.array([np.sin(tilt[0]), np.sin(tilt[1]), 1.0])
+    if stage == "cloth":
+        lean = np.radians(rng.uniform(0, 40))
+        floor = np.array([0.3 * rng.normal() * np.sin(lean), np.sin(lean), np.cos(lean)])
+        return np.array([_behind(place, floor, 0.0)])
+    if stage == "wall":
+        gap = float(np.exp(rng.uniform(np.log(0.02), np.log(2.5)))) if rng.random() < 0.8 else 0.0
+        return np.array([_behind(place, wall, gap)])
+    lean = np.radians(rng.uniform(6, 55))
+    table = np.array([0.06 * rng.normal(), np.cos(lean), np.sin(lean)])
+    return np.array([_behind(place, table, 0.0), _behind(place, wall, float(np.exp(rng.uniform(-3, 1.2))))])
+
+
+def _behind(place: Floats, normal: Floats, gap: float) -> Floats:
+    """A plane that the object touches, or `gap` behind it."""
+    normal = normal / np.linalg.norm(normal)
+    return np.array([*normal, (place @ normal).min() - gap])
