@@ -112,4 +112,4 @@ def test_usd_without_its_package_is_one_line_with_the_remedy(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pxr", None)
     done = polcap("export", result, "--usd")
-    assert done.returncode == 2 and "pip install 'polcap[usd]'" in done.stderr and done.stderr.count("\n") == 1
+    assert done.returncode == 2 and "pip install usd-core" in done.stderr and done.stderr.count("\n") == 1

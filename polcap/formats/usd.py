@@ -34,7 +34,7 @@ def require() -> None:
     try:
         from pxr import Usd  # noqa: F401
     except ModuleNotFoundError:
-        raise SettingError("USD needs the package usd-core; pip install 'polcap[usd]'") from None
+        raise SettingError("USD needs the package usd-core; pip install usd-core") from None
 
 
 def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], says: Mapping[str, str]) -> None:
