@@ -553,11 +553,14 @@ def evaluate(
     quick: Annotated[bool, typer.Option("--quick", help="50 pictures at 256² instead of 250 at 512².")] = False,
     count: Annotated[int | None, typer.Option(min=1, help="Pictures to judge.")] = None,
     size: Annotated[int | None, typer.Option(min=64, help="Their side, px.")] = None,
+    protocol: Annotated[
+        int, typer.Option(min=1, max=2, help="1: smooth bodies, high F0 as often as low; 2: rough bodies, F0 as met.")
+    ] = 1,
 ) -> None:
     """Score a model on test meshes and materials beside baselines and published figures (extra [train])."""
     judge, fixed = _extra("evaluate"), _extra("protocol")
     usual = (fixed.QUICK_COUNT, fixed.QUICK_SIZE) if quick else (fixed.COUNT, fixed.SIZE)
-    judge.main(judge.Params(model, data, out, ablations, count or usual[0], size or usual[1]))
+    judge.main(judge.Params(model, data, out, ablations, count or usual[0], size or usual[1], protocol))
     terminal.say(str(out / "evaluation.md"))
 
 

@@ -49,6 +49,7 @@ class Params:
     ablations: Path | None = None  # holds NAME/last.pt
     count: int = protocol.COUNT  # pictures
     size: int = protocol.SIZE  # px
+    protocol: int = 1  # 1 | 2, of protocol.py
 
 
 def main(params: Params) -> dict[str, Score]:
@@ -57,7 +58,7 @@ def main(params: Params) -> dict[str, Score]:
     network = onnx.load(params.model)
     found = {} if params.ablations is None else baselines.checkpoints(params.ablations)
     head = _head(params, network, found)
-    made = Protocol(params.data, params.size)
+    made = Protocol(params.data, params.size, params.protocol)
     rows = _judged(params, baselines.means(made, params.count), head)
     result = _summary(head, rows, list(found))
     shown = (made.case(number) for number in range(min(_PANEL, params.count)))
@@ -72,7 +73,8 @@ def main(params: Params) -> dict[str, Score]:
 def _head(params: Params, network: Network, found: dict[str, Path]) -> dict[str, Any]:
     """All that the figures depend on."""
     return {
-        "pictures": params.count, "size": params.size, "protocol": protocol.VERSION, "camera": protocol.CONDITIONS,
+        "pictures": params.count, "size": params.size, "protocol": f"{params.protocol}.{protocol.VERSION}",
+        "materials": protocol.PROTOCOLS[params.protocol], "camera": protocol.CONDITIONS,
         "model": network.digest, "version": network.metadata.get("version", ""), "data": _digest(params.data),
         "stages": {stage.name: stage.version for stage in (cues.compute, infer.estimate)},
         "ablations": {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in found.items()},
@@ -176,7 +178,7 @@ class Bench:
     """Pictures and all ways of estimating, ready to judge."""
 
     def __init__(self, params: Params, means: Means) -> None:
-        self.made = Protocol(params.data, params.size)
+        self.made = Protocol(params.data, params.size, params.protocol)
         network = onnx.load(params.model, threads=1)
         found = {} if params.ablations is None else baselines.checkpoints(params.ablations)
         self.columns: dict[str, Estimator] = {

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Floats
 from polcap.optics import brdf, frames, fresnel, shade
+from polcap.optics.body import SMOOTH, Law
 from polcap.synth.mesh_tracer import Triangles
 
 LIFT = 1e-3  # longest sides of the mesh, from the surface to where a ray starts; nearer hits are the place itself
@@ -51,10 +52,11 @@ class Places:
     specular: Floats  # (M, 3)
     roughness: Floats  # (M,)
     ior: float
+    law: Law = SMOOTH
 
     def take(self, which: Indices) -> "Places":
-        """Some of them; the mask stays."""
-        held = {name: value[which] for name, value in vars(self).items() if name not in ("mask", "ior")}
+        """Some of them; the mask stays, and what all have in common."""
+        held = {name: value[which] for name, value in vars(self).items() if name not in ("mask", "ior", "law")}
         return replace(self, **held)
 
 
@@ -102,7 +104,8 @@ def _shaded(
     places: Places, diffuse: Floats, specular: Floats, toward: Floats, irradiance: Floats, ior: Floats | None = None
 ) -> Floats:
     index = np.full(len(toward), places.ior) if ior is None else ior
-    return np.asarray(shade.stokes(places.normal, diffuse, specular, places.roughness, index, toward, irradiance))
+    lit = places.roughness, index, toward, irradiance
+    return np.asarray(shade.stokes(places.normal, diffuse, specular, *lit, places.law))
 
 
 class _Gather:

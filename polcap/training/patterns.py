@@ -25,6 +25,7 @@ _STEP = 1e-3  # of the gradient
 _STEEPEST = 0.6  # slope of the relief
 _ORDINARY = (0.030, 0.052)  # F0 of every second material; the others lie evenly in the logarithm between
 _STRONG = (0.06, 0.26)
+_COMMON, _RARE = (0.034, 0.055), (0.06, 0.18)  # F0 of materials as they are met: four of five, and the fifth
 
 Indices = NDArray[np.integer[Any]]
 Field = Callable[[Floats], tuple[Floats, Floats]]  # (M, 3) -> tone 0…1, depth of grooves 0…1; (M,) each
@@ -49,32 +50,38 @@ class Material:
     slope: Callable[[Floats, Floats], Floats]  # (M, 3) gradient of the relief; outward is up
 
 
-def library(folder: Path) -> list[Material]:
-    """All test materials: the texture sets of `folder` in alphabetic order, then the patterns."""
+def library(folder: Path, *, met: bool = False) -> list[Material]:
+    """All test materials: the texture sets of `folder` in alphabetic order, then the patterns.
+
+    met: F0 as it is met, most about .045, instead of half about .04 and half far above.
+    """
     sets = sorted(p for p in folder.iterdir() if (p / "albedo.jpg").exists()) if folder.exists() else []
     if len(sets) < TEXTURES:
         raise InputError(
             f"{folder} holds {len(sets)} texture sets, the evaluation takes {TEXTURES}; give DATA as it was"
         )
     names = list(_FAMILIES)
-    patterned = [_pattern(names[k % len(names)], TEXTURES + k) for k in range(PATTERNS)]
-    return [_textured(path, k) for k, path in enumerate(sets[:TEXTURES])] + patterned
+    patterned = [_pattern(names[k % len(names)], TEXTURES + k, met) for k in range(PATTERNS)]
+    return [_textured(path, k, met) for k, path in enumerate(sets[:TEXTURES])] + patterned
 
 
-def _levels(number: int) -> tuple[np.random.Generator, float, float]:
+def _levels(number: int, met: bool) -> tuple[np.random.Generator, float, float]:
     """Random state, refractive index and F0 level of a material."""
     rng = np.random.default_rng([_SEED, number])
     ior = 1.4 + 0.2 * ((7 * number) % 30) / 29
-    low, high = _ORDINARY if number % 2 else _STRONG
+    if met:
+        low, high = _COMMON if number % 5 else _RARE
+    else:
+        low, high = _ORDINARY if number % 2 else _STRONG
     return rng, ior, low * (high / low) ** (((4 * number) % 15) / 14)
 
 
 # --- texture sets -------------------------------------------------------------------------------
 
 
-def _textured(folder: Path, number: int) -> Material:
+def _textured(folder: Path, number: int, met: bool) -> Material:
     """A texture set projected along the nearest axis, mirrored at its edges."""
-    rng, ior, level = _levels(number)
+    rng, ior, level = _levels(number, met)
     maps = np.ascontiguousarray(textures.read(folder).transpose(1, 2, 0))  # albedo, roughness, two slopes
     mean = float((maps[..., :3].mean(axis=-1) ** 0.45).mean())
     scale, follow, relief = rng.uniform(0.8, 2.0), rng.uniform(-0.5, 0.5), rng.uniform(0.2, 0.5)
@@ -122,16 +129,17 @@ def _halves(image: Floats) -> tuple[Floats, Floats]:
 # --- patterns -----------------------------------------------------------------------------------
 
 
-def _pattern(family: str, number: int) -> Material:
+def _pattern(family: str, number: int, met: bool) -> Material:
     """Two colours, two glosses and a relief laid out by a field."""
-    rng, ior, level = _levels(number)
+    rng, ior, level = _levels(number, met)
     field = _FAMILIES[family](rng)
     first, second = _color(rng), _color(rng)
     if rng.random() < 0.5:  # two shades of one colour
         second = first * rng.uniform(0.2, 0.6)
     rough, change = rng.uniform(0.2, 0.7), rng.uniform(0.08, 0.3) * rng.choice([-1, 1])
     follow, raised, steep = rng.uniform(-0.6, 0.6), rng.uniform(-0.4, 0.4), rng.uniform(0.03, 0.2)
-    tint = np.array([1.0, 1.0, 1.0]) if level < 0.1 else 1 + rng.uniform(-0.15, 0.15, 3)
+    strong = _levels(number, met=False)[2] >= 0.1  # drawn alike, so that relief is the same in both protocols
+    tint = 1 + rng.uniform(-0.15, 0.15, 3) if strong else np.array([1.0, 1.0, 1.0])
 
     def height(place: Floats) -> Floats:
         tone, groove = field(place)

@@ -1,5 +1,7 @@
 """The evaluation's fixed pictures: 6 test meshes × 30 test materials -> what the camera measured, and the truth.
 
+Protocol 1: bodies leave light through a smooth interface, half of the materials have a high F0. Protocol 2: through
+the facets of their own roughness (`optics/body.py`), with F0 as it is met. Shapes, patterns and cameras are the same.
 Every picture follows from its number, at any size. Conditions: `CONDITIONS`. Made one at a time.
 """
 
@@ -15,6 +17,7 @@ from torch import Tensor
 from polcap.errors import InputError
 from polcap.images import Bits, ColorCalibration, Cues, Floats, GBuffer, Quality, StokesImage, SurfaceMaps, View
 from polcap.optics import frames
+from polcap.optics.body import SMOOTH, Law
 from polcap.stages import cues
 from polcap.synth.mesh_tracer import Tracer, Triangles, centred
 from polcap.training import gbuffers, light_transport, patterns, shapes
@@ -35,6 +38,7 @@ CONDITIONS = (
     "over 70–90 % of it; refractive index 1.4–1.6; cast shadows and one diffuse bounce between parts of the object, "
     "traced; seeds fixed"
 )
+PROTOCOLS = {1: "smooth bodies, F0 .03–.26", 2: "rough bodies, F0 as it is met"}
 
 
 @dataclass(frozen=True)
@@ -62,18 +66,18 @@ class _Subject:
 
 
 class Protocol:
-    """The pictures of one size; meshes and materials are read once."""
+    """The pictures of one size and protocol; meshes and materials are read once."""
 
-    def __init__(self, data: Path, size: int) -> None:
+    def __init__(self, data: Path, size: int, protocol: int = 1) -> None:
         files = sorted((data / "meshes" / "test").glob("*.npz"))
         if len(files) != MESHES:
             raise InputError(f"{data}/meshes/test holds {len(files)} meshes, the evaluation takes {MESHES}")
-        self.size = size
+        self.size, self.protocol = size, protocol
         self.names = [file.stem for file in files]
         self.meshes = [centred(gbuffers.read_mesh(file)) for file in files]
         self.scenes = [light_transport.Scene(mesh) for mesh in self.meshes]
         self.tracers = [Tracer(mesh) for mesh in self.meshes]
-        self.materials = patterns.library(data / "materials" / "test")
+        self.materials = patterns.library(data / "materials" / "test", met=protocol == 2)
 
     def case(self, number: int) -> Case:
         """Picture `number`."""
@@ -127,8 +131,9 @@ class Protocol:
         bent = np.asarray(frames.lifted(bent))
         _, flat = self.scenes[index].facing(position + 0.01 * (v @ turn), -v @ turn)
         places = light_transport.Places(
-            inside, position, flat, bent, v, look.diffuse, look.specular, look.roughness, material.ior
-        )
+            inside, position, flat, bent, v, look.diffuse, look.specular, look.roughness, material.ior,
+            law(number) if self.protocol == 2 else SMOOTH,
+        )  # fmt: skip
         return _Subject(f"{self.names[index]}, {material.name}", pose, buffer, places, albedo, (middle, unit))
 
 
@@ -137,6 +142,14 @@ def combination(number: int) -> tuple[int, int]:
     order = np.random.default_rng(_SEED).permutation(patterns.TEXTURES + patterns.PATTERNS)
     mesh = number % MESHES
     return mesh, int(order[(number // MESHES + 5 * mesh) % len(order)])
+
+
+def law(number: int) -> Law:
+    """Of a picture of protocol 2: facets counted evenly in every even one, by the flash's light in every odd one, .8–1
+    of the polarization left, .4–.8 in every tenth."""
+    low, high = (0.4, 0.8) if number % 10 == 9 else (0.8, 1.0)
+    kept = np.random.default_rng([_SEED, number, 2]).uniform(low, high)
+    return Law(rough=1.0, local=float(number % 2), kept=float(kept))
 
 
 def lights() -> Floats:

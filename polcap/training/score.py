@@ -38,6 +38,8 @@ class Judge:
     def score(self, maps: SurfaceMaps) -> Score:
         """RMSE unless said, angles in degrees, shares of pixels in 0…1. `·_core`: mask eroded by 2 px.
 
+        `·_picture`: over the whole square picture, where nothing is wrong beside the object.
+
         depth: both centred in the mask, over the truth's greatest minus least; `depth_fitted`: after the best
         scale and shift. diffuse_clipped: where every exposure is saturated; absent where fewer than ten pixels are.
         """
@@ -50,13 +52,20 @@ class Judge:
                 out[f"normal_within_{limit:g}{suffix}"] = float((error[inside] < limit).mean())
         for name in MAPS:
             difference = (getattr(maps, name) - getattr(case.truth, name))[mask]
-            out[name], out[f"{name}_l1"] = _rmse(difference), float(np.abs(difference).mean())
+            out |= self._counted(name, difference)
         if self.clipped is not None:
             out["diffuse_clipped"] = _rmse((maps.diffuse - case.truth.diffuse)[self.clipped])
         if maps.depth_prior is not None:
             out |= _depth(maps.depth_prior[mask], case.depth[mask])
         difference = self._rendered(maps) - self.rendered
-        return out | {"rendering": _rmse(difference), "rendering_l1": float(np.abs(difference).mean())}
+        return out | self._counted("rendering", difference)
+
+    def _counted(self, name: str, difference: Floats) -> Score:
+        """RMSE and L1, over the object and over the picture."""
+        rmse, l1, share = _rmse(difference), float(np.abs(difference).mean()), float(self.mask.mean())
+        return {
+            name: rmse, f"{name}_l1": l1, f"{name}_picture": rmse * share**0.5, f"{name}_l1_picture": l1 * share,
+        }  # fmt: skip
 
     def integrated(self, maps: SurfaceMaps) -> Score:
         """depth_integrated: depth's error once stage 9 has made a surface of the maps, on every n-th pixel."""

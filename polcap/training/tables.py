@@ -40,16 +40,24 @@ ROWS = {
     "normal_within_30_core": "normal under 30°, eroded mask [%]",
     "diffuse": "diffuse RMSE",
     "diffuse_l1": "diffuse L1",
+    "diffuse_picture": "diffuse RMSE, whole picture",
+    "diffuse_l1_picture": "diffuse L1, whole picture",
     "diffuse_clipped": "diffuse RMSE in clipped highlights",
     "roughness": "roughness RMSE",
     "roughness_l1": "roughness L1",
+    "roughness_picture": "roughness RMSE, whole picture",
+    "roughness_l1_picture": "roughness L1, whole picture",
     "specular": "specular RMSE",
     "specular_l1": "specular L1",
+    "specular_picture": "specular RMSE, whole picture",
+    "specular_l1_picture": "specular L1, whole picture",
     "depth": "depth RMSE",
     "depth_fitted": "depth RMSE, scale and shift fitted",
     "depth_integrated": "depth RMSE after integration",
     "rendering": "rendering RMSE",
     "rendering_l1": "rendering L1",
+    "rendering_picture": "rendering RMSE, whole picture",
+    "rendering_l1_picture": "rendering L1, whole picture",
 }
 _AVERAGED = (
     "RMSE is the root of the mean square over a picture's masked pixels and channels (for renderings over the 20 "
@@ -57,7 +65,9 @@ _AVERAGED = (
     "estimator's map, centred within the mask and divided by the truth's greatest minus least, no scale fitted; "
     "after integration: the surface that stage 9 makes of the normals with it, at about 128 px. Renderings are "
     "linear, the flash-lit truth's 99th percentile is 1, clipped to 0…1, drawn with refractive index 1.5 and "
-    "without cast shadows. The eroded mask is 2 px thinner."
+    "without cast shadows. The eroded mask is 2 px thinner. Over the whole picture means with nothing wrong beside the "
+    "object: RMSE times the root of the object's share of it, L1 times the share. The paper says L1 in its text and "
+    "RMSE in its captions, and not over what; its figures stand in the first row of each."
 )
 Table = Mapping[str, Mapping[str, float]]
 
@@ -68,7 +78,8 @@ def page(result: Mapping[str, Any]) -> str:
     main = {**result["table"], **_published(PUBLISHED)}
     parts = [
         f"# Evaluation: {told['pictures']} pictures at {told['size']}²",
-        f"6 test meshes × 30 test materials. Model {told['model'][:12]} {told['version']}. Camera: {told['camera']}.",
+        f"6 test meshes × 30 test materials, protocol {told['protocol']} ({told['materials']}). "
+        f"Model {told['model'][:12]} {told['version']}. Camera: {told['camera']}.",
         f"Standard deviation of the truth's F0 over all pictures: {told['f0_deviation']:.3f}.",
         _table(main),
         _AVERAGED,

@@ -7,7 +7,7 @@ import pytest
 
 from polcap.errors import InputError
 from polcap.images import Floats
-from polcap.optics import frames
+from polcap.optics import body, frames, fresnel
 from polcap.training import protocol
 from polcap.training.protocol import Protocol
 
@@ -51,6 +51,30 @@ def test_clean_cues_carry_the_polarization_of_the_truth(made: Protocol) -> None:
     tilted = case.clean.dolp[mask] > 0.02
     agreement = np.sum(expected / np.linalg.norm(expected, axis=0) * case.clean.normalized_stokes[:, mask], axis=0)
     assert np.median(agreement[tilted]) > 0.97
+
+
+def test_bodies_of_the_second_protocol_polarize_as_rough_ones(made: Protocol, test_data: Path) -> None:
+    """Same places, same shapes; the DoLP of what is lit well falls by the ratio that roughness means."""
+    second = Protocol(test_data, 96, protocol=2)
+    ratios = []
+    for number in (2, 3):
+        smooth, rough = made.case(number), second.case(number)
+        assert np.array_equal(smooth.truth.normal, rough.truth.normal)
+        assert np.array_equal(smooth.truth.roughness, rough.truth.roughness)
+        local = frames.to_ray_frame(smooth.truth.normal, smooth.clean.rays)
+        law = protocol.law(number)
+        expected = law.kept * body.dolp(np.maximum(local[..., 2], 0.1), smooth.truth.roughness**2, 1.5, law.local)
+        expected = expected / fresnel.diffuse_dolp(np.maximum(local[..., 2], 0.1), 1.5)
+        tilted = smooth.truth.mask & (smooth.clean.dolp > 0.03) & (local[..., 2] > 0.3)
+        found = rough.clean.dolp[tilted] / smooth.clean.dolp[tilted]
+        ratios.append(np.median(found - expected[tilted]))
+    assert np.abs(ratios).max() < 0.1
+
+
+def test_f0_of_the_second_protocol_is_as_met(test_data: Path) -> None:
+    second = Protocol(test_data, 96, protocol=2)
+    f0 = [float(np.median(second.truth(number, 48).specular[second.truth(number, 48).mask])) for number in range(30)]
+    assert 0.035 < np.median(f0) < 0.055 and 2 <= sum(value > 0.06 for value in f0) <= 8
 
 
 def test_noise_is_the_stated_camera_s(made: Protocol) -> None:

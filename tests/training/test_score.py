@@ -38,6 +38,9 @@ def test_known_errors_score_what_they_are(case: Case) -> None:
     expected = np.degrees(2 * np.arcsin(zenith * np.sin(np.radians(7.5)))).mean()
     assert figures["normal_mean"] == pytest.approx(expected, rel=1e-3)
     assert figures["roughness"] == pytest.approx(0.1, rel=1e-4)
+    share = case.truth.mask.mean()  # beside the object nothing is wrong
+    assert figures["roughness_picture"] == pytest.approx(0.1 * np.sqrt(share), rel=1e-4)
+    assert figures["roughness_l1_picture"] == pytest.approx(0.1 * share, rel=1e-4)
     inside = case.depth[case.truth.mask]
     assert figures["depth"] == pytest.approx(inside.std() / np.ptp(inside), rel=1e-4)
     assert figures["depth_fitted"] == pytest.approx(0, abs=1e-5)
