@@ -1,5 +1,8 @@
 """From a sensor's counts to signals, and which of them can be believed."""
 
+import math
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,15 +49,23 @@ def usable(image: SensorImage, clip: float, full: bool = False) -> Bools:
     photosite at the limit rules out its surroundings, which keeps the choice from favouring low noise.
     """
     value, level = image.value, clip * saturation(image)
+    over = _at_least(value, level)
     if image.cfa is None:
-        over = np.asarray((value >= level).any(axis=2))
+        over = np.asarray(over.any(axis=2))
     else:
         h, w = value.shape[0] // 2, value.shape[1] // 2
-        over = np.zeros((h, w), bool)
-        for i, j in np.ndindex(2, 2):
-            over |= value[i : 2 * h : 2, j : 2 * w : 2] >= level
+        over = over[: 2 * h : 2, : 2 * w] | over[1 : 2 * h : 2, : 2 * w]
+        over = np.ascontiguousarray(over).view(np.uint16) != 0  # either of two neighbours
     over = _grown(over)
     return ~(np.repeat(np.repeat(over, 2, axis=0), 2, axis=1) if full and image.cfa is not None else over)
+
+
+def _at_least(value: Floats | NDArray[np.uint16], level: float) -> Bools:
+    """value ≥ level; counts are compared as the whole numbers they are."""
+    if value.dtype == np.uint16:
+        least = math.ceil(level)
+        return np.zeros(value.shape, bool) if least > 65535 else np.asarray(value >= np.uint16(least))
+    return np.asarray(value >= level)
 
 
 def saturation(image: SensorImage) -> float:
@@ -73,10 +84,4 @@ def rounding(image: SensorImage) -> float:
 
 def _grown(mask: Bools) -> Bools:
     """Grown by one pixel in all eight directions."""
-    rows = mask.copy()
-    rows[1:] |= mask[:-1]
-    rows[:-1] |= mask[1:]
-    grown = rows.copy()
-    grown[:, 1:] |= rows[:, :-1]
-    grown[:, :-1] |= rows[:, 1:]
-    return grown
+    return np.asarray(cv2.dilate(mask.view(np.uint8), np.ones((3, 3), np.uint8))).view(bool)

@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from polcap.images import Floats
 from polcap.optics.robust import MAD_TO_SIGMA
+from polcap.stages.hdr.frames import Signals, tile_means
 
 TILE = 16  # px
 _LEAST_TILES = 30
@@ -21,15 +22,21 @@ class Ratio:
     sigma: Floats  # (C,) 1σ, relative
 
 
-def ratio(reference: Floats, other: Floats, usable: NDArray[np.bool_]) -> Ratio | None:
-    """other / reference of registered signals (H, W, C), channel by channel; None where they cannot tell.
+def ratio(reference: Signals, other: Signals) -> Ratio | None:
+    """other / reference of registered signals, channel by channel; None where they cannot tell.
 
     The quotient of sums over tiles: of Poisson counts the maximum-likelihood estimate, and free of the
     bias that a mean of quotients or of logarithms has. Tiles that disagree (something moved) are dropped.
     A channel too dim to say better than 1 % takes the ratio of all channels together.
     """
-    inside = _tiles(usable[..., None].astype(np.float32))[..., 0] > 0.999
-    a, b = (_tiles(picture)[inside].astype(np.float64) for picture in (reference, other))
+    _, height, width = reference.shape
+    usable = (reference.usable & other.usable).view(np.uint8) * np.uint8(255)
+    tiled = usable[: height // TILE * TILE, : width // TILE * TILE]
+    if not tiled.size:
+        return None
+    # one unusable pixel of the 256 takes the mean to 254
+    inside = cv2.resize(tiled, (width // TILE, height // TILE), interpolation=cv2.INTER_AREA) == 255
+    a, b = (tile_means(picture, TILE)[inside].astype(np.float64) for picture in (reference, other))
     found = [_quotient(a[:, c], b[:, c]) for c in range(a.shape[1])]
     sums = _quotient(a.sum(axis=1), b.sum(axis=1))
     if sums is None or sums[1] > 0.03:
@@ -60,12 +67,3 @@ def _quotient(a: Floats, b: Floats) -> tuple[float, float] | None:
         r = float(b[keep].sum() / a[keep].sum())
     rest = b[keep] - r * a[keep]
     return r, float(np.sqrt(np.sum(rest**2)) / b[keep].sum())
-
-
-def _tiles(picture: Floats) -> Floats:
-    h, w = picture.shape[0] // TILE, picture.shape[1] // TILE
-    rows = []
-    for i in range(h):
-        columns = picture[TILE * i : TILE * (i + 1), : TILE * w].sum(axis=0, dtype=np.float64)
-        rows.append(columns.reshape(w, TILE, -1).sum(axis=1) / TILE**2)
-    return np.stack(rows) if rows else np.zeros((0, w, picture.shape[2]), np.float32)

@@ -11,6 +11,7 @@ Baker and Matthews, Lucas-Kanade 20 years on, IJCV 2004; Schwarz, Ann. Statist. 
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,7 +23,7 @@ _REACH = 2.0  # px a tile may move in one step
 _SETTLED = 0.005  # px; a smaller step ends the search
 
 
-_Level = tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]]  # two pictures, their usable pixels
+Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -42,35 +43,53 @@ class _Matches:
     information: Floats  # (T, 2, 2) inverse covariance of the shift
 
 
-def estimate(
-    reference: Floats, other: Floats, usable_reference: NDArray[np.bool_], usable_other: NDArray[np.bool_]
-) -> Motion:
-    """Register two pictures (H, W) of about even noise (a square root of radiance), lightly smoothed.
+class View:
+    """One picture at all scales, each made when it is asked for."""
 
-    usable: which pixels are exposed well enough to be compared.
-    """
-    pyramid: list[_Level] = [(reference, other, usable_reference, usable_other)]
-    while min(pyramid[-1][0].shape) >= 8 * TILE:
-        a, b, ok_a, ok_b = pyramid[-1]
-        pyramid.append((_half(a), _half(b), _half(ok_a) > 0.99, _half(ok_b) > 0.99))
-    still, agree = _refine(pyramid[:1], np.eye(3))
+    def __init__(self, picture: Floats, usable: Bools) -> None:
+        """`picture` (H, W) of about even noise (a square root of radiance), lightly smoothed; usable: which
+        pixels are exposed well enough to be compared."""
+        self._levels = [(picture, usable)]
+        self._tiles: dict[int, NDArray[np.int64]] = {}
+        self.scales = 1
+        while min(picture.shape) // 2 ** (self.scales - 1) >= 8 * TILE:
+            self.scales += 1
+
+    def __getitem__(self, scale: int) -> tuple[Floats, Bools]:
+        """The picture at 2^-scale of its size, and its usable pixels."""
+        while len(self._levels) <= scale:
+            picture, usable = self._levels[-1]
+            self._levels.append((_half(picture), _half(usable) > 0.99))
+        return self._levels[scale]
+
+    def tiles(self, scale: int) -> NDArray[np.int64]:
+        """Corners (T, 2) = (row, column) of the tiles with most detail, spread over the picture."""
+        if scale not in self._tiles:
+            self._tiles[scale] = _choose(*self[scale])
+        return self._tiles[scale]
+
+
+def estimate(reference: View, other: View) -> Motion:
+    """Register two pictures."""
+    still, agree = _refine(reference, other, 1, np.eye(3))
     if still.shift_px < 1 and agree > 0.6 * still.tiles:  # look no further
         return still
-    near, agree = _refine(pyramid, np.eye(3))
-    far, more = _refine(pyramid, _coarse(*pyramid[-1]))
+    scales = reference.scales
+    near, agree = _refine(reference, other, scales, np.eye(3))
+    start = _coarse(*reference[scales - 1], *other[scales - 1])
+    far, more = _refine(reference, other, scales, start)
     return far if more > 1.25 * agree else near  # of repeated detail the nearest match is taken
 
 
-def _refine(pyramid: list[_Level], matrix: Floats) -> tuple[Motion, float]:
-    """Coarse to fine from a first guess on the coarsest level; with it the number of tiles that agree.
+def _refine(reference: View, other: View, scales: int, matrix: Floats) -> tuple[Motion, float]:
+    """Coarse to fine from a first guess on the coarsest of some scales; with it the number of tiles that agree.
 
     No motion is reported where fewer than two in five do.
     """
     sigma, agree = np.inf, 0.0
     points: Floats = np.zeros((0, 2))
-    for level in range(len(pyramid) - 1, -1, -1):
-        a, b, ok_a, ok_b = pyramid[level]
-        tiles = _choose(a, ok_a)
+    for level in range(scales - 1, -1, -1):
+        (a, _), (b, ok_b), tiles = reference[level], other[level], reference.tiles(level)
         points = np.zeros((0, 2))
         for _ in range(4 if level else 6):
             matches = _match(a, b, ok_b, tiles, matrix)
@@ -103,10 +122,10 @@ def apply(matrix: Floats, point: Floats) -> Floats:
 def _half(picture: Floats | NDArray[np.bool_]) -> Floats:
     h, w = picture.shape[0] // 2, picture.shape[1] // 2
     even = picture[: 2 * h, : 2 * w].astype(np.float32, copy=False)
-    return np.asarray(even.reshape(h, 2, w, 2).mean(axis=(1, 3)))
+    return np.asarray(cv2.resize(even, (w, h), interpolation=cv2.INTER_AREA))
 
 
-def _coarse(a: Floats, b: Floats, ok_a: NDArray[np.bool_], ok_b: NDArray[np.bool_]) -> Floats:
+def _coarse(a: Floats, ok_a: Bools, b: Floats, ok_b: Bools) -> Floats:
     """Whole-pixel shift by phase correlation of what both can see; the identity unless clearly better."""
     window = np.outer(np.hanning(a.shape[0]), np.hanning(a.shape[1]))
     both = ok_a & ok_b
@@ -127,11 +146,14 @@ def _choose(a: Floats, usable: NDArray[np.bool_]) -> NDArray[np.int64]:
     rows, columns = (a.shape[0] - 2) // TILE, (a.shape[1] - 2) // TILE
     if rows < 1 or columns < 1:
         return np.zeros((0, 2), np.int64)
-    gy, gx = np.gradient(a)
-    detail = np.where(usable, gx * gx + gy * gy, 0)
-    cut = (slice(0, rows * TILE), slice(0, columns * TILE))
-    score = detail[cut].reshape(rows, TILE, columns, TILE).sum(axis=(1, 3))
-    score *= usable[cut].reshape(rows, TILE, columns, TILE).mean(axis=(1, 3)) > 0.7
+    gx, gy = (cv2.Sobel(a, cv2.CV_32F, x, 1 - x, ksize=1, borderType=cv2.BORDER_REPLICATE) for x in (1, 0))
+    gx *= gx
+    gy *= gy
+    gx += gy
+    gx *= usable
+    cut, size = (slice(0, rows * TILE), slice(0, columns * TILE)), (columns, rows)
+    score = cv2.resize(gx[cut], size, interpolation=cv2.INTER_AREA)
+    score *= cv2.resize(usable[cut].view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) > 0.7 * 255
     found = []
     for cell_rows in np.array_split(np.arange(rows), min(_CELLS, rows)):
         for cell_columns in np.array_split(np.arange(columns), min(_CELLS, columns)):

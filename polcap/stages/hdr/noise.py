@@ -11,11 +11,13 @@ fitting for single-image raw-data, IEEE TIP 2008 (flat tiles, robust line).
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
 from polcap.optics.robust import MAD_TO_SIGMA
+from polcap.stages.hdr.frames import Signals
 
 TILE = 16  # px; about 68 independent second differences, so that one tile knows its variance to 17 %
 _FREEDOM = TILE * TILE / 3.78  # 3.78 = Σ ρ² over the autocorrelation of [1, −2, 1] ⊗ [1, −2, 1]
@@ -35,6 +37,13 @@ class Noise:
         """Of pixels whose expected signal (..., C) is known; a negative one counts as 0."""
         return np.maximum(signal, 0) * self.slope + self.floor
 
+    def of(self, channel: int, signal: Floats) -> Floats:
+        """The same for one channel's picture, a new array."""
+        out = np.maximum(signal, 0)
+        out *= self.slope[channel]
+        out += self.floor[channel]
+        return out
+
     def lit(self, level: Floats) -> "Noise":
         """The same sensor where light of a level (C,) was subtracted: its noise stays."""
         return Noise(self.slope, self.floor + self.slope * np.maximum(level, 0))
@@ -50,12 +59,12 @@ class Samples:
 
 
 def roughness(picture: Floats) -> Floats:
-    """Second differences along both axes, (H, W, C) → (H−2, W−2, C); white noise keeps its variance.
+    """Second differences along both axes, (C, H, W) → (C, H−2, W−2); white noise keeps its variance.
 
     [1, −2, 1] ⊗ [1, −2, 1] / 6 is blind to a ramp.
     """
-    rows = picture[:-2] - 2 * picture[1:-1] + picture[2:]
-    return (rows[:, :-2] - 2 * rows[:, 1:-1] + rows[:, 2:]) / 6
+    rows = picture[:, :-2] - 2 * picture[:, 1:-1] + picture[:, 2:]
+    return (rows[..., :-2] - 2 * rows[..., 1:-1] + rows[..., 2:]) / 6
 
 
 def strips(height: int, width: int, most: float = 1.5e6) -> list[slice]:
@@ -66,31 +75,33 @@ def strips(height: int, width: int, most: float = 1.5e6) -> list[slice]:
     return [slice(TILE * int(r), TILE * int(r) + TILE + 2) for r in first]
 
 
-def alone(picture: Floats, usable: NDArray[np.bool_]) -> Samples:
-    """Tiles of a single frame (H, W, C)."""
+def alone(picture: Signals) -> Samples:
+    """Tiles of a single frame."""
     signal, variance = [], []
-    for rows in strips(*usable.shape):
-        detail = roughness(picture[rows])
-        signal.append(_tiles(picture[rows][1:-1, 1:-1], usable[rows]))
-        variance.append(_tiles(detail * detail, usable[rows]))
-    return _samples(signal, variance, True, picture.shape[2])
+    for rows in strips(*picture.usable.shape):
+        part, usable = picture.rows(rows), picture.usable[rows]
+        detail = roughness(part)
+        signal.append(_tiles(part[:, 1:-1, 1:-1], usable))
+        variance.append(_tiles(detail * detail, usable))
+    return _samples(signal, variance, True, picture.shape[0])
 
 
-def paired(first: Floats, second: Floats, ratio: Floats, usable: NDArray[np.bool_]) -> tuple[Samples, Samples]:
+def paired(first: Signals, second: Signals, ratio: Floats) -> tuple[Samples, Samples]:
     """Tiles of two frames of the same scene in the same place, second = ratio (C,) · first but for noise.
 
     With h₁ = t + n₁ and h₂ = r t + n₂ the detail t drops out of ⟨h₁ (h₁ − h₂/r)⟩ = var n₁ and of
     ⟨h₂ (h₂ − r h₁)⟩ = var n₂, however rich it is and whatever the two gains are.
     """
     columns: tuple[list[Floats], ...] = ([], [], [], [])
-    r = np.asarray(ratio, np.float32)
-    for rows in strips(*usable.shape):
-        h1, h2 = roughness(first[rows]), roughness(second[rows])
+    r = np.asarray(ratio, np.float32)[:, None, None]
+    for rows in strips(*first.usable.shape):
+        one, two, usable = first.rows(rows), second.rows(rows), first.usable[rows] & second.usable[rows]
+        h1, h2 = roughness(one), roughness(two)
         difference = h2 - r * h1
-        maps = (first[rows][1:-1, 1:-1], -h1 * difference / r, second[rows][1:-1, 1:-1], h2 * difference)
+        maps = (one[:, 1:-1, 1:-1], -h1 * difference / r, two[:, 1:-1, 1:-1], h2 * difference)
         for column, values in zip(columns, maps):
-            column.append(_tiles(values, usable[rows]))
-    channels = first.shape[2]
+            column.append(_tiles(values, usable))
+    channels = first.shape[0]
     return (
         _samples(columns[0], columns[1], False, channels),
         _samples(columns[2], columns[3], False, channels),
@@ -110,30 +121,24 @@ def fit(samples: list[Samples], iso: float | None, least_floor: float) -> Noise:
     return Noise(line[:, 0], line[:, 1])
 
 
-def misfit(
-    first: Floats,
-    second: Floats,
-    ratio: Floats,
-    lines: tuple[Noise, Noise],
-    gain: float,
-    usable: NDArray[np.bool_],
-) -> Floats:
-    """How two registered frames (H, W, C) differ beyond noise: variance per squared gradient, (C,) px².
+def misfit(first: Signals, second: Signals, ratio: Floats, lines: tuple[Noise, Noise], gain: float) -> Floats:
+    """How two registered frames differ beyond noise: variance per squared gradient, (C,) px².
 
     Registration errors and aliasing show at edges. second = ratio · first; gain: what resampling made of
     the second frame's noise. From the tiles that have edges; 0 where it is not significant.
     """
     r = np.asarray(ratio, np.float32)
     columns: tuple[list[Floats], ...] = ([], [], [])
-    for rows in strips(*usable.shape):
-        a, d = first[rows], second[rows][1:-1, 1:-1] / r - first[rows][1:-1, 1:-1]
-        gx, gy = a[1:-1, 2:] - a[1:-1, :-2], a[2:, 1:-1] - a[:-2, 1:-1]
-        level, offset = _tiles(a[1:-1, 1:-1], usable[rows]), _tiles(d, usable[rows])
+    for rows in strips(*first.usable.shape):
+        a, usable = first.rows(rows), first.usable[rows] & second.usable[rows]
+        d = second.rows(rows)[:, 1:-1, 1:-1] / r[:, None, None] - a[:, 1:-1, 1:-1]
+        gx, gy = a[:, 1:-1, 2:] - a[:, 1:-1, :-2], a[:, 2:, 1:-1] - a[:, :-2, 1:-1]
+        level, offset = _tiles(a[:, 1:-1, 1:-1], usable), _tiles(d, usable)
         own = lines[0].variance(level)
         columns[0].append(own + lines[1].variance(level * r) / r**2 * gain)
-        columns[1].append(_tiles(d * d, usable[rows]) - offset**2)
-        columns[2].append(_tiles((gx * gx + gy * gy) / 4, usable[rows]) - own)
-    out = np.zeros(first.shape[2], np.float32)
+        columns[1].append(_tiles(d * d, usable) - offset**2)
+        columns[2].append(_tiles((gx * gx + gy * gy) / 4, usable) - own)
+    out = np.zeros(first.shape[0], np.float32)
     if columns[0]:
         expected, seen, edge = (np.concatenate(column) for column in columns)
         for c in range(len(out)):
@@ -242,10 +247,11 @@ def _low_quantile(variance: Floats) -> float:
 
 
 def _tiles(values: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Means over the tiles of one strip, (T, C); NaN where a pixel the tile touches is not usable."""
+    """Means over the tiles of one strip (C, h, w), (T, C); NaN where a pixel the tile touches is not usable."""
     count = (usable.shape[1] - 2) // TILE
-    columns = values[:TILE, : count * TILE].sum(axis=0, dtype=np.float64)
-    mean = np.asarray(columns.reshape(count, TILE, -1).sum(axis=1) / TILE**2)  # (T, C)
+    mean = np.empty((count, len(values)))
+    for c, plane in enumerate(values):
+        mean[:, c] = cv2.resize(plane[:TILE, : count * TILE], (count, 1), interpolation=cv2.INTER_AREA)[0]
     bad = np.asarray(~usable.all(axis=0))  # (W,)
     before = np.concatenate([[0], np.cumsum(bad)])
     first = TILE * np.arange(count)

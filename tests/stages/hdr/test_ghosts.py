@@ -2,12 +2,25 @@
 
 import numpy as np
 
-from polcap.stages.hdr import ghosts
+from polcap.stages.hdr import frames, ghosts
+from polcap.stages.hdr.frames import Planes, planar
+from polcap.stages.hdr.ghosts import Exposed
 from polcap.stages.hdr.noise import Noise
 
 WELL = 30000.0
 LINE = Noise(np.full(3, 1 / WELL, np.float32), np.full(3, 1e-9, np.float32))
 ONE = np.ones(3, np.float32)
+
+
+def exposed(picture, exposure=1.0, usable=None):
+    """A frame (H, W, C) of known exposure and noise."""
+    everywhere = np.ones(picture.shape[:2], bool)
+    signals = Planes(planar(picture.astype(np.float32)), everywhere if usable is None else usable)
+    return Exposed(signals, np.float32(exposure) * ONE, LINE)
+
+
+def interleaved(planes):
+    return np.moveaxis(planes, 0, -1)
 
 
 def shoot(rng, scene, exposure=1.0):
@@ -18,11 +31,11 @@ def test_first_estimate_is_unbiased_smooth_and_keeps_edges():
     rng = np.random.default_rng(0)
     scene = np.full((200, 300, 3), 0.002)
     scene[:, 150:] = 0.2
-    estimate = ghosts.FirstEstimate(scene.shape)
+    estimate = ghosts.FirstEstimate()
     everywhere = np.ones(scene.shape[:2], bool)
     for exposure in (0.25, 1, 4):
-        estimate.add(shoot(rng, scene, exposure), everywhere, exposure * ONE, LINE)
-    x = estimate.smoothed(scene.astype(np.float32), ~everywhere)
+        estimate.add(exposed(shoot(rng, scene, exposure), exposure), everywhere)
+    x = interleaved(estimate.smoothed(exposed(scene).signals, ~everywhere))
     for part in (np.s_[:, 10:140], np.s_[:, 160:290]):
         assert abs(x[part].mean() / scene[part].mean() - 1) < 2e-3
         assert (x[part] - scene[part]).std() < 0.4 * np.sqrt(scene[part].mean() / WELL / 5.25)
@@ -30,22 +43,21 @@ def test_first_estimate_is_unbiased_smooth_and_keeps_edges():
 
 
 def test_unserved_pixels_take_the_other_value():
-    estimate = ghosts.FirstEstimate((20, 20, 3))
-    estimate.add(np.ones((20, 20, 3), np.float32), np.zeros((20, 20), bool), ONE, LINE)
-    other = np.full((20, 20, 3), 7, np.float32)
+    estimate = ghosts.FirstEstimate()
+    estimate.add(exposed(np.ones((20, 20, 3))), np.zeros((20, 20), bool))
+    other = exposed(np.full((20, 20, 3), 7)).signals
     np.testing.assert_allclose(estimate.smoothed(other, np.zeros((20, 20), bool)), 7)
 
 
 def test_noise_makes_no_ghosts_and_a_mover_does():
     rng = np.random.default_rng(1)
     scene = np.geomspace(0.001, 0.5, 600)[None, :, None] * np.ones((400, 1, 3))
-    everywhere = np.ones(scene.shape[:2], bool)
-    anchor = ghosts.Anchor(shoot(rng, scene), everywhere, LINE)
-    quiet = anchor.ghosts(shoot(rng, scene, 0.25), everywhere, 0.25 * ONE, LINE, 0 * ONE, 1.0)
+    anchor = ghosts.Anchor(exposed(shoot(rng, scene)))
+    quiet = anchor.ghosts(exposed(shoot(rng, scene, 0.25), 0.25), 0 * ONE, 1.0)
     assert not quiet.any()
     moved = scene.copy()
     moved[100:130, 400:430] *= 1.4
-    found = anchor.ghosts(shoot(rng, moved, 0.25), everywhere, 0.25 * ONE, LINE, 0 * ONE, 1.0)
+    found = anchor.ghosts(exposed(shoot(rng, moved, 0.25), 0.25), 0 * ONE, 1.0)
     assert found[102:128, 402:428].all()
     found[94:136, 394:436] = False
     assert not found.any()
@@ -57,17 +69,17 @@ def test_anchor_takes_the_darkest_frame_where_the_reference_clips():
     scene[:, 40:] = 3.0
     clear = np.ones((60, 80), bool)
     clear[:, 38:] = False
-    anchor = ghosts.Anchor(np.minimum(shoot(rng, scene), 1), clear, LINE)
-    anchor.fill(shoot(rng, scene, 0.25), np.ones((60, 80), bool), 0.25 * ONE, LINE)
+    anchor = ghosts.Anchor(exposed(np.minimum(shoot(rng, scene), 1), usable=clear))
+    anchor.fill(exposed(shoot(rng, scene, 0.25), 0.25))
     assert anchor.known.all()
-    assert abs(anchor.value[:, 40:].mean() / 3 - 1) < 1e-3
-    variance = anchor.variance(scene.astype(np.float32), slice(0, 60))
+    assert abs(anchor.rows(slice(0, 60))[..., 40:].mean() / 3 - 1) < 1e-3
+    variance = anchor.variance(scene[..., 0].astype(np.float32), 0, slice(0, 60))
     np.testing.assert_allclose(variance[0, -1], 3 / WELL / 0.25, rtol=1e-3)  # photons of a quarter exposure
 
 
 def test_blocks_cover_every_row_once_with_their_halo():
     seen = np.zeros(1000, int)
-    for rows, inner, target in ghosts.blocks(1000, 3):
+    for rows, inner, target in frames.blocks(1000, 3):
         np.testing.assert_array_equal(np.arange(1000)[rows][inner], np.arange(1000)[target])
         assert rows.start == max(target.start - 3, 0) and rows.stop == min(target.stop + 3, 1000)
         seen[target] += 1

@@ -10,11 +10,11 @@ import pytest
 
 from polcap.errors import CaptureError
 from polcap.images import Capture, Exif, Frame, Quality, SensorImage, Shot
-from polcap.optics import sensor
 from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.stages import hdr
+from polcap.stages.hdr import frames, links, noise
 from polcap.stages.hdr import ghosts as bracket_pixels
-from polcap.stages.hdr import noise
+from polcap.stages.hdr.frames import Reader, signals
 
 RGGB = np.array([[0, 1], [1, 2]], np.uint8)
 BLACK, WHITE, READ, GAIN = 512.0, 15871.0, 3.0, 2.0  # counts, counts, e⁻, e⁻ per count at ISO 100
@@ -376,8 +376,9 @@ def test_a_plateau_below_the_stated_white_is_saturation():
     assert clipped[:, 32:].all() and not clipped[:, :31].any()
 
 
-def test_frames_stream():
-    """Never more than three decoded frames alive, of nine."""
+def test_frames_stream(monkeypatch):
+    """With room for three decoded frames, never more than these and the next are alive, of nine."""
+    monkeypatch.setattr(frames, "_HELD_BYTES", 3 * 2 * 256 * 256)
     quads = ramp(256, 256, high=2e4)
     alive = weakref.WeakSet()
     most = 0
@@ -400,7 +401,7 @@ def test_frames_stream():
             self.array_id = id(array)
 
     hdr.merge(capture([lazily(e, k) for k, e in enumerate(np.geomspace(0.2, 4, 9))]), hdr.Settings())
-    assert most == 3
+    assert most <= 4  # one is being decoded
 
 
 DATA = os.environ.get("POLCAP_DATA")
@@ -457,17 +458,19 @@ def test_hand_held_nikon_bracket():
     assert ghost[:1150].mean() < 0.001
     # frame against frame, registered and on one scale, where nothing moved
     shot = Shot(0.0, tuple(frames))
-    links, lines, _, first = hdr._measure(shot, [0, 1, 2], 1, noise.Lines(), hdr._Reader(), hdr.Settings())
-    own = frames[1].load()
-    mid, clear = sensor.signal(own), sensor.usable(own, 0.98)
+    found = links.measure(shot, [0, 1, 2], 1, noise.Lines(), Reader(()), 0.98, 60.0)
+    own, first = signals(frames[1].load(), 0.98).rows(slice(None)), found.estimate
+    assert found.frames is not None
     for e in (0, 2):
-        image = frames[e].load()
-        assert links[e].moved is not None
-        value, usable, gain = hdr._resample(sensor.signal(image), sensor.usable(image, 0.98), links[e].moved)
-        variance = lines[1].variance(first)
-        variance = variance + lines[e].variance(first * links[e].ratio) / links[e].ratio ** 2 * gain[..., None]
-        variance = variance + bracket_pixels.edges(first) * links[e].misfit
-        z = ((value / links[e].ratio - mid) / np.sqrt(variance))[usable & clear & ~ghost]
-        assert np.all(np.abs(z.mean(axis=0)) < 0.1)
-        assert np.all(np.abs(MAD_TO_SIGMA * np.median(np.abs(z), axis=0) - 1.05) < 0.25)
-        assert 0.8 < z.std() < 1.3
+        link, (other, gain) = found.links[e], (found.frames[e].signals, found.frames[e].gain)
+        assert link.moved is not None
+        usable = other.usable & found.frames[1].signals.usable & ~ghost
+        z = []
+        for c, ratio in enumerate(link.ratio):
+            variance = found.noises[1].of(c, first[c])
+            variance += found.noises[e].of(c, first[c] * ratio) / ratio**2 * gain
+            variance += bracket_pixels.edges(first[c]) * link.misfit[c]
+            z.append(((other.rows(slice(None))[c] / ratio - own[c]) / np.sqrt(variance))[usable])
+        assert np.all(np.abs(np.mean(z, axis=1)) < 0.1)
+        assert np.all(np.abs(MAD_TO_SIGMA * np.median(np.abs(z), axis=1) - 1.05) < 0.25)
+        assert 0.8 < np.std(z) < 1.3

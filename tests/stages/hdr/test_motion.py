@@ -42,7 +42,7 @@ MOTIONS = {
 def test_motion_is_recovered_to_a_fiftieth_of_a_pixel(name):
     rng = np.random.default_rng(0)
     usable = np.ones((480, 600), bool)
-    found = motion.estimate(view(rng, np.eye(3)), view(rng, MOTIONS[name]), usable, usable)
+    found = motion.estimate(*(motion.View(view(rng, m), usable) for m in (np.eye(3), MOTIONS[name])))
     error = motion.apply(found.matrix, corners()) - motion.apply(MOTIONS[name], corners())
     assert np.abs(error).max() < 0.02
     assert found.sigma_px < 0.02
@@ -53,7 +53,7 @@ def test_parts_that_move_on_their_own_are_outvoted():
     a, b = view(rng, np.eye(3)), view(rng, MOTIONS["shift"])
     b[100:250, 100:300] = view(rng, MOTIONS["turn"])[120:270, 150:350]
     usable = np.ones((480, 600), bool)
-    found = motion.estimate(a, b, usable, usable)
+    found = motion.estimate(motion.View(a, usable), motion.View(b, usable))
     error = motion.apply(found.matrix, corners()) - motion.apply(MOTIONS["shift"], corners())
     assert np.abs(error).max() < 0.03
 
@@ -65,7 +65,7 @@ def test_noise_alone_shows_no_motion(ramp):
     x = np.exp(ramp * np.arange(400))[None] * np.ones((300, 1))
     a, b = ((x + rng.normal(0, 0.05, x.shape)).astype(np.float32) for _ in range(2))
     usable = np.ones(a.shape, bool)
-    found = motion.estimate(a, b, usable, usable)
+    found = motion.estimate(motion.View(a, usable), motion.View(b, usable))
     assert found.shift_px < max(0.05, 3 * found.sigma_px)
 
 
@@ -75,11 +75,11 @@ def test_repeated_detail_is_matched_in_the_nearest_place():
     stairs = np.exp(np.arange(600) // 30 / 3)[None] * np.ones((480, 1))
     a, b = (np.sqrt(rng.poisson(100 * stairs * e) / 100).astype(np.float32) for e in (1, 0.25))
     usable = np.ones(a.shape, bool)
-    found = motion.estimate(a, b, usable, usable)
+    found = motion.estimate(motion.View(a, usable), motion.View(b, usable))
     assert found.shift_px < max(0.05, 3 * found.sigma_px)
 
 
 def test_nothing_usable_means_no_motion():
     a = np.ones((300, 400), np.float32)
-    found = motion.estimate(a, a, np.zeros(a.shape, bool), np.zeros(a.shape, bool))
+    found = motion.estimate(*(motion.View(a, np.zeros(a.shape, bool)) for _ in range(2)))
     assert found.tiles == 0 and np.array_equal(found.matrix, np.eye(3))

@@ -4,8 +4,15 @@ import numpy as np
 import pytest
 
 from polcap.stages.hdr import noise
+from polcap.stages.hdr.frames import Planes, planar
 
 WELL, READ = 30000.0, 4.0
+
+
+def planes(picture, usable=None):
+    """(H, W, C) as the merge sees it."""
+    everywhere = np.ones(picture.shape[:2], bool)
+    return Planes(planar(picture.astype(np.float32)), everywhere if usable is None else usable)
 
 
 def picture(rng, exposure=1.0, texture=0.3, size=(512, 640)):
@@ -22,17 +29,17 @@ def found(samples, iso=100.0):
 
 def test_roughness_keeps_white_noise_and_is_blind_to_ramps():
     rng = np.random.default_rng(0)
-    white = rng.normal(size=(400, 400, 1))
+    white = rng.normal(size=(1, 400, 400))
     assert noise.roughness(white).var() == pytest.approx(1, rel=0.03)
     y, x = np.mgrid[:20, :30].astype(float)
-    np.testing.assert_allclose(noise.roughness((3 * x - 2 * y + x * y)[..., None]), 0, atol=1e-10)
+    np.testing.assert_allclose(noise.roughness((3 * x - 2 * y + x * y)[None]), 0, atol=1e-10)
 
 
 def test_pairs_find_both_gains_under_strong_texture():
     """Texture of 30 % at the pixel scale, two unlike exposures: gain to 5 %, read noise to 1 e⁻."""
     rng = np.random.default_rng(1)
     a, b = picture(rng), picture(rng, 0.25)
-    for samples in noise.paired(a, b, np.full(3, 0.25), np.ones(a.shape[:2], bool)):
+    for samples in noise.paired(planes(a), planes(b), np.full(3, 0.25)):
         well, read = found([samples])
         np.testing.assert_allclose(well, WELL, rtol=0.05)
         np.testing.assert_allclose(read, READ, atol=1.5)
@@ -42,7 +49,7 @@ def test_single_frame_finds_its_gain_in_flat_tiles():
     rng = np.random.default_rng(2)
     a = picture(rng, texture=0)
     a[:200] *= 1 + 0.3 * np.sin(np.arange(640) * 0.9)[None, :, None]  # two fifths are textured
-    well, _ = found([noise.alone(a.astype(np.float32), np.ones(a.shape[:2], bool))])
+    well, _ = found([noise.alone(planes(a))])
     np.testing.assert_allclose(well, WELL, rtol=0.1)
 
 
@@ -52,19 +59,19 @@ def test_unusable_pixels_take_no_part():
     usable = np.ones(a.shape[:2], bool)
     usable[:, 300:340] = False
     a[:, 300:340] += rng.normal(0, 1, (512, 40, 3)).astype(np.float32)
-    well, _ = found([noise.alone(a, usable)])
+    well, _ = found([noise.alone(planes(a, usable))])
     np.testing.assert_allclose(well, WELL, rtol=0.1)
 
 
 @pytest.mark.parametrize("iso", [100.0, 800.0, None])
 def test_too_few_tiles_mean_a_typical_sensor(iso):
-    line = noise.fit([noise.alone(np.zeros((40, 40, 3), np.float32), np.ones((40, 40), bool))], iso, 1e-9)
+    line = noise.fit([noise.alone(planes(np.zeros((40, 40, 3))))], iso, 1e-9)
     np.testing.assert_allclose(1 / line.slope, 20000 * 100 / (iso or 100), rtol=1e-5)
 
 
 def test_a_noiseless_picture_keeps_a_variance():
     flat = np.broadcast_to(np.linspace(0.1, 0.9, 400, dtype=np.float32)[:, None, None], (400, 400, 3))
-    line = noise.fit([noise.alone(flat, np.ones((400, 400), bool))], 100.0, 1e-9)
+    line = noise.fit([noise.alone(planes(flat))], 100.0, 1e-9)
     assert (line.variance(np.zeros((1, 3))) >= 1e-9).all()
 
 
@@ -78,20 +85,19 @@ def test_misfit_is_the_mean_square_of_a_small_shift():
         return (rng.poisson(light) / WELL).astype(np.float32)
 
     line = noise.Noise(np.full(3, 1 / WELL), np.full(3, 1e-10))
-    usable = np.ones((400, 500), bool)
-    shifted = noise.misfit(view(0), view(0.3), np.ones(3), (line, line), 1.0, usable)
+    shifted = noise.misfit(planes(view(0)), planes(view(0.3)), np.ones(3), (line, line), 1.0)
     # the sine's difference over its central difference: 2 sin²(0.6·0.15) / (sin²(0.6) / 2)
     np.testing.assert_allclose(shifted, 0.101, rtol=0.1)
-    assert np.all(noise.misfit(view(0), view(0), np.ones(3), (line, line), 1.0, usable) < 1e-3)
+    assert np.all(noise.misfit(planes(view(0)), planes(view(0)), np.ones(3), (line, line), 1.0) < 1e-3)
 
 
 def test_lines_are_learnt_once_per_iso():
     rng = np.random.default_rng(5)
     usable = np.ones((512, 640), bool)
     lines = noise.Lines()
-    lines.learn(100.0, noise.alone(picture(rng, texture=0), usable))
+    lines.learn(100.0, noise.alone(planes(picture(rng, texture=0), usable)))
     first = lines.line(100.0, 1e-12)
     lines.close()
-    lines.learn(100.0, noise.alone(np.zeros((512, 640, 3), np.float32), usable))
+    lines.learn(100.0, noise.alone(planes(np.zeros((512, 640, 3)), usable)))
     assert lines.knows(100.0) and not lines.knows(200.0)
     assert lines.line(100.0, 1e-12) is first

@@ -1,0 +1,186 @@
+"""In: the frames of a capture. Out: their signals, a plane per channel, block by block; decoded ahead of use."""
+
+import math
+from collections import OrderedDict, deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Floats, Frame, SensorImage
+from polcap.optics import sensor
+
+Bools = NDArray[np.bool_]
+
+_ROWS = 64  # a block of one channel of a 24 MP picture then fits a core's own cache
+_AHEAD = 2  # frames decoded beside the merge, each in a process of its own
+_PLANES_BYTES = 400_000_000  # of a shot's signals; those of larger shots are made anew for every pass
+_HELD_BYTES = 1_100_000_000  # of decoded frames; more are decoded again when they are needed again
+
+
+class Signals(Protocol):
+    """Linear signals of one frame, black = 0 and white = 1, and which of its pixels can be believed."""
+
+    @property
+    def usable(self) -> Bools:
+        """(H, W)."""
+        ...
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """C, H, W."""
+        ...
+
+    def rows(self, rows: slice) -> Floats:
+        """Some rows, (C, h, W) float32: a new array, or a view that must not be written to."""
+        ...
+
+
+@dataclass(frozen=True)
+class Planes:
+    """Signals that are there already."""
+
+    value: Floats  # (C, H, W) float32
+    usable: Bools
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        channels, height, width = self.value.shape
+        return channels, height, width
+
+    def rows(self, rows: slice) -> Floats:
+        return self.value[:, rows]
+
+
+@dataclass(frozen=True)
+class Quads:
+    """Signals of a mosaic binned 2×2, made of the counts when asked for: a third of the memory of `Planes`."""
+
+    image: SensorImage
+    usable: Bools
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        height, width = self.image.value.shape
+        return 3, height // 2, width // 2
+
+    def rows(self, rows: slice) -> Floats:
+        """As `optics.sensor.signal`, to the bit."""
+        image = self.image
+        assert image.cfa is not None
+        _, height, width = self.shape
+        start, stop, _ = rows.indices(height)
+        out = np.empty((3, stop - start, width), np.float32)
+        black = np.broadcast_to(image.black, (2, 2))
+        span = np.float32(image.white - float(image.black.mean()))
+        for color, plane in enumerate(out):
+            sites = [site for site in np.ndindex(2, 2) if image.cfa[site] == color]
+            for n, (i, j) in enumerate(sites):
+                site = image.value[2 * start + i : 2 * stop : 2, j : 2 * width : 2]
+                if n == 0:
+                    plane[:] = site
+                else:
+                    plane += site
+            if len(sites) > 1:
+                plane *= np.float32(1 / len(sites))
+            plane -= np.float32(black[image.cfa == color].mean())
+            plane /= span
+        return out
+
+
+def signals(image: SensorImage, clip: float, full: bool = False, frames: int = 1) -> Signals:
+    """Of a decoded frame; a mosaic is binned to half size, or interpolated if `full`.
+
+    `frames`: how many are held at a time.
+    """
+    usable = sensor.usable(image, clip, full)
+    if image.cfa is None or full:
+        return Planes(planar(sensor.signal(image, full)), usable)
+    quads = Quads(image, usable)
+    channels, height, width = quads.shape
+    if frames * 4 * channels * height * width > _PLANES_BYTES:
+        return quads
+    value = np.empty(quads.shape, np.float32)
+    for rows, _, _ in blocks(height):
+        value[:, rows] = quads.rows(rows)
+    return Planes(value, usable)
+
+
+def planar(picture: Floats) -> Floats:
+    """(H, W, C) → (C, H, W), contiguous."""
+    return np.ascontiguousarray(np.moveaxis(picture, -1, 0))
+
+
+def blocks(height: int, halo: int = 0, rows: int = _ROWS) -> Iterator[tuple[slice, slice, slice]]:
+    """Rows to read (with a halo, cut at the border), the wanted part of what was read, and where it goes."""
+    for top in range(0, height, rows):
+        bottom = min(top + rows, height)
+        start = max(top - halo, 0)
+        yield (
+            slice(start, min(bottom + halo, height)),
+            slice(top - start, bottom - start),
+            slice(top, bottom),
+        )
+
+
+class Reader:
+    """Decoded frames, the last few kept, the next few under way."""
+
+    def __init__(self, coming: Iterable[Frame]) -> None:
+        """`coming`: the frames in the order in which they will be asked for."""
+        self.lossy = False
+        self._coming = deque(coming)
+        self._held: OrderedDict[int, SensorImage] = OrderedDict()
+        self._pool = ThreadPoolExecutor(_AHEAD)
+        self._decoding: dict[int, Future[SensorImage]] = {}
+
+    def __call__(self, frame: Frame) -> SensorImage:
+        """Raises DecodeError."""
+        if id(frame) not in self._held:
+            under_way = self._decoding.pop(id(frame), None)
+            image = frame.load() if under_way is None else under_way.result()
+            room = max(1, _HELD_BYTES // max(image.value.nbytes, 1))
+            while len(self._held) >= room:
+                self._held.popitem(last=False)
+            self._held[id(frame)] = image
+            self._look_ahead(frame, room)
+        self._held.move_to_end(id(frame))
+        image = self._held[id(frame)]
+        self.lossy |= image.lossy
+        return image
+
+    def forget(self, frames: Iterable[Frame]) -> None:
+        """These are not needed any more."""
+        for frame in frames:
+            self._held.pop(id(frame), None)
+        self._look_ahead(None, len(self._held) + 2 * _AHEAD)
+
+    def close(self) -> None:
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def _look_ahead(self, now: Frame | None, room: int) -> None:
+        """Have the next frames decoded, as long as they and those held have room."""
+        self._coming = deque(frame for frame in self._coming if frame is not now)
+        while self._coming and len(self._decoding) < _AHEAD and len(self._held) + len(self._decoding) < room:
+            following = self._coming.popleft()
+            if id(following) not in self._held:
+                self._decoding[id(following)] = self._pool.submit(following.load)
+
+
+def tile_means(picture: Signals, side: int) -> Floats:
+    """Means over tiles of side × side px, (rows, columns, C) float32; what is left of a tile is dropped."""
+    channels, height, width = picture.shape
+    down, across = height // side, width // side
+    out = np.zeros((down, across, channels), np.float32)
+    per_block = math.ceil(_ROWS / side)
+    for top in range(0, down, per_block):
+        bottom = min(top + per_block, down)
+        part = picture.rows(slice(top * side, bottom * side))
+        for c in range(channels):
+            whole = part[c, :, : across * side]
+            out[top:bottom, :, c] = cv2.resize(whole, (across, bottom - top), interpolation=cv2.INTER_AREA)
+    return out
