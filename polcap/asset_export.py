@@ -11,11 +11,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
-from polcap.config import Config
+from polcap.config import restored
 from polcap.errors import SettingError
-from polcap.formats import atomic, encoders, exr_layers, gltf, materialx, obj, ocio, provenance, texture_set, usd
+from polcap.formats import (
+    atomic,
+    encoders,
+    exr_layers,
+    file_name,
+    gltf,
+    materialx,
+    obj,
+    ocio,
+    provenance,
+    texture_set,
+    usd,
+)
 from polcap.formats import maps as maps_folder
 from polcap.formats.encoders import Kind
 from polcap.formats.presets import PRESETS, Format, Preset
@@ -49,14 +59,14 @@ def export(out: Path, about: Mapping[str, Any], wanted: Wanted) -> list[Path]:
     preset = _preset(wanted)
     if "usd" in preset.formats:
         usd.require()
-    config = msgspec.convert(about["settings"], Config)
+    config = restored(about, out / "report.json")
     stored = maps_folder.read(out / "maps")
     mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, config.surface)
     job = _Job(
         folder=out / "asset" / (wanted.preset or ""),
         maps=out / "maps",
         asset=asset.build(stored.maps, mesh, config.asset),
-        name=str(about["capture"]["name"]),
+        name=file_name.safe(str(about["capture"].get("name"))),  # whatever the report says, files stay in the folder
         preset=preset,
         images=wanted.images or preset.images,
         color=wanted.color,

@@ -6,6 +6,7 @@ to go on), 1 a bug. Heavy imports happen inside the commands, so that `--help` a
 """
 
 import functools
+import math
 import os
 import sys
 from collections.abc import Callable
@@ -37,6 +38,8 @@ def main() -> None:
     arguments = sys.argv[1:]
     if "--debug" in arguments:  # wherever it stands
         arguments = ["--debug", *(argument for argument in arguments if argument != "--debug")]
+    for stream in (sys.stdout, sys.stderr):
+        stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]  # names of files are bytes
     app(arguments)
 
 
@@ -118,7 +121,7 @@ def process(
             _print_plan(found, pipeline.plan(found, supplied(), chosen, target, force), json)
             return
         known = supplied()
-        print(captures.table(found), file=sys.stderr)
+        terminal.tell(captures.table(found))
         with terminal.progress(len(STAGES) + 1) as bar:
             about = pipeline.process(found, known, chosen, target, until, force, bar.stage, bar.frame)
         if about is None:
@@ -126,7 +129,7 @@ def process(
             terminal.say({"until": until, "work": work} if json else work)
             return
         terminal.say(about if json else str(target / "asset" / f"{found.name}.glb"))
-        print(f"verdict {about['verdict']}; {target / 'report.html'}", file=sys.stderr)
+        terminal.tell(f"verdict {about['verdict']}; {target / 'report.html'}")
         terminal.tell_gates(about)
 
     if watch:
@@ -144,9 +147,9 @@ def _whenever_settled(capture: Path, target: Path, once: Callable[[], None]) -> 
     for _ in arrivals.settled(capture, target):
         try:
             once()
-        except (InputError, GateError) as error:
-            print(f"polcap: {terminal.line(error)}", file=sys.stderr)
-        print(f"watching {capture}; Ctrl-C ends", file=sys.stderr, flush=True)
+        except (InputError, GateError, OSError) as error:  # a frame may have gone between two looks
+            terminal.tell(f"polcap: {terminal.line(error)}")
+        terminal.tell(f"watching {capture}; Ctrl-C ends")
 
 
 @app.command()
@@ -201,7 +204,7 @@ def batch(
         command = job_files.command(root, context.params)
         job = job_files.Job(command, root.resolve(), jobs or min(len(found), 1000), memory_gb=memory or 4.0)
         file = job_files.write(write_jobs, job, (out or root).resolve() / unit.FOLDER)
-        print(f"start it: {job_files.SUBMIT[write_jobs].format(file=file)}", file=sys.stderr)
+        terminal.tell(f"start it: {job_files.SUBMIT[write_jobs].format(file=file)}")
         terminal.say({"file": str(file), "shards": job.shards} if json else str(file))
         return
     order = unit.Order(
@@ -216,7 +219,7 @@ def batch(
     )
     part = shards.from_environment(os.environ) if shard is None else shards.parse(shard)
     how = batches.How(part, scheduler, workers, retries, keep_going)
-    summary = batches.run(root, out, order, how, lambda line: print(line, file=sys.stderr, flush=True))
+    summary = batches.run(root, out, order, how, terminal.tell)
     terminal.say(summary if json else str((out or root) / unit.FOLDER / "summary.html"))
     if code := batches.exit_code(summary):
         raise typer.Exit(code)
@@ -374,12 +377,22 @@ def check(
 
 @app.command()
 @terminal.reported
-def doctor(context: typer.Context, json: Json = False) -> None:
-    """What works on this machine, what does not, and the remedy. Asks every serial port who answers."""
+def doctor(
+    context: typer.Context,
+    ask_ports: Annotated[
+        bool | None,
+        typer.Option("--ports/--no-ports", help="Write to the serial ports to learn who answers; else you are asked."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """What works on this machine, what does not, and the remedy."""
     from polcap import doctor as doctors
     from polcap.rig import camera_gphoto2, rotator, serial_port
 
-    found = doctors.examine(doctors.Rig(serial_port.ports, rotator.probe, camera_gphoto2.connected), Path.cwd())
+    rig = doctors.Rig(
+        serial_port.ports, functools.partial(_may_write, ask_ports), rotator.probe, camera_gphoto2.connected
+    )
+    found = doctors.examine(rig, Path.cwd())
     terminal.say(doctors.shown(found) if json else doctors.table(found))
     if any(one.state == "fault" for one in found):
         raise typer.Exit(SettingError.exit_code)
@@ -490,9 +503,7 @@ def capture(
         planned = plan.dry_run(wanted)
         terminal.say(planned if json else plan.table(planned))
         return
-    done = sequence.shoot(
-        folder, wanted, resume=resume, tries=tries, tell=lambda line: print(line, file=sys.stderr, flush=True)
-    )
+    done = sequence.shoot(folder, wanted, resume=resume, tries=tries, tell=terminal.tell)
     verdict = None if no_check else _verdict(folder)
     terminal.say(done | {"check": verdict} if json else str(folder))
     if verdict and verdict["verdict"] != "keep":
@@ -510,9 +521,9 @@ def _verdict(folder: Path) -> dict[str, Any] | None:
         networks = pipeline.load_network(None, None, "cpu", 0), pipeline.load_mask_network()
         verdict = checks.inspect(captures.read(folder), networks[0], Config(), networks[1])
     except InputError as error:
-        print(f"polcap: not judged: {terminal.line(error)}", file=sys.stderr)
+        terminal.tell(f"polcap: not judged: {terminal.line(error)}")
         return None
-    print(checks.table(verdict), file=sys.stderr)
+    terminal.tell(checks.table(verdict))
     return checks.shown(verdict)
 
 
@@ -574,6 +585,13 @@ def _extra(module: str) -> Any:
         raise SettingError(f"{error.name} is not installed; pip install 'polcap[train]'") from error
 
 
+def _may_write(said: bool | None, ports: list[str]) -> bool:
+    """Whether serial ports may be written to: a command for a rotator may mean something else to another device."""
+    if said is not None or not sys.stdin.isatty():
+        return bool(said)
+    return typer.confirm(f"write to {', '.join(ports)} to learn who answers?", err=True)
+
+
 def _use_threads(count: int) -> None:
     """Set the number of threads before any numerical library starts its own."""
     if count:
@@ -587,8 +605,12 @@ def _use_threads(count: int) -> None:
 def _limit_memory(gigabytes: float) -> None:
     """Beyond this much of its own memory (mapped files apart) the process fails at once, and says so."""
     if gigabytes:
-        import resource
-
+        if not math.isfinite(gigabytes):
+            raise SettingError(f"--memory {gigabytes}: give a number of GB, or leave it out")
+        try:
+            import resource
+        except ImportError as error:
+            raise SettingError(f"--memory {gigabytes:g}: this system knows no such limit; leave it out") from error
         size = int(gigabytes * 1e9)
         resource.setrlimit(resource.RLIMIT_DATA, (size, resource.getrlimit(resource.RLIMIT_DATA)[1]))
 
@@ -599,9 +621,12 @@ def _angles(text: str | None) -> tuple[float, ...] | None:
 
 def _numbers(flag: str, text: str) -> tuple[float, ...]:
     try:
-        return tuple(float(part) for part in text.split(","))
+        found = tuple(float(part) for part in text.split(","))
     except ValueError:
         raise SettingError(f"{flag} {text}: not numbers separated by commas") from None
+    if not all(map(math.isfinite, found)):
+        raise SettingError(f"{flag} {text}: every number has to be finite")
+    return found
 
 
 def _chart(text: str | None, no_chart: bool) -> "ChartRequest":

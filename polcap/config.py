@@ -6,14 +6,15 @@ names it, its value and its limit. The settings themselves stand in the stages t
 
 import difflib
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 from msgspec import Meta
 
-from polcap.errors import SettingError
+from polcap.errors import SettingError, StorageError
+from polcap.formats import text_file
 from polcap.stages.align import Settings as Align
 from polcap.stages.asset import Settings as Asset
 from polcap.stages.hdr import Settings as Hdr
@@ -134,6 +135,7 @@ def load(file: Path | None = None, assignments: Sequence[str] = ()) -> Config:
         if not equals or not dot:
             raise SettingError(f"--set {assignment}: not of the form stage.name=value, as in hdr.clip=0.95")
         given.setdefault(section, {})[name] = _parse(text.strip())
+    _check_finite(given)
     known = {setting.key: setting for setting in settings()}
     for section, values in given.items():
         for name, value in values.items():
@@ -144,6 +146,20 @@ def load(file: Path | None = None, assignments: Sequence[str] = ()) -> Config:
         raise _explain(error, given, known) from error
 
 
+def restored(about: Mapping[str, Any], file: Path) -> Config:
+    """The settings that a file of an earlier run tells.
+
+    Raises
+    ------
+    StorageError
+        They are those of another polcap, or no settings.
+    """
+    try:
+        return msgspec.convert(about["settings"], Config)
+    except (msgspec.ValidationError, KeyError) as error:
+        raise StorageError(f"{file}: its settings are not this polcap's ({error}); run `polcap process`") from error
+
+
 def fill(kind: type[S], given: dict[str, Any], assignments: Sequence[str]) -> S:
     """A single struct from given values and name=value assignments, as strict as `load`."""
     for assignment in assignments:
@@ -151,6 +167,7 @@ def fill(kind: type[S], given: dict[str, Any], assignments: Sequence[str]) -> S:
         if not equals or name not in kind.__struct_fields__:
             raise SettingError(f"--set {assignment}: give one of {', '.join(kind.__struct_fields__)} as name=value")
         given = {**given, name: _parse(text.strip())}
+    _check_finite(given)
     try:
         return msgspec.convert(given, kind)
     except msgspec.ValidationError as error:
@@ -177,10 +194,10 @@ def _limits(meta: Meta) -> str:
 
 def _read(file: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
+        return text_file.read_toml(file)
     except OSError as error:
         raise SettingError(f"--config {file}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise SettingError(f"--config {file} is not TOML: {error}") from error
 
 
@@ -188,8 +205,16 @@ def _parse(text: str) -> Any:
     """A TOML value; a bare word is a string."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         return text
+
+
+def _check_finite(given: dict[str, Any]) -> None:
+    """No limit of a setting stops a NaN."""
+    try:
+        text_file.check_finite(given)
+    except ValueError as error:
+        raise SettingError(f"{error}; give a number") from error
 
 
 def _check_known(key: str, value: Any, known: dict[str, Setting]) -> None:

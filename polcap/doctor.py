@@ -41,7 +41,8 @@ class Rig:
     """How to ask for devices; each may raise a PolcapError."""
 
     ports: Callable[[], list[tuple[str, str]]]  # device and description of every serial port
-    probe: Callable[[str], str | None]  # what answers there
+    may_write: Callable[[list[str]], bool]  # whether these ports may be asked who answers
+    probe: Callable[[str], str | None]  # what answers there; writes to the port
     cameras: Callable[[], list[tuple[str, str]]]  # model and port
 
 
@@ -155,7 +156,11 @@ def _ports(rig: Rig) -> Iterator[Finding]:
     if not ports:
         remedy = "plug the rotator in; under Linux its cable appears as /dev/ttyUSB0 or /dev/ttyACM0"
         yield Finding("serial ports", "warning", "none", remedy)
+    allowed = bool(ports) and rig.may_write([device for device, _ in ports])
     for device, description in ports:
+        if not allowed:
+            yield Finding(device, "ok", f"{description}: not asked", "`polcap doctor --ports` writes to it to learn")
+            continue
         try:
             answer = rig.probe(device)
         except PolcapError as error:

@@ -4,6 +4,7 @@ The stages and their order stand in `path.py`; this is what surrounds them: lock
 """
 
 import json
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -15,15 +16,15 @@ import msgspec
 
 from polcap import asset_export, pictures, report
 from polcap.asset_export import Wanted
-from polcap.config import Config
+from polcap.config import Config, restored
 from polcap.errors import ModelError, SettingError, StorageError
-from polcap.formats import animation, atomic, calib, onnx, png, provenance
+from polcap.formats import animation, atomic, calib, layouts, onnx, png, provenance, text_file
 from polcap.formats import maps as maps_folder
 from polcap.images import Capture, Frame, Network, SensorImage
 from polcap.path import STAGES, Results, UserInput, path
 from polcap.pictures import moving
 from polcap.stages.mask import mask_channels
-from polcap.store import Archive, Progress, Store, contents, silent
+from polcap.store import Archive, Progress, Store, contents, seal, silent
 
 
 def process(
@@ -94,12 +95,14 @@ def reopen(out: Path) -> tuple[Results, dict[str, Any]]:
     StorageError
         `out` holds no stage cache.
     """
+    file = out / "work" / "run.json"
     try:
-        about = json.loads((out / "work" / "run.json").read_text(encoding="utf-8"))
-        config = msgspec.convert(about["settings"], Config)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        about = text_file.read_json(file)
+    except (OSError, ValueError) as error:
         raise StorageError(f"{out} holds no stage cache of this polcap; run `polcap process` again") from error
-    return path(None, UserInput(), config, Archive(out)), about
+    if not isinstance(about, dict) or about.get("digest") != seal(about):
+        raise StorageError(f"{file} is damaged, or of another polcap; run `polcap process` again")
+    return path(None, UserInput(), restored(about, file), Archive(out)), about
 
 
 def show(out: Path, stages: Sequence[str]) -> list[Path]:
@@ -133,11 +136,11 @@ def judge_again(out: Path) -> dict[str, Any]:
     """report.json and report.html anew from the stage cache."""
     results, about = reopen(out)
     with Store(out).lock():
-        config = msgspec.convert(about["settings"], Config)
+        config = restored(about, out / "work" / "run.json")
         fixed = {name: about[name] for name in ("model", "versions")}
         again = report.document(about["capture"], results, config, None, timings(out)) | fixed
         if (out / "report.json").exists():
-            again["keys"] = report.read(out)["keys"]
+            again["keys"] = report.read(out).get("keys", {})
         report.write(out, again, results)
     return again
 
@@ -185,9 +188,15 @@ def sweep(out: Path) -> None:
 
 
 def _check_separate(out: Path, photographs: Path) -> None:
-    """The result never lands among the photographs."""
-    if out.resolve() == photographs.resolve():
+    """The result never lands among the photographs, nor where a later run would look for some."""
+    here, there = Path(os.path.realpath(out)), Path(os.path.realpath(photographs))
+    if here == there:
         raise SettingError(f"--out {out} is the capture itself; choose a folder of its own")
+    inside = here.relative_to(there).parts if here.is_relative_to(there) else ()
+    if any(layouts.is_angle_folder(name) for name in inside):
+        raise SettingError(
+            f"--out {out} lies in a folder of the capture's shots; choose {photographs / layouts.OUTPUT}"
+        )
 
 
 def _counted(capture: Capture, frame_read: Callable[[int, int], None] | None) -> Capture:
@@ -226,5 +235,6 @@ def _remember_run(out: Path, capture: Capture, config: Config, network: Network 
         "model": model,
         "versions": provenance.versions(),
     }
+    text = json.dumps({**about, "digest": seal(about)}, indent=1)
     with atomic.path(out / "work" / "run.json") as temporary:
-        temporary.write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        temporary.write_text(text + "\n", encoding="utf-8")

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
 
+_LONGEST = 600  # characters of a message
 _QUIET_S = 5.0  # between two lines about frames, where there is no terminal to write over
 OUT_OF_MEMORY = (  # as OpenCV, threads, the loader of libraries and the system say it
     "Insufficient memory", "can't start new thread", "failed to map segment", "Cannot allocate memory",
@@ -42,7 +43,7 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
         except PolcapError as error:
             if context.obj:
                 raise
-            print(f"polcap: error: {line(error)}", file=sys.stderr)
+            tell(f"polcap: error: {line(error)}")
             code = error.exit_code
             tell_program(kwargs, error, code)
         except (typer.Exit, typer.Abort):
@@ -51,12 +52,17 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
             if context.obj:
                 raise
             if isinstance(error, MemoryError) or any(word in str(error) for word in OUT_OF_MEMORY):
-                print("polcap: error: out of memory; raise --memory or take a larger machine", file=sys.stderr)
+                tell("polcap: error: out of memory; raise --memory or take a larger machine")
+                code = SettingError.exit_code
+                tell_program(kwargs, error, code)
+            elif isinstance(error, OSError):  # what the system refuses is not of our making
+                name = f"{error.filename}: " if error.filename else ""
+                tell(f"polcap: error: {name}{error.strerror or line(error)}; check the path and its permissions")
                 code = SettingError.exit_code
                 tell_program(kwargs, error, code)
             else:
                 kind = type(error).__name__
-                print(f"polcap: bug: {kind}: {line(error)}; run with --debug and report it", file=sys.stderr)
+                tell(f"polcap: bug: {kind}: {line(error)}; run with --debug and report it")
                 code = 1
                 tell_program(kwargs, error, code)
         else:
@@ -73,17 +79,28 @@ def tell_program(options: dict[str, Any], error: BaseException, code: int) -> No
 
 
 def line(error: BaseException) -> str:
-    """What an error says, on one line."""
-    return " ".join(str(error).split())
+    """What an error says, on one line of bearable length."""
+    text = " ".join(str(error).split())
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 100]} … {text[-100:]}"
+
+
+def printable(text: str) -> str:
+    """Without what a terminal takes for a command: names of files and cameras may hold anything."""
+    return "".join(c if c.isprintable() or c in "\n\t" or "\ud800" <= c <= "\udfff" else "\ufffd" for c in text)
+
+
+def tell(text: str) -> None:
+    """Progress and messages, on stderr."""
+    print(printable(text), file=sys.stderr, flush=True)
 
 
 def say(data: Any) -> None:
-    """Data on stdout: text as it is, all else as one JSON document."""
+    """Data on stdout: printable text, all else as one JSON document."""
     if not isinstance(data, str):
         import json
 
         data = json.dumps(data, ensure_ascii=False, indent=1)
-    print(data, flush=True)
+    print(printable(data), flush=True)
 
 
 def preview(drawn: "list[Path]") -> None:
@@ -114,7 +131,7 @@ def tell_gates(about: dict[str, Any]) -> None:
         if gate["state"] in ("fail", "warn"):
             word = "gate failed" if gate["state"] == "fail" else "warning"
             value, limit = gate["value"], gate["limit"]
-            print(f"polcap: {word}: {gate['name']} {value} (limit {limit}): {gate['says']}", file=sys.stderr)
+            tell(f"polcap: {word}: {gate['name']} {value} (limit {limit}): {gate['says']}")
             failed += gate["state"] == "fail"
     if failed:
         raise GateError(f"{failed} of {len(about['gates'])} gates failed; the asset was written, see report.html")

@@ -46,7 +46,7 @@ def test_wrong_assignment_is_named_with_value_and_limit(assignment: str, words: 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("infer.turns=3", "not one of 1, 2, 4, 8"),
+        ("infer.symmetries=3", "not one of 1, 2, 4, 8"),
         ("[hdr]\nclip = 2", "hdr.clip = 2"),
         ("clip = 0.9", "not a section"),
         ("[hdr", "not TOML"),

@@ -17,7 +17,7 @@ def raising(error: Exception) -> NoReturn:
     raise error
 
 
-NO_RIG = Rig(ports=list, probe=lambda url: None, cameras=list)
+NO_RIG = Rig(ports=list, may_write=lambda ports: True, probe=lambda url: None, cameras=list)
 
 
 def named(found: tuple[Finding, ...]) -> dict[str, Finding]:
@@ -42,18 +42,28 @@ def test_ports_and_cameras_tell_who_answers(tmp_path: Path) -> None:
     def ports() -> list[tuple[str, str]]:
         return [(device, "FT230X") for device in (*answers, "/dev/ttyACM0")]
 
-    found = named(doctor.examine(Rig(ports, probe, lambda: [("Nikon Z6", "usb:001,004")]), tmp_path))
+    found = named(
+        doctor.examine(Rig(ports, lambda ports: True, probe, lambda: [("Nikon Z6", "usb:001,004")]), tmp_path)
+    )
     assert found["/dev/ttyUSB0"] == Finding("/dev/ttyUSB0", "ok", "FT230X: Elliptec ELL14")
     assert found["/dev/ttyUSB1"].state == found["/dev/ttyACM0"].state == "warning"
     assert "dialout" in found["/dev/ttyACM0"].remedy
     assert found["camera"].says == "Nikon Z6 at usb:001,004"
 
 
+def test_no_port_is_written_to_without_leave(tmp_path: Path) -> None:
+    rig = Rig(lambda: [("/dev/ttyS0", "a CNC mill")], lambda ports: False, lambda url: pytest.fail("written"), list)
+    found = named(doctor.examine(rig, tmp_path))["/dev/ttyS0"]
+    assert found == Finding(
+        "/dev/ttyS0", "ok", "a CNC mill: not asked", "`polcap doctor --ports` writes to it to learn"
+    )
+
+
 def test_rig_that_is_not_there_is_no_fault(tmp_path: Path) -> None:
     def cameras() -> list[tuple[str, str]]:
         raise SettingError("gphoto2 is not installed; pip install 'polcap[rig]'")
 
-    found = named(doctor.examine(Rig(list, lambda url: None, cameras), tmp_path))
+    found = named(doctor.examine(Rig(list, lambda ports: True, lambda url: None, cameras), tmp_path))
     assert found["serial ports"].state == found["cameras"].state == "warning"
     assert found["cameras"].remedy == "pip install 'polcap[rig]'"
 

@@ -93,7 +93,9 @@ def folder(final: str | Path) -> Iterator[Path]:
 
 def sync(target: Path) -> None:
     """Bring a file's bytes, or a folder's names, to the disk."""
-    handle = os.open(target, os.O_RDONLY)
+    if os.name == "nt" and target.is_dir():  # knows no such call
+        return
+    handle = os.open(target, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:

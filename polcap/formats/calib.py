@@ -1,6 +1,5 @@
 """In: calibration files (TOML). Out: a chart's reference colours, colour profiles of earlier captures."""
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,7 @@ import numpy as np
 import tomli_w
 
 from polcap.errors import ChartError, StorageError
-from polcap.formats import atomic
+from polcap.formats import atomic, text_file
 from polcap.images import ChartReference, ColorCalibration, Floats
 
 _SOURCES = ("chart", "corners", "profile", "camera", "none")
@@ -110,6 +109,9 @@ def read_profile(path: Path) -> ColorCalibration:
     """
     profile = _read(path, _Profile)
     matrix = np.array(profile.matrix)
+    measures = [*profile.falloff, profile.glare, profile.metres_per_px or 0.0]
+    if not np.isfinite(measures).all():
+        raise ChartError(f"{path}: falloff, glare or metres_per_px is not a finite number; write the profile again")
     if not np.isfinite(matrix).all() or np.linalg.matrix_rank(matrix, rtol=1e-6) < 3:
         raise ChartError(f"{path}: its colour matrix cannot be inverted; write the profile again")
     if profile.source not in _SOURCES:
@@ -130,10 +132,10 @@ def read_profile(path: Path) -> ColorCalibration:
 def _read(path: Path, form: Any) -> Any:
     """A TOML file as `form`; ChartError says what is wrong with it."""
     try:
-        return msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), form)
+        return msgspec.convert(text_file.read_toml(path, finite=False), form)
     except OSError as error:
         raise ChartError(f"{path}: cannot be read ({error.strerror}); give a profile's path") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, msgspec.ValidationError) as error:
+    except ValueError as error:
         raise ChartError(f"{path}: not a polcap colour file ({error})") from error
 
 

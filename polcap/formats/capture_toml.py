@@ -8,7 +8,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from polcap.errors import CaptureError
-from polcap.formats import document
+from polcap.formats import text_file
 from polcap.images import Role
 
 NAME = "capture.toml"
@@ -52,7 +52,7 @@ def load(folder: Path) -> CaptureFile:
     if not os.path.lexists(path):
         return CaptureFile()
     try:
-        stated = msgspec.convert(document.read_toml(path), CaptureFile)
+        stated = msgspec.convert(text_file.read_toml(path), CaptureFile)
     except ValueError as error:  # of TOML, of UTF-8, of msgspec
         raise CaptureError(f"{path}: {error}; see the reference page on captures") from None
     except OSError as error:

@@ -7,10 +7,11 @@ import numpy as np
 import OpenImageIO as oiio
 
 from polcap.errors import DecodeError, StorageError
-from polcap.formats import atomic
+from polcap.formats import atomic, memory_file, photo_bytes, plausible, worker
 from polcap.images import Floats
 
 Attribute = str | int | float | tuple[float, ...]
+_MAGIC = b"\x76\x2f\x31\x01"
 
 
 def write(
@@ -64,22 +65,34 @@ def read(path: Path) -> tuple[dict[str, Floats], dict[str, object]]:
     Raises
     ------
     DecodeError
-        The file is missing, cut short or no OpenEXR file.
+        The file is missing, cut short, no OpenEXR file or larger than any picture.
     """
-    source = oiio.ImageInput.open(str(path))
-    if source is None:
-        raise DecodeError(f"cannot read {path}: {_line(oiio.geterror())}; check the path")
-    try:
-        spec = source.spec()
-        pixels = source.read_image(oiio.FLOAT)
-        if pixels is None:
-            raise DecodeError(f"{path} is cut short: {_line(source.geterror())}; write it again")
-        names = tuple(spec.channelnames)
-        attributes = {item.name: item.value for item in spec.extra_attribs}
-    finally:
-        source.close()
+    meta, channels = worker.call(decode, path)
+    return {name: channels[name] for name in meta["names"]}, meta["attributes"]
+
+
+def decode(path: str) -> worker.Answer:
+    """The same, in the worker."""
+    data = photo_bytes.load(path)
+    if data[:4] != _MAGIC:
+        raise DecodeError(f"cannot read {path}: it is no OpenEXR file; write it again")
+    with memory_file.named(data) as name:
+        source = oiio.ImageInput.open(name)
+        if source is None:
+            raise DecodeError(f"cannot read {path}: {_line(oiio.geterror())}; write it again")
+        try:
+            spec = source.spec()
+            plausible.check_size(path, spec.width, spec.height * max(spec.nchannels // 4, 1))
+            pixels = source.read_image(oiio.FLOAT)
+            if pixels is None:
+                raise DecodeError(f"{path} is cut short: {_line(source.geterror())}; write it again")
+            names = tuple(spec.channelnames)
+            attributes = {item.name: item.value for item in spec.extra_attribs}
+        finally:
+            source.close()
     pixels = np.asarray(pixels, dtype=np.float32).reshape(spec.height, spec.width, len(names))
-    return {name: pixels[..., k] for k, name in enumerate(names)}, attributes
+    plain = {key: value for key, value in attributes.items() if isinstance(value, (str, int, float))}
+    return {"names": names, "attributes": plain}, {name: pixels[..., k] for k, name in enumerate(names)}
 
 
 def _line(message: str) -> str:

@@ -148,6 +148,11 @@ def _folders(folder: Path, sub_folders: dict[float, Path], angles_deg: Sequence[
     return Plan("folders", _select(folder, groups, angles_deg), notes=tuple(notes))
 
 
+def is_angle_folder(name: str) -> bool:
+    """Whether a folder of this name inside a capture holds the shots of one angle."""
+    return _POL_FOLDER.fullmatch(name) is not None
+
+
 def _pol_folders(folder: Path) -> dict[float, Path]:
     found: dict[float, Path] = {}
     for path in _children(folder):
@@ -284,8 +289,6 @@ def _list(folder: Path) -> _Listing:
 def _probe(path: Path) -> Probe:
     """As `probe.read`; bytes that nothing can read are an error."""
     found = probe.read(path)
-    if found.kind == "unknown" and not path.stat().st_size:
-        raise CaptureError(f"{path}: is empty; copy it from the card again, or remove it")
     if found.kind == "unknown":
         raise CaptureError(f"{path}: no picture, no RAW that LibRaw knows and no text; restore it, or remove it")
     return found

@@ -4,13 +4,15 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
+from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from polcap.errors import DecodeError
-from polcap.formats import atomic, exr, png
+from polcap.formats import atomic, exr, png, text_file
 from polcap.images import Cues, Floats, Mesh, StokesImage, SurfaceMaps, View
 from polcap.optics import color
 
@@ -24,6 +26,32 @@ CONVENTIONS = {
     "color": "linear Rec.709, D65; PNG of colours is sRGB-encoded",
     "outside": "values outside mask.png mean nothing; they are 0, and (0, 0, 1) in normal.png",
 }
+
+
+_Side = Annotated[int, Meta(ge=1, le=1 << 16)]
+_Positive = Annotated[float, Meta(gt=0, le=1e9)]
+_Place = Annotated[float, Meta(ge=-1e9, le=1e9)]
+
+
+class _Camera(Struct, frozen=True):
+    focal_px: _Positive
+    center_px: tuple[_Place, _Place]
+    focal_known: bool
+
+
+class _Depth(Struct, frozen=True):
+    unit: Literal["m", "relative"]
+
+
+class _Description(Struct, frozen=True):
+    """What is read back of maps.json."""
+
+    crop: tuple[_Place, _Place, _Place, _Place]
+    size: tuple[_Side, _Side]
+    scale: _Positive
+    camera: _Camera
+    depth: _Depth
+    estimator: str
 
 
 @dataclass(frozen=True)
@@ -81,24 +109,14 @@ def read(folder: Path) -> Stored:
     """
     folder = Path(folder)
     try:
-        said = json.loads((folder / "maps.json").read_text("utf-8"))
-        width, height = said["size"]
-        camera = said["camera"]
-        x0, y0 = (value / said["scale"] for value in said["crop"][:2])
-        center = (float(camera["center_px"][0]), float(camera["center_px"][1]))
-        view = View(camera["focal_px"], center, said["scale"], (x0, y0), camera["focal_known"])
-        metric, estimator = said["depth"]["unit"] == "m", str(said["estimator"])
+        said = msgspec.convert(text_file.read_json(folder / "maps.json"), _Description)
     except OSError as error:
         raise DecodeError(f"{folder} holds no maps.json ({error.strerror}); give a result's folder") from error
-    except (ValueError, KeyError, TypeError, IndexError) as error:
+    except ValueError as error:
         raise DecodeError(f"{folder / 'maps.json'} is not as polcap wrote it ({error}); process again") from error
-
-    def channels(name: str, letters: str) -> Floats:
-        found, _ = exr.read(folder / f"{name}.exr")
-        planes = [found[letter] for letter in letters if letter in found]
-        if len(planes) != len(letters) or planes[0].shape != (height, width):
-            raise DecodeError(f"{folder / name}.exr is not {width} × {height} of {letters}; process again")
-        return np.stack(planes, axis=-1) if len(letters) > 1 else planes[0]
+    width, height = said.size
+    origin = (said.crop[0] / said.scale, said.crop[1] / said.scale)
+    view = View(said.camera.focal_px, said.camera.center_px, said.scale, origin, said.camera.focal_known)
 
     mask = png.read(folder / "mask.png")
     if mask.shape != (height, width):
@@ -106,18 +124,18 @@ def read(folder: Path) -> Stored:
     inside = mask > 127
     return Stored(
         maps=SurfaceMaps(
-            normal=channels("normal", "RGB"),
-            diffuse=channels("diffuse", "RGB"),
-            specular=channels("specular", "RGB"),
-            roughness=channels("roughness", "Y"),
+            normal=_read_map(folder / "normal.exr", "RGB", said.size),
+            diffuse=_read_map(folder / "diffuse.exr", "RGB", said.size),
+            specular=_read_map(folder / "specular.exr", "RGB", said.size),
+            roughness=_read_map(folder / "roughness.exr", "Y", said.size),
             depth_prior=None,
-            confidence=channels("confidence", "Y"),
+            confidence=_read_map(folder / "confidence.exr", "Y", said.size),
             mask=inside,
             view=view,
-            estimator=estimator,
+            estimator=said.estimator,
         ),
-        depth=np.where(inside, channels("depth", "Z"), np.nan).astype(np.float32),
-        metric=metric,
+        depth=np.where(inside, _read_map(folder / "depth.exr", "Z", said.size), np.nan).astype(np.float32),
+        metric=said.depth.unit == "m",
     )
 
 
@@ -130,14 +148,27 @@ def note_export(folder: Path, where: str, said: Mapping[str, Any]) -> None:
         The file cannot be written.
     """
     file = folder / "maps.json"
-    known = json.loads(file.read_text("utf-8"))
-    known["exports"] = dict(sorted({**known.get("exports", {}), where: said}.items()))
+    known = text_file.read_json(file)
+    earlier = known.get("exports")
+    known["exports"] = dict(sorted({**(earlier if isinstance(earlier, dict) else {}), where: said}.items()))
     _write_json(file, known)
 
 
 def _write_json(file: Path, content: Mapping[str, Any]) -> None:
     with atomic.path(file) as temporary:
         temporary.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", "utf-8")
+
+
+def _read_map(file: Path, letters: str, size: tuple[int, int]) -> Floats:
+    """The channels `letters` of an EXR, (H, W, C), or (H, W) of one."""
+    found, _ = exr.read(file)
+    planes = [found[letter] for letter in letters if letter in found]
+    if len(planes) != len(letters) or planes[0].shape != size[::-1]:
+        raise DecodeError(f"{file} is not {size[0]} × {size[1]} of {letters}; process again")
+    whole = np.stack(planes, axis=-1) if len(letters) > 1 else planes[0]
+    if not np.isfinite(whole).all():
+        raise DecodeError(f"{file}: {(~np.isfinite(whole)).sum()} values are not finite numbers; process again")
+    return whole
 
 
 def _description(maps: SurfaceMaps, metric: bool, near: float, far: float) -> dict[str, Any]:

@@ -8,16 +8,23 @@ A model says in its metadata what it eats and under which terms it may be used:
     size_multiple  height and width must be multiples of this
     licence        SPDX name of the weights' licence
 
-A file that does not say so is refused. The only module that imports onnxruntime.
+A file that does not say so is refused. A model that polcap does not ship is first loaded and run on a small picture
+in the limited child: what crashes, loops or eats memory there never reaches this process. Here each run has a time
+limit. The only module that imports onnxruntime.
 """
 
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from polcap.errors import ModelError
+from polcap.errors import DecodeError, ModelError
+from polcap.formats import calib, text_file, worker
 from polcap.images import Floats, Network
 
 ENCODING = "1"
@@ -26,6 +33,10 @@ REQUIRED = ("channels", "encoding", *NUMBERS, "licence")
 CUDA, CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 _REMOTE = "AzureExecutionProvider"  # calls a service; computes nothing here
 Device = Literal["cpu", "cuda", "auto"]
+_MOST_BYTES = 1 << 30  # of a model; the one that is shipped has 15 MB
+_TRIAL_S, _TRIAL_GIB, _TRIAL_PX = 60.0, 4.0, 64
+_RUN_S = 300.0  # the shipped model takes 2 s for a picture on one core
+_MOST_NUMBER = 1 << 16  # px; of what the metadata state
 
 
 def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: str = ENCODING) -> Network:
@@ -42,10 +53,9 @@ def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: s
     import onnxruntime
 
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise ModelError(f"{path}: {error.strerror or error}; name a model file with --model") from error
+    data = _bytes(path)
+    if digest(data) not in _shipped():
+        _try(path, digest(data), encoding)
     if device == "cuda" and CUDA not in onnxruntime.get_available_providers():
         raise ModelError("--device cuda: this onnxruntime has no CUDA; install onnxruntime-gpu, or use --device cpu")
     wanted = [CPU] if device == "cpu" or CUDA not in onnxruntime.get_available_providers() else [CUDA, CPU]
@@ -53,15 +63,99 @@ def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: s
     provider = session.get_providers()[0]
     if device == "cuda" and provider != CUDA:
         raise ModelError("--device cuda: CUDA does not start; make driver, CUDA and cuDNN fit, or use --device cpu")
-    metadata = {str(k): str(v) for k, v in session.get_modelmeta().custom_metadata_map.items()}
+    metadata = _metadata(session)
     channels = _check(path, session, metadata, encoding)
-    return Network(
-        run=lambda inputs: _run(path, session, inputs),
-        digest=blake2b(data, digest_size=16).hexdigest(),
-        channels=channels,
-        metadata=metadata,
-        provider=provider,
-    )
+    return Network(Model(path, session), digest(data), channels, metadata, provider)
+
+
+def digest(data: bytes) -> str:
+    """What the bytes of a model put into the key of all that is made with it."""
+    return blake2b(data, digest_size=16).hexdigest()
+
+
+@dataclass(frozen=True)
+class Model:
+    """An open model: channels (1, N, H, W) in, maps by name (1, n, H, W) out."""
+
+    path: Path
+    session: Any
+    limit_s: float = _RUN_S
+
+    def __call__(self, inputs: Floats) -> dict[str, Floats]:
+        """Run it.
+
+        Raises
+        ------
+        ModelError
+            It fails on such an input, does not end, or answers with something that is no map of it.
+        """
+        import onnxruntime
+
+        entry = self.session.get_inputs()[0]
+        dtype = np.float16 if entry.type == "tensor(float16)" else np.float32
+        names = [output.name for output in self.session.get_outputs()]
+        options = onnxruntime.RunOptions()
+        overdue = threading.Timer(self.limit_s, setattr, (options, "terminate", True))
+        overdue.daemon = True
+        overdue.start()
+        try:
+            results = self.session.run(names, {entry.name: np.ascontiguousarray(inputs, dtype=dtype)}, options)
+        except _failures() as error:
+            if options.terminate:
+                raise ModelError(f"{self.path} did not end within {self.limit_s:g} s; take another model") from error
+            raise ModelError(f"{self.path} failed on an input of shape {inputs.shape}: {_line(error)}") from error
+        finally:
+            overdue.cancel()
+        return {name: self._map(name, value, inputs) for name, value in zip(names, results, strict=True)}
+
+    def _map(self, name: str, value: Any, inputs: Floats) -> Floats:
+        if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
+            raise ModelError(f"{self.path}: its output {name} holds no floating-point numbers; take another model")
+        if value.ndim != 4 or value.shape[0] != 1 or value.shape[2:] != inputs.shape[2:]:
+            raise ModelError(f"{self.path}: its output {name} is {value.shape} for an input of {inputs.shape}")
+        if not np.isfinite(value).all():
+            raise ModelError(f"{self.path}: its output {name} holds NaN or infinity; take another model")
+        return np.asarray(value, dtype=np.float32)
+
+
+def trial(path: str, expected: str, encoding: str) -> worker.Answer:
+    """Load a model and run it on a small picture of noise. In the worker."""
+    file = Path(path)
+    data = _bytes(file)
+    if digest(data) != expected:
+        raise ModelError(f"{path}: has changed while it was read; run again")
+    session = _open(file, data, [CPU], 1)
+    metadata = _metadata(session)
+    channels = _check(file, session, metadata, encoding)
+    side = max(_TRIAL_PX, int(metadata["size_multiple"]))
+    noise = np.random.default_rng(1).normal(size=(1, len(channels), side, side))
+    Model(file, session)(noise.astype(np.float32))
+    return {}, {}
+
+
+def _try(path: Path, expected: str, encoding: str) -> None:
+    try:
+        worker.call(trial, path, limit_s=_TRIAL_S, limit_gib=_TRIAL_GIB, expected=expected, encoding=encoding)
+    except DecodeError as error:
+        raise ModelError(f"a trial run of the model failed: {error}") from error
+
+
+@cache
+def _shipped() -> frozenset[str]:
+    """Digests of the models that come with polcap."""
+    files = calib.data_path("colorchecker").parent.glob("models/*.onnx")
+    return frozenset(digest(file.read_bytes()) for file in files)
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return text_file.read_bytes(path, _MOST_BYTES)
+    except OSError as error:
+        raise ModelError(f"{path}: {error.strerror or error}; name a model file with --model") from error
+
+
+def _metadata(session: Any) -> Mapping[str, str]:
+    return {str(k): str(v) for k, v in session.get_modelmeta().custom_metadata_map.items()}
 
 
 def providers(path: Path) -> dict[str, str]:
@@ -73,10 +167,10 @@ def providers(path: Path) -> dict[str, str]:
         if name == _REMOTE:
             continue
         try:
-            session = _open(path, path.read_bytes(), [name], 0)
+            session = _open(path, _bytes(path), [name], 0)
             shape = session.get_inputs()[0].shape
-            sides = [side if isinstance(side, int) else 64 for side in shape[2:]]
-            _run(path, session, np.zeros((1, shape[1], *sides), np.float32))
+            sides = [side if isinstance(side, int) else _TRIAL_PX for side in shape[2:]]
+            Model(path, session)(np.zeros((1, shape[1], *sides), np.float32))
             found[name] = "" if session.get_providers()[0] == name else "does not start"
         except ModelError as error:
             found[name] = str(error)
@@ -98,7 +192,7 @@ def _open(path: Path, data: bytes, providers: list[str], threads: int) -> Any:
         ) from error
 
 
-def _check(path: Path, session: Any, metadata: dict[str, str], encoding: str) -> tuple[str, ...]:
+def _check(path: Path, session: Any, metadata: Mapping[str, str], encoding: str) -> tuple[str, ...]:
     missing = [name for name in REQUIRED if not metadata.get(name)]
     if missing:
         raise ModelError(f"{path}: its metadata does not state {', '.join(missing)}; export it with polcap")
@@ -108,8 +202,9 @@ def _check(path: Path, session: Any, metadata: dict[str, str], encoding: str) ->
             "take a model of the same release"
         )
     for name in NUMBERS:
-        if not metadata[name].isdigit() or int(metadata[name]) < 1:
-            raise ModelError(f"{path}: {name} = {metadata[name]!r} in its metadata is not a whole number ≥ 1")
+        if not _usable(metadata[name]):
+            told = metadata[name][:20]
+            raise ModelError(f"{path}: {name} = {told!r} in its metadata is not a whole number of 1 to {_MOST_NUMBER}")
     channels = tuple(name.strip() for name in metadata["channels"].split(","))
     entry = session.get_inputs()
     shape = entry[0].shape if entry else []
@@ -119,15 +214,8 @@ def _check(path: Path, session: Any, metadata: dict[str, str], encoding: str) ->
     return channels
 
 
-def _run(path: Path, session: Any, inputs: Floats) -> dict[str, Floats]:
-    entry = session.get_inputs()[0]
-    dtype = np.float16 if entry.type == "tensor(float16)" else np.float32
-    names = [output.name for output in session.get_outputs()]
-    try:
-        results = session.run(names, {entry.name: np.ascontiguousarray(inputs, dtype=dtype)})
-    except _failures() as error:
-        raise ModelError(f"{path} failed on an input of shape {inputs.shape}: {_line(error)}") from error
-    return {name: np.asarray(result, dtype=np.float32) for name, result in zip(names, results, strict=True)}
+def _usable(number: str) -> bool:
+    return len(number) < 9 and number.isascii() and number.isdecimal() and 1 <= int(number) <= _MOST_NUMBER
 
 
 def _failures() -> tuple[type[Exception], ...]:

@@ -4,8 +4,6 @@
 caller states the encoding. RAW never comes here: OpenImageIO opens a DNG as its thumbnail.
 """
 
-import os
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import DecodeError
-from polcap.formats import photo_bytes, plausible, raw, sniff, worker
+from polcap.formats import memory_file, photo_bytes, plausible, raw, sniff, worker
 from polcap.images import Floats, SensorImage
 from polcap.optics import color
 
@@ -151,7 +149,7 @@ def _opened(path: str, data: bytes) -> Iterator[Any]:
         plausible.check_jpeg(path, data)
     options = oiio.ImageSpec()
     options["oiio:UnassociatedAlpha"] = 1  # else a PNG's colours come multiplied by its alpha
-    with _named(data) as name:
+    with memory_file.named(data) as name:
         file = oiio.ImageInput.open(name, options)
         if file is None:
             reason = _one_line(oiio.geterror()).replace(name, Path(path).name)
@@ -164,27 +162,6 @@ def _opened(path: str, data: bytes) -> Iterator[Any]:
             yield file
         finally:
             file.close()
-
-
-@contextmanager
-def _named(data: bytes) -> Iterator[str]:
-    """A name under which the bytes can be read: a file in memory under Linux, else a temporary one."""
-    if hasattr(os, "memfd_create"):
-        handle = os.memfd_create("polcap")
-        try:
-            with os.fdopen(os.dup(handle), "wb") as file:
-                file.write(data)
-            yield f"/proc/self/fd/{handle}"
-        finally:
-            os.close(handle)
-        return
-    handle, name = tempfile.mkstemp(prefix="polcap-")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        yield name
-    finally:
-        os.unlink(name)
 
 
 def _channels(path: str, spec: Any) -> list[int]:

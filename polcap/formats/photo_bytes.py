@@ -6,14 +6,14 @@ from hashlib import blake2b
 from typing import BinaryIO
 
 from polcap.errors import DecodeError
-from polcap.formats import document
+from polcap.formats import text_file
 
 
 @contextmanager
 def opened(path: str) -> Iterator[BinaryIO]:
     """The file, to be read; a `DecodeError` where it cannot be."""
     try:
-        with document.opened(path) as file:
+        with text_file.opened(path) as file:
             yield file
     except OSError as error:
         raise DecodeError(f"{path}: cannot be read ({error.strerror}); check the file and its permissions") from None

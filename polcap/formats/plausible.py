@@ -33,7 +33,7 @@ def check_size(path: str, width: int, height: int) -> None:
     if width * height > MOST_PIXELS:
         raise DecodeError(
             f"{path}: states {width}×{height} px, more than the {MOST_PIXELS / 1e6:.0f} million of any camera; "
-            "it is damaged, or reduce it"
+            "it is damaged, or make it smaller"
         )
 
 

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import DecodeError, StorageError
-from polcap.formats import atomic
+from polcap.formats import atomic, photo_bytes, plausible, worker
 from polcap.images import Floats
 
+_MAGIC = b"\x89PNG\r\n\x1a\n"
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 _HEADER = 33  # bytes of the signature and of IHDR, which stands first
 
@@ -75,24 +76,29 @@ def indexed(level: NDArray[np.uint8], colors: NDArray[np.uint8]) -> bytes:
 
 
 def read(path: Path) -> Pixels:
-    """Read a PNG as written above; channels in RGB(A) order.
+    """Read a PNG; channels in RGB(A) order.
 
     Raises
     ------
     DecodeError
-        The file is missing, cut short or no picture.
+        The file is missing, cut short, no PNG or larger than any picture.
     """
+    return worker.call(decode, path)[1]["pixels"]
+
+
+def decode(path: str) -> worker.Answer:
+    """The same, in the worker."""
+    data = photo_bytes.load(path)
+    if data[:8] != _MAGIC or len(data) < 24:
+        raise DecodeError(f"{path} is not a whole PNG ({len(data)} bytes); write it again")
+    plausible.check_size(path, *struct.unpack(">II", data[16:24]))
     try:
-        data = np.frombuffer(Path(path).read_bytes(), dtype=np.uint8)
-    except OSError as error:
-        raise DecodeError(f"cannot read {path}: {error.strerror}; check the path") from error
-    try:
-        array = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+        array = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         array = None
-    if array is None:
+    if array is None or array.dtype not in (np.uint8, np.uint16):
         raise DecodeError(f"{path} is not a whole PNG ({len(data)} bytes); write it again")
-    return np.asarray(_swapped(array))
+    return {}, {"pixels": _swapped(array)}
 
 
 def fitted(picture: Pixels, width: int) -> NDArray[np.uint8]:

@@ -67,6 +67,8 @@ def examine(path: str) -> worker.Answer:
             return _told(Probe(found))
         file.seek(0)
         data = file.read()
+    if not data:
+        raise DecodeError(f"{path}: is empty; copy it from the card again, or remove it")
     if found == "photo":
         return _photo(path, data)
     try:

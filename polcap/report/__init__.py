@@ -16,7 +16,7 @@ import numpy as np
 from polcap import __version__
 from polcap.config import Config, Gates
 from polcap.errors import StorageError
-from polcap.formats import atomic, provenance
+from polcap.formats import atomic, provenance, text_file
 from polcap.images import (
     Capture,
     Floats,
@@ -30,6 +30,33 @@ from polcap.report import page, shown
 
 _COMPARED_PX = 512  # the longest side on which photographs and re-rendering are compared
 State = Literal["pass", "fail", "warn", "not measured"]
+
+
+class _Photograph(msgspec.Struct, frozen=True):
+    file: str
+    digest: str
+
+
+class _Angle(msgspec.Struct, frozen=True):
+    angle_deg: float
+    frames: list[_Photograph]
+
+
+class _Facts(msgspec.Struct, frozen=True):
+    name: str
+    camera: str
+    shots: list[_Angle]
+
+
+class _Stored(msgspec.Struct, frozen=True):
+    """What other commands take from a report.json, which anybody may have written."""
+
+    polcap: str
+    capture: _Facts
+    figures: dict[str, dict[str, Any]]
+    settings: dict[str, dict[str, Any]]
+    keys: dict[str, str]
+    model: dict[str, str] | None
 
 
 class Gate(msgspec.Struct, frozen=True):
@@ -285,12 +312,15 @@ def read(folder: Path) -> dict[str, Any]:
         There is none, or it is not one.
     """
     try:
-        about = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        about = text_file.read_json(folder / "report.json")
+        msgspec.convert(about, _Stored)
+    except OSError as error:
         raise StorageError(f"{folder} holds no report.json; run `polcap process` first") from error
-    if not isinstance(about, dict) or "figures" not in about:
-        raise StorageError(f"{folder / 'report.json'} is no report of polcap; run `polcap process` again")
-    return about
+    except ValueError as error:
+        text = f"{folder / 'report.json'} is no report of this polcap ({error}); run `polcap process` again"
+        raise StorageError(text) from error
+    found: dict[str, Any] = about
+    return found
 
 
 def _least(name: str, value: float | None, limit: float, says: str) -> Gate:

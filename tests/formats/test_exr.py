@@ -46,7 +46,7 @@ def test_second_reader_agrees(tmp_path: Path) -> None:
 
 def test_cut_and_missing_files_are_one_line(tmp_path: Path) -> None:
     path = tmp_path / "a.exr"
-    with pytest.raises(DecodeError, match="cannot read"):
+    with pytest.raises(DecodeError, match="cannot be read"):
         exr.read(path)
     exr.write(path, {"Y": RNG.normal(size=(200, 200))})
     path.write_bytes(path.read_bytes()[:4000])

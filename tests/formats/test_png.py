@@ -30,7 +30,7 @@ def test_only_whole_numbers_are_taken() -> None:
 
 def test_damaged_file_is_one_line(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
-    with pytest.raises(DecodeError, match="check the path"):
+    with pytest.raises(DecodeError, match="check the file"):
         png.read(path)
     for data in (b"", b"\x89PNG\r\n\x1a\nnonsense"):
         path.write_bytes(data)

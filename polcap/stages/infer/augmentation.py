@@ -5,10 +5,12 @@ A turn or mirror of the picture is one of the scene: polarization turns twice as
 
 import numpy as np
 
+from polcap.errors import ModelError
 from polcap.images import Cues, Floats, Network
 from polcap.optics import frames
 from polcap.stages.cues import CHANNELS, channels
 
+_OUTPUTS = {"normal": 3, "depth": 1, "diffuse": 3, "specular": 3, "roughness": 1, "sigma": 1}  # channels of each map
 _POSITIONS = tuple(
     (quarters, mirror) for first in (0, 1) for mirror in (False, True) for quarters in (first, first + 2)
 )
@@ -68,5 +70,10 @@ def _run(picture: Floats, network: Network) -> dict[str, Floats]:
     multiple = int(network.metadata["size_multiple"])
     pad = ((0, 0), (0, -height % multiple), (0, -width % multiple))
     output = network.run(np.pad(picture, pad)[None].astype(np.float32))
-    images = {name: np.moveaxis(value[0], 0, -1)[:height, :width] for name, value in output.items()}
+    found = {name: value.shape[1] for name, value in output.items()}
+    if any(found.get(name) != count for name, count in _OUTPUTS.items()):
+        raise ModelError(
+            f"model {network.digest[:8]} makes {found}; this version needs {_OUTPUTS}; use a model of this version"
+        )
+    images = {name: np.moveaxis(output[name][0], 0, -1)[:height, :width] for name in _OUTPUTS}
     return {name: image[..., 0] if image.shape[-1] == 1 else image for name, image in images.items()}

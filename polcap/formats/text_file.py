@@ -34,9 +34,9 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
     return data
 
 
-def read_toml(path: str | Path) -> dict[str, Any]:
-    """A TOML document. Raises OSError or ValueError."""
-    return parse_toml(read_bytes(path, TEXT_BYTES).decode("utf-8"))
+def read_toml(path: str | Path, finite: bool = True) -> dict[str, Any]:
+    """A TOML document; unless `finite`, its numbers may be NaN. Raises OSError or ValueError."""
+    return parse_toml(read_bytes(path, TEXT_BYTES).decode("utf-8"), finite)
 
 
 def read_json(path: str | Path) -> Any:
@@ -44,13 +44,14 @@ def read_json(path: str | Path) -> Any:
     return parse_json(read_bytes(path, TEXT_BYTES).decode("utf-8"))
 
 
-def parse_toml(text: str) -> dict[str, Any]:
-    """TOML text as plain data; ValueError where it is none, or a number in it is not finite."""
+def parse_toml(text: str, finite: bool = True) -> dict[str, Any]:
+    """TOML text as plain data; ValueError where it is none, or a number in it is not finite though it shall be."""
     try:
         found = tomllib.loads(text)
     except RecursionError:
         raise ValueError("nested too deeply") from None
-    check_finite(found)
+    if finite:
+        check_finite(found)
     return found
 
 
