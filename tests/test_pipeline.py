@@ -259,3 +259,14 @@ def test_the_example_from_python_runs(result: Path, example: Path, tmp_path: Pat
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, script, example, copy], env=environment, capture_output=True, text=True)
     assert done.returncode == 0 and "ghosts pass" in done.stdout, done.stderr
+
+
+def test_the_gallery_shows_each_result_and_stands_alone(result: Path, tmp_path: Path) -> None:
+    copy, page = tmp_path / "copy", tmp_path / "gallery.html"
+    shutil.copytree(result, copy)
+    command = [sys.executable, ROOT / "examples" / "gallery.py", page, copy, copy]
+    done = subprocess.run(command, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    text = page.read_text()
+    assert text.count("data:image/webp") == 2 and text.count('<a href="copy/report.html">') == 2
+    assert "http" not in text

@@ -150,7 +150,8 @@ def _maps(small: Shown, metric: bool) -> Iterator[str]:
     maps, inside = small.maps, small.maps.mask
     depth = small.depth * (1000.0 if metric else 1.0)
     yield (
-        '<h2>Maps</h2><p class="hint">The pointer over one map reads all of them at that pixel.</p><div class="grid">'
+        '<h2>Maps</h2><p class="hint">The pointer over one map reads all of them at that pixel.</p>'
+        '<div class="grid" id="maps">'
     )
     yield normal("normal", "Normal", maps.normal, inside)
     yield _color("diffuse", "Diffuse albedo", "ρ_d, linear: red, green, blue", maps.diffuse, inside, 1.0)

@@ -148,11 +148,11 @@ class Solid {
   constructor(canvas, sources, mesh) {
     this.canvas = canvas;
     this.turn = [0.35, 0.15];  // rad about the upright axis, then up
-    this.near = 1;  // of the distance at which the surface fills the picture
+    this.near = 1;  // of the distance at which the surface just fits into the picture
     this.mode = 0;
     this.pointers = new Map();
     this.apart = 0;  // between two fingers, px
-    canvas.width = canvas.height = 640;
+    [canvas.width, canvas.height] = [960, 600];
     const painter = this.painter = new Painter(canvas, SOLID, '#define SOLID\n'), gl = painter.gl;
     if (mesh.wide && !gl.getExtension('OES_element_index_uint')) throw new Error('no 32-bit indices');
     painter.maps(sources);
@@ -229,7 +229,8 @@ class Solid {
 
   draw() {
     const gl = this.painter.gl, field = 0.35, [right, up] = this.turn;  // rad, half the field of view
-    const away = this.near * this.radius / Math.sin(field);
+    const [wide, high, deep] = DATA.mesh.extent, aspect = this.canvas.width / this.canvas.height;
+    const away = this.near * 0.57 * Math.max(high, wide / aspect) / Math.tan(field) + deep / 2;
     const [ca, sa, cb, sb] = [Math.cos(right), Math.sin(right), Math.cos(up), Math.sin(up)];
     // rows of the turn: about y, then about x
     const rows = [[ca, 0, sa], [sb * sa, cb, -sb * ca], [-cb * sa, sb, cb * ca]];
@@ -239,7 +240,7 @@ class Solid {
     const view = new Float32Array(16);
     for (let k = 0; k < 4; k++) {
       const [x, y, z] = k < 3 ? rows.map((row) => row[k]) : moved, w = k < 3 ? 0 : 1;
-      view.set([f * x, f * y, (far + near) / (near - far) * z + 2 * far * near / (near - far) * w, -z], 4 * k);
+      view.set([f / aspect * x, f * y, (far + near) / (near - far) * z + 2 * far * near / (near - far) * w, -z], 4 * k);
     }
     const eye = [0, 1, 2].map((k) => -rows.reduce((sum, row, j) => sum + row[k] * moved[j], 0));
     // the light stays beside the eye, a little above and to the left
