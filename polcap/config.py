@@ -29,13 +29,22 @@ S = TypeVar("S", bound=msgspec.Struct)
 
 
 class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a run must keep to; beyond a limit the asset is written and the exit code is 3."""
+    """What a capture must keep to: beyond, `check` says reshoot, and `process` writes the asset and ends with 3."""
 
     max_delta_e: Annotated[float, Meta(gt=0, description="mean residual of the chart [CIEDE2000]")] = 5.0
+    max_tone_curvature: Annotated[
+        float, Meta(gt=0, le=1, description="change of an exposure ratio with brightness, ln over ln; 0 is linear [1]")
+    ] = 0.1
     max_gain_disagreement: Annotated[
         float,
-        Meta(gt=0, le=1, description="between chart and object on a shot's gain beyond their errors; 1 % costs 6° [1]"),
+        Meta(gt=0, le=1, description="doubt of a shot's light, and chart against object beyond it; 1 % costs 6° [1]"),
     ] = 0.01
+    max_gain_change: Annotated[
+        float, Meta(gt=0, le=1, description="of a shot's light against the other shots'; more is no ordinary pop [1]")
+    ] = 0.1
+    max_energy_drift: Annotated[
+        float, Meta(gt=0, le=1, description="of one frame's light against its shot's and the other brackets' [1]")
+    ] = 0.06
     max_align_residual_px: Annotated[
         float, Meta(gt=0, description="estimated 1σ error of a shot's registration [px of the grid]")
     ] = 0.15
@@ -52,26 +61,6 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float, Meta(ge=0, le=1, description="share of the picture's edge on the object, to pass unnoticed [1]")
     ] = 0.0
     max_clipped: Annotated[float, Meta(ge=0, le=1, description="share of the object that is clipped [1]")] = 0.02
-    max_ill_posed: Annotated[
-        float, Meta(ge=0, le=1, description="share of the object whose DoLP no dielectric can have [1]")
-    ] = 0.05
-    max_ghost: Annotated[
-        float, Meta(ge=0, le=1, description="share of a shot whose exposures disagree beyond noise [1]")
-    ] = 0.02
-    max_normal_error_deg: Annotated[
-        float, Meta(gt=0, le=90, description="median expected error of the normals [degrees]")
-    ] = 20.0
-
-
-class Check(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where `polcap check` says reshoot, beside the gates."""
-
-    max_gain_change: Annotated[
-        float, Meta(gt=0, le=1, description="of a shot's light against the other shots'; more is no ordinary pop [1]")
-    ] = 0.1
-    max_energy_drift: Annotated[
-        float, Meta(gt=0, le=1, description="of one frame's light against its shot's and the other brackets' [1]")
-    ] = 0.06
     max_blur_px: Annotated[
         float,
         Meta(gt=0, le=20, description="1σ beyond the sharpest shot's; 0.6 px of the merged picture [RAW px]"),
@@ -83,12 +72,33 @@ class Check(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_turn_fit: Annotated[
         float, Meta(gt=0, lt=1, description="misfit of the outline with that turn over without, to be believed [1]")
     ] = 0.68
+    min_outline_dolp: Annotated[
+        float, Meta(ge=0, le=1, description="median polarization of the outline; less is no common body [1]")
+    ] = 0.03
+    min_concentration: Annotated[
+        float, Meta(ge=0, le=1, description="how well polarization follows the outline, 1 is all round [1]")
+    ] = 0.5
+    max_one_sided: Annotated[
+        float, Meta(gt=0, description="light of the outline going once round it, against its mean [1]")
+    ] = 0.6
     max_side_light: Annotated[
         float, Meta(gt=0, le=1, description="one side of the outline brighter in one shot than in the others [1]")
     ] = 0.07
+    max_dolp_noise: Annotated[
+        float, Meta(gt=0, le=1, description="polarization that noise fakes in the object's median pixel [1]")
+    ] = 0.04
     max_ambient: Annotated[
-        float, Meta(gt=0, le=1, description="share of the object's light that is there without the flash [1]")
+        float, Meta(gt=0, le=1, description="share of the light that is there without the flash [1]")
     ] = 0.1
+    max_ill_posed: Annotated[
+        float, Meta(ge=0, le=1, description="share of the object whose DoLP no dielectric can have [1]")
+    ] = 0.05
+    max_ghost: Annotated[
+        float, Meta(ge=0, le=1, description="share of a shot whose exposures disagree beyond noise [1]")
+    ] = 0.02
+    max_normal_error_deg: Annotated[
+        float, Meta(gt=0, le=90, description="median expected error of the normals [degrees]")
+    ] = 20.0
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -104,7 +114,6 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     surface: Surface = Surface()
     asset: Asset = Asset()
     gates: Gates = Gates()
-    check: Check = Check()
 
 
 class Setting(NamedTuple):

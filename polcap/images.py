@@ -155,6 +155,8 @@ class AngleStack:
     white_balance: Floats | None  # (3,) multipliers as shot
     light: Literal["flash", "steady", "one exposure", "unknown"] = "unknown"  # of the shots; one: a polarizer mosaic
     offset_px: Floats | None = None  # (K, 2) x, y of this grid, exactly known: reference px − offset = shot px
+    curvature: Floats | None = None  # (K, E) of each frame's tone against the reference's; 0: linear, NaN: unknown
+    ambient_share: Floats | None = None  # (K,) of all light, there without the flash; NaN where not photographed
 
 
 @dataclass(frozen=True)
@@ -219,6 +221,7 @@ class Gains:
     order: tuple[int, ...]  # the order of the shots that the silhouette supports best
     mirrored: bool  # the silhouette supports angles counted the other way
     anchor_sigma: Floats  # (K,) 1σ of the anchor's channel means
+    grey_slope: float  # of ln light over ln reflectance of the chart's light greys: 1 is linear, NaN unknown
     chart_gloss: float  # greatest part of a shot's ratio on the white patch that is the chart's gloss, beyond doubt
 
 

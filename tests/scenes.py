@@ -94,7 +94,8 @@ def still(shots: int = 3) -> Alignment:
 
 def equal(shots: int = 3) -> Gains:
     ones = np.ones((shots, 3))
-    return Gains(ones, 0 * ones, ones, "none", 0.0, 0.0, 0.0, 1.0, tuple(range(shots)), False, np.zeros(shots), 0.0)
+    order = tuple(range(shots))
+    return Gains(ones, 0 * ones, ones, "none", 0.0, 0.0, 0.0, 1.0, order, False, np.zeros(shots), 1.0, 0.0)
 
 
 def ball_object() -> ObjectMask:

@@ -9,8 +9,8 @@ from time import perf_counter
 import msgspec
 
 from polcap.check import judge, reduced
-from polcap.check.judge import UNITS, Line
 from polcap.config import Config
+from polcap.gates import Gate
 from polcap.images import Capture, Network
 
 
@@ -19,7 +19,7 @@ class Verdict(msgspec.Struct, frozen=True):
 
     keep: bool
     shots: tuple[str, ...]  # to be taken again, as far as single ones are to blame
-    lines: tuple[Line, ...]
+    lines: tuple[Gate, ...]
     capture: str
     seconds: float
 
@@ -34,8 +34,8 @@ def inspect(capture: Capture, network: Network | None, config: Config, mask_netw
         A frame cannot be decoded.
     """
     start = perf_counter()
-    lines = tuple(judge.lines(reduced.take(capture, config.hdr.clip), network, mask_network, config))
-    bad = [line for line in lines if line.state == "reshoot"]
+    lines = tuple(judge.judged(reduced.take(capture, config.hdr.clip), network, mask_network, config))
+    bad = [line for line in lines if line.state == "fail"]
     named = {name for line in bad for name in line.shots}
     shots = tuple(shot.name for shot in capture.shots if shot.name in named)
     return Verdict(not bad, shots, lines, capture.name, round(perf_counter() - start, 2))
@@ -46,16 +46,21 @@ def table(verdict: Verdict) -> str:
     head = "keep" if verdict.keep else f"reshoot {', '.join(verdict.shots)}".rstrip()
     rows = [f"{head}   ({verdict.capture}, {verdict.seconds:.1f} s)"]
     for line in verdict.lines:
-        limit = "" if line.limit is None else f" (limit {_with_unit(line)})"
-        rows.append(f"{line.state:13}{line.name:12}{line.says}{limit}")
+        cost = f"; costs about {line.cost_deg:.0f}°" if line.cost_deg >= 1 and line.state in ("warn", "fail") else ""
+        rows.append(f"{line.state:13}{line.name:14}{line.says}{_limit(line)}{cost}")
         if line.remedy:
-            rows.append(f"{'':25}→ {line.remedy}")
+            rows.append(f"{'':27}→ {line.remedy}")
     return "\n".join(rows)
 
 
-def _with_unit(line: Line) -> str:
-    limit = line.limit or 0.0
-    return f"{limit:g}{UNITS[line.name]}" if line.name in UNITS else f"{100 * limit:g} %"
+def _limit(line: Gate) -> str:
+    if not isinstance(line.limit, float | int):
+        return ""
+    return (
+        f" (limit {100 * line.limit:g} %)"
+        if line.unit == "%"
+        else f" (limit {line.limit:g} {line.unit})".replace(" )", ")")
+    )
 
 
 def shown(verdict: Verdict) -> dict[str, object]:

@@ -8,13 +8,13 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
 
-from polcap import __version__
-from polcap.config import Config, Gates
+from polcap import __version__, gates
+from polcap.config import Config
 from polcap.errors import StorageError
 from polcap.formats import atomic, provenance, text_file
 from polcap.images import (
@@ -27,9 +27,9 @@ from polcap.images import (
 )
 from polcap.path import Results
 from polcap.report import page, shown
+from polcap.report.whole import Whole
 
 _COMPARED_PX = 512  # the longest side on which photographs and re-rendering are compared
-State = Literal["pass", "fail", "warn", "not measured"]
 
 
 class _Photograph(msgspec.Struct, frozen=True):
@@ -57,16 +57,6 @@ class _Stored(msgspec.Struct, frozen=True):
     settings: dict[str, dict[str, Any]]
     keys: dict[str, str]
     model: dict[str, str] | None
-
-
-class Gate(msgspec.Struct, frozen=True):
-    """One judgement."""
-
-    name: str
-    state: State
-    value: float | str | None
-    limit: float | str | None
-    says: str  # what it means and what to do
 
 
 def capture_facts(capture: Capture) -> dict[str, Any]:
@@ -179,88 +169,6 @@ def rerendering(results: Results, ior: float) -> dict[str, Any]:
     return {"rms": [_number(one) for one in again.rms(small.maps.mask)], "scale": _number(again.scale)}
 
 
-def judge(found: dict[str, dict[str, Any]], focal_known: bool, limits: Gates) -> list[Gate]:
-    """The gates, in the order of the path."""
-    gains, angles, object_ = found["gains"], found["angles"], found["object"]
-    nominal = angles["best_order"] == sorted(angles["best_order"]) and not angles["mirrored"]
-    return [
-        _least(
-            "ghosts",
-            max(found["merge"]["ghost_fraction"]),
-            limits.max_ghost,
-            "share of a shot whose exposures disagree: something moved between the frames of a bracket",
-        ),
-        _least(
-            "chart",
-            found["chart"]["delta_e_mean"],
-            limits.max_delta_e,
-            "mean ΔE2000 of the chart: light the chart as the object, or give its corners with --chart",
-        ),
-        _least(
-            "alignment",
-            max(found["alignment"]["residual_px"]),
-            limits.max_align_residual_px,
-            "1σ registration error, px: fix the camera, or turn the polarizer with less force",
-        ),
-        _mask(object_, limits),
-        _least(
-            "gains",
-            gains["disagreement"] if gains["source"] == "grey patches" else None,
-            limits.max_gain_disagreement,
-            "grey patches and the object disagree on a shot's light, beyond the error of both; 1 % costs about 6°",
-        ),
-        Gate(
-            "angles",
-            "pass" if nominal else "fail",
-            f"order {angles['best_order']}{', mirrored' if angles['mirrored'] else ''}",
-            "as stated",
-            "the outline supports this order of the shots: check names, --angles and the ring's sense of turn",
-        ),
-        _least(
-            "clipped",
-            object_["clipped_fraction"],
-            limits.max_clipped,
-            "share of the object clipped in every exposure: add a darker frame to the bracket",
-        ),
-        _least(
-            "ill-posed",
-            object_["ill_posed_fraction"],
-            limits.max_ill_posed,
-            "share of the object with an impossible DoLP: ambient light, metal, or shots out of order",
-        ),
-        _least(
-            "normal error",
-            found["maps"]["normal_error_deg_median"],
-            limits.max_normal_error_deg,
-            "median expected error of the normals, degrees: more light or frames, or four angles",
-        ),
-        Gate(
-            "focal length",
-            "pass" if focal_known else "warn",
-            "known" if focal_known else "assumed",
-            "known",
-            "a wrong focal length bends the depth: state focal_length_mm in capture.toml",
-        ),
-    ]
-
-
-def _mask(object_: dict[str, Any], limits: Gates) -> Gate:
-    """Fails where the network doubts its mask, warns where its shape is none that an object before a lens has."""
-    doubt, found, limit = object_["mask_doubt"], [], limits.max_mask_doubt
-    if object_["mask_border"] > limits.max_mask_border:
-        found.append(f"it covers {object_['mask_border']:.0%} of the picture's edge: what lies beyond is missing")
-    if object_["mask_islands"] > limits.max_mask_islands:
-        found.append(f"{object_['mask_islands']:.0%} of it stands apart")
-    if object_["mask_holes"] > limits.max_mask_holes:
-        found.append(f"holes of {object_['mask_holes']:.0%} of its area")
-    state: State = "warn" if found else "pass" if doubt is not None or object_["source"] == "user" else "not measured"
-    if doubt is not None and doubt > limit:
-        state = "fail"
-        found.insert(0, "which pixels are the object is not clear")
-    what = "; ".join(found) or "share of the object's outline in doubt"
-    return Gate("mask", state, doubt, limit, f"{what}: look at it, and where it is wrong give --mask PNG")
-
-
 def document(
     capture: dict[str, Any],
     results: Results,
@@ -270,24 +178,19 @@ def document(
 ) -> dict[str, Any]:
     """report.json: what was understood, measured and judged; timings [s] of the stages that were kept."""
     found = {**figures(results), "rerendering": rerendering(results, config.infer.ior)}
-    gates = judge(found, bool(capture["focal_known"]), config.gates)
+    judged = list(gates.judge(Whole(results, bool(capture["focal_known"])), config))
     return {
         "polcap": __version__,
         "versions": provenance.versions(),
-        "verdict": verdict(gates),
+        "verdict": gates.verdict(judged),
         "capture": capture,
-        "gates": msgspec.to_builtins(gates),
+        "gates": msgspec.to_builtins(judged),
         "figures": found,
         "timings": dict(timings),
         "model": None if network is None else {**network.metadata, "digest": network.digest},
         "keys": {kept.name: kept.key for kept in vars(results).values()},
         "settings": msgspec.to_builtins(config),
     }
-
-
-def verdict(gates: list[Gate]) -> State:
-    states = {gate.state for gate in gates}
-    return "fail" if "fail" in states else "warn" if "warn" in states else "pass"
 
 
 def write(folder: Path, about: dict[str, Any], results: Results) -> None:
@@ -321,12 +224,6 @@ def read(folder: Path) -> dict[str, Any]:
         raise StorageError(text) from error
     found: dict[str, Any] = about
     return found
-
-
-def _least(name: str, value: float | None, limit: float, says: str) -> Gate:
-    """A gate whose value must not exceed its limit."""
-    state: State = "not measured" if value is None else "pass" if value <= limit else "fail"
-    return Gate(name, state, value, limit, says)
 
 
 def _share(image: StokesImage, bit: Quality) -> float:

@@ -104,15 +104,15 @@ def _verdict(about: Mapping[str, Any]) -> Iterator[str]:
 def _advice(gate: Mapping[str, Any]) -> str:
     """A gate that did not pass: its value and limit, what it means, what to do."""
     value, limit = (escape(_gate_value(gate, name)) for name in ("value", "limit"))
-    cost = f" It costs {escape(str(gate['cost']))}." if gate.get("cost") else ""
+    cost = f" It costs about {gate['cost_deg']:.0f}°." if gate.get("cost_deg", 0) >= 1 else ""
     remedy = f" <b>{escape(str(gate['remedy']))}</b>" if gate.get("remedy") else ""
     return f"<b>{escape(gate['name'].capitalize())}</b> {value} (limit {limit}): {escape(gate['says'])}.{cost}{remedy}"
 
 
 def _gate_value(gate: Mapping[str, Any], name: str) -> str:
-    value = gate[name]
+    value, unit = gate[name], gate.get("unit", "")
     if isinstance(value, (int, float)) and not isinstance(value, bool):
-        return labels.number(value)
+        return f"{labels.number(100 * value if unit == '%' else value)} {unit}".rstrip()
     return "not measured" if value is None else str(value)
 
 

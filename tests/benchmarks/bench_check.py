@@ -74,7 +74,7 @@ def judge(place: Path, network: object) -> tuple[str, list[str], list[str]]:
         (place.parent / f"{place.name}.json").write_text(json.dumps(check.shown(verdict), indent=1))
     except InputError as error:
         return "bad input", [], [str(error).replace(str(place), "…")[:90]]
-    bad = [line for line in verdict.lines if line.state == "reshoot"]
+    bad = [line for line in verdict.lines if line.state == "fail"]
     return "keep" if verdict.keep else "reshoot", [b.name for b in bad], [f"{b.name}: {b.says[:70]}" for b in bad]
 
 

@@ -25,7 +25,7 @@ def verdict(folder: Path) -> Verdict:
 
 
 def failed(found: Verdict) -> set[str]:
-    return {line.name for line in found.lines if line.state == "reshoot"}
+    return {line.name for line in found.lines if line.state == "fail"}
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -40,7 +40,7 @@ def test_planted_fault_is_named(tmp_path: Path, fault: str) -> None:
     faulty.shoot(tmp_path / "bad", 1, fault, WIDTH)
     found = verdict(tmp_path / "bad")
     assert failed(found) & set(faulty.FAULTS[fault]), check.table(found)
-    assert all(line.remedy for line in found.lines if line.state in ("warning", "reshoot"))
+    assert all(line.remedy for line in found.lines if line.state in ("warn", "fail"))
 
 
 def test_missing_frame_is_bad_input(tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ def test_command_tells_keep_and_writes_nothing(example: Path, polcap: Command, t
     done = polcap("check", folder)
     assert done.returncode == 0, done.stdout
     assert done.stdout.startswith("keep")
-    assert len(done.stdout.splitlines()) <= 24  # one screen
+    assert len(done.stdout.splitlines()) <= 26  # one screen
     assert {file: file.stat().st_mtime_ns for file in folder.rglob("*")} == before
 
 
@@ -67,7 +67,7 @@ def test_command_ends_with_3_and_one_document(example: Path, polcap: Command, tm
     about = json.loads(done.stdout)
     assert done.returncode == 3
     assert about["verdict"] == "reshoot" and not about["keep"]
-    assert [line["name"] for line in about["lines"] if line["state"] == "reshoot"] == ["order"]
+    assert [line["name"] for line in about["lines"] if line["state"] == "fail"] == ["order"]
 
 
 def test_ambient_light_is_measured(example: Path, tmp_path: Path) -> None:
@@ -92,9 +92,9 @@ def test_ambient_light_is_measured(example: Path, tmp_path: Path) -> None:
         frames.append(f'[[frame]]\nfile = "dark{angle}.dng"\nrole = "ambient"\nangle = {angle}\n')
     (tmp_path / "capture.toml").write_text("".join(frames))
     line = next(line for line in verdict(tmp_path).lines if line.name == "ambient")
-    assert line.state == "reshoot"
-    # hdr subtracts it: a fifth of the middle frame against the four fifths that are left
-    assert line.figure == pytest.approx(0.25, rel=0.05)
+    assert line.state == "fail"
+    # of all the light
+    assert line.value == pytest.approx(0.2, rel=0.05)
 
 
 def test_reduced_picture_keeps_what_is_clipped(example: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,7 +45,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 60.0
 
 
-@stage(version=3)
+@stage(version=4)
 def merge(capture: Capture, settings: Settings) -> AngleStack:
     """Radiance of every shot on the scale of its reference frame.
 
@@ -77,7 +77,7 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
     del image  # the reader alone decides how long a frame is held
     lines = noise.Lines()
     stack = _empty(0, 0, 0)
-    ratios = []
+    ratios, curvatures, ambient_shares = [], [], []
     shape = 0, 0, 0
     for k, shot in enumerate(shots):
         measured = links.measure(shot, order, reference, lines, read, settings.clip, settings.max_motion_px)
@@ -88,6 +88,8 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
         same_size(f"shot {shot.name}", mixture.shape, shape)
         mixture.into(Merged(stack.value[k], stack.variance[k], stack.quality[k]))
         ratios.append([link.ratio.astype(np.float64) for link in measured.links])
+        curvatures.append([link.curvature for link in measured.links])
+        ambient_shares.append(measured.ambient_share)
         read.forget((*shot.frames, *shot.ambient))
         lines.close()
     binned = mosaic and not full
@@ -111,6 +113,8 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
         camera_matrix=camera[0],
         white_balance=camera[1],
         light=_light(capture),
+        curvature=np.array(curvatures),
+        ambient_share=np.array(ambient_shares),
         offset_px=_offsets(shots) if capture.layout == "sensor" else None,
     )
 

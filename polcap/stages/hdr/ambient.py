@@ -59,6 +59,13 @@ def measure(shot: Shot, reference: Frame, lines: noise.Lines, read: Reader, full
     return Ambient(value, variance)
 
 
+def share(ambient: Ambient, flash: Floats) -> float:
+    """Of all light in the brighter half of the picture, what the flash (C, H, W) did not bring."""
+    without, lit = (picture[:, ::4, ::4].sum(0) for picture in (ambient.value, flash))
+    bright = lit + without >= np.median(lit + without)
+    return float(without[bright].sum() / max(float((lit + without)[bright].sum()), 1e-9))
+
+
 def noise_of(light: Floats, line: noise.Noise, cfa: Bits | None) -> Floats:
     """Noise of pixels of known expected signal (C, h, w); cfa where they were interpolated from it, not binned."""
     expected = np.stack([line.of(c, plane) for c, plane in enumerate(light)])

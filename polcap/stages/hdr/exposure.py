@@ -9,6 +9,7 @@ from polcap.images import Floats
 from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.stages.hdr.frames import Signals, tile_means
 
+_TONE_RANGE, _TONE_BINS, _TONE_SPAN = (0.01, 0.9), 8, 0.7  # of the sensor's range; bins; ln of brightness, one stop
 TILE = 16  # px
 _LEAST_TILES = 30
 _DIM, _DIMMEST = 4e-3, 4e-4  # of the sensor's range: tiles below are left to black-level errors
@@ -29,20 +30,47 @@ def ratio(reference: Signals, other: Signals) -> Ratio | None:
     bias that a mean of quotients or of logarithms has. Tiles that disagree (something moved) are dropped.
     A channel too dim to say better than 1 % takes the ratio of all channels together.
     """
-    _, height, width = reference.shape
-    usable = (reference.usable & other.usable).view(np.uint8) * np.uint8(255)
-    tiled = usable[: height // TILE * TILE, : width // TILE * TILE]
-    if not tiled.size:
+    a, b = _common(reference, other)
+    if not len(a):
         return None
-    # one unusable pixel of the 256 takes the mean to 254
-    inside = cv2.resize(tiled, (width // TILE, height // TILE), interpolation=cv2.INTER_AREA) == 255
-    a, b = (tile_means(picture, TILE)[inside].astype(np.float64) for picture in (reference, other))
     found = [_quotient(a[:, c], b[:, c]) for c in range(a.shape[1])]
     sums = _quotient(a.sum(axis=1), b.sum(axis=1))
     if sums is None or sums[1] > 0.03:
         return None
     value, sigma = np.array([one if one is not None and one[1] < 0.01 else sums for one in found]).T
     return Ratio(value, sigma)
+
+
+def _common(reference: Signals, other: Signals) -> tuple[Floats, Floats]:
+    """Means (T, C) of the tiles that are usable throughout in both."""
+    channels, height, width = reference.shape
+    usable = (reference.usable & other.usable).view(np.uint8) * np.uint8(255)
+    tiled = usable[: height // TILE * TILE, : width // TILE * TILE]
+    if not tiled.size:
+        return np.zeros((0, channels)), np.zeros((0, channels))
+    # one unusable pixel of the 256 takes the mean to 254
+    inside = cv2.resize(tiled, (width // TILE, height // TILE), interpolation=cv2.INTER_AREA) == 255
+    a, b = (tile_means(picture, TILE)[inside].astype(np.float64) for picture in (reference, other))
+    return a, b
+
+
+def curvature(reference: Signals, other: Signals) -> float:
+    """How the exposure ratio of two frames changes with brightness: d ln(other/reference) / d ln(both); 0: linear.
+
+    A tone curve, unlike a lamp, changes the ratio from shadows to highlights. NaN where the frames span too little.
+    """
+    a, b = (part.mean(axis=1) for part in _common(reference, other))
+    lit = (a > _TONE_RANGE[0]) & (b > _TONE_RANGE[0]) & (a < _TONE_RANGE[1]) & (b < _TONE_RANGE[1])
+    if lit.sum() < 4 * _LEAST_TILES:
+        return float("nan")
+    level, change = (np.log(a[lit]) + np.log(b[lit])) / 2, np.log(b[lit] / a[lit])
+    edges = np.quantile(level, np.linspace(0, 1, _TONE_BINS + 1))
+    which = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, _TONE_BINS - 1)
+    bins = [which == n for n in range(_TONE_BINS) if (which == n).any()]
+    x, y = (np.array([np.median(values[one]) for one in bins]) for values in (level, change))
+    if np.ptp(x) < _TONE_SPAN:
+        return float("nan")
+    return float(np.polyfit(x, y, 1)[0])
 
 
 def _quotient(a: Floats, b: Floats) -> tuple[float, float] | None:

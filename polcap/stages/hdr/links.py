@@ -25,6 +25,7 @@ class Link:
     ratio: Floats  # (C,) float32, exposure relative to the reference
     moved: Floats | None  # (3, 3) reference px → frame px; None: it did not move
     misfit: Floats  # (C,) float32 px²; variance per squared gradient left by registration and aliasing
+    curvature: float = 0.0  # of its tone against the reference's; 0: linear, NaN: unknown
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Measured:
     noises: list[noise.Noise]
     ghost: Bools  # (H, W)
     estimate: Floats  # (C, H, W) the smoothed first estimate
+    ambient_share: float  # of all light, there without the flash; NaN where that was not photographed
     frames: list[Registered] | None  # as they will be merged; None where ambient light was taken off
 
 
@@ -117,7 +119,7 @@ def measure(
                 lines.learn(key, samples)
         own, other = shooting.line(reference), shooting.line(e)
         misfit = noise.misfit(still, found, ratio, (own, other), blur)
-        links[e], frames[e] = Link(ratio, moved, misfit), Registered(found, gain)
+        links[e], frames[e] = Link(ratio, moved, misfit, exposure.curvature(still, found)), Registered(found, gain)
         frame = Exposed(found, ratio, other)
         anchor = anchor or Anchor(Exposed(still, same.ratio, own))
         new = anchor.ghosts(frame, misfit, blur)
@@ -134,6 +136,7 @@ def measure(
         noises=noises,
         ghost=ghost,
         estimate=first,
+        ambient_share=float("nan") if shooting.ambient is None else ambients.share(shooting.ambient, first),
         frames=None if shooting.ambient is not None else [frames[e] for e in every],
     )
 

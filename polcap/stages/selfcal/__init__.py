@@ -91,6 +91,7 @@ def solve(
         order=found.order[0],
         mirrored=found.order[1],
         anchor_sigma=np.where(np.isfinite(anchor.sigma), anchor.sigma, 1.0),
+        grey_slope=float("nan") if greys is None else greys.slope,
         chart_gloss=0.0 if greys is None else greys.gloss,
     )
 

@@ -15,6 +15,7 @@ from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Quali
 
 _GREYS = (18, 19, 20, 21, 22, 23)  # white to black
 _LIGHT = 4  # the first so many serve for the gains; the darker two are mostly noise
+_REFLECTANCE = np.array([0.900, 0.591, 0.362, 0.198])  # of the light ones, as the chart's maker states them
 _SCATTER = 0.001  # between patches, of print, registration and light that falls off
 
 
@@ -24,6 +25,7 @@ class GreyPatches:
 
     gain: Floats  # (K, 3)
     sigma: Floats  # (K, 3) 1σ
+    slope: float  # of ln light over ln reflectance from white to neutral 5; 1: linear
     gloss: float  # greatest ratio of a shot on the white patch that is gloss's, not the gain's; 0 where none is sure
 
 
@@ -58,7 +60,15 @@ def measure(radiance: AngleStack, alignment: Alignment, color: ColorCalibration)
     sigma = np.hypot(photon, scatter)
     sigma[0] = 0
     gain, sigma = _alike(gain, sigma)
-    return GreyPatches(gain, sigma, _gloss(total.sum(-1)[:, usable], variance.sum(-1)[:, usable]))
+    slope = _slope(total[0, :_LIGHT].sum(-1), light[:_LIGHT])
+    return GreyPatches(gain, sigma, slope, _gloss(total.sum(-1)[:, usable], variance.sum(-1)[:, usable]))
+
+
+def _slope(total: Floats, usable: NDArray[np.bool_]) -> float:
+    """Slope of ln total (4,) over ln reflectance; NaN for fewer than three patches."""
+    if usable.sum() < 3:
+        return float("nan")
+    return float(np.polyfit(np.log(_REFLECTANCE[usable]), np.log(total[usable]), 1)[0])
 
 
 def _gloss(total: Floats, variance: Floats) -> float:

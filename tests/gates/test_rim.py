@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polcap.check import rim
+from polcap.gates import rim
 from polcap.optics import mueller
 from tests import scenes
 

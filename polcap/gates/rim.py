@@ -6,7 +6,7 @@ angle was not what it is called, or that another light shone from one side. How 
 much of the outline is a contour of shape, and how well the mask follows it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,6 +19,8 @@ Bools = NDArray[np.bool_]
 
 _INNER_PX, _DEPTH = 3.0, 0.08  # the band: px from the outline, and up to this share of the object's radius
 _SMOOTH_PX = 1.0
+_SECTORS, _LEAST_SECTORS = 24, 8
+_DOLP_CAP = 0.4  # above, it is no body that polarizes
 _STEP_DEG, _MOST_DEG = 3.0, 48.0  # of the angles tried; beyond, order and sense are in question
 
 
@@ -28,6 +30,8 @@ class Rim:
 
     light: Floats  # (K, N) of each shot, mean of the shots = 1
     azimuth: Floats  # (N,) rad, outward direction of the outline, from image x towards image up
+    sector: NDArray[np.int_]  # (N,) part of the outline, 0…23, seen from the object's middle
+    total: Floats  # (N,) mean of the shots, of the object's mean
 
     @property
     def length(self) -> int:
@@ -41,6 +45,19 @@ class Turn:
     shot: int | None  # None: all alike
     angle: float  # rad, true minus stated
     misfit: float  # residual with that turn, relative to the residual without; 1: nothing is better
+    sigmas: float  # the improvement over its scatter between the outline's sectors
+
+
+@dataclass(frozen=True)
+class Body:
+    """The rim as a whole."""
+
+    dolp: float  # median degree of linear polarization
+    along: float  # −1…1: mean of cos 2(φ − φ_contour); 1 a body's light, −1 light reflected off it from around
+    concentration: float  # 0…1, of the AoLP about the contour, turned as it may be
+    turned: float  # rad, the common turn of the AoLP against the contour
+    turned_sigma: float  # rad
+    one_sided: float  # amplitude of the rim's light going once round, relative; under a flash by the lens about 0
 
 
 def take(light: Floats, mask: Bools, usable: Bools) -> Rim:
@@ -50,35 +67,78 @@ def take(light: Floats, mask: Bools, usable: Bools) -> Rim:
     smooth = np.stack([cv2.GaussianBlur(shot.astype(np.float32) * ok, (0, 0), _SMOOTH_PX) / weight for shot in light])
     depth = outline.depth(mask)
     reach = max(_DEPTH * float(np.sqrt(mask.sum() / np.pi)), _INNER_PX + 3)
-    (x, y), slope = outline.outward(mask.astype(np.float32), max(3.0, reach / 2))
+    out, slope = outline.outward(mask.astype(np.float32), max(3.0, reach / 2))
     band = (depth > _INNER_PX) & (depth < reach) & (ok > 0) & (slope > 1e-4)
     for edge in (band[:3], band[-3:], band[:, :3], band[:, -3:]):  # where a picture ends is no contour
         edge[:] = False
     inside = smooth[:, band]
-    return Rim(inside / np.maximum(inside.mean(0), 1e-9), np.arctan2(y, x)[band])
+    total = inside.mean(0)
+    y, x = np.nonzero(band)
+    around = np.arctan2(y - y.mean(), x - x.mean()) if len(y) else np.zeros(0)
+    sector = np.floor((around + np.pi) / (2 * np.pi) * _SECTORS).astype(int) % _SECTORS
+    level = float(smooth.mean(0)[ok > 0].mean()) if (ok > 0).any() else 1.0
+    return Rim(
+        inside / np.maximum(total, 1e-9),
+        np.arctan2(out[1], out[0])[band],
+        sector,
+        total / max(level, 1e-9),
+    )
 
 
 def turn(at: Rim, angle: Floats, least: float) -> Turn:
     """The best of all turns of one shot, or of all, by at least `least` rad; angle (K,) rad as stated."""
     stated = _misfit(at, angle)
-    best = Turn(None, 0.0, 1.0)
+    middle = float(np.median(stated)) + 1e-9
+    best, which = Turn(None, 0.0, 1.0, 0.0), stated
     steps = np.radians(np.arange(_STEP_DEG, _MOST_DEG + 1, _STEP_DEG))
     for step in (s for size in steps if size >= least for s in (-size, size)):
         for shot in (*range(len(angle)), None):
-            turned = angle + step * (1 if shot is None else np.arange(len(angle)) == shot)
-            misfit = _misfit(at, turned) / max(stated, 1e-9)
+            turned = _misfit(at, angle + step * (1 if shot is None else np.arange(len(angle)) == shot))
+            misfit = float(np.median(turned)) / middle
             if misfit < best.misfit:
-                best = Turn(shot, float(step), misfit)
-    return best
+                best, which = Turn(shot, float(step), misfit, 0.0), turned
+    return replace(best, sigmas=_sigmas(stated - which, at.sector))
 
 
-def _misfit(at: Rim, angle: Floats) -> float:
-    """Median over the rim of what 1 and cos 2(θ − φ) leave of the shots' light."""
+def _misfit(at: Rim, angle: Floats) -> Floats:
+    """What 1 and cos 2(θ − φ) leave of the shots' light, (N,)."""
     wave = np.cos(2 * (angle[:, None] - at.azimuth))
     wave = wave - wave.mean(0)
     light = at.light - at.light.mean(0)
     share = (wave * light).sum(0) / np.maximum((wave * wave).sum(0), 1e-9)
-    return float(np.median(np.linalg.norm(light - share * wave, axis=0)))
+    return np.asarray(np.linalg.norm(light - share * wave, axis=0))
+
+
+def _sigmas(gained: Floats, sector: NDArray[np.int_]) -> float:
+    """Mean over its standard error of what each sector gains; sectors stand for independent measurements."""
+    each = np.array([np.median(gained[sector == s]) for s in np.unique(sector)])
+    if len(each) < _LEAST_SECTORS:
+        return 0.0
+    return float(each.mean() / max(each.std(ddof=1) / np.sqrt(len(each)), 1e-9))
+
+
+def body(at: Rim, angle: Floats) -> Body:
+    """How the rim is polarized, and how its light is spread."""
+    s0, s1, s2 = np.linalg.lstsq(mueller.analyzer(angle), at.light, rcond=None)[0]
+    polarization = (s1 + 1j * s2) / np.maximum(s0, 1e-9)
+    weight = np.minimum(np.abs(polarization), _DOLP_CAP)
+    across = weight * np.exp(1j * (np.angle(polarization) - 2 * at.azimuth))
+    mean = complex(across.sum() / max(float(weight.sum()), 1e-9))
+    parts = [
+        across[at.sector == s].sum() / max(float(weight[at.sector == s].sum()), 1e-9) for s in np.unique(at.sector)
+    ]
+    own = np.array(parts) * np.exp(-1j * np.angle(mean))
+    sigma = float(own.imag.std() / np.sqrt(max(len(own), 1)) / max(2 * abs(mean), 1e-3))
+    basis = np.stack([np.ones_like(at.azimuth), np.cos(at.azimuth), np.sin(at.azimuth)], axis=1)
+    found = np.linalg.lstsq(basis, at.total, rcond=None)[0]
+    return Body(
+        dolp=float(np.median(np.abs(polarization))),
+        along=mean.real,
+        concentration=abs(mean),
+        turned=float(np.angle(mean) / 2),
+        turned_sigma=min(sigma, np.pi / 2),
+        one_sided=float(np.hypot(found[1], found[2]) / max(float(found[0]), 1e-9)),
+    )
 
 
 def dolp(at: Rim, angle: Floats) -> Floats:

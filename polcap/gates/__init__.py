@@ -1,0 +1,86 @@
+"""In: what the stages made of a capture. Out: every judgement of it, once, for `process` and for `check`.
+
+A gate that fails means: do not trust the result unseen (`process` ends with exit code 3, `check` says reshoot). One
+that warns states an assumption, or a loss. Each says what was found, what it costs in degrees and what to do; a
+comparison speaks only beyond the error of what it compares.
+"""
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from polcap.config import Config, Gates
+from polcap.gates import geometry, light, polarization
+from polcap.gates.gate import Found, Gate, State, Unit
+
+__all__ = ["Found", "Gate", "State", "Unit", "judge", "verdict"]
+
+
+def judge(found: Found, config: Config) -> Iterator[Gate]:
+    """The gates, in the order of the path.
+
+    Raises
+    ------
+    InputError
+        From a stage that gave up, where `found` computes what it is asked for.
+    """
+    told: list[Gate] = []
+    for gate in _in_order(found, config):
+        told.append(gate)
+        yield gate
+        if gate.name == "order" and gate.state == "fail":
+            return  # in another order all that follows is another capture's
+    yield _normal_error(found, told, config.gates)
+    yield _focal_length(found.focal_known)
+
+
+def verdict(gates: Iterable[Gate]) -> State:
+    """The worst of the states."""
+    states = {gate.state for gate in gates}
+    return "fail" if "fail" in states else "warn" if "warn" in states else "pass"
+
+
+def _in_order(found: Found, config: Config) -> Iterator[Gate]:
+    limits = config.gates
+    yield light.bracket(found)
+    yield light.tone(found, limits)
+    yield light.source(found)
+    yield light.stillness(found, limits)
+    yield light.chart(found, limits)
+    yield geometry.alignment(found, config)
+    yield geometry.mask(found, limits)
+    yield light.clipping(found, limits)
+    yield geometry.sharpness(found, limits)
+    yield from light.gains(found, limits)
+    yield polarization.order(found)
+    yield from polarization.of_outline(found, limits)
+    yield light.noise(found, limits)
+    yield light.ambient(found, limits)
+    yield polarization.ill_posed(found, limits)
+
+
+def _normal_error(found: Found, told: list[Gate], limits: Gates) -> Gate:
+    """The median expected error, with what the other gates add to it."""
+    maps = found.maps
+    inside = maps.confidence[maps.mask]
+    own = float(np.median(inside)) if inside.size else float("nan")
+    expected = float(np.sqrt(own**2 + sum(gate.cost_deg**2 for gate in told)))
+    because = ", ".join(gate.name for gate in told if gate.cost_deg > 0.5 * own)
+    says = f"expected error of the normals {expected:.1f}° (median)" + (
+        f", most of it from: {because}" if because else ""
+    )
+    limit = limits.max_normal_error_deg
+    if not np.isfinite(expected):
+        return Gate("normal error", "not measured", None, limit, says, unit="°")
+    if expected <= limit:
+        return Gate("normal error", "pass", round(expected, 2), limit, says, unit="°")
+    remedy = "see the lines above" if because else "more light or frames, four angles, or a darker room"
+    return Gate("normal error", "fail", round(expected, 2), limit, says, remedy, unit="°")
+
+
+def _focal_length(known: bool) -> Gate:
+    if known:
+        return Gate("focal length", "pass", "known", "known", "known", unit="")
+    says = "the focal length is assumed; a wrong one bends the depth"
+    remedy = "state focal_length_mm and sensor_width_mm in capture.toml"
+    return Gate("focal length", "warn", "assumed", "known", says, remedy, unit="")

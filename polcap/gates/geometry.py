@@ -1,0 +1,69 @@
+"""Gates of place: what moved, what is out of focus, what is out of the frame."""
+
+import numpy as np
+
+from polcap.config import Config, Gates
+from polcap.gates.gate import Found, Gate, State, at_most, blamed
+
+
+def alignment(found: Found, config: Config) -> Gate:
+    """How far camera or object moved from shot to shot, in px of the picture that is processed, and how surely."""
+    measured, names = found.alignment, found.names
+    height, width = found.radiance.value.shape[1:3]
+    corners = np.array([[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]], float).T
+    at = measured.transform @ corners  # (K, 3, 4)
+    shift = np.abs(at[:, :2] / at[:, 2:] - corners[:2]).max((1, 2)) * found.grid_px
+    limit = config.align.max_shift_px
+    lost = (measured.correlation < config.align.min_correlation) | ~np.isfinite(shift)
+    doubt = measured.residual_px * found.grid_px
+    unsure = doubt > config.gates.max_align_residual_px * max(found.grid_px, 1)
+    bad = lost | (shift > limit) | unsure
+    worst = int(np.argmax(np.where(bad, 1e9, 0) + np.nan_to_num(shift)))
+    says = f"{names[worst]} moved by {shift[worst]:.1f} px, sure to {doubt[worst]:.2f}"
+    if lost[worst]:
+        says = f"{names[worst]} shows another scene, or moved too far to be followed"
+    elif unsure[worst] and shift[worst] <= limit:
+        says = f"{names[worst]} moved by {shift[worst]:.1f} px, sure to {doubt[worst]:.2f} only: too little texture"
+    figure = round(float(shift[worst]), 3) if np.isfinite(shift[worst]) else None
+    if not bad.any():
+        return Gate("alignment", "pass", figure, limit, says, unit="px")
+    remedy = "lock the camera, do not touch the object, and take that shot again"
+    return Gate("alignment", "fail", figure, limit, says, remedy, 10.0, blamed(names, bad), "px")
+
+
+def mask(found: Found, limits: Gates) -> Gate:
+    """Fails where the network doubts its mask, warns where its shape is none that an object before a lens has."""
+    object_, limit = found.object_, limits.max_mask_doubt
+    told = []
+    if object_.border > limits.max_mask_border:
+        told.append(
+            f"the object leaves the picture along {object_.border:.0%} of its border, where its outline tells nothing"
+        )
+    if object_.islands > limits.max_mask_islands:
+        told.append(f"{object_.islands:.0%} of it stands apart")
+    if object_.holes > limits.max_mask_holes:
+        told.append(f"it has holes of {object_.holes:.0%} of its area")
+    state: State = (
+        "warn" if told else "pass" if object_.doubt is not None or object_.source == "user" else "not measured"
+    )
+    if object_.doubt is not None and object_.doubt > limit:
+        state = "fail"
+        told.insert(0, "which pixels are the object is not clear")
+    says = "; ".join(told) or "share of the object's outline in doubt"
+    remedy = "look at it, and where it is wrong give --mask PNG; let backdrop show all around the object"
+    cost = 10 * object_.border if state == "warn" else 5.0 if state == "fail" else 0.0
+    return Gate("mask", state, object_.doubt, limit, says, remedy if told else "", cost)
+
+
+def sharpness(found: Found, limits: Gates) -> Gate:
+    """Every frame against the frames of the same exposure in the other shots."""
+    blur, limit = found.blur_px, limits.max_blur_px
+    if blur is None:
+        return Gate("sharpness", "not measured", None, limit, "`polcap check` looks at it", unit="px")
+    if np.isnan(blur).all():
+        return Gate("sharpness", "not measured", None, limit, "too little bright detail", unit="px")
+    k, e = (int(i) for i in np.unravel_index(int(np.nanargmax(blur)), blur.shape))
+    says = f"{found.names[k]} frame {e + 1} is blurred by {blur[k, e]:.1f} px beyond the sharpest"
+    bad = blamed(found.names, np.nanmax(np.nan_to_num(blur), axis=1) > limit)
+    remedy = "focus by hand and tape the ring, use a remote release, then take it again"
+    return at_most("sharpness", float(blur[k, e]), limit, says, remedy, bad, 3, "px")

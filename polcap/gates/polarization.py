@@ -1,0 +1,137 @@
+"""Gates of polarization: the order of the angles, their turn, and whether it is a body's light at all."""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+
+from polcap.config import Gates
+from polcap.gates import rim
+from polcap.gates.gate import Found, Gate, at_most
+from polcap.images import Floats, Quality, StokesImage
+from polcap.optics import mueller
+
+_LEAST_RIM = 200  # pixels of outline that an angle can be told from
+_LEAST_DOLP = 0.01  # of the outline; there the least index has ten times that
+_SAME_DEG = 5.0  # axes nearer than this are the same angle
+_SURE = 2.5  # σ between sectors of the outline from which a turn is believed
+_CLEAR = 0.8  # concentration of the AoLP about the outline from which a common turn is believed
+_MOST_PIXELS = 6e5  # a larger picture is averaged down
+
+
+def order(found: Found) -> Gate:
+    gains, names = found.gains, found.names
+    if gains.order == tuple(range(len(names))) and not gains.mirrored:
+        says = f"as stated (the outline fits to {gains.concentration:.2f})"
+        return Gate("order", "pass", "as stated", "as stated", says, unit="")
+    best = ", ".join(names[i] for i in gains.order) + (", counted the other way" if gains.mirrored else "")
+    says = f"the outline fits {best} better than the stated order"
+    remedy = "name the shots by the angles they had (folders, or --angles), or take them again in order"
+    return Gate("order", "fail", best, "as stated", says, remedy, 45.0, unit="")
+
+
+def of_outline(found: Found, limits: Gates) -> Iterator[Gate]:
+    """What the outline says of the angles, of the body and of other light."""
+    angle, limit = found.radiance.angle, limits.max_turn_deg
+    band = rim.take(*_reduced(found.stokes, angle))
+    if band.length < _LEAST_RIM:
+        yield Gate("angles", "not measured", None, limit, "too little outline", unit="°")
+        return
+    body = rim.body(band, angle)
+    if body.dolp < _LEAST_DOLP:
+        says = f"the outline is polarized by {100 * body.dolp:.1f} %"
+        remedy = "is the polarizer on, and did it turn? A metal object has no diffuse polarization"
+        yield Gate("polarized", "fail", round(body.dolp, 4), _LEAST_DOLP, says, remedy, 45.0)
+        return
+    known = found.gains.source in ("grey patches", "one exposure")
+    yield _angles(rim.turn(band, angle, np.radians(limit)), body, angle, known, found.names, limits)
+    yield _light_of_body(body, limits)
+    side = rim.side_light(band)
+    k = int(np.argmax(side))
+    says = f"{found.names[k]} is brighter on one side by {100 * side[k]:.1f} %"
+    remedy = "another light was on in one of the shots: darken the room, and take that shot again"
+    yield at_most("other light", float(side[k]), limits.max_side_light, says, remedy, (found.names[k],), 10)
+
+
+def ill_posed(found: Found, limits: Gates) -> Gate:
+    image = found.stokes
+    inside = image.quality[image.mask]
+    share = float(((inside & int(Quality.ILL_POSED)) > 0).mean()) if inside.size else 0.0
+    says = f"{100 * share:.1f} % of the object is polarized as no dielectric is"
+    remedy = "ambient light, mirrored surroundings, metal, or shots out of order: darken the room, check the angles"
+    return at_most("ill-posed", share, limits.max_ill_posed, says, remedy, cost_deg=30 * share)
+
+
+def _angles(found: rim.Turn, body: rim.Body, angle: Floats, known: bool, names: list[str], limits: Gates) -> Gate:
+    """A turn of the ring, or of one shot, that the outline supports beyond its own error."""
+    limit = limits.max_turn_deg
+    common = float(np.degrees(body.turned))
+    if (
+        abs(common) > limit + 3 * np.degrees(body.turned_sigma)
+        and body.concentration > _CLEAR
+        and abs(abs(common) - 90) > 25  # light reflected off the object lies across; see "body"
+    ):
+        says = f"the ring looks turned by {common:+.0f}° ± {np.degrees(body.turned_sigma):.0f}° in all shots"
+        remedy = "set the ring's zero to the horizontal, or name the angles it really had"
+        return Gate("angles", "fail", round(common, 1), limit, says, remedy, abs(common), unit="°")
+    fit = limits.max_turn_fit * (1.0 if known else 0.75)  # guessed gains look like turns
+    if found.misfit >= fit or found.sigmas < _SURE or found.shot is None:
+        return Gate("angles", "pass", 0.0, limit, "no other angle fits the outline clearly better", unit="°")
+    degrees = float(np.degrees(found.angle))
+    gap = np.degrees(angle[found.shot] + found.angle - angle)
+    same = np.abs((gap + 90) % 180 - 90) < _SAME_DEG
+    same[found.shot] = False
+    cost = abs(degrees) / 2
+    if same.any():  # which of the two is wrong cannot be seen
+        shots = tuple(names[k] for k in sorted((found.shot, int(np.argmax(same)))))
+        says = f"{' and '.join(shots)} look alike: the polarizer was not turned between them"
+        remedy = "turn the ring to its mark and take the shot again"
+        return Gate("angles", "fail", round(degrees, 1), limit, says, remedy, cost, shots, "°")
+    times = 1 / found.misfit
+    says = f"{names[found.shot]} looks turned by {degrees:+.0f}°, which fits the outline {times:.1f} times better"
+    remedy = "set the ring to its mark and take the shot again, or name the angle it really had"
+    return Gate("angles", "fail", round(degrees, 1), limit, says, remedy, cost, (names[found.shot],), "°")
+
+
+def _light_of_body(body: rim.Body, limits: Gates) -> Gate:
+    """Whether the outline is polarized as a body under a flash by the lens: across the contour, and enough."""
+    limit = limits.min_outline_dolp
+    remedy = "darken the room, keep the flash beside the lens, and photograph an ambient frame"
+    if body.along < -0.3:
+        says = "the outline is polarized along the contour: light from around is reflected off the object"
+        return Gate("body", "fail", round(body.dolp, 4), limit, says, remedy, 30.0)
+    if body.concentration < limits.min_concentration:
+        says = (
+            f"polarization hardly follows the outline ({body.concentration:.2f}): ambient light, "
+            "or an object whose outline is no contour of shape"
+        )
+        return Gate("body", "warn", round(body.dolp, 4), limit, says, remedy, 15.0)
+    if body.one_sided > limits.max_one_sided:
+        says = f"one side of the object is lit {body.one_sided:.1f} times more than its mean: light from the side"
+        return Gate("body", "warn", round(body.dolp, 4), limit, says, remedy, 10.0)
+    if body.dolp < limit:
+        says = (
+            f"the outline is polarized by {100 * body.dolp:.1f} %, far less than shading says: a translucent body "
+            "(wax, skin, milk), a very rough one, or ambient light"
+        )
+        hint = "under even light translucent and very rough bodies give little; trust the shape less"
+        return Gate("body", "warn", round(body.dolp, 4), limit, says, hint, min(300 * (limit - body.dolp) + 8, 25))
+    return Gate("body", "pass", round(body.dolp, 4), limit, f"the outline is polarized by {100 * body.dolp:.1f} %")
+
+
+def _reduced(image: StokesImage, angle: Floats) -> tuple[Floats, rim.Bools, rim.Bools]:
+    """The shots' light (K, h, w) as solved, object and sound pixels, averaged down to _MOST_PIXELS."""
+    step = int(np.ceil(np.sqrt(max(image.mask.size / _MOST_PIXELS, 1))))
+    doubtful = Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST
+    usable = (image.quality & int(doubtful)) == 0
+    total = image.stokes.sum(-1)
+    mask = image.mask
+    if step > 1:
+        size = (mask.shape[1] // step, mask.shape[0] // step)
+        cut = np.s_[: size[1] * step, : size[0] * step]
+        total = np.stack([cv2.resize(part[cut], size, interpolation=cv2.INTER_AREA) for part in total])
+        mask, usable = (
+            cv2.resize(part[cut].astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
+            for part in (mask, usable)
+        )
+    return np.einsum("kj,jhw->khw", mueller.analyzer(angle), total), mask, usable

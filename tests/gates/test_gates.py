@@ -1,0 +1,131 @@
+"""Each gate speaks of its own fault, in words, beyond its own error; nothing speaks on a good capture."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from polcap import gates
+from polcap.config import Config
+from polcap.gates import Gate
+from polcap.images import SurfaceMaps
+from polcap.stages import selfcal, stokes
+from tests import scenes
+
+
+def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> SimpleNamespace:
+    """A ball well photographed, or with something of it changed."""
+    radiance = changed.pop("radiance", scenes.stack(noise=0.002, angles=angles))
+    shots = len(radiance.angle)
+    object_ = scenes.ball_object()
+    unchecked = selfcal.Settings(check_order=False)
+    gains = selfcal.solve(radiance, scenes.still(shots), object_, scenes.no_color(), unchecked)
+    gains = changed.pop("gains", replace(gains, source="grey patches", sigma=0 * gains.sigma, disagreement=0.0))
+    image = stokes.solve(radiance, scenes.still(shots), gains, object_, stokes.Settings())
+    normal = np.zeros((*image.mask.shape, 3), np.float32)
+    flat = np.full(image.mask.shape, 0.5, np.float32)
+    maps = SurfaceMaps(normal, normal, normal, flat, None, 8 * flat, image.mask, image.view, "analytic")
+    given = {
+        "names": [f"{np.degrees(a):g}°" for a in radiance.angle], "focal_known": True, "grid_px": 1.0,
+        "chart_missing": "", "blur_px": None, "clipped": np.zeros(shots), "radiance": radiance,
+        "color": scenes.no_color(), "alignment": scenes.still(shots), "object_": object_, "gains": gains,
+        "stokes": image, "maps": maps,
+    }  # fmt: skip
+    return SimpleNamespace(**{**given, **changed})
+
+
+@pytest.fixture(scope="module")
+def good() -> SimpleNamespace:
+    return found()
+
+
+def judged(of: SimpleNamespace) -> dict[str, Gate]:
+    return {gate.name: gate for gate in gates.judge(of, Config())}
+
+
+def failed(of: SimpleNamespace) -> list[str]:
+    return [name for name, gate in judged(of).items() if gate.state == "fail"]
+
+
+def test_nothing_fails_on_a_good_capture(good: SimpleNamespace) -> None:
+    assert failed(good) == []
+    assert gates.verdict(judged(good).values()) == "warn"  # one exposure per shot
+
+
+def changed(good: SimpleNamespace, **fields: Any) -> SimpleNamespace:
+    return SimpleNamespace(**{**vars(good), **fields})
+
+
+def test_each_gate_fails_alone(good: SimpleNamespace) -> None:
+    radiance, gains, maps = good.radiance, good.gains, good.maps
+    still = good.alignment
+    away = still.transform.copy()
+    away[1, 0, 2] = 50
+    curved = np.array([[0.0, -0.2]] * 3)
+    pairs = {"exposure_ratio": np.tile([[[1.0], [4.0]]], (3, 1, 3)), "exif_ratio": np.array([[1.0, 4.0]] * 3)}
+    faults = {
+        "tone curve": {"radiance": replace(radiance, curvature=curved, **pairs)},
+        "stillness": {"radiance": replace(radiance, ghost_fraction=np.array([0.0, 0.05, 0.0]))},
+        "ambient": {"radiance": replace(radiance, ambient_share=np.array([0.2, 0.2, 0.2]))},
+        "alignment": {"alignment": replace(still, transform=away)},
+        "clipping": {"clipped": np.array([0.0, 0.03, 0.0])},
+        "sharpness": {"blur_px": np.array([[0.0], [2.0], [0.1]])},
+        "gains": {"gains": replace(gains, gain=np.array([[1.0] * 3, [1.0] * 3, [0.7] * 3]))},
+        "gain doubt": {"gains": replace(gains, disagreement=0.03)},
+        "normal error": {"maps": replace(maps, confidence=np.full_like(maps.confidence, 25.0))},
+    }
+    for name, fields in faults.items():
+        gate = judged(changed(good, **fields))[name]
+        assert gate.state == "fail" and gate.remedy, name
+        assert failed(changed(good, **fields)) in ([name], [name, "normal error"]), name
+
+
+def test_what_follows_a_wrong_order_is_not_judged(good: SimpleNamespace) -> None:
+    told = judged(changed(good, gains=replace(good.gains, order=(2, 1, 0))))
+    assert list(told)[-1] == "focal length" or told["order"].state == "fail"
+    assert "angles" not in told
+
+
+def test_flash_bracketed_by_the_shutter_is_named(good: SimpleNamespace) -> None:
+    alike = np.tile([[[1.0], [1.01], [0.99]]], (3, 1, 3))
+    radiance = replace(good.radiance, exposure_ratio=alike, exif_ratio=np.array([[0.25, 1, 4]] * 3), light="flash")
+    gate = judged(changed(good, radiance=radiance))["exposures"]
+    assert gate.state == "warn"
+    assert "flash power, aperture or ISO" in gate.remedy
+
+
+def test_gains_nobody_knows_cost_degrees(good: SimpleNamespace) -> None:
+    gains = replace(good.gains, source="object", sigma=np.array([[0.0] * 3, [0.02] * 3, [0.02] * 3]))
+    gate = judged(changed(good, gains=gains))["gain doubt"]
+    assert gate.state == "warn" and gate.cost_deg == pytest.approx(12)
+    assert judged(changed(good, gains=gains))["normal error"].value > 10  # type: ignore[operator]
+
+
+def test_body_that_polarizes_too_little_is_told(good: SimpleNamespace) -> None:
+    image = good.stokes
+    weak = image.stokes * np.array([1, 0.2, 0.2], np.float32)[:, None, None, None]
+    gate = judged(changed(good, stokes=replace(image, stokes=weak)))["body"]
+    assert gate.state == "warn" and "translucent" in gate.says and gate.cost_deg > 5
+
+
+def test_light_from_around_is_told(good: SimpleNamespace) -> None:
+    image = good.stokes
+    across = image.stokes * np.array([1, -1, -1], np.float32)[:, None, None, None]
+    gate = judged(changed(good, stokes=replace(image, stokes=across)))["body"]
+    assert gate.state == "fail" and "reflected" in gate.says
+
+
+@pytest.mark.parametrize(("name", "value"), [("border", 0.6), ("islands", 0.03), ("holes", 0.06)])
+def test_mask_of_a_doubtful_shape_warns(good: SimpleNamespace, name: str, value: float) -> None:
+    gate = judged(changed(good, object_=replace(good.object_, **{name: value})))["mask"]
+    assert gate.state == "warn" and "--mask" in gate.remedy
+
+
+def test_mask_that_its_network_doubts_fails(good: SimpleNamespace) -> None:
+    assert failed(changed(good, object_=replace(good.object_, doubt=0.2))) == ["mask"]
+
+
+def test_assumed_focal_length_warns(good: SimpleNamespace) -> None:
+    assert judged(changed(good, focal_known=False))["focal length"].state == "warn"
