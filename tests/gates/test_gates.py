@@ -105,7 +105,7 @@ def test_gains_nobody_knows_cost_degrees(good: SimpleNamespace) -> None:
 
 def test_body_that_polarizes_too_little_is_told(good: SimpleNamespace) -> None:
     image = good.stokes
-    weak = image.stokes * np.array([1, 0.2, 0.2], np.float32)[:, None, None, None]
+    weak = image.stokes * np.array([1, 0.13, 0.13], np.float32)[:, None, None, None]
     gate = judged(changed(good, stokes=replace(image, stokes=weak)))["body"]
     assert gate.state == "warn" and "translucent" in gate.says and gate.cost_deg > 5
 
