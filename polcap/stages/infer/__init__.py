@@ -5,6 +5,7 @@ hand back camera-frame maps.
 
     analytic       the inversion: zenith from DoLP, azimuth from AoLP
         azimuth        which of the two half-turns an AoLP means
+        body_law       which law of the body the DoLP follows, and the zenith it means
     learned        the network, joined with the inversion
         augmentation   the network's mean over turned and mirrored pictures
 """
@@ -27,7 +28,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 2
 
 
-@stage(version=6)
+@stage(version=7)
 def estimate(cues: Cues, network: Network | None, settings: Settings) -> SurfaceMaps:
     """Normal, diffuse, specular, roughness and expected error; network None means analytic.
 

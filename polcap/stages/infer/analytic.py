@@ -9,7 +9,8 @@ from scipy.special import erf
 
 from polcap.images import Cues, Floats, Quality, SurfaceMaps
 from polcap.optics import brdf, frames, fresnel
-from polcap.stages.infer import azimuth
+from polcap.stages.infer import azimuth, body_law
+from polcap.stages.infer.body_law import Zeniths
 
 _BLURS_PX = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0)
 _SAME = 2.0  # standard deviations that two averages of the same thing may differ by
@@ -39,20 +40,25 @@ def estimate(cues: Cues, ior: float) -> SurfaceMaps:
 def invert(cues: Cues, ior: float, guide: tuple[Floats, Floats] | None = None) -> tuple[Floats, Floats, Floats]:
     """Normals (H, W, 3), their expected error (H, W) in degrees and cosines of the zenith (H, W).
 
-    Zenith by the exact DoLP inversion; half-turn of the azimuth by `stages/infer/azimuth.py`, or as `guide` has it:
-    normals (H, W, 3) in the frame of each ray and their expected error (H, W), degrees.
+    Zenith by the DoLP and the law of the body that the cues speak for (`body_law.py`); half-turn of the azimuth by
+    `stages/infer/azimuth.py`, or as `guide` has it: normals (H, W, 3) in the frame of each ray and their expected error
+    (H, W), degrees.
     """
     ratio, sigma = _smoothed(cues)
     squared = ratio[0] ** 2 + ratio[1] ** 2
     dolp = np.sqrt(np.maximum(squared - sigma**2, 0))
-    cos_zenith = fresnel.cos_zenith_from_dolp(dolp, ior)
-    zenith = np.arccos(cos_zenith)
+    known = None
+    if guide is not None:
+        known = np.arccos(np.clip(guide[0][..., 2], 0, 1)), np.radians(guide[1])
+    read = body_law.zeniths(dolp, cues, ior, known)
+    zenith = read.angle
+    cos_zenith = np.cos(zenith)
     axis = ratio / np.sqrt(squared + 1e-12)
     if guide is None:
         phi, certainty = azimuth.resolve(axis, np.sin(zenith), cues.mask)
     else:
         phi, certainty = _guided(axis, cues.rays, *guide)
-    error = _expected_error(zenith, dolp, sigma, certainty, cues, ior)
+    error = _expected_error(read, dolp, sigma, certainty, cues)
     return _from_angles(cos_zenith, phi, cues.rays), error, cos_zenith
 
 
@@ -164,14 +170,15 @@ def _gloss(highlight: Floats, cos_zenith: Floats, cues: Cues) -> tuple[float, fl
     return roughness, f0
 
 
-def _expected_error(zenith: Floats, dolp: Floats, sigma: Floats, certainty: Floats, cues: Cues, ior: float) -> Floats:
-    """Expected normal error (H, W), degrees: noise through the inversion, the half-turn's doubt, the model's.
+def _expected_error(read: Zeniths, dolp: Floats, sigma: Floats, certainty: Floats, cues: Cues) -> Floats:
+    """Expected normal error (H, W), degrees: noise through the inversion, doubts of half-turn and law, the model's.
 
     A wrong half-turn costs 2θ and happens with probability (1 − certainty)/2.
     """
     step = np.maximum(sigma, 1e-5)
-    low, high = (np.arccos(fresnel.cos_zenith_from_dolp(dolp + s * step, ior)) for s in (-1, 1))
-    zenith_error = (high - low) / 2
+    zenith = read.angle
+    low, high = (read.at(np.maximum(dolp + s * step, 0)) for s in (-1, 1))
+    zenith_error = np.hypot((high - low) / 2, read.spread)
     azimuth_error = np.sin(zenith) * np.minimum(sigma / (2 * np.maximum(dolp, 1e-5)), np.pi / 4)
     flip = (1 - certainty) / 2 * 2 * zenith
     noise = np.degrees(np.hypot(zenith_error, azimuth_error))

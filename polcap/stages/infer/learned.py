@@ -41,6 +41,8 @@ def estimate(cues: Cues, network: Network, ior: float, symmetries: int) -> Surfa
     # beside the object the network guesses: zeros there leave an edge's direction to the object's own pixels
     small["normal"] = _without_grid(small["normal"], seen.mask) * seen.mask[..., None]
     small["factor"] = _factor(small["diffuse"], seen)
+    for name in ("specular", "roughness"):
+        small[name] = _blended(small[name], seen.mask)
     maps = {name: np.asarray(cv2.resize(image, size)) for name, image in small.items()}
     ahead = maps["normal"] / np.maximum(_length(maps["normal"]), 1e-6)
     guide = np.asarray(frames.to_ray_frame(ahead, cues.rays)), maps["sigma"]
@@ -85,6 +87,17 @@ def _without_grid(normal: Floats, mask: NDArray[np.bool_]) -> Floats:
         )
         out[place] -= common / np.maximum(share, _REACHED)[..., None] * mask[place][..., None]
     return out
+
+
+def _blended(image: Floats, mask: NDArray[np.bool_]) -> Floats:
+    """A map (H, W[, 3]) of gloss without the network's grid of one or two pixels: a kernel in which both vanish."""
+    inside = mask.astype(np.float32)
+    weight = inside if image.ndim == 2 else inside[..., None]
+    smooth, share = (
+        cv2.sepFilter2D(part, -1, _BINOMIAL, _BINOMIAL) for part in ((image * weight).astype(np.float32), inside)
+    )
+    share = share if image.ndim == 2 else share[..., None]
+    return np.where(weight > 0, smooth / np.maximum(share, _REACHED), image)
 
 
 def _detailed(coarse: Floats, fine: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:
