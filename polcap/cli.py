@@ -556,7 +556,7 @@ def train(
 def evaluate(
     context: typer.Context,
     model: Annotated[Path, typer.Argument(help="ONNX model.")],
-    data: Annotated[Path, typer.Argument(help="Folder with meshes/ and materials/.")],
+    data: Annotated[Path | None, typer.Argument(help="Folder with meshes/ and materials/.")] = None,
     out: Annotated[Path, typer.Option(help="Tables, picture panel and what is done so far.")] = Path("runs/evaluate"),
     ablations: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Networks to compare, DIR/NAME/last.pt of `polcap train`.")
@@ -567,8 +567,17 @@ def evaluate(
     protocol: Annotated[
         int, typer.Option(min=1, max=2, help="1: smooth bodies, high F0 as often as low; 2: rough bodies, F0 as met.")
     ] = 1,
+    real: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Photographs with normals instead: pol000/ … mask/ normal/.")
+    ] = None,
 ) -> None:
     """Score a model on test meshes and materials beside baselines and published figures (extra [train])."""
+    if (data is None) == (real is None):
+        raise SettingError("evaluate takes DATA, a folder with meshes/ and materials/, or --real DIR; give one of them")
+    if real is not None:
+        _extra("real").main(real, model, out)
+        terminal.say(str(out / "real.md"))
+        return
     judge, fixed = _extra("evaluate"), _extra("protocol")
     usual = (fixed.QUICK_COUNT, fixed.QUICK_SIZE) if quick else (fixed.COUNT, fixed.SIZE)
     judge.main(judge.Params(model, data, out, ablations, count or usual[0], size or usual[1], protocol))

@@ -19,4 +19,5 @@ In the order a sample meets them:
     evaluate    error of every map on fixed pictures of held-out meshes and materials, of which
                 protocol makes one at a time (patterns: its materials, transport: its light), baselines
                 estimates without a network, score judges, and tables and panel tell
+    real        error of normals on photographs that come with measured ones
 """

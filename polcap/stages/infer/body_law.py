@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from polcap.images import Cues, Floats, Quality
 from polcap.optics import body
@@ -128,7 +129,8 @@ def _round_outline(dolp: Floats, cues: Cues, laws: _Laws) -> Floats:
     return np.asarray(np.log(np.exp(-0.5 * ((seen - ball) / _OUTLINE_DEG) ** 2) + _SHARP))
 
 
-def _some(places: Floats) -> Floats:
+def _some(places: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Some thousand of many places, evenly."""
     return places[:: max(1, len(places) // _SAMPLES)]
 
 

@@ -1,0 +1,120 @@
+"""Photographs with measured normals -> how far polcap's are from them: the layout of the public shape-from-polarization
+sets, which are not bundled.
+
+    DIR/pol000/NAME.png  pol045  pol090  pol135   photographs behind a polarizer, or of a polarization sensor
+    DIR/mask/NAME.png                             not 0 on the object
+    DIR/normal/NAME.png                           n/2 + ½, camera frame, y up; 8 or 16 bit
+
+Any angle may be missing down to three. Pictures are taken as the whole path takes them, with the mask that is given and
+no chart; light from all sides, as in most of these sets, is not the flash that polcap asks for.
+"""
+
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.config import Config
+from polcap.errors import InputError
+from polcap.formats import atomic, onnx, png
+from polcap.formats import capture as captures
+from polcap.images import ChartRequest, Floats, Network
+from polcap.path import UserInput, path
+from polcap.store import Store
+
+_MISSED_DEG = 90.0  # what an object's pixel without a normal counts as
+_LIMITS_DEG = (11.25, 22.5, 30.0)
+_ROWS = ("mean", "median", *(f"within {limit:g}°" for limit in _LIMITS_DEG), "covered")
+
+Score = dict[str, float]
+
+
+def main(folder: Path, model: Path, out: Path) -> dict[str, Score]:
+    """Score every picture with the network and without; writes out/real.json and out/real.md.
+
+    Raises
+    ------
+    InputError
+        The folder has not this layout.
+    """
+    names, angles = _contents(folder)
+    network = onnx.load(model)
+    rows: dict[str, dict[str, Score]] = {
+        name: {"ours": scored(folder, angles, name, network), "analytic": scored(folder, angles, name, None)}
+        for name in names
+    }
+    table = {
+        column: {row: float(np.mean([figures[column][row] for figures in rows.values()])) for row in _ROWS}
+        for column in ("ours", "analytic")
+    }
+    result = {"folder": str(folder), "model": network.digest, "table": table, "pictures": rows}
+    for file, text in (("real.json", json.dumps(result, indent=1)), ("real.md", _page(folder, rows, table))):
+        with atomic.path(out / file) as beside:
+            beside.write_text(text, encoding="utf-8")
+    return table
+
+
+def _contents(folder: Path) -> tuple[list[str], list[str]]:
+    """Names of the pictures that have a mask and a normal map, and the folders of angles."""
+    angles = sorted(place.name for place in folder.glob("pol*") if place.is_dir())
+    names = sorted(place.name for place in (folder / "normal").glob("*.png"))
+    if len(angles) < 3 or not names:
+        raise InputError(
+            f"{folder} holds {len(angles)} folders pol… and {len(names)} normal maps; --real takes pol000 pol045 "
+            "pol090 [pol135], mask and normal, with pictures of the same names"
+        )
+    for name in names:
+        missing = [part for part in (*angles, "mask") if not (folder / part / name).exists()]
+        if missing:
+            raise InputError(f"{folder / missing[0] / name} is missing; every normal map needs its pictures and mask")
+    return names, angles
+
+
+def scored(folder: Path, angles: list[str], name: str, network: Network | None) -> Score:
+    """Angles between estimated and given normals over the mask that is given, degrees; shares 0…1."""
+    mask, truth = _mask(folder / "mask" / name), _normal(folder / "normal" / name)
+    with tempfile.TemporaryDirectory() as place:
+        for angle in angles:
+            (Path(place) / "shots" / angle).mkdir(parents=True)
+            (Path(place) / "shots" / angle / name).symlink_to((folder / angle / name).resolve())
+        capture = captures.read(Path(place) / "shots", None)
+        supplied = UserInput(chart=ChartRequest("none"), mask=mask, network=network)
+        found = path(capture, supplied, Config(), Store(Path(place) / "out"))
+        maps, (x0, y0, x1, y1) = found.maps.value, found.object_.value.crop
+    by = round(mask.shape[0] / found.radiance.value.value.shape[1])
+    error = np.full(mask[::by, ::by].shape, _MISSED_DEG)
+    there = truth[::by, ::by][y0:y1, x0:x1]
+    cosine = np.clip((maps.normal * there).sum(-1), -1, 1)
+    error[y0:y1, x0:x1] = np.where(maps.mask, np.degrees(np.arccos(cosine)), _MISSED_DEG)
+    covered = np.zeros(error.shape, bool)
+    covered[y0:y1, x0:x1] = maps.mask
+    inside = mask[::by, ::by]
+    figures = {"mean": float(error[inside].mean()), "median": float(np.median(error[inside]))}
+    figures |= {f"within {limit:g}°": float((error[inside] < limit).mean()) for limit in _LIMITS_DEG}
+    return figures | {"covered": float(covered[inside].mean())}
+
+
+def _mask(file: Path) -> NDArray[np.bool_]:
+    picture = png.read(file)
+    return np.asarray((picture if picture.ndim == 2 else picture[..., :3].max(-1)) > 0)
+
+
+def _normal(file: Path) -> Floats:
+    picture = png.read(file)
+    vector = picture[..., :3].astype(np.float64) / np.iinfo(picture.dtype).max * 2 - 1
+    return np.asarray(vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-6))
+
+
+def _page(folder: Path, rows: dict[str, dict[str, Score]], table: dict[str, Score]) -> str:
+    lines = [f"# Photographs with measured normals: {folder.name}", ""]
+    lines += ["| | " + " | ".join(_ROWS) + " |", "|" + " --- |" * (len(_ROWS) + 1)]
+    told: dict[str, Any] = {f"mean, {column}": figures for column, figures in table.items()}
+    told |= {f"{name}, {column}": figures for name, both in rows.items() for column, figures in both.items()}
+    lines += [
+        f"| {name} | " + " | ".join(f"{figures[row]:.3g}" for row in _ROWS) + " |" for name, figures in told.items()
+    ]
+    lines += ["", f"Degrees over the mask that is given; a pixel without a normal counts as {_MISSED_DEG:g}°."]
+    return "\n".join(lines) + "\n"
