@@ -1,6 +1,5 @@
 """What several tests share: the bundled capture, the `polcap` command, and one finished run of the two."""
 
-import fcntl
 import os
 import signal
 import subprocess
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from filelock import FileLock
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run beside each other
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # as in a shell's background job; interruption is tested
@@ -17,6 +17,30 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # as in a shell's backgro
 
 ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "examples" / "capture"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """With POLCAP_SKIPPED_TO=FILE, what this machine skipped is listed there, for a richer one to run with `@FILE`."""
+    if (file := os.environ.get("POLCAP_SKIPPED_TO")) and not hasattr(config, "workerinput"):
+        config.pluginmanager.register(SkippedList(Path(file)))
+
+
+class SkippedList:
+    """Collects what was skipped, whole files and single tests."""
+
+    def __init__(self, file: Path) -> None:
+        self._file, self._names = file, set[str]()
+
+    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
+        if report.skipped:
+            self._names.add(report.nodeid)
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.skipped:
+            self._names.add(report.nodeid)
+
+    def pytest_sessionfinish(self) -> None:
+        self._file.write_text("".join(f"{name}\n" for name in sorted(self._names)), encoding="utf-8")
 
 
 class Done(NamedTuple):
@@ -64,8 +88,7 @@ def result(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
     shared = tmp_path_factory.getbasetemp()
     shared = shared if worker_id == "master" else shared.parent
     folder = shared / "bundled"
-    with (shared / "bundled.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with FileLock(shared / "bundled.lock"):
         if not (folder / "report.json").exists():
             done = shell("process", EXAMPLE, "--out", folder, "--estimator", "analytic")
             assert done.returncode == 0, done.stderr
