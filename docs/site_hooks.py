@@ -1,4 +1,4 @@
-"""Two things that the site needs beyond its pages: every decision listed, and links out of docs/ made names of files.
+"""Two things that the site needs beyond its pages: pages listed by folder, and links out of docs/ made names of files.
 
 Read by mkdocs (`hooks:` in mkdocs.yml).
 """
@@ -12,19 +12,17 @@ _OUT = re.compile(r"\[([^\]]+)\]\(((?:\.\./)+[^)#]*)(?:#[^)]*)?\)")
 
 
 def on_config(config: Any) -> Any:
-    """Put the decision records, in order, where the navigation names their folder."""
-    _fill(config.nav)
+    """Put a folder's pages, in the order of their names, where the navigation names the folder."""
+    config.nav = [
+        {title: _pages(inside) if (DOCS / inside).is_dir() else inside}
+        for entry in config.nav
+        for title, inside in entry.items()
+    ]
     return config
 
 
-def _fill(entries: list[Any]) -> None:
-    for entry in entries:
-        if isinstance(entry, dict):
-            for title, inside in entry.items():
-                if inside == "explanations/decisions":
-                    entry[title] = [str(p.relative_to(DOCS)) for p in sorted((DOCS / inside).glob("*.md"))]
-                elif isinstance(inside, list):
-                    _fill(inside)
+def _pages(folder: str) -> list[str]:
+    return [page.relative_to(DOCS).as_posix() for page in sorted((DOCS / folder).glob("*.md"))]
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
