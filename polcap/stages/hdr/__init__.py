@@ -29,7 +29,7 @@ from polcap.stages import stage
 from polcap.stages.hdr import combine, links, noise
 from polcap.stages.hdr.ambient import same_size
 from polcap.stages.hdr.combine import Merged
-from polcap.stages.hdr.frames import Reader
+from polcap.stages.hdr.planes import Reader
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

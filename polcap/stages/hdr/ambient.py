@@ -9,7 +9,7 @@ from polcap.errors import CaptureError
 from polcap.images import Bits, Floats, Frame, Shot
 from polcap.optics import demosaic, sensor
 from polcap.stages.hdr import noise
-from polcap.stages.hdr.frames import Reader, planar, signals
+from polcap.stages.hdr.planes import Reader, planar, signals
 
 _CLIP = 0.98
 

@@ -11,9 +11,9 @@ from polcap.images import Bits, Floats, Quality, Shot
 from polcap.stages.hdr import ambient as ambients
 from polcap.stages.hdr import noise, registration
 from polcap.stages.hdr.ambient import Ambient
-from polcap.stages.hdr.frames import Reader, Signals, blocks, signals
 from polcap.stages.hdr.ghosts import edges
 from polcap.stages.hdr.links import Measured
+from polcap.stages.hdr.planes import Reader, Signals, blocks, signals
 
 Bools = NDArray[np.bool_]
 

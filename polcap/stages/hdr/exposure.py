@@ -7,7 +7,7 @@ import numpy as np
 
 from polcap.images import Floats
 from polcap.optics.robust import MAD_TO_SIGMA
-from polcap.stages.hdr.frames import Signals, tile_means
+from polcap.stages.hdr.planes import Signals, tile_means
 
 _TONE_RANGE, _TONE_BINS, _TONE_SPAN = (0.01, 0.9), 8, 0.7  # of the sensor's range; bins; ln of brightness, one stop
 TILE = 16  # px

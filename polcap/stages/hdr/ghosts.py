@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
-from polcap.stages.hdr.frames import Signals, blocks
 from polcap.stages.hdr.noise import Noise
+from polcap.stages.hdr.planes import Signals, blocks
 
 Bools = NDArray[np.bool_]
 

@@ -12,8 +12,8 @@ from polcap.optics import sensor
 from polcap.stages.hdr import ambient as ambients
 from polcap.stages.hdr import exposure, noise, registration
 from polcap.stages.hdr.ambient import promised, same_size
-from polcap.stages.hdr.frames import Planes, Reader, Signals, signals
 from polcap.stages.hdr.ghosts import Anchor, Exposed, FirstEstimate
+from polcap.stages.hdr.planes import Planes, Reader, Signals, signals
 
 Bools = NDArray[np.bool_]
 

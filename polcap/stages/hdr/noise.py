@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Floats
 from polcap.optics.robust import MAD_TO_SIGMA
-from polcap.stages.hdr.frames import Signals
+from polcap.stages.hdr.planes import Signals
 
 TILE = 16  # px; about 68 independent second differences, so that one tile knows its variance to 17 %
 _FREEDOM = TILE * TILE / 3.78  # 3.78 = Σ ρ² over the autocorrelation of [1, −2, 1] ⊗ [1, −2, 1]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from polcap.errors import CaptureError
 from polcap.images import Floats
 from polcap.stages.hdr import motion
-from polcap.stages.hdr.frames import Planes, Signals, blocks
+from polcap.stages.hdr.planes import Planes, Signals, blocks
 
 Bools = NDArray[np.bool_]
 

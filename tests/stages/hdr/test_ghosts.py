@@ -3,9 +3,9 @@
 import numpy as np
 
 from polcap.stages.hdr import frames, ghosts
-from polcap.stages.hdr.frames import Planes, planar
 from polcap.stages.hdr.ghosts import Exposed
 from polcap.stages.hdr.noise import Noise
+from polcap.stages.hdr.planes import Planes, planar
 
 WELL = 30000.0
 LINE = Noise(np.full(3, 1 / WELL, np.float32), np.full(3, 1e-9, np.float32))

@@ -14,7 +14,7 @@ from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.stages import hdr
 from polcap.stages.hdr import frames, links, noise
 from polcap.stages.hdr import ghosts as bracket_pixels
-from polcap.stages.hdr.frames import Reader, signals
+from polcap.stages.hdr.planes import Reader, signals
 
 RGGB = np.array([[0, 1], [1, 2]], np.uint8)
 BLACK, WHITE, READ, GAIN = 512.0, 15871.0, 3.0, 2.0  # counts, counts, e⁻, e⁻ per count at ISO 100

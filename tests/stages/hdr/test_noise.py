@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from polcap.stages.hdr import noise
-from polcap.stages.hdr.frames import Planes, planar
+from polcap.stages.hdr.planes import Planes, planar
 
 WELL, READ = 30000.0, 4.0
 
