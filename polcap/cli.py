@@ -35,6 +35,7 @@ Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.
 
 def main() -> None:
     """The `polcap` command."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # else the order of its sums follows the number of threads
     arguments = sys.argv[1:]
     if "--debug" in arguments:  # wherever it stands
         arguments = ["--debug", *(argument for argument in arguments if argument != "--debug")]
@@ -604,7 +605,7 @@ def _may_write(said: bool | None, ports: list[str]) -> bool:
 def _use_threads(count: int) -> None:
     """Set the number of threads before any numerical library starts its own."""
     if count:
-        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
             os.environ[name] = str(count)
         import cv2
 

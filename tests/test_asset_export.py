@@ -12,7 +12,7 @@ import pytest
 
 from polcap.formats import encoders, png
 from polcap.formats.presets import PRESETS
-from tests.conftest import Command
+from tests.conftest import Command, shell
 from tests.formats.test_gltf import NODE, document
 
 
@@ -113,3 +113,15 @@ def test_usd_without_its_package_is_one_line_with_the_remedy(
     monkeypatch.setitem(sys.modules, "pxr", None)
     done = polcap("export", result, "--usd")
     assert done.returncode == 2 and "pip install usd-core" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_number_of_threads_changes_no_byte(example: Path, tmp_path: Path) -> None:
+    """Two whole runs; the network's own sums are tested with it (tests/training/test_profiles.py)."""
+    found = []
+    for threads in (1, 2):
+        out = tmp_path / str(threads)
+        done = shell("process", example, "--out", out, "--estimator", "analytic", "--threads", threads)
+        assert done.returncode == 0, done.stderr
+        found.append({file.name: file.read_bytes() for part in ("maps", "asset") for file in (out / part).iterdir()})
+        found[-1] |= {str(file.relative_to(out)): file.read_bytes() for file in (out / "work").rglob("*.npy")}
+    assert [name for name in found[0] if found[0][name] != found[1][name]] == [] and found[0].keys() == found[1].keys()

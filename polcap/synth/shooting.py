@@ -72,9 +72,7 @@ class Shoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return View(self.focal_mm / _SENSOR_MM * self.width, center, scale=1)
 
 
-def write(
-    folder: Path, scene: Scene, shoot: Shoot, frame_written: Callable[[int, int], None] | None = None
-) -> None:
+def write(folder: Path, scene: Scene, shoot: Shoot, frame_written: Callable[[int, int], None] | None = None) -> None:
     """Photograph `scene` into `folder`, which is made; the same arguments give the same bytes.
 
     `frame_written` is told how many of how many photographs are there.

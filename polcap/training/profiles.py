@@ -20,6 +20,7 @@ _EDGES_DEG = (0.0, 4.0, 8.0, 12.0, 17.0, 23.0, 30.0, 40.0, 52.0, 66.0, 90.0)
 _BINS = len(_EDGES_DEG) - 1
 _FIGURES = 6  # per bin
 PROFILE = _BINS * _FIGURES
+_BLOCK = 64  # divides the places of every picture: sides are multiples of 32, profiles read every second place
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def profile(weight: Tensor, figures: Tensor, cosine: Tensor) -> Tensor:
     edges = cosine.new_tensor([cos(radians(angle)) for angle in _EDGES_DEG]).view(1, -1, 1)
     at = ((cosine <= edges[:, :-1]) & (cosine > edges[:, 1:])).to(weight.dtype)  # (B, bins, N)
     seen = torch.cat([torch.ones_like(cosine), figures], dim=1)
-    sums = weight @ (at[:, :, None] * seen[:, None]).flatten(1, 2).transpose(1, 2)
+    sums = summed(weight, (at[:, :, None] * seen[:, None]).flatten(1, 2).transpose(1, 2))
     sums = sums.unflatten(2, (_BINS, _FIGURES))
     share, total = sums[..., :1], sums[..., :1].sum(dim=2, keepdim=True) + 1e-3
     mean = sums[..., 1:] / (share + 1e-4 * total)
@@ -88,3 +89,12 @@ def profile(weight: Tensor, figures: Tensor, cosine: Tensor) -> Tensor:
         torch.log(share[..., 0] / total[..., 0] + 1e-3) / 3, light - whole, excess, torch.log1p(factor), square, short,
     )  # fmt: skip
     return torch.stack(columns, dim=-1).flatten(2)
+
+
+def summed(weight: Tensor, values: Tensor) -> Tensor:
+    """weight (B, G, N) @ values (B, N, K), in blocks of N added in one order.
+
+    onnxruntime 1.32 cuts a long sum of few rows into as many parts as it has threads, and the last bits follow.
+    """
+    blocks = weight.unflatten(2, (-1, _BLOCK)).transpose(1, 2) @ values.unflatten(1, (-1, _BLOCK))  # (B, ·, G, K)
+    return blocks.sum(dim=1)

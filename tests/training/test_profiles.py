@@ -1,6 +1,9 @@
 """Light over zenith: what the profile says is what was rendered."""
 
+from pathlib import Path
+
 import numpy as np
+import pytest
 import torch
 
 from polcap.optics import brdf, fresnel, shade
@@ -80,3 +83,25 @@ def test_two_colors_in_a_fine_print_are_told_apart() -> None:
         alone = told(one * kind)[:, :, kind[0, 0]]
         torch.testing.assert_close(both[:, :, kind[0, 0]], alone, rtol=1e-3, atol=1e-3)
     assert (both[:, :, 0, 0] - both[:, :, 0, 1]).abs().max() > 0.01
+
+
+class Alone(torch.nn.Module):  # type: ignore[misc]
+    """`profile` as a model of its own: 14 channels are the groups, the figures and the cosine."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        weight, figures, cosine = x.flatten(2).split((8, 5, 1), dim=1)
+        return profiles.profile(weight.sigmoid(), figures, cosine)
+
+
+def test_exported_sums_are_the_same_whatever_the_number_of_threads(tmp_path: Path) -> None:
+    ort = pytest.importorskip("onnxruntime")
+    inputs = torch.rand(1, 14, 128, 112)
+    file = tmp_path / "profile.onnx"
+    torch.onnx.export(Alone(), (inputs,), str(file), opset_version=17, dynamo=False)
+    found = []
+    for threads in (1, 2, 3):
+        options = ort.SessionOptions()
+        options.intra_op_num_threads = threads
+        session = ort.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+        found.append(session.run(None, {session.get_inputs()[0].name: inputs.numpy()})[0].tobytes())
+    assert found[0] == found[1] == found[2]
