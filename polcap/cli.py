@@ -490,7 +490,7 @@ def capture(
     from polcap.rig import camera as cameras
     from polcap.rig import plan, sequence
 
-    given = {
+    stated = {
         "rotator": rotator,
         "camera": camera,
         "angles_deg": _angles(angles),
@@ -499,7 +499,7 @@ def capture(
         "ambient": ambient or None,
         "chart": chart or None,
     }
-    wanted = sequence.order(folder, given, resume)
+    wanted = sequence.order(folder, stated, resume)
     if dry_run:
         planned = plan.dry_run(wanted)
         terminal.say(planned if json else plan.table(planned))
@@ -545,11 +545,11 @@ def train(
 ) -> None:
     """Train the network (extra [train])."""
     trainer = _extra("train")
-    told = trainer.Params(
+    params = trainer.Params(
         preset=preset, data=data, out=out, minutes=minutes, samples=samples, variant=variant, resume=resume,
         start=start, threads=threads, seed=seed,
     )  # fmt: skip
-    terminal.say(str(trainer.main(told)))
+    terminal.say(str(trainer.main(params)))
 
 
 @app.command()

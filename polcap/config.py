@@ -134,8 +134,8 @@ def load(file: Path | None = None, assignments: Sequence[str] = ()) -> Config:
     SettingError
         The file is not TOML, or a key is unknown, of the wrong type or out of its range.
     """
-    given = _read(file) if file else {}
-    for section, values in given.items():
+    stated = _read(file) if file else {}
+    for section, values in stated.items():
         if not isinstance(values, dict):
             raise SettingError(f"{file}: `{section}` is not a section; write [stage] and below it name = value")
     for assignment in assignments:
@@ -143,16 +143,16 @@ def load(file: Path | None = None, assignments: Sequence[str] = ()) -> Config:
         section, dot, name = key.strip().partition(".")
         if not equals or not dot:
             raise SettingError(f"--set {assignment}: not of the form stage.name=value, as in hdr.clip=0.95")
-        given.setdefault(section, {})[name] = _parse(text.strip())
-    _check_finite(given)
+        stated.setdefault(section, {})[name] = _parse(text.strip())
+    _check_finite(stated)
     known = {setting.key: setting for setting in settings()}
-    for section, values in given.items():
+    for section, values in stated.items():
         for name, value in values.items():
             _check_known(f"{section}.{name}", value, known)
     try:
-        return msgspec.convert(given, Config)
+        return msgspec.convert(stated, Config)
     except msgspec.ValidationError as error:
-        raise _explain(error, given, known) from error
+        raise _explain(error, stated, known) from error
 
 
 def restored(about: Mapping[str, Any], file: Path) -> Config:
@@ -169,16 +169,16 @@ def restored(about: Mapping[str, Any], file: Path) -> Config:
         raise StorageError(f"{file}: its settings are not this polcap's ({error}); run `polcap process`") from error
 
 
-def fill(kind: type[S], given: dict[str, Any], assignments: Sequence[str]) -> S:
+def fill(kind: type[S], stated: dict[str, Any], assignments: Sequence[str]) -> S:
     """A single struct from given values and name=value assignments, as strict as `load`."""
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
         if not equals or name not in kind.__struct_fields__:
             raise SettingError(f"--set {assignment}: give one of {', '.join(kind.__struct_fields__)} as name=value")
-        given = {**given, name: _parse(text.strip())}
-    _check_finite(given)
+        stated = {**stated, name: _parse(text.strip())}
+    _check_finite(stated)
     try:
-        return msgspec.convert(given, kind)
+        return msgspec.convert(stated, kind)
     except msgspec.ValidationError as error:
         raise SettingError(f"--set: {error}") from error
 
@@ -218,10 +218,10 @@ def _parse(text: str) -> Any:
         return text
 
 
-def _check_finite(given: dict[str, Any]) -> None:
+def _check_finite(stated: dict[str, Any]) -> None:
     """No limit of a setting stops a NaN."""
     try:
-        text_file.check_finite(given)
+        text_file.check_finite(stated)
     except ValueError as error:
         raise SettingError(f"{error}; give a number") from error
 
@@ -234,11 +234,11 @@ def _check_known(key: str, value: Any, known: dict[str, Setting]) -> None:
     raise SettingError(f"{key} = {value!r}: there is no such setting{hint}")
 
 
-def _explain(error: msgspec.ValidationError, given: dict[str, Any], known: dict[str, Setting]) -> SettingError:
+def _explain(error: msgspec.ValidationError, stated: dict[str, Any], known: dict[str, Setting]) -> SettingError:
     message, _, path = str(error).partition(" - at `$.")
     key = path.rstrip("`").split("[")[0]
     section, _, name = key.partition(".")
-    value = given.get(section, {}).get(name)
+    value = stated.get(section, {}).get(name)
     about = known[key].description if key in known else ""
     if message.startswith("Invalid enum value"):
         message = f"not one of {known[key].kind.removeprefix('Literal').strip('[]')}"

@@ -79,8 +79,8 @@ def shown(found: tuple[Finding, ...]) -> dict[str, object]:
 def _libraries() -> Finding:
     import cv2
 
-    told = ", ".join(f"{name} {module}" for name, module in (("numpy", np.__version__), ("OpenCV", cv2.__version__)))
-    return Finding("polcap", "ok", f"{__version__}, Python {sys.version.split()[0]}, {told}")
+    version = ", ".join(f"{name} {module}" for name, module in (("numpy", np.__version__), ("OpenCV", cv2.__version__)))
+    return Finding("polcap", "ok", f"{__version__}, Python {sys.version.split()[0]}, {version}")
 
 
 def _decoder() -> Finding:
@@ -116,8 +116,8 @@ def _model(file: Path | None) -> Finding:
         network = onnx.load(file)
     except PolcapError as error:
         return Finding("model", "fault", str(error), "install polcap again, or use --estimator analytic")
-    told = network.metadata.get("version", network.digest[:8])
-    return Finding("model", "ok", f"{file.name}, version {told}, {file.stat().st_size / 1e6:.1f} MB, loads")
+    version = network.metadata.get("version", network.digest[:8])
+    return Finding("model", "ok", f"{file.name}, version {version}, {file.stat().st_size / 1e6:.1f} MB, loads")
 
 
 def _providers(model: Path) -> Iterator[Finding]:

@@ -64,7 +64,7 @@ def run(wanted: Sequence[Unit], order: Order, workers: int, retries: int) -> Ite
                     if attempt <= retries:
                         queue.append((unit, attempt + 1))
                     else:
-                        yield units.crashed(unit, _obituary(attempt), attempt)
+                        yield units.crashed(unit, _cause_of_death(attempt), attempt)
                 else:
                     hand.busy = None
                     yield record
@@ -82,7 +82,7 @@ def _answer(hand: _Hand) -> Record | None:
         return None
 
 
-def _obituary(attempts: int) -> str:
+def _cause_of_death(attempts: int) -> str:
     return (
         f"its process died {attempts} times; most often memory runs out: run fewer --workers, lower --memory, "
         "or take it out of the batch"

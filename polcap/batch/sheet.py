@@ -36,26 +36,26 @@ def summary(records: Sequence[Record]) -> dict[str, Any]:
 
 def write(desk: Path, units: Sequence[Unit], records: Sequence[Record]) -> None:
     """The three summaries into the batch's folder. Raises StorageError."""
-    told = summary(records)
+    totals = summary(records)
     text = io.StringIO()
     table = csv.DictWriter(text, ["name", "state", "seconds", "attempts", "says"], extrasaction="ignore")
     table.writeheader()
-    table.writerows(told["rows"])
+    table.writerows(totals["rows"])
     written = {
-        "summary.json": json.dumps(told, ensure_ascii=False, indent=1) + "\n",
+        "summary.json": json.dumps(totals, ensure_ascii=False, indent=1) + "\n",
         "summary.csv": text.getvalue(),
-        "summary.html": _page(told, units, records),
+        "summary.html": _page(totals, units, records),
     }
     for name, content in written.items():
         with atomic.path(desk / name) as temporary:
             temporary.write_text(content, encoding="utf-8")
 
 
-def _page(told: dict[str, Any], units: Sequence[Unit], records: Sequence[Record]) -> str:
-    states = ", ".join(f"{count} {state}" for state, count in told["states"].items())
+def _page(totals: dict[str, Any], units: Sequence[Unit], records: Sequence[Record]) -> str:
+    states = ", ".join(f"{count} {state}" for state, count in totals["states"].items())
     lines = [
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{FOLDER}</title><style>{_STYLE}</style>',
-        f"<h1>{told['finished']} of {told['captures']} captures finished ({escape(states)})</h1>",
+        f"<h1>{totals['finished']} of {totals['captures']} captures finished ({escape(states)})</h1>",
     ]
     wrong = [record for record in records if record.state != "done"]
     if wrong:

@@ -113,13 +113,13 @@ def _process(unit: Unit, order: Order) -> dict[str, Any]:
     from polcap.path import UserInput
 
     config = msgspec.convert(order.settings, Config)
-    given = UserInput(
+    supplied = UserInput(
         chart=order.chart,
         network=_network(order.estimator, order.model, order.device, order.threads),
         mask_network=pipeline.load_mask_network(order.threads),
     )
     found = captures.read(unit.capture, order.angles_deg)
-    about = pipeline.process(found, given, config, Path(unit.out))
+    about = pipeline.process(found, supplied, config, Path(unit.out))
     assert about is not None  # only `until` leaves it out
     thumbnail.write(unit.thumbnail_file, Path(unit.out))
     return about

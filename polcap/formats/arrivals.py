@@ -10,16 +10,16 @@ _POLL_S = 0.2
 Seen = dict[str, tuple[int, int]]  # size and time of change by path
 
 
-def settled(folder: Path, apart: Path, still_s: float = 2.0) -> Iterator[None]:
+def settled(folder: Path, ignored: Path, still_s: float = 2.0) -> Iterator[None]:
     """Yield at once, then whenever files came, went or changed and then nothing moved for `still_s` seconds.
 
     `apart` is not looked at (what is made of the folder may lie in it), nor is what begins with a dot.
     """
-    folder, apart = folder.resolve(), apart.resolve()
+    folder, ignored = folder.resolve(), ignored.resolve()
     done: Seen | None = None
-    last, since = _seen(folder, apart), time.monotonic()
+    last, since = _seen(folder, ignored), time.monotonic()
     while True:
-        now = _seen(folder, apart)
+        now = _seen(folder, ignored)
         if now != last:
             last, since = now, time.monotonic()
         elif now != done and (done is None or time.monotonic() - since >= still_s):
@@ -28,12 +28,12 @@ def settled(folder: Path, apart: Path, still_s: float = 2.0) -> Iterator[None]:
         time.sleep(_POLL_S)
 
 
-def _seen(folder: Path, apart: Path) -> Seen:
+def _seen(folder: Path, ignored: Path) -> Seen:
     """All files below the folder; those that vanish meanwhile are left out."""
     found: Seen = {}
     for root, folders, files in os.walk(folder):
         here = Path(root)
-        folders[:] = [name for name in folders if not name.startswith(".") and (here / name) != apart]
+        folders[:] = [name for name in folders if not name.startswith(".") and (here / name) != ignored]
         for name in files:
             if name.startswith("."):
                 continue

@@ -203,8 +203,8 @@ def _check(path: Path, session: Any, metadata: Mapping[str, str], encoding: str)
         )
     for name in NUMBERS:
         if not _usable(metadata[name]):
-            told = metadata[name][:20]
-            raise ModelError(f"{path}: {name} = {told!r} in its metadata is not a whole number of 1 to {_MOST_NUMBER}")
+            value = metadata[name][:20]
+            raise ModelError(f"{path}: {name} = {value!r} in its metadata is not a whole number of 1 to {_MOST_NUMBER}")
     channels = tuple(name.strip() for name in metadata["channels"].split(","))
     entry = session.get_inputs()
     shape = entry[0].shape if entry else []

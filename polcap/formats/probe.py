@@ -39,17 +39,17 @@ def read(path: str | Path) -> Probe:
     DecodeError
         The file cannot be read, no decoder recognises it, it is cut short or of a form that polcap refuses.
     """
-    told, _ = worker.call(examine, path, limit_s=_LIMIT_S, limit_gib=_LIMIT_GIB)
-    found = msgspec.convert(told["probe"], Probe)
-    if told["doubtful"]:  # decoding tells; some cameras note odd places for previews
+    answer, _ = worker.call(examine, path, limit_s=_LIMIT_S, limit_gib=_LIMIT_GIB)
+    found = msgspec.convert(answer["probe"], Probe)
+    if answer["doubtful"]:  # decoding tells; some cameras note odd places for previews
         raw.read(path) if found.kind == "raw" else photo.read(path)
     return found
 
 
 def kind(path: str | Path) -> sniff.Kind:
     """The kind alone, by the first bytes. Raises DecodeError where the file cannot be read."""
-    told, _ = worker.call(sniffed, path, limit_s=_LIMIT_S, limit_gib=_LIMIT_GIB)
-    found: sniff.Kind = told["kind"]
+    answer, _ = worker.call(sniffed, path, limit_s=_LIMIT_S, limit_gib=_LIMIT_GIB)
+    found: sniff.Kind = answer["kind"]
     return found
 
 
@@ -64,7 +64,7 @@ def examine(path: str) -> worker.Answer:
     with photo_bytes.opened(path) as file:
         found = sniff.kind(file, Path(path).suffix)
         if found == "other":
-            return _told(Probe(found))
+            return _answer(Probe(found))
         file.seek(0)
         data = file.read()
     if not data:
@@ -76,14 +76,14 @@ def examine(path: str) -> worker.Answer:
     except DecodeError:
         if found == "raw":
             raise
-        return _told(Probe("unknown"))
+        return _answer(Probe("unknown"))
 
 
 def _photo(path: str, data: bytes) -> worker.Answer:
     size = photo.size(path, data)
-    told = exif.sized(exif.tags(data), size["width"], size["height"])
-    found = Probe("photo", photo_bytes.digest(data), told, size["channels"], size["bits"])
-    return _told(found, sniff.structure(io.BytesIO(data)).truncated)
+    stated = exif.sized(exif.tags(data), size["width"], size["height"])
+    found = Probe("photo", photo_bytes.digest(data), stated, size["channels"], size["bits"])
+    return _answer(found, sniff.structure(io.BytesIO(data)).truncated)
 
 
 def _raw(path: str, data: bytes) -> worker.Answer:
@@ -92,11 +92,11 @@ def _raw(path: str, data: bytes) -> worker.Answer:
     known = exif.tags(data)
     bare = known.exposure_time is None and not known.make  # CRW: the decoder knows more, but has to unpack
     size = raw.size(path, data, unpack=bare)
-    told = replace(exif.sized(known, size["width"], size["height"]), **size.get("exif", {}))
+    stated = replace(exif.sized(known, size["width"], size["height"]), **size.get("exif", {}))
     lossy = plausible.is_lossy(structure)
-    return _told(Probe("raw", photo_bytes.digest(data), told, lossy=lossy), structure.truncated or lossy)
+    return _answer(Probe("raw", photo_bytes.digest(data), stated, lossy=lossy), structure.truncated or lossy)
 
 
-def _told(found: Probe, doubtful: bool = False) -> worker.Answer:
+def _answer(found: Probe, doubtful: bool = False) -> worker.Answer:
     answer: dict[str, Any] = {"probe": asdict(found), "doubtful": doubtful}
     return answer, {}

@@ -47,12 +47,12 @@ def record(about: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def words(told: Mapping[str, Any]) -> dict[str, str]:
+def words(facts: Mapping[str, Any]) -> dict[str, str]:
     """The same as texts, for formats that keep only those."""
-    return {key: value if isinstance(value, str) else _plain(value) for key, value in told.items()}
+    return {key: value if isinstance(value, str) else _plain(value) for key, value in facts.items()}
 
 
-def write(path: Path, told: Mapping[str, Any], files: Iterable[Path]) -> None:
+def write(path: Path, facts: Mapping[str, Any], files: Iterable[Path]) -> None:
     """The sidecar: the record, and the digest of every file of the export.
 
     Raises
@@ -62,7 +62,7 @@ def write(path: Path, told: Mapping[str, Any], files: Iterable[Path]) -> None:
     """
     digests = {file.name: blake2b(file.read_bytes(), digest_size=20).hexdigest() for file in sorted(files)}
     with atomic.path(path) as temporary:
-        text = json.dumps({**told, "files": digests}, indent=1, ensure_ascii=False)
+        text = json.dumps({**facts, "files": digests}, indent=1, ensure_ascii=False)
         temporary.write_text(text + "\n", encoding="utf-8")
 
 

@@ -24,13 +24,13 @@ def judge(found: Found, config: Config) -> Iterator[Gate]:
     InputError
         From a stage that gave up, where `found` computes what it is asked for.
     """
-    told: list[Gate] = []
+    judged: list[Gate] = []
     for gate in _in_order(found, config):
-        told.append(gate)
+        judged.append(gate)
         yield gate
         if gate.name == "order" and gate.state == "fail":
             return  # in another order all that follows is another capture's
-    yield _normal_error(found, told, config.gates)
+    yield _normal_error(found, judged, config.gates)
     yield _focal_length(found.focal_known)
 
 
@@ -59,13 +59,13 @@ def _in_order(found: Found, config: Config) -> Iterator[Gate]:
     yield polarization.ill_posed(found, limits)
 
 
-def _normal_error(found: Found, told: list[Gate], limits: Gates) -> Gate:
+def _normal_error(found: Found, judged: list[Gate], limits: Gates) -> Gate:
     """The median expected error, with what the other gates add to it."""
     maps = found.maps
     inside = maps.confidence[maps.mask]
     own = float(np.median(inside)) if inside.size else float("nan")
-    expected = float(np.sqrt(own**2 + sum(gate.cost_deg**2 for gate in told)))
-    because = ", ".join(gate.name for gate in told if gate.cost_deg > 0.5 * own)
+    expected = float(np.sqrt(own**2 + sum(gate.cost_deg**2 for gate in judged)))
+    because = ", ".join(gate.name for gate in judged if gate.cost_deg > 0.5 * own)
     says = f"expected error of the normals {expected:.1f}° (median)" + (
         f", most of it from: {because}" if because else ""
     )

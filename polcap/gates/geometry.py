@@ -34,25 +34,25 @@ def alignment(found: Found, config: Config) -> Gate:
 def mask(found: Found, limits: Gates) -> Gate:
     """Fails where the network doubts its mask, warns where its shape is none that an object before a lens has."""
     object_, limit = found.object_, limits.max_mask_doubt
-    told = []
+    doubts = []
     if object_.border > limits.max_mask_border:
-        told.append(
+        doubts.append(
             f"the object leaves the picture along {object_.border:.0%} of its border, where its outline tells nothing"
         )
     if object_.islands > limits.max_mask_islands:
-        told.append(f"{object_.islands:.0%} of it stands apart")
+        doubts.append(f"{object_.islands:.0%} of it stands apart")
     if object_.holes > limits.max_mask_holes:
-        told.append(f"it has holes of {object_.holes:.0%} of its area")
+        doubts.append(f"it has holes of {object_.holes:.0%} of its area")
     state: State = (
-        "warn" if told else "pass" if object_.doubt is not None or object_.source == "user" else "not measured"
+        "warn" if doubts else "pass" if object_.doubt is not None or object_.source == "user" else "not measured"
     )
     if object_.doubt is not None and object_.doubt > limit:
         state = "fail"
-        told.insert(0, "which pixels are the object is not clear")
-    says = "; ".join(told) or "share of the object's outline in doubt"
+        doubts.insert(0, "which pixels are the object is not clear")
+    says = "; ".join(doubts) or "share of the object's outline in doubt"
     remedy = "look at it, and where it is wrong give --mask PNG; let backdrop show all around the object"
     cost = 10 * object_.border if state == "warn" else 5.0 if state == "fail" else 0.0
-    return Gate("mask", state, object_.doubt, limit, says, remedy if told else "", cost)
+    return Gate("mask", state, object_.doubt, limit, says, remedy if doubts else "", cost)
 
 
 def sharpness(found: Found, limits: Gates) -> Gate:

@@ -156,12 +156,12 @@ def _gain_doubt(found: Found, limits: Gates) -> Gate:
             remedy = "turn the chart so that it mirrors neither flash nor window, or use a matt one"
             cost = DEGREES_PER_GAIN * gloss
             return at_most("gain doubt", gloss, limit, says, remedy, cost_deg=cost, beyond=_grade(cost))
-        apart = measured.disagreement
+        gap = measured.disagreement
         says = f"grey patches and object agree on the light of the shots (1σ {100 * doubt:.2f} %)"
-        if apart > limit:
-            says = f"grey patches and object differ by {100 * apart:.1f} % on a shot's light, beyond the error of both"
+        if gap > limit:
+            says = f"grey patches and object differ by {100 * gap:.1f} % on a shot's light, beyond the error of both"
         remedy = "was the chart lit and seen as the object is, and unpolarized? Turn it to the camera"
-        return at_most("gain doubt", apart, limit, says, remedy, cost_deg=DEGREES_PER_GAIN * apart)
+        return at_most("gain doubt", gap, limit, says, remedy, cost_deg=DEGREES_PER_GAIN * gap)
     cost = DEGREES_PER_GAIN * doubt
     says = f"no grey patches: the light of the shots is known to {100 * doubt:.1f} % (1σ)"
     if measured.source == "none":
@@ -188,14 +188,14 @@ def ambient(found: Found, limits: Gates) -> Gate:
 
 def _promised_steps(radiance: AngleStack) -> float:
     """Least step of the bracket as the metadata tell it; NaN where they do not."""
-    told = np.sort(radiance.exif_ratio[0])
-    return float((told[1:] / told[:-1]).min()) if np.isfinite(told).all() and len(told) > 1 else float("nan")
+    stated = np.sort(radiance.exif_ratio[0])
+    return float((stated[1:] / stated[:-1]).min()) if np.isfinite(stated).all() and len(stated) > 1 else float("nan")
 
 
 def _power(radiance: AngleStack) -> float:
     """Slope of ln measured over ln stated exposure; 1 where the metadata are silent, or state no steps."""
-    told: Floats = np.log(radiance.exif_ratio[0]) if np.isfinite(radiance.exif_ratio[0]).all() else np.zeros(1)
+    stated: Floats = np.log(radiance.exif_ratio[0]) if np.isfinite(radiance.exif_ratio[0]).all() else np.zeros(1)
     seen = np.log(np.maximum(radiance.exposure_ratio.mean((0, 2)), 1e-6))
-    if np.ptp(told) < 0.5 or np.ptp(seen) < 0.3:
+    if np.ptp(stated) < 0.5 or np.ptp(seen) < 0.3:
         return 1.0
-    return float(np.polyfit(told, seen, 1)[0])
+    return float(np.polyfit(stated, seen, 1)[0])

@@ -124,8 +124,8 @@ def _table() -> Floats:
             smooth_plus, smooth_minus = fresnel.transmission(cosine, ior)
             mean = (weight * plus).sum(axis=1)
             even = (weight * minus * turned).sum(axis=1) / mean
-            came = weight * c * plus
-            local = (came * minus * turned).sum(axis=1) / (came * plus).sum(axis=1)
+            weighted = weight * c * plus
+            local = (weighted * minus * turned).sum(axis=1) / (weighted * plus).sum(axis=1)
             out[i, j, :, 0] = mean - smooth_plus
             # towards the normal both vanish with sin²θ: the limit of the ratio is the next node's
             ratio = np.stack([even, local], axis=1)[:-1] / (smooth_minus / smooth_plus)[:-1, None]

@@ -94,9 +94,9 @@ def _maps(folders: Sequence[Path], names: Sequence[str]) -> Iterator[str]:
     for place, (maps, name) in enumerate(zip(small, names, strict=True)):
         yield page.normal(f"normal-{place}", name, maps.normal, maps.mask)
     if same:
-        apart = _degrees(small[0].normal, small[1].normal)
-        says = f"median {labels.number(float(np.median(apart[both])), 2)}°" if both.any() else ""
-        yield page.scalar("normal-apart", "Angle between them", says, apart, both, keys.ERROR)
+        difference = _degrees(small[0].normal, small[1].normal)
+        says = f"median {labels.number(float(np.median(difference[both])), 2)}°" if both.any() else ""
+        yield page.scalar("normal-apart", "Angle between them", says, difference, both, keys.ERROR)
     yield "</div>"
     scalars = (
         ("roughness", "Roughness", keys.ROUGHNESS, [maps.roughness for maps in small]),
@@ -119,9 +119,9 @@ def _degrees(one: Floats, other: Floats) -> Floats:
 
 def _differences(found: Sequence[Row], names: Sequence[str]) -> Iterator[str]:
     for kind, title in (("figures", "Figures that differ"), ("settings", "Settings that differ")):
-        told = [spoken(row) for row in found if row[0].startswith(kind)]
+        lines = [spoken(row) for row in found if row[0].startswith(kind)]
         yield f"<h2>{title}</h2>"
-        yield f"<div class='scroll'>{html.table(('', *names), told)}</div>" if told else "<p>None.</p>"
+        yield f"<div class='scroll'>{html.table(('', *names), lines)}</div>" if lines else "<p>None.</p>"
 
 
 def _gates(abouts: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Iterator[str]:

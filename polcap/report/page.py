@@ -95,9 +95,9 @@ def _verdict(about: Mapping[str, Any]) -> Iterator[str]:
         f"{len(capture['shots'])} polarizer angles · {escape(about['figures']['maps']['estimator'])}</p>"
         f'<section class="verdict {state}"><h1>{escape(headline)}.</h1><p>{escape(good)}</p>'
     )
-    told = [gate for gate in about["gates"] if gate["state"] in ("fail", "warn")]
-    if told:
-        yield f"<ul>{''.join(f'<li>{_advice(gate)}</li>' for gate in told)}</ul>"
+    notable = [gate for gate in about["gates"] if gate["state"] in ("fail", "warn")]
+    if notable:
+        yield f"<ul>{''.join(f'<li>{_advice(gate)}</li>' for gate in notable)}</ul>"
     yield "</section>"
 
 
@@ -285,13 +285,13 @@ def _drawn(title: str, says: str, drawing: str) -> str:
 
 def _pictures(results: Results) -> Iterator[str]:
     radiance, color = results.radiance.value, results.color.value
-    told: Sequence[tuple[str, str, NDArray[np.uint8]]] = (
+    notable: Sequence[tuple[str, str, NDArray[np.uint8]]] = (
         ("Reference shot", "the chart as it was read", pictures.chart(radiance, color)),
         ("Object", "what was taken for it", pictures.outline(radiance, color, results.object_.value)),
         ("Registration", "first shot magenta, the other green: grey is good", pictures.of_stage(results, "align")),
     )
     yield '<h2>What polcap saw</h2><div class="grid">'
-    for title, says, picture in told:
+    for title, says, picture in notable:
         image = html.jpeg(pictures.shrink(picture, 1000))
         yield (
             f'<figure><div class="picture"><img alt="{title}" src="{image}"></div><figcaption><b>{title}</b><br><span>'

@@ -166,11 +166,11 @@ class Gphoto2:
         place = self._camera.capture(self._gp.GP_CAPTURE_IMAGE)
         data = self._fetch(place)
         while data.startswith(_JPEG):
-            kind, told = self._camera.wait_for_event(_SECOND_FILE_MS)
+            kind, content = self._camera.wait_for_event(_SECOND_FILE_MS)
             if kind == self._gp.GP_EVENT_TIMEOUT:
                 break
             if kind == self._gp.GP_EVENT_FILE_ADDED:
-                place, data = told, self._fetch(told)
+                place, data = content, self._fetch(content)
         return data, str(place.name)
 
     def _fetch(self, place: Any) -> bytes:

@@ -67,10 +67,10 @@ class Elliptec:
         self._limit_s = limit_s
         self.model = "Elliptec"
         patiently(lambda: self._ask("gs", "GS"))  # clears a fault of the day before
-        told = patiently(lambda: self._ask("in", "IN"))
-        self.model = f"Elliptec ELL{int(told[0:2], 16)}"
-        self._pulses = int(told[22:30], 16)  # per revolution
-        if int(told[18:22], 16) != 360 or self._pulses < 360:
+        reply = patiently(lambda: self._ask("in", "IN"))
+        self.model = f"Elliptec ELL{int(reply[0:2], 16)}"
+        self._pulses = int(reply[22:30], 16)  # per revolution
+        if int(reply[18:22], 16) != 360 or self._pulses < 360:
             raise HardwareError(f"{self.model} at {port.url} is no rotation mount; give another port or address")
         self.speed_deg_s = _FULL_SPEED * (settings.velocity or 100) / 100
         if settings.velocity is not None:

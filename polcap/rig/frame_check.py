@@ -103,11 +103,11 @@ def blurred(sharpness: float, sharpest: float, limits: Limits) -> bool:
     return sharpness < limits.blur * sharpest
 
 
-def _exposed(told: Exif, asked: Exposure) -> str | None:
+def _exposed(stated: Exif, asked: Exposure) -> str | None:
     rows = (
-        ("exposure time [s]", asked.time_s, told.exposure_time, 1.0),
-        ("f-number", asked.f_number, told.f_number, 2.0),
-        ("ISO", asked.iso, told.iso, 1.0),
+        ("exposure time [s]", asked.time_s, stated.exposure_time, 1.0),
+        ("f-number", asked.f_number, stated.f_number, 2.0),
+        ("ISO", asked.iso, stated.iso, 1.0),
     )
     for what, wanted, found, power in rows:
         if wanted and found and power * abs(log2(found / wanted)) > _STOPS:

@@ -94,7 +94,7 @@ class Record:
             self.write()
             return aside
 
-    def came(self, slot: Slot, read_deg: float) -> list[str]:
+    def arrived_again(self, slot: Slot, read_deg: float) -> list[str]:
         """The ring came to an angle again: frames of a bracket that was begun elsewhere are put aside."""
         with self._lock:
             begun = {name: good for name, good in self.content.frames.items() if _bracket(good) == _bracket(slot)}
@@ -181,7 +181,7 @@ def without_port(url: str) -> str:
     return f"{head.partition(':')[0]}?{query}"
 
 
-def told(value: Any) -> str:
+def remedy(value: Any) -> str:
     """How to have a setting so again."""
     if isinstance(value, bool):
         return "give it" if value else "leave it out"

@@ -108,20 +108,20 @@ def open_rotator(url: str, log: Log) -> Rotator:
     """
     head, _, query = url.partition("?")
     kind, _, port = head.partition(":")
-    given = _pairs(url, query)
+    stated = _pairs(url, query)
     if kind == "manual":
-        if port or given:
+        if port or stated:
             raise SettingError(f"rotator {url!r}: manual takes no port and no settings; write manual")
         return manual.Manual(log)
     if kind not in MOTORS:
         raise SettingError(f"rotator {url!r}: {kind!r} is no rotator; choose one of {', '.join(MOTORS)}, manual")
     driver = MOTORS[kind]()
     shared, own = Drive.__struct_fields__, driver.Settings.__struct_fields__
-    for key in given:
+    for key in stated:
         if key not in shared + own:
             raise SettingError(f"rotator {url!r}: {key!r} is no setting of {kind}; it knows {', '.join(own + shared)}")
-    drive = _convert(url, {key: text for key, text in given.items() if key in shared}, Drive)
-    settings = _convert(url, {key: text for key, text in given.items() if key in own}, driver.Settings)
+    drive = _convert(url, {key: text for key, text in stated.items() if key in shared}, Drive)
+    settings = _convert(url, {key: text for key, text in stated.items() if key in own}, driver.Settings)
     if not port and kind != "simulated":
         raise SettingError(
             f"rotator {url!r} names no port; write {kind}:/dev/ttyUSB0, {kind}:COM3 or {kind}:socket://…"
@@ -215,8 +215,8 @@ class Driven:
 
     def _approach(self, target: float) -> None:
         """Turn to motor degrees, the last stretch upwards."""
-        came, self._at = self._at, None
-        if self._backlash_deg and (came is None or target < came):
+        previous, self._at = self._at, None
+        if self._backlash_deg and (previous is None or target < previous):
             below = target - self._backlash_deg
             patiently(lambda: self._motor.go(below))
         patiently(lambda: self._motor.go(target))
@@ -249,8 +249,8 @@ def _pairs(url: str, query: str) -> dict[str, str]:
     return {key: text.removeprefix("+") for key, text in pairs}
 
 
-def _convert(url: str, given: dict[str, str], settings: type[T]) -> T:
+def _convert(url: str, stated: dict[str, str], settings: type[T]) -> T:
     try:
-        return msgspec.convert(given, settings, strict=False)
+        return msgspec.convert(stated, settings, strict=False)
     except msgspec.ValidationError as error:
         raise SettingError(f"rotator {url!r}: {error}; see the reference page on rotators") from None

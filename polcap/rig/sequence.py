@@ -39,7 +39,7 @@ def silent(line: str) -> None:
     """Tell nobody."""
 
 
-def order(folder: Path, given: dict[str, Any], resume: bool) -> Order:
+def order(folder: Path, stated: dict[str, Any], resume: bool) -> Order:
     """What to shoot: `given` where it is not None, else with `resume` what was begun, else the default.
 
     Raises
@@ -49,7 +49,7 @@ def order(folder: Path, given: dict[str, Any], resume: bool) -> Order:
     """
     begun = record.load(folder) if resume else None
     wanted = {} if begun is None else msgspec.structs.asdict(begun.order)
-    wanted |= {name: value for name, value in given.items() if value is not None}
+    wanted |= {name: value for name, value in stated.items() if value is not None}
     for name in ("rotator", "camera"):
         if name not in wanted:
             raise SettingError(f"--{name} is missing; name one, or `simulated` to try without")
@@ -133,7 +133,7 @@ def _loop(book: Record, landing: Landing, turner: Rotator, camera: Camera, log: 
                     continue
                 at_deg, read_deg = slot.angle_deg, None
                 read_deg = _beside(turner.move(at_deg), at_deg)
-            for aside in book.came(slot, read_deg):
+            for aside in book.arrived_again(slot, read_deg):
                 tell(f"{aside} is taken again: the ring came back to {read_deg:.2f}°")
         left = pace.total_s(plan.schedule([*missing], at_deg), at_deg)
         done = len(book.slots) - len(missing) + 1
@@ -198,7 +198,7 @@ def _begun(folder: Path, wanted: Order, resume: bool) -> Content | None:
             here = record.without_port(value) if name in ("rotator", "camera") else value
             if here != (record.without_port(was) if name in ("rotator", "camera") else was):
                 flag = {"angles_deg": "--angles", "repeat_deg": "--repeat"}.get(name, f"--{name}")
-                raise CaptureError(f"{folder} was begun with another {flag}; {record.told(was)}, or a new folder")
+                raise CaptureError(f"{folder} was begun with another {flag}; {record.remedy(was)}, or a new folder")
         return content
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -175,9 +175,9 @@ def _shade(scene: Scene, ray: Floats, hits: Hits) -> Floats:
     direct = shade.stokes(normal, diffuse, specular, roughness, ior, light, irradiance, law)
     if not scene.interreflection:
         return np.asarray(direct)
-    came = np.einsum("nkc,nk->nc", _bounced(scene)[hits.face], hits.weight)
+    bounced = np.einsum("nkc,nk->nc", _bounced(scene)[hits.face], hits.weight)
     entered, _ = fresnel.transmission(1.0, ior)  # already in what came
-    once = shade.stokes(normal, diffuse * came, 0 * specular, roughness, ior, normal, 1 / entered, law)
+    once = shade.stokes(normal, diffuse * bounced, 0 * specular, roughness, ior, normal, 1 / entered, law)
     return np.asarray(direct + once)
 
 

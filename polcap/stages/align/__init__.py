@@ -181,8 +181,8 @@ def _step(a: Floats, b: Floats, weight: Floats, transform: Floats, model: str) -
     y = ((np.arange(height) - height / 2) / size)[:, None]
     margin = np.zeros_like(a, dtype=bool)
     margin[4:-4, 4:-4] = True
-    told = weight * (gx * gx + gy * gy)  # what a pixel says of the movement; most say nothing
-    use = margin & (weight > 1e-9) & (told > 0.05 * told.mean())
+    information = weight * (gx * gx + gy * gy)  # what a pixel says of the movement; most say nothing
+    use = margin & (weight > 1e-9) & (information > 0.05 * information.mean())
     columns = [gx, gy]
     if model in ("similarity", "homography"):
         columns += [gx * x + gy * y, gy * x - gx * y]

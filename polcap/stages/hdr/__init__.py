@@ -9,7 +9,7 @@ For one angle, with the frames' exposures e relative to the reference frame (e =
 3. X = Σ w (Y/e) / Σ w with w = e² / (a e X₀ + b) from that smoothed estimate, clipped pixels left out.
 
 Frames are decoded ahead, in processes of their own; work goes on in blocks of rows that fit a core's cache.
-`frames` decodes, `links` measures a shot, `combine` weights and sums.
+`planes` decodes, `links` measures a shot, `combine` weights and sums.
 
 References
 ----------

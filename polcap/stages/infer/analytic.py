@@ -94,9 +94,9 @@ def _smoothed(cues: Cues) -> tuple[Floats, Floats]:
         weight = cv2.GaussianBlur(light, (0, 0), blur) + np.float32(1e-9)
         wider = np.stack([cv2.GaussianBlur(part, (0, 0), blur) / weight for part in weighted])
         spread = cv2.GaussianBlur(weighted_sigma, (0, 0), blur) / weight / np.float32(np.sqrt(4 * np.pi) * blur)
-        for narrower, apart in kept:
+        for narrower, limit in kept:
             moved = wider - narrower
-            growing = growing & (moved[0] ** 2 + moved[1] ** 2 < apart)
+            growing = growing & (moved[0] ** 2 + moved[1] ** 2 < limit)
         ratio, sigma = np.where(growing, wider, ratio), np.where(growing, spread, sigma)
         kept.append((wider, (_SAME * spread) ** 2))
     return ratio, sigma

@@ -70,8 +70,8 @@ def zeniths(dolp: Floats, cues: Cues, ior: float, guide: tuple[Floats, Floats] |
         score += _even_albedo(angles, cues.radiance.mean(-1).flat[some], laws)
         score += _round_outline(dolp, cues, laws)
         if guide is not None:
-            apart = (angles - guide[0].flat[some]) / np.maximum(guide[1].flat[some], np.radians(2.0))
-            score -= _PATCHES / 2 * np.minimum(apart**2, 9.0).mean(axis=1)
+            deviation = (angles - guide[0].flat[some]) / np.maximum(guide[1].flat[some], np.radians(2.0))
+            score -= _PATCHES / 2 * np.minimum(deviation**2, 9.0).mean(axis=1)
     weights = np.exp(score - score.max())
     weights /= weights.sum()
     angle, spread = _mean(dolp, laws.dolp, weights)
@@ -111,8 +111,8 @@ def _even_albedo(angles: Floats, light: Floats, laws: _Laws) -> Floats:
         albedo = np.log(light) - np.interp(angle, _ZENITHS, shading)
         middle = np.array([np.mean(albedo[tenth]) for tenth in tenths])
         within = np.mean([np.std(albedo[tenth] - m) for tenth, m in zip(tenths, middle)])
-        apart = np.mean((middle - middle.mean()) ** 2)
-        misfit[k] = _PATCHES * apart / (within**2 + _UNEVEN**2)
+        deviation = np.mean((middle - middle.mean()) ** 2)
+        misfit[k] = _PATCHES * deviation / (within**2 + _UNEVEN**2)
     return -misfit / 2 / max(1.0, float(misfit.min()))
 
 

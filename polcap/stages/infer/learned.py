@@ -108,11 +108,11 @@ def _detailed(coarse: Floats, fine: Floats, mask: NDArray[np.bool_], shrink: flo
     height, width = mask.shape
     size = (round(width / shrink), round(height / shrink))
     inside = mask.astype(np.float32)
-    apart, share = (
+    difference, share = (
         cv2.GaussianBlur(cv2.resize(image, size, interpolation=cv2.INTER_AREA), (0, 0), _DETAIL)
         for image in ((coarse - fine).astype(np.float32) * inside[..., None], inside)
     )
-    moved = fine + cv2.resize(apart / np.maximum(share, 1e-3)[..., None], (width, height))
+    moved = fine + cv2.resize(difference / np.maximum(share, 1e-3)[..., None], (width, height))
     return np.asarray(moved / np.maximum(_length(moved), 1e-6))
 
 
@@ -125,8 +125,8 @@ def _joined(*estimates: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
     total = sum(w[..., None] * n / np.maximum(_length(n), 1e-6) for w, (n, _) in zip(weights, estimates))
     length = _length(np.asarray(total))
     share = np.clip(length[..., 0] / sum(weights), 1e-3, 1)  # 1 where all point the same way
-    apart = np.degrees(np.arccos(share))
-    return np.asarray(total / np.maximum(length, 1e-12)), np.hypot(1 / np.sqrt(sum(weights)), apart)
+    spread = np.degrees(np.arccos(share))
+    return np.asarray(total / np.maximum(length, 1e-12)), np.hypot(1 / np.sqrt(sum(weights)), spread)
 
 
 def _length(vectors: Floats) -> Floats:

@@ -78,13 +78,13 @@ def solve(
     if settings.check_order and found.order != stated:
         raise CaptureError(_disorder(found, radiance.angle))
     own = np.hypot(anchor.sigma, sigma.mean(1))
-    apart = np.abs(gain.mean(1) / anchor.gain - 1)
+    difference = np.abs(gain.mean(1) / anchor.gain - 1)
     return Gains(
         gain=gain,
         sigma=sigma,
         anchor=np.repeat(anchor.gain[:, None], 3, axis=1),
         source=source,
-        disagreement=float(np.max(np.where(np.isfinite(own), apart - _SURPRISE * own, 0), initial=0)),
+        disagreement=float(np.max(np.where(np.isfinite(own), difference - _SURPRISE * own, 0), initial=0)),
         angle_offset=found.offset,
         angle_offset_sigma=found.offset_sigma,
         concentration=found.concentration,

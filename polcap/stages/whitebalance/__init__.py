@@ -160,20 +160,20 @@ def _at_corners(
     height, width = radiance.value.shape[1:3]
     scale = radiance.view.scale
     corners = (np.asarray(corners_px, np.float64) - (scale - 1) / 2) / scale
-    given = chart.from_corners(corners)
+    placement = chart.from_corners(corners)
     said = "chart corners " + ", ".join(f"({x:g}, {y:g})" for x, y in corners_px)
-    if not chart.is_view(given.homography):
+    if not chart.is_view(placement.homography):
         raise ChartError(f"{said} do not go round clockwise; start at the dark-skin patch, go along its row")
     if (corners < -0.5).any() or (corners > np.array([width, height]) - 0.5).any():
         raise ChartError(f"{said} reach outside the image of {width * scale:g} × {height * scale:g} px; check them")
-    if given.pitch_px < _LEAST_PITCH_PX:
+    if placement.pitch_px < _LEAST_PITCH_PX:
         raise ChartError(
-            f"{said} put the patches {given.pitch_px:.1f} px apart on the merged image, at least "
+            f"{said} put the patches {placement.pitch_px:.1f} px apart on the merged image, at least "
             f"{_LEAST_PITCH_PX:g} are needed; show the chart larger, or demosaic at full size"
         )
-    refined = _refine(radiance.value[0], given)
-    moved = float(np.abs(refined.corners() - corners).max()) / given.pitch_px
-    place = refined if _plausible(refined, settings) and moved < 0.35 else given
+    refined = _refine(radiance.value[0], placement)
+    moved = float(np.abs(refined.corners() - corners).max()) / placement.pitch_px
+    place = refined if _plausible(refined, settings) and moved < 0.35 else placement
     find = _Find(place, _fit(radiance, place, reference, settings), float("nan"))
     if find.error > settings.max_delta_e:
         turned = _Find(place.turned(), _fit(radiance, place.turned(), reference, settings), float("nan"))
