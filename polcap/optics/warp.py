@@ -55,7 +55,10 @@ def warp(image: Floats, transform: Floats, box: Box | None = None, order: Litera
     out = np.empty((len(planes), size[1], size[0]), np.float32)
     for y in range(0, size[1], _ROWS):
         rows = slice(y, min(y + _ROWS, size[1]))
-        taps = Taps(*coordinates(local, np.arange(size[0]), np.arange(rows.start, rows.stop)[:, None]), part.shape[:2])
+        taps = Taps(
+            *coordinates(local, np.arange(float(size[0])), np.arange(float(rows.start), rows.stop)[:, None]),
+            part.shape[:2],
+        )
         for spline, plane in zip(splines, out):
             plane[rows] = spline.at(taps)
     return out[0] if image.ndim == 2 else np.asarray(cv2.merge(list(out))).reshape(size[1], size[0], -1)

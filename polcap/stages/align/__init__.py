@@ -12,6 +12,7 @@ Benhimane & Malis, Homography-based 2D visual tracking and servoing, IJRR 2007 (
 Huber & Ronchetti, Robust Statistics, 2009 (biweight and scale).
 """
 
+from functools import cached_property
 from typing import Annotated, Literal
 
 import cv2
@@ -22,11 +23,14 @@ from msgspec import Meta
 from polcap.errors import AlignmentError
 from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Quality
 from polcap.optics.robust import MAD_TO_SIGMA
-from polcap.optics.warp import warp
+from polcap.optics.warp import Spline, Taps, coordinates, warp
 from polcap.stages import stage
 
 _ALIASING_PX2 = 0.05**2  # variance of an edge's place between two samplings of it
 _FLOOR_PX = 0.02  # what aliasing leaves of an error on rendered captures, whatever the noise
+_MOST_POINTS = 1e5  # of a picture tell of a movement; more are evenly thinned
+_MEDIAN_OF = 20000  # points: knows a median to 1 %
+_SIDE = 1024
 _MOST_PIXELS = 1.5e6  # a larger image is averaged down first: it has detail to spare
 
 
@@ -47,7 +51,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 4.0
 
 
-@stage(version=2)
+@stage(version=3)
 def register(radiance: AngleStack, color: ColorCalibration, settings: Settings) -> Alignment:
     """One transform per shot, reference grid px → shot grid px.
 
@@ -57,7 +61,7 @@ def register(radiance: AngleStack, color: ColorCalibration, settings: Settings) 
     if radiance.offset_px is not None:
         return _as_known(radiance.offset_px)
     step = int(np.ceil(np.sqrt(radiance.value[0, ..., 0].size / _MOST_PIXELS)))
-    detail = [_Detail.of(radiance, k, settings.detail_px, step) for k in range(shots)]
+    detail = [_Detail(radiance, k, settings.detail_px, step) for k in range(shots)]
     transform = np.tile(np.eye(3), (shots, 1, 1))
     residual = np.zeros(shots)
     correlation = np.ones(shots)
@@ -96,33 +100,63 @@ def _as_known(offset_px: Floats) -> Alignment:
     return Alignment(transform, np.zeros(len(offset_px)), np.ones(len(offset_px)))
 
 
-class _Detail(msgspec.Struct, frozen=True):
-    """Fine structure of one shot's log radiance, its weight, and the blurred copies for coarse steps."""
+class _Detail:
+    """Fine structure of one shot's log radiance and its weight, at all scales, each made when it is asked for."""
 
-    value: Floats  # (H, W)
-    weight: Floats  # (H, W) 1/variance, 0 where clipped
-
-    @staticmethod
-    def of(radiance: AngleStack, k: int, detail_px: float, step: int) -> "_Detail":
-        total = _averaged(radiance.value[k].sum(-1, dtype=np.float32), step)
-        sigma = np.sqrt(_averaged(radiance.variance[k].sum(-1, dtype=np.float32), step)) / step
+    def __init__(self, radiance: AngleStack, k: int, detail_px: float, step: int) -> None:
+        total = _averaged(_summed(radiance.value[k]), step)
+        sigma = np.sqrt(_averaged(_summed(radiance.variance[k]), step)) / step
+        some = (slice(None, None, 3),) * 2  # enough for a percentile
         # The floor keeps the logarithm of a dark background from amplifying its noise.
-        floor = max(float(np.percentile(total, 99)) * 0.01, 2 * float(np.median(sigma)), 1e-9)
-        log = np.log(np.maximum(total, 0) + floor).astype(np.float32)
+        floor = max(float(np.percentile(total[some], 99)) * 0.01, 2 * float(np.median(sigma[some])), 1e-9)
+        level = np.maximum(total, 0)
+        level += np.float32(floor)
+        log = np.log(level)
         smooth = cv2.GaussianBlur(log, (0, 0), 0.7)  # both shots need one resolution; cubic warps change it
-        value = smooth - cv2.GaussianBlur(log, (0, 0), detail_px)
-        relative = sigma / (np.maximum(total, 0) + floor)
-        weight = 1.0 / (relative**2 + 0.003**2)
-        clipped = (_averaged((radiance.quality[k] & Quality.CLIPPED).astype(np.float32), step) > 0).astype(np.uint8)
-        reach = int(np.ceil(2 * detail_px)) | 1
-        weight[cv2.dilate(clipped, np.ones((reach, reach), np.uint8)) > 0] = 0
-        return _Detail(value, weight)
+        smooth -= cv2.GaussianBlur(log, (0, 0), detail_px)
+        sigma /= level
+        sigma *= sigma
+        sigma += np.float32(0.003**2)
+        weight = np.divide(np.float32(1), sigma, out=sigma)
+        clipped = (radiance.quality[k] & Quality.CLIPPED).astype(np.uint8)
+        if clipped.any():
+            clipped = (_averaged(clipped.astype(np.float32), step) > 0).astype(np.uint8)
+            reach = int(np.ceil(2 * detail_px)) | 1
+            weight[cv2.dilate(clipped, np.ones((reach, reach), np.uint8)) > 0] = 0
+        self._scales: dict[int, _Scale] = {1: _Scale(smooth, weight)}
 
-    def shrunk(self, step: int) -> "_Detail":
+    def __getitem__(self, shrink: int) -> "_Scale":
         """The same of an image averaged down."""
-        if step == 1:
-            return self
-        return _Detail(_averaged(self.value.astype(np.float32), step), _averaged(self.weight, step))
+        if shrink not in self._scales:
+            whole = self._scales[1]
+            self._scales[shrink] = _Scale(_averaged(whole.value, shrink), _averaged(whole.weight, shrink))
+        return self._scales[shrink]
+
+
+class _Scale:
+    """One shot's detail at one scale."""
+
+    def __init__(self, value: Floats, weight: Floats) -> None:
+        self.value = value  # (H, W)
+        self.weight = weight  # (H, W) 1/variance, 0 where clipped
+
+    @cached_property
+    def gradient(self) -> tuple[Floats, Floats]:
+        """Central differences, (H, W) each."""
+        x, y = (
+            cv2.Sobel(self.value, cv2.CV_32F, x, 1 - x, ksize=1, scale=0.5, borderType=cv2.BORDER_REPLICATE)
+            for x in (1, 0)
+        )
+        return np.asarray(x), np.asarray(y)
+
+    @cached_property
+    def spline(self) -> Spline:
+        return Spline(self.value)
+
+
+def _summed(picture: Floats) -> Floats:
+    """Over channels, (H, W)."""
+    return np.asarray(cv2.transform(np.asarray(picture, np.float32), np.ones((1, 3), np.float32)))
 
 
 def _averaged(image: Floats, step: int) -> Floats:
@@ -130,8 +164,8 @@ def _averaged(image: Floats, step: int) -> Floats:
     if step == 1:
         return image
     height, width = image.shape[0] // step, image.shape[1] // step
-    blocks = image[: height * step, : width * step].reshape(height, step, width, step)
-    return np.asarray(blocks.mean((1, 3), dtype=np.float32))
+    whole = image[: height * step, : width * step]
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA))
 
 
 def _to_full_grid(transform: Floats, step: float) -> Floats:
@@ -141,12 +175,11 @@ def _to_full_grid(transform: Floats, step: float) -> Floats:
 
 
 def _coarse_shift(reference: _Detail, shot: _Detail) -> Floats:
-    """Whole-image translation by phase correlation, (2,) px."""
-    window = cv2.createHanningWindow(reference.value.shape[::-1], cv2.CV_32F)
-    shift, _ = cv2.phaseCorrelate(
-        reference.value * np.sqrt(reference.weight), shot.value * np.sqrt(shot.weight), window
-    )
-    return np.array(shift)
+    """Whole-image translation by phase correlation at half size, (2,) px."""
+    a, b = reference[2], shot[2]
+    window = cv2.createHanningWindow(a.value.shape[::-1], cv2.CV_32F)
+    shift, _ = cv2.phaseCorrelate(a.value * np.sqrt(a.weight), b.value * np.sqrt(b.weight), window)
+    return 2 * np.array(shift)
 
 
 def _refine(reference: _Detail, shot: _Detail, start: Floats, model: str) -> tuple[Floats, float]:
@@ -154,13 +187,12 @@ def _refine(reference: _Detail, shot: _Detail, start: Floats, model: str) -> tup
     transform = start
     error = np.inf
     for shrink in (4, 2, 1):
-        a, b = reference.shrunk(shrink), shot.shrunk(shrink)
-        height, width = a.value.shape
+        height, width = reference[shrink].value.shape
         level = _to_full_grid(transform, 1 / shrink)
         coarse = "translation" if shrink == 4 and model != "translation" else model
-        shared = 1 / (1 / np.maximum(a.weight, 1e-12) + 1 / np.maximum(warp(b.weight, level, order=1), 1e-12))
+        compared = _Compared(reference[shrink], shot[shrink], level, coarse)
         for _ in range(15):
-            step, error = _step(a.value, b.value, shared, level, coarse)
+            step, error = compared.step(level)
             level = level @ step
             level = level / level[2, 2]
             if np.abs(step - np.eye(3))[:2].dot([width / 2, height / 2, 1]).max() < 0.004:
@@ -169,41 +201,70 @@ def _refine(reference: _Detail, shot: _Detail, start: Floats, model: str) -> tup
     return transform, float(np.hypot(error, _FLOOR_PX))
 
 
-def _step(a: Floats, b: Floats, weight: Floats, transform: Floats, model: str) -> tuple[Floats, float]:
-    """One compositional update (3, 3) that brings b∘transform closer to a, and its 1σ, px."""
-    warped = warp(b, transform)
-    gx_a, gy_a = _gradient(a)
-    gx_b, gy_b = _gradient(warped)
-    gx, gy = (gx_a + gx_b) / 2, (gy_a + gy_b) / 2
-    height, width = a.shape
-    size = max(height, width) / 2
-    x = ((np.arange(width) - width / 2) / size)[None, :]
-    y = ((np.arange(height) - height / 2) / size)[:, None]
-    margin = np.zeros_like(a, dtype=bool)
-    margin[4:-4, 4:-4] = True
-    information = weight * (gx * gx + gy * gy)  # what a pixel says of the movement; most say nothing
-    use = margin & (weight > 1e-9) & (information > 0.05 * information.mean())
-    columns = [gx, gy]
-    if model in ("similarity", "homography"):
-        columns += [gx * x + gy * y, gy * x - gx * y]
-    if model == "homography":
-        radial = gx * x + gy * y
-        columns += [gx * x - gy * y, gx * y + gy * x, radial * x, radial * y]
-    jacobian = np.stack([np.broadcast_to(c, a.shape)[use] for c in columns], axis=-1).astype(np.float64)
-    difference = (a - warped)[use].astype(np.float64)
-    # An edge sampled at two phases differs by a share of its own gradient: aliasing counts as noise,
-    # else the robust loss keeps the edges that happen to agree and pulls the shift to whole pixels.
-    slope = jacobian[:, 0] ** 2 + jacobian[:, 1] ** 2
-    w = 1 / (_ALIASING_PX2 * slope + 1 / weight[use].astype(np.float64))
-    normalized = np.abs(difference) * np.sqrt(w)
-    scale = MAD_TO_SIGMA * _weighted_median(normalized, w * slope) + 1e-9
-    w = w * np.maximum(0, 1 - (normalized / (4.685 * scale)) ** 2) ** 2
-    normal = jacobian.T @ (jacobian * w[:, None]) + 1e-12 * np.eye(jacobian.shape[1])
-    p = np.linalg.solve(normal, jacobian.T @ (w * difference))
-    # Neighbouring residuals are correlated by the blur over about ten pixels.
-    spread = np.linalg.inv(normal) @ (jacobian.T @ (jacobian * (w * difference)[:, None] ** 2)) @ np.linalg.inv(normal)
-    error = float(np.sqrt(10 * np.trace(spread[:2, :2]) / 2))
-    return _matrix(p, width, height, size), error
+class _Compared:
+    """The pixels of two shots that tell how one moved against the other."""
+
+    def __init__(self, a: _Scale, b: _Scale, level: Floats, model: str) -> None:
+        self.shot, self.model = b, model
+        self.height, self.width = a.value.shape
+        self.size = max(self.height, self.width) / 2
+        other = warp(b.weight, level, order=1)
+        weight = 1 / (1 / np.maximum(a.weight, 1e-12) + 1 / np.maximum(other, 1e-12))
+        gx, gy = a.gradient
+        information = weight * (gx * gx + gy * gy)  # what a pixel says of the movement; most say nothing
+        use = (weight > 1e-9) & (information > 0.05 * information.mean())
+        use[:4] = use[-4:] = False
+        use[:, :4] = use[:, -4:] = False
+        at = np.flatnonzero(use)
+        at = at[:: max(1, round(len(at) / _MOST_POINTS))]
+        self.y, self.x = np.divmod(at, self.width)
+        self.value, self.weight = a.value.ravel()[at], weight.ravel()[at].astype(np.float64)
+        self.gradient = gx.ravel()[at], gy.ravel()[at]
+
+    def step(self, transform: Floats) -> tuple[Floats, float]:
+        """One compositional update (3, 3) that brings b∘transform closer to a, and its 1σ, px."""
+        u, v = (_rows(c) for c in coordinates(transform, self.x, self.y))
+        count = len(self.x)
+        warped = self.shot.spline.at(Taps(u, v, (self.height, self.width))).ravel()[:count]
+        u, v = u.astype(np.float32), v.astype(np.float32)
+        bx, by = (
+            cv2.remap(g, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel()[:count]
+            for g in self.shot.gradient
+        )
+        m = transform  # the warped shot's gradient: of a homography this near a similarity, its linear part's
+        gx = (self.gradient[0] + m[0, 0] * bx + m[1, 0] * by) / 2
+        gy = (self.gradient[1] + m[0, 1] * bx + m[1, 1] * by) / 2
+        x, y = (self.x - self.width / 2) / self.size, (self.y - self.height / 2) / self.size
+        columns = [gx, gy]
+        if self.model in ("similarity", "homography"):
+            columns += [gx * x + gy * y, gy * x - gx * y]
+        if self.model == "homography":
+            radial = gx * x + gy * y
+            columns += [gx * x - gy * y, gx * y + gy * x, radial * x, radial * y]
+        jacobian = np.stack(columns).astype(np.float64)
+        difference = (self.value - warped).astype(np.float64)
+        # An edge sampled at two phases differs by a share of its own gradient: aliasing counts as noise,
+        # else the robust loss keeps the edges that happen to agree and pulls the shift to whole pixels.
+        slope = jacobian[0] ** 2 + jacobian[1] ** 2
+        w = 1 / (_ALIASING_PX2 * slope + 1 / self.weight)
+        normalized = np.abs(difference) * np.sqrt(w)
+        scale = MAD_TO_SIGMA * _weighted_median(normalized, w * slope) + 1e-9
+        w = w * np.maximum(0, 1 - (normalized / (4.685 * scale)) ** 2) ** 2
+        weighted = jacobian * w
+        normal = weighted @ jacobian.T + 1e-12 * np.eye(len(jacobian))
+        p = np.linalg.solve(normal, weighted @ difference)
+        # Neighbouring residuals are correlated by the blur over about ten pixels.
+        residual = weighted * difference
+        spread = np.linalg.inv(normal) @ (residual @ residual.T) @ np.linalg.inv(normal)
+        error = float(np.sqrt(10 * np.trace(spread[:2, :2]) / 2))
+        return _matrix(p, self.width, self.height, self.size), error
+
+
+def _rows(points: Floats) -> Floats:
+    """(N,) as a picture, filled up with zeros: OpenCV's pictures have sides under 32768 px."""
+    out = np.zeros((len(points) // _SIDE + 1, _SIDE))
+    out.ravel()[: len(points)] = points
+    return out
 
 
 def _matrix(p: Floats, width: int, height: int, size: float) -> Floats:
@@ -221,12 +282,9 @@ def _matrix(p: Floats, width: int, height: int, size: float) -> Floats:
     return np.asarray(np.linalg.inv(to_unit) @ local @ to_unit)
 
 
-def _gradient(image: Floats) -> tuple[Floats, Floats]:
-    """Central differences, (H, W) each."""
-    return np.gradient(image, axis=1), np.gradient(image, axis=0)
-
-
 def _weighted_median(value: Floats, weight: Floats) -> float:
+    step = max(1, len(value) // _MEDIAN_OF)
+    value, weight = value[::step], weight[::step]
     order = np.argsort(value)
     total = np.cumsum(weight[order])
     return float(value[order][np.searchsorted(total, total[-1] / 2)])
@@ -234,8 +292,12 @@ def _weighted_median(value: Floats, weight: Floats) -> float:
 
 def _correlation(reference: _Detail, shot: _Detail, transform: Floats) -> float:
     """Weighted zero-mean correlation of the detail of two shots once registered."""
-    warped = warp(shot.value, transform)
-    weight = reference.weight * warp(shot.weight, transform, order=1)
-    product = (weight * reference.value * warped).sum()
-    power = (weight * reference.value**2).sum() * (weight * warped**2).sum()
+    a, b = reference[1], shot[1]
+    height, width = a.value.shape
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    warped = cv2.warpPerspective(b.value, transform, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    weight = a.weight * warp(b.weight, transform, order=1)
+    weighted = weight * warped
+    product = float(np.vdot(weighted, a.value))
+    power = float(np.vdot(weight * a.value, a.value)) * float(np.vdot(weighted, warped))
     return float(product / np.sqrt(power + 1e-30))
