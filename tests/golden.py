@@ -2,7 +2,7 @@
 
     python -m tests.golden RESULT > tests/golden.json
 
-RESULT is made by `polcap process examples/capture --estimator analytic`. An array is told by four
+RESULT is made by `polcap process examples/capture --estimator analytic`. An array is described by four
 projections on fixed random signs, relative to its length: a change δ moves each by about |δ|/|x|.
 """
 
@@ -17,6 +17,8 @@ import numpy as np
 from polcap import path, pipeline, stages
 from polcap.formats import npy_folder
 
+LEARNED = "infer by the shipped network"
+
 
 def versions() -> dict[str, int]:
     rooms = (vars(path)[name] for name in path.STAGES)
@@ -25,21 +27,24 @@ def versions() -> dict[str, int]:
 
 
 def fingerprints(result: Path) -> dict[str, dict[str, Any]]:
-    """Stage → version and array → shape and projections."""
+    """Stage → version and array → shape and projections; last the shipped network's maps of the same cues."""
     opened, _ = pipeline.reopen(result)
-    version = versions()
-    made = {}
-    for kept in vars(opened).values():
-        arrays: dict[str, Any] = {}
-        npy_folder.encode(kept.value, kept.name, arrays)
-        made[kept.name] = {
-            "version": version[kept.name],
-            "arrays": {name: _told(name, a) for name, a in arrays.items()},
-        }
+    version: dict[str, Any] = versions()
+    made = {stage.name: _entry(version[stage.name], stage.name, stage.value) for stage in vars(opened).values()}
+    network = pipeline.load_network("network", None, "cpu", 1)
+    assert network is not None
+    maps = path.infer.estimate(opened.cues.value, network, path.infer.Settings())
+    made[LEARNED] = _entry([version["infer"], network.digest], "infer", maps)
     return made
 
 
-def _told(name: str, array: Any) -> dict[str, Any]:
+def _entry(version: Any, name: str, value: Any) -> dict[str, Any]:
+    arrays: dict[str, Any] = {}
+    npy_folder.encode(value, name, arrays)
+    return {"version": version, "arrays": {name: projections(name, a) for name, a in arrays.items()}}
+
+
+def projections(name: str, array: Any) -> dict[str, Any]:
     value = np.nan_to_num(np.asarray(array, np.float64)).ravel()
     length = float(np.linalg.norm(value))
     signs = np.random.default_rng(crc32(name.encode())).choice([-1.0, 1.0], (4, value.size))

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,21 +17,21 @@ REMEDY = "raise its version, then run `python -m tests.golden RESULT > tests/gol
 
 
 @pytest.fixture(scope="module")
-def made(result: Path) -> dict[str, dict]:
+def made(result: Path) -> dict[str, Any]:
     return golden.fingerprints(result)
 
 
-@pytest.mark.parametrize("stage", STAGES)
-def test_changed_pixels_have_a_new_version(made: dict[str, dict], stage: str) -> None:
+@pytest.mark.parametrize("stage", [*STAGES, golden.LEARNED])
+def test_changed_pixels_have_a_new_version(made: dict[str, Any], stage: str) -> None:
     expected, found = json.loads(FILE.read_text())[stage], made[stage]
     assert found["version"] == expected["version"], f"{stage}: golden of another version; {REMEDY}"
-    tolerance = CHOOSING if stage in ("infer", "surface", "asset") else TOLERANCE
+    tolerance = CHOOSING if stage in ("infer", "surface", "asset", golden.LEARNED) else TOLERANCE
     changed = [
         name
-        for name, told in found["arrays"].items()
+        for name, now in found["arrays"].items()
         if (before := expected["arrays"].get(name)) is None
-        or told["shape"] != before["shape"]
-        or np.abs(np.subtract(told["projections"], before["projections"])).max()
+        or now["shape"] != before["shape"]
+        or np.abs(np.subtract(now["projections"], before["projections"])).max()
         > tolerance * max(before["length"], 1e-9)
     ]
     assert changed == [], f"{stage} makes other pixels of the same input; {REMEDY}"
@@ -40,6 +41,6 @@ def test_fingerprint_sees_a_small_change_and_no_rounding() -> None:
     value = np.random.default_rng(0).normal(1, 0.3, (200, 200)).astype(np.float32)
     same, other = value * np.float32(1 + 1e-6), value.copy()
     other[:20, :20] *= 1.1
-    told = [np.array(golden._told("x", array)["projections"]) for array in (value, same, other)]
-    length = golden._told("x", value)["length"]
-    assert np.abs(told[1] - told[0]).max() < TOLERANCE * length < np.abs(told[2] - told[0]).max()
+    seen = [np.array(golden.projections("x", array)["projections"]) for array in (value, same, other)]
+    length = golden.projections("x", value)["length"]
+    assert np.abs(seen[1] - seen[0]).max() < TOLERANCE * length < np.abs(seen[2] - seen[0]).max()
