@@ -65,6 +65,14 @@ def test_the_shipped_model_can_start_training() -> None:
     assert run.begun.split()[1] == "samples"
 
 
+def test_a_layer_that_came_to_see_more_starts_as_if_it_did_not(tmp_path: Path) -> None:
+    """New channels come last and begin at zero; a layer with other outputs is another network's."""
+    own = torch.rand(4, 6, 3, 3)
+    grown = train._widened(own[:, :5], own)
+    assert torch.equal(grown[:, :5], own[:, :5]) and not grown[:, 5].any()
+    assert train._widened(own[:3, :5], own).shape == (3, 5, 3, 3)
+
+
 def test_resume_and_start_exclude_each_other(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="take one"):
         train.main(train.Params(out=tmp_path, resume=True, start=tmp_path / "m.onnx"))
@@ -140,7 +148,7 @@ def test_rate_falls_to_nothing_over_the_last_part_of_the_budget(data: Path) -> N
     batch = Batch(
         torch.rand(1, 14, 32, 32), torch.ones(1, 32, 32, dtype=torch.bool),
         torch.nn.functional.normalize(torch.ones(1, 3, 32, 32), dim=1), torch.rand(size), *torch.rand(2, 1, 3, 32, 32),
-        *torch.rand(2, *size),
+        *torch.rand(2, *size), torch.tensor([0.0, 0.0, 1.0]).view(1, 3, 1, 1).expand(1, 3, 32, 32),
     )  # fmt: skip
     rates = []
     for progress in (0.1, 0.2, 0.6, 1.0):
