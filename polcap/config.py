@@ -211,11 +211,13 @@ def _read(file: Path) -> dict[str, Any]:
 
 
 def _parse(text: str) -> Any:
-    """A TOML value; a bare word is a string."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except (ValueError, RecursionError):
-        return text
+    """A TOML value; a bare word is a string, and what has commas outside brackets is a list: 0,60,120."""
+    for written in (text, f"[{text}]" if "," in text else text):
+        try:
+            return tomllib.loads(f"value = {written}")["value"]
+        except (ValueError, RecursionError):
+            continue
+    return text
 
 
 def _check_finite(stated: dict[str, Any]) -> None:

@@ -82,19 +82,18 @@ def path(capture: Capture | None, supplied: UserInput, config: Config, store: St
 
 
 def on_grid(drawn: NDArray[np.bool_] | None, radiance: AngleStack) -> NDArray[np.bool_] | None:
-    """The user's mask on the grid of the merged picture; drawn there, or on the RAW pixels."""
+    """The user's mask on the grid of the merged picture; drawn there, or on the pixels of the RAW or of the mosaic."""
     if drawn is None:
         return None
     height, width = radiance.value.shape[1:3]
-    step = round(radiance.view.scale)
+    step = 2 if radiance.offset_px is not None else round(radiance.view.scale)
     tall, wide = drawn.shape
     if (tall, wide) == (height, width):
         return drawn
     if abs(tall - step * height) < step and abs(wide - step * width) < step:
         return np.asarray(drawn[::step, ::step][:height, :width])
-    raise ObjectError(
-        f"--mask is {wide}×{tall} px; draw it on the picture's {step * width}×{step * height} or {width}×{height} px"
-    )
+    sizes = dict.fromkeys(f"{n * width}×{n * height}" for n in (step, 1))
+    raise ObjectError(f"--mask is {wide}×{tall} px; draw it on the picture's {' or '.join(sizes)} px")
 
 
 def distance_m(color: ColorCalibration, radiance: AngleStack) -> float | None:

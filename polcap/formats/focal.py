@@ -2,6 +2,7 @@
 
 import math
 import tomllib
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ from polcap.formats import calib
 from polcap.images import Exif
 
 FULL_FRAME_MM = (36.0, 24.0)
+_CONTRADICTION = 0.1  # ln: more than breathing and rounding
 NORMAL_MM = 50.0  # full-frame equivalent that is assumed where nothing is known
 
 
@@ -24,6 +26,10 @@ def find(exif: Exif, stated_mm: float | None, stated_width_mm: float | None) -> 
     diagonal = math.hypot(width, height)
     equivalent = exif.focal_length_35mm  # by its definition of equal diagonals, in whole millimetres
     focal = stated_mm or exif.focal_length_mm
+    if stated_mm and exif.focal_length_mm and abs(math.log(stated_mm / exif.focal_length_mm)) > _CONTRADICTION:
+        found = find(replace(exif, focal_length_mm=None), stated_mm, stated_width_mm)
+        note = f"{found.note}, but the photographs say {exif.focal_length_mm:g} mm: correct one of the two"
+        return Focal(found.px, False, note)
     sensor = stated_width_mm or (exif.pixel_pitch_um and exif.pixel_pitch_um * width / 1e3)
     sensor = sensor or sensor_widths().get(exif.model)
     if focal and sensor:

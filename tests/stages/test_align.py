@@ -66,3 +66,26 @@ def test_a_shot_that_moved_too_far_is_refused_by_name_and_limit():
 def test_a_locked_camera_is_left_alone():
     found = align.register(scenes.stack(noise=0.01), scenes.no_color(), align.Settings(model="none"))
     assert np.array_equal(found.transform, np.tile(np.eye(3), (3, 1, 1)))
+
+
+def test_strong_polarization_is_no_other_scene() -> None:
+    """A film that turns the polarization from patch to patch, under one polarizer: contrast changes, edges stay."""
+    random = np.random.default_rng(3)
+    patches = np.kron(random.uniform(0, np.pi, (20, 26)), np.ones((12, 12)))[: scenes.HEIGHT, : scenes.WIDTH]
+    patches = np.pad(patches, ((0, 0), (0, scenes.WIDTH - patches.shape[1])), mode="edge")
+    radiance = scenes.stack(noise=0.002)
+    wave = 1 + 0.4 * np.cos(2 * (radiance.angle[:, None, None] - patches))
+    value = scenes.texture(*np.meshgrid(np.arange(scenes.WIDTH), np.arange(scenes.HEIGHT))) * wave[..., None]
+    value = value.astype(np.float32)
+    found = align.register(dataclasses.replace(radiance, value=value), scenes.no_color(), align.Settings())
+    assert np.abs(found.transform - np.eye(3))[:, :2, 2].max() < 0.5
+    other = np.stack([value[0], value[1][::-1], value[2][:, ::-1]])
+    with pytest.raises(AlignmentError, match="another scene"):
+        align.register(dataclasses.replace(radiance, value=other), scenes.no_color(), align.Settings(max_shift_px=500))
+
+
+def test_shots_with_nothing_to_compare_are_named() -> None:
+    radiance = scenes.stack()
+    clipped = dataclasses.replace(radiance, quality=np.full_like(radiance.quality, 1))
+    with pytest.raises(AlignmentError, match="no unclipped detail"):
+        align.register(clipped, scenes.no_color(), align.Settings())

@@ -31,6 +31,8 @@ _FLOOR_PX = 0.02  # what aliasing leaves of an error on rendered captures, whate
 _MOST_POINTS = 1e5  # of a picture tell of a movement; more are evenly thinned
 _MEDIAN_OF = 20000  # points: knows a median to 1 %
 _SIDE = 1024
+_SURE_LIKENESS = 0.6  # correlation of detail from which nothing else is tried
+_LEAST_PIXELS = 30  # that show detail, for six or eight unknowns
 _MOST_PIXELS = 1.5e6  # a larger image is averaged down first: it has detail to spare
 
 
@@ -51,7 +53,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 4.0
 
 
-@stage(version=3)
+@stage(version=4)
 def register(radiance: AngleStack, color: ColorCalibration, settings: Settings) -> Alignment:
     """One transform per shot, reference grid px → shot grid px.
 
@@ -61,7 +63,7 @@ def register(radiance: AngleStack, color: ColorCalibration, settings: Settings) 
     if radiance.offset_px is not None:
         return _as_known(radiance.offset_px)
     step = int(np.ceil(np.sqrt(radiance.value[0, ..., 0].size / _MOST_PIXELS)))
-    detail = [_Detail(radiance, k, settings.detail_px, step) for k in range(shots)]
+    detail = [_Detail(_fine(radiance, k, settings.detail_px, step)) for k in range(shots)]
     transform = np.tile(np.eye(3), (shots, 1, 1))
     residual = np.zeros(shots)
     correlation = np.ones(shots)
@@ -70,15 +72,17 @@ def register(radiance: AngleStack, color: ColorCalibration, settings: Settings) 
     for k in range(1, shots):
         if settings.model == "none":
             continue
-        start = np.eye(3)
-        start[:2, 2] = _coarse_shift(detail[0], detail[k])
-        transform[k], residual[k] = _refine(detail[0], detail[k], start, settings.model)
-        correlation[k] = _correlation(detail[0], detail[k], transform[k])
+        name = f"shot {np.degrees(radiance.angle[k]):g}°"
+        if not _in_common(detail[0][1], detail[k][1]):
+            raise AlignmentError(
+                f"{name} has no unclipped detail in common with the first shot: over-exposed, black, or even all over; "
+                "shoot a darker frame, or with a locked camera --set align.model=none"
+            )
+        transform[k], residual[k], correlation[k] = _find(detail[0], detail[k], settings.model)
         transform[k] = _to_full_grid(transform[k], step)
         residual[k] *= step
         moved = transform[k] @ corners
         shift = np.abs(moved[:2] / moved[2] - corners[:2]).max()
-        name = f"shot {np.degrees(radiance.angle[k]):g}°"
         if not np.isfinite(shift) or correlation[k] < settings.min_correlation:
             raise AlignmentError(
                 f"{name} shows another scene than the first shot: correlation {correlation[k]:.2f}, "
@@ -100,30 +104,41 @@ def _as_known(offset_px: Floats) -> Alignment:
     return Alignment(transform, np.zeros(len(offset_px)), np.ones(len(offset_px)))
 
 
-class _Detail:
-    """Fine structure of one shot's log radiance and its weight, at all scales, each made when it is asked for."""
+def _fine(radiance: AngleStack, k: int, detail_px: float, step: int) -> "_Scale":
+    """Fine structure of one shot's log radiance and its weight."""
+    total = _averaged(_summed(radiance.value[k]), step)
+    sigma = np.sqrt(_averaged(_summed(radiance.variance[k]), step)) / step
+    some = (slice(None, None, 3),) * 2  # enough for a percentile
+    # The floor keeps the logarithm of a dark background from amplifying its noise.
+    floor = max(float(np.percentile(total[some], 99)) * 0.01, 2 * float(np.median(sigma[some])), 1e-9)
+    level = np.maximum(total, 0)
+    level += np.float32(floor)
+    log = np.log(level)
+    smooth = cv2.GaussianBlur(log, (0, 0), 0.7)  # both shots need one resolution; cubic warps change it
+    smooth -= cv2.GaussianBlur(log, (0, 0), detail_px)
+    sigma /= level
+    sigma *= sigma
+    sigma += np.float32(0.003**2)
+    weight = np.divide(np.float32(1), sigma, out=sigma)
+    clipped = (radiance.quality[k] & Quality.CLIPPED).astype(np.uint8)
+    if clipped.any():
+        clipped = (_averaged(clipped.astype(np.float32), step) > 0).astype(np.uint8)
+        reach = int(np.ceil(2 * detail_px)) | 1
+        weight[cv2.dilate(clipped, np.ones((reach, reach), np.uint8)) > 0] = 0
+    return _Scale(smooth, weight)
 
-    def __init__(self, radiance: AngleStack, k: int, detail_px: float, step: int) -> None:
-        total = _averaged(_summed(radiance.value[k]), step)
-        sigma = np.sqrt(_averaged(_summed(radiance.variance[k]), step)) / step
-        some = (slice(None, None, 3),) * 2  # enough for a percentile
-        # The floor keeps the logarithm of a dark background from amplifying its noise.
-        floor = max(float(np.percentile(total[some], 99)) * 0.01, 2 * float(np.median(sigma[some])), 1e-9)
-        level = np.maximum(total, 0)
-        level += np.float32(floor)
-        log = np.log(level)
-        smooth = cv2.GaussianBlur(log, (0, 0), 0.7)  # both shots need one resolution; cubic warps change it
-        smooth -= cv2.GaussianBlur(log, (0, 0), detail_px)
-        sigma /= level
-        sigma *= sigma
-        sigma += np.float32(0.003**2)
-        weight = np.divide(np.float32(1), sigma, out=sigma)
-        clipped = (radiance.quality[k] & Quality.CLIPPED).astype(np.uint8)
-        if clipped.any():
-            clipped = (_averaged(clipped.astype(np.float32), step) > 0).astype(np.uint8)
-            reach = int(np.ceil(2 * detail_px)) | 1
-            weight[cv2.dilate(clipped, np.ones((reach, reach), np.uint8)) > 0] = 0
-        self._scales: dict[int, _Scale] = {1: _Scale(smooth, weight)}
+
+class _Detail:
+    """One shot's detail at all scales, each made when it is asked for."""
+
+    def __init__(self, whole: "_Scale") -> None:
+        self._scales: dict[int, _Scale] = {1: whole}
+
+    def edges(self) -> "_Detail":
+        """Where edges are and how strong, whichever side is brighter: the root of their strength, about its mean."""
+        whole = self._scales[1]
+        strength = np.sqrt(cv2.GaussianBlur(np.hypot(*whole.gradient), (0, 0), 1.0))
+        return _Detail(_Scale(np.asarray(strength - strength.mean()), whole.weight))
 
     def __getitem__(self, shrink: int) -> "_Scale":
         """The same of an image averaged down."""
@@ -172,6 +187,40 @@ def _to_full_grid(transform: Floats, step: float) -> Floats:
     """A transform of a grid averaged by `step` on the grid it was averaged from (1/step: the other way)."""
     up = np.array([[step, 0, (step - 1) / 2], [0, step, (step - 1) / 2], [0, 0, 1.0]])
     return np.asarray(up @ transform @ np.linalg.inv(up))
+
+
+def _in_common(reference: _Scale, shot: _Scale) -> bool:
+    """Whether both show anything that could be compared."""
+    return all(
+        np.count_nonzero(one.weight) > _LEAST_PIXELS and np.ptp(one.value[one.weight > 0]) > 0
+        for one in (reference, shot)
+    )
+
+
+def _find(reference: _Detail, shot: _Detail, model: str) -> tuple[Floats, float, float]:
+    """Transform of a shot, its 1σ in px, and the likeness of the two shots under it.
+
+    Polarization may change which side of an edge is bright: where the detail is little alike, the edges are compared
+    in its place, and from where a camera stands that was not touched.
+    """
+    found = _follow(reference, shot, _coarse_shift(reference, shot), model)
+    if found[2] > _SURE_LIKENESS:
+        return found
+    edges, still = (reference.edges(), shot.edges()), np.zeros(2)
+    others = [
+        _follow(reference, shot, still, model),
+        _follow(*edges, _coarse_shift(*edges), model),
+        _follow(*edges, still, model),
+    ]
+    return max(found, *others, key=lambda one: one[2])
+
+
+def _follow(reference: _Detail, shot: _Detail, shift: Floats, model: str) -> tuple[Floats, float, float]:
+    """The same from a first shift (2,) px."""
+    start = np.eye(3)
+    start[:2, 2] = shift
+    transform, residual = _refine(reference, shot, start, model)
+    return transform, residual, _correlation(reference, shot, transform)
 
 
 def _coarse_shift(reference: _Detail, shot: _Detail) -> Floats:
@@ -223,8 +272,10 @@ class _Compared:
 
     def step(self, transform: Floats) -> tuple[Floats, float]:
         """One compositional update (3, 3) that brings b∘transform closer to a, and its 1σ, px."""
-        u, v = (_rows(c) for c in coordinates(transform, self.x, self.y))
         count = len(self.x)
+        if count <= _LEAST_PIXELS:
+            return np.eye(3), np.inf
+        u, v = (_rows(c) for c in coordinates(transform, self.x, self.y))
         warped = self.shot.spline.at(Taps(u, v, (self.height, self.width))).ravel()[:count]
         u, v = u.astype(np.float32), v.astype(np.float32)
         bx, by = (

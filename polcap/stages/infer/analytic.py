@@ -130,12 +130,18 @@ def _albedo(cues: Cues, cos_zenith: Floats, ior: float) -> tuple[Floats, Floats]
 
 
 def fill_highlights(image: Floats, cues: Cues) -> Floats:
-    """An image (H, W, 3) that goes on from around into highlights which saturate the shortest exposure."""
+    """An image (H, W, 3) that goes on from around into highlights which saturate the shortest exposure.
+
+    A hole that nothing known reaches across the whole picture takes the mean of what is known.
+    """
     clipped = cues.mask & ((cues.quality & Quality.CLIPPED) > 0)
     hole = cues.mask & (cv2.dilate(clipped.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
     known = cues.mask & ~hole
     out, blur = np.array(image, np.float32), 2.0
     while hole.any() and known.any():
+        if blur > max(hole.shape):
+            out[hole] = out[known].mean(axis=0)
+            break
         share = cv2.GaussianBlur(known.astype(np.float32), (0, 0), blur)
         mean = cv2.GaussianBlur(out * known[..., None], (0, 0), blur) / np.maximum(share, 1e-6)[..., None]
         reached = hole & (share > _REACHED)

@@ -1,0 +1,116 @@
+"""Captures that are valid and hostile: every stage ends, with a finite value or one clear error."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from polcap import gates
+from polcap.config import Config
+from polcap.errors import InputError
+from polcap.images import AngleStack, Quality, View
+from polcap.stages import align, asset, cues, infer, mask, selfcal, stokes, surface
+from tests import scenes
+
+HEIGHT, WIDTH = 36, 48
+LOOKS = ("noise", "constant", "zero", "disc", "stripes", "one pixel", "ramp", "negative")
+FLAWS = ("none", "all clipped", "half clipped", "all dark", "all ghosts", "ball clipped")
+MASKS = ("found", "whole", "one pixel", "line", "two specks", "disc")
+
+
+def hostile(seed: int) -> tuple[AngleStack, np.ndarray | None]:
+    """A stack and a user's mask (None: to be found), drawn at random from what may go wrong."""
+    random = np.random.default_rng(seed)
+    shots = int(random.integers(3, 7))
+    angle = np.sort(random.uniform(0, np.pi, shots)) if random.integers(2) else np.arange(shots) * np.pi / shots
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(float)
+    disc = (x - 22) ** 2 + (y - 18) ** 2 < 150
+    look = LOOKS[random.integers(len(LOOKS))]
+    light = {
+        "noise": random.uniform(0, 1, (HEIGHT, WIDTH)),
+        "constant": np.full((HEIGHT, WIDTH), 0.5),
+        "zero": np.zeros((HEIGHT, WIDTH)),
+        "disc": 0.01 + 0.5 * disc,
+        "stripes": 0.5 + 0.5 * np.sin(x),
+        "one pixel": 1.0 * ((x == 20) & (y == 20)),
+        "ramp": x / WIDTH,
+        "negative": -0.1 * random.uniform(0, 1, (HEIGHT, WIDTH)),
+    }[look]
+    wave = 1 + random.uniform(0, 1) * np.cos(2 * angle - random.uniform(0, np.pi))
+    value = (light * wave[:, None, None])[..., None] * random.uniform(0.3, 1, 3)
+    value = value + random.choice([0, 1e-3]) * random.normal(size=value.shape)
+    quality = np.zeros(value.shape[:3], np.uint8)
+    flaw = FLAWS[random.integers(len(FLAWS))]
+    if flaw == "all clipped":
+        quality[:] = Quality.CLIPPED
+    elif flaw == "half clipped":
+        quality[:, :, ::2] = Quality.CLIPPED
+    elif flaw == "all dark":
+        quality[:] = Quality.DARK
+    elif flaw == "all ghosts":
+        quality[:] = Quality.GHOST
+    elif flaw == "ball clipped":
+        quality[:, disc] = Quality.CLIPPED
+    drawn = {
+        "found": None,
+        "whole": np.ones((HEIGHT, WIDTH), bool),
+        "one pixel": (x == 20) & (y == 20),
+        "line": y == 18,
+        "two specks": ((x < 4) & (y < 4)) | ((x > 40) & (y > 30)),
+        "disc": disc,
+    }[MASKS[random.integers(len(MASKS))]]
+    ones = np.ones((shots, 2, 3)) * np.array([1.0, random.uniform(1, 5)])[:, None]
+    stack = AngleStack(
+        value=value.astype(np.float32), variance=np.full(value.shape, 1e-6, np.float32), quality=quality,
+        angle=angle, view=View(200.0, ((WIDTH - 1) / 2, (HEIGHT - 1) / 2), 2.0), exposure_ratio=ones,
+        exif_ratio=ones[..., 0], ghost_fraction=np.zeros(shots), lossy=False, camera_matrix=None, white_balance=None,
+        light=("flash", "steady", "unknown")[random.integers(3)], curvature=np.full((shots, 2), np.nan),
+    )  # fmt: skip
+    return stack, drawn
+
+
+def run(radiance: AngleStack, drawn: np.ndarray | None) -> None:
+    """Every stage after the merge, and the gates; what they refuse is fine."""
+    config, color = Config(), scenes.no_color()
+    try:
+        alignment = align.register(radiance, color, config.align)
+        object_ = mask.segment(radiance, alignment, color, drawn, None, config.mask)
+        gains = selfcal.solve(radiance, alignment, object_, color, config.selfcal)
+        image = stokes.solve(radiance, alignment, gains, object_, config.stokes)
+        seen = cues.compute(image, color)
+        maps = infer.estimate(seen, None, config.infer)
+        mesh = surface.integrate(maps, None, config.surface)
+        built = asset.build(maps, mesh, config.asset)
+    except InputError as error:
+        assert "\n" not in str(error)
+        return
+    for array in (gains.gain, image.stokes, maps.normal, maps.diffuse, maps.confidence, mesh.vertices):
+        assert np.isfinite(array).all()
+    found: dict[str, Any] = {
+        "names": [str(k) for k in range(len(radiance.angle))], "focal_known": True, "grid_px": 1.0,
+        "chart_missing": "", "blur_px": None, "clipped": np.zeros(len(radiance.angle)), "radiance": radiance,
+        "color": color, "alignment": alignment, "object_": object_, "gains": gains, "stokes": image, "maps": maps,
+    }  # fmt: skip
+    told = list(gates.judge(SimpleNamespace(**found), config))
+    assert all(gate.says and gate.state in ("pass", "warn", "fail", "not measured") for gate in told)
+    assert built.base_color.dtype == np.uint8
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("first", range(0, 120, 20))
+def test_hostile_captures_end(first: int) -> None:
+    for seed in range(first, first + 20):
+        try:
+            run(*hostile(seed))
+        except (InputError, AssertionError, RuntimeWarning, ValueError, IndexError, ZeroDivisionError) as error:
+            raise AssertionError(f"seed {seed}: {type(error).__name__} {error}") from error
+
+
+def test_filling_ends_where_nothing_known_reaches() -> None:
+    stack, _ = hostile(0)
+    clipped = np.full(stack.quality.shape, np.uint8(Quality.CLIPPED))
+    clipped[:, 0, 0] = 0
+    run(replace(stack, quality=clipped), np.ones((HEIGHT, WIDTH), bool))
