@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import trimesh
+from numpy.typing import NDArray
 
 from polcap.formats import atomic, exr, gltf
 from polcap.formats.texture_set import SPECULAR_RANGE, Key
-from polcap.images import Asset
+from polcap.images import Asset, Floats
 
 
 def stem(name: str) -> str:
@@ -47,25 +47,62 @@ def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], says: s
     with atomic.path(library) as temporary:
         temporary.write_text(header + _material(asset, stem(name), files, data), encoding="utf-8")
     with atomic.path(path) as temporary:
-        temporary.write_text(header + _geometry(asset, stem(name), library.name), encoding="utf-8")
+        temporary.write_bytes(header.encode() + _geometry(asset, stem(name), library.name))
     return written
 
 
-def _geometry(asset: Asset, material: str, library: str) -> str:
+def _geometry(asset: Asset, material: str, library: str) -> bytes:
+    """The text of the mesh. Numbers are filled up with zeros: whole columns are then written at once."""
     mesh = asset.mesh
-    shape = trimesh.Trimesh(
-        vertices=mesh.vertices - gltf.center(mesh.vertices),
-        faces=mesh.faces,
-        vertex_normals=mesh.normals,
-        visual=trimesh.visual.TextureVisuals(
-            uv=mesh.uv * [1.0, -1.0] + [0.0, 1.0], material=trimesh.visual.material.SimpleMaterial()
-        ),
-        process=False,
-    )
-    text = trimesh.exchange.obj.export_obj(
-        shape, include_normals=True, include_color=False, write_texture=False, mtl_name=library, header=material
-    )
-    return re.sub(r"(?m)^usemtl .*$", f"usemtl {material}", text, count=1)
+    head = f"mtllib {library}\no {material}\n".encode()
+    vertices = _decimals(b"v", mesh.vertices - gltf.center(mesh.vertices), 8)
+    corners = _decimals(b"vt", mesh.uv * [1.0, -1.0] + [0.0, 1.0], 8)
+    normals = _decimals(b"vn", mesh.normals, 6)
+    return b"".join([head, vertices, corners, normals, f"usemtl {material}\ns 1\n".encode(), _faces(mesh.faces)])
+
+
+def _decimals(word: bytes, values: Floats, places: int) -> bytes:
+    """A line for each row of (N, k) numbers, with so many decimals."""
+    count, columns = values.shape
+    if not count:
+        return b""
+    left = np.rint(np.abs(values, dtype=np.float64) * 10**places).astype(np.uint64)
+    digits = max(len(str(int(left.max()))), places + 1)
+    width = 2 + digits + 1  # a space, the sign, the digits and the point
+    out = np.full((count, columns, width), ord(" "), np.uint8)
+    out[..., 1] = np.where(np.signbit(values) & (left > 0), ord("-"), ord("0"))
+    _digits(out[..., 2 : 2 + digits - places], left // np.uint64(10**places))
+    out[..., 2 + digits - places] = ord(".")
+    _digits(out[..., 3 + digits - places :], left % np.uint64(10**places))
+    return _lines(word, out.reshape(count, columns * width))
+
+
+def _faces(faces: NDArray[np.int32]) -> bytes:
+    """f a/a/a b/b/b c/c/c: vertex, texture corner and normal have one number, from 1."""
+    if not len(faces):
+        return b""
+    number = faces.astype(np.uint64) + np.uint64(1)
+    digits = len(str(int(number.max())))
+    out = np.full((len(faces), 3, 3, digits + 1), ord("/"), np.uint8)
+    out[:, :, 0, 0] = ord(" ")
+    _digits(out[:, :, 0, 1:], number)
+    out[:, :, 1:, 1:] = out[:, :, :1, 1:]
+    return _lines(b"f", out.reshape(len(faces), -1))
+
+
+def _digits(out: NDArray[np.uint8], number: NDArray[np.uint64]) -> None:
+    """Decimal digits of whole numbers into the last axis, from its end."""
+    left = number.astype(np.uint32) if number.max() < 2**32 else number
+    ten = left.dtype.type(10)
+    for place in range(out.shape[-1] - 1, -1, -1):
+        left, digit = np.divmod(left, ten)
+        out[..., place] = digit + left.dtype.type(ord("0"))
+
+
+def _lines(word: bytes, text: NDArray[np.uint8]) -> bytes:
+    start = np.broadcast_to(np.frombuffer(word, np.uint8), (len(text), len(word)))
+    end = np.full((len(text), 1), ord("\n"), np.uint8)
+    return np.concatenate([start, text, end], axis=1).tobytes()
 
 
 def _material(asset: Asset, material: str, files: Mapping[Key, str], data: Mapping[Key, str]) -> str:
