@@ -99,6 +99,13 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_normal_error_deg: Annotated[
         float, Meta(gt=0, le=90, description="median expected error of the normals [degrees]")
     ] = 20.0
+    max_mesh_pieces: Annotated[int, Meta(ge=1, description="pieces of the seen surface, without specks")] = 10
+    max_mesh_cuts: Annotated[
+        float, Meta(ge=0, description="length of the mesh's cuts where depth jumps over that of its outline [1]")
+    ] = 1.0
+    max_mesh_raggedness: Annotated[
+        float, Meta(ge=0, description="how much longer the mesh's rim is than its smooth curve [1]")
+    ] = 0.25
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

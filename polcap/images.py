@@ -292,6 +292,9 @@ class Mesh:
     faces: NDArray[np.int32]  # (F, 3) counter-clockwise seen from the camera
     depth: Floats  # (H, W) along the optical axis, growing away from the camera; NaN outside
     metric: bool
+    pieces: int  # of the seen side, without specks
+    cuts: float  # length of its boundary inside the mask over that along the mask's outline
+    raggedness: float  # length of its boundary over that of itself smoothed, less 1; before it was smoothed
 
 
 @dataclass(frozen=True)

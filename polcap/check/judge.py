@@ -31,6 +31,8 @@ from polcap.stages import align, cues, hdr, infer, mask, selfcal, stokes, whiteb
 class Reduced:
     """What the stages make of a reduced capture; their own limits are left to the gates."""
 
+    mesh: None = None  # none is made
+
     def __init__(self, taken: Taken, network: Network | None, mask_network: Network | None, config: Config) -> None:
         self.taken, self.network, self.mask_network, self.config = taken, network, mask_network, config
         self.names = [shot.name for shot in taken.capture.shots]

@@ -31,6 +31,8 @@ def judge(found: Found, config: Config) -> Iterator[Gate]:
         if gate.name == "order" and gate.state == "fail":
             return  # in another order all that follows is another capture's
     yield _normal_error(found, judged, config.gates)
+    if found.mesh is not None:
+        yield geometry.mesh(found.mesh, config.gates)
     yield _focal_length(found.focal_known)
 
 

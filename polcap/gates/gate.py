@@ -12,6 +12,7 @@ from polcap.images import (
     ColorCalibration,
     Floats,
     Gains,
+    Mesh,
     ObjectMask,
     StokesImage,
     SurfaceMaps,
@@ -66,6 +67,8 @@ class Found(Protocol):
     def stokes(self) -> StokesImage: ...
     @property
     def maps(self) -> SurfaceMaps: ...
+    @property
+    def mesh(self) -> Mesh | None: ...  # None where none is made
 
 
 def at_most(

@@ -4,6 +4,7 @@ import numpy as np
 
 from polcap.config import Config, Gates
 from polcap.gates.gate import Found, Gate, State, at_most, blamed
+from polcap.images import Mesh
 
 
 def alignment(found: Found, config: Config) -> Gate:
@@ -53,6 +54,23 @@ def mask(found: Found, limits: Gates) -> Gate:
     remedy = "look at it, and where it is wrong give --mask PNG; let backdrop show all around the object"
     cost = 10 * object_.border if state == "warn" else 5.0 if state == "fail" else 0.0
     return Gate("mask", state, object_.doubt, limit, says, remedy if doubts else "", cost)
+
+
+def mesh(of: Mesh, limits: Gates) -> Gate:
+    """Fails where the surface is in shreds: many pieces, cuts longer than its outline, or a jagged rim."""
+    faults = []
+    if of.pieces > limits.max_mesh_pieces:
+        faults.append(f"{of.pieces} pieces, more than {limits.max_mesh_pieces}")
+    if of.cuts > limits.max_mesh_cuts:
+        faults.append(f"cuts {of.cuts:.0%} of the outline's length, more than {limits.max_mesh_cuts:.0%}")
+    if of.raggedness > limits.max_mesh_raggedness:
+        faults.append(f"a rim {of.raggedness:.0%} longer than its curve, more than {limits.max_mesh_raggedness:.0%}")
+    cuts = round(of.cuts, 4)
+    if not faults:
+        says = f"cut where one part hides another, along {of.cuts:.0%} of the outline's length"
+        return Gate("mesh", "pass", cuts, limits.max_mesh_cuts, says)
+    remedy = "the normals fit no surface, see their error; --set surface.stiffness=0 keeps it in one piece"
+    return Gate("mesh", "fail", cuts, limits.max_mesh_cuts, "; ".join(faults), remedy)
 
 
 def sharpness(found: Found, limits: Gates) -> Gate:

@@ -157,6 +157,9 @@ def figures(results: Results) -> dict[str, dict[str, Any]]:
             "faces": len(mesh.faces),
             "metric": mesh.metric,
             "extent": _list(extent, 5),
+            "pieces": mesh.pieces,
+            "cuts": _number(mesh.cuts),
+            "raggedness": _number(mesh.raggedness),
         },
     }
 

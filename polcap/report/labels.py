@@ -55,6 +55,9 @@ LABELS: dict[str, tuple[str, str]] = {
     "mesh.faces": ("Triangles", ""),
     "mesh.metric": ("Scale known", ""),
     "mesh.extent": ("Width, height, depth", ""),
+    "mesh.pieces": ("Pieces", ""),
+    "mesh.cuts": ("Cuts where depth jumps, of the outline's length", "%"),
+    "mesh.raggedness": ("Rim longer than its smooth curve by", "%"),
     "rerendering.rms": ("Difference of photographs and re-rendering, of white, each angle", "%"),
     "rerendering.scale": ("Brightness of the photographs, of the re-rendering's", "×"),
 }

@@ -10,6 +10,7 @@ from polcap.images import (
     ColorCalibration,
     Floats,
     Gains,
+    Mesh,
     ObjectMask,
     Quality,
     StokesImage,
@@ -64,3 +65,7 @@ class Whole:
     @property
     def maps(self) -> SurfaceMaps:
         return self.results.maps.value
+
+    @property
+    def mesh(self) -> Mesh:
+        return self.results.mesh.value

@@ -31,7 +31,7 @@ def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> SimpleNamespace
         "names": [f"{np.degrees(a):g}°" for a in radiance.angle], "focal_known": True, "grid_px": 1.0,
         "chart_missing": "", "blur_px": None, "clipped": np.zeros(shots), "radiance": radiance,
         "color": scenes.no_color(), "alignment": scenes.still(shots), "object_": object_, "gains": gains,
-        "stokes": image, "maps": maps,
+        "stokes": image, "maps": maps, "mesh": None,
     }  # fmt: skip
     return SimpleNamespace(**{**given, **changed})
 
@@ -129,3 +129,13 @@ def test_mask_that_its_network_doubts_fails(good: SimpleNamespace) -> None:
 
 def test_assumed_focal_length_warns(good: SimpleNamespace) -> None:
     assert judged(changed(good, focal_known=False))["focal length"].state == "warn"
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"), [({"pieces": 26}, "26 pieces"), ({"cuts": 2.0}, "cuts 200%"), ({"raggedness": 0.4}, "rim 40%")]
+)
+def test_mesh_in_shreds_fails(good: SimpleNamespace, fault: dict[str, float], words: str) -> None:
+    whole = {"pieces": 1, "cuts": 0.3, "raggedness": 0.1}
+    assert judged(changed(good, mesh=SimpleNamespace(**whole)))["mesh"].state == "pass"
+    gate = judged(changed(good, mesh=SimpleNamespace(**whole | fault)))["mesh"]
+    assert gate.state == "fail" and words in gate.says

@@ -12,12 +12,14 @@ from tests import surfaces
 
 
 def rendered_normals(of: Asset, maps: SurfaceMaps) -> Floats:
-    """A renderer's normals at the vertices' pixels: texture in the vertex's own frame."""
+    """A renderer's normals at vertices on pixels, which those inside are: texture in the vertex's own frame."""
     mesh = of.mesh
-    column, row = np.rint(mesh.uv * [surfaces.WIDTH, surfaces.HEIGHT] - 0.5).astype(int).T
+    place = mesh.uv * [surfaces.WIDTH, surfaces.HEIGHT] - 0.5
+    on = np.abs(place - np.rint(place)).max(axis=1) < 0.01
+    column, row = np.rint(place[on]).astype(int).T
     x, y, z = (of.normal[row, column] / 127.5 - 1).T[..., None]
-    bitangent = np.cross(mesh.normals, mesh.tangents[:, :3]) * mesh.tangents[:, 3:]
-    normal = x * mesh.tangents[:, :3] + y * bitangent + z * mesh.normals
+    n, t = mesh.normals[on], mesh.tangents[on]
+    normal = x * t[:, :3] + y * np.cross(n, t[:, :3]) * t[:, 3:] + z * n
     return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True)), (row, column)
 
 

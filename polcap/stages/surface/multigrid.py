@@ -8,6 +8,7 @@ References
 Vaněk, Mandel & Brezina, Algebraic multigrid by smoothed aggregation, Computing 56 (1996).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,6 +70,33 @@ class Multigrid:
         x = step * right
         x = x + level.prolong @ self._cycle(depth + 1, level.restrict @ (right - level.matrix @ x))
         return np.asarray(x + step * (right - level.matrix @ x))
+
+
+class Nested:
+    """One cycle on a grid whose half resolution has a preconditioner already.
+
+    The coarse equations are those of the same surface on blocks of 2×2 pixels, in the same unit per pixel: a step
+    of 1 on the fine grid weighs there as much as here, so block means correct the fine solution unscaled.
+
+    Parameters
+    ----------
+    matrix : (N, N) CSR.
+    parent : (N,) number of the block that each unknown lies in.
+    coarse : the preconditioner of the blocks.
+    """
+
+    def __init__(self, matrix: Any, parent: NDArray[np.intp], coarse: Callable[[Floats], Floats]) -> None:
+        self.matrix, self.parent, self.coarse = matrix.astype(np.float32), parent, coarse
+        self.inverse_diagonal = 1 / self.matrix.diagonal()
+        self.blocks = int(parent.max()) + 1
+
+    def __call__(self, right: Floats) -> Floats:
+        right = right.astype(np.float32)
+        step = _DAMPING * self.inverse_diagonal
+        x = step * right
+        left = np.asarray(np.bincount(self.parent, right - self.matrix @ x, self.blocks), dtype=np.float64)
+        x = x + self.coarse(left).astype(np.float32)[self.parent]
+        return np.asarray(x + step * (right - self.matrix @ x))
 
 
 def conjugate_gradients(

@@ -5,6 +5,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from scipy import ndimage
 from polcap.errors import ObjectError
 from polcap.images import Floats, Mesh, SurfaceMaps, View
 from polcap.stages import surface
+from polcap.stages.surface import boundary, integration
 
 SETTINGS = surface.Settings()
 VIEW = View(focal=400.0, center=(63.5, 55.5), scale=2.0)
@@ -90,7 +92,7 @@ def test_bumps_are_recovered_to_a_thousandth() -> None:
 
 def test_pyramid_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     truth_maps, truth = sphere()
-    monkeypatch.setattr(surface, "_DIRECT", 500)
+    monkeypatch.setattr(integration, "_DECIDED", 500)
     mesh = surface.integrate(truth_maps, 0.95, SETTINGS)
     assert error_share(mesh, truth, truth_maps.mask) < 0.01
 
@@ -231,3 +233,64 @@ def test_rendered_normals_give_the_rendered_depth(name: str, alone: float, guide
     prior = (blurred / truth[mask].mean() - 1) / radius
     mesh = surface.integrate(replace(scene, depth_prior=prior.astype(np.float32)), None, SETTINGS)
     assert error_share(mesh, truth, mask) < guided
+
+
+def waved(size: int, degrees: float) -> tuple[SurfaceMaps, Floats]:
+    """A ball `size` px across whose normals err by `degrees` in waves of some px, as a network's do."""
+    view = View(5.0 * size, (size / 2 - 0.5, size / 2 - 0.5), 1.0)
+    ball, truth = sphere(view, (size, size), (0.0, 0.0, -1.0), 0.098)
+    rng = np.random.default_rng(size)
+    error = sum(ndimage.gaussian_filter(rng.normal(size=(size, size, 2)), (s, s, 0)) * s for s in (2, 8))
+    error *= np.radians(degrees) / np.sqrt(np.mean(np.sum(error**2, axis=-1)))
+    normal = ball.normal + np.concatenate([error, np.zeros((size, size, 1))], axis=-1)
+    normal[..., 2] = np.maximum(normal[..., 2], 0.02)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    return replace(ball, normal=np.where(ball.mask[..., None], normal, 0).astype(np.float32)), truth
+
+
+@pytest.mark.parametrize("size", [200, 560])
+def test_noise_tears_no_smooth_surface_at_any_resolution(size: int) -> None:
+    scene, truth = waved(size, 6.0)
+    mesh = surface.integrate(scene, None, SETTINGS)
+    plain = surface.integrate(scene, None, surface.Settings(stiffness=0.0))
+    assert (mesh.pieces, mesh.cuts) == (1, 0.0)
+    assert error_share(mesh, truth, scene.mask) < 1.02 * error_share(plain, truth, scene.mask)
+
+
+def test_prior_weighs_alike_at_any_resolution() -> None:
+    """A wrong prior, half as deep again, bends the ball's inner part by as much at 200 and at 400 px."""
+    bend = []
+    for size in (200, 400):
+        view = View(5.0 * size, (size / 2 - 0.5, size / 2 - 0.5), 1.0)
+        ball, truth = sphere(view, (size, size), (0.0, 0.0, -1.0), 0.098)
+        radius = np.sqrt(ball.mask.sum() / np.pi) / view.focal
+        wrong = 1.5 * (np.nan_to_num(truth) / np.nanmean(truth) - 1) / radius
+        scene = replace(ball, depth_prior=wrong.astype(np.float32))
+        depth = surface.integrate(scene, None, surface.Settings(prior_weight=20.0, stiffness=0.0)).depth
+        middle, side = (size // 2, size // 2), (size // 2, size // 8 * 7)
+        bend.append(np.log(depth[side] / depth[middle]) / np.log(truth[side] / truth[middle]) - 1)
+    assert bend[0] > 0.02
+    assert bend[1] == pytest.approx(bend[0], rel=0.1)
+
+
+def test_boundary_is_a_curve_not_stairs() -> None:
+    """Distance of the rim's vertices from the ball's outline, in px of the picture: 1/√12 for pixels' stairs."""
+    ball, _ = sphere(View(1000.0, (99.5, 99.5), 1.0), (200, 200), (0.0, 0.0, -1.0), 0.09)
+    mesh = surface.integrate(ball, None, SETTINGS)
+    rim = np.unique(boundary.edges(mesh.faces))
+    away = np.linalg.norm(mesh.uv[rim] * 200 - 100, axis=1)
+    assert np.std(away) < 0.2
+    assert 0 < mesh.raggedness < 0.15
+
+
+@pytest.mark.parametrize(("back", "holes"), [("open", True), ("skirt", True), ("closed", False)])
+def test_back_closes_the_mesh_where_it_is_asked_to(back: str, holes: bool) -> None:
+    truth_maps, _ = sphere()
+    seen = surface.integrate(truth_maps, 0.95, SETTINGS)
+    mesh = surface.integrate(truth_maps, 0.95, msgspec.structs.replace(SETTINGS, back=back))
+    assert bool(len(boundary.edges(mesh.faces))) == holes
+    assert (mesh.faces[: len(seen.faces)] == seen.faces).all()
+    p, q, r = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    volume = np.sum(p * np.cross(q, r)) / 6
+    if back == "closed":
+        assert 0.0015 < volume < np.pi * 0.1**3  # the cap that is seen holds 0.0018, the cylinder about a half more

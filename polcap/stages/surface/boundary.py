@@ -1,0 +1,108 @@
+"""The edges where a mesh ends: measured, and smoothed from the pixels' stairs to the curve they stand for."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from polcap.images import Floats
+
+_SPECK = 0.002  # of the mesh's triangles: smaller pieces do not count
+_ROUNDS = 4  # of averaging along the boundary; about two grid steps either side
+_FARTHEST = 0.75  # grid steps that a vertex may move in the picture
+_LEAST_AREA = 0.1  # of a triangle after the move, over before: else its corners stay
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What tells a torn mesh from a whole one."""
+
+    pieces: int  # that hold more than a speck
+    cuts: float  # length of the boundary inside the mask over that along its outline
+    raggedness: float  # length of the boundary over that of itself smoothed, less 1
+
+
+def edges(faces: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Edges (B, 2) of one triangle only, in that triangle's direction."""
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    low, high = ends.min(axis=1), ends.max(axis=1)
+    key = low * (int(faces.max()) + 1) + high
+    order = np.argsort(key, kind="stable")
+    same = key[order[1:]] == key[order[:-1]]
+    alone = np.ones(len(key), dtype=bool)
+    alone[order[1:]] &= ~same
+    alone[order[:-1]] &= ~same
+    return np.asarray(ends[alone])
+
+
+def measure(place: NDArray[np.int64], faces: NDArray[np.int32], mask: NDArray[np.bool_], step: int) -> Figures:
+    """Of vertices at pixels (V, 2) x, y of a grid of every `step` px, before they are smoothed."""
+    rim = edges(faces)
+    size = np.ones((4 * step + 1, 4 * step + 1), np.uint8)
+    inner = cv2.erode(np.pad(mask.astype(np.uint8), 1), size, borderValue=0)[1:-1, 1:-1] > 0
+    inside = inner[place[:, 1], place[:, 0]][rim].any(axis=1)
+    position = place.astype(np.float64)
+    length = np.linalg.norm(position[rim[:, 0]] - position[rim[:, 1]], axis=-1)
+    smooth = _averaged(position, rim, 3 * _ROUNDS)
+    shorter = np.linalg.norm(smooth[rim[:, 0]] - smooth[rim[:, 1]], axis=-1).sum()
+    return Figures(
+        pieces=_pieces(faces, len(place)),
+        cuts=float(length[inside].sum() / max(length[~inside].sum(), 1e-9)),
+        raggedness=float(length.sum() / max(shorter, 1e-9) - 1),
+    )
+
+
+def smoothed(place: Floats, log: Floats, faces: NDArray[np.int32], step: int) -> tuple[Floats, Floats]:
+    """Vertices' places (V, 2) [px] and scaled log depth (V,), with those on the boundary averaged along it."""
+    before = np.concatenate([place, log[:, None]], axis=-1)
+    after = _averaged(before, edges(faces), _ROUNDS)
+    far = np.linalg.norm((after - before)[:, :2], axis=-1, keepdims=True)
+    after = before + (after - before) * np.minimum(1, _FARTHEST * step / np.maximum(far, 1e-9))
+    was, area = _area(before, faces), _area(after, faces)
+    after_all = after
+    for _ in range(3):  # a triangle that would turn over keeps its corners; so may its neighbours then have to
+        bad = np.unique(faces[area < _LEAST_AREA * was])
+        if not len(bad):
+            break
+        after_all = after_all.copy()
+        after_all[bad] = before[bad]
+        area = _area(after_all, faces)
+    return after_all[:, :2], after_all[:, 2]
+
+
+def _averaged(values: Floats, rim: NDArray[np.int64], rounds: int) -> Floats:
+    """Values (V, C) with each vertex on the boundary drawn half-way to the mean of its two neighbours there.
+
+    A vertex where the boundary touches itself stays.
+    """
+    ends = np.concatenate([rim, rim[:, ::-1]])
+    degree = np.bincount(ends[:, 0], minlength=len(values))
+    used = np.flatnonzero(degree)
+    number = np.full(len(values), -1)
+    number[used] = np.arange(len(used))
+    row, column = number[ends[:, 0]], number[ends[:, 1]]
+    mean = sparse.csr_matrix((1 / degree[ends[:, 0]], (row, column)), (len(used), len(used)))
+    moving = degree[used] == 2
+    out = values.copy()
+    on = values[used]
+    for _ in range(rounds):
+        on = np.where(moving[:, None], (on + mean @ on) / 2, on)
+    out[used] = on
+    return out
+
+
+def _pieces(faces: NDArray[np.int32], count: int) -> int:
+    pairs = np.concatenate([faces[:, :2], faces[:, 1:]])
+    links = sparse.coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (count, count))
+    _, piece = connected_components(links, directed=False)
+    share = np.bincount(piece[faces[:, 0]]) / len(faces)
+    return int((share > _SPECK).sum())
+
+
+def _area(place: Floats, faces: NDArray[np.int32]) -> Floats:
+    """Twice the triangles' area in the picture, y down, positive counter-clockwise seen from the camera."""
+    one, two = (place[faces[:, k], :2] - place[faces[:, 0], :2] for k in (1, 2))
+    return np.asarray(one[:, 1] * two[:, 0] - one[:, 0] * two[:, 1])

@@ -1,0 +1,265 @@
+"""Normals of the object's pixels -> scaled log depth z, by least squares with jumps where the surface hides itself.
+
+Which pixels lie at a jump is decided on a grid of at most `_DECIDED` pixels, by bilateral integration: there noise
+is small against a pixel's own bend, and how much of it there is does not depend on the camera. On finer grids only
+the pixels near those jumps may choose between their neighbours; all others keep both. So a finer picture refines the
+contour and cannot tear the surface.
+
+References
+----------
+Cao, Santo, Shi, Okura & Matsushita, Bilateral normal integration, ECCV 2022: each pixel trusts whichever of its two
+neighbours per axis continues its own tangent plane.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Floats, SurfaceMaps, View
+from polcap.stages.surface.jumps import Jumps, jumps, least_step, widened
+from polcap.stages.surface.multigrid import Multigrid, Nested, conjugate_gradients
+from polcap.stages.surface.pixel_grid import PixelGrid
+
+_DECIDED = 80_000  # pixels, at most, of the grid on which jumps are decided
+_SOFT, _ANNEAL = 0.25, 1.2  # stiffness at first, and its growth per iteration: few early errors are kept as jumps
+_REFINED = 2  # solutions on each finer grid with jumps
+_MENDED = 4  # solutions on the grid that decides, after tears were found
+_UNDECIDED = 0.1  # of the prior's pull while jumps are sought: where it strains the normals it tears them
+_REACH = 2  # px around a jump within which pixels choose their neighbours on the next finer grid
+_TIRED = 9  # iterations of a linear solution that call for a new multigrid hierarchy
+_ACCURACY = 1e-3  # of each linear solution, relative
+_PROXIMITY = 1e-8  # pulls towards the last estimate: fixes what the normals leave free (one offset per piece)
+_FLATTEST = 0.05  # cosine under which a normal tells no slope
+_TURNED = 1 / 12  # variance of a step that lies anywhere between its ends' slopes, over their difference squared
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Normals of one pyramid level, on its N pixels."""
+
+    mask: NDArray[np.bool_]  # (H, W)
+    view: View
+    normal: Floats  # (N, 3)
+    weight: Floats  # (N,) 1 at the median error
+    sigma: float  # rad, median error of the normals
+    prior: Floats | None  # (N,) z of the prior
+    pull: float  # weight of the prior
+
+
+def problem(maps: SurfaceMaps, steepest: float, prior_weight: float) -> Problem:
+    """The maps' normals, leaning at most `steepest` rad, as equations on their own grid."""
+    mask = np.asarray(maps.mask, dtype=bool)
+    normal = np.nan_to_num(maps.normal[mask].astype(np.float64))  # 0 is no normal: neighbours bridge it
+    sigma = np.maximum(np.nan_to_num(maps.confidence[mask].astype(np.float64), nan=90.0, posinf=90.0), 1.0)
+    middle = float(np.median(sigma))
+    prior = None
+    if maps.depth_prior is not None and prior_weight > 0:
+        radius = np.sqrt(mask.sum() / np.pi) / maps.view.focal  # the prior's unit over the distance
+        prior = maps.view.focal * np.log(np.maximum(1 + radius * maps.depth_prior[mask], 0.05))
+    return Problem(
+        mask=mask,
+        view=maps.view,
+        normal=_capped(normal, mask, maps.view, steepest),
+        weight=np.clip((middle / sigma) ** 2, 0.02, 50.0),
+        sigma=np.radians(np.clip(middle, 1.0, 20.0)),
+        prior=None if prior is None else prior.astype(np.float64),
+        pull=prior_weight / max(int(mask.sum()), 1),
+    )
+
+
+def equations(of: Problem) -> tuple[Floats, Floats, Floats]:
+    """m, and the right sides of the slopes to the right and down: (N,) each."""
+    x, y = _slopes_of_rays(of.mask, of.view)
+    n = of.normal
+    return n[:, 2] - x * n[:, 0] - y * n[:, 1], n[:, 0], -n[:, 1]
+
+
+def log_depth(of: Problem, stiffness: float, iterations: int, tolerance: float, jump: float) -> Floats:
+    """z of the object's pixels (N,).
+
+    Parameters
+    ----------
+    stiffness : how firmly jumps are kept; 0 = plain least squares.
+    iterations, tolerance : of the reweighting on the grid that decides: at most so many, or the energy's change.
+    jump : least depth step of a jump over the object's radius.
+    """
+    z, _, _ = _solved(of, stiffness, iterations, tolerance, jump)
+    return z
+
+
+def _solved(
+    of: Problem, stiffness: float, iterations: int, tolerance: float, jump: float
+) -> tuple[Floats, NDArray[np.bool_], Any]:
+    """z (N,), the pixels near its jumps (H, W), and a preconditioner for matrices of this level."""
+    level = _Level(of)
+    if level.grid.size <= _DECIDED:
+        z = level.decided(stiffness, iterations, tolerance)
+        torn = level.jumps(z, jump / 2).torn
+        free = ~widened(torn, _REACH)[of.mask] & (stiffness > 0)
+        z, solver = level.mended(z, free, stiffness)
+        return z, level.jumps(z, jump / 2).near(_REACH), solver
+    coarse, parent = halved(of), parents(of.mask)
+    start, at_jumps, solver = _solved(coarse, stiffness, iterations, tolerance, jump)
+    z = level.finer(start, parent)
+    free = at_jumps[coarse.mask][parent] & (stiffness > 0)
+    z, nested = level.refined(z, free, stiffness, parent, solver)
+    found = level.jumps(z, jump / 2).near(_REACH)
+    return z, found & level.grid.image(free, outside=False), nested
+
+
+class _Level:
+    """The equations of one pyramid level."""
+
+    def __init__(self, of: Problem) -> None:
+        self.of = of
+        self.grid = grid = PixelGrid(of.mask)
+        self.facing, right, down = equations(of)
+        self.side = (right, down)
+        p, q, turn = grid.p, grid.q, grid.turn
+        target = np.concatenate([right[p[:turn]] + right[q[:turn]], down[p[turn:]] + down[q[turn:]]]) / 2
+        facing = (self.facing[p] + self.facing[q]) / 2
+        steep = np.maximum(facing, _FLATTEST)
+        self.slope = tuple(side / np.maximum(self.facing, _FLATTEST) for side in self.side)
+        turned = np.concatenate([s[a] - s[b] for s, a, b in zip(self.slope, self._halves(p), self._halves(q))])
+        # a chord's direction is the mean of its ends' tangents (exact on a circle); its variance is that of the
+        # normals' angle plus that of where between the two slopes a bend puts the step
+        noise = of.sigma**2 * (1 / of.weight[p] + 1 / of.weight[q]) / 2
+        self.step = target / steep
+        self.chord = of.sigma**2 / (
+            noise * np.maximum(facing**2 + target**2, _FLATTEST**2) / steep**4 + _TURNED * turned**2
+        )
+
+    def _halves(self, links: Any) -> tuple[Any, Any]:
+        """What belongs to links to the right, and to links down."""
+        return links[: self.grid.turn], links[self.grid.turn :]
+
+    def decided(self, stiffness: float, iterations: int, tolerance: float) -> Floats:
+        """Bilateral integration of all pixels, its stiffness growing from `_SOFT`, with a tenth of the prior's pull."""
+        z: Floats = np.zeros(self.grid.size)
+        before, taken, solver = np.inf, _TIRED + 1, None
+        free = np.full(self.grid.size, True)
+        for count in range(iterations if stiffness > 0 else 0):
+            firm = stiffness * min(1.0, _SOFT * _ANNEAL**count)
+            matrix, right, energy = self.linear(z, free, firm, _UNDECIDED * self.of.pull)
+            if firm == stiffness and abs(before - energy) <= tolerance * energy:
+                break
+            before = energy
+            if solver is None or taken > _TIRED:  # until then, an older matrix's multigrid still serves
+                solver = Multigrid(matrix, self.grid.pixel)
+            z, taken = conjugate_gradients(matrix, right, z, solver, _ACCURACY, 30)
+        return z
+
+    def mended(self, z: Floats, free: NDArray[np.bool_], stiffness: float) -> tuple[Floats, Multigrid]:
+        """From the decision, with pixels that may no longer choose and all of the prior's pull."""
+        for _ in range(_MENDED if free.any() else 1):
+            matrix, right, _ = self.linear(z, free, stiffness, self.of.pull)
+            solver = Multigrid(matrix, self.grid.pixel)
+            z, _ = conjugate_gradients(matrix, right, z, solver, _ACCURACY, 30)
+        return z, solver
+
+    def refined(
+        self, z: Floats, free: NDArray[np.bool_], stiffness: float, parent: Any, coarse: Any
+    ) -> tuple[Floats, "Nested"]:
+        """From the solution at half the resolution; only `free` pixels choose between neighbours."""
+        solver = None
+        for _ in range(_REFINED if free.any() else 1):
+            matrix, right, _ = self.linear(z, free, stiffness, self.of.pull)
+            solver = Nested(matrix, parent, coarse)
+            z, _ = conjugate_gradients(matrix, right, z, solver, _ACCURACY, 20)
+        assert solver is not None
+        return z, solver
+
+    def linear(self, z: Floats, free: NDArray[np.bool_], stiffness: float, pull: float) -> tuple[Any, Floats, float]:
+        """Matrix and right side of the weighted least squares about z, and z's energy."""
+        grid, facing = self.grid, self.facing
+        link, flux = self.chord.copy(), self.chord * self.step
+        change = z[grid.q] - z[grid.p]
+        energy = 0.0
+        if free.any():
+            for part, side in zip((slice(None, grid.turn), slice(grid.turn, None)), self.side):
+                chosen = np.flatnonzero(free[grid.p[part]] | free[grid.q[part]]) + (part.start or 0)
+                p, q, step = grid.p[chosen], grid.q[chosen], change[chosen]
+                ahead, behind = np.zeros(grid.size), np.zeros(grid.size)  # m ∂z on either side; 0 past the mask
+                ahead[p], behind[q] = facing[p] * step, facing[q] * step
+                forward, backward = (
+                    _sigmoid(stiffness * (a[e] ** 2 - b[e] ** 2))
+                    for a, b, e in ((behind, ahead, p), (ahead, behind, q))
+                )
+                forward, backward = self.of.weight[p] * forward, self.of.weight[q] * backward
+                energy += float(forward @ (ahead - side)[p] ** 2 + backward @ (behind - side)[q] ** 2)
+                both = free[p] & free[q]
+                at = chosen[both]
+                link[at] = (forward * facing[p] ** 2 + backward * facing[q] ** 2)[both]
+                flux[at] = (forward * facing[p] * side[p] + backward * facing[q] * side[q])[both]
+        diagonal, right = np.full(grid.size, _PROXIMITY), _PROXIMITY * z + grid.divergence(flux)
+        if self.of.prior is not None:
+            diagonal += pull
+            right = right + pull * self.of.prior
+        return grid.laplacian(link, diagonal), right, energy
+
+    def finer(self, coarse: Floats, parent: NDArray[np.intp]) -> Floats:
+        """z from that of half the resolution: each block tilted by its pixels' own slopes."""
+        steep = np.maximum(self.facing, 0.1)
+        row, column = self.grid.row % 2 - 0.5, self.grid.column % 2 - 0.5
+        tilt = (column * self.side[0] + row * self.side[1]) / steep
+        return np.asarray(2 * coarse[parent] + tilt)
+
+    def jumps(self, z: Floats, least: float) -> Jumps:
+        right, down = (self.grid.image(slope, 0.0) for slope in self.slope)
+        return jumps(self.grid.image(z, 0.0), (right, down), self.of.mask, least_step(self.of.mask, least))
+
+
+def halved(of: Problem) -> Problem:
+    """The same on blocks of 2×2 pixels: weighted means of what lies in the mask."""
+    parent = parents(of.mask)
+    count = np.bincount(parent).astype(np.float64)
+    weight = np.bincount(parent, of.weight)
+    normal: Floats = np.stack([np.bincount(parent, of.normal[:, k] * of.weight) for k in range(3)], axis=-1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    x, y = of.view.center
+    return Problem(
+        mask=_blocks(of.mask),
+        view=View(of.view.focal / 2, ((x - 0.5) / 2, (y - 0.5) / 2), of.view.scale * 2),
+        normal=normal,
+        weight=weight / count,
+        sigma=of.sigma,
+        prior=None if of.prior is None else np.bincount(parent, of.prior) / count / 2,
+        pull=4 * of.pull,
+    )
+
+
+def parents(mask: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Number of the 2×2 block, among those that hold a pixel, that each of the N pixels lies in."""
+    blocks = _blocks(mask)
+    number = np.cumsum(blocks).reshape(blocks.shape) - 1
+    row, column = np.nonzero(mask)
+    return np.asarray(number[row // 2, column // 2], dtype=np.intp)
+
+
+def _blocks(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    padded = np.pad(mask, [(0, size % 2) for size in mask.shape])
+    return np.asarray(padded[::2, ::2] | padded[1::2, ::2] | padded[::2, 1::2] | padded[1::2, 1::2])
+
+
+def _capped(normal: Floats, mask: NDArray[np.bool_], view: View, steepest: float) -> Floats:
+    """Normals turned towards the camera until they lean no more than `steepest` rad."""
+    x, y = _slopes_of_rays(mask, view)
+    ray = np.stack([-x, -y, np.ones_like(x)], axis=-1)
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    facing = np.sum(normal * ray, axis=-1, keepdims=True)
+    across = normal - facing * ray
+    length = np.linalg.norm(across, axis=-1, keepdims=True)
+    capped = np.cos(steepest) * ray + np.sin(steepest) * across / np.maximum(length, 1e-12)
+    return np.asarray(np.where(facing < np.cos(steepest) * np.hypot(facing, length), capped, normal))
+
+
+def _slopes_of_rays(mask: NDArray[np.bool_], view: View) -> tuple[Floats, Floats]:
+    """a, b of the object's pixels: (N,) each."""
+    row, column = np.nonzero(mask)
+    return (column - view.center[0]) / view.focal, -(row - view.center[1]) / view.focal
+
+
+def _sigmoid(x: Floats) -> Floats:
+    return np.asarray(1 / (1 + np.exp(-np.clip(x, -30.0, 30.0))))
