@@ -24,7 +24,7 @@ def test_report_is_plain_json_with_figures_gates_and_settings(result: Path) -> N
     about = json.loads((result / "report.json").read_text(), parse_constant=pytest.fail)  # no NaN, no Infinity
     assert {"capture", "gates", "figures", "settings", "keys", "verdict"} <= about.keys()
     assert about["verdict"] == "pass"
-    assert {gate["state"] for gate in about["gates"]} == {"pass", "not measured"}
+    assert {gate["state"] for gate in about["gates"]} <= {"pass", "not measured"}
     assert len(about["figures"]["chart"]["delta_e"]) == 24
 
 

@@ -199,13 +199,12 @@ def bar(key: Key) -> str:
 def normal(name: str, title: str, vectors: Floats, inside: NDArray[np.bool_]) -> str:
     """A map of normals with its key; the pointer reads it."""
     filled = _outwards(np.rint(255 * (vectors / 2 + 0.5)).astype(np.uint8), inside)
-    image = np.concatenate([filled, np.where(inside, 255, 0).astype(np.uint8)[..., None]], axis=-1)
     legend = (
         f'<div class="key"><img width="72" height="72" alt="" src="{html.lossless(plots.ball())}">'
         "<span>colors of a ball: red right, green up, blue toward the camera</span></div>"
     )
     about = {"kind": "normal", "unit": "", "digits": 2}
-    return _figure(name, title, "x right, y up, z toward the camera", about, html.lossless(image), legend)
+    return _figure(name, title, "x right, y up, z toward the camera", about, html.lossless(filled), legend)
 
 
 def _color(name: str, title: str, says: str, linear: Floats, inside: NDArray[np.bool_], top: float) -> str:

@@ -48,6 +48,7 @@ class Probe {
     const k = 4 * (Math.min(height - 1, Math.floor(v * height)) * width + Math.min(width - 1, Math.floor(u * width)));
     const [r, g, b, a] = data.subarray(k, k + 4), { kind, unit, digits } = this.about;
     if (a < 128) return '';
+    if (r + g + b === 0 && kind !== 'scalar') return '';  // far outside the object
     if (kind === 'normal') return [r, g, b].map((x) => (x / 127.5 - 1).toFixed(2)).join(', ');
     if (kind === 'color') return [r, g, b].map((x) => (this.about.top * linear(x)).toFixed(digits)).join(', ');
     const { low, high, power, palette } = this.about;

@@ -6,37 +6,41 @@ const SOLID = `attribute vec3 position; attribute vec2 uv; uniform mat4 view; un
 varying vec2 at; varying vec3 point;
 void main() { at = uv; point = low + extent * position; gl_Position = view * vec4(point, 1.0); }`;
 const PIXEL = `
-uniform sampler2D normals, diffuse, specular, roughness;
+uniform sampler2D shape, body, gloss;  // normal and roughness; root of the diffuse albedo and mask; root of F0
 uniform vec3 light, eye; uniform vec2 size, center; uniform float focal, ior, exposure, top; uniform int mode;
 varying vec2 at;
 #ifdef SOLID
 varying vec3 point;
 #endif
 void main() {
-  vec4 texel = texture2D(normals, at);
+  vec4 inner = texture2D(body, at);
+#ifndef SOLID
+  if (inner.a < 0.5) { gl_FragColor = vec4(0.0, 0.0, 0.0, 1.0); return; }
+#endif
+  vec4 outer = texture2D(shape, at);
 #ifdef SOLID
   vec3 v = normalize(eye - point);
 #else
-  if (texel.a < 0.5) discard;
   vec2 pixel = at * size - 0.5 - center;
   vec3 v = normalize(vec3(-pixel.x, pixel.y, focal));
 #endif
-  vec3 n = normalize(texel.rgb * 2.0 - 1.0), l = light == vec3(0.0) ? v : normalize(light);
-  if (mode == 2) { gl_FragColor = vec4(texel.rgb, 1.0); return; }
+  vec3 n = normalize(outer.rgb * 2.0 - 1.0), l = light == vec3(0.0) ? v : normalize(light);
+  if (mode == 2) { gl_FragColor = vec4(outer.rgb, 1.0); return; }
   bool clay = mode == 1;
-  vec3 body = clay ? vec3(0.6) : decoded(texture2D(diffuse, at).rgb);
-  vec3 gloss = clay ? vec3(0.0) : top * decoded(texture2D(specular, at).rgb);
-  vec3 seen = shade(n, v, l, body, gloss, clay ? 1.0 : max(texture2D(roughness, at).r, 0.02), ior);
+  vec3 root = texture2D(gloss, at).rgb;
+  vec3 diffuse = clay ? vec3(0.6) : inner.rgb * inner.rgb, specular = clay ? vec3(0.0) : top * root * root;
+  vec3 seen = shade(n, v, l, diffuse, specular, clay ? 1.0 : max(outer.a, 0.02), ior);
 #ifdef SOLID
-  seen += 0.04 * body;  // so that the dark side can be told from the backdrop
+  seen += 0.04 * diffuse;  // so that the dark side can be told from the backdrop
   if (!gl_FrontFacing) seen = vec3(0.02);
 #endif
   gl_FragColor = vec4(encoded(seen * (clay ? 1.0 : exposure)), 1.0);
 }`;
 
 class Painter {
-  constructor(canvas, vertex, prefix) {
-    this.gl = canvas.getContext('webgl', { antialias: true, preserveDrawingBuffer: true });
+  constructor(canvas, vertex, prefix, solid) {
+    this.solid = solid;
+    this.gl = canvas.getContext('webgl', { antialias: solid, alpha: false, depth: solid });
     if (!this.gl) throw new Error('no WebGL');
     const gl = this.gl;
     this.program = gl.createProgram();
@@ -62,16 +66,10 @@ class Painter {
     const gl = this.gl;
     gl.activeTexture(gl.TEXTURE0 + slot);
     gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-    gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
-    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
-    if (source.data) {
-      gl.texImage2D(gl.TEXTURE_2D, 0, gl.LUMINANCE, source.width, source.height, 0, gl.LUMINANCE, gl.UNSIGNED_BYTE,
-        source.data);
-    } else {
-      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, source);
-    }
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, source.width, source.height, 0, gl.RGBA, gl.UNSIGNED_BYTE, source.data);
+    const filter = this.solid ? gl.LINEAR : gl.NEAREST;  // the flat picture has a pixel for each of the maps
     for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, side, gl.CLAMP_TO_EDGE);
-    for (const end of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, end, gl.LINEAR);
+    for (const end of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, end, filter);
     gl.uniform1i(this.place(name), slot);
   }
 
@@ -107,7 +105,7 @@ class Relight {
     this.canvas = canvas;
     this.light = [0, 0, 0];  // none: the flash, beside the lens
     [canvas.width, canvas.height] = DATA.view.size;
-    this.painter = new Painter(canvas, FLAT, '');
+    this.painter = new Painter(canvas, FLAT, '', false);
     this.painter.maps(sources);
     this.painter.buffer('corner', 2, this.painter.gl.FLOAT, false, new Float32Array([0, 0, 1, 0, 0, 1, 1, 1]));
     this.later = new Later(() => this.draw());
@@ -153,7 +151,7 @@ class Solid {
     this.pointers = new Map();
     this.apart = 0;  // between two fingers, px
     [canvas.width, canvas.height] = [960, 600];
-    const painter = this.painter = new Painter(canvas, SOLID, '#define SOLID\n'), gl = painter.gl;
+    const painter = this.painter = new Painter(canvas, SOLID, '#define SOLID\n', true), gl = painter.gl;
     if (mesh.wide && !gl.getExtension('OES_element_index_uint')) throw new Error('no 32-bit indices');
     painter.maps(sources);
     painter.buffer('position', 3, gl.UNSIGNED_SHORT, true, mesh.position);
@@ -268,26 +266,37 @@ async function meshed({ position, uv, faces, low, extent }) {
   return { position: new Uint16Array(p), uv: new Uint16Array(t), faces: new Uint32Array(index.buffer), low, extent, wide: true };
 }
 
-// levels of a palette's picture as numbers 0…255
-function levels(image, palette) {
+function pixels(image) {
   const canvas = document.createElement('canvas');
-  const [width, height] = [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
+  [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
   const context = canvas.getContext('2d', { willReadFrequently: true });
   context.drawImage(image, 0, 0);
-  const from = context.getImageData(0, 0, width, height).data, data = new Uint8Array(width * height);
-  for (let k = 0; k < data.length; k++) {
-    const level = LEVELS[palette].get((from[4 * k] << 16) | (from[4 * k + 1] << 8) | from[4 * k + 2]) ?? 127;
-    data[k] = Math.round(level / 254 * 255);
+  return context.getImageData(0, 0, canvas.width, canvas.height);
+}
+
+// what the shader samples; roots of linear light need no power to undo and keep dark colors apart
+function textures({ normal, diffuse, specular, roughness }) {
+  const [n, d, s, r] = [normal, diffuse, specular, roughness].map(pixels), { width, height } = n;
+  const root = Uint8Array.from({ length: 256 }, (_, code) => Math.round(255 * Math.sqrt(linear(code))));
+  const [shape, body, gloss] = [0, 1, 2].map(() => ({ data: new Uint8Array(4 * width * height), width, height }));
+  for (let k = 0; k < n.data.length; k += 4) {
+    const level = LEVELS.viridis.get((r.data[k] << 16) | (r.data[k + 1] << 8) | r.data[k + 2]) ?? 127;
+    for (let c = 0; c < 3; c++) {
+      shape.data[k + c] = n.data[k + c];
+      body.data[k + c] = root[d.data[k + c]];
+      gloss.data[k + c] = root[s.data[k + c]];
+    }
+    shape.data[k + 3] = Math.round(level / 254 * 255);
+    body.data[k + 3] = r.data[k + 3];  // transparent outside
   }
-  return { data, width, height };
+  return { shape, body, gloss };
 }
 
 async function begin() {
   const images = Object.fromEntries(['normal', 'diffuse', 'specular', 'roughness'].map(
     (name) => [name, document.querySelector(`#map-${name} img`)]));
   await Promise.all(Object.values(images).map((image) => image.decode()));
-  const sources = { normals: images.normal, diffuse: images.diffuse, specular: images.specular,
-    roughness: levels(images.roughness, 'viridis') };
+  const sources = textures(images);
   window.relight = new Relight(document.getElementById('relight'), sources);
   document.getElementById('relit').classList.add('live');
   window.solid = new Solid(document.getElementById('solid'), sources, await meshed(DATA.mesh));
