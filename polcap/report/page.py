@@ -104,9 +104,17 @@ def _verdict(about: Mapping[str, Any]) -> Iterator[str]:
 def _advice(gate: Mapping[str, Any]) -> str:
     """A gate that did not pass: its value and limit, what it means, what to do."""
     value, limit = (escape(_gate_value(gate, name)) for name in ("value", "limit"))
-    cost = f" It costs about {gate['cost_deg']:.0f}°." if gate.get("cost_deg", 0) >= 1 else ""
-    remedy = f" <b>{escape(str(gate['remedy']))}</b>" if gate.get("remedy") else ""
-    return f"<b>{escape(gate['name'].capitalize())}</b> {value} (limit {limit}): {escape(gate['says'])}.{cost}{remedy}"
+    cost = f" It costs about {_cost(gate)}." if _cost(gate) else ""
+    return f"<b>{escape(gate['name'].capitalize())}</b> {value} (limit {limit}): {escape(gate['says'])}.{cost}{_remedy(gate)}"
+
+
+def _cost(gate: Mapping[str, Any]) -> str:
+    """Degrees of normal error that what the gate found costs; nothing under one."""
+    return f"{gate['cost_deg']:.0f}°" if (gate.get("cost_deg") or 0) >= 1 else ""
+
+
+def _remedy(gate: Mapping[str, Any]) -> str:
+    return f" <b>{escape(gate['remedy'])}</b>" if gate.get("remedy") and gate["state"] != "pass" else ""
 
 
 def _gate_value(gate: Mapping[str, Any], name: str) -> str:
@@ -327,10 +335,10 @@ def gates(judged: Sequence[Mapping[str, Any]]) -> str:
         f"<tr><td>{escape(gate['name'].capitalize())}</td>"
         f'<td class="{escape(gate["state"])}">{escape(gate["state"])}</td>'
         f"<td>{escape(_gate_value(gate, 'value'))}</td><td>{escape(_gate_value(gate, 'limit'))}</td>"
-        f"<td>{escape(gate['says'])}</td></tr>"
+        f"<td>{_cost(gate)}</td><td>{escape(gate['says'])}{_remedy(gate)}</td></tr>"
         for gate in sorted(judged, key=lambda gate: order.get(gate["state"], 4))
     )
-    head = "<tr><th>Check</th><th></th><th>Value</th><th>Limit</th><th>What it says</th></tr>"
+    head = "<tr><th>Check</th><th></th><th>Value</th><th>Limit</th><th>Cost</th><th>What it says</th></tr>"
     return f'<div class="scroll"><table>{head}{rows}</table></div>'
 
 
