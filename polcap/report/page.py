@@ -105,7 +105,8 @@ def _advice(gate: Mapping[str, Any]) -> str:
     """A gate that did not pass: its value and limit, what it means, what to do."""
     value, limit = (escape(_gate_value(gate, name)) for name in ("value", "limit"))
     cost = f" It costs about {_cost(gate)}." if _cost(gate) else ""
-    return f"<b>{escape(gate['name'].capitalize())}</b> {value} (limit {limit}): {escape(gate['says'])}.{cost}{_remedy(gate)}"
+    says = f"{escape(gate['says'])}.{cost}{_remedy(gate)}"
+    return f"<b>{escape(gate['name'].capitalize())}</b> {value} (limit {limit}): {says}"
 
 
 def _cost(gate: Mapping[str, Any]) -> str:
