@@ -160,6 +160,8 @@ def load(file: Path | None = None, assignments: Sequence[str] = ()) -> Config:
         return msgspec.convert(stated, Config)
     except msgspec.ValidationError as error:
         raise _explain(error, stated, known) from error
+    except UnicodeError as error:
+        raise SettingError("--set: a value is no UTF-8 text; write it in ASCII") from error
 
 
 def restored(about: Mapping[str, Any], file: Path) -> Config:

@@ -79,6 +79,7 @@ def _parts(file: io.BytesIO) -> Iterator[tuple[str, io.BytesIO]]:
             (length,) = struct.unpack_from(">I", top, at + 4)
             if top[at : at + 4] == b"\0TTW":
                 yield "", io.BytesIO(top[at + 8 : at + 8 + length])
+                return
             at += 8 + length
     else:
         file.seek(0)

@@ -63,7 +63,7 @@ def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: s
     provider = session.get_providers()[0]
     if device == "cuda" and provider != CUDA:
         raise ModelError("--device cuda: CUDA does not start; make driver, CUDA and cuDNN fit, or use --device cpu")
-    metadata = _metadata(session)
+    metadata = _metadata(path, session)
     channels = _check(path, session, metadata, encoding)
     return Network(Model(path, session), digest(data), channels, metadata, provider)
 
@@ -125,7 +125,7 @@ def trial(path: str, expected: str, encoding: str) -> worker.Answer:
     if digest(data) != expected:
         raise ModelError(f"{path}: has changed while it was read; run again")
     session = _open(file, data, [CPU], 1)
-    metadata = _metadata(session)
+    metadata = _metadata(file, session)
     channels = _check(file, session, metadata, encoding)
     side = max(_TRIAL_PX, int(metadata["size_multiple"]))
     noise = np.random.default_rng(1).normal(size=(1, len(channels), side, side))
@@ -154,8 +154,11 @@ def _bytes(path: Path) -> bytes:
         raise ModelError(f"{path}: {error.strerror or error}; name a model file with --model") from error
 
 
-def _metadata(session: Any) -> Mapping[str, str]:
-    return {str(k): str(v) for k, v in session.get_modelmeta().custom_metadata_map.items()}
+def _metadata(path: Path, session: Any) -> Mapping[str, str]:
+    try:
+        return {str(k): str(v) for k, v in session.get_modelmeta().custom_metadata_map.items()}
+    except UnicodeError as error:
+        raise ModelError(f"{path}: its metadata are no text ({error}); export it with polcap") from error
 
 
 def providers(path: Path) -> dict[str, str]:

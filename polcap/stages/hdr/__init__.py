@@ -32,6 +32,9 @@ from polcap.stages.hdr.combine import Merged
 from polcap.stages.hdr.planes import Reader
 
 
+_LEAST_PX = 48  # of a merged picture's side: tiles of noise, and registration at a quarter of the size
+
+
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How brackets are merged."""
 
@@ -74,6 +77,12 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
     image = read(shots[0].frames[reference])
     camera = image.camera_matrix, image.white_balance
     mosaic, full = image.cfa is not None, settings.demosaic == "full"
+    height, width = image.value.shape[:2]
+    if min(height, width) < _LEAST_PX * (1 + mosaic):
+        raise CaptureError(
+            f"{shots[0].frames[reference].path}: {width}×{height} px are too few to measure noise and movement; "
+            f"polcap needs {_LEAST_PX * (1 + mosaic)} px a side"
+        )
     del image  # the reader alone decides how long a frame is held
     lines = noise.Lines()
     stack = _empty(0, 0, 0)

@@ -1,0 +1,232 @@
+"""Text, TOML, JSON, serial replies and headers, mutated, through polcap's parsers in this process.
+
+python tests/campaigns/fuzz_parsers.py [--runs 100000] [--seed 0]
+
+A parser may give a value or one of its declared errors, within a second. Prints a table per parser; anything else is
+printed with its input and ends with exit code 1.
+"""
+
+import argparse
+import io
+import json
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[1] / "formats"))
+
+import headers
+
+from polcap import config
+from polcap.errors import PolcapError
+from polcap.formats import calib, capture_toml, exif, file_name, maps, npy_folder, plausible, sniff, text_file
+from polcap.images import ColorCalibration, StokesImage
+from polcap.rig import camera, elliptec, grbl, line_protocol, serial_port
+from tests.campaigns.mutations import mutated
+
+serial_port.ANSWER_S = grbl._START_S = grbl._HOLD_S = line_protocol._START_S = 0.02  # nobody is waited for
+
+
+class Replies:
+    """A serial port whose answers are written beforehand."""
+
+    url = "fuzz://"
+
+    def __init__(self, data: bytes) -> None:
+        self._lines = data.split(b"\n")
+
+    def send(self, data: bytes) -> None: ...
+
+    def add(self, data: bytes) -> None: ...
+
+    def drain(self) -> None: ...
+
+    def close(self) -> None: ...
+
+    def read_line(self, timeout_s: float | None = None) -> str:
+        if not self._lines:
+            raise serial_port.Silent("fuzz:// answered with nothing")
+        line = self._lines.pop(0).strip()
+        if not all(32 <= byte < 127 or byte == 9 for byte in line):
+            raise serial_port.Silent("fuzz:// answered with no text")
+        return line.decode("ascii")
+
+    def strange(self, line: str) -> serial_port.Silent:
+        return serial_port.Silent(f"fuzz:// answered {line:.40}")
+
+
+@dataclass(frozen=True)
+class Parser:
+    seeds: tuple[bytes, ...]
+    run: Callable[[bytes, Path], object]
+    declared: tuple[type[Exception], ...] = (PolcapError,)
+    limit_s: float = 1.0
+
+
+def _written(data: bytes, folder: Path, name: str) -> Path:
+    file = folder / name
+    file.write_bytes(data)
+    return file
+
+
+def _settings(data: bytes, folder: Path) -> object:
+    return config.load(_written(data, folder, "settings.toml"))
+
+
+def _assignment(data: bytes, folder: Path) -> object:
+    return config.load(None, [data.decode("utf-8", "surrogateescape")])
+
+
+def _capture(data: bytes, folder: Path) -> object:
+    _written(data, folder, capture_toml.NAME)
+    return capture_toml.load(folder)
+
+
+def _profile(data: bytes, folder: Path) -> object:
+    return calib.read_profile(_written(data, folder, "profile.toml"))
+
+
+def _maps(data: bytes, folder: Path) -> object:
+    return msgspec.convert(text_file.read_json(_written(data, folder, "maps.json")), maps._Description)
+
+
+def _tree(data: bytes, folder: Path) -> object:
+    return npy_folder.decode(text_file.parse_json(data.decode("utf-8")), StokesImage, folder)
+
+
+def _calibration(data: bytes, folder: Path) -> object:
+    return npy_folder.decode(text_file.parse_json(data.decode("utf-8")), ColorCalibration, folder)
+
+
+def _header(data: bytes, folder: Path) -> object:
+    file = io.BytesIO(data)
+    structure = sniff.structure(file)
+    plausible.check_structure("fuzz", structure, data)
+    return sniff.kind(file, ".dng"), structure.truncated, structure.dng
+
+
+def _tags(data: bytes, folder: Path) -> object:
+    return exif.sized(exif.tags(data), 640, 480)
+
+
+def _jpeg(data: bytes, folder: Path) -> object:
+    return plausible.check_jpeg("fuzz", data)
+
+
+def _bracket(data: bytes, folder: Path) -> object:
+    return camera.parse_bracket(data.decode("utf-8", "surrogateescape"))
+
+
+def _name(data: bytes, folder: Path) -> object:
+    name = file_name.safe(data.decode("utf-8", "surrogateescape"))
+    assert name and len(name.encode()) <= 100 and name.isprintable() and not set(name) & set("/\\:"), name
+    return name
+
+
+def _elliptec(data: bytes, folder: Path) -> object:
+    motor = elliptec.Elliptec(Replies(data), elliptec.Settings(), 0.05)  # type: ignore[arg-type]
+    return motor.home(), motor.where()
+
+
+def _grbl(data: bytes, folder: Path) -> object:
+    board = grbl.Grbl(Replies(data), grbl.Settings(), 0.05, grbl.Log(None))  # type: ignore[arg-type]
+    return board.home(), board.where()
+
+
+def _line(data: bytes, folder: Path) -> object:
+    board = line_protocol.Line(Replies(data), line_protocol.Settings(), 0.05, line_protocol.Log(None))  # type: ignore[arg-type]
+    return board.home(), board.where()
+
+
+_FRAME = {"array": "value.stokes.npy"}
+_STOKES = {
+    "stokes": _FRAME, "covariance": _FRAME, "quality": _FRAME, "mask": _FRAME, "residual": None,
+    "view": {"focal": 900.0, "center": [1.0, 2.0], "scale": 2.0, "origin": [0.0, 0.0], "known": True},
+}  # fmt: skip
+_COLOR = {
+    "matrix": _FRAME, "quads": None, "corners": None, "delta_e": None, "source": "chart", "cost": "nan",
+    "metres_per_px": 0.001, "falloff": [0.0, 0.0], "glare": 0.0,
+}  # fmt: skip
+_MAPS = {
+    "crop": [0, 0, 64, 48], "size": [32, 24], "scale": 2, "estimator": "network 7", "depth": {"unit": "m"},
+    "camera": {"focal_px": 900.0, "center_px": [15.5, 11.5], "focal_known": True},
+}  # fmt: skip
+_TIFFS = (
+    headers.dng(np.zeros((16, 16))),
+    headers.tiff(headers.camera(), {headers.EXIF_IFD: headers.settings()}, magic=b"MM\0*", order=">"),
+    headers.raf(headers.tiff(headers.camera(), {headers.EXIF_IFD: headers.settings()})),
+    headers.cr3(headers.camera(), headers.settings()),
+    headers.mrw(headers.tiff(headers.camera(), {headers.EXIF_IFD: headers.settings()})),
+)
+_GRBL = b"Grbl 1.1h ['$' for help]\n$100=8.889\n$110=2000\n$120=50\n$130=400\n$22=1\nok\nok\n<Idle|MPos:0.000,0,0|FS:0,0>\nok\n"
+PARSERS = {
+    "settings (TOML)": Parser((b"[hdr]\nclip = 0.98\n[gates]\nmax_ghost = 0.02\n",), _settings),
+    "settings (--set)": Parser((b"hdr.clip=0.98", b"gates.max_ghost=0.1"), _assignment),
+    "capture.toml": Parser(
+        (b'name = "vase"\nfocal_length_mm = 60.0\n[[frame]]\nfile = "a.dng"\nangle = 45\nrole = "shot"\n',), _capture
+    ),
+    "color profile": Parser(
+        (b'matrix = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]\nsource = "chart"\ncost = nan\n',), _profile
+    ),
+    "maps.json": Parser((json.dumps(_MAPS).encode(),), _maps, (ValueError, OSError)),
+    "manifest, Stokes": Parser((json.dumps(_STOKES).encode(),), _tree, (ValueError, PolcapError)),
+    "manifest, color": Parser((json.dumps(_COLOR).encode(),), _calibration, (ValueError, PolcapError)),
+    "TIFF structure": Parser(_TIFFS, _header),
+    "EXIF": Parser(_TIFFS, _tags, limit_s=30.0),  # the limit of the child that it runs in
+    "JPEG markers": Parser((headers.jpeg(b"") + b"\xff\xda\0\x02abc\xff\0\xff\xd9",), _jpeg),
+    "bracket": Parser((b"1/200,1/50,0.5", b"f/11,iso100", b"flash1/16"), _bracket),
+    "names": Parser((b"My vase, 2nd try", "Büste №3".encode()), _name),
+    "Elliptec replies": Parser((b"0GS00\n0IN0E1140041520211501016800023000\n0PO00000000\n0PO00000100\n",), _elliptec),
+    "GRBL replies": Parser((_GRBL,), _grbl),
+    "line protocol": Parser((b"polcap-rotator 1\nok\nok 0.00\nok 12.50\n",), _line),
+}
+
+
+def campaign(runs: int, seed: int, say: Callable[[str], None] = print) -> int:
+    """Failures of `runs` executions, spread evenly over the parsers."""
+    failures = 0
+    random = np.random.default_rng(seed)
+    each = -(-runs // len(PARSERS))
+    say(
+        "| parser | executions | values | declared errors | slowest, ms | failures |\n| --- | --- | --- | --- | --- | --- |"
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        for name, parser in PARSERS.items():
+            seen: Counter[str] = Counter()
+            slowest = 0.0
+            for _ in range(each):
+                data = mutated(parser.seeds[int(random.integers(len(parser.seeds)))], random)
+                start = time.perf_counter()
+                try:
+                    parser.run(data, Path(folder))
+                    seen["value"] += 1
+                except parser.declared:
+                    seen["error"] += 1
+                except Exception:
+                    seen["failure"] += 1
+                    say(f"{name}: {data[:400]!r}\n{traceback.format_exc()}")
+                took = time.perf_counter() - start
+                slowest = max(slowest, took)
+                if took > parser.limit_s:
+                    seen["failure"] += 1
+                    say(f"{name}: {took:.1f} s on {data[:400]!r}")
+            failures += seen["failure"]
+            say(f"| {name} | {each} | {seen['value']} | {seen['error']} | {1e3 * slowest:.0f} | {seen['failure']} |")
+    return failures
+
+
+if __name__ == "__main__":
+    arguments = argparse.ArgumentParser(description=__doc__)
+    arguments.add_argument("--runs", type=int, default=100_000)
+    arguments.add_argument("--seed", type=int, default=0)
+    given = arguments.parse_args()
+    sys.exit(1 if campaign(given.runs, given.seed) else 0)

@@ -1,0 +1,134 @@
+"""Captures that are valid and hold next to nothing, drawn at random, through the whole path.
+
+python tests/campaigns/odd_captures.py [--captures 60] [--seed 0]
+
+Frames are all clipped, all dark, flat, a single bright pixel, noise, a ramp, half clipped, or a mixture by shot; sizes
+are tiny; masks are absent, one pixel, all of the frame or random. Every run ends with 0, 2 or 3 within its limit, and
+what was written is finite. Prints the outcomes; anything else is printed and ends with exit code 1.
+"""
+
+import argparse
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[1] / "formats"))
+
+import headers
+
+from polcap import pipeline
+from polcap.config import Config
+from polcap.errors import GateError, InputError
+from polcap.formats import capture as captures
+from polcap.formats import maps
+from polcap.images import ChartRequest, Floats
+from polcap.path import UserInput
+
+BLACK, WHITE = 512, 16383
+LIMIT_S = 60.0
+Random = np.random.Generator
+CONTENT: dict[str, Callable[[Floats, Random], Floats]] = {  # from a noise of deviation 1, (H, W), to counts
+    "clipped": lambda noise, random: np.full_like(noise, WHITE),
+    "dark": lambda noise, random: BLACK + 3 * noise,
+    "zero": lambda noise, random: np.full_like(noise, BLACK),
+    "flat": lambda noise, random: np.full_like(noise, 4000),
+    "noise": lambda noise, random: 4000 + 300 * noise,
+    "one pixel": lambda noise, random: _one_pixel(noise, random),
+    "ramp": lambda noise, random: np.linspace(BLACK, WHITE, noise.size).reshape(noise.shape),
+    "half clipped": lambda noise, random: np.where(np.arange(noise.shape[1]) % 40 < 20, WHITE, 4000 + 200 * noise),
+    "disc": lambda noise, random: _disc(noise),
+}
+
+
+def _one_pixel(noise: Floats, random: Random) -> Floats:
+    out = BLACK + 3 * noise
+    out[int(random.integers(noise.shape[0])), int(random.integers(noise.shape[1]))] = WHITE
+    return out
+
+
+def _disc(noise: Floats) -> Floats:
+    y, x = np.mgrid[-1 : 1 : noise.shape[0] * 1j, -1 : 1 : noise.shape[1] * 1j]
+    return np.where(x * x + y * y < 0.3, 6000 + 80 * noise, BLACK + 100 + 8 * noise)
+
+
+def write(folder: Path, what: list[str], size: tuple[int, int], exposures: int, random: Random) -> None:
+    """A capture of a shot per angle, 0, 45 and 90 degrees, whose frames hold what is named."""
+    taken = 0
+    for angle, name in zip((0, 45, 90), what):
+        place = folder / f"pol{angle:03d}"
+        place.mkdir(parents=True)
+        for e in range(exposures):
+            counts = BLACK + (CONTENT[name](random.normal(size=size), random) - BLACK) * 4.0**e
+            pixels = np.clip(counts, 0, WHITE).round()
+            pixels[0, 0] = taken = taken + 1  # no two files are the same
+            photo = headers.settings(time=4.0**e / 200)
+            black = [[BLACK, BLACK], [BLACK, BLACK]]
+            (place / f"IMG_{e}.dng").write_bytes(headers.dng(pixels, photo=photo, black=black))
+
+
+def mask(kind: str, size: tuple[int, int], random: Random) -> np.ndarray | None:  # type: ignore[type-arg]
+    if kind == "none":
+        return None
+    drawn = np.full(size, kind == "all")
+    if kind == "one pixel":
+        drawn[size[0] // 2, size[1] // 2] = True
+    if kind == "random":
+        drawn = random.random(size) < 0.5
+    return drawn
+
+
+def run(folder: Path, drawn: np.ndarray | None) -> str:  # type: ignore[type-arg]
+    """The outcome of a run in a word; what was written is checked."""
+    out = folder / "polcap"
+    try:
+        found = captures.read(folder)
+        about = pipeline.process(found, UserInput(ChartRequest("none"), drawn), Config(), out)
+    except GateError:
+        return "gate"
+    except InputError as error:
+        assert "\n" not in str(error), error
+        return type(error).__name__
+    stored = maps.read(out / "maps")  # refuses what is not finite
+    assert about is not None and stored.maps.mask.any()
+    return f"verdict {about['verdict']}"
+
+
+def campaign(count: int, seed: int, say: Callable[[str], None] = print) -> int:
+    """Failures of so many captures."""
+    random = np.random.default_rng(seed)
+    outcomes: Counter[str] = Counter()
+    failures, slowest = 0, 0.0
+    for _ in range(count):
+        alike = random.random() < 0.6
+        what = [str(random.choice(list(CONTENT)))] * 3 if alike else [str(x) for x in random.choice(list(CONTENT), 3)]
+        size = (2 * int(random.integers(8, 50)), 2 * int(random.integers(8, 50)))
+        kind = str(random.choice(["none", "none", "one pixel", "all", "random"]))
+        start = time.perf_counter()
+        with tempfile.TemporaryDirectory() as place:
+            try:
+                write(Path(place) / "c", what, size, int(random.integers(1, 4)), random)
+                outcomes[run(Path(place) / "c", mask(kind, size, random))] += 1
+            except Exception:
+                failures += 1
+                say(f"{what}, {size}, mask {kind}:\n{traceback.format_exc()}")
+        took = time.perf_counter() - start
+        slowest = max(slowest, took)
+        failures += took > LIMIT_S
+    say("\n".join(f"| {name} | {number} |" for name, number in outcomes.most_common()))
+    say(f"{count} captures, slowest {slowest:.1f} s, {failures} failures")
+    return failures
+
+
+if __name__ == "__main__":
+    arguments = argparse.ArgumentParser(description=__doc__)
+    arguments.add_argument("--captures", type=int, default=60)
+    arguments.add_argument("--seed", type=int, default=0)
+    given = arguments.parse_args()
+    sys.exit(1 if campaign(given.captures, given.seed) else 0)
