@@ -194,9 +194,7 @@ def _check_separate(out: Path, photographs: Path) -> None:
         raise SettingError(f"--out {out} is the capture itself; choose a folder of its own")
     inside = here.relative_to(there).parts if here.is_relative_to(there) else ()
     if any(layouts.is_angle_folder(name) for name in inside):
-        raise SettingError(
-            f"--out {out} lies in a folder of the capture's shots; choose {photographs / layouts.OUTPUT}"
-        )
+        raise SettingError(f"--out {out} lies among the capture's shots; choose {photographs / layouts.OUTPUT}")
 
 
 def _counted(capture: Capture, frame_read: Callable[[int, int], None] | None) -> Capture:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from polcap.formats import exr
-from tests.conftest import Command, Done
+from tests.conftest import Command, Done, shell
 
 NESTED = "[" * 30_000
 
@@ -70,7 +70,6 @@ def test_a_pipe_as_capture_toml_is_not_waited_for(polcap: Command, capture: Path
         (("--chart", "nan,0,1,0,1,1,0,1"), "finite"),
         (("--chart", "0,0,1e999,0,1,1,0,1"), "finite"),
         (("--angles", "0,nan,90"), "finite"),
-        (("--memory", "nan"), "--memory"),
         (("--memory", "inf"), "--memory"),
         (("--config", "/dev/zero"), "no regular file"),
         (("--config", "/" + "a" * 300), "too long"),
@@ -95,7 +94,7 @@ def test_a_strange_name_of_the_folder_becomes_a_plain_one(
 ) -> None:
     folder = tmp_path / name
     folder.symlink_to(example) if name == "..." else shutil.copytree(example, folder)
-    done = polcap("process", folder, "--dry-run", "--json", "--out", tmp_path / "out")
+    done = (shell if "\udcff" in name else polcap)("process", folder, "--dry-run", "--json", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)["capture"]["name"]
     assert found.isprintable() and not set(found) & set("/\\:\n") and 0 < len(found.encode()) <= 100

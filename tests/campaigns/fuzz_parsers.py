@@ -167,7 +167,10 @@ _TIFFS = (
     headers.cr3(headers.camera(), headers.settings()),
     headers.mrw(headers.tiff(headers.camera(), {headers.EXIF_IFD: headers.settings()})),
 )
-_GRBL = b"Grbl 1.1h ['$' for help]\n$100=8.889\n$110=2000\n$120=50\n$130=400\n$22=1\nok\nok\n<Idle|MPos:0.000,0,0|FS:0,0>\nok\n"
+_GRBL = (
+    b"Grbl 1.1h ['$' for help]\n$100=8.889\n$110=2000\n$120=50\n$130=400\n$22=1\nok\nok\n"
+    b"<Idle|MPos:0.000,0,0|FS:0,0>\nok\n"
+)
 PARSERS = {
     "settings (TOML)": Parser((b"[hdr]\nclip = 0.98\n[gates]\nmax_ghost = 0.02\n",), _settings),
     "settings (--set)": Parser((b"hdr.clip=0.98", b"gates.max_ghost=0.1"), _assignment),
@@ -196,9 +199,7 @@ def campaign(runs: int, seed: int, say: Callable[[str], None] = print) -> int:
     failures = 0
     random = np.random.default_rng(seed)
     each = -(-runs // len(PARSERS))
-    say(
-        "| parser | executions | values | declared errors | slowest, ms | failures |\n| --- | --- | --- | --- | --- | --- |"
-    )
+    say("| parser | executions | values | declared errors | slowest, ms | failures |\n|" + " --- |" * 6)
     with tempfile.TemporaryDirectory() as folder:
         for name, parser in PARSERS.items():
             seen: Counter[str] = Counter()

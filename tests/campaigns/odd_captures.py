@@ -108,7 +108,7 @@ def campaign(count: int, seed: int, say: Callable[[str], None] = print) -> int:
     for _ in range(count):
         alike = random.random() < 0.6
         what = [str(random.choice(list(CONTENT)))] * 3 if alike else [str(x) for x in random.choice(list(CONTENT), 3)]
-        size = (2 * int(random.integers(8, 50)), 2 * int(random.integers(8, 50)))
+        size = (2 * int(random.integers(40, 100)), 2 * int(random.integers(40, 100)))
         kind = str(random.choice(["none", "none", "one pixel", "all", "random"]))
         start = time.perf_counter()
         with tempfile.TemporaryDirectory() as place:

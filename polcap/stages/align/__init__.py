@@ -69,8 +69,8 @@ def register(radiance: AngleStack, color: ColorCalibration, settings: Settings) 
         usable = float(np.mean(detail[k][1].weight > 0))
         if usable < _LEAST_USABLE:
             raise AlignmentError(
-                f"shot {np.degrees(angle):g}° is clipped in {1 - usable:.1%} of its pixels, nothing is left to compare; "
-                "add darker frames to the bracket"
+                f"shot {np.degrees(angle):g}° is clipped in {1 - usable:.1%} of its pixels, which leaves nothing to "
+                "compare; add darker frames to the bracket"
             )
     transform = np.tile(np.eye(3), (shots, 1, 1))
     residual = np.zeros(shots)

@@ -31,7 +31,6 @@ from polcap.stages.hdr.ambient import same_size
 from polcap.stages.hdr.combine import Merged
 from polcap.stages.hdr.planes import Reader
 
-
 _LEAST_PX = 48  # of a merged picture's side: tiles of noise, and registration at a quarter of the size
 
 
