@@ -28,7 +28,6 @@ from polcap.stages import stage
 
 _ALIASING_PX2 = 0.05**2  # variance of an edge's place between two samplings of it
 _FLOOR_PX = 0.02  # what aliasing leaves of an error on rendered captures, whatever the noise
-_LEAST_USABLE = 0.01  # of a shot's pixels unclipped; with less there is nothing to register by
 _MOST_POINTS = 1e5  # of a picture tell of a movement; more are evenly thinned
 _MEDIAN_OF = 20000  # points: knows a median to 1 %
 _SIDE = 1024
@@ -65,13 +64,6 @@ def register(radiance: AngleStack, color: ColorCalibration, settings: Settings) 
         return _as_known(radiance.offset_px)
     step = int(np.ceil(np.sqrt(radiance.value[0, ..., 0].size / _MOST_PIXELS)))
     detail = [_Detail(_fine(radiance, k, settings.detail_px, step)) for k in range(shots)]
-    for k, angle in enumerate(radiance.angle):
-        usable = float(np.mean(detail[k][1].weight > 0))
-        if usable < _LEAST_USABLE:
-            raise AlignmentError(
-                f"shot {np.degrees(angle):g}° is clipped in {1 - usable:.1%} of its pixels, which leaves nothing to "
-                "compare; add darker frames to the bracket"
-            )
     transform = np.tile(np.eye(3), (shots, 1, 1))
     residual = np.zeros(shots)
     correlation = np.ones(shots)
@@ -273,11 +265,6 @@ class _Compared:
         use[:4] = use[-4:] = False
         use[:, :4] = use[:, -4:] = False
         at = np.flatnonzero(use)
-        if not len(at):
-            raise AlignmentError(
-                "the shots hold no detail by which to register them; light the object, or set align.model=none where "
-                "nothing moved"
-            )
         at = at[:: max(1, round(len(at) / _MOST_POINTS))]
         self.y, self.x = np.divmod(at, self.width)
         self.value, self.weight = a.value.ravel()[at], weight.ravel()[at].astype(np.float64)
