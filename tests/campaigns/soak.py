@@ -1,0 +1,59 @@
+"""Small captures one after the other in one process: memory and open memory maps after each.
+
+python tests/campaigns/soak.py [--captures 60]
+
+The bundled capture, analytic estimator, each run into a new folder. Prints the slope of resident memory after a third
+of the runs, MB a capture, and the memory maps of results that are open at the beginning and at the end.
+"""
+
+import argparse
+import sys
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from polcap import pipeline
+from polcap.config import Config
+from polcap.errors import GateError
+from polcap.formats import capture as captures
+from polcap.path import UserInput
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "capture"
+
+
+def resident_mb() -> float:
+    """Private memory of this process; mapped files, which the system takes back at will, apart."""
+    told = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return int(told["RssAnon"].split()[0]) / 1024
+
+
+def open_maps(folder: str) -> int:
+    """Files of results that are mapped now."""
+    return sum(folder in line for line in Path("/proc/self/maps").read_text().splitlines())
+
+
+def main(count: int) -> None:
+    """Print the table."""
+    memory, maps = [], []
+    with tempfile.TemporaryDirectory() as place:
+        for number in range(count):
+            out = Path(place) / f"{number:03d}"
+            with suppress(GateError):
+                pipeline.process(captures.read(EXAMPLE), UserInput(), Config(), out)
+            memory.append(resident_mb())
+            maps.append(open_maps(place))
+            print(f"{number:4d} {memory[-1]:8.1f} MB {maps[-1]:4d} maps", flush=True)
+    settled = memory[count // 3 :]
+    slope = np.polyfit(np.arange(len(settled)), settled, 1)[0]
+    told = f"{slope:+.3f} MB per capture after the {count // 3}th"
+    print(f"{count} captures: {told}; maps {maps[0]} at first, {maps[-1]} last")
+
+
+if __name__ == "__main__":
+    arguments = argparse.ArgumentParser(description=__doc__)
+    arguments.add_argument("--captures", type=int, default=60)
+    main(arguments.parse_args().captures)
