@@ -1,13 +1,15 @@
 """Rendered captures in, polcap's error against their truth out: the yardstick of the whole path.
 
-    python tests/benchmarks/bench_captures.py $POLCAP_DATA/rendered [--estimator analytic] [--model ONNX]
+    python tests/benchmarks/bench_captures.py $POLCAP_DATA/rendered [--estimator analytic] [--model ONNX] [--rough]
 
-Prints a Markdown row per capture. Truth comes with the captures, from another renderer.
+Prints a Markdown row per capture. Truth comes with the captures, from another renderer, whose bodies have a smooth
+interface; with --rough, S1 and S2 are scaled to what the facets of each pixel's true roughness leave of them.
 """
 
 import argparse
 import json
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,7 +19,9 @@ from polcap import pipeline
 from polcap.config import Config
 from polcap.formats import capture as captures
 from polcap.images import Capture, Floats, Network
-from polcap.path import Results, UserInput, path
+from polcap.optics import body, frames, fresnel
+from polcap.path import Results, UserInput, distance_m, path
+from polcap.stages import cues, infer, surface
 from polcap.store import Store
 
 COLUMNS = (
@@ -31,17 +35,18 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--estimator", choices=("network", "analytic"))
     parser.add_argument("--model", type=Path)
+    parser.add_argument("--rough", action="store_true")
     options = parser.parse_args()
     network = pipeline.load_network(options.estimator, options.model, "cpu", 2)
     print("|", " | ".join(COLUMNS), "|\n|", " | ".join("---" for _ in COLUMNS), "|")
     rows = []
     for truth in sorted(options.folder.glob("*.truth.json")):
-        rows.append(measure(truth, network))
+        rows.append(measure(truth, network, options.rough))
         print(f"| {truth.name.split('.')[0]} |", " | ".join(f"{value:.3g}" for value in rows[-1]), "|", flush=True)
     print("| mean |", " | ".join(f"{value:.3g}" for value in np.mean(rows, axis=0)), "|")
 
 
-def measure(truth_file: Path, network: Network | None) -> list[float]:
+def measure(truth_file: Path, network: Network | None, rough: bool) -> list[float]:
     """One capture's figures, in the order of COLUMNS."""
     stem = str(truth_file)[: -len(".truth.json")]
     told = json.loads(truth_file.read_text())
@@ -51,8 +56,8 @@ def measure(truth_file: Path, network: Network | None) -> list[float]:
         supplied = UserInput(network=network, mask_network=pipeline.load_mask_network(2))
         found = path(capture, supplied, Config(), Store(Path(out)))
         with np.load(stem + ".truth.npz") as maps:
-            surface = surface_errors(found, dict(maps))
-        return [*surface[:2], *capture_errors(found, capture, told, meta), *surface[2:]]
+            errors = surface_errors(found, dict(maps), network, rough)
+        return [*errors[:2], *capture_errors(found, capture, told, meta), *errors[2:]]
 
 
 def capture_errors(found: Results, capture: Capture, told: dict, meta: dict) -> list[float]:  # type: ignore[type-arg]
@@ -85,9 +90,8 @@ def capture_errors(found: Results, capture: Capture, told: dict, meta: dict) -> 
     return [float(chart), worst, float(100 * np.abs(gain).max()), float(100 * np.abs(ratios).max())]
 
 
-def surface_errors(found: Results, truth: dict[str, Floats]) -> list[float]:
+def surface_errors(found: Results, truth: dict[str, Floats], network: Network | None, rough: bool) -> list[float]:
     """Normal mean and median [degrees], RMSE of diffuse, roughness and F0, of depth [share of its range]."""
-    maps, depth = found.maps.value, found.mesh.value.depth
     x0, y0, x1, y1 = found.object_.value.crop
     crop = np.s_[y0:y1, x0:x1]
 
@@ -99,6 +103,14 @@ def surface_errors(found: Results, truth: dict[str, Floats]) -> list[float]:
 
     normal = binned(truth["normal"])
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+    maps, depth = found.maps.value, found.mesh.value.depth
+    if rough:
+        kept = _kept(normal, binned(truth["alpha"]), binned(truth["ior"]), found.cues.value.rays)
+        parts = found.stokes.value.stokes.copy()
+        parts[1:] *= np.where(binned(truth["mask"]) > 0, kept, 1)[..., None]
+        seen = cues.compute(replace(found.stokes.value, stokes=parts), found.color.value)
+        maps = infer.estimate(seen, network, Config().infer)
+        depth = surface.integrate(maps, distance_m(found.color.value, found.radiance.value), Config().surface).depth
     inside = (binned(truth["mask"]) == 1) & maps.mask
     angle = np.degrees(np.arccos(np.clip((normal * maps.normal).sum(-1), -1, 1)))[inside]
     ior = np.maximum(binned(truth["ior"]), 1)
@@ -119,6 +131,13 @@ def surface_errors(found: Results, truth: dict[str, Floats]) -> list[float]:
         rmse(maps.specular[..., 1], f0),
         relative,
     ]
+
+
+def _kept(normal: Floats, alpha: Floats, ior: Floats, rays: Floats) -> Floats:
+    """Share of the smooth body's DoLP that facets leave (H, W)."""
+    cosine = np.clip(frames.to_ray_frame(normal, rays)[..., 2], 0.05, 1 - 1e-6)
+    index = np.clip(ior, 1.3, 1.7)
+    return np.asarray(body.dolp(cosine, alpha, index) / fresnel.diffuse_dolp(cosine, index), np.float32)
 
 
 if __name__ == "__main__":
