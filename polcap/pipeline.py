@@ -17,7 +17,7 @@ import msgspec
 from polcap import asset_export, pictures, report
 from polcap.asset_export import Wanted
 from polcap.config import Config, restored
-from polcap.errors import ModelError, SettingError, StorageError
+from polcap.errors import InputError, ModelError, SettingError, StorageError
 from polcap.formats import animation, atomic, calib, layouts, onnx, png, provenance, text_file
 from polcap.formats import maps as maps_folder
 from polcap.images import Capture, Frame, Network, SensorImage
@@ -55,6 +55,10 @@ def process(
         store.materialize(until)
         if until is not None:
             return None
+        before = _written_before(out, capture, config, supplied.network, results)
+        if before is not None and force is None:
+            progress("write", 0.0, True)
+            return before
         progress("write", None, False)
         start = time.perf_counter()
         about = report.document(report.capture_facts(capture), results, config, supplied.network, timings(out))
@@ -63,6 +67,7 @@ def process(
         )
         asset_export.export(out, about, Wanted())
         report.write(out, about, results)
+        _remember_written(out)
         progress("write", time.perf_counter() - start, False)
     return about
 
@@ -222,6 +227,44 @@ class _Counted:
         self._done = min(self._done + 1, self._total)
         self._tell(self._done, self._total)
         return image
+
+
+def _written_before(
+    out: Path, capture: Capture, config: Config, network: Network | None, results: Results
+) -> dict[str, Any] | None:
+    """The report of an earlier run that would write the same files, where nobody has touched these since."""
+    try:
+        if text_file.read_json(out / "work" / "written.json") != _files(out):
+            return None
+        about = report.read(out)
+    except (OSError, ValueError, InputError):
+        return None
+    same: dict[str, Any] = {
+        "capture": report.capture_facts(capture),
+        "versions": provenance.versions(),
+        "model": None if network is None else {**network.metadata, "digest": network.digest},
+        "keys": {kept.name: kept.key for kept in vars(results).values()},
+        "settings": msgspec.to_builtins(config),
+    }
+    return about if json.loads(json.dumps(same)) == {name: about.get(name) for name in same} else None
+
+
+def _remember_written(out: Path) -> None:
+    """work/written.json: what the next run finds if nothing has changed."""
+    with atomic.path(out / "work" / "written.json") as temporary:
+        temporary.write_text(json.dumps(_files(out)) + "\n", encoding="utf-8")
+
+
+def _files(out: Path) -> dict[str, list[int]]:
+    """Size and time of every file of a result but the cache."""
+    found = {}
+    for root, folders, files in os.walk(out):
+        if Path(root) == out:
+            folders[:] = [name for name in folders if name != "work"]
+        for name in files:
+            about = (Path(root) / name).stat()
+            found[os.path.relpath(os.path.join(root, name), out)] = [about.st_size, about.st_mtime_ns]
+    return found
 
 
 def _remember_run(out: Path, capture: Capture, config: Config, network: Network | None) -> None:

@@ -141,8 +141,8 @@ class Reader:
     def __call__(self, frame: Frame) -> SensorImage:
         """Raises DecodeError."""
         if id(frame) not in self._held:
-            under_way = self._decoding.pop(id(frame), None)
-            image = frame.load() if under_way is None else under_way.result()
+            under_way = self._decoding.pop(id(frame), None) or self._pool.submit(frame.load)
+            image = under_way.result()
             room = max(1, _HELD_BYTES // max(image.value.nbytes, 1))
             while len(self._held) >= room:
                 self._held.popitem(last=False)
