@@ -49,6 +49,16 @@ def test_maps_json_and_the_files_say_what_they_hold(exported: Path, preset: str)
         assert meaning.encode() in (exported / "asset" / preset / name).read_bytes()[:300]
 
 
+def test_maps_json_and_report_json_agree_and_state_units(exported: Path) -> None:
+    said = json.loads((exported / "maps" / "maps.json").read_text())
+    about = json.loads((exported / "report.json").read_text())
+    assert about["figures"]["object"]["crop"] == said["crop"] and about["units"]["object.crop"] == "RAW px"
+    assert about["figures"]["maps"]["estimator"] == said["estimator"]
+    assert about["units"]["mesh.extent"] == said["depth"]["unit"]
+    assert about["capture"]["focal_known"] == said["camera"]["focal_known"]
+    assert about["capture"]["focal_px"] == pytest.approx(said["camera"]["focal_px"] * said["scale"])
+
+
 def test_unreal_gets_green_down_and_unity_smoothness(exported: Path) -> None:
     assets = exported / "asset"
     down, up = (png.read(assets / name) for name in ("unreal/T_capture_N.png", "unity/capture_Normal.png"))

@@ -175,12 +175,11 @@ def _description(maps: SurfaceMaps, metric: bool, near: float, far: float) -> di
     """maps.json."""
     view = maps.view
     height, width = maps.mask.shape
-    x, y = view.origin
     unit = "m" if metric else "relative"
     linear, encoded = "linear Rec.709", "8 bit, sRGB"
     return {
         "format": "polcap maps 1",
-        "crop": [_plain(v * view.scale) for v in (x, y, x + width, y + height)],
+        "crop": raw_crop(view, width, height),
         "size": [width, height],
         "scale": _plain(view.scale),
         "camera": {
@@ -210,6 +209,12 @@ def _description(maps: SurfaceMaps, metric: bool, near: float, far: float) -> di
             "cues.exr": "dolp; aolp in degrees, 0 ... 180; normalized.S1, normalized.S2; diffuse_color.R, .G, .B; half",
         },
     }
+
+
+def raw_crop(view: View, width: int, height: int) -> list[int | float]:
+    """x0, y0, x1, y1 of a crop in visible RAW pixels of the reference shot, end exclusive."""
+    x, y = view.origin
+    return [_plain(edge * view.scale) for edge in (x, y, x + width, y + height)]
 
 
 def _plain(value: float) -> int | float:

@@ -17,6 +17,7 @@ from polcap import __version__, gates
 from polcap.config import Config
 from polcap.errors import StorageError
 from polcap.formats import atomic, provenance, text_file
+from polcap.formats import maps as maps_folder
 from polcap.images import (
     Capture,
     Floats,
@@ -26,7 +27,7 @@ from polcap.images import (
     StokesImage,
 )
 from polcap.path import Results
-from polcap.report import page, shown
+from polcap.report import labels, page, shown
 from polcap.report.whole import Whole
 
 _COMPARED_PX = 512  # the longest side on which photographs and re-rendering are compared
@@ -127,7 +128,7 @@ def figures(results: Results) -> dict[str, dict[str, Any]]:
         },
         "object": {
             "pixels": int(image.mask.sum()),
-            "crop": list(results.object_.value.crop),
+            "crop": maps_folder.raw_crop(maps.view, *maps.mask.shape[::-1]),
             "source": results.object_.value.source,
             "mask_doubt": None if results.object_.value.doubt is None else _number(results.object_.value.doubt),
             "mask_islands": _number(results.object_.value.islands),
@@ -189,6 +190,7 @@ def document(
         "capture": capture,
         "gates": msgspec.to_builtins(judged),
         "figures": found,
+        "units": labels.units(bool(found["mesh"]["metric"])),
         "timings": dict(timings),
         "model": None if network is None else {**network.metadata, "digest": network.digest},
         "keys": {kept.name: kept.key for kept in vars(results).values()},

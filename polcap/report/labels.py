@@ -30,7 +30,7 @@ LABELS: dict[str, tuple[str, str]] = {
     "angles.best_order": ("Order of the shots that the outline supports", ""),
     "angles.mirrored": ("Angles counted the other way", ""),
     "object.pixels": ("Size of the object", "px"),
-    "object.crop": ("Crop: left, top, right, bottom", "px"),
+    "object.crop": ("Crop: left, top, right, bottom", "RAW px"),
     "object.source": ("Outline from", ""),
     "object.mask_doubt": ("Pixels of the outline in doubt, of the object's", "%"),
     "object.mask_islands": ("Parts that stand apart, of the object", "%"),
@@ -73,7 +73,15 @@ PARTS = {
     "mesh": "Surface",
     "rerendering": "Re-rendering",
 }
+_STORED = {"%": "1", "×": "1", "mm": "m", "°": "deg"}  # unit on the page -> unit of the number in report.json
 _FACTORS = {"%": 100.0, "mm": 1000.0}  # figures are shares and metres
+
+
+def units(metric: bool) -> dict[str, str]:
+    """Unit of every number in report.json that has one; "1" is a share or a factor."""
+    found = {name: _STORED.get(unit, unit) for name, (_, unit) in LABELS.items() if unit}
+    raw = {"capture.focal_px": "RAW px", "capture.size_px": "RAW px"}
+    return {**found, **raw, "mesh.extent": "m" if metric else "relative", "timings": "s"}
 
 
 def part(name: str) -> str:

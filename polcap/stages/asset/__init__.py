@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from polcap.images import Asset, Floats, Mesh, SurfaceMaps
-from polcap.optics import color, fresnel
+from polcap.optics import color, frames, fresnel
 from polcap.stages import stage
 
 _LEAST_UP = 0.05  # a tangent-space normal must leave the surface (glTF: blue above one half)
@@ -58,15 +58,18 @@ def tangent_space(maps: SurfaceMaps, mesh: Mesh) -> Floats:
     height, width = maps.mask.shape
     frame, covered = _interpolated(mesh, height, width)
     covered &= maps.mask
-    n, t = _unit(frame[..., :3]), _unit(frame[..., 3:6])
-    b = np.cross(n, t) * np.where(frame[..., 6:] < 0, -1.0, 1.0)
+    there = frame[covered]  # (N, 7)
+    n, t = _unit(there[:, :3]), _unit(there[:, 3:6])
+    b = frames.cross(n, t) * np.where(there[:, 6:] < 0, -1.0, 1.0)
     # n and t are each interpolated, so not quite square to each other: solve, do not project
-    volume = np.sum(t * np.cross(b, n), axis=-1)
-    volume = np.where(covered, volume, 1.0)
-    m = maps.normal.astype(np.float64)
-    local = np.stack([np.sum(m * np.cross(*pair), axis=-1) / volume for pair in ((b, n), (n, t), (t, b))], axis=-1)
-    local[..., 2] = np.maximum(local[..., 2], _LEAST_UP)
-    return _unit(np.where(covered[..., None], local, [0.0, 0.0, 1.0]))[_nearest(covered)]
+    volume = frames.dot(t, frames.cross(b, n))
+    m = maps.normal[covered].astype(np.float64)
+    local = np.stack([frames.dot(m, frames.cross(*pair)) / volume for pair in ((b, n), (n, t), (t, b))], axis=-1)
+    local[:, 2] = np.maximum(local[:, 2], _LEAST_UP)
+    whole = np.zeros((height, width, 3))
+    whole[..., 2] = 1.0
+    whole[covered] = _unit(local)
+    return np.asarray(whole[_nearest(covered)])
 
 
 def _interpolated(mesh: Mesh, height: int, width: int) -> tuple[Floats, NDArray[np.bool_]]:

@@ -1,0 +1,106 @@
+"""How long an export takes against encoding the same files alone.
+
+python tests/benchmarks/bench_export.py FOLDER [SIDE]     (usd-core for `archive`)
+
+Makes a result folder with maps of SIDE² pixels (2048), a ball with two paints, and exports every preset.
+`whole` reads the maps, builds mesh and textures and writes; `encode` is what the writing takes of it. Seconds of all
+threads together.
+"""
+
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+
+from polcap import asset_export
+from polcap.asset_export import Wanted
+from polcap.config import Config
+from polcap.formats import maps as maps_folder
+from polcap.formats.presets import PRESETS
+from polcap.images import Cues, Floats, Mesh, StokesImage, SurfaceMaps, View
+from polcap.stages import asset, surface
+from tests import surfaces
+
+
+def main(folder: Path, side: int) -> None:
+    about = result(folder, side)
+    start = time.process_time()
+    stored = maps_folder.read(folder / "maps")
+    mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, surface.Settings())
+    asset.build(stored.maps, mesh, asset.Settings())
+    built = time.process_time() - start
+    print(f"maps read, mesh and textures built: {built:.2f} s")
+    print(f"{'preset':10}{'whole s':>10}{'encode s':>10}{'ratio':>8}{'MB':>8}")
+    for preset in PRESETS:
+        start = time.process_time()
+        written = asset_export.export(folder, about, Wanted(preset=preset))
+        whole = time.process_time() - start
+        size = sum(file.stat().st_size for file in written) / 1e6
+        print(f"{preset:10}{whole:10.2f}{whole - built:10.2f}{whole / (whole - built):8.2f}{size:8.1f}", flush=True)
+
+
+def result(folder: Path, side: int) -> dict[str, object]:
+    """maps/ of a ball, side² pixels, and what report.json would tell of them."""
+    scale = side / surfaces.WIDTH
+    view = View(surfaces.VIEW.focal * scale, (surfaces.VIEW.center[0] * scale, side / 2), 1.0)
+    ball = surfaces.maps()
+    grown = {name: enlarged(getattr(ball, name), side) for name in ("normal", "diffuse", "specular", "roughness")}
+    normal = grown["normal"] / np.maximum(np.linalg.norm(grown["normal"], axis=-1, keepdims=True), 1e-6)
+    noise = np.random.default_rng(0).normal(scale=0.01, size=(side, side)).astype(np.float32)
+    maps = replace(
+        ball,
+        normal=normal,
+        diffuse=np.clip(grown["diffuse"] + noise[..., None], 0, 1),
+        specular=np.clip(0.04 + noise[..., None] / 4, 0, 1).repeat(3, axis=-1),
+        roughness=np.clip(grown["roughness"] / 2 + noise, 0, 1),
+        confidence=np.full((side, side), 3.0, np.float32),
+        mask=enlarged(ball.mask.astype(np.float32), side) > 0.5,
+        view=view,
+    )
+    small = surfaces.mesh(ball)
+    mesh = replace(small, depth=enlarged(np.nan_to_num(small.depth, nan=surfaces.DISTANCE), side))
+    write(folder, maps, mesh, noise)
+    return {
+        "polcap": "0",
+        "capture": {"name": "ball", "camera": "", "shots": []},
+        "model": None,
+        "settings": msgspec.to_builtins(Config()),
+        "keys": {},
+    }
+
+
+def enlarged(values: Floats, side: int) -> Floats:
+    return np.asarray(cv2.resize(np.asarray(values, np.float32), (side, side), interpolation=cv2.INTER_LINEAR))
+
+
+def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, noise: Floats) -> None:
+    size = noise.shape
+    stokes = StokesImage(
+        stokes=np.stack([np.stack([maps.diffuse + noise[..., None]] * 3)[k] / 3 for k in range(3)]),
+        covariance=np.zeros((6, *size, 3), np.float32),
+        quality=np.zeros(size, np.uint8),
+        mask=maps.mask,
+        view=maps.view,
+        residual=None,
+    )
+    cues = Cues(
+        radiance=maps.diffuse,
+        ratio=np.stack([noise, noise]),
+        ratio_sigma=np.full(size, 0.01, np.float32),
+        dolp=np.abs(noise),
+        normalized_stokes=maps.normal[..., :2].transpose(2, 0, 1),
+        diffuse_color=maps.diffuse,
+        rays=maps.normal,
+        mask=maps.mask,
+        quality=np.zeros(size, np.uint8),
+        view=maps.view,
+    )
+    maps_folder.write(folder / "maps", maps, mesh, stokes, cues)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]).resolve(), int(sys.argv[2]) if len(sys.argv) > 2 else 2048)
