@@ -258,7 +258,7 @@ def test_the_example_from_python_runs(result: Path, example: Path, tmp_path: Pat
     script = ROOT / "examples" / "from_python.py"
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, script, example, copy], env=environment, capture_output=True, text=True)
-    assert done.returncode == 0 and "ghosts pass" in done.stdout, done.stderr
+    assert done.returncode == 0 and "stillness pass" in done.stdout, done.stderr
 
 
 def test_the_gallery_shows_each_result_and_stands_alone(result: Path, tmp_path: Path) -> None:
