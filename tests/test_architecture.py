@@ -41,6 +41,25 @@ def imported(name: str) -> set[str]:
 USES = {name: imported(name) for name in MODULES}
 
 
+UNIX_ONLY = {"fcntl", "resource", "termios", "tty", "pty", "pwd", "grp"}
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_module_loads_where_there_is_no_unix(name: str) -> None:
+    """What Windows lacks is imported where it is used, and only there."""
+    top = ast.parse(MODULES[name].read_text(encoding="utf-8")).body
+    named = {alias.name for node in top if isinstance(node, ast.Import) for alias in node.names}
+    named |= {node.module for node in top if isinstance(node, ast.ImportFrom) and node.module}
+    assert not named & UNIX_ONLY
+
+
+def test_the_path_is_imported_without_unix_modules() -> None:
+    rooms = "polcap.cli, polcap.api, polcap.check, polcap.batch, polcap.synth.shooting"
+    code = f"import sys; sys.modules.update(dict.fromkeys({sorted(UNIX_ONLY)})); import {rooms}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+
+
 def test_imports_form_no_circle() -> None:
     """Also those inside functions; a package and its own modules count as one another's house, not as a circle."""
     left = {name: {used for used in uses if not name.startswith(f"{used}.")} for name, uses in USES.items()}

@@ -4,8 +4,6 @@ The rig turns and shoots; meanwhile another thread saves and judges what came. A
 is empty again, so that shooting on, shooting again and going on after a crash are one loop: take what is missing.
 """
 
-import fcntl
-import os
 import shutil
 import signal
 import sys
@@ -17,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from filelock import FileLock, Timeout
 
 from polcap.errors import CaptureError, PolcapError, SettingError, StorageError
 from polcap.formats import atomic, layouts
@@ -262,15 +261,16 @@ def _held(name: str, log: Log) -> Iterator[Camera]:
 
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
-    """Keep a second polcap out of the folder; the kernel drops the lock when its owner dies."""
-    handle = os.open(folder, os.O_RDONLY)
+    """Keep a second polcap out of the folder; the system drops the lock when its owner dies."""
+    lock = FileLock(folder / ".lock", timeout=0)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    except BlockingIOError as error:
+        lock.acquire()
+    except Timeout as error:
         raise StorageError(f"{folder}: another polcap is shooting into it; wait for it") from error
+    try:
+        yield
     finally:
-        os.close(handle)
+        lock.release()
 
 
 @contextmanager
