@@ -39,7 +39,7 @@ def test_a_simulated_capture_is_shot_and_read(polcap: Command, tmp_path: Path) -
 def test_the_verdict_ends_a_capture(
     polcap: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verdict: str
 ) -> None:
-    monkeypatch.setattr("polcap.check.inspect", lambda found, network, config: found.shots[2].name)
+    monkeypatch.setattr("polcap.check.inspect", lambda found, *_: found.shots[2].name)
     monkeypatch.setattr("polcap.check.table", lambda judged: f"{verdict} {judged}")
     monkeypatch.setattr("polcap.check.shown", lambda judged: {"verdict": verdict})
     done = polcap("capture", tmp_path / "c", *SIMULATED[:4], "--json")
