@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from polcap.synth import capture as synthetic
 from polcap.synth import scenes
+from polcap.synth import shooting as synthetic
 
 OPTIONS = ("--estimator", "analytic", "--no-chart")
 

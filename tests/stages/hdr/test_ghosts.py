@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from polcap.stages.hdr import frames, ghosts
+from polcap.stages.hdr import ghosts, planes
 from polcap.stages.hdr.ghosts import Exposed
 from polcap.stages.hdr.noise import Noise
 from polcap.stages.hdr.planes import Planes, planar
@@ -79,7 +79,7 @@ def test_anchor_takes_the_darkest_frame_where_the_reference_clips():
 
 def test_blocks_cover_every_row_once_with_their_halo():
     seen = np.zeros(1000, int)
-    for rows, inner, target in frames.blocks(1000, 3):
+    for rows, inner, target in planes.blocks(1000, 3):
         np.testing.assert_array_equal(np.arange(1000)[rows][inner], np.arange(1000)[target])
         assert rows.start == max(target.start - 3, 0) and rows.stop == min(target.stop + 3, 1000)
         seen[target] += 1

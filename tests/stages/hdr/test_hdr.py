@@ -12,8 +12,8 @@ from polcap.errors import CaptureError
 from polcap.images import Capture, Exif, Frame, Quality, SensorImage, Shot
 from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.stages import hdr
-from polcap.stages.hdr import frames, links, noise
 from polcap.stages.hdr import ghosts as bracket_pixels
+from polcap.stages.hdr import links, noise, planes
 from polcap.stages.hdr.planes import Reader, signals
 
 RGGB = np.array([[0, 1], [1, 2]], np.uint8)
@@ -378,7 +378,7 @@ def test_a_plateau_below_the_stated_white_is_saturation():
 
 def test_frames_stream(monkeypatch):
     """With room for three decoded frames, never more than these and the next are alive, of nine."""
-    monkeypatch.setattr(frames, "_HELD_BYTES", 3 * 2 * 256 * 256)
+    monkeypatch.setattr(planes, "_HELD_BYTES", 3 * 2 * 256 * 256)
     quads = ramp(256, 256, high=2e4)
     alive = weakref.WeakSet()
     most = 0
