@@ -55,8 +55,8 @@ _START_S = 2.5  # a board that restarts when its port is opened
 _HOLD_S = 2.0  # to slow down in
 _RESET = b"\x18"
 _BANNER = re.compile(r"Grbl(?:HAL)? (1\.1\S*) .*")
-_STORED = re.compile(r"\$(\d+)=(\d+(?:\.\d+)?)(?: .*)?")
-_STATUS = re.compile(r"<(\w+)(?::\d+)?\|MPos:(-?\d+\.?\d*),(-?\d+\.?\d*),(-?\d+\.?\d*).*>")
+_STORED = re.compile(r"\$(\d{1,9})=(\d{1,9}(?:\.\d+)?)(?: .*)?")
+_STATUS = re.compile(r"<(\w+)(?::\d+)?\|MPos:(-?\d{1,9}\.?\d*),(-?\d{1,9}\.?\d*),(-?\d{1,9}\.?\d*).*>")
 
 
 class Settings(Struct, frozen=True):

@@ -42,7 +42,7 @@ class Replies:
     url = "fuzz://"
 
     def __init__(self, data: bytes) -> None:
-        self._lines = data.split(b"\n")
+        self._lines = [line for line in data.split(b"\n") if line.strip()]  # as Port, which passes over empty ones
 
     def send(self, data: bytes) -> None: ...
 

@@ -1,12 +1,14 @@
 """A model is taken for what its file says, or refused with the reason."""
 
+import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from polcap.errors import ModelError
-from polcap.formats.onnx import ENCODING, load
+from polcap.formats.onnx import ENCODING, Model, load
 
 onnx = pytest.importorskip("onnx", reason="writing test models needs the extra [train]")
 SAID = {"channels": "s1,s2", "encoding": ENCODING, "native_size": "128", "size_multiple": "8"} | {
@@ -95,3 +97,72 @@ def test_cuda_is_never_replaced_silently(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="--device cuda"):
         load(path, "cuda")
     assert load(path, "auto").provider == "CPUExecutionProvider"
+
+
+def build(path: Path, nodes: list[Any], outputs: dict[str, list[Any]], tensors: tuple[Any, ...] = ()) -> Path:
+    """A model of two channels made of these nodes."""
+    from onnx import TensorProto, helper
+
+    graph = helper.make_graph(
+        nodes,
+        "odd",
+        [helper.make_tensor_value_info("input", TensorProto.FLOAT, [1, 2, "h", "w"])],
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in outputs.items()],
+        list(tensors),
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    helper.set_model_props(model, SAID)
+    onnx.save(model, path)
+    return path
+
+
+def endless(path: Path) -> Path:
+    """A model that doubles its input for ever."""
+    from onnx import TensorProto, helper
+
+    value = helper.make_tensor_value_info
+    body = helper.make_graph(
+        [helper.make_node("Identity", ["go"], ["on"]), helper.make_node("Mul", ["x", "x"], ["y"])],
+        "body",
+        [value("i", TensorProto.INT64, []), value("go", TensorProto.BOOL, []), value("x", TensorProto.FLOAT, None)],
+        [value("on", TensorProto.BOOL, []), value("y", TensorProto.FLOAT, None)],
+    )
+    loop = helper.make_node("Loop", ["times", "", "input"], ["normal"], body=body)
+    times = helper.make_tensor("times", TensorProto.INT64, [], [2**62])
+    return build(path, [loop], {"normal": [1, 2, "h", "w"]}, (times,))
+
+
+def test_a_model_that_does_not_end_is_refused_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("polcap.formats.onnx._TRIAL_S", 8.0)
+    start = time.monotonic()
+    with pytest.raises(ModelError, match="not decoded within 8 s"):
+        load(endless(tmp_path / "m.onnx"), "cpu", 1)
+    assert time.monotonic() - start < 60
+
+
+def test_a_run_that_does_not_end_is_stopped(tmp_path: Path) -> None:
+    import onnxruntime
+
+    model = Model(tmp_path / "m.onnx", onnxruntime.InferenceSession(endless(tmp_path / "m.onnx")), limit_s=1.0)
+    with pytest.raises(ModelError, match=r"did not end within 1 s"):
+        model(np.ones((1, 2, 8, 8), np.float32))
+
+
+@pytest.mark.parametrize(("power", "shape", "words"), [(-0.5, [1, 2, "h", "w"], "NaN"), (2.0, [2], "is \\(2,\\) for")])
+def test_an_answer_that_is_no_map_is_refused(tmp_path: Path, power: float, shape: list[Any], words: str) -> None:
+    from onnx import TensorProto, helper
+
+    exponent = helper.make_tensor("exponent", TensorProto.FLOAT, [], [power])
+    name = "normal" if len(shape) == 4 else "powers"
+    nodes = [helper.make_node("Pow", ["input", "exponent"], [name])]
+    if len(shape) == 1:
+        nodes.append(helper.make_node("ReduceMean", ["powers"], ["normal"], axes=[0, 2, 3], keepdims=0))
+    with pytest.raises(ModelError, match=words):
+        load(build(tmp_path / "m.onnx", nodes, {"normal": shape}, (exponent,)), "cpu", 1)
+
+
+def test_metadata_that_are_no_text_are_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "m.onnx", SAID)
+    path.write_bytes(path.read_bytes().replace(b"Apache-2.0", b"Apache-\xea\x80\xff"))
+    with pytest.raises(ModelError, match=r"no text|cannot be run|not a model"):
+        load(path)
