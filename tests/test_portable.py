@@ -8,6 +8,7 @@ from tests.conftest import EXAMPLE, ROOT
 
 IMPORTS = """
 import importlib, pkgutil, sys
+import filelock, serial, serial.tools.list_ports, subprocess, tempfile  # these choose by the system
 for name in ("fcntl", "resource", "termios", "pwd", "grp"):
     sys.modules[name] = None  # an import of it fails
 import polcap
