@@ -7,7 +7,7 @@ result gives the same bytes, whenever and with however many threads.
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -108,7 +108,7 @@ class _Job:
             "exr": self._exr,
         }
         tasks = [writers[one] for one in self.preset.formats]
-        tasks += [partial(self._texture, file, made) for file, made in self.loose().items()]
+        tasks += [partial(self._texture, file, made) for file, made in self.loose.items()]
         with ThreadPoolExecutor(len(tasks)) as pool:
             running = [pool.submit(task) for task in tasks]
             written = [file for one in running for file in one.result()]
@@ -116,6 +116,7 @@ class _Job:
         provenance.write(sidecar, self.record, written)
         return [*written, sidecar]
 
+    @cached_property
     def loose(self) -> dict[str, Texture]:
         """The textures that lie beside the asset, by file name."""
         named = {pattern.format(obj.stem(self.name)): make for pattern, make in self.preset.textures.items()}
@@ -129,9 +130,16 @@ class _Job:
         return {
             "for": self.preset.says,
             "unit": self.unit,
-            "glb_images": self.images,
-            "textures": {file: texture.says for file, texture in sorted(self.loose().items())},
+            "glb": self._embedded(),
+            "textures": {file: texture.says for file, texture in sorted(self.loose.items())},
         }
+
+    def _embedded(self) -> dict[str, str]:
+        """The GLB's pictures and what they hold, where there is a GLB."""
+        if "gltf" not in self.preset.formats:
+            return {}
+        held = gltf.textures(self.asset)
+        return {f"{self.stem}_{key}": f"{texture.says}; {self.images}" for key, texture in held.items()}
 
     @property
     def stem(self) -> str:

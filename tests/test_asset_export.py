@@ -1,6 +1,7 @@
 """`polcap export`: every preset whole and valid, the same bytes whenever, one line where it cannot."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import pytest
 
 from polcap.formats import encoders, png
 from polcap.formats.presets import PRESETS
-from tests.conftest import Command, shell
+from tests.conftest import ROOT, Command, shell
 from tests.formats.test_gltf import NODE, document
 
 
@@ -115,6 +116,41 @@ def test_ktx2_needs_an_encoder_and_says_so(result: Path, polcap: Command) -> Non
         pytest.skip("an encoder is here")
     done = polcap("export", result, "--gltf", "--images", "ktx2")
     assert done.returncode == 2 and "ktx" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_encoder_on_the_path_makes_ktx2_textures(
+    result: Path, polcap: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stand-in for `toktx` keeps its arguments and writes KTX2's identifier: the way there, not the compression."""
+    encoder = tmp_path / "bin" / "toktx"
+    encoder.parent.mkdir()
+    encoder.write_text(
+        '#!/bin/sh\necho "$@" >> "$0.log"\nfor last; do before=$out; out=$last; done\n'
+        "printf '\\253KTX 20\\273\\r\\n\\032\\n' > \"$before\"\n"
+    )
+    encoder.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{encoder.parent}:{os.environ['PATH']}")
+    monkeypatch.setattr(encoders, "_PROGRAMS", ("toktx",))
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
+    done = polcap("export", copy, "--gltf", "--images", "ktx2")
+    assert done.returncode == 0, done.stderr
+    said = document((copy / "asset" / "capture.glb").read_bytes())
+    assert said["extensionsRequired"] == ["KHR_texture_basisu"]
+    assert {image["mimeType"] for image in said["images"]} == {"image/ktx2"}
+    assert all("KHR_texture_basisu" in texture["extensions"] for texture in said["textures"])
+    calls = Path(f"{encoder}.log").read_text().splitlines()
+    assert sorted("--assign_oetf srgb" in call for call in calls) == [False, False, True, True]  # data, colours
+
+
+def test_the_example_of_presets_runs(result: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
+    script = ROOT / "examples" / "export_presets.py"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, script, copy], capture_output=True, text=True, env=environment, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "T_capture_N.png: tangent-space normal n * 0.5 + 0.5, -Y" in done.stdout
 
 
 def test_usd_without_its_package_is_one_line_with_the_remedy(

@@ -24,6 +24,7 @@ from polcap.formats.texture_set import Texture
 
 Kind = Literal["png", "jpeg", "webp", "ktx2"]
 MIME: dict[Kind, str] = {"png": "image/png", "jpeg": "image/jpeg", "webp": "image/webp", "ktx2": "image/ktx2"}
+_PROGRAMS = ("ktx", "toktx")
 _QUALITY = {"jpeg": (95, 92), "webp": (101, 90)}  # data, colour; WebP over 100 is lossless
 
 
@@ -67,7 +68,7 @@ def encode(texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
 
 def ktx2_encoder() -> str | None:
     """`ktx` or `toktx` of Khronos' KTX software, where it is installed."""
-    return next((found for name in ("ktx", "toktx") if (found := shutil.which(name))), None)
+    return next((found for name in _PROGRAMS if (found := shutil.which(name))), None)
 
 
 def _ktx2(texture: Texture) -> bytes:

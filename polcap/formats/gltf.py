@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from polcap import __version__
 from polcap.formats import atomic, encoders, texture_set
 from polcap.formats.encoders import Kind
+from polcap.formats.texture_set import Texture
 from polcap.images import Asset, Floats, Mesh
 
 _FLOAT, _UINT32 = 5126, 5125
@@ -55,15 +56,10 @@ def encode(asset: Asset, name: str, images: Kind = "png", provenance: Mapping[st
     """The bytes of the GLB; `provenance` goes into its XMP packet."""
     blob = _Blob()
     primitive = _primitive(asset.mesh, blob)
-    textures = {
-        "basecolor": texture_set.base_color(asset),
-        "orm": texture_set.packed(asset),
-        "normal": texture_set.normal(asset),
-        "specular": texture_set.relative_specular(asset),
-    }
+    held = textures(asset)
     pictures = [
         blob.image(f"{name}_{key}", data, encoders.MIME[images])
-        for key, data in encoders.encode_all(textures, images).items()
+        for key, data in encoders.encode_all(held, images).items()
     ]
     used = ["KHR_materials_specular", "KHR_materials_ior", "KHR_xmp_json_ld"]
     required = [_IMAGE_EXTENSION[images]] if images in _IMAGE_EXTENSION else []
@@ -74,7 +70,7 @@ def encode(asset: Asset, name: str, images: Kind = "png", provenance: Mapping[st
             "extras": {
                 "unit": "metre" if asset.mesh.metric else "relative",
                 "origin_in_camera": [float(x) for x in center(asset.mesh.vertices)],
-                "textures": {f"{name}_{key}": texture.says for key, texture in textures.items()},
+                "textures": {f"{name}_{key}": texture.says for key, texture in held.items()},
             },
             "extensions": {"KHR_xmp_json_ld": {"packet": 0}},
         },
@@ -105,6 +101,16 @@ def encode(asset: Asset, name: str, images: Kind = "png", provenance: Mapping[st
             bytes(blob.data),
         ]
     )
+
+
+def textures(asset: Asset) -> dict[str, Texture]:
+    """What the GLB embeds, by the ends of their names, in the order of the material."""
+    return {
+        "basecolor": texture_set.base_color(asset),
+        "orm": texture_set.packed(asset),
+        "normal": texture_set.normal(asset),
+        "specular": texture_set.relative_specular(asset),
+    }
 
 
 def _primitive(mesh: Mesh, blob: "_Blob") -> dict[str, Any]:

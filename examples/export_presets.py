@@ -1,0 +1,21 @@
+"""A result for Unreal and for a web page: each folder's files, and what their textures hold, from maps.json.
+
+python examples/export_presets.py RESULT
+"""
+
+import json
+import sys
+from pathlib import Path
+
+from polcap import pipeline
+from polcap.asset_export import Wanted
+
+result = Path(sys.argv[1])
+for wanted in (Wanted(preset="unreal"), Wanted(preset="web"), Wanted(formats=("exr",), color="ACEScg")):
+    for file in pipeline.export(result, wanted):
+        print(f"{file.relative_to(result)}  {file.stat().st_size / 1e6:.2f} MB")
+exports = json.loads((result / "maps" / "maps.json").read_text(encoding="utf-8"))["exports"]
+for folder, told in exports.items():
+    print(f"\n{folder}: {told['for']}; unit of length: {told['unit']}")
+    for name, holds in {**told["glb"], **told["textures"]}.items():
+        print(f"  {name}: {holds}")
