@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from polcap.formats import encoders, gltf, texture_set, usd
 from polcap.images import Asset, Floats, SurfaceMaps
@@ -58,7 +59,7 @@ def main(folder: Path) -> None:
             told = [np.percentile(off[where], q) for where in (facing, inside & ~facing) for q in (50, 95)]
             row = "".join(f"{100 * value:{wide}.1f} %" for value, wide in zip(told, (14, 6, 14, 6)))
             print(f"{light:15}{f'{one} : {other}':26}{row}")
-        np.savez(folder / f"{light}.npz", **seen)
+        np.savez(folder / f"{light}.npz", allow_pickle=False, **seen)
 
 
 def varied() -> SurfaceMaps:
@@ -95,9 +96,9 @@ def cosine(maps: SurfaceMaps, direction: tuple[float, float, float]) -> Floats:
     return np.asarray(maps.normal @ (np.array(direction) / np.linalg.norm(direction)))
 
 
-def inner(maps: SurfaceMaps, *pictures: Floats) -> Floats:
+def inner(maps: SurfaceMaps, *pictures: Floats) -> NDArray[np.bool_]:
     """Pixels of the object a few pixels from its rim and from the seam of the two paints."""
-    mask = maps.mask.copy()
+    mask: NDArray[np.bool_] = maps.mask.copy()
     red = maps.diffuse[..., 0] > maps.diffuse[..., 1]
     for axis in (0, 1):
         for step in range(-3, 4):

@@ -16,7 +16,7 @@ from tests import surfaces
 FILES = {
     "normal.exr", "normal.png", "depth.exr", "depth.png", "diffuse.exr", "diffuse.png", "specular.exr",
     "specular.png", "roughness.exr", "roughness.png", "mask.png", "confidence.exr", "stokes.exr",
-    "cues.exr", "maps.json",
+    "cues.exr", "photograph.png", "maps.json",
 }  # fmt: skip
 
 Result = tuple[SurfaceMaps, Mesh, StokesImage, Cues]

@@ -171,7 +171,7 @@ def test_full_size_keeps_bias_and_variance_honest():
 
 
 def test_view_is_that_of_the_binned_grid():
-    frames, _, _ = bracket(ramp(64, 96), [(1, 100)])
+    frames, _, _ = bracket(ramp(192, 288), [(1, 100)])
     view = hdr.merge(capture(frames), hdr.Settings()).view
     assert (view.scale, view.focal, view.center) == (2, 500, (50.0, 40.0))
 
@@ -358,10 +358,10 @@ def test_shots_share_the_reference_index_and_keep_their_own_flash_energy():
 
 def test_unequal_brackets_and_sizes_are_refused_by_name():
     rng = np.random.default_rng(0)
-    small, large = expose(ramp(64, 64), 1, rng), expose(ramp(64, 96), 1, rng)
+    small, large = expose(ramp(192, 192), 1, rng), expose(ramp(192, 256), 1, rng)
     with pytest.raises(CaptureError, match=r"shot 45° has 1 frames, shot 0° has 2"):
         hdr.merge(capture([frame(small)] * 2, [frame(small)]), hdr.Settings())
-    with pytest.raises(CaptureError, match=r"^shot 45° is 48×32"):
+    with pytest.raises(CaptureError, match=r"^shot 45° is 128×96"):
         hdr.merge(capture([frame(small)], [frame(large)]), hdr.Settings())
 
 
