@@ -385,9 +385,19 @@ def doctor(
         typer.Option("--ports/--no-ports", help="Write to the serial ports to learn who answers; else you are asked."),
     ] = None,
     json: Json = False,
+    file: Annotated[
+        Path | None, typer.Argument(metavar="[FILE.RAW]", help="One photograph: can polcap use it, what does it tell?")
+    ] = None,
 ) -> None:
-    """What works on this machine, what does not, and the remedy."""
+    """What works on this machine, or with one photograph; what does not, and the remedy."""
     from polcap import doctor as doctors
+
+    if file is not None:
+        told = doctors.examine_file(file)
+        terminal.say(doctors.shown(told) if json else doctors.table(told))
+        if any(one.state == "fault" for one in told):
+            raise typer.Exit(SettingError.exit_code)
+        return
     from polcap.rig import camera_gphoto2, rotator, serial_port
 
     rig = doctors.Rig(

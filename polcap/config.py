@@ -37,7 +37,10 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.1
     max_gain_disagreement: Annotated[
         float,
-        Meta(gt=0, le=1, description="doubt of a shot's light, and chart against object beyond it; 1 % costs 6° [1]"),
+        Meta(gt=0, le=1, description="chart against object on a shot's light beyond both errors; 1 % costs 6° [1]"),
+    ] = 0.03
+    max_gain_doubt: Annotated[
+        float, Meta(gt=0, le=1, description="1σ of a shot's light, or of the chart's gloss on it; 1 % is 6° [1]")
     ] = 0.01
     max_gain_change: Annotated[
         float, Meta(gt=0, le=1, description="of a shot's light against the other shots'; more is no ordinary pop [1]")

@@ -148,14 +148,24 @@ def _counts(path: str, raw: Any) -> tuple[dict[str, Any], worker.Arrays]:
     return meta | {"black": black, "white": _white(raw, float(np.max(black)))}, arrays
 
 
+def unsupported(shape: tuple[int, ...] | None) -> str:
+    """Why a colour filter of this period (rows, columns) cannot be used, and what to do; None: LibRaw tells none."""
+    what = "of no mosaic that LibRaw tells (Foveon, or sub-sampled colour)"
+    if shape == (6, 6):
+        what = "Fujifilm's X-Trans (6×6)"
+    elif shape is not None:
+        what = f"a mosaic of {'×'.join(map(str, shape))}"
+    return (
+        f"its colour filter is {what}, not a 2×2 Bayer mosaic; develop every photograph alike to linear 16-bit TIFF "
+        "(no tone curve, no denoising, one white balance), or use a camera with a Bayer or monochrome sensor"
+    )
+
+
 def _mosaic(raw: Any, path: str) -> tuple[Bits, list[list[float]]]:
     """The 2×2 colours and black levels from the first visible pixel on."""
     pattern = raw.raw_pattern
     if pattern is None or pattern.shape != (2, 2):
-        raise DecodeError(
-            f"{path}: its colour filter is not a 2×2 Bayer mosaic (X-Trans, Foveon or another), which polcap "
-            "does not support; develop it to linear 16-bit TIFF"
-        )
+        raise DecodeError(f"{path}: {unsupported(None if pattern is None else pattern.shape)}")
     top, left = raw.sizes.top_margin, raw.sizes.left_margin
     index = [[raw.raw_color(top + y, left + x) for x in (0, 1)] for y in (0, 1)]
     names = raw.color_desc.decode()

@@ -143,7 +143,7 @@ def gains(found: Found, limits: Gates) -> Iterator[Gate]:
 def _gain_doubt(found: Found, limits: Gates) -> Gate:
     """How far the gains themselves are to be trusted."""
     measured = found.gains
-    limit = limits.max_gain_disagreement
+    limit = limits.max_gain_doubt
     if measured.source == "one exposure":
         return Gate("gain doubt", "pass", 0.0, limit, "one exposure: one gain")
     doubt = float(measured.sigma.mean(1).max())
@@ -156,7 +156,7 @@ def _gain_doubt(found: Found, limits: Gates) -> Gate:
             remedy = "turn the chart so that it mirrors neither flash nor window, or use a matt one"
             cost = DEGREES_PER_GAIN * gloss
             return at_most("gain doubt", gloss, limit, says, remedy, cost_deg=cost, beyond=_grade(cost))
-        gap = measured.disagreement
+        gap, limit = measured.disagreement, limits.max_gain_disagreement
         says = f"grey patches and object agree on the light of the shots (1σ {100 * doubt:.2f} %)"
         if gap > limit:
             says = f"grey patches and object differ by {100 * gap:.1f} % on a shot's light, beyond the error of both"

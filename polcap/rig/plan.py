@@ -13,6 +13,9 @@ from polcap.images import Role
 from polcap.rig.camera import Exposure, spread
 
 PAPER_S = 60.0  # Deschaintre et al. 2021: a capture "takes about a minute"
+_BY_SHUTTER = (
+    "bracket  by the shutter: for a steady lamp. It does not change a flash exposure: step power, aperture or ISO there"
+)
 FINISH_S = 1.0  # the last frame's check, and the preview
 SPEED_DEG_S = {"elliptec": 430.0, "grbl": 60.0, "line": 60.0, "manual": 9.0, "simulated": 360.0}  # nominal
 SETTLE_S = {"manual": 0.0}  # else 0.2
@@ -192,7 +195,14 @@ def document(order: Order, ordered: Sequence[Slot], pace: Pace) -> dict[str, Any
         "parts": parts,
         "seconds": sum(part["seconds"] for part in parts),
         "paper_seconds": PAPER_S,
+        "by_shutter": _by_shutter(order.bracket),
     }
+
+
+def _by_shutter(bracket: Sequence[Exposure]) -> bool:
+    """Whether the frames differ by their shutter times alone, which change nothing under a flash."""
+    others = {(one.f_number, one.iso, one.flash) for one in bracket}
+    return len(others) == 1 and len({one.time_s for one in bracket}) > 1
 
 
 def table(plan: dict[str, Any]) -> str:
@@ -212,5 +222,6 @@ def table(plan: dict[str, Any]) -> str:
             f"rotator  {plan['rotator']}: {plan['speed_deg_s']:g} degrees/s, settles in {plan['settle_s']:g} s",
             f"camera   {plan['camera']}: {plan['overhead_s']:g} s a frame beside the exposure",
             f"paper    about a minute (Deschaintre et al. 2021); this takes {share:.2f} of it",
+            *([_BY_SHUTTER] if plan["by_shutter"] else []),
         ]
     )

@@ -73,7 +73,7 @@ def test_each_gate_fails_alone(good: SimpleNamespace) -> None:
         "clipping": {"clipped": np.array([0.0, 0.03, 0.0])},
         "sharpness": {"blur_px": np.array([[0.0], [2.0], [0.1]])},
         "gains": {"gains": replace(gains, gain=np.array([[1.0] * 3, [1.0] * 3, [0.7] * 3]))},
-        "gain doubt": {"gains": replace(gains, disagreement=0.03)},
+        "gain doubt": {"gains": replace(gains, disagreement=0.05)},
         "normal error": {"maps": replace(maps, confidence=np.full_like(maps.confidence, 25.0))},
     }
     for name, fields in faults.items():

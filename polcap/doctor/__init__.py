@@ -10,12 +10,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Literal
 
 import msgspec
 import numpy as np
 
 from polcap import __version__
+from polcap.doctor import photograph
+from polcap.doctor.finding import Finding, State
 from polcap.errors import PolcapError
 from polcap.formats import calib, dng, onnx, raw
 from polcap.images import Exif
@@ -23,17 +24,6 @@ from polcap.images import Exif
 _ENOUGH_GB, _LEAST_GB = 10.0, 1.0  # free disk: a capture of 24 MP with its result takes about 2
 _EDGE_PX = 64  # of the RAW that is written and decoded as a trial
 _CFA = np.array([[0, 1], [1, 2]], np.uint8)
-
-State = Literal["ok", "warning", "fault"]
-
-
-class Finding(msgspec.Struct, frozen=True):
-    """One thing looked at."""
-
-    name: str
-    state: State
-    says: str
-    remedy: str = ""
 
 
 @dataclass(frozen=True)
@@ -58,6 +48,11 @@ def examine(rig: Rig, folder: Path) -> tuple[Finding, ...]:
         *_ports(rig),
         *_cameras(rig),
     )
+
+
+def examine_file(path: Path) -> tuple[Finding, ...]:
+    """Look at one photograph."""
+    return tuple(photograph.examine(path))
 
 
 def table(found: tuple[Finding, ...]) -> str:

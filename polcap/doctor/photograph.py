@@ -1,0 +1,96 @@
+"""One photograph in. Out: whether polcap can use it, and all that it tells of itself, to read or to send in."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from polcap.doctor.finding import Finding
+from polcap.errors import DecodeError
+from polcap.formats import focal, photo, probe, raw
+from polcap.images import Exif, SensorImage
+from polcap.optics import sensor
+
+_CLIP = 0.98  # of the white level, from where counts are clipped
+_PATTERNS = {0: "R", 1: "G", 2: "B"}
+
+
+def examine(path: Path) -> Iterator[Finding]:
+    """Kind, metadata, decoding, pattern and levels of a file."""
+    try:
+        told = probe.read(path)
+    except DecodeError as error:
+        what, _, remedy = str(error).partition("; ")
+        yield Finding("file", "fault", what, remedy or "send this report in with the file")
+        return
+    if told.kind not in ("raw", "photo"):
+        yield Finding(
+            "file", "fault", f"{path.name} is no photograph that polcap knows", "give a RAW, TIFF, PNG or EXR"
+        )
+        return
+    kind = "RAW" if told.kind == "raw" else f"finished picture of {told.bits} bits"
+    yield Finding("file", "ok", f"{path.name}: {kind}, {path.stat().st_size / 1e6:.1f} MB, digest {told.digest[:12]}")
+    yield from _metadata(told.exif)
+    try:
+        image = raw.read(path) if told.kind == "raw" else photo.read(path)
+    except DecodeError as error:
+        what, _, remedy = str(error).partition("; ")
+        yield Finding("pixels", "fault", what, remedy)
+        return
+    yield from _pixels(image, told.exif)
+
+
+def _metadata(exif: Exif) -> Iterator[Finding]:
+    camera = f"{exif.make} {exif.model}".strip()
+    if camera:
+        yield Finding(
+            "camera", "ok", f"{camera}, {exif.lens or 'lens not stated'}, taken {exif.taken or 'at no stated time'}"
+        )
+    else:
+        yield Finding("camera", "warning", "not stated", "copy the file without a program that strips EXIF")
+    parts = {
+        "exposure": exif.exposure_time and f"{exif.exposure_time:.4g} s",
+        "f-number": exif.f_number and f"f/{exif.f_number:g}",
+        "ISO": exif.iso and f"{exif.iso:g}",
+        "flash": None if exif.flash_fired is None else "fired" if exif.flash_fired else "off",
+    }
+    missing = [name for name, value in parts.items() if not value]
+    says = ", ".join(f"{name} {value}" for name, value in parts.items() if value) or "none"
+    remedy = f"not stated: {', '.join(missing)}; exposures are then taken from the pixels" if missing else ""
+    yield Finding("exposure", "warning" if missing else "ok", says, remedy)
+    lens = focal.find(exif, None, None)
+    remedy = "" if lens.known else "state focal_length_mm and sensor_width_mm in capture.toml"
+    yield Finding("focal length", "ok" if lens.known else "warning", lens.note, remedy)
+
+
+def _pixels(image: SensorImage, exif: Exif) -> Iterator[Finding]:
+    height, width = image.value.shape[:2]
+    size = f"{width}×{height} px"
+    if image.cfa is not None:
+        pattern = "".join(_PATTERNS[int(color)] for color in image.cfa.ravel())
+        yield Finding("pattern", "ok", f"Bayer {pattern}, {size}")
+    elif sensor.monochrome(image):
+        remedy = "gains, normals and shape work; colors are grey, and no ColorChecker can be read"
+        yield Finding("pattern", "warning", f"one channel (a monochrome sensor), {size}", remedy)
+    else:
+        yield Finding("pattern", "ok", f"three channels a pixel, {size}: developed or linear DNG, no mosaic left")
+    if exif.width and (exif.width, exif.height) != (width, height):
+        yield Finding(
+            "size", "warning", f"{size} decoded where {exif.width}×{exif.height} are stated", "send this report in"
+        )
+    black, white = float(image.black.mean()), image.white
+    least, most = float(image.value.min()), float(image.value.max())
+    clipped = float(np.mean(image.value >= _CLIP * sensor.saturation(image)))
+    says = f"black {black:g}, white {white:g}; counts {least:g} … {most:g}, {100 * clipped:.2f} % clipped"
+    if most > 1.001 * white or white <= black:
+        yield Finding("levels", "warning", says, "the white level does not fit the counts: send this report in")
+    elif clipped > 0.5 or most <= black:
+        yield Finding("levels", "warning", says, "nothing is left to measure: expose otherwise")
+    else:
+        yield Finding("levels", "ok", says)
+    known = image.camera_matrix is not None
+    yield Finding(
+        "color matrix", "ok" if known else "warning", "known" if known else "not known", "" if known else "use a chart"
+    )
+    if image.lossy:
+        yield Finding("encoding", "warning", "8 bits or display-encoded", "shoot RAW: normals and albedo lose accuracy")

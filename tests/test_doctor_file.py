@@ -1,0 +1,56 @@
+"""`polcap doctor FILE` tells in seconds whether a photograph can be used, and why not."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polcap import doctor
+from polcap.formats import dng, png, raw
+from polcap.images import Exif
+from tests.conftest import Command
+
+
+def told(file: Path) -> dict[str, doctor.Finding]:
+    return {one.name: one for one in doctor.examine_file(file)}
+
+
+def test_a_sound_raw_is_ok_throughout(example: Path) -> None:
+    found = told(sorted(example.rglob("*.DNG"))[0])
+    assert {one.state for one in found.values()} == {"ok"}
+    assert found["pattern"].says.startswith("Bayer")
+
+
+def test_a_cut_file_and_a_text_are_faults(example: Path, tmp_path: Path) -> None:
+    whole = sorted(example.rglob("*.DNG"))[0].read_bytes()
+    (tmp_path / "cut.dng").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "notes.txt").write_text("f/11")
+    for name in ("cut.dng", "notes.txt"):
+        assert any(one.state == "fault" and one.remedy for one in told(tmp_path / name).values())
+
+
+def test_an_over_exposed_frame_and_a_monochrome_one_are_told(tmp_path: Path) -> None:
+    dng.write(
+        tmp_path / "white.dng",
+        np.full((64, 64), 4095, np.uint16),
+        cfa=np.array([[0, 1], [1, 2]], np.uint8),
+        black=0,
+        white=4095,
+        exif=Exif(make="Polcap", model="Test"),
+        color_matrix=np.eye(3),
+        as_shot_neutral=np.ones(3),
+    )
+    assert told(tmp_path / "white.dng")["levels"].state == "warning"
+    png.write(tmp_path / "grey.png", np.tile(np.arange(64, dtype=np.uint16) * 900, (64, 1))[..., None].repeat(3, 2))
+    assert "monochrome" in told(tmp_path / "grey.png")["pattern"].says
+
+
+@pytest.mark.parametrize(("shape", "name"), [((6, 6), "X-Trans"), (None, "Foveon"), ((4, 4), "4×4")])
+def test_other_mosaics_are_named_with_a_way_out(shape: tuple[int, int] | None, name: str) -> None:
+    assert name in raw.unsupported(shape) and "16-bit TIFF" in raw.unsupported(shape)
+
+
+def test_command_prints_one_line_a_finding(example: Path, polcap: Command) -> None:
+    done = polcap("doctor", sorted(example.rglob("*.DNG"))[0])
+    assert done.returncode == 0
+    assert "Bayer" in done.stdout
