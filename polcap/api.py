@@ -71,7 +71,7 @@ def process(
     folder = Path(capture)
     target = folder / "polcap" if out is None else Path(out)
     network = pipeline.load_network(estimator, None if model is None else Path(model), "cpu", 0)
-    supplied = UserInput(chart=chart, mask=mask, network=network)
+    supplied = UserInput(chart=chart, mask=mask, network=network, mask_network=pipeline.load_mask_network())
     found = captures.read(folder, angles_deg)
     about = pipeline.process(found, supplied, config or Config(), target, progress=progress)
     assert about is not None  # only `until` leaves it out

@@ -52,8 +52,8 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float, Meta(gt=0, description="estimated 1σ error of a shot's registration [px of the grid]")
     ] = 0.15
     max_mask_doubt: Annotated[
-        float, Meta(ge=0, le=1, description="1 − the overlap with the true outline that the mask's network expects [1]")
-    ] = 0.1
+        float, Meta(ge=0, le=1, description="1 − the overlap with the truth that the network expects; half warns [1]")
+    ] = 0.25
     max_mask_islands: Annotated[
         float, Meta(ge=0, le=1, description="share of the object outside its largest part, to pass unnoticed [1]")
     ] = 0.02

@@ -33,7 +33,7 @@ def alignment(found: Found, config: Config) -> Gate:
 
 
 def mask(found: Found, limits: Gates) -> Gate:
-    """Fails where the network doubts its mask, warns where its shape is none that an object before a lens has."""
+    """Fails where the network doubts its mask; warns from half of that on, and of a shape that no object has."""
     object_, limit = found.object_, limits.max_mask_doubt
     doubts = []
     if object_.border > limits.max_mask_border:
@@ -44,12 +44,13 @@ def mask(found: Found, limits: Gates) -> Gate:
         doubts.append(f"{object_.islands:.0%} of it stands apart")
     if object_.holes > limits.max_mask_holes:
         doubts.append(f"it has holes of {object_.holes:.0%} of its area")
+    if object_.doubt is not None and object_.doubt > limit / 2:
+        doubts.insert(0, "which pixels are the object is not clear")
     state: State = (
         "warn" if doubts else "pass" if object_.doubt is not None or object_.source == "user" else "not measured"
     )
     if object_.doubt is not None and object_.doubt > limit:
         state = "fail"
-        doubts.insert(0, "which pixels are the object is not clear")
     says = "; ".join(doubts) or "share of the object's outline in doubt"
     remedy = "look at it, and where it is wrong give --mask PNG; let backdrop show all around the object"
     cost = 10 * object_.border if state == "warn" else 5.0 if state == "fail" else 0.0

@@ -1,7 +1,7 @@
 """The mask's network: channels of `stages/mask/mask_channels.py` -> how likely each pixel is the object.
 
-A U-Net that looks twice with the same weights: at the whole picture, reduced, without a hint; then at the
-object alone, with what it found before as a hint. No normalization, as in `model.py`: levels are information.
+A U-Net that looks at the whole picture, reduced, hinted by a guess; then, with the same weights, at the object
+alone, hinted by what it found before. No normalization, as in `model.py`: levels are information.
 """
 
 from itertools import pairwise
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from polcap.stages.mask.mask_channels import CHANNELS, SIZE_MULTIPLE
+from polcap.stages.mask.mask_channels import CHANNELS
 
 _WIDTHS = (16, 32, 64, 112)  # from half resolution down
 
@@ -66,8 +66,3 @@ def loss(logits: Tensor, truth: Tensor) -> Tensor:
     both = (chance * truth).sum(dim=(1, 2, 3))
     either = (chance + truth - chance * truth).sum(dim=(1, 2, 3))
     return entropy + 0.3 * (1 - (both + 1) / (either + 1)).mean()
-
-
-def padded(size: int) -> int:
-    """The next multiple of what the network takes."""
-    return -(-size // SIZE_MULTIPLE) * SIZE_MULTIPLE

@@ -17,7 +17,7 @@ from polcap.stages.mask.mask_channels import Look
 from polcap.synth.mesh_tracer import Tracer, Triangles, centred
 from polcap.training import gbuffers, mask_scenes, mask_views, materials, shapes
 
-SIZE = (288, 384)  # H, W
+SIZE = (288, 384)  # H, W, traced; half of it is kept
 _VIEWS, _DRESSES = 4, 2  # of each mesh, of each view
 
 
@@ -67,11 +67,13 @@ def _mesh(files: list[Path], rng: np.random.Generator) -> Triangles:
 
 
 def packed(picture: mask_scenes.Picture) -> Floats:
-    """What a file holds; radiance in units of its own 95th percentile."""
+    """What a file holds, means of 2 × 2 pixels; radiance in units of its own 95th percentile."""
     stokes = picture.stokes / max(float(np.percentile(picture.stokes[0].mean(-1), 95)), 1e-9)
     sums = np.moveaxis(stokes[1:].sum(-1), 0, -1)
     layers = [stokes[0], sums, picture.mask[..., None], picture.chart[..., None]]
-    return np.asarray(np.clip(np.concatenate(layers, axis=-1), -6e4, 6e4), np.float16)
+    whole = np.clip(np.concatenate(layers, axis=-1), -6e4, 6e4)
+    height, width, count = whole.shape
+    return np.asarray(whole.reshape(height // 2, 2, width // 2, 2, count).mean((1, 3)), np.float16)
 
 
 def drawn(file: Path, rng: np.random.Generator) -> tuple[Look, Floats]:

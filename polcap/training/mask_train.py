@@ -23,8 +23,8 @@ from polcap.stages.mask.mask_channels import CHANNELS, ENCODING, SIZE_MULTIPLE, 
 from polcap.training import export, mask_model, mask_pictures
 from polcap.training.train import Muon
 
-_BATCH, _PART = 4, 160  # pictures a step; side of the part, px
-_ZOOM = (0.3, 1.0)  # side of what it shows, of the picture's height
+_BATCH, _PARTS, _PART = 8, 4, 96  # pictures a step, of how many a part is looked at; its side, px
+_ZOOM = (0.35, 1.0)  # side of what it shows, of the picture's height
 _HELD = 40  # pictures that are only looked at
 _WARM, _HOLD = 50, 0.35  # steps; share of the budget at the full learning rate
 
@@ -94,11 +94,12 @@ class Run:
         for group in (g for optimizer in self.optimizers for g in optimizer.param_groups):
             group["lr"] = group["full"] * fall
         drawn = [mask_pictures.drawn(file, rng) for file in files]
-        logits = self.network(batch([first(look) for look, _ in drawn]))
+        height, width = (side // 2 for side in drawn[0][1].shape)
+        logits = self.network(batch([first(look) for look, _ in drawn]))[..., :height, :width]
         coarse = mask_model.loss(logits, stacked([halved(truth) for _, truth in drawn]))
         coarse.backward()
         chances = torch.sigmoid(logits.detach())[:, 0].numpy()
-        parts = [part(look, truth, chance, rng) for (look, truth), chance in zip(drawn, chances)]
+        parts = [part(look, truth, chance, rng) for (look, truth), chance in zip(drawn[:_PARTS], chances)]
         fine = mask_model.loss(self.network(batch([seen for seen, _ in parts])), stacked([t for _, t in parts]))
         fine.backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0, foreach=True)
@@ -119,6 +120,7 @@ class Run:
             look, truth = mask_pictures.drawn(file, np.random.default_rng(number))
             with torch.no_grad():
                 chance = torch.sigmoid(network(batch([first(look)])))[0, 0].numpy()
+                chance = chance[: truth.shape[0] // 2, : truth.shape[1] // 2]
                 hint = cv2.resize(chance, truth.shape[::-1], interpolation=cv2.INTER_LINEAR)
                 fine = network(batch([encode(look, brightness(look.color), hint)]))[0, 0].numpy()
             found[0].append(iou(hint > 0.5, truth > 0.5))
@@ -188,7 +190,10 @@ def halved(image: Floats) -> Floats:
 
 
 def batch(channels: list[Floats]) -> Tensor:
-    return torch.from_numpy(np.stack(channels)).contiguous(memory_format=torch.channels_last)
+    """Channels of pictures of one size, the edge repeated up to what the network takes."""
+    more = [(0, -side % SIZE_MULTIPLE) for side in channels[0].shape[1:]]
+    padded = np.pad(np.stack(channels), [(0, 0), (0, 0), *more], mode="edge")
+    return torch.from_numpy(padded).contiguous(memory_format=torch.channels_last)
 
 
 def stacked(truths: list[Floats]) -> Tensor:
@@ -203,7 +208,7 @@ def ship(checkpoint: Path, path: Path) -> Path:
     """The averaged weights of a checkpoint as the model that `formats/onnx.py` loads."""
     state = torch.load(checkpoint, weights_only=True)
     metadata = {
-        "channels": ",".join(CHANNELS), "encoding": ENCODING, "native_size": str(mask_pictures.SIZE[1] // 2),
+        "channels": ",".join(CHANNELS), "encoding": ENCODING, "native_size": str(mask_pictures.SIZE[1] // 4),
         "size_multiple": str(SIZE_MULTIPLE), "licence": "Apache-2.0", "outputs": "logit: of being the object",
         "training": f"{state['step'] * _BATCH} pictures in {state['step']} steps",
     }  # fmt: skip

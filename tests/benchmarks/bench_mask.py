@@ -27,7 +27,7 @@ from polcap.synth.mesh_tracer import Tracer, Triangles, centred
 from polcap.training import gbuffers, mask_scenes, mask_views, materials
 from polcap.training.mask_views import Kind
 
-SIZE = (576, 768)
+SIZE = (360, 480)
 NEAR, FAR = (0.0, 0.12), (0.3, 0.7)  # flash from the lens [object distances]
 DIFFICULTIES: dict[str, tuple[Kind, mask_scenes.Mode, float]] = {  # view, materials, how likely the chart touches
     "dark backdrop": (Kind("whole", "wall", NEAR), "dark", 0.0),

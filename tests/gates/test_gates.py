@@ -124,7 +124,7 @@ def test_mask_of_a_doubtful_shape_warns(good: SimpleNamespace, name: str, value:
 
 
 def test_mask_that_its_network_doubts_fails(good: SimpleNamespace) -> None:
-    assert failed(changed(good, object_=replace(good.object_, doubt=0.2))) == ["mask"]
+    assert failed(changed(good, object_=replace(good.object_, doubt=0.3))) == ["mask"]
 
 
 def test_assumed_focal_length_warns(good: SimpleNamespace) -> None:

@@ -43,7 +43,7 @@ def test_the_ball_is_found_and_the_chart_is_not_the_object(model):
     assert (found.chance is None) == (model is None)
 
 
-def test_the_second_look_is_at_what_the_first_found_and_is_told_so():
+def test_the_later_looks_are_at_what_was_found_and_are_told_so():
     seen = []
 
     def run(inputs):
@@ -51,7 +51,8 @@ def test_the_second_look_is_at_what_the_first_found_and_is_told_so():
         return bright_is_object(inputs)
 
     segment(scenes.stack(), chart_color(), model=network(run))
-    first, second = seen
+    first, second, third = seen
+    assert third.shape == second.shape
     assert first.shape[2:] == (128, 160)  # 120 rows, up to a multiple of 16
     assert not first[0, CHANNEL("looked")].any() and (second[0, CHANNEL("looked")] == 1).all()
     hint = second[0, CHANNEL("chance")]

@@ -1,10 +1,12 @@
 """Stage 4: decide which pixels are the object, and how sure that is.
 
 A small network gives every pixel its chance of being the object (`two_looks`): it was trained on what is hard to
-tell apart, such as black gloss on black cloth, white on white and deep shadow. Without a network the object is
-what stands out from the backdrop (`standing_out`). A mask that the user drew is taken as drawn.
+tell apart, such as black gloss on black cloth, white on white and deep shadow. What stands out from the backdrop
+(`standing_out`) is the object where the network agrees, for its outline is sharper, and where there is no network.
+A mask that the user drew is taken as drawn.
 """
 
+import contextlib
 from typing import Annotated
 
 import cv2
@@ -31,7 +33,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.7
 
 
-@stage(version=1)
+@stage(version=2)
 def segment(
     radiance: AngleStack,
     alignment: Alignment,
@@ -58,12 +60,18 @@ def segment(
         if not user_mask.any():
             raise ObjectError("mask is empty: no pixel is 128 or brighter; paint the object white")
         return ObjectMask(user_mask, _crop(user_mask, settings.margin), "user", None, None, *solid.shape(user_mask))
+    picture, zone = _picture(radiance, alignment, color), _chart_zone(radiance, color, settings.chart_margin)
     if network is None:
-        chart = _chart_zone(radiance, color, settings.chart_margin)
-        mask = standing_out.search(_picture(radiance, alignment, color), chart, settings.min_area)
+        mask = standing_out.search(picture, zone, settings.min_area)
         return ObjectMask(mask, _crop(mask, settings.margin), "automatic", None, None, *solid.shape(mask))
-    chance = two_looks.chances(radiance, alignment, color, _chart_zone(radiance, color, 0.0), network)
+    patches = _chart_zone(radiance, color, 0.0)
+    chance = two_looks.chances(radiance, alignment, color, patches, network)
     mask = solid.body(chance)
+    if mask.any():
+        mask = standing_out.sharpened(picture, mask, patches)
+    with contextlib.suppress(ObjectError):
+        plain = standing_out.search(picture, zone, settings.min_area)
+        mask = solid.preferred(plain, mask, chance)
     if mask.mean() < settings.min_area:
         raise ObjectError(
             f"no object is seen: {100 * mask.mean():.2f} % of the picture, less than "

@@ -11,6 +11,7 @@ from polcap.images import Floats
 
 _SPECK = 0.01  # of the largest part: smaller ones are no parts of their own
 _PINHOLE = 1e-3  # of the mask: smaller holes are dark texture
+_LEEWAY = 1.5  # times the doubt, given for the sharper outline (decision 15)
 _DOUBTED = 0.15  # mean chance of a hole that is a shadowed hollow and no opening
 
 
@@ -25,6 +26,11 @@ def body(chance: Floats) -> NDArray[np.bool_]:
     mask = np.isin(labels, np.flatnonzero(area >= _SPECK * area.max()) if area.max() else []).astype(np.uint8)
     mask[labels == 0] = 0
     return _filled(mask, chance)
+
+
+def preferred(plain: NDArray[np.bool_], learned: NDArray[np.bool_], chance: Floats) -> NDArray[np.bool_]:
+    """The mask of what stands out where the network finds it nearly as likely as its own: its outline is sharper."""
+    return plain if doubt(plain, chance) < _LEEWAY * doubt(learned, chance) else learned
 
 
 def _filled(mask: NDArray[np.uint8], chance: Floats) -> NDArray[np.bool_]:

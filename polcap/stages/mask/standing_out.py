@@ -30,11 +30,7 @@ def search(picture: Floats, chart: NDArray[np.uint8], min_area: float) -> NDArra
     ObjectError
         Less than `min_area` of the picture stands out.
     """
-    height, width = picture.shape[:2]
-    shrink = max(1.0, float(np.sqrt(height * width / _WORK_PIXELS)))
-    size = (round(width / shrink), round(height / shrink))
-    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    outside = cv2.resize(chart, size, interpolation=cv2.INTER_NEAREST) > 0
+    small, outside = _reduced(picture, chart)
 
     log = np.log2(np.maximum(small, 0).mean(-1) + 1e-4)
     log = cv2.GaussianBlur(log.astype(np.float32), (0, 0), 1.5)
@@ -52,8 +48,28 @@ def search(picture: Floats, chart: NDArray[np.uint8], min_area: float) -> NDArra
             f"no object stands out from the backdrop: {100 * seed.mean():.2f} % of the picture, "
             f"less than mask.min_area = {100 * min_area:g} %; use a darker backdrop, or give --mask PNG"
         )
-    cut = _graph_cut(small, seed, outside)
-    mask = cv2.resize(cut, (width, height), interpolation=cv2.INTER_LINEAR) if shrink > 1 else cut
+    return _enlarged(_filled(_sizeable(_graph_cut(small, seed, outside), 0.0)).astype(np.float32), chart)
+
+
+def sharpened(picture: Floats, mask: NDArray[np.bool_], chart: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """A mask (H, W) whose outline is right to a few pixels, moved to the picture's edges."""
+    small, outside = _reduced(picture, chart)
+    seed = cv2.resize(mask.astype(np.uint8), small.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    return _enlarged(_graph_cut(small, seed, outside).astype(np.float32), chart)
+
+
+def _reduced(picture: Floats, chart: NDArray[np.uint8]) -> tuple[Floats, NDArray[np.bool_]]:
+    """Picture and chart at the size that graph cuts work at."""
+    height, width = chart.shape
+    shrink = max(1.0, float(np.sqrt(height * width / _WORK_PIXELS)))
+    size = (round(width / shrink), round(height / shrink))
+    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(small), cv2.resize(chart, size, interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _enlarged(cut: Floats, chart: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    size = chart.shape[1], chart.shape[0]
+    mask = cv2.resize(cut, size, interpolation=cv2.INTER_LINEAR) if cut.shape != chart.shape else cut
     return np.asarray((mask > 0.5) & (chart == 0))
 
 
@@ -108,7 +124,7 @@ def _filled(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(np.maximum(mask, (np.isin(labels, small) & (labels > 0)).astype(np.uint8)))
 
 
-def _graph_cut(picture: Floats, seed: NDArray[np.uint8], outside: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _graph_cut(picture: Floats, seed: NDArray[np.uint8], outside: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """The seed's outline moved to the picture's edges."""
     tone = np.log2(np.clip(picture, 0, 4) + 0.002)
     display = (255 * (tone - tone.min()) / (np.ptp(tone) + 1e-9)).astype(np.uint8)
@@ -124,5 +140,4 @@ def _graph_cut(picture: Floats, seed: NDArray[np.uint8], outside: NDArray[np.boo
         cv2.setRNGSeed(1)
         cv2.grabCut(display, labels, None, np.zeros((1, 65)), np.zeros((1, 65)), 3, cv2.GC_INIT_WITH_MASK)
     found = ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).astype(np.uint8)
-    found = _filled(_sizeable(found if found.any() else seed, 0.0))
-    return found.astype(np.float32)
+    return found if found.any() else seed

@@ -1,4 +1,4 @@
-"""How likely each pixel is the object, by a network that looks twice: at the whole picture, then at what it found.
+"""How likely each pixel is the object, by a network that looks at the whole picture, then at what it found.
 
 The pictures are reduced before they are aligned and resampled, so the time goes with what the network sees and
 not with the sensor.
@@ -14,7 +14,8 @@ from polcap.optics.warp import warp
 from polcap.stages.mask.mask_channels import SIZE_MULTIPLE, Look, brightness, encode
 
 Box = tuple[int, int, int, int]  # x0, y0, x1, y1 full-frame grid px, end exclusive
-_FINE = 640  # px of the second look's longer side, at most
+_FINE = 256  # px of the second look's longer side, at most
+_AGAIN = 2  # looks at what was found; what the hint lacked is found from there
 _ROOM = 0.12  # shown around what the first look found, of its longer side
 _LIKELY = 0.3  # of being the object, for a pixel to be shown to the second look
 
@@ -30,14 +31,15 @@ def chances(
     bright = brightness(seen.color)
     found = _run(network, encode(seen, bright))
     out = _resized(found, whole)
-    box = around(out > _LIKELY)
-    if box is None:
-        return out
-    x0, y0, x1, y1 = box
-    seen = look(radiance, alignment, color, chart, box, _FINE)
-    hint = _area(out[y0:y1, x0:x1], seen.chart.shape)
-    out = np.where(out > 0.5, 0, out)  # beyond the box nothing is likely
-    out[y0:y1, x0:x1] = _resized(_run(network, encode(seen, bright, hint)), box)
+    for _ in range(_AGAIN):
+        box = around(out > _LIKELY)
+        if box is None:
+            break
+        x0, y0, x1, y1 = box
+        seen = look(radiance, alignment, color, chart, box, _FINE)
+        hint = _area(out[y0:y1, x0:x1], seen.chart.shape)
+        out = np.minimum(out, _LIKELY)  # of what lies beyond the box
+        out[y0:y1, x0:x1] = _resized(_run(network, encode(seen, bright, hint)), box)
     return out
 
 
