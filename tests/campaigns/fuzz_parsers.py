@@ -168,8 +168,8 @@ _TIFFS = (
     headers.mrw(headers.tiff(headers.camera(), {headers.EXIF_IFD: headers.settings()})),
 )
 _GRBL = (
-    b"Grbl 1.1h ['$' for help]\n$100=8.889\n$110=2000\n$120=50\n$130=400\n$22=1\nok\nok\n"
-    b"<Idle|MPos:0.000,0,0|FS:0,0>\nok\n"
+    b"Grbl 1.1h ['$' for help]\n$100=8.889\n$110=2000\n$120=50\n$130=400\n$22=1\nok\n"
+    b"Grbl 1.1h ['$' for help]\nok\n<Idle|MPos:0.000,0,0|FS:0,0>\nok\n<Idle|MPos:1.000,0,0|FS:0,0>\nok\n"
 )
 PARSERS = {
     "settings (TOML)": Parser((b"[hdr]\nclip = 0.98\n[gates]\nmax_ghost = 0.02\n",), _settings),
@@ -190,7 +190,7 @@ PARSERS = {
     "names": Parser((b"My vase, 2nd try", "Büste №3".encode()), _name),
     "Elliptec replies": Parser((b"0GS00\n0IN0E1140041520211501016800023000\n0PO00000000\n0PO00000100\n",), _elliptec),
     "GRBL replies": Parser((_GRBL,), _grbl),
-    "line protocol": Parser((b"polcap-rotator 1\nok\nok 0.00\nok 12.50\n",), _line),
+    "line protocol": Parser((b"polcap-rotator 1 bench 60\nok 0.00\nok 12.50\nok 12.50\n",), _line),
 }
 
 
@@ -205,7 +205,7 @@ def campaign(runs: int, seed: int, say: Callable[[str], None] = print) -> int:
             seen: Counter[str] = Counter()
             slowest = 0.0
             for _ in range(each):
-                data = mutated(parser.seeds[int(random.integers(len(parser.seeds)))], random)
+                data = mutated(parser.seeds[int(random.integers(len(parser.seeds)))], random, most=4)
                 start = time.perf_counter()
                 try:
                     parser.run(data, Path(folder))

@@ -35,7 +35,7 @@ def digests(folder: Path) -> dict[str, str]:
     found = {}
     for file in sorted(path for path in folder.rglob("*") if path.is_file()):
         name = str(file.relative_to(folder))
-        if name in ("work/lock", "work/owner", "report.html"):
+        if name in ("work/lock", "work/owner", "work/written.json", "report.html"):
             continue
         data = file.read_bytes()
         if file.suffix == ".json":
