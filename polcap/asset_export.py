@@ -44,6 +44,8 @@ class Wanted:
     preset: str | None = None
     images: Kind | None = None  # inside the GLB; by default the preset's, or PNG
     color: str = ocio.INSIDE  # colour space or role of the colours in the layered EXR
+    texture_size: int | None = None  # px of the longer side; by default the maps'
+    lod: int = 0  # further GLBs, each in a quarter of the triangles of the one before
 
 
 def export(out: Path, about: Mapping[str, Any], wanted: Wanted) -> list[Path]:
@@ -62,10 +64,16 @@ def export(out: Path, about: Mapping[str, Any], wanted: Wanted) -> list[Path]:
     config = restored(about, out / "report.json")
     stored = maps_folder.read(out / "maps")
     mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, config.surface)
+    built = asset.build(stored.maps, mesh, config.asset)
+    levels = [surface.decimated(mesh, stored.maps.view, 0.25**k) for k in range(1, wanted.lod + 1)]
+    lods = [asset.build(stored.maps, level.mesh, config.asset) for level in levels]
+    if wanted.texture_size is not None:
+        built, *lods = (asset.resized(one, wanted.texture_size) for one in (built, *lods))
     job = _Job(
         folder=out / "asset" / (wanted.preset or ""),
         maps=out / "maps",
-        asset=asset.build(stored.maps, mesh, config.asset),
+        asset=built,
+        lods=tuple(zip(lods, levels)),
         name=file_name.safe(str(about["capture"].get("name"))),  # whatever the report says, files stay in the folder
         preset=preset,
         images=wanted.images or preset.images,
@@ -92,6 +100,7 @@ class _Job:
     folder: Path
     maps: Path
     asset: Asset
+    lods: tuple[tuple[Asset, surface.Decimated], ...]
     name: str
     preset: Preset
     images: Kind
@@ -108,6 +117,7 @@ class _Job:
             "exr": self._exr,
         }
         tasks = [writers[one] for one in self.preset.formats]
+        tasks += [partial(self._lod, k) for k in range(1, len(self.lods) + 1)]
         tasks += [partial(self._texture, file, made) for file, made in self.loose.items()]
         with ThreadPoolExecutor(len(tasks)) as pool:
             running = [pool.submit(task) for task in tasks]
@@ -131,6 +141,13 @@ class _Job:
             "for": self.preset.says,
             "unit": self.unit,
             "glb": self._embedded(),
+            "lods": {
+                f"{self.stem}_lod{k}.glb": {
+                    "triangles": len(level.mesh.faces),
+                    "error": f"{1000 * level.error:.4g} mm" if level.mesh.metric else f"{level.error_px:.3g} px",
+                }
+                for k, (_, level) in enumerate(self.lods, 1)
+            },
             "textures": {file: texture.says for file, texture in sorted(self.loose.items())},
         }
 
@@ -172,6 +189,11 @@ class _Job:
     def _gltf(self) -> list[Path]:
         file = self.folder / f"{self.stem}.glb"
         gltf.write(file, self.asset, self.stem, self.images, self.words)
+        return [file]
+
+    def _lod(self, level: int) -> list[Path]:
+        file = self.folder / f"{self.stem}_lod{level}.glb"
+        gltf.write(file, self.lods[level - 1][0], f"{self.stem}_lod{level}", self.images, self.words)
         return [file]
 
     def _obj(self) -> list[Path]:

@@ -245,6 +245,12 @@ def export(
     color: Annotated[
         str, typer.Option(metavar="SPACE", help="Colour space or OCIO role of the EXR's colours, as ACEScg.")
     ] = "lin_rec709",
+    texture_size: Annotated[
+        int | None, typer.Option(min=16, max=16384, help="Px of the textures' longer side; by default the maps'.")
+    ] = None,
+    lod: Annotated[
+        int, typer.Option(min=0, max=6, help="Further GLBs, each in a quarter of the triangles of the one before.")
+    ] = 0,
     json: Json = False,
 ) -> None:
     """Write the asset again from the maps of a result; without a flag GLB and OBJ, as `process` does."""
@@ -256,7 +262,7 @@ def export(
     formats = tuple(name for name in presets.FORMATS if flags[name])
     if preset is not None and formats:
         raise SettingError(f"--preset {preset} brings its formats; leave out --{formats[0]}")
-    wanted = Wanted(formats or ("gltf", "obj"), preset, images, color)
+    wanted = Wanted(formats or ("gltf", "obj"), preset, images, color, texture_size, lod)
     written = [str(file) for file in pipeline.export(result, wanted)]
     terminal.say({"written": written} if json else "\n".join(written))
 

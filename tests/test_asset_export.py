@@ -171,3 +171,19 @@ def test_number_of_threads_changes_no_byte(example: Path, tmp_path: Path) -> Non
         found.append({file.name: file.read_bytes() for part in ("maps", "asset") for file in (out / part).iterdir()})
         found[-1] |= {str(file.relative_to(out)): file.read_bytes() for file in (out / "work").rglob("*.npy")}
     assert [name for name in found[0] if found[0][name] != found[1][name]] == [] and found[0].keys() == found[1].keys()
+
+
+def test_texture_size_and_levels_of_detail(result: Path, tmp_path: Path) -> None:
+    from polcap import pipeline
+    from polcap.asset_export import Wanted
+
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
+    pipeline.export(copy, Wanted(formats=("gltf",), texture_size=128, lod=2))
+    levels = json.loads((copy / "maps" / "maps.json").read_text())["exports"]["asset"]["lods"]
+    counts = []
+    for name, told in levels.items():
+        glb = document((copy / "asset" / name).read_bytes())
+        counts.append(glb["accessors"][glb["meshes"][0]["primitives"][0]["indices"]]["count"] // 3)
+        assert counts[-1] == told["triangles"] and told["error"].split()[1] in ("mm", "px")
+    assert len(counts) == 2 and counts[0] == pytest.approx(4 * counts[1], rel=0.1)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from polcap.images import Asset, Floats, SurfaceMaps
 from polcap.optics import color
@@ -11,11 +12,11 @@ from polcap.stages import asset, surface
 from tests import surfaces
 
 
-def rendered_normals(of: Asset, maps: SurfaceMaps) -> Floats:
+def rendered_normals(of: Asset, maps: SurfaceMaps, within: float = 0.01) -> Floats:
     """A renderer's normals at vertices on pixels, which those inside are: texture in the vertex's own frame."""
     mesh = of.mesh
     place = mesh.uv * [surfaces.WIDTH, surfaces.HEIGHT] - 0.5
-    on = np.abs(place - np.rint(place)).max(axis=1) < 0.01
+    on = np.abs(place - np.rint(place)).max(axis=1) < within
     column, row = np.rint(place[on]).astype(int).T
     x, y, z = (of.normal[row, column] / 127.5 - 1).T[..., None]
     n, t = mesh.normals[on], mesh.tangents[on]
@@ -57,11 +58,12 @@ def test_diffuse_and_specular_come_back_through_gltf_formulas() -> None:
         specular=rng.uniform(0.02, 0.08, (*shape, 3)).astype(np.float32),
     )
     built = surfaces.built(maps, surfaces.mesh(surfaces.maps()))
-    base = color.decode_srgb(built.base_color[maps.mask] / 255)
-    f0 = 0.04 * np.array(built.specular_factor) * color.decode_srgb(built.specular_color[maps.mask] / 255)
+    inner = ndimage.binary_erosion(maps.mask, np.ones((3, 3)))  # the outermost pixels are filled from there
+    base = color.decode_srgb(built.base_color[inner] / 255)
+    f0 = 0.04 * np.array(built.specular_factor) * color.decode_srgb(built.specular_color[inner] / 255)
     frontal = base * (1 - f0.max(axis=-1, keepdims=True))  # glTF: (1 − max F) base
-    assert np.allclose(frontal, 0.96**2 * maps.diffuse[maps.mask], atol=0.006)  # half a step of sRGB at white
-    assert np.allclose(f0, maps.specular[maps.mask], atol=0.0006)
+    assert np.allclose(frontal, 0.96**2 * maps.diffuse[inner], atol=0.006)  # half a step of sRGB at white
+    assert np.allclose(f0, maps.specular[inner], atol=0.0006)
     assert (built.occlusion_roughness_metallic[maps.mask] == [255, 94, 0]).all()
 
 
@@ -76,3 +78,29 @@ def test_textures_reach_past_the_mask() -> None:
 def test_black_specular_is_allowed() -> None:
     maps = surfaces.maps(specular=0.0)
     assert asset.build(maps, surfaces.mesh(maps), asset.Settings()).specular_factor == (0.0, 0.0, 0.0)
+
+
+def test_backdrop_does_not_run_along_the_limb() -> None:
+    """Pixels of the outline that are half backdrop take the colour beside them."""
+    maps = surfaces.maps()
+    rim = maps.mask & ~ndimage.binary_erosion(maps.mask, np.ones((3, 3)))
+    mixed = replace(maps, diffuse=np.where(rim[..., None], 0.1 * maps.diffuse, maps.diffuse).astype(np.float32))
+    mesh = surfaces.mesh(maps)
+    assert np.array_equal(surfaces.built(mixed, mesh).base_color, surfaces.built(maps, mesh).base_color)
+
+
+def test_walls_and_back_leave_the_normal_texture_alone() -> None:
+    maps = surfaces.maps(ripple=0.2)
+    seen, closed = (surfaces.mesh(maps, surface.Settings(back=back)) for back in ("open", "closed"))
+    assert np.array_equal(surfaces.built(maps, closed).normal, surfaces.built(maps, seen).normal)
+
+
+@pytest.mark.parametrize(("size", "shape"), [(64, (64, 64)), (256, (256, 256)), (1024, (1024, 1024))])
+def test_textures_take_the_size_asked_for(size: int, shape: tuple[int, int]) -> None:
+    maps = surfaces.maps()
+    built = surfaces.built(maps, surfaces.mesh(maps))
+    other = asset.resized(built, size)
+    assert other.base_color.shape == other.normal.shape == (*shape, 3)
+    length = np.linalg.norm(other.normal / 127.5 - 1, axis=-1)
+    assert np.abs(length - 1).max() < 0.02
+    assert other.base_color.mean((0, 1)) == pytest.approx(built.base_color.mean((0, 1)), abs=1)

@@ -5,8 +5,10 @@ References
 Khronos, glTF 2.0 §3.9 (materials) and KHR_materials_specular.
 """
 
+from dataclasses import replace
 from typing import Annotated
 
+import cv2
 import msgspec
 import numpy as np
 from msgspec import Meta
@@ -26,16 +28,17 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 1.5
 
 
-@stage(version=1, keep=False)
+@stage(version=2, keep=False)
 def build(maps: SurfaceMaps, mesh: Mesh, settings: Settings) -> Asset:
-    """Textures on the crop's grid, filled outwards from the object so that no seam shows.
+    """Textures on the crop's grid, filled outwards from the object so that no seam shows; the outermost pixels, which
+    the backdrop shines into, are filled too, so that it does not run along the limb.
 
     Ours is a diffuse term behind two Fresnel transmissions, glTF's is base·(1 − F): base =
     ρ_d T₊(0)²/(1 − F0) makes the frontal looks agree. F0 = 0.04-like · factor · texture, the factor
     holding the map's greatest value. The mesh has already bent the light as its own normals do, so
     the normal texture holds what is left: the map's normals in the mesh's interpolated tangent frame.
     """
-    nearest = _nearest(maps.mask)
+    nearest = _nearest(_unmixed(maps.mask))
     specular = np.clip(maps.specular, 0.0, 1.0)
     entry, _ = fresnel.transmission(np.float64(1.0), settings.ior)
     base = maps.diffuse * entry**2 / (1 - np.minimum(specular.max(axis=-1, keepdims=True), 0.99))
@@ -51,6 +54,35 @@ def build(maps: SurfaceMaps, mesh: Mesh, settings: Settings) -> Asset:
         specular_factor=(top / float(fresnel.normal_reflectance(settings.ior)),) * 3,
         ior=settings.ior,
     )
+
+
+def resized(asset: Asset, size: int) -> Asset:
+    """The asset with textures whose longer side is `size` px and whose other is the next power of two that holds it.
+
+    Smaller ones are means over what each pixel covers; a larger one holds no more detail than was photographed.
+    """
+    height, width = asset.normal.shape[:2]
+    shorter = size * min(height, width) / max(height, width)
+    other = min(size, 1 << int(np.ceil(np.log2(shorter))))
+    wide, tall = (size, other) if width >= height else (other, size)
+    base, orm, normal, specular = (
+        _scaled(one, wide, tall)
+        for one in (asset.base_color, asset.occlusion_roughness_metallic, asset.normal, asset.specular_color)
+    )
+    return replace(
+        asset,
+        base_color=_eight_bits(base / 255),
+        occlusion_roughness_metallic=_eight_bits(orm / 255),
+        normal=_eight_bits(_unit(normal / 127.5 - 1) / 2 + 0.5),
+        specular_color=_eight_bits(specular / 255),
+    )
+
+
+def _scaled(texture: NDArray[np.uint8], width: int, height: int) -> Floats:
+    """(height, width, 3) of 0…255, by area where both sides shrink, else by cubic interpolation."""
+    shrinks = width <= texture.shape[1] and height <= texture.shape[0]
+    how = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(texture.astype(np.float32), (width, height), interpolation=how))
 
 
 def tangent_space(maps: SurfaceMaps, mesh: Mesh) -> Floats:
@@ -81,6 +113,9 @@ def _interpolated(mesh: Mesh, height: int, width: int) -> tuple[Floats, NDArray[
     extent = np.floor(corner.max(axis=1) + 1e-4).astype(np.int64) - first
     one, two = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     area = one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
+    seen = area < 0  # the texture belongs to what faces the camera, not to walls and a back; v runs down
+    faces, first, extent, area = mesh.faces[seen], first[seen], extent[seen], area[seen]
+    corner, one, two = corner[seen], one[seen], two[seen]
     out, covered = np.zeros((height, width, 7)), np.zeros((height, width), dtype=bool)
     for down in range(int(extent[:, 1].max()) + 1):
         for right in range(int(extent[:, 0].max()) + 1):
@@ -91,9 +126,15 @@ def _interpolated(mesh: Mesh, height: int, width: int) -> tuple[Floats, NDArray[
             hit = (w1 > -1e-4) & (w2 > -1e-4) & (w1 + w2 < 1 + 1e-4)
             share = np.stack([1 - w1 - w2, w1, w2], axis=-1)[hit]
             column, row = pixel[hit].T
-            out[row, column] = np.einsum("fk,fkc->fc", share, value[mesh.faces[hit]])
+            out[row, column] = np.einsum("fk,fkc->fc", share, value[faces[hit]])
             covered[row, column] = True
     return out, covered
+
+
+def _unmixed(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The mask without its outermost pixels, but for parts so thin that nothing would be left of them."""
+    inner = ndimage.binary_erosion(mask, np.ones((3, 3), dtype=bool))
+    return np.asarray(inner | (mask & ~ndimage.binary_dilation(inner, np.ones((5, 5), dtype=bool))))
 
 
 def _nearest(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -19,7 +19,10 @@ from polcap.images import Floats, Mesh, SurfaceMaps
 from polcap.stages import stage
 from polcap.stages.surface import triangles
 from polcap.stages.surface.backing import Back
+from polcap.stages.surface.decimation import Decimated, decimated
 from polcap.stages.surface.integration import log_depth, problem
+
+__all__ = ["Back", "Decimated", "Settings", "decimated", "integrate", "triangulate"]
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -61,15 +61,15 @@ def smoothed(place: Floats, log: Floats, faces: NDArray[np.int32], step: int) ->
     after = _averaged(before, edges(faces), _ROUNDS)
     far = np.linalg.norm((after - before)[:, :2], axis=-1, keepdims=True)
     after = before + (after - before) * np.minimum(1, _FARTHEST * step / np.maximum(far, 1e-9))
-    was, area = _area(before, faces), _area(after, faces)
+    was, now = area(before, faces), area(after, faces)
     after_all = after
     for _ in range(3):  # a triangle that would turn over keeps its corners; so may its neighbours then have to
-        bad = np.unique(faces[area < _LEAST_AREA * was])
+        bad = np.unique(faces[now < _LEAST_AREA * was])
         if not len(bad):
             break
         after_all = after_all.copy()
         after_all[bad] = before[bad]
-        area = _area(after_all, faces)
+        now = area(after_all, faces)
     return after_all[:, :2], after_all[:, 2]
 
 
@@ -102,7 +102,7 @@ def _pieces(faces: NDArray[np.int32], count: int) -> int:
     return int((share > _SPECK).sum())
 
 
-def _area(place: Floats, faces: NDArray[np.int32]) -> Floats:
+def area(place: Floats, faces: NDArray[np.int32]) -> Floats:
     """Twice the triangles' area in the picture, y down, positive counter-clockwise seen from the camera."""
     one, two = (place[faces[:, k], :2] - place[faces[:, 0], :2] for k in (1, 2))
     return np.asarray(one[:, 1] * two[:, 0] - one[:, 0] * two[:, 1])

@@ -46,7 +46,7 @@ def triangulate(
     ray = np.stack([place[:, 0] - x, y - place[:, 1], np.full(len(place), -maps.view.focal)], axis=-1)
     vertices: Floats = ray / maps.view.focal * np.exp(log / maps.view.focal)[:, None]
     uv: Floats = (place + 0.5) / [width, height]
-    normals, tangents = _frames(vertices, uv, faces)
+    normals, tangents = frames(vertices, uv, faces)
     if back != "open":
         vertices, normals, uv, tangents, faces = closed(vertices, normals, uv, tangents, faces, back)
     return Mesh(
@@ -107,7 +107,7 @@ def _whole(holds: Bools, step: int, axis: int) -> Bools:
     return np.moveaxis(together, -1, axis)
 
 
-def _frames(vertices: Floats, uv: Floats, faces: NDArray[np.int32]) -> tuple[Floats, Floats]:
+def frames(vertices: Floats, uv: Floats, faces: NDArray[np.int32]) -> tuple[Floats, Floats]:
     """Unit normals (V, 3) and tangents (V, 4), means over the triangles around, weighted by area.
 
     A tangent is ∂P/∂u made square to the normal; w = 1 because v runs down the picture while

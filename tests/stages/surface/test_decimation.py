@@ -1,0 +1,38 @@
+"""Levels of detail: fewer triangles, a stated distance, the same look."""
+
+import numpy as np
+import pytest
+
+from polcap.errors import ObjectError
+from polcap.stages import surface
+from tests import surfaces
+from tests.stages.test_asset import rendered_normals
+
+
+@pytest.fixture(scope="module")
+def level() -> surface.Decimated:
+    return surface.decimated(surfaces.mesh(surfaces.maps()), surfaces.VIEW, 1 / 16)
+
+
+def test_a_sixteenth_of_the_triangles_lies_where_it_says(level: surface.Decimated) -> None:
+    """Against the ball itself, which the first mesh follows to within half a pixel."""
+    assert len(level.mesh.faces) == pytest.approx(len(surfaces.mesh(surfaces.maps()).faces) / 16, rel=0.1)
+    scale = np.nanmedian(surfaces.mesh(surfaces.maps()).depth) / surfaces.VIEW.focal  # m per px
+    assert level.error == pytest.approx(level.error_px * scale, rel=1e-3)
+    assert 0 < level.error_px < 2
+
+
+def test_detail_stays_in_the_normal_texture(level: surface.Decimated) -> None:
+    maps = surfaces.maps(ripple=0.2)
+    built = surfaces.built(maps, level.mesh)
+    seen, (row, column) = rendered_normals(built, maps, within=0.5)
+    cosine = np.sum(seen * maps.normal[row, column], axis=-1)
+    inner = maps.normal[row, column][:, 2] > 0.3
+    assert (
+        np.degrees(np.arccos(np.clip(cosine[inner], -1, 1))).mean() < 4
+    )  # vertices lie between pixels: the ripple's own
+
+
+def test_too_many_levels_are_refused() -> None:
+    with pytest.raises(ObjectError, match="fewer levels"):
+        surface.decimated(surfaces.mesh(surfaces.maps()), surfaces.VIEW, 1e-5)
