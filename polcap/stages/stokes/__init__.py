@@ -15,6 +15,8 @@ from polcap.optics import fresnel, mueller
 from polcap.optics.warp import covered, warp
 from polcap.stages import stage
 
+_ROWS = 16
+
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     greatest_ior: Annotated[
@@ -50,18 +52,25 @@ def solve(
             "at most 50); shoot angles spread over 180°, such as 0°, 45°, 90°"
         )
     value, variance, quality = _registered(radiance, alignment, gains, object_.crop)
-    stokes, covariance = _weighted_least_squares(weights_of, value, variance)
+    stokes = np.empty((3, *value.shape[1:]), np.float32)
+    covariance = np.empty((6, *value.shape[1:]), np.float32)
+    residual = np.empty(quality.shape, np.float32) if len(radiance.angle) > 3 else None
+    for top in range(0, len(quality), _ROWS):  # blocks whose float64 fits the cache
+        rows = slice(top, top + _ROWS)
+        solved, doubt = _weighted_least_squares(weights_of, value[:, rows], variance[:, rows])
+        stokes[:, rows], covariance[:, rows] = solved, doubt
+        quality[rows] = _judged(solved, doubt, quality[rows], settings)
+        if residual is not None:
+            fitted = np.einsum("kj,jhwc->khwc", weights_of, solved)
+            difference = np.abs(value[:, rows] - fitted).sum(-1).mean(0)
+            residual[rows] = difference / np.maximum(solved[0].sum(-1), 1e-9)
     x0, y0, x1, y1 = object_.crop
     mask = object_.mask[y0:y1, x0:x1]
-    residual = None
-    if len(radiance.angle) > 3:
-        fitted = np.einsum("kj,jhwc->khwc", weights_of, stokes)
-        residual = np.abs(value - fitted).sum(-1).mean(0) / np.maximum(stokes[0].sum(-1), 1e-9)
     view = radiance.view
     return StokesImage(
-        stokes=stokes.astype(np.float32),
-        covariance=covariance.astype(np.float32),
-        quality=_judged(stokes, covariance, quality, settings),
+        stokes=stokes,
+        covariance=covariance,
+        quality=quality,
         mask=np.array(mask),
         view=View(
             focal=view.focal,
@@ -70,7 +79,7 @@ def solve(
             origin=(view.origin[0] + x0, view.origin[1] + y0),
             known=view.known,
         ),
-        residual=None if residual is None else residual.astype(np.float32),
+        residual=residual,
     )
 
 
