@@ -52,10 +52,10 @@ def reduce(maps: SurfaceMaps, mesh: Mesh, cues: Cues, angle: Floats, longest: in
 class Rerendered:
     """The photographs of each angle, in grey, beside what the maps say they should be."""
 
-    measured: Floats  # (K, H, W) ½(S0 + S1 cos 2θ + S2 sin 2θ), white = 1 where the object is brightest
+    measured: Floats  # (K, H, W) S0 + S1 cos 2θ + S2 sin 2θ, 1 where the object is brightest, not beyond
     predicted: Floats  # (K, H, W) the same from normals and material under a flash beside the lens
     flashed: Floats  # (H, W, 3) S0 of the maps under that flash, linear Rec.709
-    scale: float  # brightness of the photographs over that of the re-rendering, least squares
+    scale: float  # brightness of the photographs over that of the re-rendering, median of the pixels
 
     def rms(self, inside: NDArray[np.bool_]) -> list[float]:
         """Root mean square of the difference of each angle, of white."""
@@ -75,9 +75,9 @@ def rerender(shown: Shown, ior: float) -> Rerendered:
     flashed = np.asarray(drawn)[0] * maps.mask[..., None]
     drawn = np.asarray(drawn).mean(axis=-1) * maps.mask
     seen = shown.radiance.mean(axis=-1) * maps.mask
-    both = seen[maps.mask], drawn[0][maps.mask]
-    scale = float(both[0] @ both[1] / max(float(both[1] @ both[1]), 1e-12)) if maps.mask.any() else 1.0
-    white = max(float(np.quantile(both[0], _GREATEST_S0)), 1e-6) if maps.mask.any() else 1.0
+    light, lit = seen[maps.mask], drawn[0][maps.mask]
+    scale = float(np.median(light[lit > 0] / lit[lit > 0])) if (lit > 0).any() else 1.0  # highlights have no say
+    white = max(float(np.quantile(light, _GREATEST_S0)), 1e-6) if light.size else 1.0
     measured, predicted = [], []
     for angle in shown.angle:
         on_ray = frames.axis_on_ray(np.float32(angle), ray)
@@ -85,7 +85,7 @@ def rerender(shown: Shown, ior: float) -> Rerendered:
         predicted.append(
             scale * (drawn[0] + drawn[1] * np.cos(2 * on_ray) + drawn[2] * np.sin(2 * on_ray)) * maps.mask / white
         )
-    return Rerendered(np.stack(measured), np.stack(predicted), flashed, scale)
+    return Rerendered(np.minimum(measured, 1.0), np.minimum(predicted, 1.0), flashed, scale)
 
 
 def exposure(shown: Shown) -> float:

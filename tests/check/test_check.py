@@ -98,12 +98,12 @@ def test_ambient_light_is_measured(example: Path, tmp_path: Path) -> None:
 
 
 def test_reduced_picture_keeps_what_is_clipped(example: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("polcap.check.reduced._MOST_PIXELS", 3e4)
+    monkeypatch.setattr("polcap.check.reduced._MOST_PIXELS", 7e4)
     capture = captures.read(example)
     taken = take(capture, clip=0.98)
     assert taken.step == 4
-    assert taken.capture.size_px == (192, 144)
+    assert taken.capture.size_px == (288, 216)
     brightest = taken.capture.shots[0].frames[2].load()
-    assert brightest.cfa is None and brightest.value.shape == (144, 192, 3)
+    assert brightest.cfa is None and brightest.value.shape == (216, 288, 3)
     assert ((taken.clipped[0, 2] > 0) == (brightest.value == 1).all(-1)).all()
     assert taken.clipped[0, 2].mean() > 0.001
