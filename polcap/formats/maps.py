@@ -77,7 +77,8 @@ def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues
     inside = np.asarray(maps.mask, dtype=bool)
     depth = np.where(inside & np.isfinite(mesh.depth), mesh.depth, 0.0).astype(np.float32)
     seen = depth[depth > 0]
-    near, far = (float(seen.min()), float(seen.max())) if seen.size else (0.0, 1.0)
+    unit = "m" if mesh.metric else "relative"
+    near, median, far = (float(q) for q in np.quantile(seen, (0, 0.5, 1))) if seen.size else (0.0, 0.5, 1.0)
     normal, flat = _kept(maps.normal, inside), np.where(inside[..., None], maps.normal, [0.0, 0.0, 1.0])
 
     exr.write(folder / "normal.exr", _channels("RGB", normal))
@@ -96,7 +97,7 @@ def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues
     png.write(folder / "roughness.png", png.sixteen_bits(_kept(maps.roughness, inside)))
     png.write(folder / "photograph.png", _picture(cues.radiance))
     png.write(folder / "mask.png", np.where(inside, 255, 0).astype(np.uint8))
-    _write_json(folder / "maps.json", _description(maps, mesh.metric, near, far))
+    _write_json(folder / "maps.json", _description(maps, {"unit": unit, "near": near, "median": median, "far": far}))
 
 
 def read(folder: Path) -> Stored:
@@ -171,11 +172,11 @@ def _read_map(file: Path, letters: str, size: tuple[int, int]) -> Floats:
     return whole
 
 
-def _description(maps: SurfaceMaps, metric: bool, near: float, far: float) -> dict[str, Any]:
+def _description(maps: SurfaceMaps, depth: Mapping[str, str | float]) -> dict[str, Any]:
     """maps.json."""
     view = maps.view
     height, width = maps.mask.shape
-    unit = "m" if metric else "relative"
+    unit = depth["unit"]
     linear, encoded = "linear Rec.709", "8 bit, sRGB"
     return {
         "format": "polcap maps 1",
@@ -188,7 +189,7 @@ def _description(maps: SurfaceMaps, metric: bool, near: float, far: float) -> di
             "focal_known": view.known,
             "unit": "map pixels",
         },
-        "depth": {"unit": unit, "near": near, "far": far},
+        "depth": dict(depth),
         "estimator": maps.estimator,
         "conventions": CONVENTIONS,
         "maps": {

@@ -39,8 +39,8 @@ class Result:
 
     @property
     def distance(self) -> float:
-        """Middle of the object's depth, in its unit."""
-        return float(self.said["depth"]["near"] + self.said["depth"]["far"]) / 2
+        """The object's median depth, in its unit: where the light of the photographs is 1."""
+        return float(self.said["depth"]["median"])
 
     def origin(self) -> Vector:
         """Where the GLB's origin lies in the frame of the camera (x right, y up, z toward it)."""
