@@ -20,4 +20,7 @@ In the order a sample meets them:
                 protocol makes one at a time (patterns: its materials, transport: its light), baselines
                 estimates without a network, score judges, and tables and panel tell
     real        error of normals on photographs that come with measured ones
+
+The object's mask has a network of its own: mask_views traces objects before a backdrop, mask_scenes dresses and
+lights them, mask_pictures keeps them as files, mask_model learns from those in mask_train.
 """

@@ -1,6 +1,6 @@
-"""The mask on 60 scenes of meshes never trained on: ten difficulties, six objects; and on $POLCAP_DATA/rendered.
+"""The mask on 60 scenes of meshes never trained on: ten difficulties, six objects.
 
-    python -m tests.benchmarks.bench_mask OUT [MODEL]
+    python -m tests.benchmarks.bench_mask OUT calib/models/mask.onnx
 
 Scenes are kept in OUT/scenes; OUT/mask.json holds every IoU, OUT/NAME.png outlines for a person to look at.
 """
