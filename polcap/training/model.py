@@ -85,19 +85,19 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
         features = [self.levels[0](self.stem(F.pixel_unshuffle(seen, 2)))]
         for down, level in zip(self.down, list(self.levels)[1:]):
             features.append(level(down(features[-1])))
-        inside = x[:, _MASK : _MASK + 1]
+        inside, clipped = (x[:, at : at + 1].clamp(0, 1) for at in (_MASK, _CLIPPED))
         features[-1] = self.context(features[-1], F.avg_pool2d(inside, SIZE_MULTIPLE))
         shape, color = (branch(features, seen, inside).float() for branch in (self.geometry, self.color))
         level = x[:, COLOR].float()
         normal = F.normalize(shape[:, :3] + shape.new_tensor([0.0, 0.0, 0.5]).view(1, 3, 1, 1), dim=1, eps=1e-6)
         own = torch.sigmoid(level + color[:, :3] + 0.7)
-        cosine, clipped = normal[:, 2:].detach(), x[:, _CLIPPED : _CLIPPED + 1].float()
+        cosine, usable = normal[:, 2:].detach(), inside * (1 - clipped)
         with torch.autocast(x.device.type, enabled=False):
-            diffuse, member, colors = self.recolor(own, color[:, 3:], cosine, inside.float(), clipped)
+            diffuse, member, colors = self.recolor(own, color[:, 3:], cosine, inside.float(), clipped.float())
         body = torch.log(0.9 * diffuse * normal[:, 2:].clamp(min=0) + FLOOR)  # what the diffuse light would be
         figures = figures_of(level, self.sees_dolp * x[:, _RATIO].float() / 10, normal, diffuse)
         hints = torch.cat([normal, diffuse, level - body, figures[:, -1:]], dim=1).detach() * inside
-        thinned = Evidence(*(part[:, :, ::2, ::2].detach() for part in (figures, normal[:, 2:], diffuse, _usable(x))))
+        thinned = Evidence(*(part[:, :, ::2, ::2].detach() for part in (figures, normal[:, 2:], diffuse, usable)))
         parts = [self.shape.gloss[1], _GLOSS_OUTPUTS]
         told, itself = self.profiles(features[1], features[0], thinned).split(parts, dim=1)
         shown = torch.cat([seen, hints.to(seen.dtype)], dim=1)
@@ -115,11 +115,6 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
             "sigma": 60 * torch.sigmoid(shape[:, 4:5] - 1.5),
             "highlight": torch.sigmoid(gloss[:, 4:5] - 1.0),
         }
-
-
-def _usable(x: Tensor) -> Tensor:
-    """1 where the object is seen unclipped, (B, 1, H, W)."""
-    return x[:, _MASK : _MASK + 1] * (1 - x[:, _CLIPPED : _CLIPPED + 1])
 
 
 class Residual(nn.Module):  # type: ignore[misc]  # torch comes without types here
