@@ -18,7 +18,7 @@ from polcap.stages.infer.analytic import fill_highlights, invert
 
 _INVERSION = 4.0  # factor on the inversion's expected error in the join: the network has seen what it has seen
 _DETAIL = 2.0  # pixels that the network sees, 1σ: what is finer is the inversion's to tell
-_CALIBRATION = (0.718, 1.16, 50.0)  # error = min(a·expectedᵇ, c), degrees: traced pictures of training meshes
+_CALIBRATION = (0.78, 1.16, 50.0)  # error = min(a·expectedᵇ, c), degrees: traced training meshes, both laws
 _CELLS = 2.0  # cells of the network's grid, 1σ, over which its pattern is taken as the same
 _BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 _REACHED = 0.05  # share of known pixels under a Gaussian from which a mean is taken
