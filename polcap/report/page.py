@@ -121,7 +121,8 @@ def _remedy(gate: Mapping[str, Any]) -> str:
 def _gate_value(gate: Mapping[str, Any], name: str) -> str:
     value, unit = gate[name], gate.get("unit", "")
     if isinstance(value, (int, float)) and not isinstance(value, bool):
-        return f"{labels.number(100 * value if unit == '%' else value)} {unit}".rstrip()
+        shown = labels.number(100 * value if unit == "%" else value)
+        return f"{shown}{unit}" if unit == "°" else f"{shown} {unit}".rstrip()
     return "not measured" if value is None else str(value)
 
 
@@ -340,7 +341,7 @@ def gates(judged: Sequence[Mapping[str, Any]]) -> str:
         for gate in sorted(judged, key=lambda gate: order.get(gate["state"], 4))
     )
     head = "<tr><th>Check</th><th></th><th>Value</th><th>Limit</th><th>Cost</th><th>What it says</th></tr>"
-    return f'<div class="scroll"><table>{head}{rows}</table></div>'
+    return f'<div class="scroll"><table class="checks">{head}{rows}</table></div>'
 
 
 def _shots(capture: Mapping[str, Any]) -> str:

@@ -35,8 +35,8 @@ def test_page_prints_with_its_pictures(page: devtools.Page) -> None:
 
 
 def seen(page: devtools.Page, canvas: str, tmp_path: Path) -> np.ndarray:
-    """The pixels of a canvas, (H, W, 3) 0…255."""
-    text = page.evaluate(f"document.getElementById('{canvas}').toDataURL().split(',')[1]")
+    """The pixels of a canvas as it is drawn now, (H, W, 3) 0…255."""
+    text = page.evaluate(f"({canvas}.draw(), {canvas}.canvas.toDataURL().split(',')[1])")
     data = np.frombuffer(devtools.base64.b64decode(text), np.uint8)
     return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))[..., ::-1].astype(float)
 
