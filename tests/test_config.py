@@ -5,8 +5,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from polcap.config import Config, load, settings
+from polcap.config import Config, fill, load, settings
 from polcap.errors import SettingError
+from polcap.synth.shooting import Shoot
 
 
 def test_defaults_come_from_the_stages() -> None:
@@ -74,3 +75,8 @@ def test_every_setting_is_described() -> None:
 def test_config_survives_its_own_dump() -> None:
     config = load(None, ["hdr.clip=0.95"])
     assert msgspec.convert(msgspec.to_builtins(config), Config) == config
+
+
+@pytest.mark.parametrize("text", ["0,60,120", "[0,60,120]", "0, 60, 120"])
+def test_a_list_may_be_typed_without_brackets(text: str) -> None:
+    assert fill(Shoot, {}, [f"angles_deg={text}"]).angles_deg == (0, 60, 120)

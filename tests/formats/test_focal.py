@@ -1,0 +1,25 @@
+"""The focal length in pixels, and whether it is known."""
+
+import pytest
+
+from polcap.formats import focal
+from polcap.images import Exif
+
+
+def test_sensor_table_makes_a_stated_focal_length_known() -> None:
+    found = focal.find(Exif(model="NIKON D90", focal_length_mm=50.0, width=4310, height=2868), None, None)
+    assert found.known and found.px == pytest.approx(50 / 23.6 * 4310)
+
+
+def test_stated_focal_length_that_contradicts_the_photographs_is_no_knowledge() -> None:
+    exif = Exif(model="NIKON D90", focal_length_mm=50.0, width=4310, height=2868)
+    found = focal.find(exif, 24.0, None)
+    assert not found.known and "50 mm" in found.note
+    assert found.px == pytest.approx(24 / 23.6 * 4310)  # what the user states is what is taken
+    assert focal.find(exif, 51.0, None).known
+
+
+def test_every_sensor_width_is_one_that_cameras_have() -> None:
+    widths = focal.sensor_widths()
+    assert len(widths) > 300
+    assert all(5 < width < 55 for width in widths.values())
