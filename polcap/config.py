@@ -83,7 +83,7 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.5
     max_one_sided: Annotated[
         float, Meta(gt=0, description="light of the outline going once round it, against its mean [1]")
-    ] = 0.6
+    ] = 0.4
     max_side_light: Annotated[
         float, Meta(gt=0, le=1, description="one side of the outline brighter in one shot than in the others [1]")
     ] = 0.07
