@@ -89,6 +89,7 @@ def export(out: Path, wanted: Wanted) -> list[Path]:
     """
     about = report.read(out)
     with Store(out).lock():
+        sweep(out)
         return asset_export.export(out, about, wanted)
 
 
