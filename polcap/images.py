@@ -239,7 +239,7 @@ class StokesImage:
 
 @dataclass(frozen=True)
 class Cues:
-    """What the estimators see, all on the crop's grid; see stages/cues.py for each formula."""
+    """What the estimators see, all on the crop's grid; see stages/cues for each formula."""
 
     radiance: Floats  # (H, W, 3) S0 in linear Rec.709, chart white = its reflectance
     ratio: Floats  # (2, H, W) S1/S0 and S2/S0 over all channels
@@ -261,7 +261,7 @@ class Network:
         compare=False, repr=False, metadata=NOT_IN_KEY
     )
     digest: str
-    channels: tuple[str, ...]  # names of stages/cues.py, in order
+    channels: tuple[str, ...]  # names of stages/cues, in order
     metadata: Mapping[str, str]
     provider: str
 

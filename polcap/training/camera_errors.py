@@ -85,7 +85,7 @@ def photograph(
     """Measured Stokes parameters (3, M, 3), their covariance (6, M, 3) and clipped pixels (M,) at pixels `at`.
 
     stokes (3, B, H, W, 3) in the frame of each ray; diffuse (B, H, W, 3); mask (B, H, W); rays (B, H, W, 3); at (M,)
-    indices into B·H·W. The solve takes the angles as they are in the image, as `stages/stokes.py` does.
+    indices into B·H·W. The solve takes the angles as they are in the image, as `stages/stokes` does.
     """
     count, height, width = mask.shape
     wide = (count, 1, 1, 1)

@@ -1,6 +1,6 @@
 """Batches made fresh at every step: traced views, new materials, flash and camera -> channels and truth.
 
-The cues are computed by `stages/cues.py`, the same code that a capture goes through.
+The cues are computed by `stages/cues`, the same code that a capture goes through.
 """
 
 from dataclasses import dataclass
@@ -189,7 +189,7 @@ def batch(photo: Photo) -> Batch:
 
 
 def channels(photo: Photo) -> Tensor:
-    """What `stages/cues.py` makes of the measured pixels, (B, N, H, W), 0 elsewhere; channels last in memory."""
+    """What `stages/cues` makes of the measured pixels, (B, N, H, W), 0 elsewhere; channels last in memory."""
     count, height, width = photo.rays.shape[:3]
     ratio, sigma, dolp, normalized = cues.polarization(photo.stokes, photo.covariance)
     clipped, at = photo.clipped, photo.at
