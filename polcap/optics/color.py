@@ -3,6 +3,9 @@
 The curves and matrices work on NumPy and torch; colours on the last axis. White is D65 throughout.
 """
 
+import sys
+import unittest.mock
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,43 +52,25 @@ def luminance(rgb: Any) -> Any:
 def delta_e(rgb: Floats, reference: Floats) -> Floats:
     """CIEDE2000 (kL = kC = kH = 1) between linear Rec.709 colours (..., 3) → (...,), white = D65.
 
-    About 1 is just noticeable side by side.
-
-    References
-    ----------
-    Sharma, Wu, Dalal, The CIEDE2000 color-difference formula: implementation notes, supplementary test data,
-    and mathematical observations, Color Research and Application 2005, eq. (2)–(22).
+    About 1 is just noticeable side by side. Loads colour-science.
     """
-    (l1, a1, b1), (l2, a2, b2) = (np.moveaxis(_lab(np.asarray(c, np.float64)), -1, 0) for c in (rgb, reference))
-    chroma7 = ((np.hypot(a1, b1) + np.hypot(a2, b2)) / 2) ** 7
-    stretch = 1.5 - 0.5 * np.sqrt(chroma7 / (chroma7 + 25.0**7))  # 1 + G
-    c1, c2 = np.hypot(stretch * a1, b1), np.hypot(stretch * a2, b2)
-    h1, h2 = np.arctan2(b1, stretch * a1), np.arctan2(b2, stretch * a2)
-    grey = c1 * c2 == 0
-    turn = np.where(grey, 0.0, (h2 - h1 + np.pi) % (2 * np.pi) - np.pi)
-    hue = np.where(grey, h1 + h2, h1 + turn / 2)  # halfway on the shorter arc
-    lightness, chroma = (l1 + l2) / 2, (c1 + c2) / 2
-    t = (
-        1
-        - 0.17 * np.cos(hue - np.radians(30))
-        + 0.24 * np.cos(2 * hue)
-        + 0.32 * np.cos(3 * hue + np.radians(6))
-        - 0.20 * np.cos(4 * hue - np.radians(63))
-    )
-    sl = 1 + 0.015 * (lightness - 50) ** 2 / np.sqrt(20 + (lightness - 50) ** 2)
-    sc, sh = 1 + 0.045 * chroma, 1 + 0.015 * chroma * t
-    blue = np.radians(30) * np.exp(-((((np.degrees(hue) - 275 + 180) % 360 - 180) / 25) ** 2))  # Δθ
-    rotation = -np.sin(2 * blue) * 2 * np.sqrt(chroma**7 / (chroma**7 + 25.0**7))
-    dl, dc, dh = (l2 - l1) / sl, (c2 - c1) / sc, 2 * np.sqrt(c1 * c2) * np.sin(turn / 2) / sh
-    return np.asarray(np.sqrt(dl**2 + dc**2 + dh**2 + rotation * dc * dh))
+    colour = load_colour_science()
+    lab = [colour.XYZ_to_Lab(np.asarray(c, np.float64) @ REC709_TO_XYZ.T, _D65) for c in (rgb, reference)]
+    return np.asarray(colour.delta_E(lab[0], lab[1], method="CIE 2000"), dtype=np.float64)
 
 
-def _lab(rgb: Floats) -> Floats:
-    """Linear Rec.709 → CIE L*a*b* for white = D65, (..., 3). CIE 15:2004, eq. (8.3)–(8.8)."""
-    x, y = _D65
-    xyz = rgb @ REC709_TO_XYZ.T / np.array([x / y, 1.0, (1 - x - y) / y])
-    f = np.where(xyz > (24 / 116) ** 3, np.cbrt(xyz), 841 / 108 * xyz + 16 / 116)
-    return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1)
+def load_colour_science() -> Any:
+    """The `colour` package, imported when first needed (0.3–0.9 s).
+
+    colour-science 0.4.7 puts MagicMock objects into sys.modules for each optional package it does not
+    find, and trimesh then takes them for the real ones: they are removed again.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import colour
+    for name in [n for n, module in sys.modules.items() if isinstance(module, unittest.mock.MagicMock)]:
+        del sys.modules[name]
+    return colour
 
 
 @dataclass(frozen=True)

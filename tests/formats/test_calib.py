@@ -10,7 +10,6 @@ from polcap.errors import ChartError, StorageError
 from polcap.formats import calib
 from polcap.images import ColorCalibration
 from polcap.optics import color
-from tests import colour_science
 
 PROFILE = ColorCalibration(
     matrix=np.array([[2.1, -0.4, 0.1], [-0.2, 1.5, -0.3], [0.05, -0.6, 1.9]]),
@@ -26,7 +25,7 @@ PROFILE = ColorCalibration(
 
 
 def test_shipped_chart_is_the_makers_table():
-    colour = colour_science.load()
+    colour = color.load_colour_science()
     table = colour.CCS_COLOURCHECKERS["ColorChecker24 - After November 2014"]
     xyz = colour.xyY_to_XYZ(list(table.data.values()))
     expected = colour.XYZ_to_RGB(xyz, "ITU-R BT.709", table.illuminant, "Bradford")
