@@ -23,6 +23,7 @@ from polcap.training import model
 OPSET = 17
 NATIVE_SIZE = 256  # px of the longer side that inference shows it: more than it was trained on; measured best
 _OWNER, _HALF = "network.", ".half"  # around the names of stored weights
+_EARLIER_NAMES = {".ask.": ".qkv.", ".tell.": ".proj.", ".share.": ".attention."}
 _GREATEST_IR = 10  # what onnxruntime 1.20 and later read
 
 
@@ -73,11 +74,19 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     except (OSError, DecodeError) as error:
         raise InputError(f"{path}: cannot be read as an ONNX model ({error}); name one that polcap wrote") from error
     state = {
-        tensor.name.removeprefix(_OWNER).removesuffix(_HALF): torch.tensor(numpy_helper.to_array(tensor)).float()
+        _named(tensor.name): torch.tensor(numpy_helper.to_array(tensor)).float()
         for tensor in graph.graph.initializer
         if tensor.name.startswith(_OWNER)
     }
     return state, {entry.key: entry.value for entry in graph.metadata_props}
+
+
+def _named(name: str) -> str:
+    """Today's name of a weight in the network: models up to number 8 were written under earlier ones."""
+    name = name.removeprefix(_OWNER).removesuffix(_HALF)
+    for before, now in _EARLIER_NAMES.items():
+        name = name.replace(before, now)
+    return name
 
 
 class _Ordered(nn.Module):  # type: ignore[misc]  # torch comes without types here

@@ -99,9 +99,9 @@ class Network(nn.Module):  # type: ignore[misc]  # torch comes without types her
         hints = torch.cat([normal, diffuse, level - body, figures[:, -1:]], dim=1).detach() * inside
         thinned = Evidence(*(part[:, :, ::2, ::2].detach() for part in (figures, normal[:, 2:], diffuse, usable)))
         parts = [self.shape.gloss[1], _GLOSS_OUTPUTS]
-        told, itself = self.profiles(features[1], features[0], thinned).split(parts, dim=1)
+        readings, itself = self.profiles(features[1], features[0], thinned).split(parts, dim=1)
         shown = torch.cat([seen, hints.to(seen.dtype)], dim=1)
-        gloss = self.gloss(features, shown, inside, F.avg_pool2d(told, 2)).float()
+        gloss = self.gloss(features, shown, inside, F.avg_pool2d(readings, 2)).float()
         gloss = gloss + F.interpolate(itself, scale_factor=2.0, mode="bilinear", align_corners=False)
         with torch.autocast(x.device.type, enabled=False):
             corrected = self.color_gloss(thinned, gloss[:, :, ::2, ::2], member[:, :, ::2, ::2].detach(), colors)
@@ -140,25 +140,25 @@ class Context(nn.Module):  # type: ignore[misc]  # torch comes without types her
     def __init__(self, width: int, heads: int = 4) -> None:
         super().__init__()
         self.heads = heads
-        self.ask = nn.Conv2d(width, 3 * width, 1)
-        self.tell = nn.Conv2d(2 * width, width, 1)
-        nn.init.zeros_(self.tell.weight)
+        self.qkv = nn.Conv2d(width, 3 * width, 1)
+        self.proj = nn.Conv2d(2 * width, width, 1)
+        nn.init.zeros_(self.proj.weight)
 
     def forward(self, x: Tensor, inside: Tensor) -> Tensor:
         batch, width, height, across = x.shape
         query, key, value = (
             part.flatten(2).reshape(batch, self.heads, width // self.heads, -1).transpose(2, 3)
-            for part in self.ask(F.relu(x)).chunk(3, dim=1)
+            for part in self.qkv(F.relu(x)).chunk(3, dim=1)
         )
         weight = inside.flatten(2)  # (B, 1, cells)
         score = query @ key.transpose(2, 3) / (width // self.heads) ** 0.5
         attention = torch.softmax(score.float() + torch.log(weight[:, :, None].float() + 1e-4), dim=-1)
         seen = (attention.to(value.dtype) @ value).transpose(2, 3).reshape(batch, width, height, across)
         mean = (x.flatten(2) * weight).sum(dim=2) / (weight.sum(dim=2) + 1e-4)
-        return x + self.tell(torch.cat([seen, mean[:, :, None, None].expand_as(x).to(seen.dtype)], dim=1))
+        return x + self.proj(torch.cat([seen, mean[:, :, None, None].expand_as(x).to(seen.dtype)], dim=1))
 
 
-class Share(nn.Module):  # type: ignore[misc]  # torch comes without types here
+class LinearAttention(nn.Module):  # type: ignore[misc]  # torch comes without types here
     """Places sort themselves softly into groups, and each is told the mean of its groups: cost linear in area.
 
     References
@@ -169,20 +169,20 @@ class Share(nn.Module):  # type: ignore[misc]  # torch comes without types here
     def __init__(self, width: int, heads: int = 4, groups: int = 16) -> None:
         super().__init__()
         self.heads, self.groups = heads, groups
-        self.ask = nn.Conv2d(width, heads * groups * 2 + width, 1)
-        self.tell = nn.Conv2d(width, width, 1)
-        nn.init.zeros_(self.tell.weight)
+        self.qkv = nn.Conv2d(width, heads * groups * 2 + width, 1)
+        self.proj = nn.Conv2d(width, width, 1)
+        nn.init.zeros_(self.proj.weight)
 
     def forward(self, x: Tensor, inside: Tensor) -> Tensor:
         batch, width, height, across = x.shape
         sorts = self.heads * self.groups
-        member, weight, value = self.ask(F.relu(x)).split([sorts, sorts, width], dim=1)
+        member, weight, value = self.qkv(F.relu(x)).split([sorts, sorts, width], dim=1)
         group = (batch, self.heads, self.groups, -1)
         member = torch.softmax(member.float().reshape(group), dim=2)
         weight = torch.softmax(weight.float().reshape(group) + torch.log(inside.flatten(2)[:, :, None] + 1e-4), dim=3)
         value = value.float().reshape(batch, self.heads, width // self.heads, -1)
         means = value @ weight.transpose(2, 3)  # (B, heads, width/heads, groups)
-        return x + self.tell((means @ member).reshape(batch, width, height, across).to(x.dtype))
+        return x + self.proj((means @ member).reshape(batch, width, height, across).to(x.dtype))
 
 
 class Branch(nn.Module):  # type: ignore[misc]  # torch comes without types here
@@ -210,26 +210,26 @@ class Branch(nn.Module):  # type: ignore[misc]  # torch comes without types here
         nn.init.normal_(self.out.weight, std=1e-2)
         nn.init.zeros_(self.out.bias)
         self.hint = nn.ModuleList()
-        self.share = nn.ModuleDict()
+        self.attention = nn.ModuleDict()
         if hints:
             self.hint.append(nn.Conv2d(4 * (hints + len(CHANNELS)), widths[0], 3, padding=1))
             self.hint.extend(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(widths))
-            self.share = nn.ModuleDict({str(level): Share(widths[level]) for level in _SHARED})
+            self.attention = nn.ModuleDict({str(level): LinearAttention(widths[level]) for level in _SHARED})
 
-    def forward(self, features: list[Tensor], seen: Tensor, inside: Tensor, told: Tensor | None = None) -> Tensor:
+    def forward(self, features: list[Tensor], seen: Tensor, inside: Tensor, readings: Tensor | None = None) -> Tensor:
         hinted: list[Tensor] = []
         for hint in self.hint:
             hinted.append(hint(F.relu(hinted[-1]) if hinted else F.pixel_unshuffle(seen, 2)))
-            if told is not None and len(hinted) == 2:
-                hinted[-1] = hinted[-1] + told
+            if readings is not None and len(hinted) == 2:
+                hinted[-1] = hinted[-1] + readings
         y = features[-1]
         for level in reversed(range(len(self.up))):
             skip = self.skip[level](features[level])
             skip = self.skip_block[level](skip + hinted[level] if hinted else skip)
             lifted = F.interpolate(self.up[level](y), scale_factor=2.0, mode="bilinear", align_corners=False)
             y = self.block[level](skip + lifted)
-            if str(level) in self.share:
-                y = self.share[str(level)](y, F.avg_pool2d(inside, 2 << level))
+            if str(level) in self.attention:
+                y = self.attention[str(level)](y, F.avg_pool2d(inside, 2 << level))
         y = F.pixel_shuffle(self.fine(F.relu(y)), 2) + self.raw(seen)
         y = y + self.mix(F.relu(y))
         return self.out(F.relu(y))

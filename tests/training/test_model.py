@@ -57,7 +57,7 @@ def test_a_far_pixel_reaches_the_whole_object() -> None:
 def test_context_tells_every_cell_of_the_object_of_every_other() -> None:
     torch.manual_seed(6)
     context = model.Context(16, heads=2)
-    torch.nn.init.normal_(context.tell.weight)
+    torch.nn.init.normal_(context.proj.weight)
     x, inside = torch.randn(1, 16, 4, 4), torch.ones(1, 1, 4, 4)
     inside[..., 3] = 0
     before = context(x, inside)
@@ -69,10 +69,10 @@ def test_context_tells_every_cell_of_the_object_of_every_other() -> None:
 
 
 def test_groups_tell_alike_places_the_same() -> None:
-    """What `Share` adds depends on a place's own features and the whole picture's, not on where it lies."""
+    """What `LinearAttention` adds depends on a place's own features and the whole picture's, not on where it lies."""
     torch.manual_seed(3)
-    share = model.Share(16, heads=2, groups=4)
-    torch.nn.init.normal_(share.tell.weight)
+    share = model.LinearAttention(16, heads=2, groups=4)
+    torch.nn.init.normal_(share.proj.weight)
     x, inside = torch.randn(1, 16, 6, 6), torch.ones(1, 1, 6, 6)
     order = torch.randperm(36)
     mixed = x.flatten(2)[:, :, order].reshape(x.shape)
@@ -83,8 +83,8 @@ def test_groups_tell_alike_places_the_same() -> None:
 
 def test_groups_do_not_see_what_is_outside_the_mask() -> None:
     torch.manual_seed(4)
-    share = model.Share(16, heads=2, groups=4)
-    torch.nn.init.normal_(share.tell.weight)
+    share = model.LinearAttention(16, heads=2, groups=4)
+    torch.nn.init.normal_(share.proj.weight)
     x, inside = torch.randn(1, 16, 8, 8), torch.ones(1, 1, 8, 8)
     inside[..., 4:] = 0
     changed = x.clone()
