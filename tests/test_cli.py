@@ -186,9 +186,9 @@ def test_folder_that_is_no_result_is_exit_2(tmp_path: Path, polcap: Command, com
 
 
 def test_user_mask_replaces_the_search(result: Path, example: Path, polcap: Command, tmp_path: Path) -> None:
-    copy, drawn = tmp_path / "copy", np.zeros((288, 384), np.uint8)
+    copy, drawn = tmp_path / "copy", np.zeros((432, 576), np.uint8)
     shutil.copytree(result, copy)
-    drawn[80:200, 70:160] = 255
+    drawn[120:300, 105:240] = 255
     cv2.imwrite(str(tmp_path / "mask.png"), drawn)
     done = polcap("process", example, "--out", copy, "--mask", tmp_path / "mask.png", "--until", "mask", "--json")
     assert done.returncode == 0, done.stderr

@@ -210,9 +210,10 @@ def test_photographs_are_never_touched(example: Path, tmp_path: Path, polcap: Co
 
 def test_plan_tells_what_is_cached(result: Path, example: Path) -> None:
     found = captures.read(example)
-    states = pipeline.plan(found, UserInput(), Config(), result)
+    supplied = UserInput(mask_network=pipeline.load_mask_network())
+    states = pipeline.plan(found, supplied, Config(), result)
     assert set(states.values()) == {"cached", "on demand"}
-    states = pipeline.plan(found, UserInput(), Config(), result, force="mask")
+    states = pipeline.plan(found, supplied, Config(), result, force="mask")
     assert states["align"] == "cached" and states["mask"] == states["surface"] == "compute"
 
 

@@ -91,7 +91,11 @@ def decode(path: str) -> worker.Answer:
         finally:
             source.close()
     pixels = np.asarray(pixels, dtype=np.float32).reshape(spec.height, spec.width, len(names))
-    plain = {key: value for key, value in attributes.items() if isinstance(value, (str, int, float))}
+    plain = {
+        key: list(value) if isinstance(value, tuple) else value
+        for key, value in attributes.items()
+        if all(isinstance(part, (str, int, float)) for part in (value if isinstance(value, tuple) else (value,)))
+    }
     return {"names": names, "attributes": plain}, {name: pixels[..., k] for k, name in enumerate(names)}
 
 

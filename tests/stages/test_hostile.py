@@ -92,6 +92,7 @@ def run(radiance: AngleStack, drawn: np.ndarray | None) -> None:
         "names": [str(k) for k in range(len(radiance.angle))], "focal_known": True, "grid_px": 1.0,
         "chart_missing": "", "blur_px": None, "clipped": np.zeros(len(radiance.angle)), "radiance": radiance,
         "color": color, "alignment": alignment, "object_": object_, "gains": gains, "stokes": image, "maps": maps,
+        "mesh": mesh,
     }  # fmt: skip
     told = list(gates.judge(SimpleNamespace(**found), config))
     assert all(gate.says and gate.state in ("pass", "warn", "fail", "not measured") for gate in told)
