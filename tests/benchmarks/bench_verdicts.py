@@ -14,6 +14,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from polcap import check, gates, path
@@ -171,7 +172,7 @@ def _good(seed: int, kind: str, width: int, random: np.random.Generator) -> Shoo
     angles = ANGLES[seed % 3] if not kind else ANGLES[0]
     bracket = ("time", "flash", "iso")[seed % 3]
     how = Shoot(seed=seed, width=width, height=width * 3 // 4, samples=1, angles_deg=angles, bracket=bracket)  # type: ignore[arg-type]
-    scene = random_scene(seed, ("bumps", "clusters", "vase")[(seed // 2) % 3])  # type: ignore[arg-type]
+    scene = random_scene(seed, ("bumps", "clusters", "vase")[(seed // 2) % 3])
     look = LOOKS[seed % 5] if not kind else LOOKS[0]
     if look != "as drawn":
         scene = msgspec.structs.replace(scene, coat=_dressed(scene.coat, look))
@@ -243,7 +244,7 @@ def _plant(planned: Shooting, kind: str, random: np.random.Generator) -> None:
         planned.light = lambda light, k, e: np.where(mask[..., None], mean + 0.12 * (light - mean), light)
 
 
-def _pushed(light: Floats, mask: Floats, px: int) -> Floats:
+def _pushed(light: Floats, mask: NDArray[np.bool_], px: int) -> Floats:
     """The object moved by so many pixels before its backdrop."""
     moved, there = np.roll(light, px, 1), np.roll(mask, px, 1)
     behind = np.where(mask[..., None], np.median(light[~mask], axis=0), light)
