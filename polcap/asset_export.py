@@ -65,7 +65,7 @@ def export(out: Path, about: Mapping[str, Any], wanted: Wanted) -> list[Path]:
     stored = maps_folder.read(out / "maps")
     mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, config.surface)
     built = asset.build(stored.maps, mesh, config.asset)
-    levels = [surface.decimated(mesh, stored.maps.view, 0.25**k) for k in range(1, wanted.lod + 1)]
+    levels = [surface.decimated(mesh, stored.maps.view, 0.25**k, config.surface.back) for k in range(1, wanted.lod + 1)]
     lods = [asset.build(stored.maps, level.mesh, config.asset) for level in levels]
     if wanted.texture_size is not None:
         built, *lods = (asset.resized(one, wanted.texture_size) for one in (built, *lods))

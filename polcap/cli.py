@@ -357,7 +357,7 @@ def check(
     capture: Annotated[Path, typer.Argument(help="Folder with the photographs.")],
     config: Annotated[Path | None, typer.Option(help="TOML file of settings, a section per stage.")] = None,
     assignments: Annotated[
-        list[str] | None, typer.Option("--set", metavar="K=V", help="A setting, as check.max_blur_px=2; repeatable.")
+        list[str] | None, typer.Option("--set", metavar="K=V", help="A setting, as gates.max_blur_px=2; repeatable.")
     ] = None,
     angles: Annotated[
         str | None, typer.Option(metavar="DEG,…", help="Angles of the shots in order, as 0,45,90.")

@@ -188,7 +188,7 @@ def load_mask_network(threads: int = 0) -> Network | None:
 
 def sweep(out: Path) -> None:
     """Remove what a killed run left half written; final names are whole by construction."""
-    for place in (out, out / "maps", out / "asset"):
+    for place in (out, out / "maps", out / "asset", *(out / "asset").glob("*/")):
         for left in place.glob(".*.part*"):
             atomic.discard(left)
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from polcap.batch import unit as units
+from polcap.batch.processes import prepare
 from polcap.batch.unit import Order, Record, Unit
 from polcap.errors import SettingError
 
@@ -58,6 +59,7 @@ def _gather(
     import distributed
 
     attempts = dict.fromkeys(wanted, 1)
+    client.run(prepare, order)  # those that join later work with what they were started with
     doing = {client.submit(units.run, unit, order, pure=False, resources=resources): unit for unit in wanted}
     landing = distributed.as_completed(list(doing))
     for future in landing:

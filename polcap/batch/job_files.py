@@ -39,6 +39,9 @@ _OK = "|| test $? -eq 3"
 _LEFT_OUT = ("context", "root", "shard", "write_jobs", "jobs", "json", "scheduler")  # of the command's options
 
 
+_UNSAID = {"threads": 0, "memory": 0, "workers": 0}  # defaults that need no word
+
+
 def command(root: Path, options: Mapping[str, Any]) -> tuple[str, ...]:
     """`polcap batch ROOT …` with the options that were given, by their names in the function of cli.py."""
     words = ["polcap", "batch", str(root.resolve())]
@@ -46,7 +49,7 @@ def command(root: Path, options: Mapping[str, Any]) -> tuple[str, ...]:
         if name == "keep_going":
             words += [] if value else ["--fail-fast"]
             continue
-        if name in _LEFT_OUT or value in (None, False, 0, [], ()):
+        if name in _LEFT_OUT or value is None or value is False or value in ([], ()) or value == _UNSAID.get(name):
             continue
         flag = "--set" if name == "assignments" else "--" + name.replace("_", "-")
         if isinstance(value, list | tuple):

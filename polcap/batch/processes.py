@@ -102,9 +102,9 @@ def _serve(pipe: connection.Connection, order: Order) -> None:
 
 
 def prepare(order: Order) -> None:
-    """Threads and memory of this process, before any numerical library has started its own."""
+    """Threads and memory of this process."""
     if order.threads:
-        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
             os.environ[name] = str(order.threads)
         import cv2
 

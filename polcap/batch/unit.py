@@ -19,12 +19,12 @@ import msgspec
 
 from polcap import __version__
 from polcap.errors import InputError, PolcapError, StorageError
-from polcap.formats import atomic
+from polcap.formats import atomic, layouts
 from polcap.images import ChartRequest, Network
 
 State = Literal["todo", "running", "interrupted", "done", "gates", "failed", "bug", "crashed"]
 FINISHED: tuple[State, ...] = ("done", "gates")  # the asset is there
-FOLDER = "polcap-batch"  # in ROOT or in --out: records, thumbnails, summary, job files; safe to delete
+FOLDER = layouts.BATCH  # in ROOT or in --out: records, thumbnails, summary, job files; safe to delete
 
 
 @dataclass(frozen=True)
@@ -91,6 +91,8 @@ def run(unit: Unit, order: Order, attempt: int = 1) -> Record:
         record = replace(record, state="gates" if failed else "done", says=says)
     except PolcapError as error:
         record = replace(record, state="failed", says=_line(error))
+    except OSError as error:
+        record = replace(record, state="failed", says=_line(error))
     except MemoryError:
         record = replace(record, state="failed", says="out of memory; raise --memory or run fewer workers")
     except Exception as error:
@@ -139,7 +141,8 @@ def stamp(unit: Unit, order: Order) -> str:
     out = Path(unit.out).resolve()
     for root, folders, names in os.walk(unit.capture):
         here = Path(root)
-        folders[:] = sorted(name for name in folders if not name.startswith(".") and (here / name).resolve() != out)
+        left_out = {name for name in folders if name.startswith(".") or name in layouts.OURS}
+        folders[:] = sorted(name for name in folders if name not in left_out and (here / name).resolve() != out)
         for name in sorted(names):
             if not name.startswith("."):
                 about = (here / name).stat()

@@ -10,8 +10,9 @@ from polcap.errors import DecodeError
 from polcap.formats import focal, photo, probe, raw
 from polcap.images import Exif, SensorImage
 from polcap.optics import sensor
+from polcap.stages import hdr
 
-_CLIP = 0.98  # of the white level, from where counts are clipped
+_CLIP = hdr.Settings().clip
 _PATTERNS = {0: "R", 1: "G", 2: "B"}
 
 

@@ -19,6 +19,8 @@ from polcap.formats.probe import Probe
 from polcap.images import Role
 
 OUTPUT = "polcap"  # where results go by default
+BATCH = "polcap-batch"  # where a batch keeps its records: in ROOT or in --out; safe to delete
+OURS = (OUTPUT, BATCH)  # folders among photographs that hold none
 DEFAULT_DEG = (0.0, 45.0, 90.0)
 APART_DEG = 5.0  # closer angles do not count as different
 EQUAL_STOPS = 0.15  # EXIF rounds times to a sixth of a stop at worst
@@ -86,7 +88,7 @@ def looks_like_a_capture(folder: Path, inside: Iterable[str], files: Iterable[st
     """
     if capture_toml.NAME in files or any(_POL_FOLDER.fullmatch(name) for name in inside):
         return True
-    if any(name != OUTPUT and not name.startswith(".") for name in inside):
+    if any(name not in OURS and not name.startswith(".") for name in inside):
         return False
     return any(probe.kind(folder / name) in ("raw", "photo") for name in sorted(files) if not name.startswith("."))
 
@@ -140,7 +142,7 @@ def _folders(folder: Path, sub_folders: dict[float, Path], angles_deg: Sequence[
     beside = sorted(
         path.name
         for path in _children(folder)
-        if path.is_dir() and path not in sub_folders.values() and path.name != OUTPUT
+        if path.is_dir() and path not in sub_folders.values() and path.name not in OURS
     )
     notes += [f"not used: the folders {', '.join(beside)}"] if beside else []
     loose = sorted(path.name for path in _children(folder) if path.is_file() and path.name != capture_toml.NAME)

@@ -101,7 +101,8 @@ class Worker:
                 head, arrays = self._answer(cast(IO[bytes], child.stdout))
             except (EOFError, OSError):
                 code = child.wait()
-                raise errors.DecodeError(self._cause_of_death(path, code, limit, overdue.is_set())) from None
+                gib = limit_gib or self.memory_gib
+                raise errors.DecodeError(self._cause_of_death(path, code, limit, gib, overdue.is_set())) from None
             except (ValueError, TypeError, KeyError) as error:
                 self._stop()
                 raise errors.DecodeError(f"{os.fspath(path)}: the decoder's answer is damaged ({error})") from error
@@ -115,8 +116,12 @@ class Worker:
             bug.add_note(str(head["traceback"]))
             raise bug
         if "error" in head:
-            kind = getattr(errors, head["kind"])
-            raise kind(head["error"]) if issubclass(kind, errors.InputError) else TypeError(head["kind"])
+            kind = getattr(errors, str(head.get("kind")), None)
+            if isinstance(kind, type) and issubclass(kind, errors.InputError):
+                raise kind(head["error"])
+            raise errors.DecodeError(f"{os.fspath(path)}: {head['error']}")
+        if "meta" not in head:
+            raise errors.DecodeError(f"{os.fspath(path)}: the decoder's answer is damaged (it says nothing)")
         return head["meta"], arrays
 
     def close(self) -> None:
@@ -172,13 +177,15 @@ class Worker:
             os.close(self._lifeline)
             self._lifeline = None
 
-    def _cause_of_death(self, path: str | os.PathLike[str], code: int, limit_s: float, overdue: bool) -> str:
+    def _cause_of_death(
+        self, path: str | os.PathLike[str], code: int, limit_s: float, gib: float, overdue: bool
+    ) -> str:
         name = os.fspath(path)
         if overdue or code == -_signal("SIGXCPU"):
             return f"{name}: not decoded within {limit_s:g} s; the file is damaged or far too large"
         last = self._last_line()
         memory = "MemoryError" in last or "bad_alloc" in last or code == -9
-        cause = f"ran out of memory ({self.memory_gib:g} GiB)" if memory else f"crashed (exit {code}) {last}"
+        cause = f"ran out of memory ({gib:g} GiB)" if memory else f"crashed (exit {code}) {last}"
         return f"{name}: the decoder {cause.strip()}; the file is damaged, copy it from the card again"
 
     def _last_line(self) -> str:
@@ -323,7 +330,8 @@ def _time_limit(limit_s: float) -> Iterator[None]:
         import resource
 
         spent = int(time.process_time() + limit_s * (os.cpu_count() or 1) + _GRACE_S)
-        resource.setrlimit(resource.RLIMIT_CPU, (spent, resource.getrlimit(resource.RLIMIT_CPU)[1]))
+        most = resource.getrlimit(resource.RLIMIT_CPU)[1]  # of the machine's owner: never raised
+        resource.setrlimit(resource.RLIMIT_CPU, (spent if most < 0 else min(spent, most), most))
     faulthandler.dump_traceback_later(limit_s + _GRACE_S, exit=True)  # by a thread that needs no interpreter
     try:
         yield

@@ -11,8 +11,6 @@ from polcap.optics import demosaic, sensor
 from polcap.stages.hdr import noise
 from polcap.stages.hdr.planes import Reader, planar, signals
 
-_CLIP = 0.98
-
 
 @dataclass(frozen=True)
 class Ambient:
@@ -34,8 +32,8 @@ def gathered(frame: Frame, reference: Frame) -> float:
     return settings if np.isfinite(settings) else 1.0
 
 
-def measure(shot: Shot, reference: Frame, lines: noise.Lines, read: Reader, full: bool) -> Ambient | None:
-    """The mean of a shot's ambient frames; None where it has none."""
+def measure(shot: Shot, reference: Frame, lines: noise.Lines, read: Reader, full: bool, clip: float) -> Ambient | None:
+    """The mean of a shot's ambient frames; None where it has none. `clip` as in the stage's settings."""
     if not shot.ambient:
         return None
     value: Floats | None = None
@@ -52,7 +50,7 @@ def measure(shot: Shot, reference: Frame, lines: noise.Lines, read: Reader, full
         image = read(frame)
         key = frame.exif.iso or "ambient"
         if not lines.knows(key):
-            lines.learn(key, noise.alone(signals(image, _CLIP)))
+            lines.learn(key, noise.alone(signals(image, clip)))
         line = lines.line(key, sensor.rounding(image) / 2)
         level = np.stack([cv2.blur(plane, (5, 5)) for plane in value]) * np.float32(one)
         variance += noise_of(level, line, image.cfa if full else None) / np.float32(sum(share) ** 2)

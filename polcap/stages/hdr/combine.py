@@ -56,7 +56,7 @@ def prepare(
     if full:
         ghost = np.repeat(np.repeat(measured.ghost, 2, axis=0), 2, axis=1)
         measured = replace(measured, estimate=_twice(measured.estimate), ghost=ghost)
-    ambient = ambients.measure(shot, shot.frames[reference], lines, read, full)
+    ambient = ambients.measure(shot, shot.frames[reference], lines, read, full, clip)
     bright = [float(link.ratio.mean()) for link in links]
     darkest = int(np.argmin(bright))
     served = anchored = np.zeros(measured.ghost.shape, bool)

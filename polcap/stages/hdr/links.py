@@ -57,7 +57,7 @@ class Shooting:
         still = read(shot.frames[reference])
         self.raw_px = 1.0 if still.cfa is None else 2.0  # of one pixel
         self.least = sensor.rounding(still) / 2  # of a binned green
-        self.ambient = ambients.measure(shot, shot.frames[reference], lines, read, False)
+        self.ambient = ambients.measure(shot, shot.frames[reference], lines, read, False, clip)
 
     def gathered(self, e: int) -> np.float32:
         return np.float32(ambients.gathered(self.shot.frames[e], self.shot.frames[self.reference]))

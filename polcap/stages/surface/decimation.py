@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from polcap.errors import ObjectError
 from polcap.images import Floats, Mesh, View
 from polcap.stages.surface import boundary
+from polcap.stages.surface.backing import Back
 from polcap.stages.surface.triangles import frames
 
 _FEWEST = 16  # triangles
@@ -26,8 +27,10 @@ class Decimated:
     error_px: float  # the same in px of the maps, at the object's middle depth
 
 
-def decimated(mesh: Mesh, view: View, share: float) -> Decimated:
+def decimated(mesh: Mesh, view: View, share: float, back: Back) -> Decimated:
     """The mesh in about a `share` of its triangles; textures stay where they are, as seen from the camera.
+
+    `back` says whether it has walls, whose triangles face away from the camera.
 
     Raises
     ------
@@ -49,7 +52,8 @@ def decimated(mesh: Mesh, view: View, share: float) -> Decimated:
     a, b = -vertices[:, 0] / vertices[:, 2], -vertices[:, 1] / vertices[:, 2]
     uv = (np.stack([view.center[0] + view.focal * a, view.center[1] - view.focal * b], -1) + 0.5) / [width, height]
     faces = np.asarray(faces, dtype=np.int32)
-    faces = faces[boundary.area(uv, faces) > 0]  # what a collapse folded over is not seen
+    if back == "open":
+        faces = faces[boundary.area(uv, faces) > 0]  # what a collapse folded over is not seen
     normals, tangents = frames(vertices, uv, faces)
     less = replace(
         mesh,
