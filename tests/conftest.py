@@ -26,18 +26,18 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 class SkippedList:
-    """Collects what was skipped, whole files and single tests."""
+    """Collects what was skipped, whole files and tests with all their parameters, which may be others elsewhere."""
 
     def __init__(self, file: Path) -> None:
         self._file, self._names = file, set[str]()
 
     def pytest_collectreport(self, report: pytest.CollectReport) -> None:
         if report.skipped:
-            self._names.add(report.nodeid)
+            self._names.add(report.nodeid.partition("[")[0])
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         if report.skipped:
-            self._names.add(report.nodeid)
+            self._names.add(report.nodeid.partition("[")[0])
 
     def pytest_sessionfinish(self) -> None:
         self._file.write_text("".join(f"{name}\n" for name in sorted(self._names)), encoding="utf-8")
