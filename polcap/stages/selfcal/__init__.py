@@ -3,7 +3,8 @@
 One per cent of flash energy fakes, where a surface faces the camera, the polarization of one tilted by 24° (over a
 whole object it costs normals about 6° on average). A matt grey patch is unpolarized, so its brightness must be the
 same in every shot (`grey_patches`); where there is no chart, the object itself says what it can (`object_gains`), and
-what is known of lamps and flashes says the rest. One exposure of a polarization mosaic has one gain. The outline tells whether the angles are in order, counted the right way, and clocked (`order`).
+what is known of lamps and flashes says the rest. One exposure of a polarization mosaic has one gain. The outline tells
+whether the angles are in order, counted the right way, and clocked (`order`).
 """
 
 from typing import Annotated, Literal
