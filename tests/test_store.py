@@ -360,3 +360,19 @@ def test_a_disk_that_refuses_is_one_clear_line(
         path(Store(tmp_path))[0].materialize()
     assert "\n" not in str(caught.value)
     assert list((tmp_path / "work").iterdir()) == []
+
+
+def test_an_alias_of_an_array_type_is_read_as_the_array(tmp_path: Path) -> None:
+    """From Python 3.12 on NumPy's NDArray is a `type` alias, whose origin is itself."""
+    import types
+    from typing import get_origin
+
+    from polcap.formats import npy_folder
+
+    class Alias:
+        __value__ = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
+
+    npy_folder.save(tmp_path / "value.npy", np.arange(3.0))
+    hint = types.GenericAlias(Alias, (float,))
+    assert get_origin(hint) is Alias
+    assert np.array_equal(npy_folder.decode({"array": "value.npy"}, hint, tmp_path), np.arange(3.0))

@@ -59,6 +59,8 @@ def decode(tree: Any, hint: Any, folder: Path) -> Any:
         if tree is None and NoneType in inner:
             return None
         return decode(tree, next(arm for arm in inner if arm is not NoneType), folder)
+    if hasattr(origin, "__value__"):  # a `type` alias, as NumPy's NDArray is from Python 3.12 on
+        origin = get_origin(origin.__value__)
     if origin is np.ndarray or hint is np.ndarray:
         return load(_array_file(tree, folder))
     if is_dataclass(hint) and isinstance(hint, type):
