@@ -41,6 +41,7 @@ STATUS = {
     0x0D: "over-current; free the ring, check the supply",
 }
 _OK, _BUSY = 0x00, 0x09
+_LATE = 3  # answers to earlier commands that may still come when one is given
 _FULL_SPEED = 430.0  # degrees/s, nominal
 _ANSWER = re.compile(r"([0-9A-F])(IN|GS|PO|HO)([0-9A-F]+)")
 _LENGTH = {"IN": 30, "GS": 2, "PO": 8, "HO": 8}  # digits of data
@@ -93,7 +94,11 @@ class Elliptec:
         return (pulses - (1 << 32 if pulses >> 31 else 0)) / self._pulses * 360.0
 
     def halt(self) -> None:
-        self._ask("st", "GS")  # between moves the piezo is without current: nothing to release
+        self._port.send(f"{self._address}st".encode())  # between moves the piezo is without current
+        for _ in range(_LATE):  # busy: the answer to a question asked before
+            kind, data = self._answer()
+            if (kind, int(data, 16)) != ("GS", _BUSY):
+                return
 
     def close(self) -> None:
         self._port.close()
