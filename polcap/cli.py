@@ -93,6 +93,17 @@ def process(
     model: Annotated[Path | None, typer.Option(metavar="ONNX", help="Another model than the shipped one.")] = None,
 ) -> None:
     """Turn a capture into maps and a 3-D asset."""
+    from polcap import unchanged
+
+    target = out or capture / "polcap"
+    request = None if until or force or dry_run or watch else _request(context.params, capture, target)
+    if (finished := unchanged.find(target, request)) is not None:
+        terminal.tell(finished.table)
+        with terminal.progress(len(finished.stages)) as bar:
+            for name in finished.stages:
+                bar.stage(name, 0.0, True)
+        _tell_result(finished.report, target, json)
+        return
     _use_threads(threads)
     from polcap import config as settings
     from polcap import pipeline
@@ -104,13 +115,12 @@ def process(
         if stage is not None and stage not in STAGES:
             raise SettingError(f"{flag} {stage}: no such stage; choose one of {', '.join(STAGES)}")
     chosen = settings.load(config, assignments or ())
-    request = _chart(chart, no_chart)
-    target = out or capture / "polcap"
+    calibration = _chart(chart, no_chart)
 
     @functools.cache
     def supplied() -> UserInput:
         return UserInput(
-            chart=request,
+            chart=calibration,
             mask=None if mask is None else _mask(mask),
             network=pipeline.load_network(estimator, model, device, threads),
             mask_network=pipeline.load_mask_network(threads),
@@ -122,21 +132,40 @@ def process(
             _print_plan(found, pipeline.plan(found, supplied(), chosen, target, force), json)
             return
         known = supplied()
-        terminal.tell(captures.table(found))
+        table = captures.table(found)
+        terminal.tell(table)
         with terminal.progress(len(STAGES) + 1) as bar:
             about = pipeline.process(found, known, chosen, target, until, force, bar.stage, bar.frame)
         if about is None:
             work = str(target / "work")
             terminal.say({"until": until, "work": work} if json else work)
             return
-        terminal.say(about if json else str(target / "asset" / f"{found.name}.glb"))
-        terminal.tell(f"verdict {about['verdict']}; {target / 'report.html'}")
-        terminal.tell_gates(about)
+        unchanged.remember(target, request, table, (*pipeline.timings(target), "write"))
+        _tell_result(about, target, json)
 
     if watch:
         _whenever_settled(capture, target, once)
     else:
         once()
+
+
+def _request(options: dict[str, Any], capture: Path, out: Path) -> str | None:
+    """What identifies a run of `process`: its options and the state of all files that it reads."""
+    from polcap import unchanged
+
+    aside = ("capture", "out", "json", "dry_run", "watch", "threads", "memory")  # they change no byte of a result
+    given = [options[name] for name in ("config", "mask", "model") if options[name] is not None]
+    if options["chart"] is not None and Path(options["chart"]).suffix == ".toml":
+        given.append(Path(options["chart"]))
+    asked = {name: value for name, value in options.items() if name not in aside}
+    return unchanged.fingerprint(asked, capture, out, given)
+
+
+def _tell_result(about: dict[str, Any], out: Path, json: bool) -> None:
+    """The asset on stdout, the verdict beside it; a failed gate ends with exit code 3."""
+    terminal.say(about if json else str(out / "asset" / f"{about['capture']['name']}.glb"))
+    terminal.tell(f"verdict {about['verdict']}; {out / 'report.html'}")
+    terminal.tell_gates(about)
 
 
 def _whenever_settled(capture: Path, target: Path, once: Callable[[], None]) -> None:

@@ -1,0 +1,106 @@
+"""In: what `polcap process` is asked. Out: whether the same was asked before of the same files, and what it answered.
+
+A look at sizes and times, as build tools take one, before anything is imported or hashed; where a file, an option or
+the program differs in any of them the keys of `store.py` decide. So a run that has nothing to do costs milliseconds.
+"""
+
+import json
+import os
+import sys
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from polcap.formats import atomic, provenance, text_file
+
+_FILE = "unchanged.json"
+_OF_A_RUN = ("lock", "owner", _FILE)  # in work/: they differ from run to run
+_SETTLED_NS = 3_000_000_000  # a file system's clock may have steps of 2 s; in one step a file may change twice
+_PACKAGE = Path(__file__).parent
+Stats = dict[str, list[int]]
+
+
+class Finished(NamedTuple):
+    """A finished run."""
+
+    table: str  # what was understood of the capture
+    stages: tuple[str, ...]  # that lie in the cache
+    report: dict[str, Any]
+
+
+class InDoubt(Exception):
+    """Sizes and times do not tell."""
+
+
+def fingerprint(asked: Mapping[str, Any], capture: Path, out: Path, given: Iterable[Path]) -> str | None:
+    """Digest of a request: options, program, photographs and the `given` files by size and time; None if in doubt."""
+    try:
+        photographs, files = _folder(capture, out), [[str(file.absolute()), _stat(file)] for file in given]
+        newest = max((stat[1] for stat in [*photographs.values(), *(stat for _, stat in files)]), default=0)
+        if newest > time.time_ns() - _SETTLED_NS:
+            return None
+        program = [sys.version, provenance.versions(), _folder(_PACKAGE), _folder(_PACKAGE.parent / "calib")]
+    except (OSError, InDoubt):
+        return None
+    places = [os.path.realpath(capture), os.path.realpath(out)]
+    text = json.dumps([dict(asked), places, photographs, files, program], sort_keys=True, default=str)
+    return blake2b(text.encode(errors="surrogateescape"), digest_size=16).hexdigest()
+
+
+def find(out: Path, request: str | None) -> Finished | None:
+    """The run that answered this very request, if all that it wrote stands as it left it."""
+    if request is None:
+        return None
+    try:
+        known = text_file.read_json(out / "work" / _FILE)
+        if known["request"] != request or known["result"] != _result(out):
+            return None
+        return Finished(str(known["table"]), tuple(known["stages"]), text_file.read_json(out / "report.json"))
+    except (OSError, ValueError, TypeError, KeyError, InDoubt):
+        return None
+
+
+def remember(out: Path, request: str | None, table: str, stages: Iterable[str]) -> None:
+    """What `find` finds after this run; nothing where the request is in doubt.
+
+    Raises
+    ------
+    StorageError
+        The result folder cannot be written.
+    """
+    if request is None:
+        return
+    known = {"request": request, "table": table, "stages": list(stages), "result": _result(out)}
+    with atomic.path(out / "work" / _FILE) as temporary:
+        temporary.write_text(json.dumps(known) + "\n", encoding="utf-8")
+
+
+def _result(out: Path) -> Stats:
+    found = _folder(out)
+    return {name: stat for name, stat in found.items() if name not in [os.path.join("work", one) for one in _OF_A_RUN]}
+
+
+def _folder(folder: Path, but: Path | None = None) -> Stats:
+    """Size and times of every file below a folder, without what lies in `but`; empty where there is none."""
+    aside = None if but is None else os.path.realpath(but)
+    return {os.path.relpath(file, folder): _stat(file) for file in _files(str(folder), aside)}
+
+
+def _files(folder: str, aside: str | None) -> Iterator[str]:
+    for place, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if name != "__pycache__" and not _same(os.path.join(place, name), aside)]
+        if any(os.path.islink(os.path.join(place, name)) for name in folders):
+            raise InDoubt  # what a link leads to is not walked
+        yield from (os.path.join(place, name) for name in files)
+
+
+def _same(place: str, aside: str | None) -> bool:
+    return aside is not None and os.path.realpath(place) == aside
+
+
+def _stat(file: str | Path) -> list[int]:
+    """Size, time of the content, time of the last change of any kind, and which file it is."""
+    about = os.stat(file)
+    return [about.st_size, about.st_mtime_ns, about.st_ctime_ns, about.st_ino]
