@@ -4,7 +4,6 @@ Decoders return pixels from files that are cut, stripped or of a form they do no
 lay in memory. In the worker.
 """
 
-import re
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ _FORMS = {
 }
 _LOSSY = 34892  # JPEG of 8 bits under a curve; LibRaw decodes some of them to black
 _COPY_AGAIN = "copy it from the card again"
-_MARKER = re.compile(rb"\xff+[^\x00\xff\xd0-\xd7]")  # ends the coded data of a JPEG scan
+_PART = 1 << 20  # bytes of coded data that are searched at a time
 _CLIPPED_SHARE = 0.5  # of a picture; no exposure of use has more at the white level
 _BEYOND = 2.0  # white levels; counts that reach so far deny the level
 
@@ -104,12 +103,22 @@ def check_jpeg(path: str, data: bytes, start: int = 0) -> None:
             continue
         at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
         if marker == 0xDA:  # coded data follow
-            found = _MARKER.search(data, at)
-            if found is None:
-                break
-            at = found.end() - 2
+            at = _end_of_scan(data, at)
     if data[at : at + 2] != b"\xff\xd9":
         raise DecodeError(f"{path}: is cut short, its JPEG data have no end; {_COPY_AGAIN}")
+
+
+def _end_of_scan(data: bytes, start: int) -> int:
+    """Where the first marker after a JPEG scan's coded data stands: FF, and what is neither stuffing nor a restart."""
+    coded = np.frombuffer(data, np.uint8)
+    for at in range(start, len(data), _PART):
+        part = coded[at : at + _PART + 1]
+        marks = np.flatnonzero(part[:-1] == 0xFF)
+        code = part[marks + 1]
+        ends = marks[(code != 0) & (code != 0xFF) & ((code < 0xD0) | (code > 0xD7))]
+        if len(ends):
+            return at + int(ends[0])
+    return len(data)
 
 
 def check_levels(path: str, value: NDArray[Any], black: float, white: float, lossy: bool) -> None:
