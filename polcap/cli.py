@@ -391,6 +391,10 @@ def check(
     angles: Annotated[
         str | None, typer.Option(metavar="DEG,…", help="Angles of the shots in order, as 0,45,90.")
     ] = None,
+    chart: Annotated[
+        str | None, typer.Option(metavar="X0,Y0,…|FILE", help="As given to process: the chart's corners, or a profile.")
+    ] = None,
+    no_chart: Annotated[bool, typer.Option("--no-chart", help="As given to process: there is no chart.")] = False,
     json: Json = False,
 ) -> None:
     """Keep a capture or reshoot it, and why: seconds after its last frame. Writes nothing."""
@@ -402,10 +406,11 @@ def check(
     from polcap.formats import capture as captures
 
     chosen = settings.load(config, assignments or ())
+    request = _chart(chart, no_chart)
     with ThreadPoolExecutor(1) as beside:  # the model loads while the headers are read
         network = beside.submit(pipeline.load_network, None, None, "cpu", 0)
         found = captures.read(capture, _angles(angles))
-    verdict = checks.inspect(found, network.result(), chosen, pipeline.load_mask_network())
+    verdict = checks.inspect(found, network.result(), chosen, pipeline.load_mask_network(), request)
     terminal.say(checks.shown(verdict) if json else checks.table(verdict))
     if not verdict.keep:
         raise typer.Exit(GateError.exit_code)

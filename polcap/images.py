@@ -157,6 +157,7 @@ class AngleStack:
     offset_px: Floats | None = None  # (K, 2) x, y of this grid, exactly known: reference px − offset = shot px
     curvature: Floats | None = None  # (K, E) of each frame's tone against the reference's; 0: linear, NaN: unknown
     ambient_share: Floats | None = None  # (K,) of all light, there without the flash; NaN where not photographed
+    blur_px: Floats | None = None  # (K, E) beyond the sharpest frame of the same exposure, 1σ [RAW px]; NaN: unknown
 
 
 @dataclass(frozen=True)

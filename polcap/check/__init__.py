@@ -11,7 +11,8 @@ import msgspec
 from polcap.check import judge, reduced
 from polcap.config import Config
 from polcap.gates import Gate
-from polcap.images import Capture, Network
+from polcap.images import Capture, ChartRequest, Network
+from polcap.path import AUTO
 
 
 class Verdict(msgspec.Struct, frozen=True):
@@ -22,9 +23,16 @@ class Verdict(msgspec.Struct, frozen=True):
     lines: tuple[Gate, ...]
     capture: str
     seconds: float
+    needs: str = ""  # the option without which `polcap process` ends with an error
 
 
-def inspect(capture: Capture, network: Network | None, config: Config, mask_network: Network | None = None) -> Verdict:
+def inspect(
+    capture: Capture,
+    network: Network | None,
+    config: Config,
+    mask_network: Network | None = None,
+    chart: ChartRequest = AUTO,
+) -> Verdict:
     """Judge a capture; network None expects the errors of the analytic estimator, mask_network None takes for the
     object what stands out from the backdrop.
 
@@ -34,16 +42,21 @@ def inspect(capture: Capture, network: Network | None, config: Config, mask_netw
         A frame cannot be decoded.
     """
     start = perf_counter()
-    lines = tuple(judge.judged(reduced.take(capture, config.hdr.clip), network, mask_network, config))
+    small = judge.Reduced(reduced.take(capture, config.hdr.clip), network, mask_network, config, chart)
+    lines = tuple(judge.judged(small))
     bad = [line for line in lines if line.state == "fail"]
     named = {name for line in bad for name in line.shots}
     shots = tuple(shot.name for shot in capture.shots if shot.name in named)
-    return Verdict(not bad, shots, lines, capture.name, round(perf_counter() - start, 2))
+    missing = any(line.name == "chart" and line.state == "warn" for line in lines)
+    seconds = round(perf_counter() - start, 2)
+    return Verdict(not bad, shots, lines, capture.name, seconds, "--no-chart" if missing else "")
 
 
 def table(verdict: Verdict) -> str:
     """The verdict for a person, in one screen."""
     head = "keep" if verdict.keep else f"reshoot {', '.join(verdict.shots)}".rstrip()
+    if verdict.keep and verdict.needs:
+        head += f", and process it with {verdict.needs}"
     rows = [f"{head}   ({verdict.capture}, {verdict.seconds:.1f} s)"]
     for line in verdict.lines:
         cost = f"; costs about {line.cost_deg:.0f}°" if line.cost_deg >= 1 and line.state in ("warn", "fail") else ""

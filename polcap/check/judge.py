@@ -1,13 +1,13 @@
 """A reduced capture in, its gates out: the path's own stages on small pictures, each when a gate asks for it."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cached_property
 
 import msgspec
 import numpy as np
 
 from polcap import gates
-from polcap.check import sharpness
 from polcap.check.reduced import Taken
 from polcap.config import Config
 from polcap.errors import ChartError, InputError
@@ -33,24 +33,37 @@ class Reduced:
 
     mesh: None = None  # none is made
 
-    def __init__(self, taken: Taken, network: Network | None, mask_network: Network | None, config: Config) -> None:
+    def __init__(
+        self,
+        taken: Taken,
+        network: Network | None,
+        mask_network: Network | None,
+        config: Config,
+        chart: ChartRequest,
+    ) -> None:
         self.taken, self.network, self.mask_network, self.config = taken, network, mask_network, config
+        self.chart = chart
         self.names = [shot.name for shot in taken.capture.shots]
         self.focal_known = taken.capture.focal_known
-        self.grid_px = taken.step / (taken.tile_px if config.hdr.demosaic == "superpixel" else 1)
+        self.grid_px = taken.step / (taken.binned if config.hdr.demosaic == "superpixel" else 1)
 
     @cached_property
     def radiance(self) -> AngleStack:
         motion = max(self.config.hdr.max_motion_px / self.taken.step, 1.0)
-        return hdr.merge(self.taken.capture, msgspec.structs.replace(self.config.hdr, max_motion_px=motion))
+        merged = hdr.merge(self.taken.capture, msgspec.structs.replace(self.config.hdr, max_motion_px=motion))
+        return replace(merged, blur_px=self.taken.blur_px)
 
     @cached_property
     def _color(self) -> tuple[ColorCalibration, str]:
         """Without a chart the rest can still be judged."""
-        reference = calib.colorchecker()
+        reference, step, request = calib.colorchecker(), self.taken.step, self.chart
+        if request.corners is not None:
+            request = replace(request, corners=(request.corners - (step - 1) / 2) / step)
         try:
-            return whitebalance.measure(self.radiance, reference, ChartRequest("auto"), self.config.whitebalance), ""
+            return whitebalance.measure(self.radiance, reference, request, self.config.whitebalance), ""
         except ChartError as error:
+            if request.mode != "auto":
+                raise
             none = whitebalance.measure(self.radiance, reference, ChartRequest("none"), self.config.whitebalance)
             return none, str(error).partition(" (")[2].partition(")")[0] or str(error)
 
@@ -88,26 +101,11 @@ class Reduced:
     def clipped(self) -> Floats:
         return np.asarray(self.taken.clipped[:, :, self.object_.mask].mean(2).min(1))
 
-    @property
-    def blur_px(self) -> Floats | None:
-        """None where the shots show different places: tiles would compare unlike detail."""
-        moved = np.abs(self.alignment.transform[:, :2, 2]).max() * self.grid_px
-        if not moved <= sharpness.TILE / 2:
-            return None
-        taken = self.taken
-        return np.stack(
-            [
-                taken.tile_px * sharpness.extra_blur(taken.tiles[:, e], taken.tiles_usable[:, e])
-                for e in range(taken.tiles.shape[1])
-            ],
-            axis=1,
-        )
 
-
-def judged(taken: Taken, network: Network | None, mask_network: Network | None, config: Config) -> Iterator[Gate]:
+def judged(small: Reduced) -> Iterator[Gate]:
     """The gates in the order of the path; where a stage gives up, its error is the last of them."""
     try:
-        yield from gates.judge(Reduced(taken, network, mask_network, config), config)
+        yield from gates.judge(small, small.config)
     except InputError as error:
         what, _, remedy = str(error).partition("; ")
         yield Gate(type(error).__name__.removesuffix("Error").lower(), "fail", None, None, what, remedy, 45.0)

@@ -7,12 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.check import sharpness
 from polcap.images import Capture, Floats, Frame, SensorImage
-from polcap.optics import sensor
+from polcap.optics import sensor, sharpness
 
 _MOST_PIXELS = 0.6e6  # of the pictures that the stages see: they take three to four seconds on two cores
-_LEAST_LIGHT = 0.01  # of the sensor's range; in darker tiles noise is detail
 
 
 @dataclass(frozen=True)
@@ -22,9 +20,8 @@ class Taken:
     capture: Capture  # loads from memory
     step: int  # visible RAW px per px
     clipped: Floats  # (K, E, h, w) share of each pixel that is clipped
-    tiles: Floats  # (K, E, T, n, n) of the half-size pictures
-    tiles_usable: NDArray[np.bool_]  # (K, E, T)
-    tile_px: float  # visible RAW px per px of the tiles
+    blur_px: Floats  # (K, E) of each frame beyond the sharpest of its exposure, 1σ [visible RAW px]
+    binned: int  # visible RAW px per px of the picture that `process` merges
 
 
 def take(capture: Capture, clip: float) -> Taken:
@@ -36,26 +33,25 @@ def take(capture: Capture, clip: float) -> Taken:
         image = first.load()
         usable = sensor.usable(image, clip)
         times = max(1, int(np.ceil(np.sqrt(usable.size / _MOST_PIXELS))))
-        return image, sharpness.choose(_half(image)[1], usable), times
+        return image, sharpness.places(image, clip), times
 
     with ThreadPoolExecutor(2) as pool:
         reference = pool.submit(looked_over)  # before all others, which wait for it
 
-        def seen(frame: Frame) -> tuple[SensorImage, Floats, Floats, NDArray[np.bool_]]:
+        def seen(frame: Frame) -> tuple[SensorImage, Floats, sharpness.Tiles]:
             loaded = None if frame is first else frame.load()
             image, corners, times = reference.result()
             whole = loaded or image
-            signal, light = _half(whole)
+            signal = sensor.signal(whole)
+            signal = np.repeat(signal, 3, axis=2) if signal.shape[2] == 1 else signal
             usable = sensor.usable(whole, clip)
             shares = _averaged((~usable).astype(np.float32), times)
             value = _averaged(signal, times)
             value[shares > 0] = 1  # the stages drop a pixel of which a part is clipped
-            tiles = sharpness.cut(light, corners)
-            clear = sharpness.cut(usable.astype(np.float32), corners).all((1, 2)) & (tiles.mean((1, 2)) > _LEAST_LIGHT)
             small = SensorImage(
                 value, np.zeros((1, 1)), 1.0, None, whole.camera_matrix, whole.white_balance, whole.lossy
             )
-            return small, shares, tiles, clear
+            return small, shares, sharpness.take(whole, corners, clip)
 
         found = dict(zip(map(id, frames), pool.map(seen, frames)))
     image, _, times = reference.result()
@@ -80,18 +76,9 @@ def take(capture: Capture, clip: float) -> Taken:
         ),
         step=step,
         clipped=np.stack([[found[id(frame)][1] for frame in shot.frames] for shot in capture.shots]),
-        tiles=np.stack([[found[id(frame)][2] for frame in shot.frames] for shot in capture.shots]),
-        tiles_usable=np.stack([[found[id(frame)][3] for frame in shot.frames] for shot in capture.shots]),
-        tile_px=half,
+        blur_px=sharpness.frames_blur([[found[id(f)][2] for f in shot.frames] for shot in capture.shots], half),
+        binned=half,
     )
-
-
-def _half(image: SensorImage) -> tuple[Floats, Floats]:
-    """A frame's signal (h, w, 3), mosaics binned, and the mean of its photosites (h, w)."""
-    signal = sensor.signal(image)
-    if signal.shape[2] == 1:
-        return np.repeat(signal, 3, axis=2), signal[..., 0]
-    return signal, cv2.transform(signal, np.array([[0.25, 0.5, 0.25]]))
 
 
 def _averaged(picture: Floats, times: int) -> Floats:

@@ -50,8 +50,6 @@ class Found(Protocol):
     @property
     def chart_missing(self) -> str: ...  # why no chart was found though one was looked for; "" else
     @property
-    def blur_px(self) -> Floats | None: ...  # (K, E) RAW px, 1σ beyond the sharpest; None where not looked at
-    @property
     def clipped(self) -> Floats: ...  # (K,) share of the object that is clipped in every frame
     @property
     def radiance(self) -> AngleStack: ...

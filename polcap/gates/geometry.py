@@ -5,6 +5,7 @@ import numpy as np
 from polcap.config import Config, Gates
 from polcap.gates.gate import Found, Gate, State, at_most, blamed
 from polcap.images import Mesh
+from polcap.optics.sharpness import TILE
 
 
 def alignment(found: Found, config: Config) -> Gate:
@@ -76,11 +77,12 @@ def mesh(of: Mesh, limits: Gates) -> Gate:
 
 def sharpness(found: Found, limits: Gates) -> Gate:
     """Every frame against the frames of the same exposure in the other shots."""
-    blur, limit = found.blur_px, limits.max_blur_px
-    if blur is None:
-        return Gate("sharpness", "not measured", None, limit, "`polcap check` looks at it", unit="px")
-    if np.isnan(blur).all():
+    blur, limit = found.radiance.blur_px, limits.max_blur_px
+    moved = float(np.abs(found.alignment.transform[:, :2, 2]).max()) * found.grid_px
+    if blur is None or np.isnan(blur).all():
         return Gate("sharpness", "not measured", None, limit, "too little bright detail", unit="px")
+    if not moved <= TILE / 2:  # tiles would compare unlike detail
+        return Gate("sharpness", "not measured", None, limit, "the shots show different places", unit="px")
     k, e = (int(i) for i in np.unravel_index(int(np.nanargmax(blur)), blur.shape))
     says = f"{found.names[k]} frame {e + 1} is blurred by {blur[k, e]:.1f} px beyond the sharpest"
     bad = blamed(found.names, np.nanmax(np.nan_to_num(blur), axis=1) > limit)

@@ -95,8 +95,11 @@ def stillness(found: Found, limits: Gates) -> Gate:
 def chart(found: Found, limits: Gates) -> Gate:
     limit = limits.max_delta_e
     if found.chart_missing:
-        remedy = "let it be seen whole and in the flash's light, or give --chart or --no-chart to `polcap process`"
-        says = f"no chart found ({found.chart_missing}): colours and scale come from the camera alone"
+        remedy = (
+            "shoot it again with the chart seen whole and lit, or give process its corners with --chart; with "
+            "--no-chart colours and scale come from the camera alone"
+        )
+        says = f"no chart found ({found.chart_missing}): `polcap process` asks for one, or for --no-chart"
         return Gate("chart", "warn", None, limit, says, remedy, unit="ΔE2000")
     error = found.color.delta_e
     if error is None:

@@ -48,7 +48,12 @@ def usable(image: SensorImage, clip: float, full: bool = False) -> Bools:
     Judged on raw counts over whole 2×2 quads, so that all colours of a pixel go together; a single noisy
     photosite at the limit rules out its surroundings, which keeps the choice from favouring low noise.
     """
-    value, level = image.value, clip * saturation(image)
+    return below(image, clip * saturation(image), full)
+
+
+def below(image: SensorImage, level: float, full: bool = False) -> Bools:
+    """The same of counts that reach `level`."""
+    value = image.value
     over = _at_least(value, level)
     if image.cfa is None:
         over = np.asarray(over.any(axis=2))

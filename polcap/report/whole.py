@@ -27,7 +27,6 @@ class Whole:
     focal_known: bool
     grid_px: float = 1.0
     chart_missing: str = ""  # without a chart, and none asked away, a run ends
-    blur_px: None = None  # told by `polcap check` alone, from the frames
 
     @property
     def names(self) -> list[str]:

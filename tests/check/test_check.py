@@ -11,9 +11,12 @@ from polcap import check
 from polcap.check import Verdict
 from polcap.check.reduced import take
 from polcap.config import Config
-from polcap.errors import CaptureError
+from polcap.errors import CaptureError, ChartError
+from polcap.formats import calib, dng, probe, raw
 from polcap.formats import capture as captures
-from polcap.formats import dng, probe, raw
+from polcap.images import ChartRequest
+from polcap.path import AUTO
+from polcap.stages import hdr, whitebalance
 from tests import faulty
 from tests.conftest import Command
 
@@ -41,6 +44,26 @@ def test_planted_fault_is_named(tmp_path: Path, fault: str) -> None:
     found = verdict(tmp_path / "bad")
     assert failed(found) & set(faulty.FAULTS[fault]), check.table(found)
     assert all(line.remedy for line in found.lines if line.state in ("warn", "fail"))
+
+
+def test_process_measures_the_blur_that_check_measures(tmp_path: Path) -> None:
+    faulty.shoot(tmp_path / "bad", 1, "defocus", 256)
+    capture = captures.read(tmp_path / "bad")
+    merged = hdr.merge(capture, Config().hdr)
+    assert merged.blur_px is not None and np.nanmax(merged.blur_px) > Config().gates.max_blur_px
+    np.testing.assert_array_equal(merged.blur_px, take(capture, clip=0.98).blur_px)
+
+
+def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path) -> None:
+    faulty.shoot(tmp_path / "small", 1, "", 200)  # too small for a chart to be found
+    capture = captures.read(tmp_path / "small")
+    found = verdict(tmp_path / "small")
+    line = next(line for line in found.lines if line.name == "chart")
+    assert line.state == "warn" and found.needs == "--no-chart" and "--no-chart" in line.remedy
+    with pytest.raises(ChartError):
+        whitebalance.measure(hdr.merge(capture, Config().hdr), calib.colorchecker(), AUTO, Config().whitebalance)
+    asked = check.inspect(capture, None, Config(), chart=ChartRequest("none"))
+    assert asked.needs == "" and next(line for line in asked.lines if line.name == "chart").state == "not measured"
 
 
 def test_missing_frame_is_bad_input(tmp_path: Path) -> None:

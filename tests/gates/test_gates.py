@@ -29,7 +29,7 @@ def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> SimpleNamespace
     maps = SurfaceMaps(normal, normal, normal, flat, None, 8 * flat, image.mask, image.view, "analytic")
     given = {
         "names": [f"{np.degrees(a):g}°" for a in radiance.angle], "focal_known": True, "grid_px": 1.0,
-        "chart_missing": "", "blur_px": None, "clipped": np.zeros(shots), "radiance": radiance,
+        "chart_missing": "", "clipped": np.zeros(shots), "radiance": radiance,
         "color": scenes.no_color(), "alignment": scenes.still(shots), "object_": object_, "gains": gains,
         "stokes": image, "maps": maps, "mesh": None,
     }  # fmt: skip
@@ -71,7 +71,7 @@ def test_each_gate_fails_alone(good: SimpleNamespace) -> None:
         "ambient": {"radiance": replace(radiance, ambient_share=np.array([0.2, 0.2, 0.2]))},
         "alignment": {"alignment": replace(still, transform=away)},
         "clipping": {"clipped": np.array([0.0, 0.03, 0.0])},
-        "sharpness": {"blur_px": np.array([[0.0], [2.0], [0.1]])},
+        "sharpness": {"radiance": replace(radiance, blur_px=np.array([[0.0], [2.0], [0.1]]))},
         "gains": {"gains": replace(gains, gain=np.array([[1.0] * 3, [1.0] * 3, [0.7] * 3]))},
         "gain doubt": {"gains": replace(gains, disagreement=0.05)},
         "normal error": {"maps": replace(maps, confidence=np.full_like(maps.confidence, 25.0))},

@@ -90,7 +90,7 @@ def run(radiance: AngleStack, drawn: np.ndarray | None) -> None:
         assert np.isfinite(array).all()
     found: dict[str, Any] = {
         "names": [str(k) for k in range(len(radiance.angle))], "focal_known": True, "grid_px": 1.0,
-        "chart_missing": "", "blur_px": None, "clipped": np.zeros(len(radiance.angle)), "radiance": radiance,
+        "chart_missing": "", "clipped": np.zeros(len(radiance.angle)), "radiance": radiance,
         "color": color, "alignment": alignment, "object_": object_, "gains": gains, "stokes": image, "maps": maps,
         "mesh": mesh,
     }  # fmt: skip

@@ -25,6 +25,7 @@ from msgspec import Meta
 
 from polcap.errors import CaptureError
 from polcap.images import AngleStack, Capture, Floats, Frame, Quality, Shot, View
+from polcap.optics import sharpness
 from polcap.stages import stage
 from polcap.stages.hdr import combine, links, noise
 from polcap.stages.hdr.ambient import same_size
@@ -47,7 +48,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 60.0
 
 
-@stage(version=4)
+@stage(version=5)
 def merge(capture: Capture, settings: Settings) -> AngleStack:
     """Radiance of every shot on the scale of its reference frame.
 
@@ -82,10 +83,12 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
             f"{shots[0].frames[reference].path}: {width}×{height} px are too few to measure noise and movement; "
             f"polcap needs {_LEAST_PX * (1 + mosaic)} px a side"
         )
+    middle = (len(shots[0].frames) - 1) // 2  # by the metadata, as in `check`, which reads each frame once
+    corners = sharpness.places(read(shots[0].frames[middle]), settings.clip)
     del image  # the reader alone decides how long a frame is held
     lines = noise.Lines()
     stack = _empty(0, 0, 0)
-    ratios, curvatures, ambient_shares = [], [], []
+    ratios, curvatures, ambient_shares, tiles = [], [], [], []
     shape = 0, 0, 0
     for k, shot in enumerate(shots):
         measured = links.measure(shot, order, reference, lines, read, settings.clip, settings.max_motion_px)
@@ -98,6 +101,7 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
         ratios.append([link.ratio.astype(np.float64) for link in measured.links])
         curvatures.append([link.curvature for link in measured.links])
         ambient_shares.append(measured.ambient_share)
+        tiles.append([sharpness.take(read(frame), corners, settings.clip) for frame in shot.frames])
         read.forget((*shot.frames, *shot.ambient))
         lines.close()
     binned = mosaic and not full
@@ -123,6 +127,7 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
         light=_light(capture),
         curvature=np.array(curvatures),
         ambient_share=np.array(ambient_shares),
+        blur_px=sharpness.frames_blur(tiles, 2.0 if mosaic else 1.0),
         offset_px=_offsets(shots) if capture.layout == "sensor" else None,
     )
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 
-from polcap.check import sharpness
 from polcap.images import Floats
+from polcap.optics import sharpness
+from polcap.optics.sharpness import TILE
 
 
 def scene(seed: int = 0) -> Floats:
@@ -18,7 +19,7 @@ def measured(pictures: list[Floats], noise: float = 0.002) -> Floats:
     random = np.random.default_rng(1)
     noisy = [np.asarray(p + noise * random.normal(size=p.shape), np.float32) for p in pictures]
     corners = sharpness.choose(noisy[0], np.ones(noisy[0].shape, bool))
-    tiles = np.stack([sharpness.cut(p, corners) for p in noisy])
+    tiles = np.stack([[p[y : y + TILE, x : x + TILE] for y, x in corners] for p in noisy])
     return sharpness.extra_blur(tiles, np.ones(tiles.shape[:2], bool))
 
 

@@ -5,20 +5,76 @@ four directions, so that a motion along one of them shows. What blur that means 
 sharper one's own tiles until they look alike: the measure needs no knowledge of the scene.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.images import Floats, SensorImage
+from polcap.optics import sensor
 
-TILE = 32  # px
+TILE = 32  # px of the frames, mosaics binned
 _CELLS = (8, 12)  # of the picture; each gives its tiles of most detail
 _PER_CELL = 3
 _FINE, _COARSE = 1, 4  # px
 _WAYS = ((0, 1), (1, 0), (1, 1), (1, -1))
 _LADDER = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # px, 1σ
 _LEAST_TILES = 4
+_LEAST_LIGHT = 0.01  # of the sensor's range; in darker tiles noise is detail
 _DETAIL = -0.5  # log of fine over coarse energy: noise has 0, detail less
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """What one photograph shows at the places that were chosen."""
+
+    light: Floats  # (T, TILE, TILE) mean of its photosites
+    usable: NDArray[np.bool_]  # (T,) unclipped and bright enough
+
+
+def places(image: SensorImage, clip: float) -> NDArray[np.int64]:
+    """Corners (T, 2) of the tiles to compare, chosen in one decoded photograph of the capture."""
+    return choose(_light(sensor.signal(image)), sensor.usable(image, clip))
+
+
+def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
+    """The tiles of one decoded photograph; only they are binned."""
+    step = 1 if image.cfa is None else 2
+    side, margin = TILE * step, step  # a clipped photosite rules out its neighbours
+    padded = [(margin, margin), (margin, margin), *[(0, 0)] * (image.value.ndim - 2)]
+    around = [
+        np.pad(image.value[y : y + side, x : x + side], padded, mode="edge")
+        if min(y, x) < margin or y + side + margin > image.value.shape[0] or x + side + margin > image.value.shape[1]
+        else image.value[y - margin : y + side + margin, x - margin : x + side + margin]
+        for y, x in step * corners
+    ]
+    if not around:
+        return Tiles(np.zeros((0, TILE, TILE), np.float32), np.zeros(0, bool))
+    strip = replace(image, value=np.concatenate(around))  # an even number of rows each keeps the mosaic's phase
+    shape = (len(corners), TILE + 2, TILE + 2)
+    inner = np.s_[:, 1:-1, 1:-1]
+    light = _light(sensor.signal(strip)).reshape(shape)[inner]
+    sound = sensor.below(strip, clip * sensor.saturation(image)).reshape(shape)[inner].all((1, 2))
+    return Tiles(light, sound & (light.mean((1, 2)) > _LEAST_LIGHT))
+
+
+def frames_blur(shots: Sequence[Sequence[Tiles]], px: float) -> Floats:
+    """1σ that every frame is blurred by beyond the sharpest of the same exposure, (K, E), NaN where none can tell.
+
+    shots: K brackets of E photographs; px: RAW px per px of the tiles.
+    """
+    each = [
+        extra_blur(np.stack([frame.light for frame in frames]), np.stack([frame.usable for frame in frames]))
+        for frames in zip(*shots, strict=True)
+    ]
+    return np.asarray(px * np.stack(each, axis=1))
+
+
+def _light(signal: Floats) -> Floats:
+    """Mean of the photosites (H, W) of a signal (H, W, C)."""
+    return signal[..., 0] if signal.shape[2] == 1 else cv2.transform(signal, np.array([[0.25, 0.5, 0.25]]))
 
 
 def choose(light: Floats, usable: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -41,11 +97,6 @@ def choose(light: Floats, usable: NDArray[np.bool_]) -> NDArray[np.int64]:
                 if cell[i, j] > 0:
                     found.append((TILE * some_rows[i], TILE * some_columns[j]))
     return np.array(found, np.int64).reshape(-1, 2)
-
-
-def cut(light: Floats, corners: NDArray[np.int64]) -> Floats:
-    """(T, TILE, TILE) out of (H, W)."""
-    return np.array([light[y : y + TILE, x : x + TILE] for y, x in corners], np.float32).reshape(-1, TILE, TILE)
 
 
 def extra_blur(tiles: Floats, usable: NDArray[np.bool_]) -> Floats:
