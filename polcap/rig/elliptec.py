@@ -140,14 +140,31 @@ class Elliptec:
             self._set("us")
 
     def _ask(self, command: str, expected: str) -> str:
-        """The data of the answer. Raises Silent, HardwareError."""
-        self._port.send(f"{self._address}{command}".encode())
-        kind, data = self._answer()
-        if kind == "GS" != expected:
-            raise self._fault(int(data, 16))
-        if kind != expected:
-            raise self._port.strange(kind + data)
-        return data
+        """The data of the answer; a busy device is asked again. Raises Silent, HardwareError."""
+        end = time.monotonic() + self._limit_s
+        while True:
+            self._port.send(f"{self._address}{command}".encode())
+            if (data := self._reply(expected)) is not None:
+                return data
+            if time.monotonic() >= end:
+                raise self._fault(_BUSY)
+
+    def _reply(self, expected: str) -> str | None:
+        """The data of the answer, None from a busy device; late answers to what was asked before are passed over."""
+        busy = False
+        for _ in range(_LATE + 1):
+            try:
+                kind, data = self._answer()
+            except Silent:
+                if busy:
+                    return None
+                raise
+            busy = (kind, int(data, 16)) == ("GS", _BUSY)
+            if kind == expected and not busy:
+                return data
+            if kind == "GS" and int(data, 16) not in (_OK, _BUSY):
+                raise self._fault(int(data, 16))
+        raise self._port.strange(kind + data)
 
     def _answer(self) -> tuple[str, str]:
         """Kind and data of this device's next answer; other addresses of the bus are passed over."""

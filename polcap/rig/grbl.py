@@ -53,6 +53,7 @@ ERROR = {
 }
 _START_S = 2.5  # a board that restarts when its port is opened
 _HOLD_S = 2.0  # to slow down in
+_LOOK_S = 0.1  # between two questions for its state
 _RESET = b"\x18"
 _BANNER = re.compile(r"Grbl(?:HAL)? (1\.1\S*) .*")
 _STORED = re.compile(r"\$(\d{1,9})=(\d{1,9}(?:\.\d+)?)(?: .*)?")
@@ -182,10 +183,16 @@ class Grbl:
         )
 
     def _position(self) -> float:
-        state, at = self._status()
-        if state == "Alarm":
-            raise self._error("is locked by an alarm; home it")
-        return at
+        """Of the axis, in machine units, once it stands: the ok that ended a movement may have been an older one."""
+        end = time.monotonic() + self._limit_s
+        while time.monotonic() < end:
+            state, at = self._status()
+            if state == "Alarm":
+                raise self._error("is locked by an alarm; home it")
+            if state not in ("Run", "Jog"):
+                return at
+            time.sleep(_LOOK_S)
+        raise self._error(f"still moves after timeout = {self._limit_s:g} s; raise timeout in the rotator's URL")
 
     def _status(self) -> tuple[str, float]:
         """State and machine position of the axis."""

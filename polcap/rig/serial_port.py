@@ -24,6 +24,8 @@ with suppress(ImportError):  # Windows
 
 ANSWER_S = 1.0  # for one answer
 _SLICE_S = 0.05  # longest single read
+_QUIET_S = 0.25  # after which nothing is on its way any more; a USB adapter delivers within 16 ms
+_CATCH_UP_S = 2.0  # longest wait for that
 _LONGEST_LINE = 1024  # bytes; more without a line's end is noise
 _REFUSED = {
     errno.ENOENT: "there is no such port; plug the device in, `polcap doctor` lists the ports",
@@ -65,6 +67,7 @@ class Port:
         self._name = name
         self._kept = b""  # received and not yet read
         self._asked = ""
+        self._behind = self._heard = False  # a question has no answer yet; something came since
         try:
             self._serial = serial.serial_for_url(
                 url, baudrate=baud, timeout=_SLICE_S, write_timeout=ANSWER_S, exclusive=True
@@ -80,6 +83,8 @@ class Port:
 
     def send(self, data: bytes) -> None:
         """Forget what came before, and send. Raises Silent, Unplugged."""
+        if self._behind:
+            self._catch_up()
         self.drain()
         self.add(data)
 
@@ -102,6 +107,7 @@ class Port:
         """
         limit = ANSWER_S if timeout_s is None else timeout_s
         end = time.monotonic() + limit
+        over = False
         while True:
             line, found, rest = self._kept.partition(b"\n")
             if found:
@@ -109,11 +115,15 @@ class Port:
                 if line.strip():
                     return self._understood(line.strip())
                 continue
-            if time.monotonic() >= end or len(self._kept) > _LONGEST_LINE:
+            if over or len(self._kept) > _LONGEST_LINE:
                 break
+            over = time.monotonic() >= end  # a busy machine may look late: what has come by then counts
             with self._clear():
-                self._kept += self._serial.read(max(1, self._serial.in_waiting))
+                waiting = self._serial.in_waiting
+                if waiting or not over:
+                    self._kept += self._serial.read(max(1, waiting))
         half, self._kept = self._kept, b""
+        self._behind, self._heard = True, False
         if half.strip():
             self._log.write(self._name, "<", shown(half) + " …")
             raise Silent(
@@ -144,9 +154,20 @@ class Port:
 
     def _understood(self, line: bytes) -> str:
         self._log.write(self._name, "<", shown(line))
+        self._heard = True
         if not all(32 <= byte < 127 or byte == 9 for byte in line):
             raise Silent(f"{self.where} '{shown(line):.40}', which is no text; check the cable and the baud rate")
         return line.decode("ascii")
+
+    def _catch_up(self) -> None:
+        """Let answers to what was asked before arrive, lest they be taken for the next one's."""
+        limit = time.monotonic() + _CATCH_UP_S
+        quiet = time.monotonic() + _QUIET_S
+        while time.monotonic() < min(quiet, limit):
+            with self._clear():
+                if self._serial.read(max(1, self._serial.in_waiting)):
+                    self._heard, quiet = True, time.monotonic() + _QUIET_S
+        self._behind = not self._heard
 
     @contextmanager
     def _clear(self) -> Iterator[None]:

@@ -1,142 +1,12 @@
-"""Rotators at the far end of a pseudo-terminal, as far as their protocol goes, with faults on order.
-
-    with Elliptec(fault="half-line", at=3) as device:
-        rotator = open_rotator(f"elliptec:{device.port}", Log(None))
-
-`fault` is one of the class's FAULTS, `at` the moment, `times` for how many moments in a row (`ALWAYS`: for ever).
-
-    moments are answers:    no-answer, garbage, half-line
-    moments are movements:  busy (never ends), mechanical-timeout, wrong-position (stops 5° off, and says so);
-                            halfway: unplug (the port vanishes), alarm (a limit switch), restart (power lost)
-
-Homing is a movement; the first moment is 1. What happened: `heard` lists the commands, `angle_deg` is where the ring
-truly stands, `moves` and `answers` count. `unplug()` pulls the cable now.
+"""Rotators at the far end of a serial line, as far as their protocol goes; faults and clock are told in `far_end`.
 
 GRBL counts steps and cannot feel the ring: its wrong-position is one it reports, as after a stray jog.
 """
 
-import os
 import re
-import select
-import threading
-import time
-import tty
-from collections.abc import Callable
-from typing import ClassVar, Self
+from typing import ClassVar
 
-ALWAYS = 1 << 30
-SPOKEN = ("no-answer", "garbage", "half-line")
-_OFF_DEG = 5.0  # of a wrong position
-
-
-class Device:
-    """A port, a thread that answers on it, a ring that takes time to turn."""
-
-    FAULTS: ClassVar[tuple[str, ...]] = ()
-    END = b"\r\n"
-
-    def __init__(
-        self, *, fault: str = "", at: int = 1, times: int = 1, speed_deg_s: float = 2000.0, start_deg: float = 37.0
-    ) -> None:
-        assert not fault or fault in self.FAULTS, f"{fault} is none of {self.FAULTS}"
-        self.fault, self.at, self.times = fault, at, times
-        self.speed_deg_s = speed_deg_s
-        self.angle_deg = start_deg
-        self.heard: list[str] = []
-        self.moves = 0
-        self.answers = 0
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        self.port = os.ttyname(self._slave)
-        self._target_deg = start_deg
-        self._struck = ""  # the fault of this movement
-        self._ends: float | None = None  # monotonic; None: the ring stands
-        self._then: Callable[[], None] = lambda: None
-        self._gone = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.unplug()
-
-    def unplug(self) -> None:
-        """Pull the cable."""
-        self._gone.set()
-        self._thread.join(5)
-
-    def receive(self, data: bytes) -> None:
-        """Bytes have come."""
-        raise NotImplementedError
-
-    def halfway(self) -> None:
-        """The planted fault of a movement strikes: mechanical-timeout, alarm, restart."""
-        raise NotImplementedError
-
-    def say(self, text: str) -> None:
-        """Answer a line, unless a fault is due."""
-        self.answers += 1
-        data = text.encode() + self.END
-        if self.fault in SPOKEN and self.at <= self.answers < self.at + self.times:
-            data = {"no-answer": b"", "garbage": b"\xff\x00\x87~\xf3" + self.END, "half-line": data[: len(text) // 2]}[
-                self.fault
-            ]
-        os.write(self._master, data)
-
-    def tick(self) -> None:
-        """Called every few milliseconds."""
-
-    @property
-    def moving(self) -> bool:
-        return self._ends is not None
-
-    def turn(self, target_deg: float, then: Callable[[], None]) -> None:
-        """Start turning; `then` when the ring stands."""
-        self.moves += 1
-        due = self.fault not in SPOKEN and self.at <= self.moves < self.at + self.times
-        self._struck = self.fault if due else ""
-        seconds = abs(target_deg - self.angle_deg) / self.speed_deg_s
-        if self._struck == "wrong-position":
-            target_deg += _OFF_DEG
-        elif self._struck:
-            target_deg, seconds = (target_deg + self.angle_deg) / 2, seconds / 2
-        self._target_deg, self._then = target_deg, then
-        self._ends = time.monotonic() + seconds
-
-    def freeze(self) -> None:
-        """Stop where the ring is about now, without `then`."""
-        if self._ends is not None:
-            left = max(0.0, self._ends - time.monotonic()) * self.speed_deg_s
-            away = self._target_deg - self.angle_deg
-            self.angle_deg = self._target_deg - (left if away > 0 else -left) if abs(away) > left else self.angle_deg
-        self._ends = None
-
-    def _run(self) -> None:
-        while not self._gone.is_set():
-            ready = select.select([self._master], [], [], 0.002 if self.moving else 0.02)[0]
-            if ready:
-                self.receive(os.read(self._master, 4096))
-            self.tick()
-            if self._ends is not None and time.monotonic() >= self._ends:
-                self._arrive()
-        os.close(self._master)
-        os.close(self._slave)
-
-    def _arrive(self) -> None:
-        self.angle_deg = self._target_deg
-        if self._struck == "busy":
-            self._ends = float("inf")
-        elif self._struck == "unplug":
-            self._ends = None
-            self._gone.set()
-        elif self._struck in ("mechanical-timeout", "alarm", "restart"):
-            self._ends = None
-            self.halfway()
-        else:
-            self._ends = None
-            self._then()
+from tests.rig.far_end import SPOKEN, Device
 
 
 class Elliptec(Device):
@@ -427,6 +297,6 @@ class Line(Device):
         )
 
     def tick(self) -> None:
-        if self.moving and time.monotonic() - self._beat > 0.2:
-            self._beat = time.monotonic()
-            os.write(self._master, f"busy {self.angle_deg - self._zero_deg:.3f}\n".encode())
+        if self.moving and self._clock.monotonic() - self._beat > 0.2:
+            self._beat = self._clock.monotonic()
+            self.send(f"busy {self.angle_deg - self._zero_deg:.3f}\n".encode())

@@ -1,19 +1,39 @@
 """A tethering application writes as it likes; polcap takes whole RAW files, once each, and touches none."""
 
-import threading
-import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from polcap.errors import HardwareError, SettingError
+from polcap.rig import camera_folder
 from polcap.rig.camera import Exposure
 from polcap.rig.camera_choice import open_camera
 from polcap.rig.camera_folder import WatchedFolder
 from polcap.rig.log import Log
+from tests.rig import virtual
 from tests.rig.pool import tiny
 
 ANY = Exposure()
+
+
+class Clock(virtual.Clock):
+    """Of the waiting camera; whoever fills the folder does so meanwhile."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.meanwhile: Callable[[], object] = lambda: None
+
+    def sleep(self, seconds: float) -> None:
+        super().sleep(seconds)
+        self.meanwhile()
+
+
+@pytest.fixture(autouse=True)
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(camera_folder, "time", clock)
+    return clock
 
 
 @pytest.fixture
@@ -28,21 +48,19 @@ def watched(folder: Path, timeout_s: float = 20.0) -> WatchedFolder:
     return WatchedFolder(str(folder), Log(None), timeout_s=timeout_s, stable_s=0.2)
 
 
-def test_a_file_written_slowly_is_taken_when_whole_and_stays_where_it_is(tether: Path, tmp_path: Path) -> None:
+def test_a_file_written_slowly_is_taken_when_whole_and_stays_where_it_is(
+    tether: Path, tmp_path: Path, clock: Clock
+) -> None:
     camera, data = watched(tether), tiny(tmp_path / "new.dng", iso=200.0)
+    parts = iter([data[start : start + 400] for start in range(0, len(data), 400)])
 
     def write() -> None:
-        with (tether / "IMG_1.dng").open("wb") as file:
-            for start in range(0, len(data), 400):
-                file.write(data[start : start + 400])
-                file.flush()
-                time.sleep(0.05)
+        with (tether / "IMG_1.dng").open("ab") as file:
+            file.write(next(parts, b""))
 
-    writer = threading.Thread(target=write)
+    clock.meanwhile = write
     camera.prepare(0.0, "shot", 0)
-    writer.start()
     shot = camera.shoot(ANY, flash=True)
-    writer.join()
     assert shot.data == data and shot.name == "IMG_1.dng"
     assert (tether / "IMG_1.dng").read_bytes() == data
 

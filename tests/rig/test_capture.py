@@ -13,6 +13,7 @@ from polcap.formats import capture_toml
 from polcap.images import Role
 from polcap.rig import camera_gphoto2
 from tests.conftest import ROOT, Command
+from tests.rig import virtual
 from tests.rig.devices import Elliptec
 from tests.rig.pool import Key
 
@@ -100,7 +101,7 @@ def test_a_motor_on_a_port_and_a_camera_on_a_cable_make_a_capture(
     (tmp_path / "x.jpg").write_bytes(bytes(size))
     monkeypatch.setattr(camera_gphoto2.Gphoto2, "prepare", prepare)
     folder = tmp_path / "capture"
-    with Elliptec() as device:
+    with virtual.time(), Elliptec() as device:
         url = f"elliptec:{device.port}?settle=0"
         done = polcap(
             "capture", folder, "--rotator", url, "--camera", "gphoto2", "--bracket", "1/200,1/50,1/13", "--no-check"

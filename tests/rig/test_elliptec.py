@@ -5,18 +5,18 @@ from collections.abc import Iterator
 import pytest
 
 from polcap.errors import HardwareError
-from polcap.rig import serial_port
 from polcap.rig.elliptec import STATUS, Elliptec, Settings, open_motor
 from polcap.rig.log import Log
 from polcap.rig.serial_port import Silent
-from tests.rig import devices
+from tests.rig import devices, virtual
 
 pytestmark = pytest.mark.timeout(60)
 
 
 @pytest.fixture(autouse=True)
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serial_port, "ANSWER_S", 0.3)
+def clock() -> Iterator[virtual.Clock]:
+    with virtual.time() as clock:
+        yield clock
 
 
 @pytest.fixture
@@ -111,9 +111,9 @@ def test_the_protocol_s_status_numbers() -> None:
 
 def test_busy_for_ever_ends_with_the_limit() -> None:
     with devices.Elliptec(fault="busy", at=2) as device:
-        ell = motor(device, limit_s=1.0)
+        ell = motor(device, limit_s=2.0)
         ell.home()
-        with pytest.raises(HardwareError, match=r"busy for more than timeout = 1 s"):
+        with pytest.raises(HardwareError, match=r"busy for more than timeout = 2 s"):
             ell.go(45)
         assert "0gs" in device.heard[3:]
         ell.halt()
@@ -122,7 +122,7 @@ def test_busy_for_ever_ends_with_the_limit() -> None:
 
 
 def test_a_move_longer_than_one_answer_is_waited_for() -> None:
-    with devices.Elliptec(speed_deg_s=45) as device:  # a second for 45°
+    with devices.Elliptec(speed_deg_s=15) as device:  # three seconds for 45°
         device.angle_deg = 0.0
         ell = motor(device, limit_s=10)
         ell.go(45)

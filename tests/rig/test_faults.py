@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from tests.rig import faults
-from tests.rig.devices import Device
+from tests.rig.far_end import Device
 from tests.rig.pool import Key
 
 

@@ -1,23 +1,23 @@
 """GRBL 1.1 over the wire: scaling, homing, alarms, and a stop that loses no position."""
 
-import time
+from collections.abc import Iterator
 
 import pytest
 
 from polcap.errors import HardwareError
-from polcap.rig import grbl, manual, serial_port
+from polcap.rig import manual
 from polcap.rig.grbl import ALARM, ERROR, Grbl, Settings, open_motor
 from polcap.rig.log import Log
 from polcap.rig.serial_port import Silent
-from tests.rig import devices
+from tests.rig import devices, virtual
 
 pytestmark = pytest.mark.timeout(60)
 
 
 @pytest.fixture(autouse=True)
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serial_port, "ANSWER_S", 0.3)
-    monkeypatch.setattr(grbl, "_START_S", 0.5)
+def clock() -> Iterator[virtual.Clock]:
+    with virtual.time() as clock:
+        yield clock
 
 
 def motor(device: devices.Grbl, settings: Settings | None = None, limit_s: float = 2.0) -> Grbl:
@@ -85,13 +85,13 @@ def test_a_restart_in_mid_move_is_told_and_ended_by_homing() -> None:
         assert device.angle_deg == pytest.approx(45)
 
 
-def test_stop_holds_before_it_resets_and_lets_the_motor_sleep() -> None:
+def test_stop_holds_before_it_resets_and_lets_the_motor_sleep(clock: virtual.Clock) -> None:
     with devices.Grbl(speed_deg_s=45) as device:
         device.angle_deg = 0.0
         board = motor(device)
         board.home()
         board._command("G21G90G53G0X-454.0")
-        time.sleep(0.1)
+        clock.sleep(0.1)
         board.halt()
         assert device.heard[-4:] == ["!", "?", "reset", "$SLP"]
         assert device.state == "Sleep"
@@ -101,7 +101,7 @@ def test_stop_holds_before_it_resets_and_lets_the_motor_sleep() -> None:
 
 
 def test_homing_may_be_longer_than_one_answer() -> None:
-    with devices.Grbl(speed_deg_s=37) as device:  # a second, in which GRBL says nothing
+    with devices.Grbl(speed_deg_s=10) as device:  # four seconds, in which GRBL says nothing
         motor(device, limit_s=20).home()
         assert device.angle_deg == 0
 
@@ -109,8 +109,8 @@ def test_homing_may_be_longer_than_one_answer() -> None:
 @pytest.mark.parametrize("at", [1, 2])
 def test_a_movement_without_end_ends_with_the_limit(at: int) -> None:
     with devices.Grbl(fault="busy", at=at) as device:
-        board = motor(device, limit_s=1.0)
-        with pytest.raises(HardwareError, match=r"takes more than timeout = 1 s for (\$H|G4P0.01)"):
+        board = motor(device, limit_s=2.0)
+        with pytest.raises(HardwareError, match=r"takes more than timeout = 2 s for (\$H|G4P0.01)"):
             board.home()
             board.go(45)
 

@@ -1,22 +1,16 @@
 """The line protocol, and the firmware in `examples/` that speaks it, compiled for this computer."""
 
-import os
-import shutil
-import subprocess
-import tty
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
 from polcap.errors import HardwareError
-from polcap.rig import line_protocol, manual, serial_port
+from polcap.rig import manual
 from polcap.rig.line_protocol import Line, Settings, open_motor
 from polcap.rig.log import Log
-from polcap.rig.rotator import open_rotator, probe
 from polcap.rig.serial_port import Silent
-from tests.rig import devices
+from tests.rig import devices, virtual
 
 pytestmark = pytest.mark.timeout(120)
 ROOT = Path(__file__).parents[2]
@@ -24,8 +18,10 @@ STEPS_PER_DEGREE = 26.6667  # of the sketch
 
 
 @pytest.fixture(autouse=True)
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(line_protocol, "_START_S", 0.6)
+def clock() -> Iterator[virtual.Clock]:
+    """Of the simulated boards."""
+    with virtual.time() as clock:
+        yield clock
 
 
 def motor(device: devices.Line, settings: Settings | None = None, limit_s: float = 2.0) -> Line:
@@ -43,9 +39,8 @@ def test_words_on_the_wire() -> None:
         assert (board.model, board.speed_deg_s, device.released) == ("polcap-rotator simulated", 60, True)
 
 
-def test_a_move_is_waited_for_as_long_as_it_is_busy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serial_port, "ANSWER_S", 0.5)
-    with devices.Line(speed_deg_s=37) as device:  # homing takes a second
+def test_a_move_is_waited_for_as_long_as_it_is_busy() -> None:
+    with devices.Line(speed_deg_s=10) as device:  # homing takes four seconds
         motor(device, limit_s=20).home()
         assert device.angle_deg == 0
 
@@ -84,91 +79,3 @@ def test_a_restart_in_mid_move_is_told() -> None:
 def test_another_device_is_not_taken_for_one() -> None:
     with devices.Grbl() as device, pytest.raises(Silent, match="no polcap-rotator answers"):
         open_motor(device.port, Settings(), 2.0, Log(None))
-
-
-class Board(NamedTuple):
-    port: str
-    switch_deg: float
-    process: "subprocess.Popen[str]"
-
-    def released_deg(self) -> float:
-        """Where the ring was let go last."""
-        self.process.kill()
-        told = self.process.communicate(timeout=30)[1].splitlines()
-        return int(told[-1].split()[1]) / STEPS_PER_DEGREE
-
-
-@pytest.fixture(scope="module")
-def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    if shutil.which("g++") is None:
-        pytest.skip("needs g++")
-    folder = tmp_path_factory.mktemp("firmware")
-    program, sketch, shim = folder / "rotator", folder / "rotator_firmware.ino", Path(__file__).with_name("arduino.h")
-    text = (ROOT / "examples" / "rotator_firmware" / "rotator_firmware.ino").read_text()
-    sketch.write_text(text.replace("SPEED = 60.0", "SPEED = 600.0"))  # the ring of the test weighs nothing
-    flags = ["-Wall", "-Wextra", "-Werror", "-include", shim, "-x", "c++"]
-    subprocess.run(["g++", *flags, sketch, "-o", program], check=True, timeout=120)
-    return program
-
-
-@pytest.fixture
-def board(firmware: Path, request: pytest.FixtureRequest) -> Iterator[Board]:
-    """A ring at 20° whose switch closes at `param` degrees."""
-    master, slave = os.openpty()
-    tty.setraw(slave)
-    steps = [str(round(STEPS_PER_DEGREE * degrees)) for degrees in (20, request.param)]
-    process = subprocess.Popen([firmware, *steps], stdin=master, stdout=master, stderr=subprocess.PIPE, text=True)
-    yield Board(os.ttyname(slave), request.param, process)
-    process.kill()
-    process.communicate(timeout=30)
-    os.close(master)
-    os.close(slave)
-
-
-@pytest.mark.parametrize("board", [5, 25], indirect=True)  # the second starts on its switch
-def test_the_firmware_turns_the_ring_and_lets_it_go(board: Board) -> None:
-    rotator = open_rotator(f"line:{board.port}?settle=0", Log(None))
-    assert rotator.model == "polcap-rotator stepper"
-    for angle in (0.0, 45.0, 30.0):
-        assert rotator.move(angle) == pytest.approx(angle, abs=0.02)
-    rotator.close()
-    assert board.released_deg() == pytest.approx(board.switch_deg + 30, abs=0.06)
-
-
-@pytest.mark.parametrize("board", [-500], indirect=True)
-def test_the_firmware_refuses_what_it_cannot_do(board: Board) -> None:
-    assert probe(board.port) == "polcap-rotator stepper"
-    port = serial_port.Port(board.port, baud=line_protocol.BAUD, log=Log(None), name="rotator")
-    answers = []
-    for command in ("go 10", "where", "jump", "zero", "go north", "go 1e9", "go 5 6", "go -2.5", "stop", "where"):
-        port.send(command.encode() + b"\r\n")
-        while (answer := port.read_line(30)).startswith("polcap-rotator"):  # it has just started, and been asked
-            pass
-        answers.append(answer)
-    assert answers == [
-        "error home first",
-        "error home first",
-        "error unknown command",
-        "ok 0.000",
-        "error no angle",
-        "error no angle",
-        "error no angle",
-        "ok -2.512",  # 67 steps
-        "ok -2.512",
-        "error home first",
-    ]
-
-
-@pytest.mark.parametrize("board", [-500], indirect=True)
-def test_the_firmware_gives_up_on_a_missing_switch_and_says_it_is_busy_until_then(board: Board) -> None:
-    log_lines = []
-
-    class Lines(Log):
-        def write(self, device: str, mark: str, text: str) -> None:
-            log_lines.append(text)
-
-    port_url = f"line:{board.port}?settle=0"
-    rotator = open_rotator(port_url, Lines(None))
-    with pytest.raises(HardwareError, match="the switch was not found in 400 degrees; check its wiring"):
-        rotator.home()
-    assert any(text.startswith("busy -") for text in log_lines)

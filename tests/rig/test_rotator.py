@@ -7,22 +7,22 @@ import pytest
 from msgspec import convert
 
 from polcap.errors import HardwareError, SettingError
-from polcap.rig import grbl, line_protocol, serial_port
 from polcap.rig.log import Log
 from polcap.rig.rotator import Drive, Driven, Rotator, open_rotator, probe
 from polcap.rig.serial_port import Unplugged
-from tests.rig.devices import ALWAYS, SPOKEN, Device, Elliptec, Grbl, Line
+from tests.rig import virtual
+from tests.rig.devices import Elliptec, Grbl, Line
+from tests.rig.far_end import ALWAYS, SPOKEN, Device
 
 pytestmark = pytest.mark.timeout(120)
 KINDS = {"elliptec": Elliptec, "grbl": Grbl, "line": Line}
-QUICK = "settle=0&timeout=1"
+QUICK = "settle=0&timeout=4"
 
 
 @pytest.fixture(autouse=True)
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serial_port, "ANSWER_S", 0.3)
-    monkeypatch.setattr(grbl, "_START_S", 0.5)
-    monkeypatch.setattr(line_protocol, "_START_S", 1.2)
+def clock() -> Iterator[virtual.Clock]:
+    with virtual.time() as clock:
+        yield clock
 
 
 @pytest.fixture
@@ -54,7 +54,7 @@ def test_angles_are_reached_with_offset_and_sense(kind: str, drive: str, axis: i
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("at", [1, 2, 3, 5, 8, 12])
-@pytest.mark.parametrize("fault", SPOKEN)
+@pytest.mark.parametrize("fault", [*SPOKEN, "late"])
 def test_a_lost_or_spoilt_answer_is_asked_again(kind: str, at: int, fault: str, rotators: list[Rotator]) -> None:
     with KINDS[kind](fault=fault, at=at) as device:
         rotators.append(open_rotator(f"{kind}:{device.port}?{QUICK}", Log(None)))

@@ -1,0 +1,192 @@
+"""What every simulated rotator is: a ring that takes time to turn, answers on a wire, faults on order.
+
+    with virtual.time(), Elliptec(fault="half-line", at=3) as device:
+        rotator = open_rotator(f"elliptec:{device.port}", Log(None))
+
+They live by the clock of `virtual`, in the thread of whoever reads from them; with `real=True` on a pseudo-terminal and
+in a thread of their own, for another process.
+
+`fault` is one of the class's FAULTS or `late`, `at` the moment, `times` for how many moments in a row (`ALWAYS`: for
+ever).
+
+    moments are answers:    no-answer, garbage, half-line, late (after `serial_port` has given it up)
+    moments are movements:  busy (never ends), mechanical-timeout, wrong-position (stops 5° off, and says so);
+                            halfway: unplug (the port vanishes), alarm (a limit switch), restart (power lost)
+
+Homing is a movement; the first moment is 1. What happened: `heard` lists the commands, `angle_deg` is where the ring
+truly stands, `moves` and `answers` count. `unplug()` pulls the cable now.
+"""
+
+import os
+import select
+import threading
+import time
+import tty
+from collections.abc import Callable
+from typing import Any, ClassVar, Self
+
+from polcap.rig import serial_port
+from tests.rig import virtual
+
+ALWAYS = 1 << 30
+SPOKEN = ("no-answer", "garbage", "half-line")
+LATENCY_S = 0.016  # of a USB adapter's buffer, for each answer
+LATE_S = 1.4 * serial_port.ANSWER_S
+_OFF_DEG = 5.0  # of a wrong position
+
+
+class Device:
+    """A ring that takes time to turn, and answers that come one behind the other."""
+
+    FAULTS: ClassVar[tuple[str, ...]] = ()
+    END = b"\r\n"
+
+    def __init__(
+        self,
+        *,
+        fault: str = "",
+        at: int = 1,
+        times: int = 1,
+        speed_deg_s: float = 2000.0,
+        start_deg: float = 37.0,
+        real: bool = False,
+    ) -> None:
+        assert not fault or fault in (*self.FAULTS, "late"), f"{fault} is none of {self.FAULTS}"
+        self.fault, self.at, self.times = fault, at, times
+        self.speed_deg_s = speed_deg_s
+        self.angle_deg = start_deg
+        self.heard: list[str] = []
+        self.moves = 0
+        self.answers = 0
+        self.delivered = b""
+        self._wire = Terminal(self) if real else None
+        self.port = self._wire.name if self._wire else f"virtual://{id(self)}"
+        self._clock: Any = time if real else virtual.CLOCK
+        self._target_deg = start_deg
+        self._struck = ""  # the fault of this movement
+        self._ends: float | None = None  # monotonic; None: the ring stands
+        self._then: Callable[[], None] = lambda: None
+        self._said: list[tuple[float, bytes]] = []  # answers on their way, and when they arrive
+        self._gone = threading.Event()
+
+    def __enter__(self) -> Self:
+        if self._wire:
+            self._wire.start()
+        else:
+            virtual.PLUGGED[self.port] = self
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.unplug()
+        virtual.PLUGGED.pop(self.port, None)
+
+    @property
+    def gone(self) -> bool:
+        return self._gone.is_set()
+
+    def unplug(self) -> None:
+        """Pull the cable."""
+        self._gone.set()
+        if self._wire:
+            self._wire.join()
+
+    def receive(self, data: bytes) -> None:
+        """Bytes have come."""
+        raise NotImplementedError
+
+    def halfway(self) -> None:
+        """The planted fault of a movement strikes: mechanical-timeout, alarm, restart."""
+        raise NotImplementedError
+
+    def say(self, text: str) -> None:
+        """Answer a line, unless a fault is due."""
+        self.answers += 1
+        data, late_s = text.encode() + self.END, 0.0
+        if self.at <= self.answers < self.at + self.times:
+            spoilt = {"no-answer": b"", "garbage": b"\xff\x00\x87~\xf3" + self.END, "half-line": data[: len(text) // 2]}
+            data = spoilt.get(self.fault, data)
+            late_s = LATE_S if self.fault == "late" else 0.0
+        self.send(data, late_s)
+
+    def send(self, data: bytes, late_s: float = 0.0) -> None:
+        """Put bytes on the wire, behind those that are on it."""
+        before = max((due for due, _ in self._said), default=0.0)
+        self._said.append((max(self._clock.monotonic() + late_s, before) + LATENCY_S, data))
+
+    def tick(self) -> None:
+        """Called every few milliseconds."""
+
+    @property
+    def moving(self) -> bool:
+        return self._ends is not None
+
+    def turn(self, target_deg: float, then: Callable[[], None]) -> None:
+        """Start turning; `then` when the ring stands."""
+        self.moves += 1
+        due = self.fault not in (*SPOKEN, "late") and self.at <= self.moves < self.at + self.times
+        self._struck = self.fault if due else ""
+        seconds = abs(target_deg - self.angle_deg) / self.speed_deg_s
+        if self._struck == "wrong-position":
+            target_deg += _OFF_DEG
+        elif self._struck:
+            target_deg, seconds = (target_deg + self.angle_deg) / 2, seconds / 2
+        self._target_deg, self._then = target_deg, then
+        self._ends = self._clock.monotonic() + seconds
+
+    def freeze(self) -> None:
+        """Stop where the ring is about now, without `then`."""
+        if self._ends is not None:
+            left = max(0.0, self._ends - self._clock.monotonic()) * self.speed_deg_s
+            away = self._target_deg - self.angle_deg
+            self.angle_deg = self._target_deg - (left if away > 0 else -left) if abs(away) > left else self.angle_deg
+        self._ends = None
+
+    def step(self) -> None:
+        """Do what is due by now."""
+        self.tick()
+        if self._ends is not None and self._clock.monotonic() >= self._ends:
+            self._arrive()
+        while self._said and self._said[0][0] <= self._clock.monotonic():
+            self.delivered += self._said.pop(0)[1]
+
+    def _arrive(self) -> None:
+        self.angle_deg = self._target_deg
+        if self._struck == "busy":
+            self._ends = float("inf")
+        elif self._struck == "unplug":
+            self._ends = None
+            self._gone.set()
+        elif self._struck in ("mechanical-timeout", "alarm", "restart"):
+            self._ends = None
+            self.halfway()
+        else:
+            self._ends = None
+            self._then()
+
+
+class Terminal:
+    """A pseudo-terminal, and the thread in which its device lives."""
+
+    def __init__(self, device: Device) -> None:
+        self._device = device
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        self.name = os.ttyname(self._slave)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def join(self) -> None:
+        self._thread.join(5)
+
+    def _run(self) -> None:
+        device = self._device
+        while not device.gone:
+            if select.select([self._master], [], [], 0.002 if device.moving else 0.02)[0]:
+                device.receive(os.read(self._master, 4096))
+            device.step()
+            os.write(self._master, device.delivered)
+            device.delivered = b""
+        os.close(self._master)
+        os.close(self._slave)
