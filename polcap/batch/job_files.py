@@ -43,7 +43,7 @@ _UNSAID = {"threads": 0, "memory": 0, "workers": 0}  # defaults that need no wor
 
 
 def command(root: Path, options: Mapping[str, Any]) -> tuple[str, ...]:
-    """`polcap batch ROOT …` with the options that were given, by their names in the function of cli.py."""
+    """`polcap batch ROOT …` with the options that were given, by their names in `cli.batch_command`."""
     words = ["polcap", "batch", str(root.resolve())]
     for name, value in options.items():
         if name == "keep_going":

@@ -1,0 +1,66 @@
+"""In: a command line. Out: one call into polcap, its answer on stdout, an exit code.
+
+stdout carries data only; progress and messages go to stderr. Exit codes: 0 done, 2 the input or a
+setting is at fault, 3 the asset was written but a gate failed, 4 hardware, 130 interrupted (run again
+to go on), 1 a bug. Heavy imports happen inside the commands, so that `--help` answers at once.
+
+process_command    the path over one capture
+batch_command      over many
+result_commands    export, show, status, report: what is done with a result
+check_command      keep a capture or reshoot it
+doctor_command     what works on this machine
+synth_command      captures of objects that do not exist
+capture_command    shooting with a rig
+training_commands  train, evaluate
+options            what several commands share, and the values it means
+"""
+
+import os
+import sys
+from typing import Annotated
+
+import typer
+
+from polcap import __version__, terminal
+from polcap.cli.batch_command import batch
+from polcap.cli.capture_command import capture
+from polcap.cli.check_command import check
+from polcap.cli.doctor_command import doctor
+from polcap.cli.process_command import process
+from polcap.cli.result_commands import export, report, show, status
+from polcap.cli.synth_command import synth
+from polcap.cli.training_commands import evaluate, train
+
+COMMANDS = (process, batch, export, show, status, report, check, doctor, synth, capture, train, evaluate)
+app = typer.Typer(
+    help="Photographs through a turned polarizer, under a flash: in. A relightable 3-D asset: out.",
+    no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    rich_markup_mode=None,  # plain help: half the start-up time
+    pretty_exceptions_enable=False,
+)
+for command in COMMANDS:
+    app.command()(terminal.reported(command))
+
+
+def main() -> None:
+    """The `polcap` command."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # else the order of its sums follows the number of threads
+    arguments = sys.argv[1:]
+    if "--debug" in arguments:  # wherever it stands
+        arguments = ["--debug", *(argument for argument in arguments if argument != "--debug")]
+    for stream in (sys.stdout, sys.stderr):
+        stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]  # names of files are bytes
+    app(arguments)
+
+
+@app.callback()
+def front(
+    context: typer.Context,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of a failure.")] = False,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and end.")] = False,
+) -> None:
+    context.obj = debug
+    if version:
+        print(__version__)
+        raise typer.Exit

@@ -1,0 +1,76 @@
+"""In: a folder of captures. Out: their results, a summary, or a farm's job file: `polcap batch`."""
+
+import os
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from polcap import terminal
+from polcap.cli import options
+from polcap.cli.options import Angles, Assignments, ConfigFile, Device, Estimator, Json, Model, NoChart
+
+
+def batch(
+    context: typer.Context,
+    root: Annotated[Path, typer.Argument(help="Folder with captures, however deep.")],
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; by default CAPTURE/polcap each.")] = None,
+    config: ConfigFile = None,
+    assignments: Assignments = None,
+    shard: Annotated[
+        str | None, typer.Option(metavar="K/N", help="The K-th of N parts; else what Slurm, AWS, Kubernetes, PBS say.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, tcp://host:8786 or local (extra [batch]).")
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Captures at a time on this machine.")] = 1,
+    retries: Annotated[int, typer.Option(min=0, help="Tries more for a capture whose process died.")] = 2,
+    keep_going: Annotated[
+        bool, typer.Option("--keep-going/--fail-fast", help="Go on after a failure, or stop at the first.")
+    ] = True,
+    write_jobs: Annotated[
+        Literal["slurm", "openjd", "opencue", "snakemake", "kubernetes"] | None,
+        typer.Option(metavar="KIND", help="Only write the job file for slurm, openjd, opencue, snakemake, kubernetes."),
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=0, help="Shards of the job file; 0 is one per capture, 1000 at most.")] = 0,
+    json: Json = False,
+    device: Device = "cpu",
+    threads: Annotated[int, typer.Option(min=0, help="Threads per capture; 0 is all.")] = 0,
+    memory: Annotated[float, typer.Option(min=0, help="Most memory per process, GB; 0 is no limit.")] = 0,
+    angles: Angles = None,
+    chart: Annotated[Path | None, typer.Option(metavar="FILE", help="Color profile for all captures.")] = None,
+    no_chart: NoChart = False,
+    estimator: Estimator = None,
+    model: Model = None,
+) -> None:
+    """Process every capture below a folder; what is finished is left alone, what breaks does not stop the rest."""
+    import msgspec
+
+    from polcap import batch as batches
+    from polcap import config as settings
+    from polcap.batch import job_files, shards, unit
+
+    if write_jobs is not None:
+        found = batches.find(root, out)
+        command = job_files.command(root, context.params)
+        job = job_files.Job(command, root.resolve(), jobs or min(len(found), 1000), memory_gb=memory or 4.0)
+        file = job_files.write(write_jobs, job, (out or root).resolve() / unit.FOLDER)
+        terminal.tell(f"start it: {job_files.SUBMIT[write_jobs].format(file=file)}")
+        terminal.say({"file": str(file), "shards": job.shards} if json else str(file))
+        return
+    order = unit.Order(
+        settings=msgspec.to_builtins(settings.load(config, assignments or ())),
+        chart=options.chart_request(None if chart is None else str(chart), no_chart),
+        estimator=estimator,
+        model=None if model is None else str(model.resolve()),
+        device=device,
+        threads=threads,
+        memory_gb=memory,
+        angles_deg=options.angles_deg(angles),
+    )
+    part = shards.from_environment(os.environ) if shard is None else shards.parse(shard)
+    how = batches.How(part, scheduler, workers, retries, keep_going)
+    summary = batches.run(root, out, order, how, terminal.tell)
+    terminal.say(summary if json else str((out or root) / unit.FOLDER / "summary.html"))
+    if code := batches.exit_code(summary):
+        raise typer.Exit(code)

@@ -1,0 +1,77 @@
+"""In: a rig and how to shoot. Out: a capture folder and the verdict on it: `polcap capture`."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from polcap import terminal
+from polcap.cli import options
+from polcap.cli.check_command import judged
+from polcap.cli.options import Json
+from polcap.errors import GateError, InputError
+
+
+def capture(
+    context: typer.Context,
+    folder: Annotated[Path, typer.Argument(help="Folder to shoot into; new, or begun with --resume.")],
+    rotator: Annotated[
+        str | None, typer.Option(metavar="URL", help="elliptec:PORT, grbl:PORT, line:PORT, manual or simulated.")
+    ] = None,
+    camera: Annotated[
+        str | None, typer.Option(metavar="NAME", help="gphoto2, gphoto2:MODEL, folder:PATH or simulated.")
+    ] = None,
+    angles: Annotated[str | None, typer.Option(metavar="DEG,…", help="By default 0,45,90.")] = None,
+    bracket: Annotated[
+        str | None, typer.Option(metavar="1/200,1/50,…", help="Exposures; also as f/11, iso100, flash1/16.")
+    ] = None,
+    repeat: Annotated[
+        str | None,
+        typer.Option(metavar="DEG,…", help="Angles whose bracket is taken twice, to see the flash's spread."),
+    ] = None,
+    ambient: Annotated[bool, typer.Option("--ambient", help="Also frames without the flash.")] = False,
+    chart: Annotated[bool, typer.Option("--chart", help="Also a frame of the chart alone.")] = False,
+    tries: Annotated[int, typer.Option(min=0, help="How often a bad frame is taken again.")] = 2,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on: take what is missing.")] = False,
+    no_check: Annotated[bool, typer.Option("--no-check", help="Leave out the verdict at the end.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan with its times, and stop.")] = False,
+    json: Json = False,
+) -> None:
+    """Shoot a capture: turn the polarizer, take the bracket, check every frame as it lands."""
+    from polcap.rig import camera as cameras
+    from polcap.rig import plan, sequence
+
+    stated = {
+        "rotator": rotator,
+        "camera": camera,
+        "angles_deg": options.angles_deg(angles),
+        "bracket": None if bracket is None else cameras.parse_bracket(bracket),
+        "repeat_deg": None if repeat is None else options.numbers("--repeat", repeat),
+        "ambient": ambient or None,
+        "chart": chart or None,
+    }
+    wanted = sequence.order(folder, stated, resume)
+    if dry_run:
+        planned = plan.dry_run(wanted)
+        terminal.say(planned if json else plan.table(planned))
+        return
+    done = sequence.shoot(folder, wanted, resume=resume, tries=tries, tell=terminal.tell)
+    verdict = None if no_check else _verdict(folder)
+    terminal.say(done | {"check": verdict} if json else str(folder))
+    if verdict and verdict["verdict"] != "keep":
+        raise typer.Exit(GateError.exit_code)
+
+
+def _verdict(folder: Path) -> dict[str, Any] | None:
+    """What `polcap check` says of a capture, on stderr too; None where it cannot be judged."""
+    from polcap import check as checks
+    from polcap.config import Config
+    from polcap.path import AUTO
+
+    try:
+        verdict = judged(folder, None, Config(), AUTO)
+    except InputError as error:
+        terminal.tell(f"polcap: not judged: {terminal.line(error)}")
+        return None
+    terminal.tell(checks.table(verdict))
+    return checks.shown(verdict)

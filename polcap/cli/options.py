@@ -1,0 +1,70 @@
+"""In: words of the command line that several commands know. Out: their declarations, and the values they mean."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from polcap.errors import SettingError
+
+if TYPE_CHECKING:
+    from polcap.images import ChartRequest
+
+Result = Annotated[Path, typer.Argument(help="Result folder of `polcap process`.")]
+Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
+ConfigFile = Annotated[Path | None, typer.Option(help="TOML file of settings, a section per stage.")]
+Assignments = Annotated[
+    list[str] | None, typer.Option("--set", metavar="K=V", help="A setting, as hdr.clip=0.95; repeatable.")
+]
+Angles = Annotated[str | None, typer.Option(metavar="DEG,…", help="Angles of the shots in order, as 0,45,90.")]
+NoChart = Annotated[bool, typer.Option("--no-chart", help="Use the camera's own colours.")]
+Estimator = Annotated[
+    Literal["network", "analytic"] | None, typer.Option(help="By default the network where one is shipped.")
+]
+Model = Annotated[Path | None, typer.Option(metavar="ONNX", help="Another model than the shipped one.")]
+Device = Annotated[Literal["cpu", "cuda", "auto"], typer.Option(help="Where the network runs; cuda never falls back.")]
+
+
+def angles_deg(text: str | None) -> tuple[float, ...] | None:
+    """--angles in degrees; None where nothing was said."""
+    return None if text is None else numbers("--angles", text)
+
+
+def numbers(flag: str, text: str) -> tuple[float, ...]:
+    """Finite numbers between commas."""
+    try:
+        found = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise SettingError(f"{flag} {text}: not numbers separated by commas") from None
+    if not all(map(math.isfinite, found)):
+        raise SettingError(f"{flag} {text}: every number has to be finite")
+    return found
+
+
+def chart_request(text: str | None, no_chart: bool) -> "ChartRequest":
+    """--chart and --no-chart: corners in RAW px, a color profile, the camera's own colors, or what is found."""
+    import numpy as np
+
+    from polcap.formats import calib
+    from polcap.images import ChartRequest
+
+    if text is None:
+        return ChartRequest("none" if no_chart else "auto")
+    if no_chart:
+        raise SettingError("--chart and --no-chart exclude each other; leave one out")
+    if Path(text).suffix == ".toml":
+        return ChartRequest("profile", profile=calib.read_profile(Path(text)))
+    corners = numbers("--chart", text)
+    if len(corners) != 8:
+        raise SettingError(f"--chart gives {len(corners)} numbers; four corners have 8, a profile ends in .toml")
+    return ChartRequest("corners", corners=np.reshape(corners, (4, 2)))
+
+
+def user_mask(file: Path) -> Any:
+    """--mask: (H, W) bool, true where the picture is lighter than half of white."""
+    from polcap.formats import png
+
+    picture = png.read(file)
+    half = 128 if picture.dtype.itemsize == 1 else 32768
+    return (picture if picture.ndim == 2 else picture[..., :3].max(-1)) >= half

@@ -1,0 +1,127 @@
+"""In: a result folder of `process`. Out: its asset again, pictures, what it holds, its verdict: export to report."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from polcap import terminal
+from polcap.cli.options import Json, Result
+from polcap.errors import SettingError
+
+
+def export(
+    context: typer.Context,
+    result: Result,
+    gltf: Annotated[bool, typer.Option("--gltf", help="asset/NAME.glb")] = False,
+    obj: Annotated[bool, typer.Option("--obj", help="asset/NAME.obj, .mtl and textures")] = False,
+    usd: Annotated[bool, typer.Option("--usd", help="asset/NAME.usdc and textures (extra [usd])")] = False,
+    materialx: Annotated[bool, typer.Option("--materialx", help="asset/NAME.mtlx and textures")] = False,
+    exr: Annotated[bool, typer.Option("--exr", help="asset/NAME_layers.exr, every map as a layer")] = False,
+    preset: Annotated[
+        str | None, typer.Option(metavar="NAME", help="blender, unreal, unity, web or archive, into asset/NAME/.")
+    ] = None,
+    images: Annotated[
+        Literal["png", "jpeg", "webp", "ktx2"] | None, typer.Option(help="Kind of the pictures in the GLB.")
+    ] = None,
+    color: Annotated[
+        str, typer.Option(metavar="SPACE", help="Colour space or OCIO role of the EXR's colours, as ACEScg.")
+    ] = "lin_rec709",
+    texture_size: Annotated[
+        int | None, typer.Option(min=16, max=16384, help="Px of the textures' longer side; by default the maps'.")
+    ] = None,
+    lod: Annotated[
+        int, typer.Option(min=0, max=6, help="Further GLBs, each in a quarter of the triangles of the one before.")
+    ] = 0,
+    json: Json = False,
+) -> None:
+    """Write the asset again from the maps of a result; without a flag GLB and OBJ, as `process` does."""
+    from polcap import pipeline
+    from polcap.asset_export import Wanted
+    from polcap.formats import presets
+
+    flags = {"gltf": gltf, "obj": obj, "usd": usd, "materialx": materialx, "exr": exr}
+    formats = tuple(name for name in presets.FORMATS if flags[name])
+    if preset is not None and formats:
+        raise SettingError(f"--preset {preset} brings its formats; leave out --{formats[0]}")
+    wanted = Wanted(formats or ("gltf", "obj"), preset, images, color, texture_size, lod)
+    written = [str(file) for file in pipeline.export(result, wanted)]
+    terminal.say({"written": written} if json else "\n".join(written))
+
+
+def show(
+    context: typer.Context,
+    result: Result,
+    stage: Annotated[
+        str | None, typer.Argument(help="hdr, whitebalance, align, mask, selfcal, stokes, cues, …")
+    ] = None,
+    all_: Annotated[bool, typer.Option("--all", help="Every stage.")] = False,
+    animate: Annotated[
+        Literal["light", "turntable"] | None,
+        typer.Option(help="WebP, and MP4 where FFmpeg is present: a light that goes round, or the surface turned."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Draw what a stage made; prints the picture's path, and on a terminal shows it."""
+    from polcap import pipeline
+    from polcap.path import STAGES
+
+    if (stage is None) + (not all_) + (animate is None) != 2:
+        raise SettingError(f"show {result}: give one of a stage ({', '.join(STAGES)}), --all or --animate")
+    if animate is not None:
+        drawn = pipeline.animate(result, animate)
+    else:
+        drawn = pipeline.show(result, STAGES if stage is None else (stage,))
+    terminal.say({"written": [str(file) for file in drawn]} if json else "\n".join(map(str, drawn)))
+    terminal.preview(drawn)
+
+
+def status(context: typer.Context, result: Result, json: Json = False) -> None:
+    """What a result folder holds, stage by stage; or how far a batch of captures is."""
+    from polcap import store
+
+    found = store.contents(result)
+    if not found and (result / "polcap-batch").is_dir():
+        from polcap import batch as batches
+
+        about = batches.status(batches.reopen(result))
+        terminal.say(about if json else batches.lines(about))
+        return
+    if not found:
+        raise SettingError(f"{result} holds no stage cache; give the result folder of `polcap process`")
+    rows = [{name: about[name] for name in ("stage", "version", "key", "seconds", "bytes")} for about in found]
+    complete = (result / "report.json").exists()
+    if json:
+        terminal.say({"stages": rows, "complete": complete})
+        return
+    lines = [f"{r['stage']:14}{r['seconds']:8.2f} s {r['bytes'] / 1e6:9.2f} MB   {r['key'][:12]}" for r in rows]
+    terminal.say("\n".join([*lines, "complete" if complete else "not complete: run `polcap process` to go on"]))
+
+
+def report(
+    context: typer.Context,
+    result: Result,
+    compare: Annotated[Path | None, typer.Option(metavar="OTHER", help="Another result folder.")] = None,
+    json: Json = False,
+) -> None:
+    """Judge a result again from its stage cache, or show in which figures two results differ."""
+    from polcap import report as reports
+
+    if compare is not None:
+        from polcap.report import compare as pairs
+
+        abouts = reports.read(result), reports.read(compare)
+        file = result / "compare.html"
+        pairs.write(file, (result, compare), abouts)
+        rows = pairs.rows(*abouts)
+        named = [{"name": name, "here": here, "there": there} for name, here, there in rows]
+        spoken = (pairs.spoken(row) for row in rows)
+        terminal.say(named if json else "\n".join(f"{title}: {here}  |  {there}" for title, here, there in spoken))
+        print(f"polcap: both side by side: {file}", file=sys.stderr)
+        return
+    from polcap import pipeline
+
+    about = pipeline.judge_again(result)
+    terminal.say(about if json else str(result / "report.html"))
+    terminal.tell_gates(about)
