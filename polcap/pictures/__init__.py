@@ -32,6 +32,7 @@ from polcap.path import Results
 from polcap.pictures import keys
 from polcap.pictures.sheets import WIDTH, Tile, sheet, write
 from polcap.pictures.sheets import Picture as Picture
+from polcap.pictures.smaller import area
 
 _AGREE = "first shot magenta, this one green: grey where they agree"
 _LEVELS = 16383  # of linear light: a fifth of an 8-bit step where the curve is steepest
@@ -55,9 +56,11 @@ def of_stage(results: Results, stage: str) -> Picture:
     return paint[stage]()
 
 
-def reference(radiance: AngleStack, color: ColorCalibration) -> Picture:
-    """The reference shot in the calibrated colours, brightest parts just below white."""
-    return display(cv2.transform(np.asarray(radiance.value[0], np.float32), 2 * color.matrix.astype(np.float32)))
+def reference(radiance: AngleStack, color: ColorCalibration, widest: int | None = None) -> Picture:
+    """The reference shot in the calibrated colours, brightest parts just below white; averaged down to `widest` px."""
+    first = radiance.value[0]
+    shown = np.asarray(first, np.float32) if widest is None else area(first, _no_wider(first, widest))
+    return display(cv2.transform(shown, 2 * color.matrix.astype(np.float32)))
 
 
 def merged(radiance: AngleStack) -> Picture:
@@ -72,11 +75,12 @@ def merged(radiance: AngleStack) -> Picture:
     return sheet(tiles)
 
 
-def chart(radiance: AngleStack, color: ColorCalibration) -> Picture:
+def chart(radiance: AngleStack, color: ColorCalibration, widest: int | None = None) -> Picture:
     """The reference shot with the chart's patches as they were read."""
-    picture = reference(radiance, color)
-    zoom = max(1, round(2 * WIDTH / picture.shape[1]))
-    picture = np.asarray(np.repeat(np.repeat(picture, zoom, 0), zoom, 1), np.uint8)
+    picture = reference(radiance, color, widest)
+    times = max(1, round(2 * WIDTH / picture.shape[1]))
+    picture = np.asarray(np.repeat(np.repeat(picture, times, 0), times, 1), np.uint8)
+    zoom = picture.shape[1] / radiance.value.shape[2]
     outlines = [(quad, (0, 255, 0)) for quad in (color.quads if color.quads is not None else ())]
     if color.corners is not None:
         outlines.append((color.corners, (255, 255, 0)))
@@ -88,21 +92,28 @@ def chart(radiance: AngleStack, color: ColorCalibration) -> Picture:
 
 def alignment(radiance: AngleStack, found: Alignment) -> Picture:
     """Brightness of each shot after registration (green) over the reference (magenta): grey where they agree."""
-    first = _grey(radiance.value[0])
+    size = _no_wider(radiance.value[0], 2 * WIDTH)
+    zoom = np.diag([*np.divide(size, radiance.value.shape[2:0:-1]), 1.0])
+    zoom[:2, 2] = (zoom.diagonal()[:2] - 1) / 2  # pixel centres stand on whole numbers
+    first = _grey(area(radiance.value[0], size))
     tiles = []
     shots = zip(radiance.value, found.transform, found.residual_px, np.degrees(radiance.angle), strict=True)
     for value, transform, residual, angle in list(shots)[1:]:
-        moved = display(np.stack([first, warp(_grey(value), transform, order=1), first], -1), _top(first))
+        on_first = warp(_grey(area(value, size)), zoom @ transform @ np.linalg.inv(zoom), order=1)
+        moved = display(np.stack([first, on_first, first], -1), _top(first))
         x, y = transform[:2, 2]
         tiles.append(Tile(moved, f"{angle:g}° on the first: {x:+.2f}, {y:+.2f} px ± {residual:.3f}", note=_AGREE))
     return sheet(tiles)
 
 
-def outline(radiance: AngleStack, color: ColorCalibration, object_: ObjectMask) -> Picture:
+def outline(
+    radiance: AngleStack, color: ColorCalibration, object_: ObjectMask, widest: int | None = None
+) -> Picture:
     """The reference shot, darkened outside the mask, with the crop's box."""
-    picture = reference(radiance, color)
-    picture[~object_.mask] = picture[~object_.mask] // 3
-    x0, y0, x1, y1 = object_.crop
+    picture = reference(radiance, color, widest)
+    outside = area(object_.mask.astype(np.float32), picture.shape[1::-1]) < 0.5
+    picture[outside] = picture[outside] // 3
+    x0, y0, x1, y1 = (round(edge * picture.shape[1] / radiance.value.shape[2]) for edge in object_.crop)
     cv2.rectangle(picture, (x0, y0), (x1 - 1, y1 - 1), (255, 255, 0), 2)
     return picture
 
@@ -250,10 +261,14 @@ def hue(aolp: Floats, inside: NDArray[np.bool_]) -> Picture:
 
 def shrink(picture: Picture, width: int) -> Picture:
     """A picture no wider than `width`."""
-    if picture.shape[1] <= width:
-        return picture
-    height = max(1, round(picture.shape[0] * width / picture.shape[1]))
-    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    size = _no_wider(picture, width)
+    return picture if picture.shape[1] <= width else cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+
+
+def _no_wider(picture: Floats, width: int) -> tuple[int, int]:
+    """Width and height of a picture (h, w, …) made no wider than that."""
+    tall, wide = picture.shape[:2]
+    return (wide, tall) if wide <= width else (width, max(1, round(tall * width / wide)))
 
 
 def _top(linear: Floats) -> float:

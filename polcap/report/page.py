@@ -20,6 +20,7 @@ from polcap.report import labels, lean, plots, shown
 from polcap.report.shown import Rerendered, Shown
 
 _LONGEST = 1024  # px of a map on the page
+_WIDEST = 1000  # px of a picture of what was photographed
 _RIM = 4  # px that normals go on past the outline, for a texture's filter
 _HEADLINE = {
     "pass": "Good to use",
@@ -295,13 +296,13 @@ def _drawn(title: str, says: str, drawing: str) -> str:
 def _pictures(results: Results) -> Iterator[str]:
     radiance, color = results.radiance.value, results.color.value
     notable: Sequence[tuple[str, str, NDArray[np.uint8]]] = (
-        ("Reference shot", "the chart as it was read", pictures.chart(radiance, color)),
-        ("Object", "what was taken for it", pictures.outline(radiance, color, results.object_.value)),
+        ("Reference shot", "the chart as it was read", pictures.chart(radiance, color, _WIDEST)),
+        ("Object", "what was taken for it", pictures.outline(radiance, color, results.object_.value, _WIDEST)),
         ("Registration", "first shot magenta, the other green: grey is good", pictures.of_stage(results, "align")),
     )
     yield '<h2>What polcap saw</h2><div class="grid">'
     for title, says, picture in notable:
-        image = html.jpeg(pictures.shrink(picture, 1000))
+        image = html.jpeg(pictures.shrink(picture, _WIDEST))
         yield (
             f'<figure><div class="picture"><img alt="{title}" src="{image}"></div><figcaption><b>{title}</b><br><span>'
             f"{says}</span></figcaption></figure>"
