@@ -113,9 +113,13 @@ def patches(radiance: AngleStack, found: ColorCalibration) -> Floats | None:
         return None
     camera = np.zeros((24, 3))
     for index, quad in enumerate(found.quads):
-        drawn = np.zeros(radiance.value.shape[1:3], np.uint8)
-        cv2.fillConvexPoly(drawn, np.round(quad).astype(np.int32), 1)
-        inside = radiance.value[0][drawn > 0]
+        corners = np.round(quad).astype(np.int32)
+        low = np.clip(corners.min(axis=0), 0, None)  # x, y
+        part = radiance.value[0][low[1] : corners[:, 1].max() + 1, low[0] : corners[:, 0].max() + 1]
+        drawn = np.zeros(part.shape[:2], np.uint8)
+        if drawn.size:
+            cv2.fillConvexPoly(drawn, corners - low, 1)
+        inside = part[drawn > 0]
         camera[index] = 2 * np.median(inside, axis=0) if len(inside) else np.nan
     row, column = np.divmod(np.arange(24), _COLUMNS)
     white_row, white_column = divmod(WHITE_PATCH, _COLUMNS)

@@ -19,6 +19,9 @@ _REFLECTANCE = np.array([0.900, 0.591, 0.362, 0.198])  # of the light ones, as t
 _SCATTER = 0.001  # between patches, of print, registration and light that falls off
 
 
+Box = tuple[slice, slice]
+
+
 @dataclass(frozen=True)
 class GreyPatches:
     """Gains by the greys."""
@@ -43,11 +46,11 @@ def measure(radiance: AngleStack, alignment: Alignment, color: ColorCalibration)
     for p, patch in enumerate(_GREYS):
         clipped = False
         for k in range(shots):
-            inside = _polygon(color.quads[patch], alignment.transform[k], radiance.value.shape[1:3])
+            box, inside = _polygon(color.quads[patch], alignment.transform[k], radiance.value.shape[1:3])
             count = inside.sum()
-            clipped |= count < 9 or bool((radiance.quality[k][inside] & Quality.CLIPPED).any())
-            total[k, p] = radiance.value[k][inside].mean(0) if count else 0
-            variance[k, p] = radiance.variance[k][inside].sum(0) / max(count, 1) ** 2
+            clipped |= count < 9 or bool((radiance.quality[k][box][inside] & Quality.CLIPPED).any())
+            total[k, p] = radiance.value[k][box][inside].mean(0) if count else 0
+            variance[k, p] = radiance.variance[k][box][inside].sum(0) / max(count, 1) ** 2
         usable[p] = not clipped and bool((total[:, p] > 0).all())
     light = usable & (np.arange(len(_GREYS)) < _LIGHT)
     if not light.any():
@@ -100,9 +103,15 @@ def _alike(gain: Floats, sigma: Floats) -> tuple[Floats, Floats]:
     return np.where(agree, mean, gain), np.where(agree, pooled_sigma, sigma)
 
 
-def _polygon(quad: Floats, transform: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """(H, W) pixels of a shot inside a reference-grid quad (4, 2), one pixel within its edge."""
+def _polygon(quad: Floats, transform: Floats, shape: tuple[int, ...]) -> tuple[Box, NDArray[np.bool_]]:
+    """The pixels of a shot inside a reference-grid quad (4, 2), one pixel within its edge, in a box around them."""
     corners = transform @ np.column_stack([quad, np.ones(4)]).T
-    inside = np.zeros(shape[:2], np.uint8)
-    cv2.fillConvexPoly(inside, np.round((corners[:2] / corners[2]).T * 16).astype(np.int32), 1, shift=4)
-    return np.asarray(cv2.erode(inside, np.ones((3, 3), np.uint8)) > 0)
+    place = (corners[:2] / corners[2]).T  # (4, 2) x, y
+    low = np.clip(np.floor(place.min(axis=0)).astype(int) - 2, 0, shape[1::-1])
+    high = np.clip(np.ceil(place.max(axis=0)).astype(int) + 3, low, shape[1::-1])
+    box = slice(low[1], high[1]), slice(low[0], high[0])
+    inside = np.zeros(high[::-1] - low[::-1], np.uint8)
+    if inside.size:
+        cv2.fillConvexPoly(inside, np.round((place - low) * 16).astype(np.int32), 1, shift=4)
+        inside = np.asarray(cv2.erode(inside, np.ones((3, 3), np.uint8)), np.uint8)
+    return box, inside > 0
