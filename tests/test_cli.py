@@ -214,7 +214,7 @@ def test_watch_goes_on_as_the_photographs_come_in(example: Path, tmp_path: Path)
             plan += process.stdout.readline()
         assert len(json.loads(plan)["capture"]["shots"]) == 3
         process.send_signal(signal.SIGINT)
-        assert process.wait(20) == 130
+        assert process.wait(300) == 130
     finally:
         process.kill()
 

@@ -13,7 +13,7 @@ Seen = dict[str, tuple[int, int]]  # size and time of change by path
 def settled(folder: Path, ignored: Path, still_s: float = 2.0) -> Iterator[None]:
     """Yield at once, then whenever files came, went or changed and then nothing moved for `still_s` seconds.
 
-    `apart` is not looked at (what is made of the folder may lie in it), nor is what begins with a dot.
+    `ignored` is not looked at (what is made of the folder may lie in it), nor is what begins with a dot.
     """
     folder, ignored = folder.resolve(), ignored.resolve()
     done: Seen | None = None

@@ -30,7 +30,8 @@ from numpy.typing import NDArray
 
 from polcap import errors
 
-TIMEOUT_S = 180.0  # a 150 MP compressed frame takes about 6 s
+START_S = 300.0  # until a child has begun; about a second, but not on a machine that is busy with all else
+TIMEOUT_S = 180.0  # from then on; a 150 MP compressed frame takes about 6 s
 MEMORY_GIB = 8.0  # address space of the child
 _HEAD_BYTES = 4 << 20  # of an answer without its arrays; the tags of a photograph make a few kB
 _LOG_BYTES = 1 << 16  # of what a child has printed, read at its death
@@ -39,6 +40,7 @@ _GRACE_S = 5.0  # by which the child's own clock is later than its parent's
 Arrays = dict[str, NDArray[Any]]
 Answer = tuple[dict[str, Any], Arrays]
 _LENGTH = struct.Struct("<Q")
+_BEGUN = b"begun"  # the child has started and imported what it needs: from now on its time counts
 _START = (
     "import sys; sys.path[:] = sys.argv[3:]; from polcap.formats import worker; "
     "worker.serve(float(sys.argv[1]), int(sys.argv[2]))"
@@ -92,15 +94,18 @@ class Worker:
         }
         with self._lock:
             child = self._child if self._child and self._child.poll() is None else self._spawn()
-            overdue = threading.Event()
-            timer = threading.Timer(limit, _kill, (child, overdue))
-            timer.daemon = True
-            timer.start()
+            slow, overdue = threading.Event(), threading.Event()
             try:
-                _send(cast(IO[bytes], child.stdin), json.dumps(request).encode())
-                head, arrays = self._answer(cast(IO[bytes], child.stdout))
+                with _killed_after(START_S, child, slow):
+                    _send(cast(IO[bytes], child.stdin), json.dumps(request).encode())
+                    _receive(cast(IO[bytes], child.stdout), len(_BEGUN))
+                with _killed_after(limit, child, overdue):
+                    head, arrays = self._answer(cast(IO[bytes], child.stdout))
             except (EOFError, OSError):
                 code = child.wait()
+                if slow.is_set():
+                    name = os.fspath(path)
+                    raise errors.DecodeError(f"{name}: no decoder began within {START_S:g} s; run again") from None
                 gib = limit_gib or self.memory_gib
                 raise errors.DecodeError(self._cause_of_death(path, code, limit, gib, overdue.is_set())) from None
             except (ValueError, TypeError, KeyError) as error:
@@ -109,8 +114,6 @@ class Worker:
             except BaseException:  # Ctrl-C amid an answer: the pipe is no longer in step
                 self._stop()
                 raise
-            finally:
-                timer.cancel()
         if "bug" in head:
             bug = ChildBug(f"{os.fspath(path)}: {head['bug']}")
             bug.add_note(str(head["traceback"]))
@@ -195,6 +198,18 @@ class Worker:
         return self._log.read().decode(errors="replace").strip().rsplit("\n", 1)[-1].strip()
 
 
+@contextlib.contextmanager
+def _killed_after(limit_s: float, child: subprocess.Popen[bytes], overdue: threading.Event) -> Iterator[None]:
+    """Kill the child, and say so, when this takes too long."""
+    timer = threading.Timer(limit_s, _kill, (child, overdue))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
 def _kill(child: subprocess.Popen[bytes], overdue: threading.Event) -> None:
     overdue.set()
     child.kill()
@@ -258,6 +273,9 @@ def serve(memory_gib: float, lifeline: int) -> None:
             request = json.loads(_receive(requests, _HEAD_BYTES))
         except EOFError:
             return
+        with contextlib.suppress(Exception):  # told as the answer
+            importlib.import_module(request["module"])
+        _send(answers, _BEGUN)
         with _time_limit(request["limit_s"]), _memory_limit(request["limit_gib"]):
             head, arrays = _run(request, request["limit_gib"] or memory_gib)
         _send(answers, json.dumps(head).encode())

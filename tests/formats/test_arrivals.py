@@ -1,7 +1,7 @@
 """A folder that is being filled: told once it rests, and not before."""
 
-import threading
-import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -9,36 +9,56 @@ import pytest
 from polcap.formats import arrivals
 
 
-def test_tells_when_a_folder_rests_after_a_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+class Clock:
+    """Of the one who waits; whoever fills the folder does so meanwhile."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.meanwhile: Callable[[], object] = lambda: None
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+        self.meanwhile()
+
+
+@pytest.fixture(autouse=True)
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(arrivals, "time", clock)
+    return clock
+
+
+def test_tells_when_a_folder_rests_after_a_change(
+    tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made = tmp_path / "polcap"
     made.mkdir()
     monkeypatch.chdir(tmp_path)
     moments = arrivals.settled(Path(), made, still_s=0.6)  # the same folder by two names
     next(moments)  # as it is
 
+    (made / "map.exr").write_bytes(b"not looked at")
+    (tmp_path / ".hidden").write_bytes(b"nor this")
+    written = []
+
     def arrive() -> None:
-        (made / "map.exr").write_bytes(b"not looked at")
-        (tmp_path / ".hidden").write_bytes(b"nor this")
-        time.sleep(0.8)
-        for _ in range(4):  # a file that grows, more slowly than anybody looks
+        if clock.now > 1.0 and len(written) < 4:  # a file that grows
             with (tmp_path / "a.dng").open("ab") as file:
                 file.write(bytes(100))
-            written.append(time.monotonic())
-            time.sleep(0.3)
+            written.append(clock.now)
 
-    written: list[float] = []
-    thread = threading.Thread(target=arrive)
-    thread.start()
+    clock.meanwhile = arrive
     next(moments)
-    told = time.monotonic()
-    thread.join()
-    assert len(written) == 4 and told - written[-1] >= 0.6
+    assert len(written) == 4 and clock.now - written[-1] >= 0.6
 
 
-def test_tells_when_a_file_goes(tmp_path: Path) -> None:
+def test_tells_when_a_file_goes(tmp_path: Path, clock: Clock) -> None:
     (tmp_path / "a.dng").write_bytes(b"a")
     moments = arrivals.settled(tmp_path, tmp_path / "polcap", still_s=0.0)
     next(moments)
-    threading.Timer(0.3, (tmp_path / "a.dng").unlink).start()
+    clock.meanwhile = partial((tmp_path / "a.dng").unlink, missing_ok=True)
     next(moments)
     assert not (tmp_path / "a.dng").exists()

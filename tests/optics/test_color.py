@@ -62,7 +62,7 @@ def test_colour_science_leaves_no_mock_modules_behind():
         "import sys, unittest.mock; from polcap.optics import color; color.load_colour_science(); "
         "assert not [n for n, m in sys.modules.items() if isinstance(m, unittest.mock.MagicMock)]; import trimesh"
     )
-    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, timeout=120)
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, timeout=500)
 
 
 def seen(matrix, slope=(0.0, 0.0), glare=0.0):

@@ -13,7 +13,7 @@ from typing import Any
 
 from tests.render import browser
 
-LIMIT_S = 60
+LIMIT_S = 400
 
 
 class Page:
@@ -119,7 +119,6 @@ def opened() -> Iterator[Page]:
             page.call("Network.emulateNetworkConditions", **offline)
             yield page
         finally:
-            process.terminate()
-            process.wait(timeout=10)
+            browser.end(process)
             os.close(to_browser[1])
             os.close(from_browser[0])
