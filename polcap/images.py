@@ -166,7 +166,8 @@ class ChartReference:
 
     name: str
     rec709: Floats  # (24, 3) linear Rec.709/D65 reflectance, row by row from dark skin
-    size_m: tuple[float, float]  # width, height between the outer patch corners
+    size_m: tuple[float, float] | None  # width, height between the outer patch corners, as far as it is known
+    patches: tuple[str, ...] = ()  # (24,) their names
 
 
 @dataclass(frozen=True)
@@ -182,6 +183,8 @@ class ColorCalibration:
     metres_per_px: float | None  # at the chart's distance, on this grid; None without a known chart size
     falloff: tuple[float, float] = (0.0, 0.0)  # relative change of the light per patch, to the chart's right, down
     glare: float = 0.0  # white light that the chart's gloss and the lens add to every patch [reflectance]
+    predicted: Floats | None = None  # (24,) CIEDE2000 of each patch by the matrix of all others
+    patch_use: Bits | None = None  # (24,) 0 served; else why not, `whitebalance.patches.PatchUse`
 
 
 @dataclass(frozen=True)

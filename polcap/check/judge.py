@@ -56,7 +56,8 @@ class Reduced:
     @cached_property
     def _color(self) -> tuple[ColorCalibration, str]:
         """Without a chart the rest can still be judged."""
-        reference, step, request = calib.colorchecker(), self.taken.step, self.chart
+        reference = calib.colorchecker(self.config.whitebalance.chart)
+        step, request = self.taken.step, self.chart
         if request.corners is not None:
             request = replace(request, corners=(request.corners - (step - 1) / 2) / step)
         try:

@@ -9,7 +9,7 @@ import tomli_w
 
 from polcap.errors import ChartError, StorageError
 from polcap.formats import atomic, text_file
-from polcap.images import ChartReference, ColorCalibration, Floats
+from polcap.images import Bits, ChartReference, ColorCalibration, Floats
 
 _SOURCES = ("chart", "corners", "profile", "camera", "none")
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -42,19 +42,19 @@ class _Chart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     illuminant: tuple[float, float]
     rows: int
     columns: int
-    size_m: tuple[float, float]
     patch: list[_Patch]
+    size_m: tuple[float, float] | None = None
 
 
-def colorchecker(path: Path | None = None) -> ChartReference:
-    """The ColorChecker Classic's reference colours, shipped with polcap, or of a file of the same form.
+def colorchecker(kind: str = "classic", path: Path | None = None) -> ChartReference:
+    """The reference colours of a shipped kind of ColorChecker (classic, sg), or of a file of the same form.
 
     Raises
     ------
     ChartError
         A file that is not TOML, or does not describe a chart of 4 rows of 6 patches.
     """
-    path = path or data_path("colorchecker/classic.toml")
+    path = path or data_path(f"colorchecker/{kind}.toml")
     chart = _read(path, _Chart)
     if (chart.rows, chart.columns, len(chart.patch)) != (4, 6, 24):
         raise ChartError(
@@ -62,7 +62,10 @@ def colorchecker(path: Path | None = None) -> ChartReference:
             "polcap reads charts of 4 × 6 = 24 patches"
         )
     return ChartReference(
-        name=chart.name, rec709=np.array([patch.rec709 for patch in chart.patch]), size_m=chart.size_m
+        name=chart.name,
+        rec709=np.array([patch.rec709 for patch in chart.patch]),
+        size_m=chart.size_m,
+        patches=tuple(patch.name.partition(" (")[0] for patch in chart.patch),
     )
 
 
@@ -76,6 +79,8 @@ class _Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     corners: list[list[float]] | None = None
     falloff: tuple[float, float] = (0.0, 0.0)
     glare: float = 0.0
+    predicted: list[float] | None = None
+    patch_use: list[int] | None = None
 
 
 def write_profile(path: Path, color: ColorCalibration) -> None:
@@ -90,6 +95,8 @@ def write_profile(path: Path, color: ColorCalibration) -> None:
         "corners": _rounded(color.corners, 3),
         "falloff": list(color.falloff),
         "glare": color.glare,
+        "predicted": _rounded(color.predicted, 3),
+        "patch_use": None if color.patch_use is None else color.patch_use.tolist(),
     }
     text = (
         "# polcap colour profile. matrix: camera radiance (I0 + I90) -> linear Rec.709 reflectance.\n"
@@ -126,6 +133,8 @@ def read_profile(path: Path) -> ColorCalibration:
         metres_per_px=profile.metres_per_px,
         falloff=profile.falloff,
         glare=profile.glare,
+        predicted=_shaped(profile.predicted, (24,), path, "predicted"),
+        patch_use=_uses(profile.patch_use, path),
     )
 
 
@@ -137,6 +146,13 @@ def _read(path: Path, form: Any) -> Any:
         raise ChartError(f"{path}: cannot be read ({error.strerror}); give a profile's path") from error
     except ValueError as error:
         raise ChartError(f"{path}: not a polcap colour file ({error})") from error
+
+
+def _uses(values: list[int] | None, path: Path) -> Bits | None:
+    found = _shaped(values, (24,), path, "patch_use")
+    if found is not None and ((found < 0) | (found > 255)).any():
+        raise ChartError(f"{path}: patch_use holds no small whole numbers; write the profile again")
+    return None if found is None else found.astype(np.uint8)
 
 
 def _rounded(values: Floats | None, digits: int) -> Any:

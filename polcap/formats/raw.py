@@ -16,6 +16,7 @@ from polcap.formats import exif, photo_bytes, plausible, sniff, worker
 from polcap.images import Bits, Exif, Floats, SensorImage
 from polcap.optics.color import REC709_TO_XYZ
 
+_EIGHT_BITS = 255  # counts between black and white: rounding alone is 1 % of a dark patch
 _COPY_AGAIN = "copy it from the card again"
 
 
@@ -126,7 +127,7 @@ def decode(path: str, digest: str | None = None) -> worker.Answer:
     lossy = plausible.is_lossy(structure)
     plausible.check_levels(path, arrays["value"], float(np.max(meta["black"])), meta["white"], lossy)
     stated = exif.tags(data).color_matrix
-    meta["lossy"] = lossy
+    meta["lossy"] = lossy or meta["white"] - float(np.min(meta["black"])) <= _EIGHT_BITS
     return meta | ({} if stated is None else {"xyz_to_camera": stated}), arrays
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from polcap.config import Gates
 from polcap.gates.gate import DEGREES_PER_GAIN, Found, Gate, State, at_most, blamed
 from polcap.images import AngleStack, Floats
+from polcap.stages.whitebalance import patches
 
 _EVEN_STEPS = (1.3, 20.0)  # from one exposure to the next: less is no bracket, more leaves a gap
 _ALIKE = 1.15  # steps in the pixels below this, where the metadata promise more than _PROMISED, are none
@@ -106,6 +107,12 @@ def chart(found: Found, limits: Gates) -> Gate:
         return Gate("chart", "not measured", None, limit, "none was asked for", unit="ΔE2000")
     mean = float(np.nanmean(error))
     says = f"its colours are met to ΔE {mean:.1f}"
+    if found.color.predicted is not None:
+        says += f", to {float(np.nanmean(found.color.predicted)):.1f} where a patch is left out of the fit"
+    if found.color.patch_use is not None and found.color.patch_use.any():
+        says += f"; {patches.left_out(found.color.patch_use)}"
+    if found.radiance.lossy:
+        says += "; the pictures have 8 bits or a camera's rendering, which a matrix cannot undo"
     remedy = "light the chart as the object, without glare, or give its corners with --chart"
     return at_most("chart", mean, limit, says, remedy, unit="ΔE2000")
 

@@ -29,6 +29,7 @@ from polcap.images import (
 from polcap.path import Results
 from polcap.report import labels, page, shown
 from polcap.report.whole import Whole
+from polcap.stages.whitebalance import patches
 
 _COMPARED_PX = 512  # the longest side on which photographs and re-rendering are compared
 
@@ -102,6 +103,9 @@ def figures(results: Results) -> dict[str, dict[str, Any]]:
             "delta_e_mean": None if color.delta_e is None else _number(np.nanmean(color.delta_e)),
             "delta_e_max": None if color.delta_e is None else _number(np.nanmax(color.delta_e)),
             "delta_e": None if color.delta_e is None else _list(color.delta_e, 2),
+            "predicted_mean": None if color.predicted is None else _number(np.nanmean(color.predicted)),
+            "predicted": None if color.predicted is None else _list(color.predicted, 2),
+            "left_out": None if color.patch_use is None else patches.left_out(color.patch_use),
             "detector_cost": _number(color.cost),
             "metres_per_px": color.metres_per_px,
             "matrix": _list(color.matrix),

@@ -27,11 +27,6 @@ _HEADLINE = {
     "warn": "Good to use, with an assumption to check",
     "fail": "Look before you use this",
 }
-PATCHES = (
-    "dark skin", "light skin", "blue sky", "foliage", "blue flower", "bluish green", "orange", "purplish blue",
-    "moderate red", "purple", "yellow green", "orange yellow", "blue", "green", "red", "yellow", "magenta", "cyan",
-    "white", "neutral 8", "neutral 6.5", "neutral 5", "neutral 3.5", "black", "",
-)  # fmt: skip
 
 
 def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
@@ -264,10 +259,13 @@ def _measured(results: Results, about: Mapping[str, Any]) -> Iterator[str]:
     yield "<h2>How it was measured</h2><div class='grid'>"
     measured = shown.patches(radiance, color)
     if measured is not None and color.delta_e is not None:
-        reference = shown.srgb(calib.colorchecker().rec709)
-        drawing = plots.chart(reference, shown.srgb(measured), color.delta_e, PATCHES)
-        mean = labels.number(about["figures"]["chart"]["delta_e_mean"], 2)
-        yield _drawn("Chart", f"outside the maker's colors, inside as photographed; below ΔE2000, mean {mean}", drawing)
+        reference = calib.colorchecker(about["settings"]["whitebalance"]["chart"])
+        drawing = plots.chart(shown.srgb(reference.rec709), shown.srgb(measured), color.delta_e, reference.patches)
+        figures = about["figures"]["chart"]
+        mean, ahead = labels.number(figures["delta_e_mean"], 2), figures["predicted_mean"]
+        says = f"outside the maker's colors, inside as photographed; below ΔE2000, mean {mean}"
+        says += "" if ahead is None else f", {labels.number(ahead, 2)} where the patch itself is left out of the fit"
+        yield _drawn("Chart", says, drawing)
     merge = about["figures"]["merge"]
     yield _drawn(
         "Exposures",

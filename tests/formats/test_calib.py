@@ -21,15 +21,24 @@ PROFILE = ColorCalibration(
     metres_per_px=0.00072,
     falloff=(0.01, -0.02),
     glare=0.015,
+    predicted=np.where(np.arange(24) == 18, np.nan, 1.5),
+    patch_use=np.where(np.arange(24) == 18, 1, 0).astype(np.uint8),
 )
 
 
-def test_shipped_chart_is_the_makers_table():
+@pytest.mark.parametrize(
+    ("kind", "name", "patches"),
+    [
+        ("classic", "ColorChecker24 - After November 2014", None),
+        ("sg", "ColorCheckerSG - After November 2014", [f"{c}{r}" for r in (2, 3, 4, 5) for c in "EFGHIJ"]),
+    ],
+)
+def test_shipped_chart_is_the_makers_table(kind, name, patches):
     colour = color.load_colour_science()
-    table = colour.CCS_COLOURCHECKERS["ColorChecker24 - After November 2014"]
-    xyz = colour.xyY_to_XYZ(list(table.data.values()))
+    table = colour.CCS_COLOURCHECKERS[name]
+    xyz = colour.xyY_to_XYZ([table.data[patch] for patch in patches or table.data])
     expected = colour.XYZ_to_RGB(xyz, "ITU-R BT.709", table.illuminant, "Bradford")
-    reference = calib.colorchecker()
+    reference = calib.colorchecker(kind)
     assert reference.rec709.shape == (24, 3)
     assert reference.rec709 == pytest.approx(expected, rel=3e-4, abs=1e-4)  # the standard prints four digits
 
@@ -63,7 +72,18 @@ def test_profile_comes_back_as_it_went(tmp_path):
     path = tmp_path / "set-up.toml"
     calib.write_profile(path, PROFILE)
     back = calib.read_profile(path)
-    for name in ("matrix", "quads", "corners", "delta_e", "cost", "metres_per_px", "falloff", "glare"):
+    for name in (
+        "matrix",
+        "quads",
+        "corners",
+        "delta_e",
+        "cost",
+        "metres_per_px",
+        "falloff",
+        "glare",
+        "predicted",
+        "patch_use",
+    ):
         np.testing.assert_allclose(getattr(back, name), getattr(PROFILE, name), atol=1e-8)  # NaN equals NaN
     assert back.source == "chart"
 
@@ -103,4 +123,4 @@ def test_chart_of_another_shape_is_refused(tmp_path):
     text = calib.data_path("colorchecker/classic.toml").read_text()
     (tmp_path / "c.toml").write_text(text.replace("rows = 4", "rows = 3"))
     with pytest.raises(ChartError, match="3 rows"):
-        calib.colorchecker(tmp_path / "c.toml")
+        calib.colorchecker(path=tmp_path / "c.toml")

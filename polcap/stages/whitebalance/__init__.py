@@ -12,7 +12,7 @@ McCamy, Marcus, Davidson, A Color-Rendition Chart, J. Applied Photographic Engin
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import cv2
 import msgspec
@@ -21,23 +21,25 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from polcap.errors import ChartError
-from polcap.images import AngleStack, ChartReference, ChartRequest, ColorCalibration, Floats, Quality, View
-from polcap.optics.color import MatrixFit, fit_matrix
+from polcap.images import AngleStack, ChartReference, ChartRequest, ColorCalibration, Floats, View
 from polcap.stages import stage
-from polcap.stages.whitebalance import chart
+from polcap.stages.whitebalance import chart, patches
 from polcap.stages.whitebalance.chart import Placement
+from polcap.stages.whitebalance.patches import ChartFit
 
 _WORK_PITCH_PX = 32.0  # the chart is placed at no more pixels per patch than this
 _LEAST_PITCH_PX = 8.0  # below, a patch has too few pixels to be sampled
-_LEAST_PATCHES = 12  # unclipped, for 9 + 2 unknowns per three channels
 _TILE_PX, _TILE_STEP_PX = 900, 600
 _GAMMA = (255 * np.linspace(0, 1, 2**14) ** (1 / 2.2)).astype(np.uint8)
 _CANDIDATES = 3  # per picture: texture may look more like a chart than the chart
-_WHITE = 18  # index of the white patch, the first of six greys
 _REMEDY = "give its corners with --chart x0,y0,…,x3,y3, a profile with --chart FILE, or --no-chart"
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    chart: Annotated[
+        Literal["classic", "sg"],
+        Meta(description="kind of chart; of a (Digital) SG its block E2 to J5, whose corners --chart states"),
+    ] = "classic"
     chart_width_m: (
         Annotated[float, Meta(gt=0, le=2, description="chart between its outer patch corners, unset: unknown [m]")]
         | None
@@ -53,7 +55,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     patch_share: Annotated[float, Meta(ge=0.2, le=0.95, description="sampled share of each patch's side")] = 0.6
 
 
-@stage(version=1)
+@stage(version=2)
 def measure(
     radiance: AngleStack, reference: ChartReference, request: ChartRequest, settings: Settings
 ) -> ColorCalibration:
@@ -61,7 +63,7 @@ def measure(
 
     The patches of the reference shot give 2·I = S0, for a matt chart that faces the camera is unpolarized.
     The matrix holds at the white patch, less the chart's glare: matrix @ S0 = reflectance + glare there.
-    `delta_e` is NaN for patches left out because they are over-exposed. `metres_per_px` needs
+    `delta_e` is NaN for patches left out, `patch_use` says why. `metres_per_px` needs
     `settings.chart_width_m`: nothing is assumed about the chart's size.
 
     Raises
@@ -77,18 +79,25 @@ def measure(
         return replace(request.profile, source="profile", quads=None, corners=None)
     if request.mode == "corners":
         found = _at_corners(radiance, reference, request.corners, settings)
+    elif settings.chart == "sg":
+        raise ChartError(
+            "a ColorChecker SG is not looked for; give the outer corners of its patches E2, J2, J5, E5 with --chart"
+        )
     else:
         found = _search(radiance, reference, settings)
+    fit = found.seen.fit
     return ColorCalibration(
-        matrix=found.fit.matrix,
+        matrix=fit.matrix,
         quads=found.place.quads(settings.patch_share),
         corners=found.place.corners(),
-        delta_e=found.fit.delta_e,
+        delta_e=fit.delta_e,
         source="corners" if request.mode == "corners" else "chart",
         cost=found.cost,
         metres_per_px=_scale(found.place, radiance.view, settings.chart_width_m),
-        falloff=(float(found.fit.slope[0]), float(found.fit.slope[1])),
-        glare=found.fit.glare,
+        falloff=(float(fit.slope[0]), float(fit.slope[1])),
+        glare=fit.glare,
+        predicted=patches.predicted(found.seen, reference),
+        patch_use=found.seen.use,
     )
 
 
@@ -102,12 +111,12 @@ def _monochrome(value: Floats) -> bool:
 @dataclass(frozen=True)
 class _Find:
     place: Placement
-    fit: MatrixFit
+    seen: ChartFit
     cost: float  # the detector's; NaN where the user said where
 
     @property
     def error(self) -> float:
-        return float(np.nanmean(self.fit.delta_e))
+        return self.seen.mean
 
 
 def _search(radiance: AngleStack, reference: ChartReference, settings: Settings) -> _Find:
@@ -187,46 +196,8 @@ def _at_corners(
     return find
 
 
-def _fit(radiance: AngleStack, place: Placement, reference: ChartReference, settings: Settings) -> MatrixFit:
-    """The matrix that the reference shot's patches ask for; ChartError where too many are over-exposed."""
-    color, usable = sample(radiance.value[0], radiance.quality[0], place, settings.patch_share)
-    if usable.sum() < _LEAST_PATCHES:
-        raise ChartError(
-            f"{24 - usable.sum()} of the chart's 24 patches are over-exposed or outside the image, at most "
-            f"{24 - _LEAST_PATCHES} may be; add a shorter exposure to the bracket, or show the whole chart"
-        )
-    return fit_matrix(color, reference.rec709, chart.centers() - chart.centers()[_WHITE], usable)
-
-
-def sample(
-    value: Floats, quality: NDArray[np.uint8], place: Placement, share: float
-) -> tuple[Floats, NDArray[np.bool_]]:
-    """S0 of each patch (24, 3) and whether it may be used (24,).
-
-    Twice the trimmed mean over the inner `share` of the patch in one shot's radiance (H, W, 3). Not
-    used: patches with more than 2 % clipped pixels, or with hardly any pixel in the image.
-    """
-    color, usable = np.zeros((24, 3)), np.zeros(24, bool)
-    for index, quad in enumerate(place.quads(share)):
-        x, y = _inside(quad, value.shape[:2])
-        if len(x) < 4:
-            continue
-        pixels = np.sort(value[y, x].astype(np.float64), axis=0)
-        trim = len(pixels) // 10
-        color[index] = 2 * pixels[trim : len(pixels) - trim].mean(axis=0)
-        usable[index] = np.mean((quality[y, x] & Quality.CLIPPED) > 0) <= 0.02
-    return color, usable
-
-
-def _inside(quad: Floats, shape: tuple[int, ...]) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
-    """x, y of the pixels whose centres lie in a convex quad (4, 2) px."""
-    x0, y0 = np.maximum(np.ceil(quad.min(axis=0)).astype(int), 0)
-    x1, y1 = np.minimum(np.floor(quad.max(axis=0)).astype(int) + 1, [shape[1], shape[0]])
-    y, x = np.mgrid[y0 : max(y1, y0), x0 : max(x1, x0)]
-    inside = np.ones(x.shape, bool)
-    for (ax, ay), (bx, by) in zip(quad, np.roll(quad, -1, axis=0), strict=True):
-        inside &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= 0
-    return x[inside], y[inside]
+def _fit(radiance: AngleStack, place: Placement, reference: ChartReference, settings: Settings) -> ChartFit:
+    return patches.fit(radiance.value[0], radiance.quality[0], place, reference, settings.patch_share)
 
 
 def _plausible(place: Placement, settings: Settings) -> bool:

@@ -1,0 +1,146 @@
+"""In: radiance and a chart's place. Out: the colour of each patch, which of them may serve, and their matrix.
+
+A patch serves unless it is clipped, outside the picture, uneven (an edge of a shadow or of a finger lies on it), or
+at odds with the matrix that suits most of the others (it is hidden, in shade, or it shines).
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.errors import ChartError
+from polcap.images import Bits, ChartReference, Floats, Quality
+from polcap.optics import color
+from polcap.stages.whitebalance import chart
+from polcap.stages.whitebalance.chart import Placement
+
+WHITE = 18  # index of the white patch, the first of six greys
+_LEAST = 12  # patches for 9 + 2 unknowns per three channels
+_CLIPPED = 0.02  # share of a patch's pixels that may be clipped
+_UNEVEN, _UNEVEN_WHITE = 0.15, 0.01  # a quarter of a patch may differ by so much of it and of the white patch
+_ODD, _LEAST_ODD = 6.0, 4.0  # times the median ΔE, and ΔE at least, beyond which a patch is at odds with the others
+_MOST_COUNTED = 30.0  # ΔE of a patch left out in the mean that accepts a chart: 40 is no worse than 30
+
+
+class PatchUse(IntEnum):
+    """Why a patch did not serve."""
+
+    USED = 0
+    CLIPPED = 1
+    OUTSIDE = 2
+    UNEVEN = 3
+    ODD = 4
+
+
+@dataclass(frozen=True)
+class ChartFit:
+    """What the patches say."""
+
+    fit: color.MatrixFit
+    use: Bits  # (24,) PatchUse
+    mean: float  # ΔE2000 over all patches that are seen unclipped, those left out too: judges whether it is a chart
+    color: Floats  # (24, 3) S0 of the patches, camera channels
+
+
+def fit(value: Floats, quality: Bits, place: Placement, reference: ChartReference, share: float) -> ChartFit:
+    """The matrix that one shot's patches (radiance (H, W, 3) and its quality) ask for.
+
+    Raises
+    ------
+    ChartError
+        Fewer than 12 patches may serve.
+    """
+    seen, use = sample(value, quality, place, share)
+    _check(use)
+    error = color.fitting(seen, reference.rec709, position(), use == PatchUse.USED)
+    odd = error > max(_LEAST_ODD, _ODD * float(np.median(error[use == PatchUse.USED])))
+    use = np.where((use == PatchUse.USED) & odd, PatchUse.ODD, use).astype(np.uint8)
+    if (use == PatchUse.USED).sum() < _LEAST:  # no matrix suits most of them: then all are to say how badly
+        use = np.where(use == PatchUse.ODD, PatchUse.USED, use).astype(np.uint8)
+    found = color.fit_matrix(seen, reference.rec709, position(), use == PatchUse.USED)
+    every = np.where(use == PatchUse.ODD, np.minimum(error, _MOST_COUNTED), found.delta_e)
+    return ChartFit(found, use, float(np.nanmean(every)), seen)
+
+
+def predicted(found: ChartFit, reference: ChartReference) -> Floats | None:
+    """ΔE2000 (24,) of each patch by the matrix of all others; None where too few are left for that."""
+    used = found.use == PatchUse.USED
+    return color.predicted(found.color, reference.rec709, position(), used) if used.sum() > _LEAST else None
+
+
+def position() -> Floats:
+    """(24, 2) of the patches from the white one, in patches."""
+    return np.asarray(chart.centers() - chart.centers()[WHITE])
+
+
+def sample(value: Floats, quality: Bits, place: Placement, share: float) -> tuple[Floats, Bits]:
+    """S0 of each patch (24, 3) and its use (24,).
+
+    Twice the trimmed mean over the inner `share` of the patch in one shot's radiance (H, W, 3).
+    """
+    color_, uneven = np.zeros((24, 3)), np.zeros(24)
+    use = np.zeros(24, np.uint8)
+    for index, quad in enumerate(place.quads(share)):
+        x, y = _inside(quad, value.shape[:2])
+        if len(x) < 4:
+            use[index] = PatchUse.OUTSIDE
+            continue
+        inside = value[y, x].astype(np.float64)
+        pixels = np.sort(inside, axis=0)
+        trim = len(pixels) // 10
+        color_[index] = 2 * pixels[trim : len(pixels) - trim].mean(axis=0)
+        uneven[index] = 2 * _between_quarters(inside, x - x.mean(), y - y.mean())
+        if np.mean((quality[y, x] & Quality.CLIPPED) > 0) > _CLIPPED:
+            use[index] = PatchUse.CLIPPED
+    light = color_.sum(axis=1)
+    too_uneven = uneven > _UNEVEN * light + _UNEVEN_WHITE * light.max()
+    return color_, np.where((use == PatchUse.USED) & too_uneven, PatchUse.UNEVEN, use).astype(np.uint8)
+
+
+def left_out(use: Bits) -> str:
+    """The patches that did not serve and why, for a message; empty where all did. Numbers count from dark skin."""
+    words = {
+        PatchUse.CLIPPED: "over-exposed",
+        PatchUse.OUTSIDE: "outside the picture",
+        PatchUse.UNEVEN: "partly hidden or in shade",
+        PatchUse.ODD: "hidden, in shade or shining",
+    }
+    parts = []
+    for reason, word in words.items():
+        which = [str(patch + 1) for patch in np.flatnonzero(use == reason)]
+        if which:
+            parts.append(f"{', '.join(which)} {word}")
+    return f"left out, of patches 1 to 24: {'; '.join(parts)}" if parts else ""
+
+
+def _between_quarters(pixels: Floats, x: Floats, y: Floats) -> float:
+    """Greatest difference of the light (sum of channels) between a patch's quarter and the whole."""
+    light = pixels.sum(axis=1)
+    quarter = 2 * (x > 0) + (y > 0)
+    means = [np.median(light[quarter == q]) for q in range(4) if (quarter == q).sum() >= 4]
+    return float(np.abs(np.array(means) - np.median(light)).max()) if means else 0.0
+
+
+def _check(use: Bits) -> None:
+    used = int((use == PatchUse.USED).sum())
+    if used >= _LEAST:
+        return
+    clipped, uneven = int((use == PatchUse.CLIPPED).sum()), int((use == PatchUse.UNEVEN).sum())
+    raise ChartError(
+        f"{24 - used} of the chart's 24 patches are over-exposed or outside the image ({clipped} over-exposed, "
+        f"{uneven} partly hidden or in shade), at most {24 - _LEAST} may be; add a shorter exposure to the "
+        "bracket, or show the whole chart"
+    )
+
+
+def _inside(quad: Floats, shape: tuple[int, ...]) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    """x, y of the pixels whose centres lie in a convex quad (4, 2) px."""
+    x0, y0 = np.maximum(np.ceil(quad.min(axis=0)).astype(int), 0)
+    x1, y1 = np.minimum(np.floor(quad.max(axis=0)).astype(int) + 1, [shape[1], shape[0]])
+    y, x = np.mgrid[y0 : max(y1, y0), x0 : max(x1, x0)]
+    inside = np.ones(x.shape, bool)
+    for (ax, ay), (bx, by) in zip(quad, np.roll(quad, -1, axis=0), strict=True):
+        inside &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= 0
+    return x[inside], y[inside]
