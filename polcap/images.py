@@ -64,12 +64,17 @@ class SensorImage:
     """One decoded frame, linear, nothing subtracted."""
 
     value: Floats | NDArray[np.uint16]  # (H, W) mosaic, or (H, W, 3) where the file holds no mosaic; counts
-    black: Floats  # (2, 2) of the mosaic's phase, or (1, 1); counts
+    black: Floats  # of the mosaic's phase, as `cfa`, or (1, 1); counts
     white: float  # counts at which the sensor saturates
-    cfa: Bits | None  # (2, 2) of 0 R, 1 G, 2 B; None where value has three channels
+    cfa: Bits | None  # (2, 2), X-Trans (6, 6), of 0 R, 1 G, 2 B; None where value has three channels
     camera_matrix: Floats | None = None  # (3, 3) camera RGB → linear Rec.709 at the camera's white balance
     white_balance: Floats | None = None  # (3,) multipliers as shot, green = 1
     lossy: bool = False  # decoded from 8 bits or a display encoding
+
+    @property
+    def superpixel(self) -> int:
+        """Photosites per side of the least square of all colors about its middle: 2 Bayer, 3 X-Trans, 1 no mosaic."""
+        return 1 if self.cfa is None else 2 if self.cfa.shape == (2, 2) else 3
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ def take(capture: Capture, clip: float) -> Taken:
 
         found = dict(zip(map(id, frames), pool.map(seen, frames)))
     image, _, times = reference.result()
-    half = 1 if image.cfa is None else 2
+    half = image.superpixel
 
     def smaller(frame: Frame) -> Frame:
         small = found[id(frame)][0]

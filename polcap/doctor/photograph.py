@@ -69,13 +69,15 @@ def _pixels(image: SensorImage, exif: Exif) -> Iterator[Finding]:
     size = f"{width}×{height} px"
     if image.cfa is not None:
         pattern = "".join(_PATTERNS[int(color)] for color in image.cfa.ravel())
-        yield Finding("pattern", "ok", f"Bayer {pattern}, {size}")
+        name = f"Bayer {pattern}" if image.superpixel == 2 else "X-Trans, merged as 3×3 superpixels"
+        yield Finding("pattern", "ok", f"{name}, {size}")
     elif sensor.monochrome(image):
         remedy = "gains, normals and shape work; colors are grey, and no ColorChecker can be read"
         yield Finding("pattern", "warning", f"one channel (a monochrome sensor), {size}", remedy)
     else:
         yield Finding("pattern", "ok", f"three channels a pixel, {size}: developed or linear DNG, no mosaic left")
-    if exif.width and (exif.width, exif.height) != (width, height):
+    gone = (exif.width or width) - width, (exif.height or height) - height
+    if not all(0 <= side < image.superpixel for side in gone):  # a mosaic begins with a whole superpixel
         yield Finding(
             "size", "warning", f"{size} decoded where {exif.width}×{exif.height} are stated", "send this report in"
         )

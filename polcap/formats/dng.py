@@ -1,4 +1,4 @@
-"""Write one Bayer mosaic as a DNG: a classic little-endian TIFF with an Exif sub-IFD.
+"""Write one mosaic, Bayer or X-Trans, as a DNG: a classic little-endian TIFF with an Exif sub-IFD.
 
 References
 ----------
@@ -41,8 +41,8 @@ def write(
 
     Parameters
     ----------
-    cfa : (2, 2) of 0 R, 1 G, 2 B.
-    black : counts, one for all or (2, 2) of the mosaic's phase; white : counts.
+    cfa : (2, 2), of X-Trans (6, 6), of 0 R, 1 G, 2 B.
+    black : counts, one for all or of a Bayer mosaic's phase (2, 2); white : counts.
     exif : its fields that are None are left out; width, height and color_matrix are not read.
     color_matrix : (3, 3) XYZ under D65 → camera; as_shot_neutral : (3,) camera values of a grey.
 
@@ -70,7 +70,7 @@ def write(
         (284, _SHORT, 1),
         (305, _ASCII, "polcap"),
         (306, _ASCII, taken and taken.strftime("%Y:%m:%d %H:%M:%S")),
-        (33421, _SHORT, (2, 2)),
+        (33421, _SHORT, np.shape(cfa)),
         (33422, _BYTE, bytes(np.asarray(cfa, np.uint8).ravel())),
         (34665, _LONG, 0),  # Exif IFD, set below
         (50706, _BYTE, bytes((1, 4, 0, 0))),

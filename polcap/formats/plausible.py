@@ -19,6 +19,10 @@ _FORMS = {
     52546: "a DNG of JPEG XL (compression 52546); convert the original RAW without it, to DNG 1.4",
 }
 _LOSSY = 34892  # JPEG of 8 bits under a curve; LibRaw decodes some of them to black
+DEVELOP = (
+    "neither Bayer (2×2) nor X-Trans (6×6); develop every photograph alike to linear 16-bit TIFF (no tone curve, no "
+    "denoising, one white balance), or use a camera with a Bayer, X-Trans or monochrome sensor"
+)
 _COPY_AGAIN = "copy it from the card again"
 _PART = 1 << 20  # bytes of coded data that are searched at a time
 _CLIPPED_SHARE = 0.5  # of a picture; no exposure of use has more at the white level
@@ -51,6 +55,9 @@ def check_structure(path: str, structure: sniff.Tiff, data: bytes) -> None:
         form = _FORMS.get(sniff.first(directory, sniff.COMPRESSION), "")
         if form and structure.dng:
             raise DecodeError(f"{path}: is {form}")
+        layout = sniff.first(directory, sniff.CFA_LAYOUT, 1)
+        if layout != 1:  # LibRaw takes staggered rows for a rectangular mosaic
+            raise DecodeError(f"{path}: its colour filter is staggered (CFALayout {layout}, SuperCCD), {DEVELOP}")
         _check_strips(path, directory, structure.dng)
         _check_jpeg(path, directory, data)
     if structure.dng and not images:

@@ -4,6 +4,7 @@ The only module that imports rawpy, and only in the child process.
 """
 
 import io
+from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from polcap.errors import DecodeError
 from polcap.formats import exif, photo_bytes, plausible, sniff, worker
 from polcap.images import Bits, Exif, Floats, SensorImage
+from polcap.optics import demosaic
 from polcap.optics.color import REC709_TO_XYZ
 
 _EIGHT_BITS = 255  # counts between black and white: rounding alone is 1 % of a dark patch
@@ -24,15 +26,17 @@ def read(path: str | Path, digest: str | None = None) -> SensorImage:
     """Decode one RAW file, nothing subtracted, without the masked border.
 
     A Bayer file gives its mosaic (H, W) with `black` (2, 2) and `cfa` in the phase of its
-    first visible pixel. A file of finished linear channels, or of a monochrome sensor, gives
-    (H, W, 3) and no `cfa`. `camera_matrix` holds the white balance: it takes the camera's
-    answer to a grey in the light of the shot, 1/`white_balance`, to (1, 1, 1).
+    first visible pixel; an X-Trans file from its first whole 3×3 block on, (6, 6) both. A file of
+    finished linear channels, or of a monochrome sensor, gives (H, W, 3) and no `cfa`.
+    `camera_matrix` holds the white balance: it takes the camera's answer to a grey in the light of
+    the shot, 1/`white_balance`, to (1, 1, 1).
     With `digest`, of `probe.read`, the bytes that are decoded are those that were probed.
 
     Raises
     ------
     DecodeError
-        Not a RAW, damaged, changed since, X-Trans or Foveon; or the decoder crashed, hung or ran out of memory.
+        Not a RAW, damaged, changed since, of another mosaic or Foveon; or the decoder crashed, hung or ran out
+        of memory.
     """
     meta, arrays = worker.call(decode, path, digest=digest)
     balance = None if meta["balance"] is None else np.array(meta["balance"])
@@ -112,6 +116,8 @@ def decode(path: str, digest: str | None = None) -> worker.Answer:
     import rawpy
 
     data = photo_bytes.load(path, digest)
+    if sniff.is_foveon(data):
+        raise DecodeError(f"{path}: {unsupported(None)}")
     structure = sniff.structure(io.BytesIO(data))
     plausible.check_structure(path, structure, data)
     if structure.dng and structure.truncated:  # LibRaw may return whatever lay in memory
@@ -145,37 +151,55 @@ def _counts(path: str, raw: Any) -> tuple[dict[str, Any], worker.Arrays]:
         black = [[float(raw.black_level_per_channel[0])]]
     else:
         cfa, black = _mosaic(raw, path)
+        if cfa.shape == (6, 6):
+            value, cfa, black = _from_whole_block(path, value, cfa, black)
         arrays = {"value": value, "cfa": cfa}
     return meta | {"black": black, "white": _white(raw, float(np.max(black)))}, arrays
 
 
-def unsupported(shape: tuple[int, ...] | None) -> str:
-    """Why a colour filter of this period (rows, columns) cannot be used, and what to do; None: LibRaw tells none."""
-    what = "of no mosaic that LibRaw tells (Foveon, or sub-sampled colour)"
-    if shape == (6, 6):
-        what = "Fujifilm's X-Trans (6×6)"
-    elif shape is not None:
+def unsupported(shape: tuple[int, ...] | None, rotated: bool = False) -> str:
+    """Why a colour filter of this period (rows, columns) cannot be used, and what to do; None: there is none.
+
+    rotated : its rows and columns run at 45° to the picture's.
+    """
+    if shape is None:
+        what = "not in front of each pixel: it is a Foveon's layers, or sub-sampled colour"
+    elif rotated:
+        what = "Fujifilm's SuperCCD, turned by 45°"
+    else:
         what = f"a mosaic of {'×'.join(map(str, shape))}"
-    return (
-        f"its colour filter is {what}, not a 2×2 Bayer mosaic; develop every photograph alike to linear 16-bit TIFF "
-        "(no tone curve, no denoising, one white balance), or use a camera with a Bayer or monochrome sensor"
-    )
+    return f"its colour filter is {what}, {plausible.DEVELOP}"
 
 
 def _mosaic(raw: Any, path: str) -> tuple[Bits, list[list[float]]]:
-    """The 2×2 colours and black levels from the first visible pixel on."""
+    """The colours and black levels of one period, (2, 2) or (6, 6), from the first visible pixel on."""
     pattern = raw.raw_pattern
-    if pattern is None or pattern.shape != (2, 2):
-        raise DecodeError(f"{path}: {unsupported(None if pattern is None else pattern.shape)}")
+    if pattern is None or pattern.shape not in ((2, 2), (6, 6)):
+        rotated = raw.sizes.width * raw.sizes.height > raw.sizes.raw_width * raw.sizes.raw_height
+        raise DecodeError(f"{path}: {unsupported(None if pattern is None else pattern.shape, rotated)}")
     top, left = raw.sizes.top_margin, raw.sizes.left_margin
-    index = [[raw.raw_color(top + y, left + x) for x in (0, 1)] for y in (0, 1)]
+    period = range(len(pattern))
+    index = [[raw.raw_color(top + y, left + x) for x in period] for y in period]
     names = raw.color_desc.decode()
     letters = [[names[i] for i in row] for row in index]
-    if sorted(letters[0] + letters[1]) != ["B", "G", "G", "R"]:
+    usual = {2: {"R": 1, "G": 2, "B": 1}, 6: {"R": 8, "G": 20, "B": 8}}[len(pattern)]
+    if Counter(letter for row in letters for letter in row) != usual:
         raise DecodeError(f"{path}: its mosaic is {letters}, not of red, green and blue; polcap does not support it")
     cfa = np.array([["RGB".index(letter) for letter in row] for row in letters], np.uint8)
     levels = raw.black_level_per_channel  # in the order of the colour index
     return cfa, [[float(levels[i]) for i in row] for row in index]
+
+
+def _from_whole_block(
+    path: str, value: NDArray[Any], cfa: Bits, black: list[list[float]]
+) -> tuple[NDArray[Any], Bits, list[list[float]]]:
+    """An X-Trans mosaic from its first whole 3×3 block on: up to two rows and columns are dropped."""
+    corner = demosaic.x_trans_corner(cfa)
+    if corner is None:
+        raise DecodeError(f"{path}: {unsupported((6, 6))}")
+    down, right = corner
+    cfa, levels = (np.roll(part, (-down, -right), (0, 1)) for part in (cfa, np.array(black)))
+    return np.ascontiguousarray(value[down:, right:]), cfa, levels.tolist()
 
 
 def _white(raw: Any, black: float) -> float:

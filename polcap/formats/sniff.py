@@ -9,14 +9,14 @@ Kind = Literal["raw", "photo", "other", "unknown"]
 
 SUBTYPE, WIDTH, LENGTH, BITS, COMPRESSION, PHOTOMETRIC, MAKE = 254, 256, 257, 258, 259, 262, 271
 STRIP_OFFSETS, SAMPLES, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS = 273, 277, 279, 324, 325, 330
-DNG_VERSION = 50706
+DNG_VERSION, CFA_LAYOUT = 50706, 50711
 CFA, LINEAR_RAW = 32803, 34892
 
 _TIFF_MAGIC = (b"II*\0", b"MM\0*")
 # Sony, Samsung, Kodak, Panasonic, Nikon, Kodak, Pentax
 _RAW_COMPRESSION = {32767, 32769, 32770, 32867, 34316, 34713, 65000, 65535}
 _WANTED = {
-    SUBTYPE, WIDTH, LENGTH, BITS, COMPRESSION, PHOTOMETRIC, MAKE, DNG_VERSION, SAMPLES,
+    SUBTYPE, WIDTH, LENGTH, BITS, COMPRESSION, PHOTOMETRIC, MAKE, DNG_VERSION, CFA_LAYOUT, SAMPLES,
     STRIP_OFFSETS, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS,
 }  # fmt: skip
 _INTEGERS = {1: "B", 3: "H", 4: "I", 13: "I"}
@@ -100,6 +100,11 @@ def is_raw_magic(head: bytes) -> bool:
         or head[:4] in (b"\0MRM", b"FOVb", b"IIRO", b"IIRS", b"MMOR", b"IIU\0")  # Minolta, Sigma, Olympus, Panasonic
         or (head[:2] in (b"II", b"MM") and (head[8:10] == b"CR" or head[8:12] in (b"IIII", b"MMMM")))  # CR2, IIQ
     )
+
+
+def is_foveon(head: bytes) -> bool:
+    """The first bytes are those of Sigma's X3F."""
+    return head[:4] == b"FOVb"
 
 
 def _is_raw(structure: Tiff) -> bool:

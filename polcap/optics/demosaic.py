@@ -1,7 +1,9 @@
-"""From one colour per photosite to three per pixel: 2×2 binning, or linear interpolation.
+"""From one colour per photosite to three per pixel: binning by superpixels, or linear interpolation.
 
 Both are linear and the same for every picture, so that they add no polarization of their own and a
-pixel's variance follows from its photosites'. The CFA is a (2, 2) of 0 R, 1 G, 2 B.
+pixel's variance follows from its photosites'. The CFA is a (2, 2) of 0 R, 1 G, 2 B; of X-Trans a (6, 6), which
+is binned 3×3: five greens in a cross of corners and middle, two reds and two blues on opposite sides, so
+that every colour has its centroid in the middle.
 """
 
 from functools import lru_cache
@@ -13,17 +15,33 @@ from polcap.images import Bits, Floats
 
 
 def superpixel(mosaic: Any, cfa: Bits) -> Floats:
-    """Each 2×2 quad as one pixel, (H, W) → (H//2, W//2, 3) float32; green is the mean of its two.
+    """Each 2×2 quad, or 3×3 block of X-Trans, as one pixel of colour means, (H, W) → (H//n, W//n, 3) float32.
 
-    An odd last row or column is dropped.
+    Last rows and columns that fill no block are dropped.
     """
-    h, w = mosaic.shape[0] // 2, mosaic.shape[1] // 2
+    period = len(cfa)
+    side, blocks = (2, 1) if period == 2 else (3, 2)  # of a block; blocks per period
+    h, w = mosaic.shape[0] // side, mosaic.shape[1] // side
     out = np.zeros((h, w, 3), np.float32)
-    share = np.bincount(np.ravel(cfa), minlength=3)  # photosites per colour
-    for i, j in np.ndindex(2, 2):
+    share = np.bincount(np.ravel(cfa), minlength=3) / blocks**2  # photosites per colour and block
+    for i, j in np.ndindex(period, period):
         color = int(cfa[i, j])
-        out[..., color] += mosaic[i : 2 * h : 2, j : 2 * w : 2] * np.float32(1 / share[color])
+        sites = mosaic[i : side * h : period, j : side * w : period]
+        out[i // side :: blocks, j // side :: blocks, color] += sites * np.float32(1 / share[color])
     return out
+
+
+def x_trans_corner(cfa: Bits) -> tuple[int, int] | None:
+    """Row and column of the first 3×3 block of X-Trans in a (6, 6); None where it is another mosaic."""
+    for down, right in np.ndindex(3, 3):
+        moved = np.roll(cfa, (-down, -right), (0, 1))
+        blocks = moved.reshape(2, 3, 2, 3).transpose(0, 2, 1, 3).reshape(4, 9)
+        sides = blocks[:, 1::2]  # above, left, right, below
+        alike = (sides[:, 0] == sides[:, 3]) & (sides[:, 1] == sides[:, 2])
+        red_and_blue = (sides != 1).all() and (sides[:, 0] + sides[:, 1] == 2).all()
+        if (blocks[:, ::2] == 1).all() and alike.all() and red_and_blue:
+            return down, right
+    return None
 
 
 def interpolate(mosaic: Floats, cfa: Bits) -> Floats:

@@ -15,14 +15,14 @@ Bools = NDArray[np.bool_]
 def signal(image: SensorImage, full: bool = False) -> Floats:
     """Linear signal (H, W, C) float32, black = 0 and white = 1; negative noise is kept.
 
-    A mosaic is binned to half size, or interpolated if `full`. C = 1 where the three channels of a
+    A mosaic is binned by superpixels, or interpolated if `full`. C = 1 where the three channels of a
     file without a mosaic are one and the same (a monochrome sensor).
     """
     span = np.float32(image.white - float(image.black.mean()))
     if image.cfa is None:
         value = image.value[..., :1] if monochrome(image) else image.value
         return np.asarray((value - np.float32(image.black.mean())) / span, np.float32)
-    black = np.broadcast_to(image.black, (2, 2))  # of each phase
+    black = np.broadcast_to(image.black, image.cfa.shape)  # of each phase
     if full:
         h, w = (2 * (n // 2) for n in image.value.shape)
         mosaic = image.value[:h, :w].astype(np.float32)
@@ -45,7 +45,7 @@ def monochrome(image: SensorImage) -> bool:
 def usable(image: SensorImage, clip: float, full: bool = False) -> Bools:
     """Pixels (H, W) of `signal` with no clipped photosite in them nor in their eight neighbours.
 
-    Judged on raw counts over whole 2×2 quads, so that all colours of a pixel go together; a single noisy
+    Judged on raw counts over whole superpixels, so that all colours of a pixel go together; a single noisy
     photosite at the limit rules out its surroundings, which keeps the choice from favouring low noise.
     """
     return below(image, clip * saturation(image), full)
@@ -57,6 +57,9 @@ def below(image: SensorImage, level: float, full: bool = False) -> Bools:
     over = _at_least(value, level)
     if image.cfa is None:
         over = np.asarray(over.any(axis=2))
+    elif image.superpixel == 3:
+        h, w = value.shape[0] // 3, value.shape[1] // 3
+        over = np.asarray(over[: 3 * h, : 3 * w].reshape(h, 3, w, 3).any((1, 3)))
     else:
         h, w = value.shape[0] // 2, value.shape[1] // 2
         over = over[: 2 * h : 2, : 2 * w] | over[1 : 2 * h : 2, : 2 * w]

@@ -41,8 +41,9 @@ def places(image: SensorImage, clip: float) -> NDArray[np.int64]:
 
 def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
     """The tiles of one decoded photograph; only they are binned."""
-    step = 1 if image.cfa is None else 2
-    side, margin = TILE * step, step  # a clipped photosite rules out its neighbours
+    step = image.superpixel
+    margin = 1 if image.cfa is None else len(image.cfa)  # a clipped photosite rules out its neighbours
+    side, spare = TILE * step, margin // step
     padded = [(margin, margin), (margin, margin), *[(0, 0)] * (image.value.ndim - 2)]
     around = [
         np.pad(image.value[y : y + side, x : x + side], padded, mode="edge")
@@ -52,9 +53,9 @@ def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
     ]
     if not around:
         return Tiles(np.zeros((0, TILE, TILE), np.float32), np.zeros(0, bool))
-    strip = replace(image, value=np.concatenate(around))  # an even number of rows each keeps the mosaic's phase
-    shape = (len(corners), TILE + 2, TILE + 2)
-    inner = np.s_[:, 1:-1, 1:-1]
+    strip = replace(image, value=np.concatenate(around))  # whole periods of rows each keep the mosaic's phase
+    shape = (len(corners), TILE + 2 * spare, TILE + 2 * spare)
+    inner = np.s_[:, spare:-spare, spare:-spare]
     light = _light(sensor.signal(strip)).reshape(shape)[inner]
     sound = sensor.below(strip, clip * sensor.saturation(image)).reshape(shape)[inner].all((1, 2))
     return Tiles(light, sound & (light.mean((1, 2)) > _LEAST_LIGHT))

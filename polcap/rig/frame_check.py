@@ -63,7 +63,9 @@ def measure(path: str) -> worker.Answer:
     black = float(np.mean(meta["black"]))
     clipped = float(np.mean(value >= black + _SATURATED * (white - black)))
     grey = value if value.ndim == 2 else value.mean(-1, dtype=np.float32)
-    height, width = (side // 2 for side in grey.shape)
+    block = 3 if arrays.get("cfa", grey).shape == (6, 6) else 2  # of all colors
+    height, width = (side // block for side in grey.shape)
+    grey = grey[: block * height, : block * width]
     cells = cv2.resize(np.asarray(grey, np.float32), (width, height), interpolation=cv2.INTER_AREA)
     light = (cells - black) / (white - black)
     small_size = min(width, PREVIEW_PX), round(height * min(width, PREVIEW_PX) / width)

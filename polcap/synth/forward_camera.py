@@ -24,11 +24,11 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def mosaic(image: Floats, cfa: Bits) -> Floats:
-    """Every pixel of (H, W, 3) through its own colour filter, (H, W); cfa (2, 2) of 0 R, 1 G, 2 B."""
+    """Every pixel of (H, W, 3) through its own colour filter, (H, W); cfa (n, n) of 0 R, 1 G, 2 B."""
     out = np.empty(image.shape[:2], image.dtype)
-    for row in (0, 1):
-        for column in (0, 1):
-            out[row::2, column::2] = image[row::2, column::2, cfa[row, column]]
+    period = len(cfa)
+    for row, column in np.ndindex(period, period):
+        out[row::period, column::period] = image[row::period, column::period, cfa[row, column]]
     return out
 
 

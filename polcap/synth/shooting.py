@@ -34,7 +34,14 @@ __all__ = ["MIDDLE_S", "Kind", "Scene", "Shoot", "Studio", "Take", "random_scene
 
 MIDDLE_S = 0.02  # exposure time of the middle frame of a bracket by time
 _SENSOR_MM = 36.0  # width
-_CFA = {"RGGB": (0, 1, 1, 2), "BGGR": (2, 1, 1, 0), "GRBG": (1, 0, 2, 1), "GBRG": (1, 2, 0, 1)}
+_CFA = {
+    "RGGB": [[0, 1], [1, 2]],
+    "BGGR": [[2, 1], [1, 0]],
+    "GRBG": [[1, 0], [2, 1]],
+    "GBRG": [[1, 2], [0, 1]],
+    "X-Trans": [[1, 2, 1, 1, 0, 1], [0, 1, 0, 2, 1, 2], [1, 2, 1, 1, 0, 1],
+                [1, 0, 1, 1, 2, 1], [2, 1, 2, 0, 1, 0], [1, 0, 1, 1, 2, 1]],
+}  # fmt: skip
 _CONVENTIONS = (
     "pixel (i, j) of the visible RAW has its centre at column i, row j; camera at the origin, x right, y up, "
     "z towards the camera; depth = -z [m]; polarizer and AoLP angles from image x towards image up; "
@@ -62,7 +69,7 @@ class Shoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     blur_px: float = 0.4  # 1σ of the lens's point spread
     samples: Annotated[int, Meta(ge=1, le=4)] = 2  # rays per pixel side
     sensor: Sensor = Sensor()
-    cfa: Literal["RGGB", "BGGR", "GRBG", "GBRG"] = "RGGB"
+    cfa: Literal["RGGB", "BGGR", "GRBG", "GBRG", "X-Trans"] = "RGGB"
     color_matrix: tuple[float, ...] = (0.87, -0.27, -0.075, -0.44, 1.23, 0.235, -0.09, 0.19, 0.69)  # XYZ → camera
 
     @property
@@ -241,7 +248,7 @@ def _write_frame(
     light *= take.lit
     random = np.random.default_rng([shoot.seed, 1 + take.shot, take.frame, *(() if not take.again else (take.again,))])
     energy = float(1 + shoot.gain_jitter * random.normal())
-    cfa = np.reshape(_CFA[shoot.cfa], (2, 2)).astype(np.uint8)
+    cfa = np.array(_CFA[shoot.cfa], np.uint8)
     mosaic = forward_camera.mosaic(radiance, cfa) * (light * energy)
     counts = forward_camera.expose(mosaic, shoot.sensor, amplification, random)
     dng.write(

@@ -1,71 +1,41 @@
 """How often `check` and `process` are right, and agree, on simulated captures good and with one planted fault.
 
 python tests/benchmarks/bench_verdicts.py FOLDER [--good 12] [--faults 1] [--first-seed 300] [--width 640] [--only KIND]
+python tests/benchmarks/bench_verdicts.py FOLDER --tally
 
-FOLDER keeps the captures, outside the repository. `process` is the path up to its gates, with the analytic estimator.
-Prints a Markdown row per capture and the shares: kept, passed, contradictions, found, rightly named.
+`process` is the whole path with the shipped networks, and the option that `check` says it needs, up to its gates.
+FOLDER/rows.jsonl gains a line per capture, so that a run goes on where it ended; the captures themselves are removed
+unless --keep. Prints the shares: kept, passed, contradictions, found, rightly named, and of faults that passed whether
+the expected error was raised above the actual one.
 """
 
 import argparse
+import json
+import shutil
+import sys
 import tempfile
-from collections.abc import Callable
-from dataclasses import dataclass
+import time
+from collections import Counter
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from typing import Any
 
-import msgspec
 import numpy as np
-from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
-from polcap import check, gates, path
+sys.path.insert(0, str(Path(__file__).parent))
+
+from plant_captures import FAULTS, shoot
+
+from polcap import check, gates, path, pipeline
 from polcap.config import Config
 from polcap.errors import InputError
 from polcap.formats import capture as captures
-from polcap.formats import png
-from polcap.images import ChartRequest, Floats
+from polcap.images import Capture, ChartRequest, Frame, Network, SurfaceMaps
 from polcap.report.whole import Whole
 from polcap.store import Store
-from polcap.synth import shooting as synthetic
-from polcap.synth.scenes import random_scene
-from polcap.synth.shooting import Shoot, Studio, Take
 
-ANGLES = ((0.0, 45.0, 90.0), (0.0, 60.0, 120.0), (0.0, 45.0, 90.0, 135.0))
-LOOKS = ("as drawn", "dark", "white", "matte", "glossy")
-
-# kind: (gates or words that name it, of `check` or of the error line)
-FAULTS: dict[str, tuple[str, ...]] = {
-    "swapped": ("order", "angles"),
-    "mirrored": ("order", "angles"),
-    "missing turn": ("angles", "order", "polarized"),
-    "turned by 15°": ("angles", "order"),
-    "flash jitter, no chart": ("gains", "gain doubt"),
-    "clipped": ("clipping", "alignment"),
-    "underexposed": ("noise", "chart", "capture"),  # capture: "too few well exposed pixels"
-    "object moved": ("alignment", "stillness", "body", "ill-posed"),
-    "camera moved": ("alignment",),
-    "defocus": ("sharpness",),
-    "ambient light": ("ambient", "body", "other light", "ill-posed"),
-    "tone curve": ("tone curve", "source"),
-    "lossy": ("source", "tone curve"),
-    "cut file": ("error",),
-    "wrong focal": ("focal length",),
-    "no chart": ("chart",),
-    "glossy chart": ("gain doubt", "chart", "gains"),
-    "other object": ("alignment",),
-    "flash by shutter": ("exposures", "clipping"),
-    "wax": ("body",),
-}
-
-
-@dataclass
-class Shooting:
-    """A capture about to be written."""
-
-    studio: Studio
-    actual: list[float]  # degrees
-    names: list[float]
-    shifts: Floats
-    light: Callable[[Floats, int, int], Floats]
+Row = dict[str, Any]
 
 
 def main() -> None:
@@ -76,188 +46,159 @@ def main() -> None:
     parse.add_argument("--first-seed", type=int, default=300)
     parse.add_argument("--width", type=int, default=640)
     parse.add_argument("--only", default="")
+    parse.add_argument("--keep", action="store_true")
+    parse.add_argument("--tally", action="store_true")
     given = parse.parse_args()
+    given.folder.mkdir(parents=True, exist_ok=True)
+    log = given.folder / "rows.jsonl"
+    rows = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
+    done = {(row["seed"], row["kind"], row["width"]) for row in rows}
     plan = [""] * given.good + list(FAULTS) * given.faults
-    print("| seed | planted | check | process | because of | right |\n| --- | --- | --- | --- | --- | --- |")
-    good = kept = passed = contradictions = faulty = found = named = 0
-    for seed, kind in enumerate(plan, given.first_seed):
-        if given.only and kind != given.only:
+    for seed, kind in enumerate([] if given.tally else plan, given.first_seed):
+        if (given.only and kind != given.only) or (seed, kind, given.width) in done:
             continue
-        place = given.folder / f"{seed}-{kind.replace(' ', '-') or 'good'}-{given.width}"
-        if not place.exists():
-            shoot(place, seed, kind, given.width)
-        said, reasons = judge_check(place)
-        done, why = judge_process(place, no_chart=with_no_chart(seed, kind))
-        told = reasons | why
-        sound = "fail" not in (said, done)
-        mark = ""
-        if not kind:
-            good, kept, passed = good + 1, kept + (said != "fail"), passed + (done != "fail")
-            contradictions += (said == "fail") != (done == "fail")
-            mark = "yes" if sound else "NO"
-        else:
-            faulty, found = faulty + 1, found + bool(told)
-            right = any(word in reason for reason in told for word in FAULTS[kind])
-            named += right
-            mark = "named" if right else "found" if told else "NO"
-        print(f"| {seed} | {kind} | {said} | {done} | {'; '.join(sorted(told))} | {mark} |", flush=True)
-    print(f"\ngood {good}: kept by check {kept}, passed by process {passed}, contradictions {contradictions}")
-    print(f"faulty {faulty}: found {found}, rightly named {named}")
+        row = one(given.folder, seed, kind, given.width, given.keep)
+        rows.append(row)
+        with log.open("a") as out:
+            out.write(json.dumps(row) + "\n")
+        print(f"{seed} {kind or 'good':24}{row['check']:5}{row['process']:5} {mark(row):6}{spoken(row)}", flush=True)
+    tally(rows)
 
 
-def judge_check(place: Path) -> tuple[str, set[str]]:
-    """The verdict, and the gates that speak; a missing chart speaks only where it is the fault."""
+def one(folder: Path, seed: int, kind: str, width: int, keep: bool) -> Row:
+    place = folder / f"{seed}-{kind.replace(' ', '-') or 'good'}-{width}"
+    start = time.process_time()
+    if place.exists():
+        shutil.rmtree(place)
+    row: Row = {"seed": seed, "kind": kind, **shoot(place, seed, kind, width)}
     try:
-        verdict = check.inspect(captures.read(place), None, Config())
+        capture = _read_once(captures.read(place)) if width < 2000 else captures.read(place)
     except InputError as error:
-        return "fail", {f"error {type(error).__name__}"}
-    return gates.verdict(verdict.lines), _speaking(verdict.lines, place)
+        row |= {"check": "fail", "process": "fail", "check_gates": {_name(error): ["fail", None, 45.0]}}
+        row |= {"process_gates": {}, "needs": "", "expected": None, "actual": None}
+    else:
+        row |= judge_check(capture) | judge_process(capture, place)
+        if row["needs"]:
+            row |= judge_process(capture, place, no_chart=True)
+    if not keep:
+        shutil.rmtree(place)
+    return row | {"seconds": round(time.process_time() - start, 1)}
 
 
-def judge_process(place: Path, no_chart: bool) -> tuple[str, set[str]]:
+def judge_check(capture: Capture) -> Row:
+    try:
+        found = check.inspect(capture, networks()[0], Config(), networks()[1])
+    except InputError as error:
+        return {"check": "fail", "check_gates": {_name(error): ["fail", None, 45.0]}, "needs": ""}
+    return {"check": gates.verdict(found.lines), "check_gates": _shown(found.lines), "needs": found.needs}
+
+
+def judge_process(capture: Capture, place: Path, no_chart: bool = False) -> Row:
+    """The verdict; the expected error of the normals with all costs, and the actual one (medians, degrees)."""
     chart = ChartRequest("none" if no_chart else "auto")
     with tempfile.TemporaryDirectory() as out:
         try:
-            capture = captures.read(place)
-            found = path.path(capture, path.UserInput(chart=chart), Config(), Store(Path(out)))
+            found = path.path(capture, path.UserInput(chart, None, *networks()), Config(), Store(Path(out)))
             lines = list(gates.judge(Whole(found, capture.focal_known), Config()))
+            actual = error_deg(found.maps.value, place)
         except InputError as error:
-            name = type(error).__name__.removesuffix("Error").lower()
-            order = "order " if "contradict the object's outline" in str(error) else ""
-            return "fail", {f"error {order}{name}{' chart' * ('ColorChecker' in str(error))}"}
-    return gates.verdict(lines), _speaking(lines, place)
+            return {
+                "process": "fail", "process_gates": {_name(error): ["fail", None, 45.0]},
+                "expected": None, "actual": None,
+            }  # fmt: skip
+    expected = next((line.value for line in lines if line.name == "normal error"), None)
+    shown = _shown(lines)
+    return {"process": gates.verdict(lines), "process_gates": shown, "expected": expected, "actual": actual}
 
 
-def _speaking(lines: tuple[gates.Gate, ...] | list[gates.Gate], place: Path) -> set[str]:
-    usual = {"mask", "chart"} if "good" in place.name or "no-chart" not in place.name else {"mask"}
-    return {line.name for line in lines if line.state == "fail" or (line.state == "warn" and line.name not in usual)}
+def error_deg(maps: SurfaceMaps, place: Path) -> float | None:
+    """Median angle between the normals and the truth where both see the object."""
+    truth = np.load(place / "normals.npz")
+    step, (x0, y0) = round(maps.view.scale), (round(at) for at in maps.view.origin)
+    height, width = maps.mask.shape
+    cut = np.s_[step * y0 : step * (y0 + height), step * x0 : step * (x0 + width)]
+    normal = truth["normal"][cut].astype(np.float32).reshape(height, step, width, step, 3).sum((1, 3))
+    seen = truth["mask"][cut].reshape(height, step, width, step).all((1, 3)) & maps.mask
+    if not seen.any():
+        return None
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
+    cosine = np.clip((normal * maps.normal).sum(-1)[seen], -1, 1)
+    return round(float(np.median(np.degrees(np.arccos(cosine)))), 2)
 
 
-def with_no_chart(seed: int, kind: str) -> bool:
-    return kind == "flash jitter, no chart" or (not kind and seed % 4 == 3)
+def tally(rows: list[Row]) -> None:
+    good, bad = ([row for row in rows if bool(row["kind"]) == faulty] for faulty in (False, True))
+    against = [row for row in rows if (row["check"] == "fail") != (row["process"] == "fail")]
+    print(f"\ngood {len(good)}: kept by check {_count(good, 'check')}, passed by process {_count(good, 'process')}")
+    print(f"   spoken to though passed: {dict(Counter(g for row in good for g in speaking(row)))}")
+    print(f"contradictions: {[(row['seed'], row['kind'], row['check'], row['process']) for row in against]}")
+    found, named = (sum(mark(row) in what for row in bad) for what in (("found", "named"), ("named",)))
+    print(f"faulty {len(bad)}: found {found}, rightly named {named}")
+    for kind in FAULTS:
+        marks = Counter(mark(row) for row in bad if row["kind"] == kind)
+        print(f"   {kind:24}{dict(marks)}")
+    passed = [row for row in bad if row["process"] != "fail" and row["actual"] is not None]
+    raised = [row for row in passed if row["expected"] > row["actual"]]
+    print(f"faults that passed {len(passed)}: expected error above the actual one in {len(raised)}")
+    for row in passed:
+        if row not in raised:
+            print(f"   {row['seed']} {row['kind']}: expected {row['expected']}°, actual {row['actual']}°")
+    both = [row for row in good if row["actual"] is not None]
+    ratio = [row["expected"] / row["actual"] for row in both]
+    if ratio:
+        print(f"good: actual error {np.median([r['actual'] for r in both]):.1f}°, expected over actual median")
+        print(f"   {np.median(ratio):.2f}, 10 % {np.quantile(ratio, 0.1):.2f}, 90 % {np.quantile(ratio, 0.9):.2f}")
 
 
-def shoot(folder: Path, seed: int, kind: str, width: int) -> None:
-    """Write a capture of 3 exposures with ordinary jitter and nudges, and the fault `kind` ("" for none)."""
-    random = np.random.default_rng([seed, 11])
-    planned = _good(seed, kind, width, random)
-    _plant(planned, kind, random)
-    how = planned.studio.shoot
-    for k, name in enumerate(planned.names):
-        roll = how.nudge_deg * float(random.uniform(-1, 1)) * (k > 0)
-        shift = float(planned.shifts[k, 0]), float(planned.shifts[k, 1])
-        pose = {
-            "actual_deg": planned.actual[k],
-            "rot_deg": roll,
-            "transform": synthetic.transform(how, shift, roll).tolist(),
-        }
-        radiance = planned.studio.radiance(pose, first=k == 0)
-        for e in range(3):
-            stops = how.step ** (e - 1)
-            suffix = "png" if kind in ("tone curve", "lossy") else "DNG"
-            file = folder / f"pol{name:03.0f}" / f"IMG_{3 * k + e + 1:04d}.{suffix}"
-            file.parent.mkdir(parents=True, exist_ok=True)
-            light = planned.light(radiance, k, e)
-            if suffix == "png":
-                _develop(file, light * planned.studio.middle * stops, kind)
-                continue
-            planned.studio.photograph(file, light, Take(k, e, stops))
-            if kind == "cut file" and (k, e) == (1, 1):
-                file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    if kind == "wrong focal":
-        (folder / "capture.toml").write_text("focal_length_mm = 24.0\n")
+def mark(row: Row) -> str:
+    """Whether a verdict is right: yes or NO of a good capture; named, found or NO of a faulty one."""
+    if not row["kind"]:
+        return "yes" if "fail" not in (row["check"], row["process"]) else "NO"
+    told = speaking(row)
+    if any(word in name for name in told for word in FAULTS[row["kind"]]):
+        return "named"
+    return "found" if told else "NO"
 
 
-def _good(seed: int, kind: str, width: int, random: np.random.Generator) -> Shooting:
-    angles = ANGLES[seed % 3] if not kind else ANGLES[0]
-    bracket = ("time", "flash", "iso")[seed % 3]
-    how = Shoot(seed=seed, width=width, height=width * 3 // 4, samples=1, angles_deg=angles, bracket=bracket)  # type: ignore[arg-type]
-    scene = random_scene(seed, ("bumps", "clusters", "vase")[(seed // 2) % 3])
-    look = LOOKS[seed % 5] if not kind else LOOKS[0]
-    if look != "as drawn":
-        scene = msgspec.structs.replace(scene, coat=_dressed(scene.coat, look))
-    if with_no_chart(seed, kind) or kind == "no chart":
-        scene = msgspec.structs.replace(scene, chart=None)
-    shots = len(angles)
-    actual = (np.array(angles) + how.angle_error_deg * random.normal(size=shots)).tolist()
-    shifts = random.uniform(-1, 1, (shots, 2)) * how.nudge_px
-    shifts[0] = 0
-    return Shooting(Studio(scene, how), actual, list(angles), shifts, lambda light, k, e: light)
+def speaking(row: Row) -> set[str]:
+    """Gates that fail, or warn of more than what was arranged: a doubtful mask, no chart and what follows from it."""
+    usual = {"mask"} | ({"chart", "gain doubt"} if row["chart"] == "none" and not row["kind"] else set())
+    every = [*row["check_gates"].items(), *row["process_gates"].items()]
+    return {name for name, (state, *_) in every if state == "fail" or (state == "warn" and name not in usual)}
 
 
-def _dressed(coat: object, look: str) -> object:
-    scale = {"dark": 0.25, "white": 1.0, "matte": 1.0, "glossy": 1.0}[look]
-    dressed = []
-    for one in coat.materials:  # type: ignore[attr-defined]
-        first, second = (tuple(min(scale * c, 1.0) for c in color) for color in (one.first, one.second))
-        if look == "white":
-            first, second = (0.85, 0.85, 0.83), (0.75, 0.75, 0.74)
-        rough = {"matte": (0.6, 0.8), "glossy": (0.15, 0.25)}.get(look, one.roughness)
-        dressed.append(msgspec.structs.replace(one, first=first, second=second, roughness=rough))
-    return msgspec.structs.replace(coat, materials=tuple(dressed))  # type: ignore[type-var]
+def spoken(row: Row) -> str:
+    return f"{'; '.join(sorted(speaking(row)))} | {row['expected']}° {row['actual']}° | {row['seconds']} s"
 
 
-def _plant(planned: Shooting, kind: str, random: np.random.Generator) -> None:
-    studio, victim = planned.studio, int(random.integers(1, 3))
-    mask = studio.buffer.mask
-    if kind == "swapped":
-        planned.names[0], planned.names[victim] = planned.names[victim], planned.names[0]
-    elif kind == "mirrored":
-        planned.actual = [-angle for angle in planned.actual]
-    elif kind == "missing turn":
-        planned.actual[victim] = planned.actual[victim - 1]
-    elif kind == "turned by 15°":
-        planned.actual[victim] += 15 * float(random.choice([-1, 1]))
-    elif kind == "flash jitter, no chart":
-        pops = 1 + np.array([0, -0.12, 0.13])[random.permutation(3)]
-        planned.light = lambda light, k, e: light * pops[k]
-    elif kind == "clipped":
-        bright = float(np.percentile(studio.through(0)[mask].max(-1), 80)) * studio.middle / studio.shoot.step
-        planned.light = lambda light, k, e: light * 1.1 / bright
-    elif kind == "underexposed":
-        planned.light = lambda light, k, e: light / 300
-    elif kind == "object moved":
-        planned.light = lambda light, k, e: _pushed(light, mask, 6) if k == victim else light
-    elif kind == "camera moved":
-        planned.shifts[victim] = random.choice([-1, 1], 2) * random.uniform(90, 120, 2)
-    elif kind == "defocus":
-        planned.light = lambda light, k, e: gaussian_filter(light, 2.4, axes=(0, 1)) if k == victim else light
-    elif kind == "ambient light":
-        lamp = Studio(msgspec.structs.replace(studio.scene, light=(0.6, 0.3, 0.0)), studio.shoot)
-        share = 0.8 * studio.reference[0][mask].mean() / lamp.reference[0][mask].mean()
-        extra = share * (lamp.reference[0] @ lamp.to_camera.T) / 2
-        planned.light = lambda light, k, e: light + extra
-    elif kind == "glossy chart":
-        shine = 0.06 * np.array([1.0, 0.6, 0.2]) * float(studio.through(0).max())
-        zone = ~mask & (studio.through(0).mean(-1) > 0)
-        zone[:, : zone.shape[1] * 6 // 10] = False
-        planned.light = lambda light, k, e: light + shine[k] * zone[..., None]
-    elif kind == "other object":
-        other = Studio(random_scene(999, "clusters"), studio.shoot)
-        light_of = other.through(planned.actual[victim])
-        planned.light = lambda light, k, e: light_of if k == victim else light
-    elif kind == "flash by shutter":
-        studio.shoot = msgspec.structs.replace(studio.shoot, bracket="time")
-        planned.light = lambda light, k, e: light / studio.shoot.step ** (e - 1)
-    elif kind == "wax":
-        mean = np.mean([studio.through(a) for a in (0, 90)], axis=0)
-        planned.light = lambda light, k, e: np.where(mask[..., None], mean + 0.12 * (light - mean), light)
+@cache
+def networks() -> tuple[Network | None, Network | None]:
+    return pipeline.load_network(None, None, "cpu", 1), pipeline.load_mask_network(1)
 
 
-def _pushed(light: Floats, mask: NDArray[np.bool_], px: int) -> Floats:
-    """The object moved by so many pixels before its backdrop."""
-    moved, there = np.roll(light, px, 1), np.roll(mask, px, 1)
-    behind = np.where(mask[..., None], np.median(light[~mask], axis=0), light)
-    return np.where(there[..., None], moved, behind)
+def _read_once(capture: Capture) -> Capture:
+    """The same, decoding each photograph once for `check` and `process`."""
+    shots = (replace(shot, frames=tuple(map(_held, shot.frames))) for shot in capture.shots)
+    return replace(capture, shots=tuple(shots))
 
 
-def _develop(file: Path, light: Floats, kind: str) -> None:
-    """A finished picture: sRGB in 8 bits ("lossy"), or an S-curve in 16 bits passed off as linear."""
-    balanced = np.clip(light / light.mean((0, 1)) * light.mean(), 0, 1)
-    if kind == "lossy":
-        png.write(file, np.round(255 * balanced ** (1 / 2.2)).astype(np.uint8))
-        return
-    png.write(file, np.round(65535 * (balanced**0.6) * (1.2 - 0.2 * balanced) / 1.0).clip(0, 65535).astype(np.uint16))
+def _held(frame: Frame) -> Frame:
+    return replace(frame, load=cache(frame.load))
+
+
+def _name(error: InputError) -> str:
+    """The error's class; what it is about where that names another fault."""
+    name = type(error).__name__.removesuffix("Error").lower()
+    order = "order " if "contradict the object's outline" in str(error) else ""
+    return f"error {order}{name}{' chart' * ('ColorChecker' in str(error))}"
+
+
+def _shown(lines: Any) -> dict[str, list[Any]]:
+    return {line.name: [line.state, line.value, line.cost_deg] for line in lines}
+
+
+def _count(rows: list[Row], which: str) -> int:
+    return sum(row[which] != "fail" for row in rows)
 
 
 if __name__ == "__main__":

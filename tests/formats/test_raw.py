@@ -1,5 +1,7 @@
 """RAW decoding: counts, black, white and colours of the mosaic, against files whose content is known."""
 
+import struct
+
 import headers
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from headers import DATA, needs_data
 
 from polcap.errors import DecodeError
 from polcap.formats import raw
+from polcap.optics import demosaic
 
 RAMP = np.arange(60 * 84, dtype=np.uint16).reshape(60, 84)
 PHASES = [((0, 1), (1, 2)), ((2, 1), (1, 0)), ((1, 0), (2, 1)), ((1, 2), (0, 1))]
@@ -57,12 +60,47 @@ def test_monochrome_sensor_stands_in_all_channels(tmp_path):
     assert image.cfa is None and image.black.tolist() == [[7]]
 
 
-def test_x_trans_is_refused(tmp_path):
-    g, r, b = 1, 0, 2
-    x_trans = [[g, g, r, g, g, b], [g, g, b, g, g, r], [b, r, g, r, b, g],
-               [g, g, b, g, g, r], [g, g, r, g, g, b], [r, b, g, b, r, g]]  # fmt: skip
-    with pytest.raises(DecodeError, match=r"a\.dng.*not a 2×2 Bayer mosaic.*develop"):
-        raw.read(written(tmp_path, RAMP, cfa=x_trans))
+G, R, B = 1, 0, 2
+X_TRANS = [[G, G, R, G, G, B], [G, G, B, G, G, R], [B, R, G, R, B, G],
+           [G, G, B, G, G, R], [G, G, R, G, G, B], [R, B, G, B, R, G]]  # fmt: skip
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (2, 1), (4, 5)])
+def test_x_trans_comes_back_from_its_first_whole_block_on(tmp_path, shift):
+    cfa = np.roll(X_TRANS, shift, (0, 1))
+    image = raw.read(written(tmp_path, RAMP, cfa=cfa.tolist()))
+    down, right = 60 - image.value.shape[0], 84 - image.value.shape[1]
+    assert max(down, right) < 3 and image.superpixel == 3
+    np.testing.assert_array_equal(image.value, RAMP[down:, right:])
+    np.testing.assert_array_equal(image.cfa, np.roll(cfa, (-down, -right), (0, 1)))
+    assert demosaic.x_trans_corner(image.cfa) == (0, 0)
+
+
+def test_another_mosaic_of_6_by_6_is_refused(tmp_path):
+    cfa = np.array(X_TRANS)
+    cfa[[0, 5]] = cfa[[5, 0]]
+    with pytest.raises(DecodeError, match=r"a\.dng.*a mosaic of 6×6.*develop"):
+        raw.read(written(tmp_path, RAMP, cfa=cfa.tolist()))
+
+
+@pytest.mark.parametrize("layout", [2, 3, 9])
+def test_super_ccd_is_refused_by_name(tmp_path, layout):
+    path = written(tmp_path, RAMP)
+    rectangular = struct.pack("<HHIHH", 50711, 3, 1, 1, 0)
+    assert rectangular in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(rectangular, struct.pack("<HHIHH", 50711, 3, 1, layout, 0)))
+    with pytest.raises(DecodeError, match=rf"CFALayout {layout}, SuperCCD.*16-bit TIFF"):
+        raw.read(path)
+
+
+def test_a_turned_mosaic_is_told_from_its_size():
+    assert "SuperCCD, turned by 45°" in raw.unsupported((4, 4), rotated=True)
+
+
+def test_foveon_is_refused_by_name(tmp_path):
+    (tmp_path / "a.x3f").write_bytes(b"FOVb" + bytes(4096))
+    with pytest.raises(DecodeError, match=r"a\.x3f.*Foveon's layers.*16-bit TIFF"):
+        raw.read(tmp_path / "a.x3f")
 
 
 def test_camera_matrix_takes_the_grey_of_the_shot_to_white(tmp_path):

@@ -6,6 +6,8 @@ import pytest
 from polcap.optics import demosaic
 
 RGGB = np.array([[0, 1], [1, 2]], np.uint8)
+X_TRANS = np.array([[1, 2, 1, 1, 0, 1], [0, 1, 0, 2, 1, 2], [1, 2, 1, 1, 0, 1],
+                    [1, 0, 1, 1, 2, 1], [2, 1, 2, 0, 1, 0], [1, 0, 1, 1, 2, 1]], np.uint8)  # fmt: skip
 PHASES = [RGGB, RGGB[::-1], RGGB[:, ::-1], RGGB[::-1, ::-1]]
 
 
@@ -37,6 +39,22 @@ def test_superpixel_center_is_half_a_photosite_in(cfa):
     binned = demosaic.superpixel(3 * x + 5 * y, cfa)
     yy, xx = np.mgrid[:8, :8].astype(np.float32)
     np.testing.assert_allclose(binned[..., 1], 3 * (2 * xx + 0.5) + 5 * (2 * yy + 0.5), atol=1e-4)
+
+
+def test_x_trans_block_is_one_pixel_with_every_color_in_its_middle():
+    """Ramps of three slopes, read at the blocks' middles (3i + 1, 3j + 1); a cut block is dropped."""
+    y, x = np.mgrid[:25, :32].astype(np.float32)
+    ramp = np.stack([3 * x + 5 * y, x - 2 * y + 90, 4 * y + 7], -1)
+    colors = np.tile(X_TRANS, (5, 6))[:25, :32]
+    binned = demosaic.superpixel(np.take_along_axis(ramp, colors[..., None].astype(int), 2)[..., 0], X_TRANS)
+    np.testing.assert_allclose(binned, ramp[1:24:3, 1:30:3], atol=1e-4)
+
+
+def test_x_trans_is_told_from_other_mosaics():
+    for shift in ((0, 0), (1, 2), (5, 4)):
+        down, right = demosaic.x_trans_corner(np.roll(X_TRANS, shift, (0, 1)))
+        assert ((down - shift[0]) % 3, (right - shift[1]) % 3) == (0, 0)
+    assert demosaic.x_trans_corner(np.tile(RGGB, (3, 3))) is None
 
 
 @pytest.mark.parametrize("cfa", PHASES)

@@ -41,7 +41,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     clip: Annotated[float, Meta(ge=0.5, le=1.0, description="counts from here on are clipped [white level]")] = 0.98
     demosaic: Annotated[
         Literal["superpixel", "full"],
-        Meta(description="one pixel per 2×2 quad (half size), or interpolated to full size"),
+        Meta(description="a pixel per 2×2 quad (X-Trans 3×3), or Bayer interpolated to full size"),
     ] = "superpixel"
     max_motion_px: Annotated[
         float, Meta(ge=0.0, le=500.0, description="a bracket that moved more is refused [visible RAW px]")
@@ -76,12 +76,17 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
     reference = order[(len(order) - 1) // 2]
     image = read(shots[0].frames[reference])
     camera = image.camera_matrix, image.white_balance
-    mosaic, full = image.cfa is not None, settings.demosaic == "full"
+    mosaic, full, side = image.cfa is not None, settings.demosaic == "full", image.superpixel
     height, width = image.value.shape[:2]
-    if min(height, width) < _LEAST_PX * (1 + mosaic):
+    if full and side == 3:
+        raise CaptureError(
+            f"{shots[0].frames[reference].path}: hdr.demosaic=full interpolates Bayer mosaics only, this is X-Trans; "
+            "leave it at superpixel"
+        )
+    if min(height, width) < _LEAST_PX * side:
         raise CaptureError(
             f"{shots[0].frames[reference].path}: {width}×{height} px are too few to measure noise and movement; "
-            f"polcap needs {_LEAST_PX * (1 + mosaic)} px a side"
+            f"polcap needs {_LEAST_PX * side} px a side"
         )
     middle = (len(shots[0].frames) - 1) // 2  # by the metadata, as in `check`, which reads each frame once
     corners = sharpness.places(read(shots[0].frames[middle]), settings.clip)
@@ -104,9 +109,8 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
         tiles.append([sharpness.take(read(frame), corners, settings.clip) for frame in shot.frames])
         read.forget((*shot.frames, *shot.ambient))
         lines.close()
-    binned = mosaic and not full
+    scale = 1.0 if full else float(side)
     x, y = capture.principal_px
-    scale = 2.0 if binned else 1.0
     return AngleStack(
         value=stack.value,
         variance=stack.variance,
@@ -114,7 +118,7 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
         angle=capture.angle,
         view=View(
             focal=capture.focal_px / scale,
-            center=((x - 0.5) / 2, (y - 0.5) / 2) if binned else (x, y),
+            center=((x - (scale - 1) / 2) / scale, (y - (scale - 1) / 2) / scale),
             scale=scale,
             known=capture.focal_known,
         ),
@@ -127,7 +131,7 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
         light=_light(capture),
         curvature=np.array(curvatures),
         ambient_share=np.array(ambient_shares),
-        blur_px=sharpness.frames_blur(tiles, 2.0 if mosaic else 1.0),
+        blur_px=sharpness.frames_blur(tiles, side),
         offset_px=_offsets(shots) if capture.layout == "sensor" else None,
     )
 

@@ -55,7 +55,7 @@ class Shooting:
         self.shot, self.reference, self.lines, self.read, self.clip = shot, reference, lines, read, clip
         self.iso = [frame.exif.iso or f"frame {e}" for e, frame in enumerate(shot.frames)]
         still = read(shot.frames[reference])
-        self.raw_px = 1.0 if still.cfa is None else 2.0  # of one pixel
+        self.raw_px = still.superpixel  # of one pixel
         self.least = sensor.rounding(still) / 2  # of a binned green
         self.ambient = ambients.measure(shot, shot.frames[reference], lines, read, False, clip)
 

@@ -4,7 +4,7 @@ import math
 from collections import OrderedDict, deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import cv2
@@ -58,7 +58,7 @@ class Planes:
 
 @dataclass(frozen=True)
 class Quads:
-    """Signals of a mosaic binned 2×2, made of the counts when asked for: a third of the memory of `Planes`."""
+    """Signals of a binned mosaic, made of the counts when asked for: a third of the memory of `Planes`."""
 
     image: SensorImage
     usable: Bools
@@ -66,7 +66,7 @@ class Quads:
     @property
     def shape(self) -> tuple[int, int, int]:
         height, width = self.image.value.shape
-        return 3, height // 2, width // 2
+        return 3, height // self.image.superpixel, width // self.image.superpixel
 
     def rows(self, rows: slice) -> Floats:
         """As `optics.sensor.signal`, to the bit."""
@@ -74,6 +74,9 @@ class Quads:
         assert image.cfa is not None
         _, height, width = self.shape
         start, stop, _ = rows.indices(height)
+        if image.superpixel == 3:
+            cfa = np.roll(image.cfa, -3 * start % 6, axis=0)
+            return planar(sensor.signal(replace(image, value=image.value[3 * start : 3 * stop], cfa=cfa)))
         out = np.empty((3, stop - start, width), np.float32)
         black = np.broadcast_to(image.black, (2, 2))
         span = np.float32(image.white - float(image.black.mean()))
@@ -93,7 +96,7 @@ class Quads:
 
 
 def signals(image: SensorImage, clip: float, full: bool = False, frames: int = 1) -> Signals:
-    """Of a decoded frame; a mosaic is binned to half size, or interpolated if `full`.
+    """Of a decoded frame; a mosaic is binned by superpixels, or interpolated if `full`.
 
     `frames`: how many are held at a time.
     """

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from polcap.errors import CaptureError
+from polcap.formats import capture as captures
 from polcap.images import Capture, Exif, Frame, Quality, SensorImage, Shot
 from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.stages import hdr
 from polcap.stages.hdr import ghosts as bracket_pixels
 from polcap.stages.hdr import links, noise, planes
 from polcap.stages.hdr.planes import Reader, signals
+from polcap.synth import shooting
 
 RGGB = np.array([[0, 1], [1, 2]], np.uint8)
 BLACK, WHITE, READ, GAIN = 512.0, 15871.0, 3.0, 2.0  # counts, counts, e⁻, e⁻ per count at ISO 100
@@ -474,3 +476,27 @@ def test_hand_held_nikon_bracket():
         assert np.all(np.abs(np.mean(z, axis=1)) < 0.1)
         assert np.all(np.abs(MAD_TO_SIGMA * np.median(np.abs(z), axis=1) - 1.05) < 0.25)
         assert 0.8 < np.std(z) < 1.3
+
+
+def test_x_trans_brackets_give_the_light_of_a_bayer_camera(tmp_path):
+    """The same scene through both mosaics: S0 of each channel alike within noise, three RAW px per px."""
+    still = {"width": 312, "height": 234, "nudge_px": 0.0, "nudge_deg": 0.0, "gain_jitter": 0.0, "samples": 1}
+    merged = {}
+    for cfa in ("RGGB", "X-Trans"):
+        shooting.write(tmp_path / cfa, shooting.random_scene(3, "bumps"), shooting.Shoot(seed=3, cfa=cfa, **still))
+        capture = captures.read(tmp_path / cfa)
+        merged[cfa] = hdr.merge(capture, hdr.Settings())
+        if cfa == "X-Trans":
+            with pytest.raises(CaptureError, match="X-Trans"):
+                hdr.merge(capture, hdr.Settings(demosaic="full"))
+    bayer, x_trans = merged.values()
+    assert x_trans.view.scale == 3 and x_trans.value.shape == (3, 78, 104, 3)
+    assert x_trans.view.focal == pytest.approx(bayer.view.focal * 2 / 3)
+    # 12 RAW px a side: six Bayer quads, four X-Trans blocks
+    one, other = (
+        m.value[:, : 19 * n, : 26 * n].reshape(3, 19, n, 26, n, 3).mean((2, 4)) for m, n in ((bayer, 6), (x_trans, 4))
+    )
+    bright = one.min((0, 3)) > 0.02
+    assert bright.sum() > 50
+    assert np.median(np.abs(other / one - 1)[:, bright]) < 0.02  # texture is sampled at other sites
+    assert np.abs(np.median((other / one)[:, bright], axis=1) - 1).max() < 0.01  # no channel is off
