@@ -50,7 +50,7 @@ def warp(image: Floats, transform: Floats, box: Box | None = None, order: Litera
         how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         flat = cv2.warpPerspective(np.ascontiguousarray(part), local, size, flags=how, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(flat, np.float32).reshape(size[1], size[0], *image.shape[2:])
-    planes = [part] if part.ndim == 2 else [part[..., c] for c in range(part.shape[2])]
+    planes = [part] if part.ndim == 2 else cv2.split(part)
     splines = [Spline(np.ascontiguousarray(plane)) for plane in planes]
     out = np.empty((len(planes), size[1], size[0]), np.float32)
     for y in range(0, size[1], _ROWS):
@@ -145,6 +145,13 @@ def _source(shape: tuple[int, ...], transform: Floats, box: Box) -> Box:
 def covered(shape: tuple[int, int], transform: Floats, box: tuple[int, int, int, int], margin: float = 1.0) -> Bools:
     """(h, w) bool: which pixels of `box` fall inside an image of `shape`, at least `margin` px from its edge."""
     x0, y0, x1, y1 = box
+    x, y = np.array([x0, x1 - 1.0, x0, x1 - 1.0]), np.array([y0, y0, y1 - 1.0, y1 - 1.0])
+    if _within(*coordinates(transform, x, y), shape, margin).all():  # a homography keeps the rest between its corners
+        return np.ones((y1 - y0, x1 - x0), bool)
     u, v = coordinates(transform, np.arange(x0, x1, dtype=np.float64), np.arange(y0, y1, dtype=np.float64)[:, None])
+    return _within(u, v, shape, margin)
+
+
+def _within(u: Floats, v: Floats, shape: tuple[int, int], margin: float) -> Bools:
     inside = (u >= margin) & (v >= margin) & (u <= shape[1] - 1 - margin) & (v <= shape[0] - 1 - margin)
     return np.asarray(inside)

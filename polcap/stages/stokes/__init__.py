@@ -15,7 +15,11 @@ from polcap.optics import fresnel, mueller
 from polcap.optics.warp import covered, warp
 from polcap.stages import stage
 
-_ROWS = 16
+_ROWS = 64  # of a block that fits the cache, from resampling to the last bit
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # the rows of a covariance
+
+Flags = list[list[tuple[Quality, Bits]]]  # of every shot
+
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -28,7 +32,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 5.0
 
 
-@stage(version=2)
+@stage(version=3)
 def solve(
     radiance: AngleStack, alignment: Alignment, gains: Gains, object_: ObjectMask, settings: Settings
 ) -> StokesImage:
@@ -51,20 +55,23 @@ def solve(
             f"polarizer angles {angles} do not determine the Stokes parameters (condition {condition:.0f}, "
             "at most 50); shoot angles spread over 180°, such as 0°, 45°, 90°"
         )
-    value, variance, quality = _registered(radiance, alignment, gains, object_.crop)
-    stokes = np.empty((3, *value.shape[1:]), np.float32)
-    covariance = np.empty((6, *value.shape[1:]), np.float32)
-    residual = np.empty(quality.shape, np.float32) if len(radiance.angle) > 3 else None
-    for top in range(0, len(quality), _ROWS):  # blocks whose float64 fits the cache
-        rows = slice(top, top + _ROWS)
-        solved, doubt = _weighted_least_squares(weights_of, value[:, rows], variance[:, rows])
+    x0, y0, x1, y1 = object_.crop
+    size = y1 - y0, x1 - x0
+    stokes, covariance = np.empty((3, *size, 3), np.float32), np.empty((6, *size, 3), np.float32)
+    quality = np.empty(size, np.uint8)
+    residual = np.empty(size, np.float32) if len(radiance.angle) > 3 else None
+    solved_by = _exact if len(radiance.angle) == 3 else _weighted_least_squares
+    flags = [_flagged(shot) for shot in radiance.quality]
+    for top in range(y0, y1, _ROWS):
+        rows = slice(top - y0, min(top + _ROWS, y1) - y0)
+        value, variance, seen = _registered(radiance, alignment, gains, flags, (x0, top, x1, rows.stop + y0))
+        solved, doubt = solved_by(weights_of, value, variance)
         stokes[:, rows], covariance[:, rows] = solved, doubt
-        quality[rows] = _judged(solved, doubt, quality[rows], settings)
+        quality[rows] = _judged(solved, doubt, seen, settings)
         if residual is not None:
             fitted = np.einsum("kj,jhwc->khwc", weights_of, solved)
-            difference = np.abs(value[:, rows] - fitted).sum(-1).mean(0)
+            difference = np.abs(value - fitted).sum(-1).mean(0)
             residual[rows] = difference / np.maximum(solved[0].sum(-1), 1e-9)
-    x0, y0, x1, y1 = object_.crop
     mask = object_.mask[y0:y1, x0:x1]
     view = radiance.view
     return StokesImage(
@@ -83,38 +90,52 @@ def solve(
     )
 
 
+def _flagged(quality: Bits) -> list[tuple[Quality, Bits]]:
+    """The bits that pixels of a shot (H, W) bring with them, each with the pixels that do."""
+    planes = [(bit, quality & np.uint8(bit)) for bit in (Quality.CLIPPED, Quality.GHOST)]
+    return [(bit, plane) for bit, plane in planes if plane.any()]
+
+
 def _registered(
-    radiance: AngleStack, alignment: Alignment, gains: Gains, crop: tuple[int, int, int, int]
+    radiance: AngleStack, alignment: Alignment, gains: Gains, flags: Flags, box: tuple[int, int, int, int]
 ) -> tuple[Floats, Floats, Bits]:
-    """Every shot's radiance over gain on the crop of the reference grid: (K, h, w, 3) twice, (h, w)."""
-    values, variances = [], []
-    x0, y0, x1, y1 = crop
+    """Every shot's radiance over gain on a box of the reference grid: (K, h, w, 3) twice, (h, w)."""
+    x0, y0, x1, y1 = box
+    values, variances = (np.empty((len(alignment.transform), y1 - y0, x1 - x0, 3), np.float32) for _ in range(2))
     quality: Bits = np.zeros((y1 - y0, x1 - x0), np.uint8)
     mosaic = radiance.offset_px is not None
     part = alignment.transform[:, :2, 2] % 1
     shares = np.prod(part**2 + (1 - part) ** 2, axis=1).mean()  # alike for all, lest the sharpest shot counts least
     for k, transform in enumerate(alignment.transform):
-        values.append(warp(radiance.value[k], transform, crop, order=1 if mosaic else 3) / gains.gain[k])
-        spread = np.maximum(warp(radiance.variance[k], transform, crop, order=1), 1e-14)
-        if mosaic:  # the mean of two or four neighbours, as is usual: splines ring at the edges of so coarse a grid
-            spread = spread * shares
-        variances.append(spread / gains.gain[k] ** 2)
-        for bit in (Quality.CLIPPED, Quality.GHOST):
-            flagged = warp((radiance.quality[k] & bit).astype(np.float32), transform, crop, order=1) > 0.01 * bit
-            quality |= np.where(flagged, np.uint8(bit), np.uint8(0))
-        inside = covered(radiance.value.shape[1:3], transform, crop)
+        gain = gains.gain[k].astype(np.float32)
+        np.divide(warp(radiance.value[k], transform, box, order=1 if mosaic else 3), gain, out=values[k])
+        spread = np.maximum(warp(radiance.variance[k], transform, box, order=1), np.float32(1e-14))
+        # the mean of two or four neighbours in a mosaic, as is usual: splines ring at the edges of so coarse a grid
+        np.multiply(spread, np.float32(shares if mosaic else 1) / gain**2, out=variances[k])
+        for bit, plane in flags[k]:
+            quality |= np.where(warp(plane, transform, box, order=1) > 0.01 * bit, np.uint8(bit), np.uint8(0))
+        inside = covered(radiance.value.shape[1:3], transform, box)
         quality |= np.where(inside, np.uint8(0), np.uint8(Quality.OUTSIDE))
-    return np.stack(values), np.stack(variances), quality
+    return values, variances, quality
+
+
+def _exact(weights_of: Floats, value: Floats, variance: Floats) -> tuple[Floats, Floats]:
+    """The same of three angles, which need no weights: s = A⁻¹ I, and its covariance A⁻¹ diag(var) A⁻ᵀ."""
+    inverse = np.linalg.inv(weights_of)  # (3, K)
+    squares = np.stack([inverse[i] * inverse[j] for i, j in _PAIRS])  # (6, K)
+    shape = value.shape[1:]
+    solved = inverse.astype(np.float32) @ value.reshape(3, -1)
+    doubt = squares.astype(np.float32) @ variance.reshape(3, -1)
+    return solved.reshape(3, *shape), doubt.reshape(6, *shape)
 
 
 def _weighted_least_squares(weights_of: Floats, value: Floats, variance: Floats) -> tuple[Floats, Floats]:
     """Stokes (3, H, W, C) and covariance (6, H, W, C) from value and variance (K, H, W, C), A (K, 3)."""
-    w = 1.0 / variance.astype(np.float64)
-    pairs = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
-    m00, m01, m02, m11, m12, m22 = (
-        np.tensordot(weights_of[:, i] * weights_of[:, j], w, axes=1) for i, j in pairs
-    )  # the symmetric AᵀWA of every pixel
-    right = [np.tensordot(weights_of[:, i], w * value, axes=1) for i in range(3)]
+    shape = value.shape[1:]
+    w = 1.0 / variance.astype(np.float64).reshape(len(value), -1)
+    products = np.stack([weights_of[:, i] * weights_of[:, j] for i, j in _PAIRS])
+    m00, m01, m02, m11, m12, m22 = products @ w  # the symmetric AᵀWA of every pixel
+    right = weights_of.T @ (w * value.reshape(len(value), -1))
     c00, c01, c02 = m11 * m22 - m12**2, m02 * m12 - m01 * m22, m01 * m12 - m02 * m11
     determinant = m00 * c00 + m01 * c01 + m02 * c02
     c11, c12, c22 = m00 * m22 - m02**2, m01 * m02 - m00 * m12, m00 * m11 - m01**2
@@ -127,21 +148,25 @@ def _weighted_least_squares(weights_of: Floats, value: Floats, variance: Floats)
             i02 * right[0] + i12 * right[1] + i22 * right[2],
         ]
     )
-    return stokes, covariance
+    return stokes.reshape(3, *shape), covariance.reshape(6, *shape)
 
 
 def _judged(stokes: Floats, covariance: Floats, quality: Bits, settings: Settings) -> Bits:
     """Quality bits with what the solution itself betrays."""
-    s0, s1, s2 = stokes.sum(-1)
-    sigma0 = np.sqrt(covariance[0].sum(-1))
-    sigma = np.sqrt((covariance[3] + covariance[5]).sum(-1) / 2)
-    length = np.hypot(s1, s2)
+    s0, s1, s2 = (_total(plane) for plane in stokes)
+    sigma0 = np.sqrt(_total(covariance[0]))
+    sigma = np.sqrt(_total(covariance[3] + covariance[5]) / 2)
     limit = fresnel.greatest_diffuse_dolp(settings.greatest_ior)
-    ill = (s0 <= 0) | (length - 3 * sigma > limit * s0)
+    ill = (s0 <= 0) | (np.sqrt(s1 * s1 + s2 * s2) - 3 * sigma > limit * s0)
     dark = s0 < settings.dark_sigma * sigma0
     bits = quality | np.where(ill, np.uint8(Quality.ILL_POSED), np.uint8(0))
     bits |= np.where(dark, np.uint8(Quality.DARK), np.uint8(0))
     return bits | np.where(_metal(stokes, covariance), np.uint8(Quality.METAL), np.uint8(0))
+
+
+def _total(picture: Floats) -> Floats:
+    """Sum over the channels of (h, w, 3)."""
+    return picture[..., 0] + picture[..., 1] + picture[..., 2]
 
 
 def _metal(stokes: Floats, covariance: Floats) -> Floats:
@@ -150,12 +175,18 @@ def _metal(stokes: Floats, covariance: Floats) -> Floats:
     In a dielectric every channel has the same azimuth and a highlight only shortens the vectors; in a
     conductor the complex index changes with wavelength. Red and blue are compared at 5σ.
     """
-    s0 = np.maximum(stokes[0], 1e-9)
-    ratio = stokes[1:] / s0  # (2, H, W, C)
-    sigma2 = (covariance[3] + covariance[5]) / 2 / s0**2
-    turned = ratio[0, ..., 0] * ratio[1, ..., 2] - ratio[1, ..., 0] * ratio[0, ..., 2]
-    strength = np.hypot(*ratio)
-    spread = np.sqrt(sigma2[..., 0] * strength[..., 2] ** 2 + sigma2[..., 2] * strength[..., 0] ** 2)
-    enough = np.minimum(strength[..., 0], strength[..., 2]) > 0.05
-    across = strength[..., 0] * strength[..., 2] * np.sin(np.radians(20.0))  # 10° between the AoLPs
+    (x0, y0, strength0, noise0), (x1, y1, strength1, noise1) = (
+        _polarization(stokes[..., c], covariance[..., c]) for c in (0, 2)
+    )
+    turned = x0 * y1 - y0 * x1
+    spread = np.sqrt(noise0 * strength1**2 + noise1 * strength0**2)
+    enough = np.minimum(strength0, strength1) > 0.05
+    across = strength0 * strength1 * np.float32(np.sin(np.radians(20.0)))  # 10° between the AoLPs
     return np.asarray(enough & (np.abs(turned) - 5 * spread > across))
+
+
+def _polarization(stokes: Floats, covariance: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """S1/S0, S2/S0, their length and their variance in one channel, each (H, W)."""
+    over = np.float32(1) / np.maximum(stokes[0], np.float32(1e-9))
+    x, y = stokes[1] * over, stokes[2] * over
+    return x, y, np.sqrt(x * x + y * y), (covariance[3] + covariance[5]) * (over * over) / 2
