@@ -34,7 +34,7 @@ def of_outline(found: Found, limits: Gates) -> Iterator[Gate]:
     """What the outline says of the angles, of the body and of other light."""
     angle, limit = found.radiance.angle, limits.max_turn_deg
     band = rim.take(*_reduced(found.stokes, angle))
-    if band.length < _LEAST_RIM:
+    if len(band.azimuth) < _LEAST_RIM:
         yield Gate("angles", "not measured", None, limit, "too little outline", unit="°")
         return
     body = rim.body(band, angle)

@@ -13,29 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
-from polcap.optics import mueller, outline
+from polcap.optics import outline
 
 Bools = NDArray[np.bool_]
 
 _INNER_PX, _DEPTH = 3.0, 0.08  # the band: px from the outline, and up to this share of the object's radius
 _SMOOTH_PX = 1.0
-_SECTORS, _LEAST_SECTORS = 24, 8
-_DOLP_CAP = 0.4  # above, it is no body that polarizes
+_LEAST_SECTORS = 8  # a third of the outline
 _STEP_DEG, _MOST_DEG = 3.0, 48.0  # of the angles tried; beyond, order and sense are in question
 
 
 @dataclass(frozen=True)
-class Rim:
-    """The band inside the outline."""
+class Rim(outline.Rim):
+    """The band inside the outline; `light` is relative to the mean of the shots."""
 
-    light: Floats  # (K, N) of each shot, mean of the shots = 1
-    azimuth: Floats  # (N,) rad, outward direction of the outline, from image x towards image up
-    sector: NDArray[np.int_]  # (N,) part of the outline, 0…23, seen from the object's middle
     total: Floats  # (N,) mean of the shots, of the object's mean
-
-    @property
-    def length(self) -> int:
-        return len(self.azimuth)
 
 
 @dataclass(frozen=True)
@@ -73,14 +65,11 @@ def take(light: Floats, mask: Bools, usable: Bools) -> Rim:
         edge[:] = False
     inside = smooth[:, band]
     total = inside.mean(0)
-    y, x = np.nonzero(band)
-    around = np.arctan2(y - y.mean(), x - x.mean()) if len(y) else np.zeros(0)
-    sector = np.floor((around + np.pi) / (2 * np.pi) * _SECTORS).astype(int) % _SECTORS
     level = float(smooth.mean(0)[ok > 0].mean()) if (ok > 0).any() else 1.0
     return Rim(
         inside / np.maximum(total, 1e-9),
         np.arctan2(out[1], out[0])[band],
-        sector,
+        outline.sectors(band),
         total / max(level, 1e-9),
     )
 
@@ -119,32 +108,17 @@ def _sigmas(gained: Floats, sector: NDArray[np.int_]) -> float:
 
 def body(at: Rim, angle: Floats) -> Body:
     """How the rim is polarized, and how its light is spread."""
-    s0, s1, s2 = np.linalg.lstsq(mueller.analyzer(angle), at.light, rcond=None)[0]
-    polarization = (s1 + 1j * s2) / np.maximum(s0, 1e-9)
-    weight = np.minimum(np.abs(polarization), _DOLP_CAP)
-    across = weight * np.exp(1j * (np.angle(polarization) - 2 * at.azimuth))
-    mean = complex(across.sum() / max(float(weight.sum()), 1e-9))
-    parts = [
-        across[at.sector == s].sum() / max(float(weight[at.sector == s].sum()), 1e-9) for s in np.unique(at.sector)
-    ]
-    own = np.array(parts) * np.exp(-1j * np.angle(mean))
-    sigma = float(own.imag.std() / np.sqrt(max(len(own), 1)) / max(2 * abs(mean), 1e-3))
+    mean, turned_sigma = outline.mean_and_doubt(*outline.phasor(at, angle))
     basis = np.stack([np.ones_like(at.azimuth), np.cos(at.azimuth), np.sin(at.azimuth)], axis=1)
     found = np.linalg.lstsq(basis, at.total, rcond=None)[0]
     return Body(
-        dolp=float(np.median(np.abs(polarization))),
+        dolp=float(np.median(np.abs(outline.polarization(at, angle)))),
         along=mean.real,
         concentration=abs(mean),
         turned=float(np.angle(mean) / 2),
-        turned_sigma=min(sigma, np.pi / 2),
+        turned_sigma=turned_sigma,
         one_sided=float(np.hypot(found[1], found[2]) / max(float(found[0]), 1e-9)),
     )
-
-
-def dolp(at: Rim, angle: Floats) -> Floats:
-    """Degree of linear polarization along the rim, (N,)."""
-    s0, s1, s2 = np.linalg.lstsq(mueller.analyzer(angle), at.light, rcond=None)[0]
-    return np.asarray(np.hypot(s1, s2) / np.maximum(s0, 1e-9))
 
 
 def side_light(at: Rim) -> Floats:

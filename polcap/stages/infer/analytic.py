@@ -14,7 +14,7 @@ from polcap.stages.infer.body_law import Zeniths
 
 _BLURS_PX = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0)
 _SAME = 2.0  # standard deviations that two averages of the same thing may differ by
-_REACHED = 0.05  # share of known pixels under a Gaussian from which a mean is taken
+REACHED = 0.05  # share of known pixels under a Gaussian from which a mean is taken
 _MODEL_ERROR_DEG = 4.0  # interreflection, highlights, unknown index: measured on path-traced objects
 
 
@@ -144,7 +144,7 @@ def fill_highlights(image: Floats, cues: Cues) -> Floats:
             break
         share = cv2.GaussianBlur(known.astype(np.float32), (0, 0), blur)
         mean = cv2.GaussianBlur(out * known[..., None], (0, 0), blur) / np.maximum(share, 1e-6)[..., None]
-        reached = hole & (share > _REACHED)
+        reached = hole & (share > REACHED)
         out[reached] = mean[reached]
         hole, blur = hole & ~reached, 2 * blur
     return out

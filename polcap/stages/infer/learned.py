@@ -14,14 +14,13 @@ from polcap.images import Cues, Floats, Network, Quality, SurfaceMaps
 from polcap.optics import frames
 from polcap.stages.cues import CHANNELS, FLOOR
 from polcap.stages.infer import augmentation
-from polcap.stages.infer.analytic import fill_highlights, invert
+from polcap.stages.infer.analytic import REACHED, fill_highlights, invert
 
 _INVERSION = 4.0  # factor on the inversion's expected error in the join: the network has seen what it has seen
 _DETAIL = 2.0  # pixels that the network sees, 1σ: what is finer is the inversion's to tell
 _CALIBRATION = (0.78, 1.16, 50.0)  # error = min(a·expectedᵇ, c), degrees: traced training meshes, both laws
 _CELLS = 2.0  # cells of the network's grid, 1σ, over which its pattern is taken as the same
 _BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
-_REACHED = 0.05  # share of known pixels under a Gaussian from which a mean is taken
 _BRIGHTEST = 2.0  # S0, which is 1 where white paper faces the flash beside the chart; what no body reflects
 
 
@@ -85,7 +84,7 @@ def _without_grid(normal: Floats, mask: NDArray[np.bool_]) -> Floats:
         common, share = (
             cv2.GaussianBlur(np.ascontiguousarray(part[place]), (0, 0), _CELLS) for part in (uneven, whole)
         )
-        out[place] -= common / np.maximum(share, _REACHED)[..., None] * mask[place][..., None]
+        out[place] -= common / np.maximum(share, REACHED)[..., None] * mask[place][..., None]
     return out
 
 
@@ -97,7 +96,7 @@ def _blended(image: Floats, mask: NDArray[np.bool_]) -> Floats:
         cv2.sepFilter2D(part, -1, _BINOMIAL, _BINOMIAL) for part in ((image * weight).astype(np.float32), inside)
     )
     share = share if image.ndim == 2 else share[..., None]
-    return np.where(weight > 0, smooth / np.maximum(share, _REACHED), image)
+    return np.where(weight > 0, smooth / np.maximum(share, REACHED), image)
 
 
 def _detailed(coarse: Floats, fine: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:

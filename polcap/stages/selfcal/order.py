@@ -7,31 +7,20 @@ with more than three shots, intensities that lie in the space of S0, S1, S2. Tie
 
 from dataclasses import dataclass
 from itertools import combinations, permutations
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
 from polcap.optics import mueller, outline
+from polcap.optics.outline import Rim
 
 Bools = NDArray[np.bool_]
 Order = tuple[tuple[int, ...], bool]  # which stated angle each shot has, and whether they count clockwise
 
 _MOST_PERMUTED = 4  # beyond, only exchanges of two shots, and the reversal, are tried
-_SECTORS = 24  # of the outline; their scatter is the doubt
-_DOLP_CAP = 0.4  # above, it is no body that polarizes
 _CLOSES = 3.0  # factor on the misfit of more than three shots that rules an order out, or in
 _ROUGH = 0.01  # misfit that gains and interpolation leave at most, relative to the light
-
-
-@dataclass(frozen=True)
-class Rim:
-    """The band inside the outline."""
-
-    light: Floats  # (K, N) of the registered shots, gains taken out
-    azimuth: Floats  # (N,) rad, outward direction of the outline
-    sector: NDArray[np.int_]  # (N,) part of the outline, 0…23
 
 
 @dataclass(frozen=True)
@@ -58,10 +47,7 @@ def rim(value: Floats, usable: Bools, mask: Bools, crop: tuple[int, int, int, in
     band[:, : max(0, edge - x0)] = False
     band[mask.shape[0] - max(0, y1 - (full[0] - edge)) :] = False
     band[:, mask.shape[1] - max(0, x1 - (full[1] - edge)) :] = False
-    y, x = np.nonzero(band)
-    around = np.arctan2(y - y.mean(), x - x.mean()) if len(y) else np.zeros(0)
-    sector = np.floor((around + np.pi) / (2 * np.pi) * _SECTORS).astype(int) % _SECTORS
-    return Rim(np.asarray(value[:, band], np.float64), np.arctan2(out[1], out[0])[band], sector)
+    return Rim(np.asarray(value[:, band], np.float64), np.arctan2(out[1], out[0])[band], outline.sectors(band))
 
 
 def judge(at: Rim, angle: Floats, margin: float, believable: float, beyond_sigma: float = 3.0) -> Verdict:
@@ -69,8 +55,8 @@ def judge(at: Rim, angle: Floats, margin: float, believable: float, beyond_sigma
     stated: Order = (tuple(range(len(angle))), False)
     if at.light.shape[1] == 0:
         return Verdict(stated, 0.0, 0.0, 1.0, 0.0, np.pi / 2, 0.0)
-    total, weight = _phasor(at, angle)
-    mean = complex(total.sum() / max(weight.sum(), 1e-9))
+    total, weight = outline.phasor(at, angle)
+    mean, offset_sigma = outline.mean_and_doubt(total, weight)
     here = _misfit(at, angle)
     best, best_score, doubt = stated, abs(mean), 0.0
     for order, turned in hypotheses(angle).items():
@@ -78,19 +64,13 @@ def judge(at: Rim, angle: Floats, margin: float, believable: float, beyond_sigma
         if order == stated or misfit > _CLOSES * here:
             continue
         least = 0.0 if _CLOSES * misfit < here > _ROUGH else margin  # more than three shots agree in this order alone
-        other, others = _phasor(at, turned)
+        other, others = outline.phasor(at, turned)
         score = float(other.sum().real / max(others.sum(), 1e-9))
         if score > best_score:
             sigma = _jackknife(other.real, others, (total * np.exp(-1j * np.angle(mean))).real, weight)
             if score > believable and score - abs(mean) > max(least, beyond_sigma * sigma * (least > 0)):
                 best, best_score, doubt = order, score, sigma
-    concentration = abs(mean)
-    parts = np.array([t / w for t, w in zip(total, weight) if w > 0])
-    across = (parts * np.exp(-1j * np.angle(mean))).imag
-    sigma = float(across.std() / np.sqrt(max(len(parts), 1)) / max(2 * concentration, 1e-3))
-    return Verdict(
-        best, mean.real, best_score, doubt, float(np.angle(mean) / 2), min(sigma, np.pi / 2), float(concentration)
-    )
+    return Verdict(best, mean.real, best_score, doubt, float(np.angle(mean) / 2), offset_sigma, abs(mean))
 
 
 def hypotheses(angle: Floats) -> dict[Order, Floats]:
@@ -116,16 +96,6 @@ def _exchanged(shots: int) -> list[tuple[int, ...]]:
         order[i], order[j] = j, i
         found.append(tuple(order))
     return found
-
-
-def _phasor(at: Rim, angle: Floats) -> tuple[NDArray[Any], Floats]:
-    """Σ w e^{2i(φ − φ_contour)} and Σ w of every sector, (24,) each, w the DoLP up to what a body has."""
-    s0, s1, s2 = np.linalg.lstsq(mueller.analyzer(angle), at.light, rcond=None)[0]
-    polarization = (s1 + 1j * s2) / np.maximum(s0, 1e-9)
-    weight = np.minimum(np.abs(polarization), _DOLP_CAP)
-    phasor = weight * polarization / np.maximum(np.abs(polarization), 1e-12) * np.exp(-2j * at.azimuth)
-    real, imaginary = (np.bincount(at.sector, part, _SECTORS) for part in (phasor.real, phasor.imag))
-    return real + 1j * imaginary, np.asarray(np.bincount(at.sector, weight, _SECTORS), np.float64)
 
 
 def _misfit(at: Rim, angle: Floats) -> float:
