@@ -1,4 +1,4 @@
-"""Two things that the site needs beyond its pages: pages listed by folder, and links out of docs/ made names of files.
+"""What the site needs beyond its pages: pages listed by folder, the commands' options, links out of docs/ made names.
 
 Read by mkdocs (`hooks:` in mkdocs.yml).
 """
@@ -7,8 +7,13 @@ import re
 from pathlib import Path
 from typing import Any
 
+from typer.main import get_command
+
+from polcap.cli import app
+
 DOCS = Path(__file__).parent
 _OUT = re.compile(r"\[([^\]]+)\]\(((?:\.\./)+[^)#]*)(?:#[^)]*)?\)")
+_OPTIONS = re.compile(r"<!-- options of (\w+) -->")
 
 
 def on_config(config: Any) -> Any:
@@ -26,7 +31,10 @@ def _pages(folder: str) -> list[str]:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """A link to a file of the repository outside docs/ becomes the file's name; the site does not hold it."""
+    """The options of a command where its page has `<!-- options of NAME -->`, and links out of docs/ as names.
+
+    The site does not hold the files of the repository outside docs/.
+    """
     here = (DOCS / page.file.src_uri).parent
 
     def shown(match: re.Match[str]) -> str:
@@ -35,4 +43,15 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
             return match[0]
         return f"{match[1]} (`{target.relative_to(DOCS.parent)}`)"
 
-    return _OUT.sub(shown, markdown)
+    return _OUT.sub(shown, _OPTIONS.sub(lambda match: options_table(match[1]), markdown))
+
+
+def options_table(name: str) -> str:
+    """What `polcap NAME --help` says of its arguments and options, as a table."""
+    command = get_command(app).commands[name]  # type: ignore[attr-defined]
+    context = command.make_context(name, [], resilient_parsing=True)
+    rows = [record for one in command.params if (record := one.get_help_record(context))]
+    lines = ["| option | |", "| --- | --- |"]
+    for option, meaning in rows:  # inside `…` a | parts no columns
+        lines.append(f"| `{option}` | {' '.join(meaning.split()).replace('|', '&#124;')} |")
+    return "\n".join(lines)
