@@ -21,7 +21,7 @@ from msgspec import Meta, Struct
 from polcap.errors import HardwareError
 from polcap.rig import serial_port
 from polcap.rig.log import Log
-from polcap.rig.serial_port import Port, Silent, patiently
+from polcap.rig.serial_port import Port, Silent, patiently, started
 
 BACKLASH_DEG = 0.0  # the piezo drives the ring itself
 BAUD = 9600
@@ -193,9 +193,4 @@ def recognize(line: str) -> str | None:
 
 def open_motor(port: str, settings: Settings, limit_s: float, log: Log) -> Elliptec:
     """Raises HardwareError where no Elliptec answers."""
-    opened = Port(port, baud=BAUD, log=log, name="rotator")
-    try:
-        return Elliptec(opened, settings, limit_s)
-    except BaseException:
-        opened.close()
-        raise
+    return started(lambda opened: Elliptec(opened, settings, limit_s), port, BAUD, log)

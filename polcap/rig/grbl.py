@@ -19,7 +19,7 @@ from msgspec import Meta, Struct
 from polcap.errors import HardwareError
 from polcap.rig import manual, serial_port
 from polcap.rig.log import Log
-from polcap.rig.serial_port import Port, Silent, patiently
+from polcap.rig.serial_port import Port, Silent, patiently, started
 
 BACKLASH_DEG = 2.0
 BAUD = 115200
@@ -232,9 +232,4 @@ def recognize(line: str) -> str | None:
 
 def open_motor(port: str, settings: Settings, limit_s: float, log: Log) -> Grbl:
     """Raises HardwareError where no GRBL answers."""
-    opened = Port(port, baud=BAUD, log=log, name="rotator")
-    try:
-        return Grbl(opened, settings, limit_s, log)
-    except BaseException:
-        opened.close()
-        raise
+    return started(lambda opened: Grbl(opened, settings, limit_s, log), port, BAUD, log)

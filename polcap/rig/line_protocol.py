@@ -22,7 +22,7 @@ from msgspec import Struct
 from polcap.errors import HardwareError
 from polcap.rig import manual
 from polcap.rig.log import Log
-from polcap.rig.serial_port import Port, Silent
+from polcap.rig.serial_port import Port, Silent, started
 
 BACKLASH_DEG = 2.0
 BAUD = 115200
@@ -112,9 +112,4 @@ def recognize(line: str) -> str | None:
 
 def open_motor(port: str, settings: Settings, limit_s: float, log: Log) -> Line:
     """Raises HardwareError where no such board answers."""
-    opened = Port(port, baud=BAUD, log=log, name="rotator")
-    try:
-        return Line(opened, settings, limit_s, log)
-    except BaseException:
-        opened.close()
-        raise
+    return started(lambda opened: Line(opened, settings, limit_s, log), port, BAUD, log)

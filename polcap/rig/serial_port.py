@@ -57,6 +57,22 @@ def ports() -> list[tuple[str, str]]:
     return sorted((port.device, port.description) for port in list_ports.comports())
 
 
+def started(driver: Callable[["Port"], T], url: str, baud: int, log: Log) -> T:
+    """A rotator's driver on a port of its own, which is closed again where the driver does not start.
+
+    Raises
+    ------
+    HardwareError
+        The port cannot be opened, or what answers there is not what the driver speaks to.
+    """
+    port = Port(url, baud=baud, log=log, name="rotator")
+    try:
+        return driver(port)
+    except BaseException:
+        port.close()
+        raise
+
+
 class Port:
     """Lines of ASCII over a port nobody else may open meanwhile."""
 
