@@ -103,6 +103,7 @@ def sync(target: Path) -> None:
 
 
 def discard(target: Path) -> None:
+    """Remove a file or folder, whatever stands in the way."""
     if target.is_dir():
         shutil.rmtree(target, ignore_errors=True)
     else:

@@ -37,16 +37,39 @@ def write(
     as_shot_neutral: Floats,
     compression: Literal["ljpeg", "none"] = "ljpeg",
 ) -> None:
-    """Write a mosaic (H, W), both even, bit for bit; on a failure nothing stands under `path`.
+    """Write a mosaic bit for bit; on a failure nothing stands under `path`.
 
     Parameters
     ----------
-    cfa : (2, 2), of X-Trans (6, 6), of 0 R, 1 G, 2 B.
-    black : counts, one for all or of a Bayer mosaic's phase (2, 2); white : counts.
-    exif : its fields that are None are left out; width, height and color_matrix are not read.
-    color_matrix : (3, 3) XYZ under D65 → camera; as_shot_neutral : (3,) camera values of a grey.
+    path
+        The file.
+    mosaic
+        (H, W) counts, both sides even.
+    cfa
+        (2, 2), of X-Trans (6, 6), of 0 R, 1 G, 2 B.
+    black
+        Counts, one for all or (2, 2) of a Bayer mosaic's phase.
+    white
+        Counts.
+    exif
+        Its fields that are None are left out; width, height and color_matrix are not read.
+    color_matrix
+        (3, 3) XYZ under D65 → camera.
+    as_shot_neutral
+        (3,) camera values of a grey.
+    compression
+        Lossless JPEG, or none.
 
-    Raises StorageError.
+    Raises
+    ------
+    ValueError
+        The mosaic is of another type, or of odd sides.
+    StorageError
+        The file cannot be written.
+
+    References
+    ----------
+    Adobe, Digital Negative (DNG) Specification 1.4. ITU-T T.81, annex H (lossless JPEG).
     """
     height, width = mosaic.shape
     if mosaic.dtype != np.uint16 or height % 2 or width % 2:

@@ -46,7 +46,15 @@ def encode_all(textures: Mapping[str, Texture], kind: Kind, *, text: bool = Fals
 
 
 def encode(texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
-    """The bytes of one picture; JPEG and WebP hold 8 bits, PNG what it is given."""
+    """The bytes of one picture; JPEG and WebP hold 8 bits, PNG what it is given.
+
+    Raises
+    ------
+    SettingError
+        The kind cannot hold the picture's channels, or its encoder is not installed.
+    StorageError
+        The encoder failed.
+    """
     if kind == "png":
         return png.encode(texture.pixels, {"Description": texture.says} if text else None)
     if kind == "ktx2":

@@ -21,10 +21,19 @@ def write(
     *,
     half: bool | Collection[str] = False,
 ) -> None:
-    """Write maps (H, W) under their channel names ("R", "normal.x", "S0.R"); ZIP, float32 or half.
+    """Write maps as one OpenEXR file, ZIP; the same input gives the same bytes.
 
-    `half` may name the channels that are to be half. Values beyond the range of half become its
-    greatest. The same input gives the same bytes.
+    Parameters
+    ----------
+    path
+        The file; its name ends in .exr.
+    channels
+        Maps (H, W) by channel name: "R", "normal.x", "S0.R".
+    attributes
+        Header entries.
+    half
+        Whether values are 16 bits instead of 32, or the channels of which they are. Values beyond the range of half
+        become its greatest.
 
     Raises
     ------
@@ -72,7 +81,7 @@ def read(path: Path) -> tuple[dict[str, Floats], dict[str, object]]:
 
 
 def decode(path: str) -> worker.Answer:
-    """The same, in the worker."""
+    """What `read` reads, in the worker; raises DecodeError."""
     data = photo_bytes.load(path)
     if data[:4] != _MAGIC:
         raise DecodeError(f"cannot read {path}: it is no OpenEXR file; write it again")

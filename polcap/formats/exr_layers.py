@@ -30,7 +30,18 @@ SAYS = {
 
 
 def write(path: Path, maps: Path, color: str, says: Mapping[str, str]) -> None:
-    """Write the layers of `maps`; colours in the space or role `color` of the OpenColorIO configuration.
+    """Write every map of a result as the layers of one OpenEXR file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    maps
+        Folder with the maps, as `formats.maps.write` leaves it.
+    color
+        Space or role of the OpenColorIO configuration that the colors are converted to.
+    says
+        Header entries: where the result comes from.
 
     Raises
     ------

@@ -15,6 +15,8 @@ NORMAL_MM = 50.0  # full-frame equivalent that is assumed where nothing is known
 
 
 class Focal(NamedTuple):
+    """A focal length and where it comes from."""
+
     px: float  # visible RAW pixels
     known: bool
     note: str

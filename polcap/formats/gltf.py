@@ -41,6 +41,19 @@ def write(
 ) -> None:
     """Write a GLB with embedded textures; the same asset gives the same bytes.
 
+    Parameters
+    ----------
+    path
+        The file.
+    asset
+        Mesh and textures.
+    name
+        Of scene, node, mesh and material.
+    images
+        Kind of the embedded pictures.
+    provenance
+        Goes into the XMP packet (KHR_xmp_json_ld).
+
     Raises
     ------
     SettingError
@@ -53,7 +66,23 @@ def write(
 
 
 def encode(asset: Asset, name: str, images: Kind = "png", provenance: Mapping[str, str] | None = None) -> bytes:
-    """The bytes of the GLB; `provenance` goes into its XMP packet."""
+    """The bytes of the GLB.
+
+    Parameters
+    ----------
+    asset
+        Mesh and textures.
+    name
+        Of scene, node, mesh and material.
+    images
+        Kind of the embedded pictures.
+    provenance
+        Goes into the XMP packet (KHR_xmp_json_ld).
+
+    References
+    ----------
+    Khronos, glTF 2.0 specification, "GLB File Format".
+    """
     blob = _Blob()
     primitive = _primitive(asset.mesh, blob)
     held = textures(asset)
@@ -166,12 +195,12 @@ def _packet(name: str, provenance: Mapping[str, str]) -> dict[str, Any]:
 
 
 def center(vertices: Floats) -> Floats:
-    """Middle of the bounding box (3,): the asset's origin."""
+    """Middle (3,) of the bounding box of vertices (V, 3): the asset's origin."""
     return np.asarray((vertices.min(axis=0).astype(np.float64) + vertices.max(axis=0)) / 2)
 
 
 def is_open(faces: NDArray[np.int32]) -> bool:
-    """Some edge belongs to one triangle only: the surface has a back that can be seen."""
+    """Whether some edge of faces (F, 3) belongs to one triangle only: the surface has a back that can be seen."""
     ends = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
     _, count = np.unique(ends[:, 0] * (int(faces.max()) + 1) + ends[:, 1], return_counts=True)
     return bool((count == 1).any())

@@ -64,9 +64,18 @@ class Stored:
 
 
 def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues: Cues) -> None:
-    """Write every map as EXR, the main ones as PNG too, and maps.json last.
+    """Write every map as EXR, the main ones as PNG too, and maps.json last; the same values give the same bytes.
 
-    The same values give the same bytes.
+    Parameters
+    ----------
+    folder
+        `maps/` of a result.
+    maps
+        What `infer` found, (H, W) of the crop.
+    mesh
+        Its depth is written, not its triangles.
+    stokes, cues
+        The images that the maps were made from, on the same crop.
 
     Raises
     ------

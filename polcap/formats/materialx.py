@@ -13,7 +13,20 @@ VERSION = "1.39"
 
 
 def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], says: str) -> None:
-    """Write the document; `files` names the textures, `says` is its doc string.
+    """Write a MaterialX document.
+
+    Parameters
+    ----------
+    path
+        The file.
+    asset
+        Its factors stand in the document, its textures beside it.
+    name
+        Of the material.
+    files
+        Names of the textures beside the document.
+    says
+        Its doc string.
 
     Raises
     ------
@@ -25,7 +38,13 @@ def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], says: s
 
 
 def document(asset: Asset, name: str, files: Mapping[Key, str], says: str) -> str:
-    """The XML: the description's nodes as they stand, and a material that shows the last."""
+    """The XML: the description's nodes as they stand, and a material that shows the last.
+
+    Parameters
+    ----------
+    asset, name, files, says
+        As in `write`.
+    """
     root = ElementTree.Element("materialx", version=VERSION, colorspace="lin_rec709", doc=says)
     nodes = openpbr.describe(asset, files)
     for node in nodes:

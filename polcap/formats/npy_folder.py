@@ -23,7 +23,7 @@ _MAPPED = 1 << 16  # bytes; smaller files are read, a map costs a page table and
 
 
 def encode(value: Any, name: str, arrays: Arrays) -> Any:
-    """JSON for a value; its arrays go into `arrays` under dotted names."""
+    """JSON for a value; its arrays go into `arrays` under dotted names. Raises TypeError for what cannot be kept."""
     if isinstance(value, np.ndarray):
         if value.dtype.hasobject:
             raise TypeError(f"{name}: an array of Python objects cannot be kept")
@@ -108,7 +108,7 @@ def _expect(holds: bool, tree: Any, wanted: str, folder: Path) -> None:
 
 
 def save(file: Path, array: NDArray[Any]) -> list[Any]:
-    """Write one .npy; returns its `checksum`. Unlike numpy.save it tells why a write failed."""
+    """Write an array of any shape as .npy; returns its `checksum`. Unlike numpy.save it tells why a write failed."""
     array = np.asarray(array, order="C")
     head = io.BytesIO()
     np.lib.format.write_array_header_2_0(head, np.lib.format.header_data_from_array_1_0(array))
@@ -121,7 +121,7 @@ def save(file: Path, array: NDArray[Any]) -> list[Any]:
 
 
 def load(file: Path) -> NDArray[Any]:
-    """One array: a read-only memory map, or in memory where it is small.
+    """An array of any shape: a read-only memory map, or in memory where it is small.
 
     Raises
     ------

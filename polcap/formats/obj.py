@@ -24,11 +24,25 @@ def stem(name: str) -> str:
 
 
 def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], says: str = "") -> list[Path]:
-    """Write `path` (.obj) and beside it the .mtl and two EXRs; `files` names the PNGs beside them.
+    """Write `path` (.obj) and beside it the .mtl and two EXRs.
+
+    Parameters
+    ----------
+    path
+        The .obj; the others take its stem.
+    asset
+        Mesh and textures.
+    name
+        Of the material.
+    files
+        Names of the PNGs beside it, which are there already.
+    says
+        Comment at the head of both texts.
 
     Returns
     -------
-    The files written.
+    list of Path
+        The files written.
 
     Raises
     ------

@@ -40,9 +40,18 @@ _MOST_NUMBER = 1 << 16  # px; of what the metadata state
 
 
 def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: str = ENCODING) -> Network:
-    """Open a model; `threads` 0 leaves their number to the runtime, `encoding` is that of the channels it must eat.
+    """Open a model, after a trial in a child where it is none that polcap ships.
 
-    `cuda` fails where the provider is missing or does not start; `auto` takes it where it starts.
+    Parameters
+    ----------
+    path
+        The file.
+    device
+        `cuda` fails where the provider is missing or does not start; `auto` takes it where it starts.
+    threads
+        0 leaves their number to the runtime.
+    encoding
+        Of the channels that the model must eat.
 
     Raises
     ------
@@ -119,7 +128,13 @@ class Model:
 
 
 def trial(path: str, expected: str, encoding: str) -> worker.Answer:
-    """Load a model and run it on a small picture of noise. In the worker."""
+    """Load a model and run it on a small picture of noise. In the worker.
+
+    Raises
+    ------
+    ModelError
+        What is wrong with it, as `load` says it.
+    """
     file = Path(path)
     data = _bytes(file)
     if digest(data) != expected:

@@ -36,6 +36,8 @@ class Link:
 
 @dataclass(frozen=True)
 class Input:
+    """What goes into a node under a name: a number, a file, or the output of an earlier node."""
+
     name: str
     type: str  # MaterialX type: float, integer, string, color3, vector3, filename
     value: float | int | str | tuple[float, ...] | File | Link

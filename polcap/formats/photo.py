@@ -37,11 +37,24 @@ def read(
 ) -> SensorImage:
     """A picture as (H, W, 3); a grey one stands in all three channels.
 
-    Linear integers stay counts, `white` being the type's maximum unless stated; floating point
-    has white 1. An sRGB-encoded picture becomes linear 0…1 and `lossy`, as every 8-bit one is.
-    With `digest`, of `probe.read`, the bytes that are decoded are those that were probed.
+    Linear integers stay counts; floating point has white 1. An sRGB-encoded picture becomes linear 0…1 and
+    `lossy`, as every 8-bit one is.
 
-    Raises DecodeError.
+    Parameters
+    ----------
+    path
+        The file.
+    encoding
+        By default sRGB for 8 bits, else linear.
+    white, black
+        Counts; by default the greatest of the type, and 0.
+    digest
+        Of `probe.read`: the bytes that are decoded are those that were probed.
+
+    Raises
+    ------
+    DecodeError
+        No picture, a damaged one, or other bytes than those that were probed.
     """
     pixels = _pixels(path, digest)
     lossy = pixels.dtype == np.uint8
@@ -64,9 +77,23 @@ def read_mosaic(
 ) -> SensorImage:
     """One angle of a monochrome polarization sensor's raw frame, (H/2, W/2, 3), linear.
 
-    `path` is a RAW or a picture, as `kind` says; the frame's 2×2 cell is 90 45 / 135 0 degrees.
+    Parameters
+    ----------
+    path
+        A RAW or a picture.
+    angle_deg
+        0, 45, 90 or 135: the frame's 2×2 cell is 90 45 / 135 0 degrees.
+    white, black
+        Counts; by default what the file says, or the greatest of the type and 0.
+    digest
+        Of `probe.read`: the bytes that are decoded are those that were probed.
+    kind
+        Whether `path` is a RAW or a picture.
 
-    Raises DecodeError where the frame is in colour.
+    Raises
+    ------
+    DecodeError
+        The frame is in color, or cannot be read.
     """
     y, x = dict(SENSOR_DEG)[angle_deg]
     if kind == "photo":
@@ -117,7 +144,7 @@ def size(path: str, data: bytes) -> dict[str, int]:
 
 
 def decode(path: str, digest: str | None = None) -> worker.Answer:
-    """The stored values, (H, W, 1 or 3), of the type they are stored in. In the worker."""
+    """The stored values (H, W, 1 or 3), of the type they are stored in. In the worker; raises DecodeError."""
     import OpenImageIO as oiio
 
     with _opened(path, photo_bytes.load(path, digest)) as file:

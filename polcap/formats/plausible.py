@@ -30,7 +30,7 @@ _BEYOND = 2.0  # white levels; counts that reach so far deny the level
 
 
 def check_size(path: str, width: int, height: int) -> None:
-    """A picture of no pixels, or of more than any camera takes, is refused before memory is taken for it."""
+    """Refuse a picture of no pixels, or of more than any camera takes, before memory is taken for it: DecodeError."""
     if width < 1 or height < 1:
         raise DecodeError(f"{path}: states {width}×{height} px; it is damaged, {_COPY_AGAIN}")
     if width * height > MOST_PIXELS:
@@ -41,7 +41,22 @@ def check_size(path: str, width: int, height: int) -> None:
 
 
 def check_bytes(path: str, width: int, height: int, size: int) -> None:
-    """A file too small for its pixels is a remnant."""
+    """A file too small for its pixels is a remnant.
+
+    Parameters
+    ----------
+    path
+        For the message.
+    width, height
+        px, as stated.
+    size
+        Bytes of the file.
+
+    Raises
+    ------
+    DecodeError
+        Fewer bits per pixel than any camera writes.
+    """
     if 8 * size < _LEAST_BITS * width * height:
         raise DecodeError(
             f"{path}: {size / 1e3:.0f} kB cannot hold {width}×{height} px; only its beginning is there, {_COPY_AGAIN}"
@@ -49,7 +64,7 @@ def check_bytes(path: str, width: int, height: int, size: int) -> None:
 
 
 def check_structure(path: str, structure: sniff.Tiff, data: bytes) -> None:
-    """Refuse by name what LibRaw decodes wrongly, and a DNG whose image data are not there."""
+    """Refuse by name what LibRaw decodes wrongly, and a DNG whose image data are not there: DecodeError."""
     images = [one for one in structure.directories if _is_sensor(one)]
     for directory in images:
         form = _FORMS.get(sniff.first(directory, sniff.COMPRESSION), "")
@@ -97,7 +112,7 @@ def _check_jpeg(path: str, directory: sniff.Directory, data: bytes) -> None:
 
 
 def check_jpeg(path: str, data: bytes, start: int = 0) -> None:
-    """A JPEG from `start` on goes on until its end marker; a cut one decodes, its rest grey."""
+    """A JPEG from `start` on goes on until its end marker; a cut one decodes, its rest grey. Raises DecodeError."""
     at = start + 2
     while at + 4 <= len(data):
         if data[at] != 0xFF:
@@ -129,7 +144,24 @@ def _end_of_scan(data: bytes, start: int) -> int:
 
 
 def check_levels(path: str, value: NDArray[Any], black: float, white: float, lossy: bool) -> None:
-    """Counts that stand beyond the white level, rows that were never written, and nothing at all are told."""
+    """Refuse a mosaic that its own levels deny.
+
+    Parameters
+    ----------
+    path
+        For the message.
+    value
+        (H, W) or (H, W, C) counts.
+    black, white
+        Counts, as stated.
+    lossy
+        It is a lossy DNG.
+
+    Raises
+    ------
+    DecodeError
+        Counts far beyond the white level, rows that were never written, or nothing at all.
+    """
     if lossy and not value.any():
         raise DecodeError(
             f"{path}: is a lossy DNG (JPEG compression {_LOSSY}) that LibRaw decodes to black; "

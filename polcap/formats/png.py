@@ -36,7 +36,15 @@ def write(path: Path, array: Pixels) -> None:
 
 
 def encode(array: Pixels, text: Mapping[str, str] | None = None) -> bytes:
-    """The bytes of the PNG; `text` goes into tEXt chunks under its keywords (Latin-1, as PNG has it)."""
+    """The bytes of the PNG; `text` goes into tEXt chunks under its keywords (Latin-1, as PNG has it).
+
+    Raises
+    ------
+    TypeError
+        The values are neither uint8 nor uint16.
+    StorageError
+        OpenCV could not encode them.
+    """
     if array.dtype not in (np.uint8, np.uint16):
         raise TypeError(f"PNG holds uint8 or uint16, not {array.dtype}")
     done, data = cv2.imencode(".png", _swapped(array), [cv2.IMWRITE_PNG_COMPRESSION, 4])
@@ -87,7 +95,7 @@ def read(path: Path) -> Pixels:
 
 
 def decode(path: str) -> worker.Answer:
-    """The same, in the worker."""
+    """What `read` reads, in the worker; raises DecodeError."""
     data = photo_bytes.load(path)
     if data[:8] != _MAGIC or len(data) < 24:
         raise DecodeError(f"{path} is not a whole PNG ({len(data)} bytes); write it again")
@@ -109,7 +117,7 @@ def fitted(picture: Pixels, width: int) -> NDArray[np.uint8]:
 
 
 def sixteen_bits(value: Floats) -> NDArray[np.uint16]:
-    """0…1 as 0…65535, clipped."""
+    """Values 0…1 of any shape as 0…65535, clipped."""
     return np.asarray(np.rint(np.clip(np.asarray(value, dtype=np.float64), 0.0, 1.0) * 65535), dtype=np.uint16)
 
 

@@ -60,7 +60,7 @@ def sniffed(path: str) -> worker.Answer:
 
 
 def examine(path: str) -> worker.Answer:
-    """The same, with whether only decoding can tell if the file is whole. In the worker."""
+    """What `read` says, and whether only decoding can tell if the file is whole. In the worker; raises DecodeError."""
     with photo_bytes.opened(path) as file:
         found = sniff.kind(file, Path(path).suffix)
         if found == "other":

@@ -112,7 +112,7 @@ def about(path: str) -> worker.Answer:
 
 
 def decode(path: str, digest: str | None = None) -> worker.Answer:
-    """The counts and what they mean. In the worker."""
+    """The counts (H, W) or (H, W, 3) and what they mean. In the worker; raises DecodeError."""
     import rawpy
 
     data = photo_bytes.load(path, digest)

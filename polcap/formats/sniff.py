@@ -35,6 +35,7 @@ class Tiff(NamedTuple):
 
     @property
     def dng(self) -> bool:
+        """Some directory carries a DNG version."""
         return any(DNG_VERSION in directory for directory in self.directories)
 
     @property

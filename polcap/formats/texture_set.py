@@ -30,6 +30,7 @@ class Texture:
 
 
 def base_color(asset: Asset) -> Texture:
+    """Diffuse color, or albedo as glTF mixes it."""
     return Texture(asset.base_color, True, "base colour, sRGB-encoded Rec.709")
 
 
@@ -43,11 +44,13 @@ def normal(asset: Asset, *, up: bool = True) -> Texture:
 
 
 def roughness(asset: Asset) -> Texture:
+    """Roughness alone, out of the packed texture."""
     says = "perceptual roughness (GGX alpha = roughness squared), linear"
     return Texture(np.ascontiguousarray(asset.occlusion_roughness_metallic[..., 1]), False, says)
 
 
 def packed(asset: Asset) -> Texture:
+    """Occlusion, roughness and metallic in one picture, as glTF wants them."""
     says = "R occlusion (1: none measured), G perceptual roughness, B metallic (0); linear"
     return Texture(asset.occlusion_roughness_metallic, False, says)
 

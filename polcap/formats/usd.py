@@ -38,7 +38,20 @@ def require() -> None:
 
 
 def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], says: Mapping[str, str]) -> None:
-    """Write `path` (.usdc or .usda); `files` names the textures beside it, `says` goes into its layer's data.
+    """Write a USD layer: mesh, UsdPreviewSurface and OpenPBR in one material.
+
+    Parameters
+    ----------
+    path
+        The file, .usdc or .usda.
+    asset
+        Mesh and factors.
+    name
+        Of the root prim.
+    files
+        Names of the textures beside it.
+    says
+        Goes into the layer's custom data.
 
     Raises
     ------

@@ -71,10 +71,18 @@ class Worker:
         limit_gib: float | None = None,
         **options: Any,
     ) -> Answer:
-        """Run `function(path, **options)`, of a module's top level, in the child; options are plain JSON values.
+        """Run `function(path, **options)` in the child.
 
-        `limit_s` and `limit_gib` (beyond what the idle child has) are tighter limits than the worker's, for what
-        takes little of a sound file.
+        Parameters
+        ----------
+        function
+            Of a module's top level; the child imports it.
+        path
+            Its first argument.
+        limit_s, limit_gib
+            Tighter limits than the worker's, for what takes little of a sound file; memory beyond the idle child's.
+        options
+            Plain JSON values.
 
         Raises
         ------
@@ -128,6 +136,7 @@ class Worker:
         return head["meta"], arrays
 
     def close(self) -> None:
+        """End the child."""
         with self._lock:
             self._stop()
 
@@ -242,7 +251,13 @@ def call(
     limit_gib: float | None = None,
     **options: Any,
 ) -> Answer:
-    """`Worker.call` on a child that is idle, or on a new one: as many as threads call at a time."""
+    """`Worker.call` on a child that is idle, or on a new one: as many as threads call at a time.
+
+    Parameters
+    ----------
+    function, path, limit_s, limit_gib, options
+        As in `Worker.call`.
+    """
     global _owner
     with _hold:
         if _owner != os.getpid():  # a fork must not share the pipes

@@ -80,7 +80,29 @@ def at_most(
     unit: Unit = "%",
     beyond: State = "fail",
 ) -> Gate:
-    """A figure that must not exceed its limit."""
+    """A figure that must not exceed its limit.
+
+    Parameters
+    ----------
+    name
+        Of the gate, as the report lists it.
+    value
+        In `unit`s, a share where that is %; None or not finite: it was not measured.
+    limit
+        The greatest that passes.
+    says
+        What was found, in one clause.
+    remedy
+        What to do where it is exceeded.
+    shots
+        Those to blame.
+    cost_deg
+        What an excess costs the normals, degrees.
+    unit
+        Of value and limit.
+    beyond
+        State of a value over the limit.
+    """
     if value is None or not np.isfinite(value):
         return Gate(name, "not measured", None, limit, says, unit=unit)
     if value <= limit:

@@ -85,6 +85,7 @@ def noise(found: Found, limits: Gates) -> Gate:
 
 
 def stillness(found: Found, limits: Gates) -> Gate:
+    """How much of a shot differs between its exposures."""
     fraction = found.radiance.ghost_fraction
     k = int(np.argmax(fraction))
     says = f"{100 * fraction[k]:.2f} % of {found.names[k]} differs between exposures"
@@ -94,6 +95,7 @@ def stillness(found: Found, limits: Gates) -> Gate:
 
 
 def chart(found: Found, limits: Gates) -> Gate:
+    """How well the chart's colors are met, where there is one."""
     limit = limits.max_delta_e
     if found.chart_missing:
         remedy = (
@@ -118,6 +120,7 @@ def chart(found: Found, limits: Gates) -> Gate:
 
 
 def clipping(found: Found, limits: Gates) -> Gate:
+    """How much of the object is clipped even in the shortest exposure."""
     clipped, limit = found.clipped, limits.max_clipped
     k = int(np.argmax(clipped))
     says = f"{100 * clipped[k]:.1f} % of the object is clipped even in the shortest exposure of {found.names[k]}"

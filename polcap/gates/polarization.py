@@ -20,6 +20,7 @@ _MOST_PIXELS = 6e5  # a larger picture is averaged down
 
 
 def order(found: Found) -> Gate:
+    """Whether the outline supports the stated order and sense of the angles."""
     gains, names = found.gains, found.names
     if gains.order == tuple(range(len(names))) and not gains.mirrored:
         says = f"as stated (the outline fits to {gains.concentration:.2f})"
@@ -54,6 +55,7 @@ def of_outline(found: Found, limits: Gates) -> Iterator[Gate]:
 
 
 def ill_posed(found: Found, limits: Gates) -> Gate:
+    """How much of the object is polarized as no dielectric is."""
     image = found.stokes
     inside = image.quality[image.mask]
     share = float(((inside & int(Quality.ILL_POSED)) > 0).mean()) if inside.size else 0.0

@@ -107,7 +107,7 @@ def _sigmas(gained: Floats, sector: NDArray[np.int_]) -> float:
 
 
 def body(at: Rim, angle: Floats) -> Body:
-    """How the rim is polarized, and how its light is spread."""
+    """How the rim is polarized, and how its light is spread; angle (K,) rad."""
     mean, turned_sigma = outline.mean_and_doubt(*outline.phasor(at, angle))
     basis = np.stack([np.ones_like(at.azimuth), np.cos(at.azimuth), np.sin(at.azimuth)], axis=1)
     found = np.linalg.lstsq(basis, at.total, rcond=None)[0]

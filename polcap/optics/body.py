@@ -53,8 +53,10 @@ def leaving(c: Any, alpha: Any, ior: Any, local: Any = 0.0) -> tuple[Any, Any]:
 
     Parameters
     ----------
-    c : (...,) cosine of the zenith.
-    alpha, ior, local : GGX α 0…1, refractive index and `Law.local`, broadcast with c.
+    c
+        (...,) cosine of the zenith.
+    alpha, ior, local
+        GGX α 0…1, refractive index and `Law.local`, broadcast with c.
     """
     plus, minus = fresnel.transmission(c, ior)
     more, even, weighed = _looked_up(c, alpha, ior)
@@ -63,7 +65,13 @@ def leaving(c: Any, alpha: Any, ior: Any, local: Any = 0.0) -> tuple[Any, Any]:
 
 
 def dolp(c: Any, alpha: Any, ior: Any, local: Any = 0.0) -> Any:
-    """Degree of linear polarization of body light; arguments as in `leaving`."""
+    """Degree of linear polarization of body light.
+
+    Parameters
+    ----------
+    c, alpha, ior, local
+        As in `leaving`.
+    """
     plus, minus = leaving(c, alpha, ior, local)
     return minus / plus
 
@@ -71,10 +79,18 @@ def dolp(c: Any, alpha: Any, ior: Any, local: Any = 0.0) -> Any:
 def flatter(cos_i: Any, cos_o: Any, between: Any, alpha: Any) -> Any:
     """Factor on Lambert's shading of a rough body whose light stays local: 1 where surface or light face the camera.
 
-    between: cosine of the angle between light and camera. Facets that turn towards a light beside the camera brighten
-    the limb: 1 + B(α) sin θᵢ sin θₒ max(0, cos Δφ) / (g (1 + g)), g = max(cos θᵢ, cos θₒ), close to Oren & Nayar's
-    form; B is fitted to the facets. Where the flash stands at the lens it is 1 + B (1/cos θ − 1). What they call A is
-    1 here: albedo is what a facing surface shows.
+    Facets that turn towards a light beside the camera brighten the limb: 1 + B(α) sin θᵢ sin θₒ max(0, cos Δφ) /
+    (g (1 + g)), g = max(cos θᵢ, cos θₒ), close to Oren & Nayar's form; B is fitted to the facets. Where the flash
+    stands at the lens it is 1 + B (1/cos θ − 1). What they call A is 1 here: albedo is what a facing surface shows.
+
+    Parameters
+    ----------
+    cos_i, cos_o
+        (...,) cosines of light and camera against the normal.
+    between
+        (...,) cosine of the angle between light and camera.
+    alpha
+        (...,) GGX α 0…1.
     """
     xp = array_namespace(cos_o)
     strength = _between(xp, xp.asarray(_strengths(), dtype=cos_o.dtype, device=device(cos_o)), alpha, _ALPHAS)

@@ -75,6 +75,8 @@ def load_colour_science() -> Any:
 
 @dataclass(frozen=True)
 class MatrixFit:
+    """A color matrix and what is known beside it."""
+
     matrix: Floats  # (3, 3) camera channels → linear Rec.709 reflectance, where the position is 0
     slope: Floats  # (2,) relative change of the light per unit of position
     glare: float  # white light added to every patch: its gloss, the lens [reflectance]

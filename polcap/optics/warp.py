@@ -65,7 +65,7 @@ def warp(image: Floats, transform: Floats, box: Box | None = None, order: Litera
 
 
 def coordinates(transform: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Where a homography takes points, float64; x and y broadcast."""
+    """Where a homography (3, 3) takes points x, y of any shapes that broadcast; float64."""
     h = np.asarray(transform, np.float64)
     u, v = (h[k, 0] * x + (h[k, 1] * y + h[k, 2]) for k in (0, 1))
     if abs(h[2, 0]) + abs(h[2, 1]) > 0 or h[2, 2] != 1:
@@ -109,7 +109,7 @@ class Spline:
         self._of = cv2.sepFilter2D(around, cv2.CV_32F, _PREFILTER, _PREFILTER, borderType=cv2.BORDER_REPLICATE)
 
     def at(self, taps: Taps) -> Floats:
-        """Interpolated, (h, w)."""
+        """Interpolated at places (h, w)."""
         upper, lower = (
             _between(self._look(taps.x0, y), self._look(taps.x1, y), taps.right) for y in (taps.y0, taps.y1)
         )
@@ -143,7 +143,24 @@ def _source(shape: tuple[int, ...], transform: Floats, box: Box) -> Box:
 
 
 def covered(shape: tuple[int, int], transform: Floats, box: tuple[int, int, int, int], margin: float = 1.0) -> Bools:
-    """(h, w) bool: which pixels of `box` fall inside an image of `shape`, at least `margin` px from its edge."""
+    """Which pixels of a box fall inside another image.
+
+    Parameters
+    ----------
+    shape
+        (H, W) of that image.
+    transform
+        (3, 3) px of the box's grid → px of that image.
+    box
+        x0, y0, x1, y1 px.
+    margin
+        Least distance from its edge, px.
+
+    Returns
+    -------
+    NDArray
+        (y1 − y0, x1 − x0) bool.
+    """
     x0, y0, x1, y1 = box
     x, y = np.array([x0, x1 - 1.0, x0, x1 - 1.0]), np.array([y0, y0, y1 - 1.0, y1 - 1.0])
     if _within(*coordinates(transform, x, y), shape, margin).all():  # a homography keeps the rest between its corners

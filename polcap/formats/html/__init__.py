@@ -24,7 +24,18 @@ _SCRIPTS = ("probe.js", "relight.js")
 
 
 def write(path: str | Path, title: str, body: Iterable[str], data: Mapping[str, Any]) -> None:
-    """Write a page of body fragments; `data` is what its scripts read.
+    """Write a page that needs no other file and no network.
+
+    Parameters
+    ----------
+    path
+        The file.
+    title
+        Plain text.
+    body
+        Fragments of HTML, whose texts are escaped.
+    data
+        What the page's scripts read, as JSON.
 
     Raises
     ------
@@ -67,7 +78,7 @@ def indexed(level: NDArray[np.uint8], colors: NDArray[np.uint8]) -> str:
 
 
 def packed(array: NDArray[Any]) -> str:
-    """An array's little-endian bytes, gzipped, as base64."""
+    """The little-endian bytes of an array of any shape, gzipped, as base64."""
     solid = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
     return text(gzip.compress(solid.tobytes(), 6, mtime=0))
 
