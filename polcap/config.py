@@ -182,7 +182,13 @@ def restored(about: Mapping[str, Any], file: Path) -> Config:
 
 
 def fill(kind: type[S], stated: dict[str, Any], assignments: Sequence[str]) -> S:
-    """A single struct from given values and name=value assignments, as strict as `load`."""
+    """A single struct from given values and name=value assignments, as strict as `load`.
+
+    Raises
+    ------
+    SettingError
+        No such name, or a value of another type or outside its range.
+    """
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
         if not equals or name not in kind.__struct_fields__:

@@ -82,7 +82,15 @@ def path(capture: Capture | None, supplied: UserInput, config: Config, store: St
 
 
 def on_grid(drawn: NDArray[np.bool_] | None, radiance: AngleStack) -> NDArray[np.bool_] | None:
-    """The user's mask on the grid of the merged picture; drawn there, or on the pixels of the RAW or of the mosaic."""
+    """The user's mask (H, W) on the grid of the merged picture.
+
+    It may be drawn there, or on the pixels of the RAW or of the mosaic.
+
+    Raises
+    ------
+    ObjectError
+        It has neither size.
+    """
     if drawn is None:
         return None
     height, width = radiance.value.shape[1:3]

@@ -57,6 +57,7 @@ class Result(Generic[T]):
         return self.find()
 
     def find(self) -> T:
+        """The value, from wherever it can be had."""
         raise NotImplementedError
 
 
@@ -69,6 +70,7 @@ class Derived(Result[T]):
         self.inputs = inputs
 
     def find(self) -> T:
+        """The function of the inputs' values."""
         return self.function(*map(value_of, self.inputs))
 
 
@@ -113,6 +115,7 @@ class StageResult(Result[T]):
         return "value" in vars(self) or self.stored()
 
     def stored(self) -> bool:
+        """A whole manifest with this key lies in the folder, and nobody asked for it anew."""
         return self.keep and self.key not in self.run.fresh and manifest(self.place).get("key") == self.key
 
     def materialize(self) -> None:
@@ -121,6 +124,7 @@ class StageResult(Result[T]):
             _ = self.value
 
     def find(self) -> T:
+        """From the folder; where it is damaged, or of another key, by computing it."""
         if self.stored():
             try:
                 result: T = read(self.place, returns(self.stage))
@@ -130,6 +134,7 @@ class StageResult(Result[T]):
         return self.compute()
 
     def compute(self) -> T:
+        """Run the stage on its inputs' values, and keep what it gives."""
         values = [*map(value_of, self.inputs), *(() if self.config is None else (self.config,))]
         self.run.progress(self.name, None, False)
         start = time.perf_counter()
@@ -168,9 +173,11 @@ class ArchivedResult(StageResult[T]):
     """A kept result of a run whose photographs are gone: taken as it is, whatever its key."""
 
     def stored(self) -> bool:
+        """A whole manifest lies in the folder, whatever its key."""
         return self.keep and bool(manifest(self.place))
 
     def find(self) -> T:
+        """From the folder; what is not kept is computed from what is."""
         if self.keep:
             result: T = read(self.place, returns(self.stage))
             return result

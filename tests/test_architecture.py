@@ -5,9 +5,12 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from polcap import errors
 
 ROOT = Path(__file__).parents[1]
 
@@ -140,3 +143,56 @@ def test_commands_page_has_the_options_of_every_command_from_the_code() -> None:
     for name, command in commands.items():
         table = hooks.options_table(name)
         assert all(option in table for one in command.params for option in one.opts if option.startswith("--"))
+
+
+PUBLIC = re.compile(r"polcap\.((stages|optics|formats|gates)(\..*)?|api|config)")  # rooms that others call
+MANY = 4  # parameters that no sentence explains
+ARRAY = re.compile(r"Floats|NDArray|Bools|Bits")
+SHAPE = re.compile(r"\((\w+|…|\.\.\.),[^()]*\)|any shape")
+
+
+def public(body: list[ast.stmt]) -> Iterator[ast.FunctionDef]:
+    """Functions and methods of public classes; properties say it by name and type."""
+    for node in body:
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            yield from public(node.body)
+        properties = [one for one in getattr(node, "decorator_list", []) if "property" in ast.unparse(one)]
+        if isinstance(node, ast.FunctionDef) and not node.name.startswith("_") and not properties:
+            yield node
+
+
+def parameters(function: ast.FunctionDef) -> list[ast.arg]:
+    every = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
+    return [one for one in every if one.arg not in ("self", "cls")]
+
+
+def explained(doc: str) -> list[str]:
+    """The names in the section Parameters."""
+    section = re.search(r"^Parameters\n-+\n(.*?)(?=^\w[^\n]*\n-+$|\Z)", doc, re.S | re.M)
+    lines = re.findall(r"^(\w[^\n]*)$", section[1], re.M) if section else []
+    return [name for line in lines for name in re.split(r",\s*", line.partition(" :")[0])]
+
+
+@pytest.mark.parametrize("name", filter(PUBLIC.fullmatch, MODULES))
+def test_docstrings_say_what_goes_in_and_what_comes_out(name: str) -> None:
+    """ruff holds their form; four parameters are explained one by one, arrays have shapes, our errors are named."""
+    faults = []
+    for function in public(ast.parse(MODULES[name].read_text(encoding="utf-8")).body):
+        doc = ast.get_docstring(function) or ""
+        where = f"{function.name} (line {function.lineno})"
+        names = [one.arg for one in parameters(function)]
+        said = explained(doc)
+        if (said or len(names) >= MANY) and not set(names) <= {*said}:
+            faults.append(f"{where}: Parameters lacks {', '.join(name for name in names if name not in said)}")
+        if gone := [name for name in said if name not in names and name != getattr(function.args.kwarg, "arg", None)]:
+            faults.append(f"{where}: Parameters explains {', '.join(gone)}, which it does not take")
+        types = [ast.unparse(one.annotation) for one in parameters(function) if one.annotation]
+        types.append(ast.unparse(function.returns) if function.returns else "")
+        if any(ARRAY.search(one) for one in types) and not SHAPE.search(doc):
+            faults.append(f"{where}: says no shape, as (H, W) or (N, 3), of its arrays")
+        calls = [one.exc for one in ast.walk(function) if isinstance(one, ast.Raise)]
+        raised = {ast.unparse(call.func).rpartition(".")[2] for call in calls if isinstance(call, ast.Call)}
+        for error in sorted(raised):
+            if hasattr(errors, error) and error not in doc:
+                faults.append(f"{where}: does not say that it raises {error}")
+    assert faults == []

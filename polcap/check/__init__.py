@@ -33,8 +33,20 @@ def inspect(
     mask_network: Network | None = None,
     chart: ChartRequest = AUTO,
 ) -> Verdict:
-    """Judge a capture; network None expects the errors of the analytic estimator, mask_network None takes for the
-    object what stands out from the backdrop.
+    """Judge a capture.
+
+    Parameters
+    ----------
+    capture
+        Its frames are decoded, averaged down and forgotten.
+    network
+        None expects the errors of the analytic estimator.
+    config
+        Settings of the stages, and the gates' limits.
+    mask_network
+        None takes for the object what stands out from the backdrop.
+    chart
+        As given to `process`.
 
     Raises
     ------

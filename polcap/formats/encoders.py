@@ -33,7 +33,12 @@ def encode_all(textures: Mapping[str, Texture], kind: Kind, *, text: bool = Fals
 
     Parameters
     ----------
-    text : write into each PNG what it holds (a tEXt chunk), for files that lie beside the asset.
+    textures
+        Pictures by key.
+    kind
+        Of the files.
+    text
+        Write into each PNG what it holds (a tEXt chunk), for files that lie beside the asset.
 
     Raises
     ------

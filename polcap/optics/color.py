@@ -50,7 +50,7 @@ def luminance(rgb: Any) -> Any:
 
 
 def delta_e(rgb: Floats, reference: Floats) -> Floats:
-    """CIEDE2000 (kL = kC = kH = 1) between linear Rec.709 colours (..., 3) → (...,), white = D65.
+    """CIEDE2000 (kL = kC = kH = 1) between linear Rec.709 colors (N, 3), or any (…, 3), white = D65; (N,).
 
     About 1 is just noticeable side by side. Loads colour-science.
     """
@@ -90,8 +90,14 @@ def fit_matrix(
 
     Parameters
     ----------
-    color, reference : (N, 3) patches in camera channels c and linear Rec.709 r; 12 usable ones or more.
-    position : (N, 2) x of each patch, from the patch at which the matrix is to hold.
+    color, reference
+        (N, 3) patches in camera channels c and linear Rec.709 r.
+    position
+        (N, 2) x of each patch, from the patch at which the matrix is to hold.
+    usable
+        (N,) which of them serve, 12 or more.
+    rounds
+        Of reweighting.
 
     Notes
     -----
@@ -112,8 +118,12 @@ def predicted(
 ) -> Floats:
     """CIEDE2000 (N,) of each usable patch by the matrix that all others ask for; NaN for patches not used.
 
-    Arguments as of `fit_matrix`, 13 usable patches or more: what the matrix promises for colours it was not
-    fitted to.
+    What the matrix promises for colors it was not fitted to.
+
+    Parameters
+    ----------
+    color, reference, position, usable, rounds
+        As in `fit_matrix`; 13 usable patches or more.
     """
     seen = np.full(reference.shape, np.nan)
     for patch in np.flatnonzero(usable):
@@ -129,7 +139,14 @@ def fitting(color: Floats, reference: Floats, position: Floats, usable: NDArray[
     """CIEDE2000 (N,) of every patch by the matrix that suits the better 60 % of the usable ones.
 
     A shadow's edge or a hand spoils many patches alike and draws least squares to them; the least trimmed
-    squares over `tries` random ninths of patches see them from outside. Same arguments, same result.
+    squares over random ninths of patches see them from outside. Same arguments, same result.
+
+    Parameters
+    ----------
+    color, reference, position, usable
+        As in `fit_matrix`.
+    tries
+        Random choices of nine patches.
 
     References
     ----------
@@ -139,7 +156,7 @@ def fitting(color: Floats, reference: Floats, position: Floats, usable: NDArray[
     base, random = _base(reference), np.random.default_rng(24)
     able = np.flatnonzero(usable)
     most = max(9, round(0.6 * len(able)))
-    best, least = None, np.inf
+    best, least = reference, np.inf
     for _ in range(tries):
         chosen = random.choice(able, 9, replace=False)
         for _ in range(3):  # each step lowers the sum (Rousseeuw's C-step)

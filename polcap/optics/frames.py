@@ -57,8 +57,10 @@ def from_ray_frame(m: Any, v: Any) -> Any:
 
 
 def lifted(m: Any) -> Any:
-    """Unit vectors m (..., 3) in the frames of rays, those that turn away from the camera brought to where they
-    can be seen: z at least 0.02 before they are made unit again."""
+    """Unit vectors m (..., 3) in the frames of rays, all turned to where they can be seen.
+
+    Those that turn away from the camera are brought to z = 0.02 before they are made unit again.
+    """
     xp = array_namespace(m)
     up = xp.concat([m[..., :2], xp.clip(m[..., 2:], 0.02, None)], axis=-1)
     return up / (dot(up, up) ** 0.5)[..., None]

@@ -94,7 +94,7 @@ def phasor(at: Rim, angle: Floats) -> tuple[NDArray[Any], Floats]:
 
 
 def mean_and_doubt(total: NDArray[Any], weight: Floats) -> tuple[complex, float]:
-    """The mean of `phasor`, and 1σ of half its argument, which is the common turn of all angles, rad."""
+    """The mean of what `phasor` gives, (24,) each, and 1σ of half its argument: the common turn of all angles, rad."""
     mean = complex(total.sum() / max(float(weight.sum()), 1e-9))
     used = weight > 0
     across = (total[used] / weight[used] * np.exp(-1j * np.angle(mean))).imag

@@ -52,7 +52,7 @@ def usable(image: SensorImage, clip: float, full: bool = False) -> Bools:
 
 
 def below(image: SensorImage, level: float, full: bool = False) -> Bools:
-    """The same of counts that reach `level`."""
+    """Pixels (H, W) as of `usable`, of counts that reach `level`."""
     value = image.value
     over = _at_least(value, level)
     if image.cfa is None:

@@ -35,12 +35,17 @@ def stokes(
 
     Parameters
     ----------
-    normal, to_light : (..., 3) unit vectors in the frame of each ray, where the camera lies along
+    normal, to_light
+        (..., 3) unit vectors in the frame of each ray, where the camera lies along
         (0, 0, 1): see `frames.to_ray_frame`.
-    diffuse, specular : (..., 3) ρ_d and F0, linear.
-    roughness, ior : (...,) perceptual roughness; refractive index of the body and its surface.
-    irradiance : (...,) on a plane facing the light, so that a white Lambertian plane has S0 = irradiance.
-    law : how the body lets light in and out.
+    diffuse, specular
+        (..., 3) ρ_d and F0, linear.
+    roughness, ior
+        (...,) perceptual roughness; refractive index of the body and its surface.
+    irradiance
+        (...,) on a plane facing the light, so that a white Lambertian plane has S0 = irradiance.
+    law
+        How the body lets light in and out.
 
     Notes
     -----

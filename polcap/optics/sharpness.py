@@ -40,7 +40,7 @@ def places(image: SensorImage, clip: float) -> NDArray[np.int64]:
 
 
 def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
-    """The tiles of one decoded photograph; only they are binned."""
+    """The tiles of one decoded photograph at corners (T, 2) px; only they are binned."""
     step = image.superpixel
     margin = 1 if image.cfa is None else len(image.cfa)  # a clipped photosite rules out its neighbours
     side, spare = TILE * step, margin // step

@@ -33,10 +33,14 @@ def warp(image: Floats, transform: Floats, box: Box | None = None, order: Litera
 
     Parameters
     ----------
-    image : (H, W) or (H, W, C).
-    transform : (3, 3), output px (x, y, 1) → image px, homogeneous.
-    box : x0, y0, x1, y1 of the output in its own px (end exclusive); the image's own frame by default.
-    order : 3 for values, 1 for weights and masks. Outside the image the edge is repeated.
+    image
+        (H, W) or (H, W, C).
+    transform
+        (3, 3), output px (x, y, 1) → image px, homogeneous.
+    box
+        x0, y0, x1, y1 of the output in its own px (end exclusive); the image's own frame by default.
+    order
+        3 for values, 1 for weights and masks. Outside the image the edge is repeated.
     """
     x0, y0, x1, y1 = (int(v) for v in box or (0, 0, image.shape[1], image.shape[0]))
     if np.array_equal(transform, np.eye(3)) and x0 >= 0 and y0 >= 0 and x1 <= image.shape[1] and y1 <= image.shape[0]:

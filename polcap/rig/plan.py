@@ -92,8 +92,11 @@ def slots(order: Order, switches_flash: bool) -> tuple[Slot, ...]:
 
 
 def next_slot(missing: Sequence[Slot], at_deg: float) -> Slot:
-    """What to take now: the chart first, all of the present angle, then on towards the nearer end of the angles
-    left and through them (upwards if alike); what a person must switch the flash for comes last."""
+    """What to take now, so that the ring turns little.
+
+    The chart first, all of the present angle, then on towards the nearer end of the angles left and through them
+    (upwards if alike); what a person must switch the flash for comes last.
+    """
     for slot in missing:
         if slot.role == "chart":
             return slot

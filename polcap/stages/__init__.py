@@ -38,6 +38,7 @@ class Stage(Generic[P, T]):
         return self.function.__module__.rpartition(".")[2]
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T:
+        """As the function itself."""
         return self.function(*args, **kwargs)
 
 

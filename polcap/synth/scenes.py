@@ -18,8 +18,9 @@ Kind = Literal["bumps", "clusters", "vase"]
 
 
 def random_scene(seed: int, kind: Kind) -> Scene:
-    """An object 0.1 to 0.17 m across at 0.7 m, beside a chart: one or two textured dielectrics of
-    roughness 0.3–0.6 and index 1.4–1.6, under a flash 4 to 7 cm above the lens.
+    """An object 0.1 to 0.17 m across at 0.7 m, beside a chart, under a flash 4 to 7 cm above the lens.
+
+    It wears one or two textured dielectrics of roughness 0.3–0.6 and index 1.4–1.6.
 
     Raises SettingError for an unknown kind.
     """

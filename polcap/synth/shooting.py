@@ -145,8 +145,11 @@ class Studio:
 
 
 def transform(shoot: Shoot, shift_px: tuple[float, float], rot_deg: float) -> Floats:
-    """Reference RAW px (x, y, 1) -> RAW px of a shot, (3, 3): the picture is rolled by `rot_deg`, counter-clockwise
-    as seen, about the principal point and moved by `shift_px` (right, down)."""
+    """Reference RAW px (x, y, 1) -> RAW px of a shot, (3, 3).
+
+    The picture is rolled by `rot_deg`, counter-clockwise as seen, about the principal point and moved by `shift_px`
+    (right, down).
+    """
     c, s = np.cos(np.radians(rot_deg)), np.sin(np.radians(rot_deg))
     roll = np.array([[c, s], [-s, c]])  # rows run down, so counter-clockwise is the transpose
     center = np.array(shoot.view.center)
@@ -217,8 +220,11 @@ def _to_camera(shoot: Shoot) -> Floats:
 
 
 def _middle_exposure(scene: Scene, shoot: Shoot, buffer: GBuffer, s0: Floats) -> float:
-    """Exposure of the middle frame: most of the object and the white patch at 0.35 of the white level there,
-    and all but the sharpest highlights below it in the darkest frame. s0 (H, W, 3) in camera channels."""
+    """Exposure of the middle frame, for s0 (H, W, 3) in camera channels.
+
+    Most of the object and the white patch stand at 0.35 of the white level there, and all but the sharpest highlights
+    below it in the darkest frame.
+    """
     bright = s0[buffer.mask].max(axis=-1) / 2
     if not bright.size:
         raise CaptureError("the object is outside the picture; move scene.position towards (0, 0, -0.7)")

@@ -1,10 +1,10 @@
-"""Light between the parts of an object in training: which pixel each one sees, traced once per view, and what
-comes from there at every step.
+"""Light between the parts of an object in training: which pixel each one sees, and what comes from there.
 
-The flash stands next to the lens, so what it lights the camera sees: the light that bounces comes from pixels
-of the same picture. `visibility` traces a few rays from every second pixel of every second row and remembers
-which pixels they meet; `arriving` is the light that takes those ways under the materials of the moment. Left
-out, as in `light_transport.py`: more bounces, and that bounced light arrives a little polarized.
+The first is traced once per view, the second computed at every step. The flash stands next to the lens, so what
+it lights the camera sees: the light that bounces comes from pixels of the same picture. `visibility` traces a
+few rays from every second pixel of every second row and remembers which pixels they meet; `arriving` is the
+light that takes those ways under the materials of the moment. Left out, as in `light_transport.py`: more
+bounces, and that bounced light arrives a little polarized.
 """
 
 from math import pi

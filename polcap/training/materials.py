@@ -181,8 +181,10 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
 
 
 def _colors(shape: tuple[int, int], device: torch.device) -> Tensor:
-    """Reflectances (B, 3, 3): grey to saturated, dark to light; every second one a pure hue mixed as on a display,
-    which leaves vivid colors a channel with hardly any light, as paints and plastics have.
+    """Reflectances (B, 3, 3): grey to saturated, dark to light.
+
+    Every second one is a pure hue mixed as on a display, which leaves vivid colors a channel with hardly any light, as
+    paints and plastics have.
     """
     value = 0.02 + 0.88 * _u((*shape, 1), device) ** 1.3
     hue = _u((*shape, 3), device)

@@ -140,8 +140,10 @@ class ColorGloss(nn.Module):  # type: ignore[misc]  # torch comes without types 
 
 
 def described(seen: Evidence, first: Tensor, member: Tensor, colors: Mixture) -> Tensor:
-    """What is known of each color, (B, COLORS, ·): its own profile and the whole object's, the color itself and beside
-    the object's mean, its share, the mean of the first reading.
+    """What is known of each color, (B, COLORS, ·).
+
+    Its own profile and the whole object's, the color itself and beside the object's mean, its share, the mean of the
+    first reading.
     """
     usable, figures, cosine = (part.flatten(2) for part in (seen.usable, seen.figures, seen.cosine))
     mine = member.flatten(2) * usable

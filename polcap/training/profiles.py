@@ -57,8 +57,10 @@ class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types he
 
 
 def figures_of(level: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) -> Tensor:
-    """What is averaged, (B, 5, H, W): log of light over shading, its excess over the diffuse light, the excess
-    squared and as a factor, and the share by which the DoLP falls short of the diffuse one.
+    """What is averaged, (B, 5, H, W).
+
+    Log of light over shading, its excess over the diffuse light, the excess squared and as a factor, and the share by
+    which the DoLP falls short of the diffuse one.
 
     level (B, 3, H, W) log radiance, ratio (B, 2, H, W) S1/S0 and S2/S0, normal and diffuse (B, 3, H, W).
     """
@@ -74,8 +76,10 @@ def figures_of(level: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) ->
 
 
 def profile(weight: Tensor, figures: Tensor, cosine: Tensor) -> Tensor:
-    """weight (B, groups, N), figures (B, 5, N), cosine (B, 1, N) -> per group and bin: log share of the group,
-    then the figures' means, 0 where there is nothing; (B, groups, bins · 6)."""
+    """weight (B, groups, N), figures (B, 5, N), cosine (B, 1, N) -> figures per group and bin, (B, groups, bins · 6).
+
+    Log share of the group, then the figures' means, 0 where there is nothing.
+    """
     edges = cosine.new_tensor([cos(radians(angle)) for angle in _EDGES_DEG]).view(1, -1, 1)
     at = ((cosine <= edges[:, :-1]) & (cosine > edges[:, 1:])).to(weight.dtype)  # (B, bins, N)
     seen = torch.cat([torch.ones_like(cosine), figures], dim=1)

@@ -145,8 +145,11 @@ def combination(number: int) -> tuple[int, int]:
 
 
 def law(number: int) -> Law:
-    """Of a picture of protocol 2: facets counted evenly in every even one, by the flash's light in every odd one, .8–1
-    of the polarization left, .4–.8 in every tenth."""
+    """The law of the body of a picture of protocol 2.
+
+    Facets counted evenly in every even one, by the flash's light in every odd one; .8–1 of the polarization left, .4–.8
+    in every tenth.
+    """
     low, high = (0.4, 0.8) if number % 10 == 9 else (0.8, 1.0)
     kept = np.random.default_rng([_SEED, number, 2]).uniform(low, high)
     return Law(rough=1.0, local=float(number % 2), kept=float(kept))

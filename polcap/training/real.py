@@ -1,5 +1,6 @@
-"""Photographs with measured normals -> how far polcap's are from them: the layout of the public shape-from-polarization
-sets, which are not bundled.
+"""Photographs with measured normals -> how far polcap's are from them.
+
+The layout is that of the public shape-from-polarization sets, which are not bundled.
 
     DIR/pol000/NAME.png  pol045  pol090  pol135   photographs behind a polarizer, or of a polarization sensor
     DIR/mask/NAME.png                             not 0 on the object

@@ -37,6 +37,8 @@ _MOST_PIXELS = 1.5e6  # a larger image is averaged down first: it has detail to 
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The section `align` of a settings file."""
+
     model: Annotated[
         Literal["none", "translation", "similarity", "homography"],
         Meta(description="how a shot may have moved; none: trust a locked camera"),
@@ -57,7 +59,19 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def register(radiance: AngleStack, color: ColorCalibration, settings: Settings) -> Alignment:
     """One transform per shot, reference grid px → shot grid px.
 
-    Raises AlignmentError naming the shot that moved too far or shows another scene.
+    Parameters
+    ----------
+    radiance
+        The shots (K, H, W, 3).
+    color
+        Tells where the chart lies.
+    settings
+        How a shot may have moved, and how far.
+
+    Raises
+    ------
+    AlignmentError
+        A shot moved too far, or shows another scene; names it.
     """
     shots = len(radiance.angle)
     if radiance.offset_px is not None:

@@ -23,6 +23,8 @@ _LEAST_UP = 0.05  # a tangent-space normal must leave the surface (glTF: blue ab
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The section `asset` of a settings file."""
+
     ior: Annotated[
         float, Meta(ge=1.1, le=2.5, description="refractive index written to the asset; F0 is kept whatever it is [1]")
     ] = 1.5
@@ -30,8 +32,9 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @stage(version=2, keep=False)
 def build(maps: SurfaceMaps, mesh: Mesh, settings: Settings) -> Asset:
-    """Textures on the crop's grid, filled outwards from the object so that no seam shows; the outermost pixels, which
-    the backdrop shines into, are filled too, so that it does not run along the limb.
+    """Textures on the crop's grid, filled outwards from the object so that no seam shows.
+
+    The outermost pixels, which the backdrop shines into, are filled too, so that it does not run along the limb.
 
     Ours is a diffuse term behind two Fresnel transmissions, glTF's is base·(1 − F): base =
     ρ_d T₊(0)²/(1 − F0) makes the frontal looks agree. F0 = 0.04-like · factor · texture, the factor

@@ -33,7 +33,28 @@ def gathered(frame: Frame, reference: Frame) -> float:
 
 
 def measure(shot: Shot, reference: Frame, lines: noise.Lines, read: Reader, full: bool, clip: float) -> Ambient | None:
-    """The mean of a shot's ambient frames; None where it has none. `clip` as in the stage's settings."""
+    """The mean of a shot's ambient frames; None where it has none.
+
+    Parameters
+    ----------
+    shot
+        Its ambient frames are averaged.
+    reference
+        The frame at whose settings the answer stands.
+    lines
+        Noise by ISO; learns that of these frames.
+    read
+        Decodes a frame.
+    full
+        Interpolate the mosaic instead of binning it.
+    clip
+        As in the stage's settings [white level].
+
+    Raises
+    ------
+    CaptureError
+        The frames are of unlike size.
+    """
     if not shot.ambient:
         return None
     value: Floats | None = None

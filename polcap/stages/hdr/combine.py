@@ -51,7 +51,27 @@ def prepare(
     shot: Shot, order: Sequence[int], reference: int, measured: Measured, lines: noise.Lines, read: Reader, clip: float,
     full: bool,
 ) -> "Mixture":  # fmt: skip
-    """The frames of a shot ready to be weighted, on the full grid if `full`."""
+    """The frames of a shot ready to be weighted.
+
+    Parameters
+    ----------
+    shot
+        Its frames.
+    order
+        Their numbers, brightest first.
+    reference
+        Number of the frame on whose grid they are merged.
+    measured
+        Motion, ratios, noise and ghosts, on the binned grid.
+    lines
+        Noise by ISO.
+    read
+        Decodes a frame.
+    clip
+        As in the stage's settings [white level].
+    full
+        On the full grid instead of the binned one.
+    """
     links = measured.links
     if full:
         ghost = np.repeat(np.repeat(measured.ghost, 2, axis=0), 2, axis=1)

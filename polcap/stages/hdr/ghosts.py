@@ -57,7 +57,7 @@ class Anchor:
         return np.stack([np.where(own, a, b / r) for a, b, r in zip(value, other, dark.ratio)])
 
     def variance(self, level: Floats, channel: int, rows: slice) -> Floats:
-        """Noise of one pixel of the given rows, for their expected radiance (h, W) in a channel."""
+        """Noise of one pixel of the given rows in a channel, for an expected radiance `level` (h, W)."""
         own = self._reference.noise.of(channel, level)
         if self._dark is None:
             return own
@@ -153,12 +153,12 @@ def _wiener(x: Floats, electrons: Floats, floor: Floats) -> Floats:
 
 
 def box(picture: Floats) -> Floats:
-    """Mean over the window around each pixel of (h, w); the border repeats."""
+    """Mean (h, w) over the window around each pixel of a picture (h, w), whose border repeats."""
     return np.asarray(cv2.blur(picture, (_WINDOW, _WINDOW), borderType=cv2.BORDER_REPLICATE))
 
 
 def edges(picture: Floats) -> Floats:
-    """Squared gradient of (h, w), per px²."""
+    """Squared gradient (h, w) of a picture (h, w), per px²."""
     gx, gy = (
         np.asarray(cv2.Sobel(picture, cv2.CV_32F, x, 1 - x, ksize=1, scale=0.5, borderType=cv2.BORDER_REPLICATE))
         for x in (1, 0)

@@ -60,6 +60,7 @@ class Shooting:
         self.ambient = ambients.measure(shot, shot.frames[reference], lines, read, False, clip)
 
     def gathered(self, e: int) -> np.float32:
+        """How much more ambient light a frame gathers than the reference frame."""
         return np.float32(ambients.gathered(self.shot.frames[e], self.shot.frames[self.reference]))
 
     def signals(self, e: int) -> Signals:
@@ -73,6 +74,7 @@ class Shooting:
         return Planes(value, found.usable)
 
     def line(self, e: int) -> noise.Noise:
+        """Noise of a frame, with that of the ambient light that was taken off it."""
         known = self.lines.line(self.iso[e], self.least)
         if self.ambient is None:
             return known
@@ -82,9 +84,29 @@ class Shooting:
 def measure(
     shot: Shot, order: Sequence[int], reference: int, lines: noise.Lines, read: Reader, clip: float, limit_px: float
 ) -> Measured:
-    """Compare every frame with the reference frame; limit_px: accepted motion, visible RAW px.
+    """Compare every frame with the reference frame.
 
-    Raises CaptureError: too much motion, no common exposure, frames of unlike size.
+    Parameters
+    ----------
+    shot
+        Its frames.
+    order
+        Their numbers, in which they are compared.
+    reference
+        Number of the reference frame.
+    lines
+        Noise by ISO; learns that of these frames.
+    read
+        Decodes a frame.
+    clip
+        As in the stage's settings [white level].
+    limit_px
+        Accepted motion, visible RAW px.
+
+    Raises
+    ------
+    CaptureError
+        Too much motion, no common exposure, frames of unlike size.
     """
     shooting = Shooting(shot, reference, lines, read, clip)
     still = shooting.signals(reference)

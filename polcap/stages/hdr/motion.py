@@ -47,8 +47,15 @@ class View:
     """One picture at all scales, each made when it is asked for."""
 
     def __init__(self, picture: Floats, usable: Bools) -> None:
-        """`picture` (H, W) of about even noise (a square root of radiance), lightly smoothed; usable: which
-        pixels are exposed well enough to be compared."""
+        """A picture to compare, at several scales.
+
+        Parameters
+        ----------
+        picture
+            (H, W) of about even noise (a square root of radiance), lightly smoothed.
+        usable
+            (H, W) which pixels are exposed well enough to be compared.
+        """
         self._levels = [(picture, usable)]
         self._tiles: dict[int, NDArray[np.int64]] = {}
         self.scales = 1
@@ -114,7 +121,7 @@ def _refine(reference: View, other: View, scales: int, matrix: Floats) -> tuple[
 
 
 def apply(matrix: Floats, point: Floats) -> Floats:
-    """Points (..., 2) through a homography."""
+    """Points (N, 2), or any (…, 2), through a homography (3, 3)."""
     x = point @ matrix[:, :2].T + matrix[:, 2]
     return np.asarray(x[..., :2] / x[..., 2:])
 

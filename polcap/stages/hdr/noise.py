@@ -34,18 +34,18 @@ class Noise:
     floor: Floats  # (C,)
 
     def variance(self, signal: Floats) -> Floats:
-        """Of pixels whose expected signal (..., C) is known; a negative one counts as 0."""
+        """Of pixels whose expected signal (N, C), or any (…, C), is known; a negative one counts as 0."""
         return np.maximum(signal, 0) * self.slope + self.floor
 
     def of(self, channel: int, signal: Floats) -> Floats:
-        """The same for one channel's picture, a new array."""
+        """The same for one channel's picture (h, w), a new array."""
         out = np.maximum(signal, 0)
         out *= self.slope[channel]
         out += self.floor[channel]
         return out
 
     def lit(self, level: Floats) -> "Noise":
-        """The same sensor where light of a level (C,) was subtracted: its noise stays."""
+        """The same sensor where light of a `level` per channel (C,) was subtracted: its noise stays."""
         return Noise(self.slope, self.floor + self.slope * np.maximum(level, 0))
 
 
@@ -87,7 +87,7 @@ def alone(picture: Signals) -> Samples:
 
 
 def paired(first: Signals, second: Signals, ratio: Floats) -> tuple[Samples, Samples]:
-    """Tiles of two frames of the same scene in the same place, second = ratio (C,) · first but for noise.
+    """Tiles of two frames of the same scene in the same place, second = ratio · first but for noise; ratio (C, ).
 
     With h₁ = t + n₁ and h₂ = r t + n₂ the detail t drops out of ⟨h₁ (h₁ − h₂/r)⟩ = var n₁ and of
     ⟨h₂ (h₂ − r h₁)⟩ = var n₂, however rich it is and whatever the two gains are.
@@ -124,8 +124,18 @@ def fit(samples: list[Samples], iso: float | None, least_floor: float) -> Noise:
 def misfit(first: Signals, second: Signals, ratio: Floats, lines: tuple[Noise, Noise], gain: float) -> Floats:
     """How two registered frames differ beyond noise: variance per squared gradient, (C,) px².
 
-    Registration errors and aliasing show at edges. second = ratio · first; gain: what resampling made of
-    the second frame's noise. From the tiles that have edges; 0 where it is not significant.
+    Registration errors and aliasing show at edges. From the tiles that have edges; 0 where it is not significant.
+
+    Parameters
+    ----------
+    first, second
+        The frames, on one grid.
+    ratio
+        (C,), second = ratio · first.
+    lines
+        Noise of each.
+    gain
+        What resampling made of the second frame's noise variance.
     """
     r = np.asarray(ratio, np.float32)
     columns: tuple[list[Floats], ...] = ([], [], [])
@@ -172,6 +182,7 @@ class Lines:
         self._closed: set[object] = set()
 
     def learn(self, iso: object, samples: Samples) -> None:
+        """Take in what a frame of an ISO shows, unless that ISO is closed."""
         if iso not in self._closed:
             self._samples.setdefault(iso, []).append(samples)
             self._known.pop(iso, None)
@@ -184,6 +195,7 @@ class Lines:
         return self._known[iso]
 
     def knows(self, iso: object) -> bool:
+        """Whether the line of an ISO is settled."""
         return iso in self._closed
 
     def close(self) -> None:

@@ -53,6 +53,7 @@ class Planes:
         return channels, height, width
 
     def rows(self, rows: slice) -> Floats:
+        """As `Signals.rows`: a view, (C, h, W)."""
         return self.value[:, rows]
 
 
@@ -69,7 +70,7 @@ class Quads:
         return 3, height // self.image.superpixel, width // self.image.superpixel
 
     def rows(self, rows: slice) -> Floats:
-        """As `optics.sensor.signal`, to the bit."""
+        """As `optics.sensor.signal`, (C, h, W), to the bit."""
         image = self.image
         assert image.cfa is not None
         _, height, width = self.shape
@@ -96,9 +97,18 @@ class Quads:
 
 
 def signals(image: SensorImage, clip: float, full: bool = False, frames: int = 1) -> Signals:
-    """Of a decoded frame; a mosaic is binned by superpixels, or interpolated if `full`.
+    """Signals of a decoded frame, and which of its pixels can be believed.
 
-    `frames`: how many are held at a time.
+    Parameters
+    ----------
+    image
+        The counts.
+    clip
+        As in the stage's settings [white level].
+    full
+        Interpolate a mosaic instead of binning it by superpixels.
+    frames
+        How many of this size are held at a time.
     """
     usable = sensor.usable(image, clip, full)
     if image.cfa is None or full:
@@ -163,6 +173,7 @@ class Reader:
         self._look_ahead(None, len(self._held) + 2 * _AHEAD)
 
     def close(self) -> None:
+        """Wait for nothing more."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _look_ahead(self, now: Frame | None, room: int) -> None:
@@ -175,7 +186,7 @@ class Reader:
 
 
 def tile_means(picture: Signals, side: int) -> Floats:
-    """Means over tiles of side × side px, (rows, columns, C) float32; what is left of a tile is dropped."""
+    """Means (rows, columns, C) float32 over tiles of side × side px; what is left of a tile is dropped."""
     channels, height, width = picture.shape
     down, across = height // side, width // side
     out = np.zeros((down, across, channels), np.float32)

@@ -32,9 +32,21 @@ def view(signals: Signals) -> motion.View:
 
 
 def moved(name: str, still: motion.View, other: motion.View, limit_px: float) -> Floats | None:
-    """Reference px → frame px, or None where the frame did not move measurably.
+    """Reference px → frame px (3, 3), or None where the frame did not move measurably.
 
-    Raises CaptureError where it moved by more than `limit_px`.
+    Parameters
+    ----------
+    name
+        Of the frame, for the message.
+    still, other
+        Views of the reference frame and of the frame.
+    limit_px
+        Accepted motion, px of the views.
+
+    Raises
+    ------
+    CaptureError
+        It moved by more.
     """
     found = motion.estimate(still, other)
     if found.shift_px > limit_px:
@@ -75,7 +87,7 @@ def resampled(signals: Signals, matrix: Floats) -> tuple[Planes, Floats]:
 
 
 def on_full(matrix: Floats) -> Floats:
-    """A homography between binned grids, between the full ones."""
+    """A homography (3, 3) between binned grids, between the full ones."""
     full = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1.0]])
     return np.asarray(full @ matrix @ np.linalg.inv(full))
 

@@ -21,6 +21,8 @@ from polcap.stages.infer import analytic, learned
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The section `infer` of a settings file."""
+
     ior: Annotated[float, Meta(ge=1.2, le=2.5, description="refractive index assumed by the analytic estimator")] = 1.5
     symmetries: Annotated[
         Literal[1, 2, 4, 8],

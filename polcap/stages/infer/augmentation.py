@@ -17,7 +17,7 @@ _POSITIONS = tuple(
 
 
 def mean(cues: Cues, network: Network, symmetries: int) -> dict[str, Floats]:
-    """The network's maps of the whole object, normals in the camera frame; the mean over symmetries of the square.
+    """The network's maps (H, W[, 3]) of the whole object, normals in the camera frame, means over several positions.
 
     A turn or mirror of the picture is one of the scene: polarization turns twice as fast, rays with it.
     """

@@ -29,8 +29,14 @@ _CONVEXITY = 1e-4  # weight of "outward from the outline" everywhere else
 def resolve(double_angle: Floats, strength: Floats, mask: NDArray[np.bool_]) -> tuple[Floats, Floats]:
     """Azimuth φ (H, W) rad, and the certainty of its half-turn (H, W) 0…1.
 
-    double_angle : (2, H, W) cos 2φ, sin 2φ of the AoLP.
-    strength : (H, W) sin of the zenith; flat pixels bind their neighbours little.
+    Parameters
+    ----------
+    double_angle
+        (2, H, W) cos 2φ, sin 2φ of the AoLP.
+    strength
+        (H, W) sine of the zenith; flat pixels bind their neighbours little.
+    mask
+        (H, W).
     """
     height, width = mask.shape
     shrink = max(1.0, float(np.sqrt(mask.sum() / _MOST_PIXELS)))

@@ -44,7 +44,7 @@ class Zeniths:
     _weights: Floats  # (C,)
 
     def at(self, dolp: Floats) -> Floats:
-        """Zeniths (...,) that other DoLPs mean, rad: expected over the laws."""
+        """Zeniths, rad, that other DoLPs of any shape mean: expected over the laws."""
         return _mean(dolp, self._dolps, self._weights)[0]
 
 
@@ -60,7 +60,19 @@ class _Laws:
 
 
 def zeniths(dolp: Floats, cues: Cues, ior: float, guide: tuple[Floats, Floats] | None = None) -> Zeniths:
-    """Zeniths of debiased DoLPs (H, W); guide: zeniths (H, W) rad and their 1σ (H, W) rad from elsewhere."""
+    """Zeniths that DoLPs mean under the laws that the object may follow.
+
+    Parameters
+    ----------
+    dolp
+        (H, W), debiased.
+    cues
+        Light, mask and quality, by which the laws are weighed.
+    ior
+        Refractive index, the same for all laws.
+    guide
+        Zeniths (H, W) and their 1σ (H, W), rad, from elsewhere.
+    """
     laws = _laws(ior)
     score = laws.prior.copy()
     inside = cues.mask & ((cues.quality & Quality.CLIPPED) == 0) & (cues.radiance.mean(-1) > _LEAST_LIGHT)

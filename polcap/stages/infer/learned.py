@@ -30,6 +30,22 @@ def estimate(cues: Cues, network: Network, ior: float, symmetries: int) -> Surfa
     The network sees the whole object at the size it was made for, which settles half-turns, shape and gloss.
     Detail comes from the pixels: of color by the picture itself, which the network's albedo only divides by its
     shading; of normals by what the inversion shows that is finer than the network sees, where noise leaves it a say.
+
+    Parameters
+    ----------
+    cues
+        Of the object's crop (H, W).
+    network
+        Eats the channels of `stages.cues`.
+    ior
+        Refractive index of the inversion.
+    symmetries
+        1, 2, 4 or 8 turned and mirrored positions that the network looks from.
+
+    Raises
+    ------
+    ModelError
+        The network was made for other channels, or gives other maps.
     """
     _check(network)
     size = cues.mask.shape[::-1]

@@ -23,6 +23,8 @@ from polcap.stages.mask import solid, standing_out, two_looks
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The section `mask` of a settings file."""
+
     margin: Annotated[
         float, Meta(ge=0, le=1, description="border added around the object's box [share of its longer side]")
     ] = 0.04
@@ -44,7 +46,20 @@ def segment(
 ) -> ObjectMask:
     """The object on the sum of the aligned shots, and a crop around it.
 
-    user_mask (H, W) on the full-frame grid replaces the search.
+    Parameters
+    ----------
+    radiance
+        The shots (K, H, W, 3), each on its own grid.
+    alignment
+        Where each lies on the reference grid.
+    color
+        Tells where the chart lies, which is not the object.
+    user_mask
+        (H, W) on the reference grid; replaces the search.
+    network
+        Finds the object; None takes for it what stands out from the backdrop.
+    settings
+        Borders around object and chart, and the least area.
 
     Raises
     ------

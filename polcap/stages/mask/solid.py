@@ -29,7 +29,10 @@ def body(chance: Floats) -> NDArray[np.bool_]:
 
 
 def preferred(plain: NDArray[np.bool_], learned: NDArray[np.bool_], chance: Floats) -> NDArray[np.bool_]:
-    """The mask of what stands out where the network finds it nearly as likely as its own: its outline is sharper."""
+    """The better of two masks (H, W), by the network's chance (H, W) of each pixel.
+
+    That of what stands out where the network finds it nearly as likely as its own: its outline is sharper.
+    """
     return plain if doubt(plain, chance) < _LEEWAY * doubt(learned, chance) else learned
 
 
@@ -51,7 +54,13 @@ def doubt(mask: NDArray[np.bool_], chance: Floats) -> float:
 
 
 def shape(mask: NDArray[np.bool_]) -> tuple[float, float, float]:
-    """Share of the mask outside its largest part; area of the holes, of its own; share of the picture's edge on it."""
+    """What a mask (H, W) of an object should have little of.
+
+    Returns
+    -------
+    apart, holes, cut : float
+        Share of the mask outside its largest part; area of the holes over its own; share of the picture's edge on it.
+    """
     area = mask.sum()
     _, _, parts, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     largest = parts[1:, cv2.CC_STAT_AREA].max()

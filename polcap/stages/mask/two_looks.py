@@ -23,7 +23,17 @@ _LIKELY = 0.3  # of being the object, for a pixel to be shown to the second look
 def chances(
     radiance: AngleStack, alignment: Alignment, color: ColorCalibration, chart: NDArray[np.uint8], network: Network
 ) -> Floats:
-    """Chance (H, W) 0…1 of each pixel of the full-frame grid to be the object; chart (H, W) 1 where that lies."""
+    """Chance (H, W) 0…1 of each pixel of the reference grid to be the object.
+
+    Parameters
+    ----------
+    radiance, alignment, color
+        As in `segment`.
+    chart
+        (H, W) 1 where the chart lies.
+    network
+        Looks at the whole picture, then again at what it found.
+    """
     height, width = chart.shape
     whole = (0, 0, width, height)
     longest = int(network.metadata["native_size"])
@@ -47,7 +57,19 @@ def look(
     radiance: AngleStack, alignment: Alignment, color: ColorCalibration, chart: NDArray[np.uint8], box: Box,
     longest: int,
 ) -> Look:  # fmt: skip
-    """What the aligned shots show in `box`, averaged down to at most `longest` px a side."""
+    """What the aligned shots show in a box, averaged down.
+
+    Parameters
+    ----------
+    radiance, alignment, color
+        As in `chances`.
+    chart
+        (H, W) 1 where the chart lies.
+    box
+        x0, y0, x1, y1 px of the reference grid.
+    longest
+        Greatest side of the answer, px.
+    """
     x0, y0, x1, y1 = box
     scale = max(1.0, max(x1 - x0, y1 - y0) / longest)
     width, height = round((x1 - x0) / scale), round((y1 - y0) / scale)
@@ -69,7 +91,7 @@ def look(
 
 
 def around(likely: NDArray[np.bool_]) -> Box | None:
-    """The box of the pixels that count, with room around it, within the picture; None where there are none."""
+    """The box of the pixels (H, W) that count, with room around it, within the picture; None where there are none."""
     rows, columns = np.flatnonzero(likely.any(1)), np.flatnonzero(likely.any(0))
     if not len(rows):
         return None

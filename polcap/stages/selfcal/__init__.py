@@ -30,6 +30,8 @@ Source = Literal["grey patches", "object", "one exposure", "none"]
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The section `selfcal` of a settings file."""
+
     check_order: Annotated[
         bool, Meta(description="refuse a capture whose outline contradicts the order or sense of its angles")
     ] = True
@@ -49,7 +51,23 @@ def solve(
 ) -> Gains:
     """Gain of every shot and channel relative to the first, with the outline's verdict on the angles.
 
-    Raises CaptureError where the outline clearly supports another order or sense of the angles.
+    Parameters
+    ----------
+    radiance
+        The shots (K, H, W, 3), each on its own grid.
+    alignment
+        Where each lies on the reference grid.
+    object_
+        Its mask and crop.
+    color
+        Tells where the chart's grey patches lie.
+    settings
+        Whether another order of the angles ends the run, and what it has to show.
+
+    Raises
+    ------
+    CaptureError
+        The outline clearly supports another order or sense of the angles.
     """
     shots = len(radiance.angle)
     x0, y0, x1, y1 = object_.crop

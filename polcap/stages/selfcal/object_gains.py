@@ -86,9 +86,18 @@ def closure(light: Floats, usable: Bools, angle: Floats) -> Estimate:
 
 
 def outline(light: Floats, azimuth: Floats, sector: NDArray[np.int_], angle: Floats) -> Estimate:
-    """Gains (K,) that let the polarization cross the contour; light (K, N) of the rim, azimuth (N,) rad.
+    """Gains (K,) that let the polarization cross the contour.
 
-    sector (N,): which part of the outline a pixel belongs to, for the doubt.
+    Parameters
+    ----------
+    light
+        (K, N) of the rim.
+    azimuth
+        (N,) rad, outward direction of the outline.
+    sector
+        (N,) part of the outline that a pixel belongs to, for the doubt.
+    angle
+        (K,) rad, of the shots' polarizers.
     """
     shots = len(angle)
     parts = np.unique(sector)
@@ -203,6 +212,6 @@ def smoothed(value: Floats) -> Floats:
 
 
 def inside(mask: Bools, quality: Bits) -> Bools:
-    """The object's sound pixels, away from its edge where there are enough."""
+    """The object's sound pixels (H, W), away from its edge where there are enough."""
     solid = cv2.erode(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     return np.asarray((solid if solid.sum() > 100 else mask) & (quality == 0))

@@ -1,4 +1,4 @@
-"""Does the object's outline support the order and sense of the angles as stated, or others clearly better?
+"""Whether the object's outline supports the order and sense of the angles as stated, or others clearly better.
 
 Orders that give the same analyzers are one: (0°, 120°, 60°) counted clockwise is (0°, 60°, 120°). A common turn of
 all angles is no other order. What is left is compared by what it predicts: AoLP across the contour all round, and,
@@ -37,7 +37,21 @@ class Verdict:
 
 
 def rim(value: Floats, usable: Bools, mask: Bools, crop: tuple[int, int, int, int], full: tuple[int, ...]) -> Rim:
-    """The rim of shots (K, H, W); where the object leaves the picture its outline is no contour of shape."""
+    """The rim of the object; where it leaves the picture its outline is no contour of shape.
+
+    Parameters
+    ----------
+    value
+        (K, H, W) registered shots on the crop, gains taken out.
+    usable
+        (H, W) pixels to be believed.
+    mask
+        (H, W).
+    crop
+        x0, y0, x1, y1 of the crop on the reference grid, px.
+    full
+        (H, W) of that grid.
+    """
     depth = outline.depth(mask)
     out, slope = outline.outward(mask.astype(np.float32), 3.0)
     band = (depth > 1.5) & (depth < max(5.0, 0.02 * max(mask.shape))) & (slope > 1e-4) & usable
@@ -51,7 +65,21 @@ def rim(value: Floats, usable: Bools, mask: Bools, crop: tuple[int, int, int, in
 
 
 def judge(at: Rim, angle: Floats, margin: float, believable: float, beyond_sigma: float = 3.0) -> Verdict:
-    """The verdict on angles (K,) rad; another order must fit better by `margin` and by `beyond_sigma` σ."""
+    """What the rim says of the order and sense of the angles.
+
+    Parameters
+    ----------
+    at
+        The rim.
+    angle
+        (K,) rad, as stated.
+    margin
+        How much better another order must fit, of a score −1…1.
+    believable
+        Least score of another order.
+    beyond_sigma
+        σ of the difference of the two scores that it must exceed as well.
+    """
     stated: Order = (tuple(range(len(angle))), False)
     if at.light.shape[1] == 0:
         return Verdict(stated, 0.0, 0.0, 1.0, 0.0, np.pi / 2, 0.0)

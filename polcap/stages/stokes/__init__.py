@@ -23,6 +23,8 @@ Flags = list[list[tuple[Quality, Bits]]]  # of every shot
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The section `stokes` of a settings file."""
+
     greatest_ior: Annotated[
         float,
         Meta(ge=1.2, le=3, description="a DoLP no dielectric up to this refractive index emits is flagged"),
@@ -41,7 +43,23 @@ def solve(
     Rows of A are `mueller.analyzer`, W the inverse variances; the covariance is (AᵀWA)⁻¹. Three angles
     are solved exactly; with more, the mean residual is kept as a check.
 
-    Raises CaptureError where the angles leave a Stokes parameter undetermined.
+    Parameters
+    ----------
+    radiance
+        The shots (K, H, W, 3), each on its own grid.
+    alignment
+        Where each lies on the reference grid.
+    gains
+        What each is divided by.
+    object_
+        Its crop is solved.
+    settings
+        From where on a pixel is flagged.
+
+    Raises
+    ------
+    CaptureError
+        The angles leave a Stokes parameter undetermined.
 
     References
     ----------

@@ -26,6 +26,8 @@ __all__ = ["Back", "Decimated", "Settings", "decimated", "integrate", "triangula
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The section `surface` of a settings file."""
+
     stiffness: Annotated[
         float,
         Meta(ge=0.0, le=20.0, description="how firmly depth jumps are kept; 0 = plain least squares [1]"),
@@ -86,7 +88,18 @@ def integrate(maps: SurfaceMaps, distance_m: float | None, settings: Settings) -
 
 
 def triangulate(depth: Floats, maps: SurfaceMaps, metric: bool, settings: Settings) -> Mesh:
-    """The mesh of a depth map (H, W): for an export from stored maps, without integrating again.
+    """The mesh of a depth map: for an export from stored maps, without integrating again.
+
+    Parameters
+    ----------
+    depth
+        (H, W), in metres or relative.
+    maps
+        Mask, view and expected errors of the same crop.
+    metric
+        Whether the depth is in metres.
+    settings
+        Of the stage.
 
     Raises
     ------

@@ -17,7 +17,25 @@ def closed(
 ) -> tuple[Floats, Floats, Floats, Floats, NDArray[np.int32]]:
     """The mesh with walls from its boundary straight back to a plane, and with `closed` that plane too.
 
-    What is added takes its colour from the front it hangs on; it was not photographed.
+    What is added takes its color from the front it hangs on; it was not photographed.
+
+    Parameters
+    ----------
+    vertices, normals
+        (V, 3), the camera at +z.
+    uv
+        (V, 2).
+    tangents
+        (V, 4), as glTF has them.
+    faces
+        (F, 3), counter-clockwise from outside.
+    back
+        "skirt": walls alone; "closed": the plane too.
+
+    Returns
+    -------
+    tuple
+        vertices, normals, uv, tangents and faces of all.
     """
     count = len(vertices)
     rim = boundary.edges(faces)

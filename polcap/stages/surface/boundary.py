@@ -39,7 +39,19 @@ def edges(faces: NDArray[np.int32]) -> NDArray[np.int64]:
 
 
 def measure(place: NDArray[np.int64], faces: NDArray[np.int32], mask: NDArray[np.bool_], step: int) -> Figures:
-    """Of vertices at pixels (V, 2) x, y of a grid of every `step` px, before they are smoothed."""
+    """Pieces, cuts and raggedness of a mesh before its boundary is smoothed.
+
+    Parameters
+    ----------
+    place
+        (V, 2) x, y px of the vertices.
+    faces
+        (F, 3).
+    mask
+        (H, W) of the object.
+    step
+        The vertices' grid has every so many px.
+    """
     rim = edges(faces)
     size = np.ones((4 * step + 1, 4 * step + 1), np.uint8)
     inner = cv2.erode(np.pad(mask.astype(np.uint8), 1), size, borderValue=0)[1:-1, 1:-1] > 0
@@ -56,7 +68,24 @@ def measure(place: NDArray[np.int64], faces: NDArray[np.int32], mask: NDArray[np
 
 
 def smoothed(place: Floats, log: Floats, faces: NDArray[np.int32], step: int) -> tuple[Floats, Floats]:
-    """Vertices' places (V, 2) [px] and scaled log depth (V,), with those on the boundary averaged along it."""
+    """Vertices with those on the boundary averaged along it.
+
+    Parameters
+    ----------
+    place
+        (V, 2) x, y px.
+    log
+        (V,) scaled log depth.
+    faces
+        (F, 3).
+    step
+        The vertices' grid has every so many px.
+
+    Returns
+    -------
+    place, log : Floats
+        (V, 2) and (V,).
+    """
     before = np.concatenate([place, log[:, None]], axis=-1)
     after = _averaged(before, edges(faces), _ROUNDS)
     far = np.linalg.norm((after - before)[:, :2], axis=-1, keepdims=True)
@@ -103,6 +132,6 @@ def _pieces(faces: NDArray[np.int32], count: int) -> int:
 
 
 def area(place: Floats, faces: NDArray[np.int32]) -> Floats:
-    """Twice the triangles' area in the picture, y down, positive counter-clockwise seen from the camera."""
+    """Twice the area (F,) of faces (F, 3) in the picture, y down, positive counter-clockwise seen from the camera."""
     one, two = (place[faces[:, k], :2] - place[faces[:, 0], :2] for k in (1, 2))
     return np.asarray(one[:, 1] * two[:, 0] - one[:, 0] * two[:, 1])

@@ -22,15 +22,26 @@ _MEASURED = 20_000  # vertices, at most, whose distance is measured
 
 @dataclass(frozen=True)
 class Decimated:
+    """A mesh in fewer triangles, and how far it is from the one before."""
+
     mesh: Mesh
     error: float  # 99th percentile of the first mesh's vertices from this surface, in the mesh's unit of length
     error_px: float  # the same in px of the maps, at the object's middle depth
 
 
 def decimated(mesh: Mesh, view: View, share: float, back: Back) -> Decimated:
-    """The mesh in about a `share` of its triangles; textures stay where they are, as seen from the camera.
+    """The mesh in fewer triangles; textures stay where they are, as seen from the camera.
 
-    `back` says whether it has walls, whose triangles face away from the camera.
+    Parameters
+    ----------
+    mesh
+        All of it.
+    view
+        The camera that saw it.
+    share
+        About this share of its triangles is left, 0…1.
+    back
+        Whether it has walls, whose triangles face away from the camera.
 
     Raises
     ------

@@ -81,9 +81,14 @@ def log_depth(of: Problem, stiffness: float, iterations: int, tolerance: float, 
 
     Parameters
     ----------
-    stiffness : how firmly jumps are kept; 0 = plain least squares.
-    iterations, tolerance : of the reweighting on the grid that decides: at most so many, or the energy's change.
-    jump : least depth step of a jump over the object's radius.
+    of
+        Normals, weights and prior of N pixels.
+    stiffness
+        How firmly jumps are kept; 0 = plain least squares.
+    iterations, tolerance
+        Of the reweighting on the grid that decides: at most so many, or the energy's change.
+    jump
+        Least depth step of a jump over the object's radius.
     """
     z, _, _ = _solved(of, stiffness, iterations, tolerance, jump)
     return z
@@ -231,7 +236,7 @@ def halved(of: Problem) -> Problem:
 
 
 def parents(mask: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Number of the 2×2 block, among those that hold a pixel, that each of the N pixels lies in."""
+    """Number (N,) of the 2×2 block, among those that hold a pixel, in which each pixel of a mask (H, W) lies."""
     blocks = _blocks(mask)
     number = np.cumsum(blocks).reshape(blocks.shape) - 1
     row, column = np.nonzero(mask)

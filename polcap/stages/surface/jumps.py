@@ -49,12 +49,12 @@ def widened(at: Bools, reach: int) -> Bools:
 
 
 def least_step(mask: Bools, share: float) -> float:
-    """The depth step [px] from which on a link may be a jump; share of the object's radius √(N/π)."""
+    """The depth step [px] from which on a link may be a jump: a share of the radius √(N/π) of a mask (H, W)."""
     return max(_LEAST_PX, share * radius(mask))
 
 
 def radius(mask: Bools) -> float:
-    """Of the disc with as many pixels [px]."""
+    """Radius of the disc with as many pixels as a mask (H, W), px."""
     return float(np.sqrt(mask.sum() / np.pi))
 
 
@@ -63,9 +63,14 @@ def jumps(z: Floats, slope: tuple[Floats, Floats], mask: Bools, least: float) ->
 
     Parameters
     ----------
-    z : (H, W) scaled log depth [px]; anything outside the mask.
-    slope : ∂z to the right and down that the normals tell, (H, W) each.
-    least : the step beyond both ends' slopes that makes a jump [px].
+    z
+        (H, W) scaled log depth [px]; anything outside the mask.
+    slope
+        ∂z to the right and down that the normals tell, (H, W) each.
+    mask
+        (H, W).
+    least
+        The step beyond both ends' slopes that makes a jump [px].
     """
     beyond = tuple(_excess(z, of, mask, axis) for axis, of in zip((1, 0), slope))
     highest = np.zeros(mask.shape, dtype=np.float32)  # of a pixel's links

@@ -39,8 +39,10 @@ class Multigrid:
 
     Parameters
     ----------
-    matrix : (N, N) CSR, float64, off-diagonals ≤ 0.
-    cell : (N, 2) whole-number pixel positions of the unknowns.
+    matrix
+        (N, N) CSR, float64, off-diagonals ≤ 0.
+    cell
+        (N, 2) whole-number pixel positions of the unknowns.
     """
 
     def __init__(self, matrix: Any, cell: NDArray[np.int64]) -> None:
@@ -60,6 +62,7 @@ class Multigrid:
         self.coarsest = splu(matrix.tocsc())
 
     def __call__(self, right: Floats) -> Floats:
+        """One cycle from zero: about A⁻¹ times a residual (N,)."""
         return self._cycle(0, right)
 
     def _cycle(self, depth: int, right: Floats) -> Floats:
@@ -80,9 +83,12 @@ class Nested:
 
     Parameters
     ----------
-    matrix : (N, N) CSR.
-    parent : (N,) number of the block that each unknown lies in.
-    coarse : the preconditioner of the blocks.
+    matrix
+        (N, N) CSR.
+    parent
+        (N,) number of the block that each unknown lies in.
+    coarse
+        The preconditioner of the blocks.
     """
 
     def __init__(self, matrix: Any, parent: NDArray[np.intp], coarse: Callable[[Floats], Floats]) -> None:
@@ -91,6 +97,7 @@ class Nested:
         self.blocks = int(parent.max()) + 1
 
     def __call__(self, right: Floats) -> Floats:
+        """Smooth, correct on the blocks, smooth: about A⁻¹ times a residual (N,)."""
         right = right.astype(np.float32)
         step = _DAMPING * self.inverse_diagonal
         x = step * right
@@ -102,7 +109,32 @@ class Nested:
 def conjugate_gradients(
     matrix: Any, right: Floats, start: Floats, precondition: Any, tolerance: float, most: int
 ) -> tuple[Floats, int]:
-    """x with |b − A x| ≤ tolerance |b| or after `most` iterations, and the iterations taken."""
+    """Solve A x = b by preconditioned conjugate gradients.
+
+    Parameters
+    ----------
+    matrix
+        A (N, N), symmetric and positive definite; anything with `@`.
+    right, start
+        b and the first x, (N,).
+    precondition
+        Residual (N,) → a guess of A⁻¹ times it.
+    tolerance
+        It ends at |b − A x| ≤ tolerance |b|,
+    most
+        or after so many iterations.
+
+    Returns
+    -------
+    x : Floats
+        (N,)
+    iterations : int
+        Taken.
+
+    References
+    ----------
+    Saad, Iterative Methods for Sparse Linear Systems, 2003, algorithm 9.1.
+    """
     x = start
     residual = right - matrix @ x
     goal = tolerance * float(np.linalg.norm(right))

@@ -16,13 +16,24 @@ _FLATTEST = 0.05  # cosine under which a normal tells no slope
 def triangulate(
     depth: Floats, maps: SurfaceMaps, metric: bool, steepest: float, jump: float, most: int, back: Back
 ) -> Mesh:
-    """The mesh of a depth map (H, W): one vertex per pixel of a regular grid in the mask.
+    """The mesh of a depth map: one vertex per pixel of a regular grid in the mask.
 
     Parameters
     ----------
-    steepest : lean at which normals are capped [rad].
-    jump : least depth step of a jump over the object's radius.
-    most : vertices, at most; the grid is as wide as that asks for.
+    depth
+        (H, W), in metres or relative.
+    maps
+        Mask, view and expected errors of the same crop.
+    metric
+        Whether the depth is in metres.
+    steepest
+        Lean at which normals are capped [rad].
+    jump
+        Least depth step of a jump over the object's radius.
+    most
+        Vertices, at most; the grid is as wide as that asks for.
+    back
+        What stands behind the seen side.
 
     Raises
     ------

@@ -36,6 +36,8 @@ _REMEDY = "give its corners with --chart x0,y0,…,x3,y3, a profile with --chart
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The section `whitebalance` of a settings file."""
+
     chart: Annotated[
         Literal["classic", "sg"],
         Meta(description="kind of chart; of a (Digital) SG its block E2 to J5, whose corners --chart states"),
@@ -59,12 +61,23 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def measure(
     radiance: AngleStack, reference: ChartReference, request: ChartRequest, settings: Settings
 ) -> ColorCalibration:
-    """The colour matrix of a capture, on the scale of S0 = I₀ + I₉₀, with the chart's place and residuals.
+    """The color matrix of a capture, on the scale of S0 = I₀ + I₉₀, with the chart's place and residuals.
 
     The patches of the reference shot give 2·I = S0, for a matt chart that faces the camera is unpolarized.
     The matrix holds at the white patch, less the chart's glare: matrix @ S0 = reflectance + glare there.
-    `delta_e` is NaN for patches left out, `patch_use` says why. `metres_per_px` needs
+    `delta_e` is NaN for patches left out because they are over-exposed. `metres_per_px` needs
     `settings.chart_width_m`: nothing is assumed about the chart's size.
+
+    Parameters
+    ----------
+    radiance
+        The shots (K, H, W, 3); the first is searched.
+    reference
+        Colors of the chart's patches.
+    request
+        Search, corners, a profile, or no chart.
+    settings
+        What is accepted as a chart.
 
     Raises
     ------

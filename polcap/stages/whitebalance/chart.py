@@ -90,7 +90,7 @@ def project(homography: Floats, points: Floats) -> Floats:
 
 
 def is_view(homography: Floats) -> bool:
-    """Whether a flat chart can look like this: convex, not mirrored, nowhere behind the camera."""
+    """Whether a flat chart can look like this homography (3, 3): convex, not mirrored, nowhere behind the camera."""
     corners = _outer(1.0)
     depth = corners @ homography[2, :2] + homography[2, 2]
     if not np.isfinite(homography).all() or not (depth * depth[0] > 0).all():
@@ -106,8 +106,13 @@ def refine(image: Floats, start: Placement, steps: int = 12) -> Placement:
 
     Parameters
     ----------
-    image : (H, W, 3) linear, white about 1. Pixels per patch: 8 or more. Light mixes linearly at an edge,
+    image
+        (H, W, 3) linear, white about 1. Pixels per patch: 8 or more. Light mixes linearly at an edge,
         but the difference is judged through a gamma of 2.2, so that dark patches count.
+    start
+        The placement to begin with.
+    steps
+        At most so many.
     """
     frame = _frame(start)  # image px → about the chart's own, so that the steps are well scaled
     at = _pixels(image.shape[:2], start)

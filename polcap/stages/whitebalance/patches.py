@@ -45,7 +45,20 @@ class ChartFit:
 
 
 def fit(value: Floats, quality: Bits, place: Placement, reference: ChartReference, share: float) -> ChartFit:
-    """The matrix that one shot's patches (radiance (H, W, 3) and its quality) ask for.
+    """The matrix that one shot's patches ask for.
+
+    Parameters
+    ----------
+    value
+        (H, W, 3) radiance of the shot.
+    quality
+        (H, W) its bits.
+    place
+        Of the chart.
+    reference
+        Colors of its patches.
+    share
+        Of each patch's side that is sampled.
 
     Raises
     ------
@@ -78,7 +91,12 @@ def position() -> Floats:
 def sample(value: Floats, quality: Bits, place: Placement, share: float) -> tuple[Floats, Bits]:
     """S0 of each patch (24, 3) and its use (24,).
 
-    Twice the trimmed mean over the inner `share` of the patch in one shot's radiance (H, W, 3).
+    Twice the trimmed mean over the inner part of the patch.
+
+    Parameters
+    ----------
+    value, quality, place, share
+        As in `fit`.
     """
     color_, uneven = np.zeros((24, 3)), np.zeros(24)
     use = np.zeros(24, np.uint8)
@@ -100,7 +118,10 @@ def sample(value: Floats, quality: Bits, place: Placement, share: float) -> tupl
 
 
 def left_out(use: Bits) -> str:
-    """The patches that did not serve and why, for a message; empty where all did. Numbers count from dark skin."""
+    """The patches that did not serve and why, of their use (24,), for a message; empty where all did.
+
+    Numbers count from dark skin.
+    """
     words = {
         PatchUse.CLIPPED: "over-exposed",
         PatchUse.OUTSIDE: "outside the picture",
