@@ -224,8 +224,9 @@ class Gains:
     anchor: Floats  # (K, 3) the same from the object itself, the cross-check
     source: Literal["grey patches", "object", "one exposure", "none"]
     disagreement: float  # largest |gain/anchor − 1| of the channel means beyond three times the error of both
-    angle_offset: float  # rad, common turn of the polarizer ring seen against the silhouette (not applied)
-    angle_offset_sigma: float  # rad
+    angle_offset: float  # rad, true less stated angle of all shots alike, as the outline tells it
+    angle_offset_sigma: float  # rad, 1σ; π/2 where nothing is known
+    angle_correction: float  # rad, what is added to every stated angle: the offset where it is sure, else 0
     concentration: float  # 0…1, how well AoLP follows the silhouette
     order: tuple[int, ...]  # the order of the shots that the silhouette supports best
     mirrored: bool  # the silhouette supports angles counted the other way

@@ -95,7 +95,7 @@ def still(shots: int = 3) -> Alignment:
 def equal(shots: int = 3) -> Gains:
     ones = np.ones((shots, 3))
     order = tuple(range(shots))
-    return Gains(ones, 0 * ones, ones, "none", 0.0, 0.0, 0.0, 1.0, order, False, np.zeros(shots), 1.0, 0.0)
+    return Gains(ones, 0 * ones, ones, "none", 0.0, 0.0, 0.0, 0.0, 1.0, order, False, np.zeros(shots), 1.0, 0.0)
 
 
 def ball_object() -> ObjectMask:

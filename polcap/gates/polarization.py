@@ -8,7 +8,7 @@ import numpy as np
 from polcap.config import Gates
 from polcap.gates import rim
 from polcap.gates.gate import Found, Gate, at_most
-from polcap.images import Floats, Quality, StokesImage
+from polcap.images import Floats, Gains, Quality, StokesImage
 from polcap.optics import mueller
 
 _LEAST_RIM = 200  # pixels of outline that an angle can be told from
@@ -45,7 +45,8 @@ def of_outline(found: Found, limits: Gates) -> Iterator[Gate]:
         yield Gate("polarized", "fail", round(body.dolp, 4), _LEAST_DOLP, says, remedy, 45.0)
         return
     known = found.gains.source in ("grey patches", "one exposure")
-    yield _angles(rim.turn(band, angle, np.radians(limit)), body, angle, known, found.names, limits)
+    of_shots = _angles(rim.turn(band, angle, np.radians(limit)), body, angle, known, found.names, limits)
+    yield _with_ring(of_shots, found.gains, limits)
     yield _light_of_body(body, limits)
     side = rim.side_light(band)
     k = int(np.argmax(side))
@@ -67,7 +68,7 @@ def ill_posed(found: Found, limits: Gates) -> Gate:
 def _angles(found: rim.Turn, body: rim.Body, angle: Floats, known: bool, names: list[str], limits: Gates) -> Gate:
     """A turn of the ring, or of one shot, that the outline supports beyond its own error."""
     limit = limits.max_turn_deg
-    common = float(np.degrees(body.turned))
+    common = -float(np.degrees(body.turned))  # an AoLP too small is an angle stated too small
     if (
         abs(common) > limit + 3 * np.degrees(body.turned_sigma)
         and body.concentration > _CLEAR
@@ -93,6 +94,19 @@ def _angles(found: rim.Turn, body: rim.Body, angle: Floats, known: bool, names: 
     says = f"{names[found.shot]} looks turned by {degrees:+.0f}°, which fits the outline {times:.1f} times better"
     remedy = "set the ring to its mark and take the shot again, or name the angle it really had"
     return Gate("angles", "fail", round(degrees, 1), limit, says, remedy, cost, (names[found.shot],), "°")
+
+
+def _with_ring(gate: Gate, gains: Gains, limits: Gates) -> Gate:
+    """The gate of the angles with what was taken out of them before: the turn of the whole ring."""
+    turn, doubt = np.degrees([gains.angle_correction, gains.angle_offset_sigma])
+    if turn == 0 or gate.state != "pass":
+        return gate
+    says = f"the ring's zero was off by {turn:+.1f}° ± {doubt:.1f}°, which was taken out of all angles"
+    value, cost = round(float(turn), 2), float(doubt)
+    if abs(turn) <= limits.max_turn_deg:
+        return Gate("angles", "pass", value, limits.max_turn_deg, says, cost_deg=cost, unit="°")
+    remedy = "set the ring's zero to the horizontal, or name the angles it really had"
+    return Gate("angles", "warn", value, limits.max_turn_deg, says, remedy, cost, unit="°")
 
 
 def _light_of_body(body: rim.Body, limits: Gates) -> Gate:

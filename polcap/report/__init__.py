@@ -126,6 +126,7 @@ def figures(results: Results) -> dict[str, dict[str, Any]]:
         "angles": {
             "offset_deg": _number(np.degrees(gains.angle_offset)),
             "offset_sigma_deg": _number(np.degrees(gains.angle_offset_sigma)),
+            "applied_deg": _number(np.degrees(gains.angle_correction)),
             "concentration": _number(gains.concentration),
             "best_order": list(gains.order),
             "mirrored": gains.mirrored,

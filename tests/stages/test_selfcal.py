@@ -7,7 +7,7 @@ import pytest
 
 from polcap.errors import CaptureError
 from polcap.optics import mueller
-from polcap.stages import selfcal
+from polcap.stages import selfcal, stokes
 from polcap.stages.selfcal import grey_patches, object_gains, order
 from tests import scenes
 
@@ -115,12 +115,36 @@ def test_angles_counted_clockwise_are_refused():
         solve(mirrored, scenes.no_color())
 
 
-def test_the_turn_of_the_ring_is_measured():
-    radiance = scenes.stack(noise=0.002, angles=np.radians([7.0, 52.0, 97.0]))
-    clocked = dataclasses.replace(radiance, angle=np.radians([0.0, 45.0, 90.0]))
+@pytest.mark.parametrize("turn", [7.0, -2.5])
+def test_a_ring_whose_zero_is_off_is_found_and_taken_out(turn):
+    stated = np.array([0.0, 45.0, 90.0])
+    radiance = scenes.stack(noise=0.002, angles=np.radians(stated + turn))
+    clocked = dataclasses.replace(radiance, angle=np.radians(stated))
     found = solve(clocked, scenes.no_color())
-    assert np.degrees(found.angle_offset) == pytest.approx(-7, abs=max(0.5, 3 * np.degrees(found.angle_offset_sigma)))
-    assert np.degrees(found.angle_offset_sigma) < 2
+    assert np.degrees(found.angle_offset) == pytest.approx(turn, abs=3 * np.degrees(found.angle_offset_sigma))
+    assert np.degrees(found.angle_offset_sigma) < 0.7
+    assert found.angle_correction == found.angle_offset
+    right = stokes.solve(radiance, scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
+    mended = stokes.solve(clocked, scenes.still(), found, scenes.ball_object(), stokes.Settings())
+    s1, s2 = (right.stokes - mended.stokes)[1:].sum(-1)[:, right.mask]
+    polarized = np.hypot(*right.stokes[1:].sum(-1)[:, right.mask])
+    assert np.hypot(s1, s2).sum() < 2 * np.radians(1.0) * polarized.sum()
+
+
+def test_a_ring_set_right_is_left_alone():
+    found = solve(scenes.stack(noise=0.002), scenes.no_color())
+    assert found.angle_correction == 0
+    assert abs(found.angle_offset) < 3 * found.angle_offset_sigma
+
+
+def test_a_turn_that_the_outline_is_not_sure_of_is_not_applied():
+    radiance = scenes.stack(noise=0.002, angles=np.radians([3.0, 48.0, 93.0]))
+    clocked = dataclasses.replace(radiance, angle=np.radians([0.0, 45.0, 90.0]))
+    assert solve(clocked, scenes.no_color(), correct_ring=False).angle_correction == 0
+    assert solve(dataclasses.replace(clocked, light="one exposure"), scenes.no_color()).angle_correction == 0
+    cut = dataclasses.replace(scenes.ball_object(), border=0.1)
+    found = selfcal.solve(clocked, scenes.still(), cut, scenes.no_color(), selfcal.Settings())
+    assert found.angle_correction == 0 and found.angle_offset_sigma == pytest.approx(np.pi / 2)
 
 
 def test_the_check_can_be_left_out():

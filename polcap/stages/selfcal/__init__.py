@@ -4,7 +4,8 @@ One per cent of flash energy fakes, where a surface faces the camera, the polari
 whole object it costs normals about 6° on average). A matt grey patch is unpolarized, so its brightness must be the
 same in every shot (`grey_patches`); where there is no chart, the object itself says what it can (`object_gains`), and
 what is known of lamps and flashes says the rest. One exposure of a polarization mosaic has one gain. The outline tells
-whether the angles are in order, counted the right way, and clocked (`order`).
+whether the angles are in order and counted the right way (`order`), and by how much the ring's zero is off
+(`ring_zero`); that is applied where it is sure.
 """
 
 from typing import Annotated, Literal
@@ -17,9 +18,11 @@ from polcap.errors import CaptureError
 from polcap.images import Alignment, AngleStack, Bits, ColorCalibration, Floats, Gains, ObjectMask, Quality
 from polcap.optics.warp import warp
 from polcap.stages import stage
-from polcap.stages.selfcal import grey_patches, object_gains, order
+from polcap.stages.selfcal import grey_patches, object_gains, order, ring_zero
+from polcap.stages.selfcal.grey_patches import GreyPatches
 from polcap.stages.selfcal.object_gains import Estimate
 from polcap.stages.selfcal.order import Order
+from polcap.stages.selfcal.ring_zero import RingZero
 
 _PRIOR = {"flash": 0.03, "steady": 0.01, "unknown": 0.03}  # 1σ of a shot's light before anything is measured: makers
 # of studio flashes state 0.5–2 % from pop to pop at full recycling, of LED and HMI lamps under 1 %
@@ -39,9 +42,22 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float,
         Meta(ge=0, le=2, description="how much better another order must fit the outline to be believed"),
     ] = 0.2
+    correct_ring: Annotated[
+        bool, Meta(description="turn all stated angles by what the outline says of the ring's zero, where it is sure")
+    ] = True
+    ring_sigmas: Annotated[
+        float, Meta(ge=1, le=20, description="so many times its own error must a turn of the ring be, to be sure [1σ]")
+    ] = 3.0
+    max_ring_sigma_deg: Annotated[
+        float, Meta(gt=0, le=5, description="a turn of the ring known less well is not applied [degrees]")
+    ] = 1.0
+    max_ring_turn_deg: Annotated[
+        float,
+        Meta(gt=0, le=20, description="a greater turn is not applied: it is no zero that was set by eye [degrees]"),
+    ] = 12.0
 
 
-@stage(version=3)
+@stage(version=4)
 def solve(
     radiance: AngleStack,
     alignment: Alignment,
@@ -75,8 +91,25 @@ def solve(
     value, quality = _registered(radiance, alignment, object_.crop)
     light = object_gains.smoothed(value)
     facing = object_gains.facing(light, object_gains.inside(mask, quality))
-    anchor = object_gains.combined([*_by_law(light, mask, quality, radiance, object_.crop), facing])
     greys = grey_patches.measure(radiance, alignment, color)
+    blind = _blind(radiance, greys, facing)  # to the angles, which are to be judged
+    rim = order.rim(light / blind.gain[:, None, None], quality == 0, mask, object_.crop, radiance.value.shape[1:3])
+    guessed = greys is None and radiance.light != "one exposure"
+    found = order.judge(rim, radiance.angle, settings.order_margin, _GUESSED_ORDER if guessed else _SOLID_ORDER)
+    stated: Order = (tuple(range(shots)), False)
+    if settings.check_order and found.order != stated:
+        raise CaptureError(_disorder(found, radiance.angle))
+    ring = ring_zero.measure(
+        value.sum(-1) / blind.gain[:, None, None],
+        quality == 0,
+        mask,
+        radiance.angle,
+        float(blind.sigma.max()),
+        object_.border > 0,
+    )
+    correction = ring.turn if radiance.light != "one exposure" and _sure(ring, settings) else 0.0
+    angle = radiance.angle + correction
+    anchor = object_gains.combined([*_by_law(light, mask, quality, radiance, angle, object_.crop), facing])
     source: Source
     gain: Floats
     sigma: Floats
@@ -88,14 +121,6 @@ def solve(
         believed = supported(anchor, _PRIOR[radiance.light])
         gain, sigma = (np.repeat(part[:, None], 3, axis=1) for part in (believed.gain, believed.sigma))
         source = "object" if np.isfinite(anchor.sigma).all() else "none"
-    # of what the object says, only this knows nothing of the angles that are to be judged
-    free = gain.mean(1) if source != "object" else supported(facing, _PRIOR[radiance.light]).gain
-    rim = order.rim(light / free[:, None, None], quality == 0, mask, object_.crop, radiance.value.shape[1:3])
-    sure = _GUESSED_ORDER if source in ("object", "none") else _SOLID_ORDER
-    found = order.judge(rim, radiance.angle, settings.order_margin, sure)
-    stated: Order = (tuple(range(shots)), False)
-    if settings.check_order and found.order != stated:
-        raise CaptureError(_disorder(found, radiance.angle))
     own = np.hypot(anchor.sigma, sigma.mean(1))
     difference = np.abs(gain.mean(1) / anchor.gain - 1)
     return Gains(
@@ -104,8 +129,9 @@ def solve(
         anchor=np.repeat(anchor.gain[:, None], 3, axis=1),
         source=source,
         disagreement=float(np.max(np.where(np.isfinite(own), difference - _SURPRISE * own, 0), initial=0)),
-        angle_offset=found.offset,
-        angle_offset_sigma=found.offset_sigma,
+        angle_offset=ring.turn,
+        angle_offset_sigma=ring.sigma,
+        angle_correction=correction,
         concentration=found.concentration,
         order=found.order[0],
         mirrored=found.order[1],
@@ -134,14 +160,39 @@ def supported(anchor: Estimate, prior: float) -> Estimate:
     return Estimate(np.where(later, gain, 1.0), np.where(later, doubt, 0.0))
 
 
+def _blind(radiance: AngleStack, greys: GreyPatches | None, facing: Estimate) -> Estimate:
+    """Gains (K,) from what knows nothing of the angles."""
+    if radiance.light == "one exposure":
+        shots = len(radiance.angle)
+        return Estimate(np.ones(shots), np.zeros(shots))
+    if greys is not None:
+        return Estimate(greys.gain.mean(1), greys.sigma.mean(1))
+    return supported(facing, _PRIOR[radiance.light])
+
+
+def _sure(ring: RingZero, settings: Settings) -> bool:
+    """Whether the angles are better with the outline's turn than without."""
+    return (
+        settings.correct_ring
+        and abs(ring.turn) > settings.ring_sigmas * ring.sigma
+        and abs(ring.turn) <= np.radians(settings.max_ring_turn_deg)
+        and ring.sigma <= np.radians(settings.max_ring_sigma_deg)
+    )
+
+
 def _by_law(
-    light: Floats, mask: object_gains.Bools, quality: Bits, radiance: AngleStack, crop: tuple[int, int, int, int]
+    light: Floats,
+    mask: object_gains.Bools,
+    quality: Bits,
+    radiance: AngleStack,
+    angle: Floats,
+    crop: tuple[int, int, int, int],
 ) -> list[Estimate]:
-    """What the object says of the gains if the angles are as stated."""
+    """What the object says of the gains if the angles (K,) rad are right."""
     at = order.rim(light, quality == 0, mask, crop, radiance.value.shape[1:3])
     return [
-        object_gains.closure(light, object_gains.inside(mask, quality), radiance.angle),
-        object_gains.outline(at.light, at.azimuth, at.sector, radiance.angle),
+        object_gains.closure(light, object_gains.inside(mask, quality), angle),
+        object_gains.outline(at.light, at.azimuth, at.sector, angle),
     ]
 
 

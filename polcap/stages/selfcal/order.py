@@ -31,8 +31,6 @@ class Verdict:
     score: float  # of the stated order: mean of w cos 2(φ − φ_contour)
     best_score: float
     doubt: float  # 1σ of the difference of the two
-    offset: float  # rad, common turn of the ring against the outline
-    offset_sigma: float  # rad
     concentration: float  # 0…1, of the AoLP about the turned outline
 
 
@@ -82,9 +80,9 @@ def judge(at: Rim, angle: Floats, margin: float, believable: float, beyond_sigma
     """
     stated: Order = (tuple(range(len(angle))), False)
     if at.light.shape[1] == 0:
-        return Verdict(stated, 0.0, 0.0, 1.0, 0.0, np.pi / 2, 0.0)
+        return Verdict(stated, 0.0, 0.0, 1.0, 0.0)
     total, weight = outline.phasor(at, angle)
-    mean, offset_sigma = outline.mean_and_doubt(total, weight)
+    mean, _ = outline.mean_and_doubt(total, weight)
     here = _misfit(at, angle)
     best, best_score, doubt = stated, abs(mean), 0.0
     for order, turned in hypotheses(angle).items():
@@ -98,7 +96,7 @@ def judge(at: Rim, angle: Floats, margin: float, believable: float, beyond_sigma
             sigma = _jackknife(other.real, others, (total * np.exp(-1j * np.angle(mean))).real, weight)
             if score > believable and score - abs(mean) > max(least, beyond_sigma * sigma * (least > 0)):
                 best, best_score, doubt = order, score, sigma
-    return Verdict(best, mean.real, best_score, doubt, float(np.angle(mean) / 2), offset_sigma, abs(mean))
+    return Verdict(best, mean.real, best_score, doubt, abs(mean))
 
 
 def hypotheses(angle: Floats) -> dict[Order, Floats]:

@@ -1,6 +1,6 @@
 """Stage 6: solve each pixel's linear Stokes parameters from its K angles.
 
-Gains and transforms are applied here and nowhere else, so every pixel is resampled once.
+Gains, transforms and the ring's turn are applied here and nowhere else, so every pixel is resampled once.
 """
 
 from typing import Annotated
@@ -65,7 +65,7 @@ def solve(
     ----------
     Collett, Polarized Light, ch. 5; Tyo, Design of optimal polarimeters, Applied Optics 2002.
     """
-    weights_of = mueller.analyzer(radiance.angle)  # (K, 3)
+    weights_of = mueller.analyzer(radiance.angle + gains.angle_correction)  # (K, 3)
     condition = np.linalg.cond(weights_of)
     if condition > 50:
         angles = ", ".join(f"{np.degrees(a):g}°" for a in radiance.angle)
