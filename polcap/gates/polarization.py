@@ -114,8 +114,12 @@ def _light_of_body(body: rim.Body, limits: Gates) -> Gate:
     limit = limits.min_outline_dolp
     remedy = "darken the room, keep the flash beside the lens, and photograph an ambient frame"
     if body.along < -0.3:
-        says = "the outline is polarized along the contour: light from around is reflected off the object"
-        return Gate("body", "fail", round(body.dolp, 4), limit, says, remedy, 30.0)
+        says = (
+            "the outline is polarized along the contour: light from around is reflected off the object, or all angles "
+            "are off by 90°; the pictures cannot tell these two apart"
+        )
+        both = f"{remedy}; if it was dark, the ring's mark stood upright at 0°: name the angles as they were, 90° on"
+        return Gate("body", "fail", round(body.dolp, 4), limit, says, both, 30.0)
     if body.concentration < limits.min_concentration:
         says = (
             f"polarization hardly follows the outline ({body.concentration:.2f}): ambient light, "

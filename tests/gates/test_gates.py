@@ -115,6 +115,14 @@ def test_light_from_around_is_told(good: SimpleNamespace) -> None:
     across = image.stokes * np.array([1, -1, -1], np.float32)[:, None, None, None]
     gate = judged(changed(good, stokes=replace(image, stokes=across)))["body"]
     assert gate.state == "fail" and "reflected" in gate.says
+    assert "90°" in gate.says and "90° on" in gate.remedy  # a ring set upright at 0° looks the same
+
+
+def test_a_ring_that_was_mended_is_told() -> None:
+    clocked = replace(scenes.stack(noise=0.002, angles=scenes.ANGLES + np.radians(4.0)), angle=scenes.ANGLES)
+    gate = judged(found(radiance=clocked))["angles"]
+    assert gate.state == "pass" and gate.value == pytest.approx(4.0, abs=0.5)
+    assert "taken out" in gate.says and 0 < gate.cost_deg < 0.7
 
 
 @pytest.mark.parametrize(("name", "value"), [("border", 0.6), ("islands", 0.03), ("holes", 0.06)])
