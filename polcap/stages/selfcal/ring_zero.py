@@ -51,7 +51,11 @@ def measure(
     Parameters
     ----------
     light
-        (K, H, W) shots; `usable` and `mask` (H, W): sound pixels, and the object.
+        (K, H, W) shots.
+    usable
+        (H, W) pixels to be believed.
+    mask
+        (H, W) the object.
     angle
         (K,) rad, as stated.
     gain_sigma
