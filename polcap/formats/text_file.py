@@ -13,6 +13,7 @@ import tomllib
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn
 
+_PART = 1 << 22  # bytes that are read at a time
 TEXT_BYTES = 16 << 20  # the manifest of a large capture has some 20 kB
 
 
@@ -27,11 +28,14 @@ def opened(path: str | Path) -> BinaryIO:
 
 def read_bytes(path: str | Path, limit: int) -> bytes:
     """The content of a regular file of at most `limit` bytes. Raises OSError."""
+    data, left = bytearray(), limit + 1  # no room is taken for what is not there
     with opened(path) as file:
-        data = file.read(limit + 1)
-    if len(data) > limit:
+        while left and (part := file.read(min(left, _PART))):
+            data += part
+            left -= len(part)
+    if not left:
         raise OSError(errno.EFBIG, f"is larger than {limit / 2**20:g} MiB", str(path))
-    return data
+    return bytes(data)
 
 
 def read_toml(path: str | Path, finite: bool = True) -> dict[str, Any]:

@@ -24,10 +24,10 @@ import numpy as np
 from msgspec import Meta
 
 from polcap.errors import CaptureError
-from polcap.images import AngleStack, Capture, Floats, Frame, Quality, Shot, View
+from polcap.images import AngleStack, Capture, Floats, Frame, Quality, SensorImage, Shot, View
 from polcap.optics import sharpness
 from polcap.stages import stage
-from polcap.stages.hdr import combine, links, noise
+from polcap.stages.hdr import budget, combine, links, noise
 from polcap.stages.hdr.ambient import same_size
 from polcap.stages.hdr.combine import Merged
 from polcap.stages.hdr.planes import Reader
@@ -72,6 +72,7 @@ def merge(capture: Capture, settings: Settings) -> AngleStack:
 
 def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
     shots = capture.shots
+    read.budget = _budget(shots, read(shots[0].frames[0]), settings)
     order = _by_brightness(shots[0], read)
     reference = order[(len(order) - 1) // 2]
     image = read(shots[0].frames[reference])
@@ -134,6 +135,14 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
         blur_px=sharpness.frames_blur(tiles, side),
         offset_px=_offsets(shots) if capture.layout == "sensor" else None,
     )
+
+
+def _budget(shots: tuple[Shot, ...], image: SensorImage, settings: Settings) -> budget.Budget:
+    """What may be held, by the first frame's size; a binned mosaic's pixels are a quarter of its photosites."""
+    height, width = image.value.shape[:2]
+    binned = image.cfa is not None and settings.demosaic == "superpixel"
+    pixels = height * width // (4 if binned else 1)
+    return budget.plan(len(shots), len(shots[0].frames), pixels, image.value.nbytes)
 
 
 def _light(capture: Capture) -> Literal["flash", "steady", "one exposure", "unknown"]:

@@ -13,7 +13,7 @@ from polcap.stages.hdr import noise, registration
 from polcap.stages.hdr.ambient import Ambient
 from polcap.stages.hdr.ghosts import edges
 from polcap.stages.hdr.links import Measured
-from polcap.stages.hdr.planes import Reader, Signals, blocks, signals
+from polcap.stages.hdr.planes import Reader, Signals, blocks
 
 Bools = NDArray[np.bool_]
 
@@ -86,7 +86,7 @@ def prepare(
         if measured.frames is not None and not full:
             found, blur = measured.frames[e].signals, measured.frames[e].gain
         else:
-            found, blur = signals(image, clip, full, len(links)), None
+            found, blur = read.signals(shot, e, clip, full), None
             if link.moved is not None:
                 found, blur = registration.resampled(found, registration.on_full(link.moved) if full else link.moved)
         last = bright[e] < 1.02 * bright[darkest]

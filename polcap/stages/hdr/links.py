@@ -13,7 +13,7 @@ from polcap.stages.hdr import ambient as ambients
 from polcap.stages.hdr import exposure, noise, registration
 from polcap.stages.hdr.ambient import promised, same_size
 from polcap.stages.hdr.ghosts import Anchor, Exposed, FirstEstimate
-from polcap.stages.hdr.planes import Planes, Reader, Signals, signals
+from polcap.stages.hdr.planes import Planes, Reader, Signals
 
 Bools = NDArray[np.bool_]
 
@@ -65,7 +65,7 @@ class Shooting:
 
     def signals(self, e: int) -> Signals:
         """A frame's signals, less its ambient light."""
-        found = signals(self.read(self.shot.frames[e]), self.clip, frames=len(self.shot.frames))
+        found = self.read.signals(self.shot, e, self.clip)
         if self.ambient is None:
             return found
         if not self.lines.knows(self.iso[e]):

@@ -11,15 +11,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats, Frame, SensorImage
+from polcap.images import Floats, Frame, SensorImage, Shot
 from polcap.optics import sensor
+from polcap.stages.hdr.budget import Budget
 
 Bools = NDArray[np.bool_]
 
 _ROWS = 64  # a block of one channel of a 24 MP picture then fits a core's own cache
 _AHEAD = 2  # frames decoded beside the merge, each in a process of its own
-_PLANES_BYTES = 400_000_000  # of a shot's signals; those of larger shots are made anew for every pass
-_HELD_BYTES = 1_100_000_000  # of decoded frames; more are decoded again when they are needed again
 
 
 class Signals(Protocol):
@@ -96,7 +95,7 @@ class Quads:
         return out
 
 
-def signals(image: SensorImage, clip: float, full: bool = False, frames: int = 1) -> Signals:
+def signals(image: SensorImage, clip: float, full: bool = False, planes_bytes: float = math.inf) -> Signals:
     """Signals of a decoded frame, and which of its pixels can be believed.
 
     Parameters
@@ -107,15 +106,15 @@ def signals(image: SensorImage, clip: float, full: bool = False, frames: int = 1
         As in the stage's settings [white level].
     full
         Interpolate a mosaic instead of binning it by superpixels.
-    frames
-        How many of this size are held at a time.
+    planes_bytes
+        How large binned planes may be; larger ones are made of the counts when they are asked for.
     """
     usable = sensor.usable(image, clip, full)
     if image.cfa is None or full:
         return Planes(planar(sensor.signal(image, full)), usable)
     quads = Quads(image, usable)
     channels, height, width = quads.shape
-    if frames * 4 * channels * height * width > _PLANES_BYTES:
+    if 4 * channels * height * width > planes_bytes:
         return quads
     value = np.empty(quads.shape, np.float32)
     for rows, _, _ in blocks(height):
@@ -146,6 +145,7 @@ class Reader:
     def __init__(self, coming: Iterable[Frame]) -> None:
         """`coming`: the frames in the order in which they will be asked for."""
         self.lossy = False
+        self.budget = Budget()
         self._coming = deque(coming)
         self._held: OrderedDict[int, SensorImage] = OrderedDict()
         self._pool = ThreadPoolExecutor(_AHEAD)
@@ -156,7 +156,7 @@ class Reader:
         if id(frame) not in self._held:
             under_way = self._decoding.pop(id(frame), None) or self._pool.submit(frame.load)
             image = under_way.result()
-            room = max(1, _HELD_BYTES // max(image.value.nbytes, 1))
+            room = max(1, self.budget.frames // max(image.value.nbytes, 1))
             while len(self._held) >= room:
                 self._held.popitem(last=False)
             self._held[id(frame)] = image
@@ -165,6 +165,20 @@ class Reader:
         image = self._held[id(frame)]
         self.lossy |= image.lossy
         return image
+
+    def signals(self, shot: Shot, e: int, clip: float, full: bool = False) -> Signals:
+        """Signals of a frame; as planes where there is room for those of its whole shot.
+
+        Parameters
+        ----------
+        shot
+            The bracket.
+        e
+            Index of the frame in it.
+        clip, full
+            As `signals` has them.
+        """
+        return signals(self(shot.frames[e]), clip, full, self.budget.planes / len(shot.frames))
 
     def forget(self, frames: Iterable[Frame]) -> None:
         """These are not needed any more."""

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polcap.errors import CaptureError
+from polcap.errors import CaptureError, SettingError
 from polcap.formats import capture as captures
 from polcap.images import Capture, Exif, Frame, Quality, SensorImage, Shot
 from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.stages import hdr
+from polcap.stages.hdr import budget, links, noise
 from polcap.stages.hdr import ghosts as bracket_pixels
-from polcap.stages.hdr import links, noise, planes
 from polcap.stages.hdr.planes import Reader, signals
 from polcap.synth import shooting
 
@@ -378,9 +378,23 @@ def test_a_plateau_below_the_stated_white_is_saturation():
     assert clipped[:, 32:].all() and not clipped[:, :31].any()
 
 
+def test_little_memory_gives_the_same_pixels_and_less_is_refused_by_its_least(monkeypatch):
+    quads = ramp(256, 256, high=2e4)
+    shots = [[frame(expose(quads, e, np.random.default_rng(k)), exposure=e) for e in (1, 4)] for k in (0, 1)]
+    plenty = hdr.merge(capture(*shots), hdr.Settings())
+    needed = 128 * 128 * (2 * 25 + 2 * 9 + 60)
+    monkeypatch.setattr(budget, "_memory", lambda: (0, needed))
+    little = hdr.merge(capture(*shots), hdr.Settings())
+    for name in ("value", "variance", "quality", "exposure_ratio"):
+        np.testing.assert_array_equal(getattr(little, name), getattr(plenty, name))
+    monkeypatch.setattr(budget, "_memory", lambda: (1_000_000_000, needed + 999_999_999))
+    with pytest.raises(SettingError, match=r"needs 1\.00 GB at least"):
+        hdr.merge(capture(*shots), hdr.Settings())
+
+
 def test_frames_stream(monkeypatch):
     """With room for three decoded frames, never more than these and the next are alive, of nine."""
-    monkeypatch.setattr(planes, "_HELD_BYTES", 3 * 2 * 256 * 256)
+    monkeypatch.setattr(budget, "plan", lambda *_: budget.Budget(frames=3 * 2 * 256 * 256))
     quads = ramp(256, 256, high=2e4)
     alive = weakref.WeakSet()
     most = 0
