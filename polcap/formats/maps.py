@@ -101,10 +101,10 @@ def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues
 
     png.write(folder / "normal.png", png.sixteen_bits(flat / 2 + 0.5))
     png.write(folder / "depth.png", png.sixteen_bits(np.where(depth > 0, (depth - near) / max(far - near, 1e-9), 0)))
-    png.write(folder / "diffuse.png", _picture(_kept(maps.diffuse, inside)))
-    png.write(folder / "specular.png", _picture(_kept(maps.specular, inside)))
+    png.write(folder / "diffuse.png", color.srgb_eight_bits(_kept(maps.diffuse, inside)))
+    png.write(folder / "specular.png", color.srgb_eight_bits(_kept(maps.specular, inside)))
     png.write(folder / "roughness.png", png.sixteen_bits(_kept(maps.roughness, inside)))
-    png.write(folder / "photograph.png", _picture(cues.radiance))
+    png.write(folder / "photograph.png", color.srgb_eight_bits(cues.radiance))
     png.write(folder / "mask.png", np.where(inside, 255, 0).astype(np.uint8))
     _write_json(folder / "maps.json", _description(maps, {"unit": unit, "near": near, "median": median, "far": far}))
 
@@ -237,10 +237,6 @@ def _kept(values: Floats, inside: NDArray[np.bool_]) -> Floats:
 
 def _channels(names: str, values: Floats) -> dict[str, Floats]:
     return {name: values[..., k] for k, name in enumerate(names)}
-
-
-def _picture(linear: Floats) -> NDArray[np.uint8]:
-    return np.asarray(np.rint(255 * color.encode_srgb(np.clip(linear, 0.0, 1.0))), np.uint8)
 
 
 def _stokes_channels(stokes: StokesImage) -> dict[str, Floats]:

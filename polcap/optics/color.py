@@ -7,6 +7,7 @@ import sys
 import unittest.mock
 import warnings
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ REC709_TO_XYZ = np.array(
 XYZ_TO_REC709 = np.linalg.inv(REC709_TO_XYZ)
 LUMINANCE = REC709_TO_XYZ[1]  # Y of linear Rec.709
 _D65 = (0.3127, 0.3290)  # xy
+_LEVELS = 65535  # of linear light: a twentieth of an 8-bit step where the curve is steepest
 
 
 def encode_srgb(linear: Any) -> Any:
@@ -42,6 +44,20 @@ def decode_srgb(encoded: Any) -> Any:
     xp = array_namespace(encoded)
     size = xp.abs(encoded)
     return xp.sign(encoded) * xp.where(size > 0.04045, ((size + 0.055) / 1.055) ** 2.4, size / 12.92)
+
+
+def srgb_eight_bits(linear: Floats) -> NDArray[np.uint8]:
+    """Linear Rec.709 0…1 as 8-bit sRGB, clipped; NaN becomes 0."""
+    level = np.asarray(linear, np.float32) * np.float32(_LEVELS)
+    level += np.float32(0.5)
+    np.fmin(np.fmax(level, 0, out=level), _LEVELS, out=level)
+    return _curve()[level.astype(np.uint16)]
+
+
+@cache
+def _curve() -> NDArray[np.uint8]:
+    """sRGB of each of the levels that `srgb_eight_bits` rounds to: a look-up is ten times as fast as the power."""
+    return np.asarray(np.rint(255 * encode_srgb(np.arange(_LEVELS + 1) / _LEVELS)), np.uint8)
 
 
 def luminance(rgb: Any) -> Any:

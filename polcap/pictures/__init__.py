@@ -5,7 +5,6 @@ turn of 180° once around the wheel; DoLP, depth and errors from dark (small) to
 """
 
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import cv2
@@ -35,7 +34,6 @@ from polcap.pictures.sheets import Picture as Picture
 from polcap.pictures.smaller import area
 
 _AGREE = "first shot magenta, this one green: grey where they agree"
-_LEVELS = 16383  # of linear light: a fifth of an 8-bit step where the curve is steepest
 _DIRECTIONS = "red right, green up, blue toward the camera"
 
 
@@ -231,16 +229,7 @@ def asset(built: Asset) -> Picture:
 
 def display(linear: Floats, top: float | None = None) -> Picture:
     """Linear light as sRGB; `top` becomes white, by default the 99.5th percentile."""
-    level = np.asarray(linear, np.float32) * np.float32(_LEVELS / (top or _top(linear)))
-    level += np.float32(0.5)
-    np.fmin(np.fmax(level, 0, out=level), _LEVELS, out=level)  # NaN becomes 0
-    return _curve()[level.astype(np.uint16)]
-
-
-@cache
-def _curve() -> Picture:
-    """sRGB of each of the levels that `display` rounds to: a look-up is ten times as fast as the power."""
-    return _eight(color.encode_srgb(np.arange(_LEVELS + 1) / _LEVELS))
+    return color.srgb_eight_bits(np.asarray(linear, np.float32) / np.float32(top or _top(linear)))
 
 
 def scale(value: Floats, low: float, high: float, inside: NDArray[np.bool_]) -> Picture:

@@ -95,4 +95,4 @@ def _nearest(points: Floats, seen: Floats, view: View, shape: tuple[int, int]) -
 def _developed(drawn: list[Floats]) -> list[Picture]:
     """Linear frames as sRGB, all with one exposure."""
     top = max(float(np.quantile(np.stack(drawn[:: FRAMES // 6])[..., 1], _BRIGHTEST)), 1e-6)
-    return [np.asarray(np.rint(255 * color.encode_srgb(np.clip(0.9 * frame / top, 0, 1))), np.uint8) for frame in drawn]
+    return [color.srgb_eight_bits(0.9 * frame / top) for frame in drawn]

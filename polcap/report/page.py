@@ -13,6 +13,7 @@ from scipy import ndimage
 from polcap import pictures
 from polcap.formats import calib, html
 from polcap.images import Floats
+from polcap.optics.color import srgb_eight_bits
 from polcap.path import Results
 from polcap.pictures import keys
 from polcap.pictures.keys import Key, Palette
@@ -46,7 +47,7 @@ def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
     taken = shown.photograph(radiance, results.color.value, small.maps.view, size)
     body = [
         *_verdict(about),
-        *_relit(shown.srgb(bright * taken), shown.srgb(bright * again.scale * again.flashed)),
+        *_relit(srgb_eight_bits(bright * taken), srgb_eight_bits(bright * again.scale * again.flashed)),
         *_solid(mesh.metric, about),
         *_maps(small, mesh.metric),
         *_rerendered(small, again, about),
@@ -215,8 +216,8 @@ def normal(name: str, title: str, vectors: Floats, inside: NDArray[np.bool_]) ->
 
 def _color(name: str, title: str, says: str, linear: Floats, inside: NDArray[np.bool_], top: float) -> str:
     about = {"kind": "color", "top": top, "unit": "", "digits": 2 if top == 1 else 3}
-    image = html.jpeg(_outwards(shown.srgb(linear / top), inside), whole_color=True)
-    grey = ",".join(f"rgb({v},{v},{v})" for v in shown.srgb(np.linspace(0, 1, 17)).tolist())
+    image = html.jpeg(_outwards(srgb_eight_bits(linear / top), inside), whole_color=True)
+    grey = ",".join(f"rgb({v},{v},{v})" for v in srgb_eight_bits(np.linspace(0, 1, 17)).tolist())
     ticks = "".join(
         f'<span style="left:{100 * share:g}%">{labels.number(top * share)}</span>' for share in (0, 0.25, 0.5, 0.75, 1)
     )
@@ -260,7 +261,9 @@ def _measured(results: Results, about: Mapping[str, Any]) -> Iterator[str]:
     measured = shown.patches(radiance, color)
     if measured is not None and color.delta_e is not None:
         reference = calib.colorchecker(about["settings"]["whitebalance"]["chart"])
-        drawing = plots.chart(shown.srgb(reference.rec709), shown.srgb(measured), color.delta_e, reference.patches)
+        drawing = plots.chart(
+            srgb_eight_bits(reference.rec709), srgb_eight_bits(measured), color.delta_e, reference.patches
+        )
         figures = about["figures"]["chart"]
         mean, ahead = labels.number(figures["delta_e_mean"], 2), figures["predicted_mean"]
         says = f"outside the maker's colors, inside as photographed; below ΔE2000, mean {mean}"

@@ -1,14 +1,13 @@
 """In: the results of a run. Out: what a page shows of them, reduced to the size of a screen."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import AngleStack, ColorCalibration, Cues, Floats, Mesh, SurfaceMaps, View
-from polcap.optics import color, frames, shade
+from polcap.optics import frames, shade
 from polcap.pictures.smaller import Smaller, area
 
 WHITE_PATCH = 18  # of a ColorChecker Classic, row by row from dark skin
@@ -126,9 +125,3 @@ def patches(radiance: AngleStack, found: ColorCalibration) -> Floats | None:
     offset = np.stack([column - white_column, row - white_row], axis=-1)
     light = 1 + offset @ np.array(found.falloff)
     return np.asarray((camera @ found.matrix.T - found.glare) / light[:, None])
-
-
-def srgb(linear: Any) -> NDArray[np.uint8]:
-    """Linear 0…1 as 8-bit sRGB."""
-    encoded = color.encode_srgb(np.clip(np.nan_to_num(np.asarray(linear)), 0, 1))
-    return np.asarray(np.rint(255 * encoded), np.uint8)

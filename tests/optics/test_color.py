@@ -104,3 +104,9 @@ def test_patches_left_out_have_no_say_and_no_residual():
     fit = color.fit_matrix(patches, calib.colorchecker().rec709, POSITION, usable)
     assert fit.matrix @ CAMERA == pytest.approx(np.eye(3), abs=1e-8)
     assert np.array_equal(np.isnan(fit.delta_e), ~usable)
+
+
+def test_eight_bits_of_srgb_are_those_of_the_curve() -> None:
+    linear = np.concatenate([np.linspace(0, 1, 20_001), [-0.5, 1.5, np.nan]])
+    exact = 255 * color.encode_srgb(np.clip(np.nan_to_num(linear), 0, 1))
+    assert np.abs(color.srgb_eight_bits(linear) - exact).max() <= 0.53

@@ -9,6 +9,7 @@ from scipy import ndimage
 from polcap.images import Asset, Floats, SurfaceMaps
 from polcap.optics import color
 from polcap.stages import asset, surface
+from polcap.stages.asset.coverage import interpolated
 from tests import surfaces
 
 
@@ -104,3 +105,33 @@ def test_textures_take_the_size_asked_for(size: int, shape: tuple[int, int]) -> 
     length = np.linalg.norm(other.normal / 127.5 - 1, axis=-1)
     assert np.abs(length - 1).max() < 0.02
     assert other.base_color.mean((0, 1)) == pytest.approx(built.base_color.mean((0, 1)), abs=1)
+
+
+def test_coverage_interpolates_as_a_renderer_does() -> None:
+    """Against the barycentric formula, corner by corner, on triangles that lie anyhow."""
+    rng = np.random.default_rng(3)
+    mesh = surfaces.mesh(surfaces.maps(), surface.Settings(max_vertices=2000))
+    value = np.concatenate([mesh.normals, mesh.tangents], axis=-1)
+    there, covered = interpolated(mesh, surfaces.HEIGHT, surfaces.WIDTH)
+    place = mesh.uv * [surfaces.WIDTH, surfaces.HEIGHT] - 0.5
+    number = np.cumsum(covered).reshape(covered.shape) - 1
+    found = 0
+    for face in mesh.faces[rng.choice(len(mesh.faces), 60)]:
+        a, b, c = place[face].astype(np.float64)
+        low, high = np.ceil(np.min([a, b, c], axis=0)).astype(int), np.floor(np.max([a, b, c], axis=0)).astype(int)
+        for x, y in ((x, y) for x in range(low[0], high[0] + 1) for y in range(low[1], high[1] + 1)):
+            share = np.linalg.solve(np.stack([[*a, 1], [*b, 1], [*c, 1]], axis=-1), [x, y, 1])
+            if share.min() > -1e-6:  # on an edge both triangles agree
+                assert covered[y, x]
+                assert there[number[y, x]] == pytest.approx(share @ value[face], abs=2e-4)
+                found += 1
+    assert found > 60
+
+
+def test_pixels_without_a_value_take_that_of_a_nearest_one() -> None:
+    known = np.random.default_rng(1).random((40, 60)) < 0.05
+    value = np.stack(np.indices(known.shape), axis=-1).astype(np.float32)
+    out = asset.filled(value, known)
+    assert np.array_equal(out[known], value[known])
+    away = np.linalg.norm(out - value, axis=-1)
+    assert np.all(away <= 1.05 * ndimage.distance_transform_edt(~known) + 1e-3)

@@ -6,7 +6,7 @@ Khronos, glTF 2.0 §3.9 (materials) and KHR_materials_specular.
 """
 
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import cv2
 import msgspec
@@ -18,6 +18,7 @@ from scipy import ndimage
 from polcap.images import Asset, Floats, Mesh, SurfaceMaps
 from polcap.optics import color, frames, fresnel
 from polcap.stages import stage
+from polcap.stages.asset.coverage import interpolated
 
 _LEAST_UP = 0.05  # a tangent-space normal must leave the surface (glTF: blue above one half)
 
@@ -30,7 +31,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 1.5
 
 
-@stage(version=2, keep=False)
+@stage(version=3, keep=False)
 def build(maps: SurfaceMaps, mesh: Mesh, settings: Settings) -> Asset:
     """Textures on the crop's grid, filled outwards from the object so that no seam shows.
 
@@ -41,19 +42,19 @@ def build(maps: SurfaceMaps, mesh: Mesh, settings: Settings) -> Asset:
     holding the map's greatest value. The mesh has already bent the light as its own normals do, so
     the normal texture holds what is left: the map's normals in the mesh's interpolated tangent frame.
     """
-    nearest = _nearest(_unmixed(maps.mask))
+    known = _unmixed(maps.mask)
     specular = np.clip(maps.specular, 0.0, 1.0)
     entry, _ = fresnel.transmission(np.float64(1.0), settings.ior)
-    base = maps.diffuse * entry**2 / (1 - np.minimum(specular.max(axis=-1, keepdims=True), 0.99))
+    base = maps.diffuse * np.float32(entry**2) / (1 - np.minimum(_greatest(specular), 0.99))
     top = float(specular[maps.mask].max(initial=0.0))
     roughness = _eight_bits(maps.roughness)
     full, none = np.full_like(roughness, 255), np.zeros_like(roughness)
     return Asset(
         mesh=mesh,
-        base_color=_eight_bits(color.encode_srgb(np.clip(base, 0.0, 1.0)))[nearest],
-        occlusion_roughness_metallic=np.stack([full, roughness, none], axis=-1)[nearest],
+        base_color=filled(color.srgb_eight_bits(base), known),
+        occlusion_roughness_metallic=filled(np.stack([full, roughness, none], axis=-1), known),
         normal=_eight_bits(tangent_space(maps, mesh) / 2 + 0.5),
-        specular_color=_eight_bits(color.encode_srgb(specular / max(top, 1e-9)))[nearest],
+        specular_color=filled(color.srgb_eight_bits(specular / max(top, 1e-9)), known),
         specular_factor=(top / float(fresnel.normal_reflectance(settings.ior)),) * 3,
         ior=settings.ior,
     )
@@ -90,48 +91,21 @@ def _scaled(texture: NDArray[np.uint8], width: int, height: int) -> Floats:
 
 def tangent_space(maps: SurfaceMaps, mesh: Mesh) -> Floats:
     """The maps' normals as x t + y b + z n of the mesh's frame at each pixel, (H, W, 3) unit, z > 0."""
-    height, width = maps.mask.shape
-    frame, covered = _interpolated(mesh, height, width)
-    covered &= maps.mask
-    there = frame[covered]  # (N, 7)
+    there, covered = interpolated(mesh, *maps.mask.shape)
+    on = maps.mask[covered]
+    there, covered = there[on], covered & maps.mask
+    # n and t are each interpolated, so neither unit nor square to each other: solve, do not project
     n, t = _unit(there[:, :3]), _unit(there[:, 3:6])
-    b = frames.cross(n, t) * np.where(there[:, 6:] < 0, -1.0, 1.0)
-    # n and t are each interpolated, so not quite square to each other: solve, do not project
-    volume = frames.dot(t, frames.cross(b, n))
-    m = maps.normal[covered].astype(np.float64)
-    local = np.stack([frames.dot(m, frames.cross(*pair)) / volume for pair in ((b, n), (n, t), (t, b))], axis=-1)
+    b = frames.cross(n, t) * np.where(there[:, 6:] < 0, np.float32(-1), np.float32(1))
+    m = maps.normal[covered]
+    across = frames.cross(t, b)
+    local = np.stack([frames.dot(m, v) for v in (frames.cross(b, n), frames.cross(n, t), across)], axis=-1)
+    local /= frames.dot(n, across)[:, None]
     local[:, 2] = np.maximum(local[:, 2], _LEAST_UP)
-    whole = np.zeros((height, width, 3))
+    whole = np.zeros((*covered.shape, 3), np.float32)
     whole[..., 2] = 1.0
     whole[covered] = _unit(local)
-    return np.asarray(whole[_nearest(covered)])
-
-
-def _interpolated(mesh: Mesh, height: int, width: int) -> tuple[Floats, NDArray[np.bool_]]:
-    """Normals and tangents (H, W, 7) at the pixels that triangles cover in the texture, and which those are."""
-    position = mesh.uv.astype(np.float64) * [width, height] - 0.5
-    value = np.concatenate([mesh.normals, mesh.tangents], axis=-1).astype(np.float64)
-    corner = position[mesh.faces]  # (F, 3, 2)
-    first = np.ceil(corner.min(axis=1) - 1e-4).astype(np.int64)
-    extent = np.floor(corner.max(axis=1) + 1e-4).astype(np.int64) - first
-    one, two = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-    area = one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
-    seen = area < 0  # the texture belongs to what faces the camera, not to walls and a back; v runs down
-    faces, first, extent, area = mesh.faces[seen], first[seen], extent[seen], area[seen]
-    corner, one, two = corner[seen], one[seen], two[seen]
-    out, covered = np.zeros((height, width, 7)), np.zeros((height, width), dtype=bool)
-    for down in range(int(extent[:, 1].max()) + 1):
-        for right in range(int(extent[:, 0].max()) + 1):
-            pixel = first + np.array([right, down])
-            at = pixel - corner[:, 0]
-            w1 = (at[:, 0] * two[:, 1] - at[:, 1] * two[:, 0]) / area
-            w2 = (one[:, 0] * at[:, 1] - one[:, 1] * at[:, 0]) / area
-            hit = (w1 > -1e-4) & (w2 > -1e-4) & (w1 + w2 < 1 + 1e-4)
-            share = np.stack([1 - w1 - w2, w1, w2], axis=-1)[hit]
-            column, row = pixel[hit].T
-            out[row, column] = np.einsum("fk,fkc->fc", share, value[faces[hit]])
-            covered[row, column] = True
-    return out, covered
+    return filled(whole, covered)
 
 
 def _unmixed(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -140,17 +114,29 @@ def _unmixed(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(inner | (mask & ~ndimage.binary_dilation(inner, np.ones((5, 5), dtype=bool))))
 
 
-def _nearest(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Row and column (H, W) of the pixel of the mask that is nearest to each."""
-    if not mask.any():
-        row, column = np.indices(mask.shape)
-    else:
-        row, column = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
-    return np.asarray(row), np.asarray(column)
+def filled(value: Any, known: NDArray[np.bool_]) -> Any:
+    """(H, W, C) with the value of a nearest known pixel wherever none is known."""
+    if known.all() or not known.any():
+        return value
+    label = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )[1]
+    source = np.empty(int(label.max()) + 1, np.intp)
+    source[label[known]] = np.flatnonzero(known)  # every known pixel is the nearest to itself
+    missing = ~known
+    out = value.copy()
+    out[missing] = value.reshape(-1, value.shape[-1])[source[label[missing]]]
+    return out
+
+
+def _greatest(color_: Floats) -> Floats:
+    """Of the three channels (H, W, 1), in a fifth of the time that a maximum over so short an axis takes."""
+    r, g, b = (color_[..., k] for k in range(3))
+    return np.asarray(np.maximum(np.maximum(r, g), b)[..., None])
 
 
 def _unit(vector: Floats) -> Floats:
-    return np.asarray(vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-12))
+    return np.asarray(vector / np.maximum(np.sqrt(frames.dot(vector, vector)), 1e-12)[..., None])
 
 
 def _eight_bits(value: Floats) -> NDArray[np.uint8]:
