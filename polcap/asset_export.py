@@ -6,7 +6,7 @@ result gives the same bytes, whenever and with however many threads.
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from polcap.config import restored
 from polcap.errors import SettingError
 from polcap.formats import (
     atomic,
-    encoders,
     exr_layers,
     file_name,
     gltf,
@@ -27,7 +26,7 @@ from polcap.formats import (
     usd,
 )
 from polcap.formats import maps as maps_folder
-from polcap.formats.encoders import Kind
+from polcap.formats.encoders import Encoder, Kind
 from polcap.formats.presets import PRESETS, Format, Preset
 from polcap.formats.texture_set import Key, Texture
 from polcap.images import Asset
@@ -66,7 +65,7 @@ def export(out: Path, about: Mapping[str, Any], wanted: Wanted) -> list[Path]:
     mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, config.surface)
     built = asset.build(stored.maps, mesh, config.asset)
     levels = [surface.decimated(mesh, stored.maps.view, 0.25**k, config.surface.back) for k in range(1, wanted.lod + 1)]
-    lods = [asset.build(stored.maps, level.mesh, config.asset) for level in levels]
+    lods = [asset.on_mesh(built, stored.maps, level.mesh) for level in levels]
     if wanted.texture_size is not None:
         built, *lods = (asset.resized(one, wanted.texture_size) for one in (built, *lods))
     job = _Job(
@@ -106,6 +105,7 @@ class _Job:
     images: Kind
     color: str
     record: Mapping[str, Any]
+    encoder: Encoder = field(default_factory=Encoder)
 
     def write(self) -> list[Path]:
         """Every file of the export, in threads, and the sidecar."""
@@ -183,17 +183,17 @@ class _Job:
 
     def _texture(self, file: str, texture: Texture) -> list[Path]:
         with atomic.path(self.folder / file) as temporary:
-            temporary.write_bytes(encoders.encode(texture, "png", text=True))
+            temporary.write_bytes(self.encoder(texture, "png", text=True))
         return [self.folder / file]
 
     def _gltf(self) -> list[Path]:
         file = self.folder / f"{self.stem}.glb"
-        gltf.write(file, self.asset, self.stem, self.images, self.words)
+        gltf.write(file, self.asset, self.stem, self.images, self.words, self.encoder)
         return [file]
 
     def _lod(self, level: int) -> list[Path]:
         file = self.folder / f"{self.stem}_lod{level}.glb"
-        gltf.write(file, self.lods[level - 1][0], f"{self.stem}_lod{level}", self.images, self.words)
+        gltf.write(file, self.lods[level - 1][0], f"{self.stem}_lod{level}", self.images, self.words, self.encoder)
         return [file]
 
     def _obj(self) -> list[Path]:

@@ -9,9 +9,10 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from threading import Lock
 from typing import Literal
 
 import cv2
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from polcap.errors import SettingError, StorageError
 from polcap.formats import png
-from polcap.formats.texture_set import Texture
+from polcap.formats.texture_set import Pixels, Texture
 
 Kind = Literal["png", "jpeg", "webp", "ktx2"]
 MIME: dict[Kind, str] = {"png": "image/png", "jpeg": "image/jpeg", "webp": "image/webp", "ktx2": "image/ktx2"}
@@ -28,30 +29,51 @@ _PROGRAMS = ("ktx", "toktx")
 _QUALITY = {"jpeg": (95, 92), "webp": (101, 90)}  # data, colour; WebP over 100 is lossless
 
 
-def encode_all(textures: Mapping[str, Texture], kind: Kind, *, text: bool = False) -> dict[str, bytes]:
-    """The bytes of each picture, in threads; the same whatever their number.
+class Encoder:
+    """Encodes each picture once, whichever files of an export hold it and in whichever threads they are written."""
 
-    Parameters
-    ----------
-    textures
-        Pictures by key.
-    kind
-        Of the files.
-    text
-        Write into each PNG what it holds (a tEXt chunk), for files that lie beside the asset.
+    def __init__(self) -> None:
+        self._lock = Lock()
+        # the pixels stay with their bytes: no other array can then have their id
+        self._made: dict[tuple[int, Kind, bool], tuple[Pixels, Future[bytes]]] = {}
 
-    Raises
-    ------
-    SettingError
-        KTX2 was asked for and no encoder is on the PATH.
-    """
-    encode_one = partial(encode, kind=kind, text=text)
-    with ThreadPoolExecutor(min(len(textures), os.cpu_count() or 1) or 1) as pool:
-        return dict(zip(textures, pool.map(encode_one, textures.values())))
+    def __call__(self, texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
+        """As `encode`."""
+        key = (id(texture.pixels), kind, texture.color)
+        with self._lock:
+            first = key not in self._made
+            _, made = self._made.setdefault(key, (texture.pixels, Future()))
+        if first:
+            try:
+                made.set_result(encode(texture, kind))
+            except BaseException as error:
+                made.set_exception(error)
+        data = made.result()
+        return png.described(data, {"Description": texture.says}) if text and kind == "png" else data
+
+    def all(self, textures: Mapping[str, Texture], kind: Kind) -> dict[str, bytes]:
+        """The bytes of each picture, in threads; the same whatever their number.
+
+        Raises
+        ------
+        SettingError
+            KTX2 was asked for and no encoder is on the PATH.
+        """
+        with ThreadPoolExecutor(min(len(textures), os.cpu_count() or 1) or 1) as pool:
+            return dict(zip(textures, pool.map(partial(self, kind=kind), textures.values())))
 
 
 def encode(texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
     """The bytes of one picture; JPEG and WebP hold 8 bits, PNG what it is given.
+
+    Parameters
+    ----------
+    texture
+        The picture and what it means.
+    kind
+        Of the file.
+    text
+        Write into a PNG what it holds (a tEXt chunk), for files that lie beside the asset.
 
     Raises
     ------
@@ -61,7 +83,8 @@ def encode(texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
         The encoder failed.
     """
     if kind == "png":
-        return png.encode(texture.pixels, {"Description": texture.says} if text else None)
+        data = png.encode(texture.pixels)
+        return png.described(data, {"Description": texture.says}) if text else data
     if kind == "ktx2":
         return _ktx2(texture)
     quality = _QUALITY[kind][texture.color]

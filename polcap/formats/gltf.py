@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from polcap import __version__
 from polcap.formats import atomic, encoders, texture_set
-from polcap.formats.encoders import Kind
+from polcap.formats.encoders import Encoder, Kind
 from polcap.formats.texture_set import Texture
 from polcap.images import Asset, Floats, Mesh
 
@@ -37,7 +37,12 @@ _CONTEXT = {
 
 
 def write(
-    path: Path, asset: Asset, name: str, images: Kind = "png", provenance: Mapping[str, str] | None = None
+    path: Path,
+    asset: Asset,
+    name: str,
+    images: Kind = "png",
+    provenance: Mapping[str, str] | None = None,
+    encoder: Encoder | None = None,
 ) -> None:
     """Write a GLB with embedded textures; the same asset gives the same bytes.
 
@@ -53,6 +58,8 @@ def write(
         Kind of the embedded pictures.
     provenance
         Goes into the XMP packet (KHR_xmp_json_ld).
+    encoder
+        What it has encoded for other files of the same export is not encoded again.
 
     Raises
     ------
@@ -62,10 +69,16 @@ def write(
         The file cannot be written.
     """
     with atomic.path(path) as temporary:
-        temporary.write_bytes(encode(asset, name, images, provenance))
+        temporary.write_bytes(encode(asset, name, images, provenance, encoder))
 
 
-def encode(asset: Asset, name: str, images: Kind = "png", provenance: Mapping[str, str] | None = None) -> bytes:
+def encode(
+    asset: Asset,
+    name: str,
+    images: Kind = "png",
+    provenance: Mapping[str, str] | None = None,
+    encoder: Encoder | None = None,
+) -> bytes:
     """The bytes of the GLB.
 
     Parameters
@@ -78,6 +91,8 @@ def encode(asset: Asset, name: str, images: Kind = "png", provenance: Mapping[st
         Kind of the embedded pictures.
     provenance
         Goes into the XMP packet (KHR_xmp_json_ld).
+    encoder
+        What it has encoded for other files of the same export is not encoded again.
 
     References
     ----------
@@ -88,7 +103,7 @@ def encode(asset: Asset, name: str, images: Kind = "png", provenance: Mapping[st
     held = textures(asset)
     pictures = [
         blob.image(f"{name}_{key}", data, encoders.MIME[images])
-        for key, data in encoders.encode_all(held, images).items()
+        for key, data in (encoder or Encoder()).all(held, images).items()
     ]
     used = ["KHR_materials_specular", "KHR_materials_ior", "KHR_xmp_json_ld"]
     required = [_IMAGE_EXTENSION[images]] if images in _IMAGE_EXTENSION else []

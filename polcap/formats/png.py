@@ -35,8 +35,8 @@ def write(path: Path, array: Pixels) -> None:
         temporary.write_bytes(encode(array))
 
 
-def encode(array: Pixels, text: Mapping[str, str] | None = None) -> bytes:
-    """The bytes of the PNG; `text` goes into tEXt chunks under its keywords (Latin-1, as PNG has it).
+def encode(array: Pixels) -> bytes:
+    """The bytes of the PNG.
 
     Raises
     ------
@@ -50,9 +50,12 @@ def encode(array: Pixels, text: Mapping[str, str] | None = None) -> bytes:
     done, data = cv2.imencode(".png", _swapped(array), [cv2.IMWRITE_PNG_COMPRESSION, 4])
     if not done:
         raise StorageError(f"cannot encode a picture of {array.shape} as PNG; report this as a bug")
-    header, rest = bytes(data[:_HEADER]), bytes(data[_HEADER:])
-    chunks = [_text_chunk(key, said) for key, said in (text or {}).items()]
-    return b"".join([header, *chunks, rest])
+    return bytes(data)
+
+
+def described(data: bytes, text: Mapping[str, str]) -> bytes:
+    """A PNG with `text` in tEXt chunks under its keywords (Latin-1, as PNG has it)."""
+    return b"".join([data[:_HEADER], *(_text_chunk(key, said) for key, said in text.items()), data[_HEADER:]])
 
 
 def _text_chunk(key: str, said: str) -> bytes:

@@ -60,6 +60,11 @@ def build(maps: SurfaceMaps, mesh: Mesh, settings: Settings) -> Asset:
     )
 
 
+def on_mesh(asset: Asset, maps: SurfaceMaps, mesh: Mesh) -> Asset:
+    """The asset on another mesh of the same maps: only the normal texture depends on it."""
+    return replace(asset, mesh=mesh, normal=_eight_bits(tangent_space(maps, mesh) / 2 + 0.5))
+
+
 def resized(asset: Asset, size: int) -> Asset:
     """The asset with textures whose longer side is `size` px and whose other is the next power of two that holds it.
 
