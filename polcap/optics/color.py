@@ -47,7 +47,7 @@ def decode_srgb(encoded: Any) -> Any:
 
 
 def srgb_eight_bits(linear: Floats) -> NDArray[np.uint8]:
-    """Linear Rec.709 0…1 as 8-bit sRGB, clipped; NaN becomes 0."""
+    """Linear Rec.709 0…1, (..., 3) or (...,), as 8-bit sRGB, clipped; NaN becomes 0."""
     level = np.asarray(linear, np.float32) * np.float32(_LEVELS)
     level += np.float32(0.5)
     np.fmin(np.fmax(level, 0, out=level), _LEVELS, out=level)
