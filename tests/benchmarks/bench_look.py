@@ -3,8 +3,8 @@
 python tests/benchmarks/bench_look.py FOLDER     (needs $POLCAP_BPY, a Chromium, `npm ci` in tests/gltf, usd-core)
 
 Prints, per light and renderer, how far its picture is from another's, of the 99th percentile of that
-picture: median and 95th percentile over the pixels that face camera and light within 60°, and over all
-others. A ball with two paints, varying roughness and F0, and rippled normals; suns, no shadows.
+picture: median and 95th percentile over the pixels that face camera and light within 45°, within 60°, and over
+all others. A ball with two paints, varying roughness and F0, and rippled normals; suns, no shadows.
 """
 
 import sys
@@ -43,7 +43,7 @@ def main(folder: Path) -> None:
     blender = session.ask(folder, files, camera=camera, lights=list(LIGHTS.values()), samples=SAMPLES)
     job = browser.Job("ball", files[0], mesh, maps.view, tuple(LIGHTS.values()))
     web = browser.render(folder, [job])["ball"]
-    print(f"{'light':15}{'pictures':26}{'facing: median':>16}{'95 %':>8}{'others: median':>16}{'95 %':>8}")
+    print(f"{'light':15}{'pictures':26}{'within 45°':>18}{'within 60°':>18}{'others':>18}   (median, 95 %)")
     for k, (light, to_light) in enumerate(LIGHTS.items()):
         seen = {
             "cycles glb": blender[0][f"light {k}"],
@@ -52,13 +52,13 @@ def main(folder: Path) -> None:
             "polcap": own(maps, np.array(to_light)),
         }
         inside = inner(maps, *seen.values())
-        facing = inside & (np.minimum(cosine(maps, to_light), cosine(maps, (0, 0, 1))) > 0.5)
+        towards = np.minimum(cosine(maps, to_light), cosine(maps, (0, 0, 1)))
+        places = [inside & where for where in (towards > np.sqrt(0.5), towards > 0.5, towards <= 0.5)]
         for one, other in PAIRS:
             scale = np.percentile(seen[other][inside], 99)
             off = np.abs(seen[one] - seen[other]).max(axis=-1) / scale
-            told = [np.percentile(off[where], q) for where in (facing, inside & ~facing) for q in (50, 95)]
-            row = "".join(f"{100 * value:{wide}.1f} %" for value, wide in zip(told, (14, 6, 14, 6)))
-            print(f"{light:15}{f'{one} : {other}':26}{row}")
+            told = [" %, ".join(f"{100 * np.percentile(off[where], q):.1f}" for q in (50, 95)) for where in places]
+            print(f"{light:15}{f'{one} : {other}':26}" + "".join(f"{text + ' %':>18}" for text in told))
         np.savez(folder / f"{light}.npz", allow_pickle=False, **seen)
 
 
