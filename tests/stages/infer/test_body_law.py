@@ -12,8 +12,13 @@ from polcap.stages.infer import body_law
 
 RADIUS, SIZE = 70, 160
 DEGREES = (25, 35, 45, 55, 65, 70)
-# DoLP over the smooth law's (n = 1.5) of two real matte balls, the mean of both
-MEASURED = ([0, 32, 44, 56, 68, 74, 90], [0.88, 0.83, 0.72, 0.62, 0.525, 0.5, 0.44])
+# DoLP over the smooth law's (n = 1.5) of two real matte balls, 0° and 90° extrapolated
+PLACES = [0, 32, 44, 56, 68, 74, 90]
+MEASURED = {
+    "first": [0.87, 0.82, 0.71, 0.59, 0.50, 0.5, 0.42],
+    "second": [0.90, 0.84, 0.73, 0.65, 0.55, 0.5, 0.45],
+    "mean": [0.88, 0.83, 0.72, 0.62, 0.525, 0.5, 0.44],
+}
 
 
 def ball(dolp_of: Callable[[Floats], Floats], alpha: float, albedo: Floats | float = 0.4) -> tuple[Cues, Floats]:
@@ -52,29 +57,36 @@ def test_a_ball_drawn_by_a_law_gets_its_zeniths_back(alpha: float, textured: boo
     albedo = chequered() if textured else 0.4
     cues, truth = ball(lambda zenith: body.dolp(np.cos(zenith), alpha, 1.5), alpha, albedo)
     found = body_law.zeniths(cues.dolp, cues, 1.5)
-    assert np.abs(bias_deg(found.angle, truth, cues.mask)).max() < 1.0
-    assert found.alpha == pytest.approx(alpha, abs=0.06)
-    assert (found.smooth > 0.9) == (alpha == 0)
+    assert np.abs(bias_deg(found.angle, truth, cues.mask)).max() < 1.6
+    assert found.alpha == pytest.approx(alpha, abs=0.13)
+    assert (found.smooth > 0.8) == (alpha == 0)
 
 
 def test_an_even_depolarization_is_found_too() -> None:
-    cues, truth = ball(lambda zenith: 0.7 * fresnel.diffuse_dolp(np.cos(zenith), 1.5), 0.0)
-    found = body_law.zeniths(cues.dolp, cues, 1.5)
-    assert np.abs(bias_deg(found.angle, truth, cues.mask)).max() < 0.5
-    assert found.kept == pytest.approx(0.7, abs=0.02)
+    """Less sure than one that falls towards the limb, as both real balls' does: which it is shows in 2° only."""
+    cues, truth = ball(lambda zenith: 0.8 * fresnel.diffuse_dolp(np.cos(zenith), 1.5), 0.0)
+    found = bias_deg(body_law.zeniths(cues.dolp, cues, 1.5).angle, truth, cues.mask)
+    smooth = bias_deg(np.arccos(fresnel.cos_zenith_from_dolp(cues.dolp.astype(float), 1.5)), truth, cues.mask)
+    assert np.abs(found).max() < 2.2 and np.abs(found).mean() < 0.5 * np.abs(smooth).mean()
 
 
-def test_real_balls_lose_most_of_their_bias() -> None:
-    """No one roughness is their law, so some is left; the smooth law reads 68° as 53°."""
+@pytest.mark.parametrize("shading", ["even", "chequered", "flat"])
+@pytest.mark.parametrize("which", MEASURED)
+def test_real_balls_are_read_within_2_degrees(which: str, shading: str) -> None:
+    """From 25° to 70°, where the smooth law reads 68° as 53°; how flat a real rough body looks is not known."""
 
     def measured(zenith: Floats) -> Floats:
-        return np.interp(np.degrees(zenith), *MEASURED) * fresnel.diffuse_dolp(np.cos(zenith), 1.5)
+        return np.interp(np.degrees(zenith), PLACES, MEASURED[which]) * fresnel.diffuse_dolp(np.cos(zenith), 1.5)
 
-    cues, truth = ball(measured, 0.27)
+    cues, truth = ball(measured, 0.27, chequered() if shading == "chequered" else 0.4)
+    if shading == "flat":
+        cosine = np.cos(truth)
+        flatter = body.flatter(cosine, cosine, np.ones_like(cosine), 0.15 + 0 * cosine)
+        cues = replace(cues, radiance=(cues.radiance * flatter[..., None]).astype(np.float32))
     found = bias_deg(body_law.zeniths(cues.dolp, cues, 1.5).angle, truth, cues.mask)
     smooth = bias_deg(np.arccos(fresnel.cos_zenith_from_dolp(cues.dolp.astype(float), 1.5)), truth, cues.mask)
     print(f"bias at {DEGREES}°: {np.round(found, 1)}, by the smooth law {np.round(smooth, 1)}")
-    assert np.abs(found).max() < 4.6 and np.abs(found).mean() < 0.35 * np.abs(smooth).mean()
+    assert np.abs(found).max() < 2.0 and np.abs(found).mean() < 0.25 * np.abs(smooth).mean()
 
 
 def test_a_guide_settles_what_shading_leaves_open() -> None:
