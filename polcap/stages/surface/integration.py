@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats, SurfaceMaps, View
+from polcap.optics.frames import dot
 from polcap.stages.surface.jumps import Jumps, jumps, least_step, widened
 from polcap.stages.surface.multigrid import Multigrid, Nested, conjugate_gradients
 from polcap.stages.surface.pixel_grid import PixelGrid
@@ -251,13 +252,15 @@ def _blocks(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _capped(normal: Floats, mask: NDArray[np.bool_], view: View, steepest: float) -> Floats:
     """Normals turned towards the camera until they lean no more than `steepest` rad."""
     x, y = _slopes_of_rays(mask, view)
-    ray = np.stack([-x, -y, np.ones_like(x)], axis=-1)
+    facing = (normal[:, 2] - x * normal[:, 0] - y * normal[:, 1]) / np.sqrt(1 + x * x + y * y)
+    over = np.flatnonzero(facing < np.cos(steepest) * np.sqrt(dot(normal, normal)))
+    ray = np.stack([-x[over], -y[over], np.ones(len(over))], axis=-1)
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    facing = np.sum(normal * ray, axis=-1, keepdims=True)
-    across = normal - facing * ray
+    across = normal[over] - facing[over, None] * ray
     length = np.linalg.norm(across, axis=-1, keepdims=True)
-    capped = np.cos(steepest) * ray + np.sin(steepest) * across / np.maximum(length, 1e-12)
-    return np.asarray(np.where(facing < np.cos(steepest) * np.hypot(facing, length), capped, normal))
+    capped = normal.copy()
+    capped[over] = np.cos(steepest) * ray + np.sin(steepest) * across / np.maximum(length, 1e-12)
+    return capped
 
 
 def _slopes_of_rays(mask: NDArray[np.bool_], view: View) -> tuple[Floats, Floats]:

@@ -114,9 +114,8 @@ def _lean(on: Bools, beyond: tuple[Floats, ...], slope: tuple[Floats, Floats], l
         begin = (_RIM_PX, 0) if axis else (0, _RIM_PX)
         backward = cv2.dilate(of.astype(np.float32), np.ones(size, np.uint8), anchor=begin)
         forward = cv2.dilate(-of.astype(np.float32), np.ones(size, np.uint8), anchor=(0, 0))
-        rim = np.arctan(np.where(excess > 0, backward[first], forward[second]))
         at = (np.abs(excess) > least) & on[first]
-        total[first] += np.where(at, rim, 0)
+        total[first][at] += np.arctan(np.where(excess[at] > 0, backward[first][at], forward[second][at]))
         links[first] += at
     total, links = (cv2.GaussianBlur(values, (0, 0), _ALONG_PX) for values in (total, links))
     return np.asarray(total / np.maximum(links, 1e-9))

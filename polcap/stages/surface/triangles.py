@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from polcap.errors import ObjectError
 from polcap.images import Floats, Mesh, SurfaceMaps
+from polcap.optics.frames import cross, dot
 from polcap.stages.surface import boundary
 from polcap.stages.surface.backing import Back, closed
 from polcap.stages.surface.integration import equations, problem
@@ -126,11 +127,11 @@ def frames(vertices: Floats, uv: Floats, faces: NDArray[np.int32]) -> tuple[Floa
     """
     one, two = (vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2))
     (u1, v1), (u2, v2) = ((uv[faces[:, k]] - uv[faces[:, 0]]).T for k in (1, 2))
-    area = np.cross(one, two)
+    area = cross(one, two)
     along = (one * v2[:, None] - two * v1[:, None]) * np.sign(u1 * v2 - u2 * v1)[:, None]
     normals = _unit(_gathered(area, faces, len(vertices)))
     tangents = _gathered(along, faces, len(vertices))
-    tangents = _unit(tangents - normals * np.sum(normals * tangents, axis=-1, keepdims=True))
+    tangents = _unit(tangents - normals * dot(normals, tangents)[:, None])
     return normals, np.concatenate([tangents, np.ones((len(vertices), 1))], axis=-1)
 
 
@@ -141,4 +142,4 @@ def _gathered(values: Floats, faces: NDArray[np.int32], count: int) -> Floats:
 
 
 def _unit(vector: Floats) -> Floats:
-    return np.asarray(vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-30))
+    return np.asarray(vector / np.maximum(np.sqrt(dot(vector, vector)), 1e-30)[..., None])
