@@ -104,9 +104,7 @@ def alignment(radiance: AngleStack, found: Alignment) -> Picture:
     return sheet(tiles)
 
 
-def outline(
-    radiance: AngleStack, color: ColorCalibration, object_: ObjectMask, widest: int | None = None
-) -> Picture:
+def outline(radiance: AngleStack, color: ColorCalibration, object_: ObjectMask, widest: int | None = None) -> Picture:
     """The reference shot, darkened outside the mask, with the crop's box."""
     picture = reference(radiance, color, widest)
     outside = area(object_.mask.astype(np.float32), picture.shape[1::-1]) < 0.5

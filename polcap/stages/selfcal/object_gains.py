@@ -28,6 +28,7 @@ from polcap.optics import mueller
 Bools = NDArray[np.bool_]
 
 _KERNELS = (0.04, 0.02, 0.01, 0.007, 0.005)  # of the mean shift, in units of S1/S0
+_KERNEL_REACH = 8.0  # widths; beyond, less one that a climb may have moved, a Gaussian is under 10⁻¹⁰
 _STARTS = 12  # of the mean shift, beside the median and equal gains
 _PEAK_WIDTH = 0.02  # kernel in which peaks are compared, in units of S1/S0
 _CELL_PX = 6  # of the blocks whose means the closure takes
@@ -146,15 +147,28 @@ def facing(light: Floats, usable: Bools) -> Estimate:
 
 def _climb(ratio: Floats, start: Floats) -> list[Floats]:
     """Mean shift over ratios (K, N): where each kernel of _KERNELS ends."""
-    at, found = start, []
+    at, found = start.astype(np.float32), []
     for width in _KERNELS:
+        some, middle = _near(ratio, at, width), at
         for _ in range(50):
-            weight = np.exp(-((ratio - at[:, None]) ** 2).sum(0) / (2 * width**2))
-            before, at = at, ratio @ weight / max(float(weight.sum()), 1e-12) if weight.sum() > 1e-9 else at
-            if np.abs(at - before).max() < 1e-5:
+            if np.abs(at - middle).max() > width:
+                some, middle = _near(ratio, at, width), at
+            away = some - at[:, None]
+            weight = np.exp(np.einsum("kn,kn->n", away, away) * np.float32(-0.5 / width**2))
+            total = float(weight.sum())
+            step = away @ weight / total if total > 1e-9 else np.zeros_like(at)
+            at = at + step
+            if np.abs(step).max() < 1e-5:
                 break
-        found.append(at)
+        found.append(at.astype(np.float64))
     return found
+
+
+def _near(ratio: Floats, at: Floats, width: float) -> Floats:
+    """Those of the ratios (K, N) that a kernel within `width` of a place (K,) gives any weight, float32."""
+    away = ratio - at[:, None]
+    near = np.einsum("kn,kn->n", away, away) < (_KERNEL_REACH * width) ** 2
+    return np.asarray(ratio[:, near], np.float32)
 
 
 def _cells(light: Floats, usable: Bools) -> tuple[Floats, NDArray[np.int_]]:
