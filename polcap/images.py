@@ -104,6 +104,93 @@ class Shot:
 
 
 @dataclass(frozen=True)
+class NoiseLine:
+    """Noise of a sensor at one ISO: variance of a merged picture's pixel = slope · signal + floor, white = 1."""
+
+    iso: float
+    slope: tuple[float, ...]  # (C,)
+    slope_sigma: tuple[float, ...]
+    floor: tuple[float, ...]  # (C,)
+    floor_sigma: tuple[float, ...]
+    electrons_at_white: tuple[float, ...]  # (C,) of one photosite
+    read_noise_electrons: tuple[float, ...]  # (C,) 1σ of one photosite
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Black and white of a sensor, counts; `stated` are the maker's tags."""
+
+    black: tuple[float, ...]  # of the mosaic's phases, row by row
+    black_sigma: tuple[float, ...]
+    black_stated: tuple[float, ...]
+    white: float | None  # where frames saturate; None where none did
+    white_stated: float
+
+
+@dataclass(frozen=True)
+class Linearity:
+    """Signal against exposure time."""
+
+    greatest_deviation: float  # from proportional, relative
+    power: float  # of the exposure time that the signal follows; 1 is linear
+    power_sigma: float
+    darkest: float  # of white
+    brightest: float
+    exposures: int
+
+
+@dataclass(frozen=True)
+class Falloff:
+    """Light of a lens towards the corners: 1 + a r² + b r⁴ + c r⁶, r = 1 in the corners."""
+
+    coefficient: tuple[tuple[float, float, float], ...]  # (C, 3)
+    sigma: tuple[tuple[float, float, float], ...]
+    corner: tuple[float, ...]  # (C,) light there
+    f_number: float | None  # it holds at this aperture and focal length
+    focal_length_mm: float | None
+
+
+@dataclass(frozen=True)
+class Polarizer:
+    """A filter on its ring: its axis stands at sense · stated + zero, from image x towards image up."""
+
+    zero_deg: float
+    zero_sigma_deg: float
+    sense: int  # 1: the ring counts as the picture does; −1: the other way
+    sense_known: bool  # False: assumed, for light of one axis cannot tell
+    extinction: tuple[float, ...]  # (C,) greatest over least transmittance
+    extinction_sigma: tuple[float, ...]
+    frames: int
+
+
+@dataclass(frozen=True)
+class FlashEnergy:
+    """Energy of a flash from pop to pop, relative to its mean."""
+
+    spread: float  # 1σ
+    spread_sigma: float
+    drift_per_pop: float
+    drift_sigma: float
+    pops: int
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What `polcap calibrate` measured of one camera, lens and filter."""
+
+    made: str  # ISO 8601
+    camera: str  # make and model
+    lens: str
+    filter: str  # the polarizer's name, as the user gave it
+    noise: tuple[NoiseLine, ...] = ()
+    levels: Levels | None = None
+    linearity: Linearity | None = None
+    falloff: Falloff | None = None
+    polarizer: Polarizer | None = None
+    flash: FlashEnergy | None = None
+
+
+@dataclass(frozen=True)
 class Capture:
     """A folder of photographs as understood."""
 
@@ -117,10 +204,14 @@ class Capture:
     size_px: tuple[int, int]  # width, height, visible RAW pixels
     chart_frames: tuple[Frame, ...] = ()
     notes: tuple[str, ...] = field(default=(), metadata=NOT_IN_KEY)  # what was assumed, one line each
+    calibration: Calibration | None = None  # of this camera, lens and filter, where the user has measured one
 
     @property
     def angle(self) -> Floats:
-        return np.array([shot.angle for shot in self.shots])  # (K,) rad
+        """(K,) rad, of the polarizer's axis: as stated, or by the ring's calibration."""
+        stated = np.array([shot.angle for shot in self.shots])
+        ring = self.calibration.polarizer if self.calibration is not None else None
+        return stated if ring is None else ring.sense * stated + np.radians(ring.zero_deg)
 
 
 @dataclass(frozen=True)
@@ -162,6 +253,8 @@ class AngleStack:
     offset_px: Floats | None = None  # (K, 2) x, y of this grid, exactly known: reference px − offset = shot px
     curvature: Floats | None = None  # (K, E) of each frame's tone against the reference's; 0: linear, NaN: unknown
     ambient_share: Floats | None = None  # (K,) of all light, there without the flash; NaN where not photographed
+    extinction: Floats | None = None  # (3,) or (1,) extinction ratio of the polarizer, calibrated; None: ideal
+    flash_spread: float | None = None  # 1σ of the flash's energy from pop to pop, calibrated
     blur_px: Floats | None = None  # (K, E) beyond the sharpest frame of the same exposure, 1σ [RAW px]; NaN: unknown
 
 

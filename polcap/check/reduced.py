@@ -73,6 +73,7 @@ def take(capture: Capture, clip: float) -> Taken:
             focal_px=capture.focal_px / step,
             principal_px=((x - (step - 1) / 2) / step, (y - (step - 1) / 2) / step),
             size_px=(width // step, height // step),
+            calibration=capture.calibration and replace(capture.calibration, noise=()),  # of pixels, not of their means
         ),
         step=step,
         clipped=np.stack([[found[id(frame)][1] for frame in shot.frames] for shot in capture.shots]),

@@ -8,6 +8,7 @@ process_command    the path over one capture
 batch_command      over many
 result_commands    export, show, status, report: what is done with a result
 check_command      keep a capture or reshoot it
+calibrate_command  what camera, lens, polarizer and flash are in fact
 doctor_command     what works on this machine
 synth_command      captures of objects that do not exist
 capture_command    shooting with a rig
@@ -23,6 +24,7 @@ import typer
 
 from polcap import __version__, terminal
 from polcap.cli.batch_command import batch
+from polcap.cli.calibrate_command import calibrate
 from polcap.cli.capture_command import capture
 from polcap.cli.check_command import check
 from polcap.cli.doctor_command import doctor
@@ -31,7 +33,7 @@ from polcap.cli.result_commands import export, report, show, status
 from polcap.cli.synth_command import synth
 from polcap.cli.training_commands import evaluate, train
 
-COMMANDS = (process, batch, export, show, status, report, check, doctor, synth, capture, train, evaluate)
+COMMANDS = (process, batch, export, show, status, report, check, calibrate, doctor, synth, capture, train, evaluate)
 app = typer.Typer(
     help="Photographs through a turned polarizer, under a flash: in. A relightable 3-D asset: out.",
     no_args_is_help=True,

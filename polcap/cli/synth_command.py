@@ -31,6 +31,9 @@ def synth(
     law: Annotated[
         Literal["smooth", "rough"], typer.Option(help="Interface that light from inside the body leaves through.")
     ] = "smooth",
+    calibration: Annotated[
+        bool, typer.Option("--calibration", help="Make photographs for `polcap calibrate` instead.")
+    ] = False,
     dataset: Annotated[
         int | None,
         typer.Option(min=1, metavar="N", help="Make N samples of a data set instead (extra [train]); goes on."),
@@ -48,6 +51,13 @@ def synth(
         named = {"seed": seed, "mesh": str(mesh or ""), "material": str(material or ""), "law": law}
         corpus.main(folder, dataset, settings.fill(corpus.Recipe, named, assignments or ()))
         terminal.say(str(folder / "dataset.json"))
+        return
+    if calibration:
+        from polcap.synth import calibration_frames
+
+        set_up = settings.fill(calibration_frames.CalibrationShoot, {"seed": seed}, assignments or ())
+        calibration_frames.write(folder, set_up)
+        terminal.say(str(folder))
         return
     if interreflection and mesh is None:
         raise SettingError("--interreflection is traced between triangles; give the object with --mesh")

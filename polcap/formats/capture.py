@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from polcap.errors import CaptureError
-from polcap.formats import capture_toml, file_name, focal, layouts, photo, raw
+from polcap.formats import calibrations, capture_toml, file_name, focal, layouts, photo, raw
 from polcap.formats.capture_toml import CaptureFile
 from polcap.formats.layouts import Source
 from polcap.images import Capture, Exif, Frame, SensorImage, Shot
@@ -61,6 +61,9 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
     step = 2 if plan.layout == "sensor" else 1  # a plane of a sensor mosaic has half its sides
     width, height = (reference.width or 0) // step, (reference.height or 0) // step
     notes = _notes(plan.layout, plan.others, plan.shots[0][1][0], shots, stated)
+    calibration, told = None, list[str]()
+    if plan.layout != "sensor" and plan.shots[0][1][0].probe.kind == "raw":  # through a ring, the sensor's own counts
+        calibration, told = calibrations.choose(reference, stated.filter, stated.focal_length_mm)
     return Capture(
         name=file_name.safe(stated.name or Path(os.path.realpath(folder)).name),
         folder=str(folder),
@@ -71,7 +74,8 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
         principal_px=((width - 1) / 2, (height - 1) / 2),
         size_px=(width, height),
         chart_frames=tuple(_frame(plan, stated, source, 0.0) for source in plan.others if source.role == "chart"),
-        notes=(*plan.notes, *notes, f"focal length {lens.note}"),
+        notes=(*plan.notes, *notes, *told, f"focal length {lens.note}"),
+        calibration=calibration,
     )
 
 

@@ -40,6 +40,19 @@ def solve(radiance: AngleStack, gains: Gains | None = None):
     return stokes.solve(radiance, scenes.still(shots), gains or scenes.equal(shots), WHOLE, stokes.Settings())
 
 
+def test_light_that_leaks_through_a_poor_polarizer_is_made_up_for():
+    """Extinction 20: I = ½ (1 + c ρ cos 2(θ − φ)) with c = 19/21."""
+    ratio = np.array([20.0, 100.0, np.inf])
+    contrast = np.array([19 / 21, 99 / 101, 1.0])
+    ideal, leaky = seen((0, 45, 90), 0.3, 25), seen((0, 45, 90), 0.3, 25)
+    mean = np.array(0.5)
+    value = mean + (ideal.value - mean) * contrast  # S0 = 1
+    leaky = dataclasses.replace(leaky, value=value.astype(np.float32), extinction=ratio)
+    found, truth = solve(leaky), solve(ideal)
+    assert found.stokes == pytest.approx(truth.stokes, abs=1e-6)
+    assert found.covariance[5] == pytest.approx(truth.covariance[5] / contrast**2, rel=1e-5)
+
+
 @pytest.mark.parametrize("angles", [(0, 45, 90), (0, 60, 120), (0, 45, 90, 135), (10, 37, 101, 140, 170)])
 def test_malus_law_is_inverted(angles):
     found = solve(seen(angles, dolp=0.3, aolp_deg=25)).stokes[:, 4, 4, 1]

@@ -27,7 +27,7 @@ from polcap.errors import CaptureError
 from polcap.images import AngleStack, Capture, Floats, Frame, Quality, SensorImage, Shot, View
 from polcap.optics import sharpness
 from polcap.stages import stage
-from polcap.stages.hdr import budget, combine, links, noise
+from polcap.stages.hdr import budget, combine, falloff, links, noise
 from polcap.stages.hdr.ambient import same_size
 from polcap.stages.hdr.combine import Merged
 from polcap.stages.hdr.planes import Reader
@@ -46,6 +46,9 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_motion_px: Annotated[
         float, Meta(ge=0.0, le=500.0, description="a bracket that moved more is refused [visible RAW px]")
     ] = 60.0
+    falloff: Annotated[
+        bool, Meta(description="take out the lens's falloff, where `polcap calibrate` has measured it")
+    ] = True
 
 
 @stage(version=5)
@@ -92,7 +95,8 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
     middle = (len(shots[0].frames) - 1) // 2  # by the metadata, as in `check`, which reads each frame once
     corners = sharpness.places(read(shots[0].frames[middle]), settings.clip)
     del image  # the reader alone decides how long a frame is held
-    lines = noise.Lines()
+    known = capture.calibration
+    lines = noise.Lines(() if known is None else known.noise)
     stack = _empty(0, 0, 0)
     ratios, curvatures, ambient_shares, tiles = [], [], [], []
     shape = 0, 0, 0
@@ -112,17 +116,21 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
         lines.close()
     scale = 1.0 if full else float(side)
     x, y = capture.principal_px
+    view = View(
+        focal=capture.focal_px / scale,
+        center=((x - (scale - 1) / 2) / scale, (y - (scale - 1) / 2) / scale),
+        scale=scale,
+        known=capture.focal_known,
+    )
+    if known is not None and known.falloff is not None and settings.falloff:
+        for value, variance in zip(stack.value, stack.variance, strict=True):
+            falloff.divide(value, variance, view, capture.size_px, known.falloff)
     return AngleStack(
         value=stack.value,
         variance=stack.variance,
         quality=stack.quality,
         angle=capture.angle,
-        view=View(
-            focal=capture.focal_px / scale,
-            center=((x - (scale - 1) / 2) / scale, (y - (scale - 1) / 2) / scale),
-            scale=scale,
-            known=capture.focal_known,
-        ),
+        view=view,
         exposure_ratio=np.repeat(np.array(ratios), 3 // shape[0], axis=2),  # a monochrome channel stands in three
         exif_ratio=np.array([[links.stated(f, shot.frames[reference]) for f in shot.frames] for shot in shots]),
         ghost_fraction=np.array([np.mean((quality & Quality.GHOST) > 0) for quality in stack.quality]),
@@ -134,6 +142,8 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
         ambient_share=np.array(ambient_shares),
         blur_px=sharpness.frames_blur(tiles, side),
         offset_px=_offsets(shots) if capture.layout == "sensor" else None,
+        extinction=None if known is None or known.polarizer is None else np.array(known.polarizer.extinction),
+        flash_spread=None if known is None or known.flash is None else known.flash.spread,
     )
 
 

@@ -9,13 +9,14 @@ Janesick, Photon Transfer, SPIE 2007; Foi et al., Practical Poissonian-Gaussian 
 fitting for single-image raw-data, IEEE TIP 2008 (flat tiles, robust line).
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.images import Floats, NoiseLine
 from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.stages.hdr.planes import Signals
 
@@ -174,12 +175,14 @@ def _per_edge(expected: Floats, seen: Floats, edge: Floats) -> float:
 
 
 class Lines:
-    """The lines of a capture by ISO, learnt from the first shot that shows it."""
+    """The lines of a capture by ISO, calibrated ones or learnt from the first shot that shows it."""
 
-    def __init__(self) -> None:
+    def __init__(self, calibrated: Iterable[NoiseLine] = ()) -> None:
         self._samples: dict[object, list[Samples]] = {}
-        self._known: dict[object, Noise] = {}
-        self._closed: set[object] = set()
+        self._known: dict[object, Noise] = {
+            one.iso: Noise(np.array(one.slope, np.float32), np.array(one.floor, np.float32)) for one in calibrated
+        }
+        self._closed: set[object] = set(self._known)
 
     def learn(self, iso: object, samples: Samples) -> None:
         """Take in what a frame of an ISO shows, unless that ISO is closed."""

@@ -26,6 +26,7 @@ from polcap.stages.selfcal.ring_zero import RingZero
 
 _PRIOR = {"flash": 0.03, "steady": 0.01, "unknown": 0.03}  # 1σ of a shot's light before anything is measured: makers
 # of studio flashes state 0.5–2 % from pop to pop at full recycling, of LED and HMI lamps under 1 %
+_LEAST_PRIOR = 0.001  # of any light, whatever a calibration says of its flash
 _SURPRISE = 3.0  # σ from the prior beyond which two independent measurements have to agree
 _SOLID_ORDER, _GUESSED_ORDER = 0.25, 0.45  # least score of another order; guessed gains turn AoLPs too
 
@@ -107,7 +108,8 @@ def solve(
         float(blind.sigma.max()),
         object_.border > 0,
     )
-    correction = ring.turn if radiance.light != "one exposure" and _sure(ring, settings) else 0.0
+    turns = radiance.light != "one exposure" and radiance.extinction is None  # calibrated, the ring's zero is known
+    correction = ring.turn if turns and _sure(ring, settings) else 0.0
     angle = radiance.angle + correction
     anchor = object_gains.combined([*_by_law(light, mask, quality, radiance, angle, object_.crop), facing])
     source: Source
@@ -118,7 +120,7 @@ def solve(
     elif greys is not None:
         gain, sigma, source = greys.gain, greys.sigma, "grey patches"
     else:
-        believed = supported(anchor, _PRIOR[radiance.light])
+        believed = supported(anchor, _prior(radiance))
         gain, sigma = (np.repeat(part[:, None], 3, axis=1) for part in (believed.gain, believed.sigma))
         source = "object" if np.isfinite(anchor.sigma).all() else "none"
     own = np.hypot(anchor.sigma, sigma.mean(1))
@@ -167,7 +169,14 @@ def _blind(radiance: AngleStack, greys: GreyPatches | None, facing: Estimate) ->
         return Estimate(np.ones(shots), np.zeros(shots))
     if greys is not None:
         return Estimate(greys.gain.mean(1), greys.sigma.mean(1))
-    return supported(facing, _PRIOR[radiance.light])
+    return supported(facing, _prior(radiance))
+
+
+def _prior(radiance: AngleStack) -> float:
+    """1σ of a shot's light before anything is measured in this capture: of its kind of lamp, or as calibrated."""
+    if radiance.light == "flash" and radiance.flash_spread is not None:
+        return max(2**0.5 * radiance.flash_spread, _LEAST_PRIOR)  # of one pop against another
+    return _PRIOR[radiance.light]
 
 
 def _sure(ring: RingZero, settings: Settings) -> bool:

@@ -21,7 +21,6 @@ _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # the rows of a covar
 Flags = list[list[tuple[Quality, Bits]]]  # of every shot
 
 
-
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The section `stokes` of a settings file."""
 
@@ -83,11 +82,12 @@ def solve(
     for top in range(y0, y1, _ROWS):
         rows = slice(top - y0, min(top + _ROWS, y1) - y0)
         value, variance, seen = _registered(radiance, alignment, gains, flags, (x0, top, x1, rows.stop + y0))
-        solved, doubt = solved_by(weights_of, value, variance)
+        solved, doubt = _undiluted(*solved_by(weights_of, value, variance), radiance.extinction)
         stokes[:, rows], covariance[:, rows] = solved, doubt
         quality[rows] = _judged(solved, doubt, seen, settings)
         if residual is not None:
-            fitted = np.einsum("kj,jhwc->khwc", weights_of, solved)
+            diluted = solved * _contrast(radiance.extinction)[:, None, None]
+            fitted = np.einsum("kj,jhwc->khwc", weights_of, diluted)
             difference = np.abs(value - fitted).sum(-1).mean(0)
             residual[rows] = difference / np.maximum(solved[0].sum(-1), 1e-9)
     mask = object_.mask[y0:y1, x0:x1]
@@ -167,6 +167,23 @@ def _weighted_least_squares(weights_of: Floats, value: Floats, variance: Floats)
         ]
     )
     return stokes.reshape(3, *shape), covariance.reshape(6, *shape)
+
+
+def _contrast(extinction: Floats | None) -> Floats:
+    """(3, C) how much of S0, S1, S2 a polarizer of extinction ratios (C,) shows: 1, c, c; c = (E − 1)/(E + 1)."""
+    ratio = np.array([np.inf]) if extinction is None else np.asarray(extinction, np.float64)
+    contrast = (1 - 1 / ratio) / (1 + 1 / ratio)
+    return np.stack([np.ones_like(contrast), contrast, contrast])
+
+
+def _undiluted(stokes: Floats, covariance: Floats, extinction: Floats | None) -> tuple[Floats, Floats]:
+    """What an ideal polarizer would have shown, where the extinction ratio is known."""
+    if extinction is None:
+        return stokes, covariance
+    up = 1 / _contrast(extinction)  # (3, C)
+    pairs = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+    both = np.stack([up[i] * up[j] for i, j in pairs])
+    return stokes * up[:, None, None], covariance * both[:, None, None]
 
 
 def _judged(stokes: Floats, covariance: Floats, quality: Bits, settings: Settings) -> Bits:

@@ -1,0 +1,63 @@
+"""In: flat frames. Out: how a lens's light falls off towards the corners, 1 in the middle.
+
+The surface is never lit quite evenly: a linear slope of its light is fitted beside the lens's radial law and left out.
+"""
+
+import cv2
+import numpy as np
+
+from polcap.calibrate.photographs import CLIP, Photograph, by_setting
+from polcap.errors import CaptureError
+from polcap.images import Falloff, Floats
+from polcap.optics import sensor
+
+_CELLS = 48  # along the longer side
+_FAINT = 0.02  # of white, mean: noise and black's error count
+
+
+def measure(flat: list[Photograph]) -> Falloff:
+    """1 + a r² + b r⁴ + c r⁶ per channel, r = 1 in the corners, from the brightest setting that does not clip.
+
+    Raises
+    ------
+    CaptureError
+        Every flat frame is clipped or dark.
+    """
+    for group in sorted(by_setting(flat).values(), key=_exposure, reverse=True):
+        images = [one.image() for one in group]
+        if all(sensor.usable(image, CLIP).mean() > 0.999 for image in images):
+            mean = np.mean([sensor.signal(image) for image in images], axis=0)
+            if mean.mean() > _FAINT:
+                break
+    else:
+        raise CaptureError(f"{flat[0].path.parent}: every flat frame is clipped or dark; expose to half of white")
+    coefficient, sigma = _fitted(mean)
+    return Falloff(
+        coefficient=tuple(map(tuple, coefficient.tolist())),
+        sigma=tuple(map(tuple, sigma.tolist())),
+        corner=tuple((1 + coefficient.sum(axis=1)).tolist()),
+        f_number=group[0].exif.f_number,
+        focal_length_mm=group[0].exif.focal_length_mm,
+    )
+
+
+def _exposure(group: list[Photograph]) -> float:
+    return group[0].exif.relative_exposure or 0.0
+
+
+def _fitted(picture: Floats) -> tuple[Floats, Floats]:
+    """(C, 3) coefficients and their 1σ."""
+    h, w = picture.shape[:2]
+    width, height = (max(4, round(_CELLS * side / max(h, w))) for side in (w, h))
+    cells = cv2.resize(np.asarray(picture, np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    cells = cells.reshape(height * width, -1)
+    y, x = np.mgrid[0:height, 0:width].reshape(2, -1) + 0.5
+    x, y = (x / width - 0.5) * w, (y / height - 0.5) * h
+    half = np.hypot(w, h) / 2
+    r2 = (x**2 + y**2) / half**2
+    matrix = np.stack([np.ones_like(x), x / half, y / half, r2, r2**2, r2**3], axis=1)
+    solved, _, _, _ = np.linalg.lstsq(matrix, cells, rcond=None)
+    scatter = cells - matrix @ solved
+    variance = (scatter**2).sum(axis=0) / (len(cells) - 6)
+    doubt = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix))[3:, None] * variance)
+    return (solved[3:] / solved[0]).T, (doubt / solved[0]).T

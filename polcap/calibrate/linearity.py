@@ -1,0 +1,40 @@
+"""In: flat frames by steady light at several exposure times. Out: how far the signal is from proportional to time."""
+
+import numpy as np
+
+from polcap.calibrate.photographs import Photograph, by_setting, center
+from polcap.images import Floats, Linearity
+
+_LEAST = 0.02  # of white: below, black's error counts more than a curve
+
+
+def measure(flat: list[Photograph]) -> Linearity | None:
+    """Of the ISO and aperture with most exposure times; None where there are fewer than three.
+
+    Shutters keep their stated times to a per cent or two: what exceeds that is the sensor's.
+    """
+    groups: dict[tuple[float, float], list[tuple[float, float]]] = {}
+    for (iso, time, aperture), photographs in by_setting(flat).items():
+        for one in photographs:
+            mean, clipped = center(one.image())
+            signal = float(mean.mean())
+            if clipped == 0 and signal > _LEAST and time > 0:
+                groups.setdefault((iso, aperture), []).append((time, signal))
+    best = max(groups.values(), key=lambda group: len({time for time, _ in group}), default=[])
+    times = sorted({time for time, _ in best})
+    if len(times) < 3:
+        return None
+    exposure = np.array(times)
+    light = np.array([np.mean([value for at, value in best if at == time]) for time in times])
+    gain = float(np.exp(np.mean(np.log(light / exposure))))
+    deviation = light / (gain * exposure) - 1
+    power, sigma = _power(np.log(exposure), np.log(light))
+    return Linearity(float(np.abs(deviation).max()), power, sigma, float(light.min()), float(light.max()), len(times))
+
+
+def _power(x: Floats, y: Floats) -> tuple[float, float]:
+    """Slope of a straight line and its 1σ from the scatter about it."""
+    centered = x - x.mean()
+    slope = float(centered @ (y - y.mean()) / (centered @ centered))
+    scatter = y - y.mean() - slope * centered
+    return slope, float(np.sqrt(scatter @ scatter / max(len(x) - 2, 1) / (centered @ centered)))

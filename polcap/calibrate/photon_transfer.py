@@ -1,0 +1,117 @@
+"""In: pairs of flat frames, dark frames. Out: a sensor's noise at each ISO: photons per count, and what is there unlit.
+
+Two frames of the same thing differ by noise alone: dust, lens and uneven pixels drop out. Per channel the variance is
+a straight line over the signal, its slope the inverse of the electrons at white, its height the read noise.
+
+References
+----------
+Janesick, Photon Transfer, SPIE 2007, ch. 5; EMVA Standard 1288, release 4.0, ch. 6.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.calibrate.photographs import CLIP, Photograph, by_setting
+from polcap.errors import CaptureError
+from polcap.images import Floats, NoiseLine, SensorImage
+from polcap.optics import sensor
+
+_TILE = 16  # px of a tile's side: vignetting within one changes nothing
+_LEAST_LEVELS = 2.0  # brightest over darkest tile: a line needs two ends
+
+
+def measure(flat: list[Photograph], dark: list[Photograph]) -> tuple[NoiseLine, ...]:
+    """The line of every ISO that has a pair of flat frames.
+
+    Raises
+    ------
+    CaptureError
+        Flat frames of which no two have the same setting, or whose signals are all alike.
+    """
+    lines = []
+    for iso in sorted({one.setting[0] for one in flat}):
+        points = list(_points([one for one in flat if one.setting[0] == iso]))
+        if not points:
+            continue
+        points += _points([one for one in dark if one.setting[0] == iso])
+        lines.append(_line(iso, points, flat[0]))
+    if flat and not lines:
+        raise CaptureError(
+            f"{flat[0].path.parent}: no two frames have the same ISO, time and aperture; take each twice"
+        )
+    return tuple(lines)
+
+
+def _points(photographs: list[Photograph]) -> Iterator[tuple[Floats, Floats, Floats]]:
+    """Of every pair: signal and variance of its tiles (T, C), and photosites per pixel of each channel (C,)."""
+    for group in by_setting(photographs).values():
+        for first, second in zip(group[::2], group[1::2]):
+            one, two = first.image(), second.image()
+            a, b = sensor.signal(one), sensor.signal(two)
+            if a.shape != b.shape:
+                raise CaptureError(f"{second.path}: {b.shape[1]}×{b.shape[0]} px, {first.path.name} has another size")
+            usable = sensor.usable(one, CLIP) & sensor.usable(two, CLIP)
+            ratio = 1.0
+            lit = a[usable].mean() > 0.01 if usable.any() else False
+            if lit:  # a lamp that flickers; in the dark there is nothing to compare
+                ratio = float(b[usable].mean() / a[usable].mean())
+            yield (*_tiles(a, b, usable, ratio), _photosites(one, a.shape[-1]))
+
+
+def _tiles(a: Floats, b: Floats, usable: NDArray[np.bool_], ratio: float) -> tuple[Floats, Floats]:
+    """With d = b − r a: var d / (1 + r²) over the signal (b + r² a) / (1 + r²) is the sensor's line."""
+    rows, columns = a.shape[0] // _TILE, a.shape[1] // _TILE
+    shape = rows, _TILE, columns, _TILE
+    cut = slice(rows * _TILE), slice(columns * _TILE)
+    whole = usable[cut].reshape(shape).all(axis=(1, 3)).ravel()
+    weight = 1 / (1 + ratio**2)
+    level = ((b + ratio**2 * a)[cut] * weight).reshape(*shape, -1).mean(axis=(1, 3), dtype=np.float64)
+    difference = (b - ratio * a)[cut].astype(np.float64).reshape(*shape, -1)
+    variance = difference.var(axis=(1, 3), ddof=1) * weight
+    channels = a.shape[-1]
+    return level.reshape(-1, channels)[whole], variance.reshape(-1, channels)[whole]
+
+
+def _photosites(image: SensorImage, channels: int) -> Floats:
+    """How many of a mosaic's are binned into one pixel, (C,)."""
+    if image.cfa is None:
+        return np.ones(channels)
+    count = np.bincount(image.cfa.ravel(), minlength=3)
+    return np.asarray(count * image.superpixel**2 / image.cfa.size)
+
+
+def _line(iso: float, points: list[tuple[Floats, Floats, Floats]], where: Photograph) -> NoiseLine:
+    level, variance = (np.concatenate([point[i] for point in points]) for i in (0, 1))
+    if len(level) < 4 or level.max() < _LEAST_LEVELS * max(float(level.min()), 1e-3):
+        raise CaptureError(
+            f"{where.path.parent}: flat frames at ISO {iso:g} are all of one brightness or clipped; take pairs from "
+            "a tenth to nine tenths of white, or dark ones too"
+        )
+    solved = [_solved(level[:, c], variance[:, c], _TILE * _TILE - 1) for c in range(level.shape[1])]
+    slope, floor, slope_sigma, floor_sigma = np.array(solved).T
+    sites = points[0][2]
+    electrons = 1 / (slope * sites)
+    return NoiseLine(
+        iso=iso,
+        slope=tuple(slope.tolist()),
+        slope_sigma=tuple(slope_sigma.tolist()),
+        floor=tuple(np.maximum(floor, 0.0).tolist()),
+        floor_sigma=tuple(floor_sigma.tolist()),
+        electrons_at_white=tuple(electrons.tolist()),
+        read_noise_electrons=tuple((np.sqrt(np.maximum(floor * sites, 0)) * electrons).tolist()),
+    )
+
+
+def _solved(level: Floats, variance: Floats, freedom: int) -> tuple[float, float, float, float]:
+    """Slope, height and their 1σ: a variance of n differences is known to √(2/n) of itself."""
+    matrix = np.stack([level, np.ones_like(level)], axis=1)
+    model = np.full_like(variance, float(variance.mean()))
+    for _ in range(6):
+        weight = freedom / 2 / np.maximum(model, 1e-12) ** 2
+        normal = (matrix * weight[:, None]).T @ matrix
+        slope, floor = np.linalg.solve(normal, (matrix * weight[:, None]).T @ variance)
+        model = np.maximum(slope * level + floor, 0.2 * np.median(variance))
+    doubt = np.sqrt(np.diag(np.linalg.inv(normal)))
+    return float(slope), float(floor), float(doubt[0]), float(doubt[1])

@@ -1,0 +1,100 @@
+"""The user's folder of calibrations: the newest that fits is taken, and nothing that cannot be."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polcap.errors import CaptureError
+from polcap.formats import calibrations, capture
+from polcap.images import Calibration, Exif, Falloff, FlashEnergy, NoiseLine, Polarizer
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "capture"
+EXIF = Exif(make="Polcap", model="Synthetic", lens="Synthetic 60mm", f_number=11.0, focal_length_mm=60.0)
+LINE = NoiseLine(100.0, (3e-5,), (1e-7,), (1e-8,), (1e-9,), (33333.0,), (3.3,))
+RING = Polarizer(1.5, 0.05, -1, True, (300.0, 500.0, 200.0), (10.0, 10.0, 10.0), 24)
+FALLOFF = Falloff(((-0.2, 0.0, 0.0),), ((0.001, 0.001, 0.001),), (0.8,), 11.0, 60.0)
+FLASH = FlashEnergy(0.01, 0.002, 0.0, 0.001, 12)
+KNOWN = Calibration(
+    made="2026-11-22T20:00:00+00:00",
+    camera="Polcap Synthetic",
+    lens="Synthetic 60mm",
+    filter="B+W",
+    noise=(LINE,),
+    falloff=FALLOFF,
+    polarizer=RING,
+    flash=FLASH,
+)
+
+
+@pytest.fixture
+def users(tmp_path, monkeypatch) -> Path:
+    monkeypatch.setenv("POLCAP_CALIB", str(tmp_path / "calib"))
+    return tmp_path / "calib"
+
+
+def test_calibration_comes_back_as_it_went(users):
+    path = calibrations.write(users, KNOWN)
+    assert calibrations.read(path) == KNOWN
+    assert path.name.startswith("2026-11-22")
+
+
+def test_without_a_folder_there_is_none(users):
+    assert calibrations.choose(EXIF, None, None) == (None, [])
+
+
+def test_newest_of_camera_lens_and_filter_is_chosen(users):
+    later = dataclasses.replace(KNOWN, made="2026-12-01T08:00:00+00:00", noise=())
+    for one in (KNOWN, later, dataclasses.replace(later, camera="Other X"), dataclasses.replace(later, lens="Other")):
+        calibrations.write(users, one)
+    assert calibrations.choose(EXIF, None, None)[0] == later
+    assert calibrations.choose(EXIF, "B+W", None)[0] == later
+    assert calibrations.choose(EXIF, "Hoya", None)[0] is None
+    calibrations.write(users, dataclasses.replace(KNOWN, filter="Hoya"))
+    nothing, notes = calibrations.choose(EXIF, None, None)
+    assert nothing is None
+    assert "B+W, Hoya" in notes[0]
+    assert calibrations.choose(EXIF, "Hoya", None)[0].filter == "Hoya"
+    assert calibrations.choose(Exif(), None, None) == (None, [])
+
+
+def test_ring_s_angles_and_notes_reach_the_capture(users):
+    known = dataclasses.replace(KNOWN, lens="")
+    calibrations.write(users, known)
+    read = capture.read(EXAMPLE)
+    assert read.calibration is not None
+    assert np.degrees(read.angle) == pytest.approx([1.5, 1.5 - 45, 1.5 - 90])
+    assert [shot.name for shot in read.shots] == ["0°", "45°", "90°"]
+    assert any("polarizer +1.50° ± 0.05°, mirrored" in note for note in read.notes)
+
+
+def test_falloff_of_another_aperture_is_left_out(users):
+    calibrations.write(users, KNOWN)
+    found, notes = calibrations.choose(dataclasses.replace(EXIF, f_number=4.0), None, None)
+    assert (found.falloff, found.polarizer) == (None, RING)
+    assert "another aperture" in notes[-1]
+
+
+@pytest.mark.parametrize("text", [b"x = ", b"made = 3", b"", b"made = '\xff'"])
+def test_a_foreign_file_is_one_clear_line(users, text):
+    users.mkdir()
+    (users / "a.toml").write_bytes(text)
+    with pytest.raises(CaptureError, match="no calibration"):
+        calibrations.choose(EXIF, None, None)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"noise": (dataclasses.replace(LINE, slope=(-1.0,)),)},
+        {"polarizer": dataclasses.replace(RING, extinction=(0.5, 2.0, 2.0))},
+        {"polarizer": dataclasses.replace(RING, sense=2)},
+        {"falloff": dataclasses.replace(FALLOFF, coefficient=((-1.0, 0.0, 0.0),))},
+        {"flash": dataclasses.replace(FLASH, spread=0.0)},
+    ],
+)
+def test_figures_that_cannot_be_are_refused(users, change):
+    calibrations.write(users, dataclasses.replace(KNOWN, **change))
+    with pytest.raises(CaptureError, match="impossible"):
+        calibrations.choose(EXIF, None, None)

@@ -1,0 +1,31 @@
+"""The lens's falloff is taken out where it is, in the corners as in the middle."""
+
+import numpy as np
+import pytest
+
+from polcap.images import Falloff, NoiseLine, View
+from polcap.stages.hdr import falloff, noise
+
+LAW = Falloff(((-0.25, 0.05, 0.0),) * 3, ((0.0, 0.0, 0.0),) * 3, (0.8, 0.8, 0.8), 11.0, 60.0)
+
+
+def test_light_of_a_falling_off_lens_becomes_even():
+    width, height = 60, 40  # of the grid; the RAW has 120 × 80 px
+    view = View(100.0, ((119 - 1) / 4, (79 - 1) / 4), 2.0)
+    y, x = np.mgrid[0:height, 0:width]
+    r2 = (((2 * x + 0.5) - 59.5) ** 2 + ((2 * y + 0.5) - 39.5) ** 2) / (60**2 + 40**2)
+    light = (1 - 0.25 * r2 + 0.05 * r2**2)[..., None] * np.array([0.5, 1.0, 0.7])
+    value, variance = light.astype(np.float32), (light * 1e-4).astype(np.float32)
+    falloff.divide(value, variance, view, (120, 80), LAW)
+    assert value == pytest.approx(np.broadcast_to([0.5, 1.0, 0.7], value.shape), rel=1e-3)
+    assert variance * light == pytest.approx(1e-4 * value**2, rel=2e-3)  # the error relative to the light is as before
+
+
+def test_calibrated_noise_is_not_learnt_again():
+    line = NoiseLine(100.0, (1e-4,), (0.0,), (2e-8,), (0.0,), (1e4,), (1.4,))
+    lines = noise.Lines([line])
+    rich = noise.Samples(np.full((500, 1), 0.3), np.full((500, 1), 1.0), flat=False)
+    lines.learn(100.0, rich)
+    assert lines.knows(100.0)
+    assert lines.line(100.0, 0.0).slope == pytest.approx([1e-4])
+    assert not lines.knows(200.0)
