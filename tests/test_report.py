@@ -86,3 +86,8 @@ def test_missing_or_foreign_report_is_one_line(tmp_path: Path, text: str | None)
         (tmp_path / "report.json").write_text(text)
     with pytest.raises(StorageError, match="polcap process"):
         report.read(tmp_path)
+
+
+def test_a_list_of_nothing_says_so() -> None:
+    assert labels.text("chart.unused", []) == "none"
+    assert labels.text("chart.unused", [1, 2]) == "1, 2"

@@ -132,6 +132,8 @@ def _plain(value: Any, factor: float) -> str:
     if isinstance(value, (int, float)):
         return number(value * factor)
     if isinstance(value, (list, tuple)):
+        if not value:
+            return "none"
         nested = any(isinstance(item, (list, tuple)) for item in value)
         return (" / " if nested else ", ").join(_plain(item, factor) for item in value)
     if isinstance(value, dict):

@@ -318,7 +318,8 @@ def _tables(about: Mapping[str, Any]) -> Iterator[str]:
         rows = [
             (labels.label(f"{part}.{name}"), labels.text(f"{part}.{name}", value)) for name, value in values.items()
         ]
-        yield f"<div><h3>{escape(labels.part(part))}</h3><div class='scroll'>{html.table(('', ''), rows)}</div></div>"
+        table = html.table(("", ""), rows)
+        yield f'<div><h3>{escape(labels.part(part))}</h3><div class="scroll figures">{table}</div></div>'
     yield "</div><h2>Photographs</h2>" + _shots(about["capture"])
     notes = about["capture"]["notes"]
     if notes:
