@@ -5,13 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from polcap import terminal
+from polcap import __version__, terminal
 from tests.conftest import Command
 
 
 def test_short_help_and_completion_are_there(polcap: Command) -> None:
     text = polcap("-h").stdout
     assert "--version" in text and "--install-completion" in text
+    assert polcap("--version") == (0, f"{__version__}\n", "")
 
 
 def test_with_json_an_error_is_a_document_too(polcap: Command, tmp_path: Path) -> None:

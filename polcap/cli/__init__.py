@@ -57,13 +57,19 @@ def main() -> None:
     app(arguments)
 
 
+def _version(asked: bool) -> None:
+    """Before anything else is asked for."""
+    if asked:
+        print(__version__)
+        raise typer.Exit
+
+
 @app.callback()
 def front(
     context: typer.Context,
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of a failure.")] = False,
-    version: Annotated[bool, typer.Option("--version", help="Print the version and end.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_version, help="Print the version and end.")
+    ] = False,
 ) -> None:
     context.obj = debug
-    if version:
-        print(__version__)
-        raise typer.Exit
