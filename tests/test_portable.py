@@ -1,10 +1,12 @@
 """What holds on any system, shown on this one: no Unix module is needed, and nothing asks the network."""
 
+import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
-from tests.conftest import EXAMPLE, ROOT
+from tests.conftest import EXAMPLE, ROOT, Command
 
 IMPORTS = """
 import importlib, pkgutil, sys
@@ -49,3 +51,28 @@ def test_nothing_at_run_time_asks_the_network(tmp_path: Path) -> None:
     done = python(OFFLINE, "process", EXAMPLE, "--out", tmp_path / "out", "--until", "stokes")
     assert done.returncode == 0 and "network was asked" not in done.stderr, done.stderr
     assert python(OFFLINE, "doctor", "--no-ports").returncode in (0, 2)
+
+
+def test_path_of_500_characters_is_read_and_written(tmp_path: Path, polcap: Command) -> None:
+    """Every part under 256, as file systems have it; the capture's own name is as long as it may be."""
+    capture = tmp_path / ("d" * 150) / ("e" * 150) / ("n" * 250)
+    shutil.copytree(EXAMPLE, capture, ignore=shutil.ignore_patterns("polcap"))
+    done = polcap("process", capture, "--until", "hdr", "--estimator", "analytic")
+    assert done.returncode == 0, done.stderr
+    assert polcap("status", capture / "polcap").stdout.startswith("hdr ")
+
+
+def test_what_is_written_below_a_result_is_short_however_long_the_captures_name(
+    result: Path, tmp_path: Path, polcap: Command
+) -> None:
+    """So that the 260 characters of Windows are left to the folder; the reference page states the number."""
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
+    about = json.loads((copy / "report.json").read_text())
+    about["capture"]["name"] = "n" * 250
+    (copy / "report.json").write_text(json.dumps(about))
+    done = polcap("export", copy, "--gltf", "--obj", "--materialx", "--exr")
+    assert done.returncode == 0, done.stderr
+    longest = max(len(str(file.relative_to(copy))) for file in copy.rglob("*"))
+    page = (ROOT / "docs" / "reference" / "result.md").read_text(encoding="utf-8")
+    assert longest + len("archive/") + len(".4194304.part") <= 120 and "120 characters" in page

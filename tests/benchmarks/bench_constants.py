@@ -1,0 +1,181 @@
+"""What the numbers inside the stages are worth: each halved and doubled, and what becomes of a capture.
+
+    python tests/benchmarks/bench_constants.py RESULT TRUTH.npz [--network]
+
+RESULT is what `polcap process` made of a capture whose true normals TRUTH holds (`normal`, `mask`, on its RAW pixels or
+on the grid that they were merged to). Prints one row per number: mean normal error in degrees for those of `infer`,
+greatest movement of a corner in px against the default for those of `align`, greatest change of a gain in per cent for
+those of `selfcal`, found without the chart. A number that the capture does not feel may matter to another one.
+"""
+
+import argparse
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+
+from polcap import pipeline
+from polcap.config import Config
+from polcap.images import Floats, Network
+from polcap.path import Results
+from polcap.stages import align, infer, selfcal
+from polcap.stages.infer import analytic, azimuth, body_law, learned
+from polcap.stages.selfcal import grey_patches, object_gains
+
+FACTORS = (0.5, 2.0)
+ALIGN = {align: ("_ALIASING_PX2", "_FLOOR_PX", "_MOST_POINTS", "_SURE_LIKENESS", "_MOST_PIXELS")}
+SELFCAL: dict[ModuleType, tuple[str, ...]] = {
+    object_gains: (
+        "_PEAK_WIDTH",
+        "_CELL_PX",
+        "_PARTS",
+        "_ANGLE_ERROR",
+        "_FACING_ERROR",
+        "_OUTLINE_ERROR",
+        "_CLOSURE_ERROR",
+    ),
+}
+GREYS: dict[ModuleType, tuple[str, ...]] = {grey_patches: ("_LIGHT", "_SCATTER")}
+ANALYTIC = {
+    analytic: ("_BLURS_PX", "_SAME", "_MODEL_ERROR_DEG"),
+    azimuth: ("_MOST_PIXELS", "_RIM_PX", "_BLUR_PX", "_CONVEXITY"),
+    body_law: (
+        "_SMOOTH_LIKELIER", "_DEPOLARIZED_LIKELIER", "_PATCHES", "_SAMPLES", "_UNEVEN", "_OUTLINE_PX", "_OUTLINE_SHARE",
+        "_OUTLINE_DEG", "_SHARP",
+    ),
+}  # fmt: skip
+LEARNED: dict[ModuleType, tuple[str, ...]] = {
+    learned: ("_INVERSION", "_DETAIL", "_CELLS", "_BRIGHTEST"),
+    analytic: ("_MODEL_ERROR_DEG", "_SAME"),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("result", type=Path)
+    parser.add_argument("truth", type=Path)
+    parser.add_argument("--network", action="store_true", help="the join's numbers, with the shipped network")
+    options = parser.parse_args()
+    results, _ = pipeline.reopen(options.result)
+    judge = Judge(results, options.truth)
+    print(f"| number | as it is | × {FACTORS[0]:g} | × {FACTORS[1]:g} | |\n| --- | --- | --- | --- | --- |")
+    if options.network:
+        table(LEARNED, Normals(judge, pipeline.load_network(None, None, "cpu", 1)), "° normals, network")
+        return
+    table(ALIGN, Moved(results), "px of a corner")
+    table(SELFCAL, Gained(results, chart=False), "% of a gain, no chart")
+    table(GREYS, Gained(results, chart=True), "% of a gain, chart")
+    table(ANALYTIC, Normals(judge, None), "° normals, analytic")
+
+
+def table(numbers: dict[ModuleType, tuple[str, ...]], measure: Callable[[], float], unit: str) -> None:
+    """A row per number."""
+    usual = measure()
+    for module, names in numbers.items():
+        for name in names:
+            cells = [f"{measured(module, name, factor, measure):.3f}" for factor in FACTORS]
+            where = module.__name__.removeprefix("polcap.stages.")
+            print(f"| `{where}.{name}` | {usual:.3f} | {' | '.join(cells)} | {unit} |", flush=True)
+
+
+def measured(module: ModuleType, name: str, factor: float, measure: Callable[[], float]) -> float:
+    """The measure with one number changed."""
+    usual = getattr(module, name)
+    setattr(module, name, scaled(usual, factor))
+    body_law_tables()
+    try:
+        return measure()
+    finally:
+        setattr(module, name, usual)
+        body_law_tables()
+
+
+def scaled(value: Any, factor: float) -> Any:
+    """A number, or each of several, times a factor; whole ones stay whole."""
+    if isinstance(value, tuple):
+        return tuple(scaled(one, factor) for one in value)
+    return type(value)(value * factor) if isinstance(value, float) else max(1, round(value * factor))
+
+
+def body_law_tables() -> None:
+    """What was kept of tables that depend on the numbers is forgotten."""
+    for name in ("_laws",):
+        getattr(getattr(body_law, name), "cache_clear", lambda: None)()
+
+
+class Judge:
+    """The true normals on the crop of the maps."""
+
+    def __init__(self, results: Results, truth: Path) -> None:
+        self.cues = results.cues.value
+        x0, y0, x1, y1 = results.object_.value.crop
+        with np.load(truth) as maps:
+            normal, mask = maps["normal"].astype(np.float32), maps["mask"].astype(np.float32)
+        height, width = results.radiance.value.value.shape[1:3]
+        grid = [cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) for image in (normal, mask)]
+        self.normal, inside = grid[0][y0:y1, x0:x1], grid[1][y0:y1, x0:x1]
+        self.normal = self.normal / np.maximum(np.linalg.norm(self.normal, axis=-1, keepdims=True), 1e-6)
+        self.inside = (inside == 1) & self.cues.mask
+
+    def error(self, normal: Floats) -> float:
+        """Mean error of normals (H, W, 3), degrees."""
+        cosine = np.clip((self.normal * normal).sum(-1)[self.inside], -1, 1)
+        return float(np.degrees(np.arccos(cosine)).mean())
+
+
+class Normals:
+    """The estimator's mean normal error, degrees."""
+
+    def __init__(self, judge: Judge, network: Network | None) -> None:
+        self.judge, self.network = judge, network
+
+    def __call__(self) -> float:
+        return self.judge.error(infer.estimate(self.judge.cues, self.network, Config().infer).normal)
+
+
+class Moved:
+    """How far the corners of the shots move against the registration as it is, px."""
+
+    def __init__(self, results: Results) -> None:
+        self.radiance, self.color = results.radiance.value, results.color.value
+        height, width = self.radiance.value.shape[1:3]
+        self.corners = np.array([[0, width, 0, width], [0, 0, height, height], [1, 1, 1, 1]], np.float64)
+        self.usual = self.places()
+
+    def places(self) -> Floats:
+        """Corners (K, 2, 4) px on the shots."""
+        moved = align.register(self.radiance, self.color, Config().align).transform @ self.corners
+        return np.asarray(moved[:, :2] / moved[:, 2:])
+
+    def __call__(self) -> float:
+        return float(np.abs(self.places() - self.usual).max())
+
+
+class Gained:
+    """How far gains are from those as they are, per cent."""
+
+    def __init__(self, results: Results, chart: bool) -> None:
+        self.results, self.chart = results, chart
+        self.usual = self.gains()
+
+    def gains(self) -> Floats:
+        """(K, 3)."""
+        color = self.results.color.value
+        return selfcal.solve(
+            self.results.radiance.value,
+            self.results.alignment.value,
+            self.results.object_.value,
+            color if self.chart else replace(color, quads=None),
+            Config().selfcal,
+        ).gain
+
+    def __call__(self) -> float:
+        return float(100 * np.abs(self.gains() / self.usual - 1).max())
+
+
+if __name__ == "__main__":
+    main()
