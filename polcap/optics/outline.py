@@ -15,7 +15,7 @@ from polcap.images import Floats
 from polcap.optics import mueller
 
 SECTORS = 24  # of an outline, 15° each as seen from the object's middle; their scatter is the doubt
-_DOLP_CAP = 0.4  # weights end here: edge-on, a smooth body of index 1.5 emits 0.385 and none more (optics.fresnel)
+DOLP_CAP = 0.4  # weights end here: edge-on, a smooth body of index 1.5 emits 0.385 and none more (optics.fresnel)
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def phasor(at: Rim, angle: Floats) -> tuple[NDArray[Any], Floats]:
         (24,) Σ w, w the DoLP up to what a body has.
     """
     along = polarization(at, angle)
-    weight = np.minimum(np.abs(along), _DOLP_CAP)
+    weight = np.minimum(np.abs(along), DOLP_CAP)
     lying = weight * along / np.maximum(np.abs(along), 1e-12) * np.exp(-2j * at.azimuth)
     real, imaginary = (np.bincount(at.sector, part, SECTORS) for part in (lying.real, lying.imag))
     return real + 1j * imaginary, np.asarray(np.bincount(at.sector, weight, SECTORS), np.float64)

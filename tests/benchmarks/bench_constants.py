@@ -1,6 +1,6 @@
 """What the numbers inside the stages are worth: each halved and doubled, and what becomes of a capture.
 
-    python tests/benchmarks/bench_constants.py RESULT TRUTH.npz [--network]
+    python tests/benchmarks/bench_constants.py RESULT TRUTH.npz [align selfcal analytic network]
 
 RESULT is what `polcap process` made of a capture whose true normals TRUTH holds (`normal`, `mask`, on its RAW pixels or
 on the grid that they were merged to). Prints one row per number: mean normal error in degrees for those of `infer`,
@@ -9,7 +9,7 @@ those of `selfcal`, found without the chart. A number that the capture does not 
 """
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -24,11 +24,12 @@ from polcap.images import Floats, Network
 from polcap.path import Results
 from polcap.stages import align, infer, selfcal
 from polcap.stages.infer import analytic, azimuth, body_law, learned
-from polcap.stages.selfcal import grey_patches, object_gains
+from polcap.stages.selfcal import object_gains
 
 FACTORS = (0.5, 2.0)
+ROOMS = ["align", "selfcal", "analytic", "network"]
 ALIGN = {align: ("_ALIASING_PX2", "_FLOOR_PX", "_MOST_POINTS", "_SURE_LIKENESS", "_MOST_PIXELS")}
-SELFCAL: dict[ModuleType, tuple[str, ...]] = {
+SELFCAL: Mapping[ModuleType, tuple[str, ...]] = {
     object_gains: (
         "_PEAK_WIDTH",
         "_CELL_PX",
@@ -39,16 +40,15 @@ SELFCAL: dict[ModuleType, tuple[str, ...]] = {
         "_CLOSURE_ERROR",
     ),
 }
-GREYS: dict[ModuleType, tuple[str, ...]] = {grey_patches: ("_LIGHT", "_SCATTER")}
 ANALYTIC = {
     analytic: ("_BLURS_PX", "_SAME", "_MODEL_ERROR_DEG"),
     azimuth: ("_MOST_PIXELS", "_RIM_PX", "_BLUR_PX", "_CONVEXITY"),
     body_law: (
-        "_SMOOTH_LIKELIER", "_DEPOLARIZED_LIKELIER", "_PATCHES", "_SAMPLES", "_UNEVEN", "_OUTLINE_PX", "_OUTLINE_SHARE",
+        "_FLAT", "_FLATTEST", "_SMOOTH_LIKELIER", "_DEPOLARIZED_LIKELIER", "_PATCHES", "_UNEVEN", "_RADIUS_SPREAD",
         "_OUTLINE_DEG", "_SHARP",
     ),
 }  # fmt: skip
-LEARNED: dict[ModuleType, tuple[str, ...]] = {
+LEARNED: Mapping[ModuleType, tuple[str, ...]] = {
     learned: ("_INVERSION", "_DETAIL", "_CELLS", "_BRIGHTEST"),
     analytic: ("_MODEL_ERROR_DEG", "_SAME"),
 }
@@ -58,21 +58,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("result", type=Path)
     parser.add_argument("truth", type=Path)
-    parser.add_argument("--network", action="store_true", help="the join's numbers, with the shipped network")
+    parser.add_argument("rooms", nargs="*", default=ROOMS, help=f"of {', '.join(ROOMS)}; all by default")
     options = parser.parse_args()
     results, _ = pipeline.reopen(options.result)
-    judge = Judge(results, options.truth)
     print(f"| number | as it is | × {FACTORS[0]:g} | × {FACTORS[1]:g} | |\n| --- | --- | --- | --- | --- |")
-    if options.network:
-        table(LEARNED, Normals(judge, pipeline.load_network(None, None, "cpu", 1)), "° normals, network")
-        return
-    table(ALIGN, Moved(results), "px of a corner")
-    table(SELFCAL, Gained(results, chart=False), "% of a gain, no chart")
-    table(GREYS, Gained(results, chart=True), "% of a gain, chart")
-    table(ANALYTIC, Normals(judge, None), "° normals, analytic")
+    if "align" in options.rooms:
+        table(ALIGN, Moved(results), "px of a corner")
+    if "selfcal" in options.rooms:
+        table(SELFCAL, Gained(results), "% of a gain, no chart")
+    if "analytic" in options.rooms:
+        table(ANALYTIC, Normals(Judge(results, options.truth), None), "° normals, analytic")
+    if "network" in options.rooms:
+        network = pipeline.load_network(None, None, "cpu", 1)
+        table(LEARNED, Normals(Judge(results, options.truth), network), "° normals, network")
 
 
-def table(numbers: dict[ModuleType, tuple[str, ...]], measure: Callable[[], float], unit: str) -> None:
+def table(numbers: Mapping[ModuleType, tuple[str, ...]], measure: Callable[[], float], unit: str) -> None:
     """A row per number."""
     usual = measure()
     for module, names in numbers.items():
@@ -156,20 +157,19 @@ class Moved:
 
 
 class Gained:
-    """How far gains are from those as they are, per cent."""
+    """How far gains without the chart are from those as they are, per cent."""
 
-    def __init__(self, results: Results, chart: bool) -> None:
-        self.results, self.chart = results, chart
+    def __init__(self, results: Results) -> None:
+        self.results = results
         self.usual = self.gains()
 
     def gains(self) -> Floats:
         """(K, 3)."""
-        color = self.results.color.value
         return selfcal.solve(
             self.results.radiance.value,
             self.results.alignment.value,
             self.results.object_.value,
-            color if self.chart else replace(color, quads=None),
+            replace(self.results.color.value, quads=None),
             Config().selfcal,
         ).gain
 

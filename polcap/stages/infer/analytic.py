@@ -12,8 +12,8 @@ from polcap.optics import brdf, frames, fresnel
 from polcap.stages.infer import azimuth, body_law
 from polcap.stages.infer.body_law import Zeniths
 
-_BLURS_PX = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0)
-_SAME = 2.0  # standard deviations that two averages of the same thing may differ by
+_BLURS_PX = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0)  # in steps of 1.5, in which noise falls by a third
+_SAME = 2.0  # standard deviations that two averages of the same thing may differ by: 95 %
 REACHED = 0.05  # share of known pixels under a Gaussian from which a mean is taken
 _MODEL_ERROR_DEG = 4.0  # interreflection, highlights, unknown index: measured on path-traced objects
 

@@ -23,7 +23,7 @@ from polcap.optics import outline
 _MOST_PIXELS = 90_000  # of the grid the signs are solved on; finer signs follow the coarse direction
 _RIM_PX = 3.0  # anchored band inside the outline, on that grid
 _BLUR_PX = 3.0  # of the depth, for its slope
-_CONVEXITY = 1e-4  # weight of "outward from the outline" everywhere else
+_CONVEXITY = 1e-4  # weight of "outward from the outline" everywhere else: decides only what no neighbour does
 
 
 def resolve(double_angle: Floats, strength: Floats, mask: NDArray[np.bool_]) -> tuple[Floats, Floats]:

@@ -28,7 +28,8 @@ _PRIOR = {"flash": 0.03, "steady": 0.01, "unknown": 0.03}  # 1σ of a shot's lig
 # of studio flashes state 0.5–2 % from pop to pop at full recycling, of LED and HMI lamps under 1 %
 _LEAST_PRIOR = 0.001  # of any light, whatever a calibration says of its flash
 _SURPRISE = 3.0  # σ from the prior beyond which two independent measurements have to agree
-_SOLID_ORDER, _GUESSED_ORDER = 0.25, 0.45  # least score of another order; guessed gains turn AoLPs too
+_SOLID_ORDER, _GUESSED_ORDER = 0.25, 0.45  # least score of another order; guessed gains turn AoLPs too. Set by hand;
+# 32 simulated captures in order were all kept with them (tests/benchmarks/bench_verdicts.py)
 
 Source = Literal["grey patches", "object", "one exposure", "none"]
 

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Quality
 
 _GREYS = (18, 19, 20, 21, 22, 23)  # white to black
-_LIGHT = 4  # the first so many serve for the gains; the darker two are mostly noise
+_LIGHT = 4  # the first so many serve for the gains; the darker two reflect 9 and 3 % and are mostly noise
 _REFLECTANCE = np.array([0.900, 0.591, 0.362, 0.198])  # of the light ones, as the chart's maker states them
-_SCATTER = 0.001  # between patches, of print, registration and light that falls off
+_SCATTER = 0.001  # between patches, of print, registration, falling light: gains by them err by .0009 (decision 6)
 
 
 Box = tuple[slice, slice]

@@ -24,20 +24,21 @@ from numpy.typing import NDArray
 
 from polcap.images import Bits, Floats
 from polcap.optics import mueller
+from polcap.optics.robust import BIWEIGHT, MAD_TO_SIGMA
 
 Bools = NDArray[np.bool_]
 
-_KERNELS = (0.04, 0.02, 0.01, 0.007, 0.005)  # of the mean shift, in units of S1/S0
+_KERNELS = (0.04, 0.02, 0.01, 0.007, 0.005)  # of the mean shift, of S1/S0; ended at .01 a vase errs 12 × (decision 6)
 _KERNEL_REACH = 8.0  # widths; beyond, less one that a climb may have moved, a Gaussian is under 10⁻¹⁰
 _STARTS = 12  # of the mean shift, beside the median and equal gains
-_PEAK_WIDTH = 0.02  # kernel in which peaks are compared, in units of S1/S0
-_CELL_PX = 6  # of the blocks whose means the closure takes
-_PARTS = 12  # of the object, left out one at a time
-_ANGLE_ERROR = np.radians(0.5)  # 1σ of a ring set by hand or motor against its mark
+_PEAK_WIDTH = 0.02  # kernel in which peaks are compared, of S1/S0; set by hand
+_CELL_PX = 6  # of the blocks whose means the closure takes: three times the blur of `smoothed`
+_PARTS = 12  # of the object, left out one at a time: knows a 1σ to a fifth
+_ANGLE_ERROR = np.radians(0.5)  # 1σ of a ring set against its mark: half of what divides it, a degree; assumed
 _LEAST_RIM, _MOST_RIM = 200, 20_000  # pixels of the outline
 _FACING_ERROR = 0.005  # what facing pixels were wrong by on simulated objects, whatever their scatter (decision 20)
 _OUTLINE_ERROR = 0.004  # the same of the outline
-_CLOSURE_ERROR = 0.001  # registration and interpolation
+_CLOSURE_ERROR = 0.001  # registration and interpolation; assumed, the angles' error is most of its doubt (decision 20)
 
 
 @dataclass(frozen=True)
@@ -193,8 +194,8 @@ def _null_vector(rows_at: Callable[[Floats], Floats], angle: Floats, part: NDArr
     for _ in range(4):
         h = _solved(_square(rows, trust))
         residual = np.linalg.norm(rows @ h, axis=1)
-        scale = 1.4826 * float(np.median(residual)) + 1e-9
-        trust = np.maximum(0, 1 - (residual / (4.685 * scale)) ** 2) ** 2
+        scale = MAD_TO_SIGMA * float(np.median(residual)) + 1e-9
+        trust = np.maximum(0, 1 - (residual / (BIWEIGHT * scale)) ** 2) ** 2
     each = [_square(rows[part == p], trust[part == p]) for p in np.unique(part)]
     total = np.sum(each, axis=0)
     without = np.stack([_solved(total - one) for one in each])

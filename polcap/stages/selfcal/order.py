@@ -19,8 +19,8 @@ Bools = NDArray[np.bool_]
 Order = tuple[tuple[int, ...], bool]  # which stated angle each shot has, and whether they count clockwise
 
 _MOST_PERMUTED = 4  # beyond, only exchanges of two shots, and the reversal, are tried
-_CLOSES = 3.0  # factor on the misfit of more than three shots that rules an order out, or in
-_ROUGH = 0.01  # misfit that gains and interpolation leave at most, relative to the light
+_CLOSES = 3.0  # factor on the misfit of more than three shots that rules an order out, or in; set by hand
+_ROUGH = 0.01  # misfit that gains and interpolation leave at most, relative to the light: a flash repeats within 1 %
 
 
 @dataclass(frozen=True)

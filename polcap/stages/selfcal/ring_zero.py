@@ -25,7 +25,6 @@ _DEEPER = (0.1, 0.2)  # further blurs, in radii of the object
 _PLATEAU = 0.3  # radii; the contours of the depth up to here are the last band
 _SMOOTH_PX = 1.0  # of the light, inside the object only
 _LEAST_DEPTH_PX = 1.5  # nearer, a pixel is partly backdrop
-_DOLP_CAP = 0.4  # above, it is no body that polarizes
 _SPREAD_TO_SIGMA = 2.0  # error of the rim's answer over its rms distance from the deeper ones (decision 26)
 _FLOOR = np.radians(0.25)  # where all depths agree (decision 26)
 _LEAST_RIM_PX = 200
@@ -78,7 +77,7 @@ def measure(
     seen = inside & usable & (s0 > 0)
     polarization = np.where(seen, (s1 + 1j * s2) / np.where(seen, s0, 1), 0)
     strength = np.abs(polarization)
-    slope = polarization * np.minimum(1, _DOLP_CAP / np.maximum(strength, 1e-9))
+    slope = polarization * np.minimum(1, outline.DOLP_CAP / np.maximum(strength, 1e-9))
     out = [_outward(cv2.GaussianBlur(mask.astype(np.float32), (0, 0), _RIM_PX))]
     out += [_outward(cv2.GaussianBlur(mask.astype(np.float32), (0, 0), part * radius)) for part in _DEEPER]
     out.append(_outward(cv2.GaussianBlur(np.minimum(depth, _PLATEAU * radius), (0, 0), 2.0)))

@@ -15,6 +15,9 @@ from polcap.optics import fresnel, mueller
 from polcap.optics.warp import covered, warp
 from polcap.stages import stage
 
+_MOST_CONDITION = 50.0  # of three angles 12° apart, where S1 has 26 times the noise of a shot; 0, 45, 90° have 2.4
+_METAL_DOLP, _METAL_DEG, _METAL_SIGMA = 0.05, 10.0, 5.0  # of red and blue: DoLP, and how far their AoLPs part; set by
+# hand, beyond what noise and registration do to a dielectric, and not measured on metals
 _ROWS = 64  # of a block that fits the cache, from resampling to the last bit
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # the rows of a covariance
 
@@ -66,11 +69,11 @@ def solve(
     """
     weights_of = mueller.analyzer(radiance.angle + gains.angle_correction)  # (K, 3)
     condition = np.linalg.cond(weights_of)
-    if condition > 50:
+    if condition > _MOST_CONDITION:
         angles = ", ".join(f"{np.degrees(a):g}°" for a in radiance.angle)
         raise CaptureError(
             f"polarizer angles {angles} do not determine the Stokes parameters (condition {condition:.0f}, "
-            "at most 50); shoot angles spread over 180°, such as 0°, 45°, 90°"
+            f"at most {_MOST_CONDITION:g}); shoot angles spread over 180°, such as 0°, 45°, 90°"
         )
     x0, y0, x1, y1 = object_.crop
     size = y1 - y0, x1 - x0
@@ -215,9 +218,9 @@ def _metal(stokes: Floats, covariance: Floats) -> Floats:
     )
     turned = x0 * y1 - y0 * x1
     spread = np.sqrt(noise0 * strength1**2 + noise1 * strength0**2)
-    enough = np.minimum(strength0, strength1) > 0.05
-    across = strength0 * strength1 * np.float32(np.sin(np.radians(20.0)))  # 10° between the AoLPs
-    return np.asarray(enough & (np.abs(turned) - 5 * spread > across))
+    enough = np.minimum(strength0, strength1) > _METAL_DOLP
+    across = strength0 * strength1 * np.float32(np.sin(2 * np.radians(_METAL_DEG)))
+    return np.asarray(enough & (np.abs(turned) - _METAL_SIGMA * spread > across))
 
 
 def _polarization(stokes: Floats, covariance: Floats) -> tuple[Floats, Floats, Floats, Floats]:
