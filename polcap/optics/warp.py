@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.images import Bits, Floats
 
 Bools = NDArray[np.bool_]
 Box = tuple[int, int, int, int]
@@ -28,7 +28,7 @@ _EDGE = 3  # px around the image, for the taps of its outermost pixels
 _ROWS = 64
 
 
-def warp(image: Floats, transform: Floats, box: Box | None = None, order: Literal[1, 3] = 3) -> Floats:
+def warp(image: Floats | Bits, transform: Floats, box: Box | None = None, order: Literal[1, 3] = 3) -> Floats:
     """image∘transform over `box`, float32.
 
     Parameters

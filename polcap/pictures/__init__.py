@@ -252,7 +252,7 @@ def shrink(picture: Picture, width: int) -> Picture:
     return picture if picture.shape[1] <= width else cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
 
 
-def _no_wider(picture: Floats, width: int) -> tuple[int, int]:
+def _no_wider(picture: NDArray[Any], width: int) -> tuple[int, int]:
     """Width and height of a picture (h, w, …) made no wider than that."""
     tall, wide = picture.shape[:2]
     return (wide, tall) if wide <= width else (width, max(1, round(tall * width / wide)))

@@ -148,7 +148,8 @@ def facing(light: Floats, usable: Bools) -> Estimate:
 
 def _climb(ratio: Floats, start: Floats) -> list[Floats]:
     """Mean shift over ratios (K, N): where each kernel of _KERNELS ends."""
-    at, found = start.astype(np.float32), []
+    at: Floats = start.astype(np.float32)
+    found: list[Floats] = []
     for width in _KERNELS:
         some, middle = _near(ratio, at, width), at
         for _ in range(50):
