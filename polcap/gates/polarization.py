@@ -16,6 +16,7 @@ _LEAST_DOLP = 0.01  # of the outline; there the least index has ten times that
 _SAME_DEG = 5.0  # axes nearer than this are the same angle
 _SURE = 2.5  # σ between sectors of the outline from which a turn is believed
 _CLEAR = 0.8  # concentration of the AoLP about the outline from which a common turn is believed
+_LOPSIDED = 1.4  # so much more uneven may a body be that is polarized as it should all round: its shape, not the light
 _MOST_PIXELS = 6e5  # a larger picture is averaged down
 
 
@@ -115,8 +116,8 @@ def _light_of_body(body: rim.Body, limits: Gates) -> Gate:
     remedy = "darken the room, keep the flash beside the lens, and photograph an ambient frame"
     if body.along < -0.3:
         says = (
-            "the outline is polarized along the contour: light from around is reflected off the object, or all angles "
-            "are off by 90°; the pictures cannot tell these two apart"
+            "the outline is polarized along the contour: light from around is reflected off the object (metal, or "
+            "dark gloss), or all angles are off by 90°; the pictures cannot tell these apart"
         )
         both = f"{remedy}; if it was dark, the ring's mark stood upright at 0°: name the angles as they were, 90° on"
         return Gate("body", "fail", round(body.dolp, 4), limit, says, both, 30.0)
@@ -126,7 +127,8 @@ def _light_of_body(body: rim.Body, limits: Gates) -> Gate:
             "or an object whose outline is no contour of shape"
         )
         return Gate("body", "warn", round(body.dolp, 4), limit, says, remedy, 15.0)
-    if body.one_sided > limits.max_one_sided:
+    lopsided = _LOPSIDED if body.concentration > _CLEAR else 1.0
+    if body.one_sided > limits.max_one_sided * lopsided:
         says = f"one side of the object is lit {body.one_sided:.1f} times more than its mean: light from the side"
         return Gate("body", "warn", round(body.dolp, 4), limit, says, remedy, 10.0)
     if body.dolp < limit:

@@ -118,6 +118,15 @@ def test_light_from_around_is_told(good: SimpleNamespace) -> None:
     assert "90°" in gate.says and "90° on" in gate.remedy  # a ring set upright at 0° looks the same
 
 
+@pytest.mark.parametrize(("uneven", "state"), [(0.47, "pass"), (0.7, "warn")])
+def test_a_lopsided_body_is_no_light_from_the_side(good: SimpleNamespace, uneven: float, state: str) -> None:
+    image = good.stokes
+    across = np.linspace(-1, 1, image.mask.shape[1])[:, None] / (scenes.RADIUS / (image.mask.shape[1] / 2))
+    lit = (image.stokes * np.maximum(1 + uneven * across, 0)).astype(np.float32)
+    gate = judged(changed(good, stokes=replace(image, stokes=lit)))["body"]
+    assert gate.state == state and ("side" in gate.says) == (state == "warn")
+
+
 def test_a_ring_that_was_mended_is_told() -> None:
     clocked = replace(scenes.stack(noise=0.002, angles=scenes.ANGLES + np.radians(4.0)), angle=scenes.ANGLES)
     gate = judged(found(radiance=clocked))["angles"]
