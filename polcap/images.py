@@ -123,8 +123,8 @@ class Levels:
     black: tuple[float, ...]  # of the mosaic's phases, row by row
     black_sigma: tuple[float, ...]
     black_stated: tuple[float, ...]
-    white: float | None  # where frames saturate; None where none did
     white_stated: float
+    white: float | None = None  # where frames saturate; None where none did
 
 
 @dataclass(frozen=True)
@@ -146,8 +146,8 @@ class Falloff:
     coefficient: tuple[tuple[float, float, float], ...]  # (C, 3)
     sigma: tuple[tuple[float, float, float], ...]
     corner: tuple[float, ...]  # (C,) light there
-    f_number: float | None  # it holds at this aperture and focal length
-    focal_length_mm: float | None
+    f_number: float | None = None  # it holds at this aperture and focal length, where the photographs say them
+    focal_length_mm: float | None = None
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from polcap import calibrate
 from polcap.calibrate import photographs
 from polcap.cli import calibrate_command
 from polcap.errors import CaptureError, InputError
-from polcap.formats import dng
+from polcap.formats import calibrations, dng
 from polcap.images import Calibration, Exif
 from polcap.synth import calibration_frames, forward_camera
 from polcap.synth.calibration_frames import CalibrationShoot
@@ -95,6 +95,7 @@ def test_command_writes_a_dated_file_where_process_looks(folder, found, tmp_path
     calibrate_command.calibrate(None, folder, json=True)
     answer = json.loads(capsys.readouterr().out)
     assert Path(answer["file"]).parent == tmp_path / "calib"
+    assert calibrations.read(Path(answer["file"])).camera == found.camera
     assert answer["calibration"]["polarizer"]["zero_deg"] == found.polarizer.zero_deg
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from polcap.errors import CaptureError
 from polcap.formats import calibrations, capture
-from polcap.images import Calibration, Exif, Falloff, FlashEnergy, NoiseLine, Polarizer
+from polcap.images import Calibration, Exif, Falloff, FlashEnergy, Levels, NoiseLine, Polarizer
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "capture"
 EXIF = Exif(make="Polcap", model="Synthetic", lens="Synthetic 60mm", f_number=11.0, focal_length_mm=60.0)
@@ -38,6 +38,13 @@ def test_calibration_comes_back_as_it_went(users):
     path = calibrations.write(users, KNOWN)
     assert calibrations.read(path) == KNOWN
     assert path.name.startswith("2026-11-22")
+
+
+def test_what_was_not_seen_is_left_out_and_comes_back_unknown(users):
+    levels = Levels((512.0,) * 4, (0.1,) * 4, (512.0,) * 4, 15871.0)
+    unsaid = dataclasses.replace(FALLOFF, f_number=None, focal_length_mm=None)
+    bare = dataclasses.replace(KNOWN, levels=levels, falloff=unsaid, polarizer=None)
+    assert calibrations.read(calibrations.write(users, bare)) == bare
 
 
 def test_without_a_folder_there_is_none(users):
