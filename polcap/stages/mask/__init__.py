@@ -35,7 +35,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.7
 
 
-@stage(version=2)
+@stage(version=3)
 def segment(
     radiance: AngleStack,
     alignment: Alignment,

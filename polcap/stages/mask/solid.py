@@ -12,7 +12,7 @@ from polcap.images import Floats
 _SPECK = 0.01  # of the largest part: smaller ones are no parts of their own
 _PINHOLE = 1e-3  # of the mask: smaller holes are dark texture
 _LEEWAY = 1.5  # times the doubt, given for the sharper outline (decision 15)
-_DOUBTED = 0.15  # mean chance of a hole that is a shadowed hollow and no opening
+_DOUBTED = 0.22  # mean chance of a hole that is a shadowed hollow and no opening
 
 
 def body(chance: Floats) -> NDArray[np.bool_]:
