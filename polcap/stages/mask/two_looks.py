@@ -94,6 +94,11 @@ def look(
 def tempered(chance: Floats) -> Floats:
     """Chances as often true as they say: a network that has learned its pictures well is too sure of others.
 
+    Parameters
+    ----------
+    chance
+        (H, W) 0…1, of an answer as the network gives it.
+
     References
     ----------
     Guo et al., On calibration of modern neural networks, ICML 2017.
