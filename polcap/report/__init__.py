@@ -29,6 +29,7 @@ from polcap.images import (
 from polcap.path import Results
 from polcap.report import labels, page, shown
 from polcap.report.whole import Whole
+from polcap.stages.cues import scale_doubt
 from polcap.stages.whitebalance import patches
 
 _COMPARED_PX = 512  # the longest side on which photographs and re-rendering are compared
@@ -108,6 +109,7 @@ def figures(results: Results) -> dict[str, dict[str, Any]]:
             "left_out": None if color.patch_use is None else patches.left_out(color.patch_use),
             "detector_cost": _number(color.cost),
             "metres_per_px": color.metres_per_px,
+            "scale_doubt": scale_doubt(image, color),
             "matrix": _list(color.matrix),
         },
         "alignment": {

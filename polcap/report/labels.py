@@ -17,6 +17,7 @@ LABELS: dict[str, tuple[str, str]] = {
     "chart.left_out": ("Patches that did not serve", ""),
     "chart.detector_cost": ("Detector's cost", ""),
     "chart.metres_per_px": ("Size of a pixel at the chart", "mm"),
+    "chart.scale_doubt": ("All albedos together, 1σ: how deep the chart stands is not known", "%"),
     "chart.matrix": ("Camera channels to linear Rec.709", ""),
     "alignment.shift_px": ("Shift of each shot, right and down", "px"),
     "alignment.turn_deg": ("Turn of each shot", "°"),

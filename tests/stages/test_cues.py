@@ -56,6 +56,20 @@ def test_diffuse_color_is_the_fitted_least_intensity(ball):
     assert np.allclose(ball.diffuse_color[inside], expected, atol=1e-3)
 
 
+def test_albedo_of_a_ball_is_within_what_the_chart_s_depth_leaves_open():
+    """Inverse squares over the visible half, seen and lit along the axis; the chart anywhere beside the ball."""
+    solved = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
+    color = dataclasses.replace(scenes.no_color(), source="chart")
+    doubt = cues.scale_doubt(solved, color)
+    assert cues.scale_doubt(solved, scenes.no_color()) is None
+    radius = np.sqrt(solved.mask.sum() / np.pi) / solved.view.focal
+    ahead = radius * np.sqrt(np.linspace(0, 1, 1001))  # cos θ of places that are spread evenly over the disc
+    rule = (1 - radius / 2) ** 2
+    error = {z: np.mean(((1 - z) / (1 - ahead)) ** 2) * rule - 1 for z in (-radius, 0.0, radius)}
+    assert abs(error[0.0]) < doubt / 2 and doubt < 1.5 * max(map(abs, error.values()))
+    assert error[-radius] > doubt and -2 * doubt < error[radius] < -doubt / 2 and error[-radius] < 2.5 * doubt
+
+
 def test_radiance_of_a_frontal_patch_is_its_albedo(ball):
     """White balance is on S0: ρ T₊(0)² at the middle, plus the highlight's π F0 D/4 (α = ¼: 4 F0)."""
     front = ball.radiance[90, 90]
