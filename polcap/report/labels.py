@@ -30,6 +30,7 @@ LABELS: dict[str, tuple[str, str]] = {
     "gains.disagreement": ("Greatest disagreement of the two", "%"),
     "angles.offset_deg": ("Turn of the polarizer's ring, told by the outline", "°"),
     "angles.offset_sigma_deg": ("1σ of it", "°"),
+    "angles.applied_deg": ("Turn taken out of the angles", "°"),
     "angles.concentration": ("How well polarization follows the outline, 0 … 1", ""),
     "angles.best_order": ("Order of the shots that the outline supports", ""),
     "angles.mirrored": ("Angles counted the other way", ""),

@@ -13,6 +13,7 @@ In the order a sample meets them:
     variants    the network with one thing taken away
     loss        maps against truth
     train       the loop, checkpoints, metrics; arithmetic says in which numbers
+    pack        all that a machine without a network needs to train, in pieces; parted checkpoints
     watch       a look at held-out pictures as training goes
     export      weights -> ONNX
     corpus      the same simulator's pictures and truth as files

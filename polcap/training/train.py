@@ -44,8 +44,11 @@ class Params:
     out: Path = Path("runs/train")  # cache of views, checkpoints, metrics
     minutes: float = 90.0  # training time, all resumed parts together; building the cache is extra
     samples: int | None = None  # the budget in pictures instead, where runs are to be compared
+    piece: float | None = None  # minutes after which this run stops and leaves last.pt, for `resume` to go on from
     resume: bool = False  # go on from out/last.pt
     start: Path | None = None  # ONNX model whose weights are the first; else random ones
+    views: int | None = None  # of each mesh, instead of the preset's
+    procedural: int | None = None  # random shapes, instead of the preset's
     threads: int = 2  # learners on a CPU, each with a batch of its own; one more thread makes the batches
     seed: int = 1
     rate: float = 1e-3  # of Muon; at twice that, weights without norms grew until training burst
@@ -73,7 +76,10 @@ PRESETS = {
 
 
 def main(params: Params) -> Path:
-    """Train; leaves out/model.onnx and last.pt (all that resuming needs), metrics.csv, watch.csv, watch.png."""
+    """Train; leaves last.pt (all that resuming needs), metrics.csv, watch.csv, watch.png, and model.onnx at the end.
+
+    Returns model.onnx, or last.pt where a piece ended before the budget.
+    """
     for name, value, known in (("preset", params.preset, PRESETS), ("variant", params.variant, VARIANTS)):
         if value not in known:
             raise InputError(f"{name} {value!r} is not one of {', '.join(known)}")
@@ -106,8 +112,8 @@ def main(params: Params) -> Path:
     ready = _ahead(simulator, preset, params.seed + run.step, run.samples, progress)
     saved = looked = run.elapsed
     parts: list[dict[str, float]] = []
-    before = time.monotonic()
-    while progress(run.samples) < 1:
+    before = begun = time.monotonic()
+    while progress(run.samples) < 1 and (params.piece is None or before == begun or before - begun < 60 * params.piece):
         parts.append(run.advance([next(ready) for _ in range(learners)], progress(run.samples)))
         now = time.monotonic()
         run.elapsed, before = run.elapsed + now - before, now
@@ -125,6 +131,8 @@ def main(params: Params) -> Path:
             run.save(last)
     ready.close()
     run.save(last)
+    if progress(run.samples) < 1:
+        return last
     ship(last, params.out / "model.onnx", version=params.out.resolve().name)
     return params.out / "model.onnx"
 
@@ -140,7 +148,11 @@ def _keep_memory() -> None:
 def views(params: Params, preset: Preset) -> dict[str, Any]:
     """The cache of training views, traced now where it is not there yet."""
     meshes = sorted((params.data / "meshes" / "train").glob("*.npz"))
-    recipe = gbuffers.Recipe(views=preset.views, procedural=preset.procedural, size=preset.size, seed=11)
+    of_mesh, of_chance = (
+        n if n is not None else usual
+        for n, usual in ((params.views, preset.views), (params.procedural, preset.procedural))
+    )
+    recipe = gbuffers.Recipe(views=of_mesh, procedural=of_chance, size=preset.size, seed=11)
     return gbuffers.cached(params.out / "views", meshes, recipe, mapped=False)  # random access to a map is slow
 
 

@@ -60,7 +60,12 @@ def fit(pixels: Floats) -> tuple[float, float, float]:
     stated, roughness, error = pixels.astype(np.float64)
     terms = np.stack([np.ones_like(stated), np.log(np.maximum(stated, 0.1)), roughness])
     capped = np.minimum(error, GREATEST_DEG)
-    best = minimize(lambda w: float(np.mean(w @ terms + capped * np.exp(-(w @ terms)))), np.array([0.0, 1.0, 0.0]))
+
+    def unlikely(weights: Floats) -> float:
+        log = weights @ terms
+        return float(np.mean(log + capped * np.exp(-log)))
+
+    best = minimize(unlikely, np.array([0.0, 1.0, 0.0]))
     return float(np.exp(best.x[0])), float(best.x[1]), float(best.x[2])
 
 

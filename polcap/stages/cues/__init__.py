@@ -4,7 +4,7 @@ Training calls `compute` and `channels` too, so nothing here may know NumPy from
 namespace comes from the arguments, no cv2, no torch. Pixel axes are (..., H, W).
 """
 
-from math import pi
+from math import hypot, pi, sqrt
 from typing import Any
 
 from array_api_compat import array_namespace
@@ -72,12 +72,12 @@ def scale_doubt(stokes: StokesImage, color: ColorCalibration) -> float | None:
     if color.source not in ("chart", "corners"):
         return None
     radius = _radius(stokes)
-    return 2 * radius * (_BULGE_SPREAD**2 + _CHART_SPREAD**2) ** 0.5 / (1 - _BULGE * radius)
+    return 2 * radius * hypot(_BULGE_SPREAD, _CHART_SPREAD) / (1 - _BULGE * radius)
 
 
 def _radius(stokes: StokesImage) -> float:
     """Radius of a disc of as many pixels as the object, in its distances."""
-    return min(float(stokes.mask.sum() / pi) ** 0.5 / stokes.view.focal, _LARGEST_RADIUS)
+    return min(sqrt(stokes.mask.sum() / pi) / stokes.view.focal, _LARGEST_RADIUS)
 
 
 def polarization(stokes: Any, covariance: Any) -> tuple[Any, Any, Any, Any]:

@@ -120,7 +120,8 @@ def _laws(ior: float) -> _Laws:
     plus, _ = body.leaving(cosine, 0.0, ior)
     shading = np.log(np.maximum(cosine * plus * plus, 1e-4))
     flatter = np.log(body.flatter(cosine, cosine, np.ones_like(cosine), _FLAT + 0 * cosine))
-    return _Laws(*(np.array(column) for column in zip(*rows)), shading, flatter)
+    alphas, keeps, limbs, priors, dolps = (np.array(column) for column in zip(*rows))
+    return _Laws(alphas, keeps, limbs, priors, dolps, shading, flatter)
 
 
 def _even_albedo(angles: Floats, light: Floats, laws: _Laws) -> Floats:
@@ -143,7 +144,7 @@ def _even_albedo(angles: Floats, light: Floats, laws: _Laws) -> Floats:
     much = (middle * flat).sum(axis=1) / np.maximum((flat * flat).sum(axis=1), 1e-9)
     uneven = middle - np.clip(much, 0, _FLATTEST)[:, None] * flat
     misfit = _PATCHES * (uneven**2).mean(axis=1) / (within**2 + _UNEVEN**2)
-    return -misfit / 2 / max(1.0, float(misfit.min()))
+    return np.asarray(-misfit / 2 / max(1.0, float(misfit.min())))
 
 
 def _round_outline(dolp: Floats, cues: Cues, laws: _Laws) -> Floats:
