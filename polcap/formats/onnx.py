@@ -201,6 +201,7 @@ def _open(path: Path, data: bytes, providers: list[str], threads: int) -> Any:
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4  # its failures are raised, and told once
     options.intra_op_num_threads = threads
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # waiting threads sleep
     try:
         return onnxruntime.InferenceSession(data, options, providers=providers)
     except _failures() as error:

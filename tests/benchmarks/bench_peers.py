@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,10 @@ def main() -> None:
     folder = bench_speed.made(given.folder, given.megapixels)
     capture = captures.read(folder)
     stack = hdr.merge(capture, hdr.Settings())
-    rows = [*merging(capture), *registering(stack, folder), *solving(stack)]
+    rows = []
+    for row in chain(solving(stack), registering(stack, folder), merging(capture)):
+        print(table([row]), file=sys.stderr)
+        rows.append(row)
     given.out.write_text(json.dumps([vars(row) for row in rows], indent=1) + "\n")
     print(table(rows))
 
@@ -107,8 +111,23 @@ def solving(stack: AngleStack) -> Iterator[Row]:
         polanalyser.cvtStokesToDoLP(found)
         polanalyser.cvtStokesToAoLP(found)
 
-    gains = Gains.__new__(Gains)
-    object.__setattr__(gains, "gain", np.ones((shots, 3)))
+    one, none = np.ones((shots, 3)), np.zeros((shots, 3))
+    gains = Gains(
+        gain=one,
+        sigma=none,
+        anchor=one,
+        source="none",
+        disagreement=0.0,
+        angle_offset=0.0,
+        angle_offset_sigma=0.0,
+        angle_correction=0.0,
+        concentration=1.0,
+        order=tuple(range(shots)),
+        mirrored=False,
+        anchor_sigma=one[:, 0],
+        grey_slope=1.0,
+        chart_gloss=0.0,
+    )
     whole = ObjectMask(np.ones((height, width), bool), (0, 0, width, height), "user")
     still = np.stack([np.eye(3)] * shots)
     moved = still.copy()

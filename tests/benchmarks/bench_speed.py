@@ -179,7 +179,7 @@ def spent(work: Callable[[], Any]) -> float:
 
 def cpu_of(command: list[str]) -> float:
     before = os.times()
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     after = os.times()
     return after.children_user + after.children_system - before.children_user - before.children_system
 
