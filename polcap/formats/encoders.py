@@ -83,8 +83,8 @@ def encode(texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
         The encoder failed.
     """
     if kind == "png":
-        data = png.encode(texture.pixels)
-        return png.described(data, {"Description": texture.says}) if text else data
+        plain = png.encode(texture.pixels)
+        return png.described(plain, {"Description": texture.says}) if text else plain
     if kind == "ktx2":
         return _ktx2(texture)
     quality = _QUALITY[kind][texture.color]

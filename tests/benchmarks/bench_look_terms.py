@@ -17,10 +17,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from bench_look import LIGHTS, cosine, inner, own, varied
 
 from polcap.images import Floats, SurfaceMaps
 from polcap.optics import brdf, frames, fresnel
-from tests.benchmarks.bench_look import LIGHTS, cosine, inner, own, varied
 
 IOR = 1.5
 
@@ -47,22 +47,22 @@ class Scene:
 
     @property
     def alpha(self) -> Floats:
-        return self.maps.roughness**2
+        return np.asarray(self.maps.roughness**2)
 
     @property
     def base(self) -> Floats:
         """As the asset holds it, unrounded."""
         entry, _ = fresnel.transmission(np.float64(1.0), IOR)
-        return self.maps.diffuse * entry**2 / (1 - self.maps.specular.max(axis=-1, keepdims=True))
+        return np.asarray(self.maps.diffuse * entry**2 / (1 - self.maps.specular.max(axis=-1, keepdims=True)))
 
 
 def two_transmissions(scene: Scene) -> Floats:
     through = fresnel.transmission(scene.light, IOR)[0] * fresnel.transmission(scene.eye, IOR)[0]
-    return scene.maps.diffuse * through[..., None]
+    return np.asarray(scene.maps.diffuse * through[..., None])
 
 
 def what_is_not_reflected(scene: Scene) -> Floats:
-    return scene.base * (1 - schlick(scene).max(axis=-1, keepdims=True))
+    return np.asarray(scene.base * (1 - schlick(scene).max(axis=-1, keepdims=True)))
 
 
 def all_of_it(scene: Scene) -> Floats:
@@ -71,12 +71,12 @@ def all_of_it(scene: Scene) -> Floats:
 
 def exact(scene: Scene) -> Floats:
     share = fresnel.reflection(scene.between, IOR)[0] / fresnel.normal_reflectance(IOR)
-    return scene.maps.specular * share[..., None]
+    return np.asarray(scene.maps.specular * share[..., None])
 
 
 def schlick(scene: Scene) -> Floats:
     f0 = scene.maps.specular
-    return f0 + (1 - f0) * (1 - scene.between[..., None]) ** 5
+    return np.asarray(f0 + (1 - f0) * (1 - scene.between[..., None]) ** 5)
 
 
 def separable(scene: Scene) -> Floats:
@@ -99,7 +99,7 @@ def again(scene: Scene) -> Floats:
     rough = scene.maps.roughness
     z, w = (a * rough + b for a, b in ((-0.572, 1.04), (0.022, -0.04)))
     sent = z + w  # scale −1.04 a + z and bias 1.04 a + w together: F0 = F90 = 1
-    return 1 + scene.maps.specular * (1 / np.clip(sent, 0.1, 1.0)[..., None] - 1)
+    return np.asarray(1 + scene.maps.specular * (1 / np.clip(sent, 0.1, 1.0)[..., None] - 1))
 
 
 STEPS = (

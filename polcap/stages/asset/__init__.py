@@ -110,7 +110,7 @@ def tangent_space(maps: SurfaceMaps, mesh: Mesh) -> Floats:
     whole = np.zeros((*covered.shape, 3), np.float32)
     whole[..., 2] = 1.0
     whole[covered] = _unit(local)
-    return filled(whole, covered)
+    return np.asarray(filled(whole, covered))
 
 
 def _unmixed(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
