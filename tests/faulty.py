@@ -18,6 +18,7 @@ FAULTS = {  # what went wrong: the lines of `polcap check` that tell it; none: t
     "defocus": ("sharpness",),
     "shaken": ("sharpness",),
     "moved": ("alignment",),
+    "pushed": ("alignment",),
     "misfire": ("gains", "energy"),
     "drift": ("energy",),
     "wrong angle": ("angles", "order"),
@@ -62,6 +63,11 @@ def shoot(folder: Path, seed: int, fault: str, width: int) -> str:
         victim = 1 + victim % 2
         shift[victim] = random.choice([-1, 1], 2) * random.uniform(90, 120, 2)
         done = f"shot {victim} by {np.round(shift[victim])} px"
+    elif fault == "pushed":
+        victim, mask = 1 + victim % 2, studio.buffer.mask
+        there = np.roll(mask, 6, 1)[..., None]
+        change = lambda light, k, e: np.where(there, np.roll(light, 6, 1), light) if k == victim else light  # noqa: E731
+        done = f"shot {victim}, the object by 6 px"
     elif fault == "misfire":
         whole = bool(random.integers(2))
         change = lambda light, k, e: light * (0.7 if k == victim and (whole or e == frame) else 1)  # noqa: E731

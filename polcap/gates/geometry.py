@@ -6,6 +6,7 @@ from polcap.config import Config, Gates
 from polcap.gates.gate import Found, Gate, State, at_most, blamed
 from polcap.images import Mesh
 from polcap.optics.sharpness import TILE
+from polcap.stages.align import object_motion
 
 
 def alignment(found: Found, config: Config) -> Gate:
@@ -28,9 +29,25 @@ def alignment(found: Found, config: Config) -> Gate:
         says = f"{names[worst]} moved by {shift[worst]:.1f} px, sure to {doubt[worst]:.2f} only: too little texture"
     figure = round(float(shift[worst]), 3) if np.isfinite(shift[worst]) else None
     if not bad.any():
-        return Gate("alignment", "pass", figure, limit, says, unit="px")
+        pushed = _pushed(found, config)
+        return pushed or Gate("alignment", "pass", figure, limit, says, unit="px")
     remedy = "lock the camera, do not touch the object, and take that shot again"
     return Gate("alignment", "fail", figure, limit, says, remedy, 10.0, blamed(names, bad), "px")
+
+
+def _pushed(found: Found, config: Config) -> Gate | None:
+    """An object that moved while what is around it stood still."""
+    apart = object_motion.measure(found.radiance, found.alignment, found.object_) * found.grid_px
+    limit = config.gates.max_object_shift_px
+    bad = np.nan_to_num(apart) > limit * max(found.grid_px, 1)
+    if not bad.any():
+        return None
+    worst = int(np.nanargmax(apart))
+    says = f"the object moved by {apart[worst]:.1f} px against what is around it in {found.names[worst]}"
+    remedy = "let it stand firm, do not touch it between shots, and take that shot again"
+    return Gate(
+        "alignment", "fail", round(float(apart[worst]), 3), limit, says, remedy, 5.0, blamed(found.names, bad), "px"
+    )
 
 
 def mask(found: Found, limits: Gates) -> Gate:

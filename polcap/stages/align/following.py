@@ -1,0 +1,231 @@
+"""How one shot is laid over another: detail at several scales, and Gauss–Newton steps towards the likest.
+
+References
+----------
+Benhimane & Malis, Homography-based 2D visual tracking and servoing, IJRR 2007 (second-order steps).
+Huber & Ronchetti, Robust Statistics, 2009 (biweight and scale).
+"""
+
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from polcap.images import AngleStack, Floats, Quality
+from polcap.optics.robust import BIWEIGHT, MAD_TO_SIGMA
+from polcap.optics.warp import Spline, Taps, coordinates, warp
+
+_ALIASING_PX2 = 0.05**2  # variance of an edge's place between two samplings of it
+_FLOOR_PX = 0.02  # error that aliasing leaves whatever the noise: the bundled capture's is .016 and .027 (decision 19)
+_MOST_POINTS = 1e5  # of a picture tell of a movement; more, evenly thinned, tell no more (decision 19)
+_MEDIAN_OF = 20000  # points: knows a median to 1 %
+_SIDE = 1024
+LEAST_PIXELS = 30  # that show detail, for two to eight unknowns
+
+
+def fine(radiance: AngleStack, k: int, detail_px: float, step: int) -> "Scale":
+    """Fine structure of one shot's log radiance and its weight."""
+    total = averaged(_summed(radiance.value[k]), step)
+    sigma = np.sqrt(averaged(_summed(radiance.variance[k]), step)) / step
+    some = (slice(None, None, 3),) * 2  # enough for a percentile
+    # The floor keeps the logarithm of a dark background from amplifying its noise.
+    floor = max(float(np.percentile(total[some], 99)) * 0.01, 2 * float(np.median(sigma[some])), 1e-9)
+    level = np.maximum(total, 0)
+    level += np.float32(floor)
+    log = np.log(level)
+    smooth = cv2.GaussianBlur(log, (0, 0), 0.7)  # both shots need one resolution; cubic warps change it
+    smooth -= cv2.GaussianBlur(log, (0, 0), detail_px)
+    sigma /= level
+    sigma *= sigma
+    sigma += np.float32(0.003**2)
+    weight = np.divide(np.float32(1), sigma, out=sigma)
+    clipped = (radiance.quality[k] & Quality.CLIPPED).astype(np.uint8)
+    if clipped.any():
+        clipped = (averaged(clipped.astype(np.float32), step) > 0).astype(np.uint8)
+        reach = int(np.ceil(2 * detail_px)) | 1
+        weight[cv2.dilate(clipped, np.ones((reach, reach), np.uint8)) > 0] = 0
+    return Scale(smooth, weight)
+
+
+class Detail:
+    """One shot's detail at all scales, each made when it is asked for."""
+
+    def __init__(self, whole: "Scale") -> None:
+        self._scales: dict[int, Scale] = {1: whole}
+
+    def edges(self) -> "Detail":
+        """Where edges are and how strong, whichever side is brighter: the root of their strength, about its mean."""
+        whole = self._scales[1]
+        strength = np.sqrt(cv2.GaussianBlur(np.hypot(*whole.gradient), (0, 0), 1.0))
+        return Detail(Scale(np.asarray(strength - strength.mean()), whole.weight))
+
+    def __getitem__(self, shrink: int) -> "Scale":
+        """The same of an image averaged down."""
+        if shrink not in self._scales:
+            whole = self._scales[1]
+            self._scales[shrink] = Scale(averaged(whole.value, shrink), averaged(whole.weight, shrink))
+        return self._scales[shrink]
+
+
+class Scale:
+    """One shot's detail at one scale."""
+
+    def __init__(self, value: Floats, weight: Floats) -> None:
+        self.value = value  # (H, W)
+        self.weight = weight  # (H, W) 1/variance, 0 where clipped
+
+    @cached_property
+    def gradient(self) -> tuple[Floats, Floats]:
+        """Central differences, (H, W) each."""
+        x, y = (
+            cv2.Sobel(self.value, cv2.CV_32F, x, 1 - x, ksize=1, scale=0.5, borderType=cv2.BORDER_REPLICATE)
+            for x in (1, 0)
+        )
+        return np.asarray(x), np.asarray(y)
+
+    @cached_property
+    def spline(self) -> Spline:
+        return Spline(self.value)
+
+
+def _summed(picture: Floats) -> Floats:
+    """Over channels, (H, W)."""
+    return np.asarray(cv2.transform(np.asarray(picture, np.float32), np.ones((1, 3), np.float32)))
+
+
+def averaged(image: Floats, step: int) -> Floats:
+    """Means of step × step blocks; an incomplete last block is dropped."""
+    if step == 1:
+        return image
+    height, width = image.shape[0] // step, image.shape[1] // step
+    whole = image[: height * step, : width * step]
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA))
+
+
+def to_full_grid(transform: Floats, step: float) -> Floats:
+    """A transform of a grid averaged by `step` on the grid it was averaged from (1/step: the other way)."""
+    up = np.array([[step, 0, (step - 1) / 2], [0, step, (step - 1) / 2], [0, 0, 1.0]])
+    return np.asarray(up @ transform @ np.linalg.inv(up))
+
+
+def refine(reference: Detail, shot: Detail, start: Floats, model: str) -> tuple[Floats, float]:
+    """Coarse-to-fine robust Gauss–Newton; the transform and its 1σ at the weighted pixels, px."""
+    transform = start
+    error = np.inf
+    for shrink in (4, 2, 1):
+        height, width = reference[shrink].value.shape
+        level = to_full_grid(transform, 1 / shrink)
+        coarse = "translation" if shrink == 4 and model != "translation" else model
+        compared = _Compared(reference[shrink], shot[shrink], level, coarse)
+        for _ in range(15):
+            step, error = compared.step(level)
+            level = level @ step
+            level = level / level[2, 2]
+            if np.abs(step - np.eye(3))[:2].dot([width / 2, height / 2, 1]).max() < 0.004:
+                break
+        transform = to_full_grid(level, shrink)
+    return transform, float(np.hypot(error, _FLOOR_PX))
+
+
+class _Compared:
+    """The pixels of two shots that tell how one moved against the other."""
+
+    def __init__(self, a: Scale, b: Scale, level: Floats, model: str) -> None:
+        self.shot, self.model = b, model
+        self.height, self.width = a.value.shape
+        self.size = max(self.height, self.width) / 2
+        other = warp(b.weight, level, order=1)
+        weight = 1 / (1 / np.maximum(a.weight, 1e-12) + 1 / np.maximum(other, 1e-12))
+        gx, gy = a.gradient
+        information = weight * (gx * gx + gy * gy)  # what a pixel says of the movement; most say nothing
+        use = (weight > 1e-9) & (information > 0.05 * information.mean())
+        use[:4] = use[-4:] = False
+        use[:, :4] = use[:, -4:] = False
+        at = np.flatnonzero(use)
+        at = at[:: max(1, round(len(at) / _MOST_POINTS))]
+        self.y, self.x = np.divmod(at, self.width)
+        self.value, self.weight = a.value.ravel()[at], weight.ravel()[at].astype(np.float64)
+        self.gradient = gx.ravel()[at], gy.ravel()[at]
+
+    def step(self, transform: Floats) -> tuple[Floats, float]:
+        """One compositional update (3, 3) that brings b∘transform closer to a, and its 1σ, px."""
+        count = len(self.x)
+        if count <= LEAST_PIXELS:
+            return np.eye(3), np.inf
+        u, v = (_rows(c) for c in coordinates(transform, self.x, self.y))
+        warped = self.shot.spline.at(Taps(u, v, (self.height, self.width))).ravel()[:count]
+        u, v = u.astype(np.float32), v.astype(np.float32)
+        bx, by = (
+            cv2.remap(g, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel()[:count]
+            for g in self.shot.gradient
+        )
+        m = transform  # the warped shot's gradient: of a homography this near a similarity, its linear part's
+        gx = (self.gradient[0] + m[0, 0] * bx + m[1, 0] * by) / 2
+        gy = (self.gradient[1] + m[0, 1] * bx + m[1, 1] * by) / 2
+        x, y = (self.x - self.width / 2) / self.size, (self.y - self.height / 2) / self.size
+        columns = [gx, gy]
+        if self.model in ("similarity", "homography"):
+            columns += [gx * x + gy * y, gy * x - gx * y]
+        if self.model == "homography":
+            radial = gx * x + gy * y
+            columns += [gx * x - gy * y, gx * y + gy * x, radial * x, radial * y]
+        jacobian = np.stack(columns).astype(np.float64)
+        difference = (self.value - warped).astype(np.float64)
+        # An edge sampled at two phases differs by a share of its own gradient: aliasing counts as noise,
+        # else the robust loss keeps the edges that happen to agree and pulls the shift to whole pixels.
+        slope = jacobian[0] ** 2 + jacobian[1] ** 2
+        w = 1 / (_ALIASING_PX2 * slope + 1 / self.weight)
+        normalized = np.abs(difference) * np.sqrt(w)
+        scale = MAD_TO_SIGMA * _weighted_median(normalized, w * slope) + 1e-9
+        w = w * np.maximum(0, 1 - (normalized / (BIWEIGHT * scale)) ** 2) ** 2
+        weighted = jacobian * w
+        normal = weighted @ jacobian.T + 1e-12 * np.eye(len(jacobian))
+        p = np.linalg.solve(normal, weighted @ difference)
+        # Neighbouring residuals are correlated by the blur over about ten pixels.
+        residual = weighted * difference
+        spread = np.linalg.inv(normal) @ (residual @ residual.T) @ np.linalg.inv(normal)
+        error = float(np.sqrt(10 * np.trace(spread[:2, :2]) / 2))
+        return _matrix(p, self.width, self.height, self.size), error
+
+
+def _rows(points: Floats) -> Floats:
+    """(N,) as a picture, filled up with zeros: OpenCV's pictures have sides under 32768 px."""
+    out = np.zeros((len(points) // _SIDE + 1, _SIDE))
+    out.ravel()[: len(points)] = points
+    return out
+
+
+def _matrix(p: Floats, width: int, height: int, size: float) -> Floats:
+    """The update's parameters (about the image centre, in units of `size`) as a px transform."""
+    dx, dy, zoom, turn, *rest = [*p, 0.0, 0.0][: max(len(p), 4)]
+    stretch, shear, tilt_x, tilt_y = [*rest, 0.0, 0.0, 0.0, 0.0][:4]
+    local = np.array(
+        [
+            [1 + (zoom + stretch) / size, (shear - turn) / size, dx / size],
+            [(turn + shear) / size, 1 + (zoom - stretch) / size, dy / size],
+            [-tilt_x / size, -tilt_y / size, 1],
+        ]
+    )
+    to_unit = np.array([[1 / size, 0, -width / 2 / size], [0, 1 / size, -height / 2 / size], [0, 0, 1]])
+    return np.asarray(np.linalg.inv(to_unit) @ local @ to_unit)
+
+
+def _weighted_median(value: Floats, weight: Floats) -> float:
+    step = max(1, len(value) // _MEDIAN_OF)
+    value, weight = value[::step], weight[::step]
+    order = np.argsort(value)
+    total = np.cumsum(weight[order])
+    return float(value[order][np.searchsorted(total, total[-1] / 2)])
+
+
+def likeness(reference: Detail, shot: Detail, transform: Floats) -> float:
+    """Weighted zero-mean correlation of the detail of two shots once registered."""
+    a, b = reference[1], shot[1]
+    height, width = a.value.shape
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    warped = cv2.warpPerspective(b.value, transform, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    weight = a.weight * warp(b.weight, transform, order=1)
+    weighted = weight * warped
+    product = float(np.vdot(weighted, a.value))
+    power = float(np.vdot(weight * a.value, a.value)) * float(np.vdot(weighted, warped))
+    return float(product / np.sqrt(power + 1e-30))
