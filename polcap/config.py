@@ -75,6 +75,10 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float,
         Meta(ge=3, le=45, description="of the polarizer away from the stated angle, told by the outline [degrees]"),
     ] = 8.0
+    max_ring_turn_deg: Annotated[
+        float,
+        Meta(gt=0, le=45, description="of the ring's zero, by three angles: it may be a single shot's [degrees]"),
+    ] = 3.0
     max_turn_fit: Annotated[
         float, Meta(gt=0, lt=1, description="misfit of the outline with that turn over without, to be believed [1]")
     ] = 0.68

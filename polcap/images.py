@@ -326,6 +326,9 @@ class Gains:
     anchor_sigma: Floats  # (K,) 1σ of the anchor's channel means
     grey_slope: float  # of ln light over ln reflectance of the chart's light greys: 1 is linear, NaN unknown
     chart_gloss: float  # greatest part of a shot's ratio on the white patch that is the chart's gloss, beyond doubt
+    turned_shots: tuple[int, ...] = ()  # whose angle keeps more than three shots from closing; several: one of them
+    turned: float = 0.0  # rad, true less stated angle of the first of them
+    turned_sigma: float = np.pi / 2  # rad, 1σ
 
 
 @dataclass(frozen=True)

@@ -45,8 +45,7 @@ def of_outline(found: Found, limits: Gates) -> Iterator[Gate]:
         remedy = "is the polarizer on, and did it turn? A metal object has no diffuse polarization"
         yield Gate("polarized", "fail", round(body.dolp, 4), _LEAST_DOLP, says, remedy, 45.0)
         return
-    known = found.gains.source in ("grey patches", "one exposure")
-    of_shots = _angles(rim.turn(band, angle, np.radians(limit)), body, angle, known, found.names, limits)
+    of_shots = _angles(rim.turn(band, angle, np.radians(limit)), body, angle, found.gains, found.names, limits)
     yield _with_ring(of_shots, found.gains, limits)
     yield _light_of_body(body, limits)
     side = rim.side_light(band)
@@ -66,9 +65,10 @@ def ill_posed(found: Found, limits: Gates) -> Gate:
     return at_most("ill-posed", share, limits.max_ill_posed, says, remedy, cost_deg=30 * share)
 
 
-def _angles(found: rim.Turn, body: rim.Body, angle: Floats, known: bool, names: list[str], limits: Gates) -> Gate:
-    """A turn of the ring, or of one shot, that the outline supports beyond its own error."""
+def _angles(found: rim.Turn, body: rim.Body, angle: Floats, gains: Gains, names: list[str], limits: Gates) -> Gate:
+    """A turn of the ring, or of one shot, that outline or closure support beyond their own error."""
     limit = limits.max_turn_deg
+    known = gains.source in ("grey patches", "one exposure")
     common = -float(np.degrees(body.turned))  # an AoLP too small is an angle stated too small
     if (
         abs(common) > limit + 3 * np.degrees(body.turned_sigma)
@@ -78,6 +78,8 @@ def _angles(found: rim.Turn, body: rim.Body, angle: Floats, known: bool, names: 
         says = f"the ring looks turned by {common:+.0f}° ± {np.degrees(body.turned_sigma):.0f}° in all shots"
         remedy = "set the ring's zero to the horizontal, or name the angles it really had"
         return Gate("angles", "fail", round(common, 1), limit, says, remedy, abs(common), unit="°")
+    if gains.turned_shots and abs(np.degrees(gains.turned)) > limit:
+        return _not_closing(gains, names, limit)
     fit = limits.max_turn_fit * (1.0 if known else 0.75)  # guessed gains look like turns
     if found.misfit >= fit or found.sigmas < _SURE or found.shot is None:
         return Gate("angles", "pass", 0.0, limit, "no other angle fits the outline clearly better", unit="°")
@@ -97,17 +99,37 @@ def _angles(found: rim.Turn, body: rim.Body, angle: Floats, known: bool, names: 
     return Gate("angles", "fail", round(degrees, 1), limit, says, remedy, cost, (names[found.shot],), "°")
 
 
+def _not_closing(gains: Gains, names: list[str], limit: float) -> Gate:
+    """One angle of more than three that contradicts the others over the whole object."""
+    degrees, doubt = np.degrees([gains.turned, gains.turned_sigma])
+    shots = tuple(names[k] for k in gains.turned_shots)
+    which = shots[0] if len(shots) == 1 else f"{shots[0]} (or {', '.join(shots[1:])} the other way)"
+    says = f"{which} looks turned by {degrees:+.0f}° ± {doubt:.0f}°: the shots contradict one another"
+    remedy = "set the ring to its mark and take the shot again, or name the angle it really had"
+    return Gate("angles", "fail", round(float(degrees), 1), limit, says, remedy, abs(float(degrees)) / 2, shots, "°")
+
+
 def _with_ring(gate: Gate, gains: Gains, limits: Gates) -> Gate:
-    """The gate of the angles with what was taken out of them before: the turn of the whole ring."""
-    turn, doubt = np.degrees([gains.angle_correction, gains.angle_offset_sigma])
-    if turn == 0 or gate.state != "pass":
+    """The gate of the angles with the turn of the whole ring, taken out of them before where it was sure.
+
+    To three angles a single shot that was turned looks like a smaller turn of all; more would not close.
+    """
+    turn, doubt = np.degrees([gains.angle_offset, gains.angle_offset_sigma])
+    applied = gains.angle_correction != 0
+    noted = len(gains.gain) == 3 and abs(turn) > max(limits.max_ring_turn_deg, _SURE * doubt)
+    if gate.state != "pass" or not (applied or noted):
         return gate
-    says = f"the ring's zero was off by {turn:+.1f}° ± {doubt:.1f}°, which was taken out of all angles"
-    value, cost = round(float(turn), 2), float(doubt)
-    if abs(turn) <= limits.max_turn_deg:
-        return Gate("angles", "pass", value, limits.max_turn_deg, says, cost_deg=cost, unit="°")
+    says = f"the ring's zero was off by {turn:+.1f}° ± {doubt:.1f}°"
+    says += ", which was taken out of all angles" if applied else ""
+    value, limit = round(float(turn), 2), limits.max_ring_turn_deg
+    if not noted and abs(turn) <= limits.max_turn_deg:
+        return Gate("angles", "pass", value, limits.max_turn_deg, says, cost_deg=float(doubt), unit="°")
     remedy = "set the ring's zero to the horizontal, or name the angles it really had"
-    return Gate("angles", "warn", value, limits.max_turn_deg, says, remedy, cost, unit="°")
+    if noted:
+        says += "; of a single shot it would be two to four times as much, and is not mended"
+        remedy += "; where one shot was off its mark, take it again"
+    cost = float(np.hypot(turn / 2 if noted else 0, doubt))
+    return Gate("angles", "warn", value, limit if noted else limits.max_turn_deg, says, remedy, cost, unit="°")
 
 
 def _light_of_body(body: rim.Body, limits: Gates) -> Gate:

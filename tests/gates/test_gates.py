@@ -103,6 +103,20 @@ def test_gains_nobody_knows_cost_degrees(good: SimpleNamespace) -> None:
     assert judged(changed(good, gains=gains))["normal error"].value > 10  # type: ignore[operator]
 
 
+def test_one_angle_that_keeps_four_shots_from_closing_fails(good: SimpleNamespace) -> None:
+    gains = replace(good.gains, turned_shots=(1,), turned=np.radians(15), turned_sigma=np.radians(2))
+    gate = judged(changed(good, gains=gains))["angles"]
+    assert gate.state == "fail" and gate.shots == ("45°",) and "+15° ± 2°" in gate.says
+
+
+@pytest.mark.parametrize(("turn", "state"), [(1.5, "pass"), (5.0, "warn")])
+def test_a_turn_of_the_ring_is_told_though_taken_out(good: SimpleNamespace, turn: float, state: str) -> None:
+    turned, doubt = np.radians([turn, 0.4])
+    gains = replace(good.gains, angle_offset=turned, angle_offset_sigma=doubt, angle_correction=turned)
+    gate = judged(changed(good, gains=gains))["angles"]
+    assert gate.state == state and f"{turn:+.1f}°" in gate.says and "taken out" in gate.says
+
+
 def test_body_that_polarizes_too_little_is_told(good: SimpleNamespace) -> None:
     image = good.stokes
     weak = image.stokes * np.array([1, 0.13, 0.13], np.float32)[:, None, None, None]
@@ -130,8 +144,8 @@ def test_a_lopsided_body_is_no_light_from_the_side(good: SimpleNamespace, uneven
 def test_a_ring_that_was_mended_is_told() -> None:
     clocked = replace(scenes.stack(noise=0.002, angles=scenes.ANGLES + np.radians(4.0)), angle=scenes.ANGLES)
     gate = judged(found(radiance=clocked))["angles"]
-    assert gate.state == "pass" and gate.value == pytest.approx(4.0, abs=0.5)
-    assert "taken out" in gate.says and 0 < gate.cost_deg < 0.7
+    assert gate.state == "warn" and gate.value == pytest.approx(4.0, abs=0.5)  # it may be a single shot's
+    assert "taken out" in gate.says and 0 < gate.cost_deg < 2.5
 
 
 @pytest.mark.parametrize(("name", "value"), [("border", 0.6), ("islands", 0.03), ("holes", 0.06)])

@@ -131,6 +131,23 @@ def test_a_ring_whose_zero_is_off_is_found_and_taken_out(turn):
     assert np.hypot(s1, s2).sum() < 2 * np.radians(1.0) * polarized.sum()
 
 
+@pytest.mark.parametrize("victim", [1, 2])
+def test_one_of_four_angles_that_was_not_what_it_is_called_is_found(victim):
+    stated = np.radians([0.0, 45.0, 90.0, 135.0])
+    turn = np.radians(15.0) * (np.arange(4) == victim)
+    radiance = dataclasses.replace(scenes.stack(noise=0.002, angles=stated + turn), angle=stated)
+    found = selfcal.solve(
+        radiance, scenes.still(4), scenes.ball_object(), scenes.no_color(), selfcal.Settings(correct_ring=False)
+    )
+    assert victim in found.turned_shots
+    assert abs(np.degrees(found.turned)) == pytest.approx(15, abs=3 * np.degrees(found.turned_sigma) + 1)
+    right = scenes.stack(noise=0.002, angles=stated)
+    assert (
+        selfcal.solve(right, scenes.still(4), scenes.ball_object(), scenes.no_color(), selfcal.Settings()).turned_shots
+        == ()
+    )
+
+
 def test_a_ring_set_right_is_left_alone():
     found = solve(scenes.stack(noise=0.002), scenes.no_color())
     assert found.angle_correction == 0

@@ -24,7 +24,19 @@ LEAST_PIXELS = 30  # that show detail, for two to eight unknowns
 
 
 def fine(radiance: AngleStack, k: int, detail_px: float, step: int) -> "Scale":
-    """Fine structure of one shot's log radiance and its weight."""
+    """Fine structure of one shot's log radiance and its weight.
+
+    Parameters
+    ----------
+    radiance
+        The shots, (K, H, W, 3).
+    k
+        Which of them.
+    detail_px
+        Structure coarser than this Gaussian sigma is taken out [px of the averaged grid].
+    step
+        So many pixels a side are averaged first.
+    """
     total = averaged(_summed(radiance.value[k]), step)
     sigma = np.sqrt(averaged(_summed(radiance.variance[k]), step)) / step
     some = (slice(None, None, 3),) * 2  # enough for a percentile
@@ -94,7 +106,7 @@ def _summed(picture: Floats) -> Floats:
 
 
 def averaged(image: Floats, step: int) -> Floats:
-    """Means of step × step blocks; an incomplete last block is dropped."""
+    """Means of step × step blocks of (H, W); an incomplete last block is dropped."""
     if step == 1:
         return image
     height, width = image.shape[0] // step, image.shape[1] // step
@@ -103,13 +115,25 @@ def averaged(image: Floats, step: int) -> Floats:
 
 
 def to_full_grid(transform: Floats, step: float) -> Floats:
-    """A transform of a grid averaged by `step` on the grid it was averaged from (1/step: the other way)."""
+    """A transform (3, 3) of a grid averaged by `step` on the grid it was averaged from (1/step: the other way)."""
     up = np.array([[step, 0, (step - 1) / 2], [0, step, (step - 1) / 2], [0, 0, 1.0]])
     return np.asarray(up @ transform @ np.linalg.inv(up))
 
 
 def refine(reference: Detail, shot: Detail, start: Floats, model: str) -> tuple[Floats, float]:
-    """Coarse-to-fine robust Gauss–Newton; the transform and its 1σ at the weighted pixels, px."""
+    """Coarse-to-fine robust Gauss–Newton; the transform (3, 3) and its 1σ at the weighted pixels, px.
+
+    Parameters
+    ----------
+    reference
+        Where a pixel's weight is 0 it does not count.
+    shot
+        To be laid over it.
+    start
+        (3, 3) reference px → shot px, to begin with.
+    model
+        How it may have moved: translation, similarity or homography.
+    """
     transform = start
     error = np.inf
     for shrink in (4, 2, 1):
@@ -219,7 +243,7 @@ def _weighted_median(value: Floats, weight: Floats) -> float:
 
 
 def likeness(reference: Detail, shot: Detail, transform: Floats) -> float:
-    """Weighted zero-mean correlation of the detail of two shots once registered."""
+    """Weighted zero-mean correlation of the detail of two shots once registered by (3, 3)."""
     a, b = reference[1], shot[1]
     height, width = a.value.shape
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP

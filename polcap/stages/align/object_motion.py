@@ -14,11 +14,15 @@ _DETAIL_PX = 4.0  # as `align.detail_px`
 _MOST_PIXELS = 1.5e6  # a larger picture is averaged down first
 _BEYOND_PX = 6  # around the object, where its outline still tells
 _SURE_LIKENESS = 0.6  # of detail, from which a region is known to have been followed
+_OTHER_LIKENESS = 0.4  # of the object, below which it is another, or too far away
 _ANY_LIKENESS = 0.4  # where nothing moved; noise and an even backdrop have less
 
 
 def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> Floats:
-    """How far the object moved against its surroundings, (K,) px of the grid; NaN where either has no detail."""
+    """How far the object moved against its surroundings, (K,) px of the grid.
+
+    NaN where either has no detail to be followed, infinite where the surroundings are the same and the object is not.
+    """
     shots = len(radiance.angle)
     apart = np.full(shots, np.nan)
     apart[0] = 0.0
@@ -39,7 +43,10 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
         shot = Detail(fine(radiance, k, _DETAIL_PX, step))
         known = to_full_grid(alignment.transform[k], 1 / step)
         found = [_followed(region, shot, known) for region in regions]
-        if all(like > _SURE_LIKENESS for _, like in found):
+        here, around = (like for _, like in found)
+        if around > _SURE_LIKENESS and here < _OTHER_LIKENESS:
+            apart[k] = np.inf
+        elif min(here, around) > _SURE_LIKENESS:
             at = [(transform @ middle)[:2] / (transform @ middle)[2] for transform, _ in found]
             apart[k] = step * float(np.hypot(*(at[0] - at[1])))
     return apart

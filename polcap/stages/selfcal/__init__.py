@@ -5,7 +5,8 @@ whole object it costs normals about 6° on average). A matt grey patch is unpola
 same in every shot (`grey_patches`); where there is no chart, the object itself says what it can (`object_gains`), and
 what is known of lamps and flashes says the rest. One exposure of a polarization mosaic has one gain. The outline tells
 whether the angles are in order and counted the right way (`order`), and by how much the ring's zero is off
-(`ring_zero`); that is applied where it is sure.
+(`ring_zero`); that is applied where it is sure. Of more than three shots their closure tells which angle is wrong
+(`angle_closure`).
 """
 
 from typing import Annotated, Literal
@@ -18,7 +19,7 @@ from polcap.errors import CaptureError
 from polcap.images import Alignment, AngleStack, Bits, ColorCalibration, Floats, Gains, ObjectMask, Quality
 from polcap.optics.warp import warp
 from polcap.stages import stage
-from polcap.stages.selfcal import grey_patches, object_gains, order, ring_zero
+from polcap.stages.selfcal import angle_closure, grey_patches, object_gains, order, ring_zero
 from polcap.stages.selfcal.grey_patches import GreyPatches
 from polcap.stages.selfcal.object_gains import Estimate
 from polcap.stages.selfcal.order import Order
@@ -124,6 +125,9 @@ def solve(
         believed = supported(anchor, _prior(radiance))
         gain, sigma = (np.repeat(part[:, None], 3, axis=1) for part in (believed.gain, believed.sigma))
         source = "object" if np.isfinite(anchor.sigma).all() else "none"
+    closed = angle_closure.measure(
+        *object_gains.cells(light / blind.gain[:, None, None], object_gains.inside(mask, quality)), angle, blind.sigma
+    )
     own = np.hypot(anchor.sigma, sigma.mean(1))
     difference = np.abs(gain.mean(1) / anchor.gain - 1)
     return Gains(
@@ -141,6 +145,9 @@ def solve(
         anchor_sigma=np.where(np.isfinite(anchor.sigma), anchor.sigma, 1.0),
         grey_slope=float("nan") if greys is None else greys.slope,
         chart_gloss=0.0 if greys is None else greys.gloss,
+        turned_shots=closed.shots,
+        turned=closed.angle,
+        turned_sigma=closed.sigma,
     )
 
 

@@ -74,15 +74,15 @@ def closure(light: Floats, usable: Bools, angle: Floats) -> Estimate:
     shots = len(angle)
     if shots < 4:
         return unknown(shots)
-    cells, at = _cells(light, usable)
+    means, at = cells(light, usable)
     if len(at) < 4 * _PARTS:
         return unknown(shots)
     part = (np.arange(len(at)) * _PARTS) // len(at)  # bands of the object, top to bottom
-    cells = (cells / cells.mean(0)).T  # (P, K)
+    means = (means / means.mean(0)).T  # (P, K)
 
     def rows(turned: Floats) -> Floats:
         null = np.linalg.svd(mueller.analyzer(turned).T)[2][3:]  # (K − 3, K), N A = 0
-        return np.asarray(null[None] * cells[:, None])
+        return np.asarray(null[None] * means[:, None])
 
     return _null_vector(rows, angle, part, _CLOSURE_ERROR)
 
@@ -173,7 +173,7 @@ def _near(ratio: Floats, at: Floats, width: float) -> Floats:
     return np.asarray(ratio[:, near], np.float32)
 
 
-def _cells(light: Floats, usable: Bools) -> tuple[Floats, NDArray[np.int_]]:
+def cells(light: Floats, usable: Bools) -> tuple[Floats, NDArray[np.int_]]:
     """Means (K, P) of whole blocks inside the object, and the row of each (P,)."""
     height, width = (size // _CELL_PX for size in usable.shape)
     cut = np.s_[..., : height * _CELL_PX, : width * _CELL_PX]
