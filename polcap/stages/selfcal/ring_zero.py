@@ -75,6 +75,8 @@ def measure(
     light = np.stack([cv2.GaussianBlur((shot * ok).astype(np.float32), (0, 0), _SMOOTH_PX) / share for shot in light])
     s0, s1, s2 = np.einsum("jk,khw->jhw", np.linalg.pinv(mueller.analyzer(angle)), light)
     seen = inside & usable & (s0 > 0)
+    if not seen.any():
+        return UNKNOWN
     polarization = np.where(seen, (s1 + 1j * s2) / np.where(seen, s0, 1), 0)
     strength = np.abs(polarization)
     slope = polarization * np.minimum(1, outline.DOLP_CAP / np.maximum(strength, 1e-9))
