@@ -162,6 +162,8 @@ def _gloss(highlight: Floats, cos_zenith: Floats, cues: Cues) -> tuple[float, fl
     edges = np.cos(np.radians(np.arange(0, 46, 3)))
     which = np.digitize(cos_zenith[usable], edges)
     count = np.bincount(which, minlength=len(edges) + 1)[1 : len(edges)]
+    if not count.any():
+        return roughness, f0
     light = np.bincount(which, highlight[usable], len(edges) + 1)[1 : len(edges)] / np.maximum(count, 1)
     c = (edges[:-1] + edges[1:]) / 2
     weight = np.sqrt(count)

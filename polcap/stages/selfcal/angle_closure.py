@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Floats
 from polcap.optics import mueller
-from polcap.optics.robust import MAD_TO_SIGMA
+from polcap.optics.robust import BIWEIGHT, MAD_TO_SIGMA
 
 _PARTS = 12  # of the object, whose scatter is the doubt
 _LEAST_CELLS = 60
@@ -94,7 +94,7 @@ def _fit(left: Floats, by_gain: Floats, by_turn: Floats, part: NDArray[np.intp],
         found = np.linalg.solve(square + scaled + 1e-12 * np.eye(size), right)
         off = np.linalg.norm(left - columns @ found, axis=0)
         spread = MAD_TO_SIGMA * float(np.median(off)) + 1e-9
-        trust = np.maximum(0, 1 - (off / (4.685 * spread)) ** 2) ** 2
+        trust = np.maximum(0, 1 - (off / (BIWEIGHT * spread)) ** 2) ** 2
     total = float((trust * (left**2).sum(0)).sum())
     gains_alone = np.linalg.solve(square[:-1, :-1] + scaled[:-1, :-1] + 1e-12 * np.eye(size - 1), right[:-1])
     stated = total - float(right[:-1] @ gains_alone)
