@@ -37,8 +37,8 @@ class InDoubt(Exception):
 def fingerprint(asked: Mapping[str, Any], capture: Path, out: Path, given: Iterable[Path]) -> str | None:
     """Digest of a request: options, program, photographs and the `given` files by size and time; None if in doubt."""
     try:
-        photographs, files = _folder(capture, out), [[str(file.absolute()), _stat(file)] for file in given]
-        newest = max((stat[1] for stat in [*photographs.values(), *(stat for _, stat in files)]), default=0)
+        photographs, files = _folder(capture, out), {str(file.absolute()): _stat(file) for file in given}
+        newest = max((stat[1] for stat in [*photographs.values(), *files.values()]), default=0)
         if newest > time.time_ns() - _SETTLED_NS:
             return None
         program = [sys.version, provenance.versions(), _folder(_PACKAGE), _folder(_PACKAGE.parent / "calib")]

@@ -96,10 +96,10 @@ def encode(texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
         options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
     else:
         options = [cv2.IMWRITE_WEBP_QUALITY, quality]
-    done, data = cv2.imencode(f".{kind}", pixels, options)
+    done, coded = cv2.imencode(f".{kind}", pixels, options)
     if not done:
         raise StorageError(f"cannot encode a picture of {pixels.shape} as {kind}; choose png")
-    return bytes(data.tobytes())
+    return bytes(coded.tobytes())
 
 
 def ktx2_encoder() -> str | None:

@@ -57,13 +57,15 @@ def photographs() -> None:
     ]:
         color = whitebalance.measure(radiance, CLASSIC, AUTO, Settings())
         plain = opencv(radiance)
+        assert color.delta_e is not None and color.predicted is not None
         own = (100 * corners_off(color, MARKED[name]), np.nanmean(color.delta_e), np.nanmean(color.predicted))
         there = f"{'not found':>20}" if plain is None else f"{100 * far(plain[0], MARKED[name]):12.2f}{plain[1]:8.2f}"
         print(f"{name:22}{own[0]:10.2f}{own[1]:8.2f}{own[2]:10.2f}{there}", flush=True)
 
 
 def chart_free(pictures: int, first: int) -> None:
-    start, seen, by_polcap, by_opencv, by_cost = time.process_time(), 0, [], 0, 0
+    start, seen, by_opencv, by_cost = time.process_time(), 0, 0, 0
+    by_polcap: list[tuple[str, float]] = []
     for name, picture in itertools.islice(foreign(first), pictures):
         radiance = stack(picture)
         seen += 1
@@ -71,6 +73,7 @@ def chart_free(pictures: int, first: int) -> None:
             print(seen, by_polcap, by_opencv, by_cost, flush=True)
         try:
             color = whitebalance.measure(radiance, CLASSIC, AUTO, Settings())
+            assert color.delta_e is not None
             by_polcap.append((name, float(np.nanmean(color.delta_e))))
         except ChartError:
             pass
@@ -108,8 +111,8 @@ def foreign(first: int) -> Iterator[tuple[str, Floats]]:
     data = Path(DATA or ".")
     textures = [read(path) for path in sorted((data / "materials").glob("*/*/*albedo*.jpg"))]
     probes = sorted((data / "environments").glob("*.hdr"))
-    skies = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., ::-1] for path in probes]
-    board = decode_srgb(cv2.imread(str(REAL / "charts" / "1.png"))[..., ::-1] / 255.0)
+    skies = [picture(path, cv2.IMREAD_UNCHANGED) for path in probes]
+    board = read(REAL / "charts" / "1.png")
     for number in itertools.count(first):
         random = np.random.default_rng([18, number])
         kind = number % 4
@@ -124,7 +127,14 @@ def foreign(first: int) -> Iterator[tuple[str, Floats]]:
 
 
 def read(path: Path) -> Floats:
-    return np.asarray(decode_srgb(cv2.imread(str(path))[..., ::-1] / 255.0))
+    return np.asarray(decode_srgb(picture(path) / 255.0))
+
+
+def picture(path: Path, flags: int = cv2.IMREAD_COLOR) -> Floats:
+    """(H, W, 3) as stored, red first."""
+    found = cv2.imread(str(path), flags)
+    assert found is not None, path
+    return np.asarray(found)[..., ::-1]
 
 
 def swatches(textures: list[Floats], random: np.random.Generator) -> Floats:

@@ -24,10 +24,11 @@ from numpy.typing import NDArray
 from polcap.config import Gates
 from polcap.formats import png
 from polcap.gates import polarization
-from polcap.images import AngleStack, Floats, GBuffer, ObjectMask
+from polcap.images import AngleStack, Floats, ObjectMask
 from polcap.optics import fresnel, mueller
 from polcap.stages import stokes
 from polcap.synth import scene_materials
+from polcap.synth.render import Seen
 from polcap.synth.scenes import random_scene
 from polcap.synth.shooting import Shoot, Studio
 from tests import scenes
@@ -90,8 +91,8 @@ def main() -> None:
         across, jumps, error = (
             np.median([getattr(one, of) for one in each]) for of in ("flipped", "jumps", "normal_deg")
         )
-        right = sum(right for right, _ in rows[name])
-        print(f"| {name} | {len(each)} | {across:.0%} | {jumps:.1%} | {error:.0f}° | {right} |")
+        count = sum(right for right, _ in rows[name])
+        print(f"| {name} | {len(each)} | {across:.0%} | {jumps:.1%} | {error:.0f}° | {count} |")
     every = [right for name, row in rows.items() for right, _ in row if "neither" not in name]
     print(f"\nright {sum(every)} of {len(every)}")
     if given.picture:
@@ -169,7 +170,7 @@ def _spoken(image: Any) -> dict[str, str]:
     found = SimpleNamespace(
         stokes=image, radiance=SimpleNamespace(angle=ANGLE), gains=scenes.equal(), names=["0°", "45°", "90°"]
     )
-    lines = [*polarization.of_outline(found, Gates()), polarization.ill_posed(found, Gates())]  # type: ignore[arg-type]
+    lines = [*polarization.of_outline(found, Gates()), polarization.ill_posed(found, Gates())]
     return {line.name: line.says for line in lines if line.state in ("fail", "warn")}
 
 
@@ -185,12 +186,14 @@ def _dressed(material: Any, albedo: float | None, rough: float | None) -> Any:
 def _probe(seed: int, turn: float) -> Floats:
     """A light probe (64, 128, 3) of mean 1, latitude down and longitude across, turned about the vertical."""
     files = sorted((Path(os.environ["POLCAP_DATA"]) / "environments").glob("*.hdr"))
-    picture = cv2.imread(str(files[seed % len(files)]), cv2.IMREAD_UNCHANGED)[..., ::-1]
+    stored = cv2.imread(str(files[seed % len(files)]), cv2.IMREAD_UNCHANGED)
+    assert stored is not None
+    picture = np.asarray(stored)[..., ::-1]
     small = cv2.resize(np.minimum(picture, np.percentile(picture, 99.9)), (128, 64), interpolation=cv2.INTER_AREA)
     return np.roll(small / small.mean(), int(turn / (2 * np.pi) * 128), 1)
 
 
-def _around(buffer: GBuffer, coat: Any, probe: Floats, metal: complex | None) -> Floats:
+def _around(buffer: Seen, coat: Any, probe: Floats, metal: complex | None) -> Floats:
     """Stokes parameters (3, H, W, 3) under the probe: mirrored light, spread by one lobe, and body light."""
     normal = buffer.normal.astype(np.float64)
     diffuse, specular, roughness, ior = scene_materials.evaluate(coat, buffer.position, buffer.facing)
@@ -227,7 +230,7 @@ def _spread(probe: Floats, sigma: float) -> Floats:
     width = probe.shape[1]
     round_ = np.concatenate([probe, probe, probe], axis=1)
     pixels = max(float(sigma) * width / (2 * np.pi), 0.5)
-    return cv2.GaussianBlur(round_.astype(np.float32), (0, 0), pixels)[:, width : 2 * width]
+    return np.asarray(cv2.GaussianBlur(round_.astype(np.float32), (0, 0), pixels))[:, width : 2 * width]
 
 
 def _seen(probe: Floats, direction: Floats) -> Floats:
@@ -235,13 +238,8 @@ def _seen(probe: Floats, direction: Floats) -> Floats:
     height, width = probe.shape[:2]
     row = np.arccos(np.clip(direction[..., 1], -1, 1)) / np.pi * height - 0.5
     column = (np.arctan2(direction[..., 0], direction[..., 2]) / (2 * np.pi) % 1) * width - 0.5
-    return cv2.remap(
-        probe.astype(np.float32),
-        column.astype(np.float32),
-        row.astype(np.float32),
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_WRAP,
-    )
+    places = column.astype(np.float32), row.astype(np.float32)
+    return np.asarray(cv2.remap(probe.astype(np.float32), *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
 
 
 def _normal_error(ratio: Any, normal: Floats, mask: NDArray[np.bool_]) -> float:

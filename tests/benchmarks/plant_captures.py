@@ -6,7 +6,7 @@ Kind "" is a good capture: ordinary jitter of light and angles, ordinary nudges.
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -112,18 +112,18 @@ def shoot(folder: Path, seed: int, kind: str, width: int) -> dict[str, Any]:
 
 def _good(seed: int, kind: str, width: int, random: Random) -> Planned:
     angles = _angles(seed, random)
-    bracket = ("time", "flash", "iso", "time", "aperture")[seed // 3 % 5]
+    bracket: Literal["time", "flash", "iso", "aperture"] = ("time", "flash", "iso", "time", "aperture")[seed // 3 % 5]
     how = Shoot(
         seed=seed,
         width=width,
         height=width * 3 // 8 * 2,
         samples=1,
         angles_deg=angles,
-        bracket=bracket,  # type: ignore[arg-type]
+        bracket=bracket,
         gain_jitter=0.003 if bracket == "time" else 0.01,  # steady lamps repeat better than flashes
-        cfa=("RGGB", "BGGR", "GRBG", "GBRG")[seed // 2 % 4],  # type: ignore[arg-type]
+        cfa=("RGGB", "BGGR", "GRBG", "GBRG")[seed // 2 % 4],
     )
-    scene = random_scene(seed, ("bumps", "clusters", "vase")[int(random.integers(3))])  # type: ignore[arg-type]
+    scene = random_scene(seed, ("bumps", "clusters", "vase")[int(random.integers(3))])
     look = LOOKS[int(random.integers(5))]
     if look != "as drawn":
         scene = msgspec.structs.replace(scene, coat=_dressed(scene.coat, look))
@@ -135,7 +135,7 @@ def _good(seed: int, kind: str, width: int, random: Random) -> Planned:
     elif chart == "corner":
         up = float(random.choice([-1, 1]))
         scene = msgspec.structs.replace(scene, chart=Chart(center=(0.146, 0.108 * up, -0.7)))
-    scene = msgspec.structs.replace(scene, law=("smooth", "rough")[int(random.integers(2))])  # type: ignore[arg-type]
+    scene = msgspec.structs.replace(scene, law=("smooth", "rough")[int(random.integers(2))])
     shots = len(angles)
     actual = (np.array(angles) + how.angle_error_deg * random.normal(size=shots)).tolist()
     shifts = random.uniform(-1, 1, (shots, 2)) * how.nudge_px
