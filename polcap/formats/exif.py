@@ -70,7 +70,7 @@ def _parts(file: io.BytesIO) -> Iterator[tuple[str, io.BytesIO]]:
             if at >= 4:
                 (length,) = struct.unpack_from(">I", top, at - 4)
                 yield prefix, io.BytesIO(top[at + 4 : at - 4 + length])
-    elif head[:4] == b"\0MRM":  # in a block among the first
+    elif head[:4] == b"\0MRM" and len(head) >= 8:  # in a block among the first
         (length,) = struct.unpack_from(">I", head, 4)
         file.seek(8)
         top = file.read(min(length, 1 << 24))

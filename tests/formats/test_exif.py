@@ -11,6 +11,7 @@ from headers import DATA, EXIF_IFD, SUB_IFDS, needs_data
 
 from polcap.errors import DecodeError
 from polcap.formats import exif, probe, sniff
+from polcap.images import Exif
 
 PHOTO = headers.settings(time=1 / 50, f_number=8, iso=200, focal=60, flash=0x0F)
 WITH_EXIF = {EXIF_IFD: PHOTO}
@@ -184,3 +185,8 @@ def test_a_folder_is_scanned_in_milliseconds():
     for path in modern:
         probe.examine(path)
     assert (time.process_time() - start) / len(modern) < 0.5  # 60 ms, of which 45 hash up to 13 MB
+
+
+@pytest.mark.parametrize("head", [b"\0MRM\0\0\1", b"\0MRM", b"FUJIFILMCCD-RAW ", b"\0\0\0\x18ftypcrx CMT1"])
+def test_a_head_cut_short_has_no_tags(head: bytes) -> None:
+    assert exif.tags(head) == Exif()
