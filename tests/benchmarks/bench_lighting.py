@@ -91,8 +91,8 @@ def main() -> None:
         across, jumps, error = (
             np.median([getattr(one, of) for one in each]) for of in ("flipped", "jumps", "normal_deg")
         )
-        count = sum(right for right, _ in rows[name])
-        print(f"| {name} | {len(each)} | {across:.0%} | {jumps:.1%} | {error:.0f}° | {count} |")
+        passed = sum(right for right, _ in rows[name])
+        print(f"| {name} | {len(each)} | {across:.0%} | {jumps:.1%} | {error:.0f}° | {passed} |")
     every = [right for name, row in rows.items() for right, _ in row if "neither" not in name]
     print(f"\nright {sum(every)} of {len(every)}")
     if given.picture:
@@ -186,9 +186,7 @@ def _dressed(material: Any, albedo: float | None, rough: float | None) -> Any:
 def _probe(seed: int, turn: float) -> Floats:
     """A light probe (64, 128, 3) of mean 1, latitude down and longitude across, turned about the vertical."""
     files = sorted((Path(os.environ["POLCAP_DATA"]) / "environments").glob("*.hdr"))
-    stored = cv2.imread(str(files[seed % len(files)]), cv2.IMREAD_UNCHANGED)
-    assert stored is not None
-    picture = np.asarray(stored)[..., ::-1]
+    picture = np.asarray(cv2.imread(str(files[seed % len(files)]), cv2.IMREAD_UNCHANGED))[..., ::-1]
     small = cv2.resize(np.minimum(picture, np.percentile(picture, 99.9)), (128, 64), interpolation=cv2.INTER_AREA)
     return np.roll(small / small.mean(), int(turn / (2 * np.pi) * 128), 1)
 
@@ -230,7 +228,7 @@ def _spread(probe: Floats, sigma: float) -> Floats:
     width = probe.shape[1]
     round_ = np.concatenate([probe, probe, probe], axis=1)
     pixels = max(float(sigma) * width / (2 * np.pi), 0.5)
-    return np.asarray(cv2.GaussianBlur(round_.astype(np.float32), (0, 0), pixels))[:, width : 2 * width]
+    return np.asarray(cv2.GaussianBlur(round_.astype(np.float32), (0, 0), pixels)[:, width : 2 * width])
 
 
 def _seen(probe: Floats, direction: Floats) -> Floats:
@@ -238,8 +236,8 @@ def _seen(probe: Floats, direction: Floats) -> Floats:
     height, width = probe.shape[:2]
     row = np.arccos(np.clip(direction[..., 1], -1, 1)) / np.pi * height - 0.5
     column = (np.arctan2(direction[..., 0], direction[..., 2]) / (2 * np.pi) % 1) * width - 0.5
-    places = column.astype(np.float32), row.astype(np.float32)
-    return np.asarray(cv2.remap(probe.astype(np.float32), *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
+    at = column.astype(np.float32), row.astype(np.float32)
+    return np.asarray(cv2.remap(probe.astype(np.float32), *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
 
 
 def _normal_error(ratio: Any, normal: Floats, mask: NDArray[np.bool_]) -> float:
