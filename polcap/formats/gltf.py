@@ -83,16 +83,8 @@ def encode(
 
     Parameters
     ----------
-    asset
-        Mesh and textures.
-    name
-        Of scene, node, mesh and material.
-    images
-        Kind of the embedded pictures.
-    provenance
-        Goes into the XMP packet (KHR_xmp_json_ld).
-    encoder
-        What it has encoded for other files of the same export is not encoded again.
+    asset, name, images, provenance, encoder
+        As in `write`.
 
     References
     ----------
