@@ -208,7 +208,8 @@ class _Compared:
         # Neighbouring residuals are correlated by the blur over about ten pixels.
         residual = weighted * difference
         spread = np.linalg.inv(normal) @ (residual @ residual.T) @ np.linalg.inv(normal)
-        error = float(np.sqrt(10 * np.trace(spread[:2, :2]) / 2))
+        variance = max(float(np.trace(spread[:2, :2])), 0.0)  # rounding, where next to nothing tells
+        error = float(np.sqrt(10 * variance / 2))
         return _matrix(p, self.width, self.height, self.size), error
 
 
