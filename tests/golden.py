@@ -16,6 +16,7 @@ import numpy as np
 
 from polcap import path, pipeline, stages
 from polcap.formats import npy_folder
+from polcap.stages import infer
 
 LEARNED = "infer by the shipped network"
 
@@ -33,7 +34,7 @@ def fingerprints(result: Path) -> dict[str, dict[str, Any]]:
     made = {stage.name: _entry(version[stage.name], stage.name, stage.value) for stage in vars(opened).values()}
     network = pipeline.load_network("network", None, "cpu", 1)
     assert network is not None
-    maps = path.infer.estimate(opened.cues.value, network, path.infer.Settings())
+    maps = infer.estimate(opened.cues.value, network, infer.Settings())
     made[LEARNED] = _entry([version["infer"], network.digest], "infer", maps)
     return made
 

@@ -1,6 +1,9 @@
 """A textured ball beside a flat board, known everywhere, to try the stages on: evaluated, never resampled."""
 
+from collections.abc import Sequence
+
 import numpy as np
+from numpy.typing import NDArray
 
 from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Gains, ObjectMask, View
 from polcap.optics import frames, mueller, shade
@@ -11,7 +14,7 @@ VIEW = View(focal=FOCAL, center=((WIDTH - 1) / 2, (HEIGHT - 1) / 2), scale=2.0)
 ANGLES = np.radians([0.0, 45.0, 90.0])
 
 
-def normals(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+def normals(x: Floats, y: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Ball normals in the frame of each ray (H, W, 3) and its mask (H, W) at pixel coordinates."""
     u, v = (x - CENTER[0]) / RADIUS, -(y - CENTER[1]) / RADIUS
     inside = u * u + v * v < 0.995
@@ -27,7 +30,7 @@ def texture(x: Floats, y: Floats) -> Floats:
     return np.stack([grey * 1.1, grey, grey * 0.8], axis=-1)
 
 
-def stokes(x: Floats, y: Floats, textured: bool = True) -> tuple[Floats, Floats]:
+def stokes(x: Floats, y: Floats, textured: bool = True) -> tuple[Floats, NDArray[np.bool_]]:
     """Noise-free Stokes parameters (3, H, W, 3) in the ray frames, and the ball's mask."""
     n, inside = normals(x, y)
     albedo = texture(x, y) if textured else np.full((*x.shape, 3), 0.5)
@@ -42,7 +45,7 @@ def stokes(x: Floats, y: Floats, textured: bool = True) -> tuple[Floats, Floats]
 
 
 def stack(
-    transforms: list[Floats] | None = None,
+    transforms: Sequence[Floats] | None = None,
     gain: Floats | None = None,
     noise: float = 0.0,
     angles: Floats = ANGLES,
@@ -104,7 +107,7 @@ def ball_object() -> ObjectMask:
     return ObjectMask(inside, (30, 28, 212, 210), "user")
 
 
-def truth() -> tuple[Floats, Floats]:
+def truth() -> tuple[Floats, NDArray[np.bool_]]:
     """Ray-frame normals and mask on the crop of `ball_object`."""
     x0, y0, x1, y1 = ball_object().crop
     y, x = np.mgrid[y0:y1, x0:x1].astype(float)

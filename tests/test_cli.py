@@ -200,7 +200,7 @@ def test_user_mask_replaces_the_search(result: Path, example: Path, polcap: Comm
 def test_watch_goes_on_as_the_photographs_come_in(example: Path, tmp_path: Path) -> None:
     folder = tmp_path / "c"
     shutil.copytree(example / "pol000", folder / "pol000")
-    command = [sys.executable, "-m", "polcap", "process", folder, "--watch", "--dry-run", "--json"]
+    command = [sys.executable, "-m", "polcap", "process", str(folder), "--watch", "--dry-run", "--json"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None and process.stderr is not None

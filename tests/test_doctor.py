@@ -1,13 +1,15 @@
 """The doctor says what is broken, and only what `polcap process` needs is a fault."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import NoReturn
 
 import pytest
 
 from polcap import doctor
-from polcap.doctor import Finding, Rig
+from polcap.doctor import Rig
+from polcap.doctor.finding import Finding
 from polcap.errors import DecodeError, HardwareError, ModelError, SettingError
 from polcap.formats import onnx, raw
 from tests.conftest import Command
@@ -82,7 +84,7 @@ def test_full_disk_is_a_fault_and_a_nearly_full_one_a_warning(tmp_path: Path, mo
     class Usage:
         free = 5e8
 
-    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda folder: Usage)
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: Usage)
     assert named(doctor.examine(NO_RIG, tmp_path))["disk"].state == "fault"
     Usage.free = 5e9
     assert named(doctor.examine(NO_RIG, tmp_path))["disk"].state == "warning"

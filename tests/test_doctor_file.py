@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from polcap import doctor
+from polcap.doctor.finding import Finding
 from polcap.formats import dng, png, raw
 from polcap.images import Exif
 from tests.conftest import Command
 
 
-def told(file: Path) -> dict[str, doctor.Finding]:
+def told(file: Path) -> dict[str, Finding]:
     return {one.name: one for one in doctor.examine_file(file)}
 
 

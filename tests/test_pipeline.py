@@ -265,7 +265,7 @@ def test_the_example_from_python_runs(result: Path, example: Path, tmp_path: Pat
 def test_the_gallery_shows_each_result_and_stands_alone(result: Path, tmp_path: Path) -> None:
     copy, page = tmp_path / "copy", tmp_path / "gallery.html"
     shutil.copytree(result, copy)
-    command = [sys.executable, ROOT / "examples" / "gallery.py", page, copy, copy]
+    command = [sys.executable, *map(str, (ROOT / "examples" / "gallery.py", page, copy, copy))]
     done = subprocess.run(command, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     text = page.read_text()

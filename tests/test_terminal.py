@@ -1,6 +1,7 @@
 """What a command says, where, and with which exit code."""
 
 import json
+import time
 from pathlib import Path
 
 import pytest
@@ -31,7 +32,7 @@ def test_frames_are_told_now_and_then_with_the_time_left(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     clock = iter([0.0, 2.0, 6.0, 8.0, 12.0])
-    monkeypatch.setattr(terminal.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(time, "monotonic", lambda: next(clock))
     steps = terminal.Steps()
     for done in (1, 2, 3, 4):
         steps.frame(done, 9)

@@ -75,7 +75,7 @@ def test_fail_fast_stops(captures: Path, tmp_path: Path, polcap: Command) -> Non
 
 
 def start(captures: Path, out: Path, *more: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "polcap", "batch", captures / "obj0", "--out", out, *OPTIONS, *more]
+    command = [sys.executable, "-m", "polcap", "batch", str(captures / "obj0"), "--out", str(out), *OPTIONS, *more]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
 
@@ -94,7 +94,9 @@ def kill_worker(out: Path) -> None:
 
 
 @pytest.mark.parametrize("how", [(), ("--scheduler", "local", "--workers", "2")], ids=["processes", "dask"])
-def test_killed_worker_costs_nothing_but_time(captures: Path, finished: Path, tmp_path: Path, how: tuple) -> None:
+def test_killed_worker_costs_nothing_but_time(
+    captures: Path, finished: Path, tmp_path: Path, how: tuple[str, ...]
+) -> None:
     if how:
         pytest.importorskip("distributed")
     running = start(captures, tmp_path, *how)

@@ -130,7 +130,7 @@ def main() -> None:
             found |= {f"{number}/{name}": value for name, value in bake(mesh, tuple(job["bake"])).items()}
         for k, picture in enumerate(render(job["camera"], job["lights"], job["samples"]) if job["lights"] else []):
             found[f"{number}/light {k}"] = picture
-    np.savez(Path(sys.argv[1]).with_suffix(".npz"), **found)
+    np.savez(Path(sys.argv[1]).with_suffix(".npz"), **found)  # type: ignore[arg-type]  # NumPy: `allow_pickle` stands among the names
 
 
 main()

@@ -24,14 +24,12 @@ import onnx
 from onnx import TensorProto, helper
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-sys.path.insert(0, str(Path(__file__).parents[1] / "formats"))
-
-import headers
 
 from polcap.errors import InputError
 from polcap.formats import exr, photo, plausible, png, probe, raw
 from polcap.formats import onnx as models
 from tests.campaigns.mutations import Random, mutated
+from tests.formats import headers
 
 MOST_MB = 2e6  # bytes of a RAW taken as a seed
 LIMIT_S = 200.0  # of one call: the worker's own is 180

@@ -65,7 +65,10 @@ def main(kills: int, seed: int) -> int:
         small_capture.write(capture)
         photographs = digests(capture)
         whole = Path(place) / "whole"
-        steps = (("process", capture, "--estimator", "analytic", "--no-chart", "--out"), ("export",))
+        steps: tuple[tuple[str | Path, ...], ...] = (
+            ("process", capture, "--estimator", "analytic", "--no-chart", "--out"),
+            ("export",),
+        )
         spans = []
         for step in steps:
             start = time.perf_counter()

@@ -19,9 +19,6 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-sys.path.insert(0, str(Path(__file__).parents[1] / "formats"))
-
-import headers
 
 from polcap import pipeline
 from polcap.config import Config
@@ -30,6 +27,7 @@ from polcap.formats import capture as captures
 from polcap.formats import maps
 from polcap.images import ChartRequest, Floats
 from polcap.path import UserInput
+from tests.formats import headers
 
 BLACK, WHITE = 512, 16383
 LIMIT_S = 60.0
@@ -73,7 +71,7 @@ def write(folder: Path, what: list[str], size: tuple[int, int], exposures: int, 
             (place / f"IMG_{e}.dng").write_bytes(headers.dng(pixels, photo=photo, black=black))
 
 
-def mask(kind: str, size: tuple[int, int], random: Random) -> np.ndarray | None:  # type: ignore[type-arg]
+def mask(kind: str, size: tuple[int, int], random: Random) -> np.ndarray | None:
     if kind == "none":
         return None
     drawn = np.full(size, kind == "all")
@@ -84,7 +82,7 @@ def mask(kind: str, size: tuple[int, int], random: Random) -> np.ndarray | None:
     return drawn
 
 
-def run(folder: Path, drawn: np.ndarray | None) -> str:  # type: ignore[type-arg]
+def run(folder: Path, drawn: np.ndarray | None) -> str:
     """The outcome of a run in a word; what was written is checked."""
     out = folder / "polcap"
     try:

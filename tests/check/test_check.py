@@ -109,7 +109,7 @@ def test_ambient_light_is_measured(example: Path, tmp_path: Path) -> None:
         dng.write(
             tmp_path / f"dark{angle}.dng",
             (middle.black.mean() + dark / 5).astype(np.uint16),
-            cfa=middle.cfa,  # type: ignore[arg-type]
+            cfa=middle.cfa,
             black=float(middle.black.mean()),
             white=middle.white,
             exif=probe.read(files[1]).exif,

@@ -42,7 +42,7 @@ def test_tells_when_a_folder_rests_after_a_change(
 
     (made / "map.exr").write_bytes(b"not looked at")
     (tmp_path / ".hidden").write_bytes(b"nor this")
-    written = []
+    written: list[float] = []
 
     def arrive() -> None:
         if clock.now > 1.0 and len(written) < 4:  # a file that grows

@@ -3,15 +3,16 @@
 import shutil
 from itertools import count
 from pathlib import Path
+from typing import Any
 
-import headers
 import numpy as np
 import pytest
-from headers import DATA, needs_data
-from test_photo import mosaic, save
 
 from polcap.errors import CaptureError, DecodeError, InputError
 from polcap.formats import capture
+from tests.formats import headers
+from tests.formats.headers import DATA, needs_data
+from tests.formats.test_photo import mosaic, save
 
 _serial = count()
 
@@ -118,7 +119,7 @@ def test_capture_toml_states_angles_roles_and_exposures(tmp_path):
     for number in range(9):
         shoot(tmp_path / f"{number}.dng", 1 / 50, f_number=8, iso=200)
     (tmp_path / "log.csv").write_text("0\n")
-    entries = [
+    entries: list[dict[str, Any]] = [
         *[{"angle": angle, "flash_energy": energy} for angle in (0, 60, 120) for energy in (1.0, 0.25)],
         {"angle": 0, "role": "ambient"}, {"role": "chart"}, {"role": "ambient"},
     ]  # fmt: skip

@@ -1,6 +1,7 @@
 """The DNG writer, read back by LibRaw and exifread, which know nothing of it."""
 
 from pathlib import Path
+from typing import Literal
 
 import exifread
 import numpy as np
@@ -33,7 +34,9 @@ PHASES = {
 MATRIX = np.array([[0.9, -0.29, -0.07], [-0.45, 1.24, 0.23], [-0.09, 0.19, 0.71]])
 
 
-def write(path: Path, mosaic: np.ndarray, phase: str = "RGGB", compression: str = "ljpeg", **exif: object) -> Path:
+def write(
+    path: Path, mosaic: np.ndarray, phase: str = "RGGB", compression: Literal["ljpeg", "none"] = "ljpeg", **exif: object
+) -> Path:
     dng.write(
         path,
         mosaic,
@@ -61,7 +64,9 @@ def raw(path: Path) -> np.ndarray:
 
 @pytest.mark.parametrize("compression", ["ljpeg", "none"])
 @pytest.mark.parametrize("phase", PHASES)
-def test_counts_phase_black_and_white_come_back_exactly(tmp_path: Path, phase: str, compression: str) -> None:
+def test_counts_phase_black_and_white_come_back_exactly(
+    tmp_path: Path, phase: str, compression: Literal["ljpeg", "none"]
+) -> None:
     mosaic = picture(1)
     with rawpy.imread(str(write(tmp_path / "a.DNG", mosaic, phase, compression))) as r:
         np.testing.assert_array_equal(r.raw_image_visible, mosaic)

@@ -16,9 +16,14 @@ def picture(channels: int = 3) -> Texture:
 
 
 def test_a_picture_is_encoded_once_whoever_asks(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
+    asked: list[str] = []
     whole = encoders.encode
-    monkeypatch.setattr(encoders, "encode", lambda texture, kind: (asked.append(kind), whole(texture, kind))[1])
+
+    def counted(texture: Texture, kind: encoders.Kind) -> bytes:
+        asked.append(kind)
+        return whole(texture, kind)
+
+    monkeypatch.setattr(encoders, "encode", counted)
     texture, encoder = picture(), Encoder()
     with ThreadPoolExecutor(8) as pool:
         made = set(pool.map(lambda _: encoder(texture, "png"), range(16)))

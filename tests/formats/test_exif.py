@@ -4,14 +4,14 @@ import io
 import time
 
 import cv2
-import headers
 import numpy as np
 import pytest
-from headers import DATA, EXIF_IFD, SUB_IFDS, needs_data
 
 from polcap.errors import DecodeError
 from polcap.formats import exif, probe, sniff
 from polcap.images import Exif
+from tests.formats import headers
+from tests.formats.headers import DATA, EXIF_IFD, SUB_IFDS, needs_data
 
 PHOTO = headers.settings(time=1 / 50, f_number=8, iso=200, focal=60, flash=0x0F)
 WITH_EXIF = {EXIF_IFD: PHOTO}

@@ -1,15 +1,15 @@
 """Finished pictures as sources: what is stored, what it means, what is refused."""
 
 import cv2
-import headers
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from headers import DATA, needs_data
 
 from polcap.errors import DecodeError
 from polcap.formats import photo
 from polcap.optics import color
+from tests.formats import headers
+from tests.formats.headers import DATA, needs_data
 
 SIXTEEN = np.arange(24 * 32 * 3, dtype=np.uint16).reshape(24, 32, 3) * 20
 EIGHT = (np.arange(24 * 32 * 3).reshape(24, 32, 3) % 256).astype(np.uint8)

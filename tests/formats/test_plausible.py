@@ -3,12 +3,12 @@
 import io
 
 import cv2
-import headers
 import numpy as np
 import pytest
 
 from polcap.errors import DecodeError
 from polcap.formats import photo, plausible, probe, raw, sniff
+from tests.formats import headers
 
 RNG = np.random.default_rng(4)
 MOSAIC = RNG.integers(600, 9000, (60, 84)).astype(np.uint16)

@@ -9,7 +9,7 @@ from polcap.formats import png
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("tail", [(), (3,), (4,)])
-def test_pixels_come_back_in_order(tmp_path: Path, dtype: type, tail: tuple[int, ...]) -> None:
+def test_pixels_come_back_in_order(tmp_path: Path, dtype: type[np.uint8], tail: tuple[int, ...]) -> None:
     pixels = np.random.default_rng(1).integers(0, np.iinfo(dtype).max, (5, 7, *tail)).astype(dtype)
     png.write(tmp_path / "a.png", pixels)
     assert np.array_equal(png.read(tmp_path / "a.png"), pixels)
@@ -25,7 +25,7 @@ def test_red_is_first_for_other_readers(tmp_path: Path) -> None:
 
 def test_only_whole_numbers_are_taken() -> None:
     with pytest.raises(TypeError, match="float32"):
-        png.encode(np.zeros((2, 2), dtype=np.float32))
+        png.encode(np.zeros((2, 2), dtype=np.float32))  # type: ignore[arg-type]
 
 
 def test_damaged_file_is_one_line(tmp_path: Path) -> None:

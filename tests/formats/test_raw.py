@@ -2,15 +2,15 @@
 
 import struct
 
-import headers
 import numpy as np
 import pytest
 import rawpy
-from headers import DATA, needs_data
 
 from polcap.errors import DecodeError
 from polcap.formats import raw
 from polcap.optics import demosaic
+from tests.formats import headers
+from tests.formats.headers import DATA, needs_data
 
 RAMP = np.arange(60 * 84, dtype=np.uint16).reshape(60, 84)
 PHASES = [((0, 1), (1, 2)), ((2, 1), (1, 0)), ((1, 0), (2, 1)), ((1, 2), (0, 1))]

@@ -18,7 +18,7 @@ def mosaic_of(picture, cfa):
 
 @pytest.mark.parametrize("cfa", PHASES)
 def test_each_photosite_lands_in_its_colour(cfa):
-    flat = np.broadcast_to(np.float32([100, 200, 300]), (12, 16, 3))
+    flat = np.broadcast_to(np.array([100, 200, 300], np.float32), (12, 16, 3))
     np.testing.assert_array_equal(demosaic.superpixel(mosaic_of(flat, cfa), cfa), flat[:6, :8])
     np.testing.assert_allclose(demosaic.interpolate(mosaic_of(flat, cfa), cfa), flat, rtol=1e-6)
 

@@ -13,7 +13,7 @@ def tilted(zenith_deg: float, azimuth_deg: float = 0.0) -> np.ndarray:
     return np.array([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)])
 
 
-def render(normal, light, *, diffuse=0.0, specular=0.0, roughness=0.4, ior=1.5) -> np.ndarray:  # type: ignore[no-untyped-def]
+def render(normal, light, *, diffuse=0.0, specular=0.0, roughness=0.4, ior=1.5) -> np.ndarray:
     """(3,) Stokes parameters of the first channel under unit irradiance."""
     color = np.ones(3)
     one = np.array(1.0)

@@ -6,6 +6,7 @@ against the maps, not against what the writer believes.
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from polcap.formats import encoders, gltf, obj, texture_set
 from polcap.images import Floats, SurfaceMaps
@@ -37,13 +38,13 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Pictures:
         for key, file in files.items():
             (folder / file).write_bytes(encoders.encode(texture_set.LOOSE[key](asset), "png"))
         for suffix in ("glb", "obj"):
-            file = folder / f"{shape}.{suffix}"
-            jobs.append(browser.Job(file.name, file, mesh, RIPPLED.view, tuple(LIGHTS.values())))
+            model = folder / f"{shape}.{suffix}"
+            jobs.append(browser.Job(model.name, model, mesh, RIPPLED.view, tuple(LIGHTS.values())))
     answer = browser.render(folder, jobs)
     return {job.name: dict(zip(LIGHTS, answer[job.name])) for job in jobs}
 
 
-def inner(maps: SurfaceMaps) -> Floats:
+def inner(maps: SurfaceMaps) -> NDArray[np.bool_]:
     """Pixels of the object that are not at its rim."""
     mask = maps.mask & (maps.normal[..., 2] > 0.35)
     return mask & np.roll(mask, 3, 0) & np.roll(mask, -3, 0) & np.roll(mask, 3, 1) & np.roll(mask, -3, 1)

@@ -1,5 +1,6 @@
 """report.html in a browser without network: it opens, the light moves, the pointer reads the maps."""
 
+import base64
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,12 +38,13 @@ def test_page_prints_with_its_pictures(page: devtools.Page) -> None:
 def seen(page: devtools.Page, canvas: str, tmp_path: Path) -> np.ndarray:
     """The pixels of a canvas as it is drawn now, (H, W, 3) 0…255."""
     text = page.evaluate(f"({canvas}.draw(), {canvas}.canvas.toDataURL().split(',')[1])")
-    data = np.frombuffer(devtools.base64.b64decode(text), np.uint8)
+    data = np.frombuffer(base64.b64decode(text), np.uint8)
     return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))[..., ::-1].astype(float)
 
 
 def test_light_follows_the_pointer(page: devtools.Page, tmp_path: Path) -> None:
-    left, right = [], []
+    left: list[float] = []
+    right: list[float] = []
     for across, found in ((0.05, left), (0.95, right)):
         page.evaluate(f"relight.aim({2 * across - 1}, 0); relight.draw()")
         picture = seen(page, "relight", tmp_path)

@@ -70,8 +70,8 @@ def test_only_its_own_address_is_asked_and_heard() -> None:
         ell = motor(device, Settings(address="b", home="ccw"))
         ell.home()
         assert device.heard == ["Bgs", "Bin", "Bho1"]
-    with devices.Elliptec(address="B") as device, pytest.raises(Silent, match="answered '0gs' with nothing"):
-        motor(device)
+    with devices.Elliptec(address="B") as far, pytest.raises(Silent, match="answered '0gs' with nothing"):
+        motor(far)
 
 
 def test_a_linear_stage_is_refused() -> None:

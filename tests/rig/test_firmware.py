@@ -50,8 +50,8 @@ def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
     program, sketch, shim = folder / "rotator", folder / "rotator_firmware.ino", Path(__file__).with_name("arduino.h")
     text = (ROOT / "examples" / "rotator_firmware" / "rotator_firmware.ino").read_text()
     sketch.write_text(text.replace("SPEED = 60.0", "SPEED = 600.0"))  # the ring of the test weighs nothing
-    flags = ["-Wall", "-Wextra", "-Werror", "-include", shim, "-x", "c++"]
-    subprocess.run(["g++", *flags, sketch, "-o", program], check=True, timeout=120)
+    flags = ["-Wall", "-Wextra", "-Werror", "-include", str(shim), "-x", "c++"]
+    subprocess.run(["g++", *flags, str(sketch), "-o", str(program)], check=True, timeout=120)
     return program
 
 

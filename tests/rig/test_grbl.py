@@ -120,7 +120,7 @@ def test_a_movement_without_end_ends_with_the_limit(at: int) -> None:
 )
 def test_only_version_1_1_is_spoken(banner: str, error: type[Exception] | None) -> None:
     with devices.Grbl() as device:
-        device.BANNER = banner  # type: ignore[misc]
+        device.BANNER = banner
         if error:
             with pytest.raises(error, match=r"no GRBL 1\.1"):
                 motor(device)

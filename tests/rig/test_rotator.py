@@ -15,7 +15,7 @@ from tests.rig.devices import Elliptec, Grbl, Line
 from tests.rig.far_end import ALWAYS, SPOKEN, Device
 
 pytestmark = pytest.mark.timeout(120)
-KINDS = {"elliptec": Elliptec, "grbl": Grbl, "line": Line}
+KINDS: dict[str, type[Elliptec | Grbl | Line]] = {"elliptec": Elliptec, "grbl": Grbl, "line": Line}
 QUICK = "settle=0&timeout=4"
 
 
@@ -133,10 +133,10 @@ def test_a_ring_turned_by_hand_or_a_lost_zero_is_homed_again(
     with KINDS[kind]() as device:
         rotators.append(open_rotator(f"{kind}:{device.port}?{QUICK}", log))
         rotators[0].move(45)
-        if kind == "line":
-            device.homed = False  # type: ignore[attr-defined]
+        if isinstance(device, Line):
+            device.homed = False
         else:  # its counter begins anew
-            device._zero_deg = device.angle_deg  # type: ignore[attr-defined]
+            device._zero_deg = device.angle_deg
         assert off(rotators[0].move(90), 90) < 0.06
         assert off(device.angle_deg, 90) < 0.06
     log.close()

@@ -6,6 +6,7 @@ import signal
 import tomllib
 from collections import namedtuple
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -55,10 +56,10 @@ class Rig:
         monkeypatch.setattr("polcap.rig.camera_choice.open_camera", lambda name, log: self.camera)
         monkeypatch.setattr("polcap.rig.rotator.open_rotator", lambda url, log: self.turner)
 
-    def shoot(self, order: Order = ORDER, resume: bool = False, **options: int) -> dict[str, object]:
+    def shoot(self, order: Order = ORDER, resume: bool = False, **options: int) -> dict[str, Any]:
         return sequence.shoot(self.folder, order, resume=resume, tell=self.said.append, **options)  # type: ignore[arg-type]
 
-    def again(self) -> dict[str, object]:
+    def again(self) -> dict[str, Any]:
         self.camera, self.turner = PoolCamera(self.pool), Turner()
         return self.shoot(resume=True)
 
@@ -82,7 +83,7 @@ def test_every_angle_is_visited_once_and_the_capture_reads_as_ordered(rig: Rig) 
     assert [len(shot.frames) for shot in understood.shots] == [3, 3, 3, 3]
     assert [len(shot.ambient) for shot in understood.shots] == [1, 1, 1, 1]
     assert done["frames"] == 15 and done["rejected"] == []
-    assert done["angles"][1] == {"asked_deg": 45.0, "read_deg": 44.99, "stated_deg": 44.99}  # type: ignore[index]
+    assert done["angles"][1] == {"asked_deg": 45.0, "read_deg": 44.99, "stated_deg": 44.99}
     assert (rig.folder / "preview.png").exists()
     stated = tomllib.loads((rig.folder / "capture.toml").read_text())
     assert stated["rotator"] == {"model": "turner", "log": "rig.log"}
@@ -122,7 +123,7 @@ def test_a_bad_frame_is_taken_again_at_once_and_kept_aside(rig: Rig) -> None:
     rig.camera = PoolCamera(rig.pool, fault="corrupt", at=5)
     done = rig.shoot()
     assert len(rig.taken) == 16 and done["frames"] == 15
-    (bad,) = done["rejected"]  # type: ignore[misc]
+    (bad,) = done["rejected"]
     assert bad["slot"] == "ambient/pol000" or bad["slot"].startswith("pol")
     assert (rig.folder / bad["file"]).stat().st_size > 0
 
@@ -184,7 +185,7 @@ class Shaken(PoolCamera):
     def shoot(self, exposure: Exposure, flash: bool) -> Shot:
         shot = super().shoot(exposure, flash)
         first = self._key == ("shot", 0.0, 1) and len(self.delivered) < 5
-        return Shot(self.pool["blurred", 0.0, 1], shot.name, exposure) if first else shot  # type: ignore[index]
+        return Shot(self.pool["blurred", 0.0, 1], shot.name, exposure) if first else shot
 
 
 def test_an_early_frame_is_judged_by_its_later_neighbours(rig: Rig, tmp_path: Path) -> None:
@@ -193,9 +194,9 @@ def test_an_early_frame_is_judged_by_its_later_neighbours(rig: Rig, tmp_path: Pa
     (tmp_path / "sharp.dng").write_bytes(rig.pool["shot", 0.0, 1])
     _blur(tmp_path / "sharp.dng", tmp_path / "blurred.dng", 2.0)
     blurred = {("blurred", 0.0, 1): (tmp_path / "blurred.dng").read_bytes()}
-    rig.camera = Shaken({**rig.pool, **blurred})  # type: ignore[dict-item]
+    rig.camera = Shaken({**rig.pool, **blurred})
     done = rig.shoot(msgspec.structs.replace(ORDER, repeat_deg=(), ambient=False))
-    (bad,) = done["rejected"]  # type: ignore[misc]
+    (bad,) = done["rejected"]
     assert bad["slot"] == "pol000/frame_2" and "less sharp" in bad["reason"]
     assert rig.taken.count(("shot", 0.0, 1)) == 2 and rig.turner.moves.count(0.0) == 2
 

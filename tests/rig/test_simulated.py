@@ -55,7 +55,7 @@ def test_a_frame_taken_again_has_noise_of_its_own_and_every_role_too() -> None:
     camera = open_camera(f"simulated?{SMALL}", Log(None))
     seen = set()
     for role in ("shot", "shot", "repeat", "ambient", "chart"):
-        camera.prepare(45.0, role, 1)  # type: ignore[arg-type]
+        camera.prepare(45.0, role, 1)
         seen.add(camera.shoot(Exposure(time_s=0.02), flash=role != "ambient").data)
     assert len(seen) == 5
 

@@ -31,7 +31,7 @@ def errors_px(found: np.ndarray, true: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(5))
 def test_polarized_textured_shots_are_registered_to_a_twentieth_of_a_pixel(seed):
     rng = np.random.default_rng(seed)
-    true = [np.eye(3)] + [pose(*rng.uniform(-20, 20, 2), rng.uniform(-0.5, 0.5)) for _ in range(2)]
+    true = [np.eye(3)] + [pose(rng.uniform(-20, 20), rng.uniform(-20, 20), rng.uniform(-0.5, 0.5)) for _ in range(2)]
     radiance = scenes.stack(true, noise=0.004, seed=seed)
     found = align.register(radiance, scenes.no_color(), align.Settings())
     error = np.concatenate([errors_px(found.transform[k], true[k]) for k in (1, 2)])
@@ -78,7 +78,8 @@ def test_strong_polarization_is_no_other_scene() -> None:
     patches = np.pad(patches, ((0, 0), (0, scenes.WIDTH - patches.shape[1])), mode="edge")
     radiance = scenes.stack(noise=0.002)
     wave = 1 + 0.4 * np.cos(2 * (radiance.angle[:, None, None] - patches))
-    value = scenes.texture(*np.meshgrid(np.arange(scenes.WIDTH), np.arange(scenes.HEIGHT))) * wave[..., None]
+    y, x = np.mgrid[: scenes.HEIGHT, : scenes.WIDTH].astype(float)
+    value = scenes.texture(x, y) * wave[..., None]
     value = value.astype(np.float32)
     found = align.register(dataclasses.replace(radiance, value=value), scenes.no_color(), align.Settings())
     assert np.abs(found.transform - np.eye(3))[:, :2, 2].max() < 0.5

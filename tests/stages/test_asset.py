@@ -13,7 +13,7 @@ from polcap.stages.asset.coverage import interpolated
 from tests import surfaces
 
 
-def rendered_normals(of: Asset, maps: SurfaceMaps, within: float = 0.01) -> Floats:
+def rendered_normals(of: Asset, maps: SurfaceMaps, within: float = 0.01) -> tuple[Floats, tuple[Floats, Floats]]:
     """A renderer's normals at vertices on pixels, which those inside are: texture in the vertex's own frame."""
     mesh = of.mesh
     place = mesh.uv * [surfaces.WIDTH, surfaces.HEIGHT] - 0.5
@@ -59,7 +59,7 @@ def test_diffuse_and_specular_come_back_through_gltf_formulas() -> None:
         specular=rng.uniform(0.02, 0.08, (*shape, 3)).astype(np.float32),
     )
     built = surfaces.built(maps, surfaces.mesh(surfaces.maps()))
-    inner = ndimage.binary_erosion(maps.mask, np.ones((3, 3)))  # the outermost pixels are filled from there
+    inner = ndimage.binary_erosion(maps.mask, np.ones((3, 3), bool))  # the outermost pixels are filled from there
     base = color.decode_srgb(built.base_color[inner] / 255)
     f0 = 0.04 * np.array(built.specular_factor) * color.decode_srgb(built.specular_color[inner] / 255)
     frontal = base * (1 - f0.max(axis=-1, keepdims=True))  # glTF: (1 − max F) base
@@ -84,7 +84,7 @@ def test_black_specular_is_allowed() -> None:
 def test_backdrop_does_not_run_along_the_limb() -> None:
     """Pixels of the outline that are half backdrop take the colour beside them."""
     maps = surfaces.maps()
-    rim = maps.mask & ~ndimage.binary_erosion(maps.mask, np.ones((3, 3)))
+    rim = maps.mask & ~ndimage.binary_erosion(maps.mask, np.ones((3, 3), bool))
     mixed = replace(maps, diffuse=np.where(rim[..., None], 0.1 * maps.diffuse, maps.diffuse).astype(np.float32))
     mesh = surfaces.mesh(maps)
     assert np.array_equal(surfaces.built(mixed, mesh).base_color, surfaces.built(maps, mesh).base_color)
@@ -130,7 +130,7 @@ def test_coverage_interpolates_as_a_renderer_does() -> None:
 
 def test_pixels_without_a_value_take_that_of_a_nearest_one() -> None:
     known = np.random.default_rng(1).random((40, 60)) < 0.05
-    value = np.stack(np.indices(known.shape), axis=-1).astype(np.float32)
+    value = np.moveaxis(np.indices(known.shape), 0, -1).astype(np.float32)
     out = asset.filled(value, known)
     assert np.array_equal(out[known], value[known])
     away = np.linalg.norm(out - value, axis=-1)

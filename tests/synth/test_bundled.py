@@ -16,7 +16,7 @@ CAPTURE = EXAMPLES / "capture"
 
 
 @pytest.fixture(scope="module")
-def script():  # type: ignore[no-untyped-def]
+def script():
     spec = importlib.util.spec_from_file_location("make_capture", EXAMPLES / "make_capture.py")
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
@@ -35,7 +35,7 @@ def test_bundled_capture_is_small_and_whole() -> None:
             assert raw.raw_image_visible.shape == (truth["shoot"]["height"], truth["shoot"]["width"])
 
 
-def test_script_and_bundle_agree(script) -> None:  # type: ignore[no-untyped-def]
+def test_script_and_bundle_agree(script) -> None:
     """The bytes agree on one machine; another one's sines may differ in the last bit, so the surface is compared."""
     truth = json.loads((CAPTURE / "truth.json").read_text())
     assert msgspec.convert(truth["scene"], type(script.SCENE)) == script.SCENE

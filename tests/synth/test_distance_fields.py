@@ -1,5 +1,7 @@
 """Distance fields never promise more room than there is, and their surfaces are where geometry says."""
 
+from typing import Literal
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -85,5 +87,5 @@ def test_a_ball_hides_another_from_a_light_behind_it() -> None:
 
 
 @pytest.mark.parametrize("kind", ["bumps", "clusters", "vase"])
-def test_a_seed_is_a_scene(kind: str) -> None:
+def test_a_seed_is_a_scene(kind: Literal["bumps", "clusters", "vase"]) -> None:
     assert random_scene(4, kind) == random_scene(4, kind) != random_scene(5, kind)

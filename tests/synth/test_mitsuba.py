@@ -73,7 +73,7 @@ def tessellated(mi: Any, shape: distance_fields.Bumps, at: trace.Vector, rings: 
     """The waved ellipsoid as triangles half a millimetre across, with its own normals at their corners."""
     polar, around = np.meshgrid(np.linspace(0, np.pi, rings), np.linspace(0, 2 * np.pi, 2 * rings), indexing="ij")
     unit = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], -1).reshape(-1, 3)
-    raised = sum(a * np.sin(unit @ [x, y, z] + phase) for a, x, y, z, phase in shape.waves)
+    raised = np.sum([a * np.sin(unit @ [x, y, z] + phase) for a, x, y, z, phase in shape.waves], axis=0)
     point = unit * (1 + raised)[:, None] * shape.size
     step = 1e-5 * np.eye(3)
     slope = np.stack([shape.distance(point + s) - shape.distance(point - s) for s in step], -1)

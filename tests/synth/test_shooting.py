@@ -11,9 +11,10 @@ import rawpy
 
 from polcap.errors import CaptureError, SettingError
 from polcap.formats import calib
-from polcap.synth import render, shooting
+from polcap.synth import color_checker, render, shooting
 from polcap.synth.color_checker import Chart
 from polcap.synth.distance_fields import Cluster
+from polcap.synth.forward_camera import Sensor
 from polcap.synth.scene_materials import Coat, Material
 from polcap.synth.shooting import Scene, Shoot
 
@@ -29,7 +30,7 @@ STILL = Shoot(
     angle_error_deg=0.0,
     extinction_ratio=1e9,
     samples=2,
-    sensor=shooting.Sensor(full_well=1e8, read_noise=0.0),
+    sensor=Sensor(full_well=1e8, read_noise=0.0),
 )
 
 
@@ -89,7 +90,7 @@ def test_white_patch_has_its_reflectance(still: Any) -> None:
     reference = calib.colorchecker().rec709 @ np.array(truth["camera_matrix_from_linear_srgb"])[1]
     s0 = pictures[0] + pictures[2]
     scale = truth["files"][0]["relative_exposure"] * truth["white_S0"]
-    far = np.linalg.norm(shooting.charts.patches(Chart()).mean(axis=1), axis=-1)  # of the patches from the flash
+    far = np.linalg.norm(color_checker.patches(Chart()).mean(axis=1), axis=-1)  # of the patches from the flash
     for patch in (18, 20, 22, 7):
         (x0, y0), (x1, y1) = quads[patch].min(axis=0) + 2, quads[patch].max(axis=0) - 2
         part = s0[int(np.ceil(y0)) : int(y1), int(np.ceil(x0)) : int(x1)]
@@ -186,7 +187,7 @@ def test_object_and_chart_are_whole_and_apart_in_every_scene(kind: Any) -> None:
         scene = shooting.random_scene(seed, kind)
         mask = render.gbuffer(scene, shoot.view, shoot.height, shoot.width).mask
         assert scene.chart is not None
-        corners = render.project(shoot.view, shooting.charts.corners(scene.chart))
+        corners = render.project(shoot.view, color_checker.corners(scene.chart))
         assert 0.03 < mask.mean() < 0.3
         assert not mask[[0, -1]].any() and not mask[:, [0, -1]].any()
         assert corners.min() > 2 and (corners < [shoot.width - 3, shoot.height - 3]).all()

@@ -22,8 +22,8 @@ def scene(s1: float = 0.05, s2: float = -0.03) -> tuple[Tensor, ...]:
     return stokes, torch.full((B, S, S, 3), 0.4), torch.ones(B, S, S, dtype=torch.bool), rays
 
 
-def shoot(errors: Errors, *images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    return photograph(*images, torch.arange(B * S * S), errors)
+def shoot(errors: Errors, stokes: Tensor, diffuse: Tensor, mask: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    return photograph(stokes, diffuse, mask, rays, torch.arange(B * S * S), errors)
 
 
 def test_perfect_camera_returns_the_stokes_parameters() -> None:

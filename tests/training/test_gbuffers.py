@@ -55,6 +55,6 @@ def test_a_cache_of_other_views_is_not_taken_for_this_one(data: Path, views: Pat
 
 def test_a_mesh_that_no_side_shows_is_named_not_waited_for() -> None:
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 0.01, 0]], np.float32)
-    needle = Triangles(corners, np.array([[0, 1, 2]], np.int32), np.tile(np.float32([0, 0, 1]), (1, 3, 1)))
+    needle = Triangles(corners, np.array([[0, 1, 2]], np.int32), np.tile(np.array([0, 0, 1], np.float32), (1, 3, 1)))
     with pytest.raises(InputError, match="the needle covers less than 6% of the picture"):
         gbuffers.seen("the needle", Tracer(needle), 32, np.random.default_rng(0))

@@ -158,10 +158,16 @@ def test_rate_falls_to_nothing_over_the_last_part_of_the_budget(data: Path) -> N
     torch.manual_seed(0)
     size = (1, 1, 32, 32)
     batch = Batch(
-        torch.rand(1, 14, 32, 32), torch.ones(1, 32, 32, dtype=torch.bool),
-        torch.nn.functional.normalize(torch.ones(1, 3, 32, 32), dim=1), torch.rand(size), *torch.rand(2, 1, 3, 32, 32),
-        *torch.rand(2, *size), torch.tensor([0.0, 0.0, 1.0]).view(1, 3, 1, 1).expand(1, 3, 32, 32),
-    )  # fmt: skip
+        channels=torch.rand(1, 14, 32, 32),
+        mask=torch.ones(1, 32, 32, dtype=torch.bool),
+        normal=torch.nn.functional.normalize(torch.ones(1, 3, 32, 32), dim=1),
+        depth=torch.rand(size),
+        diffuse=torch.rand(1, 3, 32, 32),
+        specular=torch.rand(1, 3, 32, 32),
+        roughness=torch.rand(size),
+        highlight=torch.rand(size),
+        law=torch.tensor([0.0, 0.0, 1.0]).view(1, 3, 1, 1).expand(1, 3, 32, 32),
+    )
     rates = []
     for progress in (0.1, 0.2, 0.6, 1.0):
         run.advance([batch], progress)
@@ -181,7 +187,7 @@ def test_orthogonal_keeps_directions_and_levels_strengths(shape: tuple[int, int]
 
 
 def test_every_weight_is_in_one_optimizer() -> None:
-    network = train.model.Network(TINY)
+    network = model.Network(TINY)
     optimizers = train._optimizers(network, 1e-3)
     held = [w for o in optimizers for g in o.param_groups for w in g["params"]]
     assert sorted(map(id, held)) == sorted(map(id, network.parameters()))

@@ -4,9 +4,11 @@ import json
 import os
 import weakref
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from polcap.errors import CaptureError, SettingError
 from polcap.formats import capture as captures
@@ -396,7 +398,7 @@ def test_frames_stream(monkeypatch):
     """With room for three decoded frames, never more than these and the next are alive, of nine."""
     monkeypatch.setattr(budget, "plan", lambda *_: budget.Budget(frames=3 * 2 * 256 * 256))
     quads = ramp(256, 256, high=2e4)
-    alive = weakref.WeakSet()
+    alive: weakref.WeakSet[Any] = weakref.WeakSet()
     most = 0
 
     def lazily(exposure, seed):
@@ -494,10 +496,10 @@ def test_hand_held_nikon_bracket():
 
 def test_x_trans_brackets_give_the_light_of_a_bayer_camera(tmp_path):
     """The same scene through both mosaics: S0 of each channel alike within noise, three RAW px per px."""
-    still = {"width": 312, "height": 234, "nudge_px": 0.0, "nudge_deg": 0.0, "gain_jitter": 0.0, "samples": 1}
+    shoot = shooting.Shoot(seed=3, width=312, height=234, nudge_px=0.0, nudge_deg=0.0, gain_jitter=0.0, samples=1)
     merged = {}
     for cfa in ("RGGB", "X-Trans"):
-        shooting.write(tmp_path / cfa, shooting.random_scene(3, "bumps"), shooting.Shoot(seed=3, cfa=cfa, **still))
+        shooting.write(tmp_path / cfa, shooting.random_scene(3, "bumps"), structs.replace(shoot, cfa=cfa))
         capture = captures.read(tmp_path / cfa)
         merged[cfa] = hdr.merge(capture, hdr.Settings())
         if cfa == "X-Trans":

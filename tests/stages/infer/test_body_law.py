@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from polcap.images import Cues, Floats, View
 from polcap.optics import body, frames, fresnel
@@ -41,7 +42,7 @@ def ball(dolp_of: Callable[[Floats], Floats], alpha: float, albedo: Floats | flo
     return found, np.arccos(cosine)
 
 
-def bias_deg(angle: Floats, truth: Floats, mask: Floats) -> Floats:
+def bias_deg(angle: Floats, truth: Floats, mask: NDArray[np.bool_]) -> Floats:
     near = [mask & (np.abs(truth - np.radians(d)) < np.radians(2.5)) for d in DEGREES]
     return np.degrees([np.mean((angle - truth)[ring]) for ring in near])
 

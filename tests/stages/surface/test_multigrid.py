@@ -21,8 +21,8 @@ def laplacian(kind: str) -> tuple[sparse.csr_matrix, np.ndarray]:
         inside = np.zeros((SIZE, SIZE), dtype=bool)
         inside[30:90, 40:80] = True
         weight = np.where(inside.ravel()[p] != inside.ravel()[q], 1e-8, RNG.choice([1.0, 1e-4], len(p), p=[0.9, 0.1]))
-    off = sparse.coo_matrix((-weight, (p, q)), (SIZE**2, SIZE**2))
-    off = (off + off.T).tocsr()
+    right_and_down = sparse.coo_matrix((-weight, (p, q)), (SIZE**2, SIZE**2))
+    off = (right_and_down + right_and_down.T).tocsr()
     matrix = (off + sparse.diags(1e-8 - np.asarray(off.sum(axis=1)).ravel())).tocsr()
     return matrix, np.stack(np.divmod(np.arange(SIZE**2), SIZE), axis=-1)
 

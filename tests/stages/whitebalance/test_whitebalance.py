@@ -4,6 +4,7 @@ import functools
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -66,7 +67,7 @@ def stack(image: Floats, view: View | None = None, clip: float = np.inf, **known
     )
 
 
-def photograph(homography: Floats, colors: Floats = CLASSIC.rec709, seed: int = 0, **drawing: float) -> Floats:
+def photograph(homography: Floats, colors: Floats = CLASSIC.rec709, seed: int = 0, **drawing: Any) -> Floats:
     """I of one shot: half of S0, through a lens (σ = 0.4 px), with photon noise of 20 000 electrons at white."""
     light = cv2.GaussianBlur(draw(homography, colors, **drawing) @ CAMERA.T / 2, (0, 0), 0.4)
     return light + np.random.default_rng(seed).normal(size=light.shape) * np.sqrt(light / 20_000 + 1e-8)
@@ -375,15 +376,15 @@ def test_a_chart_of_18_patches_is_refused():
         whitebalance.measure(photo(REAL / "charts" / "1.png"), CLASSIC, AUTO, Settings())
 
 
-def rendered(name: str) -> tuple[AngleStack, dict, dict]:
+def rendered(name: str) -> tuple[AngleStack, dict[str, Any], dict[str, Any]]:
     """The 0° bracket merged on its true exposures, unclipped samples only."""
     meta = json.loads((RENDERED / f"{name}.meta.json").read_text())
     truth = json.loads((RENDERED / f"{name}.truth.json").read_text())
-    total, weight = 0.0, 0.0
+    total, weight = np.zeros(()), np.zeros(())
     for shot in truth["shots"][:3]:
         exposure = shot["relative_exposure"] * shot["flash_factor"]
         frame = superpixels(RENDERED / shot["file"])
-        good = (frame < 0.9).all(axis=-1)[..., None]
+        good = np.all(frame < 0.9, axis=-1, keepdims=True)
         total, weight = total + good * frame, weight + good * exposure
     first = truth["shots"][0]["relative_exposure"] * truth["shots"][0]["flash_factor"]
     view = View(meta["fx"] / 2, ((meta["cx"] - 1) / 2, (meta["cy"] - 1) / 2), 2.0)
