@@ -50,6 +50,8 @@ def batch(
     from polcap import config as settings
     from polcap.batch import job_files, shards, unit
 
+    if model is not None or estimator == "network":
+        _check_model(estimator, model)
     if write_jobs is not None:
         found = batches.find(root, out)
         command = job_files.command(root, context.params)
@@ -74,3 +76,13 @@ def batch(
     terminal.say(summary if json else str((out or root) / unit.FOLDER / "summary.html"))
     if code := batches.exit_code(summary):
         raise typer.Exit(code)
+
+
+def _check_model(estimator: Literal["network", "analytic"] | None, model: Path | None) -> None:
+    """A model that cannot be used is told once, here, not by every capture; ModelError, SettingError.
+
+    On the CPU: the machine that hands out the work may lack what its workers have.
+    """
+    from polcap import pipeline
+
+    pipeline.load_network(estimator, model, "cpu", 1)

@@ -27,6 +27,28 @@ def test_captures_are_found_however_deep_and_results_are_not(captures: Path, tmp
         batch.find(tmp_path)
 
 
+@pytest.mark.parametrize("more", [(), ("--write-jobs", "slurm")], ids=["run", "job file"])
+@pytest.mark.parametrize(
+    ("model", "estimator", "says"),
+    [
+        ("none.onnx", "network", "No such file or directory; name a model file with --model"),
+        ("noise.onnx", "network", "noise.onnx"),
+        ("noise.onnx", "analytic", "--model and --estimator analytic exclude each other"),
+    ],
+)
+def test_a_model_that_cannot_be_used_is_told_before_any_capture(
+    tmp_path: Path, polcap: Command, model: str, estimator: str, says: str, more: tuple[str, ...]
+) -> None:
+    (tmp_path / "captures" / "obj" / "pol000").mkdir(parents=True)
+    (tmp_path / "noise.onnx").write_bytes(b"no model")
+    order = ("--out", tmp_path / "out", "--model", tmp_path / model, "--estimator", estimator)
+    done = polcap("batch", tmp_path / "captures", *order, *more)
+    assert done.returncode == 2 and done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert says in line
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.fixture(scope="module")
 def finished(captures: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("finished")

@@ -1,0 +1,92 @@
+"""Brackets of a camera whose gain and noise are known: frames in, captures out; light in electrons."""
+
+import os
+
+import numpy as np
+import pytest
+
+from polcap.images import Capture, Exif, Frame, Quality, SensorImage, Shot
+
+RGGB = np.array([[0, 1], [1, 2]], np.uint8)
+BLACK, WHITE, READ, GAIN = 512.0, 15871.0, 3.0, 2.0  # counts, counts, e⁻, e⁻ per count at ISO 100
+
+
+def ramp(height, width, low=20.0, high=1.2e5, ripple=0.2):
+    """Expected electrons (h, w, 3) of the quads at exposure 1, from deep shadow to far beyond the well."""
+    y, x = np.mgrid[: height // 2, : width // 2]
+    level = np.exp(np.interp(x, [0, width // 2], [np.log(low), np.log(high)]))
+    level = level * (1 + ripple * np.sin(x / 7) * np.sin(y / 5))
+    return level[..., None] * np.array([0.6, 1.0, 0.7])
+
+
+def expose(quads, exposure, rng, iso=100.0):
+    """One mosaic frame: Poisson light, read noise, gain of the ISO, rounding, clipping."""
+    light = np.empty((2 * quads.shape[0], 2 * quads.shape[1]))
+    for i, j in np.ndindex(2, 2):
+        light[i::2, j::2] = quads[..., RGGB[i, j]] * exposure
+    counts = (rng.poisson(light) + rng.normal(0, READ, light.shape)) / (GAIN * 100 / iso) + BLACK
+    value = np.clip(np.round(counts), 0, WHITE).astype(np.uint16)
+    value.setflags(write=False)
+    return SensorImage(value, np.full((2, 2), BLACK), WHITE, RGGB)
+
+
+def frame(image, **exif):
+    stated = exif.pop("exposure", None)
+    return Frame("x.dng", Exif(**exif), "shot", "", lambda: image, exposure=stated)
+
+
+def capture(*shots, ambient=()):
+    return Capture(
+        "test", "", tuple(Shot(np.pi / 4 * k, tuple(s), tuple(ambient)) for k, s in enumerate(shots)),
+        "folders", 1000.0, True, (100.5, 80.5), (1, 1),
+    )  # fmt: skip
+
+
+def scores(stack, truth, shot=0):
+    """z of the pixels that are not clipped, (N, 3)."""
+    clear = (stack.quality[shot] & Quality.CLIPPED) == 0
+    return ((stack.value[shot] - truth) / np.sqrt(stack.variance[shot]))[clear]
+
+
+def electrons_to_signal(electrons, iso=100.0):
+    return electrons / (GAIN * 100 / iso) / (WHITE - BLACK)
+
+
+BRACKETS = {
+    "time": [(0.25, 100), (1, 100), (4, 100)],
+    "wide": [(1 / 16, 100), (0.5, 100), (1, 100), (6, 100), (16, 100)],
+    "iso": [(1, 100), (1, 400), (1, 1600)],
+    "repeats": [(1, 100), (1, 100), (1, 100), (1, 100)],
+    "single": [(1, 100)],
+}
+
+
+def bracket(quads, settings, seed=0, jitter=0.015, **exif):
+    """Frames of (exposure, ISO) pairs with flash jitter, and the exposures that really were."""
+    rng = np.random.default_rng(seed)
+    exposures = [e * (1 + jitter * rng.normal()) for e, _ in settings]
+    isos = [float(iso) for _, iso in settings]
+    frames = [frame(expose(quads, e, rng, i), iso=i, flash_fired=True, **exif) for e, i in zip(exposures, isos)]
+    return frames, np.array(exposures), np.array(isos)
+
+
+def reference_of(stack):
+    """Index of the frame whose ratio is 1 by definition."""
+    return int(np.flatnonzero(np.all(stack.exposure_ratio[0] == 1, axis=1))[0])
+
+
+DATA = os.environ.get("POLCAP_DATA")
+needs_data = pytest.mark.skipif(not DATA, reason="POLCAP_DATA is not set: no RAW files to merge")
+
+
+def raw_file(path, **exif):
+    """A DNG by rawpy alone, independent of the project's reader."""
+    rawpy = pytest.importorskip("rawpy")
+
+    def load():
+        with rawpy.imread(str(path)) as raw:
+            cfa = np.where(raw.raw_pattern == 3, 1, raw.raw_pattern).astype(np.uint8)
+            black = np.array(raw.black_level_per_channel, float)[raw.raw_pattern]
+            return SensorImage(raw.raw_image_visible.copy(), black, float(raw.white_level), cfa)
+
+    return Frame(str(path), Exif(**exif), "shot", "", load)
