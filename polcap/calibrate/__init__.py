@@ -16,8 +16,8 @@ from pathlib import Path
 
 from polcap.calibrate import flash_energy, lens_falloff, levels, linearity, photon_transfer, polarizer
 from polcap.calibrate.photographs import Photograph, angle_of, inside, listed
+from polcap.calibration_values import Calibration, Polarizer
 from polcap.errors import CaptureError
-from polcap.images import Calibration, Polarizer
 
 _ROOMS = ("dark", "flat", "flash", "polarizer")
 

@@ -3,7 +3,8 @@
 import numpy as np
 
 from polcap.calibrate.photographs import Photograph, by_setting, center
-from polcap.images import Floats, Linearity
+from polcap.calibration_values import Linearity
+from polcap.images import Floats
 
 _LEAST = 0.02  # of white: below, black's error counts more than a curve
 

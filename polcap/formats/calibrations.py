@@ -8,9 +8,10 @@ from typing import Any
 import msgspec
 import tomli_w
 
+from polcap.calibration_values import Calibration
 from polcap.errors import CaptureError
 from polcap.formats import atomic, calibrations_folder, file_name, text_file
-from polcap.images import Calibration, Exif
+from polcap.images import Exif
 
 _LEAST_LIGHT = 0.02  # of the middle's, in a lens's corner
 _HEAD = """\

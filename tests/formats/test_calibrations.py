@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from polcap.calibration_values import Calibration, Falloff, FlashEnergy, Levels, NoiseLine, Polarizer
 from polcap.errors import CaptureError
 from polcap.formats import calibrations, capture
-from polcap.images import Calibration, Exif, Falloff, FlashEnergy, Levels, NoiseLine, Polarizer
+from polcap.images import Exif
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "capture"
 EXIF = Exif(make="Polcap", model="Synthetic", lens="Synthetic 60mm", f_number=11.0, focal_length_mm=60.0)

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from polcap.images import Falloff, Floats, View
+from polcap.calibration_values import Falloff
+from polcap.images import Floats, View
 
 _BLOCK = 64  # rows at a time
 

@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats, NoiseLine
+from polcap.calibration_values import NoiseLine
+from polcap.images import Floats
 from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.stages.hdr.planes import Signals
 
