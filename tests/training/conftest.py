@@ -19,6 +19,12 @@ from polcap.training.dataset import Simulator
 RECIPE = gbuffers.Recipe(views=6, procedural=2, size=64, seed=5, per_shape=3)
 
 
+@pytest.fixture(autouse=True)
+def seeded() -> None:
+    """What a test draws does not depend on which tests ran before it."""
+    torch.manual_seed(0)
+
+
 def write_mesh(path: Path, seed: int) -> None:
     """A mesh in the data folder's format."""
     mesh = shapes.compose(np.random.default_rng(seed))

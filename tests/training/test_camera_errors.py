@@ -41,7 +41,7 @@ def test_off_axis_the_angles_of_the_image_are_carried_to_the_ray() -> None:
     stokes[1], stokes[2] = (0.5 * f(2 * axis)[..., None] for f in (torch.cos, torch.sin))
     measured, _, _ = shoot(Errors.none(B, CPU), stokes, diffuse, mask, rays)
     through_45 = (measured[0] + measured[2]) / 2
-    torch.testing.assert_close(through_45, torch.full_like(through_45, 0.5), atol=1e-4, rtol=0)
+    torch.testing.assert_close(through_45, torch.full_like(through_45, 0.5), atol=2e-4, rtol=0)  # 9σ of the noise left
 
 
 def test_noise_has_the_variance_it_states() -> None:
