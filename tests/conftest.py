@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 from filelock import FileLock
 
@@ -52,6 +53,12 @@ class Done(NamedTuple):
 
 
 Command = Callable[..., Done]
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """Random numbers that no other test draws from."""
+    return np.random.default_rng(6)
 
 
 @pytest.fixture(scope="session")

@@ -8,11 +8,9 @@ import pytest
 from polcap.errors import DecodeError, StorageError
 from polcap.formats import exr
 
-RNG = np.random.default_rng(2)
 
-
-def test_named_channels_and_attributes_come_back(tmp_path: Path) -> None:
-    channels = {name: RNG.normal(size=(9, 13)).astype(np.float32) for name in ("S0.R", "S0.G", "S2.B")}
+def test_named_channels_and_attributes_come_back(tmp_path: Path, rng: np.random.Generator) -> None:
+    channels = {name: rng.normal(size=(9, 13)).astype(np.float32) for name in ("S0.R", "S0.G", "S2.B")}
     exr.write(tmp_path / "a.exr", channels, {"unit": "m", "near": 0.5})
     read, attributes = exr.read(tmp_path / "a.exr")
     assert set(read) == set(channels)
@@ -28,8 +26,8 @@ def test_half_keeps_eleven_bits_and_stays_finite(tmp_path: Path) -> None:
     assert read[2:4].tolist() == [65504, -65504] and np.isnan(read[4])
 
 
-def test_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
-    channels = {"R": RNG.normal(size=(40, 30)), "G": RNG.normal(size=(40, 30))}
+def test_same_input_gives_the_same_bytes(tmp_path: Path, rng: np.random.Generator) -> None:
+    channels = {"R": rng.normal(size=(40, 30)), "G": rng.normal(size=(40, 30))}
     exr.write(tmp_path / "a" / "x.exr", channels)
     time.sleep(1.1)  # a file's own date counts in seconds
     exr.write(tmp_path / "b" / "x.exr", channels)
@@ -44,11 +42,11 @@ def test_second_reader_agrees(tmp_path: Path) -> None:
     assert data.index(b"B\0", data.index(b"chlist")) < data.index(b"R\0", data.index(b"chlist"))
 
 
-def test_cut_and_missing_files_are_one_line(tmp_path: Path) -> None:
+def test_cut_and_missing_files_are_one_line(tmp_path: Path, rng: np.random.Generator) -> None:
     path = tmp_path / "a.exr"
     with pytest.raises(DecodeError, match="cannot be read"):
         exr.read(path)
-    exr.write(path, {"Y": RNG.normal(size=(200, 200))})
+    exr.write(path, {"Y": rng.normal(size=(200, 200))})
     path.write_bytes(path.read_bytes()[:4000])
     with pytest.raises(DecodeError) as caught:
         exr.read(path)
@@ -56,11 +54,13 @@ def test_cut_and_missing_files_are_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full to play a full disk")
-def test_full_disk_is_told_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_is_told_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
     def onto_full_disk(self: Path, **_: object) -> None:
         os.symlink("/dev/full", self)
 
     monkeypatch.setattr(Path, "touch", onto_full_disk)
     with pytest.raises(StorageError, match="cannot write"):
-        exr.write(tmp_path / "a.exr", {"Y": RNG.normal(size=(200, 200))})
+        exr.write(tmp_path / "a.exr", {"Y": rng.normal(size=(200, 200))})
     assert list(tmp_path.iterdir()) == []

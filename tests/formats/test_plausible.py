@@ -10,8 +10,7 @@ from polcap.errors import DecodeError
 from polcap.formats import photo, plausible, probe, raw, sniff
 from tests.formats import headers
 
-RNG = np.random.default_rng(4)
-MOSAIC = RNG.integers(600, 9000, (60, 84)).astype(np.uint16)
+MOSAIC = np.random.default_rng(4).integers(600, 9000, (60, 84)).astype(np.uint16)
 BLACK = [[512, 512], [512, 512]]
 
 
@@ -20,8 +19,8 @@ def written(tmp_path, data, name="a.dng"):
     return tmp_path / name
 
 
-def test_a_jpeg_cut_anywhere_is_refused(tmp_path):
-    picture = cv2.GaussianBlur(RNG.integers(0, 255, (64, 96, 3)).astype(np.uint8), (0, 0), 2)
+def test_a_jpeg_cut_anywhere_is_refused(tmp_path, rng):
+    picture = cv2.GaussianBlur(rng.integers(0, 255, (64, 96, 3)).astype(np.uint8), (0, 0), 2)
     for options in ([], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 2]):
         whole = cv2.imencode(".jpg", picture, options)[1].tobytes()
         assert photo.read(written(tmp_path, whole, "a.jpg")).value.shape == (64, 96, 3)
@@ -42,8 +41,8 @@ def jpeg_raw(coded):
     return headers.tiff(main, image=coded)
 
 
-def test_a_raw_of_cut_jpeg_data_is_refused():
-    coded = cv2.imencode(".jpg", RNG.integers(0, 255, (64, 96)).astype(np.uint8))[1].tobytes()
+def test_a_raw_of_cut_jpeg_data_is_refused(rng):
+    coded = cv2.imencode(".jpg", rng.integers(0, 255, (64, 96)).astype(np.uint8))[1].tobytes()
     for data, whole in ((coded, True), (coded[:-200] + bytes(200), False), (coded[:-2], False)):
         file = jpeg_raw(data)
         structure = sniff.structure(io.BytesIO(file))
@@ -105,8 +104,8 @@ def test_a_remnant_of_a_panasonic_is_refused(tmp_path):
         raw.read(path)
 
 
-def test_a_white_level_that_the_counts_deny_is_told(tmp_path):
-    scan = RNG.integers(1000, 65000, (60, 84, 3)).astype(np.uint16)  # as a film scanner writes it
+def test_a_white_level_that_the_counts_deny_is_told(tmp_path, rng):
+    scan = rng.integers(1000, 65000, (60, 84, 3)).astype(np.uint16)  # as a film scanner writes it
     path = written(tmp_path, headers.dng(scan, photometric=34892, white=255))
     with pytest.raises(DecodeError, match=r"white level is 255, but its counts reach 6\d{4}"):
         raw.read(path)
@@ -124,10 +123,10 @@ def test_rows_that_were_never_written_are_told(tmp_path):
         raw.read(written(tmp_path, headers.dng(0 * cut, black=BLACK)))
 
 
-def test_a_raw_that_begins_with_text_is_not_taken_for_a_note(tmp_path):
+def test_a_raw_that_begins_with_text_is_not_taken_for_a_note(tmp_path, rng):
     """A Rollei's file begins with lines of text; LibRaw knows it by its first word."""
     head = b"DSC-Image\nHDR=1024\nX=84\nY=60\nTX=8\nTY=8\nEOHD\n".ljust(1024, b" ")
-    data = head + RNG.integers(0, 255, 84 * 60 * 10 // 8 + 64, dtype=np.uint8).tobytes()
+    data = head + rng.integers(0, 255, 84 * 60 * 10 // 8 + 64, dtype=np.uint8).tobytes()
     assert probe.read(written(tmp_path, data, "rollei.raw")).kind != "other"
     assert probe.read(written(tmp_path, b"a note\n" * 40, "note")).kind == "other"
 

@@ -7,20 +7,19 @@ from scipy import sparse
 from polcap.stages.surface.multigrid import Multigrid, Nested, conjugate_gradients
 
 SIZE = 120
-RNG = np.random.default_rng(6)
 
 
-def laplacian(kind: str) -> tuple[sparse.csr_matrix, np.ndarray]:
+def laplacian(kind: str, rng: np.random.Generator) -> tuple[sparse.csr_matrix, np.ndarray]:
     number = np.arange(SIZE * SIZE).reshape(SIZE, SIZE)
     p = np.concatenate([number[:, :-1].ravel(), number[:-1].ravel()])
     q = np.concatenate([number[:, 1:].ravel(), number[1:].ravel()])
     weight = np.ones(len(p))
     if kind == "random":
-        weight = 10 ** RNG.uniform(-2, 0, len(p))
+        weight = 10 ** rng.uniform(-2, 0, len(p))
     if kind == "cut":  # a square all but cut out of the plane, and links missing here and there
         inside = np.zeros((SIZE, SIZE), dtype=bool)
         inside[30:90, 40:80] = True
-        weight = np.where(inside.ravel()[p] != inside.ravel()[q], 1e-8, RNG.choice([1.0, 1e-4], len(p), p=[0.9, 0.1]))
+        weight = np.where(inside.ravel()[p] != inside.ravel()[q], 1e-8, rng.choice([1.0, 1e-4], len(p), p=[0.9, 0.1]))
     right_and_down = sparse.coo_matrix((-weight, (p, q)), (SIZE**2, SIZE**2))
     off = (right_and_down + right_and_down.T).tocsr()
     matrix = (off + sparse.diags(1e-8 - np.asarray(off.sum(axis=1)).ravel())).tocsr()
@@ -28,9 +27,9 @@ def laplacian(kind: str) -> tuple[sparse.csr_matrix, np.ndarray]:
 
 
 @pytest.mark.parametrize("kind", ["even", "random", "cut"])
-def test_few_iterations_reach_the_solution(kind: str) -> None:
-    matrix, pixel = laplacian(kind)
-    truth = np.cumsum(RNG.normal(size=SIZE**2))
+def test_few_iterations_reach_the_solution(kind: str, rng: np.random.Generator) -> None:
+    matrix, pixel = laplacian(kind, rng)
+    truth = np.cumsum(rng.normal(size=SIZE**2))
     truth -= truth.mean()
     right = matrix @ truth
     x, taken = conjugate_gradients(matrix, right, np.zeros(SIZE**2), Multigrid(matrix, pixel), 1e-8, 60)
@@ -39,9 +38,9 @@ def test_few_iterations_reach_the_solution(kind: str) -> None:
     assert np.sqrt((x - truth) @ (matrix @ (x - truth))) < 1e-4 * np.sqrt(truth @ right)  # in the energy's norm
 
 
-def nested(kind: str) -> tuple[sparse.csr_matrix, Nested]:
+def nested(kind: str, rng: np.random.Generator) -> tuple[sparse.csr_matrix, Nested]:
     """The even grid above one of half its resolution, whose links weigh the same."""
-    matrix, pixel = laplacian(kind)
+    matrix, pixel = laplacian(kind, rng)
     parent = (pixel[:, 0] // 2) * (SIZE // 2) + pixel[:, 1] // 2
     group = sparse.csr_matrix((np.ones(len(parent)), parent, np.arange(len(parent) + 1)))
     coarse = (group.T @ (matrix @ group) / 2).tocsr()  # two fine links cross each border
@@ -51,9 +50,9 @@ def nested(kind: str) -> tuple[sparse.csr_matrix, Nested]:
 
 
 @pytest.mark.parametrize("kind", ["even", "random"])
-def test_half_resolution_preconditions_the_whole(kind: str) -> None:
-    matrix, cycle = nested(kind)
-    truth = np.cumsum(RNG.normal(size=SIZE**2))
+def test_half_resolution_preconditions_the_whole(kind: str, rng: np.random.Generator) -> None:
+    matrix, cycle = nested(kind, rng)
+    truth = np.cumsum(rng.normal(size=SIZE**2))
     truth -= truth.mean()
     right = matrix @ truth
     x, taken = conjugate_gradients(matrix, right, np.zeros(SIZE**2), cycle, 1e-3, 40)
@@ -61,9 +60,9 @@ def test_half_resolution_preconditions_the_whole(kind: str) -> None:
     assert np.sqrt((x - truth) @ (matrix @ (x - truth))) < 1e-2 * np.sqrt(truth @ right)
 
 
-def test_preconditioners_are_symmetric() -> None:
+def test_preconditioners_are_symmetric(rng: np.random.Generator) -> None:
     """Conjugate gradients need it."""
-    matrix, pixel = laplacian("random")
-    a, b = RNG.normal(size=(2, SIZE**2))
-    for cycle, rounding in ((Multigrid(matrix, pixel), 1e-9), (nested("random")[1], 1e-3)):  # float32
+    matrix, pixel = laplacian("random", rng)
+    a, b = rng.normal(size=(2, SIZE**2))
+    for cycle, rounding in ((Multigrid(matrix, pixel), 1e-9), (nested("random", rng)[1], 1e-3)):  # float32
         assert a @ cycle(b) == pytest.approx(b @ cycle(a), rel=rounding)
