@@ -19,26 +19,26 @@ _PATTERNS = {0: "R", 1: "G", 2: "B"}
 def examine(path: Path) -> Iterator[Finding]:
     """Kind, metadata, decoding, pattern and levels of a file."""
     try:
-        told = probe.read(path)
+        found = probe.read(path)
     except DecodeError as error:
         what, _, remedy = str(error).partition("; ")
         yield Finding("file", "fault", what, remedy or "send this report in with the file")
         return
-    if told.kind not in ("raw", "photo"):
+    if found.kind not in ("raw", "photo"):
         yield Finding(
             "file", "fault", f"{path.name} is no photograph that polcap knows", "give a RAW, TIFF, PNG or EXR"
         )
         return
-    kind = "RAW" if told.kind == "raw" else f"finished picture of {told.bits} bits"
-    yield Finding("file", "ok", f"{path.name}: {kind}, {path.stat().st_size / 1e6:.1f} MB, digest {told.digest[:12]}")
-    yield from _metadata(told.exif)
+    kind = "RAW" if found.kind == "raw" else f"finished picture of {found.bits} bits"
+    yield Finding("file", "ok", f"{path.name}: {kind}, {path.stat().st_size / 1e6:.1f} MB, digest {found.digest[:12]}")
+    yield from _metadata(found.exif)
     try:
-        image = raw.read(path) if told.kind == "raw" else photo.read(path)
+        image = raw.read(path) if found.kind == "raw" else photo.read(path)
     except DecodeError as error:
         what, _, remedy = str(error).partition("; ")
         yield Finding("pixels", "fault", what, remedy)
         return
-    yield from _pixels(image, told.exif)
+    yield from _pixels(image, found.exif)
 
 
 def _metadata(exif: Exif) -> Iterator[Finding]:

@@ -122,9 +122,9 @@ def arriving(seen: Any, normal: Tensor, surface: Surface, body: Tensor) -> Tenso
     diffuse, specular = surface.diffuse[here] * light, surface.specular[here]
     # where F0 is more than the body's index gives, facets have the index that gives it, as in `light_transport.py`
     root = torch.maximum(specular.mean(dim=1), fresnel.normal_reflectance(ior)).sqrt()
-    came = shade.stokes(n, diffuse, 0 * specular, rough, ior, way, irradiance, surface.law.at(here))
-    came = came + shade.stokes(n, 0 * diffuse, specular * light, rough, (1 + root) / (1 - root), way, irradiance)
-    return normal.new_zeros(3, len(normal), 3).index_add(1, here, came)
+    diffuse_part = shade.stokes(n, diffuse, 0 * specular, rough, ior, way, irradiance, surface.law.at(here))
+    mirrored = shade.stokes(n, 0 * diffuse, specular * light, rough, (1 + root) / (1 - root), way, irradiance)
+    return normal.new_zeros(3, len(normal), 3).index_add(1, here, diffuse_part + mirrored)
 
 
 def _density(normal: Tensor, way: Tensor) -> Tensor:

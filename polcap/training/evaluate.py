@@ -104,7 +104,7 @@ def _judged(params: Params, means: Means, head: dict[str, Any]) -> list[Row]:
     rows = _kept(path, head)
     with atomic.path(path) as beside:
         beside.write_text("".join(json.dumps(row) + "\n" for row in [head, *rows]))
-    started = told = time.monotonic()
+    started = reported = time.monotonic()
     first = len(rows)
     with path.open("a") as file:
         for row in _made(params, means, range(first, params.count)):
@@ -112,8 +112,8 @@ def _judged(params: Params, means: Means, head: dict[str, Any]) -> list[Row]:
             file.write(json.dumps(row) + "\n")
             file.flush()
             now = time.monotonic()
-            if now - told > _QUIET or len(rows) == params.count:
-                told = now
+            if now - reported > _QUIET or len(rows) == params.count:
+                reported = now
                 each = (now - started) / (len(rows) - first)
                 left = each * (params.count - len(rows)) / 60
                 mean = np.mean([row["scores"][OURS]["normal_mean"] for row in rows])

@@ -91,8 +91,8 @@ def build(folder: Path, meshes: list[Path], recipe: Recipe) -> int:
 
 def _index(meshes: list[Path], recipe: Recipe) -> dict[str, Any]:
     """All that the views follow from, as JSON has it."""
-    told: dict[str, Any] = json.loads(json.dumps(asdict(recipe)))
-    return told | {"meshes": [mesh.stem for mesh in meshes]}
+    plain: dict[str, Any] = json.loads(json.dumps(asdict(recipe)))
+    return plain | {"meshes": [mesh.stem for mesh in meshes]}
 
 
 def load(folder: Path, *, mapped: bool = True) -> dict[str, NDArray[Any]]:

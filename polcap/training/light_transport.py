@@ -123,8 +123,8 @@ class _Gather:
         for k in range(_AROUND):
             cosine = np.sqrt(1 - (k + turn[:, 0]) / _AROUND)
             way = self._around(cosine, 2 * pi * (k * 0.618034 + turn[:, 1]))
-            met, came = self.light(way, np.arange(count))
-            received[met] += came * fresnel.transmission(np.maximum(cosine[met], 1e-3), places.ior)[0][:, None]
+            met, incoming = self.light(way, np.arange(count))
+            received[met] += incoming * fresnel.transmission(np.maximum(cosine[met], 1e-3), places.ior)[0][:, None]
         entered = fresnel.transmission(1.0, places.ior)[0]
         received = self.smooth(received / (_AROUND * entered))
         # as if all of it had come straight down, which enters through `entered`
@@ -149,11 +149,11 @@ class _Gather:
             cos_d = half[:, 2]
             way = 2 * cos_d[:, None] * half - [0, 0, 1]
             possible = (cos_d > 0.01) & (np.sum(way * places.normal, axis=1) > 0.01)
-            met, came = self.light(way, np.flatnonzero(possible))
+            met, incoming = self.light(way, np.flatnonzero(possible))
             density = pi * brdf.ggx_distribution(cos_h[met], alpha[met]) * cos_h[met] / (4 * cos_d[met])
             irradiance = 1 / np.maximum(density * _MIRRORED, 1e-9)
             total[:, met] += _shaded(
-                places.take(met), 0 * came, places.specular[met] * came, way[met], irradiance, ior[met]
+                places.take(met), 0 * incoming, places.specular[met] * incoming, way[met], irradiance, ior[met]
             )
         return np.stack([self.smooth(part) for part in total])
 

@@ -112,10 +112,10 @@ def mixture(color: Tensor, weight: Tensor) -> Mixture:
 
 def _drawn(color: Tensor, spread: Tensor, colors: Mixture) -> tuple[Tensor, Tensor]:
     """Expected true colors (B, 3, N) behind measured ones with variances `spread`, and membership (B, COLORS, N)."""
-    apart = color[:, None] - colors.center[..., None]  # (B, COLORS, 3, N)
+    difference = color[:, None] - colors.center[..., None]  # (B, COLORS, 3, N)
     wide = spread[:, None] + colors.variance[..., None]
-    pull = apart / wide
-    score = (apart * pull).sum(dim=2) + torch.log(wide.prod(dim=2))
+    pull = difference / wide
+    score = (difference * pull).sum(dim=2) + torch.log(wide.prod(dim=2))
     member = torch.softmax(torch.log(colors.share) - 0.5 * score, dim=1)
     return color - spread * (member[:, :, None] * pull).sum(dim=1), member
 
@@ -134,9 +134,9 @@ class ColorGloss(nn.Module):  # type: ignore[misc]  # torch comes without types 
 
     def forward(self, seen: Evidence, first: Tensor, member: Tensor, colors: Mixture) -> Tensor:
         """first (B, outputs, H, W): the reading that is corrected, before its sigmoids."""
-        told = self.read(described(seen, first, member, colors))  # (B, COLORS, outputs)
+        outputs = self.read(described(seen, first, member, colors))  # (B, COLORS, outputs)
         batch, _, height, width = member.shape
-        return (told.transpose(1, 2) @ member.flatten(2)).reshape(batch, -1, height, width)
+        return (outputs.transpose(1, 2) @ member.flatten(2)).reshape(batch, -1, height, width)
 
 
 def described(seen: Evidence, first: Tensor, member: Tensor, colors: Mixture) -> Tensor:

@@ -48,12 +48,13 @@ class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types he
         """coarse (B, ·, H/2, W/2) and fine features (B, ·, H, W) sort the places: a region, and what in it is alike."""
         color = torch.log(seen.diffuse + 0.02)
         weight = seen.usable + 1e-4
-        apart = color - (color * weight).sum(dim=(2, 3), keepdim=True) / weight.sum(dim=(2, 3), keepdim=True)
+        deviation = color - (color * weight).sum(dim=(2, 3), keepdim=True) / weight.sum(dim=(2, 3), keepdim=True)
         region = F.interpolate(self.sort(coarse).float(), scale_factor=2.0, mode="bilinear", align_corners=False)
-        kind = self.part(torch.cat([fine, color.to(fine.dtype), apart.to(fine.dtype)], dim=1)).float()
+        kind = self.part(torch.cat([fine, color.to(fine.dtype), deviation.to(fine.dtype)], dim=1)).float()
         member = torch.softmax(region + kind, dim=1)
-        told = self.read(profile((member * seen.usable).flatten(2), seen.figures.flatten(2), seen.cosine.flatten(2)))
-        return (told.transpose(1, 2) @ member.flatten(2)).unflatten(2, member.shape[2:])  # told (B, groups, outputs)
+        outputs = self.read(profile((member * seen.usable).flatten(2), seen.figures.flatten(2), seen.cosine.flatten(2)))
+        # (B, groups, outputs) and (B, groups, H·W)
+        return (outputs.transpose(1, 2) @ member.flatten(2)).unflatten(2, member.shape[2:])
 
 
 def figures_of(level: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) -> Tensor:

@@ -112,10 +112,10 @@ def _normal(file: Path) -> Floats:
 def _page(folder: Path, rows: dict[str, dict[str, Score]], table: dict[str, Score]) -> str:
     lines = [f"# Photographs with measured normals: {folder.name}", ""]
     lines += ["| | " + " | ".join(_ROWS) + " |", "|" + " --- |" * (len(_ROWS) + 1)]
-    told: dict[str, Any] = {f"mean, {column}": figures for column, figures in table.items()}
-    told |= {f"{name}, {column}": figures for name, both in rows.items() for column, figures in both.items()}
+    summary: dict[str, Any] = {f"mean, {column}": figures for column, figures in table.items()}
+    summary |= {f"{name}, {column}": figures for name, both in rows.items() for column, figures in both.items()}
     lines += [
-        f"| {name} | " + " | ".join(f"{figures[row]:.3g}" for row in _ROWS) + " |" for name, figures in told.items()
+        f"| {name} | " + " | ".join(f"{figures[row]:.3g}" for row in _ROWS) + " |" for name, figures in summary.items()
     ]
     lines += ["", f"Degrees over the mask that is given; a pixel without a normal counts as {_MISSED_DEG:g}°."]
     return "\n".join(lines) + "\n"

@@ -74,13 +74,13 @@ Table = Mapping[str, Mapping[str, float]]
 
 def page(result: Mapping[str, Any]) -> str:
     """Markdown of evaluation.json's content."""
-    told = result["conditions"]
+    conditions = result["conditions"]
     main = {**result["table"], **_published(PUBLISHED)}
     parts = [
-        f"# Evaluation: {told['pictures']} pictures at {told['size']}²",
-        f"6 test meshes × 30 test materials, protocol {told['protocol']} ({told['materials']}). "
-        f"Model {told['model'][:12]} {told['version']}. Camera: {told['camera']}.",
-        f"Standard deviation of the truth's F0 over all pictures: {told['f0_deviation']:.3f}.",
+        f"# Evaluation: {conditions['pictures']} pictures at {conditions['size']}²",
+        f"6 test meshes × 30 test materials, protocol {conditions['protocol']} ({conditions['materials']}). "
+        f"Model {conditions['model'][:12]} {conditions['version']}. Camera: {conditions['camera']}.",
+        f"Standard deviation of the truth's F0 over all pictures: {conditions['f0_deviation']:.3f}.",
         _table(main),
         _AVERAGED,
         "*As published*: on the authors' own test set, which is not public: not like for like.",

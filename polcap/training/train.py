@@ -398,11 +398,11 @@ def load_average(path: Path) -> tuple[model.Network, dict[str, Any]]:
 def ship(checkpoint: Path, path: Path, version: str, licence: str = "Apache-2.0") -> int:
     """Export a checkpoint's EMA weights with what is known of their training. Returns the file's bytes."""
     network, facts = load_average(checkpoint)
-    told = {"version": version, "licence": licence, "variant": network.variant}
+    metadata = {"version": version, "licence": licence, "variant": network.variant}
     training = f"{facts['samples']} samples in {facts['step']} steps, {facts['elapsed'] / 60:.0f} minutes"
     if facts["begun"]:
         training += f", after {facts['begun']}"
-    return export.write(network, path, told | {"training": training})
+    return export.write(network, path, metadata | {"training": training})
 
 
 def _record(path: Path, run: Run, figures: dict[str, float]) -> None:
