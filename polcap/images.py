@@ -181,6 +181,20 @@ class ChartReference:
     rec709: Floats  # (24, 3) linear Rec.709/D65 reflectance, row by row from dark skin
     size_m: tuple[float, float] | None  # width, height between the outer patch corners, as far as it is known
     patches: tuple[str, ...] = ()  # (24,) their names
+    editions: tuple["ChartReference", ...] = ()  # the same chart as it was made at other times
+
+
+@dataclass(frozen=True)
+class ChartLight:
+    """How a chart stands to camera and flash; lengths in distances of its middle along the optical axis."""
+
+    white: Floats  # (3,) its white patch, camera frame
+    normal: Floats  # (3,) unit, towards the camera
+    normal_sigma: float  # rad, 1σ about each axis
+    flash: (
+        Floats  # (3,) right of the lens and above it; power of the cosine by which the light falls off to the corners
+    )
+    covariance: Floats  # (3, 3) of these three
 
 
 @dataclass(frozen=True)
@@ -198,6 +212,8 @@ class ColorCalibration:
     glare: float = 0.0  # white light that the chart's gloss and the lens add to every patch [reflectance]
     predicted: Floats | None = None  # (24,) CIEDE2000 of each patch by the matrix of all others
     patch_use: Bits | None = None  # (24,) 0 served; else why not, `whitebalance.patches.PatchUse`
+    edition: str = ""  # whose colors its patches were held against, `ChartReference.name`
+    light: ChartLight | None = None  # None without a chart in the picture
 
 
 @dataclass(frozen=True)

@@ -44,10 +44,13 @@ class _Chart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     columns: int
     patch: list[_Patch]
     size_m: tuple[float, float] | None = None
+    editions: tuple[str, ...] = ()
 
 
 def colorchecker(kind: str = "classic", path: Path | None = None) -> ChartReference:
     """The reference colours of a shipped kind of ColorChecker (classic, sg), or of a file of the same form.
+
+    Other editions that the file names are read from beside it.
 
     Raises
     ------
@@ -66,6 +69,7 @@ def colorchecker(kind: str = "classic", path: Path | None = None) -> ChartRefere
         rec709=np.array([patch.rec709 for patch in chart.patch]),
         size_m=chart.size_m,
         patches=tuple(patch.name.partition(" (")[0] for patch in chart.patch),
+        editions=tuple(colorchecker(path=path.with_name(f"{name}.toml")) for name in chart.editions),
     )
 
 

@@ -20,6 +20,7 @@ from polcap.formats import atomic, provenance, text_file
 from polcap.formats import maps as maps_folder
 from polcap.images import (
     Capture,
+    ChartLight,
     Floats,
     Frame,
     Network,
@@ -29,7 +30,7 @@ from polcap.images import (
 from polcap.path import Results
 from polcap.report import labels, page, shown
 from polcap.report.whole import Whole
-from polcap.stages.cues import scale_doubt
+from polcap.stages.cues import scale
 from polcap.stages.whitebalance import patches
 
 _COMPARED_PX = 512  # the longest side on which photographs and re-rendering are compared
@@ -101,6 +102,9 @@ def figures(results: Results) -> dict[str, dict[str, Any]]:
         },
         "chart": {
             "source": color.source,
+            "edition": color.edition or None,
+            "tilt_deg": None if color.light is None else _number(_tilt_deg(color.light)),
+            "flash": None if color.light is None else _list(color.light.flash[:2], 3),
             "delta_e_mean": None if color.delta_e is None else _number(np.nanmean(color.delta_e)),
             "delta_e_max": None if color.delta_e is None else _number(np.nanmax(color.delta_e)),
             "delta_e": None if color.delta_e is None else _list(color.delta_e, 2),
@@ -109,7 +113,7 @@ def figures(results: Results) -> dict[str, dict[str, Any]]:
             "left_out": None if color.patch_use is None else patches.left_out(color.patch_use),
             "detector_cost": _number(color.cost),
             "metres_per_px": color.metres_per_px,
-            "scale_doubt": scale_doubt(image, color),
+            "scale_doubt": scale.doubt(image, color),
             "matrix": _list(color.matrix),
         },
         "alignment": {
@@ -250,6 +254,11 @@ def _inside(value: Floats, image: StokesImage, percentile: float) -> float | Non
 def _number(value: Any, digits: int = 6) -> float | None:
     """A figure for JSON; None where it could not be measured."""
     return round(float(value), digits) if math.isfinite(value) else None
+
+
+def _tilt_deg(light: ChartLight) -> float:
+    """How far a chart is turned from facing the lens."""
+    return float(np.degrees(np.arccos(np.clip(-light.normal @ light.white / np.linalg.norm(light.white), -1, 1))))
 
 
 def _list(values: Floats, digits: int = 5) -> list[Any]:

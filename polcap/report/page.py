@@ -260,7 +260,8 @@ def _measured(results: Results, about: Mapping[str, Any]) -> Iterator[str]:
     yield "<h2>How it was measured</h2><div class='grid'>"
     measured = shown.patches(radiance, color)
     if measured is not None and color.delta_e is not None:
-        reference = calib.colorchecker(about["settings"]["whitebalance"]["chart"])
+        known = calib.colorchecker(about["settings"]["whitebalance"]["chart"])
+        reference = next((one for one in known.editions if one.name == color.edition), known)
         drawing = plots.chart(
             srgb_eight_bits(reference.rec709), srgb_eight_bits(measured), color.delta_e, reference.patches
         )

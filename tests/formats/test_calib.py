@@ -30,6 +30,7 @@ PROFILE = ColorCalibration(
     ("kind", "name", "patches"),
     [
         ("classic", "ColorChecker24 - After November 2014", None),
+        ("classic_before_2014", "ColorChecker24 - Before November 2014", None),
         ("sg", "ColorCheckerSG - After November 2014", [f"{c}{r}" for r in (2, 3, 4, 5) for c in "EFGHIJ"]),
     ],
 )
@@ -48,6 +49,18 @@ def test_white_patch_is_bright_and_nearly_neutral_and_greys_darken():
     assert (np.diff(color.luminance(grey)) < 0).all()
     assert np.ptp(grey, axis=1).max() < 0.06
     assert color.luminance(grey)[0] == pytest.approx(0.8807, abs=0.002)  # Y of the white patch
+
+
+def test_chart_by_the_makers_srgb_values():
+    """Eight-bit triples of the data sheet: white 243 243 242, cyan cut off at 8 133 161."""
+    colors = np.rint(255 * color.encode_srgb(calib.colorchecker("classic_srgb").rec709))
+    assert colors[[0, 17, 18, 23]].tolist() == [[115, 82, 68], [8, 133, 161], [243, 243, 242], [52, 52, 52]]
+
+
+def test_the_classic_knows_its_other_editions():
+    found = calib.colorchecker()
+    assert len(found.editions) == 2 and len({found.name, *(other.name for other in found.editions)}) == 3
+    assert all(other.patches == found.patches and not other.editions for other in found.editions)
 
 
 def test_chart_is_as_wide_as_six_square_patches_by_four():

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from polcap.images import Quality
+from polcap.images import ChartLight, Quality
 from polcap.optics import fresnel
 from polcap.stages import cues, stokes
 from tests import scenes
@@ -60,8 +60,8 @@ def test_albedo_of_a_ball_is_within_what_the_chart_s_depth_leaves_open():
     """Inverse squares over the visible half, seen and lit along the axis; the chart anywhere beside the ball."""
     solved = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
     color = dataclasses.replace(scenes.no_color(), source="chart")
-    doubt = cues.scale_doubt(solved, color)
-    assert cues.scale_doubt(solved, scenes.no_color()) is None
+    doubt = cues.scale.doubt(solved, color)
+    assert cues.scale.doubt(solved, scenes.no_color()) is None
     radius = np.sqrt(solved.mask.sum() / np.pi) / solved.view.focal
     ahead = radius * np.sqrt(np.linspace(0, 1, 1001))  # cos θ of places that are spread evenly over the disc
     rule = (1 - radius / 2) ** 2
@@ -119,3 +119,32 @@ def test_the_chart_stands_beside_the_middle_of_what_bulges_forward(size: float):
     r = np.sqrt((np.arange(1000) + 0.5) / 1000)  # evenly over the disc
     cone, ball = (1 / np.mean(1 / (1 - size * height) ** 2) for height in (1 - r, np.sqrt(1 - r * r)))
     assert ball < factor < cone
+
+
+@pytest.mark.parametrize(("turn", "aside"), [(0.0, 0.0), (0.4, 0.0), (0.0, 0.15)])
+def test_a_chart_that_is_turned_or_stands_aside_gets_less_light_than_the_object(turn: float, aside: float):
+    """n·l / d² of a chart under a flash at the lens: cos of its turn, or cos³ of the angle to the axis."""
+    found = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
+    white, normal = np.array([aside, 0.0, -1.0]), np.array([np.sin(turn), 0.0, np.cos(turn)])
+    light = ChartLight(white, normal, 0.0, np.zeros(3), np.zeros((3, 3)))
+    facing = cues.scale.factor(found, dataclasses.replace(scenes.no_color(), source="chart"))
+    factor = cues.scale.factor(found, dataclasses.replace(scenes.no_color(), source="chart", light=light))
+    assert factor / facing == pytest.approx(np.cos(turn) * np.cos(np.arctan(aside)) ** 3, rel=1e-6)
+
+
+def test_the_scale_follows_a_flash_at_the_chart_s_side_and_its_doubt_widens_the_scale_s():
+    """The object stands on the axis: a flash nearer to the chart lights that more, by its distances squared."""
+    found = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
+    row, column = (axis.mean() for axis in np.nonzero(found.mask))
+    found = dataclasses.replace(found, view=dataclasses.replace(found.view, center=(column, row)))
+    white, flash = np.array([0.2, 0.0, -1.0]), np.array([0.1, 0.0, 0.0])
+    color = dataclasses.replace(scenes.no_color(), source="chart")
+    facing = np.array([0.0, 0.0, 1.0])
+    at_lens, beside, doubtful = (
+        dataclasses.replace(color, light=ChartLight(white, facing, 0.0, at, spread))
+        for at, spread in ((0 * flash, np.zeros((3, 3))), (flash, np.zeros((3, 3))), (flash, 0.01 * np.eye(3)))
+    )
+    ahead = 1 - np.sqrt(found.mask.sum() / np.pi) / found.view.focal / 2
+    lit = (1.01 / 1.04) ** -1.5 * (ahead**2 + 0.01) / ahead**2
+    assert cues.scale.factor(found, beside) / cues.scale.factor(found, at_lens) == pytest.approx(lit, rel=1e-6)
+    assert cues.scale.doubt(found, doubtful) > cues.scale.doubt(found, beside) + 0.002

@@ -4,7 +4,6 @@ Training calls `compute` and `channels` too, so nothing here may know NumPy from
 namespace comes from the arguments, no cv2, no torch. Pixel axes are (..., H, W).
 """
 
-from math import hypot, pi, sqrt
 from typing import Any
 
 from array_api_compat import array_namespace
@@ -12,6 +11,7 @@ from array_api_compat import array_namespace
 from polcap.images import ColorCalibration, Cues, Quality, StokesImage
 from polcap.optics import frames, fresnel
 from polcap.stages import stage
+from polcap.stages.cues import scale
 
 NOMINAL_IOR = 1.5
 CHANNELS = (
@@ -25,19 +25,14 @@ CHANNELS = (
 
 FLOOR = 0.02  # added to a radiance before its logarithm, in the channels and wherever they are undone
 
-_BULGE = 0.5  # how far the visible surface comes forward on average, in radii: a cone's 1/3 to a ball's 2/3
-_BULGE_SPREAD = 0.3  # 1σ of it over 60 views of training meshes and random shapes (decision 8)
-_CHART_SPREAD = 3**-0.5  # radii: 1σ of the depth of a chart that stands anywhere between the object's front and back
-_LARGEST_RADIUS = 0.5  # of an object, in its distances; nearer, the law of the far field ends
 
-
-@stage(version=2, keep=False)
+@stage(version=3, keep=False)
 def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
     """All cues of a crop.
 
     The colour matrix acts on S0 only; DoLP and AoLP are taken in camera channels, summed over them
     before any ratio. The chart stands beside the object's middle, so that the visible surface, nearer to
-    the flash, gets more light than the chart. A capture without a chart has no absolute scale: its 99th
+    the flash, gets more light than the chart (`scale`). A capture without a chart has no absolute scale: its 99th
     percentile is set to 0.8.
     """
     import numpy as np
@@ -45,7 +40,7 @@ def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
     ratio, sigma, dolp, normalized = polarization(stokes.stokes, stokes.covariance)
     radiance = np.asarray(stokes.stokes[0] @ color.matrix.T, dtype=np.float32)
     if color.source in ("chart", "corners"):
-        radiance = radiance * np.float32((1 - _BULGE * _radius(stokes)) ** 2)
+        radiance = radiance * np.float32(scale.factor(stokes, color))
     if color.source in ("camera", "none") and stokes.mask.any():
         radiance = radiance * np.float32(0.8 / max(float(np.percentile(radiance[stokes.mask], 99)), 1e-9))
     height, width = stokes.mask.shape
@@ -61,23 +56,6 @@ def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
         quality=stokes.quality,
         view=stokes.view,
     )
-
-
-def scale_doubt(stokes: StokesImage, color: ColorCalibration) -> float | None:
-    """Share by which all albedos may be off together, 1σ; None where no chart in the picture gives their scale.
-
-    The light falls with the square of the distance: a chart beside the object's front makes albedo too dark, one
-    behind it too bright.
-    """
-    if color.source not in ("chart", "corners"):
-        return None
-    radius = _radius(stokes)
-    return 2 * radius * hypot(_BULGE_SPREAD, _CHART_SPREAD) / (1 - _BULGE * radius)
-
-
-def _radius(stokes: StokesImage) -> float:
-    """Radius of a disc of as many pixels as the object, in its distances."""
-    return min(sqrt(stokes.mask.sum() / pi) / stokes.view.focal, _LARGEST_RADIUS)
 
 
 def polarization(stokes: Any, covariance: Any) -> tuple[Any, Any, Any, Any]:

@@ -30,7 +30,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 2
 
 
-@stage(version=9)
+@stage(version=10)
 def estimate(cues: Cues, network: Network | None, settings: Settings) -> SurfaceMaps:
     """Normal, diffuse, specular, roughness and expected error; network None means analytic.
 

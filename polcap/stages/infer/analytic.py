@@ -114,10 +114,10 @@ def _albedo(cues: Cues, cos_zenith: Floats, ior: float) -> tuple[Floats, Floats]
     """Diffuse albedo (H, W, 3) and the highlight's radiance (H, W).
 
     A highlight is white, small, and faces the camera: what a grey-scale opening of the darkest channel
-    removes where the zenith is under 35°. The rest over cos θ T₊² is the albedo.
+    removes where the zenith is under 35°. The rest over cos θ T₊² is the albedo; off the axis, light comes farther.
     """
     size = max(5, round(0.12 * np.sqrt(max(cues.mask.sum(), 1)))) | 1
-    radiance = fill_highlights(cues.radiance, cues)
+    radiance = fill_highlights(cues.radiance, cues) / cues.rays[..., 2:] ** 2
     darkest = cv2.GaussianBlur(radiance.min(-1), (0, 0), 1.0)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     opened = cv2.GaussianBlur(cv2.morphologyEx(darkest, cv2.MORPH_OPEN, kernel), (0, 0), size / 6)

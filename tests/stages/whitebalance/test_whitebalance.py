@@ -114,6 +114,22 @@ def test_s0_of_the_white_patch_is_its_reflectance():
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.02)
 
 
+@pytest.mark.parametrize("edition", [CLASSIC, *CLASSIC.editions], ids=["since 2014", "before", "sRGB values"])
+def test_the_edition_of_the_chart_is_told_by_its_colors(edition: ChartReference):
+    _, place = plain()
+    color = whitebalance.measure(stack(photograph(place, edition.rec709)), CLASSIC, AUTO, Settings())
+    assert color.edition == edition.name
+    assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.02)
+
+
+def test_faded_patches_do_not_change_the_edition():
+    """Each off by 3 %, as on cards in use: no edition suits them clearly better than another."""
+    _, place = plain()
+    before = CLASSIC.editions[0].rec709 * (1 + 0.03 * np.random.default_rng(3).normal(size=(24, 3)))
+    color = whitebalance.measure(stack(photograph(place, before)), CLASSIC, AUTO, Settings())
+    assert color.edition == CLASSIC.name
+
+
 def test_matrix_ignores_exposure_and_the_place_does_too():
     image, _ = plain()
     one, other = (whitebalance.measure(stack(k * image), CLASSIC, AUTO, Settings()) for k in (1.0, 0.01))

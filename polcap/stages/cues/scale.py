@@ -1,0 +1,71 @@
+"""In: an object's pixels and how the chart stands to camera and flash. Out: the scale of the albedo, and its doubt.
+
+The chart says what light gave what radiance, where it stands and as it is turned. The object stands elsewhere: nearer
+to the flash, for what the camera sees of it comes forward of its middle, and at another angle to the optical axis.
+"""
+
+from math import hypot, log, pi, sqrt
+
+import numpy as np
+
+from polcap.images import ChartLight, ColorCalibration, Floats, StokesImage
+from polcap.optics import point_light
+
+_BULGE = 0.5  # how far the visible surface comes forward on average, in radii: a cone's 1/3 to a ball's 2/3
+_BULGE_SPREAD = 0.4  # 1σ of it over 204 views of training meshes and random shapes (decision 30)
+_CHART_SPREAD = 3**-0.5  # radii: 1σ of the depth of a chart that stands anywhere between the object's front and back
+_LARGEST_RADIUS = 0.5  # of an object, in its distances; nearer, the law of the far field ends
+_STEP = 1e-4
+
+
+def factor(stokes: StokesImage, color: ColorCalibration) -> float:
+    """By what the radiance is multiplied: 1 is a white plane on the axis, as far as the object, that faces the flash.
+
+    Light falls off over the object, with distance and to the sides, as in the pictures that the network learned from.
+    """
+    ahead = 1 - _BULGE * _radius(stokes)
+    if color.light is None:
+        return ahead**2
+    return float(np.exp(_log_factor(color.light, color.light.flash, _middle(stokes, ahead))))
+
+
+def doubt(stokes: StokesImage, color: ColorCalibration) -> float | None:
+    """Share by which all albedos may be off together, 1σ; None where no chart in the picture gives their scale.
+
+    The light falls with the square of the distance: a chart beside the object's front makes albedo too dark, one
+    behind it too bright. Where the flash stands is known as far as the light's slope across the chart tells.
+    """
+    if color.source not in ("chart", "corners"):
+        return None
+    radius = _radius(stokes)
+    ahead = 1 - _BULGE * radius
+    depth = 2 * radius * hypot(_BULGE_SPREAD, _CHART_SPREAD) / ahead
+    if color.light is None:
+        return depth
+    light, middle = color.light, _middle(stokes, ahead)
+    here = _log_factor(light, light.flash, middle)
+    slope = np.array([_log_factor(light, light.flash + step, middle) - here for step in _STEP * np.eye(3)]) / _STEP
+    to_flash = np.append(light.flash[:2], 0.0) - light.white
+    cosine = float(light.normal @ to_flash / np.linalg.norm(to_flash))
+    turn = light.normal_sigma * sqrt(max(1 - cosine**2, 0.0)) / max(cosine, 0.1)
+    return hypot(depth, sqrt(slope @ light.covariance @ slope), turn)
+
+
+def _log_factor(light: ChartLight, flash: Floats, middle: Floats) -> float:
+    """ln of what the chart got, over what the object got more than a flash at the lens alone would give it."""
+    chart = point_light.irradiance(light.white, flash[:2], flash[2], light.normal)
+    object_ = point_light.irradiance(middle, flash[:2], flash[2])
+    alone = point_light.irradiance(middle, np.zeros(2), 0.0)
+    return log(max(float(chart), 1e-6) * float(alone) / float(object_)) + 2 * log(-middle[2])
+
+
+def _middle(stokes: StokesImage, distance: float) -> Floats:
+    """Where the middle of the object's pixels stands (3,), camera frame, `distance` along the axis."""
+    row, column = (axis.mean() for axis in np.nonzero(stokes.mask)) if stokes.mask.any() else (0.0, 0.0)
+    x, y = stokes.view.center
+    return distance * np.array([(column - x) / stokes.view.focal, (y - row) / stokes.view.focal, -1.0])
+
+
+def _radius(stokes: StokesImage) -> float:
+    """Radius of a disc of as many pixels as the object, in its distances."""
+    return min(sqrt(stokes.mask.sum() / pi) / stokes.view.focal, _LARGEST_RADIUS)

@@ -1,0 +1,78 @@
+"""In: a chart's place and the slope of the light across it. Out: how it stands to the camera and to the flash.
+
+A flash at L lights points P of a chart with normal n as n·(L − P)/|L − P|³. Across the chart n·(L − P) stays the same,
+so the light's slope tells over what point of its plane the flash stands: per patch it is 3 pitches over the distance,
+times the sine of the angle from the normal to the flash. The chart's tilt itself comes from its outline: a
+homography's first two columns point along rows and columns, whatever the card's sides are.
+
+References
+----------
+Zhang, A flexible new technique for camera calibration, IEEE PAMI 2000 (pose from a homography).
+"""
+
+import numpy as np
+
+from polcap.images import ChartLight, Floats, View
+from polcap.optics import point_light
+from polcap.stages.whitebalance import chart, patches
+from polcap.stages.whitebalance.chart import Placement
+
+# 1σ before anything is seen: the flash right of the lens and above it [distances], the falloff's power. A hot shoe
+# stands .1 to .15 m above the lens, objects at about 1 m; cos⁴ is a lens's natural falloff, 0 a corrected one.
+_PRIOR = np.array([0.1, 0.1, 2.0])
+_TILT_SIGMA = 0.03  # rad: corners within .2 % of the chart, lenses that bend by 1 %
+_FARTHEST = 0.3  # a flash beyond is no flash at the camera [distances]
+_LIGHT_PER_DELTA_E = 0.02  # a patch that is off by ΔE2000 = 1 is off by about 2 % in Y: half of it lightness
+_LEAST_PATCH_ERROR = 0.005
+_STEP = 1e-4
+_ROUNDS = 4
+
+
+def measure(place: Placement, view: View, slope: Floats, delta_e: float) -> ChartLight:
+    """The chart's plane, the likeliest place of the flash and falloff of the light, and their covariance.
+
+    Parameters
+    ----------
+    place
+        Of the chart.
+    view
+        The camera over the same pixels.
+    slope
+        (2,) relative change of the light per patch, to the chart's right and down, from the white patch.
+    delta_e
+        Mean residual of the patches: how well the slope is known.
+    """
+    point, normal = _plane(place, view)
+    design = np.concatenate([np.ones((len(point), 1)), patches.position()], axis=1)
+    solve = np.linalg.pinv(design)  # (3, 24)
+    error = max(_LEAST_PATCH_ERROR, _LIGHT_PER_DELTA_E * delta_e)
+    pitch = float(np.sqrt(np.prod([np.linalg.norm(point[i] - point[0]) for i in (1, 6)])))
+    noise = error**2 * (solve @ solve.T)[1:, 1:] + (3 * pitch * _TILT_SIGMA) ** 2 * np.eye(2)
+
+    state = np.zeros(3)
+    for _ in range(_ROUNDS):
+        here = _slope(solve, point, normal, state)
+        by_state = np.stack(
+            [(_slope(solve, point, normal, state + step) - here) / _STEP for step in _STEP * np.eye(3)], axis=1
+        )
+        known = by_state.T @ np.linalg.inv(noise)
+        covariance = np.linalg.inv(np.diag(_PRIOR**-2) + known @ by_state)
+        state = covariance @ known @ (slope - here + by_state @ state)
+        state[:2] = np.clip(state[:2], -_FARTHEST, _FARTHEST)
+    return ChartLight(point[patches.WHITE], normal, _TILT_SIGMA, state, covariance)
+
+
+def _slope(solve: Floats, point: Floats, normal: Floats, state: Floats) -> Floats:
+    """Relative change (2,) of a flash's light per patch, as the fit of a straight slope sees it."""
+    level, *slope = solve @ point_light.irradiance(point, state[:2], state[2], normal)
+    return np.asarray(np.array(slope) / level)
+
+
+def _plane(place: Placement, view: View) -> tuple[Floats, Floats]:
+    """Patch centres (24, 3) in distances of the chart's middle, and the chart's normal (3,), camera frame."""
+    camera = np.array([[view.focal, 0, view.center[0]], [0, view.focal, view.center[1]], [0, 0, 1]])
+    pose = np.diag([1.0, -1.0, -1.0]) @ np.linalg.solve(camera, place.homography)
+    pose = -pose / (pose[2] @ [chart.COLUMNS / 2, chart.ROWS / 2, 1])
+    normal = np.cross(pose[:, 1], pose[:, 0])
+    at = chart.centers()
+    return at @ pose[:, :2].T + pose[:, 2], normal / (np.linalg.norm(normal) * np.sign(normal[2]))
