@@ -8,6 +8,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 
@@ -15,10 +16,11 @@ from polcap.formats import atomic
 from polcap.images import Floats
 from polcap.stages.mask.mask_channels import Look
 from polcap.synth.mesh_tracer import Tracer, Triangles, centred
-from polcap.training import gbuffers, mask_scenes, mask_views, materials, shapes
+from polcap.training import gbuffers, limbs, mask_scenes, mask_views, materials, shapes
 
 SIZE = (288, 384)  # H, W, traced; half of it is kept
-_VIEWS, _DRESSES = 4, 2  # of each mesh, of each view
+_VIEWS, _DRESSES = 3, 2  # of each mesh, of each view
+_UNSEEN = 0.15  # of the charts are in the picture but not found
 
 
 def main(out: Path, data: Path, count: int, seed: int = 5) -> None:
@@ -53,17 +55,17 @@ def _group(files: list[Path], library: materials.Library, seed: int, group: int)
 
 
 def _mesh(files: list[Path], rng: np.random.Generator) -> Triangles:
-    """A scan, a random shape, or two or three of them apart."""
+    """A scan, a random shape, one with limbs, or two or three of them apart."""
+    if rng.random() < 0.75:
+        return _one(files, rng)
+    return mask_views.several([_one(files, rng) for _ in range(rng.integers(2, 4))], rng)
+
+
+def _one(files: list[Path], rng: np.random.Generator) -> Triangles:
     kind = rng.random()
     if kind < 0.4:
         return centred(gbuffers.read_mesh(files[rng.integers(len(files))]))
-    if kind < 0.75:
-        return shapes.compose(rng)
-    parts = [
-        shapes.compose(rng) if rng.random() < 0.5 else centred(gbuffers.read_mesh(files[rng.integers(len(files))]))
-        for _ in range(rng.integers(2, 4))
-    ]
-    return mask_views.several(parts, rng)
+    return shapes.compose(rng) if kind < 0.7 else limbs.grown(rng)
 
 
 def packed(picture: mask_scenes.Picture) -> Floats:
@@ -76,10 +78,21 @@ def packed(picture: mask_scenes.Picture) -> Floats:
     return np.asarray(whole.reshape(height // 2, 2, width // 2, 2, count).mean((1, 3)), np.float16)
 
 
-def drawn(file: Path, rng: np.random.Generator) -> tuple[Look, Floats]:
-    """A picture under new light, turned or mirrored, and measured; and its truth (H, W)."""
+def drawn(file: Path, rng: np.random.Generator, other: Path | None = None) -> tuple[Look, Floats]:
+    """A picture under new light, a part of it, turned or mirrored, and measured; and its truth (H, W).
+
+    other: a picture whose object is laid into this one, too.
+    """
     held = np.load(file).astype(np.float32)
+    if other is not None:
+        more = np.load(other).astype(np.float32)
+        more[..., 6] = 0
+        cover = more[..., 5:6] > 0.5
+        held = np.where(cover & (held[..., 6:] < 0.5), more, held)
+    held = _window(held, rng)
     stokes, mask, chart = held[..., :5], held[..., 5], held[..., 6] > 0.5
+    if not chart.any() and rng.random() < 0.3:
+        stokes = stokes[..., [*rng.permutation(3), 3, 4]]
     if rng.random() < 0.5:
         stokes, mask, chart = stokes[:, ::-1] * [1, 1, 1, 1, -1], mask[:, ::-1], chart[:, ::-1]
     if rng.random() < 0.1:  # the camera stood on its head
@@ -89,4 +102,19 @@ def drawn(file: Path, rng: np.random.Generator) -> tuple[Look, Floats]:
     tint = np.exp(rng.normal(0, 0.1, (2, 3)))
     color = stokes[..., :3] * light[..., None] * np.where((mask > 0)[..., None], tint[0], tint[1])
     sums = np.stack([color.sum(-1), *(np.moveaxis(stokes[..., 3:], -1, 0) * light * rng.uniform(0.6, 1.1))])
+    if rng.random() < _UNSEEN:
+        chart = np.zeros_like(chart)
     return mask_scenes.measured(color, sums, chart, rng), mask
+
+
+def _window(held: Floats, rng: np.random.Generator) -> Floats:
+    """Half of the time a part of the picture (H, W, 7) that shows enough of the object, at the picture's size."""
+    height, width = held.shape[:2]
+    for _ in range(4 if rng.random() < 0.5 else 0):
+        share = rng.uniform(0.6, 0.95)
+        tall, wide = int(height * share), int(width * share)
+        y, x = rng.integers(height - tall + 1), rng.integers(width - wide + 1)
+        part = held[y : y + tall, x : x + wide]
+        if 0.01 < part[..., 5].mean() < 0.9:
+            return np.asarray(cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR))
+    return held

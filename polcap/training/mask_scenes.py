@@ -18,13 +18,14 @@ from polcap.formats import calib
 from polcap.images import Floats
 from polcap.optics import frames, shade
 from polcap.stages.mask.mask_channels import Look, grid
-from polcap.training import materials
+from polcap.training import backdrop_prints, materials
 from polcap.training.mask_views import Traced, backdrop
 from polcap.training.materials import Surface
 
-Mode = Literal["any", "dark", "black", "white", "alike", "shadow", "printed"]
+Mode = Literal["any", "dark", "black", "white", "alike", "shadow", "printed", "pictured"]
 MODES: dict[Mode, float] = {
-    "any": 0.2, "dark": 0.22, "black": 0.18, "white": 0.08, "alike": 0.1, "shadow": 0.1, "printed": 0.12,
+    "any": 0.2, "dark": 0.12, "black": 0.1, "white": 0.08, "alike": 0.12, "shadow": 0.11, "printed": 0.12,
+    "pictured": 0.15,
 }  # fmt: skip
 _BANK = np.random.default_rng(0).standard_normal(1 << 21, dtype=np.float32)
 _PITCH = 16  # px per patch of the chart's own picture
@@ -136,6 +137,8 @@ def _dressed(
             diffuse[wall] = mean * (1 - share + share * relative)
         elif mode == "printed":
             diffuse[wall] = _printed(position[wall], rng)
+        elif mode == "pictured":
+            diffuse[wall] = backdrop_prints.drawn(position[wall], rng)
         elif rng.random() < 0.5:  # plain paper, cloth or board
             _recolored(diffuse, wall, np.exp(rng.uniform(np.log(0.02), np.log(0.9))), rng.uniform(0, 0.3), rng)
         specular[wall] = rng.uniform(0.03, 0.05) if gloss else rng.uniform(0.0, 0.02)

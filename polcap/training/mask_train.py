@@ -1,7 +1,8 @@
 """Train the mask's network: `python -m polcap.training.mask_train DATA OUT MINUTES`; goes on where it was stopped.
 
-Pictures are made first, then learned from in two looks a picture: the whole at a quarter of its pixels, then a
-part of it at its own, hinted by what the first look found. Leaves OUT/mask.onnx, last.pt and metrics.csv.
+Pictures are made first, then learned from in two looks a picture: the whole at a quarter of its pixels or a few
+more, then a part of it, hinted by what the first look found, or by what a look at the part itself did. Leaves
+OUT/mask.onnx, last.pt and metrics.csv.
 """
 
 import csv
@@ -23,9 +24,13 @@ from polcap.stages.mask.mask_channels import CHANNELS, ENCODING, SIZE_MULTIPLE, 
 from polcap.training import export, mask_model, mask_pictures
 from polcap.training.train import Muon
 
-_BATCH, _PARTS, _PART = 8, 4, 96  # pictures a step, of how many a part is looked at; its side, px
-_ZOOM = (0.35, 1.0)  # side of what it shows, of the picture's height
+_BATCH, _PARTS, _PART = 8, 4, (96, 128)  # pictures a step, of how many a part is looked at; its height, width, px
+_WHOLE = (80, 96, 112, 128, 144)  # px of the first look's width: drawn for each step
+_ZOOM = (0.35, 1.0)  # width of what a part shows, of the picture's
+_AGAIN = 0.3  # of the steps look at the parts twice and learn from the second
+WHOLE = 128  # px of the longer side at the first look
 _HELD = 40  # pictures that are only looked at
+_LAID = 0.12  # of the pictures have another one's object laid into them
 _WARM, _HOLD = 50, 0.35  # steps; share of the budget at the full learning rate
 
 
@@ -93,14 +98,20 @@ class Run:
         fall = min(1.0, (1 - min(progress, 1.0)) / (1 - _HOLD)) * min(1.0, (self.step + 1) / _WARM)
         for group in (g for optimizer in self.optimizers for g in optimizer.param_groups):
             group["lr"] = group["full"] * fall
-        drawn = [mask_pictures.drawn(file, rng) for file in files]
-        height, width = (side // 2 for side in drawn[0][1].shape)
-        logits = self.network(batch([first(look) for look, _ in drawn]))[..., :height, :width]
-        coarse = mask_model.loss(logits, stacked([halved(truth) for _, truth in drawn]))
+        others = [files[n - 1] if rng.random() < _LAID else None for n in range(len(files))]
+        drawn = [mask_pictures.drawn(file, rng, other) for file, other in zip(files, others)]
+        width = int(rng.choice(_WHOLE))
+        truths = stacked([reduced(truth, width) for _, truth in drawn])
+        logits = self.network(batch([first(look, width) for look, _ in drawn]))[..., : truths.shape[2], :width]
+        coarse = mask_model.loss(logits, truths)
         coarse.backward()
         chances = torch.sigmoid(logits.detach())[:, 0].numpy()
         parts = [part(look, truth, chance, rng) for (look, truth), chance in zip(drawn[:_PARTS], chances)]
-        fine = mask_model.loss(self.network(batch([seen for seen, _ in parts])), stacked([t for _, t in parts]))
+        shown = batch([seen for seen, _ in parts])
+        if rng.random() < _AGAIN:
+            with torch.no_grad():
+                shown[:, CHANNELS.index("chance")] = 2 * torch.sigmoid(self.network(shown)[:, 0]) - 1
+        fine = mask_model.loss(self.network(shown), stacked([t for _, t in parts]))
         fine.backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0, foreach=True)
         for optimizer in self.optimizers:
@@ -119,8 +130,8 @@ class Run:
         for number, file in enumerate(files):
             look, truth = mask_pictures.drawn(file, np.random.default_rng(number))
             with torch.no_grad():
-                chance = torch.sigmoid(network(batch([first(look)])))[0, 0].numpy()
-                chance = chance[: truth.shape[0] // 2, : truth.shape[1] // 2]
+                seen = first(look, WHOLE)
+                chance = torch.sigmoid(network(batch([seen])))[0, 0].numpy()[: seen.shape[1], : seen.shape[2]]
                 hint = cv2.resize(chance, truth.shape[::-1], interpolation=cv2.INTER_LINEAR)
                 fine = network(batch([encode(look, brightness(look.color), hint)]))[0, 0].numpy()
             found[0].append(iou(hint > 0.5, truth > 0.5))
@@ -150,32 +161,35 @@ def averaged(weights: dict[str, Tensor]) -> mask_model.Network:
     return network
 
 
-def first(look: Look) -> Floats:
-    """The channels of the whole picture at half its width and height."""
+def first(look: Look, width: int) -> Floats:
+    """The channels of the whole picture at so many pixels across."""
     smaller = Look(
-        halved(look.color), np.stack([halved(s) for s in look.stokes]), halved(look.chart.astype(np.float32)) > 0.5,
-        np.stack([halved(p) for p in look.place]),
+        reduced(look.color, width), np.stack([reduced(s, width) for s in look.stokes]),
+        reduced(look.chart.astype(np.float32), width) > 0.5, np.stack([reduced(p, width) for p in look.place]),
     )  # fmt: skip
     return encode(smaller, brightness(smaller.color))
 
 
 def part(look: Look, truth: Floats, chance: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """The channels of a square about a place of the outline, hinted, and its truth."""
+    """The channels of a rectangle about a place of the outline, hinted, and its truth."""
     height, width = truth.shape
-    side = int(height * rng.uniform(*_ZOOM))
+    zoom = rng.uniform(*_ZOOM)
+    tall, wide = int(height * zoom), int(width * zoom)
     hint = cv2.resize(chance, (width, height), interpolation=cv2.INTER_LINEAR)
     solid = (truth > 0.5).astype(np.uint8)
     rim = np.argwhere((solid > 0) & (cv2.erode(solid, np.ones((3, 3), np.uint8), borderValue=1) == 0))
     wrong = np.argwhere((hint > 0.5) != (solid > 0))
     places = wrong if len(wrong) and rng.random() < 0.4 else rim
     y, x = places[rng.integers(len(places))] if len(places) else (height // 2, width // 2)
-    y, x = (int(np.clip(a - rng.uniform(0.2, 0.8) * side, 0, n - side)) for a, n in ((y, height), (x, width)))
-
-    kind = cv2.INTER_AREA if side > _PART else cv2.INTER_LINEAR
+    y, x = (
+        int(np.clip(a - rng.uniform(0.2, 0.8) * side, 0, n - side))
+        for a, n, side in ((y, height, tall), (x, width, wide))
+    )
+    kind = cv2.INTER_AREA if tall > _PART[0] else cv2.INTER_LINEAR
 
     def cut(image: Floats) -> Floats:
-        shown = np.ascontiguousarray(image[y : y + side, x : x + side])
-        return np.asarray(cv2.resize(shown, (_PART, _PART), interpolation=kind))
+        shown = np.ascontiguousarray(image[y : y + tall, x : x + wide])
+        return np.asarray(cv2.resize(shown, _PART[::-1], interpolation=kind))
 
     seen = Look(
         cut(look.color), np.stack([cut(s) for s in look.stokes]), cut(look.chart.astype(np.float32)) > 0.5,
@@ -184,8 +198,9 @@ def part(look: Look, truth: Floats, chance: Floats, rng: np.random.Generator) ->
     return encode(seen, brightness(look.color), cut(hint)), cut(truth)
 
 
-def halved(image: Floats) -> Floats:
-    size = image.shape[1] // 2, image.shape[0] // 2
+def reduced(image: Floats, width: int) -> Floats:
+    """Averaged down to so many pixels across."""
+    size = width, round(image.shape[0] * width / image.shape[1])
     return np.asarray(cv2.resize(np.asarray(image, np.float32), size, interpolation=cv2.INTER_AREA))
 
 
@@ -208,7 +223,7 @@ def ship(checkpoint: Path, path: Path) -> Path:
     """The averaged weights of a checkpoint as the model that `formats/onnx.py` loads."""
     state = torch.load(checkpoint, weights_only=True)
     metadata = {
-        "channels": ",".join(CHANNELS), "encoding": ENCODING, "native_size": str(mask_pictures.SIZE[1] // 4),
+        "channels": ",".join(CHANNELS), "encoding": ENCODING, "native_size": str(WHOLE),
         "size_multiple": str(SIZE_MULTIPLE), "licence": "Apache-2.0", "outputs": "logit: of being the object",
         "training": f"{state['step'] * _BATCH} pictures in {state['step']} steps",
     }  # fmt: skip

@@ -63,7 +63,7 @@ def any_kind(rng: np.random.Generator) -> Kind:
     """As photographs come, and the hard ones among them more often."""
     framing: Framing = rng.choice(["whole", "small", "cut", "full"], p=[0.66, 0.12, 0.16, 0.06])
     stage: Stage = rng.choice(["wall", "table", "cloth"], p=[0.4, 0.4, 0.2])
-    return Kind(framing, stage, (0.2, 0.7) if rng.random() < 0.2 else (0.0, 0.15))
+    return Kind(framing, stage, (0.2, 0.7) if rng.random() < 0.3 else (0.0, 0.15))
 
 
 def several(meshes: list[Triangles], rng: np.random.Generator) -> Triangles:

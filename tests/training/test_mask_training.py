@@ -9,7 +9,17 @@ import torch
 from polcap.formats import onnx
 from polcap.stages.mask.mask_channels import CHANNELS, ENCODING
 from polcap.synth.mesh_tracer import Tracer, smooth
-from polcap.training import mask_model, mask_pictures, mask_scenes, mask_train, mask_views, materials, shapes
+from polcap.training import (
+    backdrop_prints,
+    limbs,
+    mask_model,
+    mask_pictures,
+    mask_scenes,
+    mask_train,
+    mask_views,
+    materials,
+    shapes,
+)
 
 SIZE = (72, 96)
 
@@ -82,3 +92,32 @@ def test_loss_is_small_where_the_network_is_right_and_sure() -> None:
     truth = torch.zeros(1, 1, 16, 16)
     truth[..., 4:12, 4:12] = 1
     assert mask_model.loss(20 * (2 * truth - 1), truth) < 1e-3 < mask_model.loss(torch.zeros_like(truth), truth)
+
+
+def test_limbs_are_closed_to_the_outside() -> None:
+    """A surface whose faces turn outwards encloses a positive volume (the divergence theorem)."""
+    for seed in range(4):
+        vertices, faces = limbs._limb(np.array([0.0, 0.3, 0.1]), 0.04, 0.8, np.ones(3), np.random.default_rng(seed))
+        a, b, c = (vertices[faces[:, k]] for k in range(3))
+        volume = np.einsum("ni,ni->n", a, np.cross(b, c)).sum() / 6
+        assert 0 < volume < np.pi * 0.06**2 * 2
+    mesh = limbs.grown(np.random.default_rng(2))
+    assert np.ptp(mesh.vertices, axis=0).max() == pytest.approx(1, abs=1e-5)
+
+
+def test_prints_have_colours_and_are_albedos() -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (500, 3))
+    for seed in range(16):
+        albedo = backdrop_prints.drawn(points, np.random.default_rng(seed))
+        assert albedo.shape == (500, 3) and 0 < albedo.min() <= albedo.max() <= 0.95
+
+
+def test_an_object_laid_into_a_picture_is_part_of_the_truth(tmp_path: Path, picture: mask_scenes.Picture) -> None:
+    held = mask_pictures.packed(picture)
+    np.save(tmp_path / "0.npy", held)
+    np.save(tmp_path / "1.npy", held[:, ::-1])
+    shares = []
+    for other in (None, tmp_path / "1.npy"):
+        _, truth = mask_pictures.drawn(tmp_path / "0.npy", np.random.default_rng(4), other)
+        shares.append(truth.mean())
+    assert shares[1] >= shares[0] > 0
