@@ -44,7 +44,7 @@ class Reduced:
         self.taken, self.network, self.mask_network, self.config = taken, network, mask_network, config
         self.chart = chart
         self.names = [shot.name for shot in taken.capture.shots]
-        self.focal_known = taken.capture.focal_known
+        self.focal_doubt = taken.capture.focal_doubt
         self.grid_px = taken.step / (taken.binned if config.hdr.demosaic == "superpixel" else 1)
 
     @cached_property

@@ -71,6 +71,7 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
         layout=plan.layout,
         focal_px=lens.px / step,
         focal_known=lens.known,
+        focal_doubt=lens.doubt,
         principal_px=((width - 1) / 2, (height - 1) / 2),
         size_px=(width, height),
         chart_frames=tuple(_frame(plan, stated, source, 0.0) for source in plan.others if source.role == "chart"),

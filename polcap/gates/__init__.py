@@ -33,7 +33,6 @@ def judge(found: Found, config: Config) -> Iterator[Gate]:
     yield _normal_error(found, judged, config.gates)
     if found.mesh is not None:
         yield geometry.mesh(found.mesh, config.gates)
-    yield _focal_length(found.focal_known)
 
 
 def verdict(gates: Iterable[Gate]) -> State:
@@ -59,6 +58,7 @@ def _in_order(found: Found, config: Config) -> Iterator[Gate]:
     yield light.noise(found, limits)
     yield light.ambient(found, limits)
     yield polarization.ill_posed(found, limits)
+    yield geometry.focal_length(found)
 
 
 def _normal_error(found: Found, judged: list[Gate], limits: Gates) -> Gate:
@@ -78,11 +78,3 @@ def _normal_error(found: Found, judged: list[Gate], limits: Gates) -> Gate:
         return Gate("normal error", "pass", round(expected, 2), limit, says, unit="°")
     remedy = "see the lines above" if because else "more light or frames, four angles, or a darker room"
     return Gate("normal error", "fail", round(expected, 2), limit, says, remedy, unit="°")
-
-
-def _focal_length(known: bool) -> Gate:
-    if known:
-        return Gate("focal length", "pass", "known", "known", "known", unit="")
-    says = "the focal length is assumed; a wrong one bends the depth"
-    remedy = "state focal_length_mm and sensor_width_mm in capture.toml"
-    return Gate("focal length", "warn", "assumed", "known", says, remedy, unit="")

@@ -3,10 +3,12 @@
 import numpy as np
 
 from polcap.config import Config, Gates
+from polcap.formats import calib
 from polcap.gates.gate import Found, Gate, State, at_most, blamed
 from polcap.images import Mesh
 from polcap.optics.sharpness import TILE
 from polcap.stages.align import object_motion
+from polcap.stages.whitebalance import chart_in_mask
 
 
 def alignment(found: Found, config: Config) -> Gate:
@@ -53,7 +55,7 @@ def _pushed(found: Found, config: Config) -> Gate | None:
 
 
 def mask(found: Found, limits: Gates) -> Gate:
-    """Fails where the network doubts its mask; warns from half of that on, and of a shape that no object has."""
+    """Fails where a chart is in it or the network doubts it; warns from half of that on, and of shapes none has."""
     object_, limit = found.object_, limits.max_mask_doubt
     doubts = []
     if object_.border > limits.max_mask_border:
@@ -70,6 +72,12 @@ def mask(found: Found, limits: Gates) -> Gate:
         "warn" if doubts else "pass" if object_.doubt is not None or object_.source == "user" else "not measured"
     )
     if object_.doubt is not None and object_.doubt > limit:
+        state = "fail"
+    charted = 0.0
+    if found.color.corners is None:
+        charted = chart_in_mask.share(found.radiance, object_.mask, calib.colorchecker())
+    if charted:
+        doubts.insert(0, f"{charted:.0%} of it looks like a colour chart that was not found, and is no object")
         state = "fail"
     says = "; ".join(doubts) or "share of the object's outline in doubt"
     remedy = "look at it, and where it is wrong give --mask PNG; let backdrop show all around the object"
@@ -107,3 +115,17 @@ def sharpness(found: Found, limits: Gates) -> Gate:
     bad = blamed(found.names, np.nanmax(np.nan_to_num(blur), axis=1) > limit)
     remedy = "focus by hand and tape the ring, use a remote release, then take it again"
     return at_most("sharpness", float(blur[k, e]), limit, says, remedy, bad, 3, "px")
+
+
+def focal_length(found: Found) -> Gate:
+    """Whether it is known; where not, what it costs: normals stand on view rays, which lean as it says."""
+    doubt = found.focal_doubt
+    if not doubt:
+        return Gate("focal length", "pass", "known", "known", "known", unit="")
+    maps, (y, x) = found.maps, np.nonzero(found.maps.mask)
+    off = np.hypot(x - maps.view.center[0], y - maps.view.center[1]) / maps.view.focal
+    lean, more, less = (np.arctan(off * factor) for factor in (1.0, np.exp(doubt), np.exp(-doubt)))
+    cost = float(np.degrees(np.median(np.maximum(more - lean, lean - less)))) if len(off) else 0.0
+    says = f"the focal length is assumed, perhaps {np.exp(doubt):.1f} times off; a wrong one bends shape and depth"
+    remedy = "state focal_length_mm and sensor_width_mm in capture.toml"
+    return Gate("focal length", "warn", "assumed", "known", says, remedy, round(cost, 1), unit="")

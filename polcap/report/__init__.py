@@ -78,6 +78,7 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
         "size_px": list(capture.size_px),
         "focal_px": capture.focal_px,
         "focal_known": capture.focal_known,
+        "focal_doubt": capture.focal_doubt,
         "shots": [
             {"angle_deg": float(np.degrees(shot.angle)), "frames": [frame(one) for one in shot.frames]}
             for shot in capture.shots
@@ -193,7 +194,7 @@ def document(
 ) -> dict[str, Any]:
     """report.json: what was understood, measured and judged; timings [s] of the stages that were kept."""
     found = {**figures(results), "rerendering": rerendering(results, config.infer.ior)}
-    judged = list(gates.judge(Whole(results, bool(capture["focal_known"])), config))
+    judged = list(gates.judge(Whole(results, float(capture["focal_doubt"])), config))
     return {
         "polcap": __version__,
         "versions": provenance.versions(),

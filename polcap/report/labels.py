@@ -88,7 +88,7 @@ _FACTORS = {"%": 100.0, "mm": 1000.0}  # figures are shares and metres
 def units(metric: bool) -> dict[str, str]:
     """Unit of every number in report.json that has one; "1" is a share or a factor."""
     found = {name: _STORED.get(unit, unit) for name, (_, unit) in LABELS.items() if unit}
-    raw = {"capture.focal_px": "RAW px", "capture.size_px": "RAW px"}
+    raw = {"capture.focal_px": "RAW px", "capture.size_px": "RAW px", "capture.focal_doubt": "1"}
     return {**found, **raw, "mesh.extent": "m" if metric else "relative", "timings": "s"}
 
 

@@ -134,7 +134,8 @@ def _good(seed: int, kind: str, width: int, random: Random) -> Planned:
         scene = msgspec.structs.replace(scene, chart=None)
     elif chart == "corner":
         up = float(random.choice([-1, 1]))
-        scene = msgspec.structs.replace(scene, chart=Chart(center=(0.146, 0.108 * up, -0.7)))
+        turn = tuple(random.uniform(-1, 1, 3) * (6, 6, 3))  # not along the rays' rows: one ray a pixel sees steps there
+        scene = msgspec.structs.replace(scene, chart=Chart(center=(0.144, 0.106 * up, -0.7), turn_deg=turn))
     scene = msgspec.structs.replace(scene, law=("smooth", "rough")[int(random.integers(2))])
     shots = len(angles)
     actual = (np.array(angles) + how.angle_error_deg * random.normal(size=shots)).tolist()

@@ -28,7 +28,7 @@ def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> SimpleNamespace
     flat = np.full(image.mask.shape, 0.5, np.float32)
     maps = SurfaceMaps(normal, normal, normal, flat, None, 8 * flat, image.mask, image.view, "analytic")
     given = {
-        "names": [f"{np.degrees(a):g}°" for a in radiance.angle], "focal_known": True, "grid_px": 1.0,
+        "names": [f"{np.degrees(a):g}°" for a in radiance.angle], "focal_doubt": 0.0, "grid_px": 1.0,
         "chart_missing": "", "clipped": np.zeros(shots), "radiance": radiance,
         "color": scenes.no_color(), "alignment": scenes.still(shots), "object_": object_, "gains": gains,
         "stokes": image, "maps": maps, "mesh": None,
@@ -158,8 +158,13 @@ def test_mask_that_its_network_doubts_fails(good: SimpleNamespace) -> None:
     assert failed(changed(good, object_=replace(good.object_, doubt=0.3))) == ["mask"]
 
 
-def test_assumed_focal_length_warns(good: SimpleNamespace) -> None:
-    assert judged(changed(good, focal_known=False))["focal length"].state == "warn"
+def test_assumed_focal_length_warns_and_costs_what_the_rays_would_lean(good: SimpleNamespace) -> None:
+    doubt = float(np.log(2.0))
+    gate = judged(changed(good, focal_doubt=doubt))["focal length"]
+    y, x = np.nonzero(good.maps.mask)
+    off = np.hypot(x - good.maps.view.center[0], y - good.maps.view.center[1]) / good.maps.view.focal
+    lean = np.degrees(np.median(np.arctan(2 * off) - np.arctan(off)))  # a focal length half as long
+    assert gate.state == "warn" and gate.cost_deg == pytest.approx(lean, abs=0.06)
 
 
 @pytest.mark.parametrize(

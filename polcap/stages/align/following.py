@@ -151,6 +151,29 @@ def refine(reference: Detail, shot: Detail, start: Floats, model: str) -> tuple[
     return transform, float(np.hypot(error, _FLOOR_PX))
 
 
+def sigma_at(reference: Detail, shot: Detail, transform: Floats, point: Floats) -> float:
+    """1σ of where a similarity puts a point, px; far from what told, open roll and zoom count with the distance.
+
+    Parameters
+    ----------
+    reference
+        Where a pixel's weight is 0 it does not count.
+    shot
+        What was laid over it.
+    transform
+        (3, 3) reference px → shot px, as refined.
+    point
+        x, y, 1 on the reference.
+    """
+    compared = _Compared(reference[1], shot[1], transform, "similarity")
+    if len(compared.x) <= LEAST_PIXELS:
+        return np.inf
+    x, y = (point[0] - compared.width / 2) / compared.size, (point[1] - compared.height / 2) / compared.size
+    lever = np.array([[1, 0, x, -y], [0, 1, y, x]])
+    covariance = lever @ compared.update(transform)[1] @ lever.T
+    return float(np.hypot(np.sqrt(max(np.trace(covariance) / 2, 0.0)), _FLOOR_PX))
+
+
 class _Compared:
     """The pixels of two shots that tell how one moved against the other."""
 
@@ -173,9 +196,15 @@ class _Compared:
 
     def step(self, transform: Floats) -> tuple[Floats, float]:
         """One compositional update (3, 3) that brings b∘transform closer to a, and its 1σ, px."""
-        count = len(self.x)
-        if count <= LEAST_PIXELS:
+        if len(self.x) <= LEAST_PIXELS:
             return np.eye(3), np.inf
+        p, covariance = self.update(transform)
+        variance = max(float(np.trace(covariance[:2, :2])), 0.0)  # rounding, where next to nothing tells
+        return _matrix(p, self.width, self.height, self.size), float(np.sqrt(variance / 2))
+
+    def update(self, transform: Floats) -> tuple[Floats, Floats]:
+        """The update's parameters (P,), about the image centre in units of `size`, and their covariance (P, P)."""
+        count = len(self.x)
         u, v = (_rows(c) for c in coordinates(transform, self.x, self.y))
         warped = self.shot.spline.at(Taps(u, v, (self.height, self.width))).ravel()[:count]
         u, v = u.astype(np.float32), v.astype(np.float32)
@@ -208,9 +237,7 @@ class _Compared:
         # Neighbouring residuals are correlated by the blur over about ten pixels.
         residual = weighted * difference
         spread = np.linalg.inv(normal) @ (residual @ residual.T) @ np.linalg.inv(normal)
-        variance = max(float(np.trace(spread[:2, :2])), 0.0)  # rounding, where next to nothing tells
-        error = float(np.sqrt(10 * variance / 2))
-        return _matrix(p, self.width, self.height, self.size), error
+        return p, 10 * spread
 
 
 def _rows(points: Floats) -> Floats:

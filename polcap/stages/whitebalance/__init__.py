@@ -32,6 +32,7 @@ _LEAST_PITCH_PX = 8.0  # below, a patch has too few pixels to be sampled
 _TILE_PX, _TILE_STEP_PX = 900, 600
 _GAMMA = (255 * np.linspace(0, 1, 2**14) ** (1 / 2.2)).astype(np.uint8)
 _CLEARLY_BETTER = 0.5  # of the residual: of 15 photographs none comes below .93 with another edition
+_SMALL_PART = 0.05  # of the variance that edges of patches under ten pixels take: colors decide there
 _CANDIDATES = 3  # per picture: texture may look more like a chart than the chart
 _REMEDY = "give its corners with --chart x0,y0,…,x3,y3, a profile with --chart FILE, or --no-chart"
 
@@ -61,7 +62,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     patch_share: Annotated[float, Meta(ge=0.2, le=0.95, description="sampled share of each patch's side")] = 0.6
 
 
-@stage(version=3)
+@stage(version=4)
 def measure(
     radiance: AngleStack, reference: ChartReference, request: ChartRequest, settings: Settings
 ) -> ColorCalibration:
@@ -153,7 +154,7 @@ def _search(radiance: AngleStack, reference: ChartReference, settings: Settings)
         if cost > settings.max_cost or not chart.is_view(start.homography) or _among(known, start):
             continue
         place = _refine(value, start)
-        if not _plausible(place, settings):
+        if not _plausible(place, settings.min_explained - _SMALL_PART):
             continue
         known.append(place)
         try:
@@ -163,6 +164,10 @@ def _search(radiance: AngleStack, reference: ChartReference, settings: Settings)
         except ChartError as error:
             exposed = error
             continue
+        if place.explained < settings.min_explained:
+            ways = [way for way in ways if way.error <= settings.max_delta_e / 3]
+            if not ways:
+                continue
         best = min(ways if best is None else [*ways, best], key=lambda find: find.error)
         if best.error <= settings.max_delta_e / 2:  # beyond, a later picture may place the chart better
             return best
@@ -203,7 +208,7 @@ def _at_corners(
         )
     refined = _refine(radiance.value[0], placement)
     moved = float(np.abs(refined.corners() - corners).max()) / placement.pitch_px
-    place = refined if _plausible(refined, settings) and moved < 0.35 else placement
+    place = refined if _plausible(refined, settings.min_explained) and moved < 0.35 else placement
     find = _Find(place, _fit(radiance, place, reference, settings), float("nan"))
     if find.error > settings.max_delta_e:
         turned = _Find(place.turned(), _fit(radiance, place.turned(), reference, settings), float("nan"))
@@ -233,12 +238,8 @@ def _edition(
     return best, name
 
 
-def _plausible(place: Placement, settings: Settings) -> bool:
-    return (
-        chart.is_view(place.homography)
-        and place.pitch_px >= _LEAST_PITCH_PX
-        and place.explained >= settings.min_explained
-    )
+def _plausible(place: Placement, min_explained: float) -> bool:
+    return chart.is_view(place.homography) and place.pitch_px >= _LEAST_PITCH_PX and place.explained >= min_explained
 
 
 def _among(places: list[Placement], start: Placement) -> bool:

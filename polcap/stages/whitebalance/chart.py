@@ -133,6 +133,8 @@ def refine(image: Floats, start: Placement, steps: int = 12) -> Placement:
         weight = np.minimum(1.0, 2.5 * scale / (np.abs(residual) + 1e-12))  # Huber
         normal = np.einsum("nci,nc,ncj->ij", jacobian, weight, jacobian)
         right = np.einsum("nci,nc,nc->i", jacobian, weight, residual)
+        if not np.trace(normal) > 0:  # even all over: nothing tells
+            return start
         damping = 1e-3 * np.diag(normal) + 1e-9 * np.trace(normal)
         change = np.linalg.solve(normal + np.diag(damping), right)
         inverse = inverse + np.append(change[:8], 0.0).reshape(3, 3)

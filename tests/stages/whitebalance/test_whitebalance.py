@@ -15,7 +15,7 @@ from polcap.formats import calib
 from polcap.images import AngleStack, ChartReference, ChartRequest, ColorCalibration, Floats, Quality, View
 from polcap.optics.color import decode_srgb
 from polcap.stages import whitebalance
-from polcap.stages.whitebalance import Settings, chart, patches
+from polcap.stages.whitebalance import Settings, chart, chart_in_mask, patches
 
 CLASSIC = calib.colorchecker()
 CAMERA = np.array([[0.28, 0.10, 0.07], [0.08, 0.71, 0.22], [0.02, 0.18, 0.66]])  # linear Rec.709 → S0 in camera
@@ -103,6 +103,32 @@ def test_chart_is_placed_within_a_tenth_of_a_pixel(pitch, turn, tilt):
     assert color.source == "chart"
     assert centers_off(color, place).max() < 0.1
     assert np.nanmean(color.delta_e) < 1  # noise only
+
+
+def test_chart_of_eight_pixel_patches_is_known_by_its_colors():
+    """Superpixels see red and blue half a pixel apart: of patches this small, that leaves 24 flat ones under .9."""
+    raw = photograph(pose(17, 2, (235, 185)), samples=1)
+    image = np.stack([raw[::2, ::2, 0], raw[::2, 1::2, 1], raw[1::2, 1::2, 2]], axis=-1)
+    place = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]]) @ pose(17, 2, (235, 185))
+    assert chart.refine(image / image.max(), chart.from_centers(chart.project(place, chart.centers()))).explained < 0.9
+    color = whitebalance.measure(stack(image), CLASSIC, AUTO, Settings())
+    assert color.source == "chart" and centers_off(color, place).max() < 0.3
+    assert np.nanmean(color.delta_e) < 1
+
+
+def test_chart_that_was_taken_for_the_object_is_recognized():
+    image, place = plain()
+    card = np.zeros(image.shape[:2], np.uint8)
+    edge = chart.project(place, np.array([[-0.1, -0.1], [6.1, -0.1], [6.1, 4.1], [-0.1, 4.1]]))
+    cv2.fillConvexPoly(card, np.round(edge).astype(np.int32), 1)
+    ball = np.hypot(*np.mgrid[-60 : HEIGHT - 60.0, -70 : WIDTH - 70.0]) < 50
+    both = (card > 0) | ball
+    assert chart_in_mask.share(stack(image), both, CLASSIC) == pytest.approx(card.sum() / both.sum())
+    assert chart_in_mask.share(stack(image), ball, CLASSIC) == 0
+    table = np.where(card[..., None] > 0, image[:80, :80].mean((0, 1)), image)  # an even card
+    assert chart_in_mask.share(stack(table), both, CLASSIC) == 0
+    other = photograph(place, np.random.default_rng(0).uniform(0.1, 0.8, (24, 3)))  # 24 tiles of other colors
+    assert chart_in_mask.share(stack(other), both, CLASSIC) == 0
 
 
 def test_s0_of_the_white_patch_is_its_reflectance():

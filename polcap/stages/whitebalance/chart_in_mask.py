@@ -1,0 +1,60 @@
+"""Whether a part of what was taken for the object is a ColorChecker that was not found."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.errors import ChartError
+from polcap.images import AngleStack, ChartReference
+from polcap.stages.whitebalance import chart, patches
+
+_LEAST_SHARE = 0.05  # of the mask; less than that spoils little
+_LEAST_PITCH_PX = 6.0  # of patches that can be told from texture
+_MOST_SIDE_PX = 320  # the part is averaged down to this
+_FILLED = 0.9  # of its rectangle, by a flat card
+_ASPECT = (1.15, 1.8)  # of a card of 6 × 4 patches with its border, seen askew
+_EXPLAINED = 0.75  # of its variance by 24 flat patches on a card; of 106 textures of that outline 17 have that
+_DELTA_E = 15.0  # of its colors, as `whitebalance.max_delta_e`: the textures have 20 and more
+_PATCH_SHARE = 0.6  # of a patch's side that is sampled
+
+
+def share(radiance: AngleStack, mask: NDArray[np.bool_], reference: ChartReference) -> float:
+    """Share of the mask (H, W) where the first shot shows 6 × 4 flat patches of a chart's colors on a card."""
+    count, label, about, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    total = max(int(mask.sum()), 1)
+    parts = [n for n in range(1, count) if about[n, cv2.CC_STAT_AREA] > _LEAST_SHARE * total]
+    return sum(int(about[n, cv2.CC_STAT_AREA]) for n in parts if _is_chart(radiance, label == n, reference)) / total
+
+
+def _is_chart(radiance: AngleStack, part: NDArray[np.bool_], reference: ChartReference) -> bool:
+    y, x = np.nonzero(part)
+    center, (a, b), turn = cv2.minAreaRect(np.stack([x, y], axis=-1).astype(np.float32))
+    long, short = max(a, b) + 1, min(a, b) + 1  # from pixel centres to their edges
+    if not _ASPECT[0] < long / short < _ASPECT[1] or len(x) < _FILLED * long * short:
+        return False
+    if long / chart.COLUMNS < _LEAST_PITCH_PX:
+        return False
+    box = cv2.boxPoints((center, (a, b), turn)).astype(np.float64)  # clockwise as seen
+    if np.linalg.norm(box[1] - box[0]) < np.linalg.norm(box[2] - box[1]):
+        box = np.roll(box, -1, axis=0)
+    x0, y0 = x.min(), y.min()
+    crop = radiance.value[0, y0 : y.max() + 1, x0 : x.max() + 1]
+    small = min(1.0, _MOST_SIDE_PX / long)
+    size = (max(1, round(crop.shape[1] * small)), max(1, round(crop.shape[0] * small)))
+    crop = cv2.resize(crop, size, interpolation=cv2.INTER_AREA)
+    white = np.maximum(np.percentile(crop, 99, axis=(0, 1)), 1e-9)
+    start = chart.from_corners((box - (x0, y0) + 0.5) * small - 0.5, patch=1.0)
+    if not chart.is_view(start.homography):
+        return False
+    place = chart.refine(np.clip(crop / white, 0, 4), start)
+    if place.explained < _EXPLAINED or not chart.is_view(place.homography):
+        return False
+    to_full = np.array([[1 / small, 0, x0 + (0.5 / small - 0.5)], [0, 1 / small, y0 + (0.5 / small - 0.5)], [0, 0, 1]])
+    return any(_delta_e(radiance, way.moved(to_full), reference) < _DELTA_E for way in (place, place.turned()))
+
+
+def _delta_e(radiance: AngleStack, place: chart.Placement, reference: ChartReference) -> float:
+    try:
+        return patches.fit(radiance.value[0], radiance.quality[0], place, reference, _PATCH_SHARE).mean
+    except ChartError:
+        return float("inf")
