@@ -111,8 +111,8 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 20.0
     max_mesh_pieces: Annotated[int, Meta(ge=1, description="pieces of the seen surface, without specks")] = 10
     max_mesh_cuts: Annotated[
-        float, Meta(ge=0, description="length of the mesh's cuts where depth jumps over that of its outline [1]")
-    ] = 1.0
+        float, Meta(ge=0, description="length of the cuts where depth jumps, both sides, over the outline's [1]")
+    ] = 2.0
     max_mesh_raggedness: Annotated[
         float, Meta(ge=0, description="how much longer the mesh's rim is than its smooth curve [1]")
     ] = 0.25

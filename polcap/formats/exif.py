@@ -92,16 +92,13 @@ def _exif(found: Mapping[str, Any]) -> Exif:
     if not time and speed is not None and abs(speed) < 30:
         time = 2.0**-speed  # APEX
     flash = _number(found, "EXIF Flash", "Image Flash")
-    iso = _number(found, "EXIF ISOSpeedRatings", "Image ISOSpeedRatings", "Image Tag 0x0017")  # the last is RW2's
-    if iso in (None, 0.0, 65535.0):  # too large for its 16 bits
-        iso = _number(found, "EXIF RecommendedExposureIndex", "EXIF StandardOutputSensitivity", "EXIF ISOSpeed")
     return Exif(
         make=_text(found, "Image Make"),
         model=_text(found, "Image Model"),
         lens=_text(found, "EXIF LensModel", "Image LensModel"),
         exposure_time=time or None,
         f_number=_number(found, "EXIF FNumber", "Image FNumber") or None,
-        iso=iso or None,
+        iso=_iso(found),
         focal_length_mm=_number(found, "EXIF FocalLength", "Image FocalLength") or None,
         focal_length_35mm=_number(found, "EXIF FocalLengthIn35mmFilm", "Image FocalLengthIn35mmFilm") or None,
         pixel_pitch_um=_plane_pitch(found),
@@ -109,6 +106,14 @@ def _exif(found: Mapping[str, Any]) -> Exif:
         flash_fired=None if flash is None else bool(int(flash) & 1),
         color_matrix=_color_matrix(found),
     )
+
+
+def _iso(found: Mapping[str, Any]) -> float | None:
+    """The sensitivity; 65535 is one too large for its 16 bits, (0, 200) a pair whose second is meant."""
+    names = ("EXIF ISOSpeedRatings", "Image ISOSpeedRatings", "Image Tag 0x0017")  # the last is RW2's
+    beyond = ("EXIF RecommendedExposureIndex", "EXIF StandardOutputSensitivity", "EXIF ISOSpeed")
+    numbers = [number for name in (*names, *beyond) for number in _numbers(found, name)]
+    return next((number for number in numbers if 0 < number != 65535), None)
 
 
 def _plane_pitch(found: Mapping[str, Any]) -> float | None:

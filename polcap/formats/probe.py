@@ -91,8 +91,10 @@ def _raw(path: str, data: bytes) -> worker.Answer:
     plausible.check_structure(path, structure, data)
     known = exif.tags(data)
     bare = known.exposure_time is None and not known.make  # CRW: the decoder knows more, but has to unpack
-    size = raw.size(path, data, unpack=bare)
-    stated = replace(exif.sized(known, size["width"], size["height"]), **size.get("exif", {}))
+    silent = known.iso is None and not structure.dng  # old bodies tell it in makers' tags, or have but one
+    size = raw.size(path, data, unpack=bare or silent)
+    told = {name: value for name, value in size.get("exif", {}).items() if bare or not getattr(known, name)}
+    stated = replace(exif.sized(known, size["width"], size["height"]), **told)
     lossy = plausible.is_lossy(structure)
     return _answer(Probe("raw", photo_bytes.digest(data), stated, lossy=lossy), structure.truncated or lossy)
 

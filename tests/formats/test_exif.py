@@ -2,13 +2,14 @@
 
 import io
 import time
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
 from polcap.errors import DecodeError
-from polcap.formats import exif, probe, sniff
+from polcap.formats import exif, plausible, probe, raw, sniff
 from polcap.images import Exif
 from tests.formats import headers
 from tests.formats.headers import DATA, EXIF_IFD, SUB_IFDS, needs_data
@@ -75,6 +76,31 @@ def test_iso_beyond_sixteen_bits_is_read_where_it_stands(tmp_path):
     path = tmp_path / "a.dng"
     path.write_bytes(headers.dng(np.zeros((32, 32)), photo=photo))
     assert exif.tags(path.read_bytes()).iso == 102400
+
+
+def test_iso_of_a_pair_whose_first_is_zero_is_the_second():
+    assert exif.tags(headers.dng(np.zeros((32, 32)), photo=PHOTO | {34855: (3, (0, 320))})).iso == 320
+
+
+def test_iso_that_no_tag_states_is_asked_of_the_decoder(tmp_path, monkeypatch):
+    """Nikon's first bodies tell it in their maker's tags, old Kodaks have but one; what tags do tell stands."""
+    of_a_maker = SimpleNamespace(dng=False, truncated=False)
+    monkeypatch.setattr(sniff, "structure", lambda file: of_a_maker)
+    monkeypatch.setattr(plausible, "check_structure", lambda *known: None)
+    monkeypatch.setattr(plausible, "is_lossy", lambda structure: False)
+    asked = []
+
+    def size(path, data, unpack):
+        asked.append(unpack)
+        return {"width": 32, "height": 32, "exif": {"iso": 160.0, "exposure_time": 9.0}}
+
+    monkeypatch.setattr(raw, "size", size)
+    for photo, iso in ((PHOTO, 200), ({tag: value for tag, value in PHOTO.items() if tag != 34855}, 160)):
+        path = tmp_path / f"{iso}.dng"
+        path.write_bytes(headers.dng(np.zeros((32, 32)), photo=photo))
+        found = probe.examine(str(path))[0]["probe"]["exif"]
+        assert (found["iso"], found["exposure_time"]) == (iso, pytest.approx(1 / 50))
+    assert asked == [False, True]
 
 
 def test_flash_that_is_not_mentioned_is_unknown(tmp_path):
@@ -169,10 +195,13 @@ def test_real_files():
     assert linear.color_matrix[0] == pytest.approx(0.7034)  # the second matrix, D65
     nikon = _exif(DATA / "real/raw_bracket/sample2.dng")
     assert (nikon.make, nikon.exposure_time, nikon.focal_length_35mm) == ("NIKON CORPORATION", 1 / 640, 36)
+    assert nikon.iso == 200
     powershot = _exif(DATA / "real/raw_chart/CRW_0101.CRW")  # no EXIF: LibRaw's own reading
+    assert powershot.iso == 50
     assert powershot.exposure_time == pytest.approx(1 / 100, rel=0.02)
     assert powershot.focal_length_mm == pytest.approx(7.09, abs=0.01)
     kodak = _exif(DATA / "real/raw_chart/P003910.KDC")
+    assert kodak.iso == 160  # the DC120's only one
     assert (kodak.width, kodak.height, kodak.model) == (848, 976, "Kodak DC120 ZOOM Digital Camera")
 
 

@@ -168,7 +168,7 @@ def test_assumed_focal_length_warns_and_costs_what_the_rays_would_lean(good: Sim
 
 
 @pytest.mark.parametrize(
-    ("fault", "words"), [({"pieces": 26}, "26 pieces"), ({"cuts": 2.0}, "cuts 200%"), ({"raggedness": 0.4}, "rim 40%")]
+    ("fault", "words"), [({"pieces": 26}, "26 pieces"), ({"cuts": 2.5}, "cuts 250%"), ({"raggedness": 0.4}, "rim 40%")]
 )
 def test_mesh_in_shreds_fails(good: SimpleNamespace, fault: dict[str, float], words: str) -> None:
     whole = {"pieces": 1, "cuts": 0.3, "raggedness": 0.1}
