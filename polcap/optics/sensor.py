@@ -37,9 +37,10 @@ def signal(image: SensorImage, full: bool = False) -> Floats:
 
 
 def monochrome(image: SensorImage) -> bool:
-    """Whether three channels repeat one."""
+    """Whether three channels repeat one; an even picture, as where all is clipped, does not tell."""
     v = image.value
-    return image.cfa is None and np.array_equal(v[..., 0], v[..., 1]) and np.array_equal(v[..., 0], v[..., 2])
+    alike = image.cfa is None and np.array_equal(v[..., 0], v[..., 1]) and np.array_equal(v[..., 0], v[..., 2])
+    return alike and bool(np.ptp(v[..., 0]) > 0)
 
 
 def usable(image: SensorImage, clip: float, full: bool = False) -> Bools:

@@ -199,7 +199,8 @@ def _name(error: InputError) -> str:
     """The error's class; what it is about where that names another fault."""
     name = type(error).__name__.removesuffix("Error").lower()
     order = "order " if "contradict the object's outline" in str(error) else ""
-    return f"error {order}{name}{' chart' * ('ColorChecker' in str(error))}"
+    exposed = " exposure" * ("well exposed" in str(error))
+    return f"error {order}{name}{' chart' * ('ColorChecker' in str(error))}{exposed}"
 
 
 def _shown(lines: Any) -> dict[str, list[Any]]:

@@ -32,8 +32,8 @@ FAULTS: dict[str, tuple[str, ...]] = {
     "missing turn": ("angles", "order", "polarized"),
     "turned by 15°": ("angles", "order"),
     "flash jitter, no chart": ("gains", "gain doubt"),
-    "clipped": ("clipping", "alignment"),
-    "underexposed": ("noise", "chart", "capture"),  # capture: "too few well exposed pixels"
+    "clipped": ("clipping", "alignment", "exposure"),  # an error line "too few well exposed pixels"
+    "underexposed": ("noise", "chart", "exposure"),
     "object moved": ("alignment", "stillness"),
     "camera moved": ("alignment",),
     "defocus": ("sharpness",),

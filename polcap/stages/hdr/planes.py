@@ -145,6 +145,7 @@ class Reader:
     def __init__(self, coming: Iterable[Frame]) -> None:
         """`coming`: the frames in the order in which they will be asked for."""
         self.lossy = False
+        self._channels = 0  # of the first frame
         self.budget = Budget()
         self._coming = deque(coming)
         self._held: OrderedDict[int, SensorImage] = OrderedDict()
@@ -178,7 +179,14 @@ class Reader:
         clip, full
             As `signals` has them.
         """
-        return signals(self(shot.frames[e]), clip, full, self.budget.planes / len(shot.frames))
+        found = signals(self(shot.frames[e]), clip, full, self.budget.planes / len(shot.frames))
+        self._channels = self._channels or found.shape[0]
+        if not isinstance(found, Planes) or found.shape[0] == self._channels:
+            return found
+        even = np.ptp(found.value) == 0  # all clipped: of how many channels it is the others say
+        if even or found.shape[0] == 1:  # a grey picture among coloured ones
+            return Planes(np.repeat(found.value[:1], self._channels, axis=0), found.usable)
+        return found
 
     def forget(self, frames: Iterable[Frame]) -> None:
         """These are not needed any more."""

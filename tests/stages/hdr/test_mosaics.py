@@ -93,6 +93,22 @@ def test_monochrome_channel_stands_in_three_with_three_times_the_variance():
     assert abs(z.var() - 1) < 0.1
 
 
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("order", [(0.5, 1, 80), (80, 1, 0.5)])
+def test_wholly_clipped_frame_has_the_channels_of_the_others(channels, order):
+    """Its three channels are alike whatever they are of."""
+    color = [0.6, 1, 0.7] if channels == 3 else [1, 1, 1]
+    light = np.exp(np.linspace(5, 9, 120))[None, :, None] * np.ones((90, 1, 3)) * color / 2e4
+    noise = 1 + np.random.default_rng(2).normal(scale=0.002, size=(90, 120, 1))
+    pictures = [np.minimum(light * noise * e + (e > 9), 1).astype(np.float32) for e in order]
+    frames = [
+        frame(SensorImage(value, np.zeros((1, 1)), 1.0, None), exposure_time=e) for value, e in zip(pictures, order)
+    ]
+    assert (frames[order.index(80)].load().value == 1).all()
+    stack = hdr.merge(capture(frames), hdr.Settings())
+    assert stack.value.shape == (1, 90, 120, 3) and np.isfinite(stack.value).all()
+
+
 def test_three_channel_frames_pass_unbinned_and_lossy_is_told():
     rng = np.random.default_rng(15)
     light = np.exp(np.linspace(5, 9, 300))[None, :, None] * np.ones((200, 1, 3)) * [0.6, 1, 0.7]
