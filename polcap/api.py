@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap import pipeline
+from polcap import models, pipeline
 from polcap.config import Config
 from polcap.formats import capture as captures
 from polcap.images import ChartRequest
@@ -70,8 +70,8 @@ def process(
     """
     folder = Path(capture)
     target = folder / "polcap" if out is None else Path(out)
-    network = pipeline.load_network(estimator, None if model is None else Path(model), "cpu", 0)
-    supplied = UserInput(chart=chart, mask=mask, network=network, mask_network=pipeline.load_mask_network())
+    network = models.load_network(estimator, None if model is None else Path(model), "cpu", 0)
+    supplied = UserInput(chart=chart, mask=mask, network=network, mask_network=models.load_mask_network())
     found = captures.read(folder, angles_deg)
     about = pipeline.process(found, supplied, config or Config(), target, progress=progress)
     assert about is not None  # only `until` leaves it out

@@ -89,6 +89,10 @@ class Frame:
     digest: str  # of the file's bytes
     load: Callable[[], SensorImage] = field(compare=False, repr=False, metadata=NOT_IN_KEY)
     exposure: float | None = None  # stated in capture.toml; relative; overrides EXIF
+    # applies a function (image, **plain options) → plain facts, arrays in the process that decodes; None: load it
+    within: Callable[..., tuple[dict[str, Any], dict[str, NDArray[Any]]]] | None = field(
+        default=None, compare=False, repr=False, metadata=NOT_IN_KEY
+    )
 
 
 @dataclass(frozen=True)

@@ -10,20 +10,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 
 from polcap import asset_export, pictures, report
 from polcap.asset_export import Wanted
 from polcap.config import Config, restored
-from polcap.errors import InputError, ModelError, SettingError, StorageError
-from polcap.formats import animation, atomic, calib, layouts, onnx, png, provenance, text_file
+from polcap.errors import InputError, SettingError, StorageError
+from polcap.formats import animation, atomic, layouts, png, provenance, text_file
 from polcap.formats import maps as maps_folder
 from polcap.images import Capture, Frame, Network, SensorImage
 from polcap.path import STAGES, Results, UserInput, path
 from polcap.pictures import moving
-from polcap.stages.mask import mask_channels
 from polcap.store import Archive, Progress, Store, contents, seal, silent
 
 
@@ -154,36 +153,6 @@ def judge_again(out: Path) -> dict[str, Any]:
 def timings(out: Path) -> dict[str, float]:
     """Seconds that each kept stage took when it was computed."""
     return {about["stage"]: about["seconds"] for about in contents(out)}
-
-
-def load_network(
-    estimator: Literal["network", "analytic"] | None, model: Path | None, device: onnx.Device, threads: int
-) -> Network | None:
-    """The model to use: the one named, else the one shipped; None is the analytic estimator.
-
-    Raises
-    ------
-    ModelError
-        The network was asked for and there is none, or it cannot be used.
-    """
-    if estimator == "analytic":
-        if model is not None:
-            raise SettingError("--model and --estimator analytic exclude each other; leave one out")
-        return None
-    if model is None:
-        shipped = sorted(calib.data_path("colorchecker").parent.glob("models/polcap*.onnx"))
-        if not shipped and (estimator == "network" or device == "cuda"):
-            raise ModelError("this polcap ships no model; name one with --model, or use --estimator analytic")
-        if not shipped:
-            return None
-        model = shipped[-1]
-    return onnx.load(model, device, threads)
-
-
-def load_mask_network(threads: int = 0) -> Network | None:
-    """The network that finds the object, as shipped; None where this polcap ships none."""
-    shipped = sorted(calib.data_path("colorchecker").parent.glob("models/mask*.onnx"))
-    return onnx.load(shipped[-1], "cpu", threads, mask_channels.ENCODING) if shipped else None
 
 
 def sweep(out: Path) -> None:

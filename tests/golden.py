@@ -14,7 +14,7 @@ from zlib import crc32
 
 import numpy as np
 
-from polcap import path, pipeline, stages
+from polcap import models, path, pipeline, stages
 from polcap.formats import npy_folder
 from polcap.stages import infer
 
@@ -32,7 +32,7 @@ def fingerprints(result: Path) -> dict[str, dict[str, Any]]:
     opened, _ = pipeline.reopen(result)
     version: dict[str, Any] = versions()
     made = {stage.name: _entry(version[stage.name], stage.name, stage.value) for stage in vars(opened).values()}
-    network = pipeline.load_network("network", None, "cpu", 1)
+    network = models.load_network("network", None, "cpu", 1)
     assert network is not None
     maps = infer.estimate(opened.cues.value, network, infer.Settings())
     made[LEARNED] = _entry([version["infer"], network.digest], "infer", maps)

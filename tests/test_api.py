@@ -6,7 +6,7 @@ import sys
 import pytest
 
 import polcap
-from polcap import pipeline
+from polcap import models
 from polcap.formats import maps
 
 
@@ -37,7 +37,7 @@ def test_python_takes_the_network_as_the_command_line_does(monkeypatch: pytest.M
         asked.append(arguments)
         raise polcap.PolcapError("far enough")
 
-    monkeypatch.setattr(pipeline, "load_network", load)
+    monkeypatch.setattr(models, "load_network", load)
     with pytest.raises(polcap.PolcapError, match="far enough"):
         polcap.process("nowhere")
     assert asked == [(None, None, "cpu", 0)]  # what `polcap process` without flags asks for

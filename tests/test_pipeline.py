@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polcap import pipeline
+from polcap import models, pipeline
 from polcap.config import Config
 from polcap.errors import ObjectError
 from polcap.formats import capture as captures
@@ -210,7 +210,7 @@ def test_photographs_are_never_touched(example: Path, tmp_path: Path, polcap: Co
 
 def test_plan_tells_what_is_cached(result: Path, example: Path) -> None:
     found = captures.read(example)
-    supplied = UserInput(mask_network=pipeline.load_mask_network())
+    supplied = UserInput(mask_network=models.load_mask_network())
     states = pipeline.plan(found, supplied, Config(), result)
     assert set(states.values()) == {"cached", "on demand"}
     states = pipeline.plan(found, supplied, Config(), result, force="mask")

@@ -4,6 +4,8 @@ The path's own stages judge, on pictures averaged down to at most 0.6 MP; what t
 the full pictures as they are read. Nothing is written.
 """
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from time import perf_counter
 
 import msgspec
@@ -13,6 +15,8 @@ from polcap.config import Config
 from polcap.gates import Gate
 from polcap.images import Capture, ChartRequest, Network
 from polcap.path import AUTO
+
+Networks = tuple[Network | None, Network | None]  # the estimator's, the mask's
 
 
 class Verdict(msgspec.Struct, frozen=True):
@@ -28,9 +32,8 @@ class Verdict(msgspec.Struct, frozen=True):
 
 def inspect(
     capture: Capture,
-    network: Network | None,
+    networks: Callable[[], Networks],
     config: Config,
-    mask_network: Network | None = None,
     chart: ChartRequest = AUTO,
 ) -> Verdict:
     """Judge a capture.
@@ -39,12 +42,11 @@ def inspect(
     ----------
     capture
         Its frames are decoded, averaged down and forgotten.
-    network
-        None expects the errors of the analytic estimator.
+    networks
+        Loads the estimator's and the mask's, while frames are decoded. Without the first the errors of the analytic
+        estimator are expected; without the second the object is what stands out from the backdrop.
     config
         Settings of the stages, and the gates' limits.
-    mask_network
-        None takes for the object what stands out from the backdrop.
     chart
         As given to `process`.
 
@@ -54,8 +56,13 @@ def inspect(
         A frame cannot be decoded.
     """
     start = perf_counter()
-    small = judge.Reduced(reduced.take(capture, config.hdr.clip), network, mask_network, config, chart)
-    lines = tuple(judge.judged(small))
+    with ThreadPoolExecutor(2) as pool, ThreadPoolExecutor(1) as beside:
+        loaded = beside.submit(networks)
+        try:
+            taken = reduced.take(capture, config.hdr.clip, pool)
+            lines = tuple(judge.judged(judge.Reduced(taken, loaded.result, config, chart)))
+        finally:
+            pool.shutdown(cancel_futures=True)
     bad = [line for line in lines if line.state == "fail"]
     named = {name for line in bad for name in line.shots}
     shots = tuple(shot.name for shot in capture.shots if shot.name in named)

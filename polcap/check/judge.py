@@ -1,6 +1,6 @@
 """A reduced capture in, its gates out: the path's own stages on small pictures, each when a gate asks for it."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
 
@@ -10,7 +10,7 @@ import numpy as np
 from polcap import gates
 from polcap.check.reduced import Taken
 from polcap.config import Config
-from polcap.errors import ChartError, InputError
+from polcap.errors import ChartError, DecodeError, InputError
 from polcap.formats import calib
 from polcap.gates import Gate
 from polcap.images import (
@@ -36,12 +36,11 @@ class Reduced:
     def __init__(
         self,
         taken: Taken,
-        network: Network | None,
-        mask_network: Network | None,
+        networks: Callable[[], tuple[Network | None, Network | None]],
         config: Config,
         chart: ChartRequest,
     ) -> None:
-        self.taken, self.network, self.mask_network, self.config = taken, network, mask_network, config
+        self.taken, self.networks, self.config = taken, networks, config
         self.chart = chart
         self.names = [shot.name for shot in taken.capture.shots]
         self.focal_doubt = taken.capture.focal_doubt
@@ -83,7 +82,7 @@ class Reduced:
 
     @cached_property
     def object_(self) -> ObjectMask:
-        return mask.segment(self.radiance, self.alignment, self.color, None, self.mask_network, self.config.mask)
+        return mask.segment(self.radiance, self.alignment, self.color, None, self.networks()[1], self.config.mask)
 
     @cached_property
     def gains(self) -> Gains:
@@ -96,7 +95,7 @@ class Reduced:
 
     @cached_property
     def maps(self) -> SurfaceMaps:
-        return infer.estimate(cues.compute(self.stokes, self.color), self.network, self.config.infer)
+        return infer.estimate(cues.compute(self.stokes, self.color), self.networks()[0], self.config.infer)
 
     @property
     def clipped(self) -> Floats:
@@ -107,6 +106,8 @@ def judged(small: Reduced) -> Iterator[Gate]:
     """The gates in the order of the path; where a stage gives up, its error is the last of them."""
     try:
         yield from gates.judge(small, small.config)
+    except DecodeError:  # a frame is decoded when the merge asks for it
+        raise
     except InputError as error:
         what, _, remedy = str(error).partition("; ")
         yield Gate(type(error).__name__.removesuffix("Error").lower(), "fail", None, None, what, remedy, 45.0)

@@ -1,65 +1,73 @@
 """A capture in, the same of at most 0.6 MP out, with what the averaging would hide: clipping and sharpness."""
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from polcap.images import Capture, Floats, Frame, SensorImage
-from polcap.optics import sensor, sharpness
+from polcap.optics import glance, sharpness
+from polcap.optics.glance import Glance
 
-_MOST_PIXELS = 0.6e6  # of the pictures that the stages see: they take three to four seconds on two cores
+_MOST_PIXELS = 0.6e6  # of the pictures that the stages see
 
 
 @dataclass(frozen=True)
 class Taken:
-    """A capture averaged down, and what the averaging would hide."""
+    """A capture averaged down, and what the averaging would hide; its frames come as they are decoded."""
 
-    capture: Capture  # loads from memory
+    capture: Capture  # loads from memory, or waits
     step: int  # visible RAW px per px
-    clipped: Floats  # (K, E, h, w) share of each pixel that is clipped
-    blur_px: Floats  # (K, E) of each frame beyond the sharpest of its exposure, 1σ [visible RAW px]
     binned: int  # visible RAW px per px of the picture that `process` merges
+    coming: dict[int, Future[Glance]]  # by the frame's id
+    shots: tuple[tuple[Frame, ...], ...]  # (K, E)
+
+    @cached_property
+    def clipped(self) -> Floats:
+        """(K, E, h, w) share of each pixel that is clipped."""
+        return np.stack([[self._seen(frame).clipped for frame in shot] for shot in self.shots])
+
+    @cached_property
+    def blur_px(self) -> Floats:
+        """(K, E) of each frame beyond the sharpest of its exposure, 1σ [visible RAW px]."""
+        return sharpness.frames_blur([[self._seen(f).tiles for f in shot] for shot in self.shots], self.binned)
+
+    def _seen(self, frame: Frame) -> Glance:
+        return self.coming[id(frame)].result()
 
 
-def take(capture: Capture, clip: float) -> Taken:
-    """Every frame decoded once, two at a time; the reference frame says how far to reduce and where to look."""
-    frames = [frame for shot in capture.shots for frame in (*shot.frames, *shot.ambient)]
+def take(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> Taken:
+    """Every frame decoded once, and averaged down where it is decoded.
+
+    The reference frame comes first: it says how far to reduce and where to look. The others follow in the order in
+    which they are merged.
+
+    Parameters
+    ----------
+    capture
+        Its frames are forgotten.
+    clip
+        Counts from here on are clipped [white level].
+    pool
+        Decodes as many frames at a time as it has threads.
+
+    Raises
+    ------
+    DecodeError
+        Of the reference frame at once, of another one when it is asked for.
+    """
     first = capture.shots[0].frames[(len(capture.shots[0].frames) - 1) // 2]
-
-    def looked_over() -> tuple[SensorImage, NDArray[np.int64], int]:
-        image = first.load()
-        usable = sensor.usable(image, clip)
-        times = max(1, int(np.ceil(np.sqrt(usable.size / _MOST_PIXELS))))
-        return image, sharpness.places(image, clip), times
-
-    with ThreadPoolExecutor(2) as pool:
-        reference = pool.submit(looked_over)  # before all others, which wait for it
-
-        def seen(frame: Frame) -> tuple[SensorImage, Floats, sharpness.Tiles]:
-            loaded = None if frame is first else frame.load()
-            image, corners, times = reference.result()
-            whole = loaded or image
-            signal = sensor.signal(whole)
-            signal = np.repeat(signal, 3, axis=2) if signal.shape[2] == 1 else signal
-            usable = sensor.usable(whole, clip)
-            shares = _averaged((~usable).astype(np.float32), times)
-            value = _averaged(signal, times)
-            value[shares > 0] = 1  # the stages drop a pixel of which a part is clipped
-            small = SensorImage(
-                value, np.zeros((1, 1)), 1.0, None, whole.camera_matrix, whole.white_balance, whole.lossy
-            )
-            return small, shares, sharpness.take(whole, corners, clip)
-
-        found = dict(zip(map(id, frames), pool.map(seen, frames)))
-    image, _, times = reference.result()
-    half = image.superpixel
+    meta, arrays = _within(first, glance.first, clip=clip, most_pixels=_MOST_PIXELS)
+    times, half, corners = int(meta["times"]), int(meta["superpixel"]), arrays["corners"].tolist()
+    others = [frame for shot in capture.shots for frame in (*shot.frames, *shot.ambient) if frame is not first]
+    coming = {id(frame): pool.submit(_glance, frame, clip, times, corners) for frame in others}
+    coming[id(first)] = Future()
+    coming[id(first)].set_result(glance.joined(meta, arrays))
 
     def smaller(frame: Frame) -> Frame:
-        small = found[id(frame)][0]
-        return replace(frame, load=lambda: small)
+        return replace(frame, load=partial(_picture, coming[id(frame)]), within=None)
 
     step = half * times
     (x, y), (width, height) = capture.principal_px, capture.size_px
@@ -76,14 +84,26 @@ def take(capture: Capture, clip: float) -> Taken:
             calibration=capture.calibration and replace(capture.calibration, noise=()),  # of pixels, not of their means
         ),
         step=step,
-        clipped=np.stack([[found[id(frame)][1] for frame in shot.frames] for shot in capture.shots]),
-        blur_px=sharpness.frames_blur([[found[id(f)][2] for f in shot.frames] for shot in capture.shots], half),
         binned=half,
+        coming=coming,
+        shots=tuple(shot.frames for shot in capture.shots),
     )
 
 
-def _averaged(picture: Floats, times: int) -> Floats:
-    """Means of times × times pixels; an incomplete last block is dropped."""
-    height, width = picture.shape[0] // times, picture.shape[1] // times
-    whole = picture[: height * times, : width * times]
-    return np.array(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+def _glance(frame: Frame, clip: float, times: int, corners: list[list[int]]) -> Glance:
+    return glance.joined(*_within(frame, glance.take, clip=clip, times=times, corners=corners))
+
+
+def _picture(coming: Future[Glance]) -> SensorImage:
+    return coming.result().picture
+
+
+def _within(frame: Frame, function: Any, **options: Any) -> tuple[dict[str, Any], glance.Arrays]:
+    """The function applied where the frame is decoded, which for some kinds of file is here."""
+    apply = frame.within or partial(_here, frame)
+    return apply(function, **options)
+
+
+def _here(frame: Frame, function: Any, **options: Any) -> tuple[dict[str, Any], glance.Arrays]:
+    meta, arrays = function(frame.load(), **options)
+    return meta, arrays

@@ -48,7 +48,6 @@ for command in COMMANDS:
 def main() -> None:
     """The `polcap` command."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # else the order of its sums follows the number of threads
-    sys.modules.setdefault("matplotlib", None)  # type: ignore[arg-type]  # colour-science loads it: .5 s for no use
     arguments = sys.argv[1:]
     if "--debug" in arguments:  # wherever it stands
         arguments = ["--debug", *(argument for argument in arguments if argument != "--debug")]

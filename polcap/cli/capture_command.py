@@ -7,7 +7,6 @@ import typer
 
 from polcap import terminal
 from polcap.cli import options
-from polcap.cli.check_command import judged
 from polcap.cli.options import Json
 from polcap.errors import GateError, InputError
 
@@ -65,11 +64,12 @@ def capture(
 def _verdict(folder: Path) -> dict[str, Any] | None:
     """What `polcap check` says of a capture, on stderr too; None where it cannot be judged."""
     from polcap import check as checks
+    from polcap import models
     from polcap.config import Config
-    from polcap.path import AUTO
+    from polcap.formats import capture as captures
 
     try:
-        verdict = judged(folder, None, Config(), AUTO)
+        verdict = checks.inspect(captures.read(folder), models.shipped, Config())
     except InputError as error:
         terminal.tell(f"polcap: not judged: {terminal.line(error)}")
         return None

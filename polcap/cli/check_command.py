@@ -1,7 +1,7 @@
 """In: a capture folder. Out: keep or reshoot, and why: `polcap check`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -9,11 +9,6 @@ from polcap import terminal
 from polcap.cli import options
 from polcap.cli.options import Angles, ConfigFile, Json
 from polcap.errors import GateError
-
-if TYPE_CHECKING:
-    from polcap.check import Verdict
-    from polcap.config import Config
-    from polcap.images import ChartRequest
 
 
 def check(
@@ -31,25 +26,18 @@ def check(
     json: Json = False,
 ) -> None:
     """Keep a capture or reshoot it, and why: seconds after its last frame. Writes nothing."""
-    from polcap import check as checks
-    from polcap import config as settings
+    from concurrent.futures import ThreadPoolExecutor
 
-    chosen, request = settings.load(config, assignments or ()), options.chart_request(chart, no_chart)
-    verdict = judged(capture, options.angles_deg(angles), chosen, request)
+    from polcap.formats import capture as captures
+
+    with ThreadPoolExecutor(1) as beside:  # headers are read while all else is imported
+        found = beside.submit(captures.read, capture, options.angles_deg(angles))
+        from polcap import check as checks
+        from polcap import config as settings
+        from polcap import models
+
+        chosen, request = settings.load(config, assignments or ()), options.chart_request(chart, no_chart)
+        verdict = checks.inspect(found.result(), models.shipped, chosen, request)
     terminal.say(checks.shown(verdict) if json else checks.table(verdict))
     if not verdict.keep:
         raise typer.Exit(GateError.exit_code)
-
-
-def judged(folder: Path, angles_deg: tuple[float, ...] | None, config: "Config", chart: "ChartRequest") -> "Verdict":
-    """The verdict on a capture, with the networks that are shipped."""
-    from concurrent.futures import ThreadPoolExecutor
-
-    from polcap import check as checks
-    from polcap import pipeline
-    from polcap.formats import capture as captures
-
-    with ThreadPoolExecutor(1) as beside:  # the model loads while the headers are read
-        network = beside.submit(pipeline.load_network, None, None, "cpu", 0)
-        found = captures.read(folder, angles_deg)
-    return checks.inspect(found, network.result(), config, pipeline.load_mask_network(), chart)

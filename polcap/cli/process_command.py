@@ -140,14 +140,14 @@ def _user_input(
     device: Literal["cpu", "cuda", "auto"],
     threads: int,
 ) -> "UserInput":
-    from polcap import pipeline
+    from polcap import models
     from polcap.path import UserInput
 
     return UserInput(
         chart=chart,
         mask=None if mask is None else options.user_mask(mask),
-        network=pipeline.load_network(estimator, model, device, threads),
-        mask_network=pipeline.load_mask_network(threads),
+        network=models.load_network(estimator, model, device, threads),
+        mask_network=models.load_mask_network(threads),
     )
 
 

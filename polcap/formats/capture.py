@@ -130,6 +130,7 @@ def _shot(plan: layouts.Plan, stated: CaptureFile, angle_deg: float, bracket: Se
 
 def _frame(plan: layouts.Plan, stated: CaptureFile, source: Source, angle_deg: float) -> Frame:
     load, manner = _loader(source, stated, angle_deg if plan.layout == "sensor" else None)
+    alone = source.probe.kind == "raw" and plan.layout != "sensor"  # nothing beside the file decides its values
     return Frame(
         path=str(source.path),
         exif=source.probe.exif,
@@ -137,6 +138,7 @@ def _frame(plan: layouts.Plan, stated: CaptureFile, source: Source, angle_deg: f
         digest=" ".join([source.probe.digest, *manner]),
         load=load,
         exposure=_stated_exposure(source),
+        within=partial(raw.within, source.path, source.probe.digest) if alone else None,
     )
 
 

@@ -11,8 +11,7 @@ from polcap import __version__
 from polcap.formats import atomic
 
 _PARTS = (
-    "numpy", "scipy", "opencv-contrib-python-headless", "onnxruntime", "rawpy", "OpenImageIO", "colour-science",
-    "trimesh",
+    "numpy", "scipy", "opencv-contrib-python-headless", "onnxruntime", "rawpy", "OpenImageIO", "trimesh",
 )  # fmt: skip
 
 

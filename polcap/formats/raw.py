@@ -3,8 +3,10 @@
 The only module that imports rawpy, and only in the child process.
 """
 
+import importlib
 import io
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -38,7 +40,40 @@ def read(path: str | Path, digest: str | None = None) -> SensorImage:
         Not a RAW, damaged, changed since, of another mosaic or Foveon; or the decoder crashed, hung or ran out
         of memory.
     """
-    meta, arrays = worker.call(decode, path, digest=digest)
+    return _image(*worker.call(decode, path, digest=digest))
+
+
+def within(
+    path: str | Path, digest: str | None, function: Callable[..., worker.Answer], **options: Any
+) -> worker.Answer:
+    """What a function makes of the decoded file in the worker: only that comes back.
+
+    Parameters
+    ----------
+    path, digest
+        As in `read`.
+    function
+        Of a module's top level; of a `SensorImage` and `options`.
+    options
+        Plain JSON values.
+
+    Raises
+    ------
+    DecodeError
+        As in `read`.
+    """
+    return worker.call(apply, path, digest=digest, module=function.__module__, name=function.__name__, options=options)
+
+
+def apply(path: str, digest: str | None, module: str, name: str, options: dict[str, Any]) -> worker.Answer:
+    """The same, in the worker."""
+    function = getattr(importlib.import_module(module), name)
+    answer: worker.Answer = function(_image(*decode(path, digest)), **options)
+    return answer
+
+
+def _image(meta: dict[str, Any], arrays: worker.Arrays) -> SensorImage:
+    """A decoded frame of the worker's answer."""
     balance = None if meta["balance"] is None else np.array(meta["balance"])
     xyz_to_camera = meta["xyz_to_camera"]
     return SensorImage(

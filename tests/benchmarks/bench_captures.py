@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from polcap import pipeline
+from polcap import models
 from polcap.config import Config
 from polcap.formats import capture as captures
 from polcap.images import Capture, Floats, Network
@@ -37,7 +37,7 @@ def main() -> None:
     parser.add_argument("--model", type=Path)
     parser.add_argument("--rough", action="store_true")
     options = parser.parse_args()
-    network = pipeline.load_network(options.estimator, options.model, "cpu", 2)
+    network = models.load_network(options.estimator, options.model, "cpu", 2)
     print("|", " | ".join(COLUMNS), "|\n|", " | ".join("---" for _ in COLUMNS), "|")
     rows = []
     for truth in sorted(options.folder.glob("*.truth.json")):
@@ -53,7 +53,7 @@ def measure(truth_file: Path, network: Network | None, rough: bool) -> list[floa
     meta = json.loads(Path(stem + ".meta.json").read_text())
     capture = captures.read(Path(stem), None)
     with tempfile.TemporaryDirectory() as out:
-        supplied = UserInput(network=network, mask_network=pipeline.load_mask_network(2))
+        supplied = UserInput(network=network, mask_network=models.load_mask_network(2))
         found = path(capture, supplied, Config(), Store(Path(out)))
         with np.load(stem + ".truth.npz") as maps:
             errors = surface_errors(found, dict(maps), network, rough)

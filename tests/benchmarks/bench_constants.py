@@ -18,7 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from polcap import pipeline
+from polcap import models, pipeline
 from polcap.config import Config
 from polcap.images import Floats, Network
 from polcap.path import Results
@@ -69,7 +69,7 @@ def main() -> None:
     if "analytic" in options.rooms:
         table(ANALYTIC, Normals(Judge(results, options.truth), None), "° normals, analytic")
     if "network" in options.rooms:
-        network = pipeline.load_network(None, None, "cpu", 1)
+        network = models.load_network(None, None, "cpu", 1)
         table(LEARNED, Normals(Judge(results, options.truth), network), "° normals, network")
 
 

@@ -18,7 +18,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from polcap import pipeline
+from polcap import models
 from polcap.config import Config
 from polcap.formats import capture as captures
 from polcap.images import ColorCalibration, Floats, Network, StokesImage
@@ -39,7 +39,7 @@ def main() -> None:
     parser.add_argument("--estimator", choices=("network", "analytic"))
     parser.add_argument("--model", type=Path)
     options = parser.parse_args()
-    network = pipeline.load_network(options.estimator, options.model, "cpu", 2)
+    network = models.load_network(options.estimator, options.model, "cpu", 2)
     print("| capture | through the camera | noise-free cues | loss |\n| --- | --- | --- | --- |")
     rows = []
     for number in range(options.captures):
@@ -69,7 +69,7 @@ def make(folder: Path, data: Path, number: int, width: int) -> Path:
 def measure(place: Path, network: Network | None) -> list[float]:
     """Mean normal error [degrees] through the path and from noise-free cues, and their difference."""
     with tempfile.TemporaryDirectory() as out:
-        supplied = UserInput(network=network, mask_network=pipeline.load_mask_network(2))
+        supplied = UserInput(network=network, mask_network=models.load_mask_network(2))
         found = path(captures.read(place, None), supplied, Config(), Store(Path(out)))
         x0, y0, x1, y1 = found.object_.value.crop
         measured, maps = found.stokes.value, found.maps.value

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from polcap import pipeline
+from polcap import models
 from polcap.images import ColorCalibration, SurfaceMaps, View
 from polcap.optics import frames
 from polcap.stages import cues, infer
@@ -30,7 +30,7 @@ def main() -> None:
     parser.add_argument("--model", type=Path)
     parser.add_argument("--clean", action="store_true")
     options = parser.parse_args()
-    networks = {"network": pipeline.load_network("network", options.model, "cpu", 2), "analytic": None}
+    networks = {"network": models.load_network("network", options.model, "cpu", 2), "analytic": None}
     print("| scene | estimator |", " | ".join(ROWS), "|\n| --- | --- |", " | ".join("---" for _ in ROWS), "|")
     table: dict[str, list[list[float]]] = {name: [] for name in networks}
     for number, file in enumerate(sorted(options.folder.glob("*.npz"))):

@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from polcap import __version__, pipeline
+from polcap import __version__, models, pipeline
 from polcap.config import Config
 from polcap.formats import capture as captures
 from polcap.formats import exr, png
@@ -53,7 +53,6 @@ class Bench:
 
 
 def main() -> None:
-    sys.modules.setdefault("matplotlib", None)  # type: ignore[arg-type]  # as the command does
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("folder", type=Path)
     options.add_argument("--megapixels", default="6,24")
@@ -101,7 +100,7 @@ def made(folder: Path, megapixels: float) -> Path:
 def processed(capture: Path, out: Path) -> tuple[float, dict[str, float]]:
     """Wall seconds and CPU seconds by stage; `start` is reading the capture and the network."""
     begun, told, last = time.monotonic(), {}, tree_cpu()
-    network, finder = pipeline.load_network("network", None, "cpu", 0), pipeline.load_mask_network()
+    network, finder = models.load_network("network", None, "cpu", 0), models.load_mask_network()
     found = captures.read(capture)
     told["start"] = tree_cpu() - last
 
@@ -128,7 +127,7 @@ def floor(capture: Path, out: Path) -> dict[str, float]:
         unpacking = tree_cpu() - started
     stack = np.load(next(out.glob("work/01-hdr/value.value.npy")), mmap_mode="r")
     held = np.ascontiguousarray(stack)
-    network = pipeline.load_network("network", None, "cpu", 0)
+    network = models.load_network("network", None, "cpu", 0)
     assert network is not None
     maps = json.loads((out / "maps" / "maps.json").read_text())
     shrink = max(1.0, max(maps["size"]) / int(network.metadata["native_size"]))

@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from plant_captures import FAULTS, shoot
 
-from polcap import check, gates, path, pipeline
+from polcap import check, gates, models, path
 from polcap.config import Config
 from polcap.errors import InputError
 from polcap.formats import capture as captures
@@ -96,7 +96,7 @@ def one(folder: Path, seed: int, kind: str, width: int, keep: bool) -> Row:
 
 def judge_check(capture: Capture) -> Row:
     try:
-        found = check.inspect(capture, networks()[0], Config(), networks()[1])
+        found = check.inspect(capture, networks, Config())
     except InputError as error:
         return {"check": "fail", "check_gates": {_name(error): ["fail", None, 45.0]}, "needs": ""}
     return {"check": gates.verdict(found.lines), "check_gates": _shown(found.lines), "needs": found.needs}
@@ -182,7 +182,7 @@ def spoken(row: Row) -> str:
 
 @cache
 def networks() -> tuple[Network | None, Network | None]:
-    return pipeline.load_network(None, None, "cpu", 1), pipeline.load_mask_network(1)
+    return models.load_network(None, None, "cpu", 1), models.load_mask_network(1)
 
 
 def _read_once(capture: Capture) -> Capture:

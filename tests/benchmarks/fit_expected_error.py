@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize
 
-from polcap import pipeline
+from polcap import models
 from polcap.images import Floats, Network
 from polcap.stages import infer
 from polcap.stages.infer import learned
@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("--model", type=Path)
     parser.add_argument("--pictures", type=int, default=10)
     options = parser.parse_args()
-    network = pipeline.load_network("network", options.model, "cpu", 1)
+    network = models.load_network("network", options.model, "cpu", 1)
     assert network is not None
     learned._CALIBRATION = _AS_STATED  # what the join itself states
     found = {w: drawn(Protocol(options.folder, SIZE, w), network, options.pictures) for w in PROTOCOLS}

@@ -2,13 +2,14 @@
 
 import json
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from polcap import check
-from polcap.check import Verdict
+from polcap.check import Networks, Verdict
 from polcap.check.reduced import take
 from polcap.config import Config
 from polcap.errors import CaptureError, ChartError
@@ -24,7 +25,11 @@ WIDTH = 512  # the chart must be found: without its greys order and angles are t
 
 
 def verdict(folder: Path) -> Verdict:
-    return check.inspect(captures.read(folder), None, Config())
+    return check.inspect(captures.read(folder), without_networks, Config())
+
+
+def without_networks() -> Networks:
+    return None, None
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -55,7 +60,8 @@ def test_process_measures_the_blur_that_check_measures(tmp_path: Path) -> None:
     capture = captures.read(tmp_path / "bad")
     merged = hdr.merge(capture, Config().hdr)
     assert merged.blur_px is not None and np.nanmax(merged.blur_px) > Config().gates.max_blur_px
-    np.testing.assert_array_equal(merged.blur_px, take(capture, clip=0.98).blur_px)
+    with ThreadPoolExecutor(2) as pool:
+        np.testing.assert_array_equal(merged.blur_px, take(capture, 0.98, pool).blur_px)
 
 
 def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path) -> None:
@@ -66,7 +72,7 @@ def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path) -> N
     assert line.state == "warn" and found.needs == "--no-chart" and "--no-chart" in line.remedy
     with pytest.raises(ChartError):
         whitebalance.measure(hdr.merge(capture, Config().hdr), calib.colorchecker(), AUTO, Config().whitebalance)
-    asked = check.inspect(capture, None, Config(), chart=ChartRequest("none"))
+    asked = check.inspect(capture, without_networks, Config(), chart=ChartRequest("none"))
     assert asked.needs == "" and next(line for line in asked.lines if line.name == "chart").state == "not measured"
 
 
@@ -127,7 +133,8 @@ def test_ambient_light_is_measured(example: Path, tmp_path: Path) -> None:
 def test_reduced_picture_keeps_what_is_clipped(example: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("polcap.check.reduced._MOST_PIXELS", 7e4)
     capture = captures.read(example)
-    taken = take(capture, clip=0.98)
+    with ThreadPoolExecutor(2) as pool:
+        taken = take(capture, 0.98, pool)
     assert taken.step == 4
     assert taken.capture.size_px == (288, 216)
     brightest = taken.capture.shots[0].frames[2].load()

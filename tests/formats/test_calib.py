@@ -10,6 +10,7 @@ from polcap.errors import ChartError, StorageError
 from polcap.formats import calib
 from polcap.images import ColorCalibration
 from polcap.optics import color
+from tests import colour_science
 
 PROFILE = ColorCalibration(
     matrix=np.array([[2.1, -0.4, 0.1], [-0.2, 1.5, -0.3], [0.05, -0.6, 1.9]]),
@@ -35,7 +36,7 @@ PROFILE = ColorCalibration(
     ],
 )
 def test_shipped_chart_is_the_makers_table(kind, name, patches):
-    colour = color.load_colour_science()
+    colour = colour_science.load()
     table = colour.CCS_COLOURCHECKERS[name]
     xyz = colour.xyY_to_XYZ([table.data[patch] for patch in patches or table.data])
     expected = colour.XYZ_to_RGB(xyz, "ITU-R BT.709", table.illuminant, "Bradford")

@@ -13,7 +13,6 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from polcap.images import Asset, Floats, Mesh, SurfaceMaps
 from polcap.optics import color, frames, fresnel
@@ -115,8 +114,9 @@ def tangent_space(maps: SurfaceMaps, mesh: Mesh) -> Floats:
 
 def _unmixed(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The mask without its outermost pixels, but for parts so thin that nothing would be left of them."""
-    inner = ndimage.binary_erosion(mask, np.ones((3, 3), dtype=bool))
-    return np.asarray(inner | (mask & ~ndimage.binary_dilation(inner, np.ones((5, 5), dtype=bool))))
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    near = cv2.dilate(inner, np.ones((5, 5), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return np.asarray((inner > 0) | (mask & (near == 0)))
 
 
 def filled(value: Any, known: NDArray[np.bool_]) -> Any:

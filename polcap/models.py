@@ -1,0 +1,44 @@
+"""In: which model to use, if any is named. Out: the networks of the path, by default those that are shipped."""
+
+from pathlib import Path
+from typing import Literal
+
+from polcap.errors import ModelError, SettingError
+from polcap.formats import calib, onnx
+from polcap.images import Network
+from polcap.stages.mask import mask_channels
+
+
+def load_network(
+    estimator: Literal["network", "analytic"] | None, model: Path | None, device: onnx.Device, threads: int
+) -> Network | None:
+    """The model to use: the one named, else the one shipped; None is the analytic estimator.
+
+    Raises
+    ------
+    ModelError
+        The network was asked for and there is none, or it cannot be used.
+    """
+    if estimator == "analytic":
+        if model is not None:
+            raise SettingError("--model and --estimator analytic exclude each other; leave one out")
+        return None
+    if model is None:
+        shipped = sorted(calib.data_path("colorchecker").parent.glob("models/polcap*.onnx"))
+        if not shipped and (estimator == "network" or device == "cuda"):
+            raise ModelError("this polcap ships no model; name one with --model, or use --estimator analytic")
+        if not shipped:
+            return None
+        model = shipped[-1]
+    return onnx.load(model, device, threads)
+
+
+def load_mask_network(threads: int = 0) -> Network | None:
+    """The network that finds the object, as shipped; None where this polcap ships none."""
+    shipped = sorted(calib.data_path("colorchecker").parent.glob("models/mask*.onnx"))
+    return onnx.load(shipped[-1], "cpu", threads, mask_channels.ENCODING) if shipped else None
+
+
+def shipped() -> tuple[Network | None, Network | None]:
+    """Estimator and mask network as shipped."""
+    return load_network(None, None, "cpu", 0), load_mask_network()
