@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from polcap.formats import glance
+from polcap.formats.glance import Glance
 from polcap.images import Capture, Floats, Frame, SensorImage
-from polcap.optics import glance, sharpness
-from polcap.optics.glance import Glance
+from polcap.optics import sharpness
 
 _MOST_PIXELS = 0.6e6  # of the pictures that the stages see
 

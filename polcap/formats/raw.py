@@ -158,11 +158,11 @@ def decode(path: str, digest: str | None = None) -> worker.Answer:
     if structure.dng and structure.truncated:  # LibRaw may return whatever lay in memory
         raise DecodeError(f"{path}: its image data run past the end of the file; {_COPY_AGAIN}")
     try:
-        with rawpy.RawPy() as raw:
-            raw.open_buffer(io.BytesIO(data))
-            plausible.check_size(path, raw.sizes.raw_width, raw.sizes.raw_height)
-            plausible.check_bytes(path, raw.sizes.width, raw.sizes.height, len(data))
-            meta, arrays = _counts(path, raw)
+        raw = rawpy.RawPy()  # never closed: the counts are a view that keeps it
+        raw.open_buffer(io.BytesIO(data))
+        plausible.check_size(path, raw.sizes.raw_width, raw.sizes.raw_height)
+        plausible.check_bytes(path, raw.sizes.width, raw.sizes.height, len(data))
+        meta, arrays = _counts(path, raw)
     except (rawpy.LibRawError, NotImplementedError) as error:
         raise _refused(path, error) from None
     lossy = plausible.is_lossy(structure)
@@ -175,7 +175,7 @@ def decode(path: str, digest: str | None = None) -> worker.Answer:
 def _counts(path: str, raw: Any) -> tuple[dict[str, Any], worker.Arrays]:
     """The counts as they lie in the file, their levels and colors."""
     meta: dict[str, Any] = {"balance": _balance(raw), "xyz_to_camera": _xyz_to_camera(raw)}
-    value = raw.raw_image_visible.copy()  # a view kept past the block is a crash
+    value = raw.raw_image_visible
     if value.ndim == 3 and value.shape[2] >= 3:
         if raw.num_colors != 3:
             raise DecodeError(f"{path}: has {raw.num_colors} colour channels where 3 are supported")

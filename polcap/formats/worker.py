@@ -297,6 +297,7 @@ def serve(memory_gib: float, lifeline: int) -> None:
         for array in arrays.values():
             answers.write(np.ascontiguousarray(array).data)
         answers.flush()
+        head, arrays = {}, {}  # an idle child holds no picture
 
 
 def _run(request: dict[str, Any], memory_gib: float) -> tuple[dict[str, Any], Arrays]:
