@@ -66,7 +66,15 @@ def within(
 
 
 def apply(path: str, digest: str | None, module: str, name: str, options: dict[str, Any]) -> worker.Answer:
-    """The same, in the worker."""
+    """The same, in the worker.
+
+    Parameters
+    ----------
+    path, digest, options
+        As in `within`.
+    module, name
+        Where the function stands.
+    """
     function = getattr(importlib.import_module(module), name)
     answer: worker.Answer = function(_image(*decode(path, digest)), **options)
     return answer

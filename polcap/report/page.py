@@ -6,9 +6,9 @@ from html import escape
 from pathlib import Path
 from typing import Any, get_args
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from polcap import pictures
 from polcap.formats import calib, html
@@ -372,5 +372,10 @@ def _shutter(seconds: float | None) -> str:
 
 def _outwards(picture: NDArray[np.uint8], inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """A picture that goes on a few pixels past the object, and is dark beyond."""
-    distance, (row, column) = ndimage.distance_transform_edt(~inside, return_indices=True)
-    return np.where((distance <= _RIM)[..., None], picture[row, column], np.uint8(0))
+    if not inside.any():
+        return np.zeros_like(picture)
+    outside = np.where(inside, np.uint8(0), np.uint8(1))
+    distance, nearest = cv2.distanceTransformWithLabels(outside, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    color_of = np.zeros((int(nearest.max()) + 1, picture.shape[-1]), np.uint8)
+    color_of[nearest[inside]] = picture[inside]
+    return np.where((distance <= _RIM)[..., None], color_of[nearest], np.uint8(0))

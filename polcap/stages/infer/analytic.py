@@ -5,7 +5,6 @@ In: cues. Out: normals, albedo, one roughness and one F0, and the normals' expec
 
 import cv2
 import numpy as np
-from scipy.special import erf
 
 from polcap.images import Cues, Floats, Quality, SurfaceMaps
 from polcap.optics import brdf, frames, fresnel
@@ -67,6 +66,8 @@ def _guided(axis: Floats, rays: Floats, normal: Floats, sigma: Floats) -> tuple[
 
     The normal's error is taken as Gaussian across the axis; certainty is P(right side) − P(wrong side).
     """
+    from scipy.special import erf  # here: importing it costs .2 s of every start
+
     phi = np.arctan2(axis[1], axis[0]) / 2
     turned = frames.axis_on_ray(phi, rays)
     along = normal[..., 0] * np.cos(turned) + normal[..., 1] * np.sin(turned)

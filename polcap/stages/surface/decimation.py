@@ -8,7 +8,6 @@ Garland & Heckbert, Surface simplification using quadric error metrics, SIGGRAPH
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from polcap.errors import ObjectError
 from polcap.images import Floats, Mesh, View
@@ -80,6 +79,8 @@ def decimated(mesh: Mesh, view: View, share: float, back: Back) -> Decimated:
 
 def _distance(first: Mesh, less: Mesh) -> float:
     """99th percentile of the vertices' distance from the plane of the nearest of the other's triangles."""
+    from scipy.spatial import cKDTree  # here: importing it costs .1 s of every start
+
     corner = less.vertices[less.faces].astype(np.float64)  # (F, 3, 3)
     share = np.array([[1, 1, 1], [4, 1, 1], [1, 4, 1], [1, 1, 4], [0, 1, 1], [1, 0, 1], [1, 1, 0]], float)
     sample = np.einsum("sk,fkc->fsc", share / share.sum(axis=1, keepdims=True), corner)
