@@ -83,6 +83,6 @@ def _check_model(estimator: Literal["network", "analytic"] | None, model: Path |
 
     On the CPU: the machine that hands out the work may lack what its workers have.
     """
-    from polcap import pipeline
+    from polcap import models
 
-    pipeline.load_network(estimator, model, "cpu", 1)
+    models.load_network(estimator, model, "cpu", 1)
