@@ -55,7 +55,7 @@ def _bands(u: Floats, w: Floats, rng: np.random.Generator) -> Floats:
 def _woven(u: Floats, w: Floats, rng: np.random.Generator) -> Floats:
     """Stripes of several widths across one another: tartan, tiles, towels."""
     one, other = (rng.random(7), rng.random(7) * (rng.random() < 0.7))
-    return 0.6 * one[np.floor(5 * u).astype(int) % 7] + 0.4 * other[np.floor(5 * w).astype(int) % 7]
+    return np.asarray(0.6 * one[np.floor(5 * u).astype(int) % 7] + 0.4 * other[np.floor(5 * w).astype(int) % 7])
 
 
 def _cells(u: Floats, w: Floats, rng: np.random.Generator) -> Floats:
