@@ -123,7 +123,7 @@ class Capture:
     size_px: tuple[int, int]  # width, height, visible RAW pixels
     chart_frames: tuple[Frame, ...] = ()
     notes: tuple[str, ...] = field(default=(), metadata=NOT_IN_KEY)  # what was assumed, one line each
-    focal_doubt: float = field(default=0.0, metadata=NOT_IN_KEY)  # ln of the factor by which focal_px may be off
+    focal_doubt: tuple[float, float] = field(default=(0.0, 0.0), metadata=NOT_IN_KEY)  # ln of least, most over focal_px
     calibration: Calibration | None = None  # of this camera, lens and filter, where the user has measured one
 
     @property

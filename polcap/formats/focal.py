@@ -11,7 +11,8 @@ from polcap.images import Exif
 
 FULL_FRAME_MM = (36.0, 24.0)
 _CONTRADICTION = 0.1  # ln: more than breathing and rounding
-_ASSUMED = math.log(2.0)  # lenses of 25 to 100 mm equivalent; sensors from full frame to half its width
+_KNOWN = 0.0, 0.0
+_ASSUMED = -math.log(2.0), math.log(2.0)  # lenses of 25 to 100 mm equivalent; sensors from full frame to half its width
 NORMAL_MM = 50.0  # full-frame equivalent that is assumed where nothing is known
 
 
@@ -19,12 +20,12 @@ class Focal(NamedTuple):
     """A focal length and where it comes from."""
 
     px: float  # visible RAW pixels
-    doubt: float  # ln of the factor by which it may be off; 0: known
+    doubt: tuple[float, float]  # ln of least and greatest that it may be, over px; 0, 0: known
     note: str
 
     @property
     def known(self) -> bool:
-        return self.doubt == 0
+        return self.doubt == (0.0, 0.0)
 
 
 def find(exif: Exif, stated_mm: float | None, stated_width_mm: float | None) -> Focal:
@@ -33,19 +34,19 @@ def find(exif: Exif, stated_mm: float | None, stated_width_mm: float | None) -> 
     diagonal = math.hypot(width, height)
     equivalent = exif.focal_length_35mm  # by its definition of equal diagonals, in whole millimetres
     focal = stated_mm or exif.focal_length_mm
-    gap = abs(math.log(stated_mm / exif.focal_length_mm)) if stated_mm and exif.focal_length_mm else 0.0
-    if gap > _CONTRADICTION:
+    gap = math.log(exif.focal_length_mm / stated_mm) if stated_mm and exif.focal_length_mm else 0.0
+    if abs(gap) > _CONTRADICTION:
         found = find(replace(exif, focal_length_mm=None), stated_mm, stated_width_mm)
         note = f"{found.note}, but the photographs say {exif.focal_length_mm:g} mm: correct one of the two"
-        return Focal(found.px, max(gap, found.doubt), note)
+        return Focal(found.px, (min(gap, found.doubt[0]), max(gap, found.doubt[1])), note)
     sensor = stated_width_mm or (exif.pixel_pitch_um and exif.pixel_pitch_um * width / 1e3)
     sensor = sensor or sensor_widths().get(exif.model)
     if focal and sensor:
         source = "capture.toml" if stated_mm or stated_width_mm else "EXIF"
-        return Focal(focal / sensor * width, 0.0, f"{focal:g} mm on a sensor {sensor:.1f} mm wide ({source})")
+        return Focal(focal / sensor * width, _KNOWN, f"{focal:g} mm on a sensor {sensor:.1f} mm wide ({source})")
     if equivalent and not stated_mm:
         px = equivalent / math.hypot(*FULL_FRAME_MM) * diagonal
-        return Focal(px, 0.0, f"{equivalent:g} mm full-frame equivalent (EXIF, to about 2 %)")
+        return Focal(px, _KNOWN, f"{equivalent:g} mm full-frame equivalent (EXIF, to about 2 %)")
     if focal:
         return Focal(
             focal / FULL_FRAME_MM[0] * width,

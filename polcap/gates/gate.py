@@ -44,7 +44,7 @@ class Found(Protocol):
     @property
     def names(self) -> list[str]: ...  # (K,) of the shots
     @property
-    def focal_doubt(self) -> float: ...  # ln of the factor by which the focal length may be off; 0: known
+    def focal_doubt(self) -> tuple[float, float]: ...  # ln of least and most that it may be, over it; 0, 0: known
     @property
     def grid_px(self) -> float: ...  # px of the picture that is processed per px of these
     @property

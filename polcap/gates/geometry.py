@@ -119,13 +119,14 @@ def sharpness(found: Found, limits: Gates) -> Gate:
 
 def focal_length(found: Found) -> Gate:
     """Whether it is known; where not, what it costs: normals stand on view rays, which lean as it says."""
-    doubt = found.focal_doubt
-    if not doubt:
+    least, most = found.focal_doubt
+    if not most - least:
         return Gate("focal length", "pass", "known", "known", "known", unit="")
     maps, (y, x) = found.maps, np.nonzero(found.maps.mask)
     off = np.hypot(x - maps.view.center[0], y - maps.view.center[1]) / maps.view.focal
-    lean, more, less = (np.arctan(off * factor) for factor in (1.0, np.exp(doubt), np.exp(-doubt)))
+    lean, more, less = (np.arctan(off * factor) for factor in (1.0, np.exp(-least), np.exp(-most)))
     cost = float(np.degrees(np.median(np.maximum(more - lean, lean - less)))) if len(off) else 0.0
-    says = f"the focal length is assumed, perhaps {np.exp(doubt):.1f} times off; a wrong one bends shape and depth"
+    times = np.exp(max(most, -least))
+    says = f"the focal length is assumed, perhaps {times:.1f} times off; a wrong one bends shape and depth"
     remedy = "state focal_length_mm and sensor_width_mm in capture.toml"
     return Gate("focal length", "warn", "assumed", "known", says, remedy, round(cost, 1), unit="")

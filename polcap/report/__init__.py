@@ -78,7 +78,7 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
         "size_px": list(capture.size_px),
         "focal_px": capture.focal_px,
         "focal_known": capture.focal_known,
-        "focal_doubt": capture.focal_doubt,
+        "focal_doubt": list(capture.focal_doubt),
         "shots": [
             {"angle_deg": float(np.degrees(shot.angle)), "frames": [frame(one) for one in shot.frames]}
             for shot in capture.shots
@@ -194,7 +194,7 @@ def document(
 ) -> dict[str, Any]:
     """report.json: what was understood, measured and judged; timings [s] of the stages that were kept."""
     found = {**figures(results), "rerendering": rerendering(results, config.infer.ior)}
-    judged = list(gates.judge(Whole(results, float(capture["focal_doubt"])), config))
+    judged = list(gates.judge(Whole(results, tuple(capture.get("focal_doubt", (0.0, 0.0)))), config))
     return {
         "polcap": __version__,
         "versions": provenance.versions(),

@@ -24,7 +24,7 @@ class Whole:
     """A run's results, as the gates look at them."""
 
     results: Results
-    focal_doubt: float
+    focal_doubt: tuple[float, float]
     grid_px: float = 1.0
     chart_missing: str = ""  # without a chart, and none asked away, a run ends
 

@@ -28,7 +28,7 @@ def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> SimpleNamespace
     flat = np.full(image.mask.shape, 0.5, np.float32)
     maps = SurfaceMaps(normal, normal, normal, flat, None, 8 * flat, image.mask, image.view, "analytic")
     given = {
-        "names": [f"{np.degrees(a):g}°" for a in radiance.angle], "focal_doubt": 0.0, "grid_px": 1.0,
+        "names": [f"{np.degrees(a):g}°" for a in radiance.angle], "focal_doubt": (0.0, 0.0), "grid_px": 1.0,
         "chart_missing": "", "clipped": np.zeros(shots), "radiance": radiance,
         "color": scenes.no_color(), "alignment": scenes.still(shots), "object_": object_, "gains": gains,
         "stokes": image, "maps": maps, "mesh": None,
@@ -159,12 +159,14 @@ def test_mask_that_its_network_doubts_fails(good: SimpleNamespace) -> None:
 
 
 def test_assumed_focal_length_warns_and_costs_what_the_rays_would_lean(good: SimpleNamespace) -> None:
-    doubt = float(np.log(2.0))
-    gate = judged(changed(good, focal_doubt=doubt))["focal length"]
+    two = float(np.log(2.0))
+    gate = judged(changed(good, focal_doubt=(-two, two)))["focal length"]
+    longer = judged(changed(good, focal_doubt=(0.0, two)))["focal length"]
     y, x = np.nonzero(good.maps.mask)
     off = np.hypot(x - good.maps.view.center[0], y - good.maps.view.center[1]) / good.maps.view.focal
     lean = np.degrees(np.median(np.arctan(2 * off) - np.arctan(off)))  # a focal length half as long
     assert gate.state == "warn" and gate.cost_deg == pytest.approx(lean, abs=0.06)
+    assert longer.state == "warn" and 0 < longer.cost_deg < gate.cost_deg
 
 
 @pytest.mark.parametrize(

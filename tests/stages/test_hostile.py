@@ -89,7 +89,7 @@ def run(radiance: AngleStack, drawn: np.ndarray | None) -> None:
     for array in (gains.gain, image.stokes, maps.normal, maps.diffuse, maps.confidence, mesh.vertices):
         assert np.isfinite(array).all()
     found: dict[str, Any] = {
-        "names": [str(k) for k in range(len(radiance.angle))], "focal_doubt": 0.0, "grid_px": 1.0,
+        "names": [str(k) for k in range(len(radiance.angle))], "focal_doubt": (0.0, 0.0), "grid_px": 1.0,
         "chart_missing": "", "clipped": np.zeros(len(radiance.angle)), "radiance": radiance,
         "color": color, "alignment": alignment, "object_": object_, "gains": gains, "stokes": image, "maps": maps,
         "mesh": mesh,
