@@ -10,9 +10,17 @@ from polcap.stages.mask import mask_channels
 
 
 def load_network(
-    estimator: Literal["network", "analytic"] | None, model: Path | None, device: onnx.Device, threads: int
-) -> Network | None:
+    estimator: Literal["network", "analytic"] | None, model: Path | None, device: onnx.Device, threads: int,
+    later: bool = False,
+) -> Network | None:  # fmt: skip
     """The model to use: the one named, else the one shipped; None is the analytic estimator.
+
+    Parameters
+    ----------
+    estimator, model
+        As the user names them.
+    device, threads, later
+        As in `onnx.load`.
 
     Raises
     ------
@@ -30,13 +38,13 @@ def load_network(
         if not shipped:
             return None
         model = shipped[-1]
-    return onnx.load(model, device, threads)
+    return onnx.load(model, device, threads, later=later)
 
 
-def load_mask_network(threads: int = 0) -> Network | None:
+def load_mask_network(threads: int = 0, later: bool = False) -> Network | None:
     """The network that finds the object, as shipped; None where this polcap ships none."""
     shipped = sorted(calib.data_path("colorchecker").parent.glob("models/mask*.onnx"))
-    return onnx.load(shipped[-1], "cpu", threads, mask_channels.ENCODING) if shipped else None
+    return onnx.load(shipped[-1], "cpu", threads, mask_channels.ENCODING, later) if shipped else None
 
 
 def shipped() -> tuple[Network | None, Network | None]:

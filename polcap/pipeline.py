@@ -62,7 +62,12 @@ def process(
         start = time.perf_counter()
         about = report.document(report.capture_facts(capture), results, config, supplied.network, timings(out))
         maps_folder.write(
-            out / "maps", results.maps.value, results.mesh.value, results.stokes.value, results.cues.value
+            out / "maps",
+            results.maps.value,
+            results.mesh.value,
+            results.stokes.value,
+            results.cues.value,
+            depth_alone=force is None and _maps_stand(out, results),
         )
         asset_export.export(out, about, Wanted())
         report.write(out, about, results)
@@ -217,6 +222,20 @@ def _written_before(
         "settings": msgspec.to_builtins(config),
     }
     return about if json.loads(json.dumps(same)) == {name: about.get(name) for name in same} else None
+
+
+def _maps_stand(out: Path, results: Results) -> bool:
+    """An earlier run made all of maps/ that does not come from the mesh from the same results, untouched since."""
+    try:
+        before, now = text_file.read_json(out / "work" / "written.json"), _files(out)
+        about = report.read(out)
+    except (OSError, ValueError, InputError):
+        return False
+    names = {name for name in {*before, *now} if Path(name).parent == Path("maps") and Path(name).stem != "depth"}
+    same = "maps/maps.json" in names and all(before.get(name) == now.get(name) for name in names)
+    versions = about.get("versions") == json.loads(json.dumps(provenance.versions()))
+    made_from = (results.stokes, results.cues, results.maps)
+    return same and versions and all(about["keys"].get(kept.name) == kept.key for kept in made_from)
 
 
 def _remember_written(out: Path) -> None:

@@ -68,6 +68,21 @@ def test_running_again_computes_nothing_and_gives_the_same_bytes(
     assert product(copy) == product(result)
 
 
+def test_late_change_writes_what_follows_from_it_alone(
+    result: Path, example: Path, polcap: Command, tmp_path: Path
+) -> None:
+    copy = tmp_path / "again"
+    shutil.copytree(result, copy)
+    before = {file.name: file.stat().st_mtime_ns for file in (copy / "maps").iterdir()}
+    command = ("process", example, "--out", copy, "--estimator", "analytic")
+    assert polcap(*command, "--set", "surface.stiffness=1").returncode == 0
+    after = {file.name: file.stat().st_mtime_ns for file in (copy / "maps").iterdir()}
+    assert {name for name in before if after[name] != before[name]} == {"depth.exr", "depth.png", "maps.json"}
+    (copy / "maps" / "normal.png").write_bytes(b"touched")
+    assert polcap(*command).returncode == 0
+    assert product(copy) == product(result)
+
+
 def test_killed_run_resumes_and_gives_the_same_bytes(result: Path, example: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "polcap", "process", str(example), "--out", str(tmp_path)]
     command += ["--estimator", "analytic"]

@@ -146,8 +146,8 @@ def _user_input(
     return UserInput(
         chart=chart,
         mask=None if mask is None else options.user_mask(mask),
-        network=models.load_network(estimator, model, device, threads),
-        mask_network=models.load_mask_network(threads),
+        network=models.load_network(estimator, model, device, threads, later=True),
+        mask_network=models.load_mask_network(threads, later=True),
     )
 
 

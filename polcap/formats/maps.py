@@ -63,7 +63,9 @@ class Stored:
     metric: bool
 
 
-def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues: Cues) -> None:
+def write(
+    folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues: Cues, depth_alone: bool = False
+) -> None:
     """Write every map as EXR, the main ones as PNG too, and maps.json last; the same values give the same bytes.
 
     Parameters
@@ -76,6 +78,8 @@ def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues
         Its depth is written, not its triangles.
     stokes, cues
         The images that the maps were made from, on the same crop.
+    depth_alone
+        All that does not come from the mesh stands there already.
 
     Raises
     ------
@@ -88,10 +92,17 @@ def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues
     seen = depth[depth > 0]
     unit = "m" if mesh.metric else "relative"
     near, median, far = (float(q) for q in np.quantile(seen, (0, 0.5, 1))) if seen.size else (0.0, 0.5, 1.0)
-    normal, flat = _kept(maps.normal, inside), np.where(inside[..., None], maps.normal, [0.0, 0.0, 1.0])
-
-    exr.write(folder / "normal.exr", _channels("RGB", normal))
     exr.write(folder / "depth.exr", {"Z": depth})
+    png.write(folder / "depth.png", png.sixteen_bits(np.where(depth > 0, (depth - near) / max(far - near, 1e-9), 0)))
+    if not depth_alone:
+        _write_seen(folder, maps, inside, stokes, cues)
+    _write_json(folder / "maps.json", _description(maps, {"unit": unit, "near": near, "median": median, "far": far}))
+
+
+def _write_seen(folder: Path, maps: SurfaceMaps, inside: NDArray[np.bool_], stokes: StokesImage, cues: Cues) -> None:
+    """What comes from the photographs and the estimator, without the mesh."""
+    flat = np.where(inside[..., None], maps.normal, [0.0, 0.0, 1.0])
+    exr.write(folder / "normal.exr", _channels("RGB", _kept(maps.normal, inside)))
     exr.write(folder / "diffuse.exr", _channels("RGB", _kept(maps.diffuse, inside)), half=True)
     exr.write(folder / "specular.exr", _channels("RGB", _kept(maps.specular, inside)), half=True)
     exr.write(folder / "roughness.exr", {"Y": _kept(maps.roughness, inside)}, half=True)
@@ -100,13 +111,11 @@ def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues
     exr.write(folder / "cues.exr", _cue_channels(cues), half=True)
 
     png.write(folder / "normal.png", png.sixteen_bits(flat / 2 + 0.5))
-    png.write(folder / "depth.png", png.sixteen_bits(np.where(depth > 0, (depth - near) / max(far - near, 1e-9), 0)))
     png.write(folder / "diffuse.png", color.srgb_eight_bits(_kept(maps.diffuse, inside)))
     png.write(folder / "specular.png", color.srgb_eight_bits(_kept(maps.specular, inside)))
     png.write(folder / "roughness.png", png.sixteen_bits(_kept(maps.roughness, inside)))
     png.write(folder / "photograph.png", color.srgb_eight_bits(cues.radiance))
     png.write(folder / "mask.png", np.where(inside, 255, 0).astype(np.uint8))
-    _write_json(folder / "maps.json", _description(maps, {"unit": unit, "near": near, "median": median, "far": far}))
 
 
 def read(folder: Path) -> Stored:

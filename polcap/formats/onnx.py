@@ -14,9 +14,9 @@ limit. The only module that imports onnxruntime.
 """
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property, partial
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Literal
@@ -24,7 +24,7 @@ from typing import Any, Literal
 import numpy as np
 
 from polcap.errors import DecodeError, ModelError
-from polcap.formats import calib, text_file, worker
+from polcap.formats import calib, onnx_metadata, text_file, worker
 from polcap.images import Floats, Network
 
 ENCODING = "1"
@@ -39,7 +39,9 @@ _RUN_S = 300.0  # the shipped model takes 2 s for a picture on one core
 _MOST_NUMBER = 1 << 16  # px; of what the metadata state
 
 
-def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: str = ENCODING) -> Network:
+def load(
+    path: str | Path, device: Device = "cpu", threads: int = 0, encoding: str = ENCODING, later: bool = False
+) -> Network:
     """Open a model, after a trial in a child where it is none that polcap ships.
 
     Parameters
@@ -52,6 +54,8 @@ def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: s
         0 leaves their number to the runtime.
     encoding
         Of the channels that the model must eat.
+    later
+        A shipped model for the CPU is opened when it first runs: a run that finds all in its cache needs none.
 
     Raises
     ------
@@ -59,10 +63,14 @@ def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: s
         No such file, not a model this runtime can run, metadata missing or of another encoding,
         or the device is not there.
     """
-    import onnxruntime
-
     path = Path(path)
     data = _bytes(path)
+    if later and device == "cpu" and digest(data) in _shipped():
+        metadata: Mapping[str, str] = onnx_metadata.read(data)
+        model = Model(path, partial(_reopen, path, digest(data), threads))
+        return Network(model, digest(data), _stated(path, metadata, encoding), metadata, CPU)
+    import onnxruntime
+
     if digest(data) not in _shipped():
         _try(path, digest(data), encoding)
     if device == "cuda" and CUDA not in onnxruntime.get_available_providers():
@@ -74,7 +82,7 @@ def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: s
         raise ModelError("--device cuda: CUDA does not start; make driver, CUDA and cuDNN fit, or use --device cpu")
     metadata = _metadata(path, session)
     channels = _check(path, session, metadata, encoding)
-    return Network(Model(path, session), digest(data), channels, metadata, provider)
+    return Network(Model(path, lambda: session), digest(data), channels, metadata, provider)
 
 
 def digest(data: bytes) -> str:
@@ -87,8 +95,12 @@ class Model:
     """An open model: channels (1, N, H, W) in, maps by name (1, n, H, W) out."""
 
     path: Path
-    session: Any
+    opened: Callable[[], Any]  # its session
     limit_s: float = _RUN_S
+
+    @cached_property
+    def session(self) -> Any:
+        return self.opened()
 
     def __call__(self, inputs: Floats) -> dict[str, Floats]:
         """Run it.
@@ -144,8 +156,19 @@ def trial(path: str, expected: str, encoding: str) -> worker.Answer:
     channels = _check(file, session, metadata, encoding)
     side = max(_TRIAL_PX, int(metadata["size_multiple"]))
     noise = np.random.default_rng(1).normal(size=(1, len(channels), side, side))
-    Model(file, session)(noise.astype(np.float32))
+    Model(file, lambda: session)(noise.astype(np.float32))
     return {}, {}
+
+
+def _known(session: Any) -> Callable[[], Any]:
+    return lambda: session
+
+
+def _reopen(path: Path, expected: str, threads: int) -> Any:
+    data = _bytes(path)
+    if digest(data) != expected:
+        raise ModelError(f"{path}: has changed since it was read; run again")
+    return _open(path, data, [CPU], threads)
 
 
 def _try(path: Path, expected: str, encoding: str) -> None:
@@ -188,7 +211,7 @@ def providers(path: Path) -> dict[str, str]:
             session = _open(path, _bytes(path), [name], 0)
             shape = session.get_inputs()[0].shape
             sides = [side if isinstance(side, int) else _TRIAL_PX for side in shape[2:]]
-            Model(path, session)(np.zeros((1, shape[1], *sides), np.float32))
+            Model(path, _known(session))(np.zeros((1, shape[1], *sides), np.float32))
             found[name] = "" if session.get_providers()[0] == name else "does not start"
         except ModelError as error:
             found[name] = str(error)
@@ -212,6 +235,18 @@ def _open(path: Path, data: bytes, providers: list[str], threads: int) -> Any:
 
 
 def _check(path: Path, session: Any, metadata: Mapping[str, str], encoding: str) -> tuple[str, ...]:
+    """Names of the channels, which are those that the model takes."""
+    channels = _stated(path, metadata, encoding)
+    entry = session.get_inputs()
+    shape = entry[0].shape if entry else []
+    if len(entry) != 1 or len(shape) != 4 or (isinstance(shape[1], int) and shape[1] != len(channels)):
+        takes = [one.shape for one in entry]
+        raise ModelError(f"{path}: takes {takes}, its metadata names {len(channels)} channels of one input")
+    return channels
+
+
+def _stated(path: Path, metadata: Mapping[str, str], encoding: str) -> tuple[str, ...]:
+    """Names of the channels, by the metadata alone."""
     missing = [name for name in REQUIRED if not metadata.get(name)]
     if missing:
         raise ModelError(f"{path}: its metadata does not state {', '.join(missing)}; export it with polcap")
@@ -224,13 +259,7 @@ def _check(path: Path, session: Any, metadata: Mapping[str, str], encoding: str)
         if not _usable(metadata[name]):
             value = metadata[name][:20]
             raise ModelError(f"{path}: {name} = {value!r} in its metadata is not a whole number of 1 to {_MOST_NUMBER}")
-    channels = tuple(name.strip() for name in metadata["channels"].split(","))
-    entry = session.get_inputs()
-    shape = entry[0].shape if entry else []
-    if len(entry) != 1 or len(shape) != 4 or (isinstance(shape[1], int) and shape[1] != len(channels)):
-        takes = [one.shape for one in entry]
-        raise ModelError(f"{path}: takes {takes}, its metadata names {len(channels)} channels of one input")
-    return channels
+    return tuple(name.strip() for name in metadata["channels"].split(","))
 
 
 def _usable(number: str) -> bool:

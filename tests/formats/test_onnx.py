@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import ModelError
+from polcap.formats import calib
 from polcap.formats.onnx import ENCODING, Model, load
 
 onnx = pytest.importorskip("onnx", reason="writing test models needs the extra [train]")
@@ -140,7 +141,7 @@ def test_a_model_that_does_not_end_is_refused_in_time(tmp_path: Path, monkeypatc
 def test_a_run_that_does_not_end_is_stopped(tmp_path: Path) -> None:
     import onnxruntime
 
-    model = Model(tmp_path / "m.onnx", onnxruntime.InferenceSession(endless(tmp_path / "m.onnx")), limit_s=1.0)
+    model = Model(tmp_path / "m.onnx", lambda: onnxruntime.InferenceSession(endless(tmp_path / "m.onnx")), limit_s=1.0)
     with pytest.raises(ModelError, match=r"did not end within 1 s"):
         model(np.ones((1, 2, 8, 8), np.float32))
 
@@ -163,3 +164,13 @@ def test_metadata_that_are_no_text_are_refused(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"Apache-2.0", b"Apache-\xea\x80\xff"))
     with pytest.raises(ModelError, match=r"no text|cannot be run|not a model"):
         load(path)
+
+
+def test_a_shipped_model_opened_later_says_and_does_the_same() -> None:
+    file = sorted(calib.data_path("colorchecker").parent.glob("models/polcap*.onnx"))[-1]
+    now, later = load(file, threads=1), load(file, threads=1, later=True)
+    assert later == now and "session" not in vars(later.run)
+    side = int(now.metadata["size_multiple"])
+    noise = np.random.default_rng(3).normal(size=(1, len(now.channels), side, side)).astype(np.float32)
+    for name, value in now.run(noise).items():
+        np.testing.assert_array_equal(later.run(noise)[name], value)
