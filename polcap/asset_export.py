@@ -1,7 +1,8 @@
 """In: the maps of a result. Out: its asset in the formats of a program or purpose, and what it was made from.
 
 Everything comes from the stored maps and report.json, for `process` as for `polcap export`: the same
-result gives the same bytes, whenever and with however many threads.
+result gives the same bytes, whenever and with however many threads. Mesh and textures are kept in work/ under a digest
+of the maps' files, so that a further export encodes and writes, and no more.
 """
 
 from collections.abc import Callable, Mapping
@@ -10,6 +11,8 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from polcap.config import restored
 from polcap.errors import SettingError
@@ -30,7 +33,8 @@ from polcap.formats.encoders import Encoder, Kind
 from polcap.formats.presets import PRESETS, Format, Preset
 from polcap.formats.texture_set import Key, Texture
 from polcap.images import Asset
-from polcap.stages import asset, surface
+from polcap.stages import asset, stage, surface
+from polcap.store import FORMAT, Derived, Run, StageResult, digest, silent
 
 _SHARING = {"obj", "usd", "materialx"}  # formats whose textures lie beside them, and are the same
 
@@ -61,11 +65,12 @@ def export(out: Path, about: Mapping[str, Any], wanted: Wanted) -> list[Path]:
     if "usd" in preset.formats:
         usd.require()
     config = restored(about, out / "report.json")
-    stored = maps_folder.read(out / "maps")
-    mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, config.surface)
-    built = asset.build(stored.maps, mesh, config.asset)
-    levels = [surface.decimated(mesh, stored.maps.view, 0.25**k, config.surface.back) for k in range(1, wanted.lod + 1)]
-    lods = [asset.on_mesh(built, stored.maps, level.mesh) for level in levels]
+    maps, built = _maps_and_asset(out, _Settings(config.surface, config.asset))
+    lods, levels = [], []
+    if wanted.lod:
+        stored, mesh = maps.value.maps, built.mesh
+        levels = [surface.decimated(mesh, stored.view, 0.25**k, config.surface.back) for k in range(1, wanted.lod + 1)]
+        lods = [asset.on_mesh(built, stored, level.mesh) for level in levels]
     if wanted.texture_size is not None:
         built, *lods = (asset.resized(one, wanted.texture_size) for one in (built, *lods))
     job = _Job(
@@ -82,6 +87,27 @@ def export(out: Path, about: Mapping[str, Any], wanted: Wanted) -> list[Path]:
     written = job.write()
     maps_folder.note_export(out / "maps", job.folder.relative_to(out).as_posix(), job.said())
     return written
+
+
+class _Settings(msgspec.Struct, frozen=True):
+    surface: surface.Settings
+    asset: asset.Settings
+
+
+@stage(version=1)
+def assembled(stored: maps_folder.Stored, settings: _Settings) -> Asset:
+    """The mesh of stored maps, and their textures on it."""
+    mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, settings.surface)
+    return asset.build(stored.maps, mesh, settings.asset)
+
+
+def _maps_and_asset(out: Path, settings: _Settings) -> tuple[Derived[maps_folder.Stored], Asset]:
+    """A result's maps, read when they are asked for, and its asset: kept in work/ for the next export of these maps."""
+    maps = Derived(maps_folder.digest(out / "maps"), maps_folder.read, (out / "maps",))
+    versions = [FORMAT, assembled.version, surface.integrate.version, asset.build.version]
+    key = digest([versions, msgspec.to_builtins(settings), maps.key])
+    kept = StageResult(key, assembled, (maps,), settings, out / "work" / assembled.name, Run(silent))
+    return maps, kept.value
 
 
 def _preset(wanted: Wanted) -> Preset:

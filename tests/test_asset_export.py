@@ -6,12 +6,13 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from polcap.formats import encoders, png
+from polcap.formats import encoders, exr, png
 from polcap.formats.presets import PRESETS
 from tests.conftest import ROOT, Command, shell
 from tests.formats.test_gltf import NODE, document
@@ -96,6 +97,33 @@ def test_exporting_again_gives_the_bytes_that_process_wrote(result: Path, polcap
         cv2.setNumThreads(-1)
     assert {file.name: file.read_bytes() for file in (copy / "asset").iterdir()} == before
     assert (copy / "maps/maps.json").read_bytes() == (result / "maps/maps.json").read_bytes()
+
+
+def test_further_export_builds_nothing_until_a_map_changes(
+    result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from polcap import pipeline
+    from polcap.asset_export import Wanted
+    from polcap.stages import surface
+
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
+    (glb,) = (copy / "asset").glob("*.glb")
+    pipeline.export(copy, Wanted(("gltf",)))
+    before = glb.read_bytes()
+    triangulate, built = surface.triangulate, []
+
+    def counted(*of: Any) -> Any:
+        built.append(of)
+        return triangulate(*of)
+
+    monkeypatch.setattr(surface, "triangulate", counted)
+    pipeline.export(copy, Wanted(("gltf",)))
+    assert not built and glb.read_bytes() == before
+    rough, _ = exr.read(copy / "maps" / "roughness.exr")
+    exr.write(copy / "maps" / "roughness.exr", {"Y": rough["Y"] / 2}, half=True)
+    pipeline.export(copy, Wanted(("gltf",)))
+    assert built and glb.read_bytes() != before
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from hashlib import blake2b
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,7 +13,7 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from polcap.errors import DecodeError
-from polcap.formats import atomic, exr, png, text_file
+from polcap.formats import atomic, exr, npy_folder, png, text_file
 from polcap.images import Cues, Floats, Mesh, StokesImage, SurfaceMaps, View
 from polcap.optics import color
 
@@ -28,6 +29,9 @@ CONVENTIONS = {
 }
 
 
+_READ = (
+    "mask.png", "normal.exr", "diffuse.exr", "specular.exr", "roughness.exr", "confidence.exr", "depth.exr",
+)  # fmt: skip
 _Side = Annotated[int, Meta(ge=1, le=1 << 16)]
 _Positive = Annotated[float, Meta(gt=0, le=1e9)]
 _Place = Annotated[float, Meta(ge=-1e9, le=1e9)]
@@ -156,6 +160,22 @@ def read(folder: Path) -> Stored:
         depth=np.where(inside, _read_map(folder / "depth.exr", "Z", said.size), np.nan).astype(np.float32),
         metric=said.depth.unit == "m",
     )
+
+
+def digest(folder: Path) -> str:
+    """Digest of all that `read` reads.
+
+    Raises
+    ------
+    DecodeError
+        A file is missing.
+    """
+    try:
+        said = {name: value for name, value in text_file.read_json(folder / "maps.json").items() if name != "exports"}
+        files = [npy_folder.checksum(folder / name) for name in _READ]
+    except (OSError, ValueError) as error:
+        raise DecodeError(f"{folder} is not as polcap wrote it ({error}); process again") from error
+    return blake2b(json.dumps([said, files], sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
 def note_export(folder: Path, where: str, said: Mapping[str, Any]) -> None:
