@@ -201,6 +201,11 @@ class ChartLight:
     )
     covariance: Floats  # (3, 3) of these three
 
+    @property
+    def tilt(self) -> float:
+        """How far the chart is turned from facing the lens [rad]."""
+        return float(np.arccos(np.clip(-self.normal @ self.white / np.linalg.norm(self.white), -1, 1)))
+
 
 @dataclass(frozen=True)
 class ColorCalibration:

@@ -12,6 +12,7 @@ from polcap.stages.whitebalance import patches
 _EVEN_STEPS = (1.3, 20.0)  # from one exposure to the next: less is no bracket, more leaves a gap
 _ALIKE = 1.15  # steps in the pixels below this, where the metadata promise more than _PROMISED, are none
 _PROMISED = 1.4
+_TURNED = 0.35  # rad, from here on a chart's turn is worth a word: a sixteenth of its light
 _GLOSS_PART = 0.3  # of the chart's gloss goes into gains taken from its light patches
 
 
@@ -113,6 +114,8 @@ def chart(found: Found, limits: Gates) -> Gate:
         says += f", to {float(np.nanmean(found.color.predicted)):.1f} where a patch is left out of the fit"
     if found.color.patch_use is not None and found.color.patch_use.any():
         says += f"; {patches.left_out(found.color.patch_use)}"
+    if found.color.light is not None and found.color.light.tilt > _TURNED:
+        says += f"; it is turned by {np.degrees(found.color.light.tilt):.0f}° from the lens, which the scale takes out"
     if found.radiance.lossy:
         says += "; the pictures have 8 bits or a camera's rendering, which a matrix cannot undo"
     remedy = "light the chart as the object, without glare, or give its corners with --chart"

@@ -20,7 +20,6 @@ from polcap.formats import atomic, provenance, text_file
 from polcap.formats import maps as maps_folder
 from polcap.images import (
     Capture,
-    ChartLight,
     Floats,
     Frame,
     Network,
@@ -104,7 +103,7 @@ def figures(results: Results) -> dict[str, dict[str, Any]]:
         "chart": {
             "source": color.source,
             "edition": color.edition or None,
-            "tilt_deg": None if color.light is None else _number(_tilt_deg(color.light)),
+            "tilt_deg": None if color.light is None else _number(np.degrees(color.light.tilt)),
             "flash": None if color.light is None else _list(color.light.flash[:2], 3),
             "delta_e_mean": None if color.delta_e is None else _number(np.nanmean(color.delta_e)),
             "delta_e_max": None if color.delta_e is None else _number(np.nanmax(color.delta_e)),
@@ -255,11 +254,6 @@ def _inside(value: Floats, image: StokesImage, percentile: float) -> float | Non
 def _number(value: Any, digits: int = 6) -> float | None:
     """A figure for JSON; None where it could not be measured."""
     return round(float(value), digits) if math.isfinite(value) else None
-
-
-def _tilt_deg(light: ChartLight) -> float:
-    """How far a chart is turned from facing the lens."""
-    return float(np.degrees(np.arccos(np.clip(-light.normal @ light.white / np.linalg.norm(light.white), -1, 1))))
 
 
 def _list(values: Floats, digits: int = 5) -> list[Any]:

@@ -230,12 +230,12 @@ def _edition(
     radiance: AngleStack, found: _Find, reference: ChartReference, settings: Settings
 ) -> tuple[_Find, ChartReference]:
     """The find by the edition of the chart that its colors speak for, and that edition."""
-    best, name = found, reference
-    for other in reference.editions:
-        again = replace(found, seen=_fit(radiance, found.place, other, settings))
-        if again.error < min(best.error, _CLEARLY_BETTER * found.error):
-            best, name = again, other
-    return best, name
+    residuals = [patches.residual(found.seen, other) for other in (reference, *reference.editions)]
+    least = int(np.argmin(residuals))
+    if residuals[least] >= _CLEARLY_BETTER * residuals[0]:
+        return found, reference
+    edition = reference.editions[least - 1]
+    return replace(found, seen=_fit(radiance, found.place, edition, settings)), edition
 
 
 def _plausible(place: Placement, min_explained: float) -> bool:

@@ -83,6 +83,12 @@ def predicted(found: ChartFit, reference: ChartReference) -> Floats | None:
     return color.predicted(found.color, reference.rec709, position(), used) if used.sum() > _LEAST else None
 
 
+def residual(found: ChartFit, reference: ChartReference) -> float:
+    """Mean ΔE2000 that the patches in use have by the colors of a chart."""
+    used = found.use == PatchUse.USED
+    return float(np.nanmean(color.fit_matrix(found.color, reference.rec709, position(), used).delta_e))
+
+
 def position() -> Floats:
     """(24, 2) of the patches from the white one, in patches."""
     return np.asarray(chart.centers() - chart.centers()[WHITE])

@@ -49,6 +49,7 @@ def test_the_normal_of_a_tilted_chart_is_found_whatever_its_cells_sides(turn: tu
     found = chart_light.measure(place, VIEW, slope(point, normal, (0, 0)), 0.1)
     assert found.normal == pytest.approx(normal, abs=1e-6)
     assert found.white == pytest.approx(point[patches.WHITE], abs=1e-6)
+    assert np.cos(found.tilt) == pytest.approx(-normal @ point[patches.WHITE] / np.linalg.norm(point[patches.WHITE]))
 
 
 @pytest.mark.parametrize("flash", [(0.09, 0.0), (0.0, 0.12), (-0.05, 0.07)])
