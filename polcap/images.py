@@ -195,11 +195,8 @@ class ChartLight:
 
     white: Floats  # (3,) its white patch, camera frame
     normal: Floats  # (3,) unit, towards the camera
-    normal_sigma: float  # rad, 1σ about each axis
-    flash: (
-        Floats  # (3,) right of the lens and above it; power of the cosine by which the light falls off to the corners
-    )
-    covariance: Floats  # (3, 3) of these three
+    flash: Floats  # (3,) right of the lens and above it; power of the cosine by which the light falls off sideways
+    covariance: Floats  # (5, 5) of these three and of the chart's turn about x and y [rad]
 
     @property
     def tilt(self) -> float:

@@ -126,7 +126,7 @@ def test_a_chart_that_is_turned_or_stands_aside_gets_less_light_than_the_object(
     """n·l / d² of a chart under a flash at the lens: cos of its turn, or cos³ of the angle to the axis."""
     found = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
     white, normal = np.array([aside, 0.0, -1.0]), np.array([np.sin(turn), 0.0, np.cos(turn)])
-    light = ChartLight(white, normal, 0.0, np.zeros(3), np.zeros((3, 3)))
+    light = ChartLight(white, normal, np.zeros(3), np.zeros((5, 5)))
     facing = cues.scale.factor(found, dataclasses.replace(scenes.no_color(), source="chart"))
     factor = cues.scale.factor(found, dataclasses.replace(scenes.no_color(), source="chart", light=light))
     assert factor / facing == pytest.approx(np.cos(turn) * np.cos(np.arctan(aside)) ** 3, rel=1e-6)
@@ -141,10 +141,11 @@ def test_the_scale_follows_a_flash_at_the_chart_s_side_and_its_doubt_widens_the_
     color = dataclasses.replace(scenes.no_color(), source="chart")
     facing = np.array([0.0, 0.0, 1.0])
     at_lens, beside, doubtful = (
-        dataclasses.replace(color, light=ChartLight(white, facing, 0.0, at, spread))
-        for at, spread in ((0 * flash, np.zeros((3, 3))), (flash, np.zeros((3, 3))), (flash, 0.01 * np.eye(3)))
+        dataclasses.replace(color, light=ChartLight(white, facing, at, spread))
+        for at, spread in ((0 * flash, np.zeros((5, 5))), (flash, np.zeros((5, 5))), (flash, 0.01 * np.eye(5)))
     )
     ahead = 1 - np.sqrt(found.mask.sum() / np.pi) / found.view.focal / 2
+    doubtful.light.normal.flags.writeable = False  # as the store hands them out
     lit = (1.01 / 1.04) ** -1.5 * (ahead**2 + 0.01) / ahead**2
     assert cues.scale.factor(found, beside) / cues.scale.factor(found, at_lens) == pytest.approx(lit, rel=1e-6)
     assert cues.scale.doubt(found, doubtful) > cues.scale.doubt(found, beside) + 0.002

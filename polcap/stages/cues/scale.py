@@ -4,9 +4,11 @@ The chart says what light gave what radiance, where it stands and as it is turne
 to the flash, for what the camera sees of it comes forward of its middle, and at another angle to the optical axis.
 """
 
+from dataclasses import replace
 from math import hypot, log, pi, sqrt
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from polcap.images import ChartLight, ColorCalibration, Floats, StokesImage
 from polcap.optics import point_light
@@ -26,7 +28,7 @@ def factor(stokes: StokesImage, color: ColorCalibration) -> float:
     ahead = 1 - _BULGE * _radius(stokes)
     if color.light is None:
         return ahead**2
-    return float(np.exp(_log_factor(color.light, color.light.flash, _middle(stokes, ahead))))
+    return float(np.exp(_log_factor(color.light, _middle(stokes, ahead))))
 
 
 def doubt(stokes: StokesImage, color: ColorCalibration) -> float | None:
@@ -43,20 +45,24 @@ def doubt(stokes: StokesImage, color: ColorCalibration) -> float | None:
     if color.light is None:
         return depth
     light, middle = color.light, _middle(stokes, ahead)
-    here = _log_factor(light, light.flash, middle)
-    slope = np.array([_log_factor(light, light.flash + step, middle) - here for step in _STEP * np.eye(3)]) / _STEP
-    to_flash = np.append(light.flash[:2], 0.0) - light.white
-    cosine = float(light.normal @ to_flash / np.linalg.norm(to_flash))
-    turn = light.normal_sigma * sqrt(max(1 - cosine**2, 0.0)) / max(cosine, 0.1)
-    return hypot(depth, sqrt(slope @ light.covariance @ slope), turn)
+    here = _log_factor(light, middle)
+    slope = np.array([_log_factor(_changed(light, step), middle) - here for step in _STEP * np.eye(5)]) / _STEP
+    return hypot(depth, sqrt(slope @ light.covariance @ slope))
 
 
-def _log_factor(light: ChartLight, flash: Floats, middle: Floats) -> float:
+def _log_factor(light: ChartLight, middle: Floats) -> float:
     """ln of what the chart got, over what the object got more than a flash at the lens alone would give it."""
-    chart = point_light.irradiance(light.white, flash[:2], flash[2], light.normal)
-    object_ = point_light.irradiance(middle, flash[:2], flash[2])
+    flash, power = light.flash[:2], float(light.flash[2])
+    chart = point_light.irradiance(light.white, flash, power, light.normal)
+    object_ = point_light.irradiance(middle, flash, power)
     alone = point_light.irradiance(middle, np.zeros(2), 0.0)
     return log(max(float(chart), 1e-6) * float(alone) / float(object_)) + 2 * log(-middle[2])
+
+
+def _changed(light: ChartLight, step: Floats) -> ChartLight:
+    """With the flash and its falloff moved by step (5,), and the chart turned about x and y."""
+    turned = Rotation.from_rotvec([*step[3:], 0.0]).apply(np.array(light.normal))  # SciPy takes no read-only array
+    return replace(light, flash=light.flash + step[:3], normal=turned)
 
 
 def _middle(stokes: StokesImage, distance: float) -> Floats:

@@ -2,7 +2,7 @@
 
 A flash at L lights points P of a chart with normal n as n·(L − P)/|L − P|³. Across the chart n·(L − P) stays the same,
 so the light's slope tells over what point of its plane the flash stands: per patch it is 3 pitches over the distance,
-times the sine of the angle from the normal to the flash. The chart's tilt itself comes from its outline: a
+times the sine of the angle from the normal to the flash. The chart's turn itself comes from its outline: a
 homography's first two columns point along rows and columns, whatever the card's sides are.
 
 References
@@ -10,7 +10,10 @@ References
 Zhang, A flexible new technique for camera calibration, IEEE PAMI 2000 (pose from a homography).
 """
 
+from dataclasses import dataclass
+
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from polcap.images import ChartLight, Floats, View
 from polcap.optics import point_light
@@ -20,12 +23,15 @@ from polcap.stages.whitebalance.chart import Placement
 # 1σ before anything is seen: the flash right of the lens and above it [distances], the falloff's power. A hot shoe
 # stands .1 to .15 m above the lens, objects at about 1 m; cos⁴ is a lens's natural falloff, 0 a corrected one.
 _PRIOR = np.array([0.1, 0.1, 2.0])
-_TILT_SIGMA = 0.03  # rad: corners within .2 % of the chart, lenses that bend by 1 %
+# 1σ of the chart's turn as its outline has it [rad]: corners within .2 % of the chart, lenses that bend by 1 %; and the
+# focal length's where the sensor's size is a guess, a share that the turn is off by too
+_TURN_SIGMA, _FOCAL_SPREAD = 0.03, 0.3
 _FARTHEST = 0.3  # a flash beyond is no flash at the camera [distances]
 _LIGHT_PER_DELTA_E = 0.02  # a patch that is off by ΔE2000 = 1 is off by about 2 % in Y: half of it lightness
 _LEAST_PATCH_ERROR = 0.005
 _STEP = 1e-4
 _ROUNDS = 4
+_STRAIGHT = np.linalg.pinv(np.column_stack([np.ones(24), patches.position()]))  # (3, 24) light → level and slope
 
 
 def measure(place: Placement, view: View, slope: Floats, delta_e: float) -> ChartLight:
@@ -42,29 +48,39 @@ def measure(place: Placement, view: View, slope: Floats, delta_e: float) -> Char
     delta_e
         Mean residual of the patches: how well the slope is known.
     """
-    point, normal = _plane(place, view)
-    design = np.concatenate([np.ones((len(point), 1)), patches.position()], axis=1)
-    solve = np.linalg.pinv(design)  # (3, 24)
+    outlined = _Plane(*_plane(place, view))
+    aslant = np.hypot(*outlined.normal[:2]) / outlined.normal[2]  # tangent of the turn from the image's plane
+    turn = _TURN_SIGMA if view.known else float(np.hypot(_TURN_SIGMA, _FOCAL_SPREAD * min(aslant, 1.0)))
+    prior = np.diag(1 / np.array([*_PRIOR, turn, turn]) ** 2)
     error = max(_LEAST_PATCH_ERROR, _LIGHT_PER_DELTA_E * delta_e)
-    pitch = float(np.sqrt(np.prod([np.linalg.norm(point[i] - point[0]) for i in (1, 6)])))
-    noise = error**2 * (solve @ solve.T)[1:, 1:] + (3 * pitch * _TILT_SIGMA) ** 2 * np.eye(2)
+    known = np.linalg.inv(error**2 * (_STRAIGHT @ _STRAIGHT.T)[1:, 1:])
 
-    state = np.zeros(3)
+    state = np.zeros(5)
     for _ in range(_ROUNDS):
-        here = _slope(solve, point, normal, state)
-        by_state = np.stack(
-            [(_slope(solve, point, normal, state + step) - here) / _STEP for step in _STEP * np.eye(3)], axis=1
-        )
-        known = by_state.T @ np.linalg.inv(noise)
-        covariance = np.linalg.inv(np.diag(_PRIOR**-2) + known @ by_state)
-        state = covariance @ known @ (slope - here + by_state @ state)
+        here = _slope(outlined, state)
+        by_state = np.stack([(_slope(outlined, state + step) - here) / _STEP for step in _STEP * np.eye(5)], axis=1)
+        covariance = np.linalg.inv(prior + by_state.T @ known @ by_state)
+        state = covariance @ by_state.T @ known @ (slope - here + by_state @ state)
         state[:2] = np.clip(state[:2], -_FARTHEST, _FARTHEST)
-    return ChartLight(point[patches.WHITE], normal, _TILT_SIGMA, state, covariance)
+    likely = outlined.turned(state[3:])
+    return ChartLight(likely.point[patches.WHITE], likely.normal, state[:3], covariance)
 
 
-def _slope(solve: Floats, point: Floats, normal: Floats, state: Floats) -> Floats:
+@dataclass(frozen=True)
+class _Plane:
+    point: Floats  # (24, 3) patch centres, in distances of the chart's middle, camera frame
+    normal: Floats  # (3,)
+
+    def turned(self, turn: Floats) -> "_Plane":
+        """About its middle, by a small turn (2,) about x and y [rad]."""
+        rotation, middle = Rotation.from_rotvec([*turn, 0.0]), self.point.mean(axis=0)
+        return _Plane(middle + rotation.apply(self.point - middle), rotation.apply(self.normal))
+
+
+def _slope(outlined: _Plane, state: Floats) -> Floats:
     """Relative change (2,) of a flash's light per patch, as the fit of a straight slope sees it."""
-    level, *slope = solve @ point_light.irradiance(point, state[:2], state[2], normal)
+    plane = outlined.turned(state[3:])
+    level, *slope = _STRAIGHT @ point_light.irradiance(plane.point, state[:2], state[2], plane.normal)
     return np.asarray(np.array(slope) / level)
 
 
