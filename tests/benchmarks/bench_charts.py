@@ -24,18 +24,8 @@ from polcap.images import AngleStack, Floats
 from polcap.optics.color import decode_srgb, encode_srgb, fit_matrix
 from polcap.stages import whitebalance
 from polcap.stages.whitebalance import Settings, patches
-from tests.stages.whitebalance.test_whitebalance import (
-    AUTO,
-    CLASSIC,
-    DATA,
-    MARKED,
-    PHOTOS,
-    REAL,
-    corners_off,
-    photo,
-    stack,
-    superpixels,
-)  # fmt: skip
+from tests.stages.whitebalance.chart_pictures import AUTO, CLASSIC, stack
+from tests.stages.whitebalance.test_real_charts import DATA, MARKED, PHOTOS, REAL, corners_off, photo, superpixels
 
 _SIDE = (480, 640)
 _ACCEPTED_COST = 0.06  # the same limit as polcap's own, so that the tests after it are what is compared

@@ -1,10 +1,6 @@
 """The chart found where it is, refused where it is not, and colours on the scale of its white patch."""
 
 import functools
-import json
-import os
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -12,65 +8,10 @@ import pytest
 
 from polcap.errors import ChartError
 from polcap.formats import calib
-from polcap.images import AngleStack, ChartReference, ChartRequest, ColorCalibration, Floats, Quality, View
-from polcap.optics.color import decode_srgb
+from polcap.images import ChartReference, ChartRequest, ColorCalibration, Floats, View
 from polcap.stages import whitebalance
 from polcap.stages.whitebalance import Settings, chart, chart_in_mask, patches
-
-CLASSIC = calib.colorchecker()
-CAMERA = np.array([[0.28, 0.10, 0.07], [0.08, 0.71, 0.22], [0.02, 0.18, 0.66]])  # linear Rec.709 → S0 in camera
-WIDTH, HEIGHT = 480, 360
-AUTO = ChartRequest("auto")
-
-
-def pose(pitch: float, turn_deg: float, at: tuple[float, float], tilt: tuple[float, float] = (0, 0)) -> Floats:
-    """Homography chart → px of a chart centred `at`, turned and (by its horizon) tilted."""
-    c, s = pitch * np.cos(np.radians(turn_deg)), pitch * np.sin(np.radians(turn_deg))
-    flat = np.array([[c, -s, 0], [s, c, 0], [tilt[0], tilt[1], 1]]) @ np.array([[1, 0, -3], [0, 1, -2], [0, 0, 1]])
-    return np.array([[1, 0, at[0]], [0, 1, at[1]], [0, 0, 1]]) @ flat
-
-
-def draw(homography: Floats, colors: Floats, patch: float = 0.87, card: float = 0.03, samples: int = 4) -> Floats:
-    """A chart on a softly patterned table (H, W, 3), linear Rec.709: each pixel the mean of many points."""
-    inverse = np.linalg.inv(homography)
-    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
-    table = 0.2 + 0.05 * np.sin(x / 17)[..., None] * np.cos(y / 23)[..., None] * np.array([1, 0.8, 0.5])
-    total = np.zeros((HEIGHT, WIDTH, 3))
-    for dy in (np.arange(samples) + 0.5) / samples - 0.5:
-        for dx in (np.arange(samples) + 0.5) / samples - 0.5:
-            at = chart.project(inverse, np.stack([x + dx, y + dy], axis=-1))
-            u, v = at[..., 0], at[..., 1]
-            on = (u > -0.1) & (u < 6.1) & (v > -0.1) & (v < 4.1)
-            column, row = np.clip(np.floor(u), 0, 5).astype(int), np.clip(np.floor(v), 0, 3).astype(int)
-            inside = on & (abs(u - column - 0.5) < patch / 2) & (abs(v - row - 0.5) < patch / 2)
-            picture = np.where(on[..., None], card, table)
-            total += np.where(inside[..., None], colors[row * 6 + column], picture)
-    return total / samples**2
-
-
-def stack(image: Floats, view: View | None = None, clip: float = np.inf, **known: Floats) -> AngleStack:
-    """One shot of an image in camera channels."""
-    height, width = image.shape[:2]
-    clipped = (image >= clip).any(axis=-1)
-    return AngleStack(
-        value=np.minimum(image, clip)[None].astype(np.float32),
-        variance=np.full((1, *image.shape), 1e-8, np.float32),
-        quality=np.where(clipped, int(Quality.CLIPPED), 0).astype(np.uint8)[None],
-        angle=np.zeros(1),
-        view=view or View(1000.0, (width / 2, height / 2), 2.0),
-        exposure_ratio=np.ones((1, 1, 3)),
-        exif_ratio=np.ones((1, 1)),
-        ghost_fraction=np.zeros(1),
-        lossy=False,
-        camera_matrix=known.get("camera_matrix"),
-        white_balance=known.get("white_balance"),
-    )
-
-
-def photograph(homography: Floats, colors: Floats = CLASSIC.rec709, seed: int = 0, **drawing: Any) -> Floats:
-    """I of one shot: half of S0, through a lens (σ = 0.4 px), with photon noise of 20 000 electrons at white."""
-    light = cv2.GaussianBlur(draw(homography, colors, **drawing) @ CAMERA.T / 2, (0, 0), 0.4)
-    return light + np.random.default_rng(seed).normal(size=light.shape) * np.sqrt(light / 20_000 + 1e-8)
+from tests.stages.whitebalance.chart_pictures import AUTO, CAMERA, CLASSIC, HEIGHT, WIDTH, draw, photograph, pose, stack
 
 
 @functools.cache
@@ -330,131 +271,3 @@ def test_scale_comes_from_the_charts_width_and_only_from_it():
     color = whitebalance.measure(radiance, CLASSIC, AUTO, Settings(chart_width_m=width))
     assert color.metres_per_px == pytest.approx(0.7 / 1100, rel=3e-3)
     assert whitebalance.measure(radiance, CLASSIC, AUTO, Settings()).metres_per_px is None
-
-
-# --- real photographs and path-traced captures ---
-
-DATA = os.environ.get("POLCAP_DATA")
-needs_data = pytest.mark.skipif(not DATA, reason="POLCAP_DATA is not set: no real charts")
-REAL = Path(DATA or ".") / "real"
-RENDERED = Path(DATA or ".") / "rendered"
-PHOTOS = sorted((REAL / "charts").glob("*.jpg"))
-SCENES = ["d21_spot", "d22_demosthenes", "d23_penguin", "d24_scorpion"]
-
-
-def photo(path: Path) -> AngleStack:
-    """An 8-bit photograph as linear light, half size where it is large."""
-    image = cv2.imread(str(path))
-    assert image is not None
-    step = 2 if max(image.shape) > 2000 else 1
-    return stack(decode_srgb(image[::step, ::step, ::-1] / 255.0), clip=decode_srgb(np.array(254 / 255.0)))
-
-
-def superpixels(path: Path) -> Floats:
-    """A RAW file binned 2×2, (counts − black)/(white − black)."""
-    import rawpy
-
-    with rawpy.imread(str(path)) as raw:
-        counts, names = raw.raw_image_visible.astype(np.float32), raw.color_desc.decode()
-        black, white, pattern = raw.black_level_per_channel, raw.white_level, raw.raw_pattern.copy()
-    counts = counts[: counts.shape[0] // 2 * 2, : counts.shape[1] // 2 * 2]
-    binned = np.zeros((counts.shape[0] // 2, counts.shape[1] // 2, 3))
-    for (y, x), index in np.ndenumerate(pattern):
-        channel = "RGB".index(names[index])
-        share = 0.5 if channel == 1 else 1.0
-        binned[..., channel] += share * (counts[y::2, x::2] - black[index]) / (white - black[index])
-    return binned
-
-
-# Outer corners of the outer patches, marked by eye in enlarged pictures; px as `photo` and `superpixels` give them.
-MARKED = {
-    "Apple_iPhone_13_Pro": ((1285, 147), (1292, 1895), (145, 1899), (151, 149)),
-    "Canon_PowerShot_G2": ((72, 84), (1041, 82), (1045, 710), (77, 718)),
-    "Canon_PowerShot_G6": ((125, 54), (572, 55), (577, 347), (118, 347)),
-    "Canon_Rebel_XT_350D": ((116, 1588), (107, 158), (1037, 158), (1042, 1577)),
-    "IMG_20140613_203438": ((811, 449), (570, 692), (381, 594), (628, 378)),
-    "Kodak_DC210": ((181, 203), (979, 205), (979, 726), (178, 723)),
-    "Nikon_D3100": ((186, 2066), (196, 295), (1339, 312), (1333, 2056)),
-    "Panasonic_DS_CAMERA": ((353, 308), (963, 307), (958, 703), (357, 700)),
-    "Pentax__ist_DL": ((125, 81), (1383, 86), (1378, 908), (125, 899)),
-    "Sony_DSC-P5": ((138, 184), (854, 179), (853, 646), (130, 654)),
-    "TL84_colorchecker": ((308, 316), (1028, 314), (1027, 783), (310, 784)),
-    "exposure30": ((317, 334), (1031, 331), (1033, 798), (317, 798)),
-    "passport": ((740, 337), (328, 338), (329, 68), (739, 67)),
-    "CRW_0101.CRW": ((109, 98), (1022, 93), (1021, 685), (117, 693)),
-    "P003910.KDC": ((13, 69), (279, 60), (279, 338), (13, 336)),
-}
-_MARK = 0.02  # of the chart's longer side
-
-
-def corners_off(color: ColorCalibration, marked: tuple[tuple[float, float], ...]) -> float:
-    """Greatest distance of a corner from its mark, of the chart's longer side."""
-    assert color.corners is not None
-    side = max(np.linalg.norm(np.subtract(marked[0], marked[1])), np.linalg.norm(np.subtract(marked[1], marked[2])))
-    return float(np.linalg.norm(color.corners - np.array(marked), axis=-1).max() / side)
-
-
-@needs_data
-@pytest.mark.parametrize("path", PHOTOS, ids=lambda path: path.stem)
-def test_classic_is_found_in_every_real_photograph(path):
-    color = whitebalance.measure(photo(path), CLASSIC, AUTO, Settings())
-    linear = path.stem in ("TL84_colorchecker", "exposure30")  # not gamma-encoded: decoding them bends their greys
-    assert np.nanmean(color.delta_e) < (14 if linear else 7)
-    assert corners_off(color, MARKED[path.stem]) < _MARK
-
-
-@needs_data
-@pytest.mark.parametrize(("name", "fitted", "ahead"), [("CRW_0101.CRW", 2.6, 3.2), ("P003910.KDC", 5.0, 6.0)])
-def test_classic_is_found_in_real_raw_files(name, fitted, ahead):
-    color = whitebalance.measure(stack(superpixels(REAL / "raw_chart" / name)), CLASSIC, AUTO, Settings())
-    assert np.nanmean(color.delta_e) < fitted
-    assert np.nanmean(color.predicted) < ahead
-    assert corners_off(color, MARKED[name]) < _MARK
-
-
-@needs_data
-def test_a_chart_of_18_patches_is_refused():
-    with pytest.raises(ChartError, match="no ColorChecker Classic"):
-        whitebalance.measure(photo(REAL / "charts" / "1.png"), CLASSIC, AUTO, Settings())
-
-
-def rendered(name: str) -> tuple[AngleStack, dict[str, Any], dict[str, Any]]:
-    """The 0° bracket merged on its true exposures, unclipped samples only."""
-    meta = json.loads((RENDERED / f"{name}.meta.json").read_text())
-    truth = json.loads((RENDERED / f"{name}.truth.json").read_text())
-    total, weight = np.zeros(()), np.zeros(())
-    for shot in truth["shots"][:3]:
-        exposure = shot["relative_exposure"] * shot["flash_factor"]
-        frame = superpixels(RENDERED / shot["file"])
-        good = np.all(frame < 0.9, axis=-1, keepdims=True)
-        total, weight = total + good * frame, weight + good * exposure
-    first = truth["shots"][0]["relative_exposure"] * truth["shots"][0]["flash_factor"]
-    view = View(meta["fx"] / 2, ((meta["cx"] - 1) / 2, (meta["cy"] - 1) / 2), 2.0)
-    return stack(first * total / np.maximum(weight, 1e-9), view), meta, truth
-
-
-@needs_data
-@pytest.mark.parametrize("name", SCENES)
-def test_path_traced_chart_is_found_and_its_camera_matrix_recovered(name):
-    radiance, meta, truth = rendered(name)
-    printed = ChartReference("as rendered", np.array(meta["chart"]["reference_linear_srgb"]), CLASSIC.size_m)
-    color = whitebalance.measure(radiance, printed, AUTO, Settings(chart_width_m=0.0165 * 5.862))
-    true = (np.array(meta["chart"]["patch_corners_px"]) - 1) / 2  # RAW px with centres on +½ → binned px
-    error = np.linalg.norm(color.quads.mean(axis=1) - true.mean(axis=1), axis=-1)
-    assert np.median(error) < 0.05 and error.max() < 0.15
-    identity = color.matrix @ np.array(truth["camera_matrix_from_linear_srgb"])
-    assert identity / np.trace(identity) * 3 == pytest.approx(np.eye(3), abs=0.006)
-    assert np.nanmean(color.delta_e) < 0.3
-    assert color.metres_per_px == pytest.approx(-meta["chart"]["c"][2] / radiance.view.focal, rel=3e-3)
-
-
-@needs_data
-@pytest.mark.parametrize("name", SCENES)
-def test_path_traced_scene_without_its_chart_is_refused(name):
-    radiance, meta, _ = rendered(name)
-    x0 = int(np.min(np.array(meta["chart"]["patch_corners_px"])[..., 0]) / 2) - 6
-    x1 = int(np.max(np.array(meta["chart"]["patch_corners_px"])[..., 0]) / 2) + 6
-    image = radiance.value[0]
-    rest = image[:, :x0] if x0 > image.shape[1] - x1 else image[:, x1:]
-    with pytest.raises(ChartError, match="no ColorChecker Classic"):
-        whitebalance.measure(stack(rest), CLASSIC, AUTO, Settings())

@@ -1,0 +1,65 @@
+"""Pictures of a ColorChecker Classic at a known place, through a camera of known colours."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+
+from polcap.formats import calib
+from polcap.images import AngleStack, ChartRequest, Floats, Quality, View
+from polcap.stages.whitebalance import chart
+
+CLASSIC = calib.colorchecker()
+CAMERA = np.array([[0.28, 0.10, 0.07], [0.08, 0.71, 0.22], [0.02, 0.18, 0.66]])  # linear Rec.709 → S0 in camera
+WIDTH, HEIGHT = 480, 360
+AUTO = ChartRequest("auto")
+
+
+def pose(pitch: float, turn_deg: float, at: tuple[float, float], tilt: tuple[float, float] = (0, 0)) -> Floats:
+    """Homography chart → px of a chart centred `at`, turned and (by its horizon) tilted."""
+    c, s = pitch * np.cos(np.radians(turn_deg)), pitch * np.sin(np.radians(turn_deg))
+    flat = np.array([[c, -s, 0], [s, c, 0], [tilt[0], tilt[1], 1]]) @ np.array([[1, 0, -3], [0, 1, -2], [0, 0, 1]])
+    return np.array([[1, 0, at[0]], [0, 1, at[1]], [0, 0, 1]]) @ flat
+
+
+def draw(homography: Floats, colors: Floats, patch: float = 0.87, card: float = 0.03, samples: int = 4) -> Floats:
+    """A chart on a softly patterned table (H, W, 3), linear Rec.709: each pixel the mean of many points."""
+    inverse = np.linalg.inv(homography)
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
+    table = 0.2 + 0.05 * np.sin(x / 17)[..., None] * np.cos(y / 23)[..., None] * np.array([1, 0.8, 0.5])
+    total = np.zeros((HEIGHT, WIDTH, 3))
+    for dy in (np.arange(samples) + 0.5) / samples - 0.5:
+        for dx in (np.arange(samples) + 0.5) / samples - 0.5:
+            at = chart.project(inverse, np.stack([x + dx, y + dy], axis=-1))
+            u, v = at[..., 0], at[..., 1]
+            on = (u > -0.1) & (u < 6.1) & (v > -0.1) & (v < 4.1)
+            column, row = np.clip(np.floor(u), 0, 5).astype(int), np.clip(np.floor(v), 0, 3).astype(int)
+            inside = on & (abs(u - column - 0.5) < patch / 2) & (abs(v - row - 0.5) < patch / 2)
+            picture = np.where(on[..., None], card, table)
+            total += np.where(inside[..., None], colors[row * 6 + column], picture)
+    return total / samples**2
+
+
+def stack(image: Floats, view: View | None = None, clip: float = np.inf, **known: Floats) -> AngleStack:
+    """One shot of an image in camera channels."""
+    height, width = image.shape[:2]
+    clipped = (image >= clip).any(axis=-1)
+    return AngleStack(
+        value=np.minimum(image, clip)[None].astype(np.float32),
+        variance=np.full((1, *image.shape), 1e-8, np.float32),
+        quality=np.where(clipped, int(Quality.CLIPPED), 0).astype(np.uint8)[None],
+        angle=np.zeros(1),
+        view=view or View(1000.0, (width / 2, height / 2), 2.0),
+        exposure_ratio=np.ones((1, 1, 3)),
+        exif_ratio=np.ones((1, 1)),
+        ghost_fraction=np.zeros(1),
+        lossy=False,
+        camera_matrix=known.get("camera_matrix"),
+        white_balance=known.get("white_balance"),
+    )
+
+
+def photograph(homography: Floats, colors: Floats = CLASSIC.rec709, seed: int = 0, **drawing: Any) -> Floats:
+    """I of one shot: half of S0, through a lens (σ = 0.4 px), with photon noise of 20 000 electrons at white."""
+    light = cv2.GaussianBlur(draw(homography, colors, **drawing) @ CAMERA.T / 2, (0, 0), 0.4)
+    return light + np.random.default_rng(seed).normal(size=light.shape) * np.sqrt(light / 20_000 + 1e-8)
