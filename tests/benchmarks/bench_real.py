@@ -3,7 +3,9 @@
     python tests/benchmarks/bench_real.py $POLCAP_DATA/real
 
 Four angles give a check that three do not: I₀ + I₉₀ = I₄₅ + I₁₃₅. Normals rendered by another group
-under natural light, which is reflected rather than diffuse, show how AoLP relates to azimuth there.
+under natural light, which is reflected rather than diffuse, show how AoLP relates to azimuth there. A mosaic goes
+through the path as `process` runs it, and is compared with polanalyser, where that is installed (`pip install
+polanalyser`), on the same pixels.
 """
 
 import sys
@@ -13,12 +15,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from polcap import pipeline
 from polcap.config import Config
 from polcap.formats import capture as captures
 from polcap.formats import png
-from polcap.images import AngleStack, Floats
+from polcap.images import AngleStack, ChartRequest, Floats
 from polcap.optics import mueller
+from polcap.path import UserInput, path
 from polcap.stages import hdr
+from polcap.store import Store
 
 
 def main() -> None:
@@ -26,9 +31,40 @@ def main() -> None:
     for name in ("polarizer_rotated/macbeth_classic", "polarizer_rotated/potery", "polarization_mosaic"):
         radiance = merged(real / name)
         print(f"{name}: median |I0 + I90 - I45 - I135|/S0 = {100 * residual(radiance):.2f} %")
-    for name in sorted(path.name for path in (real / "polarized_ground_truth" / "normal").glob("*.png")):
+    against_polanalyser(real / "polarization_mosaic")
+    for name in sorted(file.name for file in (real / "polarized_ground_truth" / "normal").glob("*.png")):
         along, across = against_normals(real / "polarized_ground_truth", name)
         print(f"{name}: median |AoLP - azimuth| {along:.1f} degrees, from its perpendicular {across:.1f}")
+
+
+def against_polanalyser(folder: Path) -> None:
+    """Gains and offsets of a mosaic as found; DoLP and AoLP against polanalyser's bilinear demosaicing."""
+    try:
+        import polanalyser
+    except ImportError:
+        print("polanalyser is not installed: mosaic not compared")
+        return
+    capture = captures.read(folder, None)
+    supplied = UserInput(ChartRequest("none"), None, None, pipeline.load_mask_network(1))
+    with tempfile.TemporaryDirectory() as place:
+        found = path(capture, supplied, Config(), Store(Path(place)))
+        gains, alignment, image = found.gains.value, found.alignment.value, found.stokes.value
+    print(f"gains all 1: {bool((gains.gain == 1).all())} ({gains.source})")
+    print(f"offsets [grid px]: {(-alignment.transform[:, :2, 2]).tolist()}")
+    (x0, y0), (height, width) = (round(at) for at in image.view.origin), image.mask.shape
+    counts = np.uint16(257) * png.read(Path(capture.shots[0].frames[0].path))  # their means are rounded to integers
+    here = np.s_[
+        2 * y0 + 1 : 2 * (y0 + height) : 2, 2 * x0 + 1 : 2 * (x0 + width) : 2
+    ]  # where 0° stands: the first shot
+    planes = [plane[here] / 1.0 for plane in polanalyser.demosaicing(counts, polanalyser.COLOR_PolarMono)]
+    theirs = polanalyser.calcStokes(planes, [polanalyser.polarizer(angle) for angle in np.radians([0, 45, 90, 135])])
+    s0, s1, s2 = image.stokes.mean(-1)
+    use = image.mask & (image.quality == 0)
+    dolp = np.hypot(s1, s2) / np.maximum(s0, 1e-9) - polanalyser.cvtStokesToDoLP(theirs)
+    aolp = np.arctan2(s2, s1) / 2 - polanalyser.cvtStokesToAoLP(theirs)
+    sure = use & (polanalyser.cvtStokesToDoLP(theirs) > 0.03)
+    print(f"against polanalyser, medians over {use.sum()} px: DoLP {np.median(np.abs(dolp[use])):.4f}, ", end="")
+    print(f"AoLP {median_turn(aolp, use):.2f} degrees; of DoLP over .03 {median_turn(aolp, sure):.2f}")
 
 
 def merged(folder: Path) -> AngleStack:
