@@ -30,7 +30,7 @@ from polcap.path import UserInput
 from tests.formats import headers
 
 BLACK, WHITE = 512, 16383
-LIMIT_S = 60.0
+LIMIT_S = 30.0  # of processor time
 Random = np.random.Generator
 CONTENT: dict[str, Callable[[Floats, Random], Floats]] = {  # from a noise of deviation 1, (H, W), to counts
     "clipped": lambda noise, random: np.full_like(noise, WHITE),
@@ -108,7 +108,7 @@ def campaign(count: int, seed: int, say: Callable[[str], None] = print) -> int:
         what = [str(random.choice(list(CONTENT)))] * 3 if alike else [str(x) for x in random.choice(list(CONTENT), 3)]
         size = (2 * int(random.integers(40, 100)), 2 * int(random.integers(40, 100)))
         kind = str(random.choice(["none", "none", "one pixel", "all", "random"]))
-        start = time.perf_counter()
+        start = time.process_time()
         with tempfile.TemporaryDirectory() as place:
             try:
                 write(Path(place) / "c", what, size, int(random.integers(1, 4)), random)
@@ -116,7 +116,7 @@ def campaign(count: int, seed: int, say: Callable[[str], None] = print) -> int:
             except Exception:
                 failures += 1
                 say(f"{what}, {size}, mask {kind}:\n{traceback.format_exc()}")
-        took = time.perf_counter() - start
+        took = time.process_time() - start  # whatever else the machine does
         slowest = max(slowest, took)
         failures += took > LIMIT_S
     say("\n".join(f"| {name} | {number} |" for name, number in outcomes.most_common()))

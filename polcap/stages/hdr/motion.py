@@ -140,7 +140,10 @@ def _coarse(a: Floats, ok_a: Bools, b: Floats, ok_b: Bools) -> Floats:
         return np.eye(3)
     flat = [window * np.where(both, p - p[both].mean(), 0) for p in (a, b)]
     cross = np.conj(np.fft.rfft2(flat[0])) * np.fft.rfft2(flat[1])
-    correlation = np.fft.irfft2(cross / (np.abs(cross) + 1e-3 * np.abs(cross).max()), s=a.shape)
+    strength = np.abs(cross)
+    if not strength.max() > 0:  # one of them is even
+        return np.eye(3)
+    correlation = np.fft.irfft2(cross / (strength + 1e-3 * strength.max()), s=a.shape)
     dy, dx = (int(v) for v in np.unravel_index(int(np.argmax(correlation)), a.shape))
     dy, dx = dy - a.shape[0] * (dy > a.shape[0] // 2), dx - a.shape[1] * (dx > a.shape[1] // 2)
     if correlation[dy, dx] < 1.5 * correlation[0, 0]:

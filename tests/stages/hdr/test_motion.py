@@ -83,3 +83,13 @@ def test_nothing_usable_means_no_motion():
     a = np.ones((300, 400), np.float32)
     found = motion.estimate(*(motion.View(a, np.zeros(a.shape, bool)) for _ in range(2)))
     assert found.tiles == 0 and np.array_equal(found.matrix, np.eye(3))
+
+
+@pytest.mark.filterwarnings("error")
+def test_even_picture_shows_no_motion():
+    """All dark, all clipped or a grey card: nothing to compare, and nothing divided by nothing."""
+    even, usable = np.full((128, 160), 0.5, np.float32), np.ones((128, 160), bool)
+    textured = ndimage.gaussian_filter(np.random.default_rng(1).normal(size=even.shape), 2).astype(np.float32)
+    for other in (even, textured):
+        found = motion.estimate(motion.View(even, usable), motion.View(other, usable))
+        assert np.array_equal(found.matrix, np.eye(3))
