@@ -5,6 +5,7 @@ Gains, transforms and the ring's turn are applied here and nowhere else, so ever
 
 from typing import Annotated
 
+import cv2
 import msgspec
 import numpy as np
 from msgspec import Meta
@@ -18,7 +19,7 @@ from polcap.stages import stage
 _MOST_CONDITION = 50.0  # of three angles 12° apart, where S1 has 26 times the noise of a shot; 0, 45, 90° have 2.4
 _METAL_DOLP, _METAL_DEG, _METAL_SIGMA = 0.05, 10.0, 5.0  # of red and blue: DoLP, and how far their AoLPs part; set by
 # hand, beyond what noise and registration do to a dielectric, and not measured on metals
-_ROWS = 64  # of a block that fits the cache, from resampling to the last bit
+_ROWS = 64  # of a block whose planes, all shots and channels, fit the cache from resampling to the last bit
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # the rows of a covariance
 
 Flags = list[list[tuple[Quality, Bits]]]  # of every shot
@@ -86,13 +87,14 @@ def solve(
         rows = slice(top - y0, min(top + _ROWS, y1) - y0)
         value, variance, seen = _registered(radiance, alignment, gains, flags, (x0, top, x1, rows.stop + y0))
         solved, doubt = _undiluted(*solved_by(weights_of, value, variance), radiance.extinction)
-        stokes[:, rows], covariance[:, rows] = solved, doubt
+        for planes, out in zip((*solved, *doubt), (*stokes, *covariance)):
+            cv2.merge([np.asarray(plane, np.float32) for plane in planes], out[rows])
         quality[rows] = _judged(solved, doubt, seen, settings)
         if residual is not None:
-            diluted = solved * _contrast(radiance.extinction)[:, None, None]
-            fitted = np.einsum("kj,jhwc->khwc", weights_of, diluted)
-            difference = np.abs(value - fitted).sum(-1).mean(0)
-            residual[rows] = difference / np.maximum(solved[0].sum(-1), 1e-9)
+            diluted = solved * _contrast(radiance.extinction)[..., None, None]
+            fitted = np.einsum("kj,jchw->kchw", weights_of, diluted)
+            difference = np.abs(value - fitted).sum(1).mean(0)
+            residual[rows] = difference / np.maximum(solved[0].sum(0), 1e-9)
     mask = object_.mask[y0:y1, x0:x1]
     view = radiance.view
     return StokesImage(
@@ -120,19 +122,23 @@ def _flagged(quality: Bits) -> list[tuple[Quality, Bits]]:
 def _registered(
     radiance: AngleStack, alignment: Alignment, gains: Gains, flags: Flags, box: tuple[int, int, int, int]
 ) -> tuple[Floats, Floats, Bits]:
-    """Every shot's radiance over gain on a box of the reference grid: (K, h, w, 3) twice, (h, w)."""
+    """Every shot's radiance over gain on a box of the reference grid, by planes: (K, 3, h, w) twice, (h, w)."""
     x0, y0, x1, y1 = box
-    values, variances = (np.empty((len(alignment.transform), y1 - y0, x1 - x0, 3), np.float32) for _ in range(2))
+    values, variances = (np.empty((len(alignment.transform), 3, y1 - y0, x1 - x0), np.float32) for _ in range(2))
     quality: Bits = np.zeros((y1 - y0, x1 - x0), np.uint8)
     mosaic = radiance.offset_px is not None
     part = alignment.transform[:, :2, 2] % 1
     shares = np.prod(part**2 + (1 - part) ** 2, axis=1).mean()  # alike for all, lest the sharpest shot counts least
     for k, transform in enumerate(alignment.transform):
         gain = gains.gain[k].astype(np.float32)
-        np.divide(warp(radiance.value[k], transform, box, order=1 if mosaic else 3), gain, out=values[k])
-        spread = np.maximum(warp(radiance.variance[k], transform, box, order=1), np.float32(1e-14))
         # the mean of two or four neighbours in a mosaic, as is usual: splines ring at the edges of so coarse a grid
-        np.multiply(spread, np.float32(shares if mosaic else 1) / gain**2, out=variances[k])
+        shot = cv2.split(warp(radiance.value[k], transform, box, order=1 if mosaic else 3))
+        doubt = cv2.split(warp(radiance.variance[k], transform, box, order=1))
+        spread = np.float32(shares if mosaic else 1) / gain**2
+        for c in range(3):
+            np.divide(shot[c], gain[c], out=values[k, c])
+            np.maximum(doubt[c], np.float32(1e-14), out=variances[k, c])
+            variances[k, c] *= spread[c]
         for bit, plane in flags[k]:
             quality |= np.where(warp(plane, transform, box, order=1) > 0.01 * bit, np.uint8(bit), np.uint8(0))
         inside = covered(radiance.value.shape[1:3], transform, box)
@@ -151,7 +157,7 @@ def _exact(weights_of: Floats, value: Floats, variance: Floats) -> tuple[Floats,
 
 
 def _weighted_least_squares(weights_of: Floats, value: Floats, variance: Floats) -> tuple[Floats, Floats]:
-    """Stokes (3, H, W, C) and covariance (6, H, W, C) from value and variance (K, H, W, C), A (K, 3)."""
+    """Stokes (3, C, H, W) and covariance (6, C, H, W) from value and variance (K, C, H, W), A (K, 3)."""
     shape = value.shape[1:]
     w = 1.0 / variance.astype(np.float64).reshape(len(value), -1)
     products = np.stack([weights_of[:, i] * weights_of[:, j] for i, j in _PAIRS])
@@ -186,7 +192,7 @@ def _undiluted(stokes: Floats, covariance: Floats, extinction: Floats | None) ->
     up = 1 / _contrast(extinction)  # (3, C)
     pairs = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
     both = np.stack([up[i] * up[j] for i, j in pairs])
-    return stokes * up[:, None, None], covariance * both[:, None, None]
+    return stokes * up[..., None, None], covariance * both[..., None, None]
 
 
 def _judged(stokes: Floats, covariance: Floats, quality: Bits, settings: Settings) -> Bits:
@@ -203,8 +209,8 @@ def _judged(stokes: Floats, covariance: Floats, quality: Bits, settings: Setting
 
 
 def _total(picture: Floats) -> Floats:
-    """Sum over the channels of (h, w, 3)."""
-    return picture[..., 0] + picture[..., 1] + picture[..., 2]
+    """Sum over the channels of (3, h, w)."""
+    return picture[0] + picture[1] + picture[2]
 
 
 def _metal(stokes: Floats, covariance: Floats) -> Floats:
@@ -214,7 +220,7 @@ def _metal(stokes: Floats, covariance: Floats) -> Floats:
     conductor the complex index changes with wavelength. Red and blue are compared at 5σ.
     """
     (x0, y0, strength0, noise0), (x1, y1, strength1, noise1) = (
-        _polarization(stokes[..., c], covariance[..., c]) for c in (0, 2)
+        _polarization(stokes[:, c], covariance[:, c]) for c in (0, 2)
     )
     turned = x0 * y1 - y0 * x1
     spread = np.sqrt(noise0 * strength1**2 + noise1 * strength0**2)
