@@ -8,7 +8,7 @@ import pytest
 from polcap.errors import ObjectError
 from polcap.images import Network
 from polcap.stages import mask
-from polcap.stages.mask import mask_channels, solid, two_looks
+from polcap.stages.mask import mask_channels, solid, standing_out, two_looks
 from tests import scenes
 
 CHANNEL = mask_channels.CHANNELS.index
@@ -99,6 +99,32 @@ def test_doubtful_holes_are_filled_openings_stay_and_specks_go():
     chance[5:7, 5:7] = 0.9
     found = solid.body(chance)
     assert found[30:40, 30:40].all() and not found[50:60, 50:60].any() and not found[5:7, 5:7].any()
+
+
+def test_colours_decide_what_the_chances_leave_open():
+    """A ring seen by a network that is sure of its left half alone, and of the picture's rim."""
+    y, x = np.mgrid[:120, :160].astype(float)
+    away = np.hypot(x - 80, y - 60)
+    true = (away < 45) & (away > 20)
+    rng = np.random.default_rng(0)
+    picture = np.where(true[..., None], [0.5, 0.2, 0.1], [0.1, 0.2, 0.3]) * rng.normal(1, 0.02, (120, 160, 1))
+    chance = np.where(away < 55, 0.6, 0.001)
+    chance[true & (x < 70)] = 0.999
+    found = standing_out.sharpened(
+        picture.astype(np.float32), chance > 0.5, np.zeros(true.shape, np.uint8), chance.astype(np.float32)
+    )
+    assert (found & true).sum() / (found | true).sum() > 0.97
+    assert ((chance > 0.5) & true).sum() / ((chance > 0.5) | true).sum() < 0.6
+
+
+def test_a_cleaned_mask_keeps_its_openings():
+    drawn = np.zeros((100, 100), bool)
+    drawn[20:80, 20:80] = True
+    drawn[30:40, 30:40] = False  # one looks through
+    drawn[50, 50] = False
+    drawn[5, 5] = True
+    found = solid.cleaned(drawn)
+    assert found.sum() == 3600 - 100 and not found[30:40, 30:40].any() and found[50, 50]
 
 
 def test_a_drawn_mask_is_taken_as_drawn():

@@ -11,38 +11,46 @@ from polcap.images import Floats
 
 _SPECK = 0.01  # of the largest part: smaller ones are no parts of their own
 _PINHOLE = 1e-3  # of the mask: smaller holes are dark texture
-_LEEWAY = 1.5  # times the doubt, given for the sharper outline (decision 15)
-_DOUBTED = 0.22  # mean chance of a hole that is a shadowed hollow and no opening
+_LEEWAY = 1.1  # times the doubt, given for the sharper outline (decision 39)
+_DOUBTED = 0.15  # mean chance of a hole that is a shadowed hollow and no opening
 
 
 def body(chance: Floats) -> NDArray[np.bool_]:
     """The mask (H, W) of chances (H, W) 0…1."""
-    mask = (chance > 0.5).astype(np.uint8)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
-    area = stats[:, cv2.CC_STAT_AREA].astype(float)
-    area[0] = 0
-    if not area.any():
-        return mask > 0
-    mask = np.isin(labels, np.flatnonzero(area >= _SPECK * area.max()) if area.max() else []).astype(np.uint8)
-    mask[labels == 0] = 0
-    return _filled(mask, chance)
+    return _filled(_sizeable(chance > 0.5), chance)
+
+
+def cleaned(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """A mask (H, W) without specks and pinholes."""
+    return _filled(_sizeable(mask), None)
 
 
 def preferred(plain: NDArray[np.bool_], learned: NDArray[np.bool_], chance: Floats) -> NDArray[np.bool_]:
     """The better of two masks (H, W), by the network's chance (H, W) of each pixel.
 
-    That of what stands out where the network finds it nearly as likely as its own: its outline is sharper.
+    That of what stands out where the network finds it as likely as its own: its outline is sharper.
     """
     return plain if doubt(plain, chance) < _LEEWAY * doubt(learned, chance) else learned
 
 
-def _filled(mask: NDArray[np.uint8], chance: Floats) -> NDArray[np.bool_]:
+def _sizeable(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """The parts that are no specks."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    area = stats[:, cv2.CC_STAT_AREA].astype(float)
+    area[0] = 0
+    keep = (area > 0) & (area >= _SPECK * area.max())
+    return keep[labels].astype(np.uint8)
+
+
+def _filled(mask: NDArray[np.uint8], chance: Floats | None) -> NDArray[np.bool_]:
     """Holes filled that are pinholes, or of which the network is not sure that one looks through them."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(1 - mask, connectivity=4)
     area = stats[:, cv2.CC_STAT_AREA].astype(float)
-    mean = np.bincount(labels.reshape(-1), weights=chance.reshape(-1), minlength=count) / np.maximum(area, 1)
     outer = np.concatenate([labels[[0, -1]].ravel(), labels[:, [0, -1]].ravel()])
-    fill = (area < _PINHOLE * mask.sum()) | (mean > _DOUBTED)
+    fill = area < _PINHOLE * mask.sum()
+    if chance is not None:
+        mean = np.bincount(labels.reshape(-1), weights=chance.reshape(-1), minlength=count) / np.maximum(area, 1)
+        fill |= mean > _DOUBTED
     fill[np.unique(outer)] = False
     return np.asarray((mask > 0) | (fill[labels] & (mask == 0)))
 

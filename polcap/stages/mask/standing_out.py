@@ -19,6 +19,7 @@ from polcap.optics.robust import MAD_TO_SIGMA
 
 _STANDS_OUT = (0.8, 1.6)  # stops above the backdrop that make an object, however even or uneven that is
 _OTHER_CHROMA = 0.15  # |Δr| + |Δg| + |Δb| of r + g + b = 1 that makes another colour
+_SURE = 0.996  # chance from which on, either way, colours decide nothing (decision 39)
 _WORK_PIXELS = 3e5  # graph cuts run on an image averaged down to about this
 
 
@@ -51,11 +52,25 @@ def search(picture: Floats, chart: NDArray[np.uint8], min_area: float) -> NDArra
     return _enlarged(_filled(_sizeable(_graph_cut(small, seed, outside), 0.0)).astype(np.float32), chart)
 
 
-def sharpened(picture: Floats, mask: NDArray[np.bool_], chart: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """A mask (H, W) whose outline is right to a few pixels, moved to the picture's edges."""
+def sharpened(picture: Floats, mask: NDArray[np.bool_], chart: NDArray[np.uint8], chance: Floats) -> NDArray[np.bool_]:
+    """A mask moved to the picture's edges, and decided by colour where its chances leave it open.
+
+    Parameters
+    ----------
+    picture
+        (H, W, 3) linear Rec.709.
+    mask
+        (H, W) right to a few pixels, or wherever its chances are near 0 or 1.
+    chart
+        (H, W) 1 where the chart lies.
+    chance
+        (H, W) 0…1 of each pixel to be the object.
+    """
     small, outside = _reduced(picture, chart)
-    seed = cv2.resize(mask.astype(np.uint8), small.shape[1::-1], interpolation=cv2.INTER_NEAREST)
-    return _enlarged(_graph_cut(small, seed, outside).astype(np.float32), chart)
+    size = small.shape[1::-1]
+    seed = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    cut = _graph_cut(small, seed, outside, cv2.resize(chance, size, interpolation=cv2.INTER_AREA))
+    return _enlarged(cut.astype(np.float32), chart)
 
 
 def _reduced(picture: Floats, chart: NDArray[np.uint8]) -> tuple[Floats, NDArray[np.bool_]]:
@@ -124,13 +139,18 @@ def _filled(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(np.maximum(mask, (np.isin(labels, small) & (labels > 0)).astype(np.uint8)))
 
 
-def _graph_cut(picture: Floats, seed: NDArray[np.uint8], outside: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """The seed's outline moved to the picture's edges."""
+def _graph_cut(
+    picture: Floats, seed: NDArray[np.uint8], outside: NDArray[np.bool_], chance: Floats | None = None
+) -> NDArray[np.uint8]:
+    """The seed's outline moved to the picture's edges, and anew wherever the chances leave it open."""
     tone = np.log2(np.clip(picture, 0, 4) + 0.002)
     display = (255 * (tone - tone.min()) / (np.ptp(tone) + 1e-9)).astype(np.uint8)
     reach = max(3, round(0.006 * max(seed.shape)))
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     sure, possible = cv2.erode(seed, kernel), cv2.dilate(seed, kernel)
+    if chance is not None:
+        sure[chance < _SURE] = 0
+        possible[chance > 1 - _SURE] = 1
     labels = np.full(seed.shape, cv2.GC_BGD, np.uint8)
     labels[possible > 0] = cv2.GC_PR_BGD
     labels[seed > 0] = cv2.GC_PR_FGD

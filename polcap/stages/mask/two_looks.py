@@ -17,7 +17,6 @@ Box = tuple[int, int, int, int]  # x0, y0, x1, y1 full-frame grid px, end exclus
 _FINE = 256  # px of the second look's longer side, at most
 _AGAIN = 2  # looks at what was found; what the hint lacked is found from there
 _ROOM = 0.12  # shown around what the first look found, of its longer side
-_TEMPERATURE = 1.4  # of the answer's logits: on 40 pictures of training the overlap it expects is then the true one
 _LIKELY = 0.3  # of being the object, for a pixel to be shown to the second look
 
 
@@ -51,7 +50,7 @@ def chances(
         hint = _area(out[y0:y1, x0:x1], seen.chart.shape)
         out = np.minimum(out, _LIKELY)  # of what lies beyond the box
         out[y0:y1, x0:x1] = _resized(_run(network, encode(seen, bright, hint)), box)
-    return tempered(out)
+    return out
 
 
 def look(
@@ -89,22 +88,6 @@ def look(
     y = 2 * (sy * (np.arange(height) + 0.5) + y0) / full_h - 1
     on_chart = _area(chart[y0:y1, x0:x1].astype(np.float32), (height, width)) > 0.5
     return Look(seen, sums, on_chart, np.stack(np.meshgrid(x, y)).astype(np.float32))
-
-
-def tempered(chance: Floats) -> Floats:
-    """Chances as often true as they say: a network that has learned its pictures well is too sure of others.
-
-    Parameters
-    ----------
-    chance
-        (H, W) 0…1, of an answer as the network gives it.
-
-    References
-    ----------
-    Guo et al., On calibration of modern neural networks, ICML 2017.
-    """
-    odds = (chance / np.maximum(1 - chance, 1e-7)) ** (1 / _TEMPERATURE)
-    return np.asarray(odds / (1 + odds), np.float32)
 
 
 def around(likely: NDArray[np.bool_]) -> Box | None:
