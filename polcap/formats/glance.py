@@ -94,7 +94,7 @@ def _means(image: SensorImage, times: int) -> Floats:
     if image.superpixel != 2 or image.cfa is None or image.value.dtype != np.uint16:
         signal = sensor.signal(image)
         return _averaged(np.repeat(signal, 3, axis=2) if signal.shape[2] == 1 else signal, times)
-    sites = _sums(image.value, times)  # (2, 2, h, w)
+    sites = _sums(image.value.astype(np.uint16, copy=False), times)  # (2, 2, h, w)
     out = np.empty((*sites.shape[2:], 3), np.float32)
     black = np.broadcast_to(image.black, (2, 2))
     span = image.white - float(image.black.mean())

@@ -49,7 +49,8 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
             apart[k] = np.inf
         elif min(here, around) > _SURE_LIKENESS:
             at = [(transform @ middle)[:2] / (transform @ middle)[2] for transform, _ in found]
-            doubt = np.hypot(*(sigma_at(region, shot, way, middle) for region, (way, _) in zip(regions, found)))
+            inner, outer = (sigma_at(region, shot, way, middle) for region, (way, _) in zip(regions, found))
+            doubt = float(np.hypot(inner, outer))
             apart[k] = step * max(float(np.hypot(*(at[0] - at[1]))) - _SURE_SIGMAS * doubt, 0.0)
     return apart
 
