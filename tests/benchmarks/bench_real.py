@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from polcap import pipeline
+from polcap import models
 from polcap.config import Config
 from polcap.formats import capture as captures
 from polcap.formats import png
@@ -45,7 +45,7 @@ def against_polanalyser(folder: Path) -> None:
         print("polanalyser is not installed: mosaic not compared")
         return
     capture = captures.read(folder, None)
-    supplied = UserInput(ChartRequest("none"), None, None, pipeline.load_mask_network(1))
+    supplied = UserInput(ChartRequest("none"), None, None, models.load_mask_network(1))
     with tempfile.TemporaryDirectory() as place:
         found = path(capture, supplied, Config(), Store(Path(place)))
         gains, alignment, image = found.gains.value, found.alignment.value, found.stokes.value

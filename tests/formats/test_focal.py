@@ -16,8 +16,8 @@ def test_sensor_table_makes_a_stated_focal_length_known() -> None:
 def test_stated_focal_length_that_contradicts_the_photographs_is_no_knowledge() -> None:
     exif = Exif(model="NIKON D90", focal_length_mm=50.0, width=4310, height=2868)
     found = focal.find(exif, 24.0, None)
-    shorter, longer = found.doubt
-    assert shorter == 0.0 and longer == pytest.approx(math.log(50 / 24))  # it may be as long as they say, and no shorter
+    shorter, longer = found.doubt  # it may be as long as they say, and no shorter
+    assert shorter == 0.0 and longer == pytest.approx(math.log(50 / 24))
     assert not found.known and "50 mm" in found.note
     assert found.px == pytest.approx(24 / 23.6 * 4310)  # what the user states is what is taken
     assert focal.find(exif, 51.0, None).known

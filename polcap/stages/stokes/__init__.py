@@ -210,7 +210,8 @@ def _judged(stokes: Floats, covariance: Floats, quality: Bits, settings: Setting
 
 def _total(picture: Floats) -> Floats:
     """Sum over the channels of (3, h, w)."""
-    return picture[0] + picture[1] + picture[2]
+    total: Floats = picture[0] + picture[1] + picture[2]
+    return total
 
 
 def _metal(stokes: Floats, covariance: Floats) -> Floats:
