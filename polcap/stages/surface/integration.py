@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from polcap.images import Floats, SurfaceMaps, View
 from polcap.optics.frames import dot
-from polcap.stages.surface.jumps import Jumps, jumps, least_step, widened
+from polcap.stages.surface.jumps import Jumps, jumps, least_step, radius, widened
 from polcap.stages.surface.multigrid import Multigrid, Nested, conjugate_gradients
 from polcap.stages.surface.pixel_grid import PixelGrid
+from polcap.stages.surface.rims import contours, rims
 
 _DECIDED = 80_000  # pixels, at most, of the grid on which jumps are decided
 _SOFT, _ANNEAL = 0.25, 1.2  # stiffness at first, and its growth per iteration: few early errors are kept as jumps
@@ -30,6 +31,10 @@ _MENDED = 4  # solutions on the grid that decides, after tears were found
 _UNDECIDED = 0.1  # of the prior's pull while jumps are sought: where it strains the normals it tears them
 _REACH = 2  # px around a jump within which pixels choose their neighbours on the next finer grid
 _TIRED = 9  # iterations of a linear solution that call for a new multigrid hierarchy
+_GAP = 0.25  # depth behind a limb, over the object's radius, where nothing else tells it
+_OPEN = 0.3  # share of that gap which opens where a part is free indeed
+_SURE = 1 / 16  # weight of a normal under which it tells of no limb: an error four times the median
+_HOVER = 0.1  # weight of that, of all limbs together
 _ACCURACY = 1e-3  # of each linear solution, relative
 _PROXIMITY = 1e-8  # pulls towards the last estimate: fixes what the normals leave free (one offset per piece)
 _FLATTEST = 0.05  # cosine under which a normal tells no slope
@@ -57,8 +62,8 @@ def problem(maps: SurfaceMaps, steepest: float, prior_weight: float) -> Problem:
     middle = float(np.median(sigma))
     prior = None
     if maps.depth_prior is not None and prior_weight > 0:
-        radius = np.sqrt(mask.sum() / np.pi) / maps.view.focal  # the prior's unit over the distance
-        prior = maps.view.focal * np.log(np.maximum(1 + radius * maps.depth_prior[mask], 0.05))
+        unit = radius(mask) / maps.view.focal  # the prior's over the distance
+        prior = maps.view.focal * np.log(np.maximum(1 + unit * maps.depth_prior[mask], 0.05))
     return Problem(
         mask=mask,
         view=maps.view,
@@ -101,7 +106,10 @@ def _solved(
     """z (N,), the pixels near its jumps (H, W), and a preconditioner for matrices of this level."""
     level = _Level(of)
     if level.grid.size <= _DECIDED:
+        if stiffness > 0:
+            level.leave_limbs()
         z = level.decided(stiffness, iterations, tolerance)
+        level.close_limbs(z)
         torn = level.jumps(z, jump / 2).torn
         free = ~widened(torn, _REACH)[of.mask] & (stiffness > 0)
         z, solver = level.mended(z, free, stiffness)
@@ -128,7 +136,7 @@ class _Level:
         facing = (self.facing[p] + self.facing[q]) / 2
         steep = np.maximum(facing, _FLATTEST)
         self.slope = tuple(side / np.maximum(self.facing, _FLATTEST) for side in self.side)
-        turned = np.concatenate([s[a] - s[b] for s, a, b in zip(self.slope, self._halves(p), self._halves(q))])
+        turned = self._along(p) - self._along(q)
         # a chord's direction is the mean of its ends' tangents (exact on a circle); its variance is that of the
         # normals' angle plus that of where between the two slopes a bend puts the step
         noise = of.sigma**2 * (1 / of.weight[p] + 1 / of.weight[q]) / 2
@@ -136,6 +144,35 @@ class _Level:
         self.chord = of.sigma**2 / (
             noise * np.maximum(facing**2 + target**2, _FLATTEST**2) / steep**4 + _TURNED * turned**2
         )
+        self.limb = np.zeros(0, dtype=np.intp)  # links that leave a limb
+        self.gap = self.leap = np.zeros(0)  # usual depth behind it, positive to the right or down; that and its slope
+
+    def leave_limbs(self) -> None:
+        """From now on, links between a limb and what it hides tell no slope, and pull a little towards a usual gap."""
+        sure = self.of.weight > _SURE
+        lean = [np.where(sure, np.arctan2(side, np.maximum(self.facing, 1e-6)), np.nan) for side in self.side]
+        found = rims((self.grid.image(lean[0]), self.grid.image(lean[1])), self.of.mask)
+        mask = self.of.mask
+        sign = np.concatenate([found.right[mask[:, :-1] & mask[:, 1:]], found.down[mask[:-1] & mask[1:]]])
+        self.limb = np.flatnonzero(sign)
+        self.gap = _GAP * radius(mask) * sign[self.limb]
+        first, second = (self._along(ends)[self.limb] for ends in (self.grid.p, self.grid.q))
+        self.leap = self.gap + np.where(self.gap > 0, first, second)
+
+    def close_limbs(self, z: Floats) -> None:
+        """Limbs behind which z opens no gap, because the surface holds together around them, are none."""
+        p, q = self.grid.p[self.limb], self.grid.q[self.limb]
+        open_ = (z[q] - z[p] - self.leap + self.gap) / self.gap
+        at = np.zeros(self.grid.size, dtype=bool)
+        at[p] = True
+        contour = contours(self.grid.image(at, outside=False))[self.of.mask][p]
+        stays = [number for number in np.unique(contour) if np.median(open_[contour == number]) > _OPEN]
+        kept = np.isin(contour, stays)
+        self.limb, self.gap, self.leap = self.limb[kept], self.gap[kept], self.leap[kept]
+
+    def _along(self, ends: Any) -> Floats:
+        """The slopes (L,) along the links at one end of each."""
+        return np.concatenate([slope[part] for slope, part in zip(self.slope, self._halves(ends))])
 
     def _halves(self, links: Any) -> tuple[Any, Any]:
         """What belongs to links to the right, and to links down."""
@@ -199,6 +236,8 @@ class _Level:
                 at = chosen[both]
                 link[at] = (forward * facing[p] ** 2 + backward * facing[q] ** 2)[both]
                 flux[at] = (forward * facing[p] * side[p] + backward * facing[q] * side[q])[both]
+        link[self.limb] = weight = _HOVER / max(len(self.limb), 1)
+        flux[self.limb] = weight * self.leap
         diagonal, right = np.full(grid.size, _PROXIMITY), _PROXIMITY * z + grid.divergence(flux)
         if self.of.prior is not None:
             diagonal += pull

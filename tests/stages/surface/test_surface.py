@@ -294,3 +294,27 @@ def test_back_closes_the_mesh_where_it_is_asked_to(back: str, holes: bool) -> No
     volume = np.sum(p * np.cross(q, r)) / 6
     if back == "closed":
         assert 0.0015 < volume < np.pi * 0.1**3  # the cap that is seen holds 0.0018, the cylinder about a half more
+
+
+def two_balls(gap: float) -> tuple[SurfaceMaps, Floats]:
+    """A small ball whose limb hides part of a large one, `gap` m behind it, and their depth [m]."""
+    small, near = sphere(center=(0.04, 0.0, -1.0), radius=0.045)
+    large, far = sphere(center=(-0.02, 0.0, -1.045 - gap - 0.09), radius=0.09)
+    front = small.mask
+    normal = np.where(front[..., None], small.normal, large.normal)
+    return maps(normal, front | large.mask), np.where(front, near, far)
+
+
+def test_part_behind_a_limb_stands_apart_where_no_slope_tells_by_how_much() -> None:
+    scene, truth = two_balls(0.03)
+    plain, ours = (surface.integrate(scene, None, surface.Settings(stiffness=s)) for s in (0.0, 2.0))
+    assert plain.cuts == 0 and ours.cuts > 0.3
+    assert error_share(ours, truth, scene.mask) < 0.8 * error_share(plain, truth, scene.mask)
+
+
+def test_crease_where_two_parts_touch_is_no_limb() -> None:
+    a, _ = slopes()
+    valley = 1 - 0.6 * np.abs(a)  # two planes that lean by 31° towards a crease
+    scene = maps(from_depth(valley), np.ones(SHAPE, dtype=bool))
+    mesh = surface.integrate(scene, None, SETTINGS)
+    assert mesh.pieces == 1 and mesh.cuts == 0
