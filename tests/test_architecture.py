@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,6 +22,17 @@ def test_layers_and_strangers() -> None:
         [str(Path(sys.executable).with_name("lint-imports")), "--no-cache"], capture_output=True, text=True, cwd=ROOT
     )
     assert done.returncode == 0, done.stdout
+
+
+def test_the_page_draws_the_layers_that_are_held() -> None:
+    held = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]["contracts"][0]
+    page = (ROOT / "docs" / "explanations" / "architecture.md").read_text(encoding="utf-8")
+    drawn: list[list[str]] = []
+    for line in page.partition("## Who may import whom")[2].split("```")[1].strip("\n").splitlines():
+        names = re.findall(r"\w+", line.strip().partition("   ")[0])
+        drawn += [] if line.startswith(" ") else [[]]  # a layer may take two lines
+        drawn[-1] += names
+    assert drawn == [layer.split(" | ") for layer in held["layers"]]
 
 
 MODULES = {  # dotted name → file
