@@ -41,7 +41,7 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.03
     max_gain_doubt: Annotated[
         float, Meta(gt=0, le=1, description="1σ of a shot's light, or of the chart's gloss on it; 1 % is 6° [1]")
-    ] = 0.01
+    ] = 0.006
     max_gain_change: Annotated[
         float, Meta(gt=0, le=1, description="of a shot's light against the other shots'; more is no ordinary pop [1]")
     ] = 0.1
@@ -100,6 +100,9 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_ambient: Annotated[
         float, Meta(gt=0, le=1, description="share of the light that is there without the flash [1]")
     ] = 0.1
+    max_crossed_misfit: Annotated[
+        float, Meta(gt=0, le=1, description="share of the object brighter in the cross-polarised shot than in S0 [1]")
+    ] = 0.05
     max_ill_posed: Annotated[
         float, Meta(ge=0, le=1, description="share of the object whose DoLP no dielectric can have [1]")
     ] = 0.05

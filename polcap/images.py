@@ -125,11 +125,19 @@ class Capture:
     notes: tuple[str, ...] = field(default=(), metadata=NOT_IN_KEY)  # what was assumed, one line each
     focal_doubt: tuple[float, float] = field(default=(0.0, 0.0), metadata=NOT_IN_KEY)  # ln of least, most over focal_px
     calibration: Calibration | None = None  # of this camera, lens and filter, where the user has measured one
+    crossed: Shot | None = None  # under a polarized flash; its angle is the lens's filter, across the flash's
 
     @property
     def angle(self) -> Floats:
         """(K,) rad, of the polarizer's axis: as stated, or by the ring's calibration."""
-        stated = np.array([shot.angle for shot in self.shots])
+        return self._turned(np.array([shot.angle for shot in self.shots]))
+
+    @property
+    def crossed_angle(self) -> float:
+        """The same of the crossed shot; NaN without one."""
+        return float("nan") if self.crossed is None else float(self._turned(np.array(self.crossed.angle)))
+
+    def _turned(self, stated: Floats) -> Floats:
         ring = self.calibration.polarizer if self.calibration is not None else None
         return stated if ring is None else ring.sense * stated + np.radians(ring.zero_deg)
 
@@ -155,6 +163,14 @@ class MaskedImage:
 
 
 @dataclass(frozen=True)
+class CrossedShot:
+    """A shot under a flash polarized across the lens's filter: nothing that the surface mirrors comes through."""
+
+    picture: MaskedImage  # on its own grid; sensor white at its reference exposure = 1
+    angle: float  # rad, of the filter before the lens
+
+
+@dataclass(frozen=True)
 class AngleStack:
     """The merged shots of a capture in camera channels, not yet registered."""
 
@@ -175,7 +191,13 @@ class AngleStack:
     ambient_share: Floats | None = None  # (K,) of all light, there without the flash; NaN where not photographed
     extinction: Floats | None = None  # (3,) or (1,) extinction ratio of the polarizer, calibrated; None: ideal
     flash_spread: float | None = None  # 1σ of the flash's energy from pop to pop, calibrated
+    ring_sigma: float | None = None  # rad, 1σ of the ring's zero as calibrated; None: set by eye
     blur_px: Floats | None = None  # (K, E) beyond the sharpest frame of the same exposure, 1σ [RAW px]; NaN: unknown
+    crossed: CrossedShot | None = None  # where one was taken
+
+    def shot(self, k: int) -> MaskedImage:
+        """One of the shots, (H, W, 3)."""
+        return MaskedImage(self.value[k], self.variance[k], self.quality[k])
 
 
 @dataclass(frozen=True)
@@ -230,6 +252,7 @@ class Alignment:
     transform: Floats  # (K, 3, 3) reference grid px → shot grid px, homogeneous (x, y, 1)
     residual_px: Floats  # (K,) estimated 1σ error of the transform over the object
     correlation: Floats  # (K,) zero-mean correlation of the compared detail after registration, 1 = the same
+    crossed: Floats | None = None  # (3, 3) reference grid px → crossed shot's grid px; None without one
 
 
 @dataclass(frozen=True)
@@ -267,6 +290,10 @@ class Gains:
     turned_shots: tuple[int, ...] = ()  # whose angle keeps more than three shots from closing; several: one of them
     turned: float = 0.0  # rad, true less stated angle of the first of them
     turned_sigma: float = np.pi / 2  # rad, 1σ
+    rival: tuple[int, ...] = ()  # an order of the shots that the silhouette supports as well; none: it tells
+    rival_mirrored: bool = False
+    crossed: Floats | None = None  # (3,) S0 of what has no gloss over the crossed shot's light; None without one
+    crossed_sigma: float = 0.0  # 1σ, relative
 
 
 @dataclass(frozen=True)
@@ -279,6 +306,7 @@ class StokesImage:
     mask: NDArray[np.bool_]  # (H, W)
     view: View  # of the crop
     residual: Floats | None  # (H, W) |measured − fitted| / S0 where K > 3
+    body: MaskedImage | None = None  # S0 without what the surface mirrors, from a crossed shot
 
 
 @dataclass(frozen=True)
@@ -295,6 +323,8 @@ class Cues:
     mask: NDArray[np.bool_]  # (H, W)
     quality: Bits  # (H, W)
     view: View
+    body: Floats | None = None  # (H, W, 3) radiance without what the surface mirrors, from a crossed shot
+    body_known: NDArray[np.bool_] | None = None  # (H, W) where that shot tells it
 
 
 @dataclass(frozen=True)

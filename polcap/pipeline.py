@@ -20,7 +20,7 @@ from polcap.config import Config, restored
 from polcap.errors import InputError, SettingError, StorageError
 from polcap.formats import animation, atomic, layouts, png, provenance, text_file
 from polcap.formats import maps as maps_folder
-from polcap.images import Capture, Frame, Network, SensorImage
+from polcap.images import Capture, Frame, Network, SensorImage, Shot
 from polcap.path import STAGES, Results, UserInput, path
 from polcap.pictures import moving
 from polcap.store import Archive, Progress, Store, contents, seal, silent
@@ -181,7 +181,8 @@ def _counted(capture: Capture, frame_read: Callable[[int, int], None] | None) ->
     """The capture with frames that tell when they have been decoded."""
     if frame_read is None:
         return capture
-    return _Counted(sum(len(shot.frames) for shot in capture.shots), frame_read).capture(capture)
+    brackets = [*capture.shots, *(() if capture.crossed is None else (capture.crossed,))]
+    return _Counted(sum(len(shot.frames) for shot in brackets), frame_read).capture(capture)
 
 
 class _Counted:
@@ -191,8 +192,11 @@ class _Counted:
         self._total, self._tell, self._done = total, tell, 0
 
     def capture(self, capture: Capture) -> Capture:
-        shots = (replace(shot, frames=tuple(map(self._frame, shot.frames))) for shot in capture.shots)
-        return replace(capture, shots=tuple(shots))
+        crossed = None if capture.crossed is None else self._shot(capture.crossed)
+        return replace(capture, shots=tuple(map(self._shot, capture.shots)), crossed=crossed)
+
+    def _shot(self, shot: Shot) -> Shot:
+        return replace(shot, frames=tuple(map(self._frame, shot.frames)))
 
     def _frame(self, frame: Frame) -> Frame:
         return replace(frame, load=partial(self._load, frame.load))

@@ -9,7 +9,7 @@ import numpy as np
 
 from polcap.formats import glance
 from polcap.formats.glance import Glance
-from polcap.images import Capture, Floats, Frame, SensorImage
+from polcap.images import Capture, Floats, Frame, SensorImage, Shot
 from polcap.optics import sharpness
 
 _MOST_PIXELS = 0.6e6  # of the pictures that the stages see
@@ -62,7 +62,8 @@ def take(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> Taken:
     first = capture.shots[0].frames[(len(capture.shots[0].frames) - 1) // 2]
     meta, arrays = _within(first, glance.first, clip=clip, most_pixels=_MOST_PIXELS)
     times, half, corners = int(meta["times"]), int(meta["superpixel"]), arrays["corners"].tolist()
-    others = [frame for shot in capture.shots for frame in (*shot.frames, *shot.ambient) if frame is not first]
+    brackets = (*capture.shots, *(() if capture.crossed is None else (capture.crossed,)))
+    others = [frame for shot in brackets for frame in (*shot.frames, *shot.ambient) if frame is not first]
     coming = {id(frame): pool.submit(_glance, frame, clip, times, corners) for frame in others}
     coming[id(first)] = Future()
     coming[id(first)].set_result(glance.joined(meta, arrays))
@@ -70,15 +71,16 @@ def take(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> Taken:
     def smaller(frame: Frame) -> Frame:
         return replace(frame, load=partial(_picture, coming[id(frame)]), within=None)
 
+    def shrunk(shot: Shot) -> Shot:
+        return replace(shot, frames=tuple(map(smaller, shot.frames)), ambient=tuple(map(smaller, shot.ambient)))
+
     step = half * times
     (x, y), (width, height) = capture.principal_px, capture.size_px
     return Taken(
         capture=replace(
             capture,
-            shots=tuple(
-                replace(s, frames=tuple(map(smaller, s.frames)), ambient=tuple(map(smaller, s.ambient)))
-                for s in capture.shots
-            ),
+            shots=tuple(map(shrunk, capture.shots)),
+            crossed=None if capture.crossed is None else shrunk(capture.crossed),
             focal_px=capture.focal_px / step,
             principal_px=((x - (step - 1) / 2) / step, (y - (step - 1) / 2) / step),
             size_px=(width // step, height // step),

@@ -30,6 +30,9 @@ def capture(
     ] = None,
     ambient: Annotated[bool, typer.Option("--ambient", help="Also frames without the flash.")] = False,
     chart: Annotated[bool, typer.Option("--chart", help="Also a frame of the chart alone.")] = False,
+    cross: Annotated[
+        bool, typer.Option("--cross", help="Also the bracket under a polarized flash, crossed: highlights apart.")
+    ] = False,
     tries: Annotated[int, typer.Option(min=0, help="How often a bad frame is taken again.")] = 2,
     resume: Annotated[bool, typer.Option("--resume", help="Go on: take what is missing.")] = False,
     no_check: Annotated[bool, typer.Option("--no-check", help="Leave out the verdict at the end.")] = False,
@@ -48,6 +51,7 @@ def capture(
         "repeat_deg": None if repeat is None else options.numbers("--repeat", repeat),
         "ambient": ambient or None,
         "chart": chart or None,
+        "cross": cross or None,
     }
     wanted = sequence.order(folder, stated, resume)
     if dry_run:

@@ -56,6 +56,7 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
     _check_no_duplicate({path: source.probe.digest for path, source in every.items()})
     shots = tuple(_shot(plan, stated, angle, bracket) for angle, bracket in plan.shots)
     _check_brackets(shots)
+    crossed = None if plan.layout == "sensor" else _crossed(folder, plan, stated)
     reference = shots[0].frames[0].exif
     lens = focal.find(reference, stated.focal_length_mm, stated.sensor_width_mm)
     step = 2 if plan.layout == "sensor" else 1  # a plane of a sensor mosaic has half its sides
@@ -77,6 +78,7 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
         chart_frames=tuple(_frame(plan, stated, source, 0.0) for source in plan.others if source.role == "chart"),
         notes=(*plan.notes, *notes, *told, f"focal length {lens.note}"),
         calibration=calibration,
+        crossed=crossed,
     )
 
 
@@ -86,6 +88,8 @@ def table(capture: Capture) -> str:
     for shot in capture.shots:
         for frame in (*shot.frames, *shot.ambient):
             rows.append([shot.name, *_row(frame, capture.folder)])
+    if capture.crossed is not None:
+        rows += [[capture.crossed.name, *_row(frame, capture.folder)] for frame in capture.crossed.frames]
     rows += [["", *_row(frame, capture.folder)] for frame in capture.chart_frames]
     widths = [max(map(len, column)) for column in zip(*rows)]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows]
@@ -126,6 +130,19 @@ def _shot(plan: layouts.Plan, stated: CaptureFile, angle_deg: float, bracket: Se
         ambient=_darkest_first(_frame(plan, stated, source, angle_deg) for source in ambient),
         place_px=photo.place_px(angle_deg) if plan.layout == "sensor" else (0.0, 0.0),
     )
+
+
+def _crossed(folder: Path, plan: layouts.Plan, stated: CaptureFile) -> Shot | None:
+    """The shot under the polarized flash; the first shot's angle where nobody states the filter's."""
+    sources = [source for source in plan.others if source.role == "cross"]
+    if not sources:
+        return None
+    angles = {source.angle_deg for source in sources}
+    if len(angles) > 1:
+        listed = ", ".join("unstated" if angle is None else f"{angle:g}°" for angle in angles)
+        raise CaptureError(f"{folder}: cross-polarised frames at {listed}; take them at one angle of the lens's filter")
+    angle = angles.pop()
+    return _shot(plan, stated, plan.shots[0][0] if angle is None else angle, sources)
 
 
 def _frame(plan: layouts.Plan, stated: CaptureFile, source: Source, angle_deg: float) -> Frame:
@@ -243,8 +260,8 @@ def _notes(
 ) -> list[str]:
     notes = []
     cross = sum(source.role == "cross" for source in others)
-    if cross:
-        notes.append(f"not used: {cross} cross-polarised frames")
+    if cross and layout == "sensor":
+        notes.append(f"not used: {cross} cross-polarised frames, which a polarization sensor cannot take")
     if layout != "sensor" and reference.probe.kind == "photo":
         bits = reference.probe.bits
         encoding = photo.encoding_of(bits, stated.encoding)

@@ -7,7 +7,7 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
@@ -25,6 +25,7 @@ DEFAULT_DEG = (0.0, 45.0, 90.0)
 APART_DEG = 5.0  # closer angles do not count as different
 EQUAL_STOPS = 0.15  # EXIF rounds times to a sixth of a stop at worst
 _POL_FOLDER = re.compile(r"pol[ _-]?(\d+(?:\.\d+)?)", re.IGNORECASE)
+_CROSS_FOLDER = re.compile(r"cross(?:[ _-]?(\d+(?:\.\d+)?))?", re.IGNORECASE)
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
@@ -139,20 +140,42 @@ def _folders(folder: Path, sub_folders: dict[float, Path], angles_deg: Sequence[
             )
         groups[angle] = listing.pictures
         notes += [f"{sub_folder.name}: {note}" for note in listing.notes]
+    crossed = _crossed(folder)
     beside = sorted(
         path.name
         for path in _children(folder)
-        if path.is_dir() and path not in sub_folders.values() and path.name not in OURS
+        if path.is_dir() and path not in sub_folders.values() and path.name not in OURS and not _is_crossed(path.name)
     )
     notes += [f"not used: the folders {', '.join(beside)}"] if beside else []
     loose = sorted(path.name for path in _children(folder) if path.is_file() and path.name != capture_toml.NAME)
     notes += [f"not used: the files {', '.join(loose[:4])}{', …' if len(loose) > 4 else ''}"] if loose else []
-    return Plan("folders", _select(folder, groups, angles_deg), notes=tuple(notes))
+    return Plan("folders", _select(folder, groups, angles_deg), crossed, tuple(notes))
+
+
+def _crossed(folder: Path) -> tuple[Source, ...]:
+    """The photographs of cross/ or cross045/, whose number is the angle of the filter before the lens."""
+    places = [path for path in _children(folder) if path.is_dir() and _is_crossed(path.name)]
+    if len(places) > 1:
+        raise CaptureError(f"{places[1]}: {places[0].name} holds a cross-polarised shot too; keep one of the two")
+    if not places:
+        return ()
+    match = _CROSS_FOLDER.fullmatch(places[0].name)
+    angle = float(match[1]) if match and match[1] else None
+    if angle is not None and angle > 360:
+        raise CaptureError(f"{places[0]}: {angle:g}° is not an angle of a polarizer; name it by 0 to 360 degrees")
+    found = tuple(replace(source, role="cross", angle_deg=angle) for source in _list(places[0]).pictures)
+    if not found:
+        raise CaptureError(f"{places[0]}: holds no photograph that polcap reads; shoot it again, or remove the folder")
+    return found
+
+
+def _is_crossed(name: str) -> bool:
+    return _CROSS_FOLDER.fullmatch(name) is not None
 
 
 def is_angle_folder(name: str) -> bool:
-    """Whether a folder of this name inside a capture holds the shots of one angle."""
-    return _POL_FOLDER.fullmatch(name) is not None
+    """Whether a folder of this name inside a capture holds the shots of one angle, or the crossed one."""
+    return _POL_FOLDER.fullmatch(name) is not None or _is_crossed(name)
 
 
 def _pol_folders(folder: Path) -> dict[float, Path]:

@@ -245,7 +245,9 @@ def _description(maps: SurfaceMaps, depth: Mapping[str, str | float]) -> dict[st
             "mask.png": "8 bit, 255 on the object",
             "confidence.exr": "expected error of the normal, degrees; half",
             "stokes.exr": "S0.R ... S2.B in camera channels, linear, sensor white at the reference exposure = 1; half",
-            "cues.exr": "dolp; aolp in degrees, 0 ... 180; normalized.S1, normalized.S2; diffuse_color.R, .G, .B; half",
+            "cues.exr": "dolp; aolp in degrees, 0 ... 180; normalized.S1, normalized.S2; diffuse_color.R, .G, .B; "
+            "with a cross-polarised shot the two parts of S0 as photograph.png has it, linear: scattered.R, .G, .B and "
+            "mirrored.R, .G, .B; half",
         },
     }
 
@@ -280,4 +282,15 @@ def _cue_channels(cues: Cues) -> dict[str, Floats]:
         "normalized.S1": cues.normalized_stokes[0],
         "normalized.S2": cues.normalized_stokes[1],
         **{f"diffuse_color.{c}": cues.diffuse_color[..., k] for k, c in enumerate("RGB")},
+        **_separated(cues),
     }
+
+
+def _separated(cues: Cues) -> dict[str, Floats]:
+    """S0 in two parts, where a crossed shot tells them apart; else nothing."""
+    if cues.body is None or cues.body_known is None:
+        return {}
+    body = _kept(cues.body, cues.body_known)
+    mirrored = _kept(np.maximum(cues.radiance - cues.body, 0), cues.body_known)
+    parts = {"scattered": body, "mirrored": mirrored}
+    return {f"{name}.{c}": part[..., k] for name, part in parts.items() for k, c in enumerate("RGB")}

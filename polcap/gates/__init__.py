@@ -57,6 +57,7 @@ def _in_order(found: Found, config: Config) -> Iterator[Gate]:
     yield from polarization.of_outline(found, limits)
     yield light.noise(found, limits)
     yield light.ambient(found, limits)
+    yield from light.crossed(found, limits)
     yield polarization.ill_posed(found, limits)
     yield geometry.focal_length(found)
 

@@ -2,17 +2,22 @@
 
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
 
 from polcap.config import Gates
 from polcap.gates.gate import DEGREES_PER_GAIN, Found, Gate, State, at_most, blamed
-from polcap.images import AngleStack, Floats
+from polcap.images import AngleStack, Floats, Quality
 from polcap.stages.whitebalance import patches
 
 _EVEN_STEPS = (1.3, 20.0)  # from one exposure to the next: less is no bracket, more leaves a gap
 _ALIKE = 1.15  # steps in the pixels below this, where the metadata promise more than _PROMISED, are none
 _PROMISED = 1.4
 _TURNED = 0.35  # rad, from here on a chart's turn is worth a word: a sixteenth of its light
+_BRIGHTER = 1.08  # times S0: the greatest that scale and registration explain; set by hand
+_EDGE_PX = 2.0  # 1σ over which two shots are compared: edges of a print need not meet
+_STILL_CLIPPED = 0.5  # share of highlights that a crossed filter should have stopped
+_FEW = 20  # px
 _GLOSS_PART = 0.3  # of the chart's gloss goes into gains taken from its light patches
 
 
@@ -188,6 +193,38 @@ def _gain_doubt(found: Found, limits: Gates) -> Gate:
 
 def _grade(cost_deg: float) -> State:
     return "fail" if cost_deg > 15 else "warn"
+
+
+def crossed(found: Found, limits: Gates) -> Iterator[Gate]:
+    """Whether the cross-polarised shot shows what it should: less light than S0, and nothing clipped where S0 clips."""
+    if found.radiance.crossed is None:
+        return
+    image, limit = found.stokes, limits.max_crossed_misfit
+    remedy = (
+        "turn the flash's filter until the highlights vanish, lens's filter at the angle stated; same place, same chart"
+    )
+    if image.body is None:
+        says = "nothing tells how bright the cross-polarised shot is against the others: it is not used"
+        yield Gate("crossed", "warn", None, limit, says, "put a ColorChecker beside the object, or expose it more")
+        return
+    known = image.mask & (image.body.quality == 0)
+    sound = known & ((image.quality & int(Quality.CLIPPED)) == 0)
+    total, body = image.stokes[0].sum(-1), image.body.value.sum(-1)
+    clipped = image.mask & ((image.quality & int(Quality.CLIPPED)) > 0)
+    left = float((clipped & ~known).sum() / max(clipped.sum(), 1))
+    weight = sound.astype(np.float32)
+    smooth, whole = (cv2.GaussianBlur(part * weight, (0, 0), _EDGE_PX) for part in (body, total))
+    inner = cv2.erode(sound.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    over = float((smooth > _BRIGHTER * whole)[inner].mean()) if inner.any() else 1.0
+    mirrored = float(np.maximum(total - body, 0)[sound].sum() / max(float(total[sound].sum()), 1e-9))
+    says = f"{100 * mirrored:.1f} % of the object's light is mirrored at its surface, and taken out of its albedo"
+    if left > _STILL_CLIPPED and clipped.sum() > _FEW:
+        says = f"{100 * left:.0f} % of the clipped highlights are clipped in the cross-polarised shot too"
+        yield Gate("crossed", "warn", round(left, 3), _STILL_CLIPPED, says, remedy)
+        return
+    if over > limit:
+        says = f"{100 * over:.0f} % of the object is brighter in the cross-polarised shot than light allows"
+    yield at_most("crossed", over, limit, says, remedy, beyond="warn")
 
 
 def ambient(found: Found, limits: Gates) -> Gate:

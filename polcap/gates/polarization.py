@@ -25,6 +25,11 @@ _MOST_PIXELS = 6e5  # a larger picture is averaged down
 def order(found: Found) -> Gate:
     """Whether the outline supports the stated order and sense of the angles."""
     gains, names = found.gains, found.names
+    if gains.order == tuple(range(len(names))) and not gains.mirrored and gains.rival:
+        other = ", ".join(names[i] for i in gains.rival) + (", counted the other way" if gains.rival_mirrored else "")
+        says = f"the outline cannot tell the stated order from {other} (it fits to {gains.concentration:.2f})"
+        remedy = "make sure of folders and ring yourself; a closed, rounded object, a chart or four angles would tell"
+        return Gate("order", "warn", "cannot tell", "as stated", says, remedy, unit="")
     if gains.order == tuple(range(len(names))) and not gains.mirrored:
         says = f"as stated (the outline fits to {gains.concentration:.2f})"
         return Gate("order", "pass", "as stated", "as stated", says, unit="")

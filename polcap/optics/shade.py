@@ -16,7 +16,7 @@ from typing import Any
 from array_api_compat import array_namespace
 
 from polcap.optics import body as bodies
-from polcap.optics import brdf, fresnel
+from polcap.optics import brdf, frames, fresnel
 
 _LEAST_COSINE = 1e-4
 
@@ -30,6 +30,7 @@ def stokes(
     to_light: Any,
     irradiance: Any,
     law: bodies.Law = bodies.SMOOTH,
+    axis: Any = None,
 ) -> Any:
     """Stokes parameters (3, ..., 3) towards the camera, in the frame of `optics/frames.py` on each ray.
 
@@ -46,6 +47,8 @@ def stokes(
         (...,) on a plane facing the light, so that a white Lambertian plane has S0 = irradiance.
     law
         How the body lets light in and out.
+    axis
+        (..., 3) unit vectors across the light's way along which it is polarized; None: it is not.
 
     Notes
     -----
@@ -66,6 +69,8 @@ def stokes(
         out_plus, out_minus = bodies.leaving(cos_o, law.rough * alpha, ior, law.local)
         in_plus = in_plus * (1 + law.local * (bodies.flatter(cos_i, cos_o, to_light[..., 2], law.rough * alpha) - 1))
         out_minus = out_minus * law.kept
+    if axis is not None:
+        in_plus = in_plus + _entering(normal, to_light, axis, alpha, ior, law)
     body = irradiance * cos_i * in_plus
 
     ray = xp.zeros_like(to_light)
@@ -80,17 +85,52 @@ def stokes(
 
     diffuse_cos, diffuse_sin = _double_angle(normal)
     half_cos, half_sin = _double_angle(half)
-    parts = [
-        (out_plus, reflect_plus),
-        (out_minus * diffuse_cos, -reflect_minus * half_cos),
-        (out_minus * diffuse_sin, -reflect_minus * half_sin),
-    ]
+    mirrored = reflect_plus, -reflect_minus * half_cos, -reflect_minus * half_sin
+    if axis is not None:
+        mirrored = _mirrored(to_light, axis, cos_d, ior)
+    leaving = out_plus, out_minus * diffuse_cos, out_minus * diffuse_sin
+    parts = list(zip(leaving, mirrored))
     return xp.stack(
         [
             xp.where(lit[..., None], diffuse * (body * d)[..., None] + specular * (facets * s)[..., None], 0.0)
             for d, s in parts
         ]
     )
+
+
+def _entering(normal: Any, to_light: Any, axis: Any, alpha: Any, ior: Any, law: bodies.Law) -> Any:
+    """What polarization along `axis` adds to T₊ of light that enters: T₋ cos 2Δ, Δ between axis and azimuth, (...,)."""
+    xp = array_namespace(normal)
+    cos_i = xp.clip(xp.sum(normal * to_light, axis=-1), _LEAST_COSINE, 1.0)
+    if law is bodies.SMOOTH:
+        _, minus = fresnel.transmission(cos_i, ior)
+    else:
+        _, minus = bodies.leaving(cos_i, law.rough * alpha, ior, law.local)
+    along = xp.sum(normal * axis, axis=-1)
+    return minus * (2 * along**2 / (1 - cos_i**2 + 1e-12) - 1)
+
+
+def _mirrored(to_light: Any, axis: Any, cos_d: Any, ior: Any) -> tuple[Any, Any, Any]:
+    """Stokes parameters of what a facet mirrors of unit light polarized along `axis`, in the frame of the ray.
+
+    The field's part across the plane of light and ray is multiplied by r_s, its part in that plane by r_p, where
+    the directions p stand across their rays: at normal incidence the axis is kept.
+    """
+    xp = array_namespace(to_light)
+    x, y = to_light[..., 0], to_light[..., 1]
+    length = (x * x + y * y) ** 0.5
+    beside = length < 1e-9  # light and ray are one: any plane will do
+    safe = xp.where(beside, xp.ones_like(length), length)
+    across_x, across_y = xp.where(beside, 1.0 + 0 * x, -y / safe), xp.where(beside, 0 * y, x / safe)
+    zero = xp.zeros_like(across_x)
+    across = xp.stack([across_x, across_y, zero], axis=-1)
+    inwards = frames.cross(-to_light, across)
+    root = (ior * ior - 1 + cos_d * cos_d) ** 0.5
+    r_s = (cos_d - root) / (cos_d + root)
+    r_p = (ior * ior * cos_d - root) / (ior * ior * cos_d + root)
+    s, p = r_s * frames.dot(axis, across), r_p * frames.dot(axis, inwards)
+    field_x, field_y = s * across_x - p * across_y, s * across_y + p * across_x  # p leaves along ray × across
+    return field_x**2 + field_y**2, field_x**2 - field_y**2, 2 * field_x * field_y
 
 
 def _double_angle(vector: Any) -> tuple[Any, Any]:

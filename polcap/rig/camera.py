@@ -52,6 +52,7 @@ class Camera(Protocol):
     model: str
     frame_bytes: int  # about, for the disk
     switches_flash: bool  # can take a frame without flash by itself
+    polarizes_flash: bool  # puts the flash's filter on by itself
 
     def bracket(self) -> tuple[Exposure, ...]:
         """The exposures of a bracket where the user gave none."""

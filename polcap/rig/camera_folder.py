@@ -20,7 +20,7 @@ class WatchedFolder:
     """`folder:PATH`: somebody, or some application, presses the release."""
 
     model = "tethering folder"
-    switches_flash = False
+    switches_flash = polarizes_flash = False
     frame_bytes = 60_000_000
 
     def __init__(self, path: str, log: Log, timeout_s: float = 600.0, stable_s: float = _STABLE_S) -> None:

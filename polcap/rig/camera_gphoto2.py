@@ -62,6 +62,7 @@ class Gphoto2:
             name: self._ask(f"offer {name}", partial(self._offered, name)) for name in (*known, _FLASH_MODE)
         }
         self.switches_flash = self._dark() is not None
+        self.polarizes_flash = False
         self._lit = self._ask("flash mode", lambda: self._value(_FLASH_MODE)) if self._choices[_FLASH_MODE] else None
 
     def bracket(self) -> tuple[Exposure, ...]:

@@ -30,6 +30,7 @@ class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     repeat_deg: tuple[float, ...] = ()  # angles whose bracket is taken twice
     ambient: bool = False  # a frame without flash per angle, or one where a person switches it
     chart: bool = False  # a frame of the chart alone
+    cross: bool = False  # the bracket once more under a polarized flash, crossed to the first angle
     rotator: str = ""  # URL
     camera: str = ""
 
@@ -67,6 +68,8 @@ class Slot:
             return f"{at}/frame_{self.step + 1}"
         if self.role == "repeat":
             return f"repeat/{at}_frame_{self.step + 1}"
+        if self.role == "cross":
+            return f"cross/frame_{self.step + 1}"
         return f"{self.role}/{at or self.role}"
 
 
@@ -76,7 +79,7 @@ def _degrees(angle: float) -> str:
 
 
 def slots(order: Order, switches_flash: bool) -> tuple[Slot, ...]:
-    """Every frame, in the order of capture.toml: angles as asked, then repeats, ambient, chart.
+    """Every frame, in the order of capture.toml: angles as asked, then repeats, ambient, chart, cross.
 
     Where a person has to switch the flash there is one ambient frame, for all angles.
     """
@@ -88,6 +91,8 @@ def slots(order: Order, switches_flash: bool) -> tuple[Slot, ...]:
         found += [Slot("ambient", angle, last, order.bracket[last], flash=False) for angle in at]
     if order.chart:
         found.append(Slot("chart", None, middle, order.bracket[middle]))
+    if order.cross:
+        found += [Slot("cross", order.angles_deg[0], e, x) for e, x in enumerate(order.bracket)]
     return tuple(found)
 
 
@@ -95,14 +100,14 @@ def next_slot(missing: Sequence[Slot], at_deg: float) -> Slot:
     """What to take now, so that the ring turns little.
 
     The chart first, all of the present angle, then on towards the nearer end of the angles left and through them
-    (upwards if alike); what a person must switch the flash for comes last.
+    (upwards if alike); then what a person must switch the flash for, and last what the flash's filter is put on for.
     """
     for slot in missing:
         if slot.role == "chart":
             return slot
-    turning = [slot for slot in missing if slot.angle_deg is not None]
+    turning = [slot for slot in missing if slot.angle_deg is not None and slot.role != "cross"]
     if not turning:
-        return missing[0]
+        return next((slot for slot in missing if slot.role != "cross"), missing[0])
     angles = [slot.angle_deg for slot in turning if slot.angle_deg is not None]
     if at_deg in angles:
         goal = at_deg

@@ -116,6 +116,7 @@ def _loop(book: Record, landing: Landing, turner: Rotator, camera: Camera, log: 
     """Take what is missing until nothing is."""
     turner.home()
     at_deg, read_deg = 0.0, None  # asked for, and read back there
+    filtered = False  # the flash
     while True:
         landing.collect(block=len(landing.pending) >= AHEAD)
         missing = book.missing(landing.pending)
@@ -137,9 +138,19 @@ def _loop(book: Record, landing: Landing, turner: Rotator, camera: Camera, log: 
         left = pace.total_s(plan.schedule([*missing], at_deg), at_deg)
         done = len(book.slots) - len(missing) + 1
         tell(f"{slot.name:24}{done:3}/{len(book.slots)}  {slot.exposure}  {left / 60:.0f}:{left % 60:02.0f} left")
+        filtered = _with_filter(slot, filtered, camera, log)
         shot = _photograph(slot, camera, log)
         _check_apart(slot, shot, book)
         landing.take(slot, None if slot.angle_deg is None else read_deg, shot)
+
+
+def _with_filter(slot: Slot, filtered: bool, camera: Camera, log: Log) -> bool:
+    """Have a person put the flash's filter on or off, as a frame needs it; whether it is on now."""
+    wanted = slot.role == "cross"
+    if wanted != filtered and not camera.polarizes_flash:
+        on = "put the second polarizer on the flash and turn it until the highlights vanish"
+        manual.ask(f"{on if wanted else 'take the polarizer off the flash again'}, then Enter: ", log)
+    return wanted
 
 
 def _photograph(slot: Slot, camera: Camera, log: Log) -> Shot:
@@ -236,9 +247,14 @@ def _check_room(folder: Path, needed: int) -> None:
 
 def _check_person(missing: list[Slot], camera: Camera) -> None:
     """Fail before the first frame where somebody has to be asked later and nobody is there."""
-    asks = any(slot.role == "chart" or (not slot.flash and not camera.switches_flash) for slot in missing)
-    if asks and not (sys.stdin and sys.stdin.isatty()):
-        raise SettingError("--chart and --ambient need a person at a terminal here; run in one, or leave them out")
+    asks = {
+        "--chart": any(slot.role == "chart" for slot in missing),
+        "--ambient": not camera.switches_flash and any(not slot.flash for slot in missing),
+        "--cross": not camera.polarizes_flash and any(slot.role == "cross" for slot in missing),
+    }
+    if any(asks.values()) and not (sys.stdin and sys.stdin.isatty()):
+        named = " and ".join(name for name, needed in asks.items() if needed)
+        raise SettingError(f"{named}: need a person at a terminal here; run in one, or leave it out")
 
 
 @contextmanager

@@ -99,15 +99,16 @@ class Camera:
     """`simulated?seed=1&width=384`: any setting of `polcap synth`, and `scene`. A tripod: it does not move."""
 
     model = "Polcap Synthetic"
-    switches_flash = True
+    switches_flash = polarizes_flash = True
 
     def __init__(self, query: str, log: Log) -> None:
         self._subject, self._shoot = understood(query)
         self._log = log
         self._studio: Studio | None = None
-        self._seen: dict[float, Floats] = {}  # what passes at an angle
+        self._seen: dict[tuple[float, bool], Floats] = {}  # what passes at an angle, the flash's filter off or on
         self._taken: Counter[tuple[int, int, bool]] = Counter()
         self._next = (0, 0, 0.0)  # shot, frame, true angle in degrees
+        self._crossed = False  # the flash's filter is on
         self.frame_bytes = 2 * self._shoot.width * self._shoot.height
 
     def bracket(self) -> tuple[Exposure, ...]:
@@ -119,6 +120,7 @@ class Camera:
         angles = self._shoot.angles_deg
         asked = 0.0 if angle_deg is None else angle_deg
         shot = angles.index(asked) if asked in angles else len(angles) + round(10 * asked) % 900
+        self._crossed = role == "cross"
         self._next = shot + _NUMBER_OF_ROLE[role], step, asked if RING.true_deg is None else RING.true_deg
 
     def shoot(self, exposure: Exposure, flash: bool) -> Shot:
@@ -126,15 +128,16 @@ class Camera:
             raise SettingError(f"the simulated camera has f/11, ISO 100 and no flash power, not {exposure}; give times")
         self._studio = self._studio or Studio(random_scene(self._subject.seed, self._subject.scene), self._shoot)
         shot, step, angle = self._next
-        if angle not in self._seen:
-            self._seen = {angle: self._studio.through(angle)}
+        if (angle, self._crossed) not in self._seen:
+            look = self._studio.crossed_at if self._crossed else self._studio.through
+            self._seen = {(angle, self._crossed): look(angle)}
         time_s = exposure.time_s or MIDDLE_S
         take = Take(shot, step, time_s / MIDDLE_S, self._taken[shot, step, flash], flash)
         self._taken[shot, step, flash] += 1
         self._log.write("camera", ">", f"{exposure}, {'lit' if flash else 'dark'}, polarizer at {angle:.4f}°")
         with tempfile.TemporaryDirectory() as place:
             file = Path(place) / f"SIM_{shot}_{step}.DNG"
-            self._studio.photograph(file, self._seen[angle], take)
+            self._studio.photograph(file, self._seen[angle, self._crossed], take)
             data = file.read_bytes()
         self._log.write("camera", "<", f"{len(data)} bytes")
         return Shot(data, file.name, Exposure(time_s=time_s, f_number=11.0, iso=100.0))

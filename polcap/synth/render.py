@@ -48,10 +48,13 @@ class Scene(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return Rotation.from_rotvec(self.turn_deg, degrees=True)
 
 
-def stokes(scene: Scene, view: View, x: Floats, y: Floats, start: Floats | None = None) -> Floats:
+def stokes(
+    scene: Scene, view: View, x: Floats, y: Floats, start: Floats | None = None, flash_axis: float | None = None
+) -> Floats:
     """Stokes parameters (3, H, W, 3) at pixel positions x, y (H, W) of `view`, in the frame of each ray.
 
-    A white matt plane at the object's distance that faces the flash has S0 = 1. `start` is of `guide`.
+    A white matt plane at the object's distance that faces the flash has S0 = 1. `start` is of `guide`. A flash that is
+    polarized along `flash_axis` [rad, in the picture] is as bright as one that is not.
     """
     v = view_rays(view, x, y).reshape(-1, 3)
     if start is not None:
@@ -61,7 +64,7 @@ def stokes(scene: Scene, view: View, x: Floats, y: Floats, start: Floats | None 
     hits, surroundings = _visible(scene, v, start)
     out = np.zeros((3, x.size, 3), np.float32)
     out[0] = surroundings
-    out[:, hits.index] = _shade(scene, v[hits.index], hits)
+    out[:, hits.index] = _shade(scene, v[hits.index], hits, flash_axis)
     return out.reshape(3, *x.shape, 3)
 
 
@@ -159,7 +162,7 @@ def _irradiance(scene: Scene, point: Floats, normal: Floats) -> Floats:
     return np.asarray(np.maximum(cosine, 0.0) * reference / squared)
 
 
-def _shade(scene: Scene, ray: Floats, hits: Hits) -> Floats:
+def _shade(scene: Scene, ray: Floats, hits: Hits, flash_axis: float | None = None) -> Floats:
     """Stokes parameters (3, N, 3) of the object's surface."""
     to_light = np.array(scene.light) - hits.point
     to_light /= np.linalg.norm(to_light, axis=-1, keepdims=True)
@@ -172,7 +175,12 @@ def _shade(scene: Scene, ray: Floats, hits: Hits) -> Floats:
     diffuse, specular, roughness, ior = scene_materials.evaluate(scene.coat, hits.local, facing)
     normal, light = frames.to_ray_frame(bent, ray), frames.to_ray_frame(to_light, ray)
     law = _ROUGH if scene.law == "rough" else body.SMOOTH
-    direct = shade.stokes(normal, diffuse, specular, roughness, ior, light, irradiance, law)
+    axis = None
+    if flash_axis is not None:
+        wanted = np.array([np.cos(flash_axis), np.sin(flash_axis), 0.0])
+        across = wanted - to_light * (to_light @ wanted)[:, None]
+        axis = frames.to_ray_frame(across / np.linalg.norm(across, axis=-1, keepdims=True), ray)
+    direct = shade.stokes(normal, diffuse, specular, roughness, ior, light, irradiance, law, axis)
     if not scene.interreflection:
         return np.asarray(direct)
     bounced = np.einsum("nkc,nk->nc", _bounced(scene)[hits.face], hits.weight)

@@ -3,6 +3,7 @@
 ::
 
     FOLDER/pol000/IMG_0001.DNG …   what `formats/capture.py` reads
+    FOLDER/cross000/IMG_0010.DNG … with `cross`: under a flash polarized across the filter
     FOLDER/truth.json              scene, shoot, and what was done to every file
     FOLDER/truth.npz               maps at the pixel centres of the first angle's shots
 """
@@ -60,12 +61,15 @@ class Shoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     angles_deg: tuple[float, ...] = (0.0, 45.0, 90.0)  # nominal
     exposures: Annotated[int, Meta(ge=1, le=9)] = 3
     step: Annotated[float, Meta(gt=1)] = 4.0  # from one exposure to the next
+    exposure_factor: Annotated[float, Meta(gt=0)] = 1.0  # of every frame, on what suits the scene; more clips gloss
     bracket: Literal["time", "aperture", "iso", "flash"] = "time"  # time: steady light, else a flash fired
     gain_jitter: float = 0.01  # 1σ of the light's energy from frame to frame, relative
     nudge_px: float = 1.5  # the camera moves by up to this between angles
     nudge_deg: float = 0.05  # and rolls by up to this
     angle_error_deg: float = 0.5  # 1σ of the polarizer's angle
     extinction_ratio: float = 1000.0
+    cross: bool = False  # one shot more, the flash polarized across the filter at the first angle
+    flash_extinction: float = 1000.0  # extinction ratio of the flash's film
     blur_px: float = 0.4  # 1σ of the lens's point spread
     samples: Annotated[int, Meta(ge=1, le=4)] = 2  # rays per pixel side
     sensor: Sensor = Sensor()
@@ -105,6 +109,14 @@ def write(folder: Path, scene: Scene, shoot: Shoot, frame_written: Callable[[int
                 files.append({"file": name, "nominal_deg": angle, **pose, **done})
                 if frame_written is not None:
                     frame_written(len(files), len(shoot.angles_deg) * shoot.exposures)
+        if shoot.cross:
+            shot = len(shoot.angles_deg)
+            pose = _pose(shoot, shot)
+            radiance = studio.crossed(pose)
+            for frame in range(shoot.exposures):
+                name = f"cross{shoot.angles_deg[0]:03.0f}/IMG_{shot * shoot.exposures + frame + 1:04d}.DNG"
+                done = studio.photograph(place / name, radiance, Take(shot, frame, _stops(shoot, frame)))
+                files.append({"file": name, "nominal_deg": shoot.angles_deg[0], **pose, **done})
         _write_truth(place, scene, shoot, studio.buffer, studio.reference, studio.to_camera, files)
 
 
@@ -131,13 +143,26 @@ class Studio:
 
     def through(self, angle_deg: float) -> Floats:
         """What the polarizer at this angle passes to a camera that stands still, (H, W, 3) camera channels."""
-        still = {"actual_deg": angle_deg, "rot_deg": 0.0, "transform": np.eye(3).tolist()}
-        return self.radiance(still, first=True)
+        return self.radiance(_still(angle_deg), first=True)
+
+    def crossed_at(self, angle_deg: float) -> Floats:
+        """The same with the flash's filter on, across the first angle."""
+        return self.crossed(_still(angle_deg))
 
     def radiance(self, pose: dict[str, Any], first: bool) -> Floats:
         """The same for a camera moved to `pose`; the `first` shot defines where it stood."""
         passed = _passed(self.scene, self.shoot, self.buffer, pose, self.reference if first else None)
         return np.asarray(passed @ self.to_camera.T)
+
+    def crossed(self, pose: dict[str, Any]) -> Floats:
+        """The same under a flash polarized across the filter at the first angle; its film takes half the light."""
+        shoot = self.shoot
+        axis = np.radians(shoot.angles_deg[0] + 90.0)
+        back = np.linalg.inv(np.array(pose["transform"]))
+        whole, along = (_light(self.scene, shoot, self.buffer, back, one) for one in (None, axis))
+        kept = (shoot.flash_extinction - 1) / (shoot.flash_extinction + 1)
+        lit = 0.5 * (kept * along + (1 - kept) * whole)
+        return np.asarray(_passed(self.scene, shoot, self.buffer, pose, lit) @ self.to_camera.T)
 
     def photograph(self, path: Path, radiance: Floats, take: Take) -> dict[str, Any]:
         """One DNG of `radiance` (H, W, 3), and what was done to it. Raises StorageError."""
@@ -159,13 +184,19 @@ def transform(shoot: Shoot, shift_px: tuple[float, float], rot_deg: float) -> Fl
     return out
 
 
+def _still(angle_deg: float) -> dict[str, Any]:
+    """A camera that did not move, its polarizer at this angle."""
+    return {"actual_deg": angle_deg, "rot_deg": 0.0, "transform": np.eye(3).tolist()}
+
+
 def _pose(shoot: Shoot, shot: int) -> dict[str, Any]:
     """What the hand did to the camera and to the polarizer before one shot; the first defines the frame."""
     random = np.random.default_rng([shoot.seed, 0, shot])
     x, y, roll = (random.uniform(-1, 1, 3) if shot else np.zeros(3)).tolist()
     shift = x * shoot.nudge_px, y * shoot.nudge_px
     roll *= shoot.nudge_deg
-    actual = shoot.angles_deg[shot] + shoot.angle_error_deg * random.normal()
+    nominal = shoot.angles_deg[shot % len(shoot.angles_deg)]  # past the last: the crossed shot, at the first
+    actual = nominal + shoot.angle_error_deg * random.normal()
     return {
         "actual_deg": float(actual),
         "shift_px": shift,
@@ -188,7 +219,7 @@ def _passed(scene: Scene, shoot: Shoot, buffer: GBuffer, pose: dict[str, Any], r
     return _blurred(shoot, passed)
 
 
-def _light(scene: Scene, shoot: Shoot, buffer: GBuffer, back: Floats) -> Floats:
+def _light(scene: Scene, shoot: Shoot, buffer: GBuffer, back: Floats, flash_axis: float | None = None) -> Floats:
     """Mean Stokes parameters over each pixel's square, (3, H, W, 3).
 
     `back` (3, 3) takes the pixels to the reference shot's, where the scene stands still.
@@ -199,7 +230,7 @@ def _light(scene: Scene, shoot: Shoot, buffer: GBuffer, back: Floats) -> Floats:
     total = np.zeros((3, shoot.height, shoot.width, 3), np.float32)
     for dy in offsets:
         for dx in offsets:
-            total += render.stokes(scene, shoot.view, *_moved(back, x + dx, y + dy), start)
+            total += render.stokes(scene, shoot.view, *_moved(back, x + dx, y + dy), start, flash_axis)
     return total / shoot.samples**2
 
 
@@ -233,7 +264,7 @@ def _middle_exposure(scene: Scene, shoot: Shoot, buffer: GBuffer, s0: Floats) ->
     if scene.chart is not None:
         white = render.white_level(scene) / 2
         level, peak = max(level, white), max(peak, white)
-    return min(0.35 / level, 0.95 / peak * shoot.step ** (shoot.exposures // 2))
+    return shoot.exposure_factor * min(0.35 / level, 0.95 / peak * shoot.step ** (shoot.exposures // 2))
 
 
 def _stops(shoot: Shoot, frame: int) -> float:

@@ -41,7 +41,7 @@ class Clock:
 
 
 class Camera:
-    model, frame_bytes, switches_flash = "Bench", 50_000_000, False
+    model, frame_bytes, switches_flash, polarizes_flash = "Bench", 50_000_000, False, False
 
     def __init__(self, clock: Clock, frames: list[bytes]) -> None:
         self.clock, self.frames = clock, iter(frames)

@@ -70,7 +70,7 @@ class PoolCamera:
 
     model = "Polcap Synthetic"
     frame_bytes = 100_000
-    switches_flash = True
+    switches_flash = polarizes_flash = True
 
     def __init__(
         self,

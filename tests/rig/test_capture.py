@@ -22,18 +22,19 @@ SIMULATED = ("--rotator", "simulated?settle=0", "--camera", "simulated?width=96&
 
 def test_a_simulated_capture_is_shot_and_read(polcap: Command, tmp_path: Path) -> None:
     folder = tmp_path / "c"
-    done = polcap("capture", folder, *SIMULATED, "--ambient", "--repeat", "45")
+    done = polcap("capture", folder, *SIMULATED, "--ambient", "--repeat", "45", "--cross")
     assert done.returncode == 0 and done.stdout == f"{folder}\n", done.stderr
     assert "pol045/frame_2" in done.stderr and "left" in done.stderr
     understood = captures.read(folder)
     assert [shot.name for shot in understood.shots] == ["0°", "45°", "90°", "45°"]
     assert {len(shot.ambient) for shot in understood.shots} == {1}
+    assert understood.crossed is not None and len(understood.crossed.frames) == 3
     log = (folder / "rig.log").read_text()
     assert "rotator > go 45.000" in log and "camera > 1/200s f/11 iso100, lit" in log and "dark" in log
     again = polcap("capture", folder, *SIMULATED)
     assert again.returncode == 2 and "--resume" in again.stderr and again.stderr.count("\n") == 1
     resumed = json.loads(polcap("capture", folder, "--resume", "--json").stdout)
-    assert resumed["taken"] == 0 and resumed["frames"] == 15 and len(resumed["angles"]) == 3
+    assert resumed["taken"] == 0 and resumed["frames"] == 18 and len(resumed["angles"]) == 3
 
 
 @pytest.mark.parametrize("verdict", ["keep", "reshoot"])

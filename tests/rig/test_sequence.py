@@ -110,6 +110,13 @@ def test_chart_comes_first_and_what_a_person_switches_last() -> None:
     assert names[4:10] == [f"{place}frame_{n}" for place in ("pol045/", "repeat/pol045_") for n in (1, 2, 3)]
 
 
+def test_the_flash_s_filter_is_put_on_when_all_else_is_taken() -> None:
+    slots = plan.slots(msgspec.structs.replace(ORDER, cross=True), switches_flash=True)
+    names = [slot.name for slot in plan.schedule(slots, 45.0)]
+    assert names[-3:] == [f"cross/frame_{n}" for n in (1, 2, 3)]
+    assert {slot.angle_deg for slot in slots if slot.role == "cross"} == {ORDER.angles_deg[0]}
+
+
 def test_time_of_a_plan_is_the_sum_of_its_parts() -> None:
     """0.84 s home, two turns of 45° at 430°/s and three settlings of 0.2 s, nine frames of 2 s + 0.105 s a bracket."""
     order = Order((0.0, 45.0, 90.0), BRACKET, rotator="elliptec:/dev/ttyUSB0?settle=0.2", camera="gphoto2")
@@ -140,7 +147,7 @@ def test_a_person_is_asked_for_what_no_device_can(rig: Rig, monkeypatch: pytest.
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
 
     class Plain(PoolCamera):
-        switches_flash = False
+        switches_flash = polarizes_flash = False
 
         def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:
             if angle_deg is None:

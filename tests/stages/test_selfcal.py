@@ -115,6 +115,14 @@ def test_angles_counted_clockwise_are_refused():
         solve(mirrored, scenes.no_color())
 
 
+def test_an_order_that_fits_as_well_is_named():
+    """All angles stated 90° on are those of another order, counted the other way: the outline fits both alike."""
+    radiance = scenes.stack(noise=0.002)
+    assert solve(radiance, scenes.no_color()).rival == ()
+    turned = dataclasses.replace(radiance, angle=radiance.angle + np.pi / 2)
+    assert solve(turned, scenes.no_color()).rival
+
+
 @pytest.mark.parametrize("turn", [7.0, -2.5])
 def test_a_ring_whose_zero_is_off_is_found_and_taken_out(turn):
     stated = np.array([0.0, 45.0, 90.0])
@@ -146,6 +154,21 @@ def test_one_of_four_angles_that_was_not_what_it_is_called_is_found(victim):
         selfcal.solve(right, scenes.still(4), scenes.ball_object(), scenes.no_color(), selfcal.Settings()).turned_shots
         == ()
     )
+
+
+def test_a_calibrated_zero_and_the_outline_are_joined_by_their_errors():
+    settings, deg = selfcal.Settings(), np.radians(1.0)
+    outline = selfcal.RingZero(0.6 * deg, 0.4 * deg)
+    joined, correction = selfcal.corrected(outline, 0.01 * deg, settings)
+    before = np.hypot(0.01, 0.3)  # a thread's play
+    share = before**2 / (before**2 + 0.4**2)
+    assert correction == joined.turn == pytest.approx(share * 0.6 * deg)
+    assert joined.sigma == pytest.approx(before * 0.4 / np.hypot(before, 0.4) * deg)
+    vague = selfcal.RingZero(3 * deg, 2 * deg)
+    assert selfcal.corrected(vague, 0.01 * deg, settings) == (selfcal.RingZero(0.0, pytest.approx(before * deg)), 0.0)
+    another = selfcal.RingZero(5 * deg, 0.4 * deg)  # the filter was screwed on anew
+    assert selfcal.corrected(another, 0.01 * deg, settings) == (another, another.turn)
+    assert selfcal.corrected(outline, None, settings) == (outline, 0.0)  # set by eye: within its error
 
 
 def test_a_ring_set_right_is_left_alone():

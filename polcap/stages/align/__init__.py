@@ -64,38 +64,49 @@ def register(radiance: AngleStack, color: ColorCalibration, settings: Settings) 
     if radiance.offset_px is not None:
         return _as_known(radiance.offset_px)
     step = int(np.ceil(np.sqrt(radiance.value[0, ..., 0].size / _MOST_PIXELS)))
-    detail = [Detail(fine(radiance, k, settings.detail_px, step)) for k in range(shots)]
+    detail = [Detail(fine(radiance.shot(k), settings.detail_px, step)) for k in range(shots)]
     transform = np.tile(np.eye(3), (shots, 1, 1))
     residual = np.zeros(shots)
     correlation = np.ones(shots)
-    height, width = radiance.value.shape[1:3]
-    corners = np.array([[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]], float).T
     for k in range(1, shots):
         if settings.model == "none":
             continue
         name = f"shot {np.degrees(radiance.angle[k]):g}°"
-        if not _in_common(detail[0][1], detail[k][1]):
-            raise AlignmentError(
-                f"{name} has no unclipped detail in common with the first shot: over-exposed, black, or even all over; "
-                "shoot a darker frame, or with a locked camera --set align.model=none"
-            )
-        transform[k], residual[k], correlation[k] = _find(detail[0], detail[k], settings.model)
-        transform[k] = to_full_grid(transform[k], step)
-        residual[k] *= step
-        moved = transform[k] @ corners
-        shift = np.abs(moved[:2] / moved[2] - corners[:2]).max()
-        if not np.isfinite(shift) or correlation[k] < settings.min_correlation:
-            raise AlignmentError(
-                f"{name} shows another scene than the first shot: correlation {correlation[k]:.2f}, "
-                f"less than align.min_correlation = {settings.min_correlation:g}; "
-                "check its files, or reshoot with the camera and the object held still"
-            )
-        if shift > settings.max_shift_px:
-            raise AlignmentError(
-                f"{name} moved by {shift:.1f} px, more than align.max_shift_px = {settings.max_shift_px:g}; "
-                "reshoot, or raise it"
-            )
-    return Alignment(transform=transform, residual_px=residual, correlation=correlation)
+        transform[k], residual[k], correlation[k] = _accepted(name, detail[0], detail[k], step, settings)
+    crossed = None
+    if radiance.crossed is not None and settings.model == "none":
+        crossed = np.eye(3)
+    elif radiance.crossed is not None:
+        last = Detail(fine(radiance.crossed.picture, settings.detail_px, step))
+        crossed, _, _ = _accepted("the cross-polarised shot", detail[0], last, step, settings)
+    return Alignment(transform=transform, residual_px=residual, correlation=correlation, crossed=crossed)
+
+
+def _accepted(name: str, reference: Detail, shot: Detail, step: int, settings: Settings) -> tuple[Floats, float, float]:
+    """Transform (3, 3) of a shot on the full grid, its 1σ in px of that, and the likeness; refuses what cannot be."""
+    if not _in_common(reference[1], shot[1]):
+        raise AlignmentError(
+            f"{name} has no unclipped detail in common with the first shot: over-exposed, black, or even all over; "
+            "shoot a darker frame, or with a locked camera --set align.model=none"
+        )
+    small, residual, correlation = _find(reference, shot, settings.model)
+    transform = to_full_grid(small, step)
+    height, width = (step * side for side in reference[1].value.shape)
+    corners = np.array([[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]], float).T
+    moved = transform @ corners
+    shift = np.abs(moved[:2] / moved[2] - corners[:2]).max()
+    if not np.isfinite(shift) or correlation < settings.min_correlation:
+        raise AlignmentError(
+            f"{name} shows another scene than the first shot: correlation {correlation:.2f}, "
+            f"less than align.min_correlation = {settings.min_correlation:g}; "
+            "check its files, or reshoot with the camera and the object held still"
+        )
+    if shift > settings.max_shift_px:
+        raise AlignmentError(
+            f"{name} moved by {shift:.1f} px, more than align.max_shift_px = {settings.max_shift_px:g}; "
+            "reshoot, or raise it"
+        )
+    return transform, residual * step, correlation
 
 
 def _as_known(offset_px: Floats) -> Alignment:

@@ -11,7 +11,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from polcap.images import AngleStack, Floats, Quality
+from polcap.images import Floats, MaskedImage, Quality
 from polcap.optics.robust import BIWEIGHT, MAD_TO_SIGMA
 from polcap.optics.warp import Spline, Taps, coordinates, warp
 
@@ -23,22 +23,20 @@ _SIDE = 1024
 LEAST_PIXELS = 30  # that show detail, for two to eight unknowns
 
 
-def fine(radiance: AngleStack, k: int, detail_px: float, step: int) -> "Scale":
+def fine(shot: MaskedImage, detail_px: float, step: int) -> "Scale":
     """Fine structure of one shot's log radiance and its weight.
 
     Parameters
     ----------
-    radiance
-        The shots, (K, H, W, 3).
-    k
-        Which of them.
+    shot
+        (H, W, 3).
     detail_px
         Structure coarser than this Gaussian sigma is taken out [px of the averaged grid].
     step
         So many pixels a side are averaged first.
     """
-    total = averaged(_summed(radiance.value[k]), step)
-    sigma = np.sqrt(averaged(_summed(radiance.variance[k]), step)) / step
+    total = averaged(_summed(shot.value), step)
+    sigma = np.sqrt(averaged(_summed(shot.variance), step)) / step
     some = (slice(None, None, 3),) * 2  # enough for a percentile
     # The floor keeps the logarithm of a dark background from amplifying its noise.
     floor = max(float(np.percentile(total[some], 99)) * 0.01, 2 * float(np.median(sigma[some])), 1e-9)
@@ -51,7 +49,7 @@ def fine(radiance: AngleStack, k: int, detail_px: float, step: int) -> "Scale":
     sigma *= sigma
     sigma += np.float32(0.003**2)
     weight = np.divide(np.float32(1), sigma, out=sigma)
-    clipped = (radiance.quality[k] & Quality.CLIPPED).astype(np.uint8)
+    clipped = (shot.quality & Quality.CLIPPED).astype(np.uint8)
     if clipped.any():
         clipped = (averaged(clipped.astype(np.float32), step) > 0).astype(np.uint8)
         reach = int(np.ceil(2 * detail_px)) | 1

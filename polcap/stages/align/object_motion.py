@@ -32,7 +32,7 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
     if not object_.mask.any():
         return apart
     step = int(np.ceil(np.sqrt(object_.mask.size / _MOST_PIXELS)))
-    reference = fine(radiance, 0, _DETAIL_PX, step)
+    reference = fine(radiance.shot(0), _DETAIL_PX, step)
     height, width = reference.value.shape
     reach = 2 * _BEYOND_PX + 1
     small = cv2.resize(object_.mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_AREA)
@@ -41,7 +41,7 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
     y, x = np.nonzero(small)
     middle = np.array([x.mean(), y.mean(), 1.0]) if len(x) else np.array([width / 2, height / 2, 1.0])
     for k in range(1, shots):
-        shot = Detail(fine(radiance, k, _DETAIL_PX, step))
+        shot = Detail(fine(radiance.shot(k), _DETAIL_PX, step))
         known = to_full_grid(alignment.transform[k], 1 / step)
         found = [_followed(region, shot, known) for region in regions]
         here, around = (like for _, like in found)

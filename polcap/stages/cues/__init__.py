@@ -39,10 +39,17 @@ def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
 
     ratio, sigma, dolp, normalized = polarization(stokes.stokes, stokes.covariance)
     radiance = np.asarray(stokes.stokes[0] @ color.matrix.T, dtype=np.float32)
+    whole = 1.0
     if color.source in ("chart", "corners"):
-        radiance = radiance * np.float32(scale.factor(stokes, color))
+        whole = scale.factor(stokes, color)
     if color.source in ("camera", "none") and stokes.mask.any():
-        radiance = radiance * np.float32(0.8 / max(float(np.percentile(radiance[stokes.mask], 99)), 1e-9))
+        whole = 0.8 / max(float(np.percentile(radiance[stokes.mask], 99)), 1e-9)
+    radiance = radiance * np.float32(whole)
+    body, body_known = None, None
+    if stokes.body is not None:
+        body = np.asarray(stokes.body.value @ color.matrix.T, dtype=np.float32) * np.float32(whole)
+        unknown = Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST
+        body_known = stokes.mask & ((stokes.body.quality & np.uint8(unknown)) == 0)
     height, width = stokes.mask.shape
     return Cues(
         radiance=radiance,
@@ -55,6 +62,8 @@ def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
         mask=stokes.mask,
         quality=stokes.quality,
         view=stokes.view,
+        body=body,
+        body_known=body_known,
     )
 
 

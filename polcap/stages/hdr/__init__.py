@@ -24,7 +24,7 @@ import numpy as np
 from msgspec import Meta
 
 from polcap.errors import CaptureError
-from polcap.images import AngleStack, Capture, Floats, Frame, Quality, SensorImage, Shot, View
+from polcap.images import AngleStack, Capture, CrossedShot, Floats, Frame, MaskedImage, Quality, SensorImage, Shot, View
 from polcap.optics import sharpness
 from polcap.stages import stage
 from polcap.stages.hdr import budget, combine, falloff, links, noise
@@ -66,7 +66,8 @@ def merge(capture: Capture, settings: Settings) -> AngleStack:
     """
     shots = capture.shots
     _check(shots)
-    read = Reader(frame for shot in shots for frame in (*shot.frames, *shot.ambient))
+    brackets = (*shots, *(() if capture.crossed is None else (capture.crossed,)))
+    read = Reader(frame for shot in brackets for frame in (*shot.frames, *shot.ambient))
     try:
         return _merge(capture, read, settings)
     finally:
@@ -114,6 +115,7 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
         tiles.append([sharpness.take(read(frame), corners, settings.clip) for frame in shot.frames])
         read.forget((*shot.frames, *shot.ambient))
         lines.close()
+    crossed = None if capture.crossed is None else _crossed(capture.crossed, shape, lines, read, settings)
     scale = 1.0 if full else float(side)
     x, y = capture.principal_px
     view = View(
@@ -125,6 +127,8 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
     if known is not None and known.falloff is not None and settings.falloff:
         for value, variance in zip(stack.value, stack.variance, strict=True):
             falloff.divide(value, variance, view, capture.size_px, known.falloff)
+        if crossed is not None:
+            falloff.divide(crossed.value, crossed.variance, view, capture.size_px, known.falloff)
     return AngleStack(
         value=stack.value,
         variance=stack.variance,
@@ -144,7 +148,26 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
         offset_px=_offsets(shots) if capture.layout == "sensor" else None,
         extinction=None if known is None or known.polarizer is None else np.array(known.polarizer.extinction),
         flash_spread=None if known is None or known.flash is None else known.flash.spread,
+        ring_sigma=None if known is None or known.polarizer is None else np.radians(known.polarizer.zero_sigma_deg),
+        crossed=None if crossed is None else CrossedShot(crossed, capture.crossed_angle),
     )
+
+
+def _crossed(
+    shot: Shot, shape: tuple[int, int, int], lines: noise.Lines, read: Reader, settings: Settings
+) -> MaskedImage:
+    """The crossed shot merged like the others, on the scale of its own middle frame: its flash has another power."""
+    order = _by_brightness(shot, read)
+    reference = order[(len(order) - 1) // 2]
+    measured = links.measure(shot, order, reference, lines, read, settings.clip, settings.max_motion_px)
+    full = settings.demosaic == "full" and read(shot.frames[reference]).cfa is not None
+    mixture = combine.prepare(shot, order, reference, measured, lines, read, settings.clip, full)
+    same_size("the cross-polarised shot", mixture.shape, shape)
+    room = _empty(1, shape[1], shape[2])
+    mixture.into(Merged(room.value[0], room.variance[0], room.quality[0]))
+    read.forget((*shot.frames, *shot.ambient))
+    lines.close()
+    return MaskedImage(room.value[0], room.variance[0], room.quality[0])
 
 
 def _budget(shots: tuple[Shot, ...], image: SensorImage, settings: Settings) -> budget.Budget:

@@ -6,6 +6,7 @@ hand back camera-frame maps.
     analytic       the inversion: zenith from DoLP, azimuth from AoLP
         azimuth        which of the two half-turns an AoLP means
         body_law       which law of the body the DoLP follows, and the zenith it means
+    body_light     albedo in highlights, where a crossed shot shows what lies under them
     learned        the network, joined with the inversion
         augmentation   the network's mean over turned and mirrored pictures
 """
@@ -17,7 +18,7 @@ from msgspec import Meta
 
 from polcap.images import Cues, Network, SurfaceMaps
 from polcap.stages import stage
-from polcap.stages.infer import analytic, learned
+from polcap.stages.infer import analytic, body_light, learned
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -40,5 +41,7 @@ def estimate(cues: Cues, network: Network | None, settings: Settings) -> Surface
         The network was made for other channels.
     """
     if network is None:
-        return analytic.estimate(cues, settings.ior)
-    return learned.estimate(cues, network, settings.ior, settings.symmetries)
+        maps = analytic.estimate(cues, settings.ior)
+    else:
+        maps = learned.estimate(cues, network, settings.ior, settings.symmetries)
+    return body_light.albedo(maps, cues, settings.ior)

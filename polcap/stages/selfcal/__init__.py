@@ -5,8 +5,8 @@ whole object it costs normals about 6° on average). A matt grey patch is unpola
 same in every shot (`grey_patches`); where there is no chart, the object itself says what it can (`object_gains`), and
 what is known of lamps and flashes says the rest. One exposure of a polarization mosaic has one gain. The outline tells
 whether the angles are in order and counted the right way (`order`), and by how much the ring's zero is off
-(`ring_zero`); that is applied where it is sure. Of more than three shots their closure tells which angle is wrong
-(`angle_closure`).
+(`ring_zero`); that is applied where it is sure, joined with a calibrated zero by the errors of both. Of more than three
+shots their closure tells which angle is wrong (`angle_closure`).
 """
 
 from typing import Annotated, Literal
@@ -19,7 +19,7 @@ from polcap.errors import CaptureError
 from polcap.images import Alignment, AngleStack, Bits, ColorCalibration, Floats, Gains, ObjectMask, Quality
 from polcap.optics.warp import warp
 from polcap.stages import stage
-from polcap.stages.selfcal import angle_closure, grey_patches, object_gains, order, ring_zero
+from polcap.stages.selfcal import angle_closure, crossed_light, grey_patches, object_gains, order, ring_zero
 from polcap.stages.selfcal.grey_patches import GreyPatches
 from polcap.stages.selfcal.object_gains import Estimate
 from polcap.stages.selfcal.order import Order
@@ -29,6 +29,7 @@ _PRIOR = {"flash": 0.03, "steady": 0.01, "unknown": 0.03}  # 1σ of a shot's lig
 # of studio flashes state 0.5–2 % from pop to pop at full recycling, of LED and HMI lamps under 1 %
 _LEAST_PRIOR = 0.001  # of any light, whatever a calibration says of its flash
 _SURPRISE = 3.0  # σ from the prior beyond which two independent measurements have to agree
+_REMOUNTED = np.radians(0.3)  # 1σ of a filter's zero from one screwing on to the next: a thread's play; assumed
 _SOLID_ORDER, _GUESSED_ORDER = 0.25, 0.45  # least score of another order; guessed gains turn AoLPs too. Set by hand;
 # 32 simulated captures in order were all kept with them (tests/benchmarks/bench_verdicts.py)
 
@@ -60,7 +61,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 12.0
 
 
-@stage(version=5)
+@stage(version=6)
 def solve(
     radiance: AngleStack,
     alignment: Alignment,
@@ -93,7 +94,7 @@ def solve(
     mask = object_.mask[y0:y1, x0:x1]
     value, quality = _registered(radiance, alignment, object_.crop)
     light = object_gains.smoothed(value)
-    facing = object_gains.facing(light, object_gains.inside(mask, quality))
+    facing = object_gains.facing(light, object_gains.inside(mask, quality), radiance.angle)
     greys = grey_patches.measure(radiance, alignment, color)
     blind = _blind(radiance, greys, facing)  # to the angles, which are to be judged
     rim = order.rim(light / blind.gain[:, None, None], quality == 0, mask, object_.crop, radiance.value.shape[1:3])
@@ -110,8 +111,9 @@ def solve(
         float(blind.sigma.max()),
         object_.border > 0,
     )
-    turns = radiance.light != "one exposure" and radiance.extinction is None  # calibrated, the ring's zero is known
-    correction = ring.turn if turns and _sure(ring, settings) else 0.0
+    correction = 0.0
+    if radiance.light != "one exposure":
+        ring, correction = corrected(ring, radiance.ring_sigma, settings)
     angle = radiance.angle + correction
     anchor = object_gains.combined([*_by_law(light, mask, quality, radiance, angle, object_.crop), facing])
     source: Source
@@ -128,6 +130,7 @@ def solve(
     closed = angle_closure.measure(
         *object_gains.cells(light / blind.gain[:, None, None], object_gains.inside(mask, quality)), angle, blind.sigma
     )
+    crossed = crossed_light.measure(radiance, alignment, color, value, gain, angle, mask & (quality == 0), object_.crop)
     own = np.hypot(anchor.sigma, sigma.mean(1))
     difference = np.abs(gain.mean(1) / anchor.gain - 1)
     return Gains(
@@ -148,6 +151,10 @@ def solve(
         turned_shots=closed.shots,
         turned=closed.angle,
         turned_sigma=closed.sigma,
+        rival=() if found.rival is None else found.rival[0],
+        rival_mirrored=found.rival is not None and found.rival[1],
+        crossed=None if crossed is None else crossed[0],
+        crossed_sigma=0.0 if crossed is None else crossed[1],
     )
 
 
@@ -185,6 +192,32 @@ def _prior(radiance: AngleStack) -> float:
     if radiance.light == "flash" and radiance.flash_spread is not None:
         return max(2**0.5 * radiance.flash_spread, _LEAST_PRIOR)  # of one pop against another
     return _PRIOR[radiance.light]
+
+
+def corrected(ring: RingZero, calibrated: float | None, settings: Settings) -> tuple[RingZero, float]:
+    """What is known of the ring's zero, and what is added to the angles for it, rad.
+
+    A calibrated zero and the outline are two measurements of one number: they are joined by their errors, where both
+    are of one ring. Where they are not, the filter was screwed on anew, and the outline stands alone.
+
+    Parameters
+    ----------
+    ring
+        By the outline.
+    calibrated
+        1σ rad of the zero that stands in the angles already; None where none does.
+    settings
+        When the outline is sure.
+    """
+    if calibrated is not None:
+        before = float(np.hypot(calibrated, _REMOUNTED))
+        if not settings.correct_ring or ring.sigma > np.radians(settings.max_ring_sigma_deg):
+            return RingZero(0.0, min(before, ring.sigma)), 0.0
+        if abs(ring.turn) <= _SURPRISE * np.hypot(before, ring.sigma):
+            share = before**2 / (before**2 + ring.sigma**2)
+            joined = RingZero(share * ring.turn, float(np.sqrt(share) * ring.sigma))
+            return joined, joined.turn
+    return ring, ring.turn if _sure(ring, settings) else 0.0
 
 
 def _sure(ring: RingZero, settings: Settings) -> bool:

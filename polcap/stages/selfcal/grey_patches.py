@@ -67,6 +67,39 @@ def measure(radiance: AngleStack, alignment: Alignment, color: ColorCalibration)
     return GreyPatches(gain, sigma, slope, _gloss(total.sum(-1)[:, usable], variance.sum(-1)[:, usable]))
 
 
+def crossed_share(
+    radiance: AngleStack, alignment: Alignment, color: ColorCalibration, gain: Floats
+) -> tuple[Floats, float] | None:
+    """S0 of the light greys over the crossed shot's light (3,), and its relative 1σ; None where they do not tell.
+
+    Parameters
+    ----------
+    radiance, alignment, color
+        As `measure` takes them.
+    gain
+        (K, 3) of the shots.
+    """
+    if color.quads is None or radiance.crossed is None or alignment.crossed is None:
+        return None
+    shots = (radiance.value / gain[:, None, None].astype(np.float32), radiance.quality)
+    other, ratios = radiance.crossed.picture, []
+    for patch in _GREYS[:_LIGHT]:
+        parts, clipped = [], False
+        for value, quality, transform in [
+            *zip(*shots, alignment.transform, strict=True),
+            (other.value, other.quality, alignment.crossed),
+        ]:
+            box, inside = _polygon(color.quads[patch], transform, value.shape[:2])
+            clipped |= inside.sum() < 9 or bool((quality[box][inside] & Quality.CLIPPED).any())
+            parts.append(value[box][inside].mean(0) if inside.any() else np.zeros(3))
+        if not clipped and min(part.min() for part in parts) > 0:
+            ratios.append(2 * np.mean(parts[:-1], axis=0) / parts[-1])  # unpolarized: every shot is half of S0
+    if len(ratios) < 2:
+        return None
+    share = np.mean(ratios, axis=0)
+    return share, float((np.std(ratios, axis=0, ddof=1) / share).max() / np.sqrt(len(ratios)))
+
+
 def _slope(total: Floats, usable: NDArray[np.bool_]) -> float:
     """Slope of ln total (4,) over ln reflectance; NaN for fewer than three patches."""
     if usable.sum() < 3:

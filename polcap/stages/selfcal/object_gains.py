@@ -36,8 +36,11 @@ _CELL_PX = 6  # of the blocks whose means the closure takes: three times the blu
 _PARTS = 12  # of the object, left out one at a time: knows a 1σ to a fifth
 _ANGLE_ERROR = np.radians(0.5)  # 1σ of a ring set against its mark: half of what divides it, a degree; assumed
 _LEAST_RIM, _MOST_RIM = 200, 20_000  # pixels of the outline
-_FACING_ERROR = 0.005  # what facing pixels were wrong by on simulated objects, whatever their scatter (decision 20)
-_OUTLINE_ERROR = 0.004  # the same of the outline
+_FACING_ERROR = 0.003  # what facing pixels were wrong by on simulated objects, whatever their scatter (decision 32)
+_ONE_SIDED = 0.02  # the same where slopes lie to one side of them alone, as a ridge's that leans (decision 32)
+_RING = (0.006, 0.02)  # polarization of the slopes that are looked at for that
+_OUTLINE_ERROR = 0.002  # of the outline, beside its own scatter
+_OUTLINE_TIMES = 3.0  # its error over the scatter of its parts: what bends one bends its neighbours (decision 32)
 _CLOSURE_ERROR = 0.001  # registration and interpolation; assumed, the angles' error is most of its doubt (decision 20)
 
 
@@ -117,15 +120,16 @@ def outline(light: Floats, azimuth: Floats, sector: NDArray[np.int_], angle: Flo
         project = np.eye(shots) - one - np.einsum("kn,ln->nkl", wave, wave)  # of rank K − 2
         return np.asarray(project * light[:, None])
 
-    return _null_vector(rows, angle, np.searchsorted(parts, sector), _OUTLINE_ERROR)
+    return _null_vector(rows, angle, np.searchsorted(parts, sector), _OUTLINE_ERROR, _OUTLINE_TIMES)
 
 
-def facing(light: Floats, usable: Bools) -> Estimate:
-    """Gains (K,) at which the ratios of the shots pile up; light (K, H, W).
+def facing(light: Floats, usable: Bools, angle: Floats) -> Estimate:
+    """Gains (K,) at which the ratios of the shots pile up; light (K, H, W), angle (K,) rad for the doubt alone.
 
     Over a rounded object the density of (S1, S2)/S0 grows as 1/θ² towards its zero, whatever the albedo. Mean shift
     with a shrinking kernel climbs there from several places. The peak with most pixels is taken; others that hold
-    nearly as many are what it may be wrong by: on flat faces, or under light from all sides, there are many.
+    nearly as many are what it may be wrong by: on flat faces, or under light from all sides, there are many. A ridge
+    that leans has its peak where it leans least: slopes lie to one side of it alone, in whatever order the shots are.
     """
     shots = len(light)
     usable = usable & (light.sum(0) > np.quantile(light.sum(0)[usable], 0.2)) if usable.any() else usable
@@ -142,8 +146,18 @@ def facing(light: Floats, usable: Bools) -> Estimate:
     odds = (height / max(float(height[best]), 1e-12)) ** 4
     spread = np.sqrt((odds[:, None] * (np.stack([path[-1] for path in climbs]) - gain) ** 2).sum(0) / odds.sum())
     scatter = np.std(climbs[best][1:], axis=0)
-    sigma = np.sqrt(spread**2 + scatter**2 + _FACING_ERROR**2)
+    beside = _ONE_SIDED * _one_sided(ratio / gain[:, None], angle)
+    sigma = np.sqrt(spread**2 + scatter**2 + beside**2 + _FACING_ERROR**2)
     return Estimate(gain, np.where(np.arange(shots) > 0, sigma, 0.0))
+
+
+def _one_sided(ratio: Floats, angle: Floats) -> float:
+    """How far the slopes about facing pixels all lie one way, 0…1, of the shots' ratios (K, N) without gains."""
+    s0, s1, s2 = np.linalg.pinv(mueller.analyzer(angle)) @ ratio
+    polarization = (s1 + 1j * s2) / np.maximum(s0, 1e-9)
+    strength = np.abs(polarization)
+    some = polarization[(strength > _RING[0]) & (strength < _RING[1])]
+    return float(abs(np.mean(some / np.abs(some)))) if some.size else 1.0
 
 
 def _climb(ratio: Floats, start: Floats) -> list[Floats]:
@@ -184,10 +198,12 @@ def cells(light: Floats, usable: Bools) -> tuple[Floats, NDArray[np.int_]]:
     return means[:, bright], np.nonzero(whole)[0][bright]
 
 
-def _null_vector(rows_at: Callable[[Floats], Floats], angle: Floats, part: NDArray[np.int_], floor: float) -> Estimate:
+def _null_vector(
+    rows_at: Callable[[Floats], Floats], angle: Floats, part: NDArray[np.int_], floor: float, times: float = 1.0
+) -> Estimate:
     """The h with h₀ = 1 that rows (P, C, K) take nearest to zero, as gains 1/h, by biweight.
 
-    Its doubt: the scatter between parts (jackknife), and what an error of each angle does to it.
+    Its doubt: the scatter between parts (jackknife) so many times, and what an error of each angle does to it.
     """
     rows = rows_at(angle)
     trust = np.ones(len(rows))
@@ -201,7 +217,7 @@ def _null_vector(rows_at: Callable[[Floats], Floats], angle: Floats, part: NDArr
     total = np.sum(each, axis=0)
     without = np.stack([_solved(total - one) for one in each])
     count = len(each)
-    variance = (count - 1) / count * ((without - without.mean(0)) ** 2).sum(0)
+    variance = times**2 * (count - 1) / count * ((without - without.mean(0)) ** 2).sum(0)
     for k in range(len(angle)):
         turned = angle + _ANGLE_ERROR * (np.arange(len(angle)) == k)
         variance = variance + (_solved(_square(rows_at(turned), trust)) - h) ** 2

@@ -20,6 +20,8 @@ Order = tuple[tuple[int, ...], bool]  # which stated angle each shot has, and wh
 
 _MOST_PERMUTED = 4  # beyond, only exchanges of two shots, and the reversal, are tried
 _CLOSES = 3.0  # factor on the misfit of more than three shots that rules an order out, or in; set by hand
+_APART = 2.0  # σ that the stated order must be ahead of another for the outline to tell the two apart
+_LEAST_RIVAL = 0.25  # score of an order that the object could have as well: half of chance's greatest; set by hand
 _ROUGH = 0.01  # misfit that gains and interpolation leave at most, relative to the light: a flash repeats within 1 %
 
 
@@ -32,6 +34,7 @@ class Verdict:
     best_score: float
     doubt: float  # 1σ of the difference of the two
     concentration: float  # 0…1, of the AoLP about the turned outline
+    rival: Order | None = None  # another order that fits as well as far as can be seen
 
 
 def rim(value: Floats, usable: Bools, mask: Bools, crop: tuple[int, int, int, int], full: tuple[int, ...]) -> Rim:
@@ -85,6 +88,7 @@ def judge(at: Rim, angle: Floats, margin: float, believable: float, beyond_sigma
     mean, _ = outline.mean_and_doubt(total, weight)
     here = _misfit(at, angle)
     best, best_score, doubt = stated, abs(mean), 0.0
+    rival, nearest = None, -np.inf
     for order, turned in hypotheses(angle).items():
         misfit = _misfit(at, turned)
         if order == stated or misfit > _CLOSES * here:
@@ -92,11 +96,13 @@ def judge(at: Rim, angle: Floats, margin: float, believable: float, beyond_sigma
         least = 0.0 if _CLOSES * misfit < here > _ROUGH else margin  # more than three shots agree in this order alone
         other, others = outline.phasor(at, turned)
         score = float(other.sum().real / max(others.sum(), 1e-9))
-        if score > best_score:
-            sigma = _jackknife(other.real, others, (total * np.exp(-1j * np.angle(mean))).real, weight)
-            if score > believable and score - abs(mean) > max(least, beyond_sigma * sigma * (least > 0)):
-                best, best_score, doubt = order, score, sigma
-    return Verdict(best, mean.real, best_score, doubt, abs(mean))
+        sigma = _jackknife(other.real, others, (total * np.exp(-1j * np.angle(mean))).real, weight)
+        if score > _LEAST_RIVAL and least and score - abs(mean) > max(nearest, -_APART * sigma):
+            rival, nearest = order, score - abs(mean)
+        needed = max(least, beyond_sigma * sigma * (least > 0))
+        if score > max(best_score, believable) and score - abs(mean) > needed:
+            best, best_score, doubt = order, score, sigma
+    return Verdict(best, mean.real, best_score, doubt, abs(mean), rival)
 
 
 def hypotheses(angle: Floats) -> dict[Order, Floats]:

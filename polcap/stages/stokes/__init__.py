@@ -11,8 +11,19 @@ import numpy as np
 from msgspec import Meta
 
 from polcap.errors import CaptureError
-from polcap.images import Alignment, AngleStack, Bits, Floats, Gains, ObjectMask, Quality, StokesImage, View
-from polcap.optics import fresnel, mueller
+from polcap.images import (
+    Alignment,
+    AngleStack,
+    Bits,
+    Floats,
+    Gains,
+    MaskedImage,
+    ObjectMask,
+    Quality,
+    StokesImage,
+    View,
+)
+from polcap.optics import crossing, fresnel, mueller
 from polcap.optics.warp import covered, warp
 from polcap.stages import stage
 
@@ -97,6 +108,7 @@ def solve(
             residual[rows] = difference / np.maximum(solved[0].sum(0), 1e-9)
     mask = object_.mask[y0:y1, x0:x1]
     view = radiance.view
+    body = _body(radiance, alignment, gains, stokes, quality, object_.crop) if gains.crossed is not None else None
     return StokesImage(
         stokes=stokes,
         covariance=covariance,
@@ -110,6 +122,31 @@ def solve(
             known=view.known,
         ),
         residual=residual,
+        body=body,
+    )
+
+
+def _body(
+    radiance: AngleStack,
+    alignment: Alignment,
+    gains: Gains,
+    stokes: Floats,
+    seen: Bits,
+    crop: tuple[int, int, int, int],
+) -> MaskedImage:
+    """S0 without what the surface mirrors (h, w, 3): the crossed shot, which has none of it, registered and scaled."""
+    assert radiance.crossed is not None and alignment.crossed is not None and gains.crossed is not None
+    picture, transform, share = radiance.crossed.picture, alignment.crossed, gains.crossed.astype(np.float32)
+    clipped = (seen & np.uint8(Quality.CLIPPED)) > 0  # nothing is known of polarization there: it faces the camera
+    across = np.where(clipped[..., None], 0, crossing.polarized(stokes[1], stokes[2], radiance.crossed.angle))
+    value = crossing.body_light(warp(picture.value, transform, crop) * share, across)
+    variance = np.maximum(warp(picture.variance, transform, crop, order=1), np.float32(1e-14)) * share**2
+    quality: Bits = np.zeros(value.shape[:2], np.uint8)
+    for bit, plane in _flagged(picture.quality):
+        quality |= np.where(warp(plane, transform, crop, order=1) > 0.01 * bit, np.uint8(bit), np.uint8(0))
+    inside = covered(picture.value.shape[:2], transform, crop)
+    return MaskedImage(
+        value.astype(np.float32), variance, quality | np.where(inside, np.uint8(0), np.uint8(Quality.OUTSIDE))
     )
 
 

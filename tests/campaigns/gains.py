@@ -1,0 +1,77 @@
+"""How well the light of the shots is known without a chart, and whether what is wrong is told.
+
+python -m tests.campaigns.gains [--objects 20] [--first-seed 0] [--angles 0,45,90] [--parts]
+
+Objects of `lit_objects` under a flash that repeats within 2 %. A capture is flagged where the gate `gain doubt`
+does not pass, refused where it fails. Prints the errors, the worst shot's of each capture, and what is promised.
+"""
+
+import argparse
+from types import SimpleNamespace
+
+import numpy as np
+
+from polcap.config import Gates
+from polcap.gates import light
+from polcap.stages import selfcal
+from polcap.stages.selfcal import object_gains, order
+from tests import scenes
+from tests.campaigns import lit_objects
+
+JITTER = 0.02  # 1σ of a pop
+GOOD, BAD = 0.003, 0.006
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--objects", type=int, default=20)
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--angles", default="0,45,90")
+    parser.add_argument("--parts", action="store_true", help="also what each property of the object says")
+    given = parser.parse_args()
+    angle = np.radians([float(one) for one in given.angles.split(",")])
+    rows, errors, states = [], [], []
+    for seed in range(given.first_seed, given.first_seed + given.objects):
+        case = lit_objects.lit(seed)
+        true = 1 + JITTER * np.random.default_rng([seed, 13]).normal(size=len(angle))
+        true = true / true[0]
+        radiance, object_ = lit_objects.stack(case, angle, seed, true), lit_objects.object_of(case)
+        settings = selfcal.Settings(check_order=False)
+        found = selfcal.solve(radiance, scenes.still(len(angle)), object_, scenes.no_color(), settings)
+        gate = light._gain_doubt(SimpleNamespace(gains=found), Gates())
+        error = np.abs(found.gain.mean(1) / true - 1)
+        errors.append(float(error.max()))
+        states.append(gate.state)
+        rows.append((seed, case.look, f"{100 * errors[-1]:.2f} %", f"{100 * found.sigma.max():.2f} %", gate.state))
+        if given.parts:
+            print(seed, case.look, *parts(radiance, object_, angle, true), flush=True)
+    print(lit_objects.shown(rows, ("seed", "look", "worst error", "1σ", "gate")))
+    off, flagged = np.array(errors), np.array([state != "pass" for state in states])
+    print(f"\nwithin {100 * GOOD:g} %: {(off <= GOOD).sum()} of {len(off)}")
+    print(f"above {100 * BAD:g} %: {(off > BAD).sum()}, of them unflagged: {((off > BAD) & ~flagged).sum()}")
+    print(f"flagged {flagged.sum()}, refused {sum(state == 'fail' for state in states)}")
+
+
+def parts(radiance, object_, angle, true) -> list[str]:  # type: ignore[no-untyped-def]
+    """Error and doubt [%] of each shot's gain by each property alone."""
+    x0, y0, x1, y1 = object_.crop
+    mask = object_.mask[y0:y1, x0:x1]
+    value = radiance.value[:, y0:y1, x0:x1]
+    quality = radiance.quality[:, y0:y1, x0:x1].max(0)
+    light_of = object_gains.smoothed(value)
+    rim = order.rim(light_of, quality == 0, mask, object_.crop, radiance.value.shape[1:3])
+    found = {
+        "facing": object_gains.facing(light_of, object_gains.inside(mask, quality), angle),
+        "outline": object_gains.outline(rim.light, rim.azimuth, rim.sector, angle),
+        "closure": object_gains.closure(light_of, object_gains.inside(mask, quality), angle),
+    }
+    return [
+        f"{name} "
+        + " ".join(f"{100 * (g / t - 1):+.2f}±{100 * s:.2f}" for g, t, s in zip(one.gain[1:], true[1:], one.sigma[1:]))
+        for name, one in found.items()
+        if np.isfinite(one.sigma).all()
+    ]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,92 @@
+"""In: a seed. Out: shots of a simulated object without its photographs, for campaigns on what `selfcal` tells.
+
+Bumps, clusters and vases of `polcap.synth`, 320 × 240 px, under a flash by the lens, smooth and rough bodies in turn,
+with the looks that gains are hard to tell of: glossy, matt, textured, a white patch at the limb, clipped highlights.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import AngleStack, Floats, ObjectMask, Quality
+from polcap.optics import frames, mueller
+from polcap.synth.scenes import random_scene
+from polcap.synth.shooting import Shoot, Studio
+from tests import scenes
+
+LOOKS = ("textured", "glossy", "matt", "white patch", "clipped")
+_NOISE = 0.004  # 1σ at S0 = 1, growing with its root: that of a bracket's merged pixel
+_MARGIN = 12  # px of the crop around the object
+
+
+@dataclass(frozen=True)
+class Lit:
+    """An object under a flash."""
+
+    look: str
+    stokes: Floats  # (3, H, W, 3) in the frame of each ray
+    mask: NDArray[np.bool_]
+    rays: Floats  # (H, W, 3)
+
+
+def lit(seed: int, thin: bool = False) -> Lit:
+    """The seed's object; `thin` takes clusters alone, whose parts hide one another."""
+    random = np.random.default_rng([seed, 11])
+    look = LOOKS[seed % len(LOOKS)]
+    scene = random_scene(seed, "clusters" if thin else ("bumps", "clusters", "vase")[seed // 2 % 3])
+    scene = msgspec.structs.replace(scene, chart=None, position=(0.0, 0.0, scene.position[2]))
+    rough = {"glossy": 0.2, "clipped": 0.25, "matt": 0.8}.get(look)
+    if rough is not None:
+        worn = tuple(msgspec.structs.replace(one, roughness=(rough, rough)) for one in scene.coat.materials)
+        scene = msgspec.structs.replace(scene, coat=msgspec.structs.replace(scene.coat, materials=worn))
+    law = "rough" if seed % 2 else "smooth"
+    shoot = Shoot(width=320, height=240, focal_mm=70.0, samples=1)
+    studio = Studio(msgspec.structs.replace(scene, law=law), shoot)
+    image, mask = np.asarray(studio.reference, np.float64), studio.buffer.mask
+    image = image / np.percentile(image[0][mask], 90)
+    if look == "white patch":
+        slope = studio.buffer.normal[..., 2]
+        limb = np.argwhere(mask & (slope > 0.3) & (slope < 0.5))
+        y, x = limb[int(random.integers(len(limb)))]
+        rows, columns = np.mgrid[: mask.shape[0], : mask.shape[1]]
+        image[:, mask & (np.hypot(rows - y, columns - x) < 14)] *= 4
+    return Lit(look, image, mask, frames.rays(shoot.view, *mask.shape))
+
+
+def stack(case: Lit, angle: Floats, seed: int, gain: Floats | None = None, stated: Floats | None = None) -> AngleStack:
+    """Shots at angles (K,) rad, with gains (K,) and noise, of which `stated` (K,) rad are told."""
+    random = np.random.default_rng([seed, 12])
+    gain = np.ones(len(angle)) if gain is None else gain
+    weights = np.stack([mueller.analyzer(frames.axis_on_ray(np.asarray(a), case.rays)) for a in angle])  # (K, H, W, 3)
+    shots = np.einsum("khwj,jhwc->khwc", weights, case.stokes) * gain[:, None, None, None]
+    variance = _NOISE**2 * np.maximum(shots, 0.02)
+    shots = shots + random.normal(size=shots.shape) * np.sqrt(variance)
+    top = 0.75 if case.look == "clipped" else 4.0
+    clipped = (shots > top).any(-1)
+    return AngleStack(
+        value=np.minimum(shots, top).astype(np.float32), variance=variance.astype(np.float32),
+        quality=clipped.astype(np.uint8) * np.uint8(Quality.CLIPPED), angle=angle if stated is None else stated,
+        view=scenes.VIEW, exposure_ratio=np.ones((len(angle), 1, 3)), exif_ratio=np.ones((len(angle), 1)),
+        ghost_fraction=np.zeros(len(angle)), lossy=False, camera_matrix=None, white_balance=None, light="flash",
+    )  # fmt: skip
+
+
+def object_of(case: Lit) -> ObjectMask:
+    """The object as cut out by hand."""
+    rows, columns = (np.flatnonzero(case.mask.any(axis)) for axis in (1, 0))
+    height, width = case.mask.shape
+    edge = float(np.concatenate([case.mask[[0, -1]].ravel(), case.mask[:, [0, -1]].ravel()]).mean())
+    box = (
+        max(int(columns[0]) - _MARGIN, 0), max(int(rows[0]) - _MARGIN, 0),
+        min(int(columns[-1]) + 1 + _MARGIN, width), min(int(rows[-1]) + 1 + _MARGIN, height),
+    )  # fmt: skip
+    return ObjectMask(case.mask, box, "user", border=edge)
+
+
+def shown(rows: list[tuple[Any, ...]], names: tuple[str, ...]) -> str:
+    """A Markdown table."""
+    lines = ["| " + " | ".join(names) + " |", "|" + " --- |" * len(names)]
+    return "\n".join([*lines, *("| " + " | ".join(map(str, row)) + " |" for row in rows)])
