@@ -123,7 +123,8 @@ def test_a_cleaned_mask_keeps_its_openings():
     drawn[30:40, 30:40] = False  # one looks through
     drawn[50, 50] = False
     drawn[5, 5] = True
-    found = solid.cleaned(drawn)
+    drawn[80:100, 85:95] = True  # colors alone took it for the object
+    found = solid.cleaned(drawn, np.where(np.arange(100) < 82, 0.6, 0.1) * np.ones((100, 1)))
     assert found.sum() == 3600 - 100 and not found[30:40, 30:40].any() and found[50, 50]
 
 

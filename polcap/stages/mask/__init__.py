@@ -35,7 +35,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.7
 
 
-@stage(version=4)
+@stage(version=5)
 def segment(
     radiance: AngleStack,
     alignment: Alignment,
@@ -83,7 +83,7 @@ def segment(
     chance = two_looks.chances(radiance, alignment, color, patches, network)
     mask = solid.body(chance)
     if mask.any():
-        mask = solid.cleaned(standing_out.sharpened(picture, mask, patches, chance))
+        mask = solid.cleaned(standing_out.sharpened(picture, mask, patches, chance), chance)
     with contextlib.suppress(ObjectError):
         plain = standing_out.search(picture, zone, settings.min_area)
         mask = solid.preferred(plain, mask, chance)

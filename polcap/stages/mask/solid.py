@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from polcap.images import Floats
 
 _SPECK = 0.01  # of the largest part: smaller ones are no parts of their own
+_LIKELY = 0.3  # chance that a part has somewhere that is more than the backdrop in its color (decision 39)
 _PINHOLE = 1e-3  # of the mask: smaller holes are dark texture
 _LEEWAY = 1.1  # times the doubt, given for the sharper outline (decision 39)
 _DOUBTED = 0.15  # mean chance of a hole that is a shadowed hollow and no opening
@@ -20,9 +21,11 @@ def body(chance: Floats) -> NDArray[np.bool_]:
     return _filled(_sizeable(chance > 0.5), chance)
 
 
-def cleaned(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """A mask (H, W) without specks and pinholes."""
-    return _filled(_sizeable(mask), None)
+def cleaned(mask: NDArray[np.bool_], chance: Floats) -> NDArray[np.bool_]:
+    """A mask (H, W) without specks, pinholes, and parts of which no pixel is likely by its chances (H, W)."""
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+    seen = np.bincount(labels[mask & (chance > _LIKELY)], minlength=count) > 0
+    return _filled(_sizeable(seen[labels]), None)
 
 
 def preferred(plain: NDArray[np.bool_], learned: NDArray[np.bool_], chance: Floats) -> NDArray[np.bool_]:
