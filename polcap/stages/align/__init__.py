@@ -73,7 +73,7 @@ def register(radiance: AngleStack, color: ColorCalibration, settings: Settings) 
             continue
         name = f"shot {np.degrees(radiance.angle[k]):g}°"
         transform[k], residual[k], correlation[k] = _accepted(name, detail[0], detail[k], step, settings)
-    crossed = None
+    crossed: Floats | None = None
     if radiance.crossed is not None and settings.model == "none":
         crossed = np.eye(3)
     elif radiance.crossed is not None:

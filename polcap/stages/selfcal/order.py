@@ -88,7 +88,8 @@ def judge(at: Rim, angle: Floats, margin: float, believable: float, beyond_sigma
     mean, _ = outline.mean_and_doubt(total, weight)
     here = _misfit(at, angle)
     best, best_score, doubt = stated, abs(mean), 0.0
-    rival, nearest = None, -np.inf
+    rival: Order | None = None
+    nearest = -np.inf
     for order, turned in hypotheses(angle).items():
         misfit = _misfit(at, turned)
         if order == stated or misfit > _CLOSES * here:
