@@ -65,14 +65,15 @@ def load(
     """
     path = Path(path)
     data = _bytes(path)
-    if later and device == "cpu" and digest(data) in _shipped():
+    mark = digest(data)
+    if later and device == "cpu" and mark in _shipped():
         metadata: Mapping[str, str] = onnx_metadata.read(data)
-        model = Model(path, partial(_reopen, path, digest(data), threads))
-        return Network(model, digest(data), _stated(path, metadata, encoding), metadata, CPU)
+        model = Model(path, partial(_reopen, path, mark, threads))
+        return Network(model, mark, _stated(path, metadata, encoding), metadata, CPU)
     import onnxruntime
 
-    if digest(data) not in _shipped():
-        _try(path, digest(data), encoding)
+    if mark not in _shipped():
+        _try(path, mark, encoding)
     if device == "cuda" and CUDA not in onnxruntime.get_available_providers():
         raise ModelError("--device cuda: this onnxruntime has no CUDA; install onnxruntime-gpu, or use --device cpu")
     wanted = [CPU] if device == "cpu" or CUDA not in onnxruntime.get_available_providers() else [CUDA, CPU]
@@ -82,7 +83,7 @@ def load(
         raise ModelError("--device cuda: CUDA does not start; make driver, CUDA and cuDNN fit, or use --device cpu")
     metadata = _metadata(path, session)
     channels = _check(path, session, metadata, encoding)
-    return Network(Model(path, lambda: session), digest(data), channels, metadata, provider)
+    return Network(Model(path, lambda: session), mark, channels, metadata, provider)
 
 
 def digest(data: bytes) -> str:
