@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bits, Floats, SensorImage
+from polcap.images import Floats, SensorImage
 from polcap.optics import sensor, sharpness
 
 Arrays = dict[str, NDArray[Any]]
@@ -49,7 +49,8 @@ def first(image: SensorImage, clip: float, most_pixels: float) -> tuple[dict[str
     times = max(1, int(np.ceil(np.sqrt(pixels / most_pixels))))
     corners = sharpness.places(image, clip)
     meta, arrays = take(image, clip, times, corners.tolist())
-    return meta | {"times": times, "superpixel": side}, arrays | {"corners": corners}
+    arrays["corners"] = corners
+    return meta | {"times": times, "superpixel": side}, arrays
 
 
 def take(image: SensorImage, clip: float, times: int, corners: list[list[int]]) -> tuple[dict[str, Any], Arrays]:
@@ -70,9 +71,12 @@ def take(image: SensorImage, clip: float, times: int, corners: list[list[int]]) 
     value = _means(image, times)
     value[shares > 0] = 1  # the stages drop a pixel of which a part is clipped
     tiles = sharpness.take(image, np.asarray(corners, np.int64).reshape(-1, 2), clip)
-    arrays = {"value": value, "clipped": shares, "light": tiles.light, "usable": tiles.usable}
-    known = {"camera_matrix": image.camera_matrix, "white_balance": image.white_balance}
-    return {"lossy": image.lossy}, arrays | {name: a for name, a in known.items() if a is not None}
+    arrays: Arrays = {"value": value, "clipped": shares, "light": tiles.light, "usable": tiles.usable}
+    if image.camera_matrix is not None:
+        arrays["camera_matrix"] = image.camera_matrix
+    if image.white_balance is not None:
+        arrays["white_balance"] = image.white_balance
+    return {"lossy": image.lossy}, arrays
 
 
 def joined(meta: dict[str, Any], arrays: Arrays) -> Glance:
@@ -99,7 +103,7 @@ def _means(image: SensorImage, times: int) -> Floats:
     black = np.broadcast_to(image.black, (2, 2))
     span = image.white - float(image.black.mean())
     for color in range(3):
-        here: Bits = image.cfa == color
+        here = image.cfa == color
         out[..., color] = (sites[here].mean(0) / times**2 - black[here].mean()) / span
     return out
 
