@@ -95,7 +95,7 @@ def test_both_parts_of_the_light_are_written(
 ) -> None:
     written: dict[str, set[str]] = {}
     keep: Callable[..., None] = lambda file, channels, half=False: written.update({file.name: set(channels)})  # noqa: E731
-    monkeypatch.setattr(maps_folder.exr, "write", keep)
+    monkeypatch.setattr("polcap.formats.maps.exr.write", keep)
     found = results[1]
     maps_folder.write(tmp_path, found.maps.value, found.mesh.value, found.stokes.value, found.cues.value)
     assert {"scattered.R", "mirrored.B"} <= written["cues.exr"]

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from msgspec import structs
 
-from polcap import pipeline
+from polcap import models
 from polcap.config import Config
 from polcap.formats import capture as captures
 from polcap.images import Capture, ChartRequest, Floats, Network, Quality
@@ -37,7 +37,7 @@ def main() -> None:
     parser.add_argument("--estimator", choices=("network", "analytic"))
     parser.add_argument("--no-chart", action="store_true")
     given = parser.parse_args()
-    network = pipeline.load_network(given.estimator, None, "cpu", 1)
+    network = models.load_network(given.estimator, None, "cpu", 1)
     print("| seed |", " | ".join(NAMES), "|\n|" + " --- |" * (len(NAMES) + 1))
     rows = []
     for seed in range(given.first_seed, given.first_seed + given.captures):
@@ -77,7 +77,7 @@ def measure(place: Path, seed: int, width: int, network: Network | None, chart: 
 def solved(capture: Capture, out: Path, network: Network | None, chart: str) -> Results:
     """The path's results."""
     request = ChartRequest("none" if chart == "none" else "auto")
-    supplied = UserInput(chart=request, network=network, mask_network=pipeline.load_mask_network(1))
+    supplied = UserInput(chart=request, network=network, mask_network=models.load_mask_network(1))
     return path(capture, supplied, Config(), Store(out))
 
 

@@ -52,7 +52,7 @@ def main() -> None:
     print(f"flagged {flagged.sum()}, refused {sum(state == 'fail' for state in states)}")
 
 
-def parts(radiance, object_, angle, true) -> list[str]:  # type: ignore[no-untyped-def]
+def parts(radiance, object_, angle, true) -> list[str]:
     """Error and doubt [%] of each shot's gain by each property alone."""
     x0, y0, x1, y1 = object_.crop
     mask = object_.mask[y0:y1, x0:x1]

@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from polcap.errors import CaptureError
+from polcap.images import AngleStack
 from polcap.stages import selfcal
 from polcap.stages.selfcal import order
 from tests import scenes
@@ -44,7 +45,7 @@ def main() -> None:
     print("in order:", dict(right), "\nout of order:", dict(wrong))
 
 
-def judged(case: lit_objects.Lit, radiance: lit_objects.AngleStack) -> str:
+def judged(case: lit_objects.Lit, radiance: AngleStack) -> str:
     """What becomes of a capture."""
     shots = len(radiance.angle)
     try:

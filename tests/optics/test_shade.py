@@ -96,7 +96,7 @@ def test_torch_and_numpy_agree() -> None:
     np.testing.assert_allclose(shade.stokes(*tensors).numpy(), shade.stokes(*arrays), rtol=1e-12)
 
 
-def polarized(normal, light, axis_deg, **material):  # type: ignore[no-untyped-def]
+def polarized(normal, light, axis_deg, **material):
     """(3,) Stokes parameters under a flash polarized along an axis of the picture."""
     axis = np.array([np.cos(np.radians(axis_deg)), np.sin(np.radians(axis_deg)), 0.0])
     across = axis - light * (axis @ light)

@@ -9,6 +9,7 @@ from polcap.errors import CaptureError
 from polcap.optics import mueller
 from polcap.stages import selfcal, stokes
 from polcap.stages.selfcal import grey_patches, object_gains, order
+from polcap.stages.selfcal.ring_zero import RingZero
 from tests import scenes
 
 GAIN = np.array([1.0, 1.013, 0.981])
@@ -158,15 +159,16 @@ def test_one_of_four_angles_that_was_not_what_it_is_called_is_found(victim):
 
 def test_a_calibrated_zero_and_the_outline_are_joined_by_their_errors():
     settings, deg = selfcal.Settings(), np.radians(1.0)
-    outline = selfcal.RingZero(0.6 * deg, 0.4 * deg)
+    outline = RingZero(0.6 * deg, 0.4 * deg)
     joined, correction = selfcal.corrected(outline, 0.01 * deg, settings)
     before = np.hypot(0.01, 0.3)  # a thread's play
     share = before**2 / (before**2 + 0.4**2)
     assert correction == joined.turn == pytest.approx(share * 0.6 * deg)
     assert joined.sigma == pytest.approx(before * 0.4 / np.hypot(before, 0.4) * deg)
-    vague = selfcal.RingZero(3 * deg, 2 * deg)
-    assert selfcal.corrected(vague, 0.01 * deg, settings) == (selfcal.RingZero(0.0, pytest.approx(before * deg)), 0.0)
-    another = selfcal.RingZero(5 * deg, 0.4 * deg)  # the filter was screwed on anew
+    vague = RingZero(3 * deg, 2 * deg)
+    alone, nothing = selfcal.corrected(vague, 0.01 * deg, settings)
+    assert alone.turn == nothing == 0 and alone.sigma == pytest.approx(before * deg)
+    another = RingZero(5 * deg, 0.4 * deg)  # the filter was screwed on anew
     assert selfcal.corrected(another, 0.01 * deg, settings) == (another, another.turn)
     assert selfcal.corrected(outline, None, settings) == (outline, 0.0)  # set by eye: within its error
 
