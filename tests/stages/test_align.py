@@ -58,7 +58,7 @@ def test_place_far_from_all_detail_is_known_as_badly_as_its_scatter_says():
         noise = np.random.default_rng(seed).normal(scale=0.03, size=(3, 160, 200, 3))
         value = np.asarray(light[..., None] + noise, np.float32)
         taken = dataclasses.replace(blank, value=value, quality=np.zeros((3, 160, 200), np.uint8))
-        a, b = (following.Detail(following.fine(taken, k, 4.0, 1)) for k in (0, 1))
+        a, b = (following.Detail(following.fine(taken.shot(k), 4.0, 1)) for k in (0, 1))
         way = following.refine(a, b, np.eye(3), "similarity")[0]
         off.append([np.hypot(*((way @ at)[:2] - at[:2])) / np.sqrt(2) for at in (near, far)])
         said.append([following.sigma_at(a, b, way, at) for at in (near, far)])

@@ -42,7 +42,7 @@ def _sizeable(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
     area = stats[:, cv2.CC_STAT_AREA].astype(float)
     area[0] = 0
     keep = (area > 0) & (area >= _SPECK * area.max())
-    return keep[labels].astype(np.uint8)
+    return np.asarray(keep[labels], np.uint8)
 
 
 def _filled(mask: NDArray[np.uint8], chance: Floats | None) -> NDArray[np.bool_]:
