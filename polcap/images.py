@@ -338,6 +338,7 @@ class Network:
     channels: tuple[str, ...]  # names of stages/cues, in order
     metadata: Mapping[str, str]
     provider: str
+    fine: "Network | None" = None  # what adds relief to this one's normals
 
 
 @dataclass(frozen=True)

@@ -93,9 +93,9 @@ class Protocol:
             clean = _measured(light, places, buffer.view, Errors.none(1, one.device))
         return Case(
             name=subject.name,
-            cues=cues.compute(stated, _white()),
-            clean=cues.compute(clean, _white()),
-            small=cues.compute(_binned(stated, max(1, round(self.size / _NATIVE))), _white()),
+            cues=cues.compute(stated, white()),
+            clean=cues.compute(clean, white()),
+            small=cues.compute(_binned(stated, max(1, round(self.size / _NATIVE))), white()),
             truth=_truth(subject),
             depth=_relative_depth(subject),
         )
@@ -247,5 +247,5 @@ def _relative_depth(subject: _Subject) -> Floats:
     return np.where(subject.places.mask, (subject.buffer.depth - middle) / unit, 0).astype(np.float32)
 
 
-def _white() -> ColorCalibration:
+def white() -> ColorCalibration:
     return ColorCalibration(np.eye(3, dtype=np.float32), None, None, None, "profile", 0.0, None)

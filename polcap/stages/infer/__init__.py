@@ -8,6 +8,7 @@ hand back camera-frame maps.
         body_law       which law of the body the DoLP follows, and the zenith it means
     body_light     albedo in highlights, where a crossed shot shows what lies under them
     learned        the network, joined with the inversion
+    fine           relief that the network is shown too small to see
         augmentation   the network's mean over turned and mirrored pictures
 """
 
@@ -29,6 +30,9 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Literal[1, 2, 4, 8],
         Meta(description="turned and mirrored positions in which the network sees the object; their mean is taken"),
     ] = 2
+    fine: Annotated[bool, Meta(description="a second network adds relief that the first is shown too small to see")] = (
+        True
+    )
 
 
 @stage(version=10)
@@ -43,5 +47,5 @@ def estimate(cues: Cues, network: Network | None, settings: Settings) -> Surface
     if network is None:
         maps = analytic.estimate(cues, settings.ior)
     else:
-        maps = learned.estimate(cues, network, settings.ior, settings.symmetries)
+        maps = learned.estimate(cues, network, settings.ior, settings.symmetries, fine_pass=settings.fine)
     return body_light.albedo(maps, cues, settings.ior)

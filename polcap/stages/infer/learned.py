@@ -13,7 +13,7 @@ from polcap.errors import ModelError
 from polcap.images import Cues, Floats, Network, Quality, SurfaceMaps
 from polcap.optics import frames
 from polcap.stages.cues import CHANNELS, FLOOR
-from polcap.stages.infer import augmentation
+from polcap.stages.infer import augmentation, fine
 from polcap.stages.infer.analytic import REACHED, fill_highlights, invert
 
 _INVERSION = 4.0  # factor on the inversion's expected error in the join: the network has seen what it has seen
@@ -25,7 +25,7 @@ _BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 _BRIGHTEST = 2.0  # S0, which is 1 where white paper faces the flash beside the chart; what no body reflects
 
 
-def estimate(cues: Cues, network: Network, ior: float, symmetries: int) -> SurfaceMaps:
+def estimate(cues: Cues, network: Network, ior: float, symmetries: int, *, fine_pass: bool) -> SurfaceMaps:
     """The network's maps, its normals joined with the analytic ones by their expected errors.
 
     The network sees the whole object at the size it was made for, which settles half-turns, shape and gloss.
@@ -42,30 +42,17 @@ def estimate(cues: Cues, network: Network, ior: float, symmetries: int) -> Surfa
         Refractive index of the inversion.
     symmetries
         1, 2, 4 or 8 turned and mirrored positions that the network looks from.
+    fine_pass
+        Whether the network's own fine pass, where it has one, adds relief.
 
     Raises
     ------
     ModelError
-        The network was made for other channels, or gives other maps.
+        A network was made for other channels, or gives other maps.
     """
-    _check(network)
-    size = cues.mask.shape[::-1]
-    shrink = max(1.0, max(size) / int(network.metadata["native_size"]))
-    bounded = _bounded(cues)
-    seen = _resized(bounded, 1 / shrink)
-    small = augmentation.mean(seen, network, symmetries)
-    # beside the object the network guesses: zeros there leave an edge's direction to the object's own pixels
-    small["normal"] = _without_grid(small["normal"], seen.mask) * seen.mask[..., None]
-    small["factor"] = _factor(small["diffuse"], seen)
-    for name in ("specular", "roughness"):
-        small[name] = _blended(small[name], seen.mask)
-    maps = {name: np.asarray(cv2.resize(image, size)) for name, image in small.items()}
-    ahead = maps["normal"] / np.maximum(_length(maps["normal"]), 1e-6)
-    guide = np.asarray(frames.to_ray_frame(ahead, cues.rays)), maps["sigma"]
-    by_pixel, doubt, _ = invert(cues, ior, guide)
-    detailed = _detailed(ahead, by_pixel, cues.mask, shrink)
-    normal, stated = _joined((ahead, maps["sigma"]), (detailed, _INVERSION * doubt))
-    diffuse = fill_highlights((np.maximum(cues.radiance, 0) + FLOOR) * np.exp(maps["factor"]) - FLOOR, bounded)
+    maps, guess, stated = known(cues, network, ior, symmetries)
+    normal = fine.refined(cues, guess, network.fine) if fine_pass and network.fine else guess.normal
+    diffuse = fill_highlights((np.maximum(cues.radiance, 0) + FLOOR) * np.exp(maps["factor"]) - FLOOR, _bounded(cues))
     scale, power, rougher, most = _CALIBRATION
     expected = np.minimum(scale * stated**power * np.exp(rougher * np.clip(maps["roughness"], 0, 1)), most)
     inside = cues.mask[..., None]
@@ -80,6 +67,32 @@ def estimate(cues: Cues, network: Network, ior: float, symmetries: int) -> Surfa
         view=cues.view,
         estimator=f"network {network.metadata.get('version', network.digest[:8])}",
     )
+
+
+def known(
+    cues: Cues, network: Network, ior: float, symmetries: int
+) -> tuple[dict[str, Floats], fine.Guess, Floats]:
+    """The network's maps at the crop's size, what the fine pass is told, and the error stated for its normals.
+
+    The maps' `factor` is the logarithm of albedo over S0. Training the fine pass begins here.
+    """
+    _check(network)
+    size = cues.mask.shape[::-1]
+    shrink = max(1.0, max(size) / int(network.metadata["native_size"]))
+    seen = _resized(_bounded(cues), 1 / shrink)
+    small = augmentation.mean(seen, network, symmetries)
+    # beside the object the network guesses: zeros there leave an edge's direction to the object's own pixels
+    small["normal"] = _without_grid(small["normal"], seen.mask) * seen.mask[..., None]
+    small["factor"] = _factor(small["diffuse"], seen)
+    for name in ("specular", "roughness"):
+        small[name] = _blended(small[name], seen.mask)
+    maps = {name: np.asarray(cv2.resize(image, size)) for name, image in small.items()}
+    ahead = maps["normal"] / np.maximum(_length(maps["normal"]), 1e-6)
+    guide = np.asarray(frames.to_ray_frame(ahead, cues.rays)), maps["sigma"]
+    by_pixel, doubt, _ = invert(cues, ior, guide)
+    detailed = _detailed(ahead, by_pixel, cues.mask, shrink)
+    normal, stated = _joined((ahead, maps["sigma"]), (detailed, _INVERSION * doubt))
+    return maps, fine.Guess(normal, ahead, maps["sigma"], maps["roughness"], shrink), stated
 
 
 def _bounded(cues: Cues) -> Cues:
@@ -116,7 +129,7 @@ def _blended(image: Floats, mask: NDArray[np.bool_]) -> Floats:
     return np.where(weight > 0, smooth / np.maximum(share, REACHED), image)
 
 
-def _detailed(coarse: Floats, fine: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:
+def _detailed(coarse: Floats, by_pixel: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:
     """Normals (H, W, 3) of one kind with what is finer than 2 px (1σ), seen `shrink` times smaller, of another.
 
     Interreflection, index and half-turns bend the inversion's normals over whole regions; relief is finer.
@@ -126,9 +139,9 @@ def _detailed(coarse: Floats, fine: Floats, mask: NDArray[np.bool_], shrink: flo
     inside = mask.astype(np.float32)
     difference, share = (
         cv2.GaussianBlur(cv2.resize(image, size, interpolation=cv2.INTER_AREA), (0, 0), _DETAIL)
-        for image in ((coarse - fine).astype(np.float32) * inside[..., None], inside)
+        for image in ((coarse - by_pixel).astype(np.float32) * inside[..., None], inside)
     )
-    moved = fine + cv2.resize(difference / np.maximum(share, 1e-3)[..., None], (width, height))
+    moved = by_pixel + cv2.resize(difference / np.maximum(share, 1e-3)[..., None], (width, height))
     return np.asarray(moved / np.maximum(_length(moved), 1e-6))
 
 

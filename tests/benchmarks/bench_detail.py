@@ -1,0 +1,105 @@
+"""How much fine relief the normals keep, with and without the fine pass: pictures of the evaluation at 1,024².
+
+    python -m tests.benchmarks.bench_detail DATA [--pictures 6] [--size 1024] [--protocol 1] [--store DIR] [--look PNG]
+
+Test meshes in test materials, whose relief training never draws. The normals' error is told apart into bands: finer
+than what the first network can see (its Nyquist wavelength is two of its pixels), from there to what the inversion
+adds, and coarser. Each is the rms of the difference of band-passed normals inside the object, eroded, in degrees.
+"""
+
+import argparse
+import json
+import pickle
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from polcap import pipeline
+from polcap.images import Floats, Network
+from polcap.stages import infer
+from polcap.training.protocol import Case, Protocol
+
+_ROOT = Path(__file__).parents[2]
+_HALF = 0.375  # σ of the Gaussian that halves a wave of two, in units of half its length: √(2 ln 2)/π
+_COARSE = 2.0  # px of the first network, 1σ: the fine pass and the inversion tell what is finer
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--pictures", type=int, default=6)
+    parser.add_argument("--size", type=int, default=1024)
+    parser.add_argument("--protocol", type=int, default=1)
+    parser.add_argument("--store", type=Path, help="folder that keeps the pictures from one run to the next")
+    parser.add_argument("--look", type=Path, help="PNG of a part of each picture: light, before, after, truth")
+    given = parser.parse_args()
+    network = pipeline.load_network("network", None, "cpu", 1)
+    rows, looks = [], []
+    for case in _cases(given.data, given.size, given.protocol, given.pictures, given.store):
+        before = infer.estimate(case.cues, network, infer.Settings(fine=False))
+        after = infer.estimate(case.cues, network, infer.Settings())
+        both = {"before": errors(before.normal, case, network), "after": errors(after.normal, case, network)}
+        rows.append({"picture": case.name, **both})
+        print(json.dumps(rows[-1]), flush=True)
+        looks.append(_look(case, before.normal, after.normal))
+    for band in rows[0]["before"]:
+        was, now = (float(np.mean([row[when][band] for row in rows])) for when in ("before", "after"))
+        print(f"{band:>16}  {was:6.2f}°  {now:6.2f}°  {100 * (now / was - 1):+.1f} %")
+    if given.look:
+        cv2.imwrite(str(given.look), np.concatenate(looks))
+
+
+def errors(normal: Floats, case: Case, network: Network | None) -> dict[str, float]:
+    """Mean angle, and rms by bands, degrees."""
+    native = 256 if network is None else int(network.metadata["native_size"])
+    shrink = max(1.0, max(case.cues.mask.shape) / native)
+    truth, inside = case.truth.normal, case.truth.mask & case.cues.mask
+    solid = cv2.erode(inside.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    off = (normal - truth) * inside[..., None]
+    fine, middle = off - _smooth(off, inside, _HALF * shrink), off - _smooth(off, inside, _COARSE * shrink)
+    angle = np.degrees(np.arccos(np.clip((normal * truth).sum(-1), -1, 1)))[solid]
+
+    def rms(image: Floats) -> float:
+        return float(np.degrees(np.sqrt((image[solid] ** 2).sum(-1).mean())))
+
+    return {
+        "mean": float(angle.mean()), "median": float(np.median(angle)), "beyond Nyquist": rms(fine),
+        "to 2 px": rms(middle - fine), "coarser": rms(off - middle),
+    }  # fmt: skip
+
+
+def _smooth(image: Floats, inside: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], sigma: float) -> Floats:
+    share = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), sigma)
+    return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma) / np.maximum(share, 1e-3)[..., None])
+
+
+def _cases(data: Path, size: int, protocol: int, count: int, store: Path | None):  # type: ignore[no-untyped-def]
+    made = None
+    for number in range(count):
+        path = None if store is None else store / f"detail_{protocol}_{size}_{number}.pkl"
+        if path is not None and path.exists():
+            yield pickle.loads(path.read_bytes())
+            continue
+        made = made or Protocol(data, size, protocol)
+        case = made.case(number)
+        if path is not None:
+            store.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(pickle.dumps(case))
+        yield case
+
+
+def _look(case: Case, *normals: Floats) -> Floats:
+    """The busiest part of a picture: its light, the normals, the truth."""
+    side = 320
+    inside = case.truth.mask.astype(np.float32)
+    relief = np.abs(case.truth.normal - _smooth(case.truth.normal, case.truth.mask, 6.0)).sum(-1) * inside
+    around = cv2.blur(relief, (side, side))[side // 2 : -side // 2, side // 2 : -side // 2]
+    y, x = np.unravel_index(int(around.argmax()), around.shape)
+    light = np.clip(case.cues.radiance, 0, 1) ** 0.45
+    shown = [light, *((n + 1) / 2 * case.cues.mask[..., None] for n in (*normals, case.truth.normal))]
+    return np.concatenate([(255 * part[y : y + side, x : x + side, ::-1]).astype(np.uint8) for part in shown], axis=1)
+
+
+if __name__ == "__main__":
+    main()

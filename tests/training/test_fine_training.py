@@ -1,0 +1,81 @@
+"""What the fine pass learns from, and that it learns."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from polcap.formats import onnx
+from polcap.stages.infer import fine
+from polcap.training import fine_train, relief
+
+COUNT = len(fine.CHANNELS)
+
+
+@pytest.fixture
+def picture() -> NDArray[np.float16]:
+    """Waves that the first network saw and that the normals so far lack."""
+    rng = np.random.default_rng(2)
+    out = np.zeros((COUNT + 4, 160, 200), np.float32)
+    wave = 0.3 * np.sin(np.arange(200) * 2 * np.pi / 8 + rng.uniform(0, 6, (160, 1)))
+    out[fine.CHANNELS.index("smooth_x")] = wave
+    for first in (fine.CHANNELS.index("normal_x"), COUNT):
+        out[first + 2] = 1
+    out[COUNT] = wave / np.sqrt(1 + wave**2)
+    out[COUNT + 2] = 1 / np.sqrt(1 + wave**2)
+    out[COUNT - 1], out[-1] = np.log(2.0), 1
+    return out.astype(np.float16)
+
+
+def test_slopes_are_those_of_a_surface() -> None:
+    """The gradient of a height has no curl: what it adds up to does not depend on the way."""
+    rng = np.random.default_rng(0)
+    place = rng.uniform(-1, 1, (200, 3))
+    step = 1e-4
+    for seed in range(8):
+        def at(shift: NDArray[np.float64], seed: int = seed) -> NDArray[np.float64]:
+            height, _ = relief._waves(place + shift, 0.1, np.random.default_rng(seed))
+            return np.asarray(height)
+
+        _, gradient = relief._waves(place, 0.1, np.random.default_rng(seed))
+        for axis, way in enumerate(np.eye(3)):
+            measured = (at(step * way) - at(-step * way)) / (2 * step)
+            assert np.abs(measured - gradient[:, axis]).max() < 1e-2 * np.abs(gradient).max()
+        slope = relief.slopes(place, 0.01, np.random.default_rng(seed))
+        assert slope.shape == (200, 3) and np.linalg.norm(slope, axis=1).max() < 1.3
+
+
+def test_bent_normals_lean_away_from_the_slope() -> None:
+    up, slope = np.array([[0.0, 0, 1]]), np.array([[0.5, 0, 0.7]])
+    assert np.allclose(relief.bent(up, slope), np.array([[-0.5, 0, 1]]) / np.sqrt(1.25), atol=1e-6)
+
+
+def test_a_scene_turned_four_times_is_itself(picture: NDArray[np.float16]) -> None:
+    rng = np.random.default_rng(3)
+    shown = rng.normal(size=(COUNT + 4, 16, 16)).astype(np.float32)
+    twice = fine_train.turned(fine_train.turned(shown, 1, False), 3, False)
+    assert np.allclose(twice, shown)
+    assert np.allclose(fine_train.turned(fine_train.turned(shown, 0, True), 0, True), shown)
+    right = np.zeros_like(shown)
+    right[COUNT] = 1  # relief to the right: after a quarter turn counter-clockwise it points up
+    assert np.allclose(fine_train.turned(right, 1, False)[COUNT + 1], 1)
+
+
+def test_it_learns_and_ships(tmp_path: Path, picture: NDArray[np.float16]) -> None:
+    file = tmp_path / "00000.npy"
+    np.save(file, picture)
+    torch.manual_seed(0)
+    run = fine_train.Run(3e-3)
+    rng = np.random.default_rng(0)
+    losses = [run.advance([file], 0.0, rng) for _ in range(40)]
+    assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:5])
+    run.save(tmp_path / "last.pt")
+    path = fine_train.ship(tmp_path / "last.pt", tmp_path / "fine.onnx")
+    network = onnx.load(path, threads=1, encoding=fine.ENCODING)
+    assert network.channels == fine.CHANNELS
+    shown = fine_train.taught(file)[:COUNT].astype(np.float32)[None]
+    with torch.no_grad():
+        own = fine_train.averaged(run.average)(torch.from_numpy(shown)).numpy()
+    assert np.abs(network.run(shown)["relief"] - own).max() < 2e-3  # weights in halves
