@@ -2,14 +2,17 @@
 
     python -m tests.benchmarks.bench_detail DATA [--pictures 6] [--size 1024] [--protocol 1] [--store DIR] [--look PNG]
 
-Test meshes in test materials, whose relief training never draws. The normals' error is told apart into bands: finer
-than what the first network can see (its Nyquist wavelength is two of its pixels), from there to what the inversion
-adds, and coarser. Each is the rms of the difference of band-passed normals inside the object, eroded, in degrees.
+Test meshes in test materials, engraved with lettering, a relief that training never draws. The normals' error is told
+apart into bands: finer than what the first network can see (its Nyquist wavelength is two of its pixels), from there to
+what the inversion adds, and coarser. Each is the rms of the difference of band-passed normals inside the object,
+eroded, in degrees.
 """
 
 import argparse
 import json
 import pickle
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -22,6 +25,8 @@ from polcap.training.protocol import Case, Protocol
 
 _ROOT = Path(__file__).parents[2]
 _HALF = 0.375  # σ of the Gaussian that halves a wave of two, in units of half its length: √(2 ln 2)/π
+_TEXELS, _PERIOD = 1024, 0.6  # of the lettering; its length in sides of the object
+_DEEP = 0.7  # its steepest slope
 _COARSE = 2.0  # px of the first network, 1σ: the fine pass and the inversion tell what is finer
 
 
@@ -74,17 +79,43 @@ def _smooth(image: Floats, inside: np.ndarray[tuple[int, ...], np.dtype[np.bool_
     return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma) / np.maximum(share, 1e-3)[..., None])
 
 
-def _cases(data: Path, size: int, protocol: int, count: int, store: Path | None):  # type: ignore[no-untyped-def]
+class Lettering:
+    """Words cut into the three coordinate planes of an object whose longest side is 1."""
+
+    def __init__(self) -> None:
+        drawn = np.zeros((_TEXELS, _TEXELS), np.uint8)
+        for row, word in enumerate(("polarize", "0 45 90", "Stokes", "relief", "ABC xyz")):
+            at = (12 + 9 * row, int((row + 0.75) * _TEXELS / 5))
+            cv2.putText(drawn, word, at, cv2.FONT_HERSHEY_DUPLEX, 3.2, 255, 6, cv2.LINE_AA)
+        height = cv2.GaussianBlur(drawn.astype(np.float32), (0, 0), 2.0)
+        slope = np.stack([np.gradient(height, axis=1), np.gradient(height, axis=0)], axis=-1)
+        self.slope = (_DEEP * slope / np.abs(slope).max()).astype(np.float32)
+
+    def __call__(self, place: Floats, facing: Floats) -> Floats:
+        """Gradient (M, 3) of the relief at places (M, 3) that face (M, 3)."""
+        axis = np.abs(facing).argmax(axis=1)
+        rows = np.arange(len(place))
+        along = np.stack([(axis + 1) % 3, (axis + 2) % 3], axis=1)
+        texel = np.floor(np.mod(np.stack([place[rows, k] for k in along.T], axis=1) / _PERIOD, 1) * _TEXELS).astype(int)
+        out = np.zeros(place.shape, np.float32)
+        for k in (0, 1):
+            out[rows, along[:, k]] = self.slope[texel[:, 1], texel[:, 0], k]
+        return out
+
+
+def _cases(data: Path, size: int, protocol: int, count: int, store: Path | None) -> Iterator[Case]:
     made = None
     for number in range(count):
-        path = None if store is None else store / f"detail_{protocol}_{size}_{number}.pkl"
+        path = None if store is None else store / f"lettered_{protocol}_{size}_{number}.pkl"
         if path is not None and path.exists():
             yield pickle.loads(path.read_bytes())
             continue
-        made = made or Protocol(data, size, protocol)
+        if made is None:
+            made = Protocol(data, size, protocol)
+            made.materials = [replace(one, slope=Lettering()) for one in made.materials]
         case = made.case(number)
         if path is not None:
-            store.mkdir(parents=True, exist_ok=True)
+            path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(pickle.dumps(case))
         yield case
 
