@@ -20,7 +20,7 @@ def load_network(
     Parameters
     ----------
     estimator, model
-        As the user names them; the one that is shipped brings its fine pass.
+        As the user names them.
     device, threads, later
         As in `onnx.load`.
 
@@ -33,20 +33,27 @@ def load_network(
         if model is not None:
             raise SettingError("--model and --estimator analytic exclude each other; leave one out")
         return None
-    if model is None:
-        shipped = sorted(calib.data_path("colorchecker").parent.glob("models/polcap*.onnx"))
-        if not shipped and (estimator == "network" or device == "cuda"):
+    named = model or _newest("polcap")
+    if named is None:
+        if estimator == "network" or device == "cuda":
             raise ModelError("this polcap ships no model; name one with --model, or use --estimator analytic")
-        if not shipped:
-            return None
-        beside = _shipped("fine", device, threads, fine.ENCODING, later)
-        return replace(onnx.load(shipped[-1], device, threads, later=later), fine=beside)
-    return onnx.load(model, device, threads, later=later)
+        return None
+    return open_network(named, device, threads, later)
+
+
+def open_network(path: Path, device: onnx.Device = "cpu", threads: int = 0, later: bool = False) -> Network:
+    """An estimator's model; the one that polcap ships brings its fine pass, which was trained with it alone."""
+    network = onnx.load(path, device, threads, later=later)
+    own, relief = _newest("polcap"), _newest("fine")
+    if own is None or relief is None or (path != own and network.digest != onnx.digest(own.read_bytes())):
+        return network
+    return replace(network, fine=onnx.load(relief, device, threads, fine.ENCODING, later))
 
 
 def load_mask_network(threads: int = 0, later: bool = False) -> Network | None:
     """The network that finds the object, as shipped; None where this polcap ships none."""
-    return _shipped("mask", "cpu", threads, mask_channels.ENCODING, later)
+    found = _newest("mask")
+    return onnx.load(found, "cpu", threads, mask_channels.ENCODING, later) if found else None
 
 
 def shipped() -> tuple[Network | None, Network | None]:
@@ -54,7 +61,7 @@ def shipped() -> tuple[Network | None, Network | None]:
     return load_network(None, None, "cpu", 0), load_mask_network()
 
 
-def _shipped(name: str, device: onnx.Device, threads: int, encoding: str, later: bool) -> Network | None:
-    """The newest model of a name that comes with polcap, if any does."""
+def _newest(name: str) -> Path | None:
+    """The last model of a name that comes with polcap."""
     files = sorted(calib.data_path("colorchecker").parent.glob(f"models/{name}*.onnx"))
-    return onnx.load(files[-1], device, threads, encoding, later) if files else None
+    return files[-1] if files else None

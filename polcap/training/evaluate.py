@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from polcap.formats import atomic, onnx, png
+from polcap import models
+from polcap.formats import atomic, png
 from polcap.images import Cues, Network, SurfaceMaps
 from polcap.stages import cues, infer
 from polcap.training import baselines, panel, protocol, tables
@@ -55,7 +56,7 @@ class Params:
 def main(params: Params) -> dict[str, Score]:
     """Score all columns; writes out/evaluation.json, out/evaluation.md and out/panel.png."""
     torch.set_num_threads(1)
-    network = onnx.load(params.model)
+    network = models.open_network(params.model)
     found = {} if params.ablations is None else baselines.checkpoints(params.ablations)
     head = _head(params, network, found)
     made = Protocol(params.data, params.size, params.protocol)
@@ -179,7 +180,7 @@ class Bench:
 
     def __init__(self, params: Params, means: Means) -> None:
         self.made = Protocol(params.data, params.size, params.protocol)
-        network = onnx.load(params.model, threads=1)
+        network = models.open_network(params.model, threads=1)
         found = {} if params.ablations is None else baselines.checkpoints(params.ablations)
         self.columns: dict[str, Estimator] = {
             OURS: lambda case: _estimated(case.cues, network),

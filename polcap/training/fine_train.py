@@ -144,7 +144,8 @@ class Run:
 def averaged(weights: dict[str, Tensor]) -> fine_model.Network:
     network = fine_model.Network()
     network.load_state_dict(weights)
-    return network.eval()
+    network.eval()
+    return network
 
 
 @cache

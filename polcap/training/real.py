@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap import models
 from polcap.config import Config
 from polcap.errors import InputError
-from polcap.formats import atomic, onnx, png
+from polcap.formats import atomic, png
 from polcap.formats import capture as captures
 from polcap.images import ChartRequest, Floats, Network
 from polcap.path import UserInput, path
@@ -42,7 +43,7 @@ def main(folder: Path, model: Path, out: Path) -> dict[str, Score]:
         The folder has not this layout.
     """
     names, angles = _contents(folder)
-    network = onnx.load(model)
+    network = models.open_network(model)
     rows: dict[str, dict[str, Score]] = {
         name: {"ours": scored(folder, angles, name, network), "analytic": scored(folder, angles, name, None)}
         for name in names

@@ -18,7 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from polcap import pipeline
+from polcap import models
 from polcap.images import Floats, Network
 from polcap.stages import infer
 from polcap.training.protocol import Case, Protocol
@@ -39,7 +39,7 @@ def main() -> None:
     parser.add_argument("--store", type=Path, help="folder that keeps the pictures from one run to the next")
     parser.add_argument("--look", type=Path, help="PNG of a part of each picture: light, before, after, truth")
     given = parser.parse_args()
-    network = pipeline.load_network("network", None, "cpu", 1)
+    network = models.load_network("network", None, "cpu", 1)
     rows, looks = [], []
     for case in _cases(given.data, given.size, given.protocol, given.pictures, given.store):
         before = infer.estimate(case.cues, network, infer.Settings(fine=False))

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from polcap.formats import onnx
+from polcap import models
 from polcap.images import Cues
 from polcap.optics import frames
 from polcap.stages import infer
@@ -26,13 +26,11 @@ from polcap.stages.cues import channels
 from polcap.stages.infer import augmentation, learned
 from polcap.training.protocol import Protocol
 
-_SHIPPED = Path(__file__).parents[2] / "calib" / "models" / "polcap.onnx"
-
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path, help="folder with meshes/ and materials/")
-    parser.add_argument("--model", type=Path, default=_SHIPPED)
+    parser.add_argument("--model", type=Path, help="by default what is shipped, with its fine pass")
     parser.add_argument("--symmetries", type=int, default=infer.Settings().symmetries, help="positions averaged")
     options = parser.parse_args()
     seen = Protocol(options.data, 512).case(0).cues
@@ -43,9 +41,10 @@ def main() -> None:
         print(f"| {512 * times}² | {stage:.2f} | {floor:.2f} | {stage / floor:.1f} | {peak:.2f} |", flush=True)
 
 
-def _measured(seen: Cues, model: Path, symmetries: Literal[1, 2, 4, 8]) -> tuple[float, float, float]:
+def _measured(seen: Cues, model: Path | None, symmetries: Literal[1, 2, 4, 8]) -> tuple[float, float, float]:
     """Best seconds of the stage, of one run of the network at its own size; greatest resident memory, GB."""
-    network = onnx.load(model)
+    network = models.load_network("network", model, "cpu", 0)
+    assert network is not None
     small = learned._resized(seen, int(network.metadata["native_size"]) / max(seen.mask.shape))
     settings = infer.Settings(symmetries=symmetries)
     floor = _best(lambda: augmentation._run(channels(small), network))
