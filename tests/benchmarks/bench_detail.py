@@ -40,13 +40,14 @@ def main() -> None:
     parser.add_argument("--look", type=Path, help="PNG of a part of each picture: light, before, after, truth")
     given = parser.parse_args()
     network = models.load_network("network", None, "cpu", 1)
-    rows, looks = [], []
+    rows: list[dict[str, dict[str, float]]] = []
+    looks: list[Floats] = []
     for case in _cases(given.data, given.size, given.protocol, given.pictures, given.store):
         before = infer.estimate(case.cues, network, infer.Settings(fine=False))
         after = infer.estimate(case.cues, network, infer.Settings())
         both = {"before": errors(before.normal, case, network), "after": errors(after.normal, case, network)}
-        rows.append({"picture": case.name, **both})
-        print(json.dumps(rows[-1]), flush=True)
+        rows.append(both)
+        print(json.dumps({"picture": case.name, **both}), flush=True)
         looks.append(_look(case, before.normal, after.normal))
     for band in rows[0]["before"]:
         was, now = (float(np.mean([row[when][band] for row in rows])) for when in ("before", "after"))
