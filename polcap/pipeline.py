@@ -221,7 +221,7 @@ def _written_before(
     same: dict[str, Any] = {
         "capture": report.capture_facts(capture),
         "versions": provenance.versions(),
-        "model": None if network is None else {**network.metadata, "digest": network.digest},
+        "model": report.model_facts(network),
         "keys": {kept.name: kept.key for kept in vars(results).values()},
         "settings": msgspec.to_builtins(config),
     }
@@ -262,11 +262,10 @@ def _files(out: Path) -> dict[str, list[int]]:
 
 def _remember_run(out: Path, capture: Capture, config: Config, network: Network | None) -> None:
     """work/run.json: what `show` and `report` need when the photographs are gone."""
-    model = None if network is None else {**network.metadata, "digest": network.digest}
     about = {
         "capture": report.capture_facts(capture),
         "settings": msgspec.to_builtins(config),
-        "model": model,
+        "model": report.model_facts(network),
         "versions": provenance.versions(),
     }
     text = json.dumps({**about, "digest": seal(about)}, indent=1)

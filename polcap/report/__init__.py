@@ -203,14 +203,16 @@ def document(
         "figures": found,
         "units": labels.units(bool(found["mesh"]["metric"])),
         "timings": dict(timings),
-        "model": None if network is None else _model(network),
+        "model": model_facts(network),
         "keys": {kept.name: kept.key for kept in vars(results).values()},
         "settings": msgspec.to_builtins(config),
     }
 
 
-def _model(network: Network) -> dict[str, str]:
-    """What a model says of itself, its digest and that of its fine pass."""
+def model_facts(network: Network | None) -> dict[str, str] | None:
+    """What a model says of itself, its digest and that of its fine pass; None for the analytic estimator."""
+    if network is None:
+        return None
     beside = {} if network.fine is None else {"fine": network.fine.digest}
     return {**network.metadata, "digest": network.digest, **beside}
 
