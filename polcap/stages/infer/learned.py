@@ -72,9 +72,18 @@ def estimate(cues: Cues, network: Network, ior: float, symmetries: int, *, fine_
 def known(
     cues: Cues, network: Network, ior: float, symmetries: int
 ) -> tuple[dict[str, Floats], fine.Guess, Floats]:
-    """The network's maps at the crop's size, what the fine pass is told, and the error stated for its normals.
+    """What stands before the fine pass, whose training begins here too.
 
-    The maps' `factor` is the logarithm of albedo over S0. Training the fine pass begins here.
+    Parameters
+    ----------
+    cues, network, ior, symmetries
+        As in `estimate`.
+
+    Returns
+    -------
+    tuple
+        The network's maps (H, W[, 3]) at the crop's size, of which `factor` is the logarithm of albedo over S0; what
+        the fine pass is told; the error (H, W) stated for the normals, degrees.
     """
     _check(network)
     size = cues.mask.shape[::-1]
