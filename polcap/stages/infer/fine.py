@@ -28,7 +28,7 @@ GUESSED = (
 CHANNELS = (*seen.CHANNELS, *GUESSED)
 SIZE_MULTIPLE = 8
 COARSEST = 2.0  # pixels that the first network sees, 1σ: what is coarser is not the fine pass's to tell
-_TILE, _MARGIN = 256, 24  # px; the margin is more than the network looks far
+_TILE, _MARGIN = 512, 64  # px, multiples of SIZE_MULTIPLE; the network looks 62 px far
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from polcap import models
 from polcap.errors import ModelError
 from polcap.images import Cues, Floats, Network, View
 from polcap.optics import frames
@@ -43,7 +44,17 @@ def network(relief: Floats | None = None) -> Network:
     return Network(run, "0" * 32, fine.CHANNELS, {"native_size": "256", "size_multiple": "8"}, "CPU")
 
 
-def test_relief_moves_the_normals_and_tiles_leave_no_seam(seen: Cues, guess: fine.Guess) -> None:
+def test_tiles_leave_no_seam(seen: Cues, guess: fine.Guess, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The shipped network sees the same about a pixel in a tile as in the whole picture."""
+    found = models.load_network("network", None, "cpu", 1)
+    assert found is not None and found.fine is not None
+    whole = fine.refined(seen, guess, found.fine)
+    monkeypatch.setattr(fine, "_TILE", 64)
+    assert np.abs(fine.refined(seen, guess, found.fine) - whole).max() < 1e-4
+
+
+def test_relief_moves_the_normals(seen: Cues, guess: fine.Guess, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fine, "_TILE", 128)
     normal = fine.refined(seen, guess, network())
     whole = fine.finer(np.stack([fine.encode(seen, guess)[0], *np.zeros((2, SIDE, SIDE))], -1), seen.mask, 2.0)
     local = frames.to_ray_frame(normal, seen.rays)
