@@ -171,10 +171,14 @@ def digest(folder: Path) -> str:
         A file is missing.
     """
     try:
-        said = {name: value for name, value in text_file.read_json(folder / "maps.json").items() if name != "exports"}
-        files = [npy_folder.checksum(folder / name) for name in _READ]
+        said = msgspec.convert(text_file.read_json(folder / "maps.json"), dict[str, Any])
     except (OSError, ValueError) as error:
+        raise DecodeError(f"{folder / 'maps.json'} is not as polcap wrote it ({error}); process again") from error
+    try:
+        files = [npy_folder.checksum(folder / name) for name in _READ]
+    except OSError as error:
         raise DecodeError(f"{folder} is not as polcap wrote it ({error}); process again") from error
+    said.pop("exports", None)
     return blake2b(json.dumps([said, files], sort_keys=True).encode(), digest_size=16).hexdigest()
 
 

@@ -20,7 +20,7 @@ _ANY_LIKENESS = 0.4  # where nothing moved; noise and an even backdrop have less
 
 
 def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> Floats:
-    """How far the object surely moved against its surroundings, (K,) px of the grid: three errors less than it seems.
+    """How far the object moved against its surroundings, (K,) px of the grid; 0 within three errors of both places.
 
     NaN where either has no detail to be followed, infinite where the surroundings are the same and the object is not.
     """
@@ -51,7 +51,8 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
             at = [(transform @ middle)[:2] / (transform @ middle)[2] for transform, _ in found]
             inner, outer = (sigma_at(region, shot, way, middle) for region, (way, _) in zip(regions, found))
             doubt = float(np.hypot(inner, outer))
-            apart[k] = step * max(float(np.hypot(*(at[0] - at[1]))) - _SURE_SIGMAS * doubt, 0.0)
+            seems = float(np.hypot(*(at[0] - at[1])))
+            apart[k] = step * seems if seems > _SURE_SIGMAS * doubt else 0.0
     return apart
 
 

@@ -54,8 +54,8 @@ def decimated(mesh: Mesh, view: View, share: float, back: Back) -> Decimated:
         raise ObjectError(
             f"{len(mesh.faces)} triangles × {share:g} leave {count}, under {_FEWEST}; ask for fewer levels"
         )
-    points, faces = fast_simplification.simplify(
-        np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.int32), target_count=count
+    points, faces = fast_simplification.simplify(  # which takes no read-only arrays
+        np.array(mesh.vertices, np.float32), np.array(mesh.faces, np.int32), target_count=count
     )
     vertices = np.asarray(points, dtype=np.float64)
     height, width = mesh.depth.shape
