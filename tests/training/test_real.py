@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from polcap.errors import InputError
-from polcap.formats import onnx, png
+from polcap import models
+from polcap.formats import png
 from polcap.images import Floats
 from polcap.optics import fresnel
 from polcap.training import real
@@ -39,7 +40,7 @@ def _write(file: Path, picture: Floats) -> None:
 
 
 def test_a_ball_in_this_layout_is_scored(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(onnx, "load", lambda path: network())
+    monkeypatch.setattr(models, "open_network", lambda path: network())
     table = real.main(folder, Path("model.onnx"), tmp_path)
     # the lens is not stated, 50 mm is assumed: rays of the ball's side are off by 13°
     assert table["analytic"]["mean"] < 9 and table["analytic"]["covered"] > 0.97
