@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polcap.errors import InputError
 from polcap import models
+from polcap.errors import InputError
 from polcap.formats import png
 from polcap.images import Floats
 from polcap.optics import fresnel
