@@ -26,5 +26,5 @@ The object's mask has a network of its own: mask_views traces objects before a b
 lights them, mask_pictures keeps them as files, mask_model learns from those in mask_train.
 
 The fine pass has one too: relief bends traced normals, fine_pictures photographs them and asks the first network,
-fine_model learns what is missing in fine_train.
+fine_model learns what is missing in fine_train. Both learn in a small_run.
 """

@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from polcap.errors import InputError
-from polcap.formats import atomic, onnx
+from polcap.formats import onnx
 from polcap.images import Floats
 from polcap.stages.infer import fine
 from polcap.training import export, fine_model, fine_pictures
-from polcap.training.train import Muon
+from polcap.training.small_run import SmallRun
 
 _PICTURES, _TILES, _TILE = 4, 4, 96  # pictures a step, tiles of each, their side, px
 _HELD = 24  # pictures that are only looked at
-_WARM, _HOLD = 30, 0.35  # steps; share of the budget at the full learning rate
+_WARM, _KEEP = 30, 0.995  # steps over which the rate rises; share of the average that a step leaves
 _DOUBLED = tuple(fine.CHANNELS.index(name) for name in ("s1", "zenith_x", "cos_2phi"))  # and the channel after each
 _VECTORS = tuple(fine.CHANNELS.index(name) for name in ("ray_x", "normal_x", "smooth_x"))
 _NORMAL, _COUNT = fine.CHANNELS.index("normal_x"), len(fine.CHANNELS)
@@ -78,38 +78,19 @@ def main(params: Params) -> Path:
     return ship(last, params.out / "fine.onnx")
 
 
-class Run:
-    """Network, moving average of its weights, optimizers."""
+class Run(SmallRun):
+    """The network in training, by its own pictures."""
 
     def __init__(self, rate: float) -> None:
-        self.network = fine_model.Network().to(memory_format=torch.channels_last)
-        self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
-        hidden: list[Tensor] = []
-        others: list[Tensor] = []
-        for name, weight in self.network.named_parameters():
-            outer = weight.ndim <= 1 or name.split(".")[0] in ("stem", "raw", "out")
-            (others if outer else hidden).append(weight)
-        self.optimizers = [Muon(hidden, rate), torch.optim.AdamW(others, 0.5 * rate, betas=(0.9, 0.98))]
-        for group in (g for optimizer in self.optimizers for g in optimizer.param_groups):
-            group["full"] = group["lr"]
-        self.step, self.elapsed = 0, 0.0
+        super().__init__(fine_model.Network(), rate, _WARM, _KEEP)
 
     def advance(self, files: list[Path], progress: float, rng: np.random.Generator) -> float:
         """One step; its loss."""
-        fall = min(1.0, (1 - min(progress, 1.0)) / (1 - _HOLD)) * min(1.0, (self.step + 1) / _WARM)
-        for group in (g for optimizer in self.optimizers for g in optimizer.param_groups):
-            group["lr"] = group["full"] * fall
+        self.pace(progress)
         drawn = [tile(taught(file), rng) for file in files for _ in range(_TILES)]
         loss = fine_model.loss(*answered(self.network, np.stack(drawn)))
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0, foreach=True)
-        for optimizer in self.optimizers:
-            optimizer.step()
-            optimizer.zero_grad()
-        self.step += 1
-        keep = min(0.995, (1 + self.step) / (10 + self.step))
-        with torch.no_grad():
-            torch._foreach_lerp_(list(self.average.values()), list(self.network.state_dict().values()), 1 - keep)
+        self.learn()
         return float(loss.detach())
 
     def judge(self, files: list[Path]) -> tuple[float, float]:
@@ -124,21 +105,6 @@ class Run:
             left.append(float((((relief - target) * known) ** 2).sum() / known.sum()))
             whole.append(float(((target * known) ** 2).sum() / known.sum()))
         return float(np.sqrt(np.mean(left))), float(np.sqrt(np.mean(whole)))
-
-    def save(self, path: Path) -> None:
-        state = {
-            "network": self.network.state_dict(), "average": self.average, "step": self.step, "elapsed": self.elapsed,
-            "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
-        }  # fmt: skip
-        with atomic.path(path) as beside:
-            torch.save(state, beside)
-
-    def load(self, path: Path) -> None:
-        state = torch.load(path, weights_only=True)
-        self.network.load_state_dict(state["network"])
-        self.average, self.step, self.elapsed = state["average"], state["step"], state["elapsed"]
-        for optimizer, held in zip(self.optimizers, state["optimizers"]):
-            optimizer.load_state_dict(held)
 
 
 def averaged(weights: dict[str, Tensor]) -> fine_model.Network:

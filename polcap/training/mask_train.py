@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from polcap.errors import InputError
-from polcap.formats import atomic
 from polcap.images import Floats
 from polcap.stages.mask.mask_channels import CHANNELS, ENCODING, SIZE_MULTIPLE, Look, brightness, encode
 from polcap.training import export, mask_model, mask_pictures
-from polcap.training.train import Muon
+from polcap.training.small_run import SmallRun
 
 _BATCH, _PARTS, _PART = 8, 4, (96, 128)  # pictures a step, of how many a part is looked at; its height, width, px
 _WHOLE = (80, 96, 112, 128, 144)  # px of the first look's width: drawn for each step
@@ -31,7 +30,7 @@ _AGAIN = 0.3  # of the steps look at the parts twice and learn from the second
 WHOLE = 112  # px of the longer side at the first look
 _HELD = 40  # pictures that are only looked at
 _LAID = 0.12  # of the pictures have another one's object laid into them
-_WARM, _HOLD = 50, 0.35  # steps; share of the budget at the full learning rate
+_WARM, _KEEP = 50, 0.998  # steps over which the rate rises; share of the average that a step leaves
 
 
 @dataclass(frozen=True)
@@ -77,27 +76,15 @@ def main(params: Params) -> Path:
     return ship(last, params.out / "mask.onnx")
 
 
-class Run:
-    """Network, moving average of its weights, optimizers."""
+class Run(SmallRun):
+    """The network in training, by its own pictures."""
 
     def __init__(self, rate: float) -> None:
-        self.network = mask_model.Network().to(memory_format=torch.channels_last)
-        self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
-        hidden: list[Tensor] = []
-        others: list[Tensor] = []
-        for name, weight in self.network.named_parameters():
-            outer = weight.ndim <= 1 or name.split(".")[0] in ("stem", "raw", "out")
-            (others if outer else hidden).append(weight)
-        self.optimizers = [Muon(hidden, rate), torch.optim.AdamW(others, 0.5 * rate, betas=(0.9, 0.98))]
-        for group in (g for optimizer in self.optimizers for g in optimizer.param_groups):
-            group["full"] = group["lr"]
-        self.step, self.elapsed = 0, 0.0
+        super().__init__(mask_model.Network(), rate, _WARM, _KEEP)
 
     def advance(self, files: list[Path], progress: float, rng: np.random.Generator) -> tuple[float, float]:
         """One step; the two looks' losses."""
-        fall = min(1.0, (1 - min(progress, 1.0)) / (1 - _HOLD)) * min(1.0, (self.step + 1) / _WARM)
-        for group in (g for optimizer in self.optimizers for g in optimizer.param_groups):
-            group["lr"] = group["full"] * fall
+        self.pace(progress)
         others = [files[n - 1] if rng.random() < _LAID else None for n in range(len(files))]
         drawn = [mask_pictures.drawn(file, rng, other) for file, other in zip(files, others)]
         width = int(rng.choice(_WHOLE))
@@ -113,14 +100,7 @@ class Run:
                 shown[:, CHANNELS.index("chance")] = 2 * torch.sigmoid(self.network(shown)[:, 0]) - 1
         fine = mask_model.loss(self.network(shown), stacked([t for _, t in parts]))
         fine.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0, foreach=True)
-        for optimizer in self.optimizers:
-            optimizer.step()
-            optimizer.zero_grad()
-        self.step += 1
-        keep = min(0.998, (1 + self.step) / (10 + self.step))
-        with torch.no_grad():
-            torch._foreach_lerp_(list(self.average.values()), list(self.network.state_dict().values()), 1 - keep)
+        self.learn()
         return float(coarse.detach()), float(fine.detach())
 
     def judge(self, files: list[Path]) -> tuple[Floats, Floats]:
@@ -137,21 +117,6 @@ class Run:
             found[0].append(iou(hint > 0.5, truth > 0.5))
             found[1].append(iou(fine > 0, truth > 0.5))
         return np.array(found[0]), np.array(found[1])
-
-    def save(self, path: Path) -> None:
-        state = {
-            "network": self.network.state_dict(), "average": self.average, "step": self.step, "elapsed": self.elapsed,
-            "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
-        }  # fmt: skip
-        with atomic.path(path) as beside:
-            torch.save(state, beside)
-
-    def load(self, path: Path) -> None:
-        state = torch.load(path, weights_only=True)
-        self.network.load_state_dict(state["network"])
-        self.average, self.step, self.elapsed = state["average"], state["step"], state["elapsed"]
-        for optimizer, held in zip(self.optimizers, state["optimizers"]):
-            optimizer.load_state_dict(held)
 
 
 def averaged(weights: dict[str, Tensor]) -> mask_model.Network:
