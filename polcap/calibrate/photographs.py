@@ -64,8 +64,8 @@ def inside(folder: Path, prefix: str) -> list[tuple[float, Path]]:
 
 def angle_of(name: str, prefix: str) -> float | None:
     """Degrees in `pol045` or `axis22.5`; None where the name is no such."""
-    told = _ANGLE.fullmatch(name.removeprefix(prefix)) if name.startswith(prefix) else None
-    return None if told is None else float(told.group(1))
+    match = _ANGLE.fullmatch(name.removeprefix(prefix)) if name.startswith(prefix) else None
+    return None if match is None else float(match.group(1))
 
 
 def by_setting(photographs: Iterable[Photograph]) -> dict[tuple[float, float, float], list[Photograph]]:

@@ -62,9 +62,9 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
     step = 2 if plan.layout == "sensor" else 1  # a plane of a sensor mosaic has half its sides
     width, height = (reference.width or 0) // step, (reference.height or 0) // step
     notes = _notes(plan.layout, plan.others, plan.shots[0][1][0], shots, stated)
-    calibration, told = None, list[str]()
+    calibration, calibration_notes = None, list[str]()
     if plan.layout != "sensor" and plan.shots[0][1][0].probe.kind == "raw":  # through a ring, the sensor's own counts
-        calibration, told = calibrations.choose(reference, stated.filter, stated.focal_length_mm)
+        calibration, calibration_notes = calibrations.choose(reference, stated.filter, stated.focal_length_mm)
     return Capture(
         name=file_name.safe(stated.name or Path(os.path.realpath(folder)).name),
         folder=str(folder),
@@ -76,7 +76,7 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
         principal_px=((width - 1) / 2, (height - 1) / 2),
         size_px=(width, height),
         chart_frames=tuple(_frame(plan, stated, source, 0.0) for source in plan.others if source.role == "chart"),
-        notes=(*plan.notes, *notes, *told, f"focal length {lens.note}"),
+        notes=(*plan.notes, *notes, *calibration_notes, f"focal length {lens.note}"),
         calibration=calibration,
         crossed=crossed,
     )

@@ -93,8 +93,8 @@ def _raw(path: str, data: bytes) -> worker.Answer:
     bare = known.exposure_time is None and not known.make  # CRW: the decoder knows more, but has to unpack
     silent = known.iso is None and not structure.dng  # old bodies tell it in makers' tags, or have but one
     size = raw.size(path, data, unpack=bare or silent)
-    told = {name: value for name, value in size.get("exif", {}).items() if bare or not getattr(known, name)}
-    stated = replace(exif.sized(known, size["width"], size["height"]), **told)
+    decoded = {name: value for name, value in size.get("exif", {}).items() if bare or not getattr(known, name)}
+    stated = replace(exif.sized(known, size["width"], size["height"]), **decoded)
     lossy = plausible.is_lossy(structure)
     return _answer(Probe("raw", photo_bytes.digest(data), stated, lossy=lossy), structure.truncated or lossy)
 

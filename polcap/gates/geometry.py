@@ -39,15 +39,15 @@ def alignment(found: Found, config: Config) -> Gate:
 
 def _pushed(found: Found, config: Config) -> Gate | None:
     """An object that moved while what is around it stood still."""
-    apart = object_motion.measure(found.radiance, found.alignment, found.object_) * found.grid_px
+    displacement = object_motion.measure(found.radiance, found.alignment, found.object_) * found.grid_px
     limit = config.gates.max_object_shift_px
-    bad = np.nan_to_num(apart, posinf=np.inf) > limit * max(found.grid_px, 1)
+    bad = np.nan_to_num(displacement, posinf=np.inf) > limit * max(found.grid_px, 1)
     if not bad.any():
         return None
-    worst = int(np.nanargmax(apart))
-    says = f"the object moved by {apart[worst]:.1f} px against what is around it in {found.names[worst]}"
-    figure: float | None = round(float(apart[worst]), 3)
-    if np.isinf(apart[worst]):
+    worst = int(np.nanargmax(displacement))
+    says = f"the object moved by {displacement[worst]:.1f} px against what is around it in {found.names[worst]}"
+    figure: float | None = round(float(displacement[worst]), 3)
+    if np.isinf(displacement[worst]):
         figure, says = None, f"{found.names[worst]} shows another object before the same surroundings"
     remedy = "let it stand firm, do not touch it between shots, and take that shot again"
     cost = 45.0 if figure is None else 5.0

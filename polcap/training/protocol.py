@@ -199,8 +199,8 @@ def _measured(light: Floats, places: light_transport.Places, view: View, errors:
 
     scene = torch.stack([image(part) for part in light])
     rays = torch.from_numpy(frames.rays(view, *mask.shape))[None]
-    given = torch.from_numpy(mask)[None]
-    seen = photograph(scene, image(places.diffuse), given, rays, torch.from_numpy(at), errors)
+    whole = torch.from_numpy(mask)[None]
+    seen = photograph(scene, image(places.diffuse), whole, rays, torch.from_numpy(at), errors)
     return stokes_image(seen, at, mask, view)
 
 

@@ -25,12 +25,12 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
     NaN where either has no detail to be followed, infinite where the surroundings are the same and the object is not.
     """
     shots = len(radiance.angle)
-    apart = np.full(shots, np.nan)
-    apart[0] = 0.0
+    displacement = np.full(shots, np.nan)
+    displacement[0] = 0.0
     if radiance.offset_px is not None:  # shots cut from one mosaic
         return np.zeros(shots)
     if not object_.mask.any():
-        return apart
+        return displacement
     step = int(np.ceil(np.sqrt(object_.mask.size / _MOST_PIXELS)))
     reference = fine(radiance.shot(0), _DETAIL_PX, step)
     height, width = reference.value.shape
@@ -46,14 +46,14 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
         found = [_followed(region, shot, known) for region in regions]
         here, around = (like for _, like in found)
         if around > _SURE_LIKENESS and here < _OTHER_LIKENESS:
-            apart[k] = np.inf
+            displacement[k] = np.inf
         elif min(here, around) > _SURE_LIKENESS:
             at = [(transform @ middle)[:2] / (transform @ middle)[2] for transform, _ in found]
             inner, outer = (sigma_at(region, shot, way, middle) for region, (way, _) in zip(regions, found))
             doubt = float(np.hypot(inner, outer))
             seems = float(np.hypot(*(at[0] - at[1])))
-            apart[k] = step * seems if seems > _SURE_SIGMAS * doubt else 0.0
-    return apart
+            displacement[k] = step * seems if seems > _SURE_SIGMAS * doubt else 0.0
+    return displacement
 
 
 def _followed(region: Detail, shot: Detail, known: Floats) -> tuple[Floats, float]:

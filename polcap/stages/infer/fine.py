@@ -45,12 +45,12 @@ class Guess:
 def encode(cues: Cues, guess: Guess) -> Floats:
     """The fine network's input, CHANNELS in order, (N, H, W) float32, 0 outside the mask."""
     plane = np.full(cues.mask.shape, np.log(guess.shrink))
-    told = [
+    guessed = [
         *np.moveaxis(frames.to_ray_frame(guess.normal, cues.rays), -1, 0),
         *np.moveaxis(frames.to_ray_frame(guess.smooth, cues.rays), -1, 0),
         np.log(np.maximum(guess.sigma, 0.5)), guess.roughness, plane,
     ]  # fmt: skip
-    return np.concatenate([seen.channels(cues), np.stack(told) * cues.mask]).astype(np.float32)
+    return np.concatenate([seen.channels(cues), np.stack(guessed) * cues.mask]).astype(np.float32)
 
 
 def refined(cues: Cues, guess: Guess, network: Network) -> Floats:

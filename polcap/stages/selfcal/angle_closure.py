@@ -99,13 +99,13 @@ def _fit(left: Floats, by_gain: Floats, by_turn: Floats, part: NDArray[np.intp],
     gains_alone = np.linalg.solve(square[:-1, :-1] + scaled[:-1, :-1] + 1e-12 * np.eye(size - 1), right[:-1])
     stated = total - float(right[:-1] @ gains_alone)
     after = total - float(right @ found)
-    turns = []
+    estimates = []
     for p in np.unique(part):
         kept = part != p
         some = np.einsum("npi,npj->ij", weighted[:, kept], columns[:, kept], optimize=True) + scaled
         towards = np.einsum("npi,np->i", weighted[:, kept], left[:, kept])
-        turns.append(np.linalg.solve(some + 1e-12 * np.eye(size), towards)[-1])
-    count = len(turns)
-    sigma = float(np.sqrt((count - 1) / count * np.sum((np.array(turns) - np.mean(turns)) ** 2)))
+        estimates.append(np.linalg.solve(some + 1e-12 * np.eye(size), towards)[-1])
+    count = len(estimates)
+    sigma = float(np.sqrt((count - 1) / count * np.sum((np.array(estimates) - np.mean(estimates)) ** 2)))
     doubt = float(np.sqrt(noise * np.linalg.inv(square + scaled + 1e-12 * np.eye(size))[-1, -1]))
     return _Fit(float(found[-1]), float(np.hypot(sigma, doubt)), stated, stated - after)
