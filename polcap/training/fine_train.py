@@ -6,10 +6,10 @@ OUT/fine.onnx, last.pt and metrics.csv.
 
 import csv
 import sys
-import time
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -57,25 +57,8 @@ def main(params: Params) -> Path:
         raise InputError(f"{len(files)} pictures; training needs more than the {_HELD} that it looks at")
     torch.manual_seed(params.seed)
     run = Run(params.rate)
-    last = params.out / "last.pt"
-    if last.exists():
-        run.load(last)
-    rng = np.random.default_rng([params.seed, run.step])
-    before = saved = time.monotonic()
-    losses: list[float] = []
-    while run.elapsed < 60 * params.minutes:
-        chosen = [files[n] for n in rng.integers(_HELD, len(files), _PICTURES)]
-        losses.append(run.advance(chosen, run.elapsed / (60 * params.minutes), rng))
-        now = time.monotonic()
-        run.elapsed, before = run.elapsed + now - before, now
-        if run.step % 100 == 0:
-            _record(params.out / "metrics.csv", run, float(np.mean(losses)), *run.judge(files[:_HELD]))
-            losses, before = [], time.monotonic()
-        if now - saved > 60:
-            run.save(last)
-            saved = now
-    run.save(last)
-    return ship(last, params.out / "fine.onnx")
+    run.spend(params.minutes, files, _HELD, _PICTURES, params.seed, params.out)
+    return ship(params.out / "last.pt", params.out / "fine.onnx")
 
 
 class Run(SmallRun):
@@ -92,6 +75,10 @@ class Run(SmallRun):
         loss.backward()
         self.learn()
         return float(loss.detach())
+
+    def look(self, path: Path, losses: Any, files: list[Path]) -> None:
+        """A row of metrics."""
+        _record(path, self, float(losses), *self.judge(files))
 
     def judge(self, files: list[Path]) -> tuple[float, float]:
         """Distance of the relief from the truth, rms, with the averaged weights and without any relief."""

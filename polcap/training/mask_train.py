@@ -7,9 +7,9 @@ OUT/mask.onnx, last.pt and metrics.csv.
 
 import csv
 import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -54,26 +54,8 @@ def main(params: Params) -> Path:
     torch.set_num_threads(1)
     torch.manual_seed(params.seed)
     run = Run(params.rate)
-    last = params.out / "last.pt"
-    if last.exists():
-        run.load(last)
-    rng = np.random.default_rng([params.seed, run.step])
-    before = saved = time.monotonic()
-    figures: list[tuple[float, float]] = []
-    while run.elapsed < 60 * params.minutes:
-        chosen = [files[n] for n in rng.integers(_HELD, len(files), _BATCH)]
-        figures.append(run.advance(chosen, run.elapsed / (60 * params.minutes), rng))
-        now = time.monotonic()
-        run.elapsed, before = run.elapsed + now - before, now
-        if run.step % 100 == 0:
-            coarse, fine = run.judge(files[:_HELD])
-            _record(params.out / "metrics.csv", run, np.mean(figures, axis=0), coarse, fine)
-            figures, before = [], time.monotonic()
-        if now - saved > 60:
-            run.save(last)
-            saved = now
-    run.save(last)
-    return ship(last, params.out / "mask.onnx")
+    run.spend(params.minutes, files, _HELD, _BATCH, params.seed, params.out)
+    return ship(params.out / "last.pt", params.out / "mask.onnx")
 
 
 class Run(SmallRun):
@@ -102,6 +84,10 @@ class Run(SmallRun):
         fine.backward()
         self.learn()
         return float(coarse.detach()), float(fine.detach())
+
+    def look(self, path: Path, losses: Any, files: list[Path]) -> None:
+        """A row of metrics."""
+        _record(path, self, losses, *self.judge(files))
 
     def judge(self, files: list[Path]) -> tuple[Floats, Floats]:
         """IoU of both looks of the averaged weights on pictures never learned from; the second at the whole picture."""

@@ -1,7 +1,11 @@
 """Training of the two small networks, mask and fine pass: weights, their moving average, optimizers, checkpoints."""
 
+import time
+from abc import ABC, abstractmethod
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -13,7 +17,7 @@ _OUTER = ("stem", "raw", "out")  # layers beside pixels, whose weights AdamW lea
 _STEEPEST = 1.0  # norm of a step's gradient
 
 
-class SmallRun:
+class SmallRun(ABC):
     """Network, moving average of its weights, optimizers.
 
     Parameters
@@ -41,6 +45,47 @@ class SmallRun:
         for group in (g for optimizer in self.optimizers for g in optimizer.param_groups):
             group["full"] = group["lr"]
         self.step, self.elapsed = 0, 0.0
+
+    def spend(self, minutes: float, files: list[Path], held: int, count: int, seed: int, out: Path) -> None:
+        """Go on from OUT/last.pt and learn until the budget is spent, looking at `held` of the files now and then.
+
+        Parameters
+        ----------
+        minutes
+            Budget, resumed parts together.
+        files, held, count
+            Pictures; how many of them are only looked at; how many of the others a step takes.
+        seed
+            Of the pictures' order.
+        out
+            Folder of last.pt and metrics.csv.
+        """
+        last = out / "last.pt"
+        if last.exists():
+            self.load(last)
+        rng = np.random.default_rng([seed, self.step])
+        before = saved = time.monotonic()
+        losses: list[Any] = []
+        while self.elapsed < 60 * minutes:
+            chosen = [files[n] for n in rng.integers(held, len(files), count)]
+            losses.append(self.advance(chosen, self.elapsed / (60 * minutes), rng))
+            now = time.monotonic()
+            self.elapsed, before = self.elapsed + now - before, now
+            if self.step % 100 == 0:
+                self.look(out / "metrics.csv", np.mean(losses, axis=0), files[:held])
+                losses, before = [], time.monotonic()
+            if now - saved > 60:
+                self.save(last)
+                saved = now
+        self.save(last)
+
+    @abstractmethod
+    def advance(self, files: list[Path], progress: float, rng: np.random.Generator) -> Any:
+        """One step; its losses."""
+
+    @abstractmethod
+    def look(self, path: Path, losses: Any, files: list[Path]) -> None:
+        """Add a row of metrics to the file `path`: mean losses, and what pictures never learned from say."""
 
     def pace(self, progress: float) -> None:
         """Set the learning rates of a step; `progress` is the share of the budget that is spent."""
