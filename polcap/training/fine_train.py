@@ -16,7 +16,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from polcap.errors import InputError
 from polcap.formats import onnx
 from polcap.images import Floats
 from polcap.stages.infer import fine
@@ -53,8 +52,6 @@ def main(params: Params) -> Path:
         studio = fine_pictures.Studio.open(params.out / "views", params.data, network)
         fine_pictures.main(folder, studio, params.pictures)
     files = sorted(folder.glob("[0-9]*.npy"))
-    if len(files) <= _HELD:
-        raise InputError(f"{len(files)} pictures; training needs more than the {_HELD} that it looks at")
     torch.manual_seed(params.seed)
     run = Run(params.rate)
     run.spend(params.minutes, files, _HELD, _PICTURES, params.seed, params.out)

@@ -17,7 +17,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from polcap.errors import InputError
 from polcap.images import Floats
 from polcap.stages.mask.mask_channels import CHANNELS, ENCODING, SIZE_MULTIPLE, Look, brightness, encode
 from polcap.training import export, mask_model, mask_pictures
@@ -48,9 +47,7 @@ class Params:
 def main(params: Params) -> Path:
     """Make the pictures that are missing, train, export."""
     mask_pictures.main(params.out / "pictures", params.data, params.pictures)
-    files = sorted((params.out / "pictures").glob("*.npy"))
-    if len(files) <= _HELD:
-        raise InputError(f"{len(files)} pictures; training needs more than the {_HELD} that it looks at")
+    files = sorted((params.out / "pictures").glob("[0-9]*.npy"))
     torch.set_num_threads(1)
     torch.manual_seed(params.seed)
     run = Run(params.rate)

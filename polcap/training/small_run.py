@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from polcap.errors import InputError
 from polcap.formats import atomic
 from polcap.training.train import Muon
 
@@ -59,7 +60,14 @@ class SmallRun(ABC):
             Of the pictures' order.
         out
             Folder of last.pt and metrics.csv.
+
+        Raises
+        ------
+        InputError
+            There are no more files than `held`.
         """
+        if len(files) <= held:
+            raise InputError(f"{len(files)} pictures; training needs more than the {held} that it looks at")
         last = out / "last.pt"
         if last.exists():
             self.load(last)

@@ -12,10 +12,8 @@ import numpy as np
 from polcap.images import Cues, Floats, SurfaceMaps
 from polcap.optics import fresnel
 
-_GLOSS = (
-    0.03,
-    0.1,
-)  # share of S0 that is mirrored: below the estimator's albedo stays, above the crossed shot's counts
+# share of S0 that is mirrored: below the first the estimator's albedo stays, above the second the crossed shot's counts
+_GLOSS = (0.03, 0.1)
 _AROUND = 0.05  # 1σ over which the shading is carried on, of the object's radius
 _LEAST_PX = 2.0
 _LEAST_COSINE = 0.2  # further out a shading is not to be divided by

@@ -6,7 +6,7 @@ Training (`training/fine_*.py`) makes its channels by `encode` too.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -63,10 +63,9 @@ def refined(cues: Cues, guess: Guess, network: Network) -> Floats:
     """
     if network.channels != CHANNELS:
         raise ModelError(f"fine model {network.digest[:8]} expects other channels; use the one of this version")
-    picture = encode(cues, guess)
     relief = np.zeros((*cues.mask.shape, 3), np.float32)
     for inner, outer in _tiles(cues.mask):
-        relief[inner] = _answer(picture, inner, outer, network)
+        relief[inner] = _answer(encode(*_part(cues, guess, outer)), inner, outer, network)
     relief = finer(relief, cues.mask, guess.shrink)
     local = frames.to_ray_frame(guess.normal, cues.rays) + relief
     moved = frames.from_ray_frame(local, cues.rays)
@@ -100,12 +99,21 @@ def _tiles(mask: NDArray[np.bool_]) -> Iterator[tuple[Window, Window]]:
                 yield inner, outer
 
 
+def _part(cues: Cues, guess: Guess, window: Window) -> tuple[Cues, Guess]:
+    """What `encode` takes of a window, so that no channels of the whole crop are ever held."""
+    single = ("radiance", "ratio_sigma", "dolp", "rays", "mask", "quality")
+    double = ("ratio", "normalized_stokes")
+    shown = {name: getattr(cues, name)[window] for name in single}
+    shown |= {name: getattr(cues, name)[(slice(None), *window)] for name in double}
+    known = {name: getattr(guess, name)[window] for name in ("normal", "smooth", "sigma", "roughness")}
+    return replace(cues, **shown), replace(guess, **known)
+
+
 def _answer(picture: Floats, inner: Window, outer: Window, network: Network) -> Floats:
-    """Deviation of the normals (h, w, 3) of the tile `inner`, ray frame."""
-    part = picture[(slice(None), *outer)]
-    _, height, width = part.shape
+    """Deviation of the normals (h, w, 3) of the tile `inner`, ray frame, by the channels (N, H, W) of `outer`."""
+    _, height, width = picture.shape
     more = ((0, 0), (0, -height % SIZE_MULTIPLE), (0, -width % SIZE_MULTIPLE))
-    relief = network.run(np.pad(part, more)[None]).get("relief")
+    relief = network.run(np.pad(picture, more)[None]).get("relief")
     if relief is None or relief.shape[1] != 3:
         raise ModelError(f"fine model {network.digest[:8]} makes no relief; use the one of this version")
     y, x = (within.start - around.start for within, around in zip(inner, outer))
