@@ -24,7 +24,6 @@ from polcap.training.small_run import SmallRun
 
 _PICTURES, _TILES, _TILE = 4, 4, 96  # pictures a step, tiles of each, their side, px
 _HELD = 24  # pictures that are only looked at
-_WARM, _KEEP = 30, 0.995  # steps over which the rate rises; share of the average that a step leaves
 _DOUBLED = tuple(fine.CHANNELS.index(name) for name in ("s1", "zenith_x", "cos_2phi"))  # and the channel after each
 _VECTORS = tuple(fine.CHANNELS.index(name) for name in ("ray_x", "normal_x", "smooth_x"))
 _NORMAL, _COUNT = fine.CHANNELS.index("normal_x"), len(fine.CHANNELS)
@@ -61,8 +60,7 @@ def main(params: Params) -> Path:
 class Run(SmallRun):
     """The network in training, by its own pictures."""
 
-    def __init__(self, rate: float) -> None:
-        super().__init__(fine_model.Network(), rate, _WARM, _KEEP)
+    made, warm, keep = fine_model.Network, 30, 0.995
 
     def advance(self, files: list[Path], progress: float, rng: np.random.Generator) -> float:
         """One step; its loss."""

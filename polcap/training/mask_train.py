@@ -29,7 +29,6 @@ _AGAIN = 0.3  # of the steps look at the parts twice and learn from the second
 WHOLE = 112  # px of the longer side at the first look
 _HELD = 40  # pictures that are only looked at
 _LAID = 0.12  # of the pictures have another one's object laid into them
-_WARM, _KEEP = 50, 0.998  # steps over which the rate rises; share of the average that a step leaves
 
 
 @dataclass(frozen=True)
@@ -58,8 +57,7 @@ def main(params: Params) -> Path:
 class Run(SmallRun):
     """The network in training, by its own pictures."""
 
-    def __init__(self, rate: float) -> None:
-        super().__init__(mask_model.Network(), rate, _WARM, _KEEP)
+    made, warm, keep = mask_model.Network, 50, 0.998
 
     def advance(self, files: list[Path], progress: float, rng: np.random.Generator) -> tuple[float, float]:
         """One step; the two looks' losses."""

@@ -19,24 +19,15 @@ _STEEPEST = 1.0  # norm of a step's gradient
 
 
 class SmallRun(ABC):
-    """Network, moving average of its weights, optimizers.
+    """Network, moving average of its weights, optimizers; `rate` is Muon's, half of it AdamW's."""
 
-    Parameters
-    ----------
-    network
-        What learns.
-    rate
-        Of Muon; half of it for AdamW.
-    warm
-        Steps over which the rate rises.
-    keep
-        Share of the average that a step leaves, in the end.
-    """
+    made: type[nn.Module]  # the network that learns
+    warm: int  # steps over which the rate rises
+    keep: float  # share of the average that a step leaves, in the end
 
-    def __init__(self, network: nn.Module, rate: float, warm: int, keep: float) -> None:
-        self.network = network.to(memory_format=torch.channels_last)
+    def __init__(self, rate: float) -> None:
+        self.network = self.made().to(memory_format=torch.channels_last)
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
-        self.warm, self.keep = warm, keep
         hidden: list[Tensor] = []
         others: list[Tensor] = []
         for name, weight in self.network.named_parameters():
