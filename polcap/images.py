@@ -78,6 +78,15 @@ class SensorImage:
         """Photosites per side of the least square of all colors about its middle: 2 Bayer, 3 X-Trans, 1 no mosaic."""
         return 1 if self.cfa is None else 2 if self.cfa.shape == (2, 2) else 3
 
+    @property
+    def site_px(self) -> Floats:
+        """(3, 2) x, y of each color's photosites in a superpixel, from its middle [superpixels]; 0 without a mosaic."""
+        if self.cfa is None:
+            return np.zeros((3, 2))
+        side = self.superpixel
+        square = self.cfa[:side, :side]
+        return np.array([(np.argwhere(square == color).mean(axis=0)[::-1] + 0.5) / side - 0.5 for color in range(3)])
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -187,6 +196,7 @@ class AngleStack:
     white_balance: Floats | None  # (3,) multipliers as shot
     light: Literal["flash", "steady", "one exposure", "unknown"] = "unknown"  # of the shots; one: a polarizer mosaic
     offset_px: Floats | None = None  # (K, 2) x, y of this grid, exactly known: reference px − offset = shot px
+    site_px: Floats | None = None  # (3, 2) x, y of this grid, from the pixel's middle to where a channel was seen; None: 0
     curvature: Floats | None = None  # (K, E) of each frame's tone against the reference's; 0: linear, NaN: unknown
     ambient_share: Floats | None = None  # (K,) of all light, there without the flash; NaN where not photographed
     extinction: Floats | None = None  # (3,) or (1,) extinction ratio of the polarizer, calibrated; None: ideal

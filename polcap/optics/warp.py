@@ -55,6 +55,9 @@ def warp(image: Floats | Bits, transform: Floats, box: Box | None = None, order:
         flat = cv2.warpPerspective(np.ascontiguousarray(part), local, size, flags=how, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(flat, np.float32).reshape(size[1], size[0], *image.shape[2:])
     planes = [part] if part.ndim == 2 else cv2.split(part)
+    if _shifts(local):
+        moved = [_shifted(np.ascontiguousarray(plane), local[:2, 2], size) for plane in planes]
+        return moved[0] if image.ndim == 2 else np.asarray(cv2.merge(moved)).reshape(size[1], size[0], -1)
     splines = [Spline(np.ascontiguousarray(plane)) for plane in planes]
     out = np.empty((len(planes), size[1], size[0]), np.float32)
     for y in range(0, size[1], _ROWS):
@@ -66,6 +69,35 @@ def warp(image: Floats | Bits, transform: Floats, box: Box | None = None, order:
         for spline, plane in zip(splines, out):
             plane[rows] = spline.at(taps)
     return out[0] if image.ndim == 2 else np.asarray(cv2.merge(list(out))).reshape(size[1], size[0], -1)
+
+
+def _shifts(transform: Floats) -> bool:
+    """Whether it moves all alike."""
+    return np.array_equal(transform, _moved(*transform[:2, 2]))
+
+
+def _shifted(plane: Floats, by: Floats, size: tuple[int, int]) -> Floats:
+    """Output px + by = px of a plane (H, W): every pixel asks for the same fraction, so its spline is one filter.
+
+    Returns
+    -------
+    NDArray
+        (size[1], size[0]).
+    """
+    whole = np.floor(by).astype(int)
+    across, down = (_kernel(float(share)) for share in by - whole)
+    rows, columns = (
+        np.clip(np.arange(start, start + length), 0, last)
+        for start, length, last in ((whole[1], size[1], plane.shape[0] - 1), (whole[0], size[0], plane.shape[1] - 1))
+    )
+    filtered = cv2.sepFilter2D(plane, cv2.CV_32F, across, down, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(filtered[np.ix_(rows, columns)])
+
+
+def _kernel(f: float) -> Floats:
+    """What a cubic spline reads a share f of a pixel further on, as a filter of the samples."""
+    taps = np.array([(1 - f) ** 3, 4 - 6 * f**2 + 3 * f**3, 1 + 3 * f + 3 * f**2 - 3 * f**3, f**3]) / 6
+    return np.r_[0, np.convolve(_PREFILTER, taps)].astype(np.float32)  # a tap more behind than ahead: 0 evens it
 
 
 def coordinates(transform: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import CaptureError
-from polcap.images import AngleStack, Gains, ObjectMask, Quality
+from polcap.images import AngleStack, Gains, ObjectMask, Quality, SensorImage
 from polcap.stages import stokes
 from tests import scenes
 
@@ -51,6 +51,26 @@ def test_light_that_leaks_through_a_poor_polarizer_is_made_up_for():
     found, truth = solve(leaky), solve(ideal)
     assert found.stokes == pytest.approx(truth.stokes, abs=1e-6)
     assert found.covariance[5] == pytest.approx(truth.covariance[5] / contrast**2, rel=1e-5)
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
+def test_colors_of_a_mosaic_are_laid_over_one_another(pattern):
+    """A grey parabola as superpixels see it: red and blue a quarter of a pixel off to either side, green in the middle."""
+    cfa = np.array([["RGB".index(color) for color in pattern[:2]], ["RGB".index(color) for color in pattern[2:]]], np.uint8)
+    sensor = SensorImage(np.zeros((80, 80), np.uint16), np.zeros((1, 1)), 1.0, cfa)
+    y, x = np.mgrid[0:40.0, 0:40.0]
+    at = [(x + dx, y + dy) for dx, dy in sensor.site_px]
+    shot = np.stack([1 + 0.002 * u * u - 0.01 * v for u, v in at], axis=-1).astype(np.float32)
+    assert np.ptp(shot[20, 20]) > 0.02
+    value = np.repeat(0.5 * shot[None], 3, axis=0)
+    radiance = dataclasses.replace(
+        scenes_stack(3), value=value, variance=np.full_like(value, 1e-8), quality=np.zeros(value.shape[:3], np.uint8),
+        angle=np.radians([0, 45, 90]), site_px=sensor.site_px,
+    )  # fmt: skip
+    object_ = ObjectMask(np.ones((40, 40), bool), (10, 10, 30, 30), "user")
+    found = stokes.solve(radiance, scenes.still(3), scenes.equal(3), object_, stokes.Settings())
+    assert np.ptp(found.stokes[0], axis=-1).max() < 1e-4
+    assert found.stokes[0, ..., 1] == pytest.approx(shot[10:30, 10:30, 1], abs=1e-4)
 
 
 @pytest.mark.parametrize("angles", [(0, 45, 90), (0, 60, 120), (0, 45, 90, 135), (10, 37, 101, 140, 170)])

@@ -51,7 +51,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = True
 
 
-@stage(version=5)
+@stage(version=6)
 def merge(capture: Capture, settings: Settings) -> AngleStack:
     """Radiance of every shot on the scale of its reference frame.
 
@@ -82,6 +82,7 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
     image = read(shots[0].frames[reference])
     camera = image.camera_matrix, image.white_balance
     mosaic, full, side = image.cfa is not None, settings.demosaic == "full", image.superpixel
+    site = image.site_px if mosaic and not full and capture.layout != "sensor" else None
     height, width = image.value.shape[:2]
     if full and side == 3:
         raise CaptureError(
@@ -146,6 +147,7 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
         ambient_share=np.array(ambient_shares),
         blur_px=sharpness.frames_blur(tiles, side),
         offset_px=_offsets(shots) if capture.layout == "sensor" else None,
+        site_px=site,
         extinction=None if known is None or known.polarizer is None else np.array(known.polarizer.extinction),
         flash_spread=None if known is None or known.flash is None else known.flash.spread,
         ring_sigma=None if known is None or known.polarizer is None else np.radians(known.polarizer.zero_sigma_deg),

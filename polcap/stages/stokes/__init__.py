@@ -1,8 +1,10 @@
 """Stage 6: solve each pixel's linear Stokes parameters from its K angles.
 
-Gains, transforms and the ring's turn are applied here and nowhere else, so every pixel is resampled once.
+Gains, transforms, the places of a mosaic's colors and the ring's turn are applied here and nowhere else, so every
+pixel is resampled once.
 """
 
+from collections.abc import Sequence
 from typing import Annotated
 
 import cv2
@@ -48,7 +50,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 5.0
 
 
-@stage(version=3)
+@stage(version=4)
 def solve(
     radiance: AngleStack, alignment: Alignment, gains: Gains, object_: ObjectMask, settings: Settings
 ) -> StokesImage:
@@ -139,7 +141,8 @@ def _body(
     picture, transform, share = radiance.crossed.picture, alignment.crossed, gains.crossed.astype(np.float32)
     clipped = (seen & np.uint8(Quality.CLIPPED)) > 0  # nothing is known of polarization there: it faces the camera
     across = np.where(clipped[..., None], 0, crossing.polarized(stokes[1], stokes[2], radiance.crossed.angle))
-    value = crossing.body_light(warp(picture.value, transform, crop) * share, across)
+    registered = cv2.merge(_registered_planes(picture.value, transform, radiance.site_px, crop))
+    value = crossing.body_light(registered * share, across)
     variance = np.maximum(warp(picture.variance, transform, crop, order=1), np.float32(1e-14)) * share**2
     quality: Bits = np.zeros(value.shape[:2], np.uint8)
     for bit, plane in _flagged(picture.quality):
@@ -168,8 +171,10 @@ def _registered(
     shares = np.prod(part**2 + (1 - part) ** 2, axis=1).mean()  # alike for all, lest the sharpest shot counts least
     for k, transform in enumerate(alignment.transform):
         gain = gains.gain[k].astype(np.float32)
-        # the mean of two or four neighbours in a mosaic, as is usual: splines ring at the edges of so coarse a grid
-        shot = cv2.split(warp(radiance.value[k], transform, box, order=1 if mosaic else 3))
+        if mosaic:  # the mean of two or four neighbours, as is usual: splines ring at the edges of so coarse a grid
+            shot = cv2.split(warp(radiance.value[k], transform, box, order=1))
+        else:
+            shot = _registered_planes(radiance.value[k], transform, radiance.site_px, box)
         doubt = cv2.split(warp(radiance.variance[k], transform, box, order=1))
         spread = np.float32(shares if mosaic else 1) / gain**2
         for c in range(3):
@@ -181,6 +186,18 @@ def _registered(
         inside = covered(radiance.value.shape[1:3], transform, box)
         quality |= np.where(inside, np.uint8(0), np.uint8(Quality.OUTSIDE))
     return values, variances, quality
+
+
+def _registered_planes(
+    picture: Floats, transform: Floats, site_px: Floats | None, box: tuple[int, int, int, int]
+) -> Sequence[Floats]:
+    """A shot (H, W, 3) on a box of the reference grid, by planes (h, w): every channel where its photosites saw it."""
+    if site_px is None or not site_px.any():
+        return cv2.split(warp(picture, transform, box))
+    return [
+        warp(picture[..., c], np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1]]) @ transform, box)
+        for c, (x, y) in enumerate(site_px)
+    ]
 
 
 def _exact(weights_of: Floats, value: Floats, variance: Floats) -> tuple[Floats, Floats]:
