@@ -196,7 +196,7 @@ class AngleStack:
     white_balance: Floats | None  # (3,) multipliers as shot
     light: Literal["flash", "steady", "one exposure", "unknown"] = "unknown"  # of the shots; one: a polarizer mosaic
     offset_px: Floats | None = None  # (K, 2) x, y of this grid, exactly known: reference px − offset = shot px
-    site_px: Floats | None = None  # (3, 2) x, y of this grid, from the pixel's middle to where a channel was seen; None: 0
+    site_px: Floats | None = None  # (3, 2) x, y of this grid: where in a pixel each channel was seen; None: 0
     curvature: Floats | None = None  # (K, E) of each frame's tone against the reference's; 0: linear, NaN: unknown
     ambient_share: Floats | None = None  # (K,) of all light, there without the flash; NaN where not photographed
     extinction: Floats | None = None  # (3,) or (1,) extinction ratio of the polarizer, calibrated; None: ideal

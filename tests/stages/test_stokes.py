@@ -55,8 +55,8 @@ def test_light_that_leaks_through_a_poor_polarizer_is_made_up_for():
 
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
 def test_colors_of_a_mosaic_are_laid_over_one_another(pattern):
-    """A grey parabola as superpixels see it: red and blue a quarter of a pixel off to either side, green in the middle."""
-    cfa = np.array([["RGB".index(color) for color in pattern[:2]], ["RGB".index(color) for color in pattern[2:]]], np.uint8)
+    """A grey parabola as superpixels see it: red and blue a quarter of a pixel off, green in the middle."""
+    cfa = np.array(["RGB".index(color) for color in pattern], np.uint8).reshape(2, 2)
     sensor = SensorImage(np.zeros((80, 80), np.uint16), np.zeros((1, 1)), 1.0, cfa)
     y, x = np.mgrid[0:40.0, 0:40.0]
     at = [(x + dx, y + dy) for dx, dy in sensor.site_px]
