@@ -82,6 +82,18 @@ def test_any_angles_in_order_are_kept_and_swapped_ones_refused(angles):
         selfcal.solve(swapped, scenes.still(len(angle)), scenes.ball_object(), scenes.no_color(), selfcal.Settings())
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("sectors", [1, 24])
+def test_an_outline_that_tells_nothing_supports_no_order(sectors):
+    """Unpolarized all round, or seen at one place only: there is no scatter to say how sure it is."""
+    sector = np.arange(240) % sectors
+    wave = 0.2 * (sectors == 1) * np.cos(2 * np.radians([[0], [60], [120]]))
+    unpolarized = order.Rim(1.0 + wave + np.zeros((3, 240)), np.zeros(240), sector)
+    found = order.judge(unpolarized, np.radians([0.0, 60.0, 120.0]), 0.2, 0.25)
+    assert found.order == ((0, 1, 2), False)
+    assert found.rival == (((0, 1, 2), True) if sectors == 1 else None)  # an axis along x is its own mirror image
+
+
 def test_one_exposure_has_one_gain():
     radiance = dataclasses.replace(scenes.stack(gain=GAIN), light="one exposure")
     found = solve(radiance, scenes.no_color())

@@ -142,8 +142,10 @@ def _misfit(at: Rim, angle: Floats) -> float:
 
 
 def _jackknife(one: Floats, one_weight: Floats, other: Floats, other_weight: Floats) -> float:
-    """1σ of Σone/Σone_weight − Σother/Σother_weight from leaving sectors out, (24,) each."""
+    """1σ of Σone/Σone_weight − Σother/Σother_weight from leaving sectors out, (24,) each; 1 where nothing tells it."""
     used = np.flatnonzero(one_weight + other_weight)
+    if len(used) < 2:
+        return 1.0
     without = np.array(
         [
             (one.sum() - one[s]) / max(one_weight.sum() - one_weight[s], 1e-9)
@@ -151,5 +153,4 @@ def _jackknife(one: Floats, one_weight: Floats, other: Floats, other_weight: Flo
             for s in used
         ]
     )
-    count = max(len(used), 1)
-    return float(np.sqrt((count - 1) / count * ((without - without.mean()) ** 2).sum()))
+    return float(np.sqrt((len(used) - 1) / len(used) * ((without - without.mean()) ** 2).sum()))
