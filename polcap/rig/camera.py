@@ -15,6 +15,7 @@ Positive = Annotated[float, Meta(gt=0)]
 _WORD = re.compile(
     r"(?P<kind>f/|iso|flash)?(?P<over>\d+(?:\.\d+)?/)?(?P<value>\d+(?:\.\d+)?)s?", re.IGNORECASE
 )  # f/11, iso100, flash1/16, 1/200, 0.5s
+_BASE_ISO = 100.0  # below, many bodies reach an ISO by arithmetic alone, and clip earlier
 _SNAP_STOPS = 0.5  # a camera's nearest setting may lie this far from the one asked for
 
 
@@ -54,8 +55,8 @@ class Camera(Protocol):
     switches_flash: bool  # can take a frame without flash by itself
     polarizes_flash: bool  # puts the flash's filter on by itself
 
-    def bracket(self) -> tuple[Exposure, ...]:
-        """The exposures of a bracket where the user gave none."""
+    def bracket(self, flash: bool) -> tuple[Exposure, ...]:
+        """The exposures of a bracket where the user gave none; under a flash the shutter changes none."""
         ...
 
     def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:
@@ -100,11 +101,19 @@ def light(exposure: Exposure) -> float:
     return values[0] * values[1] * values[2] / (exposure.f_number or 1.0) ** 2
 
 
-def spread(middle: Exposure) -> tuple[Exposure, ...]:
+def by_shutter(middle_s: float | None) -> tuple[Exposure, ...]:
     """Three frames two stops apart by time, around the camera's own setting."""
-    if not middle.time_s:
+    if not middle_s:
         raise SettingError("the camera states no shutter speed; give the exposures with --bracket")
-    return tuple(msgspec.structs.replace(middle, time_s=middle.time_s * stops) for stops in (0.25, 1.0, 4.0))
+    return tuple(Exposure(time_s=middle_s * stops) for stops in (0.25, 1.0, 4.0))
+
+
+def by_iso(offered: list[float]) -> tuple[Exposure, ...]:
+    """Three frames two stops apart by ISO, from the least of 100 or more that the camera offers: for a flash."""
+    least = min((iso for iso in offered if iso >= _BASE_ISO), default=None)
+    if least is None:
+        raise SettingError("the camera's ISO cannot be set; give the exposures with --bracket: flash power or aperture")
+    return tuple(Exposure(iso=nearest("iso", least * stops, offered)) for stops in (1.0, 4.0, 16.0))
 
 
 def nearest(what: str, asked: float, offered: list[float], power: float = 1.0) -> float:

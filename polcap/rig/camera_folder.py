@@ -33,7 +33,7 @@ class WatchedFolder:
         self._seen = set(self._files())
         self._angle: float | None = None
 
-    def bracket(self) -> tuple[Exposure, ...]:
+    def bracket(self, flash: bool) -> tuple[Exposure, ...]:
         raise SettingError("--camera folder cannot ask the camera; give its exposures with --bracket 1/200,1/50,1/13")
 
     def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:

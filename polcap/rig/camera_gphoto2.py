@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from polcap.errors import HardwareError, SettingError
 from polcap.images import Role
 from polcap.rig import watchdog
-from polcap.rig.camera import Exposure, Shot, nearest, spread
+from polcap.rig.camera import Exposure, Shot, by_iso, by_shutter, nearest
 from polcap.rig.log import Log
 
 T = TypeVar("T")
@@ -65,12 +65,13 @@ class Gphoto2:
         self.polarizes_flash = False
         self._lit = self._ask("flash mode", lambda: self._value(_FLASH_MODE)) if self._choices[_FLASH_MODE] else None
 
-    def bracket(self) -> tuple[Exposure, ...]:
-        """Two stops darker and lighter than the camera's own shutter speed."""
-        (names, _) = _WIDGETS["time_s"]
+    def bracket(self, flash: bool) -> tuple[Exposure, ...]:
+        """Two stops darker and lighter than the camera's own shutter speed; under a flash by its ISO."""
+        (names, _) = _WIDGETS["iso" if flash else "time_s"]
         name = self._widget(names)
-        now = _number(self._ask(f"value {name}", lambda: self._value(name))) if name else None
-        return spread(Exposure(time_s=now))
+        if flash:
+            return by_iso([value for text in self._choices[name] if (value := _number(text))] if name else [])
+        return by_shutter(_number(self._ask(f"value {name}", lambda: self._value(name))) if name else None)
 
     def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:
         """Nothing: the camera sees for itself."""

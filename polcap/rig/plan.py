@@ -10,14 +10,12 @@ import msgspec
 from polcap.errors import SettingError
 from polcap.formats import layouts
 from polcap.images import Role
-from polcap.rig.camera import Exposure, spread
+from polcap.rig.camera import Exposure, by_iso, by_shutter
 
 PAPER_S = 60.0  # Deschaintre et al. 2021: a capture "takes about a minute"
-_BY_SHUTTER = (
-    "bracket  by the shutter: for a steady lamp. It does not change a flash exposure: step power, aperture or ISO there"
-)
 FINISH_S = 1.0  # the last frame's check, and the preview
 SPEED_DEG_S = {"elliptec": 430.0, "grbl": 60.0, "line": 60.0, "manual": 9.0, "simulated": 360.0}  # nominal
+_DIAL = [100.0, 400.0, 1600.0]  # ISOs that any camera has
 SETTLE_S = {"manual": 0.0}  # else 0.2
 OVERHEAD_S = {"gphoto2": 2.0, "folder": 4.0, "simulated": 0.5}  # per frame: release, 24 MP over USB, a person
 
@@ -161,7 +159,9 @@ def overhead_s(camera: str) -> float:
 
 
 def dry_run(order: Order) -> dict[str, Any]:
-    """The plan for devices that are not asked: nominal pace, and three exposures around 1/50 s where none are given."""
+    """The plan for devices that are not asked: nominal pace, and where no exposures are given, three that fit the light:
+    ISO 100 to 1600 under a flash, else around 1/50 s.
+    """
     head, _, query = order.rotator.partition("?")
     kind = head.partition(":")[0]
     if kind not in SPEED_DEG_S:
@@ -171,9 +171,11 @@ def dry_run(order: Order) -> dict[str, Any]:
     except ValueError:
         raise SettingError(f"--rotator {order.rotator}: settle is no number of seconds") from None
     pace = Pace(SPEED_DEG_S[kind], settle, overhead_s(order.camera))
-    bracket = order.bracket or spread(Exposure(time_s=0.02))
+    simulated = order.camera.startswith("simulated")
+    usual = by_iso(_DIAL) if names_flash(order) and not simulated else by_shutter(0.02)
+    bracket = order.bracket or usual
     whole = msgspec.structs.replace(order, bracket=bracket)
-    return document(whole, schedule(slots(whole, order.camera.startswith("simulated"))), pace)
+    return document(whole, schedule(slots(whole, simulated)), pace)
 
 
 def document(order: Order, ordered: Sequence[Slot], pace: Pace) -> dict[str, Any]:
@@ -204,7 +206,29 @@ def document(order: Order, ordered: Sequence[Slot], pace: Pace) -> dict[str, Any
         "seconds": sum(part["seconds"] for part in parts),
         "paper_seconds": PAPER_S,
         "by_shutter": _by_shutter(order.bracket),
+        "flash": names_flash(order),
+        "note": light_note(order),
     }
+
+
+def names_flash(order: Order) -> bool:
+    """Whether the light is a flash by what is ordered: its power, frames without it, or a filter before it."""
+    return order.ambient or order.cross or any(one.flash for one in order.bracket)
+
+
+def light_note(order: Order) -> str:
+    """What a bracket by the shutter asks of the light; empty for another one, and for the simulated lamp."""
+    if not _by_shutter(order.bracket) or order.camera.startswith("simulated"):
+        return ""
+    if names_flash(order):
+        return (
+            "the bracket steps the shutter alone, which does not change a flash exposure: all its frames would be "
+            "alike; step power, aperture or ISO, as in --bracket iso100,iso400,iso1600"
+        )
+    return (
+        "the bracket steps the shutter, which is for a steady lamp; under a flash step power, aperture or ISO, as in "
+        "--bracket iso100,iso400,iso1600"
+    )
 
 
 def _by_shutter(bracket: Sequence[Exposure]) -> bool:
@@ -230,6 +254,6 @@ def table(plan: dict[str, Any]) -> str:
             f"rotator  {plan['rotator']}: {plan['speed_deg_s']:g} degrees/s, settles in {plan['settle_s']:g} s",
             f"camera   {plan['camera']}: {plan['overhead_s']:g} s a frame beside the exposure",
             f"paper    about a minute (Deschaintre et al. 2021); this takes {share:.2f} of it",
-            *([_BY_SHUTTER] if plan["by_shutter"] else []),
+            *([f"light    {plan['note']}"] if plan["note"] else []),
         ]
     )

@@ -79,7 +79,8 @@ def shoot(
     content = _begun(folder, wanted, resume)
     with _alone(folder), _ended_politely(), _log(folder) as log, _held(wanted.camera, log) as camera:
         if content is None:
-            content = Content(wanted if wanted.bracket else _with_bracket(wanted, camera.bracket()))
+            exposures = wanted.bracket or camera.bracket(plan.names_flash(wanted))
+            content = Content(_with_bracket(wanted, exposures))
         content.camera = camera.model
         book = Record(folder, content, plan.slots(content.order, camera.switches_flash))
         for line in record.verify(book):
@@ -88,6 +89,8 @@ def shoot(
         _check_room(folder, len(missing) * camera.frame_bytes)
         landing = Landing(book, limits, tries, log)
         if missing:
+            if note := plan.light_note(content.order):
+                tell(f"polcap: {note}")
             _check_person(missing, camera)
             _take_all(book, landing, wanted.rotator, camera, log, tell)
         return _finished(book, landing) | {"taken": len(missing), "seconds": round(time.monotonic() - start, 1)}

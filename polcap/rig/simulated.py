@@ -111,7 +111,8 @@ class Camera:
         self._crossed = False  # the flash's filter is on
         self.frame_bytes = 2 * self._shoot.width * self._shoot.height
 
-    def bracket(self) -> tuple[Exposure, ...]:
+    def bracket(self, flash: bool) -> tuple[Exposure, ...]:
+        """By time: its lamp is on as long as its shutter is open."""
         stops = [self._shoot.step ** (frame - self._shoot.exposures // 2) for frame in range(self._shoot.exposures)]
         return tuple(Exposure(time_s=MIDDLE_S * stop, f_number=11.0, iso=100.0) for stop in stops)
 

@@ -86,7 +86,7 @@ class PoolCamera:
         self.closed = False
         self._last = b""
 
-    def bracket(self) -> tuple[Exposure, ...]:
+    def bracket(self, flash: bool) -> tuple[Exposure, ...]:
         return BRACKET
 
     def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:

@@ -110,7 +110,7 @@ def test_a_folder_that_is_not_there_is_the_users_fault(tmp_path: Path) -> None:
 
 def test_the_bracket_has_to_be_told(tether: Path) -> None:
     with pytest.raises(SettingError, match="--bracket"):
-        watched(tether).bracket()
+        watched(tether).bracket(flash=False)
 
 
 def test_a_disk_that_vanishes_is_a_hardware_fault(tether: Path) -> None:

@@ -15,7 +15,7 @@ from polcap.errors import CaptureError, HardwareError, SettingError, StorageErro
 from polcap.formats import capture as captures
 from polcap.images import Role
 from polcap.rig import plan, record, sequence
-from polcap.rig.camera import Exposure, Shot, nearest, parse_bracket
+from polcap.rig.camera import Exposure, Shot, by_iso, nearest, parse_bracket
 from polcap.rig.plan import Order, Slot
 from tests.rig import pool as pools
 from tests.rig.pool import BRACKET, Key, PoolCamera
@@ -124,6 +124,36 @@ def test_time_of_a_plan_is_the_sum_of_its_parts() -> None:
     assert planned["frames"] == 9
     assert planned["seconds"] == pytest.approx(360 / 430 + 90 / 430 + 2 * 0.2 + 9 * 2 + 3 * 0.105 + 1.0)
     assert "about a minute" in plan.table(planned)
+
+
+@pytest.mark.parametrize(
+    ("bracket", "more", "first", "words"),
+    [
+        ("", {}, "1/200s", "for a steady lamp; under a flash step power, aperture or ISO"),
+        ("", {"ambient": True}, "iso100", ""),
+        ("", {"cross": True}, "iso100", ""),
+        ("1/200,1/50", {"ambient": True}, "1/200s", "does not change a flash exposure"),
+        ("1/160 flash1/16, 1/40", {}, "1/160s flash1/16", "does not change a flash exposure"),
+        ("flash1/64,flash1/16", {}, "flash1/64", ""),
+        ("f/22,f/11", {"cross": True}, "f/22", ""),
+    ],
+)
+def test_a_plan_brackets_by_the_shutter_only_under_a_steady_lamp(
+    bracket: str, more: dict[str, bool], first: str, words: str
+) -> None:
+    order = Order((0.0, 45.0, 90.0), parse_bracket(bracket) if bracket else (), rotator="manual")
+    order = msgspec.structs.replace(order, camera="gphoto2", **more)
+    planned = plan.dry_run(order)
+    assert next(part for part in planned["parts"] if part["frames"])["exposures"][0] == first
+    assert words in planned["note"] and bool(words) == bool(planned["note"])
+    assert plan.dry_run(msgspec.structs.replace(order, camera="simulated"))["note"] == ""
+
+
+def test_a_bracket_by_iso_takes_what_the_camera_offers() -> None:
+    assert [one.iso for one in by_iso([50, 100, 200, 400, 800, 1600])] == [100, 400, 1600]
+    assert [one.iso for one in by_iso([160, 320, 640, 1250, 2500])] == [160, 640, 2500]
+    with pytest.raises(SettingError, match="flash power or aperture"):
+        by_iso([])
 
 
 def test_a_bad_frame_is_taken_again_at_once_and_kept_aside(rig: Rig) -> None:
