@@ -159,8 +159,9 @@ def overhead_s(camera: str) -> float:
 
 
 def dry_run(order: Order) -> dict[str, Any]:
-    """The plan for devices that are not asked: nominal pace, and where no exposures are given, three that fit the light:
-    ISO 100 to 1600 under a flash, else around 1/50 s.
+    """The plan for devices that are not asked: nominal pace.
+
+    Where no exposures are given, three are taken that fit the light: ISO 100 to 1600 under a flash, else around 1/50 s.
     """
     head, _, query = order.rotator.partition("?")
     kind = head.partition(":")[0]

@@ -63,7 +63,7 @@ def test_a_value_the_dial_lacks_is_an_error_that_lists_the_others(camera: Gphoto
 
 def test_its_own_bracket_is_two_stops_around_its_shutter(camera: Gphoto2) -> None:
     assert [exposure.time_s for exposure in camera.bracket(flash=False)] == [0.0025, 0.01, 0.04]
-    with pytest.raises(SettingError, match="ISO cannot be set; .*: flash power or aperture"):  # the body has none
+    with pytest.raises(SettingError, match=r"ISO cannot be set; .*: flash power or aperture"):  # the body has none
         camera.bracket(flash=True)
     assert not camera.switches_flash
 
