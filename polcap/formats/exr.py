@@ -7,7 +7,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from polcap.errors import DecodeError, StorageError
-from polcap.formats import atomic, memory_file, photo_bytes, plausible, worker
+from polcap.formats import atomic, image_io, memory_file, photo_bytes, plausible, worker
 from polcap.images import Floats
 
 Attribute = str | int | float | tuple[float, ...]
@@ -62,10 +62,10 @@ def write(
         temporary.touch()  # an OSError here says more than OpenImageIO's text
         output = oiio.ImageOutput.create(str(temporary))
         if output is None:
-            raise StorageError(f"cannot write {path}: {_line(oiio.geterror())}; end its name in .exr")
+            raise StorageError(f"cannot write {path}: {image_io.reason(oiio)}; end its name in .exr")
         done = output.open(str(temporary), spec) and output.write_image(pixels)
         if not (output.close() and done):
-            raise StorageError(f"cannot write {path}: {_line(output.geterror())}; check the disk's free space")
+            raise StorageError(f"cannot write {path}: {image_io.reason(output)}; check the disk's free space")
 
 
 def read(path: Path) -> tuple[dict[str, Floats], dict[str, object]]:
@@ -88,13 +88,13 @@ def decode(path: str) -> worker.Answer:
     with memory_file.named(data) as name:
         source = oiio.ImageInput.open(name)
         if source is None:
-            raise DecodeError(f"cannot read {path}: {_line(oiio.geterror())}; write it again")
+            raise DecodeError(f"cannot read {path}: {image_io.reason(oiio)}; write it again")
         try:
             spec = source.spec()
             plausible.check_size(path, spec.width, spec.height * max(spec.nchannels // 4, 1))
             pixels = source.read_image(oiio.FLOAT)
             if pixels is None:
-                raise DecodeError(f"{path} is cut short: {_line(source.geterror())}; write it again")
+                raise DecodeError(f"{path} is cut short: {image_io.reason(source)}; write it again")
             names = tuple(spec.channelnames)
             attributes = {item.name: item.value for item in spec.extra_attribs}
         finally:
@@ -106,7 +106,3 @@ def decode(path: str) -> worker.Answer:
         if all(isinstance(part, (str, int, float)) for part in (value if isinstance(value, tuple) else (value,)))
     }
     return {"names": names, "attributes": plain}, {name: pixels[..., k] for k, name in enumerate(names)}
-
-
-def _line(message: str) -> str:
-    return " ".join(message.split()) or "no reason given"

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import DecodeError
-from polcap.formats import memory_file, photo_bytes, plausible, raw, sniff, worker
+from polcap.formats import image_io, memory_file, photo_bytes, plausible, raw, sniff, worker
 from polcap.images import Floats, SensorImage
 from polcap.optics import color
 
@@ -152,7 +152,7 @@ def decode(path: str, digest: str | None = None) -> worker.Answer:
         channels = _channels(path, spec)
         kind = "float" if spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE) else str(spec.format)
         pixels = file.read_image(0, 0, 0, spec.nchannels, kind)
-        reason = _one_line(file.geterror())
+        reason = image_io.reason(file)
     if pixels is None:
         raise DecodeError(f"{path}: truncated or damaged ({reason}); copy it from the card again")
     pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)[..., channels]
@@ -174,12 +174,13 @@ def _opened(path: str, data: bytes) -> Iterator[Any]:
 
     if data[:3] == b"\xff\xd8\xff":
         plausible.check_jpeg(path, data)
+    plausible.check_png(path, data)
     options = oiio.ImageSpec()
     options["oiio:UnassociatedAlpha"] = 1  # else a PNG's colours come multiplied by its alpha
     with memory_file.named(data) as name:
         file = oiio.ImageInput.open(name, options)
         if file is None:
-            reason = _one_line(oiio.geterror()).replace(name, Path(path).name)
+            reason = image_io.reason(oiio).replace(name, Path(path).name)
             raise DecodeError(f"{path}: not a readable picture ({reason}); is the file complete?")
         try:
             spec = file.spec()
@@ -216,7 +217,3 @@ def _check_monochrome(path: str | Path, mosaic: NDArray[Any]) -> None:
             f"{path}: neighbouring 2×2 cells differ by {levels.max() / levels.min() - 1:.0%}, as on a colour "
             "polarization sensor, which is not supported; give one demosaiced picture per angle"
         )
-
-
-def _one_line(message: str) -> str:
-    return " ".join(message.split()) or "no reason given"

@@ -4,6 +4,7 @@ Decoders return pixels from files that are cut, stripped or of a form they do no
 lay in memory. In the worker.
 """
 
+import struct
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,9 @@ DEVELOP = (
 )
 _COPY_AGAIN = "copy it from the card again"
 _PART = 1 << 20  # bytes of coded data that are searched at a time
+_PNG = b"\x89PNG\r\n\x1a\n"
+_SAMPLES = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # of a PNG's pixel by its color type
+_DEFLATE = 1032  # zlib makes no byte of more than so many (zlib.net, Technical Details: Maximum Compression Factor)
 _CLIPPED_SHARE = 0.5  # of a picture; no exposure of use has more at the white level
 _BEYOND = 2.0  # white levels; counts that reach so far deny the level
 
@@ -60,6 +64,24 @@ def check_bytes(path: str, width: int, height: int, size: int) -> None:
     if 8 * size < _LEAST_BITS * width * height:
         raise DecodeError(
             f"{path}: {size / 1e3:.0f} kB cannot hold {width}×{height} px; only its beginning is there, {_COPY_AGAIN}"
+        )
+
+
+def check_png(path: str, data: bytes) -> None:
+    """A PNG holds the pixels that it states, before memory is taken for them; what is no PNG passes.
+
+    Raises
+    ------
+    DecodeError
+        More pixels than any camera has, or than its bytes can be unpacked to.
+    """
+    if data[:8] != _PNG or len(data) < 26:
+        return
+    width, height, bits, kind = struct.unpack_from(">IIBB", data, 16)
+    check_size(path, width, height)
+    if height * (1 + width * bits * _SAMPLES.get(kind, 1) // 8) > _DEFLATE * len(data):
+        raise DecodeError(
+            f"{path}: {len(data) / 1e3:.3g} kB cannot hold {width}×{height} px; it is damaged, {_COPY_AGAIN}"
         )
 
 

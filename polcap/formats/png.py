@@ -103,7 +103,7 @@ def decode(path: str) -> worker.Answer:
     data = photo_bytes.load(path)
     if data[:8] != _MAGIC or len(data) < 24:
         raise DecodeError(f"{path} is not a whole PNG ({len(data)} bytes); write it again")
-    plausible.check_size(path, *struct.unpack(">II", data[16:24]))
+    plausible.check_png(path, data)
     try:
         array = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:

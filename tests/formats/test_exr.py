@@ -1,12 +1,13 @@
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from polcap.errors import DecodeError, StorageError
-from polcap.formats import exr
+from polcap.formats import exr, photo
 
 
 def test_named_channels_and_attributes_come_back(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -51,6 +52,21 @@ def test_cut_and_missing_files_are_one_line(tmp_path: Path, rng: np.random.Gener
     with pytest.raises(DecodeError) as caught:
         exr.read(path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("door", [exr.read, photo.read])
+def test_bytes_of_a_file_that_are_no_text_may_stand_in_a_message(
+    tmp_path: Path, door: Callable[[Path], object]
+) -> None:
+    path = tmp_path / "a.exr"
+    exr.write(path, {name: np.ones((8, 8)) for name in "RGB"})
+    whole = path.read_bytes()
+    path.write_bytes(whole.replace(b"lineOrder\0lineOrder", b"lineOrder\0l\xa0$dzrder"))  # the type is repeated
+    door(path)  # the pixels are whole
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(DecodeError) as caught:
+        door(path)
+    assert str(caught.value).isprintable()
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full to play a full disk")

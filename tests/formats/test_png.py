@@ -1,10 +1,13 @@
+import struct
+import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from polcap.errors import DecodeError, StorageError
-from polcap.formats import png
+from polcap.formats import photo, png
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
@@ -36,6 +39,20 @@ def test_damaged_file_is_one_line(tmp_path: Path) -> None:
         path.write_bytes(data)
         with pytest.raises(DecodeError, match="not a whole PNG"):
             png.read(path)
+
+
+@pytest.mark.parametrize("door", [png.read, photo.read])
+def test_more_pixels_than_the_bytes_unpack_to_are_refused_unread(
+    tmp_path: Path, door: Callable[[Path], object]
+) -> None:
+    path = tmp_path / "a.png"
+    png.write(path, np.zeros((3000, 3000), np.uint8))  # nothing packs better than one value
+    door(path)
+    data = path.read_bytes()
+    head = b"IHDR" + struct.pack(">II", 15_000, 15_000) + data[24:29]
+    path.write_bytes(data[:12] + head + struct.pack(">I", zlib.crc32(head)) + data[33:])
+    with pytest.raises(DecodeError, match="cannot hold 15000×15000 px"):
+        door(path)
 
 
 def test_folder_that_is_a_file_is_one_line(tmp_path: Path) -> None:
