@@ -1,22 +1,29 @@
 """Mutated RAW files, pictures and models, each through the door that polcap opens it by.
 
-python tests/campaigns/fuzz_files.py [--files 300] [--models 100] [--seed 0]
+python tests/campaigns/fuzz_files.py [--files 300] [--models 100] [--seed 0] [--rows FILE]
 
-Seeds are made here (DNG, TIFF, PNG, JPEG, EXR, models) and, where POLCAP_DATA is set, its smaller RAW files. Outcomes
-allowed: a value that is finite and of a bounded size, or an InputError of one line. Prints a table: outcomes, deaths
-of the child, slowest call, growth of this process. Anything else is printed and ends with exit code 1.
+Seeds are made here (DNG, TIFF, PNG, JPEG, EXR, models) and, where POLCAP_DATA is set, its smaller RAW files. Half of
+the mutations leave all bytes in their places. Outcomes allowed: a value that is finite and of a bounded size, or an
+InputError of one line. Prints a table: outcomes, deaths of the child, slowest call, growth of this process, the
+children's peak. Anything else is printed and ends with exit code 1. With --rows a campaign goes on where it stopped.
 """
 
 import argparse
 import os
 import resource
+import struct
 import sys
 import tempfile
 import time
 import traceback
+import zlib
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
+from math import ceil
 from pathlib import Path
+from random import Random
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,18 +33,31 @@ from onnx import TensorProto, helper
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from polcap.errors import InputError
-from polcap.formats import exr, photo, plausible, png, probe, raw
+from polcap.formats import exr, photo, plausible, png, probe, raw, worker
 from polcap.formats import onnx as models
-from tests.campaigns.mutations import Random, mutated
+from tests.campaigns.mutations import mutated
+from tests.campaigns.rows import Rows, processor_s
 from tests.formats import headers
 
-MOST_MB = 2e6  # bytes of a RAW taken as a seed
+BATCH = 25  # files that make a row
+MOST_BYTES = 3e6  # of a RAW taken as a seed
+SLOW, SLOW_SHARE = 1e6, 0.1  # bytes of a RAW beyond which fewer are tried, and how many
 LIMIT_S = 200.0  # of one call: the worker's own is 180
 Door = Callable[[Path], object]
 
 
-def photographs(folder: Path) -> list[tuple[str, bytes, Door]]:
-    """Kind, sound bytes and door of each seed."""
+@dataclass(frozen=True)
+class Seed:
+    """Sound bytes, and the door that polcap opens them by."""
+
+    data: bytes
+    door: Door
+    share: float = 1.0  # of the files
+    mend: Callable[[bytes], bytes] = bytes  # what is put right after a mutation, for it to get further in
+
+
+def photographs(folder: Path) -> dict[str, Seed]:
+    """Seeds by their kinds."""
     random = np.random.default_rng(7)
     picture = random.integers(0, 65535, (40, 60, 3), np.uint16)
     cv2.imwrite(str(folder / "a.png"), picture)
@@ -45,21 +65,36 @@ def photographs(folder: Path) -> list[tuple[str, bytes, Door]]:
     cv2.imwrite(str(folder / "a.jpg"), (picture >> 8).astype(np.uint8))
     exr.write(folder / "a.exr", {name: random.random((40, 60), np.float32) for name in "RGB"}, half=True)
     mosaic = random.integers(500, 16000, (60, 84))
-    seeds: list[tuple[str, bytes, Door]] = [
-        ("DNG", headers.dng(mosaic, black=[[500, 500], [500, 500]]), _raw),
-        ("linear DNG", headers.dng(picture, photometric=34892), _raw),
-        ("PNG", (folder / "a.png").read_bytes(), _photo),
-        ("TIFF", (folder / "a.tif").read_bytes(), _photo),
-        ("JPEG", (folder / "a.jpg").read_bytes(), _photo),
-        ("EXR", (folder / "a.exr").read_bytes(), _photo),
-        ("map", (folder / "a.exr").read_bytes(), exr.read),
-        ("mask", (folder / "a.png").read_bytes(), png.read),
-    ]
+    seeds = {
+        "DNG": Seed(headers.dng(mosaic, black=[[500, 500], [500, 500]]), _raw),
+        "linear DNG": Seed(headers.dng(picture, photometric=34892), _raw),
+        "PNG": Seed((folder / "a.png").read_bytes(), _photo, mend=summed),
+        "TIFF": Seed((folder / "a.tif").read_bytes(), _photo),
+        "JPEG": Seed((folder / "a.jpg").read_bytes(), _photo),
+        "EXR": Seed((folder / "a.exr").read_bytes(), _photo),
+        "map": Seed((folder / "a.exr").read_bytes(), exr.read),
+        "mask": Seed((folder / "a.png").read_bytes(), png.read, mend=summed),
+    }
     data = Path(os.environ.get("POLCAP_DATA") or "/nonexistent")
     for file in sorted((data / "real").glob("raw_*/*")):
-        if file.suffix.lower() in (".dng", ".crw", ".kdc", ".cr2", ".nef") and file.stat().st_size < MOST_MB:
-            seeds.append((file.suffix[1:].upper() + " of a camera", file.read_bytes(), _raw))
+        size = file.stat().st_size
+        if file.suffix.lower() in (".dng", ".crw", ".kdc", ".cr2", ".nef") and size < MOST_BYTES:
+            share = SLOW_SHARE if size > SLOW else 1.0
+            seeds[file.suffix[1:].upper() + " of a camera"] = Seed(file.read_bytes(), _raw, share)
     return seeds
+
+
+def summed(data: bytes) -> bytes:
+    """A PNG with right checksums, as far as its chunks can be followed: a decoder looks past them only then."""
+    out, at = bytearray(data), 8
+    while at + 12 <= len(out):
+        (length,) = struct.unpack_from(">I", out, at)
+        end = at + 8 + length
+        if end + 4 > len(out):
+            break
+        struct.pack_into(">I", out, end, zlib.crc32(out[at + 4 : end]))
+        at = end + 4
+    return bytes(out)
 
 
 def model(folder: Path) -> bytes:
@@ -118,50 +153,68 @@ def _model(path: Path) -> object:
     return answer
 
 
-def attack(
-    name: str, data: bytes, door: Door, count: int, random: Random, folder: Path, say: Callable[[str], None]
-) -> int:
-    """Send `count` mutations through a door; prints its row, returns the failures."""
-    seen: Counter[str] = Counter()
+def attack(seed: Seed, random: Random, folder: Path, say: Callable[[str], None]) -> dict[str, Any]:
+    """The outcomes of a batch of mutations, sent through a door; the slowest in s."""
+    seen = Counter({"value": 0, "refused": 0, "died": 0, "failure": 0})
     slowest = 0.0
-    for _ in range(count):
-        file = folder / "fuzz.dng"
-        file.write_bytes(mutated(data, random, most=3))
+    file = folder / "fuzz.dng"
+    for _ in range(BATCH):
+        file.write_bytes(seed.mend(mutated(seed.data, random, most=3, in_place=random.random() < 0.5)))
         start = time.perf_counter()
         try:
-            door(file)
+            seed.door(file)
             seen["value"] += 1
         except InputError as error:
             seen["died" if "the decoder" in str(error) or "not decoded within" in str(error) else "refused"] += 1
             if "\n" in str(error):
                 seen["failure"] += 1
-                say(f"{name}: not one line: {error}")
+                say(f"not one line: {error}")
         except Exception:
             seen["failure"] += 1
-            kept = folder.parent / f"polcap-fuzz-{name.replace(' ', '-')}-{time.time_ns()}"
+            kept = Path(tempfile.gettempdir()) / f"polcap-fuzz-{time.time_ns()}"
             kept.write_bytes(file.read_bytes())
-            say(f"{name}: {kept}\n{traceback.format_exc()}")
+            say(f"{kept}\n{traceback.format_exc()}")
         took = time.perf_counter() - start
         slowest = max(slowest, took)
         seen["failure"] += took > LIMIT_S
-    row = [name, count, seen["value"], seen["refused"], seen["died"], f"{slowest:.1f}", seen["failure"]]
-    say("| " + " | ".join(map(str, row)) + " |")
-    return seen["failure"]
+    return {**seen, "slowest": round(slowest, 2)}
 
 
-def main(files: int, count: int, seed: int, say: Callable[[str], None] = print) -> int:
+def main(files: int, count: int, number: int, rows: Rows, say: Callable[[str], None] = print) -> int:
     """Failures of the campaign."""
-    random = np.random.default_rng(seed)
+    done = rows.done("number", "seed", "batch")
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    say("| seed | files | values | refused | child died | slowest, s | failures |\n|" + " --- |" * 7)
-    with tempfile.TemporaryDirectory() as place:
+    with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as place:
         folder = Path(place)
         seeds = photographs(folder)
-        failures = sum(attack(*one, -(-files // len(seeds)), random, folder, say) for one in seeds)
-        failures += attack("ONNX", model(folder), _model, count, random, folder, say)
+        each = files / sum(seed.share for seed in seeds.values())
+        wanted = {name: ceil(seed.share * each / BATCH) for name, seed in seeds.items()}
+        seeds["ONNX"], wanted["ONNX"] = Seed(model(folder), _model), ceil(count / BATCH)
+        for name, batches in wanted.items():
+            for batch in range(batches):
+                if (number, name, batch) not in done:
+                    found = attack(seeds[name], Random(f"{number} {name} {batch}"), folder, say)
+                    rows.add({"number": number, "seed": name, "batch": batch, **found})
+    worker._close()  # what the children took is known once they have ended
+    children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
-    say(f"This process grew by {grown:.0f} MB.")
+    failures = summary(rows, say)
+    say(
+        f"Now {processor_s():.0f} s of processor time; this process grew by {grown:.0f} MB, a child had {children:.0f}."
+    )
     return failures
+
+
+def summary(rows: Rows, say: Callable[[str], None]) -> int:
+    """The table of all files so far; their failures."""
+    say("| seed | files | values | refused | child died | slowest, s | failures |\n|" + " --- |" * 7)
+    for name in dict.fromkeys(row["seed"] for row in rows.all):
+        of_it = [row for row in rows.all if row["seed"] == name]
+        counts = [sum(row[column] for row in of_it) for column in ("value", "refused", "died", "failure")]
+        slowest = max(row["slowest"] for row in of_it)
+        say(f"| {name} | {BATCH * len(of_it)} | {' | '.join(map(str, counts[:3]))} | {slowest} | {counts[3]} |")
+    say(f"{BATCH * len(rows.all)} files")
+    return sum(row["failure"] for row in rows.all)
 
 
 if __name__ == "__main__":
@@ -169,5 +222,6 @@ if __name__ == "__main__":
     arguments.add_argument("--files", type=int, default=300)
     arguments.add_argument("--models", type=int, default=100)
     arguments.add_argument("--seed", type=int, default=0)
+    arguments.add_argument("--rows", type=Path)
     given = arguments.parse_args()
-    sys.exit(1 if main(given.files, given.models, given.seed) else 0)
+    sys.exit(1 if main(given.files, given.models, given.seed, Rows(given.rows)) else 0)

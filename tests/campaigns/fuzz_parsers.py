@@ -1,9 +1,9 @@
 """Text, TOML, JSON, serial replies and headers, mutated, through polcap's parsers in this process.
 
-python tests/campaigns/fuzz_parsers.py [--runs 100000] [--seed 0]
+python tests/campaigns/fuzz_parsers.py [--runs 100000] [--seed 0] [--rows FILE]
 
 A parser may give a value or one of its declared errors, within a second of processor time. Prints a table per parser;
-anything else is printed with its input and ends with exit code 1.
+anything else is printed with its input and ends with exit code 1. With --rows a campaign goes on where it was stopped.
 """
 
 import argparse
@@ -16,23 +16,45 @@ import traceback
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import ceil
 from pathlib import Path
+from random import Random
+from typing import Any
 
 import msgspec
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from polcap import config
+from polcap import config, report
 from polcap.errors import PolcapError
 from polcap.formats import calib, capture_toml, exif, file_name, maps, npy_folder, plausible, sniff, text_file
-from polcap.images import ColorCalibration, StokesImage
+from polcap.images import ColorCalibration, StokesImage, View
 from polcap.rig import camera, elliptec, grbl, line_protocol, serial_port
 from polcap.rig.log import Log
 from tests.campaigns.mutations import mutated
+from tests.campaigns.rows import Rows
 from tests.formats import headers
 
-serial_port.ANSWER_S = grbl._START_S = grbl._HOLD_S = line_protocol._START_S = 0.02  # nobody is waited for
+BATCH = 500  # executions that make a row
+
+
+class Clock:
+    """Time that passes where somebody waits, and nowhere else."""
+
+    def __init__(self) -> None:
+        self._now = 0.0
+
+    def monotonic(self) -> float:
+        return self._now
+
+    def sleep(self, seconds: float) -> None:
+        self._now += max(seconds, 0.001)
+
+
+CLOCK = Clock()
+for driver in (elliptec, grbl, line_protocol):
+    driver.time = CLOCK  # type: ignore[attr-defined]
 
 
 class Replies:
@@ -53,6 +75,7 @@ class Replies:
 
     def read_line(self, timeout_s: float | None = None) -> str:
         if not self._lines:
+            CLOCK.sleep(serial_port.ANSWER_S if timeout_s is None else timeout_s)
             raise serial_port.Silent("fuzz:// answered with nothing")
         line = self._lines.pop(0).strip()
         if not all(32 <= byte < 127 or byte == 9 for byte in line):
@@ -69,6 +92,7 @@ class Parser:
     run: Callable[[bytes, Path], object]
     declared: tuple[type[Exception], ...] = (PolcapError,)
     limit_s: float = 1.0
+    share: float = 1.0  # of the executions: less where one takes long
 
 
 def _written(data: bytes, folder: Path, name: str) -> Path:
@@ -104,6 +128,11 @@ def _tree(data: bytes, folder: Path) -> object:
 
 def _calibration(data: bytes, folder: Path) -> object:
     return npy_folder.decode(text_file.parse_json(data.decode("utf-8")), ColorCalibration, folder)
+
+
+def _report(data: bytes, folder: Path) -> object:
+    _written(data, folder, "report.json")
+    return report.read(folder)
 
 
 def _header(data: bytes, folder: Path) -> object:
@@ -150,18 +179,26 @@ def _line(data: bytes, folder: Path) -> object:
     return board.where()
 
 
-_FRAME = {"array": "value.stokes.npy"}
-_STOKES = {
-    "stokes": _FRAME, "covariance": _FRAME, "quality": _FRAME, "mask": _FRAME, "residual": None,
-    "view": {"focal": 900.0, "center": [1.0, 2.0], "scale": 2.0, "origin": [0.0, 0.0], "known": True},
+_VALUES = {  # by the name that each has in its manifest
+    "stokes": StokesImage(
+        np.ones((3, 4, 4, 3), np.float32), np.ones((6, 4, 4, 3), np.float32), np.zeros((4, 4), np.uint8),
+        np.ones((4, 4), bool), View(900.0, (1.0, 2.0), 2.0, (0.0, 0.0), True), None,
+    ),
+    "color": ColorCalibration(np.eye(3), None, None, np.ones(24), "chart", float("nan"), 0.001),
 }  # fmt: skip
-_COLOR = {
-    "matrix": _FRAME, "quads": None, "corners": None, "delta_e": None, "source": "chart", "cost": "nan",
-    "metres_per_px": 0.001, "falloff": [0.0, 0.0], "glare": 0.0,
-}  # fmt: skip
+_ARRAYS: npy_folder.Arrays = {}
+_MANIFEST = {name: json.dumps(npy_folder.encode(value, name, _ARRAYS)).encode() for name, value in _VALUES.items()}
 _MAPS = {
     "crop": [0, 0, 64, 48], "size": [32, 24], "scale": 2, "estimator": "network 7", "depth": {"unit": "m"},
     "camera": {"focal_px": 900.0, "center_px": [15.5, 11.5], "focal_known": True},
+}  # fmt: skip
+_REPORT = {
+    "polcap": "0.9.0", "verdict": "pass",
+    "figures": {"maps": {"normal_error_deg_median": 5.0, "estimator": "network 9"}},
+    "capture": {"name": "vase", "camera": "Acme Z1", "notes": [], "shots": [
+        {"angle_deg": 0.0, "frames": [{"file": "pol000/a.dng", "digest": "0f"}]}
+    ]},
+    "settings": {"hdr": {"clip": 0.98}}, "keys": {"merge": "0f"}, "model": None, "gates": [],
 }  # fmt: skip
 _TIFFS = (
     headers.dng(np.zeros((16, 16))),
@@ -175,19 +212,24 @@ _GRBL = (
     b"Grbl 1.1h ['$' for help]\nok\n<Idle|MPos:0.000,0,0|FS:0,0>\nok\n<Idle|MPos:1.000,0,0|FS:0,0>\nok\n"
 )
 PARSERS = {
-    "settings (TOML)": Parser((b"[hdr]\nclip = 0.98\n[gates]\nmax_ghost = 0.02\n",), _settings),
-    "settings (--set)": Parser((b"hdr.clip=0.98", b"gates.max_ghost=0.1"), _assignment),
+    "settings (TOML)": Parser((b"[hdr]\nclip = 0.98\n[gates]\nmax_ghost = 0.02\n",), _settings, share=0.3),
+    "settings (--set)": Parser((b"hdr.clip=0.98", b"gates.max_ghost=0.1"), _assignment, share=0.06),
     "capture.toml": Parser(
-        (b'name = "vase"\nfocal_length_mm = 60.0\n[[frame]]\nfile = "a.dng"\nangle = 45\nrole = "shot"\n',), _capture
+        (b'name = "vase"\nfocal_length_mm = 60.0\n[[frame]]\nfile = "a.dng"\nangle = 45\nrole = "shot"\n',),
+        _capture,
+        share=0.4,
     ),
     "color profile": Parser(
-        (b'matrix = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]\nsource = "chart"\ncost = nan\n',), _profile
+        (b'matrix = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]\nsource = "chart"\ncost = nan\n',),
+        _profile,
+        share=0.4,
     ),
-    "maps.json": Parser((json.dumps(_MAPS).encode(),), _maps, (ValueError, OSError)),
-    "manifest, Stokes": Parser((json.dumps(_STOKES).encode(),), _tree, (ValueError, PolcapError)),
-    "manifest, color": Parser((json.dumps(_COLOR).encode(),), _calibration, (ValueError, PolcapError)),
+    "maps.json": Parser((json.dumps(_MAPS).encode(),), _maps, (ValueError, OSError), share=0.6),
+    "report.json": Parser((json.dumps(_REPORT).encode(),), _report, share=0.6),
+    "manifest, Stokes": Parser((_MANIFEST["stokes"],), _tree, (ValueError, PolcapError)),
+    "manifest, color": Parser((_MANIFEST["color"],), _calibration, (ValueError, PolcapError)),
     "TIFF structure": Parser(_TIFFS, _header),
-    "EXIF": Parser(_TIFFS, _tags, limit_s=30.0),  # the limit of the child that it runs in
+    "EXIF": Parser(_TIFFS, _tags, limit_s=30.0, share=0.06),  # the limit of the child that it runs in
     "JPEG markers": Parser((headers.jpeg(b"") + b"\xff\xda\0\x02abc\xff\0\xff\xd9",), _jpeg),
     "bracket": Parser((b"1/200,1/50,0.5", b"f/11,iso100", b"flash1/16"), _bracket),
     "names": Parser((b"My vase, 2nd try", "Büste №3".encode()), _name),
@@ -197,40 +239,62 @@ PARSERS = {
 }
 
 
-def campaign(runs: int, seed: int, say: Callable[[str], None] = print) -> int:
-    """Failures of `runs` executions, spread evenly over the parsers."""
-    failures = 0
-    random = np.random.default_rng(seed)
-    each = -(-runs // len(PARSERS))
-    say("| parser | executions | values | declared errors | slowest, ms | failures |\n|" + " --- |" * 6)
-    with tempfile.TemporaryDirectory() as folder:
+def campaign(runs: int, seed: int, rows: Rows, say: Callable[[str], None] = print) -> int:
+    """Failures of `runs` executions, by the parsers' shares."""
+    done = rows.done("seed", "parser", "batch")
+    each = runs / sum(parser.share for parser in PARSERS.values())
+    with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as place:
+        folder = Path(place)
+        for name, array in _ARRAYS.items():
+            npy_folder.save(folder / f"{name}.npy", array)
         for name, parser in PARSERS.items():
-            seen: Counter[str] = Counter()
-            slowest = 0.0
-            for _ in range(each):
-                data = mutated(parser.seeds[int(random.integers(len(parser.seeds)))], random, most=4)
-                start = time.process_time()
-                try:
-                    parser.run(data, Path(folder))
-                    seen["value"] += 1
-                except parser.declared:
-                    seen["error"] += 1
-                except Exception:
-                    seen["failure"] += 1
-                    say(f"{name}: {data[:400]!r}\n{traceback.format_exc()}")
-                took = time.process_time() - start
-                slowest = max(slowest, took)
-                if took > parser.limit_s:
-                    seen["failure"] += 1
-                    say(f"{name}: {took:.1f} s on {data[:400]!r}")
-            failures += seen["failure"]
-            say(f"| {name} | {each} | {seen['value']} | {seen['error']} | {1e3 * slowest:.0f} | {seen['failure']} |")
-    return failures
+            for batch in range(ceil(parser.share * each / BATCH)):
+                if (seed, name, batch) not in done:
+                    row = _batch(parser, Random(f"{seed} {name} {batch}"), folder, say)
+                    rows.add({"seed": seed, "parser": name, "batch": batch, **row})
+    return summary(rows, say)
+
+
+def _batch(parser: Parser, random: Random, folder: Path, say: Callable[[str], None]) -> dict[str, Any]:
+    """The outcomes of so many executions, and the processor time of all and of the slowest, s."""
+    seen = Counter({"value": 0, "error": 0, "failure": 0})
+    slowest, begun = 0.0, time.process_time()
+    for _ in range(BATCH):
+        data = mutated(random.choice(parser.seeds), random, most=4)
+        start = time.process_time()
+        try:
+            parser.run(data, folder)
+            seen["value"] += 1
+        except parser.declared:
+            seen["error"] += 1
+        except Exception:
+            seen["failure"] += 1
+            say(f"{data[:400]!r}\n{traceback.format_exc()}")
+        took = time.process_time() - start
+        slowest = max(slowest, took)
+        if took > parser.limit_s:
+            seen["failure"] += 1
+            say(f"{took:.1f} s on {data[:400]!r}")
+    return {**seen, "slowest": round(slowest, 4), "processor": round(time.process_time() - begun, 3)}
+
+
+def summary(rows: Rows, say: Callable[[str], None]) -> int:
+    """The table of all executions so far; their failures."""
+    say("| parser | executions | values | declared errors | slowest, ms | failures |\n|" + " --- |" * 6)
+    for name in PARSERS:
+        of_it = [row for row in rows.all if row["parser"] == name]
+        value, error, failure = (sum(row[column] for row in of_it) for column in ("value", "error", "failure"))
+        slowest = 1e3 * max(row["slowest"] for row in of_it)
+        say(f"| {name} | {BATCH * len(of_it)} | {value} | {error} | {slowest:.0f} | {failure} |")
+    spent, failures = (sum(row[column] for row in rows.all) for column in ("processor", "failure"))
+    say(f"{BATCH * len(rows.all)} executions in {spent:.0f} s of processor time, {failures} failures")
+    return int(failures)
 
 
 if __name__ == "__main__":
     arguments = argparse.ArgumentParser(description=__doc__)
     arguments.add_argument("--runs", type=int, default=100_000)
     arguments.add_argument("--seed", type=int, default=0)
+    arguments.add_argument("--rows", type=Path)
     given = arguments.parse_args()
-    sys.exit(1 if campaign(given.runs, given.seed) else 0)
+    sys.exit(1 if campaign(given.runs, given.seed, Rows(given.rows)) else 0)

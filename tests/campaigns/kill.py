@@ -1,11 +1,12 @@
 """kill -9 at random moments over `polcap process` and `export`; then the same command again, undisturbed.
 
-python tests/campaigns/kill.py [--kills 30] [--seed 0]
+python tests/campaigns/kill.py [--kills 30] [--seed 0] [--rows FILE]
 
-Each of the kills is one of `process` and one of `export`, on a capture of 320 × 240 px.
+Each round kills one `process` and one `export` of a capture of 320 × 240 px: every other round at any moment of the
+command, else at any moment after it began to write. With --rows a campaign goes on where it was stopped.
 
-After each resume every file of the result has the bytes of a run that nobody disturbed (times of measurement apart),
-no partial file lies under a final name, none is left over, and the photographs are what they were.
+Amid the damage no file under a final name differs from that of a run that nobody disturbed (times of measurement
+apart); after the command was given again none is missing or left over either, and the photographs are what they were.
 """
 
 import argparse
@@ -25,8 +26,12 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
 from tests.campaigns import small_capture  # noqa: E402
+from tests.campaigns.rows import Rows, processor_s  # noqa: E402
 
 _CLOCK = {"seconds", "timings", "time"}  # keys of JSON that hold measured times
+_OWN = ("work/lock", "work/owner", "work/written.json", "work/unchanged.json", "report.html")  # hold times, processes
+_LOOK_S = 0.004  # between two looks whether the command writes
+Step = tuple[str | Path, ...]
 
 
 def polcap(*arguments: object) -> subprocess.Popen[bytes]:
@@ -41,11 +46,14 @@ def digests(folder: Path) -> dict[str, str]:
     found = {}
     for file in sorted(path for path in folder.rglob("*") if path.is_file()):
         name = str(file.relative_to(folder))
-        if name in ("work/lock", "work/owner", "work/written.json", "work/unchanged.json", "report.html"):
+        if name in _OWN:
             continue
         data = file.read_bytes()
-        if file.suffix == ".json":
-            data = json.dumps(_timeless(json.loads(data)), sort_keys=True).encode()
+        if file.suffix == ".json" and not _partial(name):
+            try:
+                data = json.dumps(_timeless(json.loads(data)), sort_keys=True).encode()
+            except ValueError:
+                data = b"damaged: " + data
         found[name] = blake2b(data, digest_size=16).hexdigest()
     return found
 
@@ -56,48 +64,103 @@ def _timeless(value: object) -> object:
     return [_timeless(item) for item in value] if isinstance(value, list) else value
 
 
-def main(kills: int, seed: int) -> int:
+def _partial(name: str) -> bool:
+    """Whether a file bears no final name, or lies in a folder that bears none."""
+    return any(".part" in part for part in Path(name).parts)
+
+
+def _writes(out: Path) -> int:
+    """When something in the result was changed last, ns."""
+    places = (out, out / "work", out / "maps", out / "asset")
+    return max((place.stat().st_mtime_ns for place in places if place.exists()), default=0)
+
+
+def undisturbed(step: Step, out: Path) -> tuple[float, float]:
+    """Seconds that the command takes in all, and from its first write on."""
+    before, start, first = _writes(out), time.perf_counter(), None
+    run = polcap(*step, out)
+    while run.poll() is None:
+        if first is None and _writes(out) != before:
+            first = time.perf_counter()
+        time.sleep(_LOOK_S)
+    end = time.perf_counter()
+    assert run.returncode in (0, 3), (step, run.returncode)
+    return end - start, end - (first or start)
+
+
+def kill_amid(step: Step, out: Path, share: float, span_s: float, writing: bool) -> bool:
+    """Start the command and kill it after a share of its span, from its start or its first write on; True if amid."""
+    before = _writes(out)
+    run = polcap(*step, out)
+    while writing and run.poll() is None and _writes(out) == before:
+        time.sleep(_LOOK_S)
+    time.sleep(share * span_s)
+    amid = run.poll() is None
+    run.kill()
+    run.wait()
+    return amid
+
+
+def broken_names(found: dict[str, str], *whole: dict[str, str]) -> list[str]:
+    """Files under a final name that are as in none of the whole results; what is missing is not broken."""
+    final = {name: digest for name, digest in found.items() if not _partial(name)}
+    return sorted(name for name, digest in final.items() if all(one.get(name) != digest for one in whole))
+
+
+def main(kills: int, seed: int, rows: Rows) -> int:
     """Failures."""
-    random = np.random.default_rng(seed)
-    failures = killed = 0
     with tempfile.TemporaryDirectory() as place:
         capture = Path(place) / "capture"
         small_capture.write(capture)
         photographs = digests(capture)
         whole = Path(place) / "whole"
-        steps: tuple[tuple[str | Path, ...], ...] = (
+        steps: tuple[Step, ...] = (
             ("process", capture, "--estimator", "analytic", "--no-chart", "--out"),
-            ("export",),
+            ("export", "--gltf", "--obj", "--usd", "--materialx", "--exr"),
         )
-        spans = []
-        for step in steps:
-            start = time.perf_counter()
-            code = polcap(*step, whole).wait()
-            spans.append(time.perf_counter() - start)
-            assert code in (0, 3), code
-        wanted = digests(whole)
-        print(f"undisturbed: process {spans[0]:.1f} s, export {spans[1]:.1f} s, {len(wanted)} files", flush=True)
-        for number in range(kills):
-            out = Path(place) / "killed"
-            for step, span in zip(steps, spans):
-                run = polcap(*step, out)
-                time.sleep(float(random.uniform(0, span)))
-                killed += run.poll() is None
-                run.kill()
-                run.wait()
-                polcap(*step, out).wait()
-            found = digests(out)
-            wrong = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
-            failures += bool(wrong) or digests(capture) != photographs
-            print(f"{number:4d} {wrong or 'same bytes'}", flush=True)
+        spans = [undisturbed(steps[0], whole)]
+        stages = [digests(whole)]
+        spans.append(undisturbed(steps[1], whole))
+        stages.append(digests(whole))
+        told = ", ".join(f"{step[0]} {span[0]:.1f} s" for step, span in zip(steps, spans))
+        print(f"undisturbed: {told}, {len(stages[-1])} files", flush=True)
+        done = rows.done("seed", "number")
+        for number in range(-(-kills // len(steps))):
+            if (seed, number) in done:
+                continue
+            random = np.random.default_rng([seed, number])
+            out, before = Path(place) / "killed", processor_s()
+            row: dict[str, object] = {"seed": seed, "number": number}
+            for step, (span, writing), wanted in zip(steps, spans, stages):
+                from_write = number % 2 == 1
+                amid = kill_amid(step, out, float(random.uniform()), writing if from_write else span, from_write)
+                broken = broken_names(digests(out), *stages) if out.exists() else []
+                code = polcap(*step, out).wait()
+                found = digests(out)
+                differ = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
+                row[str(step[0])] = {"amid": amid, "broken": broken, "code": code, "differ": differ}
+            row["photographs"] = digests(capture) == photographs
+            row["processor"] = round(processor_s() - before, 1)
+            rows.add(row)
+            print(json.dumps(row), flush=True)
             shutil.rmtree(out)
-    print(f"{killed} kills amid a run, {failures} failures")
+    return summary(rows)
+
+
+def summary(rows: Rows) -> int:
+    """Failures of all rounds so far."""
+    halves = [row[step] for row in rows.all for step in ("process", "export")]
+    failures = sum(bool(half["broken"] or half["differ"] or half["code"] not in (0, 3)) for half in halves)
+    failures += sum(not row["photographs"] for row in rows.all)
+    spent = sum(row["processor"] for row in rows.all)
+    print(f"{len(halves)} kills, {sum(half['amid'] for half in halves)} amid a run; {failures} failures; {spent:.0f} s")
     return failures
 
 
 if __name__ == "__main__":
-    arguments = argparse.ArgumentParser(description=__doc__)
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("--kills", type=int, default=30)
     arguments.add_argument("--seed", type=int, default=0)
+    arguments.add_argument("--rows", type=Path)
     given = arguments.parse_args()
-    sys.exit(1 if main(given.kills, given.seed) else 0)
+    sys.exit(1 if main(given.kills, given.seed, Rows(given.rows)) else 0)
