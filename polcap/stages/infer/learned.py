@@ -22,6 +22,7 @@ _DETAIL = 2.0  # pixels that the network sees, 1σ: what is finer is the inversi
 _CALIBRATION = (0.59, 1.07, 1.11, 50.0)
 _CELLS = 2.0  # cells of the network's grid, 1σ, over which its pattern is taken as the same
 _BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
+_GRAZING = 0.15  # cosine below which shading is not told apart; .1 and .2 leave the same error
 _BRIGHTEST = 2.0  # S0, which is 1 where white paper faces the flash beside the chart; what no body reflects
 
 
@@ -29,8 +30,9 @@ def estimate(cues: Cues, network: Network, ior: float, symmetries: int, *, fine_
     """The network's maps, its normals joined with the analytic ones by their expected errors.
 
     The network sees the whole object at the size it was made for, which settles half-turns, shape and gloss.
-    Detail comes from the pixels: of color by the picture itself, which the network's albedo only divides by its
-    shading; of normals by what the inversion shows that is finer than the network sees, where noise leaves it a say.
+    Detail comes from the pixels: of color by the picture itself, divided by the shading of the normals and by what
+    else the network tells between light and albedo; of normals by what the inversion shows that is finer than the
+    network sees, where noise leaves it a say.
 
     Parameters
     ----------
@@ -52,7 +54,8 @@ def estimate(cues: Cues, network: Network, ior: float, symmetries: int, *, fine_
     """
     maps, guess, stated = known(cues, network, ior, symmetries)
     normal = fine.refined(cues, guess, network.fine) if fine_pass and network.fine else guess.normal
-    diffuse = fill_highlights((np.maximum(cues.radiance, 0) + FLOOR) * np.exp(maps["factor"]) - FLOOR, _bounded(cues))
+    lit = (np.maximum(cues.radiance, 0) + FLOOR) * np.exp(maps["factor"])
+    diffuse = fill_highlights(lit / _shading(normal, cues.rays) - FLOOR, _bounded(cues))
     scale, power, rougher, most = _CALIBRATION
     expected = np.minimum(scale * stated**power * np.exp(rougher * np.clip(maps["roughness"], 0, 1)), most)
     inside = cues.mask[..., None]
@@ -82,8 +85,9 @@ def known(
     Returns
     -------
     tuple
-        The network's maps (H, W[, 3]) at the crop's size, of which `factor` is the logarithm of albedo over S0; what
-        the fine pass is told; the error (H, W) stated for the normals, degrees.
+        The network's maps (H, W[, 3]) at the crop's size, of which `factor` is the logarithm of the light that its
+        albedo sends back under the shading of its normals over S0; what the fine pass is told; the error (H, W)
+        stated for the normals, degrees.
     """
     _check(network)
     size = cues.mask.shape[::-1]
@@ -92,7 +96,7 @@ def known(
     small = augmentation.mean(seen, network, symmetries)
     # beside the object the network guesses: zeros there leave an edge's direction to the object's own pixels
     small["normal"] = _without_grid(small["normal"], seen.mask) * seen.mask[..., None]
-    small["factor"] = _factor(small["diffuse"], seen)
+    small["factor"] = _factor(small["diffuse"] * _shading(small["normal"], seen.rays), seen)
     for name in ("specular", "roughness"):
         small[name] = _blended(small[name], seen.mask)
     maps = {name: np.asarray(cv2.resize(image, size)) for name, image in small.items()}
@@ -219,14 +223,25 @@ def _resized(cues: Cues, scale: float) -> Cues:
     )
 
 
-def _factor(albedo: Floats, seen: Cues) -> Floats:
-    """Logarithm of albedo over S0 (H, W, 3), without the network's 2 px grid: a kernel in which that vanishes.
+def _shading(normal: Floats, rays: Floats) -> Floats:
+    """Share of the light (H, W, 1) that normals send back, as far as they are trusted.
+
+    So relief finer than the network sees, and limbs that its pixels cut into steps, leave the albedo. Half of
+    Lambert's law, as a power, left the least error of the albedo on pictures of both protocols, engraved or not,
+    and on path-traced captures: normals err, and light from around fills what turns away.
+    """
+    length = np.maximum(_length(normal), 1e-6)
+    return np.asarray(np.sqrt(np.maximum(frames.to_ray_frame(normal / length, rays)[..., 2:], _GRAZING)))
+
+
+def _factor(light: Floats, seen: Cues) -> Floats:
+    """Logarithm of light over S0 (H, W, 3), without the network's 2 px grid: a kernel in which that vanishes.
 
     Beside the object and in saturated highlights it goes on from around, for the pixels there when it is enlarged.
     """
     known = seen.mask & ((seen.quality & Quality.CLIPPED) == 0)
     inside = known.astype(np.float32)
-    factor = (np.log((albedo + FLOOR) / (np.maximum(seen.radiance, 0) + FLOOR)) * inside[..., None]).astype(np.float32)
+    factor = (np.log((light + FLOOR) / (np.maximum(seen.radiance, 0) + FLOOR)) * inside[..., None]).astype(np.float32)
 
     def mean(kernel: Floats) -> Floats:
         smooth, share = (

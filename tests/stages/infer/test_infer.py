@@ -146,6 +146,24 @@ def test_a_grid_of_the_network_does_not_reach_the_albedo():
     assert abs(part[(x + y) % 2 == 0].mean() / part[(x + y) % 2 == 1].mean() - 1) < 2e-3
 
 
+def test_relief_that_the_network_does_not_see_leaves_the_albedo(monkeypatch):
+    """Waves of one color, 5 px long and 45° steep, of which the network sees no more than grey 0.3."""
+    found = seen(noise=1e-4)
+    steep = np.tan(np.radians(45)) * np.sin(2 * np.pi * np.arange(found.mask.shape[1]) / 5)
+    local = np.stack([steep, 0 * steep, 1 + 0 * steep], -1) / np.sqrt(1 + steep**2)[:, None]
+    waves = frames.from_ray_frame(np.broadcast_to(local, (*found.mask.shape, 3)), found.rays)
+    lit = np.repeat(0.3 * local[None, :, 2:] * found.mask[..., None], 3, axis=-1).astype(np.float32)
+    found = dataclasses.replace(found, radiance=lit)
+    half = dataclasses.replace(network(), fine=network(), metadata={"native_size": "64", "size_multiple": "32"})
+    rows, columns = np.nonzero(found.mask)
+    middle = np.s_[rows.min() + 60 : rows.max() - 60, columns.min() + 60 : columns.max() - 60]
+    spread = []
+    for normal in (found.rays, waves):
+        monkeypatch.setattr(learned.fine, "refined", lambda cues_, guess, network_, known=normal: known)
+        spread.append(np.log(infer.estimate(found, half, infer.Settings()).diffuse[middle] + cues.FLOOR).std())
+    assert spread[1] == pytest.approx(spread[0] / 2, rel=0.1)
+
+
 def test_a_grid_of_the_network_does_not_reach_the_gloss():
     """Means of the four phases of a 2 px grid, and of single pixels, are even where the network prints ±5 %."""
     found = seen(noise=1e-4, textured=False)
