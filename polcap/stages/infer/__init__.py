@@ -29,7 +29,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     symmetries: Annotated[
         Literal[1, 2, 4, 8],
         Meta(description="turned and mirrored positions in which the network sees the object; their mean is taken"),
-    ] = 2
+    ] = 4
     fine: Annotated[bool, Meta(description="a second network adds relief that the first is shown too small to see")] = (
         True
     )
