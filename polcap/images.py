@@ -297,7 +297,7 @@ class Gains:
     anchor_sigma: Floats  # (K,) 1σ of the anchor's channel means
     grey_slope: float  # of ln light over ln reflectance of the chart's light greys: 1 is linear, NaN unknown
     chart_gloss: float  # greatest part of a shot's ratio on the white patch that is the chart's gloss, beyond doubt
-    turned_shots: tuple[int, ...] = ()  # whose angle keeps more than three shots from closing; several: one of them
+    turned_shots: tuple[int, ...] = ()  # one of these keeps more than three shots from closing; the most turned first
     turned: float = 0.0  # rad, true less stated angle of the first of them
     turned_sigma: float = np.pi / 2  # rad, 1σ
     rival: tuple[int, ...] = ()  # an order of the shots that the silhouette supports as well; none: it tells

@@ -110,7 +110,7 @@ def _not_closing(gains: Gains, names: list[str], limit: float) -> Gate:
     """One angle of more than three that contradicts the others over the whole object."""
     degrees, doubt = np.degrees([gains.turned, gains.turned_sigma])
     shots = tuple(names[k] for k in gains.turned_shots)
-    which = shots[0] if len(shots) == 1 else f"{shots[0]} (or {', '.join(shots[1:])} the other way)"
+    which = shots[0] if len(shots) == 1 else f"{shots[0]} (or {', '.join(shots[1:])}, by as much or less)"
     says = f"{which} looks turned by {degrees:+.0f}° ± {doubt:.0f}°: the shots contradict one another"
     remedy = "set the ring to its mark and take the shot again, or name the angle it really had"
     return Gate("angles", "fail", round(float(degrees), 1), limit, says, remedy, abs(float(degrees)) / 2, shots, "°")

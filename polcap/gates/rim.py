@@ -37,7 +37,7 @@ class Turn:
     shot: int | None  # None: all alike
     angle: float  # rad, true minus stated
     misfit: float  # residual with that turn, relative to the residual without; 1: nothing is better
-    sigmas: float  # the improvement over its scatter between the outline's sectors
+    sigmas: float  # the turn that the outline's sectors ask for, this way round, over its scatter between them
 
 
 @dataclass(frozen=True)
@@ -76,17 +76,20 @@ def take(light: Floats, mask: Bools, usable: Bools) -> Rim:
 
 def turn(at: Rim, angle: Floats, least: float) -> Turn:
     """The best of all turns of one shot, or of all, by at least `least` rad; angle (K,) rad as stated."""
-    stated = _misfit(at, angle)
-    middle = float(np.median(stated)) + 1e-9
-    best, which = Turn(None, 0.0, 1.0, 0.0), stated
+    middle = float(np.median(_misfit(at, angle))) + 1e-9
+    best = Turn(None, 0.0, 1.0, 0.0)
     steps = np.radians(np.arange(_STEP_DEG, _MOST_DEG + 1, _STEP_DEG))
     for step in (s for size in steps if size >= least for s in (-size, size)):
         for shot in (*range(len(angle)), None):
-            turned = _misfit(at, angle + step * (1 if shot is None else np.arange(len(angle)) == shot))
-            misfit = float(np.median(turned)) / middle
+            misfit = float(np.median(_misfit(at, angle + step * _whose(shot, angle)))) / middle
             if misfit < best.misfit:
-                best, which = Turn(shot, float(step), misfit, 0.0), turned
-    return replace(best, sigmas=_sigmas(stated - which, at.sector))
+                best = Turn(shot, float(step), misfit, 0.0)
+    return replace(best, sigmas=_sigmas(at, angle, np.sign(best.angle) * _whose(best.shot, angle)))
+
+
+def _whose(shot: int | None, angle: Floats) -> Floats:
+    """(K,) 1 for the shot that turns, 0 for the others; None: 1 for all."""
+    return np.ones(len(angle)) if shot is None else (np.arange(len(angle)) == shot).astype(float)
 
 
 def _misfit(at: Rim, angle: Floats) -> Floats:
@@ -98,12 +101,24 @@ def _misfit(at: Rim, angle: Floats) -> Floats:
     return np.asarray(np.linalg.norm(light - share * wave, axis=0))
 
 
-def _sigmas(gained: Floats, sector: NDArray[np.int_]) -> float:
-    """Mean over its standard error of what each sector gains; sectors stand for independent measurements."""
-    each = np.array([np.median(gained[sector == s]) for s in np.unique(sector)])
-    if len(each) < _LEAST_SECTORS:
+def _sigmas(at: Rim, angle: Floats, way: Floats) -> float:
+    """The turn that the sectors ask for along `way` (K,), over its scatter when each of them is left out.
+
+    Linear in the turn, and signed: what is wrong with the outline turns some sectors one way and some the other.
+    """
+    away = 2 * (angle[:, None] - at.azimuth)
+    wave, slope, light = (part - part.mean(0) for part in (np.cos(away), -2 * np.sin(away) * way[:, None], at.light))
+    power = np.maximum((wave * wave).sum(0), 1e-9)
+    share = (wave * light).sum(0) / power
+    slope = slope - (wave * slope).sum(0) / power * wave
+    asked = np.bincount(at.sector, (slope * (light - share * wave)).sum(0))
+    room = np.bincount(at.sector, (slope * slope).sum(0)) * float(np.median(share))
+    used = np.flatnonzero(room)
+    if len(used) < _LEAST_SECTORS:
         return 0.0
-    return float(each.mean() / max(each.std(ddof=1) / np.sqrt(len(each)), 1e-9))
+    without = (asked.sum() - asked[used]) / (room.sum() - room[used])
+    doubt = np.sqrt((len(used) - 1) / len(used) * ((without - without.mean()) ** 2).sum())
+    return float(asked.sum() / room.sum() / max(doubt, 1e-9))
 
 
 def body(at: Rim, angle: Floats) -> Body:

@@ -34,6 +34,21 @@ def test_ring_off_its_mark_is_no_single_shots_fault() -> None:
     assert np.degrees(found.angle) == pytest.approx(-12, abs=rim._STEP_DEG)
 
 
+def test_an_outline_bent_at_random_asks_for_no_turn_that_its_parts_agree_on() -> None:
+    """The best of a hundred turns explains it better than none does: that is how it was chosen."""
+    angle = np.radians([62.0, 134.0, 165.0])
+    fooled, sure = 0, 0
+    for seed in range(40):
+        random = np.random.default_rng(seed)
+        azimuth, sector = np.linspace(-np.pi, np.pi, 480, endpoint=False), np.repeat(np.arange(24), 20)
+        bent = azimuth + np.repeat(random.normal(0, np.radians(20), 24), 20)  # contour beside the surface's azimuth
+        light = 1 + 0.1 * np.cos(2 * (angle[:, None] - bent))
+        found = rim.turn(rim.Rim(light, azimuth, sector, np.ones(480)), angle, np.radians(8))
+        fooled += found.shot is not None and found.misfit < 0.9
+        sure += found.shot is not None and found.sigmas > 2.5
+    assert fooled > 5 and sure < 3
+
+
 def test_true_angles_stand_unchallenged() -> None:
     assert rim.turn(ball_rim((0.5, 44.6, 90.3)), scenes.ANGLES, np.radians(8)).misfit > 0.9
 

@@ -169,6 +169,17 @@ def test_one_of_four_angles_that_was_not_what_it_is_called_is_found(victim):
     )
 
 
+def test_of_shots_that_cannot_be_told_apart_the_most_turned_counts():
+    """Crossed analyzers stand for one another in the closure, by unlike turns where the other angles lie unevenly."""
+    stated = np.radians([81.0, 108.0, 126.0, 171.0])
+    radiance = scenes.stack(noise=0.002, angles=stated + np.radians([0, 0, 0, 15.0]))
+    unturned = selfcal.Settings(correct_ring=False)
+    found = selfcal.solve(
+        dataclasses.replace(radiance, angle=stated), scenes.still(4), scenes.ball_object(), scenes.no_color(), unturned
+    )
+    assert found.turned_shots[0] == 3 and np.degrees(found.turned) == pytest.approx(15, abs=5)
+
+
 def test_a_calibrated_zero_and_the_outline_are_joined_by_their_errors():
     settings, deg = selfcal.Settings(), np.radians(1.0)
     outline = RingZero(0.6 * deg, 0.4 * deg)

@@ -61,7 +61,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 12.0
 
 
-@stage(version=6)
+@stage(version=7)
 def solve(
     radiance: AngleStack,
     alignment: Alignment,

@@ -27,7 +27,7 @@ _ANGLE_ERROR = np.radians(0.5)  # 1σ of every angle, set by hand or motor, agai
 class Turn:
     """The turn of one shot that lets all of them close."""
 
-    shots: tuple[int, ...]  # the likeliest; more than one where they cannot be told apart; none: all close
+    shots: tuple[int, ...]  # the likeliest; of several that cannot be told apart the most turned first; none: all close
     angle: float  # rad, true minus stated, of the first of them
     sigma: float  # rad
 
@@ -62,13 +62,14 @@ def measure(light: Floats, row: NDArray[np.int_], angle: Floats, gain_sigma: Flo
     part = np.searchsorted(np.quantile(row, np.linspace(0, 1, _PARTS + 1)[1:-1]), row)
     prior = np.diag(1 / np.maximum(gain_sigma, 1e-4) ** 2)
     fits = [_fit(left, by_gain, free[:, k, None] * slope[k], part, prior) for k in range(shots)]
-    best = max(range(shots), key=lambda k: fits[k].gained)
-    alike = tuple(k for k in range(shots) if k != best and fits[k].gained > _ALIKE * fits[best].gained)
-    found = fits[best]
+    most = max(fit.gained for fit in fits)
+    alike = [k for k in range(shots) if fits[k].gained >= _ALIKE * most]
+    alike.sort(key=lambda k: -abs(fits[k].turn))  # a small turn of one shot can be a large one of another
+    found = fits[alike[0]]
     sigma = float(np.hypot(found.sigma, _ANGLE_ERROR * np.sqrt(shots)))
     if found.gained < _LEAST_GAIN * found.stated or abs(found.turn) < _LEAST_SIGMAS * sigma:
         return NONE
-    return Turn((best, *alike), found.turn, sigma)
+    return Turn(tuple(alike), found.turn, sigma)
 
 
 @dataclass(frozen=True)
