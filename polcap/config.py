@@ -85,6 +85,10 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_outline_dolp: Annotated[
         float, Meta(ge=0, le=1, description="median polarization of the outline; less is no common body [1]")
     ] = 0.03
+    min_zenith_deg: Annotated[
+        float,
+        Meta(ge=0, le=90, description="median zenith of a weakly polarized shape; less is flattened [degrees]"),
+    ] = 33.0
     min_concentration: Annotated[
         float, Meta(ge=0, le=1, description="how well polarization follows the outline, 1 is all round [1]")
     ] = 0.5

@@ -8,8 +8,9 @@ import numpy as np
 from polcap.config import Gates
 from polcap.gates import rim
 from polcap.gates.gate import Found, Gate, at_most
-from polcap.images import Floats, Gains, Quality, StokesImage
+from polcap.images import Floats, Gains, Quality, StokesImage, SurfaceMaps
 from polcap.optics import mueller
+from polcap.optics.frames import dot, rays
 
 _LEAST_RIM = 200  # pixels of outline that an angle can be told from
 _LEAST_DOLP = 0.01  # of the outline; there the least index has ten times that
@@ -19,6 +20,10 @@ _CLEAR = 0.8  # concentration of the AoLP about the outline from which a common 
 _LOPSIDED = 1.4  # so much more uneven may a body be that is polarized as it should all round: its shape, not the light
 _USUAL_DOLP = 0.1  # of an outline under a flash; a part q of it tilts by √q of the true zenith
 _FLATTENED_DEG = 34.0  # of a sphere's median zenith of 45°: what the estimators do not restore (two wax-like captures)
+_BALL_DEG = 45.0  # median zenith over the disc of a ball
+_WEAK_DOLP = 0.05  # of an outline: above, nothing is taken for flattened
+_DIMMED = 0.9  # of the mean light: below, an outline turns away
+_ROUGH = 0.5  # roughness from which facets alone leave little polarization
 _MOST_PIXELS = 6e5  # a larger picture is averaged down
 
 
@@ -49,12 +54,12 @@ def of_outline(found: Found, limits: Gates) -> Iterator[Gate]:
     body = rim.body(band, angle)
     if body.dolp < _LEAST_DOLP:
         says = f"the outline is polarized by {100 * body.dolp:.1f} %"
-        remedy = "is the polarizer on, and did it turn? A metal object has no diffuse polarization"
+        remedy = "is the polarizer on, and did it turn? Metal and translucent bodies (wax, milk) hardly polarize"
         yield Gate("polarized", "fail", round(body.dolp, 4), _LEAST_DOLP, says, remedy, 45.0)
         return
     of_shots = _angles(rim.turn(band, angle, np.radians(limit)), body, angle, found.gains, found.names, limits)
     yield _with_ring(of_shots, found.gains, limits)
-    yield _light_of_body(body, limits)
+    yield _light_of_body(body, found.maps, limits)
     side = rim.side_light(band)
     k = int(np.argmax(side))
     says = f"{found.names[k]} is brighter on one side by {100 * side[k]:.1f} %"
@@ -139,8 +144,12 @@ def _with_ring(gate: Gate, gains: Gains, limits: Gates) -> Gate:
     return Gate("angles", "warn", value, limit if noted else limits.max_turn_deg, says, remedy, cost, unit="°")
 
 
-def _light_of_body(body: rim.Body, limits: Gates) -> Gate:
-    """Whether the outline is polarized as a body under a flash by the lens: across the contour, and enough."""
+def _light_of_body(body: rim.Body, maps: SurfaceMaps, limits: Gates) -> Gate:
+    """Whether the outline is polarized as a body under a flash by the lens: across the contour, and enough.
+
+    A rough body polarizes as little as a translucent one. The estimators allow for roughness, and then find a shape as
+    round as shading says; what else weakens polarization is left in the shape, which is flattened.
+    """
     limit = limits.min_outline_dolp
     remedy = "darken the room, keep the flash beside the lens, and photograph an ambient frame"
     if body.along < -0.3:
@@ -157,18 +166,37 @@ def _light_of_body(body: rim.Body, limits: Gates) -> Gate:
             "or an object whose outline is no contour of shape"
         )
         return Gate("body", "warn", round(body.dolp, 4), limit, says, remedy, max(15.0, weak))
-    if body.dolp < limit:
+    zenith, roughness = _median_shape(maps)
+    flat, dimmed = zenith < limits.min_zenith_deg, body.brightness < _DIMMED
+    hint = "under even light translucent bodies give little; trust the shape less"
+    if flat and dimmed and body.dolp < max(limit, _WEAK_DOLP):
         says = (
-            f"the outline is polarized by {100 * body.dolp:.1f} %, far less than shading says: a translucent body "
-            "(wax, skin, milk), a very rough one, or ambient light"
+            f"the outline is polarized by {100 * body.dolp:.1f} % and the shape found is flat ({zenith:.0f}° in the "
+            "median), far less than shading says: a translucent body (wax, skin, milk), or ambient light"
         )
-        hint = "under even light translucent and very rough bodies give little; trust the shape less"
+        return Gate("body", "warn", round(body.dolp, 4), limit, says, hint, round(_BALL_DEG - zenith, 1))
+    if body.dolp < limit and (dimmed if flat else roughness < _ROUGH):
+        says = (
+            f"the outline is polarized by {100 * body.dolp:.1f} %, far less than gloss and shading say: a translucent "
+            "body (wax, skin, milk), or ambient light"
+        )
         return Gate("body", "warn", round(body.dolp, 4), limit, says, hint, round(weak, 1))
     lopsided = _LOPSIDED if body.concentration > _CLEAR else 1.0
     if body.one_sided > limits.max_one_sided * lopsided:
         says = f"one side of the object is lit {body.one_sided:.1f} times more than its mean: light from the side"
         return Gate("body", "warn", round(body.dolp, 4), limit, says, remedy, 10.0)
-    return Gate("body", "pass", round(body.dolp, 4), limit, f"the outline is polarized by {100 * body.dolp:.1f} %")
+    says = f"the outline is polarized by {100 * body.dolp:.1f} %"
+    if body.dolp < limit:
+        says += ": little, as a flat object's" if flat else ": little, as a rough body's"
+    return Gate("body", "pass", round(body.dolp, 4), limit, says)
+
+
+def _median_shape(maps: SurfaceMaps) -> tuple[float, float]:
+    """Median zenith of the normals, degrees from the view ray, and median roughness."""
+    if not maps.mask.any():
+        return 0.0, 0.0
+    facing = dot(maps.normal, rays(maps.view, *maps.mask.shape))[maps.mask]
+    return float(np.degrees(np.arccos(np.clip(np.median(facing), -1, 1)))), float(np.median(maps.roughness[maps.mask]))
 
 
 def _reduced(image: StokesImage, angle: Floats) -> tuple[Floats, rim.Bools, rim.Bools]:

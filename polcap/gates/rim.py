@@ -49,6 +49,7 @@ class Body:
     concentration: float  # 0…1, of the AoLP about the contour, turned as it may be
     turned: float  # rad, the common turn of the AoLP against the contour
     turned_sigma: float  # rad
+    brightness: float  # median light of the rim over the object's mean; under a flash a body dims where it turns away
     one_sided: float  # amplitude of the rim's light going once round, relative; under a flash by the lens about 0
 
 
@@ -132,6 +133,7 @@ def body(at: Rim, angle: Floats) -> Body:
         concentration=abs(mean),
         turned=float(np.angle(mean) / 2),
         turned_sigma=turned_sigma,
+        brightness=float(np.median(at.total)),
         one_sided=float(np.hypot(found[1], found[2]) / max(float(found[0]), 1e-9)),
     )
 

@@ -46,7 +46,7 @@ FAULTS: dict[str, tuple[str, ...]] = {
     "glossy chart": ("gain doubt", "chart", "gains"),
     "other object": ("alignment",),
     "flash by shutter": ("exposures", "clipping"),
-    "wax": ("body",),
+    "wax": ("body", "polarized"),  # which names translucent bodies too
 }
 
 

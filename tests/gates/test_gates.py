@@ -24,7 +24,7 @@ def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> SimpleNamespace
     gains = selfcal.solve(radiance, scenes.still(shots), object_, scenes.no_color(), unchecked)
     gains = changed.pop("gains", replace(gains, source="grey patches", sigma=0 * gains.sigma, disagreement=0.0))
     image = stokes.solve(radiance, scenes.still(shots), gains, object_, stokes.Settings())
-    normal = np.zeros((*image.mask.shape, 3), np.float32)
+    normal = scenes.truth()[0].astype(np.float32)
     flat = np.full(image.mask.shape, 0.5, np.float32)
     maps = SurfaceMaps(normal, normal, normal, flat, None, 8 * flat, image.mask, image.view, "analytic")
     given = {
@@ -117,11 +117,36 @@ def test_a_turn_of_the_ring_is_told_though_taken_out(good: SimpleNamespace, turn
     assert gate.state == state and f"{turn:+.1f}°" in gate.says and "taken out" in gate.says
 
 
-def test_body_that_polarizes_too_little_is_told(good: SimpleNamespace) -> None:
-    image = good.stokes
-    weak = image.stokes * np.array([1, 0.13, 0.13], np.float32)[:, None, None, None]
-    gate = judged(changed(good, stokes=replace(image, stokes=weak)))["body"]
-    assert gate.state == "warn" and "translucent" in gate.says and gate.cost_deg > 5
+def shaped(good: SimpleNamespace, polarized: float, flattened: float, roughness: float, dimmed: bool = True) -> Any:
+    """The ball with a part of its polarization and of its tangents' slope, and whether it dims towards its outline."""
+    image, maps = good.stokes, good.maps
+    weak = image.stokes * np.array([1, polarized, polarized], np.float32)[:, None, None, None]
+    shading = np.maximum(maps.normal[..., 2:], 0.1)
+    slope = maps.normal[..., :2] / shading * flattened
+    normal = np.concatenate([slope, np.ones_like(shading)], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    maps = replace(maps, normal=normal, roughness=np.full_like(maps.roughness, roughness))
+    weak = (weak * shading if dimmed else weak / weak[0].mean(-1)[..., None]).astype(np.float32)
+    return changed(good, stokes=replace(image, stokes=weak), maps=maps)
+
+
+@pytest.mark.parametrize(
+    ("polarized", "flattened", "roughness", "dimmed", "words"),
+    [
+        (0.13, 0.4, 0.6, True, "the shape found is flat"),  # wax
+        (0.25, 0.4, 0.6, True, "the shape found is flat"),  # wax that is not quite as bad
+        (0.13, 1.0, 0.2, True, "gloss and shading"),  # no rough body shines
+        (0.13, 1.0, 0.7, True, ""),  # a rough body, which the estimator has allowed for
+        (0.13, 0.3, 0.2, False, ""),  # a coin
+        (0.9, 0.4, 0.2, True, ""),  # the wall of a vessel
+    ],
+)
+def test_body_that_polarizes_too_little_for_its_shape_is_told(
+    good: SimpleNamespace, polarized: float, flattened: float, roughness: float, dimmed: bool, words: str
+) -> None:
+    gate = judged(shaped(good, polarized, flattened, roughness, dimmed))["body"]
+    assert gate.state == ("warn" if words else "pass"), gate
+    assert words in gate.says and (gate.cost_deg > 10) == bool(words)
 
 
 def test_light_from_around_is_told(good: SimpleNamespace) -> None:
