@@ -23,6 +23,8 @@ _WAYS = ((0, 1), (1, 0), (1, 1), (1, -1))
 _LADDER = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # px, 1σ
 _LEAST_TILES = 4
 _LEAST_LIGHT = 0.01  # of the sensor's range; in darker tiles noise is detail
+_SURE = 3.0  # 1σ of the tiles' median beyond which a loss of detail is one
+_MEDIAN_SE = (np.pi / 2) ** 0.5  # standard error of a median over that of a mean, of normal scatter
 _DETAIL = -0.5  # log of fine over coarse energy: noise has 0, detail less
 
 
@@ -103,6 +105,7 @@ def choose(light: Floats, usable: NDArray[np.bool_]) -> NDArray[np.int64]:
 def extra_blur(tiles: Floats, usable: NDArray[np.bool_]) -> Floats:
     """1σ of the Gaussian that each photograph is blurred by beyond the sharpest, (K,) px; NaN: cannot tell.
 
+    A blur that the tiles' scatter explains counts as none.
     tiles (K, T, n, n) of K photographs of equal exposure; usable (K, T).
     """
     fineness = np.stack([_fineness(shot) for shot in tiles])  # (K, 4, T)
@@ -113,7 +116,10 @@ def extra_blur(tiles: Floats, usable: NDArray[np.bool_]) -> Floats:
     sharpest = int(np.argmax(np.median(fineness, axis=2).mean(1)))
     ladder = np.stack([_fineness(_blurred(tiles[sharpest][every], sigma)) for sigma in _LADDER])  # (L, 4, T)
     fall = np.median(ladder[0] - ladder, axis=2)  # (L, 4), growing
-    lost = np.median(fineness[sharpest] - fineness, axis=2)  # (K, 4)
+    each = fineness[sharpest] - fineness  # (K, 4, T)
+    lost = np.median(each, axis=2)  # (K, 4)
+    doubt = _MEDIAN_SE * each.std(axis=2, ddof=1) / np.sqrt(each.shape[2])
+    lost = np.where(lost > _SURE * doubt, lost, 0.0)
     return np.array([max(np.interp(lost[k, w], fall[:, w], _LADDER) for w in range(4)) for k in range(len(tiles))])
 
 

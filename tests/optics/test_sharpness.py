@@ -31,6 +31,16 @@ def test_defocus_is_measured_in_pixels(sigma: float) -> None:
     assert max(blur[0], blur[2]) < 0.4
 
 
+def test_few_noisy_tiles_of_one_scene_show_no_blur() -> None:
+    """The loss of detail of some photograph along some way is always the greatest; its scatter says that it is none."""
+    corners = sharpness.choose(scene(), np.ones((256, 384), bool))[:4]
+    tiles = np.stack([scene()[y : y + TILE, x : x + TILE] for y, x in corners])
+    random = np.random.default_rng(3)
+    noisy = tiles + 0.03 * random.normal(size=(20, 4, *tiles.shape))  # twenty captures of four shots
+    blur = np.array([sharpness.extra_blur(one, np.ones((4, 4), bool)).max() for one in noisy.astype(np.float32)])
+    assert (blur > 0.2).sum() <= 5
+
+
 def test_motion_along_one_direction_counts_as_its_standard_deviation() -> None:
     sharp = scene()
     blur = measured([sharp, sharp, uniform_filter1d(sharp, 7, axis=0)])
