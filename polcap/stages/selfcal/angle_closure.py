@@ -6,7 +6,7 @@ leaves N_j ε I_j, which goes with the light. Where gains are only guessed, the 
 is known of gains enters as it is doubted.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ _LEAST_CELLS = 60
 _LEAST_GAIN = 0.5  # of the misfit with the stated angles, to be believed; 15° takes 0.8 or more, good captures < 0.3
 _LEAST_SIGMAS = 3.5
 _ALIKE = 0.9  # of the best shot's gain in misfit: then which of them was turned cannot be seen
+_FAR = np.radians(np.arange(20.0, 91.0, 5.0))  # turns that no tangent reaches: a ring that was not turned at all
+_MOST_LEFT = 0.25  # of the median residual with the angles as stated, for such a turn to be started from
 _ANGLE_ERROR = np.radians(0.5)  # 1σ of every angle, set by hand or motor, against its mark
 
 
@@ -52,16 +54,15 @@ def measure(light: Floats, row: NDArray[np.int_], angle: Floats, gain_sigma: Flo
     shots = len(angle)
     if shots < 4 or light.shape[1] < _LEAST_CELLS:
         return NONE
-    weights_of = mueller.analyzer(angle)
-    free = np.linalg.svd(weights_of)[0][:, 3:].T  # (K − 3, K)
     light = light / light.mean(0)
-    _, s1, s2 = np.linalg.lstsq(weights_of, light, rcond=None)[0]
-    slope = s2 * np.cos(2 * angle[:, None]) - s1 * np.sin(2 * angle[:, None])  # dI/dθ, (K, P)
-    left = free @ light
-    by_gain = free[:, None] * light.T  # (K − 3, P, K)
     part = np.searchsorted(np.quantile(row, np.linspace(0, 1, _PARTS + 1)[1:-1]), row)
     prior = np.diag(1 / np.maximum(gain_sigma, 1e-4) ** 2)
-    fits = [_fit(left, by_gain, free[:, k, None] * slope[k], part, prior) for k in range(shots)]
+    fits = [_turned(k, 0.0, light, angle, part, prior) for k in range(shots)]
+    for k, start in _far_turns(light, angle):
+        further = _turned(k, start, light, angle, part, prior)
+        left = further.stated - further.gained
+        if left < fits[k].stated - fits[k].gained:
+            fits[k] = replace(further, stated=fits[k].stated, gained=fits[k].stated - left)
     most = max(fit.gained for fit in fits)
     alike = [k for k in range(shots) if fits[k].gained >= _ALIKE * most]
     alike.sort(key=lambda k: -abs(fits[k].turn))  # a small turn of one shot can be a large one of another
@@ -78,6 +79,38 @@ class _Fit:
     sigma: float  # rad
     stated: float  # misfit with the angles as stated
     gained: float  # of it by the turn
+
+
+def _far_turns(light: Floats, angle: Floats) -> list[tuple[int, float]]:
+    """Great turns (shot, rad) after which next to nothing is left of what keeps the shots from closing."""
+    shots = range(len(angle))
+    stated = _median_left(light, angle)
+    found = []
+    for k in shots:
+        turns = [float(way * size) for size in _FAR for way in (-1, 1)]
+        left, best = min((_median_left(light, angle + turn * np.eye(len(angle))[k]), turn) for turn in turns)
+        if left < _MOST_LEFT * stated:
+            found.append((k, best))
+    return found
+
+
+def _median_left(light: Floats, angle: Floats) -> float:
+    return float(np.median(np.linalg.norm(_free(angle) @ light, axis=0)))
+
+
+def _free(angle: Floats) -> Floats:
+    """(K − 3, K) what no light gives to shots at these angles."""
+    return np.asarray(np.linalg.svd(mueller.analyzer(angle))[0][:, 3:].T)
+
+
+def _turned(k: int, start: float, light: Floats, angle: Floats, part: NDArray[np.intp], prior: Floats) -> _Fit:
+    """Shot k turned by `start`, and what more the shots ask for."""
+    angle = angle + start * np.eye(len(angle))[k]
+    free = _free(angle)
+    _, s1, s2 = np.linalg.lstsq(mueller.analyzer(angle), light, rcond=None)[0]
+    slope = s2 * np.cos(2 * angle[k]) - s1 * np.sin(2 * angle[k])  # dI/dθ, (P,)
+    fit = _fit(free @ light, free[:, None] * light.T, free[:, k, None] * slope, part, prior)
+    return replace(fit, turn=start + fit.turn)
 
 
 def _fit(left: Floats, by_gain: Floats, by_turn: Floats, part: NDArray[np.intp], prior: Floats) -> _Fit:
