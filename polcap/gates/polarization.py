@@ -17,11 +17,12 @@ _LEAST_DOLP = 0.01  # of the outline; there the least index has ten times that
 _SAME_DEG = 5.0  # axes nearer than this are the same angle
 _SURE = 2.5  # σ between sectors of the outline from which a turn is believed
 _CLEAR = 0.8  # concentration of the AoLP about the outline from which a common turn is believed
-_LOPSIDED = 1.4  # so much more uneven may a body be that is polarized as it should all round: its shape, not the light
+_LOPSIDED = 1.4  # so much more uneven may a body be that is polarized all round nearly as it should: its shape
+_LIT_DOLP = 0.07  # of an outline's brighter half: above, its light is the flash's (13 with a lamp beside: up to .049)
 _USUAL_DOLP = 0.1  # of an outline under a flash; a part q of it tilts by √q of the true zenith
 _FLATTENED_DEG = 34.0  # of a sphere's median zenith of 45°: what the estimators do not restore (two wax-like captures)
 _BALL_DEG = 45.0  # median zenith over the disc of a ball
-_WEAK_DOLP = 0.05  # of an outline: above, nothing is taken for flattened
+_WEAK_DOLP = 0.05  # of an outline: above, nothing is taken for flattened; below, uneven light is no matter of shape
 _DIMMED = 0.9  # of the mean light: below, an outline turns away
 _ROUGH = 0.5  # roughness from which facets alone leave little polarization
 _MOST_PIXELS = 6e5  # a larger picture is averaged down
@@ -181,14 +182,20 @@ def _light_of_body(body: rim.Body, maps: SurfaceMaps, limits: Gates) -> Gate:
             "body (wax, skin, milk), or ambient light"
         )
         return Gate("body", "warn", round(body.dolp, 4), limit, says, hint, round(weak, 1))
-    lopsided = _LOPSIDED if body.concentration > _CLEAR else 1.0
-    if body.one_sided > limits.max_one_sided * lopsided:
+    if body.one_sided > limits.max_one_sided * _lopsided(body):
         says = f"one side of the object is lit {body.one_sided:.1f} times more than its mean: light from the side"
         return Gate("body", "warn", round(body.dolp, 4), limit, says, remedy, 10.0)
     says = f"the outline is polarized by {100 * body.dolp:.1f} %"
     if body.dolp < limit:
         says += ": little, as a flat object's" if flat else ": little, as a rough body's"
     return Gate("body", "pass", round(body.dolp, 4), limit, says)
+
+
+def _lopsided(body: rim.Body) -> float:
+    """How much more uneven than the limit its light may be: other light takes polarization away where it falls."""
+    if body.concentration <= _CLEAR or body.dolp_lit < _WEAK_DOLP:
+        return 1.0
+    return _LOPSIDED if body.dolp_lit < _LIT_DOLP else np.inf
 
 
 def _median_shape(maps: SurfaceMaps) -> tuple[float, float]:

@@ -45,6 +45,7 @@ class Body:
     """The rim as a whole."""
 
     dolp: float  # median degree of linear polarization
+    dolp_lit: float  # of its brighter half
     along: float  # −1…1: mean of cos 2(φ − φ_contour); 1 a body's light, −1 light reflected off it from around
     concentration: float  # 0…1, of the AoLP about the contour, turned as it may be
     turned: float  # rad, the common turn of the AoLP against the contour
@@ -125,10 +126,12 @@ def _sigmas(at: Rim, angle: Floats, way: Floats) -> float:
 def body(at: Rim, angle: Floats) -> Body:
     """How the rim is polarized, and how its light is spread; angle (K,) rad."""
     mean, turned_sigma = outline.mean_and_doubt(*outline.phasor(at, angle))
+    dolp = np.abs(outline.polarization(at, angle))
     basis = np.stack([np.ones_like(at.azimuth), np.cos(at.azimuth), np.sin(at.azimuth)], axis=1)
     found = np.linalg.lstsq(basis, at.total, rcond=None)[0]
     return Body(
-        dolp=float(np.median(np.abs(outline.polarization(at, angle)))),
+        dolp=float(np.median(dolp)),
+        dolp_lit=float(np.median(dolp[at.total >= np.median(at.total)])),
         along=mean.real,
         concentration=abs(mean),
         turned=float(np.angle(mean) / 2),

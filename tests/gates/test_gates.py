@@ -157,12 +157,19 @@ def test_light_from_around_is_told(good: SimpleNamespace) -> None:
     assert "90°" in gate.says and "90° on" in gate.remedy  # a ring set upright at 0° looks the same
 
 
-@pytest.mark.parametrize(("uneven", "state"), [(0.47, "pass"), (0.7, "warn")])
-def test_a_lopsided_body_is_no_light_from_the_side(good: SimpleNamespace, uneven: float, state: str) -> None:
+@pytest.mark.parametrize(
+    ("uneven", "ambient", "state"),
+    [(0.47, 0.0, "pass"), (0.7, 0.0, "pass"), (0.0, 1.5, "warn"), (0.0, 6.0, "warn")],
+)
+def test_a_lopsided_body_is_no_light_from_the_side(
+    good: SimpleNamespace, uneven: float, ambient: float, state: str
+) -> None:
+    """A body turned to one side is as polarized there as elsewhere; a lamp from there is not."""
     image = good.stokes
     across = np.linspace(-1, 1, image.mask.shape[1])[:, None] / (scenes.RADIUS / (image.mask.shape[1] / 2))
-    lit = (image.stokes * np.maximum(1 + uneven * across, 0)).astype(np.float32)
-    gate = judged(changed(good, stokes=replace(image, stokes=lit)))["body"]
+    lit = image.stokes * np.maximum(1 + uneven * across, 0)
+    lit[0] += ambient * np.maximum(across, 0) * image.stokes[0].mean()
+    gate = judged(changed(good, stokes=replace(image, stokes=lit.astype(np.float32))))["body"]
     assert gate.state == state and ("side" in gate.says) == (state == "warn")
 
 
