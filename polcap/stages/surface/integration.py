@@ -110,8 +110,10 @@ def _solved(
             level.leave_limbs()
         z = level.decided(stiffness, iterations, tolerance)
         level.close_limbs(z)
-        torn = level.jumps(z, jump / 2).torn
-        free = ~widened(torn, _REACH)[of.mask] & (stiffness > 0)
+        found = level.jumps(z, jump / 2)
+        free = ~widened(found.torn, _REACH)[of.mask] & (stiffness > 0) & found.any()
+        if not free.any():
+            z = np.zeros_like(z)  # nothing of what was tried is left: plain least squares, to the last bit
         z, solver = level.mended(z, free, stiffness)
         return z, level.jumps(z, jump / 2).near(_REACH), solver
     coarse, parent = halved(of), parents(of.mask)

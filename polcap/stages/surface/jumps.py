@@ -33,6 +33,10 @@ class Jumps:
     down: Bools
     torn: Bools  # steps as high and long, with no rim: the normals there fit no surface
 
+    def any(self) -> bool:
+        """Whether the depth jumps anywhere."""
+        return bool(self.right.any() or self.down.any())
+
     def near(self, reach: int) -> Bools:
         """Pixels (H, W) within `reach` px of a jump."""
         at = np.zeros(self.torn.shape, dtype=bool)

@@ -62,7 +62,7 @@ def triangulate(
     if back != "open":
         vertices, normals, uv, tangents, faces = closed(vertices, normals, uv, tangents, faces, back)
     return Mesh(
-        vertices=vertices.astype(np.float32),
+        vertices=on_grid(vertices).astype(np.float32),
         normals=normals.astype(np.float32),
         uv=uv.astype(np.float32),
         tangents=tangents.astype(np.float32),
@@ -73,6 +73,12 @@ def triangulate(
         cuts=figures.cuts,
         raggedness=figures.raggedness,
     )
+
+
+def on_grid(vertices: Floats) -> Floats:
+    """Vertices (V, 3) to 2⁻²³ of the greatest coordinate, so that float32 holds them exactly from their middle, too."""
+    grid = 2.0 ** (np.ceil(np.log2(np.abs(vertices).max())) - 23)
+    return np.asarray(np.rint(vertices / grid) * grid)
 
 
 def _links_that_hold(z: Floats, mask: Bools, maps: SurfaceMaps, steepest: float, jump: float) -> tuple[Bools, Bools]:

@@ -159,7 +159,7 @@ def test_distance_is_the_median_depth_in_metres() -> None:
     assert known.metric and not unknown.metric
     assert np.nanmedian(known.depth) == pytest.approx(0.7, rel=1e-5)
     assert np.nanmedian(unknown.depth) == pytest.approx(1.0, rel=1e-5)
-    assert np.allclose(known.vertices, 0.7 * unknown.vertices, rtol=1e-5)
+    assert np.allclose(known.vertices, 0.7 * unknown.vertices, rtol=1e-5, atol=2e-7)  # two grids of 1.2e-7
 
 
 def test_mesh_faces_the_camera_and_keeps_its_frames() -> None:
@@ -254,7 +254,8 @@ def test_noise_tears_no_smooth_surface_at_any_resolution(size: int) -> None:
     mesh = surface.integrate(scene, None, SETTINGS)
     plain = surface.integrate(scene, None, surface.Settings(stiffness=0.0))
     assert (mesh.pieces, mesh.cuts) == (1, 0.0)
-    assert error_share(mesh, truth, scene.mask) < 1.02 * error_share(plain, truth, scene.mask)
+    assert np.array_equal(mesh.depth, plain.depth, equal_nan=True)  # where nothing hides, plain least squares
+    assert error_share(mesh, truth, scene.mask) < 0.02
 
 
 def test_prior_weighs_alike_at_any_resolution() -> None:
@@ -271,6 +272,13 @@ def test_prior_weighs_alike_at_any_resolution() -> None:
         bend.append(np.log(depth[side] / depth[middle]) / np.log(truth[side] / truth[middle]) - 1)
     assert bend[0] > 0.02
     assert bend[1] == pytest.approx(bend[0], rel=0.1)
+
+
+def test_vertices_are_the_same_once_moved_from_their_middle_and_back() -> None:
+    scene, _ = sphere()
+    vertices = surface.integrate(scene, None, SETTINGS).vertices
+    middle = (vertices.min(axis=0).astype(np.float64) + vertices.max(axis=0)) / 2
+    assert np.array_equal(((vertices - middle).astype(np.float32) + middle).astype(np.float32), vertices)
 
 
 def test_boundary_is_a_curve_not_stairs() -> None:
