@@ -196,14 +196,14 @@ def rendered(name: str) -> dict[str, Floats | Bools]:
     crop = np.s_[top : rows.max() + 5, left : columns.max() + 5]
     mask = seen.mask[crop]
     view = View(view.focal, (half - left, half - top), 2.0)
-    links = [_true_links(scene, view, seen.depth[crop], mask, axis) for axis in (1, 0)]
+    links = [true_links(scene, view, seen.depth[crop], mask, axis) for axis in (1, 0)]
     return {
         "normal": seen.normal[crop], "depth": seen.depth[crop], "mask": mask,
         "view": np.array([view.focal, *view.center]), "right": links[0], "down": links[1],
     }  # fmt: skip
 
 
-def _true_links(scene: render.Scene, view: View, depth: Floats, mask: Bools, axis: int) -> Bools:
+def true_links(scene: render.Scene, view: View, depth: Floats, mask: Bools, axis: int) -> Bools:
     """Links along an axis whose depth step stays, however near the rays."""
     least = least_step(mask, surface.Settings().jump)
     log = view.focal * np.log(np.where(mask, depth, 1).astype(np.float64))
