@@ -1,13 +1,13 @@
 """In: the maps of a result. Out: its asset in the formats of a program or purpose, and what it was made from.
 
 Everything comes from the stored maps and report.json, for `process` as for `polcap export`: the same
-result gives the same bytes, whenever and with however many threads. Mesh and textures are kept in work/ under a digest
-of the maps' files, so that a further export encodes and writes, and no more.
+result gives the same bytes, whenever and with however many threads. A GLB of an earlier export that was made from these
+maps, as its sidecar says, holds mesh and textures already: a further export encodes what is new and writes.
 """
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -15,16 +15,18 @@ from typing import Any
 import msgspec
 
 from polcap.config import restored
-from polcap.errors import SettingError
+from polcap.errors import DecodeError, SettingError
 from polcap.formats import (
     atomic,
     exr_layers,
     file_name,
+    glb_reader,
     gltf,
     materialx,
     obj,
     ocio,
     provenance,
+    text_file,
     texture_set,
     usd,
 )
@@ -33,9 +35,10 @@ from polcap.formats.encoders import Encoder, Kind
 from polcap.formats.presets import PRESETS, Format, Preset
 from polcap.formats.texture_set import Key, Texture
 from polcap.images import Asset
-from polcap.stages import asset, stage, surface
-from polcap.store import FORMAT, Derived, Run, StageResult, digest, silent
+from polcap.stages import asset, surface
+from polcap.store import Derived, digest
 
+_SIDECAR = ".provenance.json"
 _SHARING = {"obj", "usd", "materialx"}  # formats whose textures lie beside them, and are the same
 
 
@@ -65,10 +68,20 @@ def export(out: Path, about: Mapping[str, Any], wanted: Wanted) -> list[Path]:
     if "usd" in preset.formats:
         usd.require()
     config = restored(about, out / "report.json")
-    maps, built = _maps_and_asset(out, _Settings(config.surface, config.asset))
+    settings = _Settings(config.surface, config.asset)
+    maps = Derived(maps_folder.digest(out / "maps"), maps_folder.read, (out / "maps",))
+    source = _source(maps, settings)
+    earlier = _earlier(out / "asset", source)
+    encoder = Encoder()
+    if earlier is None:
+        built = assembled(maps.value, settings)
+    else:
+        built = earlier.asset
+        for key, texture in gltf.textures(built).items():
+            encoder.know(texture, "png", earlier.pngs[key])
     lods, levels = [], []
     if wanted.lod:
-        stored, mesh = maps.value.maps, built.mesh
+        stored, mesh = maps.value.maps, replace(built.mesh, depth=maps.value.depth)
         levels = [surface.decimated(mesh, stored.view, 0.25**k, config.surface.back) for k in range(1, wanted.lod + 1)]
         lods = [asset.on_mesh(built, stored, level.mesh) for level in levels]
     if wanted.texture_size is not None:
@@ -83,6 +96,8 @@ def export(out: Path, about: Mapping[str, Any], wanted: Wanted) -> list[Path]:
         images=wanted.images or preset.images,
         color=wanted.color,
         record=provenance.record(about),
+        source=source if wanted.texture_size is None else "",
+        encoder=encoder,
     )
     written = job.write()
     maps_folder.note_export(out / "maps", job.folder.relative_to(out).as_posix(), job.said())
@@ -94,20 +109,29 @@ class _Settings(msgspec.Struct, frozen=True):
     asset: asset.Settings
 
 
-@stage(version=1)
 def assembled(stored: maps_folder.Stored, settings: _Settings) -> Asset:
     """The mesh of stored maps, and their textures on it."""
     mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, settings.surface)
     return asset.build(stored.maps, mesh, settings.asset)
 
 
-def _maps_and_asset(out: Path, settings: _Settings) -> tuple[Derived[maps_folder.Stored], Asset]:
-    """A result's maps, read when they are asked for, and its asset: kept in work/ for the next export of these maps."""
-    maps = Derived(maps_folder.digest(out / "maps"), maps_folder.read, (out / "maps",))
-    versions = [FORMAT, assembled.version, surface.integrate.version, asset.build.version]
-    key = digest([versions, msgspec.to_builtins(settings), maps.key])
-    kept = StageResult(key, assembled, (maps,), settings, out / "work" / assembled.name, Run(silent))
-    return maps, kept.value
+def _source(maps: Derived[maps_folder.Stored], settings: _Settings) -> str:
+    """Digest of all that mesh and textures are made from."""
+    made_by = [provenance.versions(), surface.integrate.version, asset.build.version]
+    return digest([made_by, msgspec.to_builtins(settings), maps.key])
+
+
+def _earlier(folder: Path, source: str) -> glb_reader.Stored | None:
+    """What an export in asset/ or one of its folders holds, where it was made from `source` and is whole."""
+    for sidecar in sorted([*folder.glob(f"*{_SIDECAR}"), *folder.glob(f"*/*{_SIDECAR}")]):
+        glb = sidecar.with_name(f"{sidecar.name.removesuffix(_SIDECAR)}.glb")
+        try:
+            told = text_file.read_json(sidecar)
+            if told["made_from"] == source:
+                return glb_reader.read(glb, told["files"][glb.name])
+        except (OSError, ValueError, LookupError, TypeError, DecodeError):
+            continue  # of another program, or touched since: as if it were not there
+    return None
 
 
 def _preset(wanted: Wanted) -> Preset:
@@ -131,7 +155,8 @@ class _Job:
     images: Kind
     color: str
     record: Mapping[str, Any]
-    encoder: Encoder = field(default_factory=Encoder)
+    source: str  # of the asset; empty where its textures were made larger or smaller
+    encoder: Encoder
 
     def write(self) -> list[Path]:
         """Every file of the export, in threads, and the sidecar."""
@@ -148,8 +173,9 @@ class _Job:
         with ThreadPoolExecutor(len(tasks)) as pool:
             running = [pool.submit(task) for task in tasks]
             written = [file for one in running for file in one.result()]
-        sidecar = self.folder / f"{self.stem}.provenance.json"
-        provenance.write(sidecar, self.record, written)
+        sidecar = self.folder / f"{self.stem}{_SIDECAR}"
+        whole = self.source and "gltf" in self.preset.formats and self.images == "png"
+        provenance.write(sidecar, {**self.record, "made_from": self.source if whole else None}, written)
         return [*written, sidecar]
 
     @cached_property

@@ -99,18 +99,11 @@ def test_exporting_again_gives_the_bytes_that_process_wrote(result: Path, polcap
     assert (copy / "maps/maps.json").read_bytes() == (result / "maps/maps.json").read_bytes()
 
 
-def test_further_export_builds_nothing_until_a_map_changes(
-    result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from polcap import pipeline
-    from polcap.asset_export import Wanted
+@pytest.fixture
+def building(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Grows by one whenever an export builds a mesh."""
     from polcap.stages import surface
 
-    copy = tmp_path / "copy"
-    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
-    (glb,) = (copy / "asset").glob("*.glb")
-    pipeline.export(copy, Wanted(("gltf",)))
-    before = glb.read_bytes()
     triangulate, built = surface.triangulate, []
 
     def counted(*of: Any) -> Any:
@@ -118,12 +111,56 @@ def test_further_export_builds_nothing_until_a_map_changes(
         return triangulate(*of)
 
     monkeypatch.setattr(surface, "triangulate", counted)
+    return built
+
+
+def test_export_beside_the_asset_builds_nothing_and_gives_the_bytes_of_one_from_the_maps(
+    result: Path, tmp_path: Path, building: list[Any]
+) -> None:
+    from polcap import pipeline
+    from polcap.asset_export import Wanted
+
+    beside, alone = tmp_path / "beside", tmp_path / "alone"
+    for copy, left in ((beside, ("work",)), (alone, ("work", "asset"))):
+        shutil.copytree(result, copy, ignore=shutil.ignore_patterns(*left))
+    wanted = [Wanted(("gltf", "obj")), Wanted(preset="unreal"), Wanted(preset="web", lod=1)]
+    for one in wanted:
+        pipeline.export(beside, one)
+    assert not building
+    shutil.rmtree(alone / "asset", ignore_errors=True)
+    for one in wanted:
+        pipeline.export(alone, one)
+        shutil.move(alone / "asset", tmp_path / f"kept{len(building)}")
+    assert len(building) == len(wanted)
+    kept = {
+        file.relative_to(folder): file.read_bytes() for folder in tmp_path.glob("kept*") for file in folder.rglob("*.*")
+    }
+    assert kept == {file.relative_to(beside / "asset"): file.read_bytes() for file in (beside / "asset").rglob("*.*")}
+
+
+@pytest.mark.parametrize("touched", ["map", "asset", "sidecar", "size"])
+def test_asset_is_built_anew_once_something_else_stands_there(
+    result: Path, tmp_path: Path, building: list[Any], touched: str
+) -> None:
+    from polcap import pipeline
+    from polcap.asset_export import Wanted
+
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
+    glb, sidecar = copy / "asset" / "capture.glb", copy / "asset" / "capture.provenance.json"
+    before = glb.read_bytes()
+    if touched == "map":
+        rough, _ = exr.read(copy / "maps" / "roughness.exr")
+        exr.write(copy / "maps" / "roughness.exr", {"Y": rough["Y"] / 2}, half=True)
+    elif touched == "asset":
+        glb.write_bytes(before[:-1] + bytes([before[-1] ^ 1]))
+    elif touched == "sidecar":
+        sidecar.write_text("[]")
+    else:
+        pipeline.export(copy, Wanted(("gltf",), texture_size=128))
+        assert not building and json.loads(sidecar.read_text())["made_from"] is None
     pipeline.export(copy, Wanted(("gltf",)))
-    assert not built and glb.read_bytes() == before
-    rough, _ = exr.read(copy / "maps" / "roughness.exr")
-    exr.write(copy / "maps" / "roughness.exr", {"Y": rough["Y"] / 2}, half=True)
-    pipeline.export(copy, Wanted(("gltf",)))
-    assert built and glb.read_bytes() != before
+    assert len(building) == 1 and (glb.read_bytes() == before) == (touched != "map")
 
 
 @pytest.mark.parametrize(

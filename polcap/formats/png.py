@@ -100,7 +100,17 @@ def read(path: Path) -> Pixels:
 
 def decode(path: str) -> worker.Answer:
     """What `read` reads, in the worker; raises DecodeError."""
-    data = photo_bytes.load(path)
+    return {}, {"pixels": pixels(path, photo_bytes.load(path))}
+
+
+def pixels(path: str, data: bytes) -> Pixels:
+    """The pixels of a PNG's bytes, which lie in the file `path`; in the worker.
+
+    Raises
+    ------
+    DecodeError
+        They are cut short, no PNG or larger than any picture.
+    """
     if data[:8] != _MAGIC or len(data) < 24:
         raise DecodeError(f"{path} is not a whole PNG ({len(data)} bytes); write it again")
     plausible.check_png(path, data)
@@ -110,7 +120,8 @@ def decode(path: str) -> worker.Answer:
         array = None
     if array is None or array.dtype not in (np.uint8, np.uint16):
         raise DecodeError(f"{path} is not a whole PNG ({len(data)} bytes); write it again")
-    return {}, {"pixels": _swapped(array)}
+    swapped: Pixels = _swapped(array)
+    return swapped
 
 
 def fitted(picture: Pixels, width: int) -> NDArray[np.uint8]:

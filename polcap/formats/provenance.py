@@ -2,13 +2,12 @@
 
 import json
 from collections.abc import Iterable, Mapping
-from hashlib import blake2b
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from polcap import __version__
-from polcap.formats import atomic
+from polcap.formats import atomic, photo_bytes
 
 _PARTS = (
     "numpy", "scipy", "opencv-contrib-python-headless", "onnxruntime", "rawpy", "OpenImageIO", "trimesh",
@@ -59,7 +58,7 @@ def write(path: Path, facts: Mapping[str, Any], files: Iterable[Path]) -> None:
     StorageError
         The file cannot be written.
     """
-    digests = {file.name: blake2b(file.read_bytes(), digest_size=20).hexdigest() for file in sorted(files)}
+    digests = {file.name: photo_bytes.digest(file.read_bytes()) for file in sorted(files)}
     with atomic.path(path) as temporary:
         text = json.dumps({**facts, "files": digests}, indent=1, ensure_ascii=False)
         temporary.write_text(text + "\n", encoding="utf-8")

@@ -263,7 +263,7 @@ def call(
         if _owner != os.getpid():  # a fork must not share the pipes
             _idle.clear()
             _owner = os.getpid()
-            atexit.register(_close)
+            atexit.register(end_idle)
         worker = _idle.pop() if _idle else Worker()
     try:
         return worker.call(function, path, limit_s=limit_s, limit_gib=limit_gib, **options)
@@ -272,7 +272,8 @@ def call(
             _idle.append(worker)
 
 
-def _close() -> None:
+def end_idle() -> None:
+    """End the children that wait for a file; the next call starts one."""
     for worker in _idle:
         worker.close()
 
