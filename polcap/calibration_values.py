@@ -17,6 +17,8 @@ class NoiseLine:
     floor_sigma: tuple[float, ...]
     electrons_at_white: tuple[float, ...]  # (C,) of one photosite
     read_noise_electrons: tuple[float, ...]  # (C,) 1σ of one photosite
+    read_noise_sigma: tuple[float, ...] = ()  # (C,) e⁻, 1σ of that figure, upwards
+    source: str = "flat frames"  # or "bracket"
 
 
 @dataclass(frozen=True)

@@ -4,22 +4,23 @@
 
     FOLDER/dark/                     the cap on the lens
     FOLDER/flat/                     an evenly lit white surface, out of focus, twice at least at every exposure
+    FOLDER/bracket/                  exposures of any still scene, or such folders: noise where flat/ has no such ISO
     FOLDER/flash/                    one and the same thing, again and again, by the flash
     FOLDER/polarizer/axis000/pol000/ polarized light of a known axis (a second polarizer before a lamp, a screen)
                     /pol015/ …       through the filter at every angle of its ring; a second axis tells its sense
 
-Each is optional, each quantity a file: `photon_transfer` noise, `levels` black and white, `linearity`, `lens_falloff`,
-`polarizer` extinction, zero and sense of the ring, `flash_energy`.
+Each is optional, each quantity a file: `photon_transfer` and `bracket_noise` noise, `levels` black and white,
+`linearity`, `lens_falloff`, `polarizer` extinction, zero and sense of the ring, `flash_energy`.
 """
 
 from pathlib import Path
 
-from polcap.calibrate import flash_energy, lens_falloff, levels, linearity, photon_transfer, polarizer
+from polcap.calibrate import bracket_noise, flash_energy, lens_falloff, levels, linearity, photon_transfer, polarizer
 from polcap.calibrate.photographs import Photograph, angle_of, inside, listed
-from polcap.calibration_values import Calibration, Polarizer
+from polcap.calibration_values import Calibration, NoiseLine, Polarizer
 from polcap.errors import CaptureError
 
-_ROOMS = ("dark", "flat", "flash", "polarizer")
+_ROOMS = ("dark", "flat", "bracket", "flash", "polarizer")
 
 
 def measure(folder: Path, made: str, lens_filter: str = "", axis_deg: float = 0.0) -> Calibration:
@@ -44,20 +45,32 @@ def measure(folder: Path, made: str, lens_filter: str = "", axis_deg: float = 0.
     flat = listed(rooms["flat"]) if "flat" in rooms else []
     flash = listed(rooms["flash"]) if "flash" in rooms else []
     turned = _turned(rooms["polarizer"], axis_deg) if "polarizer" in rooms else []
-    first = next(iter([*dark, *flat, *flash, *(shot.photograph for shot in turned)]))
-    _check_one_camera([*dark, *flat, *flash, *(shot.photograph for shot in turned)])
+    stepped = bracket_noise.brackets(rooms["bracket"]) if "bracket" in rooms else []
+    every = [*dark, *flat, *(shot for one in stepped for shot in one), *flash, *(shot.photograph for shot in turned)]
+    first = every[0]
+    _check_one_camera(every)
     return Calibration(
         made=made,
         camera=f"{first.exif.make} {first.exif.model}".strip(),
         lens=first.exif.lens,
         filter=lens_filter,
-        noise=photon_transfer.measure(flat, dark),
+        noise=_noise(flat, dark, stepped),
         levels=levels.measure(dark, flat) if dark else None,
         linearity=linearity.measure(flat),
         falloff=lens_falloff.measure(flat) if flat else None,
         polarizer=_polarizer(turned),
         flash=flash_energy.measure(flash) if flash else None,
     )
+
+
+def _noise(flat: list[Photograph], dark: list[Photograph], stepped: list[list[Photograph]]) -> tuple[NoiseLine, ...]:
+    """By flat frames; at an ISO that has none by brackets."""
+    lines = photon_transfer.measure(flat, dark)
+    if not stepped:
+        return lines
+    known = {line.iso for line in lines}
+    others = [line for line in bracket_noise.measure(stepped) if line.iso not in known]
+    return tuple(sorted((*lines, *others), key=lambda line: line.iso))
 
 
 def _turned(folder: Path, axis_deg: float) -> list[polarizer.Turned]:

@@ -58,7 +58,7 @@ def _points(photographs: list[Photograph]) -> Iterator[tuple[Floats, Floats, Flo
             lit = a[usable].mean() > 0.01 if usable.any() else False
             if lit:  # a lamp that flickers; in the dark there is nothing to compare
                 ratio = float(b[usable].mean() / a[usable].mean())
-            yield (*_tiles(a, b, usable, ratio), _photosites(one, a.shape[-1]))
+            yield (*_tiles(a, b, usable, ratio), photosites(one, a.shape[-1]))
 
 
 def _tiles(a: Floats, b: Floats, usable: NDArray[np.bool_], ratio: float) -> tuple[Floats, Floats]:
@@ -75,7 +75,7 @@ def _tiles(a: Floats, b: Floats, usable: NDArray[np.bool_], ratio: float) -> tup
     return level.reshape(-1, channels)[whole], variance.reshape(-1, channels)[whole]
 
 
-def _photosites(image: SensorImage, channels: int) -> Floats:
+def photosites(image: SensorImage, channels: int) -> Floats:
     """How many of a mosaic's are binned into one pixel, (C,)."""
     if image.cfa is None:
         return np.ones(channels)
@@ -92,16 +92,26 @@ def _line(iso: float, points: list[tuple[Floats, Floats, Floats]], where: Photog
         )
     solved = [_solved(level[:, c], variance[:, c], _TILE * _TILE - 1) for c in range(level.shape[1])]
     slope, floor, slope_sigma, floor_sigma = np.array(solved).T
-    sites = points[0][2]
-    electrons = 1 / (slope * sites)
+    return as_line(iso, (slope, slope_sigma), (floor, floor_sigma), points[0][2], "flat frames")
+
+
+def as_line(
+    iso: float, slope: tuple[Floats, Floats], floor: tuple[Floats, Floats], sites: Floats, source: str
+) -> NoiseLine:
+    """A line and its 1σ (C,) as it is kept, with what it means of one photosite; `sites` (C,) make a pixel."""
+    electrons = 1 / (slope[0] * sites)
+    height = np.maximum(floor[0], 0.0)
+    read = np.sqrt(height * sites) * electrons
     return NoiseLine(
         iso=iso,
-        slope=tuple(slope.tolist()),
-        slope_sigma=tuple(slope_sigma.tolist()),
-        floor=tuple(np.maximum(floor, 0.0).tolist()),
-        floor_sigma=tuple(floor_sigma.tolist()),
+        slope=tuple(slope[0].tolist()),
+        slope_sigma=tuple(slope[1].tolist()),
+        floor=tuple(height.tolist()),
+        floor_sigma=tuple(floor[1].tolist()),
         electrons_at_white=tuple(electrons.tolist()),
-        read_noise_electrons=tuple((np.sqrt(np.maximum(floor * sites, 0)) * electrons).tolist()),
+        read_noise_electrons=tuple(read.tolist()),
+        read_noise_sigma=tuple((np.sqrt(height + floor[1]) * np.sqrt(sites) * electrons - read).tolist()),
+        source=source,
     )
 
 

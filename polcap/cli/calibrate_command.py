@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 def calibrate(
     context: typer.Context,
     folder: Annotated[
-        Path, typer.Argument(help="Folder that holds dark/, flat/, flash/, polarizer/, or some of them.")
+        Path,
+        typer.Argument(help="Folder that holds dark/, flat/, bracket/, flash/, polarizer/, lens/, or some of them."),
     ],
     lens_filter: Annotated[str, typer.Option("--filter", metavar="NAME", help="The polarizer's name.")] = "",
     axis: Annotated[
@@ -48,7 +49,11 @@ def lines(found: "Calibration") -> list[str]:
     for line in found.noise:
         doubt = 100 * max(sigma / slope for sigma, slope in zip(line.slope_sigma, line.slope, strict=True))
         electrons, read = _listed(line.electrons_at_white, ".0f"), _listed(line.read_noise_electrons, ".1f")
-        rows.append(f"noise      ISO {line.iso:g}: {electrons} e⁻ at white ± {doubt:.1f} %, read noise {read} e⁻")
+        if line.read_noise_sigma:
+            read += f" ± {max(line.read_noise_sigma):.1f}"
+        source = "a bracket" if line.source == "bracket" else line.source
+        said = f"{electrons} e⁻ at white ± {doubt:.1f} %, read noise {read} e⁻, from {source}"
+        rows.append(f"noise      ISO {line.iso:g}: {said}")
     if (levels := found.levels) is not None:
         black, stated = _listed(levels.black, ".2f"), _listed(levels.black_stated, "g")
         white = "no frame saturates" if levels.white is None else f"white {levels.white:g}"

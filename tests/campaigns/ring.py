@@ -62,7 +62,9 @@ def main() -> None:
 
 def planted(seed: int, number: int) -> float:
     """True less stated angle of the ring, degrees; the first of every object is 0."""
-    return float(np.random.default_rng([seed, 17, number]).uniform(-_MOST_TURN, _MOST_TURN)) if number else 0.0
+    return (
+        round(float(np.random.default_rng([seed, 17, number]).uniform(-_MOST_TURN, _MOST_TURN)), 1) if number else 0.0
+    )
 
 
 def at_stokes_level(case: lit_objects.Lit, seed: int, number: int, turn: float) -> dict[str, Any]:
@@ -83,7 +85,9 @@ def from_raw(seed: int, turn: float) -> dict[str, Any]:
     """The same of photographs that are shot, read and merged, with a chart, the mask found by polcap."""
     kind = KINDS[seed % 3]
     true = [(angle + turn) % 180 for angle in np.degrees(_ANGLE)]
-    shoot = shooting.Shoot(seed=seed, width=640, height=480, samples=1, angles_deg=tuple(round(a, 1) for a in true))
+    shoot = shooting.Shoot(
+        seed=seed, width=640, height=480, samples=1, angles_deg=tuple(round(float(a), 1) for a in true)
+    )
     with tempfile.TemporaryDirectory() as place:
         shooting.write(Path(place) / "capture", random_scenes.random_scene(seed, kind), shoot)
         capture = captures.read(Path(place) / "capture")

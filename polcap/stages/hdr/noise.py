@@ -22,7 +22,7 @@ from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.stages.hdr.planes import Signals
 
 TILE = 16  # px; about 68 independent second differences, so that one tile knows its variance to 17 %
-_FREEDOM = TILE * TILE / 3.78  # 3.78 = Σ ρ² over the autocorrelation of [1, −2, 1] ⊗ [1, −2, 1]
+FREEDOM = TILE * TILE / 3.78  # 3.78 = Σ ρ² over the autocorrelation of [1, −2, 1] ⊗ [1, −2, 1]
 _LEAST_TILES = 40
 _TYPICAL_ELECTRONS, _TYPICAL_READ = 20000.0, 4.0  # at ISO 100; e⁻
 _SANE_ELECTRONS = (100.0, 1e6)
@@ -83,8 +83,8 @@ def alone(picture: Signals) -> Samples:
     for rows in strips(*picture.usable.shape):
         part, usable = picture.rows(rows), picture.usable[rows]
         detail = roughness(part)
-        signal.append(_tiles(part[:, 1:-1, 1:-1], usable))
-        variance.append(_tiles(detail * detail, usable))
+        signal.append(tiles(part[:, 1:-1, 1:-1], usable))
+        variance.append(tiles(detail * detail, usable))
     return _samples(signal, variance, True, picture.shape[0])
 
 
@@ -102,7 +102,7 @@ def paired(first: Signals, second: Signals, ratio: Floats) -> tuple[Samples, Sam
         difference = h2 - r * h1
         maps = (one[:, 1:-1, 1:-1], -h1 * difference / r, two[:, 1:-1, 1:-1], h2 * difference)
         for column, values in zip(columns, maps):
-            column.append(_tiles(values, usable))
+            column.append(tiles(values, usable))
     channels = first.shape[0]
     return (
         _samples(columns[0], columns[1], False, channels),
@@ -145,11 +145,11 @@ def misfit(first: Signals, second: Signals, ratio: Floats, lines: tuple[Noise, N
         a, usable = first.rows(rows), first.usable[rows] & second.usable[rows]
         d = second.rows(rows)[:, 1:-1, 1:-1] / r[:, None, None] - a[:, 1:-1, 1:-1]
         gx, gy = a[:, 1:-1, 2:] - a[:, 1:-1, :-2], a[:, 2:, 1:-1] - a[:, :-2, 1:-1]
-        level, offset = _tiles(a[:, 1:-1, 1:-1], usable), _tiles(d, usable)
+        level, offset = tiles(a[:, 1:-1, 1:-1], usable), tiles(d, usable)
         own = lines[0].variance(level)
         columns[0].append(own + lines[1].variance(level * r) / r**2 * gain)
-        columns[1].append(_tiles(d * d, usable) - offset**2)
-        columns[2].append(_tiles((gx * gx + gy * gy) / 4, usable) - own)
+        columns[1].append(tiles(d * d, usable) - offset**2)
+        columns[2].append(tiles((gx * gx + gy * gy) / 4, usable) - own)
     out = np.zeros(first.shape[0], np.float32)
     if columns[0]:
         expected, seen, edge = (np.concatenate(column) for column in columns)
@@ -241,7 +241,7 @@ def _solve(x: Floats, y: Floats, n: Floats, least: float) -> tuple[float, float]
     slope, floor = float(np.median(y) / max(float(np.median(x)), 1e-6)), least
     for _ in range(8):
         model = np.maximum(slope * np.maximum(x, 0) + floor, least)
-        z = (y / model - 1) * np.sqrt(n * _FREEDOM / 2)
+        z = (y / model - 1) * np.sqrt(n * FREEDOM / 2)
         scale = max(1.0, MAD_TO_SIGMA * float(np.median(np.abs(z))))
         weight = n / model**2 / np.maximum(1, (np.abs(z) / (2.5 * scale)) ** 2)
         matrix = np.array([[np.sum(weight * x * x), np.sum(weight * x)], [np.sum(weight * x), np.sum(weight)]])
@@ -258,12 +258,12 @@ def _solve(x: Floats, y: Floats, n: Floats, least: float) -> tuple[float, float]
 
 def _low_quantile(variance: Floats) -> float:
     """Mean variance of pure noise from the 15 % quantile of tile variances (Wilson and Hilferty's χ²)."""
-    spread = 2 / (9 * _FREEDOM)
+    spread = 2 / (9 * FREEDOM)
     return float(np.quantile(variance, 0.15) / (1 - spread - 1.0364 * spread**0.5) ** 3)
 
 
-def _tiles(values: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Means over the tiles of one strip (C, h, w), (T, C); NaN where a pixel the tile touches is not usable."""
+def tiles(values: Floats, usable: NDArray[np.bool_]) -> Floats:
+    """Means over the tiles of one of `strips` (C, h, w), (T, C); NaN where a pixel the tile touches is not usable."""
     count = (usable.shape[1] - 2) // TILE
     mean = np.empty((count, len(values)))
     for c, plane in enumerate(values):

@@ -72,9 +72,7 @@ def estimate(cues: Cues, network: Network, ior: float, symmetries: int, *, fine_
     )
 
 
-def known(
-    cues: Cues, network: Network, ior: float, symmetries: int
-) -> tuple[dict[str, Floats], fine.Guess, Floats]:
+def known(cues: Cues, network: Network, ior: float, symmetries: int) -> tuple[dict[str, Floats], fine.Guess, Floats]:
     """What stands before the fine pass, whose training begins here too.
 
     Parameters
