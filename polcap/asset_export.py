@@ -2,7 +2,8 @@
 
 Everything comes from the stored maps and report.json, for `process` as for `polcap export`: the same
 result gives the same bytes, whenever and with however many threads. A GLB of an earlier export that was made from these
-maps, as its sidecar says, holds mesh and textures already: a further export encodes what is new and writes.
+maps, as its sidecar says, holds mesh and textures already: a further export encodes what is new and writes. `process`
+leaves the files that stand.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from polcap.config import restored
 from polcap.errors import DecodeError, SettingError
@@ -34,7 +36,9 @@ from polcap.formats import maps as maps_folder
 from polcap.formats.encoders import Encoder, Kind
 from polcap.formats.presets import PRESETS, Format, Preset
 from polcap.formats.texture_set import Key, Texture
+from polcap.formats.written import Written
 from polcap.images import Asset
+from polcap.path import Results
 from polcap.stages import asset, surface
 from polcap.store import Derived, digest
 
@@ -54,10 +58,27 @@ class Wanted:
     lod: int = 0  # further GLBs, each in a quarter of the triangles of the one before
 
 
-def export(out: Path, about: Mapping[str, Any], wanted: Wanted) -> list[Path]:
+def export(
+    out: Path,
+    about: Mapping[str, Any],
+    wanted: Wanted,
+    standing: Written | None = None,
+    made: Results | None = None,
+) -> list[Path]:
     """Write the asset of a result folder again; returns the files, the sidecar last.
 
-    `about` is report.json's content. Without a preset the files go to asset/, with one to asset/PRESET/.
+    Parameters
+    ----------
+    out
+        The result folder.
+    about
+        report.json's content.
+    wanted
+        Without a preset the files go to asset/, with one to asset/PRESET/.
+    standing
+        Which files stand already; without it none does.
+    made
+        What maps/ was written from, where that is known: it is not read back then.
 
     Raises
     ------
@@ -70,15 +91,21 @@ def export(out: Path, about: Mapping[str, Any], wanted: Wanted) -> list[Path]:
     config = restored(about, out / "report.json")
     settings = _Settings(config.surface, config.asset)
     maps = Derived(maps_folder.digest(out / "maps"), maps_folder.read, (out / "maps",))
+    if made is not None:
+        maps = Derived(maps.key, maps_folder.as_read, (made.maps, made.mesh))
     source = _source(maps, settings)
-    earlier = _earlier(out / "asset", source)
+    earlier, whole = _earlier(out / "asset", source)
     encoder = Encoder()
     if earlier is None:
         built = assembled(maps.value, settings)
     else:
         built = earlier.asset
+        if not whole:
+            built = asset.joined(built.mesh, built.normal, asset.colors(maps.value.maps, settings.asset))
+        before = gltf.textures(earlier.asset)
         for key, texture in gltf.textures(built).items():
-            encoder.know(texture, "png", earlier.pngs[key])
+            if whole or np.array_equal(texture.pixels, before[key].pixels):
+                encoder.know(texture, "png", earlier.pngs[key])
     lods, levels = [], []
     if wanted.lod:
         stored, mesh = maps.value.maps, replace(built.mesh, depth=maps.value.depth)
@@ -96,8 +123,9 @@ def export(out: Path, about: Mapping[str, Any], wanted: Wanted) -> list[Path]:
         images=wanted.images or preset.images,
         color=wanted.color,
         record=provenance.record(about),
-        source=source if wanted.texture_size is None else "",
+        source=source if wanted.texture_size is None else None,
         encoder=encoder,
+        standing=standing or Written(out, anew=True),
     )
     written = job.write()
     maps_folder.note_export(out / "maps", job.folder.relative_to(out).as_posix(), job.said())
@@ -115,23 +143,38 @@ def assembled(stored: maps_folder.Stored, settings: _Settings) -> Asset:
     return asset.build(stored.maps, mesh, settings.asset)
 
 
-def _source(maps: Derived[maps_folder.Stored], settings: _Settings) -> str:
-    """Digest of all that mesh and textures are made from."""
+class _Source(msgspec.Struct, frozen=True):
+    """Digests of all that an asset is made from."""
+
+    mesh: str  # and the normals on it
+    colors: str
+
+
+def _source(maps: Derived[maps_folder.Stored], settings: _Settings) -> _Source:
     made_by = [provenance.versions(), surface.integrate.version, asset.build.version]
-    return digest([made_by, msgspec.to_builtins(settings), maps.key])
+    sections = (msgspec.to_builtins(section) for section in (settings.surface, settings.asset))
+    return _Source(*(digest([made_by, section, maps.key]) for section in sections))
 
 
-def _earlier(folder: Path, source: str) -> glb_reader.Stored | None:
-    """What an export in asset/ or one of its folders holds, where it was made from `source` and is whole."""
+def _earlier(folder: Path, source: _Source) -> tuple[glb_reader.Stored | None, bool]:
+    """What an export in asset/ or one of its folders holds, where the mesh in it was made from `source`, or None.
+
+    And whether its colors were made from it, too.
+    """
+    found: tuple[glb_reader.Stored | None, bool] = (None, False)
     for sidecar in sorted([*folder.glob(f"*{_SIDECAR}"), *folder.glob(f"*/*{_SIDECAR}")]):
         glb = sidecar.with_name(f"{sidecar.name.removesuffix(_SIDECAR)}.glb")
         try:
             told = text_file.read_json(sidecar)
-            if told["made_from"] == source:
-                return glb_reader.read(glb, told["files"][glb.name])
+            made_from = msgspec.convert(told["made_from"], _Source)
+            whole = made_from == source
+            if whole or (made_from.mesh == source.mesh and found[0] is None):
+                found = glb_reader.read(glb, told["files"][glb.name]), whole
         except (OSError, ValueError, LookupError, TypeError, DecodeError):
             continue  # of another program, or touched since: as if it were not there
-    return None
+        if found[1]:
+            break
+    return found
 
 
 def _preset(wanted: Wanted) -> Preset:
@@ -155,8 +198,9 @@ class _Job:
     images: Kind
     color: str
     record: Mapping[str, Any]
-    source: str  # of the asset; empty where its textures were made larger or smaller
+    source: _Source | None  # of the asset; None where its textures were made larger or smaller
     encoder: Encoder
+    standing: Written
 
     def write(self) -> list[Path]:
         """Every file of the export, in threads, and the sidecar."""
@@ -175,7 +219,8 @@ class _Job:
             written = [file for one in running for file in one.result()]
         sidecar = self.folder / f"{self.stem}{_SIDECAR}"
         whole = self.source and "gltf" in self.preset.formats and self.images == "png"
-        provenance.write(sidecar, {**self.record, "made_from": self.source if whole else None}, written)
+        made_from = msgspec.to_builtins(self.source) if whole else None
+        provenance.write(sidecar, {**self.record, "made_from": made_from}, written)
         return [*written, sidecar]
 
     @cached_property
@@ -233,10 +278,15 @@ class _Job:
         """For formats that hold a comment."""
         return f"polcap; unit of length: {self.unit}; normals +Y (OpenGL); made from: {self.stem}.provenance.json"
 
-    def _texture(self, file: str, texture: Texture) -> list[Path]:
-        with atomic.path(self.folder / file) as temporary:
+    def _texture(self, name: str, texture: Texture) -> list[Path]:
+        file = self.folder / name
+        made_from = [texture.pixels, texture.color, texture.says]
+        self.standing.make(file, made_from, partial(self._encoded, file, texture))
+        return [file]
+
+    def _encoded(self, file: Path, texture: Texture) -> None:
+        with atomic.path(file) as temporary:
             temporary.write_bytes(self.encoder(texture, "png", text=True))
-        return [self.folder / file]
 
     def _gltf(self) -> list[Path]:
         file = self.folder / f"{self.stem}.glb"
@@ -249,7 +299,8 @@ class _Job:
         return [file]
 
     def _obj(self) -> list[Path]:
-        return obj.write(self.folder / f"{self.stem}.obj", self.asset, self.stem, self.files, self.line)
+        file = self.folder / f"{self.stem}.obj"
+        return obj.write(file, self.asset, self.stem, self.files, self.line, self.standing)
 
     def _usd(self) -> list[Path]:
         file = self.folder / f"{self.stem}.usdc"

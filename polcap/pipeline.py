@@ -14,15 +14,17 @@ from typing import Any
 
 import msgspec
 
-from polcap import asset_export, pictures, report
+from polcap import asset_export, pictures, report, unchanged
 from polcap.asset_export import Wanted
 from polcap.config import Config, restored
 from polcap.errors import InputError, SettingError, StorageError
 from polcap.formats import animation, atomic, layouts, png, provenance, text_file
 from polcap.formats import maps as maps_folder
+from polcap.formats.written import Written
 from polcap.images import Capture, Frame, Network, SensorImage, Shot
 from polcap.path import STAGES, Results, UserInput, path
 from polcap.pictures import moving
+from polcap.remembered import Remembered
 from polcap.store import Archive, Progress, Store, contents, seal, silent
 
 
@@ -54,24 +56,18 @@ def process(
         store.materialize(until)
         if until is not None:
             return None
-        before = _written_before(out, capture, config, supplied.network, results)
-        if before is not None and force is None:
+        written, remembered = _kept(out, force is not None)
+        if force is None and (before := _written_before(written, out, capture, config, supplied.network, results)):
             progress("write", 0.0, True)
             return before
         progress("write", None, False)
         start = time.perf_counter()
-        about = report.document(report.capture_facts(capture), results, config, supplied.network, timings(out))
-        maps_folder.write(
-            out / "maps",
-            results.maps.value,
-            results.mesh.value,
-            results.stokes.value,
-            results.cues.value,
-            depth_alone=force is None and _maps_stand(out, results),
-        )
-        asset_export.export(out, about, Wanted())
-        report.write(out, about, results)
-        _remember_written(out)
+        facts = report.capture_facts(capture)
+        about = report.document(facts, results, config, supplied.network, timings(out), remembered)
+        maps_folder.write(out / "maps", results.maps, results.mesh, results.stokes, results.cues, written)
+        asset_export.export(out, about, Wanted(), written, results)
+        report.write(out, about, results, remembered)
+        written.remember()
         progress("write", time.perf_counter() - start, False)
     return about
 
@@ -148,10 +144,11 @@ def judge_again(out: Path) -> dict[str, Any]:
     with Store(out).lock():
         config = restored(about, out / "work" / "run.json")
         fixed = {name: about[name] for name in ("model", "versions")}
-        again = report.document(about["capture"], results, config, None, timings(out)) | fixed
+        nothing = Remembered()
+        again = report.document(about["capture"], results, config, None, timings(out), nothing) | fixed
         if (out / "report.json").exists():
             again["keys"] = report.read(out).get("keys", {})
-        report.write(out, again, results)
+        report.write(out, again, results, nothing)
     return again
 
 
@@ -208,15 +205,24 @@ class _Counted:
         return image
 
 
+def _kept(out: Path, anew: bool) -> tuple[Written, Remembered]:
+    """What an earlier run wrote and measured; nothing where it is not clear whether this program did."""
+    try:
+        program = unchanged.program()
+    except (OSError, unchanged.InDoubt):
+        program, anew = "", True
+    return Written(out, program, anew), Remembered(out, program, anew)
+
+
 def _written_before(
-    out: Path, capture: Capture, config: Config, network: Network | None, results: Results
+    written: Written, out: Path, capture: Capture, config: Config, network: Network | None, results: Results
 ) -> dict[str, Any] | None:
     """The report of an earlier run that would write the same files, where nobody has touched these since."""
+    if not written.untouched():
+        return None
     try:
-        if text_file.read_json(out / "work" / "written.json") != _files(out):
-            return None
         about = report.read(out)
-    except (OSError, ValueError, InputError):
+    except InputError:
         return None
     same: dict[str, Any] = {
         "capture": report.capture_facts(capture),
@@ -226,38 +232,6 @@ def _written_before(
         "settings": msgspec.to_builtins(config),
     }
     return about if json.loads(json.dumps(same)) == {name: about.get(name) for name in same} else None
-
-
-def _maps_stand(out: Path, results: Results) -> bool:
-    """An earlier run made all of maps/ that does not come from the mesh from the same results, untouched since."""
-    try:
-        before, now = text_file.read_json(out / "work" / "written.json"), _files(out)
-        about = report.read(out)
-    except (OSError, ValueError, InputError):
-        return False
-    names = {name for name in {*before, *now} if Path(name).parent == Path("maps") and Path(name).stem != "depth"}
-    same = "maps/maps.json" in names and all(before.get(name) == now.get(name) for name in names)
-    versions = about.get("versions") == json.loads(json.dumps(provenance.versions()))
-    made_from = (results.stokes, results.cues, results.maps)
-    return same and versions and all(about["keys"].get(kept.name) == kept.key for kept in made_from)
-
-
-def _remember_written(out: Path) -> None:
-    """work/written.json: what the next run finds if nothing has changed."""
-    with atomic.path(out / "work" / "written.json") as temporary:
-        temporary.write_text(json.dumps(_files(out)) + "\n", encoding="utf-8")
-
-
-def _files(out: Path) -> dict[str, list[int]]:
-    """Size and time of every file of a result but the cache."""
-    found = {}
-    for root, folders, files in os.walk(out):
-        if Path(root) == out:
-            folders[:] = [name for name in folders if name != "work"]
-        for name in files:
-            about = (Path(root) / name).stat()
-            found[os.path.relpath(os.path.join(root, name), out)] = [about.st_size, about.st_mtime_ns]
-    return found
 
 
 def _remember_run(out: Path, capture: Capture, config: Config, network: Network | None) -> None:

@@ -9,6 +9,7 @@ import os
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -41,12 +42,24 @@ def fingerprint(asked: Mapping[str, Any], capture: Path, out: Path, given: Itera
         newest = max((stat[1] for stat in [*photographs.values(), *files.values()]), default=0)
         if newest > time.time_ns() - _SETTLED_NS:
             return None
-        program = [sys.version, provenance.versions(), _folder(_PACKAGE), _folder(_PACKAGE.parent / "calib")]
+        places = [os.path.realpath(capture), os.path.realpath(out)]
+        return _digest([dict(asked), places, photographs, files, program()])
     except (OSError, InDoubt):
         return None
-    places = [os.path.realpath(capture), os.path.realpath(out)]
-    text = json.dumps([dict(asked), places, photographs, files, program], sort_keys=True, default=str)
-    return blake2b(text.encode(errors="surrogateescape"), digest_size=16).hexdigest()
+
+
+@cache
+def program() -> str:
+    """Digest of the program by its files' sizes and times, and of the packages that decide on pixels.
+
+    Raises
+    ------
+    InDoubt
+        A folder of it is a link.
+    OSError
+        It cannot be listed.
+    """
+    return _digest([sys.version, provenance.versions(), _folder(_PACKAGE), _folder(_PACKAGE.parent / "calib")])
 
 
 def find(out: Path, request: str | None) -> Finished | None:
@@ -75,6 +88,11 @@ def remember(out: Path, request: str | None, table: str, stages: Iterable[str]) 
     known = {"request": request, "table": table, "stages": list(stages), "result": _result(out)}
     with atomic.path(out / "work" / _FILE) as temporary:
         temporary.write_text(json.dumps(known) + "\n", encoding="utf-8")
+
+
+def _digest(value: Any) -> str:
+    text = json.dumps(value, sort_keys=True, default=str)
+    return blake2b(text.encode(errors="surrogateescape"), digest_size=16).hexdigest()
 
 
 def _result(out: Path) -> Stats:

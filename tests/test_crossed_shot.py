@@ -97,7 +97,7 @@ def test_both_parts_of_the_light_are_written(
     keep: Callable[..., None] = lambda file, channels, half=False: written.update({file.name: set(channels)})  # noqa: E731
     monkeypatch.setattr("polcap.formats.maps.exr.write", keep)
     found = results[1]
-    maps_folder.write(tmp_path, found.maps.value, found.mesh.value, found.stokes.value, found.cues.value)
+    maps_folder.write(tmp_path, found.maps, found.mesh, found.stokes, found.cues)
     assert {"scattered.R", "mirrored.B"} <= written["cues.exr"]
 
 

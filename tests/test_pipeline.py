@@ -78,6 +78,16 @@ def test_late_change_writes_what_follows_from_it_alone(
     assert polcap(*command, "--set", "surface.stiffness=1").returncode == 0
     after = {file.name: file.stat().st_mtime_ns for file in (copy / "maps").iterdir()}
     assert {name for name in before if after[name] != before[name]} == {"depth.exr", "depth.png", "maps.json"}
+    before = {file.name: file.stat().st_mtime_ns for file in copy.glob("*/*") if file.parent.name != "work"}
+    remembered = {file.name: file.stat().st_mtime_ns for file in (copy / "work" / "remembered").iterdir()}
+    assert polcap(*command, "--set", "surface.stiffness=1", "--set", "asset.ior=1.4").returncode == 0
+    after = {file.name: file.stat().st_mtime_ns for file in copy.glob("*/*") if file.parent.name != "work"}
+    changed = {name for name in before if after[name] != before[name]}
+    of_colors = (".glb", ".mtl", ".provenance.json", "_basecolor.png")
+    assert changed == {"maps.json", *(f"capture{end}" for end in of_colors)}
+    assert remembered == {file.name: file.stat().st_mtime_ns for file in (copy / "work" / "remembered").iterdir()}
+    for file in (copy / "work" / "remembered").iterdir():
+        file.write_bytes(file.read_bytes().replace(b"0", b"1"))
     (copy / "maps" / "normal.png").write_bytes(b"touched")
     assert polcap(*command).returncode == 0
     assert product(copy) == product(result)

@@ -1,11 +1,12 @@
 """In: the maps of an object. Out: the folder maps/ of a result, as docs/reference/result.md says; and back."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from hashlib import blake2b
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol, TypeVar
 
 import msgspec
 import numpy as np
@@ -14,8 +15,11 @@ from numpy.typing import NDArray
 
 from polcap.errors import DecodeError
 from polcap.formats import atomic, exr, npy_folder, png, text_file
+from polcap.formats.written import Written
 from polcap.images import Cues, Floats, Mesh, StokesImage, SurfaceMaps, View
 from polcap.optics import color
+
+Value = TypeVar("Value", covariant=True)
 
 CONVENTIONS = {
     "frame": "camera: x right, y up, z toward the camera; a normal facing the camera is (0, 0, 1)",
@@ -67,8 +71,23 @@ class Stored:
     metric: bool
 
 
+class Keyed(Protocol[Value]):
+    """A result of the path: what tells it from others, and its value, read when it is asked for."""
+
+    @property
+    def key(self) -> str: ...
+
+    @property
+    def value(self) -> Value: ...
+
+
 def write(
-    folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues: Cues, depth_alone: bool = False
+    folder: Path,
+    maps: Keyed[SurfaceMaps],
+    mesh: Keyed[Mesh],
+    stokes: Keyed[StokesImage],
+    cues: Keyed[Cues],
+    written: Written | None = None,
 ) -> None:
     """Write every map as EXR, the main ones as PNG too, and maps.json last; the same values give the same bytes.
 
@@ -82,8 +101,8 @@ def write(
         Its depth is written, not its triangles.
     stokes, cues
         The images that the maps were made from, on the same crop.
-    depth_alone
-        All that does not come from the mesh stands there already.
+    written
+        Which files stand already; without it none does.
 
     Raises
     ------
@@ -91,35 +110,78 @@ def write(
         A file cannot be written.
     """
     folder = Path(folder)
-    inside = np.asarray(maps.mask, dtype=bool)
-    depth = np.where(inside & np.isfinite(mesh.depth), mesh.depth, 0.0).astype(np.float32)
+    written = written or Written(folder.parent, anew=True)
+    made: dict[_Source, Keyed[Any]] = {"maps": maps, "mesh": mesh, "stokes": stokes, "cues": cues}
+    for name, (sources, encode) in {**_EXRS, **_PNGS}.items():
+        taken = [made[source] for source in sources]
+        written.make(folder / name, [one.key for one in taken], partial(_write, folder / name, encode, taken))
+    near, median, far = _range(maps.value, mesh.value)
+    depth: dict[str, str | float] = {"unit": "m" if mesh.value.metric else "relative"}
+    _write_json(folder / "maps.json", _description(maps.value, {**depth, "near": near, "median": median, "far": far}))
+
+
+def _write(file: Path, encode: Callable[..., Any], taken: Sequence[Keyed[Any]]) -> None:
+    """One file; an .exr of channels, a .png of pixels."""
+    content = encode(*(one.value for one in taken))
+    if file.suffix == ".exr":
+        exr.write(file, content, half=file.stem not in _WHOLE)
+    else:
+        png.write(file, content)
+
+
+def _depth(maps: SurfaceMaps, mesh: Mesh) -> Floats:
+    """Depth on the object, 0 beside it."""
+    return np.where(_inside(maps) & np.isfinite(mesh.depth), mesh.depth, 0.0).astype(np.float32)
+
+
+def _range(maps: SurfaceMaps, mesh: Mesh) -> tuple[float, float, float]:
+    """Least, median and greatest depth on the object."""
+    depth = _depth(maps, mesh)
     seen = depth[depth > 0]
-    unit = "m" if mesh.metric else "relative"
     near, median, far = (float(q) for q in np.quantile(seen, (0, 0.5, 1))) if seen.size else (0.0, 0.5, 1.0)
-    exr.write(folder / "depth.exr", {"Z": depth})
-    png.write(folder / "depth.png", png.sixteen_bits(np.where(depth > 0, (depth - near) / max(far - near, 1e-9), 0)))
-    if not depth_alone:
-        _write_seen(folder, maps, inside, stokes, cues)
-    _write_json(folder / "maps.json", _description(maps, {"unit": unit, "near": near, "median": median, "far": far}))
+    return near, median, far
 
 
-def _write_seen(folder: Path, maps: SurfaceMaps, inside: NDArray[np.bool_], stokes: StokesImage, cues: Cues) -> None:
-    """What comes from the photographs and the estimator, without the mesh."""
-    flat = np.where(inside[..., None], maps.normal, [0.0, 0.0, 1.0])
-    exr.write(folder / "normal.exr", _channels("RGB", _kept(maps.normal, inside)))
-    exr.write(folder / "diffuse.exr", _channels("RGB", _kept(maps.diffuse, inside)), half=True)
-    exr.write(folder / "specular.exr", _channels("RGB", _kept(maps.specular, inside)), half=True)
-    exr.write(folder / "roughness.exr", {"Y": _kept(maps.roughness, inside)}, half=True)
-    exr.write(folder / "confidence.exr", {"Y": _kept(maps.confidence, inside)}, half=True)
-    exr.write(folder / "stokes.exr", _stokes_channels(stokes), half=True)
-    exr.write(folder / "cues.exr", _cue_channels(cues), half=True)
+def _depth_picture(maps: SurfaceMaps, mesh: Mesh) -> NDArray[np.uint16]:
+    near, _, far = _range(maps, mesh)
+    depth = _depth(maps, mesh)
+    return png.sixteen_bits(np.where(depth > 0, (depth - near) / max(far - near, 1e-9), 0))
 
-    png.write(folder / "normal.png", png.sixteen_bits(flat / 2 + 0.5))
-    png.write(folder / "diffuse.png", color.srgb_eight_bits(_kept(maps.diffuse, inside)))
-    png.write(folder / "specular.png", color.srgb_eight_bits(_kept(maps.specular, inside)))
-    png.write(folder / "roughness.png", png.sixteen_bits(_kept(maps.roughness, inside)))
-    png.write(folder / "photograph.png", color.srgb_eight_bits(cues.radiance))
-    png.write(folder / "mask.png", np.where(inside, 255, 0).astype(np.uint8))
+
+def _normal_picture(maps: SurfaceMaps) -> NDArray[np.uint16]:
+    flat = np.where(_inside(maps)[..., None], maps.normal, [0.0, 0.0, 1.0])
+    return png.sixteen_bits(flat / 2 + 0.5)
+
+
+def _inside(maps: SurfaceMaps) -> NDArray[np.bool_]:
+    return np.asarray(maps.mask, dtype=bool)
+
+
+def _seen(maps: SurfaceMaps, values: Floats) -> Floats:
+    """A map on the object, 0 beside it."""
+    return _kept(values, _inside(maps))
+
+
+def as_read(maps: SurfaceMaps, mesh: Mesh) -> Stored:
+    """What `read` gives of the folder that `write` makes of these: half where the files are half."""
+    inside = _inside(maps)
+    whole = SurfaceMaps(
+        normal=_kept(maps.normal, inside),
+        diffuse=_half(_kept(maps.diffuse, inside)),
+        specular=_half(_kept(maps.specular, inside)),
+        roughness=_half(_kept(maps.roughness, inside)),
+        depth_prior=None,
+        confidence=_half(_kept(maps.confidence, inside)),
+        mask=inside,
+        view=maps.view,
+        estimator=maps.estimator,
+    )
+    return Stored(whole, np.where(inside, _depth(maps, mesh), np.nan).astype(np.float32), mesh.metric)
+
+
+def _half(values: Floats) -> Floats:
+    limit = np.finfo(np.float16).max
+    return np.clip(values, -limit, limit).astype(np.float16).astype(np.float32)
 
 
 def read(folder: Path) -> Stored:
@@ -298,3 +360,27 @@ def _separated(cues: Cues) -> dict[str, Floats]:
     mirrored = _kept(np.maximum(cues.radiance - cues.body, 0), cues.body_known)
     parts = {"scattered": body, "mirrored": mirrored}
     return {f"{name}.{c}": part[..., k] for name, part in parts.items() for k, c in enumerate("RGB")}
+
+
+_Source = Literal["maps", "mesh", "stokes", "cues"]
+_Made = Mapping[str, tuple[tuple[_Source, ...], Callable[..., Any]]]  # what a file is made from, and its content
+_EXRS: _Made = {
+    "depth.exr": (("maps", "mesh"), lambda maps, mesh: {"Z": _depth(maps, mesh)}),
+    "normal.exr": (("maps",), lambda maps: _channels("RGB", _seen(maps, maps.normal))),
+    "diffuse.exr": (("maps",), lambda maps: _channels("RGB", _seen(maps, maps.diffuse))),
+    "specular.exr": (("maps",), lambda maps: _channels("RGB", _seen(maps, maps.specular))),
+    "roughness.exr": (("maps",), lambda maps: {"Y": _seen(maps, maps.roughness)}),
+    "confidence.exr": (("maps",), lambda maps: {"Y": _seen(maps, maps.confidence)}),
+    "stokes.exr": (("stokes",), _stokes_channels),
+    "cues.exr": (("cues",), _cue_channels),
+}
+_WHOLE = ("depth", "normal")  # of 32 bits; the others are half
+_PNGS: _Made = {
+    "depth.png": (("maps", "mesh"), _depth_picture),
+    "normal.png": (("maps",), _normal_picture),
+    "diffuse.png": (("maps",), lambda maps: color.srgb_eight_bits(_seen(maps, maps.diffuse))),
+    "specular.png": (("maps",), lambda maps: color.srgb_eight_bits(_seen(maps, maps.specular))),
+    "roughness.png": (("maps",), lambda maps: png.sixteen_bits(_seen(maps, maps.roughness))),
+    "photograph.png": (("cues",), lambda cues: color.srgb_eight_bits(cues.radiance)),
+    "mask.png": (("maps",), lambda maps: np.where(_inside(maps), 255, 0).astype(np.uint8)),
+}

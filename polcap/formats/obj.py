@@ -8,13 +8,16 @@ reads as it is; `norm` names the PNG for the others. OBJ counts v upwards where 
 
 import re
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polcap.formats import atomic, exr, gltf
 from polcap.formats.texture_set import SPECULAR_RANGE, Key
+from polcap.formats.written import Written
 from polcap.images import Asset, Floats
 
 
@@ -23,7 +26,14 @@ def stem(name: str) -> str:
     return re.sub(r"\s+", "_", name)
 
 
-def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], says: str = "") -> list[Path]:
+def write(
+    path: Path,
+    asset: Asset,
+    name: str,
+    files: Mapping[Key, str],
+    says: str = "",
+    standing: Written | None = None,
+) -> list[Path]:
     """Write `path` (.obj) and beside it the .mtl and two EXRs.
 
     Parameters
@@ -38,6 +48,8 @@ def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], says: s
         Names of the PNGs beside it, which are there already.
     says
         Comment at the head of both texts.
+    standing
+        Which files stand already; without it none does.
 
     Returns
     -------
@@ -52,17 +64,28 @@ def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], says: s
     base = stem(path.stem)
     written = [path, *(path.with_name(f"{base}{ending}") for ending in (".mtl", "_roughness.exr", "_normal.exr"))]
     _, library, roughness, normal = written
-    whole = np.float32(np.iinfo(asset.normal.dtype).max)
-    exr.write(normal, {c: asset.normal[..., k] / whole for k, c in enumerate("RGB")}, half=True)
-    packed = asset.occlusion_roughness_metallic
-    exr.write(roughness, {"Y": packed[..., 1] / np.float32(np.iinfo(packed.dtype).max)}, half=True)
+    make = (standing or Written(path.parent, anew=True)).make
+    packed = np.ascontiguousarray(asset.occlusion_roughness_metallic[..., 1])
+    make(normal, [asset.normal], partial(_data, normal, {c: asset.normal[..., k] for k, c in enumerate("RGB")}))
+    make(roughness, [packed], partial(_data, roughness, {"Y": packed}))
     data: dict[Key, str] = {"roughness": roughness.name, "normal": normal.name}
     header = "".join(f"# {line}\n" for line in says.splitlines())
     with atomic.path(library) as temporary:
         temporary.write_text(header + _material(asset, stem(name), files, data), encoding="utf-8")
-    with atomic.path(path) as temporary:
-        temporary.write_bytes(header.encode() + _geometry(asset, stem(name), library.name))
+    mesh = asset.mesh
+    made_from = [mesh.vertices, mesh.uv, mesh.normals, mesh.faces, stem(name), library.name, header]
+    make(path, made_from, partial(_mesh, path, asset, stem(name), library.name, header))
     return written
+
+
+def _data(file: Path, channels: Mapping[str, NDArray[Any]]) -> None:
+    """Whole numbers of any depth as the share of their greatest, in half."""
+    exr.write(file, {name: one / np.float32(np.iinfo(one.dtype).max) for name, one in channels.items()}, half=True)
+
+
+def _mesh(path: Path, asset: Asset, material: str, library: str, header: str) -> None:
+    with atomic.path(path) as temporary:
+        temporary.write_bytes(header.encode() + _geometry(asset, material, library))
 
 
 def _geometry(asset: Asset, material: str, library: str) -> bytes:

@@ -7,6 +7,7 @@ states an assumption. A gate that could not be measured says so.
 import json
 import math
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from polcap.images import (
     StokesImage,
 )
 from polcap.path import Results
+from polcap.remembered import Remembered
 from polcap.report import labels, page, shown
 from polcap.report.whole import Whole
 from polcap.stages.cues import scale
@@ -190,23 +192,38 @@ def document(
     config: Config,
     network: Network | None,
     timings: Mapping[str, float],
+    remembered: Remembered,
 ) -> dict[str, Any]:
-    """report.json: what was understood, measured and judged; timings [s] of the stages that were kept."""
-    found = {**figures(results), "rerendering": rerendering(results, config.infer.ior)}
-    judged = list(gates.judge(Whole(results, tuple(capture.get("focal_doubt", (0.0, 0.0)))), config))
+    """report.json: what was understood, measured and judged; timings [s] of the stages that were kept.
+
+    What is `remembered` of the same results is not measured again.
+    """
+    keys = {kept.name: kept.key for kept in vars(results).values()}
+    measured_on = {name: key for name, key in keys.items() if name != results.asset.name}
+    found = remembered("figures", measured_on, partial(figures, results))
+    again = remembered("rerendering", measured_on, partial(rerendering, results, config.infer.ior))
+    found = {**found, "rerendering": again}
+    whole = Whole(results, tuple(capture.get("focal_doubt", (0.0, 0.0))))
+    limits = {name: section for name, section in msgspec.to_builtins(config).items() if name != results.asset.name}
+    judged = remembered("gates", [measured_on, whole.focal_doubt, limits], partial(_judged, whole, config))
     return {
         "polcap": __version__,
         "versions": provenance.versions(),
-        "verdict": gates.verdict(judged),
+        "verdict": judged["verdict"],
         "capture": capture,
-        "gates": msgspec.to_builtins(judged),
+        "gates": judged["gates"],
         "figures": found,
         "units": labels.units(bool(found["mesh"]["metric"])),
         "timings": dict(timings),
         "model": model_facts(network),
-        "keys": {kept.name: kept.key for kept in vars(results).values()},
+        "keys": keys,
         "settings": msgspec.to_builtins(config),
     }
+
+
+def _judged(whole: Whole, config: Config) -> dict[str, Any]:
+    judged = list(gates.judge(whole, config))
+    return {"verdict": gates.verdict(judged), "gates": msgspec.to_builtins(judged)}
 
 
 def model_facts(network: Network | None) -> dict[str, str] | None:
@@ -217,8 +234,8 @@ def model_facts(network: Network | None) -> dict[str, str] | None:
     return {**network.metadata, "digest": network.digest, **beside}
 
 
-def write(folder: Path, about: dict[str, Any], results: Results) -> None:
-    """report.json and report.html with its pictures, in a result folder.
+def write(folder: Path, about: dict[str, Any], results: Results, remembered: Remembered) -> None:
+    """report.json and report.html with its pictures, in a result folder; what is `remembered` is not drawn again.
 
     Raises
     ------
@@ -227,7 +244,7 @@ def write(folder: Path, about: dict[str, Any], results: Results) -> None:
     """
     with atomic.path(folder / "report.json") as temporary:
         temporary.write_text(json.dumps(about, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
-    page.write(folder, about, results)
+    page.write(folder, about, results, remembered)
 
 
 def read(folder: Path) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any, get_args
@@ -17,6 +18,7 @@ from polcap.optics.color import srgb_eight_bits
 from polcap.path import Results
 from polcap.pictures import keys
 from polcap.pictures.keys import Key, Palette
+from polcap.remembered import Remembered
 from polcap.report import labels, lean, plots, shown
 from polcap.report.shown import Rerendered, Shown
 
@@ -30,14 +32,40 @@ _HEADLINE = {
 }
 
 
-def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
-    """report.html in a result folder.
+def write(folder: Path, about: Mapping[str, Any], results: Results, remembered: Remembered) -> None:
+    """report.html in a result folder; what is `remembered` is not drawn again.
 
     Raises
     ------
     StorageError
         The file cannot be written.
     """
+    seen = [results.radiance.key, results.color.key]
+    rms = about["figures"].get("rerendering", {}).get("rms")
+    shapes = [*seen, results.cues.key, results.maps.key, results.mesh.key, rms]
+    drawn = remembered("page_maps", shapes, partial(_of_maps, about, results))
+    chart = remembered("page_chart", [*seen, about["figures"]["chart"]], partial(_chart, about, results))
+    pictures_of = [*seen, results.alignment.key, results.object_.key]
+    looks = remembered("page_pictures", pictures_of, partial(_pictures, results))
+    body = [
+        *_verdict(about),
+        drawn["relit"],
+        *_solid(drawn["metric"], about),
+        drawn["maps"],
+        *_measured(results, about, drawn["angles_deg"], chart),
+        looks,
+        *_tables(about),
+    ]
+    data = {
+        "palettes": {name: html.text(keys.colors(name).tobytes()) for name in get_args(Palette)},
+        "view": drawn["view"],
+        "mesh": remembered("page_mesh", results.mesh.key, partial(_lean, results)),
+    }
+    html.write(folder / "report.html", f"{about['capture']['name']}: polcap report", body, data)
+
+
+def _of_maps(about: Mapping[str, Any], results: Results) -> dict[str, Any]:
+    """What the page shows of the maps, and how its viewer looks at them."""
     radiance, maps, mesh = results.radiance.value, results.maps.value, results.mesh.value
     small = shown.reduce(maps, mesh, results.cues.value, radiance.angle, _LONGEST)
     ior = float(about["settings"]["infer"]["ior"])
@@ -45,18 +73,12 @@ def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
     bright = shown.exposure(small)
     size = small.maps.mask.shape[1::-1]
     taken = shown.photograph(radiance, results.color.value, small.maps.view, size)
-    body = [
-        *_verdict(about),
-        *_relit(srgb_eight_bits(bright * taken), srgb_eight_bits(bright * again.scale * again.flashed)),
-        *_solid(mesh.metric, about),
-        *_maps(small, mesh.metric),
-        *_rerendered(small, again, about),
-        *_measured(results, about),
-        *_pictures(results),
-        *_tables(about),
-    ]
-    data = {
-        "palettes": {name: html.text(keys.colors(name).tobytes()) for name in get_args(Palette)},
+    relit = _relit(srgb_eight_bits(bright * taken), srgb_eight_bits(bright * again.scale * again.flashed))
+    return {
+        "relit": "".join(relit),
+        "maps": "".join([*_maps(small, mesh.metric), *_rerendered(small, again, about)]),
+        "metric": mesh.metric,
+        "angles_deg": [float(angle) for angle in np.degrees(radiance.angle)],
         "view": {
             "size": list(size),
             "center": [float(edge) for edge in small.maps.view.center],
@@ -65,9 +87,11 @@ def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
             "exposure": bright * again.scale,
             "top": keys.F0.high,
         },
-        "mesh": lean.packed(mesh),
     }
-    html.write(folder / "report.html", f"{about['capture']['name']}: polcap report", body, data)
+
+
+def _lean(results: Results) -> dict[str, Any]:
+    return lean.packed(results.mesh.value)
 
 
 def verdict(about: Mapping[str, Any]) -> tuple[str, str]:
@@ -253,23 +277,28 @@ def _rerendered(small: Shown, again: Rerendered, about: Mapping[str, Any]) -> It
     yield "</div>"
 
 
-def _measured(results: Results, about: Mapping[str, Any]) -> Iterator[str]:
-    radiance, color = results.radiance.value, results.color.value
+def _chart(about: Mapping[str, Any], results: Results) -> str:
+    """The chart as photographed beside the maker's colors; nothing where none was read."""
+    color = results.color.value
+    measured = shown.patches(results.radiance.value, color)
+    if measured is None or color.delta_e is None:
+        return ""
+    known = calib.colorchecker(about["settings"]["whitebalance"]["chart"])
+    reference = next((one for one in known.editions if one.name == color.edition), known)
+    drawing = plots.chart(
+        srgb_eight_bits(reference.rec709), srgb_eight_bits(measured), color.delta_e, reference.patches
+    )
+    figures = about["figures"]["chart"]
+    mean, ahead = labels.number(figures["delta_e_mean"], 2), figures["predicted_mean"]
+    says = f"outside the maker's colors, inside as photographed; below ΔE2000, mean {mean}"
+    says += "" if ahead is None else f", {labels.number(ahead, 2)} where the patch itself is left out of the fit"
+    return _drawn("Chart", says, drawing)
+
+
+def _measured(results: Results, about: Mapping[str, Any], angles: Sequence[float], chart: str) -> Iterator[str]:
+    """Plots of what was measured; `angles` in degrees, `chart` drawn."""
     gains, moved = results.gains.value, results.alignment.value
-    angles = [float(angle) for angle in np.degrees(radiance.angle)]
-    yield "<h2>How it was measured</h2><div class='grid'>"
-    measured = shown.patches(radiance, color)
-    if measured is not None and color.delta_e is not None:
-        known = calib.colorchecker(about["settings"]["whitebalance"]["chart"])
-        reference = next((one for one in known.editions if one.name == color.edition), known)
-        drawing = plots.chart(
-            srgb_eight_bits(reference.rec709), srgb_eight_bits(measured), color.delta_e, reference.patches
-        )
-        figures = about["figures"]["chart"]
-        mean, ahead = labels.number(figures["delta_e_mean"], 2), figures["predicted_mean"]
-        says = f"outside the maker's colors, inside as photographed; below ΔE2000, mean {mean}"
-        says += "" if ahead is None else f", {labels.number(ahead, 2)} where the patch itself is left out of the fit"
-        yield _drawn("Chart", says, drawing)
+    yield "<h2>How it was measured</h2><div class='grid'>" + chart
     merge = about["figures"]["merge"]
     yield _drawn(
         "Exposures",
@@ -295,21 +324,19 @@ def _drawn(title: str, says: str, drawing: str) -> str:
     return f"<figure>{drawing}<figcaption><b>{escape(title)}</b><br><span>{escape(says)}</span></figcaption></figure>"
 
 
-def _pictures(results: Results) -> Iterator[str]:
+def _pictures(results: Results) -> str:
     radiance, color = results.radiance.value, results.color.value
     notable: Sequence[tuple[str, str, NDArray[np.uint8]]] = (
         ("Reference shot", "the chart as it was read", pictures.chart(radiance, color, _WIDEST)),
         ("Object", "what was taken for it", pictures.outline(radiance, color, results.object_.value, _WIDEST)),
         ("Registration", "first shot magenta, the other green: grey is good", pictures.of_stage(results, "align")),
     )
-    yield '<h2>What polcap saw</h2><div class="grid">'
-    for title, says, picture in notable:
-        image = html.jpeg(pictures.shrink(picture, _WIDEST))
-        yield (
-            f'<figure><div class="picture"><img alt="{title}" src="{image}"></div><figcaption><b>{title}</b><br><span>'
-            f"{says}</span></figcaption></figure>"
-        )
-    yield "</div>"
+    figures = "".join(
+        f'<figure><div class="picture"><img alt="{title}" src="{html.jpeg(pictures.shrink(picture, _WIDEST))}"></div>'
+        f"<figcaption><b>{title}</b><br><span>{says}</span></figcaption></figure>"
+        for title, says, picture in notable
+    )
+    return f'<h2>What polcap saw</h2><div class="grid">{figures}</div>'
 
 
 def _tables(about: Mapping[str, Any]) -> Iterator[str]:

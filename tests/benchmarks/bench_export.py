@@ -29,6 +29,7 @@ from polcap.formats.presets import PRESETS, Preset
 from polcap.images import Asset, Cues, Floats, Mesh, StokesImage, SurfaceMaps, View
 from polcap.stages import asset, surface
 from tests import surfaces
+from tests.surfaces import Known
 
 
 def main(folder: Path, side: int) -> None:
@@ -135,7 +136,7 @@ def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, noise: Floats) -> None:
         quality=np.zeros(size, np.uint8),
         view=maps.view,
     )
-    maps_folder.write(folder / "maps", maps, mesh, stokes, cues)
+    maps_folder.write(folder / "maps", Known(maps), Known(mesh), Known(stokes), Known(cues))
 
 
 if __name__ == "__main__":

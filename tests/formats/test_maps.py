@@ -12,6 +12,7 @@ from polcap.formats import exr, maps, png
 from polcap.images import ColorCalibration, Cues, Mesh, StokesImage, SurfaceMaps
 from polcap.stages import cues
 from tests import surfaces
+from tests.surfaces import Known
 
 FILES = {
     "normal.exr", "normal.png", "depth.exr", "depth.png", "diffuse.exr", "diffuse.png", "specular.exr",
@@ -20,6 +21,10 @@ FILES = {
 }  # fmt: skip
 
 Result = tuple[SurfaceMaps, Mesh, StokesImage, Cues]
+
+
+def write(folder: Path, of: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues: Cues) -> None:
+    maps.write(folder, Known(of), Known(mesh), Known(stokes), Known(cues))
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +48,7 @@ def result() -> Result:
 @pytest.fixture(scope="module")
 def folder(result: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("result") / "maps"
-    maps.write(folder, *result)
+    write(folder, *result)
     return folder
 
 
@@ -107,15 +112,28 @@ def test_stored_maps_come_back(folder: Path, result: Result) -> None:
     assert np.allclose(stored.maps.diffuse[of.mask], of.diffuse[of.mask], rtol=1e-3)
 
 
+def test_what_reading_gives_is_known_before_it_is_read(folder: Path, result: Result) -> None:
+    of, mesh, *_ = result
+    rng = np.random.default_rng(5)
+    of = replace(of, diffuse=np.exp(rng.normal(-8, 6, of.diffuse.shape)).astype(np.float32))  # denormals, and too much
+    mesh = replace(mesh, depth=np.where(rng.uniform(size=mesh.depth.shape) < 0.1, np.nan, mesh.depth))
+    write(folder.parent / "other", of, mesh, *result[2:])
+    read, known = maps.read(folder.parent / "other"), maps.as_read(of, mesh)
+    assert np.array_equal(read.depth, known.depth, equal_nan=True) and read.metric == known.metric
+    for name, value in vars(read.maps).items():
+        other = getattr(known.maps, name)
+        assert np.array_equal(value, other) if isinstance(value, np.ndarray) else value == other, name
+
+
 def test_same_result_gives_the_same_bytes(folder: Path, result: Result, tmp_path: Path) -> None:
-    maps.write(tmp_path / "again", *result)
+    write(tmp_path / "again", *result)
     for name in FILES:
         assert (folder / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
 
 
 def test_relative_depth_is_called_so(result: Result, tmp_path: Path) -> None:
     of, mesh, stokes, cue = result
-    maps.write(tmp_path, of, replace(mesh, metric=False), stokes, cue)
+    write(tmp_path, of, replace(mesh, metric=False), stokes, cue)
     assert json.loads((tmp_path / "maps.json").read_text("utf-8"))["depth"]["unit"] == "relative"
 
 

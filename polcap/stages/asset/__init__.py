@@ -5,7 +5,7 @@ References
 Khronos, glTF 2.0 §3.9 (materials) and KHR_materials_specular.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import cv2
@@ -41,6 +41,22 @@ def build(maps: SurfaceMaps, mesh: Mesh, settings: Settings) -> Asset:
     holding the map's greatest value. The mesh has already bent the light as its own normals do, so
     the normal texture holds what is left: the map's normals in the mesh's interpolated tangent frame.
     """
+    return joined(mesh, normals(maps, mesh), colors(maps, settings))
+
+
+@dataclass(frozen=True)
+class Colors:
+    """What an asset holds beside its mesh and the normals on it; fields as of `Asset`."""
+
+    base_color: NDArray[np.uint8]
+    occlusion_roughness_metallic: NDArray[np.uint8]
+    specular_color: NDArray[np.uint8]
+    specular_factor: tuple[float, float, float]
+    ior: float
+
+
+def colors(maps: SurfaceMaps, settings: Settings) -> Colors:
+    """The textures that no mesh decides."""
     known = _unmixed(maps.mask)
     specular = np.clip(maps.specular, 0.0, 1.0)
     entry, _ = fresnel.transmission(np.float64(1.0), settings.ior)
@@ -48,20 +64,28 @@ def build(maps: SurfaceMaps, mesh: Mesh, settings: Settings) -> Asset:
     top = float(specular[maps.mask].max(initial=0.0))
     roughness = _eight_bits(maps.roughness)
     full, none = np.full_like(roughness, 255), np.zeros_like(roughness)
-    return Asset(
-        mesh=mesh,
+    return Colors(
         base_color=filled(color.srgb_eight_bits(base), known),
         occlusion_roughness_metallic=filled(np.stack([full, roughness, none], axis=-1), known),
-        normal=_eight_bits(tangent_space(maps, mesh) / 2 + 0.5),
         specular_color=filled(color.srgb_eight_bits(specular / max(top, 1e-9)), known),
         specular_factor=(top / float(fresnel.normal_reflectance(settings.ior)),) * 3,
         ior=settings.ior,
     )
 
 
+def normals(maps: SurfaceMaps, mesh: Mesh) -> NDArray[np.uint8]:
+    """The normal texture (H, W, 3) of a mesh."""
+    return _eight_bits(tangent_space(maps, mesh) / 2 + 0.5)
+
+
+def joined(mesh: Mesh, normal: NDArray[np.uint8], textures: Colors) -> Asset:
+    """An asset of its mesh, the normal texture (H, W, 3) on it, and its other textures."""
+    return Asset(mesh=mesh, normal=normal, **vars(textures))
+
+
 def on_mesh(asset: Asset, maps: SurfaceMaps, mesh: Mesh) -> Asset:
     """The asset on another mesh of the same maps: only the normal texture depends on it."""
-    return replace(asset, mesh=mesh, normal=_eight_bits(tangent_space(maps, mesh) / 2 + 0.5))
+    return replace(asset, mesh=mesh, normal=normals(maps, mesh))
 
 
 def resized(asset: Asset, size: int) -> Asset:

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from polcap.images import Floats
 
@@ -58,6 +57,8 @@ class PixelGrid:
         """Matrix (N, N) of the links' weights (L,) plus a diagonal (N,)."""
         total = diagonal + np.bincount(self.p, link, self.size) + np.bincount(self.q, link, self.size)
         values = np.concatenate([-link, total])[self._place]
+        from scipy import sparse  # here: a start that integrates nothing does without SciPy
+
         return sparse.csr_matrix((values, self._indices, self._starts), (self.size, self.size))
 
     def divergence(self, flux: Floats) -> Floats:
