@@ -12,6 +12,7 @@ from polcap.images import Floats
 
 _SPECK = 0.002  # of the mesh's triangles: smaller pieces do not count
 _ROUNDS = 4  # of averaging along the boundary; about two grid steps either side
+_DEPTH_ROUNDS = 64  # the same of its depth, 1σ of six steps: at a limb the stairs of the outline are ten times as deep
 _FARTHEST = 0.75  # grid steps that a vertex may move in the picture
 _LEAST_AREA = 0.1  # of a triangle after the move, over before: else its corners stay
 
@@ -68,7 +69,7 @@ def measure(place: NDArray[np.int64], faces: NDArray[np.int32], mask: NDArray[np
 
 
 def smoothed(place: Floats, log: Floats, faces: NDArray[np.int32], step: int) -> tuple[Floats, Floats]:
-    """Vertices with those on the boundary averaged along it.
+    """Vertices with those on the boundary averaged along it, their depth over a longer way than their place.
 
     Parameters
     ----------
@@ -86,20 +87,19 @@ def smoothed(place: Floats, log: Floats, faces: NDArray[np.int32], step: int) ->
     place, log : Floats
         (V, 2) and (V,).
     """
-    before = np.concatenate([place, log[:, None]], axis=-1)
-    after = _averaged(before, edges(faces), _ROUNDS)
-    far = np.linalg.norm((after - before)[:, :2], axis=-1, keepdims=True)
-    after = before + (after - before) * np.minimum(1, _FARTHEST * step / np.maximum(far, 1e-9))
-    was, now = area(before, faces), area(after, faces)
-    after_all = after
+    rim = edges(faces)
+    move = _averaged(place, rim, _ROUNDS) - place
+    far = np.linalg.norm(move, axis=-1, keepdims=True)
+    after = place + move * np.minimum(1, _FARTHEST * step / np.maximum(far, 1e-9))
+    was, now = area(place, faces), area(after, faces)
     for _ in range(3):  # a triangle that would turn over keeps its corners; so may its neighbours then have to
         bad = np.unique(faces[now < _LEAST_AREA * was])
         if not len(bad):
             break
-        after_all = after_all.copy()
-        after_all[bad] = before[bad]
-        now = area(after_all, faces)
-    return after_all[:, :2], after_all[:, 2]
+        after = after.copy()
+        after[bad] = place[bad]
+        now = area(after, faces)
+    return after, _averaged(log[:, None], rim, _DEPTH_ROUNDS)[:, 0]
 
 
 def _averaged(values: Floats, rim: NDArray[np.int64], rounds: int) -> Floats:

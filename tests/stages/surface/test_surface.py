@@ -282,12 +282,19 @@ def test_vertices_are_the_same_once_moved_from_their_middle_and_back() -> None:
 
 
 def test_boundary_is_a_curve_not_stairs() -> None:
-    """Distance of the rim's vertices from the ball's outline, in px of the picture: 1/√12 for pixels' stairs."""
+    """Distance of the rim's vertices from the ball's outline, in px of the picture: 1/√12 for pixels' stairs.
+
+    Its depth: a stair of one pixel is ten deep where the surface leans by 84°.
+    """
     ball, _ = sphere(View(1000.0, (99.5, 99.5), 1.0), (200, 200), (0.0, 0.0, -1.0), 0.09)
     mesh = surface.integrate(ball, None, SETTINGS)
     rim = np.unique(boundary.edges(mesh.faces))
     away = np.linalg.norm(mesh.uv[rim] * 200 - 100, axis=1)
     assert np.std(away) < 0.2
+    follows = dict(boundary.edges(mesh.faces).tolist())
+    depth = 1000 * mesh.vertices[:, 2].astype(np.float64)  # px
+    bends = [depth[a] - 2 * depth[b] + depth[follows[b]] for a, b in follows.items()]
+    assert np.sqrt(np.mean(np.square(bends))) < 0.3
     assert 0 < mesh.raggedness < 0.15
 
 
