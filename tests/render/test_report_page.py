@@ -53,6 +53,14 @@ def test_light_follows_the_pointer(page: devtools.Page, tmp_path: Path) -> None:
     assert left[0] > 1.5 * left[1] and right[1] > 1.5 * right[0]
 
 
+def test_moving_light_is_drawn_smaller_where_that_takes_long_and_whole_at_rest(page: devtools.Page) -> None:
+    size = "[relight.canvas.width, relight.canvas.height]"
+    whole = page.evaluate(f"(relight.draw(), {size})")
+    small = page.evaluate(f"(relight.share = 1 / 4, relight.follow(), {size})")
+    assert small == [-(-side // 4) for side in whole]
+    assert page.evaluate(f"new Promise((done) => setTimeout(() => done({size}), 4 * REST))") == whole
+
+
 @pytest.mark.parametrize("light", [(0.0, 0.0), (0.6, 0.3), (-0.5, -0.7)])
 def test_light_obeys_the_law_of_the_maps(
     page: devtools.Page, result: Path, tmp_path: Path, light: tuple[float, float]

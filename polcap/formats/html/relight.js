@@ -100,15 +100,19 @@ class Later {  // draws at most once a frame
   }
 }
 
+const BUDGET = 25, REST = 250;  // ms: of 33, so that 30 pictures a second are left; without a move
+
 class Relight {
   constructor(canvas, sources) {
     this.canvas = canvas;
     this.light = [0, 0, 0];  // none: the flash, beside the lens
-    [canvas.width, canvas.height] = DATA.view.size;
+    this.size = DATA.view.size;
+    this.share = 1;  // of its sides that is drawn while the light moves
+    canvas.style.aspectRatio = this.size.join(' / ');
     this.painter = new Painter(canvas, FLAT, '', false);
     this.painter.maps(sources);
     this.painter.buffer('corner', 2, this.painter.gl.FLOAT, false, new Float32Array([0, 0, 1, 0, 0, 1, 1, 1]));
-    this.later = new Later(() => this.draw());
+    this.later = new Later(() => this.follow());
     for (const kind of ['pointermove', 'pointerdown']) canvas.addEventListener(kind, (event) => this.move(event));
     canvas.addEventListener('keydown', (event) => this.step(event));
     this.draw();
@@ -132,9 +136,22 @@ class Relight {
     this.aim(this.light[0] + by[0], this.light[1] + by[1]);
   }
 
-  draw() {
-    const gl = this.painter.gl;
-    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+  follow() {  // while the light moves, the largest picture that is drawn within BUDGET ms; whole once it rests
+    const start = performance.now(), gl = this.painter.gl;
+    this.draw(this.share);
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));  // waits for it
+    const whole = (performance.now() - start) / this.share ** 2;
+    this.share = [1, 1 / 2].find((share) => whole * share ** 2 < BUDGET) ?? 1 / 4;
+    clearTimeout(this.rest);
+    this.rest = setTimeout(() => this.draw(), REST);
+  }
+
+  draw(share = 1) {
+    const gl = this.painter.gl, [width, height] = this.size.map((side) => Math.ceil(side * share));
+    if (this.canvas.width !== width || this.canvas.height !== height) {
+      [this.canvas.width, this.canvas.height] = [width, height];
+    }
+    gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.uniform3f(this.painter.place('light'), ...this.light);
