@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import CaptureError
-from polcap.optics import mueller
+from polcap.optics import mueller, outline
 from polcap.stages import selfcal, stokes
 from polcap.stages.selfcal import grey_patches, object_gains, order
 from polcap.stages.selfcal.ring_zero import RingZero
@@ -88,7 +88,7 @@ def test_an_outline_that_tells_nothing_supports_no_order(sectors):
     """Unpolarized all round, or seen at one place only: there is no scatter to say how sure it is."""
     sector = np.arange(240) % sectors
     wave = 0.2 * (sectors == 1) * np.cos(2 * np.radians([[0], [60], [120]]))
-    unpolarized = order.Rim(1.0 + wave + np.zeros((3, 240)), np.zeros(240), sector)
+    unpolarized = outline.Rim(1.0 + wave + np.zeros((3, 240)), np.zeros(240), sector)
     found = order.judge(unpolarized, np.radians([0.0, 60.0, 120.0]), 0.2, 0.25)
     assert found.order == ((0, 1, 2), False)
     assert found.rival == (((0, 1, 2), True) if sectors == 1 else None)  # an axis along x is its own mirror image
