@@ -72,7 +72,7 @@ def test_rig_that_is_not_there_is_no_fault(tmp_path: Path) -> None:
 
 def test_broken_decoder_model_and_provider_are_faults(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(raw, "version", lambda: raising(DecodeError("the decoder crashed")))
-    monkeypatch.setattr(onnx, "load", lambda file: raising(ModelError("model.onnx is cut short")))
+    monkeypatch.setattr(onnx, "load", lambda *given, **stated: raising(ModelError("model.onnx is cut short")))
     monkeypatch.setattr(onnx, "providers", lambda file: {onnx.CUDA: "does not start", onnx.CPU: "illegal instruction"})
     found = named(doctor.examine(NO_RIG, tmp_path))
     assert {name for name, one in found.items() if one.state == "fault"} == {"LibRaw", "model", "on CPU"}

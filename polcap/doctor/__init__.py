@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from polcap import __version__
+from polcap import __version__, models
 from polcap.doctor import photograph
 from polcap.doctor.finding import Finding, State
 from polcap.errors import PolcapError
@@ -108,11 +108,13 @@ def _model(file: Path | None) -> Finding:
         remedy = "name one with --model; without, the analytic estimator serves"
         return Finding("model", "warning", "none is shipped with this polcap", remedy)
     try:
-        network = onnx.load(file)
+        network = models.open_network(file)
+        small = [one for one in (network.fine, models.load_mask_network()) if one is not None]
     except PolcapError as error:
         return Finding("model", "fault", str(error), "install polcap again, or use --estimator analytic")
     version = network.metadata.get("version", network.digest[:8])
-    return Finding("model", "ok", f"{file.name}, version {version}, {file.stat().st_size / 1e6:.1f} MB, loads")
+    about = f"{file.name}, version {version}, {file.stat().st_size / 1e6:.1f} MB, loads, and {len(small)} smaller ones"
+    return Finding("model", "ok", about)
 
 
 def _providers(model: Path) -> Iterator[Finding]:

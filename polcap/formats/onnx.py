@@ -67,7 +67,10 @@ def load(
     data = _bytes(path)
     mark = digest(data)
     if later and device == "cpu" and mark in _shipped():
-        metadata: Mapping[str, str] = onnx_metadata.read(data)
+        try:
+            metadata: Mapping[str, str] = onnx_metadata.read(data)
+        except ValueError as error:
+            raise ModelError(f"{path}: is damaged ({error}); install polcap again") from error
         model = Model(path, partial(_reopen, path, mark, threads))
         return Network(model, mark, _stated(path, metadata, encoding), metadata, CPU)
     import onnxruntime

@@ -1,4 +1,4 @@
-"""In: the bytes of an ONNX model that is known to be whole. Out: its metadata, without a runtime.
+"""In: the bytes of an ONNX model. Out: its metadata, without a runtime.
 
 Of the fields of a ModelProto only `metadata_props` (14) is read; what is longer, the graph, is stepped over.
 
@@ -19,10 +19,12 @@ def read(data: bytes) -> dict[str, str]:
     Raises
     ------
     ValueError
-        These are no fields.
+        These are no fields, not all of them, or their text is none.
     """
+    if not data:
+        raise ValueError("there is nothing in it")
     entries = [dict(_fields(entry)) for number, entry in _fields(data) if number == _PROPS]
-    return {entry[_KEY].decode(): entry.get(_VALUE, b"").decode() for entry in entries}
+    return {entry.get(_KEY, b"").decode(): entry.get(_VALUE, b"").decode() for entry in entries}
 
 
 def _fields(data: bytes) -> Iterator[tuple[int, bytes]]:
@@ -35,6 +37,8 @@ def _fields(data: bytes) -> Iterator[tuple[int, bytes]]:
             _, at = _varint(data, at)
         elif kind == _BYTES:
             length, at = _varint(data, at)
+            if at + length > len(data):
+                raise ValueError("the fields end early")
             yield tag >> 3, data[at : at + length] if tag >> 3 in (_KEY, _VALUE, _PROPS) else b""
             at += length
         elif kind in (_EIGHT, _FOUR):
