@@ -89,6 +89,32 @@ def test_missing_or_foreign_report_is_one_line(tmp_path: Path, text: str | None)
         report.read(tmp_path)
 
 
+@pytest.mark.parametrize(
+    "left_out", ["verdict", "gates", "keys", "model", "figures.maps", "gates.0.state", "gates.0.says"]
+)
+def test_a_report_of_another_polcap_is_one_line(result: Path, tmp_path: Path, left_out: str) -> None:
+    about = json.loads((result / "report.json").read_text("utf-8"))
+    *outer, last = left_out.split(".")
+    place = about
+    for name in outer:
+        place = place[int(name) if name.isdecimal() else name]
+    del place[last]
+    (tmp_path / "report.json").write_text(json.dumps(about), "utf-8")
+    with pytest.raises(StorageError, match=rf"report\.json is no report of this polcap \(.*{last}.*\); run"):
+        report.read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "strange", [{"state": "splendid"}, {"value": []}, {"name": None}, {"cost_deg": "much"}, {"unit": "ell"}]
+)
+def test_a_report_of_strange_gates_is_one_line(result: Path, tmp_path: Path, strange: dict[str, Any]) -> None:
+    about = json.loads((result / "report.json").read_text("utf-8"))
+    about["gates"][0] |= strange
+    (tmp_path / "report.json").write_text(json.dumps(about), "utf-8")
+    with pytest.raises(StorageError, match=r"\$\.gates\[0\]"):
+        report.read(tmp_path)
+
+
 def test_a_list_of_nothing_says_so() -> None:
     assert labels.text("chart.unused", []) == "none"
     assert labels.text("chart.unused", [1, 2]) == "1, 2"

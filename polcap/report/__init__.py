@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -19,6 +19,7 @@ from polcap.config import Config
 from polcap.errors import StorageError
 from polcap.formats import atomic, provenance, text_file
 from polcap.formats import maps as maps_folder
+from polcap.gates.gate import Gate
 from polcap.images import (
     Capture,
     Floats,
@@ -53,10 +54,20 @@ class _Facts(msgspec.Struct, frozen=True):
     shots: list[_Angle]
 
 
+class _Maps(msgspec.Struct, frozen=True):
+    normal_error_deg_median: float | None
+
+
+class _Figures(msgspec.Struct, frozen=True):
+    maps: _Maps
+
+
 class _Stored(msgspec.Struct, frozen=True):
-    """What other commands take from a report.json, which anybody may have written."""
+    """What other commands take from a report.json, which anybody, or another polcap, may have written."""
 
     polcap: str
+    verdict: Literal["pass", "warn", "fail"]
+    gates: list[Gate]
     capture: _Facts
     figures: dict[str, dict[str, Any]]
     settings: dict[str, dict[str, Any]]
@@ -257,7 +268,7 @@ def read(folder: Path) -> dict[str, Any]:
     """
     try:
         about = text_file.read_json(folder / "report.json")
-        msgspec.convert(about, _Stored)
+        msgspec.convert(msgspec.convert(about, _Stored).figures, _Figures)
     except OSError as error:
         raise StorageError(f"{folder} holds no report.json; run `polcap process` first") from error
     except ValueError as error:

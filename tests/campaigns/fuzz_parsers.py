@@ -198,7 +198,8 @@ _REPORT = {
     "capture": {"name": "vase", "camera": "Acme Z1", "notes": [], "shots": [
         {"angle_deg": 0.0, "frames": [{"file": "pol000/a.dng", "digest": "0f"}]}
     ]},
-    "settings": {"hdr": {"clip": 0.98}}, "keys": {"merge": "0f"}, "model": None, "gates": [],
+    "settings": {"hdr": {"clip": 0.98}}, "keys": {"merge": "0f"}, "model": None,
+    "gates": [{"name": "noise", "state": "pass", "value": 0.01, "limit": 0.04, "says": "little"}],
 }  # fmt: skip
 _TIFFS = (
     headers.dng(np.zeros((16, 16))),
