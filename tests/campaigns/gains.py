@@ -14,7 +14,7 @@ import numpy as np
 from polcap.config import Gates
 from polcap.gates import light
 from polcap.stages import selfcal
-from polcap.stages.selfcal import object_gains, order
+from polcap.stages.selfcal import integrability, object_gains, order
 from tests import scenes
 from tests.campaigns import lit_objects
 
@@ -65,6 +65,8 @@ def parts(radiance, object_, angle, true) -> list[str]:
         "outline": object_gains.outline(rim.light, rim.azimuth, rim.sector, angle),
         "closure": object_gains.closure(light_of, object_gains.inside(mask, quality), angle),
     }
+    inside = object_gains.inside(mask, quality)
+    found["slopes"] = integrability.gains(light_of, inside, angle, found["facing"].gain)
     return [
         f"{name} "
         + " ".join(f"{100 * (g / t - 1):+.2f}±{100 * s:.2f}" for g, t, s in zip(one.gain[1:], true[1:], one.sigma[1:]))

@@ -2,11 +2,12 @@
 
 One per cent of flash energy fakes, where a surface faces the camera, the polarization of one tilted by 24° (over a
 whole object it costs normals about 6° on average). A matt grey patch is unpolarized, so its brightness must be the
-same in every shot (`grey_patches`); where there is no chart, the object itself says what it can (`object_gains`), and
-what is known of lamps and flashes says the rest. One exposure of a polarization mosaic has one gain. The outline tells
-whether the angles are in order and counted the right way (`order`), and by how much the ring's zero is off
-(`ring_zero`); that is applied where it is sure, joined with a calibrated zero by the errors of both. Of more than three
-shots their closure tells which angle is wrong (`angle_closure`).
+same in every shot (`grey_patches`); where there is no chart, the object itself says what it can (`object_gains`),
+most of it by its slopes, which are those of a height (`integrability`), and what is known of lamps and flashes the
+rest. One exposure of a polarization mosaic has one gain. The outline tells whether the angles are in order and
+counted the right way (`order`), and by how much the ring's zero is off (`ring_zero`); that is applied where it is
+sure, joined with a calibrated zero by the errors of both. Of more than three shots their closure tells which angle is
+wrong (`angle_closure`).
 """
 
 from typing import Annotated, Literal
@@ -19,7 +20,15 @@ from polcap.errors import CaptureError
 from polcap.images import Alignment, AngleStack, Bits, ColorCalibration, Floats, Gains, ObjectMask, Quality
 from polcap.optics.warp import warp
 from polcap.stages import stage
-from polcap.stages.selfcal import angle_closure, crossed_light, grey_patches, object_gains, order, ring_zero
+from polcap.stages.selfcal import (
+    angle_closure,
+    crossed_light,
+    grey_patches,
+    integrability,
+    object_gains,
+    order,
+    ring_zero,
+)
 from polcap.stages.selfcal.grey_patches import GreyPatches
 from polcap.stages.selfcal.object_gains import Estimate
 from polcap.stages.selfcal.order import Order
@@ -115,7 +124,7 @@ def solve(
     if radiance.light != "one exposure":
         ring, correction = corrected(ring, radiance.ring_sigma, settings)
     angle = radiance.angle + correction
-    anchor = object_gains.combined([*_by_law(light, mask, quality, radiance, angle, object_.crop), facing])
+    anchor = object_gains.combined([*_by_law(light, mask, quality, radiance, angle, object_.crop, facing), facing])
     source: Source
     gain: Floats
     sigma: Floats
@@ -237,12 +246,15 @@ def _by_law(
     radiance: AngleStack,
     angle: Floats,
     crop: tuple[int, int, int, int],
+    facing: Estimate,
 ) -> list[Estimate]:
     """What the object says of the gains if the angles (K,) rad are right."""
     at = order.rim(light, quality == 0, mask, crop, radiance.value.shape[1:3])
+    inside = object_gains.inside(mask, quality)
     return [
-        object_gains.closure(light, object_gains.inside(mask, quality), angle),
+        object_gains.closure(light, inside, angle),
         object_gains.outline(at.light, at.azimuth, at.sector, angle),
+        integrability.gains(light, inside, angle, facing.gain),
     ]
 
 
