@@ -23,7 +23,7 @@ _WAYS = ((0, 1), (1, 0), (1, 1), (1, -1))
 _LADDER = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # px, 1σ
 _LEAST_TILES = 4
 _LEAST_LIGHT = 0.01  # of the sensor's range; in darker tiles noise is detail
-_SURE = 3.0  # 1σ of the tiles' median beyond which a loss of detail is one
+_SURE = 0.999  # of Student's t: a loss of detail beyond is one
 _MEDIAN_SE = (np.pi / 2) ** 0.5  # standard error of a median over that of a mean, of normal scatter
 _DETAIL = -0.5  # log of fine over coarse energy: noise has 0, detail less
 
@@ -105,9 +105,12 @@ def choose(light: Floats, usable: NDArray[np.bool_]) -> NDArray[np.int64]:
 def extra_blur(tiles: Floats, usable: NDArray[np.bool_]) -> Floats:
     """1σ of the Gaussian that each photograph is blurred by beyond the sharpest, (K,) px; NaN: cannot tell.
 
-    A blur that the tiles' scatter explains counts as none.
+    A blur that the tiles' scatter explains counts as none; it is taken from the photograph that scatters least, since
+    blur itself takes more from tiles of much detail than from others.
     tiles (K, T, n, n) of K photographs of equal exposure; usable (K, T).
     """
+    from scipy.special import stdtrit  # here: importing it costs .2 s of every start
+
     fineness = np.stack([_fineness(shot) for shot in tiles])  # (K, 4, T)
     every = usable.all(0) & (fineness.mean((0, 1)) < _DETAIL)
     if every.sum() < _LEAST_TILES:
@@ -118,8 +121,10 @@ def extra_blur(tiles: Floats, usable: NDArray[np.bool_]) -> Floats:
     fall = np.median(ladder[0] - ladder, axis=2)  # (L, 4), growing
     each = fineness[sharpest] - fineness  # (K, 4, T)
     lost = np.median(each, axis=2)  # (K, 4)
-    doubt = _MEDIAN_SE * each.std(axis=2, ddof=1) / np.sqrt(each.shape[2])
-    lost = np.where(lost > _SURE * doubt, lost, 0.0)
+    scatter = np.delete(each, sharpest, axis=0).std(axis=2, ddof=1).min(axis=0, initial=np.inf)  # (4,)
+    count = each.shape[2]
+    sure = stdtrit(count - 1, _SURE) * _MEDIAN_SE * scatter / np.sqrt(count)
+    lost = np.where(lost > sure, lost, 0.0)
     return np.array([max(np.interp(lost[k, w], fall[:, w], _LADDER) for w in range(4)) for k in range(len(tiles))])
 
 

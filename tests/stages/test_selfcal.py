@@ -180,6 +180,15 @@ def test_of_four_shots_the_one_before_which_the_ring_was_not_turned_is_found(vic
     assert abs(np.degrees(found.turned)) > 25
 
 
+def test_small_errors_of_all_angles_are_no_great_turn_of_the_one_that_closure_tells_least_of():
+    stated = np.radians([24.0, 72.0, 90.0, 109.0])
+    actual = stated + np.radians([-0.2, -1.0, -1.1, 0.6])  # what a hand sets
+    radiance = dataclasses.replace(scenes.stack(noise=0.002, angles=actual), angle=stated)
+    settings = selfcal.Settings(correct_ring=False)
+    found = selfcal.solve(radiance, scenes.still(4), scenes.ball_object(), scenes.no_color(), settings)
+    assert found.turned_shots == ()
+
+
 def test_of_shots_that_cannot_be_told_apart_the_most_turned_counts():
     """Crossed analyzers stand for one another in the closure, by unlike turns where the other angles lie unevenly."""
     stated = np.radians([81.0, 108.0, 126.0, 171.0])

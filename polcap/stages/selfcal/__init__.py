@@ -70,7 +70,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 12.0
 
 
-@stage(version=8)
+@stage(version=9)
 def solve(
     radiance: AngleStack,
     alignment: Alignment,

@@ -67,7 +67,9 @@ def measure(light: Floats, row: NDArray[np.int_], angle: Floats, gain_sigma: Flo
     alike = [k for k in range(shots) if fits[k].gained >= _ALIKE * most]
     alike.sort(key=lambda k: -abs(fits[k].turn))  # a small turn of one shot can be a large one of another
     found = fits[alike[0]]
-    sigma = float(np.hypot(found.sigma, _ANGLE_ERROR * np.sqrt(shots)))
+    told = _told(light, angle)  # an error of one angle is a greater one of another that the closure tells less of
+    by_angles = _ANGLE_ERROR * float(np.linalg.norm(told) / max(told[alike[0]], 1e-9))
+    sigma = float(np.hypot(found.sigma, by_angles))
     if found.gained < _LEAST_GAIN * found.stated or abs(found.turn) < _LEAST_SIGMAS * sigma:
         return NONE
     return Turn(tuple(alike), found.turn, sigma)
@@ -103,12 +105,22 @@ def _free(angle: Floats) -> Floats:
     return np.asarray(np.linalg.svd(mueller.analyzer(angle))[0][:, 3:].T)
 
 
+def _told(light: Floats, angle: Floats) -> Floats:
+    """(K,) how much of what keeps the shots from closing a small turn of each is, per rad."""
+    return np.linalg.norm(_free(angle), axis=0) * np.sqrt((_slope(light, angle) ** 2).mean(axis=1))
+
+
+def _slope(light: Floats, angle: Floats) -> Floats:
+    """dI/dθ of every shot, (K, P)."""
+    _, s1, s2 = np.linalg.lstsq(mueller.analyzer(angle), light, rcond=None)[0]
+    return np.asarray(s2 * np.cos(2 * angle[:, None]) - s1 * np.sin(2 * angle[:, None]))
+
+
 def _turned(k: int, start: float, light: Floats, angle: Floats, part: NDArray[np.intp], prior: Floats) -> _Fit:
     """Shot k turned by `start`, and what more the shots ask for."""
     angle = angle + start * np.eye(len(angle))[k]
     free = _free(angle)
-    _, s1, s2 = np.linalg.lstsq(mueller.analyzer(angle), light, rcond=None)[0]
-    slope = s2 * np.cos(2 * angle[k]) - s1 * np.sin(2 * angle[k])  # dI/dθ, (P,)
+    slope = _slope(light, angle)[k]
     fit = _fit(free @ light, free[:, None] * light.T, free[:, k, None] * slope, part, prior)
     return replace(fit, turn=start + fit.turn)
 
