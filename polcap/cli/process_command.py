@@ -14,8 +14,10 @@ from polcap.cli.options import Angles, Assignments, ConfigFile, Device, Estimato
 from polcap.errors import GateError, InputError, SettingError
 
 if TYPE_CHECKING:
+    from concurrent.futures import Future
+
     from polcap.config import Config
-    from polcap.images import ChartRequest
+    from polcap.images import Capture, ChartRequest
     from polcap.path import UserInput
     from polcap.unchanged import Finished
 
@@ -49,6 +51,8 @@ def process(
     model: Model = None,
 ) -> None:
     """Turn a capture into maps and a 3-D asset."""
+    from concurrent.futures import ThreadPoolExecutor
+
     from polcap import unchanged
 
     target = out or capture / "polcap"
@@ -57,6 +61,9 @@ def process(
         _tell_finished(finished, target, json)
         return
     limits.set_threads(threads)  # before the libraries that start them
+    beside = ThreadPoolExecutor(1)
+    first = beside.submit(_understood, capture, options.angles_deg(angles))  # in the child, while all else is imported
+    beside.shutdown(wait=False)
     from polcap import config as settings
     from polcap.path import STAGES
 
@@ -74,6 +81,7 @@ def process(
         force,
         json,
         request,
+        [] if watch else [first],
     )
     if watch:
         _whenever_settled(capture, run.target, run.plan if dry_run else run.process)
@@ -96,13 +104,14 @@ class _Run:
     force: str | None
     json: bool
     request: str | None  # its digest, to know it again; None where it is always done
+    begun: "list[Future[Capture]]"  # a reading of the photographs that is under way
 
     def plan(self) -> None:
         """Print what was understood and what would be computed."""
         from polcap import pipeline, report
         from polcap.formats import capture as captures
 
-        found = captures.read(self.folder, self.angles_deg)
+        found = self.understood()
         stages = pipeline.plan(found, self.user_input(), self.config, self.target, self.force)
         if self.json:
             terminal.say({"capture": report.capture_facts(found), "stages": stages})
@@ -110,14 +119,18 @@ class _Run:
             rows = (f"{name:14}{state}" for name, state in stages.items())
             terminal.say("\n".join([captures.table(found), "", *rows]))
 
+    def understood(self) -> "Capture":
+        """The photographs as they are now."""
+        return self.begun.pop().result() if self.begun else _understood(self.folder, self.angles_deg)
+
     def process(self) -> None:
         """Write the result folder; say where, and what its gates judge."""
         from polcap import pipeline, unchanged
         from polcap.formats import capture as captures
         from polcap.path import STAGES
 
-        found = captures.read(self.folder, self.angles_deg)
         supplied = self.user_input()
+        found = self.understood()
         table = captures.table(found)
         terminal.tell(table)
         with terminal.progress(len(STAGES) + 1) as bar:
@@ -130,6 +143,12 @@ class _Run:
             return
         unchanged.remember(self.target, self.request, table, (*pipeline.timings(self.target), "write"))
         _tell_result(about, self.target, self.json)
+
+
+def _understood(folder: Path, angles_deg: tuple[float, ...] | None) -> "Capture":
+    from polcap.formats import capture as captures
+
+    return captures.read(folder, angles_deg)
 
 
 def _user_input(

@@ -5,7 +5,7 @@ into the material.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -64,7 +64,11 @@ def relative_specular(asset: Asset) -> Texture:
 def specular(asset: Asset) -> Texture:
     """F0 on a fixed scale, in colour."""
     says = f"F0 / {SPECULAR_RANGE:g}, sRGB-encoded; F0 beyond {SPECULAR_RANGE:g} is clipped"
-    return Texture(_quantized(color.encode_srgb(_level(asset)), asset.specular_color), True, says)
+    values = np.arange(np.iinfo(asset.specular_color.dtype).max + 1, dtype=asset.specular_color.dtype)
+    table = replace(asset, specular_color=np.repeat(values[:, None], 3, axis=1))  # each value a channel may have, once
+    encoded = _quantized(color.encode_srgb(_level(table)), values)
+    channels = [encoded[asset.specular_color[..., c], c] for c in range(3)]
+    return Texture(np.stack(channels, axis=-1), True, says)
 
 
 def specular_level(asset: Asset) -> Texture:

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csgraph
 
 from polcap.formats import html
 from polcap.images import Floats, Mesh
@@ -34,6 +33,8 @@ def thinned(mesh: Mesh, most: int) -> tuple[Floats, Floats, NDArray[np.int32]]:
     Vertices that lie in one cell of a grid over the texture and hang together there become their mean: two
     surfaces, one before the other, stay two.
     """
+    from scipy.sparse import coo_array, csgraph  # here: importing it costs .3 s of every start
+
     count = len(mesh.vertices)
     if count <= most:
         return mesh.vertices, mesh.uv, mesh.faces

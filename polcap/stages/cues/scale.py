@@ -8,7 +8,6 @@ from dataclasses import replace
 from math import hypot, log, pi, sqrt
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from polcap.images import ChartLight, ColorCalibration, Floats, StokesImage
 from polcap.optics import point_light
@@ -61,6 +60,8 @@ def _log_factor(light: ChartLight, middle: Floats) -> float:
 
 def _changed(light: ChartLight, step: Floats) -> ChartLight:
     """With the flash and its falloff moved by step (5,), and the chart turned about x and y."""
+    from scipy.spatial.transform import Rotation  # here: importing it costs .2 s of every start
+
     turned = Rotation.from_rotvec([*step[3:], 0.0]).apply(np.array(light.normal))  # SciPy takes no read-only array
     return replace(light, flash=light.flash + step[:3], normal=turned)
 

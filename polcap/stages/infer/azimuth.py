@@ -13,9 +13,7 @@ Hoppe et al., Surface reconstruction from unorganized points, SIGGRAPH 1992 (ori
 
 import cv2
 import numpy as np
-import scipy.sparse as sparse
 from numpy.typing import NDArray
-from scipy.sparse.linalg import spsolve
 
 from polcap.images import Floats
 from polcap.optics import outline
@@ -62,6 +60,9 @@ def resolve(double_angle: Floats, strength: Floats, mask: NDArray[np.bool_]) -> 
 
 def _walk(phi: Floats, strength: Floats, mask: NDArray[np.bool_]) -> Floats:
     """The relaxed signs (H, W), 0 outside: argmin Σ w (s_i − σ_ij s_j)² + Σ u (s_i − outward_i)²."""
+    from scipy import sparse  # here: importing it costs .3 s of every start
+    from scipy.sparse.linalg import spsolve
+
     height, width = mask.shape
     count = int(mask.sum())
     result = np.zeros(mask.shape)

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from polcap.images import Floats
 
@@ -107,6 +105,8 @@ def _averaged(values: Floats, rim: NDArray[np.int64], rounds: int) -> Floats:
 
     A vertex where the boundary touches itself stays.
     """
+    from scipy import sparse  # here: importing it costs .3 s of every start
+
     ends = np.concatenate([rim, rim[:, ::-1]])
     degree = np.bincount(ends[:, 0], minlength=len(values))
     used = np.flatnonzero(degree)
@@ -124,6 +124,9 @@ def _averaged(values: Floats, rim: NDArray[np.int64], rounds: int) -> Floats:
 
 
 def _pieces(faces: NDArray[np.int32], count: int) -> int:
+    from scipy import sparse
+    from scipy.sparse.csgraph import connected_components
+
     pairs = np.concatenate([faces[:, :2], faces[:, 1:]])
     links = sparse.coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (count, count))
     _, piece = connected_components(links, directed=False)

@@ -14,9 +14,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
 
 from polcap.images import Floats
 
@@ -46,6 +43,8 @@ class Multigrid:
     """
 
     def __init__(self, matrix: Any, cell: NDArray[np.int64]) -> None:
+        from scipy.sparse.linalg import splu  # here: importing it costs .3 s of every start
+
         self.levels: list[_Level] = []
         while matrix.shape[0] > _COARSEST:
             cell = cell // 3
@@ -155,6 +154,9 @@ def conjugate_gradients(
 
 def _aggregate(matrix: Any, cell: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
     """Group number of each unknown: the parts of a cell that strong links hold together."""
+    from scipy import sparse
+    from scipy.sparse.csgraph import connected_components
+
     links = matrix.tocoo()
     diagonal = matrix.diagonal()
     row, column = links.row, links.col
@@ -169,6 +171,8 @@ def _aggregate(matrix: Any, cell: NDArray[np.int64]) -> tuple[NDArray[np.int64],
 
 def _prolongation(matrix: Any, group: NDArray[np.int64], count: int) -> Any:
     """Piecewise constant over the groups, then one damped Jacobi step towards low energy."""
+    from scipy import sparse
+
     size = matrix.shape[0]
     lump = sparse.csr_matrix((np.ones(size), group, np.arange(size + 1)), (size, count))
     step = sparse.diags(_DAMPING / matrix.diagonal())

@@ -13,7 +13,6 @@ Zhang, A flexible new technique for camera calibration, IEEE PAMI 2000 (pose fro
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from polcap.images import ChartLight, Floats, View
 from polcap.optics import point_light
@@ -73,6 +72,8 @@ class _Plane:
 
     def turned(self, turn: Floats) -> "_Plane":
         """About its middle, by a small turn (2,) about x and y [rad]."""
+        from scipy.spatial.transform import Rotation  # here: importing it costs .2 s of every start
+
         rotation, middle = Rotation.from_rotvec([*turn, 0.0]), self.point.mean(axis=0)
         return _Plane(middle + rotation.apply(self.point - middle), rotation.apply(self.normal))
 
