@@ -56,6 +56,29 @@ class Falloff:
 
 
 @dataclass(frozen=True)
+class LensGeometry:
+    """A pinhole camera and what its lens does to it: what belongs at x appears at x (1 + k1 r² + k2 r⁴).
+
+    x and r from the principal point in focal lengths.
+    """
+
+    focal_px: float  # visible RAW px
+    focal_sigma_px: float
+    principal_px: tuple[float, float]  # visible RAW px
+    principal_sigma_px: float  # 0: taken to be the picture's middle
+    k1: float
+    k1_sigma: float
+    k2: float
+    k2_sigma: float
+    size_px: tuple[int, int]  # width, height, visible RAW px
+    residual_px: float  # rms of the corners, RAW px
+    pinhole_residual_px: float  # the same without k1 and k2
+    photographs: int
+    board: str
+    focal_length_mm: float | None = None  # as the photographs say it; it holds there
+
+
+@dataclass(frozen=True)
 class Polarizer:
     """A filter on its ring: its axis stands at sense · stated + zero, from image x towards image up."""
 
@@ -91,5 +114,6 @@ class Calibration:
     levels: Levels | None = None
     linearity: Linearity | None = None
     falloff: Falloff | None = None
+    geometry: LensGeometry | None = None
     polarizer: Polarizer | None = None
     flash: FlashEnergy | None = None

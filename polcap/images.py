@@ -163,6 +163,16 @@ class View:
 
 
 @dataclass(frozen=True)
+class Distortion:
+    """What a lens does to a pinhole camera's picture on one pixel grid; see optics/distortion.py."""
+
+    focal: float  # px of this grid
+    center: tuple[float, float]  # (x, y) px of this grid, the principal point
+    k1: float
+    k2: float
+
+
+@dataclass(frozen=True)
 class MaskedImage:
     """Radiance with its doubt."""
 
@@ -204,6 +214,7 @@ class AngleStack:
     ring_sigma: float | None = None  # rad, 1σ of the ring's zero as calibrated; None: set by eye
     blur_px: Floats | None = None  # (K, E) beyond the sharpest frame of the same exposure, 1σ [RAW px]; NaN: unknown
     crossed: CrossedShot | None = None  # where one was taken
+    distortion: Distortion | None = None  # of the lens, calibrated, on this grid; None: a pinhole, as far as is known
 
     def shot(self, k: int) -> MaskedImage:
         """One of the shots, (H, W, 3)."""

@@ -6,28 +6,42 @@
     FOLDER/flat/                     an evenly lit white surface, out of focus, twice at least at every exposure
     FOLDER/bracket/                  exposures of any still scene, or such folders: noise where flat/ has no such ISO
     FOLDER/flash/                    one and the same thing, again and again, by the flash
+    FOLDER/lens/                     a checkerboard or a ColorChecker, tilted to all sides, all over the picture
     FOLDER/polarizer/axis000/pol000/ polarized light of a known axis (a second polarizer before a lamp, a screen)
                     /pol015/ …       through the filter at every angle of its ring; a second axis tells its sense
 
 Each is optional, each quantity a file: `photon_transfer` and `bracket_noise` noise, `levels` black and white,
-`linearity`, `lens_falloff`, `polarizer` extinction, zero and sense of the ring, `flash_energy`.
+`linearity`, `lens_falloff`, `lens_geometry` focal length and distortion, `polarizer` extinction, zero and sense of the
+ring, `flash_energy`.
 """
 
 from pathlib import Path
 
-from polcap.calibrate import bracket_noise, flash_energy, lens_falloff, levels, linearity, photon_transfer, polarizer
+from polcap.calibrate import (
+    bracket_noise,
+    flash_energy,
+    lens_falloff,
+    lens_geometry,
+    levels,
+    linearity,
+    photon_transfer,
+    polarizer,
+)
 from polcap.calibrate.photographs import Photograph, angle_of, inside, listed
 from polcap.calibration_values import Calibration, NoiseLine, Polarizer
 from polcap.errors import CaptureError
 
-_ROOMS = ("dark", "flat", "bracket", "flash", "polarizer")
+_ROOMS = ("dark", "flat", "bracket", "flash", "lens", "polarizer")
 
 
-def measure(folder: Path, made: str, lens_filter: str = "", axis_deg: float = 0.0) -> Calibration:
+def measure(
+    folder: Path, made: str, lens_filter: str = "", axis_deg: float = 0.0, squares: tuple[int, int] = (9, 6)
+) -> Calibration:
     """All that the folder's photographs tell.
 
     made : date and time, ISO 8601. lens_filter : the polarizer's name. axis_deg : of polarized light in
-    `polarizer/pol…`, where no `axis…` folder states it; from image x towards image up.
+    `polarizer/pol…`, where no `axis…` folder states it; from image x towards image up. squares : inner corners of the
+    checkerboard in `lens/`.
 
     Raises
     ------
@@ -46,7 +60,9 @@ def measure(folder: Path, made: str, lens_filter: str = "", axis_deg: float = 0.
     flash = listed(rooms["flash"]) if "flash" in rooms else []
     turned = _turned(rooms["polarizer"], axis_deg) if "polarizer" in rooms else []
     stepped = bracket_noise.brackets(rooms["bracket"]) if "bracket" in rooms else []
-    every = [*dark, *flat, *(shot for one in stepped for shot in one), *flash, *(shot.photograph for shot in turned)]
+    boards = listed(rooms["lens"]) if "lens" in rooms else []
+    every = [*dark, *flat, *(shot for one in stepped for shot in one), *flash, *boards]
+    every += [shot.photograph for shot in turned]
     first = every[0]
     _check_one_camera(every)
     return Calibration(
@@ -58,6 +74,7 @@ def measure(folder: Path, made: str, lens_filter: str = "", axis_deg: float = 0.
         levels=levels.measure(dark, flat) if dark else None,
         linearity=linearity.measure(flat),
         falloff=lens_falloff.measure(flat) if flat else None,
+        geometry=lens_geometry.measure(boards, squares) if boards else None,
         polarizer=_polarizer(turned),
         flash=flash_energy.measure(flash) if flash else None,
     )

@@ -25,6 +25,9 @@ def calibrate(
             min=-360, max=360, metavar="DEG", help="Axis of the light in polarizer/pol…, image x to image up."
         ),
     ] = 0.0,
+    board: Annotated[
+        str, typer.Option(metavar="AxB", help="Inner corners of the checkerboard in lens/, across and down.")
+    ] = "9x6",
     out: Annotated[Path | None, typer.Option(help="Folder for the file; by default the user's calibrations.")] = None,
     json: Json = False,
 ) -> None:
@@ -37,10 +40,20 @@ def calibrate(
     from polcap.formats import calibrations, calibrations_folder
 
     made = datetime.now(UTC).isoformat(timespec="seconds")
-    found = calibration.measure(folder, made, lens_filter, axis)
+    found = calibration.measure(folder, made, lens_filter, axis, squares(board))
     path = calibrations.write(out or calibrations_folder.folder(), found)
     terminal.tell("\n".join(lines(found)))
     terminal.say({"file": str(path), "calibration": msgspec.to_builtins(found)} if json else str(path))
+
+
+def squares(board: str) -> tuple[int, int]:
+    """`9x6` as two numbers. Raises SettingError."""
+    across, _, down = board.partition("x")
+    if not (across.isdecimal() and down.isdecimal() and 3 <= int(across) <= 99 and 3 <= int(down) <= 99):
+        from polcap.errors import SettingError
+
+        raise SettingError(f"--board {board}: give the inner corners across and down, 3 to 99 each, such as 9x6")
+    return int(across), int(down)
 
 
 def lines(found: "Calibration") -> list[str]:
@@ -64,6 +77,12 @@ def lines(found: "Calibration") -> list[str]:
         rows.append(f"linearity  {power}, within {100 * curve.greatest_deviation:.2f} % {span}")
     if (light := found.falloff) is not None:
         rows.append(f"falloff    corners {_listed(light.corner, '.3f')} of the middle")
+    if (lens := found.geometry) is not None:
+        rows.append(
+            f"lens       {lens.focal_px:.1f} ± {lens.focal_sigma_px:.1f} px, k1 {lens.k1:+.4f} ± {lens.k1_sigma:.4f}, "
+            f"k2 {lens.k2:+.4f} ± {lens.k2_sigma:.4f}; {lens.photographs} boards ({lens.board}), corners within "
+            f"{lens.residual_px:.2f} px (without distortion {lens.pinhole_residual_px:.2f} px)"
+        )
     if (ring := found.polarizer) is not None:
         sense = "as the picture" if ring.sense > 0 else "the other way"
         told = f"counts {sense}" if ring.sense_known else "sense not measured: light of a second axis tells"

@@ -8,15 +8,17 @@ from typing import Any
 import msgspec
 import tomli_w
 
-from polcap.calibration_values import Calibration
+from polcap.calibration_values import Calibration, LensGeometry
 from polcap.errors import CaptureError
 from polcap.formats import atomic, calibrations_folder, file_name, text_file
-from polcap.images import Exif
+from polcap.images import Distortion, Exif
+from polcap.optics import distortion
 
 _LEAST_LIGHT = 0.02  # of the middle's, in a lens's corner
 _HEAD = """\
 # polcap calibration. Signals: 1 is the sensor's white. Each sigma is 1σ. Angles from image x towards image up.
 # noise: variance of a pixel of the merged picture (half size) = slope * signal + floor.
+# geometry: what belongs at x appears at x (1 + k1 r^2 + k2 r^4), x and r from the principal point in focal lengths.
 # falloff: light = 1 + a r^2 + b r^4 + c r^6, r = 1 in the corners. polarizer: axis = sense * stated + zero_deg.
 """
 
@@ -87,7 +89,18 @@ def choose(exif: Exif, lens_filter: str | None, focal_length_mm: float | None) -
     if found.falloff is not None and not _same_lens_setting(found, exif, focal_length_mm):
         found = replace(found, falloff=None)
         notes.append("calibration: the falloff was measured at another aperture or focal length and is not used")
+    if found.geometry is not None and not _same_geometry(found.geometry, exif, focal_length_mm):
+        found = replace(found, geometry=None)
+        notes.append(
+            "calibration: the lens was measured at another focal length or picture size; its geometry is not used"
+        )
     return found, notes
+
+
+def _same_geometry(geometry: LensGeometry, exif: Exif, focal_length_mm: float | None) -> bool:
+    stated = focal_length_mm or exif.focal_length_mm
+    alike = not stated or not geometry.focal_length_mm or abs(stated / geometry.focal_length_mm - 1) < 0.05
+    return alike and geometry.size_px == (exif.width, exif.height)
 
 
 def _same_lens_setting(found: Calibration, exif: Exif, focal_length_mm: float | None) -> bool:
@@ -105,6 +118,9 @@ def _parts(found: Calibration) -> list[str]:
         parts.append("noise at ISO " + ", ".join(f"{line.iso:g}" for line in found.noise))
     if found.falloff is not None:
         parts.append("falloff of the lens")
+    if found.geometry is not None:
+        lens = found.geometry
+        parts.append(f"lens {lens.focal_px:.0f} ± {lens.focal_sigma_px:.1f} px, k1 {lens.k1:+.4f}, k2 {lens.k2:+.4f}")
     if found.polarizer is not None:
         ring = found.polarizer
         parts.append(f"polarizer {ring.zero_deg:+.2f}° ± {ring.zero_sigma_deg:.2f}°{', mirrored' * (ring.sense < 0)}")
@@ -129,6 +145,7 @@ def _sound(found: Calibration) -> dict[str, bool]:
         ),
         "falloff": light is None
         or (len(light.coefficient) in channels and all(_positive(one) for one in light.coefficient)),
+        "geometry": found.geometry is None or _possible(found.geometry),
         "polarizer": ring is None
         or (ring.sense in (-1, 1) and len(ring.extinction) in channels and min(ring.extinction) > 1),
         "flash": found.flash is None or 0 < found.flash.spread < 1,
@@ -137,6 +154,13 @@ def _sound(found: Calibration) -> dict[str, bool]:
 
 def _sane(slope: tuple[float, ...], floor: tuple[float, ...]) -> bool:
     return min(slope) > 0 and max(slope) < 1 and min(floor) >= 0 and max(floor) < 1
+
+
+def _possible(lens: LensGeometry) -> bool:
+    """A pinhole in front of its picture, whose lens folds nothing."""
+    known = Distortion(lens.focal_px, lens.principal_px, lens.k1, lens.k2)
+    inside = all(0 < c < side for c, side in zip(lens.principal_px, lens.size_px))
+    return lens.focal_px > 0 and inside and not distortion.folds(known, *lens.size_px)
 
 
 def _positive(law: tuple[float, float, float]) -> bool:

@@ -65,6 +65,12 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
     calibration, calibration_notes = None, list[str]()
     if plan.layout != "sensor" and plan.shots[0][1][0].probe.kind == "raw":  # through a ring, the sensor's own counts
         calibration, calibration_notes = calibrations.choose(reference, stated.filter, stated.focal_length_mm)
+    geometry = calibration.geometry if calibration is not None else None
+    if geometry is not None and geometry.size_px == (width, height):
+        focal_px, principal = geometry.focal_px, geometry.principal_px
+        lens = focal.Focal(focal_px, (0.0, 0.0), f"{focal_px:.0f} px ± {geometry.focal_sigma_px:.1f} (calibrated)")
+    else:
+        principal = ((width - 1) / 2, (height - 1) / 2)
     return Capture(
         name=file_name.safe(stated.name or Path(os.path.realpath(folder)).name),
         folder=str(folder),
@@ -73,7 +79,7 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
         focal_px=lens.px / step,
         focal_known=lens.known,
         focal_doubt=lens.doubt,
-        principal_px=((width - 1) / 2, (height - 1) / 2),
+        principal_px=principal,
         size_px=(width, height),
         chart_frames=tuple(_frame(plan, stated, source, 0.0) for source in plan.others if source.role == "chart"),
         notes=(*plan.notes, *notes, *calibration_notes, f"focal length {lens.note}"),

@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bits, Floats
+from polcap.images import Bits, Distortion, Floats
+from polcap.optics import distortion
 
 Bools = NDArray[np.bool_]
 Box = tuple[int, int, int, int]
@@ -28,8 +29,14 @@ _EDGE = 3  # px around the image, for the taps of its outermost pixels
 _ROWS = 64
 
 
-def warp(image: Floats | Bits, transform: Floats, box: Box | None = None, order: Literal[1, 3] = 3) -> Floats:
-    """image∘transform over `box`, float32.
+def warp(
+    image: Floats | Bits,
+    transform: Floats,
+    box: Box | None = None,
+    order: Literal[1, 3] = 3,
+    lens: Distortion | None = None,
+) -> Floats:
+    """image∘transform∘lens over `box`, float32.
 
     Parameters
     ----------
@@ -41,8 +48,12 @@ def warp(image: Floats | Bits, transform: Floats, box: Box | None = None, order:
         x0, y0, x1, y1 of the output in its own px (end exclusive); the image's own frame by default.
     order
         3 for values, 1 for weights and masks. Outside the image the edge is repeated.
+    lens
+        Of the output's grid, which is then a pinhole's: it takes output px to what `transform` is given.
     """
     x0, y0, x1, y1 = (int(v) for v in box or (0, 0, image.shape[1], image.shape[0]))
+    if lens is not None:
+        return _through(lens, image, transform, (x0, y0, x1, y1), order)
     if np.array_equal(transform, np.eye(3)) and x0 >= 0 and y0 >= 0 and x1 <= image.shape[1] and y1 <= image.shape[0]:
         return np.asarray(image[y0:y1, x0:x1], dtype=np.float32)
     h = np.asarray(transform, np.float64)
@@ -69,6 +80,31 @@ def warp(image: Floats | Bits, transform: Floats, box: Box | None = None, order:
         for spline, plane in zip(splines, out):
             plane[rows] = spline.at(taps)
     return out[0] if image.ndim == 2 else np.asarray(cv2.merge(list(out))).reshape(size[1], size[0], -1)
+
+
+def _through(lens: Distortion, image: Floats | Bits, transform: Floats, box: Box, order: Literal[1, 3]) -> Floats:
+    """`warp` through a lens."""
+    x0, y0, x1, y1 = box
+    left, top, right, bottom = _source(image.shape[:2], transform, box, lens)
+    part = np.asarray(image[top:bottom, left:right], np.float32)
+    local = _moved(-left, -top) @ np.asarray(transform, np.float64)
+    planes = [np.ascontiguousarray(plane) for plane in ([part] if part.ndim == 2 else cv2.split(part))]
+    splines = [Spline(plane) for plane in planes] if order == 3 else []
+    out = np.empty((len(planes), y1 - y0, x1 - x0), np.float32)
+    across = np.arange(float(x0), x1)
+    for y in range(0, y1 - y0, _ROWS):
+        rows = slice(y, min(y + _ROWS, y1 - y0))
+        down = np.arange(float(y0 + rows.start), y0 + rows.stop)[:, None]
+        u, v = coordinates(local, *distortion.distorted(lens, across, down))
+        if order == 3:
+            taps = Taps(u, v, part.shape[:2])
+            for spline, plane in zip(splines, out):
+                plane[rows] = spline.at(taps)
+            continue
+        places = u.astype(np.float32), v.astype(np.float32)
+        for source, plane in zip(planes, out):
+            plane[rows] = cv2.remap(source, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return out[0] if image.ndim == 2 else np.asarray(cv2.merge(list(out))).reshape(y1 - y0, x1 - x0, -1)
 
 
 def _shifts(transform: Floats) -> bool:
@@ -166,10 +202,17 @@ def _moved(x: float, y: float) -> Floats:
     return np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])
 
 
-def _source(shape: tuple[int, ...], transform: Floats, box: Box) -> Box:
+def _source(shape: tuple[int, ...], transform: Floats, box: Box, lens: Distortion | None = None) -> Box:
     """The part of an image of `shape` that decides its warp over `box`."""
     x0, y0, x1, y1 = box
-    x, y = coordinates(transform, np.array([x0, x1, x0, x1]) - 0.5, np.array([y0, y0, y1, y1]) - 0.5)
+    if lens is None:
+        edge = np.array([x0, x1, x0, x1]) - 0.5, np.array([y0, y0, y1, y1]) - 0.5
+    else:  # which bends the sides
+        across, down = np.linspace(x0 - 0.5, x1 - 0.5, 65), np.linspace(y0 - 0.5, y1 - 0.5, 65)
+        sides_x = np.concatenate([across, across, np.full(65, across[0]), np.full(65, across[-1])])
+        sides_y = np.concatenate([np.full(65, down[0]), np.full(65, down[-1]), down, down])
+        edge = distortion.distorted(lens, sides_x, sides_y)
+    x, y = coordinates(transform, *edge)
     margin = _REACH + _EDGE + 2
     left, top = int(np.floor(x.min())) - margin, int(np.floor(y.min())) - margin
     right, bottom = int(np.ceil(x.max())) + margin, int(np.ceil(y.max())) + margin
@@ -178,7 +221,9 @@ def _source(shape: tuple[int, ...], transform: Floats, box: Box) -> Box:
     return left, top, max(min(right, width), left + 1), max(min(bottom, height), top + 1)
 
 
-def covered(shape: tuple[int, int], transform: Floats, box: tuple[int, int, int, int], margin: float = 1.0) -> Bools:
+def covered(
+    shape: tuple[int, int], transform: Floats, box: Box, margin: float = 1.0, lens: Distortion | None = None
+) -> Bools:
     """Which pixels of a box fall inside another image.
 
     Parameters
@@ -191,6 +236,8 @@ def covered(shape: tuple[int, int], transform: Floats, box: tuple[int, int, int,
         x0, y0, x1, y1 px.
     margin
         Least distance from its edge, px.
+    lens
+        As in `warp`.
 
     Returns
     -------
@@ -198,6 +245,9 @@ def covered(shape: tuple[int, int], transform: Floats, box: tuple[int, int, int,
         (y1 − y0, x1 − x0) bool.
     """
     x0, y0, x1, y1 = box
+    if lens is not None:
+        grid = np.arange(x0, x1, dtype=np.float64), np.arange(y0, y1, dtype=np.float64)[:, None]
+        return _within(*coordinates(transform, *distortion.distorted(lens, *grid)), shape, margin)
     x, y = np.array([x0, x1 - 1.0, x0, x1 - 1.0]), np.array([y0, y0, y1 - 1.0, y1 - 1.0])
     if _within(*coordinates(transform, x, y), shape, margin).all():  # a homography keeps the rest between its corners
         return np.ones((y1 - y0, x1 - x0), bool)

@@ -1,11 +1,11 @@
 """In: what a camera, lens, polarizer and flash are. Out: the photographs that calibrate them, and the truth beside.
 
-The folder is as `polcap calibrate` reads it: dark/, flat/, flash/, polarizer/axis000/pol000/ …
+The folder is as `polcap calibrate` reads it: dark/, flat/, flash/, lens/, polarizer/axis000/pol000/ …
 """
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -13,9 +13,9 @@ from msgspec import Meta
 
 from polcap.errors import CaptureError
 from polcap.formats import atomic, dng
-from polcap.images import Exif, Floats
+from polcap.images import Exif, Floats, View
 from polcap.optics.color import REC709_TO_XYZ
-from polcap.synth import forward_camera
+from polcap.synth import boards, forward_camera
 from polcap.synth.forward_camera import Sensor
 
 _CFA = np.array([[0, 1], [1, 2]], np.uint8)
@@ -45,6 +45,15 @@ class CalibrationShoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lamp_jitter: float = 0.0005  # 1σ of a steady lamp
     flash_jitter: float = 0.012  # 1σ of the flash
     pops: int = 24
+    boards: Annotated[int, Meta(ge=0)] = 0  # photographs of a board from all sides
+    board: Literal["checkerboard", "chart"] = "checkerboard"
+    distortion: tuple[float, float] = (-0.12, 0.05)  # k1, k2 of the lens, see synth/lens.py; only boards show it
+    focal_mm: float = 60.0  # on a sensor 36 mm wide
+
+    @property
+    def view(self) -> View:
+        """The camera over its own RAW pixels."""
+        return View(self.focal_mm / 36.0 * self.width, ((self.width - 1) / 2, (self.height - 1) / 2), scale=1)
 
 
 def write(folder: Path, shoot: CalibrationShoot) -> None:
@@ -91,6 +100,11 @@ def _frames(shoot: CalibrationShoot) -> Iterator[tuple[str, Floats, float, float
         jitter = 1 + shoot.flash_jitter * random.normal()
         yield f"flash/IMG_{number:04d}.DNG", light * (0.5 * jitter), 100.0, 1 / 160, True
         number += 1
+    for albedo in boards.pictures(
+        shoot.view, shoot.distortion, (shoot.width, shoot.height), shoot.boards, shoot.board, shoot.seed
+    ):
+        yield f"lens/IMG_{number:04d}.DNG", albedo * (0.8 * _TINT), 100.0, 0.05, False
+        number += 1
     contrast = (np.array(shoot.extinction) - 1) / (np.array(shoot.extinction) + 1)
     for axis in shoot.axes_deg:
         for ring in np.arange(0, 180, shoot.ring_step_deg):
@@ -128,7 +142,7 @@ def _photograph(
         exposure_time=time,
         f_number=11.0,
         iso=iso,
-        focal_length_mm=60.0,
+        focal_length_mm=shoot.focal_mm,
         taken="2026-03-14T12:00:00.000",
         flash_fired=flash,
     )

@@ -26,7 +26,7 @@ from polcap.formats import atomic, dng
 from polcap.images import Exif, Floats, GBuffer, View
 from polcap.optics.color import REC709_TO_XYZ
 from polcap.synth import color_checker as charts
-from polcap.synth import forward_camera, render, scene_materials
+from polcap.synth import forward_camera, lens, render, scene_materials
 from polcap.synth.forward_camera import Sensor
 from polcap.synth.render import Scene, Seen
 from polcap.synth.scenes import Kind, random_scene
@@ -46,8 +46,9 @@ _CFA = {
 _CONVENTIONS = (
     "pixel (i, j) of the visible RAW has its centre at column i, row j; camera at the origin, x right, y up, "
     "z towards the camera; depth = -z [m]; polarizer and AoLP angles from image x towards image up; "
-    "transform: reference RAW px (x, y, 1) -> px of this file; S in linear Rec.709 in the frame of each "
-    "ray, S0 of the chart's white patch = its reference; specular = F0; roughness = sqrt(GGX alpha)"
+    "transform: reference RAW px (x, y, 1) -> px of this file; px and maps are a pinhole's, before the lens; "
+    "S in linear Rec.709 in the frame of each ray, S0 of the chart's white patch = its reference; specular = F0; "
+    "roughness = sqrt(GGX alpha)"
 )
 
 
@@ -70,6 +71,7 @@ class Shoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     extinction_ratio: float = 1000.0
     cross: bool = False  # one shot more, the flash polarized across the filter at the first angle
     flash_extinction: float = 1000.0  # extinction ratio of the flash's film
+    distortion: tuple[float, float] = (0.0, 0.0)  # k1, k2 of the lens, see synth/lens.py
     blur_px: float = 0.4  # 1σ of the lens's point spread
     samples: Annotated[int, Meta(ge=1, le=4)] = 2  # rays per pixel side
     sensor: Sensor = Sensor()
@@ -213,7 +215,7 @@ def _passed(scene: Scene, shoot: Shoot, buffer: GBuffer, pose: dict[str, Any], r
     back = np.linalg.inv(np.array(pose["transform"]))
     stokes = _light(scene, shoot, buffer, back) if reference is None else reference
     y, x = np.mgrid[: shoot.height, : shoot.width].astype(np.float64)
-    v = render.view_rays(shoot.view, *_moved(back, x, y))
+    v = render.view_rays(shoot.view, *_looked_at(shoot, back, x, y))
     angle = np.radians(pose["actual_deg"] - pose["rot_deg"])
     passed = render.polarize(stokes, v, angle, shoot.extinction_ratio)
     return _blurred(shoot, passed)
@@ -230,8 +232,13 @@ def _light(scene: Scene, shoot: Shoot, buffer: GBuffer, back: Floats, flash_axis
     total = np.zeros((3, shoot.height, shoot.width, 3), np.float32)
     for dy in offsets:
         for dx in offsets:
-            total += render.stokes(scene, shoot.view, *_moved(back, x + dx, y + dy), start, flash_axis)
+            total += render.stokes(scene, shoot.view, *_looked_at(shoot, back, x + dx, y + dy), start, flash_axis)
     return total / shoot.samples**2
+
+
+def _looked_at(shoot: Shoot, back: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Pixels of the reference shot's pinhole that a shot's pixels show: through the lens, then back where it moved."""
+    return _moved(back, *lens.looked_at(shoot.view, shoot.distortion, x, y))
 
 
 def _moved(matrix: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
@@ -372,6 +379,8 @@ def _write_truth(
     with atomic.path(place / "truth.json") as temporary:
         temporary.write_bytes(msgspec.json.format(msgspec.json.encode(document), indent=1))
 
+    if any(shoot.distortion):  # truth is a pinhole's
+        reference = _light(scene, msgspec.structs.replace(shoot, distortion=(0.0, 0.0)), buffer, np.eye(3))
     diffuse, specular, roughness, ior = scene_materials.evaluate(scene.coat, buffer.position, buffer.facing)
     mask = buffer.mask
     with atomic.path(place / "truth.npz") as temporary:

@@ -136,7 +136,7 @@ def test_photographs_that_do_not_tell_are_one_clear_line(tmp_path, changes, says
 def test_folders_that_hold_nothing_are_one_clear_line(tmp_path):
     with pytest.raises(CaptureError, match="no such folder"):
         calibrate.measure(tmp_path / "none", MADE)
-    with pytest.raises(CaptureError, match="none of the folders dark, flat, bracket, flash, polarizer"):
+    with pytest.raises(CaptureError, match="none of the folders dark, flat, bracket, flash, lens, polarizer"):
         calibrate.measure(tmp_path, MADE)
     (tmp_path / "flat").mkdir()
     with pytest.raises(CaptureError, match="holds no RAW photograph"):

@@ -35,6 +35,7 @@ def test_slopes_are_those_of_a_surface() -> None:
     place = rng.uniform(-1, 1, (200, 3))
     step = 1e-4
     for seed in range(8):
+
         def at(shift: NDArray[np.float64], seed: int = seed) -> NDArray[np.float64]:
             height, _ = relief._waves(place + shift, 0.1, np.random.default_rng(seed))
             return np.asarray(height)

@@ -23,8 +23,21 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from polcap.calibration_values import Calibration
 from polcap.errors import CaptureError
-from polcap.images import AngleStack, Capture, CrossedShot, Floats, Frame, MaskedImage, Quality, SensorImage, Shot, View
+from polcap.images import (
+    AngleStack,
+    Capture,
+    CrossedShot,
+    Distortion,
+    Floats,
+    Frame,
+    MaskedImage,
+    Quality,
+    SensorImage,
+    Shot,
+    View,
+)
 from polcap.optics import sharpness
 from polcap.stages import stage
 from polcap.stages.hdr import budget, combine, falloff, links, noise
@@ -152,7 +165,15 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
         flash_spread=None if known is None or known.flash is None else known.flash.spread,
         ring_sigma=None if known is None or known.polarizer is None else np.radians(known.polarizer.zero_sigma_deg),
         crossed=None if crossed is None else CrossedShot(crossed, capture.crossed_angle),
+        distortion=_distortion(known, view),
     )
+
+
+def _distortion(known: Calibration | None, view: View) -> Distortion | None:
+    """What the lens does to the merged picture, whose pinhole is `view`."""
+    if known is None or known.geometry is None:
+        return None
+    return Distortion(view.focal, view.center, known.geometry.k1, known.geometry.k2)
 
 
 def _crossed(

@@ -1,7 +1,7 @@
 """Stage 6: solve each pixel's linear Stokes parameters from its K angles.
 
-Gains, transforms, the places of a mosaic's colors and the ring's turn are applied here and nowhere else, so every
-pixel is resampled once.
+Gains, transforms, the places of a mosaic's colors, the lens's distortion and the ring's turn are applied here and
+nowhere else, so every pixel is resampled once. What comes out is the picture of a pinhole camera.
 """
 
 from collections.abc import Sequence
@@ -17,6 +17,7 @@ from polcap.images import (
     Alignment,
     AngleStack,
     Bits,
+    Distortion,
     Floats,
     Gains,
     MaskedImage,
@@ -25,7 +26,7 @@ from polcap.images import (
     StokesImage,
     View,
 )
-from polcap.optics import crossing, fresnel, mueller
+from polcap.optics import crossing, distortion, fresnel, mueller
 from polcap.optics.warp import covered, warp
 from polcap.stages import stage
 
@@ -45,6 +46,9 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float,
         Meta(ge=1.2, le=3, description="a DoLP no dielectric up to this refractive index emits is flagged"),
     ] = 1.8
+    undistort: Annotated[
+        bool, Meta(description="take a calibrated lens's distortion out, where the shots are resampled anyway")
+    ] = True
     dark_sigma: Annotated[
         float, Meta(ge=0, le=100, description="S0 below this many standard deviations is flagged dark")
     ] = 5.0
@@ -89,7 +93,10 @@ def solve(
             f"polarizer angles {angles} do not determine the Stokes parameters (condition {condition:.0f}, "
             f"at most {_MOST_CONDITION:g}); shoot angles spread over 180°, such as 0°, 45°, 90°"
         )
-    x0, y0, x1, y1 = object_.crop
+    lens = radiance.distortion if settings.undistort else None
+    height, width = radiance.value.shape[1:3]
+    crop = object_.crop if lens is None else distortion.box_of(lens, object_.crop, (width, height))
+    x0, y0, x1, y1 = crop
     size = y1 - y0, x1 - x0
     stokes, covariance = np.empty((3, *size, 3), np.float32), np.empty((6, *size, 3), np.float32)
     quality = np.empty(size, np.uint8)
@@ -98,7 +105,7 @@ def solve(
     flags = [_flagged(shot) for shot in radiance.quality]
     for top in range(y0, y1, _ROWS):
         rows = slice(top - y0, min(top + _ROWS, y1) - y0)
-        value, variance, seen = _registered(radiance, alignment, gains, flags, (x0, top, x1, rows.stop + y0))
+        value, variance, seen = _registered(radiance, alignment, gains, flags, (x0, top, x1, rows.stop + y0), lens)
         solved, doubt = _undiluted(*solved_by(weights_of, value, variance), radiance.extinction)
         for planes, out in zip((*solved, *doubt), (*stokes, *covariance)):
             cv2.merge([np.asarray(plane, np.float32) for plane in planes], out[rows])
@@ -109,8 +116,10 @@ def solve(
             difference = np.abs(value - fitted).sum(1).mean(0)
             residual[rows] = difference / np.maximum(solved[0].sum(0), 1e-9)
     mask = object_.mask[y0:y1, x0:x1]
+    if lens is not None:
+        mask = warp(object_.mask.astype(np.uint8), np.eye(3), crop, order=1, lens=lens) > 0.5
     view = radiance.view
-    body = _body(radiance, alignment, gains, stokes, quality, object_.crop) if gains.crossed is not None else None
+    body = _body(radiance, alignment, gains, stokes, quality, crop, lens) if gains.crossed is not None else None
     return StokesImage(
         stokes=stokes,
         covariance=covariance,
@@ -135,19 +144,20 @@ def _body(
     stokes: Floats,
     seen: Bits,
     crop: tuple[int, int, int, int],
+    lens: Distortion | None,
 ) -> MaskedImage:
     """S0 without what the surface mirrors (h, w, 3): the crossed shot, which has none of it, registered and scaled."""
     assert radiance.crossed is not None and alignment.crossed is not None and gains.crossed is not None
     picture, transform, share = radiance.crossed.picture, alignment.crossed, gains.crossed.astype(np.float32)
     clipped = (seen & np.uint8(Quality.CLIPPED)) > 0  # nothing is known of polarization there: it faces the camera
     across = np.where(clipped[..., None], 0, crossing.polarized(stokes[1], stokes[2], radiance.crossed.angle))
-    registered = cv2.merge(_registered_planes(picture.value, transform, radiance.site_px, crop))
+    registered = cv2.merge(_registered_planes(picture.value, transform, radiance.site_px, crop, lens))
     value = crossing.body_light(registered * share, across)
-    variance = np.maximum(warp(picture.variance, transform, crop, order=1), np.float32(1e-14)) * share**2
+    variance = np.maximum(warp(picture.variance, transform, crop, 1, lens), np.float32(1e-14)) * share**2
     quality: Bits = np.zeros(value.shape[:2], np.uint8)
     for bit, plane in _flagged(picture.quality):
-        quality |= np.where(warp(plane, transform, crop, order=1) > 0.01 * bit, np.uint8(bit), np.uint8(0))
-    inside = covered(picture.value.shape[:2], transform, crop)
+        quality |= np.where(warp(plane, transform, crop, 1, lens) > 0.01 * bit, np.uint8(bit), np.uint8(0))
+    inside = covered(picture.value.shape[:2], transform, crop, lens=lens)
     return MaskedImage(
         value.astype(np.float32), variance, quality | np.where(inside, np.uint8(0), np.uint8(Quality.OUTSIDE))
     )
@@ -160,7 +170,12 @@ def _flagged(quality: Bits) -> list[tuple[Quality, Bits]]:
 
 
 def _registered(
-    radiance: AngleStack, alignment: Alignment, gains: Gains, flags: Flags, box: tuple[int, int, int, int]
+    radiance: AngleStack,
+    alignment: Alignment,
+    gains: Gains,
+    flags: Flags,
+    box: tuple[int, int, int, int],
+    lens: Distortion | None,
 ) -> tuple[Floats, Floats, Bits]:
     """Every shot's radiance over gain on a box of the reference grid, by planes: (K, 3, h, w) twice, (h, w)."""
     x0, y0, x1, y1 = box
@@ -174,28 +189,32 @@ def _registered(
         if mosaic:  # the mean of two or four neighbours, as is usual: splines ring at the edges of so coarse a grid
             shot = cv2.split(warp(radiance.value[k], transform, box, order=1))
         else:
-            shot = _registered_planes(radiance.value[k], transform, radiance.site_px, box)
-        doubt = cv2.split(warp(radiance.variance[k], transform, box, order=1))
+            shot = _registered_planes(radiance.value[k], transform, radiance.site_px, box, lens)
+        doubt = cv2.split(warp(radiance.variance[k], transform, box, 1, lens))
         spread = np.float32(shares if mosaic else 1) / gain**2
         for c in range(3):
             np.divide(shot[c], gain[c], out=values[k, c])
             np.maximum(doubt[c], np.float32(1e-14), out=variances[k, c])
             variances[k, c] *= spread[c]
         for bit, plane in flags[k]:
-            quality |= np.where(warp(plane, transform, box, order=1) > 0.01 * bit, np.uint8(bit), np.uint8(0))
-        inside = covered(radiance.value.shape[1:3], transform, box)
+            quality |= np.where(warp(plane, transform, box, 1, lens) > 0.01 * bit, np.uint8(bit), np.uint8(0))
+        inside = covered(radiance.value.shape[1:3], transform, box, lens=lens)
         quality |= np.where(inside, np.uint8(0), np.uint8(Quality.OUTSIDE))
     return values, variances, quality
 
 
 def _registered_planes(
-    picture: Floats, transform: Floats, site_px: Floats | None, box: tuple[int, int, int, int]
+    picture: Floats,
+    transform: Floats,
+    site_px: Floats | None,
+    box: tuple[int, int, int, int],
+    lens: Distortion | None,
 ) -> Sequence[Floats]:
     """A shot (H, W, 3) on a box of the reference grid, by planes (h, w): every channel where its photosites saw it."""
     if site_px is None or not site_px.any():
-        return cv2.split(warp(picture, transform, box))
+        return cv2.split(warp(picture, transform, box, lens=lens))
     return [
-        warp(picture[..., c], np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1]]) @ transform, box)
+        warp(picture[..., c], np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1]]) @ transform, box, lens=lens)
         for c, (x, y) in enumerate(site_px)
     ]
 
