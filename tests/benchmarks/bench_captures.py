@@ -105,9 +105,9 @@ def surface_errors(found: Results, truth: dict[str, Floats], network: Network | 
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
     maps, depth = found.maps.value, found.mesh.value.depth
     if rough:
-        kept = _kept(normal, binned(truth["alpha"]), binned(truth["ior"]), found.cues.value.rays)
+        share = kept(normal, binned(truth["alpha"]), binned(truth["ior"]), found.cues.value.rays)
         parts = found.stokes.value.stokes.copy()
-        parts[1:] *= np.where(binned(truth["mask"]) > 0, kept, 1)[..., None]
+        parts[1:] *= np.where(binned(truth["mask"]) > 0, share, 1)[..., None]
         seen = cues.compute(replace(found.stokes.value, stokes=parts), found.color.value)
         maps = infer.estimate(seen, network, Config().infer)
         depth = surface.integrate(maps, distance_m(found.color.value, found.radiance.value), Config().surface).depth
@@ -133,7 +133,7 @@ def surface_errors(found: Results, truth: dict[str, Floats], network: Network | 
     ]
 
 
-def _kept(normal: Floats, alpha: Floats, ior: Floats, rays: Floats) -> Floats:
+def kept(normal: Floats, alpha: Floats, ior: Floats, rays: Floats) -> Floats:
     """Share of the smooth body's DoLP that facets leave (H, W)."""
     cosine = np.clip(frames.to_ray_frame(normal, rays)[..., 2], 0.05, 1 - 1e-6)
     index = np.clip(ior, 1.3, 1.7)

@@ -1,9 +1,10 @@
 """Scenes of `make_mitsuba.py` through the cues and the inference stage: errors of every map, scene by scene.
 
-    python tests/benchmarks/bench_mitsuba.py FOLDER [--model ONNX] [--clean]
+    python tests/benchmarks/bench_mitsuba.py FOLDER [--model ONNX] [--clean] [--rough]
 
 The camera is the evaluation's: 20 ke⁻, 5 e⁻, three exposures ×4 apart, 0.3 % of gain, 0.5° of angle; --clean has none
-of it. Light, interreflection and shadows are Mitsuba's. Prints a Markdown row per scene and estimator.
+of it; --rough leaves of S1 and S2 what facets of each pixel's roughness leave. Light, interreflection and shadows are
+Mitsuba's. Prints a Markdown row per scene and estimator.
 """
 
 import argparse
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from bench_captures import kept
 
 from polcap import models
 from polcap.images import ColorCalibration, SurfaceMaps, View
@@ -29,12 +31,13 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--model", type=Path)
     parser.add_argument("--clean", action="store_true")
+    parser.add_argument("--rough", action="store_true")
     options = parser.parse_args()
     networks = {"network": models.load_network("network", options.model, "cpu", 2), "analytic": None}
     print("| scene | estimator |", " | ".join(ROWS), "|\n| --- | --- |", " | ".join("---" for _ in ROWS), "|")
     table: dict[str, list[list[float]]] = {name: [] for name in networks}
     for number, file in enumerate(sorted(options.folder.glob("*.npz"))):
-        case = read(file, options.clean, seed=number)
+        case = read(file, options.clean, options.rough, seed=number)
         judge = Judge(case)
         for name, network in networks.items():
             found = judge.score(infer.estimate(case.cues, network, infer.Settings()))
@@ -45,13 +48,15 @@ def main() -> None:
         print(f"| mean of {len(rows)} | {name} |", " | ".join(f"{value:.3g}" for value in np.mean(rows, axis=0)), "|")
 
 
-def read(file: Path, clean: bool, seed: int) -> Case:
+def read(file: Path, clean: bool, rough: bool, seed: int) -> Case:
     """One scene as the camera measures it, and its truth."""
     with np.load(file) as stored:
         made = {name: stored[name] for name in stored.files}
     mask = made["mask"]
     view = View(float(made["focal"]), (float(made["center"][0]), float(made["center"][1])), 1.0)
     rays = frames.rays(view, *mask.shape)
+    if rough:
+        made["stokes"][1:] *= kept(made["normal"], made["roughness"] ** 2, made["ior"], rays)[..., None]
     scene, diffuse, given, v = (
         torch.from_numpy(np.asarray(value, order="C"))[None] for value in (made["stokes"], made["diffuse"], mask, rays)
     )
