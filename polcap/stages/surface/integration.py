@@ -110,8 +110,8 @@ def _solved(
             level.leave_limbs()
         z = level.decided(stiffness, iterations, tolerance)
         level.close_limbs(z)
-        found = level.jumps(z, jump / 2)
-        free = ~widened(found.torn, _REACH)[of.mask] & (stiffness > 0) & found.any()
+        decided = level.jumps(z, jump / 2)
+        free = ~widened(decided.torn, _REACH)[of.mask] & (stiffness > 0) & decided.any()
         if not free.any():
             z = np.zeros_like(z)  # nothing of what was tried is left: plain least squares, to the last bit
         z, solver = level.mended(z, free, stiffness)
