@@ -187,7 +187,7 @@ def _registered(
     for k, transform in enumerate(alignment.transform):
         gain = gains.gain[k].astype(np.float32)
         if mosaic:  # the mean of two or four neighbours, as is usual: splines ring at the edges of so coarse a grid
-            shot = cv2.split(warp(radiance.value[k], transform, box, order=1))
+            shot = cv2.split(warp(radiance.value[k], transform, box, 1, lens))
         else:
             shot = _registered_planes(radiance.value[k], transform, radiance.site_px, box, lens)
         doubt = cv2.split(warp(radiance.variance[k], transform, box, 1, lens))
