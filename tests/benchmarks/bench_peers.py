@@ -3,16 +3,20 @@
     python tests/benchmarks/bench_peers.py FOLDER [--megapixels 6] [--out peers.json]
 
 FOLDER is that of `bench_speed.py`, whose captures are made where they are missing. A peer that is not installed is
-left out: `pip install HDRutils polanalyser` in an environment of its own, named with PYTHONPATH. Each figure is the
-least of three calls, one thread each. Merging is counted with its decoding, in all processes.
+left out: `pip install HDRutils polanalyser dbini-torch` in an environment of its own, named with PYTHONPATH. A figure
+is the least of three calls, one thread each. Merging is counted with its decoding, in all processes, and less LibRaw's
+unpacking. hdrmerge (with QT_QPA_PLATFORM=offscreen) and align_image_stack are of Debian's hdrmerge and hugin-tools.
 """
 
 import argparse
 import json
+import shutil
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -23,8 +27,18 @@ import numpy as np
 
 from polcap.formats import calib
 from polcap.formats import capture as captures
-from polcap.images import Alignment, AngleStack, Capture, ChartRequest, Floats, Gains, ObjectMask
-from polcap.stages import align, hdr, stokes, whitebalance
+from polcap.images import (
+    Alignment,
+    AngleStack,
+    Capture,
+    ChartRequest,
+    Floats,
+    Gains,
+    ObjectMask,
+    SurfaceMaps,
+    View,
+)
+from polcap.stages import align, hdr, stokes, surface, whitebalance
 
 _FULL = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1.0]])  # binned px → RAW px
 _ECC = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
@@ -52,7 +66,7 @@ def main() -> None:
     capture = captures.read(folder)
     stack = hdr.merge(capture, hdr.Settings())
     rows = []
-    for row in chain(solving(stack), registering(stack, folder), merging(capture)):
+    for row in chain(solving(stack), registering(stack, folder), merging(capture), integrating()):
         print(table([row]), file=sys.stderr)
         rows.append(row)
     given.out.write_text(json.dumps([vars(row) for row in rows], indent=1) + "\n")
@@ -60,17 +74,32 @@ def main() -> None:
 
 
 def merging(capture: Capture) -> Iterator[Row]:
-    """One bracket, files to radiance."""
-    try:
-        import HDRutils
-    except ModuleNotFoundError:
-        return
-
+    """One bracket, files to radiance, and the same less LibRaw's unpacking of its files."""
     shot = capture.shots[0]
     one = replace(capture, shots=(shot,))
     files = [frame.path for frame in shot.frames]
-    theirs = least(lambda: HDRutils.merge(files, do_align=False), times=1)
-    yield Row("merge of a bracket", "HDRutils", least(lambda: hdr.merge(one, hdr.Settings()), times=1), theirs)
+    unpacking = least(lambda: [bench_speed.unpack(file) for file in files])
+    ours = least(lambda: hdr.merge(one, hdr.Settings()))
+    for peer, work in (("HDRutils", partial(_hdrutils, files)), ("hdrmerge", partial(_hdrmerge, files))):
+        theirs = work()
+        if theirs is not None:
+            yield Row("merge of a bracket", peer, ours, theirs)
+            yield Row("merge, decoding apart", peer, ours - unpacking, theirs - unpacking)
+
+
+def _hdrutils(files: list[str]) -> float | None:
+    try:
+        import HDRutils
+    except ModuleNotFoundError:
+        return None
+    return least(lambda: HDRutils.merge(files, do_align=False), times=1)
+
+
+def _hdrmerge(files: list[str]) -> float | None:
+    if shutil.which("hdrmerge") is None:
+        return None
+    with tempfile.TemporaryDirectory() as place:
+        return bench_speed.cpu_of(["hdrmerge", "--no-align", "-o", f"{place}/merged.dng", *files])
 
 
 def registering(stack: AngleStack, folder: Path) -> Iterator[Row]:
@@ -95,6 +124,28 @@ def registering(stack: AngleStack, folder: Path) -> Iterator[Row]:
     size = stack.value.shape[1:3]
     errors = [", ".join(f"{_error(m, t, size):.3f}" for m, t in zip(some, true[1:])) for some in (own, found)]
     yield Row("registration", "cv2.findTransformECC", ours, theirs, f"error {errors[0]} px, theirs {errors[1]} px")
+    if shutil.which("align_image_stack") is not None:
+        theirs, left = _align_image_stack(grey)
+        yield Row("registration", "align_image_stack", ours, theirs, f"left by theirs, as ECC sees it: {left} px")
+
+
+def _align_image_stack(grey: list[Floats]) -> tuple[float, str]:
+    """CPU seconds, and what is left of the shots' shifts in its own aligned pictures, px."""
+    low, high = np.percentile(grey[0], (0.1, 99.9))
+    with tempfile.TemporaryDirectory() as place:
+        files = [f"{place}/shot{k}.tif" for k in range(len(grey))]
+        for file, shot in zip(files, grey):
+            cv2.imwrite(file, np.uint8(np.clip((shot - low) / (high - low), 0, 1) * 255))
+        command = ["align_image_stack", "-f", "30", "--corr=0.8", "-t", "1"]
+        theirs = bench_speed.cpu_of([*command, "-p", f"{place}/found.pto", *files])
+        bench_speed.cpu_of([*command, "-a", f"{place}/out", *files])
+        first, *others = (cv2.imread(str(file), 0) for file in sorted(Path(place).glob("out*.tif")))
+    left = []
+    for other in others:
+        motion = np.eye(2, 3, dtype=np.float32)
+        cv2.findTransformECC(first, other, motion, cv2.MOTION_EUCLIDEAN, _ECC)
+        left.append(_apart(np.vstack([motion, [0, 0, 1]]), np.eye(3), first.shape))
+    return theirs, ", ".join(f"{one:.3f}" for one in left)
 
 
 def solving(stack: AngleStack) -> Iterator[Row]:
@@ -139,13 +190,67 @@ def solving(stack: AngleStack) -> Iterator[Row]:
         yield Row(f"Stokes, {name}", "polanalyser", ours, cost, "ours with covariance and quality bits")
 
 
+def integrating() -> Iterator[Row]:
+    """Depth of one ball before another from true normals, 192²; the error is the rms of ln depth about its median."""
+    try:
+        import torch
+        from dbini_torch import bilateral_normal_integration
+    except ModuleNotFoundError:
+        return
+
+    torch.set_num_threads(1)
+    maps, true = _balls(192)
+    view = maps.view
+    camera = torch.tensor([[view.focal, 0, view.center[0]], [0, view.focal, view.center[1]], [0, 0, 1]])
+    normal, mask = torch.from_numpy(maps.normal.transpose(2, 0, 1).copy()), torch.from_numpy(maps.mask)
+    found: list[Floats] = []
+
+    def theirs() -> None:
+        found[:] = [np.asarray(bilateral_normal_integration(normal, mask, K=camera)[0])]
+
+    cost = least(theirs, times=1)
+    ours = least(lambda: surface.integrate(maps, None, surface.Settings()))
+    own = surface.integrate(maps, None, surface.Settings()).depth
+    errors = [_spread(np.log(depth[maps.mask] / true[maps.mask])) for depth in (own, found[0])]
+    note = f"error {errors[0]:.4f}, theirs {errors[1]:.4f}; ours with the mesh"
+    yield Row("depth of 192² from normals", "dbini-torch", ours, cost, note)
+
+
+def _balls(side: int) -> tuple[SurfaceMaps, Floats]:
+    """Maps of a ball before a larger one, and their depth."""
+    view = View(1.75 * side, ((side - 1) / 2, (side - 1) / 2), 1.0, (0.0, 0.0))
+    row, column = np.mgrid[:side, :side]
+    ray = np.stack(
+        [(column - view.center[0]) / view.focal, -(row - view.center[1]) / view.focal, -np.ones((side, side))], axis=-1
+    )
+    depth, normal = np.full((side, side), np.inf), np.zeros((side, side, 3))
+    for center, radius in (((0.02, 0.02, -0.7), 0.14), ((-0.03, -0.02, -0.5), 0.04)):
+        along, square = ray @ np.array(center), np.sum(ray * ray, axis=-1)
+        root = along**2 - square * (np.dot(center, center) - radius**2)
+        at = (along - np.sqrt(np.maximum(root, 0))) / square
+        nearer = (root > 0.03 * radius**2) & (at < depth)
+        depth[nearer] = at[nearer]
+        normal[nearer] = (((ray * at[..., None]) - center) / radius)[nearer]
+    mask = np.isfinite(depth)
+    flat, grey = np.full((side, side), 3.0, np.float32), np.zeros((side, side, 3), np.float32)
+    return SurfaceMaps(normal.astype(np.float32), grey, grey, flat, None, flat, mask, view, "truth"), depth
+
+
+def _spread(error: Floats) -> float:
+    return float(np.sqrt(np.mean((error - np.median(error)) ** 2)))
+
+
 def _error(found: Floats, true: Floats, size: tuple[int, ...]) -> float:
     """Rms distance between two transforms of the merged picture; `true` is between RAW pixels."""
+    return _apart(found, np.linalg.inv(_FULL) @ true @ _FULL, size)
+
+
+def _apart(found: Floats, true: Floats, size: tuple[int, ...]) -> float:
+    """Rms distance over a grid of points."""
     height, width = size
     x, y = np.meshgrid(np.linspace(0, width - 1, 9), np.linspace(0, height - 1, 9))
     points = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
-    binned = np.linalg.inv(_FULL) @ true @ _FULL
-    there, stated = found @ points, binned @ points
+    there, stated = found @ points, true @ points
     return float(np.sqrt(((there[:2] / there[2] - stated[:2] / stated[2]) ** 2).sum(0).mean()))
 
 
