@@ -51,7 +51,7 @@ def test_the_later_looks_are_at_what_was_found_and_are_told_so():
         return bright_is_object(inputs)
 
     segment(scenes.stack(), chart_color(), model=network(run))
-    first, second, third = seen
+    first, second, third = seen[::4]  # each look in four positions
     assert third.shape == second.shape
     assert first.shape[2:] == (128, 160)  # 120 rows, up to a multiple of 16
     assert not first[0, CHANNEL("looked")].any() and (second[0, CHANNEL("looked")] == 1).all()
@@ -59,6 +59,18 @@ def test_the_later_looks_are_at_what_was_found_and_are_told_so():
     assert hint.max() > 0.9 and hint.min() < -0.9
     x = second[0, CHANNEL("x")]
     assert x.min() > -0.98 and x.max() < 0.6  # the ball's part of the picture
+
+
+def test_what_a_network_sees_from_one_side_only_counts_for_nothing():
+    """A network that goes by left and right, up and down and the sense of the polarization, and one that goes by S1."""
+
+    def one_sided(inputs):
+        return {"logit": 5 * sum(inputs[:, CHANNEL(name)] for name in ("x", "y", "s2"))[:, None]}
+
+    channels = np.random.default_rng(0).uniform(-1, 1, (len(mask_channels.CHANNELS), 20, 35)).astype(np.float32)
+    np.testing.assert_allclose(two_looks._run(network(one_sided), channels), 0.5, atol=1e-5)
+    fair = two_looks._run(network(lambda inputs: {"logit": inputs[:, CHANNEL("s1")][:, None]}), channels)
+    np.testing.assert_allclose(fair, 1 / (1 + np.exp(-channels[CHANNEL("s1")])), rtol=1e-5)
 
 
 def test_channels_know_no_exposure():
@@ -115,6 +127,18 @@ def test_colours_decide_what_the_chances_leave_open():
     )
     assert (found & true).sum() / (found | true).sum() > 0.97
     assert ((chance > 0.5) & true).sum() / ((chance > 0.5) | true).sum() < 0.6
+
+
+def test_colors_are_not_followed_against_the_network():
+    """A square, which colors made higher by a row, and much larger."""
+    chance = np.full((100, 100), 0.01)
+    chance[20:80, 20:80] = 0.95
+    learned = chance > 0.5
+    near, far = learned.copy(), learned.copy()
+    near[19, 20:80] = True
+    far[:, 10:90] = True
+    assert solid.preferred(near, learned, chance) is near
+    assert solid.preferred(far, learned, chance) is learned
 
 
 def test_a_cleaned_mask_keeps_its_openings():

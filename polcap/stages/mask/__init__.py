@@ -1,8 +1,9 @@
 """Stage 4: decide which pixels are the object, and how sure that is.
 
 A small network gives every pixel its chance of being the object (`two_looks`): it was trained on what is hard to
-tell apart, such as black gloss on black cloth, white on white and deep shadow. What stands out from the backdrop
-(`standing_out`) is the object where the network agrees, for its outline is sharper, and where there is no network.
+tell apart, such as black gloss on black cloth, white on white and deep shadow. Colors (`standing_out`) then find the
+outline, as far as the network agrees. Where it sees nothing, or there is none, the object is what stands out from
+the backdrop.
 A mask that the user drew is taken as drawn.
 """
 
@@ -35,7 +36,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.7
 
 
-@stage(version=5)
+@stage(version=6)
 def segment(
     radiance: AngleStack,
     alignment: Alignment,
@@ -83,10 +84,11 @@ def segment(
     chance = two_looks.chances(radiance, alignment, color, patches, network)
     mask = solid.body(chance)
     if mask.any():
-        mask = solid.cleaned(standing_out.sharpened(picture, mask, patches, chance), chance)
-    with contextlib.suppress(ObjectError):
-        plain = standing_out.search(picture, zone, settings.min_area)
-        mask = solid.preferred(plain, mask, chance)
+        colored = solid.cleaned(standing_out.sharpened(picture, mask, patches, chance), chance)
+        mask = solid.preferred(colored, mask, chance)
+    else:
+        with contextlib.suppress(ObjectError):
+            mask = standing_out.search(picture, zone, settings.min_area)
     if mask.mean() < settings.min_area:
         raise ObjectError(
             f"no object is seen: {100 * mask.mean():.2f} % of the picture, less than "

@@ -95,6 +95,14 @@ def encode(look: Look, bright: float, chance: Floats | None = None) -> Floats:
     ).astype(np.float32)
 
 
+def mirrored(channels: Floats, axes: tuple[int, ...]) -> Floats:
+    """Channels (11, H, W) of the scene turned round along the image's axes, 0 y and 1 x."""
+    out: Floats = np.flip(channels, tuple(1 + axis for axis in axes)).copy()
+    for axis in axes:
+        out[[CHANNELS.index("s2"), CHANNELS.index("yx"[axis])]] *= -1
+    return out
+
+
 def _per_color(look: Look, bright: float) -> float:
     """What S0 summed over the camera's channels is where the picture is bright."""
     return bright * float(look.stokes[0].clip(0).sum() / max(look.color.clip(0).mean(-1).sum(), 1e-9))

@@ -12,7 +12,7 @@ from polcap.images import Floats
 _SPECK = 0.01  # of the largest part: smaller ones are no parts of their own
 _LIKELY = 0.3  # chance that a part has somewhere that is more than the backdrop in its color (decision 37)
 _PINHOLE = 1e-3  # of the mask: smaller holes are dark texture
-_LEEWAY = 1.1  # times the doubt, given for the sharper outline (decision 37)
+_LEEWAY = 1.7  # times the doubt of the network's own mask, given to that of the colors (decision 37)
 _DOUBTED = 0.15  # mean chance of a hole that is a shadowed hollow and no opening
 
 
@@ -28,12 +28,12 @@ def cleaned(mask: NDArray[np.bool_], chance: Floats) -> NDArray[np.bool_]:
     return _filled(_sizeable(seen[labels]), None)
 
 
-def preferred(plain: NDArray[np.bool_], learned: NDArray[np.bool_], chance: Floats) -> NDArray[np.bool_]:
-    """The better of two masks (H, W), by the network's chance (H, W) of each pixel.
+def preferred(colored: NDArray[np.bool_], learned: NDArray[np.bool_], chance: Floats) -> NDArray[np.bool_]:
+    """The mask (H, W) that colors made of the learned one, where the network's chances speak little against it.
 
-    That of what stands out where the network finds it as likely as its own: its outline is sharper.
+    Its outline is sharper; where colors tell nothing, as white on white, it goes astray.
     """
-    return plain if doubt(plain, chance) < _LEEWAY * doubt(learned, chance) else learned
+    return colored if doubt(colored, chance) <= _LEEWAY * doubt(learned, chance) else learned
 
 
 def _sizeable(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Network
 from polcap.optics import mueller
 from polcap.optics.warp import warp
-from polcap.stages.mask.mask_channels import SIZE_MULTIPLE, Look, brightness, encode
+from polcap.stages.mask.mask_channels import SIZE_MULTIPLE, Look, brightness, encode, mirrored
 
 Box = tuple[int, int, int, int]  # x0, y0, x1, y1 full-frame grid px, end exclusive
 _FINE = 256  # px of the second look's longer side, at most
 _AGAIN = 2  # looks at what was found; what the hint lacked is found from there
 _ROOM = 0.12  # shown around what the first look found, of its longer side
 _LIKELY = 0.3  # of being the object, for a pixel to be shown to the second look
+_MIRRORED = ((), (0,), (1,), (0, 1))  # axes along which a look is turned round (decision 37)
 
 
 def chances(
@@ -104,11 +105,15 @@ def around(likely: NDArray[np.bool_]) -> Box | None:
 
 
 def _run(network: Network, channels: Floats) -> Floats:
-    """The chance at each pixel, (H, W), of channels of any size."""
+    """The chance at each pixel, (H, W), of channels of any size: mean logit of the picture and its mirror images."""
     height, width = channels.shape[1:]
     more = [(0, -n % SIZE_MULTIPLE) for n in (height, width)]
-    logit = network.run(np.pad(channels, [(0, 0), *more], mode="edge")[None])["logit"][0, 0]
-    return np.asarray(1 / (1 + np.exp(-np.clip(logit[:height, :width], -30, 30))), np.float32)
+    total = np.zeros((height, width), np.float32)
+    for axes in _MIRRORED:
+        shown = np.pad(mirrored(channels, axes), [(0, 0), *more], mode="edge")
+        logit = network.run(shown[None])["logit"][0, 0, :height, :width]
+        total += np.flip(np.clip(logit, -30, 30), axes) / len(_MIRRORED)
+    return np.asarray(1 / (1 + np.exp(-total)), np.float32)
 
 
 def _resized(image: Floats, box: Box) -> Floats:
