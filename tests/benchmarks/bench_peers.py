@@ -139,7 +139,7 @@ def _align_image_stack(grey: list[Floats]) -> tuple[float, str]:
         command = ["align_image_stack", "-f", "30", "--corr=0.8", "-t", "1"]
         theirs = bench_speed.cpu_of([*command, "-p", f"{place}/found.pto", *files])
         bench_speed.cpu_of([*command, "-a", f"{place}/out", *files])
-        first, *others = (cv2.imread(str(file), 0) for file in sorted(Path(place).glob("out*.tif")))
+        first, *others = (np.asarray(cv2.imread(str(file), 0)) for file in sorted(Path(place).glob("out*.tif")))
     left = []
     for other in others:
         motion = np.eye(2, 3, dtype=np.float32)

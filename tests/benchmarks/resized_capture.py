@@ -35,14 +35,16 @@ def make(capture: Path, out: Path, megapixels: float) -> None:
 
 def _frame(source: Path, target: Path, megapixels: float, rng: np.random.Generator) -> None:
     image, known = raw.read(source), probe.read(source)
+    counts: NDArray[np.uint16] = image.value.astype(np.uint16)
     assert image.cfa is not None
+    stated = known.exif.color_matrix
     height, width = image.value.shape
     grown = float(np.sqrt(megapixels * 1e6 / (height * width)))
     size = tuple(round(side * grown / 2) for side in (width, height))
     out = np.empty((2 * size[1], 2 * size[0]), np.uint16)
     for y in (0, 1):
         for x in (0, 1):
-            out[y::2, x::2] = _plane(image.value[y::2, x::2], size, float(image.black[y, x]), image.white, grown, rng)
+            out[y::2, x::2] = _plane(counts[y::2, x::2], size, float(image.black[y, x]), image.white, grown, rng)
     dng.write(
         target,
         out,
@@ -50,7 +52,7 @@ def _frame(source: Path, target: Path, megapixels: float, rng: np.random.Generat
         black=image.black,
         white=image.white,
         exif=known.exif,
-        color_matrix=known.exif.color_matrix if known.exif.color_matrix is not None else _SRGB_FROM_XYZ,
+        color_matrix=_SRGB_FROM_XYZ if stated is None else np.reshape(stated, (3, 3)),
         as_shot_neutral=_DAYLIGHT if image.white_balance is None else 1 / image.white_balance,
         compression="none",
     )
