@@ -313,6 +313,8 @@ class Gains:
     turned_sigma: float = np.pi / 2  # rad, 1σ
     rival: tuple[int, ...] = ()  # an order of the shots that the silhouette supports as well; none: it tells
     rival_mirrored: bool = False
+    found_angle: Floats | None = None  # (K,) rad, where the stated ones are names only; None: they are angles
+    found_sigma: float = 0.0  # rad, 1σ of each
     crossed: Floats | None = None  # (3,) S0 of what has no gloss over the crossed shot's light; None without one
     crossed_sigma: float = 0.0  # 1σ, relative
 

@@ -48,6 +48,8 @@ def order(found: Found) -> Gate:
 def of_outline(found: Found, limits: Gates) -> Iterator[Gate]:
     """What the outline says of the angles, of the body and of other light."""
     angle, limit = found.radiance.angle, limits.max_turn_deg
+    if found.gains.found_angle is not None:
+        angle = found.gains.found_angle
     band = rim.take(*_reduced(found.stokes, angle))
     if len(band.azimuth) < _LEAST_RIM:
         yield Gate("angles", "not measured", None, limit, "too little outline", unit="°")
@@ -127,6 +129,11 @@ def _with_ring(gate: Gate, gains: Gains, limits: Gates) -> Gate:
 
     To three angles a single shot that was turned looks like a smaller turn of all; more would not close.
     """
+    if gains.found_angle is not None and gate.state == "pass":
+        doubt, ring = float(np.degrees(gains.found_sigma)), np.degrees(gains.found_angle + gains.angle_correction) % 180
+        says = f"nobody noted them; found {', '.join(f'{one:.1f}°' for one in ring)}, to {doubt:.1f}°"
+        remedy = "note the ring's mark of every shot: then nothing has to be found"
+        return Gate("angles", "warn", round(doubt, 2), limits.max_turn_deg, says, remedy, doubt, unit="°")
     turn, doubt = np.degrees([gains.angle_offset, gains.angle_offset_sigma])
     applied = gains.angle_correction != 0
     noted = len(gains.gain) == 3 and abs(turn) > max(limits.max_ring_turn_deg, _SURE * doubt)

@@ -8,8 +8,10 @@ rest. One exposure of a polarization mosaic has one gain. The outline tells whet
 counted the right way (`order`), and by how much the ring's zero is off (`ring_zero`); that is applied where it is
 sure, joined with a calibrated zero by the errors of both. Of more than three shots their closure tells which angle is
 wrong (`angle_closure`).
+Angles that nobody noted are found by `unknown_angles`.
 """
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import msgspec
@@ -18,6 +20,7 @@ from msgspec import Meta
 
 from polcap.errors import CaptureError
 from polcap.images import Alignment, AngleStack, Bits, ColorCalibration, Floats, Gains, ObjectMask, Quality
+from polcap.optics.outline import Rim
 from polcap.optics.warp import warp
 from polcap.stages import stage
 from polcap.stages.selfcal import (
@@ -28,11 +31,13 @@ from polcap.stages.selfcal import (
     object_gains,
     order,
     ring_zero,
+    unknown_angles,
 )
 from polcap.stages.selfcal.grey_patches import GreyPatches
 from polcap.stages.selfcal.object_gains import Estimate
 from polcap.stages.selfcal.order import Order
 from polcap.stages.selfcal.ring_zero import RingZero
+from polcap.stages.selfcal.unknown_angles import Angles
 
 _PRIOR = {"flash": 0.03, "steady": 0.01, "unknown": 0.03}  # 1σ of a shot's light before anything is measured: makers
 # of studio flashes state 0.5–2 % from pop to pop at full recycling, of LED and HMI lamps under 1 %
@@ -42,12 +47,21 @@ _REMOUNTED = np.radians(0.3)  # 1σ of a filter's zero from one screwing on to t
 _SOLID_ORDER, _GUESSED_ORDER = 0.25, 0.45  # least score of another order; guessed gains turn AoLPs too. Set by hand;
 # 32 simulated captures in order were all kept with them (tests/benchmarks/bench_verdicts.py)
 
+_MOST_GAIN = 0.005  # 1σ of a shot's light; with less known, other angles explain the shots as well
+
 Source = Literal["grey patches", "object", "one exposure", "none"]
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The section `selfcal` of a settings file."""
 
+    unknown_angles: Annotated[
+        bool,
+        Meta(description="the stated angles are names only: find the true ones, of four shots and more beside a chart"),
+    ] = False
+    max_unknown_sigma_deg: Annotated[
+        float, Meta(gt=0, le=20, description="angles that are found less well end the run [degrees]")
+    ] = 4.0
     check_order: Annotated[
         bool, Meta(description="refuse a capture whose outline contradicts the order or sense of its angles")
     ] = True
@@ -107,6 +121,13 @@ def solve(
     greys = grey_patches.measure(radiance, alignment, color)
     blind = _blind(radiance, greys, facing)  # to the angles, which are to be judged
     rim = order.rim(light / blind.gain[:, None, None], quality == 0, mask, object_.crop, radiance.value.shape[1:3])
+    unnoted: Angles | None = None
+    if settings.unknown_angles:
+        known = greys is not None or radiance.light == "one exposure"
+        sigma = float(blind.sigma.max()) if known else np.inf
+        unnoted = _unnoted(rim, light / blind.gain[:, None, None], mask, quality, sigma, settings)
+        radiance = replace(radiance, angle=unnoted.angle)
+        facing = object_gains.facing(light, object_gains.inside(mask, quality), radiance.angle)
     guessed = greys is None and radiance.light != "one exposure"
     found = order.judge(rim, radiance.angle, settings.order_margin, _GUESSED_ORDER if guessed else _SOLID_ORDER)
     stated: Order = (tuple(range(shots)), False)
@@ -162,9 +183,37 @@ def solve(
         turned_sigma=closed.sigma,
         rival=() if found.rival is None else found.rival[0],
         rival_mirrored=found.rival is not None and found.rival[1],
+        found_angle=None if unnoted is None else unnoted.angle,
+        found_sigma=0.0 if unnoted is None else unnoted.sigma,
         crossed=None if crossed is None else crossed[0],
         crossed_sigma=0.0 if crossed is None else crossed[1],
     )
+
+
+def _unnoted(
+    rim: Rim, even: Floats, mask: object_gains.Bools, quality: Bits, gain_sigma: float, settings: Settings
+) -> Angles:
+    """The angles that nobody noted, of shots (K, H, W) without their gains; else CaptureError says what is missing."""
+    shots = len(even)
+    otherwise = "or note the angles, and --set selfcal.unknown_angles=false"
+    if shots < 4:
+        raise CaptureError(f"{shots} shots at unknown angles: four are needed, better five; take more, {otherwise}")
+    if gain_sigma > _MOST_GAIN:
+        how = f"to {100 * gain_sigma:.1f} % only" if np.isfinite(gain_sigma) else "by no chart"
+        raise CaptureError(
+            f"the light of the shots is known {how}, for unknown angles {100 * _MOST_GAIN:g} % is the limit; "
+            f"put a color chart beside the object, {otherwise}"
+        )
+    inner, _ = object_gains.cells(even, object_gains.inside(mask, quality))
+    found = unknown_angles.measure(rim, inner, shots)
+    doubt = float(np.degrees(found.sigma))
+    if doubt > settings.max_unknown_sigma_deg:
+        raise CaptureError(
+            f"outline and shots tell the polarizer's angles to {doubt:.1f}° only, "
+            f"selfcal.max_unknown_sigma_deg = {settings.max_unknown_sigma_deg:g}; take five or more shots spread over "
+            f"180° of a rounded object that is all in view, {otherwise}"
+        )
+    return found
 
 
 def supported(anchor: Estimate, prior: float) -> Estimate:

@@ -85,10 +85,11 @@ def solve(
     ----------
     Collett, Polarized Light, ch. 5; Tyo, Design of optimal polarimeters, Applied Optics 2002.
     """
-    weights_of = mueller.analyzer(radiance.angle + gains.angle_correction)  # (K, 3)
+    angle = radiance.angle if gains.found_angle is None else gains.found_angle
+    weights_of = mueller.analyzer(angle + gains.angle_correction)  # (K, 3)
     condition = np.linalg.cond(weights_of)
     if condition > _MOST_CONDITION:
-        angles = ", ".join(f"{np.degrees(a):g}°" for a in radiance.angle)
+        angles = ", ".join(f"{np.degrees(a):.4g}°" for a in angle)
         raise CaptureError(
             f"polarizer angles {angles} do not determine the Stokes parameters (condition {condition:.0f}, "
             f"at most {_MOST_CONDITION:g}); shoot angles spread over 180°, such as 0°, 45°, 90°"
