@@ -21,6 +21,7 @@ from polcap.optics import demosaic
 from polcap.optics.color import REC709_TO_XYZ
 
 _EIGHT_BITS = 255  # counts between black and white: rounding alone is 1 % of a dark patch
+_MOST_CONDITION = 1e4  # of a color matrix; beyond, its inverse tells nothing. Set by hand
 _COPY_AGAIN = "copy it from the card again"
 
 
@@ -104,9 +105,12 @@ def camera_matrix(xyz_to_camera: Floats, balance: Floats | None) -> Floats | Non
     """
     camera = xyz_to_camera @ REC709_TO_XYZ
     daylight = camera.sum(axis=1)  # the camera's answer to D65
-    if (daylight <= 0).any() or abs(np.linalg.det(camera)) < 1e-9:
+    if not np.isfinite(camera).all() or (daylight <= 0).any():
         return None
-    to_rec709 = np.linalg.inv(camera / daylight[:, None])
+    even = camera / daylight[:, None]  # white gives 1 in every channel, whatever the file's units
+    if np.linalg.cond(even) > _MOST_CONDITION:
+        return None
+    to_rec709 = np.linalg.inv(even)
     gain = daylight[1] / daylight if balance is None else balance
     return np.asarray(to_rec709 * gain)
 

@@ -109,6 +109,15 @@ def test_camera_matrix_takes_the_grey_of_the_shot_to_white(tmp_path):
     np.testing.assert_allclose(image.camera_matrix @ [0.5, 1, 0.8], 1, rtol=1e-5)
 
 
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_channels_that_see_the_same_give_no_camera_matrix(scale):
+    alike = scale * np.array([[0.9, 0.3, 0.1], [0.9, 0.3, 0.1], [-0.09, 0.19, 0.71]])
+    assert raw.camera_matrix(alike, None) is None
+    alike[0, 0] = np.inf
+    assert raw.camera_matrix(alike, None) is None
+    assert raw.camera_matrix(scale * np.eye(3), None) is not None
+
+
 def test_camera_matrix_agrees_with_libraw(tmp_path):
     path = written(tmp_path, RAMP, neutral=(0.5, 1, 0.8))
     image = raw.read(path)
