@@ -165,4 +165,4 @@ def _fitted(level: Floats, variance: Floats, edges: Floats) -> Floats:
 
 
 def _model(found: Floats, level: Floats, edges: Floats) -> Floats:
-    return np.maximum(found[0] * level + found[1] + found[2] * edges, 1e-12)
+    return np.asarray(np.maximum(found[0] * level + found[1] + found[2] * edges, 1e-12))

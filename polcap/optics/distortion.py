@@ -37,7 +37,8 @@ def undistorted(lens: Distortion, x: Floats, y: Floats) -> tuple[Floats, Floats]
 
 def folds(lens: Distortion, width: float, height: float) -> bool:
     """Whether within a picture of that size two rays fall on one pixel: no lens does."""
-    far = np.hypot(*(max(c, side - c) for c, side in zip(lens.center, (width, height)))) / lens.focal
+    x, y = (max(c, side - c) for c, side in zip(lens.center, (width, height)))
+    far = np.hypot(x, y) / lens.focal
     r2 = np.linspace(0, 1.3 * far, 64) ** 2
     return bool((1 + r2 * (3 * lens.k1 + 5 * r2 * lens.k2) <= 0.05).any())
 

@@ -133,7 +133,7 @@ def _shifted(plane: Floats, by: Floats, size: tuple[int, int]) -> Floats:
 def _kernel(f: float) -> Floats:
     """What a cubic spline reads a share f of a pixel further on, as a filter of the samples."""
     taps = np.array([(1 - f) ** 3, 4 - 6 * f**2 + 3 * f**3, 1 + 3 * f + 3 * f**2 - 3 * f**3, f**3]) / 6
-    return np.r_[0, np.convolve(_PREFILTER, taps)].astype(np.float32)  # a tap more behind than ahead: 0 evens it
+    return np.asarray(np.r_[0, np.convolve(_PREFILTER, taps)], np.float32)  # a tap more behind than ahead: 0 evens it
 
 
 def coordinates(transform: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
@@ -205,14 +205,14 @@ def _moved(x: float, y: float) -> Floats:
 def _source(shape: tuple[int, ...], transform: Floats, box: Box, lens: Distortion | None = None) -> Box:
     """The part of an image of `shape` that decides its warp over `box`."""
     x0, y0, x1, y1 = box
-    if lens is None:
-        edge = np.array([x0, x1, x0, x1]) - 0.5, np.array([y0, y0, y1, y1]) - 0.5
-    else:  # which bends the sides
+    x: Floats = np.array([x0, x1, x0, x1]) - 0.5
+    y: Floats = np.array([y0, y0, y1, y1]) - 0.5
+    if lens is not None:  # which bends the sides
         across, down = np.linspace(x0 - 0.5, x1 - 0.5, 65), np.linspace(y0 - 0.5, y1 - 0.5, 65)
-        sides_x = np.concatenate([across, across, np.full(65, across[0]), np.full(65, across[-1])])
-        sides_y = np.concatenate([np.full(65, down[0]), np.full(65, down[-1]), down, down])
-        edge = distortion.distorted(lens, sides_x, sides_y)
-    x, y = coordinates(transform, *edge)
+        x = np.concatenate([across, across, np.full(65, across[0]), np.full(65, across[-1])])
+        y = np.concatenate([np.full(65, down[0]), np.full(65, down[-1]), down, down])
+        x, y = distortion.distorted(lens, x, y)
+    x, y = coordinates(transform, x, y)
     margin = _REACH + _EDGE + 2
     left, top = int(np.floor(x.min())) - margin, int(np.floor(y.min())) - margin
     right, bottom = int(np.ceil(x.max())) + margin, int(np.ceil(y.max())) + margin

@@ -141,7 +141,9 @@ def _align_image_stack(grey: list[Floats]) -> tuple[float, str]:
         bench_speed.cpu_of([*command, "-a", f"{place}/out", *files])
         first, *others = (np.asarray(cv2.imread(str(file), 0)) for file in sorted(Path(place).glob("out*.tif")))
     left = []
+    assert first is not None
     for other in others:
+        assert other is not None
         motion = np.eye(2, 3, dtype=np.float32)
         cv2.findTransformECC(first, other, motion, cv2.MOTION_EUCLIDEAN, _ECC)
         left.append(_apart(np.vstack([motion, [0, 0, 1]]), np.eye(3), first.shape))

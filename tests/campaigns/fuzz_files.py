@@ -195,7 +195,7 @@ def main(files: int, count: int, number: int, rows: Rows, say: Callable[[str], N
                 if (number, name, batch) not in done:
                     found = attack(seeds[name], Random(f"{number} {name} {batch}"), folder, say)
                     rows.add({"number": number, "seed": name, "batch": batch, **found})
-    worker._close()  # what the children took is known once they have ended
+    worker.end_idle()  # what the children took is known once they have ended
     children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
     failures = summary(rows, say)

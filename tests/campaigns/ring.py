@@ -13,7 +13,7 @@ import math
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -35,7 +35,7 @@ _ANGLE = np.radians([0.0, 45.0, 90.0])
 _GAIN_ERROR = 0.001  # 1σ of a gain that a chart tells
 _MOST_TURN = 10.0  # degrees
 GOOD_DEG = 0.2
-KINDS = ("bumps", "clusters", "vase")  # clusters are thin
+KINDS: tuple[Literal["bumps", "clusters", "vase"], ...] = ("bumps", "clusters", "vase")  # clusters are thin
 
 
 def main() -> None:

@@ -43,9 +43,9 @@ def test_picture_through_a_lens_is_the_pinhole_s():
     picture = np.sin(u / 7) + np.cos(v / 9)
     box = (20, 30, 260, 170)
     expected = (np.sin(x / 7) + np.cos(y / 9))[30:170, 20:260]
-    for order, limit in ((3, 2e-4), (1, 2e-2)):
-        found = warp(picture.astype(np.float32), np.eye(3), box, order, BARREL)
-        assert np.abs(found - expected).max() < limit
+    seen = picture.astype(np.float32)
+    assert np.abs(warp(seen, np.eye(3), box, 3, BARREL) - expected).max() < 2e-4
+    assert np.abs(warp(seen, np.eye(3), box, 1, BARREL) - expected).max() < 2e-2
     moved = np.array([[1, 0, 3.4], [0, 1, -2.3], [0, 0, 1.0]])
     shot = np.sin(distortion.undistorted(BARREL, x - 3.4, y + 2.3)[0] / 7)
     back = warp(shot.astype(np.float32), moved, box, 3, BARREL)

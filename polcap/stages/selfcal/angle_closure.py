@@ -107,7 +107,7 @@ def _free(angle: Floats) -> Floats:
 
 def _told(light: Floats, angle: Floats) -> Floats:
     """(K,) how much of what keeps the shots from closing a small turn of each is, per rad."""
-    return np.linalg.norm(_free(angle), axis=0) * np.sqrt((_slope(light, angle) ** 2).mean(axis=1))
+    return np.asarray(np.linalg.norm(_free(angle), axis=0) * np.sqrt((_slope(light, angle) ** 2).mean(axis=1)))
 
 
 def _slope(light: Floats, angle: Floats) -> Floats:

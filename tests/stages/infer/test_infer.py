@@ -10,7 +10,7 @@ from polcap.errors import ModelError
 from polcap.images import Network, Quality
 from polcap.optics import frames
 from polcap.stages import cues, infer, stokes
-from polcap.stages.infer import analytic, augmentation, learned
+from polcap.stages.infer import analytic, augmentation, fine, learned
 from tests import scenes
 
 
@@ -159,7 +159,7 @@ def test_relief_that_the_network_does_not_see_leaves_the_albedo(monkeypatch):
     middle = np.s_[rows.min() + 60 : rows.max() - 60, columns.min() + 60 : columns.max() - 60]
     spread = []
     for normal in (found.rays, waves):
-        monkeypatch.setattr(learned.fine, "refined", lambda cues_, guess, network_, known=normal: known)
+        monkeypatch.setattr(fine, "refined", lambda cues_, guess, network_, known=normal: known)
         spread.append(np.log(infer.estimate(found, half, infer.Settings()).diffuse[middle] + cues.FLOOR).std())
     assert spread[1] == pytest.approx(spread[0] / 2, rel=0.1)
 
