@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import CaptureError
+from polcap.optics.outline import Rim
 from polcap.stages import selfcal, stokes
 from polcap.stages.selfcal import unknown_angles
 from tests import scenes
@@ -56,5 +57,5 @@ def test_angles_that_are_hardly_told_are_refused():
 
 
 def test_an_outline_that_says_nothing_leaves_them_unknown():
-    rim = unknown_angles.Rim(np.zeros((4, 0)), np.zeros(0), np.zeros(0, int))
+    rim = Rim(np.zeros((4, 0)), np.zeros(0), np.zeros(0, int))
     assert unknown_angles.measure(rim, np.ones((4, 100)), 4).sigma == np.pi / 2

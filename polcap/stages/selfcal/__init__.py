@@ -124,8 +124,8 @@ def solve(
     unnoted: Angles | None = None
     if settings.unknown_angles:
         known = greys is not None or radiance.light == "one exposure"
-        sigma = float(blind.sigma.max()) if known else np.inf
-        unnoted = _unnoted(rim, light / blind.gain[:, None, None], mask, quality, sigma, settings)
+        doubt = float(blind.sigma.max()) if known else np.inf
+        unnoted = _unnoted(rim, light / blind.gain[:, None, None], mask, quality, doubt, settings)
         radiance = replace(radiance, angle=unnoted.angle)
         facing = object_gains.facing(light, object_gains.inside(mask, quality), radiance.angle)
     guessed = greys is None and radiance.light != "one exposure"

@@ -78,7 +78,7 @@ def _by_direction(rim: Rim) -> tuple[Floats, Floats]:
     light = np.stack([np.bincount(number, shot, _BINS) for shot in rim.light], axis=1)
     weight = rim.light.sum(axis=0)
     sums = [np.bincount(number, weight * wave, _BINS) for wave in (np.cos(rim.azimuth), np.sin(rim.azimuth))]
-    return light, np.arctan2(sums[1], sums[0])
+    return light.astype(np.float64), np.arctan2(sums[1], sums[0])
 
 
 def _condensed(cells: Floats) -> Floats:
