@@ -13,17 +13,20 @@ from tests import scenes
 
 TRUE = np.radians([12.0, 51.0, 83.0, 118.0, 160.0])
 NAMES = np.radians([0.0, 1.0, 2.0, 3.0, 4.0])
+SHOTS = scenes.stack(angles=TRUE)
 
 
-def found(angle, stated, **settings):
-    radiance = replace(scenes.stack(angles=angle), angle=stated, light="one exposure")
+def found(shots=5, light="one exposure", **settings):
+    radiance = replace(
+        SHOTS, value=SHOTS.value[:shots], variance=SHOTS.variance[:shots], quality=SHOTS.quality[:shots],
+        angle=NAMES[:shots], light=light,
+    )  # fmt: skip
     chosen = selfcal.Settings(unknown_angles=True, **settings)
-    shots = len(angle)
     return radiance, selfcal.solve(radiance, scenes.still(shots), scenes.ball_object(), scenes.no_color(), chosen)
 
 
 def test_five_angles_of_a_ball_are_found():
-    radiance, gains = found(TRUE, NAMES)
+    radiance, gains = found()
     apart = (gains.found_angle + gains.angle_correction - TRUE + np.pi / 2) % np.pi - np.pi / 2
     assert np.degrees(np.abs(apart)).max() < 1.5
     assert np.degrees(np.abs(apart)).max() < 3.5 * max(np.degrees(gains.found_sigma), 0.3)
@@ -36,24 +39,17 @@ def test_five_angles_of_a_ball_are_found():
 
 def test_three_shots_are_refused():
     with pytest.raises(CaptureError, match="3 shots at unknown angles: four are needed"):
-        found(TRUE[:3], NAMES[:3])
+        found(3)
 
 
 def test_gains_that_nobody_knows_are_refused():
-    radiance = replace(scenes.stack(angles=TRUE), angle=NAMES, light="unknown")
     with pytest.raises(CaptureError, match="put a color chart beside the object"):
-        selfcal.solve(
-            radiance,
-            scenes.still(5),
-            scenes.ball_object(),
-            scenes.no_color(),
-            selfcal.Settings(unknown_angles=True),
-        )
+        found(light="unknown")
 
 
 def test_angles_that_are_hardly_told_are_refused():
     with pytest.raises(CaptureError, match="tell the polarizer's angles to"):
-        found(TRUE, NAMES, max_unknown_sigma_deg=0.01)
+        found(max_unknown_sigma_deg=0.01)
 
 
 def test_an_outline_that_says_nothing_leaves_them_unknown():
