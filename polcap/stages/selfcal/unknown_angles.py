@@ -75,7 +75,7 @@ def measure(rim: Rim, cells: Floats, shots: int) -> Angles:
 def _by_direction(rim: Rim) -> tuple[Floats, Floats]:
     """Light of the outline summed where it looks one way, (B, K), and those ways (B,) rad."""
     number = np.floor(rim.azimuth / (2 * np.pi) * _BINS).astype(int) % _BINS
-    light = np.stack([np.bincount(number, shot, _BINS) for shot in rim.light], axis=1)
+    light = np.stack([np.bincount(number, shot, _BINS) for shot in rim.light], axis=1).astype(np.float64)
     weight = rim.light.sum(axis=0)
     sums = [np.bincount(number, weight * wave, _BINS) for wave in (np.cos(rim.azimuth), np.sin(rim.azimuth))]
     return light.astype(np.float64), np.arctan2(sums[1], sums[0])
