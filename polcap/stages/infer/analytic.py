@@ -115,7 +115,8 @@ def _albedo(cues: Cues, cos_zenith: Floats, ior: float) -> tuple[Floats, Floats]
     """Diffuse albedo (H, W, 3) and the highlight's radiance (H, W).
 
     A highlight is white, small, and faces the camera: what a grey-scale opening of the darkest channel
-    removes where the zenith is under 35°. The rest over cos θ T₊² is the albedo; off the axis, light comes farther.
+    removes where the zenith is under 35°. The rest over cos θ T₊(θ) T₊(0) is the albedo: light from around makes
+    up for some of what the limb lets through less; off the axis, light comes farther.
     """
     size = max(5, round(0.12 * np.sqrt(max(cues.mask.sum(), 1)))) | 1
     radiance = fill_highlights(cues.radiance, cues) / cues.rays[..., 2:] ** 2
