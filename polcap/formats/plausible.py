@@ -147,12 +147,12 @@ def check_jpeg(path: str, data: bytes, start: int = 0) -> None:
             continue
         at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
         if marker == 0xDA:  # coded data follow
-            at = _end_of_scan(data, at)
+            at = end_of_scan(data, at)
     if data[at : at + 2] != b"\xff\xd9":
         raise DecodeError(f"{path}: is cut short, its JPEG data have no end; {_COPY_AGAIN}")
 
 
-def _end_of_scan(data: bytes, start: int) -> int:
+def end_of_scan(data: bytes, start: int) -> int:
     """Where the first marker after a JPEG scan's coded data stands: FF, and what is neither stuffing nor a restart."""
     coded = np.frombuffer(data, np.uint8)
     for at in range(start, len(data), _PART):
