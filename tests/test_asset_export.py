@@ -72,7 +72,7 @@ def test_unreal_gets_green_down_and_unity_smoothness(exported: Path) -> None:
 def test_sidecar_knows_photographs_settings_and_files(exported: Path) -> None:
     told = json.loads((exported / "asset" / "archive" / "capture.provenance.json").read_text())
     about = json.loads((exported / "report.json").read_text())
-    assert [one["blake2b"] for one in told["photographs"]] == [
+    assert [one["sha256"] for one in told["photographs"]] == [
         frame["digest"] for shot in about["capture"]["shots"] for frame in shot["frames"]
     ]
     assert told["settings"] == about["settings"] and told["stages"] == about["keys"]

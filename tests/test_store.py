@@ -233,7 +233,7 @@ def edited(file: Path, old: str, new: str) -> None:
     ("old", "new"),
     [
         ("3.0", "4.0"),
-        ('"format": 2', '"format": 1'),
+        ('"format": 3', '"format": 1'),
         ("value.array.npy", "../../value.array.npy"),
         ('"value": {', '"value": null, "x": {'),
         ('"files": {', '"files": null, "x": {'),

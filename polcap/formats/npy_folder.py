@@ -8,7 +8,7 @@ import io
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum, IntEnum, IntFlag
-from hashlib import blake2b
+from hashlib import sha256
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -112,7 +112,7 @@ def save(file: Path, array: NDArray[Any]) -> list[Any]:
     array = np.asarray(array, order="C")
     head = io.BytesIO()
     np.lib.format.write_array_header_2_0(head, np.lib.format.header_data_from_array_1_0(array))
-    summed, size = blake2b(digest_size=16), 0
+    summed, size = sha256(), 0
     with file.open("wb") as stream:
         for part in (head.getbuffer(), array.reshape(-1).view(np.uint8).data if array.size else b""):
             summed.update(part)
@@ -139,8 +139,8 @@ def load(file: Path) -> NDArray[Any]:
 
 
 def checksum(file: Path) -> list[Any]:
-    """Size in bytes and BLAKE2b digest of a file."""
-    summed = blake2b(digest_size=16)
+    """Size in bytes and SHA-256 digest of a file."""
+    summed = sha256()
     with file.open("rb") as stream:
         while block := stream.read(1 << 22):
             summed.update(block)

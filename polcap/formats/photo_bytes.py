@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from hashlib import blake2b
+from hashlib import sha256
 from typing import BinaryIO
 
 from polcap.errors import DecodeError
@@ -21,7 +21,7 @@ def opened(path: str) -> Iterator[BinaryIO]:
 
 def digest(data: bytes) -> str:
     """What the bytes of a photograph put into the key of all that is made from it."""
-    return blake2b(data, digest_size=20).hexdigest()
+    return sha256(data).hexdigest()
 
 
 def load(path: str, expected: str | None = None) -> bytes:

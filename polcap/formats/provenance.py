@@ -33,7 +33,7 @@ def record(about: Mapping[str, Any]) -> dict[str, Any]:
         "name": capture["name"],
         "camera": capture["camera"],
         "photographs": [
-            {"file": frame["file"], "angle_deg": shot["angle_deg"], "blake2b": frame["digest"]}
+            {"file": frame["file"], "angle_deg": shot["angle_deg"], "sha256": frame["digest"]}
             for shot in capture["shots"]
             for frame in shot["frames"]
         ],

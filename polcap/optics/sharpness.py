@@ -38,7 +38,7 @@ class Tiles:
 
 def places(image: SensorImage, clip: float) -> NDArray[np.int64]:
     """Corners (T, 2) of the tiles to compare, chosen in one decoded photograph of the capture."""
-    return choose(_light(sensor.signal(image)), sensor.usable(image, clip))
+    return choose(_whole_light(image), sensor.usable(image, clip))
 
 
 def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
@@ -73,6 +73,19 @@ def frames_blur(shots: Sequence[Sequence[Tiles]], px: float) -> Floats:
         for frames in zip(*shots, strict=True)
     ]
     return np.asarray(px * np.stack(each, axis=1))
+
+
+def _whole_light(image: SensorImage) -> Floats:
+    """`_light` of a whole photograph; of a Bayer mosaic without the three channels that make it, ten times as fast."""
+    if image.cfa is None or image.superpixel != 2:
+        return _light(sensor.signal(image))
+    height, width = (side // 2 for side in image.value.shape)
+    counts = image.value[: 2 * height, : 2 * width].astype(np.float32)
+    light = cv2.resize(counts, (width, height), interpolation=cv2.INTER_AREA)
+    black = float(image.black.mean())
+    light -= np.float32(black)
+    light /= np.float32(image.white - black)
+    return np.asarray(light)
 
 
 def _light(signal: Floats) -> Floats:

@@ -16,6 +16,7 @@ _BEYOND_PX = 6  # around the object, where its outline still tells
 _SURE_LIKENESS = 0.6  # of detail, from which a region is known to have been followed
 _OTHER_LIKENESS = 0.4  # of the object, below which it is another, or too far away
 _SURE_SIGMAS = 3.0  # of both places: a chart in a corner tells little of where the object's middle should be
+_ALIKE_PX = 0.5  # two ways that differ by less lead to one place
 _ANY_LIKENESS = 0.4  # where nothing moved; noise and an even backdrop have less
 
 
@@ -58,7 +59,11 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
 
 def _followed(region: Detail, shot: Detail, known: Floats) -> tuple[Floats, float]:
     """Where a region lies in a shot, begun from where the whole picture does, and from where nothing moved."""
-    starts = [(way, likeness(region, shot, way)) for way in (known, np.eye(3))]
+    height, width = region[1].value.shape
+    corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], float).T
+    moved = known @ corners
+    still = np.abs(moved[:2] / moved[2] - corners[:2]).max() < _ALIKE_PX
+    starts = [(way, likeness(region, shot, way)) for way in ((known,) if still else (known, np.eye(3)))]
     if max(starts, key=_like)[1] < _ANY_LIKENESS:
         return max(starts, key=_like)
     ways = [refine(region, shot, start, "similarity")[0] for start, _ in starts]

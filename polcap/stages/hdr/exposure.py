@@ -30,7 +30,11 @@ def ratio(reference: Signals, other: Signals) -> Ratio | None:
     bias that a mean of quotients or of logarithms has. Tiles that disagree (something moved) are dropped.
     A channel too dim to say better than 1 % takes the ratio of all channels together.
     """
-    a, b = _common(reference, other)
+    return of_tiles(*common(reference, other))
+
+
+def of_tiles(a: Floats, b: Floats) -> Ratio | None:
+    """The same of the tiles (T, C) that `common` has found."""
     if not len(a):
         return None
     found = [_quotient(a[:, c], b[:, c]) for c in range(a.shape[1])]
@@ -41,7 +45,7 @@ def ratio(reference: Signals, other: Signals) -> Ratio | None:
     return Ratio(value, sigma)
 
 
-def _common(reference: Signals, other: Signals) -> tuple[Floats, Floats]:
+def common(reference: Signals, other: Signals) -> tuple[Floats, Floats]:
     """Means (T, C) of the tiles that are usable throughout in both."""
     channels, height, width = reference.shape
     usable = (reference.usable & other.usable).view(np.uint8) * np.uint8(255)
@@ -54,12 +58,13 @@ def _common(reference: Signals, other: Signals) -> tuple[Floats, Floats]:
     return a, b
 
 
-def curvature(reference: Signals, other: Signals) -> float:
+def curvature(a: Floats, b: Floats) -> float:
     """How the exposure ratio of two frames changes with brightness: d ln(other/reference) / d ln(both); 0: linear.
 
     A tone curve, unlike a lamp, changes the ratio from shadows to highlights. NaN where the frames span too little.
+    a, b (T, C): of `common`.
     """
-    a, b = (part.mean(axis=1) for part in _common(reference, other))
+    a, b = a.mean(axis=1), b.mean(axis=1)
     lit = (a > _TONE_RANGE[0]) & (b > _TONE_RANGE[0]) & (a < _TONE_RANGE[1]) & (b < _TONE_RANGE[1])
     if lit.sum() < 4 * _LEAST_TILES:
         return float("nan")

@@ -135,13 +135,14 @@ def measure(
                 lines.learn(shooting.iso[reference], noise.alone(still))
             found, gain = registration.resampled(found, moved)
             blur = float(gain.mean())
-        ratio = _ratio(name, still, found, shot.frames[e], shot.frames[reference])
+        tiles = exposure.common(still, found)
+        ratio = _ratio(name, exposure.of_tiles(*tiles), channels, shot.frames[e], shot.frames[reference])
         if moved is None and unknown:
             for key, samples in zip((shooting.iso[reference], shooting.iso[e]), noise.paired(still, found, ratio)):
                 lines.learn(key, samples)
         own, other = shooting.line(reference), shooting.line(e)
         misfit = noise.misfit(still, found, ratio, (own, other), blur)
-        links[e], frames[e] = Link(ratio, moved, misfit, exposure.curvature(still, found)), Registered(found, gain)
+        links[e], frames[e] = Link(ratio, moved, misfit, exposure.curvature(*tiles)), Registered(found, gain)
         frame = Exposed(found, ratio, other)
         anchor = anchor or Anchor(Exposed(still, same.ratio, own))
         new = anchor.ghosts(frame, misfit, blur)
@@ -170,9 +171,8 @@ def stated(frame: Frame, reference: Frame) -> float:
     return promised(frame, reference)
 
 
-def _ratio(name: str, still: Signals, found: Signals, frame: Frame, reference: Frame) -> Floats:
-    """Exposure relative to the reference frame, (C,) float32."""
-    seen = exposure.ratio(still, found)
+def _ratio(name: str, seen: exposure.Ratio | None, channels: int, frame: Frame, reference: Frame) -> Floats:
+    """Exposure relative to the reference frame, (C,) float32: as seen, or else as stated."""
     if seen is not None:
         return seen.value.astype(np.float32)
     said = stated(frame, reference)
@@ -183,4 +183,4 @@ def _ratio(name: str, still: Signals, found: Signals, frame: Frame, reference: F
             f"{name} shares too few well exposed pixels with the reference frame to measure its exposure, "
             f"and {why}: state `exposure` in capture.toml, or leave the frame out"
         )
-    return np.full(still.shape[0], said, np.float32)
+    return np.full(channels, said, np.float32)

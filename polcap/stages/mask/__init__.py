@@ -103,7 +103,7 @@ def segment(
 def _picture(radiance: AngleStack, alignment: Alignment, color: ColorCalibration) -> Floats:
     """Mean of the registered shots in linear Rec.709, (H, W, 3)."""
     total = sum(warp(radiance.value[k], alignment.transform[k], order=1) for k in range(len(radiance.angle)))
-    return np.asarray((2 / len(radiance.angle)) * total @ color.matrix.T, dtype=np.float32)
+    return np.asarray(cv2.transform(total, 2 / len(radiance.angle) * color.matrix), np.float32)
 
 
 def _chart_zone(radiance: AngleStack, color: ColorCalibration, margin: float) -> NDArray[np.uint8]:

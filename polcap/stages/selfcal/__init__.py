@@ -84,7 +84,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 12.0
 
 
-@stage(version=9)
+@stage(version=10)
 def solve(
     radiance: AngleStack,
     alignment: Alignment,

@@ -21,6 +21,7 @@ from polcap.optics import mueller, outline
 Bools = NDArray[np.bool_]
 
 _RIM_PX = 3.0  # 1σ of the blur whose contours are followed: as near to the outline as pixels allow
+_FINE_PX = 8.0  # 1σ of a blur in px of the grid that it is made on: an eighth of it is all that the grid adds
 _DEEPER = (0.1, 0.2)  # further blurs, in radii of the object
 _PLATEAU = 0.3  # radii; the contours of the depth up to here are the last band
 _SMOOTH_PX = 1.0  # of the light, inside the object only
@@ -80,8 +81,7 @@ def measure(
     polarization = np.where(seen, (s1 + 1j * s2) / np.where(seen, s0, 1), 0)
     strength = np.abs(polarization)
     slope = polarization * np.minimum(1, outline.DOLP_CAP / np.maximum(strength, 1e-9))
-    out = [_outward(cv2.GaussianBlur(mask.astype(np.float32), (0, 0), _RIM_PX))]
-    out += [_outward(cv2.GaussianBlur(mask.astype(np.float32), (0, 0), part * radius)) for part in _DEEPER]
+    out = [_outward_of(mask, sigma) for sigma in (_RIM_PX, *(part * radius for part in _DEEPER))]
     out.append(_outward(cv2.GaussianBlur(np.minimum(depth, _PLATEAU * radius), (0, 0), 2.0)))
     rim, *deeper = (_turned(slope[seen], way[seen]) for way in out)
     spread = float(np.sqrt(np.mean([(other - rim) ** 2 for other in deeper])))
@@ -103,6 +103,17 @@ def measure(
 def _outward(inside: Floats) -> NDArray[np.complex128]:
     """The way out of a picture that is larger further in, (H, W) as x + iy, y up, as long as its slope."""
     return np.asarray(-cv2.Sobel(inside, cv2.CV_64F, 1, 0) + 1j * cv2.Sobel(inside, cv2.CV_64F, 0, 1))
+
+
+def _outward_of(mask: Bools, sigma: float) -> NDArray[np.complex128]:
+    """`_outward` of a mask blurred by `sigma` px; where that is much, on a grid as much coarser."""
+    step = max(1, int(sigma / _FINE_PX))
+    height, width = mask.shape
+    small = cv2.resize(mask.astype(np.float32), (-(-width // step), -(-height // step)), interpolation=cv2.INTER_AREA)
+    way = _outward(cv2.GaussianBlur(small, (0, 0), sigma / step))
+    if step == 1:
+        return way
+    return np.asarray(cv2.resize(way.view(np.float64).reshape(*way.shape, 2), (width, height)) @ np.array([1, 1j]))
 
 
 def _turned(slope: NDArray[np.complex128], out: NDArray[np.complex128]) -> float:
