@@ -104,8 +104,8 @@ def sync(target: Path) -> None:
 
 def discard(target: Path) -> None:
     """Remove a file or folder, whatever stands in the way."""
-    if target.is_dir():
-        shutil.rmtree(target, ignore_errors=True)
-    else:
-        with suppress(OSError):  # the failure that led here is the one to tell
+    with suppress(OSError):  # the failure that led here is the one to tell
+        if target.is_dir():
+            shutil.rmtree(target, ignore_errors=True)
+        else:
             target.unlink()

@@ -48,6 +48,11 @@ def test_refusals_of_the_disk_are_one_line(
     assert names(tmp_path) == []
 
 
+def test_a_name_too_long_is_told_and_not_what_cleaning_up_met(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="the name is too long"), atomic.path(tmp_path / ("a" * 250)) as temporary:
+        temporary.write_bytes(b"abc")
+
+
 def test_file_in_place_of_a_folder_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(StorageError, match="file"), atomic.path(tmp_path / "file" / "a.bin") as temporary:
