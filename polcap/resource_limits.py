@@ -1,9 +1,11 @@
 """In: how much of the machine a command may take. Out: that limit, set for this process."""
 
-import math
 import os
+from typing import Any
 
 from polcap.errors import SettingError
+
+_MOST_GB = 1e9  # beyond what any system counts
 
 
 def set_threads(count: int) -> None:
@@ -16,15 +18,41 @@ def set_threads(count: int) -> None:
         cv2.setNumThreads(count)
 
 
+def check_memory(gigabytes: float) -> None:
+    """Whether `set_memory` can set this limit.
+
+    Raises
+    ------
+    SettingError
+        It is no amount of memory, or the system knows no such limit.
+    """
+    if not 0 <= gigabytes <= _MOST_GB:
+        raise SettingError(f"--memory {gigabytes:g}: give a number of GB up to {_MOST_GB:g}, or leave it out")
+    if gigabytes:
+        _resource(gigabytes)
+
+
 def set_memory(gigabytes: float) -> None:
-    """Beyond this much of its own memory (mapped files apart) the process fails at once, and says so; 0 sets none."""
+    """Beyond this much of its own memory (mapped files apart) the process fails at once, and says so; 0 sets none.
+
+    Raises
+    ------
+    SettingError
+        As of `check_memory`.
+    """
+    check_memory(gigabytes)
     if not gigabytes:
         return
-    if not math.isfinite(gigabytes):
-        raise SettingError(f"--memory {gigabytes}: give a number of GB, or leave it out")
+    resource = _resource(gigabytes)
+    size, most = int(gigabytes * 1e9), resource.getrlimit(resource.RLIMIT_DATA)[1]
+    if most != resource.RLIM_INFINITY:  # of the machine's owner: never raised
+        size = min(size, most)
+    resource.setrlimit(resource.RLIMIT_DATA, (size, most))
+
+
+def _resource(gigabytes: float) -> Any:
     try:
         import resource
     except ImportError as error:
         raise SettingError(f"--memory {gigabytes:g}: this system knows no such limit; leave it out") from error
-    size = int(gigabytes * 1e9)
-    resource.setrlimit(resource.RLIMIT_DATA, (size, resource.getrlimit(resource.RLIMIT_DATA)[1]))
+    return resource

@@ -1,7 +1,6 @@
 """In: units. Out: their records, from processes of this machine that are replaced when one of them dies."""
 
 import multiprocessing
-import os
 import signal
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -9,6 +8,7 @@ from dataclasses import dataclass
 from multiprocessing import connection
 from typing import Any
 
+from polcap import resource_limits
 from polcap.batch import unit as units
 from polcap.batch.unit import Order, Record, Unit
 
@@ -103,14 +103,5 @@ def _serve(pipe: connection.Connection, order: Order) -> None:
 
 def prepare(order: Order) -> None:
     """Threads and memory of this process."""
-    if order.threads:
-        for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-            os.environ[name] = str(order.threads)
-        import cv2
-
-        cv2.setNumThreads(order.threads)
-    if order.memory_gb:
-        import resource
-
-        size = int(order.memory_gb * 1e9)
-        resource.setrlimit(resource.RLIMIT_DATA, (size, resource.getrlimit(resource.RLIMIT_DATA)[1]))
+    resource_limits.set_threads(order.threads)
+    resource_limits.set_memory(order.memory_gb)

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from polcap import terminal
+from polcap import resource_limits, terminal
 from polcap.cli import options
 from polcap.cli.options import Angles, Assignments, ConfigFile, Device, Estimator, Json, Model, NoChart
 
@@ -50,6 +50,7 @@ def batch(
     from polcap import config as settings
     from polcap.batch import job_files, shards, unit
 
+    resource_limits.check_memory(memory)
     if model is not None or estimator == "network":
         _check_model(estimator, model)
     if write_jobs is not None:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from polcap import terminal
-from polcap.cli import limits, options
+from polcap import resource_limits, terminal
+from polcap.cli import options
 from polcap.cli.options import Angles, Assignments, ConfigFile, Device, Estimator, Json, Model, NoChart
 from polcap.errors import GateError, InputError, SettingError
 
@@ -60,14 +60,14 @@ def process(
     if (finished := unchanged.find(target, request)) is not None:
         _tell_finished(finished, target, json)
         return
-    limits.set_threads(threads)  # before the libraries that start them
+    resource_limits.set_threads(threads)  # before the libraries that start them
     beside = ThreadPoolExecutor(1)
     first = beside.submit(_understood, capture, options.angles_deg(angles))  # in the child, while all else is imported
     beside.shutdown(wait=False)
     from polcap import config as settings
     from polcap.path import STAGES
 
-    limits.set_memory(memory)
+    resource_limits.set_memory(memory)
     for flag, stage in (("--until", until), ("--force", force)):
         if stage is not None and stage not in STAGES:
             raise SettingError(f"{flag} {stage}: no such stage; choose one of {', '.join(STAGES)}")
