@@ -73,7 +73,7 @@ def _captures(root: Path) -> Iterator[str]:
 
 
 def _unit(root: Path, folder: Path, out: Path | None, desk: str) -> Unit:
-    name = str(folder.relative_to(root)) if folder != root else folder.resolve().name
+    name = folder.relative_to(root).as_posix() if folder != root else folder.resolve().name
     target = folder / layouts.OUTPUT if out is None else out / name
     return Unit(name, str(folder), str(target), desk)
 

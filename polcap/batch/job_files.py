@@ -168,7 +168,8 @@ def _user() -> str:
 def _snakemake(job: Job, folder: Path) -> str:
     """Snakemake; one rule instance per shard, done when its mark is there."""
     mark = str(folder / "done" / "{k}-of-").replace('"', '\\"') + str(job.shards)
-    shell = job.shell("@/" + str(job.shards)).replace("{", "{{").replace("}", "}}").replace("@/", "{wildcards.k}/", 1)
+    before, _, after = job.shell("@/" + str(job.shards)).replace("{", "{{").replace("}", "}}").rpartition("@/")
+    shell = f"{before}{{wildcards.k}}/{after}"
     return "\n".join(
         [
             "rule all:",

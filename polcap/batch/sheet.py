@@ -42,13 +42,13 @@ def write(desk: Path, units: Sequence[Unit], records: Sequence[Record]) -> None:
     table.writeheader()
     table.writerows(totals["rows"])
     written = {
-        "summary.json": json.dumps(totals, ensure_ascii=False, indent=1) + "\n",
+        "summary.json": json.dumps(totals, indent=1) + "\n",
         "summary.csv": text.getvalue(),
         "summary.html": _page(totals, units, records),
     }
     for name, content in written.items():
         with atomic.path(desk / name) as temporary:
-            temporary.write_text(content, encoding="utf-8")
+            temporary.write_text(content, encoding="utf-8", errors="backslashreplace")  # names of folders are bytes
 
 
 def _page(totals: dict[str, Any], units: Sequence[Unit], records: Sequence[Record]) -> str:

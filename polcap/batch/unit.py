@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 import socket
+import sys
 import time
 import traceback
 from dataclasses import asdict, dataclass, field, replace
@@ -19,11 +20,12 @@ import msgspec
 
 from polcap import __version__
 from polcap.errors import InputError, PolcapError, StorageError
-from polcap.formats import atomic, calibrations_folder, layouts
+from polcap.formats import atomic, calibrations_folder, file_name, layouts
 from polcap.images import ChartRequest, Network
 
 State = Literal["todo", "running", "interrupted", "done", "gates", "failed", "bug", "crashed"]
 FINISHED: tuple[State, ...] = ("done", "gates")  # the asset is there
+_SYNCHRONIZE, _WAIT_TIMEOUT = 0x00100000, 0x102  # Windows: winnt.h, winbase.h
 FOLDER = layouts.BATCH  # in ROOT or in --out: records, thumbnails, summary, job files; safe to delete
 
 
@@ -39,7 +41,8 @@ class Unit:
     @property
     def slug(self) -> str:
         """A file name of its own for every capture."""
-        return f"{Path(self.capture).name[:80]}-{hashlib.blake2b(self.name.encode(), digest_size=4).hexdigest()}"
+        digest = hashlib.blake2b(os.fsencode(self.name), digest_size=4).hexdigest()  # names of folders are bytes
+        return f"{file_name.safe(Path(self.capture).name)}-{digest}"
 
     @property
     def record_file(self) -> Path:
@@ -184,7 +187,7 @@ def read_record(unit: Unit) -> Record:
 
 def write_record(unit: Unit, record: Record) -> None:
     with atomic.path(unit.record_file) as temporary:
-        temporary.write_text(json.dumps(asdict(record), ensure_ascii=False) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(asdict(record)) + "\n", encoding="utf-8")
 
 
 def crashed(unit: Unit, why: str, attempt: int) -> Record:
@@ -195,9 +198,17 @@ def crashed(unit: Unit, why: str, attempt: int) -> Record:
 
 
 def _alive(pid: int) -> bool:
+    if sys.platform == "win32":  # there signal 0 is Ctrl-C
+        import ctypes
+
+        kernel = ctypes.windll.kernel32
+        handle = kernel.OpenProcess(_SYNCHRONIZE, False, pid)
+        runs = bool(handle) and kernel.WaitForSingleObject(handle, 0) == _WAIT_TIMEOUT
+        kernel.CloseHandle(handle)
+        return runs
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
         return True

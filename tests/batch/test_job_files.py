@@ -53,6 +53,12 @@ def test_kubernetes_job_is_valid(job: Job, tmp_path: Path) -> None:
     validate.validate(document, validate.latest_version(), strict=True)
 
 
+def test_snakefile_takes_a_root_as_it_is_called(tmp_path: Path) -> None:
+    root = Path("/shows/me@/raw")
+    text = written("snakemake", Job(job_files.command(root, {}), root, 12), tmp_path)
+    assert f"polcap batch {root} --shard {{wildcards.k}}/12" in text
+
+
 def test_snakefile_plans_every_shard(job: Job, tmp_path: Path) -> None:
     written("snakemake", job, tmp_path)
     tool = shutil.which("snakemake", path=str(Path(sys.executable).parent)) or shutil.which("snakemake")

@@ -1,0 +1,57 @@
+"""A unit's record, whatever its folder is called and whatever became of its process."""
+
+import ctypes
+import json
+import os
+import socket
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from polcap import batch
+from polcap.batch import sheet
+from polcap.batch import unit as one
+
+ANALYTIC = one.Order({}, estimator="analytic")
+
+
+def only_unit(root: Path, name: str) -> one.Unit:
+    try:
+        (root / name / "pol000").mkdir(parents=True)
+    except OSError as error:
+        pytest.skip(f"this file system has no such name ({error.strerror})")
+    (unit,) = batch.find(root)
+    return unit
+
+
+@pytest.mark.parametrize(
+    "name", [os.fsdecode(b"bad\xff"), "\N{CJK UNIFIED IDEOGRAPH-5B57}" * 84], ids=["bytes", "long"]
+)
+def test_a_capture_of_any_name_is_recorded(tmp_path: Path, name: str) -> None:
+    unit = only_unit(tmp_path, name)
+    record = one.run(unit, ANALYTIC)
+    assert record.state == "failed" and "holds no photograph" in record.says
+    assert one.read_record(unit) == record
+    sheet.write(Path(unit.desk), [unit], [record])
+    (row,) = json.loads((Path(unit.desk) / "summary.json").read_text(encoding="utf-8"))["rows"]
+    assert row["name"] == name
+
+
+@pytest.mark.parametrize(("handle", "waited", "alive"), [(0, 0, False), (7, 0x102, True), (7, 0, False)])
+def test_windows_is_asked_without_a_signal(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, handle: int, waited: int, alive: bool
+) -> None:
+    """There `os.kill(pid, 0)` would be Ctrl-C to the batch that is asked about."""
+    unit = only_unit(tmp_path, "obj")
+    one.write_record(unit, one.Record("obj", "running", host=socket.gethostname(), pid=4711))
+    kernel = SimpleNamespace(
+        OpenProcess=lambda access, inherit, pid: handle if pid == 4711 else 0,
+        WaitForSingleObject=lambda opened, milliseconds: waited,
+        CloseHandle=lambda opened: True,
+    )
+    monkeypatch.setattr(ctypes, "windll", SimpleNamespace(kernel32=kernel), raising=False)
+    monkeypatch.setattr(os, "kill", lambda *_: pytest.fail("a signal was sent"))
+    monkeypatch.setattr(sys, "platform", "win32")
+    assert one.read_record(unit).state == ("running" if alive else "interrupted")
