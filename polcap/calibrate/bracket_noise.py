@@ -21,6 +21,7 @@ from polcap.calibrate import photon_transfer
 from polcap.calibrate.photographs import CLIP, Photograph, listed
 from polcap.calibration_values import NoiseLine
 from polcap.errors import CaptureError
+from polcap.formats import layouts
 from polcap.images import Floats
 from polcap.stages.hdr import exposure, noise, planes, registration
 from polcap.stages.hdr.planes import Signals
@@ -42,10 +43,11 @@ class _Tiles:
     part: NDArray[np.int_]  # (T,) of the picture
 
 
-def rooms(folder: Path) -> list[Path]:
+def _rooms(folder: Path) -> list[Path]:
     """`bracket/` itself where it holds photographs, and each of its sub-folders: one bracket each."""
-    inner = sorted(path for path in folder.iterdir() if path.is_dir())
-    return [folder, *inner] if any(path.is_file() for path in folder.iterdir()) else inner
+    there = layouts.children(folder)
+    inner = [path for path in there if path.is_dir()]
+    return [folder, *inner] if len(inner) < len(there) else inner
 
 
 def brackets(folder: Path) -> list[list[Photograph]]:
@@ -56,7 +58,7 @@ def brackets(folder: Path) -> list[list[Photograph]]:
     CaptureError
         There is none.
     """
-    found = [listed(place) for place in rooms(folder)]
+    found = [listed(place) for place in _rooms(folder)]
     if not found:
         raise CaptureError(f"{folder}: holds no bracket; put the exposures of one still scene into it")
     return [sorted(one, key=lambda shot: shot.exif.relative_exposure or 0.0) for one in found]

@@ -40,14 +40,11 @@ def listed(folder: Path) -> list[Photograph]:
     Raises
     ------
     CaptureError
-        There is none.
+        There is none, or the folder cannot be listed.
     """
-    try:
-        files = sorted((path for path in folder.iterdir() if path.is_file()), key=lambda one: layouts.natural(one.name))
-    except OSError as error:
-        raise CaptureError(f"{folder}: cannot be listed ({error.strerror}); check the folder") from None
+    files = [path for path in layouts.children(folder) if path.is_file()]
     found = []
-    for path in files:
+    for path in sorted(files, key=lambda one: layouts.natural(one.name)):
         known = probe.read(path)
         if known.kind == "raw":
             found.append(Photograph(path, known.exif, known.digest))
@@ -58,7 +55,7 @@ def listed(folder: Path) -> list[Photograph]:
 
 def inside(folder: Path, prefix: str) -> list[tuple[float, Path]]:
     """Sub-folders such as pol022.5, with the angle that their names state [degrees], by angle."""
-    found = [(angle_of(path.name, prefix), path) for path in folder.iterdir() if path.is_dir()]
+    found = [(angle_of(path.name, prefix), path) for path in layouts.children(folder) if path.is_dir()]
     return sorted((angle, path) for angle, path in found if angle is not None)
 
 

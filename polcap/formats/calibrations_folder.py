@@ -23,6 +23,7 @@ def folder() -> Path:
 def files() -> list[Path]:
     """All calibration files of the user, by name."""
     try:
-        return sorted(path for path in folder().iterdir() if path.suffix == ".toml" and path.is_file())
+        there = [path for path in folder().iterdir() if path.suffix == ".toml" and path.is_file()]
+        return sorted(path for path in there if not path.name.startswith("."))  # ._ of macOS, .part of a killed run
     except OSError:
         return []

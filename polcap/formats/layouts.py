@@ -72,7 +72,7 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None) 
         return _folders(folder, sub_folders, angles_deg)
     listing = _list(folder)
     if not listing.pictures:
-        inside = [path.name for path in _children(folder) if path.is_dir()]
+        inside = [path.name for path in children(folder) if path.is_dir()]
         hint = (
             f"; its sub-folders are {', '.join(inside[:4])}, but polcap looks for pol000, pol045, …" if inside else ""
         )
@@ -143,18 +143,18 @@ def _folders(folder: Path, sub_folders: dict[float, Path], angles_deg: Sequence[
     crossed = _crossed(folder)
     beside = sorted(
         path.name
-        for path in _children(folder)
+        for path in children(folder)
         if path.is_dir() and path not in sub_folders.values() and path.name not in OURS and not _is_crossed(path.name)
     )
     notes += [f"not used: the folders {', '.join(beside)}"] if beside else []
-    loose = sorted(path.name for path in _children(folder) if path.is_file() and path.name != capture_toml.NAME)
+    loose = sorted(path.name for path in children(folder) if path.is_file() and path.name != capture_toml.NAME)
     notes += [f"not used: the files {', '.join(loose[:4])}{', …' if len(loose) > 4 else ''}"] if loose else []
     return Plan("folders", _select(folder, groups, angles_deg), crossed, tuple(notes))
 
 
 def _crossed(folder: Path) -> tuple[Source, ...]:
     """The photographs of cross/ or cross045/, whose number is the angle of the filter before the lens."""
-    places = [path for path in _children(folder) if path.is_dir() and _is_crossed(path.name)]
+    places = [path for path in children(folder) if path.is_dir() and _is_crossed(path.name)]
     if len(places) > 1:
         raise CaptureError(f"{places[1]}: {places[0].name} holds a cross-polarised shot too; keep one of the two")
     if not places:
@@ -180,7 +180,7 @@ def is_angle_folder(name: str) -> bool:
 
 def _pol_folders(folder: Path) -> dict[float, Path]:
     found: dict[float, Path] = {}
-    for path in _children(folder):
+    for path in children(folder):
         match = _POL_FOLDER.fullmatch(path.name) if path.is_dir() else None
         if match:
             angle = float(match[1])
@@ -296,7 +296,7 @@ def different(angles_deg: Iterable[float]) -> int:
 def _list(folder: Path) -> _Listing:
     """The photographs of one folder; where a RAW is there, the finished pictures stand back."""
     listing = _Listing()
-    found = [Source(path, _probe(path)) for path in _children(folder) if path.is_file()]
+    found = [Source(path, _probe(path)) for path in children(folder) if path.is_file()]
     pictures = [source for source in found if source.probe.kind in ("raw", "photo")]
     raws = [source for source in pictures if source.probe.kind == "raw"]
     if raws and len(raws) < len(pictures):
@@ -319,7 +319,14 @@ def _probe(path: Path) -> Probe:
     return found
 
 
-def _children(folder: Path) -> list[Path]:
+def children(folder: Path) -> list[Path]:
+    """What lies in a folder, by name, without what systems hide there: .DS_Store, ._DSC0001.NEF.
+
+    Raises
+    ------
+    CaptureError
+        It cannot be listed.
+    """
     try:
         return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     except OSError as error:

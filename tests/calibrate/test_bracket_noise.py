@@ -54,6 +54,14 @@ def test_a_single_exposure_is_told(capture, tmp_path):
         bracket_noise.measure(bracket_noise.brackets(tmp_path))
 
 
+def test_what_systems_hide_in_folders_is_no_photograph(capture, tmp_path):
+    shutil.copytree(capture / "pol000", tmp_path / "one")
+    for hidden in (tmp_path / ".DS_Store", tmp_path / "one" / "._frame_1.DNG"):
+        hidden.write_bytes(b"\0\5\x16\7")
+    (bracket,) = bracket_noise.brackets(tmp_path)
+    assert len(bracket) == 3
+
+
 def test_an_empty_folder_is_told(tmp_path):
     with pytest.raises(CaptureError, match="holds no bracket"):
         bracket_noise.brackets(tmp_path)

@@ -35,6 +35,12 @@ def users(tmp_path, monkeypatch) -> Path:
     return tmp_path / "calib"
 
 
+def test_what_systems_hide_beside_a_calibration_is_none(users):
+    path = calibrations.write(users, KNOWN)
+    (users / f"._{path.name}").write_bytes(b"\0\5\x16\7")
+    assert calibrations.choose(EXIF, None, None)[0] == KNOWN
+
+
 def test_calibration_comes_back_as_it_went(users):
     path = calibrations.write(users, KNOWN)
     assert calibrations.read(path) == KNOWN
