@@ -47,7 +47,7 @@ def process(
     InputError
         Anything at fault with what the user gave, from the stage that saw it.
     """
-    _check_separate(out, Path(capture.folder))
+    _check_out(out, Path(capture.folder))
     store = Store(out, progress, force)
     with store.lock():
         sweep(out)
@@ -164,8 +164,12 @@ def sweep(out: Path) -> None:
             atomic.discard(left)
 
 
-def _check_separate(out: Path, photographs: Path) -> None:
-    """The result never lands among the photographs, nor where a later run would look for some."""
+def _check_out(out: Path, photographs: Path) -> None:
+    """The result never lands among the photographs, nor where a later run would look for some; every format can go."""
+    try:
+        os.fspath(out).encode()
+    except UnicodeEncodeError:
+        raise SettingError(f"--out {out} is no UTF-8 text, as OpenEXR wants it; name another with --out") from None
     here, there = Path(os.path.realpath(out)), Path(os.path.realpath(photographs))
     if here == there:
         raise SettingError(f"--out {out} is the capture itself; choose a folder of its own")

@@ -53,6 +53,28 @@ def test_a_hostile_capture_toml_is_one_line(polcap: Command, capture: Path, text
     refused(polcap("process", capture, "--dry-run"), words)
 
 
+@pytest.fixture
+def nameless(capture: Path) -> Path:
+    """The capture in a folder whose name is no text."""
+    try:
+        return capture.rename(capture.with_name(os.fsdecode(b"bad\xff")))
+    except OSError as error:
+        pytest.skip(f"this file system has no such name ({error.strerror})")
+
+
+def test_a_result_folder_whose_name_is_no_text_is_refused_before_work(nameless: Path) -> None:
+    refused(shell("process", nameless), "is no UTF-8 text", "--out")
+    assert not (nameless / "polcap").exists()
+
+
+def test_a_capture_whose_name_is_no_text_gets_its_result_elsewhere(
+    polcap: Command, nameless: Path, spoilt: Path
+) -> None:
+    done = polcap("process", nameless, "--out", spoilt, "--estimator", "analytic")
+    assert done.returncode == 0, done.stderr
+    assert json.loads((spoilt / "report.json").read_text())["capture"]["folder"] == str(nameless)
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names")
 def test_a_pipe_as_capture_toml_is_not_waited_for(polcap: Command, capture: Path) -> None:
     os.mkfifo(capture / "capture.toml")

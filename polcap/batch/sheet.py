@@ -42,7 +42,7 @@ def write(desk: Path, units: Sequence[Unit], records: Sequence[Record]) -> None:
     table.writeheader()
     table.writerows(totals["rows"])
     written = {
-        "summary.json": json.dumps(totals, indent=1) + "\n",
+        "summary.json": json.dumps(totals, ensure_ascii=False, indent=1) + "\n",
         "summary.csv": text.getvalue(),
         "summary.html": _page(totals, units, records),
     }

@@ -61,7 +61,7 @@ def write(path: Path, facts: Mapping[str, Any], files: Iterable[Path]) -> None:
     digests = {file.name: photo_bytes.digest(file.read_bytes()) for file in sorted(files)}
     with atomic.path(path) as temporary:
         text = json.dumps({**facts, "files": digests}, indent=1, ensure_ascii=False)
-        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")  # names of files are bytes
 
 
 def _plain(value: Any) -> str:

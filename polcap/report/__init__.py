@@ -254,7 +254,8 @@ def write(folder: Path, about: dict[str, Any], results: Results, remembered: Rem
         The folder cannot be written.
     """
     with atomic.path(folder / "report.json") as temporary:
-        temporary.write_text(json.dumps(about, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
+        text = json.dumps(about, indent=1, ensure_ascii=False, allow_nan=False)
+        temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")  # names of files are bytes
     page.write(folder, about, results, remembered)
 
 

@@ -56,6 +56,7 @@ def write(path: str | Path, title: str, body: Iterable[str], data: Mapping[str, 
             + f'\n</main>\n<script type="application/json" id="data">{_json(known)}</script>'
             f"\n<script>\n{scripts}</script>\n</html>\n",
             encoding="utf-8",
+            errors="backslashreplace",  # names of files are bytes
         )
 
 
