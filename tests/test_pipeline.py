@@ -296,3 +296,8 @@ def test_the_gallery_shows_each_result_and_stands_alone(result: Path, tmp_path: 
     text = page.read_text()
     assert text.count("data:image/webp") == 2 and text.count('<a href="copy/report.html">') == 2
     assert "http" not in text
+
+
+def test_a_start_loads_no_library_that_only_some_runs_need() -> None:
+    code = "import sys, polcap.pipeline, polcap.check; print([m for m in ('scipy', 'onnxruntime') if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

@@ -27,6 +27,8 @@ from polcap.images import (
 )
 from polcap.stages import align, cues, hdr, infer, mask, selfcal, stokes, whitebalance
 
+_LOOKS = 2  # of the network: what gates read of its maps are medians
+
 
 class Reduced:
     """What the stages make of a reduced capture; their own limits are left to the gates."""
@@ -95,7 +97,9 @@ class Reduced:
 
     @cached_property
     def maps(self) -> SurfaceMaps:
-        return infer.estimate(cues.compute(self.stokes, self.color), self.networks()[0], self.config.infer)
+        few = min(self.config.infer.symmetries, _LOOKS)
+        settings = msgspec.structs.replace(self.config.infer, symmetries=few, fine=False)
+        return infer.estimate(cues.compute(self.stokes, self.color), self.networks()[0], settings)
 
     @property
     def clipped(self) -> Floats:

@@ -18,10 +18,11 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from array_api_compat import array_namespace, device
+from array_api_compat import device
 
 from polcap.images import Floats
 from polcap.optics import fresnel
+from polcap.optics.namespace import array_namespace
 
 _COSINES = np.linspace(0, 1, 49)
 _ALPHAS = np.linspace(0, 1, 21)

@@ -8,10 +8,10 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from array_api_compat import array_namespace
 from numpy.typing import NDArray
 
 from polcap.images import Floats
+from polcap.optics.namespace import array_namespace
 
 # Linear Rec.709 → CIE XYZ (white: Y = 1), IEC 61966-2-1:1999.
 REC709_TO_XYZ = np.array(

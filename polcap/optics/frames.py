@@ -9,9 +9,9 @@ torch; vectors on the last axis.
 from typing import Any
 
 import numpy as np
-from array_api_compat import array_namespace
 
 from polcap.images import Floats, View
+from polcap.optics.namespace import array_namespace
 
 
 def rays(view: View, height: int, width: int) -> Floats:

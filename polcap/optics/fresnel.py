@@ -11,7 +11,7 @@ Atkinson & Hancock, Recovery of surface orientation from diffuse polarization, I
 
 from typing import Any
 
-from array_api_compat import array_namespace
+from polcap.optics.namespace import array_namespace
 
 
 def transmission(c: Any, ior: Any) -> tuple[Any, Any]:

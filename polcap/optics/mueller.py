@@ -6,7 +6,7 @@ sees the picture, so S1 > 0 is horizontal and S2 > 0 is 45° up-right. Works on 
 
 from typing import Any
 
-from array_api_compat import array_namespace
+from polcap.optics.namespace import array_namespace
 
 
 def analyzer(angle: Any, extinction_ratio: float = float("inf")) -> Any:

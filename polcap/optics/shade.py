@@ -13,10 +13,9 @@ Baek et al., Simultaneous acquisition of polarimetric SVBRDF and normals, SIGGRA
 from math import pi
 from typing import Any
 
-from array_api_compat import array_namespace
-
 from polcap.optics import body as bodies
 from polcap.optics import brdf, frames, fresnel
+from polcap.optics.namespace import array_namespace
 
 _LEAST_COSINE = 1e-4
 

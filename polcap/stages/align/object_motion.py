@@ -11,7 +11,7 @@ from polcap.images import Alignment, AngleStack, Floats, ObjectMask
 from polcap.stages.align.following import Detail, Scale, fine, likeness, refine, sigma_at, to_full_grid
 
 _DETAIL_PX = 4.0  # as `align.detail_px`
-_MOST_PIXELS = 1.5e6  # a larger picture is averaged down first
+_MOST_PIXELS = 0.8e6  # a larger picture is averaged down first
 _BEYOND_PX = 6  # around the object, where its outline still tells
 _SURE_LIKENESS = 0.6  # of detail, from which a region is known to have been followed
 _OTHER_LIKENESS = 0.4  # of the object, below which it is another, or too far away

@@ -6,10 +6,9 @@ namespace comes from the arguments, no cv2, no torch. Pixel axes are (..., H, W)
 
 from typing import Any
 
-from array_api_compat import array_namespace
-
 from polcap.images import ColorCalibration, Cues, Quality, StokesImage
 from polcap.optics import frames, fresnel
+from polcap.optics.namespace import array_namespace
 from polcap.stages import stage
 from polcap.stages.cues import scale
 

@@ -87,7 +87,9 @@ def share(ambient: Ambient, flash: Floats) -> float:
 
 def noise_of(light: Floats, line: noise.Noise, cfa: Bits | None) -> Floats:
     """Noise of pixels of known expected signal (C, h, w); cfa where they were interpolated from it, not binned."""
-    expected = np.stack([line.of(c, plane) for c, plane in enumerate(light)])
+    expected = np.empty_like(light)
+    for c, plane in enumerate(light):
+        line.of(c, plane, expected[c])
     if cfa is None:
         return expected
     expected[1] *= 2  # binned green is the mean of two photosites

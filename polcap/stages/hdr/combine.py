@@ -151,7 +151,8 @@ class Mixture:
         steep = _edges(self.measured.estimate, rows) if any(f.misfit.any() for f in self.frames) else None
         for frame in self.frames:
             sample, noise_ = frame.signals.rows(rows), self._noise(frame, rows, steep)
-            trust = np.maximum(frame.serves[rows], frame.least)
+            serves = frame.serves[rows]
+            trust: Floats | np.float32 = np.float32(1) if serves.all() else np.maximum(serves, frame.least)
             if not frame.last:
                 trust = trust * self._ramp(frame, estimate)
             for c, v in enumerate(noise_):
@@ -178,7 +179,9 @@ class Mixture:
 
     def _noise(self, frame: _Frame, rows: slice, steep: Floats | None) -> Floats:
         """Expected variance of a frame's radiance, (C, h, W)."""
-        light = np.stack([plane * r for plane, r in zip(self.measured.estimate[:, rows], frame.ratio)])
+        light = np.empty_like(self.measured.estimate[:, rows])
+        for plane, estimate, ratio in zip(light, self.measured.estimate[:, rows], frame.ratio):
+            np.multiply(estimate, ratio, out=plane)
         if self.ambient is not None:
             light += frame.lit * np.maximum(self.ambient.value[:, rows], 0)
         out = ambients.noise_of(light, frame.noise, frame.cfa)

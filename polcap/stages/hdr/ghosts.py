@@ -58,11 +58,11 @@ class Anchor:
 
     def variance(self, level: Floats, channel: int, rows: slice) -> Floats:
         """Noise of one pixel of the given rows in a channel, for an expected radiance `level` (h, W)."""
-        own = self._reference.noise.of(channel, level)
-        if self._dark is None:
+        own, seen = self._reference.noise.of(channel, level), self._reference.signals.usable[rows]
+        if self._dark is None or seen.all():
             return own
         r = self._dark.ratio[channel]
-        return np.where(self._reference.signals.usable[rows], own, self._dark.noise.of(channel, level * r) / r**2)
+        return np.where(seen, own, self._dark.noise.of(channel, level * r) / r**2)
 
     def ghosts(self, frame: Exposed, misfit: Floats, gain: float) -> Bools:
         """Pixels (H, W) where a frame differs over a whole window by more than noise, misfit and flare.
@@ -117,26 +117,34 @@ class FirstEstimate:
         halo = 2 * (_WINDOW // 2)  # the spread is a window of distances to the mean of a window
         for rows, inner, target in blocks(out.shape[1], halo):
             values = [frame.signals.rows(rows) for frame, _ in self._parts]
-            serves = [serve[rows].astype(np.float32) for _, serve in self._parts]
-            stand_in = otherwise.rows(rows)
+            serves = [_weight(serve[rows]) for _, serve in self._parts]
             clear = ~ghost[rows]
+            everywhere = bool(clear.all()) and any(np.ndim(serve) == 0 for serve in serves)
+            stand_in = None if everywhere else otherwise.rows(rows)
             for c in range(len(out)):
-                number, exposure, floor = (np.zeros(clear.shape, np.float32) for _ in range(3))
+                number = np.zeros(clear.shape, np.float32)
+                exposure: Floats | np.float32 = np.float32(0)
+                floor: Floats | np.float32 = np.float32(0)
                 for (frame, _), value, serve in zip(self._parts, values, serves):
                     electrons = serve * (np.float32(1) / frame.noise.slope[c])
                     number += electrons * value[c]
-                    exposure += electrons * frame.ratio[c]
-                    electrons *= electrons
-                    electrons *= frame.noise.floor[c]
-                    floor += electrons
-                served = (exposure > 0) & clear
+                    exposure = exposure + electrons * frame.ratio[c]
+                    floor = floor + electrons * electrons * frame.noise.floor[c]
                 number /= np.maximum(exposure, np.float32(1e-20))
-                x = np.where(served, number, stand_in[c])
-                out[c, target] = _wiener(x, np.where(served, exposure, np.float32(1e15)), floor)[inner]
+                if stand_in is not None:
+                    served = (exposure > 0) & clear
+                    number = np.where(served, number, stand_in[c])
+                    exposure = np.where(served, exposure, np.float32(1e15))
+                out[c, target] = _wiener(number, exposure, floor)[inner]
         return out
 
 
-def _wiener(x: Floats, electrons: Floats, floor: Floats) -> Floats:
+def _weight(serves: Bools) -> Floats | np.float32:
+    """Where a frame serves, 1, else 0: (h, w), or one number where it serves everywhere."""
+    return np.float32(1) if serves.all() else serves.astype(np.float32)
+
+
+def _wiener(x: Floats, electrons: Floats | np.float32, floor: Floats | np.float32) -> Floats:
     """Smoothed (h, w): `electrons` per unit of x, `floor` the read noise's variance in electrons."""
     mean = box(x)
     distance = x - mean

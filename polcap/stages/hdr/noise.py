@@ -39,9 +39,9 @@ class Noise:
         """Of pixels whose expected signal (N, C), or any (…, C), is known; a negative one counts as 0."""
         return np.maximum(signal, 0) * self.slope + self.floor
 
-    def of(self, channel: int, signal: Floats) -> Floats:
-        """The same for one channel's picture (h, w), a new array."""
-        out = np.maximum(signal, 0)
+    def of(self, channel: int, signal: Floats, into: Floats | None = None) -> Floats:
+        """The same for one channel's picture (h, w), a new array unless one to write to is given."""
+        out: Floats = np.maximum(signal, 0, out=into)
         out *= self.slope[channel]
         out += self.floor[channel]
         return out

@@ -70,14 +70,21 @@ class Quads:
 
     def rows(self, rows: slice) -> Floats:
         """As `optics.sensor.signal`, (C, h, W), to the bit."""
+        start, stop, _ = rows.indices(self.shape[1])
+        out = np.empty((3, stop - start, self.shape[2]), np.float32)
+        self.into(rows, out)
+        return out
+
+    def into(self, rows: slice, out: Floats) -> None:
+        """The same, written to `out` (C, h, W)."""
         image = self.image
         assert image.cfa is not None
         _, height, width = self.shape
         start, stop, _ = rows.indices(height)
         if image.superpixel == 3:
             cfa = np.roll(image.cfa, -3 * start % 6, axis=0)
-            return planar(sensor.signal(replace(image, value=image.value[3 * start : 3 * stop], cfa=cfa)))
-        out = np.empty((3, stop - start, width), np.float32)
+            out[:] = np.moveaxis(sensor.signal(replace(image, value=image.value[3 * start : 3 * stop], cfa=cfa)), -1, 0)
+            return
         black = np.broadcast_to(image.black, (2, 2))
         span = np.float32(image.white - float(image.black.mean()))
         for color, plane in enumerate(out):
@@ -92,7 +99,6 @@ class Quads:
                 plane *= np.float32(1 / len(sites))
             plane -= np.float32(black[image.cfa == color].mean())
             plane /= span
-        return out
 
 
 def signals(image: SensorImage, clip: float, full: bool = False, planes_bytes: float = math.inf) -> Signals:
@@ -118,7 +124,7 @@ def signals(image: SensorImage, clip: float, full: bool = False, planes_bytes: f
         return quads
     value = np.empty(quads.shape, np.float32)
     for rows, _, _ in blocks(height):
-        value[:, rows] = quads.rows(rows)
+        quads.into(rows, value[:, rows])
     return Planes(value, usable)
 
 

@@ -14,7 +14,6 @@ that of starts that end as well elsewhere.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from polcap.images import Floats
 from polcap.optics.outline import SECTORS, Rim
@@ -109,6 +108,8 @@ def _best(ends: list[tuple[float, Floats]]) -> list[tuple[float, Floats]]:
 def _solved(around: Floats, part: Floats, inside: Floats, start: Floats, until: float) -> tuple[float, Floats]:
     """Misfit and angles (K,) of least squares from a start; of the two by 90° apart the one of body light."""
     relative = around / around.mean(axis=1, keepdims=True)
+    from scipy.optimize import least_squares  # here: importing it costs .3 s of every start
+
     end = least_squares(_residual, start, args=(relative, part, inside), method="lm", ftol=until, max_nfev=150)
     along = np.cos(2 * (part[:, None] - end.x))
     along -= along.mean(axis=1, keepdims=True)
