@@ -173,6 +173,12 @@ def _is_crossed(name: str) -> bool:
     return _CROSS_FOLDER.fullmatch(name) is not None
 
 
+def degrees(angle_deg: float) -> str:
+    """An angle 0…360 as folders of shots are named by it: 045, 022.5; to a thousandth."""
+    whole, _, rest = f"{angle_deg:.3f}".partition(".")
+    return f"{int(whole):03d}" + (f".{rest.rstrip('0')}" if rest.strip("0") else "")
+
+
 def is_angle_folder(name: str) -> bool:
     """Whether a folder of this name inside a capture holds the shots of one angle, or the crossed one."""
     return _POL_FOLDER.fullmatch(name) is not None or _is_crossed(name)

@@ -37,7 +37,7 @@ class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for angle in self.angles_deg:
             if not 0 <= angle < 360:
                 raise SettingError(f"--angles {angle:g}: not in 0 to 360 degrees; give the angle modulo 360")
-        names = [_degrees(angle) for angle in self.angles_deg]
+        names = [layouts.degrees(angle) for angle in self.angles_deg]
         if len(set(names)) < len(names):
             raise SettingError("--angles names an angle twice; take a bracket again with --repeat")
         if layouts.different(self.angles_deg) < 3:
@@ -61,7 +61,7 @@ class Slot:
     @property
     def name(self) -> str:
         """Path in the capture, without suffix."""
-        at = "" if self.angle_deg is None else f"pol{_degrees(self.angle_deg)}"
+        at = "" if self.angle_deg is None else f"pol{layouts.degrees(self.angle_deg)}"
         if self.role == "shot":
             return f"{at}/frame_{self.step + 1}"
         if self.role == "repeat":
@@ -69,11 +69,6 @@ class Slot:
         if self.role == "cross":
             return f"cross/frame_{self.step + 1}"
         return f"{self.role}/{at or self.role}"
-
-
-def _degrees(angle: float) -> str:
-    whole, _, rest = f"{angle:.3f}".partition(".")
-    return f"{int(whole):03d}" + (f".{rest.rstrip('0')}" if rest.strip("0") else "")
 
 
 def slots(order: Order, switches_flash: bool) -> tuple[Slot, ...]:

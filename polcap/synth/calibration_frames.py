@@ -12,43 +12,44 @@ import numpy as np
 from msgspec import Meta
 
 from polcap.errors import CaptureError
-from polcap.formats import atomic, dng
+from polcap.formats import atomic, dng, layouts
 from polcap.images import Exif, Floats, View
 from polcap.optics.color import REC709_TO_XYZ
-from polcap.synth import boards, forward_camera
+from polcap.synth import boards, forward_camera, lens
 from polcap.synth.forward_camera import Sensor
 
 _CFA = np.array([[0, 1], [1, 2]], np.uint8)
 _MATRIX = np.array([[0.87, -0.27, -0.075], [-0.44, 1.23, 0.235], [-0.09, 0.19, 0.69]])  # XYZ → camera
+Extinction = Annotated[float, Meta(ge=1)]  # greatest over least transmittance
 _TINT = np.array([0.8, 1.0, 0.7])  # of the light, in camera channels
 
 
 class CalibrationShoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The set-up, and how it is photographed."""
 
-    seed: int = 0
-    width: Annotated[int, Meta(ge=64, multiple_of=2)] = 384  # visible RAW px
-    height: Annotated[int, Meta(ge=64, multiple_of=2)] = 256
+    seed: Annotated[int, Meta(ge=0)] = 0
+    width: Annotated[int, Meta(ge=64, le=20000, multiple_of=2)] = 384  # visible RAW px
+    height: Annotated[int, Meta(ge=64, le=20000, multiple_of=2)] = 256
     sensor: Sensor = Sensor()
-    black_error: float = 0.0  # counts by which the sensor's black differs from the stated one
-    isos: tuple[float, ...] = (100.0, 400.0)
-    levels: tuple[float, ...] = (0.05, 0.15, 0.4, 0.8)  # of white, in the middle of green
-    power: float = 1.0  # of the exposure that the sensor follows; 1 is linear
+    black_error: Annotated[float, Meta(ge=-1000, le=1000)] = 0.0  # counts, of the sensor's black over the stated one
+    isos: tuple[Annotated[float, Meta(ge=1, le=1e6)], ...] = (100.0, 400.0)
+    levels: tuple[Annotated[float, Meta(gt=0, le=10)], ...] = (0.05, 0.15, 0.4, 0.8)  # of white, in the middle of green
+    power: Annotated[float, Meta(gt=0, le=10)] = 1.0  # of the exposure that the sensor follows; 1 is linear
     falloff: tuple[float, float, float] = (-0.25, 0.05, 0.0)  # of r², r⁴, r⁶; r = 1 in the corners
     slope: tuple[float, float] = (0.03, -0.02)  # of the flat surface's light, from the middle to the edge
     zero_deg: float = 1.7  # of the polarizer's ring
-    sense: int = 1
-    extinction: tuple[float, float, float] = (300.0, 500.0, 200.0)
-    axes_deg: tuple[float, ...] = (0.0, 30.0)  # of the polarized light
-    ring_step_deg: float = 15.0
-    ring_error_deg: float = 0.05  # 1σ of the ring's angle
-    lamp_jitter: float = 0.0005  # 1σ of a steady lamp
-    flash_jitter: float = 0.012  # 1σ of the flash
-    pops: int = 24
-    boards: Annotated[int, Meta(ge=0)] = 0  # photographs of a board from all sides
+    sense: Literal[1, -1] = 1  # 1: the ring counts as the picture does
+    extinction: tuple[Extinction, Extinction, Extinction] = (300.0, 500.0, 200.0)
+    axes_deg: tuple[Annotated[float, Meta(ge=0, le=360)], ...] = (0.0, 30.0)  # of the polarized light
+    ring_step_deg: Annotated[float, Meta(ge=1, le=180)] = 15.0
+    ring_error_deg: Annotated[float, Meta(ge=0, le=90)] = 0.05  # 1σ of the ring's angle
+    lamp_jitter: Annotated[float, Meta(ge=0, le=0.2)] = 0.0005  # 1σ of a steady lamp
+    flash_jitter: Annotated[float, Meta(ge=0, le=0.2)] = 0.012  # 1σ of the flash
+    pops: Annotated[int, Meta(ge=0, le=10000)] = 24
+    boards: Annotated[int, Meta(ge=0, le=10000)] = 0  # photographs of a board from all sides
     board: Literal["checkerboard", "chart"] = "checkerboard"
-    distortion: tuple[float, float] = (-0.12, 0.05)  # k1, k2 of the lens, see synth/lens.py; only boards show it
-    focal_mm: float = 60.0  # on a sensor 36 mm wide
+    distortion: tuple[lens.Bend, lens.Bend] = (-0.12, 0.05)  # k1, k2, see synth/lens.py; only boards show it
+    focal_mm: Annotated[float, Meta(ge=1, le=10000)] = 60.0  # on a sensor 36 mm wide
 
     @property
     def view(self) -> View:
@@ -111,7 +112,7 @@ def _frames(shoot: CalibrationShoot) -> Iterator[tuple[str, Floats, float, float
             actual = shoot.sense * (ring + shoot.ring_error_deg * random.normal()) + shoot.zero_deg
             passed = 0.5 * (1 + contrast * np.cos(2 * np.radians(actual - axis)))
             jitter = 1 + shoot.lamp_jitter * random.normal()
-            name = f"polarizer/axis{axis:05.1f}/pol{ring:05.1f}/IMG_{number:04d}.DNG"
+            name = f"polarizer/axis{layouts.degrees(axis)}/pol{layouts.degrees(ring)}/IMG_{number:04d}.DNG"
             yield name, light * (0.8 * jitter) * passed, 100.0, 0.05, False
             number += 1
 
@@ -122,9 +123,9 @@ def _surface(shoot: CalibrationShoot) -> Floats:
     x, y = x - (shoot.width - 1) / 2, y - (shoot.height - 1) / 2
     half = np.hypot(shoot.width, shoot.height) / 2
     r2 = (x**2 + y**2) / half**2
-    lens = 1 + sum(a * r2 ** (k + 1) for k, a in enumerate(shoot.falloff))
+    vignette = 1 + sum(a * r2 ** (k + 1) for k, a in enumerate(shoot.falloff))
     uneven = 1 + shoot.slope[0] * x / half + shoot.slope[1] * y / half
-    return np.asarray((lens * uneven)[..., None] * _TINT)
+    return np.asarray((vignette * uneven)[..., None] * _TINT)
 
 
 def _photograph(

@@ -5,10 +5,11 @@ References
 Granados et al., Optimal HDR reconstruction with linear digital cameras, CVPR 2010, §3.
 """
 
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from polcap.images import Bits, Floats
@@ -17,10 +18,10 @@ from polcap.images import Bits, Floats
 class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A pixel at base sensitivity."""
 
-    full_well: float = 30000.0  # e⁻ at the white level
-    read_noise: float = 3.0  # e⁻, 1σ
-    black: int = 512  # counts
-    white: int = 15871  # counts
+    full_well: Annotated[float, Meta(gt=0, le=1e9)] = 30000.0  # e⁻ at the white level
+    read_noise: Annotated[float, Meta(ge=0, le=1e6)] = 3.0  # e⁻, 1σ
+    black: Annotated[int, Meta(ge=0, lt=65535)] = 512  # counts
+    white: Annotated[int, Meta(gt=0, le=65535)] = 15871  # counts
 
 
 def mosaic(image: Floats, cfa: Bits) -> Floats:

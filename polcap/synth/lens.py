@@ -4,10 +4,14 @@ A ray at the angle whose tangent is t from the optical axis lands at f · (t + k
 The photograph's pixels ask the other way round, which is read off a fine table of that radius.
 """
 
+from typing import Annotated
+
 import numpy as np
+from msgspec import Meta
 
 from polcap.images import Floats, View
 
+Bend = Annotated[float, Meta(ge=-1, le=1)]  # k₁ or k₂
 _SAMPLES = 20001
 
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from polcap.errors import CaptureError
-from polcap.formats import atomic, dng
+from polcap.formats import atomic, dng, layouts
 from polcap.images import Exif, Floats, GBuffer, View
 from polcap.optics.color import REC709_TO_XYZ
 from polcap.synth import color_checker as charts
@@ -33,6 +33,7 @@ from polcap.synth.scenes import Kind, random_scene
 
 __all__ = ["MIDDLE_S", "Kind", "Scene", "Shoot", "Studio", "Take", "random_scene", "transform", "write"]
 
+Angle = Annotated[float, Meta(ge=0, le=360)]  # degrees, as folders are named by
 MIDDLE_S = 0.02  # exposure time of the middle frame of a bracket by time
 _SENSOR_MM = 36.0  # width
 _CFA = {
@@ -55,28 +56,38 @@ _CONVENTIONS = (
 class Shoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The camera, the polarizer and the photographer's hand."""
 
-    seed: int = 0
-    width: Annotated[int, Meta(ge=64, multiple_of=2)] = 1152  # visible RAW px
-    height: Annotated[int, Meta(ge=64, multiple_of=2)] = 864
-    focal_mm: float = 60.0  # on a sensor 36 mm wide
-    angles_deg: tuple[float, ...] = (0.0, 45.0, 90.0)  # nominal
+    seed: Annotated[int, Meta(ge=0)] = 0
+    width: Annotated[int, Meta(ge=64, le=20000, multiple_of=2)] = 1152  # visible RAW px
+    height: Annotated[int, Meta(ge=64, le=20000, multiple_of=2)] = 864
+    focal_mm: Annotated[float, Meta(ge=1, le=10000)] = 60.0  # on a sensor 36 mm wide
+    angles_deg: Annotated[tuple[Angle, ...], Meta(min_length=1)] = (0.0, 45.0, 90.0)  # nominal
     exposures: Annotated[int, Meta(ge=1, le=9)] = 3
-    step: Annotated[float, Meta(gt=1)] = 4.0  # from one exposure to the next
-    exposure_factor: Annotated[float, Meta(gt=0)] = 1.0  # of every frame, on what suits the scene; more clips gloss
+    step: Annotated[float, Meta(gt=1, le=1000)] = 4.0  # from one exposure to the next
+    exposure_factor: Annotated[float, Meta(gt=0, le=1000)] = 1.0  # on what suits the scene; more clips gloss
     bracket: Literal["time", "aperture", "iso", "flash"] = "time"  # time: steady light, else a flash fired
-    gain_jitter: float = 0.01  # 1σ of the light's energy from frame to frame, relative
-    nudge_px: float = 1.5  # the camera moves by up to this between angles
-    nudge_deg: float = 0.05  # and rolls by up to this
-    angle_error_deg: float = 0.5  # 1σ of the polarizer's angle
-    extinction_ratio: float = 1000.0
+    gain_jitter: Annotated[float, Meta(ge=0, le=0.2)] = 0.01  # 1σ of the light's energy from frame to frame, relative
+    nudge_px: Annotated[float, Meta(ge=0, le=1000)] = 1.5  # the camera moves by up to this between angles
+    nudge_deg: Annotated[float, Meta(ge=0, le=45)] = 0.05  # and rolls by up to this
+    angle_error_deg: Annotated[float, Meta(ge=0, le=90)] = 0.5  # 1σ of the polarizer's angle
+    extinction_ratio: Annotated[float, Meta(ge=1)] = 1000.0
     cross: bool = False  # one shot more, the flash polarized across the filter at the first angle
-    flash_extinction: float = 1000.0  # extinction ratio of the flash's film
-    distortion: tuple[float, float] = (0.0, 0.0)  # k1, k2 of the lens, see synth/lens.py
-    blur_px: float = 0.4  # 1σ of the lens's point spread
+    flash_extinction: Annotated[float, Meta(ge=1)] = 1000.0  # extinction ratio of the flash's film
+    distortion: tuple[lens.Bend, lens.Bend] = (0.0, 0.0)  # k1, k2 of the lens, see synth/lens.py
+    blur_px: Annotated[float, Meta(ge=0, le=50)] = 0.4  # 1σ of the lens's point spread
     samples: Annotated[int, Meta(ge=1, le=4)] = 2  # rays per pixel side
     sensor: Sensor = Sensor()
     cfa: Literal["RGGB", "BGGR", "GRBG", "GBRG", "X-Trans"] = "RGGB"
-    color_matrix: tuple[float, ...] = (0.87, -0.27, -0.075, -0.44, 1.23, 0.235, -0.09, 0.19, 0.69)  # XYZ → camera
+    color_matrix: Annotated[tuple[float, ...], Meta(min_length=9, max_length=9)] = (
+        0.87,
+        -0.27,
+        -0.075,
+        -0.44,
+        1.23,
+        0.235,
+        -0.09,
+        0.19,
+        0.69,
+    )  # XYZ → camera
 
     @property
     def view(self) -> View:
@@ -106,7 +117,7 @@ def write(folder: Path, scene: Scene, shoot: Shoot, frame_written: Callable[[int
             pose = _pose(shoot, shot)
             radiance = studio.radiance(pose, first=shot == 0)
             for frame in range(shoot.exposures):
-                name = f"{_folder_name(angle)}/IMG_{shot * shoot.exposures + frame + 1:04d}.DNG"
+                name = f"pol{layouts.degrees(angle)}/IMG_{shot * shoot.exposures + frame + 1:04d}.DNG"
                 done = studio.photograph(place / name, radiance, Take(shot, frame, _stops(shoot, frame)))
                 files.append({"file": name, "nominal_deg": angle, **pose, **done})
                 if frame_written is not None:
@@ -116,7 +127,7 @@ def write(folder: Path, scene: Scene, shoot: Shoot, frame_written: Callable[[int
             pose = _pose(shoot, shot)
             radiance = studio.crossed(pose)
             for frame in range(shoot.exposures):
-                name = f"cross{shoot.angles_deg[0]:03.0f}/IMG_{shot * shoot.exposures + frame + 1:04d}.DNG"
+                name = f"cross{layouts.degrees(shoot.angles_deg[0])}/IMG_{shot * shoot.exposures + frame + 1:04d}.DNG"
                 done = studio.photograph(place / name, radiance, Take(shot, frame, _stops(shoot, frame)))
                 files.append({"file": name, "nominal_deg": shoot.angles_deg[0], **pose, **done})
         _write_truth(place, scene, shoot, studio.buffer, studio.reference, studio.to_camera, files)
@@ -344,10 +355,6 @@ def _setting(shoot: Shoot, take: Take, middle: float) -> tuple[Exif, float, floa
         light = middle / shoot.step ** (shoot.exposures // 2)
         exif["iso"] = 100.0 * amplification
     return Exif(**exif), light, amplification
-
-
-def _folder_name(angle: float) -> str:
-    return f"pol{angle:03.0f}" if angle == round(angle) else f"pol{angle:05.1f}"
 
 
 def _write_truth(
