@@ -26,7 +26,7 @@ class Quality(IntFlag):
     """What is wrong with a pixel; bits of a uint8 map, 0 = nothing known."""
 
     CLIPPED = 1  # at or near sensor saturation in every exposure that could serve
-    DARK = 2  # radiance below twice its standard deviation
+    DARK = 2  # lost in its own noise: of a merged shot below 2σ, of S0 below `stokes.dark_sigma`
     OUTSIDE = 4  # not seen by every shot after registration
     ILL_POSED = 8  # DoLP above the physical maximum, or S0 ≤ 0
     METAL = 16  # channels disagree on the AoLP or DoLP as conductors' do

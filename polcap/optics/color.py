@@ -17,7 +17,6 @@ from polcap.optics.namespace import array_namespace
 REC709_TO_XYZ = np.array(
     [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]], dtype=np.float64
 )
-XYZ_TO_REC709 = np.linalg.inv(REC709_TO_XYZ)
 LUMINANCE = REC709_TO_XYZ[1]  # Y of linear Rec.709
 _D65 = (0.3127, 0.3290)  # xy
 _TURN = 2 * np.pi

@@ -13,7 +13,6 @@ class Manual:
     model = "by hand"
     speed_deg_s = 9.0  # a quarter turn in ten seconds, for the plan
     settle_s = 0.0
-    tolerance_deg = math.inf  # the angle typed is the angle
     unattended = False
 
     def __init__(self, log: Log) -> None:

@@ -48,7 +48,6 @@ class Rotator(Protocol):
     model: str
     speed_deg_s: float
     settle_s: float
-    tolerance_deg: float  # position read back against position asked for
     unattended: bool  # False: a person turns it
 
     def home(self) -> None:
@@ -165,7 +164,6 @@ class Driven:
         self.model = motor.model
         self.speed_deg_s = motor.speed_deg_s
         self.settle_s = drive.settle
-        self.tolerance_deg = drive.tolerance
         self._motor = motor
         self._drive = drive
         self._backlash_deg = backlash_deg

@@ -59,7 +59,7 @@ class Camera:
 
 
 class Rotator:
-    model, speed_deg_s, settle_s, tolerance_deg, unattended = "Bench", 1e9, 0.0, 0.3, True
+    model, speed_deg_s, settle_s, unattended = "Bench", 1e9, 0.0, True
 
     def home(self) -> None: ...
 

@@ -51,7 +51,7 @@ def test_delta_e_meets_the_published_pairs():
         ]
     )
     colour = colour_science.load()
-    rgb = colour.Lab_to_XYZ(pairs, [0.3127, 0.3290]) @ color.XYZ_TO_REC709.T
+    rgb = colour.Lab_to_XYZ(pairs, [0.3127, 0.3290]) @ np.linalg.inv(color.REC709_TO_XYZ).T
     assert color.delta_e(rgb[:, 0], rgb[:, 1]) == pytest.approx([2.0425, 2.3669, 4.3065, 1.2644], abs=1e-4)
 
 

@@ -26,7 +26,7 @@ ORDER = msgspec.structs.replace(pools.ORDER, rotator="simulated")
 class Turner:
     """A rotator that moves at once, `beside` what it is asked for."""
 
-    model, speed_deg_s, settle_s, tolerance_deg, unattended = "turner", 100.0, 0.0, 0.3, True
+    model, speed_deg_s, settle_s, unattended = "turner", 100.0, 0.0, True
 
     def __init__(self, beside: float = 0.0) -> None:
         self.beside = beside

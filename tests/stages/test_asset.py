@@ -107,6 +107,14 @@ def test_textures_take_the_size_asked_for(size: int, shape: tuple[int, int]) -> 
     assert other.base_color.mean((0, 1)) == pytest.approx(built.base_color.mean((0, 1)), abs=1)
 
 
+def test_the_shorter_side_of_a_sliver_keeps_a_pixel() -> None:
+    maps = surfaces.maps()
+    built = surfaces.built(maps, surfaces.mesh(maps))
+    textures = ("base_color", "occlusion_roughness_metallic", "normal", "specular_color")
+    sliver = replace(built, **{name: getattr(built, name)[:1] for name in textures})
+    assert asset.resized(sliver, 16).normal.shape == (1, 16, 3)
+
+
 def test_coverage_interpolates_as_a_renderer_does() -> None:
     """Against the barycentric formula, corner by corner, on triangles that lie anyhow."""
     rng = np.random.default_rng(3)

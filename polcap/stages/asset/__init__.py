@@ -94,7 +94,7 @@ def resized(asset: Asset, size: int) -> Asset:
     Smaller ones are means over what each pixel covers; a larger one holds no more detail than was photographed.
     """
     height, width = asset.normal.shape[:2]
-    shorter = size * min(height, width) / max(height, width)
+    shorter = max(size * min(height, width) / max(height, width), 1.0)
     other = min(size, 1 << int(np.ceil(np.log2(shorter))))
     wide, tall = (size, other) if width >= height else (other, size)
     base, orm, normal, specular = (
