@@ -12,6 +12,7 @@ The gates are right where they pass the good and speak of the others. Prints a M
 import argparse
 import os
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,12 +22,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap import models
 from polcap.config import Gates
 from polcap.formats import png
 from polcap.gates import polarization
-from polcap.images import AngleStack, Floats, ObjectMask
+from polcap.images import AngleStack, Floats, Network, ObjectMask
 from polcap.optics import fresnel, mueller
-from polcap.stages import stokes
+from polcap.stages import cues, infer, stokes
 from polcap.synth import scene_materials
 from polcap.synth.render import Seen
 from polcap.synth.scenes import random_scene
@@ -167,11 +169,17 @@ def solved(case: Lit, seed: int) -> Any:
 
 
 def _spoken(image: Any) -> dict[str, str]:
+    maps = infer.estimate(cues.compute(image, scenes.no_color()), _network(), infer.Settings(symmetries=1, fine=False))
     found = SimpleNamespace(
-        stokes=image, radiance=SimpleNamespace(angle=ANGLE), gains=scenes.equal(), names=["0°", "45°", "90°"]
+        stokes=image, radiance=SimpleNamespace(angle=ANGLE), gains=scenes.equal(), names=["0°", "45°", "90°"], maps=maps
     )
     lines = [*polarization.of_outline(found, Gates()), polarization.ill_posed(found, Gates())]
     return {line.name: line.says for line in lines if line.state in ("fail", "warn")}
+
+
+@lru_cache
+def _network() -> Network | None:
+    return models.load_network(None, None, "cpu", threads=1)
 
 
 def _dressed(material: Any, albedo: float | None, rough: float | None) -> Any:

@@ -229,7 +229,7 @@ def test_a_turn_that_the_outline_is_not_sure_of_is_not_applied():
     assert solve(dataclasses.replace(clocked, light="one exposure"), scenes.no_color()).angle_correction == 0
     cut = dataclasses.replace(scenes.ball_object(), border=0.1)
     found = selfcal.solve(clocked, scenes.still(), cut, scenes.no_color(), selfcal.Settings())
-    assert found.angle_correction == 0 and found.angle_offset_sigma == pytest.approx(np.pi / 2)
+    assert np.degrees(found.angle_correction) == pytest.approx(3.0, abs=0.3)  # the inside tells what the outline cannot
 
 
 def test_the_check_can_be_left_out():

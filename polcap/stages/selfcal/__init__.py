@@ -5,10 +5,9 @@ whole object it costs normals about 6° on average). A matt grey patch is unpola
 same in every shot (`grey_patches`); where there is no chart, the object itself says what it can (`object_gains`),
 most of it by its slopes, which are those of a height (`integrability`), and what is known of lamps and flashes the
 rest. One exposure of a polarization mosaic has one gain. The outline tells whether the angles are in order and
-counted the right way (`order`), and by how much the ring's zero is off (`ring_zero`); that is applied where it is
-sure, joined with a calibrated zero by the errors of both. Of more than three shots their closure tells which angle is
-wrong (`angle_closure`).
-Angles that nobody noted are found by `unknown_angles`.
+counted the right way (`order`), outline and inside by how much the ring's zero is off (`ring_zero`, `ring_by_slopes`);
+that is applied where it is sure, joined with a calibrated zero by the errors of both. Of more than three shots their
+closure tells which angle is wrong (`angle_closure`). Angles that nobody noted are found by `unknown_angles`.
 """
 
 from dataclasses import replace
@@ -30,6 +29,7 @@ from polcap.stages.selfcal import (
     integrability,
     object_gains,
     order,
+    ring_by_slopes,
     ring_zero,
     unknown_angles,
 )
@@ -70,7 +70,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Meta(ge=0, le=2, description="how much better another order must fit the outline to be believed"),
     ] = 0.2
     correct_ring: Annotated[
-        bool, Meta(description="turn all stated angles by what the outline says of the ring's zero, where it is sure")
+        bool, Meta(description="turn all angles by what outline and slopes say of the ring's zero, where it is sure")
     ] = True
     ring_sigmas: Annotated[
         float, Meta(ge=1, le=20, description="so many times its own error must a turn of the ring be, to be sure [1σ]")
@@ -84,7 +84,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 12.0
 
 
-@stage(version=10)
+@stage(version=11)
 def solve(
     radiance: AngleStack,
     alignment: Alignment,
@@ -133,13 +133,13 @@ def solve(
     stated: Order = (tuple(range(shots)), False)
     if settings.check_order and found.order != stated:
         raise CaptureError(_disorder(found, radiance.angle))
-    ring = ring_zero.measure(
-        value.sum(-1) / blind.gain[:, None, None],
-        quality == 0,
-        mask,
-        radiance.angle,
-        float(blind.sigma.max()),
-        object_.border > 0,
+    doubt = float(blind.sigma.max())
+    even = value.sum(-1) / blind.gain[:, None, None]
+    ring = ring_by_slopes.joined(
+        ring_zero.measure(even, quality == 0, mask, radiance.angle, doubt, object_.border > 0),
+        ring_by_slopes.measure(
+            light / blind.gain[:, None, None], object_gains.inside(mask, quality), radiance.angle, doubt
+        ),
     )
     correction = 0.0
     if radiance.light != "one exposure":

@@ -9,7 +9,7 @@ derivative z_ζ = ½(∂x − i∂y) z = ½ Δh is real, and without a square ro
 Each pixel with some curvature is an equation for the gains; near facing pixels, where w is small, δ weighs most. No
 outline is needed, nothing has to face the camera, and a ridge that leans tells as much as a ball. Where the sum is not
 positive, what is polarized there is no surface's body: nothing is told then. A common turn of the angles turns
-w_ζ² w* by the same for all pixels, and is left free.
+w_ζ² w* by the same for all pixels: here it is left free, `ring_by_slopes` asks for it.
 
 References
 ----------
@@ -30,7 +30,7 @@ from polcap.stages.selfcal.object_gains import Bools, Estimate, unknown
 
 _SHOTS = 3
 _SIDE = 110.0  # px; the root of the object's area is reduced to it, where it is larger: noise is averaged before slopes
-_BLUR = 2.0  # px of the reduced picture, 1σ of the Gaussian whose derivative is taken
+BLUR = 2.0  # px of the reduced picture, 1σ of the Gaussian whose derivative is taken
 _LEAST = 300  # pixels of the reduced object
 _IOR = 1.5
 _STEEPEST = 0.25  # DoLP up to which the law of the body is believed: 64° for index 1.5
@@ -40,7 +40,7 @@ _LAW = 0.3  # of w, relative: highlights and other indices
 _SLOPE_NOISE = 0.15  # of w_ζ, relative to its median
 _STEP = 1e-4
 _MOST_STEP = 0.03  # in one go
-_COHERENT = 0.25  # share of w_ζ² w* that is positive, below which it is no body's
+COHERENT = 0.25  # share of w_ζ² w* that is positive, below which it is no body's
 _PARTS = 4  # to a side of the object, left out one at a time
 _ERROR = 0.0013  # what gains were wrong by on simulated objects, beside (decision 40)
 _TIMES = 2.0  # their error over the scatter of the parts (decision 40)
@@ -65,18 +65,18 @@ def gains(light: Floats, usable: Bools, angle: Floats, start: Floats) -> Estimat
     shots = len(angle)
     if shots != _SHOTS:
         return unknown(shots)
-    reduced, inside = _reduced(light, usable)
-    if inside.sum() < _LEAST:
+    slopes = seen(light, usable, angle)
+    if slopes is None:
         return unknown(shots)
-    found = _settled(_Slopes(reduced, inside, angle), start)
-    if found.coherence < _COHERENT:
+    found = _settled(slopes, start)
+    if found.coherence < COHERENT:
         return unknown(shots)
     sigma = np.hypot(_TIMES * found.scatter, _ERROR) / found.coherence
     return Estimate(found.gain, np.where(np.arange(shots) > 0, sigma, 0.0))
 
 
 @dataclass(frozen=True)
-class _Slopes:
+class Slopes:
     """The shots (K, H, W), reduced, where they can be believed, and their angles (K,) rad."""
 
     light: Floats
@@ -96,6 +96,22 @@ class _Slopes:
         return slope**2 * np.conj(w) * np.exp(-2j * unknowns[-1]), w, slope
 
 
+def seen(light: Floats, usable: Bools, angle: Floats) -> Slopes | None:
+    """What is left of the shots where derivatives can be taken; None where that is next to nothing.
+
+    Parameters
+    ----------
+    light
+        (K, H, W) shots on the reference grid, little blurred.
+    usable
+        (H, W) pixels of the object that can be believed.
+    angle
+        (K,) rad, of the shots' polarizers.
+    """
+    less, inside = _reduced(light, usable)
+    return Slopes(less, inside, angle) if inside.sum() >= _LEAST else None
+
+
 @dataclass(frozen=True)
 class _Found:
     gain: Floats  # (K,)
@@ -103,16 +119,16 @@ class _Found:
     coherence: float  # −1…1
 
 
-def _settled(slopes: _Slopes, start: Floats) -> _Found:
+def _settled(slopes: Slopes, start: Floats) -> _Found:
     """Least squares by biweight, over ever smaller w."""
     unknowns: Floats = np.append(start[1:] / start[0], 0.0)
     for near in _NEAR:
-        residual, rows, trust, product = _linearized(slopes, unknowns, near)
+        residual, rows, trust, product = linearized(slopes, unknowns, near)
         step = _solved(rows, residual, trust) if near < _NEAR[0] else _untwisted(rows, residual, trust)
         unknowns = unknowns + np.clip(step, -_MOST_STEP, _MOST_STEP)
         if near == _NEAR[-1] and np.abs(step).max() < _STEP / 10:
             break
-    part = _part_of(slopes.inside)
+    part = part_of(slopes.inside)
     without = np.stack([_solved(rows, residual, trust * (part != p)) for p in np.unique(part)])
     count = len(without)
     scatter = np.sqrt((count - 1) / count * ((without - without.mean(0)) ** 2).sum(0))
@@ -121,7 +137,7 @@ def _settled(slopes: _Slopes, start: Floats) -> _Found:
     return _Found(np.append(1.0, unknowns[:-1]), np.append(0.0, scatter[:-1]), coherence)
 
 
-def _linearized(slopes: _Slopes, unknowns: Floats, near: float) -> tuple[Floats, Floats, Floats, NDArray[Any]]:
+def linearized(slopes: Slopes, unknowns: Floats, near: float) -> tuple[Floats, Floats, Floats, NDArray[Any]]:
     """Residuals (N,), their derivatives (N, K), what each is trusted, and w_ζ² w*, all in units of their noise."""
     product, w, slope = slopes.at(unknowns)
     length, size = np.abs(slope), np.abs(w)
@@ -154,14 +170,14 @@ def _reduced(light: Floats, usable: Bools) -> tuple[Floats, Bools]:
     shape = (height // block, block, width // block, block)
     means = light[:, :height, :width].reshape(len(light), *shape).mean((2, 4), dtype=np.float64)
     whole = usable[:height, :width].reshape(shape).all((1, 3)) & (means > 0).all(0)
-    reach = 2 * int(2 * _BLUR) + 1
+    reach = 2 * int(2 * BLUR) + 1
     return means, cv2.erode(whole.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
 
 
 def _derivative(w: NDArray[Any]) -> NDArray[Any]:
     """½(∂x − i∂y) w, x right, y up, by the derivative of a Gaussian."""
-    at = np.arange(-int(2 * _BLUR), int(2 * _BLUR) + 1)
-    bell = np.exp(-(at**2) / (2 * _BLUR**2))
+    at = np.arange(-int(2 * BLUR), int(2 * BLUR) + 1)
+    bell = np.exp(-(at**2) / (2 * BLUR**2))
     bell = bell / bell.sum()
     rise = at * bell / (at**2 * bell).sum()
     parts = np.ascontiguousarray(w.real), np.ascontiguousarray(w.imag)
@@ -171,7 +187,7 @@ def _derivative(w: NDArray[Any]) -> NDArray[Any]:
     return np.asarray((across[0] + 1j * across[1] + 1j * (down[0] + 1j * down[1])) / 2)  # rows run down
 
 
-def _part_of(inside: Bools) -> NDArray[np.int_]:
+def part_of(inside: Bools) -> NDArray[np.int_]:
     """Which of the parts each of the pixels (N,) is in."""
     y, x = np.nonzero(inside)
     rows, columns = ((axis - axis.min()) * _PARTS // (np.ptp(axis) + 1) for axis in (y, x))
