@@ -90,7 +90,7 @@ class Record:
                 os.replace(file, aside)
             except OSError as error:
                 raise atomic.failure(aside, error) from error
-            self.content.rejected.append(Bad(str(aside.relative_to(self.folder)), slot_name, read_deg, reason))
+            self.content.rejected.append(Bad(aside.relative_to(self.folder).as_posix(), slot_name, read_deg, reason))
             self.write()
             return aside
 
@@ -167,7 +167,7 @@ def verify(record: Record) -> list[str]:
     known = {good.file for good in record.content.frames.values()}
     for slot in record.slots:
         for file in sorted((record.folder / slot.name).parent.glob(f"{Path(slot.name).name}.*")):
-            if str(file.relative_to(record.folder)) not in known:
+            if file.relative_to(record.folder).as_posix() not in known:
                 record.reject(slot.name, file, None, "left by an interrupted run before it was checked")
                 said.append(f"{file.relative_to(record.folder)}: was not checked yet; it is taken again")
     for left in record.folder.rglob(".*.part*"):

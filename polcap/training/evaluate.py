@@ -86,7 +86,7 @@ def _digest(data: Path) -> str:
     """Of all test meshes and texture sets."""
     digest = hashlib.sha256()
     for file in sorted([*(data / "meshes" / "test").glob("*.npz"), *(data / "materials" / "test").glob("*/*")]):
-        digest.update(str(file.relative_to(data)).encode() + file.read_bytes())
+        digest.update(file.relative_to(data).as_posix().encode() + file.read_bytes())
     return digest.hexdigest()
 
 

@@ -9,6 +9,7 @@ the weights of a run in one piece follow, on one machine, from the seed.
 import csv
 import ctypes
 import queue
+import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
@@ -139,7 +140,7 @@ def main(params: Params) -> Path:
 
 def _keep_memory() -> None:
     """Tell glibc to keep what is freed: fetching the same pages anew at each step costs more than the arithmetic."""
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:  # numbers from malloc.h
         for option, value in ((-8, 1), (-4, 0), (-1, 2**31 - 1), (-2, 2**28)):  # arenas, mmaps, trim, top pad
             mallopt(option, value)
