@@ -94,6 +94,34 @@ def test_torch_and_numpy_give_the_same_channels(ball):
     assert np.allclose(found[0].numpy(), expected, atol=1e-4)
 
 
+def test_the_network_sees_what_the_names_of_its_channels_say(ball):
+    seen, length = dict(zip(cues.CHANNELS, cues.channels(ball))), np.maximum(np.hypot(*ball.ratio), 1e-9)
+    turned = ball.mask & (np.abs(ball.ratio[0]) > 0.01) & (np.abs(ball.ratio[1]) > 0.01)  # no two directions alike
+    told = {
+        "log_r": np.log(ball.radiance[..., 0] + 0.02), "log_b": np.log(ball.radiance[..., 2] + 0.02),
+        "s1": 10 * ball.ratio[0], "s2": 10 * ball.ratio[1],
+        "cos_2phi": ball.ratio[0] / length, "sin_2phi": ball.ratio[1] / length,
+        "ray_x": ball.rays[..., 0], "ray_y": ball.rays[..., 1], "mask": 1.0, "clipped": 0.0,
+    }  # fmt: skip
+    for name, expected in told.items():
+        assert np.abs(seen[name] - expected)[turned].max() < 1e-4, name
+    zenith = np.hypot(seen["zenith_x"], seen["zenith_y"])[turned]
+    assert fresnel.diffuse_dolp(np.cos(zenith), 1.5) == pytest.approx(ball.dolp[turned], abs=1e-4)
+    assert np.arctan2(seen["zenith_y"], seen["zenith_x"])[turned] == pytest.approx(
+        np.arctan2(ball.ratio[1], ball.ratio[0])[turned], abs=1e-4
+    )
+
+
+@pytest.mark.parametrize("source", ["camera", "none"])
+def test_without_a_chart_the_object_alone_sets_the_scale(source: str):
+    solved = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
+    light = np.where(solved.mask[..., None], solved.stokes, 7 * solved.stokes.max()).astype(np.float32)
+    found = cues.compute(
+        dataclasses.replace(solved, stokes=light), dataclasses.replace(scenes.no_color(), source=source)
+    )
+    assert np.percentile(found.radiance[found.mask], 99) == pytest.approx(0.8, rel=1e-5)
+
+
 def test_nothing_outside_the_mask_reaches_the_network(ball):
     assert (cues.channels(ball)[:, ~ball.mask] == 0).all()
 

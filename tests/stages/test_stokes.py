@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import CaptureError
-from polcap.images import AngleStack, Gains, ObjectMask, Quality, SensorImage
+from polcap.images import AngleStack, CrossedShot, Gains, MaskedImage, ObjectMask, Quality, SensorImage
 from polcap.stages import stokes
 from tests import scenes
 
@@ -68,9 +68,12 @@ def test_colors_of_a_mosaic_are_laid_over_one_another(pattern):
         angle=np.radians([0, 45, 90]), site_px=sensor.site_px,
     )  # fmt: skip
     object_ = ObjectMask(np.ones((40, 40), bool), (10, 10, 30, 30), "user")
-    found = stokes.solve(radiance, scenes.still(3), scenes.equal(3), object_, stokes.Settings())
-    assert np.ptp(found.stokes[0], axis=-1).max() < 1e-4
-    assert found.stokes[0, ..., 1] == pytest.approx(shot[10:30, 10:30, 1], abs=1e-4)
+    overturned = np.array([[-1, 0, 39], [0, -1, 39], [0, 0, 1.0]])  # the camera stood upside down, its mosaic too
+    for transform, picture in ((np.eye(3), shot), (overturned, shot[::-1, ::-1])):
+        alignment = dataclasses.replace(scenes.still(3), transform=np.tile(transform, (3, 1, 1)))
+        found = stokes.solve(radiance, alignment, scenes.equal(3), object_, stokes.Settings())
+        assert np.ptp(found.stokes[0], axis=-1).max() < 1e-4
+        assert found.stokes[0, ..., 1] == pytest.approx(picture[10:30, 10:30, 1], abs=1e-4)
 
 
 @pytest.mark.parametrize("angles", [(0, 45, 90), (0, 60, 120), (0, 45, 90, 135), (10, 37, 101, 140, 170)])
@@ -106,7 +109,17 @@ def test_gains_divide_each_shot():
     radiance = seen((0, 45, 90), 0.3, 25)
     brighter = dataclasses.replace(radiance, value=radiance.value * gain[:, None, None].astype(np.float32))
     gains = dataclasses.replace(scenes.equal(), gain=gain)
-    assert np.allclose(solve(brighter, gains).stokes, solve(radiance).stokes, atol=1e-6)
+    found = solve(brighter, gains)
+    assert np.allclose(found.stokes, solve(radiance).stokes, atol=1e-6)
+    variance = float(radiance.variance[0, 0, 0, 0])  # of every shot, whatever its gain
+    assert found.covariance[0] == pytest.approx(variance * (1 + 1 / 0.9**2), rel=1e-5)  # S0 = I0 + I90
+    assert found.covariance[5] == pytest.approx(variance * (1 + 4 / 1.1**2 + 1 / 0.9**2), rel=1e-5)
+
+
+def test_the_ring_s_turn_is_added_to_the_stated_angles():
+    turned = dataclasses.replace(seen((3, 48, 93), 0.3, 25), angle=np.radians([0, 45, 90]))
+    gains = dataclasses.replace(scenes.equal(), angle_correction=np.radians(3.0))
+    assert solve(turned, gains).stokes == pytest.approx(solve(seen((0, 45, 90), 0.3, 25)).stokes, abs=2e-6)
 
 
 def test_a_fourth_angle_leaves_a_residual_where_a_shot_lies():
@@ -115,6 +128,18 @@ def test_a_fourth_angle_leaves_a_residual_where_a_shot_lies():
     value = radiance.value.copy()
     value[3] *= 1.05
     assert solve(dataclasses.replace(radiance, value=value)).residual.min() > 0.002
+
+
+def test_a_crossed_shot_brings_its_light_and_its_doubt_in_the_unit_of_s0():
+    """Without polarization D is the crossed light itself (`optics/crossing.py`), and its 1σ scales as it does."""
+    radiance = seen((0, 45, 90), 0.0, 0)
+    shot = MaskedImage(np.full((8, 9, 3), 0.2), np.full((8, 9, 3), 4e-6), np.zeros((8, 9), np.uint8))
+    radiance = dataclasses.replace(radiance, crossed=CrossedShot(shot, 0.0))
+    alignment = dataclasses.replace(scenes.still(3), crossed=np.eye(3))
+    gains = dataclasses.replace(scenes.equal(), crossed=np.array([2.0, 3.0, 4.0]))
+    body = stokes.solve(radiance, alignment, gains, WHOLE, stokes.Settings()).body
+    assert body.value[4, 4] == pytest.approx([0.4, 0.6, 0.8], abs=1e-5)
+    assert np.sqrt(body.variance[4, 4]) == pytest.approx([4e-3, 6e-3, 8e-3], rel=1e-5)
 
 
 def test_angles_that_leave_s2_open_are_refused():
@@ -135,6 +160,19 @@ def test_clipping_in_one_angle_spoils_the_pixel():
     quality[2, 3, 4] = Quality.CLIPPED
     found = solve(dataclasses.replace(radiance, quality=quality)).quality
     assert found[3, 4] & Quality.CLIPPED and not found[0, 0] & Quality.CLIPPED
+
+
+def test_a_clipped_pixel_spoils_all_that_are_interpolated_from_it():
+    radiance = seen((0, 45, 90), 0.3, 20)
+    quality = radiance.quality.copy()
+    quality[2, 3, 4] = Quality.CLIPPED
+    transform = np.tile(np.eye(3), (3, 1, 1))
+    transform[2, 0, 2] = 0.2  # px to the right
+    found = stokes.solve(
+        dataclasses.replace(radiance, quality=quality),
+        dataclasses.replace(scenes.still(3), transform=transform), scenes.equal(), WHOLE, stokes.Settings(),
+    ).quality  # fmt: skip
+    assert (np.flatnonzero(found[3] & Quality.CLIPPED) == [3, 4]).all() and not found[2, 4] & Quality.CLIPPED
 
 
 def test_colors_polarized_across_each_other_are_called_metal():
