@@ -238,6 +238,19 @@ def test_a_guide_is_as_sure_as_its_error_is_small():
     np.testing.assert_allclose(certainty, [[0.6827, 1.0]], atol=1e-3)
 
 
+def test_a_half_turn_that_nothing_settles_costs_the_zenith():
+    """A guide across the axis leaves both sides as likely: 2θ of error in half of the cases."""
+    found = seen(noise=1e-5, textured=False)
+    local, mask = scenes.truth()
+    across = np.stack([-local[..., 1], local[..., 0], local[..., 2]], axis=-1)
+    settled, open_ = (
+        analytic.invert(found, infer.Settings().ior, (guide, np.full(mask.shape, 5.0)))[1] for guide in (local, across)
+    )
+    tilted = mask & found.mask & (local[..., 2] > 0.5) & (local[..., 2] < 0.9)
+    zenith = np.degrees(np.arccos(local[tilted, 2]))
+    assert np.median((open_ - settled)[tilted] / zenith) == pytest.approx(1.0, abs=0.1)
+
+
 def lopsided() -> Network:
     """A network without symmetry: its maps depend on where things lie in the picture and on each channel apart."""
 
