@@ -32,8 +32,8 @@ def record(about: Mapping[str, Any]) -> dict[str, Any]:
         "format": "polcap provenance 1",
         "name": capture["name"],
         "camera": capture["camera"],
-        "photographs": [
-            {"file": frame["file"], "angle_deg": shot["angle_deg"], "sha256": frame["digest"]}
+        "photographs": [  # behind a digest may stand how the file was read
+            {"file": frame["file"], "angle_deg": shot["angle_deg"], "sha256": frame["digest"].partition(" ")[0]}
             for shot in capture["shots"]
             for frame in shot["frames"]
         ],

@@ -13,7 +13,8 @@ from polcap.optics import color
 def read(folder: Path, side: int = 256) -> Floats:
     """Linear albedo, roughness and the relief's slopes along columns and rows, (6, side, side).
 
-    albedo.jpg (sRGB) and roughness.jpg must be there; normal.jpg (tangent space) or height.jpg may be.
+    albedo.jpg (sRGB) and roughness.jpg must be there; normal.jpg (tangent space, green down as in DirectX) or
+    height.jpg may be.
 
     Raises
     ------
