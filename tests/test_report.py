@@ -4,6 +4,7 @@ import json
 import re
 from html import unescape
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 
 from polcap import report
 from polcap.errors import StorageError
-from polcap.report import compare, labels, lean
+from polcap.report import compare, labels, lean, page
 from tests import surfaces
 
 
@@ -118,3 +119,11 @@ def test_a_report_of_strange_gates_is_one_line(result: Path, tmp_path: Path, str
 def test_a_list_of_nothing_says_so() -> None:
     assert labels.text("chart.unused", []) == "none"
     assert labels.text("chart.unused", [1, 2]) == "1, 2"
+
+
+def test_an_object_too_thin_for_the_page_leaves_its_figures_out() -> None:
+    nothing = np.zeros((4, 5))
+    small = SimpleNamespace(angle=np.zeros(1), maps=SimpleNamespace(mask=nothing > 0))
+    again = SimpleNamespace(measured=[nothing], predicted=[nothing])
+    told = "".join(page._rerendered(small, again, {"figures": {"rerendering": {"rms": [None]}}}))  # type: ignore[arg-type]  # stand-ins
+    assert "Polarizer at 0°" in told and "rms" not in told

@@ -265,11 +265,12 @@ def _rerendered(small: Shown, again: Rerendered, about: Mapping[str, Any]) -> It
     )
     inside = small.maps.mask
     rms = about["figures"].get("rerendering", {}).get("rms") or again.rms(inside)
-    for angle, measured, predicted, difference in zip(small.angle, again.measured, again.predicted, rms):
+    shots = zip(small.angle, again.measured, again.predicted, rms)
+    for number, (angle, measured, predicted, difference) in enumerate(shots, 1):
         yield scalar(
-            f"difference-{np.degrees(angle):.0f}",
+            f"difference-{number}",  # two shots may have the same angle
             f"Polarizer at {np.degrees(angle):g}°",
-            f"rms {labels.number(100 * difference, 2)} % of white",
+            "" if difference is None else f"rms {labels.number(100 * difference, 2)} % of white",
             100 * (measured - predicted),
             inside,
             keys.DIFFERENCE,
