@@ -8,12 +8,15 @@ from typing import Any
 import msgspec
 import tomli_w
 
-from polcap.calibration_values import Calibration, LensGeometry
+from polcap.calibration_values import Calibration, LensGeometry, Polarizer
 from polcap.errors import CaptureError
 from polcap.formats import atomic, calibrations_folder, file_name, text_file
 from polcap.images import Distortion, Exif
 from polcap.optics import distortion
 
+_FULL_TURN = 360.0  # degrees
+_MOST_SIDE = 1_000_000  # px of a picture
+_MOST_BENT = 1000.0  # of k1 and k2: a lens that folds nothing has less
 _LEAST_LIGHT = 0.02  # of the middle's, in a lens's corner
 _HEAD = """\
 # polcap calibration. Signals: 1 is the sensor's white. Each sigma is 1σ. Angles from image x towards image up.
@@ -33,10 +36,14 @@ def write(place: Path, found: Calibration) -> Path:
     """
     parts = [found.made[:19].replace(":", ""), found.camera, found.lens, found.filter]
     path = place / (file_name.safe(" ".join(part for part in parts if part)) + ".toml")
-    text = _HEAD + tomli_w.dumps(_bare(msgspec.to_builtins(found)))
     with atomic.path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text(found), encoding="utf-8")
     return path
+
+
+def text(found: Calibration) -> str:
+    """What `write` writes."""
+    return _HEAD + tomli_w.dumps(_bare(msgspec.to_builtins(found)))
 
 
 def read(path: Path) -> Calibration:
@@ -140,14 +147,17 @@ def _sound(found: Calibration) -> dict[str, bool]:
     ring, light, channels = found.polarizer, found.falloff, (1, 3)
     return {
         "noise": all(
-            len(line.slope) == len(line.floor) and len(line.slope) in channels and _sane(line.slope, line.floor)
+            line.iso > 0
+            and len(line.slope) == len(line.floor)
+            and len(line.slope) in channels
+            and _sane(line.slope, line.floor)
             for line in found.noise
         ),
         "falloff": light is None
         or (len(light.coefficient) in channels and all(_positive(one) for one in light.coefficient)),
         "geometry": found.geometry is None or _possible(found.geometry),
         "polarizer": ring is None
-        or (ring.sense in (-1, 1) and len(ring.extinction) in channels and min(ring.extinction) > 1),
+        or (ring.sense in (-1, 1) and len(ring.extinction) in channels and min(ring.extinction) > 1 and _turn(ring)),
         "flash": found.flash is None or 0 < found.flash.spread < 1,
     }
 
@@ -156,11 +166,16 @@ def _sane(slope: tuple[float, ...], floor: tuple[float, ...]) -> bool:
     return min(slope) > 0 and max(slope) < 1 and min(floor) >= 0 and max(floor) < 1
 
 
+def _turn(ring: Polarizer) -> bool:
+    return abs(ring.zero_deg) <= _FULL_TURN and 0 <= ring.zero_sigma_deg <= _FULL_TURN
+
+
 def _possible(lens: LensGeometry) -> bool:
     """A pinhole in front of its picture, whose lens folds nothing."""
     known = Distortion(lens.focal_px, lens.principal_px, lens.k1, lens.k2)
     inside = all(0 < c < side for c, side in zip(lens.principal_px, lens.size_px))
-    return lens.focal_px > 0 and inside and not distortion.folds(known, *lens.size_px)
+    small = max(lens.size_px) <= _MOST_SIDE and max(abs(lens.k1), abs(lens.k2)) <= _MOST_BENT
+    return lens.focal_px >= 1 and inside and small and not distortion.folds(known, *lens.size_px)
 
 
 def _positive(law: tuple[float, float, float]) -> bool:

@@ -9,6 +9,7 @@ anything else is printed with its input and ends with exit code 1. With --rows a
 import argparse
 import io
 import json
+import os
 import sys
 import tempfile
 import time
@@ -27,9 +28,30 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from polcap import config, report
+from polcap.calibration_values import (
+    Calibration,
+    Falloff,
+    FlashEnergy,
+    LensGeometry,
+    Levels,
+    Linearity,
+    NoiseLine,
+    Polarizer,
+)
 from polcap.errors import PolcapError
-from polcap.formats import calib, capture_toml, exif, file_name, maps, npy_folder, plausible, sniff, text_file
-from polcap.images import ColorCalibration, StokesImage, View
+from polcap.formats import (
+    calib,
+    calibrations,
+    capture_toml,
+    exif,
+    file_name,
+    maps,
+    npy_folder,
+    plausible,
+    sniff,
+    text_file,
+)
+from polcap.images import ColorCalibration, Exif, StokesImage, View
 from polcap.rig import camera, elliptec, grbl, line_protocol, serial_port
 from polcap.rig.log import Log
 from tests.campaigns.mutations import mutated
@@ -116,6 +138,14 @@ def _capture(data: bytes, folder: Path) -> object:
 
 def _profile(data: bytes, folder: Path) -> object:
     return calib.read_profile(_written(data, folder, "profile.toml"))
+
+
+def _calibration_file(data: bytes, folder: Path) -> object:
+    place = folder / "calib"
+    place.mkdir(exist_ok=True)
+    _written(data, place, "bench.toml")
+    os.environ["POLCAP_CALIB"] = str(place)
+    return calibrations.choose(_EXIF, None, 60.0)
 
 
 def _maps(data: bytes, folder: Path) -> object:
@@ -212,8 +242,35 @@ _GRBL = (
     b"Grbl 1.1h ['$' for help]\n$100=8.889\n$110=2000\n$120=50\n$130=400\n$22=1\nok\n"
     b"Grbl 1.1h ['$' for help]\nok\n<Idle|MPos:0.000,0,0|FS:0,0>\nok\n<Idle|MPos:1.000,0,0|FS:0,0>\nok\n"
 )
+_EXIF = Exif(make="Acme", model="Z1", lens="60", width=640, height=480)
+_THREE = (0.1, 0.1, 0.1)
+_CALIBRATION = calibrations.text(
+    Calibration(
+        "2024-05-01T12:00:00", "Acme Z1", "60", "ring",
+        (
+            NoiseLine(
+                100.0, (1e-5,) * 3, (1e-7,) * 3, (1e-7,) * 3, (1e-9,) * 3, (5e4,) * 3, (3.0,) * 3, _THREE, "bracket"
+            ),
+        ),
+        Levels((512.0,) * 4, _THREE, (512.0,) * 4, 16383.0, 16380.0),
+        Linearity(0.002, 1.0, 0.001, 0.01, 0.9, 8),
+        Falloff((_THREE,) * 3, (_THREE,) * 3, (0.8,) * 3, 8.0, 60.0),
+        LensGeometry(
+            1066.7, 0.4, (319.5, 239.5), 0.3, -0.05, 1e-3, 0.01, 2e-3, (640, 480), 0.2, 3.0, 6, "checkerboard", 60.0
+        ),
+        Polarizer(1.5, 0.05, 1, True, (500.0,) * 3, (5.0,) * 3, 24),
+        FlashEnergy(0.01, 0.002, 1e-4, 1e-4, 20),
+    )
+).encode()  # fmt: skip
 PARSERS = {
-    "settings (TOML)": Parser((b"[hdr]\nclip = 0.98\n[gates]\nmax_ghost = 0.02\n",), _settings, share=0.3),
+    "settings (TOML)": Parser(
+        (
+            b"[hdr]\nclip = 0.98\n[gates]\nmax_ghost = 0.02\n",
+            b"[selfcal]\nunknown_angles = true\nmax_unknown_sigma_deg = 4.0\n[stokes]\nundistort = false\n",
+        ),
+        _settings,
+        share=0.3,
+    ),
     "settings (--set)": Parser((b"hdr.clip=0.98", b"gates.max_ghost=0.1"), _assignment, share=0.06),
     "capture.toml": Parser(
         (b'name = "vase"\nfocal_length_mm = 60.0\n[[frame]]\nfile = "a.dng"\nangle = 45\nrole = "shot"\n',),
@@ -225,6 +282,7 @@ PARSERS = {
         _profile,
         share=0.4,
     ),
+    "calibration (TOML)": Parser((_CALIBRATION,), _calibration_file, share=0.4),
     "maps.json": Parser((json.dumps(_MAPS).encode(),), _maps, (ValueError, OSError), share=0.6),
     "report.json": Parser((json.dumps(_REPORT).encode(),), _report, share=0.6),
     "manifest, Stokes": Parser((_MANIFEST["stokes"],), _tree, (ValueError, PolcapError)),

@@ -69,7 +69,7 @@ def one(seed: int, shots: int) -> dict[str, Any]:
     except CaptureError as error:
         return {"refused": str(error)[:60]}
     assert found.found_angle is not None
-    apart = (found.found_angle - true + np.pi / 2) % np.pi - np.pi / 2
+    apart = (found.found_angle + found.angle_correction - true + np.pi / 2) % np.pi - np.pi / 2
     return {"error": float(np.degrees(np.abs(apart)).max()), "sigma": float(np.degrees(found.found_sigma))}
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polcap.calibration_values import Calibration, Falloff, FlashEnergy, Levels, NoiseLine, Polarizer
+from polcap.calibration_values import Calibration, Falloff, FlashEnergy, LensGeometry, Levels, NoiseLine, Polarizer
 from polcap.errors import CaptureError
 from polcap.formats import calibrations, capture
 from polcap.images import Exif
@@ -17,6 +17,9 @@ LINE = NoiseLine(100.0, (3e-5,), (1e-7,), (1e-8,), (1e-9,), (33333.0,), (3.3,))
 RING = Polarizer(1.5, 0.05, -1, True, (300.0, 500.0, 200.0), (10.0, 10.0, 10.0), 24)
 FALLOFF = Falloff(((-0.2, 0.0, 0.0),), ((0.001, 0.001, 0.001),), (0.8,), 11.0, 60.0)
 FLASH = FlashEnergy(0.01, 0.002, 0.0, 0.001, 12)
+LENS = LensGeometry(
+    1066.7, 0.4, (319.5, 239.5), 0.3, -0.05, 1e-3, 0.01, 2e-3, (640, 480), 0.2, 3.0, 6, "checkerboard", 60.0
+)
 KNOWN = Calibration(
     made="2026-11-22T20:00:00+00:00",
     camera="Polcap Synthetic",
@@ -106,6 +109,11 @@ def test_a_foreign_file_is_one_clear_line(users, text):
         {"polarizer": dataclasses.replace(RING, sense=2)},
         {"falloff": dataclasses.replace(FALLOFF, coefficient=((-1.0, 0.0, 0.0),))},
         {"flash": dataclasses.replace(FLASH, spread=0.0)},
+        {"polarizer": dataclasses.replace(RING, zero_deg=1e300)},
+        {"noise": (dataclasses.replace(LINE, iso=0.0),)},
+        {"geometry": dataclasses.replace(LENS, size_px=(10**12, 480))},
+        {"geometry": dataclasses.replace(LENS, k1=1e300, k2=-1e300)},
+        {"geometry": dataclasses.replace(LENS, focal_px=1e-300)},
     ],
 )
 def test_figures_that_cannot_be_are_refused(users, change):

@@ -54,4 +54,4 @@ def test_angles_that_are_hardly_told_are_refused():
 
 def test_an_outline_that_says_nothing_leaves_them_unknown():
     rim = Rim(np.zeros((4, 0)), np.zeros(0), np.zeros(0, int))
-    assert unknown_angles.measure(rim, np.ones((4, 100)), 4).sigma == np.pi / 2
+    assert unknown_angles.measure(rim, np.ones((4, 100)), np.zeros(100, int), 4).sigma == np.pi / 2

@@ -84,7 +84,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 12.0
 
 
-@stage(version=11)
+@stage(version=12)
 def solve(
     radiance: AngleStack,
     alignment: Alignment,
@@ -142,8 +142,8 @@ def solve(
         ),
     )
     correction = 0.0
-    if radiance.light != "one exposure":
-        ring, correction = corrected(ring, radiance.ring_sigma, settings)
+    if radiance.light != "one exposure" or unnoted is not None:  # etched angles stay
+        ring, correction = corrected(ring, radiance.ring_sigma if unnoted is None else unnoted.sigma, settings)
     angle = radiance.angle + correction
     anchor = object_gains.combined([*_by_law(light, mask, quality, radiance, angle, object_.crop, facing), facing])
     source: Source
@@ -204,8 +204,7 @@ def _unnoted(
             f"the light of the shots is known {how}, for unknown angles {100 * _MOST_GAIN:g} % is the limit; "
             f"put a color chart beside the object, {otherwise}"
         )
-    inner, _ = object_gains.cells(even, object_gains.inside(mask, quality))
-    found = unknown_angles.measure(rim, inner, shots)
+    found = unknown_angles.measure(rim, *object_gains.cells(even, object_gains.inside(mask, quality)), shots)
     doubt = float(np.degrees(found.sigma))
     if doubt > settings.max_unknown_sigma_deg:
         raise CaptureError(
@@ -263,7 +262,7 @@ def corrected(ring: RingZero, calibrated: float | None, settings: Settings) -> t
     ring
         By the outline.
     calibrated
-        1σ rad of the zero that stands in the angles already; None where none does.
+        1σ rad of the zero that stands in the angles already, or to which angles were found; None where none does.
     settings
         When the outline is sure.
     """

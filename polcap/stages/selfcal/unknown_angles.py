@@ -7,13 +7,15 @@ may be any map of the light cone, and far more is free.) The outline tells the r
 along the contour's normal φ, so I lies between 1 and cos 2(φ − θ) for every part of it.
 
 Both are asked at once: the outline by parts of equal φ, whose sums obey the same law, and the inside by what leaves
-the space that A(θ) spans, each by its own scatter. The doubt is the scatter of the outline's sides (jackknife), and
-that of starts that end as well elsewhere.
+the space that A(θ) spans, each by its own scatter. The doubt is the scatter of the outline's sides and of the inside's
+parts (jackknife), how far the answer moves when the outline is believed more or less, and starts that end as well
+elsewhere. A common turn that is left over is found by the slopes inside (`ring_by_slopes`).
 """
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from polcap.images import Floats
 from polcap.optics.outline import SECTORS, Rim
@@ -24,7 +26,9 @@ _STARTS = 20  # drawn at random, the same every time
 _COARSE, _FINE = 1e-3, 1e-7  # relative change of the misfit at which the search ends: of all starts, of the best
 _POLISHED = 4  # of the starts, the best ones
 _AS_GOOD = 1.3  # of the least misfit: angles that end there are possible too
-_LAW = 0.004  # relative, of the outline's light: what its parts leave that are no ideal body's
+_LAW = 0.012  # relative, of the outline's light: what its parts leave that are no ideal body's
+_OTHER_LAWS = (0.004, 0.03)  # that it may be as well: parts of an outline are off by up to 3 %
+_PARTS = 8  # of the outline and of the inside, left out one at a time
 _INSIDE = 0.0001  # the same of the inside: interpolation and gains
 _FLOOR = np.radians(0.3)  # 1σ; where all sides agree (200 simulated cases)
 
@@ -37,7 +41,7 @@ class Angles:
     sigma: float  # rad, 1σ of each; π/2 where nothing is known
 
 
-def measure(rim: Rim, cells: Floats, shots: int) -> Angles:
+def measure(rim: Rim, cells: Floats, row: NDArray[np.int_], shots: int) -> Angles:
     """The angles that outline and inside ask for.
 
     Parameters
@@ -46,6 +50,8 @@ def measure(rim: Rim, cells: Floats, shots: int) -> Angles:
         The band inside the outline, gains taken out.
     cells
         (K, P) means of small blocks of the inside, gains taken out.
+    row
+        (P,) where they lie; neighbors share what is wrong with them.
     shots
         K, four or more.
     """
@@ -64,11 +70,19 @@ def measure(rim: Rim, cells: Floats, shots: int) -> Angles:
     angle = best[0][1]
     others = [one for cost, one in best[1:] if cost < _AS_GOOD * best[0][0]]
     elsewhere = max((float(np.abs(_apart(one, angle)).max()) for one in others), default=0.0)
-    sides = np.arange(len(part)) * 8 // len(part)
-    each = [_solved(around[sides != s], part[sides != s], inside, angle, _FINE)[1] for s in range(8)]
-    spread = np.array([_apart(one, angle) for one in each])
-    jackknife = float(np.sqrt(7 / 8 * (spread**2).sum(axis=0)).max())
-    return Angles(angle % np.pi, min(float(np.sqrt(_FLOOR**2 + jackknife**2 + elsewhere**2)), np.pi / 2))
+    sides = np.arange(len(part)) * _PARTS // len(part)
+    places = np.argsort(np.argsort(row, kind="stable")) * _PARTS // len(row)
+    by_side = [_solved(around[sides != s], part[sides != s], inside, angle, _FINE)[1] for s in range(_PARTS)]
+    by_place = [_solved(around, part, _condensed(cells[:, places != s]), angle, _FINE)[1] for s in range(_PARTS)]
+    by_law = [_solved(around, part, inside, angle, _FINE, law)[1] for law in _OTHER_LAWS]
+    variance = sum((_PARTS - 1) / _PARTS * _squared(each, angle) for each in (by_side, by_place))
+    variance = variance + _squared(by_law, angle) / len(by_law)
+    return Angles(angle % np.pi, min(float(np.sqrt(_FLOOR**2 + variance.max() + elsewhere**2)), np.pi / 2))
+
+
+def _squared(each: list[Floats], angle: Floats) -> Floats:
+    """Σ of squared distances of each from the angles (K,), rad²."""
+    return np.asarray((np.array([_apart(one, angle) for one in each]) ** 2).sum(axis=0))
 
 
 def _by_direction(rim: Rim) -> tuple[Floats, Floats]:
@@ -105,19 +119,21 @@ def _best(ends: list[tuple[float, Floats]]) -> list[tuple[float, Floats]]:
     return found
 
 
-def _solved(around: Floats, part: Floats, inside: Floats, start: Floats, until: float) -> tuple[float, Floats]:
+def _solved(
+    around: Floats, part: Floats, inside: Floats, start: Floats, until: float, law: float = _LAW
+) -> tuple[float, Floats]:
     """Misfit and angles (K,) of least squares from a start; of the two by 90° apart the one of body light."""
     relative = around / around.mean(axis=1, keepdims=True)
     from scipy.optimize import least_squares  # here: importing it costs .3 s of every start
 
-    end = least_squares(_residual, start, args=(relative, part, inside), method="lm", ftol=until, max_nfev=150)
+    end = least_squares(_residual, start, args=(relative, part, inside, law), method="lm", ftol=until, max_nfev=150)
     along = np.cos(2 * (part[:, None] - end.x))
     along -= along.mean(axis=1, keepdims=True)
     angle = end.x if float((along * relative).sum()) > 0 else end.x + np.pi / 2
     return float(end.cost), np.asarray(angle)
 
 
-def _residual(angle: Floats, relative: Floats, part: Floats, inside: Floats) -> Floats:
+def _residual(angle: Floats, relative: Floats, part: Floats, inside: Floats, law: float) -> Floats:
     """What of the outline's light lies outside 1 and cos 2(φ − θ), and of the inside's outside A(θ), over their 1σ."""
     ones = np.ones(len(angle)) / np.sqrt(len(angle))
     wave = np.cos(2 * (part[:, None] - angle))
@@ -128,7 +144,7 @@ def _residual(angle: Floats, relative: Floats, part: Floats, inside: Floats) -> 
     rows = np.stack([np.ones_like(angle), np.cos(2 * angle), np.sin(2 * angle)], axis=1)
     basis, _ = np.linalg.qr(rows)
     out = inside - basis @ (basis.T @ inside)
-    return np.concatenate([left.ravel() / _LAW / np.sqrt(len(part)), out.ravel() / _INSIDE])
+    return np.concatenate([left.ravel() / law / np.sqrt(len(part)), out.ravel() / _INSIDE])
 
 
 def _apart(a: Floats, b: Floats) -> Floats:
