@@ -32,21 +32,26 @@ class Lit:
     rays: Floats  # (H, W, 3)
 
 
-def lit(seed: int, thin: bool = False) -> Lit:
-    """The seed's object; `thin` takes clusters alone, whose parts hide one another."""
+def lit(seed: int, thin: bool = False, chart: bool = False) -> Lit:
+    """The seed's object; `thin` takes clusters alone, whose parts hide one another; `chart` leaves one beside it.
+
+    With a chart the picture has 640 × 480 px.
+    """
     random = np.random.default_rng([seed, 11])
     look = LOOKS[seed % len(LOOKS)]
     scene = random_scene(seed, "clusters" if thin else ("bumps", "clusters", "vase")[seed // 2 % 3])
-    scene = msgspec.structs.replace(scene, chart=None, position=(0.0, 0.0, scene.position[2]))
+    if not chart:
+        scene = msgspec.structs.replace(scene, chart=None, position=(0.0, 0.0, scene.position[2]))
     rough = {"glossy": 0.2, "clipped": 0.25, "matt": 0.8}.get(look)
     if rough is not None:
         worn = tuple(msgspec.structs.replace(one, roughness=(rough, rough)) for one in scene.coat.materials)
         scene = msgspec.structs.replace(scene, coat=msgspec.structs.replace(scene.coat, materials=worn))
     law = "rough" if seed % 2 else "smooth"
-    shoot = Shoot(width=320, height=240, focal_mm=70.0, samples=1)
+    size = (640, 480, 60.0) if chart else (320, 240, 70.0)
+    shoot = Shoot(width=size[0], height=size[1], focal_mm=size[2], samples=1)
     studio = Studio(msgspec.structs.replace(scene, law=law), shoot)
     image, mask = np.asarray(studio.reference, np.float64), studio.buffer.mask
-    image = image / np.percentile(image[0][mask], 90)
+    image = image / (1.0 if chart else np.percentile(image[0][mask], 90))
     if look == "white patch":
         slope = studio.buffer.normal[..., 2]
         limb = np.argwhere(mask & (slope > 0.3) & (slope < 0.5))
