@@ -45,7 +45,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     prior_weight: Annotated[
         float,
         Meta(ge=0.0, le=1000.0, description="pull of the coarse depth on the whole surface, against its stiffness [1]"),
-    ] = 0.7
+    ] = 0.15
     jump: Annotated[
         float,
         Meta(ge=0.002, le=1.0, description="least depth step that cuts the mesh, over the object's radius [1]"),
@@ -59,7 +59,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
 
 
-@stage(version=6)
+@stage(version=7)
 def integrate(maps: SurfaceMaps, distance_m: float | None, settings: Settings) -> Mesh:
     """The visible surface of the object, from its normals.
 

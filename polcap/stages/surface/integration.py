@@ -31,6 +31,10 @@ _MENDED = 4  # solutions on the grid that decides, after tears were found
 _UNDECIDED = 0.1  # of the prior's pull while jumps are sought: where it strains the normals it tears them
 _REACH = 2  # px around a jump within which pixels choose their neighbours on the next finer grid
 _TIRED = 9  # iterations of a linear solution that call for a new multigrid hierarchy
+_BESIDE = 10  # px from a contour of jumps within which it is asked what it is worth
+_STRAIN = 1.0  # σ² per link of a contour by which the surface beside it may fit its normals worse than without cuts
+_STRAINED = 1.4  # the same as a factor; both have to be passed
+_SEWN = 2  # rounds of sewing what is worth nothing
 _GAP = 0.25  # depth behind a limb, over the object's radius, where nothing else tells it
 _OPEN = 0.3  # share of that gap which opens where a part is free indeed
 _SURE = 1 / 16  # weight of a normal under which it tells of no limb: an error four times the median
@@ -115,6 +119,7 @@ def _solved(
         if not free.any():
             z = np.zeros_like(z)  # nothing of what was tried is left: plain least squares, to the last bit
         z, solver = level.mended(z, free, stiffness)
+        z, solver = level.sewn(z, solver, free, stiffness, jump / 2)
         return z, level.jumps(z, jump / 2).near(_REACH), solver
     coarse, parent = halved(of), parents(of.mask)
     start, at_jumps, solver = _solved(coarse, stiffness, iterations, tolerance, jump)
@@ -203,6 +208,52 @@ class _Level:
             solver = Multigrid(matrix, self.grid.pixel)
             z, _ = conjugate_gradients(matrix, right, z, solver, _ACCURACY, 30)
         return z, solver
+
+    def sewn(
+        self, z: Floats, solver: Multigrid, free: NDArray[np.bool_], stiffness: float, least: float
+    ) -> tuple[Floats, Multigrid]:
+        """From z and its solver: contours of jumps that do not pay are closed, their pixels taken out of `free`.
+
+        A true jump relieves the surface about it, for slopes that no longer have to bridge it fit their normals. One
+        beside which they fit worse than on a surface without cuts is none.
+        """
+        whole: Floats | None = None
+        for _ in range(_SEWN):
+            found = self.jumps(z, least)
+            if not found.any() or not free.any():
+                break
+            if whole is None:
+                whole = self._strain(_Level(self.of).mended(np.zeros_like(z), np.zeros_like(free), stiffness)[0])
+            close = self._worthless(found, whole, self._strain(z))
+            if not close.any():
+                break
+            free &= ~close
+            stays = ~close[self.grid.p[self.limb]]
+            self.limb, self.gap, self.leap = self.limb[stays], self.gap[stays], self.leap[stays]
+            z, solver = self.mended(z, free, stiffness)
+            if not self.jumps(z, least).any():
+                free[:] = False  # plain least squares, to the last bit
+                z, solver = self.mended(np.zeros_like(z), free, stiffness)
+        return z, solver
+
+    def _strain(self, z: Floats) -> Floats:
+        """How badly z fits the slope of each link (L,), in variances of the median normal."""
+        return np.asarray(self.chord * (z[self.grid.q] - z[self.grid.p] - self.step) ** 2 / self.of.sigma**2)
+
+    def _worthless(self, found: Jumps, whole: Floats, cut: Floats) -> NDArray[np.bool_]:
+        """Pixels (N,) about contours of jumps beside which links are strained more (L,) than with no cut at all."""
+        mask, p = self.of.mask, self.grid.p
+        jumping = np.concatenate([found.right[mask[:, :-1] & mask[:, 1:]], found.down[mask[:-1] & mask[1:]]])
+        contour = contours(found.near(0))
+        links = np.bincount(contour[mask][p], jumping, minlength=int(contour.max()) + 1)
+        close = np.zeros(mask.shape, dtype=bool)
+        for number in np.flatnonzero(links[1:]) + 1:
+            at = contour == number
+            beside = widened(at, _BESIDE)[mask][p] & ~widened(at, 1)[mask][p]
+            without, with_it = (strain[beside & ~jumping].sum() / links[number] for strain in (whole, cut))
+            if with_it > max(without + _STRAIN, _STRAINED * without):
+                close |= widened(at, _REACH)
+        return np.asarray(close[mask])
 
     def refined(
         self, z: Floats, free: NDArray[np.bool_], stiffness: float, parent: Any, coarse: Any
