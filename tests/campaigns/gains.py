@@ -46,10 +46,10 @@ def main() -> None:
         settings = selfcal.Settings(check_order=False)
         try:
             color = measured(radiance) if given.chart else scenes.no_color()
-        except ChartError as error:
-            print(seed, case.look, "refused:", error, flush=True)
+        except ChartError as refusal:
+            print(seed, case.look, "refused:", refusal, flush=True)
             states.append("fail")
-            errors.append(0.0)
+            errors.append(np.nan)  # within no limit, beyond none
             continue
         found = selfcal.solve(radiance, scenes.still(len(angle)), object_, color, settings)
         gate = light._gain_doubt(SimpleNamespace(gains=found), Gates())

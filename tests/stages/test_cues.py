@@ -2,6 +2,7 @@
 
 import dataclasses
 from types import SimpleNamespace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -113,7 +114,7 @@ def test_the_network_sees_what_the_names_of_its_channels_say(ball):
 
 
 @pytest.mark.parametrize("source", ["camera", "none"])
-def test_without_a_chart_the_object_alone_sets_the_scale(source: str):
+def test_without_a_chart_the_object_alone_sets_the_scale(source: Literal["camera", "none"]) -> None:
     solved = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
     light = np.where(solved.mask[..., None], solved.stokes, 7 * solved.stokes.max()).astype(np.float32)
     found = cues.compute(
