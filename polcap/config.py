@@ -52,7 +52,8 @@ class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float, Meta(gt=0, description="estimated 1σ error of a shot's registration [px of the grid]")
     ] = 0.15
     max_object_shift_px: Annotated[
-        float, Meta(gt=0, description="of the object against what is around it, from shot to shot [px of the grid]")
+        float,
+        Meta(gt=0, description="of the object against its surroundings, shot to shot [px of the processed picture]"),
     ] = 1.5
     max_mask_doubt: Annotated[
         float, Meta(ge=0, le=1, description="1 − the overlap with the truth that the network expects; half warns [1]")

@@ -1,12 +1,15 @@
 """A textured ball beside a flat board, known everywhere, to try the stages on: evaluated, never resampled."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Gains, ObjectMask, View
 from polcap.optics import frames, mueller, shade
+from polcap.optics.warp import warp
 
 HEIGHT, WIDTH, FOCAL = 240, 320, 900.0
 CENTER, RADIUS = (120.0, 118.0), 84.0  # px; x, y of the ball's outline
@@ -84,6 +87,17 @@ def stack(
         exposure_ratio=np.ones((len(angles), 1, 3)), exif_ratio=np.ones((len(angles), 1)),
         ghost_fraction=np.zeros(len(angles)), lossy=False, camera_matrix=None, white_balance=None,
     )  # fmt: skip
+
+
+def before_backdrop(transforms: Sequence[Floats]) -> AngleStack:
+    """The ball moved from shot to shot, before a textured backdrop that stays."""
+    radiance = stack(transforms, noise=0.002)
+    waves = gaussian_filter(np.random.default_rng(5).normal(size=(HEIGHT, WIDTH)), 2.0)
+    value = np.repeat((0.1 * np.exp(4 * waves))[None, ..., None], 3, 3).repeat(len(transforms), 0)
+    for k, moved in enumerate(transforms):
+        inside = warp(ball_object().mask.astype(np.float32), np.linalg.inv(moved), order=1) > 0.5
+        value[k][inside] = radiance.value[k][inside]
+    return replace(radiance, value=value.astype(np.float32))
 
 
 def no_color(scale: float = 0.5) -> ColorCalibration:

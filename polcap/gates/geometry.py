@@ -41,7 +41,7 @@ def _pushed(found: Found, config: Config) -> Gate | None:
     """An object that moved while what is around it stood still."""
     displacement = object_motion.measure(found.radiance, found.alignment, found.object_) * found.grid_px
     limit = config.gates.max_object_shift_px
-    bad = np.nan_to_num(displacement, posinf=np.inf) > limit * max(found.grid_px, 1)
+    bad = np.nan_to_num(displacement, posinf=np.inf) > limit
     if not bad.any():
         return None
     worst = int(np.nanargmax(displacement))

@@ -82,6 +82,15 @@ def test_each_gate_fails_alone(good: SimpleNamespace) -> None:
         assert failed(changed(good, **fields)) in ([name], [name, "normal error"]), name
 
 
+@pytest.mark.parametrize(("grid_px", "state"), [(1.0, "pass"), (2.0, "fail")])
+def test_a_push_counts_in_pixels_of_the_processed_picture(good: SimpleNamespace, grid_px: float, state: str) -> None:
+    """One pixel is under the limit of 1.5; on pictures averaged down to half the side it is two, and above it."""
+    pushed = np.array([[1.0, 0, 1], [0, 1, 0], [0, 0, 1]])
+    radiance = scenes.before_backdrop([np.eye(3), pushed, np.eye(3)])
+    gate = judged(changed(good, radiance=radiance, grid_px=grid_px))["alignment"]
+    assert gate.state == state and gate.shots == (("45°",) if state == "fail" else ())
+
+
 def test_what_follows_a_wrong_order_is_not_judged(good: SimpleNamespace) -> None:
     told = judged(changed(good, gains=replace(good.gains, order=(2, 1, 0))))
     assert list(told)[-1] == "focal length" or told["order"].state == "fail"
