@@ -5,6 +5,7 @@ names it, its value and its limit. The settings themselves stand in the stages t
 """
 
 import difflib
+import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -26,6 +27,8 @@ from polcap.stages.surface import Settings as Surface
 from polcap.stages.whitebalance import Settings as Whitebalance
 
 S = TypeVar("S", bound=msgspec.Struct)
+
+_BARE_POINT = re.compile(r"(?<![\w.])\.(?=\d)")  # of a number written without its 0
 
 
 class Gates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -244,8 +247,8 @@ def _read(file: Path) -> dict[str, Any]:
 
 
 def _parse(text: str) -> Any:
-    """A TOML value; a bare word is a string, and what has commas outside brackets is a list: 0,60,120."""
-    for written in (text, f"[{text}]" if "," in text else text):
+    """A TOML value; a bare word is a string, what has commas outside brackets is a list (0,60,120), .5 is a number."""
+    for written in (text, f"[{text}]" if "," in text else text, _BARE_POINT.sub("0.", text)):
         try:
             return tomllib.loads(f"value = {written}")["value"]
         except (ValueError, RecursionError):

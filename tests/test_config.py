@@ -80,3 +80,8 @@ def test_config_survives_its_own_dump() -> None:
 @pytest.mark.parametrize("text", ["0,60,120", "[0,60,120]", "0, 60, 120"])
 def test_a_list_may_be_typed_without_brackets(text: str) -> None:
     assert fill(Shoot, {}, [f"angles_deg={text}"]).angles_deg == (0, 60, 120)
+
+
+def test_a_number_needs_no_zero_before_its_point() -> None:
+    assert load(None, ["gates.max_mask_doubt=.3"]).gates.max_mask_doubt == 0.3
+    assert fill(Shoot, {}, ["angles_deg=[.5, 45, 90.5]"]).angles_deg == (0.5, 45, 90.5)
