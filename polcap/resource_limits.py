@@ -6,6 +6,7 @@ from typing import Any
 from polcap.errors import SettingError
 
 _MOST_GB = 1e9  # beyond what any system counts
+_LEAST_GB = 0.8  # libraries and networks, and a capture of 1 MP: at .75 one fails, at .4 a library waits for ever
 
 
 def set_threads(count: int) -> None:
@@ -24,10 +25,15 @@ def check_memory(gigabytes: float) -> None:
     Raises
     ------
     SettingError
-        It is no amount of memory, or the system knows no such limit.
+        It is no amount of memory, less than any capture needs, or the system knows no such limit.
     """
     if not 0 <= gigabytes <= _MOST_GB:
         raise SettingError(f"--memory {gigabytes:g}: give a number of GB up to {_MOST_GB:g}, or leave it out")
+    if 0 < gigabytes < _LEAST_GB:
+        raise SettingError(
+            f"--memory {gigabytes:g}: libraries and networks take {_LEAST_GB:g} GB before any picture; "
+            "raise it, or leave it out"
+        )
     if gigabytes:
         _resource(gigabytes)
 

@@ -15,6 +15,13 @@ def test_what_is_no_amount_of_memory_is_refused(gigabytes: float) -> None:
         resource_limits.set_memory(gigabytes)
 
 
+def test_less_than_any_capture_needs_is_refused_with_what_it_takes() -> None:
+    """Below, allocations fail in whatever library asks first, and some of those wait for ever."""
+    with pytest.raises(SettingError, match=r"--memory 0.4: .* 0.8 GB"):
+        resource_limits.check_memory(0.4)
+    resource_limits.check_memory(0.8)
+
+
 def test_a_batch_says_so_before_any_capture(tmp_path: Path, polcap: Command) -> None:
     (tmp_path / "obj" / "pol000").mkdir(parents=True)
     done = polcap("batch", tmp_path, "--memory", "inf")
