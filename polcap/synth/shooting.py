@@ -78,16 +78,8 @@ class Shoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sensor: Sensor = Sensor()
     cfa: Literal["RGGB", "BGGR", "GRBG", "GBRG", "X-Trans"] = "RGGB"
     color_matrix: Annotated[tuple[float, ...], Meta(min_length=9, max_length=9)] = (
-        0.87,
-        -0.27,
-        -0.075,
-        -0.44,
-        1.23,
-        0.235,
-        -0.09,
-        0.19,
-        0.69,
-    )  # XYZ → camera
+        0.87, -0.27, -0.075, -0.44, 1.23, 0.235, -0.09, 0.19, 0.69,
+    )  # XYZ → camera  # fmt: skip
 
     @property
     def view(self) -> View:

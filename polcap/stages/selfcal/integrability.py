@@ -99,14 +99,7 @@ class Slopes:
 def seen(light: Floats, usable: Bools, angle: Floats) -> Slopes | None:
     """What is left of the shots where derivatives can be taken; None where that is next to nothing.
 
-    Parameters
-    ----------
-    light
-        (K, H, W) shots on the reference grid, little blurred.
-    usable
-        (H, W) pixels of the object that can be believed.
-    angle
-        (K,) rad, of the shots' polarizers.
+    light (K, H, W), usable (H, W) and angle (K,) as of `gains`.
     """
     less, inside = _reduced(light, usable)
     return Slopes(less, inside, angle) if inside.sum() >= _LEAST else None
