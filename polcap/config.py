@@ -16,6 +16,7 @@ from msgspec import Meta
 
 from polcap.errors import SettingError, StorageError
 from polcap.formats import text_file
+from polcap.formats.stated import fault
 from polcap.stages.align import Settings as Align
 from polcap.stages.asset import Settings as Asset
 from polcap.stages.hdr import Settings as Hdr
@@ -210,13 +211,17 @@ def fill(kind: type[S], stated: dict[str, Any], assignments: Sequence[str]) -> S
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
         if not equals or name not in kind.__struct_fields__:
-            raise SettingError(f"--set {assignment}: give one of {', '.join(kind.__struct_fields__)} as name=value")
+            near = difflib.get_close_matches(name, kind.__struct_fields__, n=1, cutoff=0.5) if equals else []
+            hint = (
+                f"did you mean {near[0]}?" if near else f"give one of {', '.join(kind.__struct_fields__)} as name=value"
+            )
+            raise SettingError(f"--set {assignment}: {hint}")
         stated = {**stated, name: _parse(text.strip())}
     _check_finite(stated)
     try:
         return msgspec.convert(stated, kind)
     except msgspec.ValidationError as error:
-        raise SettingError(f"--set: {error}") from error
+        raise SettingError(f"--set {fault(error, stated, kind)}") from error
 
 
 def settings() -> Iterator[Setting]:

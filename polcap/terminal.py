@@ -41,16 +41,14 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
             print(f"polcap: interrupted; run the same command again{again} to go on", file=sys.stderr)
             code = 130
         except PolcapError as error:
-            if context.obj:
-                raise
+            traceback_of(error, context)
             tell(f"polcap: error: {line(error)}")
             code = error.exit_code
             tell_program(kwargs, error, code)
         except (typer.Exit, typer.Abort):
             raise
         except Exception as error:
-            if context.obj:
-                raise
+            traceback_of(error, context)
             if isinstance(error, MemoryError) or any(word in str(error) for word in OUT_OF_MEMORY):
                 tell("polcap: error: out of memory; raise --memory or take a larger machine")
                 code = SettingError.exit_code
@@ -61,8 +59,8 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
                 code = SettingError.exit_code
                 tell_program(kwargs, error, code)
             else:
-                kind = type(error).__name__
-                tell(f"polcap: bug: {kind}: {line(error)}; run with --debug and report it")
+                kind, how = type(error).__name__, "with the lines above" if context.obj else "run with --debug and"
+                tell(f"polcap: bug: {kind}: {line(error)}; {how} report it")
                 code = 1
                 tell_program(kwargs, error, code)
         else:
@@ -70,6 +68,14 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
         raise typer.Exit(code)
 
     return run
+
+
+def traceback_of(error: BaseException, context: typer.Context) -> None:
+    """With --debug, where an error came from; what is said of it and the exit code stay the same."""
+    if context.obj:
+        import traceback
+
+        tell("".join(traceback.format_exception(error)).rstrip())
 
 
 def tell_program(options: dict[str, Any], error: BaseException, code: int) -> None:

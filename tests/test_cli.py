@@ -94,10 +94,25 @@ def test_wrong_flag_is_one_line_and_exit_2(
     assert not (tmp_path / "out").exists()
 
 
-def test_unknown_option_is_exit_2(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        cli.app(["process", "x", "--wath"])
-    assert ended.value.code == 2 and "--wath" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["process", "x", "--wath"], ["--wath", "--watch", "`polcap process --help`"]),
+        (["process"], ["missing argument 'capture'", "`polcap process --help`"]),
+        (["proces", "x"], ["'proces'", "Did you mean 'process'?"]),
+        (["synth", "x", "--seed", "-3"], ["'--seed'", "0"]),
+        (["export", "x", "--images", "gif"], ["'gif'", "'jpeg'"]),
+    ],
+)
+def test_a_faulty_command_line_is_one_line_and_exit_2(polcap: Command, arguments: list[str], words: list[str]) -> None:
+    done = polcap(*arguments)
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.count("\n") == 1 and done.stderr.startswith("polcap: error: ")
+    assert all(word in done.stderr for word in words), done.stderr
+
+
+def test_polcap_alone_prints_its_help(polcap: Command) -> None:
+    assert "Commands" in polcap().stderr
 
 
 def test_bug_is_exit_1_with_a_traceback_only_under_debug(
@@ -114,8 +129,16 @@ def test_bug_is_exit_1_with_a_traceback_only_under_debug(
         capsys.readouterr().err
         == "polcap: bug: ZeroDivisionError: a bug of two lines; run with --debug and report it\n"
     )
-    with pytest.raises(ZeroDivisionError):
+    with pytest.raises(SystemExit) as ended:
         cli.app(["--debug", "show", "x", "hdr"])
+    said = capsys.readouterr().err
+    assert ended.value.code == 1 and said.startswith("Traceback") and "with the lines above" in said.splitlines()[-1]
+
+
+def test_debug_shows_where_an_error_came_from_and_changes_no_exit_code(polcap: Command, tmp_path: Path) -> None:
+    plain, debug = (polcap(*flag, "show", tmp_path, "hdr") for flag in ((), ("--debug",)))
+    assert plain.returncode == debug.returncode == 2 and "Traceback" not in plain.stderr
+    assert debug.stderr.startswith("Traceback") and debug.stderr.endswith(plain.stderr)
 
 
 def test_failed_gate_is_exit_3_after_everything_is_written(
@@ -184,6 +207,13 @@ def test_folder_that_is_no_result_is_exit_2(tmp_path: Path, polcap: Command, com
     done = polcap(*command, tmp_path, *(["hdr"] if command == ["show"] else []))
     assert done.returncode == 2 and done.stderr.count("\n") == 1
     assert not (tmp_path / "work").exists()
+
+
+def test_a_capture_stands_for_the_result_in_it(result: Path, polcap: Command, tmp_path: Path) -> None:
+    shutil.copytree(result, tmp_path / "capture" / "polcap")
+    assert polcap("status", tmp_path / "capture").stdout == polcap("status", result).stdout
+    assert polcap("show", tmp_path / "capture", "mask").stdout.startswith(str(tmp_path / "capture" / "polcap"))
+    assert polcap("report", result, "--compare", tmp_path / "capture").returncode == 0
 
 
 def test_user_mask_replaces_the_search(result: Path, example: Path, polcap: Command, tmp_path: Path) -> None:

@@ -18,9 +18,13 @@ options            what several commands share, and the values it means
 
 import os
 import sys
-from typing import Annotated
+from collections.abc import Sequence
+from functools import partial
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
+from typer.exceptions import TyperException
 
 from polcap import __version__, terminal
 from polcap.cli.batch_command import batch
@@ -33,8 +37,49 @@ from polcap.cli.result_commands import export, report, show, status
 from polcap.cli.synth_command import synth
 from polcap.cli.training_commands import evaluate, train
 
+
+class OneLine(TyperGroup):
+    """The commands, and what was wrong with a command line in one line as any other fault."""
+
+    def main(
+        self,
+        args: Sequence[str] | None = None,
+        prog_name: str | None = None,
+        complete_var: str | None = None,
+        standalone_mode: bool = True,
+        windows_expand_args: bool = True,
+        **extra: Any,
+    ) -> Any:
+        """Parse, run, and unless in another program's hands end with the exit code."""
+        run = partial(super().main, args, prog_name, complete_var, False, windows_expand_args, **extra)
+        if not standalone_mode:
+            return run()
+        try:
+            code = run()
+        except TyperException as error:
+            terminal.tell(_spoken(error))
+            code = error.exit_code
+        except typer.Abort:  # a question that got no answer
+            terminal.tell("polcap: aborted")
+            code = 1
+        sys.exit(code or 0)
+
+
+def _spoken(error: TyperException) -> str:
+    """What was wrong with a command line; a page of help as it is."""
+    said = error.format_message()
+    if "\n" in said:
+        return said
+    said = said.rstrip(".").replace("Value error, ", "")
+    context = getattr(error, "ctx", None)
+    asked = "polcap" if context is None or context.parent is None else f"polcap {context.info_name}"
+    see = "" if said.endswith("?") else f"; see `{asked} --help`"
+    return f"polcap: error: {said[:1].lower()}{said[1:]}{see}"
+
+
 COMMANDS = (process, batch, export, show, status, report, check, calibrate, doctor, synth, capture, train, evaluate)
 app = typer.Typer(
+    cls=OneLine,
     help="Photographs through a turned polarizer, under a flash: in. A relightable 3-D asset: out.",
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -11,7 +11,19 @@ from polcap.errors import SettingError
 if TYPE_CHECKING:
     from polcap.images import ChartRequest
 
-Result = Annotated[Path, typer.Argument(help="Result folder of `polcap process`.")]
+
+def result_folder(named: Path | None) -> Path | None:
+    """The result folder that is meant, where a capture with its result in it was named."""
+    if named is None or any((named / name).exists() for name in ("work", "report.json", "maps")):
+        return named
+    inside = named / "polcap"
+    return inside if (inside / "report.json").exists() or (inside / "work").is_dir() else named
+
+
+Result = Annotated[
+    Path,
+    typer.Argument(help="Result folder of `polcap process`, or the capture that holds it.", callback=result_folder),
+]
 Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
 ConfigFile = Annotated[Path | None, typer.Option(help="TOML file of settings, a section per stage.")]
 Assignments = Annotated[

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from polcap import terminal
+from polcap.cli import options
 from polcap.cli.options import Json, Result
 from polcap.errors import SettingError
 
@@ -20,7 +21,8 @@ def export(
     materialx: Annotated[bool, typer.Option("--materialx", help="asset/NAME.mtlx and textures")] = False,
     exr: Annotated[bool, typer.Option("--exr", help="asset/NAME_layers.exr, every map as a layer")] = False,
     preset: Annotated[
-        str | None, typer.Option(metavar="NAME", help="blender, unreal, unity, web or archive, into asset/NAME/.")
+        str | None,
+        typer.Option(metavar="NAME", help="blender, unreal, unity, web or archive (extra [usd]), into asset/NAME/."),
     ] = None,
     images: Annotated[
         Literal["png", "jpeg", "webp", "ktx2"] | None, typer.Option(help="Kind of the pictures in the GLB.")
@@ -102,7 +104,9 @@ def status(context: typer.Context, result: Result, json: Json = False) -> None:
 def report(
     context: typer.Context,
     result: Result,
-    compare: Annotated[Path | None, typer.Option(metavar="OTHER", help="Another result folder.")] = None,
+    compare: Annotated[
+        Path | None, typer.Option(metavar="OTHER", help="Another result folder.", callback=options.result_folder)
+    ] = None,
     json: Json = False,
 ) -> None:
     """Judge a result again from its stage cache, or show in which figures two results differ."""

@@ -2,13 +2,14 @@
 
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta, Struct
 
 from polcap.errors import CaptureError
 from polcap.formats import text_file
+from polcap.formats.stated import fault
 from polcap.images import Role
 
 NAME = "capture.toml"
@@ -52,9 +53,13 @@ def load(folder: Path) -> CaptureFile:
     path = folder / NAME
     if not os.path.lexists(path):
         return CaptureFile()
+    given: dict[str, Any] = {}
     try:
-        stated = msgspec.convert(text_file.read_toml(path), CaptureFile)
-    except ValueError as error:  # of TOML, of UTF-8, of msgspec
+        given = text_file.read_toml(path)
+        stated = msgspec.convert(given, CaptureFile)
+    except msgspec.ValidationError as error:
+        raise CaptureError(f"{path}: {fault(error, given, CaptureFile)}; see the reference page on captures") from None
+    except ValueError as error:  # of TOML, of UTF-8
         raise CaptureError(f"{path}: {error}; see the reference page on captures") from None
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None

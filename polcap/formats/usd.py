@@ -34,7 +34,9 @@ def require() -> None:
     try:
         from pxr import Usd  # noqa: F401
     except ModuleNotFoundError:
-        raise SettingError("USD needs the package usd-core; pip install usd-core") from None
+        raise SettingError(
+            "USD, and with it --preset archive, needs usd-core: pip install 'polcap[usd]', or name other formats"
+        ) from None
 
 
 def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], says: Mapping[str, str]) -> None:

@@ -51,6 +51,11 @@ def order(folder: Path, stated: dict[str, Any], resume: bool) -> Order:
     wanted |= {name: value for name, value in stated.items() if value is not None}
     for name in ("rotator", "camera"):
         if name not in wanted:
+            if resume:
+                raise SettingError(
+                    f"{folder} holds no capture that was begun: there is nothing to resume; correct the folder, or "
+                    "begin with --rotator and --camera"
+                )
             raise SettingError(f"--{name} is missing; name one, or `simulated` to try without")
     return Order(**({"angles_deg": layouts.DEFAULT_DEG, "bracket": ()} | wanted))
 

@@ -309,6 +309,8 @@ def test_resume_without_settings_has_those_it_was_begun_with(rig: Rig) -> None:
     assert sequence.order(rig.folder, {"angles_deg": None, "camera": None}, resume=True) == ORDER
     with pytest.raises(SettingError, match="--rotator is missing"):
         sequence.order(rig.folder, {"camera": "simulated"}, resume=False)
+    with pytest.raises(SettingError, match="nothing to resume"):
+        sequence.order(rig.folder / "other", {}, resume=True)
 
 
 def test_the_port_may_be_another_after_the_cable_was_plugged_in_again(rig: Rig) -> None:
