@@ -20,6 +20,7 @@ REC709_TO_XYZ = np.array(
 LUMINANCE = REC709_TO_XYZ[1]  # Y of linear Rec.709
 _D65 = (0.3127, 0.3290)  # xy
 _TURN = 2 * np.pi
+_RIDGE = 1e-12  # of what the patches say of each unknown: too few colors leave some of them open, and no error
 _LEVELS = 65535  # of linear light: a twentieth of an 8-bit step where the curve is steepest
 
 
@@ -145,7 +146,7 @@ def fit_matrix(
     matrix, slope, glare = _weighted(color, reference, position, usable, rounds)
     seen = _seen(color, position, matrix, slope, glare)
     residual = np.where(usable, delta_e(seen, reference), np.nan)
-    return MatrixFit(matrix=matrix, slope=slope, glare=glare, delta_e=residual)
+    return MatrixFit(matrix=matrix, slope=slope, glare=float(glare), delta_e=residual)
 
 
 def predicted(
@@ -160,13 +161,12 @@ def predicted(
     color, reference, position, usable, rounds
         As in `fit_matrix`; 13 usable patches or more.
     """
-    seen = np.full(reference.shape, np.nan)
-    for patch in np.flatnonzero(usable):
-        others = usable & (np.arange(len(usable)) != patch)
-        fit = _weighted(color, reference, position, others, rounds)
-        seen[patch] = _seen(color[patch : patch + 1], position[patch : patch + 1], *fit)[0]
+    left_out = np.flatnonzero(usable)
+    others = usable & (np.arange(len(usable)) != left_out[:, None])
+    matrix, slope, glare = _weighted(color, reference, position, others, rounds)
+    each = np.arange(len(left_out))
     out = np.full(len(reference), np.nan)
-    out[usable] = delta_e(seen[usable], reference[usable])
+    out[left_out] = delta_e(_seen(color, position, matrix, slope, glare)[each, left_out], reference[left_out])
     return out
 
 
@@ -187,45 +187,50 @@ def fitting(color: Floats, reference: Floats, position: Floats, usable: NDArray[
     ----------
     Rousseeuw & Van Driessen, Computing LTS Regression for Large Data Sets, 2006.
     """
-    exposure = float(np.mean(color[usable])) + 1e-12
-    base, random = _base(reference), np.random.default_rng(24)
+    color = color / (float(np.mean(color[usable])) + 1e-12)
+    base, random, system = _base(reference), np.random.default_rng(24), _System(color, reference, position)
     able = np.flatnonzero(usable)
     most = max(9, round(0.6 * len(able)))
-    best, least = reference, np.inf
-    for _ in range(tries):
-        chosen = random.choice(able, 9, replace=False)
-        for _ in range(3):  # each step lowers the sum (Rousseeuw's C-step)
-            weight = np.where(np.isin(np.arange(len(base)), chosen), base, 0.0)
-            matrix, slope, glare = _solve(color / exposure, reference, position, weight)
-            seen = _seen(color / exposure, position, matrix, slope, glare)
-            error = np.linalg.norm(base[:, None] * (seen - reference), axis=1)
-            chosen = able[np.argsort(error[able])[:most]]
-        total = float(np.sum(error[chosen] ** 2))
-        if total < least:
-            best, least = seen, total
-    return delta_e(best, reference)
+    chosen = np.zeros((tries, len(base)), bool)
+    for row in chosen:
+        row[random.choice(able, 9, replace=False)] = True
+    for _ in range(3):  # each step lowers the sum (Rousseeuw's C-step)
+        seen = _seen(color, position, *system.solve(base * chosen))
+        error = np.linalg.norm(base[:, None] * (seen - reference), axis=-1)
+        order = able[np.argsort(error[:, able], axis=1)[:, :most]]
+        chosen = np.zeros_like(chosen)
+        np.put_along_axis(chosen, order, True, axis=1)
+    best = int(np.argmin(np.sum(error**2, axis=1, where=chosen)))
+    return delta_e(seen[best], reference)
 
 
 def _weighted(
     color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_], rounds: int
-) -> tuple[Floats, Floats, float]:
-    """M, e and b by least squares that outliers are tamed in (Huber)."""
-    exposure = float(np.mean(color[usable])) + 1e-12
-    base = np.where(usable, _base(reference), 0.0)
-    weight = base
+) -> tuple[Floats, Floats, Floats]:
+    """M (…, 3, 3), e (…, 2) and b (…,) by least squares that outliers are tamed in (Huber), `usable` (…, N)."""
+    exposure = float(np.mean(color[usable.reshape(-1, len(color)).any(axis=0)])) + 1e-12
+    color, base = color / exposure, np.where(usable, _base(reference), 0.0)
+    system, weight = _System(color, reference, position), base
     for _ in range(rounds):
-        matrix, slope, glare = _solve(color / exposure, reference, position, weight)
-        error = np.linalg.norm(
-            base[:, None] * (_seen(color / exposure, position, matrix, slope, glare) - reference), axis=1
-        )
-        limit = 2.5 * float(np.median(error[usable])) + 1e-9
+        matrix, slope, glare = system.solve(weight)
+        seen = _seen(color, position, matrix, slope, glare)
+        error = np.linalg.norm(base[..., None] * (seen - reference), axis=-1)
+        limit = 2.5 * _median(error, usable)[..., None] + 1e-9
         weight = base * np.sqrt(np.minimum(1.0, limit / np.maximum(error, 1e-12)))
     return matrix / exposure, slope, glare
 
 
-def _seen(color: Floats, position: Floats, matrix: Floats, slope: Floats, glare: float) -> Floats:
-    """Reflectance (N, 3) that the light's slope and the glare leave of camera channels."""
-    return np.asarray((color @ matrix.T - glare) / (1 + position @ slope)[:, None])
+def _median(value: Floats, usable: NDArray[np.bool_]) -> Floats:
+    """Of the usable ones among (…, N)."""
+    ordered, count = np.sort(np.where(usable, value, np.inf), axis=-1), usable.sum(axis=-1, keepdims=True)
+    middle = [np.take_along_axis(ordered, at, axis=-1)[..., 0] for at in ((count - 1) // 2, count // 2)]
+    return np.asarray((middle[0] + middle[1]) / 2)
+
+
+def _seen(color: Floats, position: Floats, matrix: Floats, slope: Floats, glare: Floats) -> Floats:
+    """Reflectance (…, N, 3) that the light's slope and the glare leave of camera channels."""
+    level = 1 + np.asarray(slope) @ position.T
+    return np.asarray((color @ np.swapaxes(matrix, -1, -2) - np.asarray(glare)[..., None, None]) / level[..., None])
 
 
 def _base(reference: Floats) -> Floats:
@@ -234,14 +239,24 @@ def _base(reference: Floats) -> Floats:
     return np.asarray((1 + (chroma < 0.1 * reference.max(axis=1))) / np.maximum(luminance(reference), 0.02) ** (2 / 3))
 
 
-def _solve(color: Floats, reference: Floats, position: Floats, weight: Floats) -> tuple[Floats, Floats, float]:
-    """M (3, 3), e (2,) and b by one linear least squares over N patches × 3 channels."""
-    system = np.zeros((3, len(color), 12))
-    for channel in range(3):
-        system[channel, :, 3 * channel : 3 * channel + 3] = color
-        system[channel, :, 9:11] = -position * reference[:, channel, None]
-    system[:, :, 11] = -1
-    rows = (weight[None, :, None] * system).reshape(-1, 12)
-    right = (weight[None, :] * reference.T).ravel()
-    solution = np.linalg.lstsq(rows, right, rcond=None)[0]
-    return solution[:9].reshape(3, 3), solution[9:11], float(solution[11])
+class _System:
+    """The linear least squares over N patches × 3 channels for M, e and b, whatever weights the patches have."""
+
+    def __init__(self, color: Floats, reference: Floats, position: Floats) -> None:
+        self._color, self._reference, self._position = color, reference, position
+        rows = np.zeros((3, len(color), 12))
+        for channel in range(3):
+            rows[channel, :, 3 * channel : 3 * channel + 3] = color
+            rows[channel, :, 9:11] = -position * reference[:, channel, None]
+        rows[:, :, 11] = -1
+        self._products = np.einsum("cni,cnj->nij", rows, rows).reshape(len(color), 144)
+        self._right = np.einsum("cni,nc->ni", rows, reference)
+
+    def solve(self, weight: Floats) -> tuple[Floats, Floats, Floats]:
+        """M (…, 3, 3), e (…, 2) and b (…,) for weights (…, N)."""
+        square = weight**2
+        normal = (square @ self._products).reshape(*weight.shape[:-1], 12, 12)
+        scale = 1 / np.sqrt(np.maximum(np.diagonal(normal, axis1=-2, axis2=-1), 1e-30))
+        alike = normal * scale[..., :, None] * scale[..., None, :] + _RIDGE * np.eye(12)
+        solution = scale * np.linalg.solve(alike, (scale * (square @ self._right))[..., None])[..., 0]
+        return solution[..., :9].reshape(*weight.shape[:-1], 3, 3), solution[..., 9:11], solution[..., 11]

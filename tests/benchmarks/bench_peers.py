@@ -3,9 +3,10 @@
     python tests/benchmarks/bench_peers.py FOLDER [--megapixels 6] [--out peers.json]
 
 FOLDER is that of `bench_speed.py`, whose captures are made where they are missing. A peer that is not installed is
-left out: `pip install HDRutils polanalyser dbini-torch` in an environment of its own, named with PYTHONPATH. A figure
-is the least of three calls, one thread each. Merging is counted with its decoding, in all processes, and less LibRaw's
-unpacking. hdrmerge (with QT_QPA_PLATFORM=offscreen) and align_image_stack are of Debian's hdrmerge and hugin-tools.
+left out: `pip install HDRutils polanalyser dbini-torch colour-checker-detection` in an environment of its own, named
+with PYTHONPATH. A figure is the least of three calls, one thread each. Merging is counted with its decoding, in all
+processes, and less LibRaw's unpacking. hdrmerge (with QT_QPA_PLATFORM=offscreen) and align_image_stack are of Debian's
+hdrmerge and hugin-tools.
 """
 
 import argparse
@@ -66,7 +67,7 @@ def main() -> None:
     capture = captures.read(folder)
     stack = hdr.merge(capture, hdr.Settings())
     rows = []
-    for row in chain(solving(stack), registering(stack, folder), merging(capture), integrating()):
+    for row in chain(solving(stack), charting(stack), registering(stack, folder), merging(capture), integrating()):
         print(table([row]), file=sys.stderr)
         rows.append(row)
     given.out.write_text(json.dumps([vars(row) for row in rows], indent=1) + "\n")
@@ -148,6 +149,23 @@ def _align_image_stack(grey: list[Floats]) -> tuple[float, str]:
         cv2.findTransformECC(first, other, motion, cv2.MOTION_EUCLIDEAN, _ECC)
         left.append(_apart(np.vstack([motion, [0, 0, 1]]), np.eye(3), first.shape))
     return theirs, ", ".join(f"{one:.3f}" for one in left)
+
+
+def charting(stack: AngleStack) -> Iterator[Row]:
+    """The chart in the first shot; ours with the matrix, every patch predicted, and the light's place."""
+    try:
+        from colour_checker_detection import detect_colour_checkers_segmentation
+    except ModuleNotFoundError:
+        return
+
+    value = stack.value[0]
+    shown = np.clip(value / np.percentile(value, 99.5, axis=(0, 1)), 0, 1).astype(np.float32) ** np.float32(1 / 2.2)
+    found = len(detect_colour_checkers_segmentation(shown))
+    theirs = least(lambda: detect_colour_checkers_segmentation(shown))
+    reference, search = calib.colorchecker(), ChartRequest("auto")
+    ours = least(lambda: whitebalance.measure(stack, reference, search, whitebalance.Settings()))
+    note = f"theirs finds {found}, ours with its matrix and doubt"
+    yield Row("chart found and fitted", "colour-checker-detection", ours, theirs, note)
 
 
 def solving(stack: AngleStack) -> Iterator[Row]:

@@ -13,6 +13,7 @@ Triggs et al., Bundle Adjustment, 2000, §4 (Gauss–Newton); Huber & Ronchetti,
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,23 +116,20 @@ def refine(image: Floats, start: Placement, steps: int = 12) -> Placement:
     """
     frame = _frame(start)  # image px → about the chart's own, so that the steps are well scaled
     at = _pixels(image.shape[:2], start)
-    value = image[at[:, 1], at[:, 0]].astype(np.float64)
-    if len(value) < 24 * 16:
+    value = np.ascontiguousarray(image[at[:, 1], at[:, 0]].T, np.float32)
+    if value.shape[1] < 24 * 16:
         return start
-    point = project(frame, at.astype(np.float64))
+    point = project(frame, at.astype(np.float64)).T
     inverse = np.linalg.inv(frame @ start.homography)
     inverse = inverse / inverse[2, 2]
     least_blur = min(_PIXEL_BLUR_PX / start.pitch_px, _GREATEST_BLUR)
-    patch, blur, explained = start.patch, max(start.blur, 0.04), 0.0
+    patch, blur, drawing = start.patch, max(start.blur, 0.04), None
+    seen = _encoded(np.maximum(value, np.float32(_DARKEST)))
     for step in range(steps):
-        drawing = _draw(point, value, inverse, patch, blur)
+        drawing = _draw(point, value, seen, inverse, patch, blur)
         if drawing is None:
             return start
-        residual, jacobian, explained = drawing
-        scale = MAD_TO_SIGMA * np.median(np.abs(residual)) + 1e-4
-        weight = np.minimum(1.0, 2.5 * scale / (np.abs(residual) + 1e-12))  # Huber
-        normal = np.einsum("nci,nc,ncj->ij", jacobian, weight, jacobian)
-        right = np.einsum("nci,nc,nc->i", jacobian, weight, residual)
+        normal, right = drawing.equations()
         if not np.trace(normal) > 0:  # even all over: nothing tells
             return start
         damping = 1e-3 * np.diag(normal) + 1e-9 * np.trace(normal)
@@ -142,78 +140,113 @@ def refine(image: Floats, start: Placement, steps: int = 12) -> Placement:
         if step > 3 and np.abs(change[:8]).max() < 1e-5:
             break
     homography = np.linalg.inv(frame) @ np.linalg.inv(inverse)
+    explained = 0.0 if drawing is None else drawing.explained()
     return Placement(homography / homography[2, 2], patch, blur, explained)
 
 
-def _draw(
-    point: Floats, value: Floats, inverse: Floats, patch: float, blur: float
-) -> tuple[Floats, Floats, float] | None:
-    """Value − drawing (N, 3) on the chart; the drawing's derivatives (N, 3, 10); variance explained."""
-    homogeneous = np.concatenate([point, np.ones((len(point), 1))], axis=1)
-    mapped = homogeneous @ inverse.T
+@dataclass(frozen=True)
+class _Drawing:
+    """A chart drawn over N pixels, float32: what is left of them, and how it changes with the ten unknowns."""
+
+    seen: Floats  # (3, N) encoded
+    residual: Floats  # (3, N) seen − drawn
+    contrast: Floats  # (3, N) derivative of what is drawn by cover
+    cover_by: Floats  # (10, N) derivative of cover by the homography's eight numbers, patch and blur
+
+    def equations(self) -> tuple[Floats, Floats]:
+        """JᵀWJ (10, 10) and JᵀWr (10,) with Huber weights W; a pixel's J is contrast times cover_by."""
+        off = np.abs(self.residual)
+        scale = np.float32(MAD_TO_SIGMA * np.median(off) + 1e-4)
+        weight = np.minimum(np.float32(1), np.float32(2.5) * scale / (off + np.float32(1e-12)))
+        weight *= self.contrast
+        slope = np.sum(weight * self.contrast, axis=0)
+        pull = np.sum(weight * self.residual, axis=0)
+        return ((self.cover_by * slope) @ self.cover_by.T).astype(np.float64), (self.cover_by @ pull).astype(np.float64)
+
+    def explained(self) -> float:
+        """Share of the variance that is drawn."""
+        spread = self.seen - np.median(self.seen, axis=1)[:, None]
+        return 1 - float(np.mean(np.minimum(self.residual**2, 0.25)) / max(float(np.mean(spread**2)), 1e-9))
+
+
+def _encoded(linear: Floats) -> Floats:
+    return np.asarray(np.exp(np.log(linear) * np.float32(1 / _GAMMA)))
+
+
+def _draw(point: Floats, value: Floats, seen: Floats, inverse: Floats, patch: float, blur: float) -> _Drawing | None:
+    """The chart over points (2, N) of its frame that show `value` (3, N), encoded `seen`; None if it lies outside."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = mapped[:, 0] / mapped[:, 2], mapped[:, 1] / mapped[:, 2]
+        u, v, depth = inverse[:, :2] @ point + inverse[:, 2:]
+        u, v = u / depth, v / depth
     edge = (1 - patch) / 2 - _MARGIN
-    used = (u > edge) & (u < COLUMNS - edge) & (v > edge) & (v < ROWS - edge) & (mapped[:, 2] > 0)
+    used = (u > edge) & (u < COLUMNS - edge) & (v > edge) & (v < ROWS - edge) & (depth > 0)
     if used.sum() < 24 * 16:
         return None
-    u, v, depth = u[used], v[used], mapped[used, 2]
-    homogeneous, value = homogeneous[used], value[used]
-    column = np.clip(np.floor(u), 0, COLUMNS - 1).astype(int)
-    row = np.clip(np.floor(v), 0, ROWS - 1).astype(int)
-    cell = row * COLUMNS + column
-    across, across_du, across_patch, across_blur = _box(u - column - 0.5, patch, blur)
-    along, along_dv, along_patch, along_blur = _box(v - row - 0.5, patch, blur)
+    u, v, x, y, over = (a[used].astype(np.float32) for a in (u, v, *point, 1 / depth))
+    value, seen = value[:, used], seen[:, used]
+    column, row = np.clip(np.floor(u), 0, COLUMNS - 1), np.clip(np.floor(v), 0, ROWS - 1)
+    cell = (row * COLUMNS + column).astype(np.intp)
+    half = np.float32(0.5)
+    across, across_du, across_patch, across_blur = _box(u - column - half, patch, blur)
+    along, along_dv, along_patch, along_blur = _box(v - row - half, patch, blur)
     cover = across * along
     colors, card = _colors(value, cover, cell)
-    contrast = (colors - card)[cell]  # (N, 3)
-    linear = np.maximum(card + contrast * cover[:, None], _DARKEST)
-    drawn = linear ** (1 / _GAMMA)
-    contrast = contrast * drawn / linear / _GAMMA
-    du, dv = along * across_du, across * along_dv
-    turn = homogeneous / depth[:, None]  # ∂u/∂h₁ = x/w, ∂u/∂h₃ = −u x/w
-    cover_by = np.concatenate(
+    contrast = np.take((colors - card).T.astype(np.float32), cell, axis=1)
+    linear = np.maximum(contrast * cover + card.astype(np.float32)[:, None], np.float32(_DARKEST))
+    drawn = _encoded(linear)
+    contrast *= drawn
+    contrast /= linear
+    contrast *= np.float32(1 / _GAMMA)
+    du, dv = along * across_du * over, across * along_dv * over  # ∂u/∂h₁ = x/w, ∂u/∂h₃ = −u x/w
+    both = -(du * u + dv * v)
+    cover_by = np.stack(
         [
-            du[:, None] * turn,
-            dv[:, None] * turn,
-            -(du * u + dv * v)[:, None] * turn[:, :2],
-            (across_patch * along + across * along_patch)[:, None],
-            (across_blur * along + across * along_blur)[:, None],
-        ],
-        axis=1,
-    )  # (N, 10)
-    seen = np.maximum(value, _DARKEST) ** (1 / _GAMMA)
-    residual = seen - drawn
-    spread = seen - np.median(seen, axis=0)
-    explained = 1 - float(np.mean(np.minimum(residual**2, 0.25)) / max(np.mean(spread**2), 1e-9))
-    return residual, contrast[:, :, None] * cover_by[:, None, :], explained
+            *(du * x, du * y, du),
+            *(dv * x, dv * y, dv),
+            *(both * x, both * y),
+            across_patch * along + across * along_patch,
+            across_blur * along + across * along_blur,
+        ]
+    )
+    return _Drawing(seen, seen - drawn, contrast, cover_by)
 
 
 def _box(offset: Floats, patch: float, blur: float) -> tuple[Floats, Floats, Floats, Floats]:
-    """A blurred box over −patch/2…patch/2, and its derivatives by offset, patch and blur."""
+    """A blurred box over −patch/2…patch/2, and its derivatives by offset, patch and blur; float32."""
     from scipy.special import ndtr  # here: importing it costs .2 s of every start
 
-    low, high = (offset + patch / 2) / blur, (offset - patch / 2) / blur
-    bell_low, bell_high = (np.exp(-0.5 * t * t) / np.sqrt(2 * np.pi) / blur for t in (low, high))
+    over = np.float32(1 / blur)
+    low, high = (offset + np.float32(patch / 2)) * over, (offset - np.float32(patch / 2)) * over
+    peak = over / np.float32(np.sqrt(2 * np.pi))
+    bell_low, bell_high = (peak * np.exp(np.float32(-0.5) * t * t) for t in (low, high))
     return (
         ndtr(low) - ndtr(high),
         bell_low - bell_high,
         (bell_low + bell_high) / 2,
-        -(bell_low * low - bell_high * high),
+        bell_high * high - bell_low * low,
     )
 
 
-def _colors(value: Floats, cover: Floats, cell: NDArray[np.int_]) -> tuple[Floats, Floats]:
-    """Colour of each patch (24, 3) and of the card (3,), as the image shows them now."""
+def _colors(value: Floats, cover: Floats, cell: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """Color of each patch (24, 3) and of the card (3,), as pixels (3, N) show them now."""
     bare = cover < max(0.1, float(np.percentile(cover, 2)))
-    card = np.median(value[bare], axis=0)
+    card = np.median(value[:, bare], axis=1)
     colors = np.tile(card, (ROWS * COLUMNS, 1))
-    full = cover > 0.9
-    for index in range(ROWS * COLUMNS):
-        inside = (cell == index) & full
-        if inside.any():
-            colors[index] = np.median(value[inside], axis=0)
+    full = np.flatnonzero(cover > 0.9)
+    full = full[np.argsort(cell[full], kind="stable")]
+    ends = np.searchsorted(cell[full], np.arange(ROWS * COLUMNS + 1))
+    inside = value[:, full]
+    for index, (start, end) in enumerate(pairwise(ends)):
+        if end > start:
+            colors[index] = _medians(inside[:, start:end])
     return colors, card
+
+
+def _medians(value: Floats) -> Floats:
+    """Of rows (C, N); np.median takes longer to begin than these take."""
+    low, high = (value.shape[1] - 1) // 2, value.shape[1] // 2
+    ordered = np.partition(value, (low, high), axis=1)
+    return np.asarray((ordered[:, low] + ordered[:, high]) / 2)
 
 
 def _pixels(shape: tuple[int, int], placement: Placement) -> NDArray[np.int_]:

@@ -50,11 +50,12 @@ def _is_chart(radiance: AngleStack, part: NDArray[np.bool_], reference: ChartRef
     if place.explained < _EXPLAINED or not chart.is_view(place.homography):
         return False
     to_full = np.array([[1 / small, 0, x0 + (0.5 / small - 0.5)], [0, 1 / small, y0 + (0.5 / small - 0.5)], [0, 0, 1]])
-    return any(_delta_e(radiance, way.moved(to_full), reference) < _DELTA_E for way in (place, place.turned()))
+    seen = patches.sample(radiance.value[0], radiance.quality[0], place.moved(to_full), _PATCH_SHARE)
+    return any(_delta_e(way, reference) < _DELTA_E for way in (seen, seen.turned()))
 
 
-def _delta_e(radiance: AngleStack, place: chart.Placement, reference: ChartReference) -> float:
+def _delta_e(seen: patches.Samples, reference: ChartReference) -> float:
     try:
-        return patches.fit(radiance.value[0], radiance.quality[0], place, reference, _PATCH_SHARE).mean
+        return patches.fit(seen, reference).mean
     except ChartError:
         return float("inf")

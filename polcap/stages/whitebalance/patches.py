@@ -44,28 +44,27 @@ class ChartFit:
     color: Floats  # (24, 3) S0 of the patches, camera channels
 
 
-def fit(value: Floats, quality: Bits, place: Placement, reference: ChartReference, share: float) -> ChartFit:
-    """The matrix that one shot's patches ask for.
+@dataclass(frozen=True)
+class Samples:
+    """What one shot shows of the patches, before anything is fitted."""
 
-    Parameters
-    ----------
-    value
-        (H, W, 3) radiance of the shot.
-    quality
-        (H, W) its bits.
-    place
-        Of the chart.
-    reference
-        Colors of its patches.
-    share
-        Of each patch's side that is sampled.
+    color: Floats  # (24, 3) S0 of the patches, camera channels
+    use: Bits  # (24,) PatchUse
+
+    def turned(self) -> "Samples":
+        """The same chart, read upside down."""
+        return Samples(self.color[::-1], self.use[::-1])
+
+
+def fit(samples: Samples, reference: ChartReference) -> ChartFit:
+    """The matrix that one shot's patches ask for to become a chart's colors.
 
     Raises
     ------
     ChartError
         Fewer than 12 patches may serve.
     """
-    seen, use = sample(value, quality, place, share)
+    seen, use = samples.color, samples.use
     _check(use)
     error = color.fitting(seen, reference.rec709, position(), use == PatchUse.USED)
     odd = error > max(_LEAST_ODD, _ODD * float(np.median(error[use == PatchUse.USED])))
@@ -94,15 +93,19 @@ def position() -> Floats:
     return np.asarray(chart.centers() - chart.centers()[WHITE])
 
 
-def sample(value: Floats, quality: Bits, place: Placement, share: float) -> tuple[Floats, Bits]:
-    """S0 of each patch (24, 3) and its use (24,).
-
-    Twice the trimmed mean over the inner part of the patch.
+def sample(value: Floats, quality: Bits, place: Placement, share: float) -> Samples:
+    """S0 of each patch: twice the trimmed mean over its inner part.
 
     Parameters
     ----------
-    value, quality, place, share
-        As in `fit`.
+    value
+        (H, W, 3) radiance of the shot.
+    quality
+        (H, W) its bits.
+    place
+        Of the chart.
+    share
+        Of each patch's side that is sampled.
     """
     color_, uneven = np.zeros((24, 3)), np.zeros(24)
     use = np.zeros(24, np.uint8)
@@ -120,7 +123,7 @@ def sample(value: Floats, quality: Bits, place: Placement, share: float) -> tupl
             use[index] = PatchUse.CLIPPED
     light = color_.sum(axis=1)
     too_uneven = uneven > _UNEVEN * light + _UNEVEN_WHITE * light.max()
-    return color_, np.where((use == PatchUse.USED) & too_uneven, PatchUse.UNEVEN, use).astype(np.uint8)
+    return Samples(color_, np.where((use == PatchUse.USED) & too_uneven, PatchUse.UNEVEN, use).astype(np.uint8))
 
 
 def left_out(use: Bits) -> str:
