@@ -29,6 +29,18 @@ def test_report_is_plain_json_with_figures_gates_and_settings(result: Path) -> N
     assert len(about["figures"]["chart"]["delta_e"]) == 24
 
 
+def test_the_page_opens_with_the_error_that_its_checks_judge(result: Path) -> None:
+    about = report.read(result)
+    gate = next(gate for gate in about["gates"] if gate["name"] == "normal error")
+    assert f"within {labels.number(gate['value'])}° of the surface's." in page.verdict(about)[1]
+    gate |= {"value": 31.74, "says": "expected error of the normals 31.7° (median), most of it from: body"}
+    assert page.verdict(about)[1].endswith(
+        "within 31.74° of the surface's; most of that is for what these checks found: body."
+    )
+    about["gates"].remove(gate)  # as where the shots are out of order
+    assert page.verdict(about)[1] == ""
+
+
 def test_page_needs_no_other_file_and_no_network(result: Path) -> None:
     page = (result / "report.html").read_text()
     assert [found[:40] for found in re.findall(r'(?:src|href)=["\']?(?!["\']|data:|asset/)[^\s>]*', page)] == []

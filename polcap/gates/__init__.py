@@ -13,6 +13,8 @@ from polcap.config import Config, Gates
 from polcap.gates import geometry, light, polarization
 from polcap.gates.gate import Found, Gate, State, Unit
 
+_MOST_DEG = 90.0  # normals face the camera: no error is larger in the median
+
 __all__ = ["Found", "Gate", "State", "Unit", "judge", "verdict"]
 
 
@@ -67,15 +69,17 @@ def _normal_error(found: Found, judged: list[Gate], limits: Gates) -> Gate:
     maps = found.maps
     inside = maps.confidence[maps.mask]
     own = float(np.median(inside)) if inside.size else float("nan")
-    expected = float(np.sqrt(own**2 + sum(gate.cost_deg**2 for gate in judged)))
+    expected = min(float(np.sqrt(own**2 + sum(gate.cost_deg**2 for gate in judged))), _MOST_DEG)
     because = ", ".join(gate.name for gate in judged if gate.cost_deg > 0.5 * own)
-    says = f"expected error of the normals {expected:.1f}° (median)" + (
-        f", most of it from: {because}" if because else ""
-    )
+    says = f"expected error of the normals {expected:.1f}° (median)"
+    if expected == _MOST_DEG:
+        says = "nothing is known of the normals"
+    says += f", most of it from: {because}" if because else ""
     limit = limits.max_normal_error_deg
     if not np.isfinite(expected):
         return Gate("normal error", "not measured", None, limit, says, unit="°")
     if expected <= limit:
         return Gate("normal error", "pass", round(expected, 2), limit, says, unit="°")
-    remedy = "see the lines above" if because else "more light or frames, four angles, or a darker room"
+    more = "" if len(found.names) > 3 else " four angles,"
+    remedy = "see the lines above" if because else f"more light or frames,{more} or a darker room"
     return Gate("normal error", "fail", round(expected, 2), limit, says, remedy, unit="°")

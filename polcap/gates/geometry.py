@@ -4,7 +4,7 @@ import numpy as np
 
 from polcap.config import Config, Gates
 from polcap.formats import calib
-from polcap.gates.gate import Found, Gate, State, at_most, blamed
+from polcap.gates.gate import Found, Gate, State, Unit, at_most, blamed
 from polcap.images import Mesh
 from polcap.optics.sharpness import TILE
 from polcap.stages.align import object_motion
@@ -25,16 +25,21 @@ def alignment(found: Found, config: Config) -> Gate:
     bad = lost | (shift > limit) | unsure
     worst = int(np.argmax(np.where(bad, 1e9, 0) + np.nan_to_num(shift)))
     says = f"{names[worst]} moved by {shift[worst]:.1f} px, sure to {doubt[worst]:.2f}"
+    figure = float(shift[worst])
+    unit: Unit = "px"
     if lost[worst]:
         says = f"{names[worst]} shows another scene, or moved too far to be followed"
+        if shift[worst] <= limit:
+            figure, limit, unit = float(measured.correlation[worst]), config.align.min_correlation, ""
     elif unsure[worst] and shift[worst] <= limit:
         says = f"{names[worst]} moved by {shift[worst]:.1f} px, sure to {doubt[worst]:.2f} only: too little texture"
-    figure = round(float(shift[worst]), 3) if np.isfinite(shift[worst]) else None
+        figure, limit = float(doubt[worst]), config.gates.max_align_residual_px * max(found.grid_px, 1)
+    value = round(figure, 3) if np.isfinite(figure) else None
     if not bad.any():
         pushed = _pushed(found, config)
-        return pushed or Gate("alignment", "pass", figure, limit, says, unit="px")
+        return pushed or Gate("alignment", "pass", value, limit, says, unit="px")
     remedy = "lock the camera, do not touch the object, and take that shot again"
-    return Gate("alignment", "fail", figure, limit, says, remedy, 10.0, blamed(names, bad), "px")
+    return Gate("alignment", "fail", value, limit, says, remedy, 10.0, blamed(names, bad), unit)
 
 
 def _pushed(found: Found, config: Config) -> Gate | None:
@@ -56,33 +61,37 @@ def _pushed(found: Found, config: Config) -> Gate | None:
 
 def mask(found: Found, limits: Gates) -> Gate:
     """Fails where a chart is in it or the network doubts it; warns from half of that on, and of shapes none has."""
-    object_, limit = found.object_, limits.max_mask_doubt
-    doubts = []
-    if object_.border > limits.max_mask_border:
-        doubts.append(
-            f"the object leaves the picture along {object_.border:.0%} of its border, where its outline tells nothing"
-        )
-    if object_.islands > limits.max_mask_islands:
-        doubts.append(f"{object_.islands:.0%} of it stands apart")
-    if object_.holes > limits.max_mask_holes:
-        doubts.append(f"it has holes of {object_.holes:.0%} of its area")
-    if object_.doubt is not None and object_.doubt > limit / 2:
-        doubts.insert(0, "which pixels are the object is not clear")
-    state: State = (
-        "warn" if doubts else "pass" if object_.doubt is not None or object_.source == "user" else "not measured"
-    )
-    if object_.doubt is not None and object_.doubt > limit:
-        state = "fail"
+    object_, limit, doubt = found.object_, limits.max_mask_doubt, found.object_.doubt
+    faults: list[tuple[str, float, float]] = []  # in words, its figure, its limit
     charted = 0.0
     if found.color.corners is None:
         charted = chart_in_mask.share(found.radiance, object_.mask, calib.colorchecker())
     if charted:
-        doubts.insert(0, f"{charted:.0%} of it looks like a colour chart that was not found, and is no object")
-        state = "fail"
-    says = "; ".join(doubts) or "share of the object's outline in doubt"
+        faults.append(
+            (f"{charted:.0%} of it looks like a colour chart that was not found, and is no object", charted, 0)
+        )
+    doubted = doubt is not None and doubt > limit
+    if doubt is not None and doubt > limit / 2:
+        faults.append(("which pixels are the object is not clear", doubt, limit if doubted else limit / 2))
+    for says, figure, most in (
+        ("the object leaves the picture along {:.0%} of its border, where its outline tells nothing",
+         object_.border, limits.max_mask_border),
+        ("{:.0%} of it stands apart", object_.islands, limits.max_mask_islands),
+        ("it has holes of {:.0%} of its area", object_.holes, limits.max_mask_holes),
+    ):  # fmt: skip
+        if figure > most:
+            faults.append((says.format(figure), figure, most))
+    if not faults and doubt is not None:
+        return Gate("mask", "pass", doubt, limit, f"its network expects {100 * doubt:.1f} % of it to be wrong")
+    if not faults:
+        known = object_.source == "user"
+        says = "as given" if known else "no network looked for it"
+        return Gate("mask", "pass" if known else "not measured", None, limit, says)
+    state: State = "fail" if charted or doubted else "warn"
     remedy = "look at it, and where it is wrong give --mask PNG; let backdrop show all around the object"
-    cost = 10 * object_.border if state == "warn" else 5.0 if state == "fail" else 0.0
-    return Gate("mask", state, object_.doubt, limit, says, remedy if doubts else "", cost)
+    cost = 10 * object_.border if state == "warn" else 5.0
+    _, value, most = faults[0]
+    return Gate("mask", state, round(value, 5), most, "; ".join(fault[0] for fault in faults), remedy, cost)
 
 
 def mesh(of: Mesh, limits: Gates) -> Gate:

@@ -25,6 +25,7 @@ _BALL_DEG = 45.0  # median zenith over the disc of a ball
 _WEAK_DOLP = 0.05  # of an outline: above, nothing is taken for flattened; below, uneven light is no matter of shape
 _DIMMED = 0.9  # of the mean light: below, an outline turns away
 _ROUGH = 0.5  # roughness from which facets alone leave little polarization
+_ALONG = -0.3  # how well the AoLP lies across the contour, below: along it
 _MOST_PIXELS = 6e5  # a larger picture is averaged down
 
 
@@ -34,7 +35,8 @@ def order(found: Found) -> Gate:
     if gains.order == tuple(range(len(names))) and not gains.mirrored and gains.rival:
         other = ", ".join(names[i] for i in gains.rival) + (", counted the other way" if gains.rival_mirrored else "")
         says = f"the outline cannot tell the stated order from {other} (it fits to {gains.concentration:.2f})"
-        remedy = "make sure of folders and ring yourself; a closed, rounded object, a chart or four angles would tell"
+        would = "a closed, rounded object, a chart" + ("" if len(names) > 3 else " or four angles")
+        remedy = f"make sure of folders and ring yourself; {would} would tell"
         return Gate("order", "warn", "cannot tell", "as stated", says, remedy, unit="")
     if gains.order == tuple(range(len(names))) and not gains.mirrored:
         says = f"as stated (the outline fits to {gains.concentration:.2f})"
@@ -133,7 +135,7 @@ def _with_ring(gate: Gate, gains: Gains, limits: Gates) -> Gate:
         doubt, ring = float(np.degrees(gains.found_sigma)), np.degrees(gains.found_angle + gains.angle_correction) % 180
         says = f"nobody noted them; found {', '.join(f'{one:.1f}°' for one in ring)}, to {doubt:.1f}°"
         remedy = "note the ring's mark of every shot: then nothing has to be found"
-        return Gate("angles", "warn", round(doubt, 2), limits.max_turn_deg, says, remedy, doubt, unit="°")
+        return Gate("angles", "warn", "found", "noted", says, remedy, doubt, unit="")
     turn, doubt = np.degrees([gains.angle_offset, gains.angle_offset_sigma])
     applied = gains.angle_correction != 0
     noted = len(gains.gain) == 3 and abs(turn) > max(limits.max_ring_turn_deg, _SURE * doubt)
@@ -160,20 +162,21 @@ def _light_of_body(body: rim.Body, maps: SurfaceMaps, limits: Gates) -> Gate:
     """
     limit = limits.min_outline_dolp
     remedy = "darken the room, keep the flash beside the lens, and photograph an ambient frame"
-    if body.along < -0.3:
+    if body.along < _ALONG:
         says = (
             "the outline is polarized along the contour: light from around is reflected off the object (metal, or "
             "dark gloss), or all angles are off by 90°; the pictures cannot tell these apart"
         )
         both = f"{remedy}; if it was dark, the ring's mark stood upright at 0°: name the angles as they were, 90° on"
-        return Gate("body", "fail", round(body.dolp, 4), limit, says, both, 30.0)
+        return Gate("body", "fail", round(body.along, 2), _ALONG, says, both, 30.0, unit="")
     weak = _FLATTENED_DEG * (1 - np.sqrt(body.dolp / _USUAL_DOLP)) if body.dolp < limit else 0.0
     if body.concentration < limits.min_concentration:
         says = (
             f"polarization hardly follows the outline ({body.concentration:.2f}): ambient light, "
             "or an object whose outline is no contour of shape"
         )
-        return Gate("body", "warn", round(body.dolp, 4), limit, says, remedy, max(15.0, weak))
+        figure, least = round(body.concentration, 2), limits.min_concentration
+        return Gate("body", "warn", figure, least, says, remedy, max(15.0, weak), unit="")
     zenith, roughness = _median_shape(maps)
     flat, dimmed = zenith < limits.min_zenith_deg, body.brightness < _DIMMED
     hint = "under even light translucent bodies give little; trust the shape less"
@@ -182,16 +185,17 @@ def _light_of_body(body: rim.Body, maps: SurfaceMaps, limits: Gates) -> Gate:
             f"the outline is polarized by {100 * body.dolp:.1f} % and the shape found is flat ({zenith:.0f}° in the "
             "median), far less than shading says: a translucent body (wax, skin, milk), or ambient light"
         )
-        return Gate("body", "warn", round(body.dolp, 4), limit, says, hint, round(_BALL_DEG - zenith, 1))
+        cost = round(_BALL_DEG - zenith, 1)
+        return Gate("body", "warn", round(zenith, 1), limits.min_zenith_deg, says, hint, cost, unit="°")
     if body.dolp < limit and (dimmed if flat else roughness < _ROUGH):
         says = (
             f"the outline is polarized by {100 * body.dolp:.1f} %, far less than gloss and shading say: a translucent "
             "body (wax, skin, milk), or ambient light"
         )
         return Gate("body", "warn", round(body.dolp, 4), limit, says, hint, round(weak, 1))
-    if body.one_sided > limits.max_one_sided * _lopsided(body):
+    if body.one_sided > (most := limits.max_one_sided * _lopsided(body)):
         says = f"one side of the object is lit {body.one_sided:.1f} times more than its mean: light from the side"
-        return Gate("body", "warn", round(body.dolp, 4), limit, says, remedy, 10.0)
+        return Gate("body", "warn", round(body.one_sided, 2), round(most, 2), says, remedy, 10.0, unit="")
     says = f"the outline is polarized by {100 * body.dolp:.1f} %"
     if body.dolp < limit:
         says += ": little, as a flat object's" if flat else ": little, as a rough body's"

@@ -54,7 +54,7 @@ LABELS: dict[str, tuple[str, str]] = {
     "polarization.dolp_sigma_median": ("Its noise, 1σ, median", "%"),
     "polarization.residual_median": ("Residual of the sinusoid, median", "%"),
     "maps.estimator": ("Estimated by", ""),
-    "maps.normal_error_deg_median": ("Expected error of the normals, median", "°"),
+    "maps.normal_error_deg_median": ("Expected error of the normals by the estimator alone, median", "°"),
     "maps.normal_error_deg_90": ("90th percentile", "°"),
     "maps.diffuse_mean": ("Mean diffuse albedo: red, green, blue", ""),
     "maps.specular_median": ("Median specular albedo F0: red, green, blue", ""),

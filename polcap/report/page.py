@@ -101,11 +101,12 @@ def verdict(about: Mapping[str, Any]) -> tuple[str, str]:
     headline = _HEADLINE[about["verdict"]]
     if failed:
         headline += f": {len(failed)} of {len(gates)} checks failed"
-    error = about["figures"]["maps"]["normal_error_deg_median"]
-    good = (
-        "" if error is None else f"Half of the normals are expected within {labels.number(error, 2)}° of the surface's."
-    )
-    return headline, good
+    judged = [gate for gate in gates if gate["name"] == "normal error" and gate["value"] is not None]
+    if not judged:  # the shots are out of order, or there is no object
+        return headline, ""
+    within = f"Half of the normals are expected within {_gate_value(judged[0], 'value')} of the surface's"
+    because = judged[0]["says"].partition(", most of it from: ")[2]
+    return headline, f"{within}; most of that is for what these checks found: {because}." if because else f"{within}."
 
 
 def _verdict(about: Mapping[str, Any]) -> Iterator[str]:
@@ -124,10 +125,12 @@ def _verdict(about: Mapping[str, Any]) -> Iterator[str]:
 
 def _advice(gate: Mapping[str, Any]) -> str:
     """A gate that did not pass: its value and limit, what it means, what to do."""
-    value, limit = (escape(_gate_value(gate, name)) for name in ("value", "limit"))
+    value, limit = escape(_gate_value(gate, "value")), ""
+    if gate["limit"] is not None:
+        limit = f" (limit {escape(_gate_value(gate, 'limit'))})"
     cost = f" It costs about {_cost(gate)}." if _cost(gate) else ""
     says = f"{escape(gate['says'])}.{cost}{_remedy(gate)}"
-    return f"<b>{escape(gate['name'].capitalize())}</b> {value} (limit {limit}): {says}"
+    return f"<b>{escape(gate['name'].capitalize())}</b> {value}{limit}: {says}"
 
 
 def _cost(gate: Mapping[str, Any]) -> str:
@@ -144,7 +147,9 @@ def _gate_value(gate: Mapping[str, Any], name: str) -> str:
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         shown = labels.number(100 * value if unit == "%" else value)
         return f"{shown}{unit}" if unit == "°" else f"{shown} {unit}".rstrip()
-    return "not measured" if value is None else str(value)
+    if value is None:
+        return "not measured" if name == "value" and gate["state"] != "pass" else ""
+    return str(value)
 
 
 def _relit(photograph: NDArray[np.uint8], flashed: NDArray[np.uint8]) -> Iterator[str]:

@@ -218,3 +218,46 @@ def test_mesh_in_shreds_fails(good: SimpleNamespace, fault: dict[str, float], wo
     assert judged(changed(good, mesh=SimpleNamespace(**whole)))["mesh"].state == "pass"
     gate = judged(changed(good, mesh=SimpleNamespace(**whole | fault)))["mesh"]
     assert gate.state == "fail" and words in gate.says
+
+
+def _within(gate: Gate, least: bool) -> bool:
+    """Whether the gate's figure keeps to its limit, where both are numbers."""
+    value, limit = gate.value, gate.limit
+    if not (isinstance(value, float | int) and isinstance(limit, float | int)):
+        return False
+    return value >= limit if least else value <= limit
+
+
+def test_what_is_beside_a_gate_s_words_is_the_figure_that_they_are_of(good: SimpleNamespace) -> None:
+    object_, still, image = good.object_, good.alignment, good.stokes
+    unlike, unsure = np.array([1, 0.1, 1]), np.array([0, 0.5, 0])
+    around = image.stokes * np.array([1, -1, -1], np.float32)[:, None, None, None]
+    turned = image.stokes.copy()
+    turned[1:, :, : image.mask.shape[1] // 2] *= -1
+    dull = shaped(good, 0.13, 0.4, 0.6)
+    for name, least, fields in (
+        ("mask", False, {"object_": replace(object_, border=0.6, doubt=0.02)}),
+        ("mask", False, {"object_": replace(object_, holes=0.3, doubt=0.02)}),
+        ("mask", False, {"object_": replace(object_, doubt=0.2)}),
+        ("alignment", True, {"alignment": replace(still, correlation=unlike)}),
+        ("alignment", False, {"alignment": replace(still, residual_px=unsure)}),
+        ("body", True, {"stokes": replace(image, stokes=around)}),
+        ("body", True, {"stokes": replace(image, stokes=turned)}),
+        ("body", True, {"stokes": dull.stokes, "maps": dull.maps}),
+    ):
+        gate = judged(changed(good, **fields))[name]
+        assert gate.state in ("warn", "fail") and not _within(gate, least), gate
+
+
+def test_four_angles_are_not_asked_of_who_has_shot_four(good: SimpleNamespace) -> None:
+    four = found(angles=np.radians([0.0, 45, 90, 135]))
+    for of, asked in ((good, True), (four, False)):
+        gains = replace(of.gains, source="object", sigma=np.full_like(of.gains.sigma, 0.2))
+        doubtful = judged(changed(of, gains=gains))
+        assert ("four angles" in doubtful["gain doubt"].remedy) == asked
+        assert doubtful["normal error"].value == 90  # no error is larger
+
+
+def test_a_passing_mask_tells_its_figure(good: SimpleNamespace) -> None:
+    gate = judged(changed(good, object_=replace(good.object_, doubt=0.024)))["mask"]
+    assert gate.state == "pass" and "2.4 %" in gate.says
