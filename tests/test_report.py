@@ -12,6 +12,7 @@ import pytest
 
 from polcap import report
 from polcap.errors import StorageError
+from polcap.pictures import keys
 from polcap.report import compare, labels, lean, page
 from tests import surfaces
 
@@ -55,6 +56,13 @@ def test_page_shows_every_figure_with_words_and_unit(result: Path) -> None:
             assert f"{part}.{name}" in labels.LABELS, f"{part}.{name} has no words of its own"
             assert f"<td>{labels.text(f'{part}.{name}', value)}</td>" in page
     assert not re.search(r"<td>(?:\[|\{|None|True|False|nan)", page)
+
+
+def test_agreement_is_drawn_grey_and_registration_is_told_in_words(result: Path) -> None:
+    middle = keys.colors(keys.DIFFERENCE.palette)[keys.LEVELS // 2]
+    assert np.ptp(middle) < 3 and 100 < middle.mean() < 180  # neither black, which is no object, nor white
+    page = unescape((result / "report.html").read_text())
+    assert re.search(r"<b>45° on the first: [+-][.\d]+, [+-][.\d]+ px ± [.\d]+</b>", page)
 
 
 def test_photographs_and_their_rerendering_agree(result: Path) -> None:

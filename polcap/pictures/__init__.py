@@ -42,7 +42,7 @@ def of_stage(results: Results, stage: str) -> Picture:
     paint: dict[str, Callable[[], Picture]] = {
         "hdr": lambda: merged(results.radiance.value),
         "whitebalance": lambda: chart(results.radiance.value, results.color.value),
-        "align": lambda: alignment(results.radiance.value, results.alignment.value),
+        "align": lambda: sheet(registered(results.radiance.value, results.alignment.value)),
         "mask": lambda: outline(results.radiance.value, results.color.value, results.object_.value),
         "selfcal": lambda: gains(results.gains.value, results.radiance.value.angle),
         "stokes": lambda: stokes(results.stokes.value),
@@ -88,7 +88,7 @@ def chart(radiance: AngleStack, color: ColorCalibration, widest: int | None = No
     return picture
 
 
-def alignment(radiance: AngleStack, found: Alignment) -> Picture:
+def registered(radiance: AngleStack, found: Alignment) -> list[Tile]:
     """Brightness of each shot after registration (green) over the reference (magenta): grey where they agree."""
     size = _no_wider(radiance.value[0], 2 * WIDTH)
     zoom = np.diag([*np.divide(size, radiance.value.shape[2:0:-1]), 1.0])
@@ -101,7 +101,7 @@ def alignment(radiance: AngleStack, found: Alignment) -> Picture:
         moved = display(np.stack([first, on_first, first], -1), _top(first))
         x, y = transform[:2, 2]
         tiles.append(Tile(moved, f"{angle:g}° on the first: {x:+.2f}, {y:+.2f} px ± {residual:.3f}", note=_AGREE))
-    return sheet(tiles)
+    return tiles
 
 
 def outline(radiance: AngleStack, color: ColorCalibration, object_: ObjectMask, widest: int | None = None) -> Picture:

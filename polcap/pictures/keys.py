@@ -65,7 +65,7 @@ def colors(palette: Palette) -> NDArray[np.uint8]:
         hsv = np.stack([360 * np.arange(LEVELS) / LEVELS, np.full(LEVELS, 0.78), np.ones(LEVELS)], axis=-1)
         rgb: Any = cv2.cvtColor(hsv[None].astype(np.float32), cv2.COLOR_HSV2RGB)[0]
     elif palette == "balance":  # blue, grey where nothing is, red
-        ends = np.array([[0.10, 0.42, 0.90], [0.16, 0.16, 0.16], [0.95, 0.35, 0.10]])
+        ends = np.array([[0.10, 0.42, 0.90], [0.55, 0.55, 0.55], [0.95, 0.35, 0.10]])
         rgb = np.stack([np.interp(_STEPS, [0, 0.5, 1], ends[:, channel]) for channel in range(3)], axis=-1)
     else:
         ramp = np.arange(256, dtype=np.uint8)[None]

@@ -335,7 +335,7 @@ def _pictures(results: Results) -> str:
     notable: Sequence[tuple[str, str, NDArray[np.uint8]]] = (
         ("Reference shot", "the chart as it was read", pictures.chart(radiance, color, _WIDEST)),
         ("Object", "what was taken for it", pictures.outline(radiance, color, results.object_.value, _WIDEST)),
-        ("Registration", "first shot magenta, the other green: grey is good", pictures.of_stage(results, "align")),
+        *((tile.caption, tile.note, tile.picture) for tile in pictures.registered(radiance, results.alignment.value)),
     )
     figures = "".join(
         f'<figure><div class="picture"><img alt="{title}" src="{html.jpeg(pictures.shrink(picture, _WIDEST))}"></div>'
