@@ -11,6 +11,7 @@ Cao, Santo, Shi, Okura & Matsushita, Bilateral normal integration, ECCV 2022: ea
 neighbours per axis continues its own tangent plane.
 """
 
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -201,12 +202,17 @@ class _Level:
             z, taken = conjugate_gradients(matrix, right, z, solver, _ACCURACY, 30)
         return z
 
-    def mended(self, z: Floats, free: NDArray[np.bool_], stiffness: float) -> tuple[Floats, Multigrid]:
-        """From the decision, with pixels that may no longer choose and all of the prior's pull."""
+    def mended(
+        self, z: Floats, free: NDArray[np.bool_], stiffness: float, solver: Multigrid | None = None
+    ) -> tuple[Floats, Multigrid]:
+        """From the decision, or a solution and its solver: fewer pixels may choose, all of the prior's pull."""
+        taken = 0
         for _ in range(_MENDED if free.any() else 1):
             matrix, right, _ = self.linear(z, free, stiffness, self.of.pull)
-            solver = Multigrid(matrix, self.grid.pixel)
-            z, _ = conjugate_gradients(matrix, right, z, solver, _ACCURACY, 30)
+            if solver is None or taken > _TIRED:
+                solver = Multigrid(matrix, self.grid.pixel)
+            z, taken = conjugate_gradients(matrix, right, z, solver, _ACCURACY, 30)
+        assert solver is not None
         return z, solver
 
     def sewn(
@@ -217,24 +223,29 @@ class _Level:
         A true jump relieves the surface about it, for slopes that no longer have to bridge it fit their normals. One
         beside which they fit worse than on a surface without cuts is none.
         """
-        whole: Floats | None = None
+        whole: tuple[Floats, Multigrid] | None = None
         for _ in range(_SEWN):
             found = self.jumps(z, least)
             if not found.any() or not free.any():
                 break
             if whole is None:
-                whole = self._strain(_Level(self.of).mended(np.zeros_like(z), np.zeros_like(free), stiffness)[0])
-            close = self._worthless(found, whole, self._strain(z))
+                whole = self._without_limbs().mended(np.zeros_like(z), np.zeros_like(free), stiffness)
+            close = self._worthless(found, self._strain(whole[0]), self._strain(z))
             if not close.any():
                 break
             free &= ~close
             stays = ~close[self.grid.p[self.limb]]
             self.limb, self.gap, self.leap = self.limb[stays], self.gap[stays], self.leap[stays]
-            z, solver = self.mended(z, free, stiffness)
+            z, solver = self.mended(z, free, stiffness, solver)
             if not self.jumps(z, least).any():
-                free[:] = False  # plain least squares, to the last bit
-                z, solver = self.mended(np.zeros_like(z), free, stiffness)
+                free[:] = False
+                return whole  # plain least squares, to the last bit
         return z, solver
+
+    def _without_limbs(self) -> "_Level":
+        level = copy(self)
+        level.limb, level.gap, level.leap = np.zeros(0, dtype=np.intp), np.zeros(0), np.zeros(0)
+        return level
 
     def _strain(self, z: Floats) -> Floats:
         """How badly z fits the slope of each link (L,), in variances of the median normal."""
