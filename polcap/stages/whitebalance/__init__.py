@@ -157,7 +157,7 @@ def _search(radiance: AngleStack, reference: ChartReference, settings: Settings)
     value = radiance.value[0]
     known: list[Placement] = []
     best: _Find | None = None
-    cheapest = np.inf
+    cheapest, small = np.inf, 0.0
     exposed: ChartError | None = None
     for centers, cost in _candidates(value):
         cheapest = min(cheapest, cost)
@@ -166,6 +166,8 @@ def _search(radiance: AngleStack, reference: ChartReference, settings: Settings)
             continue
         place = _refine(value, start)
         if not _plausible(place, settings.min_explained - _SMALL_PART):
+            if place.explained >= settings.min_explained:
+                small = max(small, place.pitch_px)
             continue
         known.append(place)
         try:
@@ -190,6 +192,12 @@ def _search(radiance: AngleStack, reference: ChartReference, settings: Settings)
         raise exposed
     if best is not None:
         why = f"best mean residual ΔE {best.error:.1f}, whitebalance.max_delta_e = {settings.max_delta_e:g}"
+    elif 0 < small < _LEAST_PITCH_PX:
+        least = _LEAST_PITCH_PX * radiance.view.scale
+        why = (
+            f"what looks like one has patches {small * radiance.view.scale:.0f} RAW px apart, at least {least:.0f} are "
+            "needed: show it larger"
+        )
     elif cheapest == np.inf:
         why = "the detector saw nothing like one"
     elif cheapest > settings.max_cost:

@@ -195,6 +195,12 @@ def test_a_mirrored_chart_is_refused():
         whitebalance.measure(stack(image[:, ::-1]), CLASSIC, AUTO, Settings())
 
 
+def test_a_chart_too_small_to_be_read_is_told_with_the_size_it_needs():
+    small = photograph(pose(7.6, 3, (260, 170)))
+    with pytest.raises(ChartError, match=r"patches 15 RAW px apart, at least 16 are needed: show it larger"):
+        whitebalance.measure(stack(small), CLASSIC, AUTO, Settings())
+
+
 def test_an_image_without_a_chart_is_refused_with_the_remedies():
     empty = draw(pose(24, 0, (-900, -900)), CLASSIC.rec709, samples=1)
     with pytest.raises(ChartError, match=r"no ColorChecker Classic.*--chart x0.*--chart FILE.*--no-chart"):
