@@ -391,7 +391,8 @@ class Mesh:
     depth: Floats  # (H, W) along the optical axis, growing away from the camera; NaN outside
     metric: bool
     pieces: int  # of the seen side, without specks
-    cuts: float  # length of its boundary inside the mask over that along the mask's outline
+    cuts: float  # length of its boundary inside the mask, both sides, over that along the mask's outline
+    cut_px: float  # length of its cuts inside the mask, one side, px of the maps
     raggedness: float  # length of its boundary over that of itself smoothed, less 1; before it was smoothed
 
 

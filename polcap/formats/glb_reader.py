@@ -50,6 +50,7 @@ class _Extras(Struct, frozen=True):
     origin_in_camera: tuple[float, float, float]
     pieces: int
     cuts: float
+    cut_px: float
     raggedness: float
 
 
@@ -82,6 +83,7 @@ def read(path: Path, digest: str) -> Stored:
         metric=extras.unit == "metre",
         pieces=extras.pieces,
         cuts=extras.cuts,
+        cut_px=extras.cut_px,
         raggedness=extras.raggedness,
     )
     red, green, blue = (float(one) for one in facts["factor"])

@@ -108,6 +108,7 @@ def encode(
                 "origin_in_camera": [float(x) for x in center(asset.mesh.vertices)],
                 "pieces": asset.mesh.pieces,
                 "cuts": asset.mesh.cuts,
+                "cut_px": asset.mesh.cut_px,
                 "raggedness": asset.mesh.raggedness,
                 "textures": {f"{name}_{key}": texture.says for key, texture in held.items()},
             },

@@ -95,20 +95,32 @@ def mask(found: Found, limits: Gates) -> Gate:
 
 
 def mesh(of: Mesh, limits: Gates) -> Gate:
-    """Fails where the surface is in shreds: many pieces, cuts longer than its outline, or a jagged rim."""
-    faults = []
+    """Fails where the surface is in shreds: many pieces, cuts longer than its outline, or a jagged rim.
+
+    A cut says that the normals fit better with the surface apart there: where a part hides another, and where they err.
+    """
+    faults, remedies = [], []
     if of.pieces > limits.max_mesh_pieces:
         faults.append(f"{of.pieces} pieces, more than {limits.max_mesh_pieces}")
     if of.cuts > limits.max_mesh_cuts:
-        faults.append(f"cuts {of.cuts:.0%} of the outline's length, more than {limits.max_mesh_cuts:.0%}")
+        faults.append(
+            f"cuts of {of.cut_px:.0f} px, {of.cuts:.0%} of the outline's length, more than {limits.max_mesh_cuts:.0%}"
+        )
+    if faults:
+        remedies.append("the normals fit no surface, see their error; --set surface.stiffness=0 closes all cuts")
     if of.raggedness > limits.max_mesh_raggedness:
         faults.append(f"a rim {of.raggedness:.0%} longer than its curve, more than {limits.max_mesh_raggedness:.0%}")
+        remedies.append("where the mask's outline is jagged give --mask PNG")
     cuts = round(of.cuts, 4)
-    if not faults:
-        says = f"cut where one part hides another, along {of.cuts:.0%} of the outline's length"
-        return Gate("mesh", "pass", cuts, limits.max_mesh_cuts, says)
-    remedy = "the normals fit no surface, see their error; --set surface.stiffness=0 keeps it in one piece"
-    return Gate("mesh", "fail", cuts, limits.max_mesh_cuts, "; ".join(faults), remedy)
+    if faults:
+        return Gate("mesh", "fail", cuts, limits.max_mesh_cuts, "; ".join(faults), "; ".join(remedies))
+    says = f"{of.pieces} piece{'s' * (of.pieces != 1)}, "
+    says += (
+        f"cut along {of.cut_px:.0f} px where the normals fit better apart: behind a part, or at a slit where they err"
+        if of.cut_px
+        else "no cut inside the outline"
+    )
+    return Gate("mesh", "pass", cuts, limits.max_mesh_cuts, says)
 
 
 def sharpness(found: Found, limits: Gates) -> Gate:

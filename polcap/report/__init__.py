@@ -184,6 +184,7 @@ def figures(results: Results) -> dict[str, dict[str, Any]]:
             "extent": _list(extent, 5),
             "pieces": mesh.pieces,
             "cuts": _number(mesh.cuts),
+            "cut_px": _number(mesh.cut_px),
             "raggedness": _number(mesh.raggedness),
         },
     }

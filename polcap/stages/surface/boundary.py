@@ -20,7 +20,8 @@ class Figures:
     """What tells a torn mesh from a whole one."""
 
     pieces: int  # that hold more than a speck
-    cuts: float  # length of the boundary inside the mask over that along its outline
+    cuts: float  # length of the boundary inside the mask, both sides, over that along its outline
+    cut_px: float  # length of the cuts inside the mask, one side [px]
     raggedness: float  # length of the boundary over that of itself smoothed, less 1
 
 
@@ -62,6 +63,7 @@ def measure(place: NDArray[np.int64], faces: NDArray[np.int32], mask: NDArray[np
     return Figures(
         pieces=_pieces(faces, len(place)),
         cuts=float(length[inside].sum() / max(length[~inside].sum(), 1e-9)),
+        cut_px=float(length[inside].sum() / 2),
         raggedness=float(length.sum() / max(shorter, 1e-9) - 1),
     )
 

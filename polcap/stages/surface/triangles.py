@@ -71,6 +71,7 @@ def triangulate(
         metric=metric,
         pieces=figures.pieces,
         cuts=figures.cuts,
+        cut_px=figures.cut_px,
         raggedness=figures.raggedness,
     )
 
