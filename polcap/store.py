@@ -17,6 +17,7 @@ check is computed again.
 
 import inspect
 import json
+import math
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -25,7 +26,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cached_property
 from hashlib import blake2b, sha256
 from pathlib import Path
-from typing import Any, Generic, TypeVar, get_type_hints
+from typing import Any, Generic, TypeVar, cast, get_type_hints
 
 import msgspec
 import numpy as np
@@ -100,6 +101,17 @@ class StageResult(Result[T]):
         self.config = config
         self.place = place
         self.run = run
+
+    @cached_property
+    def facts(self) -> T:
+        """The value; of large arrays only the shapes, where nobody has read them yet."""
+        if "value" not in vars(self) and self.stored():
+            try:
+                found = read(self.place, returns(self.stage), most=npy_folder.LARGE + npy_folder.HEAD)
+                return cast(T, npy_folder.without_large(found))
+            except StorageError:  # the value is made anew
+                pass
+        return self.value
 
     @property
     def name(self) -> str:
@@ -280,8 +292,19 @@ def seal(about: Mapping[str, Any]) -> str:
     return digest({name: value for name, value in about.items() if name not in UNDIGESTED})
 
 
-def read(place: Path, hint: Any, check: bool = True) -> Any:
+def read(place: Path, hint: Any, check: bool = True, most: float = math.inf) -> Any:
     """The value in a result folder, its arrays as read-only memory maps.
+
+    Parameters
+    ----------
+    place
+        The folder.
+    hint
+        Type of the value.
+    check
+        Compare what lies there with the digests of what was written.
+    most
+        Bytes of a file; larger ones are not compared.
 
     Raises
     ------
@@ -292,6 +315,8 @@ def read(place: Path, hint: Any, check: bool = True) -> Any:
     if not about:
         raise StorageError(f"{place}: no whole result of this polcap's cache format {FORMAT}; run `polcap process`")
     for name, expected in about["files"].items() if check else ():
+        if expected[0] > most:
+            continue
         try:
             found = npy_folder.checksum(place / name)
         except OSError:

@@ -1,5 +1,6 @@
 """The whole path on the bundled capture: right, resumable, and clear where the input is at fault."""
 
+import json
 import os
 import resource
 import shutil
@@ -16,7 +17,7 @@ from polcap import models, pipeline
 from polcap.config import Config
 from polcap.errors import ObjectError
 from polcap.formats import capture as captures
-from polcap.formats import maps
+from polcap.formats import maps, npy_folder
 from polcap.images import AngleStack, ColorCalibration, View
 from polcap.path import STAGES, UserInput, distance_m, on_grid
 from tests.conftest import ROOT, Command
@@ -91,6 +92,28 @@ def test_late_change_writes_what_follows_from_it_alone(
     (copy / "maps" / "normal.png").write_bytes(b"touched")
     assert polcap(*command).returncode == 0
     assert product(copy) == product(result)
+
+
+def test_late_changes_end_as_a_first_run_with_these_settings_does(
+    result: Path, example: Path, polcap: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(npy_folder, "LARGE", 1 << 12)  # nobody reads a picture of this small capture unseen
+    monkeypatch.setattr(pipeline, "timings", lambda out: {})  # no two runs take the same time
+    late, first = tmp_path / "late", tmp_path / "first"
+    shutil.copytree(result, late)
+    command = ("process", example, "--estimator", "analytic")
+    settings = list[str]()
+    for setting in ("gates.max_normal_error_deg=1", "asset.ior=1.4", "gates.max_turn_deg=4"):
+        settings += ["--set", setting]
+        assert polcap(*command, "--out", late, *settings).returncode == 3
+    shutil.rmtree(tmp_path / "late" / "asset")
+    settings += ["--set", "asset.ior=1.45"]
+    assert polcap(*command, "--out", late, *settings).returncode == 3
+    assert polcap(*command, "--out", first, *settings).returncode == 3
+    assert product(late) == product(first)
+    told, again = (json.loads((out / "report.json").read_text(encoding="utf-8")) for out in (late, first))
+    assert told == again
+    assert (late / "report.html").read_bytes() == (first / "report.html").read_bytes()
 
 
 def test_killed_run_resumes_and_gives_the_same_bytes(result: Path, example: Path, tmp_path: Path) -> None:

@@ -376,3 +376,26 @@ def test_an_alias_of_an_array_type_is_read_as_the_array(tmp_path: Path) -> None:
     hint = types.GenericAlias(Alias, (float,))
     assert get_origin(hint) is Alias
     assert np.array_equal(npy_folder.decode({"array": "value.npy"}, hint, tmp_path), np.arange(3.0))
+
+
+@stage(version=1)
+def painted(value: float) -> Inner:
+    return Inner(np.full((600, 600), value, np.float32), np.full(3, value, np.float32), (value, 0.0))
+
+
+def test_facts_are_known_without_reading_the_pictures(tmp_path: Path) -> None:
+    Store(tmp_path).step(painted, 2.0).materialize()
+    (file,) = tmp_path.glob("work/*/value.array.npy")
+    file.write_bytes(file.read_bytes()[:-4] + b"\0\0\0\0")  # damage that nobody who reads facts alone can see
+    again = Store(tmp_path).step(painted, 2.0)
+    facts = again.facts
+    assert facts.shift == (2.0, 0.0) and np.array_equal(facts.maybe, np.full(3, 2.0))
+    assert facts.array.shape == (600, 600)
+    with pytest.raises(TypeError, match="not read"):
+        np.asarray(facts.array)
+    assert (again.value.array == 2).all()  # damaged, and so made anew
+
+
+def test_facts_of_what_is_not_stored_are_the_value(tmp_path: Path) -> None:
+    step = Store(tmp_path).step(painted, 2.0)
+    assert step.facts is step.value

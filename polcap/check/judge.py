@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -12,7 +13,7 @@ from polcap.check.reduced import Taken
 from polcap.config import Config
 from polcap.errors import ChartError, DecodeError, InputError
 from polcap.formats import calib
-from polcap.gates import Gate
+from polcap.gates import Found, Gate
 from polcap.images import (
     Alignment,
     AngleStack,
@@ -100,6 +101,10 @@ class Reduced:
         few = min(self.config.infer.symmetries, _LOOKS)
         settings = msgspec.structs.replace(self.config.infer, symmetries=few, fine=False)
         return infer.estimate(cues.compute(self.stokes, self.color), self.networks()[0], settings)
+
+    def figure(self, name: str, measure: Callable[[Found, Any], Any], setting: Any = None) -> Any:
+        """As measured: nothing is remembered."""
+        return measure(self, setting)
 
     @property
     def clipped(self) -> Floats:

@@ -6,7 +6,7 @@ the type that is asked for is a `StorageError`, never another value.
 
 import io
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from enum import Enum, IntEnum, IntFlag
 from hashlib import sha256
 from pathlib import Path
@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from polcap.errors import StorageError
 
 Arrays = dict[str, NDArray[Any]]
+LARGE = 1 << 20  # bytes of an array file; what no picture of a capture is smaller than
+HEAD = 1 << 12  # bytes; no array file has a longer one
 _MAPPED = 1 << 16  # bytes; smaller files are read, a map costs a page table and a handle
 
 
@@ -145,6 +147,27 @@ def checksum(file: Path) -> list[Any]:
         while block := stream.read(1 << 22):
             summed.update(block)
     return [file.stat().st_size, summed.hexdigest()]
+
+
+class Absent:
+    """Of an array that was not read, its shape; whoever looks for more gets an error, never another number."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.shape = shape
+
+    def __array__(self, *_: Any, **__: Any) -> NDArray[Any]:
+        raise TypeError(f"pixels of shape {self.shape} were not read; look at them in a figure")
+
+
+def without_large(value: Any) -> Any:
+    """A value whose large arrays are replaced by their shapes."""
+    if isinstance(value, np.ndarray):
+        return value if value.nbytes <= LARGE else Absent(value.shape)
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{one.name: without_large(getattr(value, one.name)) for one in fields(value)})
+    if isinstance(value, tuple):
+        return tuple(map(without_large, value))
+    return value
 
 
 def freeze(value: Any) -> None:

@@ -66,9 +66,7 @@ def _in_order(found: Found, config: Config) -> Iterator[Gate]:
 
 def _normal_error(found: Found, judged: list[Gate], limits: Gates) -> Gate:
     """The median expected error, with what the other gates add to it."""
-    maps = found.maps
-    inside = maps.confidence[maps.mask]
-    own = float(np.median(inside)) if inside.size else float("nan")
+    own = found.figure("normal_error", _own_error)
     expected = min(float(np.sqrt(own**2 + sum(gate.cost_deg**2 for gate in judged))), _MOST_DEG)
     because = ", ".join(gate.name for gate in judged if gate.cost_deg > 0.5 * own)
     says = f"expected error of the normals {expected:.1f}° (median)"
@@ -83,3 +81,9 @@ def _normal_error(found: Found, judged: list[Gate], limits: Gates) -> Gate:
     more = "" if len(found.names) > 3 else " four angles,"
     remedy = "see the lines above" if because else f"more light or frames,{more} or a darker room"
     return Gate("normal error", "fail", round(expected, 2), limit, says, remedy, unit="°")
+
+
+def _own_error(found: Found, _: None) -> float:
+    """Median error that the estimator expects, degrees."""
+    inside = found.maps.confidence[found.maps.mask]
+    return float(np.median(inside)) if inside.size else float("nan")

@@ -1,6 +1,7 @@
 """One judgement, and what judgements look at."""
 
-from typing import Literal, Protocol
+from collections.abc import Callable
+from typing import Any, Literal, Protocol
 
 import msgspec
 import numpy as np
@@ -39,7 +40,13 @@ class Gate(msgspec.Struct, frozen=True):
 
 
 class Found(Protocol):
-    """What the stages made of a capture, at full size or reduced; each is computed when asked for."""
+    """What the stages made of a capture, at full size or reduced; each is computed when asked for.
+
+    Pixels are looked at in a `figure` alone: where one is remembered, they are not even read.
+    """
+
+    def figure(self, name: str, measure: "Callable[[Found, Any], Any]", setting: Any = None) -> Any:
+        """What `measure` gives of the pixels with a setting, or gave when it was made of the same; plain JSON data."""
 
     @property
     def names(self) -> list[str]: ...  # (K,) of the shots

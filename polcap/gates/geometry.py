@@ -44,7 +44,7 @@ def alignment(found: Found, config: Config) -> Gate:
 
 def _pushed(found: Found, config: Config) -> Gate | None:
     """An object that moved while what is around it stood still."""
-    displacement = object_motion.measure(found.radiance, found.alignment, found.object_) * found.grid_px
+    displacement = np.array(found.figure("object_motion", _displacement)) * found.grid_px
     limit = config.gates.max_object_shift_px
     bad = np.nan_to_num(displacement, posinf=np.inf) > limit
     if not bad.any():
@@ -59,13 +59,17 @@ def _pushed(found: Found, config: Config) -> Gate | None:
     return Gate("alignment", "fail", figure, limit, says, remedy, cost, blamed(found.names, bad), "px")
 
 
+def _displacement(found: Found, _: None) -> list[float]:
+    return [float(one) for one in object_motion.measure(found.radiance, found.alignment, found.object_)]
+
+
 def mask(found: Found, limits: Gates) -> Gate:
     """Fails where a chart is in it or the network doubts it; warns from half of that on, and of shapes none has."""
     object_, limit, doubt = found.object_, limits.max_mask_doubt, found.object_.doubt
     faults: list[tuple[str, float, float]] = []  # in words, its figure, its limit
     charted = 0.0
     if found.color.corners is None:
-        charted = chart_in_mask.share(found.radiance, object_.mask, calib.colorchecker())
+        charted = found.figure("charted", _charted)
     if charted:
         faults.append(
             (f"{charted:.0%} of it looks like a colour chart that was not found, and is no object", charted, 0)
@@ -92,6 +96,10 @@ def mask(found: Found, limits: Gates) -> Gate:
     cost = 10 * object_.border if state == "warn" else 5.0
     _, value, most = faults[0]
     return Gate("mask", state, round(value, 5), most, "; ".join(fault[0] for fault in faults), remedy, cost)
+
+
+def _charted(found: Found, _: None) -> float:
+    return float(chart_in_mask.share(found.radiance, found.object_.mask, calib.colorchecker()))
 
 
 def mesh(of: Mesh, limits: Gates) -> Gate:
@@ -143,11 +151,17 @@ def focal_length(found: Found) -> Gate:
     least, most = found.focal_doubt
     if not most - least:
         return Gate("focal length", "pass", "known", "known", "known", unit="")
-    maps, (y, x) = found.maps, np.nonzero(found.maps.mask)
-    off = np.hypot(x - maps.view.center[0], y - maps.view.center[1]) / maps.view.focal
-    lean, more, less = (np.arctan(off * factor) for factor in (1.0, np.exp(-least), np.exp(-most)))
-    cost = float(np.degrees(np.median(np.maximum(more - lean, lean - less)))) if len(off) else 0.0
+    cost = found.figure("lean", _lean, [least, most])
     times = np.exp(max(most, -least))
     says = f"the focal length is assumed, perhaps {times:.1f} times off; a wrong one bends shape and depth"
     remedy = "state focal_length_mm and sensor_width_mm in capture.toml"
     return Gate("focal length", "warn", "assumed", "known", says, remedy, round(cost, 1), unit="")
+
+
+def _lean(found: Found, doubt: tuple[float, float]) -> float:
+    """Degrees by which the view rays of the object lean otherwise, in the median pixel."""
+    maps, (y, x) = found.maps, np.nonzero(found.maps.mask)
+    least, most = doubt
+    off = np.hypot(x - maps.view.center[0], y - maps.view.center[1]) / maps.view.focal
+    lean, more, less = (np.arctan(off * factor) for factor in (1.0, np.exp(-least), np.exp(-most)))
+    return float(np.degrees(np.median(np.maximum(more - lean, lean - less)))) if len(off) else 0.0

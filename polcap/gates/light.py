@@ -1,6 +1,7 @@
 """Gates of the light: bracket, tone curve, chart, gains, clipping, ambient light."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import cv2
 import numpy as np
@@ -81,13 +82,17 @@ def source(found: Found) -> Gate:
 
 def noise(found: Found, limits: Gates) -> Gate:
     """The polarization that noise alone fakes, in the object's median pixel."""
-    image, limit = found.stokes, limits.max_dolp_noise
-    light = np.maximum(image.stokes[0][image.mask].sum(-1), 1e-9)
-    spread = np.sqrt((image.covariance[3] + image.covariance[5])[image.mask].sum(-1) / 2)
-    figure = float(np.median(spread / light)) if len(light) else float("nan")
+    figure, limit = found.figure("noise", _noise), limits.max_dolp_noise
     says = f"noise fakes a polarization of {100 * figure:.1f} % in the median pixel of the object"
     remedy = "too dark: more light, a wider aperture, a longer exposure, or more frames"
     return at_most("noise", figure, limit, says, remedy, cost_deg=300 * figure)
+
+
+def _noise(found: Found, _: None) -> float:
+    image = found.stokes
+    light = np.maximum(image.stokes[0][image.mask].sum(-1), 1e-9)
+    spread = np.sqrt((image.covariance[3] + image.covariance[5])[image.mask].sum(-1) / 2)
+    return float(np.median(spread / light)) if len(light) else float("nan")
 
 
 def stillness(found: Found, limits: Gates) -> Gate:
@@ -201,14 +206,30 @@ def crossed(found: Found, limits: Gates) -> Iterator[Gate]:
     """Whether the cross-polarised shot shows what it should: less light than S0, and nothing clipped where S0 clips."""
     if found.radiance.crossed is None:
         return
-    image, limit = found.stokes, limits.max_crossed_misfit
+    limit = limits.max_crossed_misfit
     remedy = (
         "turn the flash's filter until the highlights vanish, lens's filter at the angle stated; same place, same chart"
     )
-    if image.body is None:
+    if found.stokes.body is None:
         says = "nothing tells how bright the cross-polarised shot is against the others: it is not used"
         yield Gate("crossed", "warn", None, limit, says, "put a ColorChecker beside the object, or expose it more")
         return
+    seen = found.figure("crossed", _crossed)
+    share = 100 * seen["mirrored"]
+    says = f"{share:.1f} % of the object's light is mirrored at its surface, and taken out of its albedo"
+    if seen["left"] > _STILL_CLIPPED and seen["clipped"] > _FEW:
+        says = f"{100 * seen['left']:.0f} % of the clipped highlights are clipped in the cross-polarised shot too"
+        yield Gate("crossed", "warn", round(seen["left"], 3), _STILL_CLIPPED, says, remedy)
+        return
+    if seen["over"] > limit:
+        says = f"{100 * seen['over']:.0f} % of the object is brighter in the cross-polarised shot than light allows"
+    yield at_most("crossed", seen["over"], limit, says, remedy, beyond="warn")
+
+
+def _crossed(found: Found, _: None) -> dict[str, Any]:
+    """Shares of what is clipped in it too, of what is brighter than S0, and of the light that it lacks."""
+    image = found.stokes
+    assert image.body is not None
     known = image.mask & (image.body.quality == 0)
     sound = known & ((image.quality & int(Quality.CLIPPED)) == 0)
     total, body = image.stokes[0].sum(-1), image.body.value.sum(-1)
@@ -219,14 +240,7 @@ def crossed(found: Found, limits: Gates) -> Iterator[Gate]:
     inner = cv2.erode(sound.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     over = float((smooth > _BRIGHTER * whole)[inner].mean()) if inner.any() else 1.0
     mirrored = float(np.maximum(total - body, 0)[sound].sum() / max(float(total[sound].sum()), 1e-9))
-    says = f"{100 * mirrored:.1f} % of the object's light is mirrored at its surface, and taken out of its albedo"
-    if left > _STILL_CLIPPED and clipped.sum() > _FEW:
-        says = f"{100 * left:.0f} % of the clipped highlights are clipped in the cross-polarised shot too"
-        yield Gate("crossed", "warn", round(left, 3), _STILL_CLIPPED, says, remedy)
-        return
-    if over > limit:
-        says = f"{100 * over:.0f} % of the object is brighter in the cross-polarised shot than light allows"
-    yield at_most("crossed", over, limit, says, remedy, beyond="warn")
+    return {"left": left, "clipped": int(clipped.sum()), "over": over, "mirrored": mirrored}
 
 
 def ambient(found: Found, limits: Gates) -> Gate:

@@ -215,7 +215,7 @@ def document(
     found = remembered("figures", measured_on, partial(figures, results))
     again = remembered("rerendering", measured_on, partial(rerendering, results, config.infer.ior))
     found = {**found, "rerendering": again}
-    whole = Whole(results, tuple(capture.get("focal_doubt", (0.0, 0.0))))
+    whole = Whole(results, tuple(capture.get("focal_doubt", (0.0, 0.0))), remembered)
     limits = {name: section for name, section in msgspec.to_builtins(config).items() if name != results.asset.name}
     judged = remembered("gates", [measured_on, whole.focal_doubt, limits], partial(_judged, whole, config))
     return {

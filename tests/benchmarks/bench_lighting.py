@@ -170,7 +170,7 @@ def solved(case: Lit, seed: int) -> Any:
 
 def _spoken(image: Any) -> dict[str, str]:
     maps = infer.estimate(cues.compute(image, scenes.no_color()), _network(), infer.Settings(symmetries=1, fine=False))
-    found = SimpleNamespace(
+    found = scenes.Found(
         stokes=image, radiance=SimpleNamespace(angle=ANGLE), gains=scenes.equal(), names=["0°", "45°", "90°"], maps=maps
     )
     lines = [*polarization.of_outline(found, Gates()), polarization.ill_posed(found, Gates())]

@@ -33,7 +33,7 @@ def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> SimpleNamespace
         "color": scenes.no_color(), "alignment": scenes.still(shots), "object_": object_, "gains": gains,
         "stokes": image, "maps": maps, "mesh": None,
     }  # fmt: skip
-    return SimpleNamespace(**{**given, **changed})
+    return scenes.Found(**{**given, **changed})
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def test_nothing_fails_on_a_good_capture(good: SimpleNamespace) -> None:
 
 
 def changed(good: SimpleNamespace, **fields: Any) -> SimpleNamespace:
-    return SimpleNamespace(**{**vars(good), **fields})
+    return scenes.Found(**{**vars(good), **fields})
 
 
 def test_each_gate_fails_alone(good: SimpleNamespace) -> None:

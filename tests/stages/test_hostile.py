@@ -1,7 +1,6 @@
 """Captures that are valid and hostile: every stage ends, with a finite value or one clear error."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -94,7 +93,7 @@ def run(radiance: AngleStack, drawn: np.ndarray | None) -> None:
         "color": color, "alignment": alignment, "object_": object_, "gains": gains, "stokes": image, "maps": maps,
         "mesh": mesh,
     }  # fmt: skip
-    told = list(gates.judge(SimpleNamespace(**found), config))
+    told = list(gates.judge(scenes.Found(**found), config))
     assert all(gate.says and gate.state in ("pass", "warn", "fail", "not measured") for gate in told)
     assert built.base_color.dtype == np.uint8
 
