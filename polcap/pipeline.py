@@ -14,7 +14,7 @@ from typing import Any
 
 import msgspec
 
-from polcap import asset_export, pictures, report, unchanged
+from polcap import asset_export, pictures, report, resource_limits, unchanged
 from polcap.asset_export import Wanted
 from polcap.config import Config, restored
 from polcap.errors import InputError, SettingError, StorageError
@@ -48,6 +48,25 @@ def process(
         Anything at fault with what the user gave, from the stage that saw it.
     """
     _check_out(out, Path(capture.folder))
+    work = _Work(progress)
+    try:
+        return _processed(capture, supplied, config, out, until, force, work, frame_read)
+    except Exception as error:
+        if not resource_limits.is_shortfall(error):
+            raise
+        raise resource_limits.shortfall(error, work.stage, capture.size_px[0] * capture.size_px[1]) from error
+
+
+def _processed(
+    capture: Capture,
+    supplied: UserInput,
+    config: Config,
+    out: Path,
+    until: str | None,
+    force: str | None,
+    progress: Progress,
+    frame_read: Callable[[int, int], None] | None,
+) -> dict[str, Any] | None:
     store = Store(out, progress, force)
     with store.lock():
         sweep(out)
@@ -70,6 +89,18 @@ def process(
         written.remember()
         progress("write", time.perf_counter() - start, False)
     return about
+
+
+class _Work:
+    """Passes progress on, and knows which stage was begun last."""
+
+    def __init__(self, progress: Progress) -> None:
+        self.stage, self._progress = "start", progress
+
+    def __call__(self, name: str, seconds: float | None, cached: bool) -> None:
+        if seconds is None:
+            self.stage = name
+        self._progress(name, seconds, cached)
 
 
 def plan(capture: Capture, supplied: UserInput, config: Config, out: Path, force: str | None = None) -> dict[str, str]:

@@ -1,12 +1,22 @@
 """In: how much of the machine a command may take. Out: that limit, set for this process."""
 
+import math
 import os
+import re
 from typing import Any
 
 from polcap.errors import SettingError
 
 _MOST_GB = 1e9  # beyond what any system counts
 _LEAST_GB = 0.8  # libraries and networks, and a capture of 1 MP: at .75 one fails, at .4 a library waits for ever
+OUT_OF_MEMORY = (  # as OpenCV, pybind11, onnxruntime, threads, the loader of libraries and the system say it
+    "Insufficient memory", "bad_alloc", "bad allocation", "Failed to allocate memory", "can't start new thread",
+    "failed to map segment", "Cannot allocate memory",
+)  # fmt: skip
+_GB_PER_PIXEL, _GB_BESIDE = 60e-9, 0.3  # of a whole run, per RAW pixel: measured, docs/explanations/scale.md
+_ROOM = 1.1  # above what was asked for when memory ran out: more is asked for afterwards
+_ASKED = re.compile(r"allocate ([\d.]+) (bytes|KiB|MiB|GiB)")  # numpy, OpenCV
+_BYTES = {"bytes": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 
 
 def set_threads(count: int) -> None:
@@ -62,3 +72,44 @@ def _resource(gigabytes: float) -> Any:
     except ImportError as error:
         raise SettingError(f"--memory {gigabytes:g}: this system knows no such limit; leave it out") from error
     return resource
+
+
+def is_shortfall(error: BaseException | None) -> bool:
+    """Whether an error, or one that it came from, says that memory is out."""
+    if error is None:
+        return False
+    said = isinstance(error, MemoryError) or any(word in str(error) for word in OUT_OF_MEMORY)
+    return said or is_shortfall(error.__cause__)
+
+
+def shortfall(error: BaseException, stage: str, pixels: int) -> SettingError:
+    """What a lack of memory means.
+
+    Parameters
+    ----------
+    error
+        One for which `is_shortfall` holds.
+    stage
+        What was at work.
+    pixels
+        Of a RAW frame.
+
+    Returns
+    -------
+    SettingError
+        The stage, what was taken and what more it asked for, what the capture takes about in all, the remedy.
+    """
+    from polcap.stages.hdr import budget
+
+    taken, limit = budget.memory()
+    asked = _ASKED.search(str(error))
+    more = float(asked[1]) * _BYTES[asked[2]] if asked else 0.0
+    whole = max(_GB_PER_PIXEL * pixels + _GB_BESIDE, _ROOM * (taken + more) / 1e9, _LEAST_GB)
+    enough = math.ceil(10 * whole) / 10
+    said = f"{stage}: out of memory"
+    if taken:
+        said += f" with {taken / 1e9:.2f} GB taken" + (f" and {more / 1e9:.2g} GB more asked for" if more else "")
+    said += f"; a capture of {pixels / 1e6:.3g} MP takes about {enough:.1f} GB in all"
+    if limit is None:
+        return SettingError(f"{said}: free that much, run fewer at a time, or take a larger machine")
+    return SettingError(f"{said}: raise --memory from {limit / 1e9:.3g} to that, or leave it out")

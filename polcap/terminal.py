@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from polcap import resource_limits
 from polcap.errors import GateError, PolcapError, SettingError
 
 if TYPE_CHECKING:
@@ -21,9 +22,6 @@ if TYPE_CHECKING:
 
 _LONGEST = 600  # characters of a message
 _QUIET_S = 5.0  # between two lines about frames, where there is no terminal to write over
-OUT_OF_MEMORY = (  # as OpenCV, threads, the loader of libraries and the system say it
-    "Insufficient memory", "can't start new thread", "failed to map segment", "Cannot allocate memory",
-)  # fmt: skip
 
 
 def reported(command: Callable[..., None]) -> Callable[..., None]:
@@ -49,7 +47,7 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
             raise
         except Exception as error:
             traceback_of(error, context)
-            if isinstance(error, MemoryError) or any(word in str(error) for word in OUT_OF_MEMORY):
+            if resource_limits.is_shortfall(error):
                 tell("polcap: error: out of memory; raise --memory or take a larger machine")
                 code = SettingError.exit_code
                 tell_program(kwargs, error, code)

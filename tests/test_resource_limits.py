@@ -4,8 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from polcap import resource_limits
-from polcap.errors import SettingError
+from polcap import pipeline, resource_limits
+from polcap.config import Config
+from polcap.errors import ModelError, SettingError
+from polcap.formats.capture import read as read_capture
+from polcap.path import UserInput
+from polcap.stages import align
+from polcap.stages.hdr import budget
 from tests.conftest import Command
 
 
@@ -27,3 +32,40 @@ def test_a_batch_says_so_before_any_capture(tmp_path: Path, polcap: Command) -> 
     done = polcap("batch", tmp_path, "--memory", "inf")
     assert done.returncode == 2 and "--memory inf" in done.stderr
     assert not (tmp_path / "polcap-batch").exists()
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        ValueError("OpenCV(5.0.0) alloc.cpp: error: (-4:Insufficient memory) Failed to allocate 15360000 bytes in f"),
+        RuntimeError("[ONNXRuntimeError] : Failed to allocate memory for requested buffer of size 42467328"),
+    ],
+)
+def test_a_lack_of_memory_is_known_by_whoever_says_it(error: Exception) -> None:
+    wrapped = ModelError("model.onnx failed")
+    wrapped.__cause__ = error
+    assert resource_limits.is_shortfall(error) and resource_limits.is_shortfall(wrapped)
+    assert not resource_limits.is_shortfall(ModelError("model.onnx failed"))
+
+
+def test_a_lack_of_memory_names_the_stage_what_it_would_take_and_the_remedy(
+    example: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def refine(*_: object) -> None:
+        raise MemoryError("Unable to allocate 3.00 GiB for an array with shape (3, 8) and data type float32")
+
+    monkeypatch.setattr(budget, "memory", lambda: (2_000_000_000, 4_000_000_000))
+    monkeypatch.setattr(align, "refine", refine)
+    capture = read_capture(example)
+    with pytest.raises(SettingError) as caught:
+        pipeline.process(capture, UserInput(), Config(), tmp_path, until="align")
+    said = str(caught.value)
+    assert said.startswith("align: out of memory with 2.00 GB taken and 3.2 GB more asked for; a capture of 0.995 MP")
+    assert said.endswith("takes about 5.8 GB in all: raise --memory from 4 to that, or leave it out")
+
+
+def test_without_a_limit_the_remedy_is_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(budget, "memory", lambda: (0, None))
+    said = str(resource_limits.shortfall(MemoryError(), "surface", 24_000_000))
+    assert said.startswith("surface: out of memory; a capture of 24 MP takes about 1.8 GB in all: free that much")

@@ -46,7 +46,7 @@ def plan(shots: int, frames: int, pixels: int, frame_bytes: int) -> Budget:
     SettingError
         Even without holding anything the merge needs more than may be taken.
     """
-    taken, limit = _memory()
+    taken, limit = memory()
     if limit is None:
         return Budget()
     stack = pixels * shots * (6 * _SAMPLE + 1)
@@ -62,7 +62,7 @@ def plan(shots: int, frames: int, pixels: int, frame_bytes: int) -> Budget:
     return Budget(kept, min(_HELD_BYTES, left - min(planes, kept)))
 
 
-def _memory() -> tuple[int, int | None]:
+def memory() -> tuple[int, int | None]:
     """Bytes of private, writable memory that this process has taken and may take; None where nothing limits it."""
     try:
         import resource

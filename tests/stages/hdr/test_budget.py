@@ -18,11 +18,11 @@ def test_little_memory_gives_the_same_pixels_and_less_is_refused_by_its_least(mo
     shots = [[frame(expose(quads, e, np.random.default_rng(k)), exposure=e) for e in (1, 4)] for k in (0, 1)]
     plenty = hdr.merge(capture(*shots), hdr.Settings())
     needed = 128 * 128 * (2 * 25 + 2 * 9 + 60)
-    monkeypatch.setattr(budget, "_memory", lambda: (0, needed))
+    monkeypatch.setattr(budget, "memory", lambda: (0, needed))
     little = hdr.merge(capture(*shots), hdr.Settings())
     for name in ("value", "variance", "quality", "exposure_ratio"):
         np.testing.assert_array_equal(getattr(little, name), getattr(plenty, name))
-    monkeypatch.setattr(budget, "_memory", lambda: (1_000_000_000, needed + 999_999_999))
+    monkeypatch.setattr(budget, "memory", lambda: (1_000_000_000, needed + 999_999_999))
     with pytest.raises(SettingError, match=r"needs 1\.00 GB at least"):
         hdr.merge(capture(*shots), hdr.Settings())
 
