@@ -17,10 +17,10 @@ from msgspec import Meta
 from polcap.errors import AlignmentError
 from polcap.images import Alignment, AngleStack, ColorCalibration, Floats
 from polcap.stages import stage
-from polcap.stages.align.following import LEAST_PIXELS, Detail, Scale, fine, likeness, refine, to_full_grid
+from polcap.stages.align.following import Detail, fine, likeness, refine, to_full_grid
 
 _SURE_LIKENESS = 0.6  # correlation of detail from which no other start is tried; else the likest wins
-_MOST_PIXELS = 1.5e6  # a larger image is averaged down first: it has detail to spare
+_MOST_PIXELS = 0.5e6  # a larger image is averaged down first: it has detail to spare
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -42,7 +42,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 4.0
 
 
-@stage(version=4)
+@stage(version=5)
 def register(radiance: AngleStack, color: ColorCalibration, settings: Settings) -> Alignment:
     """One transform per shot, reference grid px → shot grid px.
 
@@ -64,7 +64,8 @@ def register(radiance: AngleStack, color: ColorCalibration, settings: Settings) 
     if radiance.offset_px is not None:
         return _as_known(radiance.offset_px)
     step = int(np.ceil(np.sqrt(radiance.value[0, ..., 0].size / _MOST_PIXELS)))
-    detail = [Detail(fine(radiance.shot(k), settings.detail_px, step)) for k in range(shots)]
+    detail_px = settings.detail_px / np.sqrt(step)  # detail lies between the pixels of either grid
+    detail = [Detail(fine(radiance.shot(k), detail_px, step)) for k in range(shots)]
     transform = np.tile(np.eye(3), (shots, 1, 1))
     residual = np.zeros(shots)
     correlation = np.ones(shots)
@@ -77,14 +78,14 @@ def register(radiance: AngleStack, color: ColorCalibration, settings: Settings) 
     if radiance.crossed is not None and settings.model == "none":
         crossed = np.eye(3)
     elif radiance.crossed is not None:
-        last = Detail(fine(radiance.crossed.picture, settings.detail_px, step))
+        last = Detail(fine(radiance.crossed.picture, detail_px, step))
         crossed, _, _ = _accepted("the cross-polarised shot", detail[0], last, step, settings)
     return Alignment(transform=transform, residual_px=residual, correlation=correlation, crossed=crossed)
 
 
 def _accepted(name: str, reference: Detail, shot: Detail, step: int, settings: Settings) -> tuple[Floats, float, float]:
     """Transform (3, 3) of a shot on the full grid, its 1σ in px of that, and the likeness; refuses what cannot be."""
-    if not _in_common(reference[1], shot[1]):
+    if not (reference[1].tells and shot[1].tells):
         raise AlignmentError(
             f"{name} has no unclipped detail in common with the first shot: over-exposed, black, or even all over; "
             "shoot a darker frame, or with a locked camera --set align.model=none"
@@ -114,14 +115,6 @@ def _as_known(offset_px: Floats) -> Alignment:
     transform = np.tile(np.eye(3), (len(offset_px), 1, 1))
     transform[:, :2, 2] = -offset_px
     return Alignment(transform, np.zeros(len(offset_px)), np.ones(len(offset_px)))
-
-
-def _in_common(reference: Scale, shot: Scale) -> bool:
-    """Whether both show anything that could be compared."""
-    return all(
-        np.count_nonzero(one.weight) > LEAST_PIXELS and np.ptp(one.value[one.weight > 0]) > 0
-        for one in (reference, shot)
-    )
 
 
 def _find(reference: Detail, shot: Detail, model: str) -> tuple[Floats, float, float]:

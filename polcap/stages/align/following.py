@@ -17,8 +17,9 @@ from polcap.optics.warp import Spline, Taps, coordinates, warp
 
 _ALIASING_PX2 = 0.05**2  # variance of an edge's place between two samplings of it
 _FLOOR_PX = 0.02  # error that aliasing leaves whatever the noise: the bundled capture's is .016 and .027 (decision 19)
-_MOST_POINTS = 1e5  # of a picture tell of a movement; more, evenly thinned, tell no more (decision 19)
-_MEDIAN_OF = 20000  # points: knows a median to 1 %
+_MOST_POINTS = 2e4  # of a picture tell of a movement; more, evenly thinned, tell no more (decision 19)
+_MEDIAN_OF = 5000  # points: knows a median to 2 %
+_SETTLED_PX, _NEAR_PX = 0.004, 0.03  # a step that moves no corner by more is the last; at coarse scales
 _SIDE = 1024
 LEAST_PIXELS = 30  # that show detail, for two to eight unknowns
 
@@ -36,20 +37,21 @@ def fine(shot: MaskedImage, detail_px: float, step: int) -> "Scale":
         So many pixels a side are averaged first.
     """
     total = averaged(_summed(shot.value), step)
-    sigma = np.sqrt(averaged(_summed(shot.variance), step)) / step
-    some = (slice(None, None, 3),) * 2  # enough for a percentile
+    sigma = np.sqrt(_summed(_thinned(shot.variance, total.shape, step))) / step
+    some = (slice(None, None, 5),) * 2  # enough for a percentile
     # The floor keeps the logarithm of a dark background from amplifying its noise.
     floor = max(float(np.percentile(total[some], 99)) * 0.01, 2 * float(np.median(sigma[some])), 1e-9)
     level = np.maximum(total, 0)
     level += np.float32(floor)
-    log = np.log(level)
+    log = cv2.log(level)
     smooth = cv2.GaussianBlur(log, (0, 0), 0.7)  # both shots need one resolution; cubic warps change it
-    smooth -= cv2.GaussianBlur(log, (0, 0), detail_px)
+    reach = 2 * int(np.ceil(3 * detail_px)) + 1
+    smooth -= cv2.GaussianBlur(log, (reach, reach), detail_px)
     sigma /= level
     sigma *= sigma
     sigma += np.float32(0.003**2)
     weight = np.divide(np.float32(1), sigma, out=sigma)
-    clipped = (shot.quality & Quality.CLIPPED).astype(np.uint8)
+    clipped = shot.quality & np.uint8(Quality.CLIPPED)
     if clipped.any():
         clipped = (averaged(clipped.astype(np.float32), step) > 0).astype(np.uint8)
         reach = int(np.ceil(2 * detail_px)) | 1
@@ -94,6 +96,12 @@ class Scale:
         return np.asarray(x), np.asarray(y)
 
     @cached_property
+    def tells(self) -> bool:
+        """Whether it shows anything that could be compared."""
+        seen = self.value[self.weight > 0]
+        return len(seen) > LEAST_PIXELS and bool(np.ptp(seen) > 0)
+
+    @cached_property
     def spline(self) -> Spline:
         return Spline(self.value)
 
@@ -101,6 +109,16 @@ class Scale:
 def _summed(picture: Floats) -> Floats:
     """Over channels, (H, W)."""
     return np.asarray(cv2.transform(np.asarray(picture, np.float32), np.ones((1, 3), np.float32)))
+
+
+def _thinned(picture: Floats, shape: tuple[int, ...], step: int) -> Floats:
+    """One pixel of each step × step block of (H, W, C): of a variance, which changes slowly."""
+    if step == 1:
+        return picture
+    height, width = shape
+    return np.asarray(
+        cv2.resize(picture[: height * step, : width * step], (width, height), interpolation=cv2.INTER_NEAREST)
+    )
 
 
 def averaged(image: Floats, step: int) -> Floats:
@@ -133,20 +151,19 @@ def refine(reference: Detail, shot: Detail, start: Floats, model: str) -> tuple[
         How it may have moved: translation, similarity or homography.
     """
     transform = start
-    error = np.inf
     for shrink in (4, 2, 1):
-        height, width = reference[shrink].value.shape
         level = to_full_grid(transform, 1 / shrink)
         coarse = "translation" if shrink == 4 and model != "translation" else model
-        compared = _Compared(reference[shrink], shot[shrink], level, coarse)
+        compared = _Compared(reference[shrink], shot[shrink], level, coarse, near=shrink > 1)
+        settled = _SETTLED_PX if shrink == 1 else _NEAR_PX
         for _ in range(15):
-            step, error = compared.step(level)
+            step, moved = compared.step(level)
             level = level @ step
             level = level / level[2, 2]
-            if np.abs(step - np.eye(3))[:2].dot([width / 2, height / 2, 1]).max() < 0.004:
+            if moved < settled:
                 break
         transform = to_full_grid(level, shrink)
-    return transform, float(np.hypot(error, _FLOOR_PX))
+    return transform, float(np.hypot(compared.sigma(), _FLOOR_PX))
 
 
 def sigma_at(reference: Detail, shot: Detail, transform: Floats, point: Floats) -> float:
@@ -168,19 +185,21 @@ def sigma_at(reference: Detail, shot: Detail, transform: Floats, point: Floats) 
         return np.inf
     x, y = (point[0] - compared.width / 2) / compared.size, (point[1] - compared.height / 2) / compared.size
     lever = np.array([[1, 0, x, -y], [0, 1, y, x]])
-    covariance = lever @ compared.update(transform)[1] @ lever.T
+    compared.step(transform)
+    covariance = lever @ compared.covariance() @ lever.T
     return float(np.hypot(np.sqrt(max(np.trace(covariance) / 2, 0.0)), _FLOOR_PX))
 
 
 class _Compared:
     """The pixels of two shots that tell how one moved against the other."""
 
-    def __init__(self, a: Scale, b: Scale, level: Floats, model: str) -> None:
-        self.shot, self.model = b, model
+    def __init__(self, a: Scale, b: Scale, level: Floats, model: str, near: bool = False) -> None:
+        """Two shots under a first guess `level` (3, 3) of a model; `near` is enough for a coarse scale."""
+        self.shot, self.model, self.coarse = b, model, near
         self.height, self.width = a.value.shape
         self.size = max(self.height, self.width) / 2
         other = warp(b.weight, level, order=1)
-        weight = 1 / (1 / np.maximum(a.weight, 1e-12) + 1 / np.maximum(other, 1e-12))
+        weight = a.weight * other / (a.weight + other + np.float32(1e-12))  # of a difference
         gx, gy = a.gradient
         information = weight * (gx * gx + gy * gy)  # what a pixel says of the movement; most say nothing
         use = (weight > 1e-9) & (information > 0.05 * information.mean())
@@ -189,53 +208,80 @@ class _Compared:
         at = np.flatnonzero(use)
         at = at[:: max(1, round(len(at) / _MOST_POINTS))]
         self.y, self.x = np.divmod(at, self.width)
-        self.value, self.weight = a.value.ravel()[at], weight.ravel()[at].astype(np.float64)
+        self.unit = tuple(
+            ((c - side / 2) / self.size).astype(np.float32) for c, side in ((self.x, self.width), (self.y, self.height))
+        )
+        self.value, self.weight = a.value.ravel()[at], weight.ravel()[at]
         self.gradient = gx.ravel()[at], gy.ravel()[at]
+        self.beyond: tuple[Floats, Floats] | None = None  # the shot's gradient, from where the first step began
+        self.last: tuple[Floats, Floats, Floats] | None = None  # the last step's JᵀWJ, WJ and what was left
 
     def step(self, transform: Floats) -> tuple[Floats, float]:
-        """One compositional update (3, 3) that brings b∘transform closer to a, and its 1σ, px."""
+        """One compositional update (3, 3) that brings b∘transform closer to a, and how far it moves a corner, px."""
         if len(self.x) <= LEAST_PIXELS:
-            return np.eye(3), np.inf
-        p, covariance = self.update(transform)
-        variance = max(float(np.trace(covariance[:2, :2])), 0.0)  # rounding, where next to nothing tells
-        return _matrix(p, self.width, self.height, self.size), float(np.sqrt(variance / 2))
+            return np.eye(3), 0.0
+        difference, jacobian = self._linearized(transform)
+        # An edge sampled at two phases differs by a share of its own gradient: aliasing counts as noise,
+        # else the robust loss keeps the edges that happen to agree and pulls the shift to whole pixels.
+        slope = jacobian[0] ** 2 + jacobian[1] ** 2
+        w = 1 / (np.float32(_ALIASING_PX2) * slope + 1 / self.weight)
+        normalized = np.abs(difference) * np.sqrt(w)
+        scale = MAD_TO_SIGMA * _weighted_median(normalized, w * slope) + 1e-9
+        normalized *= np.float32(1 / (BIWEIGHT * scale))
+        w *= np.square(np.maximum(0, 1 - normalized * normalized))
+        weighted = jacobian * w
+        normal = (weighted @ jacobian.T).astype(np.float64) + 1e-12 * np.eye(len(jacobian))
+        self.last = normal, weighted, difference
+        p = np.linalg.solve(normal, (weighted @ difference).astype(np.float64))
+        step = _matrix(p, self.width, self.height, self.size)
+        return step, float(np.abs(step - np.eye(3))[:2].dot([self.width / 2, self.height / 2, 1]).max())
 
-    def update(self, transform: Floats) -> tuple[Floats, Floats]:
-        """The update's parameters (P,), about the image centre in units of `size`, and their covariance (P, P)."""
+    def covariance(self) -> Floats:
+        """Of the last step's parameters (P, P), about the image centre in units of `size`."""
+        if self.last is None:
+            return np.full((2, 2), np.inf)
+        normal, weighted, difference = self.last
+        # Neighbouring residuals are correlated by the blur over about ten pixels.
+        residual = (weighted * difference).astype(np.float64)
+        inverse = np.linalg.inv(normal)
+        return np.asarray(10 * inverse @ (residual @ residual.T) @ inverse)
+
+    def sigma(self) -> float:
+        """1σ of the last step's shift, px."""
+        covariance = self.covariance()
+        return float(np.sqrt(max(float(np.trace(covariance[:2, :2])), 0.0) / 2))  # below 0: rounding
+
+    def _linearized(self, transform: Floats) -> tuple[Floats, Floats]:
+        """a − b∘transform at the pixels (N,), and its derivative by the update's parameters (P, N); float32."""
         count = len(self.x)
         u, v = (_rows(c) for c in coordinates(transform, self.x, self.y))
-        warped = self.shot.spline.at(Taps(u, v, (self.height, self.width))).ravel()[:count]
-        u, v = u.astype(np.float32), v.astype(np.float32)
-        bx, by = (
-            cv2.remap(g, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel()[:count]
-            for g in self.shot.gradient
-        )
-        m = transform  # the warped shot's gradient: of a homography this near a similarity, its linear part's
+        if self.coarse:
+            warped = _between(self.shot.value, u, v).ravel()[:count]
+        else:
+            warped = self.shot.spline.at(Taps(u, v, (self.height, self.width))).ravel()[:count]
+        if self.beyond is None:
+            bx, by = (_between(g, u, v).ravel()[:count] for g in self.shot.gradient)
+            self.beyond = bx, by
+        bx, by = self.beyond
+        m = transform.astype(
+            np.float32
+        )  # the warped shot's gradient: of a homography this near a similarity, its linear part's
         gx = (self.gradient[0] + m[0, 0] * bx + m[1, 0] * by) / 2
         gy = (self.gradient[1] + m[0, 1] * bx + m[1, 1] * by) / 2
-        x, y = (self.x - self.width / 2) / self.size, (self.y - self.height / 2) / self.size
+        x, y = self.unit
         columns = [gx, gy]
         if self.model in ("similarity", "homography"):
             columns += [gx * x + gy * y, gy * x - gx * y]
         if self.model == "homography":
             radial = gx * x + gy * y
             columns += [gx * x - gy * y, gx * y + gy * x, radial * x, radial * y]
-        jacobian = np.stack(columns).astype(np.float64)
-        difference = (self.value - warped).astype(np.float64)
-        # An edge sampled at two phases differs by a share of its own gradient: aliasing counts as noise,
-        # else the robust loss keeps the edges that happen to agree and pulls the shift to whole pixels.
-        slope = jacobian[0] ** 2 + jacobian[1] ** 2
-        w = 1 / (_ALIASING_PX2 * slope + 1 / self.weight)
-        normalized = np.abs(difference) * np.sqrt(w)
-        scale = MAD_TO_SIGMA * _weighted_median(normalized, w * slope) + 1e-9
-        w = w * np.maximum(0, 1 - (normalized / (BIWEIGHT * scale)) ** 2) ** 2
-        weighted = jacobian * w
-        normal = weighted @ jacobian.T + 1e-12 * np.eye(len(jacobian))
-        p = np.linalg.solve(normal, weighted @ difference)
-        # Neighbouring residuals are correlated by the blur over about ten pixels.
-        residual = weighted * difference
-        spread = np.linalg.inv(normal) @ (residual @ residual.T) @ np.linalg.inv(normal)
-        return p, 10 * spread
+        return self.value - warped, np.stack(columns)
+
+
+def _between(picture: Floats, x: Floats, y: Floats) -> Floats:
+    """Linearly interpolated at places of any shape."""
+    at = x.astype(np.float32), y.astype(np.float32)
+    return np.asarray(cv2.remap(picture, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _rows(points: Floats) -> Floats:
