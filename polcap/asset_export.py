@@ -94,6 +94,10 @@ def export(
     if made is not None:
         maps = Derived(maps.key, maps_folder.as_read, (made.maps, made.mesh))
     source = _source(maps, settings)
+    standing = standing or Written(out, anew=True)
+    usual = made is not None and wanted == Wanted()
+    if usual and (stood := _described(out / "asset", about, source, standing)):
+        return stood
     earlier, whole = _earlier(out / "asset", source)
     encoder = Encoder()
     if earlier is None:
@@ -125,9 +129,11 @@ def export(
         record=provenance.record(about),
         source=source if wanted.texture_size is None else None,
         encoder=encoder,
-        standing=standing or Written(out, anew=True),
+        standing=standing,
     )
     written = job.write()
+    if usual:
+        standing.note(job.folder / f"{job.stem}.glb", msgspec.to_builtins(source))
     maps_folder.note_export(out / "maps", job.folder.relative_to(out).as_posix(), job.said())
     return written
 
@@ -154,6 +160,27 @@ def _source(maps: Derived[maps_folder.Stored], settings: _Settings) -> _Source:
     made_by = [provenance.versions(), surface.integrate.version, asset.build.version]
     sections = (msgspec.to_builtins(section) for section in (settings.surface, settings.asset))
     return _Source(*(digest([made_by, section, maps.key]) for section in sections))
+
+
+def _described(folder: Path, about: Mapping[str, Any], source: _Source, standing: Written) -> list[Path]:
+    """The files of the last run's export, where only what is said of it has changed; none where more may have.
+
+    Mesh and pictures stand; the GLB and the sidecar tell the run that they are from.
+    """
+    name = file_name.safe(str(about["capture"].get("name")))
+    glb, sidecar = folder / f"{name}.glb", folder / f"{name}{_SIDECAR}"
+    made_from, record = msgspec.to_builtins(source), provenance.record(about)
+    try:
+        written = [folder / file for file in text_file.read_json(sidecar)["files"]]
+        if not standing.stand([glb, sidecar, folder.parent / "maps" / "maps.json", *written], made_from):
+            return []
+    except (OSError, ValueError, LookupError, TypeError):
+        return []
+    data = gltf.described(glb.read_bytes(), provenance.words(record))
+    with atomic.path(glb) as temporary:
+        temporary.write_bytes(data)
+    provenance.write(sidecar, {**record, "made_from": made_from}, written)
+    return [*written, sidecar]
 
 
 def _earlier(folder: Path, source: _Source) -> tuple[glb_reader.Stored | None, bool]:

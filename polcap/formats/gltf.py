@@ -129,18 +129,30 @@ def encode(
         "bufferViews": blob.views,
         "buffers": [{"byteLength": len(blob.data)}],
     }
+    return _file(document, blob.data)
+
+
+def _file(document: Mapping[str, Any], blob: bytes | bytearray) -> bytes:
     text = json.dumps(document, separators=(",", ":"), ensure_ascii=True).encode()
     text += b" " * (-len(text) % 4)
-    size = 12 + 8 + len(text) + 8 + len(blob.data)
+    size = 12 + 8 + len(text) + 8 + len(blob)
     return b"".join(
         [
             struct.pack("<4sII", b"glTF", 2, size),
             struct.pack("<I4s", len(text), b"JSON"),
             text,
-            struct.pack("<I4s", len(blob.data), b"BIN\0"),
-            bytes(blob.data),
+            struct.pack("<I4s", len(blob), b"BIN\0"),
+            blob,
         ]
     )
+
+
+def described(data: bytes, provenance: Mapping[str, str]) -> bytes:
+    """The bytes of a GLB that `encode` made, where these words of its provenance are others."""
+    length = int(struct.unpack_from("<I", data, 12)[0])
+    document = json.loads(data[20 : 20 + length])
+    document["extensions"]["KHR_xmp_json_ld"]["packets"][0] |= _worded(provenance)
+    return _file(document, data[28 + length :])
 
 
 def textures(asset: Asset) -> dict[str, Texture]:
@@ -201,8 +213,12 @@ def _packet(name: str, provenance: Mapping[str, str]) -> dict[str, Any]:
         "dc:title": {"@type": "rdf:Alt", "rdf:_1": {"@language": "x-default", "@value": name}},
         "dc:format": "model/gltf-binary",
         "xmp:CreatorTool": f"polcap {__version__}",
-        **{f"polcap:{key}": said for key, said in provenance.items()},
+        **_worded(provenance),
     }
+
+
+def _worded(provenance: Mapping[str, str]) -> dict[str, str]:
+    return {f"polcap:{key}": said for key, said in provenance.items()}
 
 
 def center(vertices: Floats) -> Floats:

@@ -115,9 +115,14 @@ def write(
     for name, (sources, encode) in {**_EXRS, **_PNGS}.items():
         taken = [made[source] for source in sources]
         written.make(folder / name, [one.key for one in taken], partial(_write, folder / name, encode, taken))
+    about = folder / "maps.json"
+    written.make(about, [maps.key, mesh.key], partial(_describe, about, maps, mesh))
+
+
+def _describe(file: Path, maps: Keyed[SurfaceMaps], mesh: Keyed[Mesh]) -> None:
     near, median, far = _range(maps.value, mesh.value)
     depth: dict[str, str | float] = {"unit": "m" if mesh.value.metric else "relative"}
-    _write_json(folder / "maps.json", _description(maps.value, {**depth, "near": near, "median": median, "far": far}))
+    _write_json(file, _description(maps.value, {**depth, "near": near, "median": median, "far": far}))
 
 
 def _write(file: Path, encode: Callable[..., Any], taken: Sequence[Keyed[Any]]) -> None:

@@ -6,7 +6,7 @@ What it is made from is told by keys of results or digests of pixels: a changed 
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from hashlib import blake2b, sha256
 from pathlib import Path
 from typing import Any
@@ -61,6 +61,20 @@ class Written:
         if self._before.made_from.get(name) != mark or self._before.files.get(name) != _stat(file):
             write()
         self._made[name] = mark
+
+    def note(self, file: Path, made_from: Any) -> None:
+        """Write down what a file that `make` does not decide on was made from, for `stand`."""
+        self._made[file.relative_to(self._out).as_posix()] = digest([self._program, made_from])
+
+    def stand(self, files: Sequence[Path], made_from: Any) -> bool:
+        """Every file is as the last run left it, and it noted the first as made from this; they are taken over then."""
+        names = [file.relative_to(self._out).as_posix() for file in files]
+        if self._before.made_from.get(names[0]) != digest([self._program, made_from]):
+            return False
+        if any(self._before.files.get(name) != _stat(file) for name, file in zip(names, files)):
+            return False
+        self._made |= {name: mark for name in names if (mark := self._before.made_from.get(name)) is not None}
+        return True
 
     def untouched(self) -> bool:
         """Every file of the result is as the last run left it, none is missing and none has come."""
