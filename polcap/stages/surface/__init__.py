@@ -59,7 +59,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
 
 
-@stage(version=9)
+@stage(version=10)
 def integrate(maps: SurfaceMaps, distance_m: float | None, settings: Settings) -> Mesh:
     """The visible surface of the object, from its normals.
 

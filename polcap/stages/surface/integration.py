@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Floats, SurfaceMaps, View
 from polcap.optics.frames import dot
+from polcap.stages.surface.contacts import contacts
 from polcap.stages.surface.jumps import Jumps, jumps, least_step, radius, widened
 from polcap.stages.surface.multigrid import Multigrid, Nested, conjugate_gradients
 from polcap.stages.surface.pixel_grid import PixelGrid
@@ -121,6 +122,7 @@ def _solved(
             z = np.zeros_like(z)  # nothing of what was tried is left: plain least squares, to the last bit
         z, solver = level.mended(z, free, stiffness)
         z, solver = level.sewn(z, solver, free, stiffness, jump / 2)
+        z, solver = level.joined(z, solver, free, stiffness, jump / 2)
         return z, level.jumps(z, jump / 2).near(_REACH), solver
     coarse, parent = halved(of), parents(of.mask)
     start, at_jumps, solver = _solved(coarse, stiffness, iterations, tolerance, jump)
@@ -233,14 +235,47 @@ class _Level:
             close = self._worthless(found, self._strain(whole[0]), self._strain(z))
             if not close.any():
                 break
-            free &= ~close
-            stays = ~close[self.grid.p[self.limb]]
-            self.limb, self.gap, self.leap = self.limb[stays], self.gap[stays], self.leap[stays]
-            z, solver = self.mended(z, free, stiffness, solver)
+            z, solver = self._closed(z, solver, free, close, stiffness)
             if not self.jumps(z, least).any():
                 free[:] = False
                 return whole  # plain least squares, to the last bit
         return z, solver
+
+    def joined(
+        self, z: Floats, solver: Multigrid, free: NDArray[np.bool_], stiffness: float, least: float
+    ) -> tuple[Floats, Multigrid]:
+        """From z and its solver: parts that stand free are joined where they touch, the pixels taken out of `free`."""
+        found = self.jumps(z, least)
+        if not found.any() or not free.any():
+            return z, solver
+        grid, apart = self.grid, self._jumping(found)
+        apart[self.limb] = True
+        step, ends = z[grid.q] - z[grid.p], (self._along(grid.p), self._along(grid.q))
+        touch = contacts(grid, apart, step - np.clip(step, np.minimum(*ends), np.maximum(*ends)), radius(self.of.mask))
+        if not touch.any():
+            return z, solver
+        at = np.zeros(grid.size, dtype=bool)
+        at[grid.p[touch]] = at[grid.q[touch]] = True
+        close = widened(grid.image(at, outside=False), _REACH)[self.of.mask]
+        z, solver = self._closed(z, solver, free, close, stiffness)
+        if not self.jumps(z, least).any():
+            free[:] = False  # plain least squares, to the last bit
+            return self._without_limbs().mended(np.zeros_like(z), free, stiffness)
+        return z, solver
+
+    def _closed(
+        self, z: Floats, solver: Multigrid, free: NDArray[np.bool_], close: NDArray[np.bool_], stiffness: float
+    ) -> tuple[Floats, Multigrid]:
+        """From z and its solver: pixels to close (N,) lose choice and limb."""
+        free &= ~close
+        stays = ~close[self.grid.p[self.limb]]
+        self.limb, self.gap, self.leap = self.limb[stays], self.gap[stays], self.leap[stays]
+        return self.mended(z, free, stiffness, solver)
+
+    def _jumping(self, found: Jumps) -> NDArray[np.bool_]:
+        """Links (L,) at jumps."""
+        mask = self.of.mask
+        return np.concatenate([found.right[mask[:, :-1] & mask[:, 1:]], found.down[mask[:-1] & mask[1:]]])
 
     def _without_limbs(self) -> "_Level":
         level = copy(self)
@@ -254,7 +289,7 @@ class _Level:
     def _worthless(self, found: Jumps, whole: Floats, cut: Floats) -> NDArray[np.bool_]:
         """Pixels (N,) about contours of jumps beside which links are strained more (L,) than with no cut at all."""
         mask, p = self.of.mask, self.grid.p
-        jumping = np.concatenate([found.right[mask[:, :-1] & mask[:, 1:]], found.down[mask[:-1] & mask[1:]]])
+        jumping = self._jumping(found)
         contour = contours(found.near(0))
         links = np.bincount(contour[mask][p], jumping, minlength=int(contour.max()) + 1)
         close = np.zeros(mask.shape, dtype=bool)
