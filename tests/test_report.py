@@ -110,6 +110,15 @@ def test_missing_or_foreign_report_is_one_line(tmp_path: Path, text: str | None)
         report.read(tmp_path)
 
 
+def test_what_is_no_result_is_told_apart(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="no such folder"):
+        report.read(tmp_path / "elsewhere")
+    (tmp_path / "report.json").write_text("{}")
+    (tmp_path / "maps").mkdir()
+    with pytest.raises(StorageError, match=f"a part of a result; give the whole, {tmp_path}"):
+        report.read(tmp_path / "maps")
+
+
 @pytest.mark.parametrize(
     "left_out", ["verdict", "gates", "keys", "model", "figures.maps", "gates.0.state", "gates.0.says"]
 )

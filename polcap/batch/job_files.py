@@ -26,10 +26,10 @@ _NAMES: dict[Kind, str] = {
     "snakemake": "Snakefile",
     "kubernetes": "kubernetes.json",
 }
-SUBMIT: dict[Kind, str] = {
+_SUBMIT: dict[Kind, str] = {
     "slurm": "sbatch {file}",
     "openjd": "openjd run {file}, or a farm that takes Open Job Description",
-    "opencue": "launch it with OpenCue's API: opencue.api.launchSpec(open('{file}').read())",
+    "opencue": "launch it with OpenCue's API: opencue.api.launchSpec(open({literal}).read())",
     "snakemake": "snakemake --snakefile {file} --cores all",
     "kubernetes": "set its image and volume, then kubectl apply -f {file}",
 }
@@ -40,6 +40,11 @@ _LEFT_OUT = ("context", "root", "shard", "write_jobs", "jobs", "json", "schedule
 
 
 _UNSAID = {"threads": 0, "memory": 0, "workers": 0}  # defaults that need no word
+
+
+def submit(kind: Kind, file: Path) -> str:
+    """How a job file is handed to its farm, whatever is in its name."""
+    return _SUBMIT[kind].format(file=shlex.quote(str(file)), literal=repr(str(file)))
 
 
 def command(root: Path, options: Mapping[str, Any]) -> tuple[str, ...]:

@@ -58,7 +58,7 @@ def batch(
         command = job_files.command(root, context.params)
         job = job_files.Job(command, root.resolve(), jobs or min(len(found), 1000), memory_gb=memory or 4.0)
         file = job_files.write(write_jobs, job, (out or root).resolve() / unit.FOLDER)
-        terminal.tell(f"start it: {job_files.SUBMIT[write_jobs].format(file=file)}")
+        terminal.tell(f"start it: {job_files.submit(write_jobs, file)}")
         terminal.say({"file": str(file), "shards": job.shards} if json else str(file))
         return
     order = unit.Order(

@@ -79,6 +79,9 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None) 
         raise CaptureError(f"{folder}: holds no photograph that polcap reads{hint}")
     if stated.sensor or _is_sensor(listing.pictures, angles_deg):
         return _sensor(listing, angles_deg)
+    whole = Path(os.path.abspath(folder))
+    if is_angle_folder(whole.name) and len(_pol_folders(whole.parent)) > 1:
+        raise CaptureError(f"{folder}: holds one angle of a capture; give the folder of all, {whole.parent}")
     return _named(folder, listing, angles_deg) or _by_time(folder, listing, angles_deg or DEFAULT_DEG)
 
 
@@ -98,6 +101,8 @@ def _toml(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None)
     sources = []
     for entry in stated.frame:
         path = folder / entry.file
+        if not path.exists():
+            path = folder / entry.file.replace("\\", "/")  # as Windows writes it
         if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder)):
             raise CaptureError(f"{folder / capture_toml.NAME}: {entry.file} lies outside the folder; move it inside")
         if not path.is_file():
@@ -249,12 +254,13 @@ def _by_time(folder: Path, listing: _Listing, angles_deg: Sequence[float]) -> Pl
     count, shots = len(order), len(angles_deg)
     by = "by their EXIF times" if timed else "by name"
     listed = ", ".join(f"{angle:g}" for angle in angles_deg)
-    remedy = "give the order with --angles, or sort the frames into pol000, pol045, … or capture.toml"
+    sort = "sort the frames into pol000, pol045, …, or list them in capture.toml"
+    remedy = f"give the order with --angles, or {sort}"
     if count % shots:
         raise CaptureError(f"{folder}: {count} frames do not make {shots} equal brackets (angles {listed}); {remedy}")
     size = count // shots
     if not timed and size > 1:
-        raise CaptureError(f"{folder}: {count} frames without EXIF times cannot be told apart; {remedy}")
+        raise CaptureError(f"{folder}: {count} frames without EXIF times cannot be told apart; {sort}")
     brackets = [order[at : at + size] for at in range(0, count, size)]
     first = [facts[source.path].relative_exposure for source in brackets[0]]
     for angle, bracket in zip(angles_deg, brackets):

@@ -68,7 +68,9 @@ def decode(tree: Any, hint: Any, folder: Path) -> Any:
     if is_dataclass(hint) and isinstance(hint, type):
         hints = get_type_hints(hint)
         names = {field.name for field in fields(hint)}
-        _expect(isinstance(tree, dict) and tree.keys() == names, tree, hint.__name__, folder)
+        if isinstance(tree, dict) and tree.keys() != names:
+            raise StorageError(f"{folder}: its {hint.__name__} is that of another polcap; run `polcap process` again")
+        _expect(isinstance(tree, dict), tree, hint.__name__, folder)
         return hint(**{name: decode(item, hints[name], folder) for name, item in tree.items()})
     if origin is tuple:
         _expect(isinstance(tree, list), tree, "a list", folder)

@@ -1,7 +1,7 @@
 """In: the path of a text file that anybody may have written. Out: its content, as TOML or JSON.
 
-Whatever stands there, a reader gets plain data or an `OSError` or `ValueError` of one line: no pipe is
-waited for, no number is without end, no nesting too deep, no value infinite.
+It is UTF-8, with or without a byte order mark. Whatever stands there, a reader gets plain data or an `OSError` or
+`ValueError` of one line: no pipe is waited for, no number is without end, no nesting too deep, no value infinite.
 """
 
 import errno
@@ -40,12 +40,12 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
 
 def read_toml(path: str | Path, finite: bool = True) -> dict[str, Any]:
     """A TOML document; unless `finite`, its numbers may be NaN. Raises OSError or ValueError."""
-    return parse_toml(read_bytes(path, TEXT_BYTES).decode("utf-8"), finite)
+    return parse_toml(read_bytes(path, TEXT_BYTES).decode("utf-8-sig"), finite)
 
 
 def read_json(path: str | Path) -> Any:
     """A JSON document. Raises OSError or ValueError."""
-    return parse_json(read_bytes(path, TEXT_BYTES).decode("utf-8"))
+    return parse_json(read_bytes(path, TEXT_BYTES).decode("utf-8-sig"))
 
 
 def parse_toml(text: str, finite: bool = True) -> dict[str, Any]:

@@ -272,6 +272,10 @@ def read(folder: Path) -> dict[str, Any]:
         about = text_file.read_json(folder / "report.json")
         msgspec.convert(msgspec.convert(about, _Stored).figures, _Figures)
     except OSError as error:
+        if not folder.exists():
+            raise StorageError(f"{folder}: no such folder; give the result folder of `polcap process`") from error
+        if (folder.parent / "report.json").exists():
+            raise StorageError(f"{folder} is a part of a result; give the whole, {folder.parent}") from error
         raise StorageError(f"{folder} holds no report.json; run `polcap process` first") from error
     except ValueError as error:
         text = f"{folder / 'report.json'} is no report of this polcap ({error}); run `polcap process` again"

@@ -1,6 +1,7 @@
 """Job files say what the farms' own rules ask for; their validators are run where they are installed."""
 
 import json
+import shlex
 import shutil
 import subprocess
 import sys
@@ -18,6 +19,12 @@ ROOT = Path("/shows/An object's {raw}")
 @pytest.fixture
 def job() -> Job:
     return Job(job_files.command(ROOT, {"assignments": ["hdr.clip=0.9"], "keep_going": True}), ROOT, 12)
+
+
+def test_what_submits_a_job_survives_any_folder_name() -> None:
+    file = ROOT / "slurm.sh"
+    assert shlex.split(job_files.submit("slurm", file)) == ["sbatch", str(file)]
+    assert repr(str(file)) in job_files.submit("opencue", file)
 
 
 def written(kind: job_files.Kind, job: Job, folder: Path) -> str:

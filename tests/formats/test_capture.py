@@ -138,6 +138,31 @@ def test_capture_toml_states_angles_roles_and_exposures(tmp_path):
     assert understood.focal_known and understood.focal_px == pytest.approx(60 / 36 * 48)
 
 
+def test_capture_toml_may_come_from_windows(tmp_path):
+    text = 'name = "bowl"\r\n'
+    for angle in (0, 45, 90):
+        shoot(tmp_path / f"pol{angle:03d}" / "a.dng")
+        text += f"[[frame]]\r\nfile = 'pol{angle:03d}\\a.dng'\r\nangle = {angle}\r\n"
+    (tmp_path / "capture.toml").write_bytes(b"\xef\xbb\xbf" + text.encode())  # with the mark that its editor sets
+    understood = capture.read(tmp_path)
+    assert (understood.name, degrees(understood)) == ("bowl", [0, 45, 90])
+
+
+def test_the_folder_of_one_angle_is_no_capture(tmp_path):
+    folders(tmp_path, times=(1 / 200, 1 / 50, 1 / 12))
+    with pytest.raises(CaptureError, match=f"holds one angle of a capture; give the folder of all, {tmp_path}"):
+        capture.read(tmp_path / "pol045")
+
+
+def test_untimed_brackets_in_one_folder_are_to_be_sorted(tmp_path):
+    """No order of angles tells them apart: none is asked for."""
+    folder = pictures(tmp_path, [f"krug_{angle}_grad_{number}.png" for angle in (0, 45, 90) for number in range(3)])
+    for angles in (None, (0.0, 45.0, 90.0)):
+        with pytest.raises(CaptureError, match="cannot be told apart; sort the frames into pol000") as caught:
+            capture.read(folder, angles)
+        assert "--angles" not in str(caught.value)
+
+
 def test_a_repeat_is_a_shot_of_its_own(tmp_path):
     angles = {"a": 0, "b": 45, "c": 90, "d": 0}
     text = ""
