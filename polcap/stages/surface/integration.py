@@ -32,7 +32,7 @@ _REFINED = 2  # solutions on each finer grid with jumps
 _MENDED = 4  # solutions on the grid that decides, after tears were found
 _UNDECIDED = 0.1  # of the prior's pull while jumps are sought: where it strains the normals it tears them
 _REACH = 2  # px around a jump within which pixels choose their neighbours on the next finer grid
-_TIRED = 9  # iterations of a linear solution that call for a new multigrid hierarchy
+_TIRED = 12  # iterations of a linear solution that call for a new multigrid hierarchy, which costs as much as 28
 _BESIDE = 10  # px from a contour of jumps within which it is asked what it is worth
 _STRAIN = 1.0  # σ² per link of a contour by which the surface beside it may fit its normals worse than without cuts
 _STRAINED = 1.4  # the same as a factor; both have to be passed
@@ -321,20 +321,23 @@ class _Level:
         energy = 0.0
         if free.any():
             for part, side in zip((slice(None, grid.turn), slice(grid.turn, None)), self.side):
-                chosen = np.flatnonzero(free[grid.p[part]] | free[grid.q[part]]) + (part.start or 0)
+                chosen, both = self._choosing(free, part)
                 p, q, step = grid.p[chosen], grid.q[chosen], change[chosen]
                 ahead, behind = np.zeros(grid.size), np.zeros(grid.size)  # m ∂z on either side; 0 past the mask
-                ahead[p], behind[q] = facing[p] * step, facing[q] * step
+                first, second = facing[p], facing[q]
+                ahead[p], behind[q] = first * step, second * step
                 forward, backward = (
                     _sigmoid(stiffness * (a[e] ** 2 - b[e] ** 2))
                     for a, b, e in ((behind, ahead, p), (ahead, behind, q))
                 )
-                forward, backward = self.of.weight[p] * forward, self.of.weight[q] * backward
+                forward *= self.of.weight[p]
+                backward *= self.of.weight[q]
                 energy += float(forward @ (ahead - side)[p] ** 2 + backward @ (behind - side)[q] ** 2)
-                both = free[p] & free[q]
-                at = chosen[both]
-                link[at] = (forward * facing[p] ** 2 + backward * facing[q] ** 2)[both]
-                flux[at] = (forward * facing[p] * side[p] + backward * facing[q] * side[q])[both]
+                forward *= first
+                backward *= second
+                at = chosen if both is None else chosen[both]
+                link[at] = _where(forward * first + backward * second, both)
+                flux[at] = _where(forward * side[p] + backward * side[q], both)
         link[self.limb] = weight = _HOVER / max(len(self.limb), 1)
         flux[self.limb] = weight * self.leap
         diagonal, right = np.full(grid.size, _PROXIMITY), _PROXIMITY * z + grid.divergence(flux)
@@ -342,6 +345,14 @@ class _Level:
             diagonal += pull
             right = right + pull * self.of.prior
         return grid.laplacian(link, diagonal), right, energy
+
+    def _choosing(self, free: NDArray[np.bool_], part: slice) -> tuple[Any, NDArray[np.bool_] | None]:
+        """The links of a part with an end among `free` pixels (N,), and which of them have both; None: all of them."""
+        if free.all():
+            return part, None
+        p, q = free[self.grid.p[part]], free[self.grid.q[part]]
+        chosen = np.flatnonzero(p | q)
+        return chosen + (part.start or 0), (p & q)[chosen]
 
     def finer(self, coarse: Floats, parent: NDArray[np.intp]) -> Floats:
         """z from that of half the resolution: each block tilted by its pixels' own slopes."""
@@ -405,6 +416,10 @@ def _slopes_of_rays(mask: NDArray[np.bool_], view: View) -> tuple[Floats, Floats
     """a, b of the object's pixels: (N,) each."""
     row, column = np.nonzero(mask)
     return (column - view.center[0]) / view.focal, -(row - view.center[1]) / view.focal
+
+
+def _where(value: Floats, these: NDArray[np.bool_] | None) -> Floats:
+    return value if these is None else value[these]
 
 
 def _sigmoid(x: Floats) -> Floats:

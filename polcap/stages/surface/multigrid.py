@@ -26,7 +26,7 @@ _DAMPING = 4 / 3 / _SPECTRUM
 @dataclass(frozen=True)
 class _Level:
     matrix: Any  # (N, N) CSR
-    inverse_diagonal: Floats  # (N,)
+    step: Floats  # (N,) of a damped Jacobi iteration
     prolong: Any  # (N, n) CSR
     restrict: Any  # (n, N) CSR
 
@@ -53,7 +53,7 @@ class Multigrid:
                 break
             prolong = _prolongation(matrix, group, count)
             restrict = prolong.T.tocsr()
-            self.levels.append(_Level(matrix, 1 / matrix.diagonal(), prolong, restrict))
+            self.levels.append(_Level(matrix, _DAMPING * (1 / matrix.diagonal()), prolong, restrict))
             matrix = (restrict @ (matrix @ prolong)).tocsr()
             kept = np.zeros((count, 2), dtype=np.int64)
             kept[group] = cell
@@ -68,10 +68,12 @@ class Multigrid:
         if depth == len(self.levels):
             return np.asarray(self.coarsest.solve(right))
         level = self.levels[depth]
-        step = _DAMPING * level.inverse_diagonal
-        x = step * right
-        x = x + level.prolong @ self._cycle(depth + 1, level.restrict @ (right - level.matrix @ x))
-        return np.asarray(x + step * (right - level.matrix @ x))
+        x = level.step * right
+        x += level.prolong @ self._cycle(depth + 1, level.restrict @ (right - level.matrix @ x))
+        left = right - level.matrix @ x
+        left *= level.step
+        left += x
+        return np.asarray(left)
 
 
 class Nested:
@@ -160,7 +162,8 @@ def _aggregate(matrix: Any, cell: NDArray[np.int64]) -> tuple[NDArray[np.int64],
     links = matrix.tocoo()
     diagonal = matrix.diagonal()
     row, column = links.row, links.col
-    together = np.all(cell[row] == cell[column], axis=1)
+    at = cell[:, 0] * (int(cell[:, 1].max()) + 1) + cell[:, 1]
+    together = at[row] == at[column]
     together &= links.data**2 > _STRONG**2 * diagonal[row] * diagonal[column]
     graph = sparse.coo_matrix(
         (np.ones(int(together.sum()), dtype=np.int8), (row[together], column[together])), matrix.shape
