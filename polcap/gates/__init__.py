@@ -11,9 +11,7 @@ import numpy as np
 
 from polcap.config import Config, Gates
 from polcap.gates import geometry, light, polarization
-from polcap.gates.gate import Found, Gate, State, Unit
-
-_MOST_DEG = 90.0  # normals face the camera: no error is larger in the median
+from polcap.gates.gate import MOST_DEG, Found, Gate, State, Unit
 
 __all__ = ["Found", "Gate", "State", "Unit", "judge", "verdict"]
 
@@ -67,10 +65,10 @@ def _in_order(found: Found, config: Config) -> Iterator[Gate]:
 def _normal_error(found: Found, judged: list[Gate], limits: Gates) -> Gate:
     """The median expected error, with what the other gates add to it."""
     own = found.figure("normal_error", _own_error)
-    expected = min(float(np.sqrt(own**2 + sum(gate.cost_deg**2 for gate in judged))), _MOST_DEG)
+    expected = min(float(np.sqrt(own**2 + sum(gate.cost_deg**2 for gate in judged))), MOST_DEG)
     because = ", ".join(gate.name for gate in judged if gate.cost_deg > 0.5 * own)
     says = f"expected error of the normals {expected:.1f}° (median)"
-    if expected == _MOST_DEG:
+    if expected == MOST_DEG:
         says = "nothing is known of the normals"
     says += f", most of it from: {because}" if because else ""
     limit = limits.max_normal_error_deg

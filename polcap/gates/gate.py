@@ -22,6 +22,7 @@ from polcap.images import (
 State = Literal["pass", "warn", "fail", "not measured"]
 Unit = Literal["%", "px", "°", "×", "ΔE2000", ""]
 
+MOST_DEG = 90.0  # of an error: normals face the camera
 DEGREES_PER_GAIN = 600.0  # 1 % of a shot's light tilts facing pixels by about 6° (error budget)
 
 
@@ -114,7 +115,9 @@ def at_most(
         return Gate(name, "not measured", None, limit, says, unit=unit)
     if value <= limit:
         return Gate(name, "pass", round(float(value), 5), limit, says, unit=unit)
-    return Gate(name, beyond, round(float(value), 5), limit, says, remedy, round(cost_deg, 1), shots, unit)
+    return Gate(
+        name, beyond, round(float(value), 5), limit, says, remedy, round(min(cost_deg, MOST_DEG), 1), shots, unit
+    )
 
 
 def blamed(names: list[str], bad: NDArray[np.bool_]) -> tuple[str, ...]:

@@ -192,9 +192,10 @@ def _gain_doubt(found: Found, limits: Gates) -> Gate:
     says = f"no grey patches: the light of the shots is known to {100 * doubt:.1f} % (1σ)"
     if measured.source == "none":
         says = f"nothing tells the light of the shots: taken as equal, to {100 * doubt:.1f} % (1σ)"
-    remedy = "put a ColorChecker beside the object"
-    remedy += "" if found.radiance.light == "steady" else ", use a steady lamp"
-    remedy += "" if len(found.names) > 3 else ", or shoot four angles"
+    ways = ["put a ColorChecker beside the object"]
+    ways += [] if found.radiance.light == "steady" else ["use a steady lamp"]
+    ways += [] if len(found.names) > 3 else ["shoot four angles"]
+    remedy = " or ".join(ways)
     return at_most("gain doubt", doubt, limit, says, remedy, cost_deg=cost, beyond=_grade(cost))
 
 

@@ -23,13 +23,14 @@ from polcap.config import Config
 from polcap.errors import InputError
 from polcap.formats import atomic, png
 from polcap.formats import capture as captures
-from polcap.images import ChartRequest, Floats, Network
+from polcap.images import ChartRequest, Cues, Floats, Network
 from polcap.path import UserInput, path
 from polcap.store import Store
 
 _MISSED_DEG = 90.0  # what an object's pixel without a normal counts as
 _LIMITS_DEG = (11.25, 22.5, 30.0)
-_ROWS = ("mean", "median", *(f"within {limit:g}°" for limit in _LIMITS_DEG), "covered")
+_ROWS = ("mean", "median", *(f"within {limit:g}°" for limit in _LIMITS_DEG), "covered", "as a body")
+_LEAST_DOLP, _LEAST_TILT = 0.03, 0.3  # of pixels whose AoLP and azimuth are compared; tilt: sine of the zenith
 
 Score = dict[str, float]
 
@@ -76,7 +77,7 @@ def _contents(folder: Path) -> tuple[list[str], list[str]]:
 
 
 def scored(folder: Path, angles: list[str], name: str, network: Network | None) -> Score:
-    """Angles between estimated and given normals over the mask that is given, degrees; shares 0…1."""
+    """Angles between estimated and given normals over the mask that is given, degrees; shares 0…1; and `as_a_body`."""
     mask, truth = _mask(folder / "mask" / name), _normal(folder / "normal" / name)
     with tempfile.TemporaryDirectory() as place:
         for angle in angles:
@@ -85,7 +86,7 @@ def scored(folder: Path, angles: list[str], name: str, network: Network | None) 
         capture = captures.read(Path(place) / "shots", None)
         supplied = UserInput(chart=ChartRequest("none"), mask=mask, network=network)
         found = path(capture, supplied, Config(), Store(Path(place) / "out"))
-        maps, (x0, y0, x1, y1) = found.maps.value, found.object_.value.crop
+        maps, cues, (x0, y0, x1, y1) = found.maps.value, found.cues.value, found.object_.value.crop
     by = round(mask.shape[0] / found.radiance.value.value.shape[1])
     error = np.full(mask[::by, ::by].shape, _MISSED_DEG)
     there = truth[::by, ::by][y0:y1, x0:x1]
@@ -96,7 +97,15 @@ def scored(folder: Path, angles: list[str], name: str, network: Network | None) 
     inside = mask[::by, ::by]
     figures = {"mean": float(error[inside].mean()), "median": float(np.median(error[inside]))}
     figures |= {f"within {limit:g}°": float((error[inside] < limit).mean()) for limit in _LIMITS_DEG}
-    return figures | {"covered": float(covered[inside].mean())}
+    return figures | {"covered": float(covered[inside].mean()), "as a body": as_a_body(cues, there)}
+
+
+def as_a_body(cues: Cues, normal: Floats) -> float:
+    """Mean cos 2(AoLP − azimuth) where DoLP and tilt show: 1 light from inside a body, −1 mirrored from around it."""
+    use = cues.mask & (cues.dolp > _LEAST_DOLP) & (np.hypot(normal[..., 0], normal[..., 1]) > _LEAST_TILT)
+    turned = 2 * np.arctan2(normal[..., 1], normal[..., 0])[use]
+    cos, sin = cues.normalized_stokes[:, use]
+    return float((cos * np.cos(turned) + sin * np.sin(turned)).mean()) if use.any() else 0.0
 
 
 def _mask(file: Path) -> NDArray[np.bool_]:
@@ -118,5 +127,9 @@ def _page(folder: Path, rows: dict[str, dict[str, Score]], table: dict[str, Scor
     lines += [
         f"| {name} | " + " | ".join(f"{figures[row]:.3g}" for row in _ROWS) + " |" for name, figures in summary.items()
     ]
-    lines += ["", f"Degrees over the mask that is given; a pixel without a normal counts as {_MISSED_DEG:g}°."]
+    lines += ["", f"Degrees over the mask that is given; a pixel without a normal counts as {_MISSED_DEG:g}°.", ""]
+    lines += [
+        "`as a body`: mean cos 2(AoLP − azimuth of the given normals). 1 is light from inside the body, as under a "
+        "flash by the lens; below 0 most of it is mirrored from around, under light that polcap's inversion is not for."
+    ]
     return "\n".join(lines) + "\n"

@@ -257,7 +257,7 @@ def test_four_angles_are_not_asked_of_who_has_shot_four(good: SimpleNamespace) -
         gains = replace(of.gains, source="object", sigma=np.full_like(of.gains.sigma, 0.2))
         doubtful = judged(changed(of, gains=gains))
         assert ("four angles" in doubtful["gain doubt"].remedy) == asked
-        assert doubtful["normal error"].value == 90  # no error is larger
+        assert doubtful["gain doubt"].cost_deg == doubtful["normal error"].value == 90  # no error is larger
 
 
 def test_a_passing_mask_tells_its_figure(good: SimpleNamespace) -> None:
