@@ -14,8 +14,8 @@ from polcap.stages.surface.pixel_grid import PixelGrid
 
 _PART = 0.002  # of the object's pixels: smaller parts are specks
 _LEAST = 10.0  # percentile of the jumps along a border that stands for the least
-_ALIKE = 0.04  # by which jumps differ from it on a stretch where parts touch, over the object's radius
-_STRETCH = 0.4  # links of such a stretch, over the object's radius
+_ALIKE = 0.04  # by which jumps differ on a stretch where parts touch, over the object's radius
+_STRETCH = 0.43  # links of such a stretch, over the object's radius
 
 
 def contacts(grid: PixelGrid, apart: Bools, excess: Floats, radius: float) -> Bools:
@@ -42,10 +42,19 @@ def contacts(grid: PixelGrid, apart: Bools, excess: Floats, radius: float) -> Bo
     for number in np.unique(pair):
         at = np.flatnonzero(pair == number)
         before = jump[at] * np.sign(np.median(jump[at]))
-        alike = np.abs(before - np.percentile(before, _LEAST)) < _ALIKE * radius
-        if alike.sum() > _STRETCH * radius:
-            touch[border[at[alike]]] = True
+        middle, count = _most_alike(before, _ALIKE * radius)
+        if count > _STRETCH * radius:
+            touch[border[at[np.abs(before - middle) < _ALIKE * radius]]] = True
     return touch
+
+
+def _most_alike(jump: Floats, width: float) -> tuple[float, int]:
+    """Middle and count of the most jumps (B,) within so much of one another, about the least."""
+    low = np.sort(jump)
+    count = np.searchsorted(low, low + width, side="right") - np.arange(len(low))
+    count[low > np.percentile(low, _LEAST) + width] = 0
+    most = int(np.argmax(count))
+    return float(low[most] + width / 2), int(count[most])
 
 
 def _parts(grid: PixelGrid, together: Bools) -> NDArray[np.int64]:
