@@ -231,9 +231,11 @@ def center(vertices: Floats) -> Floats:
 
 def is_open(faces: NDArray[np.int32]) -> bool:
     """Whether some edge of faces (F, 3) belongs to one triangle only: the surface has a back that can be seen."""
-    ends = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
-    _, count = np.unique(ends[:, 0] * (int(faces.max()) + 1) + ends[:, 1], return_counts=True)
-    return bool((count == 1).any())
+    start, end = faces.astype(np.int64).T.ravel(), faces[:, [1, 2, 0]].T.ravel()
+    edge = np.minimum(start, end) * (int(faces.max()) + 1) + np.maximum(start, end)
+    edge.sort()
+    new = np.concatenate([[True], edge[1:] != edge[:-1], [True]])
+    return bool((new[1:] & new[:-1]).any())  # an edge unlike the one before and the one after it
 
 
 class _Blob:

