@@ -122,11 +122,14 @@ def _shifted(plane: Floats, by: Floats, size: tuple[int, int]) -> Floats:
     """
     whole = np.floor(by).astype(int)
     across, down = (_kernel(float(share)) for share in by - whole)
+    filtered = cv2.sepFilter2D(plane, cv2.CV_32F, across, down, borderType=cv2.BORDER_REPLICATE)
+    (x, y), (width, height) = (int(start) for start in whole), size
+    if x >= 0 and y >= 0 and x + width <= plane.shape[1] and y + height <= plane.shape[0]:
+        return np.asarray(filtered[y : y + height, x : x + width])
     rows, columns = (
         np.clip(np.arange(start, start + length), 0, last)
-        for start, length, last in ((whole[1], size[1], plane.shape[0] - 1), (whole[0], size[0], plane.shape[1] - 1))
+        for start, length, last in ((y, height, plane.shape[0] - 1), (x, width, plane.shape[1] - 1))
     )
-    filtered = cv2.sepFilter2D(plane, cv2.CV_32F, across, down, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(filtered[np.ix_(rows, columns)])
 
 

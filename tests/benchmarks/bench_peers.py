@@ -204,10 +204,18 @@ def solving(stack: AngleStack) -> Iterator[Row]:
     moved = still.copy()
     moved[1:, :2, 2] = 0.4, -0.7
     cost = least(theirs)
-    for name, transform in (("in place", still), ("resampled", moved)):
-        at = Alignment(transform, np.zeros(shots), np.ones(shots))
-        ours = least(lambda at=at: stokes.solve(stack, at, gains, whole, stokes.Settings()))  # type: ignore[misc]
-        yield Row(f"Stokes, {name}", "polanalyser", ours, cost, "ours with covariance and quality bits")
+    as_given = replace(stack, site_px=None)  # as theirs has it: a superpixel's colors are taken as seen in its middle
+    for name, given, transform in (
+        ("nothing resampled", as_given, still),
+        ("colors laid over one another", stack, still),
+        ("every shot resampled", stack, moved),
+    ):
+        solve = partial(_solved, given, Alignment(transform, np.zeros(shots), np.ones(shots)), gains, whole)
+        yield Row(f"Stokes, {name}", "polanalyser", least(solve), cost, "ours with covariance and quality bits")
+
+
+def _solved(stack: AngleStack, at: Alignment, gains: Gains, object_: ObjectMask) -> None:
+    stokes.solve(stack, at, gains, object_, stokes.Settings())
 
 
 def integrating() -> Iterator[Row]:

@@ -33,7 +33,10 @@ from polcap.stages import stage
 _MOST_CONDITION = 50.0  # of three angles 12° apart, where S1 has 26 times the noise of a shot; 0, 45, 90° have 2.4
 _METAL_DOLP, _METAL_DEG, _METAL_SIGMA = 0.05, 10.0, 5.0  # of red and blue: DoLP, and how far their AoLPs part; set by
 # hand, beyond what noise and registration do to a dielectric, and not measured on metals
-_ROWS = 64  # of a block whose planes, all shots and channels, fit the cache from resampling to the last bit
+_LEAST_ROWS, _BLOCK = (
+    64,
+    300_000,
+)  # rows and pixels of a block: its planes fit the cache, what it is cut out with is little
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # the rows of a covariance
 
 Flags = list[list[tuple[Quality, Bits]]]  # of every shot
@@ -104,8 +107,9 @@ def solve(
     residual = np.empty(size, np.float32) if len(radiance.angle) > 3 else None
     solved_by = _exact if len(radiance.angle) == 3 else _weighted_least_squares
     flags = [_flagged(shot) for shot in radiance.quality]
-    for top in range(y0, y1, _ROWS):
-        rows = slice(top - y0, min(top + _ROWS, y1) - y0)
+    block = max(_LEAST_ROWS, _BLOCK // max(x1 - x0, 1))
+    for top in range(y0, y1, block):
+        rows = slice(top - y0, min(top + block, y1) - y0)
         value, variance, seen = _registered(radiance, alignment, gains, flags, (x0, top, x1, rows.stop + y0), lens)
         solved, doubt = _undiluted(*solved_by(weights_of, value, variance), radiance.extinction)
         for planes, out in zip((*solved, *doubt), (*stokes, *covariance)):
