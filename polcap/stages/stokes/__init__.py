@@ -57,7 +57,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 5.0
 
 
-@stage(version=4)
+@stage(version=5)
 def solve(
     radiance: AngleStack, alignment: Alignment, gains: Gains, object_: ObjectMask, settings: Settings
 ) -> StokesImage:
