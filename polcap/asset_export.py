@@ -284,7 +284,8 @@ class _Job:
 
     @property
     def stem(self) -> str:
-        return self.preset.name.format(self.name)
+        """The asset's name, spelled as those of the textures beside it."""
+        return self.preset.name.format(obj.stem(self.name) if self.preset.textures else self.name)
 
     @property
     def files(self) -> dict[Key, str]:

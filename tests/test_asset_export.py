@@ -69,6 +69,19 @@ def test_unreal_gets_green_down_and_unity_smoothness(exported: Path) -> None:
     assert np.array_equal(mask[..., 3], 255 - packed[..., 1]) and mask[..., 0].max() == 0
 
 
+def test_an_asset_and_the_textures_beside_it_are_spelled_alike(result: Path, tmp_path: Path) -> None:
+    from polcap import pipeline
+    from polcap.asset_export import Wanted
+
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work", "asset"))
+    about = json.loads((copy / "report.json").read_text())
+    about["capture"]["name"] = "blue jug 7"
+    (copy / "report.json").write_text(json.dumps(about))
+    named = {file.name for file in pipeline.export(copy, Wanted(preset="unreal", texture_size=64))}
+    assert {"SM_blue_jug_7.glb", "T_blue_jug_7_N.png"} <= named and not any(" " in name for name in named)
+
+
 def test_sidecar_knows_photographs_settings_and_files(exported: Path) -> None:
     told = json.loads((exported / "asset" / "archive" / "capture.provenance.json").read_text())
     about = json.loads((exported / "report.json").read_text())
@@ -223,7 +236,7 @@ def test_usd_without_its_package_is_one_line_with_the_remedy(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pxr", None)
     done = polcap("export", result, "--usd")
-    assert done.returncode == 2 and "pip install usd-core" in done.stderr and done.stderr.count("\n") == 1
+    assert done.returncode == 2 and "pip install 'polcap[usd]'" in done.stderr and done.stderr.count("\n") == 1
 
 
 def test_number_of_threads_changes_no_byte(example: Path, tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ def test_a_cut_file_and_a_text_are_faults(example: Path, tmp_path: Path) -> None
     whole = sorted(example.rglob("*.DNG"))[0].read_bytes()
     (tmp_path / "cut.dng").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "notes.txt").write_text("f/11")
-    for name in ("cut.dng", "notes.txt"):
+    for name in ("cut.dng", "notes.txt", "."):
         assert any(one.state == "fault" and one.remedy for one in told(tmp_path / name).values())
 
 

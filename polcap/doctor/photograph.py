@@ -18,6 +18,10 @@ _PATTERNS = {0: "R", 1: "G", 2: "B"}
 
 def examine(path: Path) -> Iterator[Finding]:
     """Kind, metadata, decoding, pattern and levels of a file."""
+    if path.is_dir():
+        remedy = "give one photograph; what is in a folder tells `polcap process FOLDER --dry-run`"
+        yield Finding("file", "fault", f"{path} is a folder", remedy)
+        return
     try:
         found = probe.read(path)
     except DecodeError as error:

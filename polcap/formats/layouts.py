@@ -72,10 +72,12 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None) 
         return _folders(folder, sub_folders, angles_deg)
     listing = _list(folder)
     if not listing.pictures:
-        inside = [path.name for path in children(folder) if path.is_dir()]
-        hint = (
-            f"; its sub-folders are {', '.join(inside[:4])}, but polcap looks for pol000, pol045, …" if inside else ""
-        )
+        inside = [path for path in children(folder) if path.is_dir()]
+        named, hint = ", ".join(path.name for path in inside[:4]), ""
+        if any(_pol_folders(path) for path in inside):
+            hint = f"; its sub-folders {named} hold captures: give one of them, or `polcap batch` the folder of all"
+        elif inside:
+            hint = f"; its sub-folders are {named}, but polcap looks for pol000, pol045, …"
         raise CaptureError(f"{folder}: holds no photograph that polcap reads{hint}")
     if stated.sensor or _is_sensor(listing.pictures, angles_deg):
         return _sensor(listing, angles_deg)

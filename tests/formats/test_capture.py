@@ -154,6 +154,12 @@ def test_the_folder_of_one_angle_is_no_capture(tmp_path):
         capture.read(tmp_path / "pol045")
 
 
+def test_a_folder_of_captures_is_told_so(tmp_path):
+    folders(tmp_path / "krug")
+    with pytest.raises(CaptureError, match="sub-folders krug hold captures: give one of them, or `polcap batch`"):
+        capture.read(tmp_path)
+
+
 def test_untimed_brackets_in_one_folder_are_to_be_sorted(tmp_path):
     """No order of angles tells them apart: none is asked for."""
     folder = pictures(tmp_path, [f"krug_{angle}_grad_{number}.png" for angle in (0, 45, 90) for number in range(3)])
