@@ -66,3 +66,23 @@ def test_a_damaged_memory_makes_all_again(file: Path, tmp_path: Path) -> None:
     assert not Written(tmp_path, "1").untouched()
     make(Written(tmp_path, "1"), file, ["key", np.arange(3)], "again")
     assert file.read_text() == "again"
+
+
+def test_files_stand_together_where_all_are_as_they_were_left(file: Path, tmp_path: Path) -> None:
+    other = tmp_path / "maps" / "b.txt"
+    other.write_text("beside")
+    written = Written(tmp_path, "1")
+    make(written, file, ["key", np.arange(3)], "again")
+    written.note(other, "source")
+    written.remember()
+    assert not Written(tmp_path, "1").stand([other, file], "another source")
+    assert not Written(tmp_path, "2").stand([other, file], "source")
+    assert not Written(tmp_path, "1", anew=True).stand([other, file], "source")
+    taken = Written(tmp_path, "1")
+    assert taken.stand([other, file], "source")
+    taken.remember()  # what each was made from goes on
+    assert Written(tmp_path, "1").stand([other, file], "source")
+    make(Written(tmp_path, "1"), file, ["key", np.arange(3)], "again")
+    assert file.read_text() == "first"
+    file.unlink()
+    assert not Written(tmp_path, "1").stand([other, file], "source")
