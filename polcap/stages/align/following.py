@@ -16,7 +16,7 @@ from polcap.optics.robust import BIWEIGHT, MAD_TO_SIGMA
 from polcap.optics.warp import Spline, Taps, coordinates, warp
 
 _ALIASING_PX2 = 0.05**2  # variance of an edge's place between two samplings of it
-_FLOOR_PX = 0.02  # error that aliasing leaves whatever the noise: the bundled capture's is .016 and .027 (decision 19)
+_FLOOR_PX = 0.02  # error that aliasing leaves whatever the noise: the bundled capture's is .026 and .025 (decision 19)
 _MOST_POINTS = 2e4  # of a picture tell of a movement; more, evenly thinned, tell no more (decision 19)
 _MEDIAN_OF = 5000  # points: knows a median to 2 %
 _SETTLED_PX, _NEAR_PX = 0.004, 0.03  # a step that moves no corner by more is the last; at coarse scales
