@@ -9,7 +9,7 @@ hand back camera-frame maps.
     body_light     albedo in highlights, where a crossed shot shows what lies under them
     learned        the network, joined with the inversion
     fine           relief that the network is shown too small to see
-        augmentation   the network's mean over turned and mirrored pictures
+        augmentation   the network's answers to turned and mirrored pictures, made one
 """
 
 from typing import Annotated, Literal
@@ -28,14 +28,14 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ior: Annotated[float, Meta(ge=1.2, le=2.5, description="refractive index assumed by the analytic estimator")] = 1.5
     symmetries: Annotated[
         Literal[1, 2, 4, 8],
-        Meta(description="turned and mirrored positions in which the network sees the object; their mean is taken"),
+        Meta(description="turned and mirrored positions in which the network sees the object; answers are joined"),
     ] = 4
     fine: Annotated[bool, Meta(description="a second network adds relief that the first is shown too small to see")] = (
         True
     )
 
 
-@stage(version=12)
+@stage(version=13)
 def estimate(cues: Cues, network: Network | None, settings: Settings) -> SurfaceMaps:
     """Normal, diffuse, specular, roughness and expected error; network None means analytic.
 

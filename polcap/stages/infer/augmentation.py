@@ -1,4 +1,4 @@
-"""Test-time augmentation: the network's answer as the mean over symmetries of the square.
+"""Test-time augmentation: what the network's answers from the symmetries of the square say together.
 
 A turn or mirror of the picture is one of the scene: polarization turns twice as fast, rays with it.
 """
@@ -14,29 +14,60 @@ _OUTPUTS = {"normal": 3, "depth": 1, "diffuse": 3, "specular": 3, "roughness": 1
 _POSITIONS = tuple(
     (quarters, mirror) for first in (0, 1) for mirror in (False, True) for quarters in (first, first + 2)
 )
+_STEPS = 4  # of the median's iteration
+_LEAST_ERROR = 0.5  # degrees
+_NEAREST = 0.05  # between unit vectors, about 3°: what is nearer weighs no more
 
 
-def mean(cues: Cues, network: Network, symmetries: int) -> dict[str, Floats]:
-    """The network's maps (H, W[, 3]) of the whole object, normals in the camera frame, means over several positions.
+def combined(cues: Cues, network: Network, symmetries: int) -> dict[str, Floats]:
+    """The network's maps (H, W[, 3]) of the whole object seen from several positions; normals in the camera frame.
 
-    A turn or mirror of the picture is one of the scene: polarization turns twice as fast, rays with it.
+    Normals are the median of the positions' directions, weighed by their stated errors: where they part it is often
+    by half a turn, and the mean of both is neither. All other maps are means.
     """
-    picture, rays = np.moveaxis(channels(cues), 0, -1), cues.rays
-    total: dict[str, Floats] = {}
-    for quarters, mirror in _POSITIONS[:symmetries]:
-        turned = _turn(picture, quarters, mirror)
-        maps = _run(np.moveaxis(_turn_channels(turned, quarters, mirror), -1, 0), network)
-        own = np.array(_turn(rays, quarters, mirror))
-        own[..., :2] = _turn_vectors(own[..., :2], quarters, mirror)
-        maps["normal"] = np.array(frames.from_ray_frame(maps["normal"], own))
-        for name, image in maps.items():
-            back = np.rot90(image, -quarters)
-            back = back[:, ::-1] if mirror else back
-            if name == "normal":
-                upright = _turn_vectors(back[..., :2], -quarters, False) * [-1.0 if mirror else 1.0, 1.0]
-                back = np.concatenate([upright, back[..., 2:]], axis=-1)
-            total[name] = total.get(name, 0) + np.asarray(back, np.float32) / symmetries
-    return total
+    picture = np.moveaxis(channels(cues), 0, -1)
+    answers = [_answer(picture, cues.rays, network, *position) for position in _POSITIONS[:symmetries]]
+    maps = {name: np.asarray(np.mean([maps[name] for maps in answers], axis=0), np.float32) for name in _OUTPUTS}
+    normals, errors = (np.stack([maps[name] for maps in answers]) for name in ("normal", "sigma"))
+    return maps | {"normal": _median(normals, errors)}
+
+
+def _answer(picture: Floats, rays: Floats, network: Network, quarters: int, mirror: bool) -> dict[str, Floats]:
+    """The network's maps of channels (H, W, N) that it sees turned, turned back."""
+    maps = _run(np.moveaxis(_turn_channels(_turn(picture, quarters, mirror), quarters, mirror), -1, 0), network)
+    own = np.array(_turn(rays, quarters, mirror))
+    own[..., :2] = _turn_vectors(own[..., :2], quarters, mirror)
+    maps["normal"] = np.array(frames.from_ray_frame(maps["normal"], own))
+    for name, image in maps.items():
+        back = np.rot90(image, -quarters)
+        back = back[:, ::-1] if mirror else back
+        if name == "normal":
+            upright = _turn_vectors(back[..., :2], -quarters, False) * [-1.0 if mirror else 1.0, 1.0]
+            back = np.concatenate([upright, back[..., 2:]], axis=-1)
+        maps[name] = np.asarray(back, np.float32)
+    return maps
+
+
+def _median(normals: Floats, errors: Floats) -> Floats:
+    """Direction (H, W, 3) with the least sum of distances from K normals (K, H, W, 3), each over its error (K, H, W).
+
+    Weiszfeld's iteration: a mean weighed by the reciprocal of the distances from the one before. At most 1 long,
+    shorter where the directions part.
+    """
+    directions = normals / np.maximum(frames.dot(normals, normals) ** 0.5, 1e-6)[..., None]
+    trust = 1 / np.maximum(errors, _LEAST_ERROR)
+    weights = trust
+    for _ in range(_STEPS):
+        middle = _weighed(directions, weights)
+        middle /= np.maximum(frames.dot(middle, middle) ** 0.5, 1e-6)[..., None]
+        apart = directions - middle
+        weights = trust / np.maximum(frames.dot(apart, apart) ** 0.5, _NEAREST)
+    return _weighed(directions, weights)
+
+
+def _weighed(directions: Floats, weights: Floats) -> Floats:
+    """Mean (H, W, 3) of directions (K, H, W, 3) with weights (K, H, W)."""
+    return np.asarray((weights[..., None] * directions).sum(axis=0) / weights.sum(axis=0)[..., None], np.float32)
 
 
 def _turn(image: Floats, quarters: int, mirror: bool) -> Floats:

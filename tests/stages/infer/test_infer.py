@@ -286,7 +286,7 @@ def test_averaged_over_turns_a_turned_object_gets_the_turned_maps(quarters: int,
         },
     )  # fmt: skip
     moved.rays[..., :2] = augmentation._turn_vectors(moved.rays[..., :2], quarters, mirror)
-    whole, turned = (augmentation.mean(c, lopsided(), 8) for c in (found, moved))
+    whole, turned = (augmentation.combined(c, lopsided(), 8) for c in (found, moved))
     np.testing.assert_allclose(turned["depth"], augmentation._turn(whole["depth"], quarters, mirror), atol=1e-4)
     expected = np.array(augmentation._turn(whole["normal"], quarters, mirror))
     expected[..., :2] = augmentation._turn_vectors(expected[..., :2], quarters, mirror)
