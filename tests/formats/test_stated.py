@@ -14,7 +14,7 @@ from polcap.synth.shooting import Shoot
     ("given", "kind", "words"),
     [
         ({"focal_lenght_mm": 50}, CaptureFile, "focal_lenght_mm: there is no such key; did you mean focal_length_mm?"),
-        ({"rotator": {"modell": ""}}, CaptureFile, "rotator.modell: there is no such key; did you mean model?"),
+        ({"rotator": {"modle": ""}}, CaptureFile, "rotator.modle: there is no such key; did you mean model?"),
         ({"rotator": {"x": 1}}, CaptureFile, "rotator.x: there is no such key; there are model, log"),
         (
             {"frame": [{"file": "a", "angel": 0}]},
