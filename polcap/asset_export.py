@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from polcap.config import restored
 from polcap.errors import DecodeError, SettingError
@@ -98,17 +97,18 @@ def export(
     usual = made is not None and wanted == Wanted()
     if usual and (stood := _described(out / "asset", about, source, standing)):
         return stood
-    earlier, whole = _earlier(out / "asset", source)
+    earlier, whole = _earlier(out / "asset", source, standing)
     encoder = Encoder()
     if earlier is None:
         built = assembled(maps.value, settings)
     else:
         built = earlier.asset
         if not whole:
-            built = asset.joined(built.mesh, built.normal, asset.colors(maps.value.maps, settings.asset))
+            albedo = maps.value.maps if made is None else maps_folder.albedo_as_read(made.maps.value)
+            built = asset.at_index(built, albedo, settings.asset)
         before = gltf.textures(earlier.asset)
         for key, texture in gltf.textures(built).items():
-            if whole or np.array_equal(texture.pixels, before[key].pixels):
+            if whole or texture.pixels is before[key].pixels:
                 encoder.know(texture, "png", earlier.pngs[key])
     lods, levels = [], []
     if wanted.lod:
@@ -183,10 +183,10 @@ def _described(folder: Path, about: Mapping[str, Any], source: _Source, standing
     return [*written, sidecar]
 
 
-def _earlier(folder: Path, source: _Source) -> tuple[glb_reader.Stored | None, bool]:
+def _earlier(folder: Path, source: _Source, standing: Written) -> tuple[glb_reader.Stored | None, bool]:
     """What an export in asset/ or one of its folders holds, where the mesh in it was made from `source`, or None.
 
-    And whether its colors were made from it, too.
+    And whether its colors were made from it, too: of the same maps, they differ in the refractive index alone.
     """
     found: tuple[glb_reader.Stored | None, bool] = (None, False)
     for sidecar in sorted([*folder.glob(f"*{_SIDECAR}"), *folder.glob(f"*/*{_SIDECAR}")]):
@@ -196,7 +196,8 @@ def _earlier(folder: Path, source: _Source) -> tuple[glb_reader.Stored | None, b
             made_from = msgspec.convert(told["made_from"], _Source)
             whole = made_from == source
             if whole or (made_from.mesh == source.mesh and found[0] is None):
-                found = glb_reader.read(glb, told["files"][glb.name]), whole
+                ours = standing.stand([glb], told["made_from"])
+                found = glb_reader.read(glb, told["files"][glb.name], ours), whole
         except (OSError, ValueError, LookupError, TypeError, DecodeError):
             continue  # of another program, or touched since: as if it were not there
         if found[1]:

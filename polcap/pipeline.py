@@ -242,11 +242,9 @@ class _Counted:
 
 def _kept(out: Path, anew: bool) -> tuple[Written, Remembered]:
     """What an earlier run wrote and measured; nothing where it is not clear whether this program did."""
-    try:
-        program = unchanged.program()
-    except (OSError, unchanged.InDoubt):
-        program, anew = "", True
-    return Written(out, program, anew), Remembered(out, program, anew)
+    program = unchanged.known_program()
+    anew = anew or program is None
+    return Written(out, program or "", anew), Remembered(out, program or "", anew)
 
 
 def _written_before(

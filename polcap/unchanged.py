@@ -7,20 +7,18 @@ the program differs in any of them the keys of `store.py` decide. So a run that 
 import json
 import os
 import sys
-import time
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from polcap.formats import atomic, provenance, text_file
+from polcap.formats import atomic, file_stat, provenance, text_file
 
 _FILE = "unchanged.json"
 _OF_A_RUN = ("lock", "owner", _FILE)  # in work/: they differ from run to run
-_SETTLED_NS = 3_000_000_000  # a file system's clock may have steps of 2 s; in one step a file may change twice
 _PACKAGE = Path(__file__).parent
-Stats = dict[str, list[int]]
+Stats = dict[str, file_stat.Stat]
 
 
 class Finished(NamedTuple):
@@ -38,9 +36,9 @@ class InDoubt(Exception):
 def fingerprint(asked: Mapping[str, Any], capture: Path, out: Path, given: Iterable[Path]) -> str | None:
     """Digest of a request: options, program, photographs and the `given` files by size and time; None if in doubt."""
     try:
-        photographs, files = _folder(capture, out), {str(file.absolute()): _stat(file) for file in given}
+        photographs, files = _folder(capture, out), {str(file.absolute()): file_stat.of(file) for file in given}
         newest = max((stat[1] for stat in [*photographs.values(), *files.values()]), default=0)
-        if newest > time.time_ns() - _SETTLED_NS:
+        if not file_stat.is_settled(newest):
             return None
         places = [os.path.realpath(capture), os.path.realpath(out)]
         return _digest([dict(asked), places, photographs, files, program()])
@@ -60,6 +58,14 @@ def program() -> str:
         It cannot be listed.
     """
     return _digest([sys.version, provenance.versions(), _folder(_PACKAGE), _folder(_PACKAGE.parent / "calib")])
+
+
+def known_program() -> str | None:
+    """The same; None where it is in doubt."""
+    try:
+        return program()
+    except (OSError, InDoubt):
+        return None
 
 
 def find(out: Path, request: str | None) -> Finished | None:
@@ -103,7 +109,7 @@ def _result(out: Path) -> Stats:
 def _folder(folder: Path, but: Path | None = None) -> Stats:
     """Size and times of every file below a folder, without what lies in `but`; empty where there is none."""
     aside = None if but is None else os.path.realpath(but)
-    return {os.path.relpath(file, folder): _stat(file) for file in _files(str(folder), aside)}
+    return {os.path.relpath(file, folder): file_stat.of(file) for file in _files(str(folder), aside)}
 
 
 def _files(folder: str, aside: str | None) -> Iterator[str]:
@@ -116,9 +122,3 @@ def _files(folder: str, aside: str | None) -> Iterator[str]:
 
 def _same(place: str, aside: str | None) -> bool:
     return aside is not None and os.path.realpath(place) == aside
-
-
-def _stat(file: str | Path) -> list[int]:
-    """Size, time of the content, time of the last change of any kind, and which file it is."""
-    about = os.stat(file)
-    return [about.st_size, about.st_mtime_ns, about.st_ctime_ns, about.st_ino]

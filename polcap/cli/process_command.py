@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
     from polcap.config import Config
+    from polcap.formats.probed import Probed
     from polcap.images import Capture, ChartRequest
     from polcap.path import UserInput
     from polcap.unchanged import Finished
@@ -62,7 +63,9 @@ def process(
         return
     resource_limits.set_threads(threads)  # before the libraries that start them
     beside = ThreadPoolExecutor(1)
-    first = beside.submit(_understood, capture, options.angles_deg(angles))  # in the child, while all else is imported
+    look = cache(partial(_look, target, force is not None))
+    # in the child, or from memory, while all else is imported
+    first = beside.submit(_understood, capture, options.angles_deg(angles), look)
     beside.shutdown(wait=False)
     from polcap import config as settings
     from polcap.path import STAGES
@@ -81,6 +84,7 @@ def process(
         force,
         json,
         request,
+        look,
         [] if watch else [first],
     )
     if watch:
@@ -104,6 +108,7 @@ class _Run:
     force: str | None
     json: bool
     request: str | None  # its digest, to know it again; None where it is always done
+    look: "Callable[[], Probed]"  # opens what is remembered of the photographs, when it is first called
     begun: "list[Future[Capture]]"  # a reading of the photographs that is under way
 
     def plan(self) -> None:
@@ -121,7 +126,7 @@ class _Run:
 
     def understood(self) -> "Capture":
         """The photographs as they are now."""
-        return self.begun.pop().result() if self.begun else _understood(self.folder, self.angles_deg)
+        return self.begun.pop().result() if self.begun else _understood(self.folder, self.angles_deg, self.look)
 
     def process(self) -> None:
         """Write the result folder; say where, and what its gates judge."""
@@ -137,6 +142,7 @@ class _Run:
             about = pipeline.process(
                 found, supplied, self.config, self.target, self.until, self.force, bar.stage, bar.frame
             )
+        self.look().remember()
         if about is None:
             work = str(self.target / "work")
             terminal.say({"until": self.until, "work": work} if self.json else work)
@@ -145,10 +151,18 @@ class _Run:
         _tell_result(about, self.target, self.json)
 
 
-def _understood(folder: Path, angles_deg: tuple[float, ...] | None) -> "Capture":
+def _look(target: Path, anew: bool) -> "Probed":
+    from polcap import unchanged
+    from polcap.formats.probed import Probed
+
+    program = None if anew else unchanged.known_program()
+    return Probed() if program is None else Probed(target / "work" / "photographs.json", program)
+
+
+def _understood(folder: Path, angles_deg: tuple[float, ...] | None, look: "Callable[[], Probed]") -> "Capture":
     from polcap.formats import capture as captures
 
-    return captures.read(folder, angles_deg)
+    return captures.read(folder, angles_deg, look())
 
 
 def _user_input(

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from polcap.errors import CaptureError
-from polcap.formats import calibrations, capture_toml, file_name, focal, layouts, photo, raw
+from polcap.formats import calibrations, capture_toml, file_name, focal, layouts, photo, probe, raw
 from polcap.formats.capture_toml import CaptureFile
 from polcap.formats.layouts import Source
 from polcap.images import Capture, Exif, Frame, SensorImage, Shot
@@ -19,12 +19,12 @@ LOSS = ": normals and albedo lose accuracy against RAW"
 Loader = Callable[[], SensorImage]
 
 
-def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Capture:
+def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, look: layouts.Look = probe.read) -> Capture:
     """Understand a capture folder: pol000/ pol045/ …, capture.toml, flat, or polarization-sensor frames.
 
     Every file's metadata and bytes are read, no pixel is decoded. `angles_deg` is the order of
     the brackets of a flat folder (0, 45, 90 by default); elsewhere it picks from the angles that
-    the folder states, the first being the reference.
+    the folder states, the first being the reference. `look` reads a file, or remembers what it told.
 
     Raises
     ------
@@ -41,7 +41,7 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
     stated = capture_toml.load(folder)
     if angles_deg is not None:
         _check_angles(folder, angles_deg, "--angles names")
-    plan = layouts.plan(folder, stated, angles_deg)
+    plan = layouts.plan(folder, stated, angles_deg, look)
     _check_angles(folder, [angle for angle, _ in plan.shots], "the shots' angles are")
 
     used: dict[Path, Source] = {}
@@ -167,14 +167,14 @@ def _frame(plan: layouts.Plan, stated: CaptureFile, source: Source, angle_deg: f
 
 def _loader(source: Source, stated: CaptureFile, mosaic_deg: float | None) -> tuple[Loader, list[str]]:
     """How to read a frame, and whatever beside the file's bytes decides its values."""
-    path, probe = source.path, source.probe
+    path, told = source.path, source.probe
     manner = [f"{stated.white:g}"] if stated.white else []
     manner += [f"-{stated.black:g}"] if stated.black else []
-    levels = (stated.white, stated.black, probe.digest)
+    levels = (stated.white, stated.black, told.digest)
     if mosaic_deg is not None:
-        return partial(photo.read_mosaic, path, mosaic_deg, *levels, probe.kind), [f"sensor {mosaic_deg:g}", *manner]
-    if probe.kind == "raw":
-        return partial(raw.read, path, probe.digest), []
+        return partial(photo.read_mosaic, path, mosaic_deg, *levels, told.kind), [f"sensor {mosaic_deg:g}", *manner]
+    if told.kind == "raw":
+        return partial(raw.read, path, told.digest), []
     return partial(photo.read, path, stated.encoding, *levels), [stated.encoding or "default", *manner]
 
 

@@ -12,8 +12,6 @@ from dataclasses import replace
 from datetime import datetime
 from typing import Any
 
-import exifread
-
 from polcap.images import Exif
 
 _D65_FIRST = (21, 20, 22, 23, 1, 4, 9, 10, 11, 12, 13, 14, 15)  # EXIF LightSource, the daylights
@@ -46,6 +44,8 @@ def sized(stated: Exif, width: int, height: int) -> Exif:
 
 def _found(data: bytes) -> dict[str, Any]:
     """The tags by name, those of the first directory as "Image …"."""
+    import exifread  # 50 ms that only the process that reads files spends
+
     found: dict[str, Any] = {}
     for prefix, part in _parts(io.BytesIO(data)):
         try:

@@ -6,7 +6,7 @@ Nothing is decoded here; `capture.py` checks and builds the `Capture`.
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -27,6 +27,7 @@ EQUAL_STOPS = 0.15  # EXIF rounds times to a sixth of a stop at worst
 _POL_FOLDER = re.compile(r"pol[ _-]?(\d+(?:\.\d+)?)", re.IGNORECASE)
 _CROSS_FOLDER = re.compile(r"cross(?:[ _-]?(\d+(?:\.\d+)?))?", re.IGNORECASE)
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
+Look = Callable[[Path], Probe]  # `probe.read`, or one that remembers
 
 
 @dataclass(frozen=True)
@@ -57,20 +58,32 @@ class _Listing:
     notes: list[str] = field(default_factory=list)
 
 
-def plan(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None) -> Plan:
+def plan(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None, look: Look = probe.read) -> Plan:
     """Understand a folder.
 
-    `angles_deg` is the order of a flat folder; where folders, names or capture.toml give the
-    angles, it says which of them to use, the first being the reference.
+    Parameters
+    ----------
+    folder
+        Of the capture.
+    stated
+        Its capture.toml.
+    angles_deg
+        The order of a flat folder; where folders, names or capture.toml give the angles, which of them to use, the
+        first being the reference.
+    look
+        Reads what a file tells.
 
-    Raises CaptureError.
+    Raises
+    ------
+    CaptureError
+        The folder and its names do not add up.
     """
     if stated.frame:
-        return _toml(folder, stated, angles_deg)
+        return _toml(folder, stated, angles_deg, look)
     sub_folders = _pol_folders(folder)
     if sub_folders:
-        return _folders(folder, sub_folders, angles_deg)
-    listing = _list(folder)
+        return _folders(folder, sub_folders, angles_deg, look)
+    listing = _list(folder, look)
     if not listing.pictures:
         inside = [path for path in children(folder) if path.is_dir()]
         named, hint = ", ".join(path.name for path in inside[:4]), ""
@@ -99,7 +112,7 @@ def looks_like_a_capture(folder: Path, inside: Iterable[str], files: Iterable[st
     return any(probe.kind(folder / name) in ("raw", "photo") for name in sorted(files) if not name.startswith("."))
 
 
-def _toml(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None) -> Plan:
+def _toml(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None, look: Look) -> Plan:
     sources = []
     for entry in stated.frame:
         path = folder / entry.file
@@ -109,7 +122,7 @@ def _toml(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None)
             raise CaptureError(f"{folder / capture_toml.NAME}: {entry.file} lies outside the folder; move it inside")
         if not path.is_file():
             raise CaptureError(f"{folder / capture_toml.NAME}: {entry.file} is not there; correct or remove its entry")
-        found = _probe(path)
+        found = _probe(path, look)
         if found.kind == "other":
             raise CaptureError(f"{folder / capture_toml.NAME}: {entry.file} is not a photograph; remove its entry")
         sources.append(Source(path, found, entry.role, entry.angle, entry.exposure, entry.flash_energy))
@@ -136,18 +149,18 @@ def _group(sources: Iterable[Source]) -> dict[float, list[Source]]:
     return groups
 
 
-def _folders(folder: Path, sub_folders: dict[float, Path], angles_deg: Sequence[float] | None) -> Plan:
+def _folders(folder: Path, sub_folders: dict[float, Path], angles_deg: Sequence[float] | None, look: Look) -> Plan:
     groups: dict[float, list[Source]] = {}
     notes = []
     for angle, sub_folder in sub_folders.items():
-        listing = _list(sub_folder)
+        listing = _list(sub_folder, look)
         if not listing.pictures:
             raise CaptureError(
                 f"{sub_folder}: holds no photograph that polcap reads; shoot this angle again, or remove the folder"
             )
         groups[angle] = listing.pictures
         notes += [f"{sub_folder.name}: {note}" for note in listing.notes]
-    crossed = _crossed(folder)
+    crossed = _crossed(folder, look)
     beside = sorted(
         path.name
         for path in children(folder)
@@ -159,7 +172,7 @@ def _folders(folder: Path, sub_folders: dict[float, Path], angles_deg: Sequence[
     return Plan("folders", _select(folder, groups, angles_deg), crossed, tuple(notes))
 
 
-def _crossed(folder: Path) -> tuple[Source, ...]:
+def _crossed(folder: Path, look: Look) -> tuple[Source, ...]:
     """The photographs of cross/ or cross045/, whose number is the angle of the filter before the lens."""
     places = [path for path in children(folder) if path.is_dir() and _is_crossed(path.name)]
     if len(places) > 1:
@@ -170,7 +183,7 @@ def _crossed(folder: Path) -> tuple[Source, ...]:
     angle = float(match[1]) if match and match[1] else None
     if angle is not None and angle > 360:
         raise CaptureError(f"{places[0]}: {angle:g}° is not an angle of a polarizer; name it by 0 to 360 degrees")
-    found = tuple(replace(source, role="cross", angle_deg=angle) for source in _list(places[0]).pictures)
+    found = tuple(replace(source, role="cross", angle_deg=angle) for source in _list(places[0], look).pictures)
     if not found:
         raise CaptureError(f"{places[0]}: holds no photograph that polcap reads; shoot it again, or remove the folder")
     return found
@@ -307,10 +320,10 @@ def different(angles_deg: Iterable[float]) -> int:
     return max(sum(gap >= APART_DEG for gap in gaps), 1 if axes else 0)
 
 
-def _list(folder: Path) -> _Listing:
+def _list(folder: Path, look: Look) -> _Listing:
     """The photographs of one folder; where a RAW is there, the finished pictures stand back."""
     listing = _Listing()
-    found = [Source(path, _probe(path)) for path in children(folder) if path.is_file()]
+    found = [Source(path, _probe(path, look)) for path in children(folder) if path.is_file()]
     pictures = [source for source in found if source.probe.kind in ("raw", "photo")]
     raws = [source for source in pictures if source.probe.kind == "raw"]
     if raws and len(raws) < len(pictures):
@@ -325,9 +338,9 @@ def _list(folder: Path) -> _Listing:
     return listing
 
 
-def _probe(path: Path) -> Probe:
-    """As `probe.read`; bytes that nothing can read are an error."""
-    found = probe.read(path)
+def _probe(path: Path, look: Look) -> Probe:
+    """What a file tells; bytes that nothing can read are an error."""
+    found = look(path)
     if found.kind == "unknown":
         raise CaptureError(f"{path}: no picture, no RAW that LibRaw knows and no text; restore it, or remove it")
     return found

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import blake2b
 from pathlib import Path
@@ -182,6 +182,13 @@ def as_read(maps: SurfaceMaps, mesh: Mesh) -> Stored:
         estimator=maps.estimator,
     )
     return Stored(whole, np.where(inside, _depth(maps, mesh), np.nan).astype(np.float32), mesh.metric)
+
+
+def albedo_as_read(maps: SurfaceMaps) -> SurfaceMaps:
+    """The maps with the two albedos and the mask that `read` gives of them; the other fields as they are."""
+    inside = _inside(maps)
+    diffuse, specular = (_half(_kept(values, inside)) for values in (maps.diffuse, maps.specular))
+    return replace(maps, diffuse=diffuse, specular=specular, mask=inside)
 
 
 def _half(values: Floats) -> Floats:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -65,10 +66,16 @@ def write(path: Path, facts: Mapping[str, Any], files: Iterable[Path]) -> None:
     StorageError
         The file cannot be written.
     """
-    digests = {file.name: photo_bytes.digest(file.read_bytes()) for file in sorted(files)}
+    listed = sorted(files)
+    with ThreadPoolExecutor(2) as pool:
+        digests = dict(zip((file.name for file in listed), pool.map(_digest, listed)))
     with atomic.path(path) as temporary:
         text = json.dumps({**facts, "files": digests}, indent=1, ensure_ascii=False)
         temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")  # names of files are bytes
+
+
+def _digest(file: Path) -> str:
+    return photo_bytes.digest(file.read_bytes())
 
 
 def _plain(value: Any) -> str:

@@ -59,22 +59,54 @@ def colors(maps: SurfaceMaps, settings: Settings) -> Colors:
     """The textures that no mesh decides."""
     known = _unmixed(maps.mask)
     specular = np.clip(maps.specular, 0.0, 1.0)
-    entry, _ = fresnel.transmission(np.float64(1.0), settings.ior)
-    base = maps.diffuse * np.float32(entry**2) / (1 - np.minimum(_greatest(specular), 0.99))
-    top = float(specular[maps.mask].max(initial=0.0))
+    greatest = _greatest(specular)
+    top = _top(maps.mask, greatest)
     roughness = _eight_bits(maps.roughness)
     full, none = np.full_like(roughness, 255), np.zeros_like(roughness)
     packed = np.stack([full, roughness, none], axis=-1)
-    parts = [color.srgb_eight_bits(base), packed, color.srgb_eight_bits(specular / max(top, 1e-9))]
+    parts = [
+        _base(maps.diffuse, greatest, settings),
+        packed,
+        color.srgb_eight_bits(specular / max(_top(maps.mask, greatest), 1e-9)),
+    ]
     whole = filled(np.concatenate(parts, axis=-1), known)  # in one go: half the time
     base_color, packed, specular_color = (np.ascontiguousarray(whole[..., k : k + 3]) for k in (0, 3, 6))
     return Colors(
         base_color=base_color,
         occlusion_roughness_metallic=packed,
         specular_color=specular_color,
-        specular_factor=(top / float(fresnel.normal_reflectance(settings.ior)),) * 3,
+        specular_factor=_factor(top, settings),
         ior=settings.ior,
     )
+
+
+def at_index(asset: Asset, maps: SurfaceMaps, settings: Settings) -> Asset:
+    """The asset of the same maps with the refractive index of other settings.
+
+    Only the base color, the factor of the specular texture and the index itself depend on it.
+    """
+    greatest = np.clip(_greatest(maps.specular), 0.0, 1.0)
+    return replace(
+        asset,
+        base_color=filled(_base(maps.diffuse, greatest, settings), _unmixed(maps.mask)),
+        specular_factor=_factor(_top(maps.mask, greatest), settings),
+        ior=settings.ior,
+    )
+
+
+def _base(diffuse: Floats, greatest: Floats, settings: Settings) -> NDArray[np.uint8]:
+    """ρ_d T₊(0)²/(1 − F0), sRGB-encoded, of the greatest F0 (H, W, 1) of each pixel's channels."""
+    entry, _ = fresnel.transmission(np.float64(1.0), settings.ior)
+    return color.srgb_eight_bits(diffuse * np.float32(entry**2) / (1 - np.minimum(greatest, 0.99)))
+
+
+def _top(mask: NDArray[np.bool_], greatest: Floats) -> float:
+    """Greatest F0 on the object."""
+    return float(greatest[mask].max(initial=0.0))
+
+
+def _factor(top: float, settings: Settings) -> tuple[float, float, float]:
+    return (top / float(fresnel.normal_reflectance(settings.ior)),) * 3
 
 
 def normals(maps: SurfaceMaps, mesh: Mesh) -> NDArray[np.uint8]:
