@@ -14,13 +14,17 @@ from numpy.typing import NDArray
 from polcap.formats import plausible, sniff
 
 _LOSSLESS, _LOSSLESS_HUFFMAN, _SCAN = 7, 0xC3, 0xDA  # compression of the TIFF; frame and scan of the JPEG
-_BEFORE = {0xC4, 0xDD, 0xFE, *range(0xE0, 0xF0)}  # of a scan: Huffman tables, restart interval, comment, applications
+_TABLES, _RESTARTS = 0xC4, 0xDD  # Huffman tables, interval of restarts
+_BEFORE = {_TABLES, _RESTARTS, 0xFE, *range(0xE0, 0xF0)}  # of a scan: these, a comment, applications
 _ONE_TO_ONE = 0x11  # sampling of a component
 _SINCE = (1, 1)  # DNG version; before it a difference of 16 bits was coded in another way
 _MOST_HEADER = 64  # segments before the scan
 _PAST_END = 32 * b"\xff\0"  # ones, which are no code: who reads on behind a scan's end decodes differences of 0
+_CATEGORIES = np.frexp(np.abs(np.arange(1 << 16, dtype=np.uint16).astype(np.int16).astype(int)))[1]  # T.81, table H.2
+_ROWS = 256  # whose differences are counted at a time
 
 Counts = NDArray[np.uint16]
+Codes = dict[int, tuple[int, int]]  # of a category of differences: the code, and its length in bits
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,7 @@ class _Scan:
 
     start: int  # bytes from the beginning of the file to the coded differences
     bits: int
-    components: int
+    codes: tuple[Codes, ...]  # of each component; none where the scan has restarts or tables that are not there
 
 
 def counts(structure: sniff.Tiff, data: bytes) -> Counts | None:
@@ -65,8 +69,6 @@ def counts(structure: sniff.Tiff, data: bytes) -> Counts | None:
         if scan is None or part is None:
             return None
         room = mosaic[window.top : window.top + window.height, window.left : window.left + window.width]
-        if room.shape == part.shape and part.flat[-1] == part.flat[-1 - scan.components]:
-            return None  # the scan was too short, which LibRaw tells; or the corner is even
         if len(windows) == 1:
             return part
         room[:] = part[: room.shape[0], : room.shape[1]]
@@ -96,8 +98,76 @@ def _decoded(data: bytes, window: Window, scan: _Scan) -> Counts | None:
         return None
     if part.dtype != np.uint16 or part.size != window.height * window.width or int(part.max()) >> scan.bits:
         return None
+    if not _in_scan(part.reshape(*part.shape[:2], -1), scan, data[scan.start : end].rstrip(b"\xff")):
+        return None  # the scan was too short, which LibRaw tells
     decoded: Counts = part.reshape(window.height, window.width)
     return decoded
+
+
+def _in_scan(samples: Counts, scan: _Scan, coded: bytes) -> bool:
+    """Whether all differences were in a scan, none decoded of what was put behind it.
+
+    The last one's code has to stand at the end. The bits of all are counted where that may be chance: where ones, which
+    are put there, or zeros, which the decoder puts behind them, give the same.
+
+    Parameters
+    ----------
+    samples
+        (h, w, components) as decoded.
+    scan
+        Of the JPEG.
+    coded
+        The coded differences, ones filling up the last byte.
+    """
+    if not scan.codes or b"\xff\xff" in coded:  # filling amid a scan ends it for LibRaw
+        return False
+    difference = int(_differences(samples[-2:, :, -1], scan.bits)[-1, -1])
+    code, length = _coded(difference, scan.codes[-1])
+    tail = int.from_bytes(coded[-32:].replace(b"\xff\0", b"\xff"), "big")
+    ends = [left for left in range(8) if tail & _ones(length + left) == (code << left | _ones(left))]
+    if not ends or not length:
+        return False
+    cuts = [cut for cut in range(1, length) if code & _ones(cut) == _ones(cut)]  # what is missing may have been ones
+    if difference and code and not any(tail & _ones(length - cut) == code >> cut for cut in cuts):
+        return True
+    bits = sum(_bits(samples[..., n], scan.bits, codes) for n, codes in enumerate(scan.codes))
+    return 8 * (len(coded) - coded.count(b"\xff\0")) - bits in ends
+
+
+def _coded(difference: int, codes: Codes) -> tuple[int, int]:
+    """A difference as it is coded, and how many bits that takes; 0 where it has no code.
+
+    References
+    ----------
+    ITU-T T.81, F.1.2.1.1 and H.1.2.2.
+    """
+    signed = difference - (difference >> 15 << 16)
+    category = abs(signed).bit_length()
+    code, length = codes.get(category, (0, 0))
+    if not length or category == 16:
+        return code, length
+    return code << category | (signed if signed > 0 else signed + _ones(category)), length + category
+
+
+def _ones(many: int) -> int:
+    return (1 << many) - 1
+
+
+def _bits(samples: Counts, bits: int, codes: Codes) -> int:
+    """How many the differences of samples (h, w) take; more than any scan has, where one has no code."""
+    times = np.zeros(1 << 16, np.int64)  # of each difference
+    for top in range(0, len(samples), _ROWS):
+        rows = _differences(samples[max(top - 1, 0) : top + _ROWS], bits)[min(top, 1) :]
+        times += np.bincount(rows.reshape(-1), minlength=1 << 16)
+    of_category = np.bincount(_CATEGORIES, times, 17).astype(int).tolist()
+    lengths = [codes[n][1] + n % 16 if n in codes else 1 << 40 for n in range(17)]
+    return sum(many * length for many, length in zip(of_category, lengths))
+
+
+def _differences(samples: Counts, bits: int) -> Counts:
+    """Samples (h, w) less what predicts them, mod 2^16: the one on the left, of the first the one above."""
+    before = np.concatenate([np.array([1 << (bits - 1)], np.uint16), samples[:-1, 0]])
+    return np.diff(samples, axis=1, prepend=before[:, None])
 
 
 def _sensor(structure: sniff.Tiff) -> sniff.Directory | None:
@@ -144,6 +214,7 @@ def _scan(data: bytes, window: Window) -> _Scan | None:
     if data[window.offset : at] != b"\xff\xd8":
         return None
     bits = components = 0
+    restarts, tables = False, dict[int, Codes]()
     for _ in range(_MOST_HEADER):
         if at + 4 > end:
             return None
@@ -160,7 +231,31 @@ def _scan(data: bytes, window: Window) -> _Scan | None:
                 return None
         elif marker == _SCAN:
             left = len(body) == 4 + 2 * components and body[0] == components and body[-3:] == b"\1\0\0"
-            return _Scan(at, bits, components) if bits and left else None
+            named = [tables.get(number >> 4) for number in body[2 : 1 + 2 * components : 2]]
+            codes = tuple(table for table in named if table is not None)
+            known = not restarts and len(codes) == components
+            return _Scan(at, bits, codes if known else ()) if bits and left else None
         elif marker not in _BEFORE:
             return None
+        restarts |= marker == _RESTARTS
+        tables |= _tables(body) if marker == _TABLES else {}
     return None
+
+
+def _tables(body: bytes) -> dict[int, Codes]:
+    """Huffman tables of a segment, by their numbers; what is damaged is left out.
+
+    References
+    ----------
+    ITU-T T.81, B.2.4.2 and C.2.
+    """
+    tables: dict[int, Codes] = {}
+    while len(body) > 17:
+        number, lengths, body = body[0], body[1:17], body[17:]
+        codes, code = Codes(), 0
+        categories = iter(body[: sum(lengths)])
+        for length, many in enumerate(lengths, 1):
+            codes |= {category: (code + n, length) for n, category in zip(range(many), categories)}
+            code = code + many << 1
+        tables[number], body = codes, body[sum(lengths) :]
+    return tables

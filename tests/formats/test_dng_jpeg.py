@@ -118,6 +118,37 @@ def test_counts_and_what_they_mean_are_libraws(tmp_path, monkeypatch, form):
     assert_alike(answer(tmp_path / "a.dng"), by_libraw(tmp_path / "a.dng", monkeypatch))
 
 
+def even_corner(seed=0):
+    """A mosaic whose last pixels are alike, as those of a decoder that ran out of data are."""
+    plain = mosaic(seed=seed)
+    plain[-1, -4:] = plain[-1, -4]
+    return plain
+
+
+@pytest.mark.parametrize("form", ["two components", "one component", "tiles beyond the border"])
+def test_an_even_corner_is_no_end_of_data(tmp_path, monkeypatch, form):
+    (tmp_path / "a.dng").write_bytes(dng(even_corner(), **FORMS[form]))
+    assert fast((tmp_path / "a.dng").read_bytes()) is not None
+    assert_alike(answer(tmp_path / "a.dng"), by_libraw(tmp_path / "a.dng", monkeypatch))
+
+
+@pytest.mark.parametrize("form", ["two components", "one component"])
+def test_data_that_end_early_are_left_to_libraw(form):
+    for bits_short in range(1, 65):
+        whole = dng(even_corner(bits_short), **FORMS[form])
+        (window,) = dng_jpeg._windows(dng_jpeg._sensor(sniff.structure(io.BytesIO(whole))))
+        start = dng_jpeg._scan(whole, window).start
+        end = whole.index(b"\xff\xd9", start)
+        coded = whole[start:end].replace(b"\xff\0", b"\xff")
+        bits = "".join(f"{byte:08b}" for byte in coded)
+        filling = min(7, len(bits) - len(bits.rstrip("1")))
+        bits = bits[: -filling - bits_short]
+        bits += -len(bits) % 8 * "1"
+        cut = int(bits, 2).to_bytes(len(bits) // 8, "big").replace(b"\xff", b"\xff\0")
+        bad = whole[:start] + cut + b"\xff\xd9" + whole[end + 2 :] + bytes(max(0, len(whole[start:end]) - len(cut)))
+        assert fast(bad) is None
+
+
 @pytest.mark.parametrize(
     "tag",
     [
