@@ -276,5 +276,5 @@ def _remember_run(out: Path, capture: Capture, config: Config, network: Network 
         "versions": provenance.versions(),
     }
     text = json.dumps({**about, "digest": seal(about)}, indent=1)
-    with atomic.path(out / "work" / "run.json") as temporary:
+    with atomic.path(out / "work" / "run.json", synced=False) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")

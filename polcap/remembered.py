@@ -71,5 +71,5 @@ class Remembered:
         if self._folder is None:
             return
         kept = {"key": key, "value": value, "digest": digest([key, value])}
-        with atomic.path(self._folder / f"{name}.json") as temporary:
+        with atomic.path(self._folder / f"{name}.json", synced=False) as temporary:
             temporary.write_text(json.dumps(kept), encoding="utf-8")

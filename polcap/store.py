@@ -229,7 +229,7 @@ class Store:
         except OSError as error:
             raise atomic.failure(self.work / "lock", error) from error
         try:
-            with atomic.path(owner) as temporary:
+            with atomic.path(owner, synced=False) as temporary:
                 temporary.write_text(f"{os.getpid()}\n", encoding="utf-8")
             for left in [*self.work.glob(".*.part*"), *self.work.glob(".*.old")]:  # of a killed run
                 atomic.discard(left)

@@ -92,7 +92,7 @@ def remember(out: Path, request: str | None, table: str, stages: Iterable[str]) 
     if request is None:
         return
     known = {"request": request, "table": table, "stages": list(stages), "result": _result(out)}
-    with atomic.path(out / "work" / _FILE) as temporary:
+    with atomic.path(out / "work" / _FILE, synced=False) as temporary:
         temporary.write_text(json.dumps(known) + "\n", encoding="utf-8")
 
 

@@ -186,7 +186,7 @@ def read_record(unit: Unit) -> Record:
 
 
 def write_record(unit: Unit, record: Record) -> None:
-    with atomic.path(unit.record_file) as temporary:
+    with atomic.path(unit.record_file, synced=False) as temporary:
         temporary.write_text(json.dumps(asdict(record)) + "\n", encoding="utf-8")
 
 

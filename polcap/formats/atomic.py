@@ -1,17 +1,20 @@
 """In: a final path. Out: a file or folder that is there whole, or not at all.
 
-Written beside, fsynced, renamed: whoever finds the final name finds a complete file.
+Written beside, fsynced, renamed: whoever finds the final name finds a complete file. The new name itself reaches the
+disk when the system next writes its journal; should the power fail before, what stood there before is there again.
 """
 
 import errno
 import os
 import shutil
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from polcap.errors import StorageError
 
+_TOGETHER = 8  # files that are synced at a time: the system writes its journal once for all of them
 REASONS = {
     errno.ENOSPC: "the disk is full; free some space",
     errno.EDQUOT: "the disk quota is used up; free some space",
@@ -33,12 +36,20 @@ def failure(target: Path, error: OSError) -> StorageError:
 
 
 @contextmanager
-def path(final: str | Path) -> Iterator[Path]:
+def path(final: str | Path, synced: bool = True) -> Iterator[Path]:
     """A temporary path beside `final`, which becomes `final` when the block ends well.
 
     Parent folders are made. The temporary keeps the suffix, so that writers which choose
     their format by name see the right one. On any exception it is removed and whatever stood
     under `final` is untouched.
+
+    Parameters
+    ----------
+    final
+        The path.
+    synced
+        Bring the file to the disk before its name; not where whoever reads it notices that it is not whole, and can do
+        without it.
 
     Raises
     ------
@@ -50,9 +61,9 @@ def path(final: str | Path) -> Iterator[Path]:
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
-        sync(temporary)
+        if synced:
+            sync(temporary)
         os.replace(temporary, final)
-        sync(final.parent)
     except OSError as error:
         raise failure(final, error) from error
     finally:
@@ -75,13 +86,11 @@ def folder(final: str | Path) -> Iterator[Path]:
         final.parent.mkdir(parents=True, exist_ok=True)
         temporary.mkdir()
         yield temporary
-        for file in sorted(temporary.rglob("*")):
-            sync(file)
-        sync(temporary)
+        with ThreadPoolExecutor(_TOGETHER) as pool:
+            list(pool.map(sync, [*sorted(temporary.rglob("*")), temporary]))
         if final.exists():
             os.replace(final, aside)
         os.replace(temporary, final)
-        sync(final.parent)
     except OSError as error:
         if aside.exists() and not final.exists():
             os.replace(aside, final)

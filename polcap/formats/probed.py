@@ -66,7 +66,7 @@ class Probed:
             return
         files = {name: [stat, asdict(found)] for name, (stat, found) in self._known.items()}
         sealed = {"program": self._program, "files": files, "digest": digest([self._program, files])}
-        with atomic.path(self._memory) as temporary:
+        with atomic.path(self._memory, synced=False) as temporary:
             temporary.write_text(json.dumps(sealed), encoding="utf-8", errors="surrogateescape")
         self._before = dict(self._known)
 

@@ -89,7 +89,7 @@ class Written:
             The folder cannot be written.
         """
         known = {"files": _files(self._out), "made_from": self._made}
-        with atomic.path(self._out / "work" / _FILE) as temporary:
+        with atomic.path(self._out / "work" / _FILE, synced=False) as temporary:
             temporary.write_text(json.dumps(known) + "\n", encoding="utf-8")
 
 

@@ -77,3 +77,27 @@ def test_failed_folder_leaves_the_old_one(tmp_path: Path) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
     assert names(final) == ["one"]
     assert names(tmp_path) == ["stage"]
+
+
+def test_bytes_reach_the_disk_before_their_name_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    named: list[tuple[str, list[str]]] = []  # what is synced, and which names stand then
+
+    def note(handle: int) -> None:
+        named.append((Path(f"/proc/self/fd/{handle}").readlink().name, names(tmp_path)))
+
+    if not Path("/proc/self/fd").exists():
+        pytest.skip("this system does not tell what a handle stands for")
+    monkeypatch.setattr(os, "fsync", note)
+    with atomic.path(tmp_path / "a.bin") as temporary:
+        temporary.write_bytes(b"abc")
+    assert [name for name, _ in named] == [temporary.name] and "a.bin" not in named[0][1]
+    named.clear()
+    with atomic.folder(tmp_path / "stage") as folder:
+        (folder / "one").write_text("1")
+        (folder / "two").write_text("2")
+    assert sorted(name for name, _ in named) == sorted(["one", "two", folder.name])
+    assert not any("stage" in standing for _, standing in named)
+    named.clear()
+    with atomic.path(tmp_path / "b.bin", synced=False) as temporary:
+        temporary.write_bytes(b"abc")
+    assert not named
