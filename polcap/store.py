@@ -6,8 +6,9 @@ is asked for. So one description of the path serves a run, a dry run, `--until` 
 The key of a result is a digest of the stage's name, its version, its own settings and the keys of
 its inputs, chained back to the bytes of the RAW files and of the model file. Where files lie is not
 part of it: a capture may be moved. A result is one folder, `work/NN-name/`: an `.npy` per array and
-a `manifest.json`. Folders are written beside, fsynced and renamed, so a killed run leaves a whole
-result or none. Arrays come back as read-only memory maps, the first time as after a resume.
+a `manifest.json`. Folders are written beside and renamed, so a killed run leaves a whole result or none;
+what a power cut leaves of one is known by its digests, and computed again. Arrays come back as read-only
+memory maps, the first time as after a resume.
 
 The manifest carries its own digest, so an edited scalar is seen as an edited pixel is. Each array's size
 and SHA-256 digest are checked once per process, when a stage that has to run (or a writer) first opens
@@ -162,7 +163,7 @@ class StageResult(Result[T]):
 
     def write(self, result: T, seconds: float) -> None:
         """Put a result into its folder, whole or not at all."""
-        with atomic.folder(self.place) as temporary:
+        with atomic.folder(self.place, synced=False) as temporary:
             arrays: npy_folder.Arrays = {}
             tree = npy_folder.encode(result, "value", arrays)
             files = {f"{name}.npy": npy_folder.save(temporary / f"{name}.npy", a) for name, a in arrays.items()}

@@ -8,12 +8,21 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from polcap.batch import unit as units
+from polcap.batch import worker_start
 from polcap.batch.processes import prepare
 from polcap.batch.unit import Order, Record, Unit
 from polcap.errors import SettingError
 
 _LOCAL = "local"
-_UNWATCHED = {"distributed.worker.profile.enabled": False}  # looks into each thread every 10 ms: 6 % of small captures
+_SETTINGS = {  # each of what Dask does beside the work takes its time from a core that works
+    "distributed.worker.profile.enabled": False,  # looks into each thread every 10 ms: 6 % of small captures
+    "distributed.admin.tick.interval": "1s",  # by default a look at the clock every 20 ms
+    "distributed.admin.tick.limit": "30s",
+    "distributed.nanny.pre-spawn-environ": {  # without MALLOC_TRIM_THRESHOLD_, which fetches every array's pages anew
+        "OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS": 1,
+    },
+    "distributed.worker.multiprocessing-method": worker_start.method(),
+}  # fmt: skip
 
 
 def run(
@@ -29,13 +38,15 @@ def run(
     SettingError
         Dask is not installed, or nobody answers at that address.
     """
+    if address == _LOCAL:
+        worker_start.context("distributed")  # begins to load while Dask is imported here
     try:
         import dask
         import distributed
     except ModuleNotFoundError as error:
         raise SettingError(f"{error.name} is not installed; pip install 'polcap[batch]'") from error
     resources = {"GPU": 1.0} if order.device == "cuda" else None
-    with dask.config.set({"distributed.scheduler.allowed-failures": retries, **_UNWATCHED}):
+    with dask.config.set({"distributed.scheduler.allowed-failures": retries, **_SETTINGS}):
         try:
             target: Any = address
             if address == _LOCAL:

@@ -1,6 +1,6 @@
 """In: units. Out: their records, from processes of this machine that are replaced when one of them dies."""
 
-import multiprocessing
+import os
 import signal
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -10,9 +10,8 @@ from typing import Any
 
 from polcap import resource_limits
 from polcap.batch import unit as units
+from polcap.batch import worker_start
 from polcap.batch.unit import Order, Record, Unit
-
-_CONTEXT = multiprocessing.get_context("spawn")  # never a fork: OpenMP and the network's threads are not copied
 
 
 @dataclass
@@ -24,9 +23,10 @@ class _Hand:
     busy: tuple[Unit, int] | None = None  # with the number of the attempt
 
     @staticmethod
-    def spawn(order: Order) -> "_Hand":
-        here, there = _CONTEXT.Pipe()
-        process = _CONTEXT.Process(target=_serve, args=(there, order), daemon=False)
+    def start(order: Order) -> "_Hand":
+        begin = worker_start.context()
+        here, there = begin.Pipe()
+        process = begin.Process(target=_serve, args=(there, order, dict(os.environ)), daemon=False)
         process.start()
         there.close()
         return _Hand(process, here)
@@ -45,7 +45,7 @@ class _Hand:
 def run(wanted: Sequence[Unit], order: Order, workers: int, retries: int) -> Iterator[Record]:
     """Records in the order in which units end; a unit that kills its process is tried `retries` times more."""
     queue = deque((unit, 1) for unit in wanted)
-    hands = [_Hand.spawn(order) for _ in range(min(workers, len(wanted)))]
+    hands = [_Hand.start(order) for _ in range(min(workers, len(wanted)))]
     try:
         for hand in hands:
             hand.give(*queue.popleft())
@@ -60,7 +60,7 @@ def run(wanted: Sequence[Unit], order: Order, workers: int, retries: int) -> Ite
                     unit, attempt = hand.busy
                     hand.busy = None
                     hand.stop()
-                    hands[hands.index(hand)] = hand = _Hand.spawn(order)
+                    hands[hands.index(hand)] = hand = _Hand.start(order)
                     if attempt <= retries:
                         queue.append((unit, attempt + 1))
                     else:
@@ -89,8 +89,10 @@ def _cause_of_death(attempts: int) -> str:
     )
 
 
-def _serve(pipe: connection.Connection, order: Order) -> None:
-    """Work until the pipe closes; in the child."""
+def _serve(pipe: connection.Connection, order: Order, environment: dict[str, str]) -> None:
+    """Work until the pipe closes; in the child, which may come of a server that began in another environment."""
+    os.environ.clear()
+    os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     prepare(order)
     while True:

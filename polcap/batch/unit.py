@@ -111,7 +111,7 @@ def run(unit: Unit, order: Order, attempt: int = 1) -> Record:
 
 
 def _process(unit: Unit, order: Order) -> dict[str, Any]:
-    from polcap import models, pipeline
+    from polcap import pipeline
     from polcap.batch import thumbnail
     from polcap.config import Config
     from polcap.formats import capture as captures
@@ -121,7 +121,7 @@ def _process(unit: Unit, order: Order) -> dict[str, Any]:
     supplied = UserInput(
         chart=order.chart,
         network=_network(order.estimator, order.model, order.device, order.threads),
-        mask_network=models.load_mask_network(order.threads),
+        mask_network=_mask_network(order.threads),
     )
     found = captures.read(unit.capture, order.angles_deg)
     about = pipeline.process(found, supplied, config, Path(unit.out))
@@ -136,6 +136,14 @@ def _network(estimator: Any, model: str | None, device: Any, threads: int) -> Ne
     from polcap import models
 
     return models.load_network(estimator, None if model is None else Path(model), device, threads)
+
+
+@lru_cache(maxsize=1)
+def _mask_network(threads: int) -> Network | None:
+    """Loaded once, too."""
+    from polcap import models
+
+    return models.load_mask_network(threads)
 
 
 def stamp(unit: Unit, order: Order) -> str:

@@ -71,8 +71,13 @@ def path(final: str | Path, synced: bool = True) -> Iterator[Path]:
 
 
 @contextmanager
-def folder(final: str | Path) -> Iterator[Path]:
+def folder(final: str | Path, synced: bool = True) -> Iterator[Path]:
     """The same for a folder; a folder that stood under `final` is replaced as a whole.
+
+    Parameters
+    ----------
+    final, synced
+        As of `path`.
 
     Raises
     ------
@@ -86,8 +91,9 @@ def folder(final: str | Path) -> Iterator[Path]:
         final.parent.mkdir(parents=True, exist_ok=True)
         temporary.mkdir()
         yield temporary
-        with ThreadPoolExecutor(_TOGETHER) as pool:
-            list(pool.map(sync, [*sorted(temporary.rglob("*")), temporary]))
+        if synced:
+            with ThreadPoolExecutor(_TOGETHER) as pool:
+                list(pool.map(sync, [*sorted(temporary.rglob("*")), temporary]))
         if final.exists():
             os.replace(final, aside)
         os.replace(temporary, final)

@@ -5,7 +5,7 @@ python tests/campaigns/dask_farm.py [--captures 40] [--kills 10] [--tiny 1000] [
 1. The captures (320 × 240 px, one exposure; copies of four) are processed serially, by one process.
 2. `--scheduler local` with one worker and with two, one thread each: wall and CPU seconds. On a machine that others
    use too the ratio of wall seconds says little; the CPU seconds say what the second worker costs, and the seconds
-   of a capture what start and end of the batch do: Dask's processes take about 4 s to be there, whatever follows.
+   of a capture what start and end of the batch do, which no second worker halves.
 3. A scheduler of its own on loopback TCP; the batch begins before any worker is there. Two workers join, one of the
    two is killed (SIGKILL) at a random moment and another takes its place, as often as asked. Every asset must be
    there and have the bytes of the serial one.
@@ -15,6 +15,7 @@ Prints one JSON document; exit code 1 where assets are missing or differ.
 """
 
 import argparse
+import ctypes
 import json
 import os
 import shutil
@@ -23,6 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,7 @@ sys.path.insert(0, str(ROOT))
 from tests.campaigns import kill, small_capture  # noqa: E402
 
 _DISTINCT = 4  # captures that are shot; the others are copies
+_PR_SET_CHILD_SUBREAPER = 36  # linux/prctl.h
 _SPAN_S = (1.0, 8.0)  # between two kills
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
 ENVIRONMENT.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed polcap is compiled: no worker does so at its start
@@ -44,6 +47,7 @@ Program = subprocess.Popen[bytes]
 def main(captures: int, kills: int, tiny: int, seed: int) -> int:
     """Assets that are missing or differ."""
     told: dict[str, Any] = {"captures": captures}
+    adopt()
     with tempfile.TemporaryDirectory() as place:
         root, base = Path(place) / "captures", Path(place)
         shoot(root, captures)
@@ -62,6 +66,12 @@ def main(captures: int, kills: int, tiny: int, seed: int) -> int:
             told["around the work"] = around(base, tiny)
     print(json.dumps(told, indent=1))
     return sum(part["differ"] for part in told.values() if isinstance(part, dict) and "differ" in part)
+
+
+def adopt() -> None:
+    """Processes whose parent has ended are this one's from now on, and so are their CPU seconds."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
 
 def shoot(root: Path, captures: int) -> None:
@@ -83,9 +93,13 @@ def timed(root: Path, out: Path, *more: str) -> dict[str, Any]:
     """Wall and CPU seconds of a batch with all its processes, and how it ended."""
     before, start = os.times(), time.monotonic()
     code = batch(root, out, *more).wait()
+    seconds = time.monotonic() - start
+    with suppress(ChildProcessError):  # until all are gone that were left to this process
+        while True:
+            os.wait()
     after = os.times()
     spent = after.children_user + after.children_system - before.children_user - before.children_system
-    return {"wall_s": round(time.monotonic() - start, 1), "cpu_s": round(spent, 1), "exit": code}
+    return {"wall_s": round(seconds, 1), "cpu_s": round(spent, 1), "exit": code}
 
 
 def capture_seconds(out: Path) -> float:

@@ -1,0 +1,12 @@
+"""In: nothing. Out: what every capture needs, imported, also what the path itself imports only when it comes to it.
+
+Imported by the process that workers are forked from. Nothing here may start a thread: a fork would not copy it. So
+onnxruntime, whose import starts one, is left to each worker.
+"""
+
+import scipy.sparse.linalg
+import scipy.special  # noqa: F401
+
+from polcap import models, pipeline  # noqa: F401
+from polcap.batch import thumbnail, unit  # noqa: F401
+from polcap.formats import capture  # noqa: F401
