@@ -72,18 +72,27 @@ def _processed(
         sweep(out)
         results = path(_counted(capture, frame_read), supplied, config, store)
         _remember_run(out, capture, config, supplied.network)
-        store.materialize(until)
         if until is not None:
+            store.materialize(until)
             return None
         written, remembered = _kept(out, force is not None)
-        if force is None and (before := _written_before(written, out, capture, config, supplied.network, results)):
+        before = None
+        if force is None:
+            before = _written_before(written, out, capture, config, supplied.network, results)
+        if before is not None:
+            store.materialize()
             progress("write", 0.0, True)
             return before
-        progress("write", None, False)
-        start = time.perf_counter()
-        facts = report.capture_facts(capture)
-        about = report.document(facts, results, config, supplied.network, timings(out), remembered)
-        maps_folder.write(out / "maps", results.maps, results.mesh, results.stokes, results.cues, written)
+        store.materialize(results.maps.name)
+        with maps_folder.writing(out / "maps", written) as files:
+            files.begin({"maps": results.maps, "stokes": results.stokes, "cues": results.cues})
+            store.materialize(after=results.maps.name)
+            progress("write", None, False)
+            start = time.perf_counter()
+            files.begin({"mesh": results.mesh})
+            facts = report.capture_facts(capture)
+            about = report.document(facts, results, config, supplied.network, timings(out), remembered)
+            files.finish()
         asset_export.export(out, about, Wanted(), written, results)
         report.write(out, about, results, remembered)
         written.remember()

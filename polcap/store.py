@@ -24,9 +24,9 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
-from functools import cached_property
 from hashlib import blake2b, sha256
 from pathlib import Path
+from threading import RLock
 from typing import Any, Generic, TypeVar, cast, get_type_hints
 
 import msgspec
@@ -50,13 +50,24 @@ def silent(stage: str, seconds: float | None, cached: bool) -> None:
 class Result(Generic[T]):
     """A value of the path: its key now, the value when asked for."""
 
+    _value: T
+
     def __init__(self, key: str) -> None:
         self.key = key
+        self._asked = RLock()  # of each its own: to ask for one does not wait for another
 
-    @cached_property
+    @property
     def value(self) -> T:
-        """Found or computed at the first asking."""
-        return self.find()
+        """Found or computed at the first asking, once whichever threads ask."""
+        with self._asked:
+            if not self.known:
+                self._value = self.find()
+            return self._value
+
+    @property
+    def known(self) -> bool:
+        """The value has been asked for."""
+        return hasattr(self, "_value")
 
     def find(self) -> T:
         """The value, from wherever it can be had."""
@@ -87,6 +98,8 @@ class Run:
 class StageResult(Result[T]):
     """The result of a stage, kept in a folder of its own."""
 
+    _facts: T
+
     def __init__(
         self,
         key: str,
@@ -103,10 +116,16 @@ class StageResult(Result[T]):
         self.place = place
         self.run = run
 
-    @cached_property
+    @property
     def facts(self) -> T:
         """The value; of large arrays only the shapes, where nobody has read them yet."""
-        if "value" not in vars(self) and self.stored():
+        with self._asked:
+            if not hasattr(self, "_facts"):
+                self._facts = self._small()
+            return self._facts
+
+    def _small(self) -> T:
+        if not self.known and self.stored():
             try:
                 found = read(self.place, returns(self.stage), most=npy_folder.LARGE + npy_folder.HEAD)
                 return cast(T, npy_folder.without_large(found))
@@ -125,7 +144,7 @@ class StageResult(Result[T]):
     @property
     def ready(self) -> bool:
         """The value is known, or a whole manifest with this key lies in the folder."""
-        return "value" in vars(self) or self.stored()
+        return self.known or self.stored()
 
     def stored(self) -> bool:
         """A whole manifest with this key lies in the folder, and nobody asked for it anew."""
@@ -258,14 +277,16 @@ class Store:
             self.run.fresh.add(key)
         return Derived(key, function, inputs)
 
-    def materialize(self, until: str | None = None) -> None:
-        """Compute what is missing, in order, up to and with the stage `until`."""
-        for result in self.steps:
+    def materialize(self, until: str | None = None, after: str | None = None) -> None:
+        """Compute what is missing, in order, from behind the stage `after` up to and with the stage `until`."""
+        first = 0 if after is None else [result.name for result in self.steps].index(after) + 1
+        for result in self.steps[first:]:
             if result.keep and result.ready:
                 self.run.progress(result.name, 0.0, True)
             result.materialize()
             if result.name == until:
-                _ = result.value  # also where it is not kept, so that its errors show
+                if not result.keep:
+                    _ = result.value  # so that its errors show
                 return
 
     def _stale(self, inputs: tuple[Any, ...]) -> bool:

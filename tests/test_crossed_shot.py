@@ -94,7 +94,7 @@ def test_both_parts_of_the_light_are_written(
     results: tuple[Results, Results], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written: dict[str, set[str]] = {}
-    keep: Callable[..., None] = lambda file, channels, half=False: written.update({file.name: set(channels)})  # noqa: E731
+    keep: Callable[..., None] = lambda file, channels, **_: written.update({file.name: set(channels)})  # noqa: E731
     monkeypatch.setattr("polcap.formats.maps.exr.write", keep)
     found = results[1]
     maps_folder.write(tmp_path, found.maps, found.mesh, found.stokes, found.cues)

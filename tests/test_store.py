@@ -6,8 +6,10 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FunctionType
@@ -399,3 +401,27 @@ def test_facts_are_known_without_reading_the_pictures(tmp_path: Path) -> None:
 def test_facts_of_what_is_not_stored_are_the_value(tmp_path: Path) -> None:
     step = Store(tmp_path).step(painted, 2.0)
     assert step.facts is step.value
+
+
+ASKED = threading.Event()
+
+
+def slow(value: float) -> float:
+    calls.append("slow")
+    assert ASKED.wait(60)
+    return value
+
+
+def quick(value: float) -> float:
+    ASKED.set()
+    return value
+
+
+def test_one_result_does_not_wait_for_another_and_is_made_once(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    first, second = store.derive(slow, 2.0), store.derive(quick, 3.0)
+    with ThreadPoolExecutor(3) as pool:
+        waiting = [pool.submit(getattr, first, "value") for _ in range(2)]
+        assert pool.submit(getattr, second, "value").result(60) == 3.0
+        assert [one.result(60) for one in waiting] == [2.0, 2.0]
+    assert calls == ["slow"]

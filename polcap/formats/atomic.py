@@ -35,9 +35,37 @@ def failure(target: Path, error: OSError) -> StorageError:
     return StorageError(f"cannot write {target}: {reason}")
 
 
+class Held:
+    """Files that are whole, and wait for their final names."""
+
+    def __init__(self) -> None:
+        self._files: list[tuple[Path, Path]] = []
+
+    def take(self, temporary: Path, final: Path) -> None:
+        """From here on a file is this one's."""
+        self._files.append((temporary, final))
+
+    def release(self) -> None:
+        """Give all their names.
+
+        Raises
+        ------
+        StorageError
+            The system refused one; those behind it go on waiting.
+        """
+        while self._files:
+            _rename(*self._files[0])
+            del self._files[0]
+
+    def drop(self) -> None:
+        """Remove those that wait."""
+        for temporary, _ in self._files:
+            discard(temporary)
+
+
 @contextmanager
-def path(final: str | Path, synced: bool = True) -> Iterator[Path]:
-    """A temporary path beside `final`, which becomes `final` when the block ends well.
+def path(final: str | Path, synced: bool = True, held: Held | None = None) -> Iterator[Path]:
+    """A temporary path beside `final`, which becomes `final` when the block ends well, or later, where it is `held`.
 
     Parent folders are made. The temporary keeps the suffix, so that writers which choose
     their format by name see the right one. On any exception it is removed and whatever stood
@@ -50,6 +78,8 @@ def path(final: str | Path, synced: bool = True) -> Iterator[Path]:
     synced
         Bring the file to the disk before its name; not where whoever reads it notices that it is not whole, and can do
         without it.
+    held
+        Gives the file its name later.
 
     Raises
     ------
@@ -63,11 +93,26 @@ def path(final: str | Path, synced: bool = True) -> Iterator[Path]:
         yield temporary
         if synced:
             sync(temporary)
+    except OSError as error:
+        discard(temporary)
+        raise failure(final, error) from error
+    except BaseException:
+        discard(temporary)
+        raise
+    if held is not None:
+        held.take(temporary, final)
+        return
+    try:
+        _rename(temporary, final)
+    finally:
+        discard(temporary)
+
+
+def _rename(temporary: Path, final: Path) -> None:
+    try:
         os.replace(temporary, final)
     except OSError as error:
         raise failure(final, error) from error
-    finally:
-        discard(temporary)
 
 
 @contextmanager

@@ -20,6 +20,7 @@ def write(
     attributes: Mapping[str, Attribute] | None = None,
     *,
     half: bool | Collection[str] = False,
+    held: atomic.Held | None = None,
 ) -> None:
     """Write maps as one OpenEXR file, ZIP; the same input gives the same bytes.
 
@@ -34,6 +35,8 @@ def write(
     half
         Whether values are 16 bits instead of 32, or the channels of which they are. Values beyond the range of half
         become its greatest.
+    held
+        Other files that this one gets its name with.
 
     Raises
     ------
@@ -58,7 +61,7 @@ def write(
             spec.attribute(key, oiio.TypeDesc(f"float[{len(value)}]"), value)
         else:
             spec.attribute(key, value)
-    with atomic.path(path) as temporary:
+    with atomic.path(path, held=held) as temporary:
         temporary.touch()  # an OSError here says more than OpenImageIO's text
         output = oiio.ImageOutput.create(str(temporary))
         if output is None:

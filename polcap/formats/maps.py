@@ -1,8 +1,9 @@
 """In: the maps of an object. Out: the folder maps/ of a result, as docs/reference/result.md says; and back."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from functools import partial
 from hashlib import blake2b
 from pathlib import Path
@@ -11,13 +12,12 @@ from typing import Annotated, Any, Literal, Protocol, TypeVar
 import msgspec
 import numpy as np
 from msgspec import Meta, Struct
-from numpy.typing import NDArray
 
+from polcap import parallel
 from polcap.errors import DecodeError
-from polcap.formats import atomic, exr, npy_folder, png, text_file
+from polcap.formats import atomic, exr, map_files, npy_folder, png, text_file
 from polcap.formats.written import Written
 from polcap.images import Cues, Floats, Mesh, StokesImage, SurfaceMaps, View
-from polcap.optics import color
 
 Value = TypeVar("Value", covariant=True)
 
@@ -109,85 +109,102 @@ def write(
     StorageError
         A file cannot be written.
     """
-    folder = Path(folder)
-    written = written or Written(folder.parent, anew=True)
-    made: dict[_Source, Keyed[Any]] = {"maps": maps, "mesh": mesh, "stokes": stokes, "cues": cues}
-    for name, (sources, encode) in {**_EXRS, **_PNGS}.items():
-        taken = [made[source] for source in sources]
-        written.make(folder / name, [one.key for one in taken], partial(_write, folder / name, encode, taken))
-    about = folder / "maps.json"
-    written.make(about, [maps.key, mesh.key], partial(_describe, about, maps, mesh))
+    with writing(Path(folder), written) as files:
+        files.begin({"maps": maps, "mesh": mesh, "stokes": stokes, "cues": cues})
+        files.finish()
+
+
+@dataclass
+class Writing:
+    """A folder maps/ under way: files are encoded beside other work, and get their names together."""
+
+    folder: Path
+    written: Written
+    beside: parallel.Beside
+    held: atomic.Held
+    made: dict[map_files.Source, Keyed[Any]] = field(default_factory=dict)
+    begun: dict[str, parallel.Task[None]] = field(default_factory=dict)
+
+    def begin(self, made: Mapping[map_files.Source, Keyed[Any]]) -> None:
+        """Encode what can be made of these and of those given before; `write` tells of them."""
+        self.made |= made
+        for name, (sources, encode) in map_files.FILES.items():
+            if name in self.begun or not self.made.keys() >= set(sources):
+                continue
+            taken, file = [self.made[source] for source in sources], self.folder / name
+            made_from = [one.key for one in taken]
+            if self.written.stands(file, made_from):
+                continue
+            content = partial(encode, *(one.value for one in taken))  # a stage that has to run does so here
+            self.begun[name] = self.beside.begin(partial(_write, file, content, self.held))
+            self.written.note(file, made_from)
+
+    def finish(self) -> None:
+        """Every file is there, and maps.json last.
+
+        Raises
+        ------
+        StorageError
+            A file cannot be written; then those that stood before stand.
+        """
+        parallel.finished(list(self.begun.values()))
+        self.held.release()
+        maps, mesh, about = self.made["maps"], self.made["mesh"], self.folder / "maps.json"
+        self.written.make(about, [maps.key, mesh.key], partial(_describe, about, maps, mesh))
+
+
+@contextmanager
+def writing(folder: Path, written: Written | None = None) -> Iterator[Writing]:
+    """Begin files of maps/ before all is known that goes there; what fails in the block leaves maps/ as it was.
+
+    Parameters
+    ----------
+    folder, written
+        As of `write`.
+    """
+    held = atomic.Held()
+    try:
+        with parallel.Beside() as beside:
+            yield Writing(folder, written or Written(folder.parent, anew=True), beside, held)
+    finally:
+        held.drop()
 
 
 def _describe(file: Path, maps: Keyed[SurfaceMaps], mesh: Keyed[Mesh]) -> None:
-    near, median, far = _range(maps.value, mesh.value)
+    near, median, far = map_files.depth_range(maps.value, mesh.value)
     depth: dict[str, str | float] = {"unit": "m" if mesh.value.metric else "relative"}
     _write_json(file, _description(maps.value, {**depth, "near": near, "median": median, "far": far}))
 
 
-def _write(file: Path, encode: Callable[..., Any], taken: Sequence[Keyed[Any]]) -> None:
+def _write(file: Path, content: Callable[[], Any], held: atomic.Held) -> None:
     """One file; an .exr of channels, a .png of pixels."""
-    content = encode(*(one.value for one in taken))
     if file.suffix == ".exr":
-        exr.write(file, content, half=file.stem not in _WHOLE)
+        exr.write(file, content(), half=file.stem not in map_files.WHOLE, held=held)
     else:
-        png.write(file, content)
-
-
-def _depth(maps: SurfaceMaps, mesh: Mesh) -> Floats:
-    """Depth on the object, 0 beside it."""
-    return np.where(_inside(maps) & np.isfinite(mesh.depth), mesh.depth, 0.0).astype(np.float32)
-
-
-def _range(maps: SurfaceMaps, mesh: Mesh) -> tuple[float, float, float]:
-    """Least, median and greatest depth on the object."""
-    depth = _depth(maps, mesh)
-    seen = depth[depth > 0]
-    near, median, far = (float(q) for q in np.quantile(seen, (0, 0.5, 1))) if seen.size else (0.0, 0.5, 1.0)
-    return near, median, far
-
-
-def _depth_picture(maps: SurfaceMaps, mesh: Mesh) -> NDArray[np.uint16]:
-    near, _, far = _range(maps, mesh)
-    depth = _depth(maps, mesh)
-    return png.sixteen_bits(np.where(depth > 0, (depth - near) / max(far - near, 1e-9), 0))
-
-
-def _normal_picture(maps: SurfaceMaps) -> NDArray[np.uint16]:
-    flat = np.where(_inside(maps)[..., None], maps.normal, [0.0, 0.0, 1.0])
-    return png.sixteen_bits(flat / 2 + 0.5)
-
-
-def _inside(maps: SurfaceMaps) -> NDArray[np.bool_]:
-    return np.asarray(maps.mask, dtype=bool)
-
-
-def _seen(maps: SurfaceMaps, values: Floats) -> Floats:
-    """A map on the object, 0 beside it."""
-    return _kept(values, _inside(maps))
+        png.write(file, content(), held)
 
 
 def as_read(maps: SurfaceMaps, mesh: Mesh) -> Stored:
     """What `read` gives of the folder that `write` makes of these: half where the files are half."""
-    inside = _inside(maps)
+    inside = map_files.inside(maps)
     whole = SurfaceMaps(
-        normal=_kept(maps.normal, inside),
-        diffuse=_half(_kept(maps.diffuse, inside)),
-        specular=_half(_kept(maps.specular, inside)),
-        roughness=_half(_kept(maps.roughness, inside)),
+        normal=map_files.kept(maps.normal, inside),
+        diffuse=_half(map_files.kept(maps.diffuse, inside)),
+        specular=_half(map_files.kept(maps.specular, inside)),
+        roughness=_half(map_files.kept(maps.roughness, inside)),
         depth_prior=None,
-        confidence=_half(_kept(maps.confidence, inside)),
+        confidence=_half(map_files.kept(maps.confidence, inside)),
         mask=inside,
         view=maps.view,
         estimator=maps.estimator,
     )
-    return Stored(whole, np.where(inside, _depth(maps, mesh), np.nan).astype(np.float32), mesh.metric)
+    return Stored(whole, np.where(inside, map_files.object_depth(maps, mesh), np.nan).astype(np.float32), mesh.metric)
 
 
 def albedo_as_read(maps: SurfaceMaps) -> SurfaceMaps:
     """The maps with the two albedos and the mask that `read` gives of them; the other fields as they are."""
-    inside = _inside(maps)
-    diffuse, specular = (_half(_kept(values, inside)) for values in (maps.diffuse, maps.specular))
+    inside = map_files.inside(maps)
+    diffuse, specular = (_half(map_files.kept(values, inside)) for values in (maps.diffuse, maps.specular))
     return replace(maps, diffuse=diffuse, specular=specular, mask=inside)
 
 
@@ -338,61 +355,3 @@ def raw_crop(view: View, width: int, height: int) -> list[int | float]:
 
 def _plain(value: float) -> int | float:
     return int(value) if float(value).is_integer() else float(value)
-
-
-def _kept(values: Floats, inside: NDArray[np.bool_]) -> Floats:
-    return np.where(inside if values.ndim == 2 else inside[..., None], values, 0).astype(np.float32)
-
-
-def _channels(names: str, values: Floats) -> dict[str, Floats]:
-    return {name: values[..., k] for k, name in enumerate(names)}
-
-
-def _stokes_channels(stokes: StokesImage) -> dict[str, Floats]:
-    return {f"S{s}.{c}": stokes.stokes[s, ..., k] for s in range(3) for k, c in enumerate("RGB")}
-
-
-def _cue_channels(cues: Cues) -> dict[str, Floats]:
-    aolp = np.degrees(np.arctan2(cues.normalized_stokes[1], cues.normalized_stokes[0]) / 2) % 180.0
-    return {
-        "dolp": cues.dolp,
-        "aolp": aolp,
-        "normalized.S1": cues.normalized_stokes[0],
-        "normalized.S2": cues.normalized_stokes[1],
-        **{f"diffuse_color.{c}": cues.diffuse_color[..., k] for k, c in enumerate("RGB")},
-        **_separated(cues),
-    }
-
-
-def _separated(cues: Cues) -> dict[str, Floats]:
-    """S0 in two parts, where a crossed shot tells them apart; else nothing."""
-    if cues.body is None or cues.body_known is None:
-        return {}
-    body = _kept(cues.body, cues.body_known)
-    mirrored = _kept(np.maximum(cues.radiance - cues.body, 0), cues.body_known)
-    parts = {"scattered": body, "mirrored": mirrored}
-    return {f"{name}.{c}": part[..., k] for name, part in parts.items() for k, c in enumerate("RGB")}
-
-
-_Source = Literal["maps", "mesh", "stokes", "cues"]
-_Made = Mapping[str, tuple[tuple[_Source, ...], Callable[..., Any]]]  # what a file is made from, and its content
-_EXRS: _Made = {
-    "depth.exr": (("maps", "mesh"), lambda maps, mesh: {"Z": _depth(maps, mesh)}),
-    "normal.exr": (("maps",), lambda maps: _channels("RGB", _seen(maps, maps.normal))),
-    "diffuse.exr": (("maps",), lambda maps: _channels("RGB", _seen(maps, maps.diffuse))),
-    "specular.exr": (("maps",), lambda maps: _channels("RGB", _seen(maps, maps.specular))),
-    "roughness.exr": (("maps",), lambda maps: {"Y": _seen(maps, maps.roughness)}),
-    "confidence.exr": (("maps",), lambda maps: {"Y": _seen(maps, maps.confidence)}),
-    "stokes.exr": (("stokes",), _stokes_channels),
-    "cues.exr": (("cues",), _cue_channels),
-}
-_WHOLE = ("depth", "normal")  # of 32 bits; the others are half
-_PNGS: _Made = {
-    "depth.png": (("maps", "mesh"), _depth_picture),
-    "normal.png": (("maps",), _normal_picture),
-    "diffuse.png": (("maps",), lambda maps: color.srgb_eight_bits(_seen(maps, maps.diffuse))),
-    "specular.png": (("maps",), lambda maps: color.srgb_eight_bits(_seen(maps, maps.specular))),
-    "roughness.png": (("maps",), lambda maps: png.sixteen_bits(_seen(maps, maps.roughness))),
-    "photograph.png": (("cues",), lambda cues: color.srgb_eight_bits(cues.radiance)),
-    "mask.png": (("maps",), lambda maps: np.where(_inside(maps), 255, 0).astype(np.uint8)),
-}

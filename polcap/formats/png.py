@@ -24,15 +24,17 @@ _LEVEL = 2  # 4 takes a third longer for one to four per cent of the bytes
 _HEADER = 33  # bytes of the signature and of IHDR, which stands first
 
 
-def write(path: Path, array: Pixels) -> None:
+def write(path: Path, array: Pixels, held: atomic.Held | None = None) -> None:
     """Write (H, W), (H, W, 3) RGB or (H, W, 4) RGBA, uint8 or uint16; the same array gives the same bytes.
+
+    Where the file is `held`, it gets its name with others.
 
     Raises
     ------
     StorageError
         The file cannot be written.
     """
-    with atomic.path(path) as temporary:
+    with atomic.path(path, held=held) as temporary:
         temporary.write_bytes(encode(array))
 
 

@@ -56,15 +56,28 @@ class Written:
         write
             Makes `file`.
         """
-        name = file.relative_to(self._out).as_posix()
-        mark = digest([self._program, made_from])
-        if self._before.made_from.get(name) != mark or self._before.files.get(name) != _stat(file):
+        name, mark = self._name(file), digest([self._program, made_from])
+        if not self._is(name, mark, file):
             write()
         self._made[name] = mark
 
+    def stands(self, file: Path, made_from: Any) -> bool:
+        """The file is as the last run left it, which made it from this; it is taken over then."""
+        name, mark = self._name(file), digest([self._program, made_from])
+        if not self._is(name, mark, file):
+            return False
+        self._made[name] = mark
+        return True
+
     def note(self, file: Path, made_from: Any) -> None:
-        """Write down what a file that `make` does not decide on was made from, for `stand`."""
-        self._made[file.relative_to(self._out).as_posix()] = digest([self._program, made_from])
+        """Write down what a file that `make` does not decide on was made from."""
+        self._made[self._name(file)] = digest([self._program, made_from])
+
+    def _is(self, name: str, mark: str, file: Path) -> bool:
+        return self._before.made_from.get(name) == mark and self._before.files.get(name) == _stat(file)
+
+    def _name(self, file: Path) -> str:
+        return file.relative_to(self._out).as_posix()
 
     def stand(self, files: Sequence[Path], made_from: Any) -> bool:
         """Every file is as the last run left it, and it noted the first as made from this; they are taken over then."""

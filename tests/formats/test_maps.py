@@ -3,11 +3,12 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from polcap.errors import DecodeError
+from polcap.errors import DecodeError, ObjectError, StorageError
 from polcap.formats import exr, maps, png
 from polcap.images import ColorCalibration, Cues, Mesh, StokesImage, SurfaceMaps
 from polcap.stages import cues
@@ -50,6 +51,38 @@ def folder(result: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("result") / "maps"
     write(folder, *result)
     return folder
+
+
+@pytest.mark.parametrize("threads", ["1", "3"])
+def test_a_file_that_cannot_be_written_leaves_all_as_they_were(
+    result: Result, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: str
+) -> None:
+    """One of those that are encoded beside other work: its error comes out, and no file of the new result is there."""
+    monkeypatch.setenv("OMP_NUM_THREADS", threads)
+    write(tmp_path / "maps", *result)
+    before = {file.name: file.stat().st_mtime_ns for file in (tmp_path / "maps").iterdir()}
+    assert {name: (tmp_path / "maps" / name).read_bytes() for name in FILES} == {
+        name: (folder / name).read_bytes() for name in FILES
+    }
+    keep = exr.write
+
+    def refuse(path: Path, *given: Any, **more: Any) -> None:
+        if path.name == "cues.exr":
+            raise StorageError(f"cannot write {path}: the disk is full")
+        keep(path, *given, **more)
+
+    monkeypatch.setattr(exr, "write", refuse)
+    with pytest.raises(StorageError, match=r"cues\.exr: the disk is full"):
+        write(tmp_path / "maps", *result)
+    assert {file.name: file.stat().st_mtime_ns for file in (tmp_path / "maps").iterdir()} == before
+
+
+def test_what_fails_beside_the_writing_leaves_maps_as_they_were(result: Result, tmp_path: Path) -> None:
+    of, _, stokes, cues = result
+    with pytest.raises(ObjectError), maps.writing(tmp_path / "maps") as files:
+        files.begin({"maps": Known(of), "stokes": Known(stokes), "cues": Known(cues)})
+        raise ObjectError("the surface cannot be integrated")
+    assert not any(path.is_file() for path in tmp_path.rglob("*"))
 
 
 def test_every_promised_file_is_there_and_described(folder: Path) -> None:
