@@ -227,10 +227,12 @@ def test_user_mask_replaces_the_search(result: Path, example: Path, polcap: Comm
     assert results.object_.value.source == "user" and np.array_equal(results.object_.value.mask, drawn > 0)
 
 
-def test_watch_goes_on_as_the_photographs_come_in(example: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "c"
+def test_watch_goes_on_as_photographs_come_in_and_settings_change(example: Path, tmp_path: Path) -> None:
+    folder, settings = tmp_path / "c", tmp_path / "settings.toml"
+    settings.write_text("")
     shutil.copytree(example / "pol000", folder / "pol000")
     command = [sys.executable, "-m", "polcap", "process", str(folder), "--watch", "--dry-run", "--json"]
+    command += ["--config", str(settings)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None and process.stderr is not None
@@ -243,6 +245,9 @@ def test_watch_goes_on_as_the_photographs_come_in(example: Path, tmp_path: Path)
         while not plan.endswith("\n}\n"):
             plan += process.stdout.readline()
         assert len(json.loads(plan)["capture"]["shots"]) == 3
+        settings.write_text("[asset]\nior = 9\n")
+        told = [process.stderr.readline() for _ in range(2)]
+        assert told[0].startswith("watching") and told[1].startswith("polcap: asset.ior = 9"), told
         process.send_signal(signal.SIGINT)
         assert process.wait(300) == 130
     finally:

@@ -25,6 +25,12 @@ _SETTINGS = {  # each of what Dask does beside the work takes its time from a co
 }  # fmt: skip
 
 
+def begin(address: str) -> None:
+    """Have what workers of this machine need imported, while the caller imports what it needs itself."""
+    if address == _LOCAL:
+        worker_start.begin("distributed")
+
+
 def run(
     wanted: Sequence[Unit], order: Order, address: str, workers: int, retries: int, tell: Callable[[str], None]
 ) -> Iterator[Record]:
@@ -38,8 +44,7 @@ def run(
     SettingError
         Dask is not installed, or nobody answers at that address.
     """
-    if address == _LOCAL:
-        worker_start.context("distributed")  # begins to load while Dask is imported here
+    begin(address)
     try:
         import dask
         import distributed

@@ -1,4 +1,4 @@
-"""In: nothing. Out: what every capture needs, imported, also what the path itself imports only when it comes to it.
+"""In: nothing. Out: what every capture needs, imported or made, also what the path itself comes to only later.
 
 Imported by the process that workers are forked from. Nothing here may start a thread: a fork would not copy it. So
 onnxruntime, whose import starts one, is left to each worker.
@@ -9,4 +9,8 @@ import scipy.special  # noqa: F401
 
 from polcap import models, pipeline  # noqa: F401
 from polcap.batch import thumbnail, unit  # noqa: F401
-from polcap.formats import capture  # noqa: F401
+from polcap.formats import capture, provenance  # noqa: F401
+from polcap.optics import body
+
+body.make_tables()
+provenance.versions()

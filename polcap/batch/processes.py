@@ -24,9 +24,9 @@ class _Hand:
 
     @staticmethod
     def start(order: Order) -> "_Hand":
-        begin = worker_start.context()
-        here, there = begin.Pipe()
-        process = begin.Process(target=_serve, args=(there, order, dict(os.environ)), daemon=False)
+        context = worker_start.context()
+        here, there = context.Pipe()
+        process = context.Process(target=_serve, args=(there, order, dict(os.environ)), daemon=False)
         process.start()
         there.close()
         return _Hand(process, here)
@@ -44,6 +44,7 @@ class _Hand:
 
 def run(wanted: Sequence[Unit], order: Order, workers: int, retries: int) -> Iterator[Record]:
     """Records in the order in which units end; a unit that kills its process is tried `retries` times more."""
+    worker_start.begin()
     queue = deque((unit, 1) for unit in wanted)
     hands = [_Hand.start(order) for _ in range(min(workers, len(wanted)))]
     try:

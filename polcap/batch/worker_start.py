@@ -16,11 +16,15 @@ def method() -> str:
     return "forkserver" if sys.platform == "linux" else "spawn"
 
 
-def context(*also: str) -> Any:
-    """The multiprocessing context of workers; the server begins to import, these modules too, meanwhile."""
+def begin(*also: str) -> None:
+    """Have the server import what workers need, and these modules, while the caller goes on."""
     if method() == "forkserver":
         from multiprocessing import forkserver
 
         forkserver.set_forkserver_preload([*_LOADED, *also])
         forkserver.ensure_running()
+
+
+def context() -> Any:
+    """The multiprocessing context of workers."""
     return multiprocessing.get_context(method())

@@ -44,6 +44,10 @@ def batch(
     model: Model = None,
 ) -> None:
     """Process every capture below a folder; what is finished is left alone, what breaks does not stop the rest."""
+    if scheduler is not None and write_jobs is None:
+        from polcap.batch import cluster
+
+        cluster.begin(scheduler)
     import msgspec
 
     from polcap import batch as batches

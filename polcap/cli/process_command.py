@@ -1,6 +1,6 @@
 """In: a capture folder and options. Out: its maps, asset and verdict, once or at every change: `polcap process`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -35,7 +35,8 @@ def process(
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what was understood, and stop.")] = False,
     watch: Annotated[
-        bool, typer.Option("--watch", help="Stay: process again whenever the folder has changed; Ctrl-C ends.")
+        bool,
+        typer.Option("--watch", help="Stay: process again whenever the folder or --config has changed; Ctrl-C ends."),
     ] = False,
     json: Json = False,
     device: Device = "cpu",
@@ -78,7 +79,7 @@ def process(
         capture,
         target,
         options.angles_deg(angles),
-        settings.load(config, assignments or ()),
+        partial(settings.load, config, assignments or ()),
         cache(partial(_user_input, options.chart_request(chart, no_chart), mask, estimator, model, device, threads)),
         until,
         force,
@@ -88,7 +89,9 @@ def process(
         [] if watch else [first],
     )
     if watch:
-        _whenever_settled(capture, run.target, run.plan if dry_run else run.process)
+        run.settings()  # what is wrong with them now ends the command
+        edited = [] if config is None else [config]
+        _whenever_settled(capture, run.target, edited, run.plan if dry_run else run.process)
     elif dry_run:
         run.plan()
     else:
@@ -102,7 +105,7 @@ class _Run:
     folder: Path  # of the photographs
     target: Path
     angles_deg: tuple[float, ...] | None
-    config: "Config"
+    settings: "Callable[[], Config]"  # reads them anew
     user_input: "Callable[[], UserInput]"  # loads the networks, when it is first called
     until: str | None
     force: str | None
@@ -116,8 +119,8 @@ class _Run:
         from polcap import pipeline, report
         from polcap.formats import capture as captures
 
-        found = self.understood()
-        stages = pipeline.plan(found, self.user_input(), self.config, self.target, self.force)
+        config, found = self.settings(), self.understood()
+        stages = pipeline.plan(found, self.user_input(), config, self.target, self.force)
         if self.json:
             terminal.say({"capture": report.capture_facts(found), "stages": stages})
         else:
@@ -134,14 +137,12 @@ class _Run:
         from polcap.formats import capture as captures
         from polcap.path import STAGES
 
-        supplied = self.user_input()
+        config, supplied = self.settings(), self.user_input()
         found = self.understood()
         table = captures.table(found)
         terminal.tell(table)
         with terminal.progress(len(STAGES) + 1) as bar:
-            about = pipeline.process(
-                found, supplied, self.config, self.target, self.until, self.force, bar.stage, bar.frame
-            )
+            about = pipeline.process(found, supplied, config, self.target, self.until, self.force, bar.stage, bar.frame)
         self.look().remember()
         if about is None:
             work = str(self.target / "work")
@@ -214,13 +215,16 @@ def _tell_result(about: dict[str, Any], out: Path, json: bool) -> None:
     terminal.tell_gates(about)
 
 
-def _whenever_settled(capture: Path, target: Path, once: Callable[[], None]) -> None:
-    """Process a folder as it is and after each change; what is wrong with it is said, and it is looked at further."""
+def _whenever_settled(capture: Path, target: Path, edited: Sequence[Path], once: Callable[[], None]) -> None:
+    """Process a folder as it is and after each change of it or of the `edited` files.
+
+    What is wrong with it is said, and it is looked at further.
+    """
     from polcap.formats import arrivals
 
     if not capture.is_dir():
         raise SettingError(f"{capture} is no folder; --watch needs the one that the photographs go to")
-    for _ in arrivals.settled(capture, target):
+    for _ in arrivals.settled(capture, target, edited=edited):
         try:
             once()
         except (InputError, GateError, OSError) as error:  # a frame may have gone between two looks

@@ -1,30 +1,42 @@
-"""In: a folder that a camera or a person is filling. Out: each moment at which it has changed and come to rest."""
+"""In: a folder that a camera or a person is filling, files that somebody edits. Out: when to look at them again."""
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-_POLL_S = 0.2
+_POLL_S = 0.1
 
 Seen = dict[str, tuple[int, int]]  # size and time of change by path
 
 
-def settled(folder: Path, ignored: Path, still_s: float = 2.0) -> Iterator[None]:
-    """Yield at once, then whenever files came, went or changed and then nothing moved for `still_s` seconds.
+def settled(folder: Path, ignored: Path, still_s: float = 2.0, edited: Sequence[Path] = ()) -> Iterator[None]:
+    """Yield at once, then whenever files came, went or changed and came to rest.
 
-    `ignored` is not looked at (what is made of the folder may lie in it), nor is what begins with a dot.
+    Parameters
+    ----------
+    folder
+        It rests when nothing in it has moved for `still_s` seconds.
+    ignored
+        Not looked at (what is made of the folder may lie in it), nor is what begins with a dot.
+    still_s
+        As said.
+    edited
+        Files beside it that are written in one go, as editors save: they rest at the next look.
     """
     folder, ignored = folder.resolve(), ignored.resolve()
-    done: Seen | None = None
-    last, since = _seen(folder, ignored), time.monotonic()
+    done: tuple[Seen, Seen] | None = None
+    last, texts, since = _seen(folder, ignored), _stats(edited), time.monotonic()
     while True:
-        now = _seen(folder, ignored)
+        now, texts_now = _seen(folder, ignored), _stats(edited)
         if now != last:
-            last, since = now, time.monotonic()
-        elif now != done and (done is None or time.monotonic() - since >= still_s):
-            done = now
+            since = time.monotonic()
+        still = done is None or now == done[0] or time.monotonic() - since >= still_s
+        if (now, texts_now) == (last, texts) != done and still:
+            done = now, texts_now
             yield
+        else:
+            last, texts = now, texts_now
         time.sleep(_POLL_S)
 
 
@@ -34,12 +46,17 @@ def _seen(folder: Path, ignored: Path) -> Seen:
     for root, folders, files in os.walk(folder):
         here = Path(root)
         folders[:] = [name for name in folders if not name.startswith(".") and (here / name) != ignored]
-        for name in files:
-            if name.startswith("."):
-                continue
-            try:
-                about = (here / name).stat()
-            except OSError:
-                continue
-            found[str(here / name)] = about.st_size, about.st_mtime_ns
+        found |= _stats(here / name for name in files if not name.startswith("."))
+    return found
+
+
+def _stats(files: Iterable[Path]) -> Seen:
+    """Of those that are there."""
+    found: Seen = {}
+    for file in files:
+        try:
+            about = file.stat()
+        except OSError:
+            continue
+        found[str(file)] = about.st_size, about.st_mtime_ns
     return found

@@ -100,6 +100,12 @@ def flatter(cos_i: Any, cos_o: Any, between: Any, alpha: Any) -> Any:
     return 1 + strength * xp.clip(between - cos_i * cos_o, 0.0, None) / (greater * (1 + greater))
 
 
+def make_tables() -> None:
+    """Make what `leaving` and `flatter` look up: a third of a second that else the first of them to be called takes."""
+    _table()
+    _strengths()
+
+
 def _looked_up(c: Any, alpha: Any, ior: Any) -> tuple[Any, Any, Any]:
     """`_table` at any place, trilinear."""
     xp = array_namespace(c)

@@ -62,3 +62,24 @@ def test_tells_when_a_file_goes(tmp_path: Path, clock: Clock) -> None:
     clock.meanwhile = partial((tmp_path / "a.dng").unlink, missing_ok=True)
     next(moments)
     assert not (tmp_path / "a.dng").exists()
+
+
+def test_an_edited_file_rests_at_once_but_not_beside_photographs_that_come(tmp_path: Path, clock: Clock) -> None:
+    folder, settings = tmp_path / "capture", tmp_path / "settings.toml"
+    folder.mkdir()
+    moments = arrivals.settled(folder, folder / "polcap", still_s=2.0, edited=[settings])
+    next(moments)
+    settings.write_text("[asset]")
+    next(moments)
+    assert clock.now < 1.0
+    begun = clock.now
+
+    def both() -> None:
+        if clock.now < begun + 1.5:
+            with (folder / "a.dng").open("ab") as file:
+                file.write(bytes(100))
+            settings.write_text(f"# {clock.now:.1f}")
+
+    clock.meanwhile = both
+    next(moments)
+    assert clock.now >= begun + 3.3
