@@ -36,7 +36,7 @@ from polcap.formats.encoders import Encoder, Kind
 from polcap.formats.presets import PRESETS, Format, Preset
 from polcap.formats.texture_set import Key, Texture
 from polcap.formats.written import Written
-from polcap.images import Asset
+from polcap.images import Asset, SurfaceMaps
 from polcap.path import Results
 from polcap.stages import asset, surface
 from polcap.store import Derived, digest
@@ -97,18 +97,17 @@ def export(
     usual = made is not None and wanted == Wanted()
     if usual and (stood := _described(out / "asset", about, source, standing)):
         return stood
-    earlier, whole = _earlier(out / "asset", source, standing)
     encoder = Encoder()
+    albedo = Derived(maps.key, _stored_maps, (maps,))
+    if made is not None:
+        albedo = Derived(maps.key, maps_folder.albedo_as_read, (made.maps,))
+    earlier = _earlier(out / "asset", source, standing, partial(_indexed, albedo, settings.asset))
     if earlier is None:
         built = assembled(maps.value, settings)
     else:
         built = earlier.asset
-        if not whole:
-            albedo = maps.value.maps if made is None else maps_folder.albedo_as_read(made.maps.value)
-            built = asset.at_index(built, albedo, settings.asset)
-        before = gltf.textures(earlier.asset)
         for key, texture in gltf.textures(built).items():
-            if whole or texture.pixels is before[key].pixels:
+            if key in earlier.pngs:
                 encoder.know(texture, "png", earlier.pngs[key])
     lods, levels = [], []
     if wanted.lod:
@@ -171,7 +170,8 @@ def _described(folder: Path, about: Mapping[str, Any], source: _Source, standing
     glb, sidecar = folder / f"{name}.glb", folder / f"{name}{_SIDECAR}"
     made_from, record = msgspec.to_builtins(source), provenance.record(about)
     try:
-        written = [folder / file for file in text_file.read_json(sidecar)["files"]]
+        digests = dict(text_file.read_json(sidecar)["files"])
+        written = [folder / file for file in digests]
         if not standing.stand([glb, sidecar, folder.parent / "maps" / "maps.json", *written], made_from):
             return []
     except (OSError, ValueError, LookupError, TypeError):
@@ -179,30 +179,55 @@ def _described(folder: Path, about: Mapping[str, Any], source: _Source, standing
     data = gltf.described(glb.read_bytes(), provenance.words(record))
     with atomic.path(glb) as temporary:
         temporary.write_bytes(data)
-    provenance.write(sidecar, {**record, "made_from": made_from}, written)
+    provenance.write(sidecar, {**record, "made_from": made_from}, {**digests, glb.name: provenance.digest(glb)})
     return [*written, sidecar]
 
 
-def _earlier(folder: Path, source: _Source, standing: Written) -> tuple[glb_reader.Stored | None, bool]:
-    """What an export in asset/ or one of its folders holds, where the mesh in it was made from `source`, or None.
+def _stored_maps(stored: maps_folder.Stored) -> SurfaceMaps:
+    return stored.maps
 
-    And whether its colors were made from it, too: of the same maps, they differ in the refractive index alone.
+
+def _indexed(maps: Derived[SurfaceMaps], settings: asset.Settings) -> asset.Indexed:
+    return asset.indexed(maps.value, settings)
+
+
+def _earlier(
+    folder: Path, source: _Source, standing: Written, indexed: Callable[[], asset.Indexed]
+) -> glb_reader.Stored | None:
+    """The asset of an export in asset/ or one of its folders whose mesh was made from `source`, or None.
+
+    Where its colors were made from another index of the same maps, with those that are `indexed` now instead, which is
+    found out while the file is read.
     """
-    found: tuple[glb_reader.Stored | None, bool] = (None, False)
+    for whole, glb, made_from, told in _alike(folder, source):
+        try:
+            with ThreadPoolExecutor(1) as beside:
+                reading = beside.submit(glb_reader.read, glb, told, standing.stand([glb], made_from))
+                changed = {} if whole else vars(indexed())
+                found = reading.result()
+        except (OSError, ValueError, DecodeError):
+            continue  # touched since: as if it were not there
+        if whole:
+            return found
+        pngs = {key: data for key, data in found.pngs.items() if key != "basecolor"}
+        return glb_reader.Stored(replace(found.asset, **changed), pngs)
+    return None
+
+
+def _alike(folder: Path, source: _Source) -> list[tuple[bool, Path, Any, str]]:
+    """Whether colors too, file, what its sidecar tells that it was made from, its digest; the wholly alike first."""
+    found = []
     for sidecar in sorted([*folder.glob(f"*{_SIDECAR}"), *folder.glob(f"*/*{_SIDECAR}")]):
         glb = sidecar.with_name(f"{sidecar.name.removesuffix(_SIDECAR)}.glb")
         try:
             told = text_file.read_json(sidecar)
             made_from = msgspec.convert(told["made_from"], _Source)
-            whole = made_from == source
-            if whole or (made_from.mesh == source.mesh and found[0] is None):
-                ours = standing.stand([glb], told["made_from"])
-                found = glb_reader.read(glb, told["files"][glb.name], ours), whole
-        except (OSError, ValueError, LookupError, TypeError, DecodeError):
-            continue  # of another program, or touched since: as if it were not there
-        if found[1]:
-            break
-    return found
+            digest_then = msgspec.convert(told["files"][glb.name], str)
+        except (OSError, ValueError, LookupError, TypeError):
+            continue  # of another program, or touched since
+        if made_from.mesh == source.mesh:
+            found.append((made_from == source, glb, told["made_from"], digest_then))
+    return sorted(found, key=lambda one: not one[0])
 
 
 def _preset(wanted: Wanted) -> Preset:
@@ -211,6 +236,11 @@ def _preset(wanted: Wanted) -> Preset:
     if wanted.preset not in PRESETS:
         raise SettingError(f"--preset {wanted.preset} is none of {', '.join(PRESETS)}")
     return PRESETS[wanted.preset]
+
+
+def _digested(task: Callable[[], list[Path]]) -> dict[Path, str]:
+    """The files that a task writes, with their digests."""
+    return {file: provenance.digest(file) for file in task()}
 
 
 @dataclass(frozen=True)
@@ -243,12 +273,13 @@ class _Job:
         tasks += [partial(self._lod, k) for k in range(1, len(self.lods) + 1)]
         tasks += [partial(self._texture, file, made) for file, made in self.loose.items()]
         with ThreadPoolExecutor(len(tasks)) as pool:
-            running = [pool.submit(task) for task in tasks]
-            written = [file for one in running for file in one.result()]
+            running = [pool.submit(_digested, task) for task in tasks]
+            written = {file: told for one in running for file, told in one.result().items()}
         sidecar = self.folder / f"{self.stem}{_SIDECAR}"
         whole = self.source and "gltf" in self.preset.formats and self.images == "png"
         made_from = msgspec.to_builtins(self.source) if whole else None
-        provenance.write(sidecar, {**self.record, "made_from": made_from}, written)
+        digests = {file.name: told for file, told in written.items()}
+        provenance.write(sidecar, {**self.record, "made_from": made_from}, digests)
         return [*written, sidecar]
 
     @cached_property

@@ -22,6 +22,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
 from hashlib import blake2b, sha256
@@ -38,6 +39,7 @@ from polcap.formats import atomic, npy_folder
 from polcap.stages import Stage
 
 T = TypeVar("T")
+_READERS = 2  # threads that compare digests: the memory gives no more
 FORMAT = 3  # of work/; raised when older folders can no longer be read
 UNDIGESTED = ("seconds", "digest")  # of a manifest: no two runs take the same time
 Progress = Callable[[str, float | None, bool], None]  # stage, seconds (None: begins), found in the cache
@@ -336,16 +338,20 @@ def read(place: Path, hint: Any, check: bool = True, most: float = math.inf) -> 
     about = manifest(place)
     if not about:
         raise StorageError(f"{place}: no whole result of this polcap's cache format {FORMAT}; run `polcap process`")
-    for name, expected in about["files"].items() if check else ():
-        if expected[0] > most:
-            continue
-        try:
-            found = npy_folder.checksum(place / name)
-        except OSError:
-            found = None
-        if found != expected:
-            raise StorageError(f"{place / name} is damaged; delete {place} and run again")
+    compared = {place / name: told for name, told in about["files"].items() if told[0] <= most} if check else {}
+    with ThreadPoolExecutor(_READERS) as pool:
+        for (file, expected), found in zip(compared.items(), pool.map(_checksum, compared)):
+            if found != expected:
+                raise StorageError(f"{file} is damaged; delete {place} and run again")
     return npy_folder.decode(about["value"], hint, place)
+
+
+def _checksum(file: Path) -> list[Any] | None:
+    """As `npy_folder.checksum`; None where the file cannot be read."""
+    try:
+        return npy_folder.checksum(file)
+    except OSError:
+        return None
 
 
 def returns(stage: Stage[..., Any]) -> Any:

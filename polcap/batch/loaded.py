@@ -4,6 +4,8 @@ Imported by the process that workers are forked from. Nothing here may start a t
 onnxruntime, whose import starts one, is left to each worker.
 """
 
+import gc
+
 import scipy.sparse.linalg
 import scipy.special  # noqa: F401
 
@@ -14,3 +16,4 @@ from polcap.optics import body
 
 body.make_tables()
 provenance.versions()
+gc.freeze()  # else each worker's first look for garbage writes to, and so copies, all that is shared

@@ -16,6 +16,7 @@ training_commands  train, evaluate
 options            what several commands share, and the values it means
 """
 
+import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -98,6 +99,7 @@ def main() -> None:
         arguments = ["--debug", *(argument for argument in arguments if argument != "--debug")]
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]  # names of files are bytes
+    gc.disable()  # until a command begins: see `resource_limits.no_garbage`
     app(arguments)
 
 

@@ -68,8 +68,10 @@ def process(
     # in the child, or from memory, while all else is imported
     first = beside.submit(_understood, capture, options.angles_deg(angles), look)
     beside.shutdown(wait=False)
-    from polcap import config as settings
-    from polcap.path import STAGES
+    with resource_limits.no_garbage():
+        from polcap import config as settings
+        from polcap import pipeline  # noqa: F401 — it is needed soon
+        from polcap.path import STAGES
 
     resource_limits.set_memory(memory)
     for flag, stage in (("--until", until), ("--force", force)):

@@ -66,7 +66,8 @@ def load(
     path = Path(path)
     data = _bytes(path)
     mark = digest(data)
-    if later and device == "cpu" and mark in _shipped():
+    shipped = path in _shipped_files() or mark in _shipped()
+    if later and device == "cpu" and shipped:
         try:
             metadata: Mapping[str, str] = onnx_metadata.read(data)
         except ValueError as error:
@@ -75,7 +76,7 @@ def load(
         return Network(model, mark, _stated(path, metadata, encoding), metadata, CPU)
     import onnxruntime
 
-    if mark not in _shipped():
+    if not shipped:
         _try(path, mark, encoding)
     if device == "cuda" and CUDA not in onnxruntime.get_available_providers():
         raise ModelError("--device cuda: this onnxruntime has no CUDA; install onnxruntime-gpu, or use --device cpu")
@@ -183,10 +184,15 @@ def _try(path: Path, expected: str, encoding: str) -> None:
 
 
 @cache
+def _shipped_files() -> frozenset[Path]:
+    """The models that come with polcap."""
+    return frozenset(calib.data_path("colorchecker").parent.glob("models/*.onnx"))
+
+
+@cache
 def _shipped() -> frozenset[str]:
-    """Digests of the models that come with polcap."""
-    files = calib.data_path("colorchecker").parent.glob("models/*.onnx")
-    return frozenset(digest(file.read_bytes()) for file in files)
+    """Their digests."""
+    return frozenset(digest(file.read_bytes()) for file in _shipped_files())
 
 
 def _bytes(path: Path) -> bytes:

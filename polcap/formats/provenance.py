@@ -1,8 +1,7 @@
 """In: a result's report and the files of an export. Out: what they were made from, as a sidecar and as words."""
 
 import json
-from collections.abc import Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -58,23 +57,21 @@ def words(facts: Mapping[str, Any]) -> dict[str, str]:
     return {key: value if isinstance(value, str) else _plain(value) for key, value in facts.items()}
 
 
-def write(path: Path, facts: Mapping[str, Any], files: Iterable[Path]) -> None:
-    """The sidecar: the record, and the digest of every file of the export.
+def write(path: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> None:
+    """The sidecar: the record, and the `digest` of every file of the export by its name.
 
     Raises
     ------
     StorageError
         The file cannot be written.
     """
-    listed = sorted(files)
-    with ThreadPoolExecutor(2) as pool:
-        digests = dict(zip((file.name for file in listed), pool.map(_digest, listed)))
     with atomic.path(path) as temporary:
-        text = json.dumps({**facts, "files": digests}, indent=1, ensure_ascii=False)
+        text = json.dumps({**facts, "files": dict(sorted(digests.items()))}, indent=1, ensure_ascii=False)
         temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")  # names of files are bytes
 
 
-def _digest(file: Path) -> str:
+def digest(file: Path) -> str:
+    """What a sidecar tells of a file."""
     return photo_bytes.digest(file.read_bytes())
 
 

@@ -80,14 +80,19 @@ def colors(maps: SurfaceMaps, settings: Settings) -> Colors:
     )
 
 
-def at_index(asset: Asset, maps: SurfaceMaps, settings: Settings) -> Asset:
-    """The asset of the same maps with the refractive index of other settings.
+@dataclass(frozen=True)
+class Indexed:
+    """What of an asset depends on the refractive index; fields as of `Asset`."""
 
-    Only the base color, the factor of the specular texture and the index itself depend on it.
-    """
+    base_color: NDArray[np.uint8]
+    specular_factor: tuple[float, float, float]
+    ior: float
+
+
+def indexed(maps: SurfaceMaps, settings: Settings) -> Indexed:
+    """All that other settings change in the asset of the same maps."""
     greatest = np.clip(_greatest(maps.specular), 0.0, 1.0)
-    return replace(
-        asset,
+    return Indexed(
         base_color=filled(_base(maps.diffuse, greatest, settings), _unmixed(maps.mask)),
         specular_factor=_factor(_top(maps.mask, greatest), settings),
         ior=settings.ior,
