@@ -7,6 +7,7 @@ waits. With one thread each task is done where it is asked for.
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from threading import Lock
 from types import TracebackType
 from typing import Generic, Self, TypeVar
 
@@ -19,6 +20,21 @@ def threads() -> int:
     if asked.isascii() and asked.isdecimal() and int(asked):
         return int(asked)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class Once(Generic[T]):
+    """A value that is made when it is first asked for, once whichever threads ask."""
+
+    def __init__(self, make: Callable[[], T]) -> None:
+        self._make, self._lock = make, Lock()
+        self._made: list[T] = []
+
+    def __call__(self) -> T:
+        """The value, or what making it raises."""
+        with self._lock:
+            if not self._made:
+                self._made.append(self._make())
+            return self._made[0]
 
 
 class Task(Generic[T]):

@@ -22,9 +22,11 @@ from polcap.formats import animation, atomic, layouts, png, provenance, text_fil
 from polcap.formats import maps as maps_folder
 from polcap.formats.written import Written
 from polcap.images import Capture, Frame, Network, SensorImage, Shot
+from polcap.parallel import Beside, finished
 from polcap.path import STAGES, Results, UserInput, path
 from polcap.pictures import moving
 from polcap.remembered import Remembered
+from polcap.report import page
 from polcap.store import Archive, Progress, Store, contents, seal, silent
 
 
@@ -93,7 +95,10 @@ def _processed(
             facts = report.capture_facts(capture)
             about = report.document(facts, results, config, supplied.network, timings(out), remembered)
             files.finish()
-        asset_export.export(out, about, Wanted(), written, results)
+        with Beside() as beside:
+            drawn = [beside.begin(piece) for piece in page.pieces(about, results, remembered).values()]
+            asset_export.export(out, about, Wanted(), written, results)
+            finished(drawn)
         report.write(out, about, results, remembered)
         written.remember()
         progress("write", time.perf_counter() - start, False)

@@ -1,6 +1,7 @@
 """Tasks side by side: each is done once, their results come in order, and so do their errors."""
 
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import pytest
@@ -60,3 +61,22 @@ def test_the_number_of_threads_is_what_was_asked_for(monkeypatch: pytest.MonkeyP
     for nothing in ("", "0", "all", "²"):
         monkeypatch.setenv("OMP_NUM_THREADS", nothing)
         assert parallel.threads() >= 1
+
+
+def test_a_value_is_made_once_whichever_threads_ask() -> None:
+    made: list[int] = []
+    here = threading.Barrier(4)
+
+    def make() -> int:
+        made.append(1)
+        return 7
+
+    once = parallel.Once(make)
+
+    def ask() -> int:
+        here.wait(60)
+        return once()
+
+    with ThreadPoolExecutor(4) as pool:
+        assert [one.result(60) for one in [pool.submit(ask) for _ in range(4)]] == [7] * 4
+    assert made == [1]

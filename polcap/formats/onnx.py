@@ -16,13 +16,14 @@ limit. The only module that imports onnxruntime.
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cache, partial
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from polcap import parallel
 from polcap.errors import DecodeError, ModelError
 from polcap.formats import calib, onnx_metadata, text_file, worker
 from polcap.images import Floats, Network
@@ -36,6 +37,7 @@ Device = Literal["cpu", "cuda", "auto"]
 _MOST_BYTES = 1 << 30  # of a model; the one that is shipped has 15 MB
 _TRIAL_S, _TRIAL_GIB, _TRIAL_PX = 60.0, 4.0, 64
 _RUN_S = 300.0  # the shipped model takes 2 s for a picture on one core
+_AT_ONCE = 4  # runs side by side, at most: positions that a network looks from
 _MOST_NUMBER = 1 << 16  # px; of what the metadata state
 
 
@@ -51,7 +53,7 @@ def load(
     device
         `cuda` fails where the provider is missing or does not start; `auto` takes it where it starts.
     threads
-        0 leaves their number to the runtime.
+        0 is as many as may run.
     encoding
         Of the channels that the model must eat.
     later
@@ -72,8 +74,8 @@ def load(
             metadata: Mapping[str, str] = onnx_metadata.read(data)
         except ValueError as error:
             raise ModelError(f"{path}: is damaged ({error}); install polcap again") from error
-        model = Model(path, partial(_reopen, path, mark, threads))
-        return Network(model, mark, _stated(path, metadata, encoding), metadata, CPU)
+        model = Model(path, parallel.Once(partial(_reopen, path, mark, threads)))
+        return Network(model, mark, _stated(path, metadata, encoding), metadata, CPU, at_once=_at_once(CPU, threads))
     import onnxruntime
 
     if not shipped:
@@ -87,7 +89,8 @@ def load(
         raise ModelError("--device cuda: CUDA does not start; make driver, CUDA and cuDNN fit, or use --device cpu")
     metadata = _metadata(path, session)
     channels = _check(path, session, metadata, encoding)
-    return Network(Model(path, lambda: session), mark, channels, metadata, provider)
+    model = Model(path, lambda: session)
+    return Network(model, mark, channels, metadata, provider, at_once=_at_once(provider, threads))
 
 
 def digest(data: bytes) -> str:
@@ -103,10 +106,6 @@ class Model:
     opened: Callable[[], Any]  # its session
     limit_s: float = _RUN_S
 
-    @cached_property
-    def session(self) -> Any:
-        return self.opened()
-
     def __call__(self, inputs: Floats) -> dict[str, Floats]:
         """Run it.
 
@@ -117,15 +116,16 @@ class Model:
         """
         import onnxruntime
 
-        entry = self.session.get_inputs()[0]
+        session = self.opened()
+        entry = session.get_inputs()[0]
         dtype = np.float16 if entry.type == "tensor(float16)" else np.float32
-        names = [output.name for output in self.session.get_outputs()]
+        names = [output.name for output in session.get_outputs()]
         options = onnxruntime.RunOptions()
         overdue = threading.Timer(self.limit_s, setattr, (options, "terminate", True))
         overdue.daemon = True
         overdue.start()
         try:
-            results = self.session.run(names, {entry.name: np.ascontiguousarray(inputs, dtype=dtype)}, options)
+            results = session.run(names, {entry.name: np.ascontiguousarray(inputs, dtype=dtype)}, options)
         except _failures() as error:
             if options.terminate:
                 raise ModelError(f"{self.path} did not end within {self.limit_s:g} s; take another model") from error
@@ -163,6 +163,11 @@ def trial(path: str, expected: str, encoding: str) -> worker.Answer:
     noise = np.random.default_rng(1).normal(size=(1, len(channels), side, side))
     Model(file, lambda: session)(noise.astype(np.float32))
     return {}, {}
+
+
+def _at_once(provider: str, threads: int) -> int:
+    """Runs that may go side by side: two of a thread each end sooner than one after another on two threads."""
+    return min(threads or parallel.threads(), _AT_ONCE) if provider == CPU else 1
 
 
 def _known(session: Any) -> Callable[[], Any]:
@@ -233,7 +238,7 @@ def _open(path: Path, data: bytes, providers: list[str], threads: int) -> Any:
 
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4  # its failures are raised, and told once
-    options.intra_op_num_threads = threads
+    options.intra_op_num_threads = max(1, (threads or parallel.threads()) - _AT_ONCE + 1)
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # waiting threads sleep
     try:
         return onnxruntime.InferenceSession(data, options, providers=providers)

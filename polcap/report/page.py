@@ -1,7 +1,7 @@
 """In: a report's figures and the results of its run. Out: report.html, the page that people look at."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from html import escape
 from pathlib import Path
@@ -40,28 +40,38 @@ def write(folder: Path, about: Mapping[str, Any], results: Results, remembered: 
     StorageError
         The file cannot be written.
     """
-    seen = [results.radiance.key, results.color.key]
-    rms = about["figures"].get("rerendering", {}).get("rms")
-    shapes = [*seen, results.cues.key, results.maps.key, results.mesh.key, rms]
-    drawn = remembered("page_maps", shapes, partial(_of_maps, about, results))
-    chart = remembered("page_chart", [*seen, about["figures"]["chart"]], partial(_chart, about, results))
-    pictures_of = [*seen, results.alignment.key, results.object_.key]
-    looks = remembered("page_pictures", pictures_of, partial(_pictures, results))
+    made = {name: piece() for name, piece in pieces(about, results, remembered).items()}
+    drawn = made["page_maps"]
     body = [
         *_verdict(about),
         drawn["relit"],
         *_solid(drawn["metric"], about),
         drawn["maps"],
-        *_measured(results, about, drawn["angles_deg"], chart),
-        looks,
+        *_measured(results, about, drawn["angles_deg"], made["page_chart"]),
+        made["page_pictures"],
         *_tables(about),
     ]
     data = {
         "palettes": {name: html.text(keys.colors(name).tobytes()) for name in get_args(Palette)},
         "view": drawn["view"],
-        "mesh": remembered("page_mesh", results.mesh.key, partial(_lean, results)),
+        "mesh": made["page_mesh"],
     }
     html.write(folder / "report.html", f"{about['capture']['name']}: polcap report", body, data)
+
+
+def pieces(about: Mapping[str, Any], results: Results, remembered: Remembered) -> dict[str, Callable[[], Any]]:
+    """What is drawn for the page, piece by piece; those that take longest first. What is `remembered` is not."""
+    seen = [results.radiance.key, results.color.key]
+    rms = about["figures"].get("rerendering", {}).get("rms")
+    made: dict[str, tuple[Any, Callable[[], Any]]] = {
+        "page_maps": (
+            [*seen, results.cues.key, results.maps.key, results.mesh.key, rms], partial(_of_maps, about, results)
+        ),
+        "page_pictures": ([*seen, results.alignment.key, results.object_.key], partial(_pictures, results)),
+        "page_mesh": (results.mesh.key, partial(_lean, results)),
+        "page_chart": ([*seen, about["figures"]["chart"]], partial(_chart, about, results)),
+    }  # fmt: skip
+    return {name: partial(remembered, name, *how) for name, how in made.items()}
 
 
 def _of_maps(about: Mapping[str, Any], results: Results) -> dict[str, Any]:

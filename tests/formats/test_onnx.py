@@ -186,3 +186,10 @@ def test_a_shipped_model_that_was_damaged_is_told(
     monkeypatch.setattr(formats_onnx, "_shipped", lambda: frozenset([digest(path.read_bytes())]))
     with pytest.raises(ModelError, match=r"fine\.onnx: is damaged \(.*\); install polcap again"):
         load(path, later=True)
+
+
+def test_runs_side_by_side_are_as_many_as_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert [formats_onnx._at_once(formats_onnx.CPU, threads) for threads in (1, 2, 16)] == [1, 2, 4]
+    assert formats_onnx._at_once(formats_onnx.CUDA, 16) == 1
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    assert formats_onnx._at_once(formats_onnx.CPU, 0) == 3

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from polcap.errors import ObjectError
+from polcap.errors import ModelError, ObjectError
 from polcap.images import Network
 from polcap.stages import mask
 from polcap.stages.mask import mask_channels, solid, standing_out, two_looks
@@ -191,3 +191,18 @@ def test_doubt_is_one_minus_the_overlap_to_be_expected():
     found = chance > 0.5
     overlaps = [((t := rng.random(chance.shape) < chance) & found).sum() / (t | found).sum() for _ in range(20)]
     assert 1 - solid.doubt(found, chance) == pytest.approx(np.mean(overlaps), abs=0.005)
+
+
+def test_looks_side_by_side_give_the_bytes_of_one_after_another():
+    stack, color = scenes.stack(noise=0.004), chart_color()
+    found = [
+        two_looks.chances(stack, scenes.still(), color, np.zeros(stack.value.shape[1:3], np.uint8), model)
+        for model in (network(), dataclasses.replace(network(), at_once=3))
+    ]
+    assert found[0].tobytes() == found[1].tobytes()
+
+    def lost(_):
+        raise ModelError("the network failed")
+
+    with pytest.raises(ModelError, match="the network failed"):
+        segment(stack, color, model=dataclasses.replace(network(lost), at_once=3))

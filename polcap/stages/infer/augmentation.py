@@ -3,8 +3,11 @@
 A turn or mirror of the picture is one of the scene: polarization turns twice as fast, rays with it.
 """
 
+from functools import partial
+
 import numpy as np
 
+from polcap import parallel
 from polcap.errors import ModelError
 from polcap.images import Cues, Floats, Network
 from polcap.optics import frames
@@ -26,7 +29,8 @@ def combined(cues: Cues, network: Network, symmetries: int) -> dict[str, Floats]
     by half a turn, and the mean of both is neither. All other maps are means.
     """
     picture = np.moveaxis(channels(cues), 0, -1)
-    answers = [_answer(picture, cues.rays, network, *position) for position in _POSITIONS[:symmetries]]
+    looks = [partial(_answer, picture, cues.rays, network, *position) for position in _POSITIONS[:symmetries]]
+    answers = parallel.results(looks, network.at_once)
     maps = {name: np.asarray(np.mean([maps[name] for maps in answers], axis=0), np.float32) for name in _OUTPUTS}
     normals, errors = (np.stack([maps[name] for maps in answers]) for name in ("normal", "sigma"))
     return maps | {"normal": _median(normals, errors)}

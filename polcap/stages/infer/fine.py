@@ -7,11 +7,13 @@ Training (`training/fine_*.py`) makes its channels by `encode` too.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap import parallel
 from polcap.errors import ModelError
 from polcap.images import Cues, Floats, Network
 from polcap.optics import frames
@@ -64,8 +66,10 @@ def refined(cues: Cues, guess: Guess, network: Network) -> Floats:
     if network.channels != CHANNELS:
         raise ModelError(f"fine model {network.digest[:8]} expects other channels; use the one of this version")
     relief = np.zeros((*cues.mask.shape, 3), np.float32)
-    for inner, outer in _tiles(cues.mask):
-        relief[inner] = _answer(encode(*_part(cues, guess, outer)), inner, outer, network)
+    tiles = list(_tiles(cues.mask))
+    looks = [partial(_answer, cues, guess, inner, outer, network) for inner, outer in tiles]
+    for (inner, _), found in zip(tiles, parallel.results(looks, network.at_once), strict=True):
+        relief[inner] = found
     relief = finer(relief, cues.mask, guess.shrink)
     local = frames.to_ray_frame(guess.normal, cues.rays) + relief
     moved = frames.from_ray_frame(local, cues.rays)
@@ -109,8 +113,9 @@ def _part(cues: Cues, guess: Guess, window: Window) -> tuple[Cues, Guess]:
     return replace(cues, **shown), replace(guess, **known)
 
 
-def _answer(picture: Floats, inner: Window, outer: Window, network: Network) -> Floats:
-    """Deviation of the normals (h, w, 3) of the tile `inner`, ray frame, by the channels (N, H, W) of `outer`."""
+def _answer(cues: Cues, guess: Guess, inner: Window, outer: Window, network: Network) -> Floats:
+    """Deviation of the normals (h, w, 3) of the tile `inner`, ray frame, by what `outer` shows."""
+    picture = encode(*_part(cues, guess, outer))
     _, height, width = picture.shape
     more = ((0, 0), (0, -height % SIZE_MULTIPLE), (0, -width % SIZE_MULTIPLE))
     relief = network.run(np.pad(picture, more)[None]).get("relief")

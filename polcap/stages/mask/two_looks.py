@@ -4,10 +4,13 @@ The pictures are reduced before they are aligned and resampled, so the time goes
 not with the sensor.
 """
 
+from functools import partial
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap import parallel
 from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Network
 from polcap.optics import mueller
 from polcap.optics.warp import warp
@@ -106,14 +109,20 @@ def around(likely: NDArray[np.bool_]) -> Box | None:
 
 def _run(network: Network, channels: Floats) -> Floats:
     """The chance at each pixel, (H, W), of channels of any size: mean logit of the picture and its mirror images."""
+    logits = parallel.results([partial(_logit, network, channels, axes) for axes in _MIRRORED], network.at_once)
+    total = np.zeros(channels.shape[1:], np.float32)
+    for logit in logits:
+        total += logit / len(_MIRRORED)
+    return np.asarray(1 / (1 + np.exp(-total)), np.float32)
+
+
+def _logit(network: Network, channels: Floats, axes: tuple[int, ...]) -> Floats:
+    """What the network answers to the picture mirrored along these axes, mirrored back, (H, W)."""
     height, width = channels.shape[1:]
     more = [(0, -n % SIZE_MULTIPLE) for n in (height, width)]
-    total = np.zeros((height, width), np.float32)
-    for axes in _MIRRORED:
-        shown = np.pad(mirrored(channels, axes), [(0, 0), *more], mode="edge")
-        logit = network.run(shown[None])["logit"][0, 0, :height, :width]
-        total += np.flip(np.clip(logit, -30, 30), axes) / len(_MIRRORED)
-    return np.asarray(1 / (1 + np.exp(-total)), np.float32)
+    shown = np.pad(mirrored(channels, axes), [(0, 0), *more], mode="edge")
+    logit = network.run(shown[None])["logit"][0, 0, :height, :width]
+    return np.flip(np.clip(logit, -30, 30), axes)
 
 
 def _resized(image: Floats, box: Box) -> Floats:

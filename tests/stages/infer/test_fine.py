@@ -53,6 +53,16 @@ def test_tiles_leave_no_seam(seen: Cues, guess: fine.Guess, monkeypatch: pytest.
     assert np.abs(fine.refined(seen, guess, found.fine) - whole).max() < 1e-4
 
 
+def test_tiles_side_by_side_are_those_one_after_another(
+    seen: Cues, guess: fine.Guess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fine, "_TILE", 64)
+    one, three = (fine.refined(seen, guess, dataclasses.replace(network(), at_once=n)) for n in (1, 3))
+    assert one.tobytes() == three.tobytes()
+    with pytest.raises(ModelError, match="makes no relief"):  # in whichever thread it is found out
+        fine.refined(seen, guess, dataclasses.replace(network(), run=lambda _: {}, at_once=3))
+
+
 def test_relief_moves_the_normals(seen: Cues, guess: fine.Guess, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fine, "_TILE", 128)
     normal = fine.refined(seen, guess, network())

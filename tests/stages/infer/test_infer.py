@@ -113,6 +113,16 @@ def test_a_model_for_other_channels_is_refused():
         infer.estimate(seen(noise=0.002), network(("red",)), infer.Settings())
 
 
+def test_positions_side_by_side_give_the_bytes_of_one_after_another():
+    found = seen(noise=0.002)
+    one, four = (infer.estimate(found, dataclasses.replace(network(), at_once=n), infer.Settings()) for n in (1, 4))
+    for name in ("normal", "diffuse", "roughness", "confidence"):
+        assert getattr(one, name).tobytes() == getattr(four, name).tobytes()
+    lost = dataclasses.replace(network(), run=lambda _: {"normal": np.zeros((1, 3, 32, 32))}, at_once=4)
+    with pytest.raises(ModelError, match="this version needs"):
+        infer.estimate(found, lost, infer.Settings())
+
+
 def test_a_crop_larger_than_the_network_sees_keeps_its_texture():
     """The network says grey 0.3 everywhere; the detail it cannot see comes from S0, to the object's very edge."""
     found = seen(noise=1e-4)
