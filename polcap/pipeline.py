@@ -85,7 +85,10 @@ def _processed(
             store.materialize()
             progress("write", 0.0, True)
             return before
-        store.materialize(results.maps.name)
+        with Beside() as beside:
+            if not results.radiance.ready:
+                beside.begin(partial(_warm, supplied))
+            store.materialize(results.maps.name)
         with maps_folder.writing(out / "maps", written) as files:
             files.begin({"maps": results.maps, "stokes": results.stokes, "cues": results.cues})
             store.materialize(after=results.maps.name)
@@ -103,6 +106,15 @@ def _processed(
         written.remember()
         progress("write", time.perf_counter() - start, False)
     return about
+
+
+def _warm(supplied: UserInput) -> None:
+    """Load what later stages need, while the merge waits for photographs; what fails here fails there again."""
+    import scipy.special  # noqa: F401 — .2 s
+
+    for network in (supplied.mask_network, supplied.network, supplied.network and supplied.network.fine):
+        if network is not None:
+            network.warm()
 
 
 class _Work:

@@ -75,7 +75,8 @@ def load(
         except ValueError as error:
             raise ModelError(f"{path}: is damaged ({error}); install polcap again") from error
         model = Model(path, parallel.Once(partial(_reopen, path, mark, threads)))
-        return Network(model, mark, _stated(path, metadata, encoding), metadata, CPU, at_once=_at_once(CPU, threads))
+        channels, at_once = _stated(path, metadata, encoding), _at_once(CPU, threads)
+        return Network(model, mark, channels, metadata, CPU, warm=model.opened, at_once=at_once)
     import onnxruntime
 
     if not shipped:

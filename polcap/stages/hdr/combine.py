@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap import parallel
 from polcap.images import Bits, Floats, Quality, Shot
 from polcap.stages.hdr import ambient as ambients
 from polcap.stages.hdr import noise, registration
@@ -129,19 +131,19 @@ class Mixture:
 
     def into(self, out: Merged) -> None:
         """Weight, sum and write; a single channel goes into all three, with 3 times its variance."""
-        channels, height, _ = self.shape
-        ghost = self.measured.ghost
-        for rows, _, _ in blocks(height):
-            value, variance = self._rows(rows)
-            total, noise_ = (np.sum(planes, axis=0) for planes in (value, variance))
-            quality = out.quality[rows]
-            quality[:] = np.where(self.served[rows], 0, np.uint8(Quality.CLIPPED))
-            quality[ghost[rows]] |= np.uint8(Quality.GHOST)
-            quality[total < 2 * np.sqrt(noise_)] |= np.uint8(Quality.DARK)
-            if channels == 1:
-                value, variance = value.repeat(3, axis=0), variance.repeat(3, axis=0) * np.float32(3)
-            cv2.merge(list(value), out.value[rows])
-            cv2.merge(list(variance), out.variance[rows])
+        parallel.results(partial(self._block, out, rows) for rows, _, _ in blocks(self.shape[1]))
+
+    def _block(self, out: Merged, rows: slice) -> None:
+        value, variance = self._rows(rows)
+        total, noise_ = (np.sum(planes, axis=0) for planes in (value, variance))
+        quality = out.quality[rows]
+        quality[:] = np.where(self.served[rows], 0, np.uint8(Quality.CLIPPED))
+        quality[self.measured.ghost[rows]] |= np.uint8(Quality.GHOST)
+        quality[total < 2 * np.sqrt(noise_)] |= np.uint8(Quality.DARK)
+        if len(value) == 1:
+            value, variance = value.repeat(3, axis=0), variance.repeat(3, axis=0) * np.float32(3)
+        cv2.merge(list(value), out.value[rows])
+        cv2.merge(list(variance), out.variance[rows])
 
     def _rows(self, rows: slice) -> tuple[Floats, Floats]:
         """Weighted mean and its variance of some rows, (C, h, W)."""

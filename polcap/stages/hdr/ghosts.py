@@ -5,11 +5,13 @@ Radiance is on the reference frame's scale. All work goes in blocks of rows, cha
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap import parallel
 from polcap.images import Floats
 from polcap.stages.hdr.noise import Noise
 from polcap.stages.hdr.planes import Signals, blocks
@@ -70,31 +72,38 @@ class Anchor:
         misfit: (C,) variance per squared gradient; gain: what resampling made of the frame's noise.
         Single deviant windows are dropped, the rest is grown by a window.
         """
-        channels, height, width = frame.signals.shape
+        _, height, width = frame.signals.shape
         found = np.zeros((height, width), bool)
-        for rows, inner, target in blocks(height, _WINDOW // 2 + 1):
-            anchor, value = self.rows(rows), frame.signals.rows(rows)
-            off = np.zeros(anchor.shape[1:], bool)
-            for c in range(channels):
-                level = box(anchor[c])
-                own = self.variance(level, c, rows)
-                limit = frame.noise.of(c, level * frame.ratio[c])
-                limit *= np.float32(gain / frame.ratio[c] ** 2)
-                limit += own
-                limit *= np.float32(_NEIGHBOURS / _WINDOW**2)
-                np.sqrt(limit, out=limit)
-                limit *= np.float32(_SIGMA)
-                limit += np.float32(_SHARE) * np.abs(level)
-                if misfit[c]:
-                    limit += _MISFIT * np.sqrt(np.maximum(box(edges(anchor[c])) - own, 0) * misfit[c])
-                difference = box(value[c])
-                difference *= np.float32(1) / frame.ratio[c]
-                difference -= level
-                off |= np.abs(difference, out=difference) > limit
-            seen = _all_around(self.known[rows] & frame.signals.usable[rows], _WINDOW // 2)
-            found[target] = (off & seen)[inner]
+        parallel.results(
+            partial(self._block, frame, misfit, gain, found, *block) for block in blocks(height, _WINDOW // 2 + 1)
+        )
         core = _all_around(found, 1)
         return _any_around(core, _WINDOW // 2 + 2)
+
+    def _block(
+        self, frame: Exposed, misfit: Floats, gain: float, found: Bools, rows: slice, inner: slice, target: slice
+    ) -> None:
+        """Windows that differ, `inner` of some rows, into their part `target` of `found`."""
+        anchor, value = self.rows(rows), frame.signals.rows(rows)
+        off = np.zeros(anchor.shape[1:], bool)
+        for c in range(len(anchor)):
+            level = box(anchor[c])
+            own = self.variance(level, c, rows)
+            limit = frame.noise.of(c, level * frame.ratio[c])
+            limit *= np.float32(gain / frame.ratio[c] ** 2)
+            limit += own
+            limit *= np.float32(_NEIGHBOURS / _WINDOW**2)
+            np.sqrt(limit, out=limit)
+            limit *= np.float32(_SIGMA)
+            limit += np.float32(_SHARE) * np.abs(level)
+            if misfit[c]:
+                limit += _MISFIT * np.sqrt(np.maximum(box(edges(anchor[c])) - own, 0) * misfit[c])
+            difference = box(value[c])
+            difference *= np.float32(1) / frame.ratio[c]
+            difference -= level
+            off |= np.abs(difference, out=difference) > limit
+        seen = _all_around(self.known[rows] & frame.signals.usable[rows], _WINDOW // 2)
+        found[target] = (off & seen)[inner]
 
 
 class FirstEstimate:
@@ -115,28 +124,32 @@ class FirstEstimate:
         """
         out = np.empty(self._parts[0][0].signals.shape, np.float32)
         halo = 2 * (_WINDOW // 2)  # the spread is a window of distances to the mean of a window
-        for rows, inner, target in blocks(out.shape[1], halo):
-            values = [frame.signals.rows(rows) for frame, _ in self._parts]
-            serves = [_weight(serve[rows]) for _, serve in self._parts]
-            clear = ~ghost[rows]
-            everywhere = bool(clear.all()) and any(np.ndim(serve) == 0 for serve in serves)
-            stand_in = None if everywhere else otherwise.rows(rows)
-            for c in range(len(out)):
-                number = np.zeros(clear.shape, np.float32)
-                exposure: Floats | np.float32 = np.float32(0)
-                floor: Floats | np.float32 = np.float32(0)
-                for (frame, _), value, serve in zip(self._parts, values, serves):
-                    electrons = serve * (np.float32(1) / frame.noise.slope[c])
-                    number += electrons * value[c]
-                    exposure = exposure + electrons * frame.ratio[c]
-                    floor = floor + electrons * electrons * frame.noise.floor[c]
-                number /= np.maximum(exposure, np.float32(1e-20))
-                if stand_in is not None:
-                    served = (exposure > 0) & clear
-                    number = np.where(served, number, stand_in[c])
-                    exposure = np.where(served, exposure, np.float32(1e15))
-                out[c, target] = _wiener(number, exposure, floor)[inner]
+        parallel.results(partial(self._block, otherwise, ghost, out, *block) for block in blocks(out.shape[1], halo))
         return out
+
+    def _block(
+        self, otherwise: Signals | Anchor, ghost: Bools, out: Floats, rows: slice, inner: slice, target: slice
+    ) -> None:
+        values = [frame.signals.rows(rows) for frame, _ in self._parts]
+        serves = [_weight(serve[rows]) for _, serve in self._parts]
+        clear = ~ghost[rows]
+        everywhere = bool(clear.all()) and any(np.ndim(serve) == 0 for serve in serves)
+        stand_in = None if everywhere else otherwise.rows(rows)
+        for c in range(len(out)):
+            number = np.zeros(clear.shape, np.float32)
+            exposure: Floats | np.float32 = np.float32(0)
+            floor: Floats | np.float32 = np.float32(0)
+            for (frame, _), value, serve in zip(self._parts, values, serves):
+                electrons = serve * (np.float32(1) / frame.noise.slope[c])
+                number += electrons * value[c]
+                exposure = exposure + electrons * frame.ratio[c]
+                floor = floor + electrons * electrons * frame.noise.floor[c]
+            number /= np.maximum(exposure, np.float32(1e-20))
+            if stand_in is not None:
+                served = (exposure > 0) & clear
+                number = np.where(served, number, stand_in[c])
+                exposure = np.where(served, exposure, np.float32(1e15))
+            out[c, target] = _wiener(number, exposure, floor)[inner]
 
 
 def _weight(serves: Bools) -> Floats | np.float32:

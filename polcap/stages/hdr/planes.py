@@ -5,12 +5,14 @@ from collections import OrderedDict, deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap import parallel
 from polcap.images import Floats, Frame, SensorImage, Shot
 from polcap.optics import sensor
 from polcap.stages.hdr.budget import Budget
@@ -123,8 +125,7 @@ def signals(image: SensorImage, clip: float, full: bool = False, planes_bytes: f
     if 4 * channels * height * width > planes_bytes:
         return quads
     value = np.empty(quads.shape, np.float32)
-    for rows, _, _ in blocks(height):
-        quads.into(rows, value[:, rows])
+    parallel.results(partial(quads.into, rows, value[:, rows]) for rows, _, _ in blocks(height))
     return Planes(value, usable)
 
 

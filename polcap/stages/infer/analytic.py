@@ -3,9 +3,12 @@
 In: cues. Out: normals, albedo, one roughness and one F0, and the normals' expected error.
 """
 
+from functools import partial
+
 import cv2
 import numpy as np
 
+from polcap import parallel
 from polcap.images import Cues, Floats, Quality, SurfaceMaps
 from polcap.optics import brdf, frames, fresnel
 from polcap.stages.infer import azimuth, body_law
@@ -36,14 +39,25 @@ def estimate(cues: Cues, ior: float) -> SurfaceMaps:
     )
 
 
-def invert(cues: Cues, ior: float, guide: tuple[Floats, Floats] | None = None) -> tuple[Floats, Floats, Floats]:
+def prepare(cues: Cues, ior: float) -> tuple[Floats, Floats]:
+    """S1/S0 and S2/S0 (2, H, W) averaged, and their 1σ (H, W): what `invert` needs before it has a guide."""
+    body_law.laws(ior)  # kept from here on
+    return _smoothed(cues)
+
+
+def invert(
+    cues: Cues,
+    ior: float,
+    guide: tuple[Floats, Floats] | None = None,
+    prepared: tuple[Floats, Floats] | None = None,
+) -> tuple[Floats, Floats, Floats]:
     """Normals (H, W, 3), their expected error (H, W) in degrees and cosines of the zenith (H, W).
 
     Zenith by the DoLP and the law of the body that the cues speak for (`body_law.py`); half-turn of the azimuth by
     `stages/infer/azimuth.py`, or as `guide` has it: normals (H, W, 3) in the frame of each ray and their expected error
-    (H, W), degrees.
+    (H, W), degrees. `prepared` is what `prepare` gives, where that is known.
     """
-    ratio, sigma = _smoothed(cues)
+    ratio, sigma = prepared or prepare(cues, ior)
     squared = ratio[0] ** 2 + ratio[1] ** 2
     dolp = np.sqrt(np.maximum(squared - sigma**2, 0))
     known = None
@@ -57,8 +71,9 @@ def invert(cues: Cues, ior: float, guide: tuple[Floats, Floats] | None = None) -
         phi, certainty = azimuth.resolve(axis, np.sin(zenith), cues.mask)
     else:
         phi, certainty = _guided(axis, cues.rays, *guide)
-    error = _expected_error(read, dolp, sigma, certainty, cues)
-    return _from_angles(cos_zenith, phi, cues.rays), error, cos_zenith
+    with parallel.Beside() as beside:
+        error = beside.begin(partial(_expected_error, read, dolp, sigma, certainty, cues))
+        return _from_angles(cos_zenith, phi, cues.rays), error.result(), cos_zenith
 
 
 def _guided(axis: Floats, rays: Floats, normal: Floats, sigma: Floats) -> tuple[Floats, Floats]:

@@ -83,28 +83,29 @@ def zeniths(dolp: Floats, cues: Cues, ior: float, guide: tuple[Floats, Floats] |
     guide
         Zeniths (H, W) and their 1σ (H, W), rad, from elsewhere.
     """
-    laws = _laws(ior)
-    score = laws.prior.copy()
+    every = laws(ior)
+    score = every.prior.copy()
     inside = cues.mask & ((cues.quality & Quality.CLIPPED) == 0) & (cues.radiance.mean(-1) > _LEAST_LIGHT)
     some = _some(np.flatnonzero(inside))
     if len(some) > _PATCHES:
-        angles = np.stack([np.interp(dolp.flat[some], row, _ZENITHS) for row in laws.dolp])  # (C, N)
-        score += _even_albedo(angles, cues.radiance.mean(-1).flat[some], laws)
-        score += _round_outline(dolp, cues, laws)
+        angles = np.stack([np.interp(dolp.flat[some], row, _ZENITHS) for row in every.dolp])  # (C, N)
+        score += _even_albedo(angles, cues.radiance.mean(-1).flat[some], every)
+        score += _round_outline(dolp, cues, every)
         if guide is not None:
             deviation = (angles - guide[0].flat[some]) / np.maximum(guide[1].flat[some], np.radians(2.0))
             score -= _PATCHES / 2 * np.minimum(deviation**2, 9.0).mean(axis=1)
     weights = np.exp(score - score.max())
     weights /= weights.sum()
-    angle, spread = _mean(dolp, laws.dolp, weights)
-    smooth = weights[(laws.alpha == 0) & (laws.kept == 1) & (laws.limb == 0)].sum()
+    angle, spread = _mean(dolp, every.dolp, weights)
+    smooth = weights[(every.alpha == 0) & (every.kept == 1) & (every.limb == 0)].sum()
     return Zeniths(
-        angle, spread, float(weights @ laws.alpha), float(weights @ laws.kept), float(smooth), laws.dolp, weights
+        angle, spread, float(weights @ every.alpha), float(weights @ every.kept), float(smooth), every.dolp, weights
     )
 
 
 @lru_cache(maxsize=4)
-def _laws(ior: float) -> _Laws:
+def laws(ior: float) -> _Laws:
+    """All candidates of an index, made once."""
     cosine = np.cos(_ZENITHS)
     rows = []
     for local in (0.0, 1.0):

@@ -4,17 +4,19 @@ In: cues and a network. Out: normals, albedo, specular albedo, roughness, depth 
 """
 
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap import parallel
 from polcap.errors import ModelError
 from polcap.images import Cues, Floats, Network, Quality, SurfaceMaps
 from polcap.optics import frames
 from polcap.stages.cues import CHANNELS, FLOOR
-from polcap.stages.infer import augmentation, fine
-from polcap.stages.infer.analytic import REACHED, fill_highlights, invert
+from polcap.stages.infer import analytic, augmentation, fine
+from polcap.stages.infer.analytic import REACHED, fill_highlights
 
 _INVERSION = 4.0  # factor on the inversion's expected error in the join: the network has seen what it has seen
 _DETAIL = 2.0  # pixels that the network sees, 1σ: what is finer is the inversion's to tell
@@ -91,7 +93,10 @@ def known(cues: Cues, network: Network, ior: float, symmetries: int) -> tuple[di
     size = cues.mask.shape[::-1]
     shrink = max(1.0, max(size) / int(network.metadata["native_size"]))
     seen = _resized(_bounded(cues), 1 / shrink)
-    small = augmentation.combined(seen, network, symmetries)
+    with parallel.Beside(network.at_once) as beside:
+        prepared = beside.begin(partial(analytic.prepare, cues, ior))
+        small = augmentation.combined(seen, network, symmetries)
+        averaged = prepared.result()
     # beside the object the network guesses: zeros there leave an edge's direction to the object's own pixels
     small["normal"] = _without_grid(small["normal"], seen.mask) * seen.mask[..., None]
     small["factor"] = _factor(small["diffuse"] * _shading(small["normal"], seen.rays), seen)
@@ -100,7 +105,7 @@ def known(cues: Cues, network: Network, ior: float, symmetries: int) -> tuple[di
     maps = {name: np.asarray(cv2.resize(image, size)) for name, image in small.items()}
     ahead = maps["normal"] / np.maximum(_length(maps["normal"]), 1e-6)
     guide = np.asarray(frames.to_ray_frame(ahead, cues.rays)), maps["sigma"]
-    by_pixel, doubt, _ = invert(cues, ior, guide)
+    by_pixel, doubt, _ = analytic.invert(cues, ior, guide, averaged)
     detailed = _detailed(ahead, by_pixel, cues.mask, shrink)
     normal, stated = _joined((ahead, maps["sigma"]), (detailed, _INVERSION * doubt))
     return maps, fine.Guess(normal, ahead, maps["sigma"], maps["roughness"], shrink), stated

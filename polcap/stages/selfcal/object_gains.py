@@ -17,11 +17,13 @@ Comaniciu & Meer, Mean shift, IEEE TPAMI 2002. Efron, The Jackknife, 1982. Birge
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap import parallel
 from polcap.images import Bits, Floats
 from polcap.optics import mueller
 from polcap.optics.robust import BIWEIGHT, MAD_TO_SIGMA
@@ -138,7 +140,8 @@ def facing(light: Floats, usable: Bools, angle: Floats) -> Estimate:
     ratio = light[:, usable] / np.maximum(light[0, usable], 1e-12)  # (K, N)
     ratio = ratio[:, :: max(1, ratio.shape[1] // 40_000)]
     seeds = ratio[:, np.linspace(0, ratio.shape[1] - 1, _STARTS).astype(int)].T
-    climbs = [_climb(ratio, start) for start in (np.median(ratio, axis=1), np.ones(shots), *seeds)]
+    starts = (np.median(ratio, axis=1), np.ones(shots), *seeds)
+    climbs = parallel.results(partial(_climb, ratio, start) for start in starts)
     away = np.stack([((ratio - path[-1][:, None]) ** 2).sum(0) for path in climbs])
     height = np.exp(-away / (2 * _PEAK_WIDTH**2)).mean(1)
     best = int(np.argmax(height))

@@ -10,11 +10,13 @@ differently at different depths, so the spread over depths tells the error (deci
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap import parallel
 from polcap.images import Floats
 from polcap.optics import mueller, outline
 
@@ -81,9 +83,9 @@ def measure(
     polarization = np.where(seen, (s1 + 1j * s2) / np.where(seen, s0, 1), 0)
     strength = np.abs(polarization)
     slope = polarization * np.minimum(1, outline.DOLP_CAP / np.maximum(strength, 1e-9))
-    out = [_outward_of(mask, sigma) for sigma in (_RIM_PX, *(part * radius for part in _DEEPER))]
+    out = parallel.results(partial(_outward_of, mask, sigma) for sigma in (_RIM_PX, *(d * radius for d in _DEEPER)))
     out.append(_outward(cv2.GaussianBlur(np.minimum(depth, _PLATEAU * radius), (0, 0), 2.0)))
-    rim, *deeper = (_turned(slope[seen], way[seen]) for way in out)
+    rim, *deeper = parallel.results(partial(_turned, slope[seen], way[seen]) for way in out)
     spread = float(np.sqrt(np.mean([(other - rim) ** 2 for other in deeper])))
     at = out[0]
     hidden = float(np.abs(at[inside & ~seen]).sum() / max(np.abs(at[inside]).sum(), 1e-9))
