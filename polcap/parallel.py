@@ -43,13 +43,13 @@ class Task(Generic[T]):
     def __init__(self, function: Callable[[], T], pool: ThreadPoolExecutor | None) -> None:
         self._function = function
         self.future: Future[T] = Future() if pool is None else pool.submit(function)
-        self._own = pool is None
+        self.alone = pool is None  # nobody else does it
 
     def help(self) -> None:
         """Do it here, where nobody has begun it."""
-        if not self._own and self.future.cancel():
-            self.future, self._own = Future(), True
-        if self._own and not self.future.done():
+        if not self.alone and self.future.cancel():
+            self.future, self.alone = Future(), True
+        if self.alone and not self.future.done():
             try:
                 self.future.set_result(self._function())
             except Exception as error:  # told as the result
@@ -105,5 +105,6 @@ def results(functions: Iterable[Callable[[], T]], most: int | None = None) -> li
 def finished(tasks: list[Task[T]]) -> list[T]:
     """What tasks that were begun give, in their order; the caller takes from the end what nobody has begun."""
     for task in reversed(tasks):
-        task.help()
+        if not task.alone:
+            task.help()
     return [task.result() for task in tasks]

@@ -19,6 +19,7 @@ def test_results_come_in_order_and_each_task_is_done_once(most: int) -> None:
 
     assert parallel.results([partial(square, n) for n in range(40)], most) == [n * n for n in range(40)]
     assert sorted(done) == list(range(40))
+    assert most > 1 or done == sorted(done)
 
 
 @pytest.mark.parametrize("most", [1, 2, 8])
