@@ -9,13 +9,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from polcap import models, pipeline
 from polcap.config import Config
-from polcap.errors import ObjectError
+from polcap.errors import ObjectError, StorageError
 from polcap.formats import capture as captures
 from polcap.formats import maps, npy_folder
 from polcap.images import AngleStack, ColorCalibration, View
@@ -237,6 +238,27 @@ def test_full_disk_is_one_clear_line_and_leaves_no_partial_file(example: Path, t
     finally:
         if mounted:
             subprocess.run(["umount", disk], check=True)
+
+
+@pytest.mark.parametrize("part", ["formats.exr.write", "report.page._pictures", "asset_export.export"])
+def test_what_fails_beside_other_work_is_one_clear_line(
+    result: Path, example: Path, polcap: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str
+) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise StorageError("cannot write it: the disk is full")
+
+    copy = tmp_path / "again"
+    shutil.copytree(result, copy)
+    before = product(copy)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    monkeypatch.setattr(f"polcap.{part}", refuse)
+    done = polcap("process", example, "--out", copy, "--estimator", "analytic", "--force", "asset")
+    assert done.returncode == StorageError.exit_code
+    assert [line for line in done.stderr.splitlines() if "cannot write" in line] == [
+        "polcap: cannot write it: the disk is full"
+    ]
+    assert partial(copy) == []
+    assert product(copy) == before  # what was written anew is the same
 
 
 def test_read_only_folder_is_one_clear_line(example: Path, tmp_path: Path, polcap: Command) -> None:
