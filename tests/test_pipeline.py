@@ -255,7 +255,7 @@ def test_what_fails_beside_other_work_is_one_clear_line(
     done = polcap("process", example, "--out", copy, "--estimator", "analytic", "--force", "asset")
     assert done.returncode == StorageError.exit_code
     assert [line for line in done.stderr.splitlines() if "cannot write" in line] == [
-        "polcap: cannot write it: the disk is full"
+        "polcap: error: cannot write it: the disk is full"
     ]
     assert partial(copy) == []
     assert product(copy) == before  # what was written anew is the same
