@@ -104,7 +104,7 @@ def scaled(value: Any, factor: float) -> Any:
 
 def body_law_tables() -> None:
     """What was kept of tables that depend on the numbers is forgotten."""
-    for name in ("_laws",):
+    for name in ("laws",):
         getattr(getattr(body_law, name), "cache_clear", lambda: None)()
 
 

@@ -53,9 +53,19 @@ def invert(
 ) -> tuple[Floats, Floats, Floats]:
     """Normals (H, W, 3), their expected error (H, W) in degrees and cosines of the zenith (H, W).
 
-    Zenith by the DoLP and the law of the body that the cues speak for (`body_law.py`); half-turn of the azimuth by
-    `stages/infer/azimuth.py`, or as `guide` has it: normals (H, W, 3) in the frame of each ray and their expected error
-    (H, W), degrees. `prepared` is what `prepare` gives, where that is known.
+    Zenith by the DoLP and the law of the body that the cues speak for (`body_law.py`).
+
+    Parameters
+    ----------
+    cues
+        Of the object's crop (H, W).
+    ior
+        Refractive index.
+    guide
+        Normals (H, W, 3) in the frame of each ray and their expected error (H, W), degrees, by which the half-turn of
+        the azimuth is chosen; without it by `stages/infer/azimuth.py`.
+    prepared
+        What `prepare` gives, where that is known.
     """
     ratio, sigma = prepared or prepare(cues, ior)
     squared = ratio[0] ** 2 + ratio[1] ** 2
