@@ -94,7 +94,7 @@ def encode(texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
     if kind == "ktx2":
         return _ktx2(texture)
     quality = _QUALITY[kind][texture.color]
-    pixels = _bgr(_eight_bits(texture))
+    pixels = png.swapped(_eight_bits(texture))
     if kind == "jpeg":
         if pixels.shape[-1] == 4:
             raise SettingError(f"{texture.says}: JPEG holds no fourth channel; choose png or webp")
@@ -143,9 +143,3 @@ def _eight_bits(texture: Texture) -> NDArray[np.uint8]:
     if texture.pixels.dtype == np.uint8:
         return np.asarray(texture.pixels, dtype=np.uint8)
     return np.asarray(np.rint(texture.pixels / 257.0), dtype=np.uint8)
-
-
-def _bgr(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    if pixels.ndim == 2:
-        return pixels
-    return np.ascontiguousarray(pixels[..., [2, 1, 0, 3][: pixels.shape[-1]]])

