@@ -1,5 +1,6 @@
 """In: how much of the machine a command may take. Out: that limit, set for this process."""
 
+import atexit
 import gc
 import math
 import os
@@ -34,14 +35,25 @@ def set_threads(count: int) -> None:
 
 @contextmanager
 def no_garbage() -> Iterator[None]:
-    """Nobody looks for garbage: imports make none, and looking takes a tenth of a short run."""
+    """Nobody looks for garbage: imports make none, and looking takes a tenth of a short run.
+
+    Nor is it looked for later in what the first such block of a process has left.
+    """
     looked = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
+        keep_imported()
         if looked:
             gc.enable()
+
+
+def keep_imported() -> None:
+    """What there is now, once imports are done, is no garbage before the process ends."""
+    if not gc.get_freeze_count():
+        gc.freeze()
+        atexit.register(gc.unfreeze)  # else bindings of C++ tell of leaks
 
 
 def check_memory(gigabytes: float) -> None:

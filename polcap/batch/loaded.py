@@ -4,16 +4,14 @@ Imported by the process that workers are forked from. Nothing here may start a t
 onnxruntime, whose import starts one, is left to each worker.
 """
 
-import gc
-
 import scipy.sparse.linalg
 import scipy.special  # noqa: F401
 
-from polcap import models, pipeline  # noqa: F401
+from polcap import models, pipeline, resource_limits  # noqa: F401
 from polcap.batch import thumbnail, unit  # noqa: F401
 from polcap.formats import capture, provenance  # noqa: F401
 from polcap.optics import body
 
 body.make_tables()
 provenance.versions()
-gc.freeze()  # else each worker's first look for garbage writes to, and so copies, all that is shared
+resource_limits.keep_imported()  # a look for garbage writes to, and so copies, what workers share
