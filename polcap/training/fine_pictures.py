@@ -28,7 +28,10 @@ RECIPE = gbuffers.Recipe(views=2, procedural=14, size=SIDE, seed=51, per_shape=4
 
 
 class WithoutBounces(Simulator):
-    """Light from the lamp alone: what bounces is coarser than relief, and the cache's indices end at 256² pixels."""
+    """Light from the lamp alone: the cache's indices end at 256² pixels.
+
+    What bounces is coarser than relief, but in shadows beside a limb, which nothing else lights (decision 29).
+    """
 
     def _met(self, first: Indices, y: Indices, x: Indices, order: Indices, mask: Any, owner: Indices) -> Indices:
         return np.full((len(owner), bounce.RAYS), -1)
