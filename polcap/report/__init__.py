@@ -14,7 +14,7 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from polcap import __version__, gates
+from polcap import __version__, gates, parallel
 from polcap.config import Config
 from polcap.errors import StorageError
 from polcap.formats import atomic, provenance, text_file
@@ -212,12 +212,16 @@ def document(
     """
     keys = {kept.name: kept.key for kept in vars(results).values()}
     measured_on = {name: key for name, key in keys.items() if name != results.asset.name}
-    found = remembered("figures", measured_on, partial(figures, results))
-    again = remembered("rerendering", measured_on, partial(rerendering, results, config.infer.ior))
-    found = {**found, "rerendering": again}
     whole = Whole(results, tuple(capture.get("focal_doubt", (0.0, 0.0))), remembered)
     limits = {name: section for name, section in msgspec.to_builtins(config).items() if name != results.asset.name}
-    judged = remembered("gates", [measured_on, whole.focal_doubt, limits], partial(_judged, whole, config))
+    found, again, judged = parallel.results(
+        [
+            partial(remembered, "figures", measured_on, partial(figures, results)),
+            partial(remembered, "rerendering", measured_on, partial(rerendering, results, config.infer.ior)),
+            partial(remembered, "gates", [measured_on, whole.focal_doubt, limits], partial(_judged, whole, config)),
+        ]
+    )
+    found = {**found, "rerendering": again}
     return {
         "polcap": __version__,
         "versions": provenance.versions(),

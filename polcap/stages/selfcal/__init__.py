@@ -11,12 +11,14 @@ closure tells which angle is wrong (`angle_closure`). Angles that nobody noted a
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
 from msgspec import Meta
 
+from polcap import parallel
 from polcap.errors import CaptureError
 from polcap.images import Alignment, AngleStack, Bits, ColorCalibration, Floats, Gains, ObjectMask, Quality
 from polcap.optics.outline import Rim
@@ -299,11 +301,13 @@ def _by_law(
     """What the object says of the gains if the angles (K,) rad are right."""
     at = order.rim(light, quality == 0, mask, crop, radiance.value.shape[1:3])
     inside = object_gains.inside(mask, quality)
-    return [
-        object_gains.closure(light, inside, angle),
-        object_gains.outline(at.light, at.azimuth, at.sector, angle),
-        integrability.gains(light, inside, angle, facing.gain),
-    ]
+    return parallel.results(
+        [
+            partial(object_gains.closure, light, inside, angle),
+            partial(object_gains.outline, at.light, at.azimuth, at.sector, angle),
+            partial(integrability.gains, light, inside, angle, facing.gain),
+        ]
+    )
 
 
 def _registered(radiance: AngleStack, alignment: Alignment, crop: tuple[int, int, int, int]) -> tuple[Floats, Bits]:

@@ -130,6 +130,6 @@ def _turned(slope: NDArray[np.complex128], out: NDArray[np.complex128]) -> float
 
 def _scatter(slope: NDArray[np.complex128], out: NDArray[np.complex128], seen: Bools) -> float:
     """How far parts of the outline differ from one another, 1σ rad."""
-    sector = outline.sectors(seen)
-    parts = [_turned(slope[seen][sector == s], out[seen][sector == s]) for s in np.unique(sector)]
+    sector, slope, out = outline.sectors(seen), slope[seen], out[seen]
+    parts = parallel.results(partial(_turned, slope[sector == s], out[sector == s]) for s in np.unique(sector))
     return float(np.std(parts))
