@@ -161,7 +161,7 @@ class Worker:
         ours, theirs = _lifeline()
         try:
             self._child = subprocess.Popen(
-                [sys.executable, "-c", _START, str(self.memory_gib), str(theirs), *sys.path],
+                [sys.executable, "-c", _START, str(self.memory_gib), str(theirs), *_module_folders()],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=self._log or subprocess.DEVNULL,
@@ -222,6 +222,14 @@ def _killed_after(limit_s: float, child: subprocess.Popen[bytes], overdue: threa
 def _kill(child: subprocess.Popen[bytes], overdue: threading.Event) -> None:
     overdue.set()
     child.kill()
+
+
+def _module_folders() -> list[str]:
+    """`sys.path` without the insides of packages: OpenCV's stands there while another thread imports it.
+
+    From there a child would take OpenCV's `typing` for Python's.
+    """
+    return [folder for folder in sys.path if not os.path.isfile(os.path.join(folder, "__init__.py"))]
 
 
 def _lifeline() -> tuple[int | None, int]:

@@ -91,6 +91,15 @@ def test_child_is_kept_for_the_next_file(worker):
     assert pid(worker) == pid(worker)
 
 
+def test_a_child_does_not_look_for_modules_inside_a_package(worker, tmp_path, monkeypatch):
+    package = tmp_path / "package"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "typing.py").write_text("raise ImportError('not the typing of Python')")  # as OpenCV has one
+    monkeypatch.setattr(sys, "path", [str(package), *sys.path])
+    assert worker.call(worker.module.ramp, "next.raw")[0]["path"] == "next.raw"
+
+
 def test_crash_names_the_file_and_the_next_file_is_read(worker):
     before = pid(worker)
     with pytest.raises(DecodeError, match=r"broken\.raw: the decoder crashed"):
