@@ -13,7 +13,7 @@ import pytest
 from polcap import report
 from polcap.errors import StorageError
 from polcap.pictures import keys
-from polcap.report import compare, labels, lean, page
+from polcap.report import compare, labels, lean, map_figures, page
 from tests import surfaces
 
 
@@ -154,5 +154,5 @@ def test_an_object_too_thin_for_the_page_leaves_its_figures_out() -> None:
     nothing = np.zeros((4, 5))
     small = SimpleNamespace(angle=np.zeros(1), maps=SimpleNamespace(mask=nothing > 0))
     again = SimpleNamespace(measured=[nothing], predicted=[nothing])
-    told = "".join(page._rerendered(small, again, {"figures": {"rerendering": {"rms": [None]}}}))  # type: ignore[arg-type]  # stand-ins
+    told = "".join(map_figures.rerendered(small, again, {"figures": {"rerendering": {"rms": [None]}}}))  # type: ignore[arg-type]  # stand-ins
     assert "Polarizer at 0°" in told and "rms" not in told

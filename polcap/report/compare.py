@@ -14,7 +14,7 @@ from polcap.images import Floats
 from polcap.pictures import keys
 from polcap.pictures.keys import Palette
 from polcap.pictures.smaller import Smaller
-from polcap.report import labels, page
+from polcap.report import labels, map_figures, page
 
 _LONGEST = 640  # px of a map
 _DIFFERENCE = keys.Key(-0.2, 0.2, "", (-0.2, -0.1, 0, 0.1, 0.2), "balance", digits=3)
@@ -92,11 +92,11 @@ def _maps(folders: Sequence[Path], names: Sequence[str]) -> Iterator[str]:
     yield "" if same else "<p class='note'>The crops differ in size, so no differences are drawn.</p>"
     yield "<h3>Normal</h3><div class='grid'>"
     for place, (maps, name) in enumerate(zip(small, names, strict=True)):
-        yield page.normal(f"normal-{place}", name, maps.normal, maps.mask)
+        yield map_figures.normal(f"normal-{place}", name, maps.normal, maps.mask)
     if same:
         difference = _degrees(small[0].normal, small[1].normal)
         says = f"median {labels.number(float(np.median(difference[both])), 2)}°" if both.any() else ""
-        yield page.scalar("normal-apart", "Angle between them", says, difference, both, keys.ERROR)
+        yield map_figures.scalar("normal-apart", "Angle between them", says, difference, both, keys.ERROR)
     yield "</div>"
     scalars = (
         ("roughness", "Roughness", keys.ROUGHNESS, [maps.roughness for maps in small]),
@@ -106,10 +106,10 @@ def _maps(folders: Sequence[Path], names: Sequence[str]) -> Iterator[str]:
     for kind, title, key, values in scalars:
         yield f"<h3>{title}</h3><div class='grid'>"
         for place, (maps, name) in enumerate(zip(small, names, strict=True)):
-            yield page.scalar(f"{kind}-{place}", name, "", values[place], maps.mask, key)
+            yield map_figures.scalar(f"{kind}-{place}", name, "", values[place], maps.mask, key)
         if same and kind != "error":
             says = f"{names[1]} less {names[0]}"
-            yield page.scalar(f"{kind}-apart", "Difference", says, values[1] - values[0], both, _DIFFERENCE)
+            yield map_figures.scalar(f"{kind}-apart", "Difference", says, values[1] - values[0], both, _DIFFERENCE)
         yield "</div>"
 
 

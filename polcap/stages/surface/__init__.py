@@ -20,7 +20,8 @@ from polcap.stages import stage
 from polcap.stages.surface import triangles
 from polcap.stages.surface.backing import Back
 from polcap.stages.surface.decimation import Decimated, decimated
-from polcap.stages.surface.integration import log_depth, problem
+from polcap.stages.surface.integration import log_depth
+from polcap.stages.surface.slope_equations import problem
 
 __all__ = ["Back", "Decimated", "Settings", "decimated", "integrate", "triangulate"]
 

@@ -14,7 +14,7 @@ from scipy import ndimage
 from polcap.errors import ObjectError
 from polcap.images import Floats, Mesh, SurfaceMaps, View
 from polcap.stages import surface
-from polcap.stages.surface import boundary, integration
+from polcap.stages.surface import boundary, integration, slope_equations
 
 SETTINGS = surface.Settings()
 VIEW = View(focal=400.0, center=(63.5, 55.5), scale=2.0)
@@ -262,7 +262,7 @@ def test_noise_tears_no_smooth_surface_at_any_resolution(size: int) -> None:
 def test_cut_that_strains_the_surface_is_sewn(step: float, sewn: bool) -> None:
     """A piece of a ball's flank, set back by some pixels though nothing hides it, comes back."""
     ball, _ = waved(200, 2.0)
-    level = integration._Level(integration.problem(ball, np.radians(84), 0.0))
+    level = integration._Level(slope_equations.problem(ball, np.radians(84), 0.0))
     nowhere = np.zeros(level.grid.size, dtype=bool)
     plain, solver = level.mended(np.zeros(level.grid.size), nowhere, SETTINGS.stiffness)
     row, column = (np.nonzero(ball.mask)[k] - 100 for k in (0, 1))
@@ -276,7 +276,7 @@ def test_cut_that_strains_the_surface_is_sewn(step: float, sewn: bool) -> None:
 
 def test_cut_that_relieves_the_surface_stays() -> None:
     balls, _ = two_balls(0.12)
-    level = integration._Level(integration.problem(balls, np.radians(84), 0.0))
+    level = integration._Level(slope_equations.problem(balls, np.radians(84), 0.0))
     level.leave_limbs()
     z = level.decided(SETTINGS.stiffness, SETTINGS.iterations, SETTINGS.tolerance)
     level.close_limbs(z)
