@@ -1,69 +1,106 @@
-"""Pictures of training meshes in, `_CALIBRATION` of `infer/learned.py` out: how the expected normal error is scaled.
+"""Training meshes and materials in, `_CALIBRATION` of `infer/learned.py` out: how the expected normal error is scaled.
 
-    python tests/benchmarks/fit_expected_error.py FOLDER [--model ONNX] [--pictures 10]
+    python tests/benchmarks/fit_expected_error.py DATA OUT [--model ONNX] [--rounds 3]
 
-FOLDER is laid out as the evaluation's data, with training meshes in meshes/test and training materials in
-materials/test (links do). Makes PICTURES of each protocol at 256² and prints a, b and r of
+Each round shows every training mesh once in each protocol and size, under training materials and patterns that are
+not the evaluation's; what is found there is kept in OUT, so that another fit costs nothing. Prints a, b and r of
 error = a·statedᵇ·exp(r·roughness), those under which the errors are likeliest as draws of exponential distributions of
 these means, as the network's own were learned; and what is predicted by what is found, in tenths.
 """
 
 import argparse
+import tempfile
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize
 
 from polcap import models
+from polcap.formats import atomic
 from polcap.images import Floats, Network
 from polcap.stages import infer
 from polcap.stages.infer import learned
-from polcap.training.protocol import PROTOCOLS, Protocol
+from polcap.training import patterns, protocol
+from polcap.training.protocol import MESHES, PROTOCOLS, Case, Protocol
 from polcap.training.score import angle, deciles
 
-SIZE, SAMPLE = 256, 1500  # px; pixels of each picture
+SIZES, SAMPLE = (256, 512), 3000  # px; pixels of each picture
 GREATEST_DEG = 60.0  # errors that count: a wrong half-turn weighs no more
+OTHER_SEEDS = 2028, 20281128  # of patterns and pictures: not the evaluation's
 _AS_STATED = (1.0, 1.0, 0.0, np.inf)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("out", type=Path)
     parser.add_argument("--model", type=Path)
-    parser.add_argument("--pictures", type=int, default=10)
+    parser.add_argument("--rounds", type=int, default=3)
     options = parser.parse_args()
     network = models.load_network("network", options.model, "cpu", 1)
     assert network is not None
     learned._CALIBRATION = _AS_STATED  # what the join itself states
-    found = {w: drawn(Protocol(options.folder, SIZE, w), network, options.pictures) for w in PROTOCOLS}
-    a, b, r = fit(np.concatenate(list(found.values()), axis=1))
+    patterns._SEED, protocol._SEED = OTHER_SEEDS
+    options.out.mkdir(parents=True, exist_ok=True)
+    shown = [(size, which) for size in SIZES for which in PROTOCOLS]
+    found = {key: drawn(options.data, options.out, network, *key, options.rounds) for key in shown}
+    a, b, r = fit(list(found.values()))
     print(f"error = {a:.3g} · stated^{b:.3g} · exp({r:.3g} · roughness)")
-    for which, (stated, roughness, error) in found.items():
+    for (size, which), (stated, roughness, error) in found.items():
         tenths = deciles(a * stated**b * np.exp(r * roughness), error)
-        print(f"protocol {which}:", " ".join(f"{d['predicted'] / d['actual']:.2f}" for d in tenths))
+        ratios = " ".join(f"{d['predicted'] / d['actual']:.2f}" for d in tenths)
+        print(f"{size}², protocol {which}: {ratios}")
 
 
-def drawn(pictures: Protocol, network: Network, count: int) -> Floats:
-    """Stated error, roughness and true error (3, N) of pixels of the first pictures."""
+def drawn(data: Path, out: Path, network: Network, size: int, which: int, rounds: int) -> Floats:
+    """Stated error, roughness and true error (3, N) of pixels of one size and protocol."""
     parts = []
-    for number in range(count):
-        case = pictures.case(number)
-        maps = infer.estimate(case.cues, network, infer.Settings())
-        inside = case.truth.mask & maps.mask
-        some = np.random.default_rng(number).permutation(int(inside.sum()))[:SAMPLE]
-        parts.append([x[inside][some] for x in (maps.confidence, maps.roughness, angle(maps, case))])
+    meshes = len(list((data / "meshes" / "train").glob("*.npz")))
+    for first in range(0, rounds * meshes, MESHES):
+        files = {number: out / f"{size}_{which}_{number:03d}.npy" for number in range(first, first + MESHES)}
+        missing = {number: file for number, file in files.items() if not file.exists()}
+        if missing:
+            with tempfile.TemporaryDirectory() as folder:
+                linked(data, Path(folder), first // MESHES, meshes)
+                pictures = Protocol(Path(folder), size, which)
+            for number, file in missing.items():
+                with atomic.path(file) as beside, beside.open("wb") as stream:
+                    np.save(stream, pixels(pictures.case(number), network, number))
+        parts += [np.load(file) for file in files.values()]
     return np.concatenate(parts, axis=1)
 
 
-def fit(pixels: Floats) -> tuple[float, float, float]:
-    """a, b and r of least mean of log σ + error/σ."""
-    stated, roughness, error = pixels.astype(np.float64)
+def linked(data: Path, folder: Path, sixth: int, meshes: int) -> None:
+    """Six training meshes and ten training materials where `Protocol` looks for the evaluation's."""
+    turn, place = divmod(sixth, meshes // MESHES)
+    own = np.random.default_rng(turn).permutation(meshes)[place * MESHES :][:MESHES]
+    files = sorted((data / "meshes" / "train").glob("*.npz"))
+    sets = sorted(path.parent for path in (data / "materials" / "train").glob("*/albedo.jpg"))
+    worn = np.random.default_rng([sixth]).permutation(len(sets))[: patterns.TEXTURES]
+    for kind, chosen in (("meshes", [files[k] for k in own]), ("materials", [sets[k] for k in worn])):
+        (folder / kind / "test").mkdir(parents=True)
+        for path in chosen:
+            (folder / kind / "test" / path.name).symlink_to(path.resolve())
+
+
+def pixels(case: Case, network: Network, seed: int) -> Floats:
+    """Stated error, roughness and true error (3, N) of some pixels of a picture."""
+    maps = infer.estimate(case.cues, network, infer.Settings())
+    mask = case.truth.mask
+    some = np.random.default_rng(seed).permutation(int(mask.sum()))[:SAMPLE]
+    return np.stack([image[mask][some] for image in (maps.confidence, maps.roughness, angle(maps, case))])
+
+
+def fit(groups: list[Floats]) -> tuple[float, float, float]:
+    """a, b and r of least mean of log σ + error/σ, each group counting alike."""
+    stated, roughness, error = np.concatenate(groups, axis=1).astype(np.float64)
+    share = np.concatenate([np.full(group.shape[1], 1 / group.shape[1] / len(groups)) for group in groups])
     terms = np.stack([np.ones_like(stated), np.log(np.maximum(stated, 0.1)), roughness])
     capped = np.minimum(error, GREATEST_DEG)
 
     def unlikely(weights: Floats) -> float:
         log = weights @ terms
-        return float(np.mean(log + capped * np.exp(-log)))
+        return float(share @ (log + capped * np.exp(-log)))
 
     best = minimize(unlikely, np.array([0.0, 1.0, 0.0]))
     return float(np.exp(best.x[0])), float(best.x[1]), float(best.x[2])

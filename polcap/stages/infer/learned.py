@@ -20,8 +20,8 @@ from polcap.stages.infer.analytic import REACHED, fill_highlights
 
 _INVERSION = 4.0  # factor on the inversion's expected error in the join: the network has seen what it has seen
 _DETAIL = 2.0  # pixels that the network sees, 1σ: what is finer is the inversion's to tell
-# error = min(a·statedᵇ·exp(r·roughness), c), degrees: likeliest on traced training meshes, both laws (decision 28)
-_CALIBRATION = (0.576, 1.07, 1.11, 50.0)
+# error = min(a·statedᵇ·exp(r·roughness), c), degrees: likeliest on traced training meshes (decision 28)
+_CALIBRATION = (0.515, 1.12, 0.906, 50.0)
 _CELLS = 2.0  # cells of the network's grid, 1σ, over which its pattern is taken as the same
 _BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 _GRAZING = 0.15  # cosine below which shading is not told apart; .1 and .2 leave the same error
