@@ -107,28 +107,31 @@ def mesh(of: Mesh, limits: Gates) -> Gate:
 
     A cut says that the normals fit better with the surface apart there: where a part hides another, and where they err.
     """
-    faults, remedies = [], []
-    if of.pieces > limits.max_mesh_pieces:
-        faults.append(f"{of.pieces} pieces, more than {limits.max_mesh_pieces}")
-    if of.cuts > limits.max_mesh_cuts:
-        faults.append(
-            f"cuts of {of.cut_px:.0f} px, {of.cuts:.0%} of the outline's length, more than {limits.max_mesh_cuts:.0%}"
-        )
+    faults: list[tuple[str, float, float, Unit]] = []  # in words, its figure, its limit
+    remedies = []
+    pieces, cuts, rim = limits.max_mesh_pieces, limits.max_mesh_cuts, limits.max_mesh_raggedness
+    if of.pieces > pieces:
+        faults.append((f"{of.pieces} pieces, more than {pieces}", of.pieces, pieces, ""))
+    if of.cuts > cuts:
+        says = f"cuts of {of.cut_px:.0f} px, {of.cuts:.0%} of the outline's length, more than {cuts:.0%}"
+        faults.append((says, of.cuts, cuts, "%"))
     if faults:
         remedies.append("the normals fit no surface, see their error; --set surface.stiffness=0 closes all cuts")
-    if of.raggedness > limits.max_mesh_raggedness:
-        faults.append(f"a rim {of.raggedness:.0%} longer than its curve, more than {limits.max_mesh_raggedness:.0%}")
+    if of.raggedness > rim:
+        says = f"a rim {of.raggedness:.0%} longer than its curve, more than {rim:.0%}"
+        faults.append((says, of.raggedness, rim, "%"))
         remedies.append("where the mask's outline is jagged give --mask PNG")
-    cuts = round(of.cuts, 4)
     if faults:
-        return Gate("mesh", "fail", cuts, limits.max_mesh_cuts, "; ".join(faults), "; ".join(remedies))
+        _, value, limit, unit = faults[0]
+        said = "; ".join(fault[0] for fault in faults)
+        return Gate("mesh", "fail", round(value, 4), limit, said, "; ".join(remedies), unit=unit)
     says = f"{of.pieces} piece{'s' * (of.pieces != 1)}, "
     says += (
         f"cut along {of.cut_px:.0f} px where the normals fit better apart: behind a part, or at a slit where they err"
         if of.cut_px
         else "no cut inside the outline"
     )
-    return Gate("mesh", "pass", cuts, limits.max_mesh_cuts, says)
+    return Gate("mesh", "pass", round(of.cuts, 4), cuts, says)
 
 
 def sharpness(found: Found, limits: Gates) -> Gate:

@@ -211,15 +211,23 @@ def test_assumed_focal_length_warns_and_costs_what_the_rays_would_lean(good: Sim
 
 
 @pytest.mark.parametrize(
-    ("fault", "words"),
-    [({"pieces": 26}, "26 pieces"), ({"cuts": 2.5}, "250% of the outline"), ({"raggedness": 0.4}, "rim 40%")],
+    ("fault", "words", "unit"),
+    [
+        ({"pieces": 26}, "26 pieces", ""),
+        ({"cuts": 2.5}, "250% of the outline", "%"),
+        ({"raggedness": 0.4}, "rim 40%", "%"),
+    ],
 )
-def test_mesh_in_shreds_fails(good: SimpleNamespace, fault: dict[str, float], words: str) -> None:
+def test_mesh_in_shreds_fails_by_the_figure_that_is_over(
+    good: SimpleNamespace, fault: dict[str, float], words: str, unit: str
+) -> None:
     whole = {"pieces": 1, "cuts": 0.3, "cut_px": 40.0, "raggedness": 0.1}
     passed = judged(changed(good, mesh=SimpleNamespace(**whole)))["mesh"]
     assert passed.state == "pass" and passed.says.startswith("1 piece, cut along 40 px")
     gate = judged(changed(good, mesh=SimpleNamespace(**whole | fault)))["mesh"]
     assert gate.state == "fail" and words in gate.says
+    (figure,) = fault.values()
+    assert (gate.value, gate.unit) == (figure, unit) and not _within(gate, least=False)
 
 
 def _within(gate: Gate, least: bool) -> bool:
