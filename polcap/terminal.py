@@ -38,8 +38,10 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
             code = 0
         except KeyboardInterrupt:
             again = " with --resume" if kwargs.get("resume") is False else ""
-            print(f"polcap: interrupted; run the same command again{again} to go on", file=sys.stderr)
+            says = f"interrupted; run the same command again{again} to go on"
+            print(f"polcap: {says}", file=sys.stderr)
             code = 130
+            tell_program(kwargs, KeyboardInterrupt(says), code)
         except PolcapError as error:
             traceback_of(error, context)
             tell(f"polcap: error: {line(error)}")

@@ -3,10 +3,12 @@
 import json
 import time
 from pathlib import Path
+from typing import Literal, get_origin
 
 import pytest
+from typer.main import get_command
 
-from polcap import __version__, terminal
+from polcap import __version__, cli, pipeline, terminal
 from tests.conftest import Command
 
 
@@ -21,6 +23,42 @@ def test_with_json_an_error_is_a_document_too(polcap: Command, tmp_path: Path) -
     said = json.loads(done.stdout)["error"]
     assert done.returncode == said["exit_code"] == 2 and "no such folder" in said["says"]
     assert "no such folder" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("process",), "missing argument"),
+        (("batch", "none", "--worker", "2"), "--worker"),
+        (("export", "none", "--lod", "many"), "--lod"),
+        (("procces", "none"), "procces"),
+    ],
+)
+def test_with_json_a_command_line_that_is_none_is_a_document_too(
+    polcap: Command, words: tuple[str, ...], says: str
+) -> None:
+    done = polcap(*words, "--json")
+    said = json.loads(done.stdout)["error"]
+    assert done.returncode == said["exit_code"] == 2 and said["kind"] == "SettingError"
+    assert says in said["says"] and says in done.stderr
+    assert polcap(*words).stdout == ""
+
+
+def test_with_json_an_interruption_is_a_document_too(polcap: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline, "show", interrupted)
+    done = polcap("show", "none", "hdr", "--json")
+    said = json.loads(done.stdout)["error"]
+    assert done.returncode == said["exit_code"] == 130 and "run the same command again" in said["says"]
+
+
+def test_no_choice_minds_case() -> None:
+    commands = get_command(cli.app).commands  # type: ignore[attr-defined]
+    declared = [option.type_descriptor for command in commands.values() for option in command.params]
+    choices = [one.parameter_info for one in declared if get_origin(one.annotation) is Literal]
+    assert len(choices) > 10 and not any(one.case_sensitive for one in choices)
 
 
 def test_a_photograph_instead_of_its_folder_is_told(polcap: Command, example: Path) -> None:

@@ -37,6 +37,7 @@ from polcap.cli.process_command import process
 from polcap.cli.result_commands import export, report, show, status
 from polcap.cli.synth_command import synth
 from polcap.cli.training_commands import evaluate, train
+from polcap.errors import SettingError
 
 
 class OneLine(TyperGroup):
@@ -58,8 +59,11 @@ class OneLine(TyperGroup):
         try:
             code = run()
         except TyperException as error:
-            terminal.tell(_spoken(error))
+            said = _spoken(error)
+            terminal.tell(said)
             code = error.exit_code
+            asked = {"json": "--json" in (sys.argv[1:] if args is None else args)}
+            terminal.tell_program(asked, SettingError(said.removeprefix("polcap: error: ")), code)
         except typer.Abort:  # a question that got no answer
             terminal.tell("polcap: aborted")
             code = 1

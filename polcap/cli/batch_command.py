@@ -30,7 +30,11 @@ def batch(
     ] = True,
     write_jobs: Annotated[
         Literal["slurm", "openjd", "opencue", "snakemake", "kubernetes"] | None,
-        typer.Option(metavar="KIND", help="Only write the job file for slurm, openjd, opencue, snakemake, kubernetes."),
+        typer.Option(
+            metavar="KIND",
+            case_sensitive=False,
+            help="Only write the job file for slurm, openjd, opencue, snakemake, kubernetes.",
+        ),
     ] = None,
     jobs: Annotated[int, typer.Option(min=0, help="Shards of the job file; 0 is one per capture, 1000 at most.")] = 0,
     json: Json = False,

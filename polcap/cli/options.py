@@ -32,10 +32,14 @@ Assignments = Annotated[
 Angles = Annotated[str | None, typer.Option(metavar="DEG,…", help="Angles of the shots in order, as 0,45,90.")]
 NoChart = Annotated[bool, typer.Option("--no-chart", help="Use the camera's own colours.")]
 Estimator = Annotated[
-    Literal["network", "analytic"] | None, typer.Option(help="By default the network where one is shipped.")
+    Literal["network", "analytic"] | None,
+    typer.Option(case_sensitive=False, help="By default the network where one is shipped."),
 ]
 Model = Annotated[Path | None, typer.Option(metavar="ONNX", help="Another model than the shipped one.")]
-Device = Annotated[Literal["cpu", "cuda", "auto"], typer.Option(help="Where the network runs; cuda never falls back.")]
+Device = Annotated[
+    Literal["cpu", "cuda", "auto"],
+    typer.Option(case_sensitive=False, help="Where the network runs; cuda never falls back."),
+]
 
 
 def angles_deg(text: str | None) -> tuple[float, ...] | None:

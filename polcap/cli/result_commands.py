@@ -21,11 +21,12 @@ def export(
     materialx: Annotated[bool, typer.Option("--materialx", help="asset/NAME.mtlx and textures")] = False,
     exr: Annotated[bool, typer.Option("--exr", help="asset/NAME_layers.exr, every map as a layer")] = False,
     preset: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="blender, unreal, unity, web or archive (extra [usd]), into asset/NAME/."),
+        Literal["blender", "unreal", "unity", "web", "archive"] | None,
+        typer.Option(case_sensitive=False, help="For which program, into asset/NAME/; archive needs the extra [usd]."),
     ] = None,
     images: Annotated[
-        Literal["png", "jpeg", "webp", "ktx2"] | None, typer.Option(help="Kind of the pictures in the GLB.")
+        Literal["png", "jpeg", "webp", "ktx2"] | None,
+        typer.Option(case_sensitive=False, help="Kind of the pictures in the GLB."),
     ] = None,
     color: Annotated[
         str, typer.Option(metavar="SPACE", help="Colour space or OCIO role of the EXR's colours, as ACEScg.")
@@ -61,7 +62,10 @@ def show(
     all_: Annotated[bool, typer.Option("--all", help="Every stage.")] = False,
     animate: Annotated[
         Literal["light", "turntable"] | None,
-        typer.Option(help="WebP, and MP4 where FFmpeg is present: a light that goes round, or the surface turned."),
+        typer.Option(
+            case_sensitive=False,
+            help="WebP, and MP4 where FFmpeg is present: a light that goes round, or the surface turned.",
+        ),
     ] = None,
     json: Json = False,
 ) -> None:

@@ -13,7 +13,9 @@ from polcap.errors import SettingError
 def synth(
     context: typer.Context,
     folder: Annotated[Path, typer.Argument(help="Folder to make; must be new or empty.")],
-    scene: Annotated[Literal["bumps", "clusters", "vase"], typer.Option(help="What stands there.")] = "bumps",
+    scene: Annotated[
+        Literal["bumps", "clusters", "vase"], typer.Option(case_sensitive=False, help="What stands there.")
+    ] = "bumps",
     seed: Annotated[int, typer.Option(min=0, help="Draws shape, material, light and noise.")] = 0,
     assignments: Annotated[
         list[str] | None, typer.Option("--set", metavar="K=V", help="How it is shot, as width=768; repeatable.")
@@ -29,7 +31,8 @@ def synth(
         bool, typer.Option("--interreflection", help="Light goes once from part to part of the mesh.")
     ] = False,
     law: Annotated[
-        Literal["smooth", "rough"], typer.Option(help="Interface that light from inside the body leaves through.")
+        Literal["smooth", "rough"],
+        typer.Option(case_sensitive=False, help="Interface that light from inside the body leaves through."),
     ] = "smooth",
     calibration: Annotated[
         bool, typer.Option("--calibration", help="Make photographs for `polcap calibrate` instead.")

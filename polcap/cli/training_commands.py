@@ -14,7 +14,9 @@ def train(
     context: typer.Context,
     data: Annotated[Path, typer.Argument(help="Folder with meshes/ and materials/.")],
     out: Annotated[Path, typer.Option(help="Checkpoints and metrics.")] = Path("runs/train"),
-    preset: Annotated[Literal["cpu", "gpu"], typer.Option(help="Size of the network and of a batch.")] = "cpu",
+    preset: Annotated[
+        Literal["cpu", "gpu"], typer.Option(case_sensitive=False, help="Size of the network and of a batch.")
+    ] = "cpu",
     minutes: Annotated[float, typer.Option(min=0.1, help="Training time, resumed parts together.")] = 90,
     samples: Annotated[int | None, typer.Option(min=1, help="Pictures to learn from, instead of minutes.")] = None,
     variant: Annotated[str, typer.Option(help="The network with one thing taken away, as the ablations.")] = "ours",
