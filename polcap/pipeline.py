@@ -18,16 +18,18 @@ from polcap import asset_export, pictures, report, resource_limits, unchanged
 from polcap.asset_export import Wanted
 from polcap.config import Config, restored
 from polcap.errors import InputError, SettingError, StorageError
-from polcap.formats import animation, atomic, layouts, png, provenance, text_file
+from polcap.formats import animation, atomic, calib, layouts, png, provenance, text_file
 from polcap.formats import maps as maps_folder
 from polcap.formats.written import Written
-from polcap.images import Capture, Frame, Network, SensorImage, Shot
+from polcap.images import Capture, ColorCalibration, Frame, Network, SensorImage, Shot
 from polcap.parallel import Beside, finished
 from polcap.path import STAGES, Results, UserInput, path
 from polcap.pictures import moving
 from polcap.remembered import Remembered
 from polcap.report import page
 from polcap.store import Archive, Progress, Store, contents, seal, silent
+
+PROFILE = "color.toml"  # beside the report
 
 
 def process(
@@ -103,6 +105,7 @@ def _processed(
             asset_export.export(out, about, Wanted(), written, results)
             finished(drawn)
         report.write(out, about, results, remembered)
+        _write_profile(out / PROFILE, results.color.value)
         written.remember()
         progress("write", time.perf_counter() - start, False)
     return about
@@ -115,6 +118,14 @@ def _warm(supplied: UserInput) -> None:
     for network in (supplied.mask_network, supplied.network, supplied.network and supplied.network.fine):
         if network is not None:
             network.warm()
+
+
+def _write_profile(file: Path, color: ColorCalibration) -> None:
+    """What `--chart FILE.toml` of other captures takes, where this one's chart was read."""
+    if color.source in ("chart", "corners"):
+        calib.write_profile(file, color)
+    else:
+        file.unlink(missing_ok=True)
 
 
 class _Work:

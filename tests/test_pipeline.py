@@ -40,9 +40,19 @@ def test_result_holds_what_the_contract_names(result: Path) -> None:
     named = """maps/normal.exr maps/normal.png maps/depth.exr maps/depth.png maps/diffuse.exr maps/diffuse.png
         maps/specular.exr maps/specular.png maps/roughness.exr maps/roughness.png maps/mask.png maps/confidence.exr
         maps/stokes.exr maps/cues.exr maps/maps.json asset/capture.glb asset/capture.obj asset/capture.mtl
-        report.html report.json work"""
+        report.html report.json color.toml work"""
     assert [name for name in named.split() if not (result / name).exists()] == []
     assert partial(result) == []
+
+
+def test_the_chart_of_one_capture_serves_another(polcap: Command, result: Path, example: Path, tmp_path: Path) -> None:
+    """As a file of the result: the same colors, and nothing of a chart in the other's result."""
+    command = ("process", example, "--out", tmp_path, "--estimator", "analytic")
+    assert polcap(*command, "--chart", result / "color.toml").returncode in (0, 3)
+    ours, theirs = (pipeline.reopen(folder)[0].color.value for folder in (tmp_path, result))
+    assert (ours.source, theirs.source) == ("profile", "chart")
+    np.testing.assert_allclose(ours.matrix, theirs.matrix, atol=1e-8)
+    assert not (tmp_path / "color.toml").exists()
 
 
 def test_normals_of_the_bundled_capture_are_near_the_truth(result: Path, example: Path) -> None:
