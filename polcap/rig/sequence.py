@@ -272,6 +272,8 @@ def _log(folder: Path) -> Iterator[Log]:
         yield log
     finally:
         log.close()
+        if not (folder / record.NAME).exists() and not (folder / record.LOG).stat().st_size:  # nothing was begun
+            (folder / record.LOG).unlink()
 
 
 @contextmanager

@@ -378,7 +378,7 @@ def test_dials_that_cannot_tell_two_exposures_apart_end_the_run(rig: Rig) -> Non
 def test_what_needs_a_person_is_refused_where_there_is_none(rig: Rig) -> None:
     with pytest.raises(SettingError, match="need a person at a terminal"):
         rig.shoot(msgspec.structs.replace(ORDER, chart=True))
-    assert rig.taken == []
+    assert rig.taken == [] and [path.name for path in rig.folder.iterdir() if not path.name.startswith(".")] == []
 
 
 @pytest.mark.parametrize(
