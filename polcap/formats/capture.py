@@ -201,9 +201,11 @@ def _check_angles(folder: Path, angles_deg: Sequence[float], who: str) -> None:
     count = layouts.different(angles_deg)
     if count < 3:
         listed = ", ".join(f"{angle:g}" for angle in angles_deg) or "none"
-        raise CaptureError(
-            f"{folder}: {who} {listed}: {count} different polarizer angles where 3 are needed; add the missing shot"
-        )
+        unread = ", ".join(layouts.numbered(folder))
+        remedy = "add the missing shot"
+        if unread:
+            remedy += f", or name {unread} as polcap reads it: pol000, pol045, …"
+        raise CaptureError(f"{folder}: {who} {listed}: {count} different polarizer angles where 3 are needed; {remedy}")
 
 
 def _check_one_camera(facts: dict[Path, Exif]) -> None:

@@ -86,7 +86,8 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None, 
     listing = _list(folder, look)
     if not listing.pictures:
         inside = [path for path in children(folder) if path.is_dir()]
-        named, hint = ", ".join(path.name for path in inside[:4]), ""
+        named = f"{', '.join(path.name for path in inside[:4])}{', …' if len(inside) > 4 else ''}"
+        hint = "; give the folder that holds the photographs"
         if any(_pol_folders(path) for path in inside):
             hint = f"; its sub-folders {named} hold captures: give one of them, or `polcap batch` the folder of all"
         elif inside:
@@ -170,6 +171,15 @@ def _folders(folder: Path, sub_folders: dict[float, Path], angles_deg: Sequence[
     loose = sorted(path.name for path in children(folder) if path.is_file() and path.name != capture_toml.NAME)
     notes += [f"not used: the files {', '.join(loose[:4])}{', …' if len(loose) > 4 else ''}"] if loose else []
     return Plan("folders", _select(folder, groups, angles_deg), crossed, tuple(notes))
+
+
+def numbered(folder: Path) -> list[str]:
+    """Sub-folders whose names hold a number that is not read as an angle: 045, angle45."""
+    return [
+        path.name
+        for path in children(folder)
+        if path.is_dir() and not is_angle_folder(path.name) and path.name not in OURS and _NUMBER.search(path.name)
+    ]
 
 
 def _crossed(folder: Path, look: Look) -> tuple[Source, ...]:

@@ -261,6 +261,13 @@ def spoil_missing_angle(folder):
     return r"angles are 0, 90: 2 different polarizer angles where 3 are needed"
 
 
+def spoil_name_of_an_angle(folder):
+    (folder / "pol045").rename(folder / "angle45")
+    return (
+        r"angles are 0, 90: 2 different polarizer angles where 3 are needed; add the missing shot, or name angle45 as"
+    )
+
+
 def spoil_axes_that_coincide(folder):
     (folder / "pol045").rename(folder / "pol180")
     return "2 different polarizer angles where 3"
@@ -275,7 +282,7 @@ def spoil_empty_angle(folder):
 def spoil_empty_folder(folder):
     for path in folder.iterdir():
         shutil.rmtree(path)
-    return "holds no photograph"
+    return "holds no photograph that polcap reads; give the folder that holds the photographs"
 
 
 def spoil_no_folder(folder):
