@@ -199,7 +199,8 @@ def test_status_and_report_speak_json(result: Path, polcap: Command, tmp_path: P
     shutil.copytree(result, copy)
     again = json.loads(polcap("report", copy, "--json").stdout)
     assert again == json.loads((result / "report.json").read_text())
-    assert polcap("report", result, "--compare", copy).stdout == "\n"
+    same = polcap("report", result, "--compare", copy)
+    assert same.stdout == "" and "no figure and no setting differs" in same.stderr
 
 
 @pytest.mark.parametrize("command", [["status"], ["report"], ["export"], ["show"]])
@@ -207,6 +208,10 @@ def test_folder_that_is_no_result_is_exit_2(tmp_path: Path, polcap: Command, com
     done = polcap(*command, tmp_path, *(["hdr"] if command == ["show"] else []))
     assert done.returncode == 2 and done.stderr.count("\n") == 1
     assert not (tmp_path / "work").exists()
+
+
+def test_the_status_of_no_folder_says_so(tmp_path: Path, polcap: Command) -> None:
+    assert "no such folder" in polcap("status", tmp_path / "none").stderr
 
 
 def test_a_capture_stands_for_the_result_in_it(result: Path, polcap: Command, tmp_path: Path) -> None:

@@ -87,6 +87,8 @@ def status(context: typer.Context, result: Result, json: Json = False) -> None:
     """What a result folder holds, stage by stage; or how far a batch of captures is."""
     from polcap import store
 
+    if not result.is_dir():
+        raise SettingError(f"{result}: no such folder; give the result folder of `polcap process`, or that of a batch")
     found = store.contents(result)
     if not found and (result / "polcap-batch").is_dir():
         from polcap import batch as batches
@@ -95,7 +97,7 @@ def status(context: typer.Context, result: Result, json: Json = False) -> None:
         terminal.say(about if json else batches.lines(about))
         return
     if not found:
-        raise SettingError(f"{result} holds no stage cache; give the result folder of `polcap process`")
+        raise SettingError(f"{result} holds no stage cache; run `polcap process` or `polcap batch` on it first")
     rows = [{name: about[name] for name in ("stage", "version", "key", "seconds", "bytes")} for about in found]
     complete = (result / "report.json").exists()
     if json:
@@ -125,7 +127,10 @@ def report(
         rows = pairs.rows(*abouts)
         named = [{"name": name, "here": here, "there": there} for name, here, there in rows]
         spoken = (pairs.spoken(row) for row in rows)
-        terminal.say(named if json else "\n".join(f"{title}: {here}  |  {there}" for title, here, there in spoken))
+        if json or rows:
+            terminal.say(named if json else "\n".join(f"{title}: {here}  |  {there}" for title, here, there in spoken))
+        if not rows:
+            terminal.tell("polcap: no figure and no setting differs")
         print(f"polcap: both side by side: {file}", file=sys.stderr)
         return
     from polcap import pipeline
