@@ -90,6 +90,8 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None, 
         hint = "; give the folder that holds the photographs"
         if any(_pol_folders(path) for path in inside):
             hint = f"; its sub-folders {named} hold captures: give one of them, or `polcap batch` the folder of all"
+        elif (folder / "report.json").is_file() and (folder / "maps").is_dir():
+            hint = "; it is a result: give the capture that it was made of"
         elif inside:
             hint = f"; its sub-folders are {named}, but polcap looks for pol000, pol045, …"
         raise CaptureError(f"{folder}: holds no photograph that polcap reads{hint}")
