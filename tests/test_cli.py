@@ -210,6 +210,11 @@ def test_folder_that_is_no_result_is_exit_2(tmp_path: Path, polcap: Command, com
     assert not (tmp_path / "work").exists()
 
 
+def test_a_result_is_told_to_be_no_capture(result: Path, polcap: Command) -> None:
+    done = polcap("process", result)
+    assert done.returncode == 2 and "it is a result: give the capture" in done.stderr
+
+
 def test_the_status_of_no_folder_says_so(tmp_path: Path, polcap: Command) -> None:
     assert "no such folder" in polcap("status", tmp_path / "none").stderr
 
@@ -267,6 +272,8 @@ def test_memory_limit_ends_with_one_line(example: Path, tmp_path: Path) -> None:
 def test_synth_makes_a_capture_that_reads(polcap: Command, tmp_path: Path) -> None:
     small = [f"--set={text}" for text in ("width=128", "height=96", "samples=1", "exposures=1")]
     made = polcap("synth", tmp_path / "c", "--seed", 5, *small)
+    named = polcap("synth", tmp_path / "named", "--json", *small).stdout
+    assert json.loads(named) == {"written": [str(tmp_path / "named")]}
     assert made.stdout == f"{tmp_path / 'c'}\n", made.stderr
     assert "3 shots" in polcap("process", tmp_path / "c", "--dry-run").stdout
     assert polcap("synth", tmp_path / "d", "--set", "widht=3").returncode == 2

@@ -7,6 +7,7 @@ import typer
 
 from polcap import terminal
 from polcap.cli import extras
+from polcap.cli.options import Json
 from polcap.errors import SettingError
 
 
@@ -41,6 +42,7 @@ def synth(
         int | None,
         typer.Option(min=1, metavar="N", help="Make N samples of a data set instead (extra [train]); goes on."),
     ] = None,
+    json: Json = False,
 ) -> None:
     """Photograph an object that does not exist: RAW brackets, with the truth beside them."""
     from msgspec.structs import replace
@@ -53,14 +55,14 @@ def synth(
         corpus = extras.training("corpus")
         named = {"seed": seed, "mesh": str(mesh or ""), "material": str(material or ""), "law": law}
         corpus.main(folder, dataset, settings.fill(corpus.Recipe, named, assignments or ()))
-        terminal.say(str(folder / "dataset.json"))
+        _say_written(folder / "dataset.json", json)
         return
     if calibration:
         from polcap.synth import calibration_frames
 
         set_up = settings.fill(calibration_frames.CalibrationShoot, {"seed": seed}, assignments or ())
         calibration_frames.write(folder, set_up)
-        terminal.say(str(folder))
+        _say_written(folder, json)
         return
     if interreflection and mesh is None:
         raise SettingError("--interreflection is traced between triangles; give the object with --mesh")
@@ -78,4 +80,8 @@ def synth(
         what = replace(what, law=law)
     with terminal.progress(len(shoot.angles_deg) * shoot.exposures) as bar:
         synthetic.write(folder, what, shoot, bar.frame)
-    terminal.say(str(folder))
+    _say_written(folder, json)
+
+
+def _say_written(made: Path, json: bool) -> None:
+    terminal.say({"written": [str(made)]} if json else str(made))
