@@ -57,7 +57,7 @@ def inspect(
     """
     start = perf_counter()
     with ThreadPoolExecutor(2) as pool, ThreadPoolExecutor(1) as beside:
-        loaded = beside.submit(networks)
+        loaded = beside.submit(_warm, networks)
         try:
             taken = reduced.take(capture, config.hdr.clip, pool)
             lines = tuple(judge.judged(judge.Reduced(taken, loaded.result, config, chart)))
@@ -69,6 +69,14 @@ def inspect(
     missing = any(line.name == "chart" and line.state == "warn" for line in lines)
     seconds = round(perf_counter() - start, 2)
     return Verdict(not bad, shots, lines, capture.name, seconds, "--no-chart" if missing else "")
+
+
+def _warm(networks: Callable[[], Networks]) -> Networks:
+    """Load what the stages need besides, while the reference frame is decoded and the second core waits."""
+    import scipy.spatial.transform
+    import scipy.special  # noqa: F401
+
+    return networks()
 
 
 def table(verdict: Verdict) -> str:

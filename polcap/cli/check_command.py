@@ -30,14 +30,15 @@ def check(
 
     from polcap.formats import capture as captures
 
-    with ThreadPoolExecutor(1) as beside:  # headers are read while all else is imported
+    with ThreadPoolExecutor(2) as beside:  # headers are read while all else is imported
         found = beside.submit(captures.read, capture, options.angles_deg(angles))
         from polcap import check as checks
         from polcap import config as settings
         from polcap import models
 
+        networks = beside.submit(models.shipped)
         chosen, request = settings.load(config, assignments or ()), options.chart_request(chart, no_chart)
-        verdict = checks.inspect(found.result(), models.shipped, chosen, request)
+        verdict = checks.inspect(found.result(), networks.result, chosen, request)
     terminal.say(checks.shown(verdict) if json else checks.table(verdict))
     if not verdict.keep:
         raise typer.Exit(GateError.exit_code)

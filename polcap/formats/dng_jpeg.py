@@ -20,6 +20,7 @@ _ONE_TO_ONE = 0x11  # sampling of a component
 _SINCE = (1, 1)  # DNG version; before it a difference of 16 bits was coded in another way
 _MOST_HEADER = 64  # segments before the scan
 _PAST_END = 32 * b"\xff\0"  # ones, which are no code: who reads on behind a scan's end decodes differences of 0
+_LAST = 256  # bytes of a scan that are looked at for its end; more of filling is left to LibRaw
 _CATEGORIES = np.frexp(np.abs(np.arange(1 << 16, dtype=np.uint16).astype(np.int16).astype(int)))[1]  # T.81, table H.2
 _ROWS = 256  # whose differences are counted at a time
 
@@ -80,7 +81,7 @@ def hollow(structure: sniff.Tiff, data: bytes) -> bytes:
     image = _sensor(structure)
     assert image is not None
     start = _windows(image)[0].offset
-    return data[:start] + b"\0\0" + data[start + 2 :]
+    return b"".join([data[:start], b"\0\0", memoryview(data)[start + 2 :]])
 
 
 def _decoded(data: bytes, window: Window, scan: _Scan) -> Counts | None:
@@ -93,18 +94,18 @@ def _decoded(data: bytes, window: Window, scan: _Scan) -> Counts | None:
     if data[end : end + 2] != b"\xff\xd9" or end + 2 > window.offset + window.length:
         return None
     try:
-        part = jpeg8_decode(data[window.offset : end] + _PAST_END + b"\xff\xd9")
+        part = jpeg8_decode(b"".join([memoryview(data)[window.offset : end], _PAST_END, b"\xff\xd9"]))
     except Jpeg8Error:
         return None
     if part.dtype != np.uint16 or part.size != window.height * window.width or int(part.max()) >> scan.bits:
         return None
-    if not _in_scan(part.reshape(*part.shape[:2], -1), scan, data[scan.start : end].rstrip(b"\xff")):
+    if not _in_scan(part.reshape(*part.shape[:2], -1), scan, data, end):
         return None  # the scan was too short, which LibRaw tells
     decoded: Counts = part.reshape(window.height, window.width)
     return decoded
 
 
-def _in_scan(samples: Counts, scan: _Scan, coded: bytes) -> bool:
+def _in_scan(samples: Counts, scan: _Scan, data: bytes, end: int) -> bool:
     """Whether all differences were in a scan, none decoded of what was put behind it.
 
     The last one's code has to stand at the end. The bits of all are counted where that may be chance: where ones, which
@@ -116,14 +117,18 @@ def _in_scan(samples: Counts, scan: _Scan, coded: bytes) -> bool:
         (h, w, components) as decoded.
     scan
         Of the JPEG.
-    coded
-        The coded differences, ones filling up the last byte.
+    data
+        All bytes of the file, which nothing here copies.
+    end
+        Where the coded differences end in it, ones filling up the last byte.
     """
-    if not scan.codes or b"\xff\xff" in coded:  # filling amid a scan ends it for LibRaw
+    last = data[max(scan.start, end - _LAST) : end].rstrip(b"\xff")
+    end = max(scan.start, end - _LAST) + len(last)
+    if not last or not scan.codes or data.find(b"\xff\xff", scan.start, end) >= 0:  # filling ends it for LibRaw
         return False
     difference = int(_differences(samples[-2:, :, -1], scan.bits)[-1, -1])
     code, length = _coded(difference, scan.codes[-1])
-    tail = int.from_bytes(coded[-32:].replace(b"\xff\0", b"\xff"), "big")
+    tail = int.from_bytes(last[-32:].replace(b"\xff\0", b"\xff"), "big")
     ends = [left for left in range(8) if tail & _ones(length + left) == (code << left | _ones(left))]
     if not ends or not length:
         return False
@@ -131,7 +136,7 @@ def _in_scan(samples: Counts, scan: _Scan, coded: bytes) -> bool:
     if difference and code and not any(tail & _ones(length - cut) == code >> cut for cut in cuts):
         return True
     bits = sum(_bits(samples[..., n], scan.bits, codes) for n, codes in enumerate(scan.codes))
-    return 8 * (len(coded) - coded.count(b"\xff\0")) - bits in ends
+    return 8 * (end - scan.start - data.count(b"\xff\0", scan.start, end)) - bits in ends
 
 
 def _coded(difference: int, codes: Codes) -> tuple[int, int]:

@@ -8,10 +8,12 @@ import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
+from polcap import parallel
 from polcap.errors import CaptureError
 from polcap.formats import capture_toml, photo, probe
 from polcap.formats.capture_toml import CaptureFile
@@ -26,6 +28,7 @@ APART_DEG = 5.0  # closer angles do not count as different
 EQUAL_STOPS = 0.15  # EXIF rounds times to a sixth of a stop at worst
 _POL_FOLDER = re.compile(r"pol[ _-]?(\d+(?:\.\d+)?)", re.IGNORECASE)
 _CROSS_FOLDER = re.compile(r"cross(?:[ _-]?(\d+(?:\.\d+)?))?", re.IGNORECASE)
+_AT_ONCE = 2  # files that are read side by side: as many processes as decode them afterwards
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 Look = Callable[[Path], Probe]  # `probe.read`, or one that remembers
 
@@ -335,7 +338,9 @@ def different(angles_deg: Iterable[float]) -> int:
 def _list(folder: Path, look: Look) -> _Listing:
     """The photographs of one folder; where a RAW is there, the finished pictures stand back."""
     listing = _Listing()
-    found = [Source(path, _probe(path, look)) for path in children(folder) if path.is_file()]
+    files = [path for path in children(folder) if path.is_file()]
+    probes = parallel.results([partial(_probe, path, look) for path in files], min(_AT_ONCE, parallel.threads()))
+    found = list(map(Source, files, probes))
     pictures = [source for source in found if source.probe.kind in ("raw", "photo")]
     raws = [source for source in pictures if source.probe.kind == "raw"]
     if raws and len(raws) < len(pictures):
