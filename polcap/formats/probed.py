@@ -1,4 +1,4 @@
-"""In: photographs, one after the other. Out: what each tells of itself, read once and remembered with the result.
+"""In: photographs, from any thread. Out: what each tells of itself, read once and remembered with the result.
 
 A file whose size and times are those of then is not read again: a late change need not wait for a hundred megabytes,
 nor start the process that reads them. Whoever decodes it compares the bytes with the digest told here.
