@@ -41,7 +41,8 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
             says = f"interrupted; run the same command again{again} to go on"
             print(f"polcap: {says}", file=sys.stderr)
             code = 130
-            tell_program(kwargs, KeyboardInterrupt(says), code)
+            if not kwargs.get("watch"):  # it ends like that; its reports stand on stdout
+                tell_program(kwargs, KeyboardInterrupt(says), code)
         except PolcapError as error:
             traceback_of(error, context)
             tell(f"polcap: error: {line(error)}")

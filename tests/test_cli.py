@@ -260,6 +260,7 @@ def test_watch_goes_on_as_photographs_come_in_and_settings_change(example: Path,
         assert told[0].startswith("watching") and told[1].startswith("polcap: asset.ior = 9"), told
         process.send_signal(signal.SIGINT)
         assert process.wait(300) == 130
+        assert process.stdout.read() == ""  # how it is meant to end is no error
     finally:
         process.kill()
 
