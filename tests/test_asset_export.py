@@ -179,7 +179,7 @@ def test_asset_is_built_anew_once_something_else_stands_there(
 @pytest.mark.parametrize(
     ("flags", "says"),
     [
-        (["--preset", "maya"], "'maya' is not one of 'blender', 'unreal', 'unity', 'web', 'archive'"),
+        (["--preset", "maya"], f"'maya' is not one of {', '.join(map(repr, PRESETS))}"),
         (["--preset", "web", "--obj"], "leave out --obj"),
         (["--exr", "--color", "ACEScq"], "--color ACEScq is no colour space or role"),
     ],

@@ -152,7 +152,7 @@ def test_a_list_of_nothing_says_so() -> None:
 
 def test_an_object_too_thin_for_the_page_leaves_its_figures_out() -> None:
     nothing = np.zeros((4, 5))
-    small = SimpleNamespace(angle=np.zeros(1), maps=SimpleNamespace(mask=nothing > 0))
-    again = SimpleNamespace(measured=[nothing], predicted=[nothing])
-    told = "".join(map_figures.rerendered(small, again, {"figures": {"rerendering": {"rms": [None]}}}))  # type: ignore[arg-type]  # stand-ins
+    small: Any = SimpleNamespace(angle=np.zeros(1), maps=SimpleNamespace(mask=nothing > 0))  # all that is read of it
+    again: Any = SimpleNamespace(measured=[nothing], predicted=[nothing])
+    told = "".join(map_figures.rerendered(small, again, {"figures": {"rerendering": {"rms": [None]}}}))
     assert "Polarizer at 0°" in told and "rms" not in told

@@ -2,11 +2,11 @@
 
 import json
 import time
+from itertools import chain
 from pathlib import Path
-from typing import Literal, get_origin
+from typing import get_args, get_type_hints
 
 import pytest
-from typer.main import get_command
 
 from polcap import __version__, cli, pipeline, terminal
 from tests.conftest import Command
@@ -55,10 +55,10 @@ def test_with_json_an_interruption_is_a_document_too(polcap: Command, monkeypatc
 
 
 def test_no_choice_minds_case() -> None:
-    commands = get_command(cli.app).commands  # type: ignore[attr-defined]
-    declared = [option.type_descriptor for command in commands.values() for option in command.params]
-    choices = [one.parameter_info for one in declared if get_origin(one.annotation) is Literal]
-    assert len(choices) > 10 and not any(one.case_sensitive for one in choices)
+    hints = [get_type_hints(command.callback, include_extras=True) for command in cli.app.registered_commands]
+    declared = [get_args(hint) for hint in chain.from_iterable(one.values() for one in hints)]
+    choices = [info for kind, *info in filter(None, declared) if "Literal[" in str(kind)]
+    assert len(choices) > 10 and not any(info[0].case_sensitive for info in choices)
 
 
 def test_a_photograph_instead_of_its_folder_is_told(polcap: Command, example: Path) -> None:
