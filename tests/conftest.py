@@ -8,11 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run beside each other; OpenBLAS asks when NumPy is loaded
+
 import numpy as np
 import pytest
 from filelock import FileLock
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run beside each other
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # as in a shell's background job; interruption is tested
     signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -113,6 +113,14 @@ def test_exporting_again_gives_the_bytes_that_process_wrote(result: Path, polcap
 
 
 @pytest.fixture
+def own(result: Path, tmp_path: Path) -> Path:
+    """The result in a folder of its own: an export locks it, and other tests run beside this one."""
+    copy = tmp_path / "own"
+    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
+    return copy
+
+
+@pytest.fixture
 def building(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Grows by one whenever an export builds a mesh."""
     from polcap.stages import surface
@@ -184,15 +192,15 @@ def test_asset_is_built_anew_once_something_else_stands_there(
         (["--exr", "--color", "ACEScq"], "--color ACEScq is no colour space or role"),
     ],
 )
-def test_what_does_not_exist_is_one_line(result: Path, polcap: Command, flags: list[str], says: str) -> None:
-    done = polcap("export", result, *flags)
+def test_what_does_not_exist_is_one_line(own: Path, polcap: Command, flags: list[str], says: str) -> None:
+    done = polcap("export", own, *flags)
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and says in done.stderr
 
 
-def test_ktx2_needs_an_encoder_and_says_so(result: Path, polcap: Command) -> None:
+def test_ktx2_needs_an_encoder_and_says_so(own: Path, polcap: Command) -> None:
     if encoders.ktx2_encoder() is not None:
         pytest.skip("an encoder is here")
-    done = polcap("export", result, "--gltf", "--images", "ktx2")
+    done = polcap("export", own, "--gltf", "--images", "ktx2")
     assert done.returncode == 2 and "ktx" in done.stderr and done.stderr.count("\n") == 1
 
 
@@ -232,10 +240,10 @@ def test_the_example_of_presets_runs(result: Path, tmp_path: Path) -> None:
 
 
 def test_usd_without_its_package_is_one_line_with_the_remedy(
-    result: Path, polcap: Command, monkeypatch: pytest.MonkeyPatch
+    own: Path, polcap: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pxr", None)
-    done = polcap("export", result, "--usd")
+    done = polcap("export", own, "--usd")
     assert done.returncode == 2 and "pip install 'polcap[usd]'" in done.stderr and done.stderr.count("\n") == 1
 
 

@@ -199,7 +199,7 @@ def test_status_and_report_speak_json(result: Path, polcap: Command, tmp_path: P
     shutil.copytree(result, copy)
     again = json.loads(polcap("report", copy, "--json").stdout)
     assert again == json.loads((result / "report.json").read_text())
-    same = polcap("report", result, "--compare", copy)
+    same = polcap("report", copy, "--compare", result)
     assert same.stdout == "" and "no figure and no setting differs" in same.stderr
 
 
@@ -223,7 +223,7 @@ def test_a_capture_stands_for_the_result_in_it(result: Path, polcap: Command, tm
     shutil.copytree(result, tmp_path / "capture" / "polcap")
     assert polcap("status", tmp_path / "capture").stdout == polcap("status", result).stdout
     assert polcap("show", tmp_path / "capture", "mask").stdout.startswith(str(tmp_path / "capture" / "polcap"))
-    assert polcap("report", result, "--compare", tmp_path / "capture").returncode == 0
+    assert polcap("report", tmp_path / "capture" / "polcap", "--compare", tmp_path / "capture").returncode == 0
 
 
 def test_user_mask_replaces_the_search(result: Path, example: Path, polcap: Command, tmp_path: Path) -> None:
