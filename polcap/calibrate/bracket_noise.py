@@ -28,6 +28,7 @@ from polcap.stages.hdr.planes import Signals
 
 _PARTS = 16  # of the picture, whose scatter is the doubt
 _LEAST_TILES = 80
+_MOST_PX = 1.5e6  # looked at per pair; twice what a merge needs
 _LEAST_RATIO = 1.2  # of two exposures; nearer ones are pairs for `flat/`
 _MOST_SHIFT_PX = 40.0  # beyond which two frames are not one scene
 _TRIM = 5.0  # σ beyond which a tile shows something that moved
@@ -108,13 +109,14 @@ def _pair(a: Signals, b: Signals) -> Iterator[_Tiles]:
     r = told.value.astype(np.float32)[:, None, None]
     weight = (1 / (1 + told.value**2)).astype(np.float32)[:, None, None]
     columns: tuple[list[Floats], ...] = ([], [], [])
-    for rows in noise.strips(*a.usable.shape):
-        one, two, usable = a.rows(rows), b.rows(rows), a.usable[rows] & b.usable[rows]
+    for rows in noise.strips(a.usable.shape[0], a.usable.shape[1], _MOST_PX):
+        one, two = a.rows(rows), b.rows(rows)
+        whole = noise.usable_tiles(a.usable[rows] & b.usable[rows])
         rough = noise.roughness(two - r * one)
         gx, gy = two[:, 1:-1, 2:] - two[:, 1:-1, :-2], two[:, 2:, 1:-1] - two[:, :-2, 1:-1]
         maps = ((two + r * r * one)[:, 1:-1, 1:-1] * weight, rough * rough * weight, (gx * gx + gy * gy) / 4 * weight)
         for column, values in zip(columns, maps):
-            column.append(noise.tiles(values, usable))
+            column.append(noise.tiles(values, whole))
     level, variance, edges = (np.concatenate(column).astype(np.float64) for column in columns)
     part = np.arange(len(level)) * _PARTS // max(len(level), 1)
     good = np.isfinite(level).all(axis=1)

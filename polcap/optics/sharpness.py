@@ -58,7 +58,7 @@ def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
     strip = replace(image, value=np.concatenate(around))  # whole periods of rows each keep the mosaic's phase
     shape = (len(corners), TILE + 2 * spare, TILE + 2 * spare)
     inner = np.s_[:, spare:-spare, spare:-spare]
-    light = _light(sensor.signal(strip)).reshape(shape)[inner]
+    light = _whole_light(strip).reshape(shape)[inner]
     sound = sensor.below(strip, clip * sensor.saturation(image)).reshape(shape)[inner].all((1, 2))
     return Tiles(light, sound & (light.mean((1, 2)) > _LEAST_LIGHT))
 
@@ -130,14 +130,16 @@ def extra_blur(tiles: Floats, usable: NDArray[np.bool_]) -> Floats:
         return np.full(len(tiles), np.nan)
     fineness = fineness[..., every]
     sharpest = int(np.argmax(np.median(fineness, axis=2).mean(1)))
-    ladder = np.stack([_fineness(_blurred(tiles[sharpest][every], sigma)) for sigma in _LADDER])  # (L, 4, T)
-    fall = np.median(ladder[0] - ladder, axis=2)  # (L, 4), growing
     each = fineness[sharpest] - fineness  # (K, 4, T)
     lost = np.median(each, axis=2)  # (K, 4)
     scatter = np.delete(each, sharpest, axis=0).std(axis=2, ddof=1).min(axis=0, initial=np.inf)  # (4,)
     count = each.shape[2]
     sure = stdtrit(count - 1, _SURE) * _MEDIAN_SE * scatter / np.sqrt(count)
     lost = np.where(lost > sure, lost, 0.0)
+    if not lost.any():
+        return np.zeros(len(tiles))
+    ladder = np.stack([_fineness(_blurred(tiles[sharpest][every], sigma)) for sigma in _LADDER])  # (L, 4, T)
+    fall = np.median(ladder[0] - ladder, axis=2)  # (L, 4), growing
     return np.array([max(np.interp(lost[k, w], fall[:, w], _LADDER) for w in range(4)) for k in range(len(tiles))])
 
 

@@ -21,6 +21,7 @@ Bools = NDArray[np.bool_]
 
 _FALL = 0.05  # [white level]; over this range below saturation a frame's weight falls to _LEAST
 _LEAST = 1e-3
+_BLOCK_PX = 64_000  # of one channel: all planes of a block then stay in a core's own cache
 _SOME = 1e-9  # weight of the reference frame where nothing can be believed: some value for every pixel
 
 
@@ -131,46 +132,48 @@ class Mixture:
 
     def into(self, out: Merged) -> None:
         """Weight, sum and write; a single channel goes into all three, with 3 times its variance."""
-        parallel.results(partial(self._block, out, rows) for rows, _, _ in blocks(self.shape[1]))
+        _, height, width = self.shape
+        rows_of_block = max(_BLOCK_PX // width, 1)
+        parallel.results(partial(self._block, out, rows) for rows, _, _ in blocks(height, rows=rows_of_block))
 
     def _block(self, out: Merged, rows: slice) -> None:
         value, variance = self._rows(rows)
         total, noise_ = (np.sum(planes, axis=0) for planes in (value, variance))
-        quality = out.quality[rows]
-        quality[:] = np.where(self.served[rows], 0, np.uint8(Quality.CLIPPED))
-        quality[self.measured.ghost[rows]] |= np.uint8(Quality.GHOST)
-        quality[total < 2 * np.sqrt(noise_)] |= np.uint8(Quality.DARK)
+        np.sqrt(noise_, out=noise_)
+        noise_ *= np.float32(2)
+        quality = _flagged(~self.served[rows], Quality.CLIPPED)
+        quality |= _flagged(self.measured.ghost[rows], Quality.GHOST)
+        quality |= _flagged(total < noise_, Quality.DARK)
+        out.quality[rows] = quality
         if len(value) == 1:
             value, variance = value.repeat(3, axis=0), variance.repeat(3, axis=0) * np.float32(3)
         cv2.merge(list(value), out.value[rows])
         cv2.merge(list(variance), out.variance[rows])
 
     def _rows(self, rows: slice) -> tuple[Floats, Floats]:
-        """Weighted mean and its variance of some rows, (C, h, W)."""
+        """Weighted mean and its variance of some rows, (C, h, W).
+
+        With frames' weights w = trust / v, v the variance of their radiance, Σ w² v is Σ trust · w. Sums are made of
+        w / ratio, so that counts need not be brought to radiance.
+        """
         estimate = self.measured.estimate[:, rows]
+        light = np.maximum(estimate, 0)
         number, weights, variance = (np.zeros_like(estimate) for _ in range(3))
         shares = np.zeros_like(estimate) if self.ambient is not None else None  # of the ambient light
         steep = _edges(self.measured.estimate, rows) if any(f.misfit.any() for f in self.frames) else None
         for frame in self.frames:
-            sample, noise_ = frame.signals.rows(rows), self._noise(frame, rows, steep)
-            serves = frame.serves[rows]
-            trust: Floats | np.float32 = np.float32(1) if serves.all() else np.maximum(serves, frame.least)
-            if not frame.last:
-                trust = trust * self._ramp(frame, estimate)
-            for c, v in enumerate(noise_):
-                weight = trust / v
+            sample, trust = frame.signals.rows(rows), self._trust(frame, estimate, rows)
+            for c, weight in enumerate(self._noise(frame, rows, light, steep)):
+                ratio, plane = float(frame.ratio[c]), sample[c]
+                np.divide(trust, weight, out=weight)
                 if self.ambient is not None and shares is not None:
-                    plane = sample[c] - frame.lit * self.ambient.value[c, rows]
-                    shares[c] += weight * (frame.lit / frame.ratio[c])
-                else:
-                    plane = sample[c]
-                weights[c] += weight
-                weighted = weight * plane
-                weighted *= np.float32(1) / frame.ratio[c]
-                number[c] += weighted
-                weight *= weight
-                weight *= v
-                variance[c] += weight
+                    plane = plane - frame.lit * self.ambient.value[c, rows]
+                    cv2.scaleAdd(weight, float(frame.lit), shares[c], shares[c])
+                cv2.accumulateProduct(weight, plane, number[c])
+                cv2.scaleAdd(weight, ratio, weights[c], weights[c])
+                if np.ndim(trust):
+                    weight *= trust
+                cv2.scaleAdd(weight, ratio, variance[c], variance[c])
         number /= weights
         variance /= weights
         variance /= weights
@@ -179,20 +182,31 @@ class Mixture:
             variance += shares * shares * self.ambient.variance[:, rows]
         return number, variance
 
-    def _noise(self, frame: _Frame, rows: slice, steep: Floats | None) -> Floats:
-        """Expected variance of a frame's radiance, (C, h, W)."""
-        light = np.empty_like(self.measured.estimate[:, rows])
-        for plane, estimate, ratio in zip(light, self.measured.estimate[:, rows], frame.ratio):
-            np.multiply(estimate, ratio, out=plane)
+    def _trust(self, frame: _Frame, estimate: Floats, rows: slice) -> Floats | np.float32:
+        """What a frame's weight is multiplied by where it clips or nearly does, (h, W) or one number."""
+        serves = frame.serves[rows]
+        trust: Floats | np.float32 = np.float32(1) if serves.all() else np.maximum(serves, frame.least)
+        return trust if frame.last else trust * self._ramp(frame, estimate)
+
+    def _noise(self, frame: _Frame, rows: slice, light: Floats, steep: Floats | None) -> Floats:
+        """Expected variance of a frame's radiance times its ratio, (C, h, W), where that is `light`."""
         if self.ambient is not None:
-            light += frame.lit * np.maximum(self.ambient.value[:, rows], 0)
-        out = ambients.noise_of(light, frame.noise, frame.cfa)
+            lit = (frame.lit / frame.ratio)[:, None, None]
+            light = light + lit * np.maximum(self.ambient.value[:, rows], 0)
+        if frame.cfa is None:
+            out = np.empty_like(light)
+            for c, plane in enumerate(light):
+                np.multiply(plane, frame.noise.slope[c], out=out[c])
+                out[c] += frame.noise.floor[c] / frame.ratio[c]
+        else:
+            ratio = frame.ratio[:, None, None]
+            out = ambients.noise_of(light * ratio, frame.noise, frame.cfa)
+            out /= ratio
         if frame.blur is not None:
             out *= frame.blur[rows]
-        for c, plane in enumerate(out):
-            plane *= np.float32(1) / frame.ratio[c] ** 2
-            if steep is not None and frame.misfit[c]:  # registration and aliasing show at edges
-                plane += steep[c] * frame.misfit[c]
+        if steep is not None:  # registration and aliasing show at edges
+            for c, plane in enumerate(out):
+                cv2.scaleAdd(steep[c], float(frame.misfit[c] * frame.ratio[c]), plane, plane)
         return out
 
     def _ramp(self, frame: _Frame, estimate: Floats) -> Floats:
@@ -203,6 +217,11 @@ class Mixture:
         np.subtract(np.float32(self.clip), peak, out=peak)
         peak *= np.float32(1 / _FALL)
         return np.asarray(np.clip(peak, np.float32(_LEAST), 1, out=peak))
+
+
+def _flagged(where: Bools, flag: Quality) -> Bits:
+    """A flag where it holds, else 0."""
+    return np.asarray(where.view(np.uint8) * np.uint8(flag))
 
 
 def _edges(estimate: Floats, rows: slice) -> Floats:

@@ -16,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
+from polcap.stages.hdr.ghosts import edges
 
 TILE = 32  # px
+_AT_ONCE = 64  # tiles whose equations fit a core's cache
 _CELLS, _PER_CELL = 10, 3  # tiles are spread over the picture: the best few of each cell
 _REACH = 2.0  # px a tile may move in one step
 _SETTLED = 0.005  # px; a smaller step ends the search
@@ -156,13 +158,13 @@ def _choose(a: Floats, usable: NDArray[np.bool_]) -> NDArray[np.int64]:
     rows, columns = (a.shape[0] - 2) // TILE, (a.shape[1] - 2) // TILE
     if rows < 1 or columns < 1:
         return np.zeros((0, 2), np.int64)
-    gx, gy = (cv2.Sobel(a, cv2.CV_32F, x, 1 - x, ksize=1, borderType=cv2.BORDER_REPLICATE) for x in (1, 0))
-    gx *= gx
-    gy *= gy
-    gx += gy
-    gx *= usable
     cut, size = (slice(0, rows * TILE), slice(0, columns * TILE)), (columns, rows)
-    score = cv2.resize(gx[cut], size, interpolation=cv2.INTER_AREA)
+    score = np.empty((rows, columns), np.float32)
+    for n in range(rows):  # a row of tiles stays in a core's cache
+        top = TILE * n
+        around = slice(max(top - 1, 0), top + TILE + 1)
+        detail = edges(a[around])[top - around.start :][:TILE, cut[1]] * usable[top : top + TILE, cut[1]]
+        score[n] = cv2.resize(detail, (columns, 1), interpolation=cv2.INTER_AREA)
     score *= cv2.resize(usable[cut].view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) > 0.7 * 255
     found = []
     for cell_rows in np.array_split(np.arange(rows), min(_CELLS, rows)):
@@ -176,7 +178,17 @@ def _choose(a: Floats, usable: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def _match(a: Floats, b: Floats, ok_b: NDArray[np.bool_], corner: NDArray[np.int64], matrix: Floats) -> _Matches:
-    """One Gauss-Newton step for every tile at once."""
+    """One Gauss-Newton step for every tile."""
+    some = [_match_some(a, b, ok_b, part, matrix) for part in np.split(corner, range(_AT_ONCE, len(corner), _AT_ONCE))]
+    return _Matches(
+        np.concatenate([one.point for one in some]),
+        np.concatenate([one.shift for one in some]),
+        np.concatenate([one.information for one in some]),
+    )
+
+
+def _match_some(a: Floats, b: Floats, ok_b: NDArray[np.bool_], corner: NDArray[np.int64], matrix: Floats) -> _Matches:
+    """The same for some tiles at once."""
     nothing = _Matches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)))
     if not len(corner):
         return nothing
@@ -203,7 +215,7 @@ def _match(a: Floats, b: Floats, ok_b: NDArray[np.bool_], corner: NDArray[np.int
     normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(4)
     target = inner.reshape(len(corner), -1, 1) * usable.reshape(len(corner), -1, 1)
     solution = np.linalg.solve(normal, basis @ target)[..., 0]
-    residual = target[..., 0] - np.einsum("tk,tkp->tp", solution, basis)
+    residual = target[..., 0] - (solution[:, None] @ basis)[:, 0]
     count = usable.sum(axis=(1, 2))
     variance = (residual**2).sum(axis=1) / np.maximum(count - 4, 1) + 1e-12
     # reference(x) = gain · other(x + s + δ) ≈ gain · (seen + ∇ · δ): the first two unknowns are δ; their own
@@ -227,21 +239,22 @@ def _cut(picture: Floats | NDArray[np.bool_], corner: NDArray[np.int64], size: i
 
 def _sample(patch: Floats, fraction: Floats) -> Floats:
     """Catmull-Rom interpolation of whole tiles at one (x, y) fraction each."""
+    return np.asarray(_bands(fraction[:, 1]) @ patch @ _bands(fraction[:, 0]).transpose(0, 2, 1))
 
-    def weights(f: Floats) -> Floats:
-        return np.stack(
-            [
-                ((-f + 2) * f - 1) * f / 2,
-                ((3 * f - 5) * f * f + 2) / 2,
-                ((-3 * f + 4) * f + 1) * f / 2,
-                (f - 1) * f * f / 2,
-            ],
-            axis=1,
-        )
 
-    wx, wy = weights(fraction[:, 0]), weights(fraction[:, 1])
-    rows = np.sum([wy[:, k, None, None] * patch[:, k : k + TILE] for k in range(4)], axis=0)
-    return np.asarray(np.sum([wx[:, k, None, None] * rows[:, :, k : k + TILE] for k in range(4)], axis=0))
+def _bands(f: Floats) -> Floats:
+    """Weights (T, TILE, TILE + 3) of the samples of lines that begin a sample early, at fractions (T,)."""
+    weights = (
+        ((-f + 2) * f - 1) * f / 2,
+        ((3 * f - 5) * f * f + 2) / 2,
+        ((-3 * f + 4) * f + 1) * f / 2,
+        (f - 1) * f * f / 2,
+    )
+    out = np.zeros((len(f), TILE, TILE + 3))
+    each = np.arange(TILE)
+    for k, weight in enumerate(weights):
+        out[:, each, each + k] = weight[:, None]
+    return out
 
 
 def _design(u: Floats) -> Floats:
@@ -294,11 +307,13 @@ def _robust(design: Floats, shift: Floats, information: Floats) -> tuple[Floats,
     """Least squares reweighted by Tukey's biweight; parameters, covariance, χ², weights."""
     weight = np.ones(len(shift))
     k = design.shape[2]
-    parameters, covariance = np.zeros(k), np.eye(k)
+    parameters: Floats = np.zeros(k)
+    covariance: Floats = np.eye(k)
     chi2 = np.zeros(len(shift))
+    informed = information @ design  # (T, 2, k)
     for _ in range(10):
-        normal = np.einsum("t,tik,tij,tjl->kl", weight, design, information, design)
-        right = np.einsum("t,tik,tij,tj->k", weight, design, information, shift)
+        weighted = (weight[:, None, None] * informed).reshape(-1, k).T
+        normal, right = weighted @ design.reshape(-1, k), weighted @ shift.ravel()
         # what the tiles hardly see (directions known to worse than 0.1 px) hardly moves
         parameters = np.linalg.solve(normal + 100 * np.eye(k), right)
         covariance = np.linalg.inv(normal + np.eye(k))

@@ -23,6 +23,7 @@ from polcap.stages.hdr.planes import Signals
 
 TILE = 16  # px; about 68 independent second differences, so that one tile knows its variance to 17 %
 FREEDOM = TILE * TILE / 3.78  # 3.78 = Σ ρ² over the autocorrelation of [1, −2, 1] ⊗ [1, −2, 1]
+_SECOND = np.array([1, -2, 1]) / 6**0.5
 _LEAST_TILES = 40
 _TYPICAL_ELECTRONS, _TYPICAL_READ = 20000.0, 4.0  # at ISO 100; e⁻
 _SANE_ELECTRONS = (100.0, 1e6)
@@ -46,6 +47,10 @@ class Noise:
         out += self.floor[channel]
         return out
 
+    def of_radiance(self, ratio: Floats, gain: float = 1.0) -> "Noise":
+        """The same of radiance: of signals divided by their frame's ratio (C,), their variance times a gain."""
+        return Noise(self.slope * np.float32(gain) / ratio, self.floor * np.float32(gain) / ratio**2)
+
     def lit(self, level: Floats) -> "Noise":
         """The same sensor where light of a `level` per channel (C,) was subtracted: its noise stays."""
         return Noise(self.slope, self.floor + self.slope * np.maximum(level, 0))
@@ -65,11 +70,10 @@ def roughness(picture: Floats) -> Floats:
 
     [1, −2, 1] ⊗ [1, −2, 1] / 6 is blind to a ramp.
     """
-    rows = picture[:, :-2] - 2 * picture[:, 1:-1] + picture[:, 2:]
-    return (rows[..., :-2] - 2 * rows[..., 1:-1] + rows[..., 2:]) / 6
+    return np.stack([np.asarray(cv2.sepFilter2D(plane, -1, _SECOND, _SECOND))[1:-1, 1:-1] for plane in picture])
 
 
-def strips(height: int, width: int, most: float = 1.5e6) -> list[slice]:
+def strips(height: int, width: int, most: float = 0.75e6) -> list[slice]:
     """Rows enough for the statistics: whole tile rows (plus the 2 that `roughness` eats), evenly spread."""
     rows = max((height - 2) // TILE, 0)
     wanted = max(1, min(rows, int(most / (TILE * max(width, 1)))))
@@ -81,10 +85,10 @@ def alone(picture: Signals) -> Samples:
     """Tiles of a single frame."""
     signal, variance = [], []
     for rows in strips(*picture.usable.shape):
-        part, usable = picture.rows(rows), picture.usable[rows]
+        part, whole = picture.rows(rows), usable_tiles(picture.usable[rows])
         detail = roughness(part)
-        signal.append(tiles(part[:, 1:-1, 1:-1], usable))
-        variance.append(tiles(detail * detail, usable))
+        signal.append(tiles(part[:, 1:-1, 1:-1], whole))
+        variance.append(tiles(detail * detail, whole))
     return _samples(signal, variance, True, picture.shape[0])
 
 
@@ -95,14 +99,17 @@ def paired(first: Signals, second: Signals, ratio: Floats) -> tuple[Samples, Sam
     ⟨h₂ (h₂ − r h₁)⟩ = var n₂, however rich it is and whatever the two gains are.
     """
     columns: tuple[list[Floats], ...] = ([], [], [], [])
-    r = np.asarray(ratio, np.float32)[:, None, None]
+    r = np.asarray(ratio, np.float32)
     for rows in strips(*first.usable.shape):
-        one, two, usable = first.rows(rows), second.rows(rows), first.usable[rows] & second.usable[rows]
+        one, two, whole = first.rows(rows), second.rows(rows), usable_tiles(first.usable[rows] & second.usable[rows])
         h1, h2 = roughness(one), roughness(two)
-        difference = h2 - r * h1
-        maps = (one[:, 1:-1, 1:-1], -h1 * difference / r, two[:, 1:-1, 1:-1], h2 * difference)
-        for column, values in zip(columns, maps):
-            column.append(tiles(values, usable))
+        difference = h2 - r[:, None, None] * h1
+        h1 *= difference
+        h2 *= difference
+        means = [tiles(values, whole) for values in (one[:, 1:-1, 1:-1], h1, two[:, 1:-1, 1:-1], h2)]
+        means[1] /= -r
+        for column, mean in zip(columns, means):
+            column.append(mean)
     channels = first.shape[0]
     return (
         _samples(columns[0], columns[1], False, channels),
@@ -142,14 +149,19 @@ def misfit(first: Signals, second: Signals, ratio: Floats, lines: tuple[Noise, N
     r = np.asarray(ratio, np.float32)
     columns: tuple[list[Floats], ...] = ([], [], [])
     for rows in strips(*first.usable.shape):
-        a, usable = first.rows(rows), first.usable[rows] & second.usable[rows]
-        d = second.rows(rows)[:, 1:-1, 1:-1] / r[:, None, None] - a[:, 1:-1, 1:-1]
+        a, whole = first.rows(rows), usable_tiles(first.usable[rows] & second.usable[rows])
+        d = second.rows(rows)[:, 1:-1, 1:-1] * (1 / r)[:, None, None]
+        d -= a[:, 1:-1, 1:-1]
         gx, gy = a[:, 1:-1, 2:] - a[:, 1:-1, :-2], a[:, 2:, 1:-1] - a[:, :-2, 1:-1]
-        level, offset = tiles(a[:, 1:-1, 1:-1], usable), tiles(d, usable)
+        gx *= gx
+        gy *= gy
+        gx += gy
+        level, offset = tiles(a[:, 1:-1, 1:-1], whole), tiles(d, whole)
+        d *= d
         own = lines[0].variance(level)
         columns[0].append(own + lines[1].variance(level * r) / r**2 * gain)
-        columns[1].append(tiles(d * d, usable) - offset**2)
-        columns[2].append(tiles((gx * gx + gy * gy) / 4, usable) - own)
+        columns[1].append(tiles(d, whole) - offset**2)
+        columns[2].append(tiles(gx, whole) / 4 - own)
     out = np.zeros(first.shape[0], np.float32)
     if columns[0]:
         expected, seen, edge = (np.concatenate(column) for column in columns)
@@ -211,29 +223,39 @@ class Lines:
 def _line(samples: list[Samples], channel: int, iso: float | None, least: float) -> tuple[float, float]:
     electrons = _TYPICAL_ELECTRONS * 100 / max(iso or 100.0, 1.0)
     typical = 1 / electrons, max(least, (_TYPICAL_READ / electrons) ** 2)
-    parts: list[tuple[Floats, Floats, bool]] = []
+    parts: list[tuple[Floats, Floats, bool]] = []  # (B, n) each: B bins of n tiles
     for sample in samples:
         good = np.isfinite(sample.signal[:, channel])
         if good.sum() < _LEAST_TILES:
             continue
         signal, variance = sample.signal[good, channel], sample.variance[good, channel]
-        for part in np.array_split(np.argsort(signal), int(np.clip(good.sum() // 25, 2, 32))):
-            parts.append((signal[part], variance[part], sample.flat))
+        for bins in _alike(signal, int(np.clip(len(signal) // 25, 2, 32))):
+            parts.append((signal[bins], variance[bins], sample.flat))
+    if not parts:
+        return typical
     line = typical
     for _ in range(3):  # within a bin the signal varies: compare each tile with the line so far
         x, y, n = [], [], []
         for signal, variance, flat in parts:
-            level = float(signal.mean())
-            model = line[0] * np.maximum(signal, 0) + line[1]
-            quotient = _low_quantile(variance / model) if flat else float(np.median(variance / model))
+            level = signal.mean(axis=1)
+            relative = variance / (line[0] * np.maximum(signal, 0) + line[1])
+            quotients = _low_quantile(relative) if flat else np.median(relative, axis=1)
             x.append(level)
-            y.append(quotient * (line[0] * max(level, 0) + line[1]))
-            n.append(len(signal))
-        solved = _solve(np.array(x), np.maximum(y, least), np.array(n, float), least) if len(x) > 1 else None
+            y.append(quotients * (line[0] * np.maximum(level, 0) + line[1]))
+            n.append(np.full(len(signal), float(signal.shape[1])))
+        solved = _solve(np.concatenate(x), np.maximum(np.concatenate(y), least), np.concatenate(n), least)
         if solved is None:
             return typical
         line = solved
     return line
+
+
+def _alike(signal: Floats, count: int) -> list[NDArray[np.int64]]:
+    """Tiles (T,) in bins by their signal, as even as may be: two arrays (B, n), the second's bins a tile shorter."""
+    order = np.argsort(signal)
+    n, longer = divmod(len(order), count)
+    cut = longer * (n + 1)
+    return [order[:cut].reshape(longer, n + 1), order[cut:].reshape(count - longer, n)]
 
 
 def _solve(x: Floats, y: Floats, n: Floats, least: float) -> tuple[float, float] | None:
@@ -244,10 +266,12 @@ def _solve(x: Floats, y: Floats, n: Floats, least: float) -> tuple[float, float]
         z = (y / model - 1) * np.sqrt(n * FREEDOM / 2)
         scale = max(1.0, MAD_TO_SIGMA * float(np.median(np.abs(z))))
         weight = n / model**2 / np.maximum(1, (np.abs(z) / (2.5 * scale)) ** 2)
-        matrix = np.array([[np.sum(weight * x * x), np.sum(weight * x)], [np.sum(weight * x), np.sum(weight)]])
-        if np.linalg.cond(matrix / np.trace(matrix)) > 1e10:  # one signal level: no line through it
+        xx, x1, one = weight @ (x * x), weight @ x, weight.sum()
+        determinant = xx * one - x1 * x1
+        if determinant < 1e-10 * (xx + one) ** 2:  # one signal level: no line through it
             return None
-        slope, floor = np.linalg.solve(matrix, [np.sum(weight * x * y), np.sum(weight * y)])
+        xy, y1 = weight @ (x * y), weight @ y
+        slope, floor = (one * xy - x1 * y1) / determinant, (xx * y1 - x1 * xy) / determinant
         if floor < least:  # never below rounding
             floor = least
             slope = np.sum(weight * x * (y - least)) / np.sum(weight * x * x)
@@ -256,22 +280,27 @@ def _solve(x: Floats, y: Floats, n: Floats, least: float) -> tuple[float, float]
     return (float(slope), float(floor)) if within else None
 
 
-def _low_quantile(variance: Floats) -> float:
-    """Mean variance of pure noise from the 15 % quantile of tile variances (Wilson and Hilferty's χ²)."""
+def _low_quantile(variance: Floats) -> Floats:
+    """Mean variances (B,) of pure noise from the 15 % quantiles of tile variances (B, n) (Wilson and Hilferty's χ²)."""
     spread = 2 / (9 * FREEDOM)
-    return float(np.quantile(variance, 0.15) / (1 - spread - 1.0364 * spread**0.5) ** 3)
+    return np.asarray(np.quantile(variance, 0.15, axis=1) / (1 - spread - 1.0364 * spread**0.5) ** 3)
 
 
-def tiles(values: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Means over the tiles of one of `strips` (C, h, w), (T, C); NaN where a pixel the tile touches is not usable."""
-    count = (usable.shape[1] - 2) // TILE
+def usable_tiles(usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Tiles (T,) of one of `strips` (h, W) that touch no pixel that is not usable."""
+    bad = np.asarray(~usable.all(axis=0))  # (W,)
+    before = np.concatenate([[0], np.cumsum(bad)])
+    first = TILE * np.arange((usable.shape[1] - 2) // TILE)
+    return np.asarray(before[first + TILE + 2] == before[first])
+
+
+def tiles(values: Floats, whole: NDArray[np.bool_]) -> Floats:
+    """Means over the tiles of one of `strips` (C, h, w), (T, C); NaN but where a tile is `whole` (T,)."""
+    count = len(whole)
     mean = np.empty((count, len(values)))
     for c, plane in enumerate(values):
         mean[:, c] = cv2.resize(plane[:TILE, : count * TILE], (count, 1), interpolation=cv2.INTER_AREA)[0]
-    bad = np.asarray(~usable.all(axis=0))  # (W,)
-    before = np.concatenate([[0], np.cumsum(bad)])
-    first = TILE * np.arange(count)
-    mean[before[first + TILE + 2] > before[first]] = np.nan
+    mean[~whole] = np.nan
     return mean
 
 
