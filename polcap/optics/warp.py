@@ -10,6 +10,7 @@ Thévenaz, Blu, Unser, Interpolation revisited, IEEE TMI 2000. Sigg and Hadwiger
 filtering, GPU Gems 2, ch. 20 (B-splines from linear look-ups).
 """
 
+from collections.abc import Callable
 from typing import Literal
 
 import cv2
@@ -59,17 +60,16 @@ def warp(
         return np.asarray(image[y0:y1, x0:x1], dtype=np.float32)
     h = np.asarray(transform, np.float64)
     left, top, right, bottom = _source(image.shape[:2], h, (x0, y0, x1, y1))
-    part = np.asarray(image[top:bottom, left:right], np.float32)
+    part = np.ascontiguousarray(image[top:bottom, left:right], np.float32)
     local = _moved(-left, -top) @ h @ _moved(x0, y0)
     size = x1 - x0, y1 - y0
+    if _shifts(local):
+        return _shifted(part, local[:2, 2], size, _linear if order == 1 else _cubic)
     if order == 1:
         how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        flat = cv2.warpPerspective(np.ascontiguousarray(part), local, size, flags=how, borderMode=cv2.BORDER_REPLICATE)
+        flat = cv2.warpPerspective(part, local, size, flags=how, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(flat, np.float32).reshape(size[1], size[0], *image.shape[2:])
     planes = [part] if part.ndim == 2 else cv2.split(part)
-    if _shifts(local):
-        moved = [_shifted(np.ascontiguousarray(plane), local[:2, 2], size) for plane in planes]
-        return moved[0] if image.ndim == 2 else np.asarray(cv2.merge(moved)).reshape(size[1], size[0], -1)
     splines = [Spline(np.ascontiguousarray(plane)) for plane in planes]
     out = np.empty((len(planes), size[1], size[0]), np.float32)
     for y in range(0, size[1], _ROWS):
@@ -113,29 +113,36 @@ def _shifts(transform: Floats) -> bool:
     return np.array_equal(transform, _moved(*transform[:2, 2]))
 
 
-def _shifted(plane: Floats, by: Floats, size: tuple[int, int]) -> Floats:
-    """Output px + by = px of a plane (H, W): every pixel asks for the same fraction, so its spline is one filter.
+def _shifted(image: Floats, by: Floats, size: tuple[int, int], kernel: Callable[[float], Floats]) -> Floats:
+    """Output px + by = px of an image (H, W[, C]): every pixel asks for the same fraction, so reading it is one filter.
 
     Returns
     -------
     NDArray
-        (size[1], size[0]).
+        (size[1], size[0][, C]).
     """
     whole = np.floor(by).astype(int)
-    across, down = (_kernel(float(share)) for share in by - whole)
-    filtered = cv2.sepFilter2D(plane, cv2.CV_32F, across, down, borderType=cv2.BORDER_REPLICATE)
+    across, down = (kernel(float(share)) for share in by - whole)
+    filtered = cv2.sepFilter2D(image, cv2.CV_32F, across, down, borderType=cv2.BORDER_REPLICATE).reshape(image.shape)
     (x, y), (width, height) = (int(start) for start in whole), size
-    if x >= 0 and y >= 0 and x + width <= plane.shape[1] and y + height <= plane.shape[0]:
+    if x >= 0 and y >= 0 and x + width <= image.shape[1] and y + height <= image.shape[0]:
         return np.asarray(filtered[y : y + height, x : x + width])
     rows, columns = (
         np.clip(np.arange(start, start + length), 0, last)
-        for start, length, last in ((y, height, plane.shape[0] - 1), (x, width, plane.shape[1] - 1))
+        for start, length, last in ((y, height, image.shape[0] - 1), (x, width, image.shape[1] - 1))
     )
     return np.asarray(filtered[np.ix_(rows, columns)])
 
 
-def _kernel(f: float) -> Floats:
-    """What a cubic spline reads a share f of a pixel further on, as a filter of the samples."""
+def _linear(f: float) -> Floats:
+    """What is read between neighbours a share f of a pixel further on, as a filter of the samples."""
+    return np.array([0, 1 - f, f], np.float32)
+
+
+def _cubic(f: float) -> Floats:
+    """The same of a cubic spline."""
+    if f == 0:
+        return np.ones(1, np.float32)
     taps = np.array([(1 - f) ** 3, 4 - 6 * f**2 + 3 * f**3, 1 + 3 * f + 3 * f**2 - 3 * f**3, f**3]) / 6
     return np.asarray(np.r_[0, np.convolve(_PREFILTER, taps)], np.float32)  # a tap more behind than ahead: 0 evens it
 
@@ -255,10 +262,12 @@ def covered(
     x, y = np.array([x0, x1 - 1.0, x0, x1 - 1.0]), np.array([y0, y0, y1 - 1.0, y1 - 1.0])
     if _within(*coordinates(transform, x, y), shape, margin).all():  # a homography keeps the rest between its corners
         return np.ones((y1 - y0, x1 - x0), bool)
-    u, v = coordinates(transform, np.arange(x0, x1, dtype=np.float64), np.arange(y0, y1, dtype=np.float64)[:, None])
-    return _within(u, v, shape, margin)
+    across, down = np.arange(x0, x1, dtype=np.float64), np.arange(y0, y1, dtype=np.float64)[:, None]
+    if _shifts(transform):
+        return _within(across + transform[0, 2], down + transform[1, 2], shape, margin)
+    return _within(*coordinates(transform, across, down), shape, margin)
 
 
 def _within(u: Floats, v: Floats, shape: tuple[int, int], margin: float) -> Bools:
-    inside = (u >= margin) & (v >= margin) & (u <= shape[1] - 1 - margin) & (v <= shape[0] - 1 - margin)
-    return np.asarray(inside)
+    across, down = (u >= margin) & (u <= shape[1] - 1 - margin), (v >= margin) & (v <= shape[0] - 1 - margin)
+    return np.asarray(across & down)

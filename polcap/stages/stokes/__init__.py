@@ -4,13 +4,14 @@ Gains, transforms, the places of a mosaic's colors, the lens's distortion and th
 nowhere else, so every pixel is resampled once. What comes out is the picture of a pinhole camera.
 """
 
-from collections.abc import Sequence
+from functools import partial
 from typing import Annotated
 
 import cv2
 import msgspec
 import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 
 from polcap.errors import CaptureError
 from polcap.images import (
@@ -33,12 +34,10 @@ from polcap.stages import stage
 _MOST_CONDITION = 50.0  # of three angles 12° apart, where S1 has 26 times the noise of a shot; 0, 45, 90° have 2.4
 _METAL_DOLP, _METAL_DEG, _METAL_SIGMA = 0.05, 10.0, 5.0  # of red and blue: DoLP, and how far their AoLPs part; set by
 # hand, beyond what noise and registration do to a dielectric, and not measured on metals
-_LEAST_ROWS, _BLOCK = (
-    64,
-    300_000,
-)  # rows and pixels of a block: its planes fit the cache, what it is cut out with is little
+_LEAST_ROWS, _BLOCK = 64, 200_000  # rows and pixels of a block: its planes fit the cache, and little is cut out with it
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # the rows of a covariance
 
+Bools = NDArray[np.bool_]
 Flags = list[list[tuple[Quality, Bits]]]  # of every shot
 
 
@@ -57,7 +56,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 5.0
 
 
-@stage(version=5)
+@stage(version=6)
 def solve(
     radiance: AngleStack, alignment: Alignment, gains: Gains, object_: ObjectMask, settings: Settings
 ) -> StokesImage:
@@ -105,21 +104,23 @@ def solve(
     stokes, covariance = np.empty((3, *size, 3), np.float32), np.empty((6, *size, 3), np.float32)
     quality = np.empty(size, np.uint8)
     residual = np.empty(size, np.float32) if len(radiance.angle) > 3 else None
-    solved_by = _exact if len(radiance.angle) == 3 else _weighted_least_squares
-    flags = [_flagged(shot) for shot in radiance.quality]
+    solve_ = _exact if len(radiance.angle) == 3 else _weighted_least_squares
     block = max(_LEAST_ROWS, _BLOCK // max(x1 - x0, 1))
+    register = partial(_register, radiance, alignment, gains, [_flagged(shot) for shot in radiance.quality], lens)
+    registered = np.empty((2, len(radiance.angle), min(block, y1 - y0), x1 - x0, 3), np.float32)
     for top in range(y0, y1, block):
         rows = slice(top - y0, min(top + block, y1) - y0)
-        value, variance, seen = _registered(radiance, alignment, gains, flags, (x0, top, x1, rows.stop + y0), lens)
-        solved, doubt = _undiluted(*solved_by(weights_of, value, variance), radiance.extinction)
-        for planes, out in zip((*solved, *doubt), (*stokes, *covariance)):
-            cv2.merge([np.asarray(plane, np.float32) for plane in planes], out[rows])
-        quality[rows] = _judged(solved, doubt, seen, settings)
+        value, variance = (shots[:, : rows.stop - rows.start] for shots in registered)
+        seen = register((x0, top, x1, rows.stop + y0), value, variance)
+        solved, doubt = stokes[:, rows], covariance[:, rows]
+        solve_(weights_of, value, variance, solved, doubt)
         if residual is not None:
-            diluted = solved * _contrast(radiance.extinction)[..., None, None]
-            fitted = np.einsum("kj,jchw->kchw", weights_of, diluted)
-            difference = np.abs(value - fitted).sum(1).mean(0)
-            residual[rows] = difference / np.maximum(solved[0].sum(0), 1e-9)
+            fitted = np.einsum("kj,jhwc->khwc", weights_of, solved)
+            difference = np.abs(value - fitted).sum(3).mean(0)
+            residual[rows] = difference / np.maximum(solved[0].sum(2), 1e-9)
+        if radiance.extinction is not None:
+            _undilute(solved, doubt, radiance.extinction)
+        quality[rows] = _judged(solved, doubt, seen, settings)
     mask = object_.mask[y0:y1, x0:x1]
     if lens is not None:
         mask = warp(object_.mask.astype(np.uint8), np.eye(3), crop, order=1, lens=lens) > 0.5
@@ -156,7 +157,7 @@ def _body(
     picture, transform, share = radiance.crossed.picture, alignment.crossed, gains.crossed.astype(np.float32)
     clipped = (seen & np.uint8(Quality.CLIPPED)) > 0  # nothing is known of polarization there: it faces the camera
     across = np.where(clipped[..., None], 0, crossing.polarized(stokes[1], stokes[2], radiance.crossed.angle))
-    registered = cv2.merge(_registered_planes(picture.value, transform, radiance.site_px, crop, lens))
+    registered = _overlaid(picture.value, transform, radiance.site_px, crop, lens)
     value = crossing.body_light(registered * share, across)
     variance = np.maximum(warp(picture.variance, transform, crop, 1, lens), np.float32(1e-14)) * share**2
     quality: Bits = np.zeros(value.shape[:2], np.uint8)
@@ -174,69 +175,75 @@ def _flagged(quality: Bits) -> list[tuple[Quality, Bits]]:
     return [(bit, plane) for bit, plane in planes if plane.any()]
 
 
-def _registered(
+def _register(
     radiance: AngleStack,
     alignment: Alignment,
     gains: Gains,
     flags: Flags,
-    box: tuple[int, int, int, int],
     lens: Distortion | None,
-) -> tuple[Floats, Floats, Bits]:
-    """Every shot's radiance over gain on a box of the reference grid, by planes: (K, 3, h, w) twice, (h, w)."""
+    box: tuple[int, int, int, int],
+    values: Floats,
+    variances: Floats,
+) -> Bits:
+    """Every shot over its gain on a box of the reference grid and its variance, into (K, h, w, 3) each; its quality."""
     x0, y0, x1, y1 = box
-    values, variances = (np.empty((len(alignment.transform), 3, y1 - y0, x1 - x0), np.float32) for _ in range(2))
-    quality: Bits = np.zeros((y1 - y0, x1 - x0), np.uint8)
+    size = y1 - y0, x1 - x0
+    quality: Bits = np.zeros(size, np.uint8)
     mosaic = radiance.offset_px is not None
     part = alignment.transform[:, :2, 2] % 1
     shares = np.prod(part**2 + (1 - part) ** 2, axis=1).mean()  # alike for all, lest the sharpest shot counts least
     for k, transform in enumerate(alignment.transform):
         gain = gains.gain[k].astype(np.float32)
         if mosaic:  # the mean of two or four neighbours, as is usual: splines ring at the edges of so coarse a grid
-            shot = cv2.split(warp(radiance.value[k], transform, box, 1, lens))
+            shot = warp(radiance.value[k], transform, box, 1, lens)
         else:
-            shot = _registered_planes(radiance.value[k], transform, radiance.site_px, box, lens)
-        doubt = cv2.split(warp(radiance.variance[k], transform, box, 1, lens))
+            shot = _overlaid(radiance.value[k], transform, radiance.site_px, box, lens)
+        doubt = warp(radiance.variance[k], transform, box, 1, lens)
         spread = np.float32(shares if mosaic else 1) / gain**2
-        for c in range(3):
-            np.divide(shot[c], gain[c], out=values[k, c])
-            np.maximum(doubt[c], np.float32(1e-14), out=variances[k, c])
-            variances[k, c] *= spread[c]
+        np.divide(_rows(shot), np.tile(gain, size[1]), out=_rows(values[k]))
+        np.maximum(doubt, np.float32(1e-14), out=variances[k])
+        if (spread != 1).any():
+            _rows(variances[k])[:] *= np.tile(spread, size[1])
         for bit, plane in flags[k]:
             quality |= np.where(warp(plane, transform, box, 1, lens) > 0.01 * bit, np.uint8(bit), np.uint8(0))
         inside = covered(radiance.value.shape[1:3], transform, box, lens=lens)
-        quality |= np.where(inside, np.uint8(0), np.uint8(Quality.OUTSIDE))
-    return values, variances, quality
+        if not inside.all():
+            quality |= np.where(inside, np.uint8(0), np.uint8(Quality.OUTSIDE))
+    return quality
 
 
-def _registered_planes(
+def _rows(picture: Floats) -> Floats:
+    """A picture (h, w, 3) as lines (h, 3 w), the same memory: what goes along a line takes no loop over three."""
+    return picture.reshape(len(picture), -1)
+
+
+def _overlaid(
     picture: Floats,
     transform: Floats,
     site_px: Floats | None,
     box: tuple[int, int, int, int],
     lens: Distortion | None,
-) -> Sequence[Floats]:
-    """A shot (H, W, 3) on a box of the reference grid, by planes (h, w): every channel where its photosites saw it."""
+) -> Floats:
+    """A shot (H, W, 3) on a box of the reference grid (h, w, 3): every channel where its photosites saw it."""
     if site_px is None or not site_px.any():
-        return cv2.split(warp(picture, transform, box, lens=lens))
-    return [
+        return warp(picture, transform, box, lens=lens)
+    planes = [
         warp(picture[..., c], np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1]]) @ transform, box, lens=lens)
         for c, (x, y) in enumerate(site_px)
     ]
+    return np.asarray(cv2.merge(planes))
 
 
-def _exact(weights_of: Floats, value: Floats, variance: Floats) -> tuple[Floats, Floats]:
+def _exact(weights_of: Floats, value: Floats, variance: Floats, solved: Floats, doubt: Floats) -> None:
     """The same of three angles, which need no weights: s = A⁻¹ I, and its covariance A⁻¹ diag(var) A⁻ᵀ."""
     inverse = np.linalg.inv(weights_of)  # (3, K)
     squares = np.stack([inverse[i] * inverse[j] for i, j in _PAIRS])  # (6, K)
-    shape = value.shape[1:]
-    solved = inverse.astype(np.float32) @ value.reshape(3, -1)
-    doubt = squares.astype(np.float32) @ variance.reshape(3, -1)
-    return solved.reshape(3, *shape), doubt.reshape(6, *shape)
+    np.matmul(inverse.astype(np.float32), value.reshape(3, -1), out=solved.reshape(3, -1))
+    np.matmul(squares.astype(np.float32), variance.reshape(3, -1), out=doubt.reshape(6, -1))
 
 
-def _weighted_least_squares(weights_of: Floats, value: Floats, variance: Floats) -> tuple[Floats, Floats]:
-    """Stokes (3, C, H, W) and covariance (6, C, H, W) from value and variance (K, C, H, W), A (K, 3)."""
-    shape = value.shape[1:]
+def _weighted_least_squares(weights_of: Floats, value: Floats, variance: Floats, solved: Floats, doubt: Floats) -> None:
+    """Stokes parameters (3, h, w, C) and their covariance (6, h, w, C) from both (K, h, w, C) and A (K, 3)."""
     w = 1.0 / variance.astype(np.float64).reshape(len(value), -1)
     products = np.stack([weights_of[:, i] * weights_of[:, j] for i, j in _PAIRS])
     m00, m01, m02, m11, m12, m22 = products @ w  # the symmetric AᵀWA of every pixel
@@ -246,14 +253,9 @@ def _weighted_least_squares(weights_of: Floats, value: Floats, variance: Floats)
     c11, c12, c22 = m00 * m22 - m02**2, m01 * m02 - m00 * m12, m00 * m11 - m01**2
     covariance = np.stack([c00, c01, c02, c11, c12, c22]) / determinant
     i00, i01, i02, i11, i12, i22 = covariance
-    stokes = np.stack(
-        [
-            i00 * right[0] + i01 * right[1] + i02 * right[2],
-            i01 * right[0] + i11 * right[1] + i12 * right[2],
-            i02 * right[0] + i12 * right[1] + i22 * right[2],
-        ]
-    )
-    return stokes.reshape(3, *shape), covariance.reshape(6, *shape)
+    doubt[:] = covariance.reshape(doubt.shape)
+    for plane, (a, b, c) in zip(solved, ((i00, i01, i02), (i01, i11, i12), (i02, i12, i22))):
+        plane[:] = (a * right[0] + b * right[1] + c * right[2]).reshape(plane.shape)
 
 
 def _contrast(extinction: Floats | None) -> Floats:
@@ -263,53 +265,56 @@ def _contrast(extinction: Floats | None) -> Floats:
     return np.stack([np.ones_like(contrast), contrast, contrast])
 
 
-def _undiluted(stokes: Floats, covariance: Floats, extinction: Floats | None) -> tuple[Floats, Floats]:
-    """What an ideal polarizer would have shown, where the extinction ratio is known."""
-    if extinction is None:
-        return stokes, covariance
-    up = 1 / _contrast(extinction)  # (3, C)
-    pairs = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
-    both = np.stack([up[i] * up[j] for i, j in pairs])
-    return stokes * up[..., None, None], covariance * both[..., None, None]
+def _undilute(stokes: Floats, covariance: Floats, extinction: Floats) -> None:
+    """Turn what was seen into what an ideal polarizer would have shown."""
+    up = (1 / _contrast(extinction)).astype(np.float32)  # (3, C)
+    stokes *= up[:, None, None]
+    covariance *= np.stack([up[i] * up[j] for i, j in _PAIRS])[:, None, None]
 
 
 def _judged(stokes: Floats, covariance: Floats, quality: Bits, settings: Settings) -> Bits:
     """Quality bits with what the solution itself betrays."""
     s0, s1, s2 = (_total(plane) for plane in stokes)
     sigma0 = np.sqrt(_total(covariance[0]))
-    sigma = np.sqrt(_total(covariance[3] + covariance[5]) / 2)
-    limit = fresnel.greatest_diffuse_dolp(settings.greatest_ior)
-    ill = (s0 <= 0) | (np.sqrt(s1 * s1 + s2 * s2) - 3 * sigma > limit * s0)
-    dark = s0 < settings.dark_sigma * sigma0
-    bits = quality | np.where(ill, np.uint8(Quality.ILL_POSED), np.uint8(0))
-    bits |= np.where(dark, np.uint8(Quality.DARK), np.uint8(0))
-    return bits | np.where(_metal(stokes, covariance), np.uint8(Quality.METAL), np.uint8(0))
+    sigma = np.sqrt((_total(covariance[3]) + _total(covariance[5])) / 2)
+    limit = np.float32(fresnel.greatest_diffuse_dolp(settings.greatest_ior))
+    ill = (s0 <= 0) | (cv2.magnitude(s1, s2) - 3 * sigma > limit * s0)
+    dark = s0 < np.float32(settings.dark_sigma) * sigma0
+    for where, bit in ((ill, Quality.ILL_POSED), (dark, Quality.DARK), (_metal(stokes, covariance), Quality.METAL)):
+        quality |= where.view(np.uint8) * np.uint8(bit)
+    return quality
 
 
 def _total(picture: Floats) -> Floats:
-    """Sum over the channels of (3, h, w)."""
-    total: Floats = picture[0] + picture[1] + picture[2]
-    return total
+    """Sum over the channels of (h, w, 3)."""
+    return np.asarray(cv2.transform(picture, np.ones((1, 3), np.float32)))
 
 
-def _metal(stokes: Floats, covariance: Floats) -> Floats:
+def _metal(stokes: Floats, covariance: Floats) -> Bools:
     """(H, W) bool: channels whose polarization vectors point apart by more than a body's can.
 
     In a dielectric every channel has the same azimuth and a highlight only shortens the vectors; in a
     conductor the complex index changes with wavelength. Red and blue are compared at 5σ.
     """
-    (x0, y0, strength0, noise0), (x1, y1, strength1, noise1) = (
-        _polarization(stokes[:, c], covariance[:, c]) for c in (0, 2)
+    (x0, y0, square0, noise0), (x1, y1, square1, noise1) = (_polarization(stokes, covariance, c) for c in (0, 2))
+    enough = np.minimum(square0, square1) > np.float32(_METAL_DOLP**2)
+    apart = np.abs(x0 * y1 - y0 * x1) - np.float32(np.sin(2 * np.radians(_METAL_DEG))) * np.sqrt(square0 * square1)
+    noise0 *= square1
+    noise1 *= square0
+    noise0 += noise1
+    return np.asarray(enough & (apart > np.float32(_METAL_SIGMA) * np.sqrt(noise0, out=noise0)))
+
+
+def _polarization(stokes: Floats, covariance: Floats, channel: int) -> tuple[Floats, Floats, Floats, Floats]:
+    """S1/S0, S2/S0, their squared length and their variance in one channel, each (H, W)."""
+    s0, s1, s2, v1, v2 = (
+        np.asarray(cv2.extractChannel(plane, channel)) for plane in (*stokes, covariance[3], covariance[5])
     )
-    turned = x0 * y1 - y0 * x1
-    spread = np.sqrt(noise0 * strength1**2 + noise1 * strength0**2)
-    enough = np.minimum(strength0, strength1) > _METAL_DOLP
-    across = strength0 * strength1 * np.float32(np.sin(2 * np.radians(_METAL_DEG)))
-    return np.asarray(enough & (np.abs(turned) - _METAL_SIGMA * spread > across))
-
-
-def _polarization(stokes: Floats, covariance: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """S1/S0, S2/S0, their length and their variance in one channel, each (H, W)."""
-    over = np.float32(1) / np.maximum(stokes[0], np.float32(1e-9))
-    x, y = stokes[1] * over, stokes[2] * over
-    return x, y, np.sqrt(x * x + y * y), (covariance[3] + covariance[5]) * (over * over) / 2
+    over = np.float32(1) / np.maximum(s0, np.float32(1e-9), out=s0)
+    s1 *= over
+    s2 *= over
+    v1 += v2
+    over *= over
+    v1 *= over
+    v1 *= np.float32(0.5)
+    return s1, s2, s1 * s1 + s2 * s2, v1
