@@ -12,7 +12,7 @@ from polcap.gates import rim
 from polcap.gates.gate import Found, Gate, at_most
 from polcap.images import Floats, Gains, Quality, StokesImage
 from polcap.optics import mueller
-from polcap.optics.frames import dot, rays
+from polcap.optics.frames import dot, rays, total
 
 _LEAST_RIM = 200  # pixels of outline that an angle can be told from
 _LEAST_DOLP = 0.01  # of the outline; there the least index has ten times that
@@ -245,14 +245,14 @@ def _reduced(image: StokesImage, angle: Floats) -> tuple[Floats, rim.Bools, rim.
     step = int(np.ceil(np.sqrt(max(image.mask.size / _MOST_PIXELS, 1))))
     doubtful = Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST
     usable = (image.quality & int(doubtful)) == 0
-    total = image.stokes.sum(-1)
+    light = total(image.stokes)
     mask = image.mask
     if step > 1:
         size = (mask.shape[1] // step, mask.shape[0] // step)
         cut = np.s_[: size[1] * step, : size[0] * step]
-        total = np.stack([cv2.resize(part[cut], size, interpolation=cv2.INTER_AREA) for part in total])
+        light = np.stack([cv2.resize(part[cut], size, interpolation=cv2.INTER_AREA) for part in light])
         mask, usable = (
             cv2.resize(part[cut].astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
             for part in (mask, usable)
         )
-    return np.einsum("kj,jhw->khw", mueller.analyzer(angle), total), mask, usable
+    return np.einsum("kj,jhw->khw", mueller.analyzer(angle), light), mask, usable

@@ -20,15 +20,21 @@ def rays(view: View, height: int, width: int) -> Floats:
     y = (np.arange(height, dtype=np.float32) - view.center[1]) / view.focal
     xx, yy = np.meshgrid(x, y)
     v = np.stack([-xx, yy, np.ones_like(xx)], axis=-1)
-    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
+    return np.asarray(v / (dot(v, v) ** 0.5)[..., None])
 
 
 def basis(v: Any) -> tuple[Any, Any]:
-    """(e_x, e_y) of the frame on each ray v (..., 3)."""
+    """(e_x, e_y) of the frame on each ray, a unit vector v (..., 3): e_x = x − (x·v) v made unit, e_y = v × e_x."""
     xp = array_namespace(v)
     vx, vy, vz = v[..., 0], v[..., 1], v[..., 2]
-    e_x = xp.stack([1 - vx * vx, -vx * vy, -vx * vz], axis=-1) / ((1 - vx * vx) ** 0.5)[..., None]
-    return e_x, cross(v, e_x)
+    long = _across(vx)
+    e_x = xp.stack([long, -vx * vy / long, -vx * vz / long], axis=-1)
+    return e_x, xp.stack([0 * vx, vz / long, -vy / long], axis=-1)
+
+
+def _across(vx: Any) -> Any:
+    """How long what is left of the x axis is across rays whose x is vx."""
+    return (1 - vx * vx) ** 0.5
 
 
 def cross(a: Any, b: Any) -> Any:
@@ -43,17 +49,27 @@ def dot(a: Any, b: Any) -> Any:
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
+def total(a: Any) -> Any:
+    """Sum of three numbers on the last axis, in a quarter of the time."""
+    return a[..., 0] + a[..., 1] + a[..., 2]
+
+
 def to_ray_frame(n: Any, v: Any) -> Any:
-    """Camera-frame vectors n (..., 3) in the frames of the rays v (..., 3)."""
+    """Camera-frame vectors n (..., 3) in the frames of the rays v (..., 3); see `basis`."""
     xp = array_namespace(n)
-    e_x, e_y = basis(v)
-    return xp.stack([dot(n, e) for e in (e_x, e_y, v)], axis=-1)
+    vx, long, along = v[..., 0], _across(v[..., 0]), dot(n, v)
+    turned = n[..., 1] * v[..., 2] - n[..., 2] * v[..., 1]
+    return xp.stack([(n[..., 0] - vx * along) / long, turned / long, along], axis=-1)
 
 
 def from_ray_frame(m: Any, v: Any) -> Any:
     """Back to the camera frame."""
-    e_x, e_y = basis(v)
-    return m[..., 0:1] * e_x + m[..., 1:2] * e_y + m[..., 2:3] * v
+    xp = array_namespace(m)
+    vx, vy, vz = v[..., 0], v[..., 1], v[..., 2]
+    long = _across(vx)
+    x, y = m[..., 0] / long, m[..., 1] / long
+    along = m[..., 2] - vx * x
+    return xp.stack([x + vx * along, y * vz + vy * along, vz * along - y * vy], axis=-1)
 
 
 def lifted(m: Any) -> Any:
@@ -66,13 +82,17 @@ def lifted(m: Any) -> Any:
     return up / (dot(up, up) ** 0.5)[..., None]
 
 
-def axis_on_ray(angle: Any, v: Any) -> Any:
-    """Angle in (e_x, e_y) of an image-plane axis at `angle` (broadcast to v's pixels), rad.
+def axis_across(angle: Any, v: Any) -> tuple[Any, Any]:
+    """Where an image-plane axis at `angle` rad (broadcast to v's pixels) points in (e_x, e_y); x, y of any length.
 
-    The axis a = (cos θ, sin θ, 0) projected across the ray, a − (a·v)v.
+    The axis a = (cos θ, sin θ, 0) projected across the ray, a − (a·v)v; see `basis`.
     """
     xp = array_namespace(v)
-    ax, ay = xp.cos(angle), xp.sin(angle)
-    a = xp.stack([ax + 0 * v[..., 0], ay + 0 * v[..., 0], 0 * v[..., 0]], axis=-1)
-    e_x, e_y = basis(v)
-    return xp.atan2(dot(a, e_y), dot(a, e_x))
+    vx, sine = v[..., 0], xp.sin(angle)
+    return xp.cos(angle) * (1 - vx * vx) - sine * vx * v[..., 1], sine * v[..., 2]
+
+
+def axis_on_ray(angle: Any, v: Any) -> Any:
+    """The angle of `axis_across`, rad."""
+    x, y = axis_across(angle, v)
+    return array_namespace(v).atan2(y, x)

@@ -55,7 +55,7 @@ def stokes(
     """
     xp = array_namespace(normal)
     cos_o = xp.clip(normal[..., 2], _LEAST_COSINE, 1.0)
-    cos_i = xp.sum(normal * to_light, axis=-1)
+    cos_i = frames.dot(normal, to_light)
     lit = (cos_i > 0) & (normal[..., 2] > 0)
     cos_i = xp.clip(cos_i, _LEAST_COSINE, 1.0)
 
@@ -75,8 +75,8 @@ def stokes(
     ray = xp.zeros_like(to_light)
     ray[..., 2] = 1.0
     half = to_light + ray
-    half = half / xp.sum(half * half, axis=-1)[..., None] ** 0.5
-    cos_h = xp.clip(xp.sum(normal * half, axis=-1), _LEAST_COSINE, 1.0)
+    half = half / frames.dot(half, half)[..., None] ** 0.5
+    cos_h = xp.clip(frames.dot(normal, half), _LEAST_COSINE, 1.0)
     cos_d = xp.clip(half[..., 2], _LEAST_COSINE, 1.0)  # θ_d = ∠(light, half) = ∠(ray, half)
     reflect_plus, reflect_minus = fresnel.reflection(cos_d, ior)
     facets = irradiance * pi * brdf.ggx_distribution(cos_h, alpha) * brdf.smith_masking(cos_i, cos_o, alpha)
@@ -100,12 +100,12 @@ def stokes(
 def _entering(normal: Any, to_light: Any, axis: Any, alpha: Any, ior: Any, law: bodies.Law) -> Any:
     """What polarization along `axis` adds to T₊ of light that enters: T₋ cos 2Δ, Δ between axis and azimuth, (...,)."""
     xp = array_namespace(normal)
-    cos_i = xp.clip(xp.sum(normal * to_light, axis=-1), _LEAST_COSINE, 1.0)
+    cos_i = xp.clip(frames.dot(normal, to_light), _LEAST_COSINE, 1.0)
     if law is bodies.SMOOTH:
         _, minus = fresnel.transmission(cos_i, ior)
     else:
         _, minus = bodies.leaving(cos_i, law.rough * alpha, ior, law.local)
-    along = xp.sum(normal * axis, axis=-1)
+    along = frames.dot(normal, axis)
     return minus * (2 * along**2 / (1 - cos_i**2 + 1e-12) - 1)
 
 

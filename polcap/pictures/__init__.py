@@ -25,7 +25,7 @@ from polcap.images import (
     StokesImage,
     SurfaceMaps,
 )
-from polcap.optics import color
+from polcap.optics import color, frames
 from polcap.optics.warp import warp
 from polcap.path import Results
 from polcap.pictures import keys
@@ -139,7 +139,7 @@ def gains(found: Gains, angle: Floats) -> Picture:
 
 def stokes(image: StokesImage) -> Picture:
     """S0, DoLP and AoLP in camera channels."""
-    total = image.stokes.sum(-1)
+    total = frames.total(image.stokes)
     s0 = np.maximum(total[0], 1e-6)
     dolp = np.hypot(total[1], total[2]) / s0
     aolp = np.arctan2(total[2], total[1]) / 2
@@ -208,7 +208,7 @@ def shaded(mesh: Mesh, found: SurfaceMaps) -> Picture:
     footprint = np.nanmedian(depth) / found.view.focal if inside.any() else 1.0  # size of a pixel there
     down, right = np.gradient(depth / footprint)
     facing = np.stack([right, -down, np.ones_like(depth)], -1)  # z towards the camera, y up
-    facing = facing / np.linalg.norm(facing, axis=-1, keepdims=True)
+    facing = facing / (frames.dot(facing, facing) ** 0.5)[..., None]
     light = np.array([-0.5, 0.6, 0.62])
     shade = np.clip(np.nan_to_num(facing) @ (light / np.linalg.norm(light)), 0, 1)
     return _eight(np.repeat((0.1 + 0.85 * shade)[..., None], 3, -1) * inside[..., None])
@@ -263,7 +263,7 @@ def _top(linear: Floats) -> float:
 
 
 def _grey(value: Floats) -> Floats:
-    return np.asarray(value.mean(-1), np.float32)
+    return np.asarray(frames.total(value) / 3, np.float32)
 
 
 def _eight(value: Any) -> Picture:

@@ -31,7 +31,7 @@ class Shown:
 def reduce(maps: SurfaceMaps, mesh: Mesh, cues: Cues, angle: Floats, longest: int) -> Shown:
     """The results with at most `longest` pixels a side; colors and angles are averaged over the object alone."""
     way = Smaller(np.asarray(maps.mask & cues.mask, bool), longest)
-    light = np.maximum(cues.radiance.sum(-1), 1e-6)
+    light = np.maximum(frames.total(cues.radiance), 1e-6)
     weight = np.maximum(way.mean(light), 1e-9)
     axis = [way.mean(part) for part in cues.normalized_stokes]
     small = way.maps(maps)
@@ -72,8 +72,8 @@ def rerender(shown: Shown, ior: float) -> Rerendered:
     ones = np.ones_like(index)
     drawn = shade.stokes(normal, maps.diffuse, maps.specular, np.maximum(maps.roughness, 0.02), index, ahead, ones)
     flashed = np.asarray(drawn)[0] * maps.mask[..., None]
-    drawn = np.asarray(drawn).mean(axis=-1) * maps.mask
-    seen = shown.radiance.mean(axis=-1) * maps.mask
+    drawn = frames.total(np.asarray(drawn)) / 3 * maps.mask
+    seen = frames.total(shown.radiance) / 3 * maps.mask
     light, lit = seen[maps.mask], drawn[0][maps.mask]
     scale = float(np.median(light[lit > 0] / lit[lit > 0])) if (lit > 0).any() else 1.0  # highlights have no say
     white = max(float(np.quantile(light, _GREATEST_S0)), 1e-6) if light.size else 1.0

@@ -11,6 +11,8 @@ from math import pi
 import torch
 from torch import Tensor
 
+from polcap.optics import frames
+
 ANGLES = (0.0, pi / 4, pi / 2)  # rad
 
 
@@ -115,10 +117,8 @@ def photograph(
 
 
 def _double_axis(angle: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """cos and sin of twice `frames.axis_on_ray`, without the arc: on the ray the axis is (x, y)."""
-    vx, vy, vz = rays.unbind(dim=-1)
-    x = torch.cos(angle) * (1 - vx * vx) - torch.sin(angle) * vx * vy
-    y = torch.sin(angle) * vz
+    """cos and sin of twice `frames.axis_on_ray`, without the arc."""
+    x, y = frames.axis_across(angle, rays)
     length = x * x + y * y
     return (x * x - y * y) / length, 2 * x * y / length
 

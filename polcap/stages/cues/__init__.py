@@ -73,10 +73,10 @@ def polarization(stokes: Any, covariance: Any) -> tuple[Any, Any, Any, Any]:
     E[ρ̂²] = ρ² + 2σ², and √(ρ̂² − σ²) has the least bias where ρ > σ (Wardle & Kronberg, ApJ 1974).
     """
     xp = array_namespace(stokes)
-    total = xp.sum(stokes, axis=-1)  # (3, ...)
+    total = frames.total(stokes)  # (3, ...)
     s0 = xp.where(total[0] > 1e-6, total[0], 1e-6 * xp.ones_like(total[0]))
     ratio = total[1:] / s0
-    variance = xp.sum(covariance[3] + covariance[5], axis=-1) / 2
+    variance = frames.total(covariance[3] + covariance[5]) / 2
     sigma = variance**0.5 / s0
     squared = ratio[0] ** 2 + ratio[1] ** 2
     dolp = xp.clip(squared - sigma * sigma, 0.0, 1.0) ** 0.5
@@ -88,7 +88,7 @@ def least_intensity_color(stokes: Any, matrix: Any) -> Any:
     xp = array_namespace(stokes)
     least = (stokes[0] - (stokes[1] ** 2 + stokes[2] ** 2) ** 0.5) / 2
     color = xp.clip(least @ matrix.T, 0.0, None)
-    length = xp.sum(color * color, axis=-1)[..., None] ** 0.5
+    length = frames.dot(color, color)[..., None] ** 0.5
     return xp.where(length > 1e-4, color / (length + 1e-12), 0.0 * color)
 
 

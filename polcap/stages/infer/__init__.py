@@ -35,7 +35,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
 
 
-@stage(version=14)
+@stage(version=15)
 def estimate(cues: Cues, network: Network | None, settings: Settings) -> SurfaceMaps:
     """Normal, diffuse, specular, roughness and expected error; network None means analytic.
 

@@ -111,7 +111,7 @@ def _smoothed(cues: Cues) -> tuple[Floats, Floats]:
     ----------
     Lepski, Mammen, Spokoiny, Optimal spatial adaptation, Annals of Statistics 1997.
     """
-    light = (np.maximum(cues.radiance.sum(-1), 1e-6) * cues.mask).astype(np.float32)
+    light = (np.maximum(frames.total(cues.radiance), 1e-6) * cues.mask).astype(np.float32)
     kept: list[tuple[Floats, Floats]] = []
     ratio, sigma = cues.ratio, cues.ratio_sigma
     weighted, weighted_sigma = ((image * light).astype(np.float32) for image in (ratio, sigma))
@@ -130,9 +130,9 @@ def _smoothed(cues: Cues) -> tuple[Floats, Floats]:
 
 def _from_angles(cos_zenith: Floats, phi: Floats, rays: Floats) -> Floats:
     """Unit normals (H, W, 3) in the camera frame from zenith and image azimuth about each ray."""
-    turned = frames.axis_on_ray(phi, rays)
-    sin_zenith = np.sqrt(np.maximum(1 - cos_zenith**2, 0))
-    local = np.stack([sin_zenith * np.cos(turned), sin_zenith * np.sin(turned), cos_zenith], axis=-1)
+    x, y = frames.axis_across(phi, rays)
+    share = np.sqrt(np.maximum(1 - cos_zenith**2, 0) / (x * x + y * y))
+    local = np.stack([share * x, share * y, cos_zenith], axis=-1)
     return np.asarray(frames.from_ray_frame(local, rays))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Cues, Floats, Quality
-from polcap.optics import body
+from polcap.optics import body, frames
 
 _ALPHAS = (0.0, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
 _KEPT = (1.0, 0.9, 0.8, 0.7, 0.5)
@@ -85,11 +85,11 @@ def zeniths(dolp: Floats, cues: Cues, ior: float, guide: tuple[Floats, Floats] |
     """
     every = laws(ior)
     score = every.prior.copy()
-    inside = cues.mask & ((cues.quality & Quality.CLIPPED) == 0) & (cues.radiance.mean(-1) > _LEAST_LIGHT)
+    inside = cues.mask & ((cues.quality & Quality.CLIPPED) == 0) & (frames.total(cues.radiance) / 3 > _LEAST_LIGHT)
     some = _some(np.flatnonzero(inside))
     if len(some) > _PATCHES:
         angles = np.stack([np.interp(dolp.flat[some], row, _ZENITHS) for row in every.dolp])  # (C, N)
-        score += _even_albedo(angles, cues.radiance.mean(-1).flat[some], every)
+        score += _even_albedo(angles, (frames.total(cues.radiance) / 3).flat[some], every)
         score += _round_outline(dolp, cues, every)
         if guide is not None:
             deviation = (angles - guide[0].flat[some]) / np.maximum(guide[1].flat[some], np.radians(2.0))

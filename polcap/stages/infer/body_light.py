@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from polcap.images import Cues, Floats, SurfaceMaps
-from polcap.optics import fresnel
+from polcap.optics import frames, fresnel
 
 # share of S0 that is mirrored: below the first the estimator's albedo stays, above the second the crossed shot's counts
 _GLOSS = (0.03, 0.1)
@@ -39,7 +39,7 @@ def albedo(maps: SurfaceMaps, cues: Cues, ior: float) -> SurfaceMaps:
     low, high = _GLOSS
     share = np.clip((gloss - low) / (high - low), 0, 1) * cues.body_known  # of the crossed shot in the answer
     share = cv2.GaussianBlur(share.astype(np.float32), (0, 0), 1.0) * cues.body_known
-    cosine = np.clip((maps.normal * cues.rays).sum(-1), _LEAST_COSINE, 1)
+    cosine = np.clip(frames.dot(maps.normal, cues.rays), _LEAST_COSINE, 1)
     shading = cosine * fresnel.transmission(cosine, ior)[0] * fresnel.transmission(1.0, ior)[0]
     own = np.log(np.maximum(cues.body, _FLOOR)) - np.log(shading)[..., None]
     seen = np.log(np.maximum(maps.diffuse, _FLOOR))

@@ -73,7 +73,7 @@ def refined(cues: Cues, guess: Guess, network: Network) -> Floats:
     relief = finer(relief, cues.mask, guess.shrink)
     local = frames.to_ray_frame(guess.normal, cues.rays) + relief
     moved = frames.from_ray_frame(local, cues.rays)
-    return np.asarray(moved / np.maximum(np.linalg.norm(moved, axis=-1, keepdims=True), 1e-6))
+    return np.asarray(moved / np.maximum((frames.dot(moved, moved) ** 0.5)[..., None], 1e-6))
 
 
 def finer(image: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:

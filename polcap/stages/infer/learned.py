@@ -196,7 +196,7 @@ def _resized(cues: Cues, scale: float) -> Cues:
     def mean(image: Floats) -> Floats:
         return np.asarray(cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA))
 
-    light = np.maximum(cues.radiance.sum(-1), 1e-6) * cues.mask
+    light = np.maximum(frames.total(cues.radiance), 1e-6) * cues.mask
     weight = np.maximum(mean(light), 1e-9)
     ratio = np.stack([mean(r * light) / weight for r in cues.ratio])
     sigma = mean(cues.ratio_sigma * light) / weight * min(1.0, scale * np.sqrt(width / size[0] * scale))

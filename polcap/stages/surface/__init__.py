@@ -60,7 +60,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
 
 
-@stage(version=11)
+@stage(version=12)
 def integrate(maps: SurfaceMaps, distance_m: float | None, settings: Settings) -> Mesh:
     """The visible surface of the object, from its normals.
 

@@ -57,7 +57,7 @@ def halved(of: Problem) -> Problem:
     count = np.bincount(parent).astype(np.float64)
     weight = np.bincount(parent, of.weight)
     normal: Floats = np.stack([np.bincount(parent, of.normal[:, k] * of.weight) for k in range(3)], axis=-1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    normal /= np.maximum(dot(normal, normal) ** 0.5, 1e-12)[:, None]
     x, y = of.view.center
     return Problem(
         mask=_blocks(of.mask),
