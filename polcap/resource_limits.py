@@ -5,6 +5,7 @@ import gc
 import math
 import os
 import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -20,6 +21,8 @@ OUT_OF_MEMORY = (  # as OpenCV, pybind11, onnxruntime, threads, the loader of li
 _GB_PER_PIXEL, _GB_BESIDE = 60e-9, 0.3  # of a whole run, per RAW pixel: measured, docs/explanations/scale.md
 _ROOM = 1.1  # above what was asked for when memory ran out: more is asked for afterwards
 _ASKED = re.compile(r"allocate ([\d.]+) (bytes|KiB|MiB|GiB)")  # numpy, OpenCV
+# of mallopt(3): M_ARENA_MAX, M_MMAP_THRESHOLD (glibc's most), M_TRIM_THRESHOLD
+_MALLOC = {-8: 1, -3: 32 << 20, -1: 256 << 20}
 _BYTES = {"bytes": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 
 
@@ -31,6 +34,21 @@ def set_threads(count: int) -> None:
         import cv2
 
         cv2.setNumThreads(count)
+
+
+def keep_pages() -> None:
+    """Memory that threads give back is kept for the next array: fetching it anew is a twentieth of a run.
+
+    Of glibc alone; each of its threads would have a heap of its own, and give its end back after every array.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    import ctypes
+
+    library = ctypes.CDLL(None)
+    if hasattr(library, "mallopt"):
+        for parameter, value in _MALLOC.items():
+            library.mallopt(parameter, value)
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from polcap import terminal
+from polcap import resource_limits, terminal
 from polcap.cli import options
 from polcap.cli.options import Angles, ConfigFile, Json
 from polcap.errors import GateError
@@ -28,6 +28,7 @@ def check(
     """Keep a capture or reshoot it, and why: seconds after its last frame. Writes nothing."""
     from concurrent.futures import ThreadPoolExecutor
 
+    resource_limits.keep_pages()
     from polcap.formats import capture as captures
 
     with ThreadPoolExecutor(2) as beside:  # headers are read while all else is imported

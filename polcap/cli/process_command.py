@@ -63,6 +63,8 @@ def process(
         _tell_finished(finished, target, json)
         return
     resource_limits.set_threads(threads)  # before the libraries that start them
+    if not memory:
+        resource_limits.keep_pages()
     beside = ThreadPoolExecutor(1)
     look = cache(partial(_look, target, force is not None))
     # in the child, or from memory, while all else is imported
