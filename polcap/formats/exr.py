@@ -4,7 +4,6 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 
 from polcap.errors import DecodeError, StorageError
 from polcap.formats import atomic, image_io, memory_file, photo_bytes, plausible, worker
@@ -43,6 +42,8 @@ def write(
     StorageError
         The file cannot be written.
     """
+    import OpenImageIO as oiio  # 20 ms, which a run that writes none can spare
+
     names = list(channels)
     pixels = np.stack([np.asarray(channels[name], dtype=np.float32) for name in names], axis=-1)
     small = [half if isinstance(half, bool) else name in half for name in names]
@@ -85,6 +86,8 @@ def read(path: Path) -> tuple[dict[str, Floats], dict[str, object]]:
 
 def decode(path: str) -> worker.Answer:
     """What `read` reads, in the worker; raises DecodeError."""
+    import OpenImageIO as oiio
+
     data = photo_bytes.load(path)
     if data[:4] != _MAGIC:
         raise DecodeError(f"cannot read {path}: it is no OpenEXR file; write it again")

@@ -8,7 +8,6 @@ import os
 from dataclasses import dataclass
 
 import numpy as np
-import OpenImageIO as oiio
 
 from polcap.errors import SettingError
 from polcap.images import Floats
@@ -34,6 +33,8 @@ def find(wanted: str) -> Space:
     SettingError
         The configuration has no such space, or it is data or a display.
     """
+    import OpenImageIO as oiio
+
     source = _source()
     config = oiio.ColorConfig(source)
     if config.geterror() or not config.getColorSpaceNames():
@@ -59,6 +60,8 @@ def convert(rgb: Floats, space: Space) -> Floats:
     SettingError
         The configuration knows no way from linear Rec.709.
     """
+    import OpenImageIO as oiio
+
     source = oiio.ImageBuf(np.ascontiguousarray(rgb, dtype=np.float32))
     done = oiio.ImageBufAlgo.colorconvert(source, INSIDE, space.name, colorconfig=_source())
     if done.has_error:
