@@ -65,12 +65,18 @@ def process(
     resource_limits.set_threads(threads)  # before the libraries that start them
     if not memory:
         resource_limits.keep_pages()
-    beside = ThreadPoolExecutor(1)
+    beside = ThreadPoolExecutor(2)
     look = cache(partial(_look, target, force is not None))
     # in the child, or from memory, while all else is imported
     first = beside.submit(_understood, capture, options.angles_deg(angles), look)
-    beside.shutdown(wait=False)
     with resource_limits.no_garbage():
+        from polcap.parallel import Once
+
+        asked = options.chart_request(chart, no_chart)
+        user_input = Once(partial(_user_input, asked, mask, estimator, model, device, threads))
+        if mask is None and model is None:  # what polcap ships is read meanwhile, too
+            beside.submit(user_input)
+        beside.shutdown(wait=False)
         from polcap import config as settings
         from polcap import pipeline  # noqa: F401 — it is needed soon
         from polcap.path import STAGES
@@ -84,7 +90,7 @@ def process(
         target,
         options.angles_deg(angles),
         partial(settings.load, config, assignments or ()),
-        cache(partial(_user_input, options.chart_request(chart, no_chart), mask, estimator, model, device, threads)),
+        user_input,
         until,
         force,
         json,
