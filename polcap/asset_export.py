@@ -238,11 +238,6 @@ def _preset(wanted: Wanted) -> Preset:
     return PRESETS[wanted.preset]
 
 
-def _digested(task: Callable[[], list[Path]]) -> dict[Path, str]:
-    """The files that a task writes, with their digests."""
-    return {file: provenance.digest(file) for file in task()}
-
-
 @dataclass(frozen=True)
 class _Job:
     """One export under way."""
@@ -272,15 +267,33 @@ class _Job:
         tasks = [writers[one] for one in self.preset.formats]
         tasks += [partial(self._lod, k) for k in range(1, len(self.lods) + 1)]
         tasks += [partial(self._texture, file, made) for file, made in self.loose.items()]
-        with ThreadPoolExecutor(len(tasks)) as pool:
-            running = [pool.submit(_digested, task) for task in tasks]
-            written = {file: told for one in running for file, told in one.result().items()}
         sidecar = self.folder / f"{self.stem}{_SIDECAR}"
+        known = self._digests(sidecar)
+        with ThreadPoolExecutor(len(tasks)) as pool:
+            running = [pool.submit(self._digested, task, known) for task in tasks]
+            written = {file: told for one in running for file, told in one.result().items()}
         whole = self.source and "gltf" in self.preset.formats and self.images == "png"
         made_from = msgspec.to_builtins(self.source) if whole else None
         digests = {file.name: told for file, told in written.items()}
         provenance.write(sidecar, {**self.record, "made_from": made_from}, digests)
         return [*written, sidecar]
+
+    def _digests(self, sidecar: Path) -> dict[str, str]:
+        """Of the files that the last run wrote; none where its sidecar was touched since."""
+        if not self.standing.left(sidecar):
+            return {}
+        try:
+            return msgspec.convert(text_file.read_json(sidecar)["files"], dict[str, str])
+        except (OSError, ValueError, LookupError, TypeError):
+            return {}
+
+    def _digested(self, task: Callable[[], list[Path]], known: Mapping[str, str]) -> dict[Path, str]:
+        """The files that a task writes, with their digests, which are known of those that stood."""
+        written = {}
+        for file in task():
+            stood = self.standing.left(file) and file.name in known
+            written[file] = known[file.name] if stood else provenance.digest(file)
+        return written
 
     @cached_property
     def loose(self) -> dict[str, Texture]:

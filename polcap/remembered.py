@@ -5,7 +5,8 @@ late change does not measure all of them again. What is damaged, or of another p
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
@@ -60,16 +61,23 @@ class Remembered:
         if self._folder is None or self._anew:
             return None
         try:
-            kept = text_file.read_json(self._folder / f"{name}.json")
-        except (OSError, ValueError):
+            data = text_file.read_bytes(self._folder / f"{name}.json", text_file.TEXT_BYTES)
+            made = data[len(_sealed(b"")) - 1 : -1]
+            if data != _sealed(made):
+                return None
+            key, value = text_file.parse_json(made.decode())
+        except (OSError, ValueError, TypeError):
             return None
-        if not isinstance(kept, Mapping) or kept.get("digest") != digest([kept.get("key"), kept.get("value")]):
-            return None
-        return str(kept["key"]), kept["value"]
+        return str(key), value
 
     def _write(self, name: str, key: str, value: Any) -> None:
         if self._folder is None:
             return
-        kept = {"key": key, "value": value, "digest": digest([key, value])}
         with atomic.path(self._folder / f"{name}.json", synced=False) as temporary:
-            temporary.write_text(json.dumps(kept), encoding="utf-8")
+            temporary.write_bytes(_sealed(json.dumps([key, value]).encode()))
+
+
+def _sealed(made: bytes) -> bytes:
+    """The file, a JSON document: the text in it is hashed as it stands, in a third of the time of writing it again."""
+    head = f'{{"digest": "{blake2b(made, digest_size=16).hexdigest()}", "made": '
+    return head.encode() + made + b"}"

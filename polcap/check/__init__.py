@@ -15,7 +15,6 @@ from polcap.config import Config
 from polcap.gates import Gate
 from polcap.images import Capture, ChartRequest, Network
 from polcap.path import AUTO
-from polcap.stages.infer import body_law
 
 Networks = tuple[Network | None, Network | None]  # the estimator's, the mask's
 
@@ -58,7 +57,7 @@ def inspect(
     """
     start = perf_counter()
     with ThreadPoolExecutor(2) as pool, ThreadPoolExecutor(1) as beside:
-        loaded = beside.submit(_warm, networks, config.infer.ior)
+        loaded = beside.submit(_warm, networks)
         try:
             taken = reduced.take(capture, config.hdr.clip, pool)
             lines = tuple(judge.judged(judge.Reduced(taken, loaded.result, config, chart)))
@@ -72,17 +71,12 @@ def inspect(
     return Verdict(not bad, shots, lines, capture.name, seconds, "--no-chart" if missing else "")
 
 
-def _warm(networks: Callable[[], Networks], ior: float) -> Networks:
+def _warm(networks: Callable[[], Networks]) -> Networks:
     """Load what the stages need besides, while the reference frame is decoded and the second core waits."""
     import scipy.spatial.transform
     import scipy.special  # noqa: F401
 
-    found = networks()
-    for network in found:
-        if network is not None:
-            network.warm()
-    body_law.laws(ior)
-    return found
+    return networks()
 
 
 def table(verdict: Verdict) -> str:

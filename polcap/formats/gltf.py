@@ -238,8 +238,22 @@ def _bounds(vertices: Floats) -> tuple[Floats, Floats]:
 
 def is_open(faces: NDArray[np.int32]) -> bool:
     """Whether some edge of faces (F, 3) belongs to one triangle only: the surface has a back that can be seen."""
-    start, end = faces.astype(np.int64).T.ravel(), faces[:, [1, 2, 0]].T.ravel()
-    edge = np.minimum(start, end) * (int(faces.max()) + 1) + np.maximum(start, end)
+    few = int(faces.max()) // 256
+    first = faces[np.minimum(np.minimum(faces[:, 0], faces[:, 1]), faces[:, 2]) <= few]
+    # what was photographed from one side has its rim among the first vertices too: no need to sort all edges
+    return _single_edge(first, few) or _single_edge(faces, int(faces.max()))
+
+
+def _single_edge(faces: NDArray[np.int32], last: int) -> bool:
+    """Whether an edge with an end among the vertices up to `last` belongs to one triangle only.
+
+    Faces (F, 3) hold all triangles at these vertices.
+    """
+    start, end = faces.T.astype(np.int64).ravel(), faces[:, [1, 2, 0]].T.ravel()
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    edge = (low << 32 | high)[low <= last]
+    if not edge.size:
+        return False
     edge.sort()
     new = np.concatenate([[True], edge[1:] != edge[:-1], [True]])
     return bool((new[1:] & new[:-1]).any())  # an edge unlike the one before and the one after it

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, Protocol, TypeVar
 import msgspec
 import numpy as np
 from msgspec import Meta, Struct
+from numpy.typing import NDArray
 
 from polcap import parallel
 from polcap.errors import DecodeError
@@ -189,11 +190,11 @@ def as_read(maps: SurfaceMaps, mesh: Mesh) -> Stored:
     inside = map_files.inside(maps)
     whole = SurfaceMaps(
         normal=map_files.kept(maps.normal, inside),
-        diffuse=_half(map_files.kept(maps.diffuse, inside)),
-        specular=_half(map_files.kept(maps.specular, inside)),
-        roughness=_half(map_files.kept(maps.roughness, inside)),
+        diffuse=_kept_half(maps.diffuse, inside),
+        specular=_kept_half(maps.specular, inside),
+        roughness=_kept_half(maps.roughness, inside),
         depth_prior=None,
-        confidence=_half(map_files.kept(maps.confidence, inside)),
+        confidence=_kept_half(maps.confidence, inside),
         mask=inside,
         view=maps.view,
         estimator=maps.estimator,
@@ -204,13 +205,17 @@ def as_read(maps: SurfaceMaps, mesh: Mesh) -> Stored:
 def albedo_as_read(maps: SurfaceMaps) -> SurfaceMaps:
     """The maps with the two albedos and the mask that `read` gives of them; the other fields as they are."""
     inside = map_files.inside(maps)
-    diffuse, specular = (_half(map_files.kept(values, inside)) for values in (maps.diffuse, maps.specular))
+    diffuse, specular = (_kept_half(values, inside) for values in (maps.diffuse, maps.specular))
     return replace(maps, diffuse=diffuse, specular=specular, mask=inside)
 
 
-def _half(values: Floats) -> Floats:
-    limit = np.finfo(np.float16).max
-    return np.clip(values, -limit, limit).astype(np.float16).astype(np.float32)
+def _kept_half(values: Floats, inside: NDArray[np.bool_]) -> Floats:
+    """As `map_files.kept`, rounded to half; pixels beside the object are not computed."""
+    rows, limit = np.flatnonzero(inside), np.finfo(np.float16).max
+    flat = values.reshape(inside.size, -1)
+    kept = np.zeros(flat.shape, np.float32)
+    kept[rows] = np.clip(flat.take(rows, axis=0), -limit, limit).astype(np.float16)
+    return kept.reshape(values.shape)
 
 
 def read(folder: Path) -> Stored:

@@ -74,7 +74,7 @@ class Written:
         self._made[self._name(file)] = digest([self._program, made_from])
 
     def _is(self, name: str, mark: str, file: Path) -> bool:
-        return self._before.made_from.get(name) == mark and self._before.files.get(name) == _stat(file)
+        return self._before.made_from.get(name) == mark and self.left(file)
 
     def _name(self, file: Path) -> str:
         return file.relative_to(self._out).as_posix()
@@ -84,10 +84,14 @@ class Written:
         names = [file.relative_to(self._out).as_posix() for file in files]
         if self._before.made_from.get(names[0]) != digest([self._program, made_from]):
             return False
-        if any(self._before.files.get(name) != _stat(file) for name, file in zip(names, files)):
+        if not all(map(self.left, files)):
             return False
         self._made |= {name: mark for name in names if (mark := self._before.made_from.get(name)) is not None}
         return True
+
+    def left(self, file: Path) -> bool:
+        """The file is as the last run left it."""
+        return self._before.files.get(self._name(file)) == _stat(file)
 
     def untouched(self) -> bool:
         """Every file of the result is as the last run left it, none is missing and none has come."""

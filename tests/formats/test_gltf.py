@@ -90,3 +90,10 @@ def test_open_surface_is_seen_from_behind_too(asset: Asset) -> None:
     assert document(gltf.encode(asset, "ball"))["materials"][0]["doubleSided"] is True
     tetrahedron = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]], dtype=np.int32)
     assert gltf.is_open(tetrahedron[:3]) and not gltf.is_open(tetrahedron)
+
+
+@pytest.mark.parametrize("lost", [0, -1])
+def test_a_lost_triangle_opens_a_closed_surface_wherever_its_vertices_stand(lost: int) -> None:
+    ball = np.asarray(trimesh.creation.icosphere(4).faces, np.int32)  # 2,562 vertices
+    ball = ball[np.argsort(ball.min(axis=1))] + 7  # no triangle at the first vertices
+    assert not gltf.is_open(ball) and gltf.is_open(np.delete(ball, lost, axis=0))

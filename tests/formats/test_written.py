@@ -61,6 +61,12 @@ def test_an_edited_or_lost_file_is_made_again(file: Path, tmp_path: Path) -> Non
     assert file.read_text() == "first"
 
 
+def test_a_file_is_left_until_it_is_touched(file: Path, tmp_path: Path) -> None:
+    assert Written(tmp_path, "2").left(file) and not Written(tmp_path, anew=True).left(file)
+    file.write_text("longer than it was")
+    assert not Written(tmp_path, "2").left(file)
+
+
 def test_a_damaged_memory_makes_all_again(file: Path, tmp_path: Path) -> None:
     (tmp_path / "work" / "written.json").write_text('{"files": 3}')
     assert not Written(tmp_path, "1").untouched()

@@ -190,13 +190,13 @@ def filled(value: Any, known: NDArray[np.bool_]) -> Any:
         return value
     label = cv2.distanceTransformWithLabels(
         (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )[1]
+    )[1].ravel()
+    there, missing = np.flatnonzero(known), np.flatnonzero(~known)  # of whole pixels: half the time of a mask
     source = np.empty(int(label.max()) + 1, np.intp)
-    source[label[known]] = np.flatnonzero(known)  # every known pixel is the nearest to itself
-    missing = ~known
-    out = value.copy()
-    out[missing] = value.reshape(-1, value.shape[-1])[source[label[missing]]]
-    return out
+    source[label[there]] = there  # every known pixel is the nearest to itself
+    out = value.reshape(-1, value.shape[-1]).copy()
+    out[missing] = out.take(source[label[missing]], axis=0)
+    return out.reshape(value.shape)
 
 
 def _greatest(color_: Floats) -> Floats:
