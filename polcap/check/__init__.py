@@ -60,7 +60,7 @@ def inspect(
         loaded = beside.submit(_warm, networks)
         try:
             taken = reduced.take(capture, config.hdr.clip, pool)
-            lines = tuple(judge.judged(judge.Reduced(taken, loaded.result, config, chart)))
+            lines = tuple(judge.judged(judge.Reduced(taken, loaded.result, config, chart, pool)))
         finally:
             pool.shutdown(cancel_futures=True)
     bad = [line for line in lines if line.state == "fail"]

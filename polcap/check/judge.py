@@ -1,6 +1,7 @@
 """A reduced capture in, its gates out: the path's own stages on small pictures, each when a gate asks for it."""
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -26,6 +27,7 @@ from polcap.images import (
     StokesImage,
     SurfaceMaps,
 )
+from polcap.parallel import Once
 from polcap.stages import align, cues, hdr, infer, mask, selfcal, stokes, whitebalance
 
 _LOOKS = 2  # of the network: what gates read of its maps are medians
@@ -42,11 +44,15 @@ class Reduced:
         networks: Callable[[], tuple[Network | None, Network | None]],
         config: Config,
         chart: ChartRequest,
+        pool: ThreadPoolExecutor,
     ) -> None:
         self.taken, self.networks, self.config = taken, networks, config
         self.chart = chart
         self.names = [shot.name for shot in taken.capture.shots]
         self.focal_doubt = taken.capture.focal_doubt
+        self._object, self._gains = Once(self._segmented), Once(self._solved_gains)
+        self._stokes, self._maps = Once(self._solved_stokes), Once(self._estimated)
+        self._ahead = Once(lambda: pool.submit(self._maps))
         self.grid_px = taken.step / (taken.binned if config.hdr.demosaic == "superpixel" else 1)
 
     @cached_property
@@ -83,21 +89,35 @@ class Reduced:
         free = msgspec.structs.replace(self.config.align, max_shift_px=500.0, min_correlation=0.0)
         return align.register(self.radiance, self.color, free)
 
-    @cached_property
+    @property
     def object_(self) -> ObjectMask:
+        found = self._object()
+        self._ahead()  # what the last gates ask for is made beside the next ones
+        return found
+
+    @property
+    def gains(self) -> Gains:
+        return self._gains()
+
+    @property
+    def stokes(self) -> StokesImage:
+        return self._stokes()
+
+    @property
+    def maps(self) -> SurfaceMaps:
+        return self._maps()
+
+    def _segmented(self) -> ObjectMask:
         return mask.segment(self.radiance, self.alignment, self.color, None, self.networks()[1], self.config.mask)
 
-    @cached_property
-    def gains(self) -> Gains:
+    def _solved_gains(self) -> Gains:
         unchecked = msgspec.structs.replace(self.config.selfcal, check_order=False)
         return selfcal.solve(self.radiance, self.alignment, self.object_, self.color, unchecked)
 
-    @cached_property
-    def stokes(self) -> StokesImage:
+    def _solved_stokes(self) -> StokesImage:
         return stokes.solve(self.radiance, self.alignment, self.gains, self.object_, self.config.stokes)
 
-    @cached_property
-    def maps(self) -> SurfaceMaps:
+    def _estimated(self) -> SurfaceMaps:
         few = min(self.config.infer.symmetries, _LOOKS)
         settings = msgspec.structs.replace(self.config.infer, symmetries=few, fine=False)
         return infer.estimate(cues.compute(self.stokes, self.color), self.networks()[0], settings)

@@ -29,6 +29,7 @@ def test_corners_of_the_chart_are_asked_for_where_they_were_seen(monkeypatch: py
     monkeypatch.setattr(whitebalance, "measure", lambda radiance, reference, request, settings: request)
     edges = np.array([[-0.5, -0.5], [39.5, -0.5], [39.5, 23.5], [-0.5, 23.5]])
     taken = SimpleNamespace(step=4, binned=2, capture=SimpleNamespace(shots=(), focal_doubt=(0.0, 0.0)))
-    small = judge.Reduced(taken, lambda: (None, None), Config(), ChartRequest("corners", corners=edges))  # type: ignore[arg-type]  # a stand-in
+    request, pool = ChartRequest("corners", corners=edges), ThreadPoolExecutor(1)
+    small = judge.Reduced(taken, lambda: (None, None), Config(), request, pool)  # type: ignore[arg-type]  # a stand-in
     monkeypatch.setattr(judge.Reduced, "radiance", None)
     np.testing.assert_allclose(small.color.corners, [[-0.5, -0.5], [9.5, -0.5], [9.5, 5.5], [-0.5, 5.5]])
