@@ -52,7 +52,7 @@ def order(found: Found) -> Gate:
 def of_outline(found: Found, limits: Gates) -> Iterator[Gate]:
     """What the outline says of the angles, of the body and of other light."""
     angle, limit = _angle(found), limits.max_turn_deg
-    seen = found.figure("outline", _outline, limit)
+    seen = found.figure("outline", _outline, [limit, angle.tolist()])
     if seen is None:
         yield Gate("angles", "not measured", None, limit, "too little outline", unit="°")
         return
@@ -77,9 +77,12 @@ def _angle(found: Found) -> Floats:
     return found.radiance.angle if found.gains.found_angle is None else found.gains.found_angle
 
 
-def _outline(found: Found, limit_deg: float) -> dict[str, Any] | None:
-    """What the outline says of a turn beyond the limit, of the body and of other light; None: it is too short."""
-    angle = _angle(found)
+def _outline(found: Found, setting: tuple[float, list[float]]) -> dict[str, Any] | None:
+    """What the outline says of a turn beyond the limit, of the body and of other light; None: it is too short.
+
+    The setting: the limit in degrees, and the angles, for which nobody has to read the photographs here.
+    """
+    limit_deg, angle = setting[0], np.array(setting[1])
     band = rim.take(*_reduced(found.stokes, angle))
     if len(band.azimuth) < _LEAST_RIM:
         return None
