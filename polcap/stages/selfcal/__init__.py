@@ -21,6 +21,7 @@ from msgspec import Meta
 from polcap import parallel
 from polcap.errors import CaptureError
 from polcap.images import Alignment, AngleStack, Bits, ColorCalibration, Floats, Gains, ObjectMask, Quality
+from polcap.optics import frames
 from polcap.optics.outline import Rim
 from polcap.optics.warp import warp
 from polcap.stages import stage
@@ -86,7 +87,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 12.0
 
 
-@stage(version=12)
+@stage(version=13)
 def solve(
     radiance: AngleStack,
     alignment: Alignment,
@@ -136,7 +137,7 @@ def solve(
     if settings.check_order and found.order != stated:
         raise CaptureError(_disorder(found, radiance.angle))
     doubt = float(blind.sigma.max())
-    even = value.sum(-1) / blind.gain[:, None, None]
+    even = frames.total(value) / blind.gain[:, None, None]
     ring = ring_by_slopes.joined(
         ring_zero.measure(even, quality == 0, mask, radiance.angle, doubt, object_.border > 0),
         ring_by_slopes.measure(

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from polcap import parallel
 from polcap.images import Bits, Floats
-from polcap.optics import mueller
+from polcap.optics import frames, mueller
 from polcap.optics.robust import BIWEIGHT, MAD_TO_SIGMA
 
 Bools = NDArray[np.bool_]
@@ -243,7 +243,7 @@ def _solved(square: Floats) -> Floats:
 
 def smoothed(value: Floats) -> Floats:
     """Sum over channels of shots (K, H, W, C), little blurred: (K, H, W)."""
-    return np.stack([cv2.GaussianBlur(v.sum(-1, dtype=np.float32), (0, 0), 2.0) for v in value])
+    return np.stack([cv2.GaussianBlur(frames.total(v), (0, 0), 2.0) for v in value])
 
 
 def inside(mask: Bools, quality: Bits) -> Bools:

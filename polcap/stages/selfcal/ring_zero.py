@@ -76,26 +76,31 @@ def measure(
     ok = (mask & usable).astype(np.float32)
     share = cv2.GaussianBlur(ok, (0, 0), _SMOOTH_PX) + 1e-6
     light = np.stack([cv2.GaussianBlur((shot * ok).astype(np.float32), (0, 0), _SMOOTH_PX) / share for shot in light])
-    s0, s1, s2 = np.einsum("jk,khw->jhw", np.linalg.pinv(mueller.analyzer(angle)), light)
-    seen = inside & usable & (s0 > 0)
-    if not seen.any():
+    seen = inside & usable
+    s0, s1, s2 = np.linalg.pinv(mueller.analyzer(angle)) @ light[:, seen]
+    lit = s0 > 0
+    seen[seen] = lit
+    if not lit.any():
         return UNKNOWN
-    polarization = np.where(seen, (s1 + 1j * s2) / np.where(seen, s0, 1), 0)
+    polarization = (s1[lit] + 1j * s2[lit]) / s0[lit]  # (N,), as all that follows
     strength = np.abs(polarization)
-    slope = polarization * np.minimum(1, outline.DOLP_CAP / np.maximum(strength, 1e-9))
+    weight = np.minimum(strength, outline.DOLP_CAP)
+    slope = np.sqrt(polarization / np.maximum(strength, 1e-9)) * weight  # along it or against it: half the angle
     out = parallel.results(partial(_outward_of, mask, sigma) for sigma in (_RIM_PX, *(d * radius for d in _DEEPER)))
     out.append(_outward(cv2.GaussianBlur(np.minimum(depth, _PLATEAU * radius), (0, 0), 2.0)))
-    rim, *deeper = parallel.results(partial(_turned, slope[seen], way[seen]) for way in out)
+    rim, *deeper = parallel.results(partial(_turned, slope, way[seen]) for way in out)
     spread = float(np.sqrt(np.mean([(other - rim) ** 2 for other in deeper])))
-    at = out[0]
-    hidden = float(np.abs(at[inside & ~seen]).sum() / max(np.abs(at[inside]).sum(), 1e-9))
-    weight = float((np.abs(at) * np.abs(slope))[seen].sum())
-    lopsided = abs(complex((np.abs(at) * np.exp(-2j * np.angle(at)))[seen].sum())) / max(weight, 1e-9)
+    lying = out[0][seen]
+    length = np.abs(lying)
+    hidden = float(np.abs(out[0][inside & ~seen]).sum())
+    hidden /= max(hidden + float(length.sum()), 1e-9)
+    lopsided = abs(complex((np.conj(lying) ** 2 / np.maximum(length, 1e-30)).sum()))
+    lopsided /= max(float(length @ weight), 1e-9)
     sigma = float(
         np.sqrt(
             _FLOOR**2
             + (_SPREAD_TO_SIGMA * spread) ** 2
-            + (hidden * _scatter(slope, at, seen)) ** 2
+            + (hidden * _scatter(slope, lying, outline.sectors(seen))) ** 2
             + (gain_sigma * lopsided / 2) ** 2
         )
     )
@@ -120,16 +125,16 @@ def _outward_of(mask: Bools, sigma: float) -> NDArray[np.complex128]:
 
 def _turned(slope: NDArray[np.complex128], out: NDArray[np.complex128]) -> float:
     """Angle of Σ g conj(out), rad: of the two opposite slopes that an AoLP means the one nearer to the way out."""
-    half = np.abs(slope) * np.exp(0.5j * np.angle(slope))
+    lying = slope * np.conj(out)
+    along, across = np.ascontiguousarray(lying.real), np.ascontiguousarray(lying.imag)
     turn = 0.0
     for _ in range(_TURNS):
-        along = half * np.conj(out) * np.exp(-1j * turn)
-        turn += float(np.angle(np.sum(along * np.where(along.real < 0, -1, 1))))
+        way = np.copysign(1.0, along * np.cos(turn) + across * np.sin(turn))
+        turn = float(np.arctan2(across @ way, along @ way))
     return turn
 
 
-def _scatter(slope: NDArray[np.complex128], out: NDArray[np.complex128], seen: Bools) -> float:
+def _scatter(slope: NDArray[np.complex128], out: NDArray[np.complex128], sector: NDArray[np.int_]) -> float:
     """How far parts of the outline differ from one another, 1σ rad."""
-    sector, slope, out = outline.sectors(seen), slope[seen], out[seen]
     parts = parallel.results(partial(_turned, slope[sector == s], out[sector == s]) for s in np.unique(sector))
     return float(np.std(parts))
