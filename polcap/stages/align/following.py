@@ -315,13 +315,15 @@ def _weighted_median(value: Floats, weight: Floats) -> float:
 
 
 def likeness(reference: Detail, shot: Detail, transform: Floats) -> float:
-    """Weighted zero-mean correlation of the detail of two shots once registered by (3, 3)."""
+    """Weighted zero-mean correlation of the detail of two shots once registered by (3, 3); of every fourth pixel."""
+    some, there = (slice(None, None, 2),) * 2, transform @ np.diag([2.0, 2.0, 1.0])
     a, b = reference[1], shot[1]
-    height, width = a.value.shape
+    value = np.ascontiguousarray(a.value[some])
+    height, width = value.shape
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    warped = cv2.warpPerspective(b.value, transform, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    weight = a.weight * warp(b.weight, transform, order=1)
+    warped = cv2.warpPerspective(b.value, there, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    weight = a.weight[some] * warp(b.weight, there, (0, 0, width, height), order=1)
     weighted = weight * warped
-    product = float(np.vdot(weighted, a.value))
-    power = float(np.vdot(weight * a.value, a.value)) * float(np.vdot(weighted, warped))
+    product = float(np.vdot(weighted, value))
+    power = float(np.vdot(weight * value, value)) * float(np.vdot(weighted, warped))
     return float(product / np.sqrt(power + 1e-30))
