@@ -57,8 +57,8 @@ def load_mask_network(threads: int = 0, later: bool = False) -> Network | None:
 
 
 def shipped() -> tuple[Network | None, Network | None]:
-    """Estimator and mask network as shipped."""
-    return load_network(None, None, "cpu", 0), load_mask_network()
+    """Estimator and mask network as shipped, opened when they are first run or warmed."""
+    return load_network(None, None, "cpu", 0, later=True), load_mask_network(later=True)
 
 
 def _newest(name: str) -> Path | None:

