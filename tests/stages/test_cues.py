@@ -40,12 +40,11 @@ def test_dolp_of_a_sphere_follows_atkinson_and_hancock(ball):
 def test_dolp_of_noise_is_not_mistaken_for_tilt():
     rng = np.random.default_rng(0)
     sigma, rho = 0.01, 0.03
-    values = np.zeros((3, 200, 200, 1))
-    values[0] = 1
-    values[1] = rho + sigma * rng.normal(size=(200, 200, 1))
-    values[2] = sigma * rng.normal(size=(200, 200, 1))
-    covariance = np.zeros((6, 200, 200, 1))
-    covariance[[3, 5]] = sigma**2
+    values, covariance = np.zeros((3, 200, 200, 3)), np.zeros((6, 200, 200, 3))  # all in one channel
+    values[0, ..., 1] = 1
+    values[1, ..., 1] = rho + sigma * rng.normal(size=(200, 200))
+    values[2, ..., 1] = sigma * rng.normal(size=(200, 200))
+    covariance[[3, 5], ..., 1] = sigma**2
     _, found, dolp, _ = cues.polarization(values, covariance)
     assert np.allclose(found, sigma)
     assert abs(dolp.mean() - rho) < 0.0004  # 0.0017 without the correction

@@ -69,7 +69,7 @@ def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
 def polarization(stokes: Any, covariance: Any) -> tuple[Any, Any, Any, Any]:
     """S1/S0 and S2/S0 (2, ...), their 1σ (...), debiased DoLP (...), normalised Stokes map (2, ...).
 
-    stokes (3, ..., C) and covariance (6, ..., C) in camera channels. The DoLP of noise is not zero:
+    stokes (3, ..., 3) and covariance (6, ..., 3) in camera channels. The DoLP of noise is not zero:
     E[ρ̂²] = ρ² + 2σ², and √(ρ̂² − σ²) has the least bias where ρ > σ (Wardle & Kronberg, ApJ 1974).
     """
     xp = array_namespace(stokes)
