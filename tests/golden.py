@@ -14,8 +14,10 @@ from zlib import crc32
 
 import numpy as np
 
-from polcap import models, path, pipeline, stages
+from polcap import stages
 from polcap.formats import npy_folder
+from polcap.pipeline import models, path
+from polcap.pipeline import run as pipeline
 from polcap.stages import infer
 
 LEARNED = "infer by the shipped network"

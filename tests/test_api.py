@@ -6,8 +6,8 @@ import sys
 import pytest
 
 import polcap
-from polcap import models
-from polcap.formats import maps
+from polcap.formats.maps import maps_folder as maps
+from polcap.pipeline import models
 
 
 def test_importing_polcap_imports_nothing_heavy() -> None:

@@ -69,7 +69,7 @@ def test_a_module_loads_where_there_is_no_unix(name: str) -> None:
 
 
 def test_the_path_is_imported_without_unix_modules() -> None:
-    rooms = "polcap.cli, polcap.api, polcap.check, polcap.batch, polcap.synth.shooting"
+    rooms = "polcap.cli, polcap.api, polcap.pipeline.check, polcap.batch, polcap.synth.shooting"
     code = f"import sys; sys.modules.update(dict.fromkeys({sorted(UNIX_ONLY)})); import {rooms}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
@@ -107,7 +107,7 @@ def test_a_files_name_is_unique_in_the_house() -> None:
 
 def test_stages_stand_in_the_order_of_the_path() -> None:
     from polcap import stages
-    from polcap.path import STAGES
+    from polcap.pipeline.path import STAGES
 
     listed = re.findall(r"^    (\w+)  ", stages.__doc__ or "", re.M)
     assert tuple(listed) == STAGES

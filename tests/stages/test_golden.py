@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from polcap.path import STAGES
+from polcap.pipeline.path import STAGES
 from tests import golden
 
 FILE = Path(golden.__file__).with_suffix(".json")
