@@ -18,7 +18,7 @@ from polcap.formats.export import provenance
 
 _FILE = "unchanged.json"
 _OF_A_RUN = ("lock", "owner", _FILE)  # in work/: they differ from run to run
-_PACKAGE = Path(__file__).parent
+_PACKAGE = Path(__file__).parents[1]
 Stats = dict[str, file_stat.Stat]
 
 

@@ -297,7 +297,7 @@ def test_a_store_that_is_done_with_leaves_no_memory_map_behind(tmp_path: Path) -
 
 def test_two_processes_never_work_in_one_folder(tmp_path: Path) -> None:
     code = (
-        "import sys, time; from pathlib import Path; from polcap.store import Store\n"
+        "import sys, time; from pathlib import Path; from polcap.pipeline.cache import Store\n"
         "with Store(Path(sys.argv[1])).lock(): print('held', flush=True); time.sleep(600)"
     )
     other = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE)

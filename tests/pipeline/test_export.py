@@ -11,12 +11,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from tests.formats.export.test_gltf import NODE, document
 
 from polcap.formats.export import encoders
 from polcap.formats.export.presets import PRESETS
 from polcap.formats.maps import exr, png
 from tests.conftest import ROOT, Command, shell
+from tests.formats.export.test_gltf import NODE, document
 
 
 @pytest.fixture(scope="module")

@@ -358,5 +358,5 @@ def test_the_gallery_shows_each_result_and_stands_alone(result: Path, tmp_path: 
 
 
 def test_a_start_loads_no_library_that_only_some_runs_need() -> None:
-    code = "import sys, polcap.pipeline, polcap.check; print([m for m in ('scipy', 'onnxruntime') if m in sys.modules])"
+    code = "import sys, polcap.pipeline.run, polcap.pipeline.check; print([m for m in ('scipy', 'onnxruntime') if m in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

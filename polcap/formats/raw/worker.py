@@ -42,7 +42,7 @@ Answer = tuple[dict[str, Any], Arrays]
 _LENGTH = struct.Struct("<Q")
 _BEGUN = b"begun"  # the child has started and imported what it needs: from now on its time counts
 _START = (
-    "import sys; sys.path[:] = sys.argv[3:]; from polcap.formats import worker; "
+    "import sys; sys.path[:] = sys.argv[3:]; from polcap.formats.raw import worker; "
     "worker.serve(float(sys.argv[1]), int(sys.argv[2]))"
 )
 

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.formats.raw.test_photo import mosaic, save
 
 from polcap.errors import CaptureError, DecodeError, InputError
 from polcap.formats.capture import reader as capture
 from tests.formats import headers
 from tests.formats.headers import DATA, needs_data
+from tests.formats.raw.test_photo import mosaic, save
 
 _serial = count()
 

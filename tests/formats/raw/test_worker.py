@@ -155,7 +155,7 @@ def test_a_call_may_have_tighter_limits(worker):
 def test_a_child_in_a_loop_dies_with_its_parent(worker, tmp_path, loop):
     code = (
         "import sys; sys.path.insert(0, sys.argv[1]); import misbehaving\n"
-        "from polcap.formats.worker import Worker\n"
+        "from polcap.formats.raw.worker import Worker\n"
         "w = Worker(); print(w.call(misbehaving.ramp, 'a')[0]['pid'], flush=True)\n"
         f"w.call(misbehaving.{loop}, 'b')"
     )
