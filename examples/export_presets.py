@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from polcap.pipeline import run as pipeline
-from polcap.pipeline.export import Wanted
+from polcap.pipeline.asset_export import Wanted
 
 result = Path(sys.argv[1])
 for wanted in (Wanted(preset="unreal"), Wanted(preset="web"), Wanted(formats=("exr",), color="ACEScg")):

@@ -42,7 +42,7 @@ def export(
     """Write the asset again from the maps of a result; without a flag GLB and OBJ, as `process` does."""
     from polcap.formats.export import presets
     from polcap.pipeline import run as pipeline
-    from polcap.pipeline.export import Wanted
+    from polcap.pipeline.asset_export import Wanted
 
     flags = {"gltf": gltf, "obj": obj, "usd": usd, "materialx": materialx, "exr": exr}
     formats = tuple(name for name in presets.FORMATS if flags[name])

@@ -13,7 +13,7 @@ import msgspec
 from polcap.config import Config
 from polcap.images import Capture, ChartRequest, Network
 from polcap.pipeline import small_capture as reduced
-from polcap.pipeline import small_run as judge
+from polcap.pipeline import small_capture_run as judge
 from polcap.pipeline.path import AUTO
 from polcap.quality.gates import Gate
 from polcap.stages.infer import body_law

@@ -24,10 +24,9 @@ from polcap.formats.maps import maps_folder, png
 from polcap.formats.written import Written
 from polcap.images import Capture, ColorCalibration, Frame, Network, SensorImage, Shot
 from polcap.parallel import Beside, finished
-from polcap.pipeline import export as asset_export
-from polcap.pipeline import unchanged
+from polcap.pipeline import asset_export, unchanged
+from polcap.pipeline.asset_export import Wanted
 from polcap.pipeline.cache import Archive, Progress, Store, contents, seal, silent
-from polcap.pipeline.export import Wanted
 from polcap.pipeline.path import STAGES, Results, UserInput, path
 from polcap.remembered import Remembered
 from polcap.report import moving, page

@@ -26,8 +26,8 @@ from polcap.formats.export.presets import PRESETS, Preset
 from polcap.formats.maps import maps_folder
 from polcap.formats.raw import worker
 from polcap.images import Asset, Cues, Floats, Mesh, StokesImage, SurfaceMaps, View
-from polcap.pipeline import export as asset_export
-from polcap.pipeline.export import Wanted
+from polcap.pipeline import asset_export
+from polcap.pipeline.asset_export import Wanted
 from polcap.stages import asset, surface
 from tests import surfaces
 from tests.surfaces import Known

@@ -23,7 +23,7 @@ from tests.formats.export.test_gltf import NODE, document
 def exported(result: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The bundled capture's result with every preset exported."""
     from polcap.pipeline import run as pipeline
-    from polcap.pipeline.export import Wanted
+    from polcap.pipeline.asset_export import Wanted
 
     pytest.importorskip("pxr", reason="needs usd-core")
     copy = tmp_path_factory.mktemp("export") / "copy"
@@ -72,7 +72,7 @@ def test_unreal_gets_green_down_and_unity_smoothness(exported: Path) -> None:
 
 def test_an_asset_and_the_textures_beside_it_are_spelled_alike(result: Path, tmp_path: Path) -> None:
     from polcap.pipeline import run as pipeline
-    from polcap.pipeline.export import Wanted
+    from polcap.pipeline.asset_export import Wanted
 
     copy = tmp_path / "copy"
     shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work", "asset"))
@@ -140,7 +140,7 @@ def test_export_beside_the_asset_builds_nothing_and_gives_the_bytes_of_one_from_
     result: Path, tmp_path: Path, building: list[Any]
 ) -> None:
     from polcap.pipeline import run as pipeline
-    from polcap.pipeline.export import Wanted
+    from polcap.pipeline.asset_export import Wanted
 
     beside, alone = tmp_path / "beside", tmp_path / "alone"
     for copy, left in ((beside, ("work",)), (alone, ("work", "asset"))):
@@ -165,7 +165,7 @@ def test_asset_is_built_anew_once_something_else_stands_there(
     result: Path, tmp_path: Path, building: list[Any], touched: str
 ) -> None:
     from polcap.pipeline import run as pipeline
-    from polcap.pipeline.export import Wanted
+    from polcap.pipeline.asset_export import Wanted
 
     copy = tmp_path / "copy"
     shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
@@ -262,7 +262,7 @@ def test_number_of_threads_changes_no_byte(example: Path, tmp_path: Path) -> Non
 
 def test_texture_size_and_levels_of_detail(result: Path, tmp_path: Path) -> None:
     from polcap.pipeline import run as pipeline
-    from polcap.pipeline.export import Wanted
+    from polcap.pipeline.asset_export import Wanted
 
     copy = tmp_path / "copy"
     shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))

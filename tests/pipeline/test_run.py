@@ -252,7 +252,7 @@ def test_full_disk_is_one_clear_line_and_leaves_no_partial_file(example: Path, t
             subprocess.run(["umount", disk], check=True)
 
 
-@pytest.mark.parametrize("part", ["formats.exr.write", "report.page._pictures", "asset_export.export"])
+@pytest.mark.parametrize("part", ["formats.maps.exr.write", "report.page._pictures", "pipeline.asset_export.export"])
 def test_what_fails_beside_other_work_is_one_clear_line(
     result: Path, example: Path, polcap: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str
 ) -> None:
@@ -358,5 +358,6 @@ def test_the_gallery_shows_each_result_and_stands_alone(result: Path, tmp_path: 
 
 
 def test_a_start_loads_no_library_that_only_some_runs_need() -> None:
-    code = "import sys, polcap.pipeline.run, polcap.pipeline.check; print([m for m in ('scipy', 'onnxruntime') if m in sys.modules])"
+    loaded = "print([m for m in ('scipy', 'onnxruntime') if m in sys.modules])"
+    code = f"import sys, polcap.pipeline.run, polcap.pipeline.check; {loaded}"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

@@ -11,7 +11,7 @@ from polcap.config import Config
 from polcap.formats.capture import reader as captures
 from polcap.images import ChartRequest
 from polcap.pipeline import small_capture as reduced
-from polcap.pipeline import small_run as judge
+from polcap.pipeline import small_capture_run as judge
 from polcap.stages import whitebalance
 
 
