@@ -316,7 +316,7 @@ KILLED = """
 import sys, time
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from test_store import Store, path
+from test_cache import Store, path
 store = Store(Path(sys.argv[1]))
 print("ready", flush=True)
 with store.lock():
