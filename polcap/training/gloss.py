@@ -30,11 +30,11 @@ class Family:
 
 
 FAMILIES = {
-    "glossy": Family(0.27, (0.10, 0.35), 0.40),  # plastics, glazes, varnish
-    "satin": Family(0.28, (0.28, 0.60), 0.28),  # paints, leather, waxed wood
-    "matte": Family(0.28, (0.50, 0.95), 0.08),  # plaster, clay, paper, stone
+    "glossy": Family(0.25, (0.10, 0.35), 0.40),  # plastics, glazes, varnish
+    "satin": Family(0.27, (0.28, 0.60), 0.28),  # paints, leather, waxed wood
+    "matte": Family(0.27, (0.50, 0.95), 0.08),  # plaster, clay, paper, stone
     "brushed": Family(0.08, (0.25, 0.65), 0.30, grain=1.0),  # sanded, scratched, grained
-    "fibrous": Family(0.09, (0.65, 1.00), 0.00, kept=(0.3, 0.9), grain=1.0),  # cloth, felt, unsized paper
+    "fibrous": Family(0.08, (0.65, 1.00), 0.00, kept=(0.3, 0.9), grain=1.0),  # cloth, felt, unsized paper
     "dark gloss": Family(0.05, (0.05, 0.30), 0.00, dark=True),  # black plastic, lacquer, leather, dark glaze
 }
 _ALL_DARK = 0.10  # of objects that are dark gloss everywhere; the parts' share comes on top
