@@ -13,9 +13,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from polcap.quality import gates
 from polcap.config import Config
-from polcap.quality import Gate, geometry, light, polarization
+from polcap.quality import Gate, gates, geometry, light, polarization
 from polcap.quality import gate as gate_module
 from tests import scenes
 
