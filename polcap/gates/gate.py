@@ -39,6 +39,12 @@ class Gate(msgspec.Struct, frozen=True):
     shots: tuple[str, ...] = ()  # to be taken again, where single ones are to blame
     unit: Unit = "%"
 
+    def __post_init__(self) -> None:
+        """Turn NumPy scalars, with which the gates compute, into Python numbers: JSON knows no others."""
+        for name in ("value", "limit", "cost_deg"):
+            if isinstance(number := getattr(self, name), np.generic):
+                msgspec.structs.force_setattr(self, name, number.item())
+
 
 class Found(Protocol):
     """What the stages made of a capture, at full size or reduced; each is computed when asked for.

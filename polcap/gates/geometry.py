@@ -125,7 +125,7 @@ def mesh(of: Mesh, limits: Gates) -> Gate:
         _, value, limit, unit = faults[0]
         said = "; ".join(fault[0] for fault in faults)
         return Gate("mesh", "fail", round(value, 4), limit, said, "; ".join(remedies), unit=unit)
-    says = f"{of.pieces} piece{'s' * (of.pieces != 1)}, "
+    says = f"{of.pieces} {'piece' if of.pieces == 1 else 'pieces'}, "
     says += (
         f"cut along {of.cut_px:.0f} px where the normals fit better apart: behind a part, or at a slit where they err"
         if of.cut_px
