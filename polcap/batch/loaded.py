@@ -10,7 +10,10 @@ import scipy.special  # noqa: F401
 from polcap import models, pipeline, resource_limits  # noqa: F401
 from polcap.batch import thumbnail, unit  # noqa: F401
 from polcap.formats import capture, provenance  # noqa: F401
-from polcap.optics import body
+from polcap.optics import (
+    body,
+    colour_science,  # noqa: F401
+)
 
 body.make_tables()
 provenance.versions()

@@ -12,6 +12,7 @@ from polcap.formats import atomic, photo_bytes
 
 _PARTS = (
     "numpy", "scipy", "opencv-contrib-python-headless", "onnxruntime", "rawpy", "OpenImageIO", "trimesh",
+    "colour-science",
 )  # fmt: skip
 
 
