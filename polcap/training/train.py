@@ -156,7 +156,7 @@ def views(params: Params, preset: Preset) -> dict[str, Any]:
         for n, usual in ((params.views, preset.views), (params.procedural, preset.procedural))
     )
     recipe = gbuffers.Recipe(views=of_mesh, procedural=of_chance, size=preset.size, seed=13)
-    return gbuffers.cached(params.out / "views", meshes, recipe, mapped=False)  # random access to a map is slow
+    return gbuffers.cached(params.out / "views", meshes, recipe)
 
 
 def library(params: Params, split: str, device: torch.device) -> materials.Library:

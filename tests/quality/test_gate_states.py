@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from polcap.config import Config
-from polcap.quality import Gate, gates, geometry, light, polarization
 from polcap.quality import gate as gate_module
+from polcap.quality import gates, geometry, light, polarization
+from polcap.quality.gate import Gate
 from tests import scenes
 
 MODULES: tuple[ModuleType, ...] = (gates, gate_module, light, geometry, polarization)

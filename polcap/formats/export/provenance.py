@@ -13,6 +13,7 @@ from polcap.formats.raw import file_bytes
 
 _PARTS = (
     "numpy", "scipy", "opencv-contrib-python-headless", "onnxruntime", "rawpy", "OpenImageIO", "trimesh",
+    "colour-science",
 )  # fmt: skip
 
 
