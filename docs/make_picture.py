@@ -9,9 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from polcap import pictures, pipeline
 from polcap.formats import atomic
-from polcap.pictures import keys, moving
+from polcap.pipeline import run as pipeline
+from polcap.report import keys, moving
+from polcap.report import stage_pictures as pictures
 
 WIDTH, GAP = 400, 8  # px
 LIGHT = 6 / 48  # of the way round, from the left above

@@ -7,8 +7,8 @@ import json
 import sys
 from pathlib import Path
 
-from polcap import pipeline
-from polcap.asset_export import Wanted
+from polcap.pipeline import run as pipeline
+from polcap.pipeline.asset_export import Wanted
 
 result = Path(sys.argv[1])
 for wanted in (Wanted(preset="unreal"), Wanted(preset="web"), Wanted(formats=("exr",), color="ACEScg")):

@@ -6,8 +6,10 @@ from html import escape
 from os.path import relpath
 from pathlib import Path
 
-from polcap import pictures, pipeline, report
+from polcap import report
 from polcap.formats import html
+from polcap.pipeline import run as pipeline
+from polcap.report import stage_pictures as pictures
 from polcap.report.page import verdict
 
 page, *folders = map(Path, sys.argv[1:])

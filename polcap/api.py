@@ -7,12 +7,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap import models, pipeline
 from polcap.config import Config
-from polcap.formats import capture as captures
+from polcap.formats.capture import reader as captures
 from polcap.images import ChartRequest
-from polcap.path import AUTO, UserInput
-from polcap.store import Progress, silent
+from polcap.pipeline import models
+from polcap.pipeline import run as pipeline
+from polcap.pipeline.cache import Progress, silent
+from polcap.pipeline.path import AUTO, UserInput
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from msgspec import Meta
 
 from polcap.errors import SettingError, StorageError
 from polcap.formats import text_file
-from polcap.formats.stated import fault
+from polcap.formats.capture.stated import fault
 from polcap.stages.align import Settings as Align
 from polcap.stages.asset import Settings as Asset
 from polcap.stages.hdr import Settings as Hdr

@@ -119,7 +119,7 @@ def preview(drawn: "list[Path]") -> None:
     from rich.console import Console
     from rich.text import Text
 
-    from polcap.formats import png
+    from polcap.formats.maps import png
 
     console = Console(stderr=True)
     for file in drawn:

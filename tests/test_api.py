@@ -6,8 +6,8 @@ import sys
 import pytest
 
 import polcap
-from polcap import models
-from polcap.formats import maps
+from polcap.formats.maps import maps_folder as maps
+from polcap.pipeline import models
 
 
 def test_importing_polcap_imports_nothing_heavy() -> None:
@@ -19,7 +19,7 @@ def test_importing_polcap_imports_nothing_heavy() -> None:
 def test_importing_the_path_leaves_to_those_who_need_it_what_is_heavy() -> None:
     """OpenImageIO also because its binding tells of leaks where it is imported before `keep_imported`."""
     heavy = ("OpenImageIO", "scipy", "onnxruntime", "trimesh", "rawpy")
-    code = f"import sys, polcap.pipeline; print([m for m in {heavy} if m in sys.modules])"
+    code = f"import sys, polcap.pipeline.run; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from polcap import cli, pipeline
+from polcap import cli
 from polcap.cli import extras
-from polcap.path import STAGES
+from polcap.pipeline import run as pipeline
+from polcap.pipeline.path import STAGES
 from tests.conftest import Command, shell
 
 

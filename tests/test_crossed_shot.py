@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from polcap import check, gates
 from polcap.config import Config
 from polcap.errors import CaptureError
-from polcap.formats import capture as captures
-from polcap.formats import maps as maps_folder
+from polcap.formats.capture import reader as captures
+from polcap.formats.maps import maps_folder
 from polcap.images import Capture, ChartRequest, Quality
-from polcap.path import Results, UserInput, path
-from polcap.store import Store
+from polcap.pipeline import check
+from polcap.pipeline.cache import Store
+from polcap.pipeline.path import Results, UserInput, path
+from polcap.quality import gates
 from polcap.synth import shooting
 from polcap.synth.distance_fields import Cluster
 from polcap.synth.scene_materials import Coat, Material
@@ -95,7 +96,7 @@ def test_both_parts_of_the_light_are_written(
 ) -> None:
     written: dict[str, set[str]] = {}
     keep: Callable[..., None] = lambda file, channels, **_: written.update({file.name: set(channels)})  # noqa: E731
-    monkeypatch.setattr("polcap.formats.maps.exr.write", keep)
+    monkeypatch.setattr("polcap.formats.maps.maps_folder.exr.write", keep)
     found = results[1]
     maps_folder.write(tmp_path, found.maps, found.mesh, found.stokes, found.cues)
     assert {"scattered.R", "mirrored.B"} <= written["cues.exr"]

@@ -11,7 +11,8 @@ from polcap import doctor
 from polcap.doctor import Rig
 from polcap.doctor.finding import Finding
 from polcap.errors import DecodeError, HardwareError, ModelError, SettingError
-from polcap.formats import onnx, raw
+from polcap.formats import onnx
+from polcap.formats.raw import libraw as raw
 from tests.conftest import Command
 
 

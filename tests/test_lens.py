@@ -10,10 +10,10 @@ import pytest
 from polcap.calibration_values import Calibration, LensGeometry
 from polcap.config import Config
 from polcap.formats import calibrations
-from polcap.formats import capture as captures
+from polcap.formats.capture import reader as captures
 from polcap.images import ChartRequest
-from polcap.path import UserInput, path
-from polcap.store import Store
+from polcap.pipeline.cache import Store
+from polcap.pipeline.path import UserInput, path
 from polcap.synth import lens, scenes, shooting
 
 SHOOT = shooting.Shoot(

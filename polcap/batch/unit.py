@@ -20,7 +20,8 @@ import msgspec
 
 from polcap import __version__
 from polcap.errors import InputError, PolcapError, StorageError
-from polcap.formats import atomic, calibrations_folder, file_name, layouts
+from polcap.formats import atomic, calibrations_folder
+from polcap.formats.capture import file_name, layouts
 from polcap.images import ChartRequest, Network
 
 State = Literal["todo", "running", "interrupted", "done", "gates", "failed", "bug", "crashed"]
@@ -111,11 +112,11 @@ def run(unit: Unit, order: Order, attempt: int = 1) -> Record:
 
 
 def _process(unit: Unit, order: Order) -> dict[str, Any]:
-    from polcap import pipeline
     from polcap.batch import thumbnail
     from polcap.config import Config
-    from polcap.formats import capture as captures
-    from polcap.path import UserInput
+    from polcap.formats.capture import reader as captures
+    from polcap.pipeline import run as pipeline
+    from polcap.pipeline.path import UserInput
 
     config = msgspec.convert(order.settings, Config)
     supplied = UserInput(
@@ -133,7 +134,7 @@ def _process(unit: Unit, order: Order) -> dict[str, Any]:
 @lru_cache(maxsize=1)
 def _network(estimator: Any, model: str | None, device: Any, threads: int) -> Network | None:
     """Loaded once for all captures of a process."""
-    from polcap import models
+    from polcap.pipeline import models
 
     return models.load_network(estimator, None if model is None else Path(model), device, threads)
 
@@ -141,7 +142,7 @@ def _network(estimator: Any, model: str | None, device: Any, threads: int) -> Ne
 @lru_cache(maxsize=1)
 def _mask_network(threads: int) -> Network | None:
     """Loaded once, too."""
-    from polcap import models
+    from polcap.pipeline import models
 
     return models.load_mask_network(threads)
 

@@ -21,7 +21,7 @@ from polcap.calibrate import photon_transfer
 from polcap.calibrate.photographs import CLIP, Photograph, listed
 from polcap.calibration_values import NoiseLine
 from polcap.errors import CaptureError
-from polcap.formats import layouts
+from polcap.formats.capture import layouts
 from polcap.images import Floats
 from polcap.stages.hdr import exposure, noise, planes, registration
 from polcap.stages.hdr.planes import Signals

@@ -92,6 +92,6 @@ def _check_model(estimator: Literal["network", "analytic"] | None, model: Path |
 
     On the CPU: the machine that hands out the work may lack what its workers have.
     """
-    from polcap import models
+    from polcap.pipeline import models
 
     models.load_network(estimator, model, "cpu", 1)

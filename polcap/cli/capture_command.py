@@ -67,10 +67,10 @@ def capture(
 
 def _verdict(folder: Path) -> dict[str, Any] | None:
     """What `polcap check` says of a capture, on stderr too; None where it cannot be judged."""
-    from polcap import check as checks
-    from polcap import models
     from polcap.config import Config
-    from polcap.formats import capture as captures
+    from polcap.formats.capture import reader as captures
+    from polcap.pipeline import check as checks
+    from polcap.pipeline import models
 
     try:
         verdict = checks.inspect(captures.read(folder), models.shipped, Config())

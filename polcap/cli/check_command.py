@@ -29,13 +29,13 @@ def check(
     from concurrent.futures import ThreadPoolExecutor
 
     resource_limits.keep_pages()
-    from polcap.formats import capture as captures
+    from polcap.formats.capture import reader as captures
 
     with ThreadPoolExecutor(2) as beside:  # headers are read while all else is imported
         found = beside.submit(captures.read, capture, options.angles_deg(angles))
-        from polcap import check as checks
         from polcap import config as settings
-        from polcap import models
+        from polcap.pipeline import check as checks
+        from polcap.pipeline import models
 
         networks = beside.submit(models.shipped)
         chosen, request = settings.load(config, assignments or ()), options.chart_request(chart, no_chart)

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
     from polcap.config import Config
-    from polcap.formats.probed import Probed
+    from polcap.formats.raw.probed import Probed
     from polcap.images import Capture, ChartRequest
-    from polcap.path import UserInput
-    from polcap.unchanged import Finished
+    from polcap.pipeline.path import UserInput
+    from polcap.pipeline.unchanged import Finished
 
 
 def process(
@@ -55,7 +55,7 @@ def process(
     """Turn a capture into maps and a 3-D asset."""
     from concurrent.futures import ThreadPoolExecutor
 
-    from polcap import unchanged
+    from polcap.pipeline import unchanged
 
     target = out or capture / "polcap"
     request = None if until or force or dry_run or watch else _request(context.params, capture, target)
@@ -78,8 +78,8 @@ def process(
             beside.submit(user_input)
         beside.shutdown(wait=False)
         from polcap import config as settings
-        from polcap import pipeline  # noqa: F401 — it is needed soon
-        from polcap.path import STAGES
+        from polcap.pipeline import run as pipeline  # noqa: F401 — it is needed soon
+        from polcap.pipeline.path import STAGES
 
     resource_limits.set_memory(memory)
     for flag, stage in (("--until", until), ("--force", force)):
@@ -126,8 +126,9 @@ class _Run:
 
     def plan(self) -> None:
         """Print what was understood and what would be computed."""
-        from polcap import pipeline, report
-        from polcap.formats import capture as captures
+        from polcap import report
+        from polcap.formats.capture import reader as captures
+        from polcap.pipeline import run as pipeline
 
         config, found = self.settings(), self.understood()
         stages = pipeline.plan(found, self.user_input(), config, self.target, self.force)
@@ -143,9 +144,10 @@ class _Run:
 
     def process(self) -> None:
         """Write the result folder; say where, and what its gates judge."""
-        from polcap import pipeline, unchanged
-        from polcap.formats import capture as captures
-        from polcap.path import STAGES
+        from polcap.formats.capture import reader as captures
+        from polcap.pipeline import run as pipeline
+        from polcap.pipeline import unchanged
+        from polcap.pipeline.path import STAGES
 
         config, supplied = self.settings(), self.user_input()
         found = self.understood()
@@ -163,15 +165,15 @@ class _Run:
 
 
 def _look(target: Path, anew: bool) -> "Probed":
-    from polcap import unchanged
-    from polcap.formats.probed import Probed
+    from polcap.formats.raw.probed import Probed
+    from polcap.pipeline import unchanged
 
     program = None if anew else unchanged.known_program()
     return Probed() if program is None else Probed(target / "work" / "photographs.json", program)
 
 
 def _understood(folder: Path, angles_deg: tuple[float, ...] | None, look: "Callable[[], Probed]") -> "Capture":
-    from polcap.formats import capture as captures
+    from polcap.formats.capture import reader as captures
 
     return captures.read(folder, angles_deg, look())
 
@@ -184,8 +186,8 @@ def _user_input(
     device: Literal["cpu", "cuda", "auto"],
     threads: int,
 ) -> "UserInput":
-    from polcap import models
-    from polcap.path import UserInput
+    from polcap.pipeline import models
+    from polcap.pipeline.path import UserInput
 
     return UserInput(
         chart=chart,
@@ -197,8 +199,8 @@ def _user_input(
 
 def _request(given: dict[str, Any], capture: Path, out: Path) -> str | None:
     """What identifies a run: its options and the state of all files that it reads."""
-    from polcap import unchanged
     from polcap.formats import calibrations_folder
+    from polcap.pipeline import unchanged
 
     aside = ("capture", "out", "json", "dry_run", "watch", "threads", "memory")  # they change no byte of a result
     files = [given[name] for name in ("config", "mask", "model") if given[name] is not None]
@@ -230,7 +232,7 @@ def _whenever_settled(capture: Path, target: Path, edited: Sequence[Path], once:
 
     What is wrong with it is said, and it is looked at further.
     """
-    from polcap.formats import arrivals
+    from polcap.formats.capture import arrivals
 
     if not capture.is_dir():
         raise SettingError(f"{capture} is no folder; --watch needs the one that the photographs go to")

@@ -7,7 +7,8 @@ import numpy as np
 
 from polcap.doctor.finding import Finding
 from polcap.errors import DecodeError
-from polcap.formats import focal, photo, probe, raw
+from polcap.formats.raw import focal, photo, probe
+from polcap.formats.raw import libraw as raw
 from polcap.images import Exif, SensorImage
 from polcap.optics import sensor
 from polcap.stages import hdr

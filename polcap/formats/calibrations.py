@@ -10,7 +10,8 @@ import tomli_w
 
 from polcap.calibration_values import Calibration, LensGeometry, Polarizer
 from polcap.errors import CaptureError
-from polcap.formats import atomic, calibrations_folder, file_name, text_file
+from polcap.formats import atomic, calibrations_folder, text_file
+from polcap.formats.capture import file_name
 from polcap.images import Distortion, Exif
 from polcap.optics import distortion
 

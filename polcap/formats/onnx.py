@@ -26,7 +26,8 @@ import numpy as np
 
 from polcap import parallel
 from polcap.errors import DecodeError, ModelError
-from polcap.formats import calib, onnx_metadata, text_file, worker
+from polcap.formats import calib, onnx_metadata, text_file
+from polcap.formats.raw import worker
 from polcap.images import Floats, Network
 
 ENCODING = "1"

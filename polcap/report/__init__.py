@@ -14,12 +14,12 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from polcap import __version__, gates, parallel
+from polcap import __version__, parallel
 from polcap.config import Config
 from polcap.errors import StorageError
-from polcap.formats import atomic, provenance, text_file
-from polcap.formats import maps as maps_folder
-from polcap.gates.gate import Gate
+from polcap.formats import atomic, text_file
+from polcap.formats.export import provenance
+from polcap.formats.maps import maps_folder
 from polcap.images import (
     Capture,
     Floats,
@@ -28,7 +28,9 @@ from polcap.images import (
     Quality,
     StokesImage,
 )
-from polcap.path import Results
+from polcap.pipeline.path import Results
+from polcap.quality import gates
+from polcap.quality.gate import Gate
 from polcap.remembered import Remembered
 from polcap.report import labels, page, shown
 from polcap.report.whole import Whole

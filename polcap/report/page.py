@@ -9,14 +9,14 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap import pictures
 from polcap.formats import calib, html
 from polcap.optics.color import srgb_eight_bits
-from polcap.path import Results
-from polcap.pictures import keys
-from polcap.pictures.keys import Palette
+from polcap.pipeline.path import Results
 from polcap.remembered import Remembered
-from polcap.report import labels, lean, map_figures, plots, shown
+from polcap.report import keys, labels, map_figures, plots, shown
+from polcap.report import mesh_preview as lean
+from polcap.report import stage_pictures as pictures
+from polcap.report.keys import Palette
 
 _LONGEST = 1024  # px of a map on the page
 _WIDEST = 1000  # px of a picture of what was photographed

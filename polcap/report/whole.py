@@ -7,7 +7,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from polcap.gates.gate import Found
 from polcap.images import (
     Alignment,
     AngleStack,
@@ -20,9 +19,10 @@ from polcap.images import (
     StokesImage,
     SurfaceMaps,
 )
-from polcap.path import Results
+from polcap.pipeline.cache import StageResult
+from polcap.pipeline.path import Results
+from polcap.quality.gate import Found
 from polcap.remembered import Remembered
-from polcap.store import StageResult
 
 T = TypeVar("T")
 

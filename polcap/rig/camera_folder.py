@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from polcap.errors import DecodeError, HardwareError, SettingError
-from polcap.formats import probe
+from polcap.formats.raw import probe
 from polcap.images import Role
 from polcap.rig.camera import Exposure, Shot
 from polcap.rig.log import Log

@@ -13,7 +13,8 @@ import msgspec
 import numpy as np
 
 from polcap.errors import DecodeError
-from polcap.formats import probe, raw, sniff, worker
+from polcap.formats.raw import libraw as raw
+from polcap.formats.raw import probe, sniff, worker
 from polcap.images import Exif, Floats
 from polcap.rig.camera import Exposure
 

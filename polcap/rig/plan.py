@@ -8,7 +8,7 @@ from urllib.parse import parse_qsl
 import msgspec
 
 from polcap.errors import SettingError
-from polcap.formats import layouts
+from polcap.formats.capture import layouts
 from polcap.images import Role
 from polcap.rig.camera import Exposure, by_iso, by_shutter
 

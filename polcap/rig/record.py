@@ -13,7 +13,9 @@ import msgspec
 import tomli_w
 
 from polcap.errors import CaptureError
-from polcap.formats import atomic, capture_toml, photo_bytes
+from polcap.formats import atomic
+from polcap.formats.capture import capture_toml
+from polcap.formats.raw import photo_bytes
 from polcap.images import Role
 from polcap.rig import frame_check
 from polcap.rig.camera import Exposure

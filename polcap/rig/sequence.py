@@ -18,8 +18,9 @@ import msgspec
 from filelock import FileLock, Timeout
 
 from polcap.errors import CaptureError, PolcapError, SettingError, StorageError
-from polcap.formats import atomic, layouts
-from polcap.formats import capture as captures
+from polcap.formats import atomic
+from polcap.formats.capture import layouts
+from polcap.formats.capture import reader as captures
 from polcap.rig import camera_choice, frame_check, manual, plan, preview, record, rotator
 from polcap.rig.camera import Camera, Exposure, Shot
 from polcap.rig.landing import AHEAD, Landing

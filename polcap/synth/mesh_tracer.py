@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import InputError
-from polcap.formats import mesh as files
+from polcap.formats.export import mesh as files
 from polcap.images import Floats, GBuffer, View
 from polcap.optics import frames
 

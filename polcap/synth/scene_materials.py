@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 
-from polcap.formats import textures
+from polcap.formats.maps import textures
 from polcap.images import Floats
 from polcap.optics import fresnel
 

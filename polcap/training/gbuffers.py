@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from polcap.errors import InputError
 from polcap.formats import atomic
-from polcap.formats import mesh as mesh_files
+from polcap.formats.export import mesh as mesh_files
 from polcap.images import Floats, GBuffer, View
 from polcap.synth.mesh_tracer import Tracer, Triangles, smooth
 from polcap.training import bounce, light_transport, shapes

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from polcap.formats import textures
+from polcap.formats.maps import textures
 from polcap.optics.body import SMOOTH, Law
 from polcap.training import gloss
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from polcap.errors import InputError
-from polcap.formats import textures
+from polcap.formats.maps import textures
 from polcap.images import Floats
 
 TEXTURES, PATTERNS = 10, 20

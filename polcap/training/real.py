@@ -18,14 +18,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap import models
 from polcap.config import Config
 from polcap.errors import InputError
-from polcap.formats import atomic, png
-from polcap.formats import capture as captures
+from polcap.formats import atomic
+from polcap.formats.capture import reader as captures
+from polcap.formats.maps import png
 from polcap.images import ChartRequest, Cues, Floats, Network
-from polcap.path import UserInput, path
-from polcap.store import Store
+from polcap.pipeline import models
+from polcap.pipeline.cache import Store
+from polcap.pipeline.path import UserInput, path
 
 _MISSED_DEG = 90.0  # what an object's pixel without a normal counts as
 _LIMITS_DEG = (11.25, 22.5, 30.0)

@@ -15,14 +15,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from polcap import models
 from polcap.config import Config
-from polcap.formats import capture as captures
+from polcap.formats.capture import reader as captures
 from polcap.images import Capture, Floats, Network
 from polcap.optics import body, frames, fresnel
-from polcap.path import Results, UserInput, distance_m, path
+from polcap.pipeline import models
+from polcap.pipeline.cache import Store
+from polcap.pipeline.path import Results, UserInput, distance_m, path
 from polcap.stages import cues, infer, surface
-from polcap.store import Store
 
 COLUMNS = (
     "capture", "normal mean", "median", "chart px", "align px", "gain %", "ratio %",

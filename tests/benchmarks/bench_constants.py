@@ -18,10 +18,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from polcap import models, pipeline
 from polcap.config import Config
 from polcap.images import Floats, Network
-from polcap.path import Results
+from polcap.pipeline import models
+from polcap.pipeline import run as pipeline
+from polcap.pipeline.path import Results
 from polcap.stages import align, infer, selfcal
 from polcap.stages.infer import analytic, azimuth, body_law, learned
 from polcap.stages.selfcal import object_gains

@@ -18,12 +18,12 @@ import cv2
 import numpy as np
 from msgspec import structs
 
-from polcap import models
 from polcap.config import Config
-from polcap.formats import capture as captures
+from polcap.formats.capture import reader as captures
 from polcap.images import Capture, ChartRequest, Floats, Network, Quality
-from polcap.path import Results, UserInput, path
-from polcap.store import Store
+from polcap.pipeline import models
+from polcap.pipeline.cache import Store
+from polcap.pipeline.path import Results, UserInput, path
 from polcap.synth import scenes, shooting
 
 NAMES = ("clipped", "without", "with", "gloss without", "gloss with", "elsewhere without", "elsewhere with")

@@ -18,13 +18,13 @@ import cv2
 import msgspec
 import numpy as np
 
-from polcap import models
 from polcap.config import Config
-from polcap.formats import capture as captures
+from polcap.formats.capture import reader as captures
 from polcap.images import ColorCalibration, Floats, Network, StokesImage
-from polcap.path import UserInput, path
+from polcap.pipeline import models
+from polcap.pipeline.cache import Store
+from polcap.pipeline.path import UserInput, path
 from polcap.stages import cues, infer
-from polcap.store import Store
 from polcap.synth import scenes
 from polcap.synth import shooting as synthetic
 from polcap.synth.forward_camera import Sensor

@@ -19,14 +19,15 @@ import cv2
 import msgspec
 import numpy as np
 
-from polcap import asset_export
-from polcap.asset_export import Wanted
 from polcap.config import Config
-from polcap.formats import exr_layers, gltf, ocio, texture_set, worker
-from polcap.formats import maps as maps_folder
-from polcap.formats.encoders import Encoder
-from polcap.formats.presets import PRESETS, Preset
+from polcap.formats.export import exr_layers, gltf, ocio, texture_set
+from polcap.formats.export.encoders import Encoder
+from polcap.formats.export.presets import PRESETS, Preset
+from polcap.formats.maps import maps_folder
+from polcap.formats.raw import worker
 from polcap.images import Asset, Cues, Floats, Mesh, StokesImage, SurfaceMaps, View
+from polcap.pipeline import asset_export
+from polcap.pipeline.asset_export import Wanted
 from polcap.stages import asset, surface
 from tests import surfaces
 from tests.surfaces import Known

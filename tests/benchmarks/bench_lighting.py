@@ -22,12 +22,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap import models
 from polcap.config import Gates
-from polcap.formats import png
-from polcap.gates import polarization
+from polcap.formats.maps import png
 from polcap.images import AngleStack, Floats, Network, ObjectMask
 from polcap.optics import fresnel, mueller
+from polcap.pipeline import models
+from polcap.quality import polarization
 from polcap.stages import cues, infer, stokes
 from polcap.synth import scene_materials
 from polcap.synth.render import Seen

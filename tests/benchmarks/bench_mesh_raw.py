@@ -23,14 +23,14 @@ import msgspec
 import numpy as np
 from bench_mesh import Case, cut_share, error, slits, true_links, true_pieces
 
-from polcap import models
 from polcap.config import Config
-from polcap.formats import capture as captures
+from polcap.formats.capture import reader as captures
 from polcap.images import SurfaceMaps
 from polcap.optics.frames import dot
-from polcap.path import UserInput, distance_m, path
+from polcap.pipeline import models
+from polcap.pipeline.cache import Store
+from polcap.pipeline.path import UserInput, distance_m, path
 from polcap.stages import surface
-from polcap.store import Store
 from polcap.synth import render, scenes, shooting
 
 SHOOTS = {

@@ -15,15 +15,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from polcap import models
 from polcap.config import Config
-from polcap.formats import capture as captures
-from polcap.formats import png
+from polcap.formats.capture import reader as captures
+from polcap.formats.maps import png
 from polcap.images import AngleStack, ChartRequest, Floats
 from polcap.optics import mueller
-from polcap.path import UserInput, path
+from polcap.pipeline import models
+from polcap.pipeline.cache import Store
+from polcap.pipeline.path import UserInput, path
 from polcap.stages import hdr
-from polcap.store import Store
 
 
 def main() -> None:

@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from polcap import pipeline
 from polcap.config import Config
-from polcap.formats import capture as captures
+from polcap.formats.capture import reader as captures
 from polcap.images import ChartRequest
-from polcap.path import UserInput
+from polcap.pipeline import run as pipeline
+from polcap.pipeline.path import UserInput
 from tests.rig import faults
 from tests.rig import pool as pools
 

@@ -14,7 +14,7 @@ from unittest import mock
 
 import numpy as np
 
-from polcap.formats import dng
+from polcap.formats.raw import dng
 from polcap.images import Exif, Role
 from polcap.rig import sequence
 from polcap.rig.camera import Exposure, Shot

@@ -30,13 +30,14 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from plant_captures import FAULTS, shoot
 
-from polcap import check, gates, models, path
 from polcap.config import Config
 from polcap.errors import InputError
-from polcap.formats import capture as captures
+from polcap.formats.capture import reader as captures
 from polcap.images import Capture, ChartRequest, Frame, Network, SurfaceMaps
+from polcap.pipeline import check, models, path
+from polcap.pipeline.cache import Store
+from polcap.quality import gates
 from polcap.report.whole import Whole
-from polcap.store import Store
 
 Row = dict[str, Any]
 

@@ -20,7 +20,8 @@ import numpy as np
 import plastic
 import trimesh
 
-from polcap.formats import atomic, textures
+from polcap.formats import atomic
+from polcap.formats.maps import textures
 from polcap.images import Floats, View
 from polcap.optics import fresnel
 from polcap.synth import render, scene_materials

@@ -33,8 +33,10 @@ from onnx import TensorProto, helper
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from polcap.errors import InputError
-from polcap.formats import exr, photo, plausible, png, probe, raw, worker
 from polcap.formats import onnx as models
+from polcap.formats.maps import exr, png
+from polcap.formats.raw import libraw as raw
+from polcap.formats.raw import photo, plausible, probe, worker
 from tests.campaigns.mutations import mutated
 from tests.campaigns.rows import Rows, processor_s
 from tests.formats import headers

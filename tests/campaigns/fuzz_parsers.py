@@ -39,18 +39,10 @@ from polcap.calibration_values import (
     Polarizer,
 )
 from polcap.errors import PolcapError
-from polcap.formats import (
-    calib,
-    calibrations,
-    capture_toml,
-    exif,
-    file_name,
-    maps,
-    npy_folder,
-    plausible,
-    sniff,
-    text_file,
-)
+from polcap.formats import calib, calibrations, npy_folder, text_file
+from polcap.formats.capture import capture_toml, file_name
+from polcap.formats.maps import maps_folder as maps
+from polcap.formats.raw import exif, plausible, sniff
 from polcap.images import ColorCalibration, Exif, StokesImage, View
 from polcap.rig import camera, elliptec, grbl, line_protocol, serial_port
 from polcap.rig.log import Log

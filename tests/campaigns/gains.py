@@ -15,9 +15,9 @@ import numpy as np
 from polcap.config import Gates
 from polcap.errors import ChartError
 from polcap.formats import calib
-from polcap.gates import light
 from polcap.images import AngleStack, ColorCalibration
-from polcap.path import AUTO
+from polcap.pipeline.path import AUTO
+from polcap.quality import light
 from polcap.stages import selfcal, whitebalance
 from polcap.stages.selfcal import integrability, object_gains, order
 from tests import scenes

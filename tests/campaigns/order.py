@@ -16,15 +16,15 @@ from pathlib import Path
 
 import numpy as np
 
-from polcap import models
 from polcap.config import Config
 from polcap.errors import CaptureError, InputError
-from polcap.formats import capture as captures
+from polcap.formats.capture import reader as captures
 from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, ObjectMask
-from polcap.path import UserInput, path
+from polcap.pipeline import models
+from polcap.pipeline.cache import Store
+from polcap.pipeline.path import UserInput, path
 from polcap.stages import selfcal
 from polcap.stages.selfcal import order
-from polcap.store import Store
 from polcap.synth import scenes as random_scenes
 from polcap.synth import shooting
 from tests import scenes

@@ -18,14 +18,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from polcap import models
 from polcap.config import Config
 from polcap.errors import InputError
-from polcap.formats import capture as captures
+from polcap.formats.capture import reader as captures
 from polcap.images import Gains
-from polcap.path import UserInput, path
+from polcap.pipeline import models
+from polcap.pipeline.cache import Store
+from polcap.pipeline.path import UserInput, path
 from polcap.stages import selfcal
-from polcap.store import Store
 from polcap.synth import scenes as random_scenes
 from polcap.synth import shooting
 from tests import scenes

@@ -12,8 +12,8 @@ import msgspec
 import numpy as np
 
 from polcap.errors import HardwareError
-from polcap.formats import dng
-from polcap.formats.photo_bytes import digest
+from polcap.formats.raw import dng
+from polcap.formats.raw.photo_bytes import digest
 from polcap.images import Exif, Role
 from polcap.rig import watchdog
 from polcap.rig.camera import Exposure, Shot

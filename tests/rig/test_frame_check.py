@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from polcap.errors import DecodeError
-from polcap.formats import dng, raw
+from polcap.formats.raw import dng
+from polcap.formats.raw import libraw as raw
 from polcap.images import Exif
 from polcap.rig import frame_check
 from polcap.rig.camera import Exposure

@@ -12,7 +12,7 @@ import msgspec
 import pytest
 
 from polcap.errors import CaptureError, HardwareError, SettingError, StorageError
-from polcap.formats import capture as captures
+from polcap.formats.capture import reader as captures
 from polcap.images import Role
 from polcap.rig import plan, record, sequence
 from polcap.rig.camera import Exposure, Shot, by_iso, nearest, parse_bracket

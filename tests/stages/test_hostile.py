@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from polcap import gates
 from polcap.config import Config
 from polcap.errors import InputError
 from polcap.images import AngleStack, Quality, View
+from polcap.quality import gates
 from polcap.stages import align, asset, cues, infer, mask, selfcal, stokes, surface
 from tests import scenes
 

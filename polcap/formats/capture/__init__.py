@@ -1,0 +1,1 @@
+"""Folders of photographs: layouts, stated facts, arrivals."""

@@ -1,0 +1,1 @@
+"""Photographs: RAW files and finished pictures, decoded in a child process."""
