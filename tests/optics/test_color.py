@@ -1,5 +1,11 @@
 """Colour against the standard's own numbers, published colour-difference pairs and charts of known light."""
 
+import json
+import re
+import shutil
+import subprocess
+from importlib import resources
+
 import numpy as np
 import pytest
 
@@ -105,3 +111,12 @@ def test_eight_bits_of_srgb_are_those_of_the_curve() -> None:
     linear = np.concatenate([np.linspace(0, 1, 20_001), [-0.5, 1.5, np.nan]])
     exact = 255 * color.encode_srgb(np.clip(np.nan_to_num(linear), 0, 1))
     assert np.abs(color.srgb_eight_bits(linear) - exact).max() <= 0.53
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
+def test_report_decodes_srgb_by_the_same_curve() -> None:
+    script = (resources.files("polcap") / "formats/html/probe.js").read_text()
+    function = re.search(r"^function linear.*?^}", script, re.MULTILINE | re.DOTALL)
+    code = f"{function.group()}; console.log(JSON.stringify([...Array(256).keys()].map(linear)))"
+    done = subprocess.run(["node", "-e", code], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == pytest.approx(color.decode_srgb(np.arange(256) / 255), rel=1e-12)
