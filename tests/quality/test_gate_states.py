@@ -13,10 +13,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from polcap.quality import gates
 from polcap.config import Config
-from polcap.quality import Gate, geometry, light, polarization
 from polcap.quality import gate as gate_module
+from polcap.quality import gates, geometry, light, polarization
+from polcap.quality.gate import Gate
 from tests import scenes
 
 MODULES: tuple[ModuleType, ...] = (gates, gate_module, light, geometry, polarization)
