@@ -212,7 +212,7 @@ def _refine(
     """From a first guess on the coarsest of some scales to the full size; with it the number of tiles that agree."""
     sigma, agree = np.inf, 0.0
     points: Floats = np.zeros((0, 2))
-    covariance = np.zeros((2, 2))
+    covariance: Floats = np.zeros((2, 2))
     for level in range(scales - 1, -1, -1):
         a, b, tiles = reference[level], other[level], reference.tiles(level)
         points = np.zeros((0, 2))
