@@ -19,7 +19,7 @@ from polcap.calibrate.photographs import Photograph
 from polcap.calibration_values import LensGeometry
 from polcap.errors import CaptureError, ChartError
 from polcap.formats import calib
-from polcap.images import AngleStack, ChartRequest, Distortion, Floats, SensorImage, View
+from polcap.images import AngleStack, ChartRequest, ColorSensor, Distortion, Floats, SensorImage, View, single_frames
 from polcap.optics import distortion, sensor
 from polcap.stages import whitebalance
 from polcap.stages.whitebalance import chart
@@ -219,12 +219,8 @@ def _as_stack(value: Floats, image: SensorImage) -> AngleStack:
         quality=np.zeros((1, height, width), np.uint8),
         angle=np.zeros(1),
         view=View(1.4 * width, ((width - 1) / 2, (height - 1) / 2), float(image.superpixel)),
-        exposure_ratio=np.ones((1, 1, 3)),
-        exif_ratio=np.ones((1, 1)),
-        ghost_fraction=np.zeros(1),
-        lossy=False,
-        camera_matrix=image.camera_matrix,
-        white_balance=image.white_balance,
+        bracket=single_frames(1),
+        sensor=ColorSensor(image.camera_matrix, image.white_balance),
     )
 
 

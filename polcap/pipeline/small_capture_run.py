@@ -59,7 +59,7 @@ class Reduced:
     def radiance(self) -> AngleStack:
         motion = max(self.config.hdr.max_motion_px / self.taken.step, 1.0)
         merged = hdr.merge(self.taken.capture, msgspec.structs.replace(self.config.hdr, max_motion_px=motion))
-        return replace(merged, blur_px=self.taken.blur_px)
+        return replace(merged, bracket=replace(merged.bracket, blur_px=self.taken.blur_px))
 
     @cached_property
     def _color(self) -> tuple[ColorCalibration, str]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from polcap.config import Config
-from polcap.images import SurfaceMaps
+from polcap.images import AngleStack, Equipment, SurfaceMaps
 from polcap.quality import gates
 from polcap.quality.gates import Gate
 from polcap.stages import selfcal, stokes
@@ -58,6 +58,11 @@ def changed(good: SimpleNamespace, **fields: Any) -> SimpleNamespace:
     return scenes.Found(**{**vars(good), **fields})
 
 
+def bracket(radiance: AngleStack, **measured: Any) -> AngleStack:
+    """A stack of shots whose brackets measured something else."""
+    return replace(radiance, bracket=replace(radiance.bracket, **measured))
+
+
 def test_each_gate_fails_alone(good: SimpleNamespace) -> None:
     radiance, gains, maps = good.radiance, good.gains, good.maps
     still = good.alignment
@@ -66,12 +71,12 @@ def test_each_gate_fails_alone(good: SimpleNamespace) -> None:
     curved = np.array([[0.0, -0.2]] * 3)
     pairs = {"exposure_ratio": np.tile([[[1.0], [4.0]]], (3, 1, 3)), "exif_ratio": np.array([[1.0, 4.0]] * 3)}
     faults = {
-        "tone curve": {"radiance": replace(radiance, curvature=curved, **pairs)},
-        "stillness": {"radiance": replace(radiance, ghost_fraction=np.array([0.0, 0.05, 0.0]))},
-        "ambient": {"radiance": replace(radiance, ambient_share=np.array([0.2, 0.2, 0.2]))},
+        "tone curve": {"radiance": bracket(radiance, curvature=curved, **pairs)},
+        "stillness": {"radiance": bracket(radiance, ghost_fraction=np.array([0.0, 0.05, 0.0]))},
+        "ambient": {"radiance": bracket(radiance, ambient_share=np.array([0.2, 0.2, 0.2]))},
         "alignment": {"alignment": replace(still, transform=away)},
         "clipping": {"clipped": np.array([0.0, 0.03, 0.0])},
-        "sharpness": {"radiance": replace(radiance, blur_px=np.array([[0.0], [2.0], [0.1]]))},
+        "sharpness": {"radiance": bracket(radiance, blur_px=np.array([[0.0], [2.0], [0.1]]))},
         "gains": {"gains": replace(gains, gain=np.array([[1.0] * 3, [1.0] * 3, [0.7] * 3]))},
         "gain doubt": {"gains": replace(gains, disagreement=0.05)},
         "normal error": {"maps": replace(maps, confidence=np.full_like(maps.confidence, 25.0))},
@@ -99,7 +104,8 @@ def test_what_follows_a_wrong_order_is_not_judged(good: SimpleNamespace) -> None
 
 def test_flash_bracketed_by_the_shutter_is_named(good: SimpleNamespace) -> None:
     alike = np.tile([[[1.0], [1.01], [0.99]]], (3, 1, 3))
-    radiance = replace(good.radiance, exposure_ratio=alike, exif_ratio=np.array([[0.25, 1, 4]] * 3), light="flash")
+    radiance = bracket(good.radiance, exposure_ratio=alike, exif_ratio=np.array([[0.25, 1, 4]] * 3))
+    radiance = replace(radiance, equipment=Equipment("flash"))
     gate = judged(changed(good, radiance=radiance))["exposures"]
     assert gate.state == "warn"
     assert "flash power, aperture or ISO" in gate.remedy
