@@ -7,11 +7,9 @@ onnxruntime, whose import starts one, is left to each worker.
 import scipy.sparse.linalg
 import scipy.special  # noqa: F401
 
-from polcap import resource_limits
 from polcap.batch import thumbnail, unit  # noqa: F401
 from polcap.formats.export import provenance
 from polcap.optics import body
 
 body.make_tables()
 provenance.versions()
-resource_limits.keep_imported()  # a look for garbage writes to, and so copies, what workers share
