@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections.abc import Callable
 from functools import partial
 
 import pytest
@@ -47,8 +48,9 @@ def test_after_ctrl_c_no_further_call_begins() -> None:
         done.append(n)
         time.sleep(0.2)
 
+    calls: list[Callable[[], None]] = [partial(slow, n) for n in range(40)]
     with pytest.raises(KeyboardInterrupt):
-        parallel.results((interrupted, *(partial(slow, n) for n in range(40))), 2)
+        parallel.results([interrupted, *calls], 2)
     assert len(done) < 5
 
 

@@ -8,8 +8,10 @@ import scipy.sparse.linalg
 import scipy.special  # noqa: F401
 
 from polcap.batch import thumbnail, unit  # noqa: F401
+from polcap.formats.capture import reader  # noqa: F401
 from polcap.formats.export import provenance
 from polcap.optics import body
+from polcap.pipeline import models, run  # noqa: F401
 
 body.make_tables()
 provenance.versions()

@@ -20,7 +20,7 @@ import msgspec
 
 from polcap.errors import InputError, PolcapError, StorageError
 from polcap.formats import atomic
-from polcap.formats.capture import file_name, own_folders
+from polcap.formats.capture import own_folders
 from polcap.images import ChartRequest, Network
 from polcap.pipeline import unchanged
 from polcap.pipeline.cache import fingerprint
@@ -44,7 +44,7 @@ class Unit:
     def slug(self) -> str:
         """A file name of its own for every capture."""
         digest = hashlib.blake2b(os.fsencode(self.name), digest_size=4).hexdigest()  # names of folders are bytes
-        return f"{file_name.safe(Path(self.capture).name)}-{digest}"
+        return f"{atomic.safe_name(Path(self.capture).name)}-{digest}"
 
     @property
     def record_file(self) -> Path:

@@ -14,8 +14,7 @@ from polcap import parallel
 from polcap.config import Config
 from polcap.errors import SettingError
 from polcap.formats import atomic
-from polcap.formats.capture import file_name
-from polcap.formats.export import exr_layers, gltf, materialx, obj, ocio, provenance, texture_set, usd
+from polcap.formats.export import exr_layers, gltf, materialx, obj, provenance, texture_set, usd
 from polcap.formats.export.encoders import Encoder, Kind
 from polcap.formats.export.presets import PRESETS, Format, Preset
 from polcap.formats.export.texture_set import Key, Texture
@@ -33,7 +32,7 @@ class ExportRequest:
     formats: tuple[Format, ...] = ("gltf", "obj")
     preset: str | None = None
     images: Kind | None = None  # inside the GLB; by default the preset's, or PNG
-    color: str = ocio.INSIDE  # color space or role of the colors in the layered EXR
+    color: str = exr_layers.LINEAR_REC709  # color space or role of the colors in the layered EXR
     texture_size: int | None = None  # px of the longer side; by default the maps'
     lod: int = 0  # further GLBs, each in a quarter of the triangles of the one before
 
@@ -96,7 +95,7 @@ def write(
         A file cannot be written.
     """
     preset = _preset(wanted)
-    name = file_name.safe(str(about["capture"].get("name")))  # whatever the report says, files stay in the folder
+    name = atomic.safe_name(str(about["capture"].get("name")))  # whatever the report says, files stay in the folder
     export = _Export(
         folder=out / "asset" / (wanted.preset or ""),
         maps=out / "maps",

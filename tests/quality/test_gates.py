@@ -72,8 +72,8 @@ def test_each_gate_fails_alone(good: Evidence) -> None:
     away = still.transform.copy()
     away[1, 0, 2] = 50
     curved = np.array([[0.0, -0.2]] * 3)
-    pairs = {"exposure_ratio": np.tile([[[1.0], [4.0]]], (3, 1, 3)), "exif_ratio": np.array([[1.0, 4.0]] * 3)}
-    faults = {
+    pairs: dict[str, Any] = {"exposure_ratio": np.tile([[[1.0], [4.0]]], (3, 1, 3)), "exif_ratio": np.array([[1.0, 4.0]] * 3)}
+    faults: dict[str, dict[str, Any]] = {
         "tone curve": {"radiance": replace(radiance, curvature=curved, **pairs)},
         "stillness": {"radiance": replace(radiance, ghost_fraction=np.array([0.0, 0.05, 0.0]))},
         "ambient": {"radiance": replace(radiance, ambient_share=np.array([0.2, 0.2, 0.2]))},
@@ -198,7 +198,7 @@ def test_a_ring_that_was_mended_is_told() -> None:
 
 
 @pytest.mark.parametrize(("name", "value"), [("border", 0.6), ("islands", 0.03), ("holes", 0.06)])
-def test_mask_of_a_doubtful_shape_warns(good: Evidence, name: str, value: float) -> None:
+def test_mask_of_a_doubtful_shape_warns(good: Evidence, name: str, value: Any) -> None:
     gate = judged(changed(good, object_=replace(good.object_, **{name: value})))["mask"]
     assert gate.state == "warn" and "--mask" in gate.remedy
 
