@@ -125,7 +125,7 @@ def own(result: Path, tmp_path: Path) -> Path:
     [
         (["--preset", "maya"], f"'maya' is not one of {', '.join(map(repr, PRESETS))}"),
         (["--preset", "web", "--obj"], "leave out --obj"),
-        (["--exr", "--color", "ACEScq"], "--color ACEScq is no colour space or role"),
+        (["--exr", "--color", "ACEScq"], "--color ACEScq is not a color space or role"),
     ],
 )
 def test_what_does_not_exist_is_one_line(own: Path, polcap: Command, flags: list[str], says: str) -> None:

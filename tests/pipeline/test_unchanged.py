@@ -87,7 +87,7 @@ def test_run_with_nothing_to_do_loads_no_library(result: Path, example: Path, po
     shutil.copytree(result, out)
     options = ["process", str(capture), "--out", str(out), "--estimator", "analytic"]
     first = polcap(*options)
-    heavy = ("numpy", "scipy", "cv2", "onnxruntime", "msgspec")
+    heavy = ("numpy", "scipy", "cv2", "onnxruntime")
     code = f"import atexit, sys; from polcap import cli; sys.argv[1:] = {options}\n"
     code += f"atexit.register(lambda: print('loaded', *sys.modules.keys() & {heavy}))\ncli.main()"
     again = subprocess.run(

@@ -72,7 +72,8 @@ def test_each_gate_fails_alone(good: Evidence) -> None:
     away = still.transform.copy()
     away[1, 0, 2] = 50
     curved = np.array([[0.0, -0.2]] * 3)
-    pairs: dict[str, Any] = {"exposure_ratio": np.tile([[[1.0], [4.0]]], (3, 1, 3)), "exif_ratio": np.array([[1.0, 4.0]] * 3)}
+    ratios = np.tile([[[1.0], [4.0]]], (3, 1, 3))
+    pairs: dict[str, Any] = {"exposure_ratio": ratios, "exif_ratio": np.array([[1.0, 4.0]] * 3)}
     faults: dict[str, dict[str, Any]] = {
         "tone curve": {"radiance": replace(radiance, curvature=curved, **pairs)},
         "stillness": {"radiance": replace(radiance, ghost_fraction=np.array([0.0, 0.05, 0.0]))},
