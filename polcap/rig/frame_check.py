@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 
 from polcap.errors import DecodeError
+from polcap.formats.raw import file_kind, probe, worker
 from polcap.formats.raw import libraw as raw
-from polcap.formats.raw import probe, sniff, worker
 from polcap.images import Exif, Floats
 from polcap.rig.camera import Exposure
 
@@ -145,7 +145,7 @@ def suffix(data: bytes, name: str) -> str:
     if data[:3] == b"\xff\xd8\xff":
         return ".jpg"
     if data[:4] in (b"II*\0", b"MM\0*"):
-        if sniff.tiff(io.BytesIO(data)).dng:
+        if file_kind.structure(io.BytesIO(data)).dng:
             return ".dng"
         head = data[:4096].lower()
         return next((found for maker, found in _MAKERS.items() if maker.encode() in head), ".tif")

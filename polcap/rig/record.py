@@ -15,7 +15,7 @@ import tomli_w
 from polcap.errors import CaptureError
 from polcap.formats import atomic
 from polcap.formats.capture import capture_toml
-from polcap.formats.raw import photo_bytes
+from polcap.formats.raw import file_bytes
 from polcap.images import Role
 from polcap.rig import frame_check
 from polcap.rig.camera import Exposure
@@ -163,7 +163,7 @@ def verify(record: Record) -> list[str]:
         if not file.is_file():
             del record.content.frames[name]
             said.append(f"{good.file}: is gone; it is taken again")
-        elif photo_bytes.digest(file.read_bytes()) != good.facts.digest:
+        elif file_bytes.digest(file.read_bytes()) != good.facts.digest:
             record.reject(name, file, good.read_deg, "changed since it was taken")
             said.append(f"{good.file}: changed since it was taken; it is taken again")
     known = {good.file for good in record.content.frames.values()}

@@ -19,7 +19,7 @@ from unittest import mock
 import msgspec
 
 from polcap.errors import HardwareError, PolcapError, StorageError
-from polcap.formats.raw.photo_bytes import digest
+from polcap.formats.raw.file_bytes import digest
 from polcap.rig import record, sequence, serial_port
 from polcap.rig.plan import Order
 from tests.conftest import ROOT

@@ -13,7 +13,7 @@ import numpy as np
 
 from polcap.errors import HardwareError
 from polcap.formats.raw import dng
-from polcap.formats.raw.photo_bytes import digest
+from polcap.formats.raw.file_bytes import digest
 from polcap.images import Exif, Role
 from polcap.rig import watchdog
 from polcap.rig.camera import Exposure, Shot
