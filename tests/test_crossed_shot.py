@@ -58,7 +58,7 @@ def test_the_folder_cross_is_a_shot_of_its_own(capture: Capture) -> None:
 def test_two_crossed_shots_are_refused(tmp_path: Path) -> None:
     shooting.write(tmp_path / "c", BALL, structs.replace(SHOOT, width=128, height=96))
     (tmp_path / "c" / "cross045").mkdir()
-    with pytest.raises(CaptureError, match="cross000 holds a cross-polarised shot too"):
+    with pytest.raises(CaptureError, match="cross000 holds a cross-polarized shot too"):
         captures.read(tmp_path / "c")
 
 

@@ -9,8 +9,10 @@ import scipy.special  # noqa: F401
 
 from polcap import resource_limits
 from polcap.batch import thumbnail, unit  # noqa: F401
+from polcap.formats.capture import reader  # noqa: F401
 from polcap.formats.export import provenance
 from polcap.optics import body
+from polcap.pipeline import models, run  # noqa: F401
 
 body.make_tables()
 provenance.versions()

@@ -21,7 +21,7 @@ import msgspec
 from polcap import __version__
 from polcap.errors import InputError, PolcapError, StorageError
 from polcap.formats import atomic, calibrations_folder
-from polcap.formats.capture import file_name, layouts
+from polcap.formats.capture import layouts
 from polcap.images import ChartRequest, Network
 
 State = Literal["todo", "running", "interrupted", "done", "gates", "failed", "bug", "crashed"]
@@ -43,7 +43,7 @@ class Unit:
     def slug(self) -> str:
         """A file name of its own for every capture."""
         digest = hashlib.blake2b(os.fsencode(self.name), digest_size=4).hexdigest()  # names of folders are bytes
-        return f"{file_name.safe(Path(self.capture).name)}-{digest}"
+        return f"{atomic.safe_name(Path(self.capture).name)}-{digest}"
 
     @property
     def record_file(self) -> Path:

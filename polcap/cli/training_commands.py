@@ -22,6 +22,12 @@ def train(
     variant: Annotated[str, typer.Option(help="The network with one thing taken away, as the ablations.")] = "ours",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint.")] = False,
     start: Annotated[Path | None, typer.Option(metavar="ONNX", help="Begin with this model's weights.")] = None,
+    done: Annotated[
+        int, typer.Option(min=0, help="Of --samples, pictures that --start has learned from: goes on with their rate.")
+    ] = 0,
+    rate: Annotated[float, typer.Option(min=0, help="Of Muon; less to go on from trained weights.")] = 1e-3,
+    views: Annotated[int | None, typer.Option(min=1, help="Views of each mesh.")] = None,
+    procedural: Annotated[int | None, typer.Option(min=0, help="Random shapes, six views each.")] = None,
     threads: Annotated[int, typer.Option(min=1)] = 2,
     seed: Annotated[int, typer.Option(min=0)] = 1,
 ) -> None:
@@ -29,7 +35,7 @@ def train(
     trainer = extras.training("train")
     params = trainer.Params(
         preset=preset, data=data, out=out, minutes=minutes, samples=samples, variant=variant, resume=resume,
-        start=start, threads=threads, seed=seed,
+        start=start, done=done, rate=rate, views=views, procedural=procedural, threads=threads, seed=seed,
     )  # fmt: skip
     terminal.say(str(trainer.main(params)))
 

@@ -10,9 +10,10 @@ A model says in its metadata what it eats and under which terms it may be used:
 
 A file that does not say so is refused. A model that polcap does not ship is first loaded and run on a small picture
 in the limited child: what crashes, loops or eats memory there never reaches this process. Here each run has a time
-limit. The only module that imports onnxruntime.
+limit. The only module that imports onnxruntime: in `_onnxruntime`, which turns its telemetry off.
 """
 
+import os
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -78,8 +79,7 @@ def load(
         model = Model(path, parallel.Once(partial(_reopen, path, mark, threads)))
         channels, at_once = _stated(path, metadata, encoding), _at_once(CPU, threads)
         return Network(model, mark, channels, metadata, CPU, warm=model.opened, at_once=at_once)
-    import onnxruntime
-
+    onnxruntime = _onnxruntime()
     if not shipped:
         _try(path, mark, encoding)
     if device == "cuda" and CUDA not in onnxruntime.get_available_providers():
@@ -116,13 +116,11 @@ class Model:
         ModelError
             It fails on such an input, does not end, or answers with something that is no map of it.
         """
-        import onnxruntime
-
         session = self.opened()
         entry = session.get_inputs()[0]
         dtype = np.float16 if entry.type == "tensor(float16)" else np.float32
         names = [output.name for output in session.get_outputs()]
-        options = onnxruntime.RunOptions()
+        options = _onnxruntime().RunOptions()
         overdue = threading.Timer(self.limit_s, setattr, (options, "terminate", True))
         overdue.daemon = True
         overdue.start()
@@ -218,10 +216,8 @@ def _metadata(path: Path, session: Any) -> Mapping[str, str]:
 
 def providers(path: Path) -> dict[str, str]:
     """Every provider this onnxruntime has for this machine, and why it does not run the model; "" where it does."""
-    import onnxruntime
-
     found = {}
-    for name in onnxruntime.get_available_providers():
+    for name in _onnxruntime().get_available_providers():
         if name == _REMOTE:
             continue
         try:
@@ -236,8 +232,7 @@ def providers(path: Path) -> dict[str, str]:
 
 
 def _open(path: Path, data: bytes, providers: list[str], threads: int) -> Any:
-    import onnxruntime
-
+    onnxruntime = _onnxruntime()
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4  # its failures are raised, and told once
     options.intra_op_num_threads = max(1, (threads or parallel.threads()) - _AT_ONCE + 1)
@@ -283,11 +278,21 @@ def _usable(number: str) -> bool:
     return len(number) < 9 and number.isascii() and number.isdecimal() and 1 <= int(number) <= _MOST_NUMBER
 
 
+def _onnxruntime() -> Any:
+    """The library, imported without its telemetry: a device id below the home folder, and events sent to its maker.
+
+    It reads the variable once, when it is first imported. Child processes inherit it.
+    """
+    os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+    import onnxruntime
+
+    return onnxruntime
+
+
 def _failures() -> tuple[type[Exception], ...]:
     """onnxruntime's exceptions have no common base of their own."""
-    from onnxruntime.capi import onnxruntime_pybind11_state as state
-
-    own = [kind for kind in vars(state).values() if isinstance(kind, type) and issubclass(kind, Exception)]
+    state = vars(_onnxruntime().capi.onnxruntime_pybind11_state)
+    own = [kind for kind in state.values() if isinstance(kind, type) and issubclass(kind, Exception)]
     return (*own, ValueError, RuntimeError)
 
 

@@ -18,8 +18,7 @@ import msgspec
 from polcap.config import restored
 from polcap.errors import DecodeError, SettingError
 from polcap.formats import atomic, text_file
-from polcap.formats.capture import file_name
-from polcap.formats.export import exr_layers, glb_reader, gltf, materialx, obj, ocio, provenance, texture_set, usd
+from polcap.formats.export import exr_layers, glb_reader, gltf, materialx, obj, provenance, texture_set, usd
 from polcap.formats.export.encoders import Encoder, Kind
 from polcap.formats.export.presets import PRESETS, Format, Preset
 from polcap.formats.export.texture_set import Key, Texture
@@ -41,7 +40,7 @@ class Wanted:
     formats: tuple[Format, ...] = ("gltf", "obj")
     preset: str | None = None
     images: Kind | None = None  # inside the GLB; by default the preset's, or PNG
-    color: str = ocio.INSIDE  # colour space or role of the colours in the layered EXR
+    color: str = exr_layers.LINEAR_REC709  # colour space or role of the colours in the layered EXR
     texture_size: int | None = None  # px of the longer side; by default the maps'
     lod: int = 0  # further GLBs, each in a quarter of the triangles of the one before
 
@@ -110,7 +109,7 @@ def export(
         maps=out / "maps",
         asset=built,
         lods=tuple(zip(lods, levels)),
-        name=file_name.safe(str(about["capture"].get("name"))),  # whatever the report says, files stay in the folder
+        name=atomic.safe_name(str(about["capture"].get("name"))),  # whatever the report says, files stay in the folder
         preset=preset,
         images=wanted.images or preset.images,
         color=wanted.color,
@@ -155,7 +154,7 @@ def _described(folder: Path, about: Mapping[str, Any], source: _Source, standing
 
     Mesh and pictures stand; the GLB and the sidecar tell the run that they are from.
     """
-    name = file_name.safe(str(about["capture"].get("name")))
+    name = atomic.safe_name(str(about["capture"].get("name")))
     glb, sidecar = folder / f"{name}.glb", folder / f"{name}{_SIDECAR}"
     made_from, record = msgspec.to_builtins(source), provenance.record(about)
     try:

@@ -78,6 +78,8 @@ def _warm(networks: Callable[[], Networks], ior: float) -> Networks:
     import scipy.spatial.transform
     import scipy.special  # noqa: F401
 
+    import polcap.optics.colour_science  # noqa: F401
+
     found = networks()
     for network in found:
         if network is not None:

@@ -118,6 +118,8 @@ def _warm(supplied: UserInput) -> None:
     """Load what later stages need, while the merge waits for photographs; what fails here fails there again."""
     import scipy.special  # noqa: F401 — .2 s
 
+    import polcap.optics.colour_science  # noqa: F401 — .2 s
+
     for network in (supplied.mask_network, supplied.network, supplied.network and supplied.network.fine):
         if network is not None:
             network.warm()

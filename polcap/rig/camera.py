@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from polcap.formats.raw import sniff
+from polcap.formats.raw import file_kind
 from polcap.images import Role
 from polcap.rig.exposure_bracket import Exposure
 
@@ -39,7 +39,7 @@ class CameraFile:
             if self.data.startswith(signature, offset):
                 return suffix
         if self.data[:4] in (b"II*\0", b"MM\0*"):
-            if sniff.tiff(io.BytesIO(self.data)).dng:
+            if file_kind.structure(io.BytesIO(self.data)).dng:
                 return ".dng"
             head = self.data[:4096].lower()
             return next((suffix for maker, suffix in _MAKERS.items() if maker.encode() in head), ".tif")

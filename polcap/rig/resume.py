@@ -8,7 +8,7 @@ import msgspec
 from polcap.errors import CaptureError, SettingError
 from polcap.formats import atomic
 from polcap.formats.capture import layouts
-from polcap.formats.raw import photo_bytes
+from polcap.formats.raw import file_bytes
 from polcap.rig import capture_record
 from polcap.rig.capture_record import CaptureRecord, RigFile
 from polcap.rig.shooting_plan import CaptureOrder
@@ -98,7 +98,7 @@ def verify(record: CaptureRecord) -> list[str]:
         if not file.is_file():
             del record.content.frames[name]
             messages.append(f"{frame.file}: the file is missing; the frame is taken again")
-        elif photo_bytes.digest(file.read_bytes()) != frame.facts.digest:
+        elif file_bytes.digest(file.read_bytes()) != frame.facts.digest:
             record.reject(name, file, frame.read_deg, "changed since it was taken")
             messages.append(f"{frame.file}: changed since it was taken; the frame is taken again")
     recorded = {frame.file for frame in record.content.frames.values()}

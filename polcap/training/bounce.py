@@ -3,11 +3,12 @@
 The first is traced once per view, the second computed at every step. The flash stands next to the lens, so what
 it lights the camera sees: the light that bounces comes from pixels of the same picture. `visibility` traces a
 few rays from every second pixel of every second row and remembers which pixels they meet; `arriving` is the
-light that takes those ways under the materials of the moment. Left out, as in `light_transport.py`: more
-bounces, and that bounced light arrives a little polarized.
+light that takes those ways under the materials of the moment. `surroundings` adds the mirror image of a backdrop and
+of the ground where no part of the object hides them. Left out, as in `light_transport.py`: more bounces, and that
+bounced light arrives a little polarized.
 """
 
-from math import pi
+from math import log, pi
 from typing import Any
 
 import numpy as np
@@ -25,10 +26,14 @@ COARSE = 2  # pixels of the cache from one place that is traced to the next
 _SPREAD = 4  # rays by the cosine about the smooth normal,
 _LOBES = ((3, 0.5**2), (3, 0.2**2))  # and by GGX facets of these α
 RAYS = _SPREAD + sum(count for count, _ in _LOBES)
-NOWHERE = 65535
+SHARP = _LOBES[-1][0]  # the last rays, nearest to the mirror direction
+NOWHERE = 65535  # the ray meets a place that the camera does not see
+ESCAPED = 65534  # the ray leaves the object
 _SHARPEST = 0.2  # roughness; what mirrors better is drawn as this
 _BESIDE = 2  # pixels of the cache that count as the place itself
 _APART = 0.01  # sides of the object by which a place met may differ from the one seen in its pixel
+
+_SURROUNDINGS = (log(0.01), log(0.5))  # logarithm of the albedo of backdrop and ground, dark cloth to paper
 
 Indices = NDArray[np.integer[Any]]
 
@@ -38,7 +43,7 @@ def visibility(
 ) -> tuple[NDArray[np.bool_], NDArray[np.uint16]]:
     """Pixels (H, W) that the flash reaches, and the flat indices (H/2, W/2, RAYS) of pixels that places see.
 
-    NOWHERE where a ray leaves the object or meets what the camera does not see.
+    ESCAPED where a ray leaves the object, NOWHERE where it meets a place that the camera does not see.
     """
     mask = buffer.mask
     height, width = mask.shape
@@ -61,7 +66,7 @@ def visibility(
     distance, _ = scene.facing(start, direction)
     met = np.flatnonzero(np.isfinite(distance) & (distance > light_transport.LIFT * scene.size))
     there = start[met] + distance[met, None] * direction[met]
-    found = np.full(len(start), NOWHERE, np.uint16)
+    found = np.where(np.isfinite(distance), NOWHERE, ESCAPED).astype(np.uint16)
     found[met] = _pixel(there, np.argwhere(places)[met // RAYS], buffer, pose, scene.size)
     out = np.full((height, width, RAYS), NOWHERE, np.uint16)
     out[places] = found.reshape(-1, RAYS)
@@ -120,11 +125,52 @@ def arriving(seen: Any, normal: Tensor, surface: Surface, body: Tensor) -> Tenso
     irradiance = 1 / (pi * _density(frames.to_ray_frame(seen.normal[here], v), way).clamp(min=1e-3))
     n, rough, ior = normal[here], surface.roughness[here].clamp(min=_SHARPEST), surface.ior[here]
     diffuse, specular = surface.diffuse[here] * light, surface.specular[here]
-    # where F0 is more than the body's index gives, facets have the index that gives it, as in `light_transport.py`
-    root = torch.maximum(specular.mean(dim=1), fresnel.normal_reflectance(ior)).sqrt()
     diffuse_part = shade.stokes(n, diffuse, 0 * specular, rough, ior, way, irradiance, surface.law.at(here))
-    mirrored = shade.stokes(n, 0 * diffuse, specular * light, rough, (1 + root) / (1 - root), way, irradiance)
+    mirrored = shade.stokes(n, 0 * diffuse, specular * light, rough, _facet_ior(specular, ior), way, irradiance)
     return normal.new_zeros(3, len(normal), 3).index_add(1, here, diffuse_part + mirrored)
+
+
+def surroundings(seen: Any, normal: Tensor, surface: Surface, strength: Tensor) -> Tensor:
+    """Stokes parameters (3, M, 3) of the backdrop's and the ground's mirror image in the surface.
+
+    Near the outline all light comes from there: reflectance tends to 1, and the mirrored ray points away from the
+    camera. Each pixel has one ray, about its own normal, as far as the sharpest lobe of `visibility` leaves the object.
+    strength (B,) as in `dataset.Simulator.shoot`; a third of the objects have neither backdrop nor ground.
+    """
+    count, device, own = len(strength), normal.device, seen.owner
+
+    def u(low: float, high: float, columns: int = 1) -> Tensor:
+        return low + (high - low) * torch.rand(count, columns, device=device)
+
+    albedo = torch.exp(u(*_SURROUNDINGS)) * torch.exp(0.1 * torch.randn(count, 3, device=device)) * (u(0, 1) > 1 / 3)
+    turn = u(0, 2 * pi)
+    down = torch.cat([torch.cos(turn), torch.sin(turn), 0 * turn], dim=1)  # the ground's normal points the other way
+    low = (seen.place * down[own]).sum(dim=1)  # the object rests on the ground
+    ground = torch.full((count,), -9.0, device=device).scatter_reduce(0, own, low, "amax") + 9 * (u(0, 1)[:, 0] > 0.6)
+    behind = 1.35 + 1.5 * u(0, 1)[:, 0] ** 2
+
+    half = frames.from_ray_frame(normal, seen.v)
+    way = 2 * normal[:, 2:] * half - seen.v
+    to_ground = (ground[own] - low) / (way * down[own]).sum(dim=1).clamp(min=1e-4)
+    to_backdrop = (behind[own] + seen.place[:, 2]) / (-way[:, 2]).clamp(min=1e-4)
+    place = seen.place + torch.minimum(to_ground, to_backdrop)[:, None] * way
+    facing = torch.where((to_ground < to_backdrop)[:, None], -down[own], down.new_tensor([0.0, 0.0, 1.0]))
+    to_flash = seen.flash[own] - place
+    far = to_flash.norm(dim=1)
+    received = strength[own] * seen.open * (to_flash * facing).sum(dim=1).clamp(min=0) / far**3
+    light = albedo[own] * received[:, None]
+
+    rough = surface.roughness.clamp(min=_SHARPEST)
+    mirror = 2 * normal[:, 2:] * normal - normal.new_tensor([0.0, 0.0, 1.0])
+    irradiance = 4 * normal[:, 2] * rough**4  # one over π times the density of facets that mirror exactly
+    ior = _facet_ior(surface.specular, surface.ior)
+    return shade.stokes(normal, 0 * light, surface.specular * light, rough, ior, mirror, irradiance)
+
+
+def _facet_ior(specular: Tensor, ior: Tensor) -> Tensor:
+    """The index that F0 (M, 3) belongs to where it is more than the body's (M,), as in `light_transport.py`."""
+    root = torch.maximum(specular.mean(dim=1), fresnel.normal_reflectance(ior)).sqrt()
+    return (1 + root) / (1 - root)
 
 
 def _density(normal: Tensor, way: Tensor) -> Tensor:

@@ -67,6 +67,7 @@ class Seen:
     depth: Tensor  # (M,) units of gbuffers.depth_unit, mean 0
     lit: Tensor  # (M,) 1 where the flash reaches
     met: Tensor  # (M, bounce.RAYS) rows among the M of the pixels that each sees, −1 for none
+    open: Tensor  # (M,) share of the rays about the mirror direction that leave the object
     turn: Tensor  # (B, 3, 3) object → camera
     flash: Tensor  # (B, 3) camera frame, in units of the object's distance
 
@@ -99,7 +100,7 @@ class Simulator:
         inside = np.flatnonzero(mask)
         owner, at = np.divmod(inside, area)
         first = pick[owner]  # view of each pixel
-        met = self._met(first, y[at], x[at], order, mask, owner)
+        met, escaped = self._met(first, y[at], x[at], order, mask, owner)
         kept = (first * full + y[at]) * full + x[at]
 
         def tensor(array: NDArray[Any]) -> Tensor:
@@ -118,23 +119,28 @@ class Simulator:
             mask=tensor(mask).reshape(-1, size, size), rays=rays.reshape(-1, size, size, 3), inside=tensor(inside),
             owner=rows, v=v, normal=taken("normal") @ mirror.T, position=taken("position"),
             place=-v * (far / v[:, 2])[:, None], depth=depth, lit=taken("lit")[:, 0], met=tensor(met),
-            turn=mirror @ camera[:, 5:14].reshape(-1, 3, 3), flash=F.pad(camera[:, 14:16], (0, 1)) @ mirror.T,
+            open=tensor(escaped), turn=mirror @ camera[:, 5:14].reshape(-1, 3, 3),
+            flash=F.pad(camera[:, 14:16], (0, 1)) @ mirror.T,
         )  # fmt: skip
 
     def _met(
         self, first: Indices, y: Indices, x: Indices, order: Indices, mask: NDArray[np.bool_], owner: Indices
-    ) -> Indices:
-        """Seen.met of pixels (y, x) of views `first`, whose thinned pixels lie in `order` with masks (B, H·W)."""
+    ) -> tuple[Indices, NDArray[np.float32]]:
+        """Seen.met and Seen.open of pixels (y, x) of views `first`.
+
+        Their thinned pixels lie in `order`, with masks (B, H·W).
+        """
         full, area = self.size, len(order)
         size, coarse = isqrt(area), full // bounce.COARSE
         there = np.full(2**16, -1, np.int64)  # place in the thinned and mirrored view of each pixel of the cache
         thinned = np.arange(full) * size // full
         there[: full * full] = np.argsort(order)[(thinned[:, None] * size + thinned).reshape(-1)]
-        there[bounce.NOWHERE] = -1
+        there[[bounce.NOWHERE, bounce.ESCAPED]] = -1
         row = np.where(mask.reshape(-1), np.cumsum(mask) - 1, -1)
         cell = (first * coarse + y // bounce.COARSE) * coarse + x // bounce.COARSE
-        to = there[self.views["met"].take(cell, axis=0)]  # (M, RAYS)
-        return np.where(to >= 0, row[to + owner[:, None] * area], -1)
+        found = self.views["met"].take(cell, axis=0)  # (M, RAYS)
+        to, escaped = there[found], found[:, -bounce.SHARP :] == bounce.ESCAPED
+        return np.where(to >= 0, row[to + owner[:, None] * area], -1), escaped.mean(axis=1, dtype=np.float32)
 
     def shoot(
         self,
@@ -171,7 +177,9 @@ class Simulator:
             "highlight": image(highlight[:, None]),
             "law": image(torch.stack([surface.law.rough, surface.law.local, surface.law.kept], dim=1)),
         }  # fmt: skip
-        bounced = torch.stack([image(part) for part in bounce.arriving(seen, normal, surface, body[0])])
+        arriving = bounce.arriving(seen, normal, surface, body[0])
+        arriving = arriving + bounce.surroundings(seen, normal, surface, strength)
+        bounced = torch.stack([image(part) for part in arriving])
         scene = torch.stack([image(part) for part in stokes]) + bounce.smooth(bounced, seen.mask)
         given = seen.mask if jitter is None else _redrawn(seen.mask, jitter)
         at = given.reshape(-1).nonzero()[:, 0]

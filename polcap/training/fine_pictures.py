@@ -33,8 +33,10 @@ class WithoutBounces(Simulator):
     What bounces is coarser than relief, but in shadows beside a limb, which nothing else lights (decision 29).
     """
 
-    def _met(self, first: Indices, y: Indices, x: Indices, order: Indices, mask: Any, owner: Indices) -> Indices:
-        return np.full((len(owner), bounce.RAYS), -1)
+    def _met(
+        self, first: Indices, y: Indices, x: Indices, order: Indices, mask: Any, owner: Indices
+    ) -> tuple[Indices, NDArray[np.float32]]:
+        return np.full((len(owner), bounce.RAYS), -1), np.zeros(len(owner), np.float32)
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class Studio:
     @staticmethod
     def open(views: Path, data: Path, network: Network) -> "Studio":
         """Trace what is missing of the views of the training meshes."""
-        meshes = sorted((data / "meshes" / "train").glob("*.npz"))
+        meshes = gbuffers.training_meshes(data)
         library = materials.Library(data / "materials" / "train", torch.device("cpu"))
         simulator = WithoutBounces(gbuffers.cached(views, meshes, RECIPE), library, torch.device("cpu"))
         return Studio(simulator, network)

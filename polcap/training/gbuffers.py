@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import InputError
-from polcap.formats import atomic
-from polcap.formats.export import mesh as mesh_files
+from polcap.formats import atomic, scene_files
 from polcap.images import Floats, GBuffer, View
 from polcap.synth.mesh_tracer import Tracer, Triangles, smooth
 from polcap.training import bounce, light_transport, shapes
@@ -25,6 +24,13 @@ ARRAYS = {  # pixels from one entry to the next, channels, kind
     "mask": (1, 1, np.bool_), "lit": (1, 1, np.bool_), "met": (bounce.COARSE, bounce.RAYS, np.uint16),
 }  # fmt: skip
 LEAST_SHARE = 0.06  # of the picture, for an object to be worth a view: a sheet seen from its edge teaches nothing
+WITHHELD = frozenset((  # meshes that no training may use: new objects for evaluation (calib/models/polcap.md)
+    "bjs_molten_dagger", "blub", "chen_red_marker", "chess_queen", "gso_bia_cordon_bleu_white_porcelain_utensil_",
+    "gso_dino_5", "gso_razer_kraken_pro_headset_full_size_black", "gso_room_essentials_salad_plate_turquoise",
+    "gso_sonny_school_bus", "gso_sperry_topsider", "gso_sterilite_caddy_blue_sky_17_58_x_12_58_x", "gz_ball_valve",
+    "gz_trash_can", "poly_sugar_cup", "statue_maria", "ycb_dice", "ycb_fork", "ycb_nine_hole_peg_test", "ycb_orange",
+    "ycb_tomato_soup_can",
+))  # fmt: skip
 _TRIES = 200  # sides from which it may be looked at in vain
 _ASIDE = 0.1  # of the distance: how far from the lens a random flash stands at most
 
@@ -110,9 +116,14 @@ def load(folder: Path, *, mapped: bool = True) -> dict[str, NDArray[Any]]:
     return arrays | {"camera": np.load(folder / "camera.npy")}
 
 
+def training_meshes(data: Path) -> list[Path]:
+    """Files of the meshes to train on, by name."""
+    return sorted(path for path in (data / "meshes" / "train").glob("*.npz") if path.stem not in WITHHELD)
+
+
 def read_mesh(path: Path) -> Triangles:
     """A mesh file with shading normals."""
-    return smooth(*mesh_files.read(path))
+    return smooth(*scene_files.read_mesh(path))
 
 
 def depth_unit(mask: NDArray[np.bool_], depth: Floats, focal: float) -> tuple[float, float]:

@@ -26,15 +26,19 @@ class Family:
     tail: float  # share with an F0 above common dielectrics
     kept: tuple[float, float] = (1.0, 1.0)  # factor on the body's polarization
     grain: float = 0.5  # share whose gloss is speckled
+    dark: bool = False  # hardly any diffuse reflection: most of the light is mirrored from other parts of the object
 
 
 FAMILIES = {
-    "glossy": Family(0.27, (0.10, 0.35), 0.40),  # plastics, glazes, varnish
-    "satin": Family(0.28, (0.28, 0.60), 0.28),  # paints, leather, waxed wood
-    "matte": Family(0.28, (0.50, 0.95), 0.08),  # plaster, clay, paper, stone
+    "glossy": Family(0.25, (0.10, 0.35), 0.40),  # plastics, glazes, varnish
+    "satin": Family(0.27, (0.28, 0.60), 0.28),  # paints, leather, waxed wood
+    "matte": Family(0.27, (0.50, 0.95), 0.08),  # plaster, clay, paper, stone
     "brushed": Family(0.08, (0.25, 0.65), 0.30, grain=1.0),  # sanded, scratched, grained
-    "fibrous": Family(0.09, (0.65, 1.00), 0.00, kept=(0.3, 0.9), grain=1.0),  # cloth, felt, unsized paper
+    "fibrous": Family(0.08, (0.65, 1.00), 0.00, kept=(0.3, 0.9), grain=1.0),  # cloth, felt, unsized paper
+    "dark gloss": Family(0.05, (0.05, 0.30), 0.00, dark=True),  # black plastic, lacquer, leather, dark glaze
 }
+_ALL_DARK = 0.10  # of objects that are dark gloss everywhere; the parts' share comes on top
+_DARK = (0.01, 0.06)  # albedo
 _F0, _F0_SPREAD = 0.042, 0.13  # common dielectrics: n = 1.45–1.58 within 1σ, in the logarithm
 _TAIL = (0.055, 1.5)  # least F0, and the logarithm of the greatest over it; small ones are commoner
 SMOOTH_SHARE = 0.5  # of objects whose body leaves light through a smooth interface
@@ -50,12 +54,27 @@ class Gloss:
     f0: Tensor
     kept: Tensor
     grained: Tensor  # bool
+    dark: Tensor  # bool
 
 
-def draw(shape: tuple[int, ...], device: torch.device) -> Gloss:
-    """A family for each surface, and its gloss."""
+def dark_objects(count: int, device: torch.device) -> Tensor:
+    """Which of `count` objects are dark gloss everywhere, (B,) bool."""
+    return torch.rand(count, device=device) < _ALL_DARK
+
+
+def dark_albedo(shape: tuple[int, ...], device: torch.device) -> Tensor:
+    """Albedos of the dark family, (*shape, 3): nearly grey."""
+    low, high = _DARK
+    value = low * (high / low) ** torch.rand((*shape, 1), device=device)
+    return value * torch.exp(0.15 * torch.randn((*shape, 3), device=device))
+
+
+def draw(shape: tuple[int, ...], device: torch.device, all_dark: Tensor | None = None) -> Gloss:
+    """A family for each surface, and its gloss; `all_dark` (bool, broadcast to the shape) forces the dark family."""
     share = torch.tensor([family.share for family in FAMILIES.values()], device=device)
     which = torch.multinomial(share, torch.Size(shape).numel(), replacement=True).reshape(shape)
+    if all_dark is not None:
+        which = torch.where(all_dark, list(FAMILIES).index("dark gloss"), which)
 
     def u() -> Tensor:
         return torch.rand(shape, device=device)
@@ -72,6 +91,7 @@ def draw(shape: tuple[int, ...], device: torch.device) -> Gloss:
         f0=torch.where(u() < of("tail"), rare, common),
         kept=least + (most - least) * u(),
         grained=u() < of("grain"),
+        dark=of("dark"),
     )
 
 

@@ -26,7 +26,7 @@ _UNSEEN = 0.15  # of the charts are in the picture but not found
 def main(out: Path, data: Path, count: int, seed: int = 5) -> None:
     """Make what is missing of pictures 0…count − 1 from the training meshes and materials."""
     torch.set_num_threads(1)
-    files = sorted((data / "meshes" / "train").glob("*.npz"))
+    files = gbuffers.training_meshes(data)
     library = materials.Library(data / "materials" / "train", torch.device("cpu"))
     out.mkdir(parents=True, exist_ok=True)
     for group in range(-(-count // (_VIEWS * _DRESSES))):

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from polcap.formats.maps import textures
+from polcap.formats import scene_files
 from polcap.optics.body import SMOOTH, Law
 from polcap.training import gloss
 
@@ -44,7 +44,8 @@ class Library:
     def __init__(self, folder: Path | None, device: torch.device, seed: int = 3) -> None:
         sets = sorted(p.parent for p in folder.glob("*/albedo.jpg")) if folder else []
         self.names = [p.name for p in sets]
-        stack = [textures.read(p, _TEXELS) for p in sets] or [np.full((6, _TEXELS, _TEXELS), 0.5, dtype=np.float32)]
+        stack = [scene_files.read_textures(p, _TEXELS) for p in sets]
+        stack = stack or [np.full((6, _TEXELS, _TEXELS), 0.5, dtype=np.float32)]
         self.texture = torch.from_numpy(np.stack(stack, axis=1)).to(device)[None]  # (1, 6, T, 256, 256)
         self.has_textures = bool(sets)
         lightness = self.texture[0, :3].mean(dim=0).flatten(1) ** 0.45  # (T, texels)
@@ -133,7 +134,7 @@ def dress(
         normal=F.normalize(bent, dim=1),
         diffuse=diffuse,
         specular=specular,
-        roughness=rough.clamp(0.08, 1.0),
+        roughness=rough.clamp(0.05, 1.0),
         ior=own["ior"],
         law=Law(law.rough, law.local, law.kept * fibers),
     )
@@ -149,7 +150,8 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
     def normal(deviation: float) -> Tensor:
         return deviation * torch.randn(shape, device=device)
 
-    one, other = gloss.draw(shape, device), gloss.draw(shape, device)
+    all_dark = gloss.dark_objects(count, device)[:, None]
+    one, other = (gloss.draw(shape, device, all_dark) for _ in range(2))
     two = u(0, 1) < 0.8  # surfaces in one pattern
     stuff = u(0, 1) < 0.5  # of which both are of one stuff
     f0_step = torch.where(stuff, normal(0.2), torch.log(other.f0 / one.f0))
@@ -158,6 +160,11 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
     near = (u(0, 1) < 0.5)[..., None]
     color2 = torch.where(near, color * (0.4 + 1.2 * _u((*shape, 1), device)), color2)
     tint = torch.exp(normal(0.4))[..., None] * torch.exp(0.15 * torch.randn((*shape, 3), device=device))
+    texture = torch.randint(0, max(len(library.names), 1), shape, device=device)
+    black = gloss.dark_albedo(shape, device)
+    color = torch.where(one.dark[..., None], black, color)
+    color2 = torch.where(other.dark[..., None], gloss.dark_albedo(shape, device), color2)
+    tint = torch.where(one.dark[..., None], black / library.middle[texture][..., None] ** (1 / 0.45), tint)
     from_texture = (u(0, 1) < 0.4) if library.has_textures else torch.zeros(shape, device=device)
     coloured = (one.f0 > 0.08) & (u(0, 1) < 0.3)
     f0_tint = torch.where(coloured[..., None], 1 + 0.4 * (_u((*shape, 3), device) - 0.5), torch.ones(1, device=device))
@@ -167,11 +174,12 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
     return {
         "color": color, "color2": color2, "tint": tint, "f0_tint": f0_tint,
         "from_texture": from_texture.float(),
-        "texture": torch.randint(0, max(len(library.names), 1), shape, device=device).float(),
+        "texture": texture.float(),
         "shift": u(0, 2), "contrast": torch.exp(u(-0.5, 3.2)), "level": u(-1.5, 1.5),
         "mid": color.mean(dim=-1) ** 0.45,
         "rough": one.roughness, "follow": normal(0.3), "speckle": u(0, 0.25) * one.grained,
-        "rough_gain": torch.where(as_is, 1.0, u(0.5, 1.0)), "rough_shift": torch.where(as_is, 0.0, u(-0.1, 0.4)),
+        "rough_gain": torch.where(one.dark, 0.1, torch.where(as_is, 1.0, u(0.5, 1.0))),
+        "rough_shift": torch.where(one.dark, one.roughness - 0.05, torch.where(as_is, 0.0, u(-0.1, 0.4))),
         "f0": one.f0, "f0_follow": normal(0.3),
         "rough_step": two * (other.roughness - one.roughness), "f0_step": two * f0_step,
         "kept": one.kept, "kept_step": two * (other.kept - one.kept), "raised": (u(0, 1) < 0.4).float(),

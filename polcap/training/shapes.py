@@ -1,4 +1,4 @@
-"""Random closed meshes: displaced spheres, superquadrics, turned profiles, vessels, tubes, and unions of them."""
+"""Random closed meshes: displaced spheres, dented domes, superquadrics, turned profiles, vessels, tubes, and unions."""
 
 from collections.abc import Callable
 
@@ -48,6 +48,29 @@ def _displaced(rng: np.random.Generator) -> tuple[Floats, NDArray[np.int32]]:
         field = field + rng.normal() * np.sin(wave + rng.uniform(0, 6.28)) / frequency
     radius = 0.5 * (1 + rng.uniform(0.2, 0.9) * np.tanh(field))
     return unit * radius[:, None] * rng.uniform(0.4, 1.0, 3), faces
+
+
+def _dented(rng: np.random.Generator) -> tuple[Floats, NDArray[np.int32]]:
+    """A smooth dome with hollows and bosses of one size range, some flat inside, and often a patch of fine relief.
+
+    A hollow and a boss polarize alike: only outline, shadow and neighbours say which of the two a place is.
+    """
+    unit, faces = _sphere(2 * _RINGS, 2 * _SECTORS)
+    radius = np.ones(len(unit))
+    widest = np.exp(rng.uniform(np.log(0.2), np.log(0.9)))  # rad
+    for _ in range(int(rng.integers(3, 17))):
+        width = widest * rng.uniform(0.4, 1.0)
+        away = np.arccos(np.clip(unit @ rotation(rng)[0], -1, 1)) / width
+        steep = rng.uniform(1, 4)  # 1: a Gaussian; more: a pit with a wall and a floor
+        radius += rng.choice([-1, -1, 1]) * width * rng.uniform(0.2, 0.8) * np.exp(-0.5 * away ** (2 * steep))
+    if rng.random() < 0.5:
+        away = np.arccos(np.clip(unit @ rotation(rng)[0], -1, 1))
+        wave = np.ones(len(unit))
+        frequency = rng.uniform(12, 40)
+        for _ in range(int(rng.integers(1, 3))):
+            wave *= np.sin(frequency * (unit @ rotation(rng)[0]) + rng.uniform(0, 6.28))
+        radius += rng.uniform(0.1, 0.5) / frequency * wave * (away < rng.uniform(0.3, 1.2))
+    return 0.5 * unit * np.clip(radius, 0.25, None)[:, None] * rng.uniform(0.5, 1.0, 3), faces
 
 
 def _superquadric(rng: np.random.Generator) -> tuple[Floats, NDArray[np.int32]]:
@@ -128,7 +151,7 @@ def _tube(rng: np.random.Generator) -> tuple[Floats, NDArray[np.int32]]:
 
 
 _PARTS: list[Callable[[np.random.Generator], tuple[Floats, NDArray[np.int32]]]] = [
-    _displaced, _displaced, _superquadric, _superquadric, _turned, _vessel, _vessel, _tube,
+    _displaced, _displaced, _dented, _dented, _dented, _superquadric, _superquadric, _turned, _vessel, _vessel, _tube,
 ]  # fmt: skip
 
 

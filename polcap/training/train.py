@@ -49,6 +49,7 @@ class Params:
     piece: float | None = None  # minutes after which this run stops and leaves last.pt, for `resume` to go on from
     resume: bool = False  # go on from out/last.pt
     start: Path | None = None  # ONNX model whose weights are the first; else random ones
+    done: int = 0  # pictures of `samples` that `start` has learned from: the schedule goes on from there
     views: int | None = None  # of each mesh, instead of the preset's
     procedural: int | None = None  # random shapes, instead of the preset's
     threads: int = 2  # learners on a CPU, each with a batch of its own; one more thread makes the batches
@@ -101,7 +102,7 @@ def main(params: Params) -> Path:
     if params.resume:
         run.load(last)
     elif params.start:
-        run.begin(params.start)
+        run.begin(params.start, params.done)
     simulator = Simulator(views(params, preset), library(params, "train", device), device)
     watch = Watch(params.data, params.out / "watch", device)
     _keep_memory()
@@ -149,13 +150,13 @@ def _keep_memory() -> None:
 
 def views(params: Params, preset: Preset) -> dict[str, Any]:
     """The cache of training views, traced now where it is not there yet."""
-    meshes = sorted((params.data / "meshes" / "train").glob("*.npz"))
+    meshes = gbuffers.training_meshes(params.data)
     of_mesh, of_chance = (
         n if n is not None else usual
         for n, usual in ((params.views, preset.views), (params.procedural, preset.procedural))
     )
-    recipe = gbuffers.Recipe(views=of_mesh, procedural=of_chance, size=preset.size, seed=11)
-    return gbuffers.cached(params.out / "views", meshes, recipe, mapped=False)  # random access to a map is slow
+    recipe = gbuffers.Recipe(views=of_mesh, procedural=of_chance, size=preset.size, seed=13)
+    return gbuffers.cached(params.out / "views", meshes, recipe)
 
 
 def library(params: Params, split: str, device: torch.device) -> materials.Library:
@@ -222,6 +223,7 @@ class Run:
         self.pool = ThreadPoolExecutor(learners, initializer=torch.set_num_threads, initargs=(1,))
         self.step, self.samples, self.elapsed, self.skipped = 0, 0, 0.0, 0
         self.begun = ""  # what the first weights had learned from
+        self.done = 0  # pictures of the budget among those
 
     def advance(self, batches: list[Batch], progress: float) -> dict[str, float]:
         """One step on a batch per learner; progress 0…1 of the budget sets the rate."""
@@ -273,13 +275,16 @@ class Run:
             "optimizers": [o.state_dict() for o in self.optimizers], "shape": asdict(self.network.shape),
             "variant": self.network.variant,
             "step": self.step, "samples": self.samples, "elapsed": self.elapsed, "skipped": self.skipped,
-            "begun": self.begun,
+            "begun": self.begun, "done": self.done,
         }  # fmt: skip
         with atomic.path(path) as beside:
             torch.save(state, beside)
 
-    def begin(self, path: Path) -> None:
-        """Take a model's weights as the first, from `export.write`; InputError where they are another network's."""
+    def begin(self, path: Path, done: int = 0) -> None:
+        """Take a model's weights as the first, from `export.write`; InputError where they are another network's.
+
+        `done` pictures count as learned from: with a budget of pictures the schedule goes on from there.
+        """
         weights, metadata = export.read(path)
         for name, own in self.network.state_dict().items():
             if name in weights:
@@ -290,6 +295,7 @@ class Run:
             raise InputError(f"{path} is not a network of this preset; start from one that is, or without") from error
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.begun = metadata.get("training", "unknown")
+        self.samples = self.done = done
 
     def load(self, path: Path) -> None:
         if not path.exists():
@@ -302,7 +308,7 @@ class Run:
         for optimizer, held in zip(self.optimizers, state["optimizers"]):
             optimizer.load_state_dict(held)
         self.step, self.samples, self.elapsed = state["step"], state["samples"], state["elapsed"]
-        self.skipped, self.begun = state["skipped"], state["begun"]
+        self.skipped, self.begun, self.done = state["skipped"], state["begun"], state["done"]
         for k, generator in enumerate(self.lights):  # other lights than before
             generator.manual_seed(1000 * self.step + k)
 
@@ -394,14 +400,15 @@ def load_average(path: Path) -> tuple[model.Network, dict[str, Any]]:
     network = model.Network(model.Shape(**state["shape"]), state["variant"])
     average: dict[str, Tensor] = state["average"]
     network.load_state_dict(average)
-    return network.eval(), {k: state[k] for k in ("step", "samples", "elapsed", "begun")}
+    return network.eval(), {k: state[k] for k in ("step", "samples", "elapsed", "begun", "done")}
 
 
 def ship(checkpoint: Path, path: Path, version: str, licence: str = "Apache-2.0") -> int:
     """Export a checkpoint's EMA weights with what is known of their training. Returns the file's bytes."""
     network, facts = load_average(checkpoint)
     metadata = {"version": version, "licence": licence, "variant": network.variant}
-    training = f"{facts['samples']} samples in {facts['step']} steps, {facts['elapsed'] / 60:.0f} minutes"
+    learned = facts["samples"] - facts["done"]
+    training = f"{learned} samples in {facts['step']} steps, {facts['elapsed'] / 60:.0f} minutes"
     if facts["begun"]:
         training += f", after {facts['begun']}"
     return export.write(network, path, metadata | {"training": training})

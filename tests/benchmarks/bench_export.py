@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 
 from polcap.config import Config
-from polcap.formats.export import exr_layers, gltf, ocio, texture_set
+from polcap.formats.export import exr_layers, gltf, texture_set
 from polcap.formats.export.encoders import Encoder
 from polcap.formats.export.presets import PRESETS, Preset
 from polcap.formats.maps import maps_folder
@@ -78,7 +78,7 @@ def alone(folder: Path, built: Asset, preset: Preset) -> None:
     for make in (*preset.textures.values(), *(texture_set.LOOSE.values() if "obj" in preset.formats else ())):
         encoder(make(built), "png")
     if "exr" in preset.formats:
-        exr_layers.write(folder / "alone.exr", folder / "maps", ocio.INSIDE, {})
+        exr_layers.write(folder / "alone.exr", folder / "maps", exr_layers.LINEAR_REC709, {})
 
 
 def result(folder: Path, side: int) -> dict[str, object]:

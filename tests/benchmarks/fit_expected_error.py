@@ -20,7 +20,7 @@ from polcap.images import Floats, Network
 from polcap.pipeline import models
 from polcap.stages import infer
 from polcap.stages.infer import learned
-from polcap.training import patterns, protocol
+from polcap.training import gbuffers, patterns, protocol
 from polcap.training.protocol import MESHES, PROTOCOLS, Case, Protocol
 from polcap.training.score import angle, deciles
 
@@ -55,7 +55,7 @@ def main() -> None:
 def drawn(data: Path, out: Path, network: Network, size: int, which: int, rounds: int) -> Floats:
     """Stated error, roughness and true error (3, N) of pixels of one size and protocol."""
     parts = []
-    meshes = len(list((data / "meshes" / "train").glob("*.npz")))
+    meshes = len(gbuffers.training_meshes(data))
     for first in range(0, rounds * meshes, MESHES):
         files = {number: out / f"{size}_{which}_{number:03d}.npy" for number in range(first, first + MESHES)}
         missing = {number: file for number, file in files.items() if not file.exists()}
@@ -74,7 +74,7 @@ def linked(data: Path, folder: Path, sixth: int, meshes: int) -> None:
     """Six training meshes and ten training materials where `Protocol` looks for the evaluation's."""
     turn, place = divmod(sixth, meshes // MESHES)
     own = np.random.default_rng(turn).permutation(meshes)[place * MESHES :][:MESHES]
-    files = sorted((data / "meshes" / "train").glob("*.npz"))
+    files = gbuffers.training_meshes(data)
     sets = sorted(path.parent for path in (data / "materials" / "train").glob("*/albedo.jpg"))
     worn = np.random.default_rng([sixth]).permutation(len(sets))[: patterns.TEXTURES]
     for kind, chosen in (("meshes", [files[k] for k in own]), ("materials", [sets[k] for k in worn])):

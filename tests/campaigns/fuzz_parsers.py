@@ -39,10 +39,10 @@ from polcap.calibration_values import (
     Polarizer,
 )
 from polcap.errors import PolcapError
-from polcap.formats import calib, calibrations, npy_folder, text_file
-from polcap.formats.capture import capture_toml, file_name
+from polcap.formats import atomic, calib, calibrations, npy_folder, text_file
+from polcap.formats.capture import capture_toml
 from polcap.formats.maps import maps_folder as maps
-from polcap.formats.raw import exif, plausible, sniff
+from polcap.formats.raw import exif, file_checks, file_kind
 from polcap.images import ColorCalibration, Exif, StokesImage, View
 from polcap.rig import exposure_bracket, motor_elliptec_ell14, motor_grbl, motor_line_protocol, serial_port
 from polcap.rig.device_log import Log
@@ -152,9 +152,9 @@ def _report(data: bytes, folder: Path) -> object:
 
 def _header(data: bytes, folder: Path) -> object:
     file = io.BytesIO(data)
-    structure = sniff.structure(file)
-    plausible.check_structure("fuzz", structure, data)
-    return sniff.kind(file, ".dng"), structure.truncated, structure.dng
+    structure = file_kind.structure(file)
+    file_checks.check_structure("fuzz", structure, data)
+    return file_kind.kind(file, ".dng"), structure.truncated, structure.dng
 
 
 def _tags(data: bytes, folder: Path) -> object:
@@ -162,7 +162,7 @@ def _tags(data: bytes, folder: Path) -> object:
 
 
 def _jpeg(data: bytes, folder: Path) -> object:
-    plausible.check_jpeg("fuzz", data)
+    file_checks.check_jpeg("fuzz", data)
     return None
 
 
@@ -171,7 +171,7 @@ def _bracket(data: bytes, folder: Path) -> object:
 
 
 def _name(data: bytes, folder: Path) -> object:
-    name = file_name.safe(data.decode("utf-8", "surrogateescape"))
+    name = atomic.safe_name(data.decode("utf-8", "surrogateescape"))
     assert name and len(name.encode()) <= 100 and name.isprintable() and not set(name) & set("/\\:"), name
     return name
 

@@ -19,7 +19,7 @@ from unittest import mock
 import msgspec
 
 from polcap.errors import HardwareError, PolcapError, StorageError
-from polcap.formats.raw.photo_bytes import digest
+from polcap.formats.raw.file_bytes import digest
 from polcap.rig import capture_record, sequence, serial_port
 from polcap.rig.shooting_plan import CaptureOrder
 from tests.conftest import ROOT

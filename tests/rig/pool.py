@@ -13,7 +13,7 @@ import numpy as np
 
 from polcap.errors import HardwareError
 from polcap.formats.raw import dng
-from polcap.formats.raw.photo_bytes import digest
+from polcap.formats.raw.file_bytes import digest
 from polcap.images import Exif, Role
 from polcap.rig.call_timeout import call_within
 from polcap.rig.camera import CameraFile

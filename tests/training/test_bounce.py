@@ -84,3 +84,20 @@ def test_inside_of_a_bowl_gets_the_light_that_tracing_finds(degrees: float) -> N
 def test_outside_of_a_bowl_gets_next_to_nothing() -> None:
     inside, outside = (_both(_turned(degrees))[0] for degrees in (0, 180))
     assert outside[0].mean() < 0.03 * inside[0].mean()
+
+
+def test_outline_of_dark_gloss_shows_the_backdrop_polarized_across_the_normal() -> None:
+    polar = torch.linspace(0.05, 1.55, 60)
+    normal = torch.stack([torch.sin(polar), 0 * polar, torch.cos(polar)], dim=1)
+    v = torch.tensor([[0.0, 0.0, 1.0]]).expand(60, 3)
+    ones = torch.ones(60)
+    surface = Surface(normal, 0.03 * torch.ones(60, 3), 0.04 * torch.ones(60, 3), 0.2 * ones, 1.5 * ones)
+    place, flash = 0.2 * normal - v, torch.zeros(1, 3)
+    seen = SimpleNamespace(v=v, owner=torch.zeros(60).long(), place=place, open=ones, flash=flash)
+    torch.manual_seed(1)
+    rooms = torch.stack([bounce.surroundings(seen, normal, surface, torch.ones(1)) for _ in range(40)])
+    light, along = rooms[:, 0].mean(dim=-1), rooms[:, 1].mean(dim=-1)  # the normals lean along x
+    assert 0.4 < (light[:, -1] > 0).float().mean() < 0.9  # some objects have no surroundings
+    assert (along <= 1e-6).all() and light[:, -1].mean() > 5 * light[:, 20].mean()
+    seen.open = torch.zeros(60)
+    assert bounce.surroundings(seen, normal, surface, torch.ones(1)).abs().max() == 0

@@ -58,3 +58,10 @@ def test_a_mesh_that_no_side_shows_is_named_not_waited_for() -> None:
     needle = Triangles(corners, np.array([[0, 1, 2]], np.int32), np.tile(np.array([0, 0, 1], np.float32), (1, 3, 1)))
     with pytest.raises(InputError, match="the needle covers less than 6% of the picture"):
         gbuffers.seen("the needle", Tracer(needle), 32, np.random.default_rng(0))
+
+
+def test_withheld_meshes_are_not_trained_on(tmp_path: Path) -> None:
+    for name in ("some", "statue_maria"):
+        (tmp_path / "meshes" / "train").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "meshes" / "train" / f"{name}.npz").touch()
+    assert [mesh.stem for mesh in gbuffers.training_meshes(tmp_path)] == ["some"] and len(gbuffers.WITHHELD) == 20

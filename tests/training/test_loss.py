@@ -65,3 +65,19 @@ def test_gradients_are_finite_at_the_truth_and_far_from_it(batch: Batch) -> None
         }  # fmt: skip
         loss.total(used, batch, None)[0].backward()
         assert all(m.grad is not None and m.grad.isfinite().all() for m in maps.values())
+
+
+def test_a_region_turned_about_the_ray_costs_more_than_as_many_scattered_pixels(batch: Batch) -> None:
+    half = torch.tensor([-1.0, -1.0, 1.0]).view(1, 3, 1, 1)
+    size = batch.mask.shape[-1]
+    block = torch.zeros(size, size)
+    block[:, : size // 2] = 1
+    order = torch.randperm(size * size, generator=torch.Generator().manual_seed(1))
+    scattered = block.flatten()[order].view(size, size)
+    cost = {}
+    for name, where in (("block", block), ("scattered", scattered)):
+        maps = maps_of(batch)
+        maps["normal"] = torch.where(where.bool(), half * maps["normal"], maps["normal"])
+        cost[name] = parts(maps, batch)
+    assert cost["block"]["region"] > 1.5 * cost["scattered"]["region"] > 0
+    assert cost["block"]["normal"] < 1.5 * cost["scattered"]["normal"]

@@ -20,7 +20,7 @@ def test_materials_stay_within_their_bounds() -> None:
     surface, normal = dressed()
     assert surface.diffuse.min() >= 0.005 and surface.diffuse.max() <= 0.95
     assert surface.specular.min() >= 0.015 and surface.specular.max() <= 0.4
-    assert surface.roughness.min() >= 0.08 and surface.roughness.max() <= 1
+    assert surface.roughness.min() >= 0.05 and surface.roughness.max() <= 1
     assert surface.ior.min() >= 1.35 and surface.ior.max() <= 1.7
     tilt = torch.rad2deg(torch.acos((surface.normal * normal).sum(dim=1).clamp(-1, 1))).view(OBJECTS, PLACES)
     assert tilt.mean(dim=1).median() < 5 < tilt.max() < 60
@@ -42,3 +42,14 @@ def test_some_colors_leave_a_channel_dark_and_most_do_not() -> None:
     purity = colors.amin(dim=1) / colors.amax(dim=1)
     assert 0.02 < (purity < 0.05).float().mean() < 0.15 and (purity > 0.5).float().mean() > 0.4
     assert colors.min() >= 0.01 and colors.max() <= 0.95
+
+
+def test_an_eighth_of_all_objects_is_dark_gloss_everywhere_or_for_the_most_part() -> None:
+    surface, _ = dressed()
+    albedo = surface.diffuse.mean(dim=1).view(OBJECTS, PLACES)
+    dark = (albedo < 0.08) & (surface.roughness.view(OBJECTS, PLACES) < 0.4)
+    share = dark.float().mean(dim=1)
+    assert 0.07 < (share > 0.9).float().mean() < 0.2
+    assert ((share > 0.1) & (share < 0.9)).float().mean() > 0.02
+    whole = (share > 0.9)[:, None] & dark
+    assert 0.035 < surface.specular.mean(dim=1).view(OBJECTS, PLACES)[whole].median() < 0.05

@@ -71,6 +71,19 @@ def test_training_starts_from_a_shipped_model(data: Path, tmp_path: Path, monkey
     assert facts["training"].endswith("minutes, after 10 samples")
 
 
+def test_a_schedule_goes_on_where_the_shipped_weights_left_it(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(train.PRESETS, "cpu", PRESET)
+    export.write(settled(TINY), tmp_path / "first.onnx", {"training": "92 samples", "licence": "x"})
+    out = tmp_path / "out"
+    params = train.Params(data=data, out=out, samples=100, done=92, threads=1, start=tmp_path / "first.onnx")
+    _, facts = export.read(train.main(params))
+    _, state = train.load_average(out / "last.pt")
+    assert 100 <= state["samples"] < 120  # eight pictures are left of a hundred
+    assert facts["training"].startswith(f"{state['samples'] - 92} samples")
+
+
 def test_the_shipped_model_can_start_training() -> None:
     run = train.Run(model.SMALL, torch.device("cpu"), 1e-3)
     run.begin(ROOT / "calib" / "models" / "polcap.onnx")

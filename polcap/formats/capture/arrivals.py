@@ -1,4 +1,4 @@
-"""In: a folder that a camera or a person is filling, files that somebody edits. Out: when to look at them again."""
+"""Waits until a folder that a camera is filling, or a file that somebody edits, has changed and rests again."""
 
 import os
 import time
@@ -7,25 +7,17 @@ from pathlib import Path
 
 _POLL_S = 0.1
 
-Seen = dict[str, tuple[int, int]]  # size and time of change by path
+FileStates = dict[str, tuple[int, int]]  # size and time of change by path
 
 
 def settled(folder: Path, ignored: Path, still_s: float = 2.0, edited: Sequence[Path] = ()) -> Iterator[None]:
-    """Yield at once, then whenever files came, went or changed and came to rest.
+    """Yield at once, then each time files were added, removed or changed and nothing moved for `still_s` seconds.
 
-    Parameters
-    ----------
-    folder
-        It rests when nothing in it has moved for `still_s` seconds.
-    ignored
-        Not looked at (what is made of the folder may lie in it), nor is what begins with a dot.
-    still_s
-        As said.
-    edited
-        Files beside it that are written in one go, as editors save: they rest at the next look.
+    The folder `ignored` (of results) and names that begin with a dot are not watched. The files `edited` are saved in
+    one step, as by an editor: they count as at rest at the next poll.
     """
     folder, ignored = folder.resolve(), ignored.resolve()
-    done: tuple[Seen, Seen] | None = None
+    done: tuple[FileStates, FileStates] | None = None
     last, texts, since = _seen(folder, ignored), _stats(edited), time.monotonic()
     while True:
         now, texts_now = _seen(folder, ignored), _stats(edited)
@@ -40,9 +32,9 @@ def settled(folder: Path, ignored: Path, still_s: float = 2.0, edited: Sequence[
         time.sleep(_POLL_S)
 
 
-def _seen(folder: Path, ignored: Path) -> Seen:
-    """All files below the folder; those that vanish meanwhile are left out."""
-    found: Seen = {}
+def _seen(folder: Path, ignored: Path) -> FileStates:
+    """All files below the folder that still exist."""
+    found: FileStates = {}
     for root, folders, files in os.walk(folder):
         here = Path(root)
         folders[:] = [name for name in folders if not name.startswith(".") and (here / name) != ignored]
@@ -50,13 +42,13 @@ def _seen(folder: Path, ignored: Path) -> Seen:
     return found
 
 
-def _stats(files: Iterable[Path]) -> Seen:
-    """Of those that are there."""
-    found: Seen = {}
+def _stats(files: Iterable[Path]) -> FileStates:
+    """Size and time of change of the files that exist."""
+    found: FileStates = {}
     for file in files:
         try:
-            about = file.stat()
+            status = file.stat()
         except OSError:
             continue
-        found[str(file)] = about.st_size, about.st_mtime_ns
+        found[str(file)] = status.st_size, status.st_mtime_ns
     return found

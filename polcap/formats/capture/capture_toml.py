@@ -1,4 +1,4 @@
-"""A folder in, what its `capture.toml` states out; strict, so that a misspelt key is an error."""
+"""Reads capture.toml, the facts that a user states about a capture; a misspelt key is an error."""
 
 import os
 from pathlib import Path
@@ -9,7 +9,6 @@ from msgspec import Meta, Struct
 
 from polcap.errors import CaptureError
 from polcap.formats import text_file
-from polcap.formats.capture.stated import fault
 from polcap.images import Role
 
 NAME = "capture.toml"
@@ -27,10 +26,10 @@ class FrameEntry(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Rotator(Struct, frozen=True, forbid_unknown_fields=True):
-    """What turned the polarizer; kept in the notes."""
+    """The device that turned the polarizer; for the notes only."""
 
     model: str = ""
-    log: str = ""  # file of the angles reached, beside capture.toml
+    log: str = ""  # file of the angles reached, in the same folder
 
 
 class CaptureFile(Struct, frozen=True, forbid_unknown_fields=True):
@@ -53,12 +52,13 @@ def load(folder: Path) -> CaptureFile:
     path = folder / NAME
     if not os.path.lexists(path):
         return CaptureFile()
-    given: dict[str, Any] = {}
+    document: dict[str, Any] = {}
     try:
-        given = text_file.read_toml(path)
-        stated = msgspec.convert(given, CaptureFile)
+        document = text_file.read_toml(path)
+        stated = msgspec.convert(document, CaptureFile)
     except msgspec.ValidationError as error:
-        raise CaptureError(f"{path}: {fault(error, given, CaptureFile)}; see the reference page on captures") from None
+        fault = text_file.fault(error, document, CaptureFile)
+        raise CaptureError(f"{path}: {fault}; see the reference page on captures") from None
     except ValueError as error:  # of TOML, of UTF-8
         raise CaptureError(f"{path}: {error}; see the reference page on captures") from None
     except OSError as error:
@@ -69,5 +69,5 @@ def load(folder: Path) -> CaptureFile:
         if entry.exposure and entry.flash_energy:
             raise CaptureError(f"{path}: {entry.file} states both exposure and flash_energy; give one of them")
     if stated.rotator and stated.rotator.log and not (folder / stated.rotator.log).is_file():
-        raise CaptureError(f"{path}: rotator log {stated.rotator.log} is not there; correct or remove the line")
+        raise CaptureError(f"{path}: no rotator log {stated.rotator.log}; correct or remove the line")
     return stated

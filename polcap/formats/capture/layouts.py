@@ -1,6 +1,7 @@
-"""A capture's folder in, which photograph was taken at which angle out: the four layouts.
+"""Finds which photograph of a folder was taken at which angle, by one of four layouts.
 
-Nothing is decoded here; `capture.py` checks and builds the `Capture`.
+Folders pol000, pol045, …; capture.toml; one flat folder; frames of a polarization sensor. No pixel is decoded;
+`reader` checks the plan and builds the `Capture`.
 """
 
 import os
@@ -21,22 +22,22 @@ from polcap.formats.raw import photo, probe
 from polcap.formats.raw.probe import Probe
 from polcap.images import Role
 
-OUTPUT = "polcap"  # where results go by default
-BATCH = "polcap-batch"  # where a batch keeps its records: in ROOT or in --out; safe to delete
-OURS = (OUTPUT, BATCH)  # folders among photographs that hold none
+OUTPUT = "polcap"  # default folder of results
+BATCH = "polcap-batch"  # folder of a batch's records, in ROOT or in --out; safe to delete
+OURS = (OUTPUT, BATCH)  # these folders hold no photographs
 DEFAULT_DEG = (0.0, 45.0, 90.0)
-APART_DEG = 5.0  # closer angles do not count as different
-EQUAL_STOPS = 0.15  # EXIF rounds times to a sixth of a stop at worst
+SEPARATION_DEG = 5.0  # closer angles count as one
+EQUAL_STOPS = 0.15  # EXIF rounds exposure times to a sixth of a stop at most
 _POL_FOLDER = re.compile(r"pol[ _-]?(\d+(?:\.\d+)?)", re.IGNORECASE)
 _CROSS_FOLDER = re.compile(r"cross(?:[ _-]?(\d+(?:\.\d+)?))?", re.IGNORECASE)
-_AT_ONCE = 2  # files that are read side by side: as many processes as decode them afterwards
+_AT_ONCE = 2  # files read in parallel: as many child processes as decode them later
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 Look = Callable[[Path], Probe]  # `probe.read`, or one that remembers
 
 
 @dataclass(frozen=True)
 class Source:
-    """One photograph and its part in the capture."""
+    """One photograph and its role in the capture."""
 
     path: Path
     probe: Probe
@@ -48,7 +49,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Plan:
-    """Which photograph is which."""
+    """The shots of a capture, and its other photographs."""
 
     layout: Literal["folders", "toml", "flat", "sensor"]
     shots: tuple[tuple[float, tuple[Source, ...]], ...]  # degrees, bracket; in the order of the capture
@@ -63,24 +64,15 @@ class _Listing:
 
 
 def plan(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None, look: Look = probe.read) -> Plan:
-    """Understand a folder.
+    """Plan the shots of a folder with its capture.toml.
 
-    Parameters
-    ----------
-    folder
-        Of the capture.
-    stated
-        Its capture.toml.
-    angles_deg
-        The order of a flat folder; where folders, names or capture.toml give the angles, which of them to use, the
-        first being the reference.
-    look
-        Reads what a file tells.
+    `angles_deg` is the order of a flat folder; where folders, names or capture.toml state the angles, it picks from
+    them, the first being the reference. `look` reads the facts of a file.
 
     Raises
     ------
     CaptureError
-        The folder and its names do not add up.
+        The folder and its names do not form a capture.
     """
     if stated.frame:
         return _toml(folder, stated, angles_deg, look)
@@ -93,9 +85,9 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None, 
         named = f"{', '.join(path.name for path in inside[:4])}{', …' if len(inside) > 4 else ''}"
         hint = "; give the folder that holds the photographs"
         if any(_pol_folders(path) for path in inside):
-            hint = f"; its sub-folders {named} hold captures: give one of them, or `polcap batch` the folder of all"
+            hint = f"; its sub-folders {named} hold captures: give one of them, or run `polcap batch` on the folder"
         elif (folder / "report.json").is_file() and (folder / "maps").is_dir():
-            hint = "; it is a result: give the capture that it was made of"
+            hint = "; it is a result of polcap: give the folder of the photographs"
         elif inside:
             hint = f"; its sub-folders are {named}, but polcap looks for pol000, pol045, …"
         raise CaptureError(f"{folder}: holds no photograph that polcap reads{hint}")
@@ -108,9 +100,9 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None, 
 
 
 def looks_like_a_capture(folder: Path, inside: Iterable[str], files: Iterable[str]) -> bool:
-    """Whether a folder of these sub-folders and files is one capture, by names and the first bytes of files alone.
+    """Whether a folder of these sub-folders and files is one capture, by names and the first bytes of files.
 
-    Photographs beside sub-folders are taken for somebody's notes, unless capture.toml says otherwise.
+    Photographs in a folder that has sub-folders are taken for notes, unless there is a capture.toml.
     """
     if capture_toml.NAME in files or any(_POL_FOLDER.fullmatch(name) for name in inside):
         return True
@@ -128,7 +120,7 @@ def _toml(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None,
         if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder)):
             raise CaptureError(f"{folder / capture_toml.NAME}: {entry.file} lies outside the folder; move it inside")
         if not path.is_file():
-            raise CaptureError(f"{folder / capture_toml.NAME}: {entry.file} is not there; correct or remove its entry")
+            raise CaptureError(f"{folder / capture_toml.NAME}: no file {entry.file}; correct or remove its entry")
         found = _probe(path, look)
         if found.kind == "other":
             raise CaptureError(f"{folder / capture_toml.NAME}: {entry.file} is not a photograph; remove its entry")
@@ -139,13 +131,13 @@ def _toml(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None,
         return Plan("sensor", _sensor_shots(shots, angles_deg), others)
     repeats = [source for source in sources if source.role == "repeat"]
     brackets = _select(folder, _group(shots), angles_deg)
-    again = [(angle, tuple(bracket)) for angle, bracket in _group(repeats).items() if _near(angle, dict(brackets))]
-    return Plan("toml", (*brackets, *again), others)
+    repeated = [(angle, tuple(bracket)) for angle, bracket in _group(repeats).items() if _near(angle, dict(brackets))]
+    return Plan("toml", (*brackets, *repeated), others)
 
 
 def _near(angle_deg: float, known_deg: Iterable[float]) -> bool:
-    """A motor comes back to an angle by a hair's breadth."""
-    return any(abs((angle_deg - known + 90) % 180 - 90) < APART_DEG for known in known_deg)
+    """Whether an angle equals a known one but for a motor's tolerance."""
+    return any(abs((angle_deg - known + 90) % 180 - 90) < SEPARATION_DEG for known in known_deg)
 
 
 def _group(sources: Iterable[Source]) -> dict[float, list[Source]]:
@@ -168,19 +160,19 @@ def _folders(folder: Path, sub_folders: dict[float, Path], angles_deg: Sequence[
         groups[angle] = listing.pictures
         notes += [f"{sub_folder.name}: {note}" for note in listing.notes]
     crossed = _crossed(folder, look)
-    beside = sorted(
+    unused = sorted(
         path.name
         for path in children(folder)
         if path.is_dir() and path not in sub_folders.values() and path.name not in OURS and not _is_crossed(path.name)
     )
-    notes += [f"not used: the folders {', '.join(beside)}"] if beside else []
+    notes += [f"not used: the folders {', '.join(unused)}"] if unused else []
     loose = sorted(path.name for path in children(folder) if path.is_file() and path.name != capture_toml.NAME)
     notes += [f"not used: the files {', '.join(loose[:4])}{', …' if len(loose) > 4 else ''}"] if loose else []
     return Plan("folders", _select(folder, groups, angles_deg), crossed, tuple(notes))
 
 
 def numbered(folder: Path) -> list[str]:
-    """Sub-folders whose names hold a number that is not read as an angle: 045, angle45."""
+    """Sub-folders whose names hold a number but are not read as an angle: 045, angle45."""
     return [
         path.name
         for path in children(folder)
@@ -192,7 +184,7 @@ def _crossed(folder: Path, look: Look) -> tuple[Source, ...]:
     """The photographs of cross/ or cross045/, whose number is the angle of the filter before the lens."""
     places = [path for path in children(folder) if path.is_dir() and _is_crossed(path.name)]
     if len(places) > 1:
-        raise CaptureError(f"{places[1]}: {places[0].name} holds a cross-polarised shot too; keep one of the two")
+        raise CaptureError(f"{places[1]}: {places[0].name} holds a cross-polarized shot too; remove one of the two")
     if not places:
         return ()
     match = _CROSS_FOLDER.fullmatch(places[0].name)
@@ -210,7 +202,7 @@ def _is_crossed(name: str) -> bool:
 
 
 def degrees(angle_deg: float) -> str:
-    """An angle 0…360 as folders of shots are named by it: 045, 022.5; to a thousandth."""
+    """An angle 0…360 as in the names of shot folders: 045, 022.5; to a thousandth."""
     whole, _, rest = f"{angle_deg:.3f}".partition(".")
     return f"{int(whole):03d}" + (f".{rest.rstrip('0')}" if rest.strip("0") else "")
 
@@ -229,13 +221,13 @@ def _pol_folders(folder: Path) -> dict[float, Path]:
             if angle > 360:
                 raise CaptureError(f"{path}: {angle:g}° is not an angle of a polarizer; name it by 0 to 360 degrees")
             if angle in found:
-                raise CaptureError(f"{path}: {angle:g}° is also in {found[angle].name}; keep one of the two folders")
+                raise CaptureError(f"{path}: {angle:g}° is also in {found[angle].name}; remove one of the two folders")
             found[angle] = path
     return dict(sorted(found.items()))
 
 
 def _is_sensor(pictures: list[Source], angles_deg: Sequence[float] | None) -> bool:
-    """One or two grey pictures, of which no three angles can come in another way."""
+    """One or two grey pictures: three angles can only be a polarization sensor's."""
     return len(pictures) <= 2 and not angles_deg and all(_is_grey(source) for source in pictures)
 
 
@@ -256,7 +248,7 @@ def _sensor_shots(
 
 
 def _named(folder: Path, listing: _Listing, angles_deg: Sequence[float] | None) -> Plan | None:
-    """Finished pictures whose names differ in one number, which can only be an angle."""
+    """Finished pictures whose names differ in one number that can only be an angle."""
     pictures = listing.pictures
     if any(source.probe.kind == "raw" for source in pictures):  # a camera's file numbers
         return None
@@ -291,7 +283,7 @@ def _by_time(folder: Path, listing: _Listing, angles_deg: Sequence[float]) -> Pl
         raise CaptureError(f"{folder}: {count} frames do not make {shots} equal brackets (angles {listed}); {remedy}")
     size = count // shots
     if not timed and size > 1:
-        raise CaptureError(f"{folder}: {count} frames without EXIF times cannot be told apart; {sort}")
+        raise CaptureError(f"{folder}: {count} frames without EXIF times cannot be assigned to angles; {sort}")
     brackets = [order[at : at + size] for at in range(0, count, size)]
     first = [facts[source.path].relative_exposure for source in brackets[0]]
     for angle, bracket in zip(angles_deg, brackets):
@@ -299,8 +291,8 @@ def _by_time(folder: Path, listing: _Listing, angles_deg: Sequence[float]) -> Pl
             value = facts[source.path].relative_exposure
             if not equal(value, reference):
                 raise CaptureError(
-                    f"{source.path}: is exposed {_times(value, reference)} as the first bracket's frame in its "
-                    f"place; these {count} frames {by} are no {shots} equal brackets ({angle:g}°); {remedy}"
+                    f"{source.path}: its exposure is {_times(value, reference)} that of the same frame of the first "
+                    f"bracket; these {count} frames {by} are not {shots} equal brackets ({angle:g}°); {remedy}"
                 )
     note = f"{count} frames {by} taken as {shots} brackets of {size}, in the order {listed}°"
     shots_ = tuple((angle, tuple(bracket)) for angle, bracket in zip(angles_deg, brackets))
@@ -308,14 +300,14 @@ def _by_time(folder: Path, listing: _Listing, angles_deg: Sequence[float]) -> Pl
 
 
 def equal(value: float | None, reference: float | None) -> bool:
-    """Two exposures are the same as far as the camera states them."""
+    """Whether two exposures are the same, as precisely as the camera states them."""
     if not value or not reference:
         return value == reference
     return max(value / reference, reference / value) < 2**EQUAL_STOPS
 
 
 def _times(value: float | None, reference: float | None) -> str:
-    return f"{value / reference:.3g} times" if value and reference else "not as clearly stated"
+    return f"{value / reference:.3g} times" if value and reference else "not stated like"
 
 
 def _select(
@@ -330,14 +322,14 @@ def _select(
 
 
 def different(angles_deg: Iterable[float]) -> int:
-    """How many angles differ as polarizer axes do, modulo 180 degrees."""
+    """The number of different polarizer axes, modulo 180 degrees."""
     axes = sorted(angle % 180 for angle in angles_deg)
     gaps = [b - a for a, b in pairwise([*axes, axes[0] + 180])] if axes else []
-    return max(sum(gap >= APART_DEG for gap in gaps), 1 if axes else 0)
+    return max(sum(gap >= SEPARATION_DEG for gap in gaps), 1 if axes else 0)
 
 
 def _list(folder: Path, look: Look) -> _Listing:
-    """The photographs of one folder; where a RAW is there, the finished pictures stand back."""
+    """The photographs of one folder; finished pictures are left out where there is a RAW."""
     listing = _Listing()
     files = [path for path in children(folder) if path.is_file()]
     probes = parallel.results([partial(_probe, path, look) for path in files], min(_AT_ONCE, parallel.threads()))
@@ -349,7 +341,7 @@ def _list(folder: Path, look: Look) -> _Listing:
         extra = [source.path for source in pictures if source.probe.kind == "photo"]
         paired = sum(path.stem.lower() in stems for path in extra)
         if paired:
-            listing.notes.append(f"{paired} pictures beside a RAW of the same name: the RAW is used")
+            listing.notes.append(f"{paired} pictures have a RAW of the same name: the RAW is used")
         if paired < len(extra):
             listing.notes.append(f"not used: {len(extra) - paired} finished pictures among RAW files")
     listing.pictures = sorted(raws or pictures, key=lambda source: natural(source.path.name))
@@ -357,21 +349,15 @@ def _list(folder: Path, look: Look) -> _Listing:
 
 
 def _probe(path: Path, look: Look) -> Probe:
-    """What a file tells; bytes that nothing can read are an error."""
+    """The facts of a file; CaptureError where no decoder can read it."""
     found = look(path)
     if found.kind == "unknown":
-        raise CaptureError(f"{path}: no picture, no RAW that LibRaw knows and no text; restore it, or remove it")
+        raise CaptureError(f"{path}: not a picture, a RAW that LibRaw knows, or text; restore the file, or remove it")
     return found
 
 
 def children(folder: Path) -> list[Path]:
-    """What lies in a folder, by name, without what systems hide there: .DS_Store, ._DSC0001.NEF.
-
-    Raises
-    ------
-    CaptureError
-        It cannot be listed.
-    """
+    """The files and folders in a folder, by name, without hidden ones (.DS_Store, ._DSC0001.NEF); CaptureError."""
     try:
         return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     except OSError as error:
@@ -379,5 +365,5 @@ def children(folder: Path) -> list[Path]:
 
 
 def natural(name: str) -> tuple[tuple[int, str], ...]:
-    """Sorting key under which frame 9 comes before frame 10."""
+    """Sorting key that puts frame 9 before frame 10."""
     return tuple((int(part), "") if part.isdecimal() else (-1, part.lower()) for part in re.split(r"(\d+)", name))

@@ -1,4 +1,4 @@
-"""A folder in, the capture it holds out: shots, brackets, camera, and a table of what was understood."""
+"""Reads a capture folder: shots, brackets, camera, lens and calibration, checked; and prints them as a table."""
 
 import math
 import os
@@ -9,32 +9,31 @@ from pathlib import Path
 import numpy as np
 
 from polcap.errors import CaptureError
-from polcap.formats import calibrations
-from polcap.formats.capture import capture_toml, file_name, layouts
+from polcap.formats import atomic, calibrations
+from polcap.formats.capture import capture_toml, focal_length, layouts
 from polcap.formats.capture.capture_toml import CaptureFile
 from polcap.formats.capture.layouts import Source
-from polcap.formats.raw import focal, photo, probe
-from polcap.formats.raw import libraw as raw
+from polcap.formats.raw import libraw, photo, probe
 from polcap.images import Capture, Exif, Frame, SensorImage, Shot
 
-_ZOOM = 0.01  # relative change of the focal length that is more than rounding
+_ZOOM = 0.01  # relative change of the focal length above rounding
 LOSS = ": normals and albedo lose accuracy against RAW"
 Loader = Callable[[], SensorImage]
 
 
 def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, look: layouts.Look = probe.read) -> Capture:
-    """Understand a capture folder: pol000/ pol045/ …, capture.toml, flat, or polarization-sensor frames.
+    """Read a capture folder: pol000/ pol045/ …, capture.toml, flat, or polarization-sensor frames.
 
     Every file's metadata and bytes are read, no pixel is decoded. `angles_deg` is the order of
     the brackets of a flat folder (0, 45, 90 by default); elsewhere it picks from the angles that
-    the folder states, the first being the reference. `look` reads a file, or remembers what it told.
+    the folder states, the first being the reference. `look` reads the facts of a file.
 
     Raises
     ------
     CaptureError
-        What does not add up, naming the file, the reason and the remedy.
+        The photographs do not form a capture; the message names the file, the reason and the remedy.
     DecodeError
-        A file that is cut short, or that no decoder recognises.
+        A file is cut short, or no decoder recognises it.
     """
     folder = Path(folder)
     if folder.is_file():
@@ -43,7 +42,7 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, look: 
         raise CaptureError(f"{folder}: no such folder; give the folder that holds the photographs")
     stated = capture_toml.load(folder)
     if angles_deg is not None:
-        _check_angles(folder, angles_deg, "--angles names")
+        _check_angles(folder, angles_deg, "--angles states")
     plan = layouts.plan(folder, stated, angles_deg, look)
     _check_angles(folder, [angle for angle, _ in plan.shots], "the shots' angles are")
 
@@ -61,7 +60,7 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, look: 
     _check_brackets(shots)
     crossed = None if plan.layout == "sensor" else _crossed(folder, plan, stated)
     reference = shots[0].frames[0].exif
-    lens = focal.find(reference, stated.focal_length_mm, stated.sensor_width_mm)
+    lens = focal_length.find(reference, stated.focal_length_mm, stated.sensor_width_mm)
     step = 2 if plan.layout == "sensor" else 1  # a plane of a sensor mosaic has half its sides
     width, height = (reference.width or 0) // step, (reference.height or 0) // step
     notes = _notes(plan.layout, plan.others, plan.shots[0][1][0], shots, stated)
@@ -71,11 +70,12 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, look: 
     geometry = calibration.geometry if calibration is not None else None
     if geometry is not None and geometry.size_px == (width, height):
         focal_px, principal = geometry.focal_px, geometry.principal_px
-        lens = focal.Focal(focal_px, (0.0, 0.0), f"{focal_px:.0f} px ± {geometry.focal_sigma_px:.1f} (calibrated)")
+        note = f"{focal_px:.0f} px ± {geometry.focal_sigma_px:.1f} (calibrated)"
+        lens = focal_length.FocalLength(focal_px, (0.0, 0.0), note)
     else:
         principal = ((width - 1) / 2, (height - 1) / 2)
     return Capture(
-        name=file_name.safe(stated.name or Path(os.path.realpath(folder)).name),
+        name=atomic.safe_name(stated.name or Path(os.path.realpath(folder)).name),
         folder=str(folder),
         shots=shots,
         layout=plan.layout,
@@ -92,7 +92,7 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, look: 
 
 
 def table(capture: Capture) -> str:
-    """What was understood, as text: one line per frame, then camera, lens, focal length and notes."""
+    """The capture as text: one line per frame, then camera, lens, focal length and notes."""
     rows = [["angle", "file", "role", "exposure", "ISO", "f/", "flash", "taken"]]
     for shot in capture.shots:
         for frame in (*shot.frames, *shot.ambient):
@@ -142,43 +142,43 @@ def _shot(plan: layouts.Plan, stated: CaptureFile, angle_deg: float, bracket: Se
 
 
 def _crossed(folder: Path, plan: layouts.Plan, stated: CaptureFile) -> Shot | None:
-    """The shot under the polarized flash; the first shot's angle where nobody states the filter's."""
+    """The shot under the polarized flash; at the first shot's angle where the filter's is not stated."""
     sources = [source for source in plan.others if source.role == "cross"]
     if not sources:
         return None
     angles = {source.angle_deg for source in sources}
     if len(angles) > 1:
         listed = ", ".join("unstated" if angle is None else f"{angle:g}°" for angle in angles)
-        raise CaptureError(f"{folder}: cross-polarised frames at {listed}; take them at one angle of the lens's filter")
+        raise CaptureError(f"{folder}: cross-polarized frames at {listed}; take them at one angle of the lens's filter")
     angle = angles.pop()
     return _shot(plan, stated, plan.shots[0][0] if angle is None else angle, sources)
 
 
 def _frame(plan: layouts.Plan, stated: CaptureFile, source: Source, angle_deg: float) -> Frame:
-    load, manner = _loader(source, stated, angle_deg if plan.layout == "sensor" else None)
-    alone = source.probe.kind == "raw" and plan.layout != "sensor"  # nothing beside the file decides its values
+    load, settings = _loader(source, stated, angle_deg if plan.layout == "sensor" else None)
+    alone = source.probe.kind == "raw" and plan.layout != "sensor"  # only the file decides its values
     return Frame(
         path=str(source.path),
         exif=source.probe.exif,
         role=source.role,
-        digest=" ".join([source.probe.digest, *manner]),
+        digest=" ".join([source.probe.digest, *settings]),
         load=load,
         exposure=_stated_exposure(source),
-        within=partial(raw.within, source.path, source.probe.digest) if alone else None,
+        within=partial(libraw.within, source.path, source.probe.digest) if alone else None,
     )
 
 
 def _loader(source: Source, stated: CaptureFile, mosaic_deg: float | None) -> tuple[Loader, list[str]]:
-    """How to read a frame, and whatever beside the file's bytes decides its values."""
-    path, told = source.path, source.probe
-    manner = [f"{stated.white:g}"] if stated.white else []
-    manner += [f"-{stated.black:g}"] if stated.black else []
-    levels = (stated.white, stated.black, told.digest)
+    """How to read a frame, and the settings besides its bytes that decide its values."""
+    path, found = source.path, source.probe
+    settings = [f"{stated.white:g}"] if stated.white else []
+    settings += [f"-{stated.black:g}"] if stated.black else []
+    levels = (stated.white, stated.black, found.digest)
     if mosaic_deg is not None:
-        return partial(photo.read_mosaic, path, mosaic_deg, *levels, told.kind), [f"sensor {mosaic_deg:g}", *manner]
-    if told.kind == "raw":
-        return partial(raw.read, path, told.digest), []
-    return partial(photo.read, path, stated.encoding, *levels), [stated.encoding or "default", *manner]
+        return partial(photo.read_mosaic, path, mosaic_deg, *levels, found.kind), [f"sensor {mosaic_deg:g}", *settings]
+    if found.kind == "raw":
+        return partial(libraw.read, path, found.digest), []
+    return partial(photo.read, path, stated.encoding, *levels), [stated.encoding or "default", *settings]
 
 
 def _stated_exposure(source: Source) -> float | None:
@@ -214,19 +214,19 @@ def _check_angles(folder: Path, angles_deg: Sequence[float], who: str) -> None:
 def _check_one_camera(facts: dict[Path, Exif]) -> None:
     first_path, first = next(iter(facts.items()))
     for path, fact in facts.items():
-        what = ""
+        fault = ""
         if (fact.make, fact.model) != (first.make, first.model):
-            what = f"was taken with {fact.make} {fact.model}, not {first.make} {first.model}"
+            fault = f"was taken with {fact.make} {fact.model}, not {first.make} {first.model}"
         elif fact.lens and first.lens and fact.lens != first.lens:
-            what = f"was taken through {fact.lens}, not {first.lens}"
+            fault = f"was taken through {fact.lens}, not {first.lens}"
         elif (fact.width, fact.height) != (first.width, first.height):
-            what = f"has {fact.width}×{fact.height} px, not {first.width}×{first.height}"
+            fault = f"has {fact.width}×{fact.height} px, not {first.width}×{first.height}"
         elif fact.focal_length_mm and first.focal_length_mm:
             ratio = fact.focal_length_mm / first.focal_length_mm
             if abs(ratio - 1) > _ZOOM:
-                what = f"was taken at {fact.focal_length_mm:g} mm, not {first.focal_length_mm:g} mm"
-        if what:
-            raise CaptureError(f"{path}: {what} as {first_path.name}; keep one set-up per capture, or remove the file")
+                fault = f"was taken at {fact.focal_length_mm:g} mm, not {first.focal_length_mm:g} mm"
+        if fault:
+            raise CaptureError(f"{path}: {fault} as {first_path.name}; use one set-up per capture, or remove the file")
 
 
 def _check_no_duplicate(digests: dict[Path, str]) -> None:
@@ -234,7 +234,7 @@ def _check_no_duplicate(digests: dict[Path, str]) -> None:
     for path, digest in digests.items():
         if digest in seen:
             raise CaptureError(
-                f"{path}: is the same photograph as {seen[digest]}; remove one, and shoot what is missing"
+                f"{path}: is the same photograph as {seen[digest]}; remove one, and shoot the missing one"
             )
         seen[digest] = path
 
@@ -272,7 +272,7 @@ def _notes(
     notes = []
     cross = sum(source.role == "cross" for source in others)
     if cross and layout == "sensor":
-        notes.append(f"not used: {cross} cross-polarised frames, which a polarization sensor cannot take")
+        notes.append(f"not used: {cross} cross-polarized frames, which a polarization sensor cannot take")
     if layout != "sensor" and reference.probe.kind == "photo":
         bits = reference.probe.bits
         encoding = photo.encoding_of(bits, stated.encoding)
@@ -287,5 +287,5 @@ def _notes(
         and None not in exposures
         and np.ptp(np.log2(np.array(exposures, float))) < layouts.EQUAL_STOPS
     ):
-        notes.append("the frames of a bracket state equal exposures; their ratios come from the pixels")
+        notes.append("all frames of a bracket state the same exposure; their ratios are measured from the pixels")
     return notes

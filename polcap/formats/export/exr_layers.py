@@ -1,22 +1,26 @@
-"""In: the folder maps/ of a result. Out: one OpenEXR file with every map and the Stokes images as layers.
+"""Writes every map and the Stokes images of a result as layers of one OpenEXR file, in a chosen color space.
 
-Colours may go to another colour space; the file says which (chromaticities, colorInteropID). S0, S1
-and S2 stay in camera channels.
+Colors are converted to any space or role of the OpenColorIO configuration $OCIO, by default the one built into
+OpenImageIO (ACES' CG config); the header names it (chromaticities, colorInteropID). S0, S1 and S2 stay in camera
+channels.
 """
 
+import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from polcap.formats.export import ocio
+from polcap.errors import SettingError
 from polcap.formats.maps import exr, png
 from polcap.images import Floats
 
+LINEAR_REC709 = "lin_rec709"  # its alias in OpenColorIO configurations
 _COLORS = ("diffuse", "specular")
 _PLAIN = {"depth": "Z", "roughness": "Y", "confidence": "Y"}
-_WHOLE = ("normal", "depth")  # layers in float; all others in half
-SAYS = {
+_FLOAT = ("normal", "depth")  # layers of 32 bits; all others are half
+MEANINGS = {
     "S0, S1, S2": "linear Stokes parameters in camera channels; sensor white at the reference exposure = 1",
     "normal": "unit vectors in the camera frame: x right, y up, z toward the camera",
     "depth": "distance along the optical axis, growing away from the camera",
@@ -30,19 +34,17 @@ SAYS = {
 }
 
 
-def write(path: Path, maps: Path, color: str, says: Mapping[str, str]) -> None:
-    """Write every map of a result as the layers of one OpenEXR file.
+@dataclass(frozen=True)
+class ColorSpace:
+    """A color space of the OpenColorIO configuration."""
 
-    Parameters
-    ----------
-    path
-        The file.
-    maps
-        Folder with the maps, as `formats.maps.write` leaves it.
-    color
-        Space or role of the OpenColorIO configuration that the colors are converted to.
-    says
-        Header entries: where the result comes from.
+    name: str
+    interop_id: str | None  # Color Interop Forum's name, where the configuration has it
+    chromaticities: tuple[float, ...] | None  # (8,) xy of R, G, B and white
+
+
+def write(path: Path, maps: Path, color: str, header: Mapping[str, str]) -> None:
+    """Write the maps of a result's folder `maps` as layers, their colors in the space or role `color`.
 
     Raises
     ------
@@ -53,11 +55,11 @@ def write(path: Path, maps: Path, color: str, says: Mapping[str, str]) -> None:
     StorageError
         The file cannot be written.
     """
-    space = ocio.find(color)
+    space = find_space(color)
     layers: dict[str, Floats] = {}
     for name in _COLORS:
         found, _ = exr.read(maps / f"{name}.exr")
-        converted = ocio.convert(np.stack([found[c] for c in "RGB"], axis=-1), space)
+        converted = convert(np.stack([found[c] for c in "RGB"], axis=-1), space)
         layers |= {f"{name}.{c}": converted[..., k] for k, c in enumerate("RGB")}
     normal, _ = exr.read(maps / "normal.exr")
     layers |= {f"normal.{axis}": normal[c] for axis, c in zip("xyz", "RGB")}
@@ -67,15 +69,64 @@ def write(path: Path, maps: Path, color: str, says: Mapping[str, str]) -> None:
     layers |= {f"{name}.Y": cues[name] for name in ("dolp", "aolp")}
     layers["mask.Y"] = (png.read(maps / "mask.png") > 127).astype(np.float32)
     layers |= exr.read(maps / "stokes.exr")[0]
-    exr.write(path, layers, _attributes(space, says), half=[name for name in layers if not name.startswith(_WHOLE)])
+    exr.write(path, layers, _attributes(space, header), half=[name for name in layers if not name.startswith(_FLOAT)])
 
 
-def _attributes(space: ocio.Space, says: Mapping[str, str]) -> dict[str, exr.Attribute]:
-    attributes: dict[str, exr.Attribute] = {f"polcap:{key}": value for key, value in says.items()}
-    attributes |= {f"polcap:layer {key}": value for key, value in SAYS.items()}
+def _attributes(space: ColorSpace, header: Mapping[str, str]) -> dict[str, exr.Attribute]:
+    attributes: dict[str, exr.Attribute] = {f"polcap:{key}": value for key, value in header.items()}
+    attributes |= {f"polcap:layer {key}": value for key, value in MEANINGS.items()}
     attributes["polcap:colors"] = f"{', '.join(_COLORS)} in {space.name}"
     if space.interop_id is not None:
         attributes["colorInteropID"] = space.interop_id
     if space.chromaticities is not None:
         attributes["chromaticities"] = space.chromaticities
     return attributes
+
+
+def find_space(wanted: str) -> ColorSpace:
+    """The color space with this role, name or alias.
+
+    Raises
+    ------
+    SettingError
+        The configuration has no such space, or it is data or a display.
+    """
+    import OpenImageIO as oiio
+
+    source = _source()
+    config = oiio.ColorConfig(source)
+    if config.geterror() or not config.getColorSpaceNames():
+        raise SettingError(f"$OCIO {source} cannot be read as an OpenColorIO configuration; correct or unset it")
+    name = config.resolve(wanted)
+    if name not in config.getColorSpaceNames() or config.isData(name):
+        known = ", ".join(sorted([*config.getRoles(), *config.getColorSpaceNames()]))
+        raise SettingError(f"--color {wanted} is not a color space or role of {source}; it has {known}")
+    white = config.get_chromaticities(name)
+    return ColorSpace(
+        name=name,
+        interop_id=config.get_color_interop_id(name) or None,
+        chromaticities=tuple(float(x) for x in white) if white else None,
+    )
+
+
+def convert(rgb: Floats, space: ColorSpace) -> Floats:
+    """Convert linear Rec.709 (H, W, 3) to the space.
+
+    Raises
+    ------
+    SettingError
+        The configuration cannot convert from linear Rec.709.
+    """
+    import OpenImageIO as oiio
+
+    source = oiio.ImageBuf(np.ascontiguousarray(rgb, dtype=np.float32))
+    done = oiio.ImageBufAlgo.colorconvert(source, LINEAR_REC709, space.name, colorconfig=_source())
+    if done.has_error:
+        raise SettingError(
+            f"cannot convert linear Rec.709 to {space.name} ({exr.reason(done)}); choose another --color or $OCIO"
+        )
+    return np.asarray(done.get_pixels(oiio.FLOAT), dtype=np.float32)
+
+
+def _source() -> str:
+    return os.environ.get("OCIO") or "ocio://default"

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from polcap.errors import DecodeError
 from polcap.formats.maps import png
-from polcap.formats.raw import photo_bytes, worker
+from polcap.formats.raw import file_bytes, worker
 from polcap.images import Asset, Mesh
 
 _SIZES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -106,7 +106,7 @@ def read(path: Path, digest: str, ours: bool = False) -> Stored:
 
 def decode(path: str, digest: str) -> worker.Answer:
     """What `read` reads; raises DecodeError."""
-    data = photo_bytes.load(path, digest)
+    data = file_bytes.load(path, digest)
     try:
         return _parsed(path, data)
     except (struct.error, ValueError, LookupError, TypeError, cv2.error) as error:

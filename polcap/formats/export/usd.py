@@ -1,9 +1,9 @@
-"""In: an Asset. Out: one USD file: its mesh, and its material as OpenPBR and as UsdPreviewSurface.
+"""Writes an asset as USD: the mesh, and its material as OpenPBR and as UsdPreviewSurface.
 
-Renderers that read MaterialX take `outputs:mtlx:surface`; all others the UsdPreviewSurface, whose specular
-workflow takes F0 from a texture. Blender reads that texture as a tint of F0 whatever the workflow is. So
-the mesh is bound twice: for every purpose to the material in the specular workflow, for the purpose
-`full`, which Blender prefers, to the same one with F0 as tint. Needs usd-core (extra [usd]).
+Renderers that read MaterialX use `outputs:mtlx:surface`; all others the UsdPreviewSurface, whose specular
+workflow takes F0 from a texture. Blender reads that texture as a tint of F0 in either workflow. So
+the mesh is bound twice: for every purpose to the material in the specular workflow, and for the purpose
+`full`, which Blender prefers, to a copy with F0 as a tint. Needs usd-core (extra [usd]).
 
 References
 ----------
@@ -18,20 +18,14 @@ import numpy as np
 
 from polcap.errors import SettingError
 from polcap.formats import atomic
-from polcap.formats.export import gltf, materialx, openpbr
+from polcap.formats.export import gltf, materialx
 from polcap.formats.export.texture_set import SPECULAR_RANGE, Key
 from polcap.images import Asset, Mesh
 from polcap.optics import fresnel
 
 
 def require() -> None:
-    """See to it that usd-core is there.
-
-    Raises
-    ------
-    SettingError
-        It is not installed.
-    """
+    """Raise a SettingError where usd-core is not installed."""
     try:
         from pxr import Usd  # noqa: F401
     except ModuleNotFoundError:
@@ -40,21 +34,10 @@ def require() -> None:
         ) from None
 
 
-def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], says: Mapping[str, str]) -> None:
-    """Write a USD layer: mesh, UsdPreviewSurface and OpenPBR in one material.
+def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], facts: Mapping[str, str]) -> None:
+    """Write a USD layer (.usdc or .usda) whose textures `files` are in the same folder.
 
-    Parameters
-    ----------
-    path
-        The file, .usdc or .usda.
-    asset
-        Mesh and factors.
-    name
-        Of the root prim.
-    files
-        Names of the textures beside it.
-    says
-        Goes into the layer's custom data.
+    `facts` go into the layer's custom data.
 
     Raises
     ------
@@ -69,7 +52,7 @@ def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], says: M
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    stage.GetRootLayer().customLayerData = {"polcap": dict(says)}
+    stage.GetRootLayer().customLayerData = {"polcap": dict(facts)}
     root = UsdGeom.Xform.Define(stage, f"/{materialx.identifier(name)}")
     Usd.ModelAPI(root).SetKind("component")
     stage.SetDefaultPrim(root.GetPrim())
@@ -118,7 +101,7 @@ def _material(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str], tin
 
 
 def _openpbr(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str]) -> Any:
-    """The description's nodes as shaders; the surface's output."""
+    """The nodes of `materialx.describe` as shaders; returns the surface's output."""
     from pxr import Sdf, UsdShade
 
     types = {
@@ -131,15 +114,15 @@ def _openpbr(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str]) -> A
         "surfaceshader": Sdf.ValueTypeNames.Token,
     }
     outputs: dict[str, Any] = {}
-    for node in openpbr.describe(asset, files):
+    for node in materialx.describe(asset, files):
         shader = UsdShade.Shader.Define(stage, path.AppendChild(f"mtlx_{node.name}"))
         shader.CreateIdAttr(node.definition)
         for one in node.inputs:
             put = shader.CreateInput(one.name, types[one.type])
             match one.value:
-                case openpbr.Link(source):
+                case materialx.NodeOutput(source):
                     put.ConnectToSource(outputs[source])
-                case openpbr.File(file, colorspace):
+                case materialx.TextureFile(file, colorspace):
                     put.Set(f"./{file}")
                     if colorspace is not None:
                         put.GetAttr().SetColorSpace(colorspace)
@@ -150,7 +133,7 @@ def _openpbr(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str]) -> A
 
 
 def _preview(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str], tint: bool) -> Any:
-    """UsdPreviewSurface with F0 from a texture; with `tint` that is F0 over the index's, outside the workflow."""
+    """UsdPreviewSurface with F0 from a texture; with `tint` F0 over that of the index, not in the specular workflow."""
     from pxr import Sdf, UsdShade
 
     kinds = Sdf.ValueTypeNames

@@ -1,7 +1,7 @@
-"""In: an array of 8 or 16 bits. Out: a PNG; and back.
+"""Reads and writes PNG files of 8 or 16 bits.
 
-No gamma or colour chunk is written: glTF ignores them, and viewers disagree on them. What the
-numbers mean is said beside the file (maps.json, the material).
+No gamma or color chunk is written: glTF ignores them, and viewers disagree on them. The meaning of the
+numbers is written elsewhere (maps.json, the material).
 """
 
 import struct
@@ -16,20 +16,20 @@ from numpy.typing import NDArray
 
 from polcap.errors import DecodeError, StorageError
 from polcap.formats import atomic
-from polcap.formats.raw import photo_bytes, plausible, worker
+from polcap.formats.raw import file_bytes, file_checks, worker
 from polcap.images import Floats
 
 _MAGIC = b"\x89PNG\r\n\x1a\n"
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
-_LEVEL = 2  # 4 takes a third longer for one to four per cent of the bytes
-_SWAPS = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}  # a seventh of the time that NumPy's indexing takes
-_HEADER = 33  # bytes of the signature and of IHDR, which stands first
+_LEVEL = 2  # of compression; 4 is a third slower, 1 to 4 % smaller
+_SWAPS = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}  # seven times faster than NumPy's indexing
+_HEADER = 33  # bytes of the signature and IHDR, which comes first
 
 
 def write(path: Path, array: Pixels, held: atomic.Held | None = None) -> None:
     """Write (H, W), (H, W, 3) RGB or (H, W, 4) RGBA, uint8 or uint16; the same array gives the same bytes.
 
-    Where the file is `held`, it gets its name with others.
+    `held` collects files that get their names together.
 
     Raises
     ------
@@ -41,14 +41,14 @@ def write(path: Path, array: Pixels, held: atomic.Held | None = None) -> None:
 
 
 def encode(array: Pixels) -> bytes:
-    """The bytes of the PNG.
+    """The bytes of a PNG, of an array as in `write`: (H, W[, C]).
 
     Raises
     ------
     TypeError
         The values are neither uint8 nor uint16.
     StorageError
-        OpenCV could not encode them.
+        OpenCV cannot encode them.
     """
     if array.dtype not in (np.uint8, np.uint16):
         raise TypeError(f"PNG holds uint8 or uint16, not {array.dtype}")
@@ -60,16 +60,19 @@ def encode(array: Pixels) -> bytes:
 
 def described(data: bytes, text: Mapping[str, str]) -> bytes:
     """A PNG with `text` in tEXt chunks under its keywords (Latin-1, as PNG has it)."""
-    return b"".join([data[:_HEADER], *(_text_chunk(key, said) for key, said in text.items()), data[_HEADER:]])
+    return b"".join([data[:_HEADER], *(_chunk(b"tEXt", _text(*item)) for item in text.items()), data[_HEADER:]])
 
 
-def _text_chunk(key: str, said: str) -> bytes:
-    body = b"tEXt" + key.encode("latin-1") + b"\0" + said.encode("latin-1", "replace")
-    return struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+def _text(key: str, value: str) -> bytes:
+    return key.encode("latin-1") + b"\0" + value.encode("latin-1", "replace")
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
 def indexed(level: NDArray[np.uint8], colors: NDArray[np.uint8]) -> bytes:
-    """The bytes of a PNG of levels (H, W): level 0 is transparent, level k has the color k − 1 of (N, 3).
+    """The bytes of a palette PNG of levels (H, W): level 0 is transparent, level k has color k − 1 of (N, 3).
 
     References
     ----------
@@ -85,10 +88,7 @@ def indexed(level: NDArray[np.uint8], colors: NDArray[np.uint8]) -> bytes:
         (b"IDAT", zlib.compress(rows.tobytes(), 6)),
         (b"IEND", b""),
     ]
-    parts = [
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
-    ]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+    return _MAGIC + b"".join(_chunk(kind, data) for kind, data in chunks)
 
 
 def read(path: Path) -> Pixels:
@@ -97,27 +97,21 @@ def read(path: Path) -> Pixels:
     Raises
     ------
     DecodeError
-        The file is missing, cut short, no PNG or larger than any picture.
+        The file is missing, cut short, not a PNG, or larger than any picture.
     """
     return worker.call(decode, path)[1]["pixels"]
 
 
 def decode(path: str) -> worker.Answer:
-    """What `read` reads, in the worker; raises DecodeError."""
-    return {}, {"pixels": pixels(path, photo_bytes.load(path))}
+    """`read`, in the child process; DecodeError."""
+    return {}, {"pixels": pixels(path, file_bytes.load(path))}
 
 
 def pixels(path: str, data: bytes) -> Pixels:
-    """The pixels of a PNG's bytes, which lie in the file `path`; in the worker.
-
-    Raises
-    ------
-    DecodeError
-        They are cut short, no PNG or larger than any picture.
-    """
+    """The pixels (H, W[, C]) of the bytes of the PNG `path`; DecodeError. In the child process."""
     if data[:8] != _MAGIC or len(data) < 24:
         raise DecodeError(f"{path} is not a whole PNG ({len(data)} bytes); write it again")
-    plausible.check_png(path, data)
+    file_checks.check_png(path, data)
     try:
         array = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
@@ -129,7 +123,7 @@ def pixels(path: str, data: bytes) -> Pixels:
 
 
 def fitted(picture: Pixels, width: int) -> NDArray[np.uint8]:
-    """An 8-bit picture (H, W, 3) made `width` px wide where it is wider, its rows an even number."""
+    """An 8-bit picture (H, W, 3) reduced to at most `width` px, with an even number of rows."""
     width = min(width, picture.shape[1])
     height = max(2, 2 * round(picture.shape[0] * width / picture.shape[1] / 2))
     return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,4 +1,4 @@
-"""Write one mosaic, Bayer or X-Trans, as a DNG: a classic little-endian TIFF with an Exif sub-IFD.
+"""Writes a Bayer or X-Trans mosaic as a DNG, uncompressed or in lossless JPEG: a little-endian TIFF.
 
 References
 ----------
@@ -10,6 +10,7 @@ import struct
 from collections.abc import Sequence
 from datetime import datetime
 from fractions import Fraction
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -37,107 +38,108 @@ def write(
     as_shot_neutral: Floats,
     compression: Literal["ljpeg", "none"] = "ljpeg",
 ) -> None:
-    """Write a mosaic bit for bit; on a failure nothing stands under `path`.
+    """Write a mosaic (H, W) of even sides bit for bit; on a failure there is no file.
 
-    Parameters
-    ----------
-    path
-        The file.
-    mosaic
-        (H, W) counts, both sides even.
-    cfa
-        (2, 2), of X-Trans (6, 6), of 0 R, 1 G, 2 B.
-    black
-        Counts, one for all or (2, 2) of a Bayer mosaic's phase.
-    white
-        Counts.
-    exif
-        Its fields that are None are left out; width, height and color_matrix are not read.
-    color_matrix
-        (3, 3) XYZ under D65 → camera.
-    as_shot_neutral
-        (3,) camera values of a grey.
-    compression
-        Lossless JPEG, or none.
+    The many parameters are the facts that a DNG has to state.
+
+    cfa : (2, 2) or (6, 6) of 0 R, 1 G, 2 B. black : counts, one or (2, 2). white : counts.
+    color_matrix : (3, 3) XYZ under D65 → camera. as_shot_neutral : (3,) camera values of a grey.
+    exif : fields that are None are left out; its width, height and color_matrix are not used.
 
     Raises
     ------
     ValueError
-        The mosaic is of another type, or of odd sides.
+        The mosaic is not uint16, or its sides are odd.
     StorageError
         The file cannot be written.
-
-    References
-    ----------
-    Adobe, Digital Negative (DNG) Specification 1.4. ITU-T T.81, annex H (lossless JPEG).
     """
     height, width = mosaic.shape
     if mosaic.dtype != np.uint16 or height % 2 or width % 2:
         raise ValueError(f"a DNG mosaic is uint16 with even sides, not {mosaic.dtype} {width}×{height}")
     image = lossless_jpeg(mosaic) if compression == "ljpeg" else mosaic.astype("<u2").tobytes()
-    taken = datetime.fromisoformat(exif.taken) if exif.taken else None
-    main: list[_Entry] = [
+    main = [
+        *_layout_tags(width, height, len(image), compression),
+        *_camera_tags(exif),
+        (33421, _SHORT, np.shape(cfa)),
+        (33422, _BYTE, bytes(np.asarray(cfa, np.uint8).ravel())),
+        (50714, _RATIONAL, np.broadcast_to(black, (2, 2)).ravel()),
+        (50717, _LONG, int(white)),
+        (50721, _SRATIONAL, np.asarray(color_matrix).ravel()),
+        (50728, _RATIONAL, as_shot_neutral),
+        (50778, _SHORT, _D65),
+    ]
+    start = 8 + len(_ifd(main, 8))
+    exif_ifd = _ifd(_exif_tags(exif), start)
+    offsets = {34665: start, 273: start + len(exif_ifd)}
+    main = [(tag, kind, offsets.get(tag, value)) for tag, kind, value in main]
+    with atomic.path(path) as temporary:
+        temporary.write_bytes(b"II*\0" + struct.pack("<I", 8) + _ifd(main, 8) + exif_ifd + image)
+
+
+def _layout_tags(width: int, height: int, length: int, compression: str) -> list[_Entry]:
+    """One strip of `length` bytes, 16 bits per pixel, the whole of it visible."""
+    return [
         (254, _LONG, 0),  # the full image
         (256, _LONG, width),
         (257, _LONG, height),
         (258, _SHORT, 16),
         (259, _SHORT, 7 if compression == "ljpeg" else 1),
-        (262, _SHORT, 32803),  # colour filter array
-        (271, _ASCII, exif.make),
-        (272, _ASCII, exif.model),
-        (273, _LONG, 0),  # strip offset, set below
+        (262, _SHORT, 32803),  # color filter array
+        (273, _LONG, 0),  # strip offset, set by the caller
         (274, _SHORT, 1),
         (277, _SHORT, 1),
         (278, _LONG, height),
-        (279, _LONG, len(image)),
+        (279, _LONG, length),
         (284, _SHORT, 1),
-        (305, _ASCII, "polcap"),
-        (306, _ASCII, taken and taken.strftime("%Y:%m:%d %H:%M:%S")),
-        (33421, _SHORT, np.shape(cfa)),
-        (33422, _BYTE, bytes(np.asarray(cfa, np.uint8).ravel())),
-        (34665, _LONG, 0),  # Exif IFD, set below
+        (34665, _LONG, 0),  # offset of the Exif directory, set by the caller
         (50706, _BYTE, bytes((1, 4, 0, 0))),
         (50707, _BYTE, bytes((1, 1, 0, 0))),
-        (50708, _ASCII, f"{exif.make} {exif.model}".strip() or "unknown"),
         (50710, _BYTE, bytes((0, 1, 2))),
         (50711, _SHORT, 1),
         (50713, _SHORT, (2, 2)),
-        (50714, _RATIONAL, np.broadcast_to(black, (2, 2)).ravel()),
-        (50717, _LONG, int(white)),
         (50718, _RATIONAL, (1, 1)),
         (50719, _LONG, (0, 0)),
         (50720, _LONG, (width, height)),
-        (50721, _SRATIONAL, np.asarray(color_matrix).ravel()),
-        (50728, _RATIONAL, as_shot_neutral),
-        (50778, _SHORT, _D65),
     ]
+
+
+def _camera_tags(exif: Exif) -> list[_Entry]:
+    return [
+        (271, _ASCII, exif.make),
+        (272, _ASCII, exif.model),
+        (305, _ASCII, "polcap"),
+        (306, _ASCII, _stamp(exif, "%Y:%m:%d %H:%M:%S")),
+        (50708, _ASCII, f"{exif.make} {exif.model}".strip() or "unknown"),
+    ]
+
+
+def _exif_tags(exif: Exif) -> list[_Entry]:
     pitch = exif.pixel_pitch_um
-    photo: list[_Entry] = [
+    return [
         (33434, _RATIONAL, exif.exposure_time),
         (33437, _RATIONAL, exif.f_number),
         (34855, _SHORT, exif.iso and round(exif.iso)),
         (36864, _UNDEFINED, b"0231"),
-        (36867, _ASCII, taken and taken.strftime("%Y:%m:%d %H:%M:%S")),
+        (36867, _ASCII, _stamp(exif, "%Y:%m:%d %H:%M:%S")),
         (37385, _SHORT, exif.flash_fired if exif.flash_fired is None else int(exif.flash_fired)),
         (37386, _RATIONAL, exif.focal_length_mm),
-        (37521, _ASCII, taken and f"{taken.microsecond // 1000:03d}"),
+        (37521, _ASCII, (_stamp(exif, "%f") or "")[:3] or None),
         (41486, _RATIONAL, pitch and 1e4 / pitch),
         (41487, _RATIONAL, pitch and 1e4 / pitch),
         (41488, _SHORT, pitch and _CENTIMETRE),
         (41989, _SHORT, exif.focal_length_35mm and round(exif.focal_length_35mm)),
         (42036, _ASCII, exif.lens),
     ]
-    start = 8 + len(_ifd(main, 8))
-    exif_ifd = _ifd(photo, start)
-    main = _set(main, {34665: start, 273: start + len(exif_ifd)})
-    with atomic.path(path) as temporary:
-        temporary.write_bytes(b"II*\0" + struct.pack("<I", 8) + _ifd(main, 8) + exif_ifd + image)
+
+
+def _stamp(exif: Exif, form: str) -> str | None:
+    return datetime.fromisoformat(exif.taken).strftime(form) if exif.taken else None
 
 
 def lossless_jpeg(mosaic: NDArray[np.uint16]) -> bytes:
-    """A (H, W) mosaic, W even, as a lossless JPEG of two components, one per column of the CFA.
+    """A mosaic (H, W), W even, as a lossless JPEG of two components, one per column of the CFA.
 
-    Predictor 1 (the pixel on the left, in the first column the one above); one optimal Huffman table.
+    Predictor 1 (the pixel on the left; in the first column the one above); one optimal Huffman table.
     """
     height, width = mosaic.shape
     pairs = mosaic.reshape(height, width // 2, 2).astype(np.int32)
@@ -170,10 +172,10 @@ def lossless_jpeg(mosaic: NDArray[np.uint16]) -> bytes:
 
 
 def _huffman_lengths(frequency: NDArray[np.intp]) -> NDArray[np.int64]:
-    """Code lengths (17,) of the categories that occur, at most 16 bits, none all ones.
+    """Code lengths (17,) of the categories that occur, at most 16 bits, none of them all ones.
 
-    A code of d bits needs a total of at least Fibonacci(d + 2) times the rarest: a floor of 1/1000 of the
-    total keeps d ≤ 14. A category that never occurs, 17, adds one bit and takes the code of all ones.
+    A code of d bits needs a total of at least Fibonacci(d + 2) times the rarest count: a floor of 1/1000 of the
+    total keeps d ≤ 14. A 17th category that never occurs adds one bit and takes the code of all ones.
     """
     floor = int(frequency.sum()) // 1000 + 1
     heap: list[tuple[int, int, tuple[int, ...]]] = [(max(int(f), floor), s, (s,)) for s, f in enumerate(frequency) if f]
@@ -214,12 +216,13 @@ def _pack(value: NDArray[np.int64], length: NDArray[np.int64]) -> bytes:
 
 
 def _ifd(entries: list[_Entry], offset: int) -> bytes:
-    """One directory placed at `offset`, with its values behind it; entries without a value are left out."""
-    encoded = [(tag, kind, *_encode(kind, value)) for tag, kind, value in entries if value is not None]
-    kept = [entry for entry in encoded if entry[3] != b"\0" or entry[1] != _ASCII]
-    behind = offset + 2 + 12 * len(kept) + 4
-    head, tail = struct.pack("<H", len(kept)), b""
-    for tag, kind, count, data in kept:
+    """The bytes of a directory placed at `offset`, its long values after it; entries without a value are left out."""
+    valued = sorted((entry for entry in entries if entry[2] is not None), key=itemgetter(0))
+    encoded = [(tag, kind, *_encode(kind, value)) for tag, kind, value in valued]
+    present = [entry for entry in encoded if entry[3] != b"\0" or entry[1] != _ASCII]
+    behind = offset + 2 + 12 * len(present) + 4
+    head, tail = struct.pack("<H", len(present)), b""
+    for tag, kind, count, data in present:
         if len(data) <= 4:
             place = data.ljust(4, b"\0")
         else:
@@ -239,7 +242,3 @@ def _encode(kind: int, value: Any) -> tuple[int, bytes]:
         pairs = [Fraction(v).limit_denominator(100000) for v in values]
         return len(values), b"".join(struct.pack(f"<{_CODE[kind]}", *p.as_integer_ratio()) for p in pairs)
     return len(values), struct.pack(f"<{len(values)}{_CODE[kind]}", *values)
-
-
-def _set(entries: list[_Entry], values: dict[int, int]) -> list[_Entry]:
-    return [(tag, kind, values.get(tag, value)) for tag, kind, value in entries]

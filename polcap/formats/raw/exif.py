@@ -1,6 +1,6 @@
-"""A photograph's bytes in, the facts of its EXIF out: every maker's RAW, and finished pictures. In the worker.
+"""Camera settings from a photograph's EXIF: every maker's RAW, and finished pictures. In the child process.
 
-Only tags are read, a millisecond a file; the pixel count comes from the decoder's header.
+Only tags are read, about a millisecond per file; the pixel count comes from the decoder.
 """
 
 import io
@@ -15,62 +15,56 @@ from typing import Any
 from polcap.images import Exif
 
 _D65_FIRST = (21, 20, 22, 23, 1, 4, 9, 10, 11, 12, 13, 14, 15)  # EXIF LightSource, the daylights
-_UNIT_MM = {
-    1: 25.4,
-    2: 25.4,
-    3: 10.0,
-    4: 1.0,
-    5: 1e-3,
-}  # FocalPlaneResolutionUnit; 1 "none" means inch in practice
-_SENSOR_MM = (2.0, 70.0)  # width; what is outside comes from a wrong unit
-_RESIZED = 1.12  # pixel counts that differ more than margins and croppings to a round size do; mRAW has 4/3
-_TEXT_LENGTH = 100  # of a name; what is longer is no name
+_UNIT_MM = {1: 25.4, 2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}  # FocalPlaneResolutionUnit; 1 "none" is inch in practice
+_SENSOR_MM = (2.0, 70.0)  # plausible widths; others come from a wrong unit
+_RESIZED = 1.12  # ratio of pixel counts above which a picture was resized, not cropped; mRAW has 4/3
+_TEXT_LENGTH = 100  # of a name; the rest is cut
 
 logging.getLogger("exifread").setLevel(logging.CRITICAL)  # its warnings are about tags that are not used here
 
 
 def tags(data: bytes) -> Exif:
-    """What the tags alone say; `width` is that of the picture that they speak of. No EXIF, an empty Exif."""
+    """The settings that the tags state, with their own image width; an empty Exif without EXIF."""
     found = _found(data)
     width = _number(found, "Image Tag 0xC791", "EXIF ExifImageWidth")
     return replace(_exif(found), width=int(width) if width else None)
 
 
 def sized(stated: Exif, width: int, height: int) -> Exif:
-    """The same with the size in visible RAW pixels, as the decoder counts them, and the pitch of those pixels."""
+    """The same with the decoder's size in visible RAW pixels, and the pitch of those pixels."""
     pitch = _pitch(stated.pixel_pitch_um, stated.width, width)
     return replace(stated, width=width, height=height, pixel_pitch_um=pitch)
 
 
 def _found(data: bytes) -> dict[str, Any]:
     """The tags by name, those of the first directory as "Image …"."""
-    import exifread  # 50 ms that only the process that reads files spends
+    import exifread
 
     found: dict[str, Any] = {}
     for prefix, part in _parts(io.BytesIO(data)):
         try:
             read_tags = exifread.process_file(part, details=False, extract_thumbnail=False)
-        except Exception:  # exifread raises whatever a damaged tag leads to: as if it were absent
+        except Exception:  # exifread documents no errors of its own for a damaged tag: taken as absent
             continue
         found |= {name.replace("Image ", prefix, 1) if prefix else name: tag for name, tag in read_tags.items()}
     return found
 
 
 def _parts(file: io.BytesIO) -> Iterator[tuple[str, io.BytesIO]]:
-    """Where the EXIF lies: (prefix for names of the first directory, bytes that exifread understands)."""
+    """Prefix for the tag names, and bytes that exifread understands, of each part of a file that holds EXIF."""
     head = file.read(92)
-    if head[:15] == b"FUJIFILMCCD-RAW" and len(head) == 92:  # in the preview
+    if head[:15] == b"FUJIFILMCCD-RAW" and len(head) == 92:  # EXIF in the preview
         offset, length = struct.unpack_from(">II", head, 84)
         file.seek(offset)
         yield "", io.BytesIO(file.read(length))
-    elif head[4:12] == b"ftypcrx ":  # in boxes of their own
+    elif head[4:12] == b"ftypcrx ":  # Canon CR3: EXIF in boxes of its own
         top = head + file.read(1 << 20)
         for box, prefix in ((b"CMT1", ""), (b"CMT2", "EXIF ")):
             at = top.find(box)
             if at >= 4:
                 (length,) = struct.unpack_from(">I", top, at - 4)
                 yield prefix, io.BytesIO(top[at + 4 : at - 4 + length])
-    elif head[:4] == b"\0MRM" and len(head) >= 8:  # in a block among the first
+    elif head[:4] == b"\0MRM" and len(head) >= 8:  # Minolta MRW: EXIF in a block
         (length,) = struct.unpack_from(">I", head, 4)
         file.seek(8)
         top = file.read(min(length, 1 << 24))
@@ -109,8 +103,8 @@ def _exif(found: Mapping[str, Any]) -> Exif:
 
 
 def _iso(found: Mapping[str, Any]) -> float | None:
-    """The sensitivity; 65535 is one too large for its 16 bits, (0, 200) a pair whose second is meant."""
-    names = ("EXIF ISOSpeedRatings", "Image ISOSpeedRatings", "Image Tag 0x0017")  # the last is RW2's
+    """ISO; 65535 stands for a value above 16 bits, which is in another tag; of a pair (0, 200) the second counts."""
+    names = ("EXIF ISOSpeedRatings", "Image ISOSpeedRatings", "Image Tag 0x0017")  # the last: RW2
     beyond = ("EXIF RecommendedExposureIndex", "EXIF StandardOutputSensitivity", "EXIF ISOSpeed")
     numbers = [number for name in (*names, *beyond) for number in _numbers(found, name)]
     return next((number for number in numbers if 0 < number != 65535), None)
@@ -124,7 +118,7 @@ def _plane_pitch(found: Mapping[str, Any]) -> float | None:
 
 
 def _pitch(pitch: float | None, reference_width: int | None, width: int) -> float | None:
-    """The pitch of the file's pixels, where the tag speaks of the picture before it was resized."""
+    """The pitch of the file's pixels; the tag's is that of the picture before it was resized."""
     if pitch is None:
         return None
     ratio = (reference_width or width) / width
@@ -180,7 +174,8 @@ def _numbers(found: Mapping[str, Any], name: str) -> list[float]:
 def _text(found: Mapping[str, Any], *names: str) -> str:
     for name in names:
         if name in found:
+            # printable only: a name goes to the terminal, the report and other files
             text = "".join(c for c in str(found[name].values) if c.isprintable()).strip()[:_TEXT_LENGTH]
-            if text:  # printable: a name goes to the terminal, the report and other files
+            if text:
                 return text
     return ""

@@ -1,7 +1,7 @@
-"""A finished picture's path in, linear values out: TIFF, PNG, EXR, JPEG, by OpenImageIO in the worker.
+"""Decodes a finished picture (TIFF, PNG, EXR, JPEG) to linear values, by OpenImageIO in the child process.
 
-16-bit and floating-point files are taken as linear, 8-bit ones as sRGB-encoded, unless the
-caller states the encoding. RAW never comes here: OpenImageIO opens a DNG as its thumbnail.
+16-bit and floating-point files are taken as linear, 8-bit files as sRGB-encoded, unless the
+caller states the encoding. RAW files go to `libraw`: OpenImageIO opens a DNG as its thumbnail.
 """
 
 from collections.abc import Iterator
@@ -13,21 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import DecodeError
-from polcap.formats.maps import image_io
-from polcap.formats.raw import libraw as raw
-from polcap.formats.raw import memory_file, photo_bytes, plausible, sniff, worker
+from polcap.formats.maps import exr
+from polcap.formats.raw import file_bytes, file_checks, file_kind, libraw, worker
 from polcap.images import Floats, SensorImage
 from polcap.optics import color
 
 Encoding = Literal["linear", "srgb"]
-SENSOR_DEG: tuple[tuple[float, tuple[int, int]], ...] = (  # where each angle lies in the 2×2 of the sensor
+SENSOR_DEG: tuple[tuple[float, tuple[int, int]], ...] = (  # row, column of each angle in the sensor's 2×2 cell
     (0.0, (1, 1)),
     (45.0, (0, 1)),
     (90.0, (0, 0)),
     (135.0, (1, 0)),
 )
 _MOST_CHANNELS = 64  # of a layered EXR
-_COLOR_LEVELS = 0.05  # neighbouring 2×2 cells of a monochrome sensor differ less, averaged over the frame
+_COLOR_LEVELS = 0.05  # averages of neighbouring 2×2 cells differ less than this on a monochrome sensor
 
 
 def read(
@@ -37,31 +36,21 @@ def read(
     black: float = 0.0,
     digest: str | None = None,
 ) -> SensorImage:
-    """A picture as (H, W, 3); a grey one stands in all three channels.
+    """A picture as (H, W, 3), grey repeated in all three channels.
 
     Linear integers stay counts; floating point has white 1. An sRGB-encoded picture becomes linear 0…1 and
-    `lossy`, as every 8-bit one is.
-
-    Parameters
-    ----------
-    path
-        The file.
-    encoding
-        By default sRGB for 8 bits, else linear.
-    white, black
-        Counts; by default the greatest of the type, and 0.
-    digest
-        Of `probe.read`: the bytes that are decoded are those that were probed.
+    `lossy`, as every 8-bit one is. By default `encoding` is sRGB for 8 bits, else linear; `white` the greatest value
+    of the type. With the `digest` of `probe.read`, the file must still hold the bytes that were probed.
 
     Raises
     ------
     DecodeError
-        No picture, a damaged one, or other bytes than those that were probed.
+        Not a picture, damaged, or changed since it was probed.
     """
     pixels = _pixels(path, digest)
     lossy = pixels.dtype == np.uint8
     full = float(np.iinfo(pixels.dtype).max) if np.issubdtype(pixels.dtype, np.integer) else 1.0
-    encoding = encoding or ("srgb" if lossy else "linear")  # as encoding_of
+    encoding = encoding_of(8 * pixels.itemsize, encoding)
     if pixels.shape[2] == 1:
         pixels = np.repeat(pixels, 3, axis=2)
     if encoding == "srgb":
@@ -75,22 +64,12 @@ def read_mosaic(
     white: float | None = None,
     black: float = 0.0,
     digest: str | None = None,
-    kind: sniff.Kind = "photo",
+    kind: file_kind.Kind = "photo",
 ) -> SensorImage:
-    """One angle of a monochrome polarization sensor's raw frame, (H/2, W/2, 3), linear.
+    """One angle (0, 45, 90 or 135°) of a polarization sensor's raw frame, (H/2, W/2, 3), linear.
 
-    Parameters
-    ----------
-    path
-        A RAW or a picture.
-    angle_deg
-        0, 45, 90 or 135: the frame's 2×2 cell is 90 45 / 135 0 degrees.
-    white, black
-        Counts; by default what the file says, or the greatest of the type and 0.
-    digest
-        Of `probe.read`: the bytes that are decoded are those that were probed.
-    kind
-        Whether `path` is a RAW or a picture.
+    The frame's 2×2 cell is 90 45 / 135 0 degrees. `white` and `black` are counts; by default those that the file
+    states, or the greatest of the type and 0. `kind` tells whether `path` is a RAW or a picture; `digest` as in `read`.
 
     Raises
     ------
@@ -108,7 +87,7 @@ def read_mosaic(
         mosaic, lossy, level = pixels[..., 0], pixels.dtype == np.uint8, black
         full = float(np.iinfo(pixels.dtype).max) if np.issubdtype(pixels.dtype, np.integer) else 1.0
     else:
-        sensor = raw.read(path, digest)
+        sensor = libraw.read(path, digest)
         mosaic = sensor.value if sensor.value.ndim == 2 else sensor.value[..., 0]
         lossy, full = False, sensor.white
         level = black or float(np.broadcast_to(sensor.black, (2, 2))[y, x])
@@ -120,13 +99,13 @@ def read_mosaic(
 
 
 def place_px(angle_deg: float) -> tuple[float, float]:
-    """x, y of the first pixel that `read_mosaic` takes, in pixels of the plane it gives: 0 or half a one."""
+    """x, y of the first pixel of an angle in the 2×2 cell, in pixels of `read_mosaic`'s picture: 0 or ½."""
     y, x = dict(SENSOR_DEG)[angle_deg]
     return x / 2, y / 2
 
 
 def encoding_of(bits: int, stated: Encoding | None) -> Encoding:
-    """How `read` takes a picture of so many bits per channel."""
+    """The encoding that `read` assumes for a picture of so many bits per channel."""
     return stated or ("srgb" if bits == 8 else "linear")
 
 
@@ -134,11 +113,11 @@ def _decoded(pixels: NDArray[Any], full: float) -> Floats:
     if pixels.dtype.kind == "f":
         return np.asarray(color.decode_srgb(pixels), np.float32)
     table = color.decode_srgb(np.arange(full + 1) / full).astype(np.float32)
-    return np.asarray(table[pixels])  # twenty times faster than the formula per pixel
+    return np.asarray(table[pixels])  # a table is twenty times faster than the formula per pixel
 
 
 def size(path: str, data: bytes) -> dict[str, int]:
-    """Size, channels and bits of a picture; no pixel is read. In the worker."""
+    """Size, channels and bits of a picture, without its pixels. In the child process."""
     with _opened(path, data) as file:
         spec = file.spec()
         count, bits = len(_channels(path, spec)), 8 * spec.format.size()
@@ -146,15 +125,15 @@ def size(path: str, data: bytes) -> dict[str, int]:
 
 
 def decode(path: str, digest: str | None = None) -> worker.Answer:
-    """The stored values (H, W, 1 or 3), of the type they are stored in. In the worker; raises DecodeError."""
+    """The stored values (H, W, 1 or 3) in their stored type; DecodeError. In the child process."""
     import OpenImageIO as oiio
 
-    with _opened(path, photo_bytes.load(path, digest)) as file:
+    with _opened(path, file_bytes.load(path, digest)) as file:
         spec = file.spec()
         channels = _channels(path, spec)
         kind = "float" if spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE) else str(spec.format)
         pixels = file.read_image(0, 0, 0, spec.nchannels, kind)
-        reason = image_io.reason(file)
+        reason = exr.reason(file)
     if pixels is None:
         raise DecodeError(f"{path}: truncated or damaged ({reason}); copy it from the card again")
     pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)[..., channels]
@@ -171,22 +150,22 @@ def _pixels(path: str | Path, digest: str | None) -> NDArray[Any]:
 
 @contextmanager
 def _opened(path: str, data: bytes) -> Iterator[Any]:
-    """OpenImageIO's view of these bytes; it reads by name only."""
+    """The bytes as an open file of OpenImageIO, which reads by name only."""
     import OpenImageIO as oiio
 
     if data[:3] == b"\xff\xd8\xff":
-        plausible.check_jpeg(path, data)
-    plausible.check_png(path, data)
+        file_checks.check_jpeg(path, data)
+    file_checks.check_png(path, data)
     options = oiio.ImageSpec()
-    options["oiio:UnassociatedAlpha"] = 1  # else a PNG's colours come multiplied by its alpha
-    with memory_file.named(data) as name:
+    options["oiio:UnassociatedAlpha"] = 1  # else a PNG's colors are multiplied by its alpha
+    with file_bytes.named(data) as name:
         file = oiio.ImageInput.open(name, options)
         if file is None:
-            reason = image_io.reason(oiio).replace(name, Path(path).name)
+            reason = exr.reason(oiio).replace(name, Path(path).name)
             raise DecodeError(f"{path}: not a readable picture ({reason}); is the file complete?")
         try:
             spec = file.spec()
-            plausible.check_size(path, spec.width, spec.height)
+            file_checks.check_size(path, spec.width, spec.height)
             if spec.nchannels > _MOST_CHANNELS or spec.depth > 1:
                 raise DecodeError(f"{path}: has {spec.nchannels} channels; polcap reads flat R, G, B")
             yield file
@@ -195,7 +174,7 @@ def _opened(path: str, data: bytes) -> Iterator[Any]:
 
 
 def _channels(path: str, spec: Any) -> list[int]:
-    """The channels that are R, G and B, or the grey one."""
+    """Indices of the channels R, G and B, or of the grey one."""
     names = [name.rpartition(".")[2].upper() for name in spec.channelnames]
     if sum(name in ("R", "G", "B") for name in names) == 3:
         return [names.index(name) for name in "RGB"]
@@ -210,12 +189,12 @@ def _counts(pixels: NDArray[Any]) -> Any:
 
 
 def _check_monochrome(path: str | Path, mosaic: NDArray[Any]) -> None:
-    """Refuse a colour polarization sensor: there, neighbouring 2×2 cells have different filters."""
+    """Refuse a color polarization sensor, where neighbouring 2×2 cells have different filters."""
     height, width = (size // 4 * 4 for size in mosaic.shape)
     cells = mosaic[:height, :width].reshape(height // 4, 2, 2, width // 4, 2, 2)
     levels = cells.mean(axis=(0, 2, 3, 5), dtype=np.float64)  # (2, 2)
     if levels.max() > (1 + _COLOR_LEVELS) * levels.min():
         raise DecodeError(
-            f"{path}: neighbouring 2×2 cells differ by {levels.max() / levels.min() - 1:.0%}, as on a colour "
+            f"{path}: neighbouring 2×2 cells differ by {levels.max() / levels.min() - 1:.0%}, as on a color "
             "polarization sensor, which is not supported; give one demosaiced picture per angle"
         )

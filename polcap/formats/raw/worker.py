@@ -1,12 +1,10 @@
-"""A function and a path in, its arrays out: untrusted files are read in a child process.
+"""Runs a function on an untrusted file in a child process with limits on time and memory.
 
-C libraries crash, hang and eat memory on damaged files. Here they may: the child is a
-fresh interpreter (never a fork, so that no OpenMP state is copied), kept for the next
-file, limited in time and memory, and it ends when its parent does, even amid a loop.
-Its death is one `DecodeError` that names the file. What it answers is bounded and holds
-numbers only, so a child that a file has taken over gains nothing from its parent.
-An exception that is no `InputError` is a defect of polcap: `ChildBug`, with the child's traceback.
-Arrays come back as raw bytes over the pipe, read straight into their final memory.
+C libraries crash, hang and eat memory on damaged files; here that ends one child and raises one `DecodeError` that
+names the file. The child is a fresh interpreter, never a fork (no OpenMP state is copied). It serves the next file
+too, and it ends when its parent does, even inside a loop. Its answer is bounded and holds JSON and numbers only, so a
+file that takes over the child gains nothing from the parent. Arrays come back as raw bytes over the pipe, read
+straight into their final memory.
 """
 
 import atexit
@@ -15,6 +13,7 @@ import faulthandler
 import importlib
 import json
 import os
+import signal
 import struct
 import subprocess
 import sys
@@ -30,18 +29,18 @@ from numpy.typing import NDArray
 
 from polcap import errors
 
-START_S = 300.0  # until a child has begun; about a second, but not on a machine that is busy with all else
-TIMEOUT_S = 180.0  # from then on; a 150 MP compressed frame takes about 6 s
+START_S = 300.0  # until a child is ready; takes about a second, longer on a busy machine
+TIMEOUT_S = 180.0  # from then on; a compressed frame of 150 MP takes about 6 s
 MEMORY_GIB = 8.0  # address space of the child
-_HEAD_BYTES = 4 << 20  # of an answer without its arrays; the tags of a photograph make a few kB
-_LOG_BYTES = 1 << 16  # of what a child has printed, read at its death
-_GRACE_S = 5.0  # by which the child's own clock is later than its parent's
+_HEAD_BYTES = 4 << 20  # limit of an answer without its arrays; the metadata of a photograph take a few kB
+_LOG_BYTES = 1 << 16  # end of the child's output, read after it died
+_GRACE_S = 5.0  # the child's own time limit is later than its parent's by this
 
 Arrays = dict[str, NDArray[Any]]
 Answer = tuple[dict[str, Any], Arrays]
 _LENGTH = struct.Struct("<Q")
-_BEGUN = b"begun"  # the child has started and imported what it needs: from now on its time counts
-_START = (
+_READY = b"ready"  # the child has imported what it needs: its time starts to count
+_CHILD = (
     "import sys; sys.path[:] = sys.argv[3:]; from polcap.formats.raw import worker; "
     "worker.serve(float(sys.argv[1]), int(sys.argv[2]))"
 )
@@ -52,7 +51,7 @@ class ChildBug(RuntimeError):
 
 
 class Worker:
-    """A child process that runs one function on one file at a time; restarts when it dies."""
+    """A child process that runs one function on one file at a time; it is started again after it died."""
 
     def __init__(self, timeout_s: float = TIMEOUT_S, memory_gib: float = MEMORY_GIB) -> None:
         self.timeout_s = timeout_s
@@ -60,7 +59,7 @@ class Worker:
         self._lock = threading.Lock()
         self._child: subprocess.Popen[bytes] | None = None
         self._log: IO[bytes] | None = None
-        self._lifeline: int | None = None  # the end of a pipe that closes with this process
+        self._lifeline: int | None = None  # our end of a pipe that closes with this process
 
     def call(
         self,
@@ -71,69 +70,66 @@ class Worker:
         limit_gib: float | None = None,
         **options: Any,
     ) -> Answer:
-        """Run `function(path, **options)` in the child.
+        """Run `function(path, **options)` in the child; the function is a module's, the options plain JSON values.
 
-        Parameters
-        ----------
-        function
-            Of a module's top level; the child imports it.
-        path
-            Its first argument.
-        limit_s, limit_gib
-            Tighter limits than the worker's, for what takes little of a sound file; memory beyond the idle child's.
-        options
-            Plain JSON values.
+        `limit_s` and `limit_gib` are tighter limits than the worker's; the second is memory on top of the idle child's.
 
         Raises
         ------
         DecodeError
-            The function refused the file, crashed, ran past its time or out of memory.
+            The function refused the file, crashed, or exceeded its time or memory.
         ChildBug
             The function failed in a way that no file may cause.
         """
-        limit = min(self.timeout_s, limit_s or self.timeout_s)
+        name, limit = os.fspath(path), min(self.timeout_s, limit_s or self.timeout_s)
         request = {
             "module": function.__module__,
             "name": function.__qualname__,
-            "path": os.fspath(path),
+            "path": name,
             "options": options,
             "limit_s": limit,
             "limit_gib": limit_gib,
         }
         with self._lock:
-            child = self._child if self._child and self._child.poll() is None else self._spawn()
-            slow, overdue = threading.Event(), threading.Event()
             try:
-                with _killed_after(START_S, child, slow):
-                    _send(cast(IO[bytes], child.stdin), json.dumps(request).encode())
-                    _receive(cast(IO[bytes], child.stdout), len(_BEGUN))
-                with _killed_after(limit, child, overdue):
-                    head, arrays = self._answer(cast(IO[bytes], child.stdout))
-            except (EOFError, OSError):
-                code = child.wait()
-                if slow.is_set():
-                    name = os.fspath(path)
-                    raise errors.DecodeError(f"{name}: no decoder began within {START_S:g} s; run again") from None
-                gib = limit_gib or self.memory_gib
-                raise errors.DecodeError(self._cause_of_death(path, code, limit, gib, overdue.is_set())) from None
+                head, arrays = self._exchange(name, request)
             except (ValueError, TypeError, KeyError) as error:
                 self._stop()
-                raise errors.DecodeError(f"{os.fspath(path)}: the decoder's answer is damaged ({error})") from error
-            except BaseException:  # Ctrl-C amid an answer: the pipe is no longer in step
+                raise errors.DecodeError(f"{name}: the decoder's answer is damaged ({error})") from error
+            except BaseException:  # Ctrl-C in the middle of an answer: the rest of it would be taken for the next one
                 self._stop()
                 raise
         if "bug" in head:
-            bug = ChildBug(f"{os.fspath(path)}: {head['bug']}")
+            bug = ChildBug(f"{name}: {head['bug']}")
             bug.add_note(str(head["traceback"]))
             raise bug
         if "error" in head:
             kind = getattr(errors, str(head.get("kind")), None)
             if isinstance(kind, type) and issubclass(kind, errors.InputError):
                 raise kind(head["error"])
-            raise errors.DecodeError(f"{os.fspath(path)}: {head['error']}")
+            raise errors.DecodeError(f"{name}: {head['error']}")
         if "meta" not in head:
-            raise errors.DecodeError(f"{os.fspath(path)}: the decoder's answer is damaged (it says nothing)")
+            raise errors.DecodeError(f"{name}: the decoder's answer is damaged (it is empty)")
         return head["meta"], arrays
+
+    def _exchange(self, name: str, request: dict[str, Any]) -> tuple[dict[str, Any], Arrays]:
+        """Send the request, wait until the child is ready, then for its answer."""
+        child = self._child if self._child and self._child.poll() is None else self._spawn()
+        limit = request["limit_s"]
+        started, overdue = False, threading.Event()
+        try:
+            with _killed_after(START_S, child, overdue):
+                _send(cast(IO[bytes], child.stdin), json.dumps(request).encode())
+                _receive(cast(IO[bytes], child.stdout), len(_READY))
+            started = True
+            with _killed_after(limit, child, overdue):
+                return self._answer(cast(IO[bytes], child.stdout))
+        except (EOFError, OSError):
+            code = child.wait()
+            if overdue.is_set() and not started:
+                raise errors.DecodeError(f"{name}: no decoder started within {START_S:g} s; run again") from None
+            gib = request["limit_gib"] or self.memory_gib
+            raise errors.DecodeError(self._cause_of_death(name, code, limit, gib, overdue.is_set())) from None
 
     def close(self) -> None:
         """End the child."""
@@ -141,7 +137,7 @@ class Worker:
             self._stop()
 
     def _answer(self, pipe: IO[bytes]) -> tuple[dict[str, Any], Arrays]:
-        """What the child sends, no larger than it may be."""
+        """Read the child's answer; ValueError where it is larger than allowed or holds no numbers."""
         head = json.loads(_receive(pipe, _HEAD_BYTES))
         arrays: Arrays = {}
         left = int(self.memory_gib * 2**30)
@@ -156,12 +152,12 @@ class Worker:
 
     def _spawn(self) -> subprocess.Popen[bytes]:
         self._stop()
-        with contextlib.suppress(OSError):  # no place for temporary files: do without the child's last words
+        with contextlib.suppress(OSError):  # no temporary files: a crash is reported without its last line
             self._log = tempfile.TemporaryFile()  # noqa: SIM115 — read at the child's death, closed in _stop
         ours, theirs = _lifeline()
         try:
             self._child = subprocess.Popen(
-                [sys.executable, "-c", _START, str(self.memory_gib), str(theirs), *_module_folders()],
+                [sys.executable, "-c", _CHILD, str(self.memory_gib), str(theirs), *_module_folders()],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=self._log or subprocess.DEVNULL,
@@ -189,11 +185,8 @@ class Worker:
             os.close(self._lifeline)
             self._lifeline = None
 
-    def _cause_of_death(
-        self, path: str | os.PathLike[str], code: int, limit_s: float, gib: float, overdue: bool
-    ) -> str:
-        name = os.fspath(path)
-        if overdue or code == -_signal("SIGXCPU"):
+    def _cause_of_death(self, name: str, code: int, limit_s: float, gib: float, overdue: bool) -> str:
+        if overdue or code == -getattr(signal, "SIGXCPU", 0):
             return f"{name}: not decoded within {limit_s:g} s; the file is damaged or far too large"
         last = self._last_line()
         memory = "MemoryError" in last or "bad_alloc" in last or code == -9
@@ -209,8 +202,13 @@ class Worker:
 
 @contextlib.contextmanager
 def _killed_after(limit_s: float, child: subprocess.Popen[bytes], overdue: threading.Event) -> Iterator[None]:
-    """Kill the child, and say so, when this takes too long."""
-    timer = threading.Timer(limit_s, _kill, (child, overdue))
+    """Kill the child and set `overdue` when the block takes too long."""
+
+    def kill() -> None:
+        overdue.set()
+        child.kill()
+
+    timer = threading.Timer(limit_s, kill)
     timer.daemon = True
     timer.start()
     try:
@@ -219,31 +217,20 @@ def _killed_after(limit_s: float, child: subprocess.Popen[bytes], overdue: threa
         timer.cancel()
 
 
-def _kill(child: subprocess.Popen[bytes], overdue: threading.Event) -> None:
-    overdue.set()
-    child.kill()
-
-
 def _module_folders() -> list[str]:
-    """`sys.path` without the insides of packages: OpenCV's stands there while another thread imports it.
+    """`sys.path` without folders inside packages: OpenCV adds its own while it is imported.
 
-    From there a child would take OpenCV's `typing` for Python's.
+    A child would import OpenCV's `typing` from there instead of Python's.
     """
     return [folder for folder in sys.path if not os.path.isfile(os.path.join(folder, "__init__.py"))]
 
 
 def _lifeline() -> tuple[int | None, int]:
-    """A pipe that nobody writes to: our end, and the child's, -1 where a child cannot take one over."""
+    """A pipe that nobody writes to: our end and the child's; -1 where a child cannot inherit one."""
     if os.name != "posix":
         return None, -1
     theirs, ours = os.pipe()
     return ours, theirs
-
-
-def _signal(name: str) -> int:
-    import signal
-
-    return int(getattr(signal, name, 0))
 
 
 _idle: list[Worker] = []
@@ -259,13 +246,7 @@ def call(
     limit_gib: float | None = None,
     **options: Any,
 ) -> Answer:
-    """`Worker.call` on a child that is idle, or on a new one: as many as threads call at a time.
-
-    Parameters
-    ----------
-    function, path, limit_s, limit_gib, options
-        As in `Worker.call`.
-    """
+    """`Worker.call` on an idle child, or on a new one: there are as many as threads call at a time."""
     global _owner
     with _hold:
         if _owner != os.getpid():  # a fork must not share the pipes
@@ -281,7 +262,7 @@ def call(
 
 
 def end_idle() -> None:
-    """End the children that wait for a file; the next call starts one."""
+    """End the idle children; the next call starts one."""
     for worker in _idle:
         worker.close()
 
@@ -289,7 +270,7 @@ def end_idle() -> None:
 def serve(memory_gib: float, lifeline: int) -> None:
     """Answer requests on stdin until it closes. Runs in the child only."""
     requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what a library prints must not fall into the answers
+    os.dup2(2, 1)  # a library's output must not mix with the answers
     _die_with_parent(lifeline)
     _limit(memory_gib)
     while True:
@@ -297,9 +278,9 @@ def serve(memory_gib: float, lifeline: int) -> None:
             request = json.loads(_receive(requests, _HEAD_BYTES))
         except EOFError:
             return
-        with contextlib.suppress(Exception):  # told as the answer
+        with contextlib.suppress(Exception):  # `_run` reports it
             importlib.import_module(request["module"])
-        _send(answers, _BEGUN)
+        _send(answers, _READY)
         with _time_limit(request["limit_s"]), _memory_limit(request["limit_gib"]):
             head, arrays = _run(request, request["limit_gib"] or memory_gib)
         _send(answers, json.dumps(head).encode())
@@ -310,7 +291,7 @@ def serve(memory_gib: float, lifeline: int) -> None:
 
 
 def _run(request: dict[str, Any], memory_gib: float) -> tuple[dict[str, Any], Arrays]:
-    """The answer to one request, whatever becomes of it."""
+    """The answer to one request: a result, an error or a bug."""
     path = request["path"]
     try:
         function = getattr(importlib.import_module(request["module"]), request["name"])
@@ -326,39 +307,39 @@ def _run(request: dict[str, Any], memory_gib: float) -> tuple[dict[str, Any], Ar
 
 
 def _die_with_parent(lifeline: int) -> None:
-    """Let the kernel end this process when the other end of the pipe closes, whatever runs here."""
+    """Let the kernel end this process when the other end of the pipe closes, even inside a C function."""
     if sys.platform == "win32" or lifeline < 0:
         return
     import fcntl
 
-    with contextlib.suppress(OSError):  # where a pipe knows no such signal, the time limit ends a loop
+    with contextlib.suppress(OSError):  # a system without this signal: the time limit ends a loop
         fcntl.fcntl(lifeline, fcntl.F_SETOWN, os.getpid())
         fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
 
 
 def _limit(memory_gib: float) -> None:
-    if sys.platform == "win32":  # no such limits there; the time limit still holds
+    if sys.platform == "win32":  # only the time limit holds there
         return
     import resource
 
     size = int(memory_gib * 2**30)
-    with contextlib.suppress(ValueError, OSError):  # macOS refuses RLIMIT_AS; a tighter limit may already stand
+    with contextlib.suppress(ValueError, OSError):  # macOS refuses RLIMIT_AS; a tighter limit may be set already
         resource.setrlimit(resource.RLIMIT_AS, (size, size))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
 @contextlib.contextmanager
 def _memory_limit(more_gib: float | None) -> Iterator[None]:
-    """Let a request take no more memory than this beyond what is taken; where the kernel tells how much."""
+    """Limit the memory of one request, on top of what the process uses now (Linux only)."""
     if more_gib is None or not sys.platform.startswith("linux"):
         yield
         return
     import resource
 
     with open("/proc/self/statm", encoding="ascii") as file:
-        taken = int(file.read().split()[0]) * resource.getpagesize()
+        used = int(file.read().split()[0]) * resource.getpagesize()
     usual = resource.getrlimit(resource.RLIMIT_AS)
-    size = taken + int(more_gib * 2**30)
+    size = used + int(more_gib * 2**30)
     resource.setrlimit(resource.RLIMIT_AS, (size if usual[0] < 0 else min(size, usual[0]), usual[1]))
     try:
         yield
@@ -368,12 +349,12 @@ def _memory_limit(more_gib: float | None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _time_limit(limit_s: float) -> Iterator[None]:
-    """End this process when a request takes too long, should the parent not have done so."""
+    """End this process when a request takes too long and the parent has not ended it."""
     if sys.platform != "win32":
         import resource
 
         spent = int(time.process_time() + limit_s * (os.cpu_count() or 1) + _GRACE_S)
-        most = resource.getrlimit(resource.RLIMIT_CPU)[1]  # of the machine's owner: never raised
+        most = resource.getrlimit(resource.RLIMIT_CPU)[1]  # the system's own limit, never raised
         resource.setrlimit(resource.RLIMIT_CPU, (spent if most < 0 else min(spent, most), most))
     faulthandler.dump_traceback_later(limit_s + _GRACE_S, exit=True)  # by a thread that needs no interpreter
     try:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import SettingError
-from polcap.formats.export import exr_layers, ocio
+from polcap.formats.export import exr_layers
 from polcap.formats.maps import exr
 
 # Linear Rec.709 → ACEScg: primaries of S-2014-004, whites adapted by Bradford
@@ -38,7 +38,7 @@ def test_colours_go_to_acescg_and_data_stays(result: Path, tmp_path: Path) -> No
 
 
 def test_role_finds_its_space_and_a_wrong_name_is_told() -> None:
-    assert ocio.find("scene_linear").name == "ACEScg"
+    assert exr_layers.find_space("scene_linear").name == "ACEScg"
     for wrong in ("ACEScq", "data"):
         with pytest.raises(SettingError, match="ACEScg"):
-            ocio.find(wrong)
+            exr_layers.find_space(wrong)

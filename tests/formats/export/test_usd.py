@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import SettingError
-from polcap.formats.export import encoders, gltf, materialx, openpbr, usd
+from polcap.formats.export import encoders, gltf, materialx, usd
 from polcap.formats.export.texture_set import LOOSE, Key
 from polcap.images import Asset
 from tests import surfaces
@@ -97,8 +97,8 @@ def test_materialx_library_finds_the_document_valid(folder: Path) -> None:
 
 def test_nodes_stand_after_what_they_take(asset: Asset) -> None:
     seen: set[str] = set()
-    for node in openpbr.describe(asset, FILES):
-        links = {one.value.node for one in node.inputs if isinstance(one.value, openpbr.Link)}
+    for node in materialx.describe(asset, FILES):
+        links = {one.value.node for one in node.inputs if isinstance(one.value, materialx.NodeOutput)}
         assert links <= seen
         seen.add(node.name)
 

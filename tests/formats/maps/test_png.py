@@ -58,5 +58,5 @@ def test_more_pixels_than_the_bytes_unpack_to_are_refused_unread(
 
 def test_folder_that_is_a_file_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "maps").write_text("")
-    with pytest.raises(StorageError, match="stands where a folder is needed"):
+    with pytest.raises(StorageError, match="file where a folder is needed"):
         png.write(tmp_path / "maps" / "a.png", np.zeros((2, 2), dtype=np.uint8))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import DecodeError
-from polcap.formats.raw import exif, plausible, probe, sniff
+from polcap.formats.raw import exif, file_checks, file_kind, probe
 from polcap.formats.raw import libraw as raw
 from polcap.images import Exif
 from tests.formats import headers
@@ -25,7 +25,7 @@ def _exif(path):
 
 def _kind(path):
     with path.open("rb") as file:
-        return sniff.kind(file, path.suffix)
+        return file_kind.kind(file, path.suffix)
 
 
 def nef():
@@ -85,10 +85,11 @@ def test_iso_of_a_pair_whose_first_is_zero_is_the_second():
 
 def test_iso_that_no_tag_states_is_asked_of_the_decoder(tmp_path, monkeypatch):
     """Nikon's first bodies tell it in their maker's tags, old Kodaks have but one; what tags do tell stands."""
-    of_a_maker = SimpleNamespace(dng=False, truncated=False)
-    monkeypatch.setattr(sniff, "structure", lambda file: of_a_maker)
-    monkeypatch.setattr(plausible, "check_structure", lambda *known: None)
-    monkeypatch.setattr(plausible, "is_lossy", lambda structure: False)
+    raw_directory = {file_kind.PHOTOMETRIC: (file_kind.CFA,)}
+    of_a_maker = SimpleNamespace(dng=False, truncated=False, directories=(raw_directory,))
+    monkeypatch.setattr(file_kind, "structure", lambda file: of_a_maker)
+    monkeypatch.setattr(file_checks, "check_structure", lambda *known: None)
+    monkeypatch.setattr(file_checks, "is_lossy", lambda structure: False)
     asked = []
 
     def size(path, data, unpack):
@@ -168,7 +169,7 @@ def test_damaged_exif_counts_as_none(tmp_path):
 
 def test_looping_directories_end(tmp_path):
     loop = headers.tiff(headers.camera(), {SUB_IFDS: {330: (4, (8,))}})
-    assert len(sniff.tiff(io.BytesIO(loop)).directories) == 2
+    assert len(file_kind.structure(io.BytesIO(loop)).directories) == 2
 
 
 def test_not_a_picture_is_one_error(tmp_path):

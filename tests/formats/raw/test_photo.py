@@ -138,7 +138,7 @@ def test_colour_sensors_are_refused(tmp_path):
     with pytest.raises(DecodeError, match=r"rgb\.png: has 3 channels"):
         photo.read_mosaic(three, 0)
     bayer = save(tmp_path / "bayer.png", mosaic(tint=[[0.6, 1], [1, 0.7]]))
-    with pytest.raises(DecodeError, match=r"bayer\.png.*colour polarization sensor"):
+    with pytest.raises(DecodeError, match=r"bayer\.png.*color polarization sensor"):
         photo.read_mosaic(bayer, 0)
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from polcap.errors import DecodeError
+from polcap.formats.raw import file_checks, file_kind, photo, probe
 from polcap.formats.raw import libraw as raw
-from polcap.formats.raw import photo, plausible, probe, sniff
 from tests.formats import headers
 
 MOSAIC = np.random.default_rng(4).integers(600, 9000, (60, 84)).astype(np.uint16)
@@ -46,12 +46,12 @@ def test_a_raw_of_cut_jpeg_data_is_refused(rng):
     coded = cv2.imencode(".jpg", rng.integers(0, 255, (64, 96)).astype(np.uint8))[1].tobytes()
     for data, whole in ((coded, True), (coded[:-200] + bytes(200), False), (coded[:-2], False)):
         file = jpeg_raw(data)
-        structure = sniff.structure(io.BytesIO(file))
+        structure = file_kind.structure(io.BytesIO(file))
         if whole:
-            plausible.check_structure("a.kdc", structure, file)
+            file_checks.check_structure("a.kdc", structure, file)
         else:
             with pytest.raises(DecodeError, match=r"a\.kdc: is cut short, its JPEG data have no end"):
-                plausible.check_structure("a.kdc", structure, file)
+                file_checks.check_structure("a.kdc", structure, file)
 
 
 def test_a_stripped_dng_is_refused(tmp_path):
@@ -86,10 +86,10 @@ def test_a_form_that_libraw_cannot_decode_is_named(tmp_path, number, words):
 
 def test_a_lossy_dng_that_decodes_to_black_is_named():
     with pytest.raises(DecodeError, match=r"lossy DNG \(JPEG compression 34892\) that LibRaw decodes to black"):
-        plausible.check_levels("a.dng", np.zeros((8, 8, 3), np.uint16), 0.0, 65535.0, lossy=True)
-    plausible.check_levels("a.dng", MOSAIC, 0.0, 65535.0, lossy=True)
+        file_checks.check_levels("a.dng", np.zeros((8, 8, 3), np.uint16), 0.0, 65535.0, lossy=True)
+    file_checks.check_levels("a.dng", MOSAIC, 0.0, 65535.0, lossy=True)
     file = bytes(compressed((34892).to_bytes(2, "little")))
-    assert plausible.is_lossy(sniff.structure(io.BytesIO(file)))
+    assert file_checks.is_lossy(file_kind.structure(io.BytesIO(file)))
 
 
 def test_a_remnant_of_a_panasonic_is_refused(tmp_path):
@@ -140,5 +140,5 @@ def test_tags_of_many_forms_do_not_hang(tmp_path):
     empty[at + 4 : at + 8] = bytes(4)  # count 0
     for data in (many, bytes(empty)):
         file = io.BytesIO(data)
-        sniff.kind(file, ".dng")
-        assert len(sniff.tiff(file).directories) < 65
+        file_kind.kind(file, ".dng")
+        assert len(file_kind.structure(file).directories) < 65

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from polcap.formats.capture.capture_toml import CaptureFile
-from polcap.formats.capture.stated import fault
+from polcap.formats.text_file import fault
 from polcap.synth.shooting import Shoot
 
 

@@ -1,4 +1,7 @@
-"""A file's bytes in, what kind of file it is out, judged by its content and never by its name. In the worker."""
+"""What kind of file it is, judged by its content and never by its name; the image directories of a TIFF.
+
+All of it runs in the child process of `worker`.
+"""
 
 import struct
 from collections import deque
@@ -9,28 +12,26 @@ Kind = Literal["raw", "photo", "other", "unknown"]
 
 SUBTYPE, WIDTH, LENGTH, BITS, COMPRESSION, PHOTOMETRIC, MAKE = 254, 256, 257, 258, 259, 262, 271
 STRIP_OFFSETS, SAMPLES, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS = 273, 277, 279, 324, 325, 330
-TILE_WIDTH, TILE_LENGTH = 322, 323
-DNG_VERSION, CFA_LAYOUT, LINEARIZATION, MASKED_AREAS = 50706, 50711, 50712, 50830
-CFA, LINEAR_RAW = 32803, 34892
+DNG_VERSION, CFA_LAYOUT = 50706, 50711
+CFA, LINEAR_RAW = 32803, 34892  # values of PHOTOMETRIC
 
 _TIFF_MAGIC = (b"II*\0", b"MM\0*")
 # Sony, Samsung, Kodak, Panasonic, Nikon, Kodak, Pentax
 _RAW_COMPRESSION = {32767, 32769, 32770, 32867, 34316, 34713, 65000, 65535}
-_WANTED = {
+_TAGS_READ = {
     SUBTYPE, WIDTH, LENGTH, BITS, COMPRESSION, PHOTOMETRIC, MAKE, DNG_VERSION, CFA_LAYOUT, SAMPLES,
-    STRIP_OFFSETS, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS, TILE_WIDTH, TILE_LENGTH, LINEARIZATION,
-    MASKED_AREAS,
+    STRIP_OFFSETS, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS,
 }  # fmt: skip
 _INTEGERS = {1: "B", 3: "H", 4: "I", 13: "I"}
-_MOST_DIRECTORIES, _MOST_VALUES = 64, 1 << 18  # a loop or a forged count ends here; of a whole file
-_SIDECARS = {".db", ".cos", ".thm", ".pdf", ".zip", ".txt", ".xmp"}  # not text, or in UTF-16
+_MAX_DIRECTORIES, _MAX_VALUES = 64, 1 << 18  # per file: stops at a loop or a forged count
+_SIDECARS = {".db", ".cos", ".thm", ".pdf", ".zip", ".txt", ".xmp"}  # binary, or text in UTF-16
 _TEXT_BYTES = 1 << 16  # some makers put lines of text in front of their pixels
 
 Directory = dict[int, tuple[int, ...]]
 
 
-class Tiff(NamedTuple):
-    """The image directories of a TIFF-structured file, the first, its siblings and their children."""
+class TiffStructure(NamedTuple):
+    """The image directories of a TIFF file: the first, its siblings and their children."""
 
     directories: tuple[Directory, ...]
     size: int  # bytes of the file
@@ -56,19 +57,13 @@ def strips(directory: Directory) -> list[tuple[int, int]]:
 
 
 def first(directory: Directory, tag: int, default: int = 0) -> int:
-    """The first value of a tag; the default where it is absent, empty or of a type that is not read here."""
+    """The first value of a tag; the default where it is absent, empty or not a whole number."""
     values = directory.get(tag, ())
     return values[0] if values else default
 
 
-def structure(file: BinaryIO) -> Tiff:
-    """The image directories of a file; none where it is not a TIFF."""
-    file.seek(0)
-    return tiff(file) if file.read(4) in _TIFF_MAGIC else Tiff((), file.seek(0, 2))
-
-
 def kind(file: BinaryIO, suffix: str) -> Kind:
-    """Whether a file is a RAW, a finished picture, something beside the pictures, or unknown bytes."""
+    """A RAW, a finished picture, some other known file, or unknown bytes."""
     file.seek(0)
     head = file.read(512)
     if head[:3] == b"\xff\xd8\xff" or head[:8] == b"\x89PNG\r\n\x1a\n" or head[:4] == b"\x76\x2f\x31\x01":
@@ -76,10 +71,10 @@ def kind(file: BinaryIO, suffix: str) -> Kind:
     if is_raw_magic(head):
         return "raw"
     if head[:4] in _TIFF_MAGIC:
-        return "raw" if _is_raw(tiff(file)) else "photo"
-    if head[4:8] == b"ftyp" or head[:4] == b"RIFF":  # HEIC, AVIF, WebP beside a RAW; films; sounds
+        return "raw" if _is_raw(structure(file)) else "photo"
+    if head[4:8] == b"ftyp" or head[:4] == b"RIFF":  # HEIC, AVIF or WebP next to a RAW; films; sounds
         return "other"
-    if suffix.lower() in _SIDECARS:  # asked only of what is no picture
+    if suffix.lower() in _SIDECARS:
         return "other"
     return "other" if _is_text(file) else "unknown"
 
@@ -95,7 +90,7 @@ def _is_text(file: BinaryIO) -> bool:
 
 
 def is_raw_magic(head: bytes) -> bool:
-    """The first bytes are those of a RAW format of its own (not a TIFF among TIFFs)."""
+    """The first bytes are those of a RAW format that is not an ordinary TIFF."""
     return (
         head[:15] == b"FUJIFILMCCD-RAW"
         or head[4:12] == b"ftypcrx "  # Canon CR3
@@ -110,30 +105,30 @@ def is_foveon(head: bytes) -> bool:
     return head[:4] == b"FOVb"
 
 
-def _is_raw(structure: Tiff) -> bool:
-    if structure.dng:
+def _is_raw(tiff: TiffStructure) -> bool:
+    if tiff.dng:
         return True
-    for directory in structure.directories:
+    for directory in tiff.directories:
         if first(directory, PHOTOMETRIC) in (CFA, LINEAR_RAW):
             return True
         if first(directory, COMPRESSION) in _RAW_COMPRESSION:
             return True
-    main = structure.directories[0] if structure.directories else {}
+    main = tiff.directories[0] if tiff.directories else {}
     return MAKE in main and SUB_IFDS in main and main.get(SUBTYPE) == (1,)  # a preview in front of sensor data
 
 
-def tiff(file: BinaryIO) -> Tiff:
-    """The image directories of a TIFF; a damaged one yields what can be read of it."""
+def structure(file: BinaryIO) -> TiffStructure:
+    """The image directories of a TIFF, as far as they can be read; none where the file is not a TIFF."""
     size = file.seek(0, 2)
     file.seek(0)
     head = file.read(8)
-    order = "<" if head[:2] == b"II" else ">"
     directories: list[Directory] = []
-    if len(head) == 8:
+    if head[:4] in _TIFF_MAGIC and len(head) == 8:
+        order = "<" if head[:2] == b"II" else ">"
         pending = deque(struct.unpack(order + "I", head[4:]))
         seen: set[int] = set()
-        left = _MOST_VALUES
-        while pending and len(directories) < _MOST_DIRECTORIES and left > 0:
+        left = _MAX_VALUES
+        while pending and len(directories) < _MAX_DIRECTORIES and left > 0:
             offset = pending.popleft()
             if offset in seen or not 8 <= offset < size:
                 continue
@@ -143,10 +138,11 @@ def tiff(file: BinaryIO) -> Tiff:
             left -= sum(map(len, directory.values()))
             directories.append(directory)
             pending.extend((*directory.get(SUB_IFDS, ()), following))
-    return Tiff(tuple(directories), size)
+    return TiffStructure(tuple(directories), size)
 
 
 def _directory(file: BinaryIO, order: str, size: int, most: int) -> tuple[Directory, int]:
+    """The tags of the directory at the file's position, and the offset of the next directory."""
     count = _unpack(file.read(2), order + "H")
     body = file.read(12 * count + 4)
     following = _unpack(body[12 * count :], order + "I")
@@ -154,12 +150,13 @@ def _directory(file: BinaryIO, order: str, size: int, most: int) -> tuple[Direct
 
 
 def _entries(body: bytes, file: BinaryIO, order: str, size: int, most: int) -> Iterator[tuple[int, tuple[int, ...]]]:
+    """Tag and values of each entry of a directory; at most `most` values."""
     for at in range(0, len(body) - 11, 12):
         tag, form, count = struct.unpack_from(order + "HHI", body, at)
-        if tag not in _WANTED or count > most:
+        if tag not in _TAGS_READ or count > most:
             continue
         if form not in _INTEGERS:
-            yield tag, ()  # there, of a type that is not read here
+            yield tag, ()
             continue
         code = f"{order}{count}{_INTEGERS[form]}"
         length = struct.calcsize(code)

@@ -1,4 +1,4 @@
-"""A photograph's EXIF in, its focal length in pixels out, and how it was come by."""
+"""Focal length in pixels from EXIF, from the user's statement, or assumed; with its source and its possible range."""
 
 import math
 import tomllib
@@ -10,17 +10,17 @@ from polcap.formats import calib
 from polcap.images import Exif
 
 FULL_FRAME_MM = (36.0, 24.0)
-_CONTRADICTION = 0.1  # ln: more than breathing and rounding
+_CONTRADICTION = 0.1  # ln of the ratio of two statements; focus breathing and rounding stay below
 _KNOWN = 0.0, 0.0
 _ASSUMED = -math.log(2.0), math.log(2.0)  # lenses of 25 to 100 mm equivalent; sensors from full frame to half its width
-NORMAL_MM = 50.0  # full-frame equivalent that is assumed where nothing is known
+NORMAL_MM = 50.0  # full-frame equivalent, assumed where nothing is known
 
 
-class Focal(NamedTuple):
-    """A focal length and where it comes from."""
+class FocalLength(NamedTuple):
+    """A focal length and its source."""
 
     px: float  # visible RAW pixels
-    doubt: tuple[float, float]  # ln of least and greatest that it may be, over px; 0, 0: known
+    doubt: tuple[float, float]  # ln of the least and the greatest possible value over px; 0, 0: known
     note: str
 
     @property
@@ -28,8 +28,8 @@ class Focal(NamedTuple):
         return self.doubt == (0.0, 0.0)
 
 
-def find(exif: Exif, stated_mm: float | None, stated_width_mm: float | None) -> Focal:
-    """Focal length in visible RAW pixels; `stated` is what the user says, and wins."""
+def find(exif: Exif, stated_mm: float | None, stated_width_mm: float | None) -> FocalLength:
+    """Focal length in visible RAW pixels; the user's statement overrides EXIF."""
     width, height = exif.width or 0, exif.height or 0
     diagonal = math.hypot(width, height)
     equivalent = exif.focal_length_35mm  # by its definition of equal diagonals, in whole millimetres
@@ -37,24 +37,25 @@ def find(exif: Exif, stated_mm: float | None, stated_width_mm: float | None) -> 
     gap = math.log(exif.focal_length_mm / stated_mm) if stated_mm and exif.focal_length_mm else 0.0
     if abs(gap) > _CONTRADICTION:
         found = find(replace(exif, focal_length_mm=None), stated_mm, stated_width_mm)
-        note = f"{found.note}, but the photographs say {exif.focal_length_mm:g} mm: correct one of the two"
-        return Focal(found.px, (min(gap, found.doubt[0]), max(gap, found.doubt[1])), note)
+        note = f"{found.note}, but EXIF states {exif.focal_length_mm:g} mm: correct one of the two"
+        return FocalLength(found.px, (min(gap, found.doubt[0]), max(gap, found.doubt[1])), note)
     sensor = stated_width_mm or (exif.pixel_pitch_um and exif.pixel_pitch_um * width / 1e3)
     sensor = sensor or sensor_widths().get(exif.model)
     if focal and sensor:
         source = "capture.toml" if stated_mm or stated_width_mm else "EXIF"
-        return Focal(focal / sensor * width, _KNOWN, f"{focal:g} mm on a sensor {sensor:.1f} mm wide ({source})")
+        return FocalLength(focal / sensor * width, _KNOWN, f"{focal:g} mm on a sensor {sensor:.1f} mm wide ({source})")
     if equivalent and not stated_mm:
         px = equivalent / math.hypot(*FULL_FRAME_MM) * diagonal
-        return Focal(px, _KNOWN, f"{equivalent:g} mm full-frame equivalent (EXIF, to about 2 %)")
+        return FocalLength(px, _KNOWN, f"{equivalent:g} mm full-frame equivalent (EXIF, to about 2 %)")
     if focal:
-        return Focal(
+        return FocalLength(
             focal / FULL_FRAME_MM[0] * width,
             _ASSUMED,
             f"{focal:g} mm, sensor size unknown: full frame assumed; state sensor_width_mm in capture.toml",
         )
     px = NORMAL_MM / math.hypot(*FULL_FRAME_MM) * diagonal
-    return Focal(px, _ASSUMED, "unknown: 50 mm full-frame equivalent assumed; state focal_length_mm in capture.toml")
+    note = "unknown: 50 mm full-frame equivalent assumed; state focal_length_mm in capture.toml"
+    return FocalLength(px, _ASSUMED, note)
 
 
 @cache
