@@ -6,8 +6,10 @@ from html import escape
 from os.path import relpath
 from pathlib import Path
 
-from polcap import pictures, pipeline, report
+from polcap import report
 from polcap.formats import html
+from polcap.pipeline import run as pipeline
+from polcap.report import stage_pictures as pictures
 from polcap.report.page import verdict
 
 page, *folders = map(Path, sys.argv[1:])
@@ -20,11 +22,11 @@ def picture(address: str, words: str) -> str:
 body = ["<h1>Gallery</h1><p>From nine photographs each. A report lies beside every result.</p>"]
 for folder in folders:
     results, _ = pipeline.reopen(folder)
-    maps, mesh, about = results.maps.value, results.mesh.value, report.read(folder)
+    maps, mesh, about = results.maps, results.mesh, report.read(folder)
     moving = pipeline.animate(folder, "light")[0].read_bytes()
     name, says = escape(about["capture"]["name"]), escape(" ".join(verdict(about)))
     shown = [
-        (html.jpeg(pictures.display(results.cues.value.radiance)), "photograph"),
+        (html.jpeg(pictures.display(results.cues.radiance)), "photograph"),
         (html.jpeg(pictures.normal(maps)), "normals"),
         (html.jpeg(pictures.shaded(mesh, maps)), "shape"),
         (f"data:image/webp;base64,{b64encode(moving).decode()}", "relit"),

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from polcap.config import Config
     from polcap.config import load as load_config
     from polcap.errors import PolcapError
-    from polcap.formats.capture import read as read_capture
-    from polcap.formats.maps import read as read_maps
+    from polcap.formats.capture.reader import read as read_capture
+    from polcap.formats.maps.maps_folder import read as read_maps
     from polcap.images import Asset, Capture, ChartRequest, Cues, Frame, Mesh, Shot, StokesImage, SurfaceMaps, View
 
 __version__ = "0.1.0"
@@ -29,8 +29,8 @@ _HOME = {  # public name → module and its name there
     "Config": ("polcap.config", "Config"),
     "load_config": ("polcap.config", "load"),
     "PolcapError": ("polcap.errors", "PolcapError"),
-    "read_capture": ("polcap.formats.capture", "read"),
-    "read_maps": ("polcap.formats.maps", "read"),
+    "read_capture": ("polcap.formats.capture.reader", "read"),
+    "read_maps": ("polcap.formats.maps.maps_folder", "read"),
 }
 _VALUES = ("Asset", "Capture", "ChartRequest", "Cues", "Frame", "Mesh", "Shot", "StokesImage", "SurfaceMaps", "View")
 _HOME |= {name: ("polcap.images", name) for name in _VALUES}

@@ -7,12 +7,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap import models, pipeline
 from polcap.config import Config
-from polcap.formats import capture as captures
+from polcap.formats.capture import reader as captures
 from polcap.images import ChartRequest
-from polcap.path import AUTO, UserInput
-from polcap.store import Progress, silent
+from polcap.pipeline import models
+from polcap.pipeline import run as pipeline
+from polcap.pipeline.cache import Progress, silent
+from polcap.pipeline.path import AUTO, UserInput
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ def process(
     """
     folder = Path(capture)
     target = folder / "polcap" if out is None else Path(out)
-    network = models.load_network(estimator, None if model is None else Path(model), "cpu", 0)
+    network = models.load_network(estimator, None if model is None else Path(model))
     supplied = UserInput(chart=chart, mask=mask, network=network, mask_network=models.load_mask_network())
     found = captures.read(folder, angles_deg)
     about = pipeline.process(found, supplied, config or Config(), target, progress=progress)

@@ -16,7 +16,6 @@ from msgspec import Meta
 
 from polcap.errors import SettingError, StorageError
 from polcap.formats import text_file
-from polcap.formats.stated import fault
 from polcap.stages.align import Settings as Align
 from polcap.stages.asset import Settings as Asset
 from polcap.stages.hdr import Settings as Hdr
@@ -221,7 +220,7 @@ def fill(kind: type[S], stated: dict[str, Any], assignments: Sequence[str]) -> S
     try:
         return msgspec.convert(stated, kind)
     except msgspec.ValidationError as error:
-        raise SettingError(f"--set {fault(error, stated, kind)}") from error
+        raise SettingError(f"--set {text_file.fault(error, stated, kind)}") from error
 
 
 def settings() -> Iterator[Setting]:

@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap import Config, images, models, read_capture
+from polcap import Config, images, read_capture
 from polcap.formats import calib
 from polcap.images import View
 from polcap.optics import frames
+from polcap.pipeline import models
 from polcap.stages import Stage, align, asset, cues, hdr, infer, mask, selfcal, stokes, surface, whitebalance
 from tests import scenes
 

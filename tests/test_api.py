@@ -6,8 +6,8 @@ import sys
 import pytest
 
 import polcap
-from polcap import models
-from polcap.formats import maps
+from polcap.formats.maps import maps_folder as maps
+from polcap.pipeline import models
 
 
 def test_importing_polcap_imports_nothing_heavy() -> None:
@@ -17,9 +17,8 @@ def test_importing_polcap_imports_nothing_heavy() -> None:
 
 
 def test_importing_the_path_leaves_to_those_who_need_it_what_is_heavy() -> None:
-    """OpenImageIO also because its binding tells of leaks where it is imported before `keep_imported`."""
     heavy = ("OpenImageIO", "scipy", "onnxruntime", "trimesh", "rawpy")
-    code = f"import sys, polcap.pipeline; print([m for m in {heavy} if m in sys.modules])"
+    code = f"import sys, polcap.pipeline.run; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -48,4 +47,4 @@ def test_python_takes_the_network_as_the_command_line_does(monkeypatch: pytest.M
     monkeypatch.setattr(models, "load_network", load)
     with pytest.raises(polcap.PolcapError, match="far enough"):
         polcap.process("nowhere")
-    assert asked == [(None, None, "cpu", 0)]  # what `polcap process` without flags asks for
+    assert asked == [(None, None)]  # what `polcap process` without flags asks for

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from polcap import cli, pipeline
+from polcap import cli
 from polcap.cli import extras
-from polcap.path import STAGES
+from polcap.pipeline import run as pipeline
+from polcap.pipeline.path import STAGES
 from tests.conftest import Command, shell
 
 
@@ -234,7 +235,7 @@ def test_user_mask_replaces_the_search(result: Path, example: Path, polcap: Comm
     done = polcap("process", example, "--out", copy, "--mask", tmp_path / "mask.png", "--until", "mask", "--json")
     assert done.returncode == 0, done.stderr
     results, _ = pipeline.reopen(copy)
-    assert results.object_.value.source == "user" and np.array_equal(results.object_.value.mask, drawn > 0)
+    assert results.object_.source == "user" and np.array_equal(results.object_.mask, drawn > 0)
 
 
 def test_watch_goes_on_as_photographs_come_in_and_settings_change(example: Path, tmp_path: Path) -> None:

@@ -7,7 +7,9 @@ import pytest
 
 from polcap import doctor
 from polcap.doctor.finding import Finding
-from polcap.formats import dng, png, raw
+from polcap.formats.maps import png
+from polcap.formats.raw import dng
+from polcap.formats.raw import libraw as raw
 from polcap.images import Exif
 from tests.conftest import Command
 

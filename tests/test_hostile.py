@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polcap.formats import exr
+from polcap.formats.maps import exr
 from tests.conftest import Command, Done, shell
 
 NESTED = "[" * 30_000

@@ -12,8 +12,8 @@ import pytest
 
 from polcap import report
 from polcap.errors import StorageError
-from polcap.pictures import keys
-from polcap.report import compare, labels, lean, map_figures, page
+from polcap.report import compare, keys, labels, map_figures, page
+from polcap.report import mesh_preview as lean
 from tests import surfaces
 
 

@@ -4,11 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from polcap import pipeline, resource_limits
+from polcap import resource_limits
 from polcap.config import Config
 from polcap.errors import ModelError, SettingError
-from polcap.formats.capture import read as read_capture
-from polcap.path import UserInput
+from polcap.formats.capture.reader import read as read_capture
+from polcap.pipeline import run as pipeline
+from polcap.pipeline.path import UserInput
 from polcap.stages import align
 from polcap.stages.hdr import budget
 from tests.conftest import Command

@@ -8,7 +8,8 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from polcap import __version__, cli, pipeline, terminal
+from polcap import __version__, cli, terminal
+from polcap.pipeline import run as pipeline
 from tests.conftest import Command
 
 

@@ -7,11 +7,11 @@ onnxruntime, whose import starts one, is left to each worker.
 import scipy.sparse.linalg
 import scipy.special  # noqa: F401
 
-from polcap import models, pipeline, resource_limits  # noqa: F401
 from polcap.batch import thumbnail, unit  # noqa: F401
-from polcap.formats import capture, provenance  # noqa: F401
+from polcap.formats.capture import reader  # noqa: F401
+from polcap.formats.export import provenance
 from polcap.optics import body
+from polcap.pipeline import models, run  # noqa: F401
 
 body.make_tables()
 provenance.versions()
-resource_limits.keep_imported()  # a look for garbage writes to, and so copies, what workers share

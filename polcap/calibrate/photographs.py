@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from polcap.errors import CaptureError
-from polcap.formats import layouts, probe, raw
+from polcap.formats.capture import layouts
+from polcap.formats.raw import libraw as raw
+from polcap.formats.raw import probe
 from polcap.images import Exif, Floats, SensorImage
 from polcap.optics import sensor
 

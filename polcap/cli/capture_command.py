@@ -40,23 +40,24 @@ def capture(
     json: Json = False,
 ) -> None:
     """Shoot a capture: turn the polarizer, take the bracket, check every frame as it lands."""
-    from polcap.rig import camera as cameras
-    from polcap.rig import plan, sequence
+    from polcap.rig import dry_run as plans
+    from polcap.rig import exposure_bracket, sequence
+    from polcap.rig.resume import complete_order
 
     stated = {
         "rotator": rotator,
         "camera": camera,
         "angles_deg": options.angles_deg(angles),
-        "bracket": None if bracket is None else cameras.parse_bracket(bracket),
+        "bracket": None if bracket is None else exposure_bracket.parse_bracket(bracket),
         "repeat_deg": None if repeat is None else options.numbers("--repeat", repeat),
         "ambient": ambient or None,
         "chart": chart or None,
         "cross": cross or None,
     }
-    wanted = sequence.order(folder, stated, resume)
+    wanted = complete_order(folder, stated, resume)
     if dry_run:
-        planned = plan.dry_run(wanted)
-        terminal.say(planned if json else plan.table(planned))
+        planned = plans.dry_run(wanted)
+        terminal.say(planned if json else plans.table(planned))
         return
     done = sequence.shoot(folder, wanted, resume=resume, tries=tries, tell=terminal.tell)
     verdict = None if no_check else _verdict(folder)
@@ -67,10 +68,10 @@ def capture(
 
 def _verdict(folder: Path) -> dict[str, Any] | None:
     """What `polcap check` says of a capture, on stderr too; None where it cannot be judged."""
-    from polcap import check as checks
-    from polcap import models
     from polcap.config import Config
-    from polcap.formats import capture as captures
+    from polcap.formats.capture import reader as captures
+    from polcap.pipeline import check as checks
+    from polcap.pipeline import models
 
     try:
         verdict = checks.inspect(captures.read(folder), models.shipped, Config())

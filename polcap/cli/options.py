@@ -79,7 +79,7 @@ def chart_request(text: str | None, no_chart: bool) -> "ChartRequest":
 
 def user_mask(file: Path) -> Any:
     """--mask: (H, W) bool, true where the picture is lighter than half of white."""
-    from polcap.formats import png
+    from polcap.formats.maps import png
 
     picture = png.read(file)
     half = 128 if picture.dtype.itemsize == 1 else 32768

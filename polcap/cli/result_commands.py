@@ -40,15 +40,15 @@ def export(
     json: Json = False,
 ) -> None:
     """Write the asset again from the maps of a result; without a flag GLB and OBJ, as `process` does."""
-    from polcap import pipeline
-    from polcap.asset_export import Wanted
-    from polcap.formats import presets
+    from polcap.formats.export import presets
+    from polcap.pipeline import run as pipeline
+    from polcap.pipeline.asset_export import ExportRequest
 
     flags = {"gltf": gltf, "obj": obj, "usd": usd, "materialx": materialx, "exr": exr}
     formats = tuple(name for name in presets.FORMATS if flags[name])
     if preset is not None and formats:
         raise SettingError(f"--preset {preset} brings its formats; leave out --{formats[0]}")
-    wanted = Wanted(formats or ("gltf", "obj"), preset, images, color, texture_size, lod)
+    wanted = ExportRequest(formats or ("gltf", "obj"), preset, images, color, texture_size, lod)
     written = [str(file) for file in pipeline.export(result, wanted)]
     terminal.say({"written": written} if json else "\n".join(written))
 
@@ -70,8 +70,8 @@ def show(
     json: Json = False,
 ) -> None:
     """Draw what a stage made; prints the picture's path, and on a terminal shows it."""
-    from polcap import pipeline
-    from polcap.path import STAGES
+    from polcap.pipeline import run as pipeline
+    from polcap.pipeline.path import STAGES
 
     if (stage is None) + (not all_) + (animate is None) != 2:
         raise SettingError(f"show {result}: give one of a stage ({', '.join(STAGES)}), --all or --animate")
@@ -85,11 +85,11 @@ def show(
 
 def status(context: typer.Context, result: Result, json: Json = False) -> None:
     """What a result folder holds, stage by stage; or how far a batch of captures is."""
-    from polcap import store
+    from polcap.pipeline import cache
 
     if not result.is_dir():
         raise SettingError(f"{result}: no such folder; give the result folder of `polcap process`, or that of a batch")
-    found = store.contents(result)
+    found = cache.contents(result)
     if not found and (result / "polcap-batch").is_dir():
         from polcap import batch as batches
 
@@ -133,7 +133,7 @@ def report(
             terminal.tell("polcap: no figure and no setting differs")
         print(f"polcap: both side by side: {file}", file=sys.stderr)
         return
-    from polcap import pipeline
+    from polcap.pipeline import run as pipeline
 
     about = pipeline.judge_again(result)
     terminal.say(about if json else str(result / "report.html"))

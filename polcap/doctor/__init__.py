@@ -14,12 +14,15 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from polcap import __version__, models
+from polcap import __version__
 from polcap.doctor import photograph
 from polcap.doctor.finding import Finding, State
 from polcap.errors import PolcapError
-from polcap.formats import calib, dng, onnx, raw
+from polcap.formats import calib, onnx
+from polcap.formats.raw import dng
+from polcap.formats.raw import libraw as raw
 from polcap.images import Exif
+from polcap.pipeline import models
 
 _ENOUGH_GB, _LEAST_GB = 10.0, 1.0  # free disk: a capture of 24 MP with its result takes about 2
 _EDGE_PX = 64  # of the RAW that is written and decoded as a trial

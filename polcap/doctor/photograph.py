@@ -7,7 +7,9 @@ import numpy as np
 
 from polcap.doctor.finding import Finding
 from polcap.errors import DecodeError
-from polcap.formats import focal, photo, probe, raw
+from polcap.formats.capture import focal_length
+from polcap.formats.raw import libraw as raw
+from polcap.formats.raw import photo, probe
 from polcap.images import Exif, SensorImage
 from polcap.optics import sensor
 from polcap.stages import hdr
@@ -63,7 +65,7 @@ def _metadata(exif: Exif) -> Iterator[Finding]:
     says = ", ".join(f"{name} {value}" for name, value in parts.items() if value) or "none"
     remedy = f"not stated: {', '.join(missing)}; exposures are then taken from the pixels" if missing else ""
     yield Finding("exposure", "warning" if missing else "ok", says, remedy)
-    lens = focal.find(exif, None, None)
+    lens = focal_length.find(exif, None, None)
     remedy = "" if lens.known else "state focal_length_mm and sensor_width_mm in capture.toml"
     yield Finding("focal length", "ok" if lens.known else "warning", lens.note, remedy)
 

@@ -1,7 +1,7 @@
-"""In: a final path. Out: a file or folder that is there whole, or not at all.
+"""Writes a file or folder complete or not at all; makes names that every file system accepts.
 
-Written beside, fsynced, renamed: whoever finds the final name finds a complete file. The new name itself reaches the
-disk when the system next writes its journal; should the power fail before, what stood there before is there again.
+It is written under a temporary name, synced to the disk and renamed, so the final name always leads to a complete
+file. The new name reaches the disk with the system's next journal write; after a power cut the old file may be back.
 """
 
 import errno
@@ -14,15 +14,18 @@ from pathlib import Path
 
 from polcap.errors import StorageError
 
-_TOGETHER = 8  # files that are synced at a time: the system writes its journal once for all of them
+_SYNCED_AT_ONCE = 8  # files; the system then writes its journal once for all of them
+_FORBIDDEN = set('/\\:*?"<>|')  # path separators, and characters that Windows refuses
+_DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{n}" for port in ("COM", "LPT") for n in range(10))}  # of Windows
+_NAME_BYTES = 60  # Windows allows 260 characters for the whole path
 REASONS = {
     errno.ENOSPC: "the disk is full; free some space",
     errno.EDQUOT: "the disk quota is used up; free some space",
     errno.EROFS: "the file system is read-only; choose another folder",
     errno.EACCES: "permission denied; choose a folder that may be written",
     errno.EPERM: "permission denied; choose a folder that may be written",
-    errno.EEXIST: "a file stands where a folder is needed; choose another path",
-    errno.ENOTDIR: "a file stands where a folder is needed; choose another path",
+    errno.EEXIST: "there is a file where a folder is needed; choose another path",
+    errno.ENOTDIR: "there is a file where a folder is needed; choose another path",
     errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
     errno.EFBIG: "the file is larger than the file system allows; choose another folder",
     errno.EIO: "the disk reports an input/output error; check the disk",
@@ -30,56 +33,40 @@ REASONS = {
 
 
 def failure(target: Path, error: OSError) -> StorageError:
-    """The one line for a write that the system refused."""
+    """The error for a write that the system refused."""
     reason = REASONS.get(error.errno or 0, error.strerror or str(error))
     return StorageError(f"cannot write {target}: {reason}")
 
 
 class Held:
-    """Files that are whole, and wait for their final names."""
+    """Complete files that get their final names together."""
 
     def __init__(self) -> None:
         self._files: list[tuple[Path, Path]] = []
 
     def take(self, temporary: Path, final: Path) -> None:
-        """From here on a file is this one's."""
+        """Keep a file until `release` or `drop`."""
         self._files.append((temporary, final))
 
     def release(self) -> None:
-        """Give all their names.
-
-        Raises
-        ------
-        StorageError
-            The system refused one; those behind it go on waiting.
-        """
+        """Rename all; StorageError where the system refuses one, the rest stays held."""
         while self._files:
             _rename(*self._files[0])
             del self._files[0]
 
     def drop(self) -> None:
-        """Remove those that wait."""
+        """Remove the files that are still held."""
         for temporary, _ in self._files:
             discard(temporary)
 
 
 @contextmanager
 def path(final: str | Path, synced: bool = True, held: Held | None = None) -> Iterator[Path]:
-    """A temporary path beside `final`, which becomes `final` when the block ends well, or later, where it is `held`.
+    """A temporary path for writing, renamed to `final` when the block ends well, or later where it is `held`.
 
-    Parent folders are made. The temporary keeps the suffix, so that writers which choose
-    their format by name see the right one. On any exception it is removed and whatever stood
-    under `final` is untouched.
-
-    Parameters
-    ----------
-    final
-        The path.
-    synced
-        Bring the file to the disk before its name; not where whoever reads it notices that it is not whole, and can do
-        without it.
-    held
-        Gives the file its name later.
+    Parent folders are made. The temporary name has the same suffix, for writers that choose a format by it. On any
+    exception it is removed, and an old file under `final` is untouched. Without `synced` the file may be incomplete
+    after a power cut: for files whose reader checks them.
 
     Raises
     ------
@@ -117,12 +104,7 @@ def _rename(temporary: Path, final: Path) -> None:
 
 @contextmanager
 def folder(final: str | Path, synced: bool = True) -> Iterator[Path]:
-    """The same for a folder; a folder that stood under `final` is replaced as a whole.
-
-    Parameters
-    ----------
-    final, synced
-        As of `path`.
+    """`path` for a folder; an old folder under `final` is replaced as a whole.
 
     Raises
     ------
@@ -131,29 +113,29 @@ def folder(final: str | Path, synced: bool = True) -> Iterator[Path]:
     """
     final = Path(final)
     temporary = final.with_name(f".{final.name}.{os.getpid()}.part")
-    aside = final.with_name(f".{final.name}.{os.getpid()}.old")
+    old = final.with_name(f".{final.name}.{os.getpid()}.old")
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
         temporary.mkdir()
         yield temporary
         if synced:
-            with ThreadPoolExecutor(_TOGETHER) as pool:
+            with ThreadPoolExecutor(_SYNCED_AT_ONCE) as pool:
                 list(pool.map(sync, [*sorted(temporary.rglob("*")), temporary]))
         if final.exists():
-            os.replace(final, aside)
+            os.replace(final, old)
         os.replace(temporary, final)
     except OSError as error:
-        if aside.exists() and not final.exists():
-            os.replace(aside, final)
+        if old.exists() and not final.exists():
+            os.replace(old, final)
         raise failure(final, error) from error
     finally:
         discard(temporary)
-        discard(aside)
+        discard(old)
 
 
 def sync(target: Path) -> None:
-    """Bring a file's bytes, or a folder's names, to the disk."""
-    if os.name == "nt" and target.is_dir():  # knows no such call
+    """Write a file's bytes, or a folder's names, to the disk."""
+    if os.name == "nt" and target.is_dir():  # Windows cannot sync a folder
         return
     handle = os.open(target, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
     try:
@@ -163,9 +145,17 @@ def sync(target: Path) -> None:
 
 
 def discard(target: Path) -> None:
-    """Remove a file or folder, whatever stands in the way."""
-    with suppress(OSError):  # the failure that led here is the one to tell
+    """Remove a file or folder if possible; errors are ignored."""
+    with suppress(OSError):  # the error that led here is the one to report
         if target.is_dir():
             shutil.rmtree(target, ignore_errors=True)
         else:
             target.unlink()
+
+
+def safe_name(text: str) -> str:
+    """A name for a file from any text: forbidden characters become _; never empty, hidden or a device's name."""
+    name = "".join("_" if c in _FORBIDDEN or not c.isprintable() else c for c in text)
+    name = name.encode("utf-8", "replace")[:_NAME_BYTES].decode("utf-8", "ignore")
+    name = name.strip(". ") or "capture"
+    return f"_{name}" if name.partition(".")[0].rstrip().upper() in _DEVICES else name

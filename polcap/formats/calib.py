@@ -1,4 +1,4 @@
-"""In: calibration files (TOML). Out: a chart's reference colours, colour profiles of earlier captures."""
+"""Reference colors of charts; color profiles of earlier captures (TOML)."""
 
 from pathlib import Path
 from typing import Any
@@ -10,13 +10,30 @@ import tomli_w
 from polcap.errors import ChartError, StorageError
 from polcap.formats import atomic, text_file
 from polcap.images import Bits, ChartReference, ColorCalibration, Floats
+from polcap.optics.color import REC709_TO_XYZ, decode_srgb
 
 _SOURCES = ("chart", "corners", "profile", "camera", "none")
+_NAMES = {
+    "classic": "ColorChecker Classic (since November 2014)",
+    "classic_before_2014": "ColorChecker Classic (before November 2014)",
+    "classic_srgb": "ColorChecker Classic (the maker's sRGB values)",
+    "sg": "ColorChecker SG, block E2 to J5 (since November 2014)",
+}
+_TABLES = {  # of colour-science
+    "classic": "ColorChecker24 - After November 2014",
+    "classic_before_2014": "ColorChecker24 - Before November 2014",
+    "sg": "ColorCheckerSG - After November 2014",
+}
+_EDITIONS = ("classic_before_2014", "classic_srgb")  # of a Classic, tried as well
+_SG_BLOCK = tuple(f"{column}{row}" for row in (2, 3, 4, 5) for column in "EFGHIJ")
+# Between the outer corners of the patches of the full-size card (279 × 216 mm): nominal patches of 40 mm, and a
+# pitch of 40 mm / 0.874, the ratio found in photographs of five such cards (0.873–0.876). About 1 %.
+_CLASSIC_SIZE_M = (0.269, 0.177)
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def data_path(name: str) -> Path:
-    """The file `name` of the shipped calibration data, e.g. "colorchecker/classic.toml".
+    """The file `name` of the shipped calibration data, e.g. "colorchecker/classic_srgb.toml".
 
     In a checkout it lies in `calib/` beside the package, in an installed wheel in `polcap/_calib/`.
 
@@ -31,45 +48,37 @@ def data_path(name: str) -> Path:
     raise StorageError(f"calibration data {name} is missing from this installation; install polcap again")
 
 
-class _Patch(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    name: str
-    xyY: tuple[float, float, float]
-    rec709: tuple[float, float, float]
+class _SrgbChart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    srgb: list[tuple[int, int, int]]
 
 
-class _Chart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    name: str
-    illuminant: tuple[float, float]
-    rows: int
-    columns: int
-    patch: list[_Patch]
-    size_m: tuple[float, float] | None = None
-    editions: tuple[str, ...] = ()
+def colorchecker(kind: str = "classic") -> ChartReference:
+    """Reference colors of a kind of ColorChecker: classic, classic_before_2014, classic_srgb or sg.
 
-
-def colorchecker(kind: str = "classic", path: Path | None = None) -> ChartReference:
-    """The reference colours of a shipped kind of ColorChecker (classic, sg), or of a file of the same form.
-
-    Other editions that the file names are read from beside it.
-
-    Raises
-    ------
-    ChartError
-        A file that is not TOML, or does not describe a chart of 4 rows of 6 patches.
+    The maker's measurements under D50 as tabulated by colour-science, adapted to D65 (Bradford). classic_srgb is
+    the maker's sRGB table, a file of ours. Of an SG it is the block E2 to J5, which repeats the Classic's colors.
     """
-    path = path or data_path(f"colorchecker/{kind}.toml")
-    chart = _read(path, _Chart)
-    if (chart.rows, chart.columns, len(chart.patch)) != (4, 6, 24):
-        raise ChartError(
-            f"{path}: {chart.rows} rows × {chart.columns} columns with {len(chart.patch)} patches; "
-            "polcap reads charts of 4 × 6 = 24 patches"
-        )
+    from polcap.optics.colour_science import colour
+
+    classic = colour.CCS_COLOURCHECKERS[_TABLES["classic"]].data
+    names = tuple(name.partition(" (")[0] for name in classic)
+    if kind == "classic_srgb":
+        file = _read(data_path("colorchecker/classic_srgb.toml"), _SrgbChart)
+        return ChartReference(_NAMES[kind], decode_srgb(np.array(file.srgb) / 255), None, names)
+    table = colour.CCS_COLOURCHECKERS[_TABLES[kind]]
+    keys = _SG_BLOCK if kind == "sg" else tuple(table.data)
+    xyz = colour.chromatic_adaptation(
+        colour.xyY_to_XYZ([table.data[key] for key in keys]),
+        colour.xy_to_XYZ(table.illuminant),
+        colour.xy_to_XYZ(colour.RGB_COLOURSPACES["sRGB"].whitepoint),
+        transform="Bradford",
+    )
     return ChartReference(
-        name=chart.name,
-        rec709=np.array([patch.rec709 for patch in chart.patch]),
-        size_m=chart.size_m,
-        patches=tuple(patch.name.partition(" (")[0] for patch in chart.patch),
-        editions=tuple(colorchecker(path=path.with_name(f"{name}.toml")) for name in chart.editions),
+        name=_NAMES[kind],
+        rec709=xyz @ np.linalg.inv(REC709_TO_XYZ).T,
+        size_m=_CLASSIC_SIZE_M if kind == "classic" else None,
+        patches=tuple(f"{key} {name}" for key, name in zip(keys, names, strict=True)) if kind == "sg" else names,
+        editions=tuple(map(colorchecker, _EDITIONS)) if kind == "classic" else (),
     )
 
 

@@ -10,7 +10,7 @@ import tomli_w
 
 from polcap.calibration_values import Calibration, LensGeometry, Polarizer
 from polcap.errors import CaptureError
-from polcap.formats import atomic, calibrations_folder, file_name, text_file
+from polcap.formats import atomic, calibrations_folder, text_file
 from polcap.images import Distortion, Exif
 from polcap.optics import distortion
 
@@ -35,7 +35,7 @@ def write(place: Path, found: Calibration) -> Path:
         It cannot be written.
     """
     parts = [found.made[:19].replace(":", ""), found.camera, found.lens, found.filter]
-    path = place / (file_name.safe(" ".join(part for part in parts if part)) + ".toml")
+    path = place / (atomic.safe_name(" ".join(part for part in parts if part)) + ".toml")
     with atomic.path(path) as temporary:
         temporary.write_text(text(found), encoding="utf-8")
     return path

@@ -10,13 +10,14 @@ A model says in its metadata what it eats and under which terms it may be used:
 
 A file that does not say so is refused. A model that polcap does not ship is first loaded and run on a small picture
 in the limited child: what crashes, loops or eats memory there never reaches this process. Here each run has a time
-limit. The only module that imports onnxruntime.
+limit. The only module that imports onnxruntime: in `_onnxruntime`, which turns its telemetry off.
 """
 
+import os
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Literal
@@ -25,7 +26,8 @@ import numpy as np
 
 from polcap import parallel
 from polcap.errors import DecodeError, ModelError
-from polcap.formats import calib, onnx_metadata, text_file, worker
+from polcap.formats import calib, text_file
+from polcap.formats.raw import worker
 from polcap.images import Floats, Network
 
 ENCODING = "1"
@@ -41,9 +43,7 @@ _AT_ONCE = 4  # runs side by side, at most: positions that a network looks from
 _MOST_NUMBER = 1 << 16  # px; of what the metadata state
 
 
-def load(
-    path: str | Path, device: Device = "cpu", threads: int = 0, encoding: str = ENCODING, later: bool = False
-) -> Network:
+def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: str = ENCODING) -> Network:
     """Open a model, after a trial in a child where it is none that polcap ships.
 
     Parameters
@@ -56,8 +56,6 @@ def load(
         0 is as many as may run.
     encoding
         Of the channels that the model must eat.
-    later
-        A shipped model for the CPU is opened when it first runs: a run that finds all in its cache needs none.
 
     Raises
     ------
@@ -68,18 +66,8 @@ def load(
     path = Path(path)
     data = _bytes(path)
     mark = digest(data)
-    shipped = path in _shipped_files() or mark in _shipped()
-    if later and device == "cpu" and shipped:
-        try:
-            metadata: Mapping[str, str] = onnx_metadata.read(data)
-        except ValueError as error:
-            raise ModelError(f"{path}: is damaged ({error}); install polcap again") from error
-        model = Model(path, parallel.Once(partial(_reopen, path, mark, threads)))
-        channels, at_once = _stated(path, metadata, encoding), _at_once(CPU, threads)
-        return Network(model, mark, channels, metadata, CPU, warm=model.opened, at_once=at_once)
-    import onnxruntime
-
-    if not shipped:
+    onnxruntime = _onnxruntime()
+    if path not in _shipped_files() and mark not in _shipped():
         _try(path, mark, encoding)
     if device == "cuda" and CUDA not in onnxruntime.get_available_providers():
         raise ModelError("--device cuda: this onnxruntime has no CUDA; install onnxruntime-gpu, or use --device cpu")
@@ -90,7 +78,7 @@ def load(
         raise ModelError("--device cuda: CUDA does not start; make driver, CUDA and cuDNN fit, or use --device cpu")
     metadata = _metadata(path, session)
     channels = _check(path, session, metadata, encoding)
-    model = Model(path, lambda: session)
+    model = Model(path, session)
     return Network(model, mark, channels, metadata, provider, at_once=_at_once(provider, threads))
 
 
@@ -104,7 +92,7 @@ class Model:
     """An open model: channels (1, N, H, W) in, maps by name (1, n, H, W) out."""
 
     path: Path
-    opened: Callable[[], Any]  # its session
+    session: Any
     limit_s: float = _RUN_S
 
     def __call__(self, inputs: Floats) -> dict[str, Floats]:
@@ -115,13 +103,11 @@ class Model:
         ModelError
             It fails on such an input, does not end, or answers with something that is no map of it.
         """
-        import onnxruntime
-
-        session = self.opened()
+        session = self.session
         entry = session.get_inputs()[0]
         dtype = np.float16 if entry.type == "tensor(float16)" else np.float32
         names = [output.name for output in session.get_outputs()]
-        options = onnxruntime.RunOptions()
+        options = _onnxruntime().RunOptions()
         overdue = threading.Timer(self.limit_s, setattr, (options, "terminate", True))
         overdue.daemon = True
         overdue.start()
@@ -162,24 +148,13 @@ def trial(path: str, expected: str, encoding: str) -> worker.Answer:
     channels = _check(file, session, metadata, encoding)
     side = max(_TRIAL_PX, int(metadata["size_multiple"]))
     noise = np.random.default_rng(1).normal(size=(1, len(channels), side, side))
-    Model(file, lambda: session)(noise.astype(np.float32))
+    Model(file, session)(noise.astype(np.float32))
     return {}, {}
 
 
 def _at_once(provider: str, threads: int) -> int:
     """Runs that may go side by side: two of a thread each end sooner than one after another on two threads."""
     return min(threads or parallel.threads(), _AT_ONCE) if provider == CPU else 1
-
-
-def _known(session: Any) -> Callable[[], Any]:
-    return lambda: session
-
-
-def _reopen(path: Path, expected: str, threads: int) -> Any:
-    data = _bytes(path)
-    if digest(data) != expected:
-        raise ModelError(f"{path}: has changed since it was read; run again")
-    return _open(path, data, [CPU], threads)
 
 
 def _try(path: Path, expected: str, encoding: str) -> None:
@@ -217,17 +192,15 @@ def _metadata(path: Path, session: Any) -> Mapping[str, str]:
 
 def providers(path: Path) -> dict[str, str]:
     """Every provider this onnxruntime has for this machine, and why it does not run the model; "" where it does."""
-    import onnxruntime
-
     found = {}
-    for name in onnxruntime.get_available_providers():
+    for name in _onnxruntime().get_available_providers():
         if name == _REMOTE:
             continue
         try:
             session = _open(path, _bytes(path), [name], 0)
             shape = session.get_inputs()[0].shape
             sides = [side if isinstance(side, int) else _TRIAL_PX for side in shape[2:]]
-            Model(path, _known(session))(np.zeros((1, shape[1], *sides), np.float32))
+            Model(path, session)(np.zeros((1, shape[1], *sides), np.float32))
             found[name] = "" if session.get_providers()[0] == name else "does not start"
         except ModelError as error:
             found[name] = str(error)
@@ -235,8 +208,7 @@ def providers(path: Path) -> dict[str, str]:
 
 
 def _open(path: Path, data: bytes, providers: list[str], threads: int) -> Any:
-    import onnxruntime
-
+    onnxruntime = _onnxruntime()
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4  # its failures are raised, and told once
     options.intra_op_num_threads = max(1, (threads or parallel.threads()) - _AT_ONCE + 1)
@@ -282,11 +254,21 @@ def _usable(number: str) -> bool:
     return len(number) < 9 and number.isascii() and number.isdecimal() and 1 <= int(number) <= _MOST_NUMBER
 
 
+def _onnxruntime() -> Any:
+    """The library, imported without its telemetry: a device id below the home folder, and events sent to its maker.
+
+    It reads the variable once, when it is first imported. Child processes inherit it.
+    """
+    os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+    import onnxruntime
+
+    return onnxruntime
+
+
 def _failures() -> tuple[type[Exception], ...]:
     """onnxruntime's exceptions have no common base of their own."""
-    from onnxruntime.capi import onnxruntime_pybind11_state as state
-
-    own = [kind for kind in vars(state).values() if isinstance(kind, type) and issubclass(kind, Exception)]
+    state = vars(_onnxruntime().capi.onnxruntime_pybind11_state)
+    own = [kind for kind in state.values() if isinstance(kind, type) and issubclass(kind, Exception)]
     return (*own, ValueError, RuntimeError)
 
 

@@ -1,24 +1,32 @@
-"""In: the path of a text file that anybody may have written. Out: its content, as TOML or JSON.
+"""Reads TOML and JSON from files that anybody may have written, and explains what is wrong with a key.
 
-It is UTF-8, with or without a byte order mark. Whatever stands there, a reader gets plain data or an `OSError` or
-`ValueError` of one line: no pipe is waited for, no number is without end, no nesting too deep, no value infinite.
+Files are UTF-8, with or without a byte order mark. The reader gets plain data, or an `OSError` or `ValueError` of one
+line: a pipe, a huge file, deep nesting and infinite numbers are refused.
 """
 
+import difflib
 import errno
 import json
 import math
 import os
+import re
 import stat
 import tomllib
 from pathlib import Path
-from typing import Any, BinaryIO, NoReturn
+from typing import Any, BinaryIO, NoReturn, TypeVar
+
+import msgspec
+from msgspec import inspect
 
 _PART = 1 << 22  # bytes that are read at a time
-TEXT_BYTES = 16 << 20  # the manifest of a large capture has some 20 kB
+TEXT_BYTES = 16 << 20  # the capture.toml of a large capture has about 20 kB
+_STEP = re.compile(r"\.([^.\[`]+)|\[(\d+)\]")  # of a path such as $.frame[0].role
+_UNKNOWN = re.compile(r"Object contains unknown field `(.*)`")
+_Type = TypeVar("_Type", bound=inspect.Type)
 
 
 def opened(path: str | Path) -> BinaryIO:
-    """A regular file, opened to be read; a pipe or a device is refused, never waited for. Raises OSError."""
+    """A regular file, open for reading; a pipe or a device is refused at once. Raises OSError."""
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     if not stat.S_ISREG(os.fstat(handle).st_mode):
         os.close(handle)
@@ -29,10 +37,10 @@ def opened(path: str | Path) -> BinaryIO:
 def read_bytes(path: str | Path, limit: int) -> bytes:
     """The content of a regular file of at most `limit` bytes. Raises OSError."""
     with opened(path) as file:
-        stated = min(os.fstat(file.fileno()).st_size, limit)  # no room is taken for what is not there
-        data = file.read(stated + 1)  # at once: putting parts together takes ten times as long
+        stated = min(os.fstat(file.fileno()).st_size, limit)  # no more memory than the file has bytes
+        data = file.read(stated + 1)  # in one call: joining parts is ten times slower
         left = limit + 1 - len(data)
-        while left and (part := file.read(min(left, _PART))):  # it grew, or the system stated no size
+        while left and (part := file.read(min(left, _PART))):  # the file grew, or its size was not known
             data += part
             left -= len(part)
     if not left:
@@ -51,7 +59,7 @@ def read_json(path: str | Path) -> Any:
 
 
 def parse_toml(text: str, finite: bool = True) -> dict[str, Any]:
-    """TOML text as plain data; ValueError where it is none, or a number in it is not finite though it shall be."""
+    """TOML text as plain data; ValueError where it is not TOML, or with `finite` holds an infinite number."""
     try:
         found = tomllib.loads(text)
     except RecursionError:
@@ -62,7 +70,7 @@ def parse_toml(text: str, finite: bool = True) -> dict[str, Any]:
 
 
 def parse_json(text: str) -> Any:
-    """JSON text as plain data; ValueError where it is none, or a number in it is not finite."""
+    """JSON text as plain data; ValueError where it is not JSON, or a number in it is not finite."""
     try:
         return json.loads(text, parse_constant=_refuse, parse_float=_finite)
     except RecursionError:
@@ -70,7 +78,7 @@ def parse_json(text: str) -> Any:
 
 
 def check_finite(value: Any, name: str = "") -> None:
-    """ValueError names the first number in plain data that is infinite or NaN."""
+    """Raise a ValueError that names the first infinite or NaN number in plain data."""
     if isinstance(value, float) and not math.isfinite(value):
         raise ValueError(f"{name} = {value} is not a finite number")
     if isinstance(value, dict):
@@ -88,3 +96,50 @@ def _finite(text: str) -> float:
 
 def _refuse(text: str) -> NoReturn:
     raise ValueError(f"{text} is not a finite number")
+
+
+def fault(error: msgspec.ValidationError, data: Any, kind: type[msgspec.Struct]) -> str:
+    """msgspec's error about `data` in plain words: the key and its value, then its limit or the most similar key."""
+    message, _, path = str(error).partition(" - at `$")
+    value, form = data, inspect.type_info(kind)
+    for name, place in _STEP.findall(path):
+        value, form = value[int(place) if place else name], _inner(form, name)
+    where = path.strip("`.")
+    if unknown := _UNKNOWN.fullmatch(message):
+        known = [field.encode_name for field in _of(form, inspect.StructType).fields]
+        near = difflib.get_close_matches(unknown[1], known, n=1, cutoff=0.5)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
+        return f"{f'{where}.' if where else ''}{unknown[1]}: there is no such key; {hint}"
+    if message.startswith("Invalid enum value"):
+        message = f"not one of {', '.join(map(str, _of(form, inspect.LiteralType).values))}"
+    text = f"{message[:1].lower()}{message[1:]}"
+    if not where or isinstance(value, (dict, list, tuple)):
+        return f"{where}: {text}" if where else text
+    return f"{where} = {value!r}: {text}"
+
+
+def _inner(form: inspect.Type, name: str) -> inspect.Type:
+    """The type at a key of a table, or at a position of a list."""
+    if name:
+        return next(field.type for field in _of(form, inspect.StructType).fields if field.encode_name == name)
+    for kind in (inspect.VarTupleType, inspect.ListType):
+        if (found := _found(form, kind)) is not None:
+            return found.item_type
+    return inspect.AnyType()  # a list of fixed length: of numbers only
+
+
+def _of(form: inspect.Type, kind: type[_Type]) -> _Type:
+    found = _found(form, kind)
+    assert found is not None, f"{form} is no {kind.__name__}"
+    return found
+
+
+def _found(form: inspect.Type, kind: type[_Type]) -> _Type | None:
+    """The member of a union that is of this kind, or the form itself; None where there is none."""
+    members = form.types if isinstance(form, inspect.UnionType) else (form,)
+    for member in members:
+        while isinstance(member, inspect.Metadata):
+            member = member.type
+        if isinstance(member, kind):
+            return member
+    return None

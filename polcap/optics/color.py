@@ -1,6 +1,7 @@
 """Colour: sRGB, Rec.709, the difference an eye would see, and the matrix of a camera.
 
-The curves and matrices work on NumPy and torch; colours on the last axis. White is D65 throughout.
+Colours on the last axis; white is D65 throughout. The sRGB curve and the luminance also run on torch, in training, and
+the RAW reader needs the matrix before anything else is loaded: these three are written here, not colour-science's.
 """
 
 from dataclasses import dataclass
@@ -18,8 +19,6 @@ REC709_TO_XYZ = np.array(
     [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]], dtype=np.float64
 )
 LUMINANCE = REC709_TO_XYZ[1]  # Y of linear Rec.709
-_D65 = (0.3127, 0.3290)  # xy
-_TURN = 2 * np.pi
 _RIDGE = 1e-12  # of what the patches say of each unknown: too few colors leave some of them open, and no error
 _LEVELS = 65535  # of linear light: a twentieth of an 8-bit step where the curve is steepest
 
@@ -72,41 +71,10 @@ def delta_e(rgb: Floats, reference: Floats) -> Floats:
     ----------
     ISO/CIE 11664-6:2014. Sharma, Wu, Dalal, The CIEDE2000 Color-Difference Formula, Color Res. Appl. 2005.
     """
-    (l1, a1, b1), (l2, a2, b2) = (np.moveaxis(lab(c), -1, 0) for c in (rgb, reference))
-    more = 1 + 0.5 * (1 - _seventh((np.hypot(a1, b1) + np.hypot(a2, b2)) / 2))
-    c1, c2 = np.hypot(more * a1, b1), np.hypot(more * a2, b2)
-    h1, h2 = np.arctan2(b1, more * a1) % _TURN, np.arctan2(b2, more * a2) % _TURN
-    grey = c1 * c2 == 0
-    turn = np.where(grey, 0, h2 - h1)
-    turn = turn - _TURN * (turn > np.pi) + _TURN * (turn < -np.pi)
-    hue = np.where(grey, h1 + h2, (h1 + h2) / 2 + np.pi * (np.abs(h1 - h2) > np.pi))
-    light, chroma = (l1 + l2) / 2, (c1 + c2) / 2
-    t = (
-        1
-        - 0.17 * np.cos(hue - np.radians(30))
-        + 0.24 * np.cos(2 * hue)
-        + 0.32 * np.cos(3 * hue + np.radians(6))
-        - 0.20 * np.cos(4 * hue - np.radians(63))
-    )
-    dl = (l2 - l1) / (1 + 0.015 * (light - 50) ** 2 / np.sqrt(20 + (light - 50) ** 2))
-    dc = (c2 - c1) / (1 + 0.045 * chroma)
-    dh = 2 * np.sqrt(c1 * c2) * np.sin(turn / 2) / (1 + 0.015 * chroma * t)
-    blue = np.radians(60) * np.exp(-(((np.degrees(hue) % 360 - 275) / 25) ** 2))
-    return np.asarray(np.sqrt(dl**2 + dc**2 + dh**2 - 2 * _seventh(chroma) * np.sin(blue) * dc * dh))
+    from polcap.optics.colour_science import colour
 
-
-def lab(rgb: Floats) -> Floats:
-    """CIE 1976 L*a*b* under D65 of linear Rec.709, (…, 3) both; ISO/CIE 11664-4."""
-    x, y = _D65
-    t = np.asarray(rgb, np.float64) @ REC709_TO_XYZ.T / np.array([x / y, 1, (1 - x - y) / y])
-    root = np.where(t > (6 / 29) ** 3, np.cbrt(t), t * (29 / 6) ** 2 / 3 + 4 / 29)
-    red, green, blue = np.moveaxis(root, -1, 0)
-    return np.stack([116 * green - 16, 500 * (red - green), 200 * (green - blue)], axis=-1)
-
-
-def _seventh(chroma: Floats) -> Floats:
-    """√(C⁷ / (C⁷ + 25⁷))."""
-    return np.asarray(np.sqrt(chroma**7 / (chroma**7 + 25.0**7)))
+    one, other = (colour.XYZ_to_Lab(np.asarray(c, np.float64) @ REC709_TO_XYZ.T) for c in (rgb, reference))  # of D65
+    return np.asarray(colour.difference.delta_E_CIE2000(one, other))
 
 
 @dataclass(frozen=True)

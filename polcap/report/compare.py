@@ -9,12 +9,11 @@ import numpy as np
 
 from polcap.errors import DecodeError
 from polcap.formats import html
-from polcap.formats import maps as maps_folder
+from polcap.formats.maps import maps_folder
 from polcap.images import Floats
-from polcap.pictures import keys
-from polcap.pictures.keys import Palette
-from polcap.pictures.smaller import Smaller
-from polcap.report import labels, map_figures, page
+from polcap.report import keys, labels, map_figures, page
+from polcap.report.keys import Palette
+from polcap.report.smaller import Smaller
 
 _LONGEST = 640  # px of a map
 _DIFFERENCE = keys.Key(-0.2, 0.2, "", (-0.2, -0.1, 0, 0.1, 0.2), "balance", digits=3)

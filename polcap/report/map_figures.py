@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from polcap.formats import html
 from polcap.images import Floats
 from polcap.optics.color import srgb_eight_bits
-from polcap.pictures import keys
-from polcap.pictures.keys import Key
-from polcap.report import labels, plots
+from polcap.report import keys, labels, plots
+from polcap.report.keys import Key
 from polcap.report.shown import Rerendered, Shown
 
 _RIM = 4  # px that normals go on past the outline, for a texture's filter

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
-from polcap.pictures import keys
+from polcap.report import keys
 from polcap.report.labels import number
 
 CHANNELS = ("#e0434c", "#2f9e4d", "#3f78e0")  # red, green, blue on light and dark

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from polcap.images import AngleStack, ColorCalibration, Cues, Floats, Mesh, SurfaceMaps, View
 from polcap.optics import frames, shade
-from polcap.pictures.smaller import Smaller, area
+from polcap.report.smaller import Smaller, area
 
 WHITE_PATCH = 18  # of a ColorChecker Classic, row by row from dark skin
 _COLUMNS = 6

@@ -1,16 +1,16 @@
-"""In: the middle exposures of a capture, small and grey, and their angles. Out: a first look at the polarization."""
+"""Preview of a capture: S0, degree and angle of polarization from its middle exposures."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from polcap import pictures
-from polcap.formats import png
+from polcap.formats.maps import png
 from polcap.images import Floats
 from polcap.optics import mueller
-from polcap.pictures import keys
-from polcap.pictures.sheets import Tile, sheet
+from polcap.report import keys
+from polcap.report import stage_pictures as pictures
+from polcap.report.sheets import Tile, sheet
 
 NAME = "preview.png"
 _FADE = 0.02  # of the brightest, below which no angle is drawn

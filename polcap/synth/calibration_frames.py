@@ -12,7 +12,9 @@ import numpy as np
 from msgspec import Meta
 
 from polcap.errors import CaptureError
-from polcap.formats import atomic, dng, layouts
+from polcap.formats import atomic
+from polcap.formats.capture import layouts
+from polcap.formats.raw import dng
 from polcap.images import Exif, Floats, View
 from polcap.optics.color import REC709_TO_XYZ
 from polcap.synth import boards, forward_camera, lens

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import InputError
-from polcap.formats import mesh as files
+from polcap.formats import scene_files
 from polcap.images import Floats, GBuffer, View
 from polcap.optics import frames
 
@@ -142,7 +142,7 @@ class Tracer:
 @lru_cache(maxsize=2)
 def tracer(file: str, radius: float) -> Tracer:
     """A mesh file about its middle, scaled so that a sphere of `radius` just holds it."""
-    vertices, faces = files.read(Path(file))
+    vertices, faces = scene_files.read_mesh(Path(file))
     used = vertices[np.unique(faces)]
     vertices = vertices - (used.min(axis=0) + used.max(axis=0)) / 2
     largest = np.linalg.norm(vertices[np.unique(faces)], axis=1).max()

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 
-from polcap.formats import textures
+from polcap.formats import scene_files
 from polcap.images import Floats
 from polcap.optics import fresnel
 
@@ -130,7 +130,7 @@ def _laid(material: Material, position: Floats, facing: Floats) -> tuple[Floats,
 
 @lru_cache(maxsize=4)
 def _texture(folder: str) -> Floats:
-    return np.ascontiguousarray(np.moveaxis(textures.read(Path(folder), _TEXELS), 0, -1))
+    return np.ascontiguousarray(np.moveaxis(scene_files.read_textures(Path(folder), _TEXELS), 0, -1))
 
 
 def _pattern(material: Material, p: Floats) -> Floats:

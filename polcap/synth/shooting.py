@@ -2,7 +2,7 @@
 
 ::
 
-    FOLDER/pol000/IMG_0001.DNG …   what `formats/capture.py` reads
+    FOLDER/pol000/IMG_0001.DNG …   what `formats/capture/reader.py` reads
     FOLDER/cross000/IMG_0010.DNG … with `cross`: under a flash polarized across the filter
     FOLDER/truth.json              scene, shoot, and what was done to every file
     FOLDER/truth.npz               maps at the pixel centres of the first angle's shots
@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from polcap.errors import CaptureError
-from polcap.formats import atomic, dng, layouts
+from polcap.formats import atomic
+from polcap.formats.capture import layouts
+from polcap.formats.raw import dng
 from polcap.images import Exif, Floats, GBuffer, View
 from polcap.optics.color import REC709_TO_XYZ
 from polcap.synth import color_checker as charts

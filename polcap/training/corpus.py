@@ -28,7 +28,8 @@ import torch
 from msgspec import Meta
 
 from polcap.errors import InputError
-from polcap.formats import atomic, png
+from polcap.formats import atomic
+from polcap.formats.maps import png
 from polcap.images import Bits, Floats
 from polcap.optics import frames, mueller, shade
 from polcap.stages import cues

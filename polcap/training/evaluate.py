@@ -21,9 +21,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from polcap import models
-from polcap.formats import atomic, png
+from polcap.formats import atomic
+from polcap.formats.maps import png
 from polcap.images import Cues, Network, SurfaceMaps
+from polcap.pipeline import models
 from polcap.stages import cues, infer
 from polcap.training import baselines, panel, protocol, tables
 from polcap.training.baselines import Estimator, Means

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import InputError
-from polcap.formats import atomic
-from polcap.formats import mesh as mesh_files
+from polcap.formats import atomic, scene_files
 from polcap.images import Floats, GBuffer, View
 from polcap.synth.mesh_tracer import Tracer, Triangles, smooth
 from polcap.training import bounce, light_transport, shapes
@@ -124,7 +123,7 @@ def training_meshes(data: Path) -> list[Path]:
 
 def read_mesh(path: Path) -> Triangles:
     """A mesh file with shading normals."""
-    return smooth(*mesh_files.read(path))
+    return smooth(*scene_files.read_mesh(path))
 
 
 def depth_unit(mask: NDArray[np.bool_], depth: Floats, focal: float) -> tuple[float, float]:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from polcap.formats import textures
+from polcap.formats import scene_files
 from polcap.optics.body import SMOOTH, Law
 from polcap.training import gloss
 
@@ -44,7 +44,8 @@ class Library:
     def __init__(self, folder: Path | None, device: torch.device, seed: int = 3) -> None:
         sets = sorted(p.parent for p in folder.glob("*/albedo.jpg")) if folder else []
         self.names = [p.name for p in sets]
-        stack = [textures.read(p, _TEXELS) for p in sets] or [np.full((6, _TEXELS, _TEXELS), 0.5, dtype=np.float32)]
+        stack = [scene_files.read_textures(p, _TEXELS) for p in sets]
+        stack = stack or [np.full((6, _TEXELS, _TEXELS), 0.5, dtype=np.float32)]
         self.texture = torch.from_numpy(np.stack(stack, axis=1)).to(device)[None]  # (1, 6, T, 256, 256)
         self.has_textures = bool(sets)
         lightness = self.texture[0, :3].mean(dim=0).flatten(1) ** 0.45  # (T, texels)

@@ -26,7 +26,9 @@ from polcap.training import train
 LARGEST = 60_000_000  # bytes of a pack
 PART = 16 * 2**20  # bytes of a part of a checkpoint
 SIDE = 512  # px of a texture, at most
-NEEDED = ("torch", "numpy", "scipy", "cv2", "embreex", "onnx", "msgspec", "array_api_compat", "filelock", "tomli_w")
+NEEDED = (
+    "torch", "numpy", "scipy", "cv2", "colour", "embreex", "onnx", "msgspec", "array_api_compat", "filelock", "tomli_w",
+)  # fmt: skip
 _RUN = '''"""Train from this pack until one piece is over: python run.py OUT"""
 
 import sys

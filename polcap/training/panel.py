@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap import pictures
 from polcap.images import Floats, SurfaceMaps
-from polcap.pictures import Picture
+from polcap.report import stage_pictures as pictures
+from polcap.report.stage_pictures import Picture
 from polcap.training.protocol import Case
 from polcap.training.score import angle, drawn
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from polcap.errors import InputError
-from polcap.formats import textures
+from polcap.formats import scene_files
 from polcap.images import Floats
 
 TEXTURES, PATTERNS = 10, 20
@@ -82,7 +82,7 @@ def _levels(number: int, met: bool) -> tuple[np.random.Generator, float, float]:
 def _textured(folder: Path, number: int, met: bool) -> Material:
     """A texture set projected along the nearest axis, mirrored at its edges."""
     rng, ior, level = _levels(number, met)
-    maps = np.ascontiguousarray(textures.read(folder).transpose(1, 2, 0))  # albedo, roughness, two slopes
+    maps = np.ascontiguousarray(scene_files.read_textures(folder).transpose(1, 2, 0))  # albedo, roughness, two slopes
     mean = float((maps[..., :3].mean(axis=-1) ** 0.45).mean())
     scale, follow, relief = rng.uniform(0.8, 2.0), rng.uniform(-0.5, 0.5), rng.uniform(0.2, 0.5)
 

@@ -24,7 +24,8 @@ import torch
 from torch import Tensor
 
 from polcap.errors import InputError
-from polcap.formats import atomic, png
+from polcap.formats import atomic
+from polcap.formats.maps import png
 from polcap.training import arithmetic, export, gbuffers, loss, materials, model
 from polcap.training.dataset import Batch, Simulator
 from polcap.training.variants import VARIANTS

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from polcap import pictures
 from polcap.images import Floats
-from polcap.pictures import Picture
+from polcap.report import stage_pictures as pictures
+from polcap.report.stage_pictures import Picture
 from polcap.stages.cues import FLOOR
 from polcap.training import arithmetic, gbuffers, loss, materials, protocol
 from polcap.training.camera_errors import Errors

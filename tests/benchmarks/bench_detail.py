@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap import models
 from polcap.images import Floats, Network
+from polcap.pipeline import models
 from polcap.stages import infer
 from polcap.training.protocol import Case, Protocol
 

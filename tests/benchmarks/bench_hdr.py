@@ -21,7 +21,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import rawpy
 
-from polcap.formats import dng
+from polcap.formats.raw import dng
 from polcap.images import Capture, Exif, Floats, Frame, SensorImage, Shot
 from polcap.optics import demosaic
 from polcap.stages import hdr

@@ -18,9 +18,9 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from polcap import models
 from polcap.images import Cues
 from polcap.optics import frames
+from polcap.pipeline import models
 from polcap.stages import infer
 from polcap.stages.cues import channels
 from polcap.stages.infer import augmentation, learned

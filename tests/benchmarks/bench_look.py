@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.formats import encoders, gltf, texture_set, usd
+from polcap.formats.export import encoders, gltf, texture_set, usd
 from polcap.images import Asset, Floats, SurfaceMaps
 from polcap.optics import frames, shade
 from tests import surfaces

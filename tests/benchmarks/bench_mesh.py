@@ -25,7 +25,7 @@ import numpy as np
 from polcap.images import Floats, Mesh, SurfaceMaps, View
 from polcap.stages import surface
 from polcap.stages.surface import boundary
-from polcap.stages.surface.jumps import Bools, least_step
+from polcap.stages.surface.occlusion import Bools, least_step
 from polcap.synth import render, scenes, trace
 
 LARGE = (

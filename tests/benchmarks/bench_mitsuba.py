@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from bench_captures import kept
 
-from polcap import models
 from polcap.images import ColorCalibration, SurfaceMaps, View
 from polcap.optics import frames
+from polcap.pipeline import models
 from polcap.stages import cues, infer
 from polcap.training.camera_errors import Errors, photograph
 from polcap.training.protocol import Case, stokes_image

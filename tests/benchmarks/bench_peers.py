@@ -27,7 +27,7 @@ import cv2
 import numpy as np
 
 from polcap.formats import calib
-from polcap.formats import capture as captures
+from polcap.formats.capture import reader as captures
 from polcap.images import (
     Alignment,
     AngleStack,

@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from polcap import pipeline
 from polcap.config import Config
-from polcap.formats import capture as captures
+from polcap.formats.capture import reader as captures
 from polcap.images import ChartRequest
-from polcap.path import UserInput
+from polcap.pipeline import run as pipeline
+from polcap.pipeline.path import UserInput
 from tests.rig import faults
 from tests.rig import pool as pools
 
@@ -72,7 +72,7 @@ def _processed(folder: Path) -> list[np.ndarray]:
     out = folder / "polcap"
     pipeline.process(found, UserInput(chart=ChartRequest("none")), Config(), out)
     results, _ = pipeline.reopen(out)
-    maps, mesh = results.maps.value, results.mesh.value
+    maps, mesh = results.maps, results.mesh
     return [np.asarray(maps.normal), np.asarray(maps.diffuse), np.asarray(mesh.vertices)]
 
 

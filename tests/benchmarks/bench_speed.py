@@ -31,12 +31,14 @@ from typing import Any
 
 import numpy as np
 
-from polcap import __version__, models, pipeline
+from polcap import __version__
 from polcap.config import Config
 from polcap.errors import GateError
-from polcap.formats import capture as captures
-from polcap.formats import exr, png
-from polcap.path import UserInput
+from polcap.formats.capture import reader as captures
+from polcap.formats.maps import exr, png
+from polcap.pipeline import models
+from polcap.pipeline import run as pipeline
+from polcap.pipeline.path import UserInput
 
 HISTORY = Path(__file__).with_name("speed_history.jsonl")
 TICK = os.sysconf("SC_CLK_TCK")

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize
 
-from polcap import models
 from polcap.formats import atomic
 from polcap.images import Floats, Network
+from polcap.pipeline import models
 from polcap.stages import infer
 from polcap.stages.infer import learned
 from polcap.training import gbuffers, patterns, protocol

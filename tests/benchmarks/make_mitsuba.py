@@ -20,7 +20,7 @@ import numpy as np
 import plastic
 import trimesh
 
-from polcap.formats import atomic, textures
+from polcap.formats import atomic, scene_files
 from polcap.images import Floats, View
 from polcap.optics import fresnel
 from polcap.synth import render, scene_materials
@@ -142,7 +142,7 @@ def dressed(corner: Floats, texture: Path | None, random: np.random.Generator) -
         other = np.clip(base * random.uniform(0.4, 1.6, 3), 0.03, 0.9)
         albedo = base + (other - base) / (1 + np.exp(-3 * noise[1][:, None]))
     else:
-        albedo = projected(textures.read(texture)[:3], corner, random.uniform(1, 2.5))
+        albedo = projected(scene_files.read_textures(texture)[:3], corner, random.uniform(1, 2.5))
     if random.random() < 0.5:
         paint = random.uniform(0.08, 0.8, 3)
         albedo = np.where(second[:, None], paint * (1 + 0.15 * noise[2][:, None]), albedo)

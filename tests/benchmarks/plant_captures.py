@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from polcap.formats import png
+from polcap.formats.maps import png
 from polcap.images import Floats
 from polcap.optics import mueller
 from polcap.synth import shooting as synthetic

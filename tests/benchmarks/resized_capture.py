@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.formats import dng, probe, raw
 from polcap.formats.atomic import folder
+from polcap.formats.raw import dng, probe
+from polcap.formats.raw import libraw as raw
 
 _ELECTRONS = 0.25  # counts per electron of the synthetic camera, about: the noise that is put back
 _DAYLIGHT = np.array([0.5, 1.0, 0.6])

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polcap.formats import encoders, gltf, obj, texture_set, usd
+from polcap.formats.export import encoders, gltf, obj, texture_set, usd
 from polcap.images import Floats, Mesh, SurfaceMaps
 from tests import surfaces
 from tests.blender import session

@@ -13,7 +13,8 @@ from polcap.calibrate import photographs
 from polcap.calibration_values import Calibration
 from polcap.cli import calibrate_command
 from polcap.errors import CaptureError, InputError
-from polcap.formats import calibrations, dng
+from polcap.formats import calibrations
+from polcap.formats.raw import dng
 from polcap.images import Exif
 from polcap.synth import calibration_frames, forward_camera
 from polcap.synth.calibration_frames import CalibrationShoot

@@ -33,8 +33,10 @@ from onnx import TensorProto, helper
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from polcap.errors import InputError
-from polcap.formats import exr, photo, plausible, png, probe, raw, worker
 from polcap.formats import onnx as models
+from polcap.formats.maps import exr, png
+from polcap.formats.raw import file_checks, photo, probe, worker
+from polcap.formats.raw import libraw as raw
 from tests.campaigns.mutations import mutated
 from tests.campaigns.rows import Rows, processor_s
 from tests.formats import headers
@@ -132,7 +134,7 @@ def _raw(path: Path) -> object:
     if found.kind == "photo":
         return _photo(path)
     image = raw.read(path, found.digest)
-    assert np.isfinite(image.value).all() and image.value[..., 0].size <= plausible.MOST_PIXELS
+    assert np.isfinite(image.value).all() and image.value[..., 0].size <= file_checks.MOST_PIXELS
     assert np.isfinite(image.black).all() and np.isfinite(image.white)
     return image
 
@@ -142,7 +144,7 @@ def _photo(path: Path) -> object:
     if found.kind != "photo":
         return _raw(path) if found.kind == "raw" else found
     image = photo.read(path, digest=found.digest)
-    assert np.isfinite(image.value).all() and image.value[..., 0].size <= plausible.MOST_PIXELS
+    assert np.isfinite(image.value).all() and image.value[..., 0].size <= file_checks.MOST_PIXELS
     return image
 
 

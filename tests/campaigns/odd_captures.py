@@ -20,13 +20,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from polcap import pipeline
 from polcap.config import Config
 from polcap.errors import GateError, InputError
-from polcap.formats import capture as captures
-from polcap.formats import maps
+from polcap.formats.capture import reader as captures
+from polcap.formats.maps import maps_folder as maps
 from polcap.images import ChartRequest, Floats
-from polcap.path import UserInput
+from polcap.pipeline import run as pipeline
+from polcap.pipeline.path import UserInput
 from tests.formats import headers
 
 BLACK, WHITE = 512, 16383

@@ -17,12 +17,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from polcap import pipeline
 from polcap.config import Config
 from polcap.errors import GateError
-from polcap.formats import capture as captures
+from polcap.formats.capture import reader as captures
 from polcap.images import ChartRequest
-from polcap.path import UserInput
+from polcap.pipeline import run as pipeline
+from polcap.pipeline.path import UserInput
 from tests.campaigns import small_capture
 
 _SETTLED = 20  # captures after which memory should not grow

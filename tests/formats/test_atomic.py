@@ -120,3 +120,25 @@ def test_held_files_get_their_names_together_or_never(tmp_path: Path) -> None:
         temporary.write_bytes(b"third")
     held.drop()
     assert names(tmp_path) == ["a.bin", "b.bin"] and (tmp_path / "a.bin").read_bytes() == b"new"
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("vase 3", "vase 3"),
+        ("C:\\shots\\vase", "C__shots_vase"),
+        ("a/b", "a_b"),
+        ("con", "_con"),  # Windows opens the console, whatever the suffix
+        ("Nul.old", "_Nul.old"),
+        ("console", "console"),
+        ("..", "capture"),
+        ("jar. ", "jar"),
+    ],
+)
+def test_name_means_a_file_and_nothing_else(text: str, name: str) -> None:
+    assert atomic.safe_name(text) == name
+
+
+def test_long_name_is_cut_between_characters() -> None:
+    cut = atomic.safe_name("ä" * 300)
+    assert set(cut) == {"ä"} and len(cut.encode()) <= 60

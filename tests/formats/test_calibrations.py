@@ -8,7 +8,8 @@ import pytest
 
 from polcap.calibration_values import Calibration, Falloff, FlashEnergy, LensGeometry, Levels, NoiseLine, Polarizer
 from polcap.errors import CaptureError
-from polcap.formats import calibrations, capture
+from polcap.formats import calibrations
+from polcap.formats.capture import reader as capture
 from polcap.images import Exif
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "capture"

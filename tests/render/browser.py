@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from polcap.formats import gltf
+from polcap.formats.export import gltf
 from polcap.images import Floats, Mesh, View
 
 HERE = Path(__file__).parent

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from polcap.formats import encoders, gltf, obj, texture_set
+from polcap.formats.export import encoders, gltf, obj, texture_set
 from polcap.images import Floats, SurfaceMaps
 from tests import surfaces
 from tests.render import browser

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from polcap.formats import maps
+from polcap.formats.maps import maps_folder as maps
 from polcap.optics import color, frames, shade
 from tests.render import devtools
 

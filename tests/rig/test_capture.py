@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from polcap.formats import capture as captures
-from polcap.formats import capture_toml
+from polcap.formats.capture import capture_toml
+from polcap.formats.capture import reader as captures
 from polcap.images import Role
 from polcap.rig import camera_gphoto2
 from tests.conftest import ROOT, Command
@@ -41,9 +41,9 @@ def test_a_simulated_capture_is_shot_and_read(polcap: Command, tmp_path: Path) -
 def test_the_verdict_ends_a_capture(
     polcap: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verdict: str
 ) -> None:
-    monkeypatch.setattr("polcap.check.inspect", lambda found, *_: found.shots[2].name)
-    monkeypatch.setattr("polcap.check.table", lambda judged: f"{verdict} {judged}")
-    monkeypatch.setattr("polcap.check.shown", lambda judged: {"verdict": verdict})
+    monkeypatch.setattr("polcap.pipeline.check.inspect", lambda found, *_: found.shots[2].name)
+    monkeypatch.setattr("polcap.pipeline.check.table", lambda judged: f"{verdict} {judged}")
+    monkeypatch.setattr("polcap.pipeline.check.shown", lambda judged: {"verdict": verdict})
     done = polcap("capture", tmp_path / "c", *SIMULATED[:4], "--json")
     assert done.returncode == (0 if verdict == "keep" else 3)
     assert json.loads(done.stdout)["check"] == {"verdict": verdict} and f"{verdict} 90°" in done.stderr
@@ -100,7 +100,7 @@ def test_a_motor_on_a_port_and_a_camera_on_a_cable_make_a_capture(
         (tmp_path / "x.jpg").write_bytes(seen(angle_deg, step))
 
     (tmp_path / "x.jpg").write_bytes(bytes(size))
-    monkeypatch.setattr(camera_gphoto2.Gphoto2, "prepare", prepare)
+    monkeypatch.setattr(camera_gphoto2.Gphoto2Camera, "prepare", prepare)
     folder = tmp_path / "capture"
     with virtual.time(), Elliptec() as device:
         url = f"elliptec:{device.port}?settle=0"

@@ -8,7 +8,8 @@ import pytest
 from polcap.errors import ModelError, ObjectError
 from polcap.images import Network
 from polcap.stages import mask
-from polcap.stages.mask import mask_channels, solid, standing_out, two_looks
+from polcap.stages.mask import mask_channels, solid, standing_out
+from polcap.stages.mask import network as two_looks
 from tests import scenes
 
 CHANNEL = mask_channels.CHANNELS.index

@@ -7,7 +7,7 @@ import pytest
 
 from polcap.config import fill
 from polcap.errors import SettingError
-from polcap.formats import layouts
+from polcap.formats.capture import layouts
 from polcap.synth import scenes, shooting
 from polcap.synth.calibration_frames import CalibrationShoot
 from polcap.synth.shooting import Shoot

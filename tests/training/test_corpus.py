@@ -11,7 +11,7 @@ pytest.importorskip("torch")
 pytest.importorskip("embreex")
 
 from polcap.errors import InputError
-from polcap.formats import png
+from polcap.formats.maps import png
 from polcap.training import corpus
 
 SAMPLE, RECIPE = "000001", corpus.Recipe(seed=4, size=96, noise=0.0)

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polcap import models
 from polcap.errors import InputError
-from polcap.formats import png
+from polcap.formats.maps import png
 from polcap.images import Floats
 from polcap.optics import fresnel
+from polcap.pipeline import models
 from polcap.training import real
 from tests.stages.infer.test_infer import network
 

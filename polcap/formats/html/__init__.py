@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.formats import atomic, png
+from polcap.formats import atomic
+from polcap.formats.maps import png
 
 _JPEG_QUALITY = 88
 _SCRIPTS = ("probe.js", "relight.js")

@@ -20,7 +20,8 @@ from polcap.errors import ObjectError
 from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Network, ObjectMask
 from polcap.optics.warp import warp
 from polcap.stages import stage
-from polcap.stages.mask import solid, standing_out, two_looks
+from polcap.stages.mask import network as two_looks
+from polcap.stages.mask import solid, standing_out
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
-from polcap.stages.surface.jumps import Bools
+from polcap.stages.surface.occlusion import Bools
 from polcap.stages.surface.pixel_grid import PixelGrid
 
 _PART = 0.002  # of the object's pixels: smaller parts are specks

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from polcap.images import Floats
 from polcap.stages.surface.contacts import contacts
-from polcap.stages.surface.jumps import Jumps, jumps, least_step, radius, widened
 from polcap.stages.surface.multigrid import Multigrid, Nested, conjugate_gradients
+from polcap.stages.surface.occlusion import Jumps, jumps, least_step, radius, widened
 from polcap.stages.surface.pixel_grid import PixelGrid
 from polcap.stages.surface.rims import contours, rims
 from polcap.stages.surface.slope_equations import Problem, equations, halved, parents

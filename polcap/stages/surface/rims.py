@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
-from polcap.stages.surface.jumps import Bools, radius
+from polcap.stages.surface.occlusion import Bools, radius
 
 _REACH = 3  # px from a link at which the nearer side's steepest, the farther side's flattest normal is looked for
 _CANDIDATE = np.radians(65.0)  # lean of the nearer side

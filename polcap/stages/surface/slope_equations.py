@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Floats, SurfaceMaps, View
 from polcap.optics.frames import dot
-from polcap.stages.surface.jumps import radius
+from polcap.stages.surface.occlusion import radius
 
 
 @dataclass(frozen=True)

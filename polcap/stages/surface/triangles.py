@@ -8,7 +8,7 @@ from polcap.images import Floats, Mesh, SurfaceMaps
 from polcap.optics.frames import cross, dot
 from polcap.stages.surface import boundary
 from polcap.stages.surface.backing import Back, closed
-from polcap.stages.surface.jumps import Bools, jumps, least_step
+from polcap.stages.surface.occlusion import Bools, jumps, least_step
 from polcap.stages.surface.slope_equations import equations, problem
 
 _FLATTEST = 0.05  # cosine under which a normal tells no slope

@@ -73,7 +73,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     patch_share: Annotated[float, Meta(ge=0.2, le=0.95, description="sampled share of each patch's side")] = 0.6
 
 
-@stage(version=6)
+@stage(version=7)
 def measure(
     radiance: AngleStack, reference: ChartReference, request: ChartRequest, settings: Settings
 ) -> ColorCalibration:

@@ -5,7 +5,7 @@ import pytest
 from msgspec import structs
 
 from polcap.errors import CaptureError
-from polcap.formats import capture as captures
+from polcap.formats.capture import reader as captures
 from polcap.images import Quality, SensorImage
 from polcap.stages import hdr
 from polcap.synth import shooting

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from polcap import models
 from polcap.errors import ModelError
 from polcap.images import Cues, Floats, Network, View
 from polcap.optics import frames
+from polcap.pipeline import models
 from polcap.stages.infer import fine
 
 SIDE = 300

@@ -1,0 +1,54 @@
+"""Waits until a folder that a camera is filling, or a file that somebody edits, has changed and rests again."""
+
+import os
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+_POLL_S = 0.1
+
+FileStates = dict[str, tuple[int, int]]  # size and time of change by path
+
+
+def settled(folder: Path, ignored: Path, still_s: float = 2.0, edited: Sequence[Path] = ()) -> Iterator[None]:
+    """Yield at once, then each time files were added, removed or changed and nothing moved for `still_s` seconds.
+
+    The folder `ignored` (of results) and names that begin with a dot are not watched. The files `edited` are saved in
+    one step, as by an editor: they count as at rest at the next poll.
+    """
+    folder, ignored = folder.resolve(), ignored.resolve()
+    done: tuple[FileStates, FileStates] | None = None
+    last, texts, since = _seen(folder, ignored), _stats(edited), time.monotonic()
+    while True:
+        now, texts_now = _seen(folder, ignored), _stats(edited)
+        if now != last:
+            since = time.monotonic()
+        still = done is None or now == done[0] or time.monotonic() - since >= still_s
+        if (now, texts_now) == (last, texts) != done and still:
+            done = now, texts_now
+            yield
+        else:
+            last, texts = now, texts_now
+        time.sleep(_POLL_S)
+
+
+def _seen(folder: Path, ignored: Path) -> FileStates:
+    """All files below the folder that still exist."""
+    found: FileStates = {}
+    for root, folders, files in os.walk(folder):
+        here = Path(root)
+        folders[:] = [name for name in folders if not name.startswith(".") and (here / name) != ignored]
+        found |= _stats(here / name for name in files if not name.startswith("."))
+    return found
+
+
+def _stats(files: Iterable[Path]) -> FileStates:
+    """Size and time of change of the files that exist."""
+    found: FileStates = {}
+    for file in files:
+        try:
+            status = file.stat()
+        except OSError:
+            continue
+        found[str(file)] = status.st_size, status.st_mtime_ns
+    return found

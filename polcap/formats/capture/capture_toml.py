@@ -1,0 +1,73 @@
+"""Reads capture.toml, the facts that a user states about a capture; a misspelt key is an error."""
+
+import os
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta, Struct
+
+from polcap.errors import CaptureError
+from polcap.formats import text_file
+from polcap.images import Role
+
+NAME = "capture.toml"
+Positive = Annotated[float, Meta(gt=0)]
+
+
+class FrameEntry(Struct, frozen=True, forbid_unknown_fields=True):
+    """One photograph: its file, relative to the folder, and what it is."""
+
+    file: str
+    angle: Annotated[float, Meta(ge=-360, le=360)] | None = None  # degrees; of shots and repeats
+    role: Role = "shot"
+    exposure: Positive | None = None  # relative, any unit; instead of EXIF
+    flash_energy: Positive | None = None  # relative; the exposure is this times ISO/100 over the f-number squared
+
+
+class Rotator(Struct, frozen=True, forbid_unknown_fields=True):
+    """The device that turned the polarizer; for the notes only."""
+
+    model: str = ""
+    log: str = ""  # file of the angles reached, in the same folder
+
+
+class CaptureFile(Struct, frozen=True, forbid_unknown_fields=True):
+    """All of capture.toml; every key is optional."""
+
+    name: Annotated[str, Meta(pattern=r"^[^/\\]+$")] = ""
+    focal_length_mm: Positive | None = None
+    sensor_width_mm: Positive | None = None  # of the visible pixels
+    sensor: Literal["polarization"] | None = None  # every frame is a 2×2 mosaic of 90 45 / 135 0 degrees
+    encoding: Literal["linear", "srgb"] | None = None  # of finished pictures; by default 8 bits are sRGB
+    white: Positive | None = None  # stored value at which linear pictures saturate; by default the type's largest
+    black: Annotated[float, Meta(ge=0)] = 0.0  # stored value of darkness, linear pictures
+    filter: str | None = None  # the polarizer's name, as given to `polcap calibrate --filter`
+    rotator: Rotator | None = None
+    frame: tuple[FrameEntry, ...] = ()
+
+
+def load(folder: Path) -> CaptureFile:
+    """The folder's capture.toml, or an empty one. Raises CaptureError."""
+    path = folder / NAME
+    if not os.path.lexists(path):
+        return CaptureFile()
+    document: dict[str, Any] = {}
+    try:
+        document = text_file.read_toml(path)
+        stated = msgspec.convert(document, CaptureFile)
+    except msgspec.ValidationError as error:
+        fault = text_file.fault(error, document, CaptureFile)
+        raise CaptureError(f"{path}: {fault}; see the reference page on captures") from None
+    except ValueError as error:  # of TOML, of UTF-8
+        raise CaptureError(f"{path}: {error}; see the reference page on captures") from None
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
+    for entry in stated.frame:
+        if entry.role in ("shot", "repeat") and entry.angle is None and stated.sensor is None:
+            raise CaptureError(f"{path}: {entry.file} has role {entry.role} and no angle; give its angle in degrees")
+        if entry.exposure and entry.flash_energy:
+            raise CaptureError(f"{path}: {entry.file} states both exposure and flash_energy; give one of them")
+    if stated.rotator and stated.rotator.log and not (folder / stated.rotator.log).is_file():
+        raise CaptureError(f"{path}: no rotator log {stated.rotator.log}; correct or remove the line")
+    return stated

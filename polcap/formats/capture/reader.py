@@ -1,0 +1,291 @@
+"""Reads a capture folder: shots, brackets, camera, lens and calibration, checked; and prints them as a table."""
+
+import math
+import os
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from polcap.errors import CaptureError
+from polcap.formats import atomic, calibrations
+from polcap.formats.capture import capture_toml, focal_length, layouts
+from polcap.formats.capture.capture_toml import CaptureFile
+from polcap.formats.capture.layouts import Source
+from polcap.formats.raw import libraw, photo
+from polcap.images import Capture, Exif, Frame, SensorImage, Shot
+
+_ZOOM = 0.01  # relative change of the focal length above rounding
+LOSS = ": normals and albedo lose accuracy against RAW"
+Loader = Callable[[], SensorImage]
+
+
+def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Capture:
+    """Read a capture folder: pol000/ pol045/ …, capture.toml, flat, or polarization-sensor frames.
+
+    Every file's metadata and bytes are read, no pixel is decoded. `angles_deg` is the order of
+    the brackets of a flat folder (0, 45, 90 by default); elsewhere it picks from the angles that
+    the folder states, the first being the reference.
+
+    Raises
+    ------
+    CaptureError
+        The photographs do not form a capture; the message names the file, the reason and the remedy.
+    DecodeError
+        A file is cut short, or no decoder recognises it.
+    """
+    folder = Path(folder)
+    if folder.is_file():
+        raise CaptureError(f"{folder} is a file; give the folder that holds all photographs of the object")
+    if not folder.is_dir():
+        raise CaptureError(f"{folder}: no such folder; give the folder that holds the photographs")
+    stated = capture_toml.load(folder)
+    if angles_deg is not None:
+        _check_angles(folder, angles_deg, "--angles states")
+    plan = layouts.plan(folder, stated, angles_deg)
+    _check_angles(folder, [angle for angle, _ in plan.shots], "the shots' angles are")
+
+    used: dict[Path, Source] = {}
+    for source in (source for _, bracket in plan.shots for source in bracket):
+        used.setdefault(source.path, source)
+    if plan.layout != "sensor" and len(used) < sum(len(bracket) for _, bracket in plan.shots):
+        raise CaptureError(f"{folder / capture_toml.NAME}: names a file twice; give each frame one entry")
+    every = used | {source.path: source for source in plan.others}
+    if len(every) < len(used) + len(plan.others):
+        raise CaptureError(f"{folder / capture_toml.NAME}: names a file twice; give each frame one entry")
+    _check_one_camera({path: source.probe.exif for path, source in every.items()})
+    _check_no_duplicate({path: source.probe.digest for path, source in every.items()})
+    shots = tuple(_shot(plan, stated, angle, bracket) for angle, bracket in plan.shots)
+    _check_brackets(shots)
+    crossed = None if plan.layout == "sensor" else _crossed(folder, plan, stated)
+    reference = shots[0].frames[0].exif
+    lens = focal_length.find(reference, stated.focal_length_mm, stated.sensor_width_mm)
+    step = 2 if plan.layout == "sensor" else 1  # a plane of a sensor mosaic has half its sides
+    width, height = (reference.width or 0) // step, (reference.height or 0) // step
+    notes = _notes(plan.layout, plan.others, plan.shots[0][1][0], shots, stated)
+    calibration, calibration_notes = None, list[str]()
+    if plan.layout != "sensor" and plan.shots[0][1][0].probe.kind == "raw":  # through a ring, the sensor's own counts
+        calibration, calibration_notes = calibrations.choose(reference, stated.filter, stated.focal_length_mm)
+    geometry = calibration.geometry if calibration is not None else None
+    if geometry is not None and geometry.size_px == (width, height):
+        focal_px, principal = geometry.focal_px, geometry.principal_px
+        note = f"{focal_px:.0f} px ± {geometry.focal_sigma_px:.1f} (calibrated)"
+        lens = focal_length.FocalLength(focal_px, (0.0, 0.0), note)
+    else:
+        principal = ((width - 1) / 2, (height - 1) / 2)
+    return Capture(
+        name=atomic.safe_name(stated.name or Path(os.path.realpath(folder)).name),
+        folder=str(folder),
+        shots=shots,
+        layout=plan.layout,
+        focal_px=lens.px / step,
+        focal_known=lens.known,
+        focal_doubt=lens.doubt,
+        principal_px=principal,
+        size_px=(width, height),
+        chart_frames=tuple(_frame(plan, stated, source, 0.0) for source in plan.others if source.role == "chart"),
+        notes=(*plan.notes, *notes, *calibration_notes, f"focal length {lens.note}"),
+        calibration=calibration,
+        crossed=crossed,
+    )
+
+
+def table(capture: Capture) -> str:
+    """The capture as text: one line per frame, then camera, lens, focal length and notes."""
+    rows = [["angle", "file", "role", "exposure", "ISO", "f/", "flash", "taken"]]
+    for shot in capture.shots:
+        for frame in (*shot.frames, *shot.ambient):
+            rows.append([shot.name, *_row(frame, capture.folder)])
+    if capture.crossed is not None:
+        rows += [[capture.crossed.name, *_row(frame, capture.folder)] for frame in capture.crossed.frames]
+    rows += [["", *_row(frame, capture.folder)] for frame in capture.chart_frames]
+    widths = [max(map(len, column)) for column in zip(*rows)]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows]
+    fact = capture.shots[0].frames[0].exif
+    width, height = capture.size_px
+    frames = " + ".join(str(len(shot.frames)) for shot in capture.shots)
+    lines += [
+        "",
+        f"capture  {capture.name} ({capture.layout}): {len(capture.shots)} shots, {frames} frames",
+        f"camera   {' '.join(filter(None, (fact.make, fact.model))) or 'not stated'}, {width}×{height} px",
+        f"lens     {fact.lens or 'not stated'}",
+        f"focal    {capture.focal_px:.0f} px" + ("" if capture.focal_known else " (assumed)"),
+    ]
+    return "\n".join([*lines, *(f"note     {note}" for note in capture.notes)])
+
+
+def _row(frame: Frame, folder: str) -> list[str]:
+    fact = frame.exif
+    path = Path(frame.path)
+    name = str(path.relative_to(folder)) if path.is_relative_to(folder) else frame.path
+    flash = {True: "fired", False: "off", None: "?"}[fact.flash_fired]
+    stated = f"{frame.exposure:.4g} (stated)" if frame.exposure else _seconds(fact.exposure_time)
+    numbers = [f"{value:g}" if value else "?" for value in (fact.iso, fact.f_number)]
+    return [name, frame.role, stated, *numbers, flash, fact.taken.replace("T", " ") or "?"]
+
+
+def _seconds(time: float | None) -> str:
+    if not time:
+        return "?"
+    return f"1/{1 / time:.0f} s" if time < 0.3 else f"{time:.3g} s"
+
+
+def _shot(plan: layouts.Plan, stated: CaptureFile, angle_deg: float, bracket: Sequence[Source]) -> Shot:
+    ambient = [s for s in plan.others if s.role == "ambient" and s.angle_deg in (None, angle_deg)]
+    return Shot(
+        angle=math.radians(angle_deg),
+        frames=_darkest_first(_frame(plan, stated, source, angle_deg) for source in bracket),
+        ambient=_darkest_first(_frame(plan, stated, source, angle_deg) for source in ambient),
+        place_px=photo.place_px(angle_deg) if plan.layout == "sensor" else (0.0, 0.0),
+    )
+
+
+def _crossed(folder: Path, plan: layouts.Plan, stated: CaptureFile) -> Shot | None:
+    """The shot under the polarized flash; at the first shot's angle where the filter's is not stated."""
+    sources = [source for source in plan.others if source.role == "cross"]
+    if not sources:
+        return None
+    angles = {source.angle_deg for source in sources}
+    if len(angles) > 1:
+        listed = ", ".join("unstated" if angle is None else f"{angle:g}°" for angle in angles)
+        raise CaptureError(f"{folder}: cross-polarized frames at {listed}; take them at one angle of the lens's filter")
+    angle = angles.pop()
+    return _shot(plan, stated, plan.shots[0][0] if angle is None else angle, sources)
+
+
+def _frame(plan: layouts.Plan, stated: CaptureFile, source: Source, angle_deg: float) -> Frame:
+    load, settings = _loader(source, stated, angle_deg if plan.layout == "sensor" else None)
+    alone = source.probe.kind == "raw" and plan.layout != "sensor"  # only the file decides its values
+    return Frame(
+        path=str(source.path),
+        exif=source.probe.exif,
+        role=source.role,
+        digest=" ".join([source.probe.digest, *settings]),
+        load=load,
+        exposure=_stated_exposure(source),
+        within=partial(libraw.within, source.path, source.probe.digest) if alone else None,
+    )
+
+
+def _loader(source: Source, stated: CaptureFile, mosaic_deg: float | None) -> tuple[Loader, list[str]]:
+    """How to read a frame, and the settings besides its bytes that decide its values."""
+    path, found = source.path, source.probe
+    settings = [f"{stated.white:g}"] if stated.white else []
+    settings += [f"-{stated.black:g}"] if stated.black else []
+    levels = (stated.white, stated.black, found.digest)
+    if mosaic_deg is not None:
+        return partial(photo.read_mosaic, path, mosaic_deg, *levels, found.kind), [f"sensor {mosaic_deg:g}", *settings]
+    if found.kind == "raw":
+        return partial(libraw.read, path, found.digest), []
+    return partial(photo.read, path, stated.encoding, *levels), [stated.encoding or "default", *settings]
+
+
+def _stated_exposure(source: Source) -> float | None:
+    if source.flash_energy:
+        fact = source.probe.exif
+        return source.flash_energy * (fact.iso or 100.0) / 100.0 / (fact.f_number or 1.0) ** 2
+    return source.exposure
+
+
+def _exposure(frame: Frame) -> float | None:
+    return frame.exposure or frame.exif.relative_exposure
+
+
+def _darkest_first(frames: Iterable[Frame]) -> tuple[Frame, ...]:
+    listed = sorted(frames, key=lambda frame: layouts.natural(Path(frame.path).name))
+    exposures = [_exposure(frame) for frame in listed]
+    if None in exposures:
+        return tuple(listed)
+    return tuple(sorted(listed, key=lambda frame: _exposure(frame) or 0.0))
+
+
+def _check_angles(folder: Path, angles_deg: Sequence[float], who: str) -> None:
+    count = layouts.different(angles_deg)
+    if count < 3:
+        listed = ", ".join(f"{angle:g}" for angle in angles_deg) or "none"
+        unread = ", ".join(layouts.numbered(folder))
+        remedy = "add the missing shot"
+        if unread:
+            remedy += f", or name {unread} as polcap reads it: pol000, pol045, …"
+        raise CaptureError(f"{folder}: {who} {listed}: {count} different polarizer angles where 3 are needed; {remedy}")
+
+
+def _check_one_camera(facts: dict[Path, Exif]) -> None:
+    first_path, first = next(iter(facts.items()))
+    for path, fact in facts.items():
+        fault = ""
+        if (fact.make, fact.model) != (first.make, first.model):
+            fault = f"was taken with {fact.make} {fact.model}, not {first.make} {first.model}"
+        elif fact.lens and first.lens and fact.lens != first.lens:
+            fault = f"was taken through {fact.lens}, not {first.lens}"
+        elif (fact.width, fact.height) != (first.width, first.height):
+            fault = f"has {fact.width}×{fact.height} px, not {first.width}×{first.height}"
+        elif fact.focal_length_mm and first.focal_length_mm:
+            ratio = fact.focal_length_mm / first.focal_length_mm
+            if abs(ratio - 1) > _ZOOM:
+                fault = f"was taken at {fact.focal_length_mm:g} mm, not {first.focal_length_mm:g} mm"
+        if fault:
+            raise CaptureError(f"{path}: {fault} as {first_path.name}; use one set-up per capture, or remove the file")
+
+
+def _check_no_duplicate(digests: dict[Path, str]) -> None:
+    seen: dict[str, Path] = {}
+    for path, digest in digests.items():
+        if digest in seen:
+            raise CaptureError(
+                f"{path}: is the same photograph as {seen[digest]}; remove one, and shoot the missing one"
+            )
+        seen[digest] = path
+
+
+def _check_brackets(shots: Sequence[Shot]) -> None:
+    counts = [len(shot.frames) for shot in shots]
+    usual = max(set(counts), key=counts.count)
+    model = next(shot for shot in shots if len(shot.frames) == usual)
+    for shot in shots:
+        where = Path(shot.frames[0].path).parent
+        if len(shot.frames) != usual:
+            raise CaptureError(
+                f"{where}: {shot.name} has {len(shot.frames)} frames where {model.name} has {usual}; "
+                "shoot equal brackets, or remove the surplus"
+            )
+        for frame, other in zip(shot.frames, model.frames):
+            if not layouts.equal(_exposure(frame), _exposure(other)):
+                raise CaptureError(
+                    f"{frame.path}: {_settings(frame)} where {model.name} has {_settings(other)} "
+                    f"({Path(other.path).name}); shoot equal brackets at every angle"
+                )
+
+
+def _settings(frame: Frame) -> str:
+    if frame.exposure:
+        return f"exposure {frame.exposure:.4g} stated"
+    fact = frame.exif
+    parts = [_seconds(fact.exposure_time), f"f/{fact.f_number or '?'}", f"ISO {fact.iso or '?'}"]
+    return " ".join(parts) if fact.exposure_time else "no exposure in EXIF"
+
+
+def _notes(
+    layout: str, others: Sequence[Source], reference: Source, shots: Sequence[Shot], stated: CaptureFile
+) -> list[str]:
+    notes = []
+    cross = sum(source.role == "cross" for source in others)
+    if cross and layout == "sensor":
+        notes.append(f"not used: {cross} cross-polarized frames, which a polarization sensor cannot take")
+    if layout != "sensor" and reference.probe.kind == "photo":
+        bits = reference.probe.bits
+        encoding = photo.encoding_of(bits, stated.encoding)
+        notes.append(f"finished pictures of {bits} bits, taken as {encoding}" + LOSS * (bits == 8))
+    if reference.probe.lossy:
+        notes.append("lossy DNG" + LOSS)
+    if stated.rotator:
+        notes.append(f"rotator {stated.rotator.model or 'of unknown model'}, log {stated.rotator.log or 'none'}")
+    exposures = [_exposure(frame) for frame in shots[0].frames]
+    if (
+        len(exposures) > 1
+        and None not in exposures
+        and np.ptp(np.log2(np.array(exposures, float))) < layouts.EQUAL_STOPS
+    ):
+        notes.append("all frames of a bracket state the same exposure; their ratios are measured from the pixels")
+    return notes

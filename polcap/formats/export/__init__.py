@@ -1,0 +1,1 @@
+"""Assets for other programs: glTF, OBJ, USD, MaterialX, layered EXR."""

@@ -1,0 +1,132 @@
+"""Writes every map and the Stokes images of a result as layers of one OpenEXR file, in a chosen color space.
+
+Colors are converted to any space or role of the OpenColorIO configuration $OCIO, by default the one built into
+OpenImageIO (ACES' CG config); the header names it (chromaticities, colorInteropID). S0, S1 and S2 stay in camera
+channels.
+"""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from polcap.errors import SettingError
+from polcap.formats.maps import exr, png
+from polcap.images import Floats
+
+LINEAR_REC709 = "lin_rec709"  # its alias in OpenColorIO configurations
+_COLORS = ("diffuse", "specular")
+_PLAIN = {"depth": "Z", "roughness": "Y", "confidence": "Y"}
+_FLOAT = ("normal", "depth")  # layers of 32 bits; all others are half
+MEANINGS = {
+    "S0, S1, S2": "linear Stokes parameters in camera channels; sensor white at the reference exposure = 1",
+    "normal": "unit vectors in the camera frame: x right, y up, z toward the camera",
+    "depth": "distance along the optical axis, growing away from the camera",
+    "diffuse": "diffuse albedo rho_d",
+    "specular": "specular albedo F0",
+    "roughness": "perceptual roughness, alpha = roughness squared",
+    "confidence": "expected error of the normal, degrees",
+    "dolp": "degree of linear polarization",
+    "aolp": "angle of linear polarization, degrees, 0 to 180 from image x toward image up",
+    "mask": "1 on the object",
+}
+
+
+@dataclass(frozen=True)
+class ColorSpace:
+    """A color space of the OpenColorIO configuration."""
+
+    name: str
+    interop_id: str | None  # Color Interop Forum's name, where the configuration has it
+    chromaticities: tuple[float, ...] | None  # (8,) xy of R, G, B and white
+
+
+def write(path: Path, maps: Path, color: str, header: Mapping[str, str]) -> None:
+    """Write the maps of a result's folder `maps` as layers, their colors in the space or role `color`.
+
+    Raises
+    ------
+    SettingError
+        There is no such space.
+    DecodeError
+        A map is missing or damaged.
+    StorageError
+        The file cannot be written.
+    """
+    space = find_space(color)
+    layers: dict[str, Floats] = {}
+    for name in _COLORS:
+        found, _ = exr.read(maps / f"{name}.exr")
+        converted = convert(np.stack([found[c] for c in "RGB"], axis=-1), space)
+        layers |= {f"{name}.{c}": converted[..., k] for k, c in enumerate("RGB")}
+    normal, _ = exr.read(maps / "normal.exr")
+    layers |= {f"normal.{axis}": normal[c] for axis, c in zip("xyz", "RGB")}
+    for name, letter in _PLAIN.items():
+        layers[f"{name}.{letter}"] = exr.read(maps / f"{name}.exr")[0][letter]
+    cues, _ = exr.read(maps / "cues.exr")
+    layers |= {f"{name}.Y": cues[name] for name in ("dolp", "aolp")}
+    layers["mask.Y"] = (png.read(maps / "mask.png") > 127).astype(np.float32)
+    layers |= exr.read(maps / "stokes.exr")[0]
+    exr.write(path, layers, _attributes(space, header), half=[name for name in layers if not name.startswith(_FLOAT)])
+
+
+def _attributes(space: ColorSpace, header: Mapping[str, str]) -> dict[str, exr.Attribute]:
+    attributes: dict[str, exr.Attribute] = {f"polcap:{key}": value for key, value in header.items()}
+    attributes |= {f"polcap:layer {key}": value for key, value in MEANINGS.items()}
+    attributes["polcap:colors"] = f"{', '.join(_COLORS)} in {space.name}"
+    if space.interop_id is not None:
+        attributes["colorInteropID"] = space.interop_id
+    if space.chromaticities is not None:
+        attributes["chromaticities"] = space.chromaticities
+    return attributes
+
+
+def find_space(wanted: str) -> ColorSpace:
+    """The color space with this role, name or alias.
+
+    Raises
+    ------
+    SettingError
+        The configuration has no such space, or it is data or a display.
+    """
+    import OpenImageIO as oiio
+
+    source = _source()
+    config = oiio.ColorConfig(source)
+    if config.geterror() or not config.getColorSpaceNames():
+        raise SettingError(f"$OCIO {source} cannot be read as an OpenColorIO configuration; correct or unset it")
+    name = config.resolve(wanted)
+    if name not in config.getColorSpaceNames() or config.isData(name):
+        known = ", ".join(sorted([*config.getRoles(), *config.getColorSpaceNames()]))
+        raise SettingError(f"--color {wanted} is not a color space or role of {source}; it has {known}")
+    white = config.get_chromaticities(name)
+    return ColorSpace(
+        name=name,
+        interop_id=config.get_color_interop_id(name) or None,
+        chromaticities=tuple(float(x) for x in white) if white else None,
+    )
+
+
+def convert(rgb: Floats, space: ColorSpace) -> Floats:
+    """Convert linear Rec.709 (H, W, 3) to the space.
+
+    Raises
+    ------
+    SettingError
+        The configuration cannot convert from linear Rec.709.
+    """
+    import OpenImageIO as oiio
+
+    source = oiio.ImageBuf(np.ascontiguousarray(rgb, dtype=np.float32))
+    done = oiio.ImageBufAlgo.colorconvert(source, LINEAR_REC709, space.name, colorconfig=_source())
+    if done.has_error:
+        raise SettingError(
+            f"cannot convert linear Rec.709 to {space.name} ({exr.reason(done)}); choose another --color or $OCIO"
+        )
+    return np.asarray(done.get_pixels(oiio.FLOAT), dtype=np.float32)
+
+
+def _source() -> str:
+    return os.environ.get("OCIO") or "ocio://default"

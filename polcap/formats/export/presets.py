@@ -1,0 +1,63 @@
+"""In: the name of a program or purpose. Out: what it is given: formats, names, packing, direction of normals."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Literal
+
+from polcap.formats.export import texture_set
+from polcap.formats.export.encoders import Kind
+from polcap.formats.export.texture_set import Texture
+from polcap.images import Asset
+
+Format = Literal["gltf", "obj", "usd", "materialx", "exr"]
+FORMATS: tuple[Format, ...] = ("gltf", "obj", "usd", "materialx", "exr")
+
+
+@dataclass(frozen=True)
+class Preset:
+    """What one export holds; names are patterns of the asset's name."""
+
+    formats: tuple[Format, ...]
+    says: str
+    name: str = "{}"  # of the asset itself
+    images: Kind = "png"  # inside the GLB
+    textures: Mapping[str, Callable[[Asset], Texture]] = field(default_factory=dict)  # loose ones, PNG
+
+
+PRESETS: Mapping[str, Preset] = {
+    "blender": Preset(
+        formats=("gltf",),
+        says="File > Import > glTF, or polcap's extension for camera, flash and photograph; normals +Y",
+    ),
+    "unreal": Preset(
+        formats=("gltf",),
+        says="Interchange imports the GLB, whose normals are +Y; the loose T_*_N is -Y as Unreal's materials want it",
+        name="SM_{}",
+        textures={
+            "T_{}_BC": texture_set.base_color,
+            "T_{}_N": partial(texture_set.normal, up=False),
+            "T_{}_ORM": texture_set.packed,
+            "T_{}_S": texture_set.specular_level,
+        },
+    ),
+    "unity": Preset(
+        formats=("gltf",),
+        says="glTFast imports the GLB; loose maps for HDRP and for the specular set-ups of URP; normals +Y",
+        textures={
+            "{}_BaseMap": texture_set.base_color,
+            "{}_Normal": texture_set.normal,
+            "{}_MaskMap": texture_set.unity_mask,
+            "{}_SpecularMap": texture_set.unity_specular,
+        },
+    ),
+    "web": Preset(
+        formats=("gltf",),
+        says="one small GLB; colours lossy, data lossless WebP (EXT_texture_webp); normals +Y",
+        images="webp",
+    ),
+    "archive": Preset(
+        formats=FORMATS,
+        says="every format, without loss; normals +Y; values in full precision in the layered EXR",
+    ),
+}

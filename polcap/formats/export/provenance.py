@@ -1,0 +1,74 @@
+"""The origin of an export (photographs, versions, settings), as a sidecar file and as texts for other formats."""
+
+import json
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from polcap import __version__
+from polcap.formats import atomic
+from polcap.formats.raw import file_bytes
+
+_PARTS = (
+    "numpy", "scipy", "opencv-contrib-python-headless", "onnxruntime", "rawpy", "OpenImageIO", "trimesh",
+    "colour-science",
+)  # fmt: skip
+
+
+def versions() -> dict[str, str]:
+    """Installed versions of polcap and of the packages that affect pixels."""
+    return dict(_installed())
+
+
+@cache
+def _installed() -> dict[str, str]:
+    found = {"polcap": __version__}
+    for name in _PARTS:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def record(about: Mapping[str, Any]) -> dict[str, Any]:
+    """The origin of a result, from the content of its report.json."""
+    capture, model = about["capture"], about["model"]
+    return {
+        "format": "polcap provenance 1",
+        "name": capture["name"],
+        "camera": capture["camera"],
+        "photographs": [  # after a space the digest names how the file was read
+            {"file": frame["file"], "angle_deg": shot["angle_deg"], "sha256": frame["digest"].partition(" ")[0]}
+            for shot in capture["shots"]
+            for frame in shot["frames"]
+        ],
+        "versions": about.get("versions", {"polcap": about["polcap"]}),
+        "model": model,  # of the network, from its file; described in calib/models/polcap.md; null: analytic
+        "settings": about["settings"],
+        "stages": about["keys"],
+        "random_seeds": "fixed in the stages, part of their versions",
+    }
+
+
+def words(facts: Mapping[str, Any]) -> dict[str, str]:
+    """The record as texts, for formats that hold only texts."""
+    return {key: value if isinstance(value, str) else _plain(value) for key, value in facts.items()}
+
+
+def write(path: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> None:
+    """Write the sidecar: the record, and the digest of every file of the export; StorageError."""
+    with atomic.path(path) as temporary:
+        text = json.dumps({**facts, "files": dict(sorted(digests.items()))}, indent=1, ensure_ascii=False)
+        temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")  # a file name may not be text
+
+
+def digest(file: Path) -> str:
+    """The digest of a file, as in the sidecar."""
+    return file_bytes.digest(file.read_bytes())
+
+
+def _plain(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=True, separators=(",", ":"))

@@ -1,0 +1,124 @@
+"""The textures of an asset, packed as each kind of program needs them.
+
+Each has a sentence on the meaning of its channels, which goes into the file, into maps.json and into the material.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Asset, Floats
+from polcap.optics import color, fresnel
+
+SPECULAR_RANGE = 0.08  # F0 of white in the loose specular textures: Disney's, Blender's and Unreal's "specular"
+
+Key = Literal["basecolor", "roughness", "normal", "specular"]  # the texture files of OBJ, USD and MaterialX
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+@dataclass(frozen=True)
+class Texture:
+    """A picture and its meaning."""
+
+    pixels: Pixels  # (H, W), (H, W, 3) or (H, W, 4)
+    color: bool  # sRGB-encoded color; else numbers
+    says: str
+
+
+def base_color(asset: Asset) -> Texture:
+    """Diffuse color, or albedo as glTF defines it."""
+    return Texture(asset.base_color, True, "base colour, sRGB-encoded Rec.709")
+
+
+def normal(asset: Asset, *, up: bool = True) -> Texture:
+    """Tangent-space normals with green up (OpenGL) or down (DirectX)."""
+    if up:
+        return Texture(asset.normal, False, "tangent-space normal n * 0.5 + 0.5, +Y (OpenGL, green up)")
+    flipped = asset.normal.copy()
+    flipped[..., 1] = np.iinfo(flipped.dtype).max - flipped[..., 1]
+    return Texture(flipped, False, "tangent-space normal n * 0.5 + 0.5, -Y (DirectX, green down)")
+
+
+def roughness(asset: Asset) -> Texture:
+    """The roughness channel of the packed texture."""
+    says = "perceptual roughness (GGX alpha = roughness squared), linear"
+    return Texture(np.ascontiguousarray(asset.occlusion_roughness_metallic[..., 1]), False, says)
+
+
+def packed(asset: Asset) -> Texture:
+    """Occlusion, roughness and metallic in one picture, as in glTF."""
+    says = "R occlusion (1: none measured), G perceptual roughness, B metallic (0); linear"
+    return Texture(asset.occlusion_roughness_metallic, False, says)
+
+
+def relative_specular(asset: Asset) -> Texture:
+    """F0 as KHR_materials_specular needs it, to be multiplied by the asset's factor."""
+    says = f"F0 over {asset.specular_factor[0] * _index_reflectance(asset):.5g}, sRGB-encoded"
+    return Texture(asset.specular_color, True, says)
+
+
+def specular(asset: Asset) -> Texture:
+    """F0 on a fixed scale, in color."""
+    says = f"F0 / {SPECULAR_RANGE:g}, sRGB-encoded; F0 beyond {SPECULAR_RANGE:g} is clipped"
+    values = np.arange(np.iinfo(asset.specular_color.dtype).max + 1, dtype=asset.specular_color.dtype)
+    table = replace(asset, specular_color=np.repeat(values[:, None], 3, axis=1))  # all values of a channel
+    encoded = _quantized(color.encode_srgb(_level(table)), values)
+    channels = [encoded[asset.specular_color[..., c], c] for c in range(3)]
+    return Texture(np.stack(channels, axis=-1), True, says)
+
+
+def specular_level(asset: Asset) -> Texture:
+    """The luminance of F0 on a fixed scale."""
+    says = f"specular level: F0 / {SPECULAR_RANGE:g}, linear; F0 beyond {SPECULAR_RANGE:g} is clipped"
+    return Texture(_quantized(color.luminance(_level(asset)), asset.specular_color), False, says)
+
+
+def unity_mask(asset: Asset) -> Texture:
+    """HDRP's mask map."""
+    orm = asset.occlusion_roughness_metallic
+    top = np.iinfo(orm.dtype).max
+    channels = [orm[..., 2], orm[..., 0], np.zeros_like(orm[..., 0]), top - orm[..., 1]]
+    says = "R metallic (0), G occlusion (1), B detail mask (0), A smoothness = 1 - perceptual roughness; linear"
+    return Texture(np.stack(channels, axis=-1), False, says)
+
+
+def unity_specular(asset: Asset) -> Texture:
+    """Specular map of the Standard, URP and HDRP specular set-ups."""
+    rough = asset.occlusion_roughness_metallic[..., 1:2]
+    smooth = 1 - rough / np.float64(np.iinfo(rough.dtype).max)
+    reflected = color.encode_srgb(np.clip(_reflectance(asset), 0.0, 1.0))
+    says = "RGB F0, sRGB-encoded; A smoothness = 1 - perceptual roughness, linear"
+    return Texture(_quantized(np.concatenate([reflected, smooth], axis=-1), asset.specular_color), True, says)
+
+
+LOOSE: Mapping[Key, Callable[[Asset], Texture]] = {
+    "basecolor": base_color,
+    "roughness": roughness,
+    "normal": normal,
+    "specular": specular,
+}
+
+
+def _reflectance(asset: Asset) -> Floats:
+    """F0 (H, W, 3), linear."""
+    relative = color.decode_srgb(asset.specular_color / np.float64(np.iinfo(asset.specular_color.dtype).max))
+    return np.asarray(relative * np.array(asset.specular_factor) * _index_reflectance(asset))
+
+
+def _index_reflectance(asset: Asset) -> float:
+    """F0 of the asset's refractive index."""
+    return float(fresnel.normal_reflectance(asset.ior))
+
+
+def _level(asset: Asset) -> Floats:
+    """F0 on the fixed scale of the loose textures, 0…1."""
+    return np.asarray(np.clip(_reflectance(asset) / SPECULAR_RANGE, 0.0, 1.0))
+
+
+def _quantized(value: Floats, like: Pixels) -> Pixels:
+    if like.dtype == np.uint8:
+        return np.rint(value * 255).astype(np.uint8)
+    return np.rint(value * 65535).astype(np.uint16)

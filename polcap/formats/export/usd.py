@@ -1,0 +1,168 @@
+"""Writes an asset as USD: the mesh, and its material as OpenPBR and as UsdPreviewSurface.
+
+Renderers that read MaterialX use `outputs:mtlx:surface`; all others the UsdPreviewSurface, whose specular
+workflow takes F0 from a texture. Blender reads that texture as a tint of F0 in either workflow. So
+the mesh is bound twice: for every purpose to the material in the specular workflow, and for the purpose
+`full`, which Blender prefers, to a copy with F0 as a tint. Needs usd-core (extra [usd]).
+
+References
+----------
+OpenUSD, UsdPreviewSurface specification (normal maps: scale 2, bias -1, raw); UsdMtlx.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from polcap.errors import SettingError
+from polcap.formats import atomic
+from polcap.formats.export import gltf, materialx
+from polcap.formats.export.texture_set import SPECULAR_RANGE, Key
+from polcap.images import Asset, Mesh
+from polcap.optics import fresnel
+
+
+def require() -> None:
+    """Raise a SettingError where usd-core is not installed."""
+    try:
+        from pxr import Usd  # noqa: F401
+    except ModuleNotFoundError:
+        raise SettingError(
+            "USD, and with it --preset archive, needs usd-core: pip install 'polcap[usd]', or name other formats"
+        ) from None
+
+
+def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], facts: Mapping[str, str]) -> None:
+    """Write a USD layer (.usdc or .usda) whose textures `files` are in the same folder.
+
+    `facts` go into the layer's custom data.
+
+    Raises
+    ------
+    SettingError
+        usd-core is not installed.
+    StorageError
+        The file cannot be written.
+    """
+    require()
+    from pxr import Usd, UsdGeom, UsdShade
+
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.GetRootLayer().customLayerData = {"polcap": dict(facts)}
+    root = UsdGeom.Xform.Define(stage, f"/{materialx.identifier(name)}")
+    Usd.ModelAPI(root).SetKind("component")
+    stage.SetDefaultPrim(root.GetPrim())
+    word = root.GetPath().name
+    shape = _mesh(stage, root.GetPath().AppendChild(f"{word}_mesh"), asset.mesh)
+    binding = UsdShade.MaterialBindingAPI.Apply(shape.GetPrim())
+    binding.Bind(_material(stage, root.GetPath().AppendChild(f"{word}_material"), asset, files, tint=False))
+    full = _material(stage, root.GetPath().AppendChild(f"{word}_material_full"), asset, files, tint=True)
+    binding.Bind(full, materialPurpose=UsdShade.Tokens.full)
+    with atomic.path(path) as temporary:
+        if not stage.GetRootLayer().Export(str(temporary)):
+            raise OSError(f"usd-core could not export {path.name}")
+
+
+def _mesh(stage: Any, path: Any, mesh: Mesh) -> Any:
+    from pxr import Sdf, UsdGeom, Vt
+
+    shape = UsdGeom.Mesh.Define(stage, path)
+    points = (mesh.vertices - gltf.center(mesh.vertices)).astype(np.float32)
+    shape.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+    shape.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
+    shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, dtype=np.int32)))
+    shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.reshape(-1).astype(np.int32)))
+    shape.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.normals, dtype=np.float32)))
+    shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    shape.CreateDoubleSidedAttr(gltf.is_open(mesh.faces))
+    uv = (mesh.uv * [1.0, -1.0] + [0.0, 1.0]).astype(np.float32)  # USD counts v upwards
+    coordinates = UsdGeom.PrimvarsAPI(shape).CreatePrimvar(
+        "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex
+    )
+    coordinates.Set(Vt.Vec2fArray.FromNumpy(uv))
+    return shape
+
+
+def _material(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str], tint: bool) -> Any:
+    from pxr import Sdf, UsdShade
+
+    material = UsdShade.Material.Define(stage, path)
+    material.GetPrim().AddAppliedSchema("MaterialXConfigAPI")  # of UsdMtlx, which not every usd-core has
+    version = material.GetPrim().CreateAttribute("config:mtlx:version", Sdf.ValueTypeNames.String, custom=False)
+    version.Set(materialx.VERSION)
+    material.CreateSurfaceOutput().ConnectToSource(_preview(stage, path, asset, files, tint))
+    material.CreateSurfaceOutput("mtlx").ConnectToSource(_openpbr(stage, path, asset, files))
+    return material
+
+
+def _openpbr(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str]) -> Any:
+    """The nodes of `materialx.describe` as shaders; returns the surface's output."""
+    from pxr import Sdf, UsdShade
+
+    types = {
+        "float": Sdf.ValueTypeNames.Float,
+        "integer": Sdf.ValueTypeNames.Int,
+        "string": Sdf.ValueTypeNames.String,
+        "color3": Sdf.ValueTypeNames.Color3f,
+        "vector3": Sdf.ValueTypeNames.Float3,
+        "filename": Sdf.ValueTypeNames.Asset,
+        "surfaceshader": Sdf.ValueTypeNames.Token,
+    }
+    outputs: dict[str, Any] = {}
+    for node in materialx.describe(asset, files):
+        shader = UsdShade.Shader.Define(stage, path.AppendChild(f"mtlx_{node.name}"))
+        shader.CreateIdAttr(node.definition)
+        for one in node.inputs:
+            put = shader.CreateInput(one.name, types[one.type])
+            match one.value:
+                case materialx.NodeOutput(source):
+                    put.ConnectToSource(outputs[source])
+                case materialx.TextureFile(file, colorspace):
+                    put.Set(f"./{file}")
+                    if colorspace is not None:
+                        put.GetAttr().SetColorSpace(colorspace)
+                case plain:
+                    put.Set(plain)
+        outputs[node.name] = shader.CreateOutput("out", types[node.type])
+    return outputs[node.name]
+
+
+def _preview(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str], tint: bool) -> Any:
+    """UsdPreviewSurface with F0 from a texture; with `tint` F0 over that of the index, not in the specular workflow."""
+    from pxr import Sdf, UsdShade
+
+    kinds = Sdf.ValueTypeNames
+    surface = UsdShade.Shader.Define(stage, path.AppendChild("preview"))
+    surface.CreateIdAttr("UsdPreviewSurface")
+    reader = UsdShade.Shader.Define(stage, path.AppendChild("preview_st"))
+    reader.CreateIdAttr("UsdPrimvarReader_float2")
+    reader.CreateInput("varname", kinds.String).Set("st")
+    st = reader.CreateOutput("result", kinds.Float2)
+    whole = SPECULAR_RANGE / (float(fresnel.normal_reflectance(asset.ior)) if tint else 1.0)
+    textures: tuple[tuple[Key, str, Any, str, str, Any, Any], ...] = (
+        ("basecolor", "diffuseColor", kinds.Color3f, "rgb", "sRGB", None, None),
+        ("specular", "specularColor", kinds.Color3f, "rgb", "sRGB", (whole, whole, whole, 1.0), None),
+        ("roughness", "roughness", kinds.Float, "r", "raw", None, None),
+        ("normal", "normal", kinds.Normal3f, "rgb", "raw", (2.0, 2.0, 2.0, 1.0), (-1.0, -1.0, -1.0, 0.0)),
+    )
+    for key, target, kind, channel, space, scale, bias in textures:
+        texture = UsdShade.Shader.Define(stage, path.AppendChild(f"preview_{key}"))
+        texture.CreateIdAttr("UsdUVTexture")
+        texture.CreateInput("file", kinds.Asset).Set(f"./{files[key]}")
+        texture.CreateInput("st", kinds.Float2).ConnectToSource(st)
+        texture.CreateInput("sourceColorSpace", kinds.Token).Set(space)
+        for axis in "ST":
+            texture.CreateInput(f"wrap{axis}", kinds.Token).Set("clamp")
+        for word, numbers in (("scale", scale), ("bias", bias)):
+            if numbers is not None:
+                texture.CreateInput(word, kinds.Float4).Set(numbers)
+        output = texture.CreateOutput(channel, kinds.Float if channel == "r" else kinds.Float3)
+        surface.CreateInput(target, kind).ConnectToSource(output)
+    surface.CreateInput("useSpecularWorkflow", kinds.Int).Set(0 if tint else 1)
+    surface.CreateInput("ior", kinds.Float).Set(float(asset.ior))
+    return surface.CreateOutput("surface", kinds.Token)

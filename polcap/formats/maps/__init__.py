@@ -1,0 +1,1 @@
+"""The folder maps/ of a result, and the EXR and PNG files in it."""

@@ -1,0 +1,103 @@
+"""In: the maps of an object. Out: what each file of maps/ holds: channels of an .exr, pixels of a .png."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.formats.maps import png
+from polcap.images import Cues, Floats, Mesh, StokesImage, SurfaceMaps
+from polcap.optics import color
+
+Source = Literal["maps", "mesh", "stokes", "cues"]
+
+
+def object_depth(maps: SurfaceMaps, mesh: Mesh) -> Floats:
+    """Depth (H, W) on the object, 0 beside it."""
+    return np.where(inside(maps) & np.isfinite(mesh.depth), mesh.depth, 0.0).astype(np.float32)
+
+
+def depth_range(maps: SurfaceMaps, mesh: Mesh) -> tuple[float, float, float]:
+    """Least, median and greatest depth on the object."""
+    depth = object_depth(maps, mesh)
+    seen = depth[depth > 0]
+    near, median, far = (float(q) for q in np.quantile(seen, (0, 0.5, 1))) if seen.size else (0.0, 0.5, 1.0)
+    return near, median, far
+
+
+def _depth_picture(maps: SurfaceMaps, mesh: Mesh) -> NDArray[np.uint16]:
+    near, _, far = depth_range(maps, mesh)
+    depth = object_depth(maps, mesh)
+    return png.sixteen_bits(np.where(depth > 0, (depth - near) / max(far - near, 1e-9), 0))
+
+
+def _normal_picture(maps: SurfaceMaps) -> NDArray[np.uint16]:
+    flat = np.where(inside(maps)[..., None], maps.normal, [0.0, 0.0, 1.0])
+    return png.sixteen_bits(flat / 2 + 0.5)
+
+
+def inside(maps: SurfaceMaps) -> NDArray[np.bool_]:
+    """Which pixels (H, W) the object covers."""
+    return np.asarray(maps.mask, dtype=bool)
+
+
+def seen(maps: SurfaceMaps, values: Floats) -> Floats:
+    """A map (H, W[, C]) on the object, 0 beside it."""
+    return kept(values, inside(maps))
+
+
+def kept(values: Floats, inside: NDArray[np.bool_]) -> Floats:
+    """Values (H, W[, C]) inside, 0 beside."""
+    return np.where(inside if values.ndim == 2 else inside[..., None], values, 0).astype(np.float32)
+
+
+def _channels(names: str, values: Floats) -> dict[str, Floats]:
+    return {name: values[..., k] for k, name in enumerate(names)}
+
+
+def _stokes_channels(stokes: StokesImage) -> dict[str, Floats]:
+    return {f"S{s}.{c}": stokes.stokes[s, ..., k] for s in range(3) for k, c in enumerate("RGB")}
+
+
+def _cue_channels(cues: Cues) -> dict[str, Floats]:
+    aolp = np.degrees(np.arctan2(cues.normalized_stokes[1], cues.normalized_stokes[0]) / 2) % 180.0
+    return {
+        "dolp": cues.dolp,
+        "aolp": aolp,
+        "normalized.S1": cues.normalized_stokes[0],
+        "normalized.S2": cues.normalized_stokes[1],
+        **{f"diffuse_color.{c}": cues.diffuse_color[..., k] for k, c in enumerate("RGB")},
+        **_separated(cues),
+    }
+
+
+def _separated(cues: Cues) -> dict[str, Floats]:
+    """S0 in two parts, where a crossed shot tells them apart; else nothing."""
+    if cues.body is None or cues.body_known is None:
+        return {}
+    body = kept(cues.body, cues.body_known)
+    mirrored = kept(np.maximum(cues.radiance - cues.body, 0), cues.body_known)
+    parts = {"scattered": body, "mirrored": mirrored}
+    return {f"{name}.{c}": part[..., k] for name, part in parts.items() for k, c in enumerate("RGB")}
+
+
+WHOLE = ("depth", "normal")  # .exr of 32 bits; the others are half
+# what a file is made from, and its content; those that take longest first
+FILES: Mapping[str, tuple[tuple[Source, ...], Callable[..., Any]]] = {
+    "stokes.exr": (("stokes",), _stokes_channels),
+    "cues.exr": (("cues",), _cue_channels),
+    "normal.exr": (("maps",), lambda maps: _channels("RGB", seen(maps, maps.normal))),
+    "normal.png": (("maps",), _normal_picture),
+    "photograph.png": (("cues",), lambda cues: color.srgb_eight_bits(cues.radiance)),
+    "diffuse.png": (("maps",), lambda maps: color.srgb_eight_bits(seen(maps, maps.diffuse))),
+    "diffuse.exr": (("maps",), lambda maps: _channels("RGB", seen(maps, maps.diffuse))),
+    "specular.png": (("maps",), lambda maps: color.srgb_eight_bits(seen(maps, maps.specular))),
+    "specular.exr": (("maps",), lambda maps: _channels("RGB", seen(maps, maps.specular))),
+    "depth.exr": (("maps", "mesh"), lambda maps, mesh: {"Z": object_depth(maps, mesh)}),
+    "depth.png": (("maps", "mesh"), _depth_picture),
+    "roughness.exr": (("maps",), lambda maps: {"Y": seen(maps, maps.roughness)}),
+    "roughness.png": (("maps",), lambda maps: png.sixteen_bits(seen(maps, maps.roughness))),
+    "confidence.exr": (("maps",), lambda maps: {"Y": seen(maps, maps.confidence)}),
+    "mask.png": (("maps",), lambda maps: np.where(inside(maps), 255, 0).astype(np.uint8)),
+}

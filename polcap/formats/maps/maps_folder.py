@@ -1,0 +1,253 @@
+"""In: the maps of an object. Out: the folder maps/ of a result, as docs/reference/result.md says; and back."""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta, Struct
+from numpy.typing import NDArray
+
+from polcap import parallel
+from polcap.errors import DecodeError
+from polcap.formats import atomic, text_file
+from polcap.formats.maps import exr, map_files, png
+from polcap.images import Cues, Floats, Mesh, StokesImage, SurfaceMaps, View
+
+CONVENTIONS = {
+    "frame": "camera: x right, y up, z toward the camera; a normal facing the camera is (0, 0, 1)",
+    "normals": "+Y (OpenGL)",
+    "pixels": "row 0 on top; pixel centres on whole numbers",
+    "raw_pixel": "map pixel (i, j) is centred on visible RAW pixel crop[0:2] + scale * (i, j) + (scale - 1) / 2",
+    "point": "map pixel (i, j) at depth d is d * ((i - cx) / f, -(j - cy) / f, -1), f and (cx, cy) of camera",
+    "angles": "polarizer and AoLP from image x toward image up, counter-clockwise as the photographer sees it",
+    "color": "linear Rec.709, D65; PNG of colours is sRGB-encoded",
+    "outside": "values outside mask.png mean nothing; they are 0, and (0, 0, 1) in normal.png",
+}
+
+
+_Side = Annotated[int, Meta(ge=1, le=1 << 16)]
+_Positive = Annotated[float, Meta(gt=0, le=1e9)]
+_Place = Annotated[float, Meta(ge=-1e9, le=1e9)]
+
+
+class _Camera(Struct, frozen=True):
+    focal_px: _Positive
+    center_px: tuple[_Place, _Place]
+    focal_known: bool
+
+
+class _Depth(Struct, frozen=True):
+    unit: Literal["m", "relative"]
+
+
+class _Description(Struct, frozen=True):
+    """What is read back of maps.json."""
+
+    crop: tuple[_Place, _Place, _Place, _Place]
+    size: tuple[_Side, _Side]
+    scale: _Positive
+    camera: _Camera
+    depth: _Depth
+    estimator: str
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a result's maps/ tells."""
+
+    maps: SurfaceMaps
+    depth: Floats  # (H, W) NaN outside the mask
+    metric: bool
+
+
+def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues: Cues) -> None:
+    """Write every map as EXR, the main ones as PNG too, and maps.json last; the same values give the same bytes.
+
+    Of the mesh its depth (H, W) is written. All images lie on the crop (H, W) of `maps`. Files are encoded on
+    threads, and get their names together: where one fails, those of an earlier run are left.
+
+    Raises
+    ------
+    StorageError
+        A file cannot be written.
+    """
+    made = {"maps": maps, "mesh": mesh, "stokes": stokes, "cues": cues}
+    held = atomic.Held()
+    try:
+        parallel.results(
+            partial(_write, folder / name, partial(encode, *(made[source] for source in sources)), held)
+            for name, (sources, encode) in map_files.FILES.items()
+        )
+        held.release()
+    finally:
+        held.drop()
+    near, median, far = map_files.depth_range(maps, mesh)
+    depth: dict[str, str | float] = {"unit": "m" if mesh.metric else "relative"}
+    _write_json(folder / "maps.json", _description(maps, {**depth, "near": near, "median": median, "far": far}))
+
+
+def _write(file: Path, content: Callable[[], Any], held: atomic.Held) -> None:
+    """One file; an .exr of channels, a .png of pixels."""
+    if file.suffix == ".exr":
+        exr.write(file, content(), half=file.stem not in map_files.WHOLE, held=held)
+    else:
+        png.write(file, content(), held)
+
+
+def as_stored(maps: SurfaceMaps) -> SurfaceMaps:
+    """The maps that `read` gives of the folder that `write` makes of these: half where the files are half."""
+    inside = map_files.inside(maps)
+    return SurfaceMaps(
+        normal=map_files.kept(maps.normal, inside),
+        diffuse=_kept_half(maps.diffuse, inside),
+        specular=_kept_half(maps.specular, inside),
+        roughness=_kept_half(maps.roughness, inside),
+        depth_prior=None,
+        confidence=_kept_half(maps.confidence, inside),
+        mask=inside,
+        view=maps.view,
+        estimator=maps.estimator,
+    )
+
+
+def stored_depth(maps: SurfaceMaps, mesh: Mesh) -> Floats:
+    """The depth (H, W) that `read` gives of that folder; NaN outside the mask."""
+    return np.where(map_files.inside(maps), map_files.object_depth(maps, mesh), np.nan).astype(np.float32)
+
+
+def _kept_half(values: Floats, inside: NDArray[np.bool_]) -> Floats:
+    """As `map_files.kept`, rounded to half; pixels beside the object are not computed."""
+    rows, limit = np.flatnonzero(inside), np.finfo(np.float16).max
+    flat = values.reshape(inside.size, -1)
+    kept = np.zeros(flat.shape, np.float32)
+    kept[rows] = np.clip(flat.take(rows, axis=0), -limit, limit).astype(np.float16)
+    return kept.reshape(values.shape)
+
+
+def read(folder: Path) -> Stored:
+    """Read back what `write` wrote, from the EXRs, mask.png and maps.json.
+
+    Raises
+    ------
+    DecodeError
+        A file is missing, damaged, or of another size than maps.json says.
+    """
+    folder = Path(folder)
+    try:
+        said = msgspec.convert(text_file.read_json(folder / "maps.json"), _Description)
+    except OSError as error:
+        raise DecodeError(f"{folder} holds no maps.json ({error.strerror}); give a result's folder") from error
+    except ValueError as error:
+        raise DecodeError(f"{folder / 'maps.json'} is not as polcap wrote it ({error}); process again") from error
+    width, height = said.size
+    origin = (said.crop[0] / said.scale, said.crop[1] / said.scale)
+    view = View(said.camera.focal_px, said.camera.center_px, said.scale, origin, said.camera.focal_known)
+
+    mask = png.read(folder / "mask.png")
+    if mask.shape != (height, width):
+        raise DecodeError(f"{folder / 'mask.png'} is not {width} × {height}; process again")
+    inside = mask > 127
+    return Stored(
+        maps=SurfaceMaps(
+            normal=_read_map(folder / "normal.exr", "RGB", said.size),
+            diffuse=_read_map(folder / "diffuse.exr", "RGB", said.size),
+            specular=_read_map(folder / "specular.exr", "RGB", said.size),
+            roughness=_read_map(folder / "roughness.exr", "Y", said.size),
+            depth_prior=None,
+            confidence=_read_map(folder / "confidence.exr", "Y", said.size),
+            mask=inside,
+            view=view,
+            estimator=said.estimator,
+        ),
+        depth=np.where(inside, _read_map(folder / "depth.exr", "Z", said.size), np.nan).astype(np.float32),
+        metric=said.depth.unit == "m",
+    )
+
+
+def note_export(folder: Path, where: str, said: Mapping[str, Any]) -> None:
+    """Write into maps.json what the export in the result's folder `where` holds.
+
+    Raises
+    ------
+    StorageError
+        The file cannot be written.
+    """
+    file = folder / "maps.json"
+    known = text_file.read_json(file)
+    earlier = known.get("exports")
+    known["exports"] = dict(sorted({**(earlier if isinstance(earlier, dict) else {}), where: said}.items()))
+    _write_json(file, known)
+
+
+def _write_json(file: Path, content: Mapping[str, Any]) -> None:
+    with atomic.path(file) as temporary:
+        temporary.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", "utf-8")
+
+
+def _read_map(file: Path, letters: str, size: tuple[int, int]) -> Floats:
+    """The channels `letters` of an EXR, (H, W, C), or (H, W) of one."""
+    found, _ = exr.read(file)
+    planes = [found[letter] for letter in letters if letter in found]
+    if len(planes) != len(letters) or planes[0].shape != size[::-1]:
+        raise DecodeError(f"{file} is not {size[0]} × {size[1]} of {letters}; process again")
+    whole = np.stack(planes, axis=-1) if len(letters) > 1 else planes[0]
+    if not np.isfinite(whole).all():
+        raise DecodeError(f"{file}: {(~np.isfinite(whole)).sum()} values are not finite numbers; process again")
+    return whole
+
+
+def _description(maps: SurfaceMaps, depth: Mapping[str, str | float]) -> dict[str, Any]:
+    """maps.json."""
+    view = maps.view
+    height, width = maps.mask.shape
+    unit = depth["unit"]
+    linear, encoded = "linear Rec.709", "8 bit, sRGB"
+    return {
+        "format": "polcap maps 1",
+        "crop": raw_crop(view, width, height),
+        "size": [width, height],
+        "scale": _plain(view.scale),
+        "camera": {
+            "focal_px": float(view.focal),
+            "center_px": [float(v) for v in view.center],
+            "focal_known": view.known,
+            "unit": "map pixels",
+        },
+        "depth": dict(depth),
+        "estimator": maps.estimator,
+        "conventions": CONVENTIONS,
+        "maps": {
+            "normal.exr": "unit vectors: R x, G y, B z; float",
+            "normal.png": "16 bit, n * 0.5 + 0.5",
+            "depth.exr": f"Z: distance along the optical axis, growing away from the camera, {unit}; float",
+            "depth.png": "16 bit, (depth - near) / (far - near)",
+            "diffuse.exr": f"diffuse albedo rho_d, {linear}; half",
+            "diffuse.png": encoded,
+            "specular.exr": f"specular albedo F0, {linear}; half",
+            "specular.png": encoded,
+            "roughness.exr": "perceptual roughness, alpha = roughness squared, linear; half",
+            "roughness.png": "16 bit, linear",
+            "photograph.png": "S0 of the whole crop, linear Rec.709 with chart white = its reflectance; 8 bit, sRGB",
+            "mask.png": "8 bit, 255 on the object",
+            "confidence.exr": "expected error of the normal, degrees; half",
+            "stokes.exr": "S0.R ... S2.B in camera channels, linear, sensor white at the reference exposure = 1; half",
+            "cues.exr": "dolp; aolp in degrees, 0 ... 180; normalized.S1, normalized.S2; diffuse_color.R, .G, .B; "
+            "with a cross-polarised shot the two parts of S0 as photograph.png has it, linear: scattered.R, .G, .B and "
+            "mirrored.R, .G, .B; half",
+        },
+    }
+
+
+def raw_crop(view: View, width: int, height: int) -> list[int | float]:
+    """x0, y0, x1, y1 of a crop in visible RAW pixels of the reference shot, end exclusive."""
+    x, y = view.origin
+    return [_plain(edge * view.scale) for edge in (x, y, x + width, y + height)]
+
+
+def _plain(value: float) -> int | float:
+    return int(value) if float(value).is_integer() else float(value)

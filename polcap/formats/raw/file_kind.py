@@ -1,0 +1,176 @@
+"""What kind of file it is, judged by its content and never by its name; the image directories of a TIFF.
+
+All of it runs in the child process of `worker`.
+"""
+
+import struct
+from collections import deque
+from collections.abc import Iterator
+from typing import BinaryIO, Literal, NamedTuple
+
+Kind = Literal["raw", "photo", "other", "unknown"]
+
+SUBTYPE, WIDTH, LENGTH, BITS, COMPRESSION, PHOTOMETRIC, MAKE = 254, 256, 257, 258, 259, 262, 271
+STRIP_OFFSETS, SAMPLES, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS = 273, 277, 279, 324, 325, 330
+DNG_VERSION, CFA_LAYOUT = 50706, 50711
+CFA, LINEAR_RAW = 32803, 34892  # values of PHOTOMETRIC
+
+_TIFF_MAGIC = (b"II*\0", b"MM\0*")
+# Sony, Samsung, Kodak, Panasonic, Nikon, Kodak, Pentax
+_RAW_COMPRESSION = {32767, 32769, 32770, 32867, 34316, 34713, 65000, 65535}
+_TAGS_READ = {
+    SUBTYPE, WIDTH, LENGTH, BITS, COMPRESSION, PHOTOMETRIC, MAKE, DNG_VERSION, CFA_LAYOUT, SAMPLES,
+    STRIP_OFFSETS, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS,
+}  # fmt: skip
+_INTEGERS = {1: "B", 3: "H", 4: "I", 13: "I"}
+_MAX_DIRECTORIES, _MAX_VALUES = 64, 1 << 18  # per file: stops at a loop or a forged count
+_SIDECARS = {".db", ".cos", ".thm", ".pdf", ".zip", ".txt", ".xmp"}  # binary, or text in UTF-16
+_TEXT_BYTES = 1 << 16  # some makers put lines of text in front of their pixels
+
+Directory = dict[int, tuple[int, ...]]
+
+
+class TiffStructure(NamedTuple):
+    """The image directories of a TIFF file: the first, its siblings and their children."""
+
+    directories: tuple[Directory, ...]
+    size: int  # bytes of the file
+
+    @property
+    def dng(self) -> bool:
+        """Some directory carries a DNG version."""
+        return any(DNG_VERSION in directory for directory in self.directories)
+
+    @property
+    def truncated(self) -> bool:
+        """Some strip or tile lies beyond the end of the file."""
+        return any(a + b > self.size for directory in self.directories for a, b in strips(directory))
+
+
+def strips(directory: Directory) -> list[tuple[int, int]]:
+    """Offset and length of each strip and tile."""
+    return [
+        pair
+        for starts, counts in ((STRIP_OFFSETS, STRIP_BYTES), (TILE_OFFSETS, TILE_BYTES))
+        for pair in zip(directory.get(starts, ()), directory.get(counts, ()))
+    ]
+
+
+def first(directory: Directory, tag: int, default: int = 0) -> int:
+    """The first value of a tag; the default where it is absent, empty or not a whole number."""
+    values = directory.get(tag, ())
+    return values[0] if values else default
+
+
+def kind(file: BinaryIO, suffix: str) -> Kind:
+    """A RAW, a finished picture, some other known file, or unknown bytes."""
+    file.seek(0)
+    head = file.read(512)
+    if head[:3] == b"\xff\xd8\xff" or head[:8] == b"\x89PNG\r\n\x1a\n" or head[:4] == b"\x76\x2f\x31\x01":
+        return "photo"
+    if is_raw_magic(head):
+        return "raw"
+    if head[:4] in _TIFF_MAGIC:
+        return "raw" if _is_raw(structure(file)) else "photo"
+    if head[4:8] == b"ftyp" or head[:4] == b"RIFF":  # HEIC, AVIF or WebP next to a RAW; films; sounds
+        return "other"
+    if suffix.lower() in _SIDECARS:
+        return "other"
+    return "other" if _is_text(file) else "unknown"
+
+
+def _is_text(file: BinaryIO) -> bool:
+    """No byte at the beginning, in the middle or at the end that no text has."""
+    size = file.seek(0, 2)
+    pieces = []
+    for at in (0, size // 2, size - _TEXT_BYTES):
+        file.seek(max(at, 0))
+        pieces.append(file.read(_TEXT_BYTES))
+    return bool(pieces[0]) and not any(byte < 9 or 13 < byte < 27 for byte in set(b"".join(pieces)))
+
+
+def is_raw_magic(head: bytes) -> bool:
+    """The first bytes are those of a RAW format that is not an ordinary TIFF."""
+    return (
+        head[:15] == b"FUJIFILMCCD-RAW"
+        or head[4:12] == b"ftypcrx "  # Canon CR3
+        or head[6:14] == b"HEAPCCDR"  # Canon CRW
+        or head[:4] in (b"\0MRM", b"FOVb", b"IIRO", b"IIRS", b"MMOR", b"IIU\0")  # Minolta, Sigma, Olympus, Panasonic
+        or (head[:2] in (b"II", b"MM") and (head[8:10] == b"CR" or head[8:12] in (b"IIII", b"MMMM")))  # CR2, IIQ
+    )
+
+
+def is_foveon(head: bytes) -> bool:
+    """The first bytes are those of Sigma's X3F."""
+    return head[:4] == b"FOVb"
+
+
+def _is_raw(tiff: TiffStructure) -> bool:
+    if tiff.dng:
+        return True
+    for directory in tiff.directories:
+        if first(directory, PHOTOMETRIC) in (CFA, LINEAR_RAW):
+            return True
+        if first(directory, COMPRESSION) in _RAW_COMPRESSION:
+            return True
+    main = tiff.directories[0] if tiff.directories else {}
+    return MAKE in main and SUB_IFDS in main and main.get(SUBTYPE) == (1,)  # a preview in front of sensor data
+
+
+def structure(file: BinaryIO) -> TiffStructure:
+    """The image directories of a TIFF, as far as they can be read; none where the file is not a TIFF."""
+    size = file.seek(0, 2)
+    file.seek(0)
+    head = file.read(8)
+    directories: list[Directory] = []
+    if head[:4] in _TIFF_MAGIC and len(head) == 8:
+        order = "<" if head[:2] == b"II" else ">"
+        pending = deque(struct.unpack(order + "I", head[4:]))
+        seen: set[int] = set()
+        left = _MAX_VALUES
+        while pending and len(directories) < _MAX_DIRECTORIES and left > 0:
+            offset = pending.popleft()
+            if offset in seen or not 8 <= offset < size:
+                continue
+            seen.add(offset)
+            file.seek(offset)
+            directory, following = _directory(file, order, size, left)
+            left -= sum(map(len, directory.values()))
+            directories.append(directory)
+            pending.extend((*directory.get(SUB_IFDS, ()), following))
+    return TiffStructure(tuple(directories), size)
+
+
+def _directory(file: BinaryIO, order: str, size: int, most: int) -> tuple[Directory, int]:
+    """The tags of the directory at the file's position, and the offset of the next directory."""
+    count = _unpack(file.read(2), order + "H")
+    body = file.read(12 * count + 4)
+    following = _unpack(body[12 * count :], order + "I")
+    return dict(_entries(body[: 12 * count], file, order, size, most)), following
+
+
+def _entries(body: bytes, file: BinaryIO, order: str, size: int, most: int) -> Iterator[tuple[int, tuple[int, ...]]]:
+    """Tag and values of each entry of a directory; at most `most` values."""
+    for at in range(0, len(body) - 11, 12):
+        tag, form, count = struct.unpack_from(order + "HHI", body, at)
+        if tag not in _TAGS_READ or count > most:
+            continue
+        if form not in _INTEGERS:
+            yield tag, ()
+            continue
+        code = f"{order}{count}{_INTEGERS[form]}"
+        length = struct.calcsize(code)
+        if length <= 4:
+            most -= count
+            yield tag, struct.unpack_from(code, body, at + 8)
+            continue
+        (offset,) = struct.unpack_from(order + "I", body, at + 8)
+        if offset + length <= size:
+            most -= count
+            file.seek(offset)
+            yield tag, struct.unpack(code, file.read(length))
+
+
+def _unpack(data: bytes, code: str) -> int:
+    length = struct.calcsize(code)
+    return int(struct.unpack(code, data[:length])[0]) if len(data) >= length else 0

@@ -1,0 +1,264 @@
+"""Decodes a RAW file to sensor counts, levels and colors, by LibRaw in the child process.
+
+The only module that imports rawpy.
+"""
+
+import importlib
+import io
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.errors import DecodeError
+from polcap.formats.raw import exif, file_bytes, file_checks, file_kind, worker
+from polcap.images import Bits, Exif, Floats, SensorImage
+from polcap.optics import demosaic
+from polcap.optics.color import REC709_TO_XYZ
+
+_EIGHT_BITS = 255  # counts between black and white: rounding alone is 1 % of a dark patch
+_MAX_CONDITION = 1e4  # of a color matrix; above, its inverse is meaningless. Set by hand
+
+
+def read(path: str | Path, digest: str | None = None) -> SensorImage:
+    """Decode one RAW file, nothing subtracted, without the masked border.
+
+    A Bayer file gives its mosaic (H, W) with `black` (2, 2) and `cfa` in the phase of its
+    first visible pixel; an X-Trans file from its first whole 3×3 block on, (6, 6) both. A file of
+    linear channels, or of a monochrome sensor, gives (H, W, 3) and no `cfa`.
+    `camera_matrix` includes the white balance: it takes the camera's response to a grey in the light of
+    the shot, 1/`white_balance`, to (1, 1, 1).
+    With the `digest` of `probe.read`, the file must still hold the bytes that were probed.
+
+    Raises
+    ------
+    DecodeError
+        Not a RAW, damaged, changed since, of another mosaic or Foveon; or the decoder crashed, hung or ran out
+        of memory.
+    """
+    return _image(*worker.call(decode, path, digest=digest))
+
+
+def within(
+    path: str | Path, digest: str | None, function: Callable[..., worker.Answer], **options: Any
+) -> worker.Answer:
+    """Decode in the child process and apply `function(image, **options)` there: only its answer comes back.
+
+    The function is a module's, the options plain JSON values.
+
+    Raises
+    ------
+    DecodeError
+        As `read`.
+    """
+    return worker.call(apply, path, digest=digest, module=function.__module__, name=function.__name__, options=options)
+
+
+def apply(path: str, digest: str | None, module: str, name: str, options: dict[str, Any]) -> worker.Answer:
+    """`within`, in the child process; the function is `name` in `module`."""
+    function = getattr(importlib.import_module(module), name)
+    answer: worker.Answer = function(_image(*decode(path, digest)), **options)
+    return answer
+
+
+def _image(meta: dict[str, Any], arrays: worker.Arrays) -> SensorImage:
+    balance = None if meta["balance"] is None else np.array(meta["balance"])
+    xyz_to_camera = meta["xyz_to_camera"]
+    return SensorImage(
+        value=arrays["value"],
+        black=np.array(meta["black"]),
+        white=meta["white"],
+        cfa=arrays.get("cfa"),
+        camera_matrix=None if xyz_to_camera is None else camera_matrix(np.reshape(xyz_to_camera, (3, 3)), balance),
+        white_balance=balance,
+        lossy=meta["lossy"],
+    )
+
+
+def camera_matrix(xyz_to_camera: Floats, balance: Floats | None) -> Floats | None:
+    """Camera RGB → linear Rec.709 (3, 3), with the white balance (3,) in it; daylight's where None.
+
+    None where the matrix cannot be inverted.
+
+    References
+    ----------
+    Adobe, Digital Negative Specification 1.4, ch. 6; dcraw's normalisation to the white of D65.
+    """
+    camera = xyz_to_camera @ REC709_TO_XYZ
+    daylight = camera.sum(axis=1)  # the camera's response to D65
+    if not np.isfinite(camera).all() or (daylight <= 0).any():
+        return None
+    normalized = camera / daylight[:, None]  # white gives 1 in every channel, in any unit of the file
+    if np.linalg.cond(normalized) > _MAX_CONDITION:
+        return None
+    to_rec709 = np.linalg.inv(normalized)
+    gain = daylight[1] / daylight if balance is None else balance
+    return np.asarray(to_rec709 * gain)
+
+
+def size(path: str, data: bytes, unpack: bool) -> dict[str, Any]:
+    """Size in visible pixels, and with `unpack` LibRaw's own reading of the metadata. In the child process."""
+    import rawpy
+
+    try:
+        with rawpy.RawPy() as raw:
+            raw.open_buffer(io.BytesIO(data))
+            sizes = raw.sizes  # unpacks nothing, unlike every other property
+            file_checks.check_size(path, sizes.width, sizes.height)
+            file_checks.check_bytes(path, sizes.width, sizes.height, len(data))
+            meta: dict[str, Any] = {"width": sizes.width, "height": sizes.height}
+            if unpack:
+                meta["exif"] = _settings(raw.other, raw.lens)
+    except (rawpy.LibRawError, NotImplementedError) as error:
+        raise _refusal(path, error) from None
+    return meta
+
+
+def _settings(other: Any, lens: Any) -> dict[str, Any]:
+    """LibRaw's own reading of the metadata: the fields of an `Exif` that it knows."""
+    stamp = other.timestamp
+    known = Exif(
+        lens=(lens.model or "").strip(),
+        exposure_time=other.shutter_speed or None,
+        f_number=other.aperture or None,
+        iso=other.iso_speed or None,
+        focal_length_mm=other.focal_length or None,
+        taken=stamp.isoformat() if stamp and stamp.year > 1970 else "",
+    )
+    return {name: value for name, value in asdict(known).items() if value}
+
+
+def version() -> str:
+    """LibRaw's version, asked in the child process; raises DecodeError where that does not run."""
+    return str(worker.call(about, "LibRaw")[0]["version"])
+
+
+def about(path: str) -> worker.Answer:
+    """`version`, in the child process."""
+    import rawpy
+
+    return {"version": ".".join(map(str, rawpy.libraw_version))}, {}
+
+
+def decode(path: str, digest: str | None = None) -> worker.Answer:
+    """`read`, in the child process: the counts (H, W) or (H, W, 3), their levels and colors; DecodeError."""
+    import rawpy
+
+    data = file_bytes.load(path, digest)
+    if file_kind.is_foveon(data):
+        raise DecodeError(f"{path}: {unsupported(None)}")
+    structure = file_kind.structure(io.BytesIO(data))
+    file_checks.check_structure(path, structure, data)
+    if structure.dng and structure.truncated:  # LibRaw would return whatever was in memory
+        raise DecodeError(f"{path}: its image data run past the end of the file; {file_checks.COPY_AGAIN}")
+    try:
+        raw = rawpy.RawPy()  # never closed: the counts are a view into it, which keeps it alive
+        raw.open_buffer(io.BytesIO(data))
+        file_checks.check_size(path, raw.sizes.raw_width, raw.sizes.raw_height)
+        file_checks.check_bytes(path, raw.sizes.width, raw.sizes.height, len(data))
+        meta, arrays = _counts(path, raw)
+    except (rawpy.LibRawError, NotImplementedError) as error:
+        raise _refusal(path, error) from None
+    lossy = file_checks.is_lossy(structure)
+    file_checks.check_levels(path, arrays["value"], float(np.max(meta["black"])), meta["white"], lossy)
+    stated = exif.tags(data).color_matrix
+    meta["lossy"] = lossy or meta["white"] - float(np.min(meta["black"])) <= _EIGHT_BITS
+    return meta | ({} if stated is None else {"xyz_to_camera": stated}), arrays
+
+
+def _counts(path: str, raw: Any) -> tuple[dict[str, Any], worker.Arrays]:
+    """The visible counts as stored in the file, their levels and colors."""
+    value: NDArray[Any] = raw.raw_image_visible
+    meta: dict[str, Any] = {"balance": _balance(raw), "xyz_to_camera": _xyz_to_camera(raw)}
+    if value.ndim == 3 and value.shape[2] >= 3:
+        if raw.num_colors != 3:
+            raise DecodeError(f"{path}: has {raw.num_colors} color channels where 3 are supported")
+        arrays = {"value": value[..., :3]}
+        black = [[float(np.mean(raw.black_level_per_channel[:3]))]]
+    elif value.ndim == 2 and raw.num_colors == 1:
+        arrays = {"value": np.repeat(value[..., None], 3, axis=2)}
+        black = [[float(raw.black_level_per_channel[0])]]
+    else:
+        cfa, black = _mosaic(raw, path)
+        if cfa.shape == (6, 6):
+            value, cfa, black = _from_whole_block(path, value, cfa, black)
+        arrays = {"value": value, "cfa": cfa}
+    return meta | {"black": black, "white": _white(raw, float(np.max(black)))}, arrays
+
+
+def unsupported(shape: tuple[int, ...] | None, rotated: bool = False) -> str:
+    """Why a color filter of this period (rows, columns), or None of a Foveon, cannot be used, and the remedy.
+
+    rotated : its rows and columns run at 45° to the picture's.
+    """
+    if shape is None:
+        reason = "not in front of each pixel: it is a Foveon's layers, or sub-sampled color"
+    elif rotated:
+        reason = "Fujifilm's SuperCCD, turned by 45°"
+    else:
+        reason = f"a mosaic of {'×'.join(map(str, shape))}"
+    return f"its color filter is {reason}, {file_checks.DEVELOP}"
+
+
+def _mosaic(raw: Any, path: str) -> tuple[Bits, list[list[float]]]:
+    """The colors and black levels of one period, (2, 2) or (6, 6), from the first visible pixel on."""
+    pattern = raw.raw_pattern
+    if pattern is None or pattern.shape not in ((2, 2), (6, 6)):
+        rotated = raw.sizes.width * raw.sizes.height > raw.sizes.raw_width * raw.sizes.raw_height
+        raise DecodeError(f"{path}: {unsupported(None if pattern is None else pattern.shape, rotated)}")
+    top, left = raw.sizes.top_margin, raw.sizes.left_margin
+    period = range(len(pattern))
+    index = [[raw.raw_color(top + y, left + x) for x in period] for y in period]
+    names = raw.color_desc.decode()
+    letters = [[names[i] for i in row] for row in index]
+    usual = {2: {"R": 1, "G": 2, "B": 1}, 6: {"R": 8, "G": 20, "B": 8}}[len(pattern)]
+    if Counter(letter for row in letters for letter in row) != usual:
+        raise DecodeError(f"{path}: its mosaic is {letters}, not of red, green and blue; polcap does not support it")
+    cfa = np.array([["RGB".index(letter) for letter in row] for row in letters], np.uint8)
+    levels = raw.black_level_per_channel  # in the order of the color index
+    return cfa, [[float(levels[i]) for i in row] for row in index]
+
+
+def _from_whole_block(
+    path: str, value: NDArray[Any], cfa: Bits, black: list[list[float]]
+) -> tuple[NDArray[Any], Bits, list[list[float]]]:
+    """An X-Trans mosaic from its first whole 3×3 block on: up to two rows and columns are dropped."""
+    corner = demosaic.x_trans_corner(cfa)
+    if corner is None:
+        raise DecodeError(f"{path}: {unsupported((6, 6))}")
+    down, right = corner
+    cfa, levels = (np.roll(part, (-down, -right), (0, 1)) for part in (cfa, np.array(black)))
+    return np.ascontiguousarray(value[down:, right:]), cfa, levels.tolist()
+
+
+def _white(raw: Any, black: float) -> float:
+    """Saturation: LibRaw's maximum, or the lower level that the camera states."""
+    stated = [level for level in raw.camera_white_level_per_channel or () if level > black]
+    lowest = min([raw.white_level, *stated])
+    return float(lowest if lowest > raw.white_level / 2 else raw.white_level)
+
+
+def _balance(raw: Any) -> list[float] | None:
+    balance = raw.camera_whitebalance[:3]
+    return [value / balance[1] for value in balance] if min(balance) > 0 else None
+
+
+def _xyz_to_camera(raw: Any) -> list[list[float]] | None:
+    matrix: NDArray[Any] = raw.rgb_xyz_matrix[:3]
+    return matrix.tolist() if matrix.any() else None
+
+
+def _refusal(path: str, error: Exception) -> DecodeError:
+    import rawpy
+
+    reason = error.args[0] if error.args else type(error).__name__
+    reason = reason.decode(errors="replace") if isinstance(reason, bytes) else str(reason)
+    if isinstance(error, rawpy.LibRawFileUnsupportedError):
+        return DecodeError(f"{path}: not a RAW format that LibRaw knows ({reason}); is the file complete?")
+    if isinstance(error, NotImplementedError):
+        return DecodeError(f"{path}: a RAW layout that is not supported ({reason}); convert it to DNG")
+    return DecodeError(f"{path}: truncated or damaged ({reason}); {file_checks.COPY_AGAIN}")

@@ -1,0 +1,200 @@
+"""Decodes a finished picture (TIFF, PNG, EXR, JPEG) to linear values, by OpenImageIO in the child process.
+
+16-bit and floating-point files are taken as linear, 8-bit files as sRGB-encoded, unless the
+caller states the encoding. RAW files go to `libraw`: OpenImageIO opens a DNG as its thumbnail.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.errors import DecodeError
+from polcap.formats.maps import exr
+from polcap.formats.raw import file_bytes, file_checks, file_kind, libraw, worker
+from polcap.images import Floats, SensorImage
+from polcap.optics import color
+
+Encoding = Literal["linear", "srgb"]
+SENSOR_DEG: tuple[tuple[float, tuple[int, int]], ...] = (  # row, column of each angle in the sensor's 2×2 cell
+    (0.0, (1, 1)),
+    (45.0, (0, 1)),
+    (90.0, (0, 0)),
+    (135.0, (1, 0)),
+)
+_MOST_CHANNELS = 64  # of a layered EXR
+_COLOR_LEVELS = 0.05  # averages of neighbouring 2×2 cells differ less than this on a monochrome sensor
+
+
+def read(
+    path: str | Path,
+    encoding: Encoding | None = None,
+    white: float | None = None,
+    black: float = 0.0,
+    digest: str | None = None,
+) -> SensorImage:
+    """A picture as (H, W, 3), grey repeated in all three channels.
+
+    Linear integers stay counts; floating point has white 1. An sRGB-encoded picture becomes linear 0…1 and
+    `lossy`, as every 8-bit one is. By default `encoding` is sRGB for 8 bits, else linear; `white` the greatest value
+    of the type. With the `digest` of `probe.read`, the file must still hold the bytes that were probed.
+
+    Raises
+    ------
+    DecodeError
+        Not a picture, damaged, or changed since it was probed.
+    """
+    pixels = _pixels(path, digest)
+    lossy = pixels.dtype == np.uint8
+    full = float(np.iinfo(pixels.dtype).max) if np.issubdtype(pixels.dtype, np.integer) else 1.0
+    encoding = encoding_of(8 * pixels.itemsize, encoding)
+    if pixels.shape[2] == 1:
+        pixels = np.repeat(pixels, 3, axis=2)
+    if encoding == "srgb":
+        return SensorImage(_decoded(pixels, full), np.zeros((1, 1)), 1.0, None, lossy=True)
+    return SensorImage(_counts(pixels), np.full((1, 1), black), white or full, None, lossy=lossy)
+
+
+def read_mosaic(
+    path: str | Path,
+    angle_deg: float,
+    white: float | None = None,
+    black: float = 0.0,
+    digest: str | None = None,
+    kind: file_kind.Kind = "photo",
+) -> SensorImage:
+    """One angle (0, 45, 90 or 135°) of a polarization sensor's raw frame, (H/2, W/2, 3), linear.
+
+    The frame's 2×2 cell is 90 45 / 135 0 degrees. `white` and `black` are counts; by default those that the file
+    states, or the greatest of the type and 0. `kind` tells whether `path` is a RAW or a picture; `digest` as in `read`.
+
+    Raises
+    ------
+    DecodeError
+        The frame is in color, or cannot be read.
+    """
+    y, x = dict(SENSOR_DEG)[angle_deg]
+    if kind == "photo":
+        pixels = _pixels(path, digest)
+        if pixels.shape[2] != 1:
+            raise DecodeError(
+                f"{path}: has {pixels.shape[2]} channels, but the frame of a polarization sensor has one; "
+                "save the camera's raw frame, or give one picture per angle"
+            )
+        mosaic, lossy, level = pixels[..., 0], pixels.dtype == np.uint8, black
+        full = float(np.iinfo(pixels.dtype).max) if np.issubdtype(pixels.dtype, np.integer) else 1.0
+    else:
+        sensor = libraw.read(path, digest)
+        mosaic = sensor.value if sensor.value.ndim == 2 else sensor.value[..., 0]
+        lossy, full = False, sensor.white
+        level = black or float(np.broadcast_to(sensor.black, (2, 2))[y, x])
+    _check_monochrome(path, mosaic)
+    height, width = mosaic.shape
+    plane = mosaic[y : height // 2 * 2 : 2, x : width // 2 * 2 : 2]
+    value = np.repeat(_counts(plane)[..., None], 3, axis=2)
+    return SensorImage(value, np.full((1, 1), level), white or full, None, lossy=lossy)
+
+
+def place_px(angle_deg: float) -> tuple[float, float]:
+    """x, y of the first pixel of an angle in the 2×2 cell, in pixels of `read_mosaic`'s picture: 0 or ½."""
+    y, x = dict(SENSOR_DEG)[angle_deg]
+    return x / 2, y / 2
+
+
+def encoding_of(bits: int, stated: Encoding | None) -> Encoding:
+    """The encoding that `read` assumes for a picture of so many bits per channel."""
+    return stated or ("srgb" if bits == 8 else "linear")
+
+
+def _decoded(pixels: NDArray[Any], full: float) -> Floats:
+    if pixels.dtype.kind == "f":
+        return np.asarray(color.decode_srgb(pixels), np.float32)
+    table = color.decode_srgb(np.arange(full + 1) / full).astype(np.float32)
+    return np.asarray(table[pixels])  # a table is twenty times faster than the formula per pixel
+
+
+def size(path: str, data: bytes) -> dict[str, int]:
+    """Size, channels and bits of a picture, without its pixels. In the child process."""
+    with _opened(path, data) as file:
+        spec = file.spec()
+        count, bits = len(_channels(path, spec)), 8 * spec.format.size()
+    return {"width": spec.width, "height": spec.height, "channels": count, "bits": bits}
+
+
+def decode(path: str, digest: str | None = None) -> worker.Answer:
+    """The stored values (H, W, 1 or 3) in their stored type; DecodeError. In the child process."""
+    import OpenImageIO as oiio
+
+    with _opened(path, file_bytes.load(path, digest)) as file:
+        spec = file.spec()
+        channels = _channels(path, spec)
+        kind = "float" if spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE) else str(spec.format)
+        pixels = file.read_image(0, 0, 0, spec.nchannels, kind)
+        reason = exr.reason(file)
+    if pixels is None:
+        raise DecodeError(f"{path}: truncated or damaged ({reason}); copy it from the card again")
+    pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)[..., channels]
+    if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
+        bad = int((~np.isfinite(pixels)).sum())
+        raise DecodeError(f"{path}: {bad} values are not finite numbers; write the file without NaN and infinity")
+    return {}, {"pixels": pixels}
+
+
+def _pixels(path: str | Path, digest: str | None) -> NDArray[Any]:
+    _, arrays = worker.call(decode, path, digest=digest)
+    return arrays["pixels"]
+
+
+@contextmanager
+def _opened(path: str, data: bytes) -> Iterator[Any]:
+    """The bytes as an open file of OpenImageIO, which reads by name only."""
+    import OpenImageIO as oiio
+
+    if data[:3] == b"\xff\xd8\xff":
+        file_checks.check_jpeg(path, data)
+    file_checks.check_png(path, data)
+    options = oiio.ImageSpec()
+    options["oiio:UnassociatedAlpha"] = 1  # else a PNG's colors are multiplied by its alpha
+    with file_bytes.named(data) as name:
+        file = oiio.ImageInput.open(name, options)
+        if file is None:
+            reason = exr.reason(oiio).replace(name, Path(path).name)
+            raise DecodeError(f"{path}: not a readable picture ({reason}); is the file complete?")
+        try:
+            spec = file.spec()
+            file_checks.check_size(path, spec.width, spec.height)
+            if spec.nchannels > _MOST_CHANNELS or spec.depth > 1:
+                raise DecodeError(f"{path}: has {spec.nchannels} channels; polcap reads flat R, G, B")
+            yield file
+        finally:
+            file.close()
+
+
+def _channels(path: str, spec: Any) -> list[int]:
+    """Indices of the channels R, G and B, or of the grey one."""
+    names = [name.rpartition(".")[2].upper() for name in spec.channelnames]
+    if sum(name in ("R", "G", "B") for name in names) == 3:
+        return [names.index(name) for name in "RGB"]
+    grey = [i for i, name in enumerate(names) if i != spec.alpha_channel]
+    if len(grey) == 1:
+        return grey
+    raise DecodeError(f"{path}: has the channels {', '.join(spec.channelnames)}; polcap reads R, G, B or one grey")
+
+
+def _counts(pixels: NDArray[Any]) -> Any:
+    return pixels if pixels.dtype == np.uint16 else pixels.astype(np.float32)
+
+
+def _check_monochrome(path: str | Path, mosaic: NDArray[Any]) -> None:
+    """Refuse a color polarization sensor, where neighbouring 2×2 cells have different filters."""
+    height, width = (size // 4 * 4 for size in mosaic.shape)
+    cells = mosaic[:height, :width].reshape(height // 4, 2, 2, width // 4, 2, 2)
+    levels = cells.mean(axis=(0, 2, 3, 5), dtype=np.float64)  # (2, 2)
+    if levels.max() > (1 + _COLOR_LEVELS) * levels.min():
+        raise DecodeError(
+            f"{path}: neighbouring 2×2 cells differ by {levels.max() / levels.min() - 1:.0%}, as on a color "
+            "polarization sensor, which is not supported; give one demosaiced picture per angle"
+        )

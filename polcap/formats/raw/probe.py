@@ -1,0 +1,102 @@
+"""Kind, digest, EXIF and size of a photograph, without decoding its pixels.
+
+One call into the child process and one reading of the file: metadata and digest are of the same bytes.
+"""
+
+import io
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import msgspec
+
+from polcap.errors import DecodeError
+from polcap.formats.raw import exif, file_bytes, file_checks, file_kind, libraw, photo, worker
+from polcap.images import Exif
+
+_LIMIT_S, _LIMIT_GIB = 30.0, 2.0  # a sound file takes milliseconds and three times its size
+
+
+@dataclass(frozen=True)
+class Probe:
+    """The facts of one file."""
+
+    kind: file_kind.Kind
+    digest: str = ""  # of the bytes of a photograph
+    exif: Exif = Exif()  # noqa: RUF009 — frozen
+    channels: int = 0  # of a finished picture: 1 grey, 3 in color
+    bits: int = 0  # of a finished picture, per channel
+    lossy: bool = False  # a RAW of 8 bits under a tone curve
+
+
+def read(path: str | Path) -> Probe:
+    """Kind, digest and metadata of a file, with its size in visible RAW pixels.
+
+    A file of unknown content that LibRaw can open is a RAW too.
+
+    Raises
+    ------
+    DecodeError
+        The file cannot be read, no decoder recognises it, it is cut short or of a form that polcap refuses.
+    """
+    answer, _ = worker.call(examine, path, limit_s=_LIMIT_S, limit_gib=_LIMIT_GIB)
+    found = msgspec.convert(answer["probe"], Probe)
+    if answer["doubtful"]:  # some cameras store odd offsets for previews: only decoding shows whether it is cut
+        libraw.read(path) if found.kind == "raw" else photo.read(path)
+    return found
+
+
+def kind(path: str | Path) -> file_kind.Kind:
+    """The kind only, by the first bytes. Raises DecodeError where the file cannot be read."""
+    answer, _ = worker.call(examine_kind, path, limit_s=_LIMIT_S, limit_gib=_LIMIT_GIB)
+    found: file_kind.Kind = answer["kind"]
+    return found
+
+
+def examine_kind(path: str) -> worker.Answer:
+    """`kind`, in the child process."""
+    with file_bytes.opened(path) as file:
+        return {"kind": file_kind.kind(file, Path(path).suffix)}, {}
+
+
+def examine(path: str) -> worker.Answer:
+    """`read`, in the child process, and whether only decoding can show that the file is whole. DecodeError."""
+    with file_bytes.opened(path) as file:
+        found = file_kind.kind(file, Path(path).suffix)
+        if found == "other":
+            return _answer(Probe(found))
+        file.seek(0)
+        data = file.read()
+    if not data:
+        raise DecodeError(f"{path}: is empty; copy it from the card again, or remove it")
+    if found == "photo":
+        return _photo(path, data)
+    try:
+        return _raw(path, data)
+    except DecodeError:
+        if found == "raw":
+            raise
+        return _answer(Probe("unknown"))
+
+
+def _photo(path: str, data: bytes) -> worker.Answer:
+    size = photo.size(path, data)
+    stated = exif.sized(exif.tags(data), size["width"], size["height"])
+    found = Probe("photo", file_bytes.digest(data), stated, size["channels"], size["bits"])
+    return _answer(found, file_kind.structure(io.BytesIO(data)).truncated)
+
+
+def _raw(path: str, data: bytes) -> worker.Answer:
+    structure = file_kind.structure(io.BytesIO(data))
+    file_checks.check_structure(path, structure, data)
+    known = exif.tags(data)
+    no_settings = known.exposure_time is None and not known.make  # CRW: LibRaw knows them, but has to unpack
+    no_iso = known.iso is None and not structure.dng  # old bodies state it in their maker's tags only
+    size = libraw.size(path, data, unpack=no_settings or no_iso)
+    decoded = {k: value for k, value in size.get("exif", {}).items() if no_settings or not getattr(known, k)}
+    stated = replace(exif.sized(known, size["width"], size["height"]), **decoded)
+    lossy = file_checks.is_lossy(structure)
+    return _answer(Probe("raw", file_bytes.digest(data), stated, lossy=lossy), structure.truncated or lossy)
+
+
+def _answer(found: Probe, doubtful: bool = False) -> worker.Answer:
+    return {"probe": asdict(found), "doubtful": doubtful}, {}

@@ -1,0 +1,77 @@
+"""Reads meshes and texture sets of other people, for synthetic scenes and training."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.errors import DecodeError
+from polcap.images import Floats
+from polcap.optics import color
+
+
+def read_mesh(path: Path) -> tuple[Floats, NDArray[np.int64]]:
+    """Vertices (V, 3), in the file's own unit and axes, and faces (F, 3).
+
+    An .npz holds `vq` uint16 (V, 3), position = vq/65535·vscale + vmin, and `faces`. Of a scene of
+    several meshes all are read, each in its place.
+
+    Raises
+    ------
+    DecodeError
+        The file is missing, of an unknown format, damaged, or holds no triangle.
+    """
+    try:
+        vertices, faces = _compact(path) if path.suffix == ".npz" else _any(path)
+    except OSError as error:
+        raise DecodeError(f"cannot read {path}: {error.strerror or error}; check the path") from error
+    except Exception as error:  # each of trimesh's readers raises errors of its own
+        raise DecodeError(f"{path} cannot be read as a mesh ({error}); give a PLY, OBJ, STL or GLB") from error
+    if not len(faces) or faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all():
+        raise DecodeError(f"{path} holds {len(faces)} usable triangles; give a mesh with faces")
+    return vertices, faces
+
+
+def _compact(path: Path) -> tuple[Floats, NDArray[np.int64]]:
+    with np.load(path) as data:
+        return data["vq"].astype(np.float64) / 65535 * data["vscale"] + data["vmin"], data["faces"].astype(np.int64)
+
+
+def _any(path: Path) -> tuple[Floats, NDArray[np.int64]]:
+    import trimesh
+
+    found = trimesh.load(path, force="mesh", process=False)
+    return np.asarray(found.vertices, dtype=np.float64), np.asarray(found.faces, dtype=np.int64)
+
+
+def read_textures(folder: Path, side: int = 256) -> Floats:
+    """Linear albedo, roughness and the relief's slopes along columns and rows, (6, side, side).
+
+    albedo.jpg (sRGB) and roughness.jpg must be there; normal.jpg (tangent space, green down as in DirectX) or
+    height.jpg may be.
+
+    Raises
+    ------
+    DecodeError
+        A picture is missing or cannot be read.
+    """
+    albedo = _picture(folder / "albedo.jpg", side)[..., ::-1]
+    linear = color.decode_srgb(albedo)
+    rough = _picture(folder / "roughness.jpg", side).mean(axis=-1)
+    slope: Floats = np.zeros((side, side, 2), dtype=np.float32)
+    if (folder / "normal.jpg").exists():
+        n = _picture(folder / "normal.jpg", side)[..., ::-1] * 2 - 1
+        slope = -n[..., :2] / np.maximum(n[..., 2:], 0.3)
+    elif (folder / "height.jpg").exists():
+        height = _picture(folder / "height.jpg", side).mean(axis=-1)
+        slope = np.stack([np.roll(height, -1, a) - np.roll(height, 1, a) for a in (1, 0)], axis=-1) * side / 64
+    maps = np.concatenate([linear, rough[..., None], np.clip(slope, -2, 2)], axis=-1)
+    return np.ascontiguousarray(maps.transpose(2, 0, 1), dtype=np.float32)
+
+
+def _picture(path: Path, side: int) -> Floats:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise DecodeError(f"{path} is missing or not a picture; a texture set has an albedo.jpg and a roughness.jpg")
+    return np.asarray(cv2.resize(image, (side, side), interpolation=cv2.INTER_AREA), dtype=np.float32) / 255

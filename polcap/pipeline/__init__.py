@@ -1,0 +1,1 @@
+"""One run: the path, its cache, the result folder around it."""

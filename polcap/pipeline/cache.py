@@ -1,0 +1,304 @@
+"""The stage cache: the result of each stage in a folder of its own, `work/NN-name/`, found again by its key.
+
+A key is a digest of the stage's name and version, its settings and the keys of its inputs, back to the bytes of the
+RAW files and of the model file. Where files lie is not part of it: a capture may be moved. A folder holds an `.npy`
+per array and `manifest.json`. It is written under a temporary name and renamed, so a killed run leaves a whole result
+or none. Sizes and SHA-256 digests are compared when a result is read, at about 1.6 GB/s; a damaged result is computed
+again. Arrays come back as read-only memory maps, when they are computed as when they are read.
+"""
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields, is_dataclass
+from hashlib import blake2b, sha256
+from pathlib import Path
+from typing import Any, Generic, TypeVar, get_type_hints
+
+import msgspec
+import numpy as np
+
+from polcap.errors import StorageError
+from polcap.formats import atomic, npy_folder
+from polcap.stages import Stage
+
+T = TypeVar("T")
+FORMAT = 3  # of work/; raised when older folders can no longer be read
+_READERS = 2  # threads that compute digests: more do not read faster
+_NOT_SEALED = ("seconds", "digest")  # fields of a manifest that its digest leaves out: no two runs take the same time
+Progress = Callable[[str, float | None, bool], None]  # stage, seconds (None: it begins), found in the cache
+
+
+def silent(stage: str, seconds: float | None, cached: bool) -> None:
+    """A progress that shows nothing."""
+
+
+class StageReached(Exception):
+    """The path has come to the stage at which it was to stop."""
+
+
+@dataclass(frozen=True)
+class StageResult(Generic[T]):
+    """A value of the path and its key."""
+
+    key: str
+    value: T
+
+
+class MemoryCache:
+    """Computes the stages of one path, in order, and holds their results in memory; nothing is written.
+
+    `force` names a stage that is computed in any case, with all after it; `until` the stage after which
+    StageReached ends the path.
+    """
+
+    def __init__(self, progress: Progress = silent, force: str | None = None, until: str | None = None) -> None:
+        self.progress, self.until = progress, until
+        self.results: dict[str, StageResult[Any]] = {}  # of the path so far, by stage
+        self.stage, self._began = "start", 0.0  # the stage begun last, and when
+        self._force, self._forced = force, False
+        self._held: dict[str, Any] = {}  # by key
+
+    def run(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
+        """The result of a stage: found, else computed. Inputs are results of other stages or plain values.
+
+        Raises
+        ------
+        StageReached
+            This was the stage at which the path was to stop.
+        """
+        about = _about(stage, inputs, config)
+        self._forced = self._forced or stage.name == self._force
+        value: T | None = None if self._forced else self._find(stage, about["key"])
+        if value is None:
+            value = self._compute(stage, inputs, config, about)
+        elif stage.keep:
+            self.progress(stage.name, 0.0, True)
+        return self._pass(stage, StageResult(about["key"], value))
+
+    def derive(self, function: Callable[..., T], *inputs: Any, version: int = 1) -> StageResult[T]:
+        """A value that is cheap to compute from results; never stored.
+
+        `version` is raised whenever the same inputs give another value.
+        """
+        key = digest(["derived", function.__name__, version, list(map(key_of, inputs))])
+        return StageResult(key, function(*map(value_of, inputs)))
+
+    def _compute(
+        self, stage: Stage[..., T], inputs: tuple[Any, ...], config: msgspec.Struct | None, about: dict[str, Any]
+    ) -> T:
+        self.begin(stage.name)
+        value = stage(*map(value_of, inputs), *(() if config is None else (config,)))
+        value = self._store(stage, value, about, time.perf_counter() - self._began)
+        self.end()
+        return value
+
+    def begin(self, stage: str) -> None:
+        """Work on a stage begins."""
+        self.stage, self._began = stage, time.perf_counter()
+        self.progress(stage, None, False)
+
+    def end(self) -> None:
+        """Work on the stage begun last has ended."""
+        self.progress(self.stage, time.perf_counter() - self._began, False)
+
+    def _pass(self, stage: Stage[..., T], result: StageResult[T]) -> StageResult[T]:
+        self.results[stage.name] = result
+        if stage.name == self.until:
+            raise StageReached(stage.name)
+        return result
+
+    def _find(self, stage: Stage[..., T], key: str) -> T | None:
+        return self._held.get(key)
+
+    def _store(self, stage: Stage[..., T], value: T, about: dict[str, Any], seconds: float) -> T:
+        npy_folder.freeze(value)
+        self._held[about["key"]] = value
+        return value
+
+
+class StageCache(MemoryCache):
+    """The stage cache of one result folder: results in `folder/work`."""
+
+    def __init__(
+        self, folder: Path, progress: Progress = silent, force: str | None = None, until: str | None = None
+    ) -> None:
+        super().__init__(progress, force, until)
+        self.work = folder / "work"
+
+    def place(self, stage: Stage[..., Any]) -> Path:
+        """Folder of the next stage of the path."""
+        return self.work / f"{len(self.results) + 1:02d}-{stage.name}"
+
+    def _find(self, stage: Stage[..., T], key: str) -> T | None:
+        place = self.place(stage)
+        if not stage.keep or manifest(place).get("key") != key:
+            return None
+        try:
+            found: T = read(place, returns(stage))
+        except StorageError:  # damaged: computed again
+            return None
+        return found
+
+    def _store(self, stage: Stage[..., T], value: T, about: dict[str, Any], seconds: float) -> T:
+        """Write a result into its folder, whole or not at all; returns it as memory maps."""
+        if not stage.keep:
+            npy_folder.freeze(value)
+            return value
+        place = self.place(stage)
+        with atomic.folder(place, synced=False) as temporary:
+            arrays: npy_folder.Arrays = {}
+            tree = npy_folder.encode(value, "value", arrays)
+            files = {f"{name}.npy": npy_folder.save(temporary / f"{name}.npy", a) for name, a in arrays.items()}
+            about = {**about, "seconds": round(seconds, 3), "files": files, "value": tree}
+            text = json.dumps({**about, "digest": seal(about)}, indent=1, allow_nan=False)
+            (temporary / "manifest.json").write_text(text, encoding="utf-8")
+        written: T = read(place, returns(stage), check=False)
+        return written
+
+
+class DryRunCache(StageCache):
+    """Which stages of a path are in the cache, by their keys alone: nothing is read or computed."""
+
+    def __init__(self, folder: Path, force: str | None = None) -> None:
+        super().__init__(folder, force=force)
+        self.states: dict[str, str] = {}  # of every stage: cached, compute, or on demand where it is never stored
+
+    def run(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
+        """The key of a stage's result, without a value."""
+        key = _about(stage, inputs, config)["key"]
+        self._forced = self._forced or stage.name == self._force
+        cached = not self._forced and manifest(self.place(stage)).get("key") == key
+        self.states[stage.name] = "on demand" if not stage.keep else "cached" if cached else "compute"
+        return self._pass(stage, StageResult[Any](key, None))
+
+    def derive(self, function: Callable[..., T], *inputs: Any, version: int = 1) -> StageResult[T]:
+        """The key of a derived value, without the value."""
+        return StageResult[Any](digest(["derived", function.__name__, version, list(map(key_of, inputs))]), None)
+
+
+class ArchiveCache(StageCache):
+    """The cache of an earlier run, without its photographs: stored results are taken whatever their keys."""
+
+    def run(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
+        """The stored result; one that is never stored is computed.
+
+        Raises
+        ------
+        StorageError
+            It is not there, or damaged.
+        """
+        if not stage.keep:
+            return super().run(stage, *inputs, config=config)
+        place = self.place(stage)
+        value: T = read(place, returns(stage))
+        return self._pass(stage, StageResult(manifest(place)["key"], value))
+
+
+def _about(stage: Stage[..., Any], inputs: tuple[Any, ...], config: msgspec.Struct | None) -> dict[str, Any]:
+    """What decides a stage's result, and the key made of it."""
+    about = {
+        "format": FORMAT,
+        "stage": stage.name,
+        "version": stage.version,
+        "settings": msgspec.to_builtins(config),
+        "inputs": list(map(key_of, inputs)),
+    }
+    return {**about, "key": digest(list(about.values()))}
+
+
+def manifest(place: Path) -> dict[str, Any]:
+    """The manifest of a stored result; empty where there is none, or it is damaged."""
+    try:
+        about = json.loads((place / "manifest.json").read_text(encoding="utf-8"))
+        whole = isinstance(about, dict) and about.get("format") == FORMAT and about.get("digest") == seal(about)
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return about if whole else {}
+
+
+def seal(about: Mapping[str, Any]) -> str:
+    """Digest of a manifest's own content, by which a later edit shows."""
+    return digest({name: value for name, value in about.items() if name not in _NOT_SEALED})
+
+
+def read(place: Path, hint: Any, check: bool = True) -> Any:
+    """The value of type `hint` in a result folder, its arrays as read-only memory maps; `check` compares digests.
+
+    Raises
+    ------
+    StorageError
+        There is no result of this cache format, a file is missing, or a file was changed.
+    """
+    about = manifest(place)
+    if not about:
+        raise StorageError(f"{place}: no whole result of this polcap's cache format {FORMAT}; run `polcap process`")
+    if check:
+        files = [place / name for name in about["files"]]
+        with ThreadPoolExecutor(_READERS) as pool:
+            for file, expected, found in zip(files, about["files"].values(), pool.map(_checksum, files)):
+                if found != expected:
+                    raise StorageError(f"{file} is damaged; delete {place} and run again")
+    return npy_folder.decode(about["value"], hint, place)
+
+
+def _checksum(file: Path) -> list[Any] | None:
+    """As `npy_folder.checksum`; None where the file cannot be read."""
+    try:
+        return npy_folder.checksum(file)
+    except OSError:
+        return None
+
+
+def returns(stage: Stage[..., Any]) -> Any:
+    """The type of a stage's result."""
+    return get_type_hints(stage.function)["return"]
+
+
+def digest(value: Any) -> str:
+    """Key of plain, nested data."""
+    return blake2b(json.dumps(value, sort_keys=True).encode(), digest_size=16).hexdigest()
+
+
+def value_of(value: Any) -> Any:
+    """The value of an input, which may be a result."""
+    return value.value if isinstance(value, StageResult) else value
+
+
+def key_of(value: Any) -> str:
+    """The key of an input, which may be a result."""
+    return value.key if isinstance(value, StageResult) else digest(fingerprint(value))
+
+
+def fingerprint(value: Any) -> Any:
+    """Plain data that is equal for two inputs exactly when no stage could distinguish them."""
+    if isinstance(value, np.ndarray):
+        solid = np.ascontiguousarray(value)
+        summed = sha256(solid.data.cast("B") if solid.size else b"")
+        return [str(solid.dtype), list(solid.shape), summed.hexdigest()]
+    if is_dataclass(value) and not isinstance(value, type):
+        facts = [one.name for one in fields(value) if one.metadata.get("in_key", True)]
+        return [type(value).__name__, {name: fingerprint(getattr(value, name)) for name in facts}]
+    if isinstance(value, msgspec.Struct):
+        return fingerprint(msgspec.to_builtins(value))
+    if isinstance(value, Mapping):
+        return {str(name): fingerprint(item) for name, item in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [fingerprint(item) for item in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value).hex()
+    if value is None or isinstance(value, (str, int, bool)):
+        return value
+    raise TypeError(f"a {type(value).__name__} cannot be an input of a stage")
+
+
+def contents(folder: Path) -> list[dict[str, Any]]:
+    """The manifests in a result folder in the order of the stages, each with its size in bytes."""
+    found = []
+    for place in sorted((folder / "work").glob("[0-9][0-9]-*")):
+        about = manifest(place)
+        if about:
+            size = sum(entry.stat().st_size for entry in place.iterdir())
+            found.append({**about, "folder": place.name, "bytes": size})
+    return found

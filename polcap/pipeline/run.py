@@ -1,0 +1,183 @@
+"""Process a capture: run the path, write maps and asset, judge, report; and open a finished result again.
+
+The order of the stages is in `path.py`.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from polcap import report, resource_limits
+from polcap.config import Config, restored
+from polcap.errors import SettingError
+from polcap.formats import calib
+from polcap.formats.export import animation, provenance
+from polcap.formats.maps import maps_folder, png
+from polcap.images import Capture, ColorCalibration, Frame, SensorImage, Shot
+from polcap.pipeline import asset_export, result_folder
+from polcap.pipeline.asset_export import ExportRequest
+from polcap.pipeline.cache import ArchiveCache, DryRunCache, Progress, StageCache, contents, silent
+from polcap.pipeline.path import STAGES, UserInput, path
+from polcap.report import moving
+from polcap.report import stage_pictures as pictures
+from polcap.results import Results
+
+PROFILE = "color.toml"  # beside the report
+
+
+def process(
+    capture: Capture,
+    supplied: UserInput,
+    config: Config,
+    out: Path,
+    until: str | None = None,
+    force: str | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any] | None:
+    """Run the path and write the result folder; returns report.json's content, None with `until`.
+
+    Raises
+    ------
+    InputError
+        Anything at fault with the user's input, from the stage that noticed it.
+    """
+    result_folder.check(out, Path(capture.folder))
+    cache = StageCache(out, progress, force, until)
+    try:
+        with result_folder.locked(out):
+            facts = _facts(capture, supplied, config)
+            result_folder.write_run(out, facts)
+            results = path(capture, supplied, config, cache)
+            if until is not None:
+                return None
+            cache.begin("write")
+            maps_folder.write(out / "maps", results.maps, results.mesh, results.stokes, results.cues)
+            about = report.document(facts, results, config, timings(out))
+            asset_export.write(out, about, ExportRequest(), results.asset)
+            report.write(out, about, results)
+            _write_profile(out / PROFILE, results.color)
+            cache.end()
+            return about
+    except Exception as error:
+        if not resource_limits.is_shortfall(error):
+            raise
+        raise resource_limits.shortfall(error, cache.stage, capture.size_px[0] * capture.size_px[1]) from error
+
+
+def _facts(capture: Capture, supplied: UserInput, config: Config) -> dict[str, Any]:
+    """The facts of a run that do not come from its pixels, as report.json has them."""
+    return {
+        "capture": report.capture_facts(capture),
+        "settings": msgspec.to_builtins(config),
+        "model": report.model_facts(supplied.network),
+        "versions": provenance.versions(),
+    }
+
+
+def _write_profile(file: Path, color: ColorCalibration) -> None:
+    """The color profile for other captures (`--chart FILE.toml`), where this one's chart was read."""
+    if color.source in ("chart", "corners"):
+        calib.write_profile(file, color)
+    else:
+        file.unlink(missing_ok=True)
+
+
+def counted(capture: Capture, frame_read: Callable[[int, int], None]) -> Capture:
+    """The capture; `frame_read` is called with the number of decoded photographs, and of all."""
+    brackets = [*capture.shots, *(() if capture.crossed is None else (capture.crossed,))]
+    total, number = sum(len(shot.frames) for shot in brackets), count(1)
+
+    def frame(one: Frame) -> Frame:
+        def load() -> SensorImage:
+            image = one.load()
+            frame_read(min(next(number), total), total)
+            return image
+
+        return replace(one, load=load)
+
+    def shot(one: Shot) -> Shot:
+        return replace(one, frames=tuple(map(frame, one.frames)))
+
+    crossed = None if capture.crossed is None else shot(capture.crossed)
+    return replace(capture, shots=tuple(map(shot, capture.shots)), crossed=crossed)
+
+
+def plan(capture: Capture, supplied: UserInput, config: Config, out: Path, force: str | None = None) -> dict[str, str]:
+    """What `process` would do with each stage: cached, compute, or on demand. Nothing is done."""
+    cache = DryRunCache(out, force)
+    path(capture, supplied, config, cache)
+    return cache.states
+
+
+def export(out: Path, wanted: ExportRequest) -> list[Path]:
+    """Write the asset again, from maps/ and report.json alone; returns the files.
+
+    Raises
+    ------
+    SettingError
+        A preset or color space does not exist, or a package or encoder is missing.
+    """
+    asset_export.check(wanted)
+    about = report.read(out)
+    with result_folder.locked(out):
+        whole, levels = asset_export.from_maps(out / "maps", restored(about, out / "report.json"), wanted)
+        return asset_export.write(out, about, wanted, whole, levels)
+
+
+def reopen(out: Path, until: str = "surface") -> tuple[Results, dict[str, Any]]:
+    """The results of an earlier run up to a stage, without its photographs, and the facts in work/run.json.
+
+    Raises
+    ------
+    StorageError
+        `out` holds no stage cache, or not that far.
+    """
+    about = result_folder.read_run(out)
+    config = restored(about, out / "work" / "run.json")
+    return path(None, UserInput(), config, ArchiveCache(out, until=until)), about
+
+
+def show(out: Path, stages: Sequence[str]) -> list[Path]:
+    """Draw the results of stages; returns the PNGs' paths."""
+    for stage in stages:
+        if stage not in STAGES:
+            raise SettingError(f"{stage!r} is no stage; choose one of {', '.join(STAGES)}")
+    results, _ = reopen(out, max(stages, key=STAGES.index))
+    drawn = []
+    for stage in stages:
+        drawn.append(out / "work" / f"{stage}.png")
+        png.write(drawn[-1], pictures.of_stage(results, stage))
+    return drawn
+
+
+def animate(out: Path, motion: moving.Motion) -> list[Path]:
+    """Move the light or the object; returns the paths of the WebP and, where FFmpeg is present, the MP4."""
+    results, about = reopen(out)
+    ior = float(about["settings"]["infer"]["ior"])
+    frames = moving.light(results.maps, ior) if motion == "light" else moving.turntable(results.maps, results.mesh, ior)
+    written = [out / "work" / f"{motion}.webp"]
+    animation.webp(written[0], frames, moving.SECONDS)
+    if animation.encoder():
+        written.append(out / "work" / f"{motion}.mp4")
+        animation.mp4(written[1], frames, moving.SECONDS)
+    return written
+
+
+def judge_again(out: Path) -> dict[str, Any]:
+    """Write report.json and report.html again, from the stage cache."""
+    results, facts = reopen(out)
+    with result_folder.locked(out):
+        about = report.document(facts, results, restored(facts, out / "work" / "run.json"), timings(out))
+        if (out / "report.json").exists():
+            about["keys"] = report.read(out).get("keys", {})
+        report.write(out, about, results)
+    return about
+
+
+def timings(out: Path) -> dict[str, float]:
+    """Seconds that each stored stage took when it was computed."""
+    return {about["stage"]: about["seconds"] for about in contents(out)}

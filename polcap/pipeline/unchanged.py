@@ -1,0 +1,116 @@
+"""Whether a result folder already answers a request: same options, same files, and nothing touched since.
+
+Compares sizes and times, as build tools do, before anything heavy is imported or hashed: a run that has nothing to do
+costs milliseconds. Where anything differs, the keys of the stage cache decide what is computed again.
+"""
+
+import json
+import os
+import sys
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from polcap.formats import atomic, calibrations_folder, text_file
+from polcap.formats.capture import own_folders
+from polcap.formats.export import provenance
+
+_FILE = "unchanged.json"
+_OF_A_RUN = ("lock", "owner", _FILE)  # files in work/ that differ from run to run
+_PACKAGE = Path(__file__).parents[1]
+_SETTLED_NS = 3_000_000_000  # some file systems have clocks of 2 s steps; within one a file may change unseen
+Stat = list[int]  # size, time of the content, time of the last change of any kind, which file it is
+
+
+class Finished(NamedTuple):
+    """A finished run."""
+
+    table: str  # of the capture, as it was understood
+    report: dict[str, Any]
+
+
+class _DoubtError(Exception):
+    """Sizes and times do not decide."""
+
+
+def request(options: Mapping[str, Any], capture: Path, out: Path, files: Iterable[Path] = ()) -> str | None:
+    """Digest of options, program, photographs and other input files by size and time; None where these do not decide.
+
+    `options` is plain data; the user's calibrations are among the files.
+    """
+    try:
+        photographs = _folder(capture, out)
+        others = {os.path.abspath(file): _stat(file) for file in (*files, *calibrations_folder.files())}
+        newest = max((stat[1] for stat in [*photographs.values(), *others.values()]), default=0)
+        if newest > time.time_ns() - _SETTLED_NS:
+            return None
+        return _digest([options, os.path.realpath(capture), os.path.realpath(out), photographs, others, _program()])
+    except (OSError, _DoubtError):
+        return None
+
+
+def find(out: Path, asked: str | None) -> Finished | None:
+    """The run that answered this request, if nothing in its result folder was changed since."""
+    if asked is None:
+        return None
+    try:
+        known = text_file.read_json(out / "work" / _FILE)
+        if known["request"] != asked or known["result"] != _result(out):
+            return None
+        return Finished(str(known["table"]), text_file.read_json(out / "report.json"))
+    except (OSError, ValueError, TypeError, KeyError, _DoubtError):
+        return None
+
+
+def remember(out: Path, asked: str | None, table: str = "") -> None:
+    """Record that the result folder now answers this request; nothing where the request is None.
+
+    Raises
+    ------
+    StorageError
+        The result folder cannot be written.
+    """
+    if asked is None:
+        return
+    known = {"request": asked, "table": table, "result": _result(out)}
+    with atomic.path(out / "work" / _FILE, synced=False) as temporary:
+        temporary.write_text(json.dumps(known) + "\n", encoding="utf-8")
+
+
+@cache
+def _program() -> str:
+    """Digest of the program by its files' sizes and times, and of the packages that decide on pixels."""
+    return _digest([sys.version, provenance.versions(), _folder(_PACKAGE), _folder(_PACKAGE.parent / "calib")])
+
+
+def _digest(value: Any) -> str:
+    text = json.dumps(value, sort_keys=True, default=str)
+    return blake2b(text.encode(errors="surrogateescape"), digest_size=16).hexdigest()
+
+
+def _result(out: Path) -> dict[str, Stat]:
+    own = {os.path.join("work", name) for name in _OF_A_RUN}
+    return {name: stat for name, stat in _folder(out).items() if name not in own}
+
+
+def _folder(folder: Path, but: Path | None = None) -> dict[str, Stat]:
+    """Size and times of every file below a folder, except those below `but`; empty where there is none."""
+    except_ = None if but is None else os.path.realpath(but)
+    return {os.path.relpath(file, folder): _stat(file) for file in _files(folder, except_)}
+
+
+def _files(folder: Path, except_: str | None) -> Iterator[str]:
+    for place, folders, files in os.walk(folder):
+        seen = [name for name in folders if name not in ("__pycache__", own_folders.BATCH)]
+        folders[:] = [name for name in seen if os.path.realpath(os.path.join(place, name)) != except_]
+        if any(os.path.islink(os.path.join(place, name)) for name in folders):
+            raise _DoubtError  # a linked folder is not walked
+        yield from (os.path.join(place, name) for name in files)
+
+
+def _stat(file: str | Path) -> Stat:
+    about = os.stat(file)
+    return [about.st_size, about.st_mtime_ns, about.st_ctime_ns, about.st_ino]

@@ -1,0 +1,1 @@
+"""Gates: judgements of a capture, each with limit, cost and remedy."""

@@ -1,0 +1,77 @@
+"""In: pictures with captions and keys. Out: one sheet of them."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.report import keys
+from polcap.report.keys import Key
+
+Picture = NDArray[np.uint8]
+WIDTH = 640  # px of one tile
+_HEAD, _FOOT, _GAP = 44, 58, 12
+_INK, _SOFT, _GROUND = (235, 237, 240), (160, 166, 176), (24, 26, 29)
+_LETTERS = cv2.FontFace("sans")
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A picture (h, w, 3), what it shows, and how its colors are read."""
+
+    picture: Picture
+    caption: str
+    key: Key | None = None
+    note: str = ""  # in place of a key
+
+
+def sheet(tiles: list[Tile]) -> Picture:
+    """Tiles three in a row, each under its caption and above its key."""
+    framed = [_framed(tile) for tile in tiles]
+    columns = min(3, len(framed))
+    rows = []
+    for start in range(0, len(framed), columns):
+        row = framed[start : start + columns]
+        height = max(tile.shape[0] for tile in row)
+        blank = np.full((height, WIDTH + _GAP, 3), _GROUND, np.uint8)
+        padded = []
+        for place in range(columns):
+            cell = blank.copy()
+            if place < len(row):
+                cell[: row[place].shape[0], :WIDTH] = row[place]
+            padded.append(cell)
+        rows.append(np.hstack(padded))
+    return np.asarray(np.vstack(rows)[:, :-_GAP], np.uint8)
+
+
+def write(picture: Picture, words: str, at: tuple[int, int], paint: tuple[int, int, int], size: int = 20) -> None:
+    """Words on a picture, their baseline's left end at (x, y)."""
+    cv2.putText(picture, words, at, paint, _LETTERS, size, 400)
+
+
+def _framed(tile: Tile) -> Picture:
+    height = max(1, round(tile.picture.shape[0] * WIDTH / tile.picture.shape[1]))
+    way = cv2.INTER_AREA if tile.picture.shape[1] > WIDTH else cv2.INTER_NEAREST
+    head = np.full((_HEAD, WIDTH, 3), _GROUND, np.uint8)
+    write(head, tile.caption, (2, 30), _INK, 22)
+    shown = cv2.resize(tile.picture, (WIDTH, height), interpolation=way)
+    return np.vstack([head, shown, _foot(tile)])
+
+
+def _foot(tile: Tile) -> Picture:
+    """The key's bar with its ticks, or the note."""
+    foot = np.full((_FOOT, WIDTH, 3), _GROUND, np.uint8)
+    if tile.key is None:
+        write(foot, tile.note, (2, 24), _SOFT, 17)
+        return foot
+    foot[8:20] = tile.key.bar(WIDTH, 12)
+    last = len(tile.key.ticks) - 1
+    for number, tick in enumerate(tile.key.ticks):
+        words = keys.plain(tick) + tile.key.unit
+        wide = cv2.getTextSize((WIDTH, 60), words, (0, 0), _LETTERS, 17, 400)[2]
+        place = round(tile.key.place(tick) * (WIDTH - 1))
+        left = place - (0 if number == 0 else wide if number == last else wide // 2)
+        foot[20:24, min(place, WIDTH - 2)] = _SOFT
+        write(foot, words, (max(0, left), 42), _SOFT, 17)
+    return foot

@@ -1,0 +1,270 @@
+"""In: a value of images.py. Out: a picture of it, (H, W, 3) uint8 sRGB, for a person to judge.
+
+Colour codes, the same everywhere (`keys.py`): normals n·½+½ (x right red, y up green); AoLP as hue, 0° red, a
+turn of 180° once around the wheel; DoLP, depth and errors from dark (small) to bright (large).
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import (
+    Alignment,
+    AngleStack,
+    Asset,
+    ColorCalibration,
+    Cues,
+    Floats,
+    Gains,
+    Mesh,
+    ObjectMask,
+    Quality,
+    StokesImage,
+    SurfaceMaps,
+)
+from polcap.optics import color, frames
+from polcap.optics.warp import warp
+from polcap.report import keys
+from polcap.report.sheets import WIDTH, Tile, sheet, write
+from polcap.report.sheets import Picture as Picture
+from polcap.report.smaller import area
+from polcap.results import Results
+
+_AGREE = "first shot magenta, this one green: grey where they agree"
+_DIRECTIONS = "red right, green up, blue toward the camera"
+
+
+def of_stage(results: Results, stage: str) -> Picture:
+    """What a stage made, for a person to look at."""
+    paint: dict[str, Callable[[], Picture]] = {
+        "hdr": lambda: merged(results.radiance),
+        "whitebalance": lambda: chart(results.radiance, results.color),
+        "align": lambda: sheet(registered(results.radiance, results.alignment)),
+        "mask": lambda: outline(results.radiance, results.color, results.object_),
+        "selfcal": lambda: gains(results.gains, results.radiance.angle),
+        "stokes": lambda: stokes(results.stokes),
+        "cues": lambda: cues(results.cues),
+        "infer": lambda: maps(results.maps),
+        "surface": lambda: surface(results.mesh, results.maps),
+        "asset": lambda: asset(results.asset),
+    }
+    return paint[stage]()
+
+
+def reference(radiance: AngleStack, color: ColorCalibration, widest: int | None = None) -> Picture:
+    """The reference shot in the calibrated colours, brightest parts just below white; averaged down to `widest` px."""
+    first = radiance.value[0]
+    shown = np.asarray(first, np.float32) if widest is None else area(first, _no_wider(first, widest))
+    return display(cv2.transform(shown, 2 * color.matrix.astype(np.float32)))
+
+
+def merged(radiance: AngleStack) -> Picture:
+    """Every shot; clipped pixels red, ghosts magenta."""
+    top = _top(radiance.value[0])
+    tiles = []
+    for value, quality, angle in zip(radiance.value, radiance.quality, np.degrees(radiance.angle), strict=True):
+        tile = display(value, top)
+        tile[(quality & int(Quality.CLIPPED)) > 0] = (255, 40, 40)
+        tile[(quality & int(Quality.GHOST)) > 0] = (255, 0, 255)
+        tiles.append(Tile(tile, f"Polarizer at {angle:g}°", note="red: clipped in every exposure; magenta: moved"))
+    return sheet(tiles)
+
+
+def chart(radiance: AngleStack, color: ColorCalibration, widest: int | None = None) -> Picture:
+    """The reference shot with the chart's patches as they were read."""
+    picture = reference(radiance, color, widest)
+    times = max(1, round(2 * WIDTH / picture.shape[1]))
+    picture = np.asarray(np.repeat(np.repeat(picture, times, 0), times, 1), np.uint8)
+    zoom = picture.shape[1] / radiance.value.shape[2]
+    outlines = [(quad, (0, 255, 0)) for quad in (color.quads if color.quads is not None else ())]
+    if color.corners is not None:
+        outlines.append((color.corners, (255, 255, 0)))
+    for corners, paint in outlines:
+        points = np.round((corners + 0.5) * zoom - 0.5).astype(np.int32)
+        cv2.polylines(picture, [points], True, paint, 1, cv2.LINE_AA)
+    return picture
+
+
+def registered(radiance: AngleStack, found: Alignment) -> list[Tile]:
+    """Brightness of each shot after registration (green) over the reference (magenta): grey where they agree."""
+    size = _no_wider(radiance.value[0], 2 * WIDTH)
+    zoom = np.diag([*np.divide(size, radiance.value.shape[2:0:-1]), 1.0])
+    zoom[:2, 2] = (zoom.diagonal()[:2] - 1) / 2  # pixel centres stand on whole numbers
+    first = _grey(area(radiance.value[0], size))
+    tiles = []
+    shots = zip(radiance.value, found.transform, found.residual_px, np.degrees(radiance.angle), strict=True)
+    for value, transform, residual, angle in list(shots)[1:]:
+        on_first = warp(_grey(area(value, size)), zoom @ transform @ np.linalg.inv(zoom), order=1)
+        moved = display(np.stack([first, on_first, first], -1), _top(first))
+        x, y = transform[:2, 2]
+        tiles.append(Tile(moved, f"{angle:g}° on the first: {x:+.2f}, {y:+.2f} px ± {residual:.3f}", note=_AGREE))
+    return tiles
+
+
+def outline(radiance: AngleStack, color: ColorCalibration, object_: ObjectMask, widest: int | None = None) -> Picture:
+    """The reference shot, darkened outside the mask, with the crop's box."""
+    picture = reference(radiance, color, widest)
+    outside = area(object_.mask.astype(np.float32), picture.shape[1::-1]) < 0.5
+    picture[outside] = picture[outside] // 3
+    x0, y0, x1, y1 = (round(edge * picture.shape[1] / radiance.value.shape[2]) for edge in object_.crop)
+    cv2.rectangle(picture, (x0, y0), (x1 - 1, y1 - 1), (255, 255, 0), 2)
+    return picture
+
+
+def gains(found: Gains, angle: Floats) -> Picture:
+    """Gains of the shots with their 1σ; crosses are the cross-check."""
+    height, left = 60 * len(found.gain) + 40, 120
+    picture = np.full((height, WIDTH, 3), 255, np.uint8)
+    span = max(0.02, 1.2 * float(np.abs(np.stack([found.gain, found.anchor]) - 1).max()))
+
+    def column(gain: float) -> int:
+        return int(left + (WIDTH - left - 20) * (0.5 + 0.5 * np.clip((gain - 1) / span, -1, 1)))
+
+    cv2.line(picture, (column(1), 10), (column(1), height - 30), (180, 180, 180), 1)
+    for shot, degrees in enumerate(np.degrees(angle)):
+        write(picture, f"{degrees:g}°", (10, 45 + 60 * shot), (0, 0, 0))
+        for channel, paint in enumerate([(200, 0, 0), (0, 140, 0), (0, 0, 200)]):
+            row = 25 + 60 * shot + 14 * channel
+            gain, sigma = float(found.gain[shot, channel]), float(found.sigma[shot, channel])
+            cv2.line(picture, (column(gain - sigma), row), (column(gain + sigma), row), paint, 2)
+            cv2.circle(picture, (column(gain), row), 4, paint, -1)
+            anchor = (column(float(found.anchor[shot, channel])), row)
+            cv2.drawMarker(picture, anchor, paint, cv2.MARKER_CROSS, 10, 1)
+    write(picture, f"1 ± {span:.3f}, from {found.source}; crosses: facing pixels", (left, height - 10), (0, 0, 0), 17)
+    return picture
+
+
+def stokes(image: StokesImage) -> Picture:
+    """S0, DoLP and AoLP in camera channels."""
+    total = frames.total(image.stokes)
+    s0 = np.maximum(total[0], 1e-6)
+    dolp = np.hypot(total[1], total[2]) / s0
+    aolp = np.arctan2(total[2], total[1]) / 2
+    turn = np.degrees(aolp) % 180
+    return sheet(
+        [
+            Tile(display(image.stokes[0]), "S0", note="camera channels, brightest parts white"),
+            Tile(keys.DOLP.picture(dolp, image.mask), "Degree of linear polarization", keys.DOLP),
+            Tile(keys.AOLP.picture(turn, image.mask), "Angle of linear polarization", keys.AOLP),
+        ]
+    )
+
+
+def cues(found: Cues) -> Picture:
+    """What the estimators see: DoLP, AoLP, the paper's normalised Stokes map and diffuse colour."""
+    cos, sin = found.normalized_stokes
+    turn = np.degrees(np.arctan2(sin, cos) / 2) % 180
+    normalized = _eight(np.stack([np.full_like(cos, 0.5), cos / 2 + 0.5, sin / 2 + 0.5], -1) * found.mask[..., None])
+    return sheet(
+        [
+            Tile(display(found.radiance), "S0", note="calibrated colors, brightest parts white"),
+            Tile(keys.DOLP.picture(found.dolp, found.mask), "Degree of linear polarization", keys.DOLP),
+            Tile(keys.AOLP.picture(turn, found.mask), "Angle of linear polarization", keys.AOLP),
+            Tile(normalized, "Normalised Stokes map", note="green S1, blue S2: 0.5 is none"),
+            Tile(display(found.diffuse_color * found.mask[..., None], 1.0), "Diffuse color", note="of unit length"),
+            Tile(keys.SIGMA.picture(found.ratio_sigma, found.mask), "Noise of S1/S0 and S2/S0, 1σ", keys.SIGMA),
+        ]
+    )
+
+
+def maps(found: SurfaceMaps) -> Picture:
+    """Normal, diffuse albedo, specular albedo, roughness and expected error."""
+    inside = found.mask[..., None]
+    return sheet(
+        [
+            Tile(normal(found), "Normal", note=_DIRECTIONS),
+            Tile(display(found.diffuse * inside, 1.0), "Diffuse albedo", note="white: 1"),
+            Tile(display(found.specular * inside, keys.F0.high), "Specular albedo F0", note=f"white: {keys.F0.high:g}"),
+            Tile(keys.ROUGHNESS.picture(found.roughness, found.mask), "Roughness", keys.ROUGHNESS),
+            Tile(keys.ERROR.picture(found.confidence, found.mask), "Expected error of the normal", keys.ERROR),
+        ]
+    )
+
+
+def normal(found: SurfaceMaps) -> Picture:
+    return _eight((found.normal / 2 + 0.5) * found.mask[..., None])
+
+
+def surface(mesh: Mesh, found: SurfaceMaps) -> Picture:
+    """The depth map, and the surface it makes under a light from the upper left."""
+    inside = np.isfinite(mesh.depth)
+    factor = 1000.0 if mesh.metric else 1.0
+    key = keys.depth(factor * mesh.depth[inside], mesh.metric)
+    return sheet(
+        [
+            Tile(key.picture(factor * mesh.depth, inside), "Depth", key),
+            Tile(shaded(mesh, found), "Shape", note="its depth's own normals under a light from the upper left"),
+        ]
+    )
+
+
+def shaded(mesh: Mesh, found: SurfaceMaps) -> Picture:
+    """The shape alone: its depth's own normals under one light, no colour of the object."""
+    inside = np.isfinite(mesh.depth)
+    depth = np.where(inside, mesh.depth, np.nan)
+    footprint = np.nanmedian(depth) / found.view.focal if inside.any() else 1.0  # size of a pixel there
+    down, right = np.gradient(depth / footprint)
+    facing = np.stack([right, -down, np.ones_like(depth)], -1)  # z towards the camera, y up
+    facing = facing / (frames.dot(facing, facing) ** 0.5)[..., None]
+    light = np.array([-0.5, 0.6, 0.62])
+    shade = np.clip(np.nan_to_num(facing) @ (light / np.linalg.norm(light)), 0, 1)
+    return _eight(np.repeat((0.1 + 0.85 * shade)[..., None], 3, -1) * inside[..., None])
+
+
+def asset(built: Asset) -> Picture:
+    """The textures as they stand in the file."""
+    tiles = [
+        (built.base_color, "Base color", "sRGB"),
+        (built.normal, "Normal", "tangent space, +Y"),
+        (built.occlusion_roughness_metallic, "Occlusion, roughness, metallic", "red, green, blue"),
+        (built.specular_color, "Specular color", f"of F0 {max(built.specular_factor):.3g} × the index's"),
+    ]
+    return sheet([Tile(np.array(picture), caption, note=note) for picture, caption, note in tiles])
+
+
+def display(linear: Floats, top: float | None = None) -> Picture:
+    """Linear light as sRGB; `top` becomes white, by default the 99.5th percentile."""
+    return color.srgb_eight_bits(np.asarray(linear, np.float32) / np.float32(top or _top(linear)))
+
+
+def scale(value: Floats, low: float, high: float, inside: NDArray[np.bool_]) -> Picture:
+    """A number per pixel as a colour from dark to bright, black outside."""
+    level = _eight((np.nan_to_num(value, nan=low) - low) / max(high - low, 1e-12))
+    picture = cv2.cvtColor(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
+    picture[~inside] = 0
+    return np.asarray(picture, np.uint8)
+
+
+def hue(aolp: Floats, inside: NDArray[np.bool_]) -> Picture:
+    """An angle mod π as a hue."""
+    turn = np.asarray(np.round(np.mod(aolp, np.pi) / np.pi * 180) % 180, np.uint8)
+    wheel = cv2.cvtColor(np.stack([turn, np.full_like(turn, 200), np.full_like(turn, 255)], -1), cv2.COLOR_HSV2RGB)
+    wheel[~inside] = 0
+    return np.asarray(wheel, np.uint8)
+
+
+def shrink(picture: Picture, width: int) -> Picture:
+    """A picture no wider than `width`."""
+    size = _no_wider(picture, width)
+    return picture if picture.shape[1] <= width else cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+
+
+def _no_wider(picture: NDArray[Any], width: int) -> tuple[int, int]:
+    """Width and height of a picture (h, w, …) made no wider than that."""
+    tall, wide = picture.shape[:2]
+    return (wide, tall) if wide <= width else (width, max(1, round(tall * width / wide)))
+
+
+def _top(linear: Floats) -> float:
+    return max(float(np.percentile(linear[::4, ::4], 99.5)), 1e-6)
+
+
+def _grey(value: Floats) -> Floats:
+    return np.asarray(frames.total(value) / 3, np.float32)
+
+
+def _eight(value: Any) -> Picture:
+    return np.asarray(np.round(np.clip(value, 0, 1) * 255), np.uint8)

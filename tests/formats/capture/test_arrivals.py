@@ -1,0 +1,85 @@
+"""A folder that is being filled: told once it rests, and not before."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from polcap.formats.capture import arrivals
+
+
+class Clock:
+    """Of the one who waits; whoever fills the folder does so meanwhile."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.meanwhile: Callable[[], object] = lambda: None
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+        self.meanwhile()
+
+
+@pytest.fixture(autouse=True)
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(arrivals, "time", clock)
+    return clock
+
+
+def test_tells_when_a_folder_rests_after_a_change(
+    tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = tmp_path / "polcap"
+    made.mkdir()
+    monkeypatch.chdir(tmp_path)
+    moments = arrivals.settled(Path(), made, still_s=0.6)  # the same folder by two names
+    next(moments)  # as it is
+
+    (made / "map.exr").write_bytes(b"not looked at")
+    (tmp_path / ".hidden").write_bytes(b"nor this")
+    written: list[float] = []
+
+    def arrive() -> None:
+        if clock.now > 1.0 and len(written) < 4:  # a file that grows
+            with (tmp_path / "a.dng").open("ab") as file:
+                file.write(bytes(100))
+            written.append(clock.now)
+
+    clock.meanwhile = arrive
+    next(moments)
+    assert len(written) == 4 and clock.now - written[-1] >= 0.6
+
+
+def test_tells_when_a_file_goes(tmp_path: Path, clock: Clock) -> None:
+    (tmp_path / "a.dng").write_bytes(b"a")
+    moments = arrivals.settled(tmp_path, tmp_path / "polcap", still_s=0.0)
+    next(moments)
+    clock.meanwhile = partial((tmp_path / "a.dng").unlink, missing_ok=True)
+    next(moments)
+    assert not (tmp_path / "a.dng").exists()
+
+
+def test_an_edited_file_rests_at_once_but_not_beside_photographs_that_come(tmp_path: Path, clock: Clock) -> None:
+    folder, settings = tmp_path / "capture", tmp_path / "settings.toml"
+    folder.mkdir()
+    moments = arrivals.settled(folder, folder / "polcap", still_s=2.0, edited=[settings])
+    next(moments)
+    settings.write_text("[asset]")
+    next(moments)
+    assert clock.now < 1.0
+    begun = clock.now
+
+    def both() -> None:
+        if clock.now < begun + 1.5:
+            with (folder / "a.dng").open("ab") as file:
+                file.write(bytes(100))
+            settings.write_text(f"# {clock.now:.1f}")
+
+    clock.meanwhile = both
+    next(moments)
+    assert clock.now >= begun + 3.3

@@ -1,0 +1,99 @@
+"""GLB: judged by the Khronos validator and by a second reader, not by its writer."""
+
+import json
+import shutil
+import struct
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from polcap.formats.export import gltf
+from polcap.formats.export.encoders import Kind
+from polcap.images import Asset
+from tests import surfaces
+
+NODE = Path(__file__).parents[1] / "gltf"
+
+
+@pytest.fixture(scope="module")
+def asset() -> Asset:
+    maps = surfaces.maps(ripple=0.1, roughness=0.5, specular=0.05)
+    return surfaces.built(maps, surfaces.mesh(maps))
+
+
+def document(data: bytes) -> dict[str, Any]:
+    magic, version, size = struct.unpack_from("<4sII", data)
+    assert (magic, version, size) == (b"glTF", 2, len(data))
+    length, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON"
+    return dict(json.loads(data[20 : 20 + length]))
+
+
+@pytest.mark.parametrize("images", ["png", "jpeg", "webp"])
+def test_khronos_validator_finds_nothing(asset: Asset, tmp_path: Path, images: Kind) -> None:
+    node = shutil.which("node")
+    if node is None or not (NODE / "node_modules" / "gltf-validator").is_dir():
+        pytest.skip("needs node, and `npm ci` in tests/gltf")
+    gltf.write(tmp_path / "ball.glb", asset, "ball", images, {"unit": "m"})
+    done = subprocess.run(
+        [node, str(NODE / "validate.js"), str(tmp_path / "ball.glb")],
+        capture_output=True, check=True, timeout=300,
+    )  # fmt: skip
+    report = json.loads(done.stdout)
+    issues = report["issues"]
+    assert (issues["numErrors"], issues["numWarnings"], issues["numHints"]) == (0, 0, 0), issues["messages"]
+    known = {"IMAGE_NPOT_DIMENSIONS", "UNSUPPORTED_EXTENSION"}  # fine since WebGL 2; XMP, which it does not know
+    assert {message["code"] for message in issues["messages"]} <= known
+    assert report["info"]["totalTriangleCount"] == len(asset.mesh.faces)
+
+
+def test_second_reader_finds_the_same_geometry(asset: Asset, tmp_path: Path) -> None:
+    gltf.write(tmp_path / "ball.glb", asset, "ball")
+    read = trimesh.load(tmp_path / "ball.glb", force="mesh", process=False, skip_materials=True)
+    middle = gltf.center(asset.mesh.vertices)
+    assert np.allclose(read.vertices, asset.mesh.vertices - middle, atol=1e-6)
+    assert np.array_equal(read.faces, asset.mesh.faces)
+    assert np.allclose(read.bounds.sum(axis=0), 0, atol=1e-6)  # the object stands at the origin
+    assert np.allclose(np.ptp(read.bounds, axis=0)[:2], 2 * surfaces.RADIUS, rtol=0.1)  # metres
+
+
+def test_extensions_carry_index_and_reflectance(asset: Asset) -> None:
+    said = document(gltf.encode(asset, "ball"))
+    extensions = said["materials"][0]["extensions"]
+    assert extensions["KHR_materials_ior"] == {"ior": 1.5}
+    factor = extensions["KHR_materials_specular"]["specularColorFactor"]
+    assert np.allclose(factor, 0.05 / 0.04, rtol=1e-5)  # F0 = 0.04 · factor; may exceed 1
+    assert said["asset"]["extras"]["unit"] == "metre"
+    assert said["asset"]["extras"]["origin_in_camera"][2] < -0.5
+
+
+def test_same_asset_gives_the_same_bytes(asset: Asset) -> None:
+    assert gltf.encode(asset, "ball") == gltf.encode(asset, "ball")
+
+
+def test_names_outside_ascii_survive(asset: Asset) -> None:
+    assert document(gltf.encode(asset, "Krug “ø”"))["nodes"][0]["name"] == "Krug “ø”"
+
+
+def test_provenance_stands_in_the_packet(asset: Asset) -> None:
+    said = document(gltf.encode(asset, "ball", provenance={"settings": "{}"}))
+    packet = said["extensions"]["KHR_xmp_json_ld"]["packets"][said["asset"]["extensions"]["KHR_xmp_json_ld"]["packet"]]
+    assert packet["polcap:settings"] == "{}" and packet["dc:title"]["rdf:_1"]["@value"] == "ball"
+    assert packet["@context"]["dc"] == "http://purl.org/dc/elements/1.1/"
+
+
+def test_open_surface_is_seen_from_behind_too(asset: Asset) -> None:
+    assert document(gltf.encode(asset, "ball"))["materials"][0]["doubleSided"] is True
+    tetrahedron = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]], dtype=np.int32)
+    assert gltf.is_open(tetrahedron[:3]) and not gltf.is_open(tetrahedron)
+
+
+@pytest.mark.parametrize("lost", [0, -1])
+def test_a_lost_triangle_opens_a_closed_surface_wherever_its_vertices_stand(lost: int) -> None:
+    ball = np.asarray(trimesh.creation.icosphere(4).faces, np.int32)  # 2,562 vertices
+    ball = ball[np.argsort(ball.min(axis=1))] + 7  # no triangle at the first vertices
+    assert not gltf.is_open(ball) and gltf.is_open(np.delete(ball, lost, axis=0))

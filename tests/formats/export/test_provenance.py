@@ -1,0 +1,25 @@
+"""What an asset says it was made from are the very files."""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polcap import report
+from polcap.formats.capture import reader as capture
+from polcap.formats.export import provenance
+from polcap.formats.maps import png
+
+NOTHING = {"versions": {}, "polcap": "", "model": None, "settings": {}, "keys": {}}
+
+
+@pytest.mark.parametrize("how", ['name = "bowl"\n', 'encoding = "linear"\nwhite = 4095\nblack = 64\n'])
+def test_photographs_are_named_by_their_sha256_however_they_are_read(tmp_path: Path, how: str) -> None:
+    for angle in (0, 60, 120):
+        picture = np.random.default_rng(angle).integers(100, 4000, (48, 64, 3)).astype(np.uint16)
+        png.write(tmp_path / f"bowl_{angle}.png", picture)
+    (tmp_path / "capture.toml").write_text(how, encoding="utf-8")
+    facts = report.capture_facts(capture.read(tmp_path))
+    for one in provenance.record({"capture": facts, **NOTHING})["photographs"]:
+        assert one["sha256"] == hashlib.sha256((tmp_path / one["file"]).read_bytes()).hexdigest()

@@ -1,0 +1,123 @@
+"""USD and MaterialX: judged by OpenUSD's validators and by the MaterialX library, not by their writers."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from polcap.errors import SettingError
+from polcap.formats.export import encoders, gltf, materialx, usd
+from polcap.formats.export.texture_set import LOOSE, Key
+from polcap.images import Asset
+from tests import surfaces
+
+FILES: dict[Key, str] = {key: f"ball_{key}.png" for key in LOOSE}
+
+
+@pytest.fixture(scope="module")
+def asset() -> Asset:
+    maps = surfaces.maps(ripple=0.1, roughness=0.5, specular=0.05)
+    return surfaces.built(maps, surfaces.mesh(maps))
+
+
+@pytest.fixture(scope="module")
+def folder(asset: Asset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """ball.usdc, ball.mtlx and their textures."""
+    pytest.importorskip("pxr", reason="needs usd-core")
+    where = tmp_path_factory.mktemp("usd")
+    usd.write(where / "ball.usdc", asset, "ball", FILES, {"unit": "m"})
+    materialx.write(where / "ball.mtlx", asset, "ball", FILES, "a ball")
+    for key, file in FILES.items():
+        (where / file).write_bytes(encoders.encode(LOOSE[key](asset), "png"))
+    return where
+
+
+def opened(folder: Path) -> Any:
+    from pxr import Usd
+
+    return Usd.Stage.Open(str(folder / "ball.usdc"))
+
+
+def test_usd_validators_find_nothing(folder: Path) -> None:
+    """Those of OpenUSD's usdchecker; a usd-core without UsdMtlx cannot know MaterialX' nodes."""
+    validation = pytest.importorskip("pxr.UsdValidation", reason="needs usd-core 25.11 or later")
+    every = validation.ValidationRegistry().GetOrLoadAllValidators()
+    found = validation.ValidationContext(every).Validate(opened(folder))
+    assert len(every) > 20
+    assert [one.GetMessage() for one in found if "shaderId 'ND_" not in one.GetMessage()] == []
+
+
+def test_stage_is_upright_in_metres_and_names_its_root(folder: Path, asset: Asset) -> None:
+    from pxr import UsdGeom
+
+    stage = opened(folder)
+    assert UsdGeom.GetStageUpAxis(stage) == "Y" and UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    assert stage.GetDefaultPrim().GetPath() == "/ball"
+    shape = UsdGeom.Mesh(stage.GetPrimAtPath("/ball/ball_mesh"))
+    points = np.array(shape.GetPointsAttr().Get())
+    assert np.allclose(points, asset.mesh.vertices - gltf.center(asset.mesh.vertices), atol=1e-6)
+    st = np.array(UsdGeom.PrimvarsAPI(shape).GetPrimvar("st").Get())
+    assert np.allclose(st[:, 1], 1 - asset.mesh.uv[:, 1], atol=1e-6)
+    assert shape.GetDoubleSidedAttr().Get()
+
+
+def test_every_reader_finds_a_surface_with_measured_reflectance(folder: Path) -> None:
+    """F0 from a texture: by its own scale in the specular workflow, as a tint of F0(1.5) for Blender."""
+    from pxr import UsdShade
+
+    stage = opened(folder)
+    bound = UsdShade.MaterialBindingAPI(stage.GetPrimAtPath("/ball/ball_mesh"))
+    scales = []
+    for purpose in (UsdShade.Tokens.allPurpose, UsdShade.Tokens.full):
+        material, _ = bound.ComputeBoundMaterial(purpose)
+        assert material.GetSurfaceOutput("mtlx").HasConnectedSource()
+        preview = material.ComputeSurfaceSource()[0]
+        source = preview.GetInput("specularColor").GetConnectedSources()[0][0].source
+        scales.append(
+            source.GetInput("scale").Get()[0] * (0.04 if not preview.GetInput("useSpecularWorkflow").Get() else 1)
+        )
+    assert np.allclose(scales, 0.08)
+
+
+def test_materialx_library_finds_the_document_valid(folder: Path) -> None:
+    mx = pytest.importorskip("MaterialX", reason="needs materialx")
+    library = mx.createDocument()
+    mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), library)
+    document = mx.createDocument()
+    mx.readFromXmlFile(document, str(folder / "ball.mtlx"))
+    document.importLibrary(library)
+    assert document.validate() == (True, "")
+    for node in document.getNodes():
+        definition = node.getNodeDef()
+        assert definition is not None, node.getName()
+        for given in node.getInputs():
+            assert definition.getActiveInput(given.getName()).getType() == given.getType(), given.getName()
+
+
+def test_nodes_stand_after_what_they_take(asset: Asset) -> None:
+    seen: set[str] = set()
+    for node in materialx.describe(asset, FILES):
+        links = {one.value.node for one in node.inputs if isinstance(one.value, materialx.NodeOutput)}
+        assert links <= seen
+        seen.add(node.name)
+
+
+def test_same_asset_gives_the_same_bytes(folder: Path, asset: Asset, tmp_path: Path) -> None:
+    usd.write(tmp_path / "ball.usdc", asset, "ball", FILES, {"unit": "m"})
+    materialx.write(tmp_path / "ball.mtlx", asset, "ball", FILES, "a ball")
+    for name in ("ball.usdc", "ball.mtlx"):
+        assert (tmp_path / name).read_bytes() == (folder / name).read_bytes()
+
+
+def test_without_usd_core_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    with pytest.raises(SettingError, match=r"usd-core: pip install 'polcap\[usd\]'"):
+        usd.require()
+
+
+@pytest.mark.parametrize(("name", "said"), [("Krug “ø” 1", "Krug_____1"), ("3 cups", "_3_cups")])
+def test_names_become_identifiers(name: str, said: str) -> None:
+    assert materialx.identifier(name) == said

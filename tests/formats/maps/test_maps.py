@@ -1,0 +1,170 @@
+"""The folder maps/: what the design promises is there, and says what it means."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from polcap.errors import DecodeError, StorageError
+from polcap.formats.maps import exr, png
+from polcap.formats.maps import maps_folder as maps
+from polcap.images import ColorCalibration, Cues, Mesh, StokesImage, SurfaceMaps
+from polcap.stages import cues
+from tests import surfaces
+
+FILES = {
+    "normal.exr", "normal.png", "depth.exr", "depth.png", "diffuse.exr", "diffuse.png", "specular.exr",
+    "specular.png", "roughness.exr", "roughness.png", "mask.png", "confidence.exr", "stokes.exr",
+    "cues.exr", "photograph.png", "maps.json",
+}  # fmt: skip
+
+Result = tuple[SurfaceMaps, Mesh, StokesImage, Cues]
+
+
+@pytest.fixture(scope="module")
+def result() -> Result:
+    of = surfaces.maps(roughness=0.4, specular=0.05)
+    rng = np.random.default_rng(4)
+    stokes = rng.normal(0, 0.1, (3, *of.mask.shape, 3)).astype(np.float32)
+    stokes[0] = np.abs(stokes[0]) + 0.5
+    image = StokesImage(
+        stokes=stokes,
+        covariance=np.full((6, *of.mask.shape, 3), 1e-6, dtype=np.float32),
+        quality=np.zeros(of.mask.shape, dtype=np.uint8),
+        mask=of.mask,
+        view=of.view,
+        residual=None,
+    )
+    color = ColorCalibration(np.eye(3), None, None, None, "none", np.nan, None)
+    return of, surfaces.mesh(of), image, cues.compute(image, color)
+
+
+@pytest.fixture(scope="module")
+def folder(result: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("result") / "maps"
+    maps.write(folder, *result)
+    return folder
+
+
+@pytest.mark.parametrize("threads", ["1", "3"])
+def test_a_file_that_cannot_be_written_leaves_all_as_they_were(
+    result: Result, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: str
+) -> None:
+    """Its error comes out, and no file of the new result is there."""
+    monkeypatch.setenv("OMP_NUM_THREADS", threads)
+    maps.write(tmp_path / "maps", *result)
+    before = {file.name: file.stat().st_mtime_ns for file in (tmp_path / "maps").iterdir()}
+    assert {name: (tmp_path / "maps" / name).read_bytes() for name in FILES} == {
+        name: (folder / name).read_bytes() for name in FILES
+    }
+    keep = exr.write
+
+    def refuse(path: Path, *given: Any, **more: Any) -> None:
+        if path.name == "cues.exr":
+            raise StorageError(f"cannot write {path}: the disk is full")
+        keep(path, *given, **more)
+
+    monkeypatch.setattr(exr, "write", refuse)
+    with pytest.raises(StorageError, match=r"cues\.exr: the disk is full"):
+        maps.write(tmp_path / "maps", *result)
+    assert {file.name: file.stat().st_mtime_ns for file in (tmp_path / "maps").iterdir()} == before
+
+
+def test_every_promised_file_is_there_and_described(folder: Path) -> None:
+    assert {path.name for path in folder.iterdir()} == FILES
+    said = json.loads((folder / "maps.json").read_text("utf-8"))
+    assert set(said["maps"]) == FILES - {"maps.json"}
+
+
+def test_crop_is_in_visible_raw_pixels(folder: Path) -> None:
+    said = json.loads((folder / "maps.json").read_text("utf-8"))
+    assert said["crop"] == [600, 400, 600 + 2 * surfaces.WIDTH, 400 + 2 * surfaces.HEIGHT]
+    assert said["size"] == [surfaces.WIDTH, surfaces.HEIGHT] and said["scale"] == 2
+    assert said["camera"]["focal_px"] == 400 and said["depth"]["unit"] == "m"
+
+
+def test_pictures_mean_what_maps_json_says(folder: Path, result: Result) -> None:
+    of, mesh, *_ = result
+    said = json.loads((folder / "maps.json").read_text("utf-8"))
+    inside = of.mask
+    normal = png.read(folder / "normal.png")
+    assert normal.dtype == np.uint16
+    assert np.allclose(normal[inside] / 65535 * 2 - 1, of.normal[inside], atol=2e-5)
+    near, far = said["depth"]["near"], said["depth"]["far"]
+    depth = png.read(folder / "depth.png")[inside] / 65535 * (far - near) + near
+    assert np.allclose(depth, mesh.depth[inside], atol=(far - near) * 1e-5)
+    assert np.allclose(png.read(folder / "roughness.png")[inside] / 65535, 0.4, atol=1e-5)
+    assert png.read(folder / "diffuse.png")[inside].max(axis=0).tolist() == [203, 188, 89]  # sRGB of .6 .5 .1
+    assert np.array_equal(png.read(folder / "mask.png") == 255, inside)
+
+
+def test_normals_point_right_up_and_towards_the_camera(folder: Path) -> None:
+    """The ball's right edge is red, its top green, its middle blue: +Y, as OpenGL and glTF."""
+    normal, inside = png.read(folder / "normal.png"), png.read(folder / "mask.png") > 0
+    rows, columns = np.nonzero(inside)
+    middle = int(np.median(rows)), int(np.median(columns))
+    right, top = normal[middle[0], columns.max()], normal[rows.min(), middle[1]]
+    assert right[0] > 60000 and top[1] > 60000 and normal[middle][2] > 64000
+
+
+def test_stokes_and_cues_are_readable_by_name(folder: Path, result: Result) -> None:
+    _, _, stokes, of = result
+    read, _ = exr.read(folder / "stokes.exr")
+    assert sorted(read) == sorted(f"S{s}.{c}" for s in range(3) for c in "RGB")
+    assert np.allclose(read["S2.B"], stokes.stokes[2, ..., 2], atol=3e-4)  # half
+    read, _ = exr.read(folder / "cues.exr")
+    assert np.allclose(read["dolp"], of.dolp, atol=1e-3)
+    double = np.radians(2 * read["aolp"])
+    assert np.allclose(np.cos(double), of.normalized_stokes[0], atol=5e-3)
+    assert np.allclose(np.sin(double), of.normalized_stokes[1], atol=5e-3)
+    assert read["aolp"].min() >= 0 and read["aolp"].max() <= 180
+
+
+def test_stored_maps_come_back(folder: Path, result: Result) -> None:
+    of, mesh, *_ = result
+    stored = maps.read(folder)
+    assert stored.metric and stored.maps.view == of.view and stored.maps.estimator == "truth"
+    assert np.array_equal(stored.maps.mask, of.mask)
+    assert np.array_equal(stored.maps.normal[of.mask], of.normal[of.mask])
+    assert np.array_equal(stored.depth, mesh.depth, equal_nan=True)
+    assert np.allclose(stored.maps.diffuse[of.mask], of.diffuse[of.mask], rtol=1e-3)
+
+
+def test_what_reading_gives_is_known_before_it_is_read(folder: Path, result: Result) -> None:
+    of, mesh, *_ = result
+    rng = np.random.default_rng(5)
+    of = replace(of, diffuse=np.exp(rng.normal(-8, 6, of.diffuse.shape)).astype(np.float32))  # denormals, and too much
+    mesh = replace(mesh, depth=np.where(rng.uniform(size=mesh.depth.shape) < 0.1, np.nan, mesh.depth))
+    maps.write(folder.parent / "other", of, mesh, *result[2:])
+    read, known = maps.read(folder.parent / "other"), maps.as_stored(of)
+    assert np.array_equal(read.depth, maps.stored_depth(known, mesh), equal_nan=True) and read.metric == mesh.metric
+    for name, value in vars(read.maps).items():
+        other = getattr(known, name)
+        assert np.array_equal(value, other) if isinstance(value, np.ndarray) else value == other, name
+
+
+def test_same_result_gives_the_same_bytes(folder: Path, result: Result, tmp_path: Path) -> None:
+    maps.write(tmp_path / "again", *result)
+    for name in FILES:
+        assert (folder / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+
+
+def test_relative_depth_is_called_so(result: Result, tmp_path: Path) -> None:
+    of, mesh, stokes, cue = result
+    maps.write(tmp_path, of, replace(mesh, metric=False), stokes, cue)
+    assert json.loads((tmp_path / "maps.json").read_text("utf-8"))["depth"]["unit"] == "relative"
+
+
+def test_damaged_folder_is_one_line(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(DecodeError, match="holds no maps"):
+        maps.read(tmp_path)
+    (tmp_path / "maps.json").write_text("{}")
+    with pytest.raises(DecodeError, match="process again"):
+        maps.read(tmp_path)
+    (tmp_path / "maps.json").write_bytes((folder / "maps.json").read_bytes())
+    png.write(tmp_path / "mask.png", np.zeros((3, 3), dtype=np.uint8))
+    with pytest.raises(DecodeError, match=r"mask\.png is not 160 × 120"):
+        maps.read(tmp_path)

@@ -1,0 +1,62 @@
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polcap.errors import DecodeError, StorageError
+from polcap.formats.maps import png
+from polcap.formats.raw import photo
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("tail", [(), (3,), (4,)])
+def test_pixels_come_back_in_order(tmp_path: Path, dtype: type[np.uint8], tail: tuple[int, ...]) -> None:
+    pixels = np.random.default_rng(1).integers(0, np.iinfo(dtype).max, (5, 7, *tail)).astype(dtype)
+    png.write(tmp_path / "a.png", pixels)
+    assert np.array_equal(png.read(tmp_path / "a.png"), pixels)
+    assert png.encode(pixels) == (tmp_path / "a.png").read_bytes()
+
+
+def test_red_is_first_for_other_readers(tmp_path: Path) -> None:
+    oiio = pytest.importorskip("OpenImageIO")
+    png.write(tmp_path / "a.png", np.full((2, 2, 3), [255, 10, 0], dtype=np.uint8))
+    source = oiio.ImageInput.open(str(tmp_path / "a.png"))
+    assert source.read_image(oiio.UINT8)[0, 0].tolist() == [255, 10, 0]
+
+
+def test_only_whole_numbers_are_taken() -> None:
+    with pytest.raises(TypeError, match="float32"):
+        png.encode(np.zeros((2, 2), dtype=np.float32))  # type: ignore[arg-type]
+
+
+def test_damaged_file_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    with pytest.raises(DecodeError, match="check the file"):
+        png.read(path)
+    for data in (b"", b"\x89PNG\r\n\x1a\nnonsense"):
+        path.write_bytes(data)
+        with pytest.raises(DecodeError, match="not a whole PNG"):
+            png.read(path)
+
+
+@pytest.mark.parametrize("door", [png.read, photo.read])
+def test_more_pixels_than_the_bytes_unpack_to_are_refused_unread(
+    tmp_path: Path, door: Callable[[Path], object]
+) -> None:
+    path = tmp_path / "a.png"
+    png.write(path, np.zeros((3000, 3000), np.uint8))  # nothing packs better than one value
+    door(path)
+    data = path.read_bytes()
+    head = b"IHDR" + struct.pack(">II", 15_000, 15_000) + data[24:29]
+    path.write_bytes(data[:12] + head + struct.pack(">I", zlib.crc32(head)) + data[33:])
+    with pytest.raises(DecodeError, match="cannot hold 15000×15000 px"):
+        door(path)
+
+
+def test_folder_that_is_a_file_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "maps").write_text("")
+    with pytest.raises(StorageError, match="file where a folder is needed"):
+        png.write(tmp_path / "maps" / "a.png", np.zeros((2, 2), dtype=np.uint8))

@@ -1,0 +1,136 @@
+"""The DNG writer, read back by LibRaw and exifread, which know nothing of it."""
+
+from pathlib import Path
+from typing import Literal
+
+import exifread
+import numpy as np
+import pytest
+import rawpy
+
+from polcap.errors import StorageError
+from polcap.formats.raw import dng
+from polcap.images import Exif
+
+EXIF = Exif(
+    make="Polcap",
+    model="Synthetic 1",
+    lens="Synthetic 60 mm",
+    exposure_time=1 / 160,
+    f_number=8.0,
+    iso=200.0,
+    focal_length_mm=60.0,
+    focal_length_35mm=90.0,
+    pixel_pitch_um=6.25,
+    taken="2026-03-14T15:57:29.250",
+    flash_fired=True,
+)
+PHASES = {
+    "RGGB": [[0, 1], [1, 2]],
+    "BGGR": [[2, 1], [1, 0]],
+    "GRBG": [[1, 0], [2, 1]],
+    "GBRG": [[1, 2], [0, 1]],
+}
+MATRIX = np.array([[0.9, -0.29, -0.07], [-0.45, 1.24, 0.23], [-0.09, 0.19, 0.71]])
+
+
+def write(
+    path: Path, mosaic: np.ndarray, phase: str = "RGGB", compression: Literal["ljpeg", "none"] = "ljpeg", **exif: object
+) -> Path:
+    dng.write(
+        path,
+        mosaic,
+        cfa=np.array(PHASES[phase], np.uint8),
+        black=[[510, 511], [512, 513]],
+        white=15871,
+        exif=Exif(**{**vars(EXIF), **exif}),
+        color_matrix=MATRIX,
+        as_shot_neutral=np.array([0.5, 1.0, 0.8]),
+        compression=compression,
+    )
+    return path
+
+
+def picture(seed: int, height: int = 60, width: int = 84) -> np.ndarray:
+    y, x = np.mgrid[:height, :width]
+    smooth = 4000 + 3000 * np.sin(x / 9) * np.cos(y / 7) + 500 * (x % 2)
+    return (smooth + np.random.default_rng(seed).normal(0, 30, smooth.shape)).clip(0, 65535).astype(np.uint16)
+
+
+def raw(path: Path) -> np.ndarray:
+    with rawpy.imread(str(path)) as r:
+        return r.raw_image_visible.copy()
+
+
+@pytest.mark.parametrize("compression", ["ljpeg", "none"])
+@pytest.mark.parametrize("phase", PHASES)
+def test_counts_phase_black_and_white_come_back_exactly(
+    tmp_path: Path, phase: str, compression: Literal["ljpeg", "none"]
+) -> None:
+    mosaic = picture(1)
+    with rawpy.imread(str(write(tmp_path / "a.DNG", mosaic, phase, compression))) as r:
+        np.testing.assert_array_equal(r.raw_image_visible, mosaic)
+        assert "".join("RGBG"[i] for i in r.raw_pattern.ravel()) == phase
+        blacks = np.array(r.black_level_per_channel)[r.raw_pattern]  # LibRaw's order is R, G, B, G2
+        np.testing.assert_array_equal(blacks, [[510, 511], [512, 513]])
+        assert r.white_level == 15871
+        np.testing.assert_allclose(r.camera_whitebalance[:3], [2, 1, 1.25], rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "mosaic",
+    [
+        np.random.default_rng(0).integers(0, 65536, (48, 64), np.uint16),  # every category, 32768 too
+        np.tile(np.array([[0, 0, 32768, 32768, 65535, 0]], np.uint16), (6, 4)),
+        np.full((10, 12), 512, np.uint16),  # one category
+        np.full((2, 2), 65535, np.uint16),
+    ],
+    ids=["noise", "greatest differences", "constant", "smallest"],
+)
+def test_lossless_jpeg_of_any_counts_is_exact(tmp_path: Path, mosaic: np.ndarray) -> None:
+    if mosaic.size < 200:  # LibRaw refuses images this small: stand it in the corner of a larger one
+        mosaic = np.pad(mosaic, ((0, 40), (0, 40)), mode="edge")
+    np.testing.assert_array_equal(raw(write(tmp_path / "a.DNG", mosaic)), mosaic)
+
+
+def test_lossless_jpeg_is_smaller_than_plain(tmp_path: Path) -> None:
+    noise = np.random.default_rng(2).normal(4000, 30, (400, 600)).astype(np.uint16)
+    size = write(tmp_path / "a.DNG", noise).stat().st_size
+    assert size * 8 / noise.size == pytest.approx(7.45, abs=0.3)  # bits: log₂(30 √2 √(2πe)), the entropy
+
+
+def test_exif_is_what_other_readers_expect(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.DNG", picture(3))
+    with path.open("rb") as file:
+        tags = exifread.process_file(file, details=False)
+    number = {k: float(v.values[0]) for k, v in tags.items() if v.values and not isinstance(v.values, str)}
+    assert (str(tags["Image Make"]), str(tags["Image Model"])) == ("Polcap", "Synthetic 1")
+    assert str(tags["EXIF LensModel"]) == "Synthetic 60 mm"
+    assert str(tags["EXIF DateTimeOriginal"]) == "2026:03:14 15:57:29"
+    assert str(tags["EXIF SubSecTimeOriginal"]) == "250"
+    assert number["EXIF ExposureTime"] == pytest.approx(1 / 160)
+    assert number["EXIF FNumber"] == 8 and number["EXIF ISOSpeedRatings"] == 200
+    assert number["EXIF FocalLength"] == 60 and number["EXIF FocalLengthIn35mmFilm"] == 90
+    assert 1e4 / number["EXIF FocalPlaneXResolution"] == 6.25 and number["EXIF FocalPlaneResolutionUnit"] == 3
+    assert int(number["EXIF Flash"]) & 1
+    with rawpy.imread(str(path)) as r:
+        assert r.other.iso_speed == 200 and r.other.aperture == 8
+        assert r.other.shutter_speed == pytest.approx(1 / 160)
+
+
+def test_facts_not_known_are_left_out(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.DNG", picture(3), exposure_time=None, flash_fired=None, pixel_pitch_um=None)
+    with path.open("rb") as file:
+        tags = exifread.process_file(file, details=False)
+    assert not {"EXIF ExposureTime", "EXIF Flash", "EXIF FocalPlaneXResolution"} & set(tags)
+    np.testing.assert_array_equal(raw(path), picture(3))
+
+
+def test_same_counts_give_the_same_bytes(tmp_path: Path) -> None:
+    assert write(tmp_path / "a", picture(4)).read_bytes() == write(tmp_path / "b", picture(4)).read_bytes()
+
+
+def test_unwritable_folder_is_a_storage_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError):
+        write(tmp_path / "file" / "a.DNG", picture(5))

@@ -1,0 +1,152 @@
+"""Finished pictures as sources: what is stored, what it means, what is refused."""
+
+import cv2
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from polcap.errors import DecodeError
+from polcap.formats.raw import photo
+from polcap.optics import color
+from tests.formats import headers
+from tests.formats.headers import DATA, needs_data
+
+SIXTEEN = np.arange(24 * 32 * 3, dtype=np.uint16).reshape(24, 32, 3) * 20
+EIGHT = (np.arange(24 * 32 * 3).reshape(24, 32, 3) % 256).astype(np.uint8)
+
+
+def save(path, pixels, names=None):
+    pixels = np.atleast_3d(pixels)
+    stored = {"float32": "float", "float16": "half"}.get(str(pixels.dtype), str(pixels.dtype))
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], oiio.TypeDesc(stored))
+    if names:
+        spec.channelnames = names
+    out = oiio.ImageOutput.create(str(path))
+    assert out.open(str(path), spec) and out.write_image(np.ascontiguousarray(pixels)) and out.close()
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.tif", "a.png"])
+def test_sixteen_bits_are_linear_counts(tmp_path, name):
+    image = photo.read(save(tmp_path / name, SIXTEEN))
+    np.testing.assert_array_equal(image.value, SIXTEEN)
+    assert (image.white, image.black.tolist(), image.cfa, image.lossy) == (65535, [[0]], None, False)
+
+
+def test_half_float_exr_is_linear_of_white_one(tmp_path):
+    pixels = np.linspace(0, 2, 24 * 32 * 3).reshape(24, 32, 3).astype(np.float16)
+    image = photo.read(save(tmp_path / "a.exr", pixels))
+    np.testing.assert_array_equal(image.value, pixels.astype(np.float32))
+    assert (image.white, image.lossy) == (1, False)
+
+
+def test_grey_stands_in_all_channels(tmp_path):
+    image = photo.read(save(tmp_path / "a.tif", SIXTEEN[..., 0]))
+    np.testing.assert_array_equal(image.value, np.stack([SIXTEEN[..., 0]] * 3, -1))
+
+
+def test_eight_bits_are_srgb_with_a_loss(tmp_path):
+    image = photo.read(save(tmp_path / "a.png", EIGHT))
+    assert image.lossy and image.white == 1 and image.value.dtype == np.float32
+    at = dict(zip(EIGHT.ravel().tolist(), image.value.ravel().tolist()))
+    assert at[0] == 0 and at[255] == pytest.approx(1)
+    assert at[119] == pytest.approx(0.1845, abs=2e-4)  # grey of 18 %, from the tables of IEC 61966-2-1
+    assert at[8] == pytest.approx(8 / 255 / 12.92)  # the linear foot
+
+
+def test_encoding_and_levels_may_be_stated(tmp_path):
+    linear = photo.read(save(tmp_path / "a.png", EIGHT), encoding="linear", white=240, black=4)
+    np.testing.assert_array_equal(linear.value, EIGHT)
+    assert (linear.white, linear.black.tolist(), linear.lossy) == (240, [[4]], True)
+    encoded = photo.read(save(tmp_path / "b.tif", SIXTEEN), encoding="srgb")
+    np.testing.assert_allclose(encoded.value, color.decode_srgb(SIXTEEN / 65535), atol=1e-6)
+    assert encoded.lossy
+    floats = photo.read(save(tmp_path / "c.exr", (SIXTEEN / 65535).astype(np.float32)), encoding="srgb")
+    np.testing.assert_allclose(floats.value, encoded.value, atol=1e-6)
+
+
+def test_alpha_neither_counts_nor_multiplies(tmp_path):
+    with_alpha = np.dstack([SIXTEEN[..., ::-1], np.full((24, 32), 1000, np.uint16)])
+    assert cv2.imwrite(str(tmp_path / "a.png"), with_alpha)
+    image = photo.read(tmp_path / "a.png")
+    np.testing.assert_array_equal(image.value, SIXTEEN)
+
+
+def test_jpeg_opens(tmp_path):
+    flat = np.full((24, 32, 3), 128, np.uint8)
+    assert cv2.imwrite(str(tmp_path / "a.jpg"), flat)
+    image = photo.read(tmp_path / "a.jpg")
+    np.testing.assert_allclose(image.value, 0.2158605, atol=2e-3)
+    assert image.lossy
+
+
+def test_unreadable_pictures_are_one_error_each(tmp_path):
+    whole = save(tmp_path / "a.png", SIXTEEN).read_bytes()
+    (tmp_path / "cut.png").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(DecodeError, match=r"cut\.png.*truncated or damaged"):
+        photo.read(tmp_path / "cut.png")
+    (tmp_path / "head.png").write_bytes(whole[:12])
+    with pytest.raises(DecodeError, match=r"head\.png"):
+        photo.read(tmp_path / "head.png")
+    holes = SIXTEEN.astype(np.float32)
+    holes[3, 4, 0] = np.nan
+    with pytest.raises(DecodeError, match=r"nan\.exr: 1 values are not finite"):
+        photo.read(save(tmp_path / "nan.exr", holes))
+    layers = save(tmp_path / "layers.exr", SIXTEEN[..., :2].astype(np.float32), ("U", "V"))
+    with pytest.raises(DecodeError, match=r"channels U, V"):
+        photo.read(layers)
+
+
+def mosaic(height=32, width=40, tint=None):
+    """I(θ) of S = (2000, 600, 300) under the sensor's four analyzers, each pixel its own."""
+    cell = np.empty((2, 2))
+    for angle, at in photo.SENSOR_DEG:
+        twice = 2 * np.radians(angle)
+        cell[at] = (2000 + 600 * np.cos(twice) + 300 * np.sin(twice)) / 2
+    levels = np.tile(cell, (height // 2, width // 2))
+    if tint is not None:
+        levels = levels * np.tile(np.kron(tint, np.ones((2, 2))), (height // 4, width // 4))
+    return levels.round().astype(np.uint16)
+
+
+def test_sensor_planes_obey_malus_law(tmp_path):
+    path = save(tmp_path / "a.png", mosaic())
+    planes = {angle: photo.read_mosaic(path, angle) for angle, _ in photo.SENSOR_DEG}
+    level = {angle: float(plane.value.mean()) for angle, plane in planes.items()}
+    assert level == {0: 1300, 45: 1150, 90: 700, 135: 850}
+    assert planes[0].value.shape == (16, 20, 3) and planes[0].cfa is None
+
+
+def test_sensor_pixel_is_the_one_of_its_angle(tmp_path):
+    counts = np.arange(32 * 40, dtype=np.uint16).reshape(32, 40) + 20000
+    path = save(tmp_path / "a.tif", counts)
+    np.testing.assert_array_equal(photo.read_mosaic(path, 90).value[..., 0], counts[::2, ::2])
+    np.testing.assert_array_equal(photo.read_mosaic(path, 45).value[..., 0], counts[::2, 1::2])
+    np.testing.assert_array_equal(photo.read_mosaic(path, 135).value[..., 0], counts[1::2, ::2])
+    np.testing.assert_array_equal(photo.read_mosaic(path, 0).value[..., 0], counts[1::2, 1::2])
+
+
+def test_sensor_frame_may_be_raw(tmp_path):
+    path = tmp_path / "a.dng"
+    path.write_bytes(headers.dng(mosaic() + 100, photometric=34892, black=[[100]], white=4000))
+    plane = photo.read_mosaic(path, 45, kind="raw")
+    assert (plane.value.mean(), plane.black.tolist(), plane.white) == (1250, [[100]], 4000)
+
+
+def test_colour_sensors_are_refused(tmp_path):
+    three = save(tmp_path / "rgb.png", SIXTEEN)
+    with pytest.raises(DecodeError, match=r"rgb\.png: has 3 channels"):
+        photo.read_mosaic(three, 0)
+    bayer = save(tmp_path / "bayer.png", mosaic(tint=[[0.6, 1], [1, 0.7]]))
+    with pytest.raises(DecodeError, match=r"bayer\.png.*color polarization sensor"):
+        photo.read_mosaic(bayer, 0)
+
+
+@needs_data
+def test_real_sensor_frame_balances():
+    path = DATA / "real/polarization_mosaic/fruits_IMX250MZR.png"
+    planes = {angle: photo.read_mosaic(path, angle).value[..., 0] for angle, _ in photo.SENSOR_DEG}
+    across, between = planes[0] + planes[90], planes[45] + planes[135]  # both are S0
+    usable = np.max(list(planes.values()), axis=0) < 250
+    blurred = [cv2.GaussianBlur(sum_, (0, 0), 2)[usable] for sum_ in (across, between)]
+    assert np.median(abs(blurred[0] - blurred[1]) / blurred[0]) < 0.03

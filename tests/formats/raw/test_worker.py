@@ -1,0 +1,183 @@
+"""The decode worker: whatever happens in the child is one error here, and the next file is read."""
+
+import importlib
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from polcap.errors import ChartError, DecodeError
+from polcap.formats.raw.worker import ChildBug, Worker
+
+FUNCTIONS = """
+    import os, time
+    import numpy as np
+    from polcap.errors import ChartError
+
+    def ramp(path, count=12):
+        print("a library chatters on stdout")
+        return {"path": path, "pid": os.getpid()}, {
+            "ramp": np.arange(count, dtype=np.uint16).reshape(-1, 4)[:, ::2],
+            "empty": np.zeros((0, 3)),
+            "bits": np.array([[True, False]]),
+        }
+
+    def crash(path):
+        os.abort()
+
+    def hang(path):
+        time.sleep(600)
+
+    def hoard(path):
+        return {}, {"much": np.ones(2**29)}
+
+    def refuse(path):
+        raise ChartError(path + ": no chart")
+
+    def spin(path):
+        sum(range(10**15))  # one call into C that never lets go of the interpreter
+
+    def objects(path):
+        return {}, {"pointers": np.array([None])}
+
+    def huge(path):
+        return {}, {"much": np.broadcast_to(np.uint8(0), (2**20, 2**20))}
+
+    def much_text(path):
+        return {"text": "a" * 2**23}, {}
+
+    def mistake(path):
+        raise RuntimeError("a defect")
+"""
+
+
+class Misled(Worker):
+    """A worker that is given functions that misbehave."""
+
+    module: Any
+
+
+@pytest.fixture
+def worker(tmp_path, monkeypatch):
+    (tmp_path / "misbehaving.py").write_text(textwrap.dedent(FUNCTIONS))
+    monkeypatch.syspath_prepend(tmp_path)
+    worker = Misled(timeout_s=300, memory_gib=1.5)
+    worker.module = importlib.import_module("misbehaving")
+    yield worker
+    sys.modules.pop("misbehaving")
+    worker.close()
+
+
+def pid(worker):
+    return worker.call(worker.module.ramp, "next.raw")[0]["pid"]
+
+
+def test_arrays_come_back_as_they_were(worker):
+    meta, arrays = worker.call(worker.module.ramp, "a.raw", count=8)
+    assert meta["path"] == "a.raw" and meta["pid"] != os.getpid()
+    np.testing.assert_array_equal(arrays["ramp"], [[0, 2], [4, 6]])
+    assert arrays["ramp"].dtype == np.uint16 and arrays["ramp"].flags.writeable
+    assert arrays["empty"].shape == (0, 3)
+    assert arrays["bits"].tolist() == [[True, False]]
+
+
+def test_child_is_kept_for_the_next_file(worker):
+    assert pid(worker) == pid(worker)
+
+
+def test_a_child_does_not_look_for_modules_inside_a_package(worker, tmp_path, monkeypatch):
+    package = tmp_path / "package"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "typing.py").write_text("raise ImportError('not the typing of Python')")  # as OpenCV has one
+    monkeypatch.setattr(sys, "path", [str(package), *sys.path])
+    assert worker.call(worker.module.ramp, "next.raw")[0]["path"] == "next.raw"
+
+
+def test_crash_names_the_file_and_the_next_file_is_read(worker):
+    before = pid(worker)
+    with pytest.raises(DecodeError, match=r"broken\.raw: the decoder crashed"):
+        worker.call(worker.module.crash, "broken.raw")
+    assert pid(worker) != before
+
+
+def test_hang_ends_at_the_time_limit_and_the_next_file_is_read(worker):
+    worker.timeout_s = 0.5  # of the decoding: however long the child takes to start
+    with pytest.raises(DecodeError, match=r"slow\.raw: not decoded within 0\.5 s"):
+        worker.call(worker.module.hang, "slow.raw")
+    worker.timeout_s = 300
+    assert pid(worker)
+
+
+def test_memory_beyond_the_limit_is_refused_and_the_next_file_is_read(worker):
+    with pytest.raises(DecodeError, match=r"huge\.raw.*memory"):
+        worker.call(worker.module.hoard, "huge.raw")
+    assert pid(worker)
+
+
+def test_an_error_of_the_function_keeps_its_class_and_its_child(worker):
+    before = pid(worker)
+    with pytest.raises(ChartError, match=r"^a\.raw: no chart$"):
+        worker.call(worker.module.refuse, "a.raw")
+    assert pid(worker) == before
+
+
+def test_a_defect_of_our_own_is_a_bug_with_the_childs_traceback(worker):
+    with pytest.raises(ChildBug, match=r"odd\.raw: RuntimeError: a defect") as caught:
+        worker.call(worker.module.mistake, "odd.raw")
+    assert 'raise RuntimeError("a defect")' in caught.value.__notes__[0]
+    assert pid(worker)
+
+
+@pytest.mark.parametrize("answer", ["objects", "huge", "much_text"])
+def test_an_answer_beyond_its_bounds_is_refused(worker, answer):
+    with pytest.raises(DecodeError, match=r"odd\.raw"):
+        worker.call(getattr(worker.module, answer), "odd.raw")
+    assert pid(worker)
+
+
+def test_a_call_may_have_tighter_limits(worker):
+    with pytest.raises(DecodeError, match=r"slow\.raw: not decoded within 0\.5 s"):
+        worker.call(worker.module.hang, "slow.raw", limit_s=0.5)
+    with pytest.raises(DecodeError, match=r"large\.raw.*more than 0\.2 GiB"):
+        worker.call(worker.module.ramp, "large.raw", limit_gib=0.2, count=2**28)
+    assert worker.call(worker.module.ramp, "large.raw", count=2**28)[1]["ramp"].size == 2**27
+
+
+@pytest.mark.skipif(os.name != "posix", reason="elsewhere the time limit ends it")
+@pytest.mark.parametrize("loop", ["spin", "hang"])
+def test_a_child_in_a_loop_dies_with_its_parent(worker, tmp_path, loop):
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1]); import misbehaving\n"
+        "from polcap.formats.raw.worker import Worker\n"
+        "w = Worker(); print(w.call(misbehaving.ramp, 'a')[0]['pid'], flush=True)\n"
+        f"w.call(misbehaving.{loop}, 'b')"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE)
+    child = int(parent.stdout.readline())
+    time.sleep(0.3)  # it is in the loop
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    parent.stdout.close()
+    for _ in range(2000):
+        try:
+            os.kill(child, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.05)
+    os.kill(child, signal.SIGKILL)
+    pytest.fail("the child outlived its parent")
+
+
+def test_fifty_megabytes_cross_in_less_time_than_they_take_to_decode(worker):
+    pid(worker)
+    start = time.process_time()
+    _, arrays = worker.call(worker.module.ramp, "large.raw", count=50_000_000)  # 50 MB of every other column
+    assert arrays["ramp"].nbytes == 50_000_000
+    assert time.process_time() - start < 2.0  # of this process' own; measured 0.15 s

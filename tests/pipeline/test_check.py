@@ -1,0 +1,145 @@
+"""`polcap check` keeps what is good, and of what is not it names the fault and the shot."""
+
+import json
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polcap.config import Config
+from polcap.errors import CaptureError, ChartError
+from polcap.formats import calib
+from polcap.formats.capture import reader as captures
+from polcap.formats.raw import dng, probe
+from polcap.formats.raw import libraw as raw
+from polcap.images import ChartRequest
+from polcap.pipeline import check
+from polcap.pipeline.check import Networks, Verdict
+from polcap.pipeline.path import AUTO
+from polcap.pipeline.small_capture import reduce
+from polcap.stages import hdr, whitebalance
+from tests import faulty
+from tests.conftest import Command
+
+WIDTH = 512  # the chart must be found: without its greys order and angles are told less well
+
+
+def verdict(folder: Path) -> Verdict:
+    return check.inspect(captures.read(folder), without_networks, Config())
+
+
+def without_networks() -> Networks:
+    return None, None
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_ordinary_jitter_and_nudges_are_kept(tmp_path: Path, seed: int) -> None:
+    faulty.shoot(tmp_path / "good", seed, "", WIDTH)
+    found = verdict(tmp_path / "good")
+    assert found.keep, check.table(found)
+
+
+@pytest.mark.parametrize("fault", [name for name, lines in faulty.FAULTS.items() if lines and name != "wrong angle"])
+def test_planted_fault_is_named(tmp_path: Path, fault: str) -> None:
+    faulty.shoot(tmp_path / "bad", 1, fault, WIDTH)
+    found = verdict(tmp_path / "bad")
+    failed = {line.name for line in found.lines if line.state == "fail"}
+    assert failed & set(faulty.FAULTS[fault]), check.table(found)
+    assert all(line.remedy for line in found.lines if line.state in ("warn", "fail"))
+
+
+def test_one_turned_shot_of_three_is_told_with_the_ring_that_it_looks_like(tmp_path: Path) -> None:
+    faulty.shoot(tmp_path / "bad", 1, "wrong angle", WIDTH)
+    line = next(line for line in verdict(tmp_path / "bad").lines if line.name == "angles")
+    assert line.state == "warn" and line.cost_deg > 1
+    assert "ring's zero" in line.says and "single shot" in line.says and "take it again" in line.remedy
+
+
+def test_process_measures_the_blur_that_check_measures(tmp_path: Path) -> None:
+    faulty.shoot(tmp_path / "bad", 1, "defocus", 256)
+    capture = captures.read(tmp_path / "bad")
+    merged = hdr.merge(capture, Config().hdr)
+    assert merged.blur_px is not None and np.nanmax(merged.blur_px) > Config().gates.max_blur_px
+    with ThreadPoolExecutor(2) as pool:
+        np.testing.assert_array_equal(merged.blur_px, reduce(capture, 0.98, pool).blur_px)
+
+
+def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path) -> None:
+    faulty.shoot(tmp_path / "small", 1, "", 200)  # too small for a chart to be found
+    capture = captures.read(tmp_path / "small")
+    found = verdict(tmp_path / "small")
+    line = next(line for line in found.lines if line.name == "chart")
+    assert line.state == "warn" and found.needs == "--no-chart" and "--no-chart" in line.remedy
+    with pytest.raises(ChartError):
+        whitebalance.measure(hdr.merge(capture, Config().hdr), calib.colorchecker(), AUTO, Config().whitebalance)
+    asked = check.inspect(capture, without_networks, Config(), chart=ChartRequest("none"))
+    assert asked.needs == "" and next(line for line in asked.lines if line.name == "chart").state == "not measured"
+
+
+def test_missing_frame_is_bad_input(tmp_path: Path) -> None:
+    faulty.shoot(tmp_path / "bad", 1, "missing", 128)
+    with pytest.raises(CaptureError, match=r"2 frames where .* has 3"):
+        captures.read(tmp_path / "bad")
+
+
+def test_command_tells_keep_and_writes_nothing(example: Path, polcap: Command, tmp_path: Path) -> None:
+    folder = tmp_path / "capture"
+    shutil.copytree(example, folder)
+    before = {file: file.stat().st_mtime_ns for file in folder.rglob("*")}
+    done = polcap("check", folder)
+    assert done.returncode == 0, done.stdout
+    assert done.stdout.startswith("keep")
+    assert len(done.stdout.splitlines()) <= 26  # one screen
+    assert {file: file.stat().st_mtime_ns for file in folder.rglob("*")} == before
+
+
+def test_command_ends_with_3_and_one_document(example: Path, polcap: Command, tmp_path: Path) -> None:
+    for name, other in (("pol000", "pol045"), ("pol045", "pol000"), ("pol090", "pol090")):
+        shutil.copytree(example / name, tmp_path / "capture" / other)
+    done = polcap("check", tmp_path / "capture", "--json")
+    about = json.loads(done.stdout)
+    assert done.returncode == 3
+    assert about["verdict"] == "reshoot" and not about["keep"]
+    assert [line["name"] for line in about["lines"] if line["state"] == "fail"] == ["order"]
+
+
+def test_ambient_light_is_measured(example: Path, tmp_path: Path) -> None:
+    frames = []
+    for angle in (0, 45, 90):
+        files = sorted((example / f"pol{angle:03d}").glob("*.DNG"))
+        for file in files:
+            shutil.copy(file, tmp_path)
+            frames.append(f'[[frame]]\nfile = "{file.name}"\nangle = {angle}\n')
+        middle = raw.read(files[1])
+        dark = middle.value.astype(float) - middle.black.mean()
+        dng.write(
+            tmp_path / f"dark{angle}.dng",
+            (middle.black.mean() + dark / 5).astype(np.uint16),
+            cfa=middle.cfa,
+            black=float(middle.black.mean()),
+            white=middle.white,
+            exif=probe.read(files[1]).exif,
+            color_matrix=np.eye(3),
+            as_shot_neutral=np.ones(3),
+        )
+        frames.append(f'[[frame]]\nfile = "dark{angle}.dng"\nrole = "ambient"\nangle = {angle}\n')
+    (tmp_path / "capture.toml").write_text("".join(frames))
+    line = next(line for line in verdict(tmp_path).lines if line.name == "ambient")
+    assert line.state == "fail"
+    # of all the light
+    assert line.value == pytest.approx(0.2, rel=0.05)
+
+
+def test_reduced_picture_keeps_what_is_clipped(example: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("polcap.pipeline.small_capture._MOST_PIXELS", 7e4)
+    capture = captures.read(example)
+    with ThreadPoolExecutor(2) as pool:
+        taken = reduce(capture, 0.98, pool)
+    assert taken.step == 4
+    assert taken.capture.size_px == (288, 216)
+    brightest = taken.capture.shots[0].frames[2].load()
+    assert brightest.cfa is None and brightest.value.shape == (216, 288, 3)
+    assert ((taken.clipped[0, 2] > 0) == (brightest.value == 1).all(-1)).all()
+    assert taken.clipped[0, 2].mean() > 0.001

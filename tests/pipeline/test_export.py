@@ -1,0 +1,211 @@
+"""`polcap export`: every preset whole and valid, the same bytes whenever, one line where it cannot."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from polcap.formats.export import encoders
+from polcap.formats.export.presets import PRESETS
+from polcap.formats.maps import png
+from tests.conftest import ROOT, Command, shell
+from tests.formats.export.test_gltf import NODE, document
+
+
+@pytest.fixture(scope="module")
+def exported(result: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The bundled capture's result with every preset exported."""
+    from polcap.pipeline import run as pipeline
+    from polcap.pipeline.asset_export import ExportRequest
+
+    pytest.importorskip("pxr", reason="needs usd-core")
+    copy = tmp_path_factory.mktemp("export") / "copy"
+    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
+    for preset in PRESETS:
+        pipeline.export(copy, ExportRequest(preset=preset))
+    return copy
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_validator_finds_no_error_and_no_warning(exported: Path, preset: str) -> None:
+    node = shutil.which("node")
+    if node is None or not (NODE / "node_modules" / "gltf-validator").is_dir():
+        pytest.skip("needs node, and `npm ci` in tests/gltf")
+    (glb,) = (exported / "asset" / preset).glob("*.glb")
+    done = subprocess.run([node, str(NODE / "validate.js"), str(glb)], capture_output=True, check=True, timeout=300)
+    issues = json.loads(done.stdout)["issues"]
+    assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_maps_json_and_the_files_say_what_they_hold(exported: Path, preset: str) -> None:
+    said = json.loads((exported / "maps" / "maps.json").read_text())["exports"][f"asset/{preset}"]
+    assert said["unit"] in ("m", "relative") and "+Y" in said["for"]
+    for name, meaning in said["textures"].items():
+        assert meaning.encode() in (exported / "asset" / preset / name).read_bytes()[:300]
+
+
+def test_maps_json_and_report_json_agree_and_state_units(exported: Path) -> None:
+    said = json.loads((exported / "maps" / "maps.json").read_text())
+    about = json.loads((exported / "report.json").read_text())
+    assert about["figures"]["object"]["crop"] == said["crop"] and about["units"]["object.crop"] == "RAW px"
+    assert about["figures"]["maps"]["estimator"] == said["estimator"]
+    assert about["units"]["mesh.extent"] == said["depth"]["unit"]
+    assert about["capture"]["focal_known"] == said["camera"]["focal_known"]
+    assert about["capture"]["focal_px"] == pytest.approx(said["camera"]["focal_px"] * said["scale"])
+
+
+def test_unreal_gets_green_down_and_unity_smoothness(exported: Path) -> None:
+    assets = exported / "asset"
+    down, up = (png.read(assets / name) for name in ("unreal/T_capture_N.png", "unity/capture_Normal.png"))
+    assert np.array_equal(down[..., 1], 255 - up[..., 1]) and np.array_equal(down[..., ::2], up[..., ::2])
+    packed, mask = (png.read(assets / name) for name in ("unreal/T_capture_ORM.png", "unity/capture_MaskMap.png"))
+    assert np.array_equal(mask[..., 3], 255 - packed[..., 1]) and mask[..., 0].max() == 0
+
+
+def test_an_asset_and_the_textures_beside_it_are_spelled_alike(result: Path, tmp_path: Path) -> None:
+    from polcap.pipeline import run as pipeline
+    from polcap.pipeline.asset_export import ExportRequest
+
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work", "asset"))
+    about = json.loads((copy / "report.json").read_text())
+    about["capture"]["name"] = "blue jug 7"
+    (copy / "report.json").write_text(json.dumps(about))
+    named = {file.name for file in pipeline.export(copy, ExportRequest(preset="unreal", texture_size=64))}
+    assert {"SM_blue_jug_7.glb", "T_blue_jug_7_N.png"} <= named and not any(" " in name for name in named)
+
+
+def test_sidecar_knows_photographs_settings_and_files(exported: Path) -> None:
+    told = json.loads((exported / "asset" / "archive" / "capture.provenance.json").read_text())
+    about = json.loads((exported / "report.json").read_text())
+    assert [one["sha256"] for one in told["photographs"]] == [
+        frame["digest"] for shot in about["capture"]["shots"] for frame in shot["frames"]
+    ]
+    assert told["settings"] == about["settings"] and told["stages"] == about["keys"]
+    assert told["versions"]["polcap"] == about["polcap"] and "numpy" in told["versions"]
+    files = {file.name for file in (exported / "asset" / "archive").iterdir()}
+    assert set(told["files"]) == files - {"capture.provenance.json"}
+    packet = document((exported / "asset/archive/capture.glb").read_bytes())["extensions"]["KHR_xmp_json_ld"][
+        "packets"
+    ][0]
+    assert json.loads(packet["polcap:settings"]) == about["settings"]
+
+
+def test_exporting_again_gives_the_bytes_that_process_wrote(result: Path, polcap: Command, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
+    before = {file.name: file.read_bytes() for file in (copy / "asset").iterdir()}
+    shutil.rmtree(copy / "asset")
+    cv2.setNumThreads(1)
+    try:
+        assert polcap("export", copy).returncode == 0
+    finally:
+        cv2.setNumThreads(-1)
+    assert {file.name: file.read_bytes() for file in (copy / "asset").iterdir()} == before
+    assert (copy / "maps/maps.json").read_bytes() == (result / "maps/maps.json").read_bytes()
+
+
+@pytest.fixture
+def own(result: Path, tmp_path: Path) -> Path:
+    """The result in a folder of its own: an export locks it, and other tests run beside this one."""
+    copy = tmp_path / "own"
+    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
+    return copy
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        (["--preset", "maya"], f"'maya' is not one of {', '.join(map(repr, PRESETS))}"),
+        (["--preset", "web", "--obj"], "leave out --obj"),
+        (["--exr", "--color", "ACEScq"], "--color ACEScq is not a color space or role"),
+    ],
+)
+def test_what_does_not_exist_is_one_line(own: Path, polcap: Command, flags: list[str], says: str) -> None:
+    done = polcap("export", own, *flags)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and says in done.stderr
+
+
+def test_ktx2_needs_an_encoder_and_says_so(own: Path, polcap: Command) -> None:
+    if encoders.ktx2_encoder() is not None:
+        pytest.skip("an encoder is here")
+    done = polcap("export", own, "--gltf", "--images", "ktx2")
+    assert done.returncode == 2 and "ktx" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_encoder_on_the_path_makes_ktx2_textures(
+    result: Path, polcap: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stand-in for `toktx` keeps its arguments and writes KTX2's identifier: the way there, not the compression."""
+    encoder = tmp_path / "bin" / "toktx"
+    encoder.parent.mkdir()
+    encoder.write_text(
+        '#!/bin/sh\necho "$@" >> "$0.log"\nfor last; do before=$out; out=$last; done\n'
+        "printf '\\253KTX 20\\273\\r\\n\\032\\n' > \"$before\"\n"
+    )
+    encoder.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{encoder.parent}:{os.environ['PATH']}")
+    monkeypatch.setattr(encoders, "_PROGRAMS", ("toktx",))
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
+    done = polcap("export", copy, "--gltf", "--images", "ktx2")
+    assert done.returncode == 0, done.stderr
+    said = document((copy / "asset" / "capture.glb").read_bytes())
+    assert said["extensionsRequired"] == ["KHR_texture_basisu"]
+    assert {image["mimeType"] for image in said["images"]} == {"image/ktx2"}
+    assert all("KHR_texture_basisu" in texture["extensions"] for texture in said["textures"])
+    calls = Path(f"{encoder}.log").read_text().splitlines()
+    assert sorted("--assign_oetf srgb" in call for call in calls) == [False, False, True, True]  # data, colours
+
+
+def test_the_example_of_presets_runs(result: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
+    script = ROOT / "examples" / "export_presets.py"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, script, copy], capture_output=True, text=True, env=environment, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "T_capture_N.png: tangent-space normal n * 0.5 + 0.5, -Y" in done.stdout
+
+
+def test_usd_without_its_package_is_one_line_with_the_remedy(
+    own: Path, polcap: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    done = polcap("export", own, "--usd")
+    assert done.returncode == 2 and "pip install 'polcap[usd]'" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_number_of_threads_changes_no_byte(example: Path, tmp_path: Path) -> None:
+    """Two whole runs; the network's own sums are tested with it (tests/training/test_profiles.py)."""
+    found = []
+    for threads in (1, 2):
+        out = tmp_path / str(threads)
+        done = shell("process", example, "--out", out, "--estimator", "analytic", "--threads", threads)
+        assert done.returncode == 0, done.stderr
+        found.append({file.name: file.read_bytes() for part in ("maps", "asset") for file in (out / part).iterdir()})
+        found[-1] |= {str(file.relative_to(out)): file.read_bytes() for file in (out / "work").rglob("*.npy")}
+    assert [name for name in found[0] if found[0][name] != found[1][name]] == [] and found[0].keys() == found[1].keys()
+
+
+def test_texture_size_and_levels_of_detail(result: Path, tmp_path: Path) -> None:
+    from polcap.pipeline import run as pipeline
+    from polcap.pipeline.asset_export import ExportRequest
+
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
+    pipeline.export(copy, ExportRequest(formats=("gltf",), texture_size=128, lod=2))
+    levels = json.loads((copy / "maps" / "maps.json").read_text())["exports"]["asset"]["lods"]
+    counts = []
+    for name, told in levels.items():
+        glb = document((copy / "asset" / name).read_bytes())
+        counts.append(glb["accessors"][glb["meshes"][0]["primitives"][0]["indices"]]["count"] // 3)
+        assert counts[-1] == told["triangles"] and told["error"].split()[1] in ("mm", "px")
+    assert len(counts) == 2 and counts[0] == pytest.approx(4 * counts[1], rel=0.1)

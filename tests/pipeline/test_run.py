@@ -1,0 +1,347 @@
+"""The whole path on the bundled capture: right, resumable, and clear where the input is at fault."""
+
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from polcap.config import Config
+from polcap.errors import ObjectError, StorageError
+from polcap.formats.capture import reader as captures
+from polcap.formats.maps import maps_folder as maps
+from polcap.images import AngleStack, ColorCalibration, View
+from polcap.pipeline import models
+from polcap.pipeline import run as pipeline
+from polcap.pipeline.path import STAGES, UserInput, distance_m, on_grid
+from tests.conftest import ROOT, Command
+
+
+def product(folder: Path) -> dict[str, bytes]:
+    """The maps and the asset, byte for byte."""
+    found = [file for part in ("maps", "asset") for file in (folder / part).iterdir()]
+    return {f"{file.parent.name}/{file.name}": file.read_bytes() for file in sorted(found)}
+
+
+def partial(folder: Path) -> list[Path]:
+    """Files that a run left under a temporary name, and empty ones."""
+    files = [file for file in folder.rglob("*") if file.is_file() and file.name != "lock"]
+    return [file for file in files if ".part" in file.name or file.stat().st_size == 0]
+
+
+def test_result_holds_what_the_contract_names(result: Path) -> None:
+    named = """maps/normal.exr maps/normal.png maps/depth.exr maps/depth.png maps/diffuse.exr maps/diffuse.png
+        maps/specular.exr maps/specular.png maps/roughness.exr maps/roughness.png maps/mask.png maps/confidence.exr
+        maps/stokes.exr maps/cues.exr maps/maps.json asset/capture.glb asset/capture.obj asset/capture.mtl
+        report.html report.json color.toml work"""
+    assert [name for name in named.split() if not (result / name).exists()] == []
+    assert partial(result) == []
+
+
+def test_the_chart_of_one_capture_serves_another(polcap: Command, result: Path, example: Path, tmp_path: Path) -> None:
+    """As a file of the result: the same colors, and nothing of a chart in the other's result."""
+    command = ("process", example, "--out", tmp_path, "--estimator", "analytic")
+    assert polcap(*command, "--chart", result / "color.toml").returncode in (0, 3)
+    ours, theirs = (pipeline.reopen(folder)[0].color for folder in (tmp_path, result))
+    assert (ours.source, theirs.source) == ("profile", "chart")
+    np.testing.assert_allclose(ours.matrix, theirs.matrix, atol=1e-8)
+    assert not (tmp_path / "color.toml").exists()
+
+
+def test_normals_of_the_bundled_capture_are_near_the_truth(result: Path, example: Path) -> None:
+    """Analytic estimator, three noisy shots with 1 % flash jitter and moved by up to 1.5 px: under 12° on the mean."""
+    truth = np.load(example / "truth.npz")
+    found = maps.read(result / "maps").maps
+    (x, y), (height, width) = map(round, found.view.origin), found.mask.shape
+    normal = truth["normal"].astype(np.float64)
+    binned = sum(normal[i::2, j::2] for i in (0, 1) for j in (0, 1))[y : y + height, x : x + width]
+    length = np.linalg.norm(binned, axis=-1)
+    inside = found.mask & (length > 3.5)  # the four pixels agree: no outline between them
+    cosine = (found.normal * binned).sum(-1)[inside] / length[inside]
+    assert inside.sum() > 0.9 * found.mask.sum()
+    assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean() < 12
+
+
+def test_running_again_computes_nothing_and_gives_the_same_bytes(
+    result: Path, example: Path, polcap: Command, tmp_path: Path
+) -> None:
+    copy = tmp_path / "again"
+    shutil.copytree(result, copy)
+    again = polcap("process", example, "--out", copy, "--estimator", "analytic")
+    states = [line.split()[1] for line in again.stderr.splitlines() if line.startswith(STAGES)]
+    assert states.count("cached") == 8 and again.returncode == 0
+    assert product(copy) == product(result)
+
+
+def test_a_touched_or_missing_file_is_written_again(
+    result: Path, example: Path, polcap: Command, tmp_path: Path
+) -> None:
+    copy = tmp_path / "again"
+    shutil.copytree(result, copy)
+    (copy / "maps" / "normal.png").write_bytes(b"touched")
+    (copy / "asset" / "capture.obj").unlink()
+    assert polcap("process", example, "--out", copy, "--estimator", "analytic").returncode == 0
+    assert product(copy) == product(result)
+
+
+def test_late_changes_end_as_a_first_run_with_these_settings_does(
+    result: Path, example: Path, polcap: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline, "timings", lambda out: {})  # no two runs take the same time
+    late, first = tmp_path / "late", tmp_path / "first"
+    shutil.copytree(result, late)
+    command = ("process", example, "--estimator", "analytic")
+    settings = list[str]()
+    for setting in ("gates.max_normal_error_deg=1", "asset.ior=1.4", "gates.max_turn_deg=4"):
+        settings += ["--set", setting]
+        assert polcap(*command, "--out", late, *settings).returncode == 3
+    settings += ["--set", "asset.ior=1.45"]
+    assert polcap(*command, "--out", late, *settings).returncode == 3
+    assert polcap(*command, "--out", first, *settings).returncode == 3
+    assert product(late) == product(first)
+    shutil.rmtree(tmp_path / "late" / "asset")
+    assert polcap(*command, "--out", late, *settings).returncode == 3
+    assert product(late) == product(first)
+    told, again = (json.loads((out / "report.json").read_text(encoding="utf-8")) for out in (late, first))
+    assert told == again
+    assert (late / "report.html").read_bytes() == (first / "report.html").read_bytes()
+
+
+def test_killed_run_resumes_and_gives_the_same_bytes(result: Path, example: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "polcap", "process", str(example), "--out", str(tmp_path)]
+    command += ["--estimator", "analytic"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    random = np.random.default_rng(0)
+    for _ in range(3):
+        process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+        assert process.stderr is not None
+        for line in process.stderr:  # killed a moment after a stage that this run had to compute
+            if line.rstrip().endswith(" s"):
+                time.sleep(float(random.uniform(0, 0.4)))
+                break
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        process.stderr.close()
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert product(tmp_path) == product(result)
+    assert partial(tmp_path) == []
+
+
+def test_interrupted_run_ends_with_130_and_one_line(example: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "polcap", "process", str(example), "--out", str(tmp_path)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    seen = []
+    for line in process.stderr:
+        seen.append(line)
+        if line.startswith("hdr"):
+            process.send_signal(signal.SIGINT)
+    assert process.wait() == 130
+    assert seen[-1] == "polcap: interrupted; run the same command again to go on\n"
+
+
+def broken(example: Path, folder: Path, fault: str) -> Path:
+    """The bundled capture with one thing wrong."""
+    if fault == "empty folder":
+        folder.mkdir()
+        return folder
+    shutil.copytree(example, folder)
+    middle = folder / "pol045" / "IMG_0005.DNG"
+    if fault == "truncated RAW":
+        os.truncate(middle, middle.stat().st_size // 2)
+    elif fault == "missing angle":
+        shutil.rmtree(folder / "pol045")
+    elif fault == "missing frame":
+        middle.unlink()
+    elif fault == "two shots swapped":
+        (folder / "pol000").rename(folder / "x")
+        (folder / "pol045").rename(folder / "pol000")
+        (folder / "x").rename(folder / "pol045")
+    elif fault == "mixed cameras":
+        for file in (folder / "pol045").iterdir():
+            data = file.read_bytes()
+            assert b"Synthetic\0" in data
+            file.write_bytes(data.replace(b"Synthetic\0", b"Different\0"))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("empty folder", ["no photograph"]),
+        ("truncated RAW", ["IMG_0005.DNG"]),
+        ("missing angle", ["0, 90", "3"]),
+        ("missing frame", ["45"]),
+        ("two shots swapped", ["45°, 0°, 90°"]),
+        ("mixed cameras", ["Different"]),
+    ],
+)
+def test_faulty_capture_is_one_clear_line_and_leaves_nothing(
+    example: Path, tmp_path: Path, polcap: Command, fault: str, words: list[str]
+) -> None:
+    out = tmp_path / "out"
+    done = polcap("process", broken(example, tmp_path / "capture", fault), "--out", out)
+    errors = [line for line in done.stderr.splitlines() if line.startswith("polcap:")]
+    assert done.returncode == 2 and len(errors) == 1 and done.stdout == "", done.stderr
+    assert all(word in errors[0] for word in words), errors[0]
+    assert not (out / "maps").exists() and not (out / "asset").exists() and partial(out) == []
+
+
+def test_capture_without_chart_says_so_and_passes_with_no_chart(tmp_path: Path, polcap: Command) -> None:
+    from polcap.synth.scenes import random_scene
+    from polcap.synth.shooting import Shoot, write
+
+    scene = random_scene(3, "bumps")
+    bare = type(scene)(**{**{f: getattr(scene, f) for f in scene.__struct_fields__}, "chart": None})
+    write(tmp_path / "c", bare, Shoot(seed=3, width=384, height=288, exposures=1, samples=1))
+    done = polcap("process", tmp_path / "c", "--until", "whitebalance")
+    assert done.returncode == 2 and "--no-chart" in done.stderr.splitlines()[-1]
+    done = polcap("process", tmp_path / "c", "--no-chart", "--estimator", "analytic")
+    assert done.returncode in (0, 3), done.stderr
+    assert (tmp_path / "c" / "polcap" / "asset" / "c.glb").exists()
+
+
+def test_full_disk_is_one_clear_line_and_leaves_no_partial_file(example: Path, tmp_path: Path) -> None:
+    """A file system of 3 MB where the system lets us mount one, else a limit on the size of files."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = (
+        subprocess.run(["mount", "-t", "tmpfs", "-o", "size=3m", "none", disk], capture_output=True).returncode == 0
+    )
+    limit = None if mounted else lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "polcap", "process", str(example), "--out", str(disk / "out")],
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+            preexec_fn=limit,
+            timeout=300,
+        )
+        assert done.returncode == 2, done.stderr
+        assert "disk is full" in done.stderr.splitlines()[-1] or "larger than" in done.stderr.splitlines()[-1]
+        assert partial(disk) == [] and not (disk / "out" / "work" / "01-hdr").exists()
+    finally:
+        if mounted:
+            subprocess.run(["umount", disk], check=True)
+
+
+@pytest.mark.parametrize("part", ["formats.maps.exr.write", "report.page._pictures", "pipeline.asset_export.write"])
+def test_an_output_that_cannot_be_written_is_one_clear_line(
+    result: Path, example: Path, polcap: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str
+) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise StorageError("cannot write it: the disk is full")
+
+    copy = tmp_path / "again"
+    shutil.copytree(result, copy)
+    before = product(copy)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    monkeypatch.setattr(f"polcap.{part}", refuse)
+    done = polcap("process", example, "--out", copy, "--estimator", "analytic", "--force", "asset")
+    assert done.returncode == StorageError.exit_code
+    assert [line for line in done.stderr.splitlines() if "cannot write" in line] == [
+        "polcap: error: cannot write it: the disk is full"
+    ]
+    assert partial(copy) == []
+    assert {**product(copy), "maps/maps.json": b""} == {**before, "maps/maps.json": b""}  # it tells of no export then
+
+
+def test_read_only_folder_is_one_clear_line(example: Path, tmp_path: Path, polcap: Command) -> None:
+    place = tmp_path / "shut"
+    place.mkdir()
+    place.chmod(0o555)
+    if os.access(place, os.W_OK):  # root writes anywhere but here
+        place = Path("/sys/kernel")
+    done = polcap("process", example, "--out", place / "out")
+    assert done.returncode == 2 and not (place / "out").exists()
+    assert "may be written" in done.stderr.splitlines()[-1] or "read-only" in done.stderr.splitlines()[-1]
+
+
+def test_photographs_are_never_touched(example: Path, tmp_path: Path, polcap: Command) -> None:
+    before = {file: (file.stat().st_mtime_ns, file.stat().st_size) for file in example.rglob("*.DNG")}
+    assert polcap("process", example, "--out", example).returncode == 2
+    assert polcap("process", example, "--out", tmp_path, "--until", "hdr").returncode == 0
+    assert before == {file: (file.stat().st_mtime_ns, file.stat().st_size) for file in example.rglob("*.DNG")}
+    assert not (example / "work").exists()
+
+
+def test_plan_tells_what_is_cached(result: Path, example: Path) -> None:
+    found = captures.read(example)
+    supplied = UserInput(mask_network=models.load_mask_network())
+    states = pipeline.plan(found, supplied, Config(), result)
+    assert set(states.values()) == {"cached", "on demand"}
+    states = pipeline.plan(found, supplied, Config(), result, force="mask")
+    assert states["align"] == "cached" and states["mask"] == states["surface"] == "compute"
+
+
+def stack(height: int, width: int, scale: float) -> AngleStack:
+    empty = np.zeros((3, height, width, 3), np.float32)
+    view = View(100.0, (0.0, 0.0), scale)
+    one = np.ones((3, 1))
+    return AngleStack(
+        empty,
+        empty,
+        empty[..., 0].astype(np.uint8),
+        one[:, 0],
+        view,
+        empty[:, :1, 0],
+        one,
+        one[:, 0],
+        False,
+        None,
+        None,
+    )
+
+
+def test_mask_may_be_drawn_on_either_grid() -> None:
+    coarse = np.zeros((4, 6), bool)
+    coarse[1:3, 2:5] = True
+    fine = coarse.repeat(2, 0).repeat(2, 1)
+    for drawn in (coarse, fine):
+        placed = on_grid(drawn, stack(4, 6, 2.0))
+        assert placed is not None and np.array_equal(placed, coarse)
+    with pytest.raises(ObjectError, match="5×4 px"):
+        on_grid(np.zeros((4, 5), bool), stack(4, 6, 2.0))
+
+
+def test_distance_follows_from_the_size_of_the_chart() -> None:
+    """Similar triangles: 1 mm per pixel at a focal length of 100 px is 0.1 m away."""
+    color = ColorCalibration(np.eye(3), None, None, None, "chart", 0.0, 1e-3)
+    assert distance_m(color, stack(2, 2, 1.0)) == pytest.approx(0.1)
+
+
+def test_the_example_from_python_runs(result: Path, example: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy)
+    script = ROOT / "examples" / "from_python.py"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, script, example, copy], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0 and "stillness pass" in done.stdout, done.stderr
+
+
+def test_the_gallery_shows_each_result_and_stands_alone(result: Path, tmp_path: Path) -> None:
+    copy, page = tmp_path / "copy", tmp_path / "gallery.html"
+    shutil.copytree(result, copy)
+    command = [sys.executable, *map(str, (ROOT / "examples" / "gallery.py", page, copy, copy))]
+    done = subprocess.run(command, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    text = page.read_text()
+    assert text.count("data:image/webp") == 2 and text.count('<a href="copy/report.html">') == 2
+    assert "http" not in text
+
+
+def test_a_start_loads_no_library_that_only_some_runs_need() -> None:
+    loaded = "print([m for m in ('scipy', 'onnxruntime') if m in sys.modules])"
+    code = f"import sys, polcap.pipeline.run, polcap.pipeline.check; {loaded}"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

@@ -1,0 +1,282 @@
+"""Each gate speaks of its own fault, in words, beyond its own error; nothing speaks on a good capture."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from polcap.config import Config
+from polcap.images import SurfaceMaps
+from polcap.quality import gates
+from polcap.quality.gate import Evidence
+from polcap.quality.gates import Gate
+from polcap.stages import selfcal, stokes
+from tests import scenes
+
+
+def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> Evidence:
+    """A ball well photographed, or with something of it changed."""
+    radiance = changed.pop("radiance", scenes.stack(noise=0.002, angles=angles))
+    shots = len(radiance.angle)
+    object_ = scenes.ball_object()
+    unchecked = selfcal.Settings(check_order=False)
+    gains = selfcal.solve(radiance, scenes.still(shots), object_, scenes.no_color(), unchecked)
+    gains = changed.pop("gains", replace(gains, source="grey patches", sigma=0 * gains.sigma, disagreement=0.0))
+    image = stokes.solve(radiance, scenes.still(shots), gains, object_, stokes.Settings())
+    normal = scenes.truth()[0].astype(np.float32)
+    flat = np.full(image.mask.shape, 0.5, np.float32)
+    maps = SurfaceMaps(normal, normal, normal, flat, None, 8 * flat, image.mask, image.view, "analytic")
+    given = {
+        "names": [f"{np.degrees(a):g}°" for a in radiance.angle], "focal_doubt": (0.0, 0.0), "grid_px": 1.0,
+        "chart_missing": "", "clipped": clipped(), "blur_px": radiance.blur_px, "radiance": radiance,
+        "color": scenes.no_color(), "alignment": scenes.still(shots), "object_": object_, "gains": gains,
+        "stokes": image, "maps": maps,
+    }  # fmt: skip
+    return Evidence.partial(**{**given, **changed})
+
+
+def clipped(second_shot: float = 0.0) -> np.ndarray:
+    """(K, E, H, W): the share of each pixel of the ball that is clipped in three shots of one exposure."""
+    share = np.zeros((3, 1, *scenes.ball_object().mask.shape))
+    share[1] = second_shot
+    return share
+
+
+@pytest.fixture(scope="module")
+def good() -> Evidence:
+    return found()
+
+
+def judged(of: Evidence) -> dict[str, Gate]:
+    return {gate.name: gate for gate in gates.judge(of, Config())}
+
+
+def failed(of: Evidence) -> list[str]:
+    return [name for name, gate in judged(of).items() if gate.state == "fail"]
+
+
+def test_nothing_fails_on_a_good_capture(good: Evidence) -> None:
+    assert failed(good) == []
+    assert gates.verdict(judged(good).values()) == "warn"  # one exposure per shot
+
+
+def changed(good: Evidence, **fields: Any) -> Evidence:
+    return Evidence.partial(**{**vars(good), **fields})
+
+
+def test_each_gate_fails_alone(good: Evidence) -> None:
+    radiance, gains, maps = good.radiance, good.gains, good.maps
+    still = good.alignment
+    away = still.transform.copy()
+    away[1, 0, 2] = 50
+    curved = np.array([[0.0, -0.2]] * 3)
+    ratios = np.tile([[[1.0], [4.0]]], (3, 1, 3))
+    pairs: dict[str, Any] = {"exposure_ratio": ratios, "exif_ratio": np.array([[1.0, 4.0]] * 3)}
+    faults: dict[str, dict[str, Any]] = {
+        "tone curve": {"radiance": replace(radiance, curvature=curved, **pairs)},
+        "stillness": {"radiance": replace(radiance, ghost_fraction=np.array([0.0, 0.05, 0.0]))},
+        "ambient": {"radiance": replace(radiance, ambient_share=np.array([0.2, 0.2, 0.2]))},
+        "alignment": {"alignment": replace(still, transform=away)},
+        "clipping": {"clipped": clipped(0.03)},
+        "sharpness": {"blur_px": np.array([[0.0], [2.0], [0.1]])},
+        "gains": {"gains": replace(gains, gain=np.array([[1.0] * 3, [1.0] * 3, [0.7] * 3]))},
+        "gain doubt": {"gains": replace(gains, disagreement=0.05)},
+        "normal error": {"maps": replace(maps, confidence=np.full_like(maps.confidence, 25.0))},
+    }
+    for name, fields in faults.items():
+        gate = judged(changed(good, **fields))[name]
+        assert gate.state == "fail" and gate.remedy, name
+        assert failed(changed(good, **fields)) in ([name], [name, "normal error"]), name
+
+
+@pytest.mark.parametrize(("grid_px", "state"), [(1.0, "pass"), (2.0, "fail")])
+def test_a_push_counts_in_pixels_of_the_processed_picture(good: Evidence, grid_px: float, state: str) -> None:
+    """One pixel is under the limit of 1.5; on pictures averaged down to half the side it is two, and above it."""
+    pushed = np.array([[1.0, 0, 1], [0, 1, 0], [0, 0, 1]])
+    radiance = scenes.before_backdrop([np.eye(3), pushed, np.eye(3)])
+    gate = judged(changed(good, radiance=radiance, grid_px=grid_px))["alignment"]
+    assert gate.state == state and gate.shots == (("45°",) if state == "fail" else ())
+
+
+def test_what_follows_a_wrong_order_is_not_judged(good: Evidence) -> None:
+    told = judged(changed(good, gains=replace(good.gains, order=(2, 1, 0))))
+    assert list(told)[-1] == "focal length" or told["order"].state == "fail"
+    assert "angles" not in told
+
+
+def test_flash_bracketed_by_the_shutter_is_named(good: Evidence) -> None:
+    alike = np.tile([[[1.0], [1.01], [0.99]]], (3, 1, 3))
+    radiance = replace(good.radiance, exposure_ratio=alike, exif_ratio=np.array([[0.25, 1, 4]] * 3), light="flash")
+    gate = judged(changed(good, radiance=radiance))["exposures"]
+    assert gate.state == "warn"
+    assert "flash power, aperture or ISO" in gate.remedy
+
+
+def test_gains_nobody_knows_cost_degrees(good: Evidence) -> None:
+    gains = replace(good.gains, source="object", sigma=np.array([[0.0] * 3, [0.02] * 3, [0.02] * 3]))
+    gate = judged(changed(good, gains=gains))["gain doubt"]
+    assert gate.state == "warn" and gate.cost_deg == pytest.approx(12)
+    assert judged(changed(good, gains=gains))["normal error"].value > 10  # type: ignore[operator]
+
+
+def test_one_angle_that_keeps_four_shots_from_closing_fails(good: Evidence) -> None:
+    gains = replace(good.gains, turned_shots=(1,), turned=np.radians(15), turned_sigma=np.radians(2))
+    gate = judged(changed(good, gains=gains))["angles"]
+    assert gate.state == "fail" and gate.shots == ("45°",) and "+15° ± 2°" in gate.says
+
+
+@pytest.mark.parametrize(("turn", "state"), [(1.5, "pass"), (5.0, "warn")])
+def test_a_turn_of_the_ring_is_told_though_taken_out(good: Evidence, turn: float, state: str) -> None:
+    turned, doubt = np.radians([turn, 0.4])
+    gains = replace(good.gains, angle_offset=turned, angle_offset_sigma=doubt, angle_correction=turned)
+    gate = judged(changed(good, gains=gains))["angles"]
+    assert gate.state == state and f"{turn:+.1f}°" in gate.says and "taken out" in gate.says
+
+
+def shaped(good: Evidence, polarized: float, flattened: float, roughness: float, dimmed: bool = True) -> Any:
+    """The ball with a part of its polarization and of its tangents' slope, and whether it dims towards its outline."""
+    image, maps = good.stokes, good.maps
+    weak = image.stokes * np.array([1, polarized, polarized], np.float32)[:, None, None, None]
+    shading = np.maximum(maps.normal[..., 2:], 0.1)
+    slope = maps.normal[..., :2] / shading * flattened
+    normal = np.concatenate([slope, np.ones_like(shading)], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    maps = replace(maps, normal=normal, roughness=np.full_like(maps.roughness, roughness))
+    weak = (weak * shading if dimmed else weak / weak[0].mean(-1)[..., None]).astype(np.float32)
+    return changed(good, stokes=replace(image, stokes=weak), maps=maps)
+
+
+@pytest.mark.parametrize(
+    ("polarized", "flattened", "roughness", "dimmed", "words"),
+    [
+        (0.13, 0.4, 0.6, True, "the shape found is flat"),  # wax
+        (0.25, 0.4, 0.6, True, "the shape found is flat"),  # wax that is not quite as bad
+        (0.13, 1.0, 0.2, True, "gloss and shading"),  # no rough body shines
+        (0.13, 1.0, 0.7, True, ""),  # a rough body, which the estimator has allowed for
+        (0.13, 0.3, 0.2, False, ""),  # a coin
+        (0.9, 0.4, 0.2, True, ""),  # the wall of a vessel
+    ],
+)
+def test_body_that_polarizes_too_little_for_its_shape_is_told(
+    good: Evidence, polarized: float, flattened: float, roughness: float, dimmed: bool, words: str
+) -> None:
+    gate = judged(shaped(good, polarized, flattened, roughness, dimmed))["body"]
+    assert gate.state == ("warn" if words else "pass"), gate
+    assert words in gate.says and (gate.cost_deg > 10) == bool(words)
+
+
+def test_light_from_around_is_told(good: Evidence) -> None:
+    image = good.stokes
+    across = image.stokes * np.array([1, -1, -1], np.float32)[:, None, None, None]
+    gate = judged(changed(good, stokes=replace(image, stokes=across)))["body"]
+    assert gate.state == "fail" and "reflected" in gate.says
+    assert "90°" in gate.says and "90° on" in gate.remedy  # a ring set upright at 0° looks the same
+
+
+@pytest.mark.parametrize(
+    ("uneven", "ambient", "state"),
+    [(0.47, 0.0, "pass"), (0.7, 0.0, "pass"), (0.0, 1.5, "warn"), (0.0, 6.0, "warn")],
+)
+def test_a_lopsided_body_is_no_light_from_the_side(
+    good: Evidence, uneven: float, ambient: float, state: str
+) -> None:
+    """A body turned to one side is as polarized there as elsewhere; a lamp from there is not."""
+    image = good.stokes
+    across = np.linspace(-1, 1, image.mask.shape[1])[:, None] / (scenes.RADIUS / (image.mask.shape[1] / 2))
+    lit = image.stokes * np.maximum(1 + uneven * across, 0)
+    lit[0] += ambient * np.maximum(across, 0) * image.stokes[0].mean()
+    gate = judged(changed(good, stokes=replace(image, stokes=lit.astype(np.float32))))["body"]
+    assert gate.state == state and ("side" in gate.says) == (state == "warn")
+
+
+def test_a_ring_that_was_mended_is_told() -> None:
+    clocked = replace(scenes.stack(noise=0.002, angles=scenes.ANGLES + np.radians(4.0)), angle=scenes.ANGLES)
+    gate = judged(found(radiance=clocked))["angles"]
+    assert gate.state == "warn" and gate.value == pytest.approx(4.0, abs=0.5)  # it may be a single shot's
+    assert "taken out" in gate.says and 0 < gate.cost_deg < 2.5
+
+
+@pytest.mark.parametrize(("name", "value"), [("border", 0.6), ("islands", 0.03), ("holes", 0.06)])
+def test_mask_of_a_doubtful_shape_warns(good: Evidence, name: str, value: Any) -> None:
+    gate = judged(changed(good, object_=replace(good.object_, **{name: value})))["mask"]
+    assert gate.state == "warn" and "--mask" in gate.remedy
+
+
+def test_mask_that_its_network_doubts_fails(good: Evidence) -> None:
+    assert failed(changed(good, object_=replace(good.object_, doubt=0.3))) == ["mask"]
+
+
+def test_assumed_focal_length_warns_and_costs_what_the_rays_would_lean(good: Evidence) -> None:
+    two = float(np.log(2.0))
+    gate = judged(changed(good, focal_doubt=(-two, two)))["focal length"]
+    longer = judged(changed(good, focal_doubt=(0.0, two)))["focal length"]
+    y, x = np.nonzero(good.maps.mask)
+    off = np.hypot(x - good.maps.view.center[0], y - good.maps.view.center[1]) / good.maps.view.focal
+    lean = np.degrees(np.median(np.arctan(2 * off) - np.arctan(off)))  # a focal length half as long
+    assert gate.state == "warn" and gate.cost_deg == pytest.approx(lean, abs=0.06)
+    assert longer.state == "warn" and 0 < longer.cost_deg < gate.cost_deg
+
+
+@pytest.mark.parametrize(
+    ("fault", "words", "unit"),
+    [
+        ({"pieces": 26}, "26 pieces", ""),
+        ({"cuts": 2.5}, "250% of the outline", "%"),
+        ({"raggedness": 0.4}, "rim 40%", "%"),
+    ],
+)
+def test_mesh_in_shreds_fails_by_the_figure_that_is_over(
+    good: Evidence, fault: dict[str, float], words: str, unit: str
+) -> None:
+    whole = {"pieces": 1, "cuts": 0.3, "cut_px": 40.0, "raggedness": 0.1}
+    passed = judged(changed(good, mesh=SimpleNamespace(**whole)))["mesh"]
+    assert passed.state == "pass" and passed.says.startswith("1 piece, cut along 40 px")
+    gate = judged(changed(good, mesh=SimpleNamespace(**whole | fault)))["mesh"]
+    assert gate.state == "fail" and words in gate.says
+    (figure,) = fault.values()
+    assert (gate.value, gate.unit) == (figure, unit) and not _within(gate, least=False)
+
+
+def _within(gate: Gate, least: bool) -> bool:
+    """Whether the gate's figure keeps to its limit, where both are numbers."""
+    value, limit = gate.value, gate.limit
+    if not (isinstance(value, float | int) and isinstance(limit, float | int)):
+        return False
+    return value >= limit if least else value <= limit
+
+
+def test_what_is_beside_a_gate_s_words_is_the_figure_that_they_are_of(good: Evidence) -> None:
+    object_, still, image = good.object_, good.alignment, good.stokes
+    unlike, unsure = np.array([1, 0.1, 1]), np.array([0, 0.5, 0])
+    around = image.stokes * np.array([1, -1, -1], np.float32)[:, None, None, None]
+    turned = image.stokes.copy()
+    turned[1:, :, : image.mask.shape[1] // 2] *= -1
+    dull = shaped(good, 0.13, 0.4, 0.6)
+    for name, least, fields in (
+        ("mask", False, {"object_": replace(object_, border=0.6, doubt=0.02)}),
+        ("mask", False, {"object_": replace(object_, holes=0.3, doubt=0.02)}),
+        ("mask", False, {"object_": replace(object_, doubt=0.2)}),
+        ("alignment", True, {"alignment": replace(still, correlation=unlike)}),
+        ("alignment", False, {"alignment": replace(still, residual_px=unsure)}),
+        ("body", True, {"stokes": replace(image, stokes=around)}),
+        ("body", True, {"stokes": replace(image, stokes=turned)}),
+        ("body", True, {"stokes": dull.stokes, "maps": dull.maps}),
+    ):
+        gate = judged(changed(good, **fields))[name]
+        assert gate.state in ("warn", "fail") and not _within(gate, least), gate
+
+
+def test_four_angles_are_not_asked_of_who_has_shot_four(good: Evidence) -> None:
+    four = found(angles=np.radians([0.0, 45, 90, 135]))
+    for of, asked in ((good, True), (four, False)):
+        gains = replace(of.gains, source="object", sigma=np.full_like(of.gains.sigma, 0.2))
+        doubtful = judged(changed(of, gains=gains))
+        assert ("four angles" in doubtful["gain doubt"].remedy) == asked
+        assert doubtful["gain doubt"].cost_deg == doubtful["normal error"].value == 90  # no error is larger
+
+
+def test_a_passing_mask_tells_its_figure(good: Evidence) -> None:
+    gate = judged(changed(good, object_=replace(good.object_, doubt=0.024)))["mask"]
+    assert gate.state == "pass" and "2.4 %" in gate.says
