@@ -20,7 +20,7 @@ import msgspec
 
 from polcap import __version__
 from polcap.errors import InputError, PolcapError, StorageError
-from polcap.formats import atomic, calibrations_folder
+from polcap.formats import atomic, calibrations
 from polcap.formats.capture import layouts
 from polcap.images import ChartRequest, Network
 
@@ -159,7 +159,7 @@ def stamp(unit: Unit, order: Order) -> str:
             if not name.startswith("."):
                 about = (here / name).stat()
                 files.append([os.path.relpath(here / name, unit.capture), about.st_size, about.st_mtime_ns])
-    files += [[str(file), file.stat().st_mtime_ns] for file in calibrations_folder.files()]  # another one may be chosen
+    files += [[str(file), file.stat().st_mtime_ns] for file in calibrations.files()]  # another one may be chosen
     model = None if order.model is None else [order.model, Path(order.model).stat().st_mtime_ns]
     wanted = [order.settings, _plain(order.chart), order.estimator, model, order.angles_deg, __version__]
     text = json.dumps([files, wanted], sort_keys=True, default=str)

@@ -199,14 +199,14 @@ def _user_input(
 
 def _request(given: dict[str, Any], capture: Path, out: Path) -> str | None:
     """What identifies a run: its options and the state of all files that it reads."""
-    from polcap.formats import calibrations_folder
+    from polcap.formats import calibrations
     from polcap.pipeline import unchanged
 
     aside = ("capture", "out", "json", "dry_run", "watch", "threads", "memory")  # they change no byte of a result
     files = [given[name] for name in ("config", "mask", "model") if given[name] is not None]
     if given["chart"] is not None and Path(given["chart"]).suffix == ".toml":
         files.append(Path(given["chart"]))
-    files += calibrations_folder.files()  # another one may be chosen
+    files += calibrations.files()  # another one may be chosen
     asked = {name: value for name, value in given.items() if name not in aside}
     return unchanged.fingerprint(asked, capture, out, files)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from polcap.config import Config
 from polcap.errors import ObjectError
-from polcap.formats import calib
+from polcap.formats import shipped_data
 from polcap.images import (
     Alignment,
     AngleStack,
@@ -65,7 +65,7 @@ class Results:
 
 def path(capture: Capture | None, supplied: UserInput, config: Config, store: Store) -> Results:
     """From RAW brackets to the asset."""
-    reference = store.derive(calib.colorchecker, config.whitebalance.chart)
+    reference = store.derive(shipped_data.colorchecker, config.whitebalance.chart)
     radiance = store.step(hdr.merge, capture, config=config.hdr)
     color = store.step(whitebalance.measure, radiance, reference, supplied.chart, config=config.whitebalance)
     alignment = store.step(align.register, radiance, color, config=config.align)

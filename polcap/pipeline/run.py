@@ -17,7 +17,7 @@ import msgspec
 from polcap import report, resource_limits
 from polcap.config import Config, restored
 from polcap.errors import InputError, SettingError, StorageError
-from polcap.formats import atomic, calib, text_file
+from polcap.formats import atomic, calibrations, text_file
 from polcap.formats.capture import layouts
 from polcap.formats.export import animation, provenance
 from polcap.formats.maps import maps_folder, png
@@ -128,7 +128,7 @@ def _warm(supplied: UserInput) -> None:
 def _write_profile(file: Path, color: ColorCalibration) -> None:
     """What `--chart FILE.toml` of other captures takes, where this one's chart was read."""
     if color.source in ("chart", "corners"):
-        calib.write_profile(file, color)
+        calibrations.write_profile(file, color)
     else:
         file.unlink(missing_ok=True)
 

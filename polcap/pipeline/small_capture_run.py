@@ -11,7 +11,7 @@ import numpy as np
 
 from polcap.config import Config
 from polcap.errors import ChartError, DecodeError, InputError
-from polcap.formats import calib
+from polcap.formats import shipped_data
 from polcap.images import (
     Alignment,
     AngleStack,
@@ -64,7 +64,7 @@ class Reduced:
     @cached_property
     def _color(self) -> tuple[ColorCalibration, str]:
         """Without a chart the rest can still be judged."""
-        reference = calib.colorchecker(self.config.whitebalance.chart)
+        reference = shipped_data.colorchecker(self.config.whitebalance.chart)
         step, request = self.taken.step, self.chart
         if request.corners is not None:
             request = replace(request, corners=(request.corners - (step - 1) / 2) / step)

@@ -9,7 +9,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.formats import calib, html
+from polcap.formats import html, shipped_data
 from polcap.optics.color import srgb_eight_bits
 from polcap.pipeline.path import Results
 from polcap.remembered import Remembered
@@ -193,7 +193,7 @@ def _chart(about: Mapping[str, Any], results: Results) -> str:
     measured = shown.patches(results.radiance.value, color)
     if measured is None or color.delta_e is None:
         return ""
-    known = calib.colorchecker(about["settings"]["whitebalance"]["chart"])
+    known = shipped_data.colorchecker(about["settings"]["whitebalance"]["chart"])
     reference = next((one for one in known.editions if one.name == color.edition), known)
     drawing = plots.chart(
         srgb_eight_bits(reference.rec709), srgb_eight_bits(measured), color.delta_e, reference.patches

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from polcap.errors import ModelError
-from polcap.formats import calib
 from polcap.formats import onnx as formats_onnx
+from polcap.formats import shipped_data
 from polcap.formats.onnx import ENCODING, Model, digest, load
 
 onnx = pytest.importorskip("onnx", reason="writing test models needs the extra [train]")
@@ -168,7 +168,7 @@ def test_metadata_that_are_no_text_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_shipped_model_opened_later_says_and_does_the_same() -> None:
-    file = sorted(calib.data_path("colorchecker").parent.glob("models/polcap*.onnx"))[-1]
+    file = sorted(shipped_data.data_path("colorchecker").parent.glob("models/polcap*.onnx"))[-1]
     now, later = load(file, threads=1), load(file, threads=1, later=True)
     assert later == now and "session" not in vars(later.run)
     side = int(now.metadata["size_multiple"])
