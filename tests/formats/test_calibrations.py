@@ -107,7 +107,7 @@ def test_falloff_of_another_aperture_is_left_out(users):
 def test_a_foreign_file_is_one_clear_line(users, text):
     users.mkdir()
     (users / "a.toml").write_bytes(text)
-    with pytest.raises(CaptureError, match="no calibration"):
+    with pytest.raises(CaptureError, match="not a polcap calibration"):
         calibrations.choose(EXIF, None, None)
 
 
