@@ -22,7 +22,7 @@ from polcap.calibrate.photographs import CLIP, Photograph, listed
 from polcap.errors import CaptureError
 from polcap.formats.capture import layouts
 from polcap.images import Floats, NoiseLine
-from polcap.stages.hdr import exposure, noise, planes, registration
+from polcap.stages.hdr import exposure, frame_motion, noise, planes
 from polcap.stages.hdr.planes import Signals
 
 _PARTS = 16  # of the picture, whose scatter is the doubt
@@ -85,8 +85,8 @@ def measure(taken: list[list[Photograph]]) -> tuple[NoiseLine, ...]:
                 raise CaptureError(
                     f"{second.path}: has another size than {first.path.name}; keep one camera per bracket"
                 )
-            views = registration.view(a), registration.view(b)
-            if registration.moved(str(second.path), *views, _MOST_SHIFT_PX) is not None:
+            views = frame_motion.view(a), frame_motion.view(b)
+            if frame_motion.moved(str(second.path), *views, _MOST_SHIFT_PX) is not None:
                 moved += 1
                 continue
             sites = photon_transfer.photosites(one, a.shape[0])

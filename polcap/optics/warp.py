@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Bits, Distortion, Floats
 from polcap.optics import distortion
+from polcap.optics.projection import coordinates
 
 Bools = NDArray[np.bool_]
 Box = tuple[int, int, int, int]
@@ -145,16 +146,6 @@ def _cubic(f: float) -> Floats:
         return np.ones(1, np.float32)
     taps = np.array([(1 - f) ** 3, 4 - 6 * f**2 + 3 * f**3, 1 + 3 * f + 3 * f**2 - 3 * f**3, f**3]) / 6
     return np.asarray(np.r_[0, np.convolve(_PREFILTER, taps)], np.float32)  # a tap more behind than ahead: 0 evens it
-
-
-def coordinates(transform: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Where a homography (3, 3) takes points x, y of any shapes that broadcast; float64."""
-    h = np.asarray(transform, np.float64)
-    u, v = (h[k, 0] * x + (h[k, 1] * y + h[k, 2]) for k in (0, 1))
-    if abs(h[2, 0]) + abs(h[2, 1]) > 0 or h[2, 2] != 1:
-        w = h[2, 0] * x + (h[2, 1] * y + h[2, 2])
-        u, v = u / w, v / w
-    return u, v
 
 
 class Taps:

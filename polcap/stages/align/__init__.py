@@ -1,26 +1,27 @@
-"""Stage 3: find where each polarizer shot sees what the reference shot sees.
+"""Stage 3: register every polarizer shot with the reference shot.
 
-Turning the polarizer changes brightness smoothly over the object, a nudge of the camera moves its
-texture. So the shots are compared in the logarithm of radiance with everything coarser than a few
-pixels taken out: what remains is texture, chart and outline, which polarization hardly touches, and
-a robust loss drops the pixels where it does. The transform is refined by Gauss–Newton steps with the
-mean of both images' gradients, coarse to fine.
+Turning the polarizer changes brightness smoothly over the object, a nudge of the camera moves its texture. So the
+shots are compared in the logarithm of radiance without its coarse structure (`detail`): what is left is texture, chart
+and outline, which polarization hardly changes. Tiles where it does are outvoted (`optics.registration`).
 """
 
 from typing import Annotated, Literal
 
-import cv2
 import msgspec
 import numpy as np
 from msgspec import Meta
 
 from polcap.errors import AlignmentError
 from polcap.images import Alignment, AngleStack, ColorCalibration, Floats
+from polcap.optics import registration
+from polcap.optics.projection import picture_corners, transform_points
+from polcap.optics.registration import Pyramid
 from polcap.stages import stage
-from polcap.stages.align.following import Detail, fine, likeness, refine, to_full_grid
+from polcap.stages.align.detail import averaging_step, detail, edge_strength, shows_detail
 
-_SURE_LIKENESS = 0.6  # correlation of detail from which no other start is tried; else the likest wins
-_MOST_PIXELS = 0.5e6  # a larger image is averaged down first: it has detail to spare
+_SURE_CORRELATION = 0.6  # of detail, from which edges need not be compared
+_MOST_PIXELS = 0.5e6  # a larger picture is averaged down first: it has detail to spare
+_FLOOR_PX = 0.02  # error that aliasing leaves whatever the noise: the bundled capture's is .026 and .025 (decision 19)
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -42,60 +43,52 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 4.0
 
 
-@stage(version=7)
+@stage(version=8)
 def register(radiance: AngleStack, color: ColorCalibration, settings: Settings) -> Alignment:
-    """One transform per shot, reference grid px → shot grid px.
+    """Transforms (K, 3, 3) from the reference grid to each shot's, px.
 
-    Parameters
-    ----------
-    radiance
-        The shots (K, H, W, 3).
-    color
-        Tells where the chart lies.
-    settings
-        How a shot may have moved, and how far.
-
-    Raises
-    ------
-    AlignmentError
-        A shot moved too far, or shows another scene; names it.
+    Raises AlignmentError, which names the shot: it moved too far, or shows another scene.
     """
-    shots = len(radiance.angle)
     if radiance.offset_px is not None:
-        return _as_known(radiance.offset_px)
-    step = int(np.ceil(np.sqrt(radiance.value[0, ..., 0].size / _MOST_PIXELS)))
+        return _of_mosaic(radiance.offset_px)
+    shots = len(radiance.angle)
+    transform, residual, correlation = np.tile(np.eye(3), (shots, 1, 1)), np.zeros(shots), np.ones(shots)
+    crossed: Floats | None = None if radiance.crossed is None else np.eye(3)
+    if settings.model == "none":
+        return Alignment(transform, residual, correlation, crossed)
+    step = averaging_step(radiance.value.shape[1:3], _MOST_PIXELS)
     detail_px = settings.detail_px / np.sqrt(step)  # detail lies between the pixels of either grid
-    detail = [Detail(fine(radiance.shot(k), detail_px, step)) for k in range(shots)]
-    transform = np.tile(np.eye(3), (shots, 1, 1))
-    residual = np.zeros(shots)
-    correlation = np.ones(shots)
+    reference = detail(radiance.shot(0), detail_px, step)
     for k in range(1, shots):
-        if settings.model == "none":
-            continue
+        shot = detail(radiance.shot(k), detail_px, step)
         name = f"shot {np.degrees(radiance.angle[k]):g}°"
-        transform[k], residual[k], correlation[k] = _accepted(name, detail[0], detail[k], step, settings)
-    crossed: Floats | None = None
-    if radiance.crossed is not None and settings.model == "none":
-        crossed = np.eye(3)
-    elif radiance.crossed is not None:
-        last = Detail(fine(radiance.crossed.picture, detail_px, step))
-        crossed, _, _ = _accepted("the cross-polarised shot", detail[0], last, step, settings)
-    return Alignment(transform=transform, residual_px=residual, correlation=correlation, crossed=crossed)
+        transform[k], residual[k], correlation[k] = _register_shot(name, reference, shot, step, settings)
+    if radiance.crossed is not None:
+        shot = detail(radiance.crossed.picture, detail_px, step)
+        crossed, _, _ = _register_shot("the cross-polarised shot", reference, shot, step, settings)
+    return Alignment(transform, residual, correlation, crossed)
 
 
-def _accepted(name: str, reference: Detail, shot: Detail, step: int, settings: Settings) -> tuple[Floats, float, float]:
-    """Transform (3, 3) of a shot on the full grid, its 1σ in px of that, and the likeness; refuses what cannot be."""
-    if not (reference[1].tells and shot[1].tells):
+def _of_mosaic(offset_px: Floats) -> Alignment:
+    """Shots cut from one polarizer mosaic: their places (K, 2) px are known."""
+    transform = np.tile(np.eye(3), (len(offset_px), 1, 1))
+    transform[:, :2, 2] = -offset_px
+    return Alignment(transform, np.zeros(len(offset_px)), np.ones(len(offset_px)))
+
+
+def _register_shot(
+    name: str, reference: Pyramid, shot: Pyramid, step: int, settings: Settings
+) -> tuple[Floats, float, float]:
+    """Transform (3, 3) of a shot and its 1σ, full-grid px, and the correlation of detail. Raises AlignmentError."""
+    if not (shows_detail(reference) and shows_detail(shot)):
         raise AlignmentError(
             f"{name} has no unclipped detail in common with the first shot: over-exposed, black, or even all over; "
             "shoot a darker frame, or with a locked camera --set align.model=none"
         )
-    small, residual, correlation = _find(reference, shot, settings.model)
-    transform = to_full_grid(small, step)
-    height, width = (step * side for side in reference[1].value.shape)
-    corners = np.array([[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]], float).T
-    moved = transform @ corners
-    shift = np.abs(moved[:2] / moved[2] - corners[:2]).max()
+    found, correlation = _best_match(reference, shot, settings)
+    transform = registration.scaled(found.matrix, step)
+    corners = picture_corners(step * reference.shape[1], step * reference.shape[0])
+    shift = np.abs(transform_points(transform, corners) - corners).max()
     if not np.isfinite(shift) or correlation < settings.min_correlation:
         raise AlignmentError(
             f"{name} shows another scene than the first shot: correlation {correlation:.2f}, "
@@ -107,45 +100,20 @@ def _accepted(name: str, reference: Detail, shot: Detail, step: int, settings: S
             f"{name} moved by {shift:.1f} px, more than align.max_shift_px = {settings.max_shift_px:g}; "
             "reshoot, or raise it"
         )
-    return transform, residual * step, correlation
+    return transform, step * float(np.hypot(found.sigma_px, _FLOOR_PX)), correlation
 
 
-def _as_known(offset_px: Floats) -> Alignment:
-    """Shots cut from one mosaic stand where its pixels stand."""
-    transform = np.tile(np.eye(3), (len(offset_px), 1, 1))
-    transform[:, :2, 2] = -offset_px
-    return Alignment(transform, np.zeros(len(offset_px)), np.ones(len(offset_px)))
+def _best_match(reference: Pyramid, shot: Pyramid, settings: Settings) -> tuple[registration.Registration, float]:
+    """The motion under which the detail of two shots correlates best, or else their edges; and that correlation.
 
-
-def _find(reference: Detail, shot: Detail, model: str) -> tuple[Floats, float, float]:
-    """Transform of a shot, its 1σ in px, and the likeness of the two shots under it.
-
-    Polarization may change which side of an edge is bright: where the detail is little alike, the edges are compared
-    in its place, and from where a camera stands that was not touched.
+    Strong polarization may change which side of an edge is brighter, but not where the edge is.
     """
-    found = _follow(reference, shot, _coarse_shift(reference, shot), model)
-    if found[2] > _SURE_LIKENESS:
-        return found
-    edges, still = (reference.edges(), shot.edges()), np.zeros(2)
-    others = [
-        _follow(reference, shot, still, model),
-        _follow(*edges, _coarse_shift(*edges), model),
-        _follow(*edges, still, model),
-    ]
-    return max(found, *others, key=lambda one: one[2])
-
-
-def _follow(reference: Detail, shot: Detail, shift: Floats, model: str) -> tuple[Floats, float, float]:
-    """The same from a first shift (2,) px."""
-    start = np.eye(3)
-    start[:2, 2] = shift
-    transform, residual = refine(reference, shot, start, model)
-    return transform, residual, likeness(reference, shot, transform)
-
-
-def _coarse_shift(reference: Detail, shot: Detail) -> Floats:
-    """Whole-image translation by phase correlation at half size, (2,) px."""
-    a, b = reference[2], shot[2]
-    window = cv2.createHanningWindow(a.value.shape[::-1], cv2.CV_32F)
-    shift, _ = cv2.phaseCorrelate(a.value * np.sqrt(a.weight), b.value * np.sqrt(b.weight), window)
-    return 2 * np.array(shift)
+    assert settings.model != "none"
+    found = registration.register(reference, shot, settings.model)
+    correlation = registration.correlation(reference, shot, found.matrix)
+    if correlation > _SURE_CORRELATION:
+        return found, correlation
+    edges = edge_strength(reference), edge_strength(shot)
+    by_edges = registration.register(*edges, settings.model)
+    of_edges = registration.correlation(*edges, by_edges.matrix)
+    return (by_edges, of_edges) if of_edges > correlation else (found, correlation)

@@ -64,7 +64,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = True
 
 
-@stage(version=9)
+@stage(version=10)
 def merge(capture: Capture, settings: Settings) -> AngleStack:
     """Radiance of every shot on the scale of its reference frame.
 

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from polcap import parallel
 from polcap.images import Bits, Floats, Quality, Shot
+from polcap.optics.registration import squared_gradient
 from polcap.stages.hdr import ambient as ambients
-from polcap.stages.hdr import noise, registration
+from polcap.stages.hdr import frame_motion, noise
 from polcap.stages.hdr.ambient import Ambient
-from polcap.stages.hdr.ghosts import edges
 from polcap.stages.hdr.links import Measured
 from polcap.stages.hdr.planes import Reader, Signals, blocks
 
@@ -91,7 +91,7 @@ def prepare(
         else:
             found, blur = read.signals(shot, e, clip, full), None
             if link.moved is not None:
-                found, blur = registration.resampled(found, registration.on_full(link.moved) if full else link.moved)
+                found, blur = frame_motion.resampled(found, frame_motion.on_full(link.moved) if full else link.moved)
         last = bright[e] < 1.02 * bright[darkest]
         serves = found.usable if link.moved is not None or not last else np.ones_like(found.usable)
         if e == reference:
@@ -227,7 +227,7 @@ def _flagged(where: Bools, flag: Quality) -> Bits:
 def _edges(estimate: Floats, rows: slice) -> Floats:
     """Squared gradient of some rows of an estimate (C, H, W)."""
     top = max(rows.start - 1, 0)
-    found = np.stack([edges(plane[top : rows.stop + 1]) for plane in estimate])
+    found = np.stack([squared_gradient(plane[top : rows.stop + 1]) for plane in estimate])
     return np.asarray(found[:, rows.start - top :][:, : rows.stop - rows.start])
 
 

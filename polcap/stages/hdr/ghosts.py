@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from polcap import parallel
 from polcap.images import Floats
+from polcap.optics.registration import squared_gradient
 from polcap.stages.hdr.noise import Noise
 from polcap.stages.hdr.planes import Signals, blocks
 
@@ -95,7 +96,7 @@ class Anchor:
             limit *= np.float32(_SIGMA**2 * _NEIGHBOURS / _WINDOW**2)
             np.sqrt(limit, out=limit)
             if misfit[c]:
-                beyond = box(edges(anchor[c]))
+                beyond = box(squared_gradient(anchor[c]))
                 beyond -= own
                 np.maximum(beyond, 0, out=beyond)
                 beyond *= np.float32(_MISFIT**2 * misfit[c])
@@ -179,18 +180,6 @@ def box(picture: Floats) -> Floats:
     """Mean (h, w) over the window around each pixel of a picture (h, w), whose border repeats."""
     # half the time of cv2.blur, which sums in doubles
     return np.asarray(cv2.sepFilter2D(picture, -1, _EVEN, _EVEN, borderType=cv2.BORDER_REPLICATE))
-
-
-def edges(picture: Floats) -> Floats:
-    """Squared gradient (h, w) of a picture (h, w), per px²."""
-    gx, gy = (
-        np.asarray(cv2.Sobel(picture, cv2.CV_32F, x, 1 - x, ksize=1, scale=0.5, borderType=cv2.BORDER_REPLICATE))
-        for x in (1, 0)
-    )
-    gx *= gx
-    gy *= gy
-    gx += gy
-    return gx
 
 
 def _any_around(mask: Bools, reach: int) -> Bools:

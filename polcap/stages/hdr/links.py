@@ -10,7 +10,7 @@ from polcap.errors import CaptureError
 from polcap.images import Floats, Frame, Shot
 from polcap.optics import sensor
 from polcap.stages.hdr import ambient as ambients
-from polcap.stages.hdr import exposure, noise, registration
+from polcap.stages.hdr import exposure, frame_motion, noise
 from polcap.stages.hdr.ambient import promised, same_size
 from polcap.stages.hdr.ghosts import Anchor, Exposed, FirstEstimate
 from polcap.stages.hdr.planes import Planes, Reader, Signals
@@ -118,13 +118,13 @@ def measure(
     ghost = np.zeros(still.usable.shape, bool)
     estimate = FirstEstimate()
     anchor: Anchor | None = None
-    still_view = registration.view(still) if len(order) > 1 else None
+    still_view = frame_motion.view(still) if len(order) > 1 else None
     for e in (e for e in order if e != reference):
         name = f"frame {e + 1} of shot {shot.name}"
         found = shooting.signals(e)
         same_size(name, found.shape, still.shape)
         assert still_view is not None
-        moved = registration.moved(name, still_view, registration.view(found), limit_px / shooting.raw_px)
+        moved = frame_motion.moved(name, still_view, frame_motion.view(found), limit_px / shooting.raw_px)
         unknown = shooting.ambient is None and not (
             lines.knows(shooting.iso[e]) and lines.knows(shooting.iso[reference])
         )
@@ -133,7 +133,7 @@ def measure(
             if unknown:
                 lines.learn(shooting.iso[e], noise.alone(found))
                 lines.learn(shooting.iso[reference], noise.alone(still))
-            found, gain = registration.resampled(found, moved)
+            found, gain = frame_motion.resampled(found, moved)
             blur = float(gain.mean())
         tiles = exposure.common(still, found)
         ratio = _ratio(name, exposure.of_tiles(*tiles), channels, shot.frames[e], shot.frames[reference])

@@ -7,8 +7,11 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from polcap.errors import AlignmentError
+from polcap.optics import registration
+from polcap.optics.projection import transform_points
 from polcap.stages import align
-from polcap.stages.align import following, object_motion
+from polcap.stages.align import object_motion
+from polcap.stages.align.detail import detail
 from tests import scenes
 
 
@@ -47,20 +50,20 @@ def test_a_shift_of_a_quarter_pixel_is_not_pulled_to_a_whole_one():
 
 def test_place_far_from_all_detail_is_known_as_badly_as_its_scatter_says():
     """Texture in one corner: roll and zoom left open by noise count with the distance."""
-    y, x = np.mgrid[:160, :200]
-    texture = gaussian_filter(np.random.default_rng(5).normal(size=(160, 200)), 1.5)
-    light = np.where((y > 110) & (x > 140), 0.3 + texture, 0.3).astype(np.float32)
-    blank = dataclasses.replace(scenes.stack(), variance=np.full((3, 160, 200, 3), 1e-6, np.float32))
-    near, far = np.array([170.0, 135, 1]), np.array([30.0, 30, 1])
+    y, x = np.mgrid[:240, :320]
+    texture = gaussian_filter(np.random.default_rng(5).normal(size=(240, 320)), 1.5)
+    light = np.where((y > 140) & (x > 180), 0.3 + texture, 0.3).astype(np.float32)
+    blank = dataclasses.replace(scenes.stack(), variance=np.full((3, 240, 320, 3), 1e-6, np.float32))
+    near, far = np.array([250.0, 190]), np.array([30.0, 30])
     off, said = [], []
     for seed in range(8):
-        noise = np.random.default_rng(seed).normal(scale=0.03, size=(3, 160, 200, 3))
+        noise = np.random.default_rng(seed).normal(scale=0.03, size=(3, 240, 320, 3))
         value = np.asarray(light[..., None] + noise, np.float32)
-        taken = dataclasses.replace(blank, value=value, quality=np.zeros((3, 160, 200), np.uint8))
-        a, b = (following.Detail(following.fine(taken.shot(k), 4.0, 1)) for k in (0, 1))
-        way = following.refine(a, b, np.eye(3), "similarity")[0]
-        off.append([np.hypot(*((way @ at)[:2] - at[:2])) / np.sqrt(2) for at in (near, far)])
-        said.append([following.sigma_at(a, b, way, at) for at in (near, far)])
+        taken = dataclasses.replace(blank, value=value, quality=np.zeros((3, 240, 320), np.uint8))
+        a, b = (detail(taken.shot(k), 4.0, 1) for k in (0, 1))
+        found = registration.register(a, b, "similarity")
+        off.append([np.hypot(*(transform_points(found.matrix, at) - at)) / np.sqrt(2) for at in (near, far)])
+        said.append([found.sigma_at(at) for at in (near, far)])
     scatter, sigma = np.sqrt(np.mean(np.square(off), axis=0)), np.mean(said, axis=0)
     assert sigma[1] > 2 * sigma[0]
     assert scatter[1] < 2 * sigma[1] and sigma[1] < 4 * scatter[1]

@@ -7,9 +7,10 @@ import pytest
 
 from polcap.errors import CaptureError
 from polcap.images import Quality, SensorImage, Shot
+from polcap.optics.registration import squared_gradient
 from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.stages import hdr
-from polcap.stages.hdr import ghosts, links, noise
+from polcap.stages.hdr import links, noise
 from polcap.stages.hdr.planes import Reader, signals
 from tests.stages.hdr.brackets import (
     BLACK,
@@ -133,7 +134,7 @@ def test_hand_held_nikon_bracket():
         for c, ratio in enumerate(link.ratio):
             variance = found.noises[1].of(c, first[c])
             variance += found.noises[e].of(c, first[c] * ratio) / ratio**2 * gain
-            variance += ghosts.edges(first[c]) * link.misfit[c]
+            variance += squared_gradient(first[c]) * link.misfit[c]
             z.append(((other.rows(slice(None))[c] / ratio - own[c]) / np.sqrt(variance))[usable])
         assert np.all(np.abs(np.mean(z, axis=1)) < 0.1)
         assert np.all(np.abs(MAD_TO_SIGMA * np.median(np.abs(z), axis=1) - 1.05) < 0.25)

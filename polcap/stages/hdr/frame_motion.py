@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from polcap.errors import CaptureError
 from polcap.images import Floats
-from polcap.stages.hdr import motion
+from polcap.optics.registration import Pyramid, register
 from polcap.stages.hdr.planes import Planes, Signals, blocks
 
 Bools = NDArray[np.bool_]
@@ -17,7 +17,7 @@ _SMOOTH = cv2.getGaussianKernel(7, 0.8, cv2.CV_32F)
 _STILL_PX = 0.05  # less motion than this is not worth a resampling
 
 
-def view(signals: Signals) -> motion.View:
+def view(signals: Signals) -> Pyramid:
     """The square root of all channels together, lightly smoothed: about even noise."""
     _, height, width = signals.shape
     out = np.empty((height, width), np.float32)
@@ -29,10 +29,10 @@ def view(signals: Signals) -> motion.View:
         np.maximum(smooth, 0, out=smooth)
         smooth += np.float32(1e-4)
         np.sqrt(smooth, out=out[target])
-    return motion.View(out, signals.usable)
+    return Pyramid(out, signals.usable)
 
 
-def moved(name: str, still: motion.View, other: motion.View, limit_px: float) -> Floats | None:
+def moved(name: str, still: Pyramid, other: Pyramid, limit_px: float) -> Floats | None:
     """Reference px → frame px (3, 3), or None where the frame did not move measurably.
 
     Parameters
@@ -49,7 +49,7 @@ def moved(name: str, still: motion.View, other: motion.View, limit_px: float) ->
     CaptureError
         It moved by more.
     """
-    found = motion.estimate(still, other)
+    found = register(still, other)
     if found.shift_px > limit_px:
         raise CaptureError(
             f"{name} moved by {found.shift_px:.0f} px against the bracket's reference frame, more than "

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from polcap.stages.hdr import motion
+from polcap.optics.projection import transform_points
+from polcap.optics.registration import Pyramid, register
 
 
 def _texture():
@@ -42,8 +43,9 @@ MOTIONS = {
 def test_motion_is_recovered_to_a_fiftieth_of_a_pixel(name):
     rng = np.random.default_rng(0)
     usable = np.ones((480, 600), bool)
-    found = motion.estimate(*(motion.View(view(rng, m), usable) for m in (np.eye(3), MOTIONS[name])))
-    error = motion.apply(found.matrix, corners()) - motion.apply(MOTIONS[name], corners())
+    still, moved = (Pyramid(view(rng, m), usable) for m in (np.eye(3), MOTIONS[name]))
+    found = register(still, moved)
+    error = transform_points(found.matrix, corners()) - transform_points(MOTIONS[name], corners())
     assert np.abs(error).max() < 0.02
     assert found.sigma_px < 0.02
 
@@ -53,8 +55,8 @@ def test_parts_that_move_on_their_own_are_outvoted():
     a, b = view(rng, np.eye(3)), view(rng, MOTIONS["shift"])
     b[100:250, 100:300] = view(rng, MOTIONS["turn"])[120:270, 150:350]
     usable = np.ones((480, 600), bool)
-    found = motion.estimate(motion.View(a, usable), motion.View(b, usable))
-    error = motion.apply(found.matrix, corners()) - motion.apply(MOTIONS["shift"], corners())
+    found = register(Pyramid(a, usable), Pyramid(b, usable))
+    error = transform_points(found.matrix, corners()) - transform_points(MOTIONS["shift"], corners())
     assert np.abs(error).max() < 0.03
 
 
@@ -65,7 +67,7 @@ def test_noise_alone_shows_no_motion(ramp):
     x = np.exp(ramp * np.arange(400))[None] * np.ones((300, 1))
     a, b = ((x + rng.normal(0, 0.05, x.shape)).astype(np.float32) for _ in range(2))
     usable = np.ones(a.shape, bool)
-    found = motion.estimate(motion.View(a, usable), motion.View(b, usable))
+    found = register(Pyramid(a, usable), Pyramid(b, usable))
     assert found.shift_px < max(0.05, 3 * found.sigma_px)
 
 
@@ -75,13 +77,14 @@ def test_repeated_detail_is_matched_in_the_nearest_place():
     stairs = np.exp(np.arange(600) // 30 / 3)[None] * np.ones((480, 1))
     a, b = (np.sqrt(rng.poisson(100 * stairs * e) / 100).astype(np.float32) for e in (1, 0.25))
     usable = np.ones(a.shape, bool)
-    found = motion.estimate(motion.View(a, usable), motion.View(b, usable))
+    found = register(Pyramid(a, usable), Pyramid(b, usable))
     assert found.shift_px < max(0.05, 3 * found.sigma_px)
 
 
 def test_nothing_usable_means_no_motion():
     a = np.ones((300, 400), np.float32)
-    found = motion.estimate(*(motion.View(a, np.zeros(a.shape, bool)) for _ in range(2)))
+    blind = Pyramid(a, np.zeros(a.shape, bool))
+    found = register(blind, blind)
     assert found.tiles == 0 and np.array_equal(found.matrix, np.eye(3))
 
 
@@ -91,5 +94,5 @@ def test_even_picture_shows_no_motion():
     even, usable = np.full((128, 160), 0.5, np.float32), np.ones((128, 160), bool)
     textured = ndimage.gaussian_filter(np.random.default_rng(1).normal(size=even.shape), 2).astype(np.float32)
     for other in (even, textured):
-        found = motion.estimate(motion.View(even, usable), motion.View(other, usable))
+        found = register(Pyramid(even, usable), Pyramid(other, usable))
         assert np.array_equal(found.matrix, np.eye(3))

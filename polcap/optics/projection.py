@@ -1,0 +1,39 @@
+"""Projection of points: through a homography, and through a pinhole camera."""
+
+import numpy as np
+
+from polcap.images import Floats, View
+
+
+def transform_points(matrix: Floats, point: Floats) -> Floats:
+    """Points x, y (…, 2) through a homography (3, 3), (…, 2)."""
+    return np.stack(coordinates(matrix, point[..., 0], point[..., 1]), axis=-1)
+
+
+def coordinates(matrix: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """The same for x, y of any shapes that broadcast; float64."""
+    h = np.asarray(matrix, np.float64)
+    u, v = (h[k, 0] * x + (h[k, 1] * y + h[k, 2]) for k in (0, 1))
+    if abs(h[2, 0]) + abs(h[2, 1]) > 0 or h[2, 2] != 1:
+        w = h[2, 0] * x + (h[2, 1] * y + h[2, 2])
+        u, v = u / w, v / w
+    return u, v
+
+
+def picture_corners(width: int, height: int) -> Floats:
+    """Centres of the four corner pixels, x, y (4, 2)."""
+    return np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], float)
+
+
+def project(view: View, point: Floats) -> tuple[Floats, Floats]:
+    """Pixels x, y (…,) that show points (…, 3) of the camera frame (x right, y up, z towards the camera)."""
+    return (
+        view.center[0] - view.focal * point[..., 0] / point[..., 2],
+        view.center[1] + view.focal * point[..., 1] / point[..., 2],
+    )
+
+
+def back_project(view: View, x: Floats, y: Floats) -> Floats:
+    """Points (…, 3) of the camera frame at distance 1 along the optical axis, that pixels x, y show."""
+    across, up = (x - view.center[0]) / view.focal, (view.center[1] - y) / view.focal
+    return np.stack([across, up, -np.ones_like(across)], axis=-1)

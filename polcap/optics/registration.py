@@ -1,0 +1,409 @@
+"""Registration of two pictures of one scene: translation, similarity or homography, to a fiftieth of a pixel.
+
+1. The pictures are averaged down to pyramids; tiles with most detail are chosen on each scale.
+2. From coarse to fine, every tile is matched by itself: Gauss-Newton steps on its brightness, with a gain and an
+   offset of its own, so that exposure, lighting and polarization may differ from tile to tile.
+3. One motion is fitted robustly to the shifts of all tiles.
+
+References
+----------
+Baker and Matthews, Lucas-Kanade 20 years on, IJCV 2004 (step 2). Kuglin and Hines, The phase correlation image
+alignment method, 1975 (the start). Beaton and Tukey, Technometrics 1974 (biweight). Schwarz, Ann. Statist. 1978 (BIC).
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Floats
+from polcap.optics.projection import transform_points
+
+Bools = NDArray[np.bool_]
+Indices = NDArray[np.int64]
+Model = Literal["translation", "similarity", "homography", "simplest"]  # simplest: that explains the shifts (BIC)
+
+_SIZES = {"translation": (2,), "similarity": (4,), "homography": (8,), "simplest": (8, 4, 2)}  # numbers of parameters
+_TILE = 20  # px; of 16 to 32 px and 3 to 12 a cell, the least error over brackets and shots (docs/benchmarks)
+_CELLS, _PER_CELL = 10, 8  # tiles are spread over a grid of cells: the best few of each
+_COARSEST_PX = 256  # of the shorter side: a smaller picture has too few tiles
+_TILES_AT_ONCE = 64  # so that their equations fit a core's cache
+_MARGIN = 2  # px around a tile that interpolation reads
+_REACH_PX = 2.0  # a tile may move in one step
+_GAIN = 0.2, 5.0  # of a tile; beyond, it shows something else
+_LEAST_TILES = 6
+_TILE_ERROR_PX = 0.02  # of interpolation and aliasing, in the richest tile
+_PRIOR_PX = 0.1  # what the tiles do not know to this, hardly moves in one step
+_AGREE_PX = 0.3  # a tile that is left over by less agrees with the motion
+_LEAST_AGREE, _SURE_AGREE = 0.4, 0.6  # shares of the tiles: fewer show no motion; with more the first match is taken
+_FAR_BETTER = 1.25  # so many more tiles must agree with a far match: detail may repeat
+_STILL_PX = 1.0  # pictures that moved less need no coarse scales
+_SETTLED_PX = 0.005  # a smaller step ends the search; four times that on coarse scales
+_STEPS, _COARSE_STEPS = 6, 4
+
+
+@dataclass(frozen=True)
+class Registration:
+    """A motion and its error."""
+
+    matrix: Floats  # (3, 3) reference px (x, y, 1) → px of the other picture
+    shift_px: float  # rms displacement of the matched tiles
+    sigma_px: float  # 1σ of a typical displacement
+    tiles: int  # matched; 0: nothing to match, and the matrix is the identity
+    covariance: Floats  # (P, P) of the motion's parameters, see `_design`
+    shape: tuple[int, int]  # of the reference
+
+    def sigma_at(self, point: Floats) -> float:
+        """1σ per axis of where the motion puts a point x, y (2,), px; it grows with the distance from the tiles."""
+        if not self.tiles:
+            return np.inf
+        lever = _design(_normalized(point[None], self.shape))[0, :, : len(self.covariance)]
+        return float(np.sqrt(np.trace(lever @ self.covariance @ lever.T) / 2))
+
+
+class Pyramid:
+    """A picture at full size, half, a quarter …; scales and tiles are computed when they are first needed."""
+
+    def __init__(self, picture: Floats, usable: Bools) -> None:
+        """A picture (H, W) of about even noise, lightly smoothed; usable (H, W): pixels that may be compared."""
+        self._levels = [(picture, usable)]
+        self._tiles: dict[int, Indices] = {}
+        self.scales = 1
+        while min(picture.shape) // 2 ** (self.scales - 1) >= _COARSEST_PX:
+            self.scales += 1
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        height, width = self._levels[0][0].shape
+        return height, width
+
+    def __getitem__(self, scale: int) -> tuple[Floats, Bools]:
+        """Picture and usable pixels at 2^-scale of the size."""
+        while len(self._levels) <= scale:
+            picture, usable = self._levels[-1]
+            self._levels.append((_half(picture), _half(usable) > 0.99))
+        return self._levels[scale]
+
+    def tiles(self, scale: int) -> Indices:
+        """Corners (T, 2) = (row, column) of the tiles with most detail, spread over the picture."""
+        if scale not in self._tiles:
+            self._tiles[scale] = _choose_tiles(*self[scale])
+        return self._tiles[scale]
+
+
+@dataclass(frozen=True)
+class _Matches:
+    """Shifts that tiles still lack under a motion."""
+
+    point: Floats  # (T, 2) tile centres x, y in the reference
+    shift: Floats  # (T, 2) px
+    information: Floats  # (T, 2, 2) inverse covariance of the shift
+
+
+def register(reference: Pyramid, other: Pyramid, model: Model = "simplest") -> Registration:
+    """The motion from a reference to another picture.
+
+    Tried from the identity, then from a phase correlation. Nothing to match, or tiles that do not agree: the identity,
+    with no tiles.
+    """
+    still, agree = _refine(reference, other, model, 1, np.eye(3))
+    if still.shift_px < _STILL_PX and agree > _SURE_AGREE * still.tiles:
+        return still
+    scales = reference.scales
+    near, agree = _refine(reference, other, model, scales, np.eye(3))
+    start = _phase_correlation(*reference[scales - 1], *other[scales - 1])
+    far, more = _refine(reference, other, model, scales, start)
+    return far if more > _FAR_BETTER * agree else near
+
+
+def refine(reference: Pyramid, other: Pyramid, model: Model, start: Floats) -> Registration:
+    """The same from a first guess (3, 3), which stays where there is nothing to match."""
+    scales = reference.scales
+    found, _ = _refine(reference, other, model, scales, scaled(start, 1 / 2 ** (scales - 1)))
+    return found if found.tiles else replace(found, matrix=start)
+
+
+def correlation(reference: Pyramid, other: Pyramid, matrix: Floats) -> float:
+    """Pearson's correlation of the usable pixels of two pictures under a motion (3, 3); 0 where there are none."""
+    (a, ok_a), (b, ok_b) = reference[0], other[0]
+    size, inverse = a.shape[::-1], cv2.WARP_INVERSE_MAP
+    warped = cv2.warpPerspective(b, matrix, size, flags=inverse | cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    seen = cv2.warpPerspective(ok_b.view(np.uint8), matrix, size, flags=inverse | cv2.INTER_NEAREST, borderValue=0)
+    both = ok_a & (seen > 0)
+    if not both.any():
+        return 0.0
+    x, y = a[both] - a[both].mean(), warped[both] - warped[both].mean()
+    return float(np.vdot(x, y) / np.sqrt(float(np.vdot(x, x)) * float(np.vdot(y, y)) + 1e-30))
+
+
+def scaled(matrix: Floats, step: float) -> Floats:
+    """A motion (3, 3) on a grid averaged by `step`, on the grid that it was averaged from; 1/step: the other way."""
+    up = np.array([[step, 0, (step - 1) / 2], [0, step, (step - 1) / 2], [0, 0, 1.0]])
+    return np.asarray(up @ matrix @ np.linalg.inv(up))
+
+
+def squared_gradient(picture: Floats) -> Floats:
+    """Of a picture (h, w) by central differences, per px²; (h, w)."""
+    gx, gy = (
+        np.asarray(cv2.Sobel(picture, cv2.CV_32F, x, 1 - x, ksize=1, scale=0.5, borderType=cv2.BORDER_REPLICATE))
+        for x in (1, 0)
+    )
+    gx *= gx
+    gy *= gy
+    gx += gy
+    return gx
+
+
+def _half(picture: Floats | Bools) -> Floats:
+    h, w = picture.shape[0] // 2, picture.shape[1] // 2
+    even = picture[: 2 * h, : 2 * w].astype(np.float32, copy=False)
+    return np.asarray(cv2.resize(even, (w, h), interpolation=cv2.INTER_AREA))
+
+
+def _choose_tiles(picture: Floats, usable: Bools) -> Indices:
+    """Corners (T, 2) = (row, column): the tiles of most squared gradient in each cell of a coarse grid."""
+    rows, columns = (picture.shape[0] - 2) // _TILE, (picture.shape[1] - 2) // _TILE
+    if rows < 1 or columns < 1:
+        return np.zeros((0, 2), np.int64)
+    cut, size = (slice(0, rows * _TILE), slice(0, columns * _TILE)), (columns, rows)
+    score = np.empty((rows, columns), np.float32)
+    for n in range(rows):  # a row of tiles stays in a core's cache
+        top = _TILE * n
+        around = slice(max(top - 1, 0), top + _TILE + 1)
+        detail = squared_gradient(picture[around])[top - around.start :][:_TILE, cut[1]]
+        detail = detail * usable[top : top + _TILE, cut[1]]
+        score[n] = cv2.resize(detail, (columns, 1), interpolation=cv2.INTER_AREA)
+    score *= cv2.resize(usable[cut].view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) > 0.7 * 255
+    found = []
+    for cell_rows in np.array_split(np.arange(rows), min(_CELLS, rows)):
+        for cell_columns in np.array_split(np.arange(columns), min(_CELLS, columns)):
+            cell = score[np.ix_(cell_rows, cell_columns)]
+            for k in np.argsort(cell, axis=None)[::-1][:_PER_CELL]:
+                i, j = np.unravel_index(k, cell.shape)
+                if cell[i, j] > 0:
+                    found.append((_TILE * cell_rows[i], _TILE * cell_columns[j]))
+    return np.array(found, np.int64).reshape(-1, 2)
+
+
+def _phase_correlation(a: Floats, ok_a: Bools, b: Floats, ok_b: Bools) -> Floats:
+    """Whole-pixel shift (3, 3) of the pixels that both can use; the identity unless clearly better."""
+    window = np.outer(np.hanning(a.shape[0]), np.hanning(a.shape[1]))
+    both = ok_a & ok_b
+    if both.mean() < 0.05:
+        return np.eye(3)
+    flat = [window * np.where(both, p - p[both].mean(), 0) for p in (a, b)]
+    cross = np.conj(np.fft.rfft2(flat[0])) * np.fft.rfft2(flat[1])
+    strength = np.abs(cross)
+    if not strength.max() > 0:  # one of them is even
+        return np.eye(3)
+    peaks = np.fft.irfft2(cross / (strength + 1e-3 * strength.max()), s=a.shape)
+    dy, dx = (int(v) for v in np.unravel_index(int(np.argmax(peaks)), a.shape))
+    dy, dx = dy - a.shape[0] * (dy > a.shape[0] // 2), dx - a.shape[1] * (dx > a.shape[1] // 2)
+    if peaks[dy, dx] < 1.5 * peaks[0, 0]:
+        dy = dx = 0
+    return np.array([[1, 0, dx], [0, 1, dy], [0, 0, 1.0]])
+
+
+def _refine(
+    reference: Pyramid, other: Pyramid, model: Model, scales: int, matrix: Floats
+) -> tuple[Registration, float]:
+    """From a first guess on the coarsest of some scales to the full size; with it the number of tiles that agree."""
+    sigma, agree = np.inf, 0.0
+    points: Floats = np.zeros((0, 2))
+    covariance: Floats = np.zeros((2, 2))
+    for level in range(scales - 1, -1, -1):
+        a, b, tiles = reference[level], other[level], reference.tiles(level)
+        points = np.zeros((0, 2))
+        for _ in range(_COARSE_STEPS if level else _STEPS):
+            matches = _match(a, b, tiles, matrix)
+            if len(matches.point) < _LEAST_TILES:
+                break
+            update, covariance, sigma = _fit(matches, a[0].shape, model)
+            matrix = matrix @ update
+            points = matches.point
+            step = transform_points(update, points) - points
+            rest = matches.shift - step
+            agree = float(np.sum(np.hypot(rest[:, 0], rest[:, 1]) < _AGREE_PX))
+            if float(np.abs(step).max()) < _SETTLED_PX * (4 if level else 1):
+                break
+        if level:
+            matrix = scaled(matrix, 2)
+    if not len(points) or agree < _LEAST_AGREE * len(points):
+        return Registration(np.eye(3), 0.0, np.inf, 0, covariance, reference.shape), 0.0
+    matrix = matrix / matrix[2, 2]
+    moved = transform_points(matrix, points) - points
+    shift_px = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+    return Registration(matrix, shift_px, sigma, len(points), covariance, reference.shape), agree
+
+
+def _match(a: tuple[Floats, Bools], b: tuple[Floats, Bools], corner: Indices, matrix: Floats) -> _Matches:
+    """One Gauss-Newton step for every tile."""
+    parts = np.split(corner, range(_TILES_AT_ONCE, len(corner), _TILES_AT_ONCE))
+    some = [_match_some(a, b, part, matrix) for part in parts]
+    return _Matches(
+        np.concatenate([one.point for one in some]),
+        np.concatenate([one.shift for one in some]),
+        np.concatenate([one.information for one in some]),
+    )
+
+
+def _match_some(a: tuple[Floats, Bools], b: tuple[Floats, Bools], corner: Indices, matrix: Floats) -> _Matches:
+    """The same for some tiles at once: reference(x) = gain · (other(x + s) + ∇·δ) + offset is solved for δ."""
+    nothing = _Matches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    if not len(corner):
+        return nothing
+    center = corner[:, ::-1] + (_TILE - 1) / 2  # x, y
+    shift = transform_points(matrix, center) - center
+    whole = np.floor(shift).astype(np.int64)
+    first = corner + whole[:, ::-1]
+    shape = np.array(a[0].shape)
+    inside = np.all((first >= _MARGIN) & (first + _TILE + _MARGIN < shape), axis=1)
+    inside &= np.all((corner >= 1) & (corner + _TILE + 1 < shape), axis=1)
+    inside[inside] = _cut(b[1], first[inside], _TILE).mean(axis=(1, 2)) > 0.6
+    if not inside.any():
+        return nothing
+    corner, first, center = corner[inside], first[inside], center[inside]
+    patch = _cut(a[0], corner - 1, _TILE + 2)  # (T, _TILE + 2, _TILE + 2)
+    fraction = np.asarray(shift - whole, np.float64)[inside]
+    other = _sample(_cut(b[0], first - 1, _TILE + 3), fraction)  # cubic: 1 before, 2 after
+    usable = _cut(b[1], first, _TILE) * _cut(a[1], corner, _TILE)
+    inner = patch[:, 1:-1, 1:-1]
+    gx = (patch[:, 1:-1, 2:] - patch[:, 1:-1, :-2]) / 2
+    gy = (patch[:, 2:, 1:-1] - patch[:, :-2, 1:-1]) / 2
+    basis = np.stack([gx, gy, other, usable], axis=1).reshape(len(corner), 4, -1) * usable.reshape(len(corner), 1, -1)
+    normal = basis @ basis.transpose(0, 2, 1)  # unknowns: shift, gain, offset
+    normal += (1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-30) * np.eye(4)
+    target = inner.reshape(len(corner), -1, 1) * usable.reshape(len(corner), -1, 1)
+    solution = np.linalg.solve(normal, basis @ target)[..., 0]
+    residual = target[..., 0] - (solution[:, None] @ basis)[:, 0]
+    count = usable.sum(axis=(1, 2))
+    variance = (residual**2).sum(axis=1) / np.maximum(count - 4, 1) + 1e-12
+    missing, information = _without_noise(solution[:, :2], normal, count, variance)
+    good = np.all(np.abs(missing) < _REACH_PX, axis=1) & np.any(information != 0, axis=(1, 2))
+    good &= (solution[:, 2] > _GAIN[0]) & (solution[:, 2] < _GAIN[1])
+    return _Matches(center[good], missing[good], information[good])
+
+
+def _without_noise(shift: Floats, normal: Floats, count: Floats, variance: Floats) -> tuple[Floats, Floats]:
+    """Shifts (T, 2) and their information (T, 2, 2), freed of the noise in the gradients that made them too small.
+
+    The normal matrix (T, 4, 4), gain and offset eliminated, is that of the scene's gradients plus that of the noise's:
+    half the variance (T,) of each of `count` (T,) pixels. Directions in which noise prevails are left out.
+    """
+    both = np.linalg.inv(np.linalg.inv(normal)[:, :2, :2])
+    power, axes = np.linalg.eigh(both)
+    scene = power - 0.5 * (count * variance)[:, None]
+    known = scene > 0.5 * power
+    along = np.einsum("tik,ti->tk", axes, shift) * power / np.maximum(scene, 0.5 * power + 1e-300)
+    missing = np.einsum("tik,tk->ti", axes, np.where(known, along, 0))
+    information = np.einsum("tik,tk,tjk->tij", axes, np.where(known, scene, 0) / variance[:, None], axes)
+    return missing, information
+
+
+def _cut(picture: Floats | Bools, corner: Indices, size: int) -> Floats:
+    windows = np.lib.stride_tricks.sliding_window_view(picture, (size, size))
+    return np.asarray(windows[corner[:, 0], corner[:, 1]], np.float64)
+
+
+def _sample(patch: Floats, fraction: Floats) -> Floats:
+    """Catmull-Rom interpolation of whole tiles at one (x, y) fraction each."""
+    return np.asarray(_bands(fraction[:, 1]) @ patch @ _bands(fraction[:, 0]).transpose(0, 2, 1))
+
+
+def _bands(f: Floats) -> Floats:
+    """Weights (T, _TILE, _TILE + 3) of the samples of lines that begin a sample early, at fractions (T,)."""
+    weights = (
+        ((-f + 2) * f - 1) * f / 2,
+        ((3 * f - 5) * f * f + 2) / 2,
+        ((-3 * f + 4) * f + 1) * f / 2,
+        (f - 1) * f * f / 2,
+    )
+    out = np.zeros((len(f), _TILE, _TILE + 3))
+    each = np.arange(_TILE)
+    for k, weight in enumerate(weights):
+        out[:, each, each + k] = weight[:, None]
+    return out
+
+
+def _fit(matches: _Matches, shape: tuple[int, ...], model: Model) -> tuple[Floats, Floats, float]:
+    """The motion (3, 3) that explains the tiles' shifts, its parameters' covariance (P, P), and its typical 1σ, px."""
+    design = _design(_normalized(matches.point, shape))
+    # the richest tiles know less than their noise says
+    power, axes = np.linalg.eigh(matches.information)
+    limited = 1 / (1 / np.maximum(power, 1e-9) + _TILE_ERROR_PX**2)
+    information = np.einsum("tik,tk,tjk->tij", axes, limited, axes)
+    sizes = [k for k in _SIZES[model] if k <= len(matches.point)] or [2]
+    fits = [_robust(design[..., :k], matches.shift, information) for k in sizes]
+    # how far off the tiles' own errors are, by the richest model
+    spread = max(1.0, fits[0].chi2 / max(2 * float(fits[0].weight.sum()) - sizes[0], 1.0))
+    bic = [fit.chi2 / spread + k * np.log(2 * len(matches.point)) for k, fit in zip(sizes, fits)]
+    k, best = sizes[int(np.argmin(bic))], fits[int(np.argmin(bic))]
+    covariance = best.covariance * spread
+    each = np.einsum("tik,kl,til->t", design[..., :k], covariance, design[..., :k])
+    return _motion(best.parameters, shape), covariance, float(np.sqrt(each.mean()))
+
+
+def _normalized(point: Floats, shape: tuple[int, ...]) -> Floats:
+    """Points x, y (T, 2) px from the picture's middle, in halves of its longer side."""
+    return np.asarray((point - [(shape[1] - 1) / 2, (shape[0] - 1) / 2]) / (max(shape) / 2))
+
+
+def _design(u: Floats) -> Floats:
+    """Displacement (T, 2, 8) px per parameter at normalized points (T, 2).
+
+    In turn: a translation adds columns 0 and 1, a similarity 2 and 3, a homography the rest.
+    """
+    x, y = u[:, 0], u[:, 1]
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    dx = [one, zero, x, -y, x, y, x * x, x * y]
+    dy = [zero, one, y, x, -y, x, x * y, y * y]
+    return np.stack([np.stack(dx, -1), np.stack(dy, -1)], axis=1)
+
+
+def _motion(parameters: Floats, shape: tuple[int, ...]) -> Floats:
+    """Parameters of `_design` as a homography (3, 3), px."""
+    h, w = shape
+    scale = max(h, w) / 2
+    p = np.zeros(8)
+    p[: len(parameters)] = parameters
+    about_middle = np.array(
+        [
+            [1 + (p[2] + p[4]) / scale, (-p[3] + p[5]) / scale, p[0]],
+            [(p[3] + p[5]) / scale, 1 + (p[2] - p[4]) / scale, p[1]],
+            [-p[6] / scale**2, -p[7] / scale**2, 1],
+        ]
+    )
+    middle = np.array([[1, 0, (w - 1) / 2], [0, 1, (h - 1) / 2], [0, 0, 1.0]])
+    return np.asarray(middle @ about_middle @ np.linalg.inv(middle))
+
+
+@dataclass(frozen=True)
+class _RobustFit:
+    """Weighted least squares."""
+
+    parameters: Floats  # (P,)
+    covariance: Floats  # (P, P)
+    chi2: float
+    weight: Floats  # (T,) of the tiles
+
+
+def _robust(design: Floats, shift: Floats, information: Floats) -> _RobustFit:
+    """Parameters of the shifts (T, 2), least squares reweighted by Tukey's biweight."""
+    weight = np.ones(len(shift))
+    k = design.shape[2]
+    parameters: Floats = np.zeros(k)
+    covariance: Floats = np.eye(k)
+    chi2 = np.zeros(len(shift))
+    informed = information @ design  # (T, 2, P)
+    for _ in range(10):
+        weighted = (weight[:, None, None] * informed).reshape(-1, k).T
+        normal, right = weighted @ design.reshape(-1, k), weighted @ shift.ravel()
+        parameters = np.linalg.solve(normal + np.eye(k) / _PRIOR_PX**2, right)
+        covariance = np.linalg.inv(normal + np.eye(k))
+        rest = shift - design @ parameters
+        chi2 = np.einsum("ti,tij,tj->t", rest, information, rest)
+        scale = max(float(np.median(chi2)) / 1.386, 1e-6)  # χ² of two has median 1.386
+        weight = np.clip(1 - chi2 / (25 * scale), 0, None) ** 2
+    return _RobustFit(parameters, covariance, float(np.sum(weight * chi2)), weight)

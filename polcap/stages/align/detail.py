@@ -1,0 +1,73 @@
+"""Fine detail of a shot's log radiance: the picture in which shots of different polarizer angles are compared."""
+
+import cv2
+import numpy as np
+
+from polcap.images import Floats, MaskedImage, Quality
+from polcap.optics.registration import Pyramid, squared_gradient
+
+_BLUR_PX = 0.7  # both shots need one resolution; interpolation changes it
+_FLOOR = 0.01  # of the 99th percentile: keeps the logarithm of a dark background from amplifying its noise
+_TYPICAL_DETAIL = 0.02  # relative; where noise exceeds it, detail is weighted down
+_LEAST_PIXELS = 30
+
+
+def averaging_step(shape: tuple[int, ...], most_pixels: float) -> int:
+    """Side of the blocks to average so that a picture (H, W) has at most so many pixels."""
+    return int(np.ceil(np.sqrt(shape[0] * shape[1] / most_pixels)))
+
+
+def detail(shot: MaskedImage, detail_px: float, step: int) -> Pyramid:
+    """Log radiance of a shot, averaged by `step`, less everything coarser than a Gaussian of `detail_px` [averaged px].
+
+    Multiplied by d² / (d² + σ²), d the typical detail and σ the relative noise, as a Wiener filter does.
+    """
+    total = _averaged(_sum_of_channels(shot.value), step)
+    sigma = np.sqrt(_thinned(_sum_of_channels(shot.variance), total.shape, step)) / step
+    some = (slice(None, None, 5),) * 2  # enough for a percentile
+    floor = max(float(np.percentile(total[some], 99)) * _FLOOR, 2 * float(np.median(sigma[some])), 1e-9)
+    level = np.maximum(total, 0)
+    level += np.float32(floor)
+    log = np.asarray(cv2.log(level))
+    reach = 2 * int(np.ceil(3 * detail_px)) + 1
+    fine = np.asarray(cv2.GaussianBlur(log, (0, 0), _BLUR_PX))
+    fine -= cv2.GaussianBlur(log, (reach, reach), detail_px)
+    sigma /= level
+    fine /= 1 + (sigma / np.float32(_TYPICAL_DETAIL)) ** 2
+    clipped = _averaged((shot.quality & Quality.CLIPPED > 0).astype(np.float32), step) > 0
+    around = np.ones((int(np.ceil(2 * detail_px)) | 1,) * 2, np.uint8)
+    return Pyramid(fine, cv2.dilate(clipped.view(np.uint8), around) == 0)
+
+
+def edge_strength(shot: Pyramid) -> Pyramid:
+    """Where edges are and how strong, whichever side is brighter: the root of the gradient."""
+    picture, usable = shot[0]
+    return Pyramid(np.asarray(np.sqrt(cv2.GaussianBlur(np.sqrt(squared_gradient(picture)), (0, 0), 1.0))), usable)
+
+
+def shows_detail(shot: Pyramid) -> bool:
+    """Whether there is anything to compare."""
+    picture, usable = shot[0]
+    seen = picture[usable]
+    return len(seen) > _LEAST_PIXELS and bool(np.ptp(seen) > 0)
+
+
+def _sum_of_channels(picture: Floats) -> Floats:
+    """(H, W, 3) → (H, W)."""
+    return np.asarray(cv2.transform(np.asarray(picture, np.float32), np.ones((1, 3), np.float32)))
+
+
+def _averaged(image: Floats, step: int) -> Floats:
+    """Means of step × step blocks of (H, W); an incomplete last block is dropped."""
+    if step == 1:
+        return image
+    height, width = image.shape[0] // step, image.shape[1] // step
+    whole = image[: height * step, : width * step]
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA))
+
+
+def _thinned(picture: Floats, shape: tuple[int, ...], step: int) -> Floats:
+    """One pixel of each step × step block of (H, W): of a variance, which changes slowly."""
+    height, width = shape
+    whole = picture[: height * step, : width * step]
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_NEAREST))
