@@ -96,8 +96,8 @@ def test_command_prints_one_document_and_ends_with_2_on_a_fault(
 ) -> None:
     from polcap.rig import camera_gphoto2, serial_port
 
-    monkeypatch.setattr(serial_port, "ports", list)
-    monkeypatch.setattr(camera_gphoto2, "connected", list)
+    monkeypatch.setattr(serial_port, "serial_ports", list)
+    monkeypatch.setattr(camera_gphoto2, "connected_cameras", list)
     done = polcap("doctor", "--json")
     about = json.loads(done.stdout)
     assert done.returncode == 0 and about["process_works"]

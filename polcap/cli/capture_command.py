@@ -40,23 +40,24 @@ def capture(
     json: Json = False,
 ) -> None:
     """Shoot a capture: turn the polarizer, take the bracket, check every frame as it lands."""
-    from polcap.rig import camera as cameras
-    from polcap.rig import plan, sequence
+    from polcap.rig import dry_run as plans
+    from polcap.rig import exposure_bracket, sequence
+    from polcap.rig.resume import complete_order
 
     stated = {
         "rotator": rotator,
         "camera": camera,
         "angles_deg": options.angles_deg(angles),
-        "bracket": None if bracket is None else cameras.parse_bracket(bracket),
+        "bracket": None if bracket is None else exposure_bracket.parse_bracket(bracket),
         "repeat_deg": None if repeat is None else options.numbers("--repeat", repeat),
         "ambient": ambient or None,
         "chart": chart or None,
         "cross": cross or None,
     }
-    wanted = sequence.order(folder, stated, resume)
+    wanted = complete_order(folder, stated, resume)
     if dry_run:
-        planned = plan.dry_run(wanted)
-        terminal.say(planned if json else plan.table(planned))
+        planned = plans.dry_run(wanted)
+        terminal.say(planned if json else plans.table(planned))
         return
     done = sequence.shoot(folder, wanted, resume=resume, tries=tries, tell=terminal.tell)
     verdict = None if no_check else _verdict(folder)

@@ -32,10 +32,13 @@ def doctor(
         if any(one.state == "fault" for one in findings):
             raise typer.Exit(SettingError.exit_code)
         return
-    from polcap.rig import camera_gphoto2, rotator, serial_port
+    from polcap.rig import camera_gphoto2, device_urls, serial_port
 
     rig = doctors.Rig(
-        serial_port.ports, functools.partial(_may_write, ask_ports), rotator.probe, camera_gphoto2.connected
+        serial_port.serial_ports,
+        functools.partial(_may_write, ask_ports),
+        device_urls.probe,
+        camera_gphoto2.connected_cameras,
     )
     found = doctors.examine(rig, Path.cwd())
     terminal.say(doctors.shown(found) if json else doctors.table(found))

@@ -1,24 +1,30 @@
-"""The rig: a motor that turns the polarizer and a camera, driven and watched.
+"""The rig: a motor turns the polarizer, a camera takes the brackets, and the frames become a capture folder.
 
-In: a port, a camera, a list of angles. Out: a capture folder. Angles are in degrees throughout, as devices speak them.
+Angles are in degrees throughout, as the devices use them.
 
-    sequence         angles × bracket -> capture folder, frame by frame
-    plan             an order -> its frames, the shortest way through the angles, the time it takes
-    landing          photographs -> saved and judged in the background
-    frame_check      one frame as it lands -> what is wrong with it
-    record           good and bad frames -> rig.json, capture.toml
-    preview          the middle exposures -> a first look at the polarization
-    camera           what every camera does
-    camera_choice    by name -> one of
-        camera_gphoto2   a body on a cable
-        camera_folder    any application that writes RAWs into a folder
-    rotator          what a rotator does, and how every motor is driven; by URL -> one of
-        elliptec         Thorlabs ELL14, ELL18
-        grbl             a stepper behind GRBL 1.1
-        line_protocol    an Arduino or RP2040 with the sketch of `examples/rotator_firmware`
-        manual           a person at the terminal
-    simulated        the camera and the motor that need no hardware
-    watchdog         a call that may hang -> its answer, or an error in time
-    serial_port      a line-based exchange over a serial port; alone knows pyserial
-    log              every command sent and answered -> a text file
+    sequence                turn, take what is missing, check in the background
+    exposure_bracket        `--bracket`, and the default exposures
+    shooting_plan           every frame, in the order that turns the motor least
+    dry_run                 the time that a plan takes
+    background_check        save and check photographs while the rig goes on
+    retake_criteria         which frame is retaken, and why
+    capture_record          accepted and rejected frames: rig.json, capture.toml
+    resume                  continue an interrupted capture
+    preview                 first picture of the polarization
+
+    device_urls             opens the rotator or camera that a URL names
+    rotator                 zero, sense, one-sided approach and read-back; the protocol `Motor` of all drivers
+    motor_elliptec_ell14    Thorlabs ELL14, ELL18
+    motor_grbl              a stepper on a GRBL 1.1 board
+    motor_line_protocol     an Arduino or RP2040 with the sketch of `examples/rotator_firmware`
+    motor_by_hand           a person turns the ring
+    motor_simulated         no hardware
+    serial_port             lines of text over a serial port, with timeouts
+    camera                  the protocol `Camera` of all drivers
+    camera_gphoto2          a camera on a USB cable
+    camera_watch_folder     a tethering program writes RAWs into a folder
+    camera_simulated        no hardware
+    call_timeout            a time limit for calls into a library that may hang
+    person                  questions at the terminal
+    device_log              every command and every answer: rig.log
 """

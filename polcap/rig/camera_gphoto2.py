@@ -1,7 +1,7 @@
-"""A camera on a cable, driven by libgphoto2: exposures in, its RAW files out, byte for byte.
+"""Camera driver for `gphoto2`: a camera on a USB cable; sets the dials, releases, and fetches the RAW file.
 
-Alone knows gphoto2. Settings are found by the names that libgphoto2's drivers give them; a body that lacks one is
-used as it stands.
+Only this module imports gphoto2. Settings have the names of libgphoto2's drivers; one that the camera lacks is not
+changed.
 """
 
 import re
@@ -13,13 +13,14 @@ from typing import Any, TypeVar
 
 from polcap.errors import HardwareError, SettingError
 from polcap.images import Role
-from polcap.rig import watchdog
-from polcap.rig.camera import Exposure, Shot, by_iso, by_shutter, nearest
-from polcap.rig.log import Log
+from polcap.rig.call_timeout import CallTimeout, call_within
+from polcap.rig.camera import CameraFile
+from polcap.rig.device_log import Log
+from polcap.rig.exposure_bracket import Exposure, bracket_by_iso, bracket_by_shutter, nearest
 
 T = TypeVar("T")
 
-_WIDGETS = {  # of Exposure's fields, and the power of the value that is light
+_WIDGETS = {  # names of Exposure's fields, and the power of the value that is proportional to light
     "time_s": (("shutterspeed", "shutterspeed2"), 1.0),
     "f_number": (("aperture", "f-number"), 2.0),
     "iso": (("iso",), 1.0),
@@ -30,57 +31,50 @@ _VALUE = re.compile(r"(?:f/?)?(?P<over>\d+(?:\.\d+)?/)?(?P<value>\d+(?:\.\d+)?) 
 _REMEDY = {
     -7: "check the cable",
     -52: "plug it in, switch it on",
-    -53: "another program holds it; close that program (gvfs, digiKam, …)",
+    -53: "another program uses it; close that program (gvfs, digiKam, …)",
     -105: "plug it in, switch it on, and set it to PTP",
     -110: "it is busy; wait, or switch it off and on",
     -115: "its card is full; put in another",
 }
 _JPEG = b"\xff\xd8\xff"
-_SECOND_FILE_MS = 2000  # a body that writes RAW and JPEG tells of the second this long after the first
+_SECOND_FILE_MS = 2000  # a camera that writes RAW and JPEG announces the second file within this time
 
 
-class Gphoto2:
-    """The camera whose model contains `which`, or on port `which`; the only one where it is empty."""
+class Gphoto2Camera:
+    """The camera on port `which` or with `which` in its model; the only one if `which` is empty."""
 
     frame_bytes = 60_000_000
 
     def __init__(self, which: str, log: Log, timeout_s: float = 30.0) -> None:
-        """`timeout_s` is for a release and the transfer, beside the exposure. Raises HardwareError, SettingError."""
-        try:
-            import gphoto2
-        except ModuleNotFoundError:
-            raise SettingError("gphoto2 is not installed; pip install 'polcap[rig]'") from None
-        self._gp: Any = gphoto2
+        """`timeout_s` limits release and transfer, without the exposure. Raises HardwareError, SettingError."""
+        self._gp = _gphoto2()
         self._log = log
         self._which = which
         self._timeout_s = timeout_s
-        self._busy = threading.Lock()  # held while a call is on its way
+        self._busy = threading.Lock()  # held during a call
         self.model = "camera"
         self._camera: Any = self._ask("connect", self._connect)
-        known = [name for names, _ in _WIDGETS.values() for name in names]
-        self._choices = {
-            name: self._ask(f"offer {name}", partial(self._offered, name)) for name in (*known, _FLASH_MODE)
-        }
+        names = [*(name for names, _ in _WIDGETS.values() for name in names), _FLASH_MODE]
+        self._choices = {name: self._ask(f"choices of {name}", partial(self._list_choices, name)) for name in names}
         self.switches_flash = self._dark() is not None
         self.polarizes_flash = False
         self._lit = self._ask("flash mode", lambda: self._value(_FLASH_MODE)) if self._choices[_FLASH_MODE] else None
 
     def bracket(self, flash: bool) -> tuple[Exposure, ...]:
-        """Two stops darker and lighter than the camera's own shutter speed; under a flash by its ISO."""
-        (names, _) = _WIDGETS["iso" if flash else "time_s"]
-        name = self._widget(names)
+        """Two stops below and above the camera's shutter speed; under a flash steps of ISO."""
+        name = self._widget("iso" if flash else "time_s")
         if flash:
-            return by_iso([value for text in self._choices[name] if (value := _number(text))] if name else [])
-        return by_shutter(_number(self._ask(f"value {name}", lambda: self._value(name))) if name else None)
+            return bracket_by_iso([value for text in self._choices[name] if (value := _number(text))] if name else [])
+        return bracket_by_shutter(_number(self._ask(f"value {name}", lambda: self._value(name))) if name else None)
 
     def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:
-        """Nothing: the camera sees for itself."""
+        """There is nothing to prepare."""
 
-    def shoot(self, exposure: Exposure, flash: bool) -> Shot:
-        """Connects anew once where the camera fails, but not where it hangs."""
+    def shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
+        """Reconnects once if the camera fails, but not if it hangs."""
         try:
             return self._shoot(exposure, flash)
-        except watchdog.Stalled:
+        except CallTimeout:
             raise
         except HardwareError as error:
             self._log.write("camera", "!", f"{error}; connecting again")
@@ -90,21 +84,21 @@ class Gphoto2:
             return self._shoot(exposure, flash)
 
     def close(self) -> None:
-        if self._busy.acquire(timeout=self._timeout_s):  # else it hangs, and would again
+        if self._busy.acquire(timeout=self._timeout_s):  # else a call hangs, and this one would too
             self._busy.release()
             with suppress(HardwareError):
                 self._ask("disconnect", self._camera.exit)
 
-    def _shoot(self, exposure: Exposure, flash: bool) -> Shot:
+    def _shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
         done = {field: self._set(field, getattr(exposure, field)) for field in _WIDGETS}
-        self._light(flash)
+        self._switch_flash(flash)
         seconds = done["time_s"] or exposure.time_s or 0.0
         data, name = self._ask("capture", self._capture, seconds)
-        return Shot(data, name, Exposure(**done))
+        return CameraFile(data, name, Exposure(**done))
 
     def _connect(self) -> Any:
         gp = self._gp
-        found = connected()
+        found = connected_cameras()
         fitting = [(name, port) for name, port in found if self._which.lower() in name.lower() or port == self._which]
         if not fitting:
             listed = ", ".join(f"{name} at {port}" for name, port in found) or "none"
@@ -120,18 +114,17 @@ class Gphoto2:
         camera.init()
         return camera
 
-    def _set(self, field: str, asked: float | None) -> float | None:
-        """Turn a dial to the value nearest in stops; returns it. None: the camera stays as it is."""
-        names, power = _WIDGETS[field]
-        name = self._widget(names)
-        if asked is None or name is None:
+    def _set(self, field: str, wanted: float | None) -> float | None:
+        """Set a dial to the value nearest in stops; returns it, or None if the dial was not changed."""
+        name = self._widget(field)
+        if wanted is None or name is None:
             return None
         offered = {value: text for text in self._choices[name] if (value := _number(text))}
-        value = nearest(field, asked, list(offered), power)
+        value = nearest(field, wanted, list(offered), _WIDGETS[field][1])
         self._ask(f"{name} = {offered[value]}", lambda: self._turn(name, offered[value]))
         return value
 
-    def _light(self, flash: bool) -> None:
+    def _switch_flash(self, flash: bool) -> None:
         dark = self._dark()
         if dark is not None and self._lit is not None:
             mode = self._lit if flash else dark
@@ -140,11 +133,11 @@ class Gphoto2:
     def _dark(self) -> str | None:
         return next((text for text in self._choices[_FLASH_MODE] if "off" in text.lower()), None)
 
-    def _widget(self, names: tuple[str, ...]) -> str | None:
-        return next((name for name in names if self._choices[name]), None)
+    def _widget(self, field: str) -> str | None:
+        return next((name for name in _WIDGETS[field][0] if self._choices[name]), None)
 
-    def _offered(self, name: str) -> list[str]:
-        """Choices of a setting; none where the body lacks it, or does not let it be chosen."""
+    def _list_choices(self, name: str) -> list[str]:
+        """Choices of a setting; none if the camera lacks it or it is read-only."""
         gp = self._gp
         try:
             widget = self._camera.get_single_config(name)
@@ -152,8 +145,8 @@ class Gphoto2:
             if error.code == gp.GP_ERROR_BAD_PARAMETERS:
                 return []
             raise
-        chosen = widget.get_type() in (gp.GP_WIDGET_RADIO, gp.GP_WIDGET_MENU) and not widget.get_readonly()
-        return [str(text) for text in widget.get_choices()] if chosen else []
+        selectable = widget.get_type() in (gp.GP_WIDGET_RADIO, gp.GP_WIDGET_MENU) and not widget.get_readonly()
+        return [str(text) for text in widget.get_choices()] if selectable else []
 
     def _value(self, name: str) -> str:
         return str(self._camera.get_single_config(name).get_value())
@@ -164,7 +157,7 @@ class Gphoto2:
         self._camera.set_single_config(name, widget)
 
     def _capture(self) -> tuple[bytes, str]:
-        """Release, and fetch the RAW; the JPEG beside it only where there is nothing else."""
+        """Release, and fetch the RAW; the JPEG only if the camera writes no RAW."""
         place = self._camera.capture(self._gp.GP_CAPTURE_IMAGE)
         data = self._fetch(place)
         while data.startswith(_JPEG):
@@ -179,35 +172,40 @@ class Gphoto2:
         file = self._camera.file_get(place.folder, place.name, self._gp.GP_FILE_TYPE_NORMAL)
         return bytes(memoryview(file.get_data_and_size()))
 
-    def _ask(self, what: str, call: Callable[[], T], extra_s: float = 0.0) -> T:
-        """One exchange, logged, in time, its failure told in one line."""
+    def _ask(self, request: str, call: Callable[[], T], extra_s: float = 0.0) -> T:
+        """One call of libgphoto2: logged, limited in time, its failure a HardwareError of one line."""
 
         def run() -> T:
             with self._busy:
                 return call()
 
-        self._log.write("camera", ">", what)
+        self._log.write("camera", ">", request)
         try:
-            answer = watchdog.within(self._timeout_s + extra_s, f"{self.model}: {what}", run)
+            answer = call_within(self._timeout_s + extra_s, f"{self.model}: {request}", run)
         except self._gp.GPhoto2Error as error:
             self._log.write("camera", "<", f"{error.code} {error.string}")
             remedy = _REMEDY.get(error.code, "check the cable, switch it off and on")
-            raise HardwareError(f"{self.model}: {what}: {error.string} ({error.code}); {remedy}") from None
-        self._log.write("camera", "<", _shown(answer))
+            raise HardwareError(f"{self.model}: {request}: {error.string} ({error.code}); {remedy}") from None
+        self._log.write("camera", "<", _summary(answer))
         return answer
 
 
-def connected() -> list[tuple[str, str]]:
-    """Model and port of every camera on a cable. Raises HardwareError; SettingError without gphoto2."""
-    try:
-        import gphoto2
-    except ModuleNotFoundError:
-        raise SettingError("gphoto2 is not installed; pip install 'polcap[rig]'") from None
+def connected_cameras() -> list[tuple[str, str]]:
+    """Model and port of every connected camera. Raises HardwareError; SettingError without gphoto2."""
+    gphoto2 = _gphoto2()
     try:
         found = gphoto2.Camera.autodetect()
         return [(str(found.get_name(at)), str(found.get_value(at))) for at in range(found.count())]
     except gphoto2.GPhoto2Error as error:
         raise HardwareError(f"cameras cannot be listed: {error.string} ({error.code}); check the cables") from None
+
+
+def _gphoto2() -> Any:
+    try:
+        import gphoto2
+    except ModuleNotFoundError:
+        raise SettingError("gphoto2 is not installed; pip install 'polcap[rig]'") from None
+    return gphoto2
 
 
 def _number(text: str) -> float | None:
@@ -219,7 +217,7 @@ def _number(text: str) -> float | None:
     return float(match["over"][:-1]) / value if match["over"] else value
 
 
-def _shown(answer: object) -> str:
+def _summary(answer: object) -> str:
     if isinstance(answer, tuple):
         return f"{answer[1]}, {len(answer[0])} bytes"
     return str(answer) if isinstance(answer, str | list) else "ok"

@@ -1,4 +1,4 @@
-"""In: the middle exposures of a capture, small and grey, and their angles. Out: a first look at the polarization."""
+"""Preview of a capture: S0, degree and angle of polarization from its middle exposures."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,251 +1,225 @@
-"""In: an order, a rotator, a camera. Out: a capture folder, frame by frame, each checked as it lands.
+"""The sequence of a capture: turn the polarizer, take the frames that are missing, check each in the background.
 
-The rig turns and shoots; meanwhile another thread saves and judges what came. A bad frame is kept aside and its place
-is empty again, so that shooting on, shooting again and going on after a crash are one loop: take what is missing.
+A rejected frame leaves its slot empty. So retakes and resuming after a crash are the same loop: take what is missing.
 """
 
 import shutil
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import msgspec
 from filelock import FileLock, Timeout
 
-from polcap.errors import CaptureError, PolcapError, SettingError, StorageError
-from polcap.formats import atomic
-from polcap.formats.capture import layouts
+from polcap.errors import PolcapError, SettingError, StorageError
 from polcap.formats.capture import reader as captures
-from polcap.rig import camera_choice, frame_check, manual, plan, preview, record, rotator
-from polcap.rig.camera import Camera, Exposure, Shot
-from polcap.rig.landing import AHEAD, Landing
-from polcap.rig.log import Log
-from polcap.rig.plan import Order, Pace, Slot
-from polcap.rig.record import Content, Record
-from polcap.rig.rotator import Rotator
+from polcap.rig import capture_record, device_urls, dry_run, person, preview, retake_criteria, shooting_plan
+from polcap.rig.background_check import MOST_PENDING, BackgroundCheck
+from polcap.rig.camera import Camera, CameraFile
+from polcap.rig.capture_record import CaptureRecord, RigFile
+from polcap.rig.device_log import Log
+from polcap.rig.resume import open_folder, verify
+from polcap.rig.retake_criteria import RetakeLimits
+from polcap.rig.rotator import PolarizerRotator
+from polcap.rig.shooting_plan import CaptureOrder, Slot
 
-LIMITS = frame_check.Limits()
+LIMITS = RetakeLimits()
 Tell = Callable[[str], None]
-_SPARE = 1.2  # of the room a capture needs
-_BESIDE = {record.LOG, "lock"}  # what a run leaves that was stopped before its first frame
-
-
-def silent(line: str) -> None:
-    """Tell nobody."""
-
-
-def order(folder: Path, stated: dict[str, Any], resume: bool) -> Order:
-    """What to shoot: `given` where it is not None, else with `resume` what was begun, else the default.
-
-    Raises
-    ------
-    SettingError
-        It makes no capture.
-    """
-    begun = record.load(folder) if resume else None
-    wanted = {} if begun is None else msgspec.structs.asdict(begun.order)
-    wanted |= {name: value for name, value in stated.items() if value is not None}
-    for name in ("rotator", "camera"):
-        if name not in wanted:
-            if resume:
-                raise SettingError(
-                    f"{folder} holds no capture that was begun: there is nothing to resume; correct the folder, or "
-                    "begin with --rotator and --camera"
-                )
-            raise SettingError(f"--{name} is missing; name one, or `simulated` to try without")
-    return Order(**({"angles_deg": layouts.DEFAULT_DEG, "bracket": ()} | wanted))
+_SPARE = 1.2  # free disk space over the size of the frames
 
 
 def shoot(
     folder: Path,
-    wanted: Order,
+    order: CaptureOrder,
     *,
     resume: bool = False,
-    limits: frame_check.Limits = LIMITS,
+    limits: RetakeLimits = LIMITS,
     tries: int = 2,
-    tell: Tell = silent,
+    tell: Tell = lambda line: None,
 ) -> dict[str, Any]:
-    """Shoot what is `wanted` into `folder`; returns what was done.
+    """Shoot the capture that was ordered into `folder`; returns a summary.
 
     Raises
     ------
     CaptureError
-        `folder` holds something, or with `resume` something else than what is `wanted`; or a frame stays bad.
+        `folder` is not empty or, with `resume`, holds another capture; or a frame is rejected too often.
     HardwareError
-        A device fails. What was taken is kept, and `resume` goes on.
+        A device failed. The frames so far stay, and `resume` continues.
     StorageError
-        The disk is full, or would be.
+        The disk is full, or too small.
     """
     start = time.monotonic()
-    content = _begun(folder, wanted, resume)
-    with _alone(folder), _ended_politely(), _log(folder) as log, _held(wanted.camera, log) as camera:
+    content = open_folder(folder, order, resume)
+    with (
+        _locked(folder),
+        _signals_as_ctrl_c(),
+        closing(Log(folder / capture_record.LOG)) as log,
+        closing(device_urls.open_camera(order.camera, log)) as camera,
+    ):
         if content is None:
-            exposures = wanted.bracket or camera.bracket(plan.names_flash(wanted))
-            content = Content(_with_bracket(wanted, exposures))
+            bracket = order.bracket or camera.bracket(shooting_plan.uses_flash(order))
+            content = RigFile(msgspec.structs.replace(order, bracket=bracket))
         content.camera = camera.model
-        book = Record(folder, content, plan.slots(content.order, camera.switches_flash))
-        for line in record.verify(book):
-            tell(line)
-        missing = book.missing(())
-        _check_room(folder, len(missing) * camera.frame_bytes)
-        landing = Landing(book, limits, tries, log)
+        record = CaptureRecord(folder, content, shooting_plan.plan_slots(content.order, camera.switches_flash))
+        for message in verify(record):
+            tell(message)
+        missing = record.missing()
+        _check_disk(folder, len(missing) * camera.frame_bytes)
+        check = BackgroundCheck(record, limits, tries, log)
         if missing:
-            if note := plan.light_note(content.order):
+            if note := shooting_plan.light_note(content.order):
                 tell(f"polcap: {note}")
             _check_person(missing, camera)
-            _take_all(book, landing, wanted.rotator, camera, log, tell)
-        return _finished(book, landing) | {"taken": len(missing), "seconds": round(time.monotonic() - start, 1)}
+            _take_missing(order.rotator, record, check, camera, log, tell)
+        summary = _finish(record, check)
+    return summary | {"taken": len(missing), "seconds": round(time.monotonic() - start, 1)}
 
 
-def _take_all(book: Record, landing: Landing, url: str, camera: Camera, log: Log, tell: Tell) -> None:
-    """Hold the rotator while frames are taken; on every way out it stops and is released."""
-    turner = rotator.open_rotator(url, log)
+def _take_missing(
+    url: str, record: CaptureRecord, check: BackgroundCheck, camera: Camera, log: Log, tell: Tell
+) -> None:
+    """Run the rotator; however the run ends, the motor is stopped and released."""
+    rotator = device_urls.open_rotator(url, log)
     try:
-        book.content.rotator = turner.model
-        book.write()
-        pace = Pace(turner.speed_deg_s, turner.settle_s, plan.overhead_s(book.content.order.camera))
-        _loop(book, landing, turner, camera, log, pace, tell)
+        record.content.rotator = rotator.model
+        log.write("polcap", "!", f"{len(record.missing())} frames to take with {rotator.model} and {camera.model}")
+        record.write()
+        Shooting(record, check, rotator, camera, log, tell).run()
     except PolcapError as error:
         log.write("polcap", "!", str(error))
-        raise type(error)(f"{error}; what was taken is kept, --resume goes on") from error
+        raise type(error)(f"{error}; the frames so far are saved, --resume continues") from error
     finally:
-        turner.stop()
+        rotator.stop()
         try:
-            landing.close()
+            check.close()
         finally:
-            turner.close()
+            rotator.close()
 
 
-def _loop(book: Record, landing: Landing, turner: Rotator, camera: Camera, log: Log, pace: Pace, tell: Tell) -> None:
-    """Take what is missing until nothing is."""
-    turner.home()
-    at_deg, read_deg = 0.0, None  # asked for, and read back there
-    filtered = False  # the flash
-    while True:
-        landing.collect(block=len(landing.pending) >= AHEAD)
-        missing = book.missing(landing.pending)
-        if not missing:
-            if not landing.pending:
-                return
-            landing.collect(block=True)
-            continue
-        slot = plan.next_slot(missing, at_deg)
-        if slot.angle_deg is not None:
-            if read_deg is None or slot.angle_deg != at_deg:
-                if landing.pending and not turner.unattended:  # nobody likes to turn back
-                    landing.collect(block=True)
+class Shooting:
+    """The loop that takes the missing frames."""
+
+    def __init__(
+        self,
+        record: CaptureRecord,
+        check: BackgroundCheck,
+        rotator: PolarizerRotator,
+        camera: Camera,
+        log: Log,
+        tell: Tell,
+    ) -> None:
+        self._record = record
+        self._check = check
+        self._rotator = rotator
+        self._camera = camera
+        self._log = log
+        self._tell = tell
+        overhead_s = dry_run.overhead_s(record.content.order.camera)
+        self._pace = dry_run.Pace(rotator.speed_deg_s, rotator.settle_s, overhead_s)
+        self._angle_deg = 0.0  # requested last
+        self._read_deg: float | None = None  # read back there
+        self._filter_on_flash = False
+
+    def run(self) -> None:
+        self._rotator.home()
+        while True:
+            self._check.collect(block=len(self._check.pending) >= MOST_PENDING)
+            missing = self._record.missing(self._check.pending)
+            if missing:
+                slot = shooting_plan.next_slot(missing, self._angle_deg)
+                turns = slot.angle_deg is not None and (self._read_deg is None or slot.angle_deg != self._angle_deg)
+                if not (turns and self._rotator.by_hand and self._check.pending):
+                    self._take(slot, missing)
                     continue
-                at_deg, read_deg = slot.angle_deg, None
-                read_deg = _beside(turner.move(at_deg), at_deg)
-            for aside in book.arrived_again(slot, read_deg):
-                tell(f"{aside} is taken again: the ring came back to {read_deg:.2f}°")
-        left = pace.total_s(plan.schedule([*missing], at_deg), at_deg)
-        done = len(book.slots) - len(missing) + 1
-        tell(f"{slot.name:24}{done:3}/{len(book.slots)}  {slot.exposure}  {left / 60:.0f}:{left % 60:02.0f} left")
-        filtered = _with_filter(slot, filtered, camera, log)
-        shot = _photograph(slot, camera, log)
-        _check_apart(slot, shot, book)
-        landing.take(slot, None if slot.angle_deg is None else read_deg, shot)
+            elif not self._check.pending:
+                return
+            self._check.collect(block=True)  # at the end, and before a person turns the ring: nobody likes to turn back
+
+    def _take(self, slot: Slot, missing: list[Slot]) -> None:
+        if slot.angle_deg is not None:
+            self._turn(slot, slot.angle_deg)
+        total = len(self._record.slots)
+        left_s = self._pace.total_s(missing, self._angle_deg)
+        self._tell(
+            f"{slot.name:24}{total - len(missing) + 1:3}/{total}  {slot.exposure}  "
+            f"{left_s / 60:.0f}:{left_s % 60:02.0f} left"
+        )
+        self._ask_for_filter(slot.role == "cross")
+        photograph = self._photograph(slot)
+        self._check_different(slot, photograph)
+        self._check.submit(slot, None if slot.angle_deg is None else self._read_deg, photograph)
+
+    def _turn(self, slot: Slot, angle_deg: float) -> None:
+        if self._read_deg is None or angle_deg != self._angle_deg:
+            self._angle_deg, self._read_deg = angle_deg, None
+            read_deg = self._rotator.move(angle_deg)
+            self._read_deg = round(angle_deg + (read_deg - angle_deg + 180.0) % 360.0 - 180.0, 4)  # not modulo 360
+        for name in self._record.reject_other_angle(slot, self._read_deg):
+            self._tell(f"{name} is taken again: the ring came back to {self._read_deg:.2f}°")
+
+    def _ask_for_filter(self, wanted: bool) -> None:
+        """Ask a person to put the flash's filter on or to take it off."""
+        if wanted != self._filter_on_flash and not self._camera.polarizes_flash:
+            on = "put the second polarizer on the flash and turn it until the highlights vanish"
+            off = "take the polarizer off the flash again"
+            person.ask(f"{on if wanted else off}, then press Enter: ", self._log)
+        self._filter_on_flash = wanted
+
+    def _photograph(self, slot: Slot) -> CameraFile:
+        """Take one frame; a person handles the chart, and the flash if the camera cannot switch it."""
+        self._camera.prepare(slot.angle_deg, slot.role, slot.step)
+        before = after = ""
+        if slot.role == "chart":
+            before, after = "put the chart in the place of the object", "remove the chart"
+        elif not slot.flash and not self._camera.switches_flash:
+            before, after = "switch the flash off", "switch the flash on again"
+        if before:
+            person.ask(f"{before}, then press Enter: ", self._log)
+        photograph = self._camera.shoot(slot.exposure, slot.flash)
+        if after:
+            person.ask(f"{after}, then press Enter: ", self._log)
+        return photograph
+
+    def _check_different(self, slot: Slot, photograph: CameraFile) -> None:
+        """Raise SettingError if the camera's dials gave two frames of the bracket the same exposure."""
+        for name, frame in self._record.accepted().items():
+            if slot.role == frame.role == "shot" and frame.step != slot.step and frame.exposure == photograph.exposure:
+                raise SettingError(
+                    f"--bracket: the camera took {slot.name} ({slot.exposure}) with {photograph.exposure}, as {name}; "
+                    "give exposures that differ more"
+                )
 
 
-def _with_filter(slot: Slot, filtered: bool, camera: Camera, log: Log) -> bool:
-    """Have a person put the flash's filter on or off, as a frame needs it; whether it is on now."""
-    wanted = slot.role == "cross"
-    if wanted != filtered and not camera.polarizes_flash:
-        on = "put the second polarizer on the flash and turn it until the highlights vanish"
-        manual.ask(f"{on if wanted else 'take the polarizer off the flash again'}, then Enter: ", log)
-    return wanted
-
-
-def _photograph(slot: Slot, camera: Camera, log: Log) -> Shot:
-    """One frame; for some a person first does what no device can."""
-    camera.prepare(slot.angle_deg, slot.role, slot.step)
-    before = after = ""
-    if slot.role == "chart":
-        before, after = "put the chart where the object is", "take the chart away again"
-    elif not slot.flash and not camera.switches_flash:
-        before, after = "switch the flash off", "switch the flash on again"
-    if before:
-        manual.ask(f"{before}, then Enter: ", log)
-    shot = camera.shoot(slot.exposure, slot.flash)
-    if after:
-        manual.ask(f"{after}, then Enter: ", log)
-    return shot
-
-
-def _beside(angle_deg: float, asked_deg: float) -> float:
-    """An angle modulo 360 as the number next to the one asked for."""
-    return round(asked_deg + (angle_deg - asked_deg + 180.0) % 360.0 - 180.0, 4)
-
-
-def _finished(book: Record, landing: Landing) -> dict[str, Any]:
-    """The preview, the capture as `polcap process` will understand it, and what was done."""
-    middle = len(book.content.order.bracket) // 2
-    shots = {name: good for name, good in book.good().items() if good.role == "shot" and good.step == middle}
+def _finish(record: CaptureRecord, check: BackgroundCheck) -> dict[str, Any]:
+    """Draw the preview, read the capture as `polcap process` will, and summarize it."""
+    middle = len(record.content.order.bracket) // 2
+    accepted = record.accepted()
+    shots = {name: frame for name, frame in accepted.items() if frame.role == "shot" and frame.step == middle}
     small = [
-        landing.small[name] if name in landing.small else frame_check.inspect(book.folder / good.file)[1]
-        for name, good in shots.items()
+        check.small[name] if name in check.small else retake_criteria.inspect(record.folder / frame.file)[1]
+        for name, frame in shots.items()
     ]
-    drawn = preview.write(book.folder, [book.stated_deg(good) or 0.0 for good in shots.values()], small)
-    captures.read(book.folder)
+    picture = preview.write(record.folder, [record.stated_deg(frame) or 0.0 for frame in shots.values()], small)
+    captures.read(record.folder)
     return {
-        "folder": str(book.folder),
-        "preview": str(drawn),
-        "rotator": book.content.rotator,
-        "camera": book.content.camera,
+        "folder": str(record.folder),
+        "preview": str(picture),
+        "rotator": record.content.rotator,
+        "camera": record.content.camera,
         "angles": [
-            {"asked_deg": good.angle_deg, "read_deg": good.read_deg, "stated_deg": book.stated_deg(good)}
-            for good in shots.values()
+            {"asked_deg": frame.angle_deg, "read_deg": frame.read_deg, "stated_deg": record.stated_deg(frame)}
+            for frame in shots.values()
         ],
-        "frames": len(book.good()),
-        "rejected": [msgspec.to_builtins(bad) for bad in book.content.rejected],
+        "frames": len(accepted),
+        "rejected": [msgspec.to_builtins(frame) for frame in record.content.rejected],
     }
 
 
-def _begun(folder: Path, wanted: Order, resume: bool) -> Content | None:
-    """What an earlier run left of the same order; None to begin. The folder is there afterwards."""
-    content = record.load(folder) if resume else None
-    if content is not None:
-        asked = msgspec.structs.asdict(_with_bracket(wanted, content.order.bracket))
-        for name, value in asked.items():
-            was = getattr(content.order, name)
-            here = record.without_port(value) if name in ("rotator", "camera") else value
-            if here != (record.without_port(was) if name in ("rotator", "camera") else was):
-                flag = {"angles_deg": "--angles", "repeat_deg": "--repeat"}.get(name, f"--{name}")
-                raise CaptureError(f"{folder} was begun with another {flag}; {record.remedy(was)}, or a new folder")
-        return content
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        there = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
-    except OSError as error:
-        raise atomic.failure(folder, error) from error
-    if (folder / record.NAME).exists():
-        raise CaptureError(f"{folder} holds a capture that was begun; go on with --resume, or choose another folder")
-    if set(there) - _BESIDE:
-        raise CaptureError(f"{folder} is not empty ({there[0]}); choose another folder for the capture")
-    return None
-
-
-def _with_bracket(wanted: Order, bracket: tuple[Exposure, ...]) -> Order:
-    return wanted if wanted.bracket else msgspec.structs.replace(wanted, bracket=bracket)
-
-
-def _check_apart(slot: Slot, shot: Shot, book: Record) -> None:
-    """The dials could be set so that a bracket has as many exposures as were asked for."""
-    for name, good in book.good().items():
-        if slot.role == good.role == "shot" and good.step != slot.step and good.exposure == shot.exposure:
-            raise SettingError(
-                f"--bracket: the camera takes {slot.name} ({slot.exposure}) as {name}, with {shot.exposure}; "
-                "give exposures that it can tell apart"
-            )
-
-
-def _check_room(folder: Path, needed: int) -> None:
+def _check_disk(folder: Path, needed: int) -> None:
     free = shutil.disk_usage(folder).free
     if free < _SPARE * needed:
         raise StorageError(
@@ -255,45 +229,25 @@ def _check_room(folder: Path, needed: int) -> None:
 
 
 def _check_person(missing: list[Slot], camera: Camera) -> None:
-    """Fail before the first frame where somebody has to be asked later and nobody is there."""
-    asks = {
+    """Fail before the first frame if a person is needed later and there is no terminal."""
+    questions = {
         "--chart": any(slot.role == "chart" for slot in missing),
         "--ambient": not camera.switches_flash and any(not slot.flash for slot in missing),
         "--cross": not camera.polarizes_flash and any(slot.role == "cross" for slot in missing),
     }
-    if any(asks.values()) and not (sys.stdin and sys.stdin.isatty()):
-        named = " and ".join(name for name, needed in asks.items() if needed)
-        raise SettingError(f"{named}: need a person at a terminal here; run in one, or leave it out")
+    if any(questions.values()) and not person.at_terminal():
+        named = " and ".join(option for option, needed in questions.items() if needed)
+        raise SettingError(f"{named}: a person at a terminal is needed; run in a terminal, or leave it out")
 
 
 @contextmanager
-def _log(folder: Path) -> Iterator[Log]:
-    log = Log(folder / record.LOG)
-    try:
-        yield log
-    finally:
-        log.close()
-        if not (folder / record.NAME).exists() and not (folder / record.LOG).stat().st_size:  # nothing was begun
-            (folder / record.LOG).unlink()
-
-
-@contextmanager
-def _held(name: str, log: Log) -> Iterator[Camera]:
-    camera = camera_choice.open_camera(name, log)
-    try:
-        yield camera
-    finally:
-        camera.close()
-
-
-@contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Keep a second polcap out of the folder; the system drops the lock when its owner dies."""
+def _locked(folder: Path) -> Iterator[None]:
+    """No second polcap shoots into the folder; the system drops the lock when the process dies."""
     lock = FileLock(folder / ".lock", timeout=0)
     try:
         lock.acquire()
     except Timeout as error:
-        raise StorageError(f"{folder}: another polcap is shooting into it; wait for it") from error
+        raise StorageError(f"{folder}: another polcap is shooting into it; wait until it has finished") from error
     try:
         yield
     finally:
@@ -301,20 +255,15 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _ended_politely() -> Iterator[None]:
+def _signals_as_ctrl_c() -> Iterator[None]:
     """SIGTERM and SIGHUP end a run as Ctrl-C does, so that the motor stops."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-
-    def interrupt(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
-
     numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    before = [signal.signal(number, interrupt) for number in numbers]
+    before = [(number, signal.signal(number, signal.default_int_handler)) for number in numbers]
     try:
         yield
     finally:
-        for number, handler in zip(numbers, before):
-            with suppress(ValueError, TypeError):
-                signal.signal(number, handler)
+        for number, handler in before:
+            signal.signal(number, handler)

@@ -1,6 +1,6 @@
-"""In: a serial port's URL. Out: an exchange of lines whose every failure is one HardwareError, and in time.
+"""Serial port with timeouts: lines of text out and in, and one HardwareError for every failure.
 
-URLs are pyserial's: `/dev/ttyUSB0`, `COM3`, `socket://host:port`, `loop://`. Alone knows pyserial.
+URLs are pyserial's: `/dev/ttyUSB0`, `COM3`, `socket://host:port`, `loop://`. Only this module imports pyserial.
 """
 
 import errno
@@ -13,21 +13,21 @@ import serial
 from serial.tools import list_ports
 
 from polcap.errors import HardwareError, SettingError
-from polcap.rig.log import Log
+from polcap.rig.device_log import Log
 
 T = TypeVar("T")
-_FAILURES: tuple[type[Exception], ...] = (OSError, TypeError)  # TypeError: pyserial, closed meanwhile
+_FAILURES: tuple[type[Exception], ...] = (OSError, TypeError)  # pyserial raises TypeError on a closed port
 with suppress(ImportError):  # Windows
     import termios
 
-    _FAILURES += (termios.error,)  # a pulled cable; neither SerialException nor OSError
+    _FAILURES += (termios.error,)  # a pulled cable
 
-ANSWER_S = 1.0  # for one answer
-_SLICE_S = 0.05  # longest single read
-_QUIET_S = 0.25  # after which nothing is on its way any more; a USB adapter delivers within 16 ms
-_CATCH_UP_S = 2.0  # longest wait for that
-_LONGEST_LINE = 1024  # bytes; more without a line's end is noise
-_REFUSED = {
+ANSWER_S = 1.0  # time limit of one answer
+_SHORTEST_READ_S = 0.02  # a line that has already arrived is read even after the time limit
+_QUIET_S = 0.25  # after so long without a byte no answer is on its way; a USB adapter delivers within 16 ms
+_LATE_S = 2.0  # longest wait for late answers
+_LONGEST_LINE = 1024  # bytes; more without a line end is noise
+_CANNOT_OPEN = {
     errno.ENOENT: "there is no such port; plug the device in, `polcap doctor` lists the ports",
     errno.EACCES: "permission denied; add yourself to the port's group (dialout on Debian), log in again",
     errno.EBUSY: "another program holds it; close that program",
@@ -36,57 +36,40 @@ _REFUSED = {
 }
 
 
-class Silent(HardwareError):
-    """No answer, half of one, or one that means nothing; asking again may help."""
+class NoAnswer(HardwareError):
+    """No answer, half of one, or an unknown one; asking again may help."""
 
 
 class Unplugged(HardwareError):
-    """The port is gone."""
+    """The port has disappeared."""
 
 
-def patiently(ask: Callable[[], T]) -> T:
-    """Ask a silent device up to three times."""
+def retry(ask: Callable[[], T]) -> T:
+    """Ask a device up to three times while it does not answer."""
     for _ in range(2):
-        with suppress(Silent):
+        with suppress(NoAnswer):
             return ask()
     return ask()
 
 
-def ports() -> list[tuple[str, str]]:
-    """The serial ports of this machine and what the system calls them."""
+def serial_ports() -> list[tuple[str, str]]:
+    """Device and description of this machine's serial ports."""
     return sorted((port.device, port.description) for port in list_ports.comports())
 
 
-def started(driver: Callable[["Port"], T], url: str, baud: int, log: Log) -> T:
-    """A rotator's driver on a port of its own, which is closed again where the driver does not start.
-
-    Raises
-    ------
-    HardwareError
-        The port cannot be opened, or what answers there is not what the driver speaks to.
-    """
-    port = Port(url, baud=baud, log=log, name="rotator")
-    try:
-        return driver(port)
-    except BaseException:
-        port.close()
-        raise
-
-
 class Port:
-    """Lines of ASCII over a port nobody else may open meanwhile."""
+    """An exclusively opened serial port for lines of ASCII."""
 
-    def __init__(self, url: str, *, baud: int, log: Log, name: str) -> None:
-        """Raises HardwareError where the port cannot be opened, SettingError where the URL is none."""
+    def __init__(self, url: str, baud: int, log: Log) -> None:
+        """Raises HardwareError if the port cannot be opened, SettingError for a malformed URL."""
         self.url = url
         self._log = log
-        self._name = name
-        self._kept = b""  # received and not yet read
-        self._asked = ""
-        self._behind = self._heard = False  # a question has no answer yet; something came since
+        self._question = ""
+        self._answer_missing = False  # it may still come, and must not be taken for the next answer
+        self._heard = False  # something has come since
         try:
             self._serial = serial.serial_for_url(
-                url, baudrate=baud, timeout=_SLICE_S, write_timeout=ANSWER_S, exclusive=True
+                url, baudrate=baud, timeout=ANSWER_S, write_timeout=ANSWER_S, exclusive=True
             )
         except ValueError as error:
             raise SettingError(
@@ -94,110 +77,88 @@ class Port:
             ) from None
         except _FAILURES as error:
             code = getattr(error, "errno", None) or getattr(error.__context__, "errno", None) or 0
-            text = _REFUSED[errno.EBUSY] if "exclusively lock" in str(error) else _REFUSED.get(code, str(error))
-            raise HardwareError(f"cannot open {url}: {text}") from error
+            code = errno.EBUSY if "exclusively lock" in str(error) else code
+            raise HardwareError(f"cannot open {url}: {_CANNOT_OPEN.get(code, error)}") from error
 
-    def send(self, data: bytes) -> None:
-        """Forget what came before, and send. Raises Silent, Unplugged."""
-        if self._behind:
-            self._catch_up()
-        self.drain()
-        self.add(data)
+    def send(self, text: str, discard: bool = True) -> None:
+        """Send `text`, by default after discarding all unread input. Raises NoAnswer, Unplugged."""
+        with self._named_failures():
+            if discard:
+                if self._answer_missing:
+                    self._discard_late_answers()
+                self._serial.reset_input_buffer()
+            self._serial.write(text.encode("ascii"))
+        self._question = _printable(text.encode("ascii"))
+        self._log.write("rotator", ">", self._question)
 
-    def add(self, data: bytes) -> None:
-        """Send, and keep what has come but was not read. Raises Silent, Unplugged."""
-        self._asked = shown(data)
-        with self._clear():
-            self._serial.write(data)
-        self._log.write(self._name, ">", self._asked)
-
-    def read_line(self, timeout_s: float | None = None) -> str:
-        """The next line that is not empty, without its end.
-
-        Raises
-        ------
-        Silent
-            None came in time, half of one, or what is no ASCII.
-        Unplugged
-            The port is gone.
-        """
-        limit = ANSWER_S if timeout_s is None else timeout_s
-        end = time.monotonic() + limit
-        over = False
-        while True:
-            line, found, rest = self._kept.partition(b"\n")
-            if found:
-                self._kept = rest
-                if line.strip():
-                    return self._understood(line.strip())
-                continue
-            if over or len(self._kept) > _LONGEST_LINE:
-                break
-            over = time.monotonic() >= end  # a busy machine may look late: what has come by then counts
-            with self._clear():
-                waiting = self._serial.in_waiting
-                if waiting or not over:
-                    self._kept += self._serial.read(max(1, waiting))
-        half, self._kept = self._kept, b""
-        self._behind, self._heard = True, False
-        if half.strip():
-            self._log.write(self._name, "<", shown(half) + " …")
-            raise Silent(
-                f"{self.where} only '{shown(half):.40}' within {limit:.3g} s; check the cable and the baud rate"
+    def read_line(self, limit_s: float | None = None) -> str:
+        """The next line that is not empty, without its end. Raises NoAnswer, Unplugged."""
+        limit_s = ANSWER_S if limit_s is None else limit_s
+        end = time.monotonic() + limit_s
+        with self._named_failures():
+            while True:
+                self._serial.timeout = max(end - time.monotonic(), _SHORTEST_READ_S)
+                received = self._serial.read_until(b"\n", _LONGEST_LINE)
+                line = received.strip()
+                if line or not received or time.monotonic() >= end:
+                    break
+        if line and received.endswith(b"\n"):
+            return self._decoded(line)
+        self._answer_missing, self._heard = True, False
+        if line:
+            self._log.write("rotator", "<", _printable(line) + " …")
+            raise NoAnswer(
+                f"{self._subject} only '{_printable(line):.40}' within {limit_s:.3g} s; "
+                "check the cable and the baud rate"
             )
-        raise Silent(f"{self.where} nothing within {limit:.3g} s; check the cable, the power and the URL")
+        raise NoAnswer(f"{self._subject} nothing within {limit_s:.3g} s; check the cable, the power and the URL")
 
-    def drain(self) -> None:
-        """Forget what has come and was not read. Raises Unplugged."""
-        self._kept = b""
-        with self._clear():
-            self._serial.reset_input_buffer()
+    def read_lines(self, limit_s: float | None = None) -> Iterator[str]:
+        """Lines as they come. Raises NoAnswer when the time is over, Unplugged."""
+        end = time.monotonic() + (ANSWER_S if limit_s is None else limit_s)
+        while True:
+            yield self.read_line(max(0.0, end - time.monotonic()))
 
     def close(self) -> None:
         with suppress(*_FAILURES):
             self._serial.close()
 
-    @property
-    def where(self) -> str:
-        """How a message about the last exchange begins."""
-        return f"{self._name} on {self.url} answered '{self._asked}' with" if self._asked else f"{self.url} sent"
-
-    def strange(self, line: str) -> Silent:
-        """The error for an answer that means nothing."""
-        return Silent(
-            f"{self.where} '{line:.40}', which means nothing; check the cable and that the URL names this device"
+    def unknown_answer(self, line: str) -> NoAnswer:
+        """The error for a line that is no answer of the protocol."""
+        return NoAnswer(
+            f"{self._subject} '{line:.40}', an unknown answer; check the cable and that the URL names this device"
         )
 
-    def _understood(self, line: bytes) -> str:
-        self._log.write(self._name, "<", shown(line))
+    @property
+    def _subject(self) -> str:
+        return f"rotator on {self.url} answered '{self._question}' with" if self._question else f"{self.url} sent"
+
+    def _decoded(self, line: bytes) -> str:
+        self._log.write("rotator", "<", _printable(line))
         self._heard = True
         if not all(32 <= byte < 127 or byte == 9 for byte in line):
-            raise Silent(f"{self.where} '{shown(line):.40}', which is no text; check the cable and the baud rate")
+            raise NoAnswer(
+                f"{self._subject} '{_printable(line):.40}', which is not text; check the cable and the baud rate"
+            )
         return line.decode("ascii")
 
-    def _catch_up(self) -> None:
-        """Let answers to what was asked before arrive, lest they be taken for the next one's."""
-        limit = time.monotonic() + _CATCH_UP_S
-        quiet = time.monotonic() + _QUIET_S
-        while time.monotonic() < min(quiet, limit):
-            with self._clear():
-                if self._serial.read(max(1, self._serial.in_waiting)):
-                    self._heard, quiet = True, time.monotonic() + _QUIET_S
-        self._behind = not self._heard
+    def _discard_late_answers(self) -> None:
+        self._serial.timeout = _QUIET_S
+        end = time.monotonic() + _LATE_S
+        while self._serial.read(_LONGEST_LINE) and time.monotonic() < end:
+            self._heard = True
+        self._answer_missing = not self._heard
 
     @contextmanager
-    def _clear(self) -> Iterator[None]:
-        """One error for every way a port fails."""
+    def _named_failures(self) -> Iterator[None]:
         try:
             yield
         except serial.SerialTimeoutException as error:
-            raise Silent(f"{self._name} on {self.url} takes no data; check its power") from error
+            raise NoAnswer(f"rotator on {self.url} accepts no data; check its power") from error
         except _FAILURES as error:
-            raise Unplugged(
-                f"{self._name} on {self.url} is gone: unplugged, or without power; plug it in again"
-            ) from error
+            raise Unplugged(f"rotator on {self.url} is gone: unplugged, or without power; plug it in again") from error
 
 
-def shown(data: bytes) -> str:
-    """Bytes as a log line shows them: without the line's end, control characters escaped."""
+def _printable(data: bytes) -> str:
+    """Bytes for the log and for messages: without the line end, control characters escaped."""
     return repr(data.strip(b"\r\n"))[2:-1]

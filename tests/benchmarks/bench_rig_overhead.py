@@ -17,8 +17,9 @@ import numpy as np
 from polcap.formats.raw import dng
 from polcap.images import Exif, Role
 from polcap.rig import sequence
-from polcap.rig.camera import Exposure, Shot
-from polcap.rig.plan import Order
+from polcap.rig.camera import CameraFile
+from polcap.rig.exposure_bracket import Exposure
+from polcap.rig.shooting_plan import CaptureOrder
 from tests.rig.pool import BRACKET
 
 _DEVICE_S = 1.0
@@ -48,10 +49,10 @@ class Camera:
 
     def prepare(self, angle_deg: float | None, role: Role, step: int) -> None: ...
 
-    def shoot(self, exposure: Exposure, flash: bool) -> Shot:
+    def shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
         self.clock.back()
         time.sleep(_DEVICE_S)
-        shot = Shot(next(self.frames), "B.DNG", exposure)
+        shot = CameraFile(next(self.frames), "B.DNG", exposure)
         self.clock.away()
         return shot
 
@@ -59,7 +60,7 @@ class Camera:
 
 
 class Rotator:
-    model, speed_deg_s, settle_s, unattended = "Bench", 1e9, 0.0, True
+    model, speed_deg_s, settle_s, by_hand = "Bench", 1e9, 0.0, False
 
     def home(self) -> None: ...
 
@@ -75,11 +76,11 @@ def main() -> None:
     clock = Clock()
     with tempfile.TemporaryDirectory() as place:
         frames = [_frame(Path(place) / "x.dng", number) for number in range(9)]
-        order = Order((0.0, 45.0, 90.0), BRACKET, rotator="simulated", camera="simulated")
+        order = CaptureOrder((0.0, 45.0, 90.0), BRACKET, rotator="simulated", camera="simulated")
         camera = Camera(clock, frames)
         with (
-            mock.patch("polcap.rig.camera_choice.open_camera", lambda name, log: camera),
-            mock.patch("polcap.rig.rotator.open_rotator", lambda url, log: Rotator()),
+            mock.patch("polcap.rig.device_urls.open_camera", lambda name, log: camera),
+            mock.patch("polcap.rig.device_urls.open_rotator", lambda url, log: Rotator()),
         ):
             sequence.shoot(Path(place) / "c", order)
         end = time.perf_counter() - clock.left

@@ -47,8 +47,8 @@ from polcap.images import (
     StokesImage,
     View,
 )
-from polcap.rig import camera, elliptec, grbl, line_protocol, serial_port
-from polcap.rig.log import Log
+from polcap.rig import exposure_bracket, motor_elliptec_ell14, motor_grbl, motor_line_protocol, serial_port
+from polcap.rig.device_log import Log
 from tests.campaigns.mutations import mutated
 from tests.campaigns.rows import Rows
 from tests.formats import headers
@@ -70,37 +70,30 @@ class Clock:
 
 
 CLOCK = Clock()
-for driver in (elliptec, grbl, line_protocol):
+for driver in (motor_elliptec_ell14, motor_grbl, motor_line_protocol, serial_port):
     driver.time = CLOCK  # type: ignore[attr-defined]
 
 
-class Replies:
+class Replies(serial_port.Port):
     """A serial port whose answers are written beforehand."""
 
-    url = "fuzz://"
-
     def __init__(self, data: bytes) -> None:
-        self._lines = [line for line in data.split(b"\n") if line.strip()]  # as Port, which passes over empty ones
+        self.url = "fuzz://"
+        self._lines = [line for line in data.split(b"\n") if line.strip()]  # as Port, which skips empty ones
 
-    def send(self, data: bytes) -> None: ...
+    def send(self, text: str, discard: bool = True) -> None: ...
 
-    def add(self, data: bytes) -> None: ...
-
-    def drain(self) -> None: ...
-
-    def close(self) -> None: ...
-
-    def read_line(self, timeout_s: float | None = None) -> str:
+    def read_line(self, limit_s: float | None = None) -> str:
         if not self._lines:
-            CLOCK.sleep(serial_port.ANSWER_S if timeout_s is None else timeout_s)
-            raise serial_port.Silent("fuzz:// answered with nothing")
+            CLOCK.sleep(serial_port.ANSWER_S if limit_s is None else limit_s)
+            raise serial_port.NoAnswer("fuzz:// answered with nothing")
         line = self._lines.pop(0).strip()
         if not all(32 <= byte < 127 or byte == 9 for byte in line):
-            raise serial_port.Silent("fuzz:// answered with no text")
+            raise serial_port.NoAnswer("fuzz:// answered with no text")
         return line.decode("ascii")
 
-    def strange(self, line: str) -> serial_port.Silent:
-        return serial_port.Silent(f"fuzz:// answered {line:.40}")
+    def unknown_answer(self, line: str) -> serial_port.NoAnswer:
+        return serial_port.NoAnswer(f"fuzz:// answered {line:.40}")
 
 
 @dataclass(frozen=True)
@@ -177,7 +170,7 @@ def _jpeg(data: bytes, folder: Path) -> object:
 
 
 def _bracket(data: bytes, folder: Path) -> object:
-    return camera.parse_bracket(data.decode("utf-8", "surrogateescape"))
+    return exposure_bracket.parse_bracket(data.decode("utf-8", "surrogateescape"))
 
 
 def _name(data: bytes, folder: Path) -> object:
@@ -187,21 +180,21 @@ def _name(data: bytes, folder: Path) -> object:
 
 
 def _elliptec(data: bytes, folder: Path) -> object:
-    motor = elliptec.Elliptec(Replies(data), elliptec.Settings(), 0.05)  # type: ignore[arg-type]
+    motor = motor_elliptec_ell14.ElliptecMotor(Replies(data), motor_elliptec_ell14.ElliptecSettings(), 0.05, Log(None))
     motor.home()
-    return motor.where()
+    return motor.position()
 
 
 def _grbl(data: bytes, folder: Path) -> object:
-    board = grbl.Grbl(Replies(data), grbl.Settings(), 0.05, Log(None))  # type: ignore[arg-type]
+    board = motor_grbl.GrblMotor(Replies(data), motor_grbl.GrblSettings(), 0.05, Log(None))
     board.home()
-    return board.where()
+    return board.position()
 
 
 def _line(data: bytes, folder: Path) -> object:
-    board = line_protocol.Line(Replies(data), line_protocol.Settings(), 0.05, Log(None))  # type: ignore[arg-type]
+    board = motor_line_protocol.LineMotor(Replies(data), motor_line_protocol.LineSettings(), 0.05, Log(None))
     board.home()
-    return board.where()
+    return board.position()
 
 
 _VALUES = {  # by the name that each has in its manifest

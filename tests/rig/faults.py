@@ -20,8 +20,8 @@ import msgspec
 
 from polcap.errors import HardwareError, PolcapError, StorageError
 from polcap.formats.raw.file_bytes import digest
-from polcap.rig import record, sequence, serial_port
-from polcap.rig.plan import Order
+from polcap.rig import capture_record, sequence, serial_port
+from polcap.rig.shooting_plan import CaptureOrder
 from tests.conftest import ROOT
 from tests.rig import pool as pools
 from tests.rig import virtual
@@ -86,12 +86,12 @@ def undisturbed(kind: type[Device], pool: dict[Key, bytes], folder: Path) -> Non
     _judge(folder, pool)
 
 
-def _order(device: Device) -> Order:
+def _order(device: Device) -> CaptureOrder:
     return msgspec.structs.replace(pools.ORDER, rotator=f"{type(device).__name__.lower()}:{device.port}?{QUICK}")
 
 
 def _shoot(device: Device, camera: PoolCamera, folder: Path, resume: bool = False) -> None:
-    with mock.patch("polcap.rig.camera_choice.open_camera", lambda name, log: camera):
+    with mock.patch("polcap.rig.device_urls.open_camera", lambda name, log: camera):
         sequence.shoot(folder, _order(device), resume=resume)
 
 
@@ -131,7 +131,7 @@ def _killed(fault: str, chance: random.Random, pool: dict[Key, bytes], folder: P
         command = [sys.executable, "-m", "tests.rig.faults", str(folder), device.port, str(file), *planted]
         child = subprocess.Popen(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stderr=subprocess.PIPE)
         end = time.monotonic() + _START_S
-        while not (folder / record.LOG).exists() and child.poll() is None and time.monotonic() < end:
+        while not (folder / capture_record.LOG).exists() and child.poll() is None and time.monotonic() < end:
             time.sleep(0.005)
         if not planted:
             time.sleep(chance.uniform(0.0, 2.5))
@@ -168,8 +168,8 @@ def _kept(folder: Path) -> dict[str, str]:
     return kept
 
 
-def _content(folder: Path) -> record.Content:
-    content = record.load(folder)
+def _content(folder: Path) -> capture_record.RigFile:
+    content = capture_record.load(folder)
     assert content is not None
     return content
 
@@ -197,7 +197,7 @@ def main() -> None:
     camera = PoolCamera(pools.loaded(Path(file)), fault="kill" if at else "", at=int(at[0]) if at else 1)
     order = msgspec.structs.replace(pools.ORDER, rotator=f"elliptec:{port}?{QUICK}")
     serial_port.ANSWER_S = 20.0  # the device is a thread of another process, which a busy machine may let wait
-    with mock.patch("polcap.rig.camera_choice.open_camera", lambda name, log: camera):
+    with mock.patch("polcap.rig.device_urls.open_camera", lambda name, log: camera):
         sequence.shoot(Path(folder), order)
 
 

@@ -15,14 +15,15 @@ from polcap.errors import HardwareError
 from polcap.formats.raw import dng
 from polcap.formats.raw.file_bytes import digest
 from polcap.images import Exif, Role
-from polcap.rig import watchdog
-from polcap.rig.camera import Exposure, Shot
-from polcap.rig.plan import Order
+from polcap.rig.call_timeout import call_within
+from polcap.rig.camera import CameraFile
+from polcap.rig.exposure_bracket import Exposure
+from polcap.rig.shooting_plan import CaptureOrder
 from polcap.synth.shooting import MIDDLE_S, Shoot, Studio, Take, random_scene
 
 ANGLES = (0.0, 45.0, 90.0)
 BRACKET = tuple(Exposure(time_s=time, f_number=11.0, iso=100.0) for time in (0.005, 0.02, 0.08))
-ORDER = Order(angles_deg=ANGLES, bracket=BRACKET, repeat_deg=(45.0,), ambient=True, camera="simulated")
+ORDER = CaptureOrder(angles_deg=ANGLES, bracket=BRACKET, repeat_deg=(45.0,), ambient=True, camera="simulated")
 CAMERA_FAULTS = ("stall", "disconnect", "card-full", "disk-full", "corrupt", "stale", "ctrl-c", "kill")
 
 Key = tuple[str, float, int]  # role, angle, step
@@ -96,12 +97,12 @@ class PoolCamera:
             assert min(abs(here - angle_deg), 180 - abs(here - angle_deg)) < 0.1, "a frame at a wrong angle"
         self._key = role, angle_deg, step
 
-    def shoot(self, exposure: Exposure, flash: bool) -> Shot:
+    def shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
         data = self.pool[self._key]
         if len(self.delivered) + 1 == self.at and self.fault:
             fault, self.fault = self.fault, ""
             if fault == "stall":
-                watchdog.within(self.timeout_s, "camera: capture", threading.Event().wait)
+                call_within(self.timeout_s, "camera: capture", threading.Event().wait)
             if fault in ("disconnect", "card-full"):
                 raise HardwareError(f"camera: capture: {fault}")
             if fault == "corrupt":
@@ -116,7 +117,7 @@ class PoolCamera:
                 os.kill(os.getpid(), signal.SIGKILL)
         self._last = data
         self.delivered.append((self._key, digest(data)))
-        return Shot(data, "POOL.DNG", exposure)
+        return CameraFile(data, "POOL.DNG", exposure)
 
     def close(self) -> None:
         self.closed = True

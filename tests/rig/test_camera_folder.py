@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from polcap.errors import HardwareError, SettingError
-from polcap.rig import camera_folder
-from polcap.rig.camera import Exposure
-from polcap.rig.camera_choice import open_camera
-from polcap.rig.camera_folder import WatchedFolder
-from polcap.rig.log import Log
+from polcap.rig import camera_watch_folder
+from polcap.rig.camera_watch_folder import WatchFolderCamera
+from polcap.rig.device_log import Log
+from polcap.rig.device_urls import open_camera
+from polcap.rig.exposure_bracket import Exposure
 from tests.rig import virtual
 from tests.rig.pool import tiny
 
@@ -32,7 +32,7 @@ class Clock(virtual.Clock):
 @pytest.fixture(autouse=True)
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    monkeypatch.setattr(camera_folder, "time", clock)
+    monkeypatch.setattr(camera_watch_folder, "time", clock)
     return clock
 
 
@@ -44,8 +44,8 @@ def tether(tmp_path: Path) -> Path:
     return folder
 
 
-def watched(folder: Path, timeout_s: float = 20.0) -> WatchedFolder:
-    return WatchedFolder(str(folder), Log(None), timeout_s=timeout_s, stable_s=0.2)
+def watched(folder: Path, timeout_s: float = 20.0) -> WatchFolderCamera:
+    return WatchFolderCamera(str(folder), Log(None), timeout_s=timeout_s, stable_s=0.2)
 
 
 def test_a_file_written_slowly_is_taken_when_whole_and_stays_where_it_is(

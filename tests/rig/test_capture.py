@@ -100,7 +100,7 @@ def test_a_motor_on_a_port_and_a_camera_on_a_cable_make_a_capture(
         (tmp_path / "x.jpg").write_bytes(seen(angle_deg, step))
 
     (tmp_path / "x.jpg").write_bytes(bytes(size))
-    monkeypatch.setattr(camera_gphoto2.Gphoto2, "prepare", prepare)
+    monkeypatch.setattr(camera_gphoto2.Gphoto2Camera, "prepare", prepare)
     folder = tmp_path / "capture"
     with virtual.time(), Elliptec() as device:
         url = f"elliptec:{device.port}?settle=0"

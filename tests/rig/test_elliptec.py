@@ -1,13 +1,14 @@
 """What goes over the wire is the ELLx protocol: literal bytes from the manual's examples and its arithmetic."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
 from polcap.errors import HardwareError
-from polcap.rig.elliptec import STATUS, Elliptec, Settings, open_motor
-from polcap.rig.log import Log
-from polcap.rig.serial_port import Silent
+from polcap.rig.device_log import Log
+from polcap.rig.motor_elliptec_ell14 import STATUS, ElliptecMotor, ElliptecSettings
+from polcap.rig.serial_port import NoAnswer, Port
 from tests.rig import devices, virtual
 
 pytestmark = pytest.mark.timeout(60)
@@ -25,8 +26,9 @@ def device() -> Iterator[devices.Elliptec]:
         yield device
 
 
-def motor(device: devices.Elliptec, settings: Settings | None = None, limit_s: float = 2.0) -> Elliptec:
-    return open_motor(device.port, settings or Settings(), limit_s, Log(None))
+def motor(device: devices.Elliptec, limit_s: float = 2.0, **settings: Any) -> ElliptecMotor:
+    port = Port(device.port, ElliptecMotor.baud, Log(None))
+    return ElliptecMotor(port, ElliptecSettings(**settings), limit_s, Log(None))
 
 
 def test_degrees_become_pulses_in_eight_upper_case_digits(device: devices.Elliptec) -> None:
@@ -48,7 +50,7 @@ def test_pulses_per_revolution_are_the_device_s() -> None:
         ell.home()
         ell.go(45)
         assert device.heard[-1] == "0ma00001194"  # 4500
-        assert ell.where() == pytest.approx(45.03)  # 3 pulses beside
+        assert ell.position() == pytest.approx(45.03)  # 3 pulses beside
         assert ell.model == "Elliptec ELL18"
 
 
@@ -57,7 +59,7 @@ def test_below_zero_is_a_relative_move_in_two_s_complement(device: devices.Ellip
     ell.home()
     ell.go(-2.0)
     assert device.heard[-1] == "0mrFFFFFCE4"  # -796
-    assert ell.where() == pytest.approx(-2.0, abs=0.01)
+    assert ell.position() == pytest.approx(-2.0, abs=0.01)
 
 
 def test_only_its_own_address_is_asked_and_heard() -> None:
@@ -67,10 +69,10 @@ def test_only_its_own_address_is_asked_and_heard() -> None:
             super().reply(text)
 
     with Chatty(address="B") as device:
-        ell = motor(device, Settings(address="b", home="ccw"))
+        ell = motor(device, address="b", home="ccw")
         ell.home()
         assert device.heard == ["Bgs", "Bin", "Bho1"]
-    with devices.Elliptec(address="B") as far, pytest.raises(Silent, match="answered '0gs' with nothing"):
+    with devices.Elliptec(address="B") as far, pytest.raises(NoAnswer, match="answered '0gs' with nothing"):
         motor(far)
 
 
@@ -126,11 +128,11 @@ def test_a_move_longer_than_one_answer_is_waited_for() -> None:
         device.angle_deg = 0.0
         ell = motor(device, limit_s=10)
         ell.go(45)
-        assert ell.where() == pytest.approx(45, abs=0.02)
+        assert ell.position() == pytest.approx(45, abs=0.02)
 
 
 def test_velocity_is_set_and_slows_the_plan(device: devices.Elliptec) -> None:
-    ell = motor(device, Settings(velocity=60))
+    ell = motor(device, velocity=60)
     assert device.heard[-1] == "0sv3C"
     assert ell.speed_deg_s == pytest.approx(0.6 * motor_speed())
 
@@ -141,9 +143,8 @@ def motor_speed() -> float:
 
 
 def test_zero_is_kept_in_the_device_and_written_only_when_new(device: devices.Elliptec) -> None:
-    first = motor(device, Settings(zero=45.0))
+    motor(device, zero=45.0)
     assert device.heard[2:] == ["0go", "0so00004600", "0us"]
     assert device.saved_offset == 17920
-    first.close()
-    motor(device, Settings(zero=45.0))
+    motor(device, zero=45.0)
     assert device.heard[5:] == ["0gs", "0in", "0go"]

@@ -11,10 +11,9 @@ from typing import NamedTuple
 import pytest
 
 from polcap.errors import HardwareError
-from polcap.rig import line_protocol, serial_port
-from polcap.rig import rotator as rotators
-from polcap.rig.log import Log
-from polcap.rig.rotator import open_rotator, probe
+from polcap.rig import device_urls, motor_line_protocol, serial_port
+from polcap.rig.device_log import Log
+from polcap.rig.device_urls import open_rotator, probe
 
 pytestmark = pytest.mark.timeout(120)
 ROOT = Path(__file__).parents[2]
@@ -25,9 +24,9 @@ STEPS_PER_DEGREE = 26.6667  # of the sketch
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """The board is a process of its own, which a busy machine may let wait."""
     monkeypatch.setattr(serial_port, "ANSWER_S", 20.0)
-    monkeypatch.setattr(line_protocol, "_START_S", 60.0)
-    elliptec, boards = rotators._QUESTIONS
-    monkeypatch.setattr(rotators, "_QUESTIONS", (elliptec, (*boards[:2], 60.0, boards[3])))
+    monkeypatch.setattr(motor_line_protocol, "_START_S", 60.0)
+    elliptec, boards = device_urls._QUESTIONS
+    monkeypatch.setattr(device_urls, "_QUESTIONS", [elliptec, (*boards[:2], 60.0, boards[3])])
 
 
 class Board(NamedTuple):
@@ -82,10 +81,10 @@ def test_the_firmware_turns_the_ring_and_lets_it_go(board: Board) -> None:
 @pytest.mark.parametrize("board", [-500], indirect=True)
 def test_the_firmware_refuses_what_it_cannot_do(board: Board) -> None:
     assert probe(board.port) == "polcap-rotator stepper"
-    port = serial_port.Port(board.port, baud=line_protocol.BAUD, log=Log(None), name="rotator")
+    port = serial_port.Port(board.port, motor_line_protocol.LineMotor.baud, Log(None))
     answers = []
     for command in ("go 10", "where", "jump", "zero", "go north", "go 1e9", "go 5 6", "go -2.5", "stop", "where"):
-        port.send(command.encode() + b"\r\n")
+        port.send(f"{command}\r\n")
         while (answer := port.read_line(30)).startswith("polcap-rotator"):  # it has just started, and been asked
             pass
         answers.append(answer)

@@ -11,22 +11,23 @@ from polcap.errors import DecodeError
 from polcap.formats.raw import dng
 from polcap.formats.raw import libraw as raw
 from polcap.images import Exif
-from polcap.rig import frame_check
-from polcap.rig.camera import Exposure
-from polcap.rig.frame_check import Facts, Limits
+from polcap.rig import retake_criteria
+from polcap.rig.camera import CameraFile
+from polcap.rig.exposure_bracket import Exposure
+from polcap.rig.retake_criteria import FrameFacts, RetakeLimits
 from tests.rig.pool import ANGLES, Key, tiny
 
 SET = Exposure(time_s=0.02, f_number=11.0, iso=100.0)
 
 
-def facts(digest: str = "a", clipped: float = 0.0, **exif: object) -> Facts:
+def facts(digest: str = "a", clipped: float = 0.0, **exif: object) -> FrameFacts:
     told = {"make": "M", "model": "One", "lens": "L", "exposure_time": 0.02, "f_number": 11.0, "iso": 100.0}
     size = {"width": 96, "height": 72, "focal_length_mm": 60.0}
-    return Facts(Exif(**{**told, **size, **exif}), digest, clipped, 0.5)  # type: ignore[arg-type]
+    return FrameFacts(Exif(**{**told, **size, **exif}), digest, clipped, 0.5)  # type: ignore[arg-type]
 
 
-def judged(frame: Facts, *others: Facts, flash: bool = True, shortest: bool = False) -> str | None:
-    return frame_check.fault(frame, SET, flash, shortest, others, Limits())
+def judged(frame: FrameFacts, *others: FrameFacts, flash: bool = True, shortest: bool = False) -> str | None:
+    return retake_criteria.retake_reason(frame, SET, flash, shortest, others, RetakeLimits())
 
 
 def test_a_frame_as_asked_passes() -> None:
@@ -37,7 +38,7 @@ def test_a_frame_as_asked_passes() -> None:
     ("frame", "words"),
     [
         (facts("a"), "same photograph"),
-        (facts("b", exposure_time=0.04), r"exposure time \[s\] 0.04, where 0.02"),
+        (facts("b", exposure_time=0.04), r"exposure time \[s\] 0.04, but 0.02"),
         (facts("b", f_number=16.0), "f-number 16"),
         (facts("b", iso=200.0), "ISO 200"),
         (facts("b", model="Two"), "taken with M Two, not M One"),
@@ -46,7 +47,7 @@ def test_a_frame_as_asked_passes() -> None:
         (facts("b", focal_length_mm=70.0), "at 70 mm, not 60 mm"),
     ],
 )
-def test_a_frame_that_differs_is_refused_with_its_reason(frame: Facts, words: str) -> None:
+def test_a_frame_that_differs_is_refused_with_its_reason(frame: FrameFacts, words: str) -> None:
     reason = judged(frame, facts("a"))
     assert reason is not None
     assert re.search(words, reason)
@@ -55,7 +56,7 @@ def test_a_frame_that_differs_is_refused_with_its_reason(frame: Facts, words: st
 def test_clipping_counts_in_the_shortest_exposure_alone() -> None:
     bright = facts("b", clipped=0.02)
     assert judged(bright) is None
-    assert "2 % of the picture are clipped" in str(judged(bright, shortest=True))
+    assert "2 % of the picture is clipped" in str(judged(bright, shortest=True))
 
 
 def test_a_flash_that_fires_in_an_ambient_frame_is_seen() -> None:
@@ -66,15 +67,15 @@ def test_sharpness_is_that_of_the_lens_at_every_angle_and_falls_with_blur(
     pool: dict[Key, bytes], tmp_path: Path
 ) -> None:
     file = tmp_path / "x.dng"
-    limits = Limits()
+    limits = RetakeLimits()
     for step in (1, 2):
         sharp = []
         for angle in ANGLES:
             file.write_bytes(pool["shot", angle, step])
-            sharp.append(frame_check.inspect(file)[0].sharpness)
-        assert not frame_check.blurred(min(sharp), max(sharp), limits)
+            sharp.append(retake_criteria.inspect(file)[0].sharpness)
+        assert not retake_criteria.is_blurred(min(sharp), max(sharp), limits)
         _blur(file, tmp_path / "y.dng", 2.0)
-        assert frame_check.blurred(frame_check.inspect(tmp_path / "y.dng")[0].sharpness, max(sharp), limits)
+        assert retake_criteria.is_blurred(retake_criteria.inspect(tmp_path / "y.dng")[0].sharpness, max(sharp), limits)
 
 
 def _blur(source: Path, target: Path, sigma_px: float) -> None:
@@ -112,7 +113,7 @@ def test_clipped_share_is_counted(tmp_path: Path) -> None:
         color_matrix=np.eye(3),
         as_shot_neutral=np.ones(3),
     )
-    found, small = frame_check.inspect(tmp_path / "x.dng")
+    found, small = retake_criteria.inspect(tmp_path / "x.dng")
     assert found.clipped == pytest.approx(300 / 2400)
     assert small.shape == (20, 30) and small[15, 20] == pytest.approx((3000 - 512) / (15871 - 512), rel=1e-4)
 
@@ -120,11 +121,11 @@ def test_clipped_share_is_counted(tmp_path: Path) -> None:
 def test_what_is_no_raw_or_is_cut_short_is_refused(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "x.jpg"), np.zeros((20, 20, 3), np.uint8))
     with pytest.raises(DecodeError, match="set the camera to RAW"):
-        frame_check.inspect(tmp_path / "x.jpg")
+        retake_criteria.inspect(tmp_path / "x.jpg")
     data = tiny(tmp_path / "y.dng")
     (tmp_path / "y.dng").write_bytes(data[:-200])
     with pytest.raises(DecodeError, match="past the end"):
-        frame_check.inspect(tmp_path / "y.dng")
+        retake_criteria.inspect(tmp_path / "y.dng")
 
 
 @pytest.mark.parametrize(
@@ -142,5 +143,5 @@ def test_what_is_no_raw_or_is_cut_short_is_refused(tmp_path: Path) -> None:
     ],
 )
 def test_the_suffix_follows_the_content(head: bytes, suffix: str, tmp_path: Path) -> None:
-    assert frame_check.suffix(head + bytes(100), "IMG_1.XYZ") == suffix
-    assert frame_check.suffix(tiny(tmp_path / "t.dng"), "x.jpg") == ".dng"
+    assert CameraFile(head + bytes(100), "IMG_1.XYZ", SET).suffix == suffix
+    assert CameraFile(tiny(tmp_path / "t.dng"), "x.jpg", SET).suffix == ".dng"

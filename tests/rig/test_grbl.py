@@ -1,14 +1,15 @@
 """GRBL 1.1 over the wire: scaling, homing, alarms, and a stop that loses no position."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
 from polcap.errors import HardwareError
-from polcap.rig import manual
-from polcap.rig.grbl import ALARM, ERROR, Grbl, Settings, open_motor
-from polcap.rig.log import Log
-from polcap.rig.serial_port import Silent
+from polcap.rig import person
+from polcap.rig.device_log import Log
+from polcap.rig.motor_grbl import ALARM, ERROR, GrblMotor, GrblSettings
+from polcap.rig.serial_port import NoAnswer, Port
 from tests.rig import devices, virtual
 
 pytestmark = pytest.mark.timeout(60)
@@ -20,8 +21,9 @@ def clock() -> Iterator[virtual.Clock]:
         yield clock
 
 
-def motor(device: devices.Grbl, settings: Settings | None = None, limit_s: float = 2.0) -> Grbl:
-    return open_motor(device.port, settings or Settings(), limit_s, Log(None))
+def motor(device: devices.Grbl, limit_s: float = 2.0, **settings: Any) -> GrblMotor:
+    port = Port(device.port, GrblMotor.baud, Log(None))
+    return GrblMotor(port, GrblSettings(**settings), limit_s, Log(None))
 
 
 def test_grbl_s_unit_is_a_degree() -> None:
@@ -31,15 +33,15 @@ def test_grbl_s_unit_is_a_degree() -> None:
         board.home()
         board.go(45)
         assert "G21G90G53G0X-454.0000" in device.heard  # homing ends at -499
-        assert (device.angle_deg, board.where()) == pytest.approx((45, 45))
+        assert (device.angle_deg, board.position()) == pytest.approx((45, 45))
 
 
 def test_or_steps_say_how_much_of_a_unit_a_degree_is() -> None:
     with devices.Grbl(steps=80, degrees=4.5, speed_deg_s=900) as device:  # 80 steps/unit, so 17.78 steps a degree
-        board = motor(device, Settings(steps=80 / 4.5))
+        board = motor(device, steps=80 / 4.5)
         board.home()
         board.go(90)
-        assert (device.angle_deg, board.where()) == pytest.approx((90, 90))
+        assert (device.angle_deg, board.position()) == pytest.approx((90, 90))
         assert board.speed_deg_s == pytest.approx(900)
 
 
@@ -52,13 +54,13 @@ def test_without_a_switch_the_error_names_both_ways_out() -> None:
 def test_or_a_person_puts_the_ring_to_zero(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
     with devices.Grbl(homing=False, start_deg=10) as device:
-        monkeypatch.setattr(manual, "ask", lambda question, log: asked.append(question))
-        board = motor(device, Settings(home="ask"))
+        monkeypatch.setattr(person, "ask", lambda question, log: asked.append(question))
+        board = motor(device, home="ask")
         board.home()
         board.go(45)
         assert device.angle_deg == pytest.approx(55)
-        assert board.where() == pytest.approx(45)
-    assert asked == ["turn the polarizer's ring to 0°, then Enter: "]
+        assert board.position() == pytest.approx(45)
+    assert asked == ["turn the polarizer's ring to 0°, then press Enter: "]
 
 
 def test_an_alarm_is_told_in_words_and_ended_by_homing() -> None:
@@ -68,7 +70,7 @@ def test_an_alarm_is_told_in_words_and_ended_by_homing() -> None:
         with pytest.raises(HardwareError, match="ALARM:1: a limit switch was hit; free the ring"):
             board.go(45)
         with pytest.raises(HardwareError, match="locked by an alarm"):
-            board.where()
+            board.position()
         board.home()
         board.go(45)
         assert device.angle_deg == pytest.approx(45)
@@ -116,7 +118,7 @@ def test_a_movement_without_end_ends_with_the_limit(at: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("banner", "error"), [("Grbl 0.9j ['$' for help]", Silent), ("GrblHAL 1.1f ['$' or '$HELP' for help]", None)]
+    ("banner", "error"), [("Grbl 0.9j ['$' for help]", NoAnswer), ("GrblHAL 1.1f ['$' or '$HELP' for help]", None)]
 )
 def test_only_version_1_1_is_spoken(banner: str, error: type[Exception] | None) -> None:
     with devices.Grbl() as device:
@@ -139,7 +141,7 @@ def test_work_positions_are_refused() -> None:
 
 def test_codes_have_grbl_s_meaning() -> None:
     assert "limit switch" in ALARM[1]
-    assert "reset while moving" in ALARM[3]
+    assert "reset during a movement" in ALARM[3]
     assert "no switch" in ALARM[9]
     assert "homing is off" in ERROR[5]
     assert "locked" in ERROR[9]

@@ -1,20 +1,19 @@
-"""The line protocol, and the firmware in `examples/` that speaks it, compiled for this computer."""
+"""The line protocol of home-made rotators, over the wire."""
 
 from collections.abc import Iterator
-from pathlib import Path
+from typing import Any
 
 import pytest
 
 from polcap.errors import HardwareError
-from polcap.rig import manual
-from polcap.rig.line_protocol import Line, Settings, open_motor
-from polcap.rig.log import Log
-from polcap.rig.serial_port import Silent
+from polcap.rig import person
+from polcap.rig.device_log import Log
+from polcap.rig.motor_line_protocol import LineMotor, LineSettings
+from polcap.rig.serial_port import NoAnswer, Port
 from tests.rig import devices, virtual
+from tests.rig.far_end import Device
 
 pytestmark = pytest.mark.timeout(120)
-ROOT = Path(__file__).parents[2]
-STEPS_PER_DEGREE = 26.6667  # of the sketch
 
 
 @pytest.fixture(autouse=True)
@@ -24,8 +23,9 @@ def clock() -> Iterator[virtual.Clock]:
         yield clock
 
 
-def motor(device: devices.Line, settings: Settings | None = None, limit_s: float = 2.0) -> Line:
-    return open_motor(device.port, settings or Settings(), limit_s, Log(None))
+def motor(device: Device, limit_s: float = 2.0, **settings: Any) -> LineMotor:
+    port = Port(device.port, LineMotor.baud, Log(None))
+    return LineMotor(port, LineSettings(**settings), limit_s, Log(None))
 
 
 def test_words_on_the_wire() -> None:
@@ -33,7 +33,7 @@ def test_words_on_the_wire() -> None:
         board = motor(device)
         board.home()
         board.go(45)
-        board.where()
+        board.position()
         board.halt()
         assert device.heard == ["?", "home", "go 45.000", "where", "stop"]
         assert (board.model, board.speed_deg_s, device.released) == ("polcap-rotator simulated", 60, True)
@@ -51,9 +51,9 @@ def test_without_a_switch_the_error_names_the_way_out() -> None:
 
 
 def test_a_person_puts_the_ring_to_zero(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(manual, "ask", lambda question, log: "")
+    monkeypatch.setattr(person, "ask", lambda question, log: "")
     with devices.Line(switch=False, start_deg=10) as device:
-        board = motor(device, Settings(home="ask"))
+        board = motor(device, home="ask")
         board.home()
         board.go(45)
         assert device.angle_deg == pytest.approx(55)
@@ -77,5 +77,5 @@ def test_a_restart_in_mid_move_is_told() -> None:
 
 
 def test_another_device_is_not_taken_for_one() -> None:
-    with devices.Grbl() as device, pytest.raises(Silent, match="no polcap-rotator answers"):
-        open_motor(device.port, Settings(), 2.0, Log(None))
+    with devices.Grbl() as device, pytest.raises(NoAnswer, match="no polcap-rotator answers"):
+        motor(device)

@@ -7,8 +7,8 @@ import sys
 import pytest
 
 from polcap.errors import HardwareError, SettingError
-from polcap.rig.log import Log
-from polcap.rig.rotator import open_rotator
+from polcap.rig.device_log import Log
+from polcap.rig.device_urls import open_rotator
 
 
 def typed(monkeypatch: pytest.MonkeyPatch, text: str) -> None:

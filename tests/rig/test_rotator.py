@@ -7,8 +7,9 @@ import pytest
 from msgspec import convert
 
 from polcap.errors import HardwareError, SettingError
-from polcap.rig.log import Log
-from polcap.rig.rotator import Drive, Driven, Rotator, open_rotator, probe
+from polcap.rig.device_log import Log
+from polcap.rig.device_urls import open_rotator, probe
+from polcap.rig.rotator import PolarizerRotator, RotatorSettings
 from polcap.rig.serial_port import Unplugged
 from tests.rig import virtual
 from tests.rig.devices import Elliptec, Grbl, Line
@@ -26,9 +27,9 @@ def clock() -> Iterator[virtual.Clock]:
 
 
 @pytest.fixture
-def rotators() -> Iterator[list[Rotator]]:
+def rotators() -> Iterator[list[PolarizerRotator]]:
     """Closed at the end."""
-    opened: list[Rotator] = []
+    opened: list[PolarizerRotator] = []
     yield opened
     for rotator in opened:
         rotator.close()
@@ -40,7 +41,9 @@ def off(a: float, b: float) -> float:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("drive", "axis"), [("", 1), ("&offset=12.5", 1), ("&offset=100&reverse=1", -1)])
-def test_angles_are_reached_with_offset_and_sense(kind: str, drive: str, axis: int, rotators: list[Rotator]) -> None:
+def test_angles_are_reached_with_offset_and_sense(
+    kind: str, drive: str, axis: int, rotators: list[PolarizerRotator]
+) -> None:
     with KINDS[kind]() as device:
         rotator = open_rotator(f"{kind}:{device.port}?{QUICK}{drive}", Log(None))
         rotators.append(rotator)
@@ -55,7 +58,9 @@ def test_angles_are_reached_with_offset_and_sense(kind: str, drive: str, axis: i
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("at", [1, 2, 3, 5, 8, 12])
 @pytest.mark.parametrize("fault", [*SPOKEN, "late"])
-def test_a_lost_or_spoilt_answer_is_asked_again(kind: str, at: int, fault: str, rotators: list[Rotator]) -> None:
+def test_a_lost_or_spoilt_answer_is_asked_again(
+    kind: str, at: int, fault: str, rotators: list[PolarizerRotator]
+) -> None:
     with KINDS[kind](fault=fault, at=at) as device:
         rotators.append(open_rotator(f"{kind}:{device.port}?{QUICK}", Log(None)))
         for angle in (0.0, 45.0, 90.0):
@@ -68,7 +73,7 @@ def test_a_lost_or_spoilt_answer_is_asked_again(kind: str, at: int, fault: str, 
 )
 @pytest.mark.parametrize("at", [1, 6])
 def test_a_lasting_fault_is_one_error_and_no_wrong_angle(
-    kind: str, fault: str, at: int, rotators: list[Rotator]
+    kind: str, fault: str, at: int, rotators: list[PolarizerRotator]
 ) -> None:
     with KINDS[kind](fault=fault, at=at, times=ALWAYS) as device:
         with pytest.raises(HardwareError, match=r"rotator|GRBL|ELL14") as raised:
@@ -85,7 +90,7 @@ def test_a_lasting_fault_is_one_error_and_no_wrong_angle(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_wrong_position_is_approached_once_more(kind: str, rotators: list[Rotator]) -> None:
+def test_a_wrong_position_is_approached_once_more(kind: str, rotators: list[PolarizerRotator]) -> None:
     with KINDS[kind](fault="wrong-position", at=4) as device:
         rotators.append(open_rotator(f"{kind}:{device.port}?{QUICK}", Log(None)))
         for angle in (10.0, 45.0, 90.0):
@@ -95,39 +100,36 @@ def test_a_wrong_position_is_approached_once_more(kind: str, rotators: list[Rota
 
 
 class Recorder:
-    """A motor that notes what it is told and stands `beside` what it is told."""
+    """A motor that records its commands and stops `beside` the angle."""
 
     model, speed_deg_s, wraps = "noted", 90.0, False
 
     def __init__(self, beside: float = 0.0) -> None:
-        self.told: list[object] = []
+        self.commands: list[object] = []
         self.beside = beside
 
     def home(self) -> None:
-        self.told.append("home")
+        self.commands.append("home")
 
     def go(self, angle_deg: float) -> None:
-        self.told.append(angle_deg)
+        self.commands.append(angle_deg)
 
-    def where(self) -> float:
-        return float(self.told[-1]) + self.beside  # type: ignore[arg-type]
+    def position(self) -> float:
+        return float(self.commands[-1]) + self.beside  # type: ignore[arg-type]
 
     def halt(self) -> None:
-        self.told.append("halt")
+        self.commands.append("halt")
         raise Unplugged("pulled")
 
-    def close(self) -> None:
-        self.told.append("close")
 
-
-def driven(motor: Recorder, query: str) -> Driven:
-    drive = convert(dict(pair.split("=") for pair in query.split("&")), Drive, strict=False)
-    return Driven(motor, drive, drive.backlash or 0.0, Log(None))
+def driven(motor: Recorder, query: str) -> PolarizerRotator:
+    settings = convert(dict(pair.split("=") for pair in query.split("&")), RotatorSettings, strict=False)
+    return PolarizerRotator(motor, settings, Log(None))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_ring_turned_by_hand_or_a_lost_zero_is_homed_again(
-    kind: str, rotators: list[Rotator], tmp_path: Path
+    kind: str, rotators: list[PolarizerRotator], tmp_path: Path
 ) -> None:
     log = Log(tmp_path / "rig.log")
     with KINDS[kind]() as device:
@@ -148,7 +150,7 @@ def test_the_last_stretch_is_always_upwards() -> None:
     rotator = driven(motor, "settle=0&backlash=2")
     for angle in (0, 45, 90, 30, 30):
         rotator.move(angle)
-    assert motor.told == ["home", -2, 0, 45, 90, 28, 30, 30]
+    assert motor.commands == ["home", -2, 0, 45, 90, 28, 30, 30]
 
 
 def test_a_reversed_motor_comes_from_its_own_side() -> None:
@@ -156,7 +158,7 @@ def test_a_reversed_motor_comes_from_its_own_side() -> None:
     rotator = driven(motor, "settle=0&backlash=2&reverse=1")
     for angle in (0, 45):
         rotator.move(angle)
-    assert motor.told == ["home", -2, 0, -47, -45]
+    assert motor.commands == ["home", -2, 0, -47, -45]
 
 
 @pytest.mark.parametrize(("beside", "reverse", "read"), [(0.2, 0, 45.2), (0.2, 1, 44.8), (-0.25, 0, 44.75)])
@@ -169,7 +171,7 @@ def test_just_below_zero_is_not_360() -> None:
 
 
 def test_beyond_the_tolerance_is_an_error_that_says_how_far() -> None:
-    with pytest.raises(HardwareError, match=r"\+0\.40° off 45°, more than tolerance = 0\.3°"):
+    with pytest.raises(HardwareError, match=r"\+0\.40° away from 45°, more than tolerance = 0\.3°"):
         driven(Recorder(0.4), "settle=0").move(45)
     assert driven(Recorder(0.4), "settle=0&tolerance=0.5").move(45) == pytest.approx(45.4)
 
@@ -181,7 +183,7 @@ def test_stop_never_raises_and_the_ring_is_homed_again() -> None:
     rotator.stop()
     rotator.move(20)
     rotator.close()
-    assert motor.told == ["home", 10, "halt", "home", 20, "halt", "close"]
+    assert motor.commands == ["home", 10, "halt", "home", 20, "halt"]
 
 
 @pytest.mark.parametrize(
@@ -189,9 +191,9 @@ def test_stop_never_raises_and_the_ring_is_homed_again() -> None:
     [
         ("piezo:/dev/x", "choose one of elliptec, grbl, line, simulated, manual"),
         ("elliptec", "names no port"),
-        ("elliptec:/dev/x?adress=1", "'adress' is no setting of elliptec; it knows address, home"),
+        ("elliptec:/dev/x?adress=1", "unknown setting 'adress'; the settings are address, home"),
         ("elliptec:/dev/x?address=G", "regex"),
-        ("elliptec:/dev/x?steps=4", "'steps' is no setting of elliptec"),
+        ("elliptec:/dev/x?steps=4", "unknown setting 'steps'"),
         ("grbl:/dev/x?backlash=-1", "backlash"),
         ("grbl:/dev/x?offset=north", "offset"),
         ("line:/dev/x?offset", "write settings as"),

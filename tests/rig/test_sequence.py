@@ -14,9 +14,11 @@ import pytest
 from polcap.errors import CaptureError, HardwareError, SettingError, StorageError
 from polcap.formats.capture import reader as captures
 from polcap.images import Role
-from polcap.rig import plan, record, sequence
-from polcap.rig.camera import Exposure, Shot, by_iso, nearest, parse_bracket
-from polcap.rig.plan import Order, Slot
+from polcap.rig import capture_record, dry_run, sequence, shooting_plan
+from polcap.rig.camera import CameraFile
+from polcap.rig.exposure_bracket import Exposure, bracket_by_iso, nearest, parse_bracket
+from polcap.rig.resume import complete_order
+from polcap.rig.shooting_plan import CaptureOrder, Slot
 from tests.rig import pool as pools
 from tests.rig.pool import BRACKET, Key, PoolCamera
 
@@ -26,7 +28,7 @@ ORDER = msgspec.structs.replace(pools.ORDER, rotator="simulated")
 class Turner:
     """A rotator that moves at once, `beside` what it is asked for."""
 
-    model, speed_deg_s, settle_s, unattended = "turner", 100.0, 0.0, True
+    model, speed_deg_s, settle_s, by_hand = "turner", 100.0, 0.0, False
 
     def __init__(self, beside: float = 0.0) -> None:
         self.beside = beside
@@ -53,10 +55,10 @@ class Rig:
         self.pool, self.folder = pool, folder
         self.camera, self.turner = PoolCamera(pool), Turner()
         self.said: list[str] = []
-        monkeypatch.setattr("polcap.rig.camera_choice.open_camera", lambda name, log: self.camera)
-        monkeypatch.setattr("polcap.rig.rotator.open_rotator", lambda url, log: self.turner)
+        monkeypatch.setattr("polcap.rig.device_urls.open_camera", lambda name, log: self.camera)
+        monkeypatch.setattr("polcap.rig.device_urls.open_rotator", lambda url, log: self.turner)
 
-    def shoot(self, order: Order = ORDER, resume: bool = False, **options: int) -> dict[str, Any]:
+    def shoot(self, order: CaptureOrder = ORDER, resume: bool = False, **options: int) -> dict[str, Any]:
         return sequence.shoot(self.folder, order, resume=resume, tell=self.said.append, **options)  # type: ignore[arg-type]
 
     def again(self) -> dict[str, Any]:
@@ -93,7 +95,7 @@ def test_the_way_through_the_angles_is_the_shortest() -> None:
     bracket = (BRACKET[0],)
     for start in (0.0, 50.0, 170.0):
         slots = [Slot("shot", angle, 0, exposure) for angle in (90.0, 30.0, 150.0, 60.0) for exposure in bracket]
-        ordered = [slot.angle_deg or 0.0 for slot in plan.schedule(slots, start)]
+        ordered = [slot.angle_deg or 0.0 for slot in shooting_plan.schedule(slots, start)]
         ways = itertools.permutations([30.0, 60.0, 90.0, 150.0])
         least = min(_way(start, way) for way in ways)
         assert _way(start, ordered) == pytest.approx(least), start
@@ -104,26 +106,26 @@ def _way(start: float, angles: object) -> float:
 
 
 def test_chart_comes_first_and_what_a_person_switches_last() -> None:
-    slots = plan.slots(msgspec.structs.replace(ORDER, chart=True), switches_flash=False)
-    names = [slot.name for slot in plan.schedule(slots)]
+    slots = shooting_plan.plan_slots(msgspec.structs.replace(ORDER, chart=True), switches_flash=False)
+    names = [slot.name for slot in shooting_plan.schedule(slots)]
     assert names[0] == "chart/chart" and names[-1] == "ambient/ambient"
     assert names[4:10] == [f"{place}frame_{n}" for place in ("pol045/", "repeat/pol045_") for n in (1, 2, 3)]
 
 
 def test_the_flash_s_filter_is_put_on_when_all_else_is_taken() -> None:
-    slots = plan.slots(msgspec.structs.replace(ORDER, cross=True), switches_flash=True)
-    names = [slot.name for slot in plan.schedule(slots, 45.0)]
+    slots = shooting_plan.plan_slots(msgspec.structs.replace(ORDER, cross=True), switches_flash=True)
+    names = [slot.name for slot in shooting_plan.schedule(slots, 45.0)]
     assert names[-3:] == [f"cross/frame_{n}" for n in (1, 2, 3)]
     assert {slot.angle_deg for slot in slots if slot.role == "cross"} == {ORDER.angles_deg[0]}
 
 
 def test_time_of_a_plan_is_the_sum_of_its_parts() -> None:
     """0.84 s home, two turns of 45° at 430°/s and three settlings of 0.2 s, nine frames of 2 s + 0.105 s a bracket."""
-    order = Order((0.0, 45.0, 90.0), BRACKET, rotator="elliptec:/dev/ttyUSB0?settle=0.2", camera="gphoto2")
-    planned = plan.dry_run(order)
+    order = CaptureOrder((0.0, 45.0, 90.0), BRACKET, rotator="elliptec:/dev/ttyUSB0?settle=0.2", camera="gphoto2")
+    planned = dry_run.dry_run(order)
     assert planned["frames"] == 9
     assert planned["seconds"] == pytest.approx(360 / 430 + 90 / 430 + 2 * 0.2 + 9 * 2 + 3 * 0.105 + 1.0)
-    assert "about a minute" in plan.table(planned)
+    assert "about a minute" in dry_run.table(planned)
 
 
 @pytest.mark.parametrize(
@@ -141,19 +143,19 @@ def test_time_of_a_plan_is_the_sum_of_its_parts() -> None:
 def test_a_plan_brackets_by_the_shutter_only_under_a_steady_lamp(
     bracket: str, more: dict[str, bool], first: str, words: str
 ) -> None:
-    order = Order((0.0, 45.0, 90.0), parse_bracket(bracket) if bracket else (), rotator="manual")
+    order = CaptureOrder((0.0, 45.0, 90.0), parse_bracket(bracket) if bracket else (), rotator="manual")
     order = msgspec.structs.replace(order, camera="gphoto2", **more)
-    planned = plan.dry_run(order)
+    planned = dry_run.dry_run(order)
     assert next(part for part in planned["parts"] if part["frames"])["exposures"][0] == first
     assert words in planned["note"] and bool(words) == bool(planned["note"])
-    assert plan.dry_run(msgspec.structs.replace(order, camera="simulated"))["note"] == ""
+    assert dry_run.dry_run(msgspec.structs.replace(order, camera="simulated"))["note"] == ""
 
 
 def test_a_bracket_by_iso_takes_what_the_camera_offers() -> None:
-    assert [one.iso for one in by_iso([50, 100, 200, 400, 800, 1600])] == [100, 400, 1600]
-    assert [one.iso for one in by_iso([160, 320, 640, 1250, 2500])] == [160, 640, 2500]
+    assert [one.iso for one in bracket_by_iso([50, 100, 200, 400, 800, 1600])] == [100, 400, 1600]
+    assert [one.iso for one in bracket_by_iso([160, 320, 640, 1250, 2500])] == [160, 640, 2500]
     with pytest.raises(SettingError, match="flash power or aperture"):
-        by_iso([])
+        bracket_by_iso([])
 
 
 def test_a_bad_frame_is_taken_again_at_once_and_kept_aside(rig: Rig) -> None:
@@ -166,14 +168,14 @@ def test_a_bad_frame_is_taken_again_at_once_and_kept_aside(rig: Rig) -> None:
 
 
 def test_a_person_at_the_ring_is_not_sent_back(rig: Rig) -> None:
-    rig.camera, rig.turner.unattended = PoolCamera(rig.pool, fault="corrupt", at=4), False  # the last at 0°
+    rig.camera, rig.turner.by_hand = PoolCamera(rig.pool, fault="corrupt", at=4), True  # the last at 0°
     rig.shoot()
     assert rig.turner.moves == [0.0, 45.0, 90.0] and len(rig.taken) == 16
 
 
 def test_a_person_is_asked_for_what_no_device_can(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
-    monkeypatch.setattr("polcap.rig.manual.ask", lambda question, log: asked.append(question))
+    monkeypatch.setattr("polcap.rig.person.ask", lambda question, log: asked.append(question))
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
 
     class Plain(PoolCamera):
@@ -188,8 +190,8 @@ def test_a_person_is_asked_for_what_no_device_can(rig: Rig, monkeypatch: pytest.
     rig.camera = Plain(rig.pool)
     rig.shoot(msgspec.structs.replace(ORDER, chart=True))
     assert [question.partition(",")[0] for question in asked] == [
-        "put the chart where the object is",
-        "take the chart away again",
+        "put the chart in the place of the object",
+        "remove the chart",
         "switch the flash off",
         "switch the flash on again",
     ]
@@ -200,16 +202,18 @@ def test_a_person_is_asked_for_what_no_device_can(rig: Rig, monkeypatch: pytest.
 class Stubborn(PoolCamera):
     """Underexposes one slot for ever."""
 
-    def shoot(self, exposure: Exposure, flash: bool) -> Shot:
+    def shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
         shot = super().shoot(exposure, flash)
         if self._key == ("shot", 45.0, 2):
-            shot = Shot(self.pool["shot", 135.0, 1], shot.name, exposure)
+            shot = CameraFile(self.pool["shot", 135.0, 1], shot.name, exposure)
         return shot
 
 
 def test_a_frame_that_stays_bad_ends_the_run_with_its_reason(rig: Rig) -> None:
     rig.camera = Stubborn(rig.pool)
-    with pytest.raises(CaptureError, match=r"pol045/frame_3 .*exposure time.* \(1 times\); what was taken is kept"):
+    with pytest.raises(
+        CaptureError, match=r"pol045/frame_3 .*exposure time.* \(1 times\); the frames so far are saved"
+    ):
         rig.shoot(tries=0)
     assert rig.turner.ended == ["stop", "close"]
     rig.again()
@@ -219,10 +223,10 @@ def test_a_frame_that_stays_bad_ends_the_run_with_its_reason(rig: Rig) -> None:
 class Shaken(PoolCamera):
     """Its first frame of the middle exposure is blurred."""
 
-    def shoot(self, exposure: Exposure, flash: bool) -> Shot:
+    def shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
         shot = super().shoot(exposure, flash)
         first = self._key == ("shot", 0.0, 1) and len(self.delivered) < 5
-        return Shot(self.pool["blurred", 0.0, 1], shot.name, exposure) if first else shot
+        return CameraFile(self.pool["blurred", 0.0, 1], shot.name, exposure) if first else shot
 
 
 def test_an_early_frame_is_judged_by_its_later_neighbours(rig: Rig, tmp_path: Path) -> None:
@@ -240,7 +244,7 @@ def test_an_early_frame_is_judged_by_its_later_neighbours(rig: Rig, tmp_path: Pa
 
 def _stopped(rig: Rig, at: int = 9) -> None:
     rig.camera = PoolCamera(rig.pool, fault="disconnect", at=at)
-    with pytest.raises(HardwareError, match="--resume goes on"):
+    with pytest.raises(HardwareError, match="--resume continues"):
         rig.shoot()
 
 
@@ -264,7 +268,7 @@ def test_a_frame_that_changed_meanwhile_is_put_aside_and_taken_again(rig: Rig) -
     rig.again()
     assert {("shot", 0.0, 1), ("shot", 0.0, 2)} <= set(rig.taken)
     assert (rig.folder / "rejected/pol000_frame_2.try1.dng").read_bytes() == b"overwritten"
-    assert any("frame_3.dng: is gone" in line for line in rig.said)
+    assert any("frame_3.dng: the file is missing" in line for line in rig.said)
 
 
 def test_a_file_that_was_never_checked_is_put_aside(rig: Rig) -> None:
@@ -281,7 +285,7 @@ def test_a_bracket_is_of_one_angle_even_if_the_ring_comes_back_elsewhere(rig: Ri
     _stopped(rig, at=7)  # in the middle of 45°
     rig.camera, rig.turner = PoolCamera(rig.pool), Turner(beside=0.25)
     rig.shoot(resume=True)
-    content = record.load(rig.folder)
+    content = capture_record.load(rig.folder)
     assert content is not None
     for angle in (45.0, 90.0):
         read = {good.read_deg for good in content.frames.values() if good.angle_deg == angle and good.role == "shot"}
@@ -306,11 +310,11 @@ def test_resume_with_other_settings_is_one_line(rig: Rig, changes: dict[str, obj
 
 def test_resume_without_settings_has_those_it_was_begun_with(rig: Rig) -> None:
     _stopped(rig)
-    assert sequence.order(rig.folder, {"angles_deg": None, "camera": None}, resume=True) == ORDER
+    assert complete_order(rig.folder, {"angles_deg": None, "camera": None}, resume=True) == ORDER
     with pytest.raises(SettingError, match="--rotator is missing"):
-        sequence.order(rig.folder, {"camera": "simulated"}, resume=False)
+        complete_order(rig.folder, {"camera": "simulated"}, resume=False)
     with pytest.raises(SettingError, match="nothing to resume"):
-        sequence.order(rig.folder / "other", {}, resume=True)
+        complete_order(rig.folder / "other", {}, resume=True)
 
 
 def test_the_port_may_be_another_after_the_cable_was_plugged_in_again(rig: Rig) -> None:
@@ -331,7 +335,7 @@ def test_a_folder_in_use_is_left_alone(rig: Rig) -> None:
 
 def test_a_begun_capture_asks_for_resume(rig: Rig) -> None:
     _stopped(rig)
-    with pytest.raises(CaptureError, match="go on with --resume"):
+    with pytest.raises(CaptureError, match="continue with --resume"):
         rig.shoot()
 
 
@@ -345,7 +349,7 @@ def test_a_disk_too_small_is_told_before_the_first_frame(rig: Rig, monkeypatch: 
 
 def test_two_polcaps_do_not_share_a_folder(rig: Rig) -> None:
     rig.folder.mkdir()
-    with sequence._alone(rig.folder), pytest.raises(StorageError, match="another polcap"):
+    with sequence._locked(rig.folder), pytest.raises(StorageError, match="another polcap"):
         rig.shoot()
 
 
@@ -366,17 +370,17 @@ def test_whatever_ends_a_run_the_motor_stops(rig: Rig, number: int) -> None:
 
 def test_dials_that_cannot_tell_two_exposures_apart_end_the_run(rig: Rig) -> None:
     class Coarse(PoolCamera):
-        def shoot(self, exposure: Exposure, flash: bool) -> Shot:
+        def shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
             shot = super().shoot(exposure, flash)
-            return Shot(self.pool["shot", 0.0, 1], shot.name, BRACKET[1]) if self._key[2] else shot
+            return CameraFile(self.pool["shot", 0.0, 1], shot.name, BRACKET[1]) if self._key[2] else shot
 
     rig.camera = Coarse(rig.pool)
-    with pytest.raises(SettingError, match="give exposures that it can tell apart"):
+    with pytest.raises(SettingError, match="give exposures that differ more"):
         rig.shoot()
 
 
 def test_what_needs_a_person_is_refused_where_there_is_none(rig: Rig) -> None:
-    with pytest.raises(SettingError, match="need a person at a terminal"):
+    with pytest.raises(SettingError, match="a person at a terminal is needed"):
         rig.shoot(msgspec.structs.replace(ORDER, chart=True))
     assert rig.taken == [] and [path.name for path in rig.folder.iterdir() if not path.name.startswith(".")] == []
 
@@ -395,7 +399,7 @@ def test_an_order_no_capture_can_come_of_is_refused(
     angles: tuple[float, ...], repeat: tuple[float, ...], words: str
 ) -> None:
     with pytest.raises(SettingError, match=words):
-        Order(angles, BRACKET, repeat_deg=repeat)
+        CaptureOrder(angles, BRACKET, repeat_deg=repeat)
 
 
 def test_a_bracket_is_read_as_photographers_write_it() -> None:

@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 
 from polcap.errors import SettingError
-from polcap.rig import sequence, simulated
-from polcap.rig.camera import Exposure
-from polcap.rig.camera_choice import open_camera
-from polcap.rig.log import Log
-from polcap.rig.plan import Order
-from polcap.rig.rotator import open_rotator
+from polcap.rig import sequence
+from polcap.rig.device_log import Log
+from polcap.rig.device_urls import open_camera, open_rotator
+from polcap.rig.exposure_bracket import Exposure
+from polcap.rig.motor_simulated import RING, SimulatedMotor, SimulatedMotorSettings
+from polcap.rig.shooting_plan import CaptureOrder
 from polcap.synth import shooting as synthetic
 from polcap.synth.shooting import Shoot
 
@@ -18,15 +18,15 @@ SMALL = "width=96&height=72&samples=1"
 
 
 def test_a_simulated_capture_is_the_synthetic_one_at_the_motors_true_angles(tmp_path: Path) -> None:
-    order = Order((0.0, 45.0, 90.0), (), rotator="simulated?seed=3&settle=0", camera=f"simulated?{SMALL}&seed=5")
+    order = CaptureOrder((0.0, 45.0, 90.0), (), rotator="simulated?seed=3&settle=0", camera=f"simulated?{SMALL}&seed=5")
     sequence.shoot(tmp_path / "rig", order)
-    motor = simulated.Motor(simulated.Settings(seed=3), Log(None))
+    motor = SimulatedMotor(SimulatedMotorSettings(seed=3), Log(None))
     true = []
     for angle in order.angles_deg:
         motor.go(angle)
-        assert simulated.RING.true_deg is not None and 0 < abs(simulated.RING.true_deg - angle) < 0.3
-        true.append(simulated.RING.true_deg)
-    motor.close()
+        assert RING.true_deg is not None and 0 < abs(RING.true_deg - angle) < 0.3
+        true.append(RING.true_deg)
+    motor.halt()
     shoot = Shoot(
         seed=5, width=96, height=72, samples=1, angles_deg=tuple(true), nudge_px=0, nudge_deg=0, angle_error_deg=0
     )
@@ -39,15 +39,15 @@ def test_a_simulated_capture_is_the_synthetic_one_at_the_motors_true_angles(tmp_
 
 
 def test_play_shows_from_above_and_the_approach_from_below_hides_it() -> None:
-    motor = simulated.Motor(simulated.Settings(error=0.0, play=0.7), Log(None))
+    motor = SimulatedMotor(SimulatedMotorSettings(error=0.0, play=0.7), Log(None))
     motor.go(90.0)
     motor.go(30.0)
-    assert simulated.RING.true_deg == pytest.approx(30.7)
-    motor.close()
+    assert RING.true_deg == pytest.approx(30.7)
+    motor.halt()
     rotator = open_rotator("simulated?error=0&play=0.7&settle=0", Log(None))
     for angle in (90.0, 30.0):
         assert rotator.move(angle) == pytest.approx(angle)
-        assert simulated.RING.true_deg == pytest.approx(angle)
+        assert RING.true_deg == pytest.approx(angle)
     rotator.close()
 
 

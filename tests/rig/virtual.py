@@ -14,7 +14,14 @@ from unittest import mock
 
 import serial
 
-from polcap.rig import elliptec, grbl, line_protocol, rotator, serial_port
+from polcap.rig import (
+    device_urls,
+    motor_elliptec_ell14,
+    motor_grbl,
+    motor_line_protocol,
+    rotator,
+    serial_port,
+)
 
 _STEP_S = 0.002  # how often a device looks at its clock
 _BITS = 10  # of a byte on the wire: start, eight, stop
@@ -57,7 +64,7 @@ class Serial:
     """pyserial's port, as far as `serial_port` uses it."""
 
     def __init__(self, device: FarEnd, baud: int, timeout_s: float) -> None:
-        self._device, self._baud, self._timeout_s = device, baud, timeout_s
+        self._device, self._baud, self.timeout = device, baud, timeout_s
 
     def write(self, data: bytes) -> None:
         self._pass(len(data) * _BITS / self._baud)
@@ -65,16 +72,18 @@ class Serial:
         self._device.step()
 
     def read(self, size: int) -> bytes:
-        end = CLOCK.monotonic() + self._timeout_s
+        end = CLOCK.monotonic() + self.timeout
         while not self._device.delivered and CLOCK.monotonic() < end:
             self._pass(_STEP_S)
         data, self._device.delivered = self._device.delivered[:size], self._device.delivered[size:]
         return data
 
-    @property
-    def in_waiting(self) -> int:
-        self._pass(0.0)
-        return len(self._device.delivered)
+    def read_until(self, expected: bytes, size: int) -> bytes:
+        end, data = CLOCK.monotonic() + self.timeout, b""
+        while not data.endswith(expected) and len(data) < size and CLOCK.monotonic() < end:
+            self._pass(0.0 if self._device.delivered else _STEP_S)
+            data, self._device.delivered = data + self._device.delivered[:1], self._device.delivered[1:]
+        return data
 
     def reset_input_buffer(self) -> None:
         self._pass(0.0)
@@ -103,7 +112,7 @@ def _open(url: str, *, baudrate: int, timeout: float, **options: object) -> obje
 def time() -> Iterator[Clock]:
     """The rig's ports and motors live by this clock."""
     with ExitStack() as patches:
-        for module in (serial_port, elliptec, grbl, line_protocol, rotator):
+        for module in (serial_port, motor_elliptec_ell14, motor_grbl, motor_line_protocol, rotator, device_urls):
             patches.enter_context(mock.patch.object(module, "time", CLOCK))
         patches.enter_context(mock.patch.object(serial, "serial_for_url", _open))
         yield CLOCK

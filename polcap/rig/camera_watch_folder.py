@@ -1,6 +1,6 @@
-"""A folder that a tethering application fills: in come new RAW files, out their bytes.
+"""Camera driver for `folder:PATH`: waits for the RAW files that a tethering program writes into a folder.
 
-What lies there belongs to the photographer: files are read, never moved, renamed or removed.
+The files belong to the photographer: they are read, never moved, renamed or removed.
 """
 
 import time
@@ -9,15 +9,16 @@ from pathlib import Path
 from polcap.errors import DecodeError, HardwareError, SettingError
 from polcap.formats.raw import probe
 from polcap.images import Role
-from polcap.rig.camera import Exposure, Shot
-from polcap.rig.log import Log
+from polcap.rig.camera import CameraFile
+from polcap.rig.device_log import Log
+from polcap.rig.exposure_bracket import Exposure
 
 _POLL_S = 0.1
-_STABLE_S = 0.5  # a file that has not grown for this long is complete
+_STABLE_S = 0.5  # a file that has not unchanged for this long is complete
 
 
-class WatchedFolder:
-    """`folder:PATH`: somebody, or some application, presses the release."""
+class WatchFolderCamera:
+    """A camera that the photographer, or a tethering program, releases."""
 
     model = "tethering folder"
     switches_flash = polarizes_flash = False
@@ -37,34 +38,34 @@ class WatchedFolder:
         raise SettingError("--camera folder cannot ask the camera; give its exposures with --bracket 1/200,1/50,1/13")
 
     def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:
-        """What was taken at another angle is left where it is."""
+        """Skip the files that arrived at the angle before."""
         if angle_deg != self._angle:
             for file in sorted(set(self._files()) - self._seen):
                 self._log.write("camera", "!", f"{file.name}: taken before the polarizer turned; not used")
                 self._seen.add(file)
         self._angle = angle_deg
 
-    def shoot(self, exposure: Exposure, flash: bool) -> Shot:
-        """The next new RAW, once it is whole; a bracket that arrives at once is taken in order of its names."""
+    def shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
+        """The next new RAW, when it is complete; files that arrive together are taken in the order of their names."""
         self._log.write("camera", ">", f"{exposure}, {'lit' if flash else 'dark'}: waiting")
         end = time.monotonic() + self._timeout_s
-        grown: dict[Path, tuple[int, float]] = {}  # size, and since when
-        refused: dict[Path, int] = {}  # size at which a file was no RAW
+        unchanged: dict[Path, tuple[int, float]] = {}  # size, and since when
+        refused: dict[Path, int] = {}  # size at which the file was not a RAW
         why = ""
         while time.monotonic() < end:
             for file in sorted(set(self._files()) - self._seen):
                 size, now = _size(file), time.monotonic()
-                if file not in grown or grown[file][0] != size:
-                    grown[file] = size, now
-                if not size or now - grown[file][1] < self._stable_s or refused.get(file) == size:
+                if file not in unchanged or unchanged[file][0] != size:
+                    unchanged[file] = size, now
+                if not size or now - unchanged[file][1] < self._stable_s or refused.get(file) == size:
                     continue
                 try:
-                    if _whole(file):
+                    if probe.read(file).kind == "raw":  # not a JPEG, nor a RAW that is still being written
                         data = file.read_bytes()
                         self._seen.add(file)
                         self._log.write("camera", "<", f"{file.name}, {len(data)} bytes")
-                        return Shot(data, file.name, exposure)
-                except (DecodeError, OSError) as error:  # gone again, or damaged
+                        return CameraFile(data, file.name, exposure)
+                except (DecodeError, OSError) as error:  # removed, or damaged
                     why = f" ({error})"
                 refused[file] = size
             time.sleep(_POLL_S)
@@ -74,7 +75,7 @@ class WatchedFolder:
         )
 
     def close(self) -> None:
-        """Nothing is held."""
+        """There is nothing to disconnect."""
 
     def _files(self) -> list[Path]:
         try:
@@ -83,11 +84,6 @@ class WatchedFolder:
             raise HardwareError(
                 f"{self._folder} cannot be listed ({error.strerror}); is its disk still there?"
             ) from None
-
-
-def _whole(file: Path) -> bool:
-    """A RAW with all its data; not the JPEG beside it, nor one that is still being written. Raises DecodeError."""
-    return probe.read(file).kind == "raw"
 
 
 def _size(file: Path) -> int:

@@ -1,0 +1,104 @@
+"""Saves and checks the camera's photographs in a thread of its own, while the rig takes the next ones."""
+
+from collections import Counter
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from pathlib import Path
+
+from polcap.errors import CaptureError, DecodeError
+from polcap.formats import atomic
+from polcap.images import Floats
+from polcap.rig import retake_criteria
+from polcap.rig.camera import CameraFile
+from polcap.rig.capture_record import AcceptedFrame, CaptureRecord
+from polcap.rig.device_log import Log
+from polcap.rig.exposure_bracket import relative_exposure
+from polcap.rig.retake_criteria import RetakeLimits
+from polcap.rig.shooting_plan import Slot
+
+MOST_PENDING = 4  # photographs in memory
+_BRACKET_ROLES = ("shot", "repeat")
+_BLURRED = "is less sharp than its neighbors; wait until the tripod is steady"
+
+
+class BackgroundCheck:
+    """Saves each photograph, then accepts or rejects it, in the order of taking."""
+
+    def __init__(self, record: CaptureRecord, limits: RetakeLimits, tries: int, log: Log) -> None:
+        self.small: dict[str, Floats] = {}  # accepted frames of this run by slot, small and grey
+        self._record = record
+        self._limits = limits
+        self._tries = tries
+        self._log = log
+        self._thread = ThreadPoolExecutor(1, "background check")
+        self._pending: dict[Slot, Future[None]] = {}
+        self._rejections: Counter[str] = Counter()
+        self._shortest = min(relative_exposure(exposure) for exposure in record.content.order.bracket)
+
+    @property
+    def pending(self) -> list[Slot]:
+        """Slots whose photographs are not yet checked."""
+        return list(self._pending)
+
+    def submit(self, slot: Slot, read_deg: float | None, photograph: CameraFile) -> None:
+        self._pending[slot] = self._thread.submit(self._save_and_check, slot, read_deg, photograph)
+
+    def collect(self, block: bool) -> None:
+        """Remove checked frames from the pending ones; with `block` wait for one. Raises a check's error."""
+        if block and self._pending:
+            wait(self._pending.values(), return_when=FIRST_COMPLETED)
+        for slot in [slot for slot, future in self._pending.items() if future.done()]:
+            self._pending.pop(slot).result()
+
+    def close(self) -> None:
+        """Finish what was submitted."""
+        self._thread.shutdown(wait=True)
+
+    def _save_and_check(self, slot: Slot, read_deg: float | None, photograph: CameraFile) -> None:
+        name = f"{slot.name}{photograph.suffix}"
+        file = self._record.folder / name
+        with atomic.path(file) as temporary:
+            temporary.write_bytes(photograph.data)
+        try:
+            facts, small = retake_criteria.inspect(file)
+        except DecodeError as error:
+            self._reject(slot.name, file, read_deg, str(error).removeprefix(f"{file}: "))
+            return
+        accepted = self._record.accepted()
+        in_bracket = slot.role in _BRACKET_ROLES
+        shortest = in_bracket and relative_exposure(slot.exposure) == self._shortest
+        others = [frame.facts for frame in accepted.values()]
+        reason = retake_criteria.retake_reason(facts, photograph.exposure, slot.flash, shortest, others, self._limits)
+        same_exposure = {
+            name: frame
+            for name, frame in accepted.items()
+            if in_bracket and frame.role in _BRACKET_ROLES and frame.step == slot.step
+        }
+        sharpest = max((frame.facts.sharpness for frame in same_exposure.values()), default=0.0)
+        if reason is None and retake_criteria.is_blurred(facts.sharpness, sharpest, self._limits):
+            reason = _BLURRED
+        if reason is not None:
+            self._reject(slot.name, file, read_deg, reason)
+            return
+        frame = AcceptedFrame(
+            name,
+            slot.role,
+            slot.angle_deg,
+            slot.step,
+            read_deg,
+            photograph.exposure,
+            slot.flash,
+            photograph.name,
+            facts,
+        )
+        self._record.accept(slot, frame)
+        self.small[slot.name] = small
+        for earlier, other in same_exposure.items():  # an early frame may be the blurred one
+            if retake_criteria.is_blurred(other.facts.sharpness, facts.sharpness, self._limits):
+                self._reject(earlier, self._record.folder / other.file, other.read_deg, _BLURRED)
+
+    def _reject(self, slot_name: str, file: Path, read_deg: float | None, reason: str) -> None:
+        moved = self._record.reject(slot_name, file, read_deg, reason)
+        self._rejections[slot_name] += 1
+        self._log.write("check", "!", f"{slot_name}: {reason}; moved to {moved.relative_to(self._record.folder)}")
+        if self._rejections[slot_name] > self._tries:
+            raise CaptureError(f"{slot_name} {reason} ({self._rejections[slot_name]} times)")

@@ -1,0 +1,96 @@
+"""Camera driver for `simulated`: renders each RAW file with `polcap.synth` at the simulated ring's true angle."""
+
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import Annotated
+from urllib.parse import parse_qsl
+
+import msgspec
+from msgspec import Meta
+
+from polcap import config
+from polcap.errors import SettingError
+from polcap.images import Floats, Role
+from polcap.rig.camera import CameraFile
+from polcap.rig.device_log import Log
+from polcap.rig.exposure_bracket import Exposure
+from polcap.rig.motor_simulated import RING
+from polcap.synth.shooting import MIDDLE_S, Kind, Shoot, Studio, Take, random_scene
+
+_NUMBER_OF_ROLE = {"shot": 0, "repeat": 1000, "ambient": 2000, "chart": 3000, "cross": 4000}
+
+
+class SimulatedSubject(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The scene in front of the simulated camera."""
+
+    scene: Kind = "bumps"
+    seed: Annotated[int, Meta(ge=0)] = 0
+
+
+class SimulatedCamera:
+    """`simulated?seed=1&width=384`: takes the settings of `polcap synth`, and `scene`. It stands on a tripod."""
+
+    model = "Polcap Synthetic"
+    switches_flash = polarizes_flash = True
+
+    def __init__(self, query: str, log: Log) -> None:
+        self._subject, self._shoot = parse_query(query)
+        self._log = log
+        self._studio: Studio | None = None
+        self._rendered: dict[tuple[float, bool], Floats] = {}  # by angle and by whether the flash has its filter
+        self._taken: Counter[tuple[int, int, bool]] = Counter()
+        self._next = (0, 0, 0.0)  # shot, frame, true angle in degrees
+        self._crossed = False  # the flash's filter is on
+        self.frame_bytes = 2 * self._shoot.width * self._shoot.height
+
+    def bracket(self, flash: bool) -> tuple[Exposure, ...]:
+        """Steps of exposure time: its lamp is steady."""
+        stops = [self._shoot.step ** (frame - self._shoot.exposures // 2) for frame in range(self._shoot.exposures)]
+        return tuple(Exposure(time_s=MIDDLE_S * stop, f_number=11.0, iso=100.0) for stop in stops)
+
+    def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:
+        """Choose the seed of noise and time stamp as `synth.write` does."""
+        angles = self._shoot.angles_deg
+        wanted = 0.0 if angle_deg is None else angle_deg
+        shot = angles.index(wanted) if wanted in angles else len(angles) + round(10 * wanted) % 900
+        self._crossed = role == "cross"
+        self._next = shot + _NUMBER_OF_ROLE[role], step, wanted if RING.true_deg is None else RING.true_deg
+
+    def shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
+        if exposure.flash or exposure.iso not in (None, 100.0) or exposure.f_number not in (None, 11.0):
+            raise SettingError(f"the simulated camera has f/11, ISO 100 and no flash power, not {exposure}; give times")
+        self._studio = self._studio or Studio(random_scene(self._subject.seed, self._subject.scene), self._shoot)
+        shot, step, angle = self._next
+        if (angle, self._crossed) not in self._rendered:
+            render = self._studio.crossed_at if self._crossed else self._studio.through
+            self._rendered = {(angle, self._crossed): render(angle)}
+        time_s = exposure.time_s or MIDDLE_S
+        take = Take(shot, step, time_s / MIDDLE_S, self._taken[shot, step, flash], flash)
+        self._taken[shot, step, flash] += 1
+        self._log.write("camera", ">", f"{exposure}, {'lit' if flash else 'dark'}, polarizer at {angle:.4f}°")
+        with tempfile.TemporaryDirectory() as place:
+            file = Path(place) / f"SIM_{shot}_{step}.DNG"
+            self._studio.photograph(file, self._rendered[angle, self._crossed], take)
+            data = file.read_bytes()
+        self._log.write("camera", "<", f"{len(data)} bytes")
+        return CameraFile(data, file.name, Exposure(time_s=time_s, f_number=11.0, iso=100.0))
+
+    def close(self) -> None:
+        self._rendered = {}
+
+
+def parse_query(query: str) -> tuple[SimulatedSubject, Shoot]:
+    """Scene and `synth` settings of a URL's query; unknown ones raise SettingError."""
+    pairs = parse_qsl(query, keep_blank_values=True)
+    own = SimulatedSubject.__struct_fields__
+    scene = [f"{name}={value}" for name, value in pairs if name in own]
+    rest = [f"{name}={value}" for name, value in pairs if name not in own or name == "seed"]
+    defaults = {"width": 768, "height": 576, "nudge_px": 0.0, "nudge_deg": 0.0, "angle_error_deg": 0.0}
+    try:
+        subject, shoot = config.fill(SimulatedSubject, {}, scene), config.fill(Shoot, defaults, rest)
+    except SettingError as error:
+        raise SettingError(f"--camera simulated?{query}: {str(error).removeprefix('--set ')}") from None
+    if shoot.bracket != "time":
+        raise SettingError(f"--camera simulated?bracket={shoot.bracket}: only time is simulated; leave it out")
+    return subject, shoot

@@ -1,0 +1,156 @@
+"""Record of a capture while it is shot: accepted and rejected frames in `rig.json`, and `capture.toml` made from it.
+
+Both files are complete at every moment. `rig.json` is written first, so `capture.toml` never has more frames.
+"""
+
+import os
+import threading
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import tomli_w
+
+from polcap.errors import CaptureError
+from polcap.formats import atomic
+from polcap.formats.capture import capture_toml
+from polcap.images import Role
+from polcap.rig.exposure_bracket import Exposure
+from polcap.rig.retake_criteria import FrameFacts
+from polcap.rig.shooting_plan import CaptureOrder, Slot
+
+NAME, LOG, REJECTED = "rig.json", "rig.log", "rejected"
+_SAME_DEG = 0.1  # the frames of a bracket are at one angle up to this
+
+
+class AcceptedFrame(msgspec.Struct, frozen=True):
+    """A frame of the capture."""
+
+    file: str
+    role: Role
+    angle_deg: float | None  # ordered
+    step: int  # within the bracket
+    read_deg: float | None  # read back from the rotator; near angle_deg, not modulo 360
+    exposure: Exposure  # as the camera really set it
+    flash: bool
+    camera_file: str
+    facts: FrameFacts
+
+
+class RejectedFrame(msgspec.Struct, frozen=True):
+    """A frame in the folder `rejected`."""
+
+    file: str
+    slot: str
+    read_deg: float | None
+    reason: str
+
+
+class RigFile(msgspec.Struct):
+    """Content of rig.json."""
+
+    order: CaptureOrder
+    rotator: str = ""  # model
+    camera: str = ""
+    frames: dict[str, AcceptedFrame] = {}  # by slot
+    rejected: list[RejectedFrame] = []
+
+
+class CaptureRecord:
+    """The frames in a capture folder so far; used by the shooting thread and the checking thread."""
+
+    def __init__(self, folder: Path, content: RigFile, slots: tuple[Slot, ...]) -> None:
+        self.folder = folder
+        self.content = content
+        self.slots = slots
+        self._lock = threading.RLock()
+
+    def missing(self, pending: Iterable[Slot] = ()) -> list[Slot]:
+        """Slots without a frame, and without one that is being checked."""
+        with self._lock:
+            return [slot for slot in self.slots if slot.name not in self.content.frames and slot not in pending]
+
+    def accepted(self) -> dict[str, AcceptedFrame]:
+        with self._lock:
+            return dict(self.content.frames)
+
+    def accept(self, slot: Slot, frame: AcceptedFrame) -> None:
+        with self._lock:
+            self.content.frames[slot.name] = frame
+            self.write()
+
+    def reject(self, slot_name: str, file: Path, read_deg: float | None, reason: str) -> Path:
+        """Move a photograph to `rejected`, never over another; its slot is empty again. Raises StorageError."""
+        with self._lock:
+            stem = slot_name.replace("/", "_")
+            places = (self.folder / REJECTED / f"{stem}.try{n}{file.suffix}" for n in range(1, 1 << 20))
+            target = next(place for place in places if not place.exists())
+            self.content.frames.pop(slot_name, None)
+            try:
+                target.parent.mkdir(exist_ok=True)
+                os.replace(file, target)
+            except OSError as error:
+                raise atomic.failure(target, error) from error
+            name = target.relative_to(self.folder).as_posix()
+            self.content.rejected.append(RejectedFrame(name, slot_name, read_deg, reason))
+            self.write()
+            return target
+
+    def reject_other_angle(self, slot: Slot, read_deg: float) -> list[str]:
+        """After the ring has returned to a bracket that was begun: reject its frames if they are at another angle."""
+        with self._lock:
+            begun = {name: frame for name, frame in self.content.frames.items() if _bracket(frame) == _bracket(slot)}
+            read = [frame.read_deg for frame in begun.values() if frame.read_deg is not None]
+            if not read or max(abs(one - read_deg) for one in read) <= _SAME_DEG:
+                return []
+            for name, frame in begun.items():
+                reason = f"the ring came back to {read_deg:.3f}°, not {frame.read_deg:.3f}°"
+                self.reject(name, self.folder / frame.file, frame.read_deg, reason)
+            return list(begun)
+
+    def write(self) -> None:
+        """Write rig.json, then capture.toml. Raises StorageError."""
+        with self._lock:
+            with atomic.path(self.folder / NAME) as temporary:
+                temporary.write_bytes(msgspec.json.format(msgspec.json.encode(self.content), indent=1))
+            with atomic.path(self.folder / capture_toml.NAME) as temporary:
+                temporary.write_text(tomli_w.dumps(self._toml()), encoding="utf-8")
+
+    def stated_deg(self, frame: AcceptedFrame) -> float | None:
+        """Angle in capture.toml: the mean over its bracket; an ambient frame has the angle of the shot."""
+        if frame.angle_deg is None:
+            return None
+        bracket = "repeat" if frame.role == "repeat" else "shot", frame.angle_deg
+        read = [one.read_deg for one in self.content.frames.values() if _bracket(one) == bracket]
+        angles = [one for one in read or [frame.read_deg] if one is not None]
+        return round(sum(angles) / len(angles), 4) if angles else None
+
+    def _toml(self) -> dict[str, Any]:
+        entries = []
+        for slot in self.slots:
+            frame = self.content.frames.get(slot.name)
+            if frame is None:
+                continue
+            stated = self.stated_deg(frame)
+            entry: dict[str, Any] = {"file": frame.file}
+            entry |= {} if stated is None else {"angle": stated}
+            entry |= {} if frame.role == "shot" else {"role": frame.role}
+            entry |= {"flash_energy": frame.exposure.flash} if frame.exposure.flash and frame.flash else {}
+            entries.append(entry)
+        return {"rotator": {"model": self.content.rotator, "log": LOG}, "frame": entries}
+
+
+def load(folder: Path) -> RigFile | None:
+    """The rig.json of an earlier run, or None. Raises CaptureError."""
+    file = folder / NAME
+    if not file.exists():
+        return None
+    try:
+        return msgspec.json.decode(file.read_bytes(), type=RigFile)
+    except (OSError, msgspec.MsgspecError) as error:
+        raise CaptureError(f"{file}: cannot be read ({error}); shoot into another folder") from None
+
+
+def _bracket(of: AcceptedFrame | Slot) -> tuple[str, float | None]:
+    return of.role, of.angle_deg

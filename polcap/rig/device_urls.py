@@ -1,0 +1,148 @@
+"""Opens the rotator or the camera that a URL names, such as `elliptec:/dev/ttyUSB0?address=0&offset=12`."""
+
+import time
+from collections.abc import Callable
+from contextlib import closing, suppress
+from typing import Any, TypeVar
+from urllib.parse import parse_qsl
+
+import msgspec
+
+from polcap.errors import SettingError
+from polcap.rig import camera_gphoto2, camera_watch_folder, motor_by_hand, motor_elliptec_ell14, motor_grbl
+from polcap.rig import motor_line_protocol as motor_line
+from polcap.rig.camera import Camera
+from polcap.rig.device_log import Log
+from polcap.rig.motor_by_hand import MotorByHand
+from polcap.rig.motor_elliptec_ell14 import ElliptecMotor, ElliptecSettings
+from polcap.rig.motor_grbl import GrblMotor, GrblSettings
+from polcap.rig.motor_line_protocol import LineMotor, LineSettings
+from polcap.rig.motor_simulated import SimulatedMotor, SimulatedMotorSettings
+from polcap.rig.rotator import PolarizerRotator, RotatorSettings
+from polcap.rig.serial_port import NoAnswer, Port
+
+T = TypeVar("T")
+
+_MOTORS: dict[str, tuple[Any, Any]] = {
+    "elliptec": (ElliptecMotor, ElliptecSettings),
+    "grbl": (GrblMotor, GrblSettings),
+    "line": (LineMotor, LineSettings),
+    "simulated": (SimulatedMotor, SimulatedMotorSettings),
+}
+ROTATORS = (*_MOTORS, "manual")
+
+_Recognizer = Callable[[str], str | None]
+_QUESTIONS: list[tuple[int, str, float, tuple[_Recognizer, ...]]] = [  # baud, question, time limit [s], who may answer
+    (ElliptecMotor.baud, "0in", 0.5, (motor_elliptec_ell14.recognize,)),
+    (GrblMotor.baud, "\n?\n", 3.0, (motor_grbl.recognize, motor_line.recognize)),
+]
+
+
+def open_rotator(url: str, log: Log) -> PolarizerRotator:
+    """Open `KIND:PORT?setting=value&…`, `simulated?…` or `manual`.
+
+    Raises
+    ------
+    SettingError
+        The URL is wrong.
+    HardwareError
+        The port cannot be opened, or another device answers.
+    """
+    head, _, query = url.partition("?")
+    kind, _, address = head.partition(":")
+    pairs = _pairs(url, query)
+    if kind not in ROTATORS:
+        raise SettingError(f"rotator {url!r}: unknown kind {kind!r}; choose one of {', '.join(ROTATORS)}")
+    if kind == "manual":
+        if address or pairs:
+            raise SettingError(f"rotator {url!r}: manual takes no port and no settings; write manual")
+        return PolarizerRotator(MotorByHand(log), motor_by_hand.SETTINGS, log, by_hand=True)
+    motor_class, own_class = _MOTORS[kind]
+    settings, own = _settings(url, pairs, own_class, motor_class.backlash_deg)
+    if kind == "simulated":
+        if address:
+            raise SettingError(f"rotator {url!r}: the simulated motor has no port; write simulated")
+        return PolarizerRotator(SimulatedMotor(own, log), settings, log)
+    if not address:
+        raise SettingError(
+            f"rotator {url!r} names no port; write {kind}:/dev/ttyUSB0, {kind}:COM3 or {kind}:socket://…"
+        )
+    port = Port(address, motor_class.baud, log)
+    try:
+        motor = motor_class(port, own, settings.timeout, log)
+    except BaseException:
+        port.close()
+        raise
+    return PolarizerRotator(motor, settings, log, port)
+
+
+def open_camera(name: str, log: Log) -> Camera:
+    """Open `gphoto2`, `gphoto2:MODEL or PORT`, `folder:PATH` or `simulated?width=768`.
+
+    Raises
+    ------
+    SettingError
+        There is no such camera, or a query names an unknown setting.
+    HardwareError
+        It does not answer.
+    """
+    kind, _, rest = name.partition(":")
+    if kind == "gphoto2":
+        return camera_gphoto2.Gphoto2Camera(rest, log)
+    if kind == "folder" and rest:
+        return camera_watch_folder.WatchFolderCamera(rest, log)
+    if name.partition("?")[0] == "simulated":
+        from polcap.rig import camera_simulated  # here: its renderer is slow to import
+
+        return camera_simulated.SimulatedCamera(name.partition("?")[2], log)
+    raise SettingError(f"--camera {name}: no such camera; give gphoto2, gphoto2:MODEL, folder:PATH or simulated")
+
+
+def probe(port_url: str) -> str | None:
+    """The name of the rotator on a serial port, within four seconds; nothing moves.
+
+    Opening the port restarts many Arduinos, which then send their name unasked.
+
+    Raises
+    ------
+    HardwareError
+        The port cannot be opened.
+    """
+    for baud, question, limit_s, recognizers in _QUESTIONS:
+        with closing(Port(port_url, baud, Log(None))) as port:
+            end = time.monotonic() + limit_s
+            with suppress(NoAnswer):
+                port.send(question)
+            while (left := end - time.monotonic()) > 0:
+                with suppress(NoAnswer):
+                    line = port.read_line(left)
+                    for recognize in recognizers:
+                        if name := recognize(line):
+                            return name
+    return None
+
+
+def _pairs(url: str, query: str) -> dict[str, str]:
+    try:
+        pairs = parse_qsl(query.replace("+", "%2B"), keep_blank_values=True, strict_parsing=bool(query))
+    except ValueError as error:
+        raise SettingError(f"rotator {url!r}: {error}; write settings as ?offset=12&settle=0.5") from None
+    return {key: text.removeprefix("+") for key, text in pairs}
+
+
+def _settings(url: str, pairs: dict[str, str], own_class: type[T], backlash_deg: float) -> tuple[RotatorSettings, T]:
+    """The settings that all motors have, and those of this kind."""
+    common, own = RotatorSettings.__struct_fields__, own_class.__struct_fields__  # type: ignore[attr-defined]
+    for key in pairs:
+        if key not in common + own:
+            raise SettingError(f"rotator {url!r}: unknown setting {key!r}; the settings are {', '.join(own + common)}")
+    try:
+        settings = msgspec.convert(
+            {key: text for key, text in pairs.items() if key in common}, RotatorSettings, strict=False
+        )
+        special = msgspec.convert({key: text for key, text in pairs.items() if key in own}, own_class, strict=False)
+    except msgspec.ValidationError as error:
+        raise SettingError(f"rotator {url!r}: {error}; see the reference page on rotators") from None
+    if settings.backlash is None:
+        settings = msgspec.structs.replace(settings, backlash=backlash_deg)
+    return settings, special

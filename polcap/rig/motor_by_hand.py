@@ -1,0 +1,45 @@
+"""Motor driver for `manual`: a person at the terminal turns the ring and may type the angle it is at."""
+
+import math
+
+from polcap.errors import SettingError
+from polcap.rig import person
+from polcap.rig.device_log import Log
+from polcap.rig.rotator import RotatorSettings
+
+SETTINGS = RotatorSettings(settle=0.0, tolerance=180.0)  # any angle typed is accepted
+
+
+class MotorByHand:
+    """Asks for every angle; the ring's own scale is the zero."""
+
+    model = "by hand"
+    speed_deg_s = 9.0  # a quarter turn in ten seconds, for the plan
+    wraps = False
+
+    def __init__(self, log: Log) -> None:
+        """Raises SettingError without a terminal."""
+        if not person.at_terminal():
+            raise SettingError("rotator manual asks a person, and there is no terminal; run in one, or name a motor")
+        self._log = log
+        self._angle_deg = 0.0
+
+    def home(self) -> None: ...
+
+    def go(self, angle_deg: float) -> None:
+        question = f"turn the polarizer to {angle_deg:g}°, then press Enter; or type the angle on its scale: "
+        while text := person.ask(question, self._log):
+            try:
+                typed = float(text.removesuffix("°").replace(",", "."))
+            except ValueError:
+                typed = math.nan
+            if math.isfinite(typed):
+                self._angle_deg = typed
+                return
+            question = f"{text!r} is not an angle; type degrees, or press Enter for {angle_deg:g}: "
+        self._angle_deg = angle_deg
+
+    def position(self) -> float:
+        return self._angle_deg
+
+    def halt(self) -> None: ...

@@ -1,0 +1,182 @@
+"""Motor driver for Thorlabs Elliptec rotation mounts ELL14 and ELL18: homing, movements, status codes.
+
+ELLx protocol, 9600 8N1: the device's bus address, two letters, upper-case hexadecimal data; answers end in CR LF.
+::
+
+    0in            0IN type(2) serial(8) year(4) firmware(2) thread(2) travel(4) pulses per revolution(8)
+    0gs            0GSnn                  status; reading it clears a fault
+    0ho0 0ho1      0PO… when home, clockwise or counter-clockwise
+    0ma… 0mr…      0PO… at the end, absolute or relative, 32-bit two's complement; 0GS09 while busy
+    0gp            0POxxxxxxxx
+    0go 0so…       0HO… | 0GS00           home offset; 0us saves it in the device
+    0sv..          0GS00                  speed [%]
+"""
+
+import re
+import time
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+from polcap.errors import HardwareError
+from polcap.rig.device_log import Log
+from polcap.rig.serial_port import NoAnswer, Port, retry
+
+STATUS = {
+    0x01: "the bus timed out; check the cable",
+    0x02: "the motor could not move: mechanical timeout; free the ring, check its power",
+    0x03: "the command is not supported; update the device's firmware",
+    0x04: "the value is out of range; home the device",
+    0x05: "the device is isolated; switch it off and on",
+    0x06: "the device is out of isolation; switch it off and on",
+    0x07: "initializing failed; switch the device off and on",
+    0x08: "the motor is too hot; let it cool",
+    0x09: "busy",
+    0x0A: "the position sensor failed; switch the device off and on",
+    0x0B: "the motor failed; switch the device off and on",
+    0x0C: "the position is out of range; home the device",
+    0x0D: "over-current; free the ring, check the supply",
+}
+_OK, _BUSY = "00", "09"
+_MOST_ANSWERS = 4  # the answer, after up to three late ones
+_FULL_SPEED = 430.0  # degrees/s, nominal
+_ANSWER = re.compile(r"([0-9A-F])(IN|GS|PO|HO)([0-9A-F]+)")
+_DIGITS = {"IN": 30, "GS": 2, "PO": 8, "HO": 8}  # of an answer's data
+
+
+class ElliptecSettings(Struct, frozen=True):
+    """Settings in the URL of an `elliptec` rotator."""
+
+    address: Annotated[str, Meta(pattern="^[0-9A-Fa-f]$")] = "0"  # on the bus
+    home: Literal["cw", "ccw"] = "cw"  # sense of the search for zero
+    velocity: Annotated[int, Meta(ge=25, le=100)] | None = None  # percent of full speed
+    zero: Annotated[float, Meta(ge=0, lt=360)] | None = None  # degrees; home offset saved in the device
+
+
+class ElliptecMotor:
+    """One rotation mount on a bus."""
+
+    baud = 9600
+    backlash_deg = 0.0  # the piezo drives the ring without a gear
+    wraps = True
+
+    def __init__(self, port: Port, settings: ElliptecSettings, timeout_s: float, log: Log) -> None:
+        self._port = port
+        self._settings = settings
+        self._address = settings.address.upper()
+        self._timeout_s = timeout_s
+        self.model = "Elliptec"
+        retry(lambda: self._ask("gs", "GS"))  # clears an old fault
+        identity = retry(lambda: self._ask("in", "IN"))
+        self.model = f"Elliptec ELL{int(identity[0:2], 16)}"
+        self._pulses = int(identity[22:30], 16)  # per revolution
+        if int(identity[18:22], 16) != 360 or self._pulses < 360:
+            raise HardwareError(f"{self.model} at {port.url} is no rotation mount; give another port or address")
+        self.speed_deg_s = _FULL_SPEED * (settings.velocity or 100) / 100
+        if settings.velocity is not None:
+            self._set(f"sv{settings.velocity:02X}")
+        if settings.zero is not None:
+            self._save_zero(self._hexadecimal(settings.zero))
+
+    def home(self) -> None:
+        self._move("ho0" if self._settings.home == "cw" else "ho1")
+
+    def go(self, angle_deg: float) -> None:
+        if 0.0 <= angle_deg < 360.0:
+            self._move("ma" + self._hexadecimal(angle_deg))
+        else:  # absolute positions end at one revolution
+            turn = (angle_deg - self.position() + 180.0) % 360.0 - 180.0
+            self._move("mr" + self._hexadecimal(turn))
+
+    def position(self) -> float:
+        pulses = int(self._ask("gp", "PO"), 16)
+        return (pulses - (1 << 32 if pulses >> 31 else 0)) / self._pulses * 360.0
+
+    def halt(self) -> None:
+        self._ask("st", "GS")  # without movement the piezo has no current
+
+    def _move(self, command: str) -> None:
+        """Send a movement and wait for its end: a position, or status ok if the position was lost."""
+        self._send(command)
+        end = time.monotonic() + self._timeout_s
+        asked = False
+        while time.monotonic() < end:
+            try:
+                kind, data = self._answer()
+            except NoAnswer:
+                if asked:
+                    raise
+                self._send("gs")
+                asked = True
+                continue
+            asked = False
+            if kind == "PO" or (kind, data) == ("GS", _OK):
+                return
+            if kind != "GS":
+                raise self._port.unknown_answer(kind + data)
+            if data != _BUSY:
+                raise self._fault(data)
+        raise HardwareError(
+            f"{self.model} on {self._port.url} is busy for more than timeout = {self._timeout_s:g} s; "
+            "free the ring, switch the device off and on"
+        )
+
+    def _ask(self, command: str, expected: str) -> str:
+        """Data of the answer of kind `expected`; skips late answers, asks a busy device again."""
+        end = time.monotonic() + self._timeout_s
+        while True:
+            self._send(command)
+            busy = False
+            try:
+                for _ in range(_MOST_ANSWERS):
+                    kind, data = self._answer()
+                    busy = (kind, data) == ("GS", _BUSY)
+                    if kind == expected and not busy:
+                        return data
+                    if kind == "GS" and data not in (_OK, _BUSY):
+                        raise self._fault(data)
+                if not busy:
+                    raise self._port.unknown_answer(kind + data)
+            except NoAnswer:
+                if not busy:
+                    raise
+            if time.monotonic() >= end:
+                raise self._fault(_BUSY)
+
+    def _set(self, command: str) -> None:
+        status = retry(lambda: self._ask(command, "GS"))
+        if status != _OK:
+            raise self._fault(status)
+
+    def _save_zero(self, offset: str) -> None:
+        """Write the home offset, unless the device has it: its memory wears."""
+        if retry(lambda: self._ask("go", "HO")) != offset:
+            self._set("so" + offset)
+            self._set("us")
+
+    def _send(self, command: str) -> None:
+        self._port.send(self._address + command)
+
+    def _answer(self) -> tuple[str, str]:
+        """Kind and data of this device's next answer; other addresses of the bus are skipped."""
+        lines = self._port.read_lines()
+        while True:
+            match = _ANSWER.fullmatch(line := next(lines))
+            if match is None or len(match[3]) != _DIGITS[match[2]]:
+                raise self._port.unknown_answer(line)
+            if match[1] == self._address:
+                return match[2], match[3]
+
+    def _fault(self, status: str) -> HardwareError:
+        text = STATUS.get(int(status, 16), f"unknown status {status}; switch the device off and on")
+        return HardwareError(f"{self.model} on {self._port.url}: {text}")
+
+    def _hexadecimal(self, angle_deg: float) -> str:
+        """Pulses of an angle as 32 bits."""
+        return f"{round(angle_deg / 360.0 * self._pulses) & 0xFFFFFFFF:08X}"
+
+
+def recognize(line: str) -> str | None:
+    """The name of an Elliptec that sent this line as its identity."""
+    match = _ANSWER.fullmatch(line)
+    return f"Elliptec ELL{int(match[3][:2], 16)} at address {match[1]}" if match and match[2] == "IN" else None

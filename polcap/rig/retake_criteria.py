@@ -1,0 +1,127 @@
+"""Which frame is retaken: damaged, repeated, wrongly exposed, clipped, unsharp, or taken with another lens or camera.
+
+Frames are measured in the decoder's process: a damaged file does no harm, and the camera goes on meanwhile.
+"""
+
+from collections.abc import Iterable
+from math import log2
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+
+from polcap.errors import DecodeError
+from polcap.formats.raw import libraw as raw
+from polcap.formats.raw import probe, worker
+from polcap.images import Exif, Floats
+from polcap.rig.exposure_bracket import Exposure
+
+PREVIEW_PX = 480  # width of the small picture
+_DIAL_STOPS = 0.34  # EXIF rounds an exposure by up to one step of the dial
+_ZOOM = 0.01  # relative change of the focal length that is more than rounding
+_SATURATED = 0.98  # of the white level
+
+
+class FrameFacts(msgspec.Struct, frozen=True):
+    """What a frame is judged by, also after a resume."""
+
+    exif: Exif
+    digest: str  # of the file's bytes
+    clipped: float  # share of saturated pixels
+    sharpness: float  # contrast of fine detail over contrast of coarse detail
+
+
+class RetakeLimits(msgspec.Struct, frozen=True):
+    """Limits beyond which a frame is retaken."""
+
+    clipped: float = 0.01  # share of the picture, in the shortest exposure
+    blur: float = 0.75  # sharpness over that of the sharpest frame of the same exposure
+
+
+def inspect(path: Path) -> tuple[FrameFacts, Floats]:
+    """Facts of a frame, and the frame small and grey (h, w) with black = 0 and saturation = 1.
+
+    Raises
+    ------
+    DecodeError
+        The file is not a RAW, or is damaged.
+    """
+    file = probe.read(path)
+    if file.kind != "raw":
+        raise DecodeError(f"{path}: is not a RAW file; set the camera to RAW")
+    numbers, arrays = worker.call(measure, path)
+    return FrameFacts(file.exif, file.digest, numbers["clipped"], numbers["sharpness"]), arrays["small"]
+
+
+def measure(path: str) -> worker.Answer:
+    """Clipped share, sharpness and small picture of one RAW file; runs in the decoder's process."""
+    meta, arrays = raw.decode(path)
+    value, white = arrays["value"], meta["white"]
+    black = float(np.mean(meta["black"]))
+    clipped = float(np.mean(value >= black + _SATURATED * (white - black)))
+    grey = value if value.ndim == 2 else value.mean(-1, dtype=np.float32)
+    block = 3 if arrays.get("cfa", grey).shape == (6, 6) else 2  # one cell has all colors
+    height, width = (side // block for side in grey.shape)
+    grey = grey[: block * height, : block * width]
+    cells = cv2.resize(np.asarray(grey, np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    light = (cells - black) / (white - black)
+    small_size = min(width, PREVIEW_PX), round(height * min(width, PREVIEW_PX) / width)
+    small = cv2.resize(light, small_size, interpolation=cv2.INTER_AREA)
+    return {"clipped": clipped, "sharpness": _sharpness(light)}, {"small": small}
+
+
+def _sharpness(light: Floats) -> float:
+    """Contrast within 1 px over contrast within 4 px; exposure and subject cancel, blur remains."""
+    near, far = (cv2.GaussianBlur(np.asarray(light, np.float32), (0, 0), sigma) for sigma in (1.0, 4.0))
+    coarse = float(np.std(near - far))
+    return float(np.std(light - near)) / coarse if coarse > 0 else 0.0
+
+
+def retake_reason(
+    facts: FrameFacts, wanted: Exposure, flash: bool, shortest: bool, others: Iterable[FrameFacts], limits: RetakeLimits
+) -> str | None:
+    """Why a frame must be retaken, sharpness excepted; `others` are the accepted frames of the capture."""
+    accepted = list(others)
+    if any(facts.digest == other.digest for other in accepted):
+        return "is the same photograph as an earlier one"
+    if reason := _wrong_exposure(facts.exif, wanted):
+        return reason
+    if flash is False and facts.exif.flash_fired:
+        return "the flash fired, although it should be off"
+    if shortest and facts.clipped > limits.clipped:
+        return (
+            f"{100 * facts.clipped:.2g} % of the picture is clipped in the shortest exposure, "
+            f"more than {100 * limits.clipped:g} %; give a shorter --bracket or less light"
+        )
+    return _other_equipment(facts.exif, accepted[0].exif) if accepted else None
+
+
+def is_blurred(sharpness: float, sharpest: float, limits: RetakeLimits) -> bool:
+    """Whether a frame is less sharp than the sharpest of the same exposure by more than the polarizer explains."""
+    return sharpness < limits.blur * sharpest
+
+
+def _wrong_exposure(stated: Exif, wanted: Exposure) -> str | None:
+    rows = (
+        ("exposure time [s]", wanted.time_s, stated.exposure_time, 1.0),
+        ("f-number", wanted.f_number, stated.f_number, 2.0),
+        ("ISO", wanted.iso, stated.iso, 1.0),
+    )
+    for name, expected, found, power in rows:
+        if expected and found and power * abs(log2(found / expected)) > _DIAL_STOPS:
+            return f"{name} {found:.4g}, but {expected:.4g} was set; set the camera to manual"
+    return None
+
+
+def _other_equipment(here: Exif, first: Exif) -> str | None:
+    if (here.make, here.model) != (first.make, first.model):
+        return f"was taken with {here.make} {here.model}, not {first.make} {first.model}"
+    if here.lens and first.lens and here.lens != first.lens:
+        return f"was taken through {here.lens}, not {first.lens}"
+    if (here.width, here.height) != (first.width, first.height):
+        return f"has {here.width}×{here.height} px, not {first.width}×{first.height}"
+    lengths = here.focal_length_mm, first.focal_length_mm
+    if lengths[0] and lengths[1] and abs(lengths[0] / lengths[1] - 1) > _ZOOM:
+        return f"was taken at {lengths[0]:g} mm, not {lengths[1]:g} mm"
+    return None

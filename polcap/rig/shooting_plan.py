@@ -1,0 +1,138 @@
+"""Shooting plan: every frame of a capture, in the order that turns the motor least."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import msgspec
+
+from polcap.errors import SettingError
+from polcap.formats.capture import layouts
+from polcap.images import Role
+from polcap.rig.exposure_bracket import Exposure
+
+
+class CaptureOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The options of `polcap capture`; a resumed capture must have the same."""
+
+    angles_deg: tuple[float, ...]
+    bracket: tuple[Exposure, ...]
+    repeat_deg: tuple[float, ...] = ()  # angles whose bracket is taken twice
+    ambient: bool = False  # a frame without flash per angle, or one in all if a person switches the flash
+    chart: bool = False  # a frame of the chart alone
+    cross: bool = False  # the bracket once more under a polarized flash, crossed to the first angle
+    rotator: str = ""  # URL
+    camera: str = ""
+
+    def __post_init__(self) -> None:
+        """Raises SettingError for angles that make no capture."""
+        for angle in self.angles_deg:
+            if not 0 <= angle < 360:
+                raise SettingError(f"--angles {angle:g}: not in 0 to 360 degrees; give the angle modulo 360")
+        names = [layouts.degrees(angle) for angle in self.angles_deg]
+        if len(set(names)) < len(names):
+            raise SettingError("--angles names an angle twice; take a bracket again with --repeat")
+        if layouts.different(self.angles_deg) < 3:
+            listed = ", ".join(f"{angle:g}" for angle in self.angles_deg)
+            raise SettingError(f"--angles {listed}: fewer than 3 different polarizer angles; give 3 or more")
+        for angle in self.repeat_deg:
+            if angle not in self.angles_deg:
+                raise SettingError(f"--repeat {angle:g}: is not among --angles; give one of them")
+
+
+@dataclass(frozen=True)
+class Slot:
+    """One frame to take."""
+
+    role: Role
+    angle_deg: float | None  # None: at any angle
+    step: int  # within the bracket
+    exposure: Exposure
+    flash: bool = True
+
+    @property
+    def name(self) -> str:
+        """Path in the capture, without suffix."""
+        at = "" if self.angle_deg is None else f"pol{layouts.degrees(self.angle_deg)}"
+        if self.role == "shot":
+            return f"{at}/frame_{self.step + 1}"
+        if self.role == "repeat":
+            return f"repeat/{at}_frame_{self.step + 1}"
+        if self.role == "cross":
+            return f"cross/frame_{self.step + 1}"
+        return f"{self.role}/{at or self.role}"
+
+
+def plan_slots(order: CaptureOrder, switches_flash: bool) -> tuple[Slot, ...]:
+    """Every frame, in the order of capture.toml: the angles, then repeats, ambient, chart, cross.
+
+    If a person has to switch the flash, there is one ambient frame for all angles.
+    """
+    slots = [Slot("shot", angle, e, x) for angle in order.angles_deg for e, x in enumerate(order.bracket)]
+    slots += [Slot("repeat", angle, e, x) for angle in order.repeat_deg for e, x in enumerate(order.bracket)]
+    last, middle = len(order.bracket) - 1, len(order.bracket) // 2
+    if order.ambient:
+        angles: Iterable[float | None] = order.angles_deg if switches_flash else (None,)
+        slots += [Slot("ambient", angle, last, order.bracket[last], flash=False) for angle in angles]
+    if order.chart:
+        slots.append(Slot("chart", None, middle, order.bracket[middle]))
+    if order.cross:
+        slots += [Slot("cross", order.angles_deg[0], e, x) for e, x in enumerate(order.bracket)]
+    return tuple(slots)
+
+
+def next_slot(missing: Sequence[Slot], at_deg: float) -> Slot:
+    """The frame to take now.
+
+    First the chart; then all frames at the present angle; then from the nearer end of the remaining angles through
+    them. Frames for which a person switches the flash follow, and last those with the filter on the flash.
+    """
+    for slot in missing:
+        if slot.role == "chart":
+            return slot
+    turning = [slot for slot in missing if slot.angle_deg is not None and slot.role != "cross"]
+    if not turning:
+        return next((slot for slot in missing if slot.role != "cross"), missing[0])
+    angles = [slot.angle_deg for slot in turning if slot.angle_deg is not None]
+    if at_deg in angles:
+        goal = at_deg
+    else:
+        low, high = min(angles), max(angles)
+        goal = low if abs(at_deg - low) <= abs(at_deg - high) else high
+    return next(slot for slot in turning if slot.angle_deg == goal)
+
+
+def schedule(slots: Iterable[Slot], at_deg: float = 0.0) -> list[Slot]:
+    """All frames in the order of taking, from the present angle on."""
+    left, ordered = list(slots), []
+    while left:
+        slot = next_slot(left, at_deg)
+        at_deg = at_deg if slot.angle_deg is None else slot.angle_deg
+        left.remove(slot)
+        ordered.append(slot)
+    return ordered
+
+
+def uses_flash(order: CaptureOrder) -> bool:
+    """Whether the light is a flash: the order names its power, frames without it, or a filter on it."""
+    return order.ambient or order.cross or any(one.flash for one in order.bracket)
+
+
+def steps_shutter(bracket: Sequence[Exposure]) -> bool:
+    """Whether the frames differ in shutter time alone, which changes nothing under a flash."""
+    others = {(one.f_number, one.iso, one.flash) for one in bracket}
+    return len(others) == 1 and len({one.time_s for one in bracket}) > 1
+
+
+def light_note(order: CaptureOrder) -> str:
+    """Warning that shutter times do not change a flash exposure; empty for other brackets and the simulated lamp."""
+    if not steps_shutter(order.bracket) or order.camera.startswith("simulated"):
+        return ""
+    if uses_flash(order):
+        return (
+            "the bracket changes only the shutter time, which does not change a flash exposure: all its frames would "
+            "be equal; step power, aperture or ISO, as in --bracket iso100,iso400,iso1600"
+        )
+    return (
+        "the bracket changes the shutter time, which is right for a steady lamp; under a flash step power, aperture "
+        "or ISO, as in --bracket iso100,iso400,iso1600"
+    )
