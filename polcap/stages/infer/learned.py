@@ -93,10 +93,9 @@ def known(cues: Cues, network: Network, ior: float, symmetries: int) -> tuple[di
     size = cues.mask.shape[::-1]
     shrink = max(1.0, max(size) / int(network.metadata["native_size"]))
     seen = _resized(_bounded(cues), 1 / shrink)
-    with parallel.Beside(network.at_once) as beside:
-        prepared = beside.begin(partial(analytic.prepare, cues, ior))
-        small = augmentation.combined(seen, network, symmetries)
-        averaged = prepared.result()
+    small, averaged = parallel.both(
+        partial(augmentation.combined, seen, network, symmetries), partial(analytic.prepare, cues, ior), network.at_once
+    )
     # beside the object the network guesses: zeros there leave an edge's direction to the object's own pixels
     small["normal"] = _without_grid(small["normal"], seen.mask) * seen.mask[..., None]
     small["factor"] = _factor(small["diffuse"] * _shading(small["normal"], seen.rays), seen)
