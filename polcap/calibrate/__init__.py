@@ -28,8 +28,8 @@ from polcap.calibrate import (
     polarizer,
 )
 from polcap.calibrate.photographs import Photograph, angle_of, inside, listed
-from polcap.calibration_values import Calibration, NoiseLine, Polarizer
 from polcap.errors import CaptureError
+from polcap.images import Calibration, NoiseLine, Polarizer
 
 _ROOMS = ("dark", "flat", "bracket", "flash", "lens", "polarizer")
 

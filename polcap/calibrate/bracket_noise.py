@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 
 from polcap.calibrate import photon_transfer
 from polcap.calibrate.photographs import CLIP, Photograph, listed
-from polcap.calibration_values import NoiseLine
 from polcap.errors import CaptureError
 from polcap.formats.capture import layouts
-from polcap.images import Floats
+from polcap.images import Floats, NoiseLine
 from polcap.stages.hdr import exposure, frame_motion, noise, planes
 from polcap.stages.hdr.planes import Signals
 
