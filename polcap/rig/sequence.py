@@ -1,6 +1,6 @@
 """The sequence of a capture: turn the polarizer, take the frames that are missing, check each in the background.
 
-A rejected frame leaves its slot empty. So retakes and resuming after a crash are the same loop: take what is missing.
+A rejected frame leaves its slot empty. So retakes and resuming after a crash are the same loop: take the missing frames.
 """
 
 import shutil
@@ -88,7 +88,7 @@ def _take_missing(
         record.content.rotator = rotator.model
         log.write("polcap", "!", f"{len(record.missing())} frames to take with {rotator.model} and {camera.model}")
         record.write()
-        Shooting(record, check, rotator, camera, log, tell).run()
+        CaptureLoop(record, check, rotator, camera, log, tell).run()
     except PolcapError as error:
         log.write("polcap", "!", str(error))
         raise type(error)(f"{error}; the frames so far are saved, --resume continues") from error
@@ -100,7 +100,7 @@ def _take_missing(
             rotator.close()
 
 
-class Shooting:
+class CaptureLoop:
     """The loop that takes the missing frames."""
 
     def __init__(
