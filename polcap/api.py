@@ -71,7 +71,7 @@ def process(
     """
     folder = Path(capture)
     target = folder / "polcap" if out is None else Path(out)
-    network = models.load_network(estimator, None if model is None else Path(model), "cpu", 0)
+    network = models.load_network(estimator, None if model is None else Path(model))
     supplied = UserInput(chart=chart, mask=mask, network=network, mask_network=models.load_mask_network())
     found = captures.read(folder, angles_deg)
     about = pipeline.process(found, supplied, config or Config(), target, progress=progress)

@@ -362,7 +362,6 @@ class Network:
     metadata: Mapping[str, str]
     provider: str
     fine: "Network | None" = None  # what adds relief to this one's normals
-    warm: Callable[[], object] = field(default=tuple, compare=False, repr=False, metadata=NOT_IN_KEY)  # opens its file
     at_once: int = field(default=1, compare=False, metadata=NOT_IN_KEY)  # runs that may go side by side
 
 

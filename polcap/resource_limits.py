@@ -1,12 +1,8 @@
 """In: how much of the machine a command may take. Out: that limit, set for this process."""
 
-import gc
 import math
 import os
 import re
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 from polcap.errors import SettingError
@@ -20,8 +16,6 @@ OUT_OF_MEMORY = (  # as OpenCV, pybind11, onnxruntime, threads, the loader of li
 _GB_PER_PIXEL, _GB_BESIDE = 60e-9, 0.3  # of a whole run, per RAW pixel: measured, docs/explanations/scale.md
 _ROOM = 1.1  # above what was asked for when memory ran out: more is asked for afterwards
 _ASKED = re.compile(r"allocate ([\d.]+) (bytes|KiB|MiB|GiB)")  # numpy, OpenCV
-# of mallopt(3): M_ARENA_MAX, M_MMAP_THRESHOLD (glibc's most), M_TRIM_THRESHOLD
-_MALLOC = {-8: 1, -3: 32 << 20, -1: 256 << 20}
 _BYTES = {"bytes": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 
 
@@ -33,46 +27,6 @@ def set_threads(count: int) -> None:
         import cv2
 
         cv2.setNumThreads(count)
-
-
-def keep_pages() -> None:
-    """Memory that threads give back is kept for the next array: fetching it anew is a twentieth of a run.
-
-    Of glibc alone; each of its threads would have a heap of its own, and give its end back after every array.
-    """
-    if not sys.platform.startswith("linux"):
-        return
-    import ctypes
-
-    library = ctypes.CDLL(None)
-    if hasattr(library, "mallopt"):
-        for parameter, value in _MALLOC.items():
-            library.mallopt(parameter, value)
-
-
-@contextmanager
-def no_garbage() -> Iterator[None]:
-    """Nobody looks for garbage: imports make none, and looking takes a tenth of a short run.
-
-    Nor is it looked for later in what the first such block of a process has left.
-    """
-    looked = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        keep_imported()
-        if looked:
-            gc.enable()
-
-
-def keep_imported() -> None:
-    """What there is now, once imports are done, is no garbage, nor looked through when the process ends.
-
-    OpenImageIO is not among it: its binding would tell of leaks then.
-    """
-    if not gc.get_freeze_count():
-        gc.freeze()
 
 
 def check_memory(gigabytes: float) -> None:

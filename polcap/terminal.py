@@ -1,7 +1,6 @@
 """In: what a command found, or what befell it. Out: data on stdout, all else on stderr, an exit code."""
 
 import functools
-import gc
 import os
 import sys
 import time
@@ -30,7 +29,6 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(context: typer.Context, *args: Any, **kwargs: Any) -> None:
-        gc.enable()
         try:
             command(context, *args, **kwargs)
         except BrokenPipeError:  # whoever read stdout has seen enough

@@ -1,9 +1,7 @@
 """A textured ball beside a flat board, known everywhere, to try the stages on: evaluated, never resampled."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,10 +126,3 @@ def truth() -> tuple[Floats, NDArray[np.bool_]]:
     x0, y0, x1, y1 = ball_object().crop
     y, x = np.mgrid[y0:y1, x0:x1].astype(float)
     return normals(x, y)
-
-
-class Found(SimpleNamespace):
-    """What the stages made of a scene, as the gates look at it: its figures are measured when they are asked for."""
-
-    def figure(self, name: str, measure: Callable[..., Any], setting: Any = None) -> Any:
-        return measure(self, setting)

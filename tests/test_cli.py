@@ -235,7 +235,7 @@ def test_user_mask_replaces_the_search(result: Path, example: Path, polcap: Comm
     done = polcap("process", example, "--out", copy, "--mask", tmp_path / "mask.png", "--until", "mask", "--json")
     assert done.returncode == 0, done.stderr
     results, _ = pipeline.reopen(copy)
-    assert results.object_.value.source == "user" and np.array_equal(results.object_.value.mask, drawn > 0)
+    assert results.object_.source == "user" and np.array_equal(results.object_.mask, drawn > 0)
 
 
 def test_watch_goes_on_as_photographs_come_in_and_settings_change(example: Path, tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
-"""In: a batch command and how many shards. Out: the file that a farm's scheduler starts them from.
+"""Job files: the shards of a batch as a job of Slurm, Open Job Description, OpenCue, Snakemake or Kubernetes.
 
-Each shard runs `polcap batch ROOT … --shard K/N`; a quality gate that failed (exit code 3) is a result, not a
-failure of the job.
+`templates/` holds one file per scheduler. Every shard runs `polcap batch ROOT … --shard K/N`. Exit code 3, a failed
+quality gate, counts as success: the asset was written.
 """
 
 import getpass
@@ -10,7 +10,9 @@ import re
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
+from string import Template
 from typing import Any, Literal
 from xml.sax.saxutils import escape
 
@@ -18,57 +20,28 @@ from polcap import __version__
 from polcap.batch.shards import COUNT
 from polcap.formats import atomic
 
-Kind = Literal["slurm", "openjd", "opencue", "snakemake", "kubernetes"]
-_NAMES: dict[Kind, str] = {
+Scheduler = Literal["slurm", "openjd", "opencue", "snakemake", "kubernetes"]
+_FILES: dict[Scheduler, str] = {
     "slurm": "slurm.sh",
     "openjd": "openjd.json",
     "opencue": "opencue.xml",
     "snakemake": "Snakefile",
     "kubernetes": "kubernetes.json",
 }
-_SUBMIT: dict[Kind, str] = {
+_SUBMIT: dict[Scheduler, str] = {
     "slurm": "sbatch {file}",
     "openjd": "openjd run {file}, or a farm that takes Open Job Description",
     "opencue": "launch it with OpenCue's API: opencue.api.launchSpec(open({literal}).read())",
     "snakemake": "snakemake --snakefile {file} --cores all",
     "kubernetes": "set its image and volume, then kubectl apply -f {file}",
 }
-_OK = "|| test $? -eq 3"
-
-
-_LEFT_OUT = ("context", "root", "shard", "write_jobs", "jobs", "json", "scheduler")  # of the command's options
-
-
-_UNSAID = {"threads": 0, "memory": 0, "workers": 0}  # defaults that need no word
-
-
-def submit(kind: Kind, file: Path) -> str:
-    """How a job file is handed to its farm, whatever is in its name."""
-    return _SUBMIT[kind].format(file=shlex.quote(str(file)), literal=repr(str(file)))
-
-
-def command(root: Path, options: Mapping[str, Any]) -> tuple[str, ...]:
-    """`polcap batch ROOT …` with the options that were given, by their names in `cli.batch_command`."""
-    words = ["polcap", "batch", str(root.resolve())]
-    for name, value in options.items():
-        if name == "keep_going":
-            words += [] if value else ["--fail-fast"]
-            continue
-        if name in _LEFT_OUT or value is None or value is False or value in ([], ()) or value == _UNSAID.get(name):
-            continue
-        flag = "--set" if name == "assignments" else "--" + name.replace("_", "-")
-        if isinstance(value, list | tuple):
-            words += [word for one in value for word in (flag, str(one))]
-        elif isinstance(value, bool):
-            words.append(flag)
-        else:
-            words += [flag, str(value.resolve() if isinstance(value, Path) else value)]
-    return tuple(words)
+_NOT_FOR_SHARDS = ("context", "root", "shard", "write_jobs", "jobs", "json", "scheduler")  # options of the command
+_DEFAULTS = {"threads": 0, "memory": 0, "workers": 0}
 
 
 @dataclass(frozen=True)
-class Job:
-    """What the scheduler is asked for."""
+class BatchJob:
+    """One job of a scheduler: the batch command, split into shards."""
 
     command: tuple[str, ...]  # polcap batch ROOT …, without --shard
     root: Path
@@ -78,89 +51,82 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Of letters, digits and dashes, as every scheduler takes it."""
+        """Letters, digits and dashes, which every scheduler accepts."""
         return "polcap-" + (re.sub(r"[^a-z0-9]+", "-", self.root.name.lower()).strip("-")[:40] or "batch")
 
-    def shell(self, shard: str | None = None) -> str:
-        """The command for /bin/sh; `shard` K/N where the environment does not tell it."""
-        flags = "" if shard is None else f" --shard {shard}"
-        return f"{shlex.join(self.command)}{flags} {_OK}"
+    def shell(self, shard: str = "") -> str:
+        """Command for /bin/sh; `shard` is K/N, or empty where environment variables carry it."""
+        return f"{shlex.join(self.command)}{shard and ' --shard ' + shard} || test $? -eq 3"
 
 
-def write(kind: Kind, job: Job, folder: Path) -> Path:
-    """Write the job file; returns its path. Raises StorageError."""
-    text = {
-        "slurm": _slurm, "openjd": _openjd, "opencue": _opencue, "snakemake": _snakemake, "kubernetes": _kubernetes
-    }[kind](job, folder)  # fmt: skip
-    with atomic.path(folder / _NAMES[kind]) as temporary:
+def batch_command(root: Path, options: Mapping[str, Any]) -> tuple[str, ...]:
+    """`polcap batch ROOT …` with the given options, named as in `cli.batch_command`."""
+    words = ["polcap", "batch", str(root.resolve())]
+    for name, value in options.items():
+        if name == "keep_going":
+            words += [] if value else ["--fail-fast"]
+            continue
+        unset = value is None or value is False or value in ([], ()) or value == _DEFAULTS.get(name)
+        if unset or name in _NOT_FOR_SHARDS:
+            continue
+        flag = "--set" if name == "assignments" else "--" + name.replace("_", "-")
+        if isinstance(value, list | tuple):
+            words += [word for one in value for word in (flag, str(one))]
+        elif value is True:
+            words.append(flag)
+        else:
+            words += [flag, str(value.resolve() if isinstance(value, Path) else value)]
+    return tuple(words)
+
+
+def submit_hint(scheduler: Scheduler, file: Path) -> str:
+    """How a user hands the job file to the scheduler."""
+    return _SUBMIT[scheduler].format(file=shlex.quote(str(file)), literal=repr(str(file)))
+
+
+def write(scheduler: Scheduler, job: BatchJob, folder: Path) -> Path:
+    """Fill the scheduler's template; returns the path of the job file. Raises StorageError."""
+    template = files("polcap.batch").joinpath("templates", _FILES[scheduler]).read_text(encoding="utf-8")
+    text = Template(template).substitute(_fields(scheduler, job, folder))
+    with atomic.path(folder / _FILES[scheduler]) as temporary:
         temporary.write_text(text, encoding="utf-8")
-    return folder / _NAMES[kind]
+    return folder / _FILES[scheduler]
 
 
-def _slurm(job: Job, folder: Path) -> str:
-    """Slurm, sbatch(1); the shard comes from SLURM_ARRAY_TASK_ID."""
-    return "\n".join(
-        [
-            "#!/bin/sh",
-            f"#SBATCH --job-name={job.name}",
-            f"#SBATCH --array=1-{job.shards}",
-            "#SBATCH --ntasks=1",
-            f"#SBATCH --cpus-per-task={job.cores}",
-            f"#SBATCH --mem={round(job.memory_gb * 1000)}M",
-            f"#SBATCH --output={shlex.quote(str(folder / '%x-%a.log'))}",
-            "#SBATCH --requeue",
-            job.shell(),
-            "",
-        ]
-    )
-
-
-def _openjd(job: Job, folder: Path) -> str:
-    """Open Job Description, template schemas 2023-09."""
-    run = {"command": "/bin/sh", "args": ["-c", job.shell("{{Task.Param.Shard}}/" + str(job.shards))]}
-    amounts = [
-        {"name": "amount.worker.vcpu", "min": job.cores},
-        {"name": "amount.worker.memory", "min": round(job.memory_gb * 1024)},  # MiB
-    ]
-    step = {
-        "name": "Captures",
-        "parameterSpace": {"taskParameterDefinitions": [{"name": "Shard", "type": "INT", "range": f"1-{job.shards}"}]},
-        "hostRequirements": {"amounts": amounts},
-        "script": {"actions": {"onRun": run}},
+def _fields(scheduler: Scheduler, job: BatchJob, folder: Path) -> dict[str, Any]:
+    """Values of the placeholders, escaped for the template's language."""
+    return {
+        "name": job.name,
+        "shards": job.shards,
+        "cores": job.cores,
+        "memory_gb": f"{job.memory_gb:g}",
+        "memory_mb": round(job.memory_gb * 1000),
+        "memory_mib": round(job.memory_gb * 1024),
+        "command": _command(scheduler, job),
+        "root": _json(str(job.root)),
+        "log": shlex.quote(str(folder / "%x-%a.log")),
+        "mark": _json(str(folder / "done" / "{k}-of-").replace('"', '\\"') + str(job.shards)),
+        "user": escape(_user()),
+        "version": __version__,
+        "count_variable": COUNT,
     }
-    return _json({"specificationVersion": "jobtemplate-2023-09", "name": job.name, "steps": [step]})
 
 
-def _opencue(job: Job, folder: Path) -> str:
-    """OpenCue, job specification cjsl-1.13; #IFRAME# becomes the frame, which is the shard."""
-    command = f"/bin/sh -c {shlex.quote(job.shell(f'#IFRAME#/{job.shards}'))}"
-    return "\n".join(
-        [
-            '<?xml version="1.0"?>',
-            '<!DOCTYPE spec PUBLIC "SPI Cue Specification Language" "http://localhost:8080/spcue/dtd/cjsl-1.13.dtd">',
-            "<spec>",
-            "  <facility>local</facility>",
-            "  <show>testing</show>",  # the show that every OpenCue is set up with
-            "  <shot>polcap</shot>",
-            f"  <user>{escape(_user())}</user>",
-            f'  <job name="{job.name}">',
-            "    <paused>False</paused>",
-            "    <maxretries>2</maxretries>",
-            "    <layers>",
-            '      <layer name="captures" type="Render">',
-            f"        <cmd>{escape(command)}</cmd>",
-            f"        <range>1-{job.shards}</range>",
-            "        <chunk>1</chunk>",
-            f"        <cores>{job.cores}</cores>",
-            f"        <memory>{job.memory_gb:g}g</memory>",
-            "        <services><service>shell</service></services>",
-            "      </layer>",
-            "    </layers>",
-            "  </job>",
-            "</spec>",
-            "",
-        ]
-    )
+def _command(scheduler: Scheduler, job: BatchJob) -> str:
+    """The shard's shell command, as the template's language spells it."""
+    if scheduler == "openjd":
+        return _json(job.shell("{{Task.Param.Shard}}/" + str(job.shards)))
+    if scheduler == "opencue":  # it replaces #IFRAME# by the frame number, here the shard
+        return escape(f"/bin/sh -c {shlex.quote(job.shell(f'#IFRAME#/{job.shards}'))}")
+    if scheduler == "snakemake":  # braces are its placeholders: only that of the shard stays single
+        before, _, after = job.shell("@/" + str(job.shards)).replace("{", "{{").replace("}", "}}").rpartition("@/")
+        return _json(f"{before}{{wildcards.k}}/{after}")
+    return job.shell() if scheduler == "slurm" else _json(job.shell())
+
+
+def _json(text: str) -> str:
+    """Text between the quotes of a JSON string; Python's string literals read it the same way."""
+    return json.dumps(text, ensure_ascii=False)[1:-1]
 
 
 def _user() -> str:
@@ -168,58 +134,3 @@ def _user() -> str:
         return getpass.getuser()
     except (KeyError, OSError):  # a container without a name for its user
         return "polcap"
-
-
-def _snakemake(job: Job, folder: Path) -> str:
-    """Snakemake; one rule instance per shard, done when its mark is there."""
-    mark = str(folder / "done" / "{k}-of-").replace('"', '\\"') + str(job.shards)
-    before, _, after = job.shell("@/" + str(job.shards)).replace("{", "{{").replace("}", "}}").rpartition("@/")
-    shell = f"{before}{{wildcards.k}}/{after}"
-    return "\n".join(
-        [
-            "rule all:",
-            f"    input: expand({json.dumps(mark)}, k=range(1, {job.shards} + 1))",
-            "",
-            "rule shard:",
-            f"    output: touch({json.dumps(mark)})",
-            f"    threads: {job.cores}",
-            f"    resources: mem_mb={round(job.memory_gb * 1000)}",
-            "    retries: 2",
-            f"    shell: {json.dumps(shell)}",
-            "",
-        ]
-    )
-
-
-def _kubernetes(job: Job, folder: Path) -> str:
-    """Kubernetes, batch/v1 indexed job; the shard comes from JOB_COMPLETION_INDEX."""
-    container = {
-        "name": "polcap",
-        "image": f"polcap:{__version__}",
-        "command": ["/bin/sh", "-c", job.shell()],
-        "env": [{"name": COUNT, "value": str(job.shards)}],
-        "resources": {
-            "requests": {"cpu": str(job.cores), "memory": f"{round(job.memory_gb * 1000)}M"},
-            "limits": {"memory": f"{round(job.memory_gb * 1000)}M"},
-        },
-        "volumeMounts": [{"name": "captures", "mountPath": str(job.root)}],
-    }
-    template = {
-        "spec": {
-            "restartPolicy": "Never",
-            "containers": [container],
-            "volumes": [{"name": "captures", "persistentVolumeClaim": {"claimName": "captures"}}],
-        }
-    }
-    spec = {
-        "completionMode": "Indexed",
-        "completions": job.shards,
-        "parallelism": job.shards,
-        "backoffLimitPerIndex": 2,
-        "template": template,
-    }
-    return _json({"apiVersion": "batch/v1", "kind": "Job", "metadata": {"name": job.name}, "spec": spec})
-
-
-def _json(document: dict[str, Any]) -> str:
-    return json.dumps(document, indent=2, ensure_ascii=False) + "\n"

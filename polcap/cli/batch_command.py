@@ -63,10 +63,10 @@ def batch(
         _check_model(estimator, model)
     if write_jobs is not None:
         found = batches.find(root, out)
-        command = job_files.command(root, context.params)
-        job = job_files.Job(command, root.resolve(), jobs or min(len(found), 1000), memory_gb=memory or 4.0)
+        command = job_files.batch_command(root, context.params)
+        job = job_files.BatchJob(command, root.resolve(), jobs or min(len(found), 1000), memory_gb=memory or 4.0)
         file = job_files.write(write_jobs, job, (out or root).resolve() / unit.FOLDER)
-        terminal.tell(f"start it: {job_files.submit(write_jobs, file)}")
+        terminal.tell(f"start it: {job_files.submit_hint(write_jobs, file)}")
         terminal.say({"file": str(file), "shards": job.shards} if json else str(file))
         return
     order = unit.Order(

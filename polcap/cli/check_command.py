@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from polcap import resource_limits, terminal
+from polcap import terminal
 from polcap.cli import options
 from polcap.cli.options import Angles, ConfigFile, Json
 from polcap.errors import GateError
@@ -26,20 +26,13 @@ def check(
     json: Json = False,
 ) -> None:
     """Keep a capture or reshoot it, and why: seconds after its last frame. Writes nothing."""
-    from concurrent.futures import ThreadPoolExecutor
-
-    resource_limits.keep_pages()
+    from polcap import config as settings
     from polcap.formats.capture import reader as captures
+    from polcap.pipeline import check as checks
+    from polcap.pipeline import models
 
-    with ThreadPoolExecutor(2) as beside:  # headers are read while all else is imported
-        found = beside.submit(captures.read, capture, options.angles_deg(angles))
-        from polcap import config as settings
-        from polcap.pipeline import check as checks
-        from polcap.pipeline import models
-
-        networks = beside.submit(models.shipped)
-        chosen, request = settings.load(config, assignments or ()), options.chart_request(chart, no_chart)
-        verdict = checks.inspect(found.result(), networks.result, chosen, request)
+    chosen, request = settings.load(config, assignments or ()), options.chart_request(chart, no_chart)
+    verdict = checks.inspect(captures.read(capture, options.angles_deg(angles)), models.shipped, chosen, request)
     terminal.say(checks.shown(verdict) if json else checks.table(verdict))
     if not verdict.keep:
         raise typer.Exit(GateError.exit_code)

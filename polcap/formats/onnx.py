@@ -15,9 +15,9 @@ limit. The only module that imports onnxruntime: in `_onnxruntime`, which turns 
 
 import os
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Literal
@@ -26,7 +26,7 @@ import numpy as np
 
 from polcap import parallel
 from polcap.errors import DecodeError, ModelError
-from polcap.formats import calib, onnx_metadata, text_file
+from polcap.formats import calib, text_file
 from polcap.formats.raw import worker
 from polcap.images import Floats, Network
 
@@ -43,9 +43,7 @@ _AT_ONCE = 4  # runs side by side, at most: positions that a network looks from
 _MOST_NUMBER = 1 << 16  # px; of what the metadata state
 
 
-def load(
-    path: str | Path, device: Device = "cpu", threads: int = 0, encoding: str = ENCODING, later: bool = False
-) -> Network:
+def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: str = ENCODING) -> Network:
     """Open a model, after a trial in a child where it is none that polcap ships.
 
     Parameters
@@ -58,8 +56,6 @@ def load(
         0 is as many as may run.
     encoding
         Of the channels that the model must eat.
-    later
-        A shipped model for the CPU is opened when it first runs: a run that finds all in its cache needs none.
 
     Raises
     ------
@@ -70,17 +66,8 @@ def load(
     path = Path(path)
     data = _bytes(path)
     mark = digest(data)
-    shipped = path in _shipped_files() or mark in _shipped()
-    if later and device == "cpu" and shipped:
-        try:
-            metadata: Mapping[str, str] = onnx_metadata.read(data)
-        except ValueError as error:
-            raise ModelError(f"{path}: is damaged ({error}); install polcap again") from error
-        model = Model(path, parallel.Once(partial(_reopen, path, mark, threads)))
-        channels, at_once = _stated(path, metadata, encoding), _at_once(CPU, threads)
-        return Network(model, mark, channels, metadata, CPU, warm=model.opened, at_once=at_once)
     onnxruntime = _onnxruntime()
-    if not shipped:
+    if path not in _shipped_files() and mark not in _shipped():
         _try(path, mark, encoding)
     if device == "cuda" and CUDA not in onnxruntime.get_available_providers():
         raise ModelError("--device cuda: this onnxruntime has no CUDA; install onnxruntime-gpu, or use --device cpu")
@@ -91,7 +78,7 @@ def load(
         raise ModelError("--device cuda: CUDA does not start; make driver, CUDA and cuDNN fit, or use --device cpu")
     metadata = _metadata(path, session)
     channels = _check(path, session, metadata, encoding)
-    model = Model(path, lambda: session)
+    model = Model(path, session)
     return Network(model, mark, channels, metadata, provider, at_once=_at_once(provider, threads))
 
 
@@ -105,7 +92,7 @@ class Model:
     """An open model: channels (1, N, H, W) in, maps by name (1, n, H, W) out."""
 
     path: Path
-    opened: Callable[[], Any]  # its session
+    session: Any
     limit_s: float = _RUN_S
 
     def __call__(self, inputs: Floats) -> dict[str, Floats]:
@@ -116,7 +103,7 @@ class Model:
         ModelError
             It fails on such an input, does not end, or answers with something that is no map of it.
         """
-        session = self.opened()
+        session = self.session
         entry = session.get_inputs()[0]
         dtype = np.float16 if entry.type == "tensor(float16)" else np.float32
         names = [output.name for output in session.get_outputs()]
@@ -161,24 +148,13 @@ def trial(path: str, expected: str, encoding: str) -> worker.Answer:
     channels = _check(file, session, metadata, encoding)
     side = max(_TRIAL_PX, int(metadata["size_multiple"]))
     noise = np.random.default_rng(1).normal(size=(1, len(channels), side, side))
-    Model(file, lambda: session)(noise.astype(np.float32))
+    Model(file, session)(noise.astype(np.float32))
     return {}, {}
 
 
 def _at_once(provider: str, threads: int) -> int:
     """Runs that may go side by side: two of a thread each end sooner than one after another on two threads."""
     return min(threads or parallel.threads(), _AT_ONCE) if provider == CPU else 1
-
-
-def _known(session: Any) -> Callable[[], Any]:
-    return lambda: session
-
-
-def _reopen(path: Path, expected: str, threads: int) -> Any:
-    data = _bytes(path)
-    if digest(data) != expected:
-        raise ModelError(f"{path}: has changed since it was read; run again")
-    return _open(path, data, [CPU], threads)
 
 
 def _try(path: Path, expected: str, encoding: str) -> None:
@@ -224,7 +200,7 @@ def providers(path: Path) -> dict[str, str]:
             session = _open(path, _bytes(path), [name], 0)
             shape = session.get_inputs()[0].shape
             sides = [side if isinstance(side, int) else _TRIAL_PX for side in shape[2:]]
-            Model(path, _known(session))(np.zeros((1, shape[1], *sides), np.float32))
+            Model(path, session)(np.zeros((1, shape[1], *sides), np.float32))
             found[name] = "" if session.get_providers()[0] == name else "does not start"
         except ModelError as error:
             found[name] = str(error)

@@ -12,16 +12,15 @@ from polcap.stages.mask import mask_channels
 
 
 def load_network(
-    estimator: Literal["network", "analytic"] | None, model: Path | None, device: onnx.Device, threads: int,
-    later: bool = False,
-) -> Network | None:  # fmt: skip
+    estimator: Literal["network", "analytic"] | None, model: Path | None, device: onnx.Device = "cpu", threads: int = 0
+) -> Network | None:
     """The model to use: the one named, else the one shipped; None is the analytic estimator.
 
     Parameters
     ----------
     estimator, model
         As the user names them.
-    device, threads, later
+    device, threads
         As in `onnx.load`.
 
     Raises
@@ -38,27 +37,27 @@ def load_network(
         if estimator == "network" or device == "cuda":
             raise ModelError("this polcap ships no model; name one with --model, or use --estimator analytic")
         return None
-    return open_network(named, device, threads, later)
+    return open_network(named, device, threads)
 
 
-def open_network(path: Path, device: onnx.Device = "cpu", threads: int = 0, later: bool = False) -> Network:
+def open_network(path: Path, device: onnx.Device = "cpu", threads: int = 0) -> Network:
     """An estimator's model; the one that polcap ships brings its fine pass, which was trained with it alone."""
-    network = onnx.load(path, device, threads, later=later)
+    network = onnx.load(path, device, threads)
     own, relief = _newest("polcap"), _newest("fine")
     if own is None or relief is None or (path != own and network.digest != onnx.digest(own.read_bytes())):
         return network
-    return replace(network, fine=onnx.load(relief, device, threads, fine.ENCODING, later))
+    return replace(network, fine=onnx.load(relief, device, threads, fine.ENCODING))
 
 
-def load_mask_network(threads: int = 0, later: bool = False) -> Network | None:
+def load_mask_network(threads: int = 0) -> Network | None:
     """The network that finds the object, as shipped; None where this polcap ships none."""
     found = _newest("mask")
-    return onnx.load(found, "cpu", threads, mask_channels.ENCODING, later) if found else None
+    return onnx.load(found, "cpu", threads, mask_channels.ENCODING) if found else None
 
 
 def shipped() -> tuple[Network | None, Network | None]:
-    """Estimator and mask network as shipped, opened when they are first run or warmed."""
-    return load_network(None, None, "cpu", 0, later=True), load_mask_network(later=True)
+    """Estimator and mask network as shipped."""
+    return load_network(None, None), load_mask_network()
 
 
 def _newest(name: str) -> Path | None:

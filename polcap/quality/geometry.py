@@ -4,14 +4,14 @@ import numpy as np
 
 from polcap.config import Config, Gates
 from polcap.formats import calib
-from polcap.images import Mesh
+from polcap.images import Floats, Mesh, SurfaceMaps
 from polcap.optics.sharpness import TILE
-from polcap.quality.gate import Found, Gate, State, Unit, at_most, blamed
+from polcap.quality.gate import Evidence, Gate, State, Unit, at_most, blamed
 from polcap.stages.align import object_motion
 from polcap.stages.whitebalance import chart_in_mask
 
 
-def alignment(found: Found, config: Config) -> Gate:
+def alignment(found: Evidence, config: Config) -> Gate:
     """How far camera or object moved from shot to shot, in px of the picture that is processed, and how surely."""
     measured, names = found.alignment, found.names
     height, width = found.radiance.value.shape[1:3]
@@ -42,9 +42,9 @@ def alignment(found: Found, config: Config) -> Gate:
     return Gate("alignment", "fail", value, limit, says, remedy, 10.0, blamed(names, bad), unit)
 
 
-def _pushed(found: Found, config: Config) -> Gate | None:
+def _pushed(found: Evidence, config: Config) -> Gate | None:
     """An object that moved while what is around it stood still."""
-    displacement = np.array(found.figure("object_motion", _displacement)) * found.grid_px
+    displacement = _displacement(found) * found.grid_px
     limit = config.gates.max_object_shift_px
     bad = np.nan_to_num(displacement, posinf=np.inf) > limit
     if not bad.any():
@@ -59,17 +59,17 @@ def _pushed(found: Found, config: Config) -> Gate | None:
     return Gate("alignment", "fail", figure, limit, says, remedy, cost, blamed(found.names, bad), "px")
 
 
-def _displacement(found: Found, _: None) -> list[float]:
-    return [float(one) for one in object_motion.measure(found.radiance, found.alignment, found.object_)]
+def _displacement(found: Evidence) -> Floats:
+    return object_motion.measure(found.radiance, found.alignment, found.object_)
 
 
-def mask(found: Found, limits: Gates) -> Gate:
+def mask(found: Evidence, limits: Gates) -> Gate:
     """Fails where a chart is in it or the network doubts it; warns from half of that on, and of shapes none has."""
     object_, limit, doubt = found.object_, limits.max_mask_doubt, found.object_.doubt
     faults: list[tuple[str, float, float]] = []  # in words, its figure, its limit
     charted = 0.0
     if found.color.corners is None:
-        charted = found.figure("charted", _charted)
+        charted = _charted(found)
     if charted:
         faults.append(
             (f"{charted:.0%} of it looks like a colour chart that was not found, and is no object", charted, 0)
@@ -98,7 +98,7 @@ def mask(found: Found, limits: Gates) -> Gate:
     return Gate("mask", state, round(value, 5), most, "; ".join(fault[0] for fault in faults), remedy, cost)
 
 
-def _charted(found: Found, _: None) -> float:
+def _charted(found: Evidence) -> float:
     return float(chart_in_mask.share(found.radiance, found.object_.mask, calib.colorchecker()))
 
 
@@ -134,9 +134,9 @@ def mesh(of: Mesh, limits: Gates) -> Gate:
     return Gate("mesh", "pass", round(of.cuts, 4), cuts, says)
 
 
-def sharpness(found: Found, limits: Gates) -> Gate:
+def sharpness(found: Evidence, limits: Gates) -> Gate:
     """Every frame against the frames of the same exposure in the other shots."""
-    blur, limit = found.radiance.blur_px, limits.max_blur_px
+    blur, limit = found.blur_px, limits.max_blur_px
     moved = float(np.abs(found.alignment.transform[:, :2, 2]).max()) * found.grid_px
     if blur is None or np.isnan(blur).all():
         return Gate("sharpness", "not measured", None, limit, "too little bright detail", unit="px")
@@ -149,22 +149,21 @@ def sharpness(found: Found, limits: Gates) -> Gate:
     return at_most("sharpness", float(blur[k, e]), limit, says, remedy, bad, 3, "px")
 
 
-def focal_length(found: Found) -> Gate:
+def focal_length(found: Evidence) -> Gate:
     """Whether it is known; where not, what it costs: normals stand on view rays, which lean as it says."""
     least, most = found.focal_doubt
     if not most - least:
         return Gate("focal length", "pass", "known", "known", "known", unit="")
-    cost = found.figure("lean", _lean, [least, most])
+    cost = _lean(found.maps, least, most)
     times = np.exp(max(most, -least))
     says = f"the focal length is assumed, perhaps {times:.1f} times off; a wrong one bends shape and depth"
     remedy = "state focal_length_mm and sensor_width_mm in capture.toml"
     return Gate("focal length", "warn", "assumed", "known", says, remedy, round(cost, 1), unit="")
 
 
-def _lean(found: Found, doubt: tuple[float, float]) -> float:
+def _lean(maps: SurfaceMaps, least: float, most: float) -> float:
     """Degrees by which the view rays of the object lean otherwise, in the median pixel."""
-    maps, (y, x) = found.maps, np.nonzero(found.maps.mask)
-    least, most = doubt
+    y, x = np.nonzero(maps.mask)
     off = np.hypot(x - maps.view.center[0], y - maps.view.center[1]) / maps.view.focal
     lean, more, less = (np.arctan(off * factor) for factor in (1.0, np.exp(-least), np.exp(-most)))
     return float(np.degrees(np.median(np.maximum(more - lean, lean - less)))) if len(off) else 0.0

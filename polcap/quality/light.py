@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 
 from polcap.config import Gates
-from polcap.images import AngleStack, Floats, Quality
-from polcap.quality.gate import DEGREES_PER_GAIN, Found, Gate, State, at_most, blamed
+from polcap.images import AngleStack, Floats, Quality, StokesImage
+from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, blamed
 from polcap.stages.whitebalance import patches
 
 _EVEN_STEPS = (1.3, 20.0)  # from one exposure to the next: less is no bracket, more leaves a gap
@@ -22,7 +22,7 @@ _FEW = 20  # px
 _GLOSS_PART = 0.3  # of the chart's gloss goes into gains taken from its light patches
 
 
-def bracket(found: Found) -> Gate:
+def bracket(found: Evidence) -> Gate:
     """The bracket as the pixels tell it, and where that is not what the camera promises, why."""
     radiance = found.radiance
     ratio = np.sort(radiance.exposure_ratio.mean((0, 2)))  # (E,)
@@ -48,7 +48,7 @@ def bracket(found: Found) -> Gate:
     return Gate("exposures", "pass", round(float(steps.max()), 3), most, says, unit="×")
 
 
-def tone(found: Found, limits: Gates) -> Gate:
+def tone(found: Evidence, limits: Gates) -> Gate:
     """Whether the pixels are linear: a tone curve changes the ratio of two exposures with brightness."""
     radiance = found.radiance
     limit = limits.max_tone_curvature
@@ -69,7 +69,7 @@ def tone(found: Found, limits: Gates) -> Gate:
     return at_most("tone curve", worst, limit, says, remedy, cost_deg=60 * worst, unit="")
 
 
-def source(found: Found) -> Gate:
+def source(found: Evidence) -> Gate:
     """Whether the pictures are the sensor's own counts."""
     if not found.radiance.lossy:
         return Gate(
@@ -80,22 +80,21 @@ def source(found: Found) -> Gate:
     return Gate("source", "warn", "lossy", "linear counts", says, remedy, 5.0, unit="")
 
 
-def noise(found: Found, limits: Gates) -> Gate:
+def noise(found: Evidence, limits: Gates) -> Gate:
     """The polarization that noise alone fakes, in the object's median pixel."""
-    figure, limit = found.figure("noise", _noise), limits.max_dolp_noise
+    figure, limit = _noise(found.stokes), limits.max_dolp_noise
     says = f"noise fakes a polarization of {100 * figure:.1f} % in the median pixel of the object"
     remedy = "too dark: more light, a wider aperture, a longer exposure, or more frames"
     return at_most("noise", figure, limit, says, remedy, cost_deg=300 * figure)
 
 
-def _noise(found: Found, _: None) -> float:
-    image = found.stokes
+def _noise(image: StokesImage) -> float:
     light = np.maximum(image.stokes[0][image.mask].sum(-1), 1e-9)
     spread = np.sqrt((image.covariance[3] + image.covariance[5])[image.mask].sum(-1) / 2)
     return float(np.median(spread / light)) if len(light) else float("nan")
 
 
-def stillness(found: Found, limits: Gates) -> Gate:
+def stillness(found: Evidence, limits: Gates) -> Gate:
     """How much of a shot differs between its exposures."""
     fraction = found.radiance.ghost_fraction
     k = int(np.argmax(fraction))
@@ -105,7 +104,7 @@ def stillness(found: Found, limits: Gates) -> Gate:
     return at_most("stillness", float(fraction[k]), limits.max_ghost, says, remedy, bad, cost_deg=5)
 
 
-def chart(found: Found, limits: Gates) -> Gate:
+def chart(found: Evidence, limits: Gates) -> Gate:
     """How well the chart's colors are met, where there is one."""
     limit = limits.max_delta_e
     if found.chart_missing:
@@ -132,9 +131,10 @@ def chart(found: Found, limits: Gates) -> Gate:
     return at_most("chart", mean, limit, says, remedy, unit="ΔE2000")
 
 
-def clipping(found: Found, limits: Gates) -> Gate:
+def clipping(found: Evidence, limits: Gates) -> Gate:
     """How much of the object is clipped even in the shortest exposure."""
-    clipped, limit = found.clipped, limits.max_clipped
+    # of the darkest frame
+    clipped, limit = found.clipped[:, :, found.object_.mask].mean(2).min(1), limits.max_clipped
     k = int(np.argmax(clipped))
     says = f"{100 * clipped[k]:.1f} % of the object is clipped even in the shortest exposure of {found.names[k]}"
     remedy = "add a darker frame, or less light: nothing is known of clipped pixels"
@@ -143,7 +143,7 @@ def clipping(found: Found, limits: Gates) -> Gate:
     )
 
 
-def gains(found: Found, limits: Gates) -> Iterator[Gate]:
+def gains(found: Evidence, limits: Gates) -> Iterator[Gate]:
     """The light of every frame against the others', and how far that is known."""
     measured, radiance, names = found.gains, found.radiance, found.names
     shot = measured.gain.mean(1)
@@ -166,7 +166,7 @@ def gains(found: Found, limits: Gates) -> Iterator[Gate]:
     yield at_most("energy", float(abs(drift[k, e])), limit, says, why.replace("between shots", "within a bracket"), bad)
 
 
-def _gain_doubt(found: Found, limits: Gates) -> Gate:
+def _gain_doubt(found: Evidence, limits: Gates) -> Gate:
     """How far the gains themselves are to be trusted."""
     measured = found.gains
     limit = limits.max_gain_doubt
@@ -203,7 +203,7 @@ def _grade(cost_deg: float) -> State:
     return "fail" if cost_deg > 15 else "warn"
 
 
-def crossed(found: Found, limits: Gates) -> Iterator[Gate]:
+def crossed(found: Evidence, limits: Gates) -> Iterator[Gate]:
     """Whether the cross-polarised shot shows what it should: less light than S0, and nothing clipped where S0 clips."""
     if found.radiance.crossed is None:
         return
@@ -215,7 +215,7 @@ def crossed(found: Found, limits: Gates) -> Iterator[Gate]:
         says = "nothing tells how bright the cross-polarised shot is against the others: it is not used"
         yield Gate("crossed", "warn", None, limit, says, "put a ColorChecker beside the object, or expose it more")
         return
-    seen = found.figure("crossed", _crossed)
+    seen = _crossed(found.stokes)
     share = 100 * seen["mirrored"]
     says = f"{share:.1f} % of the object's light is mirrored at its surface, and taken out of its albedo"
     if seen["left"] > _STILL_CLIPPED and seen["clipped"] > _FEW:
@@ -227,9 +227,8 @@ def crossed(found: Found, limits: Gates) -> Iterator[Gate]:
     yield at_most("crossed", seen["over"], limit, says, remedy, beyond="warn")
 
 
-def _crossed(found: Found, _: None) -> dict[str, Any]:
+def _crossed(image: StokesImage) -> dict[str, Any]:
     """Shares of what is clipped in it too, of what is brighter than S0, and of the light that it lacks."""
-    image = found.stokes
     assert image.body is not None
     known = image.mask & (image.body.quality == 0)
     sound = known & ((image.quality & int(Quality.CLIPPED)) == 0)
@@ -244,7 +243,7 @@ def _crossed(found: Found, _: None) -> dict[str, Any]:
     return {"left": left, "clipped": int(clipped.sum()), "over": over, "mirrored": mirrored}
 
 
-def ambient(found: Found, limits: Gates) -> Gate:
+def ambient(found: Evidence, limits: Gates) -> Gate:
     """The share of ambient light, where it was photographed."""
     share = found.radiance.ambient_share
     limit = limits.max_ambient

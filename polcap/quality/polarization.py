@@ -1,18 +1,17 @@
 """Gates of polarization: the order of the angles, their turn, and whether it is a body's light at all."""
 
 from collections.abc import Iterator
-from dataclasses import asdict
-from typing import Any
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from polcap.config import Gates
-from polcap.images import Floats, Gains, Quality, StokesImage
+from polcap.images import Floats, Gains, Quality, StokesImage, SurfaceMaps
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
 from polcap.quality import rim
-from polcap.quality.gate import Found, Gate, at_most
+from polcap.quality.gate import Evidence, Gate, at_most
 
 _LEAST_RIM = 200  # pixels of outline that an angle can be told from
 _LEAST_DOLP = 0.01  # of the outline; there the least index has ten times that
@@ -31,7 +30,7 @@ _ALONG = -0.3  # how well the AoLP lies across the contour, below: along it
 _MOST_PIXELS = 6e5  # a larger picture is averaged down
 
 
-def order(found: Found) -> Gate:
+def order(found: Evidence) -> Gate:
     """Whether the outline supports the stated order and sense of the angles."""
     gains, names = found.gains, found.names
     if gains.order == tuple(range(len(names))) and not gains.mirrored and gains.rival:
@@ -49,59 +48,61 @@ def order(found: Found) -> Gate:
     return Gate("order", "fail", best, "as stated", says, remedy, 45.0, unit="")
 
 
-def of_outline(found: Found, limits: Gates) -> Iterator[Gate]:
+def of_outline(found: Evidence, limits: Gates) -> Iterator[Gate]:
     """What the outline says of the angles, of the body and of other light."""
     angle, limit = _angle(found), limits.max_turn_deg
-    seen = found.figure("outline", _outline, [limit, angle.tolist()])
+    seen = _outline(found, limit, angle)
     if seen is None:
         yield Gate("angles", "not measured", None, limit, "too little outline", unit="°")
         return
-    body = rim.Body(**seen["body"])
+    body = seen.body
     if body.dolp < _LEAST_DOLP:
         says = f"the outline is polarized by {100 * body.dolp:.1f} %"
         remedy = "is the polarizer on, and did it turn? Metal and translucent bodies (wax, milk) hardly polarize"
         yield Gate("polarized", "fail", round(body.dolp, 4), _LEAST_DOLP, says, remedy, 45.0)
         return
-    of_shots = _angles(rim.Turn(**seen["turn"]), body, angle, found.gains, found.names, limits)
+    of_shots = _angles(seen.turn, body, angle, found.gains, found.names, limits)
     yield _with_ring(of_shots, found.gains, limits)
     yield _light_of_body(body, found, limits)
-    side = seen["side"]
+    side = seen.side
     k = int(np.argmax(side))
     says = f"{found.names[k]} is brighter on one side by {100 * side[k]:.1f} %"
     remedy = "another light was on in one of the shots: darken the room, and take that shot again"
     yield at_most("other light", float(side[k]), limits.max_side_light, says, remedy, (found.names[k],), 10)
 
 
-def _angle(found: Found) -> Floats:
+def _angle(found: Evidence) -> Floats:
     """As found where nobody noted them, else as stated, (K,) rad."""
     return found.radiance.angle if found.gains.found_angle is None else found.gains.found_angle
 
 
-def _outline(found: Found, setting: tuple[float, list[float]]) -> dict[str, Any] | None:
-    """What the outline says of a turn beyond the limit, of the body and of other light; None: it is too short.
+@dataclass(frozen=True)
+class OutlineFigures:
+    """Measurements along the object's outline."""
 
-    The setting: the limit in degrees, and the angles, for which nobody has to read the photographs here.
-    """
-    limit_deg, angle = setting[0], np.array(setting[1])
+    body: rim.Body
+    turn: rim.Turn
+    side: Floats  # (K,) how much brighter one side is than the other in each shot
+
+
+def _outline(found: Evidence, limit_deg: float, angle: Floats) -> OutlineFigures | None:
+    """Figures of the outline; turns below the limit are not tried; angle (K,) rad. None: it is too short."""
     band = rim.take(*_reduced(found.stokes, angle))
     if len(band.azimuth) < _LEAST_RIM:
         return None
-    return {
-        "body": asdict(rim.body(band, angle)),
-        "turn": asdict(rim.turn(band, angle, np.radians(limit_deg))),
-        "side": [float(one) for one in rim.side_light(band)],
-    }
+    turn = rim.turn(band, angle, np.radians(limit_deg))
+    return OutlineFigures(rim.body(band, angle), turn, rim.side_light(band))
 
 
-def ill_posed(found: Found, limits: Gates) -> Gate:
+def ill_posed(found: Evidence, limits: Gates) -> Gate:
     """How much of the object is polarized as no dielectric is."""
-    share = found.figure("ill_posed", _ill_posed)
+    share = _ill_posed(found)
     says = f"{100 * share:.1f} % of the object is polarized as no dielectric is"
     remedy = "ambient light, mirrored surroundings, metal, or shots out of order: darken the room, check the angles"
     return at_most("ill-posed", share, limits.max_ill_posed, says, remedy, cost_deg=30 * share)
 
 
-def _ill_posed(found: Found, _: None) -> float:
+def _ill_posed(found: Evidence) -> float:
     image = found.stokes
     inside = image.quality[image.mask]
     return float(((inside & int(Quality.ILL_POSED)) > 0).mean()) if inside.size else 0.0
@@ -179,7 +180,7 @@ def _with_ring(gate: Gate, gains: Gains, limits: Gates) -> Gate:
     return Gate("angles", "warn", value, limit if noted else limits.max_turn_deg, says, remedy, cost, unit="°")
 
 
-def _light_of_body(body: rim.Body, found: Found, limits: Gates) -> Gate:
+def _light_of_body(body: rim.Body, found: Evidence, limits: Gates) -> Gate:
     """Whether the outline is polarized as a body under a flash by the lens: across the contour, and enough.
 
     A rough body polarizes as little as a translucent one. The estimators allow for roughness, and then find a shape as
@@ -202,7 +203,7 @@ def _light_of_body(body: rim.Body, found: Found, limits: Gates) -> Gate:
         )
         figure, least = round(body.concentration, 2), limits.min_concentration
         return Gate("body", "warn", figure, least, says, remedy, max(15.0, weak), unit="")
-    zenith, roughness = found.figure("shape", _median_shape)
+    zenith, roughness = _median_shape(found.maps)
     flat, dimmed = zenith < limits.min_zenith_deg, body.brightness < _DIMMED
     hint = "under even light translucent bodies give little; trust the shape less"
     if flat and dimmed and body.dolp < max(limit, _WEAK_DOLP):
@@ -234,9 +235,8 @@ def _lopsided(body: rim.Body) -> float:
     return _LOPSIDED if body.dolp_lit < _LIT_DOLP else np.inf
 
 
-def _median_shape(found: Found, _: None) -> tuple[float, float]:
+def _median_shape(maps: SurfaceMaps) -> tuple[float, float]:
     """Median zenith of the normals, degrees from the view ray, and median roughness."""
-    maps = found.maps
     if not maps.mask.any():
         return 0.0, 0.0
     facing = dot(maps.normal, rays(maps.view, *maps.mask.shape))[maps.mask]

@@ -11,49 +11,54 @@ from xml.etree import ElementTree
 import pytest
 
 from polcap.batch import job_files
-from polcap.batch.job_files import Job
+from polcap.batch.job_files import BatchJob
 
 ROOT = Path("/shows/An object's {raw}")
 
 
 @pytest.fixture
-def job() -> Job:
-    return Job(job_files.command(ROOT, {"assignments": ["hdr.clip=0.9"], "keep_going": True}), ROOT, 12)
+def job() -> BatchJob:
+    return BatchJob(job_files.batch_command(ROOT, {"assignments": ["hdr.clip=0.9"], "keep_going": True}), ROOT, 12)
 
 
 def test_what_submits_a_job_survives_any_folder_name() -> None:
     file = ROOT / "slurm.sh"
-    assert shlex.split(job_files.submit("slurm", file)) == ["sbatch", str(file)]
-    assert repr(str(file)) in job_files.submit("opencue", file)
+    assert shlex.split(job_files.submit_hint("slurm", file)) == ["sbatch", str(file)]
+    assert repr(str(file)) in job_files.submit_hint("opencue", file)
 
 
-def written(kind: job_files.Kind, job: Job, folder: Path) -> str:
+def written(kind: job_files.Scheduler, job: BatchJob, folder: Path) -> str:
     return job_files.write(kind, job, folder).read_text()
 
 
-def test_options_reach_the_command(job: Job) -> None:
+def test_options_reach_the_command(job: BatchJob) -> None:
     assert job.command == ("polcap", "batch", str(ROOT), "--set", "hdr.clip=0.9")
 
 
-def test_slurm_script_is_shell(job: Job, tmp_path: Path) -> None:
+def test_an_option_of_zero_reaches_the_command() -> None:
+    words = job_files.batch_command(ROOT, {"retries": 0, "threads": 0, "keep_going": False, "no_chart": True})
+    assert words[3:] == ("--retries", "0", "--fail-fast", "--no-chart")
+
+
+def test_slurm_script_is_shell(job: BatchJob, tmp_path: Path) -> None:
     text = written("slurm", job, tmp_path)
     assert "#SBATCH --array=1-12" in text and "--shard" not in text  # the array's variables say it
     subprocess.run(["sh", "-n"], input=text, text=True, check=True)
 
 
-def test_openjd_template_is_valid(job: Job, tmp_path: Path) -> None:
+def test_openjd_template_is_valid(job: BatchJob, tmp_path: Path) -> None:
     template = json.loads(written("openjd", job, tmp_path))
     model = pytest.importorskip("openjd.model")
     assert model.decode_job_template(template=template).name == job.name
 
 
-def test_opencue_specification_is_well_formed(job: Job, tmp_path: Path) -> None:
+def test_opencue_specification_is_well_formed(job: BatchJob, tmp_path: Path) -> None:
     spec = ElementTree.fromstring(written("opencue", job, tmp_path))
     assert spec.findtext("job/layers/layer/range") == "1-12"
     assert "--shard #IFRAME#/12" in (spec.findtext("job/layers/layer/cmd") or "").replace("'\"'\"'", "'")
 
 
-def test_kubernetes_job_is_valid(job: Job, tmp_path: Path) -> None:
+def test_kubernetes_job_is_valid(job: BatchJob, tmp_path: Path) -> None:
     document = json.loads(written("kubernetes", job, tmp_path))
     assert document["spec"]["completions"] == 12 and document["spec"]["completionMode"] == "Indexed"
     validate = pytest.importorskip("kubernetes_validate")
@@ -62,11 +67,11 @@ def test_kubernetes_job_is_valid(job: Job, tmp_path: Path) -> None:
 
 def test_snakefile_takes_a_root_as_it_is_called(tmp_path: Path) -> None:
     root = Path("/shows/me@/raw")
-    text = written("snakemake", Job(job_files.command(root, {}), root, 12), tmp_path)
+    text = written("snakemake", BatchJob(job_files.batch_command(root, {}), root, 12), tmp_path)
     assert f"polcap batch {root} --shard {{wildcards.k}}/12" in text
 
 
-def test_snakefile_plans_every_shard(job: Job, tmp_path: Path) -> None:
+def test_snakefile_plans_every_shard(job: BatchJob, tmp_path: Path) -> None:
     written("snakemake", job, tmp_path)
     tool = shutil.which("snakemake", path=str(Path(sys.executable).parent)) or shutil.which("snakemake")
     if tool is None:

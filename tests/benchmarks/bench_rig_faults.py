@@ -72,7 +72,7 @@ def _processed(folder: Path) -> list[np.ndarray]:
     out = folder / "polcap"
     pipeline.process(found, UserInput(chart=ChartRequest("none")), Config(), out)
     results, _ = pipeline.reopen(out)
-    maps, mesh = results.maps.value, results.mesh.value
+    maps, mesh = results.maps, results.mesh
     return [np.asarray(maps.normal), np.asarray(maps.diffuse), np.asarray(mesh.vertices)]
 
 

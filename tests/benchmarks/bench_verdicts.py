@@ -16,7 +16,6 @@ import argparse
 import json
 import shutil
 import sys
-import tempfile
 import time
 from collections import Counter
 from dataclasses import replace
@@ -35,9 +34,9 @@ from polcap.errors import InputError
 from polcap.formats.capture import reader as captures
 from polcap.images import Capture, ChartRequest, Frame, Network, SurfaceMaps
 from polcap.pipeline import check, models, path
-from polcap.pipeline.cache import Store
+from polcap.pipeline.cache import MemoryCache
 from polcap.quality import gates
-from polcap.report.whole import Whole
+from polcap.quality.gate import full_size
 
 Row = dict[str, Any]
 
@@ -106,16 +105,15 @@ def judge_check(capture: Capture) -> Row:
 def judge_process(capture: Capture, place: Path, no_chart: bool = False) -> Row:
     """The verdict; the expected error of the normals with all costs, and the actual one (medians, degrees)."""
     chart = ChartRequest("none" if no_chart else "auto")
-    with tempfile.TemporaryDirectory() as out:
-        try:
-            found = path.path(capture, path.UserInput(chart, None, *networks()), Config(), Store(Path(out)))
-            lines = list(gates.judge(Whole(found, capture.focal_doubt), Config()))
-            actual = error_deg(found.maps.value, place)
-        except InputError as error:
-            return {
-                "process": "fail", "process_gates": {_name(error): ["fail", None, 45.0]},
-                "expected": None, "actual": None,
-            }  # fmt: skip
+    try:
+        found = path.path(capture, path.UserInput(chart, None, *networks()), Config(), MemoryCache(until="surface"))
+        lines = list(gates.judge(full_size(found, capture.focal_doubt), Config()))
+        actual = error_deg(found.maps, place)
+    except InputError as error:
+        return {
+            "process": "fail", "process_gates": {_name(error): ["fail", None, 45.0]},
+            "expected": None, "actual": None,
+        }  # fmt: skip
     expected = next((line.value for line in lines if line.name == "normal error"), None)
     shown = _shown(lines)
     return {"process": gates.verdict(lines), "process_gates": shown, "expected": expected, "actual": actual}

@@ -8,7 +8,6 @@ the worst shot's of each capture, and what is promised.
 """
 
 import argparse
-from types import SimpleNamespace
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from polcap.formats import calib
 from polcap.images import AngleStack, ColorCalibration
 from polcap.pipeline.path import AUTO
 from polcap.quality import light
+from polcap.quality.gate import Evidence
 from polcap.stages import selfcal, whitebalance
 from polcap.stages.selfcal import integrability, object_gains, order
 from tests import scenes
@@ -52,7 +52,7 @@ def main() -> None:
             errors.append(np.nan)  # within no limit, beyond none
             continue
         found = selfcal.solve(radiance, scenes.still(len(angle)), object_, color, settings)
-        gate = light._gain_doubt(SimpleNamespace(gains=found), Gates())
+        gate = light._gain_doubt(Evidence.partial(gains=found), Gates())
         error = np.abs(found.gain.mean(1) / true - 1)
         errors.append(float(error.max()))
         states.append(gate.state)

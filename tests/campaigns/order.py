@@ -21,7 +21,7 @@ from polcap.errors import CaptureError, InputError
 from polcap.formats.capture import reader as captures
 from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, ObjectMask
 from polcap.pipeline import models
-from polcap.pipeline.cache import Store
+from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
 from polcap.stages import selfcal
 from polcap.stages.selfcal import order
@@ -76,8 +76,8 @@ def from_raw(seed: int, angles: str) -> Iterator[Before]:
         supplied = UserInput(mask_network=models.load_mask_network(1))
         capture = captures.read(Path(place) / "capture")
         try:
-            results = path(capture, supplied, Config(), Store(Path(place) / "result"))
-            parts = results.radiance.value, results.alignment.value, results.object_.value, results.color.value
+            results = path(capture, supplied, Config(), MemoryCache(until="mask"))
+            parts = results.radiance, results.alignment, results.object_, results.color
         except InputError as error:
             print(seed, "refused before:", error, flush=True)
             return

@@ -23,7 +23,7 @@ from polcap.errors import InputError
 from polcap.formats.capture import reader as captures
 from polcap.images import Gains
 from polcap.pipeline import models
-from polcap.pipeline.cache import Store
+from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
 from polcap.stages import selfcal
 from polcap.synth import scenes as random_scenes
@@ -102,8 +102,8 @@ def from_raw(seed: int, turn: float) -> dict[str, Any]:
         shots = tuple(replace(shot, angle=float(a)) for shot, a in zip(capture.shots, nominal))
         supplied = UserInput(mask_network=models.load_mask_network(1))
         try:
-            results = path(replace(capture, shots=shots), supplied, Config(), Store(Path(place) / "result"))
-            return told(results.gains.value, kind)
+            results = path(replace(capture, shots=shots), supplied, Config(), MemoryCache(until="selfcal"))
+            return told(results.gains, kind)
         except InputError as error:
             return {"kind": kind, "refused": str(error)}
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from polcap.errors import ModelError
-from polcap.formats import calib
 from polcap.formats import onnx as formats_onnx
-from polcap.formats.onnx import ENCODING, Model, digest, load
+from polcap.formats.onnx import ENCODING, Model, load
 
 onnx = pytest.importorskip("onnx", reason="writing test models needs the extra [train]")
 SAID = {"channels": "s1,s2", "encoding": ENCODING, "native_size": "128", "size_multiple": "8"} | {
@@ -165,27 +164,6 @@ def test_metadata_that_are_no_text_are_refused(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"Apache-2.0", b"Apache-\xea\x80\xff"))
     with pytest.raises(ModelError, match=r"no text|cannot be run|not a model"):
         load(path)
-
-
-def test_a_shipped_model_opened_later_says_and_does_the_same() -> None:
-    file = sorted(calib.data_path("colorchecker").parent.glob("models/polcap*.onnx"))[-1]
-    now, later = load(file, threads=1), load(file, threads=1, later=True)
-    assert later == now and "session" not in vars(later.run)
-    side = int(now.metadata["size_multiple"])
-    noise = np.random.default_rng(3).normal(size=(1, len(now.channels), side, side)).astype(np.float32)
-    for name, value in now.run(noise).items():
-        np.testing.assert_array_equal(later.run(noise)[name], value)
-
-
-@pytest.mark.parametrize("harm", [b"", b"hello\n", None, b"\x72\x7f"], ids=["empty", "text", "cut", "ends early"])
-def test_a_shipped_model_that_was_damaged_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, harm: bytes | None
-) -> None:
-    path = write(tmp_path / "fine.onnx", SAID)
-    path.write_bytes(path.read_bytes()[:-20] if harm is None else harm)
-    monkeypatch.setattr(formats_onnx, "_shipped", lambda: frozenset([digest(path.read_bytes())]))
-    with pytest.raises(ModelError, match=r"fine\.onnx: is damaged \(.*\); install polcap again"):
-        load(path, later=True)
 
 
 def test_runs_side_by_side_are_as_many_as_threads(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ from polcap.images import ChartRequest
 from polcap.pipeline import check
 from polcap.pipeline.check import Networks, Verdict
 from polcap.pipeline.path import AUTO
-from polcap.pipeline.small_capture import take
+from polcap.pipeline.small_capture import reduce
 from polcap.stages import hdr, whitebalance
 from tests import faulty
 from tests.conftest import Command
@@ -63,7 +63,7 @@ def test_process_measures_the_blur_that_check_measures(tmp_path: Path) -> None:
     merged = hdr.merge(capture, Config().hdr)
     assert merged.blur_px is not None and np.nanmax(merged.blur_px) > Config().gates.max_blur_px
     with ThreadPoolExecutor(2) as pool:
-        np.testing.assert_array_equal(merged.blur_px, take(capture, 0.98, pool).blur_px)
+        np.testing.assert_array_equal(merged.blur_px, reduce(capture, 0.98, pool).blur_px)
 
 
 def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path) -> None:
@@ -136,7 +136,7 @@ def test_reduced_picture_keeps_what_is_clipped(example: Path, monkeypatch: pytes
     monkeypatch.setattr("polcap.pipeline.small_capture._MOST_PIXELS", 7e4)
     capture = captures.read(example)
     with ThreadPoolExecutor(2) as pool:
-        taken = take(capture, 0.98, pool)
+        taken = reduce(capture, 0.98, pool)
     assert taken.step == 4
     assert taken.capture.size_px == (288, 216)
     brightest = taken.capture.shots[0].frames[2].load()

@@ -5,6 +5,7 @@ import json
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -15,8 +16,8 @@ import pytest
 
 from polcap.config import Config
 from polcap.quality import gate as gate_module
-from polcap.quality import gates, geometry, light, polarization
-from polcap.quality.gate import Gate
+from polcap.quality import gates, geometry, light, polarization, rim
+from polcap.quality.gate import Evidence, Gate
 from tests import scenes
 
 MODULES: tuple[ModuleType, ...] = (gates, gate_module, light, geometry, polarization)
@@ -28,12 +29,29 @@ BODY = {
 }  # fmt: skip
 TURN = {"shot": None, "angle": 0.0, "misfit": 1.0, "sigmas": 0.0}
 FIGURES = {
-    "object_motion": [0.0, 0.1, 0.1], "charted": 0.0, "noise": 0.001, "ill_posed": 0.0, "shape": [45.0, 0.2],
+    "object_motion": np.array([0.0, 0.1, 0.1]), "charted": 0.0, "noise": 0.001, "ill_posed": 0.0, "shape": [45.0, 0.2],
     "normal_error": 4.0, "lean": 2.0, "crossed": {"left": 0.0, "clipped": 0, "over": 0.0, "mirrored": 0.1},
+}  # fmt: skip
+MEASURES = {  # the function that measures each figure
+    "object_motion": (geometry, "_displacement"), "charted": (geometry, "_charted"), "lean": (geometry, "_lean"),
+    "noise": (light, "_noise"), "crossed": (light, "_crossed"), "ill_posed": (polarization, "_ill_posed"),
+    "shape": (polarization, "_median_shape"), "outline": (polarization, "_outline"),
+    "normal_error": (gates, "_own_error"),
 }  # fmt: skip
 MESH = {"pieces": 1, "cuts": 0.3, "cut_px": 40.0, "raggedness": 0.1}
 FAR = np.array([[[1.0, 0, 50 * k], [0, 1, 0], [0, 0, 1]] for k in range(3)])
 SHOT_ALONE = {"turned_shots": (1,), "turned": 0.3, "turned_sigma": 0.02}
+
+
+def in_numpy(value: Any) -> Any:
+    """The same plain data with a NumPy scalar for every number."""
+    if isinstance(value, dict):
+        return {name: in_numpy(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(in_numpy(one) for one in value)
+    if isinstance(value, float):
+        return np.float64(value)
+    return np.int64(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
 def exposures(*ratio: float, **fields: Any) -> dict[str, Any]:
@@ -44,7 +62,15 @@ def exposures(*ratio: float, **fields: Any) -> dict[str, Any]:
 
 def outline(turn: dict[str, Any] | None = None, side: float = 0.02, **body: float) -> dict[str, Any]:
     """Measured figures with this outline."""
-    return {"outline": {"body": BODY | body, "turn": TURN | (turn or {}), "side": [0.0, 0.01, side]}}
+    found = rim.Body(**in_numpy(BODY | body)), rim.Turn(**in_numpy(TURN | (turn or {})))
+    return {"outline": polarization.OutlineFigures(*found, np.array([0.0, 0.01, side]))}
+
+
+def clipped(second_shot: float = 0.0) -> Any:
+    """(K, E, H, W): the share of each pixel that is clipped in three shots of one exposure."""
+    share = np.zeros((3, 1, *scenes.ball_object().mask.shape))
+    share[1] = second_shot
+    return share
 
 
 CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields that lead to it
@@ -68,8 +94,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("alignment", "fail", {"alignment": {"correlation": np.array([1.0, 0.1, 1.0])}}),
     ("alignment", "fail", {"alignment": {"residual_px": np.array([0.0, 0.5, 0.0])}}),
     ("alignment", "fail", {"alignment": {"transform": np.full((3, 3, 3), NAN)}}),
-    ("alignment", "fail", {"figures": {"object_motion": [0.0, 5.0, 0.0]}}),
-    ("alignment", "fail", {"figures": {"object_motion": [0.0, np.inf, 0.0]}}),
+    ("alignment", "fail", {"figures": {"object_motion": np.array([0.0, 5.0, 0.0])}}),
+    ("alignment", "fail", {"figures": {"object_motion": np.array([0.0, np.inf, 0.0])}}),
     ("mask", "pass", {}),
     ("mask", "pass", {"object_": {"doubt": None}}),
     ("mask", "not measured", {"object_": {"doubt": None, "source": "automatic"}}),
@@ -77,12 +103,12 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("mask", "fail", {"object_": {"doubt": 0.4}}),
     ("mask", "fail", {"figures": {"charted": 0.1}}),
     ("clipping", "pass", {}),
-    ("clipping", "fail", {"clipped": np.array([0.0, 0.3, 0.0])}),
-    ("sharpness", "pass", {"radiance": {"blur_px": np.array([[0.0, 0.1]] * 3)}}),
-    ("sharpness", "fail", {"radiance": {"blur_px": np.array([[0.0, 2.0]] * 3)}}),
+    ("clipping", "fail", {"clipped": clipped(0.3)}),
+    ("sharpness", "pass", {"blur_px": np.array([[0.0, 0.1]] * 3)}),
+    ("sharpness", "fail", {"blur_px": np.array([[0.0, 2.0]] * 3)}),
     ("sharpness", "not measured", {}),
     ("sharpness", "not measured",
-     {"radiance": {"blur_px": np.array([[0.0, 0.1]] * 3)}, "alignment": {"transform": FAR}}),
+     {"blur_px": np.array([[0.0, 0.1]] * 3), "alignment": {"transform": FAR}}),
     ("gains", "pass", {}),
     ("gains", "fail", {"gains": {"gain": np.array([[1.0] * 3, [1.0] * 3, [0.7] * 3])}}),
     ("energy", "pass", {}),
@@ -140,17 +166,6 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
 ]  # fmt: skip
 
 
-def in_numpy(value: Any) -> Any:
-    """The same plain data with a NumPy scalar for every number."""
-    if isinstance(value, dict):
-        return {name: in_numpy(one) for name, one in value.items()}
-    if isinstance(value, list | tuple):
-        return type(value)(in_numpy(one) for one in value)
-    if isinstance(value, float):
-        return np.float64(value)
-    return np.int64(value) if isinstance(value, int) and not isinstance(value, bool) else value
-
-
 def fields_in_numpy(value: Any) -> Any:
     """A dataclass or settings with a NumPy scalar for every number among its fields."""
     struct = isinstance(value, msgspec.Struct)
@@ -159,22 +174,16 @@ def fields_in_numpy(value: Any) -> Any:
     return msgspec.structs.replace(value, **numbers) if struct else replace(value, **numbers)
 
 
-class Found(SimpleNamespace):
-    """A capture with stated figures, which are NumPy scalars."""
-
-    def figure(self, name: str, measure: Callable[..., Any], setting: Any = None) -> Any:
-        return in_numpy(self.figures[name])
-
-
 @pytest.fixture(scope="module")
 def good() -> dict[str, Any]:
     """The parts of a capture of which every gate passes or has nothing to judge."""
     return {
         "names": ["0°", "45°", "90°"], "focal_doubt": (0.0, 0.0), "grid_px": 1.0, "chart_missing": "",
-        "clipped": np.zeros(3), "radiance": replace(scenes.stack(), **exposures(1.0, 4.0)),
+        "clipped": clipped(), "blur_px": None, "radiance": replace(scenes.stack(), **exposures(1.0, 4.0)),
         "color": scenes.no_color(), "alignment": scenes.still(), "object_": replace(scenes.ball_object(), doubt=0.01),
         "gains": replace(scenes.equal(), source="grey patches", concentration=0.95),
-        "stokes": SimpleNamespace(body=True), "mesh": SimpleNamespace(**MESH), "figures": FIGURES | outline(),
+        "stokes": SimpleNamespace(body=True), "maps": None, "mesh": SimpleNamespace(**MESH),
+        "figures": FIGURES | outline(),
     }  # fmt: skip
 
 
@@ -198,7 +207,16 @@ def judge(good: dict[str, Any], config: Config, fields: dict[str, Any]) -> list[
     for name in ("focal_doubt", "grid_px"):
         parts[name] = in_numpy(parts[name])
     parts["mesh"] = SimpleNamespace(**in_numpy(vars(parts["mesh"])))
-    return list(gates.judge(Found(**parts), config))
+    figures = parts.pop("figures")
+    with pytest.MonkeyPatch.context() as patch:
+        for figure, (module, function) in MEASURES.items():
+            patch.setattr(module, function, partial(stated, in_numpy(figures[figure])))
+        return list(gates.judge(Evidence.partial(**parts), config))
+
+
+def stated(figure: Any, *_: Any) -> Any:
+    """In place of a measurement."""
+    return figure
 
 
 @pytest.mark.parametrize(("name", "state", "fields"), CASES)

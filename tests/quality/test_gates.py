@@ -10,12 +10,13 @@ import pytest
 from polcap.config import Config
 from polcap.images import SurfaceMaps
 from polcap.quality import gates
+from polcap.quality.gate import Evidence
 from polcap.quality.gates import Gate
 from polcap.stages import selfcal, stokes
 from tests import scenes
 
 
-def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> SimpleNamespace:
+def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> Evidence:
     """A ball well photographed, or with something of it changed."""
     radiance = changed.pop("radiance", scenes.stack(noise=0.002, angles=angles))
     shots = len(radiance.angle)
@@ -29,49 +30,57 @@ def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> SimpleNamespace
     maps = SurfaceMaps(normal, normal, normal, flat, None, 8 * flat, image.mask, image.view, "analytic")
     given = {
         "names": [f"{np.degrees(a):g}°" for a in radiance.angle], "focal_doubt": (0.0, 0.0), "grid_px": 1.0,
-        "chart_missing": "", "clipped": np.zeros(shots), "radiance": radiance,
+        "chart_missing": "", "clipped": clipped(), "blur_px": radiance.blur_px, "radiance": radiance,
         "color": scenes.no_color(), "alignment": scenes.still(shots), "object_": object_, "gains": gains,
-        "stokes": image, "maps": maps, "mesh": None,
+        "stokes": image, "maps": maps,
     }  # fmt: skip
-    return scenes.Found(**{**given, **changed})
+    return Evidence.partial(**{**given, **changed})
+
+
+def clipped(second_shot: float = 0.0) -> np.ndarray:
+    """(K, E, H, W): the share of each pixel of the ball that is clipped in three shots of one exposure."""
+    share = np.zeros((3, 1, *scenes.ball_object().mask.shape))
+    share[1] = second_shot
+    return share
 
 
 @pytest.fixture(scope="module")
-def good() -> SimpleNamespace:
+def good() -> Evidence:
     return found()
 
 
-def judged(of: SimpleNamespace) -> dict[str, Gate]:
+def judged(of: Evidence) -> dict[str, Gate]:
     return {gate.name: gate for gate in gates.judge(of, Config())}
 
 
-def failed(of: SimpleNamespace) -> list[str]:
+def failed(of: Evidence) -> list[str]:
     return [name for name, gate in judged(of).items() if gate.state == "fail"]
 
 
-def test_nothing_fails_on_a_good_capture(good: SimpleNamespace) -> None:
+def test_nothing_fails_on_a_good_capture(good: Evidence) -> None:
     assert failed(good) == []
     assert gates.verdict(judged(good).values()) == "warn"  # one exposure per shot
 
 
-def changed(good: SimpleNamespace, **fields: Any) -> SimpleNamespace:
-    return scenes.Found(**{**vars(good), **fields})
+def changed(good: Evidence, **fields: Any) -> Evidence:
+    return Evidence.partial(**{**vars(good), **fields})
 
 
-def test_each_gate_fails_alone(good: SimpleNamespace) -> None:
+def test_each_gate_fails_alone(good: Evidence) -> None:
     radiance, gains, maps = good.radiance, good.gains, good.maps
     still = good.alignment
     away = still.transform.copy()
     away[1, 0, 2] = 50
     curved = np.array([[0.0, -0.2]] * 3)
-    pairs = {"exposure_ratio": np.tile([[[1.0], [4.0]]], (3, 1, 3)), "exif_ratio": np.array([[1.0, 4.0]] * 3)}
-    faults = {
+    ratios = np.tile([[[1.0], [4.0]]], (3, 1, 3))
+    pairs: dict[str, Any] = {"exposure_ratio": ratios, "exif_ratio": np.array([[1.0, 4.0]] * 3)}
+    faults: dict[str, dict[str, Any]] = {
         "tone curve": {"radiance": replace(radiance, curvature=curved, **pairs)},
         "stillness": {"radiance": replace(radiance, ghost_fraction=np.array([0.0, 0.05, 0.0]))},
         "ambient": {"radiance": replace(radiance, ambient_share=np.array([0.2, 0.2, 0.2]))},
         "alignment": {"alignment": replace(still, transform=away)},
-        "clipping": {"clipped": np.array([0.0, 0.03, 0.0])},
-        "sharpness": {"radiance": replace(radiance, blur_px=np.array([[0.0], [2.0], [0.1]]))},
+        "clipping": {"clipped": clipped(0.03)},
+        "sharpness": {"blur_px": np.array([[0.0], [2.0], [0.1]])},
         "gains": {"gains": replace(gains, gain=np.array([[1.0] * 3, [1.0] * 3, [0.7] * 3]))},
         "gain doubt": {"gains": replace(gains, disagreement=0.05)},
         "normal error": {"maps": replace(maps, confidence=np.full_like(maps.confidence, 25.0))},
@@ -83,7 +92,7 @@ def test_each_gate_fails_alone(good: SimpleNamespace) -> None:
 
 
 @pytest.mark.parametrize(("grid_px", "state"), [(1.0, "pass"), (2.0, "fail")])
-def test_a_push_counts_in_pixels_of_the_processed_picture(good: SimpleNamespace, grid_px: float, state: str) -> None:
+def test_a_push_counts_in_pixels_of_the_processed_picture(good: Evidence, grid_px: float, state: str) -> None:
     """One pixel is under the limit of 1.5; on pictures averaged down to half the side it is two, and above it."""
     pushed = np.array([[1.0, 0, 1], [0, 1, 0], [0, 0, 1]])
     radiance = scenes.before_backdrop([np.eye(3), pushed, np.eye(3)])
@@ -91,13 +100,13 @@ def test_a_push_counts_in_pixels_of_the_processed_picture(good: SimpleNamespace,
     assert gate.state == state and gate.shots == (("45°",) if state == "fail" else ())
 
 
-def test_what_follows_a_wrong_order_is_not_judged(good: SimpleNamespace) -> None:
+def test_what_follows_a_wrong_order_is_not_judged(good: Evidence) -> None:
     told = judged(changed(good, gains=replace(good.gains, order=(2, 1, 0))))
     assert list(told)[-1] == "focal length" or told["order"].state == "fail"
     assert "angles" not in told
 
 
-def test_flash_bracketed_by_the_shutter_is_named(good: SimpleNamespace) -> None:
+def test_flash_bracketed_by_the_shutter_is_named(good: Evidence) -> None:
     alike = np.tile([[[1.0], [1.01], [0.99]]], (3, 1, 3))
     radiance = replace(good.radiance, exposure_ratio=alike, exif_ratio=np.array([[0.25, 1, 4]] * 3), light="flash")
     gate = judged(changed(good, radiance=radiance))["exposures"]
@@ -105,28 +114,28 @@ def test_flash_bracketed_by_the_shutter_is_named(good: SimpleNamespace) -> None:
     assert "flash power, aperture or ISO" in gate.remedy
 
 
-def test_gains_nobody_knows_cost_degrees(good: SimpleNamespace) -> None:
+def test_gains_nobody_knows_cost_degrees(good: Evidence) -> None:
     gains = replace(good.gains, source="object", sigma=np.array([[0.0] * 3, [0.02] * 3, [0.02] * 3]))
     gate = judged(changed(good, gains=gains))["gain doubt"]
     assert gate.state == "warn" and gate.cost_deg == pytest.approx(12)
     assert judged(changed(good, gains=gains))["normal error"].value > 10  # type: ignore[operator]
 
 
-def test_one_angle_that_keeps_four_shots_from_closing_fails(good: SimpleNamespace) -> None:
+def test_one_angle_that_keeps_four_shots_from_closing_fails(good: Evidence) -> None:
     gains = replace(good.gains, turned_shots=(1,), turned=np.radians(15), turned_sigma=np.radians(2))
     gate = judged(changed(good, gains=gains))["angles"]
     assert gate.state == "fail" and gate.shots == ("45°",) and "+15° ± 2°" in gate.says
 
 
 @pytest.mark.parametrize(("turn", "state"), [(1.5, "pass"), (5.0, "warn")])
-def test_a_turn_of_the_ring_is_told_though_taken_out(good: SimpleNamespace, turn: float, state: str) -> None:
+def test_a_turn_of_the_ring_is_told_though_taken_out(good: Evidence, turn: float, state: str) -> None:
     turned, doubt = np.radians([turn, 0.4])
     gains = replace(good.gains, angle_offset=turned, angle_offset_sigma=doubt, angle_correction=turned)
     gate = judged(changed(good, gains=gains))["angles"]
     assert gate.state == state and f"{turn:+.1f}°" in gate.says and "taken out" in gate.says
 
 
-def shaped(good: SimpleNamespace, polarized: float, flattened: float, roughness: float, dimmed: bool = True) -> Any:
+def shaped(good: Evidence, polarized: float, flattened: float, roughness: float, dimmed: bool = True) -> Any:
     """The ball with a part of its polarization and of its tangents' slope, and whether it dims towards its outline."""
     image, maps = good.stokes, good.maps
     weak = image.stokes * np.array([1, polarized, polarized], np.float32)[:, None, None, None]
@@ -151,14 +160,14 @@ def shaped(good: SimpleNamespace, polarized: float, flattened: float, roughness:
     ],
 )
 def test_body_that_polarizes_too_little_for_its_shape_is_told(
-    good: SimpleNamespace, polarized: float, flattened: float, roughness: float, dimmed: bool, words: str
+    good: Evidence, polarized: float, flattened: float, roughness: float, dimmed: bool, words: str
 ) -> None:
     gate = judged(shaped(good, polarized, flattened, roughness, dimmed))["body"]
     assert gate.state == ("warn" if words else "pass"), gate
     assert words in gate.says and (gate.cost_deg > 10) == bool(words)
 
 
-def test_light_from_around_is_told(good: SimpleNamespace) -> None:
+def test_light_from_around_is_told(good: Evidence) -> None:
     image = good.stokes
     across = image.stokes * np.array([1, -1, -1], np.float32)[:, None, None, None]
     gate = judged(changed(good, stokes=replace(image, stokes=across)))["body"]
@@ -171,7 +180,7 @@ def test_light_from_around_is_told(good: SimpleNamespace) -> None:
     [(0.47, 0.0, "pass"), (0.7, 0.0, "pass"), (0.0, 1.5, "warn"), (0.0, 6.0, "warn")],
 )
 def test_a_lopsided_body_is_no_light_from_the_side(
-    good: SimpleNamespace, uneven: float, ambient: float, state: str
+    good: Evidence, uneven: float, ambient: float, state: str
 ) -> None:
     """A body turned to one side is as polarized there as elsewhere; a lamp from there is not."""
     image = good.stokes
@@ -190,16 +199,16 @@ def test_a_ring_that_was_mended_is_told() -> None:
 
 
 @pytest.mark.parametrize(("name", "value"), [("border", 0.6), ("islands", 0.03), ("holes", 0.06)])
-def test_mask_of_a_doubtful_shape_warns(good: SimpleNamespace, name: str, value: float) -> None:
+def test_mask_of_a_doubtful_shape_warns(good: Evidence, name: str, value: Any) -> None:
     gate = judged(changed(good, object_=replace(good.object_, **{name: value})))["mask"]
     assert gate.state == "warn" and "--mask" in gate.remedy
 
 
-def test_mask_that_its_network_doubts_fails(good: SimpleNamespace) -> None:
+def test_mask_that_its_network_doubts_fails(good: Evidence) -> None:
     assert failed(changed(good, object_=replace(good.object_, doubt=0.3))) == ["mask"]
 
 
-def test_assumed_focal_length_warns_and_costs_what_the_rays_would_lean(good: SimpleNamespace) -> None:
+def test_assumed_focal_length_warns_and_costs_what_the_rays_would_lean(good: Evidence) -> None:
     two = float(np.log(2.0))
     gate = judged(changed(good, focal_doubt=(-two, two)))["focal length"]
     longer = judged(changed(good, focal_doubt=(0.0, two)))["focal length"]
@@ -219,7 +228,7 @@ def test_assumed_focal_length_warns_and_costs_what_the_rays_would_lean(good: Sim
     ],
 )
 def test_mesh_in_shreds_fails_by_the_figure_that_is_over(
-    good: SimpleNamespace, fault: dict[str, float], words: str, unit: str
+    good: Evidence, fault: dict[str, float], words: str, unit: str
 ) -> None:
     whole = {"pieces": 1, "cuts": 0.3, "cut_px": 40.0, "raggedness": 0.1}
     passed = judged(changed(good, mesh=SimpleNamespace(**whole)))["mesh"]
@@ -238,7 +247,7 @@ def _within(gate: Gate, least: bool) -> bool:
     return value >= limit if least else value <= limit
 
 
-def test_what_is_beside_a_gate_s_words_is_the_figure_that_they_are_of(good: SimpleNamespace) -> None:
+def test_what_is_beside_a_gate_s_words_is_the_figure_that_they_are_of(good: Evidence) -> None:
     object_, still, image = good.object_, good.alignment, good.stokes
     unlike, unsure = np.array([1, 0.1, 1]), np.array([0, 0.5, 0])
     around = image.stokes * np.array([1, -1, -1], np.float32)[:, None, None, None]
@@ -259,7 +268,7 @@ def test_what_is_beside_a_gate_s_words_is_the_figure_that_they_are_of(good: Simp
         assert gate.state in ("warn", "fail") and not _within(gate, least), gate
 
 
-def test_four_angles_are_not_asked_of_who_has_shot_four(good: SimpleNamespace) -> None:
+def test_four_angles_are_not_asked_of_who_has_shot_four(good: Evidence) -> None:
     four = found(angles=np.radians([0.0, 45, 90, 135]))
     for of, asked in ((good, True), (four, False)):
         gains = replace(of.gains, source="object", sigma=np.full_like(of.gains.sigma, 0.2))
@@ -268,6 +277,6 @@ def test_four_angles_are_not_asked_of_who_has_shot_four(good: SimpleNamespace) -
         assert doubtful["gain doubt"].cost_deg == doubtful["normal error"].value == 90  # no error is larger
 
 
-def test_a_passing_mask_tells_its_figure(good: SimpleNamespace) -> None:
+def test_a_passing_mask_tells_its_figure(good: Evidence) -> None:
     gate = judged(changed(good, object_=replace(good.object_, doubt=0.024)))["mask"]
     assert gate.state == "pass" and "2.4 %" in gate.says

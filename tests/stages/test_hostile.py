@@ -10,6 +10,7 @@ from polcap.config import Config
 from polcap.errors import InputError
 from polcap.images import AngleStack, Quality, View
 from polcap.quality import gates
+from polcap.quality.gate import Evidence
 from polcap.stages import align, asset, cues, infer, mask, selfcal, stokes, surface
 from tests import scenes
 
@@ -89,11 +90,11 @@ def run(radiance: AngleStack, drawn: np.ndarray | None) -> None:
         assert np.isfinite(array).all()
     found: dict[str, Any] = {
         "names": [str(k) for k in range(len(radiance.angle))], "focal_doubt": (0.0, 0.0), "grid_px": 1.0,
-        "chart_missing": "", "clipped": np.zeros(len(radiance.angle)), "radiance": radiance,
-        "color": color, "alignment": alignment, "object_": object_, "gains": gains, "stokes": image, "maps": maps,
-        "mesh": mesh,
+        "chart_missing": "", "clipped": (radiance.quality & 1 > 0)[:, None], "blur_px": radiance.blur_px,
+        "radiance": radiance, "color": color, "alignment": alignment, "object_": object_, "gains": gains,
+        "stokes": image, "maps": maps, "mesh": mesh,
     }  # fmt: skip
-    told = list(gates.judge(scenes.Found(**found), config))
+    told = list(gates.judge(Evidence.partial(**found), config))
     assert all(gate.says and gate.state in ("pass", "warn", "fail", "not measured") for gate in told)
     assert built.base_color.dtype == np.uint8
 

@@ -13,7 +13,7 @@ from polcap.formats import atomic, calibrations
 from polcap.formats.capture import capture_toml, focal_length, layouts
 from polcap.formats.capture.capture_toml import CaptureFile
 from polcap.formats.capture.layouts import Source
-from polcap.formats.raw import libraw, photo, probe
+from polcap.formats.raw import libraw, photo
 from polcap.images import Capture, Exif, Frame, SensorImage, Shot
 
 _ZOOM = 0.01  # relative change of the focal length above rounding
@@ -21,12 +21,12 @@ LOSS = ": normals and albedo lose accuracy against RAW"
 Loader = Callable[[], SensorImage]
 
 
-def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, look: layouts.Look = probe.read) -> Capture:
+def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Capture:
     """Read a capture folder: pol000/ pol045/ …, capture.toml, flat, or polarization-sensor frames.
 
     Every file's metadata and bytes are read, no pixel is decoded. `angles_deg` is the order of
     the brackets of a flat folder (0, 45, 90 by default); elsewhere it picks from the angles that
-    the folder states, the first being the reference. `look` reads the facts of a file.
+    the folder states, the first being the reference.
 
     Raises
     ------
@@ -43,7 +43,7 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, look: 
     stated = capture_toml.load(folder)
     if angles_deg is not None:
         _check_angles(folder, angles_deg, "--angles states")
-    plan = layouts.plan(folder, stated, angles_deg, look)
+    plan = layouts.plan(folder, stated, angles_deg)
     _check_angles(folder, [angle for angle, _ in plan.shots], "the shots' angles are")
 
     used: dict[Path, Source] = {}

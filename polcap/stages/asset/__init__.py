@@ -80,25 +80,6 @@ def colors(maps: SurfaceMaps, settings: Settings) -> Colors:
     )
 
 
-@dataclass(frozen=True)
-class Indexed:
-    """What of an asset depends on the refractive index; fields as of `Asset`."""
-
-    base_color: NDArray[np.uint8]
-    specular_factor: tuple[float, float, float]
-    ior: float
-
-
-def indexed(maps: SurfaceMaps, settings: Settings) -> Indexed:
-    """All that other settings change in the asset of the same maps."""
-    greatest = np.clip(_greatest(maps.specular), 0.0, 1.0)
-    return Indexed(
-        base_color=filled(_base(maps.diffuse, greatest, settings), _unmixed(maps.mask)),
-        specular_factor=_factor(_top(maps.mask, greatest), settings),
-        ior=settings.ior,
-    )
-
-
 def _base(diffuse: Floats, greatest: Floats, settings: Settings) -> NDArray[np.uint8]:
     """ρ_d T₊(0)²/(1 − F0), sRGB-encoded, of the greatest F0 (H, W, 1) of each pixel's channels."""
     entry, _ = fresnel.transmission(np.float64(1.0), settings.ior)

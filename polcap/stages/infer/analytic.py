@@ -81,9 +81,10 @@ def invert(
         phi, certainty = azimuth.resolve(axis, np.sin(zenith), cues.mask)
     else:
         phi, certainty = _guided(axis, cues.rays, *guide)
-    with parallel.Beside() as beside:
-        error = beside.begin(partial(_expected_error, read, dolp, sigma, certainty, cues))
-        return _from_angles(cos_zenith, phi, cues.rays), error.result(), cos_zenith
+    error, normal = parallel.both(
+        partial(_expected_error, read, dolp, sigma, certainty, cues), partial(_from_angles, cos_zenith, phi, cues.rays)
+    )
+    return normal, error, cos_zenith
 
 
 def _guided(axis: Floats, rays: Floats, normal: Floats, sigma: Floats) -> tuple[Floats, Floats]:
