@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from polcap.calibrate import photon_transfer
 from polcap.calibrate.calibration_photographs import CLIP, Photograph, photographs_in
-from polcap.calibration_values import NoiseLine
 from polcap.errors import CaptureError
 from polcap.formats.capture import layouts
-from polcap.images import Floats
+from polcap.images import Floats, NoiseLine
 from polcap.optics import robust
 from polcap.stages.hdr import exposure, frame_motion, noise, planes
 from polcap.stages.hdr.planes import Signals

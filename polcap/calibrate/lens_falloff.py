@@ -7,9 +7,8 @@ import cv2
 import numpy as np
 
 from polcap.calibrate.calibration_photographs import CLIP, Photograph, by_setting
-from polcap.calibration_values import Falloff
 from polcap.errors import CaptureError
-from polcap.images import Floats
+from polcap.images import Falloff, Floats
 from polcap.optics import sensor
 
 _CELLS = 48  # along the longer side

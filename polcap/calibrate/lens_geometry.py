@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.calibrate.calibration_photographs import Photograph
-from polcap.calibration_values import LensGeometry
 from polcap.errors import CaptureError, ChartError
-from polcap.formats import calib
-from polcap.images import AngleStack, ChartRequest, Distortion, Floats, SensorImage, View
+from polcap.formats import shipped_data
+from polcap.images import AngleStack, ChartRequest, Distortion, Floats, LensGeometry, SensorImage, View
 from polcap.optics import distortion, sensor
 from polcap.stages import whitebalance
 from polcap.stages.whitebalance import chart
@@ -164,7 +163,7 @@ def _color_checker(image: SensorImage) -> BoardView | None:
         return None
     try:
         found = whitebalance.measure(
-            _as_stack(value, image), calib.colorchecker(), ChartRequest("auto"), whitebalance.Settings()
+            _as_stack(value, image), shipped_data.colorchecker(), ChartRequest("auto"), whitebalance.Settings()
         )
     except ChartError:
         return None

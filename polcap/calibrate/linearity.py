@@ -3,8 +3,7 @@
 import numpy as np
 
 from polcap.calibrate.calibration_photographs import Photograph, by_setting, center
-from polcap.calibration_values import Linearity
-from polcap.images import Floats
+from polcap.images import Floats, Linearity
 
 _LEAST = 0.02  # of white; below, the error of black matters more than a curve
 

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.calibrate.calibration_photographs import CLIP, Photograph, by_setting
-from polcap.calibration_values import NoiseLine
 from polcap.errors import CaptureError
-from polcap.images import Floats, SensorImage
+from polcap.images import Floats, NoiseLine, SensorImage
 from polcap.optics import robust, sensor
 
 _TILE = 16  # px; within a tile the lens's falloff changes nothing

@@ -17,7 +17,7 @@ import numpy as np
 from polcap import __version__
 from polcap.doctor.finding import Finding, State
 from polcap.errors import PolcapError
-from polcap.formats import calib, onnx
+from polcap.formats import onnx, shipped_data
 from polcap.formats.raw import dng
 from polcap.formats.raw import libraw as raw
 from polcap.images import Exif
@@ -40,7 +40,7 @@ class Rig:
 
 def examine(rig: Rig, folder: Path) -> tuple[Finding, ...]:
     """Check everything on this machine; the disk is that of `folder`."""
-    model = next(iter(sorted(calib.data_path("colorchecker").parent.glob("models/polcap*.onnx"), reverse=True)), None)
+    model = next(reversed(shipped_data.model_files("polcap")), None)
     return (
         _libraries(),
         _decoder(),

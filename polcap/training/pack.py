@@ -20,7 +20,7 @@ import cv2
 
 import polcap
 from polcap.errors import InputError
-from polcap.formats import atomic, calib
+from polcap.formats import atomic, shipped_data
 from polcap.training import train
 
 LARGEST = 60_000_000  # bytes of a pack
@@ -94,7 +94,7 @@ def make(data: Path, out: Path, plan: Plan, start: Path | None = None, wheels: P
         )
         copied = Path("polcap", "_calib", "colorchecker")
         if not (beside / copied).exists():  # a checkout has them beside the package
-            shutil.copytree(calib.data_path("colorchecker"), beside / copied)
+            shutil.copytree(shipped_data.data_path("colorchecker"), beside / copied)
         for split in ("train", "test"):
             shutil.copytree(data / "meshes" / split, beside / "data" / "meshes" / split)
         for picture in sorted((data / "materials" / "train").glob("*/*.jpg")):
