@@ -169,7 +169,7 @@ def _color_checker(image: SensorImage) -> Board | None:
         return None
     try:
         found = whitebalance.measure(
-            _as_stack(value, image), calib.colorchecker(), ChartRequest("auto"), whitebalance.Settings()
+            _as_stack(value, image), calib.colorchecker(), ChartRequest("auto"), whitebalance.WhitebalanceSettings()
         )
     except ChartError:
         return None
