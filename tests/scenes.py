@@ -19,6 +19,7 @@ from polcap.images import (
     SelfCalibration,
     ShotOrder,
     View,
+    single_frames,
 )
 from polcap.optics import frames, mueller, shade
 from polcap.optics.warp import warp
@@ -96,8 +97,7 @@ def stack(
     return AngleStack(
         value=value.astype(np.float32), variance=variance.astype(np.float32),
         quality=np.zeros(value.shape[:3], np.uint8), angle=np.asarray(angles), view=VIEW,
-        exposure_ratio=np.ones((len(angles), 1, 3)), exif_ratio=np.ones((len(angles), 1)),
-        ghost_fraction=np.zeros(len(angles)), lossy=False, camera_matrix=None, white_balance=None,
+        bracket=single_frames(len(angles)),
     )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ import msgspec
 from polcap import report, resource_limits
 from polcap.config import Config, restored
 from polcap.errors import SettingError
-from polcap.formats import calib
+from polcap.formats import calibrations
 from polcap.formats.export import animation, provenance
 from polcap.formats.maps import maps_folder, png
 from polcap.images import Capture, ColorCalibration, Frame, SensorImage, Shot
@@ -81,7 +81,7 @@ def _facts(capture: Capture, supplied: UserInput, config: Config) -> dict[str, A
 def _write_profile(file: Path, color: ColorCalibration) -> None:
     """The color profile for other captures (`--chart FILE.toml`), where this one's chart was read."""
     if color.source in ("chart", "corners"):
-        calib.write_profile(file, color)
+        calibrations.write_profile(file, color)
     else:
         file.unlink(missing_ok=True)
 

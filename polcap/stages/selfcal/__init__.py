@@ -96,17 +96,17 @@ def solve(
 
     angle, found_sigma = radiance.angle, None
     if settings.unknown_angles:
-        well_known = greys is not None or radiance.light == "one exposure"
+        well_known = greys is not None or radiance.equipment.light == "one exposure"
         angle, found_sigma = _find_angles(rim, even, float(first.sigma.max()) if well_known else np.inf, settings)
         facing = object_gains.facing(shots.light, shots.inside, angle)
-    guessed = greys is None and radiance.light != "one exposure"
+    guessed = greys is None and radiance.equipment.light != "one exposure"
     order = angles.check_order(rim, angle, settings.order_margin, _GUESSED_ORDER if guessed else _SOLID_ORDER)
     if settings.check_order and not order.check.as_stated:
         raise CaptureError(_wrong_order(order, angle))
 
     ring = _ring(even, angle, first, object_.border > 0)
-    if radiance.light != "one exposure" or found_sigma is not None:  # etched angles are exact
-        ring = corrected(ring, radiance.ring_sigma if found_sigma is None else found_sigma, settings)
+    if radiance.equipment.light != "one exposure" or found_sigma is not None:  # etched angles are exact
+        ring = corrected(ring, radiance.equipment.ring_sigma if found_sigma is None else found_sigma, settings)
     angle = angle + ring.correction
 
     with_gains = replace(rim, light=rim.light * first.gain[:, None])
@@ -131,7 +131,7 @@ def solve(
 
 def _gains_without_angles(radiance: AngleStack, greys: GreyPatches | None, facing: GainEstimate) -> GainEstimate:
     """Gains (K,) that do not depend on the angles, which are still to be checked."""
-    if radiance.light == "one exposure":
+    if radiance.equipment.light == "one exposure":
         shots = len(radiance.angle)
         return GainEstimate(np.ones(shots), np.zeros(shots))
     if greys is not None:
@@ -144,7 +144,7 @@ def _gains(radiance: AngleStack, greys: GreyPatches | None, anchor: GainEstimate
     gain: Floats
     sigma: Floats
     source: Literal["grey patches", "object", "one exposure", "none"]
-    if radiance.light == "one exposure":
+    if radiance.equipment.light == "one exposure":
         gain, sigma, source = np.ones((len(anchor.gain), 3)), np.zeros((len(anchor.gain), 3)), "one exposure"
     elif greys is not None:
         gain, sigma, source = greys.gain, greys.sigma, "grey patches"
@@ -167,9 +167,9 @@ def _gains(radiance: AngleStack, greys: GreyPatches | None, anchor: GainEstimate
 
 def _prior(radiance: AngleStack) -> float:
     """1σ of a shot's light before anything is measured in this capture: of its kind of lamp, or as calibrated."""
-    if radiance.light == "flash" and radiance.flash_spread is not None:
-        return max(2**0.5 * radiance.flash_spread, _LEAST_PRIOR)  # of one pop against another
-    return _PRIOR[radiance.light]
+    if radiance.equipment.light == "flash" and radiance.equipment.flash_spread is not None:
+        return max(2**0.5 * radiance.equipment.flash_spread, _LEAST_PRIOR)  # of one pop against another
+    return _PRIOR[radiance.equipment.light]
 
 
 def _find_angles(rim: Rim, even: ObjectShots, gain_sigma: float, settings: SelfcalSettings) -> tuple[Floats, float]:

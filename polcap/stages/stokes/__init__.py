@@ -80,7 +80,7 @@ def solve(
     """
     analyzers = mueller.analyzer(calibration.angle)  # (K, 3)
     _check_condition(analyzers, calibration.angle - calibration.ring.correction)
-    lens = radiance.distortion if settings.undistort else None
+    lens = radiance.equipment.distortion if settings.undistort else None
     height, width = radiance.value.shape[1:3]
     crop = object_.crop if lens is None else distortion.box_of(lens, object_.crop, (width, height))
     x0, y0, x1, y1 = crop
@@ -151,8 +151,8 @@ def _solve_in_blocks(
             fitted = np.einsum("kj,jhwc->khwc", analyzers, solved)
             difference = np.abs(value - fitted).sum(3).mean(0)
             residual[rows] = difference / np.maximum(solved[0].sum(2), 1e-9)
-        if shots.radiance.extinction is not None:
-            _undilute(solved, doubt, shots.radiance.extinction)
+        if shots.radiance.equipment.extinction is not None:
+            _undilute(solved, doubt, shots.radiance.equipment.extinction)
         quality[rows] = _judged(solved, doubt, flagged, settings)
     return stokes, covariance, quality, residual
 
@@ -227,7 +227,7 @@ def _rows(picture: Floats) -> Floats:
 
 def _resampled(shots: _Shots, picture: Floats, transform: Floats, box: Box) -> Floats:
     """A shot (H, W, 3) on a box of the reference grid (h, w, 3): every channel where its photosites are."""
-    site_px = shots.radiance.site_px
+    site_px = shots.radiance.sensor.site_px
     if site_px is None or not site_px.any():
         return warp(picture, transform, box, lens=shots.lens)
     planes = [

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import CaptureError
-from polcap.images import ShotOrder
+from polcap.images import Equipment, ShotOrder
 from polcap.optics import mueller
 from polcap.optics.outline import Rim
 from polcap.stages import selfcal, stokes
@@ -107,7 +107,7 @@ def test_of_shots_that_explain_the_residual_alike_the_most_turned_counts():
 
 
 TRUE = np.radians([12.0, 51.0, 83.0, 118.0, 160.0])
-UNNOTED = replace(scenes.stack(angles=TRUE), angle=np.radians(np.arange(5.0)), light="one exposure")
+UNNOTED = replace(scenes.stack(angles=TRUE), angle=np.radians(np.arange(5.0)), equipment=Equipment("one exposure"))
 
 
 def test_five_angles_of_a_ball_are_found():
@@ -133,8 +133,9 @@ def test_five_angles_of_a_ball_are_found():
 )
 def test_unknown_angles_that_cannot_be_found_are_refused(shots, light, most_deg, message):
     parts = {name: getattr(UNNOTED, name)[:shots] for name in ("value", "variance", "quality", "angle")}
+    radiance = replace(UNNOTED, equipment=Equipment(light), **parts)
     with pytest.raises(CaptureError, match=message):
-        solve(replace(UNNOTED, light=light, **parts), unknown_angles=True, max_unknown_sigma_deg=most_deg)
+        solve(radiance, unknown_angles=True, max_unknown_sigma_deg=most_deg)
 
 
 def test_without_an_outline_angles_stay_unknown():

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from polcap.config import Config
+from polcap.images import Equipment
 from polcap.stages import selfcal
 from polcap.stages.selfcal.object_gains import GainEstimate, with_prior
 from tests import scenes
@@ -23,7 +24,7 @@ def test_without_a_chart_the_gains_come_from_the_object():
 
 
 def test_one_exposure_has_one_gain():
-    found = solve(replace(scenes.stack(gain=GAIN), light="one exposure"))
+    found = solve(replace(scenes.stack(gain=GAIN), equipment=Equipment("one exposure")))
     assert found.source == "one exposure"
     assert (found.gain == 1).all() and (found.sigma == 0).all()
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from polcap.images import Floats, RingZero
+from polcap.images import Equipment, Floats, RingZero
 from polcap.stages import selfcal, stokes
 from polcap.stages.selfcal import ring_zero
 from tests import scenes
@@ -100,6 +100,6 @@ def test_a_turn_is_corrected_only_where_asked_and_certain():
     radiance = scenes.stack(noise=0.002, angles=ANGLES + 3 * DEG)
     misset = replace(radiance, angle=ANGLES)
     assert solve(misset, correct_ring=False).ring.correction == 0
-    assert solve(replace(misset, light="one exposure")).ring.correction == 0
+    assert solve(replace(misset, equipment=Equipment("one exposure"))).ring.correction == 0
     cut = replace(scenes.ball_object(), border=0.1)  # no closed outline: the slopes alone give the turn
     assert solve(misset, cut).ring.correction == pytest.approx(3 * DEG, abs=0.3 * DEG)
