@@ -81,7 +81,7 @@ def chart_request(text: str | None, no_chart: bool) -> "ChartRequest":
     """--chart and --no-chart: corners in RAW px, a color profile, the camera's own colors, or what is found."""
     import numpy as np
 
-    from polcap.formats import calib
+    from polcap.formats import calibrations
     from polcap.images import ChartRequest
 
     if text is None:
@@ -89,7 +89,7 @@ def chart_request(text: str | None, no_chart: bool) -> "ChartRequest":
     if no_chart:
         raise SettingError("--chart and --no-chart exclude each other; leave one out")
     if Path(text).suffix == ".toml":
-        return ChartRequest("profile", profile=calib.read_profile(Path(text)))
+        return ChartRequest("profile", profile=calibrations.read_profile(Path(text)))
     corners = numbers("--chart", text)
     if len(corners) != 8:
         raise SettingError(f"--chart gives {len(corners)} numbers; four corners have 8, a profile ends in .toml")

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from polcap.errors import ModelError, SettingError
-from polcap.formats import calib, onnx
+from polcap.formats import onnx, shipped_data
 from polcap.images import Network
 from polcap.stages.infer import fine
 from polcap.stages.mask import mask_channels
@@ -59,5 +59,5 @@ def shipped() -> tuple[Network | None, Network | None]:
 
 def _newest(name: str) -> Path | None:
     """The newest shipped model of a name."""
-    files = sorted(calib.data_path("colorchecker").parent.glob(f"models/{name}*.onnx"))
+    files = shipped_data.model_files(name)
     return files[-1] if files else None

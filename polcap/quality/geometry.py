@@ -3,7 +3,7 @@
 import numpy as np
 
 from polcap.config import Config, Gates
-from polcap.formats import calib
+from polcap.formats import shipped_data
 from polcap.images import Floats, Mesh, SurfaceMaps
 from polcap.optics.sharpness import TILE
 from polcap.quality.gate import Evidence, Gate, State, Unit, at_most, blamed
@@ -99,7 +99,7 @@ def mask(found: Evidence, limits: Gates) -> Gate:
 
 
 def _charted(found: Evidence) -> float:
-    return float(chart_in_mask.share(found.radiance, found.object_.mask, calib.colorchecker()))
+    return float(chart_in_mask.share(found.radiance, found.object_.mask, shipped_data.colorchecker()))
 
 
 def mesh(of: Mesh, limits: Gates) -> Gate:

@@ -10,7 +10,7 @@ import pytest
 
 from polcap.config import Config
 from polcap.errors import CaptureError, ChartError
-from polcap.formats import calib
+from polcap.formats import shipped_data
 from polcap.formats.capture import reader as captures
 from polcap.formats.raw import dng, probe
 from polcap.formats.raw import libraw as raw
@@ -73,7 +73,7 @@ def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path) -> N
     line = next(line for line in found.lines if line.name == "chart")
     assert line.state == "warn" and found.needs == "--no-chart" and "--no-chart" in line.remedy
     with pytest.raises(ChartError):
-        whitebalance.measure(hdr.merge(capture, Config().hdr), calib.colorchecker(), AUTO, Config().whitebalance)
+        whitebalance.measure(hdr.merge(capture, Config().hdr), shipped_data.colorchecker(), AUTO, Config().whitebalance)
     asked = check.inspect(capture, without_networks, Config(), chart=ChartRequest("none"))
     assert asked.needs == "" and next(line for line in asked.lines if line.name == "chart").state == "not measured"
 

@@ -23,10 +23,10 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from polcap.calibration_values import Calibration
 from polcap.errors import CaptureError
 from polcap.images import (
     AngleStack,
+    Calibration,
     Capture,
     CrossedShot,
     Distortion,

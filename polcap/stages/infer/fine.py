@@ -17,6 +17,7 @@ from polcap import parallel
 from polcap.errors import ModelError
 from polcap.images import Cues, Floats, Network
 from polcap.optics import frames
+from polcap.optics.resize import area_mean
 from polcap.stages import cues as seen
 
 ENCODING = "fine 1"
@@ -79,11 +80,10 @@ def refined(cues: Cues, guess: Guess, network: Network) -> Floats:
 def finer(image: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:
     """An image (H, W, 3) without what is coarser than COARSEST, 0 outside the mask."""
     height, width = mask.shape
-    size = (max(1, round(width / shrink)), max(1, round(height / shrink)))
+    small = max(1, round(height / shrink)), max(1, round(width / shrink))
     inside = mask.astype(np.float32)
     coarse, share = (
-        cv2.GaussianBlur(cv2.resize(part, size, interpolation=cv2.INTER_AREA), (0, 0), COARSEST)
-        for part in (image * inside[..., None], inside)
+        cv2.GaussianBlur(area_mean(part, small), (0, 0), COARSEST) for part in (image * inside[..., None], inside)
     )
     back = cv2.resize(coarse / np.maximum(share, 1e-3)[..., None], (width, height))
     return np.asarray((image - back) * inside[..., None])

@@ -14,6 +14,7 @@ from polcap import parallel
 from polcap.errors import ModelError
 from polcap.images import Cues, Floats, Network, Quality, SurfaceMaps
 from polcap.optics import frames
+from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stages.cues import CHANNELS, FLOOR
 from polcap.stages.infer import analytic, augmentation, fine
 from polcap.stages.infer.analytic import REACHED, fill_highlights
@@ -150,10 +151,10 @@ def _detailed(coarse: Floats, by_pixel: Floats, mask: NDArray[np.bool_], shrink:
     Interreflection, index and half-turns bend the inversion's normals over whole regions; relief is finer.
     """
     height, width = mask.shape
-    size = (round(width / shrink), round(height / shrink))
+    small = round(height / shrink), round(width / shrink)
     inside = mask.astype(np.float32)
     difference, share = (
-        cv2.GaussianBlur(cv2.resize(image, size, interpolation=cv2.INTER_AREA), (0, 0), _DETAIL)
+        cv2.GaussianBlur(area_mean(image, small), (0, 0), _DETAIL)
         for image in ((coarse - by_pixel).astype(np.float32) * inside[..., None], inside)
     )
     moved = by_pixel + cv2.resize(difference / np.maximum(share, 1e-3)[..., None], (width, height))
@@ -190,18 +191,13 @@ def _resized(cues: Cues, scale: float) -> Cues:
     if scale >= 1.0:
         return cues
     height, width = cues.mask.shape
-    size = (max(16, round(width * scale)), max(16, round(height * scale)))
-
-    def mean(image: Floats) -> Floats:
-        return np.asarray(cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA))
-
+    small = max(16, round(height * scale)), max(16, round(width * scale))
     light = np.maximum(frames.total(cues.radiance), 1e-6) * cues.mask
-    weight = np.maximum(mean(light), 1e-9)
-    ratio = np.stack([mean(r * light) / weight for r in cues.ratio])
-    sigma = mean(cues.ratio_sigma * light) / weight * min(1.0, scale * np.sqrt(width / size[0] * scale))
-    share = mean(cues.mask.astype(np.float32))
-    mask = share > 0.5
-    radiance = mean(cues.radiance * cues.mask[..., None]) / np.maximum(share, 1e-3)[..., None]
+    ratio = np.stack([weighted_area_mean(r, light, small) for r in cues.ratio])
+    averaging = min(1.0, scale * np.sqrt(width / small[1] * scale))
+    sigma = weighted_area_mean(cues.ratio_sigma, light, small) * averaging
+    mask = area_mean(cues.mask, small) > 0.5
+    radiance = weighted_area_mean(cues.radiance, cues.mask, small)
     squared = ratio[0] ** 2 + ratio[1] ** 2
     view = replace(
         cues.view,
@@ -209,7 +205,7 @@ def _resized(cues: Cues, scale: float) -> Cues:
         center=((cues.view.center[0] + 0.5) * scale - 0.5, (cues.view.center[1] + 0.5) * scale - 0.5),
         scale=cues.view.scale / scale,
     )
-    clipped = mean((cues.quality & Quality.CLIPPED).astype(np.float32)) > 0.5 * Quality.CLIPPED
+    clipped = area_mean((cues.quality & Quality.CLIPPED) > 0, small) > 0.5
     return replace(
         cues,
         radiance=radiance,
@@ -217,7 +213,7 @@ def _resized(cues: Cues, scale: float) -> Cues:
         ratio_sigma=sigma,
         dolp=np.sqrt(np.clip(squared - sigma**2, 0, 1)),
         normalized_stokes=ratio / np.sqrt(squared + 1e-12),
-        diffuse_color=mean(cues.diffuse_color),
+        diffuse_color=area_mean(cues.diffuse_color.astype(np.float32), small),
         rays=frames.rays(view, *mask.shape),
         mask=mask,
         quality=np.where(clipped, np.uint8(Quality.CLIPPED), np.uint8(0)),

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from polcap import parallel
 from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Network
 from polcap.optics import mueller
+from polcap.optics.resize import area_mean
 from polcap.optics.warp import warp
 from polcap.stages.mask.mask_channels import SIZE_MULTIPLE, Look, brightness, encode, mirrored
 
@@ -51,7 +52,7 @@ def chances(
             break
         x0, y0, x1, y1 = box
         seen = look(radiance, alignment, color, chart, box, _FINE)
-        hint = _area(out[y0:y1, x0:x1], seen.chart.shape)
+        hint = area_mean(out[y0:y1, x0:x1], seen.chart.shape)
         out = np.minimum(out, _LIKELY)  # of what lies beyond the box
         out[y0:y1, x0:x1] = _resized(_run(network, encode(seen, bright, hint)), box)
     return out
@@ -81,7 +82,7 @@ def look(
     there = np.array([[sx, 0, x0 + (sx - 1) / 2], [0, sy, y0 + (sy - 1) / 2], [0, 0, 1]])  # reduced px → grid px
     shots = []
     for value, transform in zip(radiance.value, alignment.transform):
-        small = _area(value[y0:y1, x0:x1], (height, width))
+        small = area_mean(value[y0:y1, x0:x1], (height, width))
         shots.append(warp(small, np.linalg.inv(there) @ transform @ there, order=1))
     solve = np.linalg.pinv(mueller.analyzer(np.asarray(radiance.angle, np.float64)))  # (3, K)
     stokes = np.einsum("sk,khwc->shwc", solve, np.stack(shots)).astype(np.float32)
@@ -90,7 +91,7 @@ def look(
     full_h, full_w = chart.shape
     x = 2 * (sx * (np.arange(width) + 0.5) + x0) / full_w - 1
     y = 2 * (sy * (np.arange(height) + 0.5) + y0) / full_h - 1
-    on_chart = _area(chart[y0:y1, x0:x1].astype(np.float32), (height, width)) > 0.5
+    on_chart = area_mean(chart[y0:y1, x0:x1].astype(np.float32), (height, width)) > 0.5
     return Look(seen, sums, on_chart, np.stack(np.meshgrid(x, y)).astype(np.float32))
 
 
@@ -128,9 +129,3 @@ def _logit(network: Network, channels: Floats, axes: tuple[int, ...]) -> Floats:
 def _resized(image: Floats, box: Box) -> Floats:
     x0, y0, x1, y1 = box
     return np.asarray(cv2.resize(image, (x1 - x0, y1 - y0), interpolation=cv2.INTER_LINEAR))
-
-
-def _area(image: Floats, size: tuple[int, int]) -> Floats:
-    """Averaged down to (H, W)."""
-    kind = cv2.INTER_AREA if size[0] < image.shape[0] else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(np.asarray(image, np.float32), (size[1], size[0]), interpolation=kind))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from polcap.errors import ObjectError
 from polcap.images import Floats
+from polcap.optics.resize import area_mean
 from polcap.optics.robust import MAD_TO_SIGMA
 
 _STANDS_OUT = (0.8, 1.6)  # stops above the backdrop that make an object, however even or uneven that is
@@ -69,7 +70,7 @@ def sharpened(picture: Floats, mask: NDArray[np.bool_], chart: NDArray[np.uint8]
     small, outside = _reduced(picture, chart)
     size = small.shape[1::-1]
     seed = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    cut = _graph_cut(small, seed, outside, cv2.resize(chance, size, interpolation=cv2.INTER_AREA))
+    cut = _graph_cut(small, seed, outside, area_mean(chance, small.shape))
     return _enlarged(cut.astype(np.float32), chart)
 
 
@@ -78,8 +79,8 @@ def _reduced(picture: Floats, chart: NDArray[np.uint8]) -> tuple[Floats, NDArray
     height, width = chart.shape
     shrink = max(1.0, float(np.sqrt(height * width / _WORK_PIXELS)))
     size = (round(width / shrink), round(height / shrink))
-    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(small), cv2.resize(chart, size, interpolation=cv2.INTER_NEAREST) > 0
+    small = area_mean(picture, size[::-1])
+    return small, cv2.resize(chart, size, interpolation=cv2.INTER_NEAREST) > 0
 
 
 def _enlarged(cut: Floats, chart: NDArray[np.uint8]) -> NDArray[np.bool_]:

@@ -5,11 +5,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from polcap.formats import calib
+from polcap.formats import shipped_data
 from polcap.images import AngleStack, ChartRequest, Floats, Quality, View
 from polcap.stages.whitebalance import chart
 
-CLASSIC = calib.colorchecker()
+CLASSIC = shipped_data.colorchecker()
 CAMERA = np.array([[0.28, 0.10, 0.07], [0.08, 0.71, 0.22], [0.02, 0.18, 0.66]])  # linear Rec.709 → S0 in camera
 WIDTH, HEIGHT = 480, 360
 AUTO = ChartRequest("auto")

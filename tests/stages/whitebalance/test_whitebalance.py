@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import ChartError
-from polcap.formats import calib
+from polcap.formats import shipped_data
 from polcap.images import ChartReference, ChartRequest, ColorCalibration, Floats, View
 from polcap.stages import whitebalance
 from polcap.stages.whitebalance import Settings, chart, chart_in_mask, patches
@@ -171,7 +171,7 @@ def test_left_out_patch_is_predicted_about_as_well_as_noise_lets():
 
 
 def test_block_of_an_sg_chart_is_read_at_its_corners_and_only_there():
-    sg, place = calib.colorchecker("sg"), pose(24, 8, (260, 170))
+    sg, place = shipped_data.colorchecker("sg"), pose(24, 8, (260, 170))
     image = photograph(place, sg.rec709)
     exact = chart.Placement(place, 0.87, 0.01, 1.0).corners()
     request = ChartRequest("corners", corners=2 * exact + 0.5)
