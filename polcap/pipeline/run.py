@@ -56,17 +56,7 @@ def process(
             if until is not None:
                 return None
             cache.begin("write")
-            about, _ = parallel.both(  # encoders leave a core idle at the end
-                partial(report.document, facts, results, config, timings(out)),
-                partial(
-                    maps_folder.write, out / "maps", results.maps, results.mesh, results.stokes, results.cues
-                ),
-            )
-            parallel.both(
-                partial(asset_export.write, out, about, ExportRequest(), results.asset),
-                partial(report.write, out, about, results),
-            )
-            _write_profile(out / PROFILE, results.color)
+            about = _write(out, results, facts, config)
             cache.end()
             return about
     except Exception as error:
@@ -83,6 +73,23 @@ def _facts(capture: Capture, supplied: UserInput, config: Config) -> dict[str, A
         "model": report.model_facts(supplied.network),
         "versions": provenance.versions(),
     }
+
+
+def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -> dict[str, Any]:
+    """Write maps, asset, color profile and report; returns report.json's content.
+
+    Files are encoded while figures are measured and the page is drawn: encoders alone do not fill two cores.
+    """
+    about, _ = parallel.both(
+        partial(report.document, facts, results, config, timings(out)),
+        partial(maps_folder.write, out / "maps", results.maps, results.mesh, results.stokes, results.cues),
+    )
+    parallel.both(
+        partial(report.write, out, about, results),
+        partial(asset_export.write, out, about, ExportRequest(), results.asset),
+    )
+    _write_profile(out / PROFILE, results.color)
+    return about
 
 
 def _write_profile(file: Path, color: ColorCalibration) -> None:
