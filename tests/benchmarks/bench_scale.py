@@ -23,8 +23,8 @@ from polcap.formats import shipped_data
 from polcap.images import AngleStack, ChartRequest, GBuffer, StokesImage, View, single_frames
 from polcap.optics import point_light
 from polcap.stages import whitebalance
-from polcap.stages.whitebalance import WhitebalanceSettings
 from polcap.stages.cues import scale
+from polcap.stages.whitebalance import WhitebalanceSettings
 from polcap.synth import color_checker, render
 from polcap.synth.render import Scene
 from polcap.synth.scenes import random_scene

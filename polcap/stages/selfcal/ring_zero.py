@@ -9,7 +9,7 @@ depths, so the spread over depths gives the error (decision 26).
 
 Inside, Im(w_ζ² w*) = 0 (`integrability`) holds for one common turn of the angles only: an error δ turns w_ζ² w* by 2δ
 at every pixel. Contours, edges and highlights are outliers. Neither outline nor symmetry is needed. The gains, which
-act where a surface faces the camera, are solved for as well, held by their own error (decision 42).
+act where a surface faces the camera, are solved for as well, held by their own error (decision 26).
 """
 
 from functools import partial
@@ -45,7 +45,7 @@ _ROUNDS = 12
 _SETTLED = 1e-5  # change that ends them
 _MOST_STEP = 0.1  # rad, and of a gain, in one go
 _CORRELATED = 2 * np.pi * integrability.BLUR**2  # px that share their noise
-_SLOPES_FLOOR = np.radians(0.1)  # 1σ where all parts agree (decision 42)
+_SLOPES_FLOOR = np.radians(0.1)  # 1σ where all parts agree (decision 26)
 
 
 def combined(one: RingZero, other: RingZero) -> RingZero:
