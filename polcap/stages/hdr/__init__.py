@@ -29,6 +29,7 @@ from polcap.images import (
     Calibration,
     Capture,
     CrossedShot,
+    Decode,
     Distortion,
     Floats,
     Frame,
@@ -65,7 +66,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @stage(version=10)
-def merge(capture: Capture, settings: Settings) -> AngleStack:
+def merge(capture: Capture, decode: Decode, settings: Settings) -> AngleStack:
     """Radiance of every shot on the scale of its reference frame.
 
     The reference frame is the one of middle brightness in the first shot, and of the same index in every
@@ -80,7 +81,7 @@ def merge(capture: Capture, settings: Settings) -> AngleStack:
     shots = capture.shots
     _check(shots)
     brackets = (*shots, *(() if capture.crossed is None else (capture.crossed,)))
-    read = Reader(frame for shot in brackets for frame in (*shot.frames, *shot.ambient))
+    read = Reader((frame for shot in brackets for frame in (*shot.frames, *shot.ambient)), decode)
     try:
         return _merge(capture, read, settings)
     finally:
