@@ -78,7 +78,7 @@ class Replies(serial_port.Port):
     """A serial port whose answers are written beforehand."""
 
     def __init__(self, data: bytes) -> None:
-        self.url = "fuzz://"
+        self.url, self.log = "fuzz://", Log(None)
         self._lines = [line for line in data.split(b"\n") if line.strip()]  # as Port, which skips empty ones
 
     def send(self, text: str, discard: bool = True) -> None: ...
@@ -180,19 +180,19 @@ def _name(data: bytes, folder: Path) -> object:
 
 
 def _elliptec(data: bytes, folder: Path) -> object:
-    motor = motor_elliptec_ell14.ElliptecMotor(Replies(data), motor_elliptec_ell14.ElliptecSettings(), 0.05, Log(None))
+    motor = motor_elliptec_ell14.ElliptecMotor(Replies(data), motor_elliptec_ell14.ElliptecSettings(), 0.05)
     motor.home()
     return motor.position()
 
 
 def _grbl(data: bytes, folder: Path) -> object:
-    board = motor_grbl.GrblMotor(Replies(data), motor_grbl.GrblSettings(), 0.05, Log(None))
+    board = motor_grbl.GrblMotor(Replies(data), motor_grbl.GrblSettings(), 0.05)
     board.home()
     return board.position()
 
 
 def _line(data: bytes, folder: Path) -> object:
-    board = motor_line_protocol.LineMotor(Replies(data), motor_line_protocol.LineSettings(), 0.05, Log(None))
+    board = motor_line_protocol.LineMotor(Replies(data), motor_line_protocol.LineSettings(), 0.05)
     board.home()
     return board.position()
 
