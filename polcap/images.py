@@ -14,8 +14,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.calibration_values import Calibration
-
 Floats = NDArray[np.floating[Any]]
 Bits = NDArray[np.uint8]
 Role = Literal["shot", "ambient", "repeat", "chart", "cross"]
@@ -86,6 +84,119 @@ class SensorImage:
         side = self.superpixel
         square = self.cfa[:side, :side]
         return np.array([(np.argwhere(square == color).mean(axis=0)[::-1] + 0.5) / side - 0.5 for color in range(3)])
+
+
+@dataclass(frozen=True)
+class NoiseLine:
+    """Noise of a sensor at one ISO: variance of a merged picture's pixel = slope · signal + floor, white = 1."""
+
+    iso: float
+    slope: tuple[float, ...]  # (C,)
+    slope_sigma: tuple[float, ...]
+    floor: tuple[float, ...]  # (C,)
+    floor_sigma: tuple[float, ...]
+    electrons_at_white: tuple[float, ...]  # (C,) of one photosite
+    read_noise_electrons: tuple[float, ...]  # (C,) 1σ of one photosite
+    read_noise_sigma: tuple[float, ...] = ()  # (C,) e⁻, 1σ of that figure, upwards
+    source: str = "flat frames"  # or "bracket"
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Black and white of a sensor, counts."""
+
+    black: tuple[float, ...]  # of the mosaic's phases, row by row
+    black_sigma: tuple[float, ...]
+    black_stated: tuple[float, ...]  # the maker's tags
+    white_stated: float  # the maker's tags
+    white: float | None = None  # where frames saturate; None where none did
+
+
+@dataclass(frozen=True)
+class Linearity:
+    """Signal against exposure time."""
+
+    greatest_deviation: float  # from proportional, relative
+    power: float  # of the exposure time that the signal follows; 1 is linear
+    power_sigma: float
+    darkest: float  # of white
+    brightest: float
+    exposures: int
+
+
+@dataclass(frozen=True)
+class Falloff:
+    """Light of a lens towards the corners: 1 + a r² + b r⁴ + c r⁶, r = 1 in the corners."""
+
+    coefficient: tuple[tuple[float, float, float], ...]  # (C, 3)
+    sigma: tuple[tuple[float, float, float], ...]
+    corner: tuple[float, ...]  # (C,) light there
+    f_number: float | None = None  # of the photographs; the falloff holds at this aperture and focal length
+    focal_length_mm: float | None = None
+
+
+@dataclass(frozen=True)
+class LensGeometry:
+    """A pinhole camera with distortion: a point at x appears at x (1 + k1 r² + k2 r⁴).
+
+    x and r from the principal point in focal lengths.
+    """
+
+    focal_px: float  # visible RAW px
+    focal_sigma_px: float
+    principal_px: tuple[float, float]  # visible RAW px
+    principal_sigma_px: float  # 0: assumed in the picture's middle
+    k1: float
+    k1_sigma: float
+    k2: float
+    k2_sigma: float
+    size_px: tuple[int, int]  # width, height, visible RAW px
+    residual_px: float  # rms of the corners, RAW px
+    pinhole_residual_px: float  # the same without k1 and k2
+    photographs: int
+    board: str
+    focal_length_mm: float | None = None  # of the photographs; the geometry holds there
+
+
+@dataclass(frozen=True)
+class Polarizer:
+    """A filter on its ring: its axis is sense · stated + zero, from image x towards image up."""
+
+    zero_deg: float
+    zero_sigma_deg: float
+    sense: int  # 1: the ring counts like the picture; −1: the other way
+    sense_known: bool  # False: assumed, for light of one axis cannot tell
+    extinction: tuple[float, ...]  # (C,) greatest over least transmittance
+    extinction_sigma: tuple[float, ...]
+    frames: int
+
+
+@dataclass(frozen=True)
+class FlashEnergy:
+    """Energy of a flash from pop to pop, relative to its mean."""
+
+    spread: float  # 1σ
+    spread_sigma: float
+    drift_per_pop: float
+    drift_sigma: float
+    pops: int
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The measurements of `polcap calibrate` for one camera, lens and filter, each with its 1σ; C channels, or 1."""
+
+    made: str  # ISO 8601
+    camera: str  # make and model
+    lens: str
+    filter: str  # the polarizer's name, as the user gave it
+    noise: tuple[NoiseLine, ...] = ()
+    levels: Levels | None = None
+    linearity: Linearity | None = None
+    falloff: Falloff | None = None
+    geometry: LensGeometry | None = None
+    polarizer: Polarizer | None = None
+    flash: FlashEnergy | None = None
 
 
 @dataclass(frozen=True)
@@ -190,6 +301,39 @@ class CrossedShot:
 
 
 @dataclass(frozen=True)
+class BracketMeasurement:
+    """What the frames of each bracket showed when they were compared; NaN where it is unknown."""
+
+    exposure_ratio: Floats  # (K, E, 3) of every frame to its shot's reference frame, from pixels
+    exif_ratio: Floats  # (K, E) the same by the metadata
+    curvature: Floats  # (K, E) of each frame's tone against the reference's; 0: linear
+    ghost_fraction: Floats  # (K,) share of pixels whose exposures disagree beyond noise
+    ambient_share: Floats  # (K,) of all light, present without the flash
+    blur_px: Floats  # (K, E) beyond the sharpest frame of the same exposure, 1σ [RAW px]
+
+
+@dataclass(frozen=True)
+class ColorSensor:
+    """The sensor by the files of a capture."""
+
+    camera_matrix: Floats | None = None  # (3, 3) camera → linear Rec.709, white balanced as shot; None if unknown
+    white_balance: Floats | None = None  # (3,) multipliers as shot
+    site_px: Floats | None = None  # (3, 2) x, y of this grid: where in a pixel each channel was seen; None: 0
+    lossy: bool = False  # a source was 8-bit or display-encoded
+
+
+@dataclass(frozen=True)
+class Equipment:
+    """Light, lens and polarizer of a capture, as metadata and calibration know them."""
+
+    light: Literal["flash", "steady", "one exposure", "unknown"] = "unknown"  # of the shots; one: a polarizer mosaic
+    flash_spread: float | None = None  # 1σ of the flash's energy from pop to pop, calibrated
+    extinction: Floats | None = None  # (3,) or (1,) extinction ratio of the polarizer, calibrated; None: ideal
+    ring_sigma: float | None = None  # rad, 1σ of the ring's zero as calibrated; None: set by eye
+    distortion: Distortion | None = None  # of the lens, calibrated, on this grid; None: a pinhole, as far as is known
+
+
+@dataclass(frozen=True)
 class AngleStack:
     """The merged shots of a capture in camera channels, not yet registered."""
 
@@ -198,27 +342,21 @@ class AngleStack:
     quality: Bits  # (K, H, W)
     angle: Floats  # (K,) rad
     view: View
-    exposure_ratio: Floats  # (K, E, 3) of every frame to the shot's reference frame, estimated from pixels
-    exif_ratio: Floats  # (K, E) the same as the metadata tell it; NaN where they do not
-    ghost_fraction: Floats  # (K,) share of pixels whose exposures disagree beyond noise
-    lossy: bool  # a source was 8-bit or display-encoded
-    camera_matrix: Floats | None  # (3, 3) camera → linear Rec.709, white balanced as shot; None if unknown
-    white_balance: Floats | None  # (3,) multipliers as shot
-    light: Literal["flash", "steady", "one exposure", "unknown"] = "unknown"  # of the shots; one: a polarizer mosaic
+    bracket: BracketMeasurement
+    sensor: ColorSensor = ColorSensor()
+    equipment: Equipment = Equipment()
     offset_px: Floats | None = None  # (K, 2) x, y of this grid, exactly known: reference px − offset = shot px
-    site_px: Floats | None = None  # (3, 2) x, y of this grid: where in a pixel each channel was seen; None: 0
-    curvature: Floats | None = None  # (K, E) of each frame's tone against the reference's; 0: linear, NaN: unknown
-    ambient_share: Floats | None = None  # (K,) of all light, there without the flash; NaN where not photographed
-    extinction: Floats | None = None  # (3,) or (1,) extinction ratio of the polarizer, calibrated; None: ideal
-    flash_spread: float | None = None  # 1σ of the flash's energy from pop to pop, calibrated
-    ring_sigma: float | None = None  # rad, 1σ of the ring's zero as calibrated; None: set by eye
-    blur_px: Floats | None = None  # (K, E) beyond the sharpest frame of the same exposure, 1σ [RAW px]; NaN: unknown
     crossed: CrossedShot | None = None  # where one was taken
-    distortion: Distortion | None = None  # of the lens, calibrated, on this grid; None: a pinhole, as far as is known
 
     def shot(self, k: int) -> MaskedImage:
         """One of the shots, (H, W, 3)."""
         return MaskedImage(self.value[k], self.variance[k], self.quality[k])
+
+
+def single_frames(shots: int) -> BracketMeasurement:
+    """Brackets of one frame each, which leave nothing to compare."""
+    each, unknown = np.ones((shots, 1)), np.full((shots, 1), np.nan)
+    return BracketMeasurement(np.ones((shots, 1, 3)), each, unknown, np.zeros(shots), unknown[:, 0], unknown)
 
 
 @dataclass(frozen=True)

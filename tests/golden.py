@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap import Config, images, read_capture
-from polcap.formats import calib
+from polcap.formats import shipped_data
 from polcap.images import View
 from polcap.optics import frames
 from polcap.pipeline import models
@@ -194,14 +194,9 @@ def radiance() -> images.AngleStack:
         quality=np.stack(clipped).astype(np.uint8) * np.uint8(images.Quality.CLIPPED),
         angle=capture.angle,
         view=VIEW,
-        exposure_ratio=np.ones((shots, 1, 3)),
-        exif_ratio=np.ones((shots, 1)),
-        ghost_fraction=np.zeros(shots),
-        lossy=False,
-        camera_matrix=photographs[0].camera_matrix,
-        white_balance=photographs[0].white_balance,
-        light="flash",
-        site_px=photographs[0].site_px,
+        bracket=images.single_frames(shots),
+        sensor=images.ColorSensor(photographs[0].camera_matrix, photographs[0].white_balance, photographs[0].site_px),
+        equipment=images.Equipment("flash"),
     )
 
 
@@ -234,7 +229,7 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
         return hdr.merge(read_capture(CAPTURE), config.hdr)
 
     def measure() -> Any:
-        chart = calib.colorchecker(config.whitebalance.chart)
+        chart = shipped_data.colorchecker(config.whitebalance.chart)
         return whitebalance.measure(shots(), chart, images.ChartRequest("auto"), config.whitebalance)
 
     def register() -> Any:
@@ -400,7 +395,7 @@ def file_of(name: str) -> Path:
 def make_inputs() -> Arrays:
     """Inputs of the later stages, by the stages before them."""
     config, shots = Config(), radiance()
-    chart = calib.colorchecker(config.whitebalance.chart)
+    chart = shipped_data.colorchecker(config.whitebalance.chart)
     color = whitebalance.measure(shots, chart, images.ChartRequest("auto"), config.whitebalance)
     registered = align.register(shots, color, config.align)
     object_ = mask.segment(shots, registered, color, None, models.load_mask_network(1), config.mask)

@@ -51,14 +51,14 @@ def test_ports_and_cameras_tell_who_answers(tmp_path: Path) -> None:
     assert found["/dev/ttyUSB0"] == Finding("/dev/ttyUSB0", "ok", "FT230X: Elliptec ELL14")
     assert found["/dev/ttyUSB1"].state == found["/dev/ttyACM0"].state == "warning"
     assert "dialout" in found["/dev/ttyACM0"].remedy
-    assert found["camera"].says == "Nikon Z6 at usb:001,004"
+    assert found["camera"].message == "Nikon Z6 at usb:001,004"
 
 
 def test_no_port_is_written_to_without_leave(tmp_path: Path) -> None:
     rig = Rig(lambda: [("/dev/ttyS0", "a CNC mill")], lambda ports: False, lambda url: pytest.fail("written"), list)
     found = named(doctor.examine(rig, tmp_path))["/dev/ttyS0"]
     assert found == Finding(
-        "/dev/ttyS0", "ok", "a CNC mill: not asked", "`polcap doctor --ports` writes to it to learn"
+        "/dev/ttyS0", "ok", "a CNC mill: not asked", "`polcap doctor --ports` asks, and writes to it"
     )
 
 

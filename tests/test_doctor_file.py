@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polcap import doctor
 from polcap.doctor.finding import Finding
+from polcap.doctor.photograph import examine_file
 from polcap.formats.maps import png
 from polcap.formats.raw import dng
 from polcap.formats.raw import libraw as raw
@@ -15,13 +15,13 @@ from tests.conftest import Command
 
 
 def told(file: Path) -> dict[str, Finding]:
-    return {one.name: one for one in doctor.examine_file(file)}
+    return {one.name: one for one in examine_file(file)}
 
 
 def test_a_sound_raw_is_ok_throughout(example: Path) -> None:
     found = told(sorted(example.rglob("*.DNG"))[0])
     assert {one.state for one in found.values()} == {"ok"}
-    assert found["pattern"].says.startswith("Bayer")
+    assert found["pattern"].message.startswith("Bayer")
 
 
 def test_a_cut_file_and_a_text_are_faults(example: Path, tmp_path: Path) -> None:
@@ -45,7 +45,7 @@ def test_an_over_exposed_frame_and_a_monochrome_one_are_told(tmp_path: Path) -> 
     )
     assert told(tmp_path / "white.dng")["levels"].state == "warning"
     png.write(tmp_path / "grey.png", np.tile(np.arange(64, dtype=np.uint16) * 900, (64, 1))[..., None].repeat(3, 2))
-    assert "monochrome" in told(tmp_path / "grey.png")["pattern"].says
+    assert "monochrome" in told(tmp_path / "grey.png")["pattern"].message
 
 
 @pytest.mark.parametrize(("shape", "name"), [((6, 6), "6×6"), (None, "Foveon"), ((4, 4), "4×4")])

@@ -1,19 +1,18 @@
-"""In: flat frames. Out: how a lens's light falls off towards the corners, 1 in the middle.
+"""Light falloff of a lens towards the corners, from flat frames; 1 in the middle.
 
-The surface is never lit quite evenly: a linear slope of its light is fitted beside the lens's radial law and left out.
+The surface is never lit quite evenly: a linear slope of its light is fitted together with the radial falloff.
 """
 
 import cv2
 import numpy as np
 
-from polcap.calibrate.photographs import CLIP, Photograph, by_setting
-from polcap.calibration_values import Falloff
+from polcap.calibrate.calibration_photographs import CLIP, Photograph, by_setting
 from polcap.errors import CaptureError
-from polcap.images import Floats
+from polcap.images import Falloff, Floats
 from polcap.optics import sensor
 
 _CELLS = 48  # along the longer side
-_FAINT = 0.02  # of white, mean: noise and black's error count
+_FAINT = 0.02  # of white; below, noise and the error of black matter
 
 
 def measure(flat: list[Photograph]) -> Falloff:

@@ -26,7 +26,7 @@ import numpy as np
 
 from polcap import parallel
 from polcap.errors import DecodeError, ModelError
-from polcap.formats import calib, text_file
+from polcap.formats import shipped_data, text_file
 from polcap.formats.raw import worker
 from polcap.images import Floats, Network
 
@@ -167,7 +167,7 @@ def _try(path: Path, expected: str, encoding: str) -> None:
 @cache
 def _shipped_files() -> frozenset[Path]:
     """The models that come with polcap."""
-    return frozenset(calib.data_path("colorchecker").parent.glob("models/*.onnx"))
+    return frozenset(shipped_data.data_path("colorchecker").parent.glob("models/*.onnx"))
 
 
 @cache

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from polcap.config import Config
 from polcap.errors import ObjectError
-from polcap.formats import calib
+from polcap.formats import shipped_data
 from polcap.formats.maps import maps_folder
 from polcap.images import AngleStack, Capture, ChartRequest, ColorCalibration, Mesh, Network, SurfaceMaps
 from polcap.pipeline.cache import MemoryCache, StageReached, StageResult
@@ -44,7 +44,7 @@ class UserInput:
 def path(capture: Capture | None, supplied: UserInput, config: Config, cache: MemoryCache) -> Results:
     """The results of all stages, or of the first ones where the cache stops the path."""
     with suppress(StageReached):
-        reference = calib.colorchecker(config.whitebalance.chart)
+        reference = shipped_data.colorchecker(config.whitebalance.chart)
         radiance = cache.run(hdr.merge, capture, config=config.hdr)
         color = cache.run(whitebalance.measure, radiance, reference, supplied.chart, config=config.whitebalance)
         alignment = cache.run(align.register, radiance, color, config=config.align)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from polcap.config import Config, Gates
-from polcap.formats import calib
+from polcap.formats import shipped_data
 from polcap.images import Floats, Mesh, SurfaceMaps
 from polcap.optics.sharpness import TILE
 from polcap.quality.gate import Evidence, Gate, State, Unit, at_most, blamed
@@ -99,7 +99,7 @@ def mask(found: Evidence, limits: Gates) -> Gate:
 
 
 def _charted(found: Evidence) -> float:
-    return float(chart_in_mask.share(found.radiance, found.object_.mask, calib.colorchecker()))
+    return float(chart_in_mask.share(found.radiance, found.object_.mask, shipped_data.colorchecker()))
 
 
 def mesh(of: Mesh, limits: Gates) -> Gate:
@@ -138,7 +138,7 @@ def sharpness(found: Evidence, limits: Gates) -> Gate:
     """Every frame against the frames of the same exposure in the other shots."""
     blur, limit = found.blur_px, limits.max_blur_px
     moved = float(np.abs(found.alignment.transform[:, :2, 2]).max()) * found.grid_px
-    if blur is None or np.isnan(blur).all():
+    if np.isnan(blur).all():
         return Gate("sharpness", "not measured", None, limit, "too little bright detail", unit="px")
     if not moved <= TILE / 2:  # tiles would compare unlike detail
         return Gate("sharpness", "not measured", None, limit, "the shots show different places", unit="px")

@@ -8,7 +8,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.formats import calib, html
+from polcap.formats import html, shipped_data
 from polcap.optics.color import srgb_eight_bits
 from polcap.report import keys, labels, map_figures, mesh_preview, plots, shown
 from polcap.report import stage_pictures as pictures
@@ -170,7 +170,7 @@ def _chart(about: Mapping[str, Any], results: Results) -> str:
     measured = shown.patches(results.radiance, color)
     if measured is None or color.delta_e is None:
         return ""
-    known = calib.colorchecker(about["settings"]["whitebalance"]["chart"])
+    known = shipped_data.colorchecker(about["settings"]["whitebalance"]["chart"])
     reference = next((one for one in known.editions if one.name == color.edition), known)
     drawing = plots.chart(
         srgb_eight_bits(reference.rec709), srgb_eight_bits(measured), color.delta_e, reference.patches

@@ -36,7 +36,7 @@ class BackgroundCheck:
 
     @property
     def pending(self) -> list[Slot]:
-        """Slots whose photographs are not yet checked."""
+        """Slots with a photograph that is not yet checked."""
         return list(self._pending)
 
     def submit(self, slot: Slot, read_deg: float | None, photograph: CameraFile) -> None:

@@ -69,7 +69,7 @@ def open_rotator(url: str, log: Log) -> PolarizerRotator:
         )
     port = Port(address, motor_class.baud, log)
     try:
-        motor = motor_class(port, own, settings.timeout, log)
+        motor = motor_class(port, own, settings.timeout)
     except BaseException:
         port.close()
         raise

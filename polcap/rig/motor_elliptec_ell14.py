@@ -19,7 +19,6 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 
 from polcap.errors import HardwareError
-from polcap.rig.device_log import Log
 from polcap.rig.serial_port import NoAnswer, Port, retry
 
 STATUS = {
@@ -60,7 +59,7 @@ class ElliptecMotor:
     backlash_deg = 0.0  # the piezo drives the ring without a gear
     wraps = True
 
-    def __init__(self, port: Port, settings: ElliptecSettings, timeout_s: float, log: Log) -> None:
+    def __init__(self, port: Port, settings: ElliptecSettings, timeout_s: float) -> None:
         self._port = port
         self._settings = settings
         self._address = settings.address.upper()

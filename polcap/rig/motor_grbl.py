@@ -17,7 +17,6 @@ from msgspec import Meta, Struct
 
 from polcap.errors import HardwareError
 from polcap.rig import person, serial_port
-from polcap.rig.device_log import Log
 from polcap.rig.serial_port import NoAnswer, Port, retry
 
 ALARM = {
@@ -72,11 +71,10 @@ class GrblMotor:
     backlash_deg = 2.0
     wraps = False
 
-    def __init__(self, port: Port, settings: GrblSettings, timeout_s: float, log: Log) -> None:
+    def __init__(self, port: Port, settings: GrblSettings, timeout_s: float) -> None:
         self._port = port
         self._settings = settings
         self._timeout_s = timeout_s
-        self._log = log
         self._axis = "XYZ".index(settings.axis)
         self._zero = 0.0  # machine units
         self.model = f"GRBL {retry(self._reset)}"
@@ -91,7 +89,7 @@ class GrblMotor:
             self._until_ok("$H", quiet_s=inf)  # GRBL reports no state while it homes
         else:
             self._command("$X")
-            person.ask(person.RING_TO_ZERO, self._log)
+            person.ask(person.RING_TO_ZERO, self._port.log)
         self._zero = self._machine_position()  # any number: -499 for a travel of 500
 
     def go(self, angle_deg: float) -> None:

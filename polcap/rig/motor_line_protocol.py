@@ -20,7 +20,6 @@ from msgspec import Struct
 
 from polcap.errors import HardwareError
 from polcap.rig import person
-from polcap.rig.device_log import Log
 from polcap.rig.serial_port import NoAnswer, Port
 
 _START_S = 3.0  # for a board that restarts when its port is opened
@@ -42,18 +41,17 @@ class LineMotor:
     backlash_deg = 2.0
     wraps = False
 
-    def __init__(self, port: Port, settings: LineSettings, timeout_s: float, log: Log) -> None:
+    def __init__(self, port: Port, settings: LineSettings, timeout_s: float) -> None:
         self._port = port
         self._settings = settings
         self._timeout_s = timeout_s
-        self._log = log
         name, speed = self._hello()
         self.model = f"polcap-rotator {name}"
         self.speed_deg_s = max(speed, 0.1)
 
     def home(self) -> None:
         if self._settings.home == "ask":
-            person.ask(person.RING_TO_ZERO, self._log)
+            person.ask(person.RING_TO_ZERO, self._port.log)
             self._command("zero")
         else:
             self._command("home")

@@ -1,4 +1,4 @@
-"""Motor driver for `simulated`: a ring with play whose true angle differs a little from the one it reports.
+"""Motor driver for `simulated`: a ring with play; its true angle differs a little from the reported one.
 
 The simulated camera reads the true angle.
 """
@@ -22,7 +22,7 @@ class SimulatedMotorSettings(Struct, frozen=True):
 
 
 class SimulatedRing:
-    """The polarizer that the motor turns and the camera looks through."""
+    """The polarizer between the simulated camera and its scene."""
 
     true_deg: float | None = None  # None: no simulated motor turns it
 

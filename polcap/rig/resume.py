@@ -39,7 +39,7 @@ def complete_order(folder: Path, options: dict[str, Any], resume: bool) -> Captu
 
 
 def open_folder(folder: Path, order: CaptureOrder, resume: bool) -> RigFile | None:
-    """What an earlier run of the same order recorded; None for a new capture, whose folder is created.
+    """The record of an earlier run of the same order; None for a new capture. Creates the folder.
 
     Raises
     ------

@@ -24,7 +24,7 @@ _SATURATED = 0.98  # of the white level
 
 
 class FrameFacts(msgspec.Struct, frozen=True):
-    """What a frame is judged by, also after a resume."""
+    """Facts that decide whether a frame is retaken; stored for a resume."""
 
     exif: Exif
     digest: str  # of the file's bytes

@@ -1,6 +1,6 @@
 """The sequence of a capture: turn the polarizer, take the frames that are missing, check each in the background.
 
-A rejected frame leaves its slot empty. So retakes and resuming after a crash are the same loop: take what is missing.
+A rejected frame leaves its slot empty. So retaking and resuming are the same loop: take the missing frames.
 """
 
 import shutil
@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +88,7 @@ def _take_missing(
         record.content.rotator = rotator.model
         log.write("polcap", "!", f"{len(record.missing())} frames to take with {rotator.model} and {camera.model}")
         record.write()
-        Shooting(record, check, rotator, camera, log, tell).run()
+        CaptureLoop(record, check, rotator, camera, log, tell).run()
     except PolcapError as error:
         log.write("polcap", "!", str(error))
         raise type(error)(f"{error}; the frames so far are saved, --resume continues") from error
@@ -100,7 +100,7 @@ def _take_missing(
             rotator.close()
 
 
-class Shooting:
+class CaptureLoop:
     """The loop that takes the missing frames."""
 
     def __init__(
@@ -240,18 +240,12 @@ def _check_person(missing: list[Slot], camera: Camera) -> None:
         raise SettingError(f"{named}: a person at a terminal is needed; run in a terminal, or leave it out")
 
 
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """No second polcap shoots into the folder; the system drops the lock when the process dies."""
-    lock = FileLock(folder / ".lock", timeout=0)
+def _locked(folder: Path) -> AbstractContextManager[Any]:
+    """Keep a second polcap out of the folder; the system drops the lock when the process dies."""
     try:
-        lock.acquire()
+        return FileLock(folder / ".lock", timeout=0).acquire()
     except Timeout as error:
         raise StorageError(f"{folder}: another polcap is shooting into it; wait until it has finished") from error
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 @contextmanager

@@ -16,7 +16,7 @@ class CaptureOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     angles_deg: tuple[float, ...]
     bracket: tuple[Exposure, ...]
-    repeat_deg: tuple[float, ...] = ()  # angles whose bracket is taken twice
+    repeat_deg: tuple[float, ...] = ()  # the bracket is taken twice at these angles
     ambient: bool = False  # a frame without flash per angle, or one in all if a person switches the flash
     chart: bool = False  # a frame of the chart alone
     cross: bool = False  # the bracket once more under a polarized flash, crossed to the first angle

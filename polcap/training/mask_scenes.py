@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from polcap.formats import calib
+from polcap.formats import shipped_data
 from polcap.images import Floats
 from polcap.optics import frames, shade
 from polcap.stages.mask.mask_channels import Look, grid
@@ -263,7 +263,7 @@ def _add_chart(
 
 def _chart_picture(frame: float) -> Floats:
     """A chart seen straight on, (h, w, 3), with a black frame `frame` patches wide."""
-    colors = calib.colorchecker().rec709.reshape(4, 6, 3)
+    colors = shipped_data.colorchecker().rec709.reshape(4, 6, 3)
     border = round(frame * _PITCH)
     out = np.full((4 * _PITCH + 2 * border, 6 * _PITCH + 2 * border, 3), 0.03, np.float32)
     for row in range(4):

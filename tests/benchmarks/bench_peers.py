@@ -26,7 +26,7 @@ import bench_speed
 import cv2
 import numpy as np
 
-from polcap.formats import calib
+from polcap.formats import shipped_data
 from polcap.formats.capture import reader as captures
 from polcap.images import (
     Alignment,
@@ -128,7 +128,7 @@ def registering(stack: AngleStack, folder: Path) -> Iterator[Row]:
             found.append(np.vstack([motion, [0, 0, 1]]))
 
     theirs = least(ecc)
-    color = whitebalance.measure(stack, calib.colorchecker(), ChartRequest("none"), whitebalance.Settings())
+    color = whitebalance.measure(stack, shipped_data.colorchecker(), ChartRequest("none"), whitebalance.Settings())
     ours = least(lambda: align.register(stack, color, align.Settings()))
     own = align.register(stack, color, align.Settings()).transform[1:]
     size = stack.value.shape[1:3]
@@ -171,7 +171,7 @@ def charting(stack: AngleStack) -> Iterator[Row]:
     shown = np.clip(value / np.percentile(value, 99.5, axis=(0, 1)), 0, 1).astype(np.float32) ** np.float32(1 / 2.2)
     found = len(detect_colour_checkers_segmentation(shown))
     theirs = least(lambda: detect_colour_checkers_segmentation(shown))
-    reference, search = calib.colorchecker(), ChartRequest("auto")
+    reference, search = shipped_data.colorchecker(), ChartRequest("auto")
     ours = least(lambda: whitebalance.measure(stack, reference, search, whitebalance.Settings()))
     note = f"theirs finds {found}, ours with its matrix and doubt"
     yield Row("chart found and fitted", "colour-checker-detection", ours, theirs, note)
@@ -213,7 +213,8 @@ def solving(stack: AngleStack) -> Iterator[Row]:
     moved = still.copy()
     moved[1:, :2, 2] = 0.4, -0.7
     cost = least(theirs)
-    as_given = replace(stack, site_px=None)  # as theirs has it: a superpixel's colors are taken as seen in its middle
+    # as theirs has it: a superpixel's colors are taken as seen in its middle
+    as_given = replace(stack, sensor=replace(stack.sensor, site_px=None))
     for name, given, transform in (
         ("nothing resampled", as_given, still),
         ("colors laid over one another", stack, still),

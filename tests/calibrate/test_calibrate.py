@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from polcap import calibrate
-from polcap.calibrate import photographs
-from polcap.calibration_values import Calibration
+from polcap.calibrate import calibration_photographs
 from polcap.cli import calibrate_command
 from polcap.errors import CaptureError, InputError
 from polcap.formats import calibrations
 from polcap.formats.raw import dng
-from polcap.images import Exif
+from polcap.images import Calibration, Exif
 from polcap.synth import calibration_frames, forward_camera
 from polcap.synth.calibration_frames import CalibrationShoot
 
@@ -146,7 +145,7 @@ def test_folders_that_hold_nothing_are_one_clear_line(tmp_path):
 
 @pytest.mark.parametrize(("name", "angle"), [("pol045", 45.0), ("pol022.5", 22.5), ("polar", None), ("axis030", None)])
 def test_angles_are_read_from_folder_names(name, angle):
-    assert photographs.angle_of(name, "pol") == angle
+    assert calibration_photographs.angle_of(name, "pol") == angle
 
 
 def written(place: Path, light: float, iso: float = 100.0, time: float = 0.01, model: str = "Synthetic") -> None:
@@ -220,7 +219,7 @@ def damaged(folder: Path) -> None:
         (burnt_flats, "all of one brightness|clipped or dark"),
         (few_pops, "3 frames of one setting; take 4"),
         (burnt_pops, "over-exposed"),
-        (unlike_exposures, "unlike exposure"),
+        (unlike_exposures, "unequal exposure"),
         (two_cameras, "one set-up at a time"),
         (no_angles, "holds no pol000"),
         (damaged, "a.dng"),

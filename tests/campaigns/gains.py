@@ -13,7 +13,7 @@ import numpy as np
 
 from polcap.config import Gates
 from polcap.errors import ChartError
-from polcap.formats import calib
+from polcap.formats import shipped_data
 from polcap.images import AngleStack, ColorCalibration
 from polcap.pipeline.path import AUTO
 from polcap.quality import light
@@ -71,7 +71,7 @@ def main() -> None:
 def measured(radiance: AngleStack) -> ColorCalibration:
     """The chart, as polcap finds it."""
     settings = whitebalance.Settings()
-    return whitebalance.measure(radiance, calib.colorchecker(settings.chart), AUTO, settings)
+    return whitebalance.measure(radiance, shipped_data.colorchecker(settings.chart), AUTO, settings)
 
 
 def parts(radiance, object_, angle, true) -> list[str]:

@@ -141,7 +141,7 @@ def test_a_model_that_does_not_end_is_refused_in_time(tmp_path: Path, monkeypatc
 def test_a_run_that_does_not_end_is_stopped(tmp_path: Path) -> None:
     import onnxruntime
 
-    model = Model(tmp_path / "m.onnx", lambda: onnxruntime.InferenceSession(endless(tmp_path / "m.onnx")), limit_s=1.0)
+    model = Model(tmp_path / "m.onnx", onnxruntime.InferenceSession(endless(tmp_path / "m.onnx")), limit_s=1.0)
     with pytest.raises(ModelError, match=r"did not end within 1 s"):
         model(np.ones((1, 2, 8, 8), np.float32))
 

@@ -10,7 +10,7 @@ import pytest
 
 from polcap.config import Config
 from polcap.errors import CaptureError, ChartError
-from polcap.formats import calib
+from polcap.formats import shipped_data
 from polcap.formats.capture import reader as captures
 from polcap.formats.raw import dng, probe
 from polcap.formats.raw import libraw as raw
@@ -61,9 +61,9 @@ def test_process_measures_the_blur_that_check_measures(tmp_path: Path) -> None:
     faulty.shoot(tmp_path / "bad", 1, "defocus", 256)
     capture = captures.read(tmp_path / "bad")
     merged = hdr.merge(capture, Config().hdr)
-    assert merged.blur_px is not None and np.nanmax(merged.blur_px) > Config().gates.max_blur_px
+    assert np.nanmax(merged.bracket.blur_px) > Config().gates.max_blur_px
     with ThreadPoolExecutor(2) as pool:
-        np.testing.assert_array_equal(merged.blur_px, reduce(capture, 0.98, pool).blur_px)
+        np.testing.assert_array_equal(merged.bracket.blur_px, reduce(capture, 0.98, pool).blur_px)
 
 
 def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path) -> N
     line = next(line for line in found.lines if line.name == "chart")
     assert line.state == "warn" and found.needs == "--no-chart" and "--no-chart" in line.remedy
     with pytest.raises(ChartError):
-        whitebalance.measure(hdr.merge(capture, Config().hdr), calib.colorchecker(), AUTO, Config().whitebalance)
+        whitebalance.measure(hdr.merge(capture, Config().hdr), shipped_data.colorchecker(), AUTO, Config().whitebalance)
     asked = check.inspect(capture, without_networks, Config(), chart=ChartRequest("none"))
     assert asked.needs == "" and next(line for line in asked.lines if line.name == "chart").state == "not measured"
 

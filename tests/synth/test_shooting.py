@@ -10,7 +10,7 @@ import pytest
 import rawpy
 
 from polcap.errors import CaptureError, SettingError
-from polcap.formats import calib
+from polcap.formats import shipped_data
 from polcap.synth import color_checker, render, shooting
 from polcap.synth.color_checker import Chart
 from polcap.synth.distance_fields import Cluster
@@ -87,7 +87,7 @@ def test_files_hold_the_stokes_parameters_of_the_truth(still: Any) -> None:
 def test_white_patch_has_its_reflectance(still: Any) -> None:
     pictures, truth, _ = still
     quads = np.array(truth["chart"]["patch_corners_px"])
-    reference = calib.colorchecker().rec709 @ np.array(truth["camera_matrix_from_linear_srgb"])[1]
+    reference = shipped_data.colorchecker().rec709 @ np.array(truth["camera_matrix_from_linear_srgb"])[1]
     s0 = pictures[0] + pictures[2]
     scale = truth["files"][0]["relative_exposure"] * truth["white_S0"]
     far = np.linalg.norm(color_checker.patches(Chart()).mean(axis=1), axis=-1)  # of the patches from the flash

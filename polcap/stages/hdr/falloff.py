@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from polcap.calibration_values import Falloff
-from polcap.images import Floats, View
+from polcap.images import Falloff, Floats, View
 
 _BLOCK = 64  # rows at a time
 

@@ -16,8 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.calibration_values import NoiseLine
-from polcap.images import Floats
+from polcap.images import Floats, NoiseLine
 from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.stages.hdr.planes import Signals
 

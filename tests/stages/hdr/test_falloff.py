@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from polcap.calibration_values import Falloff, NoiseLine
-from polcap.images import View
+from polcap.images import Falloff, NoiseLine, View
 from polcap.stages.hdr import falloff, noise
 
 LAW = Falloff(((-0.25, 0.05, 0.0),) * 3, ((0.0, 0.0, 0.0),) * 3, (0.8, 0.8, 0.8), 11.0, 60.0)

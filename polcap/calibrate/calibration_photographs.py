@@ -1,4 +1,4 @@
-"""In: a folder of calibration photographs. Out: each with its EXIF, decoded when asked for, and grouped by setting."""
+"""Reads calibration photographs: RAW files of a folder with EXIF, grouped by exposure setting or angle."""
 
 import re
 from collections.abc import Iterable
@@ -14,13 +14,13 @@ from polcap.formats.raw import probe
 from polcap.images import Exif, Floats, SensorImage
 from polcap.optics import sensor
 
-CLIP = 0.95  # of the white level: nothing is measured above
+CLIP = 0.95  # of the white level; nothing is measured above
 _ANGLE = re.compile(r"(\d{1,3}(?:\.\d+)?)")
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """One file."""
+    """One RAW file."""
 
     path: Path
     exif: Exif
@@ -32,37 +32,36 @@ class Photograph:
 
     @property
     def setting(self) -> tuple[float, float, float]:
-        """ISO, exposure time [s], f-number; 0 where the file does not say."""
+        """ISO, exposure time [s], f-number; 0 if the file does not state it."""
         return self.exif.iso or 0.0, self.exif.exposure_time or 0.0, self.exif.f_number or 0.0
 
 
-def listed(folder: Path) -> list[Photograph]:
-    """The RAW photographs of a folder in the order of their names; of finished pictures there is nothing to measure.
+def photographs_in(folder: Path) -> list[Photograph]:
+    """The RAW photographs of a folder in the order of their names.
 
     Raises
     ------
     CaptureError
         There is none, or the folder cannot be listed.
     """
-    files = [path for path in layouts.children(folder) if path.is_file()]
-    found = []
-    for path in sorted(files, key=lambda one: layouts.natural(one.name)):
-        known = probe.read(path)
-        if known.kind == "raw":
-            found.append(Photograph(path, known.exif, known.digest))
-    if not found:
+    paths = sorted(
+        (path for path in layouts.children(folder) if path.is_file()), key=lambda one: layouts.natural(one.name)
+    )
+    files = [(path, probe.read(path)) for path in paths]
+    photographs = [Photograph(path, file.exif, file.digest) for path, file in files if file.kind == "raw"]
+    if not photographs:
         raise CaptureError(f"{folder}: holds no RAW photograph; take some, or remove the folder")
-    return found
+    return photographs
 
 
-def inside(folder: Path, prefix: str) -> list[tuple[float, Path]]:
-    """Sub-folders such as pol022.5, with the angle that their names state [degrees], by angle."""
-    found = [(angle_of(path.name, prefix), path) for path in layouts.children(folder) if path.is_dir()]
-    return sorted((angle, path) for angle, path in found if angle is not None)
+def angle_folders(folder: Path, prefix: str) -> list[tuple[float, Path]]:
+    """Angle [degrees] and path of folders such as pol022.5, by angle."""
+    folders = [(angle_of(path.name, prefix), path) for path in layouts.children(folder) if path.is_dir()]
+    return sorted((angle, path) for angle, path in folders if angle is not None)
 
 
 def angle_of(name: str, prefix: str) -> float | None:
-    """Degrees in `pol045` or `axis22.5`; None where the name is no such."""
+    """Degrees in `pol045` or `axis22.5`; None for another name."""
     match = _ANGLE.fullmatch(name.removeprefix(prefix)) if name.startswith(prefix) else None
     return None if match is None else float(match.group(1))
 

@@ -1,7 +1,7 @@
-"""In: polarized light of a known axis through the filter at every angle of its ring. Out: extinction, zero, sense.
+"""Extinction ratio, zero and sense of a polarizer on its ring, from polarized light of a known axis.
 
-I(θ) = a (1 + c cos 2(s θ + z − α)) for light of axis α and a filter whose axis stands at s θ + z when its ring says θ:
-c tells the extinction ratio E = (1 + c)/(1 − c), the phase the zero z; s = ±1 needs light of two axes.
+I(θ) = a (1 + c cos 2(s θ + z − α)) for light of axis α and a filter with its axis at s θ + z for the ring angle θ.
+c gives the extinction ratio E = (1 + c)/(1 − c), the phase the zero z; the sense s = ±1 needs light of two axes.
 
 References
 ----------
@@ -12,21 +12,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polcap.calibrate.photographs import Photograph, center
-from polcap.calibration_values import Polarizer
+from polcap.calibrate.calibration_photographs import Photograph, center
 from polcap.errors import CaptureError
-from polcap.images import Floats
+from polcap.images import Floats, Polarizer
 
 _LEAST = 5  # angles of the ring, for three unknowns and a scatter
 _CLIPPED = 0.01
 _LAMP = 1e-3  # 1σ of a steady lamp from frame to frame, relative
-_RING_DEG = 0.1  # 1σ of a ring's angle; both only weigh the frames, the scatter found says how well they did
-_SPAN_DEG = 90.0  # the ring must go round at least so far
-_APART_DEG = 10.0  # of two axes, and of their mirror images, to tell the sense
+_RING_DEG = 0.1  # 1σ of a ring's angle; lamp and ring only weight the frames, the error comes from their scatter
+_SPAN_DEG = 90.0  # least range of ring angles
+_LEAST_DIFFERENCE_DEG = 10.0  # between two axes, and between their mirror images, to find the sense
 
 
 @dataclass(frozen=True)
-class Turned:
+class PolarizerShot:
     """One photograph of `polarizer/`."""
 
     axis_deg: float  # of the light
@@ -35,31 +34,32 @@ class Turned:
 
 
 @dataclass(frozen=True)
-class _Curve:
-    """What one axis of light shows."""
+class _MalusFit:
+    """cos² curve of the light of one axis."""
 
     axis_deg: float
-    phase_deg: float  # ring angle of the greatest light
+    phase_deg: float  # ring angle of most light
     phase_sigma_deg: float
     contrast: Floats  # (C,)
     contrast_sigma: Floats  # (C,)
 
 
-def measure(turned: list[Turned]) -> Polarizer:
-    """Of all axes together.
+def measure(turned: list[PolarizerShot]) -> Polarizer:
+    """Extinction, zero and sense from the light of all axes.
 
     Raises
     ------
     CaptureError
-        Too few angles, unequal exposures, or light that is not polarized.
+        There are too few angles, unequal exposures, or the light is not polarized.
     """
-    curves = [_curve([one for one in turned if one.axis_deg == axis]) for axis in sorted({t.axis_deg for t in turned})]
-    known = _tells_sense(curves)
-    ways = [(_zero(curves, sense), sense) for sense in ((1, -1) if known else (1,))]
-    (zero, sigma, _), sense = min(ways, key=lambda way: way[0][2])
+    axes = sorted({shot.axis_deg for shot in turned})
+    curves = [_fit_axis([shot for shot in turned if shot.axis_deg == axis]) for axis in axes]
+    known = _shows_sense(curves)
+    candidates = [(_zero(curves, sense), sense) for sense in ((1, -1) if known else (1,))]
+    (zero, sigma, _), sense = min(candidates, key=lambda candidate: candidate[0][2])
     weight = np.array([1 / np.maximum(curve.contrast_sigma, 1e-9) ** 2 for curve in curves])
     contrast = (weight * np.array([curve.contrast for curve in curves])).sum(0) / weight.sum(0)
-    doubt = 1 / np.sqrt(weight.sum(0))
+    contrast_sigma = 1 / np.sqrt(weight.sum(0))
     leak = np.maximum(1 - contrast, 1e-6)
     return Polarizer(
         zero_deg=round(zero, 3),
@@ -67,20 +67,20 @@ def measure(turned: list[Turned]) -> Polarizer:
         sense=sense,
         sense_known=known,
         extinction=tuple(((1 + contrast) / leak).tolist()),
-        extinction_sigma=tuple((2 * doubt / leak**2).tolist()),
+        extinction_sigma=tuple((2 * contrast_sigma / leak**2).tolist()),
         frames=len(turned),
     )
 
 
-def _curve(shots: list[Turned]) -> _Curve:
+def _fit_axis(shots: list[PolarizerShot]) -> _MalusFit:
     where = shots[0].photograph.path.parent.parent
     if len({shot.photograph.setting for shot in shots}) > 1:
-        raise CaptureError(f"{where}: frames of unlike exposure; take all angles of the ring with one setting")
+        raise CaptureError(f"{where}: frames of unequal exposure; take all angles of the ring with one setting")
     ring = np.radians([shot.ring_deg for shot in shots])
     angles = np.unique(np.round(np.degrees(ring) % 180, 2))
     if len(angles) < _LEAST or np.ptp(angles) < _SPAN_DEG:
         raise CaptureError(
-            f"{where}: {len(angles)} angles of the ring; take {_LEAST} or more over 180°, every 15° is well"
+            f"{where}: {len(angles)} angles of the ring; take {_LEAST} or more over 180°, best every 15°"
         )
     light = []
     for shot in shots:
@@ -88,11 +88,8 @@ def _curve(shots: list[Turned]) -> _Curve:
         if clipped > _CLIPPED:
             raise CaptureError(f"{shot.photograph.path}: over-exposed in the middle; take less light, at all angles")
         light.append(mean)
-    solved = [_solved(ring, channel) for channel in np.array(light).T]
-    wave, covariance = (
-        np.array([one for one, _ in solved]),
-        np.array([doubt for _, doubt in solved]),
-    )  # (C, 3), (C, 3, 3)
+    solved = [_fit_wave(ring, channel) for channel in np.array(light).T]
+    wave, covariance = (np.array(values) for values in zip(*solved))  # (C, 3), (C, 3, 3)
     length = np.hypot(wave[:, 1], wave[:, 2])
     contrast = length / wave[:, 0]
     if contrast.max() < 0.2:
@@ -102,12 +99,12 @@ def _curve(shots: list[Turned]) -> _Curve:
     spread = np.sqrt(np.einsum("ci,cij,cj->c", toward, covariance, toward))
     turn = np.sqrt(np.einsum("ci,cij,cj->c", across, covariance, across))
     phase = np.arctan2((wave[:, 2] / turn**2).sum(), (wave[:, 1] / turn**2).sum()) / 2
-    # the ring's own scatter is the same in all channels: they do not average it away
-    return _Curve(shots[0].axis_deg, float(np.degrees(phase)), float(np.degrees(turn.min())), contrast, spread)
+    # the ring's scatter is the same in all channels: an average would not lower it
+    return _MalusFit(shots[0].axis_deg, float(np.degrees(phase)), float(np.degrees(turn.min())), contrast, spread)
 
 
-def _solved(ring: Floats, light: Floats) -> tuple[Floats, Floats]:
-    """a, a c cos, a c sin and their covariance, the frames weighed by lamp and ring, the scatter as found."""
+def _fit_wave(ring: Floats, light: Floats) -> tuple[Floats, Floats]:
+    """(3,) a, a c cos 2φ, a c sin 2φ and their covariance, scaled to the scatter of the frames."""
     matrix = np.stack([np.ones_like(ring), np.cos(2 * ring), np.sin(2 * ring)], axis=1)
     weight = np.ones_like(light)
     for _ in range(6):
@@ -121,20 +118,22 @@ def _solved(ring: Floats, light: Floats) -> tuple[Floats, Floats]:
     return wave, np.linalg.inv(normal) * max(reduced, 0.1)
 
 
-def _tells_sense(curves: list[_Curve]) -> bool:
-    """Whether two axes lie so that the two senses predict different phases."""
+def _shows_sense(curves: list[_MalusFit]) -> bool:
+    """Whether the two senses predict different phases for two of the axes."""
     return any(
-        _APART_DEG < (one.axis_deg - other.axis_deg) % 90 < 90 - _APART_DEG for one in curves for other in curves
+        _LEAST_DIFFERENCE_DEG < (one.axis_deg - other.axis_deg) % 90 < 90 - _LEAST_DIFFERENCE_DEG
+        for one in curves
+        for other in curves
     )
 
 
-def _zero(curves: list[_Curve], sense: int) -> tuple[float, float, float]:
-    """z = α − s ψ of all axes, −90…90°, its 1σ, and how far the axes are apart in it."""
-    each = np.array([curve.axis_deg - sense * curve.phase_deg for curve in curves])
+def _zero(curves: list[_MalusFit], sense: int) -> tuple[float, float, float]:
+    """z = α − s ψ of all axes, −90…90°, its 1σ, and the rms difference between the axes."""
+    zeros = np.array([curve.axis_deg - sense * curve.phase_deg for curve in curves])
     weight = np.array([1 / curve.phase_sigma_deg**2 for curve in curves])
-    vector = np.sum(weight * np.exp(2j * np.radians(each))) / weight.sum()
+    vector = np.sum(weight * np.exp(2j * np.radians(zeros))) / weight.sum()
     zero = float(np.degrees(np.angle(vector)) / 2)
-    apart = (each - zero + 90) % 180 - 90
-    misfit = float(np.sqrt(np.sum(weight * apart**2) / weight.sum()))
+    difference = (zeros - zero + 90) % 180 - 90
+    misfit = float(np.sqrt(np.sum(weight * difference**2) / weight.sum()))
     between = misfit / np.sqrt(max(len(curves) - 1, 1)) if len(curves) > 1 else 0.0
     return zero, float(np.hypot(1 / np.sqrt(weight.sum()), between)), misfit

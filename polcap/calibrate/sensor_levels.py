@@ -1,23 +1,22 @@
-"""In: dark and bright frames. Out: the sensor's black and white beside what the maker's tags say of them."""
+"""Black and white level of a sensor, from dark frames and over-exposed flat frames."""
 
 import numpy as np
 
-from polcap.calibrate.photographs import Photograph
-from polcap.calibration_values import Levels
+from polcap.calibrate.calibration_photographs import Photograph
 from polcap.errors import CaptureError
-from polcap.images import SensorImage
+from polcap.images import Levels, SensorImage
 from polcap.optics import sensor
 
-_DARK = 0.05  # of white: more is no dark frame
+_DARK = 0.05  # of white; a frame above is not dark
 
 
 def measure(dark: list[Photograph], bright: list[Photograph]) -> Levels:
-    """Black of the four phases of the mosaic, and the count at which frames saturate, where some do.
+    """Black of each photosite of the mosaic's pattern, and the count at which frames saturate, if some do.
 
     Raises
     ------
     CaptureError
-        A dark frame that is not dark.
+        A dark frame is not dark.
     """
     means, noise = [], []
     for one in dark:
@@ -28,7 +27,7 @@ def measure(dark: list[Photograph], bright: list[Photograph]) -> Levels:
         stated = np.broadcast_to(image.black, (rows, columns)).ravel()
         if max(mean) - float(stated.max()) > _DARK * (image.white - float(stated.max())):
             raise CaptureError(
-                f"{one.path}: mean count {max(mean):.0f} where black is {stated.max():.0f}; "
+                f"{one.path}: the mean count is {max(mean):.0f}, but black is {stated.max():.0f}; "
                 "take dark frames with the cap on"
             )
         means.append(mean)
