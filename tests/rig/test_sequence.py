@@ -230,10 +230,10 @@ class Shaken(PoolCamera):
 
 
 def test_an_early_frame_is_judged_by_its_later_neighbours(rig: Rig, tmp_path: Path) -> None:
-    from tests.rig.test_frame_check import _blur
+    from tests.rig.test_retake_criteria import blur
 
     (tmp_path / "sharp.dng").write_bytes(rig.pool["shot", 0.0, 1])
-    _blur(tmp_path / "sharp.dng", tmp_path / "blurred.dng", 2.0)
+    blur(tmp_path / "sharp.dng", tmp_path / "blurred.dng", 2.0)
     blurred = {("blurred", 0.0, 1): (tmp_path / "blurred.dng").read_bytes()}
     rig.camera = Shaken({**rig.pool, **blurred})
     done = rig.shoot(msgspec.structs.replace(ORDER, repeat_deg=(), ambient=False))
