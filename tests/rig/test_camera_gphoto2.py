@@ -23,7 +23,7 @@ gphoto2 = pytest.importorskip("gphoto2")
 
 @pytest.fixture
 def card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The virtual camera's card: it photographs what lies there."""
+    """The virtual camera's card: the camera photographs its file."""
     spec = importlib.util.find_spec("gphoto2")
     assert spec is not None and spec.origin is not None
     monkeypatch.setenv("IOLIBS", os.path.join(os.path.dirname(spec.origin), "libgphoto2", "vusb"))

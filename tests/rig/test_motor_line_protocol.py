@@ -68,7 +68,7 @@ def test_after_a_stop_nothing_moves_before_homing() -> None:
             board.go(45)
 
 
-def test_a_restart_in_mid_move_is_told() -> None:
+def test_a_restart_during_a_move_is_an_error() -> None:
     with devices.Line(fault="restart", at=2) as device:
         board = motor(device)
         board.home()
