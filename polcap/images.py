@@ -301,6 +301,39 @@ class CrossedShot:
 
 
 @dataclass(frozen=True)
+class BracketMeasurement:
+    """What the frames of each bracket showed when they were compared; NaN where it is unknown."""
+
+    exposure_ratio: Floats  # (K, E, 3) of every frame to its shot's reference frame, from pixels
+    exif_ratio: Floats  # (K, E) the same by the metadata
+    curvature: Floats  # (K, E) of each frame's tone against the reference's; 0: linear
+    ghost_fraction: Floats  # (K,) share of pixels whose exposures disagree beyond noise
+    ambient_share: Floats  # (K,) of all light, present without the flash
+    blur_px: Floats  # (K, E) beyond the sharpest frame of the same exposure, 1σ [RAW px]
+
+
+@dataclass(frozen=True)
+class ColorSensor:
+    """The sensor by the files of a capture."""
+
+    camera_matrix: Floats | None = None  # (3, 3) camera → linear Rec.709, white balanced as shot; None if unknown
+    white_balance: Floats | None = None  # (3,) multipliers as shot
+    site_px: Floats | None = None  # (3, 2) x, y of this grid: where in a pixel each channel was seen; None: 0
+    lossy: bool = False  # a source was 8-bit or display-encoded
+
+
+@dataclass(frozen=True)
+class Equipment:
+    """Light, lens and polarizer of a capture, as metadata and calibration know them."""
+
+    light: Literal["flash", "steady", "one exposure", "unknown"] = "unknown"  # of the shots; one: a polarizer mosaic
+    flash_spread: float | None = None  # 1σ of the flash's energy from pop to pop, calibrated
+    extinction: Floats | None = None  # (3,) or (1,) extinction ratio of the polarizer, calibrated; None: ideal
+    ring_sigma: float | None = None  # rad, 1σ of the ring's zero as calibrated; None: set by eye
+    distortion: Distortion | None = None  # of the lens, calibrated, on this grid; None: a pinhole, as far as is known
+
+
+@dataclass(frozen=True)
 class AngleStack:
     """The merged shots of a capture in camera channels, not yet registered."""
 
@@ -309,27 +342,21 @@ class AngleStack:
     quality: Bits  # (K, H, W)
     angle: Floats  # (K,) rad
     view: View
-    exposure_ratio: Floats  # (K, E, 3) of every frame to the shot's reference frame, estimated from pixels
-    exif_ratio: Floats  # (K, E) the same as the metadata tell it; NaN where they do not
-    ghost_fraction: Floats  # (K,) share of pixels whose exposures disagree beyond noise
-    lossy: bool  # a source was 8-bit or display-encoded
-    camera_matrix: Floats | None  # (3, 3) camera → linear Rec.709, white balanced as shot; None if unknown
-    white_balance: Floats | None  # (3,) multipliers as shot
-    light: Literal["flash", "steady", "one exposure", "unknown"] = "unknown"  # of the shots; one: a polarizer mosaic
+    bracket: BracketMeasurement
+    sensor: ColorSensor = ColorSensor()
+    equipment: Equipment = Equipment()
     offset_px: Floats | None = None  # (K, 2) x, y of this grid, exactly known: reference px − offset = shot px
-    site_px: Floats | None = None  # (3, 2) x, y of this grid: where in a pixel each channel was seen; None: 0
-    curvature: Floats | None = None  # (K, E) of each frame's tone against the reference's; 0: linear, NaN: unknown
-    ambient_share: Floats | None = None  # (K,) of all light, there without the flash; NaN where not photographed
-    extinction: Floats | None = None  # (3,) or (1,) extinction ratio of the polarizer, calibrated; None: ideal
-    flash_spread: float | None = None  # 1σ of the flash's energy from pop to pop, calibrated
-    ring_sigma: float | None = None  # rad, 1σ of the ring's zero as calibrated; None: set by eye
-    blur_px: Floats | None = None  # (K, E) beyond the sharpest frame of the same exposure, 1σ [RAW px]; NaN: unknown
     crossed: CrossedShot | None = None  # where one was taken
-    distortion: Distortion | None = None  # of the lens, calibrated, on this grid; None: a pinhole, as far as is known
 
     def shot(self, k: int) -> MaskedImage:
         """One of the shots, (H, W, 3)."""
         return MaskedImage(self.value[k], self.variance[k], self.quality[k])
+
+
+def single_frames(shots: int) -> BracketMeasurement:
+    """Brackets of one frame each, which leave nothing to compare."""
+    each, unknown = np.ones((shots, 1)), np.full((shots, 1), np.nan)
+    return BracketMeasurement(np.ones((shots, 1, 3)), each, unknown, np.zeros(shots), unknown[:, 0], unknown)
 
 
 @dataclass(frozen=True)

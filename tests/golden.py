@@ -194,14 +194,9 @@ def radiance() -> images.AngleStack:
         quality=np.stack(clipped).astype(np.uint8) * np.uint8(images.Quality.CLIPPED),
         angle=capture.angle,
         view=VIEW,
-        exposure_ratio=np.ones((shots, 1, 3)),
-        exif_ratio=np.ones((shots, 1)),
-        ghost_fraction=np.zeros(shots),
-        lossy=False,
-        camera_matrix=photographs[0].camera_matrix,
-        white_balance=photographs[0].white_balance,
-        light="flash",
-        site_px=photographs[0].site_px,
+        bracket=images.single_frames(shots),
+        sensor=images.ColorSensor(photographs[0].camera_matrix, photographs[0].white_balance, photographs[0].site_px),
+        equipment=images.Equipment("flash"),
     )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Gains, ObjectMask, View
+from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Gains, ObjectMask, View, single_frames
 from polcap.optics import frames, mueller, shade
 from polcap.optics.warp import warp
 
@@ -84,8 +84,7 @@ def stack(
     return AngleStack(
         value=value.astype(np.float32), variance=variance.astype(np.float32),
         quality=np.zeros(value.shape[:3], np.uint8), angle=np.asarray(angles), view=VIEW,
-        exposure_ratio=np.ones((len(angles), 1, 3)), exif_ratio=np.ones((len(angles), 1)),
-        ghost_fraction=np.zeros(len(angles)), lossy=False, camera_matrix=None, white_balance=None,
+        bracket=single_frames(len(angles)),
     )  # fmt: skip
 
 

@@ -18,7 +18,17 @@ from numpy.typing import NDArray
 from polcap.calibrate.calibration_photographs import Photograph
 from polcap.errors import CaptureError, ChartError
 from polcap.formats import shipped_data
-from polcap.images import AngleStack, ChartRequest, Distortion, Floats, LensGeometry, SensorImage, View
+from polcap.images import (
+    AngleStack,
+    ChartRequest,
+    ColorSensor,
+    Distortion,
+    Floats,
+    LensGeometry,
+    SensorImage,
+    View,
+    single_frames,
+)
 from polcap.optics import distortion, sensor
 from polcap.stages import whitebalance
 from polcap.stages.whitebalance import chart
@@ -213,12 +223,8 @@ def _as_stack(value: Floats, image: SensorImage) -> AngleStack:
         quality=np.zeros((1, height, width), np.uint8),
         angle=np.zeros(1),
         view=View(1.4 * width, ((width - 1) / 2, (height - 1) / 2), float(image.superpixel)),
-        exposure_ratio=np.ones((1, 1, 3)),
-        exif_ratio=np.ones((1, 1)),
-        ghost_fraction=np.zeros(1),
-        lossy=False,
-        camera_matrix=image.camera_matrix,
-        white_balance=image.white_balance,
+        bracket=single_frames(1),
+        sensor=ColorSensor(image.camera_matrix, image.white_balance),
     )
 
 

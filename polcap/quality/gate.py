@@ -47,7 +47,7 @@ class Evidence(Results):
     names: list[str]  # (K,) of the shots
     focal_doubt: tuple[float, float]  # ln of the least and of the greatest possible focal length over the assumed one
     clipped: Floats  # (K, E, H, W) share of each pixel that is clipped
-    blur_px: Floats | None  # (K, E) beyond the sharpest frame of the same exposure, 1σ [visible RAW px]
+    blur_px: Floats  # (K, E) beyond the sharpest frame of the same exposure, 1σ [visible RAW px]
     grid_px: float = 1.0  # px of the picture that `process` works on per px of these
     chart_missing: str = ""  # the reason, where a chart was expected and none was found
 
@@ -60,7 +60,7 @@ def full_size(results: Results, focal_doubt: tuple[float, float]) -> Evidence:
         names=[f"{degrees:g}°" for degrees in np.round(np.degrees(radiance.angle), 6)],
         focal_doubt=focal_doubt,
         clipped=((radiance.quality & int(Quality.CLIPPED)) > 0)[:, None],
-        blur_px=radiance.blur_px,
+        blur_px=radiance.bracket.blur_px,
         grid_px=1.0,
         chart_missing="",
     )

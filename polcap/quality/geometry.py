@@ -138,7 +138,7 @@ def sharpness(found: Evidence, limits: Gates) -> Gate:
     """Every frame against the frames of the same exposure in the other shots."""
     blur, limit = found.blur_px, limits.max_blur_px
     moved = float(np.abs(found.alignment.transform[:, :2, 2]).max()) * found.grid_px
-    if blur is None or np.isnan(blur).all():
+    if np.isnan(blur).all():
         return Gate("sharpness", "not measured", None, limit, "too little bright detail", unit="px")
     if not moved <= TILE / 2:  # tiles would compare unlike detail
         return Gate("sharpness", "not measured", None, limit, "the shots show different places", unit="px")

@@ -25,7 +25,7 @@ _GLOSS_PART = 0.3  # of the chart's gloss goes into gains taken from its light p
 def bracket(found: Evidence) -> Gate:
     """The bracket as the pixels tell it, and where that is not what the camera promises, why."""
     radiance = found.radiance
-    ratio = np.sort(radiance.exposure_ratio.mean((0, 2)))  # (E,)
+    ratio = np.sort(radiance.bracket.exposure_ratio.mean((0, 2)))  # (E,)
     if len(ratio) == 1:
         says = "one exposure per shot"
         return Gate("exposures", "warn", 1.0, None, says, "a bracket holds highlights and shadows at once", unit="×")
@@ -36,7 +36,7 @@ def bracket(found: Evidence) -> Gate:
     if steps.min() < _ALIKE and promised > _PROMISED:
         says = f"frames of a bracket are alike, though the camera states steps of {promised:.2g} times"
         remedy = "shutter time does not change a flash exposure: bracket by flash power, aperture or ISO"
-        if radiance.light == "steady":
+        if radiance.equipment.light == "steady":
             remedy = "was a flash on? Shutter time does not change its exposure: bracket by power, aperture or ISO"
         return Gate("exposures", "warn", round(float(steps.min()), 3), least, says, remedy, unit="×")
     if steps.min() < least:
@@ -52,11 +52,11 @@ def tone(found: Evidence, limits: Gates) -> Gate:
     """Whether the pixels are linear: a tone curve changes the ratio of two exposures with brightness."""
     radiance = found.radiance
     limit = limits.max_tone_curvature
-    curved = np.zeros(1) if radiance.curvature is None else np.abs(radiance.curvature)
+    curved = np.abs(radiance.bracket.curvature)
     within = float(np.nanmedian(np.nanmax(curved, axis=-1))) if np.isfinite(curved).any() else 0.0
     worst, how = within, "the ratio of two exposures changes from shadows to highlights"
     power = _power(radiance)
-    if radiance.light == "steady" and abs(power - 1) > worst:
+    if radiance.equipment.light == "steady" and abs(power - 1) > worst:
         worst, how = abs(power - 1), f"exposures change as the stated ones to the power {power:.2f}"
     slope = found.gains.grey_slope if found.color.quads is not None else float("nan")
     if np.isfinite(slope) and abs(slope - 1) / 2 > worst:  # glare flattens greys too
@@ -71,7 +71,7 @@ def tone(found: Evidence, limits: Gates) -> Gate:
 
 def source(found: Evidence) -> Gate:
     """Whether the pictures are the sensor's own counts."""
-    if not found.radiance.lossy:
+    if not found.radiance.sensor.lossy:
         return Gate(
             "source", "pass", "linear counts", "linear counts", "the sensor's counts, or linear pictures", unit=""
         )
@@ -96,7 +96,7 @@ def _noise(image: StokesImage) -> float:
 
 def stillness(found: Evidence, limits: Gates) -> Gate:
     """How much of a shot differs between its exposures."""
-    fraction = found.radiance.ghost_fraction
+    fraction = found.radiance.bracket.ghost_fraction
     k = int(np.argmax(fraction))
     says = f"{100 * fraction[k]:.2f} % of {found.names[k]} differs between exposures"
     remedy = "something moved or the light changed within a bracket: take it again"
@@ -125,7 +125,7 @@ def chart(found: Evidence, limits: Gates) -> Gate:
         says += f"; {patches.left_out(found.color.patch_use)}"
     if found.color.light is not None and found.color.light.tilt > _TURNED:
         says += f"; it is turned by {np.degrees(found.color.light.tilt):.0f}° from the lens, which the scale takes out"
-    if found.radiance.lossy:
+    if found.radiance.sensor.lossy:
         says += "; the pictures have 8 bits or a camera's rendering, which a matrix cannot undo"
     remedy = "light the chart as the object, without glare, or give its corners with --chart"
     return at_most("chart", mean, limit, says, remedy, unit="ΔE2000")
@@ -147,13 +147,13 @@ def gains(found: Evidence, limits: Gates) -> Iterator[Gate]:
     """The light of every frame against the others', and how far that is known."""
     measured, radiance, names = found.gains, found.radiance, found.names
     shot = measured.gain.mean(1)
-    light = shot[:, None] * radiance.exposure_ratio.mean(2)  # (K, E)
+    light = shot[:, None] * radiance.bracket.exposure_ratio.mean(2)  # (K, E)
     off = light / np.median(light, axis=0) - 1
     each = np.median(off, axis=1)
     k = int(np.argmax(np.abs(each)))
     limit = limits.max_gain_change
     why = "the flash misfired or had not recycled: wait longer between pops"
-    if radiance.light == "steady":
+    if radiance.equipment.light == "steady":
         why = "the lamp or the daylight changed between shots: let it settle, and shoot again"
     says = f"the light of {names[k]} was {100 * each[k]:+.1f} % of the other shots'"
     yield at_most("gains", float(abs(each[k])), limit, says, why, blamed(names, np.abs(each) > limit), 3)
@@ -193,7 +193,7 @@ def _gain_doubt(found: Evidence, limits: Gates) -> Gate:
     if measured.source == "none":
         says = f"nothing tells the light of the shots: taken as equal, to {100 * doubt:.1f} % (1σ)"
     ways = ["put a ColorChecker beside the object"]
-    ways += [] if found.radiance.light == "steady" else ["use a steady lamp"]
+    ways += [] if found.radiance.equipment.light == "steady" else ["use a steady lamp"]
     ways += [] if len(found.names) > 3 else ["shoot four angles"]
     remedy = " or ".join(ways)
     return at_most("gain doubt", doubt, limit, says, remedy, cost_deg=cost, beyond=_grade(cost))
@@ -245,9 +245,9 @@ def _crossed(image: StokesImage) -> dict[str, Any]:
 
 def ambient(found: Evidence, limits: Gates) -> Gate:
     """The share of ambient light, where it was photographed."""
-    share = found.radiance.ambient_share
+    share = found.radiance.bracket.ambient_share
     limit = limits.max_ambient
-    if share is None or not np.isfinite(share).any():
+    if not np.isfinite(share).any():
         return Gate("ambient", "not measured", None, limit, "no frame was taken without the flash")
     worst = float(np.nanmax(share))
     says = f"{100 * worst:.1f} % of the light is there without the flash"
@@ -257,14 +257,15 @@ def ambient(found: Evidence, limits: Gates) -> Gate:
 
 def _promised_steps(radiance: AngleStack) -> float:
     """Least step of the bracket as the metadata tell it; NaN where they do not."""
-    stated = np.sort(radiance.exif_ratio[0])
+    stated = np.sort(radiance.bracket.exif_ratio[0])
     return float((stated[1:] / stated[:-1]).min()) if np.isfinite(stated).all() and len(stated) > 1 else float("nan")
 
 
 def _power(radiance: AngleStack) -> float:
     """Slope of ln measured over ln stated exposure; 1 where the metadata are silent, or state no steps."""
-    stated: Floats = np.log(radiance.exif_ratio[0]) if np.isfinite(radiance.exif_ratio[0]).all() else np.zeros(1)
-    seen = np.log(np.maximum(radiance.exposure_ratio.mean((0, 2)), 1e-6))
+    ratio = radiance.bracket.exif_ratio[0]
+    stated: Floats = np.log(ratio) if np.isfinite(ratio).all() else np.zeros(1)
+    seen = np.log(np.maximum(radiance.bracket.exposure_ratio.mean((0, 2)), 1e-6))
     if np.ptp(stated) < 0.5 or np.ptp(seen) < 0.3:
         return 1.0
     return float(np.polyfit(stated, seen, 1)[0])

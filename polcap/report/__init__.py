@@ -106,10 +106,10 @@ def figures(results: Results) -> dict[str, dict[str, Any]]:
     extent = mesh.vertices.max(0) - mesh.vertices.min(0)
     return {
         "merge": {
-            "exposure_ratio": _list(radiance.exposure_ratio.mean(-1)),
-            "exif_ratio": _list(radiance.exif_ratio),
-            "ghost_fraction": _list(radiance.ghost_fraction),
-            "lossy_source": radiance.lossy,
+            "exposure_ratio": _list(radiance.bracket.exposure_ratio.mean(-1)),
+            "exif_ratio": _list(radiance.bracket.exif_ratio),
+            "ghost_fraction": _list(radiance.bracket.ghost_fraction),
+            "lossy_source": radiance.sensor.lossy,
         },
         "chart": {
             "source": color.source,

@@ -70,7 +70,7 @@ def capture_errors(found: Results, capture: Capture, told: dict, meta: dict) -> 
         [files[str(Path(frame.path).relative_to(capture.folder))] for frame in shot.frames] for shot in capture.shots
     ]
     exposure = np.array([[f["relative_exposure"] * f["flash_factor"] for f in shot] for shot in frames])
-    ratio = found.radiance.exposure_ratio.mean(-1)
+    ratio = found.radiance.bracket.exposure_ratio.mean(-1)
     reference = int(np.abs(ratio[0] - 1).argmin())
     flash = np.array([shot[reference]["flash_factor"] for shot in frames])
     gain = found.gains.gain.mean(1) / (flash / flash[0]) - 1

@@ -81,7 +81,7 @@ def compare(title: str, theirs: Any, quads: Floats, exposures: tuple[float, ...]
     shot = Shot(0.0, tuple(frame(p, e / 100) for p, e in zip(paths, exposures)))
     capture = Capture("", "", (shot,), "folders", 1000.0, True, (0.0, 0.0), SIZE[::-1])
     stack, ours_s = timed(lambda: hdr.merge(capture, hdr.Settings()))
-    reference = int(np.argmax(np.all(stack.exposure_ratio[0] == 1, axis=1)))
+    reference = int(np.argmax(np.all(stack.bracket.exposure_ratio[0] == 1, axis=1)))
     truth = quads * true[reference] / GAIN / (WHITE - BLACK)
     clear = (stack.quality[0] & 1) == 0
     print(f"\n{title}: exposures {exposures}, {SIZE[0] * SIZE[1] / 1e6:.1f} MP")

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from polcap.config import Gates
 from polcap.formats.maps import png
-from polcap.images import AngleStack, Floats, Network, ObjectMask
+from polcap.images import AngleStack, Floats, Network, ObjectMask, single_frames
 from polcap.optics import fresnel, mueller
 from polcap.pipeline import models
 from polcap.quality import polarization
@@ -162,8 +162,7 @@ def solved(case: Lit, seed: int) -> Any:
     radiance = AngleStack(
         value=shots.astype(np.float32), variance=variance.astype(np.float32),
         quality=np.zeros(shots.shape[:3], np.uint8), angle=ANGLE, view=scenes.VIEW,
-        exposure_ratio=np.ones((3, 1, 3)), exif_ratio=np.ones((3, 1)), ghost_fraction=np.zeros(3), lossy=False,
-        camera_matrix=None, white_balance=None,
+        bracket=single_frames(3),
     )  # fmt: skip
     object_ = ObjectMask(case.mask, (0, 0, case.mask.shape[1], case.mask.shape[0]), "user")
     return stokes.solve(radiance, scenes.still(), scenes.equal(), object_, stokes.Settings())

@@ -213,7 +213,8 @@ def solving(stack: AngleStack) -> Iterator[Row]:
     moved = still.copy()
     moved[1:, :2, 2] = 0.4, -0.7
     cost = least(theirs)
-    as_given = replace(stack, site_px=None)  # as theirs has it: a superpixel's colors are taken as seen in its middle
+    # as theirs has it: a superpixel's colors are taken as seen in its middle
+    as_given = replace(stack, sensor=replace(stack.sensor, site_px=None))
     for name, given, transform in (
         ("nothing resampled", as_given, still),
         ("colors laid over one another", stack, still),

@@ -20,7 +20,7 @@ import numpy as np
 
 from polcap.errors import ChartError
 from polcap.formats import shipped_data
-from polcap.images import AngleStack, ChartRequest, GBuffer, StokesImage, View
+from polcap.images import AngleStack, ChartRequest, GBuffer, StokesImage, View, single_frames
 from polcap.optics import point_light
 from polcap.stages import whitebalance
 from polcap.stages.cues import scale
@@ -128,12 +128,7 @@ def photograph(scene: Scene, falloff: float, printed: float, random: np.random.G
         quality=np.zeros((1, 480, 640), np.uint8),
         angle=np.zeros(1),
         view=_VIEW,
-        exposure_ratio=np.ones((1, 1, 3)),
-        exif_ratio=np.ones((1, 1)),
-        ghost_fraction=np.zeros(1),
-        lossy=False,
-        camera_matrix=None,
-        white_balance=None,
+        bracket=single_frames(1),
     )
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from polcap.config import Config
 from polcap.errors import CaptureError, InputError
 from polcap.formats.capture import reader as captures
-from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, ObjectMask
+from polcap.images import Alignment, AngleStack, ColorCalibration, Equipment, Floats, ObjectMask
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
@@ -63,7 +63,7 @@ def at_stokes_level(seed: int, angle: Floats, thin: bool, chart: bool) -> Iterat
     """The seed's object without its photographs."""
     case = lit_objects.lit(seed, thin)
     gain = 1 + (0 if chart else 0.02) * np.random.default_rng([seed, 13]).normal(size=len(angle))
-    radiance = replace(lit_objects.stack(case, angle, seed, gain), light="steady" if chart else "flash")
+    radiance = replace(lit_objects.stack(case, angle, seed, gain), equipment=Equipment("steady" if chart else "flash"))
     yield case.look, radiance, scenes.still(len(angle)), lit_objects.object_of(case), scenes.no_color()
 
 

@@ -61,9 +61,9 @@ def test_process_measures_the_blur_that_check_measures(tmp_path: Path) -> None:
     faulty.shoot(tmp_path / "bad", 1, "defocus", 256)
     capture = captures.read(tmp_path / "bad")
     merged = hdr.merge(capture, Config().hdr)
-    assert merged.blur_px is not None and np.nanmax(merged.blur_px) > Config().gates.max_blur_px
+    assert np.nanmax(merged.bracket.blur_px) > Config().gates.max_blur_px
     with ThreadPoolExecutor(2) as pool:
-        np.testing.assert_array_equal(merged.blur_px, reduce(capture, 0.98, pool).blur_px)
+        np.testing.assert_array_equal(merged.bracket.blur_px, reduce(capture, 0.98, pool).blur_px)
 
 
 def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path) -> None:

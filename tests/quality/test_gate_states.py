@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from polcap.config import Config
+from polcap.images import AngleStack
 from polcap.quality import gate as gate_module
 from polcap.quality import gates, geometry, light, polarization, rim
 from polcap.quality.gate import Evidence, Gate
@@ -55,7 +56,7 @@ def in_numpy(value: Any) -> Any:
 
 
 def exposures(*ratio: float, **fields: Any) -> dict[str, Any]:
-    """Fields of merged shots with these exposures relative to the reference's."""
+    """Measurements of brackets with these exposures relative to the reference's."""
     each = np.array(ratio)[None, :, None]
     return {"exposure_ratio": np.tile(each, (3, 1, 3)), "exif_ratio": np.tile(each[..., 0], (3, 1)), **fields}
 
@@ -75,16 +76,16 @@ def clipped(second_shot: float = 0.0) -> Any:
 
 CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields that lead to it
     ("exposures", "pass", {}),
-    ("exposures", "warn", {"radiance": exposures(1.0)}),
-    ("exposures", "warn", {"radiance": exposures(1.0, 1.01, exif_ratio=np.array([[1.0, 4.0]] * 3))}),
-    ("exposures", "warn", {"radiance": exposures(1.0, 1.2)}),
-    ("exposures", "warn", {"radiance": exposures(1.0, 40.0)}),
+    ("exposures", "warn", {"bracket": exposures(1.0)}),
+    ("exposures", "warn", {"bracket": exposures(1.0, 1.01, exif_ratio=np.array([[1.0, 4.0]] * 3))}),
+    ("exposures", "warn", {"bracket": exposures(1.0, 1.2)}),
+    ("exposures", "warn", {"bracket": exposures(1.0, 40.0)}),
     ("tone curve", "pass", {}),
-    ("tone curve", "fail", {"radiance": {"curvature": np.array([[0.0, -0.2]] * 3)}}),
+    ("tone curve", "fail", {"bracket": {"curvature": np.array([[0.0, -0.2]] * 3)}}),
     ("source", "pass", {}),
-    ("source", "warn", {"radiance": {"lossy": True}}),
+    ("source", "warn", {"sensor": {"lossy": True}}),
     ("stillness", "pass", {}),
-    ("stillness", "fail", {"radiance": {"ghost_fraction": np.array([0.0, 0.05, 0.0])}}),
+    ("stillness", "fail", {"bracket": {"ghost_fraction": np.array([0.0, 0.05, 0.0])}}),
     ("chart", "pass", {"color": {"delta_e": np.full(24, 1.0)}}),
     ("chart", "fail", {"color": {"delta_e": np.full(24, 9.0)}}),
     ("chart", "warn", {"chart_missing": "nothing like one"}),
@@ -112,7 +113,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("gains", "pass", {}),
     ("gains", "fail", {"gains": {"gain": np.array([[1.0] * 3, [1.0] * 3, [0.7] * 3])}}),
     ("energy", "pass", {}),
-    ("energy", "fail", {"radiance": {"exposure_ratio": np.array([[[1.0], [4.0]], [[1.0], [4.0]], [[1.0], [6.0]]])}}),
+    ("energy", "fail", {"bracket": {"exposure_ratio": np.array([[[1.0], [4.0]], [[1.0], [4.0]], [[1.0], [6.0]]])}}),
     ("gain doubt", "pass", {}),
     ("gain doubt", "pass", {"gains": {"source": "one exposure"}}),
     ("gain doubt", "fail", {"gains": {"disagreement": 0.05}}),
@@ -144,8 +145,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("noise", "pass", {}),
     ("noise", "fail", {"figures": {"noise": 0.1}}),
     ("noise", "not measured", {"figures": {"noise": NAN}}),
-    ("ambient", "pass", {"radiance": {"ambient_share": np.full(3, 0.001)}}),
-    ("ambient", "fail", {"radiance": {"ambient_share": np.full(3, 0.3)}}),
+    ("ambient", "pass", {"bracket": {"ambient_share": np.full(3, 0.001)}}),
+    ("ambient", "fail", {"bracket": {"ambient_share": np.full(3, 0.3)}}),
     ("ambient", "not measured", {}),
     ("crossed", "pass", {"radiance": {"crossed": True}}),
     ("crossed", "warn", {"radiance": {"crossed": True}, "stokes": SimpleNamespace(body=None)}),
@@ -174,12 +175,18 @@ def fields_in_numpy(value: Any) -> Any:
     return msgspec.structs.replace(value, **numbers) if struct else replace(value, **numbers)
 
 
+def with_field(radiance: AngleStack, name: str, change: dict[str, Any]) -> AngleStack:
+    """Merged shots with fields of one of their parts replaced."""
+    return replace(radiance, **{name: replace(getattr(radiance, name), **change)})
+
+
 @pytest.fixture(scope="module")
 def good() -> dict[str, Any]:
     """The parts of a capture of which every gate passes or has nothing to judge."""
     return {
         "names": ["0°", "45°", "90°"], "focal_doubt": (0.0, 0.0), "grid_px": 1.0, "chart_missing": "",
-        "clipped": clipped(), "blur_px": None, "radiance": replace(scenes.stack(), **exposures(1.0, 4.0)),
+        "clipped": clipped(), "blur_px": np.full((3, 2), np.nan),
+        "radiance": with_field(scenes.stack(), "bracket", exposures(1.0, 4.0)),
         "color": scenes.no_color(), "alignment": scenes.still(), "object_": replace(scenes.ball_object(), doubt=0.01),
         "gains": replace(scenes.equal(), source="grey patches", concentration=0.95),
         "stokes": SimpleNamespace(body=True), "maps": None, "mesh": SimpleNamespace(**MESH),
@@ -200,6 +207,8 @@ def judge(good: dict[str, Any], config: Config, fields: dict[str, Any]) -> list[
     for name, change in fields.items():
         if name == "figures":
             parts[name] = good[name] | change
+        elif name in ("bracket", "sensor"):
+            parts["radiance"] = with_field(parts["radiance"], name, change)
         else:
             parts[name] = replace(good[name], **change) if isinstance(change, dict) else change
     for name in ("color", "gains", "object_", "radiance"):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from polcap.config import Config
-from polcap.images import SurfaceMaps
+from polcap.images import AngleStack, Equipment, SurfaceMaps
 from polcap.quality import gates
 from polcap.quality.gate import Evidence
 from polcap.quality.gates import Gate
@@ -30,7 +30,7 @@ def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> Evidence:
     maps = SurfaceMaps(normal, normal, normal, flat, None, 8 * flat, image.mask, image.view, "analytic")
     given = {
         "names": [f"{np.degrees(a):g}°" for a in radiance.angle], "focal_doubt": (0.0, 0.0), "grid_px": 1.0,
-        "chart_missing": "", "clipped": clipped(), "blur_px": radiance.blur_px, "radiance": radiance,
+        "chart_missing": "", "clipped": clipped(), "blur_px": radiance.bracket.blur_px, "radiance": radiance,
         "color": scenes.no_color(), "alignment": scenes.still(shots), "object_": object_, "gains": gains,
         "stokes": image, "maps": maps,
     }  # fmt: skip
@@ -66,6 +66,11 @@ def changed(good: Evidence, **fields: Any) -> Evidence:
     return Evidence.partial(**{**vars(good), **fields})
 
 
+def bracket(radiance: AngleStack, **measured: Any) -> AngleStack:
+    """A stack of shots whose brackets measured something else."""
+    return replace(radiance, bracket=replace(radiance.bracket, **measured))
+
+
 def test_each_gate_fails_alone(good: Evidence) -> None:
     radiance, gains, maps = good.radiance, good.gains, good.maps
     still = good.alignment
@@ -75,9 +80,9 @@ def test_each_gate_fails_alone(good: Evidence) -> None:
     ratios = np.tile([[[1.0], [4.0]]], (3, 1, 3))
     pairs: dict[str, Any] = {"exposure_ratio": ratios, "exif_ratio": np.array([[1.0, 4.0]] * 3)}
     faults: dict[str, dict[str, Any]] = {
-        "tone curve": {"radiance": replace(radiance, curvature=curved, **pairs)},
-        "stillness": {"radiance": replace(radiance, ghost_fraction=np.array([0.0, 0.05, 0.0]))},
-        "ambient": {"radiance": replace(radiance, ambient_share=np.array([0.2, 0.2, 0.2]))},
+        "tone curve": {"radiance": bracket(radiance, curvature=curved, **pairs)},
+        "stillness": {"radiance": bracket(radiance, ghost_fraction=np.array([0.0, 0.05, 0.0]))},
+        "ambient": {"radiance": bracket(radiance, ambient_share=np.array([0.2, 0.2, 0.2]))},
         "alignment": {"alignment": replace(still, transform=away)},
         "clipping": {"clipped": clipped(0.03)},
         "sharpness": {"blur_px": np.array([[0.0], [2.0], [0.1]])},
@@ -108,7 +113,8 @@ def test_what_follows_a_wrong_order_is_not_judged(good: Evidence) -> None:
 
 def test_flash_bracketed_by_the_shutter_is_named(good: Evidence) -> None:
     alike = np.tile([[[1.0], [1.01], [0.99]]], (3, 1, 3))
-    radiance = replace(good.radiance, exposure_ratio=alike, exif_ratio=np.array([[0.25, 1, 4]] * 3), light="flash")
+    radiance = bracket(good.radiance, exposure_ratio=alike, exif_ratio=np.array([[0.25, 1, 4]] * 3))
+    radiance = replace(radiance, equipment=Equipment("flash"))
     gate = judged(changed(good, radiance=radiance))["exposures"]
     assert gate.state == "warn"
     assert "flash power, aperture or ISO" in gate.remedy

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import CaptureError
+from polcap.images import Equipment
 from polcap.optics import mueller, outline
 from polcap.stages import selfcal, stokes
 from polcap.stages.selfcal import grey_patches, object_gains, order
@@ -95,7 +96,7 @@ def test_an_outline_that_tells_nothing_supports_no_order(sectors):
 
 
 def test_one_exposure_has_one_gain():
-    radiance = dataclasses.replace(scenes.stack(gain=GAIN), light="one exposure")
+    radiance = dataclasses.replace(scenes.stack(gain=GAIN), equipment=Equipment("one exposure"))
     found = solve(radiance, scenes.no_color())
     assert found.source == "one exposure"
     assert (found.gain == 1).all() and (found.sigma == 0).all()
@@ -226,7 +227,8 @@ def test_a_turn_that_the_outline_is_not_sure_of_is_not_applied():
     radiance = scenes.stack(noise=0.002, angles=np.radians([3.0, 48.0, 93.0]))
     clocked = dataclasses.replace(radiance, angle=np.radians([0.0, 45.0, 90.0]))
     assert solve(clocked, scenes.no_color(), correct_ring=False).angle_correction == 0
-    assert solve(dataclasses.replace(clocked, light="one exposure"), scenes.no_color()).angle_correction == 0
+    etched = dataclasses.replace(clocked, equipment=Equipment("one exposure"))
+    assert solve(etched, scenes.no_color()).angle_correction == 0
     cut = dataclasses.replace(scenes.ball_object(), border=0.1)
     found = selfcal.solve(clocked, scenes.still(), cut, scenes.no_color(), selfcal.Settings())
     assert np.degrees(found.angle_correction) == pytest.approx(3.0, abs=0.3)  # the inside tells what the outline cannot

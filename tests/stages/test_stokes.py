@@ -6,7 +6,18 @@ import numpy as np
 import pytest
 
 from polcap.errors import CaptureError
-from polcap.images import AngleStack, CrossedShot, Gains, MaskedImage, ObjectMask, Quality, SensorImage
+from polcap.images import (
+    AngleStack,
+    ColorSensor,
+    CrossedShot,
+    Equipment,
+    Gains,
+    MaskedImage,
+    ObjectMask,
+    Quality,
+    SensorImage,
+    single_frames,
+)
 from polcap.stages import stokes
 from tests import scenes
 
@@ -28,11 +39,8 @@ def seen(angles_deg, dolp, aolp_deg, noise=0.0, seed=0) -> AngleStack:
 
 def scenes_stack(shots: int) -> AngleStack:
     blank = np.zeros((shots, 8, 9, 3), np.float32)
-    none = np.zeros((shots, 1, 3))
-    return AngleStack(
-        blank, blank, np.zeros((shots, 8, 9), np.uint8), np.zeros(shots), scenes.VIEW, none, none[..., 0],
-        np.zeros(shots), False, None, None,
-    )  # fmt: skip
+    none = np.zeros((shots, 8, 9), np.uint8)
+    return AngleStack(blank, blank, none, np.zeros(shots), scenes.VIEW, single_frames(shots))
 
 
 def solve(radiance: AngleStack, gains: Gains | None = None):
@@ -47,7 +55,7 @@ def test_light_that_leaks_through_a_poor_polarizer_is_made_up_for():
     ideal, leaky = seen((0, 45, 90), 0.3, 25), seen((0, 45, 90), 0.3, 25)
     mean = np.array(0.5)
     value = mean + (ideal.value - mean) * contrast  # S0 = 1
-    leaky = dataclasses.replace(leaky, value=value.astype(np.float32), extinction=ratio)
+    leaky = dataclasses.replace(leaky, value=value.astype(np.float32), equipment=Equipment(extinction=ratio))
     found, truth = solve(leaky), solve(ideal)
     assert found.stokes == pytest.approx(truth.stokes, abs=1e-6)
     assert found.covariance[5] == pytest.approx(truth.covariance[5] / contrast**2, rel=1e-5, abs=0)
@@ -65,7 +73,7 @@ def test_colors_of_a_mosaic_are_laid_over_one_another(pattern):
     value = np.repeat(0.5 * shot[None], 3, axis=0)
     radiance = dataclasses.replace(
         scenes_stack(3), value=value, variance=np.full_like(value, 1e-8), quality=np.zeros(value.shape[:3], np.uint8),
-        angle=np.radians([0, 45, 90]), site_px=sensor.site_px,
+        angle=np.radians([0, 45, 90]), sensor=ColorSensor(site_px=sensor.site_px),
     )  # fmt: skip
     object_ = ObjectMask(np.ones((40, 40), bool), (10, 10, 30, 30), "user")
     overturned = np.array([[-1, 0, 39], [0, -1, 39], [0, 0, 1.0]])  # the camera stood upside down, its mosaic too

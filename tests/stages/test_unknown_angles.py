@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import CaptureError
+from polcap.images import Equipment
 from polcap.optics.outline import Rim
 from polcap.stages import selfcal, stokes
 from polcap.stages.selfcal import unknown_angles
@@ -19,7 +20,7 @@ SHOTS = scenes.stack(angles=TRUE)
 def found(shots=5, light="one exposure", **settings):
     radiance = replace(
         SHOTS, value=SHOTS.value[:shots], variance=SHOTS.variance[:shots], quality=SHOTS.quality[:shots],
-        angle=NAMES[:shots], light=light,
+        angle=NAMES[:shots], equipment=Equipment(light),
     )  # fmt: skip
     chosen = selfcal.Settings(unknown_angles=True, **settings)
     return radiance, selfcal.solve(radiance, scenes.still(shots), scenes.ball_object(), scenes.no_color(), chosen)

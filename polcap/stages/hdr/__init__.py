@@ -26,10 +26,12 @@ from msgspec import Meta
 from polcap.errors import CaptureError
 from polcap.images import (
     AngleStack,
-    Calibration,
+    BracketMeasurement,
     Capture,
+    ColorSensor,
     CrossedShot,
     Distortion,
+    Equipment,
     Floats,
     Frame,
     MaskedImage,
@@ -64,7 +66,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = True
 
 
-@stage(version=10)
+@stage(version=11)
 def merge(capture: Capture, settings: Settings) -> AngleStack:
     """Radiance of every shot on the scale of its reference frame.
 
@@ -149,31 +151,34 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
         quality=stack.quality,
         angle=capture.angle,
         view=view,
-        exposure_ratio=np.repeat(np.array(ratios), 3 // shape[0], axis=2),  # a monochrome channel stands in three
-        exif_ratio=np.array([[links.stated(f, shot.frames[reference]) for f in shot.frames] for shot in shots]),
-        ghost_fraction=np.array([np.mean((quality & Quality.GHOST) > 0) for quality in stack.quality]),
-        lossy=read.lossy,
-        camera_matrix=camera[0],
-        white_balance=camera[1],
-        light=_light(capture),
-        curvature=np.array(curvatures),
-        ambient_share=np.array(ambient_shares),
-        blur_px=sharpness.frames_blur(tiles, side),
+        bracket=BracketMeasurement(
+            exposure_ratio=np.repeat(np.array(ratios), 3 // shape[0], axis=2),  # a monochrome channel stands in three
+            exif_ratio=np.array([[links.stated(f, shot.frames[reference]) for f in shot.frames] for shot in shots]),
+            curvature=np.array(curvatures),
+            ghost_fraction=np.array([np.mean((quality & Quality.GHOST) > 0) for quality in stack.quality]),
+            ambient_share=np.array(ambient_shares),
+            blur_px=sharpness.frames_blur(tiles, side),
+        ),
+        sensor=ColorSensor(*camera, site, read.lossy),
+        equipment=_equipment(capture, view),
         offset_px=_offsets(shots) if capture.layout == "sensor" else None,
-        site_px=site,
-        extinction=None if known is None or known.polarizer is None else np.array(known.polarizer.extinction),
-        flash_spread=None if known is None or known.flash is None else known.flash.spread,
-        ring_sigma=None if known is None or known.polarizer is None else np.radians(known.polarizer.zero_sigma_deg),
         crossed=None if crossed is None else CrossedShot(crossed, capture.crossed_angle),
-        distortion=_distortion(known, view),
     )
 
 
-def _distortion(known: Calibration | None, view: View) -> Distortion | None:
-    """What the lens does to the merged picture, whose pinhole is `view`."""
-    if known is None or known.geometry is None:
-        return None
-    return Distortion(view.focal, view.center, known.geometry.k1, known.geometry.k2)
+def _equipment(capture: Capture, view: View) -> Equipment:
+    """Light, lens and polarizer of a capture; the lens on the grid of `view`."""
+    light, known = _light(capture), capture.calibration
+    if known is None:
+        return Equipment(light)
+    ring, lens = known.polarizer, known.geometry
+    return Equipment(
+        light=light,
+        flash_spread=None if known.flash is None else known.flash.spread,
+        extinction=None if ring is None else np.array(ring.extinction),
+        ring_sigma=None if ring is None else np.radians(ring.zero_sigma_deg),
+        distortion=None if lens is None else Distortion(view.focal, view.center, lens.k1, lens.k2),
+    )
 
 
 def _crossed(

@@ -126,12 +126,12 @@ def solve(
     rim = order.rim(light / blind.gain[:, None, None], quality == 0, mask, object_.crop, radiance.value.shape[1:3])
     unnoted: Angles | None = None
     if settings.unknown_angles:
-        known = greys is not None or radiance.light == "one exposure"
+        known = greys is not None or radiance.equipment.light == "one exposure"
         doubt = float(blind.sigma.max()) if known else np.inf
         unnoted = _unnoted(rim, light / blind.gain[:, None, None], mask, quality, doubt, settings)
         radiance = replace(radiance, angle=unnoted.angle)
         facing = object_gains.facing(light, object_gains.inside(mask, quality), radiance.angle)
-    guessed = greys is None and radiance.light != "one exposure"
+    guessed = greys is None and radiance.equipment.light != "one exposure"
     found = order.judge(rim, radiance.angle, settings.order_margin, _GUESSED_ORDER if guessed else _SOLID_ORDER)
     stated: Order = (tuple(range(shots)), False)
     if settings.check_order and found.order != stated:
@@ -145,14 +145,15 @@ def solve(
         ),
     )
     correction = 0.0
-    if radiance.light != "one exposure" or unnoted is not None:  # etched angles stay
-        ring, correction = corrected(ring, radiance.ring_sigma if unnoted is None else unnoted.sigma, settings)
+    if radiance.equipment.light != "one exposure" or unnoted is not None:  # etched angles stay
+        ring_sigma = radiance.equipment.ring_sigma if unnoted is None else unnoted.sigma
+        ring, correction = corrected(ring, ring_sigma, settings)
     angle = radiance.angle + correction
     anchor = object_gains.combined([*_by_law(light, mask, quality, radiance, angle, object_.crop, facing), facing])
     source: Source
     gain: Floats
     sigma: Floats
-    if radiance.light == "one exposure":
+    if radiance.equipment.light == "one exposure":
         gain, sigma, source = np.ones((shots, 3)), np.zeros((shots, 3)), "one exposure"
     elif greys is not None:
         gain, sigma, source = greys.gain, greys.sigma, "grey patches"
@@ -239,7 +240,7 @@ def supported(anchor: Estimate, prior: float) -> Estimate:
 
 def _blind(radiance: AngleStack, greys: GreyPatches | None, facing: Estimate) -> Estimate:
     """Gains (K,) from what knows nothing of the angles."""
-    if radiance.light == "one exposure":
+    if radiance.equipment.light == "one exposure":
         shots = len(radiance.angle)
         return Estimate(np.ones(shots), np.zeros(shots))
     if greys is not None:
@@ -249,9 +250,9 @@ def _blind(radiance: AngleStack, greys: GreyPatches | None, facing: Estimate) ->
 
 def _prior(radiance: AngleStack) -> float:
     """1σ of a shot's light before anything is measured in this capture: of its kind of lamp, or as calibrated."""
-    if radiance.light == "flash" and radiance.flash_spread is not None:
-        return max(2**0.5 * radiance.flash_spread, _LEAST_PRIOR)  # of one pop against another
-    return _PRIOR[radiance.light]
+    if radiance.equipment.light == "flash" and radiance.equipment.flash_spread is not None:
+        return max(2**0.5 * radiance.equipment.flash_spread, _LEAST_PRIOR)  # of one pop against another
+    return _PRIOR[radiance.equipment.light]
 
 
 def corrected(ring: RingZero, calibrated: float | None, settings: Settings) -> tuple[RingZero, float]:

@@ -96,7 +96,7 @@ def solve(
             f"polarizer angles {angles} do not determine the Stokes parameters (condition {condition:.0f}, "
             f"at most {_MOST_CONDITION:g}); shoot angles spread over 180°, such as 0°, 45°, 90°"
         )
-    lens = radiance.distortion if settings.undistort else None
+    lens = radiance.equipment.distortion if settings.undistort else None
     height, width = radiance.value.shape[1:3]
     crop = object_.crop if lens is None else distortion.box_of(lens, object_.crop, (width, height))
     x0, y0, x1, y1 = crop
@@ -118,8 +118,8 @@ def solve(
             fitted = np.einsum("kj,jhwc->khwc", weights_of, solved)
             difference = np.abs(value - fitted).sum(3).mean(0)
             residual[rows] = difference / np.maximum(solved[0].sum(2), 1e-9)
-        if radiance.extinction is not None:
-            _undilute(solved, doubt, radiance.extinction)
+        if radiance.equipment.extinction is not None:
+            _undilute(solved, doubt, radiance.equipment.extinction)
         quality[rows] = _judged(solved, doubt, seen, settings)
     mask = object_.mask[y0:y1, x0:x1]
     if lens is not None:
@@ -157,7 +157,7 @@ def _body(
     picture, transform, share = radiance.crossed.picture, alignment.crossed, gains.crossed.astype(np.float32)
     clipped = (seen & np.uint8(Quality.CLIPPED)) > 0  # nothing is known of polarization there: it faces the camera
     across = np.where(clipped[..., None], 0, crossing.polarized(stokes[1], stokes[2], radiance.crossed.angle))
-    registered = _overlaid(picture.value, transform, radiance.site_px, crop, lens)
+    registered = _overlaid(picture.value, transform, radiance.sensor.site_px, crop, lens)
     value = crossing.body_light(registered * share, across)
     variance = np.maximum(warp(picture.variance, transform, crop, 1, lens), np.float32(1e-14)) * share**2
     quality: Bits = np.zeros(value.shape[:2], np.uint8)
@@ -197,7 +197,7 @@ def _register(
         if mosaic:  # the mean of two or four neighbours, as is usual: splines ring at the edges of so coarse a grid
             shot = warp(radiance.value[k], transform, box, 1, lens)
         else:
-            shot = _overlaid(radiance.value[k], transform, radiance.site_px, box, lens)
+            shot = _overlaid(radiance.value[k], transform, radiance.sensor.site_px, box, lens)
         doubt = warp(radiance.variance[k], transform, box, 1, lens)
         spread = np.float32(shares if mosaic else 1) / gain**2
         np.divide(_rows(shot), np.tile(gain, size[1]), out=_rows(values[k]))

@@ -377,11 +377,11 @@ def _scaling(small: tuple[int, ...], large: tuple[int, ...]) -> Floats:
 def _from_camera(radiance: AngleStack) -> ColorCalibration:
     """The camera's own matrix or white balance with sensor white at 1; else colours as they are."""
     matrix = np.eye(3)
-    known = radiance.camera_matrix is not None or radiance.white_balance is not None
-    if radiance.white_balance is not None:
-        matrix = np.diag(np.asarray(radiance.white_balance, np.float64))
-    if radiance.camera_matrix is not None:
-        matrix = np.asarray(radiance.camera_matrix, np.float64)
+    known = radiance.sensor.camera_matrix is not None or radiance.sensor.white_balance is not None
+    if radiance.sensor.white_balance is not None:
+        matrix = np.diag(np.asarray(radiance.sensor.white_balance, np.float64))
+    if radiance.sensor.camera_matrix is not None:
+        matrix = np.asarray(radiance.sensor.camera_matrix, np.float64)
     return ColorCalibration(
         matrix=matrix / 2,
         quads=None,

@@ -72,7 +72,7 @@ def bracket(quads, settings, seed=0, jitter=0.015, **exif):
 
 def reference_of(stack):
     """Index of the frame whose ratio is 1 by definition."""
-    return int(np.flatnonzero(np.all(stack.exposure_ratio[0] == 1, axis=1))[0])
+    return int(np.flatnonzero(np.all(stack.bracket.exposure_ratio[0] == 1, axis=1))[0])
 
 
 DATA = os.environ.get("POLCAP_DATA")

@@ -67,8 +67,8 @@ def test_hand_held_bracket_is_registered(hand):
     ]
     stack = hdr.merge(capture(frames), hdr.Settings())
     still = hdr.merge(capture([frames[1]]), hdr.Settings())
-    np.testing.assert_allclose(stack.exposure_ratio[0, :, 1], [0.25, 1, 4], rtol=1e-3)
-    assert stack.ghost_fraction[0] < 1e-3
+    np.testing.assert_allclose(stack.bracket.exposure_ratio[0, :, 1], [0.25, 1, 4], rtol=1e-3)
+    assert stack.bracket.ghost_fraction[0] < 1e-3
     y, x = np.mgrid[:640, :800].astype(float)
     full = scene(x, y)
     truth = np.stack([full[0::2, 0::2, 0], (full[0::2, 1::2, 1] + full[1::2, 0::2, 1]) / 2, full[1::2, 1::2, 2]], -1)
@@ -113,10 +113,10 @@ def test_hand_held_nikon_bracket():
     times = {"sample2.dng": 1 / 640, "sample1.dng": 1 / 160, "sample3.dng": 1 / 40}
     frames = [raw_file(folder / n, iso=200.0, exposure_time=t, f_number=6.3) for n, t in times.items()]
     stack = hdr.merge(capture(frames), hdr.Settings())
-    ratio = stack.exposure_ratio[0].mean(axis=1)
+    ratio = stack.bracket.exposure_ratio[0].mean(axis=1)
     assert ratio[1] / ratio[0] == pytest.approx(3.96, rel=0.01)
     assert ratio[2] / ratio[1] == pytest.approx(4.21, rel=0.01)
-    np.testing.assert_allclose(stack.exif_ratio, [[0.25, 1, 4]])
+    np.testing.assert_allclose(stack.bracket.exif_ratio, [[0.25, 1, 4]])
     # what moved is flagged, and hardly anything else: the building above the street has no ghosts
     ghost = (stack.quality[0] & Quality.GHOST) > 0
     assert 0.005 < ghost.mean() < 0.03

@@ -42,7 +42,7 @@ def test_no_bias_from_20_electrons_up_and_honest_variance(name):
     light = quads * exposures[r]
     truth = electrons_to_signal(light, isos[r])
     ratios = (exposures * isos) / (exposures[r] * isos[r])
-    np.testing.assert_allclose(stack.exposure_ratio[0], np.repeat(ratios[:, None], 3, 1), rtol=1e-3)
+    np.testing.assert_allclose(stack.bracket.exposure_ratio[0], np.repeat(ratios[:, None], 3, 1), rtol=1e-3)
     z = scores(stack, truth)
     assert abs(z.mean()) < 0.05
     assert abs(z.var() - 1) < 0.1
@@ -53,7 +53,7 @@ def test_no_bias_from_20_electrons_up_and_honest_variance(name):
         bias = stack.value[0][octave].sum(dtype=np.float64) / truth[octave].sum() - 1
         assert abs(bias) < 0.003, (low, bias)
         low *= 2
-    assert stack.ghost_fraction[0] == 0
+    assert stack.bracket.ghost_fraction[0] == 0
     assert stack.value.dtype == stack.variance.dtype == np.float32
 
 
@@ -101,9 +101,9 @@ def test_flash_makes_the_shutter_time_a_lie():
     frames = [frame(expose(quads, 1, rng), iso=100.0, exposure_time=t, flash_fired=True) for t in (0.001, 0.004, 0.016)]
     stack = hdr.merge(capture(frames), hdr.Settings())
     one = hdr.merge(capture(frames[:1]), hdr.Settings())
-    np.testing.assert_allclose(stack.exposure_ratio, 1, rtol=2e-3)
+    np.testing.assert_allclose(stack.bracket.exposure_ratio, 1, rtol=2e-3)
     r = reference_of(stack)
-    np.testing.assert_allclose(stack.exif_ratio[0], np.array([1, 4, 16]) / 4.0**r)
+    np.testing.assert_allclose(stack.bracket.exif_ratio[0], np.array([1, 4, 16]) / 4.0**r)
     assert np.median(stack.variance / one.variance) == pytest.approx(1 / 3, rel=0.05)
 
 
@@ -115,12 +115,12 @@ def test_metadata_serve_only_where_pixels_cannot_tell_and_no_flash_fired():
         return [frame(expose(dark, e, rng), iso=100.0, exposure_time=e, **exif) for e in (1, 4)]
 
     stack = hdr.merge(capture(frames(flash_fired=False)), hdr.Settings())
-    assert sorted(stack.exposure_ratio[0, :, 0] / stack.exposure_ratio[0, :, 0].min()) == [1, 4]
+    assert sorted(stack.bracket.exposure_ratio[0, :, 0] / stack.bracket.exposure_ratio[0, :, 0].min()) == [1, 4]
     with pytest.raises(CaptureError, match="flash fired"):
         hdr.merge(capture(frames(flash_fired=True)), hdr.Settings())
     rng = np.random.default_rng(0)
     stated = [frame(expose(dark, e, rng), flash_fired=True, exposure=e) for e in (1.0, 4.0)]
-    assert hdr.merge(capture(stated), hdr.Settings()).exposure_ratio.max() in (1, 4)
+    assert hdr.merge(capture(stated), hdr.Settings()).bracket.exposure_ratio.max() in (1, 4)
 
 
 def test_ambient_light_is_subtracted_with_its_variance():
@@ -134,7 +134,7 @@ def test_ambient_light_is_subtracted_with_its_variance():
     ]
     ambient = [frame(expose(room * t / 0.04, 1, rng), iso=100.0, exposure_time=t, flash_fired=False) for t in times]
     stack = hdr.merge(capture(frames, ambient=ambient), hdr.Settings())
-    np.testing.assert_allclose(stack.exposure_ratio, 1, rtol=3e-3)
+    np.testing.assert_allclose(stack.bracket.exposure_ratio, 1, rtol=3e-3)
     z = scores(stack, electrons_to_signal(quads))
     assert abs(z.mean()) < 0.05
     assert abs(z.var() - 1) < 0.1
@@ -163,7 +163,7 @@ def test_shots_share_the_reference_index_and_keep_their_own_flash_energy():
     one, a, _ = bracket(quads, BRACKETS["time"], seed=1)
     two, b, _ = bracket(quads, BRACKETS["time"], seed=2)
     stack = hdr.merge(capture(one, two), hdr.Settings())
-    assert np.all(stack.exposure_ratio[:, 1] == 1)
+    assert np.all(stack.bracket.exposure_ratio[:, 1] == 1)
     clear = ((stack.quality & Quality.CLIPPED) == 0).all(axis=0)
     gain = stack.value[1][clear].sum() / stack.value[0][clear].sum()
     assert gain == pytest.approx(b[1] / a[1], rel=1e-3)
@@ -199,6 +199,6 @@ def test_rendered_captures_give_their_exposure_ratios(name):
     stack = hdr.merge(capture(frames[:3], frames[3:6], frames[6:]), hdr.Settings())
     exposure = np.array([s["relative_exposure"] * s["flash_factor"] for s in shots]).reshape(3, 3)
     expected = np.repeat((exposure / exposure[:, 1:2])[..., None], 3, axis=2)
-    np.testing.assert_allclose(stack.exposure_ratio, expected, rtol=1e-3)
-    assert np.all(stack.ghost_fraction == 0)
+    np.testing.assert_allclose(stack.bracket.exposure_ratio, expected, rtol=1e-3)
+    assert np.all(stack.bracket.ghost_fraction == 0)
     assert not (stack.quality & Quality.CLIPPED).any()

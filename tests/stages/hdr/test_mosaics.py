@@ -117,6 +117,6 @@ def test_three_channel_frames_pass_unbinned_and_lossy_is_told():
         for e in (0.5, 1, 2)
     ]
     stack = hdr.merge(capture(frames), hdr.Settings())
-    assert stack.value.shape == (1, 200, 300, 3) and stack.lossy
+    assert stack.value.shape == (1, 200, 300, 3) and stack.sensor.lossy
     z = scores(stack, light / 2e4)
     assert abs(z.mean()) < 0.05 and abs(z.var() - 1) < 0.1

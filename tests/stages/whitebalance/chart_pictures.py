@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from polcap.formats import shipped_data
-from polcap.images import AngleStack, ChartRequest, Floats, Quality, View
+from polcap.images import AngleStack, ChartRequest, ColorSensor, Floats, Quality, View, single_frames
 from polcap.stages.whitebalance import chart
 
 CLASSIC = shipped_data.colorchecker()
@@ -40,7 +40,10 @@ def draw(homography: Floats, colors: Floats, patch: float = 0.87, card: float = 
     return total / samples**2
 
 
-def stack(image: Floats, view: View | None = None, clip: float = np.inf, **known: Floats) -> AngleStack:
+UNKNOWN = ColorSensor()
+
+
+def stack(image: Floats, view: View | None = None, clip: float = np.inf, sensor: ColorSensor = UNKNOWN) -> AngleStack:
     """One shot of an image in camera channels."""
     height, width = image.shape[:2]
     clipped = (image >= clip).any(axis=-1)
@@ -50,12 +53,8 @@ def stack(image: Floats, view: View | None = None, clip: float = np.inf, **known
         quality=np.where(clipped, int(Quality.CLIPPED), 0).astype(np.uint8)[None],
         angle=np.zeros(1),
         view=view or View(1000.0, (width / 2, height / 2), 2.0),
-        exposure_ratio=np.ones((1, 1, 3)),
-        exif_ratio=np.ones((1, 1)),
-        ghost_fraction=np.zeros(1),
-        lossy=False,
-        camera_matrix=known.get("camera_matrix"),
-        white_balance=known.get("white_balance"),
+        bracket=single_frames(1),
+        sensor=sensor,
     )
 
 

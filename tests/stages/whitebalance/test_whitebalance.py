@@ -8,7 +8,7 @@ import pytest
 
 from polcap.errors import ChartError
 from polcap.formats import shipped_data
-from polcap.images import ChartReference, ChartRequest, ColorCalibration, Floats, View
+from polcap.images import ChartReference, ChartRequest, ColorCalibration, ColorSensor, Floats, View
 from polcap.stages import whitebalance
 from polcap.stages.whitebalance import Settings, chart, chart_in_mask, patches
 from tests.stages.whitebalance.chart_pictures import AUTO, CAMERA, CLASSIC, HEIGHT, WIDTH, draw, photograph, pose, stack
@@ -253,11 +253,11 @@ def test_profile_brings_its_matrix_and_leaves_its_chart_behind():
 def test_without_a_chart_the_camera_is_believed_with_sensor_white_at_one():
     image, _ = plain()
     matrix = np.array([[1.9, -0.7, -0.2], [-0.2, 1.5, -0.3], [0.0, -0.5, 1.5]])
-    known = stack(image, camera_matrix=matrix, white_balance=np.array([2.0, 1, 1.5]))
+    known = stack(image, sensor=ColorSensor(matrix, np.array([2.0, 1, 1.5])))
     color = whitebalance.measure(known, CLASSIC, ChartRequest("none"), Settings())
     assert color.source == "camera"
     assert 2 * color.matrix == pytest.approx(matrix)
-    balance = stack(image, white_balance=np.array([2.0, 1, 1.5]))
+    balance = stack(image, sensor=ColorSensor(white_balance=np.array([2.0, 1, 1.5])))
     color = whitebalance.measure(balance, CLASSIC, ChartRequest("none"), Settings())
     assert 2 * color.matrix == pytest.approx(np.diag([2.0, 1, 1.5]))
     color = whitebalance.measure(stack(image), CLASSIC, ChartRequest("none"), Settings())
