@@ -18,10 +18,7 @@ _FAINT = 0.02  # of white; below, noise and the error of black matter
 def measure(flat: list[Photograph]) -> Falloff:
     """1 + a r² + b r⁴ + c r⁶ per channel, r = 1 in the corners, from the brightest setting that does not clip.
 
-    Raises
-    ------
-    CaptureError
-        Every flat frame is clipped or dark.
+    Raises CaptureError if every flat frame is clipped or dark.
     """
     for group in sorted(by_setting(flat).values(), key=_exposure, reverse=True):
         images = [one.image() for one in group]

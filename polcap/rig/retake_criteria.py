@@ -43,10 +43,7 @@ class RetakeLimits(msgspec.Struct, frozen=True):
 def inspect(path: Path) -> tuple[FrameFacts, Floats]:
     """Facts of a frame, and the frame small and grey (h, w) with black = 0 and saturation = 1.
 
-    Raises
-    ------
-    DecodeError
-        The file is not a RAW, or is damaged.
+    Raises DecodeError if the file is not a RAW, or is damaged.
     """
     file = probe.read(path)
     if file.kind != "raw":

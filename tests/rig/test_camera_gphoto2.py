@@ -71,8 +71,7 @@ def test_the_default_bracket_is_two_stops_around_the_shutter_time(camera: Gphoto
 
 def test_a_camera_that_fails_once_is_connected_again(camera: Gphoto2Camera, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = camera._capture
-    captures = iter([mock.Mock(side_effect=gphoto2.GPhoto2Error(-7)), capture])
-    monkeypatch.setattr(camera, "_capture", lambda: next(captures)())
+    monkeypatch.setattr(camera, "_capture", mock.Mock(side_effect=[gphoto2.GPhoto2Error(-7), capture()]))
     assert camera.shoot(Exposure(), flash=True).data
 
 

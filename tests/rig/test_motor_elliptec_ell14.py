@@ -28,7 +28,7 @@ def device() -> Iterator[devices.Elliptec]:
 
 def motor(device: devices.Elliptec, limit_s: float = 2.0, **settings: Any) -> ElliptecMotor:
     port = Port(device.port, ElliptecMotor.baud, Log(None))
-    return ElliptecMotor(port, ElliptecSettings(**settings), limit_s)
+    return ElliptecMotor(port, ElliptecSettings(timeout=limit_s, **settings))
 
 
 def test_degrees_become_pulses_in_eight_upper_case_digits(device: devices.Elliptec) -> None:

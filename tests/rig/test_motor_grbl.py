@@ -23,7 +23,7 @@ def clock() -> Iterator[virtual.Clock]:
 
 def motor(device: devices.Grbl, limit_s: float = 2.0, **settings: Any) -> GrblMotor:
     port = Port(device.port, GrblMotor.baud, Log(None))
-    return GrblMotor(port, GrblSettings(**settings), limit_s)
+    return GrblMotor(port, GrblSettings(timeout=limit_s, **settings))
 
 
 def test_grbl_s_unit_is_a_degree() -> None:

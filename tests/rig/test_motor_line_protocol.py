@@ -25,7 +25,7 @@ def clock() -> Iterator[virtual.Clock]:
 
 def motor(device: Device, limit_s: float = 2.0, **settings: Any) -> LineMotor:
     port = Port(device.port, LineMotor.baud, Log(None))
-    return LineMotor(port, LineSettings(**settings), limit_s)
+    return LineMotor(port, LineSettings(timeout=limit_s, **settings))
 
 
 def test_words_on_the_wire() -> None:
