@@ -5,13 +5,14 @@ The order of the stages is in `path.py`.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from polcap import report, resource_limits
+from polcap import parallel, report, resource_limits
 from polcap.config import Config, restored
 from polcap.errors import SettingError
 from polcap.formats import calibrations
@@ -55,11 +56,7 @@ def process(
             if until is not None:
                 return None
             cache.begin("write")
-            maps_folder.write(out / "maps", results.maps, results.mesh, results.stokes, results.cues)
-            about = report.document(facts, results, config, timings(out))
-            asset_export.write(out, about, ExportRequest(), results.asset)
-            report.write(out, about, results)
-            _write_profile(out / PROFILE, results.color)
+            about = _write(out, results, facts, config)
             cache.end()
             return about
     except Exception as error:
@@ -76,6 +73,23 @@ def _facts(capture: Capture, supplied: UserInput, config: Config) -> dict[str, A
         "model": report.model_facts(supplied.network),
         "versions": provenance.versions(),
     }
+
+
+def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -> dict[str, Any]:
+    """Write maps, asset, color profile and report; returns report.json's content.
+
+    Files are encoded while figures are measured and the page is drawn: encoders alone do not fill two cores.
+    """
+    about, _ = parallel.both(
+        partial(report.document, facts, results, config, timings(out)),
+        partial(maps_folder.write, out / "maps", results.maps, results.mesh, results.stokes, results.cues),
+    )
+    parallel.both(
+        partial(report.write, out, about, results),
+        partial(asset_export.write, out, about, ExportRequest(), results.asset),
+    )
+    _write_profile(out / PROFILE, results.color)
+    return about
 
 
 def _write_profile(file: Path, color: ColorCalibration) -> None:

@@ -42,8 +42,8 @@ _STEP = 1e-4
 _MOST_STEP = 0.03  # in one go
 COHERENT = 0.25  # share of w_ζ² w* that is positive, below which it is no body's
 _PARTS = 4  # to a side of the object, left out one at a time
-_ERROR = 0.0013  # what gains were wrong by on simulated objects, beside (decision 40)
-_TIMES = 2.0  # their error over the scatter of the parts (decision 40)
+_ERROR = 0.0013  # what gains were wrong by on simulated objects, beside (decision 6)
+_TIMES = 2.0  # their error over the scatter of the parts (decision 6)
 
 
 def gains(light: Floats, usable: Bools, angle: Floats, start: Floats) -> Estimate:

@@ -38,11 +38,11 @@ _CELL_PX = 6  # of the blocks whose means the closure takes: three times the blu
 _PARTS = 12  # of the object, left out one at a time: knows a 1σ to a fifth
 _ANGLE_ERROR = np.radians(0.5)  # 1σ of a ring set against its mark: half of what divides it, a degree; assumed
 _LEAST_RIM, _MOST_RIM = 200, 20_000  # pixels of the outline
-_FACING_ERROR = 0.003  # what facing pixels were wrong by on simulated objects, whatever their scatter (decision 32)
-_ONE_SIDED = 0.02  # the same where slopes lie to one side of them alone, as a ridge's that leans (decision 32)
+_FACING_ERROR = 0.003  # what facing pixels were wrong by on simulated objects, whatever their scatter (decision 6)
+_ONE_SIDED = 0.02  # the same where slopes lie to one side of them alone, as a ridge's that leans (decision 6)
 _RING = (0.006, 0.02)  # polarization of the slopes that are looked at for that
 _OUTLINE_ERROR = 0.002  # of the outline, beside its own scatter
-_OUTLINE_TIMES = 3.0  # its error over the scatter of its parts: what bends one bends its neighbours (decision 32)
+_OUTLINE_TIMES = 3.0  # its error over the scatter of its parts: what bends one bends its neighbours (decision 6)
 _CLOSURE_ERROR = 0.001  # registration and interpolation; assumed, the angles' error is most of its doubt (decision 20)
 
 

@@ -3,7 +3,7 @@
 What `integrability` asks of the gains, Im(w_ζ² w*) = 0, holds for one common turn of the angles only: a ring that is
 off by δ turns w_ζ² w* by 2δ at every pixel. Limbs, edges and highlights are outliers, and neither outline nor
 symmetry is needed, so an object of many thin parts tells as much as a ball. The gains, which act where a surface faces
-the camera, are solved for as well, held by what is known of them (decision 42).
+the camera, are solved for as well, held by what is known of them (decision 26).
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ _ROUNDS = 12
 _SETTLED = 1e-5  # change that ends them
 _MOST_STEP = 0.1  # rad, and of a gain, in one go
 _CORRELATED = 2 * np.pi * integrability.BLUR**2  # px that share their noise
-_FLOOR = np.radians(0.1)  # 1σ where all parts agree (decision 42)
+_FLOOR = np.radians(0.1)  # 1σ where all parts agree (decision 26)
 
 
 def measure(light: Floats, usable: Bools, angle: Floats, gain_sigma: float) -> RingZero:
