@@ -104,6 +104,6 @@ def distance_m(color: ColorCalibration, radiance: AngleStack) -> float | None:
     return None if color.metres_per_px is None else color.metres_per_px * radiance.view.focal
 
 
-def remeshed(stored: SurfaceMaps, mesh: Mesh, settings: surface.Settings) -> Mesh:
+def remeshed(stored: SurfaceMaps, mesh: Mesh, settings: surface.SurfaceSettings) -> Mesh:
     """The mesh of the stored maps and of the depth that maps/ holds."""
     return surface.triangulate(maps_folder.stored_depth(stored, mesh), stored, mesh.metric, settings)

@@ -248,8 +248,8 @@ def integrating() -> Iterator[Row]:
         found[:] = [np.asarray(bilateral_normal_integration(normal, mask, K=camera)[0])]
 
     cost = least(theirs, times=1)
-    ours = least(lambda: surface.integrate(maps, None, surface.Settings()))
-    own = surface.integrate(maps, None, surface.Settings()).depth
+    ours = least(lambda: surface.integrate(maps, None, surface.SurfaceSettings()))
+    own = surface.integrate(maps, None, surface.SurfaceSettings()).depth
     errors = [_spread(np.log(depth[maps.mask] / true[maps.mask])) for depth in (own, found[0])]
     note = f"error {errors[0]:.4f}, theirs {errors[1]:.4f}; ours with the mesh"
     yield Row("depth of 192² from normals", "dbini-torch", ours, cost, note)
