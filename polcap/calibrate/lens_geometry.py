@@ -57,10 +57,7 @@ class BoardView:
 def measure(photographs: list[Photograph], squares: tuple[int, int]) -> LensGeometry:
     """Focal length, principal point, k₁ and k₂ with their 1σ; `squares` are the inner corners across and down.
 
-    Raises
-    ------
-    CaptureError
-        Too few photographs show a board, all have one tilt, or the corners do not fit a flat board.
+    Raises CaptureError if too few photographs show a board, all have one tilt, or the corners do not fit a flat board.
     """
     folder = photographs[0].path.parent
     boards: list[BoardView] = []

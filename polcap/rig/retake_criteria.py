@@ -15,6 +15,7 @@ from polcap.errors import DecodeError
 from polcap.formats.raw import libraw as raw
 from polcap.formats.raw import probe, worker
 from polcap.images import Exif, Floats
+from polcap.optics.resize import area_mean, block_means
 from polcap.rig.exposure_bracket import Exposure
 
 PREVIEW_PX = 480  # width of the small picture
@@ -42,10 +43,7 @@ class RetakeLimits(msgspec.Struct, frozen=True):
 def inspect(path: Path) -> tuple[FrameFacts, Floats]:
     """Facts of a frame, and the frame small and grey (h, w) with black = 0 and saturation = 1.
 
-    Raises
-    ------
-    DecodeError
-        The file is not a RAW, or is damaged.
+    Raises DecodeError if the file is not a RAW, or is damaged.
     """
     file = probe.read(path)
     if file.kind != "raw":
@@ -62,12 +60,9 @@ def measure(path: str) -> worker.Answer:
     clipped = float(np.mean(value >= black + _SATURATED * (white - black)))
     grey = value if value.ndim == 2 else value.mean(-1, dtype=np.float32)
     block = 3 if arrays.get("cfa", grey).shape == (6, 6) else 2  # one cell has all colors
-    height, width = (side // block for side in grey.shape)
-    grey = grey[: block * height, : block * width]
-    cells = cv2.resize(np.asarray(grey, np.float32), (width, height), interpolation=cv2.INTER_AREA)
-    light = (cells - black) / (white - black)
-    small_size = min(width, PREVIEW_PX), round(height * min(width, PREVIEW_PX) / width)
-    small = cv2.resize(light, small_size, interpolation=cv2.INTER_AREA)
+    light = (block_means(np.asarray(grey, np.float32), block) - black) / (white - black)
+    height, width = light.shape
+    small = area_mean(light, (round(height * min(width, PREVIEW_PX) / width), min(width, PREVIEW_PX)))
     return {"clipped": clipped, "sharpness": _sharpness(light)}, {"small": small}
 
 
