@@ -23,7 +23,7 @@ from polcap.stages.infer import Settings as Infer
 from polcap.stages.mask import Settings as Mask
 from polcap.stages.selfcal import Settings as Selfcal
 from polcap.stages.stokes import Settings as Stokes
-from polcap.stages.surface import Settings as Surface
+from polcap.stages.surface import SurfaceSettings
 from polcap.stages.whitebalance import Settings as Whitebalance
 
 S = TypeVar("S", bound=msgspec.Struct)
@@ -139,7 +139,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     selfcal: Selfcal = Selfcal()
     stokes: Stokes = Stokes()
     infer: Infer = Infer()
-    surface: Surface = Surface()
+    surface: SurfaceSettings = SurfaceSettings()
     asset: Asset = Asset()
     gates: Gates = Gates()
 

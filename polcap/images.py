@@ -200,19 +200,29 @@ class Calibration:
 
 
 @dataclass(frozen=True)
+class FrameReading:
+    """How the bytes of a frame's file become pixels."""
+
+    kind: Literal["raw", "photo"] = "raw"
+    encoding: Literal["linear", "srgb"] | None = None  # of a finished picture; None: sRGB for 8 bits, else linear
+    white: float | None = None  # counts; None: the greatest of the type, or as the file states
+    black: float = 0.0  # counts
+    sensor_deg: float | None = None  # degrees; the angle to take out of a polarization sensor's mosaic
+
+
+@dataclass(frozen=True)
 class Frame:
-    """One photograph of a capture, read when asked for."""
+    """One photograph of a capture; a `Decode` function reads its pixels."""
 
     path: str = field(metadata=NOT_IN_KEY)
     exif: Exif
     role: Role
-    digest: str  # of the file's bytes
-    load: Callable[[], SensorImage] = field(compare=False, repr=False, metadata=NOT_IN_KEY)
+    digest: str  # of the file's bytes; then, after spaces, the settings that decide its pixels
     exposure: float | None = None  # stated in capture.toml; relative; overrides EXIF
-    # applies a function (image, **plain options) → plain facts, arrays in the process that decodes; None: load it
-    within: Callable[..., tuple[dict[str, Any], dict[str, NDArray[Any]]]] | None = field(
-        default=None, compare=False, repr=False, metadata=NOT_IN_KEY
-    )
+    reading: FrameReading = field(default=FrameReading(), metadata=NOT_IN_KEY)
+
+
+Decode = Callable[[Frame], SensorImage]  # as `formats.raw.frame_decoder.decode`
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from polcap import Config, images, read_capture
 from polcap.formats import shipped_data
+from polcap.formats.raw import frame_decoder
 from polcap.images import View
 from polcap.optics import frames
 from polcap.pipeline import models
@@ -179,7 +180,7 @@ class Golden:
 def radiance() -> images.AngleStack:
     """The longest exposure of each angle of the bundled capture; sums and quotients of integers, no stage."""
     capture = read_capture(CAPTURE)
-    photographs = [shot.frames[-1].load() for shot in capture.shots]
+    photographs = [frame_decoder.decode(shot.frames[-1]) for shot in capture.shots]
     values, clipped = [], []
     for photograph in photographs:
         count = np.asarray(photograph.value).astype(np.float32)
@@ -226,7 +227,7 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
         return found
 
     def merge() -> Any:
-        return hdr.merge(read_capture(CAPTURE), config.hdr)
+        return hdr.merge(read_capture(CAPTURE), frame_decoder.decode, config.hdr)
 
     def measure() -> Any:
         chart = shipped_data.colorchecker(config.whitebalance.chart)

@@ -18,7 +18,8 @@ from polcap.config import Config
 from polcap.errors import ObjectError
 from polcap.formats import shipped_data
 from polcap.formats.maps import maps_folder
-from polcap.images import AngleStack, Capture, ChartRequest, ColorCalibration, Mesh, Network, SurfaceMaps
+from polcap.formats.raw import frame_decoder
+from polcap.images import AngleStack, Capture, ChartRequest, ColorCalibration, Decode, Mesh, Network, SurfaceMaps
 from polcap.pipeline.cache import MemoryCache, StageReached, StageResult
 from polcap.results import Results
 from polcap.stages import align, asset, cues, hdr, infer, mask, selfcal, stokes, surface, whitebalance
@@ -41,11 +42,17 @@ class UserInput:
     mask_network: Network | None = None  # None: the object is found by its contrast to the backdrop
 
 
-def path(capture: Capture | None, supplied: UserInput, config: Config, cache: MemoryCache) -> Results:
+def path(
+    capture: Capture | None,
+    supplied: UserInput,
+    config: Config,
+    cache: MemoryCache,
+    decode: Decode = frame_decoder.decode,
+) -> Results:
     """The results of all stages, or of the first ones where the cache stops the path."""
     with suppress(StageReached):
         reference = shipped_data.colorchecker(config.whitebalance.chart)
-        radiance = cache.run(hdr.merge, capture, config=config.hdr)
+        radiance = cache.run(hdr.merge, capture, decode, config=config.hdr)
         color = cache.run(whitebalance.measure, radiance, reference, supplied.chart, config=config.whitebalance)
         alignment = cache.run(align.register, radiance, color, config=config.align)
         drawn = cache.derive(on_grid, supplied.mask, radiance)
@@ -97,6 +104,6 @@ def distance_m(color: ColorCalibration, radiance: AngleStack) -> float | None:
     return None if color.metres_per_px is None else color.metres_per_px * radiance.view.focal
 
 
-def remeshed(stored: SurfaceMaps, mesh: Mesh, settings: surface.Settings) -> Mesh:
+def remeshed(stored: SurfaceMaps, mesh: Mesh, settings: surface.SurfaceSettings) -> Mesh:
     """The mesh of the stored maps and of the depth that maps/ holds."""
     return surface.triangulate(maps_folder.stored_depth(stored, mesh), stored, mesh.metric, settings)

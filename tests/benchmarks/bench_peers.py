@@ -28,6 +28,7 @@ import numpy as np
 
 from polcap.formats import shipped_data
 from polcap.formats.capture import reader as captures
+from polcap.formats.raw import frame_decoder
 from polcap.images import (
     Alignment,
     AngleStack,
@@ -65,7 +66,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     folder = bench_speed.made(given.folder, given.megapixels)
     capture = captures.read(folder)
-    stack = hdr.merge(capture, hdr.Settings())
+    stack = hdr.merge(capture, frame_decoder.decode, hdr.Settings())
     rows = []
     for row in chain(solving(stack), charting(stack), registering(stack, folder), merging(capture), integrating()):
         print(table([row]), file=sys.stderr)
@@ -90,10 +91,10 @@ def merging(capture: Capture) -> Iterator[Row]:
 
 def _merges(capture: Capture, times: int = 10) -> tuple[float, float]:
     """CPU seconds of one of several merges, its decoders' among them, and of this process alone."""
-    hdr.merge(capture, hdr.Settings())
+    hdr.merge(capture, frame_decoder.decode, hdr.Settings())
     before, here = bench_speed.tree_cpu(), time.process_time()
     for _ in range(times):
-        hdr.merge(capture, hdr.Settings())
+        hdr.merge(capture, frame_decoder.decode, hdr.Settings())
     return (bench_speed.tree_cpu() - before) / times, (time.process_time() - here) / times
 
 
@@ -247,8 +248,8 @@ def integrating() -> Iterator[Row]:
         found[:] = [np.asarray(bilateral_normal_integration(normal, mask, K=camera)[0])]
 
     cost = least(theirs, times=1)
-    ours = least(lambda: surface.integrate(maps, None, surface.Settings()))
-    own = surface.integrate(maps, None, surface.Settings()).depth
+    ours = least(lambda: surface.integrate(maps, None, surface.SurfaceSettings()))
+    own = surface.integrate(maps, None, surface.SurfaceSettings()).depth
     errors = [_spread(np.log(depth[maps.mask] / true[maps.mask])) for depth in (own, found[0])]
     note = f"error {errors[0]:.4f}, theirs {errors[1]:.4f}; ours with the mesh"
     yield Row("depth of 192² from normals", "dbini-torch", ours, cost, note)

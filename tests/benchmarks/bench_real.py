@@ -18,6 +18,7 @@ import numpy as np
 from polcap.config import Config
 from polcap.formats.capture import reader as captures
 from polcap.formats.maps import png
+from polcap.formats.raw import frame_decoder
 from polcap.images import AngleStack, ChartRequest, Floats
 from polcap.optics import mueller
 from polcap.pipeline import models
@@ -67,7 +68,7 @@ def against_polanalyser(folder: Path) -> None:
 
 
 def merged(folder: Path) -> AngleStack:
-    return hdr.merge(captures.read(folder, None), Config().hdr)
+    return hdr.merge(captures.read(folder, None), frame_decoder.decode, Config().hdr)
 
 
 def residual(radiance: AngleStack) -> float:
