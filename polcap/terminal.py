@@ -131,6 +131,13 @@ def preview(drawn: "list[Path]") -> None:
             console.print(line_)
 
 
+def tell_result(about: dict[str, Any], out: "Path", json: bool) -> None:
+    """The asset's path, or the report, on stdout; the verdict on stderr; a failed gate ends with exit code 3."""
+    say(about if json else str(out / "asset" / f"{about['capture']['name']}.glb"))
+    tell(f"verdict {about['verdict']}; {out / 'report.html'}")
+    tell_gates(about)
+
+
 def tell_gates(about: dict[str, Any]) -> None:
     """Tell failed gates and assumptions; a failed gate ends with exit code 3."""
     failed = 0

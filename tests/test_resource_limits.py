@@ -53,11 +53,11 @@ def test_a_lack_of_memory_is_known_by_whoever_says_it(error: Exception) -> None:
 def test_a_lack_of_memory_names_the_stage_what_it_would_take_and_the_remedy(
     example: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def refine(*_: object) -> None:
+    def register(*_: object) -> None:
         raise MemoryError("Unable to allocate 3.00 GiB for an array with shape (3, 8) and data type float32")
 
     monkeypatch.setattr(planes, "process_memory", lambda: (2_000_000_000, 4_000_000_000))
-    monkeypatch.setattr(registration, "register", refine)
+    monkeypatch.setattr(registration, "register", register)
     capture = read_capture(example)
     with pytest.raises(SettingError) as caught:
         pipeline.process(capture, UserInput(), Config(), tmp_path, until="align")

@@ -1,19 +1,18 @@
 """In: a capture folder. Out: keep or reshoot, and why: `polcap check`."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from polcap import terminal
 from polcap.cli import options
-from polcap.cli.options import Angles, ConfigFile, Json
+from polcap.cli.options import Angles, CaptureFolder, ConfigFile, Json
 from polcap.errors import GateError
 
 
 def check(
     context: typer.Context,
-    capture: Annotated[Path, typer.Argument(help="Folder with the photographs.")],
+    capture: CaptureFolder,
     config: ConfigFile = None,
     assignments: Annotated[
         list[str] | None, typer.Option("--set", metavar="K=V", help="A setting, as gates.max_blur_px=2; repeatable.")

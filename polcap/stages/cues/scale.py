@@ -13,7 +13,7 @@ from polcap.images import ChartLight, ColorCalibration, Floats, StokesImage
 from polcap.optics import point_light
 
 _BULGE = 0.5  # how far the visible surface comes forward on average, in radii: a cone's 1/3 to a ball's 2/3
-_BULGE_SPREAD = 0.4  # 1σ of it over 204 views of training meshes and random shapes (decision 30)
+_BULGE_SPREAD = 0.4  # 1σ of it over 204 views of training meshes and random shapes (decision 8)
 _CHART_SPREAD = 3**-0.5  # radii: 1σ of the depth of a chart that stands anywhere between the object's front and back
 _LARGEST_RADIUS = 0.5  # of an object, in its distances; nearer, the law of the far field ends
 _STEP = 1e-4

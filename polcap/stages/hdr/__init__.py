@@ -28,6 +28,7 @@ from polcap.images import (
     Capture,
     ColorSensor,
     CrossedShot,
+    Decode,
     Distortion,
     Equipment,
     Floats,
@@ -64,7 +65,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @stage(version=11)
-def merge(capture: Capture, settings: Settings) -> AngleStack:
+def merge(capture: Capture, decode: Decode, settings: Settings) -> AngleStack:
     """Radiance of every shot on the scale of its reference frame.
 
     The reference frame is the one of middle brightness in the first shot, and of the same index in every
@@ -78,7 +79,7 @@ def merge(capture: Capture, settings: Settings) -> AngleStack:
     """
     _check_counts(capture.shots)
     shots = (*capture.shots, *(() if capture.crossed is None else (capture.crossed,)))
-    read = Reader((frame for shot in shots for frame in (*shot.frames, *shot.ambient)), settings.clip)
+    read = Reader((frame for shot in shots for frame in (*shot.frames, *shot.ambient)), decode, settings.clip)
     try:
         return _merge(capture, read, settings)
     finally:

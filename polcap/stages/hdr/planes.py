@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from polcap import parallel
 from polcap.errors import CaptureError, SettingError
-from polcap.images import Floats, Frame, SensorImage, Shot
+from polcap.images import Decode, Floats, Frame, SensorImage, Shot
 from polcap.optics import sensor
 from polcap.optics.projection import coordinates
 
@@ -246,9 +246,10 @@ def process_memory() -> tuple[int, int | None]:
 class Reader:
     """Decoded frames: the last few held, the next few being decoded."""
 
-    def __init__(self, coming: Iterable[Frame], clip: float) -> None:
+    def __init__(self, coming: Iterable[Frame], decode: Decode, clip: float) -> None:
         """Frames in the order in which they will be read; counts from `clip` [white level] on are clipped."""
         self.clip = clip
+        self._decode = decode
         self.lossy = False
         self.plan = MemoryPlan()
         self._channels = 0  # of the first frame
@@ -260,7 +261,7 @@ class Reader:
     def __call__(self, frame: Frame) -> SensorImage:
         """Raises DecodeError."""
         if id(frame) not in self._held:
-            decoding = self._decoding.pop(id(frame), None) or self._pool.submit(frame.load)
+            decoding = self._decoding.pop(id(frame), None) or self._pool.submit(self._decode, frame)
             image = decoding.result()
             room = max(1, self.plan.frames // max(image.value.nbytes, 1))
             while len(self._held) >= room:
@@ -299,7 +300,7 @@ class Reader:
         while self._coming and len(self._decoding) < _AHEAD and len(self._held) + len(self._decoding) < room:
             following = self._coming.popleft()
             if id(following) not in self._held:
-                self._decoding[id(following)] = self._pool.submit(following.load)
+                self._decoding[id(following)] = self._pool.submit(self._decode, following)
 
 
 def same_size(name: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> None:

@@ -22,7 +22,7 @@ _FINE = 256  # px of the second look's longer side, at most
 _AGAIN = 2  # looks at what was found; what the hint lacked is found from there
 _ROOM = 0.12  # shown around what the first look found, of its longer side
 _LIKELY = 0.3  # of being the object, for a pixel to be shown to the second look
-_MIRRORED = ((), (0,), (1,), (0, 1))  # axes along which a look is turned round (decision 37)
+_MIRRORED = ((), (0,), (1,), (0, 1))  # axes along which a look is turned round (decision 15)
 
 
 def chances(

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from polcap.images import Floats
 
 _SPECK = 0.01  # of the largest part: smaller ones are no parts of their own
-_LIKELY = 0.3  # chance that a part has somewhere that is more than the backdrop in its color (decision 37)
+_LIKELY = 0.3  # chance that a part has somewhere that is more than the backdrop in its color (decision 15)
 _PINHOLE = 1e-3  # of the mask: smaller holes are dark texture
-_LEEWAY = 1.7  # times the doubt of the network's own mask, given to that of the colors (decision 37)
+_LEEWAY = 1.7  # times the doubt of the network's own mask, given to that of the colors (decision 15)
 _DOUBTED = 0.15  # mean chance of a hole that is a shadowed hollow and no opening
 
 

@@ -20,7 +20,7 @@ from polcap.optics.robust import MAD_TO_SIGMA
 
 _STANDS_OUT = (0.8, 1.6)  # stops above the backdrop that make an object, however even or uneven that is
 _OTHER_CHROMA = 0.15  # |Δr| + |Δg| + |Δb| of r + g + b = 1 that makes another colour
-_SURE = 0.996  # chance from which on, either way, colours decide nothing (decision 37)
+_SURE = 0.996  # chance from which on, either way, colours decide nothing (decision 15)
 _WORK_PIXELS = 3e5  # graph cuts run on an image averaged down to about this
 
 
