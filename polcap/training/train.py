@@ -20,8 +20,8 @@ from polcap.errors import InputError
 from polcap.formats.maps import png
 from polcap.training import arithmetic, export, gbuffers, loop, loss, materials, model
 from polcap.training.dataset import Batch, Simulator
-from polcap.training.variants import VARIANTS
 from polcap.training.validation import HeldOutPictures
+from polcap.training.variants import VARIANTS
 
 
 @dataclass(frozen=True)
