@@ -17,7 +17,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from polcap.errors import ObjectError
-from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Network, ObjectMask
+from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Network, ObjectMask, RunNetwork
 from polcap.optics.warp import warp
 from polcap.stages import stage
 from polcap.stages.mask import network as two_looks
@@ -44,6 +44,7 @@ def segment(
     color: ColorCalibration,
     user_mask: NDArray[np.bool_] | None,
     network: Network | None,
+    run: RunNetwork,
     settings: Settings,
 ) -> ObjectMask:
     """The object on the sum of the aligned shots, and a crop around it.
@@ -82,7 +83,7 @@ def segment(
         mask = standing_out.search(picture, zone, settings.min_area)
         return ObjectMask(mask, _crop(mask, settings.margin), "automatic", None, None, *solid.shape(mask))
     patches = _chart_zone(radiance, color, 0.0)
-    chance = two_looks.chances(radiance, alignment, color, patches, network)
+    chance = two_looks.chances(radiance, alignment, color, patches, network, run)
     mask = solid.body(chance)
     if mask.any():
         colored = solid.cleaned(standing_out.sharpened(picture, mask, patches, chance), chance)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap import parallel
-from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Network
+from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Network, RunNetwork
 from polcap.optics import mueller
 from polcap.optics.resize import area_mean
 from polcap.optics.warp import warp
@@ -26,8 +26,9 @@ _MIRRORED = ((), (0,), (1,), (0, 1))  # axes along which a look is turned round 
 
 
 def chances(
-    radiance: AngleStack, alignment: Alignment, color: ColorCalibration, chart: NDArray[np.uint8], network: Network
-) -> Floats:
+    radiance: AngleStack, alignment: Alignment, color: ColorCalibration, chart: NDArray[np.uint8], network: Network,
+    run: RunNetwork,
+) -> Floats:  # fmt: skip
     """Chance (H, W) 0…1 of each pixel of the reference grid to be the object.
 
     Parameters
@@ -38,13 +39,15 @@ def chances(
         (H, W) 1 where the chart lies.
     network
         Looks at the whole picture, then again at what it found.
+    run
+        Runs a network.
     """
     height, width = chart.shape
     whole = (0, 0, width, height)
     longest = int(network.metadata["native_size"])
     seen = look(radiance, alignment, color, chart, whole, longest)
     bright = brightness(seen.color)
-    found = _run(network, encode(seen, bright))
+    found = _run(network, run, encode(seen, bright))
     out = _resized(found, whole)
     for _ in range(_AGAIN):
         box = around(out > _LIKELY)
@@ -54,7 +57,7 @@ def chances(
         seen = look(radiance, alignment, color, chart, box, _FINE)
         hint = area_mean(out[y0:y1, x0:x1], seen.chart.shape)
         out = np.minimum(out, _LIKELY)  # of what lies beyond the box
-        out[y0:y1, x0:x1] = _resized(_run(network, encode(seen, bright, hint)), box)
+        out[y0:y1, x0:x1] = _resized(_run(network, run, encode(seen, bright, hint)), box)
     return out
 
 
@@ -108,21 +111,21 @@ def around(likely: NDArray[np.bool_]) -> Box | None:
     )  # fmt: skip
 
 
-def _run(network: Network, channels: Floats) -> Floats:
+def _run(network: Network, run: RunNetwork, channels: Floats) -> Floats:
     """The chance at each pixel, (H, W), of channels of any size: mean logit of the picture and its mirror images."""
-    logits = parallel.results([partial(_logit, network, channels, axes) for axes in _MIRRORED], network.at_once)
+    logits = parallel.results([partial(_logit, network, run, channels, axes) for axes in _MIRRORED], network.at_once)
     total = np.zeros(channels.shape[1:], np.float32)
     for logit in logits:
         total += logit / len(_MIRRORED)
     return np.asarray(1 / (1 + np.exp(-total)), np.float32)
 
 
-def _logit(network: Network, channels: Floats, axes: tuple[int, ...]) -> Floats:
+def _logit(network: Network, run: RunNetwork, channels: Floats, axes: tuple[int, ...]) -> Floats:
     """What the network answers to the picture mirrored along these axes, mirrored back, (H, W)."""
     height, width = channels.shape[1:]
     more = [(0, -n % SIZE_MULTIPLE) for n in (height, width)]
     shown = np.pad(mirrored(channels, axes), [(0, 0), *more], mode="edge")
-    logit = network.run(shown[None])["logit"][0, 0, :height, :width]
+    logit = run(network, shown[None])["logit"][0, 0, :height, :width]
     return np.flip(np.clip(logit, -30, 30), axes)
 
 
