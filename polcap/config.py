@@ -20,7 +20,7 @@ from polcap.stages.align import Settings as Align
 from polcap.stages.asset import Settings as Asset
 from polcap.stages.hdr import Settings as Hdr
 from polcap.stages.infer import Settings as Infer
-from polcap.stages.mask import Settings as Mask
+from polcap.stages.mask import MaskSettings
 from polcap.stages.selfcal import Settings as Selfcal
 from polcap.stages.stokes import Settings as Stokes
 from polcap.stages.surface import SurfaceSettings
@@ -135,7 +135,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     hdr: Hdr = Hdr()
     whitebalance: Whitebalance = Whitebalance()
     align: Align = Align()
-    mask: Mask = Mask()
+    mask: MaskSettings = MaskSettings()
     selfcal: Selfcal = Selfcal()
     stokes: Stokes = Stokes()
     infer: Infer = Infer()

@@ -68,7 +68,6 @@ LIMITS: dict[str, dict[str, Limit]] = {  # stage → array → limit; the first 
     },
     "mask": {
         "mask": BITS,
-        "chance": Limit("absolute", 1.0, 1e-3, sensitive=True),  # 8-bit: one level of 255
         "crop": Limit("absolute", 1.0),  # follows the outermost pixel of the mask
     },
     "selfcal": {"*angle*": Limit("degrees", 0.02)},  # under a tenth of its 1σ
