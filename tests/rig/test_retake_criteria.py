@@ -14,7 +14,7 @@ from polcap.images import Exif
 from polcap.rig import retake_criteria
 from polcap.rig.camera import CameraFile
 from polcap.rig.exposure_bracket import Exposure
-from polcap.rig.retake_criteria import FrameFacts, RetakeLimits
+from polcap.rig.retake_criteria import FrameFacts
 from tests.rig.pool import ANGLES, Key, tiny
 
 SET = Exposure(time_s=0.02, f_number=11.0, iso=100.0)
@@ -27,7 +27,7 @@ def facts(digest: str = "a", clipped: float = 0.0, **exif: object) -> FrameFacts
 
 
 def judged(frame: FrameFacts, *others: FrameFacts, flash: bool = True, shortest: bool = False) -> str | None:
-    return retake_criteria.retake_reason(frame, SET, flash, shortest, others, RetakeLimits())
+    return retake_criteria.retake_reason(frame, SET, flash, shortest, list(others), sharpest=0.5)
 
 
 def test_a_frame_as_asked_passes() -> None:
@@ -65,15 +65,14 @@ def test_a_flash_that_fires_in_an_ambient_frame_is_refused() -> None:
 
 def test_sharpness_is_equal_at_every_angle_and_falls_with_blur(pool: dict[Key, bytes], tmp_path: Path) -> None:
     file = tmp_path / "x.dng"
-    limits = RetakeLimits()
     for step in (1, 2):
         sharp = []
         for angle in ANGLES:
             file.write_bytes(pool["shot", angle, step])
             sharp.append(retake_criteria.inspect(file)[0].sharpness)
-        assert not retake_criteria.is_blurred(min(sharp), max(sharp), limits)
+        assert not retake_criteria.is_blurred(min(sharp), max(sharp))
         blur(file, tmp_path / "y.dng", 2.0)
-        assert retake_criteria.is_blurred(retake_criteria.inspect(tmp_path / "y.dng")[0].sharpness, max(sharp), limits)
+        assert retake_criteria.is_blurred(retake_criteria.inspect(tmp_path / "y.dng")[0].sharpness, max(sharp))
 
 
 def _write(path: Path, mosaic: np.ndarray) -> None:

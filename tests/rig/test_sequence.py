@@ -59,7 +59,7 @@ class Rig:
         monkeypatch.setattr("polcap.rig.device_urls.open_rotator", lambda url, log: self.turner)
 
     def shoot(self, order: CaptureOrder = ORDER, resume: bool = False, **options: int) -> dict[str, Any]:
-        return sequence.shoot(self.folder, order, resume=resume, tell=self.messages.append, **options)  # type: ignore[arg-type]
+        return sequence.shoot(self.folder, order, resume=resume, tell=self.messages.append, **options)
 
     def again(self) -> dict[str, Any]:
         self.camera, self.turner = PoolCamera(self.pool), Turner()
@@ -126,6 +126,7 @@ def test_time_of_a_plan_is_the_sum_of_its_parts() -> None:
     assert planned["frames"] == 9
     assert planned["seconds"] == pytest.approx(360 / 430 + 90 / 430 + 2 * 0.2 + 9 * 2 + 3 * 0.105 + 1.0)
     assert "about a minute" in dry_run.table(planned)
+    assert [dry_run.minutes(seconds) for seconds in (40, 99.6, 60)] == ["0:40", "1:40", "1:00"]
 
 
 @pytest.mark.parametrize(
