@@ -69,10 +69,12 @@ LIMITS: dict[str, dict[str, Limit]] = {  # stage → array → limit; the first 
     },
     "mask": {
         "mask": BITS,
-        "chance": Limit("absolute", 1.0, 1e-3, sensitive=True),  # 8-bit: one level of 255
         "crop": Limit("absolute", 1.0),  # follows the outermost pixel of the mask
     },
-    "selfcal": {"*angle*": Limit("degrees", 0.02)},  # under a tenth of its 1σ
+    "selfcal": {  # degrees: under a tenth of their 1σ
+        "*angle": Limit("degrees", 0.02),
+        "ring.*": Limit("degrees", 0.02),
+    },
     "stokes": {"quality": BITS, "mask": BITS, "*": FLOAT32},
     "cues": {"quality": BITS, "mask": BITS, "*": FLOAT32},
     "infer": {
@@ -219,7 +221,8 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
     registered = replace(scenes.still(), transform=inputs["transform"])
     x0, y0, x1, y1 = (int(edge) for edge in inputs["crop"])
     object_ = images.ObjectMask(inputs["mask"], (x0, y0, x1, y1), "automatic")
-    gains = replace(scenes.equal(), gain=inputs["gain"], sigma=inputs["sigma"])
+    equal = scenes.equal(gain=inputs["gain"])
+    calibration = replace(equal, gains=replace(equal.gains, sigma=inputs["sigma"]))
 
     def network() -> images.Network:
         found = models.load_network("network", None, "cpu", threads)
@@ -244,7 +247,7 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
         return selfcal.solve(shots(), registered, object_, color, config.selfcal)
 
     def solve() -> Any:
-        return stokes.solve(shots(), registered, gains, object_, config.stokes)
+        return stokes.solve(shots(), registered, calibration, object_, config.stokes)
 
     def compute() -> Any:
         return cues.compute(plain_stokes(shots(), object_), color)
@@ -400,13 +403,13 @@ def make_inputs() -> Arrays:
     color = whitebalance.measure(shots, chart, images.ChartRequest("auto"), config.whitebalance)
     registered = align.register(shots, color, config.align)
     object_ = mask.segment(shots, registered, color, None, models.load_mask_network(1), onnx.run, config.mask)
-    gains = selfcal.solve(shots, registered, object_, color, config.selfcal)
+    calibration = selfcal.solve(shots, registered, object_, color, config.selfcal)
     assert color.quads is not None and color.corners is not None and color.light is not None
     found = {f"light.{name}": array for name, array in vars(color.light).items()}
     found |= {"matrix": color.matrix, "quads": color.quads, "corners": color.corners}
     found |= {"transform": registered.transform, "mask": object_.mask, "crop": np.array(object_.crop)}
-    found |= {"gain": gains.gain, "sigma": gains.sigma}
-    seen = cues.compute(stokes.solve(shots, registered, gains, object_, config.stokes), color)
+    found |= {"gain": calibration.gains.gain, "sigma": calibration.gains.sigma}
+    seen = cues.compute(stokes.solve(shots, registered, calibration, object_, config.stokes), color)
     inside = seen.mask[::STEP, ::STEP]
     found["cues.mask"] = inside
     found["cues.radiance"] = short(seen.radiance[::STEP, ::STEP] * inside[..., None])

@@ -36,7 +36,7 @@ from polcap.stages import align, asset, cues, hdr, infer, mask, selfcal, stokes,
 
 AUTO = ChartRequest("auto")
 _FIELD = {  # of `Results`, by stage
-    "hdr": "radiance", "whitebalance": "color", "align": "alignment", "mask": "object_", "selfcal": "gains",
+    "hdr": "radiance", "whitebalance": "color", "align": "alignment", "mask": "object_", "selfcal": "selfcal",
     "stokes": "stokes", "cues": "cues", "infer": "maps", "surface": "mesh", "asset": "asset",
 }  # fmt: skip
 STAGES = tuple(_FIELD)
@@ -69,8 +69,8 @@ def path(
         drawn = cache.derive(on_grid, supplied.mask, radiance)
         finder = supplied.mask_network
         object_ = cache.run(mask.segment, radiance, alignment, color, drawn, finder, run, config=config.mask)
-        gains = cache.run(selfcal.solve, radiance, alignment, object_, color, config=config.selfcal)
-        stokes_ = cache.run(stokes.solve, radiance, alignment, gains, object_, config=config.stokes)
+        calibration = cache.run(selfcal.solve, radiance, alignment, object_, color, config=config.selfcal)
+        stokes_ = cache.run(stokes.solve, radiance, alignment, calibration, object_, config=config.stokes)
         cues_ = cache.run(cues.compute, stokes_, color)
         maps = cache.run(infer.estimate, cues_, supplied.network, run, config=config.infer)
         distance = cache.derive(distance_m, color, radiance)

@@ -166,12 +166,13 @@ def solved(case: Lit, seed: int) -> Any:
         bracket=single_frames(3),
     )  # fmt: skip
     object_ = ObjectMask(case.mask, (0, 0, case.mask.shape[1], case.mask.shape[0]), "user")
-    return stokes.solve(radiance, scenes.still(), scenes.equal(), object_, stokes.Settings())
+    return stokes.solve(radiance, scenes.still(), scenes.equal(), object_, stokes.StokesSettings())
 
 
 def _spoken(image: Any) -> dict[str, str]:
-    settings = infer.Settings(symmetries=1, fine=False)
-    maps = infer.estimate(cues.compute(image, scenes.no_color()), _network(), onnx.run, settings)
+    maps = infer.estimate(
+        cues.compute(image, scenes.no_color()), _network(), onnx.run, infer.InferSettings(symmetries=1, fine=False)
+    )
     found = Evidence.partial(
         stokes=image, radiance=SimpleNamespace(angle=ANGLE), gains=scenes.equal(), names=["0°", "45°", "90°"], maps=maps
     )
