@@ -21,10 +21,10 @@ from polcap.stages.asset import Settings as Asset
 from polcap.stages.hdr import Settings as Hdr
 from polcap.stages.infer import Settings as Infer
 from polcap.stages.mask import Settings as Mask
-from polcap.stages.selfcal import Settings as Selfcal
-from polcap.stages.stokes import Settings as Stokes
-from polcap.stages.surface import Settings as Surface
-from polcap.stages.whitebalance import Settings as Whitebalance
+from polcap.stages.selfcal import SelfcalSettings
+from polcap.stages.stokes import StokesSettings
+from polcap.stages.surface import SurfaceSettings
+from polcap.stages.whitebalance import WhitebalanceSettings
 
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -133,13 +133,13 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Every setting of a run."""
 
     hdr: Hdr = Hdr()
-    whitebalance: Whitebalance = Whitebalance()
+    whitebalance: WhitebalanceSettings = WhitebalanceSettings()
     align: Align = Align()
     mask: Mask = Mask()
-    selfcal: Selfcal = Selfcal()
-    stokes: Stokes = Stokes()
+    selfcal: SelfcalSettings = SelfcalSettings()
+    stokes: StokesSettings = StokesSettings()
     infer: Infer = Infer()
-    surface: Surface = Surface()
+    surface: SurfaceSettings = SurfaceSettings()
     asset: Asset = Asset()
     gates: Gates = Gates()
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from polcap import Config, images, read_capture
 from polcap.formats import shipped_data
+from polcap.formats.raw import frame_decoder
 from polcap.images import View
 from polcap.optics import frames
 from polcap.pipeline import models
@@ -71,7 +72,10 @@ LIMITS: dict[str, dict[str, Limit]] = {  # stage → array → limit; the first 
         "chance": Limit("absolute", 1.0, 1e-3, sensitive=True),  # 8-bit: one level of 255
         "crop": Limit("absolute", 1.0),  # follows the outermost pixel of the mask
     },
-    "selfcal": {"*angle*": Limit("degrees", 0.02)},  # under a tenth of its 1σ
+    "selfcal": {  # degrees: under a tenth of their 1σ
+        "*angle": Limit("degrees", 0.02),
+        "ring.*": Limit("degrees", 0.02),
+    },
     "stokes": {"quality": BITS, "mask": BITS, "*": FLOAT32},
     "cues": {"quality": BITS, "mask": BITS, "*": FLOAT32},
     "infer": {
@@ -179,7 +183,7 @@ class Golden:
 def radiance() -> images.AngleStack:
     """The longest exposure of each angle of the bundled capture; sums and quotients of integers, no stage."""
     capture = read_capture(CAPTURE)
-    photographs = [shot.frames[-1].load() for shot in capture.shots]
+    photographs = [frame_decoder.decode(shot.frames[-1]) for shot in capture.shots]
     values, clipped = [], []
     for photograph in photographs:
         count = np.asarray(photograph.value).astype(np.float32)
@@ -218,7 +222,8 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
     registered = replace(scenes.still(), transform=inputs["transform"])
     x0, y0, x1, y1 = (int(edge) for edge in inputs["crop"])
     object_ = images.ObjectMask(inputs["mask"], (x0, y0, x1, y1), "automatic")
-    gains = replace(scenes.equal(), gain=inputs["gain"], sigma=inputs["sigma"])
+    equal = scenes.equal(gain=inputs["gain"])
+    calibration = replace(equal, gains=replace(equal.gains, sigma=inputs["sigma"]))
 
     def network() -> images.Network:
         found = models.load_network("network", None, "cpu", threads)
@@ -226,7 +231,7 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
         return found
 
     def merge() -> Any:
-        return hdr.merge(read_capture(CAPTURE), config.hdr)
+        return hdr.merge(read_capture(CAPTURE), frame_decoder.decode, config.hdr)
 
     def measure() -> Any:
         chart = shipped_data.colorchecker(config.whitebalance.chart)
@@ -243,7 +248,7 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
         return selfcal.solve(shots(), registered, object_, color, config.selfcal)
 
     def solve() -> Any:
-        return stokes.solve(shots(), registered, gains, object_, config.stokes)
+        return stokes.solve(shots(), registered, calibration, object_, config.stokes)
 
     def compute() -> Any:
         return cues.compute(plain_stokes(shots(), object_), color)
@@ -399,13 +404,13 @@ def make_inputs() -> Arrays:
     color = whitebalance.measure(shots, chart, images.ChartRequest("auto"), config.whitebalance)
     registered = align.register(shots, color, config.align)
     object_ = mask.segment(shots, registered, color, None, models.load_mask_network(1), config.mask)
-    gains = selfcal.solve(shots, registered, object_, color, config.selfcal)
+    calibration = selfcal.solve(shots, registered, object_, color, config.selfcal)
     assert color.quads is not None and color.corners is not None and color.light is not None
     found = {f"light.{name}": array for name, array in vars(color.light).items()}
     found |= {"matrix": color.matrix, "quads": color.quads, "corners": color.corners}
     found |= {"transform": registered.transform, "mask": object_.mask, "crop": np.array(object_.crop)}
-    found |= {"gain": gains.gain, "sigma": gains.sigma}
-    seen = cues.compute(stokes.solve(shots, registered, gains, object_, config.stokes), color)
+    found |= {"gain": calibration.gains.gain, "sigma": calibration.gains.sigma}
+    seen = cues.compute(stokes.solve(shots, registered, calibration, object_, config.stokes), color)
     inside = seen.mask[::STEP, ::STEP]
     found["cues.mask"] = inside
     found["cues.radiance"] = short(seen.radiance[::STEP, ::STEP] * inside[..., None])

@@ -1,4 +1,4 @@
-"""The doctor says what is broken, and only what `polcap process` needs is a fault."""
+"""`polcap doctor` finds defects; only those that stop `polcap process` are faults."""
 
 import json
 import shutil
@@ -34,7 +34,7 @@ def test_this_machine_can_process(tmp_path: Path) -> None:
     assert not any(tmp_path.iterdir())
 
 
-def test_ports_and_cameras_tell_who_answers(tmp_path: Path) -> None:
+def test_ports_and_cameras_are_listed_with_what_answers(tmp_path: Path) -> None:
     answers = {"/dev/ttyUSB0": "Elliptec ELL14", "/dev/ttyUSB1": None}
 
     def probe(url: str) -> str | None:
@@ -62,7 +62,7 @@ def test_no_port_is_written_to_without_leave(tmp_path: Path) -> None:
     )
 
 
-def test_rig_that_is_not_there_is_no_fault(tmp_path: Path) -> None:
+def test_a_missing_rig_is_no_fault(tmp_path: Path) -> None:
     def cameras() -> list[tuple[str, str]]:
         raise SettingError("gphoto2 is not installed; pip install 'polcap[rig]'")
 

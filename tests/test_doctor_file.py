@@ -1,4 +1,4 @@
-"""`polcap doctor FILE` tells in seconds whether a photograph can be used, and why not."""
+"""`polcap doctor FILE` reports whether a photograph can be used, and why not."""
 
 from pathlib import Path
 
@@ -14,12 +14,12 @@ from polcap.images import Exif
 from tests.conftest import Command
 
 
-def told(file: Path) -> dict[str, Finding]:
+def findings(file: Path) -> dict[str, Finding]:
     return {one.name: one for one in examine_file(file)}
 
 
 def test_a_sound_raw_is_ok_throughout(example: Path) -> None:
-    found = told(sorted(example.rglob("*.DNG"))[0])
+    found = findings(sorted(example.rglob("*.DNG"))[0])
     assert {one.state for one in found.values()} == {"ok"}
     assert found["pattern"].message.startswith("Bayer")
 
@@ -29,10 +29,10 @@ def test_a_cut_file_and_a_text_are_faults(example: Path, tmp_path: Path) -> None
     (tmp_path / "cut.dng").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "notes.txt").write_text("f/11")
     for name in ("cut.dng", "notes.txt", "."):
-        assert any(one.state == "fault" and one.remedy for one in told(tmp_path / name).values())
+        assert any(one.state == "fault" and one.remedy for one in findings(tmp_path / name).values())
 
 
-def test_an_over_exposed_frame_and_a_monochrome_one_are_told(tmp_path: Path) -> None:
+def test_an_over_exposed_frame_and_a_monochrome_one_are_warnings(tmp_path: Path) -> None:
     dng.write(
         tmp_path / "white.dng",
         np.full((64, 64), 4095, np.uint16),
@@ -43,9 +43,9 @@ def test_an_over_exposed_frame_and_a_monochrome_one_are_told(tmp_path: Path) -> 
         color_matrix=np.eye(3),
         as_shot_neutral=np.ones(3),
     )
-    assert told(tmp_path / "white.dng")["levels"].state == "warning"
+    assert findings(tmp_path / "white.dng")["levels"].state == "warning"
     png.write(tmp_path / "grey.png", np.tile(np.arange(64, dtype=np.uint16) * 900, (64, 1))[..., None].repeat(3, 2))
-    assert "monochrome" in told(tmp_path / "grey.png")["pattern"].message
+    assert "monochrome" in findings(tmp_path / "grey.png")["pattern"].message
 
 
 @pytest.mark.parametrize(("shape", "name"), [((6, 6), "6×6"), (None, "Foveon"), ((4, 4), "4×4")])

@@ -19,8 +19,7 @@ from typing import Any, Literal
 import msgspec
 
 from polcap.errors import InputError, PolcapError, StorageError
-from polcap.formats import atomic
-from polcap.formats.capture import own_folders
+from polcap.formats import atomic, own_folders
 from polcap.images import ChartRequest, Network
 from polcap.pipeline import unchanged
 from polcap.pipeline.cache import fingerprint

@@ -43,12 +43,8 @@ def measure(
     `polarizer/pol…` if no `axis…` folder states it, from image x towards image up. squares : inner corners of the
     checkerboard in `lens/`.
 
-    Raises
-    ------
-    CaptureError
-        The folder holds none of the folders above, or photographs that do not show their quantity.
-    DecodeError
-        A photograph cannot be read.
+    Raises CaptureError if the folder holds none of these folders, or photographs that do not show their quantity;
+    DecodeError if a photograph cannot be read.
     """
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder; give the one that holds {', '.join(_FOLDERS)}")

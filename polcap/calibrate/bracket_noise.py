@@ -45,10 +45,7 @@ class BracketTiles:
 def brackets(folder: Path) -> list[list[Photograph]]:
     """The photographs of every bracket, darkest first: of `bracket/` itself and of each of its sub-folders.
 
-    Raises
-    ------
-    CaptureError
-        There is none.
+    Raises CaptureError if there is none.
     """
     children = layouts.children(folder)
     folders = [path for path in children if path.is_dir()]
@@ -62,10 +59,7 @@ def brackets(folder: Path) -> list[list[Photograph]]:
 def measure(brackets: list[list[Photograph]]) -> tuple[NoiseLine, ...]:
     """Noise line of every ISO with two exposures of one bracket.
 
-    Raises
-    ------
-    CaptureError
-        No two frames of a bracket share an ISO, or they moved, or the scene has one brightness.
+    Raises CaptureError if no two frames of a bracket share an ISO, if they moved, or the scene has one brightness.
     """
     tiles: dict[float, list[BracketTiles]] = {}
     sites: Floats = np.ones(3)

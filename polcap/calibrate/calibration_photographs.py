@@ -39,10 +39,7 @@ class Photograph:
 def photographs_in(folder: Path) -> list[Photograph]:
     """The RAW photographs of a folder in the order of their names.
 
-    Raises
-    ------
-    CaptureError
-        There is none, or the folder cannot be listed.
+    Raises CaptureError if there is none, or the folder cannot be listed.
     """
     paths = sorted(
         (path for path in layouts.children(folder) if path.is_file()), key=lambda one: layouts.natural(one.name)

@@ -13,10 +13,7 @@ _CLIPPED = 0.01
 def measure(photographs: list[Photograph]) -> FlashEnergy:
     """1σ of the energy relative to its mean, and the drift; from the largest series of one exposure setting.
 
-    Raises
-    ------
-    CaptureError
-        Fewer than four frames of one setting, or over-exposed ones.
+    Raises CaptureError for fewer than four frames of one setting, or over-exposed ones.
     """
     group = max(by_setting(photographs).values(), key=len)
     if len(group) < _LEAST:

@@ -31,7 +31,7 @@ from polcap.images import (
 )
 from polcap.optics import distortion, sensor
 from polcap.stages import whitebalance
-from polcap.stages.whitebalance import chart
+from polcap.stages.whitebalance import WhitebalanceSettings, chart
 
 _LEAST_BOARDS = 6  # three tilts determine a pinhole; the others show its error
 _MOST_FOCAL_SIGMA = 0.01  # relative; beyond, EXIF is better
@@ -57,10 +57,7 @@ class BoardView:
 def measure(photographs: list[Photograph], squares: tuple[int, int]) -> LensGeometry:
     """Focal length, principal point, k₁ and k₂ with their 1σ; `squares` are the inner corners across and down.
 
-    Raises
-    ------
-    CaptureError
-        Too few photographs show a board, all have one tilt, or the corners do not fit a flat board.
+    Raises CaptureError if too few photographs show a board, all have one tilt, or the corners do not fit a flat board.
     """
     folder = photographs[0].path.parent
     boards: list[BoardView] = []
@@ -173,7 +170,10 @@ def _color_checker(image: SensorImage) -> BoardView | None:
         return None
     try:
         found = whitebalance.measure(
-            _as_stack(value, image), shipped_data.colorchecker(), ChartRequest("auto"), whitebalance.Settings()
+            _as_stack(value, image),
+            shipped_data.colorchecker(),
+            ChartRequest("auto"),
+            WhitebalanceSettings(),
         )
     except ChartError:
         return None

@@ -25,10 +25,7 @@ _LEAST_RANGE = 2.0  # brightest over darkest tile: a line needs two ends
 def measure(flat: list[Photograph], dark: list[Photograph]) -> tuple[NoiseLine, ...]:
     """Noise line of every ISO with a pair of flat frames.
 
-    Raises
-    ------
-    CaptureError
-        No two flat frames have the same setting, or all have one brightness.
+    Raises CaptureError if no two flat frames have the same setting, or all have one brightness.
     """
     lines = []
     for iso in sorted({one.setting[0] for one in flat}):

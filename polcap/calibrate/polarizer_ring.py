@@ -47,10 +47,7 @@ class _MalusFit:
 def measure(turned: list[PolarizerShot]) -> Polarizer:
     """Extinction, zero and sense from the light of all axes.
 
-    Raises
-    ------
-    CaptureError
-        There are too few angles, unequal exposures, or the light is not polarized.
+    Raises CaptureError for too few angles, unequal exposures, or light that is not polarized.
     """
     axes = sorted({shot.axis_deg for shot in turned})
     curves = [_fit_axis([shot for shot in turned if shot.axis_deg == axis]) for axis in axes]

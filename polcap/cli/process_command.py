@@ -111,8 +111,8 @@ def _process(given: dict[str, Any], target: Path, request: str | None) -> None:
     table = captures.table(capture)
     terminal.tell(table)
     with terminal.progress(len(STAGES) + 1) as bar:
-        counted = pipeline.counted(capture, bar.frame)
-        about = pipeline.process(counted, supplied, config, target, given["until"], given["force"], bar.stage)
+        decode = pipeline.counted(capture, bar.frame)
+        about = pipeline.process(capture, supplied, config, target, given["until"], given["force"], bar.stage, decode)
     if about is None:
         work = str(target / "work")
         terminal.say({"until": given["until"], "work": work} if given["json"] else work)

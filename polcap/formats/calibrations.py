@@ -4,8 +4,6 @@
 capture uses the newest that fits it. Each result keeps its color profile for captures without a chart.
 """
 
-import os
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +15,7 @@ import tomli_w
 from msgspec import Meta
 
 from polcap.errors import CaptureError, ChartError
-from polcap.formats import atomic, text_file
+from polcap.formats import atomic, own_folders, text_file
 from polcap.images import Calibration, ColorCalibration, Distortion, Exif, Floats, LensGeometry, Polarizer
 from polcap.optics import distortion
 
@@ -31,27 +29,6 @@ _HEAD = """\
 # geometry: a point at x appears at x (1 + k1 r^2 + k2 r^4), x and r from the principal point in focal lengths.
 # falloff: light = 1 + a r^2 + b r^4 + c r^6, r = 1 in the corners. polarizer: axis = sense * stated + zero_deg.
 """
-
-
-def folder() -> Path:
-    """The folder of the user's calibrations; it may not exist."""
-    if stated := os.environ.get("POLCAP_CALIB"):
-        return Path(stated)
-    home = Path(os.path.expanduser("~"))  # unlike Path.home(), raises for no account
-    if sys.platform == "win32":
-        return Path(os.environ.get("APPDATA", home / "AppData" / "Roaming")) / "polcap" / "calib"
-    if sys.platform == "darwin":
-        return home / "Library" / "Application Support" / "polcap" / "calib"
-    return Path(os.environ.get("XDG_CONFIG_HOME") or home / ".config") / "polcap" / "calib"
-
-
-def files() -> list[Path]:
-    """All calibration files of the user, by name."""
-    try:
-        found = [path for path in folder().iterdir() if path.suffix == ".toml" and path.is_file()]
-        return sorted(path for path in found if not path.name.startswith("."))  # of macOS, or of a killed run
-    except OSError:
-        return []
 
 
 def write(place: Path, found: Calibration) -> Path:
@@ -101,7 +78,7 @@ def choose(exif: Exif, lens_filter: str | None, focal_length_mm: float | None) -
     """
     camera = f"{exif.make} {exif.model}".strip()
     fitting = []
-    for path in files():
+    for path in own_folders.calibration_files():
         found = read(path)
         if camera and found.camera == camera and (not found.lens or not exif.lens or found.lens == exif.lens):
             fitting.append((found, path))

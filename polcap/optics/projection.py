@@ -1,6 +1,9 @@
 """Projection of points: through a homography, and through a pinhole camera."""
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from polcap.images import Floats, View
 
@@ -35,5 +38,10 @@ def project(view: View, point: Floats) -> tuple[Floats, Floats]:
 
 def back_project(view: View, x: Floats, y: Floats) -> Floats:
     """Points (…, 3) of the camera frame at distance 1 along the optical axis, that pixels x, y show."""
-    across, up = (x - view.center[0]) / view.focal, (view.center[1] - y) / view.focal
+    across, up = ray_slopes(view, x, y)
     return np.stack([across, up, -np.ones_like(across)], axis=-1)
+
+
+def ray_slopes(view: View, x: NDArray[Any], y: NDArray[Any]) -> tuple[Floats, Floats]:
+    """x/−z and y/−z of the points (camera frame) that pixels x, y show; (…,) each, any shape."""
+    return (x - view.center[0]) / view.focal, (view.center[1] - y) / view.focal

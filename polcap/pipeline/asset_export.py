@@ -42,7 +42,7 @@ class DetailLevel:
     """A coarser asset and how far its surface is from the full one."""
 
     asset: Asset
-    decimated: surface.Decimated
+    decimated: surface.DecimatedMesh
 
 
 def check(wanted: ExportRequest) -> None:
@@ -72,7 +72,7 @@ def from_maps(folder: Path, config: Config, wanted: ExportRequest) -> tuple[Asse
     whole = asset.build(stored.maps, mesh, config.asset)
     levels = []
     for k in range(1, wanted.lod + 1):
-        decimated = surface.decimated(mesh, stored.maps.view, 0.25**k, config.surface.back)
+        decimated = surface.decimate(mesh, stored.maps.view, 0.25**k, config.surface.back)
         levels.append(DetailLevel(asset.on_mesh(whole, stored.maps, decimated.mesh), decimated))
     if wanted.texture_size is None:
         return whole, levels

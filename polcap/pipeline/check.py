@@ -71,7 +71,7 @@ def _judged(small: SmallCapture, supplied: UserInput, config: Config) -> list[Ga
     chart_missing, failure = "", None
     try:
         try:
-            path(small.capture, supplied, settings, cache)
+            path(small.capture, supplied, settings, cache, small.decode)
         except ChartError as error:
             if supplied.chart.mode != "auto":
                 raise

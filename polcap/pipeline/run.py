@@ -4,7 +4,6 @@ The order of the stages is in `path.py`.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -18,7 +17,8 @@ from polcap.errors import SettingError
 from polcap.formats import calibrations
 from polcap.formats.export import animation, provenance
 from polcap.formats.maps import maps_folder, png
-from polcap.images import Capture, ColorCalibration, Frame, SensorImage, Shot
+from polcap.formats.raw import frame_decoder
+from polcap.images import Capture, ColorCalibration, Decode, Frame, SensorImage
 from polcap.pipeline import asset_export, result_folder
 from polcap.pipeline.asset_export import ExportRequest
 from polcap.pipeline.cache import ArchiveCache, DryRunCache, Progress, StageCache, contents, silent
@@ -38,8 +38,11 @@ def process(
     until: str | None = None,
     force: str | None = None,
     progress: Progress = silent,
+    decode: Decode = frame_decoder.decode,
 ) -> dict[str, Any] | None:
     """Run the path and write the result folder; returns report.json's content, None with `until`.
+
+    The parameters are the options of the command.
 
     Raises
     ------
@@ -52,7 +55,7 @@ def process(
         with result_folder.locked(out):
             facts = _facts(capture, supplied, config)
             result_folder.write_run(out, facts)
-            results = path(capture, supplied, config, cache)
+            results = path(capture, supplied, config, cache, decode)
             if until is not None:
                 return None
             cache.begin("write")
@@ -100,24 +103,17 @@ def _write_profile(file: Path, color: ColorCalibration) -> None:
         file.unlink(missing_ok=True)
 
 
-def counted(capture: Capture, frame_read: Callable[[int, int], None]) -> Capture:
-    """The capture; `frame_read` is called with the number of decoded photographs, and of all."""
+def counted(capture: Capture, frame_read: Callable[[int, int], None]) -> Decode:
+    """A decode function that calls `frame_read` with the number of decoded photographs, and of all."""
     brackets = [*capture.shots, *(() if capture.crossed is None else (capture.crossed,))]
     total, number = sum(len(shot.frames) for shot in brackets), count(1)
 
-    def frame(one: Frame) -> Frame:
-        def load() -> SensorImage:
-            image = one.load()
-            frame_read(min(next(number), total), total)
-            return image
+    def decode(frame: Frame) -> SensorImage:
+        image = frame_decoder.decode(frame)
+        frame_read(min(next(number), total), total)
+        return image
 
-        return replace(one, load=load)
-
-    def shot(one: Shot) -> Shot:
-        return replace(one, frames=tuple(map(frame, one.frames)))
-
-    crossed = None if capture.crossed is None else shot(capture.crossed)
-    return replace(capture, shots=tuple(map(shot, capture.shots)), crossed=crossed)
+    return decode
 
 
 def plan(capture: Capture, supplied: UserInput, config: Config, out: Path, force: str | None = None) -> dict[str, str]:

@@ -58,7 +58,7 @@ def tone(found: Evidence, limits: Gates) -> Gate:
     power = _power(radiance)
     if radiance.equipment.light == "steady" and abs(power - 1) > worst:
         worst, how = abs(power - 1), f"exposures change as the stated ones to the power {power:.2f}"
-    slope = found.gains.grey_slope if found.color.quads is not None else float("nan")
+    slope = found.selfcal.gains.grey_slope if found.color.quads is not None else float("nan")
     if np.isfinite(slope) and abs(slope - 1) / 2 > worst:  # glare flattens greys too
         worst, how = abs(slope - 1) / 2, f"the chart's greys follow their reflectance to the power {slope:.2f}"
     says = how if worst > limit else "linear"
@@ -145,7 +145,7 @@ def clipping(found: Evidence, limits: Gates) -> Gate:
 
 def gains(found: Evidence, limits: Gates) -> Iterator[Gate]:
     """The light of every frame against the others', and how far that is known."""
-    measured, radiance, names = found.gains, found.radiance, found.names
+    measured, radiance, names = found.selfcal.gains, found.radiance, found.names
     shot = measured.gain.mean(1)
     light = shot[:, None] * radiance.bracket.exposure_ratio.mean(2)  # (K, E)
     off = light / np.median(light, axis=0) - 1
@@ -168,7 +168,7 @@ def gains(found: Evidence, limits: Gates) -> Iterator[Gate]:
 
 def _gain_doubt(found: Evidence, limits: Gates) -> Gate:
     """How far the gains themselves are to be trusted."""
-    measured = found.gains
+    measured = found.selfcal.gains
     limit = limits.max_gain_doubt
     if measured.source == "one exposure":
         return Gate("gain doubt", "pass", 0.0, limit, "one exposure: one gain")
@@ -182,6 +182,11 @@ def _gain_doubt(found: Evidence, limits: Gates) -> Gate:
             remedy = "turn the chart so that it mirrors neither flash nor window, or use a matt one"
             cost = DEGREES_PER_GAIN * gloss
             return at_most("gain doubt", gloss, limit, says, remedy, cost_deg=cost, beyond=_grade(cost))
+        if doubt > limit:
+            says = f"the chart's grey patches give the light of the shots to {100 * doubt:.1f} % only (1σ)"
+            remedy = "show the whole grey row of the chart, evenly lit, or use --no-chart"
+            cost = DEGREES_PER_GAIN * doubt
+            return at_most("gain doubt", doubt, limit, says, remedy, cost_deg=cost, beyond=_grade(cost))
         gap, limit = measured.disagreement, limits.max_gain_disagreement
         says = f"grey patches and object agree on the light of the shots (1σ {100 * doubt:.2f} %)"
         if gap > limit:

@@ -184,7 +184,7 @@ def _chart(about: Mapping[str, Any], results: Results) -> str:
 
 def _measured(results: Results, about: Mapping[str, Any], angles: Sequence[float], chart: str) -> Iterator[str]:
     """Plots of what was measured; `angles` in degrees, `chart` drawn."""
-    gains, moved = results.gains, results.alignment
+    gains, moved = results.selfcal.gains, results.alignment
     yield "<h2>How it was measured</h2><div class='grid'>" + chart
     merge = about["figures"]["merge"]
     yield _drawn(

@@ -73,7 +73,7 @@ def capture_errors(found: Results, capture: Capture, told: dict, meta: dict) -> 
     ratio = found.radiance.bracket.exposure_ratio.mean(-1)
     reference = int(np.abs(ratio[0] - 1).argmin())
     flash = np.array([shot[reference]["flash_factor"] for shot in frames])
-    gain = found.gains.gain.mean(1) / (flash / flash[0]) - 1
+    gain = found.selfcal.gains.gain.mean(1) / (flash / flash[0]) - 1
     ratios = ratio / (exposure / exposure[:, [reference]]) - 1
 
     rows, columns = np.nonzero(found.object_.mask)

@@ -172,7 +172,7 @@ class Gained:
             self.results.object_,
             replace(self.results.color, quads=None),
             Config().selfcal,
-        ).gain
+        ).gains.gain
 
     def __call__(self) -> float:
         return float(100 * np.abs(self.gains() / self.usual - 1).max())

@@ -165,7 +165,7 @@ def solved(case: Lit, seed: int) -> Any:
         bracket=single_frames(3),
     )  # fmt: skip
     object_ = ObjectMask(case.mask, (0, 0, case.mask.shape[1], case.mask.shape[0]), "user")
-    return stokes.solve(radiance, scenes.still(), scenes.equal(), object_, stokes.Settings())
+    return stokes.solve(radiance, scenes.still(), scenes.equal(), object_, stokes.StokesSettings())
 
 
 def _spoken(image: Any) -> dict[str, str]:

@@ -180,19 +180,19 @@ def _name(data: bytes, folder: Path) -> object:
 
 
 def _elliptec(data: bytes, folder: Path) -> object:
-    motor = motor_elliptec_ell14.ElliptecMotor(Replies(data), motor_elliptec_ell14.ElliptecSettings(), 0.05)
+    motor = motor_elliptec_ell14.ElliptecMotor(Replies(data), motor_elliptec_ell14.ElliptecSettings(timeout=0.05))
     motor.home()
     return motor.position()
 
 
 def _grbl(data: bytes, folder: Path) -> object:
-    board = motor_grbl.GrblMotor(Replies(data), motor_grbl.GrblSettings(), 0.05)
+    board = motor_grbl.GrblMotor(Replies(data), motor_grbl.GrblSettings(timeout=0.05))
     board.home()
     return board.position()
 
 
 def _line(data: bytes, folder: Path) -> object:
-    board = motor_line_protocol.LineMotor(Replies(data), motor_line_protocol.LineSettings(), 0.05)
+    board = motor_line_protocol.LineMotor(Replies(data), motor_line_protocol.LineSettings(timeout=0.05))
     board.home()
     return board.position()
 

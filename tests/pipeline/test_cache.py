@@ -238,7 +238,7 @@ def test_a_version_changes_the_key(tmp_path: Path) -> None:
 
 
 def test_key_follows_the_bytes_of_the_photographs_not_their_place(tmp_path: Path) -> None:
-    frame = images.Frame("/a/x.dng", images.Exif(), "shot", "digest", load=lambda: None)
+    frame = images.Frame("/a/x.dng", images.Exif(), "shot", "digest")
     capture = images.Capture(
         "a", "/a", (images.Shot(0.0, (frame,)),), "folders", 1.0, True, (0.0, 0.0), (2, 2), notes=("n",)
     )

@@ -12,7 +12,7 @@ from polcap.config import Config
 from polcap.errors import CaptureError, ChartError
 from polcap.formats import shipped_data
 from polcap.formats.capture import reader as captures
-from polcap.formats.raw import dng, probe
+from polcap.formats.raw import dng, frame_decoder, probe
 from polcap.formats.raw import libraw as raw
 from polcap.images import ChartRequest
 from polcap.pipeline import check
@@ -56,7 +56,7 @@ def test_one_turned_shot_of_three_is_told_with_the_ring_that_it_looks_like(tmp_p
 def test_process_measures_the_blur_that_check_measures(tmp_path: Path) -> None:
     faulty.shoot(tmp_path / "bad", 1, "defocus", 256)
     capture = captures.read(tmp_path / "bad")
-    merged = hdr.merge(capture, Config().hdr)
+    merged = hdr.merge(capture, frame_decoder.decode, Config().hdr)
     assert np.nanmax(merged.bracket.blur_px) > Config().gates.max_blur_px
     with ThreadPoolExecutor(2) as pool:
         np.testing.assert_array_equal(merged.bracket.blur_px, reduce(capture, 0.98, pool).blur_px)
@@ -69,7 +69,8 @@ def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path) -> N
     line = next(line for line in found.lines if line.name == "chart")
     assert line.state == "warn" and found.needs == "--no-chart" and "--no-chart" in line.remedy
     with pytest.raises(ChartError):
-        whitebalance.measure(hdr.merge(capture, Config().hdr), shipped_data.colorchecker(), AUTO, Config().whitebalance)
+        merged = hdr.merge(capture, frame_decoder.decode, Config().hdr)
+        whitebalance.measure(merged, shipped_data.colorchecker(), AUTO, Config().whitebalance)
     asked = check.inspect(capture, (None, None), Config(), chart=ChartRequest("none"))
     assert asked.needs == "" and next(line for line in asked.lines if line.name == "chart").state == "not measured"
 
@@ -135,7 +136,7 @@ def test_reduced_picture_keeps_what_is_clipped(example: Path, monkeypatch: pytes
         taken = reduce(capture, 0.98, pool)
     assert taken.step == 4
     assert taken.capture.size_px == (288, 216)
-    brightest = taken.capture.shots[0].frames[2].load()
+    brightest = taken.decode(taken.capture.shots[0].frames[2])
     assert brightest.cfa is None and brightest.value.shape == (216, 288, 3)
     assert ((taken.clipped[0, 2] > 0) == (brightest.value == 1).all(-1)).all()
     assert taken.clipped[0, 2].mean() > 0.001

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from polcap.config import Config
-from polcap.images import AngleStack, Equipment, SurfaceMaps
+from polcap.images import (
+    AngleStack,
+    Equipment,
+    OutlineCheck,
+    RingZero,
+    ShotOrder,
+    SurfaceMaps,
+    TurnedShot,
+)
 from polcap.quality import gates
 from polcap.quality.gate import Evidence
 from polcap.quality.gates import Gate
@@ -21,17 +29,18 @@ def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> Evidence:
     radiance = changed.pop("radiance", scenes.stack(noise=0.002, angles=angles))
     shots = len(radiance.angle)
     object_ = scenes.ball_object()
-    unchecked = selfcal.Settings(check_order=False)
-    gains = selfcal.solve(radiance, scenes.still(shots), object_, scenes.no_color(), unchecked)
-    gains = changed.pop("gains", replace(gains, source="grey patches", sigma=0 * gains.sigma, disagreement=0.0))
-    image = stokes.solve(radiance, scenes.still(shots), gains, object_, stokes.Settings())
+    unchecked = selfcal.SelfcalSettings(check_order=False)
+    solved = selfcal.solve(radiance, scenes.still(shots), object_, scenes.no_color(), unchecked)
+    gains = replace(solved.gains, source="grey patches", sigma=0 * solved.gains.sigma, disagreement=0.0)
+    calibration = changed.pop("selfcal", replace(solved, gains=gains))
+    image = stokes.solve(radiance, scenes.still(shots), calibration, object_, stokes.StokesSettings())
     normal = scenes.truth()[0].astype(np.float32)
     flat = np.full(image.mask.shape, 0.5, np.float32)
     maps = SurfaceMaps(normal, normal, normal, flat, None, 8 * flat, image.mask, image.view, "analytic")
     given = {
         "names": [f"{np.degrees(a):g}°" for a in radiance.angle], "focal_doubt": (0.0, 0.0), "grid_px": 1.0,
         "chart_missing": "", "clipped": clipped(), "blur_px": radiance.bracket.blur_px, "radiance": radiance,
-        "color": scenes.no_color(), "alignment": scenes.still(shots), "object_": object_, "gains": gains,
+        "color": scenes.no_color(), "alignment": scenes.still(shots), "object_": object_, "selfcal": calibration,
         "stokes": image, "maps": maps,
     }  # fmt: skip
     return Evidence.partial(**{**given, **changed})
@@ -71,8 +80,12 @@ def bracket(radiance: AngleStack, **measured: Any) -> AngleStack:
     return replace(radiance, bracket=replace(radiance.bracket, **measured))
 
 
+def with_gains(good: Evidence, **fields: Any) -> dict[str, Any]:
+    return {"selfcal": replace(good.selfcal, gains=replace(good.selfcal.gains, **fields))}
+
+
 def test_each_gate_fails_alone(good: Evidence) -> None:
-    radiance, gains, maps = good.radiance, good.gains, good.maps
+    radiance, maps = good.radiance, good.maps
     still = good.alignment
     away = still.transform.copy()
     away[1, 0, 2] = 50
@@ -86,8 +99,8 @@ def test_each_gate_fails_alone(good: Evidence) -> None:
         "alignment": {"alignment": replace(still, transform=away)},
         "clipping": {"clipped": clipped(0.03)},
         "sharpness": {"blur_px": np.array([[0.0], [2.0], [0.1]])},
-        "gains": {"gains": replace(gains, gain=np.array([[1.0] * 3, [1.0] * 3, [0.7] * 3]))},
-        "gain doubt": {"gains": replace(gains, disagreement=0.05)},
+        "gains": with_gains(good, gain=np.array([[1.0] * 3, [1.0] * 3, [0.7] * 3])),
+        "gain doubt": with_gains(good, disagreement=0.05),
         "normal error": {"maps": replace(maps, confidence=np.full_like(maps.confidence, 25.0))},
     }
     for name, fields in faults.items():
@@ -106,7 +119,7 @@ def test_a_push_counts_in_pixels_of_the_processed_picture(good: Evidence, grid_p
 
 
 def test_what_follows_a_wrong_order_is_not_judged(good: Evidence) -> None:
-    told = judged(changed(good, gains=replace(good.gains, order=(2, 1, 0))))
+    told = judged(changed(good, selfcal=replace(good.selfcal, outline=OutlineCheck(ShotOrder((2, 1, 0)), 0.9))))
     assert list(told)[-1] == "focal length" or told["order"].state == "fail"
     assert "angles" not in told
 
@@ -121,23 +134,22 @@ def test_flash_bracketed_by_the_shutter_is_named(good: Evidence) -> None:
 
 
 def test_gains_nobody_knows_cost_degrees(good: Evidence) -> None:
-    gains = replace(good.gains, source="object", sigma=np.array([[0.0] * 3, [0.02] * 3, [0.02] * 3]))
-    gate = judged(changed(good, gains=gains))["gain doubt"]
+    doubtful = with_gains(good, source="object", sigma=np.array([[0.0] * 3, [0.02] * 3, [0.02] * 3]))
+    gate = judged(changed(good, **doubtful))["gain doubt"]
     assert gate.state == "warn" and gate.cost_deg == pytest.approx(12)
-    assert judged(changed(good, gains=gains))["normal error"].value > 10  # type: ignore[operator]
+    assert judged(changed(good, **doubtful))["normal error"].value > 10  # type: ignore[operator]
 
 
 def test_one_angle_that_keeps_four_shots_from_closing_fails(good: Evidence) -> None:
-    gains = replace(good.gains, turned_shots=(1,), turned=np.radians(15), turned_sigma=np.radians(2))
-    gate = judged(changed(good, gains=gains))["angles"]
+    turned = replace(good.selfcal, turned=TurnedShot((1,), np.radians(15), np.radians(2)))
+    gate = judged(changed(good, selfcal=turned))["angles"]
     assert gate.state == "fail" and gate.shots == ("45°",) and "+15° ± 2°" in gate.says
 
 
 @pytest.mark.parametrize(("turn", "state"), [(1.5, "pass"), (5.0, "warn")])
 def test_a_turn_of_the_ring_is_told_though_taken_out(good: Evidence, turn: float, state: str) -> None:
     turned, doubt = np.radians([turn, 0.4])
-    gains = replace(good.gains, angle_offset=turned, angle_offset_sigma=doubt, angle_correction=turned)
-    gate = judged(changed(good, gains=gains))["angles"]
+    gate = judged(changed(good, selfcal=replace(good.selfcal, ring=RingZero(turned, doubt, turned))))["angles"]
     assert gate.state == state and f"{turn:+.1f}°" in gate.says and "taken out" in gate.says
 
 
@@ -185,9 +197,7 @@ def test_light_from_around_is_told(good: Evidence) -> None:
     ("uneven", "ambient", "state"),
     [(0.47, 0.0, "pass"), (0.7, 0.0, "pass"), (0.0, 1.5, "warn"), (0.0, 6.0, "warn")],
 )
-def test_a_lopsided_body_is_no_light_from_the_side(
-    good: Evidence, uneven: float, ambient: float, state: str
-) -> None:
+def test_a_lopsided_body_is_no_light_from_the_side(good: Evidence, uneven: float, ambient: float, state: str) -> None:
     """A body turned to one side is as polarized there as elsewhere; a lamp from there is not."""
     image = good.stokes
     across = np.linspace(-1, 1, image.mask.shape[1])[:, None] / (scenes.RADIUS / (image.mask.shape[1] / 2))
@@ -277,8 +287,8 @@ def test_what_is_beside_a_gate_s_words_is_the_figure_that_they_are_of(good: Evid
 def test_four_angles_are_not_asked_of_who_has_shot_four(good: Evidence) -> None:
     four = found(angles=np.radians([0.0, 45, 90, 135]))
     for of, asked in ((good, True), (four, False)):
-        gains = replace(of.gains, source="object", sigma=np.full_like(of.gains.sigma, 0.2))
-        doubtful = judged(changed(of, gains=gains))
+        sigma = np.full_like(of.selfcal.gains.sigma, 0.2)
+        doubtful = judged(changed(of, **with_gains(of, source="object", sigma=sigma)))
         assert ("four angles" in doubtful["gain doubt"].remedy) == asked
         assert doubtful["gain doubt"].cost_deg == doubtful["normal error"].value == 90  # no error is larger
 

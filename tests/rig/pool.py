@@ -1,4 +1,4 @@
-"""A camera that hands out photographs made beforehand, with a fault on order; far quicker than rendering each."""
+"""A camera that returns prepared photographs, with a planted fault; much faster than rendering each."""
 
 import os
 import resource
@@ -30,7 +30,7 @@ Key = tuple[str, float, int]  # role, angle, step
 
 
 def photographs(width: int = 192, height: int = 144, scene_seed: int = 1) -> dict[Key, bytes]:
-    """Every frame of `ORDER`, and 45 degrees beside each: what a camera sees where the ring is wrong."""
+    """Every frame of `ORDER`, and those of 135°, a wrong angle of the ring."""
     shoot = Shoot(width=width, height=height, samples=1)
     studio = Studio(random_scene(scene_seed, "bumps"), shoot)
     found: dict[Key, bytes] = {}
@@ -48,7 +48,7 @@ def photographs(width: int = 192, height: int = 144, scene_seed: int = 1) -> dic
 
 
 def tiny(path: Path, **exif: object) -> bytes:
-    """A RAW of noise, 32×24 px, for tests that look at bytes and tags alone."""
+    """A RAW of noise, 32×24 px, for tests of bytes and tags."""
     facts = {"make": "Tiny", "model": "One", "lens": "L", "exposure_time": 0.02, "f_number": 11.0, "iso": 100.0}
     random = np.random.default_rng([*repr(exif).encode()])
     mosaic = random.integers(600, 9000, (24, 32)).astype(np.uint16)
@@ -67,7 +67,7 @@ def tiny(path: Path, **exif: object) -> bytes:
 
 
 class PoolCamera:
-    """Takes what the ring's true angle shows; `fault` strikes at the frame number `at`, once."""
+    """Checks the ring's true angle; `fault` strikes once, at the frame number `at`."""
 
     model = "Polcap Synthetic"
     frame_bytes = 100_000

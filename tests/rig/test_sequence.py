@@ -1,4 +1,4 @@
-"""What is taken in which order, what is kept, and how a run that was stopped goes on."""
+"""The sequence of a capture: order of the frames, retakes, and resuming."""
 
 import itertools
 import shutil
@@ -26,12 +26,12 @@ ORDER = msgspec.structs.replace(pools.ORDER, rotator="simulated")
 
 
 class Turner:
-    """A rotator that moves at once, `beside` what it is asked for."""
+    """A rotator that moves at once, to an angle that is wrong by `error_deg`."""
 
     model, speed_deg_s, settle_s, by_hand = "turner", 100.0, 0.0, False
 
-    def __init__(self, beside: float = 0.0) -> None:
-        self.beside = beside
+    def __init__(self, error_deg: float = 0.0) -> None:
+        self.error_deg = error_deg
         self.moves: list[float] = []
         self.ended: list[str] = []
 
@@ -39,7 +39,7 @@ class Turner:
 
     def move(self, angle_deg: float) -> float:
         self.moves.append(angle_deg)
-        return (angle_deg + self.beside) % 360
+        return (angle_deg + self.error_deg) % 360
 
     def stop(self) -> None:
         self.ended.append("stop")
@@ -54,12 +54,12 @@ class Rig:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, pool: dict[Key, bytes], folder: Path) -> None:
         self.pool, self.folder = pool, folder
         self.camera, self.turner = PoolCamera(pool), Turner()
-        self.said: list[str] = []
+        self.messages: list[str] = []
         monkeypatch.setattr("polcap.rig.device_urls.open_camera", lambda name, log: self.camera)
         monkeypatch.setattr("polcap.rig.device_urls.open_rotator", lambda url, log: self.turner)
 
     def shoot(self, order: CaptureOrder = ORDER, resume: bool = False, **options: int) -> dict[str, Any]:
-        return sequence.shoot(self.folder, order, resume=resume, tell=self.said.append, **options)  # type: ignore[arg-type]
+        return sequence.shoot(self.folder, order, resume=resume, tell=self.messages.append, **options)
 
     def again(self) -> dict[str, Any]:
         self.camera, self.turner = PoolCamera(self.pool), Turner()
@@ -76,7 +76,7 @@ def rig(monkeypatch: pytest.MonkeyPatch, pool: dict[Key, bytes], tmp_path: Path)
 
 
 def test_every_angle_is_visited_once_and_the_capture_reads_as_ordered(rig: Rig) -> None:
-    rig.turner.beside = -0.01
+    rig.turner.error_deg = -0.01
     done = rig.shoot()
     assert rig.turner.moves == [0.0, 45.0, 90.0]
     assert rig.turner.ended == ["stop", "close"] and rig.camera.closed
@@ -126,6 +126,7 @@ def test_time_of_a_plan_is_the_sum_of_its_parts() -> None:
     assert planned["frames"] == 9
     assert planned["seconds"] == pytest.approx(360 / 430 + 90 / 430 + 2 * 0.2 + 9 * 2 + 3 * 0.105 + 1.0)
     assert "about a minute" in dry_run.table(planned)
+    assert [dry_run.minutes(seconds) for seconds in (40, 99.6, 60)] == ["0:40", "1:40", "1:00"]
 
 
 @pytest.mark.parametrize(
@@ -230,10 +231,10 @@ class Shaken(PoolCamera):
 
 
 def test_an_early_frame_is_judged_by_its_later_neighbours(rig: Rig, tmp_path: Path) -> None:
-    from tests.rig.test_frame_check import _blur
+    from tests.rig.test_retake_criteria import blur
 
     (tmp_path / "sharp.dng").write_bytes(rig.pool["shot", 0.0, 1])
-    _blur(tmp_path / "sharp.dng", tmp_path / "blurred.dng", 2.0)
+    blur(tmp_path / "sharp.dng", tmp_path / "blurred.dng", 2.0)
     blurred = {("blurred", 0.0, 1): (tmp_path / "blurred.dng").read_bytes()}
     rig.camera = Shaken({**rig.pool, **blurred})
     done = rig.shoot(msgspec.structs.replace(ORDER, repeat_deg=(), ambient=False))
@@ -268,7 +269,7 @@ def test_a_frame_that_changed_meanwhile_is_put_aside_and_taken_again(rig: Rig) -
     rig.again()
     assert {("shot", 0.0, 1), ("shot", 0.0, 2)} <= set(rig.taken)
     assert (rig.folder / "rejected/pol000_frame_2.try1.dng").read_bytes() == b"overwritten"
-    assert any("frame_3.dng: the file is missing" in line for line in rig.said)
+    assert any("frame_3.dng: the file is missing" in line for line in rig.messages)
 
 
 def test_a_file_that_was_never_checked_is_put_aside(rig: Rig) -> None:
@@ -283,7 +284,7 @@ def test_a_file_that_was_never_checked_is_put_aside(rig: Rig) -> None:
 
 def test_a_bracket_is_of_one_angle_even_if_the_ring_comes_back_elsewhere(rig: Rig) -> None:
     _stopped(rig, at=7)  # in the middle of 45°
-    rig.camera, rig.turner = PoolCamera(rig.pool), Turner(beside=0.25)
+    rig.camera, rig.turner = PoolCamera(rig.pool), Turner(error_deg=0.25)
     rig.shoot(resume=True)
     content = capture_record.load(rig.folder)
     assert content is not None

@@ -31,7 +31,7 @@ def test_renderer_sees_the_maps_normals_whatever_the_mesh(flat: bool, thinned: b
     maps = surfaces.maps(ripple=0.2)
     mesh = surfaces.flat_mesh(maps) if flat else surfaces.mesh(surfaces.maps())
     if thinned:
-        mesh = surfaces.mesh(surfaces.maps(), surface.Settings(max_vertices=2000))
+        mesh = surfaces.mesh(surfaces.maps(), surface.SurfaceSettings(max_vertices=2000))
     built = surfaces.built(maps, mesh)
     seen, (row, column) = rendered_normals(built, maps)
     cosine = np.sum(seen * maps.normal[row, column], axis=-1)
@@ -92,7 +92,7 @@ def test_backdrop_does_not_run_along_the_limb() -> None:
 
 def test_walls_and_back_leave_the_normal_texture_alone() -> None:
     maps = surfaces.maps(ripple=0.2)
-    seen, closed = (surfaces.mesh(maps, surface.Settings(back=back)) for back in ("open", "closed"))
+    seen, closed = (surfaces.mesh(maps, surface.SurfaceSettings(back=back)) for back in ("open", "closed"))
     assert np.array_equal(surfaces.built(maps, closed).normal, surfaces.built(maps, seen).normal)
 
 
@@ -118,7 +118,7 @@ def test_the_shorter_side_of_a_sliver_keeps_a_pixel() -> None:
 def test_coverage_interpolates_as_a_renderer_does() -> None:
     """Against the barycentric formula, corner by corner, on triangles that lie anyhow."""
     rng = np.random.default_rng(3)
-    mesh = surfaces.mesh(surfaces.maps(), surface.Settings(max_vertices=2000))
+    mesh = surfaces.mesh(surfaces.maps(), surface.SurfaceSettings(max_vertices=2000))
     value = np.concatenate([mesh.normals, mesh.tangents], axis=-1)
     there, covered = interpolated(mesh, surfaces.HEIGHT, surfaces.WIDTH)
     place = mesh.uv * [surfaces.WIDTH, surfaces.HEIGHT] - 0.5

@@ -30,6 +30,7 @@ from polcap.images import (
     Capture,
     ColorSensor,
     CrossedShot,
+    Decode,
     Distortion,
     Equipment,
     Floats,
@@ -67,7 +68,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @stage(version=11)
-def merge(capture: Capture, settings: Settings) -> AngleStack:
+def merge(capture: Capture, decode: Decode, settings: Settings) -> AngleStack:
     """Radiance of every shot on the scale of its reference frame.
 
     The reference frame is the one of middle brightness in the first shot, and of the same index in every
@@ -82,7 +83,7 @@ def merge(capture: Capture, settings: Settings) -> AngleStack:
     shots = capture.shots
     _check(shots)
     brackets = (*shots, *(() if capture.crossed is None else (capture.crossed,)))
-    read = Reader(frame for shot in brackets for frame in (*shot.frames, *shot.ambient))
+    read = Reader((frame for shot in brackets for frame in (*shot.frames, *shot.ambient)), decode)
     try:
         return _merge(capture, read, settings)
     finally:

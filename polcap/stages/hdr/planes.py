@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap import parallel
-from polcap.images import Floats, Frame, SensorImage, Shot
+from polcap.images import Decode, Floats, Frame, SensorImage, Shot
 from polcap.optics import sensor
 from polcap.stages.hdr.budget import Budget
 
@@ -149,9 +149,10 @@ def blocks(height: int, halo: int = 0, rows: int = _ROWS) -> Iterator[tuple[slic
 class Reader:
     """Decoded frames, the last few kept, the next few under way."""
 
-    def __init__(self, coming: Iterable[Frame]) -> None:
+    def __init__(self, coming: Iterable[Frame], decode: Decode) -> None:
         """`coming`: the frames in the order in which they will be asked for."""
         self.lossy = False
+        self._decode = decode
         self._channels = 0  # of the first frame
         self.budget = Budget()
         self._coming = deque(coming)
@@ -162,7 +163,7 @@ class Reader:
     def __call__(self, frame: Frame) -> SensorImage:
         """Raises DecodeError."""
         if id(frame) not in self._held:
-            under_way = self._decoding.pop(id(frame), None) or self._pool.submit(frame.load)
+            under_way = self._decoding.pop(id(frame), None) or self._pool.submit(self._decode, frame)
             image = under_way.result()
             room = max(1, self.budget.frames // max(image.value.nbytes, 1))
             while len(self._held) >= room:
@@ -211,7 +212,7 @@ class Reader:
         while self._coming and len(self._decoding) < _AHEAD and len(self._held) + len(self._decoding) < room:
             following = self._coming.popleft()
             if id(following) not in self._held:
-                self._decoding[id(following)] = self._pool.submit(following.load)
+                self._decoding[id(following)] = self._pool.submit(self._decode, following)
 
 
 def tile_means(picture: Signals, side: int) -> Floats:

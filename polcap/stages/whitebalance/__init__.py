@@ -48,7 +48,7 @@ _CANDIDATES = 3  # per picture: texture may look more like a chart than the char
 _REMEDY = "give its corners with --chart x0,y0,…,x3,y3, a profile with --chart FILE, or --no-chart"
 
 
-class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class WhitebalanceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The section `whitebalance` of a settings file."""
 
     chart: Annotated[
@@ -75,7 +75,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @stage(version=7)
 def measure(
-    radiance: AngleStack, reference: ChartReference, request: ChartRequest, settings: Settings
+    radiance: AngleStack, reference: ChartReference, request: ChartRequest, settings: WhitebalanceSettings
 ) -> ColorCalibration:
     """The color matrix of a capture, on the scale of S0 = I₀ + I₉₀, with the chart's place and residuals.
 
@@ -152,7 +152,7 @@ class _Find:
         return self.seen.mean
 
 
-def _search(radiance: AngleStack, reference: ChartReference, settings: Settings) -> _Find:
+def _search(radiance: AngleStack, reference: ChartReference, settings: WhitebalanceSettings) -> _Find:
     """The first candidate that passes every test with ease, else the best; ChartError says what it lacks."""
     value = radiance.value[0]
     known: list[Placement] = []
@@ -208,7 +208,7 @@ def _search(radiance: AngleStack, reference: ChartReference, settings: Settings)
 
 
 def _at_corners(
-    radiance: AngleStack, reference: ChartReference, corners_px: Floats | None, settings: Settings
+    radiance: AngleStack, reference: ChartReference, corners_px: Floats | None, settings: WhitebalanceSettings
 ) -> _Find:
     """The chart where the user says it is, placed more finely where the image allows it."""
     if corners_px is None or np.shape(corners_px) != (4, 2):
@@ -243,12 +243,12 @@ def _at_corners(
     return find
 
 
-def _fit(radiance: AngleStack, place: Placement, reference: ChartReference, settings: Settings) -> ChartFit:
+def _fit(radiance: AngleStack, place: Placement, reference: ChartReference, settings: WhitebalanceSettings) -> ChartFit:
     return patches.fit(patches.sample(radiance.value[0], radiance.quality[0], place, settings.patch_share), reference)
 
 
 def _edition(
-    radiance: AngleStack, found: _Find, reference: ChartReference, settings: Settings
+    radiance: AngleStack, found: _Find, reference: ChartReference, settings: WhitebalanceSettings
 ) -> tuple[_Find, ChartReference]:
     """The find by the edition of the chart that its colors speak for, and that edition."""
     residuals = [patches.residual(found.seen, other) for other in (reference, *reference.editions)]

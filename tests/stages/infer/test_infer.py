@@ -16,7 +16,7 @@ from tests import scenes
 
 def seen(noise: float, textured: bool = True):
     radiance = scenes.stack(noise=noise, textured=textured)
-    solved = stokes.solve(radiance, scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
+    solved = stokes.solve(radiance, scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
     return cues.compute(solved, scenes.no_color())
 
 

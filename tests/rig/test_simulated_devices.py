@@ -1,4 +1,4 @@
-"""The rig that does not exist takes the photographs that the synthetic camera would."""
+"""The simulated rig takes the photographs that the synthetic camera would."""
 
 from pathlib import Path
 

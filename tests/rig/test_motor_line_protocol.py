@@ -25,7 +25,7 @@ def clock() -> Iterator[virtual.Clock]:
 
 def motor(device: Device, limit_s: float = 2.0, **settings: Any) -> LineMotor:
     port = Port(device.port, LineMotor.baud, Log(None))
-    return LineMotor(port, LineSettings(**settings), limit_s)
+    return LineMotor(port, LineSettings(timeout=limit_s, **settings))
 
 
 def test_words_on_the_wire() -> None:
@@ -68,7 +68,7 @@ def test_after_a_stop_nothing_moves_before_homing() -> None:
             board.go(45)
 
 
-def test_a_restart_in_mid_move_is_told() -> None:
+def test_a_restart_during_a_move_is_an_error() -> None:
     with devices.Line(fault="restart", at=2) as device:
         board = motor(device)
         board.home()

@@ -1,4 +1,4 @@
-"""A tethering application writes as it likes; polcap takes whole RAW files, once each, and touches none."""
+"""Complete RAW files are taken from a tethering folder, once each, and stay unchanged."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +18,7 @@ ANY = Exposure()
 
 
 class Clock(virtual.Clock):
-    """Of the waiting camera; whoever fills the folder does so meanwhile."""
+    """The waiting camera's clock; `meanwhile` fills the folder."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -66,7 +66,7 @@ def test_a_file_written_slowly_is_taken_when_whole_and_stays_where_it_is(
 
 
 def test_a_file_whose_writing_pauses_is_waited_for(tether: Path, tmp_path: Path) -> None:
-    """Half a DNG looks like a TIFF picture, or like a RAW whose data lie beyond its end."""
+    """Half a DNG looks like a TIFF picture, or like a RAW with data beyond its end."""
     camera, data = watched(tether, timeout_s=1.5), tiny(tmp_path / "new.dng", iso=200.0)
     camera.prepare(0.0, "shot", 0)
     for part in (100, 1200):
@@ -81,7 +81,7 @@ def test_a_bracket_that_arrives_at_once_is_taken_in_order_each_file_once(tether:
     camera = watched(tether)
     camera.prepare(0.0, "shot", 0)
     made = [tiny(tether / f"IMG_{number}.dng", iso=100.0 * number) for number in (1, 2, 3)]
-    (tether / "IMG_1.jpg").write_bytes(b"\xff\xd8\xff a picture beside it")
+    (tether / "IMG_1.jpg").write_bytes(b"\xff\xd8\xff a picture")
     (tether / "notes.txt").write_text("mine")
     assert [camera.shoot(ANY, flash=True).data for _ in range(3)] == made
     assert len(list(tether.iterdir())) == 6
@@ -96,7 +96,7 @@ def test_a_frame_from_before_the_turn_is_not_taken_for_the_next_angle(tether: Pa
         camera.shoot(ANY, flash=True)
 
 
-def test_what_no_decoder_opens_is_named_at_the_end(tether: Path) -> None:
+def test_a_file_that_cannot_be_decoded_is_named(tether: Path) -> None:
     camera = watched(tether, timeout_s=1.5)
     (tether / "IMG_1.CR3").write_bytes(b"\0\0\0\x18ftypcrx " + bytes(500))
     with pytest.raises(HardwareError, match=r"IMG_1.CR3"):
@@ -108,7 +108,7 @@ def test_a_folder_that_is_not_there_is_the_users_fault(tmp_path: Path) -> None:
         open_camera(f"folder:{tmp_path / 'none'}", Log(None))
 
 
-def test_the_bracket_has_to_be_told(tether: Path) -> None:
+def test_a_bracket_must_be_given(tether: Path) -> None:
     with pytest.raises(SettingError, match="--bracket"):
         watched(tether).bracket(flash=False)
 

@@ -1,4 +1,4 @@
-"""What goes over the wire is the ELLx protocol: literal bytes from the manual's examples and its arithmetic."""
+"""The bytes on the wire are those of the ELLx protocol, from the manual's examples and its arithmetic."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -28,7 +28,7 @@ def device() -> Iterator[devices.Elliptec]:
 
 def motor(device: devices.Elliptec, limit_s: float = 2.0, **settings: Any) -> ElliptecMotor:
     port = Port(device.port, ElliptecMotor.baud, Log(None))
-    return ElliptecMotor(port, ElliptecSettings(**settings), limit_s)
+    return ElliptecMotor(port, ElliptecSettings(timeout=limit_s, **settings))
 
 
 def test_degrees_become_pulses_in_eight_upper_case_digits(device: devices.Elliptec) -> None:
@@ -50,7 +50,7 @@ def test_pulses_per_revolution_are_the_device_s() -> None:
         ell.home()
         ell.go(45)
         assert device.heard[-1] == "0ma00001194"  # 4500
-        assert ell.position() == pytest.approx(45.03)  # 3 pulses beside
+        assert ell.position() == pytest.approx(45.03)  # 3 pulses away
         assert ell.model == "Elliptec ELL18"
 
 
@@ -84,13 +84,13 @@ def test_a_linear_stage_is_refused() -> None:
         motor(device)
 
 
-def test_a_fault_of_the_day_before_is_cleared(device: devices.Elliptec) -> None:
+def test_an_old_fault_is_cleared(device: devices.Elliptec) -> None:
     device._status = 2
     motor(device).home()
 
 
 @pytest.mark.parametrize("status", [code for code in STATUS if code != 9])
-def test_every_status_has_its_words_and_ends_the_move(status: int) -> None:
+def test_every_status_has_a_message_and_ends_the_move(status: int) -> None:
     class Failing(devices.Elliptec):
         def halfway(self) -> None:
             self.status(status)
@@ -142,7 +142,7 @@ def motor_speed() -> float:
         return motor(device).speed_deg_s
 
 
-def test_zero_is_kept_in_the_device_and_written_only_when_new(device: devices.Elliptec) -> None:
+def test_zero_is_saved_in_the_device_only_if_it_is_new(device: devices.Elliptec) -> None:
     motor(device, zero=45.0)
     assert device.heard[2:] == ["0go", "0so00004600", "0us"]
     assert device.saved_offset == 17920

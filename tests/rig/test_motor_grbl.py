@@ -23,7 +23,7 @@ def clock() -> Iterator[virtual.Clock]:
 
 def motor(device: devices.Grbl, limit_s: float = 2.0, **settings: Any) -> GrblMotor:
     port = Port(device.port, GrblMotor.baud, Log(None))
-    return GrblMotor(port, GrblSettings(**settings), limit_s)
+    return GrblMotor(port, GrblSettings(timeout=limit_s, **settings))
 
 
 def test_grbl_s_unit_is_a_degree() -> None:
@@ -63,7 +63,7 @@ def test_or_a_person_puts_the_ring_to_zero(monkeypatch: pytest.MonkeyPatch) -> N
     assert asked == ["turn the polarizer's ring to 0°, then press Enter: "]
 
 
-def test_an_alarm_is_told_in_words_and_ended_by_homing() -> None:
+def test_an_alarm_is_explained_and_ended_by_homing() -> None:
     with devices.Grbl(fault="alarm", at=2) as device:
         board = motor(device)
         board.home()
@@ -76,7 +76,7 @@ def test_an_alarm_is_told_in_words_and_ended_by_homing() -> None:
         assert device.angle_deg == pytest.approx(45)
 
 
-def test_a_restart_in_mid_move_is_told_and_ended_by_homing() -> None:
+def test_a_restart_during_a_move_is_reported_and_ended_by_homing() -> None:
     with devices.Grbl(fault="restart", at=2) as device:
         board = motor(device)
         board.home()
@@ -87,7 +87,7 @@ def test_a_restart_in_mid_move_is_told_and_ended_by_homing() -> None:
         assert device.angle_deg == pytest.approx(45)
 
 
-def test_stop_holds_before_it_resets_and_lets_the_motor_sleep(clock: virtual.Clock) -> None:
+def test_a_stop_holds_before_it_resets_and_the_motor_sleeps(clock: virtual.Clock) -> None:
     with devices.Grbl(speed_deg_s=45) as device:
         device.angle_deg = 0.0
         board = motor(device)
@@ -103,7 +103,7 @@ def test_stop_holds_before_it_resets_and_lets_the_motor_sleep(clock: virtual.Clo
 
 
 def test_homing_may_be_longer_than_one_answer() -> None:
-    with devices.Grbl(speed_deg_s=10) as device:  # four seconds, in which GRBL says nothing
+    with devices.Grbl(speed_deg_s=10) as device:  # four seconds, in which GRBL is silent
         motor(device, limit_s=20).home()
         assert device.angle_deg == 0
 

@@ -1,4 +1,4 @@
-"""A person turns the ring: Enter is yes, a number is the truth, nobody is an error."""
+"""A person turns the ring: Enter confirms, a number is the angle, no person is an error."""
 
 import io
 import os
@@ -27,7 +27,7 @@ def typed(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
         (" 44,5° \n", 44.5),
         ("-10\n", 350),
         ("405\n", 45),
-        ("what?\nnan\n46\n", 46),
+        ("north\nnan\n46\n", 46),
         ("oops\n\n", 45),
     ],
 )
@@ -39,13 +39,13 @@ def test_enter_or_the_angle_it_stands_at(monkeypatch: pytest.MonkeyPatch, text: 
 def test_the_question_goes_to_stderr(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     typed(monkeypatch, "\n")
     open_rotator("manual", Log(None)).move(22.5)
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert "turn the polarizer to 22.5°" in said.err
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert "turn the polarizer to 22.5°" in output.err
 
 
 def test_the_end_of_input_is_an_error_with_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    typed(monkeypatch, "what?\n")
+    typed(monkeypatch, "north\n")
     with pytest.raises(HardwareError, match="the input has ended; run in a terminal"):
         open_rotator("manual", Log(None)).move(45)
 
