@@ -151,7 +151,8 @@ def test_a_grid_of_the_network_does_not_reach_the_albedo():
         y, x = np.mgrid[: picture.shape[2], : picture.shape[3]]
         return maps | {"diffuse": maps["diffuse"] * np.where((x + y) % 2, 1.1, 0.9).astype(np.float32)}
 
-    albedo = infer.estimate(found, dataclasses.replace(plain, answer=gridded), run, infer.InferSettings()).diffuse.mean(-1)
+    printing = dataclasses.replace(plain, answer=gridded)
+    albedo = infer.estimate(found, printing, run, infer.InferSettings()).diffuse.mean(-1)
     rows, columns = np.nonzero(found.mask)
     inner = np.s_[rows.min() + 60 : rows.max() - 60, columns.min() + 60 : columns.max() - 60]
     part = albedo[inner]
