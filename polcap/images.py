@@ -432,10 +432,9 @@ class ObjectMask:
     mask: NDArray[np.bool_]  # (H, W) full-frame grid
     crop: tuple[int, int, int, int]  # x0, y0, x1, y1 full-frame grid px, end exclusive
     source: Literal["automatic", "user"]
-    chance: Bits | None = None  # (H, W) 0…255, how likely each pixel is the object; None where no network looked
-    doubt: float | None = None  # 1 − the IoU with the true mask that the chances let expect
+    doubt: float | None = None  # 1 − the expected IoU with the true mask; None without a network
     islands: float = 0.0  # share of the mask outside its largest part
-    holes: float = 0.0  # area that it encloses, of the mask's
+    holes: float = 0.0  # area of its holes, over its own
     border: float = 0.0  # share of the picture's edge that it covers
 
 

@@ -69,7 +69,6 @@ LIMITS: dict[str, dict[str, Limit]] = {  # stage → array → limit; the first 
     },
     "mask": {
         "mask": BITS,
-        "chance": Limit("absolute", 1.0, 1e-3, sensitive=True),  # 8-bit: one level of 255
         "crop": Limit("absolute", 1.0),  # follows the outermost pixel of the mask
     },
     "selfcal": {  # degrees: under a tenth of their 1σ

@@ -97,7 +97,7 @@ def _alone(name: str) -> str:
 
 
 def _estimated(seen: Cues, network: Network | None) -> SurfaceMaps:
-    return infer.estimate(seen, network, infer.Settings())
+    return infer.estimate(seen, network, infer.InferSettings())
 
 
 def _judged(params: Params, means: Means, head: dict[str, Any]) -> list[Row]:

@@ -46,8 +46,8 @@ def main() -> None:
     rows: list[dict[str, dict[str, float]]] = []
     looks: list[Floats] = []
     for case in _cases(given.data, given.size, given.protocol, given.pictures, given.store):
-        before = infer.estimate(case.cues, network, infer.Settings(fine=False))
-        after = infer.estimate(case.cues, network, infer.Settings())
+        before = infer.estimate(case.cues, network, infer.InferSettings(fine=False))
+        after = infer.estimate(case.cues, network, infer.InferSettings())
         both = {"before": errors(before.normal, case, network), "after": errors(after.normal, case, network)}
         rows.append(both)
         print(json.dumps({"picture": case.name, **both}), flush=True)

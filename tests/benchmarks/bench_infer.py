@@ -31,7 +31,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path, help="folder with meshes/ and materials/")
     parser.add_argument("--model", type=Path, help="by default what is shipped, with its fine pass")
-    parser.add_argument("--symmetries", type=int, default=infer.Settings().symmetries, help="positions averaged")
+    parser.add_argument("--symmetries", type=int, default=infer.InferSettings().symmetries, help="positions averaged")
     options = parser.parse_args()
     seen = Protocol(options.data, 512).case(0).cues
     print("| crop | stage [s] | network once [s] | ratio | peak memory [GB] |\n| --- | --- | --- | --- | --- |")
@@ -46,7 +46,7 @@ def _measured(seen: Cues, model: Path | None, symmetries: Literal[1, 2, 4, 8]) -
     network = models.load_network("network", model, "cpu", 0)
     assert network is not None
     small = learned._resized(seen, int(network.metadata["native_size"]) / max(seen.mask.shape))
-    settings = infer.Settings(symmetries=symmetries)
+    settings = infer.InferSettings(symmetries=symmetries)
     floor = _best(lambda: augmentation._run(channels(small), network))
     stage = _best(lambda: infer.estimate(seen, network, settings))
     return stage, floor, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6

@@ -169,7 +169,9 @@ def solved(case: Lit, seed: int) -> Any:
 
 
 def _spoken(image: Any) -> dict[str, str]:
-    maps = infer.estimate(cues.compute(image, scenes.no_color()), _network(), infer.Settings(symmetries=1, fine=False))
+    maps = infer.estimate(
+        cues.compute(image, scenes.no_color()), _network(), infer.InferSettings(symmetries=1, fine=False)
+    )
     found = Evidence.partial(
         stokes=image, radiance=SimpleNamespace(angle=ANGLE), gains=scenes.equal(), names=["0°", "45°", "90°"], maps=maps
     )

@@ -40,7 +40,7 @@ def main() -> None:
         case = read(file, options.clean, options.rough, seed=number)
         judge = Judge(case)
         for name, network in networks.items():
-            found = judge.score(infer.estimate(case.cues, network, infer.Settings()))
+            found = judge.score(infer.estimate(case.cues, network, infer.InferSettings()))
             row = [found.get(key, np.nan) for key in ROWS]
             table[name].append(row)
             print(f"| {case.name} | {name} |", " | ".join(f"{value:.3g}" for value in row), "|", flush=True)

@@ -85,7 +85,7 @@ def linked(data: Path, folder: Path, sixth: int, meshes: int) -> None:
 
 def pixels(case: Case, network: Network, seed: int) -> Floats:
     """Stated error, roughness and true error (3, N) of some pixels of a picture."""
-    maps = infer.estimate(case.cues, network, infer.Settings())
+    maps = infer.estimate(case.cues, network, infer.InferSettings())
     mask = case.truth.mask
     some = np.random.default_rng(seed).permutation(int(mask.sum()))[:SAMPLE]
     return np.stack([image[mask][some] for image in (maps.confidence, maps.roughness, angle(maps, case))])

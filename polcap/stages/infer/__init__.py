@@ -22,7 +22,7 @@ from polcap.stages import stage
 from polcap.stages.infer import analytic, body_light, learned
 
 
-class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The section `infer` of a settings file."""
 
     ior: Annotated[float, Meta(ge=1.2, le=2.5, description="refractive index assumed by the analytic estimator")] = 1.5
@@ -36,7 +36,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @stage(version=15)
-def estimate(cues: Cues, network: Network | None, settings: Settings) -> SurfaceMaps:
+def estimate(cues: Cues, network: Network | None, settings: InferSettings) -> SurfaceMaps:
     """Normal, diffuse, specular, roughness and expected error; network None means analytic.
 
     Raises

@@ -29,14 +29,14 @@ def errors_deg(maps, cues_) -> np.ndarray:
 
 def test_a_clean_ball_is_recovered():
     found = seen(noise=1e-5)
-    error = errors_deg(infer.estimate(found, None, infer.Settings()), found)
+    error = errors_deg(infer.estimate(found, None, infer.InferSettings()), found)
     assert np.median(error) < 1.0
     assert error.mean() < 2.0  # the outline's last pixel is half backdrop
 
 
 def test_a_noisy_textured_ball_is_recovered_and_its_error_foretold():
     found = seen(noise=0.004)
-    maps = infer.estimate(found, None, infer.Settings())
+    maps = infer.estimate(found, None, infer.InferSettings())
     error = errors_deg(maps, found)
     assert error.mean() < 5.0
     expected = maps.confidence[scenes.truth()[1] & maps.mask].mean()
@@ -45,7 +45,7 @@ def test_a_noisy_textured_ball_is_recovered_and_its_error_foretold():
 
 def test_no_half_turn_is_lost_on_a_convex_object():
     found = seen(noise=0.002)
-    maps = infer.estimate(found, None, infer.Settings())
+    maps = infer.estimate(found, None, infer.InferSettings())
     local, mask = scenes.truth()
     true = frames.from_ray_frame(local, found.rays)
     tilted = mask & maps.mask & (local[..., 2] < 0.9)
@@ -55,7 +55,7 @@ def test_no_half_turn_is_lost_on_a_convex_object():
 
 def test_albedo_is_free_of_shading():
     found = seen(noise=1e-4, textured=False)
-    maps = infer.estimate(found, None, infer.Settings())
+    maps = infer.estimate(found, None, infer.InferSettings())
     local, mask = scenes.truth()
     ring = mask & (local[..., 2] > 0.5) & (local[..., 2] < 0.85)
     assert np.abs(maps.diffuse[ring] - 0.5).mean() < 0.03
@@ -71,7 +71,7 @@ def test_albedo_goes_on_into_saturated_highlights(known: bool):
     radiance[spot], quality[spot] = 4.0, quality[spot] | Quality.CLIPPED
     burnt = dataclasses.replace(found, radiance=radiance, quality=quality)
     for estimator in (None, network()):
-        albedo, whole = (infer.estimate(c, estimator, infer.Settings()).diffuse for c in (burnt, found))
+        albedo, whole = (infer.estimate(c, estimator, infer.InferSettings()).diffuse for c in (burnt, found))
         assert np.isfinite(albedo).all()
         if known:  # the network of this test says 0.3, the inversion about 0.5
             assert np.abs(albedo - whole)[spot].mean() < 0.03, estimator
@@ -89,7 +89,7 @@ def test_what_is_brighter_than_any_body_is_not_painted_on_it():
         network(), run=lambda picture: network().run(picture) | {"diffuse": np.exp(picture[:, :3]).clip(0, 1)}
     )
     shining = dataclasses.replace(found, radiance=radiance)
-    albedo, whole = (infer.estimate(c, believing, infer.Settings()).diffuse for c in (shining, found))
+    albedo, whole = (infer.estimate(c, believing, infer.InferSettings()).diffuse for c in (shining, found))
     assert np.abs(albedo - whole)[spot].mean() < 0.05
 
 
@@ -110,24 +110,26 @@ def network(channels=cues.CHANNELS) -> Network:
 
 def test_a_model_for_other_channels_is_refused():
     with pytest.raises(ModelError, match="expects channels red"):
-        infer.estimate(seen(noise=0.002), network(("red",)), infer.Settings())
+        infer.estimate(seen(noise=0.002), network(("red",)), infer.InferSettings())
 
 
 def test_positions_side_by_side_give_the_bytes_of_one_after_another():
     found = seen(noise=0.002)
-    one, four = (infer.estimate(found, dataclasses.replace(network(), at_once=n), infer.Settings()) for n in (1, 4))
+    one, four = (
+        infer.estimate(found, dataclasses.replace(network(), at_once=n), infer.InferSettings()) for n in (1, 4)
+    )
     for name in ("normal", "diffuse", "roughness", "confidence"):
         assert getattr(one, name).tobytes() == getattr(four, name).tobytes()
     lost = dataclasses.replace(network(), run=lambda _: {"normal": np.zeros((1, 3, 32, 32))}, at_once=4)
     with pytest.raises(ModelError, match="this version needs"):
-        infer.estimate(found, lost, infer.Settings())
+        infer.estimate(found, lost, infer.InferSettings())
 
 
 def test_a_crop_larger_than_the_network_sees_keeps_its_texture():
     """The network says grey 0.3 everywhere; the detail it cannot see comes from S0, to the object's very edge."""
     found = seen(noise=1e-4)
     half = dataclasses.replace(network(), metadata={"native_size": "128", "size_multiple": "32"})
-    maps = infer.estimate(found, half, infer.Settings())
+    maps = infer.estimate(found, half, infer.InferSettings())
     rows, columns = np.nonzero(found.mask)
     middle = np.s_[rows.min() + 60 : rows.max() - 60, columns.min() + 60 : columns.max() - 60]
     texture = found.radiance[middle] / cv2.GaussianBlur(found.radiance, (0, 0), 4)[middle]
@@ -148,7 +150,7 @@ def test_a_grid_of_the_network_does_not_reach_the_albedo():
         y, x = np.mgrid[: picture.shape[2], : picture.shape[3]]
         return maps | {"diffuse": maps["diffuse"] * np.where((x + y) % 2, 1.1, 0.9).astype(np.float32)}
 
-    albedo = infer.estimate(found, dataclasses.replace(plain, run=gridded), infer.Settings()).diffuse.mean(-1)
+    albedo = infer.estimate(found, dataclasses.replace(plain, run=gridded), infer.InferSettings()).diffuse.mean(-1)
     rows, columns = np.nonzero(found.mask)
     inner = np.s_[rows.min() + 60 : rows.max() - 60, columns.min() + 60 : columns.max() - 60]
     part = albedo[inner]
@@ -170,7 +172,7 @@ def test_relief_that_the_network_does_not_see_leaves_the_albedo(monkeypatch):
     spread = []
     for normal in (found.rays, waves):
         monkeypatch.setattr(fine, "refined", lambda cues_, guess, network_, known=normal: known)
-        spread.append(np.log(infer.estimate(found, half, infer.Settings()).diffuse[middle] + cues.FLOOR).std())
+        spread.append(np.log(infer.estimate(found, half, infer.InferSettings()).diffuse[middle] + cues.FLOOR).std())
     assert spread[1] == pytest.approx(spread[0] / 2, rel=0.1)
 
 
@@ -185,7 +187,7 @@ def test_a_grid_of_the_network_does_not_reach_the_gloss():
             tile = np.tile(period, (picture.shape[2] // 2, picture.shape[3] // 2))
             return maps | {name: maps[name] * np.where(tile, 1.05, 0.95) for name in ("roughness", "specular")}
 
-        maps = infer.estimate(found, dataclasses.replace(plain, run=gridded), infer.Settings())
+        maps = infer.estimate(found, dataclasses.replace(plain, run=gridded), infer.InferSettings())
         rows, columns = np.nonzero(found.mask)
         inner = np.s_[rows.min() + 60 : rows.max() - 60, columns.min() + 60 : columns.max() - 60]
         for image in (maps.roughness, maps.specular.mean(-1)):
@@ -218,7 +220,7 @@ def test_a_guide_settles_the_half_turn(side: float):
     found = seen(noise=1e-5)
     local, mask = scenes.truth()
     guide = local * [side, side, 1]
-    normal, _, _ = analytic.invert(found, infer.Settings().ior, (guide, np.full(mask.shape, 5.0)))
+    normal, _, _ = analytic.invert(found, infer.InferSettings().ior, (guide, np.full(mask.shape, 5.0)))
     error = np.degrees(np.arccos(np.clip((frames.to_ray_frame(normal, found.rays) * guide).sum(-1), -1, 1)))
     assert np.median(error[mask & found.mask]) < 1.0
 
@@ -254,7 +256,8 @@ def test_a_half_turn_that_nothing_settles_costs_the_zenith():
     local, mask = scenes.truth()
     across = np.stack([-local[..., 1], local[..., 0], local[..., 2]], axis=-1)
     settled, open_ = (
-        analytic.invert(found, infer.Settings().ior, (guide, np.full(mask.shape, 5.0)))[1] for guide in (local, across)
+        analytic.invert(found, infer.InferSettings().ior, (guide, np.full(mask.shape, 5.0)))[1]
+        for guide in (local, across)
     )
     tilted = mask & found.mask & (local[..., 2] > 0.5) & (local[..., 2] < 0.9)
     zenith = np.degrees(np.arccos(local[tilted, 2]))
