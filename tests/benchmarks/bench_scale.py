@@ -68,9 +68,7 @@ def measure(number: int, falloff: float, printed: float) -> tuple[float, ...]:
     coarse = View(_VIEW.focal / _COARSE, (319.5 / _COARSE - 0.375, 239.5 / _COARSE - 0.375), 2.0 * _COARSE)
     object_ = render.gbuffer(scene, coarse, 480 // _COARSE, 640 // _COARSE)
     taken = photograph(scene, falloff, printed, random)
-    color = whitebalance.measure(
-        taken, shipped_data.colorchecker(), ChartRequest("auto"), WhitebalanceSettings()
-    )
+    color = whitebalance.measure(taken, shipped_data.colorchecker(), ChartRequest("auto"), WhitebalanceSettings())
     assert color.light is not None
     nothing = np.zeros((3, 1, 1, 3)), np.zeros((6, 1, 1, 3)), np.zeros((1, 1), np.uint8)
     stokes = StokesImage(*nothing, object_.mask, coarse, None)

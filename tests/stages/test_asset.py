@@ -78,7 +78,7 @@ def test_textures_reach_past_the_mask() -> None:
 
 def test_black_specular_is_allowed() -> None:
     maps = surfaces.maps(specular=0.0)
-    assert asset.build(maps, surfaces.mesh(maps), asset.Settings()).specular_factor == (0.0, 0.0, 0.0)
+    assert asset.build(maps, surfaces.mesh(maps), asset.AssetSettings()).specular_factor == (0.0, 0.0, 0.0)
 
 
 def test_backdrop_does_not_run_along_the_limb() -> None:

@@ -22,7 +22,7 @@ from polcap.stages.asset.coverage import interpolated
 _LEAST_UP = 0.05  # a tangent-space normal must leave the surface (glTF: blue above one half)
 
 
-class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class AssetSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The section `asset` of a settings file."""
 
     ior: Annotated[
@@ -31,7 +31,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @stage(version=3, keep=False)
-def build(maps: SurfaceMaps, mesh: Mesh, settings: Settings) -> Asset:
+def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings) -> Asset:
     """Textures on the crop's grid, filled outwards from the object so that no seam shows.
 
     The outermost pixels, which the backdrop shines into, are filled too, so that it does not run along the limb.
@@ -55,7 +55,7 @@ class Colors:
     ior: float
 
 
-def colors(maps: SurfaceMaps, settings: Settings) -> Colors:
+def colors(maps: SurfaceMaps, settings: AssetSettings) -> Colors:
     """The textures that no mesh decides."""
     known = _unmixed(maps.mask)
     specular = np.clip(maps.specular, 0.0, 1.0)
@@ -80,7 +80,7 @@ def colors(maps: SurfaceMaps, settings: Settings) -> Colors:
     )
 
 
-def _base(diffuse: Floats, greatest: Floats, settings: Settings) -> NDArray[np.uint8]:
+def _base(diffuse: Floats, greatest: Floats, settings: AssetSettings) -> NDArray[np.uint8]:
     """ρ_d T₊(0)²/(1 − F0), sRGB-encoded, of the greatest F0 (H, W, 1) of each pixel's channels."""
     entry, _ = fresnel.transmission(np.float64(1.0), settings.ior)
     return color.srgb_eight_bits(diffuse * np.float32(entry**2) / (1 - np.minimum(greatest, 0.99)))
@@ -91,7 +91,7 @@ def _top(mask: NDArray[np.bool_], greatest: Floats) -> float:
     return float(greatest[mask].max(initial=0.0))
 
 
-def _factor(top: float, settings: Settings) -> tuple[float, float, float]:
+def _factor(top: float, settings: AssetSettings) -> tuple[float, float, float]:
     return (top / float(fresnel.normal_reflectance(settings.ior)),) * 3
 
 
