@@ -49,7 +49,7 @@ class Params:
     piece: float | None = None  # minutes after which this run stops and leaves last.pt, for `resume` to go on from
     resume: bool = False  # go on from out/last.pt
     start: Path | None = None  # ONNX model whose weights are the first; else random ones
-    done: int = 0  # pictures of `samples` that `start` has learned from: the schedule goes on from there
+    done: int = 0  # pictures of `samples` that the weights of `start` have seen; the schedule goes on from there
     views: int | None = None  # of each mesh, instead of the preset's
     procedural: int | None = None  # random shapes, instead of the preset's
     threads: int = 2  # learners on a CPU, each with a batch of its own; one more thread makes the batches
@@ -283,7 +283,7 @@ class Run:
     def begin(self, path: Path, done: int = 0) -> None:
         """Take a model's weights as the first, from `export.write`; InputError where they are another network's.
 
-        `done` pictures count as learned from: with a budget of pictures the schedule goes on from there.
+        `done` pictures of the budget count as learned; the schedule goes on from there.
         """
         weights, metadata = export.read(path)
         for name, own in self.network.state_dict().items():
