@@ -24,7 +24,7 @@ from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import Results
 from polcap.stages import align, infer, selfcal
-from polcap.stages.infer import analytic, azimuth, body_law, learned
+from polcap.stages.infer import analytic, body_law, half_turns, learned
 from polcap.stages.selfcal import object_gains
 
 FACTORS = (0.5, 2.0)
@@ -43,7 +43,7 @@ SELFCAL: Mapping[ModuleType, tuple[str, ...]] = {
 }
 ANALYTIC = {
     analytic: ("_BLURS_PX", "_SAME", "_MODEL_ERROR_DEG"),
-    azimuth: ("_MOST_PIXELS", "_RIM_PX", "_BLUR_PX", "_CONVEXITY"),
+    half_turns: ("_LONGEST", "_OUTLINE", "_INSIDE", "_AHEAD", "_BLUR", "_AROUND"),
     body_law: (
         "_FLAT", "_FLATTEST", "_SMOOTH_LIKELIER", "_DEPOLARIZED_LIKELIER", "_PATCHES", "_UNEVEN", "_RADIUS_SPREAD",
         "_OUTLINE_DEG", "_SHARP",
@@ -52,6 +52,7 @@ ANALYTIC = {
 LEARNED: Mapping[ModuleType, tuple[str, ...]] = {
     learned: ("_INVERSION", "_DETAIL", "_CELLS", "_BRIGHTEST"),
     analytic: ("_MODEL_ERROR_DEG", "_SAME"),
+    half_turns: ("_LONGEST", "_OUTLINE", "_INSIDE", "_NETWORK", "_AHEAD", "_BLUR", "_SURE_DEG", "_SUREST"),
 }
 
 

@@ -29,6 +29,7 @@ BODY = {
 TURN = {"shot": None, "angle": 0.0, "misfit": 1.0, "sigmas": 0.0}
 FIGURES = {
     "object_motion": [0.0, 0.1, 0.1], "charted": 0.0, "noise": 0.001, "ill_posed": 0.0, "shape": [45.0, 0.2],
+    "inward_outline": 0.0,
     "normal_error": 4.0, "lean": 2.0, "crossed": {"left": 0.0, "clipped": 0, "over": 0.0, "mirrored": 0.1},
 }  # fmt: skip
 MESH = {"pieces": 1, "cuts": 0.3, "cut_px": 40.0, "raggedness": 0.1}
@@ -129,6 +130,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
                          "figures": {"crossed": {"left": 0.0, "clipped": 0, "over": 0.9, "mirrored": 0.1}}}),
     ("ill-posed", "pass", {}),
     ("ill-posed", "fail", {"figures": {"ill_posed": 0.5}}),
+    ("outline", "pass", {}),
+    ("outline", "fail", {"figures": {"inward_outline": 0.3}}),
     ("focal length", "pass", {}),
     ("focal length", "warn", {"focal_doubt": (-0.7, 0.7)}),
     ("normal error", "pass", {}),

@@ -4,8 +4,8 @@ Both estimators work in the frame of each view ray, where polarization speaks of
 hand back camera-frame maps.
 
     analytic       the inversion: zenith from DoLP, azimuth from AoLP
-        azimuth        which of the two half-turns an AoLP means
         body_law       which law of the body the DoLP follows, and the zenith it means
+    half_turns     which side of the ray a normal leans to, for both estimators
     body_light     albedo in highlights, where a crossed shot shows what lies under them
     learned        the network, joined with the inversion
     fine           relief that the network is shown too small to see
@@ -35,7 +35,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
 
 
-@stage(version=15)
+@stage(version=16)
 def estimate(cues: Cues, network: Network | None, settings: Settings) -> SurfaceMaps:
     """Normal, diffuse, specular, roughness and expected error; network None means analytic.
 
