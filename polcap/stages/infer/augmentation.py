@@ -41,7 +41,7 @@ def combined(cues: Cues, network: Network, symmetries: int) -> dict[str, Floats]
 def _opposed(normals: Floats, middle: Floats, rays: Floats) -> Floats:
     """Share (H, W) of K normals (K, H, W, 3) that lean to the other side of the ray than the middle one (H, W, 3)."""
     towards = middle - frames.dot(middle, rays)[..., None] * rays
-    return np.mean([frames.dot(normal, towards) < 0 for normal in normals], axis=0, dtype=np.float32)
+    return np.asarray(np.mean([frames.dot(normal, towards) < 0 for normal in normals], axis=0), np.float32)
 
 
 def _answer(picture: Floats, rays: Floats, network: Network, quarters: int, mirror: bool) -> dict[str, Floats]:

@@ -268,8 +268,8 @@ def _cut(mask: Bools, cost: Floats, first: NDArray[np.intp], second: NDArray[np.
         *((p, q, -pair[other]) for p, q in ((c, d + count), (d + count, c), (c + count, d), (d, c + count))),
     ]  # fmt: skip
     start, end, capacity = (np.concatenate(column) for column in zip(*edges))
-    graph = sparse.csr_matrix((capacity.astype(np.int32), (start, end)), shape=(2 * count + 2, 2 * count + 2))
-    rest = graph - maximum_flow(graph, source, sink).flow
+    graph = sparse.csr_array((capacity.astype(np.int32), (start, end)), shape=(2 * count + 2, 2 * count + 2))
+    rest = sparse.csr_array(graph - maximum_flow(graph, source, sink).flow)
     rest.eliminate_zeros()
     reached = np.zeros(2 * count + 2, dtype=bool)
     reached[breadth_first_order(rest, source, return_predecessors=False)] = True
