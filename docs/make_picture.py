@@ -19,7 +19,7 @@ LIGHT = 6 / 48  # of the way round, from the left above
 
 result, file = map(Path, sys.argv[1:3])
 found, about = pipeline.reopen(result)
-cues, maps = found.cues.value, found.maps.value
+cues, maps = found.cues, found.maps
 turn = np.degrees(np.arctan2(cues.normalized_stokes[1], cues.normalized_stokes[0]) / 2) % 180
 relit = moving.light(maps, about["settings"]["infer"]["ior"])
 inside = maps.mask[..., None]

@@ -8,10 +8,11 @@ import sys
 from pathlib import Path
 
 from polcap.pipeline import run as pipeline
-from polcap.pipeline.asset_export import Wanted
+from polcap.pipeline.asset_export import ExportRequest
 
 result = Path(sys.argv[1])
-for wanted in (Wanted(preset="unreal"), Wanted(preset="web"), Wanted(formats=("exr",), color="ACEScg")):
+layers = ExportRequest(formats=("exr",), color="ACEScg")
+for wanted in (ExportRequest(preset="unreal"), ExportRequest(preset="web"), layers):
     for file in pipeline.export(result, wanted):
         print(f"{file.relative_to(result)}  {file.stat().st_size / 1e6:.2f} MB")
 exports = json.loads((result / "maps" / "maps.json").read_text(encoding="utf-8"))["exports"]

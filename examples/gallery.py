@@ -22,11 +22,11 @@ def picture(address: str, words: str) -> str:
 body = ["<h1>Gallery</h1><p>From nine photographs each. A report lies beside every result.</p>"]
 for folder in folders:
     results, _ = pipeline.reopen(folder)
-    maps, mesh, about = results.maps.value, results.mesh.value, report.read(folder)
+    maps, mesh, about = results.maps, results.mesh, report.read(folder)
     moving = pipeline.animate(folder, "light")[0].read_bytes()
     name, says = escape(about["capture"]["name"]), escape(" ".join(verdict(about)))
     shown = [
-        (html.jpeg(pictures.display(results.cues.value.radiance)), "photograph"),
+        (html.jpeg(pictures.display(results.cues.radiance)), "photograph"),
         (html.jpeg(pictures.normal(maps)), "normals"),
         (html.jpeg(pictures.shaded(mesh, maps)), "shape"),
         (f"data:image/webp;base64,{b64encode(moving).decode()}", "relit"),

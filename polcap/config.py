@@ -17,14 +17,14 @@ from msgspec import Meta
 from polcap.errors import SettingError, StorageError
 from polcap.formats import text_file
 from polcap.stages.align import Settings as Align
-from polcap.stages.asset import Settings as Asset
+from polcap.stages.asset import AssetSettings
 from polcap.stages.hdr import Settings as Hdr
-from polcap.stages.infer import Settings as Infer
-from polcap.stages.mask import Settings as Mask
-from polcap.stages.selfcal import Settings as Selfcal
-from polcap.stages.stokes import Settings as Stokes
-from polcap.stages.surface import Settings as Surface
-from polcap.stages.whitebalance import Settings as Whitebalance
+from polcap.stages.infer import InferSettings
+from polcap.stages.mask import MaskSettings
+from polcap.stages.selfcal import SelfcalSettings
+from polcap.stages.stokes import StokesSettings
+from polcap.stages.surface import SurfaceSettings
+from polcap.stages.whitebalance import WhitebalanceSettings
 
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -136,14 +136,14 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Every setting of a run."""
 
     hdr: Hdr = Hdr()
-    whitebalance: Whitebalance = Whitebalance()
+    whitebalance: WhitebalanceSettings = WhitebalanceSettings()
     align: Align = Align()
-    mask: Mask = Mask()
-    selfcal: Selfcal = Selfcal()
-    stokes: Stokes = Stokes()
-    infer: Infer = Infer()
-    surface: Surface = Surface()
-    asset: Asset = Asset()
+    mask: MaskSettings = MaskSettings()
+    selfcal: SelfcalSettings = SelfcalSettings()
+    stokes: StokesSettings = StokesSettings()
+    infer: InferSettings = InferSettings()
+    surface: SurfaceSettings = SurfaceSettings()
+    asset: AssetSettings = AssetSettings()
     gates: Gates = Gates()
 
 

@@ -1,7 +1,6 @@
 """In: what a command found, or what befell it. Out: data on stdout, all else on stderr, an exit code."""
 
 import functools
-import gc
 import os
 import sys
 import time
@@ -30,7 +29,6 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(context: typer.Context, *args: Any, **kwargs: Any) -> None:
-        gc.enable()
         try:
             command(context, *args, **kwargs)
         except BrokenPipeError:  # whoever read stdout has seen enough
@@ -131,6 +129,13 @@ def preview(drawn: "list[Path]") -> None:
             for above, below in zip(upper.tolist(), lower.tolist(), strict=True):
                 line_.append("▀", f"rgb({above[0]},{above[1]},{above[2]}) on rgb({below[0]},{below[1]},{below[2]})")
             console.print(line_)
+
+
+def tell_result(about: dict[str, Any], out: "Path", json: bool) -> None:
+    """The asset's path, or the report, on stdout; the verdict on stderr; a failed gate ends with exit code 3."""
+    say(about if json else str(out / "asset" / f"{about['capture']['name']}.glb"))
+    tell(f"verdict {about['verdict']}; {out / 'report.html'}")
+    tell_gates(about)
 
 
 def tell_gates(about: dict[str, Any]) -> None:

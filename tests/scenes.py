@@ -1,15 +1,26 @@
 """A textured ball beside a flat board, known everywhere, to try the stages on: evaluated, never resampled."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Gains, ObjectMask, View
+from polcap.images import (
+    Alignment,
+    AngleStack,
+    ColorCalibration,
+    Floats,
+    Gains,
+    ObjectMask,
+    OutlineCheck,
+    RingZero,
+    SelfCalibration,
+    ShotOrder,
+    View,
+    single_frames,
+)
 from polcap.optics import frames, mueller, shade
 from polcap.optics.warp import warp
 
@@ -86,8 +97,7 @@ def stack(
     return AngleStack(
         value=value.astype(np.float32), variance=variance.astype(np.float32),
         quality=np.zeros(value.shape[:3], np.uint8), angle=np.asarray(angles), view=VIEW,
-        exposure_ratio=np.ones((len(angles), 1, 3)), exif_ratio=np.ones((len(angles), 1)),
-        ghost_fraction=np.zeros(len(angles)), lossy=False, camera_matrix=None, white_balance=None,
+        bracket=single_frames(len(angles)),
     )  # fmt: skip
 
 
@@ -111,10 +121,12 @@ def still(shots: int = 3) -> Alignment:
     return Alignment(np.tile(np.eye(3), (shots, 1, 1)), np.zeros(shots), np.ones(shots))
 
 
-def equal(shots: int = 3) -> Gains:
-    ones = np.ones((shots, 3))
-    order = tuple(range(shots))
-    return Gains(ones, 0 * ones, ones, "none", 0.0, 0.0, 0.0, 0.0, 1.0, order, False, np.zeros(shots), 1.0, 0.0)
+def equal(angle: Floats = ANGLES, gain: Floats | float = 1.0) -> SelfCalibration:
+    """Shots at these angles (K,) rad, with these gains (K, 3)."""
+    ones = np.ones((len(angle), 3))
+    gains = Gains(gain * ones, 0 * ones, ones, "none", 0.0)
+    order = ShotOrder(tuple(range(len(angle))))
+    return SelfCalibration(gains, np.asarray(angle), OutlineCheck(order, 1.0), RingZero(0.0, 0.0))
 
 
 def ball_object() -> ObjectMask:
@@ -128,10 +140,3 @@ def truth() -> tuple[Floats, NDArray[np.bool_]]:
     x0, y0, x1, y1 = ball_object().crop
     y, x = np.mgrid[y0:y1, x0:x1].astype(float)
     return normals(x, y)
-
-
-class Found(SimpleNamespace):
-    """What the stages made of a scene, as the gates look at it: its figures are measured when they are asked for."""
-
-    def figure(self, name: str, measure: Callable[..., Any], setting: Any = None) -> Any:
-        return measure(self, setting)

@@ -1,7 +1,6 @@
 """A ball with a red top-left quarter, as maps and mesh: to see what happens to an asset on its way out."""
 
-from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,15 +11,6 @@ VIEW = View(focal=400.0, center=(70.0, 50.0), scale=2.0, origin=(300.0, 200.0))
 HEIGHT, WIDTH = 120, 160
 CENTER, RADIUS = (0.01, -0.01, -0.6), 0.075  # m, camera frame
 DISTANCE = 0.55  # m
-Value = TypeVar("Value", covariant=True)
-
-
-@dataclass(frozen=True)
-class Known(Generic[Value]):
-    """A result of the path that is there already."""
-
-    value: Value
-    key: str = "known"
 
 
 def maps(ripple: float = 0.0, roughness: float = 1.0, specular: float = 0.0) -> SurfaceMaps:
@@ -52,8 +42,8 @@ def maps(ripple: float = 0.0, roughness: float = 1.0, specular: float = 0.0) -> 
     )
 
 
-def mesh(of: SurfaceMaps, settings: surface.Settings | None = None) -> Mesh:
-    return surface.integrate(of, DISTANCE, settings or surface.Settings())
+def mesh(of: SurfaceMaps, settings: surface.SurfaceSettings | None = None) -> Mesh:
+    return surface.integrate(of, DISTANCE, settings or surface.SurfaceSettings())
 
 
 def flat_mesh(of: SurfaceMaps) -> Mesh:
@@ -64,7 +54,7 @@ def flat_mesh(of: SurfaceMaps) -> Mesh:
 
 
 def built(of: SurfaceMaps, on: Mesh) -> Asset:
-    return asset.build(of, on, asset.Settings())
+    return asset.build(of, on, asset.AssetSettings())
 
 
 def lit(of: SurfaceMaps, to_light: Floats) -> Floats:

@@ -17,7 +17,6 @@ def test_importing_polcap_imports_nothing_heavy() -> None:
 
 
 def test_importing_the_path_leaves_to_those_who_need_it_what_is_heavy() -> None:
-    """OpenImageIO also because its binding tells of leaks where it is imported before `keep_imported`."""
     heavy = ("OpenImageIO", "scipy", "onnxruntime", "trimesh", "rawpy")
     code = f"import sys, polcap.pipeline.run; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -48,4 +47,4 @@ def test_python_takes_the_network_as_the_command_line_does(monkeypatch: pytest.M
     monkeypatch.setattr(models, "load_network", load)
     with pytest.raises(polcap.PolcapError, match="far enough"):
         polcap.process("nowhere")
-    assert asked == [(None, None, "cpu", 0)]  # what `polcap process` without flags asks for
+    assert asked == [(None, None)]  # what `polcap process` without flags asks for

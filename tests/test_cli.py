@@ -213,7 +213,7 @@ def test_folder_that_is_no_result_is_exit_2(tmp_path: Path, polcap: Command, com
 
 def test_a_result_is_told_to_be_no_capture(result: Path, polcap: Command) -> None:
     done = polcap("process", result)
-    assert done.returncode == 2 and "it is a result: give the capture" in done.stderr
+    assert done.returncode == 2 and "it is a result of polcap: give the folder" in done.stderr
 
 
 def test_the_status_of_no_folder_says_so(tmp_path: Path, polcap: Command) -> None:
@@ -235,7 +235,7 @@ def test_user_mask_replaces_the_search(result: Path, example: Path, polcap: Comm
     done = polcap("process", example, "--out", copy, "--mask", tmp_path / "mask.png", "--until", "mask", "--json")
     assert done.returncode == 0, done.stderr
     results, _ = pipeline.reopen(copy)
-    assert results.object_.value.source == "user" and np.array_equal(results.object_.value.mask, drawn > 0)
+    assert results.object_.source == "user" and np.array_equal(results.object_.mask, drawn > 0)
 
 
 def test_watch_goes_on_as_photographs_come_in_and_settings_change(example: Path, tmp_path: Path) -> None:

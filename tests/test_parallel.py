@@ -1,7 +1,8 @@
-"""Tasks side by side: each is done once, their results come in order, and so do their errors."""
+"""Calls on threads: each runs once, results come in order, and so do errors."""
 
 import threading
-from concurrent.futures import ThreadPoolExecutor
+import time
+from collections.abc import Callable
 from functools import partial
 
 import pytest
@@ -10,7 +11,7 @@ from polcap import parallel
 
 
 @pytest.mark.parametrize("most", [1, 2, 8])
-def test_results_come_in_order_and_each_task_is_done_once(most: int) -> None:
+def test_results_come_in_order_and_each_call_runs_once(most: int) -> None:
     done: list[int] = []
 
     def square(n: int) -> int:
@@ -32,28 +33,25 @@ def test_the_first_error_in_order_comes_out(most: int) -> None:
         parallel.results([partial(fail, n) for n in range(9)], most)
 
 
-def test_the_caller_works_beside_the_task() -> None:
-    met = threading.Event()
-    with parallel.Beside(2) as beside:
-        task = beside.begin(partial(met.wait, 60))
-        met.set()  # by the caller, while the task waits for it
-        assert task.result()
+def test_calls_run_side_by_side() -> None:
+    here = threading.Barrier(2)
+    assert sorted(parallel.both(here.wait, here.wait, 2)) == [0, 1]  # each waits for the other
 
 
-def test_tasks_that_nobody_has_begun_are_dropped_when_the_caller_fails() -> None:
-    began, dropped, done, waiting = threading.Event(), threading.Event(), list[int](), list[parallel.Task[None]]()
+def test_after_ctrl_c_no_further_call_begins() -> None:
+    done = list[int]()
 
-    def first() -> None:
-        began.set()
-        dropped.wait(60)
-
-    with pytest.raises(KeyboardInterrupt), parallel.Beside(2) as beside:
-        beside.begin(first)
-        waiting += [beside.begin(partial(done.append, n)) for n in range(3)]
-        waiting[-1].future.add_done_callback(lambda _: dropped.set())
-        assert began.wait(60)
+    def interrupted() -> None:
         raise KeyboardInterrupt
-    assert done == [] and all(one.future.cancelled() for one in waiting)
+
+    def slow(n: int) -> None:
+        done.append(n)
+        time.sleep(0.2)
+
+    calls: list[Callable[[], None]] = [partial(slow, n) for n in range(40)]
+    with pytest.raises(KeyboardInterrupt):
+        parallel.results([interrupted, *calls], 2)
+    assert len(done) < 5
 
 
 def test_the_number_of_threads_is_what_was_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -62,22 +60,3 @@ def test_the_number_of_threads_is_what_was_asked_for(monkeypatch: pytest.MonkeyP
     for nothing in ("", "0", "all", "²"):
         monkeypatch.setenv("OMP_NUM_THREADS", nothing)
         assert parallel.threads() >= 1
-
-
-def test_a_value_is_made_once_whichever_threads_ask() -> None:
-    made: list[int] = []
-    here = threading.Barrier(4)
-
-    def make() -> int:
-        made.append(1)
-        return 7
-
-    once = parallel.Once(make)
-
-    def ask() -> int:
-        here.wait(60)
-        return once()
-
-    with ThreadPoolExecutor(4) as pool:
-        assert [one.result(60) for one in [pool.submit(ask) for _ in range(4)]] == [7] * 4
-    assert made == [1]

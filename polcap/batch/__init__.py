@@ -17,7 +17,7 @@ from polcap.batch import unit as units
 from polcap.batch.shards import WHOLE, Shard
 from polcap.batch.unit import FINISHED, FOLDER, Order, Record, Unit
 from polcap.errors import CaptureError
-from polcap.formats import atomic
+from polcap.formats import atomic, own_folders
 from polcap.formats.capture import layouts
 
 Tell = Callable[[str], None]
@@ -70,12 +70,12 @@ def _captures(root: Path) -> Iterator[str]:
             inside.clear()
             yield folder
         else:
-            inside[:] = [name for name in inside if not name.startswith(".") and name not in (FOLDER, layouts.OUTPUT)]
+            inside[:] = [name for name in inside if not name.startswith(".") and name not in own_folders.OURS]
 
 
 def _unit(root: Path, folder: Path, out: Path | None, desk: str) -> Unit:
     name = folder.relative_to(root).as_posix() if folder != root else folder.resolve().name
-    target = folder / layouts.OUTPUT if out is None else out / name
+    target = folder / own_folders.OUTPUT if out is None else out / name
     return Unit(name, str(folder), str(target), desk)
 
 

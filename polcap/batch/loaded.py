@@ -7,7 +7,6 @@ onnxruntime, whose import starts one, is left to each worker.
 import scipy.sparse.linalg
 import scipy.special  # noqa: F401
 
-from polcap import resource_limits
 from polcap.batch import thumbnail, unit  # noqa: F401
 from polcap.formats.capture import reader  # noqa: F401
 from polcap.formats.export import provenance
@@ -16,4 +15,3 @@ from polcap.pipeline import models, run  # noqa: F401
 
 body.make_tables()
 provenance.versions()
-resource_limits.keep_imported()  # a look for garbage writes to, and so copies, what workers share

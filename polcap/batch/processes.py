@@ -108,5 +108,3 @@ def prepare(order: Order) -> None:
     """Threads and memory of this process."""
     resource_limits.set_threads(order.threads)
     resource_limits.set_memory(order.memory_gb)
-    if not order.memory_gb:
-        resource_limits.keep_pages()

@@ -1,7 +1,7 @@
 """One capture of a batch: what decides its result, and the work itself, which never raises.
 
-A unit is idempotent: its result folder is written through the store, so that a unit that was cut off goes on
-where it stopped, and one that is done is known by its stamp without opening a photograph.
+A unit is idempotent: a unit that was cut off goes on from the stages in its cache, and one that is done is known
+without opening a photograph.
 """
 
 import hashlib
@@ -18,16 +18,16 @@ from typing import Any, Literal
 
 import msgspec
 
-from polcap import __version__
 from polcap.errors import InputError, PolcapError, StorageError
-from polcap.formats import atomic, calibrations_folder
-from polcap.formats.capture import layouts
+from polcap.formats import atomic, own_folders
 from polcap.images import ChartRequest, Network
+from polcap.pipeline import unchanged
+from polcap.pipeline.cache import fingerprint
 
 State = Literal["todo", "running", "interrupted", "done", "gates", "failed", "bug", "crashed"]
 FINISHED: tuple[State, ...] = ("done", "gates")  # the asset is there
 _SYNCHRONIZE, _WAIT_TIMEOUT = 0x00100000, 0x102  # Windows: winnt.h, winbase.h
-FOLDER = layouts.BATCH  # in ROOT or in --out: records, thumbnails, summary, job files; safe to delete
+FOLDER = own_folders.BATCH  # in ROOT or in --out: records, thumbnails, summary, job files; safe to delete
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,6 @@ class Record:
     state: State = "todo"
     says: str = ""  # one line: the error with its remedy, or the failed gates
     seconds: float = 0.0
-    stamp: str = ""
     host: str = ""
     pid: int = 0
     attempts: int = 0
@@ -85,9 +84,8 @@ class Record:
 def run(unit: Unit, order: Order, attempt: int = 1) -> Record:
     """Process one capture; whatever goes wrong is in the record."""
     start = time.perf_counter()
-    record = Record(unit.name, "running", "", 0.0, "", socket.gethostname(), os.getpid(), attempt)
+    record = Record(unit.name, "running", "", 0.0, socket.gethostname(), os.getpid(), attempt)
     try:
-        record = replace(record, stamp=stamp(unit, order))
         write_record(unit, record)
         about = _process(unit, order)
         failed = [gate for gate in about["gates"] if gate["state"] == "fail"]
@@ -124,9 +122,11 @@ def _process(unit: Unit, order: Order) -> dict[str, Any]:
         network=_network(order.estimator, order.model, order.device, order.threads),
         mask_network=_mask_network(order.threads),
     )
+    asked = request(unit, order)
     found = captures.read(unit.capture, order.angles_deg)
     about = pipeline.process(found, supplied, config, Path(unit.out))
     assert about is not None  # only `until` leaves it out
+    unchanged.remember(Path(unit.out), asked)
     thumbnail.write(unit.thumbnail_file, Path(unit.out))
     return about
 
@@ -147,40 +147,19 @@ def _mask_network(threads: int) -> Network | None:
     return models.load_mask_network(threads)
 
 
-def stamp(unit: Unit, order: Order) -> str:
-    """Digest of all that decides a result: names, sizes and times of the files, settings, model, version."""
-    files = []
-    out = Path(unit.out).resolve()
-    for root, folders, names in os.walk(unit.capture):
-        here = Path(root)
-        left_out = {name for name in folders if name.startswith(".") or name in layouts.OURS}
-        folders[:] = sorted(name for name in folders if name not in left_out and (here / name).resolve() != out)
-        for name in sorted(names):
-            if not name.startswith("."):
-                about = (here / name).stat()
-                files.append([os.path.relpath(here / name, unit.capture), about.st_size, about.st_mtime_ns])
-    files += [[str(file), file.stat().st_mtime_ns] for file in calibrations_folder.files()]  # another one may be chosen
-    model = None if order.model is None else [order.model, Path(order.model).stat().st_mtime_ns]
-    wanted = [order.settings, _plain(order.chart), order.estimator, model, order.angles_deg, __version__]
-    text = json.dumps([files, wanted], sort_keys=True, default=str)
-    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
-
-
-def _plain(request: ChartRequest) -> list[Any]:
-    corners = None if request.corners is None else request.corners.tolist()
-    profile = None if request.profile is None else request.profile.matrix.tolist()
-    return [request.mode, corners, profile]
+def request(unit: Unit, order: Order) -> str | None:
+    """The request that a unit is, as `pipeline/unchanged.py` compares it."""
+    options = {**asdict(replace(order, threads=0, memory_gb=0.0)), "chart": fingerprint(order.chart)}
+    files = [] if order.model is None else [Path(order.model)]
+    return unchanged.request(options, Path(unit.capture), Path(unit.out), files)
 
 
 def finished(unit: Unit, order: Order) -> Record | None:
-    """The record of an earlier run whose result is there and would come out the same; else None."""
+    """The record of an earlier run, if its result is there and nothing has changed since; else None."""
     record = read_record(unit)
-    if record.state not in FINISHED or not (Path(unit.out) / "report.json").is_file():
+    if record.state not in FINISHED or unchanged.find(Path(unit.out), request(unit, order)) is None:
         return None
-    try:
-        return record if record.stamp == stamp(unit, order) else None
-    except OSError:
-        return None
+    return record
 
 
 def read_record(unit: Unit) -> Record:
@@ -201,7 +180,7 @@ def write_record(unit: Unit, record: Record) -> None:
 
 def crashed(unit: Unit, why: str, attempt: int) -> Record:
     """The record of a unit that took its process down, written for it."""
-    record = Record(unit.name, "crashed", why, 0.0, "", socket.gethostname(), 0, attempt)
+    record = Record(unit.name, "crashed", why, 0.0, socket.gethostname(), 0, attempt)
     write_record(unit, record)
     return record
 

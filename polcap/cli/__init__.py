@@ -16,8 +16,6 @@ training_commands  train, evaluate
 options            what several commands share, and the values it means
 """
 
-import atexit
-import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -83,7 +81,6 @@ def _spoken(error: TyperException) -> str:
     return f"polcap: error: {said[:1].lower()}{said[1:]}{see}"
 
 
-_UNTOLD = 120  # exit code where stdout takes nothing any more, as Python has it
 COMMANDS = (process, batch, export, show, status, report, check, calibrate, doctor, synth, capture, train, evaluate)
 app = typer.Typer(
     cls=OneLine,
@@ -105,22 +102,7 @@ def main() -> None:
         arguments = ["--debug", *(argument for argument in arguments if argument != "--debug")]
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]  # names of files are bytes
-    gc.disable()  # until a command begins: see `resource_limits.no_garbage`
-    try:
-        app(arguments)
-    except SystemExit as ended:
-        _end(int(ended.code or 0))
-
-
-def _end(code: int) -> None:
-    """End at once: to take apart what dies with the process anyway is a tenth of a second."""
-    atexit._run_exitfuncs()
-    for stream in (sys.stdout, sys.stderr):
-        try:
-            stream.flush()
-        except OSError:
-            code = code or _UNTOLD
-    os._exit(code)
+    app(arguments)
 
 
 def _version(asked: bool) -> None:

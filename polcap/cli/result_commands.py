@@ -42,13 +42,13 @@ def export(
     """Write the asset again from the maps of a result; without a flag GLB and OBJ, as `process` does."""
     from polcap.formats.export import presets
     from polcap.pipeline import run as pipeline
-    from polcap.pipeline.asset_export import Wanted
+    from polcap.pipeline.asset_export import ExportRequest
 
     flags = {"gltf": gltf, "obj": obj, "usd": usd, "materialx": materialx, "exr": exr}
     formats = tuple(name for name in presets.FORMATS if flags[name])
     if preset is not None and formats:
         raise SettingError(f"--preset {preset} brings its formats; leave out --{formats[0]}")
-    wanted = Wanted(formats or ("gltf", "obj"), preset, images, color, texture_size, lod)
+    wanted = ExportRequest(formats or ("gltf", "obj"), preset, images, color, texture_size, lod)
     written = [str(file) for file in pipeline.export(result, wanted)]
     terminal.say({"written": written} if json else "\n".join(written))
 
@@ -85,11 +85,11 @@ def show(
 
 def status(context: typer.Context, result: Result, json: Json = False) -> None:
     """What a result folder holds, stage by stage; or how far a batch of captures is."""
-    from polcap.pipeline import cache as store
+    from polcap.pipeline import cache
 
     if not result.is_dir():
         raise SettingError(f"{result}: no such folder; give the result folder of `polcap process`, or that of a batch")
-    found = store.contents(result)
+    found = cache.contents(result)
     if not found and (result / "polcap-batch").is_dir():
         from polcap import batch as batches
 

@@ -33,7 +33,7 @@ def train(
 ) -> None:
     """Train the network (extra [train])."""
     trainer = extras.training("train")
-    params = trainer.Params(
+    params = trainer.TrainingOptions(
         preset=preset, data=data, out=out, minutes=minutes, samples=samples, variant=variant, resume=resume,
         start=start, done=done, rate=rate, views=views, procedural=procedural, threads=threads, seed=seed,
     )  # fmt: skip

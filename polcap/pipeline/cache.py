@@ -1,308 +1,215 @@
-"""In: a stage and its inputs. Out: its result, computed once and kept in the result folder.
+"""The stage cache: the result of each stage in a folder of its own, `work/NN-name/`, found again by its key.
 
-Nothing is computed when a step is declared: a `StageResult` knows its key and finds its value when it
-is asked for. So one description of the path serves a run, a dry run, `--until` and `show`.
-
-The key of a result is a digest of the stage's name, its version, its own settings and the keys of
-its inputs, chained back to the bytes of the RAW files and of the model file. Where files lie is not
-part of it: a capture may be moved. A result is one folder, `work/NN-name/`: an `.npy` per array and
-a `manifest.json`. Folders are written beside and renamed, so a killed run leaves a whole result or none;
-what a power cut leaves of one is known by its digests, and computed again. Arrays come back as read-only
-memory maps, the first time as after a resume.
-
-The manifest carries its own digest, so an edited scalar is seen as an edited pixel is. Each array's size
-and SHA-256 digest are checked once per process, when a stage that has to run (or a writer) first opens
-the result; what nobody reads is not hashed. That is one pass at about 1.6 GB/s. A result that fails any
-check is computed again.
+A key is a digest of the stage's name and version, its settings and the keys of its inputs, back to the bytes of the
+RAW files and of the model file. Where files lie is not part of it: a capture may be moved. A folder holds an `.npy`
+per array and `manifest.json`. It is written under a temporary name and renamed, so a killed run leaves a whole result
+or none. Sizes and SHA-256 digests are compared when a result is read, at about 1.6 GB/s; a damaged result is computed
+again. Arrays come back as read-only memory maps, when they are computed as when they are read.
 """
 
-import inspect
 import json
-import math
-import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from hashlib import blake2b, sha256
 from pathlib import Path
-from threading import RLock
-from typing import Any, Generic, TypeVar, cast, get_type_hints
+from typing import Any, Generic, TypeVar, get_type_hints
 
 import msgspec
 import numpy as np
-from filelock import FileLock, Timeout
 
 from polcap.errors import StorageError
 from polcap.formats import atomic, npy_folder
 from polcap.stages import Stage
 
 T = TypeVar("T")
-_READERS = 2  # threads that compare digests: the memory gives no more
 FORMAT = 3  # of work/; raised when older folders can no longer be read
-UNDIGESTED = ("seconds", "digest")  # of a manifest: no two runs take the same time
-Progress = Callable[[str, float | None, bool], None]  # stage, seconds (None: begins), found in the cache
+_READERS = 2  # threads that compute digests: more do not read faster
+_NOT_SEALED = ("seconds", "digest")  # fields of a manifest that its digest leaves out: no two runs take the same time
+Progress = Callable[[str, float | None, bool], None]  # stage, seconds (None: it begins), found in the cache
 
 
 def silent(stage: str, seconds: float | None, cached: bool) -> None:
-    """The progress of someone who does not look."""
+    """A progress that shows nothing."""
 
 
-class Result(Generic[T]):
-    """A value of the path: its key now, the value when asked for."""
-
-    _value: T
-
-    def __init__(self, key: str) -> None:
-        self.key = key
-        self._asked = RLock()  # of each its own: to ask for one does not wait for another
-
-    @property
-    def value(self) -> T:
-        """Found or computed at the first asking, once whichever threads ask."""
-        with self._asked:
-            if not self.known:
-                self._value = self.find()
-            return self._value
-
-    @property
-    def known(self) -> bool:
-        """The value has been asked for."""
-        return hasattr(self, "_value")
-
-    def find(self) -> T:
-        """The value, from wherever it can be had."""
-        raise NotImplementedError
-
-
-class Derived(Result[T]):
-    """A small value made from results; not a stage, never kept."""
-
-    def __init__(self, key: str, function: Callable[..., T], inputs: tuple[Any, ...]) -> None:
-        super().__init__(key)
-        self.function = function
-        self.inputs = inputs
-
-    def find(self) -> T:
-        """The function of the inputs' values."""
-        return self.function(*map(value_of, self.inputs))
+class StageReached(Exception):
+    """The path has come to the stage at which it was to stop."""
 
 
 @dataclass(frozen=True)
-class Run:
-    """What all results of one store share."""
+class StageResult(Generic[T]):
+    """A value of the path and its key."""
 
-    progress: Progress
-    fresh: set[str] = field(default_factory=set)  # keys that --force has declared stale in this process
+    key: str
+    value: T
 
 
-class StageResult(Result[T]):
-    """The result of a stage, kept in a folder of its own."""
+class MemoryCache:
+    """Computes the stages of one path, in order, and holds their results in memory; nothing is written.
 
-    _facts: T
+    `force` names a stage that is computed in any case, with all after it; `until` the stage after which
+    StageReached ends the path.
+    """
 
-    def __init__(
-        self,
-        key: str,
-        stage: Stage[..., T],
-        inputs: tuple[Any, ...],
-        config: msgspec.Struct | None,
-        place: Path,
-        run: Run,
-    ) -> None:
-        super().__init__(key)
-        self.stage = stage
-        self.inputs = inputs
-        self.config = config
-        self.place = place
-        self.run = run
+    def __init__(self, progress: Progress = silent, force: str | None = None, until: str | None = None) -> None:
+        self.progress, self.until = progress, until
+        self.results: dict[str, StageResult[Any]] = {}  # of the path so far, by stage
+        self.stage, self._began = "start", 0.0  # the stage begun last, and when
+        self._force, self._forced = force, False
+        self._held: dict[str, Any] = {}  # by key
 
-    @property
-    def facts(self) -> T:
-        """The value; of large arrays only the shapes, where nobody has read them yet."""
-        with self._asked:
-            if not hasattr(self, "_facts"):
-                self._facts = self._small()
-            return self._facts
+    def run(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
+        """The result of a stage: found, else computed. Inputs: other results, plain values, functions (`decode`).
 
-    def _small(self) -> T:
-        if not self.known and self.stored():
-            try:
-                found = read(self.place, returns(self.stage), most=npy_folder.LARGE + npy_folder.HEAD)
-                return cast(T, npy_folder.without_large(found))
-            except StorageError:  # the value is made anew
-                pass
-        return self.value
+        Raises
+        ------
+        StageReached
+            This was the stage at which the path was to stop.
+        """
+        about = _about(stage, inputs, config)
+        self._forced = self._forced or stage.name == self._force
+        value: T | None = None if self._forced else self._find(stage, about["key"])
+        if value is None:
+            value = self._compute(stage, inputs, config, about)
+        elif stage.keep:
+            self.progress(stage.name, 0.0, True)
+        return self._pass(stage, StageResult(about["key"], value))
 
-    @property
-    def name(self) -> str:
-        return self.stage.name
+    def derive(self, function: Callable[..., T], *inputs: Any, version: int = 1) -> StageResult[T]:
+        """A value that is cheap to compute from results; never stored.
 
-    @property
-    def keep(self) -> bool:
-        return self.stage.keep
+        `version` is raised whenever the same inputs give another value.
+        """
+        key = digest(["derived", function.__name__, version, list(map(key_of, inputs))])
+        return StageResult(key, function(*map(value_of, inputs)))
 
-    @property
-    def ready(self) -> bool:
-        """The value is known, or a whole manifest with this key lies in the folder."""
-        return self.known or self.stored()
+    def _compute(
+        self, stage: Stage[..., T], inputs: tuple[Any, ...], config: msgspec.Struct | None, about: dict[str, Any]
+    ) -> T:
+        self.begin(stage.name)
+        value = stage(*map(value_of, inputs), *(() if config is None else (config,)))
+        value = self._store(stage, value, about, time.perf_counter() - self._began)
+        self.end()
+        return value
 
-    def stored(self) -> bool:
-        """A whole manifest with this key lies in the folder, and nobody asked for it anew."""
-        return self.keep and self.key not in self.run.fresh and manifest(self.place).get("key") == self.key
+    def begin(self, stage: str) -> None:
+        """Work on a stage begins."""
+        self.stage, self._began = stage, time.perf_counter()
+        self.progress(stage, None, False)
 
-    def materialize(self) -> None:
-        """See to it that the result exists; one that is not kept waits until it is needed."""
-        if self.keep and not self.ready:
-            _ = self.value
+    def end(self) -> None:
+        """Work on the stage begun last has ended."""
+        self.progress(self.stage, time.perf_counter() - self._began, False)
 
-    def find(self) -> T:
-        """From the folder; where it is damaged, or of another key, by computing it."""
-        if self.stored():
-            try:
-                result: T = read(self.place, returns(self.stage))
-                return result
-            except StorageError:  # damaged: nothing is lost but time
-                pass
-        return self.compute()
-
-    def compute(self) -> T:
-        """Run the stage on its inputs' values, and keep what it gives."""
-        values = [*map(value_of, self.inputs), *(() if self.config is None else (self.config,))]
-        self.run.progress(self.name, None, False)
-        start = time.perf_counter()
-        result = self.stage(*values)
-        if self.keep:
-            self.write(result, time.perf_counter() - start)
-            self.run.fresh.discard(self.key)
-            result = read(self.place, returns(self.stage), check=False)
-        else:
-            npy_folder.freeze(result)
-        self.run.progress(self.name, time.perf_counter() - start, False)
+    def _pass(self, stage: Stage[..., T], result: StageResult[T]) -> StageResult[T]:
+        self.results[stage.name] = result
+        if stage.name == self.until:
+            raise StageReached(stage.name)
         return result
 
-    def write(self, result: T, seconds: float) -> None:
-        """Put a result into its folder, whole or not at all."""
-        with atomic.folder(self.place, synced=False) as temporary:
+    def _find(self, stage: Stage[..., T], key: str) -> T | None:
+        return self._held.get(key)
+
+    def _store(self, stage: Stage[..., T], value: T, about: dict[str, Any], seconds: float) -> T:
+        npy_folder.freeze(value)
+        self._held[about["key"]] = value
+        return value
+
+
+class StageCache(MemoryCache):
+    """The stage cache of one result folder: results in `folder/work`."""
+
+    def __init__(
+        self, folder: Path, progress: Progress = silent, force: str | None = None, until: str | None = None
+    ) -> None:
+        super().__init__(progress, force, until)
+        self.work = folder / "work"
+
+    def place(self, stage: Stage[..., Any]) -> Path:
+        """Folder of the next stage of the path."""
+        return self.work / f"{len(self.results) + 1:02d}-{stage.name}"
+
+    def _find(self, stage: Stage[..., T], key: str) -> T | None:
+        place = self.place(stage)
+        if not stage.keep or manifest(place).get("key") != key:
+            return None
+        try:
+            found: T = read(place, returns(stage))
+        except StorageError:  # damaged: computed again
+            return None
+        return found
+
+    def _store(self, stage: Stage[..., T], value: T, about: dict[str, Any], seconds: float) -> T:
+        """Write a result into its folder, whole or not at all; returns it as memory maps."""
+        if not stage.keep:
+            npy_folder.freeze(value)
+            return value
+        place = self.place(stage)
+        with atomic.folder(place, synced=False) as temporary:
             arrays: npy_folder.Arrays = {}
-            tree = npy_folder.encode(result, "value", arrays)
+            tree = npy_folder.encode(value, "value", arrays)
             files = {f"{name}.npy": npy_folder.save(temporary / f"{name}.npy", a) for name, a in arrays.items()}
-            about = {
-                "format": FORMAT,
-                "stage": self.name,
-                "version": self.stage.version,
-                "key": self.key,
-                "settings": msgspec.to_builtins(self.config),
-                "inputs": [key_of(value) for value in self.inputs],
-                "seconds": round(seconds, 3),
-                "files": files,
-                "value": tree,
-            }
+            about = {**about, "seconds": round(seconds, 3), "files": files, "value": tree}
             text = json.dumps({**about, "digest": seal(about)}, indent=1, allow_nan=False)
             (temporary / "manifest.json").write_text(text, encoding="utf-8")
+        written: T = read(place, returns(stage), check=False)
+        return written
 
 
-class ArchivedResult(StageResult[T]):
-    """A kept result of a run whose photographs are gone: taken as it is, whatever its key."""
+class DryRunCache(StageCache):
+    """Which stages of a path are in the cache, by their keys alone: nothing is read or computed."""
 
-    def stored(self) -> bool:
-        """A whole manifest lies in the folder, whatever its key."""
-        return self.keep and bool(manifest(self.place))
+    def __init__(self, folder: Path, force: str | None = None) -> None:
+        super().__init__(folder, force=force)
+        self.states: dict[str, str] = {}  # of every stage: cached, compute, or on demand where it is never stored
 
-    def find(self) -> T:
-        """From the folder; what is not kept is computed from what is."""
-        if self.keep:
-            result: T = read(self.place, returns(self.stage))
-            return result
-        return self.compute()
+    def run(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
+        """The key of a stage's result, without a value."""
+        key = _about(stage, inputs, config)["key"]
+        self._forced = self._forced or stage.name == self._force
+        cached = not self._forced and manifest(self.place(stage)).get("key") == key
+        self.states[stage.name] = "on demand" if not stage.keep else "cached" if cached else "compute"
+        return self._pass(stage, StageResult[Any](key, None))
+
+    def derive(self, function: Callable[..., T], *inputs: Any, version: int = 1) -> StageResult[T]:
+        """The key of a derived value, without the value."""
+        return StageResult[Any](digest(["derived", function.__name__, version, list(map(key_of, inputs))]), None)
 
 
-class Store:
-    """The stage cache of one result folder, `folder/work`."""
+class ArchiveCache(StageCache):
+    """The cache of an earlier run, without its photographs: stored results are taken whatever their keys."""
 
-    result: type[StageResult[Any]] = StageResult
-
-    def __init__(self, folder: Path, progress: Progress = silent, force: str | None = None) -> None:
-        self.work = folder / "work"
-        self.run = Run(progress)
-        self.force = force
-        self.steps: list[StageResult[Any]] = []
-
-    @contextmanager
-    def lock(self) -> Iterator[None]:
-        """Keep other processes out of this result folder.
-
-        The system drops the lock when its owner dies, however it dies: there are no stale locks.
+    def run(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
+        """The stored result; one that is never stored is computed.
 
         Raises
         ------
         StorageError
-            Another process works here, or the folder cannot be written.
+            It is not there, or damaged.
         """
-        lock, owner = FileLock(self.work / "lock", timeout=0), self.work / "owner"
-        try:
-            self.work.mkdir(parents=True, exist_ok=True)
-            lock.acquire()
-        except Timeout as error:
-            raise StorageError(
-                f"{self.work.parent}: process {_first_line(owner)} is working here; wait for it or choose another --out"
-            ) from error
-        except OSError as error:
-            raise atomic.failure(self.work / "lock", error) from error
-        try:
-            with atomic.path(owner, synced=False) as temporary:
-                temporary.write_text(f"{os.getpid()}\n", encoding="utf-8")
-            for left in [*self.work.glob(".*.part*"), *self.work.glob(".*.old")]:  # of a killed run
-                atomic.discard(left)
-            yield
-        finally:
-            lock.release()
-
-    def step(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
-        """Declare the next step of the path; inputs are other results or plain values."""
-        key = digest([FORMAT, stage.name, stage.version, msgspec.to_builtins(config), list(map(key_of, inputs))])
-        if stage.name == self.force or self._stale(inputs):
-            self.run.fresh.add(key)
-        place = self.work / f"{len(self.steps) + 1:02d}-{stage.name}"
-        result = self.result(key, stage, inputs, config, place, self.run)
-        self.steps.append(result)
-        return result
-
-    def derive(self, function: Callable[..., T], *inputs: Any) -> Derived[T]:
-        """A small value made from results, for the next step to take.
-
-        Its key holds the function's source text: an edited function makes what follows anew.
-        """
-        key = digest(["derived", function.__qualname__, inspect.getsource(function), list(map(key_of, inputs))])
-        if self._stale(inputs):
-            self.run.fresh.add(key)
-        return Derived(key, function, inputs)
-
-    def materialize(self, until: str | None = None, after: str | None = None) -> None:
-        """Compute what is missing, in order, from behind the stage `after` up to and with the stage `until`."""
-        first = 0 if after is None else [result.name for result in self.steps].index(after) + 1
-        for result in self.steps[first:]:
-            if result.keep and result.ready:
-                self.run.progress(result.name, 0.0, True)
-            result.materialize()
-            if result.name == until:
-                if not result.keep:
-                    _ = result.value  # so that its errors show
-                return
-
-    def _stale(self, inputs: tuple[Any, ...]) -> bool:
-        return any(isinstance(value, Result) and value.key in self.run.fresh for value in inputs)
+        if not stage.keep:
+            return super().run(stage, *inputs, config=config)
+        place = self.place(stage)
+        value: T = read(place, returns(stage))
+        return self._pass(stage, StageResult(manifest(place)["key"], value))
 
 
-class Archive(Store):
-    """A finished result folder opened again without its capture: what was kept is taken as it is."""
-
-    result = ArchivedResult
+def _about(stage: Stage[..., Any], inputs: tuple[Any, ...], config: msgspec.Struct | None) -> dict[str, Any]:
+    """What decides a stage's result, and the key made of it."""
+    about = {
+        "format": FORMAT,
+        "stage": stage.name,
+        "version": stage.version,
+        "settings": msgspec.to_builtins(config),
+        "inputs": [key_of(one) for one in inputs if not callable(one)],  # a function does not change a result
+    }
+    return {**about, "key": digest(list(about.values()))}
 
 
 def manifest(place: Path) -> dict[str, Any]:
-    """What a kept result says of itself; empty where there is none, or it is not what was written."""
+    """The manifest of a stored result; empty where there is none, or it is damaged."""
     try:
         about = json.loads((place / "manifest.json").read_text(encoding="utf-8"))
         whole = isinstance(about, dict) and about.get("format") == FORMAT and about.get("digest") == seal(about)
@@ -312,37 +219,27 @@ def manifest(place: Path) -> dict[str, Any]:
 
 
 def seal(about: Mapping[str, Any]) -> str:
-    """Digest of a manifest's own text."""
-    return digest({name: value for name, value in about.items() if name not in UNDIGESTED})
+    """Digest of a manifest's own content, by which a later edit shows."""
+    return digest({name: value for name, value in about.items() if name not in _NOT_SEALED})
 
 
-def read(place: Path, hint: Any, check: bool = True, most: float = math.inf) -> Any:
-    """The value in a result folder, its arrays as read-only memory maps.
-
-    Parameters
-    ----------
-    place
-        The folder.
-    hint
-        Type of the value.
-    check
-        Compare what lies there with the digests of what was written.
-    most
-        Bytes of a file; larger ones are not compared.
+def read(place: Path, hint: Any, check: bool = True) -> Any:
+    """The value of type `hint` in a result folder, its arrays as read-only memory maps; `check` compares digests.
 
     Raises
     ------
     StorageError
-        There is none of this cache format, a file is missing, or bytes are not those that were written.
+        There is no result of this cache format, a file is missing, or a file was changed.
     """
     about = manifest(place)
     if not about:
         raise StorageError(f"{place}: no whole result of this polcap's cache format {FORMAT}; run `polcap process`")
-    compared = {place / name: told for name, told in about["files"].items() if told[0] <= most} if check else {}
-    with ThreadPoolExecutor(_READERS) as pool:
-        for (file, expected), found in zip(compared.items(), pool.map(_checksum, compared)):
-            if found != expected:
-                raise StorageError(f"{file} is damaged; delete {place} and run again")
+    if check:
+        files = [place / name for name in about["files"]]
+        with ThreadPoolExecutor(_READERS) as pool:
+            for file, expected, found in zip(files, about["files"].values(), pool.map(_checksum, files)):
+                if found != expected:
+                    raise StorageError(f"{file} is damaged; delete {place} and run again")
     return npy_folder.decode(about["value"], hint, place)
 
 
@@ -355,7 +252,7 @@ def _checksum(file: Path) -> list[Any] | None:
 
 
 def returns(stage: Stage[..., Any]) -> Any:
-    """The type a stage promises to return."""
+    """The type of a stage's result."""
     return get_type_hints(stage.function)["return"]
 
 
@@ -365,17 +262,17 @@ def digest(value: Any) -> str:
 
 
 def value_of(value: Any) -> Any:
-    """What a stage is given for an input."""
-    return value.value if isinstance(value, Result) else value
+    """The value of an input, which may be a result."""
+    return value.value if isinstance(value, StageResult) else value
 
 
 def key_of(value: Any) -> str:
-    """What an input puts into the keys of what is made from it."""
-    return value.key if isinstance(value, Result) else digest(fingerprint(value))
+    """The key of an input, which may be a result."""
+    return value.key if isinstance(value, StageResult) else digest(fingerprint(value))
 
 
 def fingerprint(value: Any) -> Any:
-    """Plain data that is equal for two inputs exactly when a stage could not tell them apart."""
+    """Plain data that is equal for two inputs exactly when no stage could distinguish them."""
     if isinstance(value, np.ndarray):
         solid = np.ascontiguousarray(value)
         summed = sha256(solid.data.cast("B") if solid.size else b"")
@@ -383,6 +280,8 @@ def fingerprint(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         facts = [one.name for one in fields(value) if one.metadata.get("in_key", True)]
         return [type(value).__name__, {name: fingerprint(getattr(value, name)) for name in facts}]
+    if isinstance(value, msgspec.Struct):
+        return fingerprint(msgspec.to_builtins(value))
     if isinstance(value, Mapping):
         return {str(name): fingerprint(item) for name, item in value.items()}
     if isinstance(value, (tuple, list)):
@@ -403,10 +302,3 @@ def contents(folder: Path) -> list[dict[str, Any]]:
             size = sum(entry.stat().st_size for entry in place.iterdir())
             found.append({**about, "folder": place.name, "bytes": size})
     return found
-
-
-def _first_line(file: Path) -> str:
-    try:
-        return file.read_text(encoding="utf-8", errors="replace")[:20].strip() or "unknown"
-    except OSError:
-        return "unknown"

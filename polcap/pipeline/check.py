@@ -1,28 +1,34 @@
-"""In: a capture, seconds after its last frame. Out: keep or reshoot, and why.
+"""Judge a capture seconds after its last frame: keep or reshoot, and why.
 
-The path's own stages judge, on pictures averaged down to at most 0.6 MP; what that would hide is taken from
-the full pictures as they are read. Nothing is written.
+The path runs on pictures averaged down to at most 0.6 MP, with a cache in memory: nothing is written. Facts that
+averaging hides (clipping, sharpness) are measured at full size while frames are decoded.
 """
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from time import perf_counter
 
 import msgspec
 
 from polcap.config import Config
+from polcap.errors import ChartError, DecodeError, InputError
 from polcap.images import Capture, ChartRequest, Network
-from polcap.pipeline import small_capture as reduced
-from polcap.pipeline import small_capture_run as judge
-from polcap.pipeline.path import AUTO
-from polcap.quality.gates import Gate
-from polcap.stages.infer import body_law
+from polcap.pipeline import small_capture
+from polcap.pipeline.cache import MemoryCache
+from polcap.pipeline.path import AUTO, UserInput, path, results_of
+from polcap.pipeline.small_capture import SmallCapture
+from polcap.quality import gates
+from polcap.quality.gate import Evidence, Gate
+from polcap.results import NotReached
 
 Networks = tuple[Network | None, Network | None]  # the estimator's, the mask's
+_THREADS = 2  # frames that are decoded at a time
+_SYMMETRIES = 1  # views of the network: gates read medians of its maps, which four views move by 3 % at most
+_ERROR_COST_DEG = 45.0  # of a stage that gives up: nothing is known of the normals
 
 
 class Verdict(msgspec.Struct, frozen=True):
-    """What to do with the capture."""
+    """Whether to keep the capture."""
 
     keep: bool
     shots: tuple[str, ...]  # to be taken again, as far as single ones are to blame
@@ -32,60 +38,86 @@ class Verdict(msgspec.Struct, frozen=True):
     needs: str = ""  # the option without which `polcap process` ends with an error
 
 
-def inspect(
-    capture: Capture,
-    networks: Callable[[], Networks],
-    config: Config,
-    chart: ChartRequest = AUTO,
-) -> Verdict:
-    """Judge a capture.
+def inspect(capture: Capture, networks: Networks, config: Config, chart: ChartRequest = AUTO) -> Verdict:
+    """Judge a capture by the gates of `process`.
 
-    Parameters
-    ----------
-    capture
-        Its frames are decoded, averaged down and forgotten.
-    networks
-        Loads the estimator's and the mask's, while frames are decoded. Without the first the errors of the analytic
-        estimator are expected; without the second the object is what stands out from the backdrop.
-    config
-        Settings of the stages, and the gates' limits.
-    chart
-        As given to `process`.
+    Without a network of the estimator, the errors of the analytic estimator are expected; without one of the mask,
+    the object is found by its contrast to the backdrop.
 
     Raises
     ------
     InputError
-        A frame cannot be decoded.
+        A frame cannot be decoded, or a chart was named and cannot be read.
     """
     start = perf_counter()
-    with ThreadPoolExecutor(2) as pool, ThreadPoolExecutor(1) as beside:
-        loaded = beside.submit(_warm, networks, config.infer.ior)
+    with ThreadPoolExecutor(_THREADS) as pool:
         try:
-            taken = reduced.take(capture, config.hdr.clip, pool)
-            lines = tuple(judge.judged(judge.Reduced(taken, loaded.result, config, chart, pool)))
+            small = small_capture.reduce(capture, config.hdr.clip, pool)
+            supplied = UserInput(_moved(chart, small.step), None, *networks)
+            lines = tuple(_judged(small, supplied, config))
         finally:
             pool.shutdown(cancel_futures=True)
     bad = [line for line in lines if line.state == "fail"]
-    named = {name for line in bad for name in line.shots}
-    shots = tuple(shot.name for shot in capture.shots if shot.name in named)
+    blamed = {name for line in bad for name in line.shots}
+    shots = tuple(shot.name for shot in capture.shots if shot.name in blamed)
     missing = any(line.name == "chart" and line.state == "warn" for line in lines)
     seconds = round(perf_counter() - start, 2)
     return Verdict(not bad, shots, lines, capture.name, seconds, "--no-chart" if missing else "")
 
 
-def _warm(networks: Callable[[], Networks], ior: float) -> Networks:
-    """Load what the stages need besides, while the reference frame is decoded and the second core waits."""
-    import scipy.spatial.transform
-    import scipy.special  # noqa: F401
+def _judged(small: SmallCapture, supplied: UserInput, config: Config) -> list[Gate]:
+    """The gates in the order of the path; where a stage gives up, its error is the last of them."""
+    cache, settings = MemoryCache(until="infer"), _settings(config, small.step)
+    chart_missing, failure = "", None
+    try:
+        try:
+            path(small.capture, supplied, settings, cache, small.decode)
+        except ChartError as error:
+            if supplied.chart.mode != "auto":
+                raise
+            chart_missing = str(error).partition(" (")[2].partition(")")[0] or str(error)
+            path(small.capture, replace(supplied, chart=ChartRequest("none")), settings, cache)
+    except DecodeError:
+        raise
+    except InputError as error:
+        failure = error
+    evidence = Evidence.partial(
+        **vars(results_of(cache.results)),
+        names=[shot.name for shot in small.capture.shots],
+        focal_doubt=small.capture.focal_doubt,
+        clipped=small.clipped,
+        blur_px=small.blur_px,
+        grid_px=small.step / (small.merged_px if config.hdr.demosaic == "superpixel" else 1),
+        chart_missing=chart_missing,
+    )
+    lines = list[Gate]()
+    try:
+        lines.extend(gates.judge(evidence, config))
+    except NotReached:
+        if failure is None:
+            raise
+    if failure is not None and not any(line.name == "order" and line.state == "fail" for line in lines):
+        reason, _, remedy = str(failure).partition("; ")
+        name = type(failure).__name__.removesuffix("Error").lower()
+        lines.append(Gate(name, "fail", None, None, reason, remedy, _ERROR_COST_DEG))
+    return lines
 
-    import polcap.optics.colour_science  # noqa: F401
 
-    found = networks()
-    for network in found:
-        if network is not None:
-            network.warm()
-    body_law.laws(ior)
-    return found
+def _settings(config: Config, step: int) -> Config:
+    """Settings of the path on the small pictures; the stages' own limits are left to the gates."""
+    changed = msgspec.structs.replace
+    return changed(
+        config,
+        hdr=changed(config.hdr, max_motion_px=max(config.hdr.max_motion_px / step, 1.0)),
+        align=changed(config.align, max_shift_px=500.0, min_correlation=0.0),
+        selfcal=changed(config.selfcal, check_order=False),
+        infer=changed(config.infer, symmetries=min(config.infer.symmetries, _SYMMETRIES), fine=False),
+    )
+
+
+def _moved(chart: ChartRequest, step: int) -> ChartRequest:
+    """The chart's corners on the small pictures, where a pixel stands for `step` × `step` RAW pixels."""
+    return chart if chart.corners is None else replace(chart, corners=(chart.corners - (step - 1) / 2) / step)
 
 
 def table(verdict: Verdict) -> str:
@@ -105,11 +137,9 @@ def table(verdict: Verdict) -> str:
 def _limit(line: Gate) -> str:
     if not isinstance(line.limit, float | int):
         return ""
-    return (
-        f" (limit {100 * line.limit:g} %)"
-        if line.unit == "%"
-        else f" (limit {line.limit:g} {line.unit})".replace(" )", ")")
-    )
+    if line.unit == "%":
+        return f" (limit {100 * line.limit:g} %)"
+    return f" (limit {line.limit:g} {line.unit})".replace(" )", ")")
 
 
 def shown(verdict: Verdict) -> dict[str, object]:

@@ -1,84 +1,91 @@
-"""READ FIRST. In: a capture. Out: every result of its path, one line per stage.
+"""READ FIRST. The path of a capture, one line per stage: from RAW brackets to the asset.
 
-Each line's work is the folder of the same name in `stages/`. Measure, then apply once: white balance,
-alignment and self-calibration return small values; `stokes` applies gains and transforms, `cues` the
-colour matrix. Images are resampled once.
-
-A line declares its step and computes nothing: the store computes what somebody asks for, or finds it.
+Each line's work is the folder of the same name in `stages/`. Measure, then apply once: white balance, alignment and
+self-calibration return small values; `stokes` applies gains and transforms, `cues` the color matrix. Images are
+resampled once. `cache.run` looks a result up, or computes it. `process`, `check`, `show` and a dry run all follow
+this path; they differ in the cache.
 """
 
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polcap.config import Config
 from polcap.errors import ObjectError
-from polcap.formats import calib
+from polcap.formats import onnx, shipped_data
+from polcap.formats.maps import maps_folder
+from polcap.formats.raw import frame_decoder
 from polcap.images import (
-    Alignment,
     AngleStack,
-    Asset,
     Capture,
     ChartRequest,
     ColorCalibration,
-    Cues,
-    Gains,
+    Decode,
     Mesh,
     Network,
-    ObjectMask,
-    StokesImage,
+    RunNetwork,
     SurfaceMaps,
 )
-from polcap.pipeline.cache import Archive, StageResult, Store
+from polcap.pipeline.cache import MemoryCache, StageReached, StageResult
+from polcap.results import Results
 from polcap.stages import align, asset, cues, hdr, infer, mask, selfcal, stokes, surface, whitebalance
 
 AUTO = ChartRequest("auto")
+_FIELD = {  # of `Results`, by stage
+    "hdr": "radiance", "whitebalance": "color", "align": "alignment", "mask": "object_", "selfcal": "selfcal",
+    "stokes": "stokes", "cues": "cues", "infer": "maps", "surface": "mesh", "asset": "asset",
+}  # fmt: skip
+STAGES = tuple(_FIELD)
 
 
 @dataclass(frozen=True)
 class UserInput:
-    """What the user gives beside the photographs."""
+    """Inputs of the path besides the photographs."""
 
     chart: ChartRequest = AUTO
     mask: NDArray[np.bool_] | None = None  # on the RAW pixels or on the grid of the merged picture
     network: Network | None = None  # None: the analytic estimator
-    mask_network: Network | None = None  # None: the object is what stands out from the backdrop
+    mask_network: Network | None = None  # None: the object is found by its contrast to the backdrop
 
 
-@dataclass(frozen=True)
-class Results:
-    """Every result of the path; each is found or computed when its value is asked for."""
+def path(
+    capture: Capture | None,
+    supplied: UserInput,
+    config: Config,
+    cache: MemoryCache,
+    decode: Decode = frame_decoder.decode,
+    run: RunNetwork = onnx.run,
+) -> Results:
+    """The results of all stages, or of the first ones where the cache stops the path."""
+    with suppress(StageReached):
+        reference = shipped_data.colorchecker(config.whitebalance.chart)
+        radiance = cache.run(hdr.merge, capture, decode, config=config.hdr)
+        color = cache.run(whitebalance.measure, radiance, reference, supplied.chart, config=config.whitebalance)
+        alignment = cache.run(align.register, radiance, color, config=config.align)
+        drawn = cache.derive(on_grid, supplied.mask, radiance)
+        finder = supplied.mask_network
+        object_ = cache.run(mask.segment, radiance, alignment, color, drawn, finder, run, config=config.mask)
+        calibration = cache.run(selfcal.solve, radiance, alignment, object_, color, config=config.selfcal)
+        stokes_ = cache.run(stokes.solve, radiance, alignment, calibration, object_, config=config.stokes)
+        cues_ = cache.run(cues.compute, stokes_, color)
+        maps = cache.run(infer.estimate, cues_, supplied.network, run, config=config.infer)
+        distance = cache.derive(distance_m, color, radiance)
+        mesh = cache.run(surface.integrate, maps, distance, config=config.surface)
+        # from the maps as their files hold them: `polcap export` then makes the same bytes
+        stored = cache.derive(maps_folder.as_stored, maps)
+        stored_mesh = cache.derive(remeshed, stored, mesh, config.surface)
+        cache.run(asset.build, stored, stored_mesh, config=config.asset)
+    return results_of(cache.results)
 
-    radiance: StageResult[AngleStack]
-    color: StageResult[ColorCalibration]
-    alignment: StageResult[Alignment]
-    object_: StageResult[ObjectMask]
-    gains: StageResult[Gains]
-    stokes: StageResult[StokesImage]
-    cues: StageResult[Cues]
-    maps: StageResult[SurfaceMaps]
-    mesh: StageResult[Mesh]
-    asset: StageResult[Asset]
 
-
-def path(capture: Capture | None, supplied: UserInput, config: Config, store: Store) -> Results:
-    """From RAW brackets to the asset."""
-    reference = store.derive(calib.colorchecker, config.whitebalance.chart)
-    radiance = store.step(hdr.merge, capture, config=config.hdr)
-    color = store.step(whitebalance.measure, radiance, reference, supplied.chart, config=config.whitebalance)
-    alignment = store.step(align.register, radiance, color, config=config.align)
-    user_mask = store.derive(on_grid, supplied.mask, radiance)
-    object_ = store.step(mask.segment, radiance, alignment, color, user_mask, supplied.mask_network, config=config.mask)
-    gains = store.step(selfcal.solve, radiance, alignment, object_, color, config=config.selfcal)
-    stokes_ = store.step(stokes.solve, radiance, alignment, gains, object_, config=config.stokes)
-    cues_ = store.step(cues.compute, stokes_, color)
-    maps = store.step(infer.estimate, cues_, supplied.network, config=config.infer)
-    distance = store.derive(distance_m, color, radiance)
-    mesh = store.step(surface.integrate, maps, distance, config=config.surface)
-    asset_ = store.step(asset.build, maps, mesh, config=config.asset)
-    return Results(radiance, color, alignment, object_, gains, stokes_, cues_, maps, mesh, asset_)
+def results_of(made: Mapping[str, StageResult[Any]]) -> Results:
+    """The results of the stages that have run."""
+    keys = {stage: result.key for stage, result in made.items()}
+    return Results.partial(keys=keys, **{_FIELD[stage]: result.value for stage, result in made.items()})
 
 
 def on_grid(drawn: NDArray[np.bool_] | None, radiance: AngleStack) -> NDArray[np.bool_] | None:
@@ -105,8 +112,10 @@ def on_grid(drawn: NDArray[np.bool_] | None, radiance: AngleStack) -> NDArray[np
 
 
 def distance_m(color: ColorCalibration, radiance: AngleStack) -> float | None:
-    """Distance of the chart, and so about that of the object beside it [m]; None where no chart tells."""
+    """Distance of the chart, and so about that of the object [m]; None without a chart of known size."""
     return None if color.metres_per_px is None else color.metres_per_px * radiance.view.focal
 
 
-STAGES = tuple(step.name for step in vars(path(None, UserInput(), Config(), Archive(Path()))).values())
+def remeshed(stored: SurfaceMaps, mesh: Mesh, settings: surface.SurfaceSettings) -> Mesh:
+    """The mesh of the stored maps and of the depth that maps/ holds."""
+    return surface.triangulate(maps_folder.stored_depth(stored, mesh), stored, mesh.metric, settings)

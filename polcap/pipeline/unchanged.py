@@ -1,100 +1,88 @@
-"""In: what `polcap process` is asked. Out: whether the same was asked before of the same files, and what it answered.
+"""Whether a result folder already answers a request: same options, same files, and nothing touched since.
 
-A look at sizes and times, as build tools take one, before anything is imported or hashed; where a file, an option or
-the program differs in any of them the keys of `store.py` decide. So a run that has nothing to do costs milliseconds.
+Compares sizes and times, as build tools do, before anything heavy is imported or hashed: a run that has nothing to do
+costs milliseconds. Where anything differs, the keys of the stage cache decide what is computed again.
 """
 
 import json
 import os
 import sys
+import time
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from polcap.formats import atomic, file_stat, text_file
+from polcap.formats import atomic, own_folders, text_file
 from polcap.formats.export import provenance
 
 _FILE = "unchanged.json"
-_OF_A_RUN = ("lock", "owner", _FILE)  # in work/: they differ from run to run
+_OF_A_RUN = ("lock", "owner", _FILE)  # files in work/ that differ from run to run
 _PACKAGE = Path(__file__).parents[1]
-Stats = dict[str, file_stat.Stat]
+_SETTLED_NS = 3_000_000_000  # some file systems have clocks of 2 s steps; within one a file may change unseen
+Stat = list[int]  # size, time of the content, time of the last change of any kind, which file it is
 
 
 class Finished(NamedTuple):
     """A finished run."""
 
-    table: str  # what was understood of the capture
-    stages: tuple[str, ...]  # that lie in the cache
+    table: str  # of the capture, as it was understood
     report: dict[str, Any]
 
 
-class InDoubt(Exception):
-    """Sizes and times do not tell."""
+class _DoubtError(Exception):
+    """Sizes and times do not decide."""
 
 
-def fingerprint(asked: Mapping[str, Any], capture: Path, out: Path, given: Iterable[Path]) -> str | None:
-    """Digest of a request: options, program, photographs and the `given` files by size and time; None if in doubt."""
-    try:
-        photographs, files = _folder(capture, out), {str(file.absolute()): file_stat.of(file) for file in given}
-        newest = max((stat[1] for stat in [*photographs.values(), *files.values()]), default=0)
-        if not file_stat.is_settled(newest):
-            return None
-        places = [os.path.realpath(capture), os.path.realpath(out)]
-        return _digest([dict(asked), places, photographs, files, program()])
-    except (OSError, InDoubt):
-        return None
+def request(options: Mapping[str, Any], capture: Path, out: Path, files: Iterable[Path] = ()) -> str | None:
+    """Digest of options, program, photographs and other input files by size and time; None where these do not decide.
 
-
-@cache
-def program() -> str:
-    """Digest of the program by its files' sizes and times, and of the packages that decide on pixels.
-
-    Raises
-    ------
-    InDoubt
-        A folder of it is a link.
-    OSError
-        It cannot be listed.
+    `options` is plain data; the user's calibrations are among the files.
     """
-    return _digest([sys.version, provenance.versions(), _folder(_PACKAGE), _folder(_PACKAGE.parent / "calib")])
-
-
-def known_program() -> str | None:
-    """The same; None where it is in doubt."""
     try:
-        return program()
-    except (OSError, InDoubt):
+        photographs = _folder(capture, out)
+        others = {os.path.abspath(file): _stat(file) for file in (*files, *own_folders.calibration_files())}
+        newest = max((stat[1] for stat in [*photographs.values(), *others.values()]), default=0)
+        if newest > time.time_ns() - _SETTLED_NS:
+            return None
+        return _digest([options, os.path.realpath(capture), os.path.realpath(out), photographs, others, _program()])
+    except (OSError, _DoubtError):
         return None
 
 
-def find(out: Path, request: str | None) -> Finished | None:
-    """The run that answered this very request, if all that it wrote stands as it left it."""
-    if request is None:
+def find(out: Path, asked: str | None) -> Finished | None:
+    """The run that answered this request, if nothing in its result folder was changed since."""
+    if asked is None:
         return None
     try:
         known = text_file.read_json(out / "work" / _FILE)
-        if known["request"] != request or known["result"] != _result(out):
+        if known["request"] != asked or known["result"] != _result(out):
             return None
-        return Finished(str(known["table"]), tuple(known["stages"]), text_file.read_json(out / "report.json"))
-    except (OSError, ValueError, TypeError, KeyError, InDoubt):
+        return Finished(str(known["table"]), text_file.read_json(out / "report.json"))
+    except (OSError, ValueError, TypeError, KeyError, _DoubtError):
         return None
 
 
-def remember(out: Path, request: str | None, table: str, stages: Iterable[str]) -> None:
-    """What `find` finds after this run; nothing where the request is in doubt.
+def remember(out: Path, asked: str | None, table: str = "") -> None:
+    """Record that the result folder now answers this request; nothing where the request is None.
 
     Raises
     ------
     StorageError
         The result folder cannot be written.
     """
-    if request is None:
+    if asked is None:
         return
-    known = {"request": request, "table": table, "stages": list(stages), "result": _result(out)}
+    known = {"request": asked, "table": table, "result": _result(out)}
     with atomic.path(out / "work" / _FILE, synced=False) as temporary:
         temporary.write_text(json.dumps(known) + "\n", encoding="utf-8")
+
+
+@cache
+def _program() -> str:
+    """Digest of the program by its files' sizes and times, and of the packages that decide on pixels."""
+    return _digest([sys.version, provenance.versions(), _folder(_PACKAGE), _folder(_PACKAGE.parent / "calib")])
 
 
 def _digest(value: Any) -> str:
@@ -102,24 +90,26 @@ def _digest(value: Any) -> str:
     return blake2b(text.encode(errors="surrogateescape"), digest_size=16).hexdigest()
 
 
-def _result(out: Path) -> Stats:
-    found = _folder(out)
-    return {name: stat for name, stat in found.items() if name not in [os.path.join("work", one) for one in _OF_A_RUN]}
+def _result(out: Path) -> dict[str, Stat]:
+    own = {os.path.join("work", name) for name in _OF_A_RUN}
+    return {name: stat for name, stat in _folder(out).items() if name not in own}
 
 
-def _folder(folder: Path, but: Path | None = None) -> Stats:
-    """Size and times of every file below a folder, without what lies in `but`; empty where there is none."""
-    aside = None if but is None else os.path.realpath(but)
-    return {os.path.relpath(file, folder): file_stat.of(file) for file in _files(str(folder), aside)}
+def _folder(folder: Path, but: Path | None = None) -> dict[str, Stat]:
+    """Size and times of every file below a folder, except those below `but`; empty where there is none."""
+    except_ = None if but is None else os.path.realpath(but)
+    return {os.path.relpath(file, folder): _stat(file) for file in _files(folder, except_)}
 
 
-def _files(folder: str, aside: str | None) -> Iterator[str]:
+def _files(folder: Path, except_: str | None) -> Iterator[str]:
     for place, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if name != "__pycache__" and not _same(os.path.join(place, name), aside)]
+        seen = [name for name in folders if name not in ("__pycache__", own_folders.BATCH)]
+        folders[:] = [name for name in seen if os.path.realpath(os.path.join(place, name)) != except_]
         if any(os.path.islink(os.path.join(place, name)) for name in folders):
-            raise InDoubt  # what a link leads to is not walked
+            raise _DoubtError  # a linked folder is not walked
         yield from (os.path.join(place, name) for name in files)
 
 
-def _same(place: str, aside: str | None) -> bool:
-    return aside is not None and os.path.realpath(place) == aside
+def _stat(file: str | Path) -> Stat:
+    about = os.stat(file)
+    return [about.st_size, about.st_mtime_ns, about.st_ctime_ns, about.st_ino]

@@ -1,23 +1,14 @@
-"""One judgement, and what judgements look at."""
+"""One judgement, and the evidence for it."""
 
-from collections.abc import Callable
-from typing import Any, Literal, Protocol
+from dataclasses import dataclass
+from typing import Literal
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import (
-    Alignment,
-    AngleStack,
-    ColorCalibration,
-    Floats,
-    Gains,
-    Mesh,
-    ObjectMask,
-    StokesImage,
-    SurfaceMaps,
-)
+from polcap.images import Floats, Quality
+from polcap.results import Results
 
 State = Literal["pass", "warn", "fail", "not measured"]
 Unit = Literal["%", "px", "°", "×", "ΔE2000", ""]
@@ -46,41 +37,33 @@ class Gate(msgspec.Struct, frozen=True):
                 msgspec.structs.force_setattr(self, name, number.item())
 
 
-class Found(Protocol):
-    """What the stages made of a capture, at full size or reduced; each is computed when asked for.
+@dataclass(frozen=True)
+class Evidence(Results):
+    """Everything that gates judge: the results of a path at full size or reduced, and facts that reducing hides.
 
-    Pixels are looked at in a `figure` alone: where one is remembered, they are not even read.
+    A path that was stopped early has only some of them, as `Results`; without a mesh its gate is left out.
     """
 
-    def figure(self, name: str, measure: "Callable[[Found, Any], Any]", setting: Any = None) -> Any:
-        """What `measure` gives of the pixels with a setting, or gave when it was made of the same; plain JSON data."""
+    names: list[str]  # (K,) of the shots
+    focal_doubt: tuple[float, float]  # ln of the least and of the greatest possible focal length over the assumed one
+    clipped: Floats  # (K, E, H, W) share of each pixel that is clipped
+    blur_px: Floats  # (K, E) beyond the sharpest frame of the same exposure, 1σ [visible RAW px]
+    grid_px: float = 1.0  # px of the picture that `process` works on per px of these
+    chart_missing: str = ""  # the reason, where a chart was expected and none was found
 
-    @property
-    def names(self) -> list[str]: ...  # (K,) of the shots
-    @property
-    def focal_doubt(self) -> tuple[float, float]: ...  # ln of least and most that it may be, over it; 0, 0: known
-    @property
-    def grid_px(self) -> float: ...  # px of the picture that is processed per px of these
-    @property
-    def chart_missing(self) -> str: ...  # why no chart was found though one was looked for; "" else
-    @property
-    def clipped(self) -> Floats: ...  # (K,) share of the object that is clipped in every frame
-    @property
-    def radiance(self) -> AngleStack: ...
-    @property
-    def color(self) -> ColorCalibration: ...
-    @property
-    def alignment(self) -> Alignment: ...
-    @property
-    def object_(self) -> ObjectMask: ...
-    @property
-    def gains(self) -> Gains: ...
-    @property
-    def stokes(self) -> StokesImage: ...
-    @property
-    def maps(self) -> SurfaceMaps: ...
-    @property
-    def mesh(self) -> Mesh | None: ...  # None where none is made
+
+def full_size(results: Results, focal_doubt: tuple[float, float]) -> Evidence:
+    """The evidence of a run of `process`; of its merged pictures one stands for all exposures."""
+    radiance = results.radiance
+    return Evidence.partial(
+        **vars(results),
+        names=[f"{degrees:g}°" for degrees in np.round(np.degrees(radiance.angle), 6)],
+        focal_doubt=focal_doubt,
+        clipped=((radiance.quality & int(Quality.CLIPPED)) > 0)[:, None],
+        blur_px=radiance.bracket.blur_px,
+        grid_px=1.0,
+        chart_missing="",
+    )
 
 
 def at_most(

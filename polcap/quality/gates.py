@@ -10,19 +10,20 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from polcap.config import Config, Gates
+from polcap.images import SurfaceMaps
 from polcap.quality import geometry, light, polarization
-from polcap.quality.gate import MOST_DEG, Found, Gate, State, Unit
+from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, Unit
 
-__all__ = ["Found", "Gate", "State", "Unit", "judge", "verdict"]
+__all__ = ["Evidence", "Gate", "State", "Unit", "judge", "verdict"]
 
 
-def judge(found: Found, config: Config) -> Iterator[Gate]:
+def judge(found: Evidence, config: Config) -> Iterator[Gate]:
     """The gates, in the order of the path.
 
     Raises
     ------
-    InputError
-        From a stage that gave up, where `found` computes what it is asked for.
+    NotReached
+        The path ended before a stage that the next gate judges.
     """
     judged: list[Gate] = []
     for gate in _in_order(found, config):
@@ -31,7 +32,7 @@ def judge(found: Found, config: Config) -> Iterator[Gate]:
         if gate.name == "order" and gate.state == "fail":
             return  # in another order all that follows is another capture's
     yield _normal_error(found, judged, config.gates)
-    if found.mesh is not None:
+    if hasattr(found, "mesh"):
         yield geometry.mesh(found.mesh, config.gates)
 
 
@@ -41,7 +42,7 @@ def verdict(gates: Iterable[Gate]) -> State:
     return "fail" if "fail" in states else "warn" if "warn" in states else "pass"
 
 
-def _in_order(found: Found, config: Config) -> Iterator[Gate]:
+def _in_order(found: Evidence, config: Config) -> Iterator[Gate]:
     limits = config.gates
     yield light.bracket(found)
     yield light.tone(found, limits)
@@ -63,9 +64,9 @@ def _in_order(found: Found, config: Config) -> Iterator[Gate]:
     yield geometry.focal_length(found)
 
 
-def _normal_error(found: Found, judged: list[Gate], limits: Gates) -> Gate:
+def _normal_error(found: Evidence, judged: list[Gate], limits: Gates) -> Gate:
     """The median expected error, with what the other gates add to it."""
-    own = found.figure("normal_error", _own_error)
+    own = _own_error(found.maps)
     expected = min(float(np.sqrt(own**2 + sum(gate.cost_deg**2 for gate in judged))), MOST_DEG)
     because = ", ".join(gate.name for gate in judged if gate.cost_deg > 0.5 * own)
     says = f"expected error of the normals {expected:.1f}° (median)"
@@ -82,7 +83,7 @@ def _normal_error(found: Found, judged: list[Gate], limits: Gates) -> Gate:
     return Gate("normal error", "fail", round(expected, 2), limit, says, remedy, unit="°")
 
 
-def _own_error(found: Found, _: None) -> float:
+def _own_error(maps: SurfaceMaps) -> float:
     """Median error that the estimator expects, degrees."""
-    inside = found.maps.confidence[found.maps.mask]
+    inside = maps.confidence[maps.mask]
     return float(np.median(inside)) if inside.size else float("nan")

@@ -1,14 +1,15 @@
 """Gates of place: what moved, what is out of focus, what is out of the frame."""
 
-import cv2
 import numpy as np
 
 from polcap.config import Config, Gates
-from polcap.formats import calib
-from polcap.images import Mesh
+from polcap.formats import shipped_data
+from polcap.images import Floats, Mesh, SurfaceMaps
 from polcap.optics import frames, outline
+from polcap.optics.projection import picture_corners, transform_points
+from polcap.optics.resize import area_mean
 from polcap.optics.sharpness import TILE
-from polcap.quality.gate import Found, Gate, State, Unit, at_most, blamed
+from polcap.quality.gate import Evidence, Gate, State, Unit, at_most, blamed
 from polcap.stages.align import object_motion
 from polcap.stages.whitebalance import chart_in_mask
 
@@ -19,13 +20,13 @@ _INWARD = 0.2  # sine of the zenith from which a normal leans inward
 _INWARD_DEG = 25.0
 
 
-def alignment(found: Found, config: Config) -> Gate:
+def alignment(found: Evidence, config: Config) -> Gate:
     """How far camera or object moved from shot to shot, in px of the picture that is processed, and how surely."""
     measured, names = found.alignment, found.names
     height, width = found.radiance.value.shape[1:3]
-    corners = np.array([[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]], float).T
-    at = measured.transform @ corners  # (K, 3, 4)
-    shift = np.abs(at[:, :2] / at[:, 2:] - corners[:2]).max((1, 2)) * found.grid_px
+    corners = picture_corners(width, height)
+    moved = np.stack([transform_points(matrix, corners) for matrix in measured.transform])  # (K, 4, 2)
+    shift = np.abs(moved - corners).max((1, 2)) * found.grid_px
     limit = config.align.max_shift_px
     lost = (measured.correlation < config.align.min_correlation) | ~np.isfinite(shift)
     doubt = measured.residual_px * found.grid_px
@@ -50,9 +51,9 @@ def alignment(found: Found, config: Config) -> Gate:
     return Gate("alignment", "fail", value, limit, says, remedy, 10.0, blamed(names, bad), unit)
 
 
-def _pushed(found: Found, config: Config) -> Gate | None:
+def _pushed(found: Evidence, config: Config) -> Gate | None:
     """An object that moved while what is around it stood still."""
-    displacement = np.array(found.figure("object_motion", _displacement)) * found.grid_px
+    displacement = _displacement(found) * found.grid_px
     limit = config.gates.max_object_shift_px
     bad = np.nan_to_num(displacement, posinf=np.inf) > limit
     if not bad.any():
@@ -67,17 +68,17 @@ def _pushed(found: Found, config: Config) -> Gate | None:
     return Gate("alignment", "fail", figure, limit, says, remedy, cost, blamed(found.names, bad), "px")
 
 
-def _displacement(found: Found, _: None) -> list[float]:
-    return [float(one) for one in object_motion.measure(found.radiance, found.alignment, found.object_)]
+def _displacement(found: Evidence) -> Floats:
+    return object_motion.measure(found.radiance, found.alignment, found.object_)
 
 
-def mask(found: Found, limits: Gates) -> Gate:
+def mask(found: Evidence, limits: Gates) -> Gate:
     """Fails where a chart is in it or the network doubts it; warns from half of that on, and of shapes none has."""
     object_, limit, doubt = found.object_, limits.max_mask_doubt, found.object_.doubt
     faults: list[tuple[str, float, float]] = []  # in words, its figure, its limit
     charted = 0.0
     if found.color.corners is None:
-        charted = found.figure("charted", _charted)
+        charted = _charted(found)
     if charted:
         faults.append(
             (f"{charted:.0%} of it looks like a colour chart that was not found, and is no object", charted, 0)
@@ -106,8 +107,8 @@ def mask(found: Found, limits: Gates) -> Gate:
     return Gate("mask", state, round(value, 5), most, "; ".join(fault[0] for fault in faults), remedy, cost)
 
 
-def _charted(found: Found, _: None) -> float:
-    return float(chart_in_mask.share(found.radiance, found.object_.mask, calib.colorchecker()))
+def _charted(found: Evidence) -> float:
+    return float(chart_in_mask.share(found.radiance, found.object_.mask, shipped_data.colorchecker()))
 
 
 def mesh(of: Mesh, limits: Gates) -> Gate:
@@ -142,11 +143,11 @@ def mesh(of: Mesh, limits: Gates) -> Gate:
     return Gate("mesh", "pass", round(of.cuts, 4), cuts, says)
 
 
-def sharpness(found: Found, limits: Gates) -> Gate:
+def sharpness(found: Evidence, limits: Gates) -> Gate:
     """Every frame against the frames of the same exposure in the other shots."""
-    blur, limit = found.radiance.blur_px, limits.max_blur_px
+    blur, limit = found.blur_px, limits.max_blur_px
     moved = float(np.abs(found.alignment.transform[:, :2, 2]).max()) * found.grid_px
-    if blur is None or np.isnan(blur).all():
+    if np.isnan(blur).all():
         return Gate("sharpness", "not measured", None, limit, "too little bright detail", unit="px")
     if not moved <= TILE / 2:  # tiles would compare unlike detail
         return Gate("sharpness", "not measured", None, limit, "the shots show different places", unit="px")
@@ -157,21 +158,21 @@ def sharpness(found: Found, limits: Gates) -> Gate:
     return at_most("sharpness", float(blur[k, e]), limit, says, remedy, bad, 3, "px")
 
 
-def focal_length(found: Found) -> Gate:
+def focal_length(found: Evidence) -> Gate:
     """Whether it is known; where not, what it costs: normals stand on view rays, which lean as it says."""
     least, most = found.focal_doubt
     if not most - least:
         return Gate("focal length", "pass", "known", "known", "known", unit="")
-    cost = found.figure("lean", _lean, [least, most])
+    cost = _lean(found.maps, least, most)
     times = np.exp(max(most, -least))
     says = f"the focal length is assumed, perhaps {times:.1f} times off; a wrong one bends shape and depth"
     remedy = "state focal_length_mm and sensor_width_mm in capture.toml"
     return Gate("focal length", "warn", "assumed", "known", says, remedy, round(cost, 1), unit="")
 
 
-def inward_outline(found: Found, limits: Gates) -> Gate:
+def inward_outline(found: Evidence, limits: Gates) -> Gate:
     """Whether normals point out of the object at its outline, as those of a closed surface do."""
-    share = found.figure("inward_outline", _inward_share)
+    share = _inward_share(found.maps)
     says = f"{100 * share:.0f} % of the outline's normals point into the object"
     if share > limits.max_inward_outline:
         says += ": parts of the shape are turned inside out, most often on black gloss that mirrors its surroundings"
@@ -182,29 +183,24 @@ def inward_outline(found: Found, limits: Gates) -> Gate:
     return at_most("outline", share, limits.max_inward_outline, says, remedy, cost_deg=_INWARD_DEG)
 
 
-def _inward_share(found: Found, _: None) -> float:
-    """Share of a band inside the outline in which normals lean into the object, on a picture of at most _LONGEST px."""
-    maps = found.maps
-    across = frames.to_ray_frame(maps.normal, frames.rays(maps.view, *maps.mask.shape))[..., :2] * maps.mask[..., None]
+def _inward_share(maps: SurfaceMaps) -> float:
+    """Share of a band inside the outline in which normals lean into the object, on at most _LONGEST px a side."""
+    across = frames.to_ray_frame(maps.normal, frames.rays(maps.view, *maps.mask.shape))[..., :2]
     shrink = max(1.0, max(maps.mask.shape) / _LONGEST)
-    size = (round(maps.mask.shape[1] / shrink), round(maps.mask.shape[0] / shrink))
-    x, y, share = (
-        cv2.resize(part.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        for part in (across[..., 0], across[..., 1], maps.mask)
-    )
-    mask = share > 0.99
+    shape = tuple(round(side / shrink) for side in maps.mask.shape)
+    mask = area_mean(maps.mask, shape) > 0.99
+    lean = area_mean((across * maps.mask[..., None]).astype(np.float32), shape)
     away, _slope = outline.outward(mask.astype(np.float32), _OUTLINE_BLUR_PX)
     band = mask & (outline.depth(mask) <= _OUTLINE_PX)
     for edge in (band[:3], band[-3:], band[:, :3], band[:, -3:]):  # where a picture ends is no outline
         edge[:] = False
-    leaning = (x * away[0] + y * away[1])[band]
-    return float((leaning < -_INWARD).mean()) if leaning.size else 0.0
+    outwards = (lean[..., 0] * away[0] + lean[..., 1] * away[1])[band]
+    return float((outwards < -_INWARD).mean()) if outwards.size else 0.0
 
 
-def _lean(found: Found, doubt: tuple[float, float]) -> float:
+def _lean(maps: SurfaceMaps, least: float, most: float) -> float:
     """Degrees by which the view rays of the object lean otherwise, in the median pixel."""
-    maps, (y, x) = found.maps, np.nonzero(found.maps.mask)
-    least, most = doubt
+    y, x = np.nonzero(maps.mask)
     off = np.hypot(x - maps.view.center[0], y - maps.view.center[1]) / maps.view.focal
     lean, more, less = (np.arctan(off * factor) for factor in (1.0, np.exp(-least), np.exp(-most)))
     return float(np.degrees(np.median(np.maximum(more - lean, lean - less)))) if len(off) else 0.0

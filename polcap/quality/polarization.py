@@ -1,18 +1,17 @@
 """Gates of polarization: the order of the angles, their turn, and whether it is a body's light at all."""
 
 from collections.abc import Iterator
-from dataclasses import asdict
-from typing import Any
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from polcap.config import Gates
-from polcap.images import Floats, Gains, Quality, StokesImage
+from polcap.images import Floats, Quality, SelfCalibration, ShotOrder, StokesImage, SurfaceMaps, TurnedShot
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
 from polcap.quality import rim
-from polcap.quality.gate import Found, Gate, at_most
+from polcap.quality.gate import Evidence, Gate, at_most
 
 _LEAST_RIM = 200  # pixels of outline that an angle can be told from
 _LEAST_DOLP = 0.01  # of the outline; there the least index has ten times that
@@ -31,86 +30,89 @@ _ALONG = -0.3  # how well the AoLP lies across the contour, below: along it
 _MOST_PIXELS = 6e5  # a larger picture is averaged down
 
 
-def order(found: Found) -> Gate:
+def order(found: Evidence) -> Gate:
     """Whether the outline supports the stated order and sense of the angles."""
-    gains, names = found.gains, found.names
-    if gains.order == tuple(range(len(names))) and not gains.mirrored and gains.rival:
-        other = ", ".join(names[i] for i in gains.rival) + (", counted the other way" if gains.rival_mirrored else "")
-        says = f"the outline cannot tell the stated order from {other} (it fits to {gains.concentration:.2f})"
+    outline, names = found.selfcal.outline, found.names
+    if outline.as_stated and outline.rival is not None:
+        other = _named(outline.rival, names)
+        says = f"the outline cannot tell the stated order from {other} (it fits to {outline.concentration:.2f})"
         would = "a closed, rounded object, a chart" + ("" if len(names) > 3 else " or four angles")
         remedy = f"make sure of folders and ring yourself; {would} would tell"
         return Gate("order", "warn", "cannot tell", "as stated", says, remedy, unit="")
-    if gains.order == tuple(range(len(names))) and not gains.mirrored:
-        says = f"as stated (the outline fits to {gains.concentration:.2f})"
+    if outline.as_stated:
+        says = f"as stated (the outline fits to {outline.concentration:.2f})"
         return Gate("order", "pass", "as stated", "as stated", says, unit="")
-    best = ", ".join(names[i] for i in gains.order) + (", counted the other way" if gains.mirrored else "")
+    best = _named(outline.best, names)
     says = f"the outline fits {best} better than the stated order"
     remedy = "name the shots by the angles they had (folders, or --angles), or take them again in order"
     return Gate("order", "fail", best, "as stated", says, remedy, 45.0, unit="")
 
 
-def of_outline(found: Found, limits: Gates) -> Iterator[Gate]:
+def _named(order: ShotOrder, names: list[str]) -> str:
+    return ", ".join(names[i] for i in order.shots) + (", counted the other way" if order.mirrored else "")
+
+
+def of_outline(found: Evidence, limits: Gates) -> Iterator[Gate]:
     """What the outline says of the angles, of the body and of other light."""
-    angle, limit = _angle(found), limits.max_turn_deg
-    seen = found.figure("outline", _outline, [limit, angle.tolist()])
+    angle, limit = found.selfcal.angle - found.selfcal.ring.correction, limits.max_turn_deg
+    seen = _outline(found, limit, angle)
     if seen is None:
         yield Gate("angles", "not measured", None, limit, "too little outline", unit="°")
         return
-    body = rim.Body(**seen["body"])
+    body = seen.body
     if body.dolp < _LEAST_DOLP:
         says = f"the outline is polarized by {100 * body.dolp:.1f} %"
         remedy = "is the polarizer on, and did it turn? Metal and translucent bodies (wax, milk) hardly polarize"
         yield Gate("polarized", "fail", round(body.dolp, 4), _LEAST_DOLP, says, remedy, 45.0)
         return
-    of_shots = _angles(rim.Turn(**seen["turn"]), body, angle, found.gains, found.names, limits)
-    yield _with_ring(of_shots, found.gains, limits)
+    of_shots = _angles(seen.turn, body, angle, found.selfcal, found.names, limits)
+    yield _with_ring(of_shots, found.selfcal, limits)
     yield _light_of_body(body, found, limits)
-    side = seen["side"]
+    side = seen.side
     k = int(np.argmax(side))
     says = f"{found.names[k]} is brighter on one side by {100 * side[k]:.1f} %"
     remedy = "another light was on in one of the shots: darken the room, and take that shot again"
     yield at_most("other light", float(side[k]), limits.max_side_light, says, remedy, (found.names[k],), 10)
 
 
-def _angle(found: Found) -> Floats:
-    """As found where nobody noted them, else as stated, (K,) rad."""
-    return found.radiance.angle if found.gains.found_angle is None else found.gains.found_angle
+@dataclass(frozen=True)
+class OutlineFigures:
+    """Measurements along the object's outline."""
+
+    body: rim.Body
+    turn: rim.Turn
+    side: Floats  # (K,) how much brighter one side is than the other in each shot
 
 
-def _outline(found: Found, setting: tuple[float, list[float]]) -> dict[str, Any] | None:
-    """What the outline says of a turn beyond the limit, of the body and of other light; None: it is too short.
-
-    The setting: the limit in degrees, and the angles, for which nobody has to read the photographs here.
-    """
-    limit_deg, angle = setting[0], np.array(setting[1])
+def _outline(found: Evidence, limit_deg: float, angle: Floats) -> OutlineFigures | None:
+    """Figures of the outline; turns below the limit are not tried; angle (K,) rad. None: it is too short."""
     band = rim.take(*_reduced(found.stokes, angle))
     if len(band.azimuth) < _LEAST_RIM:
         return None
-    return {
-        "body": asdict(rim.body(band, angle)),
-        "turn": asdict(rim.turn(band, angle, np.radians(limit_deg))),
-        "side": [float(one) for one in rim.side_light(band)],
-    }
+    turn = rim.turn(band, angle, np.radians(limit_deg))
+    return OutlineFigures(rim.body(band, angle), turn, rim.side_light(band))
 
 
-def ill_posed(found: Found, limits: Gates) -> Gate:
+def ill_posed(found: Evidence, limits: Gates) -> Gate:
     """How much of the object is polarized as no dielectric is."""
-    share = found.figure("ill_posed", _ill_posed)
+    share = _ill_posed(found)
     says = f"{100 * share:.1f} % of the object is polarized as no dielectric is"
     remedy = "ambient light, mirrored surroundings, metal, or shots out of order: darken the room, check the angles"
     return at_most("ill-posed", share, limits.max_ill_posed, says, remedy, cost_deg=30 * share)
 
 
-def _ill_posed(found: Found, _: None) -> float:
+def _ill_posed(found: Evidence) -> float:
     image = found.stokes
     inside = image.quality[image.mask]
     return float(((inside & int(Quality.ILL_POSED)) > 0).mean()) if inside.size else 0.0
 
 
-def _angles(found: rim.Turn, body: rim.Body, angle: Floats, gains: Gains, names: list[str], limits: Gates) -> Gate:
+def _angles(
+    found: rim.Turn, body: rim.Body, angle: Floats, selfcal: SelfCalibration, names: list[str], limits: Gates
+) -> Gate:
     """A turn of the ring, or of one shot, that outline or closure support beyond their own error."""
     limit = limits.max_turn_deg
-    known = gains.source in ("grey patches", "one exposure")
+    known = selfcal.gains.source in ("grey patches", "one exposure")
     common = -float(np.degrees(body.turned))  # an AoLP too small is an angle stated too small
     if (
         abs(common) > limit + 3 * np.degrees(body.turned_sigma)
@@ -120,8 +122,8 @@ def _angles(found: rim.Turn, body: rim.Body, angle: Floats, gains: Gains, names:
         says = f"the ring looks turned by {common:+.0f}° ± {np.degrees(body.turned_sigma):.0f}° in all shots"
         remedy = "set the ring's zero to the horizontal, or name the angles it really had"
         return Gate("angles", "fail", round(common, 1), limit, says, remedy, abs(common), unit="°")
-    if gains.turned_shots and abs(np.degrees(gains.turned)) > limit:
-        return _not_closing(gains, names, limit)
+    if selfcal.turned.shots and abs(np.degrees(selfcal.turned.angle)) > limit:
+        return _not_closing(selfcal.turned, names, limit)
     fit = limits.max_turn_fit * (1.0 if known else 0.75)  # guessed gains look like turns
     if found.misfit >= fit or found.sigmas < _SURE or found.shot is None:
         return Gate("angles", "pass", 0.0, limit, "no other angle fits the outline clearly better", unit="°")
@@ -141,29 +143,29 @@ def _angles(found: rim.Turn, body: rim.Body, angle: Floats, gains: Gains, names:
     return Gate("angles", "fail", round(degrees, 1), limit, says, remedy, cost, (names[found.shot],), "°")
 
 
-def _not_closing(gains: Gains, names: list[str], limit: float) -> Gate:
+def _not_closing(turned: TurnedShot, names: list[str], limit: float) -> Gate:
     """One angle of more than three that contradicts the others over the whole object."""
-    degrees, doubt = np.degrees([gains.turned, gains.turned_sigma])
-    shots = tuple(names[k] for k in gains.turned_shots)
+    degrees, doubt = np.degrees([turned.angle, turned.sigma])
+    shots = tuple(names[k] for k in turned.shots)
     which = shots[0] if len(shots) == 1 else f"{shots[0]} (or {', '.join(shots[1:])}, by as much or less)"
     says = f"{which} looks turned by {degrees:+.0f}° ± {doubt:.0f}°: the shots contradict one another"
     remedy = "set the ring to its mark and take the shot again, or name the angle it really had"
     return Gate("angles", "fail", round(float(degrees), 1), limit, says, remedy, abs(float(degrees)) / 2, shots, "°")
 
 
-def _with_ring(gate: Gate, gains: Gains, limits: Gates) -> Gate:
+def _with_ring(gate: Gate, selfcal: SelfCalibration, limits: Gates) -> Gate:
     """The gate of the angles with the turn of the whole ring, taken out of them before where it was sure.
 
     To three angles a single shot that was turned looks like a smaller turn of all; more would not close.
     """
-    if gains.found_angle is not None and gate.state == "pass":
-        doubt, ring = float(np.degrees(gains.found_sigma)), np.degrees(gains.found_angle + gains.angle_correction) % 180
+    if selfcal.found_sigma is not None and gate.state == "pass":
+        doubt, ring = float(np.degrees(selfcal.found_sigma)), np.degrees(selfcal.angle) % 180
         says = f"nobody noted them; found {', '.join(f'{one:.1f}°' for one in ring)}, to {doubt:.1f}°"
         remedy = "note the ring's mark of every shot: then nothing has to be found"
         return Gate("angles", "warn", "found", "noted", says, remedy, doubt, unit="")
-    turn, doubt = np.degrees([gains.angle_offset, gains.angle_offset_sigma])
-    applied = gains.angle_correction != 0
-    noted = len(gains.gain) == 3 and abs(turn) > max(limits.max_ring_turn_deg, _SURE * doubt)
+    turn, doubt = np.degrees([selfcal.ring.offset, selfcal.ring.sigma])
+    applied = selfcal.ring.correction != 0
+    noted = len(selfcal.angle) == 3 and abs(turn) > max(limits.max_ring_turn_deg, _SURE * doubt)
     if gate.state != "pass" or not (applied or noted):
         return gate
     says = f"the ring's zero was off by {turn:+.1f}° ± {doubt:.1f}°"
@@ -179,7 +181,7 @@ def _with_ring(gate: Gate, gains: Gains, limits: Gates) -> Gate:
     return Gate("angles", "warn", value, limit if noted else limits.max_turn_deg, says, remedy, cost, unit="°")
 
 
-def _light_of_body(body: rim.Body, found: Found, limits: Gates) -> Gate:
+def _light_of_body(body: rim.Body, found: Evidence, limits: Gates) -> Gate:
     """Whether the outline is polarized as a body under a flash by the lens: across the contour, and enough.
 
     A rough body polarizes as little as a translucent one. The estimators allow for roughness, and then find a shape as
@@ -202,7 +204,7 @@ def _light_of_body(body: rim.Body, found: Found, limits: Gates) -> Gate:
         )
         figure, least = round(body.concentration, 2), limits.min_concentration
         return Gate("body", "warn", figure, least, says, remedy, max(15.0, weak), unit="")
-    zenith, roughness = found.figure("shape", _median_shape)
+    zenith, roughness = _median_shape(found.maps)
     flat, dimmed = zenith < limits.min_zenith_deg, body.brightness < _DIMMED
     hint = "under even light translucent bodies give little; trust the shape less"
     if flat and dimmed and body.dolp < max(limit, _WEAK_DOLP):
@@ -234,9 +236,8 @@ def _lopsided(body: rim.Body) -> float:
     return _LOPSIDED if body.dolp_lit < _LIT_DOLP else np.inf
 
 
-def _median_shape(found: Found, _: None) -> tuple[float, float]:
+def _median_shape(maps: SurfaceMaps) -> tuple[float, float]:
     """Median zenith of the normals, degrees from the view ray, and median roughness."""
-    maps = found.maps
     if not maps.mask.any():
         return 0.0, 0.0
     facing = dot(maps.normal, rays(maps.view, *maps.mask.shape))[maps.mask]

@@ -7,18 +7,16 @@ states an assumption. A gate that could not be measured says so.
 import json
 import math
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
-from polcap import __version__, parallel
+from polcap import __version__
 from polcap.config import Config
 from polcap.errors import StorageError
 from polcap.formats import atomic, text_file
-from polcap.formats.export import provenance
 from polcap.formats.maps import maps_folder
 from polcap.images import (
     Capture,
@@ -28,12 +26,10 @@ from polcap.images import (
     Quality,
     StokesImage,
 )
-from polcap.pipeline.path import Results
 from polcap.quality import gates
-from polcap.quality.gate import Gate
-from polcap.remembered import Remembered
+from polcap.quality.gate import Gate, full_size
 from polcap.report import labels, page, shown
-from polcap.report.whole import Whole
+from polcap.results import Results
 from polcap.stages.cues import scale
 from polcap.stages.whitebalance import patches
 
@@ -103,17 +99,18 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
 
 def figures(results: Results) -> dict[str, dict[str, Any]]:
     """Every measured figure, by the part of the path that it tells of."""
-    radiance, color = results.radiance.value, results.color.value
-    found, gains, image = results.alignment.value, results.gains.value, results.stokes.value
-    cues, maps, mesh = results.cues.value, results.maps.value, results.mesh.value
+    radiance, color = results.radiance, results.color
+    found, gains, image = results.alignment, results.selfcal.gains, results.stokes
+    cues, maps, mesh, object_ = results.cues, results.maps, results.mesh, results.object_
+    ring, outline = results.selfcal.ring, results.selfcal.outline
     turn = np.degrees(np.arctan2(found.transform[:, 1, 0], found.transform[:, 0, 0]))
     extent = mesh.vertices.max(0) - mesh.vertices.min(0)
     return {
         "merge": {
-            "exposure_ratio": _list(radiance.exposure_ratio.mean(-1)),
-            "exif_ratio": _list(radiance.exif_ratio),
-            "ghost_fraction": _list(radiance.ghost_fraction),
-            "lossy_source": radiance.lossy,
+            "exposure_ratio": _list(radiance.bracket.exposure_ratio.mean(-1)),
+            "exif_ratio": _list(radiance.bracket.exif_ratio),
+            "ghost_fraction": _list(radiance.bracket.ghost_fraction),
+            "lossy_source": radiance.sensor.lossy,
         },
         "chart": {
             "source": color.source,
@@ -145,21 +142,21 @@ def figures(results: Results) -> dict[str, dict[str, Any]]:
             "disagreement": _number(gains.disagreement),
         },
         "angles": {
-            "offset_deg": _number(np.degrees(gains.angle_offset)),
-            "offset_sigma_deg": _number(np.degrees(gains.angle_offset_sigma)),
-            "applied_deg": _number(np.degrees(gains.angle_correction)),
-            "concentration": _number(gains.concentration),
-            "best_order": list(gains.order),
-            "mirrored": gains.mirrored,
+            "offset_deg": _number(np.degrees(ring.offset)),
+            "offset_sigma_deg": _number(np.degrees(ring.sigma)),
+            "applied_deg": _number(np.degrees(ring.correction)),
+            "concentration": _number(outline.concentration),
+            "best_order": list(outline.best.shots),
+            "mirrored": outline.best.mirrored,
         },
         "object": {
             "pixels": int(image.mask.sum()),
             "crop": maps_folder.raw_crop(maps.view, *maps.mask.shape[::-1]),
-            "source": results.object_.value.source,
-            "mask_doubt": None if results.object_.value.doubt is None else _number(results.object_.value.doubt),
-            "mask_islands": _number(results.object_.value.islands),
-            "mask_holes": _number(results.object_.value.holes),
-            "mask_border": _number(results.object_.value.border),
+            "source": object_.source,
+            "mask_doubt": None if object_.doubt is None else _number(object_.doubt),
+            "mask_islands": _number(object_.islands),
+            "mask_holes": _number(object_.holes),
+            "mask_border": _number(object_.border),
             **{
                 f"{bit.name}_fraction".lower(): _share(image, bit)
                 for bit in (Quality.CLIPPED, Quality.DARK, Quality.ILL_POSED, Quality.METAL, Quality.GHOST)
@@ -194,54 +191,31 @@ def figures(results: Results) -> dict[str, dict[str, Any]]:
 
 def rerendering(results: Results, ior: float) -> dict[str, Any]:
     """How far the photographs are from what the maps say they should be."""
-    maps, mesh, angle = results.maps.value, results.mesh.value, results.radiance.value.angle
-    small = shown.reduce(maps, mesh, results.cues.value, angle, _COMPARED_PX)
+    small = shown.reduce(results.maps, results.mesh, results.cues, results.radiance.angle, _COMPARED_PX)
     again = shown.rerender(small, ior)
     return {"rms": [_number(one) for one in again.rms(small.maps.mask)], "scale": _number(again.scale)}
 
 
 def document(
-    capture: dict[str, Any],
-    results: Results,
-    config: Config,
-    network: Network | None,
-    timings: Mapping[str, float],
-    remembered: Remembered,
+    facts: Mapping[str, Any], results: Results, config: Config, timings: Mapping[str, float]
 ) -> dict[str, Any]:
-    """report.json: what was understood, measured and judged; timings [s] of the stages that were kept.
-
-    What is `remembered` of the same results is not measured again.
-    """
-    keys = {kept.name: kept.key for kept in vars(results).values()}
-    measured_on = {name: key for name, key in keys.items() if name != results.asset.name}
-    whole = Whole(results, tuple(capture.get("focal_doubt", (0.0, 0.0))), remembered)
-    limits = {name: section for name, section in msgspec.to_builtins(config).items() if name != results.asset.name}
-    found, again, judged = parallel.results(
-        [
-            partial(remembered, "figures", measured_on, partial(figures, results)),
-            partial(remembered, "rerendering", measured_on, partial(rerendering, results, config.infer.ior)),
-            partial(remembered, "gates", [measured_on, whole.focal_doubt, limits], partial(_judged, whole, config)),
-        ]
-    )
-    found = {**found, "rerendering": again}
+    """report.json: facts of the run, measurements and the gates' judgement; timings [s] of the stored stages."""
+    found = {**figures(results), "rerendering": rerendering(results, config.infer.ior)}
+    focal_doubt = tuple(facts["capture"].get("focal_doubt", (0.0, 0.0)))
+    judged = list(gates.judge(full_size(results, focal_doubt), config))
     return {
         "polcap": __version__,
-        "versions": provenance.versions(),
-        "verdict": judged["verdict"],
-        "capture": capture,
-        "gates": judged["gates"],
+        "versions": facts["versions"],
+        "verdict": gates.verdict(judged),
+        "capture": facts["capture"],
+        "gates": msgspec.to_builtins(judged),
         "figures": found,
         "units": labels.units(bool(found["mesh"]["metric"])),
         "timings": dict(timings),
-        "model": model_facts(network),
-        "keys": keys,
-        "settings": msgspec.to_builtins(config),
+        "model": facts["model"],
+        "keys": dict(results.keys),
+        "settings": facts["settings"],
     }
-
-
-def _judged(whole: Whole, config: Config) -> dict[str, Any]:
-    judged = list(gates.judge(whole, config))
-    return {"verdict": gates.verdict(judged), "gates": msgspec.to_builtins(judged)}
 
 
 def model_facts(network: Network | None) -> dict[str, str] | None:
@@ -252,8 +226,8 @@ def model_facts(network: Network | None) -> dict[str, str] | None:
     return {**network.metadata, "digest": network.digest, **beside}
 
 
-def write(folder: Path, about: dict[str, Any], results: Results, remembered: Remembered) -> None:
-    """report.json and report.html with its pictures, in a result folder; what is `remembered` is not drawn again.
+def write(folder: Path, about: dict[str, Any], results: Results) -> None:
+    """report.json and report.html with its pictures, in a result folder.
 
     Raises
     ------
@@ -263,7 +237,7 @@ def write(folder: Path, about: dict[str, Any], results: Results, remembered: Rem
     with atomic.path(folder / "report.json") as temporary:
         text = json.dumps(about, indent=1, ensure_ascii=False, allow_nan=False)
         temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")  # names of files are bytes
-    page.write(folder, about, results, remembered)
+    page.write(folder, about, results)
 
 
 def read(folder: Path) -> dict[str, Any]:

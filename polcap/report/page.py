@@ -1,7 +1,6 @@
 """In: a report's figures and the results of its run. Out: report.html, the page that people look at."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any, get_args
@@ -9,14 +8,12 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.formats import calib, html
+from polcap.formats import html, shipped_data
 from polcap.optics.color import srgb_eight_bits
-from polcap.pipeline.path import Results
-from polcap.remembered import Remembered
-from polcap.report import keys, labels, map_figures, plots, shown
-from polcap.report import mesh_preview as lean
+from polcap.report import keys, labels, map_figures, mesh_preview, plots, shown
 from polcap.report import stage_pictures as pictures
 from polcap.report.keys import Palette
+from polcap.results import Results
 
 _LONGEST = 1024  # px of a map on the page
 _WIDEST = 1000  # px of a picture of what was photographed
@@ -27,57 +24,41 @@ _HEADLINE = {
 }
 
 
-def write(folder: Path, about: Mapping[str, Any], results: Results, remembered: Remembered) -> None:
-    """report.html in a result folder; what is `remembered` is not drawn again.
+def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
+    """report.html in a result folder.
 
     Raises
     ------
     StorageError
         The file cannot be written.
     """
-    made = {name: piece() for name, piece in pieces(about, results, remembered).items()}
-    drawn = made["page_maps"]
+    drawn = _of_maps(about, results)
     body = [
         *_verdict(about),
         drawn["relit"],
         *_solid(drawn["metric"], about),
         drawn["maps"],
-        *_measured(results, about, drawn["angles_deg"], made["page_chart"]),
-        made["page_pictures"],
+        *_measured(results, about, drawn["angles_deg"], _chart(about, results)),
+        _pictures(results),
         *_tables(about),
     ]
     data = {
         "palettes": {name: html.text(keys.colors(name).tobytes()) for name in get_args(Palette)},
         "view": drawn["view"],
-        "mesh": made["page_mesh"],
+        "mesh": mesh_preview.packed(results.mesh),
     }
     html.write(folder / "report.html", f"{about['capture']['name']}: polcap report", body, data)
 
 
-def pieces(about: Mapping[str, Any], results: Results, remembered: Remembered) -> dict[str, Callable[[], Any]]:
-    """What is drawn for the page, piece by piece; those that take longest first. What is `remembered` is not."""
-    seen = [results.radiance.key, results.color.key]
-    rms = about["figures"].get("rerendering", {}).get("rms")
-    made: dict[str, tuple[Any, Callable[[], Any]]] = {
-        "page_maps": (
-            [*seen, results.cues.key, results.maps.key, results.mesh.key, rms], partial(_of_maps, about, results)
-        ),
-        "page_pictures": ([*seen, results.alignment.key, results.object_.key], partial(_pictures, results)),
-        "page_mesh": (results.mesh.key, partial(_lean, results)),
-        "page_chart": ([*seen, about["figures"]["chart"]], partial(_chart, about, results)),
-    }  # fmt: skip
-    return {name: partial(remembered, name, *how) for name, how in made.items()}
-
-
 def _of_maps(about: Mapping[str, Any], results: Results) -> dict[str, Any]:
     """What the page shows of the maps, and how its viewer looks at them."""
-    radiance, maps, mesh = results.radiance.value, results.maps.value, results.mesh.value
-    small = shown.reduce(maps, mesh, results.cues.value, radiance.angle, _LONGEST)
+    radiance, maps, mesh = results.radiance, results.maps, results.mesh
+    small = shown.reduce(maps, mesh, results.cues, radiance.angle, _LONGEST)
     ior = float(about["settings"]["infer"]["ior"])
     again = shown.rerender(small, ior)
     bright = shown.exposure(small)
     size = small.maps.mask.shape[1::-1]
-    taken = shown.photograph(radiance, results.color.value, small.maps.view, size)
+    taken = shown.photograph(radiance, results.color, small.maps.view, size)
     relit = _relit(srgb_eight_bits(bright * taken), srgb_eight_bits(bright * again.scale * again.flashed))
     return {
         "relit": "".join(relit),
@@ -93,10 +74,6 @@ def _of_maps(about: Mapping[str, Any], results: Results) -> dict[str, Any]:
             "top": keys.F0.high,
         },
     }
-
-
-def _lean(results: Results) -> dict[str, Any]:
-    return lean.packed(results.mesh.value)
 
 
 def verdict(about: Mapping[str, Any]) -> tuple[str, str]:
@@ -189,11 +166,11 @@ def _solid(metric: bool, about: Mapping[str, Any]) -> Iterator[str]:
 
 def _chart(about: Mapping[str, Any], results: Results) -> str:
     """The chart as photographed beside the maker's colors; nothing where none was read."""
-    color = results.color.value
-    measured = shown.patches(results.radiance.value, color)
+    color = results.color
+    measured = shown.patches(results.radiance, color)
     if measured is None or color.delta_e is None:
         return ""
-    known = calib.colorchecker(about["settings"]["whitebalance"]["chart"])
+    known = shipped_data.colorchecker(about["settings"]["whitebalance"]["chart"])
     reference = next((one for one in known.editions if one.name == color.edition), known)
     drawing = plots.chart(
         srgb_eight_bits(reference.rec709), srgb_eight_bits(measured), color.delta_e, reference.patches
@@ -207,7 +184,7 @@ def _chart(about: Mapping[str, Any], results: Results) -> str:
 
 def _measured(results: Results, about: Mapping[str, Any], angles: Sequence[float], chart: str) -> Iterator[str]:
     """Plots of what was measured; `angles` in degrees, `chart` drawn."""
-    gains, moved = results.gains.value, results.alignment.value
+    gains, moved = results.selfcal.gains, results.alignment
     yield "<h2>How it was measured</h2><div class='grid'>" + chart
     merge = about["figures"]["merge"]
     yield _drawn(
@@ -235,11 +212,11 @@ def _drawn(title: str, says: str, drawing: str) -> str:
 
 
 def _pictures(results: Results) -> str:
-    radiance, color = results.radiance.value, results.color.value
+    radiance, color = results.radiance, results.color
     notable: Sequence[tuple[str, str, NDArray[np.uint8]]] = (
         ("Reference shot", "the chart as it was read", pictures.chart(radiance, color, _WIDEST)),
-        ("Object", "what was taken for it", pictures.outline(radiance, color, results.object_.value, _WIDEST)),
-        *((tile.caption, tile.note, tile.picture) for tile in pictures.registered(radiance, results.alignment.value)),
+        ("Object", "what was taken for it", pictures.outline(radiance, color, results.object_, _WIDEST)),
+        *((tile.caption, tile.note, tile.picture) for tile in pictures.registered(radiance, results.alignment)),
     )
     figures = "".join(
         f'<figure><div class="picture"><img alt="{title}" src="{html.jpeg(pictures.shrink(picture, _WIDEST))}"></div>'

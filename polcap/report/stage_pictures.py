@@ -27,11 +27,11 @@ from polcap.images import (
 )
 from polcap.optics import color, frames
 from polcap.optics.warp import warp
-from polcap.pipeline.path import Results
 from polcap.report import keys
 from polcap.report.sheets import WIDTH, Tile, sheet, write
 from polcap.report.sheets import Picture as Picture
 from polcap.report.smaller import area
+from polcap.results import Results
 
 _AGREE = "first shot magenta, this one green: grey where they agree"
 _DIRECTIONS = "red right, green up, blue toward the camera"
@@ -40,16 +40,16 @@ _DIRECTIONS = "red right, green up, blue toward the camera"
 def of_stage(results: Results, stage: str) -> Picture:
     """What a stage made, for a person to look at."""
     paint: dict[str, Callable[[], Picture]] = {
-        "hdr": lambda: merged(results.radiance.value),
-        "whitebalance": lambda: chart(results.radiance.value, results.color.value),
-        "align": lambda: sheet(registered(results.radiance.value, results.alignment.value)),
-        "mask": lambda: outline(results.radiance.value, results.color.value, results.object_.value),
-        "selfcal": lambda: gains(results.gains.value, results.radiance.value.angle),
-        "stokes": lambda: stokes(results.stokes.value),
-        "cues": lambda: cues(results.cues.value),
-        "infer": lambda: maps(results.maps.value),
-        "surface": lambda: surface(results.mesh.value, results.maps.value),
-        "asset": lambda: asset(results.asset.value),
+        "hdr": lambda: merged(results.radiance),
+        "whitebalance": lambda: chart(results.radiance, results.color),
+        "align": lambda: sheet(registered(results.radiance, results.alignment)),
+        "mask": lambda: outline(results.radiance, results.color, results.object_),
+        "selfcal": lambda: gains(results.selfcal.gains, results.radiance.angle),
+        "stokes": lambda: stokes(results.stokes),
+        "cues": lambda: cues(results.cues),
+        "infer": lambda: maps(results.maps),
+        "surface": lambda: surface(results.mesh, results.maps),
+        "asset": lambda: asset(results.asset),
     }
     return paint[stage]()
 

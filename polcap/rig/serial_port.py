@@ -63,7 +63,7 @@ class Port:
     def __init__(self, url: str, baud: int, log: Log) -> None:
         """Raises HardwareError if the port cannot be opened, SettingError for a malformed URL."""
         self.url = url
-        self._log = log
+        self.log = log
         self._question = ""
         self._answer_missing = False  # it may still come, and must not be taken for the next answer
         self._heard = False  # something has come since
@@ -89,7 +89,7 @@ class Port:
                 self._serial.reset_input_buffer()
             self._serial.write(text.encode("ascii"))
         self._question = _printable(text.encode("ascii"))
-        self._log.write("rotator", ">", self._question)
+        self.log.write("rotator", ">", self._question)
 
     def read_line(self, limit_s: float | None = None) -> str:
         """The next line that is not empty, without its end. Raises NoAnswer, Unplugged."""
@@ -106,7 +106,7 @@ class Port:
             return self._decoded(line)
         self._answer_missing, self._heard = True, False
         if line:
-            self._log.write("rotator", "<", _printable(line) + " …")
+            self.log.write("rotator", "<", _printable(line) + " …")
             raise NoAnswer(
                 f"{self._subject} only '{_printable(line):.40}' within {limit_s:.3g} s; "
                 "check the cable and the baud rate"
@@ -134,7 +134,7 @@ class Port:
         return f"rotator on {self.url} answered '{self._question}' with" if self._question else f"{self.url} sent"
 
     def _decoded(self, line: bytes) -> str:
-        self._log.write("rotator", "<", _printable(line))
+        self.log.write("rotator", "<", _printable(line))
         self._heard = True
         if not all(32 <= byte < 127 or byte == 9 for byte in line):
             raise NoAnswer(

@@ -47,7 +47,7 @@ class Recipe:
     flash: tuple[float, float] | None = None  # right of the lens and above it, in object distances; None: at random
 
 
-def cached(folder: Path, meshes: list[Path], recipe: Recipe, *, mapped: bool = True) -> dict[str, NDArray[Any]]:
+def cached(folder: Path, meshes: list[Path], recipe: Recipe) -> dict[str, NDArray[Any]]:
     """`load` of what `build` traces, which is done now where the folder is empty.
 
     Raises
@@ -62,7 +62,7 @@ def cached(folder: Path, meshes: list[Path], recipe: Recipe, *, mapped: bool = T
         raise InputError(
             f"{folder} holds views of other meshes or of another preset; remove it or choose another --out"
         )
-    return load(folder, mapped=mapped)
+    return load(folder)
 
 
 def build(folder: Path, meshes: list[Path], recipe: Recipe) -> int:
@@ -101,8 +101,8 @@ def _index(meshes: list[Path], recipe: Recipe) -> dict[str, Any]:
     return plain | {"meshes": [mesh.stem for mesh in meshes]}
 
 
-def load(folder: Path, *, mapped: bool = True) -> dict[str, NDArray[Any]]:
-    """The cache, as memory maps or in memory: what ARRAYS lists (N, S, S, ·) and camera (N, 16).
+def load(folder: Path) -> dict[str, NDArray[Any]]:
+    """The cache as memory maps: what ARRAYS lists (N, S, S, ·) and camera (N, 16).
 
     camera: focal, centre x, y [px]; middle depth [m]; depth unit [m]; object → camera rotation, 9; flash right of
     the lens and above it [middle depths].
@@ -112,7 +112,7 @@ def load(folder: Path, *, mapped: bool = True) -> dict[str, NDArray[Any]]:
         raise InputError(
             f"{folder} holds no complete G-buffer cache: {missing[0]} is missing; remove it and run `polcap train`"
         )
-    arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r" if mapped else None) for name in ARRAYS}
+    arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in ARRAYS}
     return arrays | {"camera": np.load(folder / "camera.npy")}
 
 

@@ -25,7 +25,7 @@ from polcap.formats.capture import reader as captures
 from polcap.formats.maps import png
 from polcap.images import ChartRequest, Cues, Floats, Network
 from polcap.pipeline import models
-from polcap.pipeline.cache import Store
+from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
 
 _MISSED_DEG = 90.0  # what an object's pixel without a normal counts as
@@ -86,9 +86,9 @@ def scored(folder: Path, angles: list[str], name: str, network: Network | None) 
             (Path(place) / "shots" / angle / name).symlink_to((folder / angle / name).resolve())
         capture = captures.read(Path(place) / "shots", None)
         supplied = UserInput(chart=ChartRequest("none"), mask=mask, network=network)
-        found = path(capture, supplied, Config(), Store(Path(place) / "out"))
-        maps, cues, (x0, y0, x1, y1) = found.maps.value, found.cues.value, found.object_.value.crop
-    by = round(mask.shape[0] / found.radiance.value.value.shape[1])
+        found = path(capture, supplied, Config(), MemoryCache(until="infer"))
+    maps, cues, (x0, y0, x1, y1) = found.maps, found.cues, found.object_.crop
+    by = round(mask.shape[0] / found.radiance.value.shape[1])
     error = np.full(mask[::by, ::by].shape, _MISSED_DEG)
     there = truth[::by, ::by][y0:y1, x0:x1]
     cosine = np.clip((maps.normal * there).sum(-1), -1, 1)

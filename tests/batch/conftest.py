@@ -1,5 +1,6 @@
 """Two small captures and a broken one, below one folder."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -21,4 +22,6 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (root / "broken" / angle).mkdir(parents=True)
         whole = next((root / "obj0" / angle).iterdir())
         (root / "broken" / angle / whole.name).write_bytes(whole.read_bytes()[:2000])
+    for file in root.rglob("*.*"):  # as photographs that were taken a while ago
+        os.utime(file, (1e9, 1e9))
     return root

@@ -81,7 +81,7 @@ def test_changed_setting_is_done_again(captures: Path, finished: Path) -> None:
     units = [unit for unit in batch.find(captures, finished) if unit.name == "obj0"]
     order = one.Order({"hdr": {}})
     assert one.finished(units[0], order) is None
-    assert one.stamp(units[0], order) != one.stamp(units[0], one.Order({"hdr": {"clip": 0.9}}))
+    assert one.request(units[0], order) != one.request(units[0], one.Order({"hdr": {"clip": 0.9}}))
 
 
 def test_status_tells_every_capture(finished: Path, polcap: Command) -> None:

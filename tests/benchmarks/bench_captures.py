@@ -8,7 +8,6 @@ interface; with --rough, S1 and S2 are scaled to what the facets of each pixel's
 
 import argparse
 import json
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,12 +15,14 @@ import cv2
 import numpy as np
 
 from polcap.config import Config
+from polcap.formats import onnx
 from polcap.formats.capture import reader as captures
 from polcap.images import Capture, Floats, Network
 from polcap.optics import body, frames, fresnel
 from polcap.pipeline import models
-from polcap.pipeline.cache import Store
-from polcap.pipeline.path import Results, UserInput, distance_m, path
+from polcap.pipeline.cache import MemoryCache
+from polcap.pipeline.path import UserInput, distance_m, path
+from polcap.results import Results
 from polcap.stages import cues, infer, surface
 
 COLUMNS = (
@@ -52,37 +53,36 @@ def measure(truth_file: Path, network: Network | None, rough: bool) -> list[floa
     told = json.loads(truth_file.read_text())
     meta = json.loads(Path(stem + ".meta.json").read_text())
     capture = captures.read(Path(stem), None)
-    with tempfile.TemporaryDirectory() as out:
-        supplied = UserInput(network=network, mask_network=models.load_mask_network(2))
-        found = path(capture, supplied, Config(), Store(Path(out)))
-        with np.load(stem + ".truth.npz") as maps:
-            errors = surface_errors(found, dict(maps), network, rough)
-        return [*errors[:2], *capture_errors(found, capture, told, meta), *errors[2:]]
+    supplied = UserInput(network=network, mask_network=models.load_mask_network(2))
+    found = path(capture, supplied, Config(), MemoryCache(until="surface"))
+    with np.load(stem + ".truth.npz") as maps:
+        errors = surface_errors(found, dict(maps), network, rough)
+    return [*errors[:2], *capture_errors(found, capture, told, meta), *errors[2:]]
 
 
 def capture_errors(found: Results, capture: Capture, told: dict, meta: dict) -> list[float]:  # type: ignore[type-arg]
     """Chart centres and alignment [RAW px, worst], gains and bracket ratios [%, worst]."""
     centers = (np.array(meta["chart"]["patch_corners_px"]) - 1).mean(1) / 2  # their pixel centres lie at .5
-    assert found.color.value.quads is not None
-    chart = 2 * np.linalg.norm(found.color.value.quads.mean(1) - centers, axis=1).max()
+    assert found.color.quads is not None
+    chart = 2 * np.linalg.norm(found.color.quads.mean(1) - centers, axis=1).max()
 
     files = {shot["file"].split("/", 1)[1]: shot for shot in told["shots"]}
     frames = [
         [files[str(Path(frame.path).relative_to(capture.folder))] for frame in shot.frames] for shot in capture.shots
     ]
     exposure = np.array([[f["relative_exposure"] * f["flash_factor"] for f in shot] for shot in frames])
-    ratio = found.radiance.value.exposure_ratio.mean(-1)
+    ratio = found.radiance.bracket.exposure_ratio.mean(-1)
     reference = int(np.abs(ratio[0] - 1).argmin())
     flash = np.array([shot[reference]["flash_factor"] for shot in frames])
-    gain = found.gains.value.gain.mean(1) / (flash / flash[0]) - 1
+    gain = found.selfcal.gains.gain.mean(1) / (flash / flash[0]) - 1
     ratios = ratio / (exposure / exposure[:, [reference]]) - 1
 
-    rows, columns = np.nonzero(found.object_.value.mask)
+    rows, columns = np.nonzero(found.object_.mask)
     at = np.stack([columns, rows, np.ones(len(rows))])
     grid = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1.0]])  # binned px → RAW px
     half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # RAW px with centres on whole numbers → at .5
     worst = 0.0
-    for shot, transform in zip(frames, found.alignment.value.transform):
+    for shot, transform in zip(frames, found.alignment.transform):
         true = np.vstack([shot[0]["affine_ref_to_shot"], [0, 0, 1]])
         expected = np.linalg.inv(grid) @ np.linalg.inv(half) @ true @ half @ grid @ at
         seen = transform @ at
@@ -92,7 +92,7 @@ def capture_errors(found: Results, capture: Capture, told: dict, meta: dict) -> 
 
 def surface_errors(found: Results, truth: dict[str, Floats], network: Network | None, rough: bool) -> list[float]:
     """Normal mean and median [degrees], RMSE of diffuse, roughness and F0, of depth [share of its range]."""
-    x0, y0, x1, y1 = found.object_.value.crop
+    x0, y0, x1, y1 = found.object_.crop
     crop = np.s_[y0:y1, x0:x1]
 
     def binned(image: Floats) -> Floats:
@@ -103,14 +103,14 @@ def surface_errors(found: Results, truth: dict[str, Floats], network: Network | 
 
     normal = binned(truth["normal"])
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
-    maps, depth = found.maps.value, found.mesh.value.depth
+    maps, depth = found.maps, found.mesh.depth
     if rough:
-        share = kept(normal, binned(truth["alpha"]), binned(truth["ior"]), found.cues.value.rays)
-        parts = found.stokes.value.stokes.copy()
+        share = kept(normal, binned(truth["alpha"]), binned(truth["ior"]), found.cues.rays)
+        parts = found.stokes.stokes.copy()
         parts[1:] *= np.where(binned(truth["mask"]) > 0, share, 1)[..., None]
-        seen = cues.compute(replace(found.stokes.value, stokes=parts), found.color.value)
-        maps = infer.estimate(seen, network, Config().infer)
-        depth = surface.integrate(maps, distance_m(found.color.value, found.radiance.value), Config().surface).depth
+        seen = cues.compute(replace(found.stokes, stokes=parts), found.color)
+        maps = infer.estimate(seen, network, onnx.run, Config().infer)
+        depth = surface.integrate(maps, distance_m(found.color, found.radiance), Config().surface).depth
     inside = (binned(truth["mask"]) == 1) & maps.mask
     angle = np.degrees(np.arccos(np.clip((normal * maps.normal).sum(-1), -1, 1)))[inside]
     ior = np.maximum(binned(truth["ior"]), 1)

@@ -19,10 +19,11 @@ import cv2
 import numpy as np
 
 from polcap.config import Config
+from polcap.formats import onnx
 from polcap.images import Floats, Network
 from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
-from polcap.pipeline.path import Results
+from polcap.results import Results
 from polcap.stages import align, infer, selfcal
 from polcap.stages.infer import analytic, body_law, half_turns, learned
 from polcap.stages.selfcal import object_gains
@@ -114,11 +115,11 @@ class Judge:
     """The true normals on the crop of the maps."""
 
     def __init__(self, results: Results, truth: Path) -> None:
-        self.cues = results.cues.value
-        x0, y0, x1, y1 = results.object_.value.crop
+        self.cues = results.cues
+        x0, y0, x1, y1 = results.object_.crop
         with np.load(truth) as maps:
             normal, mask = maps["normal"].astype(np.float32), maps["mask"].astype(np.float32)
-        height, width = results.radiance.value.value.shape[1:3]
+        height, width = results.radiance.value.shape[1:3]
         grid = [cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) for image in (normal, mask)]
         self.normal, inside = grid[0][y0:y1, x0:x1], grid[1][y0:y1, x0:x1]
         self.normal = self.normal / np.maximum(np.linalg.norm(self.normal, axis=-1, keepdims=True), 1e-6)
@@ -137,14 +138,14 @@ class Normals:
         self.judge, self.network = judge, network
 
     def __call__(self) -> float:
-        return self.judge.error(infer.estimate(self.judge.cues, self.network, Config().infer).normal)
+        return self.judge.error(infer.estimate(self.judge.cues, self.network, onnx.run, Config().infer).normal)
 
 
 class Moved:
     """How far the corners of the shots move against the registration as it is, px."""
 
     def __init__(self, results: Results) -> None:
-        self.radiance, self.color = results.radiance.value, results.color.value
+        self.radiance, self.color = results.radiance, results.color
         height, width = self.radiance.value.shape[1:3]
         self.corners = np.array([[0, width, 0, width], [0, 0, height, height], [1, 1, 1, 1]], np.float64)
         self.usual = self.places()
@@ -168,12 +169,12 @@ class Gained:
     def gains(self) -> Floats:
         """(K, 3)."""
         return selfcal.solve(
-            self.results.radiance.value,
-            self.results.alignment.value,
-            self.results.object_.value,
-            replace(self.results.color.value, quads=None),
+            self.results.radiance,
+            self.results.alignment,
+            self.results.object_,
+            replace(self.results.color, quads=None),
             Config().selfcal,
-        ).gain
+        ).gains.gain
 
     def __call__(self) -> float:
         return float(100 * np.abs(self.gains() / self.usual - 1).max())

@@ -22,8 +22,9 @@ from polcap.config import Config
 from polcap.formats.capture import reader as captures
 from polcap.images import Capture, ChartRequest, Floats, Network, Quality
 from polcap.pipeline import models
-from polcap.pipeline.cache import Store
-from polcap.pipeline.path import Results, UserInput, path
+from polcap.pipeline.cache import MemoryCache
+from polcap.pipeline.path import UserInput, path
+from polcap.results import Results
 from polcap.synth import scenes, shooting
 
 NAMES = ("clipped", "without", "with", "gloss without", "gloss with", "elsewhere without", "elsewhere with")
@@ -58,13 +59,13 @@ def measure(place: Path, seed: int, width: int, network: Network | None, chart: 
     capture = captures.read(place / "capture", None)
     alike = replace(capture, crossed=None), capture
     both = [solved(one, place / str(k), network, chart) for k, one in enumerate(alike)]
-    without, with_it = (found.maps.value for found in both)
-    x0, y0, x1, y1 = both[1].object_.value.crop
+    without, with_it = (found.maps for found in both)
+    x0, y0, x1, y1 = both[1].object_.crop
     with np.load(place / "capture" / "truth.npz") as truth:
         albedo, inside = (_binned(truth[k].astype(np.float32)) for k in ("diffuse", "mask"))
     albedo, inside = albedo[y0:y1, x0:x1], (inside[y0:y1, x0:x1] == 1) & with_it.mask & without.mask
-    clipped = inside & ((both[1].stokes.value.quality & int(Quality.CLIPPED)) > 0)
-    cues = both[1].cues.value
+    clipped = inside & ((both[1].stokes.quality & int(Quality.CLIPPED)) > 0)
+    cues = both[1].cues
     assert cues.body is not None
     glossy = inside & ((cues.body.sum(-1) < 0.9 * cues.radiance.sum(-1)) | clipped)
     areas = [(maps, area) for area in (clipped, glossy, inside & ~glossy) for maps in (without, with_it)]
@@ -78,7 +79,7 @@ def solved(capture: Capture, out: Path, network: Network | None, chart: str) -> 
     """The path's results."""
     request = ChartRequest("none" if chart == "none" else "auto")
     supplied = UserInput(chart=request, network=network, mask_network=models.load_mask_network(1))
-    return path(capture, supplied, Config(), Store(out))
+    return path(capture, supplied, Config(), MemoryCache(until="infer"))
 
 
 def _binned(image: Floats) -> Floats:

@@ -10,7 +10,6 @@ over the pixels that both know, and the loss, which is to stay below 1.5° on av
 
 import argparse
 import os
-import tempfile
 from pathlib import Path
 from typing import get_args
 
@@ -19,10 +18,11 @@ import msgspec
 import numpy as np
 
 from polcap.config import Config
+from polcap.formats import onnx
 from polcap.formats.capture import reader as captures
 from polcap.images import ColorCalibration, Floats, Network, StokesImage
 from polcap.pipeline import models
-from polcap.pipeline.cache import Store
+from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
 from polcap.stages import cues, infer
 from polcap.synth import scenes
@@ -68,28 +68,27 @@ def make(folder: Path, data: Path, number: int, width: int) -> Path:
 
 def measure(place: Path, network: Network | None) -> list[float]:
     """Mean normal error [degrees] through the path and from noise-free cues, and their difference."""
-    with tempfile.TemporaryDirectory() as out:
-        supplied = UserInput(network=network, mask_network=models.load_mask_network(2))
-        found = path(captures.read(place, None), supplied, Config(), Store(Path(out)))
-        x0, y0, x1, y1 = found.object_.value.crop
-        measured, maps = found.stokes.value, found.maps.value
-        with np.load(place / "truth.npz") as truth:
-            normal, stokes, mask = (_binned(truth[k].astype(np.float32)) for k in ("normal", "S", "mask"))
-        crop = np.s_[..., y0:y1, x0:x1, :]
-        normal, stokes, inside = normal[crop], stokes[crop], mask[..., None][crop][..., 0] == 1
-        clean = StokesImage(
-            stokes,
-            np.full((6, *stokes.shape[1:]), 1e-14, np.float32),
-            0 * measured.quality,
-            inside,
-            measured.view,
-            None,
-        )
-        white = ColorCalibration(np.eye(3, dtype=np.float32), None, None, None, "profile", 0.0, None)
-        ideal = infer.estimate(cues.compute(clean, white), network, Config().infer)
-        both = inside & maps.mask
-        normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
-        errors = [_angle(normal, one.normal)[both].mean() for one in (maps, ideal)]
+    supplied = UserInput(network=network, mask_network=models.load_mask_network(2))
+    found = path(captures.read(place, None), supplied, Config(), MemoryCache(until="infer"))
+    x0, y0, x1, y1 = found.object_.crop
+    measured, maps = found.stokes, found.maps
+    with np.load(place / "truth.npz") as truth:
+        normal, stokes, mask = (_binned(truth[k].astype(np.float32)) for k in ("normal", "S", "mask"))
+    crop = np.s_[..., y0:y1, x0:x1, :]
+    normal, stokes, inside = normal[crop], stokes[crop], mask[..., None][crop][..., 0] == 1
+    clean = StokesImage(
+        stokes,
+        np.full((6, *stokes.shape[1:]), 1e-14, np.float32),
+        0 * measured.quality,
+        inside,
+        measured.view,
+        None,
+    )
+    white = ColorCalibration(np.eye(3, dtype=np.float32), None, None, None, "profile", 0.0, None)
+    ideal = infer.estimate(cues.compute(clean, white), network, onnx.run, Config().infer)
+    both = inside & maps.mask
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+    errors = [_angle(normal, one.normal)[both].mean() for one in (maps, ideal)]
     return [float(errors[0]), float(errors[1]), float(errors[0] - errors[1])]
 
 

@@ -2,10 +2,10 @@
 
 python tests/benchmarks/bench_export.py FOLDER [SIDE]     (usd-core for `archive`)
 
-Makes a result folder with maps of SIDE² pixels (2048), a ball with two paints, and exports every preset twice:
-`first` from the maps alone, so it builds mesh and textures, too; `again` beside the GLB that `polcap process` wrote,
-without its work/. `alone` encodes the pictures of the preset, each once, and its layered EXR. CPU seconds of all
-threads together and of the child that reads files, its start included; the least of three rounds.
+Makes a result folder with maps of SIDE² pixels (2048), a ball with two paints, and exports every preset.
+`export` builds mesh and textures from the maps, too. `alone` encodes the pictures of the preset, each once, and its
+layered EXR. CPU seconds of all threads together and of the child that reads files, its start included; the least of
+three rounds.
 """
 
 import resource
@@ -26,35 +26,29 @@ from polcap.formats.export.presets import PRESETS, Preset
 from polcap.formats.maps import maps_folder
 from polcap.formats.raw import worker
 from polcap.images import Asset, Cues, Floats, Mesh, StokesImage, SurfaceMaps, View
-from polcap.pipeline import asset_export
-from polcap.pipeline.asset_export import Wanted
+from polcap.pipeline import run as pipeline
+from polcap.pipeline.asset_export import ExportRequest
 from polcap.stages import asset, surface
 from tests import surfaces
-from tests.surfaces import Known
 
 
 def main(folder: Path, side: int) -> None:
-    about = result(folder, side)
+    result(folder, side)
     stored = maps_folder.read(folder / "maps")
-    mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, surface.Settings())
-    built = asset.build(stored.maps, mesh, asset.Settings())
-    print(f"{'preset':10}{'alone s':>10}{'first s':>10}{'ratio':>8}{'again s':>10}{'ratio':>8}{'MB':>8}")
+    mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, surface.SurfaceSettings())
+    built = asset.build(stored.maps, mesh, asset.AssetSettings())
+    print(f"{'preset':10}{'alone s':>10}{'export s':>10}{'ratio':>8}{'MB':>8}")
     for name in PRESETS:
-        encode, first, again = (min(times) for times in zip(*(thrice(folder, about, built, name) for _ in range(3))))
+        encode, whole = (min(times) for times in zip(*(both(folder, built, name) for _ in range(3))))
         size = sum(file.stat().st_size for file in (folder / "asset" / name).iterdir()) / 1e6
-        figures = f"{encode:10.2f}{first:10.2f}{first / encode:8.2f}{again:10.2f}{again / encode:8.2f}{size:8.1f}"
-        print(f"{name:10}{figures}", flush=True)
+        print(f"{name:10}{encode:10.2f}{whole:10.2f}{whole / encode:8.2f}{size:8.1f}", flush=True)
 
 
-def thrice(folder: Path, about: dict[str, object], built: Asset, name: str) -> tuple[float, float, float]:
-    """Seconds of the encoding alone, of an export from the maps and of one beside an asset."""
+def both(folder: Path, built: Asset, name: str) -> tuple[float, float]:
+    """Seconds of the encoding alone, and of an export from the maps."""
     encode = seconds(lambda: alone(folder, built, PRESETS[name]))
     shutil.rmtree(folder / "asset", ignore_errors=True)
-    first = seconds(lambda: asset_export.export(folder, about, Wanted(preset=name)))
-    shutil.rmtree(folder / "asset")
-    asset_export.export(folder, about, Wanted())
-    again = seconds(lambda: asset_export.export(folder, about, Wanted(preset=name)))
-    return encode, first, again
+    return encode, seconds(lambda: pipeline.export(folder, ExportRequest(preset=name)))
 
 
 def seconds(work: Callable[[], object]) -> float:
@@ -137,7 +131,7 @@ def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, noise: Floats) -> None:
         quality=np.zeros(size, np.uint8),
         view=maps.view,
     )
-    maps_folder.write(folder / "maps", Known(maps), Known(mesh), Known(stokes), Known(cues))
+    maps_folder.write(folder / "maps", maps, mesh, stokes, cues)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from polcap.formats.capture import reader as captures
 from polcap.images import SurfaceMaps
 from polcap.optics.frames import dot
 from polcap.pipeline import models
-from polcap.pipeline.cache import Store
+from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, distance_m, path
 from polcap.stages import surface
 from polcap.synth import render, scenes, shooting
@@ -81,9 +81,9 @@ def measured(folder: Path, size: str, kind: str, seed: int) -> dict[str, Any]:
     shooting.write(folder, scene, msgspec.structs.replace(SHOOTS[size], seed=seed))
     network, mask_network = models.shipped()
     supplied = UserInput(network=network, mask_network=mask_network)
-    found = path(captures.read(folder, None), supplied, Config(), Store(folder / "out"))
-    maps, mesh, distance = found.maps.value, found.mesh.value, distance_m(found.color.value, found.radiance.value)
-    plain = surface.integrate(maps, distance, surface.Settings(stiffness=0.0))
+    found = path(captures.read(folder, None), supplied, Config(), MemoryCache(until="surface"))
+    maps, mesh, distance = found.maps, found.mesh, distance_m(found.color, found.radiance)
+    plain = surface.integrate(maps, distance, surface.SurfaceSettings(stiffness=0.0))
     of, normal = truth(scene, maps)
     if keep := os.environ.get("POLCAP_KEEP_MAPS"):
         save(Path(keep) / f"{size}_{kind.replace('/', '_')}_{seed}.npz", maps, of)

@@ -1,15 +1,12 @@
 """The promises of the stage cache, on toy stages."""
 
 import gc
-import linecache
 import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FunctionType
@@ -22,7 +19,16 @@ import pytest
 from polcap import images
 from polcap.errors import StorageError
 from polcap.formats.npy_folder import checksum, decode, encode, save
-from polcap.pipeline.cache import Archive, Store, contents
+from polcap.pipeline import result_folder
+from polcap.pipeline.cache import (
+    ArchiveCache,
+    DryRunCache,
+    MemoryCache,
+    StageCache,
+    StageReached,
+    StageResult,
+    contents,
+)
 from polcap.stages import Stage, stage
 
 
@@ -98,11 +104,24 @@ def renamed(toy: Stage[..., Any], name: str) -> Stage[..., Any]:
 DOUBLE, PASSING, TOTAL = renamed(double, "double"), renamed(passing, "passing"), renamed(total, "total")
 
 
-def path(store: Store, value: float = 3.0, gain: float = 2.0) -> Any:
-    first = store.step(DOUBLE, value, config=Settings(gain))
-    second = store.step(PASSING, first)
-    scale = store.derive(lambda inner: inner.shift[0], first)
-    return first, second, store.step(TOTAL, second, scale)
+@dataclass(frozen=True)
+class Toys:
+    """The results of the toy path."""
+
+    double: StageResult[Inner]
+    passing: StageResult[Inner]
+    total: StageResult[Inner]
+
+
+def path(cache: MemoryCache, value: float = 3.0, gain: float = 2.0) -> Toys:
+    first = cache.run(DOUBLE, value, config=Settings(gain))
+    second = cache.run(PASSING, first)
+    scale = cache.derive(shift, first)
+    return Toys(first, second, cache.run(TOTAL, second, scale))
+
+
+def shift(inner: Inner) -> float:
+    return inner.shift[0]
 
 
 @pytest.fixture(autouse=True)
@@ -137,54 +156,88 @@ def test_every_kind_of_field_comes_back_as_it_went(tmp_path: Path) -> None:
 
 
 def test_values_with_functions_are_never_stored() -> None:
-    network = images.Network(lambda x: {}, "d", ("s1",), {}, "CPU")
-    with pytest.raises(TypeError, match="function cannot be kept"):
-        encode(network, "value", {})
+    with pytest.raises(TypeError, match="function cannot be stored"):
+        encode({"run": lambda x: {}}, "value", {})
 
 
-def test_second_run_computes_nothing(tmp_path: Path) -> None:
-    first = path(Store(tmp_path))[2].value
+def test_second_run_computes_only_what_is_never_stored(tmp_path: Path) -> None:
+    first = path(StageCache(tmp_path)).total.value
     assert calls == ["double", "passing", "total"]
     calls.clear()
-    second = path(Store(tmp_path))[2].value
-    assert calls == []
+    second = path(StageCache(tmp_path)).total.value
+    assert calls == ["passing"]
     np.testing.assert_array_equal(first.array, second.array)
 
 
-def test_results_are_read_only_the_first_time_and_the_second(tmp_path: Path) -> None:
+@pytest.mark.parametrize("in_memory", [True, False])
+def test_results_are_read_only_the_first_time_and_the_second(tmp_path: Path, in_memory: bool) -> None:
+    memory = MemoryCache()
     for _ in range(2):
-        first, second, _ = path(Store(tmp_path))
-        for kept in (first, second):
+        made = path(memory if in_memory else StageCache(tmp_path))
+        for result in (made.double, made.passing):
             with pytest.raises(ValueError, match="read-only"):
-                kept.value.array[0, 0] = 1
+                result.value.array[0, 0] = 1
 
 
-def test_declaring_the_path_computes_nothing_and_writes_nothing(tmp_path: Path) -> None:
-    steps = path(Store(tmp_path))
-    assert calls == [] and not any(kept.ready for kept in steps) and list(tmp_path.iterdir()) == []
+def test_a_cache_in_memory_computes_each_stage_once_and_writes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    cache = MemoryCache()
+    first, second = path(cache), path(cache)
+    assert calls == ["double", "passing", "total"] and first == second
+    path(cache, gain=3.0)
+    assert calls == 2 * ["double", "passing", "total"] and list(tmp_path.iterdir()) == []
 
 
-def test_until_stops_after_the_stage_and_computes_it_even_if_it_is_not_kept(tmp_path: Path) -> None:
-    store = Store(tmp_path)
-    path(store)
-    store.materialize(until="passing")
-    assert calls == ["double", "passing"]
+def test_the_path_ends_after_the_stage_at_which_it_was_to_stop(tmp_path: Path) -> None:
+    cache = StageCache(tmp_path, until="passing")
+    with pytest.raises(StageReached):
+        path(cache)
+    assert calls == ["double", "passing"] and list(cache.results) == ["double", "passing"]
+
+
+def test_a_dry_run_tells_each_state_and_computes_nothing(tmp_path: Path) -> None:
+    cache = DryRunCache(tmp_path)
+    path(cache)
+    assert cache.states == {"double": "compute", "passing": "on demand", "total": "compute"}
+    assert calls == [] and list(tmp_path.iterdir()) == []
+    path(StageCache(tmp_path))
+    calls.clear()
+    for force, states in (
+        (None, {"double": "cached", "passing": "on demand", "total": "cached"}),
+        ("total", {"double": "cached", "passing": "on demand", "total": "compute"}),
+    ):
+        cache = DryRunCache(tmp_path, force)
+        path(cache)
+        assert cache.states == states and calls == []
+
+
+def keys(toys: Toys) -> list[str]:
+    return [result.key for result in vars(toys).values()]
 
 
 def test_a_setting_changes_the_key_of_its_stage_and_of_all_after_it(tmp_path: Path) -> None:
-    path(Store(tmp_path))[2]
-    before, after = path(Store(tmp_path)), path(Store(tmp_path), gain=3.0)
-    assert all(a.key != b.key for a, b in zip(before, after, strict=True))
+    before, after = keys(path(DryRunCache(tmp_path))), keys(path(DryRunCache(tmp_path), gain=3.0))
+    assert all(a != b for a, b in zip(before, after, strict=True))
+
+
+def test_keys_are_the_same_with_every_cache(tmp_path: Path) -> None:
+    made = [keys(path(cache)) for cache in (DryRunCache(tmp_path), MemoryCache(), StageCache(tmp_path))]
+    made.append(keys(path(ArchiveCache(tmp_path), value=0.0)))  # of other photographs, as far as it knows
+    assert made[0] == made[1] == made[2] == made[3]
 
 
 def test_a_version_changes_the_key(tmp_path: Path) -> None:
     raised = Stage(DOUBLE.function, 2, True)
-    one, two = (Store(tmp_path).step(s, 3.0, config=Settings()) for s in (DOUBLE, raised))
+    one, two = (DryRunCache(tmp_path).run(s, 3.0, config=Settings()) for s in (DOUBLE, raised))
     assert one.key != two.key
+    first, second = (DryRunCache(tmp_path).derive(shift, one, version=version) for version in (1, 2))
+    assert first.key != second.key
 
 
 def test_key_follows_the_bytes_of_the_photographs_not_their_place(tmp_path: Path) -> None:
-    frame = images.Frame("/a/x.dng", images.Exif(), "shot", "digest", load=lambda: None)
+    frame = images.Frame("/a/x.dng", images.Exif(), "shot", "digest")
     capture = images.Capture(
         "a", "/a", (images.Shot(0.0, (frame,)),), "folders", 1.0, True, (0.0, 0.0), (2, 2), notes=("n",)
     )
@@ -192,27 +245,21 @@ def test_key_follows_the_bytes_of_the_photographs_not_their_place(tmp_path: Path
     moved = replace(capture, folder="/b", name="b", shots=(elsewhere,))
     other = replace(capture, shots=(images.Shot(0.0, (replace(frame, digest="other"),)),))
     turned = replace(capture, shots=(images.Shot(0.1, (frame,)),))
-    key = [Store(tmp_path).step(DOUBLE, c, config=Settings()).key for c in (capture, moved, other, turned)]
+    key = [DryRunCache(tmp_path).run(DOUBLE, c, config=Settings()).key for c in (capture, moved, other, turned)]
     assert key[0] == key[1] and len(set(key)) == 3
 
 
 def test_force_computes_the_stage_and_what_follows(tmp_path: Path) -> None:
-    path(Store(tmp_path))[2].materialize()
-    calls.clear()
-    store = Store(tmp_path, force="double")
-    path(store)
-    store.materialize()
-    assert calls == ["double", "passing", "total"]
-    calls.clear()
-    store = Store(tmp_path, force="total")
-    path(store)
-    store.materialize()
-    assert calls == ["passing", "total"]
+    path(StageCache(tmp_path))
+    for force, computed in (("double", ["double", "passing", "total"]), ("total", ["passing", "total"])):
+        calls.clear()
+        path(StageCache(tmp_path, force=force))
+        assert calls == computed
 
 
 @pytest.mark.parametrize("harm", ["flip", "truncate", "remove"])
 def test_damaged_result_is_noticed_and_computed_again(tmp_path: Path, harm: str) -> None:
-    path(Store(tmp_path))[0].materialize()
+    path(StageCache(tmp_path))
     file = tmp_path / "work" / "01-double" / "value.array.npy"
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 1
@@ -221,8 +268,8 @@ def test_damaged_result_is_noticed_and_computed_again(tmp_path: Path, harm: str)
     else:
         file.write_bytes(data if harm == "flip" else data[:100])
     calls.clear()
-    assert float(path(Store(tmp_path))[0].value.array[0, 0]) == 6.0
-    assert calls == ["double"]
+    assert float(path(StageCache(tmp_path)).double.value.array[0, 0]) == 6.0
+    assert calls == ["double", "passing"]
 
 
 def edited(file: Path, old: str, new: str) -> None:
@@ -243,14 +290,14 @@ def edited(file: Path, old: str, new: str) -> None:
     ],
 )
 def test_an_edited_manifest_is_noticed_and_computed_again(tmp_path: Path, old: str, new: str) -> None:
-    path(Store(tmp_path))[0].materialize()
+    path(StageCache(tmp_path))
     place = tmp_path / "work" / "01-double"
     edited(place / "manifest.json", old, new)
     with pytest.raises(StorageError, match=r"run `polcap process`"):
-        _ = path(Archive(tmp_path))[0].value
+        path(ArchiveCache(tmp_path))
     calls.clear()
-    assert path(Store(tmp_path))[0].value.shift == (3.0, 0.0)
-    assert calls == ["double"]
+    assert path(StageCache(tmp_path)).double.value.shift == (3.0, 0.0)
+    assert calls == ["double", "passing"]
 
 
 @pytest.mark.parametrize(
@@ -271,25 +318,12 @@ def test_a_tree_of_another_form_is_refused(tmp_path: Path, tree: Any) -> None:
         decode(tree, Inner, tmp_path)
 
 
-def test_an_edited_function_changes_the_key_of_what_it_derives(tmp_path: Path) -> None:
-    source, keys = "def half(inner):\n    return inner.shift[0] / {}\n", []
-    for divisor in (2, 2, 3):
-        file = tmp_path / "toy.py"
-        file.write_text(source.format(divisor), encoding="utf-8")
-        linecache.clearcache()
-        names: dict[str, Any] = {}
-        exec(compile(file.read_text(encoding="utf-8"), str(file), "exec"), names)
-        store = Store(tmp_path)
-        keys.append(store.derive(names["half"], store.step(DOUBLE, 3.0, config=Settings())).key)
-    assert keys[0] == keys[1] != keys[2]
-
-
-def test_a_store_that_is_done_with_leaves_no_memory_map_behind(tmp_path: Path) -> None:
+def test_a_cache_that_is_done_with_leaves_no_memory_map_behind(tmp_path: Path) -> None:
     gc.collect()
     gc.disable()  # what is freed here is freed at once
     try:
         for _ in range(5):
-            path(Store(tmp_path))[0].value  # noqa: B018
+            path(StageCache(tmp_path))
         assert not any(str(tmp_path) in str(o.filename) for o in gc.get_objects() if isinstance(o, np.memmap))
     finally:
         gc.enable()
@@ -297,18 +331,18 @@ def test_a_store_that_is_done_with_leaves_no_memory_map_behind(tmp_path: Path) -
 
 def test_two_processes_never_work_in_one_folder(tmp_path: Path) -> None:
     code = (
-        "import sys, time; from pathlib import Path; from polcap.pipeline.cache import Store\n"
-        "with Store(Path(sys.argv[1])).lock(): print('held', flush=True); time.sleep(600)"
+        "import sys, time; from pathlib import Path; from polcap.pipeline import result_folder\n"
+        "with result_folder.locked(Path(sys.argv[1])): print('held', flush=True); time.sleep(600)"
     )
     other = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE)
     try:
         assert other.stdout is not None and other.stdout.readline() == b"held\n"
-        with pytest.raises(StorageError, match=f"process {other.pid} is working"), Store(tmp_path).lock():
+        with pytest.raises(StorageError, match=f"process {other.pid} is working"), result_folder.locked(tmp_path):
             pass
     finally:
         other.kill()
         other.wait()
-    with Store(tmp_path).lock():  # of a dead process: taken over
+    with result_folder.locked(tmp_path):  # of a dead process: taken over
         pass
 
 
@@ -316,21 +350,17 @@ KILLED = """
 import sys, time
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from test_cache import Store, path
-store = Store(Path(sys.argv[1]))
+from test_cache import StageCache, path, result_folder
+cache = StageCache(Path(sys.argv[1]))
 print("ready", flush=True)
-with store.lock():
-    path(store)
-    store.materialize()
+with result_folder.locked(Path(sys.argv[1])):
+    path(cache)
 """
 
 
 def test_killed_stage_leaves_no_half_result_and_resumes_to_the_same_bytes(tmp_path: Path) -> None:
     whole = tmp_path / "whole"
-    store = Store(whole)
-    with store.lock():
-        path(store)
-        store.materialize()
+    path(StageCache(whole))
     random = np.random.default_rng(1)
     for attempt in range(6):
         folder = tmp_path / f"killed{attempt}"
@@ -343,10 +373,8 @@ def test_killed_stage_leaves_no_half_result_and_resumes_to_the_same_bytes(tmp_pa
         for about in contents(folder):  # whatever stands under a final name is whole
             place = folder / "work" / about["folder"]
             assert {f.name for f in place.iterdir()} == {*about["files"], "manifest.json"}
-        store = Store(folder)
-        with store.lock():
-            path(store)
-            store.materialize()
+        with result_folder.locked(folder):
+            path(StageCache(folder))
         assert snapshot(folder) == snapshot(whole)
 
 
@@ -359,7 +387,7 @@ def test_a_disk_that_refuses_is_one_clear_line(
 
     monkeypatch.setattr(Path, "open", refuse)
     with pytest.raises(StorageError, match=word) as caught:
-        path(Store(tmp_path))[0].materialize()
+        path(StageCache(tmp_path))
     assert "\n" not in str(caught.value)
     assert list((tmp_path / "work").iterdir()) == []
 
@@ -378,50 +406,3 @@ def test_an_alias_of_an_array_type_is_read_as_the_array(tmp_path: Path) -> None:
     hint = types.GenericAlias(Alias, (float,))
     assert get_origin(hint) is Alias
     assert np.array_equal(npy_folder.decode({"array": "value.npy"}, hint, tmp_path), np.arange(3.0))
-
-
-@stage(version=1)
-def painted(value: float) -> Inner:
-    return Inner(np.full((600, 600), value, np.float32), np.full(3, value, np.float32), (value, 0.0))
-
-
-def test_facts_are_known_without_reading_the_pictures(tmp_path: Path) -> None:
-    Store(tmp_path).step(painted, 2.0).materialize()
-    (file,) = tmp_path.glob("work/*/value.array.npy")
-    file.write_bytes(file.read_bytes()[:-4] + b"\0\0\0\0")  # damage that nobody who reads facts alone can see
-    again = Store(tmp_path).step(painted, 2.0)
-    facts = again.facts
-    assert facts.shift == (2.0, 0.0) and np.array_equal(facts.maybe, np.full(3, 2.0))
-    assert facts.array.shape == (600, 600)
-    with pytest.raises(TypeError, match="not read"):
-        np.asarray(facts.array)
-    assert (again.value.array == 2).all()  # damaged, and so made anew
-
-
-def test_facts_of_what_is_not_stored_are_the_value(tmp_path: Path) -> None:
-    step = Store(tmp_path).step(painted, 2.0)
-    assert step.facts is step.value
-
-
-ASKED = threading.Event()
-
-
-def slow(value: float) -> float:
-    calls.append("slow")
-    assert ASKED.wait(60)
-    return value
-
-
-def quick(value: float) -> float:
-    ASKED.set()
-    return value
-
-
-def test_one_result_does_not_wait_for_another_and_is_made_once(tmp_path: Path) -> None:
-    store = Store(tmp_path)
-    first, second = store.derive(slow, 2.0), store.derive(quick, 3.0)
-    with ThreadPoolExecutor(3) as pool:
-        waiting = [pool.submit(getattr, first, "value") for _ in range(2)]
-        assert pool.submit(getattr, second, "value").result(60) == 3.0
-        assert [one.result(60) for one in waiting] == [2.0, 2.0]
-    assert calls == ["slow"]

@@ -6,7 +6,6 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +13,7 @@ import pytest
 
 from polcap.formats.export import encoders
 from polcap.formats.export.presets import PRESETS
-from polcap.formats.maps import exr, png
+from polcap.formats.maps import png
 from tests.conftest import ROOT, Command, shell
 from tests.formats.export.test_gltf import NODE, document
 
@@ -23,13 +22,13 @@ from tests.formats.export.test_gltf import NODE, document
 def exported(result: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The bundled capture's result with every preset exported."""
     from polcap.pipeline import run as pipeline
-    from polcap.pipeline.asset_export import Wanted
+    from polcap.pipeline.asset_export import ExportRequest
 
     pytest.importorskip("pxr", reason="needs usd-core")
     copy = tmp_path_factory.mktemp("export") / "copy"
     shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
     for preset in PRESETS:
-        pipeline.export(copy, Wanted(preset=preset))
+        pipeline.export(copy, ExportRequest(preset=preset))
     return copy
 
 
@@ -72,14 +71,14 @@ def test_unreal_gets_green_down_and_unity_smoothness(exported: Path) -> None:
 
 def test_an_asset_and_the_textures_beside_it_are_spelled_alike(result: Path, tmp_path: Path) -> None:
     from polcap.pipeline import run as pipeline
-    from polcap.pipeline.asset_export import Wanted
+    from polcap.pipeline.asset_export import ExportRequest
 
     copy = tmp_path / "copy"
     shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work", "asset"))
     about = json.loads((copy / "report.json").read_text())
     about["capture"]["name"] = "blue jug 7"
     (copy / "report.json").write_text(json.dumps(about))
-    named = {file.name for file in pipeline.export(copy, Wanted(preset="unreal", texture_size=64))}
+    named = {file.name for file in pipeline.export(copy, ExportRequest(preset="unreal", texture_size=64))}
     assert {"SM_blue_jug_7.glb", "T_blue_jug_7_N.png"} <= named and not any(" " in name for name in named)
 
 
@@ -121,76 +120,12 @@ def own(result: Path, tmp_path: Path) -> Path:
     return copy
 
 
-@pytest.fixture
-def building(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Grows by one whenever an export builds a mesh."""
-    from polcap.stages import surface
-
-    triangulate, built = surface.triangulate, []
-
-    def counted(*of: Any) -> Any:
-        built.append(of)
-        return triangulate(*of)
-
-    monkeypatch.setattr(surface, "triangulate", counted)
-    return built
-
-
-def test_export_beside_the_asset_builds_nothing_and_gives_the_bytes_of_one_from_the_maps(
-    result: Path, tmp_path: Path, building: list[Any]
-) -> None:
-    from polcap.pipeline import run as pipeline
-    from polcap.pipeline.asset_export import Wanted
-
-    beside, alone = tmp_path / "beside", tmp_path / "alone"
-    for copy, left in ((beside, ("work",)), (alone, ("work", "asset"))):
-        shutil.copytree(result, copy, ignore=shutil.ignore_patterns(*left))
-    wanted = [Wanted(("gltf", "obj")), Wanted(preset="unreal"), Wanted(preset="web", lod=1)]
-    for one in wanted:
-        pipeline.export(beside, one)
-    assert not building
-    shutil.rmtree(alone / "asset", ignore_errors=True)
-    for one in wanted:
-        pipeline.export(alone, one)
-        shutil.move(alone / "asset", tmp_path / f"kept{len(building)}")
-    assert len(building) == len(wanted)
-    kept = {
-        file.relative_to(folder): file.read_bytes() for folder in tmp_path.glob("kept*") for file in folder.rglob("*.*")
-    }
-    assert kept == {file.relative_to(beside / "asset"): file.read_bytes() for file in (beside / "asset").rglob("*.*")}
-
-
-@pytest.mark.parametrize("touched", ["map", "asset", "sidecar", "size"])
-def test_asset_is_built_anew_once_something_else_stands_there(
-    result: Path, tmp_path: Path, building: list[Any], touched: str
-) -> None:
-    from polcap.pipeline import run as pipeline
-    from polcap.pipeline.asset_export import Wanted
-
-    copy = tmp_path / "copy"
-    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
-    glb, sidecar = copy / "asset" / "capture.glb", copy / "asset" / "capture.provenance.json"
-    before = glb.read_bytes()
-    if touched == "map":
-        rough, _ = exr.read(copy / "maps" / "roughness.exr")
-        exr.write(copy / "maps" / "roughness.exr", {"Y": rough["Y"] / 2}, half=True)
-    elif touched == "asset":
-        glb.write_bytes(before[:-1] + bytes([before[-1] ^ 1]))
-    elif touched == "sidecar":
-        sidecar.write_text("[]")
-    else:
-        pipeline.export(copy, Wanted(("gltf",), texture_size=128))
-        assert not building and json.loads(sidecar.read_text())["made_from"] is None
-    pipeline.export(copy, Wanted(("gltf",)))
-    assert len(building) == 1 and (glb.read_bytes() == before) == (touched != "map")
-
-
 @pytest.mark.parametrize(
     ("flags", "says"),
     [
         (["--preset", "maya"], f"'maya' is not one of {', '.join(map(repr, PRESETS))}"),
         (["--preset", "web", "--obj"], "leave out --obj"),
-        (["--exr", "--color", "ACEScq"], "--color ACEScq is no colour space or role"),
+        (["--exr", "--color", "ACEScq"], "--color ACEScq is not a color space or role"),
     ],
 )
 def test_what_does_not_exist_is_one_line(own: Path, polcap: Command, flags: list[str], says: str) -> None:
@@ -262,11 +197,11 @@ def test_number_of_threads_changes_no_byte(example: Path, tmp_path: Path) -> Non
 
 def test_texture_size_and_levels_of_detail(result: Path, tmp_path: Path) -> None:
     from polcap.pipeline import run as pipeline
-    from polcap.pipeline.asset_export import Wanted
+    from polcap.pipeline.asset_export import ExportRequest
 
     copy = tmp_path / "copy"
     shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
-    pipeline.export(copy, Wanted(formats=("gltf",), texture_size=128, lod=2))
+    pipeline.export(copy, ExportRequest(formats=("gltf",), texture_size=128, lod=2))
     levels = json.loads((copy / "maps" / "maps.json").read_text())["exports"]["asset"]["lods"]
     counts = []
     for name, told in levels.items():

@@ -1,4 +1,4 @@
-"""A run that has nothing to do is told by sizes and times, and by nothing less."""
+"""A run that has nothing to do is recognized by sizes and times of all files, and by nothing less."""
 
 import os
 import shutil
@@ -29,50 +29,52 @@ def _settled(file: Path, text: str, age: int = 0) -> None:
     os.utime(file, ns=(OLD_NS + age, OLD_NS + age))
 
 
-def test_same_request_has_the_same_fingerprint_and_any_other_has_not(capture: Path) -> None:
+def test_same_request_has_the_same_digest_and_any_other_has_not(capture: Path) -> None:
     out = capture / "polcap"
-    first = unchanged.fingerprint(ASKED, capture, out, ())
-    assert first is not None and first == unchanged.fingerprint(ASKED, capture, out, ())
+    first = unchanged.request(ASKED, capture, out, ())
+    assert first is not None and first == unchanged.request(ASKED, capture, out, ())
     out.mkdir()
     (out / "maps").write_text("the result is no photograph")
-    assert first == unchanged.fingerprint(ASKED, capture, out, ())
-    assert first != unchanged.fingerprint({"angles": "0,45,90"}, capture, out, ())
-    assert first != unchanged.fingerprint(ASKED, capture, out.with_name("other"), ())
-    assert first != unchanged.fingerprint(ASKED, capture, out, [capture / "a.dng"])
+    (capture / "polcap-batch").mkdir()
+    (capture / "polcap-batch" / "summary.html").write_text("nor is the record of a batch")
+    assert first == unchanged.request(ASKED, capture, out, ())
+    assert first != unchanged.request({"angles": "0,45,90"}, capture, out, ())
+    assert first != unchanged.request(ASKED, capture, out.with_name("other"), ())
+    assert first != unchanged.request(ASKED, capture, out, [capture / "a.dng"])
     _settled(capture / "b.dng", "b")
-    added = unchanged.fingerprint(ASKED, capture, out, ())
+    added = unchanged.request(ASKED, capture, out, ())
     _settled(capture / "b.dng", "c", 1)  # as large as before
-    assert len({first, added, unchanged.fingerprint(ASKED, capture, out, ())}) == 3
+    assert len({first, added, unchanged.request(ASKED, capture, out, ())}) == 3
 
 
 def test_content_that_changed_under_its_old_time_is_seen(capture: Path) -> None:
     """Whoever sets a file's time back cannot set back when he did so."""
-    before = unchanged.fingerprint(ASKED, capture, capture / "polcap", ())
+    before = unchanged.request(ASKED, capture, capture / "polcap", ())
     _settled(capture / "new", "b")
     os.replace(capture / "new", capture / "a.dng")
-    assert before != unchanged.fingerprint(ASKED, capture, capture / "polcap", ())
+    assert before != unchanged.request(ASKED, capture, capture / "polcap", ())
 
 
 def test_what_has_just_changed_is_in_doubt(capture: Path) -> None:
     (capture / "a.dng").write_text("b")
-    assert unchanged.fingerprint(ASKED, capture, capture / "polcap", ()) is None
+    assert unchanged.request(ASKED, capture, capture / "polcap", ()) is None
     assert unchanged.find(capture / "polcap", None) is None
 
 
 def test_folder_behind_a_link_is_in_doubt(capture: Path, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (capture / "pol000").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
-    assert unchanged.fingerprint(ASKED, capture, capture / "polcap", ()) is None
+    assert unchanged.request(ASKED, capture, capture / "polcap", ()) is None
 
 
 def test_result_that_was_touched_is_no_answer(capture: Path) -> None:
     out = capture / "polcap"
     (out / "work").mkdir(parents=True)
     (out / "report.json").write_text('{"verdict": "pass"}')
-    unchanged.remember(out, "asked", "table", ("hdr",))
+    unchanged.remember(out, "asked", "table")
     assert unchanged.find(out, "other") is None
     found = unchanged.find(out, "asked")
-    assert found == unchanged.Finished("table", ("hdr",), {"verdict": "pass"})
+    assert found == unchanged.Finished("table", {"verdict": "pass"})
     os.utime(out / "report.json", ns=(OLD_NS, OLD_NS))
     assert unchanged.find(out, "asked") is None
 
@@ -85,7 +87,7 @@ def test_run_with_nothing_to_do_loads_no_library(result: Path, example: Path, po
     shutil.copytree(result, out)
     options = ["process", str(capture), "--out", str(out), "--estimator", "analytic"]
     first = polcap(*options)
-    heavy = ("numpy", "scipy", "cv2", "onnxruntime", "msgspec")
+    heavy = ("numpy", "scipy", "cv2", "onnxruntime")
     code = f"import atexit, sys; from polcap import cli; sys.argv[1:] = {options}\n"
     code += f"atexit.register(lambda: print('loaded', *sys.modules.keys() & {heavy}))\ncli.main()"
     again = subprocess.run(

@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
-from polcap.formats import calib
+from polcap.formats import shipped_data
 from polcap.images import Exif
 
 FULL_FRAME_MM = (36.0, 24.0)
@@ -61,5 +61,5 @@ def find(exif: Exif, stated_mm: float | None, stated_width_mm: float | None) -> 
 @cache
 def sensor_widths() -> dict[str, float]:
     """Width of the imaging area [mm] by EXIF model, of the cameras in calib/cameras/sensors.toml."""
-    table = tomllib.loads(calib.data_path("cameras/sensors.toml").read_text(encoding="utf-8"))
+    table = tomllib.loads(shipped_data.data_path("cameras/sensors.toml").read_text(encoding="utf-8"))
     return {model: float(width) for model, width in table["width_mm"].items()}

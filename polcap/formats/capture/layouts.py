@@ -7,7 +7,7 @@ Folders pol000, pol045, …; capture.toml; one flat folder; frames of a polariza
 import os
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
@@ -18,13 +18,11 @@ from polcap import parallel
 from polcap.errors import CaptureError
 from polcap.formats.capture import capture_toml
 from polcap.formats.capture.capture_toml import CaptureFile
+from polcap.formats.own_folders import OURS
 from polcap.formats.raw import photo, probe
 from polcap.formats.raw.probe import Probe
 from polcap.images import Role
 
-OUTPUT = "polcap"  # default folder of results
-BATCH = "polcap-batch"  # folder of a batch's records, in ROOT or in --out; safe to delete
-OURS = (OUTPUT, BATCH)  # these folders hold no photographs
 DEFAULT_DEG = (0.0, 45.0, 90.0)
 SEPARATION_DEG = 5.0  # closer angles count as one
 EQUAL_STOPS = 0.15  # EXIF rounds exposure times to a sixth of a stop at most
@@ -32,7 +30,6 @@ _POL_FOLDER = re.compile(r"pol[ _-]?(\d+(?:\.\d+)?)", re.IGNORECASE)
 _CROSS_FOLDER = re.compile(r"cross(?:[ _-]?(\d+(?:\.\d+)?))?", re.IGNORECASE)
 _AT_ONCE = 2  # files read in parallel: as many child processes as decode them later
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
-Look = Callable[[Path], Probe]  # `probe.read`, or one that remembers
 
 
 @dataclass(frozen=True)
@@ -63,11 +60,11 @@ class _Listing:
     notes: list[str] = field(default_factory=list)
 
 
-def plan(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None, look: Look = probe.read) -> Plan:
+def plan(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None) -> Plan:
     """Plan the shots of a folder with its capture.toml.
 
     `angles_deg` is the order of a flat folder; where folders, names or capture.toml state the angles, it picks from
-    them, the first being the reference. `look` reads the facts of a file.
+    them, the first being the reference.
 
     Raises
     ------
@@ -75,11 +72,11 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None, 
         The folder and its names do not form a capture.
     """
     if stated.frame:
-        return _toml(folder, stated, angles_deg, look)
+        return _toml(folder, stated, angles_deg)
     sub_folders = _pol_folders(folder)
     if sub_folders:
-        return _folders(folder, sub_folders, angles_deg, look)
-    listing = _list(folder, look)
+        return _folders(folder, sub_folders, angles_deg)
+    listing = _list(folder)
     if not listing.pictures:
         inside = [path for path in children(folder) if path.is_dir()]
         named = f"{', '.join(path.name for path in inside[:4])}{', …' if len(inside) > 4 else ''}"
@@ -111,7 +108,7 @@ def looks_like_a_capture(folder: Path, inside: Iterable[str], files: Iterable[st
     return any(probe.kind(folder / name) in ("raw", "photo") for name in sorted(files) if not name.startswith("."))
 
 
-def _toml(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None, look: Look) -> Plan:
+def _toml(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None) -> Plan:
     sources = []
     for entry in stated.frame:
         path = folder / entry.file
@@ -121,7 +118,7 @@ def _toml(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None,
             raise CaptureError(f"{folder / capture_toml.NAME}: {entry.file} lies outside the folder; move it inside")
         if not path.is_file():
             raise CaptureError(f"{folder / capture_toml.NAME}: no file {entry.file}; correct or remove its entry")
-        found = _probe(path, look)
+        found = _probe(path)
         if found.kind == "other":
             raise CaptureError(f"{folder / capture_toml.NAME}: {entry.file} is not a photograph; remove its entry")
         sources.append(Source(path, found, entry.role, entry.angle, entry.exposure, entry.flash_energy))
@@ -148,18 +145,18 @@ def _group(sources: Iterable[Source]) -> dict[float, list[Source]]:
     return groups
 
 
-def _folders(folder: Path, sub_folders: dict[float, Path], angles_deg: Sequence[float] | None, look: Look) -> Plan:
+def _folders(folder: Path, sub_folders: dict[float, Path], angles_deg: Sequence[float] | None) -> Plan:
     groups: dict[float, list[Source]] = {}
     notes = []
     for angle, sub_folder in sub_folders.items():
-        listing = _list(sub_folder, look)
+        listing = _list(sub_folder)
         if not listing.pictures:
             raise CaptureError(
                 f"{sub_folder}: holds no photograph that polcap reads; shoot this angle again, or remove the folder"
             )
         groups[angle] = listing.pictures
         notes += [f"{sub_folder.name}: {note}" for note in listing.notes]
-    crossed = _crossed(folder, look)
+    crossed = _crossed(folder)
     unused = sorted(
         path.name
         for path in children(folder)
@@ -180,7 +177,7 @@ def numbered(folder: Path) -> list[str]:
     ]
 
 
-def _crossed(folder: Path, look: Look) -> tuple[Source, ...]:
+def _crossed(folder: Path) -> tuple[Source, ...]:
     """The photographs of cross/ or cross045/, whose number is the angle of the filter before the lens."""
     places = [path for path in children(folder) if path.is_dir() and _is_crossed(path.name)]
     if len(places) > 1:
@@ -191,7 +188,7 @@ def _crossed(folder: Path, look: Look) -> tuple[Source, ...]:
     angle = float(match[1]) if match and match[1] else None
     if angle is not None and angle > 360:
         raise CaptureError(f"{places[0]}: {angle:g}° is not an angle of a polarizer; name it by 0 to 360 degrees")
-    found = tuple(replace(source, role="cross", angle_deg=angle) for source in _list(places[0], look).pictures)
+    found = tuple(replace(source, role="cross", angle_deg=angle) for source in _list(places[0]).pictures)
     if not found:
         raise CaptureError(f"{places[0]}: holds no photograph that polcap reads; shoot it again, or remove the folder")
     return found
@@ -328,11 +325,11 @@ def different(angles_deg: Iterable[float]) -> int:
     return max(sum(gap >= SEPARATION_DEG for gap in gaps), 1 if axes else 0)
 
 
-def _list(folder: Path, look: Look) -> _Listing:
+def _list(folder: Path) -> _Listing:
     """The photographs of one folder; finished pictures are left out where there is a RAW."""
     listing = _Listing()
     files = [path for path in children(folder) if path.is_file()]
-    probes = parallel.results([partial(_probe, path, look) for path in files], min(_AT_ONCE, parallel.threads()))
+    probes = parallel.results([partial(_probe, path) for path in files], min(_AT_ONCE, parallel.threads()))
     found = list(map(Source, files, probes))
     pictures = [source for source in found if source.probe.kind in ("raw", "photo")]
     raws = [source for source in pictures if source.probe.kind == "raw"]
@@ -348,9 +345,9 @@ def _list(folder: Path, look: Look) -> _Listing:
     return listing
 
 
-def _probe(path: Path, look: Look) -> Probe:
+def _probe(path: Path) -> Probe:
     """The facts of a file; CaptureError where no decoder can read it."""
-    found = look(path)
+    found = probe.read(path)
     if found.kind == "unknown":
         raise CaptureError(f"{path}: not a picture, a RAW that LibRaw knows, or text; restore the file, or remove it")
     return found

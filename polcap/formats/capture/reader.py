@@ -2,9 +2,9 @@
 
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -13,20 +13,19 @@ from polcap.formats import atomic, calibrations
 from polcap.formats.capture import capture_toml, focal_length, layouts
 from polcap.formats.capture.capture_toml import CaptureFile
 from polcap.formats.capture.layouts import Source
-from polcap.formats.raw import libraw, photo, probe
-from polcap.images import Capture, Exif, Frame, SensorImage, Shot
+from polcap.formats.raw import photo
+from polcap.images import Capture, Exif, Frame, FrameReading, Shot
 
 _ZOOM = 0.01  # relative change of the focal length above rounding
 LOSS = ": normals and albedo lose accuracy against RAW"
-Loader = Callable[[], SensorImage]
 
 
-def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, look: layouts.Look = probe.read) -> Capture:
+def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Capture:
     """Read a capture folder: pol000/ pol045/ …, capture.toml, flat, or polarization-sensor frames.
 
     Every file's metadata and bytes are read, no pixel is decoded. `angles_deg` is the order of
     the brackets of a flat folder (0, 45, 90 by default); elsewhere it picks from the angles that
-    the folder states, the first being the reference. `look` reads the facts of a file.
+    the folder states, the first being the reference.
 
     Raises
     ------
@@ -43,7 +42,7 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, look: 
     stated = capture_toml.load(folder)
     if angles_deg is not None:
         _check_angles(folder, angles_deg, "--angles states")
-    plan = layouts.plan(folder, stated, angles_deg, look)
+    plan = layouts.plan(folder, stated, angles_deg)
     _check_angles(folder, [angle for angle, _ in plan.shots], "the shots' angles are")
 
     used: dict[Path, Source] = {}
@@ -155,30 +154,22 @@ def _crossed(folder: Path, plan: layouts.Plan, stated: CaptureFile) -> Shot | No
 
 
 def _frame(plan: layouts.Plan, stated: CaptureFile, source: Source, angle_deg: float) -> Frame:
-    load, settings = _loader(source, stated, angle_deg if plan.layout == "sensor" else None)
-    alone = source.probe.kind == "raw" and plan.layout != "sensor"  # only the file decides its values
+    mosaic_deg = angle_deg if plan.layout == "sensor" else None
+    kind: Literal["raw", "photo"] = "raw" if source.probe.kind == "raw" else "photo"
+    levels = [f"{stated.white:g}"] if stated.white else []
+    levels += [f"-{stated.black:g}"] if stated.black else []
+    if mosaic_deg is not None:
+        settings = [f"sensor {mosaic_deg:g}", *levels]
+    else:
+        settings = [] if kind == "raw" else [stated.encoding or "default", *levels]
     return Frame(
         path=str(source.path),
         exif=source.probe.exif,
         role=source.role,
         digest=" ".join([source.probe.digest, *settings]),
-        load=load,
         exposure=_stated_exposure(source),
-        within=partial(libraw.within, source.path, source.probe.digest) if alone else None,
+        reading=FrameReading(kind, stated.encoding, stated.white, stated.black, mosaic_deg),
     )
-
-
-def _loader(source: Source, stated: CaptureFile, mosaic_deg: float | None) -> tuple[Loader, list[str]]:
-    """How to read a frame, and the settings besides its bytes that decide its values."""
-    path, found = source.path, source.probe
-    settings = [f"{stated.white:g}"] if stated.white else []
-    settings += [f"-{stated.black:g}"] if stated.black else []
-    levels = (stated.white, stated.black, found.digest)
-    if mosaic_deg is not None:
-        return partial(photo.read_mosaic, path, mosaic_deg, *levels, found.kind), [f"sensor {mosaic_deg:g}", *settings]
-    if found.kind == "raw":
-        return partial(libraw.read, path, found.digest), []
-    return partial(photo.read, path, stated.encoding, *levels), [stated.encoding or "default", *settings]
 
 
 def _stated_exposure(source: Source) -> float | None:

@@ -51,12 +51,6 @@ class Encoder:
         data = made.result()
         return png.described(data, {"Description": texture.says}) if text and kind == "png" else data
 
-    def know(self, texture: Texture, kind: Kind, data: bytes) -> None:
-        """These are the bytes of a picture, from an earlier export."""
-        made: Future[bytes] = Future()
-        made.set_result(data)
-        self._made[(id(texture.pixels), kind, texture.color)] = (texture.pixels, made)
-
     def all(self, textures: Mapping[str, Texture], kind: Kind) -> dict[str, bytes]:
         """The bytes of each picture, in threads; the same whatever their number.
 

@@ -148,14 +148,6 @@ def _file(document: Mapping[str, Any], blob: bytes | bytearray) -> bytes:
     )
 
 
-def described(data: bytes, provenance: Mapping[str, str]) -> bytes:
-    """The bytes of a GLB that `encode` made, where these words of its provenance are others."""
-    length = int(struct.unpack_from("<I", data, 12)[0])
-    document = json.loads(data[20 : 20 + length])
-    document["extensions"]["KHR_xmp_json_ld"]["packets"][0] |= _worded(provenance)
-    return _file(document, data[28 + length :])
-
-
 def textures(asset: Asset) -> dict[str, Texture]:
     """What the GLB embeds, by the ends of their names, in the order of the material."""
     return {
@@ -214,12 +206,8 @@ def _packet(name: str, provenance: Mapping[str, str]) -> dict[str, Any]:
         "dc:title": {"@type": "rdf:Alt", "rdf:_1": {"@language": "x-default", "@value": name}},
         "dc:format": "model/gltf-binary",
         "xmp:CreatorTool": f"polcap {__version__}",
-        **_worded(provenance),
+        **{f"polcap:{key}": said for key, said in provenance.items()},
     }
-
-
-def _worded(provenance: Mapping[str, str]) -> dict[str, str]:
-    return {f"polcap:{key}": said for key, said in provenance.items()}
 
 
 def center(vertices: Floats) -> Floats:

@@ -8,7 +8,6 @@ reads as it is; `norm` names the PNG for the others. OBJ counts v upwards where 
 
 import re
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from polcap.formats import atomic
 from polcap.formats.export import gltf
 from polcap.formats.export.texture_set import SPECULAR_RANGE, Key
 from polcap.formats.maps import exr
-from polcap.formats.written import Written
 from polcap.images import Asset, Floats
 
 
@@ -34,7 +32,6 @@ def write(
     name: str,
     files: Mapping[Key, str],
     says: str = "",
-    standing: Written | None = None,
 ) -> list[Path]:
     """Write `path` (.obj) and beside it the .mtl and two EXRs.
 
@@ -50,8 +47,6 @@ def write(
         Names of the PNGs beside it, which are there already.
     says
         Comment at the head of both texts.
-    standing
-        Which files stand already; without it none does.
 
     Returns
     -------
@@ -66,28 +61,20 @@ def write(
     base = stem(path.stem)
     written = [path, *(path.with_name(f"{base}{ending}") for ending in (".mtl", "_roughness.exr", "_normal.exr"))]
     _, library, roughness, normal = written
-    make = (standing or Written(path.parent, anew=True)).make
-    packed = np.ascontiguousarray(asset.occlusion_roughness_metallic[..., 1])
-    make(normal, [asset.normal], partial(_data, normal, {c: asset.normal[..., k] for k, c in enumerate("RGB")}))
-    make(roughness, [packed], partial(_data, roughness, {"Y": packed}))
+    _data(normal, {c: asset.normal[..., k] for k, c in enumerate("RGB")})
+    _data(roughness, {"Y": np.ascontiguousarray(asset.occlusion_roughness_metallic[..., 1])})
     data: dict[Key, str] = {"roughness": roughness.name, "normal": normal.name}
     header = "".join(f"# {line}\n" for line in says.splitlines())
     with atomic.path(library) as temporary:
         temporary.write_text(header + _material(asset, stem(name), files, data), encoding="utf-8")
-    mesh = asset.mesh
-    made_from = [mesh.vertices, mesh.uv, mesh.normals, mesh.faces, stem(name), library.name, header]
-    make(path, made_from, partial(_mesh, path, asset, stem(name), library.name, header))
+    with atomic.path(path) as temporary:
+        temporary.write_bytes(header.encode() + _geometry(asset, stem(name), library.name))
     return written
 
 
 def _data(file: Path, channels: Mapping[str, NDArray[Any]]) -> None:
     """Whole numbers of any depth as the share of their greatest, in half."""
     exr.write(file, {name: one / np.float32(np.iinfo(one.dtype).max) for name, one in channels.items()}, half=True)
-
-
-def _mesh(path: Path, asset: Asset, material: str, library: str, header: str) -> None:
-    with atomic.path(path) as temporary:
-        temporary.write_bytes(header.encode() + _geometry(asset, material, library))
 
 
 def _geometry(asset: Asset, material: str, library: str) -> bytes:

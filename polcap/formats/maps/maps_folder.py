@@ -1,13 +1,11 @@
 """In: the maps of an object. Out: the folder maps/ of a result, as docs/reference/result.md says; and back."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
-from hashlib import blake2b
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, TypeVar
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -16,12 +14,9 @@ from numpy.typing import NDArray
 
 from polcap import parallel
 from polcap.errors import DecodeError
-from polcap.formats import atomic, npy_folder, text_file
+from polcap.formats import atomic, text_file
 from polcap.formats.maps import exr, map_files, png
-from polcap.formats.written import Written
 from polcap.images import Cues, Floats, Mesh, StokesImage, SurfaceMaps, View
-
-Value = TypeVar("Value", covariant=True)
 
 CONVENTIONS = {
     "frame": "camera: x right, y up, z toward the camera; a normal facing the camera is (0, 0, 1)",
@@ -35,9 +30,6 @@ CONVENTIONS = {
 }
 
 
-_READ = (
-    "mask.png", "normal.exr", "diffuse.exr", "specular.exr", "roughness.exr", "confidence.exr", "depth.exr",
-)  # fmt: skip
 _Side = Annotated[int, Meta(ge=1, le=1 << 16)]
 _Positive = Annotated[float, Meta(gt=0, le=1e9)]
 _Place = Annotated[float, Meta(ge=-1e9, le=1e9)]
@@ -73,109 +65,30 @@ class Stored:
     metric: bool
 
 
-class Keyed(Protocol[Value]):
-    """A result of the path: what tells it from others, and its value, read when it is asked for."""
-
-    @property
-    def key(self) -> str: ...
-
-    @property
-    def value(self) -> Value: ...
-
-
-def write(
-    folder: Path,
-    maps: Keyed[SurfaceMaps],
-    mesh: Keyed[Mesh],
-    stokes: Keyed[StokesImage],
-    cues: Keyed[Cues],
-    written: Written | None = None,
-) -> None:
+def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues: Cues) -> None:
     """Write every map as EXR, the main ones as PNG too, and maps.json last; the same values give the same bytes.
 
-    Parameters
-    ----------
-    folder
-        `maps/` of a result.
-    maps
-        What `infer` found, (H, W) of the crop.
-    mesh
-        Its depth is written, not its triangles.
-    stokes, cues
-        The images that the maps were made from, on the same crop.
-    written
-        Which files stand already; without it none does.
+    Of the mesh its depth (H, W) is written. All images lie on the crop (H, W) of `maps`. Files are encoded on
+    threads, and get their names together: where one fails, those of an earlier run are left.
 
     Raises
     ------
     StorageError
         A file cannot be written.
     """
-    with writing(Path(folder), written) as files:
-        files.begin({"maps": maps, "mesh": mesh, "stokes": stokes, "cues": cues})
-        files.finish()
-
-
-@dataclass
-class Writing:
-    """A folder maps/ under way: files are encoded beside other work, and get their names together."""
-
-    folder: Path
-    written: Written
-    beside: parallel.Beside
-    held: atomic.Held
-    made: dict[map_files.Source, Keyed[Any]] = field(default_factory=dict)
-    begun: dict[str, parallel.Task[None]] = field(default_factory=dict)
-
-    def begin(self, made: Mapping[map_files.Source, Keyed[Any]]) -> None:
-        """Encode what can be made of these and of those given before; `write` tells of them."""
-        self.made |= made
-        for name, (sources, encode) in map_files.FILES.items():
-            if name in self.begun or not self.made.keys() >= set(sources):
-                continue
-            taken, file = [self.made[source] for source in sources], self.folder / name
-            made_from = [one.key for one in taken]
-            if self.written.stands(file, made_from):
-                continue
-            content = partial(encode, *(one.value for one in taken))  # a stage that has to run does so here
-            self.begun[name] = self.beside.begin(partial(_write, file, content, self.held))
-            self.written.note(file, made_from)
-
-    def finish(self) -> None:
-        """Every file is there, and maps.json last.
-
-        Raises
-        ------
-        StorageError
-            A file cannot be written; then those that stood before stand.
-        """
-        parallel.finished(list(self.begun.values()))
-        self.held.release()
-        maps, mesh, about = self.made["maps"], self.made["mesh"], self.folder / "maps.json"
-        self.written.make(about, [maps.key, mesh.key], partial(_describe, about, maps, mesh))
-
-
-@contextmanager
-def writing(folder: Path, written: Written | None = None) -> Iterator[Writing]:
-    """Begin files of maps/ before all is known that goes there; what fails in the block leaves maps/ as it was.
-
-    Parameters
-    ----------
-    folder, written
-        As of `write`.
-    """
+    made = {"maps": maps, "mesh": mesh, "stokes": stokes, "cues": cues}
     held = atomic.Held()
     try:
-        with parallel.Beside() as beside:
-            yield Writing(folder, written or Written(folder.parent, anew=True), beside, held)
+        parallel.results(
+            partial(_write, folder / name, partial(encode, *(made[source] for source in sources)), held)
+            for name, (sources, encode) in map_files.FILES.items()
+        )
+        held.release()
     finally:
         held.drop()
-
-
-def _describe(file: Path, maps: Keyed[SurfaceMaps], mesh: Keyed[Mesh]) -> None:
-    near, median, far = map_files.depth_range(maps.value, mesh.value)
-    depth: dict[str, str | float] = {"unit": "m" if mesh.value.metric else "relative"}
-    _write_json(file, _description(maps.value, {**depth, "near": near, "median": median, "far": far}))
+    near, median, far = map_files.depth_range(maps, mesh)
+    depth: dict[str, str | float] = {"unit": "m" if mesh.metric else "relative"}
+    _write_json(folder / "maps.json", _description(maps, {**depth, "near": near, "median": median, "far": far}))
 
 
 def _write(file: Path, content: Callable[[], Any], held: atomic.Held) -> None:
@@ -186,10 +99,10 @@ def _write(file: Path, content: Callable[[], Any], held: atomic.Held) -> None:
         png.write(file, content(), held)
 
 
-def as_read(maps: SurfaceMaps, mesh: Mesh) -> Stored:
-    """What `read` gives of the folder that `write` makes of these: half where the files are half."""
+def as_stored(maps: SurfaceMaps) -> SurfaceMaps:
+    """The maps that `read` gives of the folder that `write` makes of these: half where the files are half."""
     inside = map_files.inside(maps)
-    whole = SurfaceMaps(
+    return SurfaceMaps(
         normal=map_files.kept(maps.normal, inside),
         diffuse=_kept_half(maps.diffuse, inside),
         specular=_kept_half(maps.specular, inside),
@@ -200,14 +113,11 @@ def as_read(maps: SurfaceMaps, mesh: Mesh) -> Stored:
         view=maps.view,
         estimator=maps.estimator,
     )
-    return Stored(whole, np.where(inside, map_files.object_depth(maps, mesh), np.nan).astype(np.float32), mesh.metric)
 
 
-def albedo_as_read(maps: SurfaceMaps) -> SurfaceMaps:
-    """The maps with the two albedos and the mask that `read` gives of them; the other fields as they are."""
-    inside = map_files.inside(maps)
-    diffuse, specular = (_kept_half(values, inside) for values in (maps.diffuse, maps.specular))
-    return replace(maps, diffuse=diffuse, specular=specular, mask=inside)
+def stored_depth(maps: SurfaceMaps, mesh: Mesh) -> Floats:
+    """The depth (H, W) that `read` gives of that folder; NaN outside the mask."""
+    return np.where(map_files.inside(maps), map_files.object_depth(maps, mesh), np.nan).astype(np.float32)
 
 
 def _kept_half(values: Floats, inside: NDArray[np.bool_]) -> Floats:
@@ -257,26 +167,6 @@ def read(folder: Path) -> Stored:
         depth=np.where(inside, _read_map(folder / "depth.exr", "Z", said.size), np.nan).astype(np.float32),
         metric=said.depth.unit == "m",
     )
-
-
-def digest(folder: Path) -> str:
-    """Digest of all that `read` reads.
-
-    Raises
-    ------
-    DecodeError
-        A file is missing.
-    """
-    try:
-        said = msgspec.convert(text_file.read_json(folder / "maps.json"), dict[str, Any])
-    except (OSError, ValueError) as error:
-        raise DecodeError(f"{folder / 'maps.json'} is not as polcap wrote it ({error}); process again") from error
-    try:
-        files = [npy_folder.checksum(folder / name) for name in _READ]
-    except OSError as error:
-        raise DecodeError(f"{folder} is not as polcap wrote it ({error}); process again") from error
-    said.pop("exports", None)
-    return blake2b(json.dumps([said, files], sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
 def note_export(folder: Path, where: str, said: Mapping[str, Any]) -> None:

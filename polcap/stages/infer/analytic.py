@@ -83,10 +83,10 @@ def invert(
         phi, certainty = phi + np.where(found.turned, np.pi, 0.0), 1 - 2 * found.doubt
     else:
         phi, certainty = _guided(axis, cues.rays, *guide)
-    with parallel.Beside() as beside:
-        error = beside.begin(partial(_expected_error, read, dolp, sigma, certainty, cues))
-        normal = np.asarray(frames.from_ray_frame(_local(cos_zenith, phi, cues.rays), cues.rays))
-        return normal, error.result(), cos_zenith
+    error, local = parallel.both(
+        partial(_expected_error, read, dolp, sigma, certainty, cues), partial(_local, cos_zenith, phi, cues.rays)
+    )
+    return np.asarray(frames.from_ray_frame(local, cues.rays)), error, cos_zenith
 
 
 def _guided(axis: Floats, rays: Floats, normal: Floats, sigma: Floats) -> tuple[Floats, Floats]:

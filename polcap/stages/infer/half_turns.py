@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Floats
 from polcap.optics import outline
+from polcap.optics.resize import area_mean, weighted_area_mean
 
 Bools = NDArray[np.bool_]
 
@@ -93,7 +94,7 @@ def resolve(normal: Floats, mask: Bools, network: NetworkDoubt | None = None) ->
         x, y = (_enlarged(part, mask.shape) for part in np.where(turned, -1, 1) * grid.lean)
         doubt = _chance(terms @ np.array(_CELL))
         return HalfTurns(x * normal[..., 0] + y * normal[..., 1] < 0, _enlarged(doubt, mask.shape))
-    sigma, opposed = (_mean(image, mask, grid.mask) for image in (network.sigma, network.opposed))
+    sigma, opposed = (weighted_area_mean(image, mask, grid.mask.shape) for image in (network.sigma, network.opposed))
     region, terms = proposals(grid, sigma, opposed)
     chance = _chance(terms @ np.array(_REGION))
     chance[0] = 0  # cells that the cut keeps: the network's error covers them
@@ -107,15 +108,12 @@ def error_with_doubt(error: Floats, doubt: Floats, cos_zenith: Floats) -> Floats
 
 
 def coarse(normal: Floats, mask: Bools) -> Grid:
-    """Mean axes and zeniths of the cells: twice the azimuth is averaged, the side is that of the mean vector."""
-    height, width = mask.shape
-    shrink = max(1.0, max(height, width) / _LONGEST)
-    size = (max(8, round(width / shrink)), max(8, round(height / shrink)))
+    """Cells of normals (H, W, 3) in a mask (H, W): mean double azimuth and zenith, and the side of the mean vector."""
+    shrink = max(1.0, max(mask.shape) / _LONGEST)
+    shape = tuple(max(8, round(side / shrink)) for side in mask.shape)
     x, y = normal[..., 0] * mask, normal[..., 1] * mask
     parts = (mask, x, y, x * x - y * y, 2 * x * y, np.hypot(x, y), np.maximum(normal[..., 2] * mask, 0))
-    share, x, y, cos2, sin2, sine, cosine = (
-        cv2.resize(part.astype(np.float32), size, interpolation=cv2.INTER_AREA) for part in parts
-    )
+    share, x, y, cos2, sin2, sine, cosine = (area_mean(part.astype(np.float32), shape) for part in parts)
     inside = share > 0.5
     azimuth = np.arctan2(sin2, cos2) / 2
     axis = np.stack([np.cos(azimuth), np.sin(azimuth)])
@@ -185,15 +183,6 @@ def proposals(grid: Grid, sigma: Floats, opposed: Floats) -> tuple[NDArray[np.in
 def _chance(odds: Floats) -> Floats:
     """Probability of the logarithm of odds."""
     return np.asarray(1 / (1 + np.exp(-odds)))
-
-
-def _mean(image: Floats, mask: Bools, cells: Bools) -> Floats:
-    """Mean (h, w) of an image (H, W) over the mask's pixels in each cell."""
-    size = cells.shape[::-1]
-    total, share = (
-        cv2.resize(part.astype(np.float32), size, interpolation=cv2.INTER_AREA) for part in (image * mask, mask)
-    )
-    return np.asarray(total / np.maximum(share, 1e-3))
 
 
 def _enlarged(cells: Floats | Bools, shape: tuple[int, ...]) -> Floats:

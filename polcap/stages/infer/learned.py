@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from polcap import parallel
 from polcap.errors import ModelError
-from polcap.images import Cues, Floats, Network, Quality, SurfaceMaps
+from polcap.images import Cues, Floats, Network, Quality, RunNetwork, SurfaceMaps
 from polcap.optics import frames
+from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stages.cues import CHANNELS, FLOOR
 from polcap.stages.infer import analytic, augmentation, fine, half_turns
 from polcap.stages.infer.analytic import REACHED, fill_highlights
@@ -28,7 +29,9 @@ _GRAZING = 0.15  # cosine below which shading is not told apart; .1 and .2 leave
 _BRIGHTEST = 2.0  # S0, which is 1 where white paper faces the flash beside the chart; what no body reflects
 
 
-def estimate(cues: Cues, network: Network, ior: float, symmetries: int, *, fine_pass: bool) -> SurfaceMaps:
+def estimate(
+    cues: Cues, network: Network, run: RunNetwork, ior: float, symmetries: int, *, fine_pass: bool
+) -> SurfaceMaps:
     """The network's maps, its normals joined with the analytic ones by their expected errors.
 
     The network sees the whole object at the size it was made for, which settles half-turns, shape and gloss.
@@ -41,7 +44,9 @@ def estimate(cues: Cues, network: Network, ior: float, symmetries: int, *, fine_
     cues
         Of the object's crop (H, W).
     network
-        Eats the channels of `stages.cues`.
+        Takes the channels of `stages.cues`.
+    run
+        Runs a network.
     ior
         Refractive index of the inversion.
     symmetries
@@ -54,8 +59,8 @@ def estimate(cues: Cues, network: Network, ior: float, symmetries: int, *, fine_
     ModelError
         A network was made for other channels, or gives other maps.
     """
-    maps, guess, stated = known(cues, network, ior, symmetries)
-    normal = fine.refined(cues, guess, network.fine) if fine_pass and network.fine else guess.normal
+    maps, guess, stated = known(cues, network, run, ior, symmetries)
+    normal = fine.refined(cues, guess, network.fine, run) if fine_pass and network.fine else guess.normal
     lit = (np.maximum(cues.radiance, 0) + FLOOR) * np.exp(maps["factor"])
     diffuse = fill_highlights(lit / _shading(normal, cues.rays) - FLOOR, _bounded(cues))
     scale, power, rougher, most = _CALIBRATION
@@ -75,12 +80,14 @@ def estimate(cues: Cues, network: Network, ior: float, symmetries: int, *, fine_
     )
 
 
-def known(cues: Cues, network: Network, ior: float, symmetries: int) -> tuple[dict[str, Floats], fine.Guess, Floats]:
+def known(
+    cues: Cues, network: Network, run: RunNetwork, ior: float, symmetries: int
+) -> tuple[dict[str, Floats], fine.Guess, Floats]:
     """What stands before the fine pass, whose training begins here too.
 
     Parameters
     ----------
-    cues, network, ior, symmetries
+    cues, network, run, ior, symmetries
         As in `estimate`.
 
     Returns
@@ -94,10 +101,8 @@ def known(cues: Cues, network: Network, ior: float, symmetries: int) -> tuple[di
     size = cues.mask.shape[::-1]
     shrink = max(1.0, max(size) / int(network.metadata["native_size"]))
     seen = _resized(_bounded(cues), 1 / shrink)
-    with parallel.Beside(network.at_once) as beside:
-        prepared = beside.begin(partial(analytic.prepare, cues, ior))
-        small = augmentation.combined(seen, network, symmetries)
-        averaged = prepared.result()
+    looks = partial(augmentation.combined, seen, network, run, symmetries)
+    small, averaged = parallel.both(looks, partial(analytic.prepare, cues, ior), network.at_once)
     # beside the object the network guesses: zeros there leave an edge's direction to the object's own pixels
     small["normal"] = _without_grid(small["normal"], seen.mask) * seen.mask[..., None]
     small["normal"], small["doubt"] = _sided(small["normal"], seen, small["sigma"], small.pop("opposed"))
@@ -161,10 +166,10 @@ def _detailed(coarse: Floats, by_pixel: Floats, mask: NDArray[np.bool_], shrink:
     Interreflection, index and half-turns bend the inversion's normals over whole regions; relief is finer.
     """
     height, width = mask.shape
-    size = (round(width / shrink), round(height / shrink))
+    small = round(height / shrink), round(width / shrink)
     inside = mask.astype(np.float32)
     difference, share = (
-        cv2.GaussianBlur(cv2.resize(image, size, interpolation=cv2.INTER_AREA), (0, 0), _DETAIL)
+        cv2.GaussianBlur(area_mean(image, small), (0, 0), _DETAIL)
         for image in ((coarse - by_pixel).astype(np.float32) * inside[..., None], inside)
     )
     moved = by_pixel + cv2.resize(difference / np.maximum(share, 1e-3)[..., None], (width, height))
@@ -201,18 +206,13 @@ def _resized(cues: Cues, scale: float) -> Cues:
     if scale >= 1.0:
         return cues
     height, width = cues.mask.shape
-    size = (max(16, round(width * scale)), max(16, round(height * scale)))
-
-    def mean(image: Floats) -> Floats:
-        return np.asarray(cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA))
-
+    small = max(16, round(height * scale)), max(16, round(width * scale))
     light = np.maximum(frames.total(cues.radiance), 1e-6) * cues.mask
-    weight = np.maximum(mean(light), 1e-9)
-    ratio = np.stack([mean(r * light) / weight for r in cues.ratio])
-    sigma = mean(cues.ratio_sigma * light) / weight * min(1.0, scale * np.sqrt(width / size[0] * scale))
-    share = mean(cues.mask.astype(np.float32))
-    mask = share > 0.5
-    radiance = mean(cues.radiance * cues.mask[..., None]) / np.maximum(share, 1e-3)[..., None]
+    ratio = np.stack([weighted_area_mean(r, light, small) for r in cues.ratio])
+    averaging = min(1.0, scale * np.sqrt(width / small[1] * scale))
+    sigma = weighted_area_mean(cues.ratio_sigma, light, small) * averaging
+    mask = area_mean(cues.mask, small) > 0.5
+    radiance = weighted_area_mean(cues.radiance, cues.mask, small)
     squared = ratio[0] ** 2 + ratio[1] ** 2
     view = replace(
         cues.view,
@@ -220,7 +220,7 @@ def _resized(cues: Cues, scale: float) -> Cues:
         center=((cues.view.center[0] + 0.5) * scale - 0.5, (cues.view.center[1] + 0.5) * scale - 0.5),
         scale=cues.view.scale / scale,
     )
-    clipped = mean((cues.quality & Quality.CLIPPED).astype(np.float32)) > 0.5 * Quality.CLIPPED
+    clipped = area_mean((cues.quality & Quality.CLIPPED) > 0, small) > 0.5
     return replace(
         cues,
         radiance=radiance,
@@ -228,7 +228,7 @@ def _resized(cues: Cues, scale: float) -> Cues:
         ratio_sigma=sigma,
         dolp=np.sqrt(np.clip(squared - sigma**2, 0, 1)),
         normalized_stokes=ratio / np.sqrt(squared + 1e-12),
-        diffuse_color=mean(cues.diffuse_color),
+        diffuse_color=area_mean(cues.diffuse_color.astype(np.float32), small),
         rays=frames.rays(view, *mask.shape),
         mask=mask,
         quality=np.where(clipped, np.uint8(Quality.CLIPPED), np.uint8(0)),

@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from polcap.errors import DecodeError, ObjectError, StorageError
+from polcap.errors import DecodeError, StorageError
 from polcap.formats.maps import exr, png
 from polcap.formats.maps import maps_folder as maps
 from polcap.images import ColorCalibration, Cues, Mesh, StokesImage, SurfaceMaps
 from polcap.stages import cues
 from tests import surfaces
-from tests.surfaces import Known
 
 FILES = {
     "normal.exr", "normal.png", "depth.exr", "depth.png", "diffuse.exr", "diffuse.png", "specular.exr",
@@ -23,10 +22,6 @@ FILES = {
 }  # fmt: skip
 
 Result = tuple[SurfaceMaps, Mesh, StokesImage, Cues]
-
-
-def write(folder: Path, of: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues: Cues) -> None:
-    maps.write(folder, Known(of), Known(mesh), Known(stokes), Known(cues))
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +45,7 @@ def result() -> Result:
 @pytest.fixture(scope="module")
 def folder(result: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("result") / "maps"
-    write(folder, *result)
+    maps.write(folder, *result)
     return folder
 
 
@@ -58,9 +53,9 @@ def folder(result: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_file_that_cannot_be_written_leaves_all_as_they_were(
     result: Result, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: str
 ) -> None:
-    """One of those that are encoded beside other work: its error comes out, and no file of the new result is there."""
+    """Its error comes out, and no file of the new result is there."""
     monkeypatch.setenv("OMP_NUM_THREADS", threads)
-    write(tmp_path / "maps", *result)
+    maps.write(tmp_path / "maps", *result)
     before = {file.name: file.stat().st_mtime_ns for file in (tmp_path / "maps").iterdir()}
     assert {name: (tmp_path / "maps" / name).read_bytes() for name in FILES} == {
         name: (folder / name).read_bytes() for name in FILES
@@ -74,16 +69,8 @@ def test_a_file_that_cannot_be_written_leaves_all_as_they_were(
 
     monkeypatch.setattr(exr, "write", refuse)
     with pytest.raises(StorageError, match=r"cues\.exr: the disk is full"):
-        write(tmp_path / "maps", *result)
+        maps.write(tmp_path / "maps", *result)
     assert {file.name: file.stat().st_mtime_ns for file in (tmp_path / "maps").iterdir()} == before
-
-
-def test_what_fails_beside_the_writing_leaves_maps_as_they_were(result: Result, tmp_path: Path) -> None:
-    of, _, stokes, cues = result
-    with pytest.raises(ObjectError), maps.writing(tmp_path / "maps") as files:
-        files.begin({"maps": Known(of), "stokes": Known(stokes), "cues": Known(cues)})
-        raise ObjectError("the surface cannot be integrated")
-    assert not any(path.is_file() for path in tmp_path.rglob("*"))
 
 
 def test_every_promised_file_is_there_and_described(folder: Path) -> None:
@@ -151,23 +138,23 @@ def test_what_reading_gives_is_known_before_it_is_read(folder: Path, result: Res
     rng = np.random.default_rng(5)
     of = replace(of, diffuse=np.exp(rng.normal(-8, 6, of.diffuse.shape)).astype(np.float32))  # denormals, and too much
     mesh = replace(mesh, depth=np.where(rng.uniform(size=mesh.depth.shape) < 0.1, np.nan, mesh.depth))
-    write(folder.parent / "other", of, mesh, *result[2:])
-    read, known = maps.read(folder.parent / "other"), maps.as_read(of, mesh)
-    assert np.array_equal(read.depth, known.depth, equal_nan=True) and read.metric == known.metric
+    maps.write(folder.parent / "other", of, mesh, *result[2:])
+    read, known = maps.read(folder.parent / "other"), maps.as_stored(of)
+    assert np.array_equal(read.depth, maps.stored_depth(known, mesh), equal_nan=True) and read.metric == mesh.metric
     for name, value in vars(read.maps).items():
-        other = getattr(known.maps, name)
+        other = getattr(known, name)
         assert np.array_equal(value, other) if isinstance(value, np.ndarray) else value == other, name
 
 
 def test_same_result_gives_the_same_bytes(folder: Path, result: Result, tmp_path: Path) -> None:
-    write(tmp_path / "again", *result)
+    maps.write(tmp_path / "again", *result)
     for name in FILES:
         assert (folder / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
 
 
 def test_relative_depth_is_called_so(result: Result, tmp_path: Path) -> None:
     of, mesh, stokes, cue = result
-    write(tmp_path, of, replace(mesh, metric=False), stokes, cue)
+    maps.write(tmp_path, of, replace(mesh, metric=False), stokes, cue)
     assert json.loads((tmp_path / "maps.json").read_text("utf-8"))["depth"]["unit"] == "relative"
 
 

@@ -111,10 +111,10 @@ def test_the_expected_error_is_the_mean_over_both_sides() -> None:
 
 def test_the_inversion_of_a_ball_leans_outward_and_knows_it() -> None:
     solved = stokes.solve(
-        scenes.stack(noise=0.004), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings()
+        scenes.stack(noise=0.004), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings()
     )
     found = cues.compute(solved, scenes.no_color())
-    maps = infer.estimate(found, None, infer.Settings())
+    maps = infer.estimate(found, None, lambda network, picture: {}, infer.InferSettings())
     local, mask = scenes.truth()
     true = frames.from_ray_frame(local, found.rays)
     tilted = mask & maps.mask & (local[..., 2] < 0.9)

@@ -1,0 +1,106 @@
+"""A result folder: its lock, the removal of temporary files, and work/run.json, from which a result is opened again."""
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from polcap.errors import SettingError, StorageError
+from polcap.formats import atomic, own_folders, text_file
+from polcap.formats.capture import layouts
+from polcap.pipeline.cache import seal
+
+
+def check(out: Path, photographs: Path) -> None:
+    """Refuse a result folder that lies among the photographs, or has a name that no OpenEXR file can have.
+
+    Raises
+    ------
+    SettingError
+        Choose another --out.
+    """
+    try:
+        os.fspath(out).encode()
+    except UnicodeEncodeError:
+        raise SettingError(f"--out {out} is no UTF-8 text, as OpenEXR wants it; name another with --out") from None
+    here, there = Path(os.path.realpath(out)), Path(os.path.realpath(photographs))
+    if here == there:
+        raise SettingError(f"--out {out} is the capture itself; choose a folder of its own")
+    inside = here.relative_to(there).parts if here.is_relative_to(there) else ()
+    if any(layouts.is_angle_folder(name) for name in inside):
+        raise SettingError(f"--out {out} lies among the capture's shots; choose {photographs / own_folders.OUTPUT}")
+
+
+@contextmanager
+def locked(out: Path) -> Iterator[None]:
+    """Work in a result folder: other processes stay out, and a killed run's temporary files are removed.
+
+    The system drops the lock when its owner dies, however it dies: there are no stale locks.
+
+    Raises
+    ------
+    StorageError
+        Another process works here, or the folder cannot be written.
+    """
+    work = out / "work"
+    lock, owner = FileLock(work / "lock", timeout=0), work / "owner"
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+        lock.acquire()
+    except Timeout as error:
+        raise StorageError(
+            f"{out}: process {_first_line(owner)} is working here; wait for it or choose another --out"
+        ) from error
+    except OSError as error:
+        raise atomic.failure(work / "lock", error) from error
+    try:
+        with atomic.path(owner, synced=False) as temporary:
+            temporary.write_text(f"{os.getpid()}\n", encoding="utf-8")
+        for place in (work, out, out / "maps", out / "asset", *(out / "asset").glob("*/")):
+            for left in [*place.glob(".*.part*"), *place.glob(".*.old")]:
+                atomic.discard(left)
+        yield
+    finally:
+        lock.release()
+
+
+def write_run(out: Path, about: Mapping[str, Any]) -> None:
+    """work/run.json: facts of a run that `show` and `report` need when the photographs are gone.
+
+    Raises
+    ------
+    StorageError
+        It cannot be written.
+    """
+    text = json.dumps({**about, "digest": seal(about)}, indent=1)
+    with atomic.path(out / "work" / "run.json", synced=False) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def read_run(out: Path) -> dict[str, Any]:
+    """The content of work/run.json.
+
+    Raises
+    ------
+    StorageError
+        There is none, or it is damaged.
+    """
+    file = out / "work" / "run.json"
+    try:
+        about = text_file.read_json(file)
+    except (OSError, ValueError) as error:
+        raise StorageError(f"{out} holds no stage cache of this polcap; run `polcap process` again") from error
+    if not isinstance(about, dict) or about.get("digest") != seal(about):
+        raise StorageError(f"{file} is damaged, or of another polcap; run `polcap process` again")
+    return about
+
+
+def _first_line(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8", errors="replace")[:20].strip() or "unknown"
+    except OSError:
+        return "unknown"
