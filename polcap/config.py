@@ -18,10 +18,10 @@ from polcap.errors import SettingError, StorageError
 from polcap.formats import text_file
 from polcap.quality.limits import GateLimits
 from polcap.stages.align import Settings as Align
-from polcap.stages.asset import Settings as Asset
+from polcap.stages.asset import AssetSettings
 from polcap.stages.hdr import Settings as Hdr
-from polcap.stages.infer import Settings as Infer
-from polcap.stages.mask import Settings as Mask
+from polcap.stages.infer import InferSettings
+from polcap.stages.mask import MaskSettings
 from polcap.stages.selfcal import SelfcalSettings
 from polcap.stages.stokes import StokesSettings
 from polcap.stages.surface import SurfaceSettings
@@ -38,12 +38,12 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     hdr: Hdr = Hdr()
     whitebalance: WhitebalanceSettings = WhitebalanceSettings()
     align: Align = Align()
-    mask: Mask = Mask()
+    mask: MaskSettings = MaskSettings()
     selfcal: SelfcalSettings = SelfcalSettings()
     stokes: StokesSettings = StokesSettings()
-    infer: Infer = Infer()
+    infer: InferSettings = InferSettings()
     surface: SurfaceSettings = SurfaceSettings()
-    asset: Asset = Asset()
+    asset: AssetSettings = AssetSettings()
     gates: GateLimits = GateLimits()
 
 

@@ -27,7 +27,7 @@ GLOSSY = Coat((Material((0.12, 0.08, 0.06), (0.45, 0.4, 0.3), "chequer", size=0.
 BALL = Scene(
     shape=Cluster(((0, 0, 0, 0.08),)), coat=GLOSSY, position=(0.0, 0.0, -0.7), light=(0.0, 0.05, 0.0), chart=None
 )
-NONE = lambda: (None, None)  # noqa: E731 (no network)
+NONE = (None, None)  # no network
 SHOOT = Shoot(width=320, height=240, exposures=1, samples=1, cross=True, exposure_factor=2.0, gain_jitter=0.002)
 
 

@@ -4,6 +4,7 @@ import numpy as np
 
 from polcap.formats import shipped_data
 from polcap.images import Floats, Mesh, SurfaceMaps
+from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.sharpness import TILE
 from polcap.quality.gate import Evidence, Gate, State, Unit, at_most, blamed
 from polcap.quality.limits import GateLimits
@@ -16,9 +17,9 @@ def alignment(found: Evidence, limits: GateLimits, align: AlignSettings) -> Gate
     """Movement of the camera or the object between shots, in px of the processed picture, and its error."""
     measured, names = found.alignment, found.names
     height, width = found.radiance.value.shape[1:3]
-    corners = np.array([[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]], float).T
-    at = measured.transform @ corners  # (K, 3, 4)
-    shift = np.abs(at[:, :2] / at[:, 2:] - corners[:2]).max((1, 2)) * found.grid_px
+    corners = picture_corners(width, height)
+    moved = np.stack([transform_points(matrix, corners) for matrix in measured.transform])  # (K, 4, 2)
+    shift = np.abs(moved - corners).max((1, 2)) * found.grid_px
     limit = align.max_shift_px
     lost = (measured.correlation < align.min_correlation) | ~np.isfinite(shift)
     doubt = measured.residual_px * found.grid_px

@@ -22,6 +22,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap.formats import onnx
 from polcap.formats.maps import png
 from polcap.images import AngleStack, Floats, Network, ObjectMask, single_frames
 from polcap.optics import fresnel, mueller
@@ -169,7 +170,9 @@ def solved(case: Lit, seed: int) -> Any:
 
 
 def _spoken(image: Any) -> dict[str, str]:
-    maps = infer.estimate(cues.compute(image, scenes.no_color()), _network(), infer.Settings(symmetries=1, fine=False))
+    maps = infer.estimate(
+        cues.compute(image, scenes.no_color()), _network(), onnx.run, infer.InferSettings(symmetries=1, fine=False)
+    )
     found = Evidence.partial(
         stokes=image, radiance=SimpleNamespace(angle=ANGLE), gains=scenes.equal(), names=["0°", "45°", "90°"], maps=maps
     )

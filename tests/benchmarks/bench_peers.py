@@ -131,9 +131,7 @@ def registering(stack: AngleStack, folder: Path) -> Iterator[Row]:
             found.append(np.vstack([motion, [0, 0, 1]]))
 
     theirs = least(ecc)
-    color = whitebalance.measure(
-        stack, shipped_data.colorchecker(), ChartRequest("none"), WhitebalanceSettings()
-    )
+    color = whitebalance.measure(stack, shipped_data.colorchecker(), ChartRequest("none"), WhitebalanceSettings())
     ours = least(lambda: align.register(stack, color, align.Settings()))
     own = align.register(stack, color, align.Settings()).transform[1:]
     size = stack.value.shape[1:3]

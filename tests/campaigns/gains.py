@@ -57,9 +57,7 @@ def main() -> None:
         errors.append(float(error.max()))
         sigma = float(found.gains.sigma.max())
         states.append(gate.state)
-        rows.append(
-            (seed, case.look, f"{100 * errors[-1]:.2f} %", f"{100 * sigma:.2f} %", gate.state)
-        )
+        rows.append((seed, case.look, f"{100 * errors[-1]:.2f} %", f"{100 * sigma:.2f} %", gate.state))
         if given.parts:
             print(seed, case.look, *parts(radiance, object_, angle, true), flush=True)
     print(lit_objects.shown(rows, ("seed", "look", "worst error", "1σ", "gate")))

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from polcap.errors import DecodeError
-from polcap.formats.raw import dng
 from polcap.formats.raw import libraw as raw
 from polcap.images import Exif
 from polcap.rig import retake_criteria
 from polcap.rig.camera import CameraFile
 from polcap.rig.exposure_bracket import Exposure
 from polcap.rig.retake_criteria import FrameFacts
+from tests.raw_files import write_raw
 from tests.rig.pool import ANGLES, Key, tiny
 
 SET = Exposure(time_s=0.02, f_number=11.0, iso=100.0)
@@ -75,32 +75,19 @@ def test_sharpness_is_equal_at_every_angle_and_falls_with_blur(pool: dict[Key, b
         assert retake_criteria.is_blurred(retake_criteria.inspect(tmp_path / "y.dng")[0].sharpness, max(sharp))
 
 
-def _write(path: Path, mosaic: np.ndarray) -> None:
-    dng.write(
-        path,
-        mosaic,
-        cfa=np.array([[0, 1], [1, 2]], np.uint8),
-        black=512,
-        white=15871,
-        exif=Exif(make="Polcap", model="Synthetic", exposure_time=0.02),
-        color_matrix=np.eye(3),
-        as_shot_neutral=np.ones(3),
-    )
-
-
 def blur(source: Path, target: Path, sigma_px: float) -> None:
     """Blur each color of a mosaic."""
     value = raw.read(source).value.astype(np.float32)
     for row, column in ((0, 0), (0, 1), (1, 0), (1, 1)):
         part = value[row::2, column::2]
         value[row::2, column::2] = cv2.GaussianBlur(np.ascontiguousarray(part), (0, 0), sigma_px / 2)
-    _write(target, np.rint(value).astype(np.uint16))
+    write_raw(target, np.rint(value).astype(np.uint16), Exif(make="Polcap", model="Synthetic", exposure_time=0.02))
 
 
 def test_clipped_share_is_counted(tmp_path: Path) -> None:
     mosaic = np.full((40, 60), 3000, np.uint16)
     mosaic[:10, :30] = 15871
-    _write(tmp_path / "x.dng", mosaic)
+    write_raw(tmp_path / "x.dng", mosaic, Exif(make="Polcap"))
     found, small = retake_criteria.inspect(tmp_path / "x.dng")
     assert found.clipped == pytest.approx(300 / 2400)
     assert small.shape == (20, 30) and small[15, 20] == pytest.approx((3000 - 512) / (15871 - 512), rel=1e-4)

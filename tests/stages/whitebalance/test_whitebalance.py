@@ -1,4 +1,4 @@
-"""The chart found where it is, refused where it is not, and colours on the scale of its white patch."""
+"""The chart found where it is, refused where it is not, and colors on the scale of its white patch."""
 
 import functools
 
@@ -9,6 +9,7 @@ import pytest
 from polcap.errors import ChartError
 from polcap.formats import shipped_data
 from polcap.images import ChartReference, ChartRequest, ColorCalibration, ColorSensor, Floats, View
+from polcap.optics.projection import transform_points
 from polcap.stages import whitebalance
 from polcap.stages.whitebalance import WhitebalanceSettings, chart, chart_in_mask, patches
 from tests.stages.whitebalance.chart_pictures import AUTO, CAMERA, CLASSIC, HEIGHT, WIDTH, draw, photograph, pose, stack
@@ -24,7 +25,7 @@ def centers_off(color: ColorCalibration, homography: Floats) -> Floats:
     """Distance of each found patch centre from the true one (24,), px."""
     assert color.quads is not None
     found = np.array([_center(quad) for quad in color.quads])
-    return np.linalg.norm(found - chart.project(homography, chart.centers()), axis=-1)
+    return np.linalg.norm(found - transform_points(homography, chart.centers()), axis=-1)
 
 
 def _center(quad: Floats) -> Floats:
@@ -51,7 +52,8 @@ def test_chart_of_eight_pixel_patches_is_known_by_its_colors():
     raw = photograph(pose(17, 2, (235, 185)), samples=1)
     image = np.stack([raw[::2, ::2, 0], raw[::2, 1::2, 1], raw[1::2, 1::2, 2]], axis=-1)
     place = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]]) @ pose(17, 2, (235, 185))
-    assert chart.refine(image / image.max(), chart.from_centers(chart.project(place, chart.centers()))).explained < 0.9
+    start = chart.from_centers(transform_points(place, chart.centers()))
+    assert chart.refine(image / image.max(), start).explained < 0.9
     color = whitebalance.measure(stack(image), CLASSIC, AUTO, WhitebalanceSettings())
     assert color.source == "chart" and centers_off(color, place).max() < 0.3
     assert np.nanmean(color.delta_e) < 1
@@ -60,7 +62,7 @@ def test_chart_of_eight_pixel_patches_is_known_by_its_colors():
 def test_chart_that_was_taken_for_the_object_is_recognized():
     image, place = plain()
     card = np.zeros(image.shape[:2], np.uint8)
-    edge = chart.project(place, np.array([[-0.1, -0.1], [6.1, -0.1], [6.1, 4.1], [-0.1, 4.1]]))
+    edge = transform_points(place, np.array([[-0.1, -0.1], [6.1, -0.1], [6.1, 4.1], [-0.1, 4.1]]))
     cv2.fillConvexPoly(card, np.round(edge).astype(np.int32), 1)
     ball = np.hypot(*np.mgrid[-60 : HEIGHT - 60.0, -70 : WIDTH - 70.0]) < 50
     both = (card > 0) | ball
@@ -75,7 +77,7 @@ def test_chart_that_was_taken_for_the_object_is_recognized():
 def test_s0_of_the_white_patch_is_its_reflectance():
     image, place = plain()
     color = whitebalance.measure(stack(image), CLASSIC, AUTO, WhitebalanceSettings())
-    x, y = np.round(chart.project(place, np.array([0.5, 3.5]))).astype(int)
+    x, y = np.round(transform_points(place, np.array([0.5, 3.5]))).astype(int)
     s0 = 2 * image[y - 4 : y + 5, x - 4 : x + 5].mean(axis=(0, 1))
     assert color.matrix @ s0 == pytest.approx(CLASSIC.rec709[18], abs=0.01)
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.02)
@@ -107,7 +109,7 @@ def test_matrix_ignores_exposure_and_the_place_does_too():
 def test_sloping_light_and_glare_are_taken_out_of_the_matrix():
     image, place = plain()
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
-    u, v = np.moveaxis(chart.project(np.linalg.inv(place), np.stack([x, y], axis=-1)), -1, 0)
+    u, v = np.moveaxis(transform_points(np.linalg.inv(place), np.stack([x, y], axis=-1)), -1, 0)
     light = 1 + 0.03 * (u - 0.5) - 0.02 * (v - 3.5)
     veil = 0.02 * CAMERA.sum(axis=1) / 2
     color = whitebalance.measure(stack(image * light[..., None] + veil), CLASSIC, AUTO, WhitebalanceSettings())
@@ -128,7 +130,7 @@ def test_overexposed_patches_are_left_out():
 
 def test_a_chart_burnt_out_asks_for_a_shorter_exposure():
     image, place = plain()
-    corners = 2 * chart.from_centers(chart.project(place, chart.centers())).corners() + 0.5
+    corners = 2 * chart.from_centers(transform_points(place, chart.centers())).corners() + 0.5
     with pytest.raises(ChartError, match=r"over-exposed.*shorter exposure"):
         whitebalance.measure(
             stack(image, clip=0.02), CLASSIC, ChartRequest("corners", corners=corners), WhitebalanceSettings()
@@ -139,7 +141,7 @@ def painted(place: Floats, columns: slice, rows: slice, color: Floats | float) -
     """`plain()`, with something over these columns and rows of the chart: (u, v) 0…6 × 0…4."""
     image, _ = plain()
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
-    u, v = np.moveaxis(chart.project(np.linalg.inv(place), np.stack([x, y], axis=-1)), -1, 0)
+    u, v = np.moveaxis(transform_points(np.linalg.inv(place), np.stack([x, y], axis=-1)), -1, 0)
     over = (u > columns.start) & (u < columns.stop) & (v > rows.start) & (v < rows.stop)
     return np.where(over[..., None], color if np.ndim(color) else color * image, image)
 
@@ -184,7 +186,7 @@ def test_block_of_an_sg_chart_is_read_at_its_corners_and_only_there():
         whitebalance.measure(stack(image), sg, AUTO, WhitebalanceSettings(chart="sg"))
 
 
-def test_24_patches_of_other_colours_are_refused():
+def test_24_patches_of_other_colors_are_refused():
     place = pose(24, 8, (260, 170))
     shuffled = np.random.default_rng(5).permutation(CLASSIC.rec709)
     with pytest.raises(ChartError, match=r"max_delta_e = 15.*--no-chart"):
@@ -199,7 +201,7 @@ def test_a_mirrored_chart_is_refused():
 
 def test_a_chart_too_small_to_be_read_is_told_with_the_size_it_needs():
     small = photograph(pose(7.6, 3, (260, 170)))
-    with pytest.raises(ChartError, match=r"patches 15 RAW px apart, at least 16 are needed: show it larger"):
+    with pytest.raises(ChartError, match=r"patches are spaced by 15 RAW px, at least 16 are needed: show it larger"):
         whitebalance.measure(stack(small), CLASSIC, AUTO, WhitebalanceSettings())
 
 
@@ -220,10 +222,10 @@ def test_manual_corners_in_raw_pixels_are_drawn_to_the_chart():
     assert color.corners == pytest.approx(exact, abs=0.15)
 
 
-def test_corners_from_the_wrong_end_say_so():
+def test_corners_from_the_wrong_end_are_named():
     image, place = plain()
     corners = 2 * chart.Placement(place, 0.87, 0.01, 1.0).corners() + 0.5
-    with pytest.raises(ChartError, match="other way up"):
+    with pytest.raises(ChartError, match="upside down"):
         request = ChartRequest("corners", corners=np.roll(corners, 2, axis=0))
         whitebalance.measure(stack(image), CLASSIC, request, WhitebalanceSettings())
 
@@ -234,7 +236,7 @@ def test_corners_from_the_wrong_end_say_so():
         (None, "four outer patch corners"),
         ([[10, 10], [10, 200], [300, 200], [300, 10]], "clockwise"),
         ([[10, 10], [3000, 10], [3000, 2000], [10, 2000]], "outside the image"),
-        ([[10, 10], [40, 10], [40, 30], [10, 30]], "px apart"),
+        ([[10, 10], [40, 10], [40, 30], [10, 30]], "space the patches by"),
         ([[10, 10], [310, 10], [310, 210], [10, 210]], "do not show a ColorChecker Classic"),
     ],
 )
