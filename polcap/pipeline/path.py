@@ -34,25 +34,20 @@ STAGES = tuple(_FIELD)
 
 @dataclass(frozen=True)
 class UserInput:
-    """Inputs of the path besides the photographs."""
+    """Inputs of the path besides the list of photographs."""
 
     chart: ChartRequest = AUTO
     mask: NDArray[np.bool_] | None = None  # on the RAW pixels or on the grid of the merged picture
     network: Network | None = None  # None: the analytic estimator
     mask_network: Network | None = None  # None: the object is found by its contrast to the backdrop
+    decode: Decode = frame_decoder.decode  # the pixels of a photograph
 
 
-def path(
-    capture: Capture | None,
-    supplied: UserInput,
-    config: Config,
-    cache: MemoryCache,
-    decode: Decode = frame_decoder.decode,
-) -> Results:
+def path(capture: Capture | None, supplied: UserInput, config: Config, cache: MemoryCache) -> Results:
     """The results of all stages, or of the first ones where the cache stops the path."""
     with suppress(StageReached):
         reference = shipped_data.colorchecker(config.whitebalance.chart)
-        radiance = cache.run(hdr.merge, capture, decode, config=config.hdr)
+        radiance = cache.run(hdr.merge, capture, supplied.decode, config=config.hdr)
         color = cache.run(whitebalance.measure, radiance, reference, supplied.chart, config=config.whitebalance)
         alignment = cache.run(align.register, radiance, color, config=config.align)
         drawn = cache.derive(on_grid, supplied.mask, radiance)

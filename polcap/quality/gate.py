@@ -38,7 +38,7 @@ class Gate(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True)
-class Evidence(Results):
+class GateEvidence(Results):
     """Everything that gates judge: the results of a path at full size or reduced, and facts that reducing hides.
 
     A path that was stopped early has only some of them, as `Results`; without a mesh its gate is left out.
@@ -52,10 +52,10 @@ class Evidence(Results):
     chart_missing: str = ""  # the reason, where a chart was expected and none was found
 
 
-def full_size(results: Results, focal_doubt: tuple[float, float]) -> Evidence:
+def full_size(results: Results, focal_doubt: tuple[float, float]) -> GateEvidence:
     """The evidence of a run of `process`; of its merged pictures one stands for all exposures."""
     radiance = results.radiance
-    return Evidence.partial(
+    return GateEvidence.partial(
         **vars(results),
         names=[f"{degrees:g}°" for degrees in np.round(np.degrees(radiance.angle), 6)],
         focal_doubt=focal_doubt,

@@ -12,12 +12,12 @@ import numpy as np
 from polcap.config import Config, Gates
 from polcap.images import SurfaceMaps
 from polcap.quality import geometry, light, polarization
-from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, Unit
+from polcap.quality.gate import MOST_DEG, Gate, GateEvidence, State, Unit
 
-__all__ = ["Evidence", "Gate", "State", "Unit", "judge", "verdict"]
+__all__ = ["Gate", "GateEvidence", "State", "Unit", "judge", "verdict"]
 
 
-def judge(found: Evidence, config: Config) -> Iterator[Gate]:
+def judge(found: GateEvidence, config: Config) -> Iterator[Gate]:
     """The gates, in the order of the path.
 
     Raises
@@ -42,7 +42,7 @@ def verdict(gates: Iterable[Gate]) -> State:
     return "fail" if "fail" in states else "warn" if "warn" in states else "pass"
 
 
-def _in_order(found: Evidence, config: Config) -> Iterator[Gate]:
+def _in_order(found: GateEvidence, config: Config) -> Iterator[Gate]:
     limits = config.gates
     yield light.bracket(found)
     yield light.tone(found, limits)
@@ -63,7 +63,7 @@ def _in_order(found: Evidence, config: Config) -> Iterator[Gate]:
     yield geometry.focal_length(found)
 
 
-def _normal_error(found: Evidence, judged: list[Gate], limits: Gates) -> Gate:
+def _normal_error(found: GateEvidence, judged: list[Gate], limits: Gates) -> Gate:
     """The median expected error, with what the other gates add to it."""
     own = _own_error(found.maps)
     expected = min(float(np.sqrt(own**2 + sum(gate.cost_deg**2 for gate in judged))), MOST_DEG)

@@ -6,12 +6,12 @@ from polcap.config import Config, Gates
 from polcap.formats import shipped_data
 from polcap.images import Floats, Mesh, SurfaceMaps
 from polcap.optics.sharpness import TILE
-from polcap.quality.gate import Evidence, Gate, State, Unit, at_most, blamed
+from polcap.quality.gate import Gate, GateEvidence, State, Unit, at_most, blamed
 from polcap.stages.align import object_motion
 from polcap.stages.whitebalance import chart_in_mask
 
 
-def alignment(found: Evidence, config: Config) -> Gate:
+def alignment(found: GateEvidence, config: Config) -> Gate:
     """How far camera or object moved from shot to shot, in px of the picture that is processed, and how surely."""
     measured, names = found.alignment, found.names
     height, width = found.radiance.value.shape[1:3]
@@ -42,7 +42,7 @@ def alignment(found: Evidence, config: Config) -> Gate:
     return Gate("alignment", "fail", value, limit, says, remedy, 10.0, blamed(names, bad), unit)
 
 
-def _pushed(found: Evidence, config: Config) -> Gate | None:
+def _pushed(found: GateEvidence, config: Config) -> Gate | None:
     """An object that moved while what is around it stood still."""
     displacement = _displacement(found) * found.grid_px
     limit = config.gates.max_object_shift_px
@@ -59,11 +59,11 @@ def _pushed(found: Evidence, config: Config) -> Gate | None:
     return Gate("alignment", "fail", figure, limit, says, remedy, cost, blamed(found.names, bad), "px")
 
 
-def _displacement(found: Evidence) -> Floats:
+def _displacement(found: GateEvidence) -> Floats:
     return object_motion.measure(found.radiance, found.alignment, found.object_)
 
 
-def mask(found: Evidence, limits: Gates) -> Gate:
+def mask(found: GateEvidence, limits: Gates) -> Gate:
     """Fails where a chart is in it or the network doubts it; warns from half of that on, and of shapes none has."""
     object_, limit, doubt = found.object_, limits.max_mask_doubt, found.object_.doubt
     faults: list[tuple[str, float, float]] = []  # in words, its figure, its limit
@@ -98,7 +98,7 @@ def mask(found: Evidence, limits: Gates) -> Gate:
     return Gate("mask", state, round(value, 5), most, "; ".join(fault[0] for fault in faults), remedy, cost)
 
 
-def _charted(found: Evidence) -> float:
+def _charted(found: GateEvidence) -> float:
     return float(chart_in_mask.share(found.radiance, found.object_.mask, shipped_data.colorchecker()))
 
 
@@ -134,7 +134,7 @@ def mesh(of: Mesh, limits: Gates) -> Gate:
     return Gate("mesh", "pass", round(of.cuts, 4), cuts, says)
 
 
-def sharpness(found: Evidence, limits: Gates) -> Gate:
+def sharpness(found: GateEvidence, limits: Gates) -> Gate:
     """Every frame against the frames of the same exposure in the other shots."""
     blur, limit = found.blur_px, limits.max_blur_px
     moved = float(np.abs(found.alignment.transform[:, :2, 2]).max()) * found.grid_px
@@ -149,7 +149,7 @@ def sharpness(found: Evidence, limits: Gates) -> Gate:
     return at_most("sharpness", float(blur[k, e]), limit, says, remedy, bad, 3, "px")
 
 
-def focal_length(found: Evidence) -> Gate:
+def focal_length(found: GateEvidence) -> Gate:
     """Whether it is known; where not, what it costs: normals stand on view rays, which lean as it says."""
     least, most = found.focal_doubt
     if not most - least:

@@ -8,7 +8,7 @@ import numpy as np
 
 from polcap.config import Gates
 from polcap.images import AngleStack, Floats, Quality, StokesImage
-from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, blamed
+from polcap.quality.gate import DEGREES_PER_GAIN, Gate, GateEvidence, State, at_most, blamed
 from polcap.stages.whitebalance import patches
 
 _EVEN_STEPS = (1.3, 20.0)  # from one exposure to the next: less is no bracket, more leaves a gap
@@ -22,7 +22,7 @@ _FEW = 20  # px
 _GLOSS_PART = 0.3  # of the chart's gloss goes into gains taken from its light patches
 
 
-def bracket(found: Evidence) -> Gate:
+def bracket(found: GateEvidence) -> Gate:
     """The bracket as the pixels tell it, and where that is not what the camera promises, why."""
     radiance = found.radiance
     ratio = np.sort(radiance.bracket.exposure_ratio.mean((0, 2)))  # (E,)
@@ -48,7 +48,7 @@ def bracket(found: Evidence) -> Gate:
     return Gate("exposures", "pass", round(float(steps.max()), 3), most, says, unit="×")
 
 
-def tone(found: Evidence, limits: Gates) -> Gate:
+def tone(found: GateEvidence, limits: Gates) -> Gate:
     """Whether the pixels are linear: a tone curve changes the ratio of two exposures with brightness."""
     radiance = found.radiance
     limit = limits.max_tone_curvature
@@ -69,7 +69,7 @@ def tone(found: Evidence, limits: Gates) -> Gate:
     return at_most("tone curve", worst, limit, says, remedy, cost_deg=60 * worst, unit="")
 
 
-def source(found: Evidence) -> Gate:
+def source(found: GateEvidence) -> Gate:
     """Whether the pictures are the sensor's own counts."""
     if not found.radiance.sensor.lossy:
         return Gate(
@@ -80,7 +80,7 @@ def source(found: Evidence) -> Gate:
     return Gate("source", "warn", "lossy", "linear counts", says, remedy, 5.0, unit="")
 
 
-def noise(found: Evidence, limits: Gates) -> Gate:
+def noise(found: GateEvidence, limits: Gates) -> Gate:
     """The polarization that noise alone fakes, in the object's median pixel."""
     figure, limit = _noise(found.stokes), limits.max_dolp_noise
     says = f"noise fakes a polarization of {100 * figure:.1f} % in the median pixel of the object"
@@ -94,7 +94,7 @@ def _noise(image: StokesImage) -> float:
     return float(np.median(spread / light)) if len(light) else float("nan")
 
 
-def stillness(found: Evidence, limits: Gates) -> Gate:
+def stillness(found: GateEvidence, limits: Gates) -> Gate:
     """How much of a shot differs between its exposures."""
     fraction = found.radiance.bracket.ghost_fraction
     k = int(np.argmax(fraction))
@@ -104,7 +104,7 @@ def stillness(found: Evidence, limits: Gates) -> Gate:
     return at_most("stillness", float(fraction[k]), limits.max_ghost, says, remedy, bad, cost_deg=5)
 
 
-def chart(found: Evidence, limits: Gates) -> Gate:
+def chart(found: GateEvidence, limits: Gates) -> Gate:
     """How well the chart's colors are met, where there is one."""
     limit = limits.max_delta_e
     if found.chart_missing:
@@ -131,7 +131,7 @@ def chart(found: Evidence, limits: Gates) -> Gate:
     return at_most("chart", mean, limit, says, remedy, unit="ΔE2000")
 
 
-def clipping(found: Evidence, limits: Gates) -> Gate:
+def clipping(found: GateEvidence, limits: Gates) -> Gate:
     """How much of the object is clipped even in the shortest exposure."""
     # of the darkest frame
     clipped, limit = found.clipped[:, :, found.object_.mask].mean(2).min(1), limits.max_clipped
@@ -143,7 +143,7 @@ def clipping(found: Evidence, limits: Gates) -> Gate:
     )
 
 
-def gains(found: Evidence, limits: Gates) -> Iterator[Gate]:
+def gains(found: GateEvidence, limits: Gates) -> Iterator[Gate]:
     """The light of every frame against the others', and how far that is known."""
     measured, radiance, names = found.selfcal.gains, found.radiance, found.names
     shot = measured.gain.mean(1)
@@ -166,7 +166,7 @@ def gains(found: Evidence, limits: Gates) -> Iterator[Gate]:
     yield at_most("energy", float(abs(drift[k, e])), limit, says, why.replace("between shots", "within a bracket"), bad)
 
 
-def _gain_doubt(found: Evidence, limits: Gates) -> Gate:
+def _gain_doubt(found: GateEvidence, limits: Gates) -> Gate:
     """How far the gains themselves are to be trusted."""
     measured = found.selfcal.gains
     limit = limits.max_gain_doubt
@@ -208,7 +208,7 @@ def _grade(cost_deg: float) -> State:
     return "fail" if cost_deg > 15 else "warn"
 
 
-def crossed(found: Evidence, limits: Gates) -> Iterator[Gate]:
+def crossed(found: GateEvidence, limits: Gates) -> Iterator[Gate]:
     """Whether the cross-polarised shot shows what it should: less light than S0, and nothing clipped where S0 clips."""
     if found.radiance.crossed is None:
         return
@@ -248,7 +248,7 @@ def _crossed(image: StokesImage) -> dict[str, Any]:
     return {"left": left, "clipped": int(clipped.sum()), "over": over, "mirrored": mirrored}
 
 
-def ambient(found: Evidence, limits: Gates) -> Gate:
+def ambient(found: GateEvidence, limits: Gates) -> Gate:
     """The share of ambient light, where it was photographed."""
     share = found.radiance.bracket.ambient_share
     limit = limits.max_ambient

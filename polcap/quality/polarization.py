@@ -11,7 +11,7 @@ from polcap.images import Floats, Quality, SelfCalibration, ShotOrder, StokesIma
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
 from polcap.quality import rim
-from polcap.quality.gate import Evidence, Gate, at_most
+from polcap.quality.gate import Gate, GateEvidence, at_most
 
 _LEAST_RIM = 200  # pixels of outline that an angle can be told from
 _LEAST_DOLP = 0.01  # of the outline; there the least index has ten times that
@@ -30,7 +30,7 @@ _ALONG = -0.3  # how well the AoLP lies across the contour, below: along it
 _MOST_PIXELS = 6e5  # a larger picture is averaged down
 
 
-def order(found: Evidence) -> Gate:
+def order(found: GateEvidence) -> Gate:
     """Whether the outline supports the stated order and sense of the angles."""
     outline, names = found.selfcal.outline, found.names
     if outline.as_stated and outline.rival is not None:
@@ -52,7 +52,7 @@ def _named(order: ShotOrder, names: list[str]) -> str:
     return ", ".join(names[i] for i in order.shots) + (", counted the other way" if order.mirrored else "")
 
 
-def of_outline(found: Evidence, limits: Gates) -> Iterator[Gate]:
+def of_outline(found: GateEvidence, limits: Gates) -> Iterator[Gate]:
     """What the outline says of the angles, of the body and of other light."""
     angle, limit = found.selfcal.angle - found.selfcal.ring.correction, limits.max_turn_deg
     seen = _outline(found, limit, angle)
@@ -84,7 +84,7 @@ class OutlineFigures:
     side: Floats  # (K,) how much brighter one side is than the other in each shot
 
 
-def _outline(found: Evidence, limit_deg: float, angle: Floats) -> OutlineFigures | None:
+def _outline(found: GateEvidence, limit_deg: float, angle: Floats) -> OutlineFigures | None:
     """Figures of the outline; turns below the limit are not tried; angle (K,) rad. None: it is too short."""
     band = rim.take(*_reduced(found.stokes, angle))
     if len(band.azimuth) < _LEAST_RIM:
@@ -93,7 +93,7 @@ def _outline(found: Evidence, limit_deg: float, angle: Floats) -> OutlineFigures
     return OutlineFigures(rim.body(band, angle), turn, rim.side_light(band))
 
 
-def ill_posed(found: Evidence, limits: Gates) -> Gate:
+def ill_posed(found: GateEvidence, limits: Gates) -> Gate:
     """How much of the object is polarized as no dielectric is."""
     share = _ill_posed(found)
     says = f"{100 * share:.1f} % of the object is polarized as no dielectric is"
@@ -101,7 +101,7 @@ def ill_posed(found: Evidence, limits: Gates) -> Gate:
     return at_most("ill-posed", share, limits.max_ill_posed, says, remedy, cost_deg=30 * share)
 
 
-def _ill_posed(found: Evidence) -> float:
+def _ill_posed(found: GateEvidence) -> float:
     image = found.stokes
     inside = image.quality[image.mask]
     return float(((inside & int(Quality.ILL_POSED)) > 0).mean()) if inside.size else 0.0
@@ -181,7 +181,7 @@ def _with_ring(gate: Gate, selfcal: SelfCalibration, limits: Gates) -> Gate:
     return Gate("angles", "warn", value, limit if noted else limits.max_turn_deg, says, remedy, cost, unit="°")
 
 
-def _light_of_body(body: rim.Body, found: Evidence, limits: Gates) -> Gate:
+def _light_of_body(body: rim.Body, found: GateEvidence, limits: Gates) -> Gate:
     """Whether the outline is polarized as a body under a flash by the lens: across the contour, and enough.
 
     A rough body polarizes as little as a translucent one. The estimators allow for roughness, and then find a shape as

@@ -28,7 +28,7 @@ from polcap.images import AngleStack, Floats, Network, ObjectMask, single_frames
 from polcap.optics import fresnel, mueller
 from polcap.pipeline import models
 from polcap.quality import polarization
-from polcap.quality.gate import Evidence
+from polcap.quality.gate import GateEvidence
 from polcap.stages import cues, infer, stokes
 from polcap.synth import scene_materials
 from polcap.synth.render import Seen
@@ -172,7 +172,7 @@ def _spoken(image: Any) -> dict[str, str]:
     maps = infer.estimate(
         cues.compute(image, scenes.no_color()), _network(), infer.InferSettings(symmetries=1, fine=False)
     )
-    found = Evidence.partial(
+    found = GateEvidence.partial(
         stokes=image, radiance=SimpleNamespace(angle=ANGLE), gains=scenes.equal(), names=["0°", "45°", "90°"], maps=maps
     )
     lines = [*polarization.of_outline(found, Gates()), polarization.ill_posed(found, Gates())]

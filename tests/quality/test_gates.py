@@ -18,13 +18,13 @@ from polcap.images import (
     TurnedShot,
 )
 from polcap.quality import gates
-from polcap.quality.gate import Evidence
+from polcap.quality.gate import GateEvidence
 from polcap.quality.gates import Gate
 from polcap.stages import selfcal, stokes
 from tests import scenes
 
 
-def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> Evidence:
+def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> GateEvidence:
     """A ball well photographed, or with something of it changed."""
     radiance = changed.pop("radiance", scenes.stack(noise=0.002, angles=angles))
     shots = len(radiance.angle)
@@ -43,7 +43,7 @@ def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> Evidence:
         "color": scenes.no_color(), "alignment": scenes.still(shots), "object_": object_, "selfcal": calibration,
         "stokes": image, "maps": maps,
     }  # fmt: skip
-    return Evidence.partial(**{**given, **changed})
+    return GateEvidence.partial(**{**given, **changed})
 
 
 def clipped(second_shot: float = 0.0) -> np.ndarray:
@@ -54,25 +54,25 @@ def clipped(second_shot: float = 0.0) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def good() -> Evidence:
+def good() -> GateEvidence:
     return found()
 
 
-def judged(of: Evidence) -> dict[str, Gate]:
+def judged(of: GateEvidence) -> dict[str, Gate]:
     return {gate.name: gate for gate in gates.judge(of, Config())}
 
 
-def failed(of: Evidence) -> list[str]:
+def failed(of: GateEvidence) -> list[str]:
     return [name for name, gate in judged(of).items() if gate.state == "fail"]
 
 
-def test_nothing_fails_on_a_good_capture(good: Evidence) -> None:
+def test_nothing_fails_on_a_good_capture(good: GateEvidence) -> None:
     assert failed(good) == []
     assert gates.verdict(judged(good).values()) == "warn"  # one exposure per shot
 
 
-def changed(good: Evidence, **fields: Any) -> Evidence:
-    return Evidence.partial(**{**vars(good), **fields})
+def changed(good: GateEvidence, **fields: Any) -> GateEvidence:
+    return GateEvidence.partial(**{**vars(good), **fields})
 
 
 def bracket(radiance: AngleStack, **measured: Any) -> AngleStack:
@@ -80,11 +80,11 @@ def bracket(radiance: AngleStack, **measured: Any) -> AngleStack:
     return replace(radiance, bracket=replace(radiance.bracket, **measured))
 
 
-def with_gains(good: Evidence, **fields: Any) -> dict[str, Any]:
+def with_gains(good: GateEvidence, **fields: Any) -> dict[str, Any]:
     return {"selfcal": replace(good.selfcal, gains=replace(good.selfcal.gains, **fields))}
 
 
-def test_each_gate_fails_alone(good: Evidence) -> None:
+def test_each_gate_fails_alone(good: GateEvidence) -> None:
     radiance, maps = good.radiance, good.maps
     still = good.alignment
     away = still.transform.copy()
@@ -110,7 +110,7 @@ def test_each_gate_fails_alone(good: Evidence) -> None:
 
 
 @pytest.mark.parametrize(("grid_px", "state"), [(1.0, "pass"), (2.0, "fail")])
-def test_a_push_counts_in_pixels_of_the_processed_picture(good: Evidence, grid_px: float, state: str) -> None:
+def test_a_push_counts_in_pixels_of_the_processed_picture(good: GateEvidence, grid_px: float, state: str) -> None:
     """One pixel is under the limit of 1.5; on pictures averaged down to half the side it is two, and above it."""
     pushed = np.array([[1.0, 0, 1], [0, 1, 0], [0, 0, 1]])
     radiance = scenes.before_backdrop([np.eye(3), pushed, np.eye(3)])
@@ -118,13 +118,13 @@ def test_a_push_counts_in_pixels_of_the_processed_picture(good: Evidence, grid_p
     assert gate.state == state and gate.shots == (("45°",) if state == "fail" else ())
 
 
-def test_what_follows_a_wrong_order_is_not_judged(good: Evidence) -> None:
+def test_what_follows_a_wrong_order_is_not_judged(good: GateEvidence) -> None:
     told = judged(changed(good, selfcal=replace(good.selfcal, outline=OutlineCheck(ShotOrder((2, 1, 0)), 0.9))))
     assert list(told)[-1] == "focal length" or told["order"].state == "fail"
     assert "angles" not in told
 
 
-def test_flash_bracketed_by_the_shutter_is_named(good: Evidence) -> None:
+def test_flash_bracketed_by_the_shutter_is_named(good: GateEvidence) -> None:
     alike = np.tile([[[1.0], [1.01], [0.99]]], (3, 1, 3))
     radiance = bracket(good.radiance, exposure_ratio=alike, exif_ratio=np.array([[0.25, 1, 4]] * 3))
     radiance = replace(radiance, equipment=Equipment("flash"))
@@ -133,27 +133,27 @@ def test_flash_bracketed_by_the_shutter_is_named(good: Evidence) -> None:
     assert "flash power, aperture or ISO" in gate.remedy
 
 
-def test_gains_nobody_knows_cost_degrees(good: Evidence) -> None:
+def test_gains_nobody_knows_cost_degrees(good: GateEvidence) -> None:
     doubtful = with_gains(good, source="object", sigma=np.array([[0.0] * 3, [0.02] * 3, [0.02] * 3]))
     gate = judged(changed(good, **doubtful))["gain doubt"]
     assert gate.state == "warn" and gate.cost_deg == pytest.approx(12)
     assert judged(changed(good, **doubtful))["normal error"].value > 10  # type: ignore[operator]
 
 
-def test_one_angle_that_keeps_four_shots_from_closing_fails(good: Evidence) -> None:
+def test_one_angle_that_keeps_four_shots_from_closing_fails(good: GateEvidence) -> None:
     turned = replace(good.selfcal, turned=TurnedShot((1,), np.radians(15), np.radians(2)))
     gate = judged(changed(good, selfcal=turned))["angles"]
     assert gate.state == "fail" and gate.shots == ("45°",) and "+15° ± 2°" in gate.says
 
 
 @pytest.mark.parametrize(("turn", "state"), [(1.5, "pass"), (5.0, "warn")])
-def test_a_turn_of_the_ring_is_told_though_taken_out(good: Evidence, turn: float, state: str) -> None:
+def test_a_turn_of_the_ring_is_told_though_taken_out(good: GateEvidence, turn: float, state: str) -> None:
     turned, doubt = np.radians([turn, 0.4])
     gate = judged(changed(good, selfcal=replace(good.selfcal, ring=RingZero(turned, doubt, turned))))["angles"]
     assert gate.state == state and f"{turn:+.1f}°" in gate.says and "taken out" in gate.says
 
 
-def shaped(good: Evidence, polarized: float, flattened: float, roughness: float, dimmed: bool = True) -> Any:
+def shaped(good: GateEvidence, polarized: float, flattened: float, roughness: float, dimmed: bool = True) -> Any:
     """The ball with a part of its polarization and of its tangents' slope, and whether it dims towards its outline."""
     image, maps = good.stokes, good.maps
     weak = image.stokes * np.array([1, polarized, polarized], np.float32)[:, None, None, None]
@@ -178,14 +178,14 @@ def shaped(good: Evidence, polarized: float, flattened: float, roughness: float,
     ],
 )
 def test_body_that_polarizes_too_little_for_its_shape_is_told(
-    good: Evidence, polarized: float, flattened: float, roughness: float, dimmed: bool, words: str
+    good: GateEvidence, polarized: float, flattened: float, roughness: float, dimmed: bool, words: str
 ) -> None:
     gate = judged(shaped(good, polarized, flattened, roughness, dimmed))["body"]
     assert gate.state == ("warn" if words else "pass"), gate
     assert words in gate.says and (gate.cost_deg > 10) == bool(words)
 
 
-def test_light_from_around_is_told(good: Evidence) -> None:
+def test_light_from_around_is_told(good: GateEvidence) -> None:
     image = good.stokes
     across = image.stokes * np.array([1, -1, -1], np.float32)[:, None, None, None]
     gate = judged(changed(good, stokes=replace(image, stokes=across)))["body"]
@@ -197,7 +197,7 @@ def test_light_from_around_is_told(good: Evidence) -> None:
     ("uneven", "ambient", "state"),
     [(0.47, 0.0, "pass"), (0.7, 0.0, "pass"), (0.0, 1.5, "warn"), (0.0, 6.0, "warn")],
 )
-def test_a_lopsided_body_is_no_light_from_the_side(good: Evidence, uneven: float, ambient: float, state: str) -> None:
+def test_a_lopsided_body_is_no_light_from_the_side(good: GateEvidence, uneven: float, ambient: float, state: str) -> None:
     """A body turned to one side is as polarized there as elsewhere; a lamp from there is not."""
     image = good.stokes
     across = np.linspace(-1, 1, image.mask.shape[1])[:, None] / (scenes.RADIUS / (image.mask.shape[1] / 2))
@@ -215,16 +215,16 @@ def test_a_ring_that_was_mended_is_told() -> None:
 
 
 @pytest.mark.parametrize(("name", "value"), [("border", 0.6), ("islands", 0.03), ("holes", 0.06)])
-def test_mask_of_a_doubtful_shape_warns(good: Evidence, name: str, value: Any) -> None:
+def test_mask_of_a_doubtful_shape_warns(good: GateEvidence, name: str, value: Any) -> None:
     gate = judged(changed(good, object_=replace(good.object_, **{name: value})))["mask"]
     assert gate.state == "warn" and "--mask" in gate.remedy
 
 
-def test_mask_that_its_network_doubts_fails(good: Evidence) -> None:
+def test_mask_that_its_network_doubts_fails(good: GateEvidence) -> None:
     assert failed(changed(good, object_=replace(good.object_, doubt=0.3))) == ["mask"]
 
 
-def test_assumed_focal_length_warns_and_costs_what_the_rays_would_lean(good: Evidence) -> None:
+def test_assumed_focal_length_warns_and_costs_what_the_rays_would_lean(good: GateEvidence) -> None:
     two = float(np.log(2.0))
     gate = judged(changed(good, focal_doubt=(-two, two)))["focal length"]
     longer = judged(changed(good, focal_doubt=(0.0, two)))["focal length"]
@@ -244,7 +244,7 @@ def test_assumed_focal_length_warns_and_costs_what_the_rays_would_lean(good: Evi
     ],
 )
 def test_mesh_in_shreds_fails_by_the_figure_that_is_over(
-    good: Evidence, fault: dict[str, float], words: str, unit: str
+    good: GateEvidence, fault: dict[str, float], words: str, unit: str
 ) -> None:
     whole = {"pieces": 1, "cuts": 0.3, "cut_px": 40.0, "raggedness": 0.1}
     passed = judged(changed(good, mesh=SimpleNamespace(**whole)))["mesh"]
@@ -263,7 +263,7 @@ def _within(gate: Gate, least: bool) -> bool:
     return value >= limit if least else value <= limit
 
 
-def test_what_is_beside_a_gate_s_words_is_the_figure_that_they_are_of(good: Evidence) -> None:
+def test_what_is_beside_a_gate_s_words_is_the_figure_that_they_are_of(good: GateEvidence) -> None:
     object_, still, image = good.object_, good.alignment, good.stokes
     unlike, unsure = np.array([1, 0.1, 1]), np.array([0, 0.5, 0])
     around = image.stokes * np.array([1, -1, -1], np.float32)[:, None, None, None]
@@ -284,7 +284,7 @@ def test_what_is_beside_a_gate_s_words_is_the_figure_that_they_are_of(good: Evid
         assert gate.state in ("warn", "fail") and not _within(gate, least), gate
 
 
-def test_four_angles_are_not_asked_of_who_has_shot_four(good: Evidence) -> None:
+def test_four_angles_are_not_asked_of_who_has_shot_four(good: GateEvidence) -> None:
     four = found(angles=np.radians([0.0, 45, 90, 135]))
     for of, asked in ((good, True), (four, False)):
         sigma = np.full_like(of.selfcal.gains.sigma, 0.2)
@@ -293,6 +293,6 @@ def test_four_angles_are_not_asked_of_who_has_shot_four(good: Evidence) -> None:
         assert doubtful["gain doubt"].cost_deg == doubtful["normal error"].value == 90  # no error is larger
 
 
-def test_a_passing_mask_tells_its_figure(good: Evidence) -> None:
+def test_a_passing_mask_tells_its_figure(good: GateEvidence) -> None:
     gate = judged(changed(good, object_=replace(good.object_, doubt=0.024)))["mask"]
     assert gate.state == "pass" and "2.4 %" in gate.says

@@ -10,7 +10,7 @@ from polcap.config import Config
 from polcap.errors import InputError
 from polcap.images import AngleStack, Equipment, Quality, View, single_frames
 from polcap.quality import gates
-from polcap.quality.gate import Evidence
+from polcap.quality.gate import GateEvidence
 from polcap.stages import align, asset, cues, infer, mask, selfcal, stokes, surface
 from tests import scenes
 
@@ -94,7 +94,7 @@ def run(radiance: AngleStack, drawn: np.ndarray | None) -> None:
         "radiance": radiance, "color": color, "alignment": alignment, "object_": object_, "selfcal": calibration,
         "stokes": image, "maps": maps, "mesh": mesh,
     }  # fmt: skip
-    told = list(gates.judge(Evidence.partial(**found), config))
+    told = list(gates.judge(GateEvidence.partial(**found), config))
     assert all(gate.says and gate.state in ("pass", "warn", "fail", "not measured") for gate in told)
     assert built.base_color.dtype == np.uint8
 
