@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.floating[Any]]
 Bits = NDArray[np.uint8]
+Device = Literal["cpu", "cuda", "auto"]
 Bools = NDArray[np.bool_]
 Role = Literal["shot", "ambient", "repeat", "chart", "cross"]
 NOT_IN_KEY = {"in_key": False}  # metadata of a field that says where or how, not what: two values are one input
@@ -537,17 +538,19 @@ class Cues:
 
 @dataclass(frozen=True)
 class Network:
-    """A loaded model: what it computes, and what its file says of itself."""
+    """A model file and the facts of its metadata; a `RunNetwork` function runs it."""
 
-    run: Callable[[Floats], dict[str, Floats]] = field(  # (1, N, H, W) → name → (1, n, H, W)
-        compare=False, repr=False, metadata=NOT_IN_KEY
-    )
     digest: str
     channels: tuple[str, ...]  # names of stages/cues, in order
     metadata: Mapping[str, str]
-    provider: str
-    fine: "Network | None" = None  # what adds relief to this one's normals
-    at_once: int = field(default=1, compare=False, metadata=NOT_IN_KEY)  # runs that may go side by side
+    fine: "Network | None" = None  # adds fine relief to the normals of this one
+    path: str = field(default="", metadata=NOT_IN_KEY)
+    device: Device = field(default="cpu", metadata=NOT_IN_KEY)
+    threads: int = field(default=0, metadata=NOT_IN_KEY)  # 0: as many as polcap may use
+    at_once: int = field(default=1, compare=False, metadata=NOT_IN_KEY)  # runs in parallel
+
+
+RunNetwork = Callable[[Network, Floats], dict[str, Floats]]  # (1, N, H, W) → name → (1, n, H, W); as `formats.onnx.run`
 
 
 @dataclass(frozen=True)

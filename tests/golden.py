@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap import Config, images, read_capture
-from polcap.formats import shipped_data
+from polcap.formats import onnx, shipped_data
 from polcap.formats.raw import frame_decoder
 from polcap.images import View
 from polcap.optics import frames
@@ -241,7 +241,7 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
 
     def segment() -> Any:
         found = models.load_mask_network(threads)
-        return mask.segment(shots(), registered, color, None, found, config.mask)
+        return mask.segment(shots(), registered, color, None, found, onnx.run, config.mask)
 
     def calibrate() -> Any:
         return selfcal.solve(shots(), registered, object_, color, config.selfcal)
@@ -253,10 +253,10 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
         return cues.compute(plain_stokes(shots(), object_), color)
 
     def estimate() -> Any:
-        return infer.estimate(stored_cues(inputs), None, config.infer)
+        return infer.estimate(stored_cues(inputs), None, onnx.run, config.infer)
 
     def estimate_by_network() -> Any:
-        return infer.estimate(stored_cues(inputs), network(), config.infer)
+        return infer.estimate(stored_cues(inputs), network(), onnx.run, config.infer)
 
     def integrate() -> Any:
         return surface.integrate(stored_maps(inputs), 0.7, config.surface)
@@ -402,7 +402,7 @@ def make_inputs() -> Arrays:
     chart = shipped_data.colorchecker(config.whitebalance.chart)
     color = whitebalance.measure(shots, chart, images.ChartRequest("auto"), config.whitebalance)
     registered = align.register(shots, color, config.align)
-    object_ = mask.segment(shots, registered, color, None, models.load_mask_network(1), config.mask)
+    object_ = mask.segment(shots, registered, color, None, models.load_mask_network(1), onnx.run, config.mask)
     calibration = selfcal.solve(shots, registered, object_, color, config.selfcal)
     assert color.quads is not None and color.corners is not None and color.light is not None
     found = {f"light.{name}": array for name, array in vars(color.light).items()}
@@ -415,7 +415,7 @@ def make_inputs() -> Arrays:
     found["cues.radiance"] = short(seen.radiance[::STEP, ::STEP] * inside[..., None])
     found["cues.ratio"] = short(seen.ratio[:, ::STEP, ::STEP] * inside)
     found["cues.ratio_sigma"] = short(seen.ratio_sigma[::STEP, ::STEP])
-    maps = infer.estimate(stored_cues(found), models.load_network("network", None, "cpu", 1), config.infer)
+    maps = infer.estimate(stored_cues(found), models.load_network("network", None, "cpu", 1), onnx.run, config.infer)
     found["maps.normal"] = short(np.moveaxis(maps.normal[..., :2] * inside[..., None], -1, 0))
     found["maps.diffuse"] = short(maps.diffuse * inside[..., None])
     found["maps.specular"] = short(maps.specular[..., 0] * inside)

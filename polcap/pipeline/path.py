@@ -16,10 +16,19 @@ from numpy.typing import NDArray
 
 from polcap.config import Config
 from polcap.errors import ObjectError
-from polcap.formats import shipped_data
+from polcap.formats import onnx, shipped_data
 from polcap.formats.maps import maps_folder
 from polcap.formats.raw import frame_decoder
-from polcap.images import AngleStack, Capture, ChartRequest, ColorCalibration, Decode, Mesh, Network, SurfaceMaps
+from polcap.images import (
+    AngleStack,
+    Capture,
+    ChartRequest,
+    ColorCalibration,
+    Decode,
+    Mesh,
+    Network,
+    SurfaceMaps,
+)
 from polcap.pipeline.cache import MemoryCache, StageReached, StageResult
 from polcap.results import Results
 from polcap.stages import align, asset, cues, hdr, infer, mask, selfcal, stokes, surface, whitebalance
@@ -51,11 +60,12 @@ def path(capture: Capture | None, supplied: UserInput, config: Config, cache: Me
         color = cache.run(whitebalance.measure, radiance, reference, supplied.chart, config=config.whitebalance)
         alignment = cache.run(align.register, radiance, color, config=config.align)
         drawn = cache.derive(on_grid, supplied.mask, radiance)
-        object_ = cache.run(mask.segment, radiance, alignment, color, drawn, supplied.mask_network, config=config.mask)
+        finder = supplied.mask_network
+        object_ = cache.run(mask.segment, radiance, alignment, color, drawn, finder, onnx.run, config=config.mask)
         calibration = cache.run(selfcal.solve, radiance, alignment, object_, color, config=config.selfcal)
         stokes_ = cache.run(stokes.solve, radiance, alignment, calibration, object_, config=config.stokes)
         cues_ = cache.run(cues.compute, stokes_, color)
-        maps = cache.run(infer.estimate, cues_, supplied.network, config=config.infer)
+        maps = cache.run(infer.estimate, cues_, supplied.network, onnx.run, config=config.infer)
         distance = cache.derive(distance_m, color, radiance)
         mesh = cache.run(surface.integrate, maps, distance, config=config.surface)
         # from the maps as their files hold them: `polcap export` then makes the same bytes

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from polcap.config import Config
+from polcap.formats import onnx
 from polcap.formats.capture import reader as captures
 from polcap.images import Capture, Floats, Network
 from polcap.optics import body, frames, fresnel
@@ -108,7 +109,7 @@ def surface_errors(found: Results, truth: dict[str, Floats], network: Network | 
         parts = found.stokes.stokes.copy()
         parts[1:] *= np.where(binned(truth["mask"]) > 0, share, 1)[..., None]
         seen = cues.compute(replace(found.stokes, stokes=parts), found.color)
-        maps = infer.estimate(seen, network, Config().infer)
+        maps = infer.estimate(seen, network, onnx.run, Config().infer)
         depth = surface.integrate(maps, distance_m(found.color, found.radiance), Config().surface).depth
     inside = (binned(truth["mask"]) == 1) & maps.mask
     angle = np.degrees(np.arccos(np.clip((normal * maps.normal).sum(-1), -1, 1)))[inside]

@@ -18,6 +18,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
+from polcap.formats import onnx
 from polcap.images import Cues
 from polcap.optics import frames
 from polcap.pipeline import models
@@ -47,8 +48,8 @@ def _measured(seen: Cues, model: Path | None, symmetries: Literal[1, 2, 4, 8]) -
     assert network is not None
     small = learned._resized(seen, int(network.metadata["native_size"]) / max(seen.mask.shape))
     settings = infer.InferSettings(symmetries=symmetries)
-    floor = _best(lambda: augmentation._run(channels(small), network))
-    stage = _best(lambda: infer.estimate(seen, network, settings))
+    floor = _best(lambda: augmentation._run(channels(small), network, onnx.run))
+    stage = _best(lambda: infer.estimate(seen, network, onnx.run, settings))
     return stage, floor, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 

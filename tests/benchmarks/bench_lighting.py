@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.config import Gates
+from polcap.formats import onnx
 from polcap.formats.maps import png
 from polcap.images import AngleStack, Floats, Network, ObjectMask, single_frames
 from polcap.optics import fresnel, mueller
@@ -170,7 +171,7 @@ def solved(case: Lit, seed: int) -> Any:
 
 def _spoken(image: Any) -> dict[str, str]:
     maps = infer.estimate(
-        cues.compute(image, scenes.no_color()), _network(), infer.InferSettings(symmetries=1, fine=False)
+        cues.compute(image, scenes.no_color()), _network(), onnx.run, infer.InferSettings(symmetries=1, fine=False)
     )
     found = GateEvidence.partial(
         stokes=image, radiance=SimpleNamespace(angle=ANGLE), gains=scenes.equal(), names=["0°", "45°", "90°"], maps=maps

@@ -197,7 +197,9 @@ def test_light_from_around_is_told(good: GateEvidence) -> None:
     ("uneven", "ambient", "state"),
     [(0.47, 0.0, "pass"), (0.7, 0.0, "pass"), (0.0, 1.5, "warn"), (0.0, 6.0, "warn")],
 )
-def test_a_lopsided_body_is_no_light_from_the_side(good: GateEvidence, uneven: float, ambient: float, state: str) -> None:
+def test_a_lopsided_body_is_no_light_from_the_side(
+    good: GateEvidence, uneven: float, ambient: float, state: str
+) -> None:
     """A body turned to one side is as polarized there as elsewhere; a lamp from there is not."""
     image = good.stokes
     across = np.linspace(-1, 1, image.mask.shape[1])[:, None] / (scenes.RADIUS / (image.mask.shape[1] / 2))

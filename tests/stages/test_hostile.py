@@ -8,6 +8,7 @@ import pytest
 
 from polcap.config import Config
 from polcap.errors import InputError
+from polcap.formats import onnx
 from polcap.images import AngleStack, Equipment, Quality, View, single_frames
 from polcap.quality import gates
 from polcap.quality.gate import GateEvidence
@@ -76,11 +77,11 @@ def run(radiance: AngleStack, drawn: np.ndarray | None) -> None:
     config, color = Config(), scenes.no_color()
     try:
         alignment = align.register(radiance, color, config.align)
-        object_ = mask.segment(radiance, alignment, color, drawn, None, config.mask)
+        object_ = mask.segment(radiance, alignment, color, drawn, None, onnx.run, config.mask)
         calibration = selfcal.solve(radiance, alignment, object_, color, config.selfcal)
         image = stokes.solve(radiance, alignment, calibration, object_, config.stokes)
         seen = cues.compute(image, color)
-        maps = infer.estimate(seen, None, config.infer)
+        maps = infer.estimate(seen, None, onnx.run, config.infer)
         mesh = surface.integrate(maps, None, config.surface)
         built = asset.build(maps, mesh, config.asset)
     except InputError as error:

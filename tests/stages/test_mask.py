@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from polcap.errors import ModelError, ObjectError
-from polcap.images import Network
 from polcap.stages import mask
 from polcap.stages.mask import graph_cut, mask_channels, regions
 from polcap.stages.mask import network as mask_network
 from tests import scenes
+from tests.fake_network import FakeNetwork, run
 
 CHANNEL = mask_channels.CHANNELS.index
 
@@ -20,12 +20,12 @@ def bright_is_object(inputs):
     return {"logit": np.where(inputs[:, CHANNEL("chart")] > 0, -9, 40 * (inputs[:, CHANNEL("log")]))[:, None]}
 
 
-def network(run=bright_is_object):
-    return Network(run, "of the test", mask_channels.CHANNELS, {"native_size": "160"}, "none")
+def network(answer=bright_is_object):
+    return FakeNetwork("of the test", mask_channels.CHANNELS, {"native_size": "160"}, answer=answer)
 
 
 def segment(radiance, color, user=None, model=None):
-    return mask.segment(radiance, scenes.still(), color, user, model, mask.MaskSettings())
+    return mask.segment(radiance, scenes.still(), color, user, model, run, mask.MaskSettings())
 
 
 def chart_color():
@@ -47,11 +47,11 @@ def test_the_ball_is_found_and_the_chart_is_not_the_object(model):
 def test_close_ups_show_the_found_part_with_its_estimate():
     seen = []
 
-    def run(inputs):
+    def answer(inputs):
         seen.append(inputs)
         return bright_is_object(inputs)
 
-    segment(scenes.stack(), chart_color(), model=network(run))
+    segment(scenes.stack(), chart_color(), model=network(answer))
     first, second, third = seen[::4]  # each pass in four positions
     assert third.shape == second.shape
     assert first.shape[2:] == (128, 160)  # 120 rows, up to a multiple of 16
@@ -69,8 +69,9 @@ def test_answers_that_depend_on_the_side_cancel():
         return {"logit": 5 * sum(inputs[:, CHANNEL(name)] for name in ("x", "y", "s2"))[:, None]}
 
     channels = np.random.default_rng(0).uniform(-1, 1, (len(mask_channels.CHANNELS), 20, 35)).astype(np.float32)
-    np.testing.assert_allclose(mask_network._run(network(one_sided), channels), 0.5, atol=1e-5)
-    fair = mask_network._run(network(lambda inputs: {"logit": inputs[:, CHANNEL("s1")][:, None]}), channels)
+    np.testing.assert_allclose(mask_network._run(network(one_sided), run, channels), 0.5, atol=1e-5)
+    by_s1 = network(lambda inputs: {"logit": inputs[:, CHANNEL("s1")][:, None]})
+    fair = mask_network._run(by_s1, run, channels)
     np.testing.assert_allclose(fair, 1 / (1 + np.exp(-channels[CHANNEL("s1")])), rtol=1e-5)
 
 
@@ -196,8 +197,9 @@ def test_expected_error_is_one_minus_the_mean_overlap():
 
 def test_parallel_passes_give_the_bytes_of_sequential_ones():
     stack, color = scenes.stack(noise=0.004), chart_color()
+    no_chart = np.zeros(stack.value.shape[1:3], np.uint8)
     found = [
-        mask_network.object_probability(stack, scenes.still(), color, np.zeros(stack.value.shape[1:3], np.uint8), model)
+        mask_network.object_probability(stack, scenes.still(), color, no_chart, model, run)
         for model in (network(), dataclasses.replace(network(), at_once=3))
     ]
     assert found[0].tobytes() == found[1].tobytes()

@@ -17,7 +17,7 @@ import numpy as np
 from msgspec import Meta
 
 from polcap.errors import ObjectError
-from polcap.images import Alignment, AngleStack, Bits, ColorCalibration, Floats, Network, ObjectMask
+from polcap.images import Alignment, AngleStack, Bits, ColorCalibration, Floats, Network, ObjectMask, RunNetwork
 from polcap.optics.warp import warp
 from polcap.stages import stage
 from polcap.stages.mask import backdrop, graph_cut, regions
@@ -45,6 +45,7 @@ def segment(
     color: ColorCalibration,
     user_mask: Bools | None,
     network: Network | None,
+    run: RunNetwork,
     settings: MaskSettings,
 ) -> ObjectMask:
     """The object on the reference grid, and a crop around it.
@@ -76,7 +77,7 @@ def segment(
     if network is None:
         return _object(backdrop.find_object(picture, zone, settings.min_area), "automatic", None, settings)
     patches = _chart_zone(radiance, color, 0.0)
-    probability = object_probability(radiance, alignment, color, patches, network)
+    probability = object_probability(radiance, alignment, color, patches, network, run)
     mask = regions.likely_regions(probability)
     if mask.any():
         colored = regions.clean(graph_cut.sharpen(picture, mask, patches, probability), probability)

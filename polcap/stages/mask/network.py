@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from polcap import parallel
-from polcap.images import Alignment, AngleStack, Bits, ColorCalibration, Floats, Network
+from polcap.images import Alignment, AngleStack, Bits, ColorCalibration, Floats, Network, RunNetwork
 from polcap.optics import mueller
 from polcap.optics.resize import area_mean
 from polcap.optics.warp import warp
@@ -24,14 +24,15 @@ _MIRRORS = ((), (0,), (1,), (0, 1))  # axes of the mirror images that are averag
 
 
 def object_probability(
-    radiance: AngleStack, alignment: Alignment, color: ColorCalibration, chart: Bits, network: Network
-) -> Floats:
+    radiance: AngleStack, alignment: Alignment, color: ColorCalibration, chart: Bits, network: Network,
+    run: RunNetwork,
+) -> Floats:  # fmt: skip
     """Probability (H, W) 0…1 of each pixel of the reference grid to be the object; `chart` (H, W) is 1 on the chart."""
     height, width = chart.shape
     whole = (0, 0, width, height)
     picture = reduced_picture(radiance, alignment, color, chart, whole, int(network.metadata["native_size"]))
     bright = brightness(picture.color)
-    out = _enlarge(_run(network, encode(picture, bright)), whole)
+    out = _enlarge(_run(network, run, encode(picture, bright)), whole)
     for _ in range(_CLOSE_UPS):
         box = box_around(out > _LIKELY, _ROOM, least=8)
         if box is None:
@@ -40,7 +41,7 @@ def object_probability(
         picture = reduced_picture(radiance, alignment, color, chart, box, _CLOSE_UP_PX)
         estimate = area_mean(out[y0:y1, x0:x1], picture.chart.shape)
         out = np.minimum(out, _LIKELY)  # outside the box
-        out[y0:y1, x0:x1] = _enlarge(_run(network, encode(picture, bright, estimate)), box)
+        out[y0:y1, x0:x1] = _enlarge(_run(network, run, encode(picture, bright, estimate)), box)
     return out
 
 
@@ -74,21 +75,21 @@ def reduced_picture(
     )
 
 
-def _run(network: Network, channels: Floats) -> Floats:
+def _run(network: Network, run: RunNetwork, channels: Floats) -> Floats:
     """Probability at each pixel, (H, W), of channels of any size: mean logit of the picture and its mirror images."""
-    logits = parallel.results([partial(_logit, network, channels, axes) for axes in _MIRRORS], network.at_once)
+    logits = parallel.results([partial(_logit, network, run, channels, axes) for axes in _MIRRORS], network.at_once)
     total = np.zeros(channels.shape[1:], np.float32)
     for logit in logits:
         total += logit / len(_MIRRORS)
     return np.asarray(1 / (1 + np.exp(-total)), np.float32)
 
 
-def _logit(network: Network, channels: Floats, axes: tuple[int, ...]) -> Floats:
+def _logit(network: Network, run: RunNetwork, channels: Floats, axes: tuple[int, ...]) -> Floats:
     """The network's logit (H, W) of the picture mirrored along these axes, mirrored back."""
     height, width = channels.shape[1:]
     more = [(0, -n % SIZE_MULTIPLE) for n in (height, width)]
     shown = np.pad(mirror(channels, axes), [(0, 0), *more], mode="edge")
-    logit = network.run(shown[None])["logit"][0, 0, :height, :width]
+    logit = run(network, shown[None])["logit"][0, 0, :height, :width]
     return np.flip(np.clip(logit, -30, 30), axes)
 
 

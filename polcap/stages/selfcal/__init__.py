@@ -222,7 +222,7 @@ def corrected(ring: RingZero, calibrated: float | None, settings: SelfcalSetting
 
     `calibrated` is 1σ (rad) of a zero that the angles already include, by calibration or because they were found; None
     without one. It and the ring's measured error are averaged by their errors where they agree. Where they do not, the
-    filter was screwed on anew, and the measurement counts alone.
+    filter was mounted again, and the measurement counts alone.
     """
     uncertain = ring.sigma > np.radians(settings.max_ring_sigma_deg)
     if calibrated is not None:

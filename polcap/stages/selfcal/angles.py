@@ -341,7 +341,7 @@ def _best(ends: list[tuple[float, Floats]]) -> list[tuple[float, Floats]]:
 def _solve(
     around: Floats, part: Floats, inside: Floats, start: Floats, until: float, law: float = _LAW
 ) -> tuple[float, Floats]:
-    """Misfit and angles (K,) of least squares from a start; of the two solutions 90° apart the diffuse one."""
+    """Misfit and angles (K,) of least squares from a start; of two solutions, 90° from one another, the diffuse one."""
     relative = around / around.mean(axis=1, keepdims=True)
     from scipy.optimize import least_squares  # here: importing it costs .3 s of every start
 

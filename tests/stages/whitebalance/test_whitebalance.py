@@ -1,4 +1,4 @@
-"""The chart found where it is, refused where it is not, and colours on the scale of its white patch."""
+"""The chart found where it is, refused where it is not, and colors on the scale of its white patch."""
 
 import functools
 
@@ -184,7 +184,7 @@ def test_block_of_an_sg_chart_is_read_at_its_corners_and_only_there():
         whitebalance.measure(stack(image), sg, AUTO, WhitebalanceSettings(chart="sg"))
 
 
-def test_24_patches_of_other_colours_are_refused():
+def test_24_patches_of_other_colors_are_refused():
     place = pose(24, 8, (260, 170))
     shuffled = np.random.default_rng(5).permutation(CLASSIC.rec709)
     with pytest.raises(ChartError, match=r"max_delta_e = 15.*--no-chart"):
@@ -199,7 +199,7 @@ def test_a_mirrored_chart_is_refused():
 
 def test_a_chart_too_small_to_be_read_is_told_with_the_size_it_needs():
     small = photograph(pose(7.6, 3, (260, 170)))
-    with pytest.raises(ChartError, match=r"patches 15 RAW px apart, at least 16 are needed: show it larger"):
+    with pytest.raises(ChartError, match=r"patches are spaced by 15 RAW px, at least 16 are needed: show it larger"):
         whitebalance.measure(stack(small), CLASSIC, AUTO, WhitebalanceSettings())
 
 
@@ -220,10 +220,10 @@ def test_manual_corners_in_raw_pixels_are_drawn_to_the_chart():
     assert color.corners == pytest.approx(exact, abs=0.15)
 
 
-def test_corners_from_the_wrong_end_say_so():
+def test_corners_from_the_wrong_end_are_named():
     image, place = plain()
     corners = 2 * chart.Placement(place, 0.87, 0.01, 1.0).corners() + 0.5
-    with pytest.raises(ChartError, match="other way up"):
+    with pytest.raises(ChartError, match="upside down"):
         request = ChartRequest("corners", corners=np.roll(corners, 2, axis=0))
         whitebalance.measure(stack(image), CLASSIC, request, WhitebalanceSettings())
 
@@ -234,7 +234,7 @@ def test_corners_from_the_wrong_end_say_so():
         (None, "four outer patch corners"),
         ([[10, 10], [10, 200], [300, 200], [300, 10]], "clockwise"),
         ([[10, 10], [3000, 10], [3000, 2000], [10, 2000]], "outside the image"),
-        ([[10, 10], [40, 10], [40, 30], [10, 30]], "px apart"),
+        ([[10, 10], [40, 10], [40, 30], [10, 30]], "space the patches by"),
         ([[10, 10], [310, 10], [310, 210], [10, 210]], "do not show a ColorChecker Classic"),
     ],
 )
