@@ -18,7 +18,7 @@ from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import AUTO, UserInput, path, results_of
 from polcap.pipeline.small_capture import SmallCapture
 from polcap.quality import gates
-from polcap.quality.gate import Gate, GateEvidence
+from polcap.quality.gate import Evidence, Gate
 from polcap.results import NotReached
 
 Networks = tuple[Network | None, Network | None]  # the estimator's, the mask's
@@ -75,7 +75,7 @@ def _judged(small: SmallCapture, supplied: UserInput, config: Config) -> list[Ga
         raise
     except InputError as error:
         failure = error
-    evidence = GateEvidence.partial(
+    evidence = Evidence.partial(
         **vars(results_of(cache.results)),
         names=[shot.name for shot in small.capture.shots],
         focal_doubt=small.capture.focal_doubt,
@@ -86,7 +86,7 @@ def _judged(small: SmallCapture, supplied: UserInput, config: Config) -> list[Ga
     )
     lines = []
     try:
-        for gate in gates.judge(evidence, config):
+        for gate in gates.judge(evidence, config.gates, config.align):
             lines.append(gate)
     except NotReached:
         assert failure is not None  # only an error ends the path before its gates
@@ -132,8 +132,8 @@ def table(verdict: Verdict) -> str:
         head += f", and process it with {verdict.needs}"
     rows = [f"{head}   ({verdict.capture}, {verdict.seconds:.1f} s)"]
     for line in verdict.lines:
-        cost = f"; costs about {line.cost_deg:.0f}°" if line.cost_deg >= 1 and line.state in ("warn", "fail") else ""
-        rows.append(f"{line.state:13}{line.name:14}{line.says}{_limit(line)}{cost}")
+        cost = f", costs about {line.cost_deg:.0f}°" if line.cost_deg >= 1 and line.state in ("warn", "fail") else ""
+        rows.append(f"{line.state:13}{line.name:14}{line.message}{_limit(line)}{cost}")
         if line.remedy:
             rows.append(f"{'':27}→ {line.remedy}")
     return "\n".join(rows)

@@ -24,7 +24,7 @@ from polcap.images import (
 )
 from polcap.quality import gate as gate_module
 from polcap.quality import gates, geometry, light, polarization, rim
-from polcap.quality.gate import Gate, GateEvidence
+from polcap.quality.gate import Evidence, Gate
 from tests import scenes
 
 MODULES: tuple[ModuleType, ...] = (gates, gate_module, light, geometry, polarization)
@@ -236,7 +236,7 @@ def judge(good: dict[str, Any], config: Config, fields: dict[str, Any]) -> list[
     with pytest.MonkeyPatch.context() as patch:
         for figure, (module, function) in MEASURES.items():
             patch.setattr(module, function, partial(stated, in_numpy(figures[figure])))
-        return list(gates.judge(GateEvidence.partial(**parts), config))
+        return list(gates.judge(Evidence.partial(**parts), config.gates, config.align))
 
 
 def stated(figure: Any, *_: Any) -> Any:
