@@ -58,7 +58,7 @@ def tone(found: Evidence, limits: Gates) -> Gate:
     power = _power(radiance)
     if radiance.equipment.light == "steady" and abs(power - 1) > worst:
         worst, how = abs(power - 1), f"exposures change as the stated ones to the power {power:.2f}"
-    slope = found.selfcal.gains.grey_slope if found.color.quads is not None else float("nan")
+    slope = found.selfcal.gains.grey_slope if found.color.place is not None else float("nan")
     if np.isfinite(slope) and abs(slope - 1) / 2 > worst:  # glare flattens greys too
         worst, how = abs(slope - 1) / 2, f"the chart's greys follow their reflectance to the power {slope:.2f}"
     says = how if worst > limit else "linear"
@@ -114,15 +114,15 @@ def chart(found: Evidence, limits: Gates) -> Gate:
         )
         says = f"no chart found ({found.chart_missing}): `polcap process` asks for one, or for --no-chart"
         return Gate("chart", "warn", None, limit, says, remedy, unit="ΔE2000")
-    error = found.color.delta_e
-    if error is None:
+    colors = found.color.patches
+    if colors is None:
         return Gate("chart", "not measured", None, limit, "none was asked for", unit="ΔE2000")
-    mean = float(np.nanmean(error))
+    mean = float(np.nanmean(colors.delta_e))
     says = f"its colours are met to ΔE {mean:.1f}"
-    if found.color.predicted is not None:
-        says += f", to {float(np.nanmean(found.color.predicted)):.1f} where a patch is left out of the fit"
-    if found.color.patch_use is not None and found.color.patch_use.any():
-        says += f"; {patches.left_out(found.color.patch_use)}"
+    if colors.predicted is not None:
+        says += f", to {float(np.nanmean(colors.predicted)):.1f} where a patch is left out of the fit"
+    if colors.use is not None and colors.use.any():
+        says += f"; {patches.left_out(colors.use)}"
     if found.color.light is not None and found.color.light.tilt > _TURNED:
         says += f"; it is turned by {np.degrees(found.color.light.tilt):.0f}° from the lens, which the scale takes out"
     if found.radiance.sensor.lossy:
