@@ -36,7 +36,7 @@ def guess(seen: Cues) -> fine.CoarseEstimate:
 
 
 def network(relief: Floats | None = None) -> FakeNetwork:
-    """One that says how bright each pixel is, to the right, or what it is told to."""
+    """A network that answers with a relief, or with the brightness of each pixel as one to the right."""
 
     def answer(channels: Floats) -> dict[str, Floats]:
         first = channels[:, :1]
@@ -60,7 +60,7 @@ def test_tiles_side_by_side_are_those_one_after_another(
     monkeypatch.setattr(fine, "_TILE", 64)
     one, three = (fine.refine(seen, guess, dataclasses.replace(network(), at_once=n), run) for n in (1, 3))
     assert one.tobytes() == three.tobytes()
-    with pytest.raises(ModelError, match="makes no relief"):  # in whichever thread it is found out
+    with pytest.raises(ModelError, match="returns no relief"):  # in whichever thread it is found out
         fine.refine(seen, guess, dataclasses.replace(network(), answer=lambda _: {}, at_once=3), run)
 
 
