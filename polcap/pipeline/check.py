@@ -92,7 +92,7 @@ def _judged(small: SmallCapture, supplied: UserInput, config: Config) -> list[Ga
     )
     lines = list[Gate]()
     try:
-        lines.extend(gates.judge(evidence, config))
+        lines.extend(gates.judge(evidence, config.gates, config.align))
     except NotReached:
         if failure is None:
             raise
@@ -127,8 +127,8 @@ def table(verdict: Verdict) -> str:
         head += f", and process it with {verdict.needs}"
     rows = [f"{head}   ({verdict.capture}, {verdict.seconds:.1f} s)"]
     for line in verdict.lines:
-        cost = f"; costs about {line.cost_deg:.0f}°" if line.cost_deg >= 1 and line.state in ("warn", "fail") else ""
-        rows.append(f"{line.state:13}{line.name:14}{line.says}{_limit(line)}{cost}")
+        cost = f", costs about {line.cost_deg:.0f}°" if line.cost_deg >= 1 and line.state in ("warn", "fail") else ""
+        rows.append(f"{line.state:13}{line.name:14}{line.message}{_limit(line)}{cost}")
         if line.remedy:
             rows.append(f"{'':27}→ {line.remedy}")
     return "\n".join(rows)

@@ -202,7 +202,7 @@ def document(
     """report.json: facts of the run, measurements and the gates' judgement; timings [s] of the stored stages."""
     found = {**figures(results), "rerendering": rerendering(results, config.infer.ior)}
     focal_doubt = tuple(facts["capture"].get("focal_doubt", (0.0, 0.0)))
-    judged = list(gates.judge(full_size(results, focal_doubt), config))
+    judged = list(gates.judge(full_size(results, focal_doubt), config.gates, config.align))
     return {
         "polcap": __version__,
         "versions": facts["versions"],

@@ -47,7 +47,7 @@ class BackgroundCheck:
             self._pending.pop(slot).result()
 
     def close(self) -> None:
-        """Finish what was submitted."""
+        """Finish the submitted checks."""
         self._thread.shutdown(wait=True)
 
     def _save_and_check(self, slot: Slot, read_deg: float | None, photograph: CameraFile) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 from polcap.errors import ChartError
 from polcap.formats import shipped_data
 from polcap.images import AngleStack, ChartRequest, GBuffer, StokesImage, View, single_frames
-from polcap.optics import point_light
+from polcap.optics import point_light, projection
 from polcap.stages import whitebalance
 from polcap.stages.cues import scale
 from polcap.stages.whitebalance import WhitebalanceSettings
@@ -116,7 +116,7 @@ def photograph(scene: Scene, falloff: float, printed: float, random: np.random.G
     light[at] = albedo * arriving[:, None]
     picture = cv2.GaussianBlur(light.reshape(480, 640, -1, 3).mean(axis=2), (0, 0), 0.5)
     row, column = np.mgrid[:480, :640]
-    for quad in render.project(_VIEW, color_checker.patches(scene.chart)):
+    for quad in projection.project(_VIEW, color_checker.patches(scene.chart)):
         low, high = quad.min(0), quad.max(0)
         picture[(column > low[0]) & (column < high[0]) & (row > low[1]) & (row < high[1])] *= (
             1 + printed * random.normal()

@@ -11,6 +11,7 @@ import numpy as np
 
 from polcap.images import ChartLight, ColorCalibration, Floats, StokesImage
 from polcap.optics import point_light
+from polcap.optics.projection import back_project
 
 _BULGE = 0.5  # mean distance of the visible surface before the middle, in radii: a cone's 1/3 to a ball's 2/3
 _BULGE_SPREAD = 0.4  # 1σ of it over 204 views of training meshes and random shapes (decision 8)
@@ -69,8 +70,7 @@ def _changed(light: ChartLight, step: Floats) -> ChartLight:
 def _middle(stokes: StokesImage, distance: float) -> Floats:
     """The middle of the object's pixels (3,), camera frame, at a distance along the axis."""
     row, column = (axis.mean() for axis in np.nonzero(stokes.mask)) if stokes.mask.any() else (0.0, 0.0)
-    x, y = stokes.view.center
-    return distance * np.array([(column - x) / stokes.view.focal, (y - row) / stokes.view.focal, -1.0])
+    return distance * back_project(stokes.view, np.array(column), np.array(row))
 
 
 def _radius(stokes: StokesImage) -> float:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from polcap.images import Alignment, AngleStack, Bools, ColorCalibration, Floats, MaskedImage, Quality
+from polcap.optics.projection import transform_points
 
 _GREYS = (18, 19, 20, 21, 22, 23)  # white to black
 _LIGHT = 4  # the first so many serve for the gains; the darker two reflect 9 and 3 % and are mostly noise
@@ -89,8 +90,7 @@ class _Patch:
 
 def _patch(picture: MaskedImage, transform: Floats, quad: Floats) -> _Patch:
     """One shot's pixels inside a quad (4, 2) of the reference grid, one pixel within its edge."""
-    corners = transform @ np.column_stack([quad, np.ones(4)]).T
-    place = (corners[:2] / corners[2]).T  # (4, 2) x, y
+    place = transform_points(transform, quad)  # (4, 2) x, y
     height, width = picture.quality.shape
     low = np.clip(np.floor(place.min(axis=0)).astype(int) - 2, 0, [width, height])
     high = np.clip(np.ceil(place.max(axis=0)).astype(int) + 3, low, [width, height])

@@ -18,6 +18,7 @@ from msgspec import Meta
 
 from polcap.errors import ChartError
 from polcap.images import AngleStack, ChartReference, ChartRequest, ColorCalibration, Floats, View
+from polcap.optics.projection import transform_points
 from polcap.stages import stage
 from polcap.stages.whitebalance import chart, chart_light, chart_search, patches
 from polcap.stages.whitebalance.chart import Placement
@@ -245,9 +246,9 @@ def _plausible(place: Placement, min_explained: float) -> bool:
 
 def _among(places: list[Placement], start: Placement) -> bool:
     """Whether a start leads to a known place: all centers within a quarter of a patch."""
-    here = chart.project(start.homography, chart.centers())
+    here = transform_points(start.homography, chart.centers())
     return any(
-        np.abs(chart.project(way.homography, chart.centers()) - here).max() < _SAME_PLACE * place.pitch_px
+        np.abs(transform_points(way.homography, chart.centers()) - here).max() < _SAME_PLACE * place.pitch_px
         for place in places
         for way in (place, place.turned())
     )

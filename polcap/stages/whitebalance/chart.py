@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
+from polcap.optics.projection import transform_points
 from polcap.optics.robust import MAD_TO_SIGMA
 
 ROWS, COLUMNS = 4, 6
@@ -42,17 +43,17 @@ class Placement:
     @property
     def pitch_px(self) -> float:
         """Mean distance of neighbouring patches, px."""
-        outline = project(self.homography, _outer(1.0))
+        outline = transform_points(self.homography, _outer(1.0))
         return float(np.sqrt(_area(outline) / (ROWS * COLUMNS)))
 
     def quads(self, share: float = 1.0) -> Floats:
         """(24, 4, 2) corners of each patch, shrunk to `share` of its side; px, from dark skin, row by row."""
         half = share * self.patch / 2
-        return project(self.homography, centers()[:, None] + half * _SQUARE)
+        return transform_points(self.homography, centers()[:, None] + half * _SQUARE)
 
     def corners(self) -> Floats:
         """(4, 2) outer corners of the outer patches, dark skin first, clockwise on the chart; px."""
-        return project(self.homography, _outer(self.patch))
+        return transform_points(self.homography, _outer(self.patch))
 
     def turned(self) -> "Placement":
         """The same place, read upside down."""
@@ -84,19 +85,13 @@ def from_corners(points: Floats, patch: float = USUAL_PATCH) -> Placement:
     return Placement(_homography(_outer(patch), points), patch, _GREATEST_BLUR / 3, 0.0)
 
 
-def project(homography: Floats, points: Floats) -> Floats:
-    """Homography (3, 3) of points (..., 2)."""
-    image = points @ homography[:, :2].T + homography[:, 2]
-    return np.asarray(image[..., :2] / image[..., 2:])
-
-
 def is_view(homography: Floats) -> bool:
     """Whether a flat chart can look like this homography (3, 3): convex, not mirrored, nowhere behind the camera."""
     corners = _outer(1.0)
     depth = corners @ homography[2, :2] + homography[2, 2]
     if not np.isfinite(homography).all() or not (depth * depth[0] > 0).all():
         return False
-    corner = project(homography, corners)
+    corner = transform_points(homography, corners)
     side = np.roll(corner, -1, axis=0) - corner
     after = np.roll(side, -1, axis=0)
     return bool((side[:, 0] * after[:, 1] - side[:, 1] * after[:, 0] > 0).all())
@@ -109,11 +104,11 @@ def refine(image: Floats, start: Placement, steps: int = 12) -> Placement:
     but the difference is judged through a gamma of 2.2, so that dark patches count.
     """
     frame = _frame(start)  # image px → about the chart's own, so that all unknowns have one scale
-    at = pixels_inside(project(start.homography, _AROUND), image.shape)
+    at = pixels_inside(transform_points(start.homography, _AROUND), image.shape)
     value = np.ascontiguousarray(image[at[:, 1], at[:, 0]].T, np.float32)
     if value.shape[1] < 24 * 16:
         return start
-    point = project(frame, at.astype(np.float64)).T
+    point = transform_points(frame, at.astype(np.float64)).T
     inverse = np.linalg.inv(frame @ start.homography)
     inverse = inverse / inverse[2, 2]
     least_blur = min(_PIXEL_BLUR_PX / start.pitch_px, _GREATEST_BLUR)
@@ -256,7 +251,7 @@ def pixels_inside(quad: Floats, shape: tuple[int, ...]) -> NDArray[np.int_]:
 
 def _frame(placement: Placement) -> Floats:
     """Image px → units of the pitch about the chart's center, (3, 3)."""
-    middle = project(placement.homography, np.array([COLUMNS / 2, ROWS / 2]))
+    middle = transform_points(placement.homography, np.array([COLUMNS / 2, ROWS / 2]))
     pitch = placement.pitch_px
     return np.array([[1 / pitch, 0, -middle[0] / pitch], [0, 1 / pitch, -middle[1] / pitch], [0, 0, 1]])
 
@@ -272,7 +267,7 @@ def _homography(source: Floats, target: Floats) -> Floats:
     for points in (source, target):
         (x, y), unit = points.mean(axis=0), 1 / (points.std() + 1e-12)
         frames.append(np.array([[unit, 0, -x * unit], [0, unit, -y * unit], [0, 0, 1]]))
-    (u, v), (x, y) = project(frames[0], source).T, project(frames[1], target).T
+    (u, v), (x, y) = transform_points(frames[0], source).T, transform_points(frames[1], target).T
     one, zero = np.ones_like(u), np.zeros_like(u)
     rows = np.concatenate(
         [

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
+from polcap.optics.projection import transform_points
 from polcap.stages.whitebalance import chart
 from polcap.stages.whitebalance.chart import Placement
 
@@ -39,7 +40,7 @@ def candidates(value: Floats) -> Iterator[tuple[Floats, float]]:
 
 def refine(value: Floats, start: Placement) -> Placement:
     """Place the chart on its surroundings in a picture (H, W, 3), averaged down where they are large."""
-    around = chart.project(start.homography, np.array([[-1.0, -1], [7, -1], [7, 5], [-1, 5]]))
+    around = transform_points(start.homography, np.array([[-1.0, -1], [7, -1], [7, 5], [-1, 5]]))
     x0, y0 = np.maximum(np.floor(around.min(axis=0)).astype(int), 0)
     x1, y1 = np.minimum(np.ceil(around.max(axis=0)).astype(int) + 1, [value.shape[1], value.shape[0]])
     if x1 - x0 < 2 or y1 - y0 < 2:
@@ -73,7 +74,7 @@ def _detected(detector: Any, picture: NDArray[np.uint8], transform: Floats) -> I
     if detector.process(picture, _CANDIDATES):
         for checker in detector.getListColorChecker():
             quads = np.asarray(checker.getColorCharts(), dtype=np.float64).reshape(24, 4, 2)
-            yield chart.project(np.linalg.inv(transform), quads.mean(axis=1)), float(checker.getCost())
+            yield transform_points(np.linalg.inv(transform), quads.mean(axis=1)), float(checker.getCost())
 
 
 def _pictures(value: Floats) -> Iterator[tuple[NDArray[np.uint8], Floats]]:

@@ -9,6 +9,7 @@ import pytest
 from polcap.errors import ChartError
 from polcap.formats import shipped_data
 from polcap.images import ChartReference, ChartRequest, ColorCalibration, ColorSensor, Floats, View
+from polcap.optics.projection import transform_points
 from polcap.stages import whitebalance
 from polcap.stages.whitebalance import WhitebalanceSettings, chart, chart_in_mask, patches
 from tests.stages.whitebalance.chart_pictures import AUTO, CAMERA, CLASSIC, HEIGHT, WIDTH, draw, photograph, pose, stack
@@ -24,7 +25,7 @@ def centers_off(color: ColorCalibration, homography: Floats) -> Floats:
     """Distance of each found patch centre from the true one (24,), px."""
     assert color.quads is not None
     found = np.array([_center(quad) for quad in color.quads])
-    return np.linalg.norm(found - chart.project(homography, chart.centers()), axis=-1)
+    return np.linalg.norm(found - transform_points(homography, chart.centers()), axis=-1)
 
 
 def _center(quad: Floats) -> Floats:
@@ -51,7 +52,8 @@ def test_chart_of_eight_pixel_patches_is_known_by_its_colors():
     raw = photograph(pose(17, 2, (235, 185)), samples=1)
     image = np.stack([raw[::2, ::2, 0], raw[::2, 1::2, 1], raw[1::2, 1::2, 2]], axis=-1)
     place = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]]) @ pose(17, 2, (235, 185))
-    assert chart.refine(image / image.max(), chart.from_centers(chart.project(place, chart.centers()))).explained < 0.9
+    start = chart.from_centers(transform_points(place, chart.centers()))
+    assert chart.refine(image / image.max(), start).explained < 0.9
     color = whitebalance.measure(stack(image), CLASSIC, AUTO, WhitebalanceSettings())
     assert color.source == "chart" and centers_off(color, place).max() < 0.3
     assert np.nanmean(color.delta_e) < 1
@@ -60,7 +62,7 @@ def test_chart_of_eight_pixel_patches_is_known_by_its_colors():
 def test_chart_that_was_taken_for_the_object_is_recognized():
     image, place = plain()
     card = np.zeros(image.shape[:2], np.uint8)
-    edge = chart.project(place, np.array([[-0.1, -0.1], [6.1, -0.1], [6.1, 4.1], [-0.1, 4.1]]))
+    edge = transform_points(place, np.array([[-0.1, -0.1], [6.1, -0.1], [6.1, 4.1], [-0.1, 4.1]]))
     cv2.fillConvexPoly(card, np.round(edge).astype(np.int32), 1)
     ball = np.hypot(*np.mgrid[-60 : HEIGHT - 60.0, -70 : WIDTH - 70.0]) < 50
     both = (card > 0) | ball
@@ -75,7 +77,7 @@ def test_chart_that_was_taken_for_the_object_is_recognized():
 def test_s0_of_the_white_patch_is_its_reflectance():
     image, place = plain()
     color = whitebalance.measure(stack(image), CLASSIC, AUTO, WhitebalanceSettings())
-    x, y = np.round(chart.project(place, np.array([0.5, 3.5]))).astype(int)
+    x, y = np.round(transform_points(place, np.array([0.5, 3.5]))).astype(int)
     s0 = 2 * image[y - 4 : y + 5, x - 4 : x + 5].mean(axis=(0, 1))
     assert color.matrix @ s0 == pytest.approx(CLASSIC.rec709[18], abs=0.01)
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.02)
@@ -107,7 +109,7 @@ def test_matrix_ignores_exposure_and_the_place_does_too():
 def test_sloping_light_and_glare_are_taken_out_of_the_matrix():
     image, place = plain()
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
-    u, v = np.moveaxis(chart.project(np.linalg.inv(place), np.stack([x, y], axis=-1)), -1, 0)
+    u, v = np.moveaxis(transform_points(np.linalg.inv(place), np.stack([x, y], axis=-1)), -1, 0)
     light = 1 + 0.03 * (u - 0.5) - 0.02 * (v - 3.5)
     veil = 0.02 * CAMERA.sum(axis=1) / 2
     color = whitebalance.measure(stack(image * light[..., None] + veil), CLASSIC, AUTO, WhitebalanceSettings())
@@ -128,7 +130,7 @@ def test_overexposed_patches_are_left_out():
 
 def test_a_chart_burnt_out_asks_for_a_shorter_exposure():
     image, place = plain()
-    corners = 2 * chart.from_centers(chart.project(place, chart.centers())).corners() + 0.5
+    corners = 2 * chart.from_centers(transform_points(place, chart.centers())).corners() + 0.5
     with pytest.raises(ChartError, match=r"over-exposed.*shorter exposure"):
         whitebalance.measure(
             stack(image, clip=0.02), CLASSIC, ChartRequest("corners", corners=corners), WhitebalanceSettings()
@@ -139,7 +141,7 @@ def painted(place: Floats, columns: slice, rows: slice, color: Floats | float) -
     """`plain()`, with something over these columns and rows of the chart: (u, v) 0…6 × 0…4."""
     image, _ = plain()
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
-    u, v = np.moveaxis(chart.project(np.linalg.inv(place), np.stack([x, y], axis=-1)), -1, 0)
+    u, v = np.moveaxis(transform_points(np.linalg.inv(place), np.stack([x, y], axis=-1)), -1, 0)
     over = (u > columns.start) & (u < columns.stop) & (v > rows.start) & (v < rows.stop)
     return np.where(over[..., None], color if np.ndim(color) else color * image, image)
 
