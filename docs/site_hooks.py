@@ -1,4 +1,4 @@
-"""What the site needs beyond its pages: pages listed by folder, the commands' options, links out of docs/ made names.
+"""Changes that the site needs: pages listed by folder, links out of docs/ replaced by names.
 
 Read by mkdocs (`hooks:` in mkdocs.yml).
 """
@@ -7,13 +7,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from typer.main import get_command
-
-from polcap.cli import app
-
 DOCS = Path(__file__).parent
 _OUT = re.compile(r"\[([^\]]+)\]\(((?:\.\./)+[^)#]*)(?:#[^)]*)?\)")
-_OPTIONS = re.compile(r"<!-- options of (\w+) -->")
 
 
 def on_config(config: Any) -> Any:
@@ -31,10 +26,7 @@ def _pages(folder: str) -> list[str]:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """The options of a command where its page has `<!-- options of NAME -->`, and links out of docs/ as names.
-
-    The site does not hold the files of the repository outside docs/.
-    """
+    """Replace links out of docs/ by names: the site does not hold the repository's other files."""
     here = (DOCS / page.file.src_uri).parent
 
     def shown(match: re.Match[str]) -> str:
@@ -43,15 +35,4 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
             return match[0]
         return f"{match[1]} (`{target.relative_to(DOCS.parent)}`)"
 
-    return _OUT.sub(shown, _OPTIONS.sub(lambda match: options_table(match[1]), markdown))
-
-
-def options_table(name: str) -> str:
-    """What `polcap NAME --help` says of its arguments and options, as a table."""
-    command = get_command(app).commands[name]  # type: ignore[attr-defined]
-    context = command.make_context(name, [], resilient_parsing=True)
-    rows = [record for one in command.params if (record := one.get_help_record(context))]
-    lines = ["| option | |", "| --- | --- |"]
-    for option, meaning in rows:  # inside `…` a | parts no columns
-        lines.append(f"| `{option}` | {' '.join(meaning.split()).replace('|', '&#124;')} |")
-    return "\n".join(lines)
+    return _OUT.sub(shown, markdown)

@@ -23,7 +23,7 @@ for seed, split in enumerate(("train", "test")):  # training looks at pictures o
 
 tiny = model.Shape((8, 16, 16, 16, 16), (8, 8, 16, 16), (8, 8, 8, 8), (8, 8, 8, 8), (1, 1, 1, 1, 1))
 train.PRESETS["cpu"] = train.Preset(tiny, 4, 1, 64, (32, 64), (0.5, 0.5), (0.2, 0.8), 4 * 64**2)
-own = train.main(train.Params(data=out / "data", out=out / "mine", minutes=10 / 60, threads=1))
+own = train.main(train.TrainingOptions(data=out / "data", out=out / "mine", minutes=10 / 60, threads=1))
 
 polcap = [sys.executable, "-m", "polcap", "process", str(source), "--model", str(own), "--out", str(out / "result")]
 sys.exit(subprocess.run(polcap).returncode)

@@ -1,4 +1,4 @@
-"""From Python what `polcap process` does: a capture folder in, a result folder and its report out."""
+"""`polcap.process`: the command `polcap process` from Python."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ from polcap.pipeline.path import AUTO, UserInput
 
 @dataclass(frozen=True)
 class Result:
-    """What a run has written."""
+    """The output of a run."""
 
     folder: Path  # maps/, asset/, report.html
     report: dict[str, Any]  # report.json's content
@@ -48,11 +48,11 @@ def process(
     capture
         Folder with the RAW brackets.
     out
-        Result folder; by default `CAPTURE/polcap`. What it holds of an earlier run is used again where it fits.
+        Result folder; by default `CAPTURE/polcap`. Stages that an earlier run has stored there are not computed again.
     config
         Settings; by default those of `docs/reference/settings.md`. `polcap.load_config` reads a file.
     angles_deg
-        Polarizer angles of the shots in order, where names do not tell them, degrees.
+        Polarizer angles of the shots in order, where names do not state them, degrees.
     chart
         How the ColorChecker is found; by default in the reference shot.
     mask

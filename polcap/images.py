@@ -14,10 +14,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.calibration_values import Calibration
-
 Floats = NDArray[np.floating[Any]]
 Bits = NDArray[np.uint8]
+Device = Literal["cpu", "cuda", "auto"]
+Bools = NDArray[np.bool_]
 Role = Literal["shot", "ambient", "repeat", "chart", "cross"]
 NOT_IN_KEY = {"in_key": False}  # metadata of a field that says where or how, not what: two values are one input
 
@@ -89,19 +89,142 @@ class SensorImage:
 
 
 @dataclass(frozen=True)
+class NoiseLine:
+    """Noise of a sensor at one ISO: variance of a merged picture's pixel = slope · signal + floor, white = 1."""
+
+    iso: float
+    slope: tuple[float, ...]  # (C,)
+    slope_sigma: tuple[float, ...]
+    floor: tuple[float, ...]  # (C,)
+    floor_sigma: tuple[float, ...]
+    electrons_at_white: tuple[float, ...]  # (C,) of one photosite
+    read_noise_electrons: tuple[float, ...]  # (C,) 1σ of one photosite
+    read_noise_sigma: tuple[float, ...] = ()  # (C,) e⁻, 1σ of that figure, upwards
+    source: str = "flat frames"  # or "bracket"
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Black and white of a sensor, counts."""
+
+    black: tuple[float, ...]  # of the mosaic's phases, row by row
+    black_sigma: tuple[float, ...]
+    black_stated: tuple[float, ...]  # the maker's tags
+    white_stated: float  # the maker's tags
+    white: float | None = None  # where frames saturate; None where none did
+
+
+@dataclass(frozen=True)
+class Linearity:
+    """Signal against exposure time."""
+
+    greatest_deviation: float  # from proportional, relative
+    power: float  # of the exposure time that the signal follows; 1 is linear
+    power_sigma: float
+    darkest: float  # of white
+    brightest: float
+    exposures: int
+
+
+@dataclass(frozen=True)
+class Falloff:
+    """Light of a lens towards the corners: 1 + a r² + b r⁴ + c r⁶, r = 1 in the corners."""
+
+    coefficient: tuple[tuple[float, float, float], ...]  # (C, 3)
+    sigma: tuple[tuple[float, float, float], ...]
+    corner: tuple[float, ...]  # (C,) light there
+    f_number: float | None = None  # of the photographs; the falloff holds at this aperture and focal length
+    focal_length_mm: float | None = None
+
+
+@dataclass(frozen=True)
+class LensGeometry:
+    """A pinhole camera with distortion: a point at x appears at x (1 + k1 r² + k2 r⁴).
+
+    x and r from the principal point in focal lengths.
+    """
+
+    focal_px: float  # visible RAW px
+    focal_sigma_px: float
+    principal_px: tuple[float, float]  # visible RAW px
+    principal_sigma_px: float  # 0: assumed in the picture's middle
+    k1: float
+    k1_sigma: float
+    k2: float
+    k2_sigma: float
+    size_px: tuple[int, int]  # width, height, visible RAW px
+    residual_px: float  # rms of the corners, RAW px
+    pinhole_residual_px: float  # the same without k1 and k2
+    photographs: int
+    board: str
+    focal_length_mm: float | None = None  # of the photographs; the geometry holds there
+
+
+@dataclass(frozen=True)
+class Polarizer:
+    """A filter on its ring: its axis is sense · stated + zero, from image x towards image up."""
+
+    zero_deg: float
+    zero_sigma_deg: float
+    sense: int  # 1: the ring counts like the picture; −1: the other way
+    sense_known: bool  # False: assumed, for light of one axis cannot tell
+    extinction: tuple[float, ...]  # (C,) greatest over least transmittance
+    extinction_sigma: tuple[float, ...]
+    frames: int
+
+
+@dataclass(frozen=True)
+class FlashEnergy:
+    """Energy of a flash from pop to pop, relative to its mean."""
+
+    spread: float  # 1σ
+    spread_sigma: float
+    drift_per_pop: float
+    drift_sigma: float
+    pops: int
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The measurements of `polcap calibrate` for one camera, lens and filter, each with its 1σ; C channels, or 1."""
+
+    made: str  # ISO 8601
+    camera: str  # make and model
+    lens: str
+    filter: str  # the polarizer's name, as the user gave it
+    noise: tuple[NoiseLine, ...] = ()
+    levels: Levels | None = None
+    linearity: Linearity | None = None
+    falloff: Falloff | None = None
+    geometry: LensGeometry | None = None
+    polarizer: Polarizer | None = None
+    flash: FlashEnergy | None = None
+
+
+@dataclass(frozen=True)
+class FrameReading:
+    """How the bytes of a frame's file become pixels."""
+
+    kind: Literal["raw", "photo"] = "raw"
+    encoding: Literal["linear", "srgb"] | None = None  # of a finished picture; None: sRGB for 8 bits, else linear
+    white: float | None = None  # counts; None: the greatest of the type, or as the file states
+    black: float = 0.0  # counts
+    sensor_deg: float | None = None  # degrees; the angle to take out of a polarization sensor's mosaic
+
+
+@dataclass(frozen=True)
 class Frame:
-    """One photograph of a capture, read when asked for."""
+    """One photograph of a capture; a `Decode` function reads its pixels."""
 
     path: str = field(metadata=NOT_IN_KEY)
     exif: Exif
     role: Role
-    digest: str  # of the file's bytes
-    load: Callable[[], SensorImage] = field(compare=False, repr=False, metadata=NOT_IN_KEY)
+    digest: str  # of the file's bytes; then, after spaces, the settings that decide its pixels
     exposure: float | None = None  # stated in capture.toml; relative; overrides EXIF
-    # applies a function (image, **plain options) → plain facts, arrays in the process that decodes; None: load it
-    within: Callable[..., tuple[dict[str, Any], dict[str, NDArray[Any]]]] | None = field(
-        default=None, compare=False, repr=False, metadata=NOT_IN_KEY
-    )
+    reading: FrameReading = field(default=FrameReading(), metadata=NOT_IN_KEY)
+
+
+Decode = Callable[[Frame], SensorImage]  # as `formats.raw.frame_decoder.decode`
 
 
 @dataclass(frozen=True)
@@ -190,6 +313,39 @@ class CrossedShot:
 
 
 @dataclass(frozen=True)
+class BracketMeasurement:
+    """What the frames of each bracket showed when they were compared; NaN where it is unknown."""
+
+    exposure_ratio: Floats  # (K, E, 3) of every frame to its shot's reference frame, from pixels
+    exif_ratio: Floats  # (K, E) the same by the metadata
+    curvature: Floats  # (K, E) of each frame's tone against the reference's; 0: linear
+    ghost_fraction: Floats  # (K,) share of pixels whose exposures disagree beyond noise
+    ambient_share: Floats  # (K,) of all light, present without the flash
+    blur_px: Floats  # (K, E) beyond the sharpest frame of the same exposure, 1σ [RAW px]
+
+
+@dataclass(frozen=True)
+class ColorSensor:
+    """The sensor by the files of a capture."""
+
+    camera_matrix: Floats | None = None  # (3, 3) camera → linear Rec.709, white balanced as shot; None if unknown
+    white_balance: Floats | None = None  # (3,) multipliers as shot
+    site_px: Floats | None = None  # (3, 2) x, y of this grid: where in a pixel each channel was seen; None: 0
+    lossy: bool = False  # a source was 8-bit or display-encoded
+
+
+@dataclass(frozen=True)
+class Equipment:
+    """Light, lens and polarizer of a capture, as metadata and calibration know them."""
+
+    light: Literal["flash", "steady", "one exposure", "unknown"] = "unknown"  # of the shots; one: a polarizer mosaic
+    flash_spread: float | None = None  # 1σ of the flash's energy from pop to pop, calibrated
+    extinction: Floats | None = None  # (3,) or (1,) extinction ratio of the polarizer, calibrated; None: ideal
+    ring_sigma: float | None = None  # rad, 1σ of the ring's zero as calibrated; None: set by eye
+    distortion: Distortion | None = None  # of the lens, calibrated, on this grid; None: a pinhole, as far as is known
+
+
+@dataclass(frozen=True)
 class AngleStack:
     """The merged shots of a capture in camera channels, not yet registered."""
 
@@ -198,27 +354,21 @@ class AngleStack:
     quality: Bits  # (K, H, W)
     angle: Floats  # (K,) rad
     view: View
-    exposure_ratio: Floats  # (K, E, 3) of every frame to the shot's reference frame, estimated from pixels
-    exif_ratio: Floats  # (K, E) the same as the metadata tell it; NaN where they do not
-    ghost_fraction: Floats  # (K,) share of pixels whose exposures disagree beyond noise
-    lossy: bool  # a source was 8-bit or display-encoded
-    camera_matrix: Floats | None  # (3, 3) camera → linear Rec.709, white balanced as shot; None if unknown
-    white_balance: Floats | None  # (3,) multipliers as shot
-    light: Literal["flash", "steady", "one exposure", "unknown"] = "unknown"  # of the shots; one: a polarizer mosaic
+    bracket: BracketMeasurement
+    sensor: ColorSensor = ColorSensor()
+    equipment: Equipment = Equipment()
     offset_px: Floats | None = None  # (K, 2) x, y of this grid, exactly known: reference px − offset = shot px
-    site_px: Floats | None = None  # (3, 2) x, y of this grid: where in a pixel each channel was seen; None: 0
-    curvature: Floats | None = None  # (K, E) of each frame's tone against the reference's; 0: linear, NaN: unknown
-    ambient_share: Floats | None = None  # (K,) of all light, there without the flash; NaN where not photographed
-    extinction: Floats | None = None  # (3,) or (1,) extinction ratio of the polarizer, calibrated; None: ideal
-    flash_spread: float | None = None  # 1σ of the flash's energy from pop to pop, calibrated
-    ring_sigma: float | None = None  # rad, 1σ of the ring's zero as calibrated; None: set by eye
-    blur_px: Floats | None = None  # (K, E) beyond the sharpest frame of the same exposure, 1σ [RAW px]; NaN: unknown
     crossed: CrossedShot | None = None  # where one was taken
-    distortion: Distortion | None = None  # of the lens, calibrated, on this grid; None: a pinhole, as far as is known
 
     def shot(self, k: int) -> MaskedImage:
         """One of the shots, (H, W, 3)."""
         return MaskedImage(self.value[k], self.variance[k], self.quality[k])
+
+
+def single_frames(shots: int) -> BracketMeasurement:
+    """Brackets of one frame each, which leave nothing to compare."""
+    each, unknown = np.ones((shots, 1)), np.full((shots, 1), np.nan)
+    return BracketMeasurement(np.ones((shots, 1, 3)), each, unknown, np.zeros(shots), unknown[:, 0], unknown)
 
 
 @dataclass(frozen=True)
@@ -248,22 +398,36 @@ class ChartLight:
 
 
 @dataclass(frozen=True)
+class ChartPlace:
+    """A chart in the reference shot, on its full-frame grid."""
+
+    quads: Floats  # (24, 4, 2) inner patch quads (x, y), px
+    corners: Floats  # (4, 2) outer patch corners, px
+
+
+@dataclass(frozen=True)
+class PatchColors:
+    """The fit of a chart's patches to its maker's colors."""
+
+    delta_e: Floats  # (24,) CIEDE2000 residual; NaN for patches left out
+    use: Bits | None = None  # (24,) 0 served; else why not, `whitebalance.patches.PatchUse`; None: unknown
+    predicted: Floats | None = None  # (24,) CIEDE2000 of each patch by the matrix of all others
+    falloff: tuple[float, float] = (0.0, 0.0)  # relative change of the light per patch, to the chart's right, down
+    glare: float = 0.0  # white light that the chart's gloss and the lens add to every patch [reflectance]
+    edition: str = ""  # of the chart whose colors fit, `ChartReference.name`
+
+
+@dataclass(frozen=True)
 class ColorCalibration:
     """From camera channels to linear Rec.709 on the scale of the chart's white patch."""
 
     matrix: Floats  # (3, 3) camera radiance (S0 scale: I₀ + I₉₀) → linear Rec.709 reflectance
-    quads: Floats | None  # (24, 4, 2) inner patch quads (x, y), full-frame grid px of the reference shot
-    corners: Floats | None  # (4, 2) outer patch corners, same grid
-    delta_e: Floats | None  # (24,) CIEDE2000 residual per patch
     source: Literal["chart", "corners", "profile", "camera", "none"]
-    cost: float  # the detector's; NaN without a chart
-    metres_per_px: float | None  # at the chart's distance, on this grid; None without a known chart size
-    falloff: tuple[float, float] = (0.0, 0.0)  # relative change of the light per patch, to the chart's right, down
-    glare: float = 0.0  # white light that the chart's gloss and the lens add to every patch [reflectance]
-    predicted: Floats | None = None  # (24,) CIEDE2000 of each patch by the matrix of all others
-    patch_use: Bits | None = None  # (24,) 0 served; else why not, `whitebalance.patches.PatchUse`
-    edition: str = ""  # whose colors its patches were held against, `ChartReference.name`
-    light: ChartLight | None = None  # None without a chart in the picture
+    cost: float = float("nan")  # of the chart's detector; NaN without it
+    metres_per_px: float | None = None  # at the chart's distance, on this grid; None without a known chart size
+    place: ChartPlace | None = None  # None without a chart in the picture
+    light: ChartLight | None = None  # the same
+    patches: PatchColors | None = None  # None without a chart, here or in the capture of the profile
 
 
 @dataclass(frozen=True)
@@ -283,40 +447,76 @@ class ObjectMask:
     mask: NDArray[np.bool_]  # (H, W) full-frame grid
     crop: tuple[int, int, int, int]  # x0, y0, x1, y1 full-frame grid px, end exclusive
     source: Literal["automatic", "user"]
-    chance: Bits | None = None  # (H, W) 0…255, how likely each pixel is the object; None where no network looked
-    doubt: float | None = None  # 1 − the IoU with the true mask that the chances let expect
+    doubt: float | None = None  # 1 − the expected IoU with the true mask; None without a network
     islands: float = 0.0  # share of the mask outside its largest part
-    holes: float = 0.0  # area that it encloses, of the mask's
+    holes: float = 0.0  # area of its holes, over its own
     border: float = 0.0  # share of the picture's edge that it covers
 
 
 @dataclass(frozen=True)
 class Gains:
-    """What each shot's radiance is divided by, and how far it may be trusted."""
+    """The light of each shot relative to the first; each shot is divided by its gain."""
 
-    gain: Floats  # (K, 3) relative to the reference shot
+    gain: Floats  # (K, 3)
     sigma: Floats  # (K, 3) 1σ
     anchor: Floats  # (K, 3) the same from the object itself, the cross-check
     source: Literal["grey patches", "object", "one exposure", "none"]
     disagreement: float  # largest |gain/anchor − 1| of the channel means beyond three times the error of both
-    angle_offset: float  # rad, true less stated angle of all shots alike, as the outline tells it
-    angle_offset_sigma: float  # rad, 1σ; π/2 where nothing is known
-    angle_correction: float  # rad, what is added to every stated angle: the offset where it is sure, else 0
-    concentration: float  # 0…1, how well AoLP follows the silhouette
-    order: tuple[int, ...]  # the order of the shots that the silhouette supports best
-    mirrored: bool  # the silhouette supports angles counted the other way
-    anchor_sigma: Floats  # (K,) 1σ of the anchor's channel means
-    grey_slope: float  # of ln light over ln reflectance of the chart's light greys: 1 is linear, NaN unknown
-    chart_gloss: float  # greatest part of a shot's ratio on the white patch that is the chart's gloss, beyond doubt
-    turned_shots: tuple[int, ...] = ()  # one of these keeps more than three shots from closing; the most turned first
-    turned: float = 0.0  # rad, true less stated angle of the first of them
-    turned_sigma: float = np.pi / 2  # rad, 1σ
-    rival: tuple[int, ...] = ()  # an order of the shots that the silhouette supports as well; none: it tells
-    rival_mirrored: bool = False
-    found_angle: Floats | None = None  # (K,) rad, where the stated ones are names only; None: they are angles
-    found_sigma: float = 0.0  # rad, 1σ of each
-    crossed: Floats | None = None  # (3,) S0 of what has no gloss over the crossed shot's light; None without one
-    crossed_sigma: float = 0.0  # 1σ, relative
+    grey_slope: float = float("nan")  # of ln light over ln reflectance of the chart's light greys: 1 is linear
+    chart_gloss: float = 0.0  # greatest part of a shot's ratio on the white patch that is the chart's gloss
+
+
+@dataclass(frozen=True)
+class ShotOrder:
+    """The order and sense of the polarizer's angles."""
+
+    shots: tuple[int, ...]  # (K,) number of the stated angle of each shot
+    mirrored: bool = False  # the angles count clockwise
+
+
+@dataclass(frozen=True)
+class OutlineCheck:
+    """The order and sense of the angles that the object's outline supports."""
+
+    best: ShotOrder  # as stated unless another fits better beyond doubt
+    concentration: float  # 0…1, how well the AoLP follows the outline
+    rival: ShotOrder | None = None  # another order that fits as well; None: the outline decides
+
+    @property
+    def as_stated(self) -> bool:
+        """Whether the stated order and sense fit best."""
+        return self.best == ShotOrder(tuple(range(len(self.best.shots))))
+
+
+@dataclass(frozen=True)
+class TurnedShot:
+    """The one of more than three shots that contradicts the others."""
+
+    shots: tuple[int, ...] = ()  # the most turned first, where several would explain it; none: all agree
+    angle: float = 0.0  # rad, true less stated angle of the first of them
+    sigma: float = np.pi / 2  # rad, 1σ
+
+
+@dataclass(frozen=True)
+class RingZero:
+    """The error of the polarizer ring's zero, common to all shots."""
+
+    offset: float  # rad, true less stated angle
+    sigma: float  # rad, 1σ; π/2: unknown
+    correction: float = 0.0  # rad, added to all angles: the offset where it is certain
+
+
+@dataclass(frozen=True)
+class SelfCalibration:
+    """Differences between the shots: the flash's energy and the polarizer's angles."""
+
+    gains: Gains
+    angle: Floats  # (K,) rad, of the polarizer, with the ring's correction
+    outline: OutlineCheck
+    ring: RingZero
+    turned: TurnedShot = TurnedShot()
+    found_sigma: float | None = None  # rad, 1σ of angles that were found; None: they were stated
+    crossed: Floats | None = None  # (3,) S0 of a surface without gloss over the crossed shot's light; None without one
 
 
 @dataclass(frozen=True)
@@ -352,17 +552,19 @@ class Cues:
 
 @dataclass(frozen=True)
 class Network:
-    """A loaded model: what it computes, and what its file says of itself."""
+    """A model file and the facts of its metadata; a `RunNetwork` function runs it."""
 
-    run: Callable[[Floats], dict[str, Floats]] = field(  # (1, N, H, W) → name → (1, n, H, W)
-        compare=False, repr=False, metadata=NOT_IN_KEY
-    )
     digest: str
     channels: tuple[str, ...]  # names of stages/cues, in order
     metadata: Mapping[str, str]
-    provider: str
-    fine: "Network | None" = None  # what adds relief to this one's normals
-    at_once: int = field(default=1, compare=False, metadata=NOT_IN_KEY)  # runs that may go side by side
+    fine: "Network | None" = None  # adds fine relief to the normals of this one
+    path: str = field(default="", metadata=NOT_IN_KEY)
+    device: Device = field(default="cpu", metadata=NOT_IN_KEY)
+    threads: int = field(default=0, metadata=NOT_IN_KEY)  # 0: as many as polcap may use
+    at_once: int = field(default=1, compare=False, metadata=NOT_IN_KEY)  # runs in parallel
+
+
+RunNetwork = Callable[[Network, Floats], dict[str, Floats]]  # (1, N, H, W) → name → (1, n, H, W); as `formats.onnx.run`
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""In: how much of the machine a command may take. Out: that limit, set for this process."""
+"""Limits of threads and memory for this process, and the message when memory runs out."""
 
 import math
 import os
@@ -7,14 +7,14 @@ from typing import Any
 
 from polcap.errors import SettingError
 
-_MOST_GB = 1e9  # beyond what any system counts
-_LEAST_GB = 0.8  # libraries and networks, and a capture of 1 MP: at .75 one fails, at .4 a library waits for ever
-OUT_OF_MEMORY = (  # as OpenCV, pybind11, onnxruntime, threads, the loader of libraries and the system say it
+_MOST_GB = 1e9  # more than any system counts
+_LEAST_GB = 0.8  # for libraries, networks and a capture of 1 MP: with .75 one fails, with .4 a library hangs
+OUT_OF_MEMORY = (  # messages of OpenCV, pybind11, onnxruntime, threads, the loader of libraries and the system
     "Insufficient memory", "bad_alloc", "bad allocation", "Failed to allocate memory", "can't start new thread",
     "failed to map segment", "Cannot allocate memory",
 )  # fmt: skip
-_GB_PER_PIXEL, _GB_BESIDE = 60e-9, 0.3  # of a whole run, per RAW pixel: measured, docs/explanations/scale.md
-_ROOM = 1.1  # above what was asked for when memory ran out: more is asked for afterwards
+_GB_PER_PIXEL, _GB_FIXED = 60e-9, 0.3  # of a whole run, per RAW pixel: measured, docs/explanations/scale.md
+_ROOM = 1.1  # over the request at which memory ran out: later ones may be larger
 _ASKED = re.compile(r"allocate ([\d.]+) (bytes|KiB|MiB|GiB)")  # numpy, OpenCV
 _BYTES = {"bytes": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 
@@ -30,12 +30,12 @@ def set_threads(count: int) -> None:
 
 
 def check_memory(gigabytes: float) -> None:
-    """Whether `set_memory` can set this limit.
+    """Refuse a limit that `set_memory` cannot set.
 
     Raises
     ------
     SettingError
-        It is no amount of memory, less than any capture needs, or the system knows no such limit.
+        It is no amount of memory, less than any capture needs, or the system has no such limit.
     """
     if not 0 <= gigabytes <= _MOST_GB:
         raise SettingError(f"--memory {gigabytes:g}: give a number of GB up to {_MOST_GB:g}, or leave it out")
@@ -49,7 +49,7 @@ def check_memory(gigabytes: float) -> None:
 
 
 def set_memory(gigabytes: float) -> None:
-    """Beyond this much of its own memory (mapped files apart) the process fails at once, and says so; 0 sets none.
+    """Limit the process's own memory, without mapped files: beyond it, allocations fail at once; 0 sets no limit.
 
     Raises
     ------
@@ -75,41 +75,29 @@ def _resource(gigabytes: float) -> Any:
 
 
 def is_shortfall(error: BaseException | None) -> bool:
-    """Whether an error, or one that it came from, says that memory is out."""
+    """Whether an error, or one of its causes, means that memory ran out."""
     if error is None:
         return False
-    said = isinstance(error, MemoryError) or any(word in str(error) for word in OUT_OF_MEMORY)
-    return said or is_shortfall(error.__cause__)
+    found = isinstance(error, MemoryError) or any(word in str(error) for word in OUT_OF_MEMORY)
+    return found or is_shortfall(error.__cause__)
 
 
 def shortfall(error: BaseException, stage: str, pixels: int) -> SettingError:
-    """What a lack of memory means.
+    """The error to raise for a shortfall: memory in use and requested by the stage, estimate for the run, remedy.
 
-    Parameters
-    ----------
-    error
-        One for which `is_shortfall` holds.
-    stage
-        What was at work.
-    pixels
-        Of a RAW frame.
-
-    Returns
-    -------
-    SettingError
-        The stage, what was taken and what more it asked for, what the capture takes about in all, the remedy.
+    `pixels` are those of a RAW frame.
     """
-    from polcap.stages.hdr import budget
+    from polcap.stages.hdr import planes
 
-    taken, limit = budget.memory()
+    taken, limit = planes.process_memory()
     asked = _ASKED.search(str(error))
     more = float(asked[1]) * _BYTES[asked[2]] if asked else 0.0
-    whole = max(_GB_PER_PIXEL * pixels + _GB_BESIDE, _ROOM * (taken + more) / 1e9, _LEAST_GB)
+    whole = max(_GB_PER_PIXEL * pixels + _GB_FIXED, _ROOM * (taken + more) / 1e9, _LEAST_GB)
     enough = math.ceil(10 * whole) / 10
-    said = f"{stage}: out of memory"
+    message = f"{stage}: out of memory"
     if taken:
-        said += f" with {taken / 1e9:.2f} GB taken" + (f" and {more / 1e9:.2g} GB more asked for" if more else "")
-    said += f"; a capture of {pixels / 1e6:.3g} MP takes about {enough:.1f} GB in all"
+        message += f" with {taken / 1e9:.2f} GB taken" + (f" and {more / 1e9:.2g} GB more asked for" if more else "")
+    message += f"; a capture of {pixels / 1e6:.3g} MP takes about {enough:.1f} GB in all"
     if limit is None:
-        return SettingError(f"{said}: free that much, run fewer at a time, or take a larger machine")
-    return SettingError(f"{said}: raise --memory from {limit / 1e9:.3g} to that, or leave it out")
+        return SettingError(f"{message}: free that much, run fewer at a time, or take a larger machine")
+    return SettingError(f"{message}: raise --memory from {limit / 1e9:.3g} to that, or leave it out")

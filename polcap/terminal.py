@@ -131,14 +131,21 @@ def preview(drawn: "list[Path]") -> None:
             console.print(line_)
 
 
+def tell_result(about: dict[str, Any], out: "Path", json: bool) -> None:
+    """The asset's path, or the report, on stdout; the verdict on stderr; a failed gate ends with exit code 3."""
+    say(about if json else str(out / "asset" / f"{about['capture']['name']}.glb"))
+    tell(f"verdict {about['verdict']}; {out / 'report.html'}")
+    tell_gates(about)
+
+
 def tell_gates(about: dict[str, Any]) -> None:
     """Tell failed gates and assumptions; a failed gate ends with exit code 3."""
     failed = 0
     for gate in about["gates"]:
         if gate["state"] in ("fail", "warn"):
             word = "gate failed" if gate["state"] == "fail" else "warning"
-            cost = f" (costs about {gate['cost_deg']:.0f}°)" if gate["cost_deg"] >= 1 else ""
-            tell(f"polcap: {word}: {gate['name']}: {gate['says']}{cost}; {gate['remedy']}")
+            cost = f", costs about {gate['cost_deg']:.0f}°" if gate["cost_deg"] >= 1 else ""
+            tell(f"polcap: {word}: {gate['name']}: {gate['says']}{cost}. {gate['remedy']}.")
             failed += gate["state"] == "fail"
     if failed:
         raise GateError(f"{failed} of {len(about['gates'])} gates failed; the asset was written, see report.html")

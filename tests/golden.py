@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap import Config, images, read_capture
-from polcap.formats import calib
+from polcap.formats import onnx, shipped_data
+from polcap.formats.raw import frame_decoder
 from polcap.images import View
 from polcap.optics import frames
 from polcap.pipeline import models
@@ -60,18 +61,19 @@ LIMITS: dict[str, dict[str, Limit]] = {  # stage → array → limit; the first 
         "variance": Limit("relative", 4e-3, 5e-4),  # its fit bins equally bright tiles in any order: 2e-3 was seen
     },
     "whitebalance": {
-        "quads": Limit("absolute", 0.02),  # px; corners are found on 8-bit pictures
-        "corners": Limit("absolute", 0.02),
+        "place.*": Limit("absolute", 0.02),  # px; corners are found on 8-bit pictures
     },
     "align": {
         "transform": Limit("px", 0.01),  # 1e-3 px was seen; the registration's own error is 0.02 px
     },
     "mask": {
         "mask": BITS,
-        "chance": Limit("absolute", 1.0, 1e-3, sensitive=True),  # 8-bit: one level of 255
         "crop": Limit("absolute", 1.0),  # follows the outermost pixel of the mask
     },
-    "selfcal": {"*angle*": Limit("degrees", 0.02)},  # under a tenth of its 1σ
+    "selfcal": {  # degrees: under a tenth of their 1σ
+        "*angle": Limit("degrees", 0.02),
+        "ring.*": Limit("degrees", 0.02),
+    },
     "stokes": {"quality": BITS, "mask": BITS, "*": FLOAT32},
     "cues": {"quality": BITS, "mask": BITS, "*": FLOAT32},
     "infer": {
@@ -179,7 +181,7 @@ class Golden:
 def radiance() -> images.AngleStack:
     """The longest exposure of each angle of the bundled capture; sums and quotients of integers, no stage."""
     capture = read_capture(CAPTURE)
-    photographs = [shot.frames[-1].load() for shot in capture.shots]
+    photographs = [frame_decoder.decode(shot.frames[-1]) for shot in capture.shots]
     values, clipped = [], []
     for photograph in photographs:
         count = np.asarray(photograph.value).astype(np.float32)
@@ -194,14 +196,9 @@ def radiance() -> images.AngleStack:
         quality=np.stack(clipped).astype(np.uint8) * np.uint8(images.Quality.CLIPPED),
         angle=capture.angle,
         view=VIEW,
-        exposure_ratio=np.ones((shots, 1, 3)),
-        exif_ratio=np.ones((shots, 1)),
-        ghost_fraction=np.zeros(shots),
-        lossy=False,
-        camera_matrix=photographs[0].camera_matrix,
-        white_balance=photographs[0].white_balance,
-        light="flash",
-        site_px=photographs[0].site_px,
+        bracket=images.single_frames(shots),
+        sensor=images.ColorSensor(photographs[0].camera_matrix, photographs[0].white_balance, photographs[0].site_px),
+        equipment=images.Equipment("flash"),
     )
 
 
@@ -215,15 +212,15 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
     color = replace(
         scenes.no_color(),
         matrix=inputs["matrix"],
-        quads=inputs["quads"],
-        corners=inputs["corners"],
+        place=images.ChartPlace(inputs["quads"], inputs["corners"]),
         source="chart",
         light=images.ChartLight(*(inputs[f"light.{name}"] for name in ("white", "normal", "flash", "covariance"))),
     )
     registered = replace(scenes.still(), transform=inputs["transform"])
     x0, y0, x1, y1 = (int(edge) for edge in inputs["crop"])
     object_ = images.ObjectMask(inputs["mask"], (x0, y0, x1, y1), "automatic")
-    gains = replace(scenes.equal(), gain=inputs["gain"], sigma=inputs["sigma"])
+    equal = scenes.equal(gain=inputs["gain"])
+    calibration = replace(equal, gains=replace(equal.gains, sigma=inputs["sigma"]))
 
     def network() -> images.Network:
         found = models.load_network("network", None, "cpu", threads)
@@ -231,10 +228,10 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
         return found
 
     def merge() -> Any:
-        return hdr.merge(read_capture(CAPTURE), config.hdr)
+        return hdr.merge(read_capture(CAPTURE), frame_decoder.decode, config.hdr)
 
     def measure() -> Any:
-        chart = calib.colorchecker(config.whitebalance.chart)
+        chart = shipped_data.colorchecker(config.whitebalance.chart)
         return whitebalance.measure(shots(), chart, images.ChartRequest("auto"), config.whitebalance)
 
     def register() -> Any:
@@ -242,22 +239,22 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
 
     def segment() -> Any:
         found = models.load_mask_network(threads)
-        return mask.segment(shots(), registered, color, None, found, config.mask)
+        return mask.segment(shots(), registered, color, None, found, onnx.run, config.mask)
 
     def calibrate() -> Any:
         return selfcal.solve(shots(), registered, object_, color, config.selfcal)
 
     def solve() -> Any:
-        return stokes.solve(shots(), registered, gains, object_, config.stokes)
+        return stokes.solve(shots(), registered, calibration, object_, config.stokes)
 
     def compute() -> Any:
         return cues.compute(plain_stokes(shots(), object_), color)
 
     def estimate() -> Any:
-        return infer.estimate(stored_cues(inputs), None, config.infer)
+        return infer.estimate(stored_cues(inputs), None, onnx.run, config.infer)
 
     def estimate_by_network() -> Any:
-        return infer.estimate(stored_cues(inputs), network(), config.infer)
+        return infer.estimate(stored_cues(inputs), network(), onnx.run, config.infer)
 
     def integrate() -> Any:
         return surface.integrate(stored_maps(inputs), 0.7, config.surface)
@@ -400,23 +397,23 @@ def file_of(name: str) -> Path:
 def make_inputs() -> Arrays:
     """Inputs of the later stages, by the stages before them."""
     config, shots = Config(), radiance()
-    chart = calib.colorchecker(config.whitebalance.chart)
+    chart = shipped_data.colorchecker(config.whitebalance.chart)
     color = whitebalance.measure(shots, chart, images.ChartRequest("auto"), config.whitebalance)
     registered = align.register(shots, color, config.align)
-    object_ = mask.segment(shots, registered, color, None, models.load_mask_network(1), config.mask)
-    gains = selfcal.solve(shots, registered, object_, color, config.selfcal)
-    assert color.quads is not None and color.corners is not None and color.light is not None
+    object_ = mask.segment(shots, registered, color, None, models.load_mask_network(1), onnx.run, config.mask)
+    calibration = selfcal.solve(shots, registered, object_, color, config.selfcal)
+    assert color.place is not None and color.light is not None
     found = {f"light.{name}": array for name, array in vars(color.light).items()}
-    found |= {"matrix": color.matrix, "quads": color.quads, "corners": color.corners}
+    found |= {"matrix": color.matrix, "quads": color.place.quads, "corners": color.place.corners}
     found |= {"transform": registered.transform, "mask": object_.mask, "crop": np.array(object_.crop)}
-    found |= {"gain": gains.gain, "sigma": gains.sigma}
-    seen = cues.compute(stokes.solve(shots, registered, gains, object_, config.stokes), color)
+    found |= {"gain": calibration.gains.gain, "sigma": calibration.gains.sigma}
+    seen = cues.compute(stokes.solve(shots, registered, calibration, object_, config.stokes), color)
     inside = seen.mask[::STEP, ::STEP]
     found["cues.mask"] = inside
     found["cues.radiance"] = short(seen.radiance[::STEP, ::STEP] * inside[..., None])
     found["cues.ratio"] = short(seen.ratio[:, ::STEP, ::STEP] * inside)
     found["cues.ratio_sigma"] = short(seen.ratio_sigma[::STEP, ::STEP])
-    maps = infer.estimate(stored_cues(found), models.load_network("network", None, "cpu", 1), config.infer)
+    maps = infer.estimate(stored_cues(found), models.load_network("network", None, "cpu", 1), onnx.run, config.infer)
     found["maps.normal"] = short(np.moveaxis(maps.normal[..., :2] * inside[..., None], -1, 0))
     found["maps.diffuse"] = short(maps.diffuse * inside[..., None])
     found["maps.specular"] = short(maps.specular[..., 0] * inside)

@@ -7,7 +7,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Gains, ObjectMask, View
+from polcap.images import (
+    Alignment,
+    AngleStack,
+    ColorCalibration,
+    Floats,
+    Gains,
+    ObjectMask,
+    OutlineCheck,
+    RingZero,
+    SelfCalibration,
+    ShotOrder,
+    View,
+    single_frames,
+)
 from polcap.optics import frames, mueller, shade
 from polcap.optics.warp import warp
 
@@ -84,8 +97,7 @@ def stack(
     return AngleStack(
         value=value.astype(np.float32), variance=variance.astype(np.float32),
         quality=np.zeros(value.shape[:3], np.uint8), angle=np.asarray(angles), view=VIEW,
-        exposure_ratio=np.ones((len(angles), 1, 3)), exif_ratio=np.ones((len(angles), 1)),
-        ghost_fraction=np.zeros(len(angles)), lossy=False, camera_matrix=None, white_balance=None,
+        bracket=single_frames(len(angles)),
     )  # fmt: skip
 
 
@@ -102,17 +114,19 @@ def before_backdrop(transforms: Sequence[Floats]) -> AngleStack:
 
 def no_color(scale: float = 0.5) -> ColorCalibration:
     """The colour calibration of these shots, which are Rec.709 at `scale`; as from another capture's chart."""
-    return ColorCalibration(np.eye(3) / scale, None, None, None, "profile", float("nan"), None)
+    return ColorCalibration(np.eye(3) / scale, "profile")
 
 
 def still(shots: int = 3) -> Alignment:
     return Alignment(np.tile(np.eye(3), (shots, 1, 1)), np.zeros(shots), np.ones(shots))
 
 
-def equal(shots: int = 3) -> Gains:
-    ones = np.ones((shots, 3))
-    order = tuple(range(shots))
-    return Gains(ones, 0 * ones, ones, "none", 0.0, 0.0, 0.0, 0.0, 1.0, order, False, np.zeros(shots), 1.0, 0.0)
+def equal(angle: Floats = ANGLES, gain: Floats | float = 1.0) -> SelfCalibration:
+    """Shots at these angles (K,) rad, with these gains (K, 3)."""
+    ones = np.ones((len(angle), 3))
+    gains = Gains(gain * ones, 0 * ones, ones, "none", 0.0)
+    order = ShotOrder(tuple(range(len(angle))))
+    return SelfCalibration(gains, np.asarray(angle), OutlineCheck(order, 1.0), RingZero(0.0, 0.0))
 
 
 def ball_object() -> ObjectMask:

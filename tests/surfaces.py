@@ -42,8 +42,8 @@ def maps(ripple: float = 0.0, roughness: float = 1.0, specular: float = 0.0) -> 
     )
 
 
-def mesh(of: SurfaceMaps, settings: surface.Settings | None = None) -> Mesh:
-    return surface.integrate(of, DISTANCE, settings or surface.Settings())
+def mesh(of: SurfaceMaps, settings: surface.SurfaceSettings | None = None) -> Mesh:
+    return surface.integrate(of, DISTANCE, settings or surface.SurfaceSettings())
 
 
 def flat_mesh(of: SurfaceMaps) -> Mesh:
@@ -54,7 +54,7 @@ def flat_mesh(of: SurfaceMaps) -> Mesh:
 
 
 def built(of: SurfaceMaps, on: Mesh) -> Asset:
-    return asset.build(of, on, asset.Settings())
+    return asset.build(of, on, asset.AssetSettings())
 
 
 def lit(of: SurfaceMaps, to_light: Floats) -> Floats:

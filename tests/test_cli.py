@@ -213,7 +213,7 @@ def test_folder_that_is_no_result_is_exit_2(tmp_path: Path, polcap: Command, com
 
 def test_a_result_is_told_to_be_no_capture(result: Path, polcap: Command) -> None:
     done = polcap("process", result)
-    assert done.returncode == 2 and "it is a result: give the capture" in done.stderr
+    assert done.returncode == 2 and "it is a result of polcap: give the folder" in done.stderr
 
 
 def test_the_status_of_no_folder_says_so(tmp_path: Path, polcap: Command) -> None:

@@ -1,4 +1,4 @@
-"""The doctor says what is broken, and only what `polcap process` needs is a fault."""
+"""`polcap doctor` finds defects; only those that stop `polcap process` are faults."""
 
 import json
 import shutil
@@ -34,7 +34,7 @@ def test_this_machine_can_process(tmp_path: Path) -> None:
     assert not any(tmp_path.iterdir())
 
 
-def test_ports_and_cameras_tell_who_answers(tmp_path: Path) -> None:
+def test_ports_and_cameras_are_listed_with_what_answers(tmp_path: Path) -> None:
     answers = {"/dev/ttyUSB0": "Elliptec ELL14", "/dev/ttyUSB1": None}
 
     def probe(url: str) -> str | None:
@@ -51,18 +51,18 @@ def test_ports_and_cameras_tell_who_answers(tmp_path: Path) -> None:
     assert found["/dev/ttyUSB0"] == Finding("/dev/ttyUSB0", "ok", "FT230X: Elliptec ELL14")
     assert found["/dev/ttyUSB1"].state == found["/dev/ttyACM0"].state == "warning"
     assert "dialout" in found["/dev/ttyACM0"].remedy
-    assert found["camera"].says == "Nikon Z6 at usb:001,004"
+    assert found["camera"].message == "Nikon Z6 at usb:001,004"
 
 
 def test_no_port_is_written_to_without_leave(tmp_path: Path) -> None:
     rig = Rig(lambda: [("/dev/ttyS0", "a CNC mill")], lambda ports: False, lambda url: pytest.fail("written"), list)
     found = named(doctor.examine(rig, tmp_path))["/dev/ttyS0"]
     assert found == Finding(
-        "/dev/ttyS0", "ok", "a CNC mill: not asked", "`polcap doctor --ports` writes to it to learn"
+        "/dev/ttyS0", "ok", "a CNC mill: not asked", "`polcap doctor --ports` asks, and writes to it"
     )
 
 
-def test_rig_that_is_not_there_is_no_fault(tmp_path: Path) -> None:
+def test_a_missing_rig_is_no_fault(tmp_path: Path) -> None:
     def cameras() -> list[tuple[str, str]]:
         raise SettingError("gphoto2 is not installed; pip install 'polcap[rig]'")
 

@@ -1,27 +1,27 @@
-"""`polcap doctor FILE` tells in seconds whether a photograph can be used, and why not."""
+"""`polcap doctor FILE` reports whether a photograph can be used, and why not."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from polcap import doctor
 from polcap.doctor.finding import Finding
+from polcap.doctor.photograph import examine_file
 from polcap.formats.maps import png
-from polcap.formats.raw import dng
 from polcap.formats.raw import libraw as raw
 from polcap.images import Exif
 from tests.conftest import Command
+from tests.raw_files import write_raw
 
 
-def told(file: Path) -> dict[str, Finding]:
-    return {one.name: one for one in doctor.examine_file(file)}
+def findings(file: Path) -> dict[str, Finding]:
+    return {one.name: one for one in examine_file(file)}
 
 
 def test_a_sound_raw_is_ok_throughout(example: Path) -> None:
-    found = told(sorted(example.rglob("*.DNG"))[0])
+    found = findings(sorted(example.rglob("*.DNG"))[0])
     assert {one.state for one in found.values()} == {"ok"}
-    assert found["pattern"].says.startswith("Bayer")
+    assert found["pattern"].message.startswith("Bayer")
 
 
 def test_a_cut_file_and_a_text_are_faults(example: Path, tmp_path: Path) -> None:
@@ -29,23 +29,14 @@ def test_a_cut_file_and_a_text_are_faults(example: Path, tmp_path: Path) -> None
     (tmp_path / "cut.dng").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "notes.txt").write_text("f/11")
     for name in ("cut.dng", "notes.txt", "."):
-        assert any(one.state == "fault" and one.remedy for one in told(tmp_path / name).values())
+        assert any(one.state == "fault" and one.remedy for one in findings(tmp_path / name).values())
 
 
-def test_an_over_exposed_frame_and_a_monochrome_one_are_told(tmp_path: Path) -> None:
-    dng.write(
-        tmp_path / "white.dng",
-        np.full((64, 64), 4095, np.uint16),
-        cfa=np.array([[0, 1], [1, 2]], np.uint8),
-        black=0,
-        white=4095,
-        exif=Exif(make="Polcap", model="Test"),
-        color_matrix=np.eye(3),
-        as_shot_neutral=np.ones(3),
-    )
-    assert told(tmp_path / "white.dng")["levels"].state == "warning"
+def test_an_over_exposed_frame_and_a_monochrome_one_are_warnings(tmp_path: Path) -> None:
+    write_raw(tmp_path / "white.dng", np.full((64, 64), 4095, np.uint16), Exif(make="Polcap", model="Test"), 0, 4095)
+    assert findings(tmp_path / "white.dng")["levels"].state == "warning"
     png.write(tmp_path / "grey.png", np.tile(np.arange(64, dtype=np.uint16) * 900, (64, 1))[..., None].repeat(3, 2))
-    assert "monochrome" in told(tmp_path / "grey.png")["pattern"].says
+    assert "monochrome" in findings(tmp_path / "grey.png")["pattern"].message
 
 
 @pytest.mark.parametrize(("shape", "name"), [((6, 6), "6×6"), (None, "Foveon"), ((4, 4), "4×4")])

@@ -8,10 +8,10 @@ from polcap import resource_limits
 from polcap.config import Config
 from polcap.errors import ModelError, SettingError
 from polcap.formats.capture.reader import read as read_capture
+from polcap.optics import registration
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import UserInput
-from polcap.stages import align
-from polcap.stages.hdr import budget
+from polcap.stages.hdr import planes
 from tests.conftest import Command
 
 
@@ -53,11 +53,11 @@ def test_a_lack_of_memory_is_known_by_whoever_says_it(error: Exception) -> None:
 def test_a_lack_of_memory_names_the_stage_what_it_would_take_and_the_remedy(
     example: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def refine(*_: object) -> None:
+    def register(*_: object) -> None:
         raise MemoryError("Unable to allocate 3.00 GiB for an array with shape (3, 8) and data type float32")
 
-    monkeypatch.setattr(budget, "memory", lambda: (2_000_000_000, 4_000_000_000))
-    monkeypatch.setattr(align, "refine", refine)
+    monkeypatch.setattr(planes, "process_memory", lambda: (2_000_000_000, 4_000_000_000))
+    monkeypatch.setattr(registration, "register", register)
     capture = read_capture(example)
     with pytest.raises(SettingError) as caught:
         pipeline.process(capture, UserInput(), Config(), tmp_path, until="align")
@@ -67,6 +67,6 @@ def test_a_lack_of_memory_names_the_stage_what_it_would_take_and_the_remedy(
 
 
 def test_without_a_limit_the_remedy_is_another(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(budget, "memory", lambda: (0, None))
+    monkeypatch.setattr(planes, "process_memory", lambda: (0, None))
     said = str(resource_limits.shortfall(MemoryError(), "surface", 24_000_000))
     assert said.startswith("surface: out of memory; a capture of 24 MP takes about 1.8 GB in all: free that much")

@@ -17,8 +17,8 @@ from polcap.batch import unit as units
 from polcap.batch.shards import WHOLE, Shard
 from polcap.batch.unit import FINISHED, FOLDER, Order, Record, Unit
 from polcap.errors import CaptureError
-from polcap.formats import atomic
-from polcap.formats.capture import layouts, own_folders
+from polcap.formats import atomic, own_folders
+from polcap.formats.capture import layouts
 
 Tell = Callable[[str], None]
 

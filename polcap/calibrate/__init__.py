@@ -1,18 +1,18 @@
-"""In: photographs of what is known. Out: what the camera, the lens, the polarizer and the flash are in fact.
+"""Calibration of camera, lens, polarizer and flash from photographs of known things.
 
 ::
 
     FOLDER/dark/                     the cap on the lens
-    FOLDER/flat/                     an evenly lit white surface, out of focus, twice at least at every exposure
-    FOLDER/bracket/                  exposures of any still scene, or such folders: noise where flat/ has no such ISO
-    FOLDER/flash/                    one and the same thing, again and again, by the flash
-    FOLDER/lens/                     a checkerboard or a ColorChecker, tilted to all sides, all over the picture
-    FOLDER/polarizer/axis000/pol000/ polarized light of a known axis (a second polarizer before a lamp, a screen)
-                    /pol015/ …       through the filter at every angle of its ring; a second axis tells its sense
+    FOLDER/flat/                     an evenly lit white surface, out of focus, at least twice at every exposure
+    FOLDER/bracket/                  exposures of any still scene, or such folders: noise at an ISO that flat/ lacks
+    FOLDER/flash/                    the same thing many times, by the flash
+    FOLDER/lens/                     a checkerboard or a ColorChecker, tilted to all sides, in all parts of the picture
+    FOLDER/polarizer/axis000/pol000/ polarized light of a known axis (a second polarizer on a lamp, a screen)
+                    /pol015/ …       through the filter at every angle of its ring; a second axis gives the sense
 
-Each is optional, each quantity a file: `photon_transfer` and `bracket_noise` noise, `levels` black and white,
-`linearity`, `lens_falloff`, `lens_geometry` focal length and distortion, `polarizer` extinction, zero and sense of the
-ring, `flash_energy`.
+Every folder is optional. A module measures one quantity: `photon_transfer` and `bracket_noise` noise,
+`sensor_levels` black and white, `linearity`, `lens_falloff`, `lens_geometry` focal length and distortion,
+`polarizer_ring` extinction, zero and sense, `flash_energy`.
 """
 
 from pathlib import Path
@@ -22,100 +22,87 @@ from polcap.calibrate import (
     flash_energy,
     lens_falloff,
     lens_geometry,
-    levels,
     linearity,
     photon_transfer,
-    polarizer,
+    polarizer_ring,
+    sensor_levels,
 )
-from polcap.calibrate.photographs import Photograph, angle_of, inside, listed
-from polcap.calibration_values import Calibration, NoiseLine, Polarizer
+from polcap.calibrate.calibration_photographs import Photograph, angle_folders, angle_of, photographs_in
 from polcap.errors import CaptureError
+from polcap.images import Calibration, NoiseLine
 
-_ROOMS = ("dark", "flat", "bracket", "flash", "lens", "polarizer")
+_FOLDERS = ("dark", "flat", "bracket", "flash", "lens", "polarizer")
 
 
 def measure(
     folder: Path, made: str, lens_filter: str = "", axis_deg: float = 0.0, squares: tuple[int, int] = (9, 6)
 ) -> Calibration:
-    """All that the folder's photographs tell.
+    """Everything that the folder's photographs show.
 
-    made : date and time, ISO 8601. lens_filter : the polarizer's name. axis_deg : of polarized light in
-    `polarizer/pol…`, where no `axis…` folder states it; from image x towards image up. squares : inner corners of the
+    made : date and time, ISO 8601. lens_filter : the polarizer's name. axis_deg : axis of the light in
+    `polarizer/pol…` if no `axis…` folder states it, from image x towards image up. squares : inner corners of the
     checkerboard in `lens/`.
 
-    Raises
-    ------
-    CaptureError
-        The folder holds none of the rooms, or photographs that do not tell what their room is for.
-    DecodeError
-        A photograph that cannot be read.
+    Raises CaptureError if the folder holds none of these folders, or photographs that do not show their quantity;
+    DecodeError if a photograph cannot be read.
     """
     if not folder.is_dir():
-        raise CaptureError(f"{folder}: no such folder; give the one that holds {', '.join(_ROOMS)}")
-    rooms = {name: folder / name for name in _ROOMS if (folder / name).is_dir()}
-    if not rooms:
-        raise CaptureError(f"{folder}: holds none of the folders {', '.join(_ROOMS)}; see the page on calibration")
-    dark = listed(rooms["dark"]) if "dark" in rooms else []
-    flat = listed(rooms["flat"]) if "flat" in rooms else []
-    flash = listed(rooms["flash"]) if "flash" in rooms else []
-    turned = _turned(rooms["polarizer"], axis_deg) if "polarizer" in rooms else []
-    stepped = bracket_noise.brackets(rooms["bracket"]) if "bracket" in rooms else []
-    boards = listed(rooms["lens"]) if "lens" in rooms else []
-    every = [*dark, *flat, *(shot for one in stepped for shot in one), *flash, *boards]
-    every += [shot.photograph for shot in turned]
-    first = every[0]
-    _check_one_camera(every)
+        raise CaptureError(f"{folder}: no such folder; give the one that holds {', '.join(_FOLDERS)}")
+    folders = {name: folder / name for name in _FOLDERS if (folder / name).is_dir()}
+    if not folders:
+        raise CaptureError(f"{folder}: holds none of the folders {', '.join(_FOLDERS)}; see the page on calibration")
+    dark, flat, flash, boards = (
+        photographs_in(folders[name]) if name in folders else [] for name in ("dark", "flat", "flash", "lens")
+    )
+    turned = _polarizer_shots(folders["polarizer"], axis_deg) if "polarizer" in folders else []
+    brackets = bracket_noise.brackets(folders["bracket"]) if "bracket" in folders else []
+    photographs = [*dark, *flat, *(shot for bracket in brackets for shot in bracket), *flash, *boards]
+    photographs += [shot.photograph for shot in turned]
+    _check_one_camera(photographs)
+    exif = photographs[0].exif
     return Calibration(
         made=made,
-        camera=f"{first.exif.make} {first.exif.model}".strip(),
-        lens=first.exif.lens,
+        camera=f"{exif.make} {exif.model}".strip(),
+        lens=exif.lens,
         filter=lens_filter,
-        noise=_noise(flat, dark, stepped),
-        levels=levels.measure(dark, flat) if dark else None,
+        noise=_noise(flat, dark, brackets),
+        levels=sensor_levels.measure(dark, flat) if dark else None,
         linearity=linearity.measure(flat),
         falloff=lens_falloff.measure(flat) if flat else None,
         geometry=lens_geometry.measure(boards, squares) if boards else None,
-        polarizer=_polarizer(turned),
+        polarizer=polarizer_ring.measure(turned) if turned else None,
         flash=flash_energy.measure(flash) if flash else None,
     )
 
 
-def _noise(flat: list[Photograph], dark: list[Photograph], stepped: list[list[Photograph]]) -> tuple[NoiseLine, ...]:
-    """By flat frames; at an ISO that has none by brackets."""
-    lines = photon_transfer.measure(flat, dark)
-    if not stepped:
-        return lines
-    known = {line.iso for line in lines}
-    others = [line for line in bracket_noise.measure(stepped) if line.iso not in known]
-    return tuple(sorted((*lines, *others), key=lambda line: line.iso))
+def _noise(flat: list[Photograph], dark: list[Photograph], brackets: list[list[Photograph]]) -> tuple[NoiseLine, ...]:
+    """From flat frames; from brackets at an ISO without flat frames."""
+    lines = {line.iso: line for line in bracket_noise.measure(brackets)} if brackets else {}
+    lines |= {line.iso: line for line in photon_transfer.measure(flat, dark)}
+    return tuple(lines[iso] for iso in sorted(lines))
 
 
-def _turned(folder: Path, axis_deg: float) -> list[polarizer.Turned]:
-    """The shots of `polarizer/`, by axis and ring angle."""
-    axes = inside(folder, "axis")
-    if not axes:
-        axes = [(axis_deg, folder)]
-    found = []
-    for axis, place in axes:
-        for ring, shots in inside(place, "pol"):
-            found += [polarizer.Turned(axis, ring, photograph) for photograph in listed(shots)]
-    if not found:
+def _polarizer_shots(folder: Path, axis_deg: float) -> list[polarizer_ring.PolarizerShot]:
+    """The photographs of `polarizer/` with the light's axis and the ring's angle."""
+    shots = [
+        polarizer_ring.PolarizerShot(axis, ring, photograph)
+        for axis, axis_folder in angle_folders(folder, "axis") or [(axis_deg, folder)]
+        for ring, ring_folder in angle_folders(axis_folder, "pol")
+        for photograph in photographs_in(ring_folder)
+    ]
+    if not shots:
         raise CaptureError(f"{folder}: holds no pol000, pol015, … with a photograph of each angle of the ring")
-    return found
-
-
-def _polarizer(turned: list[polarizer.Turned]) -> Polarizer | None:
-    return polarizer.measure(turned) if turned else None
+    return shots
 
 
 def _check_one_camera(photographs: list[Photograph]) -> None:
     first = photographs[0]
     for other in photographs:
-        for what in ("make", "model", "lens"):
-            mine, theirs = getattr(first.exif, what), getattr(other.exif, what)
-            if mine and theirs and mine != theirs:
+        for tag in ("make", "model", "lens"):
+            expected, found = getattr(first.exif, tag), getattr(other.exif, tag)
+            if expected and found and expected != found:
                 raise CaptureError(
-                    f"{other.path}: was taken with {theirs}, {first.path.name} with {mine}; "
+                    f"{other.path}: was taken with {found}, {first.path.name} with {expected}; "
                     "calibrate one set-up at a time"
                 )
 

@@ -1,28 +1,25 @@
-"""In: one thing photographed again and again by the flash. Out: how far its energy scatters from pop to pop."""
+"""Flash energy: its spread and drift from pop to pop, from photographs of one thing."""
 
 import numpy as np
 
-from polcap.calibrate.photographs import Photograph, by_setting, center
-from polcap.calibration_values import FlashEnergy
+from polcap.calibrate.calibration_photographs import Photograph, by_setting, center
 from polcap.errors import CaptureError
+from polcap.images import FlashEnergy
 
-_LEAST = 4  # pops, for a spread that means something
+_LEAST = 4  # pops
 _CLIPPED = 0.01
 
 
 def measure(photographs: list[Photograph]) -> FlashEnergy:
-    """1σ of the energy relative to its mean, its own 1σ, and the drift over the series; of the largest equal series.
+    """1σ of the energy relative to its mean, and the drift; from the largest series of one exposure setting.
 
-    Raises
-    ------
-    CaptureError
-        Fewer than four frames of one setting, or over-exposed ones.
+    Raises CaptureError for fewer than four frames of one setting, or over-exposed ones.
     """
     group = max(by_setting(photographs).values(), key=len)
     if len(group) < _LEAST:
         raise CaptureError(
             f"{group[0].path.parent}: {len(group)} frames of one setting; take {_LEAST} or more, "
-            "twenty tell the spread to 16 %"
+            "twenty give the spread to 16 %"
         )
     light = []
     for one in group:

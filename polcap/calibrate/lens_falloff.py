@@ -1,28 +1,24 @@
-"""In: flat frames. Out: how a lens's light falls off towards the corners, 1 in the middle.
+"""Light falloff of a lens towards the corners, from flat frames; 1 in the middle.
 
-The surface is never lit quite evenly: a linear slope of its light is fitted beside the lens's radial law and left out.
+The surface is never lit quite evenly: a linear slope of its light is fitted together with the radial falloff.
 """
 
-import cv2
 import numpy as np
 
-from polcap.calibrate.photographs import CLIP, Photograph, by_setting
-from polcap.calibration_values import Falloff
+from polcap.calibrate.calibration_photographs import CLIP, Photograph, by_setting
 from polcap.errors import CaptureError
-from polcap.images import Floats
+from polcap.images import Falloff, Floats
 from polcap.optics import sensor
+from polcap.optics.resize import area_mean
 
 _CELLS = 48  # along the longer side
-_FAINT = 0.02  # of white, mean: noise and black's error count
+_FAINT = 0.02  # of white; below, noise and the error of black matter
 
 
 def measure(flat: list[Photograph]) -> Falloff:
     """1 + a r² + b r⁴ + c r⁶ per channel, r = 1 in the corners, from the brightest setting that does not clip.
 
-    Raises
-    ------
-    CaptureError
-        Every flat frame is clipped or dark.
+    Raises CaptureError if every flat frame is clipped or dark.
     """
     for group in sorted(by_setting(flat).values(), key=_exposure, reverse=True):
         images = [one.image() for one in group]
@@ -32,7 +28,7 @@ def measure(flat: list[Photograph]) -> Falloff:
                 break
     else:
         raise CaptureError(f"{flat[0].path.parent}: every flat frame is clipped or dark; expose to half of white")
-    coefficient, sigma = _fitted(mean)
+    coefficient, sigma = _fit(mean)
     return Falloff(
         coefficient=tuple(map(tuple, coefficient.tolist())),
         sigma=tuple(map(tuple, sigma.tolist())),
@@ -46,19 +42,18 @@ def _exposure(group: list[Photograph]) -> float:
     return group[0].exif.relative_exposure or 0.0
 
 
-def _fitted(picture: Floats) -> tuple[Floats, Floats]:
+def _fit(picture: Floats) -> tuple[Floats, Floats]:
     """(C, 3) coefficients and their 1σ."""
     h, w = picture.shape[:2]
     width, height = (max(4, round(_CELLS * side / max(h, w))) for side in (w, h))
-    cells = cv2.resize(np.asarray(picture, np.float32), (width, height), interpolation=cv2.INTER_AREA)
-    cells = cells.reshape(height * width, -1)
+    cells = area_mean(np.asarray(picture, np.float32), (height, width)).reshape(height * width, -1)
     y, x = np.mgrid[0:height, 0:width].reshape(2, -1) + 0.5
     x, y = (x / width - 0.5) * w, (y / height - 0.5) * h
     half = np.hypot(w, h) / 2
     r2 = (x**2 + y**2) / half**2
     matrix = np.stack([np.ones_like(x), x / half, y / half, r2, r2**2, r2**3], axis=1)
     solved, _, _, _ = np.linalg.lstsq(matrix, cells, rcond=None)
-    scatter = cells - matrix @ solved
-    variance = (scatter**2).sum(axis=0) / (len(cells) - 6)
-    doubt = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix))[3:, None] * variance)
-    return (solved[3:] / solved[0]).T, (doubt / solved[0]).T
+    residual = cells - matrix @ solved
+    variance = (residual**2).sum(axis=0) / (len(cells) - 6)
+    sigma = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix))[3:, None] * variance)
+    return (solved[3:] / solved[0]).T, (sigma / solved[0]).T

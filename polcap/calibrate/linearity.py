@@ -1,18 +1,17 @@
-"""In: flat frames by steady light at several exposure times. Out: how far the signal is from proportional to time."""
+"""Linearity of a sensor: signal against exposure time, from flat frames in steady light."""
 
 import numpy as np
 
-from polcap.calibrate.photographs import Photograph, by_setting, center
-from polcap.calibration_values import Linearity
-from polcap.images import Floats
+from polcap.calibrate.calibration_photographs import Photograph, by_setting, center
+from polcap.images import Floats, Linearity
 
-_LEAST = 0.02  # of white: below, black's error counts more than a curve
+_LEAST = 0.02  # of white; below, the error of black matters more than a curve
 
 
 def measure(flat: list[Photograph]) -> Linearity | None:
-    """Of the ISO and aperture with most exposure times; None where there are fewer than three.
+    """Linearity at the ISO and aperture with most exposure times; None with fewer than three.
 
-    Shutters keep their stated times to a per cent or two: what exceeds that is the sensor's.
+    Shutter times are true to one or two percent; larger deviations come from the sensor.
     """
     groups: dict[tuple[float, float], list[tuple[float, float]]] = {}
     for (iso, time, aperture), photographs in by_setting(flat).items():

@@ -1,7 +1,7 @@
-"""In: pairs of flat frames, dark frames. Out: a sensor's noise at each ISO: photons per count, and what is there unlit.
+"""Photon transfer: a sensor's noise at each ISO, from pairs of flat frames and of dark frames.
 
-Two frames of the same thing differ by noise alone: dust, lens and uneven pixels drop out. Per channel the variance is
-a straight line over the signal, its slope the inverse of the electrons at white, its height the read noise.
+Two frames of the same thing differ by noise alone: dust, lens and uneven pixels cancel. Per channel the variance is a
+straight line over the signal; the slope is the inverse of the electrons at white, the floor is the read noise.
 
 References
 ----------
@@ -13,23 +13,19 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.calibrate.photographs import CLIP, Photograph, by_setting
-from polcap.calibration_values import NoiseLine
+from polcap.calibrate.calibration_photographs import CLIP, Photograph, by_setting
 from polcap.errors import CaptureError
-from polcap.images import Floats, SensorImage
-from polcap.optics import sensor
+from polcap.images import Floats, NoiseLine, SensorImage
+from polcap.optics import robust, sensor
 
-_TILE = 16  # px of a tile's side: vignetting within one changes nothing
-_LEAST_LEVELS = 2.0  # brightest over darkest tile: a line needs two ends
+_TILE = 16  # px; within a tile the lens's falloff changes nothing
+_LEAST_RANGE = 2.0  # brightest over darkest tile: a line needs two ends
 
 
 def measure(flat: list[Photograph], dark: list[Photograph]) -> tuple[NoiseLine, ...]:
-    """The line of every ISO that has a pair of flat frames.
+    """Noise line of every ISO with a pair of flat frames.
 
-    Raises
-    ------
-    CaptureError
-        Flat frames of which no two have the same setting, or whose signals are all alike.
+    Raises CaptureError if no two flat frames have the same setting, or all have one brightness.
     """
     lines = []
     for iso in sorted({one.setting[0] for one in flat}):
@@ -46,7 +42,7 @@ def measure(flat: list[Photograph], dark: list[Photograph]) -> tuple[NoiseLine, 
 
 
 def _points(photographs: list[Photograph]) -> Iterator[tuple[Floats, Floats, Floats]]:
-    """Of every pair: signal and variance of its tiles (T, C), and photosites per pixel of each channel (C,)."""
+    """For every pair: signal and variance of its tiles (T, C), and photosites per pixel (C,)."""
     for group in by_setting(photographs).values():
         for first, second in zip(group[::2], group[1::2]):
             one, two = first.image(), second.image()
@@ -56,13 +52,13 @@ def _points(photographs: list[Photograph]) -> Iterator[tuple[Floats, Floats, Flo
             usable = sensor.usable(one, CLIP) & sensor.usable(two, CLIP)
             ratio = 1.0
             lit = a[usable].mean() > 0.01 if usable.any() else False
-            if lit:  # a lamp that flickers; in the dark there is nothing to compare
+            if lit:  # the lamp flickers; dark frames have nothing to compare
                 ratio = float(b[usable].mean() / a[usable].mean())
             yield (*_tiles(a, b, usable, ratio), photosites(one, a.shape[-1]))
 
 
 def _tiles(a: Floats, b: Floats, usable: NDArray[np.bool_], ratio: float) -> tuple[Floats, Floats]:
-    """With d = b − r a: var d / (1 + r²) over the signal (b + r² a) / (1 + r²) is the sensor's line."""
+    """Signal (b + r² a) / (1 + r²) and variance var(b − r a) / (1 + r²) of the tiles, (T, C) each."""
     rows, columns = a.shape[0] // _TILE, a.shape[1] // _TILE
     shape = rows, _TILE, columns, _TILE
     cut = slice(rows * _TILE), slice(columns * _TILE)
@@ -76,7 +72,7 @@ def _tiles(a: Floats, b: Floats, usable: NDArray[np.bool_], ratio: float) -> tup
 
 
 def photosites(image: SensorImage, channels: int) -> Floats:
-    """How many of a mosaic's are binned into one pixel, (C,)."""
+    """Photosites of the mosaic per pixel of each channel, (C,)."""
     if image.cfa is None:
         return np.ones(channels)
     count = np.bincount(image.cfa.ravel(), minlength=3)
@@ -85,20 +81,24 @@ def photosites(image: SensorImage, channels: int) -> Floats:
 
 def _line(iso: float, points: list[tuple[Floats, Floats, Floats]], where: Photograph) -> NoiseLine:
     level, variance = (np.concatenate([point[i] for point in points]) for i in (0, 1))
-    if len(level) < 4 or level.max() < _LEAST_LEVELS * max(float(level.min()), 1e-3):
+    if len(level) < 4 or level.max() < _LEAST_RANGE * max(float(level.min()), 1e-3):
         raise CaptureError(
             f"{where.path.parent}: flat frames at ISO {iso:g} are all of one brightness or clipped; take pairs from "
             "a tenth to nine tenths of white, or dark ones too"
         )
-    solved = [_solved(level[:, c], variance[:, c], _TILE * _TILE - 1) for c in range(level.shape[1])]
-    slope, floor, slope_sigma, floor_sigma = np.array(solved).T
-    return as_line(iso, (slope, slope_sigma), (floor, floor_sigma), points[0][2], "flat frames")
+    fits = [
+        robust.fit_noise_line(level[:, c], variance[:, c], _TILE * _TILE - 1, least=0.2 * np.median(variance[:, c]))
+        for c in range(level.shape[1])
+    ]
+    slope, floor = np.array([(fit.slope, fit.floor) for fit in fits]).T
+    slope_sigma, floor_sigma = np.array([np.sqrt(np.diag(fit.covariance)) for fit in fits]).T
+    return noise_line(iso, (slope, slope_sigma), (floor, floor_sigma), points[0][2], "flat frames")
 
 
-def as_line(
+def noise_line(
     iso: float, slope: tuple[Floats, Floats], floor: tuple[Floats, Floats], sites: Floats, source: str
 ) -> NoiseLine:
-    """A line and its 1σ (C,) as it is kept, with what it means of one photosite; `sites` (C,) make a pixel."""
+    """Noise line from slope and floor (C,) with their 1σ, and its electrons for one of the `sites` (C,) per pixel."""
     electrons = 1 / (slope[0] * sites)
     height = np.maximum(floor[0], 0.0)
     read = np.sqrt(height * sites) * electrons
@@ -113,16 +113,3 @@ def as_line(
         read_noise_sigma=tuple((np.sqrt(height + floor[1]) * np.sqrt(sites) * electrons - read).tolist()),
         source=source,
     )
-
-
-def _solved(level: Floats, variance: Floats, freedom: int) -> tuple[float, float, float, float]:
-    """Slope, height and their 1σ: a variance of n differences is known to √(2/n) of itself."""
-    matrix = np.stack([level, np.ones_like(level)], axis=1)
-    model = np.full_like(variance, float(variance.mean()))
-    for _ in range(6):
-        weight = freedom / 2 / np.maximum(model, 1e-12) ** 2
-        normal = (matrix * weight[:, None]).T @ matrix
-        slope, floor = np.linalg.solve(normal, (matrix * weight[:, None]).T @ variance)
-        model = np.maximum(slope * level + floor, 0.2 * np.median(variance))
-    doubt = np.sqrt(np.diag(np.linalg.inv(normal)))
-    return float(slope), float(floor), float(doubt[0]), float(doubt[1])

@@ -9,7 +9,7 @@ from polcap import terminal
 from polcap.cli.options import Json
 
 if TYPE_CHECKING:
-    from polcap.calibration_values import Calibration
+    from polcap.images import Calibration
 
 
 def calibrate(
@@ -37,11 +37,11 @@ def calibrate(
     import msgspec
 
     from polcap import calibrate as calibration
-    from polcap.formats import calibrations, calibrations_folder
+    from polcap.formats import calibrations, own_folders
 
     made = datetime.now(UTC).isoformat(timespec="seconds")
     found = calibration.measure(folder, made, lens_filter, axis, squares(board))
-    path = calibrations.write(out or calibrations_folder.folder(), found)
+    path = calibrations.write(out or own_folders.calibrations(), found)
     terminal.tell("\n".join(lines(found)))
     terminal.say({"file": str(path), "calibration": msgspec.to_builtins(found)} if json else str(path))
 

@@ -27,7 +27,9 @@ def doctor(
     from polcap import doctor as doctors
 
     if file is not None:
-        findings = doctors.examine_file(file)
+        from polcap.doctor.photograph import examine_file
+
+        findings = tuple(examine_file(file))
         terminal.say(doctors.shown(findings) if json else doctors.table(findings))
         if any(one.state == "fault" for one in findings):
             raise typer.Exit(SettingError.exit_code)

@@ -1,6 +1,7 @@
 """In: words of the command line that several commands know. Out: their declarations, and the values they mean."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -24,12 +25,17 @@ Result = Annotated[
     Path,
     typer.Argument(help="Result folder of `polcap process`, or the capture that holds it.", callback=result_folder),
 ]
+CaptureFolder = Annotated[Path, typer.Argument(help="Folder with the photographs.")]
 Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
 ConfigFile = Annotated[Path | None, typer.Option(help="TOML file of settings, a section per stage.")]
 Assignments = Annotated[
     list[str] | None, typer.Option("--set", metavar="K=V", help="A setting, as hdr.clip=0.95; repeatable.")
 ]
 Angles = Annotated[str | None, typer.Option(metavar="DEG,…", help="Angles of the shots in order, as 0,45,90.")]
+Chart = Annotated[
+    str | None,
+    typer.Option(metavar="X0,Y0,…|FILE", help="Chart corners in RAW px, dark skin first, clockwise; or a profile."),
+]
 NoChart = Annotated[bool, typer.Option("--no-chart", help="Use the camera's own colours.")]
 Estimator = Annotated[
     Literal["network", "analytic"] | None,
@@ -40,6 +46,10 @@ Device = Annotated[
     Literal["cpu", "cuda", "auto"],
     typer.Option(case_sensitive=False, help="Where the network runs; cuda never falls back."),
 ]
+Until = Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")]
+Force = Annotated[str | None, typer.Option(metavar="STAGE", help="Compute this stage and all after it again.")]
+Threads = Annotated[int, typer.Option(min=0, help="Threads to use; 0 is all.")]
+Memory = Annotated[float, typer.Option(min=0, help="Most memory to take, GB; 0 is no limit.")]
 
 
 def angles_deg(text: str | None) -> tuple[float, ...] | None:
@@ -58,11 +68,20 @@ def numbers(flag: str, text: str) -> tuple[float, ...]:
     return found
 
 
+def check_stages(named: Mapping[str, str | None]) -> None:
+    """Refuse a stage that does not exist, by its flag."""
+    from polcap.pipeline.path import STAGES
+
+    for flag, stage in named.items():
+        if stage not in (None, *STAGES):
+            raise SettingError(f"{flag} {stage}: no such stage; choose one of {', '.join(STAGES)}")
+
+
 def chart_request(text: str | None, no_chart: bool) -> "ChartRequest":
     """--chart and --no-chart: corners in RAW px, a color profile, the camera's own colors, or what is found."""
     import numpy as np
 
-    from polcap.formats import calib
+    from polcap.formats import calibrations
     from polcap.images import ChartRequest
 
     if text is None:
@@ -70,7 +89,7 @@ def chart_request(text: str | None, no_chart: bool) -> "ChartRequest":
     if no_chart:
         raise SettingError("--chart and --no-chart exclude each other; leave one out")
     if Path(text).suffix == ".toml":
-        return ChartRequest("profile", profile=calib.read_profile(Path(text)))
+        return ChartRequest("profile", profile=calibrations.read_profile(Path(text)))
     corners = numbers("--chart", text)
     if len(corners) != 8:
         raise SettingError(f"--chart gives {len(corners)} numbers; four corners have 8, a profile ends in .toml")

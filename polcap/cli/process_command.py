@@ -1,6 +1,5 @@
 """`polcap process`: a capture folder and options in; maps, asset and verdict out, once or at every change."""
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,61 +8,52 @@ import typer
 
 from polcap import resource_limits, terminal
 from polcap.cli import options
-from polcap.cli.options import Angles, Assignments, ConfigFile, Device, Estimator, Json, Model, NoChart
-from polcap.errors import GateError, InputError, SettingError
+from polcap.cli.watch import at_every_change
 
 _NO_EFFECT = ("capture", "out", "json", "dry_run", "watch", "threads", "memory")  # on the bytes of a result
 
 
 def process(
     context: typer.Context,
-    capture: Annotated[Path, typer.Argument(help="Folder with the photographs.")],
+    capture: options.CaptureFolder,
     out: Annotated[Path | None, typer.Option(help="Result folder; by default CAPTURE/polcap.")] = None,
-    config: ConfigFile = None,
-    assignments: Assignments = None,
-    until: Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")] = None,
-    force: Annotated[
-        str | None, typer.Option(metavar="STAGE", help="Compute this stage and all after it again.")
-    ] = None,
+    config: options.ConfigFile = None,
+    assignments: options.Assignments = None,
+    until: options.Until = None,
+    force: options.Force = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what was understood, and stop.")] = False,
     watch: Annotated[
         bool,
         typer.Option("--watch", help="Stay: process again whenever the folder or --config has changed; Ctrl-C ends."),
     ] = False,
-    json: Json = False,
-    device: Device = "cpu",
-    threads: Annotated[int, typer.Option(min=0, help="Threads to use; 0 is all.")] = 0,
-    memory: Annotated[float, typer.Option(min=0, help="Most memory to take, GB; 0 is no limit.")] = 0,
-    angles: Angles = None,
-    chart: Annotated[
-        str | None,
-        typer.Option(metavar="X0,Y0,…|FILE", help="Chart corners in RAW px, dark skin first, clockwise; or a profile."),
-    ] = None,
-    no_chart: NoChart = False,
+    json: options.Json = False,
+    device: options.Device = "cpu",
+    threads: options.Threads = 0,
+    memory: options.Memory = 0,
+    angles: options.Angles = None,
+    chart: options.Chart = None,
+    no_chart: options.NoChart = False,
     mask: Annotated[Path | None, typer.Option(metavar="PNG", help="White where the object is.")] = None,
-    estimator: Estimator = None,
-    model: Model = None,
+    estimator: options.Estimator = None,
+    model: options.Model = None,
 ) -> None:
     """Turn a capture into maps and a 3-D asset."""
     from polcap.pipeline import unchanged
 
-    given = context.params
+    paths = {"capture": capture, "config": config, "mask": mask, "model": model}
+    given = {**context.params, **paths}  # there they are text
     target = out or capture / "polcap"
     request = None if until or force or dry_run or watch else _request(given, target)
     if (finished := unchanged.find(target, request)) is not None:
         terminal.tell(f"{finished.table}\nnothing has changed since the last run")
-        _tell_result(finished.report, target, json)
+        terminal.tell_result(finished.report, target, json)
         return
     resource_limits.set_threads(threads)  # before the libraries that start them
     resource_limits.set_memory(memory)
-    from polcap.pipeline.path import STAGES
-
-    for flag, stage in (("--until", until), ("--force", force)):
-        if stage is not None and stage not in STAGES:
-            raise SettingError(f"{flag} {stage}: no such stage; choose one of {', '.join(STAGES)}")
+    options.check_stages({"--until": until, "--force": force})
     once = partial(_plan, given, target) if dry_run else partial(_process, given, target, request)
     if watch:
-        _whenever_settled(capture, target, config, once)
+        at_every_change(capture, target, config, once)
     else:
         once()
 
@@ -73,9 +63,8 @@ def _request(given: dict[str, Any], target: Path) -> str | None:
     from polcap.pipeline import unchanged
 
     asked = {name: value for name, value in given.items() if name not in _NO_EFFECT}
-    files = [given[name] for name in ("config", "mask", "model") if given[name] is not None]
-    if given["chart"] is not None and Path(given["chart"]).suffix == ".toml":
-        files.append(Path(given["chart"]))
+    named = [given[name] for name in ("config", "mask", "model", "chart")]
+    files = [file for file in named if file is not None and Path(file).is_file()]
     return unchanged.request(asked, given["capture"], target, files)
 
 
@@ -106,15 +95,15 @@ def _plan(given: dict[str, Any], target: Path) -> None:
 
     capture, supplied, config = _inputs(given)
     stages = pipeline.plan(capture, supplied, config, target, given["force"])
-    rows = (f"{name:14}{state}" for name, state in stages.items())
-    if given["json"]:
-        terminal.say({"capture": report.capture_facts(capture), "stages": stages})
-    else:
-        terminal.say("\n".join([captures.table(capture), "", *rows]))
+    rows = [f"{name:14}{state}" for name, state in stages.items()]
+    table = "\n".join([captures.table(capture), "", *rows])
+    terminal.say({"capture": report.capture_facts(capture), "stages": stages} if given["json"] else table)
 
 
 def _process(given: dict[str, Any], target: Path, request: str | None) -> None:
     """Write the result folder; print the path of the asset and the verdict."""
+    from dataclasses import replace
+
     from polcap.formats.capture import reader as captures
     from polcap.pipeline import run as pipeline
     from polcap.pipeline import unchanged
@@ -124,34 +113,11 @@ def _process(given: dict[str, Any], target: Path, request: str | None) -> None:
     table = captures.table(capture)
     terminal.tell(table)
     with terminal.progress(len(STAGES) + 1) as bar:
-        counted = pipeline.counted(capture, bar.frame)
-        about = pipeline.process(counted, supplied, config, target, given["until"], given["force"], bar.stage)
+        supplied = replace(supplied, decode=pipeline.counted(capture, bar.frame))
+        about = pipeline.process(capture, supplied, config, target, given["until"], given["force"], bar.stage)
     if about is None:
         work = str(target / "work")
         terminal.say({"until": given["until"], "work": work} if given["json"] else work)
         return
     unchanged.remember(target, request, table)
-    _tell_result(about, target, given["json"])
-
-
-def _tell_result(about: dict[str, Any], out: Path, json: bool) -> None:
-    """The asset on stdout, the verdict beside it; a failed gate ends with exit code 3."""
-    terminal.say(about if json else str(out / "asset" / f"{about['capture']['name']}.glb"))
-    terminal.tell(f"verdict {about['verdict']}; {out / 'report.html'}")
-    terminal.tell_gates(about)
-
-
-def _whenever_settled(capture: Path, target: Path, config: Path | None, once: Callable[[], None]) -> None:
-    """Process a folder as it is, and after each change of it or of the settings' file; errors are told."""
-    from polcap import config as settings
-    from polcap.formats.capture import arrivals
-
-    if not capture.is_dir():
-        raise SettingError(f"{capture} is no folder; --watch needs the one that the photographs go to")
-    settings.load(config, ())  # what is wrong with it now ends the command
-    for _ in arrivals.settled(capture, target, edited=[] if config is None else [config]):
-        try:
-            once()
-        except (InputError, GateError, OSError) as error:  # a frame may have gone between two looks
-            terminal.tell(f"polcap: {terminal.line(error)}")
-        terminal.tell(f"watching {capture}; Ctrl-C ends")
+    terminal.tell_result(about, target, given["json"])

@@ -1,12 +1,12 @@
-"""In: this machine. Out: what polcap needs and finds here, each with ok, warning or fault, and the remedy.
+"""`polcap doctor`: checks everything that polcap uses on this machine: ok, warning or fault, with a remedy.
 
-A fault is what keeps `polcap process` from working; the rest of the world may lack something without it.
+Only a fault keeps `polcap process` from working.
 """
 
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -15,10 +15,9 @@ import msgspec
 import numpy as np
 
 from polcap import __version__
-from polcap.doctor import photograph
 from polcap.doctor.finding import Finding, State
 from polcap.errors import PolcapError
-from polcap.formats import calib, onnx
+from polcap.formats import onnx, shipped_data
 from polcap.formats.raw import dng
 from polcap.formats.raw import libraw as raw
 from polcap.images import Exif
@@ -31,17 +30,17 @@ _CFA = np.array([[0, 1], [1, 2]], np.uint8)
 
 @dataclass(frozen=True)
 class Rig:
-    """How to ask for devices; each may raise a PolcapError."""
+    """Functions that ask for devices; each may raise a PolcapError."""
 
     ports: Callable[[], list[tuple[str, str]]]  # device and description of every serial port
-    may_write: Callable[[list[str]], bool]  # whether these ports may be asked who answers
-    probe: Callable[[str], str | None]  # what answers there; writes to the port
+    may_write: Callable[[list[str]], bool]  # whether polcap may write to these ports
+    probe: Callable[[str], str | None]  # name of the rotator at a port; writes to it
     cameras: Callable[[], list[tuple[str, str]]]  # model and port
 
 
 def examine(rig: Rig, folder: Path) -> tuple[Finding, ...]:
-    """Look at everything; `folder` says which disk."""
-    model = next(iter(sorted(calib.data_path("colorchecker").parent.glob("models/polcap*.onnx"), reverse=True)), None)
+    """Check everything on this machine; the disk is that of `folder`."""
+    model = next(reversed(shipped_data.model_files("polcap")), None)
     return (
         _libraries(),
         _decoder(),
@@ -53,23 +52,18 @@ def examine(rig: Rig, folder: Path) -> tuple[Finding, ...]:
     )
 
 
-def examine_file(path: Path) -> tuple[Finding, ...]:
-    """Look at one photograph."""
-    return tuple(photograph.examine(path))
-
-
-def table(found: tuple[Finding, ...]) -> str:
-    """The findings for a person."""
+def table(found: Iterable[Finding]) -> str:
+    """The findings as text."""
     rows = []
     for one in found:
-        rows.append(f"{one.state:9}{one.name:16}{one.says}")
+        rows.append(f"{one.state:9}{one.name:16}{one.message}")
         if one.remedy:
             rows.append(f"{'':25}→ {one.remedy}")
     return "\n".join(rows)
 
 
-def shown(found: tuple[Finding, ...]) -> dict[str, object]:
-    """The findings for a program."""
+def shown(found: Iterable[Finding]) -> dict[str, object]:
+    """The findings for JSON."""
     works = all(one.state != "fault" for one in found)
     return {"polcap": __version__, "process_works": works, "findings": msgspec.to_builtins(found)}
 
@@ -82,7 +76,7 @@ def _libraries() -> Finding:
 
 
 def _decoder() -> Finding:
-    """LibRaw's version, and whether it decodes a RAW file that was written for the purpose."""
+    """LibRaw's version, and whether it decodes a RAW file written for this test."""
     try:
         name = raw.version()
         with tempfile.TemporaryDirectory() as folder:
@@ -108,8 +102,8 @@ def _decoder() -> Finding:
 
 def _model(file: Path | None) -> Finding:
     if file is None:
-        remedy = "name one with --model; without, the analytic estimator serves"
-        return Finding("model", "warning", "none is shipped with this polcap", remedy)
+        remedy = "name one with --model; without one the analytic estimator is used"
+        return Finding("model", "warning", "this polcap has no network", remedy)
     try:
         network = models.open_network(file)
         small = [one for one in (network.fine, models.load_mask_network()) if one is not None]
@@ -134,17 +128,18 @@ def _providers(model: Path) -> Iterator[Finding]:
         elif name == onnx.CPU:
             yield Finding(f"on {short}", "fault", failure, "pip install --force-reinstall onnxruntime")
         else:
-            remedy = "make driver, CUDA and cuDNN fit, or stay with --device cpu"
+            remedy = "install matching driver, CUDA and cuDNN, or use --device cpu"
             yield Finding(f"on {short}", "warning", failure, remedy)
 
 
 def _disk(folder: Path) -> Finding:
     free = shutil.disk_usage(folder).free / 1e9
-    says = f"{free:.1f} GB free at {folder}"
+    message = f"{free:.1f} GB free at {folder}"
     if free >= _ENOUGH_GB:
-        return Finding("disk", "ok", says)
+        return Finding("disk", "ok", message)
     state: State = "fault" if free < _LEAST_GB else "warning"
-    return Finding("disk", state, says, "a capture of 24 MP with its result takes 2 GB: make room, or use --out")
+    remedy = "a capture of 24 MP with its result takes 2 GB: free some space, or use --out"
+    return Finding("disk", state, message, remedy)
 
 
 def _ports(rig: Rig) -> Iterator[Finding]:
@@ -159,26 +154,26 @@ def _ports(rig: Rig) -> Iterator[Finding]:
     allowed = bool(ports) and rig.may_write([device for device, _ in ports])
     for device, description in ports:
         if not allowed:
-            yield Finding(device, "ok", f"{description}: not asked", "`polcap doctor --ports` writes to it to learn")
+            yield Finding(device, "ok", f"{description}: not asked", "`polcap doctor --ports` asks, and writes to it")
             continue
         try:
             answer = rig.probe(device)
         except PolcapError as error:
-            remedy = "close what else uses the port; under Linux join the group `dialout`"
+            remedy = "close other programs that use the port; under Linux join the group `dialout`"
             yield Finding(device, "warning", str(error), remedy)
             continue
         if answer:
             yield Finding(device, "ok", f"{description}: {answer}")
         else:
-            yield Finding(device, "warning", f"{description}: no rotator that polcap knows answers", "switch it on")
+            yield Finding(device, "warning", f"{description}: no known rotator answers", "switch it on")
 
 
 def _cameras(rig: Rig) -> Iterator[Finding]:
     try:
         cameras = rig.cameras()
     except PolcapError as error:
-        says, _, remedy = str(error).partition("; ")
-        yield Finding("cameras", "warning", says, remedy)
+        message, _, remedy = str(error).partition("; ")
+        yield Finding("cameras", "warning", message, remedy)
         return
     if not cameras:
         remedy = "plug it in, switch it on, set it to PTP; or tether with another program and --camera folder:PATH"

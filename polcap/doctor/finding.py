@@ -1,4 +1,4 @@
-"""One thing that the doctor looked at."""
+"""One finding of `polcap doctor`."""
 
 from typing import Literal
 
@@ -8,9 +8,9 @@ State = Literal["ok", "warning", "fault"]
 
 
 class Finding(msgspec.Struct, frozen=True):
-    """What was found, and the remedy where it is not ok."""
+    """One thing that was checked, and the remedy if it is not ok."""
 
     name: str
     state: State
-    says: str
+    message: str = msgspec.field(name="says")  # the key in the JSON output
     remedy: str = ""

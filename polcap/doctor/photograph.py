@@ -1,4 +1,4 @@
-"""One photograph in. Out: whether polcap can use it, and all that it tells of itself, to read or to send in."""
+"""`polcap doctor FILE`: whether polcap can use a photograph; kind, metadata, mosaic pattern and levels."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,21 +18,21 @@ _CLIP = hdr.Settings().clip
 _PATTERNS = {0: "R", 1: "G", 2: "B"}
 
 
-def examine(path: Path) -> Iterator[Finding]:
-    """Kind, metadata, decoding, pattern and levels of a file."""
+def examine_file(path: Path) -> Iterator[Finding]:
+    """Findings on kind, metadata, pixels and levels of one file."""
     if path.is_dir():
-        remedy = "give one photograph; what is in a folder tells `polcap process FOLDER --dry-run`"
+        remedy = "give one photograph; `polcap process FOLDER --dry-run` lists a folder"
         yield Finding("file", "fault", f"{path} is a folder", remedy)
         return
     try:
         found = probe.read(path)
     except DecodeError as error:
-        what, _, remedy = str(error).partition("; ")
-        yield Finding("file", "fault", what, remedy or "send this report in with the file")
+        message, _, remedy = str(error).partition("; ")
+        yield Finding("file", "fault", message, remedy or "send this report in with the file")
         return
     if found.kind not in ("raw", "photo"):
         yield Finding(
-            "file", "fault", f"{path.name} is no photograph that polcap knows", "give a RAW, TIFF, PNG or EXR"
+            "file", "fault", f"{path.name} is not a photograph that polcap can read", "give a RAW, TIFF, PNG or EXR"
         )
         return
     kind = "RAW" if found.kind == "raw" else f"finished picture of {found.bits} bits"
@@ -41,8 +41,8 @@ def examine(path: Path) -> Iterator[Finding]:
     try:
         image = raw.read(path) if found.kind == "raw" else photo.read(path)
     except DecodeError as error:
-        what, _, remedy = str(error).partition("; ")
-        yield Finding("pixels", "fault", what, remedy)
+        message, _, remedy = str(error).partition("; ")
+        yield Finding("pixels", "fault", message, remedy)
         return
     yield from _pixels(image, found.exif)
 
@@ -62,9 +62,9 @@ def _metadata(exif: Exif) -> Iterator[Finding]:
         "flash": None if exif.flash_fired is None else "fired" if exif.flash_fired else "off",
     }
     missing = [name for name, value in parts.items() if not value]
-    says = ", ".join(f"{name} {value}" for name, value in parts.items() if value) or "none"
+    message = ", ".join(f"{name} {value}" for name, value in parts.items() if value) or "none"
     remedy = f"not stated: {', '.join(missing)}; exposures are then taken from the pixels" if missing else ""
-    yield Finding("exposure", "warning" if missing else "ok", says, remedy)
+    yield Finding("exposure", "warning" if missing else "ok", message, remedy)
     lens = focal_length.find(exif, None, None)
     remedy = "" if lens.known else "state focal_length_mm and sensor_width_mm in capture.toml"
     yield Finding("focal length", "ok" if lens.known else "warning", lens.note, remedy)
@@ -82,21 +82,21 @@ def _pixels(image: SensorImage, exif: Exif) -> Iterator[Finding]:
         yield Finding("pattern", "warning", f"one channel (a monochrome sensor), {size}", remedy)
     else:
         yield Finding("pattern", "ok", f"three channels a pixel, {size}: developed or linear DNG, no mosaic left")
-    gone = (exif.width or width) - width, (exif.height or height) - height
-    if not all(0 <= side < image.superpixel for side in gone):  # a mosaic begins with a whole superpixel
+    missing = (exif.width or width) - width, (exif.height or height) - height
+    if not all(0 <= side < image.superpixel for side in missing):  # a mosaic begins with a whole superpixel
         yield Finding(
-            "size", "warning", f"{size} decoded where {exif.width}×{exif.height} are stated", "send this report in"
+            "size", "warning", f"{size} decoded, but {exif.width}×{exif.height} are stated", "send this report in"
         )
     black, white = float(image.black.mean()), image.white
     least, most = float(image.value.min()), float(image.value.max())
     clipped = float(np.mean(image.value >= _CLIP * sensor.saturation(image)))
-    says = f"black {black:g}, white {white:g}; counts {least:g} … {most:g}, {100 * clipped:.2f} % clipped"
+    message = f"black {black:g}, white {white:g}; counts {least:g} … {most:g}, {100 * clipped:.2f} % clipped"
     if most > 1.001 * white or white <= black:
-        yield Finding("levels", "warning", says, "the white level does not fit the counts: send this report in")
+        yield Finding("levels", "warning", message, "the white level does not fit the counts: send this report in")
     elif clipped > 0.5 or most <= black:
-        yield Finding("levels", "warning", says, "nothing is left to measure: expose otherwise")
+        yield Finding("levels", "warning", message, "nothing can be measured: change the exposure")
     else:
-        yield Finding("levels", "ok", says)
+        yield Finding("levels", "ok", message)
     known = image.camera_matrix is not None
     yield Finding(
         "color matrix", "ok" if known else "warning", "known" if known else "not known", "" if known else "use a chart"

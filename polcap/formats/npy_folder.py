@@ -1,12 +1,12 @@
-"""In: a value of images.py. Out: plain JSON and an .npy per array in one folder; and back.
+"""Stores a value of images.py as plain JSON and an .npy per array in one folder, and reads it back.
 
-The JSON holds the scalars and the names of the array files. Both sides are strict: what does not fit
-the type that is asked for is a `StorageError`, never another value.
+The JSON holds the scalars and the names of the array files. A value that does not fit the expected type is a
+`StorageError`.
 """
 
 import io
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass
 from enum import Enum, IntEnum, IntFlag
 from hashlib import sha256
 from pathlib import Path
@@ -19,16 +19,14 @@ from numpy.typing import NDArray
 from polcap.errors import StorageError
 
 Arrays = dict[str, NDArray[Any]]
-LARGE = 1 << 20  # bytes of an array file; what no picture of a capture is smaller than
-HEAD = 1 << 12  # bytes; no array file has a longer one
-_MAPPED = 1 << 16  # bytes; smaller files are read, a map costs a page table and a handle
+_MAPPED = 1 << 16  # bytes; smaller files are read at once, as a map costs a page table and a handle
 
 
 def encode(value: Any, name: str, arrays: Arrays) -> Any:
-    """JSON for a value; its arrays go into `arrays` under dotted names. Raises TypeError for what cannot be kept."""
+    """JSON for a value; its arrays go into `arrays` under dotted names. Raises TypeError for other types."""
     if isinstance(value, np.ndarray):
         if value.dtype.hasobject:
-            raise TypeError(f"{name}: an array of Python objects cannot be kept")
+            raise TypeError(f"{name}: an array of Python objects cannot be stored")
         arrays[name] = value
         return {"array": f"{name}.npy"}
     if is_dataclass(value) and not isinstance(value, type):
@@ -45,11 +43,11 @@ def encode(value: Any, name: str, arrays: Arrays) -> Any:
         return bool(value)
     if value is None or isinstance(value, (str, int, bool)):
         return value
-    raise TypeError(f"{name}: a {type(value).__name__} cannot be kept")
+    raise TypeError(f"{name}: a {type(value).__name__} cannot be stored")
 
 
 def decode(tree: Any, hint: Any, folder: Path) -> Any:
-    """The value of type `hint` that `encode` made `tree` of; arrays are read from `folder`.
+    """The value of type `hint` from the JSON of `encode`; arrays are read from `folder`.
 
     Raises
     ------
@@ -108,11 +106,11 @@ def _array_file(tree: Any, folder: Path) -> Path:
 
 def _expect(holds: bool, tree: Any, wanted: str, folder: Path) -> None:
     if not holds:
-        raise StorageError(f"{folder}: {str(tree)[:60]!r} stands where {wanted} belongs; run `polcap process` again")
+        raise StorageError(f"{folder}: expected {wanted}, found {str(tree)[:60]!r}; run `polcap process` again")
 
 
 def save(file: Path, array: NDArray[Any]) -> list[Any]:
-    """Write an array of any shape as .npy; returns its `checksum`. Unlike numpy.save it tells why a write failed."""
+    """Write an array of any shape as .npy; returns its `checksum`. Unlike numpy.save it reports why a write failed."""
     array = np.asarray(array, order="C")
     head = io.BytesIO()
     np.lib.format.write_array_header_2_0(head, np.lib.format.header_data_from_array_1_0(array))
@@ -149,27 +147,6 @@ def checksum(file: Path) -> list[Any]:
         while block := stream.read(1 << 22):
             summed.update(block)
     return [file.stat().st_size, summed.hexdigest()]
-
-
-class Absent:
-    """Of an array that was not read, its shape; whoever looks for more gets an error, never another number."""
-
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        self.shape = shape
-
-    def __array__(self, *_: Any, **__: Any) -> NDArray[Any]:
-        raise TypeError(f"pixels of shape {self.shape} were not read; look at them in a figure")
-
-
-def without_large(value: Any) -> Any:
-    """A value whose large arrays are replaced by their shapes."""
-    if isinstance(value, np.ndarray):
-        return value if value.nbytes <= LARGE else Absent(value.shape)
-    if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{one.name: without_large(getattr(value, one.name)) for one in fields(value)})
-    if isinstance(value, tuple):
-        return tuple(map(without_large, value))
-    return value
 
 
 def freeze(value: Any) -> None:

@@ -27,6 +27,11 @@ class Rim:
     sector: NDArray[np.int_]  # (N,) part of the outline, 0…23, seen from the object's middle
 
 
+def disc_radius(mask: NDArray[np.bool_]) -> float:
+    """Radius √(N/π) of a disc with as many pixels as the mask (H, W), px: the size of an object."""
+    return float(np.sqrt(mask.sum() / np.pi))
+
+
 def depth(mask: NDArray[np.bool_]) -> Floats:
     """Distance of each pixel of the mask to the outline (H, W), px; the picture's edge counts as one."""
     return np.asarray(cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, 5)[1:-1, 1:-1])

@@ -1,6 +1,9 @@
 """Projection of points: through a homography, and through a pinhole camera."""
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from polcap.images import Floats, View
 
@@ -25,15 +28,19 @@ def picture_corners(width: int, height: int) -> Floats:
     return np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], float)
 
 
-def project(view: View, point: Floats) -> tuple[Floats, Floats]:
-    """Pixels x, y (…,) that show points (…, 3) of the camera frame (x right, y up, z towards the camera)."""
-    return (
-        view.center[0] - view.focal * point[..., 0] / point[..., 2],
-        view.center[1] + view.focal * point[..., 1] / point[..., 2],
-    )
+def project(view: View, point: Floats) -> Floats:
+    """Pixels x, y (…, 2) that show points (…, 3) of the camera frame (x right, y up, z towards the camera)."""
+    x = view.center[0] - view.focal * point[..., 0] / point[..., 2]
+    y = view.center[1] + view.focal * point[..., 1] / point[..., 2]
+    return np.stack([x, y], axis=-1)
 
 
 def back_project(view: View, x: Floats, y: Floats) -> Floats:
     """Points (…, 3) of the camera frame at distance 1 along the optical axis, that pixels x, y show."""
-    across, up = (x - view.center[0]) / view.focal, (view.center[1] - y) / view.focal
+    across, up = ray_slopes(view, x, y)
     return np.stack([across, up, -np.ones_like(across)], axis=-1)
+
+
+def ray_slopes(view: View, x: NDArray[Any], y: NDArray[Any]) -> tuple[Floats, Floats]:
+    """x/−z and y/−z of the points (camera frame) that pixels x, y show; (…,) each, any shape."""
+    return (x - view.center[0]) / view.focal, (view.center[1] - y) / view.focal

@@ -15,8 +15,8 @@ from polcap.config import Config
 from polcap.errors import SettingError
 from polcap.formats import atomic
 from polcap.formats.export import exr_layers, gltf, materialx, obj, provenance, texture_set, usd
-from polcap.formats.export.encoders import Encoder, Kind
-from polcap.formats.export.presets import PRESETS, Format, Preset
+from polcap.formats.export.encoders import Kind, TextureEncoder
+from polcap.formats.export.presets import PRESETS, ExportPreset, Format
 from polcap.formats.export.texture_set import Key, Texture
 from polcap.formats.maps import maps_folder
 from polcap.images import Asset
@@ -42,7 +42,7 @@ class DetailLevel:
     """A coarser asset and how far its surface is from the full one."""
 
     asset: Asset
-    decimated: surface.Decimated
+    decimated: surface.DecimatedMesh
 
 
 def check(wanted: ExportRequest) -> None:
@@ -72,12 +72,14 @@ def from_maps(folder: Path, config: Config, wanted: ExportRequest) -> tuple[Asse
     whole = asset.build(stored.maps, mesh, config.asset)
     levels = []
     for k in range(1, wanted.lod + 1):
-        decimated = surface.decimated(mesh, stored.maps.view, 0.25**k, config.surface.back)
-        levels.append(DetailLevel(asset.on_mesh(whole, stored.maps, decimated.mesh), decimated))
+        decimated = surface.decimate(mesh, stored.maps.view, 0.25**k, config.surface.back)
+        levels.append(DetailLevel(asset.with_mesh(whole, stored.maps, decimated.mesh), decimated))
     if wanted.texture_size is None:
         return whole, levels
     size = wanted.texture_size
-    return asset.resized(whole, size), [replace(level, asset=asset.resized(level.asset, size)) for level in levels]
+    return asset.resize_textures(whole, size), [
+        replace(level, asset=asset.resize_textures(level.asset, size)) for level in levels
+    ]
 
 
 def write(
@@ -112,9 +114,9 @@ def write(
     return written
 
 
-def _preset(wanted: ExportRequest) -> Preset:
+def _preset(wanted: ExportRequest) -> ExportPreset:
     if wanted.preset is None:
-        return Preset(wanted.formats, "normals +Y")
+        return ExportPreset(wanted.formats, "normals +Y")
     if wanted.preset not in PRESETS:
         raise SettingError(f"--preset {wanted.preset} is none of {', '.join(PRESETS)}")
     return PRESETS[wanted.preset]
@@ -129,7 +131,7 @@ class _Export:
     asset: Asset
     levels: tuple[DetailLevel, ...]
     name: str
-    preset: Preset
+    preset: ExportPreset
     images: Kind
     color: str
     record: Mapping[str, Any]
@@ -154,7 +156,7 @@ class _Export:
     def description(self) -> dict[str, Any]:
         """The entry of the export in maps.json."""
         return {
-            "for": self.preset.says,
+            "for": self.preset.description,
             "unit": self.unit,
             "glb": self._embedded(),
             "lods": {
@@ -166,7 +168,7 @@ class _Export:
                 }
                 for k, level in enumerate(self.levels, 1)
             },
-            "textures": {file: texture.says for file, texture in sorted(self.loose.items())},
+            "textures": {file: texture.meaning for file, texture in sorted(self.loose.items())},
         }
 
     def _embedded(self) -> dict[str, str]:
@@ -174,12 +176,12 @@ class _Export:
         if "gltf" not in self.preset.formats:
             return {}
         held = gltf.textures(self.asset)
-        return {f"{self.stem}_{key}": f"{texture.says}; {self.images}" for key, texture in held.items()}
+        return {f"{self.stem}_{key}": f"{texture.meaning}; {self.images}" for key, texture in held.items()}
 
     @cached_property
-    def encoder(self) -> Encoder:
+    def encoder(self) -> TextureEncoder:
         """Encodes a picture once for all files that hold it."""
-        return Encoder()
+        return TextureEncoder()
 
     @cached_property
     def loose(self) -> dict[str, Texture]:

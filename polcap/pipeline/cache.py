@@ -61,7 +61,7 @@ class MemoryCache:
         self._held: dict[str, Any] = {}  # by key
 
     def run(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
-        """The result of a stage: found, else computed. Inputs are results of other stages or plain values.
+        """The result of a stage: found, else computed. Inputs: other results, plain values, functions (`decode`).
 
         Raises
         ------
@@ -203,7 +203,7 @@ def _about(stage: Stage[..., Any], inputs: tuple[Any, ...], config: msgspec.Stru
         "stage": stage.name,
         "version": stage.version,
         "settings": msgspec.to_builtins(config),
-        "inputs": list(map(key_of, inputs)),
+        "inputs": [key_of(one) for one in inputs if not callable(one)],  # a function does not change a result
     }
     return {**about, "key": digest(list(about.values()))}
 

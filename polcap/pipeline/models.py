@@ -1,32 +1,29 @@
-"""In: which model to use, if any is named. Out: the networks of the path, by default those that are shipped."""
+"""Opens the networks of the path: the model that the user names, else those that polcap ships."""
 
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 from polcap.errors import ModelError, SettingError
-from polcap.formats import calib, onnx
-from polcap.images import Network
+from polcap.formats import onnx, shipped_data
+from polcap.images import Device, Network
 from polcap.stages.infer import fine
 from polcap.stages.mask import mask_channels
 
 
 def load_network(
-    estimator: Literal["network", "analytic"] | None, model: Path | None, device: onnx.Device = "cpu", threads: int = 0
+    estimator: Literal["network", "analytic"] | None, model: Path | None, device: Device = "cpu", threads: int = 0
 ) -> Network | None:
-    """The model to use: the one named, else the one shipped; None is the analytic estimator.
+    """The estimator's network: the named model, else the shipped one; None is the analytic estimator.
 
-    Parameters
-    ----------
-    estimator, model
-        As the user names them.
-    device, threads
-        As in `onnx.load`.
+    `device` and `threads` as of `onnx.load`.
 
     Raises
     ------
     ModelError
-        The network was asked for and there is none, or it cannot be used.
+        A network is required and there is none, or it cannot be used.
+    SettingError
+        A model was named for the analytic estimator.
     """
     if estimator == "analytic":
         if model is not None:
@@ -40,8 +37,8 @@ def load_network(
     return open_network(named, device, threads)
 
 
-def open_network(path: Path, device: onnx.Device = "cpu", threads: int = 0) -> Network:
-    """An estimator's model; the one that polcap ships brings its fine pass, which was trained with it alone."""
+def open_network(path: Path, device: Device = "cpu", threads: int = 0) -> Network:
+    """An estimator's network; the shipped one comes with its refinement network, which was trained with it only."""
     network = onnx.load(path, device, threads)
     own, relief = _newest("polcap"), _newest("fine")
     if own is None or relief is None or (path != own and network.digest != onnx.digest(own.read_bytes())):
@@ -50,17 +47,17 @@ def open_network(path: Path, device: onnx.Device = "cpu", threads: int = 0) -> N
 
 
 def load_mask_network(threads: int = 0) -> Network | None:
-    """The network that finds the object, as shipped; None where this polcap ships none."""
+    """The shipped network that segments the object; None where this polcap ships none."""
     found = _newest("mask")
     return onnx.load(found, "cpu", threads, mask_channels.ENCODING) if found else None
 
 
 def shipped() -> tuple[Network | None, Network | None]:
-    """Estimator and mask network as shipped."""
+    """The shipped networks of estimator and mask."""
     return load_network(None, None), load_mask_network()
 
 
 def _newest(name: str) -> Path | None:
-    """The last model of a name that comes with polcap."""
-    files = sorted(calib.data_path("colorchecker").parent.glob(f"models/{name}*.onnx"))
+    """The newest shipped model of a name."""
+    files = shipped_data.model_files(name)
     return files[-1] if files else None

@@ -16,16 +16,26 @@ from numpy.typing import NDArray
 
 from polcap.config import Config
 from polcap.errors import ObjectError
-from polcap.formats import calib
+from polcap.formats import onnx, shipped_data
 from polcap.formats.maps import maps_folder
-from polcap.images import AngleStack, Capture, ChartRequest, ColorCalibration, Mesh, Network, SurfaceMaps
+from polcap.formats.raw import frame_decoder
+from polcap.images import (
+    AngleStack,
+    Capture,
+    ChartRequest,
+    ColorCalibration,
+    Decode,
+    Mesh,
+    Network,
+    SurfaceMaps,
+)
 from polcap.pipeline.cache import MemoryCache, StageReached, StageResult
 from polcap.results import Results
 from polcap.stages import align, asset, cues, hdr, infer, mask, selfcal, stokes, surface, whitebalance
 
 AUTO = ChartRequest("auto")
 _FIELD = {  # of `Results`, by stage
-    "hdr": "radiance", "whitebalance": "color", "align": "alignment", "mask": "object_", "selfcal": "gains",
+    "hdr": "radiance", "whitebalance": "color", "align": "alignment", "mask": "object_", "selfcal": "selfcal",
     "stokes": "stokes", "cues": "cues", "infer": "maps", "surface": "mesh", "asset": "asset",
 }  # fmt: skip
 STAGES = tuple(_FIELD)
@@ -33,27 +43,29 @@ STAGES = tuple(_FIELD)
 
 @dataclass(frozen=True)
 class UserInput:
-    """Inputs of the path besides the photographs."""
+    """Inputs of the path besides the list of photographs."""
 
     chart: ChartRequest = AUTO
     mask: NDArray[np.bool_] | None = None  # on the RAW pixels or on the grid of the merged picture
     network: Network | None = None  # None: the analytic estimator
     mask_network: Network | None = None  # None: the object is found by its contrast to the backdrop
+    decode: Decode = frame_decoder.decode  # the pixels of a photograph
 
 
 def path(capture: Capture | None, supplied: UserInput, config: Config, cache: MemoryCache) -> Results:
     """The results of all stages, or of the first ones where the cache stops the path."""
     with suppress(StageReached):
-        reference = calib.colorchecker(config.whitebalance.chart)
-        radiance = cache.run(hdr.merge, capture, config=config.hdr)
+        reference = shipped_data.colorchecker(config.whitebalance.chart)
+        radiance = cache.run(hdr.merge, capture, supplied.decode, config=config.hdr)
         color = cache.run(whitebalance.measure, radiance, reference, supplied.chart, config=config.whitebalance)
         alignment = cache.run(align.register, radiance, color, config=config.align)
         drawn = cache.derive(on_grid, supplied.mask, radiance)
-        object_ = cache.run(mask.segment, radiance, alignment, color, drawn, supplied.mask_network, config=config.mask)
-        gains = cache.run(selfcal.solve, radiance, alignment, object_, color, config=config.selfcal)
-        stokes_ = cache.run(stokes.solve, radiance, alignment, gains, object_, config=config.stokes)
+        finder = supplied.mask_network
+        object_ = cache.run(mask.segment, radiance, alignment, color, drawn, finder, onnx.run, config=config.mask)
+        calibration = cache.run(selfcal.solve, radiance, alignment, object_, color, config=config.selfcal)
+        stokes_ = cache.run(stokes.solve, radiance, alignment, calibration, object_, config=config.stokes)
         cues_ = cache.run(cues.compute, stokes_, color)
-        maps = cache.run(infer.estimate, cues_, supplied.network, config=config.infer)
+        maps = cache.run(infer.estimate, cues_, supplied.network, onnx.run, config=config.infer)
         distance = cache.derive(distance_m, color, radiance)
         mesh = cache.run(surface.integrate, maps, distance, config=config.surface)
         # from the maps as their files hold them: `polcap export` then makes the same bytes
@@ -97,6 +109,6 @@ def distance_m(color: ColorCalibration, radiance: AngleStack) -> float | None:
     return None if color.metres_per_px is None else color.metres_per_px * radiance.view.focal
 
 
-def remeshed(stored: SurfaceMaps, mesh: Mesh, settings: surface.Settings) -> Mesh:
+def remeshed(stored: SurfaceMaps, mesh: Mesh, settings: surface.SurfaceSettings) -> Mesh:
     """The mesh of the stored maps and of the depth that maps/ holds."""
     return surface.triangulate(maps_folder.stored_depth(stored, mesh), stored, mesh.metric, settings)

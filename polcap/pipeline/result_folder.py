@@ -10,8 +10,8 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from polcap.errors import SettingError, StorageError
-from polcap.formats import atomic, text_file
-from polcap.formats.capture import layouts, own_folders
+from polcap.formats import atomic, own_folders, text_file
+from polcap.formats.capture import layouts
 from polcap.pipeline.cache import seal
 
 

@@ -4,20 +4,21 @@ The order of the stages is in `path.py`.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from polcap import report, resource_limits
+from polcap import parallel, report, resource_limits
 from polcap.config import Config, restored
 from polcap.errors import SettingError
-from polcap.formats import calib
-from polcap.formats.export import animation, provenance
+from polcap.formats import calibrations
+from polcap.formats.export import encoders, provenance
 from polcap.formats.maps import maps_folder, png
-from polcap.images import Capture, ColorCalibration, Frame, SensorImage, Shot
+from polcap.formats.raw import frame_decoder
+from polcap.images import Capture, ColorCalibration, Decode, Frame, SensorImage
 from polcap.pipeline import asset_export, result_folder
 from polcap.pipeline.asset_export import ExportRequest
 from polcap.pipeline.cache import ArchiveCache, DryRunCache, Progress, StageCache, contents, silent
@@ -55,11 +56,7 @@ def process(
             if until is not None:
                 return None
             cache.begin("write")
-            maps_folder.write(out / "maps", results.maps, results.mesh, results.stokes, results.cues)
-            about = report.document(facts, results, config, timings(out))
-            asset_export.write(out, about, ExportRequest(), results.asset)
-            report.write(out, about, results)
-            _write_profile(out / PROFILE, results.color)
+            about = _write(out, results, facts, config)
             cache.end()
             return about
     except Exception as error:
@@ -78,32 +75,42 @@ def _facts(capture: Capture, supplied: UserInput, config: Config) -> dict[str, A
     }
 
 
+def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -> dict[str, Any]:
+    """Write maps, asset, color profile and report; returns report.json's content.
+
+    Files are encoded while figures are measured and the page is drawn: encoders alone do not fill two cores.
+    """
+    about, _ = parallel.both(
+        partial(report.document, facts, results, config, timings(out)),
+        partial(maps_folder.write, out / "maps", results.maps, results.mesh, results.stokes, results.cues),
+    )
+    parallel.both(
+        partial(report.write, out, about, results),
+        partial(asset_export.write, out, about, ExportRequest(), results.asset),
+    )
+    _write_profile(out / PROFILE, results.color)
+    return about
+
+
 def _write_profile(file: Path, color: ColorCalibration) -> None:
     """The color profile for other captures (`--chart FILE.toml`), where this one's chart was read."""
     if color.source in ("chart", "corners"):
-        calib.write_profile(file, color)
+        calibrations.write_profile(file, color)
     else:
         file.unlink(missing_ok=True)
 
 
-def counted(capture: Capture, frame_read: Callable[[int, int], None]) -> Capture:
-    """The capture; `frame_read` is called with the number of decoded photographs, and of all."""
+def counted(capture: Capture, frame_read: Callable[[int, int], None]) -> Decode:
+    """A decode function that calls `frame_read` with the number of decoded photographs, and of all."""
     brackets = [*capture.shots, *(() if capture.crossed is None else (capture.crossed,))]
     total, number = sum(len(shot.frames) for shot in brackets), count(1)
 
-    def frame(one: Frame) -> Frame:
-        def load() -> SensorImage:
-            image = one.load()
-            frame_read(min(next(number), total), total)
-            return image
+    def decode(frame: Frame) -> SensorImage:
+        image = frame_decoder.decode(frame)
+        frame_read(min(next(number), total), total)
+        return image
 
-        return replace(one, load=load)
-
-    def shot(one: Shot) -> Shot:
-        return replace(one, frames=tuple(map(frame, one.frames)))
-
-    crossed = None if capture.crossed is None else shot(capture.crossed)
-    return replace(capture, shots=tuple(map(shot, capture.shots)), crossed=crossed)
+    return decode
 
 
 def plan(capture: Capture, supplied: UserInput, config: Config, out: Path, force: str | None = None) -> dict[str, str]:
@@ -160,10 +167,10 @@ def animate(out: Path, motion: moving.Motion) -> list[Path]:
     ior = float(about["settings"]["infer"]["ior"])
     frames = moving.light(results.maps, ior) if motion == "light" else moving.turntable(results.maps, results.mesh, ior)
     written = [out / "work" / f"{motion}.webp"]
-    animation.webp(written[0], frames, moving.SECONDS)
-    if animation.encoder():
+    encoders.webp(written[0], frames, moving.SECONDS)
+    if encoders.ffmpeg():
         written.append(out / "work" / f"{motion}.mp4")
-        animation.mp4(written[1], frames, moving.SECONDS)
+        encoders.mp4(written[1], frames, moving.SECONDS)
     return written
 
 

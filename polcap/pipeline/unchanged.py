@@ -14,8 +14,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from polcap.formats import atomic, calibrations_folder, text_file
-from polcap.formats.capture import own_folders
+from polcap.formats import atomic, own_folders, text_file
 from polcap.formats.export import provenance
 
 _FILE = "unchanged.json"
@@ -43,7 +42,7 @@ def request(options: Mapping[str, Any], capture: Path, out: Path, files: Iterabl
     """
     try:
         photographs = _folder(capture, out)
-        others = {os.path.abspath(file): _stat(file) for file in (*files, *calibrations_folder.files())}
+        others = {os.path.abspath(file): _stat(file) for file in (*files, *own_folders.calibration_files())}
         newest = max((stat[1] for stat in [*photographs.values(), *others.values()]), default=0)
         if newest > time.time_ns() - _SETTLED_NS:
             return None

@@ -100,28 +100,31 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
 def figures(results: Results) -> dict[str, dict[str, Any]]:
     """Every measured figure, by the part of the path that it tells of."""
     radiance, color = results.radiance, results.color
-    found, gains, image = results.alignment, results.gains, results.stokes
+    colors = color.patches
+    predicted = None if colors is None else colors.predicted
+    found, gains, image = results.alignment, results.selfcal.gains, results.stokes
     cues, maps, mesh, object_ = results.cues, results.maps, results.mesh, results.object_
+    ring, outline = results.selfcal.ring, results.selfcal.outline
     turn = np.degrees(np.arctan2(found.transform[:, 1, 0], found.transform[:, 0, 0]))
     extent = mesh.vertices.max(0) - mesh.vertices.min(0)
     return {
         "merge": {
-            "exposure_ratio": _list(radiance.exposure_ratio.mean(-1)),
-            "exif_ratio": _list(radiance.exif_ratio),
-            "ghost_fraction": _list(radiance.ghost_fraction),
-            "lossy_source": radiance.lossy,
+            "exposure_ratio": _list(radiance.bracket.exposure_ratio.mean(-1)),
+            "exif_ratio": _list(radiance.bracket.exif_ratio),
+            "ghost_fraction": _list(radiance.bracket.ghost_fraction),
+            "lossy_source": radiance.sensor.lossy,
         },
         "chart": {
             "source": color.source,
-            "edition": color.edition or None,
+            "edition": None if colors is None else colors.edition or None,
             "tilt_deg": None if color.light is None else _number(np.degrees(color.light.tilt)),
             "flash": None if color.light is None else _list(color.light.flash[:2], 3),
-            "delta_e_mean": None if color.delta_e is None else _number(np.nanmean(color.delta_e)),
-            "delta_e_max": None if color.delta_e is None else _number(np.nanmax(color.delta_e)),
-            "delta_e": None if color.delta_e is None else _list(color.delta_e, 2),
-            "predicted_mean": None if color.predicted is None else _number(np.nanmean(color.predicted)),
-            "predicted": None if color.predicted is None else _list(color.predicted, 2),
-            "left_out": None if color.patch_use is None else patches.left_out(color.patch_use),
+            "delta_e_mean": None if colors is None else _number(np.nanmean(colors.delta_e)),
+            "delta_e_max": None if colors is None else _number(np.nanmax(colors.delta_e)),
+            "delta_e": None if colors is None else _list(colors.delta_e, 2),
+            "predicted_mean": None if predicted is None else _number(np.nanmean(predicted)),
+            "predicted": None if predicted is None else _list(predicted, 2),
+            "left_out": None if colors is None or colors.use is None else patches.left_out(colors.use),
             "detector_cost": _number(color.cost),
             "metres_per_px": color.metres_per_px,
             "scale_doubt": scale.doubt(image, color),
@@ -141,12 +144,12 @@ def figures(results: Results) -> dict[str, dict[str, Any]]:
             "disagreement": _number(gains.disagreement),
         },
         "angles": {
-            "offset_deg": _number(np.degrees(gains.angle_offset)),
-            "offset_sigma_deg": _number(np.degrees(gains.angle_offset_sigma)),
-            "applied_deg": _number(np.degrees(gains.angle_correction)),
-            "concentration": _number(gains.concentration),
-            "best_order": list(gains.order),
-            "mirrored": gains.mirrored,
+            "offset_deg": _number(np.degrees(ring.offset)),
+            "offset_sigma_deg": _number(np.degrees(ring.sigma)),
+            "applied_deg": _number(np.degrees(ring.correction)),
+            "concentration": _number(outline.concentration),
+            "best_order": list(outline.best.shots),
+            "mirrored": outline.best.mirrored,
         },
         "object": {
             "pixels": int(image.mask.sum()),
@@ -201,7 +204,7 @@ def document(
     """report.json: facts of the run, measurements and the gates' judgement; timings [s] of the stored stages."""
     found = {**figures(results), "rerendering": rerendering(results, config.infer.ior)}
     focal_doubt = tuple(facts["capture"].get("focal_doubt", (0.0, 0.0)))
-    judged = list(gates.judge(full_size(results, focal_doubt), config))
+    judged = list(gates.judge(full_size(results, focal_doubt), config.gates, config.align))
     return {
         "polcap": __version__,
         "versions": facts["versions"],

@@ -44,7 +44,7 @@ def of_stage(results: Results, stage: str) -> Picture:
         "whitebalance": lambda: chart(results.radiance, results.color),
         "align": lambda: sheet(registered(results.radiance, results.alignment)),
         "mask": lambda: outline(results.radiance, results.color, results.object_),
-        "selfcal": lambda: gains(results.gains, results.radiance.angle),
+        "selfcal": lambda: gains(results.selfcal.gains, results.radiance.angle),
         "stokes": lambda: stokes(results.stokes),
         "cues": lambda: cues(results.cues),
         "infer": lambda: maps(results.maps),
@@ -79,9 +79,9 @@ def chart(radiance: AngleStack, color: ColorCalibration, widest: int | None = No
     times = max(1, round(2 * WIDTH / picture.shape[1]))
     picture = np.asarray(np.repeat(np.repeat(picture, times, 0), times, 1), np.uint8)
     zoom = picture.shape[1] / radiance.value.shape[2]
-    outlines = [(quad, (0, 255, 0)) for quad in (color.quads if color.quads is not None else ())]
-    if color.corners is not None:
-        outlines.append((color.corners, (255, 255, 0)))
+    outlines: list[tuple[Floats, tuple[int, int, int]]] = []
+    if color.place is not None:
+        outlines = [*((quad, (0, 255, 0)) for quad in color.place.quads), (color.place.corners, (255, 255, 0))]
     for corners, paint in outlines:
         points = np.round((corners + 0.5) * zoom - 0.5).astype(np.int32)
         cv2.polylines(picture, [points], True, paint, 1, cv2.LINE_AA)

@@ -2,7 +2,7 @@
 
 Angles are in degrees throughout, as the devices use them.
 
-    sequence                turn, take what is missing, check in the background
+    sequence                turn, take the missing frames, check in the background
     exposure_bracket        `--bracket`, and the default exposures
     shooting_plan           every frame, in the order that turns the motor least
     dry_run                 the time that a plan takes

@@ -1,4 +1,4 @@
-"""What every camera driver does: take one photograph with a given exposure, and return its file."""
+"""The protocol of camera drivers: take one photograph with an exposure, and return its file."""
 
 import io
 from dataclasses import dataclass

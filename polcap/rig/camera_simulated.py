@@ -29,7 +29,7 @@ class SimulatedSubject(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SimulatedCamera:
-    """`simulated?seed=1&width=384`: takes the settings of `polcap synth`, and `scene`. It stands on a tripod."""
+    """`simulated?seed=1&width=384`: takes the settings of `polcap synth`, and `scene`. It does not move."""
 
     model = "Polcap Synthetic"
     switches_flash = polarizes_flash = True

@@ -20,10 +20,7 @@ class Log:
     def write(self, device: str, mark: str, text: str) -> None:
         """Append a line: `>` sent, `<` received, `!` a note. The first line creates the file.
 
-        Raises
-        ------
-        StorageError
-            The file cannot be written; raised once, later lines are dropped.
+        Raises StorageError, once, if the file cannot be written; later lines are dropped.
         """
         stamp = datetime.now().isoformat(timespec="milliseconds")
         with self._lock:

@@ -18,7 +18,7 @@ from polcap.rig.motor_elliptec_ell14 import ElliptecMotor, ElliptecSettings
 from polcap.rig.motor_grbl import GrblMotor, GrblSettings
 from polcap.rig.motor_line_protocol import LineMotor, LineSettings
 from polcap.rig.motor_simulated import SimulatedMotor, SimulatedMotorSettings
-from polcap.rig.rotator import PolarizerRotator, RotatorSettings
+from polcap.rig.rotator import PolarizerRotator
 from polcap.rig.serial_port import NoAnswer, Port
 
 T = TypeVar("T")
@@ -41,12 +41,7 @@ _QUESTIONS: list[tuple[int, str, float, tuple[_Recognizer, ...]]] = [  # baud, q
 def open_rotator(url: str, log: Log) -> PolarizerRotator:
     """Open `KIND:PORT?setting=value&…`, `simulated?…` or `manual`.
 
-    Raises
-    ------
-    SettingError
-        The URL is wrong.
-    HardwareError
-        The port cannot be opened, or another device answers.
+    Raises SettingError for a wrong URL, HardwareError if the port cannot be opened or another device answers.
     """
     head, _, query = url.partition("?")
     kind, _, address = head.partition(":")
@@ -57,34 +52,28 @@ def open_rotator(url: str, log: Log) -> PolarizerRotator:
         if address or pairs:
             raise SettingError(f"rotator {url!r}: manual takes no port and no settings; write manual")
         return PolarizerRotator(MotorByHand(log), motor_by_hand.SETTINGS, log, by_hand=True)
-    motor_class, own_class = _MOTORS[kind]
-    settings, own = _settings(url, pairs, own_class, motor_class.backlash_deg)
+    motor_class, settings_class = _MOTORS[kind]
+    settings = _settings(url, pairs, settings_class)
     if kind == "simulated":
         if address:
             raise SettingError(f"rotator {url!r}: the simulated motor has no port; write simulated")
-        return PolarizerRotator(SimulatedMotor(own, log), settings, log)
+        return PolarizerRotator(SimulatedMotor(settings, log), settings, log)
     if not address:
         raise SettingError(
             f"rotator {url!r} names no port; write {kind}:/dev/ttyUSB0, {kind}:COM3 or {kind}:socket://…"
         )
     port = Port(address, motor_class.baud, log)
     try:
-        motor = motor_class(port, own, settings.timeout, log)
+        return PolarizerRotator(motor_class(port, settings), settings, log, port)
     except BaseException:
         port.close()
         raise
-    return PolarizerRotator(motor, settings, log, port)
 
 
 def open_camera(name: str, log: Log) -> Camera:
     """Open `gphoto2`, `gphoto2:MODEL or PORT`, `folder:PATH` or `simulated?width=768`.
 
-    Raises
-    ------
-    SettingError
-        There is no such camera, or a query names an unknown setting.
-    HardwareError
-        It does not answer.
+    Raises SettingError for an unknown camera or setting, HardwareError if the camera does not answer.
     """
     kind, _, rest = name.partition(":")
     if kind == "gphoto2":
@@ -103,10 +92,7 @@ def probe(port_url: str) -> str | None:
 
     Opening the port restarts many Arduinos, which then send their name unasked.
 
-    Raises
-    ------
-    HardwareError
-        The port cannot be opened.
+    Raises HardwareError if the port cannot be opened.
     """
     for baud, question, limit_s, recognizers in _QUESTIONS:
         with closing(Port(port_url, baud, Log(None))) as port:
@@ -130,19 +116,11 @@ def _pairs(url: str, query: str) -> dict[str, str]:
     return {key: text.removeprefix("+") for key, text in pairs}
 
 
-def _settings(url: str, pairs: dict[str, str], own_class: type[T], backlash_deg: float) -> tuple[RotatorSettings, T]:
-    """The settings that all motors have, and those of this kind."""
-    common, own = RotatorSettings.__struct_fields__, own_class.__struct_fields__  # type: ignore[attr-defined]
+def _settings(url: str, pairs: dict[str, str], settings_class: type[T]) -> T:
     for key in pairs:
-        if key not in common + own:
-            raise SettingError(f"rotator {url!r}: unknown setting {key!r}; the settings are {', '.join(own + common)}")
+        if key not in (names := settings_class.__struct_fields__):  # type: ignore[attr-defined]
+            raise SettingError(f"rotator {url!r}: unknown setting {key!r}; the settings are {', '.join(names)}")
     try:
-        settings = msgspec.convert(
-            {key: text for key, text in pairs.items() if key in common}, RotatorSettings, strict=False
-        )
-        special = msgspec.convert({key: text for key, text in pairs.items() if key in own}, own_class, strict=False)
+        return msgspec.convert(pairs, settings_class, strict=False)
     except msgspec.ValidationError as error:
         raise SettingError(f"rotator {url!r}: {error}; see the reference page on rotators") from None
-    if settings.backlash is None:
-        settings = msgspec.structs.replace(settings, backlash=backlash_deg)
-    return settings, special

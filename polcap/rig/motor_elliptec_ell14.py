@@ -16,10 +16,10 @@ import re
 import time
 from typing import Annotated, Literal
 
-from msgspec import Meta, Struct
+from msgspec import Meta
 
 from polcap.errors import HardwareError
-from polcap.rig.device_log import Log
+from polcap.rig.rotator import RotatorSettings
 from polcap.rig.serial_port import NoAnswer, Port, retry
 
 STATUS = {
@@ -44,7 +44,7 @@ _ANSWER = re.compile(r"([0-9A-F])(IN|GS|PO|HO)([0-9A-F]+)")
 _DIGITS = {"IN": 30, "GS": 2, "PO": 8, "HO": 8}  # of an answer's data
 
 
-class ElliptecSettings(Struct, frozen=True):
+class ElliptecSettings(RotatorSettings, frozen=True):
     """Settings in the URL of an `elliptec` rotator."""
 
     address: Annotated[str, Meta(pattern="^[0-9A-Fa-f]$")] = "0"  # on the bus
@@ -57,14 +57,12 @@ class ElliptecMotor:
     """One rotation mount on a bus."""
 
     baud = 9600
-    backlash_deg = 0.0  # the piezo drives the ring without a gear
     wraps = True
 
-    def __init__(self, port: Port, settings: ElliptecSettings, timeout_s: float, log: Log) -> None:
+    def __init__(self, port: Port, settings: ElliptecSettings) -> None:
         self._port = port
         self._settings = settings
         self._address = settings.address.upper()
-        self._timeout_s = timeout_s
         self.model = "Elliptec"
         retry(lambda: self._ask("gs", "GS"))  # clears an old fault
         identity = retry(lambda: self._ask("in", "IN"))
@@ -98,7 +96,7 @@ class ElliptecMotor:
     def _move(self, command: str) -> None:
         """Send a movement and wait for its end: a position, or status ok if the position was lost."""
         self._send(command)
-        end = time.monotonic() + self._timeout_s
+        end = time.monotonic() + self._settings.timeout
         asked = False
         while time.monotonic() < end:
             try:
@@ -117,13 +115,13 @@ class ElliptecMotor:
             if data != _BUSY:
                 raise self._fault(data)
         raise HardwareError(
-            f"{self.model} on {self._port.url} is busy for more than timeout = {self._timeout_s:g} s; "
+            f"{self.model} on {self._port.url} is busy for more than timeout = {self._settings.timeout:g} s; "
             "free the ring, switch the device off and on"
         )
 
     def _ask(self, command: str, expected: str) -> str:
         """Data of the answer of kind `expected`; skips late answers, asks a busy device again."""
-        end = time.monotonic() + self._timeout_s
+        end = time.monotonic() + self._settings.timeout
         while True:
             self._send(command)
             busy = False

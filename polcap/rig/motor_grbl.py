@@ -13,11 +13,11 @@ import time
 from math import inf
 from typing import Annotated, Literal
 
-from msgspec import Meta, Struct
+from msgspec import Meta
 
 from polcap.errors import HardwareError
 from polcap.rig import person, serial_port
-from polcap.rig.device_log import Log
+from polcap.rig.rotator import Backlash, RotatorSettings
 from polcap.rig.serial_port import NoAnswer, Port, retry
 
 ALARM = {
@@ -57,9 +57,10 @@ _STORED = re.compile(r"\$(\d{1,9})=(\d{1,9}(?:\.\d+)?)(?: .*)?")
 _STATUS = re.compile(r"<(\w+)(?::\d+)?\|MPos:(-?\d{1,9}\.?\d*),(-?\d{1,9}\.?\d*),(-?\d{1,9}\.?\d*).*>")
 
 
-class GrblSettings(Struct, frozen=True):
+class GrblSettings(RotatorSettings, frozen=True):
     """Settings in the URL of a `grbl` rotator."""
 
+    backlash: Backlash = 2.0
     axis: Literal["X", "Y", "Z"] = "X"
     steps: Annotated[float, Meta(gt=0)] | None = None  # motor (micro)steps per degree of the polarizer
     home: Literal["switch", "ask"] = "switch"  # ask: a person turns the ring to zero
@@ -69,14 +70,12 @@ class GrblMotor:
     """One axis of a GRBL board."""
 
     baud = 115200
-    backlash_deg = 2.0
     wraps = False
 
-    def __init__(self, port: Port, settings: GrblSettings, timeout_s: float, log: Log) -> None:
+    def __init__(self, port: Port, settings: GrblSettings) -> None:
         self._port = port
         self._settings = settings
-        self._timeout_s = timeout_s
-        self._log = log
+        self._timeout_s = settings.timeout
         self._axis = "XYZ".index(settings.axis)
         self._zero = 0.0  # machine units
         self.model = f"GRBL {retry(self._reset)}"
@@ -91,7 +90,7 @@ class GrblMotor:
             self._until_ok("$H", quiet_s=inf)  # GRBL reports no state while it homes
         else:
             self._command("$X")
-            person.ask(person.RING_TO_ZERO, self._log)
+            person.ask(person.RING_TO_ZERO, self._port.log)
         self._zero = self._machine_position()  # any number: -499 for a travel of 500
 
     def go(self, angle_deg: float) -> None:
@@ -148,9 +147,7 @@ class GrblMotor:
 
         After a second without a line GRBL is asked for its state; without any line for `quiet_s` it is lost.
 
-        Raises
-        ------
-        NoAnswer, HardwareError
+        Raises NoAnswer, HardwareError.
         """
         self._port.send(f"{text}\n")
         heard = time.monotonic()

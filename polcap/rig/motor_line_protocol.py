@@ -16,11 +16,9 @@ import re
 import time
 from typing import Literal
 
-from msgspec import Struct
-
 from polcap.errors import HardwareError
 from polcap.rig import person
-from polcap.rig.device_log import Log
+from polcap.rig.rotator import Backlash, RotatorSettings
 from polcap.rig.serial_port import NoAnswer, Port
 
 _START_S = 3.0  # for a board that restarts when its port is opened
@@ -29,9 +27,10 @@ _HELLO = re.compile(r"polcap-rotator 1 (\S+) (\d+(?:\.\d+)?)( started)?")
 _POSITION = re.compile(r"(ok|busy) (-?\d{1,9}(?:\.\d+)?)")
 
 
-class LineSettings(Struct, frozen=True):
+class LineSettings(RotatorSettings, frozen=True):
     """Settings in the URL of a `line` rotator."""
 
+    backlash: Backlash = 2.0
     home: Literal["switch", "ask"] = "switch"  # ask: a person turns the ring to zero
 
 
@@ -39,21 +38,18 @@ class LineMotor:
     """A board that speaks the line protocol."""
 
     baud = 115200
-    backlash_deg = 2.0
     wraps = False
 
-    def __init__(self, port: Port, settings: LineSettings, timeout_s: float, log: Log) -> None:
+    def __init__(self, port: Port, settings: LineSettings) -> None:
         self._port = port
         self._settings = settings
-        self._timeout_s = timeout_s
-        self._log = log
         name, speed = self._hello()
         self.model = f"polcap-rotator {name}"
         self.speed_deg_s = max(speed, 0.1)
 
     def home(self) -> None:
         if self._settings.home == "ask":
-            person.ask(person.RING_TO_ZERO, self._log)
+            person.ask(person.RING_TO_ZERO, self._port.log)
             self._command("zero")
         else:
             self._command("home")
@@ -84,7 +80,7 @@ class LineMotor:
     def _command(self, command: str) -> float:
         """Send, wait for the end, return the position."""
         self._port.send(f"{command}\n")
-        end = time.monotonic() + self._timeout_s
+        end = time.monotonic() + self._settings.timeout
         while time.monotonic() < end:
             line = self._port.read_line()
             if line.startswith("error "):
@@ -99,7 +95,7 @@ class LineMotor:
             if match[1] == "ok":
                 return float(match[2])
         raise self._failed(
-            f" is busy for more than timeout = {self._timeout_s:g} s at `{command}`; "
+            f" is busy for more than timeout = {self._settings.timeout:g} s at `{command}`; "
             "free the ring, or raise timeout in the rotator's URL"
         )
 

@@ -1,4 +1,4 @@
-"""Motor driver for `simulated`: a ring with play whose true angle differs a little from the one it reports.
+"""Motor driver for `simulated`: a ring with play; its true angle differs a little from the reported one.
 
 The simulated camera reads the true angle.
 """
@@ -7,14 +7,16 @@ import time
 from typing import Annotated
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 
 from polcap.rig.device_log import Log
+from polcap.rig.rotator import Backlash, RotatorSettings
 
 
-class SimulatedMotorSettings(Struct, frozen=True):
+class SimulatedMotorSettings(RotatorSettings, frozen=True):
     """Settings in the URL of a `simulated` rotator."""
 
+    backlash: Backlash = 2.0
     seed: Annotated[int, Meta(ge=0)] = 0
     error: Annotated[float, Meta(ge=0, le=5)] = 0.05  # degrees, 1σ, between the angle reported and the true one
     play: Annotated[float, Meta(ge=0, le=45)] = 0.5  # degrees, of the gear; shows after a downward movement
@@ -22,7 +24,7 @@ class SimulatedMotorSettings(Struct, frozen=True):
 
 
 class SimulatedRing:
-    """The polarizer that the motor turns and the camera looks through."""
+    """The polarizer between the simulated camera and its scene."""
 
     true_deg: float | None = None  # None: no simulated motor turns it
 
@@ -34,7 +36,6 @@ class SimulatedMotor:
     """Turns `RING`; the same position has the same error every time."""
 
     model = "Polcap Synthetic rotator"
-    backlash_deg = 2.0
     wraps = False
 
     def __init__(self, settings: SimulatedMotorSettings, log: Log) -> None:

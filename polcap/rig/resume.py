@@ -19,10 +19,7 @@ _LEFT_BEFORE_FIRST_FRAME = {capture_record.LOG}  # by a run that failed early
 def complete_order(folder: Path, options: dict[str, Any], resume: bool) -> CaptureOrder:
     """The options that are not None; the others from the begun capture with `resume`, else by default.
 
-    Raises
-    ------
-    SettingError
-        Rotator or camera is missing, or the angles make no capture.
+    Raises SettingError if rotator or camera is missing, or the angles make no capture.
     """
     begun = capture_record.load(folder) if resume else None
     values = {} if begun is None else msgspec.structs.asdict(begun.order)
@@ -39,12 +36,9 @@ def complete_order(folder: Path, options: dict[str, Any], resume: bool) -> Captu
 
 
 def open_folder(folder: Path, order: CaptureOrder, resume: bool) -> RigFile | None:
-    """What an earlier run of the same order recorded; None for a new capture, whose folder is created.
+    """The record of an earlier run of the same order; None for a new capture. Creates the folder.
 
-    Raises
-    ------
-    CaptureError
-        The folder holds other files, or a capture that was begun with other options.
+    Raises CaptureError if the folder holds other files, or a capture that was begun with other options.
     """
     content = capture_record.load(folder) if resume else None
     if content is not None:

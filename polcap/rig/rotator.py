@@ -33,14 +33,17 @@ class Motor(Protocol):
         """Stop turning and switch the current off."""
 
 
+Backlash = Annotated[float, Meta(ge=0, le=45)]  # degrees; every angle is reached upwards, over at least this far
+
+
 class RotatorSettings(Struct, frozen=True):
-    """Settings in the URL of every motor."""
+    """Settings in the URL of every motor; a driver adds its own."""
 
     offset: float = 0.0  # degrees; the motor's position where the polarizer's axis is at 0°
     reverse: bool = False  # the motor's degrees run clockwise, as the photographer sees the picture
-    backlash: Annotated[float, Meta(ge=0, le=45)] | None = None  # degrees of upward approach; None: the motor's default
+    backlash: Backlash = 0.0
     settle: Annotated[float, Meta(ge=0, le=60)] = 0.2  # s
-    tolerance: Annotated[float, Meta(gt=0, le=180)] = 0.3  # degrees
+    tolerance: Annotated[float, Meta(gt=0, le=45)] = 0.3  # degrees
     timeout: Annotated[float, Meta(gt=0, le=600)] = 30.0  # s; the longest movement
 
 
@@ -69,10 +72,7 @@ class PolarizerRotator:
     def move(self, angle_deg: float) -> float:
         """Turn the axis to an angle; returns the angle read back, in [0, 360).
 
-        Raises
-        ------
-        HardwareError
-            The motor fails, or stops further from the angle than the tolerance.
+        Raises HardwareError if the motor fails, or stops further from the angle than the tolerance.
         """
         if not self._homed or self._was_moved():
             self.home()
@@ -124,7 +124,7 @@ class PolarizerRotator:
     def _approach(self, target: float) -> None:
         """Turn to motor degrees, upwards at the end, so that a gear's play does not show."""
         previous, self._stopped_at = self._stopped_at, None
-        backlash = self._settings.backlash or 0.0
+        backlash = self._settings.backlash
         if backlash and (previous is None or target < previous):
             retry(lambda: self._motor.go(target - backlash))
         retry(lambda: self._motor.go(target))

@@ -1,6 +1,6 @@
 """The sequence of a capture: turn the polarizer, take the frames that are missing, check each in the background.
 
-A rejected frame leaves its slot empty. So retakes and resuming after a crash are the same loop: take what is missing.
+A rejected frame leaves its slot empty. So retaking and resuming are the same loop: take the missing frames.
 """
 
 import shutil
@@ -8,7 +8,8 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,9 @@ from polcap.rig.camera import Camera, CameraFile
 from polcap.rig.capture_record import CaptureRecord, RigFile
 from polcap.rig.device_log import Log
 from polcap.rig.resume import open_folder, verify
-from polcap.rig.retake_criteria import RetakeLimits
 from polcap.rig.rotator import PolarizerRotator
 from polcap.rig.shooting_plan import CaptureOrder, Slot
 
-LIMITS = RetakeLimits()
 Tell = Callable[[str], None]
 _SPARE = 1.2  # free disk space over the size of the frames
 
@@ -37,7 +36,6 @@ def shoot(
     order: CaptureOrder,
     *,
     resume: bool = False,
-    limits: RetakeLimits = LIMITS,
     tries: int = 2,
     tell: Tell = lambda line: None,
 ) -> dict[str, Any]:
@@ -69,7 +67,7 @@ def shoot(
             tell(message)
         missing = record.missing()
         _check_disk(folder, len(missing) * camera.frame_bytes)
-        check = BackgroundCheck(record, limits, tries, log)
+        check = BackgroundCheck(record, tries, log)
         if missing:
             if note := shooting_plan.light_note(content.order):
                 tell(f"polcap: {note}")
@@ -88,7 +86,8 @@ def _take_missing(
         record.content.rotator = rotator.model
         log.write("polcap", "!", f"{len(record.missing())} frames to take with {rotator.model} and {camera.model}")
         record.write()
-        Shooting(record, check, rotator, camera, log, tell).run()
+        pace = dry_run.Pace(rotator.speed_deg_s, rotator.settle_s, dry_run.overhead_s(record.content.order.camera))
+        CaptureLoop(record, check, rotator, camera, pace, log, tell).run()
     except PolcapError as error:
         log.write("polcap", "!", str(error))
         raise type(error)(f"{error}; the frames so far are saved, --resume continues") from error
@@ -100,93 +99,81 @@ def _take_missing(
             rotator.close()
 
 
-class Shooting:
+@dataclass
+class CaptureLoop:
     """The loop that takes the missing frames."""
 
-    def __init__(
-        self,
-        record: CaptureRecord,
-        check: BackgroundCheck,
-        rotator: PolarizerRotator,
-        camera: Camera,
-        log: Log,
-        tell: Tell,
-    ) -> None:
-        self._record = record
-        self._check = check
-        self._rotator = rotator
-        self._camera = camera
-        self._log = log
-        self._tell = tell
-        overhead_s = dry_run.overhead_s(record.content.order.camera)
-        self._pace = dry_run.Pace(rotator.speed_deg_s, rotator.settle_s, overhead_s)
-        self._angle_deg = 0.0  # requested last
-        self._read_deg: float | None = None  # read back there
-        self._filter_on_flash = False
+    record: CaptureRecord
+    check: BackgroundCheck
+    rotator: PolarizerRotator
+    camera: Camera
+    pace: dry_run.Pace
+    log: Log
+    tell: Tell
+    angle_deg: float = 0.0  # requested last
+    read_deg: float | None = None  # read back there
+    filter_on_flash: bool = False
 
     def run(self) -> None:
-        self._rotator.home()
+        self.rotator.home()
         while True:
-            self._check.collect(block=len(self._check.pending) >= MOST_PENDING)
-            missing = self._record.missing(self._check.pending)
+            self.check.collect(block=len(self.check.pending) >= MOST_PENDING)
+            missing = self.record.missing(self.check.pending)
             if missing:
-                slot = shooting_plan.next_slot(missing, self._angle_deg)
-                turns = slot.angle_deg is not None and (self._read_deg is None or slot.angle_deg != self._angle_deg)
-                if not (turns and self._rotator.by_hand and self._check.pending):
+                slot = shooting_plan.next_slot(missing, self.angle_deg)
+                turns = slot.angle_deg is not None and (self.read_deg is None or slot.angle_deg != self.angle_deg)
+                if not (turns and self.rotator.by_hand and self.check.pending):
                     self._take(slot, missing)
                     continue
-            elif not self._check.pending:
+            elif not self.check.pending:
                 return
-            self._check.collect(block=True)  # at the end, and before a person turns the ring: nobody likes to turn back
+            self.check.collect(block=True)  # at the end, and before a person turns the ring: nobody likes to turn back
 
     def _take(self, slot: Slot, missing: list[Slot]) -> None:
         if slot.angle_deg is not None:
             self._turn(slot, slot.angle_deg)
-        total = len(self._record.slots)
-        left_s = self._pace.total_s(missing, self._angle_deg)
-        self._tell(
-            f"{slot.name:24}{total - len(missing) + 1:3}/{total}  {slot.exposure}  "
-            f"{left_s / 60:.0f}:{left_s % 60:02.0f} left"
-        )
+        total = len(self.record.slots)
+        left = dry_run.minutes(self.pace.total_s(missing, self.angle_deg))
+        self.tell(f"{slot.name:24}{total - len(missing) + 1:3}/{total}  {slot.exposure}  {left} left")
         self._ask_for_filter(slot.role == "cross")
         photograph = self._photograph(slot)
         self._check_different(slot, photograph)
-        self._check.submit(slot, None if slot.angle_deg is None else self._read_deg, photograph)
+        self.check.submit(slot, None if slot.angle_deg is None else self.read_deg, photograph)
 
     def _turn(self, slot: Slot, angle_deg: float) -> None:
-        if self._read_deg is None or angle_deg != self._angle_deg:
-            self._angle_deg, self._read_deg = angle_deg, None
-            read_deg = self._rotator.move(angle_deg)
-            self._read_deg = round(angle_deg + (read_deg - angle_deg + 180.0) % 360.0 - 180.0, 4)  # not modulo 360
-        for name in self._record.reject_other_angle(slot, self._read_deg):
-            self._tell(f"{name} is taken again: the ring came back to {self._read_deg:.2f}°")
+        if self.read_deg is None or angle_deg != self.angle_deg:
+            self.angle_deg, self.read_deg = angle_deg, None
+            read_deg = self.rotator.move(angle_deg)
+            self.read_deg = round(angle_deg + (read_deg - angle_deg + 180.0) % 360.0 - 180.0, 4)  # not modulo 360
+        for name in self.record.reject_other_angle(slot, self.read_deg):
+            self.tell(f"{name} is taken again: the ring came back to {self.read_deg:.2f}°")
 
     def _ask_for_filter(self, wanted: bool) -> None:
         """Ask a person to put the flash's filter on or to take it off."""
-        if wanted != self._filter_on_flash and not self._camera.polarizes_flash:
+        if wanted != self.filter_on_flash and not self.camera.polarizes_flash:
             on = "put the second polarizer on the flash and turn it until the highlights vanish"
             off = "take the polarizer off the flash again"
-            person.ask(f"{on if wanted else off}, then press Enter: ", self._log)
-        self._filter_on_flash = wanted
+            person.ask(f"{on if wanted else off}, then press Enter: ", self.log)
+        self.filter_on_flash = wanted
 
     def _photograph(self, slot: Slot) -> CameraFile:
         """Take one frame; a person handles the chart, and the flash if the camera cannot switch it."""
-        self._camera.prepare(slot.angle_deg, slot.role, slot.step)
+        self.camera.prepare(slot.angle_deg, slot.role, slot.step)
         before = after = ""
         if slot.role == "chart":
             before, after = "put the chart in the place of the object", "remove the chart"
-        elif not slot.flash and not self._camera.switches_flash:
+        elif not slot.flash and not self.camera.switches_flash:
             before, after = "switch the flash off", "switch the flash on again"
         if before:
-            person.ask(f"{before}, then press Enter: ", self._log)
-        photograph = self._camera.shoot(slot.exposure, slot.flash)
+            person.ask(f"{before}, then press Enter: ", self.log)
+        photograph = self.camera.shoot(slot.exposure, slot.flash)
         if after:
-            person.ask(f"{after}, then press Enter: ", self._log)
+            person.ask(f"{after}, then press Enter: ", self.log)
         return photograph
 
     def _check_different(self, slot: Slot, photograph: CameraFile) -> None:
         """Raise SettingError if the camera's dials gave two frames of the bracket the same exposure."""
-        for name, frame in self._record.accepted().items():
+        for name, frame in self.record.accepted().items():
             if slot.role == frame.role == "shot" and frame.step != slot.step and frame.exposure == photograph.exposure:
                 raise SettingError(
                     f"--bracket: the camera took {slot.name} ({slot.exposure}) with {photograph.exposure}, as {name}; "
@@ -240,18 +227,12 @@ def _check_person(missing: list[Slot], camera: Camera) -> None:
         raise SettingError(f"{named}: a person at a terminal is needed; run in a terminal, or leave it out")
 
 
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """No second polcap shoots into the folder; the system drops the lock when the process dies."""
-    lock = FileLock(folder / ".lock", timeout=0)
+def _locked(folder: Path) -> AbstractContextManager[Any]:
+    """Keep a second polcap out of the folder; the system drops the lock when the process dies."""
     try:
-        lock.acquire()
+        return FileLock(folder / ".lock", timeout=0).acquire()
     except Timeout as error:
         raise StorageError(f"{folder}: another polcap is shooting into it; wait until it has finished") from error
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 @contextmanager

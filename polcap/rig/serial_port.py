@@ -23,7 +23,7 @@ with suppress(ImportError):  # Windows
     _FAILURES += (termios.error,)  # a pulled cable
 
 ANSWER_S = 1.0  # time limit of one answer
-_SHORTEST_READ_S = 0.02  # a line that has already arrived is read even after the time limit
+_READ_S = 0.05  # pyserial's timeout; a new one for every read would configure the port again
 _QUIET_S = 0.25  # after so long without a byte no answer is on its way; a USB adapter delivers within 16 ms
 _LATE_S = 2.0  # longest wait for late answers
 _LONGEST_LINE = 1024  # bytes; more without a line end is noise
@@ -63,13 +63,13 @@ class Port:
     def __init__(self, url: str, baud: int, log: Log) -> None:
         """Raises HardwareError if the port cannot be opened, SettingError for a malformed URL."""
         self.url = url
-        self._log = log
+        self.log = log
         self._question = ""
         self._answer_missing = False  # it may still come, and must not be taken for the next answer
         self._heard = False  # something has come since
         try:
             self._serial = serial.serial_for_url(
-                url, baudrate=baud, timeout=ANSWER_S, write_timeout=ANSWER_S, exclusive=True
+                url, baudrate=baud, timeout=_READ_S, write_timeout=ANSWER_S, exclusive=True
             )
         except ValueError as error:
             raise SettingError(
@@ -89,24 +89,25 @@ class Port:
                 self._serial.reset_input_buffer()
             self._serial.write(text.encode("ascii"))
         self._question = _printable(text.encode("ascii"))
-        self._log.write("rotator", ">", self._question)
+        self.log.write("rotator", ">", self._question)
 
     def read_line(self, limit_s: float | None = None) -> str:
         """The next line that is not empty, without its end. Raises NoAnswer, Unplugged."""
         limit_s = ANSWER_S if limit_s is None else limit_s
         end = time.monotonic() + limit_s
+        received, over = b"", False
         with self._named_failures():
-            while True:
-                self._serial.timeout = max(end - time.monotonic(), _SHORTEST_READ_S)
-                received = self._serial.read_until(b"\n", _LONGEST_LINE)
-                line = received.strip()
-                if line or not received or time.monotonic() >= end:
-                    break
-        if line and received.endswith(b"\n"):
+            while not over and not received.endswith(b"\n") and len(received) < _LONGEST_LINE:
+                over = time.monotonic() >= end  # read once more: a line that has arrived by now counts
+                received += self._serial.read_until(b"\n", _LONGEST_LINE)
+                if received.endswith(b"\n") and not received.strip():
+                    received = b""
+        line = received.strip()
+        if received.endswith(b"\n"):
             return self._decoded(line)
         self._answer_missing, self._heard = True, False
         if line:
-            self._log.write("rotator", "<", _printable(line) + " …")
+            self.log.write("rotator", "<", _printable(line) + " …")
             raise NoAnswer(
                 f"{self._subject} only '{_printable(line):.40}' within {limit_s:.3g} s; "
                 "check the cable and the baud rate"
@@ -134,7 +135,7 @@ class Port:
         return f"rotator on {self.url} answered '{self._question}' with" if self._question else f"{self.url} sent"
 
     def _decoded(self, line: bytes) -> str:
-        self._log.write("rotator", "<", _printable(line))
+        self.log.write("rotator", "<", _printable(line))
         self._heard = True
         if not all(32 <= byte < 127 or byte == 9 for byte in line):
             raise NoAnswer(
@@ -143,10 +144,11 @@ class Port:
         return line.decode("ascii")
 
     def _discard_late_answers(self) -> None:
-        self._serial.timeout = _QUIET_S
         end = time.monotonic() + _LATE_S
-        while self._serial.read(_LONGEST_LINE) and time.monotonic() < end:
-            self._heard = True
+        quiet = time.monotonic() + _QUIET_S
+        while time.monotonic() < min(quiet, end):
+            if self._serial.read(_LONGEST_LINE):
+                self._heard, quiet = True, time.monotonic() + _QUIET_S
         self._answer_missing = not self._heard
 
     @contextmanager

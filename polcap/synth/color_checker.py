@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from polcap.formats import calib
+from polcap.formats import shipped_data
 from polcap.images import Floats
 
 _PATCH, _FRAME, _FRAME_ALBEDO = 0.88, 0.18, 0.03  # side of a patch and width of the frame, in patch pitches
@@ -55,7 +55,7 @@ def seen(chart: Chart, v: Floats) -> tuple[Floats, Floats, Floats]:
     column, row = column[on], row[on]
     patch = (column >= 0) & (row >= 0) & (column % 1 < _PATCH) & (row % 1 < _PATCH) & (column < 6) & (row < 4)
     number = np.where(patch, row.astype(int) * 6 + column.astype(int), 24)
-    colors = np.vstack([calib.colorchecker().rec709, np.full((1, 3), _FRAME_ALBEDO)])
+    colors = np.vstack([shipped_data.colorchecker().rec709, np.full((1, 3), _FRAME_ALBEDO)])
     return near[on], distance[on], colors[number]
 
 

@@ -12,9 +12,9 @@ In the order a sample meets them:
     model       channels -> maps; profiles and palette are its parts that read gloss and draw albedo
     variants    the network with one thing taken away
     loss        maps against truth
-    train       the loop, checkpoints, metrics; arithmetic says in which numbers
-    pack        all that a machine without a network needs to train, in pieces; parted checkpoints
-    watch       a look at held-out pictures as training goes
+    loop        optimizers (muon), learning rate, averaged weights, checkpoints; arithmetic: bf16 or fp32
+    train       the main network's batches and losses in that loop
+    validation  errors on held-out pictures during training
     export      weights -> ONNX
     corpus      the same simulator's pictures and truth as files
     evaluate    error of every map on fixed pictures of held-out meshes and materials, of which
@@ -26,5 +26,5 @@ The object's mask has a network of its own: mask_views traces objects before a b
 lights them, mask_pictures keeps them as files, mask_model learns from those in mask_train.
 
 The fine pass has one too: relief bends traced normals, fine_pictures photographs them and asks the first network,
-fine_model learns what is missing in fine_train. Both learn in a small_run.
+fine_model learns what is missing in fine_train. All three learn in the same loop.
 """

@@ -4,96 +4,85 @@ MODEL is the first network's file. Pictures are made first (`fine_pictures.py`),
 OUT/fine.onnx, last.pt and metrics.csv.
 """
 
-import csv
 import sys
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from polcap.formats import onnx
 from polcap.images import Floats
 from polcap.stages.infer import fine
-from polcap.training import export, fine_model, fine_pictures
-from polcap.training.small_run import SmallRun
+from polcap.training import export, fine_model, fine_pictures, loop
 
-_PICTURES, _TILES, _TILE = 4, 4, 96  # pictures a step, tiles of each, their side, px
-_HELD = 24  # pictures that are only looked at
+_TILES, _TILE = 4, 96  # tiles of a picture in a step; their side, px
 _DOUBLED = tuple(fine.CHANNELS.index(name) for name in ("s1", "zenith_x", "cos_2phi"))  # and the channel after each
 _VECTORS = tuple(fine.CHANNELS.index(name) for name in ("ray_x", "normal_x", "smooth_x"))
 _NORMAL, _COUNT = fine.CHANNELS.index("normal_x"), len(fine.CHANNELS)
 
 
 @dataclass(frozen=True)
-class Params:
-    """What one training run is told."""
+class FineTrainingOptions:
+    """One training run of the fine pass."""
 
     data: Path  # holds meshes/ and materials/
     model: Path  # the first network
     out: Path
-    minutes: float = 40.0  # of training, resumed parts together
+    minutes: float = 40.0  # of training, resumed parts included
     pictures: int = 400
-    rate: float = 2e-3  # of Muon; half of it for AdamW
+    rate: float = 2e-3  # of Muon
     seed: int = 1
 
 
-def main(params: Params) -> Path:
+def main(options: FineTrainingOptions) -> Path:
     """Make the pictures that are missing, train, export."""
     torch.set_num_threads(1)
-    folder = params.out / "pictures"
-    if len(list(folder.glob("[0-9]*.npy"))) < params.pictures:
-        network = onnx.load(params.model, threads=1)
-        studio = fine_pictures.Studio.open(params.out / "views", params.data, network)
-        fine_pictures.main(folder, studio, params.pictures)
-    files = sorted(folder.glob("[0-9]*.npy"))
-    torch.manual_seed(params.seed)
-    run = Run(params.rate)
-    run.spend(params.minutes, files, _HELD, _PICTURES, params.seed, params.out)
-    return ship(params.out / "last.pt", params.out / "fine.onnx")
+    folder = options.out / "pictures"
+    if len(list(folder.glob("[0-9]*.npy"))) < options.pictures:
+        network = onnx.load(options.model, threads=1)
+        studio = fine_pictures.Studio.open(options.out / "views", options.data, network)
+        fine_pictures.main(folder, studio, options.pictures)
+    torch.manual_seed(options.seed)
+    training = FineTraining(options.rate, sorted(folder.glob("[0-9]*.npy")), options.seed)
+    training.resume(options.out / "last.pt")
+    loop.run(training, training.draw, loop.Budget(options.minutes), options.out)
+    return ship(options.out / "last.pt", options.out / "fine.onnx")
 
 
-class Run(SmallRun):
-    """The network in training, by its own pictures."""
+class FineTraining(loop.PictureTraining):
+    """The fine pass's network in training."""
 
-    made, warm, keep = fine_model.Network, 30, 0.995
+    schedule = loop.Schedule(hold=0.35, warm_up=30, averaging=0.995)
+    held_out, per_step = 24, 4
 
-    def advance(self, files: list[Path], progress: float, rng: np.random.Generator) -> float:
-        """One step; its loss."""
-        self.pace(progress)
-        drawn = [tile(taught(file), rng) for file in files for _ in range(_TILES)]
+    def __init__(self, rate: float, files: list[Path], seed: int = 1) -> None:
+        super().__init__(fine_model.Network(), rate, files, seed)
+
+    def advance(self, batch: list[Path], progress: float) -> dict[str, float]:
+        """One step on some tiles of each picture."""
+        drawn = [tile(taught(file), self.random) for file in batch for _ in range(_TILES)]
         loss = fine_model.loss(*answered(self.network, np.stack(drawn)))
         loss.backward()
-        self.learn()
-        return float(loss.detach())
+        self.update(progress)
+        self.samples += len(drawn)
+        return {"loss": float(loss.detach())}
 
-    def look(self, path: Path, losses: Any, files: list[Path]) -> None:
-        """A row of metrics."""
-        _record(path, self, float(losses), *self.judge(files))
-
-    def judge(self, files: list[Path]) -> tuple[float, float]:
-        """Distance of the relief from the truth, rms, with the averaged weights and without any relief."""
-        network = averaged(self.average)
-        left, whole = [], []
-        for file in files:
-            picture = taught(file)
-            height, width = (side - side % fine.SIZE_MULTIPLE for side in picture.shape[1:])
-            with torch.no_grad():
-                relief, target, known = answered(network, picture[None, :, :height, :width])
-            left.append(float((((relief - target) * known) ** 2).sum() / known.sum()))
-            whole.append(float(((target * known) ** 2).sum() / known.sum()))
-        return float(np.sqrt(np.mean(left))), float(np.sqrt(np.mean(whole)))
-
-
-def averaged(weights: dict[str, Tensor]) -> fine_model.Network:
-    network = fine_model.Network()
-    network.load_state_dict(weights)
-    network.eval()
-    return network
+    def validate(self, out: Path) -> dict[str, float]:
+        """Rms distance of the relief from the truth, and of no relief at all."""
+        left, without = [], []
+        with self.averaged() as network:
+            for file in self.files[: self.held_out]:
+                picture = taught(file)
+                height, width = (side - side % fine.SIZE_MULTIPLE for side in picture.shape[1:])
+                with torch.no_grad():
+                    relief, target, known = answered(network, picture[None, :, :height, :width])
+                left.append(float((((relief - target) * known) ** 2).sum() / known.sum()))
+                without.append(float(((target * known) ** 2).sum() / known.sum()))
+        return {"off": float(np.sqrt(np.mean(left))), "off_without": float(np.sqrt(np.mean(without)))}
 
 
 @cache
@@ -103,7 +92,7 @@ def taught(file: Path) -> NDArray[np.float16]:
     shown = picture[:_COUNT].astype(np.float32)
     truth, known = picture[_COUNT : _COUNT + 3].astype(np.float32), picture[-1] > 0
     shrink = float(np.exp(shown[-1].max()))
-    relief = fine.finer(np.moveaxis(truth - shown[_NORMAL : _NORMAL + 3], 0, -1), known, shrink)
+    relief = fine.high_pass(np.moveaxis(truth - shown[_NORMAL : _NORMAL + 3], 0, -1), known, shrink)
     return np.concatenate([picture[:_COUNT], np.moveaxis(relief, -1, 0), known[None]]).astype(np.float16)
 
 
@@ -133,7 +122,7 @@ def turned(picture: Floats, quarters: int, mirror: bool) -> Floats:
     return out
 
 
-def answered(network: fine_model.Network, pictures: Floats) -> tuple[Tensor, Tensor, Tensor]:
+def answered(network: nn.Module, pictures: Floats) -> tuple[Tensor, Tensor, Tensor]:
     """Relief, what it should be, and where that is known, of pictures (B, N + 4, H, W)."""
     batch = torch.from_numpy(pictures.astype(np.float32))
     shown = batch[:, :_COUNT].contiguous(memory_format=torch.channels_last)
@@ -147,22 +136,13 @@ def ship(checkpoint: Path, path: Path) -> Path:
         "channels": ",".join(fine.CHANNELS), "encoding": fine.ENCODING, "native_size": str(fine_pictures.SIDE),
         "size_multiple": str(fine.SIZE_MULTIPLE), "licence": "Apache-2.0",
         "outputs": "relief: added to the normal so far, in the frame of each ray",
-        "training": f"{state['step'] * _PICTURES * _TILES} tiles of {_TILE} px in {state['step']} steps",
+        "training": f"{state['samples']} tiles of {_TILE} px in {state['step']} steps",
     }  # fmt: skip
-    export.save(averaged(state["average"]), path, ("relief",), metadata)
+    network = fine_model.Network()
+    network.load_state_dict(state["average"])
+    export.save(network, path, ("relief",), metadata)
     return path
 
 
-def _record(path: Path, run: Run, loss: float, left: float, whole: float) -> None:
-    row = {"step": run.step, "seconds": round(run.elapsed), "loss": loss, "off": left, "off_without": whole}
-    fresh = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, row.keys())
-        if fresh:
-            writer.writeheader()
-        writer.writerow({k: f"{v:.4g}" for k, v in row.items()})
-    print(" ".join(f"{k} {v:.4g}" for k, v in row.items()), file=sys.stderr, flush=True)
-
-
 if __name__ == "__main__":
-    main(Params(Path(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3]), float(sys.argv[4])))
+    main(FineTrainingOptions(Path(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3]), float(sys.argv[4])))

@@ -72,7 +72,7 @@ class Judge:
         by = max(1, round(max(self.mask.shape) / _INTEGRATED))
         thin = _thinned(maps, by)
         mask = thin.mask & self.mask[::by, ::by]
-        depth = surface.integrate(replace(thin, mask=mask), None, surface.Settings()).depth[mask]
+        depth = surface.integrate(replace(thin, mask=mask), None, surface.SurfaceSettings()).depth[mask]
         unit = float(depth.mean() * np.sqrt(mask.sum() / np.pi) / thin.view.focal)
         return {"depth_integrated": _depth(depth / unit, self.case.depth[::by, ::by][mask])["depth"]}
 

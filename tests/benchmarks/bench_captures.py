@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from polcap.config import Config
+from polcap.formats import onnx
 from polcap.formats.capture import reader as captures
 from polcap.images import Capture, Floats, Network
 from polcap.optics import body, frames, fresnel
@@ -62,18 +63,18 @@ def measure(truth_file: Path, network: Network | None, rough: bool) -> list[floa
 def capture_errors(found: Results, capture: Capture, told: dict, meta: dict) -> list[float]:  # type: ignore[type-arg]
     """Chart centres and alignment [RAW px, worst], gains and bracket ratios [%, worst]."""
     centers = (np.array(meta["chart"]["patch_corners_px"]) - 1).mean(1) / 2  # their pixel centres lie at .5
-    assert found.color.quads is not None
-    chart = 2 * np.linalg.norm(found.color.quads.mean(1) - centers, axis=1).max()
+    assert found.color.place is not None
+    chart = 2 * np.linalg.norm(found.color.place.quads.mean(1) - centers, axis=1).max()
 
     files = {shot["file"].split("/", 1)[1]: shot for shot in told["shots"]}
     frames = [
         [files[str(Path(frame.path).relative_to(capture.folder))] for frame in shot.frames] for shot in capture.shots
     ]
     exposure = np.array([[f["relative_exposure"] * f["flash_factor"] for f in shot] for shot in frames])
-    ratio = found.radiance.exposure_ratio.mean(-1)
+    ratio = found.radiance.bracket.exposure_ratio.mean(-1)
     reference = int(np.abs(ratio[0] - 1).argmin())
     flash = np.array([shot[reference]["flash_factor"] for shot in frames])
-    gain = found.gains.gain.mean(1) / (flash / flash[0]) - 1
+    gain = found.selfcal.gains.gain.mean(1) / (flash / flash[0]) - 1
     ratios = ratio / (exposure / exposure[:, [reference]]) - 1
 
     rows, columns = np.nonzero(found.object_.mask)
@@ -108,7 +109,7 @@ def surface_errors(found: Results, truth: dict[str, Floats], network: Network | 
         parts = found.stokes.stokes.copy()
         parts[1:] *= np.where(binned(truth["mask"]) > 0, share, 1)[..., None]
         seen = cues.compute(replace(found.stokes, stokes=parts), found.color)
-        maps = infer.estimate(seen, network, Config().infer)
+        maps = infer.estimate(seen, network, onnx.run, Config().infer)
         depth = surface.integrate(maps, distance_m(found.color, found.radiance), Config().surface).depth
     inside = (binned(truth["mask"]) == 1) & maps.mask
     angle = np.degrees(np.arccos(np.clip((normal * maps.normal).sum(-1), -1, 1)))[inside]

@@ -23,7 +23,7 @@ from polcap.errors import ChartError
 from polcap.images import AngleStack, Floats
 from polcap.optics.color import decode_srgb, encode_srgb, fit_matrix
 from polcap.stages import whitebalance
-from polcap.stages.whitebalance import Settings, patches
+from polcap.stages.whitebalance import WhitebalanceSettings, patches
 from tests.stages.whitebalance.chart_pictures import AUTO, CLASSIC, stack
 from tests.stages.whitebalance.test_real_charts import DATA, MARKED, PHOTOS, REAL, corners_off, photo, superpixels
 
@@ -45,10 +45,11 @@ def photographs() -> None:
         *((path.stem, photo(path)) for path in PHOTOS),
         *((name, stack(superpixels(folder / name))) for name, folder in raws),
     ]:
-        color = whitebalance.measure(radiance, CLASSIC, AUTO, Settings())
+        color = whitebalance.measure(radiance, CLASSIC, AUTO, WhitebalanceSettings())
         plain = opencv(radiance)
-        assert color.delta_e is not None and color.predicted is not None
-        own = (100 * corners_off(color, MARKED[name]), np.nanmean(color.delta_e), np.nanmean(color.predicted))
+        colors = color.patches
+        assert colors is not None and colors.predicted is not None
+        own = (100 * corners_off(color, MARKED[name]), np.nanmean(colors.delta_e), np.nanmean(colors.predicted))
         there = f"{'not found':>20}" if plain is None else f"{100 * far(plain[0], MARKED[name]):12.2f}{plain[1]:8.2f}"
         print(f"{name:22}{own[0]:10.2f}{own[1]:8.2f}{own[2]:10.2f}{there}", flush=True)
 
@@ -62,9 +63,9 @@ def chart_free(pictures: int, first: int) -> None:
         if seen % 20 == 0:
             print(seen, by_polcap, by_opencv, by_cost, flush=True)
         try:
-            color = whitebalance.measure(radiance, CLASSIC, AUTO, Settings())
-            assert color.delta_e is not None
-            by_polcap.append((name, float(np.nanmean(color.delta_e))))
+            color = whitebalance.measure(radiance, CLASSIC, AUTO, WhitebalanceSettings())
+            assert color.patches is not None
+            by_polcap.append((name, float(np.nanmean(color.patches.delta_e))))
         except ChartError:
             pass
         found = opencv(radiance)

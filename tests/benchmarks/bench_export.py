@@ -21,8 +21,8 @@ import numpy as np
 
 from polcap.config import Config
 from polcap.formats.export import exr_layers, gltf, texture_set
-from polcap.formats.export.encoders import Encoder
-from polcap.formats.export.presets import PRESETS, Preset
+from polcap.formats.export.encoders import TextureEncoder
+from polcap.formats.export.presets import PRESETS, ExportPreset
 from polcap.formats.maps import maps_folder
 from polcap.formats.raw import worker
 from polcap.images import Asset, Cues, Floats, Mesh, StokesImage, SurfaceMaps, View
@@ -35,8 +35,8 @@ from tests import surfaces
 def main(folder: Path, side: int) -> None:
     result(folder, side)
     stored = maps_folder.read(folder / "maps")
-    mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, surface.Settings())
-    built = asset.build(stored.maps, mesh, asset.Settings())
+    mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, surface.SurfaceSettings())
+    built = asset.build(stored.maps, mesh, asset.AssetSettings())
     print(f"{'preset':10}{'alone s':>10}{'export s':>10}{'ratio':>8}{'MB':>8}")
     for name in PRESETS:
         encode, whole = (min(times) for times in zip(*(both(folder, built, name) for _ in range(3))))
@@ -64,9 +64,9 @@ def spent() -> float:
     return sum(sum(resource.getrusage(whose)[:2]) for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
 
 
-def alone(folder: Path, built: Asset, preset: Preset) -> None:
+def alone(folder: Path, built: Asset, preset: ExportPreset) -> None:
     """Encode what the preset holds in pictures, and nothing else."""
-    encoder = Encoder()
+    encoder = TextureEncoder()
     for texture in gltf.textures(built).values():
         encoder(texture, preset.images)
     for make in (*preset.textures.values(), *(texture_set.LOOSE.values() if "obj" in preset.formats else ())):

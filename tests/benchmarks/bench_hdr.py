@@ -80,8 +80,8 @@ def compare(title: str, theirs: Any, quads: Floats, exposures: tuple[float, ...]
         )  # fmt: skip
     shot = Shot(0.0, tuple(frame(p, e / 100) for p, e in zip(paths, exposures)))
     capture = Capture("", "", (shot,), "folders", 1000.0, True, (0.0, 0.0), SIZE[::-1])
-    stack, ours_s = timed(lambda: hdr.merge(capture, hdr.Settings()))
-    reference = int(np.argmax(np.all(stack.exposure_ratio[0] == 1, axis=1)))
+    stack, ours_s = timed(lambda: hdr.merge(capture, decode, hdr.Settings()))
+    reference = int(np.argmax(np.all(stack.bracket.exposure_ratio[0] == 1, axis=1)))
     truth = quads * true[reference] / GAIN / (WHITE - BLACK)
     clear = (stack.quality[0] & 1) == 0
     print(f"\n{title}: exposures {exposures}, {SIZE[0] * SIZE[1] / 1e6:.1f} MP")
@@ -110,11 +110,12 @@ BANDS = (20, 100, 500, 2000, 8000, 20000, 50000)  # electrons at the reference e
 
 
 def frame(path: Path, seconds: float) -> Frame:
-    def load() -> SensorImage:
-        with rawpy.imread(str(path)) as raw:
-            return SensorImage(raw.raw_image_visible.copy(), np.full((2, 2), float(BLACK)), float(WHITE), RGGB)
+    return Frame(str(path), Exif(exposure_time=seconds, iso=100.0), "shot", "")
 
-    return Frame(str(path), Exif(exposure_time=seconds, iso=100.0), "shot", "", load)
+
+def decode(frame: Frame) -> SensorImage:
+    with rawpy.imread(frame.path) as raw:
+        return SensorImage(raw.raw_image_visible.copy(), np.full((2, 2), float(BLACK)), float(WHITE), RGGB)
 
 
 def timed(work: Callable[[], T]) -> tuple[T, float]:

@@ -19,7 +19,17 @@ from numpy.typing import NDArray
 
 from polcap.errors import ObjectError
 from polcap.formats import onnx
-from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Network, ObjectMask, View
+from polcap.images import (
+    Alignment,
+    AngleStack,
+    ChartPlace,
+    ColorCalibration,
+    Floats,
+    Network,
+    ObjectMask,
+    View,
+    single_frames,
+)
 from polcap.optics import mueller
 from polcap.stages import mask
 from polcap.stages.mask.mask_channels import ENCODING
@@ -106,20 +116,18 @@ def _photographed(name: str, file: Path, rng: np.random.Generator) -> Case:
     height, width = SIZE
     radiance = AngleStack(
         value=value, variance=np.full_like(value, 1e-6), quality=np.zeros(value.shape[:3], np.uint8), angle=angle,
-        view=View(1000.0, ((width - 1) / 2, (height - 1) / 2), 2.0), exposure_ratio=np.ones((3, 1, 3)),
-        exif_ratio=np.ones((3, 1)), ghost_fraction=np.zeros(3), lossy=False, camera_matrix=None, white_balance=None,
+        view=View(1000.0, ((width - 1) / 2, (height - 1) / 2), 2.0), bracket=single_frames(3),
     )  # fmt: skip
     charted = len(corners) > 0
-    color = ColorCalibration(
-        np.eye(3), None, corners if charted else None, None, "chart" if charted else "none", float("nan"), None
-    )
+    place = ChartPlace(np.zeros((24, 4, 2)), corners) if charted else None
+    color = ColorCalibration(np.eye(3), "chart" if charted else "none", place=place)
     return Case(name, radiance, color, Alignment(np.stack(transforms), np.zeros(3), np.ones(3)), held["mask"])
 
 
 def found(case: Case, network: Network | None) -> ObjectMask | None:
     """What the stage takes for the object; None where it says that there is none."""
     try:
-        return mask.segment(case.radiance, case.alignment, case.color, None, network, mask.Settings())
+        return mask.segment(case.radiance, case.alignment, case.color, None, network, onnx.run, mask.MaskSettings())
     except ObjectError:
         return None
 

@@ -24,8 +24,9 @@ import numpy as np
 
 from polcap.images import Floats, Mesh, SurfaceMaps, View
 from polcap.stages import surface
-from polcap.stages.surface import boundary
-from polcap.stages.surface.occlusion import Bools, least_step
+from polcap.stages.surface.occlusion import least_step
+from polcap.stages.surface.slope_equations import Bools
+from polcap.stages.surface.triangles import boundary_edges, measure_boundary
 from polcap.synth import render, scenes, trace
 
 LARGE = (
@@ -69,8 +70,8 @@ def main() -> None:
 
 def row(name: str, of: Case, noise: bool) -> str:
     maps = noisy(of.maps) if noise else of.maps
-    plain, plain_s = timed(maps, surface.Settings(stiffness=0.0))
-    mesh, seconds = timed(maps, surface.Settings())
+    plain, plain_s = timed(maps, surface.SurfaceSettings(stiffness=0.0))
+    mesh, seconds = timed(maps, surface.SurfaceSettings())
     slit, found = slits(mesh, of), cut_share(mesh, of)
     return (
         f"| {name} | {of.maps.mask.sum() / 1e6:.2f} | {true_pieces(of)} | {error(plain, of):.4f} | {plain_s:.1f} | "
@@ -78,7 +79,7 @@ def row(name: str, of: Case, noise: bool) -> str:
     )
 
 
-def timed(maps: SurfaceMaps, settings: surface.Settings) -> tuple[Mesh, float]:
+def timed(maps: SurfaceMaps, settings: surface.SurfaceSettings) -> tuple[Mesh, float]:
     start = time.process_time()
     mesh = surface.integrate(maps, None, settings)
     return mesh, time.process_time() - start
@@ -109,7 +110,7 @@ def true_pieces(of: Case) -> int:
     whole = right[:-1] & right[1:] & down[:, :-1] & down[:, 1:]  # one sheet under all four corners
     corners = [part[whole] for part in (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:])]
     faces = np.concatenate([np.stack([corners[k] for k in ks], axis=-1) for ks in ((0, 1, 2), (0, 2, 3))])
-    return boundary.measure(
+    return measure_boundary(
         np.stack(np.nonzero(np.ones_like(mask))[::-1], axis=-1), faces.astype(np.int32), mask, 1
     ).pieces
 
@@ -117,7 +118,7 @@ def true_pieces(of: Case) -> int:
 def mesh_rim(mesh: Mesh, of: Case) -> Floats:
     """Middles (B, 2) of the mesh's boundary edges, x, y px."""
     height, width = of.maps.mask.shape
-    rim = boundary.edges(mesh.faces)
+    rim = boundary_edges(mesh.faces)
     place = mesh.uv * [width, height] - 0.5
     return np.asarray((place[rim[:, 0]] + place[rim[:, 1]]) / 2)
 
@@ -205,7 +206,7 @@ def rendered(name: str) -> dict[str, Floats | Bools]:
 
 def true_links(scene: render.Scene, view: View, depth: Floats, mask: Bools, axis: int) -> Bools:
     """Links along an axis whose depth step stays, however near the rays."""
-    least = least_step(mask, surface.Settings().jump)
+    least = least_step(mask, surface.SurfaceSettings().jump)
     log = view.focal * np.log(np.where(mask, depth, 1).astype(np.float64))
     both = (mask[:, :-1] & mask[:, 1:]) if axis else (mask[:-1] & mask[1:])
     steps = np.diff(log, axis=axis)

@@ -83,7 +83,7 @@ def measured(folder: Path, size: str, kind: str, seed: int) -> dict[str, Any]:
     supplied = UserInput(network=network, mask_network=mask_network)
     found = path(captures.read(folder, None), supplied, Config(), MemoryCache(until="surface"))
     maps, mesh, distance = found.maps, found.mesh, distance_m(found.color, found.radiance)
-    plain = surface.integrate(maps, distance, surface.Settings(stiffness=0.0))
+    plain = surface.integrate(maps, distance, surface.SurfaceSettings(stiffness=0.0))
     of, normal = truth(scene, maps)
     if keep := os.environ.get("POLCAP_KEEP_MAPS"):
         save(Path(keep) / f"{size}_{kind.replace('/', '_')}_{seed}.npz", maps, of)

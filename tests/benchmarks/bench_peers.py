@@ -26,20 +26,23 @@ import bench_speed
 import cv2
 import numpy as np
 
-from polcap.formats import calib
+from polcap.formats import shipped_data
 from polcap.formats.capture import reader as captures
+from polcap.formats.raw import frame_decoder
 from polcap.images import (
     Alignment,
     AngleStack,
     Capture,
     ChartRequest,
     Floats,
-    Gains,
     ObjectMask,
+    SelfCalibration,
     SurfaceMaps,
     View,
 )
 from polcap.stages import align, hdr, stokes, surface, whitebalance
+from polcap.stages.whitebalance import WhitebalanceSettings
+from tests import scenes
 
 _FULL = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1.0]])  # binned px → RAW px
 _ECC = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
@@ -65,7 +68,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     folder = bench_speed.made(given.folder, given.megapixels)
     capture = captures.read(folder)
-    stack = hdr.merge(capture, hdr.Settings())
+    stack = hdr.merge(capture, frame_decoder.decode, hdr.Settings())
     rows = []
     for row in chain(solving(stack), charting(stack), registering(stack, folder), merging(capture), integrating()):
         print(table([row]), file=sys.stderr)
@@ -90,10 +93,10 @@ def merging(capture: Capture) -> Iterator[Row]:
 
 def _merges(capture: Capture, times: int = 10) -> tuple[float, float]:
     """CPU seconds of one of several merges, its decoders' among them, and of this process alone."""
-    hdr.merge(capture, hdr.Settings())
+    hdr.merge(capture, frame_decoder.decode, hdr.Settings())
     before, here = bench_speed.tree_cpu(), time.process_time()
     for _ in range(times):
-        hdr.merge(capture, hdr.Settings())
+        hdr.merge(capture, frame_decoder.decode, hdr.Settings())
     return (bench_speed.tree_cpu() - before) / times, (time.process_time() - here) / times
 
 
@@ -128,7 +131,7 @@ def registering(stack: AngleStack, folder: Path) -> Iterator[Row]:
             found.append(np.vstack([motion, [0, 0, 1]]))
 
     theirs = least(ecc)
-    color = whitebalance.measure(stack, calib.colorchecker(), ChartRequest("none"), whitebalance.Settings())
+    color = whitebalance.measure(stack, shipped_data.colorchecker(), ChartRequest("none"), WhitebalanceSettings())
     ours = least(lambda: align.register(stack, color, align.Settings()))
     own = align.register(stack, color, align.Settings()).transform[1:]
     size = stack.value.shape[1:3]
@@ -171,8 +174,8 @@ def charting(stack: AngleStack) -> Iterator[Row]:
     shown = np.clip(value / np.percentile(value, 99.5, axis=(0, 1)), 0, 1).astype(np.float32) ** np.float32(1 / 2.2)
     found = len(detect_colour_checkers_segmentation(shown))
     theirs = least(lambda: detect_colour_checkers_segmentation(shown))
-    reference, search = calib.colorchecker(), ChartRequest("auto")
-    ours = least(lambda: whitebalance.measure(stack, reference, search, whitebalance.Settings()))
+    reference, search = shipped_data.colorchecker(), ChartRequest("auto")
+    ours = least(lambda: whitebalance.measure(stack, reference, search, WhitebalanceSettings()))
     note = f"theirs finds {found}, ours with its matrix and doubt"
     yield Row("chart found and fitted", "colour-checker-detection", ours, theirs, note)
 
@@ -191,40 +194,25 @@ def solving(stack: AngleStack) -> Iterator[Row]:
         polanalyser.cvtStokesToDoLP(found)
         polanalyser.cvtStokesToAoLP(found)
 
-    one, none = np.ones((shots, 3)), np.zeros((shots, 3))
-    gains = Gains(
-        gain=one,
-        sigma=none,
-        anchor=one,
-        source="none",
-        disagreement=0.0,
-        angle_offset=0.0,
-        angle_offset_sigma=0.0,
-        angle_correction=0.0,
-        concentration=1.0,
-        order=tuple(range(shots)),
-        mirrored=False,
-        anchor_sigma=one[:, 0],
-        grey_slope=1.0,
-        chart_gloss=0.0,
-    )
+    equal = scenes.equal(stack.angle)
     whole = ObjectMask(np.ones((height, width), bool), (0, 0, width, height), "user")
     still = np.stack([np.eye(3)] * shots)
     moved = still.copy()
     moved[1:, :2, 2] = 0.4, -0.7
     cost = least(theirs)
-    as_given = replace(stack, site_px=None)  # as theirs has it: a superpixel's colors are taken as seen in its middle
+    # as theirs has it: a superpixel's colors are taken as seen in its middle
+    as_given = replace(stack, sensor=replace(stack.sensor, site_px=None))
     for name, given, transform in (
         ("nothing resampled", as_given, still),
         ("colors laid over one another", stack, still),
         ("every shot resampled", stack, moved),
     ):
-        solve = partial(_solved, given, Alignment(transform, np.zeros(shots), np.ones(shots)), gains, whole)
+        solve = partial(_solved, given, Alignment(transform, np.zeros(shots), np.ones(shots)), equal, whole)
         yield Row(f"Stokes, {name}", "polanalyser", least(solve), cost, "ours with covariance and quality bits")
 
 
-def _solved(stack: AngleStack, at: Alignment, gains: Gains, object_: ObjectMask) -> None:
-    stokes.solve(stack, at, gains, object_, stokes.Settings())
+def _solved(stack: AngleStack, at: Alignment, calibration: SelfCalibration, object_: ObjectMask) -> None:
+    stokes.solve(stack, at, calibration, object_, stokes.StokesSettings())
 
 
 def integrating() -> Iterator[Row]:
@@ -246,8 +234,8 @@ def integrating() -> Iterator[Row]:
         found[:] = [np.asarray(bilateral_normal_integration(normal, mask, K=camera)[0])]
 
     cost = least(theirs, times=1)
-    ours = least(lambda: surface.integrate(maps, None, surface.Settings()))
-    own = surface.integrate(maps, None, surface.Settings()).depth
+    ours = least(lambda: surface.integrate(maps, None, surface.SurfaceSettings()))
+    own = surface.integrate(maps, None, surface.SurfaceSettings()).depth
     errors = [_spread(np.log(depth[maps.mask] / true[maps.mask])) for depth in (own, found[0])]
     note = f"error {errors[0]:.4f}, theirs {errors[1]:.4f}; ours with the mesh"
     yield Row("depth of 192² from normals", "dbini-torch", ours, cost, note)

@@ -56,7 +56,7 @@ def main() -> None:
                 broken += not same
             cells = (*outcome[:-1], f"{outcome.seconds:.1f}", asset)
             print(f"| {' | '.join(map(str, cells))} |", flush=True)
-        ends = Counter(outcome.first for outcome in outcomes).most_common()
+        ends = Counter(outcome.ending for outcome in outcomes).most_common()
         slowest = max(outcomes, key=lambda outcome: outcome.seconds)
         print(
             f"\n{count} faults of {len(faults.CLASSES)} classes, {broken} promises broken; {alike} processed to the "

@@ -18,7 +18,6 @@ import shutil
 import sys
 import time
 from collections import Counter
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -32,7 +31,7 @@ from plant_captures import FAULTS, shoot
 from polcap.config import Config
 from polcap.errors import InputError
 from polcap.formats.capture import reader as captures
-from polcap.images import Capture, ChartRequest, Frame, Network, SurfaceMaps
+from polcap.images import Capture, ChartRequest, Network, SurfaceMaps
 from polcap.pipeline import check, models, path
 from polcap.pipeline.cache import MemoryCache
 from polcap.quality import gates
@@ -81,7 +80,7 @@ def one(folder: Path, seed: int, kind: str, width: int, keep: bool) -> Row:
         shutil.rmtree(place)
     row: Row = {"seed": seed, "kind": kind, **shoot(place, seed, kind, width)}
     try:
-        capture = _read_once(captures.read(place)) if width < 2000 else captures.read(place)
+        capture = captures.read(place)
     except InputError as error:
         row |= {"check": "fail", "process": "fail", "check_gates": {_name(error): ["fail", None, 45.0]}}
         row |= {"process_gates": {}, "needs": "", "expected": None, "actual": None}
@@ -96,7 +95,7 @@ def one(folder: Path, seed: int, kind: str, width: int, keep: bool) -> Row:
 
 def judge_check(capture: Capture) -> Row:
     try:
-        found = check.inspect(capture, networks, Config())
+        found = check.inspect(capture, networks(), Config())
     except InputError as error:
         return {"check": "fail", "check_gates": {_name(error): ["fail", None, 45.0]}, "needs": ""}
     return {"check": gates.verdict(found.lines), "check_gates": _shown(found.lines), "needs": found.needs}
@@ -107,7 +106,7 @@ def judge_process(capture: Capture, place: Path, no_chart: bool = False) -> Row:
     chart = ChartRequest("none" if no_chart else "auto")
     try:
         found = path.path(capture, path.UserInput(chart, None, *networks()), Config(), MemoryCache(until="surface"))
-        lines = list(gates.judge(full_size(found, capture.focal_doubt), Config()))
+        lines = list(gates.judge(full_size(found, capture.focal_doubt), Config().gates, Config().align))
         actual = error_deg(found.maps, place)
     except InputError as error:
         return {
@@ -182,16 +181,6 @@ def spoken(row: Row) -> str:
 @cache
 def networks() -> tuple[Network | None, Network | None]:
     return models.load_network(None, None, "cpu", 1), models.load_mask_network(1)
-
-
-def _read_once(capture: Capture) -> Capture:
-    """The same, decoding each photograph once for `check` and `process`."""
-    shots = (replace(shot, frames=tuple(map(_held, shot.frames))) for shot in capture.shots)
-    return replace(capture, shots=tuple(shots))
-
-
-def _held(frame: Frame) -> Frame:
-    return replace(frame, load=cache(frame.load))
 
 
 def _name(error: InputError) -> str:

@@ -1,4 +1,4 @@
-"""The noise that a bracket of any still scene tells is the simulated sensor's."""
+"""The noise measured from a bracket of a still scene is that of the simulated sensor."""
 
 import shutil
 from pathlib import Path
@@ -39,8 +39,8 @@ def test_noise_of_a_bracket_is_the_sensor_s(capture):
     assert max(line.slope_sigma / slope) < 0.1
 
 
-def test_a_camera_that_moved_is_told(capture, tmp_path):
-    """Frames of two angles, between which the camera was nudged, are no bracket."""
+def test_a_camera_that_moved_is_an_error(capture, tmp_path):
+    """The simulated camera moves between the angles."""
     frames = sorted(capture.glob("pol*/*.DNG"))
     for number in (0, 4):
         shutil.copy(frames[number], tmp_path)
@@ -48,13 +48,13 @@ def test_a_camera_that_moved_is_told(capture, tmp_path):
         bracket_noise.measure(bracket_noise.brackets(tmp_path))
 
 
-def test_a_single_exposure_is_told(capture, tmp_path):
+def test_a_single_exposure_is_an_error(capture, tmp_path):
     shutil.copy(next(capture.glob("pol000/*.DNG")), tmp_path)
     with pytest.raises(CaptureError, match="no two well exposed frames share an ISO"):
         bracket_noise.measure(bracket_noise.brackets(tmp_path))
 
 
-def test_what_systems_hide_in_folders_is_no_photograph(capture, tmp_path):
+def test_hidden_files_are_ignored(capture, tmp_path):
     shutil.copytree(capture / "pol000", tmp_path / "one")
     for hidden in (tmp_path / ".DS_Store", tmp_path / "one" / "._frame_1.DNG"):
         hidden.write_bytes(b"\0\5\x16\7")
@@ -62,6 +62,6 @@ def test_what_systems_hide_in_folders_is_no_photograph(capture, tmp_path):
     assert len(bracket) == 3
 
 
-def test_an_empty_folder_is_told(tmp_path):
+def test_an_empty_folder_is_an_error(tmp_path):
     with pytest.raises(CaptureError, match="holds no bracket"):
         bracket_noise.brackets(tmp_path)

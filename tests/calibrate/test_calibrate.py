@@ -1,4 +1,4 @@
-"""What `polcap calibrate` measures on photographs of a known set-up is that set-up, within the doubt it states."""
+"""`polcap calibrate` measures a simulated set-up truly, within the errors that it states."""
 
 import json
 import subprocess
@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 
 from polcap import calibrate
-from polcap.calibrate import photographs
-from polcap.calibration_values import Calibration
+from polcap.calibrate import calibration_photographs
 from polcap.cli import calibrate_command
 from polcap.errors import CaptureError, InputError
 from polcap.formats import calibrations
-from polcap.formats.raw import dng
-from polcap.images import Exif
+from polcap.images import Calibration, Exif
 from polcap.synth import calibration_frames, forward_camera
 from polcap.synth.calibration_frames import CalibrationShoot
+from tests.raw_files import write_raw
 
 MADE = "2026-11-22T20:00:00+00:00"
 SHOOT = CalibrationShoot(seed=3, zero_deg=1.7, sense=-1, black_error=1.0)
@@ -43,7 +42,7 @@ def test_electrons_at_white_are_those_of_the_sensor(found):
         assert line.read_noise_electrons == pytest.approx([SHOOT.sensor.read_noise] * 3, rel=0.15)
 
 
-def test_noise_is_as_doubtful_as_it_says(found):
+def test_noise_errors_are_as_large_as_stated(found):
     pull = []
     for line in found.noise:
         slope = np.array([1, 0.5, 1]) * line.iso / 100 / SHOOT.sensor.full_well  # a green pixel is two photosites
@@ -52,7 +51,7 @@ def test_noise_is_as_doubtful_as_it_says(found):
     assert 0.2 < np.std(pull) < 2.5
 
 
-def test_black_that_is_not_the_stated_one_shows(found):
+def test_black_is_measured_where_the_tags_are_wrong(found):
     assert found.levels.black == pytest.approx([SHOOT.sensor.black + 1.0] * 4, abs=0.1)
     assert found.levels.black_stated == (SHOOT.sensor.black,) * 4
 
@@ -85,7 +84,7 @@ def test_spread_of_the_flash(found):
     assert abs(found.flash.drift_per_pop) < 4 * found.flash.drift_sigma
 
 
-def test_what_is_measured_is_said(found):
+def test_the_command_prints_every_quantity(found):
     text = "\n".join(calibrate_command.lines(found))
     for word in ("ISO 100", "levels     black 51", "falloff    corners", "polarizer  zero +1.", "from pop to pop"):
         assert word in text
@@ -115,26 +114,26 @@ def polarizer_only(tmp_path: Path, **changes) -> Path:
     return tmp_path / "frames"
 
 
-def test_one_axis_of_light_leaves_the_sense_open(tmp_path):
+def test_light_of_one_axis_does_not_show_the_sense(tmp_path):
     ring = calibrate.measure(polarizer_only(tmp_path, zero_deg=-2.0), MADE).polarizer
     assert (ring.sense, ring.sense_known) == (1, False)
     assert ring.zero_deg == pytest.approx(-2.0, abs=0.2)
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "message"),
     [
         ({"extinction": (1.1, 1.1, 1.1)}, "hardly changes with the ring"),
         ({"ring_step_deg": 60.0}, r"3 angles of the ring; take 5"),
     ],
 )
-def test_photographs_that_do_not_tell_are_one_clear_line(tmp_path, changes, says):
+def test_unsuitable_polarizer_photographs_are_one_clear_line(tmp_path, changes, message):
     place = polarizer_only(tmp_path, **changes)
-    with pytest.raises(CaptureError, match=says):
+    with pytest.raises(CaptureError, match=message):
         calibrate.measure(place, MADE)
 
 
-def test_folders_that_hold_nothing_are_one_clear_line(tmp_path):
+def test_empty_folders_are_one_clear_line(tmp_path):
     with pytest.raises(CaptureError, match="no such folder"):
         calibrate.measure(tmp_path / "none", MADE)
     with pytest.raises(CaptureError, match="none of the folders dark, flat, bracket, flash, lens, polarizer"):
@@ -146,87 +145,49 @@ def test_folders_that_hold_nothing_are_one_clear_line(tmp_path):
 
 @pytest.mark.parametrize(("name", "angle"), [("pol045", 45.0), ("pol022.5", 22.5), ("polar", None), ("axis030", None)])
 def test_angles_are_read_from_folder_names(name, angle):
-    assert photographs.angle_of(name, "pol") == angle
+    assert calibration_photographs.angle_of(name, "pol") == angle
 
 
-def written(place: Path, light: float, iso: float = 100.0, time: float = 0.01, model: str = "Synthetic") -> None:
+def write_flat(path: Path, light: float, iso: float = 100.0, time: float = 0.01, model: str = "Synthetic") -> None:
     """One flat RAW of 64 × 64 px at `light` of white."""
-    place.parent.mkdir(parents=True, exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     sensor = SHOOT.sensor
-    random = np.random.default_rng(len(list(place.parent.iterdir())))
+    random = np.random.default_rng(len(list(path.parent.iterdir())))
     mosaic = forward_camera.expose(np.full((64, 64), light), sensor, 1.0, random)
     exif = Exif(make="Polcap", model=model, exposure_time=time, f_number=8.0, iso=iso)
-    dng.write(
-        place, mosaic, cfa=np.array([[0, 1], [1, 2]], np.uint8), black=sensor.black, white=sensor.white, exif=exif,
-        color_matrix=np.eye(3), as_shot_neutral=np.ones(3),
-    )  # fmt: skip
-
-
-def bad_dark(folder: Path) -> None:
-    written(folder / "dark" / "a.dng", 0.5)
-
-
-def single_flats(folder: Path) -> None:
-    written(folder / "flat" / "a.dng", 0.2, time=0.01)
-    written(folder / "flat" / "b.dng", 0.4, time=0.02)
-
-
-def flats_alike(folder: Path) -> None:
-    for name in "ab":
-        written(folder / "flat" / f"{name}.dng", 0.4)
-
-
-def burnt_flats(folder: Path) -> None:
-    for name, light, time in (("a", 0.001, 0.01), ("b", 0.001, 0.01), ("c", 2.0, 1.0), ("d", 2.0, 1.0)):
-        written(folder / "flat" / f"{name}.dng", light, time=time)
-
-
-def few_pops(folder: Path) -> None:
-    for name in "abc":
-        written(folder / "flash" / f"{name}.dng", 0.4)
-
-
-def burnt_pops(folder: Path) -> None:
-    for name in "abcd":
-        written(folder / "flash" / f"{name}.dng", 2.0)
-
-
-def unlike_exposures(folder: Path) -> None:
-    for ring in range(0, 180, 30):
-        written(folder / "polarizer" / f"pol{ring:03d}" / "a.dng", 0.3, time=0.01 + 0.001 * ring)
-
-
-def two_cameras(folder: Path) -> None:
-    written(folder / "dark" / "a.dng", 0.0)
-    written(folder / "dark" / "b.dng", 0.0, model="Other")
-
-
-def no_angles(folder: Path) -> None:
-    (folder / "polarizer" / "left").mkdir(parents=True)
-
-
-def damaged(folder: Path) -> None:
-    written(folder / "dark" / "a.dng", 0.0)
-    whole = (folder / "dark" / "a.dng").read_bytes()
-    (folder / "dark" / "a.dng").write_bytes(whole[: len(whole) // 2])
+    write_raw(path, mosaic, exif, sensor.black, sensor.white)
 
 
 @pytest.mark.parametrize(
-    ("make", "says"),
+    ("message", "photographs"),
     [
-        (bad_dark, "cap on"),
-        (single_flats, "take each twice"),
-        (flats_alike, "all of one brightness"),
-        (burnt_flats, "all of one brightness|clipped or dark"),
-        (few_pops, "3 frames of one setting; take 4"),
-        (burnt_pops, "over-exposed"),
-        (unlike_exposures, "unlike exposure"),
-        (two_cameras, "one set-up at a time"),
-        (no_angles, "holds no pol000"),
-        (damaged, "a.dng"),
+        ("cap on", {"dark/a": (0.5, {})}),
+        ("take each twice", {"flat/a": (0.2, {}), "flat/b": (0.4, {"time": 0.02})}),
+        ("all of one brightness", {f"flat/{name}": (0.4, {}) for name in "ab"}),
+        (
+            "all of one brightness|clipped or dark",
+            {f"flat/{name}": (0.001, {}) for name in "ab"} | {f"flat/{name}": (2.0, {"time": 1.0}) for name in "cd"},
+        ),
+        ("3 frames of one setting; take 4", {f"flash/{name}": (0.4, {}) for name in "abc"}),
+        ("over-exposed", {f"flash/{name}": (2.0, {}) for name in "abcd"}),
+        (
+            "unequal exposure",
+            {f"polarizer/pol{ring:03d}/a": (0.3, {"time": 0.01 + 0.001 * ring}) for ring in range(0, 180, 30)},
+        ),
+        ("one set-up at a time", {"dark/a": (0.0, {}), "dark/b": (0.0, {"model": "Other"})}),
+        ("holds no pol000", {"polarizer/left/a": (0.3, {})}),
     ],
 )
-def test_bad_photographs_are_one_clear_line(tmp_path, make, says):
-    make(tmp_path)
-    with pytest.raises(InputError, match=says):
+def test_bad_photographs_are_one_clear_line(tmp_path, message, photographs):
+    for name, (light, changes) in photographs.items():
+        write_flat(tmp_path / f"{name}.dng", light, **changes)
+    with pytest.raises(CaptureError, match=message):
+        calibrate.measure(tmp_path, MADE)
+
+
+def test_a_damaged_photograph_is_named(tmp_path):
+    file = tmp_path / "dark" / "a.dng"
+    write_flat(file, 0.0)
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(InputError, match=r"a\.dng"):
         calibrate.measure(tmp_path, MADE)

@@ -1,4 +1,4 @@
-"""Focal length and distortion that boards tell are the simulated lens's, and undo it."""
+"""Focal length and distortion measured from boards are those of the simulated lens, and undo it."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from polcap import calibrate
-from polcap.calibration_values import Calibration, LensGeometry
 from polcap.cli import calibrate_command
 from polcap.errors import CaptureError, SettingError
 from polcap.formats import calibrations
-from polcap.images import Distortion, Exif
+from polcap.images import Calibration, Distortion, Exif, LensGeometry
 from polcap.optics import distortion
 from polcap.synth import calibration_frames
 from polcap.synth.calibration_frames import CalibrationShoot
@@ -36,10 +35,10 @@ def found(folder) -> Calibration:
 
 
 def rays(lens: Distortion, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Where photograph pixels look, less the mean: which way the camera points is no matter."""
+    """Directions of photograph pixels, without their mean: the camera's direction does not matter."""
     u, v = distortion.undistorted(lens, x, y)
-    seen = np.stack([u - lens.center[0], v - lens.center[1]]) / lens.focal
-    return seen - seen.mean(axis=(1, 2), keepdims=True)
+    direction = np.stack([u - lens.center[0], v - lens.center[1]]) / lens.focal
+    return direction - direction.mean(axis=(1, 2), keepdims=True)
 
 
 def test_lens_is_the_simulated_one(found):
@@ -55,7 +54,7 @@ def test_lens_is_the_simulated_one(found):
     assert error.mean() < 0.4 and error.max() < 0.1 * before.max()
 
 
-def test_what_is_measured_is_said_and_kept(found, tmp_path):
+def test_the_lens_is_printed_and_saved(found, tmp_path):
     assert "lens       5" in "\n".join(calibrate_command.lines(found))
     lens = calibrations.read(calibrations.write(tmp_path, found)).geometry
     assert lens.focal_px == pytest.approx(found.geometry.focal_px, rel=1e-6)
@@ -65,7 +64,7 @@ def test_what_is_measured_is_said_and_kept(found, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "taken"), [({}, True), ({"width": 578}, False), ({"focal_length_mm": 50.0}, False)]
 )
-def test_a_lens_counts_at_its_focal_length_and_size(found, tmp_path, monkeypatch, changes, taken):
+def test_a_lens_is_used_at_its_focal_length_and_size_only(found, tmp_path, monkeypatch, changes, taken):
     monkeypatch.setenv("POLCAP_CALIB", str(tmp_path))
     calibrations.write(tmp_path, found)
     exif = Exif(make="Polcap", model="Synthetic", focal_length_mm=35.0, width=576, height=384)
@@ -81,7 +80,7 @@ def test_an_impossible_lens_is_refused(found, tmp_path):
         calibrations.read(path)
 
 
-def test_too_few_boards_are_told(folder, tmp_path):
+def test_too_few_boards_are_an_error(folder, tmp_path):
     (tmp_path / "lens").mkdir()
     for path in sorted((folder / "lens").iterdir())[:3]:
         (tmp_path / "lens" / path.name).symlink_to(path)
@@ -90,6 +89,6 @@ def test_too_few_boards_are_told(folder, tmp_path):
 
 
 @pytest.mark.parametrize("board", ["9", "9x", "1x6", "axb", "9x6x3", "200x6"])
-def test_a_board_that_is_none_is_told(board):
+def test_a_wrong_board_option_is_an_error(board):
     with pytest.raises(SettingError, match="inner corners across and down"):
         calibrate_command.squares(board)

@@ -28,22 +28,26 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from polcap import config, report
-from polcap.calibration_values import (
+from polcap.errors import PolcapError
+from polcap.formats import atomic, calibrations, npy_folder, text_file
+from polcap.formats.capture import capture_toml
+from polcap.formats.maps import maps_folder as maps
+from polcap.formats.raw import exif, file_checks, file_kind
+from polcap.images import (
     Calibration,
+    ColorCalibration,
+    Exif,
     Falloff,
     FlashEnergy,
     LensGeometry,
     Levels,
     Linearity,
     NoiseLine,
+    PatchColors,
     Polarizer,
+    StokesImage,
+    View,
 )
-from polcap.errors import PolcapError
-from polcap.formats import atomic, calib, calibrations, npy_folder, text_file
-from polcap.formats.capture import capture_toml
-from polcap.formats.maps import maps_folder as maps
-from polcap.formats.raw import exif, file_checks, file_kind
-from polcap.images import ColorCalibration, Exif, StokesImage, View
 from polcap.rig import exposure_bracket, motor_elliptec_ell14, motor_grbl, motor_line_protocol, serial_port
 from polcap.rig.device_log import Log
 from tests.campaigns.mutations import mutated
@@ -75,7 +79,7 @@ class Replies(serial_port.Port):
     """A serial port whose answers are written beforehand."""
 
     def __init__(self, data: bytes) -> None:
-        self.url = "fuzz://"
+        self.url, self.log = "fuzz://", Log(None)
         self._lines = [line for line in data.split(b"\n") if line.strip()]  # as Port, which skips empty ones
 
     def send(self, text: str, discard: bool = True) -> None: ...
@@ -122,7 +126,7 @@ def _capture(data: bytes, folder: Path) -> object:
 
 
 def _profile(data: bytes, folder: Path) -> object:
-    return calib.read_profile(_written(data, folder, "profile.toml"))
+    return calibrations.read_profile(_written(data, folder, "profile.toml"))
 
 
 def _calibration_file(data: bytes, folder: Path) -> object:
@@ -177,19 +181,19 @@ def _name(data: bytes, folder: Path) -> object:
 
 
 def _elliptec(data: bytes, folder: Path) -> object:
-    motor = motor_elliptec_ell14.ElliptecMotor(Replies(data), motor_elliptec_ell14.ElliptecSettings(), 0.05, Log(None))
+    motor = motor_elliptec_ell14.ElliptecMotor(Replies(data), motor_elliptec_ell14.ElliptecSettings(timeout=0.05))
     motor.home()
     return motor.position()
 
 
 def _grbl(data: bytes, folder: Path) -> object:
-    board = motor_grbl.GrblMotor(Replies(data), motor_grbl.GrblSettings(), 0.05, Log(None))
+    board = motor_grbl.GrblMotor(Replies(data), motor_grbl.GrblSettings(timeout=0.05))
     board.home()
     return board.position()
 
 
 def _line(data: bytes, folder: Path) -> object:
-    board = motor_line_protocol.LineMotor(Replies(data), motor_line_protocol.LineSettings(), 0.05, Log(None))
+    board = motor_line_protocol.LineMotor(Replies(data), motor_line_protocol.LineSettings(timeout=0.05))
     board.home()
     return board.position()
 
@@ -199,7 +203,7 @@ _VALUES = {  # by the name that each has in its manifest
         np.ones((3, 4, 4, 3), np.float32), np.ones((6, 4, 4, 3), np.float32), np.zeros((4, 4), np.uint8),
         np.ones((4, 4), bool), View(900.0, (1.0, 2.0), 2.0, (0.0, 0.0), True), None,
     ),
-    "color": ColorCalibration(np.eye(3), None, None, np.ones(24), "chart", float("nan"), 0.001),
+    "color": ColorCalibration(np.eye(3), "chart", metres_per_px=0.001, patches=PatchColors(np.ones(24))),
 }  # fmt: skip
 _ARRAYS: npy_folder.Arrays = {}
 _MANIFEST = {name: json.dumps(npy_folder.encode(value, name, _ARRAYS)).encode() for name, value in _VALUES.items()}

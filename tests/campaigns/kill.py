@@ -31,7 +31,7 @@ from tests.campaigns import small_capture  # noqa: E402
 from tests.campaigns.rows import Rows, processor_s  # noqa: E402
 
 _CLOCK = {"seconds", "timings", "time"}  # keys of JSON that hold measured times
-_OWN = ("work/lock", "work/owner", "work/written.json", "work/unchanged.json", "report.html")  # hold times, processes
+_OWN = ("work/lock", "work/owner", "work/unchanged.json", "report.html")  # hold times, processes
 _LOOK_S = 0.004  # between two looks whether the command writes
 Step = tuple[str | Path, ...]
 

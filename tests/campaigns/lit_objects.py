@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import AngleStack, Floats, ObjectMask, Quality
+from polcap.images import AngleStack, Equipment, Floats, ObjectMask, Quality, single_frames
 from polcap.optics import frames, mueller
 from polcap.synth.scenes import random_scene
 from polcap.synth.shooting import Shoot, Studio
@@ -74,8 +74,7 @@ def stack(case: Lit, angle: Floats, seed: int, gain: Floats | None = None, state
     return AngleStack(
         value=np.minimum(shots, top).astype(np.float32), variance=variance.astype(np.float32),
         quality=clipped.astype(np.uint8) * np.uint8(Quality.CLIPPED), angle=angle if stated is None else stated,
-        view=scenes.VIEW, exposure_ratio=np.ones((len(angle), 1, 3)), exif_ratio=np.ones((len(angle), 1)),
-        ghost_fraction=np.zeros(len(angle)), lossy=False, camera_matrix=None, white_balance=None, light="flash",
+        view=scenes.VIEW, bracket=single_frames(len(angle)), equipment=Equipment("flash"),
     )  # fmt: skip
 
 

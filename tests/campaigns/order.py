@@ -19,12 +19,12 @@ import numpy as np
 from polcap.config import Config
 from polcap.errors import CaptureError, InputError
 from polcap.formats.capture import reader as captures
-from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, ObjectMask
+from polcap.images import Alignment, AngleStack, ColorCalibration, Equipment, Floats, ObjectMask
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
 from polcap.stages import selfcal
-from polcap.stages.selfcal import order
+from polcap.stages.selfcal import angles as polarizer_angles
 from polcap.synth import scenes as random_scenes
 from polcap.synth import shooting
 from tests import scenes
@@ -50,7 +50,7 @@ def main() -> None:
         case = from_raw(seed, given.angles) if given.raw else at_stokes_level(seed, angle, given.thin, given.chart)
         for name, radiance, alignment, object_, color in case:
             seen = []
-            for number, stated in enumerate(order.hypotheses(angle).values()):
+            for number, stated in enumerate(polarizer_angles.hypotheses(angle).values()):
                 said = judged(radiance, alignment, object_, color, stated)
                 (wrong if number else right)[said] += 1
                 seen.append(said)
@@ -63,7 +63,7 @@ def at_stokes_level(seed: int, angle: Floats, thin: bool, chart: bool) -> Iterat
     """The seed's object without its photographs."""
     case = lit_objects.lit(seed, thin)
     gain = 1 + (0 if chart else 0.02) * np.random.default_rng([seed, 13]).normal(size=len(angle))
-    radiance = replace(lit_objects.stack(case, angle, seed, gain), light="steady" if chart else "flash")
+    radiance = replace(lit_objects.stack(case, angle, seed, gain), equipment=Equipment("steady" if chart else "flash"))
     yield case.look, radiance, scenes.still(len(angle)), lit_objects.object_of(case), scenes.no_color()
 
 
@@ -89,10 +89,10 @@ def judged(
 ) -> str:
     """What becomes of a capture whose shots are said to have been taken at angles (K,) rad."""
     try:
-        found = selfcal.solve(replace(radiance, angle=stated), alignment, object_, color, selfcal.Settings())
+        found = selfcal.solve(replace(radiance, angle=stated), alignment, object_, color, selfcal.SelfcalSettings())
     except CaptureError:
         return "refused"
-    return "doubted" if found.rival else "passes"
+    return "doubted" if found.outline.rival else "passes"
 
 
 if __name__ == "__main__":

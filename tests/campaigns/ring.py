@@ -21,7 +21,7 @@ import numpy as np
 from polcap.config import Config
 from polcap.errors import InputError
 from polcap.formats.capture import reader as captures
-from polcap.images import Gains
+from polcap.images import RingZero
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
@@ -77,15 +77,16 @@ def at_stokes_level(case: lit_objects.Lit, seed: int, number: int, turn: float, 
     gain = 1 + repeats * np.random.default_rng([seed, 18, number]).normal(size=len(_ANGLE))
     radiance = lit_objects.stack(case, _ANGLE + np.radians(turn), seed, gain, _ANGLE)
     if chart:
-        radiance = replace(radiance, flash_spread=_GAIN_ERROR / 2**0.5)  # as well as a chart would tell
+        spread = _GAIN_ERROR / 2**0.5  # as well as a chart would tell
+        radiance = replace(radiance, equipment=replace(radiance.equipment, flash_spread=spread))
     found = selfcal.solve(
         radiance,
         scenes.still(len(_ANGLE)),
         lit_objects.object_of(case),
         scenes.no_color(),
-        selfcal.Settings(check_order=False),
+        selfcal.SelfcalSettings(check_order=False),
     )
-    return told(found, KINDS[seed // 2 % 3])
+    return told(found.ring, KINDS[seed // 2 % 3])
 
 
 def from_raw(seed: int, turn: float) -> dict[str, Any]:
@@ -103,7 +104,7 @@ def from_raw(seed: int, turn: float) -> dict[str, Any]:
         supplied = UserInput(mask_network=models.load_mask_network(1))
         try:
             results = path(replace(capture, shots=shots), supplied, Config(), MemoryCache(until="selfcal"))
-            return told(results.gains, kind)
+            return told(results.selfcal.ring, kind)
         except InputError as error:
             return {"kind": kind, "refused": str(error)}
 
@@ -113,9 +114,9 @@ def _apart(a: float, b: float) -> float:
     return abs((a - b + math.pi / 2) % math.pi - math.pi / 2)
 
 
-def told(found: Gains, kind: str) -> dict[str, Any]:
+def told(found: RingZero, kind: str) -> dict[str, Any]:
     """A row: what was found of the ring, and what was done about it, degrees."""
-    turn, sigma, applied = np.degrees([found.angle_offset, found.angle_offset_sigma, found.angle_correction])
+    turn, sigma, applied = np.degrees([found.offset, found.sigma, found.correction])
     return {"kind": kind, "turn": float(turn), "sigma": float(sigma), "applied": float(applied)}
 
 

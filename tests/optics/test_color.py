@@ -9,7 +9,7 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from polcap.formats import calib
+from polcap.formats import shipped_data
 from polcap.optics import color
 from polcap.optics.colour_science import colour
 from polcap.stages.whitebalance import chart
@@ -68,12 +68,12 @@ def test_delta_e_meets_the_published_pairs():
 
 def seen(matrix, slope=(0.0, 0.0), glare=0.0):
     """The chart's patches in a camera under sloping light and a white veil."""
-    reference = calib.colorchecker().rec709
+    reference = shipped_data.colorchecker().rec709
     return ((1 + POSITION @ np.array(slope))[:, None] * reference + glare) @ matrix.T
 
 
 def test_matrix_slope_and_glare_of_a_linear_camera_are_recovered():
-    fit = color.fit_matrix(seen(0.3 * CAMERA, (0.03, -0.02), 0.015), calib.colorchecker().rec709, POSITION, ALL)
+    fit = color.fit_matrix(seen(0.3 * CAMERA, (0.03, -0.02), 0.015), shipped_data.colorchecker().rec709, POSITION, ALL)
     assert fit.matrix @ (0.3 * CAMERA) == pytest.approx(np.eye(3), abs=1e-9)  # exact algebra in float64
     assert fit.slope == pytest.approx([0.03, -0.02], abs=1e-9)
     assert fit.glare == pytest.approx(0.015, abs=1e-9)
@@ -82,7 +82,7 @@ def test_matrix_slope_and_glare_of_a_linear_camera_are_recovered():
 
 def test_matrix_commutes_with_exposure():
     noisy = seen(CAMERA) * np.random.default_rng(1).normal(1, 0.02, (24, 3))
-    fits = [color.fit_matrix(k * noisy, calib.colorchecker().rec709, POSITION, ALL) for k in (1, 1000)]
+    fits = [color.fit_matrix(k * noisy, shipped_data.colorchecker().rec709, POSITION, ALL) for k in (1, 1000)]
     assert 1000 * fits[1].matrix == pytest.approx(fits[0].matrix, rel=1e-6)
     assert fits[1].delta_e == pytest.approx(fits[0].delta_e, rel=1e-6)
 
@@ -90,7 +90,7 @@ def test_matrix_commutes_with_exposure():
 @pytest.mark.parametrize("patch", [0, 8, 15, 19])
 def test_a_label_or_a_highlight_on_one_patch_hardly_moves_the_matrix(patch):
     patches = seen(CAMERA) * np.random.default_rng(2).normal(1, 0.005, (24, 3))
-    reference = calib.colorchecker().rec709
+    reference = shipped_data.colorchecker().rec709
     clean = color.fit_matrix(patches, reference, POSITION, ALL)
     patches[patch] *= 1.5
     fit = color.fit_matrix(patches, reference, POSITION, ALL)
@@ -102,7 +102,7 @@ def test_patches_left_out_have_no_say_and_no_residual():
     patches, usable = seen(CAMERA), ALL.copy()
     patches[[18, 19, 15]] = 1.0  # clipped
     usable[[18, 19, 15]] = False
-    fit = color.fit_matrix(patches, calib.colorchecker().rec709, POSITION, usable)
+    fit = color.fit_matrix(patches, shipped_data.colorchecker().rec709, POSITION, usable)
     assert fit.matrix @ CAMERA == pytest.approx(np.eye(3), abs=1e-8)
     assert np.array_equal(np.isnan(fit.delta_e), ~usable)
 

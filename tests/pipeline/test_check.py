@@ -10,13 +10,13 @@ import pytest
 
 from polcap.config import Config
 from polcap.errors import CaptureError, ChartError
-from polcap.formats import calib
+from polcap.formats import shipped_data
 from polcap.formats.capture import reader as captures
-from polcap.formats.raw import dng, probe
+from polcap.formats.raw import dng, frame_decoder, probe
 from polcap.formats.raw import libraw as raw
 from polcap.images import ChartRequest
 from polcap.pipeline import check
-from polcap.pipeline.check import Networks, Verdict
+from polcap.pipeline.check import Verdict
 from polcap.pipeline.path import AUTO
 from polcap.pipeline.small_capture import reduce
 from polcap.stages import hdr, whitebalance
@@ -27,11 +27,7 @@ WIDTH = 512  # the chart must be found: without its greys order and angles are t
 
 
 def verdict(folder: Path) -> Verdict:
-    return check.inspect(captures.read(folder), without_networks, Config())
-
-
-def without_networks() -> Networks:
-    return None, None
+    return check.inspect(captures.read(folder), (None, None), Config())
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -54,16 +50,16 @@ def test_one_turned_shot_of_three_is_told_with_the_ring_that_it_looks_like(tmp_p
     faulty.shoot(tmp_path / "bad", 1, "wrong angle", WIDTH)
     line = next(line for line in verdict(tmp_path / "bad").lines if line.name == "angles")
     assert line.state == "warn" and line.cost_deg > 1
-    assert "ring's zero" in line.says and "single shot" in line.says and "take it again" in line.remedy
+    assert "ring's zero" in line.message and "single shot" in line.message and "take it again" in line.remedy
 
 
 def test_process_measures_the_blur_that_check_measures(tmp_path: Path) -> None:
     faulty.shoot(tmp_path / "bad", 1, "defocus", 256)
     capture = captures.read(tmp_path / "bad")
-    merged = hdr.merge(capture, Config().hdr)
-    assert merged.blur_px is not None and np.nanmax(merged.blur_px) > Config().gates.max_blur_px
+    merged = hdr.merge(capture, frame_decoder.decode, Config().hdr)
+    assert np.nanmax(merged.bracket.blur_px) > Config().gates.max_blur_px
     with ThreadPoolExecutor(2) as pool:
-        np.testing.assert_array_equal(merged.blur_px, reduce(capture, 0.98, pool).blur_px)
+        np.testing.assert_array_equal(merged.bracket.blur_px, reduce(capture, 0.98, pool).blur_px)
 
 
 def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path) -> None:
@@ -73,8 +69,9 @@ def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path) -> N
     line = next(line for line in found.lines if line.name == "chart")
     assert line.state == "warn" and found.needs == "--no-chart" and "--no-chart" in line.remedy
     with pytest.raises(ChartError):
-        whitebalance.measure(hdr.merge(capture, Config().hdr), calib.colorchecker(), AUTO, Config().whitebalance)
-    asked = check.inspect(capture, without_networks, Config(), chart=ChartRequest("none"))
+        merged = hdr.merge(capture, frame_decoder.decode, Config().hdr)
+        whitebalance.measure(merged, shipped_data.colorchecker(), AUTO, Config().whitebalance)
+    asked = check.inspect(capture, (None, None), Config(), chart=ChartRequest("none"))
     assert asked.needs == "" and next(line for line in asked.lines if line.name == "chart").state == "not measured"
 
 
@@ -139,7 +136,7 @@ def test_reduced_picture_keeps_what_is_clipped(example: Path, monkeypatch: pytes
         taken = reduce(capture, 0.98, pool)
     assert taken.step == 4
     assert taken.capture.size_px == (288, 216)
-    brightest = taken.capture.shots[0].frames[2].load()
+    brightest = taken.decode(taken.capture.shots[0].frames[2])
     assert brightest.cfa is None and brightest.value.shape == (216, 288, 3)
     assert ((taken.clipped[0, 2] > 0) == (brightest.value == 1).all(-1)).all()
     assert taken.clipped[0, 2].mean() > 0.001

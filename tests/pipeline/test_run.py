@@ -18,7 +18,7 @@ from polcap.config import Config
 from polcap.errors import ObjectError, StorageError
 from polcap.formats.capture import reader as captures
 from polcap.formats.maps import maps_folder as maps
-from polcap.images import AngleStack, ColorCalibration, View
+from polcap.images import AngleStack, ColorCalibration, View, single_frames
 from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import STAGES, UserInput, distance_m, on_grid
@@ -288,20 +288,7 @@ def test_plan_tells_what_is_cached(result: Path, example: Path) -> None:
 def stack(height: int, width: int, scale: float) -> AngleStack:
     empty = np.zeros((3, height, width, 3), np.float32)
     view = View(100.0, (0.0, 0.0), scale)
-    one = np.ones((3, 1))
-    return AngleStack(
-        empty,
-        empty,
-        empty[..., 0].astype(np.uint8),
-        one[:, 0],
-        view,
-        empty[:, :1, 0],
-        one,
-        one[:, 0],
-        False,
-        None,
-        None,
-    )
+    return AngleStack(empty, empty, empty[..., 0].astype(np.uint8), np.ones(3), view, single_frames(3))
 
 
 def test_mask_may_be_drawn_on_either_grid() -> None:
@@ -317,7 +304,7 @@ def test_mask_may_be_drawn_on_either_grid() -> None:
 
 def test_distance_follows_from_the_size_of_the_chart() -> None:
     """Similar triangles: 1 mm per pixel at a focal length of 100 px is 0.1 m away."""
-    color = ColorCalibration(np.eye(3), None, None, None, "chart", 0.0, 1e-3)
+    color = ColorCalibration(np.eye(3), "chart", metres_per_px=1e-3)
     assert distance_m(color, stack(2, 2, 1.0)) == pytest.approx(0.1)
 
 

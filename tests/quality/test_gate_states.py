@@ -15,6 +15,14 @@ import numpy as np
 import pytest
 
 from polcap.config import Config
+from polcap.images import (
+    AngleStack,
+    OutlineCheck,
+    PatchColors,
+    RingZero,
+    ShotOrder,
+    TurnedShot,
+)
 from polcap.quality import gate as gate_module
 from polcap.quality import gates, geometry, light, polarization, rim
 from polcap.quality.gate import Evidence, Gate
@@ -29,6 +37,7 @@ BODY = {
 }  # fmt: skip
 TURN = {"shot": None, "angle": 0.0, "misfit": 1.0, "sigmas": 0.0}
 FIGURES = {
+    "inward_outline": 0.0,
     "object_motion": np.array([0.0, 0.1, 0.1]), "charted": 0.0, "noise": 0.001, "ill_posed": 0.0, "shape": [45.0, 0.2],
     "normal_error": 4.0, "lean": 2.0, "crossed": {"left": 0.0, "clipped": 0, "over": 0.0, "mirrored": 0.1},
 }  # fmt: skip
@@ -36,11 +45,17 @@ MEASURES = {  # the function that measures each figure
     "object_motion": (geometry, "_displacement"), "charted": (geometry, "_charted"), "lean": (geometry, "_lean"),
     "noise": (light, "_noise"), "crossed": (light, "_crossed"), "ill_posed": (polarization, "_ill_posed"),
     "shape": (polarization, "_median_shape"), "outline": (polarization, "_outline"),
-    "normal_error": (gates, "_own_error"),
+    "normal_error": (gates, "_own_error"), "inward_outline": (geometry, "_inward_share"),
 }  # fmt: skip
 MESH = {"pieces": 1, "cuts": 0.3, "cut_px": 40.0, "raggedness": 0.1}
 FAR = np.array([[[1.0, 0, 50 * k], [0, 1, 0], [0, 0, 1]] for k in range(3)])
-SHOT_ALONE = {"turned_shots": (1,), "turned": 0.3, "turned_sigma": 0.02}
+GAINS = replace(scenes.equal().gains, source="grey patches")
+STATED = ShotOrder((0, 1, 2))
+
+
+def gains(**fields: Any) -> dict[str, Any]:
+    """Self-calibration with these fields of its gains."""
+    return {"selfcal": {"gains": replace(GAINS, **fields)}}
 
 
 def in_numpy(value: Any) -> Any:
@@ -55,7 +70,7 @@ def in_numpy(value: Any) -> Any:
 
 
 def exposures(*ratio: float, **fields: Any) -> dict[str, Any]:
-    """Fields of merged shots with these exposures relative to the reference's."""
+    """Measurements of brackets with these exposures relative to the reference's."""
     each = np.array(ratio)[None, :, None]
     return {"exposure_ratio": np.tile(each, (3, 1, 3)), "exif_ratio": np.tile(each[..., 0], (3, 1)), **fields}
 
@@ -75,18 +90,18 @@ def clipped(second_shot: float = 0.0) -> Any:
 
 CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields that lead to it
     ("exposures", "pass", {}),
-    ("exposures", "warn", {"radiance": exposures(1.0)}),
-    ("exposures", "warn", {"radiance": exposures(1.0, 1.01, exif_ratio=np.array([[1.0, 4.0]] * 3))}),
-    ("exposures", "warn", {"radiance": exposures(1.0, 1.2)}),
-    ("exposures", "warn", {"radiance": exposures(1.0, 40.0)}),
+    ("exposures", "warn", {"bracket": exposures(1.0)}),
+    ("exposures", "warn", {"bracket": exposures(1.0, 1.01, exif_ratio=np.array([[1.0, 4.0]] * 3))}),
+    ("exposures", "warn", {"bracket": exposures(1.0, 1.2)}),
+    ("exposures", "warn", {"bracket": exposures(1.0, 40.0)}),
     ("tone curve", "pass", {}),
-    ("tone curve", "fail", {"radiance": {"curvature": np.array([[0.0, -0.2]] * 3)}}),
+    ("tone curve", "fail", {"bracket": {"curvature": np.array([[0.0, -0.2]] * 3)}}),
     ("source", "pass", {}),
-    ("source", "warn", {"radiance": {"lossy": True}}),
+    ("source", "warn", {"sensor": {"lossy": True}}),
     ("stillness", "pass", {}),
-    ("stillness", "fail", {"radiance": {"ghost_fraction": np.array([0.0, 0.05, 0.0])}}),
-    ("chart", "pass", {"color": {"delta_e": np.full(24, 1.0)}}),
-    ("chart", "fail", {"color": {"delta_e": np.full(24, 9.0)}}),
+    ("stillness", "fail", {"bracket": {"ghost_fraction": np.array([0.0, 0.05, 0.0])}}),
+    ("chart", "pass", {"color": {"patches": PatchColors(np.full(24, 1.0))}}),
+    ("chart", "fail", {"color": {"patches": PatchColors(np.full(24, 9.0))}}),
     ("chart", "warn", {"chart_missing": "nothing like one"}),
     ("chart", "not measured", {}),
     ("alignment", "pass", {}),
@@ -110,28 +125,29 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("sharpness", "not measured",
      {"blur_px": np.array([[0.0, 0.1]] * 3), "alignment": {"transform": FAR}}),
     ("gains", "pass", {}),
-    ("gains", "fail", {"gains": {"gain": np.array([[1.0] * 3, [1.0] * 3, [0.7] * 3])}}),
+    ("gains", "fail", gains(gain=np.array([[1.0] * 3, [1.0] * 3, [0.7] * 3]))),
     ("energy", "pass", {}),
-    ("energy", "fail", {"radiance": {"exposure_ratio": np.array([[[1.0], [4.0]], [[1.0], [4.0]], [[1.0], [6.0]]])}}),
+    ("energy", "fail", {"bracket": {"exposure_ratio": np.array([[[1.0], [4.0]], [[1.0], [4.0]], [[1.0], [6.0]]])}}),
     ("gain doubt", "pass", {}),
-    ("gain doubt", "pass", {"gains": {"source": "one exposure"}}),
-    ("gain doubt", "fail", {"gains": {"disagreement": 0.05}}),
-    ("gain doubt", "warn", {"gains": {"chart_gloss": 0.05}}),
-    ("gain doubt", "warn", {"gains": {"source": "object", "sigma": np.full((3, 3), 0.02)}}),
-    ("gain doubt", "fail", {"gains": {"source": "none", "sigma": np.full((3, 3), 0.2)}}),
-    ("gain doubt", "not measured", {"gains": {"source": "none", "sigma": np.full((3, 3), NAN)}}),
+    ("gain doubt", "pass", gains(source="one exposure")),
+    ("gain doubt", "fail", gains(disagreement=0.05)),
+    ("gain doubt", "fail", gains(sigma=np.full((3, 3), 0.31))),
+    ("gain doubt", "warn", gains(chart_gloss=0.05)),
+    ("gain doubt", "warn", gains(source="object", sigma=np.full((3, 3), 0.02))),
+    ("gain doubt", "fail", gains(source="none", sigma=np.full((3, 3), 0.2))),
+    ("gain doubt", "not measured", gains(source="none", sigma=np.full((3, 3), NAN))),
     ("order", "pass", {}),
-    ("order", "warn", {"gains": {"rival": (0, 2, 1)}}),
-    ("order", "fail", {"gains": {"order": (2, 1, 0)}}),
+    ("order", "warn", {"selfcal": {"outline": OutlineCheck(STATED, 0.9, ShotOrder((0, 2, 1)))}}),
+    ("order", "fail", {"selfcal": {"outline": OutlineCheck(ShotOrder((2, 1, 0)), 0.9)}}),
     ("angles", "pass", {}),
     ("angles", "not measured", {"figures": {"outline": None}}),
     ("angles", "fail", {"figures": outline(turned=0.3)}),
-    ("angles", "fail", {"gains": SHOT_ALONE}),
+    ("angles", "fail", {"selfcal": {"turned": TurnedShot((1,), 0.3, 0.02)}}),
     ("angles", "fail", {"figures": outline({"shot": 1, "angle": 0.3, "misfit": 0.2, "sigmas": 9.0})}),
     ("angles", "fail", {"figures": outline({"shot": 1, "angle": -np.pi / 4, "misfit": 0.2, "sigmas": 9.0})}),
-    ("angles", "warn", {"gains": {"found_angle": scenes.ANGLES, "found_sigma": 0.02}}),
-    ("angles", "warn", {"gains": {"angle_offset": 0.2, "angle_offset_sigma": 0.01}}),
-    ("angles", "pass", {"gains": {"angle_offset": 0.03, "angle_offset_sigma": 0.01, "angle_correction": 0.03}}),
+    ("angles", "warn", {"selfcal": {"found_sigma": 0.02}}),
+    ("angles", "warn", {"selfcal": {"ring": RingZero(0.2, 0.01)}}),
+    ("angles", "pass", {"selfcal": {"ring": RingZero(0.03, 0.01, 0.03)}}),
     ("polarized", "fail", {"figures": outline(dolp=0.004)}),
     ("body", "pass", {}),
     ("body", "fail", {"figures": outline(along=-0.9)}),
@@ -144,8 +160,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("noise", "pass", {}),
     ("noise", "fail", {"figures": {"noise": 0.1}}),
     ("noise", "not measured", {"figures": {"noise": NAN}}),
-    ("ambient", "pass", {"radiance": {"ambient_share": np.full(3, 0.001)}}),
-    ("ambient", "fail", {"radiance": {"ambient_share": np.full(3, 0.3)}}),
+    ("ambient", "pass", {"bracket": {"ambient_share": np.full(3, 0.001)}}),
+    ("ambient", "fail", {"bracket": {"ambient_share": np.full(3, 0.3)}}),
     ("ambient", "not measured", {}),
     ("crossed", "pass", {"radiance": {"crossed": True}}),
     ("crossed", "warn", {"radiance": {"crossed": True}, "stokes": SimpleNamespace(body=None)}),
@@ -155,6 +171,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
                          "figures": {"crossed": {"left": 0.0, "clipped": 0, "over": 0.9, "mirrored": 0.1}}}),
     ("ill-posed", "pass", {}),
     ("ill-posed", "fail", {"figures": {"ill_posed": 0.5}}),
+    ("outline", "pass", {}),
+    ("outline", "fail", {"figures": {"inward_outline": 0.3}}),
     ("focal length", "pass", {}),
     ("focal length", "warn", {"focal_doubt": (-0.7, 0.7)}),
     ("normal error", "pass", {}),
@@ -174,14 +192,20 @@ def fields_in_numpy(value: Any) -> Any:
     return msgspec.structs.replace(value, **numbers) if struct else replace(value, **numbers)
 
 
+def with_field(radiance: AngleStack, name: str, change: dict[str, Any]) -> AngleStack:
+    """Merged shots with fields of one of their parts replaced."""
+    return replace(radiance, **{name: replace(getattr(radiance, name), **change)})
+
+
 @pytest.fixture(scope="module")
 def good() -> dict[str, Any]:
     """The parts of a capture of which every gate passes or has nothing to judge."""
     return {
         "names": ["0°", "45°", "90°"], "focal_doubt": (0.0, 0.0), "grid_px": 1.0, "chart_missing": "",
-        "clipped": clipped(), "blur_px": None, "radiance": replace(scenes.stack(), **exposures(1.0, 4.0)),
+        "clipped": clipped(), "blur_px": np.full((3, 2), np.nan),
+        "radiance": with_field(scenes.stack(), "bracket", exposures(1.0, 4.0)),
         "color": scenes.no_color(), "alignment": scenes.still(), "object_": replace(scenes.ball_object(), doubt=0.01),
-        "gains": replace(scenes.equal(), source="grey patches", concentration=0.95),
+        "selfcal": replace(scenes.equal(), gains=GAINS, outline=OutlineCheck(STATED, 0.95)),
         "stokes": SimpleNamespace(body=True), "maps": None, "mesh": SimpleNamespace(**MESH),
         "figures": FIGURES | outline(),
     }  # fmt: skip
@@ -200,10 +224,15 @@ def judge(good: dict[str, Any], config: Config, fields: dict[str, Any]) -> list[
     for name, change in fields.items():
         if name == "figures":
             parts[name] = good[name] | change
+        elif name in ("bracket", "sensor"):
+            parts["radiance"] = with_field(parts["radiance"], name, change)
         else:
             parts[name] = replace(good[name], **change) if isinstance(change, dict) else change
-    for name in ("color", "gains", "object_", "radiance"):
+    for name in ("color", "object_", "radiance"):
         parts[name] = fields_in_numpy(parts[name])
+    selfcal = fields_in_numpy(parts["selfcal"])
+    inner = {name: fields_in_numpy(getattr(selfcal, name)) for name in ("gains", "outline", "ring", "turned")}
+    parts["selfcal"] = replace(selfcal, **inner)
     for name in ("focal_doubt", "grid_px"):
         parts[name] = in_numpy(parts[name])
     parts["mesh"] = SimpleNamespace(**in_numpy(vars(parts["mesh"])))
@@ -211,7 +240,7 @@ def judge(good: dict[str, Any], config: Config, fields: dict[str, Any]) -> list[
     with pytest.MonkeyPatch.context() as patch:
         for figure, (module, function) in MEASURES.items():
             patch.setattr(module, function, partial(stated, in_numpy(figures[figure])))
-        return list(gates.judge(Evidence.partial(**parts), config))
+        return list(gates.judge(Evidence.partial(**parts), config.gates, config.align))
 
 
 def stated(figure: Any, *_: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What several tests of the rig share."""
+"""Fixtures of several rig tests."""
 
 import pytest
 

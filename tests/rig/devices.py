@@ -1,4 +1,4 @@
-"""Rotators at the far end of a serial line, as far as their protocol goes; faults and clock are told in `far_end`.
+"""Simulated rotators at the far end of a serial line; `far_end` has their faults and their clock.
 
 GRBL counts steps and cannot feel the ring: its wrong-position is one it reports, as after a stray jog.
 """
@@ -124,7 +124,7 @@ class Grbl(Device):
         self._kept = b""
         self._lines: list[str] = []
         self._planned: list[float] = []  # ring degrees
-        self._waiting = False  # a line whose ok comes when the ring stands
+        self._waiting = False  # for the ring to stop, before it answers ok
 
     def receive(self, data: bytes) -> None:
         for byte in data:

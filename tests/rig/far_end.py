@@ -1,20 +1,20 @@
-"""What every simulated rotator is: a ring that takes time to turn, answers on a wire, faults on order.
+"""The base of all simulated rotators: a ring that takes time to turn, delayed answers, planted faults.
 
     with virtual.time(), Elliptec(fault="half-line", at=3) as device:
         rotator = open_rotator(f"elliptec:{device.port}", Log(None))
 
-They live by the clock of `virtual`, in the thread of whoever reads from them; with `real=True` on a pseudo-terminal and
-in a thread of their own, for another process.
+They use the clock of `virtual` and run while their port is read; with `real=True` they run in a thread on a
+pseudo-terminal, for another process.
 
-`fault` is one of the class's FAULTS or `late`, `at` the moment, `times` for how many moments in a row (`ALWAYS`: for
-ever).
+`fault` is one of the class's FAULTS or `late`; `at` is the first moment it strikes, `times` the number of moments
+(`ALWAYS`: all).
 
     moments are answers:    no-answer, garbage, half-line, late (after `serial_port` has given it up)
-    moments are movements:  busy (never ends), mechanical-timeout, wrong-position (stops 5° off, and says so);
+    moments are movements:  busy (never ends), mechanical-timeout, wrong-position (stops 5° away, and reports that);
                             halfway: unplug (the port vanishes), alarm (a limit switch), restart (power lost)
 
-Homing is a movement; the first moment is 1. What happened: `heard` lists the commands, `angle_deg` is where the ring
-truly stands, `moves` and `answers` count. `unplug()` pulls the cable now.
+Homing is a movement; the first moment is 1. `heard` lists the commands, `angle_deg` is the ring's true angle, `moves`
+and `answers` count. `unplug()` pulls the cable.
 """
 
 import os
@@ -36,7 +36,7 @@ _OFF_DEG = 5.0  # of a wrong position
 
 
 class Device:
-    """A ring that takes time to turn, and answers that come one behind the other."""
+    """A ring that takes time to turn, and answers that come one after the other."""
 
     FAULTS: ClassVar[tuple[str, ...]] = ()
     END = b"\r\n"
@@ -91,7 +91,7 @@ class Device:
             self._wire.join()
 
     def receive(self, data: bytes) -> None:
-        """Bytes have come."""
+        """Handle bytes that were sent to the device."""
         raise NotImplementedError
 
     def halfway(self) -> None:
@@ -109,7 +109,7 @@ class Device:
         self.send(data, late_s)
 
     def send(self, data: bytes, late_s: float = 0.0) -> None:
-        """Put bytes on the wire, behind those that are on it."""
+        """Put bytes on the wire, after those already on it."""
         before = max((due for due, _ in self._said), default=0.0)
         self._said.append((max(self._clock.monotonic() + late_s, before) + LATENCY_S, data))
 
@@ -121,7 +121,7 @@ class Device:
         return self._ends is not None
 
     def turn(self, target_deg: float, then: Callable[[], None]) -> None:
-        """Start turning; `then` when the ring stands."""
+        """Start turning; call `then` when the ring has stopped."""
         self.moves += 1
         due = self.fault not in (*SPOKEN, "late") and self.at <= self.moves < self.at + self.times
         self._struck = self.fault if due else ""
@@ -134,7 +134,7 @@ class Device:
         self._ends = self._clock.monotonic() + seconds
 
     def freeze(self) -> None:
-        """Stop where the ring is about now, without `then`."""
+        """Stop at the present angle, without calling `then`."""
         if self._ends is not None:
             left = max(0.0, self._ends - self._clock.monotonic()) * self.speed_deg_s
             away = self._target_deg - self.angle_deg
@@ -142,7 +142,7 @@ class Device:
         self._ends = None
 
     def step(self) -> None:
-        """Do what is due by now."""
+        """Finish movements and deliver answers that are due."""
         self.tick()
         if self._ends is not None and self._clock.monotonic() >= self._ends:
             self._arrive()
@@ -165,7 +165,7 @@ class Device:
 
 
 class Terminal:
-    """A pseudo-terminal, and the thread in which its device lives."""
+    """A pseudo-terminal, and the thread of its device."""
 
     def __init__(self, device: Device) -> None:
         self._device = device

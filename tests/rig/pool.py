@@ -1,4 +1,4 @@
-"""A camera that hands out photographs made beforehand, with a fault on order; far quicker than rendering each."""
+"""A camera that returns prepared photographs, with a planted fault; much faster than rendering each."""
 
 import os
 import resource
@@ -12,7 +12,6 @@ import msgspec
 import numpy as np
 
 from polcap.errors import HardwareError
-from polcap.formats.raw import dng
 from polcap.formats.raw.file_bytes import digest
 from polcap.images import Exif, Role
 from polcap.rig.call_timeout import call_within
@@ -20,6 +19,7 @@ from polcap.rig.camera import CameraFile
 from polcap.rig.exposure_bracket import Exposure
 from polcap.rig.shooting_plan import CaptureOrder
 from polcap.synth.shooting import MIDDLE_S, Shoot, Studio, Take, random_scene
+from tests.raw_files import write_raw
 
 ANGLES = (0.0, 45.0, 90.0)
 BRACKET = tuple(Exposure(time_s=time, f_number=11.0, iso=100.0) for time in (0.005, 0.02, 0.08))
@@ -30,7 +30,7 @@ Key = tuple[str, float, int]  # role, angle, step
 
 
 def photographs(width: int = 192, height: int = 144, scene_seed: int = 1) -> dict[Key, bytes]:
-    """Every frame of `ORDER`, and 45 degrees beside each: what a camera sees where the ring is wrong."""
+    """Every frame of `ORDER`, and those of 135°, a wrong angle of the ring."""
     shoot = Shoot(width=width, height=height, samples=1)
     studio = Studio(random_scene(scene_seed, "bumps"), shoot)
     found: dict[Key, bytes] = {}
@@ -48,26 +48,15 @@ def photographs(width: int = 192, height: int = 144, scene_seed: int = 1) -> dic
 
 
 def tiny(path: Path, **exif: object) -> bytes:
-    """A RAW of noise, 32×24 px, for tests that look at bytes and tags alone."""
-    facts = {"make": "Tiny", "model": "One", "lens": "L", "exposure_time": 0.02, "f_number": 11.0, "iso": 100.0}
+    """A RAW of noise, 32×24 px, for tests of bytes and tags."""
+    tags = {"make": "Tiny", "model": "One", "lens": "L", "exposure_time": 0.02, "f_number": 11.0, "iso": 100.0}
     random = np.random.default_rng([*repr(exif).encode()])
     mosaic = random.integers(600, 9000, (24, 32)).astype(np.uint16)
-    dng.write(
-        path,
-        mosaic,
-        cfa=np.array([[0, 1], [1, 2]], np.uint8),
-        black=512,
-        white=15871,
-        exif=Exif(**{**facts, **exif}),  # type: ignore[arg-type]
-        color_matrix=np.eye(3),
-        as_shot_neutral=np.ones(3),
-        compression="none",
-    )
-    return path.read_bytes()
+    return write_raw(path, mosaic, Exif(**{**tags, **exif}))  # type: ignore[arg-type]
 
 
 class PoolCamera:
-    """Takes what the ring's true angle shows; `fault` strikes at the frame number `at`, once."""
+    """Checks the ring's true angle; `fault` strikes once, at the frame number `at`."""
 
     model = "Polcap Synthetic"
     frame_bytes = 100_000

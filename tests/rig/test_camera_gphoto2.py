@@ -1,10 +1,11 @@
-"""libgphoto2's own virtual camera: settings really turned, RAW bytes end to end, and what a failing body becomes."""
+"""The camera driver with libgphoto2's own virtual camera: dials, RAW bytes, and failures."""
 
 import importlib.util
 import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
@@ -22,7 +23,7 @@ gphoto2 = pytest.importorskip("gphoto2")
 
 @pytest.fixture
 def card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The virtual camera's card: it photographs what lies there."""
+    """The virtual camera's card: the camera photographs its file."""
     spec = importlib.util.find_spec("gphoto2")
     assert spec is not None and spec.origin is not None
     monkeypatch.setenv("IOLIBS", os.path.join(os.path.dirname(spec.origin), "libgphoto2", "vusb"))
@@ -48,73 +49,59 @@ def test_raw_bytes_are_identical_and_named_by_content(camera: Gphoto2Camera, car
     assert shot.name.endswith(".JPG") and shot.suffix == ".dng"
 
 
-def test_dials_go_to_the_nearest_in_stops_and_say_where(camera: Gphoto2Camera, tmp_path: Path) -> None:
+def test_dials_are_set_to_the_nearest_value_in_stops(camera: Gphoto2Camera, tmp_path: Path) -> None:
     shot = camera.shoot(Exposure(time_s=1 / 60, f_number=10.5, iso=100.0), flash=True)
     assert shot.exposure == Exposure(time_s=0.02, f_number=11.0)  # of 0.02 s and 0.01 s; the body has no ISO
     assert camera._value("shutterspeed") == "0.0200s" and camera._value("f-number") == "f/11"
-    told = (tmp_path / "rig.log").read_text()
-    assert "camera > shutterspeed = 0.0200s" in told and "camera > f-number = f/11" in told
+    log = (tmp_path / "rig.log").read_text()
+    assert "camera > shutterspeed = 0.0200s" in log and "camera > f-number = f/11" in log
 
 
-def test_a_value_the_dial_lacks_is_an_error_that_lists_the_others(camera: Gphoto2Camera) -> None:
+def test_a_value_that_the_dial_lacks_is_an_error_that_lists_the_others(camera: Gphoto2Camera) -> None:
     with pytest.raises(SettingError, match=r"time_s 0.4; .*0.1, 1"):
         camera.shoot(Exposure(time_s=0.4), flash=True)
 
 
-def test_its_own_bracket_is_two_stops_around_its_shutter(camera: Gphoto2Camera) -> None:
+def test_the_default_bracket_is_two_stops_around_the_shutter_time(camera: Gphoto2Camera) -> None:
     assert [exposure.time_s for exposure in camera.bracket(flash=False)] == [0.0025, 0.01, 0.04]
     with pytest.raises(SettingError, match=r"ISO cannot be set; .*: flash power or aperture"):  # the body has none
         camera.bracket(flash=True)
     assert not camera.switches_flash
 
 
-def test_a_body_that_fails_once_is_connected_anew(camera: Gphoto2Camera, monkeypatch: pytest.MonkeyPatch) -> None:
-    real, calls = camera._capture, []
-
-    def fails_once() -> tuple[bytes, str]:
-        calls.append(1)
-        if len(calls) == 1:
-            raise gphoto2.GPhoto2Error(-7)
-        return real()
-
-    monkeypatch.setattr(camera, "_capture", fails_once)
-    assert camera.shoot(Exposure(), flash=True).data and len(calls) == 2
+def test_a_camera_that_fails_once_is_connected_again(camera: Gphoto2Camera, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = camera._capture
+    monkeypatch.setattr(camera, "_capture", mock.Mock(side_effect=[gphoto2.GPhoto2Error(-7), capture()]))
+    assert camera.shoot(Exposure(), flash=True).data
 
 
-def test_a_body_that_is_gone_is_one_error(camera: Gphoto2Camera, monkeypatch: pytest.MonkeyPatch) -> None:
-    def gone() -> tuple[bytes, str]:
-        raise gphoto2.GPhoto2Error(-52)
-
-    monkeypatch.setattr(camera, "_capture", gone)
-    with pytest.raises(HardwareError, match=r"Nikon DSC D750: capture: .* \(-52\); plug it in"):
+@pytest.mark.parametrize(
+    ("code", "words"), [(-52, r"Nikon DSC D750: capture: .* \(-52\); plug it in"), (-115, "card is full")]
+)
+def test_a_camera_that_keeps_failing_is_one_error_with_a_remedy(
+    camera: Gphoto2Camera, monkeypatch: pytest.MonkeyPatch, code: int, words: str
+) -> None:
+    monkeypatch.setattr(camera, "_capture", mock.Mock(side_effect=gphoto2.GPhoto2Error(code)))
+    with pytest.raises(HardwareError, match=words):
         camera.shoot(Exposure(), flash=True)
 
 
-def test_a_full_card_says_so(camera: Gphoto2Camera, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full() -> tuple[bytes, str]:
-        raise gphoto2.GPhoto2Error(-115)
-
-    monkeypatch.setattr(camera, "_capture", full)
-    with pytest.raises(HardwareError, match="card is full"):
-        camera.shoot(Exposure(), flash=True)
-
-
-def test_a_stalled_body_is_left_alone_in_time(card: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_camera_that_hangs_is_an_error_in_time(card: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     camera = Gphoto2Camera("D750", Log(None))
     monkeypatch.setattr(camera, "_timeout_s", 0.3)
-    begun, release, calls = threading.Event(), threading.Event(), []
+    begun, release = threading.Event(), threading.Event()
 
-    def stall() -> tuple[bytes, str]:
-        calls.append(1)
+    def hang() -> tuple[bytes, str]:
         begun.set()
         release.wait(300)
         return b"", ""
 
-    monkeypatch.setattr(camera, "_capture", stall)
+    capture = mock.Mock(side_effect=hang)
+    monkeypatch.setattr(camera, "_capture", capture)
     with pytest.raises(CallTimeout, match=r"capture took more than 0.3 s"):
         camera.shoot(Exposure(), flash=True)
-    camera.close()  # returns, though the call hangs
-    assert begun.wait(60) and len(calls) == 1
+    camera.close()  # returns, although the call hangs
+    assert begun.wait(60) and capture.call_count == 1
     release.set()
 
 

@@ -84,7 +84,7 @@ def test_a_port_that_is_not_there_is_exit_4(polcap: Command, tmp_path: Path) -> 
 def test_a_motor_on_a_port_and_a_camera_on_a_cable_make_a_capture(
     polcap: Command, tmp_path: Path, pool: dict[Key, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Protocol-level Elliptec, libgphoto2's virtual camera; only what its lens sees is put there by hand."""
+    """A simulated Elliptec and libgphoto2's virtual camera; the test supplies the camera's view."""
     spec = importlib.util.find_spec("gphoto2")
     if spec is None or spec.origin is None:
         pytest.skip("gphoto2 is not installed")

@@ -1,4 +1,4 @@
-"""Whatever fails: an end in time, no frame lost, no wrong angle, and a resume that completes the same capture."""
+"""Whatever fails: the run ends in time, no frame is lost, no angle is wrong, and resuming completes the capture."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ def test_a_fault_costs_no_frame_and_the_capture_is_completed(
     fault: str, pool: dict[Key, bytes], tmp_path: Path
 ) -> None:
     outcome = faults.trial(fault, 0, pool, tmp_path / "capture")
-    assert outcome.kept + outcome.taken == 15
+    assert outcome.accepted + outcome.retaken == 15
 
 
 @pytest.mark.parametrize("kind", faults.KINDS)

@@ -22,7 +22,7 @@ STEPS_PER_DEGREE = 26.6667  # of the sketch
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The board is a process of its own, which a busy machine may let wait."""
+    """The board is a process of its own; a busy machine may delay it."""
     monkeypatch.setattr(serial_port, "ANSWER_S", 20.0)
     monkeypatch.setattr(motor_line_protocol, "_START_S", 60.0)
     elliptec, boards = device_urls._QUESTIONS
@@ -35,10 +35,10 @@ class Board(NamedTuple):
     process: "subprocess.Popen[str]"
 
     def released_deg(self) -> float:
-        """Where the ring was let go last."""
+        """Angle at which the ring was released."""
         self.process.kill()
-        told = self.process.communicate(timeout=30)[1].splitlines()
-        return int(told[-1].split()[1]) / STEPS_PER_DEGREE
+        lines = self.process.communicate(timeout=30)[1].splitlines()
+        return int(lines[-1].split()[1]) / STEPS_PER_DEGREE
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def board(firmware: Path, request: pytest.FixtureRequest) -> Iterator[Board]:
-    """A ring at 20° whose switch closes at `param` degrees."""
+    """A ring at 20° with its switch at `param` degrees."""
     master, slave = os.openpty()
     tty.setraw(slave)
     steps = [str(round(STEPS_PER_DEGREE * degrees)) for degrees in (20, request.param)]
@@ -69,7 +69,7 @@ def board(firmware: Path, request: pytest.FixtureRequest) -> Iterator[Board]:
 
 
 @pytest.mark.parametrize("board", [5, 25], indirect=True)  # the second starts on its switch
-def test_the_firmware_turns_the_ring_and_lets_it_go(board: Board) -> None:
+def test_the_firmware_turns_the_ring_and_releases_it(board: Board) -> None:
     rotator = open_rotator(f"line:{board.port}?settle=0", Log(None))
     assert rotator.model == "polcap-rotator stepper"
     for angle in (0.0, 45.0, 30.0):
@@ -103,7 +103,7 @@ def test_the_firmware_refuses_what_it_cannot_do(board: Board) -> None:
 
 
 @pytest.mark.parametrize("board", [-500], indirect=True)
-def test_the_firmware_gives_up_on_a_missing_switch_and_says_it_is_busy_until_then(board: Board) -> None:
+def test_the_firmware_gives_up_on_a_missing_switch_and_is_busy_until_then(board: Board) -> None:
     log_lines = []
 
     class Lines(Log):

@@ -1,4 +1,4 @@
-"""A port's failures are one error each, in time; the log keeps what was said."""
+"""Every failure of a port is one error, in time; the log has every line."""
 
 import os
 import re
@@ -27,7 +27,7 @@ class Wire:
         tty.setraw(self.slave)
         self.name = os.ttyname(self.slave)
 
-    def says(self, data: bytes) -> None:
+    def send(self, data: bytes) -> None:
         os.write(self.master, data)
 
     def cut(self) -> None:
@@ -68,35 +68,35 @@ def test_no_answer_names_port_question_and_limit(wire: Wire) -> None:
 def test_half_a_line_is_shown_and_does_not_join_the_next_answer(wire: Wire) -> None:
     port = opened(wire.name)
     port.send("0gp")
-    wire.says(b"0PO00")
+    wire.send(b"0PO00")
     with pytest.raises(NoAnswer, match="only '0PO00'"):
         port.read_line()
-    wire.says(b"0GS00\r\n")
+    wire.send(b"0GS00\r\n")
     assert port.read_line() == "0GS00"
 
 
 def test_a_late_answer_is_not_taken_for_that_of_the_next_question(wire: Wire) -> None:
     port = opened(wire.name)
     port.send("0gp")
-    wire.says(b"0PO00000001\r\n")
+    wire.send(b"0PO00000001\r\n")
     assert port.read_line() == "0PO00000001"
-    wire.says(b"0PO00000001\r\n")
+    wire.send(b"0PO00000001\r\n")
     port.send("0gs")
-    wire.says(b"0GS00\r\n")
+    wire.send(b"0GS00\r\n")
     assert port.read_line() == "0GS00"
 
 
-def test_bytes_that_are_no_text_mean_nothing(wire: Wire) -> None:
+def test_bytes_that_are_not_text_are_no_answer(wire: Wire) -> None:
     port = opened(wire.name)
     port.send("0gp")
-    wire.says(b"\xff\x00\x87~\r\n")
+    wire.send(b"\xff\x00\x87~\r\n")
     with pytest.raises(NoAnswer, match="not text"):
         port.read_line()
 
 
 def test_noise_without_an_end_is_given_up(wire: Wire) -> None:
     port = opened(wire.name)
-    wire.says(b"x" * 2000)
+    wire.send(b"x" * 2000)
     with pytest.raises(NoAnswer, match="only"):
         port.read_line(60)
 
@@ -131,7 +131,7 @@ def test_a_second_opener_is_refused(wire: Wire) -> None:
         ("carrier-pigeon://1", SettingError, "is no serial port"),
     ],
 )
-def test_a_port_that_cannot_be_opened_says_why(url: str, error: type[Exception], words: str) -> None:
+def test_a_port_that_cannot_be_opened_is_an_error_with_the_reason(url: str, error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
         opened(url)
 
@@ -149,11 +149,11 @@ def test_a_socket_is_a_port_and_its_end_unplugs_it() -> None:
             port.read_line(30)
 
 
-def test_log_keeps_what_was_sent_and_received_with_the_time(wire: Wire, tmp_path: Path) -> None:
+def test_the_log_has_every_line_with_its_time(wire: Wire, tmp_path: Path) -> None:
     log = Log(tmp_path / "rig.log")
     port = opened(wire.name, log)
     port.send("0gp\r\n")
-    wire.says(b"0PO00\xff\r\n")
+    wire.send(b"0PO00\xff\r\n")
     with pytest.raises(NoAnswer):
         port.read_line()
     lines = (tmp_path / "rig.log").read_text().splitlines()  # before it is closed
@@ -165,7 +165,7 @@ def test_log_keeps_what_was_sent_and_received_with_the_time(wire: Wire, tmp_path
     assert len((tmp_path / "rig.log").read_text().splitlines()) == 2
 
 
-def test_log_goes_on_where_it_ended(tmp_path: Path) -> None:
+def test_a_log_is_continued(tmp_path: Path) -> None:
     for text in ("one", "two"):
         log = Log(tmp_path / "rig.log")
         log.write("camera", "!", text)
@@ -173,7 +173,7 @@ def test_log_goes_on_where_it_ended(tmp_path: Path) -> None:
     assert [line.split()[-1] for line in (tmp_path / "rig.log").read_text().splitlines()] == ["one", "two"]
 
 
-def test_a_full_disk_is_said_once() -> None:
+def test_a_full_disk_is_reported_once() -> None:
     log = Log(Path("/dev/full"))
     with pytest.raises(StorageError, match="the disk is full"):
         log.write("rotator", ">", "0gp")

@@ -1,10 +1,10 @@
-"""Time that passes only where the rig waits, and serial ports whose far end lives in this process.
+"""Virtual time, which passes only while the rig waits, and serial ports with a simulated device at the far end.
 
     with virtual.time(), Elliptec() as device:
         rotator = open_rotator(f"elliptec:{device.port}", Log(None))
 
-Whoever reads from such a port makes the clock go on, and the device at its far end with it. So no test waits, and none
-depends on how busy the machine is.
+Reading from such a port advances the clock, and the device with it. So no test waits, and none depends on the load of
+the machine.
 """
 
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ _BITS = 10  # of a byte on the wire: start, eight, stop
 
 
 class Clock:
-    """What the rig uses of the module `time`."""
+    """Replaces the module `time` in the rig."""
 
     def __init__(self) -> None:
         self._now = 1000.0
@@ -44,7 +44,7 @@ CLOCK = Clock()
 
 
 class FarEnd(Protocol):
-    """A device, as its cable knows it."""
+    """A device, as seen from its cable."""
 
     delivered: bytes  # answers that came through the wire and were not read yet
 
@@ -54,7 +54,7 @@ class FarEnd(Protocol):
     def receive(self, data: bytes) -> None: ...
 
     def step(self) -> None:
-        """Do what is due by now."""
+        """Finish movements and deliver answers that are due."""
 
 
 PLUGGED: dict[str, FarEnd] = {}  # by URL
@@ -90,7 +90,7 @@ class Serial:
         self._device.delivered = b""
 
     def close(self) -> None:
-        """Nothing is held."""
+        """There is nothing to close."""
 
     def _pass(self, seconds: float) -> None:
         CLOCK.sleep(seconds)
@@ -110,7 +110,7 @@ def _open(url: str, *, baudrate: int, timeout: float, **options: object) -> obje
 
 @contextmanager
 def time() -> Iterator[Clock]:
-    """The rig's ports and motors live by this clock."""
+    """The rig's ports and motors use this clock."""
     with ExitStack() as patches:
         for module in (serial_port, motor_elliptec_ell14, motor_grbl, motor_line_protocol, rotator, device_urls):
             patches.enter_context(mock.patch.object(module, "time", CLOCK))

@@ -10,7 +10,8 @@ import pytest
 import rawpy
 
 from polcap.errors import CaptureError, SettingError
-from polcap.formats import calib
+from polcap.formats import shipped_data
+from polcap.optics import projection
 from polcap.synth import color_checker, render, shooting
 from polcap.synth.color_checker import Chart
 from polcap.synth.distance_fields import Cluster
@@ -87,7 +88,7 @@ def test_files_hold_the_stokes_parameters_of_the_truth(still: Any) -> None:
 def test_white_patch_has_its_reflectance(still: Any) -> None:
     pictures, truth, _ = still
     quads = np.array(truth["chart"]["patch_corners_px"])
-    reference = calib.colorchecker().rec709 @ np.array(truth["camera_matrix_from_linear_srgb"])[1]
+    reference = shipped_data.colorchecker().rec709 @ np.array(truth["camera_matrix_from_linear_srgb"])[1]
     s0 = pictures[0] + pictures[2]
     scale = truth["files"][0]["relative_exposure"] * truth["white_S0"]
     far = np.linalg.norm(color_checker.patches(Chart()).mean(axis=1), axis=-1)  # of the patches from the flash
@@ -187,7 +188,7 @@ def test_object_and_chart_are_whole_and_apart_in_every_scene(kind: Any) -> None:
         scene = shooting.random_scene(seed, kind)
         mask = render.gbuffer(scene, shoot.view, shoot.height, shoot.width).mask
         assert scene.chart is not None
-        corners = render.project(shoot.view, color_checker.corners(scene.chart))
+        corners = projection.project(shoot.view, color_checker.corners(scene.chart))
         assert 0.03 < mask.mean() < 0.3
         assert not mask[[0, -1]].any() and not mask[:, [0, -1]].any()
         assert corners.min() > 2 and (corners < [shoot.width - 3, shoot.height - 3]).all()

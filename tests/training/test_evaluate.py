@@ -22,7 +22,7 @@ def networks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("networks")
     for name in ("ours", "rgb"):
         (folder / name).mkdir()
-        train.Run(TINY, torch.device("cpu"), 1e-3).save(folder / name / "last.pt")
+        train.NetworkTraining(TINY, torch.device("cpu"), 1e-3).save(folder / name / "last.pt")
     return folder
 
 

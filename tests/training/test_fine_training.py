@@ -68,15 +68,14 @@ def test_it_learns_and_ships(tmp_path: Path, picture: NDArray[np.float16]) -> No
     file = tmp_path / "00000.npy"
     np.save(file, picture)
     torch.manual_seed(0)
-    run = fine_train.Run(3e-3)
-    rng = np.random.default_rng(0)
-    losses = [run.advance([file], 0.0, rng) for _ in range(40)]
+    run = fine_train.FineTraining(3e-3, [file])
+    losses = [run.advance([file], 0.0)["loss"] for _ in range(40)]
     assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:5])
     run.save(tmp_path / "last.pt")
     path = fine_train.ship(tmp_path / "last.pt", tmp_path / "fine.onnx")
     network = onnx.load(path, threads=1, encoding=fine.ENCODING)
     assert network.channels == fine.CHANNELS
     shown = fine_train.taught(file)[:COUNT].astype(np.float32)[None]
-    with torch.no_grad():
-        own = fine_train.averaged(run.average)(torch.from_numpy(shown)).numpy()
-    assert np.abs(network.run(shown)["relief"] - own).max() < 2e-3  # weights in halves
+    with torch.no_grad(), run.averaged() as averaged:
+        own = averaged(torch.from_numpy(shown)).numpy()
+    assert np.abs(onnx.run(network, shown)["relief"] - own).max() < 2e-3  # weights in halves

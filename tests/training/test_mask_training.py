@@ -78,13 +78,12 @@ def test_the_network_learns_and_ships(tmp_path: Path, picture: mask_scenes.Pictu
     held = mask_pictures.packed(picture)
     np.save(file, np.tile(held, (2, 2, 1)))
     torch.manual_seed(0)
-    run = mask_train.Run(3e-3)
-    rng = np.random.default_rng(0)
-    losses = [run.advance([file] * 4, 0.0, rng)[0] for _ in range(40)]
+    run = mask_train.MaskTraining(3e-3, [file])
+    losses = [run.advance([file] * 4, 0.0)["loss_whole"] for _ in range(40)]
     assert losses[-1] < 0.9 * losses[0]
     run.save(tmp_path / "last.pt")
     network = onnx.load(mask_train.ship(tmp_path / "last.pt", tmp_path / "mask.onnx"), threads=1, encoding=ENCODING)
-    logit = network.run(np.zeros((1, len(CHANNELS), 48, 80), np.float32))["logit"]
+    logit = onnx.run(network, np.zeros((1, len(CHANNELS), 48, 80), np.float32))["logit"]
     assert logit.shape == (1, 1, 48, 80) and network.channels == CHANNELS
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from polcap.errors import InputError
-from polcap.training import export, model, train
+from polcap.training import export, loop, model, muon, train
 from polcap.training.dataset import Simulator
 from tests.conftest import ROOT
 from tests.training.test_export import settled
@@ -38,8 +38,8 @@ class Clock:
 
 def test_run_stops_in_time_and_resumes(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(train.PRESETS, "cpu", PRESET)
-    monkeypatch.setattr(train, "time", Clock())
-    params = train.Params(data=data, out=tmp_path, minutes=0.07, threads=1)
+    monkeypatch.setattr(loop, "time", Clock())
+    params = train.TrainingOptions(data=data, out=tmp_path, minutes=0.07, threads=1)
     made, last = train.main(params), tmp_path / "last.pt"
     first, facts = train.load_average(last)
     weights, told = export.read(made)
@@ -51,7 +51,7 @@ def test_run_stops_in_time_and_resumes(data: Path, tmp_path: Path, monkeypatch: 
     panel = cv2.imread(str(tmp_path / "watch.png"))
     assert panel.shape == (8 * 128, 11 * 128, 3) and panel[:, :128].max() > 100  # S0, truth and estimate of five maps
 
-    train.main(train.Params(data=data, out=tmp_path, minutes=0.1, threads=1, resume=True))
+    train.main(train.TrainingOptions(data=data, out=tmp_path, minutes=0.1, threads=1, resume=True))
     second, later = train.load_average(last)
     assert later["step"] > facts["step"] and later["elapsed"] > facts["elapsed"]
     moved = [not torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters())]
@@ -62,11 +62,11 @@ def test_training_starts_from_a_shipped_model(data: Path, tmp_path: Path, monkey
     monkeypatch.setitem(train.PRESETS, "cpu", PRESET)
     export.write(settled(TINY), tmp_path / "first.onnx", {"training": "10 samples", "licence": "x"})
     weights, _ = export.read(tmp_path / "first.onnx")
-    run = train.Run(TINY, torch.device("cpu"), 1e-3)
+    run = train.NetworkTraining(TINY, torch.device("cpu"), 1e-3)
     run.begin(tmp_path / "first.onnx")
     for state in (run.network.state_dict(), run.average):
         assert all(torch.equal(value, weights[name]) for name, value in state.items())
-    params = train.Params(data=data, out=tmp_path / "out", samples=8, threads=1, start=tmp_path / "first.onnx")
+    params = train.TrainingOptions(data=data, out=tmp_path / "out", samples=8, threads=1, start=tmp_path / "first.onnx")
     _, facts = export.read(train.main(params))
     assert facts["training"].endswith("minutes, after 10 samples")
 
@@ -77,7 +77,7 @@ def test_a_schedule_goes_on_where_the_shipped_weights_left_it(
     monkeypatch.setitem(train.PRESETS, "cpu", PRESET)
     export.write(settled(TINY), tmp_path / "first.onnx", {"training": "92 samples", "licence": "x"})
     out = tmp_path / "out"
-    params = train.Params(data=data, out=out, samples=100, done=92, threads=1, start=tmp_path / "first.onnx")
+    params = train.TrainingOptions(data=data, out=out, samples=100, done=92, threads=1, start=tmp_path / "first.onnx")
     _, facts = export.read(train.main(params))
     _, state = train.load_average(out / "last.pt")
     assert 100 <= state["samples"] < 120  # eight pictures are left of a hundred
@@ -85,7 +85,7 @@ def test_a_schedule_goes_on_where_the_shipped_weights_left_it(
 
 
 def test_the_shipped_model_can_start_training() -> None:
-    run = train.Run(model.SMALL, torch.device("cpu"), 1e-3)
+    run = train.NetworkTraining(model.SMALL, torch.device("cpu"), 1e-3)
     run.begin(ROOT / "calib" / "models" / "polcap.onnx")
     assert run.begun.split()[1] == "samples"
 
@@ -93,25 +93,25 @@ def test_the_shipped_model_can_start_training() -> None:
 def test_a_layer_that_came_to_see_more_starts_as_if_it_did_not(tmp_path: Path) -> None:
     """New channels come last and begin at zero; a layer with other outputs is another network's."""
     own = torch.rand(4, 6, 3, 3)
-    grown = train._widened(own[:, :5], own)
+    grown = train._with_new_channels(own[:, :5], own)
     assert torch.equal(grown[:, :5], own[:, :5]) and not grown[:, 5].any()
-    assert train._widened(own[:3, :5], own).shape == (3, 5, 3, 3)
+    assert train._with_new_channels(own[:3, :5], own).shape == (3, 5, 3, 3)
 
 
 def test_resume_and_start_exclude_each_other(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="take one"):
-        train.main(train.Params(out=tmp_path, resume=True, start=tmp_path / "m.onnx"))
+    with pytest.raises(InputError, match="give one of them"):
+        train.main(train.TrainingOptions(out=tmp_path, resume=True, start=tmp_path / "m.onnx"))
 
 
 def test_a_model_of_another_size_cannot_start_it(tmp_path: Path) -> None:
     export.write(model.Network(TINY), tmp_path / "tiny.onnx", {"licence": "x"})
     with pytest.raises(InputError, match="not a network of this preset"):
-        train.Run(model.SMALL, torch.device("cpu"), 1e-3).begin(tmp_path / "tiny.onnx")
+        train.NetworkTraining(model.SMALL, torch.device("cpu"), 1e-3).begin(tmp_path / "tiny.onnx")
 
 
 def test_steps_on_one_batch_lower_its_loss(simulator: Simulator) -> None:
     torch.manual_seed(0)
-    run, batch = train.Run(TINY, torch.device("cpu"), 3e-3, 2), simulator.draw(4, 64)
+    run, batch = train.NetworkTraining(TINY, torch.device("cpu"), 3e-3, 2), simulator.draw(4, 64)
     run.step = 200  # past the warm-up
     losses = [run.advance([batch, batch], 0.0)["loss"] for _ in range(25)]
     assert losses[-1] < 0.8 * losses[0] and run.skipped == 0
@@ -120,25 +120,25 @@ def test_steps_on_one_batch_lower_its_loss(simulator: Simulator) -> None:
 def test_resume_without_a_checkpoint_says_so(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(train.PRESETS, "cpu", PRESET)
     with pytest.raises(InputError, match="nothing to resume"):
-        train.main(train.Params(data=data, out=tmp_path, resume=True))
+        train.main(train.TrainingOptions(data=data, out=tmp_path, resume=True))
 
 
 def test_a_run_is_not_begun_over_another(data: Path, tmp_path: Path) -> None:
-    train.Run(TINY, torch.device("cpu"), 1e-3).save(tmp_path / "last.pt")
+    train.NetworkTraining(TINY, torch.device("cpu"), 1e-3).save(tmp_path / "last.pt")
     with pytest.raises(InputError, match="go on from it with --resume"):
-        train.main(train.Params(data=data, out=tmp_path))
+        train.main(train.TrainingOptions(data=data, out=tmp_path))
 
 
 def test_a_run_is_resumed_as_it_began(tmp_path: Path) -> None:
-    train.Run(TINY, torch.device("cpu"), 1e-3, variant="published inputs").save(tmp_path / "last.pt")
+    train.NetworkTraining(TINY, torch.device("cpu"), 1e-3, variant="published inputs").save(tmp_path / "last.pt")
     for shape, variant in ((TINY, "ours"), (model.SMALL, "published inputs")):
         with pytest.raises(InputError, match="as 'published inputs'; resume it as it began"):
-            train.Run(shape, torch.device("cpu"), 1e-3, variant=variant).load(tmp_path / "last.pt")
+            train.NetworkTraining(shape, torch.device("cpu"), 1e-3, variant=variant).load(tmp_path / "last.pt")
 
 
-def test_data_without_meshes_to_look_at_is_told_before_anything_is_made(tmp_path: Path) -> None:
+def test_data_without_test_meshes_are_refused_before_anything_is_made(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="meshes/test holds no mesh"):
-        train.main(train.Params(data=tmp_path, out=tmp_path / "out"))
+        train.main(train.TrainingOptions(data=tmp_path, out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 
@@ -151,7 +151,7 @@ def test_same_seed_same_weights(data: Path, tmp_path: Path, monkeypatch: pytest.
             if (tmp_path / "first").exists() and name != "first":
                 (out / cache).parent.mkdir(exist_ok=True)
                 (out / cache).symlink_to(tmp_path / "first" / cache)
-        train.main(train.Params(data=data, out=out, samples=40, threads=1, seed=seed))
+        train.main(train.TrainingOptions(data=data, out=out, samples=40, threads=1, seed=seed))
         weights.append(train.load_average(out / "last.pt")[0].state_dict())
     same, other = ([bool(torch.equal(w, weights[0][k])) for k, w in state.items()] for state in weights[1:])
     assert all(same) and not any(other)
@@ -159,14 +159,14 @@ def test_same_seed_same_weights(data: Path, tmp_path: Path, monkeypatch: pytest.
 
 def test_unknown_preset_is_named() -> None:
     with pytest.raises(InputError, match="'tpu' is not one of cpu, gpu"):
-        train.main(train.Params(preset="tpu"))
+        train.main(train.TrainingOptions(preset="tpu"))
 
 
 def test_rate_falls_to_nothing_over_the_last_part_of_the_budget(data: Path) -> None:
     from polcap.training.dataset import Batch
 
     device = torch.device("cpu")
-    run = train.Run(TINY, device, 1e-3)
+    run = train.NetworkTraining(TINY, device, 1e-3)
     run.step = 1000
     torch.manual_seed(0)
     size = (1, 1, 32, 32)
@@ -192,7 +192,7 @@ def test_rate_falls_to_nothing_over_the_last_part_of_the_budget(data: Path) -> N
 def test_orthogonal_keeps_directions_and_levels_strengths(shape: tuple[int, int]) -> None:
     """Against LAPACK's singular value decomposition."""
     matrix = torch.randn(shape, generator=torch.Generator().manual_seed(3))
-    left, strength, right = torch.linalg.svd(train.orthogonal(matrix[None])[0], full_matrices=False)
+    left, strength, right = torch.linalg.svd(muon.orthogonal(matrix[None])[0], full_matrices=False)
     assert strength.min() > 0.5 and strength.max() < 1.35
     u, _, v = torch.linalg.svd(matrix, full_matrices=False)
     nearest = u @ v
@@ -201,7 +201,7 @@ def test_orthogonal_keeps_directions_and_levels_strengths(shape: tuple[int, int]
 
 def test_every_weight_is_in_one_optimizer() -> None:
     network = model.Network(TINY)
-    optimizers = train._optimizers(network, 1e-3)
+    optimizers = loop.make_optimizers(network, 1e-3)
     held = [w for o in optimizers for g in o.param_groups for w in g["params"]]
     assert sorted(map(id, held)) == sorted(map(id, network.parameters()))
     name = {id(w): name for name, w in network.named_parameters()}

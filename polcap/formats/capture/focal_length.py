@@ -6,8 +6,8 @@ from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
-from polcap.formats import calib
-from polcap.images import Exif
+from polcap.formats import shipped_data
+from polcap.images import Exif, LensGeometry
 
 FULL_FRAME_MM = (36.0, 24.0)
 _CONTRADICTION = 0.1  # ln of the ratio of two statements; focus breathing and rounding stay below
@@ -58,8 +58,14 @@ def find(exif: Exif, stated_mm: float | None, stated_width_mm: float | None) -> 
     return FocalLength(px, _ASSUMED, note)
 
 
+def calibrated(geometry: LensGeometry) -> FocalLength:
+    """The focal length that `polcap calibrate` measured."""
+    note = f"{geometry.focal_px:.0f} px ± {geometry.focal_sigma_px:.1f} (calibrated)"
+    return FocalLength(geometry.focal_px, _KNOWN, note)
+
+
 @cache
 def sensor_widths() -> dict[str, float]:
     """Width of the imaging area [mm] by EXIF model, of the cameras in calib/cameras/sensors.toml."""
-    table = tomllib.loads(calib.data_path("cameras/sensors.toml").read_text(encoding="utf-8"))
+    table = tomllib.loads(shipped_data.data_path("cameras/sensors.toml").read_text(encoding="utf-8"))
     return {model: float(width) for model, width in table["width_mm"].items()}

@@ -18,7 +18,7 @@ from polcap import parallel
 from polcap.errors import CaptureError
 from polcap.formats.capture import capture_toml
 from polcap.formats.capture.capture_toml import CaptureFile
-from polcap.formats.capture.own_folders import OURS
+from polcap.formats.own_folders import OURS
 from polcap.formats.raw import photo, probe
 from polcap.formats.raw.probe import Probe
 from polcap.images import Role

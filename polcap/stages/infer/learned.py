@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from polcap import parallel
 from polcap.errors import ModelError
-from polcap.images import Cues, Floats, Network, Quality, SurfaceMaps
+from polcap.images import Cues, Floats, Network, Quality, RunNetwork, SurfaceMaps
 from polcap.optics import frames
+from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stages.cues import CHANNELS, FLOOR
-from polcap.stages.infer import analytic, augmentation, fine
+from polcap.stages.infer import analytic, augmentation, fine, half_turns
 from polcap.stages.infer.analytic import REACHED, fill_highlights
 
 _INVERSION = 4.0  # factor on the inversion's expected error in the join: the network has seen what it has seen
-_DETAIL = 2.0  # pixels that the network sees, 1σ: what is finer is the inversion's to tell
 # error = min(a·statedᵇ·exp(r·roughness), c), degrees: likeliest on traced training meshes (decision 28)
 _CALIBRATION = (0.515, 1.12, 0.906, 50.0)
 _CELLS = 2.0  # cells of the network's grid, 1σ, over which its pattern is taken as the same
@@ -28,7 +28,9 @@ _GRAZING = 0.15  # cosine below which shading is not told apart; .1 and .2 leave
 _BRIGHTEST = 2.0  # S0, which is 1 where white paper faces the flash beside the chart; what no body reflects
 
 
-def estimate(cues: Cues, network: Network, ior: float, symmetries: int, *, fine_pass: bool) -> SurfaceMaps:
+def estimate(
+    cues: Cues, network: Network, run: RunNetwork, ior: float, symmetries: int, *, fine_pass: bool
+) -> SurfaceMaps:
     """The network's maps, its normals joined with the analytic ones by their expected errors.
 
     The network sees the whole object at the size it was made for, which settles half-turns, shape and gloss.
@@ -41,7 +43,9 @@ def estimate(cues: Cues, network: Network, ior: float, symmetries: int, *, fine_
     cues
         Of the object's crop (H, W).
     network
-        Eats the channels of `stages.cues`.
+        Takes the channels of `stages.cues`.
+    run
+        Runs a network.
     ior
         Refractive index of the inversion.
     symmetries
@@ -54,12 +58,13 @@ def estimate(cues: Cues, network: Network, ior: float, symmetries: int, *, fine_
     ModelError
         A network was made for other channels, or gives other maps.
     """
-    maps, guess, stated = known(cues, network, ior, symmetries)
-    normal = fine.refined(cues, guess, network.fine) if fine_pass and network.fine else guess.normal
+    maps, guess, stated = known(cues, network, run, ior, symmetries)
+    normal = fine.refine(cues, guess, network.fine, run) if fine_pass and network.fine else guess.normal
     lit = (np.maximum(cues.radiance, 0) + FLOOR) * np.exp(maps["factor"])
     diffuse = fill_highlights(lit / _shading(normal, cues.rays) - FLOOR, _bounded(cues))
     scale, power, rougher, most = _CALIBRATION
     expected = np.minimum(scale * stated**power * np.exp(rougher * np.clip(maps["roughness"], 0, 1)), most)
+    expected = half_turns.error_with_doubt(expected, maps["doubt"], frames.dot(normal, cues.rays))
     inside = cues.mask[..., None]
     return SurfaceMaps(
         normal=(normal * inside).astype(np.float32),
@@ -74,30 +79,32 @@ def estimate(cues: Cues, network: Network, ior: float, symmetries: int, *, fine_
     )
 
 
-def known(cues: Cues, network: Network, ior: float, symmetries: int) -> tuple[dict[str, Floats], fine.Guess, Floats]:
+def known(
+    cues: Cues, network: Network, run: RunNetwork, ior: float, symmetries: int
+) -> tuple[dict[str, Floats], fine.CoarseEstimate, Floats]:
     """What stands before the fine pass, whose training begins here too.
 
     Parameters
     ----------
-    cues, network, ior, symmetries
+    cues, network, run, ior, symmetries
         As in `estimate`.
 
     Returns
     -------
     tuple
         The network's maps (H, W[, 3]) at the crop's size, of which `factor` is the logarithm of the light that its
-        albedo sends back under the shading of its normals over S0; what the fine pass is told; the error (H, W)
-        stated for the normals, degrees.
+        albedo sends back under the shading of its normals over S0, and `doubt` the probability of a wrong half-turn;
+        what the fine pass is told; the error (H, W) stated for the normals, degrees.
     """
     _check(network)
     size = cues.mask.shape[::-1]
     shrink = max(1.0, max(size) / int(network.metadata["native_size"]))
     seen = _resized(_bounded(cues), 1 / shrink)
-    small, averaged = parallel.both(
-        partial(augmentation.combined, seen, network, symmetries), partial(analytic.prepare, cues, ior), network.at_once
-    )
+    looks = partial(augmentation.combined, seen, network, run, symmetries)
+    small, averaged = parallel.both(looks, partial(analytic.prepare, cues, ior), network.at_once)
     # beside the object the network guesses: zeros there leave an edge's direction to the object's own pixels
     small["normal"] = _without_grid(small["normal"], seen.mask) * seen.mask[..., None]
+    small["normal"], small["doubt"] = _sided(small["normal"], seen, small["sigma"], small.pop("opposed"))
     small["factor"] = _factor(small["diffuse"] * _shading(small["normal"], seen.rays), seen)
     for name in ("specular", "roughness"):
         small[name] = _blended(small[name], seen.mask)
@@ -107,7 +114,15 @@ def known(cues: Cues, network: Network, ior: float, symmetries: int) -> tuple[di
     by_pixel, doubt, _ = analytic.invert(cues, ior, guide, averaged)
     detailed = _detailed(ahead, by_pixel, cues.mask, shrink)
     normal, stated = _joined((ahead, maps["sigma"]), (detailed, _INVERSION * doubt))
-    return maps, fine.Guess(normal, ahead, maps["sigma"], maps["roughness"], shrink), stated
+    return maps, fine.CoarseEstimate(normal, ahead, maps["sigma"], maps["roughness"], shrink), stated
+
+
+def _sided(normal: Floats, seen: Cues, sigma: Floats, opposed: Floats) -> tuple[Floats, Floats]:
+    """Normals (H, W, 3), regions that the network took for their half-turn turned back; doubt of the side (H, W)."""
+    local = frames.to_ray_frame(normal / np.maximum(_length(normal), 1e-6), seen.rays)
+    found = half_turns.resolve(local, seen.mask, half_turns.NetworkDoubt(sigma, opposed))
+    opposite = 2 * frames.dot(normal, seen.rays)[..., None] * seen.rays - normal
+    return np.where(found.turned[..., None], opposite, normal).astype(np.float32), found.doubt
 
 
 def _bounded(cues: Cues) -> Cues:
@@ -149,14 +164,7 @@ def _detailed(coarse: Floats, by_pixel: Floats, mask: NDArray[np.bool_], shrink:
 
     Interreflection, index and half-turns bend the inversion's normals over whole regions; relief is finer.
     """
-    height, width = mask.shape
-    size = (round(width / shrink), round(height / shrink))
-    inside = mask.astype(np.float32)
-    difference, share = (
-        cv2.GaussianBlur(cv2.resize(image, size, interpolation=cv2.INTER_AREA), (0, 0), _DETAIL)
-        for image in ((coarse - by_pixel).astype(np.float32) * inside[..., None], inside)
-    )
-    moved = by_pixel + cv2.resize(difference / np.maximum(share, 1e-3)[..., None], (width, height))
+    moved = by_pixel + fine.low_pass((coarse - by_pixel).astype(np.float32), mask, shrink)
     return np.asarray(moved / np.maximum(_length(moved), 1e-6))
 
 
@@ -190,18 +198,13 @@ def _resized(cues: Cues, scale: float) -> Cues:
     if scale >= 1.0:
         return cues
     height, width = cues.mask.shape
-    size = (max(16, round(width * scale)), max(16, round(height * scale)))
-
-    def mean(image: Floats) -> Floats:
-        return np.asarray(cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA))
-
+    small = max(16, round(height * scale)), max(16, round(width * scale))
     light = np.maximum(frames.total(cues.radiance), 1e-6) * cues.mask
-    weight = np.maximum(mean(light), 1e-9)
-    ratio = np.stack([mean(r * light) / weight for r in cues.ratio])
-    sigma = mean(cues.ratio_sigma * light) / weight * min(1.0, scale * np.sqrt(width / size[0] * scale))
-    share = mean(cues.mask.astype(np.float32))
-    mask = share > 0.5
-    radiance = mean(cues.radiance * cues.mask[..., None]) / np.maximum(share, 1e-3)[..., None]
+    ratio = np.stack([weighted_area_mean(r, light, small) for r in cues.ratio])
+    averaging = min(1.0, scale * np.sqrt(width / small[1] * scale))
+    sigma = weighted_area_mean(cues.ratio_sigma, light, small) * averaging
+    mask = area_mean(cues.mask, small) > 0.5
+    radiance = weighted_area_mean(cues.radiance, cues.mask, small)
     squared = ratio[0] ** 2 + ratio[1] ** 2
     view = replace(
         cues.view,
@@ -209,7 +212,7 @@ def _resized(cues: Cues, scale: float) -> Cues:
         center=((cues.view.center[0] + 0.5) * scale - 0.5, (cues.view.center[1] + 0.5) * scale - 0.5),
         scale=cues.view.scale / scale,
     )
-    clipped = mean((cues.quality & Quality.CLIPPED).astype(np.float32)) > 0.5 * Quality.CLIPPED
+    clipped = area_mean((cues.quality & Quality.CLIPPED) > 0, small) > 0.5
     return replace(
         cues,
         radiance=radiance,
@@ -217,7 +220,7 @@ def _resized(cues: Cues, scale: float) -> Cues:
         ratio_sigma=sigma,
         dolp=np.sqrt(np.clip(squared - sigma**2, 0, 1)),
         normalized_stokes=ratio / np.sqrt(squared + 1e-12),
-        diffuse_color=mean(cues.diffuse_color),
+        diffuse_color=area_mean(cues.diffuse_color.astype(np.float32), small),
         rays=frames.rays(view, *mask.shape),
         mask=mask,
         quality=np.where(clipped, np.uint8(Quality.CLIPPED), np.uint8(0)),

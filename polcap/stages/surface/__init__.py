@@ -1,13 +1,14 @@
-"""Stage 9: integrate normals to depth, and cut the depth map into a mesh.
+"""Stage 9: depth and mesh, integrated from the normals.
 
-A pixel (i, j) at distance d along the optical axis sits at d·(a, b, −1), a = (i − cx)/f,
-b = −(j − cy)/f. Its normal n is square to the surface, so with z = f ln d and
-m = n_z − a n_x − b n_y the slopes obey m ∂z/∂i = n_x and m ∂z/∂j = −n_y: linear in z, and
-scaled so that one unit of z is about one pixel of depth.
+A pixel (i, j) at distance d along the optical axis is at the point d·(a, b, −1), a = (i − cx)/f, b = −(j − cy)/f.
+Its normal n is square to the surface, so with the scaled log depth z = f ln d and m = n_z − a n_x − b n_y the slopes
+obey m ∂z/∂i = n_x and m ∂z/∂j = −n_y. They are linear in z, and one unit of z is about one pixel of depth.
 
-`integration` solves for z, `jumps` tells where one part hides another, `triangles` makes the mesh.
+`slope_equations` sets them up on a pyramid of grids, `integration` solves them (by `multigrid`), `occlusion` finds
+where one part hides another, `triangles` makes the mesh, and `decimation` its coarser levels.
 """
 
+from dataclasses import replace
 from typing import Annotated
 
 import msgspec
@@ -16,28 +17,29 @@ from msgspec import Meta
 
 from polcap.errors import ObjectError
 from polcap.images import Floats, Mesh, SurfaceMaps
+from polcap.optics.projection import back_project
 from polcap.stages import stage
 from polcap.stages.surface import triangles
-from polcap.stages.surface.backing import Back
-from polcap.stages.surface.decimation import Decimated, decimated
+from polcap.stages.surface.decimation import DecimatedMesh, decimate
 from polcap.stages.surface.integration import log_depth
-from polcap.stages.surface.slope_equations import problem
+from polcap.stages.surface.slope_equations import normal_field
+from polcap.stages.surface.triangles import Back
 
-__all__ = ["Back", "Decimated", "Settings", "decimated", "integrate", "triangulate"]
+__all__ = ["Back", "DecimatedMesh", "SurfaceSettings", "decimate", "integrate", "triangulate"]
 
 
-class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class SurfaceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The section `surface` of a settings file."""
 
     stiffness: Annotated[
         float,
-        Meta(ge=0.0, le=20.0, description="how firmly depth jumps are kept; 0 = plain least squares [1]"),
+        Meta(ge=0.0, le=20.0, description="how firmly depth steps are left open; 0 = plain least squares [1]"),
     ] = 2.0
     iterations: Annotated[
-        int, Meta(ge=1, le=200, description="reweightings on the grid that decides on jumps, at most")
+        int, Meta(ge=1, le=200, description="most reweightings on the grid that decides on depth steps")
     ] = 25
     tolerance: Annotated[
-        float, Meta(ge=1e-8, le=0.1, description="relative change of the energy that ends them [1]")
+        float, Meta(ge=1e-8, le=0.1, description="relative change of the energy that ends the reweightings [1]")
     ] = 1e-3
     steepest_deg: Annotated[
         float,
@@ -53,66 +55,68 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.02
     max_vertices: Annotated[
         int,
-        Meta(ge=1000, le=10_000_000, description="the mesh is thinned to a regular grid under this count"),
+        Meta(ge=1000, le=10_000_000, description="most vertices of the mesh, on a regular grid of pixels"),
     ] = 250_000
-    back: Annotated[Back, Meta(description="walls behind the seen side, with or without a flat back to close it")] = (
-        "open"
-    )
+    back: Annotated[
+        Back, Meta(description="behind the front: nothing, walls (skirt), or walls and a flat back (closed)")
+    ] = "open"
 
 
 @stage(version=12)
-def integrate(maps: SurfaceMaps, distance_m: float | None, settings: Settings) -> Mesh:
+def integrate(maps: SurfaceMaps, distance_m: float | None, settings: SurfaceSettings) -> Mesh:
     """The visible surface of the object, from its normals.
 
-    `distance_m` is the distance of the object along the optical axis [m], which becomes the median
-    depth; without it the median depth is 1.
+    The median depth is `distance_m`, the object's distance along the optical axis [m], or 1 where it is unknown.
 
     Raises
     ------
     ObjectError
-        Fewer than 16 pixels in the mask, or not one of them has a neighbour.
+        The mask has fewer than 16 pixels, or not one of them has a neighbor.
     """
     count = int(maps.mask.sum())
     if count < 16:
         raise ObjectError(f"the mask holds {count} pixels, under 16; mark the object with --mask")
-    z = log_depth(
-        problem(maps, np.radians(settings.steepest_deg), settings.prior_weight),
-        settings.stiffness,
-        settings.iterations,
-        settings.tolerance,
-        settings.jump,
-    )
+    field = normal_field(maps, np.radians(settings.steepest_deg), settings.prior_weight)
+    z = log_depth(field, settings.stiffness, settings.iterations, settings.tolerance, settings.jump)
     depth = np.full(maps.mask.shape, np.nan)
     depth[maps.mask] = np.exp((z - np.median(z)) / maps.view.focal)
     depth *= 1.0 if distance_m is None else distance_m
     return triangulate(depth, maps, distance_m is not None, settings)
 
 
-def triangulate(depth: Floats, maps: SurfaceMaps, metric: bool, settings: Settings) -> Mesh:
-    """The mesh of a depth map: for an export from stored maps, without integrating again.
-
-    Parameters
-    ----------
-    depth
-        (H, W), in metres or relative.
-    maps
-        Mask, view and expected errors of the same crop.
-    metric
-        Whether the depth is in metres.
-    settings
-        Of the stage.
+def triangulate(depth: Floats, maps: SurfaceMaps, metric: bool, settings: SurfaceSettings) -> Mesh:
+    """The mesh of a depth map (H, W), in metres or relative; also for an export from stored maps.
 
     Raises
     ------
     ObjectError
         No triangle fits into the mask.
     """
-    return triangles.triangulate(
-        depth,
-        maps,
-        metric,
-        np.radians(settings.steepest_deg),
-        settings.jump,
-        settings.max_vertices,
-        settings.back,
+    height, width = maps.mask.shape
+    mask = np.asarray(maps.mask & np.isfinite(depth), dtype=bool)
+    step = max(1, int(np.ceil(np.sqrt(mask.sum() / settings.max_vertices))))
+    z = maps.view.focal * np.log(np.where(mask, depth, 1.0))
+    field = normal_field(replace(maps, mask=mask), np.radians(settings.steepest_deg), 0.0)
+    pixel, faces = triangles.grid_triangles(z, triangles.unbroken_links(z, field, settings.jump), step)
+    if len(faces) == 0:
+        raise ObjectError("the mask holds no two neighboring rows and columns; mark the object with --mask")
+    figures = triangles.measure_boundary(pixel, faces, mask, step)
+    x, y = pixel.T
+    place, z_smooth = triangles.smooth_boundary(pixel.astype(np.float64), z[y, x], faces, step)
+    vertices = back_project(maps.view, place[:, 0], place[:, 1]) * np.exp(z_smooth / maps.view.focal)[:, None]
+    uv: Floats = (place + 0.5) / [width, height]
+    normals, tangents = triangles.vertex_frames(vertices, uv, faces)
+    mesh = Mesh(
+        vertices=vertices,
+        normals=normals,
+        uv=uv,
+        tangents=tangents,
+        faces=faces,
+        depth=np.where(mask, depth, np.nan).astype(np.float32),
+        metric=metric,
+        pieces=figures.pieces,
+        cuts=figures.cuts,
+        cut_px=figures.cut_px,
+        raggedness=figures.raggedness,
     )
+    return triangles.to_float32(triangles.add_back(mesh, settings.back))

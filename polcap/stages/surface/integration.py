@@ -1,331 +1,360 @@
-"""Normals of the object's pixels -> scaled log depth z, by least squares with jumps where the surface hides itself.
+"""Integration of normals to scaled log depth z, with cuts where one part of the surface hides another.
 
-Which pixels lie at a jump is decided on a grid of at most `_DECIDED` pixels, by bilateral integration: there noise
-is small against a pixel's own bend, and how much of it there is does not depend on the camera. On finer grids only
-the pixels near those jumps may choose between their neighbours; all others keep both. So a finer picture refines the
-contour and cannot tear the surface.
+Least squares over the slope equations, on a pyramid of grids. On the first grid of at most `_DECISION_PIXELS` pixels,
+where noise is small against the bending of the surface, whatever the resolution of the camera:
+
+1. Occluding contours that the normals show are cut.
+2. Bilateral integration: each pixel trusts the one of its two neighbors per axis that continues its tangent plane.
+3. Contours behind which no gap has opened are restored.
+4. Only pixels near the remaining depth steps may choose between neighbors, and z is solved again.
+5. Cuts that do not lower the residual around them are removed.
+6. Parts that touch are joined.
+
+On each finer grid only pixels near these cuts choose between neighbors. So a finer picture refines the contours and
+cannot tear the surface.
 
 References
 ----------
-Cao, Santo, Shi, Okura & Matsushita, Bilateral normal integration, ECCV 2022: each pixel trusts whichever of its two
-neighbours per axis continues its own tangent plane.
+Cao, Santo, Shi, Okura & Matsushita, Bilateral normal integration, ECCV 2022.
 """
 
 from copy import copy
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
-from polcap.stages.surface.contacts import contacts
-from polcap.stages.surface.multigrid import Multigrid, Nested, conjugate_gradients
-from polcap.stages.surface.occlusion import Jumps, jumps, least_step, radius, widened
-from polcap.stages.surface.pixel_grid import PixelGrid
-from polcap.stages.surface.rims import contours, rims
-from polcap.stages.surface.slope_equations import Problem, equations, halved, parents
+from polcap.optics.outline import disc_radius
+from polcap.stages.surface import occlusion
+from polcap.stages.surface.multigrid import Multigrid, PixelGrid, TwoGrid, conjugate_gradients
+from polcap.stages.surface.occlusion import OcclusionMap, dilate, label_contours
+from polcap.stages.surface.slope_equations import Bools, NormalField, block_numbers, halve, slope_terms
 
-_DECIDED = 80_000  # pixels, at most, of the grid on which jumps are decided
-_SOFT, _ANNEAL = 0.25, 1.2  # stiffness at first, and its growth per iteration: few early errors are kept as jumps
-_REFINED = 2  # solutions on each finer grid with jumps
-_MENDED = 4  # solutions on the grid that decides, after tears were found
-_UNDECIDED = 0.1  # of the prior's pull while jumps are sought: where it strains the normals it tears them
-_REACH = 2  # px around a jump within which pixels choose their neighbours on the next finer grid
-_TIRED = 12  # iterations of a linear solution that call for a new multigrid hierarchy, which costs as much as 28
-_BESIDE = 10  # px from a contour of jumps within which it is asked what it is worth
-_STRAIN = 1.0  # σ² per link of a contour by which the surface beside it may fit its normals worse than without cuts
-_STRAINED = 1.4  # the same as a factor; both have to be passed
-_SEWN = 2  # rounds of sewing what is worth nothing
-_GAP = 0.25  # depth behind a limb, over the object's radius, where nothing else tells it
-_OPEN = 0.3  # share of that gap which opens where a part is free indeed
-_SURE = 1 / 16  # weight of a normal under which it tells of no limb: an error four times the median
-_HOVER = 0.1  # weight of that, of all limbs together
-_ACCURACY = 1e-3  # of each linear solution, relative
-_PROXIMITY = 1e-8  # pulls towards the last estimate: fixes what the normals leave free (one offset per piece)
-_FLATTEST = 0.05  # cosine under which a normal tells no slope
-_TURNED = 1 / 12  # variance of a step that lies anywhere between its ends' slopes, over their difference squared
+_DECISION_PIXELS = 80_000  # at most, of the grid that decides on cuts (docs/benchmarks)
+_DECISION_SOLVES, _FINER_SOLVES = 4, 2  # solutions with choosing pixels, on that grid and on each finer one
+_SOFT, _GROWTH = 0.25, 1.2  # first stiffness, over the setting, and its growth: early errors make few cuts
+_UNDECIDED_PULL = 0.1  # of the prior's pull during the decision: a prior that strains the normals would cut them
+_REACH = 2  # px around a cut within which pixels choose, also on the next finer grid
+_PRECISION = 1e-3  # of each linear solution, relative
+_SLOW = 12  # iterations of a linear solution that call for a new hierarchy, which costs as much as 28
+_PROXIMITY = 1e-8  # pull towards the last estimate: fixes the offset of each separate part
+_LEAST_FACING = 0.05  # cosine: flatter views give no slope
+_BEND = 1 / 12  # variance of a step anywhere between its ends' slopes, over their difference squared
+
+_SURE = 1 / 16  # least weight of a normal that can show an occluding contour: an error of four times the median
+_GAP = 0.25  # expected depth step behind a contour, over the object's radius
+_GAP_WEIGHT = 0.1  # of that expectation, all links together
+_OPEN = 0.3  # least share of the gap that opens where a part is separate
+
+_CUT_ROUNDS = 2  # of removing cuts
+_AROUND = 10  # px from a cut within which the residual is compared
+_STRAIN, _STRAIN_RATIO = 1.0, 1.4  # excess of the residual that condemns a cut: σ² per link, and a factor; both
 
 
-def log_depth(of: Problem, stiffness: float, iterations: int, tolerance: float, jump: float) -> Floats:
-    """z of the object's pixels (N,).
+def log_depth(field: NormalField, stiffness: float, iterations: int, tolerance: float, jump: float) -> Floats:
+    """Scaled log depth z of the object's pixels (N,) [px].
 
     Parameters
     ----------
-    of
+    field
         Normals, weights and prior of N pixels.
     stiffness
-        How firmly jumps are kept; 0 = plain least squares.
+        How exclusively a pixel trusts one neighbor; 0 = plain least squares.
     iterations, tolerance
-        Of the reweighting on the grid that decides: at most so many, or the energy's change.
+        Bilateral iterations on the grid that decides: at most so many, or until the energy changes by less.
     jump
-        Least depth step of a jump over the object's radius.
+        Least depth step of an occlusion, over the object's radius; half of it is one to the integration.
     """
-    z, _, _ = _solved(of, stiffness, iterations, tolerance, jump)
-    return z
+    fields = [field]
+    while len(fields[-1].normal) > _DECISION_PIXELS:
+        fields.append(halve(fields[-1]))
+    level = PyramidLevel(fields.pop(), stiffness, jump / 2)
+    level.decide(iterations, tolerance)
+    while fields:
+        finer = PyramidLevel(fields.pop(), stiffness, jump / 2)
+        finer.refine(level)
+        level = finer
+    return level.z
 
 
-def _solved(
-    of: Problem, stiffness: float, iterations: int, tolerance: float, jump: float
-) -> tuple[Floats, NDArray[np.bool_], Any]:
-    """z (N,), the pixels near its jumps (H, W), and a preconditioner for matrices of this level."""
-    level = _Level(of)
-    if level.grid.size <= _DECIDED:
-        if stiffness > 0:
-            level.leave_limbs()
-        z = level.decided(stiffness, iterations, tolerance)
-        level.close_limbs(z)
-        decided = level.jumps(z, jump / 2)
-        free = ~widened(decided.torn, _REACH)[of.mask] & (stiffness > 0) & decided.any()
-        if not free.any():
-            z = np.zeros_like(z)  # nothing of what was tried is left: plain least squares, to the last bit
-        z, solver = level.mended(z, free, stiffness)
-        z, solver = level.sewn(z, solver, free, stiffness, jump / 2)
-        z, solver = level.joined(z, solver, free, stiffness, jump / 2)
-        return z, level.jumps(z, jump / 2).near(_REACH), solver
-    coarse, parent = halved(of), parents(of.mask)
-    start, at_jumps, solver = _solved(coarse, stiffness, iterations, tolerance, jump)
-    z = level.finer(start, parent)
-    free = at_jumps[coarse.mask][parent] & (stiffness > 0)
-    z, nested = level.refined(z, free, stiffness, parent, solver)
-    found = level.jumps(z, jump / 2).near(_REACH)
-    return z, found & level.grid.image(free, outside=False), nested
+@dataclass(frozen=True)
+class ContourLinks:
+    """M links across occluding contours: their depth step is unknown, and a weak prior sets it."""
+
+    link: NDArray[np.intp]  # (M,) numbers of the links
+    gap: Floats  # (M,) expected depth behind the contour [px], positive where it grows to the right or down
+    step: Floats  # (M,) that and the slope of the nearer side [px]
+
+    def select(self, at: Any) -> "ContourLinks":
+        """Some of the links."""
+        return ContourLinks(self.link[at], self.gap[at], self.step[at])
 
 
-class _Level:
-    """The equations of one pyramid level."""
+_NO_CONTOURS = ContourLinks(np.zeros(0, dtype=np.intp), np.zeros(0), np.zeros(0))
 
-    def __init__(self, of: Problem) -> None:
-        self.of = of
-        self.grid = grid = PixelGrid(of.mask)
-        self.facing, right, down = equations(of)
+
+class PyramidLevel:
+    """One grid of the pyramid: its equations, and the state of their solution.
+
+    Attributes
+    ----------
+    z
+        (N,) scaled log depth [px].
+    choosing
+        (N,) pixels that may trust one neighbor more than the other.
+    cuttable
+        (N,) pixels at which a finer grid may be cut.
+    contours
+        Links without slope.
+    solver
+        Preconditioner of the last matrix, which also serves similar ones.
+    """
+
+    def __init__(self, field: NormalField, stiffness: float, jump: float) -> None:
+        self.field, self.stiffness = field, stiffness
+        self.least_step = occlusion.least_step(field.mask, jump)
+        self.grid = grid = PixelGrid(field.mask)
+        self.facing, right, down = slope_terms(field)
         self.side = (right, down)
         p, q, turn = grid.p, grid.q, grid.turn
         target = np.concatenate([right[p[:turn]] + right[q[:turn]], down[p[turn:]] + down[q[turn:]]]) / 2
         facing = (self.facing[p] + self.facing[q]) / 2
-        steep = np.maximum(facing, _FLATTEST)
-        self.slope = tuple(side / np.maximum(self.facing, _FLATTEST) for side in self.side)
-        turned = self._along(p) - self._along(q)
+        steep = np.maximum(facing, _LEAST_FACING)
+        self.slope = tuple(side / np.maximum(self.facing, _LEAST_FACING) for side in self.side)
+        bend = self._slope_at(p) - self._slope_at(q)
         # a chord's direction is the mean of its ends' tangents (exact on a circle); its variance is that of the
         # normals' angle plus that of where between the two slopes a bend puts the step
-        noise = of.sigma**2 * (1 / of.weight[p] + 1 / of.weight[q]) / 2
-        self.step = target / steep
-        self.chord = of.sigma**2 / (
-            noise * np.maximum(facing**2 + target**2, _FLATTEST**2) / steep**4 + _TURNED * turned**2
+        noise = field.sigma**2 * (1 / field.weight[p] + 1 / field.weight[q]) / 2
+        self.step = target / steep  # (L,) by the normals
+        self.weight = field.sigma**2 / (  # (L,) of that step
+            noise * np.maximum(facing**2 + target**2, _LEAST_FACING**2) / steep**4 + _BEND * bend**2
         )
-        self.limb = np.zeros(0, dtype=np.intp)  # links that leave a limb
-        self.gap = self.leap = np.zeros(0)  # usual depth behind it, positive to the right or down; that and its slope
+        self.z: Floats = np.zeros(grid.size)
+        self.choosing: Bools = np.zeros(grid.size, dtype=bool)
+        self.cuttable: Bools = np.ones(grid.size, dtype=bool)
+        self.contours = _NO_CONTOURS
+        self.solver: Any = None
 
-    def leave_limbs(self) -> None:
-        """From now on, links between a limb and what it hides tell no slope, and pull a little towards a usual gap."""
-        sure = self.of.weight > _SURE
-        lean = [np.where(sure, np.arctan2(side, np.maximum(self.facing, 1e-6)), np.nan) for side in self.side]
-        found = rims((self.grid.image(lean[0]), self.grid.image(lean[1])), self.of.mask)
-        mask = self.of.mask
-        sign = np.concatenate([found.right[mask[:, :-1] & mask[:, 1:]], found.down[mask[:-1] & mask[1:]]])
-        self.limb = np.flatnonzero(sign)
-        self.gap = _GAP * radius(mask) * sign[self.limb]
-        first, second = (self._along(ends)[self.limb] for ends in (self.grid.p, self.grid.q))
-        self.leap = self.gap + np.where(self.gap > 0, first, second)
+    def _slope_at(self, ends: NDArray[np.intp]) -> Floats:
+        """Slope (L,) along each link, at one of its ends."""
+        turn = self.grid.turn
+        return np.concatenate([self.slope[0][ends[:turn]], self.slope[1][ends[turn:]]])
 
-    def close_limbs(self, z: Floats) -> None:
-        """Limbs behind which z opens no gap, because the surface holds together around them, are none."""
-        p, q = self.grid.p[self.limb], self.grid.q[self.limb]
-        open_ = (z[q] - z[p] - self.leap + self.gap) / self.gap
-        at = np.zeros(self.grid.size, dtype=bool)
-        at[p] = True
-        contour = contours(self.grid.image(at, outside=False))[self.of.mask][p]
-        stays = [number for number in np.unique(contour) if np.median(open_[contour == number]) > _OPEN]
-        kept = np.isin(contour, stays)
-        self.limb, self.gap, self.leap = self.limb[kept], self.gap[kept], self.leap[kept]
+    def decide(self, iterations: int, tolerance: float) -> None:
+        """Find z and the cuts without a coarser grid (steps 1–6 of the module)."""
+        if self.stiffness > 0:
+            self.cut_contours()
+        self.integrate_bilaterally(iterations, tolerance)
+        self.restore_contours()
+        found = self.occlusions()
+        self.choosing = ~dilate(found.torn, _REACH)[self.field.mask] & (self.stiffness > 0) & found.any()
+        if not self.choosing.any():
+            self.z = np.zeros_like(self.z)  # no cuts: plain least squares, to the last bit
+        self.solve()
+        self.remove_useless_cuts()
+        self.join_contacts()
 
-    def _along(self, ends: Any) -> Floats:
-        """The slopes (L,) along the links at one end of each."""
-        return np.concatenate([slope[part] for slope, part in zip(self.slope, self._halves(ends))])
+    def refine(self, coarse: "PyramidLevel") -> None:
+        """Find z from that of half the resolution; only pixels near its cuts choose between neighbors."""
+        block = block_numbers(self.field.mask)
+        self.z = self._interpolated(coarse.z, block)
+        self.choosing = self.cuttable = coarse.near_cuts()[block] & (self.stiffness > 0)
+        for _ in range(_FINER_SOLVES if self.choosing.any() else 1):
+            matrix, right, _ = self.equations(self.stiffness, self.field.pull)
+            self.solver = TwoGrid(matrix, block, coarse.solver)
+            self.z, _ = conjugate_gradients(matrix, right, self.z, self.solver, _PRECISION, 20)
 
-    def _halves(self, links: Any) -> tuple[Any, Any]:
-        """What belongs to links to the right, and to links down."""
-        return links[: self.grid.turn], links[self.grid.turn :]
-
-    def decided(self, stiffness: float, iterations: int, tolerance: float) -> Floats:
-        """Bilateral integration of all pixels, its stiffness growing from `_SOFT`, with a tenth of the prior's pull."""
-        z: Floats = np.zeros(self.grid.size)
-        before, taken, solver = np.inf, _TIRED + 1, None
-        free = np.full(self.grid.size, True)
-        for count in range(iterations if stiffness > 0 else 0):
-            firm = stiffness * min(1.0, _SOFT * _ANNEAL**count)
-            matrix, right, energy = self.linear(z, free, firm, _UNDECIDED * self.of.pull)
-            if firm == stiffness and abs(before - energy) <= tolerance * energy:
-                break
-            before = energy
-            if solver is None or taken > _TIRED:  # until then, an older matrix's multigrid still serves
-                solver = Multigrid(matrix, self.grid.pixel)
-            z, taken = conjugate_gradients(matrix, right, z, solver, _ACCURACY, 30)
-        return z
-
-    def mended(
-        self, z: Floats, free: NDArray[np.bool_], stiffness: float, solver: Multigrid | None = None
-    ) -> tuple[Floats, Multigrid]:
-        """From the decision, or a solution and its solver: fewer pixels may choose, all of the prior's pull."""
-        taken = 0
-        for _ in range(_MENDED if free.any() else 1):
-            matrix, right, _ = self.linear(z, free, stiffness, self.of.pull)
-            if solver is None or taken > _TIRED:
-                solver = Multigrid(matrix, self.grid.pixel)
-            z, taken = conjugate_gradients(matrix, right, z, solver, _ACCURACY, 30)
-        assert solver is not None
-        return z, solver
-
-    def sewn(
-        self, z: Floats, solver: Multigrid, free: NDArray[np.bool_], stiffness: float, least: float
-    ) -> tuple[Floats, Multigrid]:
-        """From z and its solver: contours of jumps that do not pay are closed, their pixels taken out of `free`.
-
-        A true jump relieves the surface about it, for slopes that no longer have to bridge it fit their normals. One
-        beside which they fit worse than on a surface without cuts is none.
-        """
-        whole: tuple[Floats, Multigrid] | None = None
-        for _ in range(_SEWN):
-            found = self.jumps(z, least)
-            if not found.any() or not free.any():
-                break
-            if whole is None:
-                whole = self._without_limbs().mended(np.zeros_like(z), np.zeros_like(free), stiffness)
-            close = self._worthless(found, self._strain(whole[0]), self._strain(z))
-            if not close.any():
-                break
-            z, solver = self._closed(z, solver, free, close, stiffness)
-            if not self.jumps(z, least).any():
-                free[:] = False
-                return whole  # plain least squares, to the last bit
-        return z, solver
-
-    def joined(
-        self, z: Floats, solver: Multigrid, free: NDArray[np.bool_], stiffness: float, least: float
-    ) -> tuple[Floats, Multigrid]:
-        """From z and its solver: parts that stand free are joined where they touch, the pixels taken out of `free`."""
-        found = self.jumps(z, least)
-        if not found.any() or not free.any():
-            return z, solver
-        grid, apart = self.grid, self._jumping(found)
-        apart[self.limb] = True
-        step, ends = z[grid.q] - z[grid.p], (self._along(grid.p), self._along(grid.q))
-        touch = contacts(grid, apart, step - np.clip(step, np.minimum(*ends), np.maximum(*ends)), radius(self.of.mask))
-        if not touch.any():
-            return z, solver
-        at = np.zeros(grid.size, dtype=bool)
-        at[grid.p[touch]] = at[grid.q[touch]] = True
-        close = widened(grid.image(at, outside=False), _REACH)[self.of.mask]
-        z, solver = self._closed(z, solver, free, close, stiffness)
-        if not self.jumps(z, least).any():
-            free[:] = False  # plain least squares, to the last bit
-            return self._without_limbs().mended(np.zeros_like(z), free, stiffness)
-        return z, solver
-
-    def _closed(
-        self, z: Floats, solver: Multigrid, free: NDArray[np.bool_], close: NDArray[np.bool_], stiffness: float
-    ) -> tuple[Floats, Multigrid]:
-        """From z and its solver: pixels to close (N,) lose choice and limb."""
-        free &= ~close
-        stays = ~close[self.grid.p[self.limb]]
-        self.limb, self.gap, self.leap = self.limb[stays], self.gap[stays], self.leap[stays]
-        return self.mended(z, free, stiffness, solver)
-
-    def _jumping(self, found: Jumps) -> NDArray[np.bool_]:
-        """Links (L,) at jumps."""
-        mask = self.of.mask
-        return np.concatenate([found.right[mask[:, :-1] & mask[:, 1:]], found.down[mask[:-1] & mask[1:]]])
-
-    def _without_limbs(self) -> "_Level":
-        level = copy(self)
-        level.limb, level.gap, level.leap = np.zeros(0, dtype=np.intp), np.zeros(0), np.zeros(0)
-        return level
-
-    def _strain(self, z: Floats) -> Floats:
-        """How badly z fits the slope of each link (L,), in variances of the median normal."""
-        return np.asarray(self.chord * (z[self.grid.q] - z[self.grid.p] - self.step) ** 2 / self.of.sigma**2)
-
-    def _worthless(self, found: Jumps, whole: Floats, cut: Floats) -> NDArray[np.bool_]:
-        """Pixels (N,) about contours of jumps beside which links are strained more (L,) than with no cut at all."""
-        mask, p = self.of.mask, self.grid.p
-        jumping = self._jumping(found)
-        contour = contours(found.near(0))
-        links = np.bincount(contour[mask][p], jumping, minlength=int(contour.max()) + 1)
-        close = np.zeros(mask.shape, dtype=bool)
-        for number in np.flatnonzero(links[1:]) + 1:
-            at = contour == number
-            beside = widened(at, _BESIDE)[mask][p] & ~widened(at, 1)[mask][p]
-            without, with_it = (strain[beside & ~jumping].sum() / links[number] for strain in (whole, cut))
-            if with_it > max(without + _STRAIN, _STRAINED * without):
-                close |= widened(at, _REACH)
-        return np.asarray(close[mask])
-
-    def refined(
-        self, z: Floats, free: NDArray[np.bool_], stiffness: float, parent: Any, coarse: Any
-    ) -> tuple[Floats, "Nested"]:
-        """From the solution at half the resolution; only `free` pixels choose between neighbours."""
-        solver = None
-        for _ in range(_REFINED if free.any() else 1):
-            matrix, right, _ = self.linear(z, free, stiffness, self.of.pull)
-            solver = Nested(matrix, parent, coarse)
-            z, _ = conjugate_gradients(matrix, right, z, solver, _ACCURACY, 20)
-        assert solver is not None
-        return z, solver
-
-    def linear(self, z: Floats, free: NDArray[np.bool_], stiffness: float, pull: float) -> tuple[Any, Floats, float]:
-        """Matrix and right side of the weighted least squares about z, and z's energy."""
-        grid, facing = self.grid, self.facing
-        link, flux = self.chord.copy(), self.chord * self.step
-        change = z[grid.q] - z[grid.p]
-        energy = 0.0
-        if free.any():
-            for part, side in zip((slice(None, grid.turn), slice(grid.turn, None)), self.side):
-                chosen, both = self._choosing(free, part)
-                p, q, step = grid.p[chosen], grid.q[chosen], change[chosen]
-                ahead, behind = np.zeros(grid.size), np.zeros(grid.size)  # m ∂z on either side; 0 past the mask
-                first, second = facing[p], facing[q]
-                ahead[p], behind[q] = first * step, second * step
-                forward, backward = (
-                    _sigmoid(stiffness * (a[e] ** 2 - b[e] ** 2))
-                    for a, b, e in ((behind, ahead, p), (ahead, behind, q))
-                )
-                forward *= self.of.weight[p]
-                backward *= self.of.weight[q]
-                energy += float(forward @ (ahead - side)[p] ** 2 + backward @ (behind - side)[q] ** 2)
-                forward *= first
-                backward *= second
-                at = chosen if both is None else chosen[both]
-                link[at] = _where(forward * first + backward * second, both)
-                flux[at] = _where(forward * side[p] + backward * side[q], both)
-        link[self.limb] = weight = _HOVER / max(len(self.limb), 1)
-        flux[self.limb] = weight * self.leap
-        diagonal, right = np.full(grid.size, _PROXIMITY), _PROXIMITY * z + grid.divergence(flux)
-        if self.of.prior is not None:
-            diagonal += pull
-            right = right + pull * self.of.prior
-        return grid.laplacian(link, diagonal), right, energy
-
-    def _choosing(self, free: NDArray[np.bool_], part: slice) -> tuple[Any, NDArray[np.bool_] | None]:
-        """The links of a part with an end among `free` pixels (N,), and which of them have both; None: all of them."""
-        if free.all():
-            return part, None
-        p, q = free[self.grid.p[part]], free[self.grid.q[part]]
-        chosen = np.flatnonzero(p | q)
-        return chosen + (part.start or 0), (p & q)[chosen]
-
-    def finer(self, coarse: Floats, parent: NDArray[np.intp]) -> Floats:
-        """z from that of half the resolution: each block tilted by its pixels' own slopes."""
+    def _interpolated(self, coarse: Floats, block: NDArray[np.intp]) -> Floats:
+        """z (N,) from that of 2×2 blocks, each tilted by the slopes of its pixels."""
         steep = np.maximum(self.facing, 0.1)
         row, column = self.grid.row % 2 - 0.5, self.grid.column % 2 - 0.5
         tilt = (column * self.side[0] + row * self.side[1]) / steep
-        return np.asarray(2 * coarse[parent] + tilt)
+        return np.asarray(2 * coarse[block] + tilt)
 
-    def jumps(self, z: Floats, least: float) -> Jumps:
+    def near_cuts(self) -> Bools:
+        """Pixels (N,) near the cuts."""
+        return self.occlusions().near(_REACH)[self.field.mask] & self.cuttable
+
+    def cut_contours(self) -> None:
+        """Drop the slopes of links across the occluding contours that the normals show."""
+        sure = self.field.weight > _SURE
+        lean = [np.where(sure, np.arctan2(side, np.maximum(self.facing, 1e-6)), np.nan) for side in self.side]
+        found = occlusion.occluding_contours((self.grid.image(lean[0]), self.grid.image(lean[1])), self.field.mask)
+        sign = self.grid.links(*found)
+        link = np.flatnonzero(sign)
+        gap = _GAP * disc_radius(self.field.mask) * sign[link]
+        first, second = (self._slope_at(ends)[link] for ends in (self.grid.p, self.grid.q))
+        self.contours = ContourLinks(link, gap, gap + np.where(gap > 0, first, second))
+
+    def integrate_bilaterally(self, iterations: int, tolerance: float) -> None:
+        """Find z with all pixels choosing; the stiffness grows from `_SOFT` times the setting."""
+        self.choosing = np.full(self.grid.size, True)
+        before, taken, solver = np.inf, 0, None
+        for count in range(iterations if self.stiffness > 0 else 0):
+            stiffness = self.stiffness * min(1.0, _SOFT * _GROWTH**count)
+            matrix, right, energy = self.equations(stiffness, _UNDECIDED_PULL * self.field.pull)
+            if stiffness == self.stiffness and abs(before - energy) <= tolerance * energy:
+                break
+            before = energy
+            if solver is None or taken > _SLOW:
+                solver = Multigrid(matrix, self.grid.pixel)
+            self.z, taken = conjugate_gradients(matrix, right, self.z, solver, _PRECISION, 30)
+
+    def restore_contours(self) -> None:
+        """Give their slopes back to contours behind which z has opened no gap: the surface is whole around them."""
+        link, gap = self.contours.link, self.contours.gap
+        p, q = self.grid.p[link], self.grid.q[link]
+        opened = (self.z[q] - self.z[p] - self.contours.step + gap) / gap
+        at = np.zeros(self.grid.size, dtype=bool)
+        at[p] = True
+        contour = label_contours(self.grid.image(at, outside=False))[self.field.mask][p]
+        separate = [number for number in np.unique(contour) if np.median(opened[contour == number]) > _OPEN]
+        self.contours = self.contours.select(np.isin(contour, separate))
+
+    def solve(self) -> None:
+        """Find z with the pixels that may choose, from the present z and solver."""
+        taken = 0
+        for _ in range(_DECISION_SOLVES if self.choosing.any() else 1):
+            matrix, right, _ = self.equations(self.stiffness, self.field.pull)
+            if self.solver is None or taken > _SLOW:
+                self.solver = Multigrid(matrix, self.grid.pixel)
+            self.z, taken = conjugate_gradients(matrix, right, self.z, self.solver, _PRECISION, 30)
+
+    def remove_useless_cuts(self) -> None:
+        """Close the cuts around which z fits the slopes worse than on a surface without cuts.
+
+        A true occlusion relieves the surface around it: slopes no longer have to bridge its step.
+        """
+        uncut: PyramidLevel | None = None
+        for _ in range(_CUT_ROUNDS):
+            found = self.occlusions()
+            if not found.any() or not self.choosing.any():
+                return
+            uncut = uncut or self.without_cuts()
+            useless = self._useless_cuts(found, uncut)
+            if not useless.any():
+                return
+            self._close(useless)
+            if not self.occlusions().any():
+                self._become(uncut)
+                return
+
+    def _useless_cuts(self, found: OcclusionMap, uncut: "PyramidLevel") -> Bools:
+        """Pixels (N,) near the cuts around which the links are strained more than without any cut."""
+        mask, p = self.field.mask, self.grid.p
+        cut = self.grid.links(found.right, found.down)
+        contour = label_contours(found.near(0))
+        count = np.bincount(contour[mask][p], cut, minlength=int(contour.max()) + 1)
+        useless = np.zeros(mask.shape, dtype=bool)
+        strains = (uncut.strain(), self.strain())
+        for number in np.flatnonzero(count[1:]) + 1:
+            at = contour == number
+            around = dilate(at, _AROUND)[mask][p] & ~dilate(at, 1)[mask][p]
+            without, with_cut = (strain[around & ~cut].sum() / count[number] for strain in strains)
+            if with_cut > max(without + _STRAIN, _STRAIN_RATIO * without):
+                useless |= dilate(at, _REACH)
+        return np.asarray(useless[mask])
+
+    def strain(self) -> Floats:
+        """Squared residual of each link's slope (L,), in variances of the median normal."""
+        change = self.z[self.grid.q] - self.z[self.grid.p]
+        return np.asarray(self.weight * (change - self.step) ** 2 / self.field.sigma**2)
+
+    def join_contacts(self) -> None:
+        """Close the cuts where two separated parts touch."""
+        found = self.occlusions()
+        if not found.any() or not self.choosing.any():
+            return
+        grid, separate = self.grid, self.grid.links(found.right, found.down)
+        separate[self.contours.link] = True
+        step, ends = self.z[grid.q] - self.z[grid.p], (self._slope_at(grid.p), self._slope_at(grid.q))
+        excess = step - np.clip(step, np.minimum(*ends), np.maximum(*ends))
+        touch = occlusion.contact_links(grid, separate, excess, disc_radius(self.field.mask))
+        if not touch.any():
+            return
+        at = np.zeros(grid.size, dtype=bool)
+        at[grid.p[touch]] = at[grid.q[touch]] = True
+        self._close(dilate(grid.image(at, outside=False), _REACH)[self.field.mask])
+        if not self.occlusions().any():
+            self._become(self.without_cuts())
+
+    def _close(self, pixels: Bools) -> None:
+        """Pixels (N,) no longer choose, and their links have slopes again; z is solved again."""
+        self.choosing = self.choosing & ~pixels
+        self.contours = self.contours.select(~pixels[self.grid.p[self.contours.link]])
+        self.solve()
+
+    def without_cuts(self) -> "PyramidLevel":
+        """The same equations solved by plain least squares."""
+        level = copy(self)
+        level.contours, level.choosing = _NO_CONTOURS, np.zeros(self.grid.size, dtype=bool)
+        level.z, level.solver = np.zeros_like(self.z), None
+        level.solve()
+        return level
+
+    def _become(self, other: "PyramidLevel") -> None:
+        self.z, self.choosing = other.z, other.choosing
+        self.contours, self.solver = other.contours, other.solver
+
+    def occlusions(self) -> OcclusionMap:
+        """Where z steps by more than the normals explain."""
         right, down = (self.grid.image(slope, 0.0) for slope in self.slope)
-        return jumps(self.grid.image(z, 0.0), (right, down), self.of.mask, least_step(self.of.mask, least))
+        return occlusion.depth_steps(self.grid.image(self.z, 0.0), (right, down), self.field.mask, self.least_step)
 
+    def equations(self, stiffness: float, pull: float) -> tuple[Any, Floats, float]:
+        """Matrix (N, N) and right side (N,) of the weighted least squares about the present z; its bilateral energy."""
+        grid = self.grid
+        weight, flux = self.weight.copy(), self.weight * self.step
+        change = self.z[grid.q] - self.z[grid.p]
+        energy = 0.0
+        if self.choosing.any():
+            for part, side in zip((slice(None, grid.turn), slice(grid.turn, None)), self.side):
+                energy += self._weigh_neighbors(part, side, change, stiffness, weight, flux)
+        weight[self.contours.link] = little = _GAP_WEIGHT / max(len(self.contours.link), 1)
+        flux[self.contours.link] = little * self.contours.step
+        diagonal, right = np.full(grid.size, _PROXIMITY), _PROXIMITY * self.z + grid.divergence(flux)
+        if self.field.prior is not None:
+            diagonal += pull
+            right = right + pull * self.field.prior
+        return grid.laplacian(weight, diagonal), right, energy
 
-def _where(value: Floats, these: NDArray[np.bool_] | None) -> Floats:
-    return value if these is None else value[these]
+    def _weigh_neighbors(
+        self, part: slice, side: Floats, change: Floats, stiffness: float, weight: Floats, flux: Floats
+    ) -> float:
+        """Write weight and flux (L,) of the links between choosing pixels of one axis; returns their energy.
+
+        With m ∂z on either side of a pixel, the weight of the side ahead is σ(k (behind² − ahead²)), k the stiffness
+        and σ the sigmoid (Cao et al.).
+        """
+        facing, grid = self.facing, self.grid
+        chosen, both = self._choosing_links(part)
+        p, q, step = grid.p[chosen], grid.q[chosen], change[chosen]
+        ahead, behind = np.zeros(grid.size), np.zeros(grid.size)  # m ∂z on either side; 0 past the mask
+        first, second = facing[p], facing[q]
+        ahead[p], behind[q] = first * step, second * step
+        forward, backward = (
+            _sigmoid(stiffness * (a[e] ** 2 - b[e] ** 2)) for a, b, e in ((behind, ahead, p), (ahead, behind, q))
+        )
+        forward *= self.field.weight[p]
+        backward *= self.field.weight[q]
+        energy = float(forward @ (ahead - side)[p] ** 2 + backward @ (behind - side)[q] ** 2)
+        forward *= first
+        backward *= second
+        at = chosen if both is None else chosen[both]
+        inside = slice(None) if both is None else both
+        weight[at] = (forward * first + backward * second)[inside]
+        flux[at] = (forward * side[p] + backward * side[q])[inside]
+        return energy
+
+    def _choosing_links(self, part: slice) -> tuple[Any, Bools | None]:
+        """Links of one axis with an end that chooses, and which of them have both; None where all pixels choose."""
+        if self.choosing.all():
+            return part, None
+        p, q = self.choosing[self.grid.p[part]], self.choosing[self.grid.q[part]]
+        chosen = np.flatnonzero(p | q)
+        return chosen + (part.start or 0), (p & q)[chosen]
 
 
 def _sigmoid(x: Floats) -> Floats:

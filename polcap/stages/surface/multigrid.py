@@ -1,7 +1,7 @@
-"""Solve A x = b for the weighted Laplacian of a pixel grid: conjugate gradients, algebraic multigrid inside.
+"""Sparse linear systems on a pixel grid: weighted Laplacians, solved by multigrid-preconditioned conjugate gradients.
 
-The weights of neighbouring pixels may differ by many powers of ten (surfaces are cut apart where the
-depth jumps), so unknowns are lumped only along strong links, within blocks of 3×3 pixels.
+Weights of neighboring links may differ by many powers of ten (cuts are links of almost no weight), so unknowns are
+aggregated along strong links only, within blocks of 3×3 pixels.
 
 References
 ----------
@@ -18,99 +18,92 @@ from numpy.typing import NDArray
 from polcap.images import Floats
 
 _COARSEST = 400  # unknowns that are solved directly
-_STRONG = 0.02  # links under this share of √(a_ii a_jj) do not lump their ends
+_STRONG = 0.02  # least link, over √(a_ii a_jj), along which unknowns are aggregated
+_LEAST_COARSENING = 0.7  # the hierarchy ends where a coarser level would hold a greater share of the unknowns
 _SPECTRUM = 2.0  # D⁻¹A of a Laplacian with a shift has its eigenvalues in 0…2 (Gershgorin)
 _DAMPING = 4 / 3 / _SPECTRUM
 
 
-@dataclass(frozen=True)
-class _Level:
-    matrix: Any  # (N, N) CSR
-    step: Floats  # (N,) of a damped Jacobi iteration
-    prolong: Any  # (N, n) CSR
-    restrict: Any  # (n, N) CSR
+class PixelGrid:
+    """The N pixels of a mask (H, W), numbered row by row, and the L links between neighbors.
 
-
-class Multigrid:
-    """One V-cycle for a symmetric positive definite matrix: a preconditioner.
-
-    Parameters
-    ----------
-    matrix
-        (N, N) CSR, float64, off-diagonals ≤ 0.
-    cell
-        (N, 2) whole-number pixel positions of the unknowns.
+    `p` and `q` (L,) are the pixels that a link joins: first all links to the right, then, from number `turn` on, all
+    links down.
     """
 
-    def __init__(self, matrix: Any, cell: NDArray[np.int64]) -> None:
-        from scipy.sparse.linalg import splu  # here: importing it costs .3 s of every start
+    def __init__(self, mask: NDArray[np.bool_]) -> None:
+        self.mask = mask
+        number = np.full(mask.shape, -1, dtype=np.int32)
+        number[mask] = np.arange(int(mask.sum()), dtype=np.int32)
+        self.row, self.column = np.nonzero(mask)
+        right, down = _links(number[:, :-1], number[:, 1:]), _links(number[:-1], number[1:])
+        self.turn = len(right[0])
+        self.p, self.q = (np.concatenate(ends) for ends in zip(right, down))
+        self._lay_out(right, down)
 
-        self.levels: list[_Level] = []
-        while matrix.shape[0] > _COARSEST:
-            cell = cell // 3
-            group, count = _aggregate(matrix, cell)
-            if count > 0.7 * matrix.shape[0]:
-                break
-            prolong = _prolongation(matrix, group, count)
-            restrict = prolong.T.tocsr()
-            self.levels.append(_Level(matrix, _DAMPING * (1 / matrix.diagonal()), prolong, restrict))
-            matrix = (restrict @ (matrix @ prolong)).tocsr()
-            kept = np.zeros((count, 2), dtype=np.int64)
-            kept[group] = cell
-            cell = kept
-        self.coarsest = splu(matrix.tocsc())
+    @property
+    def size(self) -> int:
+        """N."""
+        return len(self.row)
 
-    def __call__(self, right: Floats) -> Floats:
-        """One cycle from zero: about A⁻¹ times a residual (N,)."""
-        return self._cycle(0, right)
+    @property
+    def pixel(self) -> NDArray[np.int64]:
+        """Row and column of each pixel, (N, 2)."""
+        return np.stack([self.row, self.column], axis=-1)
 
-    def _cycle(self, depth: int, right: Floats) -> Floats:
-        if depth == len(self.levels):
-            return np.asarray(self.coarsest.solve(right))
-        level = self.levels[depth]
-        x = level.step * right
-        x += level.prolong @ self._cycle(depth + 1, level.restrict @ (right - level.matrix @ x))
-        left = right - level.matrix @ x
-        left *= level.step
-        left += x
-        return np.asarray(left)
+    def _lay_out(self, right: Any, down: Any) -> None:
+        """The sparsity pattern: up, left, itself, right and down of each pixel, which is the order of the columns."""
+        size, count = self.size, len(self.p)
+        place = np.full((size, 5), -1, dtype=np.int32)  # which link or pixel each stored value belongs to
+        link = np.arange(count, dtype=np.int32)
+        place[self.q[self.turn :], 0] = link[self.turn :]
+        place[self.q[: self.turn], 1] = link[: self.turn]
+        place[:, 2] = count + np.arange(size, dtype=np.int32)
+        place[self.p[: self.turn], 3] = link[: self.turn]
+        place[self.p[self.turn :], 4] = link[self.turn :]
+        neighbor = np.zeros((size, 5), dtype=np.int32)
+        neighbor[down[1], 0], neighbor[right[1], 1] = down[0], right[0]
+        neighbor[:, 2] = np.arange(size, dtype=np.int32)
+        neighbor[right[0], 3], neighbor[down[0], 4] = right[1], down[1]
+        there = place >= 0
+        self._place = place[there]
+        self._indices = neighbor[there]
+        self._starts = np.concatenate([[0], np.cumsum(there.sum(axis=1))]).astype(np.int32)
+
+    def laplacian(self, link: Floats, diagonal: Floats) -> Any:
+        """CSR matrix (N, N) of link weights (L,) plus a diagonal (N,)."""
+        from scipy import sparse  # here: a start that integrates nothing does without SciPy
+
+        total = diagonal + np.bincount(self.p, link, self.size) + np.bincount(self.q, link, self.size)
+        values = np.concatenate([-link, total])[self._place]
+        return sparse.csr_matrix((values, self._indices, self._starts), (self.size, self.size))
+
+    def divergence(self, flux: Floats) -> Floats:
+        """Sum into each pixel (N,) of a flux (L,) from p to q."""
+        into = np.asarray(np.bincount(self.q, flux, self.size), dtype=np.float64)
+        return np.asarray(into - np.bincount(self.p, flux, self.size))
+
+    def image(self, values: NDArray[Any], outside: float = np.nan) -> NDArray[Any]:
+        """Values (N,) at their pixels, (H, W)."""
+        full = np.full(self.mask.shape, outside, dtype=values.dtype)
+        full[self.mask] = values
+        return full
+
+    def links(self, right: NDArray[Any], down: NDArray[Any]) -> NDArray[Any]:
+        """Values (L,) from images of the links to the right (H, W−1) and down (H−1, W)."""
+        mask = self.mask
+        return np.concatenate([right[mask[:, :-1] & mask[:, 1:]], down[mask[:-1] & mask[1:]]])
 
 
-class Nested:
-    """One cycle on a grid whose half resolution has a preconditioner already.
-
-    The coarse equations are those of the same surface on blocks of 2×2 pixels, in the same unit per pixel: a step
-    of 1 on the fine grid weighs there as much as here, so block means correct the fine solution unscaled.
-
-    Parameters
-    ----------
-    matrix
-        (N, N) CSR.
-    parent
-        (N,) number of the block that each unknown lies in.
-    coarse
-        The preconditioner of the blocks.
-    """
-
-    def __init__(self, matrix: Any, parent: NDArray[np.intp], coarse: Callable[[Floats], Floats]) -> None:
-        self.matrix, self.parent, self.coarse = matrix.astype(np.float32), parent, coarse
-        self.inverse_diagonal = 1 / self.matrix.diagonal()
-        self.blocks = int(parent.max()) + 1
-
-    def __call__(self, right: Floats) -> Floats:
-        """Smooth, correct on the blocks, smooth: about A⁻¹ times a residual (N,)."""
-        right = right.astype(np.float32)
-        step = _DAMPING * self.inverse_diagonal
-        x = step * right
-        left = np.asarray(np.bincount(self.parent, right - self.matrix @ x, self.blocks), dtype=np.float64)
-        x = x + self.coarse(left).astype(np.float32)[self.parent]
-        return np.asarray(x + step * (right - self.matrix @ x))
+def _links(first: NDArray[np.int32], second: NDArray[np.int32]) -> tuple[Any, Any]:
+    both = (first >= 0) & (second >= 0)
+    return first[both], second[both]
 
 
 def conjugate_gradients(
     matrix: Any, right: Floats, start: Floats, precondition: Any, tolerance: float, most: int
 ) -> tuple[Floats, int]:
-    """Solve A x = b by preconditioned conjugate gradients.
+    """Solve A x = b by preconditioned conjugate gradients; returns x (N,) and the iterations.
 
     Parameters
     ----------
@@ -119,18 +112,9 @@ def conjugate_gradients(
     right, start
         b and the first x, (N,).
     precondition
-        Residual (N,) → a guess of A⁻¹ times it.
+        From a residual (N,) to an estimate of A⁻¹ times it.
     tolerance
-        It ends at |b − A x| ≤ tolerance |b|,
-    most
-        or after so many iterations.
-
-    Returns
-    -------
-    x : Floats
-        (N,)
-    iterations : int
-        Taken.
+        Ends at |b − A x| ≤ tolerance |b|, or after `most` iterations.
 
     References
     ----------
@@ -154,8 +138,63 @@ def conjugate_gradients(
     return x, most
 
 
+@dataclass(frozen=True)
+class MultigridLevel:
+    """One level of the hierarchy: N unknowns, n on the next level."""
+
+    matrix: Any  # (N, N) CSR
+    step: Floats  # (N,) of a damped Jacobi iteration
+    prolong: Any  # (N, n) CSR
+    restrict: Any  # (n, N) CSR
+
+
+class Multigrid:
+    """Algebraic multigrid preconditioner: one V-cycle for a symmetric positive definite matrix.
+
+    Parameters
+    ----------
+    matrix
+        (N, N) CSR, float64, off-diagonals ≤ 0.
+    cell
+        (N, 2) whole-number pixel positions of the unknowns.
+    """
+
+    def __init__(self, matrix: Any, cell: NDArray[np.int64]) -> None:
+        from scipy.sparse.linalg import splu  # here: importing it costs .3 s of every start
+
+        self.levels: list[MultigridLevel] = []
+        while matrix.shape[0] > _COARSEST:
+            cell = cell // 3
+            group, count = _aggregate(matrix, cell)
+            if count > _LEAST_COARSENING * matrix.shape[0]:
+                break
+            prolong = _prolongation(matrix, group, count)
+            restrict = prolong.T.tocsr()
+            self.levels.append(MultigridLevel(matrix, _DAMPING * (1 / matrix.diagonal()), prolong, restrict))
+            matrix = (restrict @ (matrix @ prolong)).tocsr()
+            cell_of_group = np.zeros((count, 2), dtype=np.int64)
+            cell_of_group[group] = cell
+            cell = cell_of_group
+        self.coarsest = splu(matrix.tocsc())
+
+    def __call__(self, right: Floats) -> Floats:
+        """One cycle from zero: about A⁻¹ times a residual (N,)."""
+        return self._cycle(0, right)
+
+    def _cycle(self, depth: int, right: Floats) -> Floats:
+        if depth == len(self.levels):
+            return np.asarray(self.coarsest.solve(right))
+        level = self.levels[depth]
+        x = level.step * right
+        x += level.prolong @ self._cycle(depth + 1, level.restrict @ (right - level.matrix @ x))
+        left = right - level.matrix @ x
+        left *= level.step
+        left += x
+        return np.asarray(left)
+
+
 def _aggregate(matrix: Any, cell: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Group number of each unknown: the parts of a cell that strong links hold together."""
+    """Group number of each unknown, and their count: parts of a cell that strong links join."""
     from scipy import sparse
     from scipy.sparse.csgraph import connected_components
 
@@ -173,10 +212,41 @@ def _aggregate(matrix: Any, cell: NDArray[np.int64]) -> tuple[NDArray[np.int64],
 
 
 def _prolongation(matrix: Any, group: NDArray[np.int64], count: int) -> Any:
-    """Piecewise constant over the groups, then one damped Jacobi step towards low energy."""
+    """Piecewise constant over the groups, then smoothed by one damped Jacobi step."""
     from scipy import sparse
 
     size = matrix.shape[0]
-    lump = sparse.csr_matrix((np.ones(size), group, np.arange(size + 1)), (size, count))
+    piecewise = sparse.csr_matrix((np.ones(size), group, np.arange(size + 1)), (size, count))
     step = sparse.diags(_DAMPING / matrix.diagonal())
-    return (lump - step @ (matrix @ lump)).tocsr()
+    return (piecewise - step @ (matrix @ piecewise)).tocsr()
+
+
+class TwoGrid:
+    """Two-grid preconditioner: one cycle on a grid and on that of half its resolution, which has a preconditioner.
+
+    The coarse equations are those of the same surface on blocks of 2×2 pixels, and the links of both grids weigh the
+    same per pixel of depth step, so means over the blocks correct the fine solution unscaled.
+
+    Parameters
+    ----------
+    matrix
+        (N, N) CSR.
+    block
+        (N,) number of each unknown's block.
+    coarse
+        Preconditioner of the blocks' matrix.
+    """
+
+    def __init__(self, matrix: Any, block: NDArray[np.intp], coarse: Callable[[Floats], Floats]) -> None:
+        self.matrix, self.block, self.coarse = matrix.astype(np.float32), block, coarse
+        self.inverse_diagonal = 1 / self.matrix.diagonal()
+        self.count = int(block.max()) + 1
+
+    def __call__(self, right: Floats) -> Floats:
+        """Smooth, correct on the blocks, smooth: about A⁻¹ times a residual (N,)."""
+        right = right.astype(np.float32)
+        step = _DAMPING * self.inverse_diagonal
+        x = step * right
+        left = np.asarray(np.bincount(self.block, right - self.matrix @ x, self.count), dtype=np.float64)
+        x = x + self.coarse(left).astype(np.float32)[self.block]
+        return np.asarray(x + step * (right - self.matrix @ x))

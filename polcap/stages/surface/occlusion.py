@@ -1,10 +1,18 @@
-"""Where one part of the surface hides another: depth steps that no normal explains, behind a rim that leans away.
+"""Occlusions: where one part of the surface hides another, found in the normals or in the integrated depth.
 
-A link's ends have slopes s_p and s_q. Where the surface is one sheet between them its depth step lies between the
-two, whatever bend it makes; a step beyond is a jump. Noise makes such steps too, but short and low ones: a contour
-of jumps counts where it is long and reaches twice the least step, and then all of it counts. Normals that fit no
-surface are torn apart along long contours, too, but across pixels that face the camera: what hides something turns
-away from it first.
+Three tests, on the links between neighboring pixels:
+
+`occluding_contours` uses the normals alone. At an occluding contour the nearer surface turns edge-on, and the farther
+one leans much less. The depth step there is unknown: least squares would set the hidden part against the contour.
+
+`depth_steps` uses an integrated depth. On one smooth sheet the step of a link lies between the slopes at its ends.
+A step beyond them counts as an occlusion if it belongs to a long and high contour (noise makes short and low ones),
+and if the nearer side leans away (normals that fit no surface make long contours too, across pixels that face the
+camera).
+
+`contact_links` finds where two separated parts touch. In the crease between two touching balls the normals lean as at
+an occluding contour, so the integration separates the balls, by the same step all along the crease. Along a true
+occluding contour the step varies.
 """
 
 from dataclasses import dataclass
@@ -14,106 +22,145 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
+from polcap.optics.outline import disc_radius
+from polcap.stages.surface.multigrid import PixelGrid
+from polcap.stages.surface.slope_equations import Bools
 
-Bools = NDArray[np.bool_]
+# lengths in shares of the object's radius
+_LEAST_LENGTH = 0.1  # of a contour, of both kinds
+_SMOOTHING_PX = 4.0  # 1σ of means along a contour
 
-_LEAST_LENGTH = 0.1  # of a contour of jumps, over the object's radius
-_PEAK = 2.0  # the highest step of a contour, over the least
-_LEAST_PX = 2.0  # a step under this is no jump at any size
-_RIM_PX = 2  # how far from a jump its rim may lie, in pixels of a blurred normal
-_LEAST_LEAN = 0.5  # rad, of a rim, the mean about a jump
-_ALONG_PX = 4.0  # 1σ of that mean
+_REACH = 3  # px from a link within which the nearer side's steepest and the farther side's flattest normal lie
+_CANDIDATE_LEAN = np.radians(65.0)  # of the nearer side at a link
+_CANDIDATE_KINK = np.radians(25.0)  # nearer side's lean less the farther side's
+_CONTOUR_LEAN = np.radians(75.0)  # of the nearer side, mean along the contour
+
+_LEAST_STEP_PX = 2.0  # smaller depth steps are no occlusions, however small the object is
+_PEAK = 2.0  # highest step of a contour, over the least step
+_RIM_PX = 2  # the nearer side's lean is the greatest within this distance, for normals are blurred
+_RIM_LEAN = 0.5  # rad, of the nearer side, mean along the contour
+
+_PART = 0.002  # of the object's pixels: smaller parts are specks
+_LEAST_PERCENTILE = 10.0  # of the steps along a border: the smallest step, without outliers
+_EQUAL = 0.04  # range of the steps along a contact
+_CONTACT_LENGTH = 0.43  # of a contact
+
+
+def occluding_contours(lean: tuple[Floats, Floats], mask: Bools) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
+    """Links that cross an occluding contour: +1 where the first pixel is the nearer, −1 where the second is, else 0.
+
+    Of links to the right (H, W−1) and down (H−1, W). `lean` is the angle by which the surface falls away to the right
+    and down, (H, W) each [rad]; NaN outside the mask.
+    """
+    candidates = [_contour_candidates(of, mask, axis, sign) for axis, of in zip((1, 0), lean) for sign in (1, -1)]
+    total, count = np.zeros(mask.shape, np.float32), np.full(mask.shape, 1e-6, np.float32)
+    for axis, (at, steepest) in zip((1, 1, 0, 0), candidates):
+        first, _ = _ends(axis)
+        total[first] += np.where(at, steepest, 0)
+        count[first] += at
+    mean = cv2.GaussianBlur(total, (0, 0), _SMOOTHING_PX) / cv2.GaussianBlur(count, (0, 0), _SMOOTHING_PX)
+    edge_on = (mean > _CONTOUR_LEAN) & (count > 0.5)
+    label = label_contours(edge_on)
+    length = np.bincount(label[edge_on], minlength=int(label.max()) + 1)
+    edge_on &= (length >= max(_LEAST_LENGTH * disc_radius(mask), 4))[label]
+    links = [at.astype(np.int8) for at, _ in candidates]
+    right, down = (links[0] - links[1]) * edge_on[:, :-1], (links[2] - links[3]) * edge_on[:-1]
+    return right, down
+
+
+def _contour_candidates(lean: Floats, mask: Bools, axis: int, sign: int) -> tuple[Bools, Floats]:
+    """Links along an axis with an edge-on nearer pixel, the first (sign 1) or the second (−1); and its lean [rad]."""
+    away = sign * lean
+    inside = np.isfinite(away)
+    size = (1, _REACH) if axis else (_REACH, 1)
+    last = (_REACH - 1, 0) if axis else (0, _REACH - 1)
+    back, ahead = (last, (0, 0)) if sign > 0 else ((0, 0), last)
+    box = np.ones(size, np.uint8)
+    steepest = cv2.dilate(np.where(inside, away, -9).astype(np.float32), box, anchor=back, borderValue=-9)
+    flattest = cv2.erode(np.where(inside, away, 9).astype(np.float32), box, anchor=ahead, borderValue=9)
+    one, two = _ends(axis)
+    nearer, farther = (one, two) if sign > 0 else (two, one)
+    kink = steepest[nearer] - flattest[farther]
+    # of neighboring links that cross the same contour, the one where the normals turn most
+    turn = away[nearer] - away[farther]
+    most = cv2.dilate(np.nan_to_num(turn, nan=-9).astype(np.float32), np.ones((1, 5) if axis else (5, 1), np.uint8))
+    at = mask[one] & mask[two] & (steepest[nearer] > _CANDIDATE_LEAN) & (kink > _CANDIDATE_KINK) & (turn >= most - 1e-6)
+    return at, steepest[nearer]
 
 
 @dataclass(frozen=True)
-class Jumps:
-    """Links to the right (H, W−1) and down (H−1, W) at which the depth jumps, and pixels (H, W) at which it is torn."""
+class OcclusionMap:
+    """Links at which the depth steps from one sheet to another, and pixels at which the depth is torn."""
 
-    right: Bools
-    down: Bools
-    torn: Bools  # steps as high and long, with no rim: the normals there fit no surface
+    right: Bools  # (H, W−1) links to the right
+    down: Bools  # (H−1, W) links down
+    torn: Bools  # (H, W) a long, high step without an edge-on side: the normals fit no surface there
 
     def any(self) -> bool:
-        """Whether the depth jumps anywhere."""
+        """Whether there is an occlusion."""
         return bool(self.right.any() or self.down.any())
 
     def near(self, reach: int) -> Bools:
-        """Pixels (H, W) within `reach` px of a jump."""
+        """Pixels (H, W) within `reach` px of an occlusion."""
         at = np.zeros(self.torn.shape, dtype=bool)
         at[:, :-1] |= self.right
         at[:, 1:] |= self.right
         at[:-1] |= self.down
         at[1:] |= self.down
-        return widened(at, reach)
-
-
-def widened(at: Bools, reach: int) -> Bools:
-    """Pixels (H, W) within `reach` px of those."""
-    return np.asarray(cv2.dilate(at.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0)
+        return dilate(at, reach)
 
 
 def least_step(mask: Bools, share: float) -> float:
-    """The depth step [px] from which on a link may be a jump: a share of the radius √(N/π) of a mask (H, W)."""
-    return max(_LEAST_PX, share * radius(mask))
+    """Least depth step of an occlusion [px]: a share of the radius of the mask (H, W)."""
+    return max(_LEAST_STEP_PX, share * disc_radius(mask))
 
 
-def radius(mask: Bools) -> float:
-    """Radius of the disc with as many pixels as a mask (H, W), px."""
-    return float(np.sqrt(mask.sum() / np.pi))
-
-
-def jumps(z: Floats, slope: tuple[Floats, Floats], mask: Bools, least: float) -> Jumps:
-    """Where the depth jumps.
+def depth_steps(z: Floats, slope: tuple[Floats, Floats], mask: Bools, least: float) -> OcclusionMap:
+    """Occlusions of an integrated depth.
 
     Parameters
     ----------
     z
-        (H, W) scaled log depth [px]; anything outside the mask.
+        (H, W) scaled log depth [px]; any value outside the mask.
     slope
-        ∂z to the right and down that the normals tell, (H, W) each.
+        ∂z to the right and down by the normals, (H, W) each.
     mask
         (H, W).
     least
-        The step beyond both ends' slopes that makes a jump [px].
+        Least step beyond the slopes at both ends of a link [px].
     """
     beyond = tuple(_excess(z, of, mask, axis) for axis, of in zip((1, 0), slope))
     highest = np.zeros(mask.shape, dtype=np.float32)  # of a pixel's links
     for axis, excess in zip((1, 0), beyond):
-        for side in _sides(axis):
-            np.maximum(highest[side], np.abs(excess), out=highest[side])
+        for end in _ends(axis):
+            np.maximum(highest[end], np.abs(excess), out=highest[end])
     count, label = cv2.connectedComponents((highest > least).astype(np.uint8), connectivity=8)
     if count < 2:
         nothing = np.zeros(mask.shape, dtype=bool)
-        return Jumps(nothing[:, 1:], nothing[1:], nothing)
+        return OcclusionMap(nothing[:, 1:], nothing[1:], nothing)
     on = label > 0
     peak = np.zeros(count, dtype=np.float32)
     np.maximum.at(peak, label[on], highest[on])
-    clear = (np.bincount(label[on], minlength=count) >= max(_LEAST_LENGTH * radius(mask), 3)) & (peak > _PEAK * least)
-    on &= clear[label]
-    rim = _lean(on, beyond, slope, least) > _LEAST_LEAN
-    right, down = ((np.abs(excess) > least) & (on & rim)[_sides(axis)[0]] for axis, excess in zip((1, 0), beyond))
-    return Jumps(right, down, on & ~rim)
-
-
-def _sides(axis: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Where links along the last axis (1) or the first (0) begin and end."""
-    every, but_last, but_first = slice(None), slice(None, -1), slice(1, None)
-    return ((every, but_last), (every, but_first)) if axis else ((but_last, every), (but_first, every))
+    long = np.bincount(label[on], minlength=count) >= max(_LEAST_LENGTH * disc_radius(mask), 3)
+    on &= (long & (peak > _PEAK * least))[label]
+    rim = _nearer_lean(on, beyond, slope, least) > _RIM_LEAN
+    right, down = ((np.abs(excess) > least) & (on & rim)[_ends(axis)[0]] for axis, excess in zip((1, 0), beyond))
+    return OcclusionMap(right, down, on & ~rim)
 
 
 def _excess(z: Floats, slope: Floats, mask: Bools, axis: int) -> Floats:
-    """How far a link's step lies beyond its ends' slopes [px], with its sign; 0 off the mask."""
-    first, second = _sides(axis)
+    """Depth step of each link less the nearest value between its ends' slopes [px]; 0 off the mask."""
+    first, second = _ends(axis)
     step = z[second] - z[first]
     low, high = np.minimum(slope[first], slope[second]), np.maximum(slope[first], slope[second])
     return np.where(mask[first] & mask[second], step - np.clip(step, low, high), 0).astype(np.float32)
 
 
-def _lean(on: Bools, beyond: tuple[Floats, ...], slope: tuple[Floats, Floats], least: float) -> Floats:
-    """How far the nearer side of the jumps about each pixel leans away towards the farther, (H, W) [rad]."""
+def _nearer_lean(on: Bools, beyond: tuple[Floats, ...], slope: tuple[Floats, Floats], least: float) -> Floats:
+    """Lean (H, W) of the nearer side towards the farther, mean over the steps about each pixel [rad]."""
     total, links = np.zeros(on.shape, dtype=np.float32), np.full(on.shape, 1e-6, dtype=np.float32)
     for axis, excess, of in zip((1, 0), beyond, slope):
-        first, second = _sides(axis)
+        first, second = _ends(axis)
         size = (1, _RIM_PX + 1) if axis else (_RIM_PX + 1, 1)
         begin = (_RIM_PX, 0) if axis else (0, _RIM_PX)
         backward = cv2.dilate(of.astype(np.float32), np.ones(size, np.uint8), anchor=begin)
@@ -121,5 +168,72 @@ def _lean(on: Bools, beyond: tuple[Floats, ...], slope: tuple[Floats, Floats], l
         at = (np.abs(excess) > least) & on[first]
         total[first][at] += np.arctan(np.where(excess[at] > 0, backward[first][at], forward[second][at]))
         links[first] += at
-    total, links = (cv2.GaussianBlur(values, (0, 0), _ALONG_PX) for values in (total, links))
+    total, links = (cv2.GaussianBlur(values, (0, 0), _SMOOTHING_PX) for values in (total, links))
     return np.asarray(total / np.maximum(links, 1e-9))
+
+
+def contact_links(grid: PixelGrid, separate: Bools, excess: Floats, radius: float) -> Bools:
+    """Links (L,) at which two separated parts touch.
+
+    Parameters
+    ----------
+    grid
+        N pixels and their L links.
+    separate
+        (L,) links across an occlusion.
+    excess
+        (L,) depth step beyond the slopes at both ends, positive where the depth grows to the right or down [px].
+    radius
+        Of the object [px].
+    """
+    part = _parts(grid, ~separate)
+    first, second = part[grid.p], part[grid.q]
+    border = np.flatnonzero(separate & (first != second) & (first >= 0) & (second >= 0))
+    touch = np.zeros(len(separate), dtype=bool)
+    first, second = first[border], second[border]
+    step = excess[border] * np.where(first < second, 1, -1)  # from the part of lower number to the other
+    pair = np.minimum(first, second) * (int(part.max()) + 1) + np.maximum(first, second)
+    for number in np.unique(pair):
+        at = np.flatnonzero(pair == number)
+        height = step[at] * np.sign(np.median(step[at]))
+        middle, count = _most_equal(height, _EQUAL * radius)
+        if count > _CONTACT_LENGTH * radius:
+            touch[border[at[np.abs(height - middle) < _EQUAL * radius]]] = True
+    return touch
+
+
+def _parts(grid: PixelGrid, together: Bools) -> NDArray[np.int64]:
+    """Number (N,) of each pixel's connected part; −1 for specks."""
+    from scipy import sparse
+    from scipy.sparse.csgraph import connected_components
+
+    ends = (grid.p[together], grid.q[together])
+    graph = sparse.coo_matrix((np.ones(len(ends[0]), dtype=np.int8), ends), (grid.size, grid.size))
+    part = connected_components(graph, directed=False)[1].astype(np.int64)
+    return np.where(np.bincount(part)[part] > _PART * grid.size, part, -1)
+
+
+def _most_equal(step: Floats, width: float) -> tuple[float, int]:
+    """Middle and count of the fullest window of this width, among windows that begin near the smallest steps (B,)."""
+    low = np.sort(step)
+    count = np.searchsorted(low, low + width, side="right") - np.arange(len(low))
+    count[low > np.percentile(low, _LEAST_PERCENTILE) + width] = 0
+    most = int(np.argmax(count))
+    return float(low[most] + width / 2), int(count[most])
+
+
+def label_contours(at: Bools) -> NDArray[np.int32]:
+    """Number (H, W) of the contour on which each marked pixel (H, W) lies; gaps of two pixels are closed."""
+    near = cv2.dilate(at.astype(np.uint8), np.ones((3, 3), np.uint8))
+    return np.asarray(cv2.connectedComponents(near, connectivity=8)[1], dtype=np.int32)
+
+
+def dilate(at: Bools, reach: int) -> Bools:
+    """Pixels (H, W) within `reach` px, along rows and columns, of the marked ones."""
+    return np.asarray(cv2.dilate(at.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0)
+
+
+def _ends(axis: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """Slices of the first and the second pixel of all links along the last axis (1) or the first (0)."""
+    every, but_last, but_first = slice(None), slice(None, -1), slice(1, None)
+    return ((every, but_last), (every, but_first)) if axis else ((but_last, every), (but_first, every))

@@ -1,4 +1,4 @@
-"""Normals of the object's pixels -> the slopes that the integration fits, with their weights, on a pyramid of grids."""
+"""Slope equations of a normal map: linear in the scaled log depth, weighted, on a pyramid of grids."""
 
 from dataclasses import dataclass
 
@@ -7,97 +7,110 @@ from numpy.typing import NDArray
 
 from polcap.images import Floats, SurfaceMaps, View
 from polcap.optics.frames import dot
-from polcap.stages.surface.occlusion import radius
+from polcap.optics.outline import disc_radius
+from polcap.optics.projection import ray_slopes
+
+Bools = NDArray[np.bool_]
+
+_LEAST_SIGMA_DEG = 1.0  # expected errors below count as this
+_SIGMA_RANGE_DEG = (1.0, 20.0)  # of the median error that scales all residuals
+_WEIGHTS = (0.02, 50.0)  # least and greatest weight of a normal, over the median's
+_LEAST_DEPTH = 0.05  # of the prior, over the object's distance
 
 
 @dataclass(frozen=True)
-class Problem:
-    """Normals of one pyramid level, on its N pixels."""
+class NormalField:
+    """Normals of the N pixels of a mask, on one grid of the pyramid."""
 
-    mask: NDArray[np.bool_]  # (H, W)
+    mask: Bools  # (H, W)
     view: View
     normal: Floats  # (N, 3)
     weight: Floats  # (N,) 1 at the median error
     sigma: float  # rad, median error of the normals
-    prior: Floats | None  # (N,) z of the prior
-    pull: float  # weight of the prior
+    prior: Floats | None  # (N,) scaled log depth [px]
+    pull: float  # weight of the prior in each pixel
 
 
-def problem(maps: SurfaceMaps, steepest: float, prior_weight: float) -> Problem:
-    """The maps' normals, leaning at most `steepest` rad, as equations on their own grid."""
+def normal_field(maps: SurfaceMaps, steepest: float, prior_weight: float) -> NormalField:
+    """The maps' normals on their own grid, at most `steepest` rad from their rays.
+
+    Pixels without a normal get the zero vector, and the integration bridges them.
+    """
     mask = np.asarray(maps.mask, dtype=bool)
-    normal = np.nan_to_num(maps.normal[mask].astype(np.float64))  # 0 is no normal: neighbours bridge it
-    sigma = np.maximum(np.nan_to_num(maps.confidence[mask].astype(np.float64), nan=90.0, posinf=90.0), 1.0)
-    middle = float(np.median(sigma))
+    normal = np.nan_to_num(maps.normal[mask].astype(np.float64))
+    sigma = np.nan_to_num(maps.confidence[mask].astype(np.float64), nan=90.0, posinf=90.0)  # degrees
+    sigma = np.maximum(sigma, _LEAST_SIGMA_DEG)
+    median = float(np.median(sigma))
     prior = None
     if maps.depth_prior is not None and prior_weight > 0:
-        unit = radius(mask) / maps.view.focal  # the prior's over the distance
-        prior = maps.view.focal * np.log(np.maximum(1 + unit * maps.depth_prior[mask], 0.05))
-    return Problem(
+        unit = disc_radius(mask) / maps.view.focal  # of the prior, over the distance
+        depth = np.maximum(1 + unit * maps.depth_prior[mask], _LEAST_DEPTH)
+        prior = (maps.view.focal * np.log(depth)).astype(np.float64)
+    return NormalField(
         mask=mask,
         view=maps.view,
-        normal=_capped(normal, mask, maps.view, steepest),
-        weight=np.clip((middle / sigma) ** 2, 0.02, 50.0),
-        sigma=np.radians(np.clip(middle, 1.0, 20.0)),
-        prior=None if prior is None else prior.astype(np.float64),
+        normal=_limit_lean(normal, mask, maps.view, steepest),
+        weight=np.clip((median / sigma) ** 2, *_WEIGHTS),
+        sigma=np.radians(np.clip(median, *_SIGMA_RANGE_DEG)),
+        prior=prior,
         pull=prior_weight / max(int(mask.sum()), 1),
     )
 
 
-def equations(of: Problem) -> tuple[Floats, Floats, Floats]:
-    """m, and the right sides of the slopes to the right and down: (N,) each."""
-    x, y = _slopes_of_rays(of.mask, of.view)
-    n = of.normal
-    return n[:, 2] - x * n[:, 0] - y * n[:, 1], n[:, 0], -n[:, 1]
+def _limit_lean(normal: Floats, mask: Bools, view: View, steepest: float) -> Floats:
+    """Normals turned towards the camera until they are no more than `steepest` rad from their rays."""
+    a, b = _ray_slopes(mask, view)
+    facing = (normal[:, 2] - a * normal[:, 0] - b * normal[:, 1]) / np.sqrt(1 + a * a + b * b)
+    over = np.flatnonzero(facing < np.cos(steepest) * np.sqrt(dot(normal, normal)))
+    ray = np.stack([-a[over], -b[over], np.ones(len(over))], axis=-1)
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    across = normal[over] - facing[over, None] * ray
+    length = np.linalg.norm(across, axis=-1, keepdims=True)
+    limited = normal.copy()
+    limited[over] = np.cos(steepest) * ray + np.sin(steepest) * across / np.maximum(length, 1e-12)
+    return limited
 
 
-def halved(of: Problem) -> Problem:
-    """The same on blocks of 2×2 pixels: weighted means of what lies in the mask."""
-    parent = parents(of.mask)
-    count = np.bincount(parent).astype(np.float64)
-    weight = np.bincount(parent, of.weight)
-    normal: Floats = np.stack([np.bincount(parent, of.normal[:, k] * of.weight) for k in range(3)], axis=-1)
+def slope_terms(field: NormalField) -> tuple[Floats, Floats, Floats]:
+    """m, n_x and −n_y of the equations m ∂z/∂i = n_x, m ∂z/∂j = −n_y (i to the right, j down): (N,) each."""
+    a, b = _ray_slopes(field.mask, field.view)
+    n = field.normal
+    return n[:, 2] - a * n[:, 0] - b * n[:, 1], n[:, 0], -n[:, 1]
+
+
+def halve(field: NormalField) -> NormalField:
+    """The field at half the resolution: weighted means over the masked pixels of each 2×2 block."""
+    block = block_numbers(field.mask)
+    count = np.bincount(block).astype(np.float64)
+    weight = np.bincount(block, field.weight)
+    normal: Floats = np.stack([np.bincount(block, field.normal[:, k] * field.weight) for k in range(3)], axis=-1)
     normal /= np.maximum(dot(normal, normal) ** 0.5, 1e-12)[:, None]
-    x, y = of.view.center
-    return Problem(
-        mask=_blocks(of.mask),
-        view=View(of.view.focal / 2, ((x - 0.5) / 2, (y - 0.5) / 2), of.view.scale * 2),
+    x, y = field.view.center
+    return NormalField(
+        mask=_any_of_blocks(field.mask),
+        view=View(field.view.focal / 2, ((x - 0.5) / 2, (y - 0.5) / 2), field.view.scale * 2),
         normal=normal,
         weight=weight / count,
-        sigma=of.sigma,
-        prior=None if of.prior is None else np.bincount(parent, of.prior) / count / 2,
-        pull=4 * of.pull,
+        sigma=field.sigma,
+        prior=None if field.prior is None else np.bincount(block, field.prior) / count / 2,
+        pull=4 * field.pull,
     )
 
 
-def parents(mask: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Number (N,) of the 2×2 block, among those that hold a pixel, in which each pixel of a mask (H, W) lies."""
-    blocks = _blocks(mask)
+def block_numbers(mask: Bools) -> NDArray[np.intp]:
+    """Number (N,) of each masked pixel's 2×2 block; blocks without a masked pixel are not counted."""
+    blocks = _any_of_blocks(mask)
     number = np.cumsum(blocks).reshape(blocks.shape) - 1
     row, column = np.nonzero(mask)
     return np.asarray(number[row // 2, column // 2], dtype=np.intp)
 
 
-def _blocks(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _any_of_blocks(mask: Bools) -> Bools:
     padded = np.pad(mask, [(0, size % 2) for size in mask.shape])
     return np.asarray(padded[::2, ::2] | padded[1::2, ::2] | padded[::2, 1::2] | padded[1::2, 1::2])
 
 
-def _capped(normal: Floats, mask: NDArray[np.bool_], view: View, steepest: float) -> Floats:
-    """Normals turned towards the camera until they lean no more than `steepest` rad."""
-    x, y = _slopes_of_rays(mask, view)
-    facing = (normal[:, 2] - x * normal[:, 0] - y * normal[:, 1]) / np.sqrt(1 + x * x + y * y)
-    over = np.flatnonzero(facing < np.cos(steepest) * np.sqrt(dot(normal, normal)))
-    ray = np.stack([-x[over], -y[over], np.ones(len(over))], axis=-1)
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    across = normal[over] - facing[over, None] * ray
-    length = np.linalg.norm(across, axis=-1, keepdims=True)
-    capped = normal.copy()
-    capped[over] = np.cos(steepest) * ray + np.sin(steepest) * across / np.maximum(length, 1e-12)
-    return capped
-
-
-def _slopes_of_rays(mask: NDArray[np.bool_], view: View) -> tuple[Floats, Floats]:
-    """a, b of the object's pixels: (N,) each."""
+def _ray_slopes(mask: Bools, view: View) -> tuple[Floats, Floats]:
+    """a, b of the masked pixels, (N,) each."""
     row, column = np.nonzero(mask)
-    return (column - view.center[0]) / view.focal, -(row - view.center[1]) / view.focal
+    return ray_slopes(view, column, row)

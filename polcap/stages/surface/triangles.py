@@ -1,103 +1,49 @@
-"""A depth map -> triangles over its pixels, apart where the surface jumps, with frames for textures."""
+"""Triangles over a depth map: cut where the depth steps, smooth along the boundary, with a back and texture frames."""
 
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.errors import ObjectError
-from polcap.images import Floats, Mesh, SurfaceMaps
+from polcap.images import Floats, Mesh
 from polcap.optics.frames import cross, dot
-from polcap.stages.surface import boundary
-from polcap.stages.surface.backing import Back, closed
-from polcap.stages.surface.occlusion import Bools, jumps, least_step
-from polcap.stages.surface.slope_equations import equations, problem
+from polcap.stages.surface.occlusion import depth_steps, least_step
+from polcap.stages.surface.slope_equations import Bools, NormalField, slope_terms
 
-_FLATTEST = 0.05  # cosine under which a normal tells no slope
+Back = Literal["open", "skirt", "closed"]
+Faces = NDArray[np.int32]
 
-
-def triangulate(
-    depth: Floats, maps: SurfaceMaps, metric: bool, steepest: float, jump: float, most: int, back: Back
-) -> Mesh:
-    """The mesh of a depth map: one vertex per pixel of a regular grid in the mask.
-
-    Parameters
-    ----------
-    depth
-        (H, W), in metres or relative.
-    maps
-        Mask, view and expected errors of the same crop.
-    metric
-        Whether the depth is in metres.
-    steepest
-        Lean at which normals are capped [rad].
-    jump
-        Least depth step of a jump over the object's radius.
-    most
-        Vertices, at most; the grid is as wide as that asks for.
-    back
-        What stands behind the seen side.
-
-    Raises
-    ------
-    ObjectError
-        No triangle fits into the mask.
-    """
-    height, width = maps.mask.shape
-    mask = np.asarray(maps.mask & np.isfinite(depth), dtype=bool)
-    step = max(1, int(np.ceil(np.sqrt(mask.sum() / most))))
-    column, row = np.meshgrid(np.arange(0, width, step), np.arange(0, height, step))
-    z = maps.view.focal * np.log(np.where(mask, depth, 1.0))
-    corners = _faces(z, _links_that_hold(z, mask, maps, steepest, jump), step)
-    if len(corners) == 0:
-        raise ObjectError("the mask holds no two neighbouring rows and columns; mark the object with --mask")
-    used, renamed = np.unique(corners, return_inverse=True)
-    faces: NDArray[np.int32] = renamed.reshape(-1, 3).astype(np.int32)
-    pixel = np.stack([column.ravel()[used], row.ravel()[used]], axis=-1)
-    figures = boundary.measure(pixel, faces, mask, step)
-    place, log = boundary.smoothed(pixel.astype(np.float64), z[pixel[:, 1], pixel[:, 0]], faces, step)
-    x, y = maps.view.center
-    ray = np.stack([place[:, 0] - x, y - place[:, 1], np.full(len(place), -maps.view.focal)], axis=-1)
-    vertices: Floats = ray / maps.view.focal * np.exp(log / maps.view.focal)[:, None]
-    uv: Floats = (place + 0.5) / [width, height]
-    normals, tangents = frames(vertices, uv, faces)
-    if back != "open":
-        vertices, normals, uv, tangents, faces = closed(vertices, normals, uv, tangents, faces, back)
-    return Mesh(
-        vertices=on_grid(vertices).astype(np.float32),
-        normals=normals.astype(np.float32),
-        uv=uv.astype(np.float32),
-        tangents=tangents.astype(np.float32),
-        faces=faces.astype(np.int32),
-        depth=np.where(mask, depth, np.nan).astype(np.float32),
-        metric=metric,
-        pieces=figures.pieces,
-        cuts=figures.cuts,
-        cut_px=figures.cut_px,
-        raggedness=figures.raggedness,
-    )
+_LEAST_FACING = 0.05  # cosine: flatter views give no slope
+_SPECK = 0.002  # of the mesh's triangles: smaller pieces do not count
+_ROUNDS = 4  # of averaging along the boundary; about two grid steps either side
+_DEPTH_ROUNDS = 64  # the same of depth, 1σ of six steps: where the surface is edge-on its stairs are ten times as deep
+_FARTHEST = 0.75  # grid steps that a vertex may move in the picture
+_LEAST_AREA = 0.1  # of a triangle after the move, over before: else its corners stay
+_BEHIND = 0.02  # distance of the back behind the deepest vertex, over the greatest extent
 
 
-def on_grid(vertices: Floats) -> Floats:
-    """Vertices (V, 3) to 2⁻²³ of the greatest coordinate, so that float32 holds them exactly from their middle, too."""
-    grid = 2.0 ** (np.ceil(np.log2(np.abs(vertices).max())) - 23)
-    return np.asarray(np.rint(vertices / grid) * grid)
-
-
-def _links_that_hold(z: Floats, mask: Bools, maps: SurfaceMaps, steepest: float, jump: float) -> tuple[Bools, Bools]:
-    """Links to the right and down with both ends on one sheet."""
-    of = problem(maps, steepest, 0.0)
-    facing, *sides = equations(of)
+def unbroken_links(z: Floats, field: NormalField, jump: float) -> tuple[Bools, Bools]:
+    """Links to the right (H, W−1) and down (H−1, W) inside the mask that cross no occlusion of z (H, W)."""
+    mask = field.mask
+    facing, *sides = slope_terms(field)
     slopes = []
     for side in sides:
         slope = np.zeros(mask.shape)
-        slope[of.mask] = side / np.maximum(facing, _FLATTEST)
+        slope[mask] = side / np.maximum(facing, _LEAST_FACING)
         slopes.append(slope)
-    found = jumps(z, (slopes[0], slopes[1]), mask, least_step(mask, jump))
+    found = depth_steps(z, (slopes[0], slopes[1]), mask, least_step(mask, jump))
     return mask[:, :-1] & mask[:, 1:] & ~found.right, mask[:-1] & mask[1:] & ~found.down
 
 
-def _faces(z: Floats, holds: tuple[Bools, Bools], step: int) -> NDArray[np.int64]:
-    """Vertex numbers (row-major on the grid of every `step` px) of the triangles, counter-clockwise from the camera."""
-    across, along = _whole(holds[0], step, 1)[::step], _whole(holds[1], step, 0)[:, ::step]
+def grid_triangles(z: Floats, links: tuple[Bools, Bools], step: int) -> tuple[NDArray[np.int64], Faces]:
+    """Triangles on the grid of every `step` px: their vertices' pixels x, y (V, 2), and the faces (F, 3).
+
+    Counter-clockwise as the camera sees them. A square of the grid with four unbroken sides is parted along the
+    diagonal of less depth; one with two adjacent unbroken sides gives one triangle.
+    """
+    across, along = _unbroken_runs(links[0], step, 1)[::step], _unbroken_runs(links[1], step, 0)[:, ::step]
     height = z[::step, ::step]
     number = np.arange(height.size).reshape(height.shape)
     a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]  # counter-clockwise
@@ -113,40 +59,182 @@ def _faces(z: Floats, holds: tuple[Bools, Bools], step: int) -> NDArray[np.int64
         (with_rising[0] & ~fall, (a, b, d)),
         (with_rising[1] & ~fall, (b, c, d)),
     )
-    return np.concatenate([np.stack([v[chosen] for v in corners], axis=-1) for chosen, corners in triangles])
+    corners = np.concatenate([np.stack([v[chosen] for v in of], axis=-1) for chosen, of in triangles])
+    used, renumbered = np.unique(corners, return_inverse=True)
+    row, column = np.divmod(used, height.shape[1])
+    return np.stack([column * step, row * step], axis=-1), renumbered.reshape(-1, 3).astype(np.int32)
 
 
-def _whole(holds: Bools, step: int, axis: int) -> Bools:
-    """Which runs of `step` links, between the grid's lines, hold all along."""
+def _unbroken_runs(links: Bools, step: int, axis: int) -> Bools:
+    """Whether all links of each run of `step` links between the grid's lines are unbroken."""
     if step == 1:
-        return holds
-    whole = holds.shape[axis] // step * step
-    runs = np.moveaxis(holds, axis, -1)[..., :whole]
+        return links
+    whole = links.shape[axis] // step * step
+    runs = np.moveaxis(links, axis, -1)[..., :whole]
     together = np.asarray(runs.reshape(*runs.shape[:-1], -1, step).all(axis=-1))
     return np.moveaxis(together, -1, axis)
 
 
-def frames(vertices: Floats, uv: Floats, faces: NDArray[np.int32]) -> tuple[Floats, Floats]:
+@dataclass(frozen=True)
+class BoundaryFigures:
+    """Pieces, cuts and raggedness of a mesh: large where it is torn."""
+
+    pieces: int  # without specks
+    cuts: float  # length of the boundary inside the mask, both sides, over that along its outline
+    cut_px: float  # length of the cuts inside the mask, one side [px]
+    raggedness: float  # length of the boundary over that of itself smoothed, less 1
+
+
+def measure_boundary(place: NDArray[np.int64], faces: Faces, mask: Bools, step: int) -> BoundaryFigures:
+    """Figures of a mesh before its boundary is smoothed; vertices at x, y px (V, 2) of the grid of every `step` px."""
+    edge = boundary_edges(faces)
+    size = np.ones((4 * step + 1, 4 * step + 1), np.uint8)
+    inner = cv2.erode(np.pad(mask.astype(np.uint8), 1), size, borderValue=0)[1:-1, 1:-1] > 0
+    inside = inner[place[:, 1], place[:, 0]][edge].any(axis=1)
+    position = place.astype(np.float64)
+    length = np.linalg.norm(position[edge[:, 0]] - position[edge[:, 1]], axis=-1)
+    smooth = _average_along(position, edge, 3 * _ROUNDS)
+    shorter = np.linalg.norm(smooth[edge[:, 0]] - smooth[edge[:, 1]], axis=-1).sum()
+    return BoundaryFigures(
+        pieces=_count_pieces(faces, len(place)),
+        cuts=float(length[inside].sum() / max(length[~inside].sum(), 1e-9)),
+        cut_px=float(length[inside].sum() / 2),
+        raggedness=float(length.sum() / max(shorter, 1e-9) - 1),
+    )
+
+
+def _count_pieces(faces: Faces, count: int) -> int:
+    from scipy import sparse
+    from scipy.sparse.csgraph import connected_components
+
+    pairs = np.concatenate([faces[:, :2], faces[:, 1:]])
+    links = sparse.coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (count, count))
+    _, piece = connected_components(links, directed=False)
+    share = np.bincount(piece[faces[:, 0]]) / len(faces)
+    return int((share > _SPECK).sum())
+
+
+def smooth_boundary(place: Floats, z: Floats, faces: Faces, step: int) -> tuple[Floats, Floats]:
+    """Vertices x, y (V, 2) px and scaled log depth z (V,) with the boundary's averaged along it, z over a longer way.
+
+    The boundary follows pixels' stairs before, and the curve that they sample after.
+    """
+    edge = boundary_edges(faces)
+    move = _average_along(place, edge, _ROUNDS) - place
+    distance = np.linalg.norm(move, axis=-1, keepdims=True)
+    after = place + move * np.minimum(1, _FARTHEST * step / np.maximum(distance, 1e-9))
+    area_before, area_after = face_areas(place, faces), face_areas(after, faces)
+    for _ in range(3):  # corners of a triangle that would turn over stay, which may turn over the next
+        bad = np.unique(faces[area_after < _LEAST_AREA * area_before])
+        if not len(bad):
+            break
+        after = after.copy()
+        after[bad] = place[bad]
+        area_after = face_areas(after, faces)
+    return after, _average_along(z[:, None], edge, _DEPTH_ROUNDS)[:, 0]
+
+
+def boundary_edges(faces: Faces) -> NDArray[np.int64]:
+    """Edges (B, 2) that belong to one triangle only, in its direction."""
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    low, high = ends.min(axis=1), ends.max(axis=1)
+    key = low * (int(faces.max()) + 1) + high
+    order = np.argsort(key, kind="stable")
+    same = key[order[1:]] == key[order[:-1]]
+    single = np.ones(len(key), dtype=bool)
+    single[order[1:]] &= ~same
+    single[order[:-1]] &= ~same
+    return np.asarray(ends[single])
+
+
+def _average_along(values: Floats, edge: NDArray[np.int64], rounds: int) -> Floats:
+    """Values (V, C) with each boundary vertex moved, in each round, half-way to the mean of its two neighbors.
+
+    A vertex where the boundary touches itself stays.
+    """
+    from scipy import sparse  # here: importing it costs .3 s of every start
+
+    ends = np.concatenate([edge, edge[:, ::-1]])
+    degree = np.bincount(ends[:, 0], minlength=len(values))
+    used = np.flatnonzero(degree)
+    number = np.full(len(values), -1)
+    number[used] = np.arange(len(used))
+    row, column = number[ends[:, 0]], number[ends[:, 1]]
+    mean = sparse.csr_matrix((1 / degree[ends[:, 0]], (row, column)), (len(used), len(used)))
+    moving = degree[used] == 2
+    out = values.copy()
+    on = values[used]
+    for _ in range(rounds):
+        on = np.where(moving[:, None], (on + mean @ on) / 2, on)
+    out[used] = on
+    return out
+
+
+def face_areas(place: Floats, faces: Faces) -> Floats:
+    """Twice the area (F,) of faces in the picture, y down; positive where counter-clockwise as the camera sees it."""
+    one, two = (place[faces[:, k], :2] - place[faces[:, 0], :2] for k in (1, 2))
+    return np.asarray(one[:, 1] * two[:, 0] - one[:, 0] * two[:, 1])
+
+
+def vertex_frames(vertices: Floats, uv: Floats, faces: Faces) -> tuple[Floats, Floats]:
     """Unit normals (V, 3) and tangents (V, 4), means over the triangles around, weighted by area.
 
-    A tangent is ∂P/∂u made square to the normal; w = 1 because v runs down the picture while
-    the texture's +Y, which glTF's bitangent w (n × t) stands for, runs up.
+    A tangent is ∂P/∂u made square to the normal. v runs down the picture and the normal texture's +Y runs up, so the
+    handedness w of glTF's bitangent w (n × t) is 1.
     """
     one, two = (vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2))
     (u1, v1), (u2, v2) = ((uv[faces[:, k]] - uv[faces[:, 0]]).T for k in (1, 2))
     area = cross(one, two)
     along = (one * v2[:, None] - two * v1[:, None]) * np.sign(u1 * v2 - u2 * v1)[:, None]
-    normals = _unit(_gathered(area, faces, len(vertices)))
-    tangents = _gathered(along, faces, len(vertices))
+    normals = _unit(_sum_around(area, faces, len(vertices)))
+    tangents = _sum_around(along, faces, len(vertices))
     tangents = _unit(tangents - normals * dot(normals, tangents)[:, None])
     return normals, np.concatenate([tangents, np.ones((len(vertices), 1))], axis=-1)
 
 
-def _gathered(values: Floats, faces: NDArray[np.int32], count: int) -> Floats:
-    """Sums over the triangles around each vertex, (V, 3) of (F, 3)."""
+def _sum_around(values: Floats, faces: Faces, count: int) -> Floats:
+    """Sums (V, 3) of values (F, 3) over the triangles around each vertex."""
     corner = faces.ravel()
     return np.stack([np.bincount(corner, np.repeat(values[:, k], 3), count) for k in range(3)], axis=-1)
 
 
 def _unit(vector: Floats) -> Floats:
     return np.asarray(vector / np.maximum(np.sqrt(dot(vector, vector)), 1e-30)[..., None])
+
+
+def add_back(front: Mesh, back: Back) -> Mesh:
+    """The mesh with walls from its boundary straight back to a plane ("skirt"), or walls and that plane ("closed").
+
+    The added vertices repeat the texture of those in front of them; nothing of the back was photographed.
+    """
+    if back == "open":
+        return front
+    count, faces = len(front.vertices), front.faces
+    behind = front.vertices.copy()
+    behind[:, 2] = front.vertices[:, 2].min() - _BEHIND * np.ptp(front.vertices, axis=0).max()
+    start, end = boundary_edges(faces).T
+    wall = np.concatenate([np.stack([end, start, start + count], -1), np.stack([end, start + count, end + count], -1)])
+    added = [wall] if back == "skirt" else [wall, faces[:, ::-1] + count]
+    normals = np.broadcast_to([0.0, 0.0, -1.0], front.normals.shape) if back == "closed" else front.normals
+    tangents = np.broadcast_to([1.0, 0.0, 0.0, 1.0], front.tangents.shape)
+    used, renumbered = np.unique(np.concatenate([faces, *added]), return_inverse=True)
+    return replace(
+        front,
+        vertices=np.concatenate([front.vertices, behind])[used],
+        normals=np.concatenate([front.normals, normals])[used],
+        uv=np.concatenate([front.uv, front.uv])[used],
+        tangents=np.concatenate([front.tangents, tangents])[used],
+        faces=renumbered.reshape(-1, 3).astype(np.int32),
+    )
+
+
+def to_float32(mesh: Mesh) -> Mesh:
+    """The mesh in float32; vertices are multiples of 2⁻²³ of the greatest coordinate, so they can be moved and back."""
+    grid = 2.0 ** (np.ceil(np.log2(np.abs(mesh.vertices).max())) - 23)
+    return replace(
+        mesh,
+        vertices=(np.rint(mesh.vertices / grid) * grid).astype(np.float32),
+        normals=mesh.normals.astype(np.float32),
+        uv=mesh.uv.astype(np.float32),
+        tangents=mesh.tangents.astype(np.float32),
+    )

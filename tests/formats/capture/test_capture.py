@@ -10,6 +10,7 @@ import pytest
 
 from polcap.errors import CaptureError, DecodeError, InputError
 from polcap.formats.capture import reader as capture
+from polcap.formats.raw import frame_decoder
 from tests.formats import headers
 from tests.formats.headers import DATA, needs_data
 from tests.formats.raw.test_photo import mosaic, save
@@ -63,7 +64,7 @@ def test_sub_folders_state_the_angles(tmp_path):
     assert degrees(understood) == [0, 22.5, 45, 90]
     assert [names(shot) for shot in understood.shots] == [["IMG_1.dng", "IMG_0.dng"]] * 4  # darkest first
     assert understood.size_px == (48, 32) and understood.principal_px == (23.5, 15.5)
-    image = understood.shots[1].frames[0].load()
+    image = frame_decoder.decode(understood.shots[1].frames[0])
     assert image.value.shape == (32, 48) and image.cfa.tolist() == [[0, 1], [1, 2]]
 
 
@@ -111,7 +112,7 @@ def test_sensor_frame_is_four_shots(tmp_path):
     assert understood.size_px == (20, 16) and understood.focal_px == pytest.approx(
         50 / 43.2666 * np.hypot(20, 16), 1e-4
     )
-    assert [shot.frames[0].load().value.mean() for shot in understood.shots] == [1300, 1150, 700, 850]
+    assert [frame_decoder.decode(shot.frames[0]).value.mean() for shot in understood.shots] == [1300, 1150, 700, 850]
     assert len({shot.frames[0].digest for shot in understood.shots}) == 4
 
 
@@ -198,10 +199,10 @@ def test_capture_toml_without_frames_only_adds_facts(tmp_path):
     (folder / "capture.toml").write_text('encoding = "srgb"\nfocal_length_mm = 50\nsensor_width_mm = 36\n')
     stated = capture.read(folder)
     assert stated.layout == "flat" and stated.focal_known
-    assert stated.shots[0].frames[0].load().lossy
+    assert frame_decoder.decode(stated.shots[0].frames[0]).lossy
     (folder / "capture.toml").unlink()
     assumed = capture.read(folder)
-    assert not assumed.focal_known and not assumed.shots[0].frames[0].load().lossy
+    assert not assumed.focal_known and not frame_decoder.decode(assumed.shots[0].frames[0]).lossy
     assert assumed.shots[0].frames[0].digest != stated.shots[0].frames[0].digest  # other values, other key
 
 
@@ -424,10 +425,10 @@ def test_rendered_captures_are_understood(name):
 @needs_data
 def test_real_folders_are_understood():
     bowl = capture.read(DATA / "real/polarized_photos/gorshok")
-    assert degrees(bowl) == [0, 45, 90, 135] and bowl.shots[0].frames[0].load().lossy
+    assert degrees(bowl) == [0, 45, 90, 135] and frame_decoder.decode(bowl.shots[0].frames[0]).lossy
     for name in ("macbeth_classic", "potery"):
         rotated = capture.read(DATA / "real/polarizer_rotated" / name, (0.0, 45.0, 90.0))
-        assert degrees(rotated) == [0, 45, 90] and not rotated.shots[0].frames[0].load().lossy
+        assert degrees(rotated) == [0, 45, 90] and not frame_decoder.decode(rotated.shots[0].frames[0]).lossy
     fruits = capture.read(DATA / "real/polarization_mosaic")
     assert fruits.layout == "sensor" and fruits.size_px == (1224, 1024)
     truth = capture.read(DATA / "real/polarized_ground_truth")

@@ -16,7 +16,7 @@ from polcap.formats.export.encoders import Kind
 from polcap.images import Asset
 from tests import surfaces
 
-NODE = Path(__file__).parents[1] / "gltf"
+NODE = Path(__file__).parents[2] / "gltf"
 
 
 @pytest.fixture(scope="module")

@@ -1,14 +1,32 @@
 """Brackets of a camera whose gain and noise are known: frames in, captures out; light in electrons."""
 
 import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 
 from polcap.images import Capture, Exif, Frame, Quality, SensorImage, Shot
+from polcap.stages import hdr
 
 RGGB = np.array([[0, 1], [1, 2]], np.uint8)
 BLACK, WHITE, READ, GAIN = 512.0, 15871.0, 3.0, 2.0  # counts, counts, e⁻, e⁻ per count at ISO 100
+
+
+@dataclass(frozen=True)
+class PicturedFrame(Frame):
+    """A frame with a function that makes its pixels: no file is decoded."""
+
+    load: Callable[[], SensorImage] = field(default=None, compare=False)
+
+
+def decode(frame):
+    return frame.load()
+
+
+def merge(captured, settings):
+    return hdr.merge(captured, decode, settings)
 
 
 def ramp(height, width, low=20.0, high=1.2e5, ripple=0.2):
@@ -32,7 +50,7 @@ def expose(quads, exposure, rng, iso=100.0):
 
 def frame(image, **exif):
     stated = exif.pop("exposure", None)
-    return Frame("x.dng", Exif(**exif), "shot", "", lambda: image, exposure=stated)
+    return PicturedFrame("x.dng", Exif(**exif), "shot", "", stated, load=lambda: image)
 
 
 def capture(*shots, ambient=()):
@@ -72,7 +90,7 @@ def bracket(quads, settings, seed=0, jitter=0.015, **exif):
 
 def reference_of(stack):
     """Index of the frame whose ratio is 1 by definition."""
-    return int(np.flatnonzero(np.all(stack.exposure_ratio[0] == 1, axis=1))[0])
+    return int(np.flatnonzero(np.all(stack.bracket.exposure_ratio[0] == 1, axis=1))[0])
 
 
 DATA = os.environ.get("POLCAP_DATA")
@@ -89,4 +107,4 @@ def raw_file(path, **exif):
             black = np.array(raw.black_level_per_channel, float)[raw.raw_pattern]
             return SensorImage(raw.raw_image_visible.copy(), black, float(raw.white_level), cfa)
 
-    return Frame(str(path), Exif(**exif), "shot", "", load)
+    return PicturedFrame(str(path), Exif(**exif), "shot", "", load=load)

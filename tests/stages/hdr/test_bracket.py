@@ -10,7 +10,8 @@ from polcap.images import Quality, SensorImage, Shot
 from polcap.optics.registration import squared_gradient
 from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.stages import hdr
-from polcap.stages.hdr import links, noise
+from polcap.stages.hdr import noise
+from polcap.stages.hdr.bracket import Bracket, compare
 from polcap.stages.hdr.planes import Reader, signals
 from tests.stages.hdr.brackets import (
     BLACK,
@@ -20,8 +21,10 @@ from tests.stages.hdr.brackets import (
     RGGB,
     WHITE,
     capture,
+    decode,
     electrons_to_signal,
     frame,
+    merge,
     needs_data,
     raw_file,
 )
@@ -65,10 +68,10 @@ def test_hand_held_bracket_is_registered(hand):
         frame(photograph(1, rng), iso=100.0),
         frame(photograph(4, rng, turned(-hand[1], hand[0], hand[2] / 2)), iso=100.0),
     ]
-    stack = hdr.merge(capture(frames), hdr.Settings())
-    still = hdr.merge(capture([frames[1]]), hdr.Settings())
-    np.testing.assert_allclose(stack.exposure_ratio[0, :, 1], [0.25, 1, 4], rtol=1e-3)
-    assert stack.ghost_fraction[0] < 1e-3
+    stack = merge(capture(frames), hdr.Settings())
+    still = merge(capture([frames[1]]), hdr.Settings())
+    np.testing.assert_allclose(stack.bracket.exposure_ratio[0, :, 1], [0.25, 1, 4], rtol=1e-3)
+    assert stack.bracket.ghost_fraction[0] < 1e-3
     y, x = np.mgrid[:640, :800].astype(float)
     full = scene(x, y)
     truth = np.stack([full[0::2, 0::2, 0], (full[0::2, 1::2, 1] + full[1::2, 0::2, 1]) / 2, full[1::2, 1::2, 2]], -1)
@@ -85,7 +88,7 @@ def test_tripod_bracket_is_not_resampled():
     """Noise of neighbours stays independent: resampling would correlate it."""
     rng = np.random.default_rng(9)
     frames = [frame(photograph(e, rng), iso=100.0) for e in (0.25, 1, 4)]
-    stack = hdr.merge(capture(frames), hdr.Settings())
+    stack = merge(capture(frames), hdr.Settings())
     y, x = np.mgrid[:640, :800].astype(float)
     full = scene(x, y)
     error = stack.value[0, ..., 0] - electrons_to_signal(full[0::2, 0::2, 0])
@@ -98,7 +101,7 @@ def test_too_much_motion_is_refused():
     rng = np.random.default_rng(7)
     frames = [frame(photograph(1, rng), iso=100.0), frame(photograph(2, rng, turned(9, 9, 0)), iso=100.0)]
     with pytest.raises(CaptureError, match=r"frame \d of shot 0° moved by .* hdr.max_motion_px"):
-        hdr.merge(capture(frames), hdr.Settings(max_motion_px=4))
+        merge(capture(frames), hdr.Settings(max_motion_px=4))
 
 
 @needs_data
@@ -112,23 +115,23 @@ def test_hand_held_nikon_bracket():
     folder = Path(DATA) / "real" / "raw_bracket"
     times = {"sample2.dng": 1 / 640, "sample1.dng": 1 / 160, "sample3.dng": 1 / 40}
     frames = [raw_file(folder / n, iso=200.0, exposure_time=t, f_number=6.3) for n, t in times.items()]
-    stack = hdr.merge(capture(frames), hdr.Settings())
-    ratio = stack.exposure_ratio[0].mean(axis=1)
+    stack = merge(capture(frames), hdr.Settings())
+    ratio = stack.bracket.exposure_ratio[0].mean(axis=1)
     assert ratio[1] / ratio[0] == pytest.approx(3.96, rel=0.01)
     assert ratio[2] / ratio[1] == pytest.approx(4.21, rel=0.01)
-    np.testing.assert_allclose(stack.exif_ratio, [[0.25, 1, 4]])
+    np.testing.assert_allclose(stack.bracket.exif_ratio, [[0.25, 1, 4]])
     # what moved is flagged, and hardly anything else: the building above the street has no ghosts
     ghost = (stack.quality[0] & Quality.GHOST) > 0
     assert 0.005 < ghost.mean() < 0.03
     assert ghost[:1150].mean() < 0.001
     # frame against frame, registered and on one scale, where nothing moved
     shot = Shot(0.0, tuple(frames))
-    found = links.measure(shot, [0, 1, 2], 1, noise.Lines(), Reader(()), 0.98, 60.0)
+    found = compare(Bracket(shot, (0, 1, 2), 1), noise.Lines(), Reader((), decode, 0.98), 60.0)
     own, first = signals(frames[1].load(), 0.98).rows(slice(None)), found.estimate
     assert found.frames is not None
     for e in (0, 2):
         link, (other, gain) = found.links[e], (found.frames[e].signals, found.frames[e].gain)
-        assert link.moved is not None
+        assert link.motion is not None
         usable = other.usable & found.frames[1].signals.usable & ~ghost
         z = []
         for c, ratio in enumerate(link.ratio):

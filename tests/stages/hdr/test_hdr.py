@@ -21,6 +21,7 @@ from tests.stages.hdr.brackets import (
     electrons_to_signal,
     expose,
     frame,
+    merge,
     needs_data,
     ramp,
     raw_file,
@@ -37,12 +38,12 @@ def test_no_bias_from_20_electrons_up_and_honest_variance(name):
     """
     quads = ramp(768, 1024)
     frames, exposures, isos = bracket(quads, BRACKETS[name], seed=len(name))
-    stack = hdr.merge(capture(frames), hdr.Settings())
+    stack = merge(capture(frames), hdr.Settings())
     r = reference_of(stack)
     light = quads * exposures[r]
     truth = electrons_to_signal(light, isos[r])
     ratios = (exposures * isos) / (exposures[r] * isos[r])
-    np.testing.assert_allclose(stack.exposure_ratio[0], np.repeat(ratios[:, None], 3, 1), rtol=1e-3)
+    np.testing.assert_allclose(stack.bracket.exposure_ratio[0], np.repeat(ratios[:, None], 3, 1), rtol=1e-3)
     z = scores(stack, truth)
     assert abs(z.mean()) < 0.05
     assert abs(z.var() - 1) < 0.1
@@ -53,13 +54,13 @@ def test_no_bias_from_20_electrons_up_and_honest_variance(name):
         bias = stack.value[0][octave].sum(dtype=np.float64) / truth[octave].sum() - 1
         assert abs(bias) < 0.003, (low, bias)
         low *= 2
-    assert stack.ghost_fraction[0] == 0
+    assert stack.bracket.ghost_fraction[0] == 0
     assert stack.value.dtype == stack.variance.dtype == np.float32
 
 
 def test_negative_values_are_kept():
     dark = np.zeros((64, 64, 3))
-    stack = hdr.merge(capture([frame(expose(dark, 1, np.random.default_rng(1)))]), hdr.Settings())
+    stack = merge(capture([frame(expose(dark, 1, np.random.default_rng(1)))]), hdr.Settings())
     assert (stack.value < 0).mean() > 0.3
     assert abs(stack.value.mean()) < 4 * np.sqrt(stack.variance.mean() / stack.value.size)
     assert (stack.quality & Quality.DARK).astype(bool).mean() > 0.9
@@ -69,7 +70,7 @@ def test_darkest_frame_serves_where_the_others_clip():
     """Only pixels that clip in the darkest frame, or touch one that does, are flagged; all stay finite."""
     quads = ramp(256, 512, high=4e5, ripple=0)
     frames, exposures, _ = bracket(quads, BRACKETS["time"])
-    stack = hdr.merge(capture(frames), hdr.Settings())
+    stack = merge(capture(frames), hdr.Settings())
     full = 0.98 * WHITE - BLACK  # counts
     expected = quads.max(axis=2) * exposures[0] / GAIN
     clipped = (stack.quality[0] & Quality.CLIPPED) > 0
@@ -87,7 +88,7 @@ def test_no_seam_where_a_frame_drops_out():
     """Along a ramp through two clipping limits the mean of columns follows the truth to its noise."""
     quads = ramp(512, 1024, ripple=0)
     frames, exposures, _ = bracket(quads, BRACKETS["time"])
-    stack = hdr.merge(capture(frames), hdr.Settings())
+    stack = merge(capture(frames), hdr.Settings())
     truth = electrons_to_signal(quads * exposures[1])
     clear = ((stack.quality[0] & Quality.CLIPPED) == 0).all(axis=0)
     z = ((stack.value[0] - truth).sum(axis=0) / np.sqrt(stack.variance[0].sum(axis=0)))[clear]
@@ -99,11 +100,11 @@ def test_flash_makes_the_shutter_time_a_lie():
     quads = ramp(256, 384, high=2e4)
     rng = np.random.default_rng(2)
     frames = [frame(expose(quads, 1, rng), iso=100.0, exposure_time=t, flash_fired=True) for t in (0.001, 0.004, 0.016)]
-    stack = hdr.merge(capture(frames), hdr.Settings())
-    one = hdr.merge(capture(frames[:1]), hdr.Settings())
-    np.testing.assert_allclose(stack.exposure_ratio, 1, rtol=2e-3)
+    stack = merge(capture(frames), hdr.Settings())
+    one = merge(capture(frames[:1]), hdr.Settings())
+    np.testing.assert_allclose(stack.bracket.exposure_ratio, 1, rtol=2e-3)
     r = reference_of(stack)
-    np.testing.assert_allclose(stack.exif_ratio[0], np.array([1, 4, 16]) / 4.0**r)
+    np.testing.assert_allclose(stack.bracket.exif_ratio[0], np.array([1, 4, 16]) / 4.0**r)
     assert np.median(stack.variance / one.variance) == pytest.approx(1 / 3, rel=0.05)
 
 
@@ -114,13 +115,13 @@ def test_metadata_serve_only_where_pixels_cannot_tell_and_no_flash_fired():
         rng = np.random.default_rng(0)
         return [frame(expose(dark, e, rng), iso=100.0, exposure_time=e, **exif) for e in (1, 4)]
 
-    stack = hdr.merge(capture(frames(flash_fired=False)), hdr.Settings())
-    assert sorted(stack.exposure_ratio[0, :, 0] / stack.exposure_ratio[0, :, 0].min()) == [1, 4]
+    stack = merge(capture(frames(flash_fired=False)), hdr.Settings())
+    assert sorted(stack.bracket.exposure_ratio[0, :, 0] / stack.bracket.exposure_ratio[0, :, 0].min()) == [1, 4]
     with pytest.raises(CaptureError, match="flash fired"):
-        hdr.merge(capture(frames(flash_fired=True)), hdr.Settings())
+        merge(capture(frames(flash_fired=True)), hdr.Settings())
     rng = np.random.default_rng(0)
     stated = [frame(expose(dark, e, rng), flash_fired=True, exposure=e) for e in (1.0, 4.0)]
-    assert hdr.merge(capture(stated), hdr.Settings()).exposure_ratio.max() in (1, 4)
+    assert merge(capture(stated), hdr.Settings()).bracket.exposure_ratio.max() in (1, 4)
 
 
 def test_ambient_light_is_subtracted_with_its_variance():
@@ -133,8 +134,8 @@ def test_ambient_light_is_subtracted_with_its_variance():
         frame(expose(quads + room * t / 0.04, 1, rng), iso=100.0, exposure_time=t, flash_fired=True) for t in times
     ]
     ambient = [frame(expose(room * t / 0.04, 1, rng), iso=100.0, exposure_time=t, flash_fired=False) for t in times]
-    stack = hdr.merge(capture(frames, ambient=ambient), hdr.Settings())
-    np.testing.assert_allclose(stack.exposure_ratio, 1, rtol=3e-3)
+    stack = merge(capture(frames, ambient=ambient), hdr.Settings())
+    np.testing.assert_allclose(stack.bracket.exposure_ratio, 1, rtol=3e-3)
     z = scores(stack, electrons_to_signal(quads))
     assert abs(z.mean()) < 0.05
     assert abs(z.var() - 1) < 0.1
@@ -147,7 +148,7 @@ def test_ghost_is_flagged_and_taken_from_the_reference_alone():
     other = quads.copy()
     other[100:140, 60:110] *= 1.5
     frames = [frame(expose(q, e, rng), iso=100.0) for q, e in ((quads, 0.25), (quads, 1), (other, 4))]
-    stack = hdr.merge(capture(frames), hdr.Settings())
+    stack = merge(capture(frames), hdr.Settings())
     ghost = (stack.quality[0] & Quality.GHOST) > 0
     assert ghost[102:138, 62:108].all()
     ghost[94:146, 54:116] = False
@@ -162,8 +163,8 @@ def test_shots_share_the_reference_index_and_keep_their_own_flash_energy():
     quads = ramp(256, 384, high=2e4)
     one, a, _ = bracket(quads, BRACKETS["time"], seed=1)
     two, b, _ = bracket(quads, BRACKETS["time"], seed=2)
-    stack = hdr.merge(capture(one, two), hdr.Settings())
-    assert np.all(stack.exposure_ratio[:, 1] == 1)
+    stack = merge(capture(one, two), hdr.Settings())
+    assert np.all(stack.bracket.exposure_ratio[:, 1] == 1)
     clear = ((stack.quality & Quality.CLIPPED) == 0).all(axis=0)
     gain = stack.value[1][clear].sum() / stack.value[0][clear].sum()
     assert gain == pytest.approx(b[1] / a[1], rel=1e-3)
@@ -173,9 +174,9 @@ def test_unequal_brackets_and_sizes_are_refused_by_name():
     rng = np.random.default_rng(0)
     small, large = expose(ramp(192, 192), 1, rng), expose(ramp(192, 256), 1, rng)
     with pytest.raises(CaptureError, match=r"shot 45° has 1 frames, shot 0° has 2"):
-        hdr.merge(capture([frame(small)] * 2, [frame(small)]), hdr.Settings())
+        merge(capture([frame(small)] * 2, [frame(small)]), hdr.Settings())
     with pytest.raises(CaptureError, match=r"^shot 45° is 128×96"):
-        hdr.merge(capture([frame(small)], [frame(large)]), hdr.Settings())
+        merge(capture([frame(small)], [frame(large)]), hdr.Settings())
 
 
 def test_a_plateau_below_the_stated_white_is_saturation():
@@ -184,7 +185,7 @@ def test_a_plateau_below_the_stated_white_is_saturation():
     quads[:, 32:] = 1e5
     image = expose(quads, 1, np.random.default_rng(0))
     early = SensorImage(np.minimum(image.value, np.uint16(12000)), image.black, WHITE, RGGB)
-    stack = hdr.merge(capture([frame(early)]), hdr.Settings())
+    stack = merge(capture([frame(early)]), hdr.Settings())
     clipped = (stack.quality[0] & Quality.CLIPPED) > 0
     assert clipped[:, 32:].all() and not clipped[:, :31].any()
 
@@ -196,9 +197,9 @@ def test_rendered_captures_give_their_exposure_ratios(name):
     folder = Path(DATA) / "rendered"
     shots = json.loads((folder / f"{name}.truth.json").read_text())["shots"]
     frames = [raw_file(folder / s["file"], iso=float(s["iso"]), flash_fired=True) for s in shots]
-    stack = hdr.merge(capture(frames[:3], frames[3:6], frames[6:]), hdr.Settings())
+    stack = merge(capture(frames[:3], frames[3:6], frames[6:]), hdr.Settings())
     exposure = np.array([s["relative_exposure"] * s["flash_factor"] for s in shots]).reshape(3, 3)
     expected = np.repeat((exposure / exposure[:, 1:2])[..., None], 3, axis=2)
-    np.testing.assert_allclose(stack.exposure_ratio, expected, rtol=1e-3)
-    assert np.all(stack.ghost_fraction == 0)
+    np.testing.assert_allclose(stack.bracket.exposure_ratio, expected, rtol=1e-3)
+    assert np.all(stack.bracket.ghost_fraction == 0)
     assert not (stack.quality & Quality.CLIPPED).any()

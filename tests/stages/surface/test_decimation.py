@@ -10,11 +10,11 @@ from tests.stages.test_asset import rendered_normals
 
 
 @pytest.fixture(scope="module")
-def level() -> surface.Decimated:
-    return surface.decimated(surfaces.mesh(surfaces.maps()), surfaces.VIEW, 1 / 16, "open")
+def level() -> surface.DecimatedMesh:
+    return surface.decimate(surfaces.mesh(surfaces.maps()), surfaces.VIEW, 1 / 16, "open")
 
 
-def test_a_sixteenth_of_the_triangles_lies_where_it_says(level: surface.Decimated) -> None:
+def test_a_sixteenth_of_the_triangles_lies_where_it_says(level: surface.DecimatedMesh) -> None:
     """Against the ball itself, which the first mesh follows to within half a pixel."""
     assert len(level.mesh.faces) == pytest.approx(len(surfaces.mesh(surfaces.maps()).faces) / 16, rel=0.1)
     scale = np.nanmedian(surfaces.mesh(surfaces.maps()).depth) / surfaces.VIEW.focal  # m per px
@@ -22,7 +22,7 @@ def test_a_sixteenth_of_the_triangles_lies_where_it_says(level: surface.Decimate
     assert 0 < level.error_px < 2
 
 
-def test_detail_stays_in_the_normal_texture(level: surface.Decimated) -> None:
+def test_detail_stays_in_the_normal_texture(level: surface.DecimatedMesh) -> None:
     maps = surfaces.maps(ripple=0.2)
     built = surfaces.built(maps, level.mesh)
     seen, (row, column) = rendered_normals(built, maps, within=0.5)
@@ -35,12 +35,12 @@ def test_detail_stays_in_the_normal_texture(level: surface.Decimated) -> None:
 
 def test_too_many_levels_are_refused() -> None:
     with pytest.raises(ObjectError, match="fewer levels"):
-        surface.decimated(surfaces.mesh(surfaces.maps()), surfaces.VIEW, 1e-5, "open")
+        surface.decimate(surfaces.mesh(surfaces.maps()), surfaces.VIEW, 1e-5, "open")
 
 
 def test_a_closed_back_stays_in_fewer_triangles() -> None:
-    settings = surface.Settings(back="closed")
+    settings = surface.SurfaceSettings(back="closed")
     whole = surfaces.mesh(surfaces.maps(), settings)
-    less = surface.decimated(whole, surfaces.VIEW, 1 / 8, settings.back).mesh
+    less = surface.decimate(whole, surfaces.VIEW, 1 / 8, settings.back).mesh
     depth = [np.ptp(mesh.vertices[mesh.faces][..., 2]) for mesh in (whole, less)]
     assert depth[1] == pytest.approx(depth[0], rel=0.02) and len(less.faces) > len(whole.faces) / 10

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from polcap.stages.surface.multigrid import Multigrid, Nested, conjugate_gradients
+from polcap.stages.surface.multigrid import Multigrid, TwoGrid, conjugate_gradients
 
 SIZE = 120
 
@@ -38,20 +38,20 @@ def test_few_iterations_reach_the_solution(kind: str, rng: np.random.Generator) 
     assert np.sqrt((x - truth) @ (matrix @ (x - truth))) < 1e-4 * np.sqrt(truth @ right)  # in the energy's norm
 
 
-def nested(kind: str, rng: np.random.Generator) -> tuple[sparse.csr_matrix, Nested]:
+def two_grid(kind: str, rng: np.random.Generator) -> tuple[sparse.csr_matrix, TwoGrid]:
     """The even grid above one of half its resolution, whose links weigh the same."""
     matrix, pixel = laplacian(kind, rng)
     parent = (pixel[:, 0] // 2) * (SIZE // 2) + pixel[:, 1] // 2
     group = sparse.csr_matrix((np.ones(len(parent)), parent, np.arange(len(parent) + 1)))
     coarse = (group.T @ (matrix @ group) / 2).tocsr()  # two fine links cross each border
-    return matrix, Nested(
+    return matrix, TwoGrid(
         matrix, parent, Multigrid(coarse, np.stack(np.divmod(np.arange(len(parent) // 4), SIZE // 2), -1))
     )
 
 
 @pytest.mark.parametrize("kind", ["even", "random"])
 def test_half_resolution_preconditions_the_whole(kind: str, rng: np.random.Generator) -> None:
-    matrix, cycle = nested(kind, rng)
+    matrix, cycle = two_grid(kind, rng)
     truth = np.cumsum(rng.normal(size=SIZE**2))
     truth -= truth.mean()
     right = matrix @ truth
@@ -64,5 +64,5 @@ def test_preconditioners_are_symmetric(rng: np.random.Generator) -> None:
     """Conjugate gradients need it."""
     matrix, pixel = laplacian("random", rng)
     a, b = rng.normal(size=(2, SIZE**2))
-    for cycle, rounding in ((Multigrid(matrix, pixel), 1e-9), (nested("random", rng)[1], 1e-3)):  # float32
+    for cycle, rounding in ((Multigrid(matrix, pixel), 1e-9), (two_grid("random", rng)[1], 1e-3)):  # float32
         assert a @ cycle(b) == pytest.approx(b @ cycle(a), rel=rounding)

@@ -14,9 +14,11 @@ from scipy import ndimage
 from polcap.errors import ObjectError
 from polcap.images import Floats, Mesh, SurfaceMaps, View
 from polcap.stages import surface
-from polcap.stages.surface import boundary, integration, slope_equations
+from polcap.stages.surface import integration
+from polcap.stages.surface.slope_equations import normal_field
+from polcap.stages.surface.triangles import boundary_edges
 
-SETTINGS = surface.Settings()
+SETTINGS = surface.SurfaceSettings()
 VIEW = View(focal=400.0, center=(63.5, 55.5), scale=2.0)
 SHAPE = (112, 128)
 
@@ -92,7 +94,7 @@ def test_bumps_are_recovered_to_a_thousandth() -> None:
 
 def test_pyramid_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     truth_maps, truth = sphere()
-    monkeypatch.setattr(integration, "_DECIDED", 500)
+    monkeypatch.setattr(integration, "_DECISION_PIXELS", 500)
     mesh = surface.integrate(truth_maps, 0.95, SETTINGS)
     assert error_share(mesh, truth, truth_maps.mask) < 0.01
 
@@ -110,7 +112,7 @@ def ball_in_a_ramp() -> tuple[SurfaceMaps, Floats, NDArray[np.bool_]]:
 def test_jump_is_kept_as_a_jump_and_cut() -> None:
     scene, truth, front = ball_in_a_ramp()
     offset = []  # of the ball against the ramp, px of depth
-    for settings in (SETTINGS, surface.Settings(stiffness=0.0)):
+    for settings in (SETTINGS, surface.SurfaceSettings(stiffness=0.0)):
         depth = surface.integrate(scene, None, settings).depth
         error = depth / np.median(depth) - truth / np.median(truth)
         offset.append(abs(np.median(error[front]) - np.median(error[~front])) * VIEW.focal)
@@ -184,7 +186,7 @@ def test_mesh_faces_the_camera_and_keeps_its_frames() -> None:
 def test_vertices_are_thinned_to_the_limit() -> None:
     view = View(800.0, (127.5, 111.5), 1.0)
     truth_maps, _ = sphere(view, (224, 256))
-    mesh = surface.integrate(truth_maps, None, surface.Settings(max_vertices=3000))
+    mesh = surface.integrate(truth_maps, None, surface.SurfaceSettings(max_vertices=3000))
     assert 1500 < len(mesh.vertices) <= 3000
     assert mesh.depth.shape == (224, 256)
     assert len(np.unique(mesh.faces)) == len(mesh.vertices)
@@ -252,40 +254,40 @@ def waved(size: int, degrees: float) -> tuple[SurfaceMaps, Floats]:
 def test_noise_tears_no_smooth_surface_at_any_resolution(size: int) -> None:
     scene, truth = waved(size, 6.0)
     mesh = surface.integrate(scene, None, SETTINGS)
-    plain = surface.integrate(scene, None, surface.Settings(stiffness=0.0))
+    plain = surface.integrate(scene, None, surface.SurfaceSettings(stiffness=0.0))
     assert (mesh.pieces, mesh.cuts) == (1, 0.0)
     assert np.array_equal(mesh.depth, plain.depth, equal_nan=True)  # where nothing hides, plain least squares
     assert error_share(mesh, truth, scene.mask) < 0.02
 
 
-@pytest.mark.parametrize(("step", "sewn"), [(0.0, False), (30.0, True)])
-def test_cut_that_strains_the_surface_is_sewn(step: float, sewn: bool) -> None:
+@pytest.mark.parametrize(("step", "removed"), [(0.0, False), (30.0, True)])
+def test_cut_that_strains_the_surface_is_removed(step: float, removed: bool) -> None:
     """A piece of a ball's flank, set back by some pixels though nothing hides it, comes back."""
     ball, _ = waved(200, 2.0)
-    level = integration._Level(slope_equations.problem(ball, np.radians(84), 0.0))
-    nowhere = np.zeros(level.grid.size, dtype=bool)
-    plain, solver = level.mended(np.zeros(level.grid.size), nowhere, SETTINGS.stiffness)
+    level = integration.PyramidLevel(normal_field(ball, np.radians(84), 0.0), SETTINGS.stiffness, SETTINGS.jump / 2)
+    level.solve()
+    plain = level.z
     row, column = (np.nonzero(ball.mask)[k] - 100 for k in (0, 1))
-    free = np.ones_like(nowhere)
-    back = plain + step * ((column > 60) & (np.abs(row) < 40))
-    assert level.jumps(back, SETTINGS.jump / 2).any() == sewn
-    z, _ = level.sewn(back, solver, free, SETTINGS.stiffness, SETTINGS.jump / 2)
-    assert free.any() != sewn
-    assert np.allclose(z, plain, atol=1e-6)
+    level.choosing = np.ones(level.grid.size, dtype=bool)
+    level.z = plain + step * ((column > 60) & (np.abs(row) < 40))
+    assert level.occlusions().any() == removed
+    level.remove_useless_cuts()
+    assert level.choosing.any() != removed
+    assert np.allclose(level.z, plain, atol=1e-6)
 
 
 def test_cut_that_relieves_the_surface_stays() -> None:
     balls, _ = two_balls(0.12)
-    level = integration._Level(slope_equations.problem(balls, np.radians(84), 0.0))
-    level.leave_limbs()
-    z = level.decided(SETTINGS.stiffness, SETTINGS.iterations, SETTINGS.tolerance)
-    level.close_limbs(z)
-    free, limbs = np.ones(level.grid.size, dtype=bool), len(level.limb)
-    z, solver = level.mended(z, free, SETTINGS.stiffness)
-    assert limbs and level.jumps(z, SETTINGS.jump / 2).any()
-    level.sewn(z, solver, free, SETTINGS.stiffness, SETTINGS.jump / 2)
-    assert free.all()
-    assert len(level.limb) == limbs
+    level = integration.PyramidLevel(normal_field(balls, np.radians(84), 0.0), SETTINGS.stiffness, SETTINGS.jump / 2)
+    level.cut_contours()
+    level.integrate_bilaterally(SETTINGS.iterations, SETTINGS.tolerance)
+    level.restore_contours()
+    links = len(level.contours.link)
+    level.solve()
+    assert links and level.occlusions().any()
+    level.remove_useless_cuts()
+    assert level.choosing.all()
+    assert len(level.contours.link) == links
 
 
 def test_prior_weighs_alike_at_any_resolution() -> None:
@@ -297,7 +299,7 @@ def test_prior_weighs_alike_at_any_resolution() -> None:
         radius = np.sqrt(ball.mask.sum() / np.pi) / view.focal
         wrong = 1.5 * (np.nan_to_num(truth) / np.nanmean(truth) - 1) / radius
         scene = replace(ball, depth_prior=wrong.astype(np.float32))
-        depth = surface.integrate(scene, None, surface.Settings(prior_weight=20.0, stiffness=0.0)).depth
+        depth = surface.integrate(scene, None, surface.SurfaceSettings(prior_weight=20.0, stiffness=0.0)).depth
         middle, side = (size // 2, size // 2), (size // 2, size // 8 * 7)
         bend.append(np.log(depth[side] / depth[middle]) / np.log(truth[side] / truth[middle]) - 1)
     assert bend[0] > 0.02
@@ -318,10 +320,10 @@ def test_boundary_is_a_curve_not_stairs() -> None:
     """
     ball, _ = sphere(View(1000.0, (99.5, 99.5), 1.0), (200, 200), (0.0, 0.0, -1.0), 0.09)
     mesh = surface.integrate(ball, None, SETTINGS)
-    rim = np.unique(boundary.edges(mesh.faces))
+    rim = np.unique(boundary_edges(mesh.faces))
     away = np.linalg.norm(mesh.uv[rim] * 200 - 100, axis=1)
     assert np.std(away) < 0.2
-    follows = dict(boundary.edges(mesh.faces).tolist())
+    follows = dict(boundary_edges(mesh.faces).tolist())
     depth = 1000 * mesh.vertices[:, 2].astype(np.float64)  # px
     bends = [depth[a] - 2 * depth[b] + depth[follows[b]] for a, b in follows.items()]
     assert np.sqrt(np.mean(np.square(bends))) < 0.3
@@ -333,7 +335,7 @@ def test_back_closes_the_mesh_where_it_is_asked_to(back: str, holes: bool) -> No
     truth_maps, _ = sphere()
     seen = surface.integrate(truth_maps, 0.95, SETTINGS)
     mesh = surface.integrate(truth_maps, 0.95, msgspec.structs.replace(SETTINGS, back=back))
-    assert bool(len(boundary.edges(mesh.faces))) == holes
+    assert bool(len(boundary_edges(mesh.faces))) == holes
     assert (mesh.faces[: len(seen.faces)] == seen.faces).all()
     p, q, r = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
     volume = np.sum(p * np.cross(q, r)) / 6
@@ -352,7 +354,7 @@ def two_balls(gap: float) -> tuple[SurfaceMaps, Floats]:
 
 def test_part_behind_a_limb_stands_apart_where_no_slope_tells_by_how_much() -> None:
     scene, truth = two_balls(0.03)
-    plain, ours = (surface.integrate(scene, None, surface.Settings(stiffness=s)) for s in (0.0, 2.0))
+    plain, ours = (surface.integrate(scene, None, surface.SurfaceSettings(stiffness=s)) for s in (0.0, 2.0))
     assert plain.cuts == 0 and ours.cuts > 0.3
     assert error_share(ours, truth, scene.mask) < 0.8 * error_share(plain, truth, scene.mask)
 

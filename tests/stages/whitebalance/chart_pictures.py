@@ -5,11 +5,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from polcap.formats import calib
-from polcap.images import AngleStack, ChartRequest, Floats, Quality, View
-from polcap.stages.whitebalance import chart
+from polcap.formats import shipped_data
+from polcap.images import AngleStack, ChartRequest, ColorSensor, Floats, Quality, View, single_frames
+from polcap.optics.projection import transform_points
 
-CLASSIC = calib.colorchecker()
+CLASSIC = shipped_data.colorchecker()
 CAMERA = np.array([[0.28, 0.10, 0.07], [0.08, 0.71, 0.22], [0.02, 0.18, 0.66]])  # linear Rec.709 → S0 in camera
 WIDTH, HEIGHT = 480, 360
 AUTO = ChartRequest("auto")
@@ -30,7 +30,7 @@ def draw(homography: Floats, colors: Floats, patch: float = 0.87, card: float = 
     total = np.zeros((HEIGHT, WIDTH, 3))
     for dy in (np.arange(samples) + 0.5) / samples - 0.5:
         for dx in (np.arange(samples) + 0.5) / samples - 0.5:
-            at = chart.project(inverse, np.stack([x + dx, y + dy], axis=-1))
+            at = transform_points(inverse, np.stack([x + dx, y + dy], axis=-1))
             u, v = at[..., 0], at[..., 1]
             on = (u > -0.1) & (u < 6.1) & (v > -0.1) & (v < 4.1)
             column, row = np.clip(np.floor(u), 0, 5).astype(int), np.clip(np.floor(v), 0, 3).astype(int)
@@ -40,7 +40,10 @@ def draw(homography: Floats, colors: Floats, patch: float = 0.87, card: float = 
     return total / samples**2
 
 
-def stack(image: Floats, view: View | None = None, clip: float = np.inf, **known: Floats) -> AngleStack:
+UNKNOWN = ColorSensor()
+
+
+def stack(image: Floats, view: View | None = None, clip: float = np.inf, sensor: ColorSensor = UNKNOWN) -> AngleStack:
     """One shot of an image in camera channels."""
     height, width = image.shape[:2]
     clipped = (image >= clip).any(axis=-1)
@@ -50,12 +53,8 @@ def stack(image: Floats, view: View | None = None, clip: float = np.inf, **known
         quality=np.where(clipped, int(Quality.CLIPPED), 0).astype(np.uint8)[None],
         angle=np.zeros(1),
         view=view or View(1000.0, (width / 2, height / 2), 2.0),
-        exposure_ratio=np.ones((1, 1, 3)),
-        exif_ratio=np.ones((1, 1)),
-        ghost_fraction=np.zeros(1),
-        lossy=False,
-        camera_matrix=known.get("camera_matrix"),
-        white_balance=known.get("white_balance"),
+        bracket=single_frames(1),
+        sensor=sensor,
     )
 
 

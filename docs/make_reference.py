@@ -1,0 +1,81 @@
+"""Write the reference pages that follow from the code: settings, options of the commands, the Python interface.
+
+python docs/make_reference.py
+"""
+
+import ast
+import inspect
+import re
+from itertools import groupby
+from pathlib import Path
+
+from typer.main import get_command
+
+import polcap
+from polcap.cli import app
+from polcap.config import settings
+
+REFERENCE = Path(__file__).parent / "reference"
+_OPTIONS = re.compile(r"(<!-- options of (\w+) -->\n).*?(<!-- end -->)", re.S)
+_MADE = "<!-- made by docs/make_reference.py; do not edit -->"
+
+
+def pages() -> dict[Path, str]:
+    """Path of each page and its text as it should be."""
+    commands = REFERENCE / "commands.md"
+    filled = _OPTIONS.sub(lambda m: f"{m[1]}{options_table(m[2])}\n{m[3]}", commands.read_text(encoding="utf-8"))
+    return {
+        commands: filled,
+        REFERENCE / "settings.md": settings_page(),
+        REFERENCE / "api.md": api_page(),
+    }
+
+
+def options_table(command_name: str) -> str:
+    """Arguments and options of a command, as its --help has them."""
+    command = get_command(app).commands[command_name]  # type: ignore[attr-defined]
+    context = command.make_context(command_name, [], resilient_parsing=True)
+    rows = [record for one in command.params if (record := one.get_help_record(context))]
+    lines = ["| option | |", "| --- | --- |"]
+    for option, meaning in rows:  # a | inside `…` would end the cell
+        lines.append(f"| `{option.replace('|', '/')}` | {' '.join(meaning.split()).replace('|', '&#124;')} |")
+    return "\n".join(lines)
+
+
+def settings_page() -> str:
+    """Every setting with type, default, range and meaning."""
+    lines = [
+        "# Settings", "", _MADE, "",
+        "Defaults < `--config FILE.toml` (a section per stage) < `--set stage.name=value`.",
+        "An unknown name or a value outside its range is an error that names it.", "",
+    ]  # fmt: skip
+    for name, rows in groupby(settings(), lambda setting: setting.key.partition(".")[0]):
+        lines += ["", f"## {name}", "", "| setting | type | default | range | meaning [unit] |"]
+        lines += ["| --- | --- | --- | --- | --- |"]
+        for row in rows:
+            kind = row.kind.replace("Optional[float]", "float").removeprefix("Literal").strip("[]")
+            default = "unset" if row.default is None else f"`{row.default}`"
+            lines.append(f"| `{row.key}` | {kind} | {default} | {row.limits or '–'} | {row.description} |")
+    return "\n".join(lines) + "\n"
+
+
+def api_page() -> str:
+    """Signatures and docstrings of the public functions, source of the public values."""
+    lines = [
+        "# From Python", "", _MADE, "",
+        "```python", "import polcap", "", 'result = polcap.process("CAPTURE")', "print(result.verdict)",
+        'maps = polcap.read_maps(result.folder / "maps").maps', "```", "",
+        "`examples/from_python.py` is a whole program. Names are loaded at first use; the package is typed.",
+    ]  # fmt: skip
+    for name in sorted(polcap.__all__, key=lambda name: (name[0].isupper(), name)):
+        source = inspect.getsource(getattr(polcap, name))
+        definition = ast.parse(source).body[0]
+        if isinstance(definition, ast.FunctionDef):  # its signature and docstring, without the body
+            source = "\n".join(source.splitlines()[: definition.body[0].end_lineno])
+        lines += ["", f"## polcap.{name}", "", "```python", source.rstrip(), "```"]
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    for page, text in pages().items():
+        page.write_text(text, encoding="utf-8")

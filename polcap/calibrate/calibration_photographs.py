@@ -1,0 +1,79 @@
+"""Reads calibration photographs: RAW files of a folder with EXIF, grouped by exposure setting or angle."""
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from polcap.errors import CaptureError
+from polcap.formats.capture import layouts
+from polcap.formats.raw import libraw as raw
+from polcap.formats.raw import probe
+from polcap.images import Exif, Floats, SensorImage
+from polcap.optics import sensor
+
+CLIP = 0.95  # of the white level; nothing is measured above
+_ANGLE = re.compile(r"(\d{1,3}(?:\.\d+)?)")
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """One RAW file."""
+
+    path: Path
+    exif: Exif
+    digest: str
+
+    def image(self) -> SensorImage:
+        """Decoded. Raises DecodeError."""
+        return raw.read(self.path, self.digest)
+
+    @property
+    def setting(self) -> tuple[float, float, float]:
+        """ISO, exposure time [s], f-number; 0 if the file does not state it."""
+        return self.exif.iso or 0.0, self.exif.exposure_time or 0.0, self.exif.f_number or 0.0
+
+
+def photographs_in(folder: Path) -> list[Photograph]:
+    """The RAW photographs of a folder in the order of their names.
+
+    Raises CaptureError if there is none, or the folder cannot be listed.
+    """
+    paths = sorted(
+        (path for path in layouts.children(folder) if path.is_file()), key=lambda one: layouts.natural(one.name)
+    )
+    files = [(path, probe.read(path)) for path in paths]
+    photographs = [Photograph(path, file.exif, file.digest) for path, file in files if file.kind == "raw"]
+    if not photographs:
+        raise CaptureError(f"{folder}: holds no RAW photograph; take some, or remove the folder")
+    return photographs
+
+
+def angle_folders(folder: Path, prefix: str) -> list[tuple[float, Path]]:
+    """Angle [degrees] and path of folders such as pol022.5, by angle."""
+    folders = [(angle_of(path.name, prefix), path) for path in layouts.children(folder) if path.is_dir()]
+    return sorted((angle, path) for angle, path in folders if angle is not None)
+
+
+def angle_of(name: str, prefix: str) -> float | None:
+    """Degrees in `pol045` or `axis22.5`; None for another name."""
+    match = _ANGLE.fullmatch(name.removeprefix(prefix)) if name.startswith(prefix) else None
+    return None if match is None else float(match.group(1))
+
+
+def by_setting(photographs: Iterable[Photograph]) -> dict[tuple[float, float, float], list[Photograph]]:
+    """Photographs of equal ISO, exposure time and f-number, darkest first."""
+    groups: dict[tuple[float, float, float], list[Photograph]] = {}
+    for one in photographs:
+        groups.setdefault(one.setting, []).append(one)
+    return dict(sorted(groups.items()))
+
+
+def center(image: SensorImage) -> tuple[Floats, float]:
+    """Mean signal (C,) of the picture's middle ninth, and the share of its pixels that are clipped."""
+    value, usable = sensor.signal(image), sensor.usable(image, CLIP)
+    h, w = value.shape[:2]
+    part = (slice(h // 3, h - h // 3), slice(w // 3, w - w // 3))
+    return value[part].mean(axis=(0, 1), dtype=np.float64), float(np.mean(~usable[part]))

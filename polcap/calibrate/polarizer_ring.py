@@ -1,0 +1,136 @@
+"""Extinction ratio, zero and sense of a polarizer on its ring, from polarized light of a known axis.
+
+I(θ) = a (1 + c cos 2(s θ + z − α)) for light of axis α and a filter with its axis at s θ + z for the ring angle θ.
+c gives the extinction ratio E = (1 + c)/(1 − c), the phase the zero z; the sense s = ±1 needs light of two axes.
+
+References
+----------
+Collett, Polarized Light, ch. 5 (law of Malus).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from polcap.calibrate.calibration_photographs import Photograph, center
+from polcap.errors import CaptureError
+from polcap.images import Floats, Polarizer
+
+_LEAST = 5  # angles of the ring, for three unknowns and a scatter
+_CLIPPED = 0.01
+_LAMP = 1e-3  # 1σ of a steady lamp from frame to frame, relative
+_RING_DEG = 0.1  # 1σ of a ring's angle; lamp and ring only weight the frames, the error comes from their scatter
+_SPAN_DEG = 90.0  # least range of ring angles
+_LEAST_DIFFERENCE_DEG = 10.0  # between two axes, and between their mirror images, to find the sense
+
+
+@dataclass(frozen=True)
+class PolarizerShot:
+    """One photograph of `polarizer/`."""
+
+    axis_deg: float  # of the light
+    ring_deg: float  # as stated
+    photograph: Photograph
+
+
+@dataclass(frozen=True)
+class _MalusFit:
+    """cos² curve of the light of one axis."""
+
+    axis_deg: float
+    phase_deg: float  # ring angle of most light
+    phase_sigma_deg: float
+    contrast: Floats  # (C,)
+    contrast_sigma: Floats  # (C,)
+
+
+def measure(turned: list[PolarizerShot]) -> Polarizer:
+    """Extinction, zero and sense from the light of all axes.
+
+    Raises CaptureError for too few angles, unequal exposures, or light that is not polarized.
+    """
+    axes = sorted({shot.axis_deg for shot in turned})
+    curves = [_fit_axis([shot for shot in turned if shot.axis_deg == axis]) for axis in axes]
+    known = _shows_sense(curves)
+    candidates = [(_zero(curves, sense), sense) for sense in ((1, -1) if known else (1,))]
+    (zero, sigma, _), sense = min(candidates, key=lambda candidate: candidate[0][2])
+    weight = np.array([1 / np.maximum(curve.contrast_sigma, 1e-9) ** 2 for curve in curves])
+    contrast = (weight * np.array([curve.contrast for curve in curves])).sum(0) / weight.sum(0)
+    contrast_sigma = 1 / np.sqrt(weight.sum(0))
+    leak = np.maximum(1 - contrast, 1e-6)
+    return Polarizer(
+        zero_deg=round(zero, 3),
+        zero_sigma_deg=sigma,
+        sense=sense,
+        sense_known=known,
+        extinction=tuple(((1 + contrast) / leak).tolist()),
+        extinction_sigma=tuple((2 * contrast_sigma / leak**2).tolist()),
+        frames=len(turned),
+    )
+
+
+def _fit_axis(shots: list[PolarizerShot]) -> _MalusFit:
+    where = shots[0].photograph.path.parent.parent
+    if len({shot.photograph.setting for shot in shots}) > 1:
+        raise CaptureError(f"{where}: frames of unequal exposure; take all angles of the ring with one setting")
+    ring = np.radians([shot.ring_deg for shot in shots])
+    angles = np.unique(np.round(np.degrees(ring) % 180, 2))
+    if len(angles) < _LEAST or np.ptp(angles) < _SPAN_DEG:
+        raise CaptureError(
+            f"{where}: {len(angles)} angles of the ring; take {_LEAST} or more over 180°, best every 15°"
+        )
+    light = []
+    for shot in shots:
+        mean, clipped = center(shot.photograph.image())
+        if clipped > _CLIPPED:
+            raise CaptureError(f"{shot.photograph.path}: over-exposed in the middle; take less light, at all angles")
+        light.append(mean)
+    solved = [_fit_wave(ring, channel) for channel in np.array(light).T]
+    wave, covariance = (np.array(values) for values in zip(*solved))  # (C, 3), (C, 3, 3)
+    length = np.hypot(wave[:, 1], wave[:, 2])
+    contrast = length / wave[:, 0]
+    if contrast.max() < 0.2:
+        raise CaptureError(f"{where}: the light hardly changes with the ring ({contrast.max():.2f}); is it polarized?")
+    toward = np.stack([-contrast, wave[:, 1] / length, wave[:, 2] / length], axis=1) / wave[:, :1]
+    across = np.stack([0 * length, -wave[:, 2], wave[:, 1]], axis=1) / (2 * length**2)[:, None]
+    spread = np.sqrt(np.einsum("ci,cij,cj->c", toward, covariance, toward))
+    turn = np.sqrt(np.einsum("ci,cij,cj->c", across, covariance, across))
+    phase = np.arctan2((wave[:, 2] / turn**2).sum(), (wave[:, 1] / turn**2).sum()) / 2
+    # the ring's scatter is the same in all channels: an average would not lower it
+    return _MalusFit(shots[0].axis_deg, float(np.degrees(phase)), float(np.degrees(turn.min())), contrast, spread)
+
+
+def _fit_wave(ring: Floats, light: Floats) -> tuple[Floats, Floats]:
+    """(3,) a, a c cos 2φ, a c sin 2φ and their covariance, scaled to the scatter of the frames."""
+    matrix = np.stack([np.ones_like(ring), np.cos(2 * ring), np.sin(2 * ring)], axis=1)
+    weight = np.ones_like(light)
+    for _ in range(6):
+        normal = (matrix * weight[:, None]).T @ matrix
+        wave = np.linalg.solve(normal, (matrix * weight[:, None]).T @ light)
+        slope = 2 * (wave[2] * np.cos(2 * ring) - wave[1] * np.sin(2 * ring))
+        variance = (_LAMP * matrix @ wave) ** 2 + (np.radians(_RING_DEG) * slope) ** 2
+        weight = 1 / np.maximum(variance, (1e-5 * wave[0]) ** 2)
+    scatter = light - matrix @ wave
+    reduced = float(np.sum(weight * scatter**2)) / max(len(light) - 3, 1)
+    return wave, np.linalg.inv(normal) * max(reduced, 0.1)
+
+
+def _shows_sense(curves: list[_MalusFit]) -> bool:
+    """Whether the two senses predict different phases for two of the axes."""
+    return any(
+        _LEAST_DIFFERENCE_DEG < (one.axis_deg - other.axis_deg) % 90 < 90 - _LEAST_DIFFERENCE_DEG
+        for one in curves
+        for other in curves
+    )
+
+
+def _zero(curves: list[_MalusFit], sense: int) -> tuple[float, float, float]:
+    """z = α − s ψ of all axes, −90…90°, its 1σ, and the rms difference between the axes."""
+    zeros = np.array([curve.axis_deg - sense * curve.phase_deg for curve in curves])
+    weight = np.array([1 / curve.phase_sigma_deg**2 for curve in curves])
+    vector = np.sum(weight * np.exp(2j * np.radians(zeros))) / weight.sum()
+    zero = float(np.degrees(np.angle(vector)) / 2)
+    difference = (zeros - zero + 90) % 180 - 90
+    misfit = float(np.sqrt(np.sum(weight * difference**2) / weight.sum()))
+    between = misfit / np.sqrt(max(len(curves) - 1, 1)) if len(curves) > 1 else 0.0
+    return zero, float(np.hypot(1 / np.sqrt(weight.sum()), between)), misfit

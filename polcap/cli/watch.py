@@ -1,0 +1,29 @@
+"""Process a folder again whenever it changes: `polcap process --watch`."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from polcap import terminal
+from polcap.errors import GateError, InputError, SettingError
+
+
+def at_every_change(capture: Path, target: Path, config: Path | None, once: Callable[[], None]) -> None:
+    """Call `once` for a folder as it is, and after each change of it or of the settings' file; errors are shown.
+
+    Raises
+    ------
+    SettingError
+        There is no such folder, or the settings are wrong from the start.
+    """
+    from polcap import config as settings
+    from polcap.formats.capture import arrivals
+
+    if not capture.is_dir():
+        raise SettingError(f"{capture} is no folder; --watch needs the one that the photographs go to")
+    settings.load(config, ())
+    for _ in arrivals.settled(capture, target, edited=[] if config is None else [config]):
+        try:
+            once()
+        except (InputError, GateError, OSError) as error:  # a frame may have gone while it was read
+            terminal.tell(f"polcap: {terminal.line(error)}")
+        terminal.tell(f"watching {capture}; Ctrl-C ends")

@@ -1,0 +1,33 @@
+"""Folders of polcap: for results among photographs, and for the user's calibrations.
+
+Imports no library: a run with nothing to do looks here first.
+"""
+
+import os
+import sys
+from pathlib import Path
+
+OUTPUT = "polcap"  # default folder of results
+BATCH = "polcap-batch"  # folder of a batch's records, in ROOT or in --out; safe to delete
+OURS = (OUTPUT, BATCH)  # these folders hold no photographs
+
+
+def calibrations() -> Path:
+    """The folder of the user's calibrations; it may not exist."""
+    if stated := os.environ.get("POLCAP_CALIB"):
+        return Path(stated)
+    home = Path(os.path.expanduser("~"))  # unlike Path.home(), raises for no account
+    if sys.platform == "win32":
+        return Path(os.environ.get("APPDATA", home / "AppData" / "Roaming")) / "polcap" / "calib"
+    if sys.platform == "darwin":
+        return home / "Library" / "Application Support" / "polcap" / "calib"
+    return Path(os.environ.get("XDG_CONFIG_HOME") or home / ".config") / "polcap" / "calib"
+
+
+def calibration_files() -> list[Path]:
+    """All calibration files of the user, by name."""
+    try:
+        found = [path for path in calibrations().iterdir() if path.suffix == ".toml" and path.is_file()]
+        return sorted(path for path in found if not path.name.startswith("."))  # of macOS, or of a killed run
+    except OSError:
+        return []
