@@ -52,9 +52,7 @@ def _pushed(found: Evidence, limits: GateLimits) -> Gate | None:
     if not bad.any():
         return None
     worst = int(np.nanargmax(displacement))
-    message = (
-        f"The object moved by {displacement[worst]:.1f} px against its surroundings in {found.names[worst]}"
-    )
+    message = f"The object moved by {displacement[worst]:.1f} px against its surroundings in {found.names[worst]}"
     figure: float | None = round(float(displacement[worst]), 3)
     if np.isinf(displacement[worst]):
         figure, message = None, f"The {found.names[worst]} shot shows another object in the same surroundings"
@@ -78,9 +76,7 @@ def mask(found: Evidence, limits: GateLimits) -> Gate:
         faults.append((f"{charted:.0%} of the object's mask looks like a color chart that was not found", charted, 0))
     doubted = doubt is not None and doubt > limit
     if doubt is not None and doubt > limit / 2:
-        faults.append(
-            (f"About {100 * doubt:.0f} % of the mask may be wrong", doubt, limit if doubted else limit / 2)
-        )
+        faults.append((f"About {100 * doubt:.0f} % of the mask may be wrong", doubt, limit if doubted else limit / 2))
     for message, figure, most in (
         ("The object touches {:.0%} of the picture's border, where it has no outline",
          object_.border, limits.max_mask_border),
