@@ -172,7 +172,7 @@ class Gained:
             self.results.radiance,
             self.results.alignment,
             self.results.object_,
-            replace(self.results.color, quads=None),
+            replace(self.results.color, place=None),
             Config().selfcal,
         ).gains.gain
 
