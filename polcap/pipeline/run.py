@@ -38,11 +38,8 @@ def process(
     until: str | None = None,
     force: str | None = None,
     progress: Progress = silent,
-    decode: Decode = frame_decoder.decode,
 ) -> dict[str, Any] | None:
     """Run the path and write the result folder; returns report.json's content, None with `until`.
-
-    The parameters are the options of the command.
 
     Raises
     ------
@@ -55,7 +52,7 @@ def process(
         with result_folder.locked(out):
             facts = _facts(capture, supplied, config)
             result_folder.write_run(out, facts)
-            results = path(capture, supplied, config, cache, decode)
+            results = path(capture, supplied, config, cache)
             if until is not None:
                 return None
             cache.begin("write")

@@ -72,7 +72,7 @@ def mask(found: Evidence, limits: GateLimits) -> Gate:
     object_, limit, doubt = found.object_, limits.max_mask_doubt, found.object_.doubt
     faults: list[tuple[str, float, float]] = []  # in words, its figure, its limit
     charted = 0.0
-    if found.color.corners is None:
+    if found.color.place is None:
         charted = _charted(found)
     if charted:
         faults.append((f"{charted:.0%} of the object's mask looks like a color chart that was not found", charted, 0))

@@ -18,6 +18,7 @@ from polcap.config import Config
 from polcap.images import (
     AngleStack,
     OutlineCheck,
+    PatchColors,
     RingZero,
     ShotOrder,
     TurnedShot,
@@ -98,8 +99,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("source", "warn", {"sensor": {"lossy": True}}),
     ("stillness", "pass", {}),
     ("stillness", "fail", {"bracket": {"ghost_fraction": np.array([0.0, 0.05, 0.0])}}),
-    ("chart", "pass", {"color": {"delta_e": np.full(24, 1.0)}}),
-    ("chart", "fail", {"color": {"delta_e": np.full(24, 9.0)}}),
+    ("chart", "pass", {"color": {"patches": PatchColors(np.full(24, 1.0))}}),
+    ("chart", "fail", {"color": {"patches": PatchColors(np.full(24, 9.0))}}),
     ("chart", "warn", {"chart_missing": "nothing like one"}),
     ("chart", "not measured", {}),
     ("alignment", "pass", {}),

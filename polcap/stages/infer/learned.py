@@ -20,7 +20,6 @@ from polcap.stages.infer import analytic, augmentation, fine
 from polcap.stages.infer.analytic import REACHED, fill_highlights
 
 _INVERSION = 4.0  # factor on the inversion's expected error in the join: the network has seen what it has seen
-_DETAIL = 2.0  # pixels that the network sees, 1σ: what is finer is the inversion's to tell
 # error = min(a·statedᵇ·exp(r·roughness), c), degrees: likeliest on traced training meshes (decision 28)
 _CALIBRATION = (0.515, 1.12, 0.906, 50.0)
 _CELLS = 2.0  # cells of the network's grid, 1σ, over which its pattern is taken as the same
@@ -60,7 +59,7 @@ def estimate(
         A network was made for other channels, or gives other maps.
     """
     maps, guess, stated = known(cues, network, run, ior, symmetries)
-    normal = fine.refined(cues, guess, network.fine, run) if fine_pass and network.fine else guess.normal
+    normal = fine.refine(cues, guess, network.fine, run) if fine_pass and network.fine else guess.normal
     lit = (np.maximum(cues.radiance, 0) + FLOOR) * np.exp(maps["factor"])
     diffuse = fill_highlights(lit / _shading(normal, cues.rays) - FLOOR, _bounded(cues))
     scale, power, rougher, most = _CALIBRATION
@@ -81,7 +80,7 @@ def estimate(
 
 def known(
     cues: Cues, network: Network, run: RunNetwork, ior: float, symmetries: int
-) -> tuple[dict[str, Floats], fine.Guess, Floats]:
+) -> tuple[dict[str, Floats], fine.CoarseEstimate, Floats]:
     """What stands before the fine pass, whose training begins here too.
 
     Parameters
@@ -113,7 +112,7 @@ def known(
     by_pixel, doubt, _ = analytic.invert(cues, ior, guide, averaged)
     detailed = _detailed(ahead, by_pixel, cues.mask, shrink)
     normal, stated = _joined((ahead, maps["sigma"]), (detailed, _INVERSION * doubt))
-    return maps, fine.Guess(normal, ahead, maps["sigma"], maps["roughness"], shrink), stated
+    return maps, fine.CoarseEstimate(normal, ahead, maps["sigma"], maps["roughness"], shrink), stated
 
 
 def _bounded(cues: Cues) -> Cues:
@@ -155,14 +154,7 @@ def _detailed(coarse: Floats, by_pixel: Floats, mask: NDArray[np.bool_], shrink:
 
     Interreflection, index and half-turns bend the inversion's normals over whole regions; relief is finer.
     """
-    height, width = mask.shape
-    small = round(height / shrink), round(width / shrink)
-    inside = mask.astype(np.float32)
-    difference, share = (
-        cv2.GaussianBlur(area_mean(image, small), (0, 0), _DETAIL)
-        for image in ((coarse - by_pixel).astype(np.float32) * inside[..., None], inside)
-    )
-    moved = by_pixel + cv2.resize(difference / np.maximum(share, 1e-3)[..., None], (width, height))
+    moved = by_pixel + fine.low_pass((coarse - by_pixel).astype(np.float32), mask, shrink)
     return np.asarray(moved / np.maximum(_length(moved), 1e-6))
 
 

@@ -38,7 +38,7 @@ def result() -> Result:
         view=of.view,
         residual=None,
     )
-    color = ColorCalibration(np.eye(3), None, None, None, "none", np.nan, None)
+    color = ColorCalibration(np.eye(3), "none")
     return of, surfaces.mesh(of), image, cues.compute(image, color)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from polcap.config import Config
-from polcap.images import ColorCalibration, SelfCalibration
+from polcap.images import Bits, ChartPlace, ColorCalibration, PatchColors, SelfCalibration
 from polcap.quality import light
 from polcap.quality.gate import Evidence
 from polcap.quality.limits import GateLimits
@@ -20,14 +20,15 @@ SHOTS = scenes.stack(gain=GAIN, noise=0.004)
 GREYS = np.arange(24) >= 18
 
 
-def board(**fields: object) -> ColorCalibration:
+def board(use: Bits | None = None) -> ColorCalibration:
     """24 squares on the scene's unpolarized board, as a chart's patches."""
     quads = []
     for row in range(4):
         for column in range(6):
             x, y = 230 + 11 * column, 36 + 38 * row
             quads.append([[x, y], [x + 9, y], [x + 9, y + 30], [x, y + 30]])
-    return replace(scenes.no_color(), quads=np.array(quads, float), source="chart", **fields)  # type: ignore[arg-type]
+    place = ChartPlace(np.array(quads, float), np.zeros((4, 2)))
+    return replace(scenes.no_color(), place=place, source="chart", patches=PatchColors(np.zeros(24), use))
 
 
 def solve(radiance, color) -> SelfCalibration:
@@ -49,12 +50,12 @@ def test_hidden_grey_patches_do_not_count(reason):
     value[:, 150:190, 224:300] = 0.02 * np.random.default_rng(1).uniform(0.5, 1.5, size=(3, 40, 76, 1))
     covered = replace(SHOTS, value=value)
     use = np.where(GREYS, reason, PatchUse.USED).astype(np.uint8)
-    found = solve(covered, board(patch_use=use)).gains
+    found = solve(covered, board(use)).gains
     assert found.source == "object"
     assert np.abs(found.gain.mean(1) / GAIN - 1).max() < 0.005
     use[[18, 19]] = PatchUse.USED  # white and neutral 8 show: they alone serve
     value[:, 150:190, 230:252] = SHOTS.value[:, 150:190, 230:252]
-    half = solve(replace(SHOTS, value=value), board(patch_use=use)).gains
+    half = solve(replace(SHOTS, value=value), board(use)).gains
     assert half.source == "grey patches" and np.isnan(half.grey_slope)
     assert np.abs(half.gain.mean(1) / GAIN - 1).max() < 0.003
 
