@@ -104,12 +104,12 @@ def test_both_parts_of_the_light_are_written(
 
 def test_process_and_check_say_what_the_crossed_shot_shows(capture: Capture, results: tuple[Results, Results]) -> None:
     lines = {line.name: line for line in check.inspect(capture, NONE, Config(), chart=ChartRequest("none")).lines}
-    assert lines["crossed"].state == "pass" and "mirrored" in lines["crossed"].says
+    assert lines["crossed"].state == "pass" and "mirrored" in lines["crossed"].message
 
 
 def test_a_filter_that_was_not_crossed_is_told(capture: Capture) -> None:
     """The first shot once more for the crossed one: its highlights clip as well."""
     shown = replace(capture, crossed=replace(capture.shots[0], frames=capture.shots[0].frames))
     lines = {line.name: line for line in check.inspect(shown, NONE, Config(), chart=ChartRequest("none")).lines}
-    assert lines["crossed"].state == "warn" and "clipped" in lines["crossed"].says
+    assert lines["crossed"].state == "warn" and "clipped" in lines["crossed"].message
     assert gates.verdict(lines.values()) != "pass"

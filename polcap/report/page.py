@@ -87,8 +87,8 @@ def verdict(about: Mapping[str, Any]) -> tuple[str, str]:
     if not judged:  # the shots are out of order, or there is no object
         return headline, ""
     within = f"Half of the normals are expected within {_gate_value(judged[0], 'value')} of the surface's"
-    because = judged[0]["says"].partition(", most of it from: ")[2]
-    return headline, f"{within}; most of that is for what these checks found: {because}." if because else f"{within}."
+    because = judged[0]["says"].partition(", mostly due to: ")[2]
+    return headline, f"{within}; mostly due to these checks: {because}." if because else f"{within}."
 
 
 def _verdict(about: Mapping[str, Any]) -> Iterator[str]:
@@ -121,7 +121,7 @@ def _cost(gate: Mapping[str, Any]) -> str:
 
 
 def _remedy(gate: Mapping[str, Any]) -> str:
-    return f" <b>{escape(gate['remedy'])}</b>" if gate.get("remedy") and gate["state"] != "pass" else ""
+    return f" <b>{escape(gate['remedy'])}.</b>" if gate.get("remedy") and gate["state"] != "pass" else ""
 
 
 def _gate_value(gate: Mapping[str, Any], name: str) -> str:
@@ -168,12 +168,12 @@ def _chart(about: Mapping[str, Any], results: Results) -> str:
     """The chart as photographed beside the maker's colors; nothing where none was read."""
     color = results.color
     measured = shown.patches(results.radiance, color)
-    if measured is None or color.delta_e is None:
+    if measured is None or color.patches is None:
         return ""
     known = shipped_data.colorchecker(about["settings"]["whitebalance"]["chart"])
-    reference = next((one for one in known.editions if one.name == color.edition), known)
+    reference = next((one for one in known.editions if one.name == color.patches.edition), known)
     drawing = plots.chart(
-        srgb_eight_bits(reference.rec709), srgb_eight_bits(measured), color.delta_e, reference.patches
+        srgb_eight_bits(reference.rec709), srgb_eight_bits(measured), color.patches.delta_e, reference.patches
     )
     figures = about["figures"]["chart"]
     mean, ahead = labels.number(figures["delta_e_mean"], 2), figures["predicted_mean"]
@@ -255,10 +255,10 @@ def gates(judged: Sequence[Mapping[str, Any]]) -> str:
         f"<tr><td>{escape(gate['name'].capitalize())}</td>"
         f'<td class="{escape(gate["state"])}">{escape(gate["state"])}</td>'
         f"<td>{escape(_gate_value(gate, 'value'))}</td><td>{escape(_gate_value(gate, 'limit'))}</td>"
-        f"<td>{_cost(gate)}</td><td>{escape(gate['says'])}{_remedy(gate)}</td></tr>"
+        f"<td>{_cost(gate)}</td><td>{escape(gate['says'])}.{_remedy(gate)}</td></tr>"
         for gate in sorted(judged, key=lambda gate: order.get(gate["state"], 4))
     )
-    head = "<tr><th>Check</th><th></th><th>Value</th><th>Limit</th><th>Cost</th><th>What it says</th></tr>"
+    head = "<tr><th>Check</th><th></th><th>Value</th><th>Limit</th><th>Cost</th><th>Finding</th></tr>"
     return f'<div class="scroll"><table class="checks">{head}{rows}</table></div>'
 
 

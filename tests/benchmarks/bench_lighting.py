@@ -22,7 +22,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.config import Gates
 from polcap.formats import onnx
 from polcap.formats.maps import png
 from polcap.images import AngleStack, Floats, Network, ObjectMask, single_frames
@@ -30,6 +29,7 @@ from polcap.optics import fresnel, mueller
 from polcap.pipeline import models
 from polcap.quality import polarization
 from polcap.quality.gate import Evidence
+from polcap.quality.limits import GateLimits
 from polcap.stages import cues, infer, stokes
 from polcap.synth import scene_materials
 from polcap.synth.render import Seen
@@ -176,8 +176,8 @@ def _spoken(image: Any) -> dict[str, str]:
     found = Evidence.partial(
         stokes=image, radiance=SimpleNamespace(angle=ANGLE), gains=scenes.equal(), names=["0°", "45°", "90°"], maps=maps
     )
-    lines = [*polarization.of_outline(found, Gates()), polarization.ill_posed(found, Gates())]
-    return {line.name: line.says for line in lines if line.state in ("fail", "warn")}
+    lines = [*polarization.of_outline(found, GateLimits()), polarization.ill_posed(found, GateLimits())]
+    return {line.name: line.message for line in lines if line.state in ("fail", "warn")}
 
 
 @lru_cache

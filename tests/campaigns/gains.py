@@ -11,13 +11,13 @@ import argparse
 
 import numpy as np
 
-from polcap.config import Gates
 from polcap.errors import ChartError
 from polcap.formats import shipped_data
 from polcap.images import AngleStack, ColorCalibration
 from polcap.pipeline.path import AUTO
 from polcap.quality import light
 from polcap.quality.gate import Evidence
+from polcap.quality.limits import GateLimits
 from polcap.stages import selfcal, whitebalance
 from polcap.stages.selfcal import angles, integrability, object_gains
 from tests import scenes
@@ -52,7 +52,7 @@ def main() -> None:
             errors.append(np.nan)  # within no limit, beyond none
             continue
         found = selfcal.solve(radiance, scenes.still(len(angle)), object_, color, settings)
-        gate = light._gain_doubt(Evidence.partial(selfcal=found), Gates())
+        gate = light._gain_doubt(Evidence.partial(selfcal=found), GateLimits())
         error = np.abs(found.gains.gain.mean(1) / true - 1)
         errors.append(float(error.max()))
         sigma = float(found.gains.sigma.max())

@@ -50,7 +50,7 @@ def test_one_turned_shot_of_three_is_told_with_the_ring_that_it_looks_like(tmp_p
     faulty.shoot(tmp_path / "bad", 1, "wrong angle", WIDTH)
     line = next(line for line in verdict(tmp_path / "bad").lines if line.name == "angles")
     assert line.state == "warn" and line.cost_deg > 1
-    assert "ring's zero" in line.says and "single shot" in line.says and "take it again" in line.remedy
+    assert "ring's zero" in line.message and "single shot" in line.message and "take it again" in line.remedy
 
 
 def test_process_measures_the_blur_that_check_measures(tmp_path: Path) -> None:

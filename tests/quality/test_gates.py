@@ -17,6 +17,7 @@ from polcap.images import (
     SurfaceMaps,
     TurnedShot,
 )
+from polcap.optics import frames
 from polcap.quality import gates
 from polcap.quality.gate import Evidence
 from polcap.quality.gates import Gate
@@ -59,7 +60,7 @@ def good() -> Evidence:
 
 
 def judged(of: Evidence) -> dict[str, Gate]:
-    return {gate.name: gate for gate in gates.judge(of, Config())}
+    return {gate.name: gate for gate in gates.judge(of, Config().gates, Config().align)}
 
 
 def failed(of: Evidence) -> list[str]:
@@ -143,14 +144,14 @@ def test_gains_nobody_knows_cost_degrees(good: Evidence) -> None:
 def test_one_angle_that_keeps_four_shots_from_closing_fails(good: Evidence) -> None:
     turned = replace(good.selfcal, turned=TurnedShot((1,), np.radians(15), np.radians(2)))
     gate = judged(changed(good, selfcal=turned))["angles"]
-    assert gate.state == "fail" and gate.shots == ("45°",) and "+15° ± 2°" in gate.says
+    assert gate.state == "fail" and gate.shots == ("45°",) and "+15° ± 2°" in gate.message
 
 
 @pytest.mark.parametrize(("turn", "state"), [(1.5, "pass"), (5.0, "warn")])
 def test_a_turn_of_the_ring_is_told_though_taken_out(good: Evidence, turn: float, state: str) -> None:
     turned, doubt = np.radians([turn, 0.4])
     gate = judged(changed(good, selfcal=replace(good.selfcal, ring=RingZero(turned, doubt, turned))))["angles"]
-    assert gate.state == state and f"{turn:+.1f}°" in gate.says and "taken out" in gate.says
+    assert gate.state == state and f"{turn:+.1f}°" in gate.message and "corrected" in gate.message
 
 
 def shaped(good: Evidence, polarized: float, flattened: float, roughness: float, dimmed: bool = True) -> Any:
@@ -169,8 +170,8 @@ def shaped(good: Evidence, polarized: float, flattened: float, roughness: float,
 @pytest.mark.parametrize(
     ("polarized", "flattened", "roughness", "dimmed", "words"),
     [
-        (0.13, 0.4, 0.6, True, "the shape found is flat"),  # wax
-        (0.25, 0.4, 0.6, True, "the shape found is flat"),  # wax that is not quite as bad
+        (0.13, 0.4, 0.6, True, "the shape is flat"),  # wax
+        (0.25, 0.4, 0.6, True, "the shape is flat"),  # wax that is not quite as bad
         (0.13, 1.0, 0.2, True, "gloss and shading"),  # no rough body shines
         (0.13, 1.0, 0.7, True, ""),  # a rough body, which the estimator has allowed for
         (0.13, 0.3, 0.2, False, ""),  # a coin
@@ -182,15 +183,15 @@ def test_body_that_polarizes_too_little_for_its_shape_is_told(
 ) -> None:
     gate = judged(shaped(good, polarized, flattened, roughness, dimmed))["body"]
     assert gate.state == ("warn" if words else "pass"), gate
-    assert words in gate.says and (gate.cost_deg > 10) == bool(words)
+    assert words in gate.message and (gate.cost_deg > 10) == bool(words)
 
 
 def test_light_from_around_is_told(good: Evidence) -> None:
     image = good.stokes
     across = image.stokes * np.array([1, -1, -1], np.float32)[:, None, None, None]
     gate = judged(changed(good, stokes=replace(image, stokes=across)))["body"]
-    assert gate.state == "fail" and "reflected" in gate.says
-    assert "90°" in gate.says and "90° on" in gate.remedy  # a ring set upright at 0° looks the same
+    assert gate.state == "fail" and "reflects" in gate.message
+    assert "90°" in gate.message and "plus 90°" in gate.remedy  # a ring set upright at 0° looks the same
 
 
 @pytest.mark.parametrize(
@@ -204,14 +205,14 @@ def test_a_lopsided_body_is_no_light_from_the_side(good: Evidence, uneven: float
     lit = image.stokes * np.maximum(1 + uneven * across, 0)
     lit[0] += ambient * np.maximum(across, 0) * image.stokes[0].mean()
     gate = judged(changed(good, stokes=replace(image, stokes=lit.astype(np.float32))))["body"]
-    assert gate.state == state and ("side" in gate.says) == (state == "warn")
+    assert gate.state == state and ("side" in gate.message) == (state == "warn")
 
 
 def test_a_ring_that_was_mended_is_told() -> None:
     clocked = replace(scenes.stack(noise=0.002, angles=scenes.ANGLES + np.radians(4.0)), angle=scenes.ANGLES)
     gate = judged(found(radiance=clocked))["angles"]
     assert gate.state == "warn" and gate.value == pytest.approx(4.0, abs=0.5)  # it may be a single shot's
-    assert "taken out" in gate.says and 0 < gate.cost_deg < 2.5
+    assert "corrected" in gate.message and 0 < gate.cost_deg < 2.5
 
 
 @pytest.mark.parametrize(("name", "value"), [("border", 0.6), ("islands", 0.03), ("holes", 0.06)])
@@ -240,7 +241,7 @@ def test_assumed_focal_length_warns_and_costs_what_the_rays_would_lean(good: Evi
     [
         ({"pieces": 26}, "26 pieces", ""),
         ({"cuts": 2.5}, "250% of the outline", "%"),
-        ({"raggedness": 0.4}, "rim 40%", "%"),
+        ({"raggedness": 0.4}, "boundary is 40%", "%"),
     ],
 )
 def test_mesh_in_shreds_fails_by_the_figure_that_is_over(
@@ -248,9 +249,9 @@ def test_mesh_in_shreds_fails_by_the_figure_that_is_over(
 ) -> None:
     whole = {"pieces": 1, "cuts": 0.3, "cut_px": 40.0, "raggedness": 0.1}
     passed = judged(changed(good, mesh=SimpleNamespace(**whole)))["mesh"]
-    assert passed.state == "pass" and passed.says.startswith("1 piece, cut along 40 px")
+    assert passed.state == "pass" and passed.message.startswith("1 piece, cut along 40 px")
     gate = judged(changed(good, mesh=SimpleNamespace(**whole | fault)))["mesh"]
-    assert gate.state == "fail" and words in gate.says
+    assert gate.state == "fail" and words in gate.message
     (figure,) = fault.values()
     assert (gate.value, gate.unit) == (figure, unit) and not _within(gate, least=False)
 
@@ -284,6 +285,20 @@ def test_what_is_beside_a_gate_s_words_is_the_figure_that_they_are_of(good: Evid
         assert gate.state in ("warn", "fail") and not _within(gate, least), gate
 
 
+@pytest.mark.parametrize(("turned", "state"), [(0.0, "pass"), (0.03, "pass"), (0.3, "fail")])
+def test_a_shape_that_is_turned_inside_out_fails_at_its_outline(good: Evidence, turned: float, state: str) -> None:
+    """A ball of which a sector is its half-turn about the ray: as much of its outline points inward."""
+    rows, columns = np.mgrid[: good.maps.mask.shape[0], : good.maps.mask.shape[1]]
+    y, x = (part - part[good.maps.mask].mean() for part in (rows, columns))
+    around = np.arctan2(y, x) / (2 * np.pi) + 0.5
+    local = np.where((around < turned)[..., None], [-1, -1, 1], 1) * scenes.truth()[0]
+    view = frames.rays(good.maps.view, *good.maps.mask.shape)
+    normal = frames.from_ray_frame(local, view).astype(np.float32)
+    gate = judged(changed(good, maps=replace(good.maps, normal=normal)))["outline"]
+    assert gate.state == state
+    assert gate.value == pytest.approx(turned, abs=0.02)
+
+
 def test_four_angles_are_not_asked_of_who_has_shot_four(good: Evidence) -> None:
     four = found(angles=np.radians([0.0, 45, 90, 135]))
     for of, asked in ((good, True), (four, False)):
@@ -295,4 +310,4 @@ def test_four_angles_are_not_asked_of_who_has_shot_four(good: Evidence) -> None:
 
 def test_a_passing_mask_tells_its_figure(good: Evidence) -> None:
     gate = judged(changed(good, object_=replace(good.object_, doubt=0.024)))["mask"]
-    assert gate.state == "pass" and "2.4 %" in gate.says
+    assert gate.state == "pass" and "2.4 %" in gate.message

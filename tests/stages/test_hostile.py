@@ -95,8 +95,8 @@ def run(radiance: AngleStack, drawn: np.ndarray | None) -> None:
         "radiance": radiance, "color": color, "alignment": alignment, "object_": object_, "selfcal": calibration,
         "stokes": image, "maps": maps, "mesh": mesh,
     }  # fmt: skip
-    told = list(gates.judge(Evidence.partial(**found), config))
-    assert all(gate.says and gate.state in ("pass", "warn", "fail", "not measured") for gate in told)
+    told = list(gates.judge(Evidence.partial(**found), config.gates, config.align))
+    assert all(gate.message and gate.state in ("pass", "warn", "fail", "not measured") for gate in told)
     assert built.base_color.dtype == np.uint8
 
 
