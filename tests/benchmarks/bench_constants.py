@@ -25,7 +25,7 @@ from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
 from polcap.results import Results
 from polcap.stages import align, infer, selfcal
-from polcap.stages.infer import analytic, azimuth, fine, learned, zenith
+from polcap.stages.infer import analytic, fine, half_turns, learned, zenith
 from polcap.stages.selfcal import object_gains
 
 FACTORS = (0.5, 2.0)
@@ -44,7 +44,7 @@ SELFCAL: Mapping[ModuleType, tuple[str, ...]] = {
 }
 ANALYTIC = {
     analytic: ("_BLURS_PX", "_SAME", "_MODEL_ERROR_DEG"),
-    azimuth: ("_MOST_PIXELS", "_RIM_PX", "_BLUR_PX", "_CONVEXITY"),
+    half_turns: ("_LONGEST", "_OUTLINE", "_INSIDE", "_AHEAD", "_BLUR", "_AROUND"),
     zenith: (
         "_FLAT", "_FLATTEST", "_SMOOTH_LIKELIER", "_DEPOLARIZED_LIKELIER", "_PATCHES", "_UNEVEN", "_RADIUS_SPREAD",
         "_OUTLINE_DEG", "_SHARP",
@@ -54,6 +54,7 @@ LEARNED: Mapping[ModuleType, tuple[str, ...]] = {
     learned: ("_INVERSION", "_CELLS", "_BRIGHTEST"),
     fine: ("_COARSEST",),
     analytic: ("_MODEL_ERROR_DEG", "_SAME"),
+    half_turns: ("_LONGEST", "_OUTLINE", "_INSIDE", "_NETWORK", "_AHEAD", "_BLUR", "_SURE_DEG", "_SUREST"),
 }
 
 

@@ -4,8 +4,8 @@ Both estimators work in the frame of each view ray, where polarization speaks of
 hand back camera-frame maps.
 
     analytic       the inversion: zenith from DoLP, azimuth from AoLP
-        azimuth        which of the two half-turns an AoLP means
         zenith         zenith from DoLP, by the object's law of diffuse polarization
+    half_turns     side of the ray to which a normal leans, for both estimators
     highlight_albedo   albedo in highlights, from a crossed shot
     learned        the network, joined with the inversion
     fine           relief finer than the network's pixels
@@ -35,7 +35,7 @@ class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
 
 
-@stage(version=15)
+@stage(version=16)
 def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: InferSettings) -> SurfaceMaps:
     """Normal, diffuse, specular, roughness and expected error; network None means analytic.
 

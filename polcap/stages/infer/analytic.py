@@ -11,7 +11,7 @@ import numpy as np
 from polcap import parallel
 from polcap.images import Cues, Floats, Quality, SurfaceMaps
 from polcap.optics import brdf, frames, fresnel
-from polcap.stages.infer import azimuth
+from polcap.stages.infer import half_turns
 from polcap.stages.infer.zenith import ZenithEstimate, candidate_laws, estimate_zenith
 
 _BLURS_PX = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0)  # in steps of 1.5, in which noise falls by a third
@@ -63,7 +63,7 @@ def invert(
         Refractive index.
     guide
         Normals (H, W, 3) in the frame of each ray and their expected error (H, W), degrees, by which the half-turn of
-        the azimuth is chosen; without it by `stages/infer/azimuth.py`.
+        the azimuth is chosen; without it by `half_turns.py`.
     prepared
         What `prepare` gives, where that is known.
     """
@@ -78,13 +78,15 @@ def invert(
     cos_zenith = np.cos(zenith)
     axis = ratio / np.sqrt(squared + 1e-12)
     if guide is None:
-        phi, certainty = azimuth.resolve(axis, np.sin(zenith), cues.mask)
+        phi = np.arctan2(axis[1], axis[0]) / 2
+        found = half_turns.resolve(_local(cos_zenith, phi, cues.rays), cues.mask)
+        phi, certainty = phi + np.where(found.turned, np.pi, 0.0), 1 - 2 * found.doubt
     else:
         phi, certainty = _guided(axis, cues.rays, *guide)
-    error, normal = parallel.both(
-        partial(_expected_error, read, dolp, sigma, certainty, cues), partial(_from_angles, cos_zenith, phi, cues.rays)
+    error, local = parallel.both(
+        partial(_expected_error, read, dolp, sigma, certainty, cues), partial(_local, cos_zenith, phi, cues.rays)
     )
-    return normal, error, cos_zenith
+    return np.asarray(frames.from_ray_frame(local, cues.rays)), error, cos_zenith
 
 
 def _guided(axis: Floats, rays: Floats, normal: Floats, sigma: Floats) -> tuple[Floats, Floats]:
@@ -129,12 +131,11 @@ def _smoothed(cues: Cues) -> tuple[Floats, Floats]:
     return ratio, sigma
 
 
-def _from_angles(cos_zenith: Floats, phi: Floats, rays: Floats) -> Floats:
-    """Unit normals (H, W, 3) in the camera frame from zenith and image azimuth about each ray."""
+def _local(cos_zenith: Floats, phi: Floats, rays: Floats) -> Floats:
+    """Unit normals (H, W, 3) in the frame of each ray from zenith and image azimuth about it."""
     x, y = frames.axis_across(phi, rays)
     share = np.sqrt(np.maximum(1 - cos_zenith**2, 0) / (x * x + y * y))
-    local = np.stack([share * x, share * y, cos_zenith], axis=-1)
-    return np.asarray(frames.from_ray_frame(local, rays))
+    return np.stack([share * x, share * y, cos_zenith], axis=-1)
 
 
 def _albedo(cues: Cues, cos_zenith: Floats, ior: float) -> tuple[Floats, Floats]:

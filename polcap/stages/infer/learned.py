@@ -16,7 +16,7 @@ from polcap.images import Cues, Floats, Network, Quality, RunNetwork, SurfaceMap
 from polcap.optics import frames
 from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stages.cues import CHANNELS, FLOOR
-from polcap.stages.infer import analytic, augmentation, fine
+from polcap.stages.infer import analytic, augmentation, fine, half_turns
 from polcap.stages.infer.analytic import REACHED, fill_highlights
 
 _INVERSION = 4.0  # factor on the inversion's expected error in the join: the network has seen what it has seen
@@ -64,6 +64,7 @@ def estimate(
     diffuse = fill_highlights(lit / _shading(normal, cues.rays) - FLOOR, _bounded(cues))
     scale, power, rougher, most = _CALIBRATION
     expected = np.minimum(scale * stated**power * np.exp(rougher * np.clip(maps["roughness"], 0, 1)), most)
+    expected = half_turns.error_with_doubt(expected, maps["doubt"], frames.dot(normal, cues.rays))
     inside = cues.mask[..., None]
     return SurfaceMaps(
         normal=(normal * inside).astype(np.float32),
@@ -92,8 +93,8 @@ def known(
     -------
     tuple
         The network's maps (H, W[, 3]) at the crop's size, of which `factor` is the logarithm of the light that its
-        albedo sends back under the shading of its normals over S0; what the fine pass is told; the error (H, W)
-        stated for the normals, degrees.
+        albedo sends back under the shading of its normals over S0, and `doubt` the probability of a wrong half-turn;
+        what the fine pass is told; the error (H, W) stated for the normals, degrees.
     """
     _check(network)
     size = cues.mask.shape[::-1]
@@ -103,6 +104,7 @@ def known(
     small, averaged = parallel.both(looks, partial(analytic.prepare, cues, ior), network.at_once)
     # beside the object the network guesses: zeros there leave an edge's direction to the object's own pixels
     small["normal"] = _without_grid(small["normal"], seen.mask) * seen.mask[..., None]
+    small["normal"], small["doubt"] = _sided(small["normal"], seen, small["sigma"], small.pop("opposed"))
     small["factor"] = _factor(small["diffuse"] * _shading(small["normal"], seen.rays), seen)
     for name in ("specular", "roughness"):
         small[name] = _blended(small[name], seen.mask)
@@ -113,6 +115,14 @@ def known(
     detailed = _detailed(ahead, by_pixel, cues.mask, shrink)
     normal, stated = _joined((ahead, maps["sigma"]), (detailed, _INVERSION * doubt))
     return maps, fine.CoarseEstimate(normal, ahead, maps["sigma"], maps["roughness"], shrink), stated
+
+
+def _sided(normal: Floats, seen: Cues, sigma: Floats, opposed: Floats) -> tuple[Floats, Floats]:
+    """Normals (H, W, 3), regions that the network took for their half-turn turned back; doubt of the side (H, W)."""
+    local = frames.to_ray_frame(normal / np.maximum(_length(normal), 1e-6), seen.rays)
+    found = half_turns.resolve(local, seen.mask, half_turns.NetworkDoubt(sigma, opposed))
+    opposite = 2 * frames.dot(normal, seen.rays)[..., None] * seen.rays - normal
+    return np.where(found.turned[..., None], opposite, normal).astype(np.float32), found.doubt
 
 
 def _bounded(cues: Cues) -> Cues:
