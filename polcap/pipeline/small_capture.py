@@ -79,4 +79,5 @@ def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapt
 
 
 def _reduced(frame: Frame, clip: float, times: int, corners: list[list[int]]) -> ReducedFrame:
-    return reduced_frame.joined(*frame_decoder.apply(frame, reduced_frame.take, clip=clip, times=times, corners=corners))
+    parts = frame_decoder.apply(frame, reduced_frame.take, clip=clip, times=times, corners=corners)
+    return reduced_frame.joined(*parts)
