@@ -26,7 +26,7 @@ from polcap.formats import atomic
 from polcap.formats.capture import layouts
 from polcap.formats.raw import dng
 from polcap.images import Exif, Floats, GBuffer, View
-from polcap.optics import projection
+from polcap.optics import frames, projection
 from polcap.optics.color import REC709_TO_XYZ
 from polcap.synth import color_checker as charts
 from polcap.synth import forward_camera, lens, render, scene_materials
@@ -221,7 +221,7 @@ def _passed(scene: Scene, shoot: Shoot, buffer: GBuffer, pose: dict[str, Any], r
     back = np.linalg.inv(np.array(pose["transform"]))
     stokes = _light(scene, shoot, buffer, back) if reference is None else reference
     y, x = np.mgrid[: shoot.height, : shoot.width].astype(np.float64)
-    v = render.view_rays(shoot.view, *_looked_at(shoot, back, x, y))
+    v = frames.rays_at(shoot.view, *_looked_at(shoot, back, x, y))
     angle = np.radians(pose["actual_deg"] - pose["rot_deg"])
     passed = render.polarize(stokes, v, angle, shoot.extinction_ratio)
     return _blurred(shoot, passed)

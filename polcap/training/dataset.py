@@ -175,7 +175,7 @@ class Simulator:
             "normal": image(normal), "depth": image(seen.depth[:, None]), "diffuse": image(surface.diffuse),
             "specular": image(surface.specular), "roughness": image(surface.roughness[:, None]),
             "highlight": image(highlight[:, None]),
-            "law": image(torch.stack([surface.law.rough, surface.law.local, surface.law.kept], dim=1)),
+            "law": image(torch.stack([surface.law.rough, surface.law.local, surface.law.dolp_factor], dim=1)),
         }  # fmt: skip
         arriving = bounce.arriving(seen, normal, surface, body[0])
         arriving = arriving + bounce.surroundings(seen, normal, surface, strength)

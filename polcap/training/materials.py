@@ -136,7 +136,7 @@ def dress(
         specular=specular,
         roughness=rough.clamp(0.05, 1.0),
         ior=own["ior"],
-        law=Law(law.rough, law.local, law.kept * fibers),
+        law=Law(law.rough, law.local, law.dolp_factor * fibers),
     )
 
 
