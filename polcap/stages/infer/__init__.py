@@ -6,7 +6,7 @@ hand back camera-frame maps.
     analytic       the inversion: zenith from DoLP, azimuth from AoLP
         zenith         zenith from DoLP, by the object's law of diffuse polarization
     half_turns     side of the ray to which a normal leans, for both estimators
-    highlight_albedo   albedo in highlights, from a crossed shot
+    highlights   albedo in highlights, from a crossed shot
     learned        the network, joined with the inversion
     fine           relief finer than the network's pixels
         augmentation   the network's answers to turned and mirrored pictures, made one
@@ -19,7 +19,7 @@ from msgspec import Meta
 
 from polcap.images import Cues, Network, RunNetwork, SurfaceMaps
 from polcap.stages import stage
-from polcap.stages.infer import analytic, highlight_albedo, learned
+from polcap.stages.infer import analytic, highlights, learned
 
 
 class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -48,4 +48,4 @@ def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: Inf
         maps = analytic.estimate(cues, settings.ior)
     else:
         maps = learned.estimate(cues, network, run, settings.ior, settings.symmetries, fine_pass=settings.fine)
-    return highlight_albedo.correct_highlights(maps, cues, settings.ior)
+    return highlights.correct_highlights(maps, cues, settings.ior)

@@ -17,7 +17,7 @@ from polcap.optics import frames
 from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stages.cues import CHANNELS, FLOOR
 from polcap.stages.infer import analytic, augmentation, fine, half_turns
-from polcap.stages.infer.analytic import REACHED, fill_highlights
+from polcap.stages.infer.highlights import REACHED, fill_highlights
 
 _INVERSION = 4.0  # factor on the inversion's expected error in the join: the network has seen what it has seen
 # error = min(a·statedᵇ·exp(r·roughness), c), degrees: likeliest on traced training meshes (decision 28)

@@ -248,7 +248,7 @@ def test_a_guide_is_as_sure_as_its_error_is_small():
     axis, rays = np.array([[[1.0, 1.0]], [[0.0, 0.0]]]), np.full((1, 2, 3), [0.0, 0.0, 1.0])
     tilt = np.radians(10.0)
     normal = np.full((1, 2, 3), [-tilt, 0.0, 1.0])
-    phi, certainty = analytic._guided(axis, rays, normal, np.array([[10.0, 2.0]]))
+    phi, certainty = analytic._azimuth_by_guide(axis, rays, normal, np.array([[10.0, 2.0]]))
     np.testing.assert_allclose(np.cos(phi), -1)
     np.testing.assert_allclose(certainty, [[0.6827, 1.0]], atol=1e-3)
 
