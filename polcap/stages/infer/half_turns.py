@@ -1,9 +1,9 @@
 """Half-turns: the side of the view ray to which each normal leans, and how sure it is.
 
-Polarization shows the plane through a normal n and the view ray r, not the side: n and n′ = 2 (n·r) r − n give
-the same Stokes parameters. The network sometimes takes a whole region for its half-turn, most often on black gloss; the inversion knows
-no side at all. Both are decided here, by one minimum over the whole object. Every cell of a coarse grid keeps n or
-turns it. With t the part of n across the ray, of length sin θ, the energy is the sum of
+Polarization shows the plane through a normal n and the view ray r, not the side: n and n′ = 2 (n·r) r − n give the same
+Stokes parameters. The network sometimes takes a whole region for its half-turn, most often on black gloss; the
+inversion knows no side at all. Both are decided here, by one minimum over the whole object. Every cell of a coarse grid
+keeps n or turns it. With t the part of n across the ray, of length sin θ, the energy is the sum of
 
     outline      3 e, e: share of object ahead of t less that behind it. A closed surface leans towards its outline;
                  where t runs along an outline (a neck that the mask cuts), e is 0
