@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.floating[Any]]
 Bits = NDArray[np.uint8]
+Device = Literal["cpu", "cuda", "auto"]
+Bools = NDArray[np.bool_]
 Role = Literal["shot", "ambient", "repeat", "chart", "cross"]
 NOT_IN_KEY = {"in_key": False}  # metadata of a field that says where or how, not what: two values are one input
 
@@ -431,40 +433,76 @@ class ObjectMask:
     mask: NDArray[np.bool_]  # (H, W) full-frame grid
     crop: tuple[int, int, int, int]  # x0, y0, x1, y1 full-frame grid px, end exclusive
     source: Literal["automatic", "user"]
-    chance: Bits | None = None  # (H, W) 0…255, how likely each pixel is the object; None where no network looked
-    doubt: float | None = None  # 1 − the IoU with the true mask that the chances let expect
+    doubt: float | None = None  # 1 − the expected IoU with the true mask; None without a network
     islands: float = 0.0  # share of the mask outside its largest part
-    holes: float = 0.0  # area that it encloses, of the mask's
+    holes: float = 0.0  # area of its holes, over its own
     border: float = 0.0  # share of the picture's edge that it covers
 
 
 @dataclass(frozen=True)
 class Gains:
-    """What each shot's radiance is divided by, and how far it may be trusted."""
+    """The light of each shot relative to the first; each shot is divided by its gain."""
 
-    gain: Floats  # (K, 3) relative to the reference shot
+    gain: Floats  # (K, 3)
     sigma: Floats  # (K, 3) 1σ
     anchor: Floats  # (K, 3) the same from the object itself, the cross-check
     source: Literal["grey patches", "object", "one exposure", "none"]
     disagreement: float  # largest |gain/anchor − 1| of the channel means beyond three times the error of both
-    angle_offset: float  # rad, true less stated angle of all shots alike, as the outline tells it
-    angle_offset_sigma: float  # rad, 1σ; π/2 where nothing is known
-    angle_correction: float  # rad, what is added to every stated angle: the offset where it is sure, else 0
-    concentration: float  # 0…1, how well AoLP follows the silhouette
-    order: tuple[int, ...]  # the order of the shots that the silhouette supports best
-    mirrored: bool  # the silhouette supports angles counted the other way
-    anchor_sigma: Floats  # (K,) 1σ of the anchor's channel means
-    grey_slope: float  # of ln light over ln reflectance of the chart's light greys: 1 is linear, NaN unknown
-    chart_gloss: float  # greatest part of a shot's ratio on the white patch that is the chart's gloss, beyond doubt
-    turned_shots: tuple[int, ...] = ()  # one of these keeps more than three shots from closing; the most turned first
-    turned: float = 0.0  # rad, true less stated angle of the first of them
-    turned_sigma: float = np.pi / 2  # rad, 1σ
-    rival: tuple[int, ...] = ()  # an order of the shots that the silhouette supports as well; none: it tells
-    rival_mirrored: bool = False
-    found_angle: Floats | None = None  # (K,) rad, where the stated ones are names only; None: they are angles
-    found_sigma: float = 0.0  # rad, 1σ of each
-    crossed: Floats | None = None  # (3,) S0 of what has no gloss over the crossed shot's light; None without one
-    crossed_sigma: float = 0.0  # 1σ, relative
+    grey_slope: float = float("nan")  # of ln light over ln reflectance of the chart's light greys: 1 is linear
+    chart_gloss: float = 0.0  # greatest part of a shot's ratio on the white patch that is the chart's gloss
+
+
+@dataclass(frozen=True)
+class ShotOrder:
+    """The order and sense of the polarizer's angles."""
+
+    shots: tuple[int, ...]  # (K,) number of the stated angle of each shot
+    mirrored: bool = False  # the angles count clockwise
+
+
+@dataclass(frozen=True)
+class OutlineCheck:
+    """The order and sense of the angles that the object's outline supports."""
+
+    best: ShotOrder  # as stated unless another fits better beyond doubt
+    concentration: float  # 0…1, how well the AoLP follows the outline
+    rival: ShotOrder | None = None  # another order that fits as well; None: the outline decides
+
+    @property
+    def as_stated(self) -> bool:
+        """Whether the stated order and sense fit best."""
+        return self.best == ShotOrder(tuple(range(len(self.best.shots))))
+
+
+@dataclass(frozen=True)
+class TurnedShot:
+    """The one of more than three shots that contradicts the others."""
+
+    shots: tuple[int, ...] = ()  # the most turned first, where several would explain it; none: all agree
+    angle: float = 0.0  # rad, true less stated angle of the first of them
+    sigma: float = np.pi / 2  # rad, 1σ
+
+
+@dataclass(frozen=True)
+class RingZero:
+    """The error of the polarizer ring's zero, common to all shots."""
+
+    offset: float  # rad, true less stated angle
+    sigma: float  # rad, 1σ; π/2: unknown
+    correction: float = 0.0  # rad, added to all angles: the offset where it is certain
+
+
+@dataclass(frozen=True)
+class SelfCalibration:
+    """Differences between the shots: the flash's energy and the polarizer's angles."""
+
+    gains: Gains
+    angle: Floats  # (K,) rad, of the polarizer, with the ring's correction
+    outline: OutlineCheck
+    ring: RingZero
+    turned: TurnedShot = TurnedShot()
+    found_sigma: float | None = None  # rad, 1σ of angles that were found; None: they were stated
+    crossed: Floats | None = None  # (3,) S0 of a surface without gloss over the crossed shot's light; None without one
 
 
 @dataclass(frozen=True)
@@ -500,17 +538,19 @@ class Cues:
 
 @dataclass(frozen=True)
 class Network:
-    """A loaded model: what it computes, and what its file says of itself."""
+    """A model file and the facts of its metadata; a `RunNetwork` function runs it."""
 
-    run: Callable[[Floats], dict[str, Floats]] = field(  # (1, N, H, W) → name → (1, n, H, W)
-        compare=False, repr=False, metadata=NOT_IN_KEY
-    )
     digest: str
     channels: tuple[str, ...]  # names of stages/cues, in order
     metadata: Mapping[str, str]
-    provider: str
-    fine: "Network | None" = None  # what adds relief to this one's normals
-    at_once: int = field(default=1, compare=False, metadata=NOT_IN_KEY)  # runs that may go side by side
+    fine: "Network | None" = None  # adds fine relief to the normals of this one
+    path: str = field(default="", metadata=NOT_IN_KEY)
+    device: Device = field(default="cpu", metadata=NOT_IN_KEY)
+    threads: int = field(default=0, metadata=NOT_IN_KEY)  # 0: as many as polcap may use
+    at_once: int = field(default=1, compare=False, metadata=NOT_IN_KEY)  # runs in parallel
+
+
+RunNetwork = Callable[[Network, Floats], dict[str, Floats]]  # (1, N, H, W) → name → (1, n, H, W); as `formats.onnx.run`
 
 
 @dataclass(frozen=True)

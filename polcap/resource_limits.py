@@ -87,9 +87,9 @@ def shortfall(error: BaseException, stage: str, pixels: int) -> SettingError:
 
     `pixels` are those of a RAW frame.
     """
-    from polcap.stages.hdr import budget
+    from polcap.stages.hdr import planes
 
-    taken, limit = budget.memory()
+    taken, limit = planes.process_memory()
     asked = _ASKED.search(str(error))
     more = float(asked[1]) * _BYTES[asked[2]] if asked else 0.0
     whole = max(_GB_PER_PIXEL * pixels + _GB_FIXED, _ROOM * (taken + more) / 1e9, _LEAST_GB)

@@ -10,9 +10,9 @@ from polcap.images import (
     Asset,
     ColorCalibration,
     Cues,
-    Gains,
     Mesh,
     ObjectMask,
+    SelfCalibration,
     StokesImage,
     SurfaceMaps,
 )
@@ -30,7 +30,7 @@ class Results:
     color: ColorCalibration
     alignment: Alignment
     object_: ObjectMask
-    gains: Gains
+    selfcal: SelfCalibration
     stokes: StokesImage
     cues: Cues
     maps: SurfaceMaps

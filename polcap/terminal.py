@@ -144,8 +144,8 @@ def tell_gates(about: dict[str, Any]) -> None:
     for gate in about["gates"]:
         if gate["state"] in ("fail", "warn"):
             word = "gate failed" if gate["state"] == "fail" else "warning"
-            cost = f" (costs about {gate['cost_deg']:.0f}°)" if gate["cost_deg"] >= 1 else ""
-            tell(f"polcap: {word}: {gate['name']}: {gate['says']}{cost}; {gate['remedy']}")
+            cost = f", costs about {gate['cost_deg']:.0f}°" if gate["cost_deg"] >= 1 else ""
+            tell(f"polcap: {word}: {gate['name']}: {gate['says']}{cost}. {gate['remedy']}.")
             failed += gate["state"] == "fail"
     if failed:
         raise GateError(f"{failed} of {len(about['gates'])} gates failed; the asset was written, see report.html")

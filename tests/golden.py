@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap import Config, images, read_capture
-from polcap.formats import shipped_data
+from polcap.formats import onnx, shipped_data
 from polcap.formats.raw import frame_decoder
 from polcap.images import View
 from polcap.optics import frames
@@ -69,10 +69,12 @@ LIMITS: dict[str, dict[str, Limit]] = {  # stage → array → limit; the first 
     },
     "mask": {
         "mask": BITS,
-        "chance": Limit("absolute", 1.0, 1e-3, sensitive=True),  # 8-bit: one level of 255
         "crop": Limit("absolute", 1.0),  # follows the outermost pixel of the mask
     },
-    "selfcal": {"*angle*": Limit("degrees", 0.02)},  # under a tenth of its 1σ
+    "selfcal": {  # degrees: under a tenth of their 1σ
+        "*angle": Limit("degrees", 0.02),
+        "ring.*": Limit("degrees", 0.02),
+    },
     "stokes": {"quality": BITS, "mask": BITS, "*": FLOAT32},
     "cues": {"quality": BITS, "mask": BITS, "*": FLOAT32},
     "infer": {
@@ -219,7 +221,8 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
     registered = replace(scenes.still(), transform=inputs["transform"])
     x0, y0, x1, y1 = (int(edge) for edge in inputs["crop"])
     object_ = images.ObjectMask(inputs["mask"], (x0, y0, x1, y1), "automatic")
-    gains = replace(scenes.equal(), gain=inputs["gain"], sigma=inputs["sigma"])
+    equal = scenes.equal(gain=inputs["gain"])
+    calibration = replace(equal, gains=replace(equal.gains, sigma=inputs["sigma"]))
 
     def network() -> images.Network:
         found = models.load_network("network", None, "cpu", threads)
@@ -238,22 +241,22 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
 
     def segment() -> Any:
         found = models.load_mask_network(threads)
-        return mask.segment(shots(), registered, color, None, found, config.mask)
+        return mask.segment(shots(), registered, color, None, found, onnx.run, config.mask)
 
     def calibrate() -> Any:
         return selfcal.solve(shots(), registered, object_, color, config.selfcal)
 
     def solve() -> Any:
-        return stokes.solve(shots(), registered, gains, object_, config.stokes)
+        return stokes.solve(shots(), registered, calibration, object_, config.stokes)
 
     def compute() -> Any:
         return cues.compute(plain_stokes(shots(), object_), color)
 
     def estimate() -> Any:
-        return infer.estimate(stored_cues(inputs), None, config.infer)
+        return infer.estimate(stored_cues(inputs), None, onnx.run, config.infer)
 
     def estimate_by_network() -> Any:
-        return infer.estimate(stored_cues(inputs), network(), config.infer)
+        return infer.estimate(stored_cues(inputs), network(), onnx.run, config.infer)
 
     def integrate() -> Any:
         return surface.integrate(stored_maps(inputs), 0.7, config.surface)
@@ -399,20 +402,20 @@ def make_inputs() -> Arrays:
     chart = shipped_data.colorchecker(config.whitebalance.chart)
     color = whitebalance.measure(shots, chart, images.ChartRequest("auto"), config.whitebalance)
     registered = align.register(shots, color, config.align)
-    object_ = mask.segment(shots, registered, color, None, models.load_mask_network(1), config.mask)
-    gains = selfcal.solve(shots, registered, object_, color, config.selfcal)
+    object_ = mask.segment(shots, registered, color, None, models.load_mask_network(1), onnx.run, config.mask)
+    calibration = selfcal.solve(shots, registered, object_, color, config.selfcal)
     assert color.quads is not None and color.corners is not None and color.light is not None
     found = {f"light.{name}": array for name, array in vars(color.light).items()}
     found |= {"matrix": color.matrix, "quads": color.quads, "corners": color.corners}
     found |= {"transform": registered.transform, "mask": object_.mask, "crop": np.array(object_.crop)}
-    found |= {"gain": gains.gain, "sigma": gains.sigma}
-    seen = cues.compute(stokes.solve(shots, registered, gains, object_, config.stokes), color)
+    found |= {"gain": calibration.gains.gain, "sigma": calibration.gains.sigma}
+    seen = cues.compute(stokes.solve(shots, registered, calibration, object_, config.stokes), color)
     inside = seen.mask[::STEP, ::STEP]
     found["cues.mask"] = inside
     found["cues.radiance"] = short(seen.radiance[::STEP, ::STEP] * inside[..., None])
     found["cues.ratio"] = short(seen.ratio[:, ::STEP, ::STEP] * inside)
     found["cues.ratio_sigma"] = short(seen.ratio_sigma[::STEP, ::STEP])
-    maps = infer.estimate(stored_cues(found), models.load_network("network", None, "cpu", 1), config.infer)
+    maps = infer.estimate(stored_cues(found), models.load_network("network", None, "cpu", 1), onnx.run, config.infer)
     found["maps.normal"] = short(np.moveaxis(maps.normal[..., :2] * inside[..., None], -1, 0))
     found["maps.diffuse"] = short(maps.diffuse * inside[..., None])
     found["maps.specular"] = short(maps.specular[..., 0] * inside)

@@ -7,7 +7,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Gains, ObjectMask, View, single_frames
+from polcap.images import (
+    Alignment,
+    AngleStack,
+    ColorCalibration,
+    Floats,
+    Gains,
+    ObjectMask,
+    OutlineCheck,
+    RingZero,
+    SelfCalibration,
+    ShotOrder,
+    View,
+    single_frames,
+)
 from polcap.optics import frames, mueller, shade
 from polcap.optics.warp import warp
 
@@ -108,10 +121,12 @@ def still(shots: int = 3) -> Alignment:
     return Alignment(np.tile(np.eye(3), (shots, 1, 1)), np.zeros(shots), np.ones(shots))
 
 
-def equal(shots: int = 3) -> Gains:
-    ones = np.ones((shots, 3))
-    order = tuple(range(shots))
-    return Gains(ones, 0 * ones, ones, "none", 0.0, 0.0, 0.0, 0.0, 1.0, order, False, np.zeros(shots), 1.0, 0.0)
+def equal(angle: Floats = ANGLES, gain: Floats | float = 1.0) -> SelfCalibration:
+    """Shots at these angles (K,) rad, with these gains (K, 3)."""
+    ones = np.ones((len(angle), 3))
+    gains = Gains(gain * ones, 0 * ones, ones, "none", 0.0)
+    order = ShotOrder(tuple(range(len(angle))))
+    return SelfCalibration(gains, np.asarray(angle), OutlineCheck(order, 1.0), RingZero(0.0, 0.0))
 
 
 def ball_object() -> ObjectMask:

@@ -54,7 +54,7 @@ def flat_mesh(of: SurfaceMaps) -> Mesh:
 
 
 def built(of: SurfaceMaps, on: Mesh) -> Asset:
-    return asset.build(of, on, asset.Settings())
+    return asset.build(of, on, asset.AssetSettings())
 
 
 def lit(of: SurfaceMaps, to_light: Floats) -> Floats:

@@ -8,10 +8,10 @@ import pytest
 from polcap.doctor.finding import Finding
 from polcap.doctor.photograph import examine_file
 from polcap.formats.maps import png
-from polcap.formats.raw import dng
 from polcap.formats.raw import libraw as raw
 from polcap.images import Exif
 from tests.conftest import Command
+from tests.raw_files import write_raw
 
 
 def findings(file: Path) -> dict[str, Finding]:
@@ -33,16 +33,7 @@ def test_a_cut_file_and_a_text_are_faults(example: Path, tmp_path: Path) -> None
 
 
 def test_an_over_exposed_frame_and_a_monochrome_one_are_warnings(tmp_path: Path) -> None:
-    dng.write(
-        tmp_path / "white.dng",
-        np.full((64, 64), 4095, np.uint16),
-        cfa=np.array([[0, 1], [1, 2]], np.uint8),
-        black=0,
-        white=4095,
-        exif=Exif(make="Polcap", model="Test"),
-        color_matrix=np.eye(3),
-        as_shot_neutral=np.ones(3),
-    )
+    write_raw(tmp_path / "white.dng", np.full((64, 64), 4095, np.uint16), Exif(make="Polcap", model="Test"), 0, 4095)
     assert findings(tmp_path / "white.dng")["levels"].state == "warning"
     png.write(tmp_path / "grey.png", np.tile(np.arange(64, dtype=np.uint16) * 900, (64, 1))[..., None].repeat(3, 2))
     assert "monochrome" in findings(tmp_path / "grey.png")["pattern"].message

@@ -11,7 +11,7 @@ from polcap.formats.capture.reader import read as read_capture
 from polcap.optics import registration
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import UserInput
-from polcap.stages.hdr import budget
+from polcap.stages.hdr import planes
 from tests.conftest import Command
 
 
@@ -56,7 +56,7 @@ def test_a_lack_of_memory_names_the_stage_what_it_would_take_and_the_remedy(
     def register(*_: object) -> None:
         raise MemoryError("Unable to allocate 3.00 GiB for an array with shape (3, 8) and data type float32")
 
-    monkeypatch.setattr(budget, "memory", lambda: (2_000_000_000, 4_000_000_000))
+    monkeypatch.setattr(planes, "process_memory", lambda: (2_000_000_000, 4_000_000_000))
     monkeypatch.setattr(registration, "register", register)
     capture = read_capture(example)
     with pytest.raises(SettingError) as caught:
@@ -67,6 +67,6 @@ def test_a_lack_of_memory_names_the_stage_what_it_would_take_and_the_remedy(
 
 
 def test_without_a_limit_the_remedy_is_another(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(budget, "memory", lambda: (0, None))
+    monkeypatch.setattr(planes, "process_memory", lambda: (0, None))
     said = str(resource_limits.shortfall(MemoryError(), "surface", 24_000_000))
     assert said.startswith("surface: out of memory; a capture of 24 MP takes about 1.8 GB in all: free that much")

@@ -89,7 +89,7 @@ def run(unit: Unit, order: Order, attempt: int = 1) -> Record:
         write_record(unit, record)
         about = _process(unit, order)
         failed = [gate for gate in about["gates"] if gate["state"] == "fail"]
-        says = "; ".join(f"{gate['name']}: {gate['says']}; {gate['remedy']}" for gate in failed)
+        says = " ".join(f"{gate['name']}: {gate['says']}. {gate['remedy']}." for gate in failed)
         record = replace(record, state="gates" if failed else "done", says=says)
     except PolcapError as error:
         record = replace(record, state="failed", says=_line(error))

@@ -22,7 +22,7 @@ from polcap.errors import CaptureError
 from polcap.formats.capture import layouts
 from polcap.images import Floats, NoiseLine
 from polcap.optics import robust
-from polcap.stages.hdr import exposure, frame_motion, noise, planes
+from polcap.stages.hdr import bracket, exposure, noise, planes
 from polcap.stages.hdr.planes import Signals
 
 _PARTS = 16  # of the picture, for the jackknife
@@ -64,7 +64,7 @@ def measure(brackets: list[list[Photograph]]) -> tuple[NoiseLine, ...]:
     tiles: dict[float, list[BracketTiles]] = {}
     sites: Floats = np.ones(3)
     moved = 0
-    for first, second in (pair for bracket in brackets for pair in pairwise(bracket)):
+    for first, second in (pair for frames in brackets for pair in pairwise(frames)):
         iso = first.setting[0]
         if iso != second.setting[0]:
             continue
@@ -72,8 +72,8 @@ def measure(brackets: list[list[Photograph]]) -> tuple[NoiseLine, ...]:
         a, b = planes.signals(one, CLIP), planes.signals(two, CLIP)
         if a.shape != b.shape:
             raise CaptureError(f"{second.path}: has another size than {first.path.name}; keep one camera per bracket")
-        views = frame_motion.view(a), frame_motion.view(b)
-        if frame_motion.moved(str(second.path), *views, _MOST_SHIFT_PX) is not None:
+        pyramids = bracket.brightness_pyramid(a), bracket.brightness_pyramid(b)
+        if bracket.measure_motion(str(second.path), *pyramids, _MOST_SHIFT_PX) is not None:
             moved += 1
             continue
         sites = photon_transfer.photosites(one, a.shape[0])

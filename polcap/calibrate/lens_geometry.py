@@ -30,8 +30,9 @@ from polcap.images import (
     single_frames,
 )
 from polcap.optics import distortion, sensor
+from polcap.optics.projection import transform_points
 from polcap.stages import whitebalance
-from polcap.stages.whitebalance import chart
+from polcap.stages.whitebalance import WhitebalanceSettings, chart
 
 _LEAST_BOARDS = 6  # three tilts determine a pinhole; the others show its error
 _MOST_FOCAL_SIGMA = 0.01  # relative; beyond, EXIF is better
@@ -170,7 +171,10 @@ def _color_checker(image: SensorImage) -> BoardView | None:
         return None
     try:
         found = whitebalance.measure(
-            _as_stack(value, image), shipped_data.colorchecker(), ChartRequest("auto"), whitebalance.Settings()
+            _as_stack(value, image),
+            shipped_data.colorchecker(),
+            ChartRequest("auto"),
+            WhitebalanceSettings(),
         )
     except ChartError:
         return None
@@ -199,7 +203,7 @@ def _patch_center(light: Floats, place: Floats, center: Floats) -> Floats | None
     at = np.array(center)
     for _ in range(_ITERATIONS):
         grid = np.stack(np.meshgrid(at[0] + step, at[1] + step), axis=-1)
-        px = chart.project(place, grid).astype(np.float32)
+        px = transform_points(place, grid).astype(np.float32)
         if px.min() < 0 or (px.max(axis=(0, 1)) > np.array(light.shape[::-1]) - 1).any():
             return None
         window = cv2.remap(light, px[..., 0], px[..., 1], cv2.INTER_LINEAR)
@@ -208,7 +212,7 @@ def _patch_center(light: Floats, place: Floats, center: Floats) -> Floats | None
             return None
         over = np.where(counted, np.clip((window - card) / (patch - card), 0, 1), 0)
         at = np.array([(over * grid[..., k]).sum() / over.sum() for k in (0, 1)])
-    return np.asarray(chart.project(place, at))
+    return np.asarray(transform_points(place, at))
 
 
 def _as_stack(value: Floats, image: SensorImage) -> AngleStack:

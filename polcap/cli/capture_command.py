@@ -74,7 +74,7 @@ def _verdict(folder: Path) -> dict[str, Any] | None:
     from polcap.pipeline import models
 
     try:
-        verdict = checks.inspect(captures.read(folder), models.shipped, Config())
+        verdict = checks.inspect(captures.read(folder), models.shipped(), Config())
     except InputError as error:
         terminal.tell(f"polcap: not judged: {terminal.line(error)}")
         return None

@@ -25,13 +25,18 @@ def check(
     json: Json = False,
 ) -> None:
     """Keep a capture or reshoot it, and why: seconds after its last frame. Writes nothing."""
+    from concurrent.futures import ThreadPoolExecutor
+
     from polcap import config as settings
     from polcap.formats.capture import reader as captures
     from polcap.pipeline import check as checks
     from polcap.pipeline import models
 
     chosen, request = settings.load(config, assignments or ()), options.chart_request(chart, no_chart)
-    verdict = checks.inspect(captures.read(capture, options.angles_deg(angles)), models.shipped, chosen, request)
+    with ThreadPoolExecutor(1) as pool:  # photographs are read while models are opened
+        reading = pool.submit(captures.read, capture, options.angles_deg(angles))
+        networks = models.shipped()
+        verdict = checks.inspect(reading.result(), networks, chosen, request)
     terminal.say(checks.shown(verdict) if json else checks.table(verdict))
     if not verdict.keep:
         raise typer.Exit(GateError.exit_code)

@@ -1,26 +1,25 @@
-"""In: the path of an ONNX model. Out: a `Network`, ready to run on the provider that was asked for.
+"""Opens and runs the networks of ONNX files, by onnxruntime on the CPU or on CUDA.
 
-A model says in its metadata what it eats and under which terms it may be used:
+A model states in its metadata which input it takes, and its licence:
 
     channels       names of its input channels, in order, separated by commas
     encoding       version of the channels' formulas: `ENCODING`, or of `stages/mask/mask_channels.py`
-    native_size    longer side at which inference shows it a picture, px
+    native_size    longer side of the pictures it was trained on, px
     size_multiple  height and width must be multiples of this
     licence        SPDX name of the weights' licence
 
-A file that does not say so is refused. A model that polcap does not ship is first loaded and run on a small picture
-in the limited child: what crashes, loops or eats memory there never reaches this process. Here each run has a time
-limit. The only module that imports onnxruntime: in `_onnxruntime`, which turns its telemetry off.
+A file without these is refused. A model that polcap does not ship is first run on a small picture in the limited
+child process: a crash, a loop or a lack of memory ends there. In this process every run has a time limit.
+The only module that imports onnxruntime: in `_onnxruntime`, which turns its telemetry off.
 """
 
 import os
 import threading
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -28,132 +27,125 @@ from polcap import parallel
 from polcap.errors import DecodeError, ModelError
 from polcap.formats import shipped_data, text_file
 from polcap.formats.raw import worker
-from polcap.images import Floats, Network
+from polcap.images import Device, Floats, Network
 
 ENCODING = "1"
 NUMBERS = ("native_size", "size_multiple")
 REQUIRED = ("channels", "encoding", *NUMBERS, "licence")
 CUDA, CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 _REMOTE = "AzureExecutionProvider"  # calls a service; computes nothing here
-Device = Literal["cpu", "cuda", "auto"]
-_MOST_BYTES = 1 << 30  # of a model; the one that is shipped has 15 MB
+_MAX_BYTES = 1 << 30  # of a model; the shipped one has 15 MB
 _TRIAL_S, _TRIAL_GIB, _TRIAL_PX = 60.0, 4.0, 64
 _RUN_S = 300.0  # the shipped model takes 2 s for a picture on one core
-_AT_ONCE = 4  # runs side by side, at most: positions that a network looks from
-_MOST_NUMBER = 1 << 16  # px; of what the metadata state
+_AT_ONCE = 4  # runs in parallel, at most: views of one picture
+_OPEN_SESSIONS = 8  # a run uses up to three networks
+_MAX_NUMBER = 1 << 16  # px; of a size in the metadata
 
 
 def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: str = ENCODING) -> Network:
-    """Open a model, after a trial in a child where it is none that polcap ships.
+    """Open a model; one that polcap does not ship first runs in a child process.
 
-    Parameters
-    ----------
-    path
-        The file.
-    device
-        `cuda` fails where the provider is missing or does not start; `auto` takes it where it starts.
-    threads
-        0 is as many as may run.
-    encoding
-        Of the channels that the model must eat.
+    `device` cuda fails where CUDA is missing or does not start; auto uses it where it starts. `threads` 0 is as many
+    as polcap may use. `encoding` is the version of the channels that the model must take.
 
     Raises
     ------
     ModelError
-        No such file, not a model this runtime can run, metadata missing or of another encoding,
-        or the device is not there.
+        No such file, not a model that this runtime can run, metadata missing or of another encoding,
+        or no such device.
     """
     path = Path(path)
-    data = _bytes(path)
-    mark = digest(data)
-    onnxruntime = _onnxruntime()
+    mark = digest(_bytes(path))
     if path not in _shipped_files() and mark not in _shipped():
         _try(path, mark, encoding)
-    if device == "cuda" and CUDA not in onnxruntime.get_available_providers():
-        raise ModelError("--device cuda: this onnxruntime has no CUDA; install onnxruntime-gpu, or use --device cpu")
-    wanted = [CPU] if device == "cpu" or CUDA not in onnxruntime.get_available_providers() else [CUDA, CPU]
-    session = _open(path, data, wanted, threads)
-    provider = session.get_providers()[0]
-    if device == "cuda" and provider != CUDA:
-        raise ModelError("--device cuda: CUDA does not start; make driver, CUDA and cuDNN fit, or use --device cpu")
+    session = _session(str(path), mark, device, threads)
     metadata = _metadata(path, session)
     channels = _check(path, session, metadata, encoding)
-    model = Model(path, session)
-    return Network(model, mark, channels, metadata, provider, at_once=_at_once(provider, threads))
+    at_once = _at_once(session.get_providers()[0], threads)
+    return Network(mark, channels, metadata, None, str(path), device, threads, at_once)
 
 
 def digest(data: bytes) -> str:
-    """What the bytes of a model put into the key of all that is made with it."""
+    """The digest of a model's bytes, part of every cache key that depends on it."""
     return blake2b(data, digest_size=16).hexdigest()
 
 
-@dataclass(frozen=True)
-class Model:
-    """An open model: channels (1, N, H, W) in, maps by name (1, n, H, W) out."""
-
-    path: Path
-    session: Any
-    limit_s: float = _RUN_S
-
-    def __call__(self, inputs: Floats) -> dict[str, Floats]:
-        """Run it.
-
-        Raises
-        ------
-        ModelError
-            It fails on such an input, does not end, or answers with something that is no map of it.
-        """
-        session = self.session
-        entry = session.get_inputs()[0]
-        dtype = np.float16 if entry.type == "tensor(float16)" else np.float32
-        names = [output.name for output in session.get_outputs()]
-        options = _onnxruntime().RunOptions()
-        overdue = threading.Timer(self.limit_s, setattr, (options, "terminate", True))
-        overdue.daemon = True
-        overdue.start()
-        try:
-            results = session.run(names, {entry.name: np.ascontiguousarray(inputs, dtype=dtype)}, options)
-        except _failures() as error:
-            if options.terminate:
-                raise ModelError(f"{self.path} did not end within {self.limit_s:g} s; take another model") from error
-            raise ModelError(f"{self.path} failed on an input of shape {inputs.shape}: {_line(error)}") from error
-        finally:
-            overdue.cancel()
-        return {name: self._map(name, value, inputs) for name, value in zip(names, results, strict=True)}
-
-    def _map(self, name: str, value: Any, inputs: Floats) -> Floats:
-        if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
-            raise ModelError(f"{self.path}: its output {name} holds no floating-point numbers; take another model")
-        if value.ndim != 4 or value.shape[0] != 1 or value.shape[2:] != inputs.shape[2:]:
-            raise ModelError(f"{self.path}: its output {name} is {value.shape} for an input of {inputs.shape}")
-        if not np.isfinite(value).all():
-            raise ModelError(f"{self.path}: its output {name} holds NaN or infinity; take another model")
-        return np.asarray(value, dtype=np.float32)
-
-
-def trial(path: str, expected: str, encoding: str) -> worker.Answer:
-    """Load a model and run it on a small picture of noise. In the worker.
+def run(network: Network, inputs: Floats) -> dict[str, Floats]:
+    """Run a network on channels (1, N, H, W): maps by name, (1, n, H, W) each.
 
     Raises
     ------
     ModelError
-        What is wrong with it, as `load` says it.
+        It fails on this input, does not end, returns something else, or its file has changed.
     """
-    file = Path(path)
-    data = _bytes(file)
+    session = _session(network.path, network.digest, network.device, network.threads)
+    return run_session(session, Path(network.path), inputs)
+
+
+def run_session(session: Any, path: Path, inputs: Floats, limit_s: float = _RUN_S) -> dict[str, Floats]:
+    """`run` of an open session (1, N, H, W); `path` is for messages.
+
+    Raises
+    ------
+    ModelError
+        As `run`.
+    """
+    entry = session.get_inputs()[0]
+    dtype = np.float16 if entry.type == "tensor(float16)" else np.float32
+    names = [output.name for output in session.get_outputs()]
+    options = _onnxruntime().RunOptions()
+    overdue = threading.Timer(limit_s, setattr, (options, "terminate", True))
+    overdue.daemon = True
+    overdue.start()
+    try:
+        results = session.run(names, {entry.name: np.ascontiguousarray(inputs, dtype=dtype)}, options)
+    except _failures() as error:
+        if options.terminate:
+            raise ModelError(f"{path} did not end within {limit_s:g} s; use another model") from error
+        raise ModelError(f"{path} failed on an input of shape {inputs.shape}: {_line(error)}") from error
+    finally:
+        overdue.cancel()
+    return {name: _map(path, name, value, inputs) for name, value in zip(names, results, strict=True)}
+
+
+def _map(path: Path, name: str, value: Any, inputs: Floats) -> Floats:
+    if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
+        raise ModelError(f"{path}: its output {name} is not an array of floating-point numbers; use another model")
+    if value.ndim != 4 or value.shape[0] != 1 or value.shape[2:] != inputs.shape[2:]:
+        raise ModelError(f"{path}: its output {name} is {value.shape} for an input of {inputs.shape}")
+    if not np.isfinite(value).all():
+        raise ModelError(f"{path}: its output {name} holds NaN or infinity; use another model")
+    return np.asarray(value, dtype=np.float32)
+
+
+@lru_cache(_OPEN_SESSIONS)
+def _session(path: str, expected: str, device: Device, threads: int) -> Any:
+    """The open session of a file with this digest."""
+    data = _bytes(Path(path))
     if digest(data) != expected:
-        raise ModelError(f"{path}: has changed while it was read; run again")
-    session = _open(file, data, [CPU], 1)
-    metadata = _metadata(file, session)
-    channels = _check(file, session, metadata, encoding)
+        raise ModelError(f"{path}: changed while polcap was using it; leave the file alone and run again")
+    there = CUDA in _onnxruntime().get_available_providers()
+    if device == "cuda" and not there:
+        raise ModelError("--device cuda: this onnxruntime has no CUDA; install onnxruntime-gpu, or use --device cpu")
+    session = _open(Path(path), data, [CUDA, CPU] if there and device != "cpu" else [CPU], threads)
+    if device == "cuda" and session.get_providers()[0] != CUDA:
+        raise ModelError("--device cuda: CUDA does not start; make driver, CUDA and cuDNN fit, or use --device cpu")
+    return session
+
+
+def trial(path: str, expected: str, encoding: str) -> worker.Answer:
+    """Load a model and run it on a small picture of noise; ModelError as `load`. In the child process."""
+    session = _session(path, expected, "cpu", 1)
+    metadata = _metadata(Path(path), session)
+    channels = _check(Path(path), session, metadata, encoding)
     side = max(_TRIAL_PX, int(metadata["size_multiple"]))
     noise = np.random.default_rng(1).normal(size=(1, len(channels), side, side))
-    Model(file, session)(noise.astype(np.float32))
+    run_session(session, Path(path), noise.astype(np.float32))
     return {}, {}
 
 
 def _at_once(provider: str, threads: int) -> int:
-    """Runs that may go side by side: two of a thread each end sooner than one after another on two threads."""
+    """Runs in parallel: two on one thread each end sooner than one after the other on two threads."""
     return min(threads or parallel.threads(), _AT_ONCE) if provider == CPU else 1
 
 
@@ -166,8 +158,8 @@ def _try(path: Path, expected: str, encoding: str) -> None:
 
 @cache
 def _shipped_files() -> frozenset[Path]:
-    """The models that come with polcap."""
-    return frozenset(shipped_data.data_path("colorchecker").parent.glob("models/*.onnx"))
+    """The models that ship with polcap."""
+    return frozenset(shipped_data.model_files())
 
 
 @cache
@@ -178,7 +170,7 @@ def _shipped() -> frozenset[str]:
 
 def _bytes(path: Path) -> bytes:
     try:
-        return text_file.read_bytes(path, _MOST_BYTES)
+        return text_file.read_bytes(path, _MAX_BYTES)
     except OSError as error:
         raise ModelError(f"{path}: {error.strerror or error}; name a model file with --model") from error
 
@@ -187,11 +179,11 @@ def _metadata(path: Path, session: Any) -> Mapping[str, str]:
     try:
         return {str(k): str(v) for k, v in session.get_modelmeta().custom_metadata_map.items()}
     except UnicodeError as error:
-        raise ModelError(f"{path}: its metadata are no text ({error}); export it with polcap") from error
+        raise ModelError(f"{path}: its metadata are not text ({error}); export it with polcap") from error
 
 
 def providers(path: Path) -> dict[str, str]:
-    """Every provider this onnxruntime has for this machine, and why it does not run the model; "" where it does."""
+    """Every provider of this onnxruntime, with the reason why it does not run the model, or ""."""
     found = {}
     for name in _onnxruntime().get_available_providers():
         if name == _REMOTE:
@@ -200,7 +192,7 @@ def providers(path: Path) -> dict[str, str]:
             session = _open(path, _bytes(path), [name], 0)
             shape = session.get_inputs()[0].shape
             sides = [side if isinstance(side, int) else _TRIAL_PX for side in shape[2:]]
-            Model(path, session)(np.zeros((1, shape[1], *sides), np.float32))
+            run_session(session, path, np.zeros((1, shape[1], *sides), np.float32))
             found[name] = "" if session.get_providers()[0] == name else "does not start"
         except ModelError as error:
             found[name] = str(error)
@@ -210,7 +202,7 @@ def providers(path: Path) -> dict[str, str]:
 def _open(path: Path, data: bytes, providers: list[str], threads: int) -> Any:
     onnxruntime = _onnxruntime()
     options = onnxruntime.SessionOptions()
-    options.log_severity_level = 4  # its failures are raised, and told once
+    options.log_severity_level = 4  # failures are raised instead
     options.intra_op_num_threads = max(1, (threads or parallel.threads()) - _AT_ONCE + 1)
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # waiting threads sleep
     try:
@@ -218,23 +210,23 @@ def _open(path: Path, data: bytes, providers: list[str], threads: int) -> Any:
     except _failures() as error:
         raise ModelError(
             f"{path} is not a model that onnxruntime {onnxruntime.__version__} can run: {_line(error)}; "
-            "take an ONNX file of opset ≤ 18 that is whole"
+            "use a complete ONNX file of opset ≤ 18"
         ) from error
 
 
 def _check(path: Path, session: Any, metadata: Mapping[str, str], encoding: str) -> tuple[str, ...]:
-    """Names of the channels, which are those that the model takes."""
+    """The names of the channels, whose number the model takes."""
     channels = _stated(path, metadata, encoding)
     entry = session.get_inputs()
     shape = entry[0].shape if entry else []
     if len(entry) != 1 or len(shape) != 4 or (isinstance(shape[1], int) and shape[1] != len(channels)):
         takes = [one.shape for one in entry]
-        raise ModelError(f"{path}: takes {takes}, its metadata names {len(channels)} channels of one input")
+        raise ModelError(f"{path}: takes inputs {takes}, but its metadata names {len(channels)} channels of one input")
     return channels
 
 
 def _stated(path: Path, metadata: Mapping[str, str], encoding: str) -> tuple[str, ...]:
-    """Names of the channels, by the metadata alone."""
+    """The names of the channels in the metadata, which are complete and possible."""
     missing = [name for name in REQUIRED if not metadata.get(name)]
     if missing:
         raise ModelError(f"{path}: its metadata does not state {', '.join(missing)}; export it with polcap")
@@ -246,18 +238,18 @@ def _stated(path: Path, metadata: Mapping[str, str], encoding: str) -> tuple[str
     for name in NUMBERS:
         if not _usable(metadata[name]):
             value = metadata[name][:20]
-            raise ModelError(f"{path}: {name} = {value!r} in its metadata is not a whole number of 1 to {_MOST_NUMBER}")
+            raise ModelError(f"{path}: {name} = {value!r} in its metadata is not a whole number of 1 to {_MAX_NUMBER}")
     return tuple(name.strip() for name in metadata["channels"].split(","))
 
 
 def _usable(number: str) -> bool:
-    return len(number) < 9 and number.isascii() and number.isdecimal() and 1 <= int(number) <= _MOST_NUMBER
+    return len(number) < 9 and number.isascii() and number.isdecimal() and 1 <= int(number) <= _MAX_NUMBER
 
 
 def _onnxruntime() -> Any:
-    """The library, imported without its telemetry: a device id below the home folder, and events sent to its maker.
+    """The library, without its telemetry: a device id in the home folder, and events sent to its maker.
 
-    It reads the variable once, when it is first imported. Child processes inherit it.
+    It reads the variable when it is first imported; child processes inherit it.
     """
     os.environ["ORT_DISABLE_TELEMETRY"] = "1"
     import onnxruntime

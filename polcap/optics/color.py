@@ -1,7 +1,7 @@
-"""Colour: sRGB, Rec.709, the difference an eye would see, and the matrix of a camera.
+"""Color: sRGB, Rec.709, visible color differences, and the matrix of a camera.
 
-Colours on the last axis; white is D65 throughout. The sRGB curve and the luminance also run on torch, in training, and
-the RAW reader needs the matrix before anything else is loaded: these three are written here, not colour-science's.
+Colors are on the last axis; white is D65 throughout. The sRGB curve and the luminance also run on torch, in training,
+and the RAW reader needs the matrix before anything else is loaded: these three are not colour-science's.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ REC709_TO_XYZ = np.array(
     [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]], dtype=np.float64
 )
 LUMINANCE = REC709_TO_XYZ[1]  # Y of linear Rec.709
-_RIDGE = 1e-12  # of what the patches say of each unknown: too few colors leave some of them open, and no error
+_RIDGE = 1e-12  # of each unknown's normal equation: too few colors leave some unknowns open, without an error
 _LEVELS = 65535  # of linear light: a twentieth of an 8-bit step where the curve is steepest
 
 
@@ -79,7 +79,7 @@ def delta_e(rgb: Floats, reference: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class MatrixFit:
-    """A color matrix and what is known beside it."""
+    """A color matrix, with the light and residuals of its patches."""
 
     matrix: Floats  # (3, 3) camera channels → linear Rec.709 reflectance, where the position is 0
     slope: Floats  # (2,) relative change of the light per unit of position
@@ -92,21 +92,13 @@ def fit_matrix(
 ) -> MatrixFit:
     """Least squares for a camera's matrix M under sloping light and a veil: M c = (1 + e·x) r + b (1, 1, 1).
 
-    Parameters
-    ----------
-    color, reference
-        (N, 3) patches in camera channels c and linear Rec.709 r.
-    position
-        (N, 2) x of each patch, from the patch at which the matrix is to hold.
-    usable
-        (N,) which of them serve, 12 or more.
-    rounds
-        Of reweighting.
+    color and reference (N, 3) are patches in camera channels c and linear Rec.709 r, position (N, 2) their places x
+    from the patch at which the matrix holds, usable (N,) the patches that serve, 12 or more.
 
     Notes
     -----
     A patch weighs 1/Y^⅔, the slope of L*, so that errors count as they are seen; neutral ones double.
-    Huber weights take out what a label or a highlight spoiled. Linear in M, so it commutes with exposure.
+    Huber weights take out labels and highlights. Linear in M, so it commutes with exposure.
     On 15 photographs and 4 path-traced charts the left-out patch's ΔE is 3.95 without glare, 3.57 with;
     on a chart near its highlight .97 and .09. A root-polynomial (Finlayson et al., IEEE TIP 2015) or a
     curved light gain nothing there.
@@ -120,14 +112,9 @@ def fit_matrix(
 def predicted(
     color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_], rounds: int = 20
 ) -> Floats:
-    """CIEDE2000 (N,) of each usable patch by the matrix that all others ask for; NaN for patches not used.
+    """CIEDE2000 (N,) of each usable patch by the matrix of all others, of 13 or more; NaN for patches not used.
 
-    What the matrix promises for colors it was not fitted to.
-
-    Parameters
-    ----------
-    color, reference, position, usable, rounds
-        As in `fit_matrix`; 13 usable patches or more.
+    It is the error for colors that the matrix was not fitted to. Arguments as of `fit_matrix`.
     """
     left_out = np.flatnonzero(usable)
     others = usable & (np.arange(len(usable)) != left_out[:, None])
@@ -141,22 +128,16 @@ def predicted(
 def fitting(color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_], tries: int = 60) -> Floats:
     """CIEDE2000 (N,) of every patch by the matrix that suits the better 60 % of the usable ones.
 
-    A shadow's edge or a hand spoils many patches alike and draws least squares to them; the least trimmed
-    squares over random ninths of patches see them from outside. Same arguments, same result.
-
-    Parameters
-    ----------
-    color, reference, position, usable
-        As in `fit_matrix`.
-    tries
-        Random choices of nine patches.
+    A shadow's edge or a hand spoils many patches alike and attracts least squares; least trimmed squares from `tries`
+    random choices of nine patches do not follow them. The choices are the same every time. Other arguments as of
+    `fit_matrix`.
 
     References
     ----------
     Rousseeuw & Van Driessen, Computing LTS Regression for Large Data Sets, 2006.
     """
     color = color / (float(np.mean(color[usable])) + 1e-12)
-    base, random, system = _base(reference), np.random.default_rng(24), _System(color, reference, position)
+    base, random, system = _base(reference), np.random.default_rng(24), _ChartEquations(color, reference, position)
     able = np.flatnonzero(usable)
     most = max(9, round(0.6 * len(able)))
     chosen = np.zeros((tries, len(base)), bool)
@@ -175,10 +156,10 @@ def fitting(color: Floats, reference: Floats, position: Floats, usable: NDArray[
 def _weighted(
     color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_], rounds: int
 ) -> tuple[Floats, Floats, Floats]:
-    """M (…, 3, 3), e (…, 2) and b (…,) by least squares that outliers are tamed in (Huber), `usable` (…, N)."""
+    """M (…, 3, 3), e (…, 2) and b (…,) by least squares with Huber weights, `usable` (…, N)."""
     exposure = float(np.mean(color[usable.reshape(-1, len(color)).any(axis=0)])) + 1e-12
     color, base = color / exposure, np.where(usable, _base(reference), 0.0)
-    system, weight = _System(color, reference, position), base
+    system, weight = _ChartEquations(color, reference, position), base
     for _ in range(rounds):
         matrix, slope, glare = system.solve(weight)
         seen = _seen(color, position, matrix, slope, glare)
@@ -189,14 +170,14 @@ def _weighted(
 
 
 def _median(value: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Of the usable ones among (…, N)."""
+    """Median of the usable values of (…, N)."""
     ordered, count = np.sort(np.where(usable, value, np.inf), axis=-1), usable.sum(axis=-1, keepdims=True)
     middle = [np.take_along_axis(ordered, at, axis=-1)[..., 0] for at in ((count - 1) // 2, count // 2)]
     return np.asarray((middle[0] + middle[1]) / 2)
 
 
 def _seen(color: Floats, position: Floats, matrix: Floats, slope: Floats, glare: Floats) -> Floats:
-    """Reflectance (…, N, 3) that the light's slope and the glare leave of camera channels."""
+    """Reflectance (…, N, 3) from camera channels, the light's slope and the glare."""
     level = 1 + np.asarray(slope) @ position.T
     return np.asarray((color @ np.swapaxes(matrix, -1, -2) - np.asarray(glare)[..., None, None]) / level[..., None])
 
@@ -207,8 +188,8 @@ def _base(reference: Floats) -> Floats:
     return np.asarray((1 + (chroma < 0.1 * reference.max(axis=1))) / np.maximum(luminance(reference), 0.02) ** (2 / 3))
 
 
-class _System:
-    """The linear least squares over N patches × 3 channels for M, e and b, whatever weights the patches have."""
+class _ChartEquations:
+    """Linear least squares over N patches × 3 channels for M, e and b, with any weights of the patches."""
 
     def __init__(self, color: Floats, reference: Floats, position: Floats) -> None:
         self._color, self._reference, self._position = color, reference, position

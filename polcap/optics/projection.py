@@ -28,12 +28,11 @@ def picture_corners(width: int, height: int) -> Floats:
     return np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], float)
 
 
-def project(view: View, point: Floats) -> tuple[Floats, Floats]:
-    """Pixels x, y (…,) that show points (…, 3) of the camera frame (x right, y up, z towards the camera)."""
-    return (
-        view.center[0] - view.focal * point[..., 0] / point[..., 2],
-        view.center[1] + view.focal * point[..., 1] / point[..., 2],
-    )
+def project(view: View, point: Floats) -> Floats:
+    """Pixels x, y (…, 2) that show points (…, 3) of the camera frame (x right, y up, z towards the camera)."""
+    x = view.center[0] - view.focal * point[..., 0] / point[..., 2]
+    y = view.center[1] + view.focal * point[..., 1] / point[..., 2]
+    return np.stack([x, y], axis=-1)
 
 
 def back_project(view: View, x: Floats, y: Floats) -> Floats:

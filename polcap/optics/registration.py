@@ -12,7 +12,7 @@ alignment method, 1975 (the start). Beaton and Tukey, Technometrics 1974 (biweig
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -27,9 +27,10 @@ Model = Literal["translation", "similarity", "homography", "simplest"]  # simple
 
 _SIZES = {"translation": (2,), "similarity": (4,), "homography": (8,), "simplest": (8, 4, 2)}  # numbers of parameters
 _TILE = 20  # px; of 16 to 32 px and 3 to 12 a cell, the least error over brackets and shots (docs/benchmarks)
-_CELLS, _PER_CELL = 10, 8  # tiles are spread over a grid of cells: the best few of each
+_CELLS, _PER_CELL = 10, 6  # tiles are spread over a grid of cells: the best few of each
 _COARSEST_PX = 256  # of the shorter side: a smaller picture has too few tiles
 _TILES_AT_ONCE = 64  # so that their equations fit a core's cache
+_LEAST_USABLE, _USABLE = 0.6, 0.7  # shares of a tile's pixels: in the other picture, to be chosen in the reference
 _MARGIN = 2  # px around a tile that interpolation reads
 _REACH_PX = 2.0  # a tile may move in one step
 _GAIN = 0.2, 5.0  # of a tile; beyond, it shows something else
@@ -175,7 +176,7 @@ def _choose_tiles(picture: Floats, usable: Bools) -> Indices:
         detail = squared_gradient(picture[around])[top - around.start :][:_TILE, cut[1]]
         detail = detail * usable[top : top + _TILE, cut[1]]
         score[n] = cv2.resize(detail, (columns, 1), interpolation=cv2.INTER_AREA)
-    score *= cv2.resize(usable[cut].view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) > 0.7 * 255
+    score *= cv2.resize(usable[cut].view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) > _USABLE * 255
     found = []
     for cell_rows in np.array_split(np.arange(rows), min(_CELLS, rows)):
         for cell_columns in np.array_split(np.arange(columns), min(_CELLS, columns)):
@@ -261,14 +262,16 @@ def _match_some(a: tuple[Floats, Bools], b: tuple[Floats, Bools], corner: Indice
     shape = np.array(a[0].shape)
     inside = np.all((first >= _MARGIN) & (first + _TILE + _MARGIN < shape), axis=1)
     inside &= np.all((corner >= 1) & (corner + _TILE + 1 < shape), axis=1)
-    inside[inside] = _cut(b[1], first[inside], _TILE).mean(axis=(1, 2)) > 0.6
+    seen = _windows(b[1], first[inside], _TILE)
+    enough = seen.mean(axis=(1, 2)) > _LEAST_USABLE
+    inside[inside] = enough
     if not inside.any():
         return nothing
     corner, first, center = corner[inside], first[inside], center[inside]
-    patch = _cut(a[0], corner - 1, _TILE + 2)  # (T, _TILE + 2, _TILE + 2)
+    usable = np.asarray(seen[enough] & _windows(a[1], corner, _TILE), np.float64)
+    patch = _windows(a[0], corner - 1, _TILE + 2).astype(np.float64)  # (T, _TILE + 2, _TILE + 2)
     fraction = np.asarray(shift - whole, np.float64)[inside]
-    other = _sample(_cut(b[0], first - 1, _TILE + 3), fraction)  # cubic: 1 before, 2 after
-    usable = _cut(b[1], first, _TILE) * _cut(a[1], corner, _TILE)
+    other = _sample(_windows(b[0], first - 1, _TILE + 3).astype(np.float64), fraction)  # cubic: 1 before, 2 after
     inner = patch[:, 1:-1, 1:-1]
     gx = (patch[:, 1:-1, 2:] - patch[:, 1:-1, :-2]) / 2
     gy = (patch[:, 2:, 1:-1] - patch[:, :-2, 1:-1]) / 2
@@ -302,9 +305,10 @@ def _without_noise(shift: Floats, normal: Floats, count: Floats, variance: Float
     return missing, information
 
 
-def _cut(picture: Floats | Bools, corner: Indices, size: int) -> Floats:
+def _windows(picture: NDArray[Any], corner: Indices, size: int) -> NDArray[Any]:
+    """Squares (T, size, size) of a picture (H, W), from their corners (T, 2) = (row, column)."""
     windows = np.lib.stride_tricks.sliding_window_view(picture, (size, size))
-    return np.asarray(windows[corner[:, 0], corner[:, 1]], np.float64)
+    return np.asarray(windows[corner[:, 0], corner[:, 1]])
 
 
 def _sample(patch: Floats, fraction: Floats) -> Floats:

@@ -14,17 +14,19 @@ _ALL_ALIKE = 1e-10  # relative determinant below which signals of one level dete
 
 
 def spread(residual: Floats) -> float:
-    """Standard deviation (1σ) of residuals about 0 by their median absolute value, never 0."""
+    """Standard deviation (1σ) of residuals (N,) about 0 by their median absolute value, never 0."""
     return MAD_TO_SIGMA * float(np.median(np.abs(residual))) + _NEVER_ZERO
 
 
 def biweight(residual: Floats, sigma: float) -> Floats:
-    """Tukey's weights (1 − (r/4.685σ)²)², 0 beyond; of residuals of any shape."""
+    """Weights (1 − (r/4.685σ)²)² of residuals (N,), or of any shape; 0 beyond 4.685σ (Tukey)."""
     return np.asarray(np.maximum(0, 1 - (residual / (BIWEIGHT * sigma)) ** 2) ** 2)
 
 
-def jackknife(without: Floats) -> Floats:
+def jackknife(without: Floats, about: Floats | float | None = None) -> Floats:
     """1σ of an estimate, (...,), from the estimates (P, ...) that leave out one of P parts each.
+
+    `about` is the estimate from all parts; without it their mean is taken.
 
     References
     ----------
@@ -32,7 +34,8 @@ def jackknife(without: Floats) -> Floats:
     """
     without = np.asarray(without)
     count = len(without)
-    return np.asarray(np.sqrt((count - 1) / count * ((without - without.mean(axis=0)) ** 2).sum(axis=0)))
+    middle = without.mean(axis=0) if about is None else about
+    return np.asarray(np.sqrt((count - 1) / count * ((without - middle) ** 2).sum(axis=0)))
 
 
 @dataclass(frozen=True)

@@ -73,11 +73,13 @@ def from_maps(folder: Path, config: Config, wanted: ExportRequest) -> tuple[Asse
     levels = []
     for k in range(1, wanted.lod + 1):
         decimated = surface.decimate(mesh, stored.maps.view, 0.25**k, config.surface.back)
-        levels.append(DetailLevel(asset.on_mesh(whole, stored.maps, decimated.mesh), decimated))
+        levels.append(DetailLevel(asset.with_mesh(whole, stored.maps, decimated.mesh), decimated))
     if wanted.texture_size is None:
         return whole, levels
     size = wanted.texture_size
-    return asset.resized(whole, size), [replace(level, asset=asset.resized(level.asset, size)) for level in levels]
+    return asset.resize_textures(whole, size), [
+        replace(level, asset=asset.resize_textures(level.asset, size)) for level in levels
+    ]
 
 
 def write(

@@ -4,7 +4,6 @@ The path runs on pictures averaged down to at most 0.6 MP, with a cache in memor
 averaging hides (clipping, sharpness) are measured at full size while frames are decoded.
 """
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from time import perf_counter
@@ -39,11 +38,11 @@ class Verdict(msgspec.Struct, frozen=True):
     needs: str = ""  # the option without which `polcap process` ends with an error
 
 
-def inspect(capture: Capture, networks: Callable[[], Networks], config: Config, chart: ChartRequest = AUTO) -> Verdict:
+def inspect(capture: Capture, networks: Networks, config: Config, chart: ChartRequest = AUTO) -> Verdict:
     """Judge a capture by the gates of `process`.
 
-    `networks` opens the estimator's and the mask's while frames are decoded. Without the first, the errors of the
-    analytic estimator are expected; without the second, the object is found by its contrast to the backdrop.
+    Without a network of the estimator, the errors of the analytic estimator are expected; without one of the mask,
+    the object is found by its contrast to the backdrop.
 
     Raises
     ------
@@ -54,8 +53,7 @@ def inspect(capture: Capture, networks: Callable[[], Networks], config: Config, 
     with ThreadPoolExecutor(_THREADS) as pool:
         try:
             small = small_capture.reduce(capture, config.hdr.clip, pool)
-            network, mask_network = networks()
-            supplied = UserInput(_moved(chart, small.step), None, network, mask_network)
+            supplied = UserInput(_moved(chart, small.step), None, *networks)
             lines = tuple(_judged(small, supplied, config))
         finally:
             pool.shutdown(cancel_futures=True)
@@ -94,7 +92,7 @@ def _judged(small: SmallCapture, supplied: UserInput, config: Config) -> list[Ga
     )
     lines = list[Gate]()
     try:
-        lines.extend(gates.judge(evidence, config))
+        lines.extend(gates.judge(evidence, config.gates, config.align))
     except NotReached:
         if failure is None:
             raise
@@ -129,8 +127,8 @@ def table(verdict: Verdict) -> str:
         head += f", and process it with {verdict.needs}"
     rows = [f"{head}   ({verdict.capture}, {verdict.seconds:.1f} s)"]
     for line in verdict.lines:
-        cost = f"; costs about {line.cost_deg:.0f}°" if line.cost_deg >= 1 and line.state in ("warn", "fail") else ""
-        rows.append(f"{line.state:13}{line.name:14}{line.says}{_limit(line)}{cost}")
+        cost = f", costs about {line.cost_deg:.0f}°" if line.cost_deg >= 1 and line.state in ("warn", "fail") else ""
+        rows.append(f"{line.state:13}{line.name:14}{line.message}{_limit(line)}{cost}")
         if line.remedy:
             rows.append(f"{'':27}→ {line.remedy}")
     return "\n".join(rows)

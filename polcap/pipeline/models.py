@@ -6,13 +6,13 @@ from typing import Literal
 
 from polcap.errors import ModelError, SettingError
 from polcap.formats import onnx, shipped_data
-from polcap.images import Network
+from polcap.images import Device, Network
 from polcap.stages.infer import fine
 from polcap.stages.mask import mask_channels
 
 
 def load_network(
-    estimator: Literal["network", "analytic"] | None, model: Path | None, device: onnx.Device = "cpu", threads: int = 0
+    estimator: Literal["network", "analytic"] | None, model: Path | None, device: Device = "cpu", threads: int = 0
 ) -> Network | None:
     """The estimator's network: the named model, else the shipped one; None is the analytic estimator.
 
@@ -37,7 +37,7 @@ def load_network(
     return open_network(named, device, threads)
 
 
-def open_network(path: Path, device: onnx.Device = "cpu", threads: int = 0) -> Network:
+def open_network(path: Path, device: Device = "cpu", threads: int = 0) -> Network:
     """An estimator's network; the shipped one comes with its refinement network, which was trained with it only."""
     network = onnx.load(path, device, threads)
     own, relief = _newest("polcap"), _newest("fine")

@@ -16,17 +16,27 @@ from numpy.typing import NDArray
 
 from polcap.config import Config
 from polcap.errors import ObjectError
-from polcap.formats import shipped_data
+from polcap.formats import onnx, shipped_data
 from polcap.formats.maps import maps_folder
 from polcap.formats.raw import frame_decoder
-from polcap.images import AngleStack, Capture, ChartRequest, ColorCalibration, Decode, Mesh, Network, SurfaceMaps
+from polcap.images import (
+    AngleStack,
+    Capture,
+    ChartRequest,
+    ColorCalibration,
+    Decode,
+    Mesh,
+    Network,
+    RunNetwork,
+    SurfaceMaps,
+)
 from polcap.pipeline.cache import MemoryCache, StageReached, StageResult
 from polcap.results import Results
 from polcap.stages import align, asset, cues, hdr, infer, mask, selfcal, stokes, surface, whitebalance
 
 AUTO = ChartRequest("auto")
 _FIELD = {  # of `Results`, by stage
-    "hdr": "radiance", "whitebalance": "color", "align": "alignment", "mask": "object_", "selfcal": "gains",
+    "hdr": "radiance", "whitebalance": "color", "align": "alignment", "mask": "object_", "selfcal": "selfcal",
     "stokes": "stokes", "cues": "cues", "infer": "maps", "surface": "mesh", "asset": "asset",
 }  # fmt: skip
 STAGES = tuple(_FIELD)
@@ -48,6 +58,7 @@ def path(
     config: Config,
     cache: MemoryCache,
     decode: Decode = frame_decoder.decode,
+    run: RunNetwork = onnx.run,
 ) -> Results:
     """The results of all stages, or of the first ones where the cache stops the path."""
     with suppress(StageReached):
@@ -56,11 +67,12 @@ def path(
         color = cache.run(whitebalance.measure, radiance, reference, supplied.chart, config=config.whitebalance)
         alignment = cache.run(align.register, radiance, color, config=config.align)
         drawn = cache.derive(on_grid, supplied.mask, radiance)
-        object_ = cache.run(mask.segment, radiance, alignment, color, drawn, supplied.mask_network, config=config.mask)
-        gains = cache.run(selfcal.solve, radiance, alignment, object_, color, config=config.selfcal)
-        stokes_ = cache.run(stokes.solve, radiance, alignment, gains, object_, config=config.stokes)
+        finder = supplied.mask_network
+        object_ = cache.run(mask.segment, radiance, alignment, color, drawn, finder, run, config=config.mask)
+        calibration = cache.run(selfcal.solve, radiance, alignment, object_, color, config=config.selfcal)
+        stokes_ = cache.run(stokes.solve, radiance, alignment, calibration, object_, config=config.stokes)
         cues_ = cache.run(cues.compute, stokes_, color)
-        maps = cache.run(infer.estimate, cues_, supplied.network, config=config.infer)
+        maps = cache.run(infer.estimate, cues_, supplied.network, run, config=config.infer)
         distance = cache.derive(distance_m, color, radiance)
         mesh = cache.run(surface.integrate, maps, distance, config=config.surface)
         # from the maps as their files hold them: `polcap export` then makes the same bytes

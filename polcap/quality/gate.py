@@ -1,4 +1,4 @@
-"""One judgement, and the evidence for it."""
+"""A gate, and the evidence that gates judge."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -18,20 +18,20 @@ DEGREES_PER_GAIN = 600.0  # 1 % of a shot's light tilts facing pixels by about 6
 
 
 class Gate(msgspec.Struct, frozen=True):
-    """One figure against its limit, and what it means."""
+    """One value against its limit."""
 
     name: str
     state: State
-    value: float | str | None  # shares as such, not in percent
+    value: float | str | None  # a share, not per cent
     limit: float | str | None
-    says: str  # what was found
-    remedy: str = ""  # what to do, where it did not pass
-    cost_deg: float = 0.0  # what it adds to the expected error of the normals
-    shots: tuple[str, ...] = ()  # to be taken again, where single ones are to blame
+    message: str = msgspec.field(name="says")  # the finding, in one sentence; "says" in report.json
+    remedy: str = ""  # what the user can do, unless it passed
+    cost_deg: float = 0.0  # added to the expected error of the normals, squared
+    shots: tuple[str, ...] = ()  # to take again, if single ones are at fault
     unit: Unit = "%"
 
     def __post_init__(self) -> None:
-        """Turn NumPy scalars, with which the gates compute, into Python numbers: JSON knows no others."""
+        """Replace NumPy scalars by Python numbers, for JSON."""
         for name in ("value", "limit", "cost_deg"):
             if isinstance(number := getattr(self, name), np.generic):
                 msgspec.structs.force_setattr(self, name, number.item())
@@ -39,7 +39,7 @@ class Gate(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Evidence(Results):
-    """Everything that gates judge: the results of a path at full size or reduced, and facts that reducing hides.
+    """Results of a path at full size or reduced, and facts that reducing hides.
 
     A path that was stopped early has only some of them, as `Results`; without a mesh its gate is left out.
     """
@@ -70,45 +70,26 @@ def at_most(
     name: str,
     value: float | None,
     limit: float,
-    says: str,
+    message: str,
     remedy: str,
     shots: tuple[str, ...] = (),
     cost_deg: float = 0.0,
     unit: Unit = "%",
     beyond: State = "fail",
 ) -> Gate:
-    """A figure that must not exceed its limit.
+    """A gate on a value that must not exceed its limit; None or not finite: not measured.
 
-    Parameters
-    ----------
-    name
-        Of the gate, as the report lists it.
-    value
-        In `unit`s, a share where that is %; None or not finite: it was not measured.
-    limit
-        The greatest that passes.
-    says
-        What was found, in one clause.
-    remedy
-        What to do where it is exceeded.
-    shots
-        Those to blame.
-    cost_deg
-        What an excess costs the normals, degrees.
-    unit
-        Of value and limit.
-    beyond
-        State of a value over the limit.
+    `beyond` is the state of a value over the limit, `shots` those at fault.
     """
     if value is None or not np.isfinite(value):
-        return Gate(name, "not measured", None, limit, says, unit=unit)
+        return Gate(name, "not measured", None, limit, message, unit=unit)
     if value <= limit:
-        return Gate(name, "pass", round(float(value), 5), limit, says, unit=unit)
+        return Gate(name, "pass", round(float(value), 5), limit, message, unit=unit)
     return Gate(
-        name, beyond, round(float(value), 5), limit, says, remedy, round(min(cost_deg, MOST_DEG), 1), shots, unit
+        name, beyond, round(float(value), 5), limit, message, remedy, round(min(cost_deg, MOST_DEG), 1), shots, unit
     )
 
 
 def blamed(names: list[str], bad: NDArray[np.bool_]) -> tuple[str, ...]:
-    """The names where `bad` (K,) is true."""
+    """Names where `bad` (K,) is true."""
     return tuple(name for name, one in zip(names, bad) if one)

@@ -1,23 +1,24 @@
-"""In: what the stages made of a capture. Out: every judgement of it, once, for `process` and for `check`.
+"""Every gate of a capture in the order of the path, for `process` and `check` alike.
 
-A gate that fails means: do not trust the result unseen (`process` ends with exit code 3, `check` says reshoot). One
-that warns states an assumption, or a loss. Each says what was found, what it costs in degrees and what to do; a
-comparison speaks only beyond the error of what it compares.
+A gate that fails means: do not trust the result unseen (`process` ends with exit code 3, `check` message reshoot). One
+that warns states an assumption or a loss. Each has a finding, a cost in degrees and a remedy; a comparison counts only
+beyond its own error.
 """
 
 from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from polcap.config import Config, Gates
 from polcap.images import SurfaceMaps
 from polcap.quality import geometry, light, polarization
 from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, Unit
+from polcap.quality.limits import GateLimits
+from polcap.stages.align import Settings as AlignSettings
 
 __all__ = ["Evidence", "Gate", "State", "Unit", "judge", "verdict"]
 
 
-def judge(found: Evidence, config: Config) -> Iterator[Gate]:
+def judge(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iterator[Gate]:
     """The gates, in the order of the path.
 
     Raises
@@ -26,14 +27,14 @@ def judge(found: Evidence, config: Config) -> Iterator[Gate]:
         The path ended before a stage that the next gate judges.
     """
     judged: list[Gate] = []
-    for gate in _in_order(found, config):
+    for gate in _in_order(found, limits, align):
         judged.append(gate)
         yield gate
         if gate.name == "order" and gate.state == "fail":
-            return  # in another order all that follows is another capture's
-    yield _normal_error(found, judged, config.gates)
+            return  # with a wrong order nothing after it means anything
+    yield _normal_error(found, judged, limits)
     if hasattr(found, "mesh"):
-        yield geometry.mesh(found.mesh, config.gates)
+        yield geometry.mesh(found.mesh, limits)
 
 
 def verdict(gates: Iterable[Gate]) -> State:
@@ -42,14 +43,13 @@ def verdict(gates: Iterable[Gate]) -> State:
     return "fail" if "fail" in states else "warn" if "warn" in states else "pass"
 
 
-def _in_order(found: Evidence, config: Config) -> Iterator[Gate]:
-    limits = config.gates
+def _in_order(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iterator[Gate]:
     yield light.bracket(found)
     yield light.tone(found, limits)
     yield light.source(found)
     yield light.stillness(found, limits)
     yield light.chart(found, limits)
-    yield geometry.alignment(found, config)
+    yield geometry.alignment(found, limits, align)
     yield geometry.mask(found, limits)
     yield light.clipping(found, limits)
     yield geometry.sharpness(found, limits)
@@ -63,26 +63,26 @@ def _in_order(found: Evidence, config: Config) -> Iterator[Gate]:
     yield geometry.focal_length(found)
 
 
-def _normal_error(found: Evidence, judged: list[Gate], limits: Gates) -> Gate:
-    """The median expected error, with what the other gates add to it."""
+def _normal_error(found: Evidence, judged: list[Gate], limits: GateLimits) -> Gate:
+    """Median expected error of the normals, with the costs of the other gates."""
     own = _own_error(found.maps)
     expected = min(float(np.sqrt(own**2 + sum(gate.cost_deg**2 for gate in judged))), MOST_DEG)
     because = ", ".join(gate.name for gate in judged if gate.cost_deg > 0.5 * own)
-    says = f"expected error of the normals {expected:.1f}° (median)"
+    message = f"Expected error of the normals: {expected:.1f}° (median)"
     if expected == MOST_DEG:
-        says = "nothing is known of the normals"
-    says += f", most of it from: {because}" if because else ""
+        message = "The normals are unknown"
+    message += f", mostly due to: {because}" if because else ""
     limit = limits.max_normal_error_deg
     if not np.isfinite(expected):
-        return Gate("normal error", "not measured", None, limit, says, unit="°")
+        return Gate("normal error", "not measured", None, limit, message, unit="°")
     if expected <= limit:
-        return Gate("normal error", "pass", round(expected, 2), limit, says, unit="°")
+        return Gate("normal error", "pass", round(expected, 2), limit, message, unit="°")
     more = "" if len(found.names) > 3 else " four angles,"
-    remedy = "see the lines above" if because else f"more light or frames,{more} or a darker room"
-    return Gate("normal error", "fail", round(expected, 2), limit, says, remedy, unit="°")
+    remedy = "See the checks named" if because else f"Use more light or frames,{more} or a darker room"
+    return Gate("normal error", "fail", round(expected, 2), limit, message, remedy, unit="°")
 
 
 def _own_error(maps: SurfaceMaps) -> float:
-    """Median error that the estimator expects, degrees."""
+    """Median expected error of the estimator, degrees."""
     inside = maps.confidence[maps.mask]
     return float(np.median(inside)) if inside.size else float("nan")

@@ -1,4 +1,4 @@
-"""Gates of polarization: the order of the angles, their turn, and whether it is a body's light at all."""
+"""GateLimits of polarization: order and zero of the angles, material and light."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -6,74 +6,73 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from polcap.config import Gates
-from polcap.images import Floats, Gains, Quality, StokesImage, SurfaceMaps
+from polcap.images import Floats, Quality, SelfCalibration, ShotOrder, StokesImage, SurfaceMaps, TurnedShot
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
 from polcap.quality import rim
 from polcap.quality.gate import Evidence, Gate, at_most
+from polcap.quality.limits import GateLimits
 
-_LEAST_RIM = 200  # pixels of outline that an angle can be told from
+_LEAST_RIM = 200  # pixels of outline, to estimate an angle
 _LEAST_DOLP = 0.01  # of the outline; there the least index has ten times that
 _SAME_DEG = 5.0  # axes nearer than this are the same angle
-_SURE = 2.5  # σ between sectors of the outline from which a turn is believed
-_CLEAR = 0.8  # concentration of the AoLP about the outline from which a common turn is believed
-_LOPSIDED = 1.4  # so much more uneven may a body be that is polarized all round nearly as it should: its shape
+_SURE = 2.5  # σ between sectors of the outline: least significance of a turn
+_CLEAR = 0.8  # least concentration of the AoLP about the outline, to estimate a common turn
+_LOPSIDED = 1.4  # factor on the limit of uneven light for an object that is polarized all round: its shape is uneven
 _LIT_DOLP = 0.07  # of an outline's brighter half: above, its light is the flash's (13 with a lamp beside: up to .049)
-_USUAL_DOLP = 0.1  # of an outline under a flash; a part q of it tilts by √q of the true zenith
-_FLATTENED_DEG = 34.0  # of a sphere's median zenith of 45°: what the estimators do not restore (two wax-like captures)
+_USUAL_DOLP = 0.1  # of an outline under a flash; a share q of it gives √q of the true zenith
+_FLATTENED_DEG = 34.0  # lost of a sphere's median zenith of 45° (two wax-like captures)
 _BALL_DEG = 45.0  # median zenith over the disc of a ball
-_WEAK_DOLP = 0.05  # of an outline: above, nothing is taken for flattened; below, uneven light is no matter of shape
+_WEAK_DOLP = 0.05  # of an outline: above, no shape counts as flattened; below, uneven light is light from the side
 _DIMMED = 0.9  # of the mean light: below, an outline turns away
 _ROUGH = 0.5  # roughness from which facets alone leave little polarization
-_ALONG = -0.3  # how well the AoLP lies across the contour, below: along it
+_ALONG = -0.3  # below: the AoLP is along the contour
 _MOST_PIXELS = 6e5  # a larger picture is averaged down
 
 
 def order(found: Evidence) -> Gate:
     """Whether the outline supports the stated order and sense of the angles."""
-    gains, names = found.gains, found.names
-    if gains.order == tuple(range(len(names))) and not gains.mirrored and gains.rival:
-        other = ", ".join(names[i] for i in gains.rival) + (", counted the other way" if gains.rival_mirrored else "")
-        says = f"the outline cannot tell the stated order from {other} (it fits to {gains.concentration:.2f})"
-        would = "a closed, rounded object, a chart" + ("" if len(names) > 3 else " or four angles")
-        remedy = f"make sure of folders and ring yourself; {would} would tell"
-        return Gate("order", "warn", "cannot tell", "as stated", says, remedy, unit="")
-    if gains.order == tuple(range(len(names))) and not gains.mirrored:
-        says = f"as stated (the outline fits to {gains.concentration:.2f})"
-        return Gate("order", "pass", "as stated", "as stated", says, unit="")
-    best = ", ".join(names[i] for i in gains.order) + (", counted the other way" if gains.mirrored else "")
-    says = f"the outline fits {best} better than the stated order"
-    remedy = "name the shots by the angles they had (folders, or --angles), or take them again in order"
-    return Gate("order", "fail", best, "as stated", says, remedy, 45.0, unit="")
+    outline, names = found.selfcal.outline, found.names
+    if outline.as_stated and outline.rival is not None:
+        other = _named(outline.rival, names)
+        message = f"The outline fits the order {other} as well as the stated one (fit {outline.concentration:.2f} of 1)"
+        better = "a rounded object or a chart" + ("" if len(names) > 3 else " or four angles")
+        remedy = f"Check folders and ring yourself; {better} would decide"
+        return Gate("order", "warn", "cannot tell", "as stated", message, remedy, unit="")
+    if outline.as_stated:
+        message = f"The outline supports the stated order (fit {outline.concentration:.2f} of 1)"
+        return Gate("order", "pass", "as stated", "as stated", message, unit="")
+    best = _named(outline.best, names)
+    message = f"The outline fits the order {best} better than the stated one"
+    remedy = "Name the shots by their true angles (folders, or --angles), or take them again in order"
+    return Gate("order", "fail", best, "as stated", message, remedy, 45.0, unit="")
 
 
-def of_outline(found: Evidence, limits: Gates) -> Iterator[Gate]:
-    """What the outline says of the angles, of the body and of other light."""
-    angle, limit = _angle(found), limits.max_turn_deg
+def _named(order: ShotOrder, names: list[str]) -> str:
+    return ", ".join(names[i] for i in order.shots) + (", counted clockwise" if order.mirrored else "")
+
+
+def of_outline(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
+    """Angles, material and other light, as the outline shows them."""
+    angle, limit = found.selfcal.angle - found.selfcal.ring.correction, limits.max_turn_deg
     seen = _outline(found, limit, angle)
     if seen is None:
-        yield Gate("angles", "not measured", None, limit, "too little outline", unit="°")
+        yield Gate("angles", "not measured", None, limit, "The outline is too short", unit="°")
         return
     body = seen.body
     if body.dolp < _LEAST_DOLP:
-        says = f"the outline is polarized by {100 * body.dolp:.1f} %"
-        remedy = "is the polarizer on, and did it turn? Metal and translucent bodies (wax, milk) hardly polarize"
-        yield Gate("polarized", "fail", round(body.dolp, 4), _LEAST_DOLP, says, remedy, 45.0)
+        message = f"The outline is polarized by only {100 * body.dolp:.1f} %"
+        remedy = "Check that the polarizer was on and turned; metal and translucent objects (wax, milk) hardly polarize"
+        yield Gate("polarized", "fail", round(body.dolp, 4), _LEAST_DOLP, message, remedy, 45.0)
         return
-    of_shots = _angles(seen.turn, body, angle, found.gains, found.names, limits)
-    yield _with_ring(of_shots, found.gains, limits)
+    of_shots = _angles(seen.turn, body, angle, found.selfcal, found.names, limits)
+    yield _with_ring(of_shots, found.selfcal, limits)
     yield _light_of_body(body, found, limits)
     side = seen.side
     k = int(np.argmax(side))
-    says = f"{found.names[k]} is brighter on one side by {100 * side[k]:.1f} %"
-    remedy = "another light was on in one of the shots: darken the room, and take that shot again"
-    yield at_most("other light", float(side[k]), limits.max_side_light, says, remedy, (found.names[k],), 10)
-
-
-def _angle(found: Evidence) -> Floats:
-    """As found where nobody noted them, else as stated, (K,) rad."""
-    return found.radiance.angle if found.gains.found_angle is None else found.gains.found_angle
+    message = f"The {found.names[k]} shot is {100 * side[k]:.1f} % brighter on one side than the others"
+    remedy = "Darken the room and take that shot again: another light was on"
+    yield at_most("other light", float(side[k]), limits.max_side_light, message, remedy, (found.names[k],), 10)
 
 
 @dataclass(frozen=True)
@@ -82,11 +81,11 @@ class OutlineFigures:
 
     body: rim.Body
     turn: rim.Turn
-    side: Floats  # (K,) how much brighter one side is than the other in each shot
+    side: Floats  # (K,) excess brightness of one side over the other in each shot
 
 
 def _outline(found: Evidence, limit_deg: float, angle: Floats) -> OutlineFigures | None:
-    """Figures of the outline; turns below the limit are not tried; angle (K,) rad. None: it is too short."""
+    """Measurements at angles (K,) rad; turns below the limit are not tried. None: the outline is too short."""
     band = rim.take(*_reduced(found.stokes, angle))
     if len(band.azimuth) < _LEAST_RIM:
         return None
@@ -94,12 +93,14 @@ def _outline(found: Evidence, limit_deg: float, angle: Floats) -> OutlineFigures
     return OutlineFigures(rim.body(band, angle), turn, rim.side_light(band))
 
 
-def ill_posed(found: Evidence, limits: Gates) -> Gate:
-    """How much of the object is polarized as no dielectric is."""
+def ill_posed(found: Evidence, limits: GateLimits) -> Gate:
+    """Share of the object with a polarization that no dielectric has."""
     share = _ill_posed(found)
-    says = f"{100 * share:.1f} % of the object is polarized as no dielectric is"
-    remedy = "ambient light, mirrored surroundings, metal, or shots out of order: darken the room, check the angles"
-    return at_most("ill-posed", share, limits.max_ill_posed, says, remedy, cost_deg=30 * share)
+    message = "No part looks like metal or a mirror reflection"
+    if share >= 0.0005:
+        message = f"{100 * share:.1f} % of the object looks like metal or a mirror reflection"
+    remedy = "Darken the room and check the angles; metal is outside the model"
+    return at_most("ill-posed", share, limits.max_ill_posed, message, remedy, cost_deg=30 * share)
 
 
 def _ill_posed(found: Evidence) -> float:
@@ -108,135 +109,141 @@ def _ill_posed(found: Evidence) -> float:
     return float(((inside & int(Quality.ILL_POSED)) > 0).mean()) if inside.size else 0.0
 
 
-def _angles(found: rim.Turn, body: rim.Body, angle: Floats, gains: Gains, names: list[str], limits: Gates) -> Gate:
-    """A turn of the ring, or of one shot, that outline or closure support beyond their own error."""
+def _angles(
+    found: rim.Turn, body: rim.Body, angle: Floats, selfcal: SelfCalibration, names: list[str], limits: GateLimits
+) -> Gate:
+    """A wrong angle of one shot, or of all, beyond the error of its estimate."""
     limit = limits.max_turn_deg
-    known = gains.source in ("grey patches", "one exposure")
+    known = selfcal.gains.source in ("grey patches", "one exposure")
     common = -float(np.degrees(body.turned))  # an AoLP too small is an angle stated too small
     if (
         abs(common) > limit + 3 * np.degrees(body.turned_sigma)
         and body.concentration > _CLEAR
-        and abs(abs(common) - 90) > 25  # light reflected off the object lies across; see "body"
+        and abs(abs(common) - 90) > 25  # reflections are polarized across the contour; see "body"
     ):
-        says = f"the ring looks turned by {common:+.0f}° ± {np.degrees(body.turned_sigma):.0f}° in all shots"
-        remedy = "set the ring's zero to the horizontal, or name the angles it really had"
-        return Gate("angles", "fail", round(common, 1), limit, says, remedy, abs(common), unit="°")
-    if gains.turned_shots and abs(np.degrees(gains.turned)) > limit:
-        return _not_closing(gains, names, limit)
+        message = f"The ring looks turned by {common:+.0f}° ± {np.degrees(body.turned_sigma):.0f}° in all shots"
+        remedy = "Set the ring's zero to the horizontal, or state the true angles"
+        return Gate("angles", "fail", round(common, 1), limit, message, remedy, abs(common), unit="°")
+    if selfcal.turned.shots and abs(np.degrees(selfcal.turned.angle)) > limit:
+        return _not_closing(selfcal.turned, names, limit)
     fit = limits.max_turn_fit * (1.0 if known else 0.75)  # guessed gains look like turns
     if found.misfit >= fit or found.sigmas < _SURE or found.shot is None:
-        return Gate("angles", "pass", 0.0, limit, "no other angle fits the outline clearly better", unit="°")
+        return Gate("angles", "pass", 0.0, limit, "No other angle fits the outline clearly better", unit="°")
     degrees = float(np.degrees(found.angle))
     gap = np.degrees(angle[found.shot] + found.angle - angle)
     same = np.abs((gap + 90) % 180 - 90) < _SAME_DEG
     same[found.shot] = False
     cost = abs(degrees) / 2
-    if same.any():  # which of the two is wrong cannot be seen
+    if same.any():  # the pictures do not show which of the two is wrong
         shots = tuple(names[k] for k in sorted((found.shot, int(np.argmax(same)))))
-        says = f"{' and '.join(shots)} look alike: the polarizer was not turned between them"
-        remedy = "turn the ring to its mark and take the shot again"
-        return Gate("angles", "fail", round(degrees, 1), limit, says, remedy, cost, shots, "°")
+        message = f"{' and '.join(shots)} look equal: the polarizer was not turned between them"
+        remedy = "Turn the ring to its mark and take the shot again"
+        return Gate("angles", "fail", round(degrees, 1), limit, message, remedy, cost, shots, "°")
     times = 1 / found.misfit
-    says = f"{names[found.shot]} looks turned by {degrees:+.0f}°, which fits the outline {times:.1f} times better"
-    remedy = "set the ring to its mark and take the shot again, or name the angle it really had"
-    return Gate("angles", "fail", round(degrees, 1), limit, says, remedy, cost, (names[found.shot],), "°")
+    message = (
+        f"The {names[found.shot]} shot looks turned by {degrees:+.0f}°: the outline fits {times:.1f} times better"
+    )
+    remedy = "Set the ring to its mark and take the shot again, or state its true angle"
+    return Gate("angles", "fail", round(degrees, 1), limit, message, remedy, cost, (names[found.shot],), "°")
 
 
-def _not_closing(gains: Gains, names: list[str], limit: float) -> Gate:
-    """One angle of more than three that contradicts the others over the whole object."""
-    degrees, doubt = np.degrees([gains.turned, gains.turned_sigma])
-    shots = tuple(names[k] for k in gains.turned_shots)
+def _not_closing(turned: TurnedShot, names: list[str], limit: float) -> Gate:
+    """One of more than three angles that contradicts the others."""
+    degrees, doubt = np.degrees([turned.angle, turned.sigma])
+    shots = tuple(names[k] for k in turned.shots)
     which = shots[0] if len(shots) == 1 else f"{shots[0]} (or {', '.join(shots[1:])}, by as much or less)"
-    says = f"{which} looks turned by {degrees:+.0f}° ± {doubt:.0f}°: the shots contradict one another"
-    remedy = "set the ring to its mark and take the shot again, or name the angle it really had"
-    return Gate("angles", "fail", round(float(degrees), 1), limit, says, remedy, abs(float(degrees)) / 2, shots, "°")
+    message = f"{which} looks turned by {degrees:+.0f}° ± {doubt:.0f}°: the shots contradict each other"
+    remedy = "Set the ring to its mark and take the shot again, or state its true angle"
+    return Gate("angles", "fail", round(float(degrees), 1), limit, message, remedy, abs(float(degrees)) / 2, shots, "°")
 
 
-def _with_ring(gate: Gate, gains: Gains, limits: Gates) -> Gate:
-    """The gate of the angles with the turn of the whole ring, taken out of them before where it was sure.
+def _with_ring(gate: Gate, selfcal: SelfCalibration, limits: GateLimits) -> Gate:
+    """The gate of the angles, with the turn of the whole ring, which is corrected where it is sure.
 
-    To three angles a single shot that was turned looks like a smaller turn of all; more would not close.
+    With three angles, one turned shot looks like a smaller turn of all.
     """
-    if gains.found_angle is not None and gate.state == "pass":
-        doubt, ring = float(np.degrees(gains.found_sigma)), np.degrees(gains.found_angle + gains.angle_correction) % 180
-        says = f"nobody noted them; found {', '.join(f'{one:.1f}°' for one in ring)}, to {doubt:.1f}°"
-        remedy = "note the ring's mark of every shot: then nothing has to be found"
-        return Gate("angles", "warn", "found", "noted", says, remedy, doubt, unit="")
-    turn, doubt = np.degrees([gains.angle_offset, gains.angle_offset_sigma])
-    applied = gains.angle_correction != 0
-    noted = len(gains.gain) == 3 and abs(turn) > max(limits.max_ring_turn_deg, _SURE * doubt)
+    if selfcal.found_sigma is not None and gate.state == "pass":
+        doubt, ring = float(np.degrees(selfcal.found_sigma)), np.degrees(selfcal.angle) % 180
+        message = f"The angles were estimated: {', '.join(f'{one:.1f}°' for one in ring)} (± {doubt:.1f}°)"
+        remedy = "Note the ring's mark of every shot"
+        return Gate("angles", "warn", "found", "noted", message, remedy, doubt, unit="")
+    turn, doubt = np.degrees([selfcal.ring.offset, selfcal.ring.sigma])
+    applied = selfcal.ring.correction != 0
+    noted = len(selfcal.angle) == 3 and abs(turn) > max(limits.max_ring_turn_deg, _SURE * doubt)
     if gate.state != "pass" or not (applied or noted):
         return gate
-    says = f"the ring's zero was off by {turn:+.1f}° ± {doubt:.1f}°"
-    says += ", which was taken out of all angles" if applied else ""
+    message = f"The ring's zero was off by {turn:+.1f}° ± {doubt:.1f}°"
+    message += ", which was corrected in all angles" if applied else ""
     value, limit = round(float(turn), 2), limits.max_ring_turn_deg
     if not noted and abs(turn) <= limits.max_turn_deg:
-        return Gate("angles", "pass", value, limits.max_turn_deg, says, cost_deg=float(doubt), unit="°")
-    remedy = "set the ring's zero to the horizontal, or name the angles it really had"
+        return Gate("angles", "pass", value, limits.max_turn_deg, message, cost_deg=float(doubt), unit="°")
+    remedy = "Set the ring's zero to the horizontal, or state the true angles"
     if noted:
-        says += "; of a single shot it would be two to four times as much, and is not mended"
-        remedy += "; where one shot was off its mark, take it again"
+        message += "; if a single shot is wrong, it is two to four times as much and not corrected"
+        remedy += "; if one shot was off its mark, take it again"
     cost = float(np.hypot(turn / 2 if noted else 0, doubt))
-    return Gate("angles", "warn", value, limit if noted else limits.max_turn_deg, says, remedy, cost, unit="°")
+    return Gate("angles", "warn", value, limit if noted else limits.max_turn_deg, message, remedy, cost, unit="°")
 
 
-def _light_of_body(body: rim.Body, found: Evidence, limits: Gates) -> Gate:
-    """Whether the outline is polarized as a body under a flash by the lens: across the contour, and enough.
+def _light_of_body(body: rim.Body, found: Evidence, limits: GateLimits) -> Gate:
+    """Whether the outline is polarized as a dielectric under a flash at the lens: across the contour, and enough.
 
-    A rough body polarizes as little as a translucent one. The estimators allow for roughness, and then find a shape as
-    round as shading says; what else weakens polarization is left in the shape, which is flattened.
+    Rough and translucent objects polarize equally little. The estimators allow for roughness, so a rough object keeps a
+    shape as round as its shading; any other loss of polarization flattens the shape.
     """
     limit = limits.min_outline_dolp
-    remedy = "darken the room, keep the flash beside the lens, and photograph an ambient frame"
+    remedy = "Darken the room, keep the flash next to the lens, and photograph an ambient frame"
     if body.along < _ALONG:
-        says = (
-            "the outline is polarized along the contour: light from around is reflected off the object (metal, or "
-            "dark gloss), or all angles are off by 90°; the pictures cannot tell these apart"
+        message = (
+            "The outline is polarized along the contour: the object reflects light from around (metal, dark gloss), or "
+            "all angles are off by 90°; the pictures cannot tell which"
         )
-        both = f"{remedy}; if it was dark, the ring's mark stood upright at 0°: name the angles as they were, 90° on"
-        return Gate("body", "fail", round(body.along, 2), _ALONG, says, both, 30.0, unit="")
+        both = f"{remedy}; if the room was dark, the ring was upright at 0°: state the angles plus 90°"
+        return Gate("body", "fail", round(body.along, 2), _ALONG, message, both, 30.0, unit="")
     weak = _FLATTENED_DEG * (1 - np.sqrt(body.dolp / _USUAL_DOLP)) if body.dolp < limit else 0.0
     if body.concentration < limits.min_concentration:
-        says = (
-            f"polarization hardly follows the outline ({body.concentration:.2f}): ambient light, "
-            "or an object whose outline is no contour of shape"
+        message = (
+            f"Polarization hardly follows the outline (fit {body.concentration:.2f} of 1): ambient light, "
+            "or an object with sharp edges as outline"
         )
         figure, least = round(body.concentration, 2), limits.min_concentration
-        return Gate("body", "warn", figure, least, says, remedy, max(15.0, weak), unit="")
+        return Gate("body", "warn", figure, least, message, remedy, max(15.0, weak), unit="")
     zenith, roughness = _median_shape(found.maps)
     flat, dimmed = zenith < limits.min_zenith_deg, body.brightness < _DIMMED
-    hint = "under even light translucent bodies give little; trust the shape less"
+    hint = "Trust the shape less: translucent objects polarize little"
     if flat and dimmed and body.dolp < max(limit, _WEAK_DOLP):
-        says = (
-            f"the outline is polarized by {100 * body.dolp:.1f} % and the shape found is flat ({zenith:.0f}° in the "
-            "median), far less than shading says: a translucent body (wax, skin, milk), or ambient light"
+        message = (
+            f"The outline is polarized by only {100 * body.dolp:.1f} % and the shape is flat (median tilt "
+            f"{zenith:.0f}°), flatter than its shading: a translucent object (wax, skin, milk), or ambient light"
         )
         cost = round(_BALL_DEG - zenith, 1)
-        return Gate("body", "warn", round(zenith, 1), limits.min_zenith_deg, says, hint, cost, unit="°")
+        return Gate("body", "warn", round(zenith, 1), limits.min_zenith_deg, message, hint, cost, unit="°")
     if body.dolp < limit and (dimmed if flat else roughness < _ROUGH):
-        says = (
-            f"the outline is polarized by {100 * body.dolp:.1f} %, far less than gloss and shading say: a translucent "
-            "body (wax, skin, milk), or ambient light"
+        message = (
+            f"The outline is polarized by only {100 * body.dolp:.1f} %, less than gloss and shading suggest: "
+            "a translucent object (wax, skin, milk), or ambient light"
         )
-        return Gate("body", "warn", round(body.dolp, 4), limit, says, hint, round(weak, 1))
+        return Gate("body", "warn", round(body.dolp, 4), limit, message, hint, round(weak, 1))
     if body.one_sided > (most := limits.max_one_sided * _lopsided(body)):
-        says = f"one side of the object is lit {body.one_sided:.1f} times more than its mean: light from the side"
-        return Gate("body", "warn", round(body.one_sided, 2), round(most, 2), says, remedy, 10.0, unit="")
-    says = f"the outline is polarized by {100 * body.dolp:.1f} %"
+        message = (
+            f"One side of the object is {100 * body.one_sided:.0f} % brighter than the mean: light from the side"
+        )
+        return Gate("body", "warn", round(body.one_sided, 2), round(most, 2), message, remedy, 10.0, unit="")
+    message = f"The outline is polarized by {100 * body.dolp:.1f} %"
     if body.dolp < limit:
-        says += ": little, as a flat object's" if flat else ": little, as a rough body's"
-    return Gate("body", "pass", round(body.dolp, 4), limit, says)
+        message += ", as little as a flat object" if flat else ", as little as a rough object"
+    return Gate("body", "pass", round(body.dolp, 4), limit, message)
 
 
 def _lopsided(body: rim.Body) -> float:
-    """How much more uneven than the limit its light may be: other light takes polarization away where it falls."""
+    """Factor on the limit of uneven light; light from the side lowers the polarization of the side it falls on."""
     if body.concentration <= _CLEAR or body.dolp_lit < _WEAK_DOLP:
         return 1.0
     return _LOPSIDED if body.dolp_lit < _LIT_DOLP else np.inf
 
 
 def _median_shape(maps: SurfaceMaps) -> tuple[float, float]:
-    """Median zenith of the normals, degrees from the view ray, and median roughness."""
+    """Median angle of the normals from the view ray, degrees, and median roughness."""
     if not maps.mask.any():
         return 0.0, 0.0
     facing = dot(maps.normal, rays(maps.view, *maps.mask.shape))[maps.mask]
@@ -244,7 +251,7 @@ def _median_shape(maps: SurfaceMaps) -> tuple[float, float]:
 
 
 def _reduced(image: StokesImage, angle: Floats) -> tuple[Floats, rim.Bools, rim.Bools]:
-    """The shots' light (K, h, w) as solved, object and sound pixels, averaged down to _MOST_PIXELS."""
+    """Light of the shots (K, h, w) from the solved Stokes parameters, object and valid pixels, reduced."""
     step = int(np.ceil(np.sqrt(max(image.mask.size / _MOST_PIXELS, 1))))
     doubtful = Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST
     usable = (image.quality & int(doubtful)) == 0

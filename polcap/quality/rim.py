@@ -1,4 +1,4 @@
-"""What the object's outline says of the polarizer: where it turns edge-on, the polarization is known.
+"""What the object's outline message of the polarizer: where it turns edge-on, the polarization is known.
 
 There the surface's azimuth φ is the outline's own direction, so a shot at θ sees ½ S₀ (1 + ρ cos 2(θ − φ)) with
 two unknowns per pixel. Three shots leave one residual per pixel, and its pattern along the outline tells which

@@ -100,8 +100,9 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
 def figures(results: Results) -> dict[str, dict[str, Any]]:
     """Every measured figure, by the part of the path that it tells of."""
     radiance, color = results.radiance, results.color
-    found, gains, image = results.alignment, results.gains, results.stokes
+    found, gains, image = results.alignment, results.selfcal.gains, results.stokes
     cues, maps, mesh, object_ = results.cues, results.maps, results.mesh, results.object_
+    ring, outline = results.selfcal.ring, results.selfcal.outline
     turn = np.degrees(np.arctan2(found.transform[:, 1, 0], found.transform[:, 0, 0]))
     extent = mesh.vertices.max(0) - mesh.vertices.min(0)
     return {
@@ -141,12 +142,12 @@ def figures(results: Results) -> dict[str, dict[str, Any]]:
             "disagreement": _number(gains.disagreement),
         },
         "angles": {
-            "offset_deg": _number(np.degrees(gains.angle_offset)),
-            "offset_sigma_deg": _number(np.degrees(gains.angle_offset_sigma)),
-            "applied_deg": _number(np.degrees(gains.angle_correction)),
-            "concentration": _number(gains.concentration),
-            "best_order": list(gains.order),
-            "mirrored": gains.mirrored,
+            "offset_deg": _number(np.degrees(ring.offset)),
+            "offset_sigma_deg": _number(np.degrees(ring.sigma)),
+            "applied_deg": _number(np.degrees(ring.correction)),
+            "concentration": _number(outline.concentration),
+            "best_order": list(outline.best.shots),
+            "mirrored": outline.best.mirrored,
         },
         "object": {
             "pixels": int(image.mask.sum()),
@@ -201,7 +202,7 @@ def document(
     """report.json: facts of the run, measurements and the gates' judgement; timings [s] of the stored stages."""
     found = {**figures(results), "rerendering": rerendering(results, config.infer.ior)}
     focal_doubt = tuple(facts["capture"].get("focal_doubt", (0.0, 0.0)))
-    judged = list(gates.judge(full_size(results, focal_doubt), config))
+    judged = list(gates.judge(full_size(results, focal_doubt), config.gates, config.align))
     return {
         "polcap": __version__,
         "versions": facts["versions"],

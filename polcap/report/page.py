@@ -87,8 +87,8 @@ def verdict(about: Mapping[str, Any]) -> tuple[str, str]:
     if not judged:  # the shots are out of order, or there is no object
         return headline, ""
     within = f"Half of the normals are expected within {_gate_value(judged[0], 'value')} of the surface's"
-    because = judged[0]["says"].partition(", most of it from: ")[2]
-    return headline, f"{within}; most of that is for what these checks found: {because}." if because else f"{within}."
+    because = judged[0]["says"].partition(", mostly due to: ")[2]
+    return headline, f"{within}; mostly due to these checks: {because}." if because else f"{within}."
 
 
 def _verdict(about: Mapping[str, Any]) -> Iterator[str]:
@@ -121,7 +121,7 @@ def _cost(gate: Mapping[str, Any]) -> str:
 
 
 def _remedy(gate: Mapping[str, Any]) -> str:
-    return f" <b>{escape(gate['remedy'])}</b>" if gate.get("remedy") and gate["state"] != "pass" else ""
+    return f" <b>{escape(gate['remedy'])}.</b>" if gate.get("remedy") and gate["state"] != "pass" else ""
 
 
 def _gate_value(gate: Mapping[str, Any], name: str) -> str:
@@ -184,7 +184,7 @@ def _chart(about: Mapping[str, Any], results: Results) -> str:
 
 def _measured(results: Results, about: Mapping[str, Any], angles: Sequence[float], chart: str) -> Iterator[str]:
     """Plots of what was measured; `angles` in degrees, `chart` drawn."""
-    gains, moved = results.gains, results.alignment
+    gains, moved = results.selfcal.gains, results.alignment
     yield "<h2>How it was measured</h2><div class='grid'>" + chart
     merge = about["figures"]["merge"]
     yield _drawn(
@@ -255,10 +255,10 @@ def gates(judged: Sequence[Mapping[str, Any]]) -> str:
         f"<tr><td>{escape(gate['name'].capitalize())}</td>"
         f'<td class="{escape(gate["state"])}">{escape(gate["state"])}</td>'
         f"<td>{escape(_gate_value(gate, 'value'))}</td><td>{escape(_gate_value(gate, 'limit'))}</td>"
-        f"<td>{_cost(gate)}</td><td>{escape(gate['says'])}{_remedy(gate)}</td></tr>"
+        f"<td>{_cost(gate)}</td><td>{escape(gate['says'])}.{_remedy(gate)}</td></tr>"
         for gate in sorted(judged, key=lambda gate: order.get(gate["state"], 4))
     )
-    head = "<tr><th>Check</th><th></th><th>Value</th><th>Limit</th><th>Cost</th><th>What it says</th></tr>"
+    head = "<tr><th>Check</th><th></th><th>Value</th><th>Limit</th><th>Cost</th><th>Finding</th></tr>"
     return f'<div class="scroll"><table class="checks">{head}{rows}</table></div>'
 
 

@@ -44,7 +44,7 @@ def of_stage(results: Results, stage: str) -> Picture:
         "whitebalance": lambda: chart(results.radiance, results.color),
         "align": lambda: sheet(registered(results.radiance, results.alignment)),
         "mask": lambda: outline(results.radiance, results.color, results.object_),
-        "selfcal": lambda: gains(results.gains, results.radiance.angle),
+        "selfcal": lambda: gains(results.selfcal.gains, results.radiance.angle),
         "stokes": lambda: stokes(results.stokes),
         "cues": lambda: cues(results.cues),
         "infer": lambda: maps(results.maps),

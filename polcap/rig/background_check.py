@@ -12,21 +12,18 @@ from polcap.rig.camera import CameraFile
 from polcap.rig.capture_record import AcceptedFrame, CaptureRecord
 from polcap.rig.device_log import Log
 from polcap.rig.exposure_bracket import relative_exposure
-from polcap.rig.retake_criteria import RetakeLimits
 from polcap.rig.shooting_plan import Slot
 
 MOST_PENDING = 4  # photographs in memory
 _BRACKET_ROLES = ("shot", "repeat")
-_BLURRED = "is less sharp than its neighbors; wait until the tripod is steady"
 
 
 class BackgroundCheck:
     """Saves each photograph, then accepts or rejects it, in the order of taking."""
 
-    def __init__(self, record: CaptureRecord, limits: RetakeLimits, tries: int, log: Log) -> None:
+    def __init__(self, record: CaptureRecord, tries: int, log: Log) -> None:
         self.small: dict[str, Floats] = {}  # accepted frames of this run by slot, small and grey
         self._record = record
-        self._limits = limits
         self._tries = tries
         self._log = log
         self._thread = ThreadPoolExecutor(1, "background check")
@@ -50,7 +47,7 @@ class BackgroundCheck:
             self._pending.pop(slot).result()
 
     def close(self) -> None:
-        """Finish what was submitted."""
+        """Finish the submitted checks."""
         self._thread.shutdown(wait=True)
 
     def _save_and_check(self, slot: Slot, read_deg: float | None, photograph: CameraFile) -> None:
@@ -66,35 +63,33 @@ class BackgroundCheck:
         accepted = self._record.accepted()
         in_bracket = slot.role in _BRACKET_ROLES
         shortest = in_bracket and relative_exposure(slot.exposure) == self._shortest
-        others = [frame.facts for frame in accepted.values()]
-        reason = retake_criteria.retake_reason(facts, photograph.exposure, slot.flash, shortest, others, self._limits)
         same_exposure = {
             name: frame
             for name, frame in accepted.items()
             if in_bracket and frame.role in _BRACKET_ROLES and frame.step == slot.step
         }
         sharpest = max((frame.facts.sharpness for frame in same_exposure.values()), default=0.0)
-        if reason is None and retake_criteria.is_blurred(facts.sharpness, sharpest, self._limits):
-            reason = _BLURRED
+        others = [frame.facts for frame in accepted.values()]
+        reason = retake_criteria.retake_reason(facts, photograph.exposure, slot.flash, shortest, others, sharpest)
         if reason is not None:
             self._reject(slot.name, file, read_deg, reason)
             return
         frame = AcceptedFrame(
-            name,
-            slot.role,
-            slot.angle_deg,
-            slot.step,
-            read_deg,
-            photograph.exposure,
-            slot.flash,
-            photograph.name,
-            facts,
+            file=name,
+            role=slot.role,
+            angle_deg=slot.angle_deg,
+            step=slot.step,
+            read_deg=read_deg,
+            exposure=photograph.exposure,
+            flash=slot.flash,
+            camera_file=photograph.name,
+            facts=facts,
         )
         self._record.accept(slot, frame)
         self.small[slot.name] = small
         for earlier, other in same_exposure.items():  # an early frame may be the blurred one
-            if retake_criteria.is_blurred(other.facts.sharpness, facts.sharpness, self._limits):
-                self._reject(earlier, self._record.folder / other.file, other.read_deg, _BLURRED)
+            if retake_criteria.is_blurred(other.facts.sharpness, facts.sharpness):
+                self._reject(earlier, self._record.folder / other.file, other.read_deg, retake_criteria.BLURRED)
 
     def _reject(self, slot_name: str, file: Path, read_deg: float | None, reason: str) -> None:
         moved = self._record.reject(slot_name, file, read_deg, reason)

@@ -53,6 +53,11 @@ def overhead_s(camera: str) -> float:
     return OVERHEAD_S[kind]
 
 
+def minutes(seconds: float) -> str:
+    """Such as 1:40."""
+    return f"{round(seconds) // 60}:{round(seconds) % 60:02}"
+
+
 def dry_run(order: CaptureOrder) -> dict[str, Any]:
     """The plan with nominal times [s]; no device is opened.
 

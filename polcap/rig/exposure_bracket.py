@@ -66,14 +66,14 @@ def relative_exposure(exposure: Exposure) -> float:
 
 
 def bracket_by_shutter(middle_s: float | None) -> tuple[Exposure, ...]:
-    """Three frames two stops apart in time, around the camera's own setting."""
+    """Three frames in steps of two stops of time, around the camera's own setting."""
     if not middle_s:
         raise SettingError("the camera states no shutter speed; give the exposures with --bracket")
     return tuple(Exposure(time_s=middle_s * factor) for factor in (0.25, 1.0, 4.0))
 
 
 def bracket_by_iso(offered: list[float]) -> tuple[Exposure, ...]:
-    """Three frames two stops apart in ISO, from the camera's lowest of at least 100: for a flash."""
+    """Three frames in steps of two stops of ISO, from the camera's lowest of at least 100: for a flash."""
     lowest = min((iso for iso in offered if iso >= _BASE_ISO), default=None)
     if lowest is None:
         raise SettingError("the camera's ISO cannot be set; give the exposures with --bracket: flash power or aperture")

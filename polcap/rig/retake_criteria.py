@@ -3,7 +3,6 @@
 Frames are measured in the decoder's process: a damaged file does no harm, and the camera goes on meanwhile.
 """
 
-from collections.abc import Iterable
 from math import log2
 from pathlib import Path
 
@@ -18,10 +17,13 @@ from polcap.images import Exif, Floats
 from polcap.optics.resize import area_mean, block_means
 from polcap.rig.exposure_bracket import Exposure
 
+BLURRED = "is less sharp than its neighbors; wait until the tripod is steady"
 PREVIEW_PX = 480  # width of the small picture
 _DIAL_STOPS = 0.34  # EXIF rounds an exposure by up to one step of the dial
 _ZOOM = 0.01  # relative change of the focal length that is more than rounding
 _SATURATED = 0.98  # of the white level
+_MOST_CLIPPED = 0.01  # share of the picture, in the shortest exposure
+_LEAST_SHARPNESS = 0.75  # of that of the sharpest frame of the same exposure
 
 
 class FrameFacts(msgspec.Struct, frozen=True):
@@ -31,13 +33,6 @@ class FrameFacts(msgspec.Struct, frozen=True):
     digest: str  # of the file's bytes
     clipped: float  # share of saturated pixels
     sharpness: float  # contrast of fine detail over contrast of coarse detail
-
-
-class RetakeLimits(msgspec.Struct, frozen=True):
-    """Limits beyond which a frame is retaken."""
-
-    clipped: float = 0.01  # share of the picture, in the shortest exposure
-    blur: float = 0.75  # sharpness over that of the sharpest frame of the same exposure
 
 
 def inspect(path: Path) -> tuple[FrameFacts, Floats]:
@@ -74,27 +69,31 @@ def _sharpness(light: Floats) -> float:
 
 
 def retake_reason(
-    facts: FrameFacts, wanted: Exposure, flash: bool, shortest: bool, others: Iterable[FrameFacts], limits: RetakeLimits
+    facts: FrameFacts, wanted: Exposure, flash: bool, shortest: bool, others: list[FrameFacts], sharpest: float
 ) -> str | None:
-    """Why a frame must be retaken, sharpness excepted; `others` are the accepted frames of the capture."""
-    accepted = list(others)
-    if any(facts.digest == other.digest for other in accepted):
+    """Why a frame must be retaken.
+
+    others : the accepted frames of the capture. sharpest : greatest sharpness of those with the same exposure.
+    """
+    if any(facts.digest == other.digest for other in others):
         return "is the same photograph as an earlier one"
     if reason := _wrong_exposure(facts.exif, wanted):
         return reason
     if flash is False and facts.exif.flash_fired:
         return "the flash fired, although it should be off"
-    if shortest and facts.clipped > limits.clipped:
+    if shortest and facts.clipped > _MOST_CLIPPED:
         return (
             f"{100 * facts.clipped:.2g} % of the picture is clipped in the shortest exposure, "
-            f"more than {100 * limits.clipped:g} %; give a shorter --bracket or less light"
+            f"more than {100 * _MOST_CLIPPED:g} %; give a shorter --bracket or less light"
         )
-    return _other_equipment(facts.exif, accepted[0].exif) if accepted else None
+    if others and (reason := _other_equipment(facts.exif, others[0].exif)):
+        return reason
+    return BLURRED if is_blurred(facts.sharpness, sharpest) else None
 
 
-def is_blurred(sharpness: float, sharpest: float, limits: RetakeLimits) -> bool:
+def is_blurred(sharpness: float, sharpest: float) -> bool:
     """Whether a frame is less sharp than the sharpest of the same exposure by more than the polarizer explains."""
-    return sharpness < limits.blur * sharpest
+    return sharpness < _LEAST_SHARPNESS * sharpest
 
 
 def _wrong_exposure(stated: Exif, wanted: Exposure) -> str | None:

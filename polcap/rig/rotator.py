@@ -43,7 +43,7 @@ class RotatorSettings(Struct, frozen=True):
     reverse: bool = False  # the motor's degrees run clockwise, as the photographer sees the picture
     backlash: Backlash = 0.0
     settle: Annotated[float, Meta(ge=0, le=60)] = 0.2  # s
-    tolerance: Annotated[float, Meta(gt=0, le=180)] = 0.3  # degrees
+    tolerance: Annotated[float, Meta(gt=0, le=45)] = 0.3  # degrees
     timeout: Annotated[float, Meta(gt=0, le=600)] = 30.0  # s; the longest movement
 
 

@@ -24,11 +24,9 @@ from polcap.rig.camera import Camera, CameraFile
 from polcap.rig.capture_record import CaptureRecord, RigFile
 from polcap.rig.device_log import Log
 from polcap.rig.resume import open_folder, verify
-from polcap.rig.retake_criteria import RetakeLimits
 from polcap.rig.rotator import PolarizerRotator
 from polcap.rig.shooting_plan import CaptureOrder, Slot
 
-LIMITS = RetakeLimits()
 Tell = Callable[[str], None]
 _SPARE = 1.2  # free disk space over the size of the frames
 
@@ -38,7 +36,6 @@ def shoot(
     order: CaptureOrder,
     *,
     resume: bool = False,
-    limits: RetakeLimits = LIMITS,
     tries: int = 2,
     tell: Tell = lambda line: None,
 ) -> dict[str, Any]:
@@ -70,7 +67,7 @@ def shoot(
             tell(message)
         missing = record.missing()
         _check_disk(folder, len(missing) * camera.frame_bytes)
-        check = BackgroundCheck(record, limits, tries, log)
+        check = BackgroundCheck(record, tries, log)
         if missing:
             if note := shooting_plan.light_note(content.order):
                 tell(f"polcap: {note}")
@@ -136,11 +133,8 @@ class CaptureLoop:
         if slot.angle_deg is not None:
             self._turn(slot, slot.angle_deg)
         total = len(self.record.slots)
-        left_s = self.pace.total_s(missing, self.angle_deg)
-        self.tell(
-            f"{slot.name:24}{total - len(missing) + 1:3}/{total}  {slot.exposure}  "
-            f"{left_s / 60:.0f}:{left_s % 60:02.0f} left"
-        )
+        left = dry_run.minutes(self.pace.total_s(missing, self.angle_deg))
+        self.tell(f"{slot.name:24}{total - len(missing) + 1:3}/{total}  {slot.exposure}  {left} left")
         self._ask_for_filter(slot.role == "cross")
         photograph = self._photograph(slot)
         self._check_different(slot, photograph)

@@ -23,7 +23,7 @@ with suppress(ImportError):  # Windows
     _FAILURES += (termios.error,)  # a pulled cable
 
 ANSWER_S = 1.0  # time limit of one answer
-_SHORTEST_READ_S = 0.02  # a line that has already arrived is read even after the time limit
+_READ_S = 0.05  # pyserial's timeout; a new one for every read would configure the port again
 _QUIET_S = 0.25  # after so long without a byte no answer is on its way; a USB adapter delivers within 16 ms
 _LATE_S = 2.0  # longest wait for late answers
 _LONGEST_LINE = 1024  # bytes; more without a line end is noise
@@ -69,7 +69,7 @@ class Port:
         self._heard = False  # something has come since
         try:
             self._serial = serial.serial_for_url(
-                url, baudrate=baud, timeout=ANSWER_S, write_timeout=ANSWER_S, exclusive=True
+                url, baudrate=baud, timeout=_READ_S, write_timeout=ANSWER_S, exclusive=True
             )
         except ValueError as error:
             raise SettingError(
@@ -95,14 +95,15 @@ class Port:
         """The next line that is not empty, without its end. Raises NoAnswer, Unplugged."""
         limit_s = ANSWER_S if limit_s is None else limit_s
         end = time.monotonic() + limit_s
+        received, over = b"", False
         with self._named_failures():
-            while True:
-                self._serial.timeout = max(end - time.monotonic(), _SHORTEST_READ_S)
-                received = self._serial.read_until(b"\n", _LONGEST_LINE)
-                line = received.strip()
-                if line or not received or time.monotonic() >= end:
-                    break
-        if line and received.endswith(b"\n"):
+            while not over and not received.endswith(b"\n") and len(received) < _LONGEST_LINE:
+                over = time.monotonic() >= end  # read once more: a line that has arrived by now counts
+                received += self._serial.read_until(b"\n", _LONGEST_LINE)
+                if received.endswith(b"\n") and not received.strip():
+                    received = b""
+        line = received.strip()
+        if received.endswith(b"\n"):
             return self._decoded(line)
         self._answer_missing, self._heard = True, False
         if line:
@@ -143,10 +144,11 @@ class Port:
         return line.decode("ascii")
 
     def _discard_late_answers(self) -> None:
-        self._serial.timeout = _QUIET_S
         end = time.monotonic() + _LATE_S
-        while self._serial.read(_LONGEST_LINE) and time.monotonic() < end:
-            self._heard = True
+        quiet = time.monotonic() + _QUIET_S
+        while time.monotonic() < min(quiet, end):
+            if self._serial.read(_LONGEST_LINE):
+                self._heard, quiet = True, time.monotonic() + _QUIET_S
         self._answer_missing = not self._heard
 
     @contextmanager

@@ -53,13 +53,9 @@ class Slot:
     def name(self) -> str:
         """Path in the capture, without suffix."""
         at = "" if self.angle_deg is None else f"pol{layouts.degrees(self.angle_deg)}"
-        if self.role == "shot":
-            return f"{at}/frame_{self.step + 1}"
-        if self.role == "repeat":
-            return f"repeat/{at}_frame_{self.step + 1}"
-        if self.role == "cross":
-            return f"cross/frame_{self.step + 1}"
-        return f"{self.role}/{at or self.role}"
+        frame = f"frame_{self.step + 1}"
+        names = {"shot": f"{at}/{frame}", "repeat": f"repeat/{at}_{frame}", "cross": f"cross/{frame}"}
+        return names.get(self.role, f"{self.role}/{at or self.role}")
 
 
 def plan_slots(order: CaptureOrder, switches_flash: bool) -> tuple[Slot, ...]:
@@ -93,11 +89,8 @@ def next_slot(missing: Sequence[Slot], at_deg: float) -> Slot:
     if not turning:
         return next((slot for slot in missing if slot.role != "cross"), missing[0])
     angles = [slot.angle_deg for slot in turning if slot.angle_deg is not None]
-    if at_deg in angles:
-        goal = at_deg
-    else:
-        low, high = min(angles), max(angles)
-        goal = low if abs(at_deg - low) <= abs(at_deg - high) else high
+    ends = min(angles), max(angles)
+    goal = at_deg if at_deg in angles else min(ends, key=lambda angle: abs(angle - at_deg))
     return next(slot for slot in turning if slot.angle_deg == goal)
 
 

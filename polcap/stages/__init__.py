@@ -1,20 +1,20 @@
-"""The stages: pure functions from values of `images.py` to values of `images.py`.
+"""The ten stages: pure functions from values of `images.py` to values of `images.py`.
 
-In the order a pixel meets them:
+In the order of the path:
 
-    hdr            RAW bracket of each angle -> radiance, variance, quality
-    whitebalance   ColorChecker -> colour matrix
-    align          radiance -> one transform per angle
-    mask           which pixels are the object
-    selfcal        gains per shot, order and handedness of the angles
+    hdr            RAW brackets -> radiance, variance and quality of each shot
+    whitebalance   ColorChecker -> color matrix
+    align          radiance -> one transform per shot
+    mask           radiance -> the object's pixels
+    selfcal        gains of the shots, order and sense of the angles
     stokes         radiance, gains, transforms -> S0, S1, S2 of the crop
-    cues           Stokes, matrix -> DoLP, normalised Stokes map, diffuse colour, network channels
-    infer          cues -> normal, diffuse, specular, roughness, confidence
+    cues           Stokes parameters, matrix -> DoLP, normalised Stokes map, diffuse color, network channels
+    infer          cues -> normal, diffuse, specular, roughness, expected error
     surface        normals -> depth and mesh
-    asset          maps and mesh -> what a renderer wants
+    asset          maps and mesh -> glTF textures and factors
 
-A stage opens no file, warns of nothing and skips nothing: it returns a new value or raises.
-Stages do not import each other. What two of them share lives in `optics/`.
+A stage opens no file and logs nothing: it returns a new value or raises.
+Stages do not import each other. Code that two of them use is in `optics/`.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Stage(Generic[P, T]):
-    """A pure function with a name and a version that is raised whenever its pixels change."""
+    """A pure function with a name, and a version that is raised whenever its pixels change."""
 
     function: Callable[P, T]
     version: int
@@ -38,7 +38,7 @@ class Stage(Generic[P, T]):
         return self.function.__module__.rpartition(".")[2]
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T:
-        """As the function itself."""
+        """Call the function."""
         return self.function(*args, **kwargs)
 
 

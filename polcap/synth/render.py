@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from polcap.errors import SettingError
 from polcap.images import Floats, GBuffer, View
 from polcap.optics import body, frames, fresnel, mueller, shade
+from polcap.optics.projection import back_project
 from polcap.synth import color_checker as charts
 from polcap.synth import interreflection, mesh_tracer, scene_materials, trace
 from polcap.synth.color_checker import Chart
@@ -111,9 +112,8 @@ def guide(buffer: GBuffer) -> Floats:
 
 def view_rays(view: View, x: Floats, y: Floats) -> Floats:
     """`frames.rays` at any pixel positions: unit vectors from the surface to the lens, (..., 3) float64."""
-    across, down = (view.center[0] - x) / view.focal, (y - view.center[1]) / view.focal
-    along = 1 / np.sqrt(across * across + down * down + 1)
-    return np.stack([across * along, down * along, along], axis=-1)
+    towards = -back_project(view, x, y)
+    return np.asarray(towards / np.sqrt((towards**2).sum(axis=-1, keepdims=True)))
 
 
 def white_level(scene: Scene) -> float:
@@ -122,13 +122,6 @@ def white_level(scene: Scene) -> float:
         return 1.0
     point = charts.patches(scene.chart)[18].mean(axis=0, keepdims=True)
     return float(_irradiance(scene, point, scene.chart.axes[0])[0])
-
-
-def project(view: View, point: Floats) -> Floats:
-    """Pixel positions (..., 2) of points (..., 3) of the camera frame."""
-    x = view.center[0] - view.focal * point[..., 0] / point[..., 2]
-    y = view.center[1] + view.focal * point[..., 1] / point[..., 2]
-    return np.stack([x, y], axis=-1)
 
 
 def _visible(scene: Scene, v: Floats, start: Floats | None = None) -> tuple[Hits, Floats]:

@@ -26,6 +26,7 @@ from polcap.formats import atomic
 from polcap.formats.capture import layouts
 from polcap.formats.raw import dng
 from polcap.images import Exif, Floats, GBuffer, View
+from polcap.optics import projection
 from polcap.optics.color import REC709_TO_XYZ
 from polcap.synth import color_checker as charts
 from polcap.synth import forward_camera, lens, render, scene_materials
@@ -362,8 +363,8 @@ def _write_truth(
 ) -> None:
     view, white = shoot.view, render.white_level(scene)
     chart = scene.chart and {
-        "corners_px": render.project(view, charts.corners(scene.chart)).tolist(),
-        "patch_corners_px": render.project(view, charts.patches(scene.chart)).tolist(),
+        "corners_px": projection.project(view, charts.corners(scene.chart)).tolist(),
+        "patch_corners_px": projection.project(view, charts.patches(scene.chart)).tolist(),
         "size_m": scene.chart.size_m,
     }
     document = {

@@ -14,7 +14,7 @@ In the order a sample meets them:
     loss        maps against truth
     loop        optimizers (muon), learning rate, averaged weights, checkpoints; arithmetic: bf16 or fp32
     train       the main network's batches and losses in that loop
-    watch       a look at held-out pictures as training goes
+    validation  errors on held-out pictures during training
     export      weights -> ONNX
     corpus      the same simulator's pictures and truth as files
     evaluate    error of every map on fixed pictures of held-out meshes and materials, of which

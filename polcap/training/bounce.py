@@ -19,6 +19,7 @@ from torch.nn import functional as F
 
 from polcap.images import Floats, GBuffer
 from polcap.optics import brdf, frames, fresnel, shade
+from polcap.optics.projection import project
 from polcap.training import light_transport
 from polcap.training.materials import Surface
 
@@ -99,8 +100,7 @@ def _pixel(
     """
     height, width = buffer.mask.shape
     seen = place @ pose.rotation.T + pose.translation
-    x = np.round(buffer.view.center[0] - buffer.view.focal * seen[:, 0] / seen[:, 2]).astype(np.int64)
-    y = np.round(buffer.view.center[1] + buffer.view.focal * seen[:, 1] / seen[:, 2]).astype(np.int64)
+    x, y = np.round(project(buffer.view, seen)).astype(np.int64).T
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     x, y = np.where(inside, x, 0), np.where(inside, y, 0)
     inside &= np.linalg.norm(buffer.position[y, x] - place, axis=1) < _APART * size

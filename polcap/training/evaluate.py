@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from polcap.formats import atomic
+from polcap.formats import atomic, onnx
 from polcap.formats.maps import png
 from polcap.images import Cues, Network, SurfaceMaps
 from polcap.pipeline import models
@@ -97,7 +97,7 @@ def _alone(name: str) -> str:
 
 
 def _estimated(seen: Cues, network: Network | None) -> SurfaceMaps:
-    return infer.estimate(seen, network, infer.Settings())
+    return infer.estimate(seen, network, onnx.run, infer.InferSettings())
 
 
 def _judged(params: Params, means: Means, head: dict[str, Any]) -> list[Row]:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from polcap.formats import atomic
+from polcap.formats import atomic, onnx
 from polcap.images import Floats, Network, View
 from polcap.stages import cues
 from polcap.stages.infer import fine, learned
@@ -74,7 +74,7 @@ class Studio:
         found = cues.compute(image, protocol.white())
         shown = int(_SHOWN[0] * (_SHOWN[1] / _SHOWN[0]) ** rng.random())
         first = replace(self.network, metadata={**self.network.metadata, "native_size": str(shown)})
-        _, guess, _ = learned.known(found, first, _IOR, 1)
+        _, guess, _ = learned.known(found, first, onnx.run, _IOR, 1)
         truth = np.moveaxis(photo.truth["normal"][0].numpy(), -1, 0)
         known = (photo.mask[0].numpy() & mask)[None]
         rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))

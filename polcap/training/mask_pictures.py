@@ -14,7 +14,7 @@ import torch
 
 from polcap.formats import atomic
 from polcap.images import Floats
-from polcap.stages.mask.mask_channels import Look
+from polcap.stages.mask.mask_channels import ReducedPicture
 from polcap.synth.mesh_tracer import Tracer, Triangles, centred
 from polcap.training import gbuffers, limbs, mask_scenes, mask_views, materials, shapes
 
@@ -78,7 +78,7 @@ def packed(picture: mask_scenes.Picture) -> Floats:
     return np.asarray(whole.reshape(height // 2, 2, width // 2, 2, count).mean((1, 3)), np.float16)
 
 
-def drawn(file: Path, rng: np.random.Generator, other: Path | None = None) -> tuple[Look, Floats]:
+def drawn(file: Path, rng: np.random.Generator, other: Path | None = None) -> tuple[ReducedPicture, Floats]:
     """A picture under new light, a part of it, turned or mirrored, and measured; and its truth (H, W).
 
     other: a picture whose object is laid into this one, too.

@@ -17,7 +17,7 @@ from torch import Tensor
 from polcap.formats import shipped_data
 from polcap.images import Floats
 from polcap.optics import frames, shade
-from polcap.stages.mask.mask_channels import Look, grid
+from polcap.stages.mask.mask_channels import ReducedPicture, grid
 from polcap.training import backdrop_prints, materials
 from polcap.training.mask_views import Traced, backdrop
 from polcap.training.materials import Surface
@@ -77,7 +77,7 @@ def draw(
     return Picture(_blurred(image, rng.uniform(0.35, 0.9)), chart, corners, traced.mask)
 
 
-def measured(color: Floats, sums: Floats, chart: NDArray[np.bool_], rng: np.random.Generator) -> Look:
+def measured(color: Floats, sums: Floats, chart: NDArray[np.bool_], rng: np.random.Generator) -> ReducedPicture:
     """S0 (H, W, 3) and the sums over colours (3, H, W) with noise, gains not yet known, shots not quite aligned."""
     bright = float(np.percentile(color.mean(-1), 98)) + 1e-9
     color, sums = (np.asarray(a / bright, np.float32) for a in (color, sums))
@@ -91,7 +91,9 @@ def measured(color: Floats, sums: Floats, chart: NDArray[np.bool_], rng: np.rand
         off = rng.normal(0, 0.008) * sums[0] + sum(rng.normal(0, 0.08) * s for s in slope)
         seen.append(sums[k] + off + 1.5 * total * _noise(total.shape, rng))
     tint = np.exp(rng.normal(0, 0.04, 3))
-    return Look((color * tint).astype(np.float32), np.stack(seen).astype(np.float32), chart, grid(*chart.shape))
+    return ReducedPicture(
+        (color * tint).astype(np.float32), np.stack(seen).astype(np.float32), chart, grid(*chart.shape)
+    )
 
 
 def _noise(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:

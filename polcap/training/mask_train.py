@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from polcap.images import Floats
-from polcap.stages.mask.mask_channels import CHANNELS, ENCODING, SIZE_MULTIPLE, Look, brightness, encode
+from polcap.stages.mask.mask_channels import CHANNELS, ENCODING, SIZE_MULTIPLE, ReducedPicture, brightness, encode
 from polcap.training import export, loop, mask_model, mask_pictures
 
 _PARTS, _PART = 4, (96, 128)  # pictures of a step of which a part is shown; its height, width, px
@@ -99,16 +99,16 @@ class MaskTraining(loop.PictureTraining):
         return {"iou_whole": float(np.mean(coarse)), "iou": float(np.mean(fine)), "iou_least": min(fine)}
 
 
-def first(look: Look, width: int) -> Floats:
+def first(look: ReducedPicture, width: int) -> Floats:
     """The channels of the whole picture at so many pixels across."""
-    smaller = Look(
+    smaller = ReducedPicture(
         reduced(look.color, width), np.stack([reduced(s, width) for s in look.stokes]),
         reduced(look.chart.astype(np.float32), width) > 0.5, np.stack([reduced(p, width) for p in look.place]),
     )  # fmt: skip
     return encode(smaller, brightness(smaller.color))
 
 
-def part(look: Look, truth: Floats, chance: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
+def part(look: ReducedPicture, truth: Floats, chance: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """The channels of a rectangle about a place of the outline, hinted, and its truth."""
     height, width = truth.shape
     zoom = rng.uniform(*_ZOOM)
@@ -129,7 +129,7 @@ def part(look: Look, truth: Floats, chance: Floats, rng: np.random.Generator) ->
         shown = np.ascontiguousarray(image[y : y + tall, x : x + wide])
         return np.asarray(cv2.resize(shown, _PART[::-1], interpolation=kind))
 
-    seen = Look(
+    seen = ReducedPicture(
         cut(look.color), np.stack([cut(s) for s in look.stokes]), cut(look.chart.astype(np.float32)) > 0.5,
         np.stack([cut(p) for p in look.place]),
     )  # fmt: skip

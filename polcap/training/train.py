@@ -20,8 +20,8 @@ from polcap.errors import InputError
 from polcap.formats.maps import png
 from polcap.training import arithmetic, export, gbuffers, loop, loss, materials, model
 from polcap.training.dataset import Batch, Simulator
+from polcap.training.validation import HeldOutPictures
 from polcap.training.variants import VARIANTS
-from polcap.training.watch import Watch
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def main(options: TrainingOptions) -> Path:
     elif options.start:
         network.begin(options.start, options.done)
     simulator = Simulator(traced_views(options, preset), library(options, "train", device), device)
-    network.watch = Watch(options.data, options.out / "watch", device)
+    network.held_out = HeldOutPictures(options.data, options.out / "watch", device)
     torch.set_num_threads(1)
     budget = loop.Budget(options.minutes, options.samples)
     batches = _made_ahead(
@@ -186,7 +186,7 @@ class NetworkTraining(loop.Trainee):
         self.pool = ThreadPoolExecutor(learners, initializer=torch.set_num_threads, initargs=(1,))
         self.begun = ""  # pictures that the first weights had learned from, in words
         self.done = 0  # pictures of the budget among them
-        self.watch: Watch | None = None
+        self.held_out: HeldOutPictures | None = None
 
     def advance(self, batch: list[Batch], progress: float) -> dict[str, float]:
         """One step on a batch per learner."""
@@ -211,10 +211,10 @@ class NetworkTraining(loop.Trainee):
 
     def validate(self, out: Path) -> dict[str, float]:
         """Mean errors on test meshes; watch.png shows eight of them."""
-        assert self.watch is not None
+        assert self.held_out is not None
         with self.averaged() as network:
-            png.write(out / "watch.png", self.watch.picture(network))
-            return self.watch.look(network)
+            png.write(out / "watch.png", self.held_out.picture(network))
+            return self.held_out.errors(network)
 
     def facts(self) -> dict[str, Any]:
         """Shape and variant of the network, and the origin of its first weights."""

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from polcap.config import Config
+from polcap.formats import onnx
 from polcap.formats.capture import reader as captures
 from polcap.images import Capture, Floats, Network
 from polcap.optics import body, frames, fresnel
@@ -73,7 +74,7 @@ def capture_errors(found: Results, capture: Capture, told: dict, meta: dict) -> 
     ratio = found.radiance.bracket.exposure_ratio.mean(-1)
     reference = int(np.abs(ratio[0] - 1).argmin())
     flash = np.array([shot[reference]["flash_factor"] for shot in frames])
-    gain = found.gains.gain.mean(1) / (flash / flash[0]) - 1
+    gain = found.selfcal.gains.gain.mean(1) / (flash / flash[0]) - 1
     ratios = ratio / (exposure / exposure[:, [reference]]) - 1
 
     rows, columns = np.nonzero(found.object_.mask)
@@ -108,7 +109,7 @@ def surface_errors(found: Results, truth: dict[str, Floats], network: Network | 
         parts = found.stokes.stokes.copy()
         parts[1:] *= np.where(binned(truth["mask"]) > 0, share, 1)[..., None]
         seen = cues.compute(replace(found.stokes, stokes=parts), found.color)
-        maps = infer.estimate(seen, network, Config().infer)
+        maps = infer.estimate(seen, network, onnx.run, Config().infer)
         depth = surface.integrate(maps, distance_m(found.color, found.radiance), Config().surface).depth
     inside = (binned(truth["mask"]) == 1) & maps.mask
     angle = np.degrees(np.arccos(np.clip((normal * maps.normal).sum(-1), -1, 1)))[inside]

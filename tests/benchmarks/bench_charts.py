@@ -23,7 +23,7 @@ from polcap.errors import ChartError
 from polcap.images import AngleStack, Floats
 from polcap.optics.color import decode_srgb, encode_srgb, fit_matrix
 from polcap.stages import whitebalance
-from polcap.stages.whitebalance import Settings, patches
+from polcap.stages.whitebalance import WhitebalanceSettings, patches
 from tests.stages.whitebalance.chart_pictures import AUTO, CLASSIC, stack
 from tests.stages.whitebalance.test_real_charts import DATA, MARKED, PHOTOS, REAL, corners_off, photo, superpixels
 
@@ -45,7 +45,7 @@ def photographs() -> None:
         *((path.stem, photo(path)) for path in PHOTOS),
         *((name, stack(superpixels(folder / name))) for name, folder in raws),
     ]:
-        color = whitebalance.measure(radiance, CLASSIC, AUTO, Settings())
+        color = whitebalance.measure(radiance, CLASSIC, AUTO, WhitebalanceSettings())
         plain = opencv(radiance)
         assert color.delta_e is not None and color.predicted is not None
         own = (100 * corners_off(color, MARKED[name]), np.nanmean(color.delta_e), np.nanmean(color.predicted))
@@ -62,7 +62,7 @@ def chart_free(pictures: int, first: int) -> None:
         if seen % 20 == 0:
             print(seen, by_polcap, by_opencv, by_cost, flush=True)
         try:
-            color = whitebalance.measure(radiance, CLASSIC, AUTO, Settings())
+            color = whitebalance.measure(radiance, CLASSIC, AUTO, WhitebalanceSettings())
             assert color.delta_e is not None
             by_polcap.append((name, float(np.nanmean(color.delta_e))))
         except ChartError:

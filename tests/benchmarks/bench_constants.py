@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 
 from polcap.config import Config
+from polcap.formats import onnx
 from polcap.images import Floats, Network
 from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
@@ -136,7 +137,7 @@ class Normals:
         self.judge, self.network = judge, network
 
     def __call__(self) -> float:
-        return self.judge.error(infer.estimate(self.judge.cues, self.network, Config().infer).normal)
+        return self.judge.error(infer.estimate(self.judge.cues, self.network, onnx.run, Config().infer).normal)
 
 
 class Moved:
@@ -172,7 +173,7 @@ class Gained:
             self.results.object_,
             replace(self.results.color, quads=None),
             Config().selfcal,
-        ).gain
+        ).gains.gain
 
     def __call__(self) -> float:
         return float(100 * np.abs(self.gains() / self.usual - 1).max())

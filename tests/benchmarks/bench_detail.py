@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap.formats import onnx
 from polcap.images import Floats, Network
 from polcap.pipeline import models
 from polcap.stages import infer
@@ -46,8 +47,8 @@ def main() -> None:
     rows: list[dict[str, dict[str, float]]] = []
     looks: list[Floats] = []
     for case in _cases(given.data, given.size, given.protocol, given.pictures, given.store):
-        before = infer.estimate(case.cues, network, infer.Settings(fine=False))
-        after = infer.estimate(case.cues, network, infer.Settings())
+        before = infer.estimate(case.cues, network, onnx.run, infer.InferSettings(fine=False))
+        after = infer.estimate(case.cues, network, onnx.run, infer.InferSettings())
         both = {"before": errors(before.normal, case, network), "after": errors(after.normal, case, network)}
         rows.append(both)
         print(json.dumps({"picture": case.name, **both}), flush=True)

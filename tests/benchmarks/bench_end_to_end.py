@@ -18,6 +18,7 @@ import msgspec
 import numpy as np
 
 from polcap.config import Config
+from polcap.formats import onnx
 from polcap.formats.capture import reader as captures
 from polcap.images import ColorCalibration, Floats, Network, StokesImage
 from polcap.pipeline import models
@@ -84,7 +85,7 @@ def measure(place: Path, network: Network | None) -> list[float]:
         None,
     )
     white = ColorCalibration(np.eye(3, dtype=np.float32), None, None, None, "profile", 0.0, None)
-    ideal = infer.estimate(cues.compute(clean, white), network, Config().infer)
+    ideal = infer.estimate(cues.compute(clean, white), network, onnx.run, Config().infer)
     both = inside & maps.mask
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
     errors = [_angle(normal, one.normal)[both].mean() for one in (maps, ideal)]

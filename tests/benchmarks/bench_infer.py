@@ -18,6 +18,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
+from polcap.formats import onnx
 from polcap.images import Cues
 from polcap.optics import frames
 from polcap.pipeline import models
@@ -31,7 +32,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path, help="folder with meshes/ and materials/")
     parser.add_argument("--model", type=Path, help="by default what is shipped, with its fine pass")
-    parser.add_argument("--symmetries", type=int, default=infer.Settings().symmetries, help="positions averaged")
+    parser.add_argument("--symmetries", type=int, default=infer.InferSettings().symmetries, help="positions averaged")
     options = parser.parse_args()
     seen = Protocol(options.data, 512).case(0).cues
     print("| crop | stage [s] | network once [s] | ratio | peak memory [GB] |\n| --- | --- | --- | --- | --- |")
@@ -46,9 +47,9 @@ def _measured(seen: Cues, model: Path | None, symmetries: Literal[1, 2, 4, 8]) -
     network = models.load_network("network", model, "cpu", 0)
     assert network is not None
     small = learned._resized(seen, int(network.metadata["native_size"]) / max(seen.mask.shape))
-    settings = infer.Settings(symmetries=symmetries)
-    floor = _best(lambda: augmentation._run(channels(small), network))
-    stage = _best(lambda: infer.estimate(seen, network, settings))
+    settings = infer.InferSettings(symmetries=symmetries)
+    floor = _best(lambda: augmentation._run(channels(small), network, onnx.run))
+    stage = _best(lambda: infer.estimate(seen, network, onnx.run, settings))
     return stage, floor, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 

@@ -22,13 +22,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.config import Gates
+from polcap.formats import onnx
 from polcap.formats.maps import png
 from polcap.images import AngleStack, Floats, Network, ObjectMask, single_frames
 from polcap.optics import fresnel, mueller
 from polcap.pipeline import models
 from polcap.quality import polarization
 from polcap.quality.gate import Evidence
+from polcap.quality.limits import GateLimits
 from polcap.stages import cues, infer, stokes
 from polcap.synth import scene_materials
 from polcap.synth.render import Seen
@@ -165,16 +166,18 @@ def solved(case: Lit, seed: int) -> Any:
         bracket=single_frames(3),
     )  # fmt: skip
     object_ = ObjectMask(case.mask, (0, 0, case.mask.shape[1], case.mask.shape[0]), "user")
-    return stokes.solve(radiance, scenes.still(), scenes.equal(), object_, stokes.Settings())
+    return stokes.solve(radiance, scenes.still(), scenes.equal(), object_, stokes.StokesSettings())
 
 
 def _spoken(image: Any) -> dict[str, str]:
-    maps = infer.estimate(cues.compute(image, scenes.no_color()), _network(), infer.Settings(symmetries=1, fine=False))
+    maps = infer.estimate(
+        cues.compute(image, scenes.no_color()), _network(), onnx.run, infer.InferSettings(symmetries=1, fine=False)
+    )
     found = Evidence.partial(
         stokes=image, radiance=SimpleNamespace(angle=ANGLE), gains=scenes.equal(), names=["0°", "45°", "90°"], maps=maps
     )
-    lines = [*polarization.of_outline(found, Gates()), polarization.ill_posed(found, Gates())]
-    return {line.name: line.says for line in lines if line.state in ("fail", "warn")}
+    lines = [*polarization.of_outline(found, GateLimits()), polarization.ill_posed(found, GateLimits())]
+    return {line.name: line.message for line in lines if line.state in ("fail", "warn")}
 
 
 @lru_cache

@@ -118,7 +118,7 @@ def _photographed(name: str, file: Path, rng: np.random.Generator) -> Case:
 def found(case: Case, network: Network | None) -> ObjectMask | None:
     """What the stage takes for the object; None where it says that there is none."""
     try:
-        return mask.segment(case.radiance, case.alignment, case.color, None, network, mask.Settings())
+        return mask.segment(case.radiance, case.alignment, case.color, None, network, onnx.run, mask.MaskSettings())
     except ObjectError:
         return None
 

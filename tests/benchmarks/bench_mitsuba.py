@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from bench_captures import kept
 
+from polcap.formats import onnx
 from polcap.images import ColorCalibration, SurfaceMaps, View
 from polcap.optics import frames
 from polcap.pipeline import models
@@ -40,7 +41,7 @@ def main() -> None:
         case = read(file, options.clean, options.rough, seed=number)
         judge = Judge(case)
         for name, network in networks.items():
-            found = judge.score(infer.estimate(case.cues, network, infer.Settings()))
+            found = judge.score(infer.estimate(case.cues, network, onnx.run, infer.InferSettings()))
             row = [found.get(key, np.nan) for key in ROWS]
             table[name].append(row)
             print(f"| {case.name} | {name} |", " | ".join(f"{value:.3g}" for value in row), "|", flush=True)

@@ -35,12 +35,14 @@ from polcap.images import (
     Capture,
     ChartRequest,
     Floats,
-    Gains,
     ObjectMask,
+    SelfCalibration,
     SurfaceMaps,
     View,
 )
 from polcap.stages import align, hdr, stokes, surface, whitebalance
+from polcap.stages.whitebalance import WhitebalanceSettings
+from tests import scenes
 
 _FULL = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1.0]])  # binned px → RAW px
 _ECC = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
@@ -129,7 +131,7 @@ def registering(stack: AngleStack, folder: Path) -> Iterator[Row]:
             found.append(np.vstack([motion, [0, 0, 1]]))
 
     theirs = least(ecc)
-    color = whitebalance.measure(stack, shipped_data.colorchecker(), ChartRequest("none"), whitebalance.Settings())
+    color = whitebalance.measure(stack, shipped_data.colorchecker(), ChartRequest("none"), WhitebalanceSettings())
     ours = least(lambda: align.register(stack, color, align.Settings()))
     own = align.register(stack, color, align.Settings()).transform[1:]
     size = stack.value.shape[1:3]
@@ -173,7 +175,7 @@ def charting(stack: AngleStack) -> Iterator[Row]:
     found = len(detect_colour_checkers_segmentation(shown))
     theirs = least(lambda: detect_colour_checkers_segmentation(shown))
     reference, search = shipped_data.colorchecker(), ChartRequest("auto")
-    ours = least(lambda: whitebalance.measure(stack, reference, search, whitebalance.Settings()))
+    ours = least(lambda: whitebalance.measure(stack, reference, search, WhitebalanceSettings()))
     note = f"theirs finds {found}, ours with its matrix and doubt"
     yield Row("chart found and fitted", "colour-checker-detection", ours, theirs, note)
 
@@ -192,23 +194,7 @@ def solving(stack: AngleStack) -> Iterator[Row]:
         polanalyser.cvtStokesToDoLP(found)
         polanalyser.cvtStokesToAoLP(found)
 
-    one, none = np.ones((shots, 3)), np.zeros((shots, 3))
-    gains = Gains(
-        gain=one,
-        sigma=none,
-        anchor=one,
-        source="none",
-        disagreement=0.0,
-        angle_offset=0.0,
-        angle_offset_sigma=0.0,
-        angle_correction=0.0,
-        concentration=1.0,
-        order=tuple(range(shots)),
-        mirrored=False,
-        anchor_sigma=one[:, 0],
-        grey_slope=1.0,
-        chart_gloss=0.0,
-    )
+    equal = scenes.equal(stack.angle)
     whole = ObjectMask(np.ones((height, width), bool), (0, 0, width, height), "user")
     still = np.stack([np.eye(3)] * shots)
     moved = still.copy()
@@ -221,12 +207,12 @@ def solving(stack: AngleStack) -> Iterator[Row]:
         ("colors laid over one another", stack, still),
         ("every shot resampled", stack, moved),
     ):
-        solve = partial(_solved, given, Alignment(transform, np.zeros(shots), np.ones(shots)), gains, whole)
+        solve = partial(_solved, given, Alignment(transform, np.zeros(shots), np.ones(shots)), equal, whole)
         yield Row(f"Stokes, {name}", "polanalyser", least(solve), cost, "ours with covariance and quality bits")
 
 
-def _solved(stack: AngleStack, at: Alignment, gains: Gains, object_: ObjectMask) -> None:
-    stokes.solve(stack, at, gains, object_, stokes.Settings())
+def _solved(stack: AngleStack, at: Alignment, calibration: SelfCalibration, object_: ObjectMask) -> None:
+    stokes.solve(stack, at, calibration, object_, stokes.StokesSettings())
 
 
 def integrating() -> Iterator[Row]:

@@ -48,7 +48,7 @@ def against_polanalyser(folder: Path) -> None:
     capture = captures.read(folder, None)
     supplied = UserInput(ChartRequest("none"), None, None, models.load_mask_network(1))
     found = path(capture, supplied, Config(), MemoryCache(until="stokes"))
-    gains, alignment, image = found.gains, found.alignment, found.stokes
+    gains, alignment, image = found.selfcal.gains, found.alignment, found.stokes
     print(f"gains all 1: {bool((gains.gain == 1).all())} ({gains.source})")
     print(f"offsets [grid px]: {(-alignment.transform[:, :2, 2]).tolist()}")
     (x0, y0), (height, width) = (round(at) for at in image.view.origin), image.mask.shape

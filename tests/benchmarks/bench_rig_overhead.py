@@ -14,12 +14,12 @@ from unittest import mock
 
 import numpy as np
 
-from polcap.formats.raw import dng
 from polcap.images import Exif, Role
 from polcap.rig import sequence
 from polcap.rig.camera import CameraFile
 from polcap.rig.exposure_bracket import Exposure
 from polcap.rig.shooting_plan import CaptureOrder
+from tests.raw_files import write_raw
 from tests.rig.pool import BRACKET
 
 _DEVICE_S = 1.0
@@ -95,18 +95,7 @@ def _frame(path: Path, number: int) -> bytes:
     random = np.random.default_rng(number)
     tile = random.integers(600, 9000, (_SIZE[0] // 8, _SIZE[1] // 8)).astype(np.uint16)
     exif = Exif(make="Bench", model="24", exposure_time=BRACKET[number % 3].time_s, f_number=11.0, iso=100.0)
-    dng.write(
-        path,
-        np.tile(tile, (8, 8)),
-        cfa=np.array([[0, 1], [1, 2]], np.uint8),
-        black=512,
-        white=15871,
-        exif=exif,
-        color_matrix=np.eye(3),
-        as_shot_neutral=np.ones(3),
-        compression="none",
-    )
-    return path.read_bytes()
+    return write_raw(path, np.tile(tile, (8, 8)), exif)
 
 
 if __name__ == "__main__":

@@ -21,9 +21,10 @@ import numpy as np
 from polcap.errors import ChartError
 from polcap.formats import shipped_data
 from polcap.images import AngleStack, ChartRequest, GBuffer, StokesImage, View, single_frames
-from polcap.optics import point_light
+from polcap.optics import point_light, projection
 from polcap.stages import whitebalance
 from polcap.stages.cues import scale
+from polcap.stages.whitebalance import WhitebalanceSettings
 from polcap.synth import color_checker, render
 from polcap.synth.render import Scene
 from polcap.synth.scenes import random_scene
@@ -67,7 +68,7 @@ def measure(number: int, falloff: float, printed: float) -> tuple[float, ...]:
     coarse = View(_VIEW.focal / _COARSE, (319.5 / _COARSE - 0.375, 239.5 / _COARSE - 0.375), 2.0 * _COARSE)
     object_ = render.gbuffer(scene, coarse, 480 // _COARSE, 640 // _COARSE)
     taken = photograph(scene, falloff, printed, random)
-    color = whitebalance.measure(taken, shipped_data.colorchecker(), ChartRequest("auto"), whitebalance.Settings())
+    color = whitebalance.measure(taken, shipped_data.colorchecker(), ChartRequest("auto"), WhitebalanceSettings())
     assert color.light is not None
     nothing = np.zeros((3, 1, 1, 3)), np.zeros((6, 1, 1, 3)), np.zeros((1, 1), np.uint8)
     stokes = StokesImage(*nothing, object_.mask, coarse, None)
@@ -115,7 +116,7 @@ def photograph(scene: Scene, falloff: float, printed: float, random: np.random.G
     light[at] = albedo * arriving[:, None]
     picture = cv2.GaussianBlur(light.reshape(480, 640, -1, 3).mean(axis=2), (0, 0), 0.5)
     row, column = np.mgrid[:480, :640]
-    for quad in render.project(_VIEW, color_checker.patches(scene.chart)):
+    for quad in projection.project(_VIEW, color_checker.patches(scene.chart)):
         low, high = quad.min(0), quad.max(0)
         picture[(column > low[0]) & (column < high[0]) & (row > low[1]) & (row < high[1])] *= (
             1 + printed * random.normal()

@@ -34,6 +34,7 @@ import numpy as np
 from polcap import __version__
 from polcap.config import Config
 from polcap.errors import GateError
+from polcap.formats import onnx
 from polcap.formats.capture import reader as captures
 from polcap.formats.maps import exr, png
 from polcap.pipeline import models
@@ -144,7 +145,7 @@ def floor(capture: Path, out: Path) -> dict[str, float]:
     return {
         "unpack": unpacking,
         "copy": spent(lambda: held.copy()) * 2,  # value and variance
-        "network": spent(lambda: network.run(blank)),
+        "network": spent(lambda: onnx.run(network, blank)),
         "encode": encoding(out),
     }
 

@@ -95,7 +95,7 @@ def one(folder: Path, seed: int, kind: str, width: int, keep: bool) -> Row:
 
 def judge_check(capture: Capture) -> Row:
     try:
-        found = check.inspect(capture, networks, Config())
+        found = check.inspect(capture, networks(), Config())
     except InputError as error:
         return {"check": "fail", "check_gates": {_name(error): ["fail", None, 45.0]}, "needs": ""}
     return {"check": gates.verdict(found.lines), "check_gates": _shown(found.lines), "needs": found.needs}
@@ -106,7 +106,7 @@ def judge_process(capture: Capture, place: Path, no_chart: bool = False) -> Row:
     chart = ChartRequest("none" if no_chart else "auto")
     try:
         found = path.path(capture, path.UserInput(chart, None, *networks()), Config(), MemoryCache(until="surface"))
-        lines = list(gates.judge(full_size(found, capture.focal_doubt), Config()))
+        lines = list(gates.judge(full_size(found, capture.focal_doubt), Config().gates, Config().align))
         actual = error_deg(found.maps, place)
     except InputError as error:
         return {

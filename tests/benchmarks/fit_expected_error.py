@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize
 
-from polcap.formats import atomic
+from polcap.formats import atomic, onnx
 from polcap.images import Floats, Network
 from polcap.pipeline import models
 from polcap.stages import infer
@@ -85,7 +85,7 @@ def linked(data: Path, folder: Path, sixth: int, meshes: int) -> None:
 
 def pixels(case: Case, network: Network, seed: int) -> Floats:
     """Stated error, roughness and true error (3, N) of some pixels of a picture."""
-    maps = infer.estimate(case.cues, network, infer.Settings())
+    maps = infer.estimate(case.cues, network, onnx.run, infer.InferSettings())
     mask = case.truth.mask
     some = np.random.default_rng(seed).permutation(int(mask.sum()))[:SAMPLE]
     return np.stack([image[mask][some] for image in (maps.confidence, maps.roughness, angle(maps, case))])

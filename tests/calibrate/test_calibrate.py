@@ -13,10 +13,10 @@ from polcap.calibrate import calibration_photographs
 from polcap.cli import calibrate_command
 from polcap.errors import CaptureError, InputError
 from polcap.formats import calibrations
-from polcap.formats.raw import dng
 from polcap.images import Calibration, Exif
 from polcap.synth import calibration_frames, forward_camera
 from polcap.synth.calibration_frames import CalibrationShoot
+from tests.raw_files import write_raw
 
 MADE = "2026-11-22T20:00:00+00:00"
 SHOOT = CalibrationShoot(seed=3, zero_deg=1.7, sense=-1, black_error=1.0)
@@ -155,10 +155,7 @@ def write_flat(path: Path, light: float, iso: float = 100.0, time: float = 0.01,
     random = np.random.default_rng(len(list(path.parent.iterdir())))
     mosaic = forward_camera.expose(np.full((64, 64), light), sensor, 1.0, random)
     exif = Exif(make="Polcap", model=model, exposure_time=time, f_number=8.0, iso=iso)
-    dng.write(
-        path, mosaic, cfa=np.array([[0, 1], [1, 2]], np.uint8), black=sensor.black, white=sensor.white, exif=exif,
-        color_matrix=np.eye(3), as_shot_neutral=np.ones(3),
-    )  # fmt: skip
+    write_raw(path, mosaic, exif, sensor.black, sensor.white)
 
 
 @pytest.mark.parametrize(

@@ -150,7 +150,7 @@ def _photo(path: Path) -> object:
 
 def _model(path: Path) -> object:
     network = models.load(path, "cpu", 1)
-    answer = network.run(np.zeros((1, len(network.channels), 64, 64), np.float32))
+    answer = models.run(network, np.zeros((1, len(network.channels), 64, 64), np.float32))
     assert all(np.isfinite(value).all() for value in answer.values())
     return answer
 

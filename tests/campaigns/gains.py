@@ -11,15 +11,15 @@ import argparse
 
 import numpy as np
 
-from polcap.config import Gates
 from polcap.errors import ChartError
 from polcap.formats import shipped_data
 from polcap.images import AngleStack, ColorCalibration
 from polcap.pipeline.path import AUTO
 from polcap.quality import light
 from polcap.quality.gate import Evidence
+from polcap.quality.limits import GateLimits
 from polcap.stages import selfcal, whitebalance
-from polcap.stages.selfcal import integrability, object_gains, order
+from polcap.stages.selfcal import angles, integrability, object_gains
 from tests import scenes
 from tests.campaigns import lit_objects
 
@@ -43,7 +43,7 @@ def main() -> None:
         true = 1 + JITTER * np.random.default_rng([seed, 13]).normal(size=len(angle))
         true = true / true[0]
         radiance, object_ = lit_objects.stack(case, angle, seed, true), lit_objects.object_of(case)
-        settings = selfcal.Settings(check_order=False)
+        settings = selfcal.SelfcalSettings(check_order=False)
         try:
             color = measured(radiance) if given.chart else scenes.no_color()
         except ChartError as refusal:
@@ -52,11 +52,12 @@ def main() -> None:
             errors.append(np.nan)  # within no limit, beyond none
             continue
         found = selfcal.solve(radiance, scenes.still(len(angle)), object_, color, settings)
-        gate = light._gain_doubt(Evidence.partial(gains=found), Gates())
-        error = np.abs(found.gain.mean(1) / true - 1)
+        gate = light._gain_doubt(Evidence.partial(selfcal=found), GateLimits())
+        error = np.abs(found.gains.gain.mean(1) / true - 1)
         errors.append(float(error.max()))
+        sigma = float(found.gains.sigma.max())
         states.append(gate.state)
-        rows.append((seed, case.look, f"{100 * errors[-1]:.2f} %", f"{100 * found.sigma.max():.2f} %", gate.state))
+        rows.append((seed, case.look, f"{100 * errors[-1]:.2f} %", f"{100 * sigma:.2f} %", gate.state))
         if given.parts:
             print(seed, case.look, *parts(radiance, object_, angle, true), flush=True)
     print(lit_objects.shown(rows, ("seed", "look", "worst error", "1σ", "gate")))
@@ -70,25 +71,20 @@ def main() -> None:
 
 def measured(radiance: AngleStack) -> ColorCalibration:
     """The chart, as polcap finds it."""
-    settings = whitebalance.Settings()
+    settings = whitebalance.WhitebalanceSettings()
     return whitebalance.measure(radiance, shipped_data.colorchecker(settings.chart), AUTO, settings)
 
 
 def parts(radiance, object_, angle, true) -> list[str]:
     """Error and doubt [%] of each shot's gain by each property alone."""
-    x0, y0, x1, y1 = object_.crop
-    mask = object_.mask[y0:y1, x0:x1]
-    value = radiance.value[:, y0:y1, x0:x1]
-    quality = radiance.quality[:, y0:y1, x0:x1].max(0)
-    light_of = object_gains.smoothed(value)
-    rim = order.rim(light_of, quality == 0, mask, object_.crop, radiance.value.shape[1:3])
+    shots = object_gains.register(radiance, scenes.still(len(angle)), object_)
+    facing = object_gains.facing(shots.light, shots.inside, angle)
     found = {
-        "facing": object_gains.facing(light_of, object_gains.inside(mask, quality), angle),
-        "outline": object_gains.outline(rim.light, rim.azimuth, rim.sector, angle),
-        "closure": object_gains.closure(light_of, object_gains.inside(mask, quality), angle),
+        "facing": facing,
+        "outline": object_gains.outline(angles.rim(shots), angle),
+        "closure": object_gains.closure(shots.light, shots.inside, angle),
+        "slopes": integrability.gains(shots.light, shots.inside, angle, facing.gain),
     }
-    inside = object_gains.inside(mask, quality)
-    found["slopes"] = integrability.gains(light_of, inside, angle, found["facing"].gain)
     return [
         f"{name} "
         + " ".join(f"{100 * (g / t - 1):+.2f}±{100 * s:.2f}" for g, t, s in zip(one.gain[1:], true[1:], one.sigma[1:]))

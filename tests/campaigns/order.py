@@ -24,7 +24,7 @@ from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
 from polcap.stages import selfcal
-from polcap.stages.selfcal import order
+from polcap.stages.selfcal import angles as polarizer_angles
 from polcap.synth import scenes as random_scenes
 from polcap.synth import shooting
 from tests import scenes
@@ -50,7 +50,7 @@ def main() -> None:
         case = from_raw(seed, given.angles) if given.raw else at_stokes_level(seed, angle, given.thin, given.chart)
         for name, radiance, alignment, object_, color in case:
             seen = []
-            for number, stated in enumerate(order.hypotheses(angle).values()):
+            for number, stated in enumerate(polarizer_angles.hypotheses(angle).values()):
                 said = judged(radiance, alignment, object_, color, stated)
                 (wrong if number else right)[said] += 1
                 seen.append(said)
@@ -89,10 +89,10 @@ def judged(
 ) -> str:
     """What becomes of a capture whose shots are said to have been taken at angles (K,) rad."""
     try:
-        found = selfcal.solve(replace(radiance, angle=stated), alignment, object_, color, selfcal.Settings())
+        found = selfcal.solve(replace(radiance, angle=stated), alignment, object_, color, selfcal.SelfcalSettings())
     except CaptureError:
         return "refused"
-    return "doubted" if found.rival else "passes"
+    return "doubted" if found.outline.rival else "passes"
 
 
 if __name__ == "__main__":

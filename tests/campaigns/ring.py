@@ -21,7 +21,7 @@ import numpy as np
 from polcap.config import Config
 from polcap.errors import InputError
 from polcap.formats.capture import reader as captures
-from polcap.images import Gains
+from polcap.images import RingZero
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
@@ -84,9 +84,9 @@ def at_stokes_level(case: lit_objects.Lit, seed: int, number: int, turn: float, 
         scenes.still(len(_ANGLE)),
         lit_objects.object_of(case),
         scenes.no_color(),
-        selfcal.Settings(check_order=False),
+        selfcal.SelfcalSettings(check_order=False),
     )
-    return told(found, KINDS[seed // 2 % 3])
+    return told(found.ring, KINDS[seed // 2 % 3])
 
 
 def from_raw(seed: int, turn: float) -> dict[str, Any]:
@@ -104,7 +104,7 @@ def from_raw(seed: int, turn: float) -> dict[str, Any]:
         supplied = UserInput(mask_network=models.load_mask_network(1))
         try:
             results = path(replace(capture, shots=shots), supplied, Config(), MemoryCache(until="selfcal"))
-            return told(results.gains, kind)
+            return told(results.selfcal.ring, kind)
         except InputError as error:
             return {"kind": kind, "refused": str(error)}
 
@@ -114,9 +114,9 @@ def _apart(a: float, b: float) -> float:
     return abs((a - b + math.pi / 2) % math.pi - math.pi / 2)
 
 
-def told(found: Gains, kind: str) -> dict[str, Any]:
+def told(found: RingZero, kind: str) -> dict[str, Any]:
     """A row: what was found of the ring, and what was done about it, degrees."""
-    turn, sigma, applied = np.degrees([found.angle_offset, found.angle_offset_sigma, found.angle_correction])
+    turn, sigma, applied = np.degrees([found.offset, found.sigma, found.correction])
     return {"kind": kind, "turn": float(turn), "sigma": float(sigma), "applied": float(applied)}
 
 

@@ -63,13 +63,13 @@ def one(seed: int, shots: int) -> dict[str, Any]:
     gain = 1 + _GAIN_ERROR * np.random.default_rng([seed, 20]).normal(size=shots)
     names = np.radians(np.arange(shots))
     radiance = replace(lit_objects.stack(case, true, seed, gain, names), equipment=Equipment("one exposure"))
-    settings = selfcal.Settings(unknown_angles=True)
+    settings = selfcal.SelfcalSettings(unknown_angles=True)
     try:
         found = selfcal.solve(radiance, scenes.still(shots), lit_objects.object_of(case), scenes.no_color(), settings)
     except CaptureError as error:
         return {"refused": str(error)[:60]}
-    assert found.found_angle is not None
-    apart = (found.found_angle + found.angle_correction - true + np.pi / 2) % np.pi - np.pi / 2
+    assert found.found_sigma is not None
+    apart = (found.angle - true + np.pi / 2) % np.pi - np.pi / 2
     return {"error": float(np.degrees(np.abs(apart)).max()), "sigma": float(np.degrees(found.found_sigma))}
 
 

@@ -16,7 +16,7 @@ from polcap.formats.raw import dng, frame_decoder, probe
 from polcap.formats.raw import libraw as raw
 from polcap.images import ChartRequest
 from polcap.pipeline import check
-from polcap.pipeline.check import Networks, Verdict
+from polcap.pipeline.check import Verdict
 from polcap.pipeline.path import AUTO
 from polcap.pipeline.small_capture import reduce
 from polcap.stages import hdr, whitebalance
@@ -27,11 +27,7 @@ WIDTH = 512  # the chart must be found: without its greys order and angles are t
 
 
 def verdict(folder: Path) -> Verdict:
-    return check.inspect(captures.read(folder), without_networks, Config())
-
-
-def without_networks() -> Networks:
-    return None, None
+    return check.inspect(captures.read(folder), (None, None), Config())
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -54,7 +50,7 @@ def test_one_turned_shot_of_three_is_told_with_the_ring_that_it_looks_like(tmp_p
     faulty.shoot(tmp_path / "bad", 1, "wrong angle", WIDTH)
     line = next(line for line in verdict(tmp_path / "bad").lines if line.name == "angles")
     assert line.state == "warn" and line.cost_deg > 1
-    assert "ring's zero" in line.says and "single shot" in line.says and "take it again" in line.remedy
+    assert "ring's zero" in line.message and "single shot" in line.message and "take it again" in line.remedy
 
 
 def test_process_measures_the_blur_that_check_measures(tmp_path: Path) -> None:
@@ -75,7 +71,7 @@ def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path) -> N
     with pytest.raises(ChartError):
         merged = hdr.merge(capture, frame_decoder.decode, Config().hdr)
         whitebalance.measure(merged, shipped_data.colorchecker(), AUTO, Config().whitebalance)
-    asked = check.inspect(capture, without_networks, Config(), chart=ChartRequest("none"))
+    asked = check.inspect(capture, (None, None), Config(), chart=ChartRequest("none"))
     assert asked.needs == "" and next(line for line in asked.lines if line.name == "chart").state == "not measured"
 
 

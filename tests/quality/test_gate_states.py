@@ -15,7 +15,13 @@ import numpy as np
 import pytest
 
 from polcap.config import Config
-from polcap.images import AngleStack
+from polcap.images import (
+    AngleStack,
+    OutlineCheck,
+    RingZero,
+    ShotOrder,
+    TurnedShot,
+)
 from polcap.quality import gate as gate_module
 from polcap.quality import gates, geometry, light, polarization, rim
 from polcap.quality.gate import Evidence, Gate
@@ -41,7 +47,13 @@ MEASURES = {  # the function that measures each figure
 }  # fmt: skip
 MESH = {"pieces": 1, "cuts": 0.3, "cut_px": 40.0, "raggedness": 0.1}
 FAR = np.array([[[1.0, 0, 50 * k], [0, 1, 0], [0, 0, 1]] for k in range(3)])
-SHOT_ALONE = {"turned_shots": (1,), "turned": 0.3, "turned_sigma": 0.02}
+GAINS = replace(scenes.equal().gains, source="grey patches")
+STATED = ShotOrder((0, 1, 2))
+
+
+def gains(**fields: Any) -> dict[str, Any]:
+    """Self-calibration with these fields of its gains."""
+    return {"selfcal": {"gains": replace(GAINS, **fields)}}
 
 
 def in_numpy(value: Any) -> Any:
@@ -111,28 +123,29 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("sharpness", "not measured",
      {"blur_px": np.array([[0.0, 0.1]] * 3), "alignment": {"transform": FAR}}),
     ("gains", "pass", {}),
-    ("gains", "fail", {"gains": {"gain": np.array([[1.0] * 3, [1.0] * 3, [0.7] * 3])}}),
+    ("gains", "fail", gains(gain=np.array([[1.0] * 3, [1.0] * 3, [0.7] * 3]))),
     ("energy", "pass", {}),
     ("energy", "fail", {"bracket": {"exposure_ratio": np.array([[[1.0], [4.0]], [[1.0], [4.0]], [[1.0], [6.0]]])}}),
     ("gain doubt", "pass", {}),
-    ("gain doubt", "pass", {"gains": {"source": "one exposure"}}),
-    ("gain doubt", "fail", {"gains": {"disagreement": 0.05}}),
-    ("gain doubt", "warn", {"gains": {"chart_gloss": 0.05}}),
-    ("gain doubt", "warn", {"gains": {"source": "object", "sigma": np.full((3, 3), 0.02)}}),
-    ("gain doubt", "fail", {"gains": {"source": "none", "sigma": np.full((3, 3), 0.2)}}),
-    ("gain doubt", "not measured", {"gains": {"source": "none", "sigma": np.full((3, 3), NAN)}}),
+    ("gain doubt", "pass", gains(source="one exposure")),
+    ("gain doubt", "fail", gains(disagreement=0.05)),
+    ("gain doubt", "fail", gains(sigma=np.full((3, 3), 0.31))),
+    ("gain doubt", "warn", gains(chart_gloss=0.05)),
+    ("gain doubt", "warn", gains(source="object", sigma=np.full((3, 3), 0.02))),
+    ("gain doubt", "fail", gains(source="none", sigma=np.full((3, 3), 0.2))),
+    ("gain doubt", "not measured", gains(source="none", sigma=np.full((3, 3), NAN))),
     ("order", "pass", {}),
-    ("order", "warn", {"gains": {"rival": (0, 2, 1)}}),
-    ("order", "fail", {"gains": {"order": (2, 1, 0)}}),
+    ("order", "warn", {"selfcal": {"outline": OutlineCheck(STATED, 0.9, ShotOrder((0, 2, 1)))}}),
+    ("order", "fail", {"selfcal": {"outline": OutlineCheck(ShotOrder((2, 1, 0)), 0.9)}}),
     ("angles", "pass", {}),
     ("angles", "not measured", {"figures": {"outline": None}}),
     ("angles", "fail", {"figures": outline(turned=0.3)}),
-    ("angles", "fail", {"gains": SHOT_ALONE}),
+    ("angles", "fail", {"selfcal": {"turned": TurnedShot((1,), 0.3, 0.02)}}),
     ("angles", "fail", {"figures": outline({"shot": 1, "angle": 0.3, "misfit": 0.2, "sigmas": 9.0})}),
     ("angles", "fail", {"figures": outline({"shot": 1, "angle": -np.pi / 4, "misfit": 0.2, "sigmas": 9.0})}),
-    ("angles", "warn", {"gains": {"found_angle": scenes.ANGLES, "found_sigma": 0.02}}),
-    ("angles", "warn", {"gains": {"angle_offset": 0.2, "angle_offset_sigma": 0.01}}),
-    ("angles", "pass", {"gains": {"angle_offset": 0.03, "angle_offset_sigma": 0.01, "angle_correction": 0.03}}),
+    ("angles", "warn", {"selfcal": {"found_sigma": 0.02}}),
+    ("angles", "warn", {"selfcal": {"ring": RingZero(0.2, 0.01)}}),
+    ("angles", "pass", {"selfcal": {"ring": RingZero(0.03, 0.01, 0.03)}}),
     ("polarized", "fail", {"figures": outline(dolp=0.004)}),
     ("body", "pass", {}),
     ("body", "fail", {"figures": outline(along=-0.9)}),
@@ -188,7 +201,7 @@ def good() -> dict[str, Any]:
         "clipped": clipped(), "blur_px": np.full((3, 2), np.nan),
         "radiance": with_field(scenes.stack(), "bracket", exposures(1.0, 4.0)),
         "color": scenes.no_color(), "alignment": scenes.still(), "object_": replace(scenes.ball_object(), doubt=0.01),
-        "gains": replace(scenes.equal(), source="grey patches", concentration=0.95),
+        "selfcal": replace(scenes.equal(), gains=GAINS, outline=OutlineCheck(STATED, 0.95)),
         "stokes": SimpleNamespace(body=True), "maps": None, "mesh": SimpleNamespace(**MESH),
         "figures": FIGURES | outline(),
     }  # fmt: skip
@@ -211,8 +224,11 @@ def judge(good: dict[str, Any], config: Config, fields: dict[str, Any]) -> list[
             parts["radiance"] = with_field(parts["radiance"], name, change)
         else:
             parts[name] = replace(good[name], **change) if isinstance(change, dict) else change
-    for name in ("color", "gains", "object_", "radiance"):
+    for name in ("color", "object_", "radiance"):
         parts[name] = fields_in_numpy(parts[name])
+    selfcal = fields_in_numpy(parts["selfcal"])
+    inner = {name: fields_in_numpy(getattr(selfcal, name)) for name in ("gains", "outline", "ring", "turned")}
+    parts["selfcal"] = replace(selfcal, **inner)
     for name in ("focal_doubt", "grid_px"):
         parts[name] = in_numpy(parts[name])
     parts["mesh"] = SimpleNamespace(**in_numpy(vars(parts["mesh"])))
@@ -220,7 +236,7 @@ def judge(good: dict[str, Any], config: Config, fields: dict[str, Any]) -> list[
     with pytest.MonkeyPatch.context() as patch:
         for figure, (module, function) in MEASURES.items():
             patch.setattr(module, function, partial(stated, in_numpy(figures[figure])))
-        return list(gates.judge(Evidence.partial(**parts), config))
+        return list(gates.judge(Evidence.partial(**parts), config.gates, config.align))
 
 
 def stated(figure: Any, *_: Any) -> Any:

@@ -12,7 +12,6 @@ import msgspec
 import numpy as np
 
 from polcap.errors import HardwareError
-from polcap.formats.raw import dng
 from polcap.formats.raw.file_bytes import digest
 from polcap.images import Exif, Role
 from polcap.rig.call_timeout import call_within
@@ -20,6 +19,7 @@ from polcap.rig.camera import CameraFile
 from polcap.rig.exposure_bracket import Exposure
 from polcap.rig.shooting_plan import CaptureOrder
 from polcap.synth.shooting import MIDDLE_S, Shoot, Studio, Take, random_scene
+from tests.raw_files import write_raw
 
 ANGLES = (0.0, 45.0, 90.0)
 BRACKET = tuple(Exposure(time_s=time, f_number=11.0, iso=100.0) for time in (0.005, 0.02, 0.08))
@@ -49,21 +49,10 @@ def photographs(width: int = 192, height: int = 144, scene_seed: int = 1) -> dic
 
 def tiny(path: Path, **exif: object) -> bytes:
     """A RAW of noise, 32×24 px, for tests of bytes and tags."""
-    facts = {"make": "Tiny", "model": "One", "lens": "L", "exposure_time": 0.02, "f_number": 11.0, "iso": 100.0}
+    tags = {"make": "Tiny", "model": "One", "lens": "L", "exposure_time": 0.02, "f_number": 11.0, "iso": 100.0}
     random = np.random.default_rng([*repr(exif).encode()])
     mosaic = random.integers(600, 9000, (24, 32)).astype(np.uint16)
-    dng.write(
-        path,
-        mosaic,
-        cfa=np.array([[0, 1], [1, 2]], np.uint8),
-        black=512,
-        white=15871,
-        exif=Exif(**{**facts, **exif}),  # type: ignore[arg-type]
-        color_matrix=np.eye(3),
-        as_shot_neutral=np.ones(3),
-        compression="none",
-    )
-    return path.read_bytes()
+    return write_raw(path, mosaic, Exif(**{**tags, **exif}))  # type: ignore[arg-type]
 
 
 class PoolCamera:

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from polcap.errors import DecodeError
-from polcap.formats.raw import dng
 from polcap.formats.raw import libraw as raw
 from polcap.images import Exif
 from polcap.rig import retake_criteria
 from polcap.rig.camera import CameraFile
 from polcap.rig.exposure_bracket import Exposure
-from polcap.rig.retake_criteria import FrameFacts, RetakeLimits
+from polcap.rig.retake_criteria import FrameFacts
+from tests.raw_files import write_raw
 from tests.rig.pool import ANGLES, Key, tiny
 
 SET = Exposure(time_s=0.02, f_number=11.0, iso=100.0)
@@ -27,7 +27,7 @@ def facts(digest: str = "a", clipped: float = 0.0, **exif: object) -> FrameFacts
 
 
 def judged(frame: FrameFacts, *others: FrameFacts, flash: bool = True, shortest: bool = False) -> str | None:
-    return retake_criteria.retake_reason(frame, SET, flash, shortest, others, RetakeLimits())
+    return retake_criteria.retake_reason(frame, SET, flash, shortest, list(others), sharpest=0.5)
 
 
 def test_a_frame_as_asked_passes() -> None:
@@ -65,28 +65,14 @@ def test_a_flash_that_fires_in_an_ambient_frame_is_refused() -> None:
 
 def test_sharpness_is_equal_at_every_angle_and_falls_with_blur(pool: dict[Key, bytes], tmp_path: Path) -> None:
     file = tmp_path / "x.dng"
-    limits = RetakeLimits()
     for step in (1, 2):
         sharp = []
         for angle in ANGLES:
             file.write_bytes(pool["shot", angle, step])
             sharp.append(retake_criteria.inspect(file)[0].sharpness)
-        assert not retake_criteria.is_blurred(min(sharp), max(sharp), limits)
+        assert not retake_criteria.is_blurred(min(sharp), max(sharp))
         blur(file, tmp_path / "y.dng", 2.0)
-        assert retake_criteria.is_blurred(retake_criteria.inspect(tmp_path / "y.dng")[0].sharpness, max(sharp), limits)
-
-
-def _write(path: Path, mosaic: np.ndarray) -> None:
-    dng.write(
-        path,
-        mosaic,
-        cfa=np.array([[0, 1], [1, 2]], np.uint8),
-        black=512,
-        white=15871,
-        exif=Exif(make="Polcap", model="Synthetic", exposure_time=0.02),
-        color_matrix=np.eye(3),
-        as_shot_neutral=np.ones(3),
-    )
+        assert retake_criteria.is_blurred(retake_criteria.inspect(tmp_path / "y.dng")[0].sharpness, max(sharp))
 
 
 def blur(source: Path, target: Path, sigma_px: float) -> None:
@@ -95,13 +81,13 @@ def blur(source: Path, target: Path, sigma_px: float) -> None:
     for row, column in ((0, 0), (0, 1), (1, 0), (1, 1)):
         part = value[row::2, column::2]
         value[row::2, column::2] = cv2.GaussianBlur(np.ascontiguousarray(part), (0, 0), sigma_px / 2)
-    _write(target, np.rint(value).astype(np.uint16))
+    write_raw(target, np.rint(value).astype(np.uint16), Exif(make="Polcap", model="Synthetic", exposure_time=0.02))
 
 
 def test_clipped_share_is_counted(tmp_path: Path) -> None:
     mosaic = np.full((40, 60), 3000, np.uint16)
     mosaic[:10, :30] = 15871
-    _write(tmp_path / "x.dng", mosaic)
+    write_raw(tmp_path / "x.dng", mosaic, Exif(make="Polcap"))
     found, small = retake_criteria.inspect(tmp_path / "x.dng")
     assert found.clipped == pytest.approx(300 / 2400)
     assert small.shape == (20, 30) and small[15, 20] == pytest.approx((3000 - 512) / (15871 - 512), rel=1e-4)

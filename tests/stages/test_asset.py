@@ -9,7 +9,7 @@ from scipy import ndimage
 from polcap.images import Asset, Floats, SurfaceMaps
 from polcap.optics import color
 from polcap.stages import asset, surface
-from polcap.stages.asset.coverage import interpolated
+from polcap.stages.asset.texture_rasterizer import rasterize_frames
 from tests import surfaces
 
 
@@ -26,11 +26,11 @@ def rendered_normals(of: Asset, maps: SurfaceMaps, within: float = 0.01) -> tupl
 
 
 @pytest.mark.parametrize("flat", [False, True])
-@pytest.mark.parametrize("thinned", [False, True])
-def test_renderer_sees_the_maps_normals_whatever_the_mesh(flat: bool, thinned: bool) -> None:
+@pytest.mark.parametrize("coarse", [False, True])
+def test_renderer_sees_the_maps_normals_on_any_mesh(flat: bool, coarse: bool) -> None:
     maps = surfaces.maps(ripple=0.2)
     mesh = surfaces.flat_mesh(maps) if flat else surfaces.mesh(surfaces.maps())
-    if thinned:
+    if coarse:
         mesh = surfaces.mesh(surfaces.maps(), surface.SurfaceSettings(max_vertices=2000))
     built = surfaces.built(maps, mesh)
     seen, (row, column) = rendered_normals(built, maps)
@@ -46,7 +46,7 @@ def test_shape_is_not_counted_twice() -> None:
     built = surfaces.built(maps, surfaces.mesh(maps))
     inner = maps.mask & (maps.normal[..., 2] > 0.5)
     tilt = np.hypot(*(built.normal[inner][:, :2] / 127.5 - 1).T)
-    assert np.degrees(np.median(tilt)) < 1.5  # the mesh carries the ball, the texture only what is left
+    assert np.degrees(np.median(tilt)) < 1.5  # the mesh carries the ball, the texture only the difference
 
 
 def test_diffuse_and_specular_come_back_through_gltf_formulas() -> None:
@@ -78,11 +78,11 @@ def test_textures_reach_past_the_mask() -> None:
 
 def test_black_specular_is_allowed() -> None:
     maps = surfaces.maps(specular=0.0)
-    assert asset.build(maps, surfaces.mesh(maps), asset.Settings()).specular_factor == (0.0, 0.0, 0.0)
+    assert asset.build(maps, surfaces.mesh(maps), asset.AssetSettings()).specular_factor == (0.0, 0.0, 0.0)
 
 
-def test_backdrop_does_not_run_along_the_limb() -> None:
-    """Pixels of the outline that are half backdrop take the colour beside them."""
+def test_backdrop_does_not_show_along_the_outline() -> None:
+    """Pixels of the outline that are half backdrop take the color of their neighbors."""
     maps = surfaces.maps()
     rim = maps.mask & ~ndimage.binary_erosion(maps.mask, np.ones((3, 3), bool))
     mixed = replace(maps, diffuse=np.where(rim[..., None], 0.1 * maps.diffuse, maps.diffuse).astype(np.float32))
@@ -90,7 +90,7 @@ def test_backdrop_does_not_run_along_the_limb() -> None:
     assert np.array_equal(surfaces.built(mixed, mesh).base_color, surfaces.built(maps, mesh).base_color)
 
 
-def test_walls_and_back_leave_the_normal_texture_alone() -> None:
+def test_walls_and_back_do_not_change_the_normal_texture() -> None:
     maps = surfaces.maps(ripple=0.2)
     seen, closed = (surfaces.mesh(maps, surface.SurfaceSettings(back=back)) for back in ("open", "closed"))
     assert np.array_equal(surfaces.built(maps, closed).normal, surfaces.built(maps, seen).normal)
@@ -100,27 +100,27 @@ def test_walls_and_back_leave_the_normal_texture_alone() -> None:
 def test_textures_take_the_size_asked_for(size: int, shape: tuple[int, int]) -> None:
     maps = surfaces.maps()
     built = surfaces.built(maps, surfaces.mesh(maps))
-    other = asset.resized(built, size)
+    other = asset.resize_textures(built, size)
     assert other.base_color.shape == other.normal.shape == (*shape, 3)
     length = np.linalg.norm(other.normal / 127.5 - 1, axis=-1)
     assert np.abs(length - 1).max() < 0.02
     assert other.base_color.mean((0, 1)) == pytest.approx(built.base_color.mean((0, 1)), abs=1)
 
 
-def test_the_shorter_side_of_a_sliver_keeps_a_pixel() -> None:
+def test_the_shorter_side_of_a_sliver_has_a_pixel() -> None:
     maps = surfaces.maps()
     built = surfaces.built(maps, surfaces.mesh(maps))
     textures = ("base_color", "occlusion_roughness_metallic", "normal", "specular_color")
     sliver = replace(built, **{name: getattr(built, name)[:1] for name in textures})
-    assert asset.resized(sliver, 16).normal.shape == (1, 16, 3)
+    assert asset.resize_textures(sliver, 16).normal.shape == (1, 16, 3)
 
 
-def test_coverage_interpolates_as_a_renderer_does() -> None:
-    """Against the barycentric formula, corner by corner, on triangles that lie anyhow."""
+def test_frames_are_interpolated_as_by_a_renderer() -> None:
+    """Against the barycentric formula, corner by corner, on triangles of any shape."""
     rng = np.random.default_rng(3)
     mesh = surfaces.mesh(surfaces.maps(), surface.SurfaceSettings(max_vertices=2000))
     value = np.concatenate([mesh.normals, mesh.tangents], axis=-1)
-    there, covered = interpolated(mesh, surfaces.HEIGHT, surfaces.WIDTH)
+    there, covered = rasterize_frames(mesh, surfaces.HEIGHT, surfaces.WIDTH)
     place = mesh.uv * [surfaces.WIDTH, surfaces.HEIGHT] - 0.5
     number = np.cumsum(covered).reshape(covered.shape) - 1
     found = 0
@@ -139,7 +139,7 @@ def test_coverage_interpolates_as_a_renderer_does() -> None:
 def test_pixels_without_a_value_take_that_of_a_nearest_one() -> None:
     known = np.random.default_rng(1).random((40, 60)) < 0.05
     value = np.moveaxis(np.indices(known.shape), 0, -1).astype(np.float32)
-    out = asset.filled(value, known)
+    out = asset.fill_outward(value, known)
     assert np.array_equal(out[known], value[known])
     away = np.linalg.norm(out - value, axis=-1)
     assert np.all(away <= 1.05 * ndimage.distance_transform_edt(~known) + 1e-3)

@@ -17,7 +17,7 @@ from tests import scenes
 def ball():
     """Cues of a plain ball, as the pipeline makes them."""
     radiance = scenes.stack(textured=False)
-    solved = stokes.solve(radiance, scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
+    solved = stokes.solve(radiance, scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
     return cues.compute(solved, scenes.no_color())
 
 
@@ -58,7 +58,7 @@ def test_diffuse_color_is_the_fitted_least_intensity(ball):
 
 def test_albedo_of_a_ball_is_within_what_the_chart_s_depth_leaves_open():
     """Inverse squares over the visible half, seen and lit along the axis; the chart anywhere beside the ball."""
-    solved = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
+    solved = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
     color = dataclasses.replace(scenes.no_color(), source="chart")
     doubt = cues.scale.doubt(solved, color)
     assert cues.scale.doubt(solved, scenes.no_color()) is None
@@ -114,7 +114,7 @@ def test_the_network_sees_what_the_names_of_its_channels_say(ball):
 
 @pytest.mark.parametrize("source", ["camera", "none"])
 def test_without_a_chart_the_object_alone_sets_the_scale(source: Literal["camera", "none"]) -> None:
-    solved = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
+    solved = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
     light = np.where(solved.mask[..., None], solved.stokes, 7 * solved.stokes.max()).astype(np.float32)
     found = cues.compute(
         dataclasses.replace(solved, stokes=light), dataclasses.replace(scenes.no_color(), source=source)
@@ -138,7 +138,7 @@ def test_the_chart_stands_beside_the_middle_of_what_bulges_forward(size: float):
 
     size: radius over distance; inverse-square law, both solids as deep as half their width.
     """
-    found = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
+    found = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
     focal = float(np.sqrt(found.mask.sum() / np.pi)) / size
     stokes_ = dataclasses.replace(found, view=dataclasses.replace(found.view, focal=focal))
     free, charted = (
@@ -153,7 +153,7 @@ def test_the_chart_stands_beside_the_middle_of_what_bulges_forward(size: float):
 @pytest.mark.parametrize(("turn", "aside"), [(0.0, 0.0), (0.4, 0.0), (0.0, 0.15)])
 def test_a_chart_that_is_turned_or_stands_aside_gets_less_light_than_the_object(turn: float, aside: float):
     """n·l / d² of a chart under a flash at the lens: cos of its turn, or cos³ of the angle to the axis."""
-    found = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
+    found = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
     white, normal = np.array([aside, 0.0, -1.0]), np.array([np.sin(turn), 0.0, np.cos(turn)])
     light = ChartLight(white, normal, np.zeros(3), np.zeros((5, 5)))
     facing = cues.scale.factor(found, dataclasses.replace(scenes.no_color(), source="chart"))
@@ -163,7 +163,7 @@ def test_a_chart_that_is_turned_or_stands_aside_gets_less_light_than_the_object(
 
 def test_the_scale_follows_a_flash_at_the_chart_s_side_and_its_doubt_widens_the_scale_s():
     """The object stands on the axis: a flash nearer to the chart lights that more, by its distances squared."""
-    found = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
+    found = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
     row, column = (axis.mean() for axis in np.nonzero(found.mask))
     found = dataclasses.replace(found, view=dataclasses.replace(found.view, center=(column, row)))
     white, flash = np.array([0.2, 0.0, -1.0]), np.array([0.1, 0.0, 0.0])

@@ -8,6 +8,7 @@ import pytest
 
 from polcap.config import Config
 from polcap.errors import InputError
+from polcap.formats import onnx
 from polcap.images import AngleStack, Equipment, Quality, View, single_frames
 from polcap.quality import gates
 from polcap.quality.gate import Evidence
@@ -76,26 +77,26 @@ def run(radiance: AngleStack, drawn: np.ndarray | None) -> None:
     config, color = Config(), scenes.no_color()
     try:
         alignment = align.register(radiance, color, config.align)
-        object_ = mask.segment(radiance, alignment, color, drawn, None, config.mask)
-        gains = selfcal.solve(radiance, alignment, object_, color, config.selfcal)
-        image = stokes.solve(radiance, alignment, gains, object_, config.stokes)
+        object_ = mask.segment(radiance, alignment, color, drawn, None, onnx.run, config.mask)
+        calibration = selfcal.solve(radiance, alignment, object_, color, config.selfcal)
+        image = stokes.solve(radiance, alignment, calibration, object_, config.stokes)
         seen = cues.compute(image, color)
-        maps = infer.estimate(seen, None, config.infer)
+        maps = infer.estimate(seen, None, onnx.run, config.infer)
         mesh = surface.integrate(maps, None, config.surface)
         built = asset.build(maps, mesh, config.asset)
     except InputError as error:
         assert "\n" not in str(error)
         return
-    for array in (gains.gain, image.stokes, maps.normal, maps.diffuse, maps.confidence, mesh.vertices):
+    for array in (calibration.gains.gain, image.stokes, maps.normal, maps.diffuse, maps.confidence, mesh.vertices):
         assert np.isfinite(array).all()
     found: dict[str, Any] = {
         "names": [str(k) for k in range(len(radiance.angle))], "focal_doubt": (0.0, 0.0), "grid_px": 1.0,
         "chart_missing": "", "clipped": (radiance.quality & 1 > 0)[:, None], "blur_px": radiance.bracket.blur_px,
-        "radiance": radiance, "color": color, "alignment": alignment, "object_": object_, "gains": gains,
+        "radiance": radiance, "color": color, "alignment": alignment, "object_": object_, "selfcal": calibration,
         "stokes": image, "maps": maps, "mesh": mesh,
     }  # fmt: skip
-    told = list(gates.judge(Evidence.partial(**found), config))
-    assert all(gate.says and gate.state in ("pass", "warn", "fail", "not measured") for gate in told)
+    told = list(gates.judge(Evidence.partial(**found), config.gates, config.align))
+    assert all(gate.message and gate.state in ("pass", "warn", "fail", "not measured") for gate in told)
     assert built.base_color.dtype == np.uint8
 
 

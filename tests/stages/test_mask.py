@@ -6,26 +6,26 @@ import numpy as np
 import pytest
 
 from polcap.errors import ModelError, ObjectError
-from polcap.images import Network
 from polcap.stages import mask
-from polcap.stages.mask import mask_channels, solid, standing_out
-from polcap.stages.mask import network as two_looks
+from polcap.stages.mask import graph_cut, mask_channels, regions
+from polcap.stages.mask import network as mask_network
 from tests import scenes
+from tests.fake_network import FakeNetwork, run
 
 CHANNEL = mask_channels.CHANNELS.index
 
 
 def bright_is_object(inputs):
-    """Stands for a trained network: what is brighter than 1/32 of the bright parts, and is no chart."""
+    """In place of a trained network: the object is brighter than 1/32 of the bright parts, and is no chart."""
     return {"logit": np.where(inputs[:, CHANNEL("chart")] > 0, -9, 40 * (inputs[:, CHANNEL("log")]))[:, None]}
 
 
-def network(run=bright_is_object):
-    return Network(run, "of the test", mask_channels.CHANNELS, {"native_size": "160"}, "none")
+def network(answer=bright_is_object):
+    return FakeNetwork("of the test", mask_channels.CHANNELS, {"native_size": "160"}, answer=answer)
 
 
 def segment(radiance, color, user=None, model=None):
-    return mask.segment(radiance, scenes.still(), color, user, model, mask.Settings())
+    return mask.segment(radiance, scenes.still(), color, user, model, run, mask.MaskSettings())
 
 
 def chart_color():
@@ -41,18 +41,18 @@ def test_the_ball_is_found_and_the_chart_is_not_the_object(model):
     assert overlap > 0.97
     assert not found.mask[:, 230:].any()
     assert found.crop[0] < 36 and found.crop[2] > 204
-    assert (found.chance is None) == (model is None)
+    assert (found.doubt is None) == (model is None)
 
 
-def test_the_later_looks_are_at_what_was_found_and_are_told_so():
+def test_close_ups_show_the_found_part_with_its_estimate():
     seen = []
 
-    def run(inputs):
+    def answer(inputs):
         seen.append(inputs)
         return bright_is_object(inputs)
 
-    segment(scenes.stack(), chart_color(), model=network(run))
-    first, second, third = seen[::4]  # each look in four positions
+    segment(scenes.stack(), chart_color(), model=network(answer))
+    first, second, third = seen[::4]  # each pass in four positions
     assert third.shape == second.shape
     assert first.shape[2:] == (128, 160)  # 120 rows, up to a multiple of 16
     assert not first[0, CHANNEL("looked")].any() and (second[0, CHANNEL("looked")] == 1).all()
@@ -62,59 +62,60 @@ def test_the_later_looks_are_at_what_was_found_and_are_told_so():
     assert x.min() > -0.98 and x.max() < 0.6  # the ball's part of the picture
 
 
-def test_what_a_network_sees_from_one_side_only_counts_for_nothing():
+def test_answers_that_depend_on_the_side_cancel():
     """A network that goes by left and right, up and down and the sense of the polarization, and one that goes by S1."""
 
     def one_sided(inputs):
         return {"logit": 5 * sum(inputs[:, CHANNEL(name)] for name in ("x", "y", "s2"))[:, None]}
 
     channels = np.random.default_rng(0).uniform(-1, 1, (len(mask_channels.CHANNELS), 20, 35)).astype(np.float32)
-    np.testing.assert_allclose(two_looks._run(network(one_sided), channels), 0.5, atol=1e-5)
-    fair = two_looks._run(network(lambda inputs: {"logit": inputs[:, CHANNEL("s1")][:, None]}), channels)
+    np.testing.assert_allclose(mask_network._run(network(one_sided), run, channels), 0.5, atol=1e-5)
+    by_s1 = network(lambda inputs: {"logit": inputs[:, CHANNEL("s1")][:, None]})
+    fair = mask_network._run(by_s1, run, channels)
     np.testing.assert_allclose(fair, 1 / (1 + np.exp(-channels[CHANNEL("s1")])), rtol=1e-5)
 
 
-def test_channels_know_no_exposure():
-    """Radiance, and what the chart makes of it, in any unit gives the same channels."""
+def test_channels_do_not_depend_on_exposure():
+    """Radiance and reflectance in any unit give the same channels."""
     chart = np.zeros((scenes.HEIGHT, scenes.WIDTH), np.uint8)
     box = (0, 0, scenes.WIDTH, scenes.HEIGHT)
     made = []
     for scale in (0.5, 0.05):
         radiance = scenes.stack(scale=scale)
-        look = two_looks.look(radiance, scenes.still(), scenes.no_color(0.5), chart, box, 160)
-        made.append(mask_channels.encode(look, mask_channels.brightness(look.color)))
+        picture = mask_network.reduced_picture(radiance, scenes.still(), scenes.no_color(0.5), chart, box, 160)
+        made.append(mask_channels.encode(picture, mask_channels.brightness(picture.color)))
     np.testing.assert_allclose(made[0], made[1], atol=2e-5)
 
 
 def test_channels_hold_the_polarization_of_the_aligned_shots():
-    """S1 and S2 of a ball seen by shots that lie three pixels apart, where they are strong."""
+    """S1 and S2 of a ball in shots that are shifted by up to three pixels."""
     moved = np.tile(np.eye(3), (3, 1, 1))
     moved[1, 0, 2], moved[2, 1, 2] = 3.0, -2.0
     radiance = scenes.stack(list(moved), textured=False)
     alignment = dataclasses.replace(scenes.still(), transform=moved)
     chart = np.zeros((scenes.HEIGHT, scenes.WIDTH), np.uint8)
     box = (40, 30, 200, 210)
-    look = two_looks.look(radiance, alignment, scenes.no_color(), chart, box, 1000)
+    picture = mask_network.reduced_picture(radiance, alignment, scenes.no_color(), chart, box, 1000)
     y, x = np.mgrid[30:210, 40:200].astype(float)
     true, inside = scenes.stokes(x, y, textured=False)
-    solid_ = inside & (np.hypot(x - scenes.CENTER[0], y - scenes.CENTER[1]) < 78)
-    solid_[:, :5], solid_[:, -5:], solid_[:5], solid_[-5:] = False, False, False, False  # the box ends there
+    inner = inside & (np.hypot(x - scenes.CENTER[0], y - scenes.CENTER[1]) < 78)
+    inner[:, :5], inner[:, -5:], inner[:5], inner[-5:] = False, False, False, False  # the box ends there
     for k in (1, 2):
-        error = look.stokes[k] / look.stokes[0] - true[k].sum(-1) / true[0].sum(-1)
-        assert np.abs(error[solid_]).max() < 0.01
+        error = picture.stokes[k] / picture.stokes[0] - true[k].sum(-1) / true[0].sum(-1)
+        assert np.abs(error[inner]).max() < 0.01
 
 
 def test_doubtful_holes_are_filled_openings_stay_and_specks_go():
     chance = np.full((100, 100), 0.01, np.float32)
     chance[20:80, 20:80] = 0.99
     chance[30:40, 30:40] = 0.3  # a hollow in shadow
-    chance[50:60, 50:60] = 0.02  # one looks through a handle
+    chance[50:60, 50:60] = 0.02  # the opening of a handle
     chance[5:7, 5:7] = 0.9
-    found = solid.body(chance)
+    found = regions.likely_regions(chance)
     assert found[30:40, 30:40].all() and not found[50:60, 50:60].any() and not found[5:7, 5:7].any()
 
 
-def test_colours_decide_what_the_chances_leave_open():
+def test_colors_decide_where_probabilities_are_open():
     """A ring seen by a network that is sure of its left half alone, and of the picture's rim."""
     y, x = np.mgrid[:120, :160].astype(float)
     away = np.hypot(x - 80, y - 60)
@@ -123,7 +124,7 @@ def test_colours_decide_what_the_chances_leave_open():
     picture = np.where(true[..., None], [0.5, 0.2, 0.1], [0.1, 0.2, 0.3]) * rng.normal(1, 0.02, (120, 160, 1))
     chance = np.where(away < 55, 0.6, 0.001)
     chance[true & (x < 70)] = 0.999
-    found = standing_out.sharpened(
+    found = graph_cut.sharpen(
         picture.astype(np.float32), chance > 0.5, np.zeros(true.shape, np.uint8), chance.astype(np.float32)
     )
     assert (found & true).sum() / (found | true).sum() > 0.97
@@ -138,18 +139,18 @@ def test_colors_are_not_followed_against_the_network():
     near, far = learned.copy(), learned.copy()
     near[19, 20:80] = True
     far[:, 10:90] = True
-    assert solid.preferred(near, learned, chance) is near
-    assert solid.preferred(far, learned, chance) is learned
+    assert regions.choose(near, learned, chance) is near
+    assert regions.choose(far, learned, chance) is learned
 
 
-def test_a_cleaned_mask_keeps_its_openings():
+def test_cleaning_keeps_openings():
     drawn = np.zeros((100, 100), bool)
     drawn[20:80, 20:80] = True
-    drawn[30:40, 30:40] = False  # one looks through
+    drawn[30:40, 30:40] = False  # an opening
     drawn[50, 50] = False
     drawn[5, 5] = True
     drawn[80:100, 85:95] = True  # colors alone took it for the object
-    found = solid.cleaned(drawn, np.where(np.arange(100) < 82, 0.6, 0.1) * np.ones((100, 1)))
+    found = regions.clean(drawn, np.where(np.arange(100) < 82, 0.6, 0.1) * np.ones((100, 1)))
     assert found.sum() == 3600 - 100 and not found[30:40, 30:40].any() and found[50, 50]
 
 
@@ -157,7 +158,7 @@ def test_a_drawn_mask_is_taken_as_drawn():
     drawn = np.zeros((scenes.HEIGHT, scenes.WIDTH), bool)
     drawn[50:100, 60:130] = True
     found = segment(scenes.stack(), chart_color(), drawn, network())
-    assert np.array_equal(found.mask, drawn) and found.source == "user" and found.chance is None
+    assert np.array_equal(found.mask, drawn) and found.source == "user" and found.doubt is None
 
 
 def test_a_mask_of_another_size_is_refused():
@@ -180,24 +181,25 @@ def test_shape_counts_islands_holes_and_the_picture_edge():
     drawn[0:20, 0:20] = True
     drawn[5:10, 5:10] = False  # 25 of 375
     drawn[30:35, 40:45] = True  # 25 of 400
-    islands, holes, border = solid.shape(drawn)
+    islands, holes, border = regions.measure_shape(drawn)
     assert islands == pytest.approx(25 / 400) and holes == pytest.approx(25 / 400)
     assert border == pytest.approx(39 / (2 * 60 + 2 * 38))
 
 
-def test_doubt_is_one_minus_the_overlap_to_be_expected():
-    """Of masks drawn pixel by pixel with the chances."""
+def test_expected_error_is_one_minus_the_mean_overlap():
+    """Over true masks drawn pixel by pixel with the probabilities."""
     rng = np.random.default_rng(0)
     chance = rng.beta(0.3, 0.3, (200, 200))
     found = chance > 0.5
     overlaps = [((t := rng.random(chance.shape) < chance) & found).sum() / (t | found).sum() for _ in range(20)]
-    assert 1 - solid.doubt(found, chance) == pytest.approx(np.mean(overlaps), abs=0.005)
+    assert 1 - regions.expected_error(found, chance) == pytest.approx(np.mean(overlaps), abs=0.005)
 
 
-def test_looks_side_by_side_give_the_bytes_of_one_after_another():
+def test_parallel_passes_give_the_bytes_of_sequential_ones():
     stack, color = scenes.stack(noise=0.004), chart_color()
+    no_chart = np.zeros(stack.value.shape[1:3], np.uint8)
     found = [
-        two_looks.chances(stack, scenes.still(), color, np.zeros(stack.value.shape[1:3], np.uint8), model)
+        mask_network.object_probability(stack, scenes.still(), color, no_chart, model, run)
         for model in (network(), dataclasses.replace(network(), at_once=3))
     ]
     assert found[0].tobytes() == found[1].tobytes()

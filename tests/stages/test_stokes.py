@@ -11,10 +11,10 @@ from polcap.images import (
     ColorSensor,
     CrossedShot,
     Equipment,
-    Gains,
     MaskedImage,
     ObjectMask,
     Quality,
+    SelfCalibration,
     SensorImage,
     single_frames,
 )
@@ -43,9 +43,10 @@ def scenes_stack(shots: int) -> AngleStack:
     return AngleStack(blank, blank, none, np.zeros(shots), scenes.VIEW, single_frames(shots))
 
 
-def solve(radiance: AngleStack, gains: Gains | None = None):
+def solve(radiance: AngleStack, calibration: SelfCalibration | None = None):
     shots = len(radiance.angle)
-    return stokes.solve(radiance, scenes.still(shots), gains or scenes.equal(shots), WHOLE, stokes.Settings())
+    calibration = calibration or scenes.equal(radiance.angle)
+    return stokes.solve(radiance, scenes.still(shots), calibration, WHOLE, stokes.StokesSettings())
 
 
 def test_light_that_leaks_through_a_poor_polarizer_is_made_up_for():
@@ -79,7 +80,7 @@ def test_colors_of_a_mosaic_are_laid_over_one_another(pattern):
     overturned = np.array([[-1, 0, 39], [0, -1, 39], [0, 0, 1.0]])  # the camera stood upside down, its mosaic too
     for transform, picture in ((np.eye(3), shot), (overturned, shot[::-1, ::-1])):
         alignment = dataclasses.replace(scenes.still(3), transform=np.tile(transform, (3, 1, 1)))
-        found = stokes.solve(radiance, alignment, scenes.equal(3), object_, stokes.Settings())
+        found = stokes.solve(radiance, alignment, scenes.equal(), object_, stokes.StokesSettings())
         assert np.ptp(found.stokes[0], axis=-1).max() < 1e-4
         assert found.stokes[0, ..., 1] == pytest.approx(picture[10:30, 10:30, 1], abs=1e-4)
 
@@ -116,8 +117,7 @@ def test_gains_divide_each_shot():
     gain = np.array([[1.0] * 3, [1.1] * 3, [0.9] * 3])
     radiance = seen((0, 45, 90), 0.3, 25)
     brighter = dataclasses.replace(radiance, value=radiance.value * gain[:, None, None].astype(np.float32))
-    gains = dataclasses.replace(scenes.equal(), gain=gain)
-    found = solve(brighter, gains)
+    found = solve(brighter, scenes.equal(radiance.angle, gain))
     assert np.allclose(found.stokes, solve(radiance).stokes, atol=1e-6)
     variance = float(radiance.variance[0, 0, 0, 0])  # of every shot, whatever its gain
     assert found.covariance[0] == pytest.approx(variance * (1 + 1 / 0.9**2), rel=1e-5, abs=0)  # S0 = I0 + I90
@@ -126,8 +126,8 @@ def test_gains_divide_each_shot():
 
 def test_the_ring_s_turn_is_added_to_the_stated_angles():
     turned = dataclasses.replace(seen((3, 48, 93), 0.3, 25), angle=np.radians([0, 45, 90]))
-    gains = dataclasses.replace(scenes.equal(), angle_correction=np.radians(3.0))
-    assert solve(turned, gains).stokes == pytest.approx(solve(seen((0, 45, 90), 0.3, 25)).stokes, abs=2e-6)
+    corrected = scenes.equal(turned.angle + np.radians(3.0))
+    assert solve(turned, corrected).stokes == pytest.approx(solve(seen((0, 45, 90), 0.3, 25)).stokes, abs=2e-6)
 
 
 def test_a_fourth_angle_leaves_a_residual_where_a_shot_lies():
@@ -144,8 +144,8 @@ def test_a_crossed_shot_brings_its_light_and_its_doubt_in_the_unit_of_s0():
     shot = MaskedImage(np.full((8, 9, 3), 0.2), np.full((8, 9, 3), 4e-6), np.zeros((8, 9), np.uint8))
     radiance = dataclasses.replace(radiance, crossed=CrossedShot(shot, 0.0))
     alignment = dataclasses.replace(scenes.still(3), crossed=np.eye(3))
-    gains = dataclasses.replace(scenes.equal(), crossed=np.array([2.0, 3.0, 4.0]))
-    body = stokes.solve(radiance, alignment, gains, WHOLE, stokes.Settings()).body
+    calibration = dataclasses.replace(scenes.equal(), crossed=np.array([2.0, 3.0, 4.0]))
+    body = stokes.solve(radiance, alignment, calibration, WHOLE, stokes.StokesSettings()).body
     assert body.value[4, 4] == pytest.approx([0.4, 0.6, 0.8], abs=1e-5)
     assert np.sqrt(body.variance[4, 4]) == pytest.approx([4e-3, 6e-3, 8e-3], rel=1e-5)
 
@@ -178,7 +178,7 @@ def test_a_clipped_pixel_spoils_all_that_are_interpolated_from_it():
     transform[2, 0, 2] = 0.2  # px to the right
     found = stokes.solve(
         dataclasses.replace(radiance, quality=quality),
-        dataclasses.replace(scenes.still(3), transform=transform), scenes.equal(), WHOLE, stokes.Settings(),
+        dataclasses.replace(scenes.still(3), transform=transform), scenes.equal(), WHOLE, stokes.StokesSettings(),
     ).quality  # fmt: skip
     assert (np.flatnonzero(found[3] & Quality.CLIPPED) == [3, 4]).all() and not found[2, 4] & Quality.CLIPPED
 

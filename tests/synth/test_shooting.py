@@ -11,6 +11,7 @@ import rawpy
 
 from polcap.errors import CaptureError, SettingError
 from polcap.formats import shipped_data
+from polcap.optics import projection
 from polcap.synth import color_checker, render, shooting
 from polcap.synth.color_checker import Chart
 from polcap.synth.distance_fields import Cluster
@@ -187,7 +188,7 @@ def test_object_and_chart_are_whole_and_apart_in_every_scene(kind: Any) -> None:
         scene = shooting.random_scene(seed, kind)
         mask = render.gbuffer(scene, shoot.view, shoot.height, shoot.width).mask
         assert scene.chart is not None
-        corners = render.project(shoot.view, color_checker.corners(scene.chart))
+        corners = projection.project(shoot.view, color_checker.corners(scene.chart))
         assert 0.03 < mask.mean() < 0.3
         assert not mask[[0, -1]].any() and not mask[:, [0, -1]].any()
         assert corners.min() > 2 and (corners < [shoot.width - 3, shoot.height - 3]).all()

@@ -45,7 +45,7 @@ def test_onnxruntime_agrees_with_torch_at_any_size(tmp_path: Path) -> None:
         x[:, CHANNELS.index("mask")] = (x[:, CHANNELS.index("mask")] > 0).float()
         with torch.no_grad():
             expected = network(x)
-        got = loaded.run(x.numpy())
+        got = onnx.run(loaded, x.numpy())
         assert tuple(got) == model.OUTPUTS
         for name, value in ((name, expected[name]) for name in model.OUTPUTS):
             np.testing.assert_allclose(got[name], value.numpy(), atol=1e-3)

@@ -78,4 +78,4 @@ def test_it_learns_and_ships(tmp_path: Path, picture: NDArray[np.float16]) -> No
     shown = fine_train.taught(file)[:COUNT].astype(np.float32)[None]
     with torch.no_grad(), run.averaged() as averaged:
         own = averaged(torch.from_numpy(shown)).numpy()
-    assert np.abs(network.run(shown)["relief"] - own).max() < 2e-3  # weights in halves
+    assert np.abs(onnx.run(network, shown)["relief"] - own).max() < 2e-3  # weights in halves

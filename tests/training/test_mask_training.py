@@ -83,7 +83,7 @@ def test_the_network_learns_and_ships(tmp_path: Path, picture: mask_scenes.Pictu
     assert losses[-1] < 0.9 * losses[0]
     run.save(tmp_path / "last.pt")
     network = onnx.load(mask_train.ship(tmp_path / "last.pt", tmp_path / "mask.onnx"), threads=1, encoding=ENCODING)
-    logit = network.run(np.zeros((1, len(CHANNELS), 48, 80), np.float32))["logit"]
+    logit = onnx.run(network, np.zeros((1, len(CHANNELS), 48, 80), np.float32))["logit"]
     assert logit.shape == (1, 1, 48, 80) and network.channels == CHANNELS
 
 

@@ -1,7 +1,7 @@
-"""Stage 7: turn Stokes parameters into what the estimators see.
+"""Stage 7: from Stokes parameters to the estimators' inputs: radiance, DoLP, AoLP, network channels.
 
-Training calls `compute` and `channels` too, so nothing here may know NumPy from torch: the array
-namespace comes from the arguments, no cv2, no torch. Pixel axes are (..., H, W).
+Training calls `channels` and the functions below it too, so these are written to the array API: the namespace comes
+from the arguments, no cv2, no torch. Pixel axes are (..., H, W).
 """
 
 from typing import Any
@@ -17,22 +17,21 @@ CHANNELS = (
     "log_r", "log_g", "log_b",  # ln(S0 + 0.02)
     "s1", "s2",  # 10 S1/S0, 10 S2/S0
     "zenith_x", "zenith_y",  # θ(DoLP, n = 1.5) (cos 2φ, sin 2φ) [rad]
-    "cos_2phi", "sin_2phi",  # normalised Stokes map
-    "noise",  # zenith that the noise alone would fake [rad]
+    "cos_2phi", "sin_2phi",  # normalized Stokes map
+    "noise",  # zenith that noise alone would show [rad]
     "mask", "clipped", "ray_x", "ray_y",
 )  # fmt: skip
 
-FLOOR = 0.02  # added to a radiance before its logarithm, in the channels and wherever they are undone
+FLOOR = 0.02  # added to a radiance before its logarithm, in the channels and in their inverse
 
 
 @stage(version=3, keep=False)
 def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
-    """All cues of a crop.
+    """All cues of a crop (H, W).
 
-    The colour matrix acts on S0 only; DoLP and AoLP are taken in camera channels, summed over them
-    before any ratio. The chart stands beside the object's middle, so that the visible surface, nearer to
-    the flash, gets more light than the chart (`scale`). A capture without a chart has no absolute scale: its 99th
-    percentile is set to 0.8.
+    The color matrix acts on S0 only; DoLP and AoLP are taken in camera channels, summed before any ratio. The chart
+    is level with the object's middle, so the visible surface, nearer to the flash, gets more light (`scale`). A
+    capture without a chart has no absolute scale: its 99th percentile is set to 0.8.
     """
     import numpy as np
 
@@ -67,7 +66,7 @@ def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
 
 
 def polarization(stokes: Any, covariance: Any) -> tuple[Any, Any, Any, Any]:
-    """S1/S0 and S2/S0 (2, ...), their 1σ (...), debiased DoLP (...), normalised Stokes map (2, ...).
+    """S1/S0 and S2/S0 (2, ...), their 1σ (...), debiased DoLP (...), normalized Stokes map (2, ...).
 
     stokes (3, ..., 3) and covariance (6, ..., 3) in camera channels. The DoLP of noise is not zero:
     E[ρ̂²] = ρ² + 2σ², and √(ρ̂² − σ²) has the least bias where ρ > σ (Wardle & Kronberg, ApJ 1974).
@@ -84,7 +83,7 @@ def polarization(stokes: Any, covariance: Any) -> tuple[Any, Any, Any, Any]:
 
 
 def least_intensity_color(stokes: Any, matrix: Any) -> Any:
-    """The paper's diffuse colour: ½(S0 − √(S1² + S2²)) per channel, in Rec.709, unit length; 0 where dark."""
+    """The paper's diffuse color: ½(S0 − √(S1² + S2²)) per channel, in Rec.709, unit length; 0 where dark."""
     xp = array_namespace(stokes)
     least = (stokes[0] - (stokes[1] ** 2 + stokes[2] ** 2) ** 0.5) / 2
     color = xp.clip(least @ matrix.T, 0.0, None)
@@ -93,7 +92,7 @@ def least_intensity_color(stokes: Any, matrix: Any) -> Any:
 
 
 def zenith(dolp: Any, ior: float = NOMINAL_IOR) -> Any:
-    """Zenith angle that a diffuse DoLP means, rad."""
+    """Zenith angle (...) of a diffuse DoLP (...), rad."""
     xp = array_namespace(dolp)
     return xp.acos(xp.clip(fresnel.cos_zenith_from_dolp(dolp, ior), 0.0, 1.0))
 

@@ -1,7 +1,7 @@
-"""In: an object's pixels and how the chart stands to camera and flash. Out: the scale of the albedo, and its doubt.
+"""The scale of the albedo and its error, by the chart's place and light.
 
-The chart says what light gave what radiance, where it stands and as it is turned. The object stands elsewhere: nearer
-to the flash, for what the camera sees of it comes forward of its middle, and at another angle to the optical axis.
+The chart gives the ratio of reflectance to radiance at its own place and turn. The object is at another place: its
+visible surface is nearer to the flash than its middle, and at another angle to the optical axis.
 """
 
 from dataclasses import replace
@@ -11,18 +11,19 @@ import numpy as np
 
 from polcap.images import ChartLight, ColorCalibration, Floats, StokesImage
 from polcap.optics import point_light
+from polcap.optics.projection import back_project
 
-_BULGE = 0.5  # how far the visible surface comes forward on average, in radii: a cone's 1/3 to a ball's 2/3
+_BULGE = 0.5  # mean distance of the visible surface before the middle, in radii: a cone's 1/3 to a ball's 2/3
 _BULGE_SPREAD = 0.4  # 1σ of it over 204 views of training meshes and random shapes (decision 8)
-_CHART_SPREAD = 3**-0.5  # radii: 1σ of the depth of a chart that stands anywhere between the object's front and back
-_LARGEST_RADIUS = 0.5  # of an object, in its distances; nearer, the law of the far field ends
+_CHART_SPREAD = 3**-0.5  # radii: 1σ of the depth of a chart anywhere between the object's front and back
+_LARGEST_RADIUS = 0.5  # of an object, over its distance; beyond, the law of the far field ends
 _STEP = 1e-4
 
 
 def factor(stokes: StokesImage, color: ColorCalibration) -> float:
-    """By what the radiance is multiplied: 1 is a white plane on the axis, as far as the object, that faces the flash.
+    """Factor on the radiance after which 1 is a white plane on the axis, at the object's distance, facing the flash.
 
-    Light falls off over the object, with distance and to the sides, as in the pictures that the network learned from.
+    Light falls off over the object, with distance and to the sides, as in the pictures of the network's training.
     """
     ahead = 1 - _BULGE * _radius(stokes)
     if color.light is None:
@@ -31,10 +32,10 @@ def factor(stokes: StokesImage, color: ColorCalibration) -> float:
 
 
 def doubt(stokes: StokesImage, color: ColorCalibration) -> float | None:
-    """Share by which all albedos may be off together, 1σ; None where no chart in the picture gives their scale.
+    """Relative 1σ of the scale of all albedos; None where no chart in the picture gives it.
 
-    The light falls with the square of the distance: a chart beside the object's front makes albedo too dark, one
-    behind it too bright. Where the flash stands is known as far as the light's slope across the chart tells.
+    The light falls with the square of the distance: a chart level with the object's front makes albedo too dark, one
+    behind it too bright. The flash's place is known by the light's slope across the chart.
     """
     if color.source not in ("chart", "corners"):
         return None
@@ -50,7 +51,7 @@ def doubt(stokes: StokesImage, color: ColorCalibration) -> float | None:
 
 
 def _log_factor(light: ChartLight, middle: Floats) -> float:
-    """ln of what the chart got, over what the object got more than a flash at the lens alone would give it."""
+    """ln of the chart's irradiance over the object's, the latter relative to a flash at the lens."""
     flash, power = light.flash[:2], float(light.flash[2])
     chart = point_light.irradiance(light.white, flash, power, light.normal)
     object_ = point_light.irradiance(middle, flash, power)
@@ -59,7 +60,7 @@ def _log_factor(light: ChartLight, middle: Floats) -> float:
 
 
 def _changed(light: ChartLight, step: Floats) -> ChartLight:
-    """With the flash and its falloff moved by step (5,), and the chart turned about x and y."""
+    """The light with flash and falloff moved by a step (5,), and the chart turned about x and y."""
     from scipy.spatial.transform import Rotation  # here: importing it costs .2 s of every start
 
     turned = Rotation.from_rotvec([*step[3:], 0.0]).apply(np.array(light.normal))  # SciPy takes no read-only array
@@ -67,12 +68,11 @@ def _changed(light: ChartLight, step: Floats) -> ChartLight:
 
 
 def _middle(stokes: StokesImage, distance: float) -> Floats:
-    """Where the middle of the object's pixels stands (3,), camera frame, `distance` along the axis."""
+    """The middle of the object's pixels (3,), camera frame, at a distance along the axis."""
     row, column = (axis.mean() for axis in np.nonzero(stokes.mask)) if stokes.mask.any() else (0.0, 0.0)
-    x, y = stokes.view.center
-    return distance * np.array([(column - x) / stokes.view.focal, (y - row) / stokes.view.focal, -1.0])
+    return distance * back_project(stokes.view, np.array(column), np.array(row))
 
 
 def _radius(stokes: StokesImage) -> float:
-    """Radius of a disc of as many pixels as the object, in its distances."""
+    """Radius of a disc of as many pixels as the object, over its distance."""
     return min(sqrt(stokes.mask.sum() / pi) / stokes.view.focal, _LARGEST_RADIUS)

@@ -2,14 +2,11 @@
 
 For one angle, with the frames' exposures e relative to the reference frame (e = 1 there):
 
-1. every frame is binned, compared with the reference frame and *measured*: motion, exposure ratio per
-   channel, noise of its ISO, pixels that disagree (ghosts);
-2. a first estimate X₀ = Σ Y/a / Σ e/a (a = noise slope; the Poisson maximum-likelihood merge, unbiased
-   because no weight depends on a noisy pixel) is smoothed where it is flat;
-3. X = Σ w (Y/e) / Σ w with w = e² / (a e X₀ + b) from that smoothed estimate, clipped pixels left out.
-
-Frames are decoded ahead, in processes of their own; work goes on in blocks of rows that fit a core's cache.
-`planes` decodes, `links` measures a shot, `combine` weights and sums.
+1. every frame is binned and compared with the reference frame: motion, exposure ratio per channel, noise of its ISO,
+   pixels that disagree (`bracket`, with `exposure`, `noise` and `ghosts`);
+2. a first estimate X₀ = Σ Y/a / Σ e/a (a = noise slope; the Poisson maximum-likelihood merge, unbiased because no
+   weight depends on a noisy pixel) is smoothed where it is flat (`ghosts.FirstEstimate`);
+3. X = Σ w (Y/e) / Σ w with w = e² / (a e X₀ + b) from that smoothed estimate, clipped pixels left out (`weights`).
 
 References
 ----------
@@ -17,6 +14,7 @@ Hanji, Zhong, Mantiuk, Noise-aware merging of high dynamic range image stacks wi
 ECCV Workshops 2020. Granados et al., Optimal HDR reconstruction with linear digital cameras, CVPR 2010.
 """
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import msgspec
@@ -43,10 +41,9 @@ from polcap.images import (
 )
 from polcap.optics import sharpness
 from polcap.stages import stage
-from polcap.stages.hdr import budget, combine, falloff, links, noise
-from polcap.stages.hdr.ambient import same_size
-from polcap.stages.hdr.combine import Merged
-from polcap.stages.hdr.planes import Reader
+from polcap.stages.hdr import exposure, noise, planes, weights
+from polcap.stages.hdr.bracket import Bracket, Link, compare
+from polcap.stages.hdr.planes import Reader, same_size
 
 _LEAST_PX = 48  # of a merged picture's side: tiles of noise, and registration at a quarter of the size
 
@@ -76,14 +73,13 @@ def merge(capture: Capture, decode: Decode, settings: Settings) -> AngleStack:
     darkest frame and flagged CLIPPED where even that one clips; pixels whose frames disagree are taken
     from the reference frame alone (from the darkest where that clips) and flagged GHOST. Exposure ratios
     come from the pixels; the metadata's serve only where pixels cannot tell and no flash fired. Ambient
-    frames are subtracted in proportion to the exposure their settings promise; they are not registered.
+    frames are subtracted in proportion to the exposure by their settings; they are not registered.
 
-    Raises CaptureError for unequal brackets, frames of unlike size, unknown ratios and too much motion.
+    Raises CaptureError for unequal brackets, frames of different size, unknown ratios and too much motion.
     """
-    shots = capture.shots
-    _check(shots)
-    brackets = (*shots, *(() if capture.crossed is None else (capture.crossed,)))
-    read = Reader((frame for shot in brackets for frame in (*shot.frames, *shot.ambient)), decode)
+    _check_counts(capture.shots)
+    shots = (*capture.shots, *(() if capture.crossed is None else (capture.crossed,)))
+    read = Reader((frame for shot in shots for frame in (*shot.frames, *shot.ambient)), decode, settings.clip)
     try:
         return _merge(capture, read, settings)
     finally:
@@ -91,61 +87,31 @@ def merge(capture: Capture, decode: Decode, settings: Settings) -> AngleStack:
 
 
 def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
-    shots = capture.shots
-    read.budget = _budget(shots, read(shots[0].frames[0]), settings)
-    order = _by_brightness(shots[0], read)
-    reference = order[(len(order) - 1) // 2]
-    image = read(shots[0].frames[reference])
-    camera = image.camera_matrix, image.white_balance
-    mosaic, full, side = image.cfa is not None, settings.demosaic == "full", image.superpixel
-    site = image.site_px if mosaic and not full and capture.layout != "sensor" else None
-    height, width = image.value.shape[:2]
-    if full and side == 3:
-        raise CaptureError(
-            f"{shots[0].frames[reference].path}: hdr.demosaic=full interpolates Bayer mosaics only, this is X-Trans; "
-            "leave it at superpixel"
-        )
-    if min(height, width) < _LEAST_PX * side:
-        raise CaptureError(
-            f"{shots[0].frames[reference].path}: {width}×{height} px are too few to measure noise and movement; "
-            f"polcap needs {_LEAST_PX * side} px a side"
-        )
-    middle = (len(shots[0].frames) - 1) // 2  # by the metadata, as in `check`, which reads each frame once
-    corners = sharpness.places(read(shots[0].frames[middle]), settings.clip)
+    shots, first = capture.shots, capture.shots[0]
+    read.plan = _memory_plan(capture, read(first.frames[0]), settings)
+    order = _by_brightness(first, read)
+    image = read(first.frames[_middle(order)])
+    _check_grid(first.frames[_middle(order)], image, settings)
+    sensor, view, side = _sensor(capture, image, settings), _view(capture, image, settings), image.superpixel
+    # chosen in the frame of the middle by the metadata, as in `check`, which reads each frame once
+    places = sharpness.places(read(first.frames[(len(first.frames) - 1) // 2]), settings.clip)
     del image  # the reader alone decides how long a frame is held
-    known = capture.calibration
-    lines = noise.Lines(() if known is None else known.noise)
-    stack = _empty(0, 0, 0)
-    ratios, curvatures, ambient_shares, tiles = [], [], [], []
-    shape = 0, 0, 0
+    lines = noise.Lines(() if capture.calibration is None else capture.calibration.noise)
+    shape, stack = (0, 0, 0), _empty(0, (0, 0, 0))
+    links, ambient_shares, tiles = [], [], []
     for k, shot in enumerate(shots):
-        measured = links.measure(shot, order, reference, lines, read, settings.clip, settings.max_motion_px)
-        mixture = combine.prepare(shot, order, reference, measured, lines, read, settings.clip, full and mosaic)
+        weighted = _weigh(shot, order, lines, read, settings)
         if k == 0:
-            shape = mixture.shape
-            stack = _empty(len(shots), shape[1], shape[2])
-        same_size(f"shot {shot.name}", mixture.shape, shape)
-        mixture.into(Merged(stack.value[k], stack.variance[k], stack.quality[k]))
-        ratios.append([link.ratio.astype(np.float64) for link in measured.links])
-        curvatures.append([link.curvature for link in measured.links])
-        ambient_shares.append(measured.ambient_share)
-        tiles.append([sharpness.take(read(frame), corners, settings.clip) for frame in shot.frames])
+            shape, stack = weighted.shape, _empty(len(shots), weighted.shape)
+        same_size(f"shot {shot.name}", weighted.shape, shape)
+        weighted.merge_into(MaskedImage(stack.value[k], stack.variance[k], stack.quality[k]))
+        links.append(weighted.compared.links)
+        ambient_shares.append(weighted.compared.ambient_share)
+        tiles.append([sharpness.take(read(frame), places, settings.clip) for frame in shot.frames])
         read.forget((*shot.frames, *shot.ambient))
-        lines.close()
+        lines.settle()
     crossed = None if capture.crossed is None else _crossed(capture.crossed, shape, lines, read, settings)
-    scale = 1.0 if full else float(side)
-    x, y = capture.principal_px
-    view = View(
-        focal=capture.focal_px / scale,
-        center=((x - (scale - 1) / 2) / scale, (y - (scale - 1) / 2) / scale),
-        scale=scale,
-        known=capture.focal_known,
-    )
-    if known is not None and known.falloff is not None and settings.falloff:
-        for value, variance in zip(stack.value, stack.variance, strict=True):
-            falloff.divide(value, variance, view, capture.size_px, known.falloff)
-        if crossed is not None:
-            falloff.divide(crossed.value, crossed.variance, view, capture.size_px, known.falloff)
+    _divide_by_falloff(capture, view, stack, crossed, settings)
     return AngleStack(
         value=stack.value,
         variance=stack.variance,
@@ -153,18 +119,134 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
         angle=capture.angle,
         view=view,
         bracket=BracketMeasurement(
-            exposure_ratio=np.repeat(np.array(ratios), 3 // shape[0], axis=2),  # a monochrome channel stands in three
-            exif_ratio=np.array([[links.stated(f, shot.frames[reference]) for f in shot.frames] for shot in shots]),
-            curvature=np.array(curvatures),
+            exposure_ratio=_exposure_ratios(links),
+            exif_ratio=np.array(
+                [[exposure.stated(f, shot.frames[_middle(order)]) for f in shot.frames] for shot in shots]
+            ),
+            curvature=np.array([[link.curvature for link in shot] for shot in links]),
             ghost_fraction=np.array([np.mean((quality & Quality.GHOST) > 0) for quality in stack.quality]),
             ambient_share=np.array(ambient_shares),
             blur_px=sharpness.frames_blur(tiles, side),
         ),
-        sensor=ColorSensor(*camera, site, read.lossy),
+        sensor=replace(sensor, lossy=read.lossy),
         equipment=_equipment(capture, view),
         offset_px=_offsets(shots) if capture.layout == "sensor" else None,
         crossed=None if crossed is None else CrossedShot(crossed, capture.crossed_angle),
     )
+
+
+def _check_counts(shots: tuple[Shot, ...]) -> None:
+    """Raises CaptureError where brackets have different numbers of frames."""
+    for shot in shots:
+        if len(shot.frames) != len(shots[0].frames):
+            raise CaptureError(
+                f"shot {shot.name} has {len(shot.frames)} frames, shot {shots[0].name} has "
+                f"{len(shots[0].frames)}: give every angle the same bracket"
+            )
+
+
+def _memory_plan(capture: Capture, image: SensorImage, settings: Settings) -> planes.MemoryPlan:
+    """Memory to hold, by the first frame's size; a binned mosaic's pixels are a quarter of its photosites."""
+    height, width = image.value.shape[:2]
+    pixels = height * width // (4 if image.cfa is not None and settings.demosaic == "superpixel" else 1)
+    return planes.plan_memory(len(capture.shots), len(capture.shots[0].frames), pixels, image.value.nbytes)
+
+
+def _by_brightness(shot: Shot, read: Reader) -> tuple[int, ...]:
+    """Indices of the frames, darkest first, by their pixels."""
+
+    def level(frame: Frame) -> float:
+        image = read(frame)
+        black = float(image.black.mean())
+        value = image.value[: image.value.shape[0] // 2 * 2]
+        rows = value[::8].mean(dtype=np.float64) + value[1::8].mean(dtype=np.float64)  # of both phases
+        return (float(rows) / 2 - black) / (image.white - black)
+
+    if len(shot.frames) == 1:
+        return (0,)
+    return tuple(int(e) for e in np.argsort([level(frame) for frame in shot.frames], kind="stable"))
+
+
+def _middle(order: tuple[int, ...]) -> int:
+    """The frame of middle brightness."""
+    return order[(len(order) - 1) // 2]
+
+
+def _check_grid(frame: Frame, image: SensorImage, settings: Settings) -> None:
+    """Raises CaptureError where the sensor cannot be interpolated as asked, or has too few pixels."""
+    (height, width), side = image.value.shape[:2], image.superpixel
+    if settings.demosaic == "full" and side == 3:
+        raise CaptureError(
+            f"{frame.path}: hdr.demosaic=full interpolates Bayer mosaics only, this is X-Trans; leave it at superpixel"
+        )
+    if min(height, width) < _LEAST_PX * side:
+        raise CaptureError(
+            f"{frame.path}: {width}×{height} px are too few to measure noise and movement; "
+            f"polcap needs {_LEAST_PX * side} px a side"
+        )
+
+
+def _sensor(capture: Capture, image: SensorImage, settings: Settings) -> ColorSensor:
+    """The sensor by its first shot's reference frame."""
+    binned = image.cfa is not None and settings.demosaic == "superpixel" and capture.layout != "sensor"
+    return ColorSensor(image.camera_matrix, image.white_balance, image.site_px if binned else None)
+
+
+def _view(capture: Capture, image: SensorImage, settings: Settings) -> View:
+    """The pinhole camera on the grid of the merge, whose pixel (0, 0) lies in the middle of a superpixel."""
+    scale = 1.0 if settings.demosaic == "full" else float(image.superpixel)
+    x, y = capture.principal_px
+    center = (x - (scale - 1) / 2) / scale, (y - (scale - 1) / 2) / scale
+    return View(capture.focal_px / scale, center, scale, known=capture.focal_known)
+
+
+def _empty(shots: int, shape: tuple[int, int, int]) -> MaskedImage:
+    """Memory for all shots of C, H, W, (K, H, W, 3)."""
+    _, height, width = shape
+    value, variance = (np.empty((shots, height, width, 3), np.float32) for _ in range(2))
+    return MaskedImage(value, variance, np.empty((shots, height, width), np.uint8))
+
+
+def _weigh(
+    shot: Shot, order: tuple[int, ...], lines: noise.Lines, read: Reader, settings: Settings
+) -> weights.WeightedFrames:
+    """The frames of a shot, compared in an order and ready to be summed."""
+    bracket = Bracket(shot, order, _middle(order))
+    compared = compare(bracket, lines, read, settings.max_motion_px)
+    full = settings.demosaic == "full" and read(shot.frames[bracket.reference]).cfa is not None
+    return weights.prepare(bracket, compared, lines, read, full)
+
+
+def _crossed(
+    shot: Shot, shape: tuple[int, int, int], lines: noise.Lines, read: Reader, settings: Settings
+) -> MaskedImage:
+    """The crossed shot merged like the others, on the scale of its own middle frame: its flash has another power."""
+    weighted = _weigh(shot, _by_brightness(shot, read), lines, read, settings)
+    same_size("the cross-polarised shot", weighted.shape, shape)
+    one = _empty(1, shape)
+    picture = MaskedImage(one.value[0], one.variance[0], one.quality[0])
+    weighted.merge_into(picture)
+    read.forget((*shot.frames, *shot.ambient))
+    lines.settle()
+    return picture
+
+
+def _divide_by_falloff(
+    capture: Capture, view: View, stack: MaskedImage, crossed: MaskedImage | None, settings: Settings
+) -> None:
+    """Divide all shots by the lens's light, in place, where it was calibrated."""
+    light = None if capture.calibration is None else capture.calibration.falloff
+    if light is None or not settings.falloff:
+        return
+    shots = [MaskedImage(*shot) for shot in zip(stack.value, stack.variance, stack.quality, strict=True)]
+    for picture in [*shots, *([] if crossed is None else [crossed])]:
+        weights.divide_by_falloff(picture, view, capture.size_px, light)
+
+
+def _exposure_ratios(links: list[list[Link]]) -> Floats:
+    """(K, E, 3) of the frames of all shots; a monochrome channel counts as three."""
+    ratios = np.array([[link.ratio.astype(np.float64) for link in shot] for shot in links])
+    return np.repeat(ratios, 3 // ratios.shape[2], axis=2)
 
 
 def _equipment(capture: Capture, view: View) -> Equipment:
@@ -182,33 +264,8 @@ def _equipment(capture: Capture, view: View) -> Equipment:
     )
 
 
-def _crossed(
-    shot: Shot, shape: tuple[int, int, int], lines: noise.Lines, read: Reader, settings: Settings
-) -> MaskedImage:
-    """The crossed shot merged like the others, on the scale of its own middle frame: its flash has another power."""
-    order = _by_brightness(shot, read)
-    reference = order[(len(order) - 1) // 2]
-    measured = links.measure(shot, order, reference, lines, read, settings.clip, settings.max_motion_px)
-    full = settings.demosaic == "full" and read(shot.frames[reference]).cfa is not None
-    mixture = combine.prepare(shot, order, reference, measured, lines, read, settings.clip, full)
-    same_size("the cross-polarised shot", mixture.shape, shape)
-    room = _empty(1, shape[1], shape[2])
-    mixture.into(Merged(room.value[0], room.variance[0], room.quality[0]))
-    read.forget((*shot.frames, *shot.ambient))
-    lines.close()
-    return MaskedImage(room.value[0], room.variance[0], room.quality[0])
-
-
-def _budget(shots: tuple[Shot, ...], image: SensorImage, settings: Settings) -> budget.Budget:
-    """What may be held, by the first frame's size; a binned mosaic's pixels are a quarter of its photosites."""
-    height, width = image.value.shape[:2]
-    binned = image.cfa is not None and settings.demosaic == "superpixel"
-    pixels = height * width // (4 if binned else 1)
-    return budget.plan(len(shots), len(shots[0].frames), pixels, image.value.nbytes)
-
-
 def _light(capture: Capture) -> Literal["flash", "steady", "one exposure", "unknown"]:
-    """What the metadata say of the light of the shots."""
+    """The light of the shots by the metadata."""
     if capture.layout == "sensor":
         return "one exposure"
     fired = {frame.exif.flash_fired for shot in capture.shots for frame in shot.frames}
@@ -216,35 +273,5 @@ def _light(capture: Capture) -> Literal["flash", "steady", "one exposure", "unkn
 
 
 def _offsets(shots: tuple[Shot, ...]) -> Floats:
-    """Where the planes of one mosaic stand against the first, (K, 2) px."""
+    """Offsets of the planes of one polarizer mosaic against the first, (K, 2) px."""
     return np.asarray([np.subtract(shot.place_px, shots[0].place_px) for shot in shots])
-
-
-def _empty(shots: int, height: int, width: int) -> Merged:
-    """Room for all shots, (K, H, W, 3)."""
-    value, variance = (np.empty((shots, height, width, 3), np.float32) for _ in range(2))
-    return Merged(value, variance, np.empty((shots, height, width), np.uint8))
-
-
-def _check(shots: tuple[Shot, ...]) -> None:
-    for shot in shots:
-        if len(shot.frames) != len(shots[0].frames):
-            raise CaptureError(
-                f"shot {shot.name} has {len(shot.frames)} frames, shot {shots[0].name} has "
-                f"{len(shots[0].frames)}: give every angle the same bracket"
-            )
-
-
-def _by_brightness(shot: Shot, read: Reader) -> list[int]:
-    """Indices of the frames, darkest first, by their pixels."""
-
-    def level(frame: Frame) -> float:
-        image = read(frame)
-        black = float(image.black.mean())
-        value = image.value[: image.value.shape[0] // 2 * 2]
-        rows = value[::8].mean(dtype=np.float64) + value[1::8].mean(dtype=np.float64)  # of both phases
-        return (float(rows) / 2 - black) / (image.white - black)
-
-    if len(shot.frames) == 1:
-        return [0]
-    return [int(e) for e in np.argsort([level(frame) for frame in shot.frames], kind="stable")]

@@ -16,8 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats, NoiseLine
-from polcap.optics.robust import MAD_TO_SIGMA
+from polcap.images import Bits, Floats, NoiseLine
+from polcap.optics import demosaic
+from polcap.optics.robust import fit_noise_line
 from polcap.stages.hdr.planes import Signals
 
 TILE = 16  # px; about 68 independent second differences, so that one tile knows its variance to 17 %
@@ -53,6 +54,20 @@ class Noise:
     def lit(self, level: Floats) -> "Noise":
         """The same sensor where light of a `level` per channel (C,) was subtracted: its noise stays."""
         return Noise(self.slope, self.floor + self.slope * np.maximum(level, 0))
+
+
+def of_pixels(light: Floats, line: Noise, cfa: Bits | None) -> Floats:
+    """Variance of pixels of known expected signal (C, h, w); cfa where they were interpolated from it, not binned."""
+    expected = np.empty_like(light)
+    for c, plane in enumerate(light):
+        line.of(c, plane, expected[c])
+    if cfa is None:
+        return expected
+    expected[1] *= 2  # binned green is the mean of two photosites
+    gain = demosaic.variance_gain(cfa)
+    for i, j in np.ndindex(2, 2):
+        expected[:, i::2, j::2] = np.tensordot(gain[i, j], expected[:, i::2, j::2], axes=1)
+    return expected
 
 
 @dataclass(frozen=True)
@@ -119,10 +134,9 @@ def paired(first: Signals, second: Signals, ratio: Floats) -> tuple[Samples, Sam
 def fit(samples: list[Samples], iso: float | None, least_floor: float) -> Noise:
     """The line through the tiles of all frames of one ISO, channel by channel.
 
-    Tiles are binned by signal; a bin's median (of `flat` samples: its 15 % quantile, corrected to the
-    mean by the χ² law) stands for it, weighted by its relative error. Where too few tiles are usable, or
-    the line is absurd, a typical sensor is assumed: 20 000 e⁻ at ISO 100, 4 e⁻ read noise.
-    least_floor: the variance of rounding to whole counts.
+    Tiles are binned by signal, and each bin counts as its median (of `flat` samples: its 15 % quantile, corrected to
+    the mean by the χ² law). Where too few tiles are usable, or the line is absurd, a typical sensor is assumed.
+    `least_floor`: the variance of rounding to whole counts.
     """
     channels = samples[0].signal.shape[1]
     line = np.array([_line(samples, c, iso, least_floor) for c in range(channels)], np.float32)
@@ -133,17 +147,7 @@ def misfit(first: Signals, second: Signals, ratio: Floats, lines: tuple[Noise, N
     """How two registered frames differ beyond noise: variance per squared gradient, (C,) px².
 
     Registration errors and aliasing show at edges. From the tiles that have edges; 0 where it is not significant.
-
-    Parameters
-    ----------
-    first, second
-        The frames, on one grid.
-    ratio
-        (C,), second = ratio · first.
-    lines
-        Noise of each.
-    gain
-        What resampling made of the second frame's noise variance.
+    second = ratio (C,) · first, of noise `lines`; `gain`: of the second frame's noise variance by resampling.
     """
     r = np.asarray(ratio, np.float32)
     columns: tuple[list[Floats], ...] = ([], [], [])
@@ -187,23 +191,23 @@ def _per_edge(expected: Floats, seen: Floats, edge: Floats) -> float:
 
 
 class Lines:
-    """The lines of a capture by ISO, calibrated ones or learnt from the first shot that shows it."""
+    """The noise lines of a capture by ISO: calibrated, or learnt from the first shot of that ISO."""
 
     def __init__(self, calibrated: Iterable[NoiseLine] = ()) -> None:
         self._samples: dict[object, list[Samples]] = {}
         self._known: dict[object, Noise] = {
             one.iso: Noise(np.array(one.slope, np.float32), np.array(one.floor, np.float32)) for one in calibrated
         }
-        self._closed: set[object] = set(self._known)
+        self._settled: set[object] = set(self._known)
 
     def learn(self, iso: object, samples: Samples) -> None:
-        """Take in what a frame of an ISO shows, unless that ISO is closed."""
-        if iso not in self._closed:
+        """Add the tiles of a frame, unless the line of its ISO is settled."""
+        if iso not in self._settled:
             self._samples.setdefault(iso, []).append(samples)
             self._known.pop(iso, None)
 
     def line(self, iso: object, least_floor: float) -> Noise:
-        """A key that is not a number stands for an unknown ISO."""
+        """Noise at an ISO; a key that is not a number is an unknown ISO."""
         if iso not in self._known:
             number = float(iso) if isinstance(iso, int | float) else None
             self._known[iso] = fit(self._samples[iso], number, least_floor)
@@ -211,11 +215,11 @@ class Lines:
 
     def knows(self, iso: object) -> bool:
         """Whether the line of an ISO is settled."""
-        return iso in self._closed
+        return iso in self._settled
 
-    def close(self) -> None:
-        """Later shots use what is known by now."""
-        self._closed = set(self._known)
+    def settle(self) -> None:
+        """Later shots use the lines known by now."""
+        self._settled = set(self._known)
         self._samples.clear()
 
 
@@ -242,10 +246,12 @@ def _line(samples: list[Samples], channel: int, iso: float | None, least: float)
             x.append(level)
             y.append(quotients * (line[0] * np.maximum(level, 0) + line[1]))
             n.append(np.full(len(signal), float(signal.shape[1])))
-        solved = _solve(np.concatenate(x), np.maximum(np.concatenate(y), least), np.concatenate(n), least)
-        if solved is None:
+        freedom = FREEDOM * np.concatenate(n)
+        signal, seen = np.concatenate(x), np.maximum(np.concatenate(y), least)
+        fit = fit_noise_line(signal, seen, freedom, least=least, least_floor=least, outliers=True)
+        if not 1 / _SANE_ELECTRONS[1] < fit.slope < 1 / _SANE_ELECTRONS[0]:  # also of signals all alike: NaN
             return typical
-        line = solved
+        line = fit.slope, fit.floor
     return line
 
 
@@ -255,28 +261,6 @@ def _alike(signal: Floats, count: int) -> list[NDArray[np.int64]]:
     n, longer = divmod(len(order), count)
     cut = longer * (n + 1)
     return [order[:cut].reshape(longer, n + 1), order[cut:].reshape(count - longer, n)]
-
-
-def _solve(x: Floats, y: Floats, n: Floats, least: float) -> tuple[float, float] | None:
-    """Weighted line y = slope x + floor through bins of n tiles; relative errors, outliers tamed."""
-    slope, floor = float(np.median(y) / max(float(np.median(x)), 1e-6)), least
-    for _ in range(8):
-        model = np.maximum(slope * np.maximum(x, 0) + floor, least)
-        z = (y / model - 1) * np.sqrt(n * FREEDOM / 2)
-        scale = max(1.0, MAD_TO_SIGMA * float(np.median(np.abs(z))))
-        weight = n / model**2 / np.maximum(1, (np.abs(z) / (2.5 * scale)) ** 2)
-        xx, x1, one = weight @ (x * x), weight @ x, weight.sum()
-        determinant = xx * one - x1 * x1
-        if determinant < 1e-10 * (xx + one) ** 2:  # one signal level: no line through it
-            return None
-        xy, y1 = weight @ (x * y), weight @ y
-        slope, floor = (one * xy - x1 * y1) / determinant, (xx * y1 - x1 * xy) / determinant
-        if floor < least:  # never below rounding
-            floor = least
-            slope = np.sum(weight * x * (y - least)) / np.sum(weight * x * x)
-        slope = max(float(slope), 1e-9)
-    within = 1 / _SANE_ELECTRONS[1] < slope < 1 / _SANE_ELECTRONS[0]
-    return (float(slope), float(floor)) if within else None
 
 
 def _low_quantile(variance: Floats) -> Floats:

@@ -1,11 +1,15 @@
-"""In: the frames of a capture. Out: their signals, a plane per channel, block by block; decoded ahead of use."""
+"""Decoded frames as planes of signal, one per channel, in blocks of rows: decoding ahead, binning, resampling.
+
+A limit on memory (`--memory`, `ulimit -d`) decides how much is held: with little room frames are decoded again for
+every pass and planes are computed block by block. The pixels are the same.
+"""
 
 import math
 from collections import OrderedDict, deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Protocol
 
 import cv2
@@ -13,18 +17,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap import parallel
+from polcap.errors import CaptureError, SettingError
 from polcap.images import Decode, Floats, Frame, SensorImage, Shot
 from polcap.optics import sensor
-from polcap.stages.hdr.budget import Budget
+from polcap.optics.projection import coordinates
 
 Bools = NDArray[np.bool_]
 
 _ROWS = 64  # a block of one channel of a 24 MP picture then fits a core's own cache
-_AHEAD = 2  # frames decoded beside the merge, each in a process of its own
+_AHEAD = 2  # frames decoded ahead of the merge, on threads: each waits for a process that decodes
+_PLANES_BYTES = 400_000_000  # of a shot's signals; those of larger shots are computed again for every pass
+_HELD_BYTES = 1_100_000_000  # of decoded frames; more are decoded again when they are needed again
+_WORK_BYTES = 60  # per pixel of the grid: first estimate, registration, masks and blocks
+_FRACTIONS = 32  # of a pixel, to which cv2's Lanczos kernel is tabulated
 
 
 class Signals(Protocol):
-    """Linear signals of one frame, black = 0 and white = 1, and which of its pixels can be believed."""
+    """Linear signals of one frame, black = 0 and white = 1, and its usable pixels."""
 
     @property
     def usable(self) -> Bools:
@@ -43,7 +52,7 @@ class Signals(Protocol):
 
 @dataclass(frozen=True)
 class Planes:
-    """Signals that are there already."""
+    """Signals in memory."""
 
     value: Floats  # (C, H, W) float32
     usable: Bools
@@ -60,7 +69,7 @@ class Planes:
 
 @dataclass(frozen=True)
 class Quads:
-    """Signals of a binned mosaic, made of the counts when asked for: a third of the memory of `Planes`."""
+    """Signals of a binned mosaic, computed from its counts: a third of the memory of `Planes`."""
 
     image: SensorImage
     usable: Bools
@@ -104,18 +113,9 @@ class Quads:
 
 
 def signals(image: SensorImage, clip: float, full: bool = False, planes_bytes: float = math.inf) -> Signals:
-    """Signals of a decoded frame, and which of its pixels can be believed.
+    """Signals of a decoded frame, and its usable pixels: unclipped below `clip` [white level].
 
-    Parameters
-    ----------
-    image
-        The counts.
-    clip
-        As in the stage's settings [white level].
-    full
-        Interpolate a mosaic instead of binning it by superpixels.
-    planes_bytes
-        How large binned planes may be; larger ones are made of the counts when they are asked for.
+    A mosaic is binned by superpixels, or with `full` interpolated; planes above `planes_bytes` stay counts (`Quads`).
     """
     usable = sensor.usable(image, clip, full)
     if image.cfa is None or full:
@@ -135,7 +135,7 @@ def planar(picture: Floats) -> Floats:
 
 
 def blocks(height: int, halo: int = 0, rows: int = _ROWS) -> Iterator[tuple[slice, slice, slice]]:
-    """Rows to read (with a halo, cut at the border), the wanted part of what was read, and where it goes."""
+    """Rows to read (with a halo, cut at the border), the wanted part of them, and its rows in the picture."""
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
         start = max(top - halo, 0)
@@ -144,75 +144,6 @@ def blocks(height: int, halo: int = 0, rows: int = _ROWS) -> Iterator[tuple[slic
             slice(top - start, bottom - start),
             slice(top, bottom),
         )
-
-
-class Reader:
-    """Decoded frames, the last few kept, the next few under way."""
-
-    def __init__(self, coming: Iterable[Frame], decode: Decode) -> None:
-        """`coming`: the frames in the order in which they will be asked for."""
-        self.lossy = False
-        self._decode = decode
-        self._channels = 0  # of the first frame
-        self.budget = Budget()
-        self._coming = deque(coming)
-        self._held: OrderedDict[int, SensorImage] = OrderedDict()
-        self._pool = ThreadPoolExecutor(_AHEAD)
-        self._decoding: dict[int, Future[SensorImage]] = {}
-
-    def __call__(self, frame: Frame) -> SensorImage:
-        """Raises DecodeError."""
-        if id(frame) not in self._held:
-            under_way = self._decoding.pop(id(frame), None) or self._pool.submit(self._decode, frame)
-            image = under_way.result()
-            room = max(1, self.budget.frames // max(image.value.nbytes, 1))
-            while len(self._held) >= room:
-                self._held.popitem(last=False)
-            self._held[id(frame)] = image
-            self._look_ahead(frame, room)
-        self._held.move_to_end(id(frame))
-        image = self._held[id(frame)]
-        self.lossy |= image.lossy
-        return image
-
-    def signals(self, shot: Shot, e: int, clip: float, full: bool = False) -> Signals:
-        """Signals of a frame; as planes where there is room for those of its whole shot.
-
-        Parameters
-        ----------
-        shot
-            The bracket.
-        e
-            Index of the frame in it.
-        clip, full
-            As `signals` has them.
-        """
-        found = signals(self(shot.frames[e]), clip, full, self.budget.planes / len(shot.frames))
-        self._channels = self._channels or found.shape[0]
-        if not isinstance(found, Planes) or found.shape[0] == self._channels:
-            return found
-        even = np.ptp(found.value) == 0  # all clipped: of how many channels it is the others say
-        if even or found.shape[0] == 1:  # a grey picture among coloured ones
-            return Planes(np.repeat(found.value[:1], self._channels, axis=0), found.usable)
-        return found
-
-    def forget(self, frames: Iterable[Frame]) -> None:
-        """These are not needed any more."""
-        for frame in frames:
-            self._held.pop(id(frame), None)
-        self._look_ahead(None, len(self._held) + 2 * _AHEAD)
-
-    def close(self) -> None:
-        """Wait for nothing more."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
-
-    def _look_ahead(self, now: Frame | None, room: int) -> None:
-        """Have the next frames decoded, as long as they and those held have room."""
-        self._coming = deque(frame for frame in self._coming if frame is not now)
-        while self._coming and len(self._decoding) < _AHEAD and len(self._held) + len(self._decoding) < room:
-            following = self._coming.popleft()
-            if id(following) not in self._held:
-                self._decoding[id(following)] = self._pool.submit(self._decode, following)
 
 
 def tile_means(picture: Signals, side: int) -> Floats:
@@ -228,3 +159,152 @@ def tile_means(picture: Signals, side: int) -> Floats:
             whole = part[c, :, : across * side]
             out[top:bottom, :, c] = cv2.resize(whole, (across, bottom - top), interpolation=cv2.INTER_AREA)
     return out
+
+
+def resample(signals: Signals, matrix: Floats) -> tuple[Planes, Floats]:
+    """A frame on the reference frame's grid by Lanczos interpolation, and the gain of its noise variance (H, W).
+
+    matrix: (3, 3) reference px → frame px.
+    """
+    _, h, w = signals.shape
+    inverse = cv2.WARP_INVERSE_MAP
+    value = np.stack(
+        [
+            cv2.warpPerspective(
+                plane, matrix, (w, h), flags=inverse | cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE
+            )
+            for plane in signals.rows(slice(0, h))
+        ]
+    )
+    # no clipped pixel, nor the border, within the main lobes of the kernel
+    inner = cv2.erode(signals.usable.view(np.uint8) * 255, np.ones((5, 5), np.uint8), borderValue=0)
+    seen = cv2.warpPerspective(inner, matrix, (w, h), flags=inverse | cv2.INTER_LINEAR, borderValue=0) == 255
+    gain = np.empty((h, w), np.float32)
+    table = _kernel_gain()
+    x = np.arange(w, dtype=np.float32)
+    for rows, _, _ in blocks(h):
+        y = np.arange(h, dtype=np.float32)[rows, None]
+        px, py = coordinates(matrix, x, y)
+        gain[rows] = table[((px - np.floor(px)) * _FRACTIONS + 0.5).astype(np.int8)]
+        gain[rows] *= table[((py - np.floor(py)) * _FRACTIONS + 0.5).astype(np.int8)]
+    return Planes(value, seen), gain
+
+
+@lru_cache(maxsize=1)
+def _kernel_gain() -> Floats:
+    """Σ of squared weights of cv2's Lanczos kernel at fractions 0, 1/32 … 1 of a pixel, (33,)."""
+    impulse = np.zeros((17, 33), np.float32)
+    impulse[:, 16] = 1
+    x = np.arange(33, dtype=np.float32)[None] + np.arange(33, dtype=np.float32)[:, None] / 32
+    row = cv2.remap(impulse, x, np.full_like(x, 8), cv2.INTER_LANCZOS4)
+    return np.asarray(np.sum(row.astype(np.float64) ** 2, axis=1), np.float32)
+
+
+@dataclass(frozen=True)
+class MemoryPlan:
+    """Memory that the merge may hold, bytes."""
+
+    planes: int = _PLANES_BYTES
+    frames: int = _HELD_BYTES
+
+
+def plan_memory(shots: int, frames: int, pixels: int, frame_bytes: int) -> MemoryPlan:
+    """Memory to hold of shots of so many frames each, decoded frames of `frame_bytes`, merged to so many pixels.
+
+    Raises SettingError where the merge needs more than the limit even without holding anything.
+    """
+    taken, limit = process_memory()
+    if limit is None:
+        return MemoryPlan()
+    sample = np.dtype(np.float32).itemsize
+    stack = pixels * shots * (6 * sample + 1)
+    one_shot = frames * (frame_bytes + pixels) + pixels * _WORK_BYTES
+    left = limit - taken - stack - one_shot
+    if left < 0:
+        raise SettingError(
+            f"--memory {limit / 1e9:.3g}: merging {shots} × {frames} frames of {pixels / 1e6:.3g} million pixels "
+            f"needs {(limit - left) / 1e9:.2f} GB at least; raise it, or leave it out"
+        )
+    planes = 3 * sample * pixels * frames
+    held = min(_PLANES_BYTES, left) if planes <= left else 0
+    return MemoryPlan(held, min(_HELD_BYTES, left - min(planes, held)))
+
+
+def process_memory() -> tuple[int, int | None]:
+    """Bytes of private, writable memory that this process has taken, and its limit; None without one."""
+    try:
+        import resource
+
+        with open("/proc/self/statm", encoding="ascii") as file:
+            taken = int(file.read().split()[5]) * resource.getpagesize()
+    except (ImportError, OSError):  # another system
+        return 0, None
+    limit = resource.getrlimit(resource.RLIMIT_DATA)[0]
+    return taken, None if limit == resource.RLIM_INFINITY else limit
+
+
+class Reader:
+    """Decoded frames: the last few held, the next few being decoded."""
+
+    def __init__(self, coming: Iterable[Frame], decode: Decode, clip: float) -> None:
+        """Frames in the order in which they will be read; counts from `clip` [white level] on are clipped."""
+        self.clip = clip
+        self._decode = decode
+        self.lossy = False
+        self.plan = MemoryPlan()
+        self._channels = 0  # of the first frame
+        self._coming = deque(coming)
+        self._held: OrderedDict[int, SensorImage] = OrderedDict()
+        self._pool = ThreadPoolExecutor(_AHEAD)
+        self._decoding: dict[int, Future[SensorImage]] = {}
+
+    def __call__(self, frame: Frame) -> SensorImage:
+        """Raises DecodeError."""
+        if id(frame) not in self._held:
+            decoding = self._decoding.pop(id(frame), None) or self._pool.submit(self._decode, frame)
+            image = decoding.result()
+            room = max(1, self.plan.frames // max(image.value.nbytes, 1))
+            while len(self._held) >= room:
+                self._held.popitem(last=False)
+            self._held[id(frame)] = image
+            self._look_ahead(frame, room)
+        self._held.move_to_end(id(frame))
+        image = self._held[id(frame)]
+        self.lossy |= image.lossy
+        return image
+
+    def signals(self, shot: Shot, e: int, full: bool = False) -> Signals:
+        """Signals of frame e of a bracket, with the channels of the first frame read."""
+        found = signals(self(shot.frames[e]), self.clip, full, self.plan.planes / len(shot.frames))
+        self._channels = self._channels or found.shape[0]
+        if not isinstance(found, Planes) or found.shape[0] == self._channels:
+            return found
+        even = np.ptp(found.value) == 0  # all clipped: the other frames show how many channels it has
+        if even or found.shape[0] == 1:  # a grey picture among coloured ones
+            return Planes(np.repeat(found.value[:1], self._channels, axis=0), found.usable)
+        return found
+
+    def forget(self, frames: Iterable[Frame]) -> None:
+        """Drop frames that are not needed any more."""
+        for frame in frames:
+            self._held.pop(id(frame), None)
+        self._look_ahead(None, len(self._held) + 2 * _AHEAD)
+
+    def close(self) -> None:
+        """Stop decoding ahead."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def _look_ahead(self, now: Frame | None, room: int) -> None:
+        """Begin to decode the next frames, as long as they and those held have room."""
+        self._coming = deque(frame for frame in self._coming if frame is not now)
+        while self._coming and len(self._decoding) < _AHEAD and len(self._held) + len(self._decoding) < room:
+            following = self._coming.popleft()
+            if id(following) not in self._held:
+                self._decoding[id(following)] = self._pool.submit(self._decode, following)
+
+
+def same_size(name: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> None:
+    """Raises CaptureError where two frames (C, H, W) do not fit together."""
+    if shape != expected:
+        a, b = (f"{s[2]}×{s[1]}×{s[0]}" for s in (shape, expected))
+        raise CaptureError(f"{name} is {a}, the frames before it {b} [px, px, channels]: use one camera")

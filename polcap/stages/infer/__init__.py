@@ -17,12 +17,12 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from polcap.images import Cues, Network, SurfaceMaps
+from polcap.images import Cues, Network, RunNetwork, SurfaceMaps
 from polcap.stages import stage
 from polcap.stages.infer import analytic, body_light, learned
 
 
-class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The section `infer` of a settings file."""
 
     ior: Annotated[float, Meta(ge=1.2, le=2.5, description="refractive index assumed by the analytic estimator")] = 1.5
@@ -36,7 +36,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @stage(version=15)
-def estimate(cues: Cues, network: Network | None, settings: Settings) -> SurfaceMaps:
+def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: InferSettings) -> SurfaceMaps:
     """Normal, diffuse, specular, roughness and expected error; network None means analytic.
 
     Raises
@@ -47,5 +47,5 @@ def estimate(cues: Cues, network: Network | None, settings: Settings) -> Surface
     if network is None:
         maps = analytic.estimate(cues, settings.ior)
     else:
-        maps = learned.estimate(cues, network, settings.ior, settings.symmetries, fine_pass=settings.fine)
+        maps = learned.estimate(cues, network, run, settings.ior, settings.symmetries, fine_pass=settings.fine)
     return body_light.albedo(maps, cues, settings.ior)

@@ -9,7 +9,7 @@ import numpy as np
 
 from polcap import parallel
 from polcap.errors import ModelError
-from polcap.images import Cues, Floats, Network
+from polcap.images import Cues, Floats, Network, RunNetwork
 from polcap.optics import frames
 from polcap.stages.cues import CHANNELS, channels
 
@@ -22,23 +22,26 @@ _LEAST_ERROR = 0.5  # degrees
 _NEAREST = 0.05  # between unit vectors, about 3°: what is nearer weighs no more
 
 
-def combined(cues: Cues, network: Network, symmetries: int) -> dict[str, Floats]:
+def combined(cues: Cues, network: Network, run: RunNetwork, symmetries: int) -> dict[str, Floats]:
     """The network's maps (H, W[, 3]) of the whole object seen from several positions; normals in the camera frame.
 
     Normals are the median of the positions' directions, weighed by their stated errors: where they part it is often
     by half a turn, and the mean of both is neither. All other maps are means.
     """
     picture = np.moveaxis(channels(cues), 0, -1)
-    looks = [partial(_answer, picture, cues.rays, network, *position) for position in _POSITIONS[:symmetries]]
+    looks = [partial(_answer, picture, cues.rays, network, run, *position) for position in _POSITIONS[:symmetries]]
     answers = parallel.results(looks, network.at_once)
     maps = {name: np.asarray(np.mean([maps[name] for maps in answers], axis=0), np.float32) for name in _OUTPUTS}
     normals, errors = (np.stack([maps[name] for maps in answers]) for name in ("normal", "sigma"))
     return maps | {"normal": _median(normals, errors)}
 
 
-def _answer(picture: Floats, rays: Floats, network: Network, quarters: int, mirror: bool) -> dict[str, Floats]:
+def _answer(
+    picture: Floats, rays: Floats, network: Network, run: RunNetwork, quarters: int, mirror: bool
+) -> dict[str, Floats]:
     """The network's maps of channels (H, W, N) that it sees turned, turned back."""
-    maps = _run(np.moveaxis(_turn_channels(_turn(picture, quarters, mirror), quarters, mirror), -1, 0), network)
+    turned = _turn_channels(_turn(picture, quarters, mirror), quarters, mirror)
+    maps = _run(np.moveaxis(turned, -1, 0), network, run)
     own = np.array(_turn(rays, quarters, mirror))
     own[..., :2] = _turn_vectors(own[..., :2], quarters, mirror)
     maps["normal"] = np.array(frames.from_ray_frame(maps["normal"], own))
@@ -99,12 +102,12 @@ def _turn_channels(picture: Floats, quarters: int, mirror: bool) -> Floats:
     return out
 
 
-def _run(picture: Floats, network: Network) -> dict[str, Floats]:
+def _run(picture: Floats, network: Network, run: RunNetwork) -> dict[str, Floats]:
     """All maps (H, W[, 3]) of channels (N, H, W)."""
     _, height, width = picture.shape
     multiple = int(network.metadata["size_multiple"])
     pad = ((0, 0), (0, -height % multiple), (0, -width % multiple))
-    output = network.run(np.pad(picture, pad)[None].astype(np.float32))
+    output = run(network, np.pad(picture, pad)[None].astype(np.float32))
     found = {name: value.shape[1] for name, value in output.items()}
     if any(found.get(name) != count for name, count in _OUTPUTS.items()):
         raise ModelError(

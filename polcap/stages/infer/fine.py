@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from polcap import parallel
 from polcap.errors import ModelError
-from polcap.images import Cues, Floats, Network
+from polcap.images import Cues, Floats, Network, RunNetwork
 from polcap.optics import frames
 from polcap.optics.resize import area_mean
 from polcap.stages import cues as seen
@@ -56,7 +56,7 @@ def encode(cues: Cues, guess: Guess) -> Floats:
     return np.concatenate([seen.channels(cues), np.stack(guessed) * cues.mask]).astype(np.float32)
 
 
-def refined(cues: Cues, guess: Guess, network: Network) -> Floats:
+def refined(cues: Cues, guess: Guess, network: Network, run: RunNetwork) -> Floats:
     """Normals (H, W, 3), camera frame, with the fine network's relief.
 
     Raises
@@ -68,7 +68,7 @@ def refined(cues: Cues, guess: Guess, network: Network) -> Floats:
         raise ModelError(f"fine model {network.digest[:8]} expects other channels; use the one of this version")
     relief = np.zeros((*cues.mask.shape, 3), np.float32)
     tiles = list(_tiles(cues.mask))
-    looks = [partial(_answer, cues, guess, inner, outer, network) for inner, outer in tiles]
+    looks = [partial(_answer, cues, guess, inner, outer, network, run) for inner, outer in tiles]
     for (inner, _), found in zip(tiles, parallel.results(looks, network.at_once), strict=True):
         relief[inner] = found
     relief = finer(relief, cues.mask, guess.shrink)
@@ -113,12 +113,12 @@ def _part(cues: Cues, guess: Guess, window: Window) -> tuple[Cues, Guess]:
     return replace(cues, **shown), replace(guess, **known)
 
 
-def _answer(cues: Cues, guess: Guess, inner: Window, outer: Window, network: Network) -> Floats:
+def _answer(cues: Cues, guess: Guess, inner: Window, outer: Window, network: Network, run: RunNetwork) -> Floats:
     """Deviation of the normals (h, w, 3) of the tile `inner`, ray frame, by what `outer` shows."""
     picture = encode(*_part(cues, guess, outer))
     _, height, width = picture.shape
     more = ((0, 0), (0, -height % SIZE_MULTIPLE), (0, -width % SIZE_MULTIPLE))
-    relief = network.run(np.pad(picture, more)[None]).get("relief")
+    relief = run(network, np.pad(picture, more)[None]).get("relief")
     if relief is None or relief.shape[1] != 3:
         raise ModelError(f"fine model {network.digest[:8]} makes no relief; use the one of this version")
     y, x = (within.start - around.start for within, around in zip(inner, outer))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from polcap import parallel
 from polcap.errors import ModelError
-from polcap.images import Cues, Floats, Network, Quality, SurfaceMaps
+from polcap.images import Cues, Floats, Network, Quality, RunNetwork, SurfaceMaps
 from polcap.optics import frames
 from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stages.cues import CHANNELS, FLOOR
@@ -29,7 +29,9 @@ _GRAZING = 0.15  # cosine below which shading is not told apart; .1 and .2 leave
 _BRIGHTEST = 2.0  # S0, which is 1 where white paper faces the flash beside the chart; what no body reflects
 
 
-def estimate(cues: Cues, network: Network, ior: float, symmetries: int, *, fine_pass: bool) -> SurfaceMaps:
+def estimate(
+    cues: Cues, network: Network, run: RunNetwork, ior: float, symmetries: int, *, fine_pass: bool
+) -> SurfaceMaps:
     """The network's maps, its normals joined with the analytic ones by their expected errors.
 
     The network sees the whole object at the size it was made for, which settles half-turns, shape and gloss.
@@ -42,7 +44,9 @@ def estimate(cues: Cues, network: Network, ior: float, symmetries: int, *, fine_
     cues
         Of the object's crop (H, W).
     network
-        Eats the channels of `stages.cues`.
+        Takes the channels of `stages.cues`.
+    run
+        Runs a network.
     ior
         Refractive index of the inversion.
     symmetries
@@ -55,8 +59,8 @@ def estimate(cues: Cues, network: Network, ior: float, symmetries: int, *, fine_
     ModelError
         A network was made for other channels, or gives other maps.
     """
-    maps, guess, stated = known(cues, network, ior, symmetries)
-    normal = fine.refined(cues, guess, network.fine) if fine_pass and network.fine else guess.normal
+    maps, guess, stated = known(cues, network, run, ior, symmetries)
+    normal = fine.refined(cues, guess, network.fine, run) if fine_pass and network.fine else guess.normal
     lit = (np.maximum(cues.radiance, 0) + FLOOR) * np.exp(maps["factor"])
     diffuse = fill_highlights(lit / _shading(normal, cues.rays) - FLOOR, _bounded(cues))
     scale, power, rougher, most = _CALIBRATION
@@ -75,12 +79,14 @@ def estimate(cues: Cues, network: Network, ior: float, symmetries: int, *, fine_
     )
 
 
-def known(cues: Cues, network: Network, ior: float, symmetries: int) -> tuple[dict[str, Floats], fine.Guess, Floats]:
+def known(
+    cues: Cues, network: Network, run: RunNetwork, ior: float, symmetries: int
+) -> tuple[dict[str, Floats], fine.Guess, Floats]:
     """What stands before the fine pass, whose training begins here too.
 
     Parameters
     ----------
-    cues, network, ior, symmetries
+    cues, network, run, ior, symmetries
         As in `estimate`.
 
     Returns
@@ -94,9 +100,8 @@ def known(cues: Cues, network: Network, ior: float, symmetries: int) -> tuple[di
     size = cues.mask.shape[::-1]
     shrink = max(1.0, max(size) / int(network.metadata["native_size"]))
     seen = _resized(_bounded(cues), 1 / shrink)
-    small, averaged = parallel.both(
-        partial(augmentation.combined, seen, network, symmetries), partial(analytic.prepare, cues, ior), network.at_once
-    )
+    looks = partial(augmentation.combined, seen, network, run, symmetries)
+    small, averaged = parallel.both(looks, partial(analytic.prepare, cues, ior), network.at_once)
     # beside the object the network guesses: zeros there leave an edge's direction to the object's own pixels
     small["normal"] = _without_grid(small["normal"], seen.mask) * seen.mask[..., None]
     small["factor"] = _factor(small["diffuse"] * _shading(small["normal"], seen.rays), seen)

@@ -1,30 +1,31 @@
-"""Stage 4: decide which pixels are the object, and how sure that is.
+"""Stage 4: the object's mask, and how much of it may be wrong.
 
-A small network gives every pixel its chance of being the object (`two_looks`): it was trained on what is hard to
-tell apart, such as black gloss on black cloth, white on white and deep shadow. Colors (`standing_out`) then find the
-outline, as far as the network agrees. Where it sees nothing, or there is none, the object is what stands out from
-the backdrop.
-A mask that the user drew is taken as drawn.
+1. A network gives each pixel a probability of being the object (`network`, by the channels of `mask_channels`).
+2. Its likely pixels become a mask without specks (`regions`).
+3. The outline moves to edges of color, as far as the network agrees (`graph_cut`).
+
+Without a network, or where it finds nothing, the object is found by its difference from the `backdrop`. A mask that
+the user has drawn is taken as it is.
 """
 
 import contextlib
-from typing import Annotated
+from typing import Annotated, Literal
 
 import cv2
 import msgspec
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
 from polcap.errors import ObjectError
-from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Network, ObjectMask
+from polcap.images import Alignment, AngleStack, Bits, ColorCalibration, Floats, Network, ObjectMask, RunNetwork
 from polcap.optics.warp import warp
 from polcap.stages import stage
-from polcap.stages.mask import network as two_looks
-from polcap.stages.mask import solid, standing_out
+from polcap.stages.mask import backdrop, graph_cut, regions
+from polcap.stages.mask.network import object_probability
+from polcap.stages.mask.regions import Bools
 
 
-class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class MaskSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The section `mask` of a settings file."""
 
     margin: Annotated[
@@ -37,95 +38,93 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.7
 
 
-@stage(version=6)
+@stage(version=7)
 def segment(
     radiance: AngleStack,
     alignment: Alignment,
     color: ColorCalibration,
-    user_mask: NDArray[np.bool_] | None,
+    user_mask: Bools | None,
     network: Network | None,
-    settings: Settings,
+    run: RunNetwork,
+    settings: MaskSettings,
 ) -> ObjectMask:
-    """The object on the sum of the aligned shots, and a crop around it.
+    """The object on the reference grid, and a crop around it.
 
     Parameters
     ----------
     radiance
         The shots (K, H, W, 3), each on its own grid.
     alignment
-        Where each lies on the reference grid.
+        Registration of the shots.
     color
-        Tells where the chart lies, which is not the object.
+        Color matrix, and the place of the chart, which is not the object.
     user_mask
         (H, W) on the reference grid; replaces the search.
     network
-        Finds the object; None takes for it what stands out from the backdrop.
+        Of the probabilities; None: by the backdrop.
     settings
         Borders around object and chart, and the least area.
 
     Raises
     ------
     ObjectError
-        Nothing stands out, or the user's mask is empty or of another size.
+        No object is found, or the user's mask is empty or of another size.
     """
     if user_mask is not None:
-        if user_mask.shape != radiance.value.shape[1:3]:
-            raise ObjectError(
-                f"mask is {user_mask.shape[1]}×{user_mask.shape[0]} px, the picture's grid "
-                f"{radiance.value.shape[2]}×{radiance.value.shape[1]}; draw it on the RAW picture or this grid"
-            )
-        if not user_mask.any():
-            raise ObjectError("mask is empty: no pixel is 128 or brighter; paint the object white")
-        return ObjectMask(user_mask, _crop(user_mask, settings.margin), "user", None, None, *solid.shape(user_mask))
-    picture, zone = _picture(radiance, alignment, color), _chart_zone(radiance, color, settings.chart_margin)
+        _check(user_mask, radiance.value.shape[1:3])
+        return _object(user_mask, "user", None, settings)
+    picture, zone = _mean_picture(radiance, alignment, color), _chart_zone(radiance, color, settings.chart_margin)
     if network is None:
-        mask = standing_out.search(picture, zone, settings.min_area)
-        return ObjectMask(mask, _crop(mask, settings.margin), "automatic", None, None, *solid.shape(mask))
+        return _object(backdrop.find_object(picture, zone, settings.min_area), "automatic", None, settings)
     patches = _chart_zone(radiance, color, 0.0)
-    chance = two_looks.chances(radiance, alignment, color, patches, network)
-    mask = solid.body(chance)
+    probability = object_probability(radiance, alignment, color, patches, network, run)
+    mask = regions.likely_regions(probability)
     if mask.any():
-        colored = solid.cleaned(standing_out.sharpened(picture, mask, patches, chance), chance)
-        mask = solid.preferred(colored, mask, chance)
+        colored = regions.clean(graph_cut.sharpen(picture, mask, patches, probability), probability)
+        mask = regions.choose(colored, mask, probability)
     else:
         with contextlib.suppress(ObjectError):
-            mask = standing_out.search(picture, zone, settings.min_area)
+            mask = backdrop.find_object(picture, zone, settings.min_area)
     if mask.mean() < settings.min_area:
         raise ObjectError(
             f"no object is seen: {100 * mask.mean():.2f} % of the picture, less than "
             f"mask.min_area = {100 * settings.min_area:g} %; let the object fill more of it, or give --mask PNG"
         )
-    return ObjectMask(
-        mask, _crop(mask, settings.margin), "automatic", np.rint(255 * chance).astype(np.uint8),
-        solid.doubt(mask, chance), *solid.shape(mask),
-    )  # fmt: skip
+    return _object(mask, "automatic", regions.expected_error(mask, probability), settings)
 
 
-def _picture(radiance: AngleStack, alignment: Alignment, color: ColorCalibration) -> Floats:
+def _check(user_mask: Bools, shape: tuple[int, ...]) -> None:
+    if user_mask.shape != shape:
+        raise ObjectError(
+            f"mask is {user_mask.shape[1]}×{user_mask.shape[0]} px, the picture's grid {shape[1]}×{shape[0]}; "
+            "draw it on the RAW picture or this grid"
+        )
+    if not user_mask.any():
+        raise ObjectError("mask is empty: no pixel is 128 or brighter; paint the object white")
+
+
+def _object(
+    mask: Bools, source: Literal["automatic", "user"], doubt: float | None, settings: MaskSettings
+) -> ObjectMask:
+    crop = regions.box_around(mask, settings.margin, least=4)
+    assert crop is not None
+    return ObjectMask(mask, crop, source, doubt, *regions.measure_shape(mask))
+
+
+def _mean_picture(radiance: AngleStack, alignment: Alignment, color: ColorCalibration) -> Floats:
     """Mean of the registered shots in linear Rec.709, (H, W, 3)."""
     total = sum(warp(radiance.value[k], alignment.transform[k], order=1) for k in range(len(radiance.angle)))
     return np.asarray(cv2.transform(total, 2 / len(radiance.angle) * color.matrix), np.float32)
 
 
-def _chart_zone(radiance: AngleStack, color: ColorCalibration, margin: float) -> NDArray[np.uint8]:
-    """(H, W) 1 where the chart's patches lie, and up to `margin` patch widths beside them."""
+def _chart_zone(radiance: AngleStack, color: ColorCalibration, margin: float) -> Bits:
+    """(H, W) 1 on the chart's patches and up to `margin` patch widths around them."""
     zone = np.zeros(radiance.value.shape[1:3], np.uint8)
     if color.corners is not None:
         corners = np.asarray(color.corners, np.float64)
         center = corners.mean(0)
-        across = np.linalg.norm(corners[1] - corners[0]) / 6  # one patch pitch
+        patch = np.linalg.norm(corners[1] - corners[0]) / 6
         outward = corners - center
-        grown = center + outward * (1 + margin * across / np.linalg.norm(outward, axis=1))[:, None]
+        grown = center + outward * (1 + margin * patch / np.linalg.norm(outward, axis=1))[:, None]
         cv2.fillConvexPoly(zone, np.round(grown).astype(np.int32), 1)
     return zone
-
-
-def _crop(mask: NDArray[np.bool_], margin: float) -> tuple[int, int, int, int]:
-    """The mask's box with a border, within the picture."""
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    add = max(4, round(margin * max(np.ptp(rows), np.ptp(columns))))
-    height, width = mask.shape
-    return (
-        max(int(columns[0]) - add, 0), max(int(rows[0]) - add, 0),
-        min(int(columns[-1]) + 1 + add, width), min(int(rows[-1]) + 1 + add, height),
-    )  # fmt: skip

@@ -1,18 +1,19 @@
-"""The gains of the shots from the object itself, by three of its properties, each with its own doubt.
+"""Gains of the shots from the object itself: by closure, by the outline, by the pixels that face the camera.
 
-With h = 1/gain, hₖIₖ = ½(S0 + S1 cos 2θₖ + S2 sin 2θₖ) has to hold in every pixel:
+With h = 1/gain, hₖIₖ = ½(S0 + S1 cos 2θₖ + S2 sin 2θₖ) holds in every pixel:
 
 * closure: K > 3 shots lie in a space of three dimensions, so K − 3 sums N·(h∘I) vanish;
 * outline: where the surface turns edge-on the polarization points across the contour of azimuth φ, so the shots
   lie in the span of 1 and cos 2(θₖ − φ), and K − 2 sums vanish;
 * facing pixels: a surface that faces the camera is unpolarized, so there hₖIₖ is the same in all shots.
 
-The first two are least squares for the null vector h; their doubt is the scatter between parts of the object. The
-third is a guess wherever nothing faces the camera, and more than one peak says so.
+The first two are least squares for the null vector h; their error is the scatter between parts of the object. The
+third fails where nothing faces the camera; several peaks of the ratios are the sign of it. A fourth is in
+`integrability`.
 
 References
 ----------
-Comaniciu & Meer, Mean shift, IEEE TPAMI 2002. Efron, The Jackknife, 1982. Birge, Phys. Rev. 1932 (combining).
+Comaniciu & Meer, Mean shift, IEEE TPAMI 2002. Birge, Phys. Rev. 1932 (combining).
 """
 
 from collections.abc import Callable
@@ -24,38 +25,73 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap import parallel
-from polcap.images import Bits, Floats
+from polcap.images import Alignment, AngleStack, Bits, Bools, Floats, ObjectMask, Quality
 from polcap.optics import frames, mueller
-from polcap.optics.robust import BIWEIGHT, MAD_TO_SIGMA
-
-Bools = NDArray[np.bool_]
+from polcap.optics.outline import Rim
+from polcap.optics.robust import biweight, jackknife, spread
+from polcap.optics.warp import warp
 
 _KERNELS = (0.04, 0.02, 0.01, 0.007, 0.005)  # of the mean shift, of S1/S0; ended at .01 a vase errs 12 × (decision 6)
 _KERNEL_REACH = 8.0  # widths; beyond, less one that a climb may have moved, a Gaussian is under 10⁻¹⁰
-_STARTS = 12  # of the mean shift, beside the median and equal gains
+_STARTS = 12  # of the mean shift, besides the median and equal gains
 _PEAK_WIDTH = 0.02  # kernel in which peaks are compared, of S1/S0; set by hand
-_CELL_PX = 6  # of the blocks whose means the closure takes: three times the blur of `smoothed`
-_PARTS = 12  # of the object, left out one at a time: knows a 1σ to a fifth
-_ANGLE_ERROR = np.radians(0.5)  # 1σ of a ring set against its mark: half of what divides it, a degree; assumed
+_CELL_PX = 6  # side of the blocks that closure averages: three times the blur of the light
+_BLUR_PX = 2.0  # 1σ of the blur of the light
+_PARTS = 12  # of the object, left out one at a time: gives a 1σ to a fifth of itself
+_ANGLE_ERROR = np.radians(0.5)  # 1σ of a ring set against its mark: half a degree, the step of its scale; assumed
 _LEAST_RIM, _MOST_RIM = 200, 20_000  # pixels of the outline
-_FACING_ERROR = 0.003  # what facing pixels were wrong by on simulated objects, whatever their scatter (decision 6)
-_ONE_SIDED = 0.02  # the same where slopes lie to one side of them alone, as a ridge's that leans (decision 6)
-_RING = (0.006, 0.02)  # polarization of the slopes that are looked at for that
-_OUTLINE_ERROR = 0.002  # of the outline, beside its own scatter
-_OUTLINE_TIMES = 3.0  # its error over the scatter of its parts: what bends one bends its neighbours (decision 6)
+_FACING_ERROR = 0.003  # error of facing pixels on simulated objects, whatever their scatter (decision 6)
+_ONE_SIDED = 0.02  # the same where slopes lie on one side of them only, as a leaning ridge's (decision 6)
+_RING = (0.006, 0.02)  # polarization of the slopes that are tested for that
+_OUTLINE_ERROR = 0.002  # of the outline, besides its own scatter
+_OUTLINE_TIMES = 3.0  # its error over the scatter of its parts: neighbors share their errors (decision 6)
 _CLOSURE_ERROR = 0.001  # registration and interpolation; assumed, the angles' error is most of its doubt (decision 20)
+_SURPRISE = 3.0  # σ from the prior beyond which gains are not averaged with it
+_CERTAIN = 10.0  # σ of its own error from 1 beyond which such a gain is applied: the flash failed
 
 
 @dataclass(frozen=True)
-class Estimate:
+class GainEstimate:
     """Gains of the shots relative to the first."""
 
     gain: Floats  # (K,)
-    sigma: Floats  # (K,) 1σ; inf: nothing is known
+    sigma: Floats  # (K,) 1σ; inf: unknown
 
 
-def combined(estimates: list[Estimate]) -> Estimate:
-    """The mean of estimates by their inverse variances; where they differ by more than their doubt, that grows."""
+@dataclass(frozen=True)
+class ObjectShots:
+    """The shots on the crop around the object, registered by linear interpolation: enough for means."""
+
+    value: Floats  # (K, h, w, 3)
+    light: Floats  # (K, h, w) sum over channels, blurred by 2 px
+    quality: Bits  # (h, w) 0: sound in every shot
+    mask: Bools  # (h, w)
+    inside: Bools  # (h, w) the object's sound pixels, away from its edge where there are enough
+    crop: tuple[int, int, int, int]  # x0, y0, x1, y1 on the reference grid, px
+    full: tuple[int, int]  # (H, W) of that grid
+
+
+def register(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> ObjectShots:
+    """The shots on the object's crop."""
+    x0, y0, x1, y1 = crop = object_.crop
+    value = np.stack([warp(v, t, crop, order=1) for v, t in zip(radiance.value, alignment.transform)])
+    flagged = [warp(q.astype(np.float32), t, crop, order=1) > 0 for q, t in zip(radiance.quality, alignment.transform)]
+    quality = np.where(np.any(flagged, axis=0), np.uint8(Quality.CLIPPED), np.uint8(0))
+    light = np.stack([cv2.GaussianBlur(frames.total(v), (0, 0), _BLUR_PX) for v in value])
+    mask = object_.mask[y0:y1, x0:x1]
+    solid = cv2.erode(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    inside = np.asarray((solid if solid.sum() > 100 else mask) & (quality == 0))
+    height, width = radiance.value.shape[1:3]
+    return ObjectShots(value, light, quality, mask, inside, crop, (height, width))
+
+
+def unknown(shots: int) -> GainEstimate:
+    """Gains before anything is measured."""
+    return GainEstimate(np.ones(shots), np.where(np.arange(shots) > 0, np.inf, 0.0))
+
+
+def combined(estimates: list[GainEstimate]) -> GainEstimate:
+    """The mean of estimates by their inverse variances; a difference beyond their errors adds to its error."""
     gain = np.stack([one.gain for one in estimates])
     sigma = np.stack([one.sigma for one in estimates])
     weight = 1 / np.maximum(sigma, 1e-6) ** 2
@@ -64,74 +100,75 @@ def combined(estimates: list[Estimate]) -> Estimate:
     mean = np.where(known, (weight * gain).sum(0) / np.maximum(total, 1e-12), 1.0)
     count = np.maximum((weight > 0).sum(0) - 1, 1)
     excess = (weight * (gain - mean) ** 2).sum(0) / count  # Birge's ratio, squared
-    spread = np.where(known, np.sqrt(np.maximum(excess, 1) / np.maximum(total, 1e-12)), np.inf)
-    spread[0] = 0
-    return Estimate(mean, spread)
+    error = np.where(known, np.sqrt(np.maximum(excess, 1) / np.maximum(total, 1e-12)), np.inf)
+    error[0] = 0
+    return GainEstimate(mean, error)
 
 
-def unknown(shots: int) -> Estimate:
-    """What is known of gains before anything is."""
-    return Estimate(np.ones(shots), np.where(np.arange(shots) > 0, np.inf, 0.0))
+def with_prior(measured: GainEstimate, prior: float) -> GainEstimate:
+    """Measured gains (K,) averaged with light that repeats within `prior` (1σ).
+
+    A gain far from 1 with a large error is not applied: its distance from 1 then becomes its error.
+    """
+    later = np.arange(len(measured.gain)) > 0
+    sigma = np.where(np.isfinite(measured.sigma), measured.sigma, 1e6)
+    distance = np.abs(measured.gain - 1)
+    surprising = distance > _SURPRISE * np.hypot(sigma, prior)
+    weight, before = 1 / np.maximum(sigma, 1e-6) ** 2, 1 / prior**2
+    mean = (weight * measured.gain + before) / (weight + before)
+    certain = distance > _CERTAIN * sigma
+    gain = np.where(surprising, np.where(certain, measured.gain, 1.0), mean)
+    doubtful = np.where(certain, sigma, np.maximum(distance, prior))
+    error = np.where(surprising, doubtful, 1 / np.sqrt(weight + before))
+    return GainEstimate(np.where(later, gain, 1.0), np.where(later, error, 0.0))
 
 
-def closure(light: Floats, usable: Bools, angle: Floats) -> Estimate:
-    """Gains (K,) that let more than three shots agree; light (K, H, W), unknown for K = 3."""
+def closure(light: Floats, usable: Bools, angle: Floats) -> GainEstimate:
+    """Gains (K,) that let more than three shots (K, H, W) agree; unknown for K = 3."""
     shots = len(angle)
     if shots < 4:
         return unknown(shots)
-    means, at = cells(light, usable)
-    if len(at) < 4 * _PARTS:
+    means, row = cells(light, usable)
+    if len(row) < 4 * _PARTS:
         return unknown(shots)
-    part = (np.arange(len(at)) * _PARTS) // len(at)  # bands of the object, top to bottom
+    part = (np.arange(len(row)) * _PARTS) // len(row)  # bands of the object, top to bottom
     means = (means / means.mean(0)).T  # (P, K)
 
-    def rows(turned: Floats) -> Floats:
+    def equations(turned: Floats) -> Floats:
         null = np.linalg.svd(mueller.analyzer(turned).T)[2][3:]  # (K − 3, K), N A = 0
         return np.asarray(null[None] * means[:, None])
 
-    return _null_vector(rows, angle, part, _CLOSURE_ERROR)
+    return _null_vector(equations, angle, part, _CLOSURE_ERROR)
 
 
-def outline(light: Floats, azimuth: Floats, sector: NDArray[np.int_], angle: Floats) -> Estimate:
-    """Gains (K,) that let the polarization cross the contour.
-
-    Parameters
-    ----------
-    light
-        (K, N) of the rim.
-    azimuth
-        (N,) rad, outward direction of the outline.
-    sector
-        (N,) part of the outline that a pixel belongs to, for the doubt.
-    angle
-        (K,) rad, of the shots' polarizers.
-    """
+def outline(rim: Rim, angle: Floats) -> GainEstimate:
+    """Gains (K,) for which the polarization of the rim points across the contour; its light includes the gains."""
     shots = len(angle)
-    parts = np.unique(sector)
-    if len(azimuth) < _LEAST_RIM or len(parts) < _PARTS // 2:
+    parts = np.unique(rim.sector)
+    if len(rim.azimuth) < _LEAST_RIM or len(parts) < _PARTS // 2:
         return unknown(shots)
-    step = max(1, len(azimuth) // _MOST_RIM)
-    light, azimuth, sector = light[:, ::step], azimuth[::step], sector[::step]
+    step = max(1, len(rim.azimuth) // _MOST_RIM)
+    light, azimuth, sector = rim.light[:, ::step], rim.azimuth[::step], rim.sector[::step]
     light = (light / np.maximum(light.mean(0), 1e-12)).T  # (N, K)
     one = np.full((shots, shots), 1 / shots)
 
-    def rows(turned: Floats) -> Floats:
+    def equations(turned: Floats) -> Floats:
         wave = np.cos(2 * (turned[:, None] - azimuth))  # (K, N)
         wave = wave - wave.mean(0)
         wave = wave / np.maximum(np.linalg.norm(wave, axis=0), 1e-9)
         project = np.eye(shots) - one - np.einsum("kn,ln->nkl", wave, wave)  # of rank K − 2
         return np.asarray(project * light[:, None])
 
-    return _null_vector(rows, angle, np.searchsorted(parts, sector), _OUTLINE_ERROR, _OUTLINE_TIMES)
+    return _null_vector(equations, angle, np.searchsorted(parts, sector), _OUTLINE_ERROR, _OUTLINE_TIMES)
 
 
-def facing(light: Floats, usable: Bools, angle: Floats) -> Estimate:
-    """Gains (K,) at which the ratios of the shots pile up; light (K, H, W), angle (K,) rad for the doubt alone.
+def facing(light: Floats, usable: Bools, angle: Floats) -> GainEstimate:
+    """Gains (K,) at which the ratios of the shots (K, H, W) pile up; the angles (K,) rad affect the error only.
 
     Over a rounded object the density of (S1, S2)/S0 grows as 1/θ² towards its zero, whatever the albedo. Mean shift
-    with a shrinking kernel climbs there from several places. The peak with most pixels is taken; others that hold
-    nearly as many are what it may be wrong by: on flat faces, or under light from all sides, there are many. A ridge
-    that leans has its peak where it leans least: slopes lie to one side of it alone, in whatever order the shots are.
+    with a shrinking kernel climbs there from several places. The peak with most pixels is taken. Other peaks that hold
+    nearly as many add to its error: flat faces, or light from all sides, have many. A leaning ridge has its peak where
+    it leans least, with slopes on one side of it only.
     """
     shots = len(light)
     usable = usable & (light.sum(0) > np.quantile(light.sum(0)[usable], 0.2)) if usable.any() else usable
@@ -142,20 +179,20 @@ def facing(light: Floats, usable: Bools, angle: Floats) -> Estimate:
     seeds = ratio[:, np.linspace(0, ratio.shape[1] - 1, _STARTS).astype(int)].T
     starts = (np.median(ratio, axis=1), np.ones(shots), *seeds)
     climbs = parallel.results(partial(_climb, ratio, start) for start in starts)
-    away = np.stack([((ratio - path[-1][:, None]) ** 2).sum(0) for path in climbs])
-    height = np.exp(-away / (2 * _PEAK_WIDTH**2)).mean(1)
+    distance = np.stack([((ratio - path[-1][:, None]) ** 2).sum(0) for path in climbs])
+    height = np.exp(-distance / (2 * _PEAK_WIDTH**2)).mean(1)
     best = int(np.argmax(height))
     gain = climbs[best][-1]
     odds = (height / max(float(height[best]), 1e-12)) ** 4
-    spread = np.sqrt((odds[:, None] * (np.stack([path[-1] for path in climbs]) - gain) ** 2).sum(0) / odds.sum())
+    peaks = np.sqrt((odds[:, None] * (np.stack([path[-1] for path in climbs]) - gain) ** 2).sum(0) / odds.sum())
     scatter = np.std(climbs[best][1:], axis=0)
-    beside = _ONE_SIDED * _one_sided(ratio / gain[:, None], angle)
-    sigma = np.sqrt(spread**2 + scatter**2 + beside**2 + _FACING_ERROR**2)
-    return Estimate(gain, np.where(np.arange(shots) > 0, sigma, 0.0))
+    one_sided = _ONE_SIDED * _one_sided(ratio / gain[:, None], angle)
+    sigma = np.sqrt(peaks**2 + scatter**2 + one_sided**2 + _FACING_ERROR**2)
+    return GainEstimate(gain, np.where(np.arange(shots) > 0, sigma, 0.0))
 
 
 def _one_sided(ratio: Floats, angle: Floats) -> float:
-    """How far the slopes about facing pixels all lie one way, 0…1, of the shots' ratios (K, N) without gains."""
+    """Directional imbalance of weakly polarized pixels, 0…1, of ratios (K, N) without gains."""
     s0, s1, s2 = np.linalg.pinv(mueller.analyzer(angle)) @ ratio
     polarization = (s1 + 1j * s2) / np.maximum(s0, 1e-9)
     strength = np.abs(polarization)
@@ -164,7 +201,7 @@ def _one_sided(ratio: Floats, angle: Floats) -> float:
 
 
 def _climb(ratio: Floats, start: Floats) -> list[Floats]:
-    """Mean shift over ratios (K, N): where each kernel of _KERNELS ends."""
+    """Mean shift over ratios (K, N) from a start (K,): its end for each kernel."""
     at: Floats = start.astype(np.float32)
     found: list[Floats] = []
     for width in _KERNELS:
@@ -172,10 +209,10 @@ def _climb(ratio: Floats, start: Floats) -> list[Floats]:
         for _ in range(50):
             if np.abs(at - middle).max() > width:
                 some, middle = _near(ratio, at, width), at
-            away = some - at[:, None]
-            weight = np.exp(np.einsum("kn,kn->n", away, away) * np.float32(-0.5 / width**2))
+            distance = some - at[:, None]
+            weight = np.exp(np.einsum("kn,kn->n", distance, distance) * np.float32(-0.5 / width**2))
             total = float(weight.sum())
-            step = away @ weight / total if total > 1e-9 else np.zeros_like(at)
+            step = distance @ weight / total if total > 1e-9 else np.zeros_like(at)
             at = at + step
             if np.abs(step).max() < 1e-5:
                 break
@@ -184,14 +221,14 @@ def _climb(ratio: Floats, start: Floats) -> list[Floats]:
 
 
 def _near(ratio: Floats, at: Floats, width: float) -> Floats:
-    """Those of the ratios (K, N) that a kernel within `width` of a place (K,) gives any weight, float32."""
-    away = ratio - at[:, None]
-    near = np.einsum("kn,kn->n", away, away) < (_KERNEL_REACH * width) ** 2
+    """Those of the ratios (K, N) that a kernel of this width at a place (K,) reaches, float32."""
+    distance = ratio - at[:, None]
+    near = np.einsum("kn,kn->n", distance, distance) < (_KERNEL_REACH * width) ** 2
     return np.asarray(ratio[:, near], np.float32)
 
 
 def cells(light: Floats, usable: Bools) -> tuple[Floats, NDArray[np.int_]]:
-    """Means (K, P) of whole blocks inside the object, and the row of each (P,)."""
+    """Means (K, P) of whole blocks inside the object, and the row of blocks of each (P,)."""
     height, width = (size // _CELL_PX for size in usable.shape)
     cut = np.s_[..., : height * _CELL_PX, : width * _CELL_PX]
     shape = (height, _CELL_PX, width, _CELL_PX)
@@ -202,51 +239,37 @@ def cells(light: Floats, usable: Bools) -> tuple[Floats, NDArray[np.int_]]:
 
 
 def _null_vector(
-    rows_at: Callable[[Floats], Floats], angle: Floats, part: NDArray[np.int_], floor: float, times: float = 1.0
-) -> Estimate:
-    """The h with h₀ = 1 that rows (P, C, K) take nearest to zero, as gains 1/h, by biweight.
+    equations: Callable[[Floats], Floats], angle: Floats, part: NDArray[np.int_], floor: float, times: float = 1.0
+) -> GainEstimate:
+    """Gains 1/h from the h with h₀ = 1 for which rows (P, C, K) · h are least, by biweight.
 
-    Its doubt: the scatter between parts (jackknife) so many times, and what an error of each angle does to it.
+    The error: the jackknife over parts, `times` larger, with the effect of an error of each angle, and `floor`.
     """
-    rows = rows_at(angle)
-    trust = np.ones(len(rows))
+    rows = equations(angle)
+    weight: Floats = np.ones(len(rows))
     h: Floats = np.ones(rows.shape[2])
     for _ in range(4):
-        h = _solved(_square(rows, trust))
+        h = _least(_squares(rows, weight))
         residual = np.linalg.norm(rows @ h, axis=1)
-        scale = MAD_TO_SIGMA * float(np.median(residual)) + 1e-9
-        trust = np.maximum(0, 1 - (residual / (BIWEIGHT * scale)) ** 2) ** 2
-    each = [_square(rows[part == p], trust[part == p]) for p in np.unique(part)]
+        weight = biweight(residual, spread(residual))
+    each = [_squares(rows[part == p], weight[part == p]) for p in np.unique(part)]
     total = np.sum(each, axis=0)
-    without = np.stack([_solved(total - one) for one in each])
-    count = len(each)
-    variance = times**2 * (count - 1) / count * ((without - without.mean(0)) ** 2).sum(0)
+    variance = (times * jackknife(np.stack([_least(total - one) for one in each]))) ** 2
     for k in range(len(angle)):
         turned = angle + _ANGLE_ERROR * (np.arange(len(angle)) == k)
-        variance = variance + (_solved(_square(rows_at(turned), trust)) - h) ** 2
+        variance = variance + (_least(_squares(equations(turned), weight)) - h) ** 2
     h = np.clip(h, 0.05, 20)
     sigma = np.hypot(np.sqrt(variance) / h**2, floor)
-    return Estimate(1 / h, np.where(np.arange(len(h)) > 0, sigma, 0.0))
+    return GainEstimate(1 / h, np.where(np.arange(len(h)) > 0, sigma, 0.0))
 
 
-def _square(rows: Floats, trust: Floats) -> Floats:
-    """Σ trust · rowᵀrow, (K, K) of rows (P, C, K)."""
-    return np.asarray(np.einsum("p,pck,pcl->kl", trust, rows, rows, optimize=True))
+def _squares(rows: Floats, weight: Floats) -> Floats:
+    """Σ weight · rowᵀrow, (K, K) of rows (P, C, K)."""
+    return np.asarray(np.einsum("p,pck,pcl->kl", weight, rows, rows, optimize=True))
 
 
-def _solved(square: Floats) -> Floats:
-    """h (K,) with h₀ = 1 of least hᵀQh."""
+def _least(square: Floats) -> Floats:
+    """The h (K,) with h₀ = 1 that minimizes hᵀQh."""
     size = len(square) - 1
     inner = square[1:, 1:] + 1e-9 * (np.trace(square) + 1e-12) * np.eye(size)
     return np.concatenate([[1.0], np.linalg.solve(inner, -square[1:, 0])])
-
-
-def smoothed(value: Floats) -> Floats:
-    """Sum over channels of shots (K, H, W, C), little blurred: (K, H, W)."""
-    return np.stack([cv2.GaussianBlur(frames.total(v), (0, 0), 2.0) for v in value])
-
-
-def inside(mask: Bools, quality: Bits) -> Bools:
-    """The object's sound pixels (H, W), away from its edge where there are enough."""
-    solid = cv2.erode(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
-    return np.asarray((solid if solid.sum() > 100 else mask) & (quality == 0))

@@ -1,15 +1,17 @@
-"""By how much the zero of the polarizer ring is off, told by the object's outline.
+"""The error of the polarizer ring's zero, by the object's outline and by the slopes inside it.
 
-Body light is polarized along the slope g = tan θ (cos φ, sin φ) of the surface. A slope has no curl: along a closed
-curve inside the outline, ∮ g·t = 0 on any smooth surface, symmetrical or not. A ring whose zero is off by δ turns g,
-and then ∮ g·t / ∮ g·n = tan δ, n pointing out of the curve. Instead of one curve a band of them is taken: the contours
-of a blurred mask. The DoLP stands for tan θ; any weight does on a symmetrical object.
+Diffuse reflection is polarized along the slope g = tan θ (cos φ, sin φ) of the surface. A slope has no curl: along a
+closed curve inside the outline, ∮ g·t = 0 on any smooth surface, symmetrical or not. A ring whose zero is off by δ
+turns g, and then ∮ g·t / ∮ g·n = tan δ, n pointing out of the curve. Instead of one curve a band of them is taken: the
+contours of a blurred mask. The DoLP serves as tan θ; any weight does on a symmetrical object. The law does not hold
+for hidden parts, sharp edges, reflected light and light thrown from fold to fold. These act differently at different
+depths, so the spread over depths gives the error (decision 26).
 
-What the law does not hold for (hidden parts, sharp edges, reflected light, light thrown from fold to fold) acts
-differently at different depths, so the spread over depths tells the error (decision 26).
+Inside, Im(w_ζ² w*) = 0 (`integrability`) holds for one common turn of the angles only: an error δ turns w_ζ² w* by 2δ
+at every pixel. Contours, edges and highlights are outliers. Neither outline nor symmetry is needed. The gains, which
+act where a surface faces the camera, are solved for as well, held by their own error (decision 26).
 """
 
-from dataclasses import dataclass
 from functools import partial
 
 import cv2
@@ -17,12 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap import parallel
-from polcap.images import Floats
+from polcap.images import Bools, Floats, RingZero
 from polcap.optics import mueller, outline
+from polcap.optics.robust import jackknife
+from polcap.stages.selfcal import integrability
 
-Bools = NDArray[np.bool_]
+Complexes = NDArray[np.complex128]
 
-_RIM_PX = 3.0  # 1σ of the blur whose contours are followed: as near to the outline as pixels allow
+UNKNOWN = RingZero(0.0, np.pi / 2)
+
+# By the outline.
+_RIM_PX = 3.0  # 1σ of the blur of the mask for the outermost contours: as near to the outline as pixels allow
 _FINE_PX = 8.0  # 1σ of a blur in px of the grid that it is made on: an eighth of it is all that the grid adds
 _DEEPER = (0.1, 0.2)  # further blurs, in radii of the object
 _PLATEAU = 0.3  # radii; the contours of the depth up to here are the last band
@@ -32,88 +39,82 @@ _SPREAD_TO_SIGMA = 2.0  # error of the rim's answer over its rms distance from t
 _FLOOR = np.radians(0.25)  # where all depths agree (decision 26)
 _LEAST_RIM_PX = 200
 _TURNS = 4  # of the answer into the angles, until it no longer changes
+# By the slopes.
+_STEEPEST = 9.0  # tan²θ of the pixels that count; beyond, the law of diffuse reflection is another
+_ROUNDS = 12
+_SETTLED = 1e-5  # change that ends them
+_MOST_STEP = 0.1  # rad, and of a gain, in one go
+_CORRELATED = 2 * np.pi * integrability.BLUR**2  # px that share their noise
+_SLOPES_FLOOR = np.radians(0.1)  # 1σ where all parts agree (decision 26)
 
 
-@dataclass(frozen=True)
-class RingZero:
-    """The ring's error; stated angle + turn = true angle."""
-
-    turn: float  # rad
-    sigma: float  # rad, 1σ; π/2 where nothing is known
-
-
-UNKNOWN = RingZero(0.0, np.pi / 2)
+def combined(one: RingZero, other: RingZero) -> RingZero:
+    """The mean of two measurements of one ring; its error is their distance where they contradict one another."""
+    weight = one.sigma**-2, other.sigma**-2
+    offset = (weight[0] * one.offset + weight[1] * other.offset) / sum(weight)
+    sigmas = abs(one.offset - other.offset) / float(np.hypot(one.sigma, other.sigma))
+    return RingZero(offset, min(max(1.0, sigmas) / float(np.sqrt(sum(weight))), np.pi / 2))
 
 
-def measure(
-    light: Floats, usable: Bools, mask: Bools, angle: Floats, gain_sigma: float, leaves_picture: bool
+def by_outline(
+    light: Floats, sound: Bools, mask: Bools, angle: Floats, gain_sigma: float, leaves_picture: bool
 ) -> RingZero:
-    """The ring's error, of registered shots without their gains.
+    """The ring's error from the outline of registered shots (K, H, W) without their gains.
 
-    Parameters
-    ----------
-    light
-        (K, H, W) shots.
-    usable
-        (H, W) pixels to be believed.
-    mask
-        (H, W) the object.
-    angle
-        (K,) rad, as stated.
-    gain_sigma
-        1σ of the shots' gains, relative.
-    leaves_picture
-        Where the object touches the picture's edge there is no closed curve, and no answer.
+    sound (H, W) are the pixels to use, angle (K,) rad as stated, gain_sigma 1σ of the gains, relative. Where the
+    object leaves the picture there is no closed curve, and the error is unknown.
     """
     margin = int(np.ceil(4 * _RIM_PX))
     light = np.pad(light, ((0, 0), (margin, margin), (margin, margin)))
-    usable, mask = np.pad(usable, margin), np.pad(mask, margin)
+    sound, mask = np.pad(sound, margin), np.pad(mask, margin)
     depth = outline.depth(mask)
     inside = depth > _LEAST_DEPTH_PX
     radius = float(np.sqrt(mask.sum() / np.pi))
     if leaves_picture or int((mask & (depth < 2 * _RIM_PX)).sum()) < _LEAST_RIM_PX:
         return UNKNOWN
-    ok = (mask & usable).astype(np.float32)
-    share = cv2.GaussianBlur(ok, (0, 0), _SMOOTH_PX) + 1e-6
-    light = np.stack([cv2.GaussianBlur((shot * ok).astype(np.float32), (0, 0), _SMOOTH_PX) / share for shot in light])
-    seen = inside & usable
-    s0, s1, s2 = np.linalg.pinv(mueller.analyzer(angle)) @ light[:, seen]
+    s0, s1, s2 = np.linalg.pinv(mueller.analyzer(angle)) @ _smoothed(light, mask & sound)[:, inside & sound]
+    seen = inside & sound
     lit = s0 > 0
     seen[seen] = lit
     if not lit.any():
         return UNKNOWN
-    polarization = (s1[lit] + 1j * s2[lit]) / s0[lit]  # (N,), as all that follows
+    polarization = (s1[lit] + 1j * s2[lit]) / s0[lit]  # (N,), as everything below
     strength = np.abs(polarization)
     weight = np.minimum(strength, outline.DOLP_CAP)
     slope = np.sqrt(polarization / np.maximum(strength, 1e-9)) * weight  # along it or against it: half the angle
-    out = parallel.results(partial(_outward_of, mask, sigma) for sigma in (_RIM_PX, *(d * radius for d in _DEEPER)))
-    out.append(_outward(cv2.GaussianBlur(np.minimum(depth, _PLATEAU * radius), (0, 0), 2.0)))
-    rim, *deeper = parallel.results(partial(_turned, slope, way[seen]) for way in out)
-    spread = float(np.sqrt(np.mean([(other - rim) ** 2 for other in deeper])))
-    lying = out[0][seen]
-    length = np.abs(lying)
-    hidden = float(np.abs(out[0][inside & ~seen]).sum())
+    outward = parallel.results(partial(_outward_of, mask, sigma) for sigma in (_RIM_PX, *(d * radius for d in _DEEPER)))
+    outward.append(_outward(cv2.GaussianBlur(np.minimum(depth, _PLATEAU * radius), (0, 0), 2.0)))
+    rim, *deeper = parallel.results(partial(_turn, slope, way[seen]) for way in outward)
+    scatter = float(np.sqrt(np.mean([(other - rim) ** 2 for other in deeper])))
+    at_rim = outward[0][seen]
+    length = np.abs(at_rim)
+    hidden = float(np.abs(outward[0][inside & ~seen]).sum())
     hidden /= max(hidden + float(length.sum()), 1e-9)
-    lopsided = abs(complex((np.conj(lying) ** 2 / np.maximum(length, 1e-30)).sum()))
+    lopsided = abs(complex((np.conj(at_rim) ** 2 / np.maximum(length, 1e-30)).sum()))
     lopsided /= max(float(length @ weight), 1e-9)
-    sigma = float(
-        np.sqrt(
-            _FLOOR**2
-            + (_SPREAD_TO_SIGMA * spread) ** 2
-            + (hidden * _scatter(slope, lying, outline.sectors(seen))) ** 2
-            + (gain_sigma * lopsided / 2) ** 2
-        )
+    variance = (
+        _FLOOR**2
+        + (_SPREAD_TO_SIGMA * scatter) ** 2
+        + (hidden * _scatter(slope, at_rim, outline.sectors(seen))) ** 2
+        + (gain_sigma * lopsided / 2) ** 2
     )
-    return RingZero(-rim, min(sigma, np.pi / 2))
+    return RingZero(-rim, min(float(np.sqrt(variance)), np.pi / 2))
 
 
-def _outward(inside: Floats) -> NDArray[np.complex128]:
-    """The way out of a picture that is larger further in, (H, W) as x + iy, y up, as long as its slope."""
+def _smoothed(light: Floats, used: Bools) -> Floats:
+    """Shots (K, H, W) blurred over the used pixels alone."""
+    ok = used.astype(np.float32)
+    share = cv2.GaussianBlur(ok, (0, 0), _SMOOTH_PX) + 1e-6
+    return np.stack([cv2.GaussianBlur((shot * ok).astype(np.float32), (0, 0), _SMOOTH_PX) / share for shot in light])
+
+
+def _outward(inside: Floats) -> Complexes:
+    """The downward gradient (H, W) as x + iy, y up, of a picture that is larger further in."""
     return np.asarray(-cv2.Sobel(inside, cv2.CV_64F, 1, 0) + 1j * cv2.Sobel(inside, cv2.CV_64F, 0, 1))
 
 
-def _outward_of(mask: Bools, sigma: float) -> NDArray[np.complex128]:
-    """`_outward` of a mask blurred by `sigma` px; where that is much, on a grid as much coarser."""
+def _outward_of(mask: Bools, sigma: float) -> Complexes:
+    """`_outward` of a mask blurred by `sigma` px; a large blur is made on a coarser grid."""
     step = max(1, int(sigma / _FINE_PX))
     height, width = mask.shape
     small = cv2.resize(mask.astype(np.float32), (-(-width // step), -(-height // step)), interpolation=cv2.INTER_AREA)
@@ -123,18 +124,50 @@ def _outward_of(mask: Bools, sigma: float) -> NDArray[np.complex128]:
     return np.asarray(cv2.resize(way.view(np.float64).reshape(*way.shape, 2), (width, height)) @ np.array([1, 1j]))
 
 
-def _turned(slope: NDArray[np.complex128], out: NDArray[np.complex128]) -> float:
-    """Angle of Σ g conj(out), rad: of the two opposite slopes that an AoLP means the one nearer to the way out."""
-    lying = slope * np.conj(out)
-    along, across = np.ascontiguousarray(lying.real), np.ascontiguousarray(lying.imag)
+def _turn(slope: Complexes, outward: Complexes) -> float:
+    """Angle of Σ g conj(out), rad; of the two opposite slopes of an AoLP the one nearer to the way out."""
+    across = slope * np.conj(outward)
+    real, imaginary = np.ascontiguousarray(across.real), np.ascontiguousarray(across.imag)
     turn = 0.0
     for _ in range(_TURNS):
-        way = np.copysign(1.0, along * np.cos(turn) + across * np.sin(turn))
-        turn = float(np.arctan2(across @ way, along @ way))
+        way = np.copysign(1.0, real * np.cos(turn) + imaginary * np.sin(turn))
+        turn = float(np.arctan2(imaginary @ way, real @ way))
     return turn
 
 
-def _scatter(slope: NDArray[np.complex128], out: NDArray[np.complex128], sector: NDArray[np.int_]) -> float:
-    """How far parts of the outline differ from one another, 1σ rad."""
-    parts = parallel.results(partial(_turned, slope[sector == s], out[sector == s]) for s in np.unique(sector))
+def _scatter(slope: Complexes, outward: Complexes, sector: NDArray[np.int_]) -> float:
+    """1σ between parts of the outline, rad."""
+    parts = parallel.results(partial(_turn, slope[sector == s], outward[sector == s]) for s in np.unique(sector))
     return float(np.std(parts))
+
+
+def by_slopes(light: Floats, usable: Bools, angle: Floats, gain_sigma: float) -> RingZero:
+    """The ring's error from the slopes inside, of registered shots (K, H, W), little blurred, without their gains.
+
+    usable (H, W) are the object's sound pixels, angle (K,) rad as stated, gain_sigma 1σ of the gains, relative.
+    """
+    slopes = integrability.reduced_slopes(light, usable, angle)
+    if slopes is None:
+        return UNKNOWN
+    start: Floats = np.append(np.ones(len(angle) - 1), 0.0)
+    unknowns = start
+    for _ in range(_ROUNDS):
+        found = integrability.linearize(slopes, unknowns, _STEEPEST)
+        weight = found.weight * (found.product.real > 0)
+        step = _step(found, weight, unknowns - start, gain_sigma)
+        unknowns = unknowns + np.clip(step, -_MOST_STEP, _MOST_STEP)
+        if np.abs(step).max() < _SETTLED:
+            break
+    if integrability.linearize(slopes, unknowns, _STEEPEST).coherence <= integrability.COHERENT:
+        return UNKNOWN
+    part = integrability.part_of(slopes.inside)
+    without = [_step(found, weight * (part != p), unknowns - start, gain_sigma)[-1] for p in np.unique(part)]
+    sigma = float(np.hypot(jackknife(np.array(without)), _SLOPES_FLOOR))
+    return RingZero(-float(unknowns[-1]), min(sigma, np.pi / 2))
+
+
+def _step(found: integrability.Equations, weight: Floats, moved: Floats, gain_sigma: float) -> Floats:
+    """The step (K,) of gains and turn; gains that `moved` from 1 are held by their 1σ."""
+    noise = float((weight * found.residual**2).sum() / max(float(weight.sum()), 1e-9))
+    prior = np.append(np.full(len(moved) - 1, 1 / max(gain_sigma, 1e-4) ** 2), 0.0) * noise * _CORRELATED
+    return found.step(weight, prior, moved)

@@ -1,29 +1,29 @@
-"""Stage 6: solve each pixel's linear Stokes parameters from its K angles.
+"""Stage 6: linear Stokes parameters of each pixel from K polarizer angles.
 
-Gains, transforms, the places of a mosaic's colors, the lens's distortion and the ring's turn are applied here and
-nowhere else, so every pixel is resampled once. What comes out is the picture of a pinhole camera.
+Gains, transforms, the places of a mosaic's colors and the lens's distortion are applied here and nowhere else, so
+every pixel is resampled once. The result is the picture of a pinhole camera.
 """
 
-from functools import partial
+from dataclasses import dataclass
 from typing import Annotated
 
 import cv2
 import msgspec
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
 from polcap.errors import CaptureError
 from polcap.images import (
     Alignment,
     AngleStack,
     Bits,
+    Bools,
     Distortion,
     Floats,
-    Gains,
     MaskedImage,
     ObjectMask,
     Quality,
+    SelfCalibration,
     StokesImage,
     View,
 )
@@ -32,16 +32,16 @@ from polcap.optics.warp import covered, warp
 from polcap.stages import stage
 
 _MOST_CONDITION = 50.0  # of three angles 12° apart, where S1 has 26 times the noise of a shot; 0, 45, 90° have 2.4
-_METAL_DOLP, _METAL_DEG, _METAL_SIGMA = 0.05, 10.0, 5.0  # of red and blue: DoLP, and how far their AoLPs part; set by
-# hand, beyond what noise and registration do to a dielectric, and not measured on metals
+_METAL_DOLP, _METAL_DEG, _METAL_SIGMA = 0.05, 10.0, 5.0  # of red and blue: DoLP, and difference of their AoLPs; set by
+# hand, beyond the effect of noise and registration on a dielectric, and not measured on metals
 _LEAST_ROWS, _BLOCK = 64, 200_000  # rows and pixels of a block: its planes fit the cache, and little is cut out with it
+_LEAST_VARIANCE = np.float32(1e-14)
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # the rows of a covariance
 
-Bools = NDArray[np.bool_]
-Flags = list[list[tuple[Quality, Bits]]]  # of every shot
+Box = tuple[int, int, int, int]  # x0, y0, x1, y1 px of the reference grid
 
 
-class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class StokesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The section `stokes` of a settings file."""
 
     greatest_ior: Annotated[
@@ -58,25 +58,16 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @stage(version=6)
 def solve(
-    radiance: AngleStack, alignment: Alignment, gains: Gains, object_: ObjectMask, settings: Settings
+    radiance: AngleStack,
+    alignment: Alignment,
+    calibration: SelfCalibration,
+    object_: ObjectMask,
+    settings: StokesSettings,
 ) -> StokesImage:
     """Weighted least squares s = (AᵀWA)⁻¹ AᵀW I per pixel and channel over the object's crop.
 
-    Rows of A are `mueller.analyzer`, W the inverse variances; the covariance is (AᵀWA)⁻¹. Three angles
-    are solved exactly; with more, the mean residual is kept as a check.
-
-    Parameters
-    ----------
-    radiance
-        The shots (K, H, W, 3), each on its own grid.
-    alignment
-        Where each lies on the reference grid.
-    gains
-        What each is divided by.
-    object_
-        Its crop is solved.
-    settings
-        From where on a pixel is flagged.
+    Rows of A are `mueller.analyzer`, W the inverse variances; the covariance is (AᵀWA)⁻¹. Three angles are solved
+    exactly; with more, the mean residual is stored as a check.
 
     Raises
     ------
@@ -87,45 +78,18 @@ def solve(
     ----------
     Collett, Polarized Light, ch. 5; Tyo, Design of optimal polarimeters, Applied Optics 2002.
     """
-    angle = radiance.angle if gains.found_angle is None else gains.found_angle
-    weights_of = mueller.analyzer(angle + gains.angle_correction)  # (K, 3)
-    condition = np.linalg.cond(weights_of)
-    if condition > _MOST_CONDITION:
-        angles = ", ".join(f"{np.degrees(a):.4g}°" for a in angle)
-        raise CaptureError(
-            f"polarizer angles {angles} do not determine the Stokes parameters (condition {condition:.0f}, "
-            f"at most {_MOST_CONDITION:g}); shoot angles spread over 180°, such as 0°, 45°, 90°"
-        )
+    analyzers = mueller.analyzer(calibration.angle)  # (K, 3)
+    _check_condition(analyzers, calibration.angle - calibration.ring.correction)
     lens = radiance.equipment.distortion if settings.undistort else None
     height, width = radiance.value.shape[1:3]
     crop = object_.crop if lens is None else distortion.box_of(lens, object_.crop, (width, height))
     x0, y0, x1, y1 = crop
-    size = y1 - y0, x1 - x0
-    stokes, covariance = np.empty((3, *size, 3), np.float32), np.empty((6, *size, 3), np.float32)
-    quality = np.empty(size, np.uint8)
-    residual = np.empty(size, np.float32) if len(radiance.angle) > 3 else None
-    solve_ = _exact if len(radiance.angle) == 3 else _weighted_least_squares
-    block = max(_LEAST_ROWS, _BLOCK // max(x1 - x0, 1))
-    register = partial(_register, radiance, alignment, gains, [_flagged(shot) for shot in radiance.quality], lens)
-    registered = np.empty((2, len(radiance.angle), min(block, y1 - y0), x1 - x0, 3), np.float32)
-    for top in range(y0, y1, block):
-        rows = slice(top - y0, min(top + block, y1) - y0)
-        value, variance = (shots[:, : rows.stop - rows.start] for shots in registered)
-        seen = register((x0, top, x1, rows.stop + y0), value, variance)
-        solved, doubt = stokes[:, rows], covariance[:, rows]
-        solve_(weights_of, value, variance, solved, doubt)
-        if residual is not None:
-            fitted = np.einsum("kj,jhwc->khwc", weights_of, solved)
-            difference = np.abs(value - fitted).sum(3).mean(0)
-            residual[rows] = difference / np.maximum(solved[0].sum(2), 1e-9)
-        if radiance.equipment.extinction is not None:
-            _undilute(solved, doubt, radiance.equipment.extinction)
-        quality[rows] = _judged(solved, doubt, seen, settings)
+    shots = _Shots(radiance, alignment.transform, calibration.gains.gain, lens)
+    stokes, covariance, quality, residual = _solve_in_blocks(shots, analyzers, crop, settings)
     mask = object_.mask[y0:y1, x0:x1]
     if lens is not None:
         mask = warp(object_.mask.astype(np.uint8), np.eye(3), crop, order=1, lens=lens) > 0.5
     view = radiance.view
-    body = _body(radiance, alignment, gains, stokes, quality, crop, lens) if gains.crossed is not None else None
     return StokesImage(
         stokes=stokes,
         covariance=covariance,
@@ -139,115 +103,154 @@ def solve(
             known=view.known,
         ),
         residual=residual,
-        body=body,
+        body=_body(shots, alignment.crossed, calibration.crossed, stokes, quality, crop),
     )
+
+
+def _check_condition(analyzers: Floats, angle: Floats) -> None:
+    """CaptureError for angles (K,) rad that do not determine S0, S1 and S2."""
+    condition = np.linalg.cond(analyzers)
+    if condition > _MOST_CONDITION:
+        angles = ", ".join(f"{np.degrees(a):.4g}°" for a in angle)
+        raise CaptureError(
+            f"polarizer angles {angles} do not determine the Stokes parameters (condition {condition:.0f}, "
+            f"at most {_MOST_CONDITION:g}); shoot angles spread over 180°, such as 0°, 45°, 90°"
+        )
+
+
+@dataclass(frozen=True)
+class _Shots:
+    """The shots, and the mapping from the reference grid to each."""
+
+    radiance: AngleStack
+    transform: Floats  # (K, 3, 3)
+    gain: Floats  # (K, 3)
+    lens: Distortion | None
+
+
+def _solve_in_blocks(
+    shots: _Shots, analyzers: Floats, crop: Box, settings: StokesSettings
+) -> tuple[Floats, Floats, Bits, Floats | None]:
+    """Stokes parameters (3, h, w, 3), covariance (6, h, w, 3), quality (h, w) and, for K > 3, residual (h, w)."""
+    x0, y0, x1, y1 = crop
+    size, count = (y1 - y0, x1 - x0), len(analyzers)
+    stokes, covariance = np.empty((3, *size, 3), np.float32), np.empty((6, *size, 3), np.float32)
+    quality = np.empty(size, np.uint8)
+    residual = np.empty(size, np.float32) if count > 3 else None
+    solve_ = _exact if count == 3 else _weighted_least_squares
+    block = max(_LEAST_ROWS, _BLOCK // max(size[1], 1))
+    memory = np.empty((2, count, min(block, size[0]), size[1], 3), np.float32)
+    flags = [_flagged(quality_) for quality_ in shots.radiance.quality]
+    for top in range(y0, y1, block):
+        rows = slice(top - y0, min(top + block, y1) - y0)
+        value, variance = (part[:, : rows.stop - rows.start] for part in memory)
+        flagged = _register(shots, flags, (x0, top, x1, rows.stop + y0), value, variance)
+        solved, doubt = stokes[:, rows], covariance[:, rows]
+        solve_(analyzers, value, variance, solved, doubt)
+        if residual is not None:
+            fitted = np.einsum("kj,jhwc->khwc", analyzers, solved)
+            difference = np.abs(value - fitted).sum(3).mean(0)
+            residual[rows] = difference / np.maximum(solved[0].sum(2), 1e-9)
+        if shots.radiance.equipment.extinction is not None:
+            _undilute(solved, doubt, shots.radiance.equipment.extinction)
+        quality[rows] = _judged(solved, doubt, flagged, settings)
+    return stokes, covariance, quality, residual
 
 
 def _body(
-    radiance: AngleStack,
-    alignment: Alignment,
-    gains: Gains,
-    stokes: Floats,
-    seen: Bits,
-    crop: tuple[int, int, int, int],
-    lens: Distortion | None,
-) -> MaskedImage:
-    """S0 without what the surface mirrors (h, w, 3): the crossed shot, which has none of it, registered and scaled."""
-    assert radiance.crossed is not None and alignment.crossed is not None and gains.crossed is not None
-    picture, transform, share = radiance.crossed.picture, alignment.crossed, gains.crossed.astype(np.float32)
-    clipped = (seen & np.uint8(Quality.CLIPPED)) > 0  # nothing is known of polarization there: it faces the camera
-    across = np.where(clipped[..., None], 0, crossing.polarized(stokes[1], stokes[2], radiance.crossed.angle))
-    registered = _overlaid(picture.value, transform, radiance.sensor.site_px, crop, lens)
-    value = crossing.body_light(registered * share, across)
-    variance = np.maximum(warp(picture.variance, transform, crop, 1, lens), np.float32(1e-14)) * share**2
+    shots: _Shots, transform: Floats | None, factor: Floats | None, stokes: Floats, seen: Bits, crop: Box
+) -> MaskedImage | None:
+    """S0 without mirrored light (h, w, 3): the crossed shot, which has none, registered and times its factor (3,)."""
+    crossed = shots.radiance.crossed
+    if crossed is None or transform is None or factor is None:
+        return None
+    picture, factor = crossed.picture, factor.astype(np.float32)
+    clipped = (seen & np.uint8(Quality.CLIPPED)) > 0  # polarization is unknown there, and small: it faces the camera
+    across = np.where(clipped[..., None], 0, crossing.polarized(stokes[1], stokes[2], crossed.angle))
+    value = crossing.body_light(_resampled(shots, picture.value, transform, crop) * factor, across)
+    variance = np.maximum(warp(picture.variance, transform, crop, 1, shots.lens), _LEAST_VARIANCE) * factor**2
     quality: Bits = np.zeros(value.shape[:2], np.uint8)
-    for bit, plane in _flagged(picture.quality):
-        quality |= np.where(warp(plane, transform, crop, 1, lens) > 0.01 * bit, np.uint8(bit), np.uint8(0))
-    inside = covered(picture.value.shape[:2], transform, crop, lens=lens)
-    return MaskedImage(
-        value.astype(np.float32), variance, quality | np.where(inside, np.uint8(0), np.uint8(Quality.OUTSIDE))
-    )
+    _add_flags(quality, _flagged(picture.quality), transform, crop, shots.lens)
+    _add_outside(quality, picture.quality.shape, transform, crop, shots.lens)
+    return MaskedImage(value.astype(np.float32), variance, quality)
 
 
 def _flagged(quality: Bits) -> list[tuple[Quality, Bits]]:
-    """The bits that pixels of a shot (H, W) bring with them, each with the pixels that do."""
+    """The bits of a shot (H, W) that are resampled, each with its plane."""
     planes = [(bit, quality & np.uint8(bit)) for bit in (Quality.CLIPPED, Quality.GHOST)]
     return [(bit, plane) for bit, plane in planes if plane.any()]
 
 
+def _add_flags(
+    quality: Bits, flags: list[tuple[Quality, Bits]], transform: Floats, box: Box, lens: Distortion | None
+) -> None:
+    for bit, plane in flags:
+        quality |= np.where(warp(plane, transform, box, 1, lens) > 0.01 * bit, np.uint8(bit), np.uint8(0))
+
+
+def _add_outside(quality: Bits, shape: tuple[int, int], transform: Floats, box: Box, lens: Distortion | None) -> None:
+    inside = covered(shape, transform, box, lens=lens)
+    if not inside.all():
+        quality |= np.where(inside, np.uint8(0), np.uint8(Quality.OUTSIDE))
+
+
 def _register(
-    radiance: AngleStack,
-    alignment: Alignment,
-    gains: Gains,
-    flags: Flags,
-    lens: Distortion | None,
-    box: tuple[int, int, int, int],
-    values: Floats,
-    variances: Floats,
+    shots: _Shots, flags: list[list[tuple[Quality, Bits]]], box: Box, values: Floats, variances: Floats
 ) -> Bits:
     """Every shot over its gain on a box of the reference grid and its variance, into (K, h, w, 3) each; its quality."""
-    x0, y0, x1, y1 = box
-    size = y1 - y0, x1 - x0
-    quality: Bits = np.zeros(size, np.uint8)
+    radiance, lens, width = shots.radiance, shots.lens, box[2] - box[0]
+    quality: Bits = np.zeros((box[3] - box[1], width), np.uint8)
     mosaic = radiance.offset_px is not None
-    part = alignment.transform[:, :2, 2] % 1
+    part = shots.transform[:, :2, 2] % 1
     shares = np.prod(part**2 + (1 - part) ** 2, axis=1).mean()  # alike for all, lest the sharpest shot counts least
-    for k, transform in enumerate(alignment.transform):
-        gain = gains.gain[k].astype(np.float32)
-        if mosaic:  # the mean of two or four neighbours, as is usual: splines ring at the edges of so coarse a grid
+    for k, transform in enumerate(shots.transform):
+        gain = shots.gain[k].astype(np.float32)
+        if mosaic:  # the mean of two or four neighbors, as is usual: splines ring at the edges of so coarse a grid
             shot = warp(radiance.value[k], transform, box, 1, lens)
         else:
-            shot = _overlaid(radiance.value[k], transform, radiance.sensor.site_px, box, lens)
+            shot = _resampled(shots, radiance.value[k], transform, box)
         doubt = warp(radiance.variance[k], transform, box, 1, lens)
-        spread = np.float32(shares if mosaic else 1) / gain**2
-        np.divide(_rows(shot), np.tile(gain, size[1]), out=_rows(values[k]))
-        np.maximum(doubt, np.float32(1e-14), out=variances[k])
-        if (spread != 1).any():
-            _rows(variances[k])[:] *= np.tile(spread, size[1])
-        for bit, plane in flags[k]:
-            quality |= np.where(warp(plane, transform, box, 1, lens) > 0.01 * bit, np.uint8(bit), np.uint8(0))
-        inside = covered(radiance.value.shape[1:3], transform, box, lens=lens)
-        if not inside.all():
-            quality |= np.where(inside, np.uint8(0), np.uint8(Quality.OUTSIDE))
+        scale = np.float32(shares if mosaic else 1) / gain**2
+        np.divide(_rows(shot), np.tile(gain, width), out=_rows(values[k]))
+        np.maximum(doubt, _LEAST_VARIANCE, out=variances[k])
+        if (scale != 1).any():
+            _rows(variances[k])[:] *= np.tile(scale, width)
+        _add_flags(quality, flags[k], transform, box, lens)
+        _add_outside(quality, radiance.quality.shape[1:], transform, box, lens)
     return quality
 
 
 def _rows(picture: Floats) -> Floats:
-    """A picture (h, w, 3) as lines (h, 3 w), the same memory: what goes along a line takes no loop over three."""
+    """A picture (h, w, 3) as lines (h, 3 w), the same memory: NumPy's loops over lines are faster than over three."""
     return picture.reshape(len(picture), -1)
 
 
-def _overlaid(
-    picture: Floats,
-    transform: Floats,
-    site_px: Floats | None,
-    box: tuple[int, int, int, int],
-    lens: Distortion | None,
-) -> Floats:
-    """A shot (H, W, 3) on a box of the reference grid (h, w, 3): every channel where its photosites saw it."""
+def _resampled(shots: _Shots, picture: Floats, transform: Floats, box: Box) -> Floats:
+    """A shot (H, W, 3) on a box of the reference grid (h, w, 3): every channel where its photosites are."""
+    site_px = shots.radiance.sensor.site_px
     if site_px is None or not site_px.any():
-        return warp(picture, transform, box, lens=lens)
+        return warp(picture, transform, box, lens=shots.lens)
     planes = [
-        warp(picture[..., c], np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1]]) @ transform, box, lens=lens)
+        warp(picture[..., c], np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1]]) @ transform, box, lens=shots.lens)
         for c, (x, y) in enumerate(site_px)
     ]
     return np.asarray(cv2.merge(planes))
 
 
-def _exact(weights_of: Floats, value: Floats, variance: Floats, solved: Floats, doubt: Floats) -> None:
-    """The same of three angles, which need no weights: s = A⁻¹ I, and its covariance A⁻¹ diag(var) A⁻ᵀ."""
-    inverse = np.linalg.inv(weights_of)  # (3, K)
+def _exact(analyzers: Floats, value: Floats, variance: Floats, solved: Floats, doubt: Floats) -> None:
+    """Three angles, which need no weights: s = A⁻¹ I, and its covariance A⁻¹ diag(var) A⁻ᵀ."""
+    inverse = np.linalg.inv(analyzers)  # (3, K)
     squares = np.stack([inverse[i] * inverse[j] for i, j in _PAIRS])  # (6, K)
     np.matmul(inverse.astype(np.float32), value.reshape(3, -1), out=solved.reshape(3, -1))
     np.matmul(squares.astype(np.float32), variance.reshape(3, -1), out=doubt.reshape(6, -1))
 
 
-def _weighted_least_squares(weights_of: Floats, value: Floats, variance: Floats, solved: Floats, doubt: Floats) -> None:
+def _weighted_least_squares(analyzers: Floats, value: Floats, variance: Floats, solved: Floats, doubt: Floats) -> None:
     """Stokes parameters (3, h, w, C) and their covariance (6, h, w, C) from both (K, h, w, C) and A (K, 3)."""
     w = 1.0 / variance.astype(np.float64).reshape(len(value), -1)
-    products = np.stack([weights_of[:, i] * weights_of[:, j] for i, j in _PAIRS])
+    products = np.stack([analyzers[:, i] * analyzers[:, j] for i, j in _PAIRS])
     m00, m01, m02, m11, m12, m22 = products @ w  # the symmetric AᵀWA of every pixel
-    right = weights_of.T @ (w * value.reshape(len(value), -1))
+    right = analyzers.T @ (w * value.reshape(len(value), -1))
     c00, c01, c02 = m11 * m22 - m12**2, m02 * m12 - m01 * m22, m01 * m12 - m02 * m11
     determinant = m00 * c00 + m01 * c01 + m02 * c02
     c11, c12, c22 = m00 * m22 - m02**2, m01 * m02 - m00 * m12, m00 * m11 - m01**2
@@ -258,22 +261,17 @@ def _weighted_least_squares(weights_of: Floats, value: Floats, variance: Floats,
         plane[:] = (a * right[0] + b * right[1] + c * right[2]).reshape(plane.shape)
 
 
-def _contrast(extinction: Floats | None) -> Floats:
-    """(3, C) how much of S0, S1, S2 a polarizer of extinction ratios (C,) shows: 1, c, c; c = (E − 1)/(E + 1)."""
-    ratio = np.array([np.inf]) if extinction is None else np.asarray(extinction, np.float64)
-    contrast = (1 - 1 / ratio) / (1 + 1 / ratio)
-    return np.stack([np.ones_like(contrast), contrast, contrast])
-
-
 def _undilute(stokes: Floats, covariance: Floats, extinction: Floats) -> None:
-    """Turn what was seen into what an ideal polarizer would have shown."""
-    up = (1 / _contrast(extinction)).astype(np.float32)  # (3, C)
+    """Scale S1 and S2 to an ideal polarizer's: one of extinction ratio E (C,) shows (E − 1)/(E + 1) of them."""
+    ratio = np.asarray(extinction, np.float64)
+    contrast = (1 - 1 / ratio) / (1 + 1 / ratio)
+    up = (1 / np.stack([np.ones_like(contrast), contrast, contrast])).astype(np.float32)  # (3, C)
     stokes *= up[:, None, None]
     covariance *= np.stack([up[i] * up[j] for i, j in _PAIRS])[:, None, None]
 
 
-def _judged(stokes: Floats, covariance: Floats, quality: Bits, settings: Settings) -> Bits:
-    """Quality bits with what the solution itself betrays."""
+def _judged(stokes: Floats, covariance: Floats, quality: Bits, settings: StokesSettings) -> Bits:
+    """Quality bits (h, w), with those that follow from the solution: ILL_POSED, DARK, METAL."""
     s0, s1, s2 = (_total(plane) for plane in stokes)
     sigma0 = np.sqrt(_total(covariance[0]))
     sigma = np.sqrt((_total(covariance[3]) + _total(covariance[5])) / 2)
@@ -291,18 +289,18 @@ def _total(picture: Floats) -> Floats:
 
 
 def _metal(stokes: Floats, covariance: Floats) -> Bools:
-    """(H, W) bool: channels whose polarization vectors point apart by more than a body's can.
+    """(H, W) whether the polarization of red and blue differs by more than a dielectric's can, at 5σ.
 
     In a dielectric every channel has the same azimuth and a highlight only shortens the vectors; in a
-    conductor the complex index changes with wavelength. Red and blue are compared at 5σ.
+    conductor the complex index changes with wavelength.
     """
     (x0, y0, square0, noise0), (x1, y1, square1, noise1) = (_polarization(stokes, covariance, c) for c in (0, 2))
     enough = np.minimum(square0, square1) > np.float32(_METAL_DOLP**2)
-    apart = np.abs(x0 * y1 - y0 * x1) - np.float32(np.sin(2 * np.radians(_METAL_DEG))) * np.sqrt(square0 * square1)
+    excess = np.abs(x0 * y1 - y0 * x1) - np.float32(np.sin(2 * np.radians(_METAL_DEG))) * np.sqrt(square0 * square1)
     noise0 *= square1
     noise1 *= square0
     noise0 += noise1
-    return np.asarray(enough & (apart > np.float32(_METAL_SIGMA) * np.sqrt(noise0, out=noise0)))
+    return np.asarray(enough & (excess > np.float32(_METAL_SIGMA) * np.sqrt(noise0, out=noise0)))
 
 
 def _polarization(stokes: Floats, covariance: Floats, channel: int) -> tuple[Floats, Floats, Floats, Floats]:

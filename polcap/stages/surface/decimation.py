@@ -49,7 +49,7 @@ def decimate(mesh: Mesh, view: View, share: float, back: Back) -> DecimatedMesh:
     )
     vertices = np.asarray(points, dtype=np.float64)
     height, width = mesh.depth.shape
-    uv = (np.stack(project(view, vertices), -1) + 0.5) / [width, height]
+    uv = (project(view, vertices) + 0.5) / [width, height]
     faces = np.asarray(faces, dtype=np.int32)
     if back == "open":
         faces = faces[face_areas(uv, faces) > 0]  # the others were folded over by a collapse

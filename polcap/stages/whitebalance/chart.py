@@ -1,9 +1,9 @@
 """The ColorChecker Classic's geometry, and its place in an image to a fraction of a pixel.
 
-Chart coordinates (u, v) count patches: patch (row, column) is centred on (column + ½, row + ½), so the
+Chart coordinates (u, v) count patches: patch (row, column) is centered on (column + ½, row + ½), so the
 chart spans 0…6 × 0…4; each patch is a square of side `patch` (its share of the pitch) on a dark card.
 
-The place is found by synthesis: the chart is drawn with its own patch colours through a blurred homography,
+The place is found by synthesis: the chart is drawn with its own patch colors through a blurred homography,
 and the homography, the patch side and the blur are changed until the drawing fits the image
 (Gauss–Newton on every pixel at once, with a robust loss for dust, labels and highlights).
 
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
+from polcap.optics.projection import transform_points
 from polcap.optics.robust import MAD_TO_SIGMA
 
 ROWS, COLUMNS = 4, 6
@@ -42,39 +43,40 @@ class Placement:
     @property
     def pitch_px(self) -> float:
         """Mean distance of neighbouring patches, px."""
-        outline = project(self.homography, _outer(1.0))
+        outline = transform_points(self.homography, _outer(1.0))
         return float(np.sqrt(_area(outline) / (ROWS * COLUMNS)))
 
     def quads(self, share: float = 1.0) -> Floats:
         """(24, 4, 2) corners of each patch, shrunk to `share` of its side; px, from dark skin, row by row."""
         half = share * self.patch / 2
-        return project(self.homography, centers()[:, None] + half * _SQUARE)
+        return transform_points(self.homography, centers()[:, None] + half * _SQUARE)
 
     def corners(self) -> Floats:
-        """(4, 2) outer corners of the outer patches, dark skin first, in the order of reading's clock; px."""
-        return project(self.homography, _outer(self.patch))
+        """(4, 2) outer corners of the outer patches, dark skin first, clockwise on the chart; px."""
+        return transform_points(self.homography, _outer(self.patch))
 
     def turned(self) -> "Placement":
-        """The same rectangle, read upside down."""
+        """The same place, read upside down."""
         half_turn = np.array([[-1.0, 0, COLUMNS], [0, -1.0, ROWS], [0, 0, 1]])
         return Placement(self.homography @ half_turn, self.patch, self.blur, self.explained)
 
     def moved(self, transform: Floats) -> "Placement":
-        """Seen in another image; transform (3, 3) takes this image's px to the other's."""
+        """The place in another image; transform (3, 3) takes this image's px to the other's."""
         return Placement(transform @ self.homography, self.patch, self.blur, self.explained)
 
 
 _SQUARE = np.array([[-1.0, -1.0], [1, -1], [1, 1], [-1, 1]])
+_AROUND = np.array([[-0.3, -0.3], [6.3, -0.3], [6.3, 4.3], [-0.3, 4.3]])  # the compared part, in chart coordinates
 
 
 def centers() -> Floats:
-    """(24, 2) patch centres in chart coordinates."""
+    """(24, 2) patch centers in chart coordinates."""
     v, u = np.mgrid[0:ROWS, 0:COLUMNS] + 0.5
     return np.stack([u.ravel(), v.ravel()], axis=-1)
 
 
 def from_centers(points: Floats) -> Placement:
-    """The placement that brings the patch centres nearest to 24 image points (24, 2) px."""
+    """The placement that brings the patch centers nearest to 24 image points (24, 2) px."""
     return Placement(_homography(centers(), points), USUAL_PATCH, _GREATEST_BLUR / 3, 0.0)
 
 
@@ -83,43 +85,30 @@ def from_corners(points: Floats, patch: float = USUAL_PATCH) -> Placement:
     return Placement(_homography(_outer(patch), points), patch, _GREATEST_BLUR / 3, 0.0)
 
 
-def project(homography: Floats, points: Floats) -> Floats:
-    """Homography (3, 3) of points (..., 2)."""
-    image = points @ homography[:, :2].T + homography[:, 2]
-    return np.asarray(image[..., :2] / image[..., 2:])
-
-
 def is_view(homography: Floats) -> bool:
     """Whether a flat chart can look like this homography (3, 3): convex, not mirrored, nowhere behind the camera."""
     corners = _outer(1.0)
     depth = corners @ homography[2, :2] + homography[2, 2]
     if not np.isfinite(homography).all() or not (depth * depth[0] > 0).all():
         return False
-    corner = project(homography, corners)
+    corner = transform_points(homography, corners)
     side = np.roll(corner, -1, axis=0) - corner
     after = np.roll(side, -1, axis=0)
     return bool((side[:, 0] * after[:, 1] - side[:, 1] * after[:, 0] > 0).all())
 
 
 def refine(image: Floats, start: Placement, steps: int = 12) -> Placement:
-    """The placement that draws `image` best, from one that is right within a third of a patch.
+    """The placement whose drawing fits the image best, in `steps` at most from one that is right to a third of a patch.
 
-    Parameters
-    ----------
-    image
-        (H, W, 3) linear, white about 1. Pixels per patch: 8 or more. Light mixes linearly at an edge,
-        but the difference is judged through a gamma of 2.2, so that dark patches count.
-    start
-        The placement to begin with.
-    steps
-        At most so many.
+    The image (H, W, 3) is linear, with white about 1 and 8 pixels per patch or more. Light mixes linearly at an edge,
+    but the difference is judged through a gamma of 2.2, so that dark patches count.
     """
-    frame = _frame(start)  # image px → about the chart's own, so that the steps are well scaled
-    at = _pixels(image.shape[:2], start)
+    frame = _frame(start)  # image px → about the chart's own, so that all unknowns have one scale
+    at = pixels_inside(transform_points(start.homography, _AROUND), image.shape)
     value = np.ascontiguousarray(image[at[:, 1], at[:, 0]].T, np.float32)
     if value.shape[1] < 24 * 16:
         return start
-    point = project(frame, at.astype(np.float64)).T
+    point = transform_points(frame, at.astype(np.float64)).T
     inverse = np.linalg.inv(frame @ start.homography)
     inverse = inverse / inverse[2, 2]
     least_blur = min(_PIXEL_BLUR_PX / start.pitch_px, _GREATEST_BLUR)
@@ -130,7 +119,7 @@ def refine(image: Floats, start: Placement, steps: int = 12) -> Placement:
         if drawing is None:
             return start
         normal, right = drawing.equations()
-        if not np.trace(normal) > 0:  # even all over: nothing tells
+        if not np.trace(normal) > 0:  # an even picture
             return start
         damping = 1e-3 * np.diag(normal) + 1e-9 * np.trace(normal)
         change = np.linalg.solve(normal + np.diag(damping), right)
@@ -146,11 +135,11 @@ def refine(image: Floats, start: Placement, steps: int = 12) -> Placement:
 
 @dataclass(frozen=True)
 class _Drawing:
-    """A chart drawn over N pixels, float32: what is left of them, and how it changes with the ten unknowns."""
+    """A chart drawn over N pixels, float32: the residual and its derivatives by the ten unknowns."""
 
     seen: Floats  # (3, N) encoded
     residual: Floats  # (3, N) seen − drawn
-    contrast: Floats  # (3, N) derivative of what is drawn by cover
+    contrast: Floats  # (3, N) derivative of the drawing by cover
     cover_by: Floats  # (10, N) derivative of cover by the homography's eight numbers, patch and blur
 
     def equations(self) -> tuple[Floats, Floats]:
@@ -164,7 +153,7 @@ class _Drawing:
         return ((self.cover_by * slope) @ self.cover_by.T).astype(np.float64), (self.cover_by @ pull).astype(np.float64)
 
     def explained(self) -> float:
-        """Share of the variance that is drawn."""
+        """Share of the variance that the drawing accounts for."""
         spread = self.seen - np.median(self.seen, axis=1)[:, None]
         return 1 - float(np.mean(np.minimum(self.residual**2, 0.25)) / max(float(np.mean(spread**2)), 1e-9))
 
@@ -228,7 +217,7 @@ def _box(offset: Floats, patch: float, blur: float) -> tuple[Floats, Floats, Flo
 
 
 def _colors(value: Floats, cover: Floats, cell: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Color of each patch (24, 3) and of the card (3,), as pixels (3, N) show them now."""
+    """Color of each patch (24, 3) and of the card (3,), medians of pixels (3, N)."""
     bare = cover < max(0.1, float(np.percentile(cover, 2)))
     card = np.median(value[:, bare], axis=1)
     colors = np.tile(card, (ROWS * COLUMNS, 1))
@@ -243,29 +232,26 @@ def _colors(value: Floats, cover: Floats, cell: NDArray[np.intp]) -> tuple[Float
 
 
 def _medians(value: Floats) -> Floats:
-    """Of rows (C, N); np.median takes longer to begin than these take."""
+    """Medians of rows (C, N), faster than np.median on so few values."""
     low, high = (value.shape[1] - 1) // 2, value.shape[1] // 2
     ordered = np.partition(value, (low, high), axis=1)
     return np.asarray((ordered[:, low] + ordered[:, high]) / 2)
 
 
-def _pixels(shape: tuple[int, int], placement: Placement) -> NDArray[np.int_]:
-    """(N, 2) pixels x, y on and a little around the chart."""
-    outline = project(placement.homography, np.array([[-0.3, -0.3], [6.3, -0.3], [6.3, 4.3], [-0.3, 4.3]]))
-    x0, y0 = np.maximum(np.floor(outline.min(axis=0)).astype(int), 0)
-    x1, y1 = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + 1, [shape[1], shape[0]])
+def pixels_inside(quad: Floats, shape: tuple[int, ...]) -> NDArray[np.int_]:
+    """(N, 2) x, y of the pixels of a picture (H, W, …) in a convex quad (4, 2) px, clockwise."""
+    x0, y0 = np.maximum(np.floor(quad.min(axis=0)).astype(int), 0)
+    x1, y1 = np.minimum(np.ceil(quad.max(axis=0)).astype(int) + 1, [shape[1], shape[0]])
     y, x = np.mgrid[y0 : max(y1, y0), x0 : max(x1, x0)]
-    at = np.stack([x.ravel(), y.ravel()], axis=-1)
-    side = np.roll(outline, -1, axis=0) - outline
-    inside = np.ones(len(at), bool)
-    for corner, (dx, dy) in zip(outline, side, strict=True):
-        inside &= dx * (at[:, 1] - corner[1]) - dy * (at[:, 0] - corner[0]) >= 0
-    return at[inside]
+    inside = np.ones(x.shape, bool)
+    for (ax, ay), (bx, by) in zip(quad, np.roll(quad, -1, axis=0), strict=True):
+        inside &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= 0
+    return np.stack([x[inside], y[inside]], axis=-1)
 
 
 def _frame(placement: Placement) -> Floats:
-    """Image px → units of the pitch about the chart's centre, (3, 3)."""
-    middle = project(placement.homography, np.array([COLUMNS / 2, ROWS / 2]))
+    """Image px → units of the pitch about the chart's center, (3, 3)."""
+    middle = transform_points(placement.homography, np.array([COLUMNS / 2, ROWS / 2]))
     pitch = placement.pitch_px
     return np.array([[1 / pitch, 0, -middle[0] / pitch], [0, 1 / pitch, -middle[1] / pitch], [0, 0, 1]])
 
@@ -276,12 +262,12 @@ def _outer(patch: float) -> Floats:
 
 
 def _homography(source: Floats, target: Floats) -> Floats:
-    """Direct linear transform of (N ≥ 4, 2) points, on normalised coordinates."""
+    """Direct linear transform of (N ≥ 4, 2) points, on normalized coordinates."""
     frames = []
     for points in (source, target):
         (x, y), unit = points.mean(axis=0), 1 / (points.std() + 1e-12)
         frames.append(np.array([[unit, 0, -x * unit], [0, unit, -y * unit], [0, 0, 1]]))
-    (u, v), (x, y) = project(frames[0], source).T, project(frames[1], target).T
+    (u, v), (x, y) = transform_points(frames[0], source).T, transform_points(frames[1], target).T
     one, zero = np.ones_like(u), np.zeros_like(u)
     rows = np.concatenate(
         [

@@ -1,4 +1,4 @@
-"""Whether a part of what was taken for the object is a ColorChecker that was not found."""
+"""Whether a part of the object's mask is a ColorChecker that the search did not find."""
 
 import cv2
 import numpy as np
@@ -8,11 +8,11 @@ from polcap.errors import ChartError
 from polcap.images import AngleStack, ChartReference
 from polcap.stages.whitebalance import chart, patches
 
-_LEAST_SHARE = 0.05  # of the mask; less than that spoils little
-_LEAST_PITCH_PX = 6.0  # of patches that can be told from texture
+_LEAST_SHARE = 0.05  # of the mask; less spoils little
+_LEAST_PITCH_PX = 6.0  # of patches that differ from texture
 _MOST_SIDE_PX = 320  # the part is averaged down to this
 _FILLED = 0.9  # of its rectangle, by a flat card
-_ASPECT = (1.15, 1.8)  # of a card of 6 × 4 patches with its border, seen askew
+_ASPECT = (1.15, 1.8)  # of a card of 6 × 4 patches with its border, seen obliquely
 _EXPLAINED = 0.75  # of its variance by 24 flat patches on a card; of 106 textures of that outline 17 have that
 _DELTA_E = 15.0  # of its colors, as `whitebalance.max_delta_e`: the textures have 20 and more
 _PATCH_SHARE = 0.6  # of a patch's side that is sampled
@@ -29,7 +29,7 @@ def share(radiance: AngleStack, mask: NDArray[np.bool_], reference: ChartReferen
 def _is_chart(radiance: AngleStack, part: NDArray[np.bool_], reference: ChartReference) -> bool:
     y, x = np.nonzero(part)
     center, (a, b), turn = cv2.minAreaRect(np.stack([x, y], axis=-1).astype(np.float32))
-    long, short = max(a, b) + 1, min(a, b) + 1  # from pixel centres to their edges
+    long, short = max(a, b) + 1, min(a, b) + 1  # from pixel centers to their edges
     if not _ASPECT[0] < long / short < _ASPECT[1] or len(x) < _FILLED * long * short:
         return False
     if long / chart.COLUMNS < _LEAST_PITCH_PX:
@@ -54,7 +54,7 @@ def _is_chart(radiance: AngleStack, part: NDArray[np.bool_], reference: ChartRef
     return any(_delta_e(way, reference) < _DELTA_E for way in (seen, seen.turned()))
 
 
-def _delta_e(seen: patches.Samples, reference: ChartReference) -> float:
+def _delta_e(seen: patches.PatchSamples, reference: ChartReference) -> float:
     try:
         return patches.fit(seen, reference).mean
     except ChartError:

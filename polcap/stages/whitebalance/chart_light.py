@@ -1,8 +1,8 @@
-"""In: a chart's place and the slope of the light across it. Out: how it stands to the camera and to the flash.
+"""The chart's plane, the flash's place and the light's falloff, from the chart's outline and the light across it.
 
-A flash at L lights points P of a chart with normal n as n·(L − P)/|L − P|³. Across the chart n·(L − P) stays the same,
-so the light's slope tells over what point of its plane the flash stands: per patch it is 3 pitches over the distance,
-times the sine of the angle from the normal to the flash. The chart's turn itself comes from its outline: a
+A flash at L lights points P of a chart with normal n as n·(L − P)/|L − P|³. Across the chart n·(L − P) is constant,
+so the slope of the light gives the flash's position over the chart's plane: per patch it is 3 pitches over the
+distance, times the sine of the angle from the normal to the flash. The chart's turn comes from its outline: a
 homography's first two columns point along rows and columns, whatever the card's sides are.
 
 References
@@ -19,11 +19,11 @@ from polcap.optics import point_light
 from polcap.stages.whitebalance import chart, patches
 from polcap.stages.whitebalance.chart import Placement
 
-# 1σ before anything is seen: the flash right of the lens and above it [distances], the falloff's power. A hot shoe
-# stands .1 to .15 m above the lens, objects at about 1 m; cos⁴ is a lens's natural falloff, 0 a corrected one.
+# 1σ before the measurement: the flash right of the lens and above it [distances], the falloff's power. A hot shoe
+# is .1 to .15 m above the lens, objects at about 1 m; cos⁴ is a lens's natural falloff, 0 a corrected one.
 _PRIOR = np.array([0.1, 0.1, 2.0])
-# 1σ of the chart's turn as its outline has it [rad]: corners within .2 % of the chart, lenses that bend by 1 %; and the
-# focal length's where the sensor's size is a guess, a share that the turn is off by too
+# 1σ of the chart's turn by its outline [rad]: corners within .2 % of the chart, lenses that bend by 1 %; and of the
+# focal length where the sensor's size is a guess, relative; the turn has the same relative error
 _TURN_SIGMA, _FOCAL_SPREAD = 0.03, 0.3
 _FARTHEST = 0.3  # a flash beyond is no flash at the camera [distances]
 _LIGHT_PER_DELTA_E = 0.02  # a patch that is off by ΔE2000 = 1 is off by about 2 % in Y: half of it lightness
@@ -34,20 +34,12 @@ _STRAIGHT = np.linalg.pinv(np.column_stack([np.ones(24), patches.position()]))  
 
 
 def measure(place: Placement, view: View, slope: Floats, delta_e: float) -> ChartLight:
-    """The chart's plane, the likeliest place of the flash and falloff of the light, and their covariance.
+    """The chart's plane, the most probable place of the flash and falloff of the light, and their covariance.
 
-    Parameters
-    ----------
-    place
-        Of the chart.
-    view
-        The camera over the same pixels.
-    slope
-        (2,) relative change of the light per patch, to the chart's right and down, from the white patch.
-    delta_e
-        Mean residual of the patches: how well the slope is known.
+    slope (2,) is the relative change of the light per patch, to the chart's right and down, from the white patch;
+    delta_e, the mean residual of the patches, gives its error.
     """
-    outlined = _Plane(*_plane(place, view))
+    outlined = _ChartPlane(*_plane(place, view))
     aslant = np.hypot(*outlined.normal[:2]) / outlined.normal[2]  # tangent of the turn from the image's plane
     turn = _TURN_SIGMA if view.known else float(np.hypot(_TURN_SIGMA, _FOCAL_SPREAD * min(aslant, 1.0)))
     prior = np.diag(1 / np.array([*_PRIOR, turn, turn]) ** 2)
@@ -61,32 +53,32 @@ def measure(place: Placement, view: View, slope: Floats, delta_e: float) -> Char
         covariance = np.linalg.inv(prior + by_state.T @ known @ by_state)
         state = covariance @ by_state.T @ known @ (slope - here + by_state @ state)
         state[:2] = np.clip(state[:2], -_FARTHEST, _FARTHEST)
-    likely = outlined.turned(state[3:])
-    return ChartLight(likely.point[patches.WHITE], likely.normal, state[:3], covariance)
+    found = outlined.turned(state[3:])
+    return ChartLight(found.point[patches.WHITE], found.normal, state[:3], covariance)
 
 
 @dataclass(frozen=True)
-class _Plane:
-    point: Floats  # (24, 3) patch centres, in distances of the chart's middle, camera frame
+class _ChartPlane:
+    point: Floats  # (24, 3) patch centers, in distances of the chart's middle, camera frame
     normal: Floats  # (3,)
 
-    def turned(self, turn: Floats) -> "_Plane":
-        """About its middle, by a small turn (2,) about x and y [rad]."""
+    def turned(self, turn: Floats) -> "_ChartPlane":
+        """Turned about its middle by a small turn (2,) about x and y [rad]."""
         from scipy.spatial.transform import Rotation  # here: importing it costs .2 s of every start
 
         rotation, middle = Rotation.from_rotvec([*turn, 0.0]), self.point.mean(axis=0)
-        return _Plane(middle + rotation.apply(self.point - middle), rotation.apply(self.normal))
+        return _ChartPlane(middle + rotation.apply(self.point - middle), rotation.apply(self.normal))
 
 
-def _slope(outlined: _Plane, state: Floats) -> Floats:
-    """Relative change (2,) of a flash's light per patch, as the fit of a straight slope sees it."""
+def _slope(outlined: _ChartPlane, state: Floats) -> Floats:
+    """Relative change (2,) of a flash's light per patch, by the fit of a straight slope."""
     plane = outlined.turned(state[3:])
     level, *slope = _STRAIGHT @ point_light.irradiance(plane.point, state[:2], state[2], plane.normal)
     return np.asarray(np.array(slope) / level)
 
 
 def _plane(place: Placement, view: View) -> tuple[Floats, Floats]:
-    """Patch centres (24, 3) in distances of the chart's middle, and the chart's normal (3,), camera frame."""
+    """Patch centers (24, 3) in distances of the chart's middle, and the chart's normal (3,), camera frame."""
     camera = np.array([[view.focal, 0, view.center[0]], [0, view.focal, view.center[1]], [0, 0, 1]])
     pose = np.diag([1.0, -1.0, -1.0]) @ np.linalg.solve(camera, place.homography)
     pose = -pose / (pose[2] @ [chart.COLUMNS / 2, chart.ROWS / 2, 1])

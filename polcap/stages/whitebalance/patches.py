@@ -1,4 +1,4 @@
-"""In: radiance and a chart's place. Out: the colour of each patch, which of them may serve, and their matrix.
+"""The colors of a chart's patches, the reasons to leave patches out, and their matrix.
 
 A patch serves unless it is clipped, outside the picture, uneven (an edge of a shadow or of a finger lies on it), or
 at odds with the matrix that suits most of the others (it is hidden, in shade, or it shines).
@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from polcap.errors import ChartError
 from polcap.images import Bits, ChartReference, Floats, Quality
@@ -36,28 +35,28 @@ class PatchUse(IntEnum):
 
 @dataclass(frozen=True)
 class ChartFit:
-    """What the patches say."""
+    """A color matrix by the patches of one shot."""
 
     fit: color.MatrixFit
     use: Bits  # (24,) PatchUse
-    mean: float  # ΔE2000 over all patches that are seen unclipped, those left out too: judges whether it is a chart
+    mean: float  # ΔE2000 over all unclipped patches, those left out too: judges whether it is a chart
     color: Floats  # (24, 3) S0 of the patches, camera channels
 
 
 @dataclass(frozen=True)
-class Samples:
-    """What one shot shows of the patches, before anything is fitted."""
+class PatchSamples:
+    """The colors of the patches in one shot, before anything is fitted."""
 
     color: Floats  # (24, 3) S0 of the patches, camera channels
     use: Bits  # (24,) PatchUse
 
-    def turned(self) -> "Samples":
+    def turned(self) -> "PatchSamples":
         """The same chart, read upside down."""
-        return Samples(self.color[::-1], self.use[::-1])
+        return PatchSamples(self.color[::-1], self.use[::-1])
 
 
-def fit(samples: Samples, reference: ChartReference) -> ChartFit:
-    """The matrix that one shot's patches ask for to become a chart's colors.
+def fit(samples: PatchSamples, reference: ChartReference) -> ChartFit:
+    """The matrix (3, 3) from one shot's patches to a chart's colors.
 
     Raises
     ------
@@ -69,7 +68,7 @@ def fit(samples: Samples, reference: ChartReference) -> ChartFit:
     error = color.fitting(seen, reference.rec709, position(), use == PatchUse.USED)
     odd = error > max(_LEAST_ODD, _ODD * float(np.median(error[use == PatchUse.USED])))
     use = np.where((use == PatchUse.USED) & odd, PatchUse.ODD, use).astype(np.uint8)
-    if (use == PatchUse.USED).sum() < _LEAST:  # no matrix suits most of them: then all are to say how badly
+    if (use == PatchUse.USED).sum() < _LEAST:  # no matrix suits most of them: then all count
         use = np.where(use == PatchUse.ODD, PatchUse.USED, use).astype(np.uint8)
     found = color.fit_matrix(seen, reference.rec709, position(), use == PatchUse.USED)
     every = np.where(use == PatchUse.ODD, np.minimum(error, _MOST_COUNTED), found.delta_e)
@@ -83,7 +82,7 @@ def predicted(found: ChartFit, reference: ChartReference) -> Floats | None:
 
 
 def residual(found: ChartFit, reference: ChartReference) -> float:
-    """Mean ΔE2000 that the patches in use have by the colors of a chart."""
+    """Mean ΔE2000 of the patches in use against the colors of a chart."""
     used = found.use == PatchUse.USED
     return float(np.nanmean(color.fit_matrix(found.color, reference.rec709, position(), used).delta_e))
 
@@ -93,24 +92,15 @@ def position() -> Floats:
     return np.asarray(chart.centers() - chart.centers()[WHITE])
 
 
-def sample(value: Floats, quality: Bits, place: Placement, share: float) -> Samples:
-    """S0 of each patch: twice the trimmed mean over its inner part.
+def sample(value: Floats, quality: Bits, place: Placement, share: float) -> PatchSamples:
+    """S0 of each patch in a shot (H, W, 3) with its quality (H, W): twice the trimmed mean over its inner part.
 
-    Parameters
-    ----------
-    value
-        (H, W, 3) radiance of the shot.
-    quality
-        (H, W) its bits.
-    place
-        Of the chart.
-    share
-        Of each patch's side that is sampled.
+    `share` of each patch's side is sampled.
     """
     color_, uneven = np.zeros((24, 3)), np.zeros(24)
     use = np.zeros(24, np.uint8)
     for index, quad in enumerate(place.quads(share)):
-        x, y = _inside(quad, value.shape[:2])
+        x, y = chart.pixels_inside(quad, value.shape[:2]).T
         if len(x) < 4:
             use[index] = PatchUse.OUTSIDE
             continue
@@ -123,14 +113,11 @@ def sample(value: Floats, quality: Bits, place: Placement, share: float) -> Samp
             use[index] = PatchUse.CLIPPED
     light = color_.sum(axis=1)
     too_uneven = uneven > _UNEVEN * light + _UNEVEN_WHITE * light.max()
-    return Samples(color_, np.where((use == PatchUse.USED) & too_uneven, PatchUse.UNEVEN, use).astype(np.uint8))
+    return PatchSamples(color_, np.where((use == PatchUse.USED) & too_uneven, PatchUse.UNEVEN, use).astype(np.uint8))
 
 
 def left_out(use: Bits) -> str:
-    """The patches that did not serve and why, of their use (24,), for a message; empty where all did.
-
-    Numbers count from dark skin.
-    """
+    """The patches that did not serve and why, by their use (24,), for a message; empty where all did."""
     words = {
         PatchUse.CLIPPED: "over-exposed",
         PatchUse.OUTSIDE: "outside the picture",
@@ -163,14 +150,3 @@ def _check(use: Bits) -> None:
         f"{uneven} partly hidden or in shade), at most {24 - _LEAST} may be; add a shorter exposure to the "
         "bracket, or show the whole chart"
     )
-
-
-def _inside(quad: Floats, shape: tuple[int, ...]) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
-    """x, y of the pixels whose centres lie in a convex quad (4, 2) px."""
-    x0, y0 = np.maximum(np.ceil(quad.min(axis=0)).astype(int), 0)
-    x1, y1 = np.minimum(np.floor(quad.max(axis=0)).astype(int) + 1, [shape[1], shape[0]])
-    y, x = np.mgrid[y0 : max(y1, y0), x0 : max(x1, x0)]
-    inside = np.ones(x.shape, bool)
-    for (ax, ay), (bx, by) in zip(quad, np.roll(quad, -1, axis=0), strict=True):
-        inside &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= 0
-    return x[inside], y[inside]

@@ -10,7 +10,8 @@ from polcap.images import Quality, SensorImage, Shot
 from polcap.optics.registration import squared_gradient
 from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.stages import hdr
-from polcap.stages.hdr import links, noise
+from polcap.stages.hdr import noise
+from polcap.stages.hdr.bracket import Bracket, compare
 from polcap.stages.hdr.planes import Reader, signals
 from tests.stages.hdr.brackets import (
     BLACK,
@@ -125,12 +126,12 @@ def test_hand_held_nikon_bracket():
     assert ghost[:1150].mean() < 0.001
     # frame against frame, registered and on one scale, where nothing moved
     shot = Shot(0.0, tuple(frames))
-    found = links.measure(shot, [0, 1, 2], 1, noise.Lines(), Reader((), decode), 0.98, 60.0)
+    found = compare(Bracket(shot, (0, 1, 2), 1), noise.Lines(), Reader((), decode, 0.98), 60.0)
     own, first = signals(frames[1].load(), 0.98).rows(slice(None)), found.estimate
     assert found.frames is not None
     for e in (0, 2):
         link, (other, gain) = found.links[e], (found.frames[e].signals, found.frames[e].gain)
-        assert link.moved is not None
+        assert link.motion is not None
         usable = other.usable & found.frames[1].signals.usable & ~ghost
         z = []
         for c, ratio in enumerate(link.ratio):

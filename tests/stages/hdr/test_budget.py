@@ -9,7 +9,7 @@ import pytest
 from polcap.errors import SettingError
 from polcap.images import Exif, SensorImage
 from polcap.stages import hdr
-from polcap.stages.hdr import budget
+from polcap.stages.hdr import planes
 from tests.stages.hdr.brackets import (
     PicturedFrame,
     capture,
@@ -25,19 +25,19 @@ def test_little_memory_gives_the_same_pixels_and_less_is_refused_by_its_least(mo
     shots = [[frame(expose(quads, e, np.random.default_rng(k)), exposure=e) for e in (1, 4)] for k in (0, 1)]
     plenty = merge(capture(*shots), hdr.Settings())
     needed = 128 * 128 * (2 * 25 + 2 * 9 + 60)
-    monkeypatch.setattr(budget, "memory", lambda: (0, needed))
+    monkeypatch.setattr(planes, "process_memory", lambda: (0, needed))
     little = merge(capture(*shots), hdr.Settings())
     for name in ("value", "variance", "quality"):
         np.testing.assert_array_equal(getattr(little, name), getattr(plenty, name))
     np.testing.assert_array_equal(little.bracket.exposure_ratio, plenty.bracket.exposure_ratio)
-    monkeypatch.setattr(budget, "memory", lambda: (1_000_000_000, needed + 999_999_999))
+    monkeypatch.setattr(planes, "process_memory", lambda: (1_000_000_000, needed + 999_999_999))
     with pytest.raises(SettingError, match=r"needs 1\.00 GB at least"):
         merge(capture(*shots), hdr.Settings())
 
 
 def test_frames_stream(monkeypatch):
     """With room for three decoded frames, never more than these and the next are alive, of nine."""
-    monkeypatch.setattr(budget, "plan", lambda *_: budget.Budget(frames=3 * 2 * 256 * 256))
+    monkeypatch.setattr(planes, "plan_memory", lambda *_: planes.MemoryPlan(frames=3 * 2 * 256 * 256))
     quads = ramp(256, 256, high=2e4)
     alive: weakref.WeakSet[Any] = weakref.WeakSet()
     most = 0

@@ -97,7 +97,7 @@ def test_lines_are_learnt_once_per_iso():
     lines = noise.Lines()
     lines.learn(100.0, noise.alone(planes(picture(rng, texture=0), usable)))
     first = lines.line(100.0, 1e-12)
-    lines.close()
+    lines.settle()
     lines.learn(100.0, noise.alone(planes(np.zeros((512, 640, 3)), usable)))
     assert lines.knows(100.0) and not lines.knows(200.0)
     assert lines.line(100.0, 1e-12) is first

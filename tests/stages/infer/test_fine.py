@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from polcap.errors import ModelError
-from polcap.images import Cues, Floats, Network, View
+from polcap.images import Cues, Floats, View
 from polcap.optics import frames
 from polcap.pipeline import models
 from polcap.stages.infer import fine
+from tests.fake_network import FakeNetwork, run
 
 SIDE = 300
 RNG = np.random.default_rng(1)
@@ -34,38 +35,38 @@ def guess(seen: Cues) -> fine.Guess:
     return fine.Guess(seen.rays, seen.rays, np.full((SIDE, SIDE), 5.0), np.full((SIDE, SIDE), 0.4), 2.0)
 
 
-def network(relief: Floats | None = None) -> Network:
+def network(relief: Floats | None = None) -> FakeNetwork:
     """One that says how bright each pixel is, to the right, or what it is told to."""
 
-    def run(channels: Floats) -> dict[str, Floats]:
+    def answer(channels: Floats) -> dict[str, Floats]:
         first = channels[:, :1]
         return {"relief": np.concatenate([first, 0 * first, 0 * first], axis=1) if relief is None else relief}
 
-    return Network(run, "0" * 32, fine.CHANNELS, {"native_size": "256", "size_multiple": "8"}, "CPU")
+    return FakeNetwork("0" * 32, fine.CHANNELS, {"native_size": "256", "size_multiple": "8"}, answer=answer)
 
 
 def test_tiles_leave_no_seam(seen: Cues, guess: fine.Guess, monkeypatch: pytest.MonkeyPatch) -> None:
     """The shipped network sees the same about a pixel in a tile as in the whole picture."""
     found = models.load_network("network", None, "cpu", 1)
     assert found is not None and found.fine is not None
-    whole = fine.refined(seen, guess, found.fine)
+    whole = fine.refined(seen, guess, found.fine, run)
     monkeypatch.setattr(fine, "_TILE", 64)
-    assert np.abs(fine.refined(seen, guess, found.fine) - whole).max() < 1e-4
+    assert np.abs(fine.refined(seen, guess, found.fine, run) - whole).max() < 1e-4
 
 
 def test_tiles_side_by_side_are_those_one_after_another(
     seen: Cues, guess: fine.Guess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fine, "_TILE", 64)
-    one, three = (fine.refined(seen, guess, dataclasses.replace(network(), at_once=n)) for n in (1, 3))
+    one, three = (fine.refined(seen, guess, dataclasses.replace(network(), at_once=n), run) for n in (1, 3))
     assert one.tobytes() == three.tobytes()
     with pytest.raises(ModelError, match="makes no relief"):  # in whichever thread it is found out
-        fine.refined(seen, guess, dataclasses.replace(network(), run=lambda _: {}, at_once=3))
+        fine.refined(seen, guess, dataclasses.replace(network(), answer=lambda _: {}, at_once=3), run)
 
 
 def test_relief_moves_the_normals(seen: Cues, guess: fine.Guess, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fine, "_TILE", 128)
-    normal = fine.refined(seen, guess, network())
+    normal = fine.refined(seen, guess, network(), run)
     whole = fine.finer(np.stack([fine.encode(seen, guess)[0], *np.zeros((2, SIDE, SIDE))], -1), seen.mask, 2.0)
     local = frames.to_ray_frame(normal, seen.rays)
     moved = (local[..., 0] / local[..., 2])[seen.mask]
@@ -84,6 +85,6 @@ def test_what_is_coarser_than_the_first_network_sees_is_not_added(seen: Cues, gu
 
 def test_a_network_of_other_channels_or_maps_is_refused(seen: Cues, guess: fine.Guess) -> None:
     with pytest.raises(ModelError, match="other channels"):
-        fine.refined(seen, guess, dataclasses.replace(network(), channels=("red",)))
+        fine.refined(seen, guess, dataclasses.replace(network(), channels=("red",)), run)
     with pytest.raises(ModelError, match="no relief"):
-        fine.refined(seen, guess, network(np.zeros((1, 1, SIDE, SIDE), np.float32)))
+        fine.refined(seen, guess, network(np.zeros((1, 1, SIDE, SIDE), np.float32)), run)

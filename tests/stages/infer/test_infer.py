@@ -7,16 +7,17 @@ import numpy as np
 import pytest
 
 from polcap.errors import ModelError
-from polcap.images import Network, Quality
+from polcap.images import Quality
 from polcap.optics import frames
 from polcap.stages import cues, infer, stokes
 from polcap.stages.infer import analytic, augmentation, fine, learned
 from tests import scenes
+from tests.fake_network import FakeNetwork, run
 
 
 def seen(noise: float, textured: bool = True):
     radiance = scenes.stack(noise=noise, textured=textured)
-    solved = stokes.solve(radiance, scenes.still(), scenes.equal(), scenes.ball_object(), stokes.Settings())
+    solved = stokes.solve(radiance, scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
     return cues.compute(solved, scenes.no_color())
 
 
@@ -29,14 +30,14 @@ def errors_deg(maps, cues_) -> np.ndarray:
 
 def test_a_clean_ball_is_recovered():
     found = seen(noise=1e-5)
-    error = errors_deg(infer.estimate(found, None, infer.Settings()), found)
+    error = errors_deg(infer.estimate(found, None, run, infer.InferSettings()), found)
     assert np.median(error) < 1.0
     assert error.mean() < 2.0  # the outline's last pixel is half backdrop
 
 
 def test_a_noisy_textured_ball_is_recovered_and_its_error_foretold():
     found = seen(noise=0.004)
-    maps = infer.estimate(found, None, infer.Settings())
+    maps = infer.estimate(found, None, run, infer.InferSettings())
     error = errors_deg(maps, found)
     assert error.mean() < 5.0
     expected = maps.confidence[scenes.truth()[1] & maps.mask].mean()
@@ -45,7 +46,7 @@ def test_a_noisy_textured_ball_is_recovered_and_its_error_foretold():
 
 def test_no_half_turn_is_lost_on_a_convex_object():
     found = seen(noise=0.002)
-    maps = infer.estimate(found, None, infer.Settings())
+    maps = infer.estimate(found, None, run, infer.InferSettings())
     local, mask = scenes.truth()
     true = frames.from_ray_frame(local, found.rays)
     tilted = mask & maps.mask & (local[..., 2] < 0.9)
@@ -55,7 +56,7 @@ def test_no_half_turn_is_lost_on_a_convex_object():
 
 def test_albedo_is_free_of_shading():
     found = seen(noise=1e-4, textured=False)
-    maps = infer.estimate(found, None, infer.Settings())
+    maps = infer.estimate(found, None, run, infer.InferSettings())
     local, mask = scenes.truth()
     ring = mask & (local[..., 2] > 0.5) & (local[..., 2] < 0.85)
     assert np.abs(maps.diffuse[ring] - 0.5).mean() < 0.03
@@ -71,7 +72,7 @@ def test_albedo_goes_on_into_saturated_highlights(known: bool):
     radiance[spot], quality[spot] = 4.0, quality[spot] | Quality.CLIPPED
     burnt = dataclasses.replace(found, radiance=radiance, quality=quality)
     for estimator in (None, network()):
-        albedo, whole = (infer.estimate(c, estimator, infer.Settings()).diffuse for c in (burnt, found))
+        albedo, whole = (infer.estimate(c, estimator, run, infer.InferSettings()).diffuse for c in (burnt, found))
         assert np.isfinite(albedo).all()
         if known:  # the network of this test says 0.3, the inversion about 0.5
             assert np.abs(albedo - whole)[spot].mean() < 0.03, estimator
@@ -86,17 +87,17 @@ def test_what_is_brighter_than_any_body_is_not_painted_on_it():
     radiance = found.radiance.copy()
     radiance[spot] = 30.0
     believing = dataclasses.replace(
-        network(), run=lambda picture: network().run(picture) | {"diffuse": np.exp(picture[:, :3]).clip(0, 1)}
+        network(), answer=lambda picture: network().answer(picture) | {"diffuse": np.exp(picture[:, :3]).clip(0, 1)}
     )
     shining = dataclasses.replace(found, radiance=radiance)
-    albedo, whole = (infer.estimate(c, believing, infer.Settings()).diffuse for c in (shining, found))
+    albedo, whole = (infer.estimate(c, believing, run, infer.InferSettings()).diffuse for c in (shining, found))
     assert np.abs(albedo - whole)[spot].mean() < 0.05
 
 
-def network(channels=cues.CHANNELS) -> Network:
+def network(channels=cues.CHANNELS) -> FakeNetwork:
     """A network that answers with the zenith channels' own normal: its maps are known in closed form."""
 
-    def run(picture):
+    def answer(picture):
         x, y = picture[:, 5:6], picture[:, 6:7]
         tilt = np.sqrt(x * x + y * y)
         phi = np.arctan2(y, x) / 2
@@ -105,29 +106,31 @@ def network(channels=cues.CHANNELS) -> Network:
         return {"normal": normal, "depth": 0 * one, "diffuse": np.repeat(0.3 * one, 3, 1),
                 "specular": np.repeat(0.04 * one, 3, 1), "roughness": 0.4 * one, "sigma": 5 * one}  # fmt: skip
 
-    return Network(run, "0123456789", channels, {"native_size": "256", "size_multiple": "32"}, "CPU")
+    return FakeNetwork("0123456789", channels, {"native_size": "256", "size_multiple": "32"}, answer=answer)
 
 
 def test_a_model_for_other_channels_is_refused():
     with pytest.raises(ModelError, match="expects channels red"):
-        infer.estimate(seen(noise=0.002), network(("red",)), infer.Settings())
+        infer.estimate(seen(noise=0.002), network(("red",)), run, infer.InferSettings())
 
 
 def test_positions_side_by_side_give_the_bytes_of_one_after_another():
     found = seen(noise=0.002)
-    one, four = (infer.estimate(found, dataclasses.replace(network(), at_once=n), infer.Settings()) for n in (1, 4))
+    one, four = (
+        infer.estimate(found, dataclasses.replace(network(), at_once=n), run, infer.InferSettings()) for n in (1, 4)
+    )
     for name in ("normal", "diffuse", "roughness", "confidence"):
         assert getattr(one, name).tobytes() == getattr(four, name).tobytes()
-    lost = dataclasses.replace(network(), run=lambda _: {"normal": np.zeros((1, 3, 32, 32))}, at_once=4)
+    lost = dataclasses.replace(network(), answer=lambda _: {"normal": np.zeros((1, 3, 32, 32))}, at_once=4)
     with pytest.raises(ModelError, match="this version needs"):
-        infer.estimate(found, lost, infer.Settings())
+        infer.estimate(found, lost, run, infer.InferSettings())
 
 
 def test_a_crop_larger_than_the_network_sees_keeps_its_texture():
     """The network says grey 0.3 everywhere; the detail it cannot see comes from S0, to the object's very edge."""
     found = seen(noise=1e-4)
     half = dataclasses.replace(network(), metadata={"native_size": "128", "size_multiple": "32"})
-    maps = infer.estimate(found, half, infer.Settings())
+    maps = infer.estimate(found, half, run, infer.InferSettings())
     rows, columns = np.nonzero(found.mask)
     middle = np.s_[rows.min() + 60 : rows.max() - 60, columns.min() + 60 : columns.max() - 60]
     texture = found.radiance[middle] / cv2.GaussianBlur(found.radiance, (0, 0), 4)[middle]
@@ -144,11 +147,12 @@ def test_a_grid_of_the_network_does_not_reach_the_albedo():
     plain = network()
 
     def gridded(picture):
-        maps = plain.run(picture)
+        maps = plain.answer(picture)
         y, x = np.mgrid[: picture.shape[2], : picture.shape[3]]
         return maps | {"diffuse": maps["diffuse"] * np.where((x + y) % 2, 1.1, 0.9).astype(np.float32)}
 
-    albedo = infer.estimate(found, dataclasses.replace(plain, run=gridded), infer.Settings()).diffuse.mean(-1)
+    printing = dataclasses.replace(plain, answer=gridded)
+    albedo = infer.estimate(found, printing, run, infer.InferSettings()).diffuse.mean(-1)
     rows, columns = np.nonzero(found.mask)
     inner = np.s_[rows.min() + 60 : rows.max() - 60, columns.min() + 60 : columns.max() - 60]
     part = albedo[inner]
@@ -169,8 +173,9 @@ def test_relief_that_the_network_does_not_see_leaves_the_albedo(monkeypatch):
     middle = np.s_[rows.min() + 60 : rows.max() - 60, columns.min() + 60 : columns.max() - 60]
     spread = []
     for normal in (found.rays, waves):
-        monkeypatch.setattr(fine, "refined", lambda cues_, guess, network_, known=normal: known)
-        spread.append(np.log(infer.estimate(found, half, infer.Settings()).diffuse[middle] + cues.FLOOR).std())
+        monkeypatch.setattr(fine, "refined", lambda cues_, guess, network_, run_, known=normal: known)
+        albedo = infer.estimate(found, half, run, infer.InferSettings()).diffuse[middle]
+        spread.append(np.log(albedo + cues.FLOOR).std())
     assert spread[1] == pytest.approx(spread[0] / 2, rel=0.1)
 
 
@@ -181,11 +186,11 @@ def test_a_grid_of_the_network_does_not_reach_the_gloss():
     for period in (np.indices((2, 2)).sum(0) % 2, np.array([[1, 0], [0, 0]])):
 
         def gridded(picture, period=period):
-            maps = plain.run(picture)
+            maps = plain.answer(picture)
             tile = np.tile(period, (picture.shape[2] // 2, picture.shape[3] // 2))
             return maps | {name: maps[name] * np.where(tile, 1.05, 0.95) for name in ("roughness", "specular")}
 
-        maps = infer.estimate(found, dataclasses.replace(plain, run=gridded), infer.Settings())
+        maps = infer.estimate(found, dataclasses.replace(plain, answer=gridded), run, infer.InferSettings())
         rows, columns = np.nonzero(found.mask)
         inner = np.s_[rows.min() + 60 : rows.max() - 60, columns.min() + 60 : columns.max() - 60]
         for image in (maps.roughness, maps.specular.mean(-1)):
@@ -218,7 +223,7 @@ def test_a_guide_settles_the_half_turn(side: float):
     found = seen(noise=1e-5)
     local, mask = scenes.truth()
     guide = local * [side, side, 1]
-    normal, _, _ = analytic.invert(found, infer.Settings().ior, (guide, np.full(mask.shape, 5.0)))
+    normal, _, _ = analytic.invert(found, infer.InferSettings().ior, (guide, np.full(mask.shape, 5.0)))
     error = np.degrees(np.arccos(np.clip((frames.to_ray_frame(normal, found.rays) * guide).sum(-1), -1, 1)))
     assert np.median(error[mask & found.mask]) < 1.0
 
@@ -254,17 +259,18 @@ def test_a_half_turn_that_nothing_settles_costs_the_zenith():
     local, mask = scenes.truth()
     across = np.stack([-local[..., 1], local[..., 0], local[..., 2]], axis=-1)
     settled, open_ = (
-        analytic.invert(found, infer.Settings().ior, (guide, np.full(mask.shape, 5.0)))[1] for guide in (local, across)
+        analytic.invert(found, infer.InferSettings().ior, (guide, np.full(mask.shape, 5.0)))[1]
+        for guide in (local, across)
     )
     tilted = mask & found.mask & (local[..., 2] > 0.5) & (local[..., 2] < 0.9)
     zenith = np.degrees(np.arccos(local[tilted, 2]))
     assert np.median((open_ - settled)[tilted] / zenith) == pytest.approx(1.0, abs=0.1)
 
 
-def lopsided() -> Network:
+def lopsided() -> FakeNetwork:
     """A network without symmetry: its maps depend on where things lie in the picture and on each channel apart."""
 
-    def run(picture):
+    def answer(picture):
         y, x = np.mgrid[: picture.shape[2], : picture.shape[3]] / 100.0
         a = picture[:, 3:4] + 0.3 * picture[:, 5:6] + 0.1 * x
         b = picture[:, 4:5] - 0.2 * picture[:, 12:13] + 0.1 * y
@@ -274,7 +280,7 @@ def lopsided() -> Network:
         return {"normal": normal, "depth": a * b, "diffuse": 0.3 + 0 * normal,
                 "specular": 0.04 + 0.01 * normal, "roughness": 0.5 + 0.1 * b, "sigma": 5 + a}  # fmt: skip
 
-    return dataclasses.replace(network(), run=run)
+    return dataclasses.replace(network(), answer=answer)
 
 
 @pytest.mark.parametrize(("quarters", "mirror"), [(1, False), (2, False), (0, True), (3, True)])
@@ -296,7 +302,7 @@ def test_averaged_over_turns_a_turned_object_gets_the_turned_maps(quarters: int,
         },
     )  # fmt: skip
     moved.rays[..., :2] = augmentation._turn_vectors(moved.rays[..., :2], quarters, mirror)
-    whole, turned = (augmentation.combined(c, lopsided(), 8) for c in (found, moved))
+    whole, turned = (augmentation.combined(c, lopsided(), run, 8) for c in (found, moved))
     np.testing.assert_allclose(turned["depth"], augmentation._turn(whole["depth"], quarters, mirror), atol=1e-4)
     expected = np.array(augmentation._turn(whole["normal"], quarters, mirror))
     expected[..., :2] = augmentation._turn_vectors(expected[..., :2], quarters, mirror)

@@ -7,7 +7,7 @@ import numpy as np
 
 from polcap.formats import shipped_data
 from polcap.images import AngleStack, ChartRequest, ColorSensor, Floats, Quality, View, single_frames
-from polcap.stages.whitebalance import chart
+from polcap.optics.projection import transform_points
 
 CLASSIC = shipped_data.colorchecker()
 CAMERA = np.array([[0.28, 0.10, 0.07], [0.08, 0.71, 0.22], [0.02, 0.18, 0.66]])  # linear Rec.709 → S0 in camera
@@ -30,7 +30,7 @@ def draw(homography: Floats, colors: Floats, patch: float = 0.87, card: float = 
     total = np.zeros((HEIGHT, WIDTH, 3))
     for dy in (np.arange(samples) + 0.5) / samples - 0.5:
         for dx in (np.arange(samples) + 0.5) / samples - 0.5:
-            at = chart.project(inverse, np.stack([x + dx, y + dy], axis=-1))
+            at = transform_points(inverse, np.stack([x + dx, y + dy], axis=-1))
             u, v = at[..., 0], at[..., 1]
             on = (u > -0.1) & (u < 6.1) & (v > -0.1) & (v < 4.1)
             column, row = np.clip(np.floor(u), 0, 5).astype(int), np.clip(np.floor(v), 0, 3).astype(int)

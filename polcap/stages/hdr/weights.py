@@ -1,6 +1,13 @@
-"""The merge itself: every frame of a shot weighted by its exposure over its noise, in one pass of blocks."""
+"""Weighted mean of a bracket's frames: radiance, its variance and quality, in one pass over blocks of rows.
 
-from collections.abc import Sequence
+X = Σ w (Y/e) / Σ w with w = e² / (a e X₀ + b): e the frame's exposure, a and b its noise line, X₀ the smoothed first
+estimate. Weights fall towards saturation and are 0 where a frame is clipped or disagrees.
+
+References
+----------
+Granados et al., Optimal HDR reconstruction with linear digital cameras, CVPR 2010.
+"""
+
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -9,29 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap import parallel
-from polcap.images import Bits, Floats, Quality, Shot
-from polcap.optics.registration import squared_gradient
-from polcap.stages.hdr import ambient as ambients
-from polcap.stages.hdr import frame_motion, noise
-from polcap.stages.hdr.ambient import Ambient
-from polcap.stages.hdr.links import Measured
-from polcap.stages.hdr.planes import Reader, Signals, blocks
+from polcap.images import Bits, Falloff, Floats, MaskedImage, Quality, View
+from polcap.optics.registration import scaled, squared_gradient
+from polcap.stages.hdr import exposure, noise
+from polcap.stages.hdr.bracket import AmbientLight, Bracket, ComparedBracket, ambient_light
+from polcap.stages.hdr.planes import Reader, Signals, blocks, resample
 
 Bools = NDArray[np.bool_]
 
 _FALL = 0.05  # [white level]; over this range below saturation a frame's weight falls to _LEAST
 _LEAST = 1e-3
 _BLOCK_PX = 64_000  # of one channel: all planes of a block then stay in a core's own cache
-_SOME = 1e-9  # weight of the reference frame where nothing can be believed: some value for every pixel
-
-
-@dataclass(frozen=True)
-class Merged:
-    """Where one shot goes: slices of the stack."""
-
-    value: Floats  # (H, W, 3)
-    variance: Floats  # (H, W, 3)
-    quality: Bits  # (H, W)
+_SOME = 1e-9  # weight of the reference frame where no frame is usable: some value for every pixel
+_AS_DARK = 1.02  # a frame not brighter by more than this counts as the darkest
+_DARK_SIGMAS = np.float32(2)
 
 
 @dataclass(frozen=True)
@@ -50,99 +48,33 @@ class _Frame:
     least: np.float32  # weight even where it does not serve
 
 
-def prepare(
-    shot: Shot, order: Sequence[int], reference: int, measured: Measured, lines: noise.Lines, read: Reader, clip: float,
-    full: bool,
-) -> "Mixture":  # fmt: skip
-    """The frames of a shot ready to be weighted.
-
-    Parameters
-    ----------
-    shot
-        Its frames.
-    order
-        Their numbers, brightest first.
-    reference
-        Number of the frame on whose grid they are merged.
-    measured
-        Motion, ratios, noise and ghosts, on the binned grid.
-    lines
-        Noise by ISO.
-    read
-        Decodes a frame.
-    clip
-        As in the stage's settings [white level].
-    full
-        On the full grid instead of the binned one.
-    """
-    links = measured.links
-    if full:
-        ghost = np.repeat(np.repeat(measured.ghost, 2, axis=0), 2, axis=1)
-        measured = replace(measured, estimate=_twice(measured.estimate), ghost=ghost)
-    ambient = ambients.measure(shot, shot.frames[reference], lines, read, full, clip)
-    bright = [float(link.ratio.mean()) for link in links]
-    darkest = int(np.argmin(bright))
-    served = anchored = np.zeros(measured.ghost.shape, bool)
-    frames = []
-    for e in [reference, *(e for e in order if e != reference)]:
-        link, image = links[e], read(shot.frames[e])
-        if measured.frames is not None and not full:
-            found, blur = measured.frames[e].signals, measured.frames[e].gain
-        else:
-            found, blur = read.signals(shot, e, clip, full), None
-            if link.moved is not None:
-                found, blur = frame_motion.resampled(found, frame_motion.on_full(link.moved) if full else link.moved)
-        last = bright[e] < 1.02 * bright[darkest]
-        serves = found.usable if link.moved is not None or not last else np.ones_like(found.usable)
-        if e == reference:
-            anchored = serves
-        elif measured.ghost.any():
-            serves = serves & (~measured.ghost | (~anchored & (e == darkest)))
-        served = served | (serves & found.usable)
-        frames.append(
-            _Frame(
-                signals=found,
-                serves=serves,
-                blur=blur,
-                ratio=link.ratio,
-                noise=measured.noises[e],
-                misfit=link.misfit * (4 if full else 1),
-                lit=np.float32(ambients.gathered(shot.frames[e], shot.frames[reference])),
-                last=last,
-                cfa=image.cfa if full else None,
-                least=np.float32(_SOME if e == reference else 0),
-            )
-        )
-    return Mixture(frames, measured, ambient, served, clip)
-
-
 @dataclass(frozen=True)
-class Mixture:
-    """A shot's frames and what they are weighted by."""
+class WeightedFrames:
+    """The frames of a bracket, ready to be summed."""
 
     frames: list[_Frame]
-    measured: Measured  # on the grid of the frames
-    ambient: Ambient | None
-    served: Bools  # (H, W) where some frame can be believed
+    compared: ComparedBracket  # on the grid of the frames
+    ambient: AmbientLight | None
+    served: Bools  # (H, W) where some frame is usable
     clip: float
 
     @property
     def shape(self) -> tuple[int, int, int]:
         return self.frames[0].signals.shape
 
-    def into(self, out: Merged) -> None:
-        """Weight, sum and write; a single channel goes into all three, with 3 times its variance."""
+    def merge_into(self, out: MaskedImage) -> None:
+        """Write the weighted mean; a single channel goes into all three, with 3 times its variance."""
         _, height, width = self.shape
         rows_of_block = max(_BLOCK_PX // width, 1)
         parallel.results(partial(self._block, out, rows) for rows, _, _ in blocks(height, rows=rows_of_block))
 
-    def _block(self, out: Merged, rows: slice) -> None:
+    def _block(self, out: MaskedImage, rows: slice) -> None:
         value, variance = self._rows(rows)
         total, noise_ = (np.sum(planes, axis=0) for planes in (value, variance))
         np.sqrt(noise_, out=noise_)
-        noise_ *= np.float32(2)
+        noise_ *= _DARK_SIGMAS
         quality = _flagged(~self.served[rows], Quality.CLIPPED)
-        quality |= _flagged(self.measured.ghost[rows], Quality.GHOST)
+        quality |= _flagged(self.compared.ghost[rows], Quality.GHOST)
         quality |= _flagged(total < noise_, Quality.DARK)
         out.quality[rows] = quality
         if len(value) == 1:
@@ -156,11 +88,11 @@ class Mixture:
         With frames' weights w = trust / v, v the variance of their radiance, Σ w² v is Σ trust · w. Sums are made of
         w / ratio, so that counts need not be brought to radiance.
         """
-        estimate = self.measured.estimate[:, rows]
+        estimate = self.compared.estimate[:, rows]
         light = np.maximum(estimate, 0)
         number, weights, variance = (np.zeros_like(estimate) for _ in range(3))
         shares = np.zeros_like(estimate) if self.ambient is not None else None  # of the ambient light
-        steep = _edges(self.measured.estimate, rows) if any(f.misfit.any() for f in self.frames) else None
+        steep = _edges(self.compared.estimate, rows) if any(f.misfit.any() for f in self.frames) else None
         for frame in self.frames:
             sample, trust = frame.signals.rows(rows), self._trust(frame, estimate, rows)
             for c, weight in enumerate(self._noise(frame, rows, light, steep)):
@@ -183,13 +115,13 @@ class Mixture:
         return number, variance
 
     def _trust(self, frame: _Frame, estimate: Floats, rows: slice) -> Floats | np.float32:
-        """What a frame's weight is multiplied by where it clips or nearly does, (h, W) or one number."""
+        """Factor of a frame's weight, lower where it clips or nearly does, (h, W) or one number."""
         serves = frame.serves[rows]
         trust: Floats | np.float32 = np.float32(1) if serves.all() else np.maximum(serves, frame.least)
         return trust if frame.last else trust * self._ramp(frame, estimate)
 
     def _noise(self, frame: _Frame, rows: slice, light: Floats, steep: Floats | None) -> Floats:
-        """Expected variance of a frame's radiance times its ratio, (C, h, W), where that is `light`."""
+        """Expected variance of a frame's radiance `light` (C, h, W) times its ratio."""
         if self.ambient is not None:
             lit = (frame.lit / frame.ratio)[:, None, None]
             light = light + lit * np.maximum(self.ambient.value[:, rows], 0)
@@ -200,7 +132,7 @@ class Mixture:
                 out[c] += frame.noise.floor[c] / frame.ratio[c]
         else:
             ratio = frame.ratio[:, None, None]
-            out = ambients.noise_of(light * ratio, frame.noise, frame.cfa)
+            out = noise.of_pixels(light * ratio, frame.noise, frame.cfa)
             out /= ratio
         if frame.blur is not None:
             out *= frame.blur[rows]
@@ -219,6 +151,54 @@ class Mixture:
         return np.asarray(np.clip(peak, np.float32(_LEAST), 1, out=peak))
 
 
+def prepare(
+    bracket: Bracket, compared: ComparedBracket, lines: noise.Lines, read: Reader, full: bool
+) -> WeightedFrames:
+    """The frames of a compared bracket, registered, on the full grid with `full`; each with the pixels it serves."""
+    ambient = ambient_light(bracket, lines, read, full)
+    if full:
+        ghost = np.repeat(np.repeat(compared.ghost, 2, axis=0), 2, axis=1)
+        compared = replace(compared, estimate=_twice(compared.estimate), ghost=ghost)
+    bright = [float(link.ratio.mean()) for link in compared.links]
+    darkest = int(np.argmin(bright))
+    served = anchored = np.zeros(compared.ghost.shape, bool)
+    frames = []
+    for e in [bracket.reference, *bracket.others]:
+        frame = _frame(bracket, e, compared, read, full, last=bright[e] < _AS_DARK * bright[darkest])
+        if e == bracket.reference:
+            anchored = frame.serves
+        elif compared.ghost.any():
+            frame = replace(frame, serves=frame.serves & (~compared.ghost | (~anchored & (e == darkest))))
+        served = served | (frame.serves & frame.signals.usable)
+        frames.append(frame)
+    return WeightedFrames(frames, compared, ambient, served, read.clip)
+
+
+def _frame(bracket: Bracket, e: int, compared: ComparedBracket, read: Reader, full: bool, last: bool) -> _Frame:
+    """Frame e on the grid of the merge; it serves wherever it is usable, the last one everywhere."""
+    shot, link = bracket.shot, compared.links[e]
+    image = read(shot.frames[e])
+    if compared.frames is not None and not full:
+        found, blur = compared.frames[e].signals, compared.frames[e].gain
+    else:
+        found, blur = read.signals(shot, e, full), None
+        if link.motion is not None:
+            found, blur = resample(found, scaled(link.motion, 2) if full else link.motion)
+    is_reference = e == bracket.reference
+    return _Frame(
+        signals=found,
+        serves=found.usable if link.motion is not None or not last else np.ones_like(found.usable),
+        blur=blur,
+        ratio=link.ratio,
+        noise=compared.noises[e],
+        misfit=link.misfit * (4 if full else 1),
+        lit=np.float32(exposure.of_ambient(shot.frames[e], shot.frames[bracket.reference])),
+        last=last,
+        cfa=image.cfa if full else None,
+        least=np.float32(_SOME if is_reference else 0),
+    )
+
+
 def _flagged(where: Bools, flag: Quality) -> Bits:
     """A flag where it holds, else 0."""
     return np.asarray(where.view(np.uint8) * np.uint8(flag))
@@ -235,3 +215,20 @@ def _twice(picture: Floats) -> Floats:
     """A binned picture (C, H, W) on the full grid; cv2 keeps the half-pixel offset of the two."""
     _, h, w = picture.shape
     return np.stack([cv2.resize(plane, (2 * w, 2 * h)) for plane in picture])
+
+
+def divide_by_falloff(image: MaskedImage, view: View, size_px: tuple[int, int], light: Falloff) -> None:
+    """Divide merged radiance (H, W, 3) by the lens's light, its variance by the light's square, in place.
+
+    `view`: of its grid; `size_px`: width and height of the visible RAW, in the corners of which the law's r is 1.
+    """
+    coefficient = np.broadcast_to(np.array(light.coefficient), (3, 3))
+    half = np.hypot(*size_px) / 2 / view.scale  # px of this grid
+    height, width = image.quality.shape
+    x2 = ((np.arange(width) - view.center[0]) / half) ** 2
+    for rows, _, _ in blocks(height):
+        y2 = ((np.arange(rows.start, rows.stop) - view.center[1]) / half) ** 2
+        r2 = (y2[:, None] + x2)[..., None]
+        gain = (1 + r2 * (coefficient[:, 0] + r2 * (coefficient[:, 1] + r2 * coefficient[:, 2]))).astype(np.float32)
+        image.value[rows] /= gain
+        image.variance[rows] /= gain**2

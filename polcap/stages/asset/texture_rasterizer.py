@@ -1,34 +1,34 @@
-"""Triangles laid out over a texture -> what each of its pixels shows of them, interpolated between their corners."""
+"""Rasterization of a mesh onto its texture: vertex frames interpolated at each pixel."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats, Mesh
 
-_SLACK = 1e-4  # px and shares by which a pixel may miss a triangle, so that none falls between two
+_SLACK = 1e-4  # px and barycentric coordinates by which a pixel may miss a triangle, so that none falls between two
 
 
-def interpolated(mesh: Mesh, height: int, width: int) -> tuple[Floats, NDArray[np.bool_]]:
-    """Normals and tangents (N, 7) at the N pixels that triangles cover, row by row, and which (H, W) those are.
+def rasterize_frames(mesh: Mesh, height: int, width: int) -> tuple[Floats, NDArray[np.bool_]]:
+    """Normals and tangents (N, 7) at the N covered pixels, row by row, and the covered pixels (H, W).
 
-    Only triangles that face the camera count: the texture belongs to them, not to walls and a back. Where several
-    cover a pixel the last has it.
+    Only triangles that face the camera count: walls and back have no part of the texture. Where several cover a pixel
+    the last one counts.
     """
     place = mesh.uv * np.array([width, height]) - 0.5
     corner = place[mesh.faces]  # (F, 3, 2) x, y [px]
     one, two = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     area = one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
-    seen = np.flatnonzero(area < 0)  # v runs down
-    corner, one, two, area = corner[seen], one[seen], two[seen], area[seen]
+    facing = np.flatnonzero(area < 0)  # v runs down
+    corner, one, two, area = corner[facing], one[facing], two[facing], area[facing]
     first = np.ceil(corner.min(axis=1) - _SLACK).astype(np.int32)
     extent = np.floor(corner.max(axis=1) + _SLACK).astype(np.int32) - first
     at = (first - corner[:, 0]).astype(np.float32)
     across, down = ((v / area[:, None]).astype(np.float32) for v in (one, two))
-    # shares of the second and third corner at the first pixel, and their growth by a pixel to the right and down
+    # barycentric coordinates of the second and third corner at the first pixel; they are linear in the pixel
     second = at[:, 0] * down[:, 1] - at[:, 1] * down[:, 0]
     third = across[:, 0] * at[:, 1] - across[:, 1] * at[:, 0]
     owner = np.full(height * width, -1, np.int32)
-    shares = np.empty((height * width, 2), np.float32)
+    weights = np.empty((height * width, 2), np.float32)
     for y in range(int(extent[:, 1].max(initial=-1)) + 1):
         tall = np.flatnonzero(extent[:, 1] >= y)
         for x in range(int(extent[tall, 0].max(initial=-1)) + 1):
@@ -39,12 +39,12 @@ def interpolated(mesh: Mesh, height: int, width: int) -> tuple[Floats, NDArray[n
             f = f[hit]
             pixel = (first[f, 1] + y) * width + first[f, 0] + x
             owner[pixel] = f
-            shares[pixel, 0], shares[pixel, 1] = w1[hit], w2[hit]
+            weights[pixel, 0], weights[pixel, 1] = w1[hit], w2[hit]
     covered = owner >= 0
-    corners = mesh.faces[seen][owner[covered]]  # (N, 3)
-    w1, w2 = shares[covered].T[..., None]
+    corners = mesh.faces[facing][owner[covered]]  # (N, 3)
+    w1, w2 = weights[covered].T[..., None]
     value = np.concatenate([mesh.normals, mesh.tangents], axis=-1, dtype=np.float32)
-    there = value[corners[:, 0]] * (1 - w1 - w2)
-    there += value[corners[:, 1]] * w1
-    there += value[corners[:, 2]] * w2
-    return there, covered.reshape(height, width)
+    out = value[corners[:, 0]] * (1 - w1 - w2)
+    out += value[corners[:, 1]] * w1
+    out += value[corners[:, 2]] * w2
+    return out, covered.reshape(height, width)

@@ -1,4 +1,4 @@
-"""A look at held-out pictures while training runs; nothing is chosen by it."""
+"""Errors on held-out pictures while training runs; no choice depends on them."""
 
 from pathlib import Path
 
@@ -18,8 +18,8 @@ from polcap.training.model import COLOR
 _FLASH = (0.0, protocol.FLASH)
 
 
-class Watch:
-    """A fixed set of pictures of test meshes with test materials, in the stated conditions."""
+class HeldOutPictures:
+    """Fixed pictures of test meshes with test materials, at the stated camera and flash."""
 
     def __init__(self, data: Path, folder: Path, device: torch.device, *, count: int = 48, size: int = 128) -> None:
         simulator = held_out(data, folder, device, views=20, size=size)
@@ -34,8 +34,8 @@ class Watch:
                 photo = simulator.shoot(seen, torch.ones(number, device=device), Errors.stated(number, device))
                 self.batches.append(batch(photo))
 
-    def look(self, network: nn.Module) -> dict[str, float]:
-        """Mean figures over all pixels of all pictures."""
+    def errors(self, network: nn.Module) -> dict[str, float]:
+        """Mean errors over all pixels of all pictures."""
         rows = [figures(run(network, batch), batch) for batch in self.batches]
         return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 

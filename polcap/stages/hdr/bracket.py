@@ -1,0 +1,253 @@
+"""Comparison of the frames of one bracket: ambient light, motion, exposure ratio, noise, and ghosts.
+
+Everything is measured on the binned grid, frame by frame against the bracket's reference frame.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.errors import CaptureError
+from polcap.images import Floats, Shot
+from polcap.optics import sensor
+from polcap.optics.registration import Pyramid, register
+from polcap.stages.hdr import exposure, noise
+from polcap.stages.hdr.ghosts import Anchor, Exposed, FirstEstimate
+from polcap.stages.hdr.planes import Planes, Reader, Signals, blocks, planar, resample, same_size, signals
+
+Bools = NDArray[np.bool_]
+
+_SMOOTH = cv2.getGaussianKernel(7, 0.8, cv2.CV_32F)
+_STILL_PX = 0.05  # less motion than this is not worth a resampling
+_MOTION_SIGMAS = 3.0  # nor is motion that is not known better
+
+
+@dataclass(frozen=True)
+class Bracket:
+    """A shot, and the order in which its frames are compared."""
+
+    shot: Shot
+    order: tuple[int, ...]  # of the frames, darkest first
+    reference: int
+
+    @property
+    def others(self) -> list[int]:
+        """The frames but the reference frame."""
+        return [e for e in self.order if e != self.reference]
+
+
+@dataclass(frozen=True)
+class Link:
+    """A frame against the reference frame, on the binned grid."""
+
+    ratio: Floats  # (C,) float32, exposure relative to the reference
+    motion: Floats | None  # (3, 3) reference px → frame px; None: it did not move
+    misfit: Floats  # (C,) float32 px²; variance per squared gradient left by registration and aliasing
+    curvature: float = 0.0  # of its tone against the reference's; 0: linear, NaN: unknown
+
+
+@dataclass(frozen=True)
+class RegisteredFrame:
+    """A frame on the reference frame's grid."""
+
+    signals: Signals
+    gain: Floats | None  # (H, W) noise variance gain of resampling; None: it was not resampled
+
+    @property
+    def mean_gain(self) -> float:
+        return 1.0 if self.gain is None else float(self.gain.mean())
+
+
+@dataclass(frozen=True)
+class AmbientLight:
+    """Light without the flash, at the settings of the reference frame."""
+
+    value: Floats  # (C, H, W)
+    variance: Floats  # (C, H, W)
+
+
+@dataclass(frozen=True)
+class ComparedBracket:
+    """A bracket, measured on the binned grid."""
+
+    links: list[Link]
+    noises: list[noise.Noise]
+    ghost: Bools  # (H, W)
+    estimate: Floats  # (C, H, W) the smoothed first estimate
+    ambient_share: float  # of all light, present without the flash; NaN where that was not photographed
+    frames: list[RegisteredFrame] | None  # as they will be merged; None where ambient light was subtracted
+
+
+def compare(bracket: Bracket, lines: noise.Lines, read: Reader, limit_px: float) -> ComparedBracket:
+    """Compare every frame with the reference frame; `lines` learns the noise of their ISO.
+
+    Raises CaptureError: motion above `limit_px` visible RAW px, no common exposure, frames of different size.
+    """
+    source = _BracketSignals(bracket, lines, read)
+    still = source.signals(bracket.reference)
+    channels = still.shape[0]
+    if not bracket.others and source.ambient is None:
+        source.learn(bracket.reference, noise.alone(still))
+    same = Link(np.ones(channels, np.float32), None, np.zeros(channels, np.float32))
+    links, frames = {bracket.reference: same}, {bracket.reference: RegisteredFrame(still, None)}
+    ghost = np.zeros(still.usable.shape, bool)
+    estimate = FirstEstimate()
+    anchor: Anchor | None = None
+    pyramid = brightness_pyramid(still) if bracket.others else None
+    for e in bracket.others:
+        assert pyramid is not None
+        links[e], frames[e] = _compare_frame(source, e, still, pyramid, limit_px)
+        frame = Exposed(frames[e].signals, links[e].ratio, source.line(e))
+        anchor = anchor or Anchor(Exposed(still, same.ratio, source.line(bracket.reference)))
+        new = anchor.ghosts(frame, links[e].misfit, frames[e].mean_gain)
+        estimate.add(frame, frame.signals.usable & ~new)
+        ghost |= new
+        if e == bracket.order[0]:
+            anchor.fill(frame)
+    estimate.add(Exposed(still, same.ratio, source.line(bracket.reference)), still.usable)
+    smoothed = estimate.smoothed(still if anchor is None else anchor, ghost)
+    every = range(len(links))
+    return ComparedBracket(
+        links=[links[e] for e in every],
+        noises=[source.sensor_line(e) for e in every],
+        ghost=ghost,
+        estimate=smoothed,
+        ambient_share=float("nan") if source.ambient is None else _ambient_share(source.ambient, smoothed),
+        frames=[frames[e] for e in every] if source.ambient is None else None,
+    )
+
+
+class _BracketSignals:
+    """Signals and noise of a bracket's frames, less the ambient light."""
+
+    def __init__(self, bracket: Bracket, lines: noise.Lines, read: Reader) -> None:
+        self.frames, self.reference = bracket.shot.frames, bracket.reference
+        self._shot, self._lines, self._read = bracket.shot, lines, read
+        self.name = f"shot {bracket.shot.name}"
+        self._iso = [frame.exif.iso or f"frame {e}" for e, frame in enumerate(self.frames)]
+        still = read(self.frames[self.reference])
+        self.raw_px = still.superpixel  # of one pixel
+        self._rounding = sensor.rounding(still) / 2  # variance of a binned green
+        self.ambient = ambient_light(bracket, lines, read)
+
+    def signals(self, e: int) -> Signals:
+        """Signals of a frame, less its ambient light."""
+        found = self._read.signals(self._shot, e)
+        if self.ambient is None:
+            return found
+        if not self.settled(e):
+            self.learn(e, noise.alone(found))
+        value = found.rows(slice(0, found.shape[1])) - self._ambient_exposure(e) * self.ambient.value
+        return Planes(value, found.usable)
+
+    def line(self, e: int) -> noise.Noise:
+        """Noise of a frame, with that of the ambient light that was subtracted."""
+        if self.ambient is None:
+            return self.sensor_line(e)
+        return self.sensor_line(e).lit(self._ambient_exposure(e) * self.ambient.value.mean(axis=(1, 2)))
+
+    def sensor_line(self, e: int) -> noise.Noise:
+        return self._lines.line(self._iso[e], self._rounding)
+
+    def settled(self, *frames: int) -> bool:
+        """Whether the noise of these frames' ISO is settled."""
+        return all(self._lines.knows(self._iso[e]) for e in frames)
+
+    def learn(self, e: int, samples: noise.Samples) -> None:
+        self._lines.learn(self._iso[e], samples)
+
+    def _ambient_exposure(self, e: int) -> np.float32:
+        return np.float32(exposure.of_ambient(self.frames[e], self.frames[self.reference]))
+
+
+def _compare_frame(
+    source: _BracketSignals, e: int, still: Signals, pyramid: Pyramid, limit_px: float
+) -> tuple[Link, RegisteredFrame]:
+    """Motion, exposure ratio, noise and misfit of frame e against the reference frame's signals."""
+    reference, name = source.reference, f"frame {e + 1} of {source.name}"
+    found = source.signals(e)
+    same_size(name, found.shape, still.shape)
+    motion = measure_motion(name, pyramid, brightness_pyramid(found), limit_px / source.raw_px)
+    learn = source.ambient is None and not source.settled(e, reference)
+    frame = RegisteredFrame(found, None)
+    if motion is not None:  # the scene's detail does not cancel between the frames as they are
+        if learn:
+            source.learn(e, noise.alone(found))
+            source.learn(reference, noise.alone(still))
+        frame = RegisteredFrame(*resample(found, motion))
+    tiles = exposure.common_tiles(still, frame.signals)
+    measured = exposure.of_tiles(*tiles)
+    ratio = exposure.measured_or_stated(name, measured, still.shape[0], source.frames[e], source.frames[reference])
+    if motion is None and learn:
+        for number, samples in zip((reference, e), noise.paired(still, frame.signals, ratio)):
+            source.learn(number, samples)
+    noises = source.line(reference), source.line(e)
+    misfit = noise.misfit(still, frame.signals, ratio, noises, frame.mean_gain)
+    return Link(ratio, motion, misfit, exposure.curvature(*tiles)), frame
+
+
+def brightness_pyramid(frame: Signals) -> Pyramid:
+    """The square root of all channels together, lightly smoothed: about even noise."""
+    _, height, width = frame.shape
+    out = np.empty((height, width), np.float32)
+    for rows, inner, target in blocks(height, _SMOOTH.size // 2):
+        total, *others = frame.rows(rows)
+        for plane in others:
+            total = total + plane
+        smooth = np.asarray(cv2.sepFilter2D(total, -1, _SMOOTH, _SMOOTH))[inner]
+        np.maximum(smooth, 0, out=smooth)
+        smooth += np.float32(1e-4)
+        np.sqrt(smooth, out=out[target])
+    return Pyramid(out, frame.usable)
+
+
+def measure_motion(name: str, still: Pyramid, other: Pyramid, limit_px: float) -> Floats | None:
+    """Reference px → frame px (3, 3), or None where the frame did not move measurably.
+
+    Raises CaptureError, with the frame's name, where it moved by more than `limit_px` px of the pyramids.
+    """
+    found = register(still, other)
+    if found.shift_px > limit_px:
+        raise CaptureError(
+            f"{name} moved by {found.shift_px:.0f} px against the bracket's reference frame, more than "
+            f"{limit_px:.0f}: use a tripod, or raise hdr.max_motion_px"
+        )
+    return found.matrix if found.shift_px > max(_STILL_PX, _MOTION_SIGMAS * found.sigma_px) else None
+
+
+def ambient_light(bracket: Bracket, lines: noise.Lines, read: Reader, full: bool = False) -> AmbientLight | None:
+    """The mean of a bracket's ambient frames, on the full grid with `full`; None where it has none.
+
+    Raises CaptureError where the frames are of different size.
+    """
+    shot, reference = bracket.shot, bracket.shot.frames[bracket.reference]
+    if not shot.ambient:
+        return None
+    value: Floats | None = None
+    share = [exposure.of_ambient(frame, reference) for frame in shot.ambient]
+    for frame in shot.ambient:
+        part = planar(sensor.signal(read(frame), full))
+        if value is not None:
+            same_size(f"an ambient frame of shot {shot.name}", part.shape, value.shape)
+        value = part if value is None else value + part
+    assert value is not None
+    value /= np.float32(sum(share))
+    variance = np.zeros_like(value)
+    for frame, one in zip(shot.ambient, share):
+        image = read(frame)
+        iso = frame.exif.iso or "ambient"
+        if not lines.knows(iso):
+            lines.learn(iso, noise.alone(signals(image, read.clip)))
+        line = lines.line(iso, sensor.rounding(image) / 2)
+        level = np.stack([cv2.blur(plane, (5, 5)) for plane in value]) * np.float32(one)
+        variance += noise.of_pixels(level, line, image.cfa if full else None) / np.float32(sum(share) ** 2)
+    return AmbientLight(value, variance)
+
+
+def _ambient_share(ambient: AmbientLight, flash: Floats) -> float:
+    """Of all light in the brighter half of the picture, the part that the flash (C, H, W) did not bring."""
+    without, lit = (picture[:, ::4, ::4].sum(0) for picture in (ambient.value, flash))
+    bright = lit + without >= np.median(lit + without)
+    return float(without[bright].sum() / max(float((lit + without)[bright].sum()), 1e-9))

@@ -1,0 +1,75 @@
+"""Graph cut: moves a mask's outline to the picture's edges of color.
+
+References
+----------
+Rother, Kolmogorov & Blake, GrabCut, SIGGRAPH 2004.
+"""
+
+import cv2
+import numpy as np
+
+from polcap.images import Bits, Floats
+from polcap.optics.resize import area_mean
+from polcap.stages.mask.regions import Bools
+
+_WORK_PIXELS = 3e5  # about, of the reduced picture that is cut
+_REACH = 0.006  # of the picture's longer side, by which the outline may move
+_ROUNDS = 3  # of GrabCut
+_SURE = 0.996  # probability of the object, or of the backdrop, from which colors decide nothing (decision 37)
+
+
+def sharpen(picture: Floats, mask: Bools, chart: Bits, probability: Floats) -> Bools:
+    """A mask moved to the picture's edges, and decided by color where its probabilities leave it open.
+
+    Parameters
+    ----------
+    picture
+        (H, W, 3) linear Rec.709.
+    mask
+        (H, W) right to a few pixels, or wherever its probabilities are near 0 or 1.
+    chart
+        (H, W) 1 on the chart.
+    probability
+        (H, W) 0…1 of each pixel to be the object.
+    """
+    small, outside = reduce_picture(picture, chart)
+    seed = cv2.resize(mask.astype(np.uint8), small.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    return enlarge(cut(small, seed, outside, area_mean(probability, small.shape)) > 0, chart)
+
+
+def reduce_picture(picture: Floats, chart: Bits) -> tuple[Floats, Bools]:
+    """Picture (h, w, 3) and chart (h, w) at the size of the cut."""
+    height, width = chart.shape
+    shrink = max(1.0, float(np.sqrt(height * width / _WORK_PIXELS)))
+    size = (round(width / shrink), round(height / shrink))
+    return area_mean(picture, size[::-1]), cv2.resize(chart, size, interpolation=cv2.INTER_NEAREST) > 0
+
+
+def cut(picture: Floats, seed: Bits, outside: Bools, probability: Floats | None = None) -> Bits:
+    """The seed (h, w) with its outline at the picture's edges; open wherever the probabilities (h, w) are not sure."""
+    tone = np.log2(np.clip(picture, 0, 4) + 0.002)
+    display = (255 * (tone - tone.min()) / (np.ptp(tone) + 1e-9)).astype(np.uint8)
+    reach = max(3, round(_REACH * max(seed.shape)))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    sure, possible = cv2.erode(seed, kernel), cv2.dilate(seed, kernel)
+    if probability is not None:
+        sure[probability < _SURE] = 0
+        possible[probability > 1 - _SURE] = 1
+    labels = np.full(seed.shape, cv2.GC_BGD, np.uint8)
+    labels[possible > 0] = cv2.GC_PR_BGD
+    labels[seed > 0] = cv2.GC_PR_FGD
+    labels[sure > 0] = cv2.GC_FGD
+    labels[outside] = cv2.GC_BGD
+    if sure.any() and (labels == cv2.GC_BGD).any():
+        cv2.setRNGSeed(1)
+        cv2.grabCut(display, labels, None, np.zeros((1, 65)), np.zeros((1, 65)), _ROUNDS, cv2.GC_INIT_WITH_MASK)
+    found = ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).astype(np.uint8)
+    return found if found.any() else seed
+
+
+def enlarge(mask: Bools, chart: Bits) -> Bools:
+    """A mask (h, w) at the size of the chart's zone (H, W), and outside it."""
+    large = mask.astype(np.float32)
+    if mask.shape != chart.shape:
+        large = cv2.resize(large, chart.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return np.asarray((large > 0.5) & (chart == 0))

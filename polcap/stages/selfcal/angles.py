@@ -1,0 +1,371 @@
+"""The polarizer's angles: their order and sense, one shot that was turned, angles that nobody noted.
+
+The first is judged by the outline, where diffuse reflection is polarized across the contour all round. Orders that
+give the same analyzers are one: (0°, 120°, 60°) counted clockwise is (0°, 60°, 120°). A common turn of all angles is
+no other order. The stated order wins ties.
+
+The second needs K > 3 shots of known gains g. They lie in a space of three dimensions: with N spanning the rest of
+A = ½ (1, cos 2θ, sin 2θ), N·(I/g) = 0. A shot k turned by δ leaves N_k δ dI_k/dθ, which goes with the polarization; a
+gain that is off by ε leaves N_j ε I_j, which goes with the light. Guessed gains can take the place of turns, so they
+enter with their errors.
+
+The third needs four shots of well known gains. Shots at angles θ are I = A(θ) S, of rank three. Another A′ = A B
+explains them as well if its rows are (1, cos, sin) too: points on the unit circle that an affine map takes from one
+another. Through five points goes one ellipse, so five shots fix θ up to a common turn and the sense; four leave one
+more parameter free. The outline gives the rest: light there is polarized along the contour's normal φ, so I lies
+between 1 and cos 2(φ − θ) for every part of it. A common turn that remains is found by `ring_zero.by_slopes`.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import combinations, permutations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Floats, OutlineCheck, ShotOrder, TurnedShot
+from polcap.optics import mueller, outline
+from polcap.optics.outline import Rim
+from polcap.optics.robust import biweight, jackknife, spread
+from polcap.stages.selfcal.object_gains import ObjectShots
+
+# Order and sense.
+_EDGE_PX = 3  # of the picture; nearer, an outline is no contour of shape
+_MOST_PERMUTED = 4  # shots; beyond, only exchanges of two of them, and the reversal, are tried
+_CLOSES = 3.0  # factor on the misfit of more than three shots that rules an order out, or in; set by hand
+_AHEAD = 2.0  # σ by which the stated order must be better than another to exclude it
+_BETTER = 3.0  # σ by which another order must be better than the stated one
+_LEAST_RIVAL = 0.25  # score of an order that the object could have as well: half of chance's greatest; set by hand
+_ROUGH = 0.01  # misfit that gains and interpolation leave at most, relative to the light: a flash repeats within 1 %
+# One turned shot.
+_PARTS = 12  # of the object; their scatter is the error
+_LEAST_CELLS = 60
+_LEAST_GAIN = 0.5  # of the misfit with the stated angles, to be believed; 15° takes 0.8 or more, good captures < 0.3
+_LEAST_SIGMAS = 3.5
+_ALIKE = 0.9  # of the best shot's gain in misfit: then it cannot be decided which of them was turned
+_FAR = np.radians(np.arange(20.0, 91.0, 5.0))  # turns that no tangent reaches: a ring that was not turned at all
+_MOST_LEFT = 0.25  # of the median residual with the angles as stated, for such a turn to be started from
+_ANGLE_ERROR = np.radians(0.5)  # 1σ of every angle, set by hand or motor, against its mark
+# Unknown angles.
+_BINS = 36  # of φ, 10° each
+_LEAST_BINS = 24  # with light in them; fewer sides do not determine turn and sense
+_STARTS = 20  # drawn at random, the same every time
+_COARSE, _FINE = 1e-3, 1e-7  # relative change of the misfit at which the search ends: of all starts, of the best
+_POLISHED = 4  # of the starts, the best ones
+_AS_GOOD = 1.3  # of the least misfit: angles that end there are possible too
+_LAW = 0.012  # relative, of the outline's light: residuals of its parts that are no ideal diffuse reflectors
+_OTHER_LAWS = (0.004, 0.03)  # that it may be as well: parts of an outline are off by up to 3 %
+_SIDES = 8  # parts of the outline and of the inside, left out one at a time
+_INSIDE = 0.0001  # the same of the inside: interpolation and gains
+_FLOOR = np.radians(0.3)  # 1σ; where all sides agree (200 simulated cases)
+
+
+def rim(shots: ObjectShots) -> Rim:
+    """The band inside the object's outline; where the object leaves the picture its outline is no contour of shape."""
+    mask, (x0, y0, x1, y1), (height, width) = shots.mask, shots.crop, shots.full
+    depth = outline.depth(mask)
+    outward, slope = outline.outward(mask.astype(np.float32), 3.0)
+    band = (depth > 1.5) & (depth < max(5.0, 0.02 * max(mask.shape))) & (slope > 1e-4) & (shots.quality == 0)
+    band[: max(0, _EDGE_PX - y0)] = False
+    band[:, : max(0, _EDGE_PX - x0)] = False
+    band[mask.shape[0] - max(0, y1 - (height - _EDGE_PX)) :] = False
+    band[:, mask.shape[1] - max(0, x1 - (width - _EDGE_PX)) :] = False
+    light = np.asarray(shots.light[:, band], np.float64)
+    return Rim(light, np.arctan2(outward[1], outward[0])[band], outline.sectors(band))
+
+
+@dataclass(frozen=True)
+class OrderFit:
+    """The check of order and sense, with the scores −1…1 of the stated order and of the best one."""
+
+    check: OutlineCheck
+    score: float  # mean of w cos 2(φ − φ_contour)
+    best_score: float
+
+
+def check_order(at: Rim, angle: Floats, margin: float, least_score: float) -> OrderFit:
+    """The order and sense of the stated angles (K,) rad that the rim supports.
+
+    Another order must score `least_score` or more, and `margin` more than the stated one.
+    """
+    stated = ShotOrder(tuple(range(len(angle))))
+    if at.light.shape[1] == 0:
+        return OrderFit(OutlineCheck(stated, 0.0), 0.0, 0.0)
+    total, weight = outline.phasor(at, angle)
+    mean, _ = outline.mean_and_doubt(total, weight)
+    along = (total * np.exp(-1j * np.angle(mean))).real
+    here = _misfit(at, angle)
+    best, best_score = stated, abs(mean)
+    rival, nearest = None, -np.inf
+    for order, turned in hypotheses(angle).items():
+        misfit = _misfit(at, turned)
+        if order == stated or misfit > _CLOSES * here:
+            continue
+        closes_alone = _CLOSES * misfit < here > _ROUGH  # more than three shots agree in this order only
+        least = 0.0 if closes_alone else margin
+        other, others = outline.phasor(at, turned)
+        score = float(other.sum().real / max(others.sum(), 1e-9))
+        sigma = _sigma_of_difference(other.real, others, along, weight)
+        if score > _LEAST_RIVAL and least and score - abs(mean) > max(nearest, -_AHEAD * sigma):
+            rival, nearest = order, score - abs(mean)
+        needed = max(least, _BETTER * sigma * (least > 0))
+        if score > max(best_score, least_score) and score - abs(mean) > needed:
+            best, best_score = order, score
+    return OrderFit(OutlineCheck(best, abs(mean), rival), mean.real, best_score)
+
+
+def hypotheses(angle: Floats) -> dict[ShotOrder, Floats]:
+    """Angles (K,) rad of every order and sense that gives analyzers of its own; the stated one first."""
+    shots = len(angle)
+    nominal = tuple(range(shots))
+    orders = list(permutations(nominal)) if shots <= _MOST_PERMUTED else [nominal, *_exchanged(shots), nominal[::-1]]
+    found: dict[ShotOrder, Floats] = {}
+    for order in sorted(set(orders), key=lambda one: (one != nominal, one)):
+        for mirrored in (False, True):
+            turned = angle[list(order)] * (-1 if mirrored else 1)
+            weights = mueller.analyzer(turned)
+            if all(np.abs(weights - mueller.analyzer(known)).max() > 0.02 for known in found.values()):
+                found[ShotOrder(order, mirrored)] = turned
+    return found
+
+
+def _exchanged(shots: int) -> list[tuple[int, ...]]:
+    """Every exchange of two of the shots."""
+    found = []
+    for i, j in combinations(range(shots), 2):
+        order = list(range(shots))
+        order[i], order[j] = j, i
+        found.append(tuple(order))
+    return found
+
+
+def _misfit(at: Rim, angle: Floats) -> float:
+    """Median relative residual of more than three shots; 1 for three, which always fit."""
+    if len(angle) < 4:
+        return 1.0
+    weights = mueller.analyzer(angle)
+    stokes = np.linalg.lstsq(weights, at.light, rcond=None)[0]
+    residual = np.linalg.norm(at.light - weights @ stokes, axis=0) / np.maximum(at.light.sum(0), 1e-9)
+    return float(np.median(residual)) + 1e-4
+
+
+def _sigma_of_difference(one: Floats, one_weight: Floats, other: Floats, other_weight: Floats) -> float:
+    """1σ of Σone/Σone_weight − Σother/Σother_weight, sums over sectors (24,); 1 for fewer than two sectors."""
+    used = np.flatnonzero(one_weight + other_weight)
+    if len(used) < 2:
+        return 1.0
+    without = [
+        (part.sum() - part[used]) / np.maximum(weight.sum() - weight[used], 1e-9)
+        for part, weight in ((one, one_weight), (other, other_weight))
+    ]
+    return float(jackknife(without[0] - without[1]))
+
+
+def turned_shot(light: Floats, row: NDArray[np.int_], angle: Floats, gain_sigma: Floats) -> TurnedShot:
+    """The single turn that more than three shots ask for beyond its error; none for three shots, or few cells.
+
+    light (K, P) are means of small cells of the object without their gains, row (P,) the row of each (neighbors fall
+    into the same part), angle (K,) rad as stated, gain_sigma (K,) 1σ of each gain.
+    """
+    shots = len(angle)
+    if shots < 4 or light.shape[1] < _LEAST_CELLS:
+        return TurnedShot()
+    light = light / light.mean(0)
+    part = np.searchsorted(np.quantile(row, np.linspace(0, 1, _PARTS + 1)[1:-1]), row)
+    prior = np.diag(1 / np.maximum(gain_sigma, 1e-4) ** 2)
+    fits = [_fit_turn(k, 0.0, light, angle, part, prior) for k in range(shots)]
+    for k, start in _far_turns(light, angle):
+        further = _fit_turn(k, start, light, angle, part, prior)
+        left = further.stated - further.gained
+        if left < fits[k].stated - fits[k].gained:
+            fits[k] = replace(further, stated=fits[k].stated, gained=fits[k].stated - left)
+    most = max(fit.gained for fit in fits)
+    alike = [k for k in range(shots) if fits[k].gained >= _ALIKE * most]
+    alike.sort(key=lambda k: -abs(fits[k].turn))  # a small turn of one shot can be a large one of another
+    found = fits[alike[0]]
+    # An error of one angle is a greater one of another to which the closure is less sensitive.
+    sensitivity = np.linalg.norm(_free(angle), axis=0) * np.sqrt((_change_per_rad(light, angle) ** 2).mean(axis=1))
+    by_angles = _ANGLE_ERROR * float(np.linalg.norm(sensitivity) / max(sensitivity[alike[0]], 1e-9))
+    sigma = float(np.hypot(found.sigma, by_angles))
+    if found.gained < _LEAST_GAIN * found.stated or abs(found.turn) < _LEAST_SIGMAS * sigma:
+        return TurnedShot()
+    return TurnedShot(tuple(alike), found.turn, sigma)
+
+
+@dataclass(frozen=True)
+class _TurnFit:
+    turn: float  # rad
+    sigma: float  # rad
+    stated: float  # misfit with the angles as stated
+    gained: float  # of it by the turn
+
+
+def _far_turns(light: Floats, angle: Floats) -> list[tuple[int, float]]:
+    """Great turns (shot, rad) that leave next to no residual of closure."""
+    stated = _median_residual(light, angle)
+    found = []
+    for k in range(len(angle)):
+        turns = [float(way * size) for size in _FAR for way in (-1, 1)]
+        left, best = min((_median_residual(light, angle + turn * np.eye(len(angle))[k]), turn) for turn in turns)
+        if left < _MOST_LEFT * stated:
+            found.append((k, best))
+    return found
+
+
+def _median_residual(light: Floats, angle: Floats) -> float:
+    return float(np.median(np.linalg.norm(_free(angle) @ light, axis=0)))
+
+
+def _free(angle: Floats) -> Floats:
+    """N (K − 3, K), across the space of shots at these angles."""
+    return np.asarray(np.linalg.svd(mueller.analyzer(angle))[0][:, 3:].T)
+
+
+def _change_per_rad(light: Floats, angle: Floats) -> Floats:
+    """dI/dθ of every shot, (K, P)."""
+    _, s1, s2 = np.linalg.lstsq(mueller.analyzer(angle), light, rcond=None)[0]
+    return np.asarray(s2 * np.cos(2 * angle[:, None]) - s1 * np.sin(2 * angle[:, None]))
+
+
+def _fit_turn(k: int, start: float, light: Floats, angle: Floats, part: NDArray[np.intp], prior: Floats) -> _TurnFit:
+    """Gains and one turn of shot k, after a turn by `start` rad, by least squares with biweights."""
+    angle = angle + start * np.eye(len(angle))[k]
+    free = _free(angle)
+    residual = free @ light  # (K − 3, P)
+    by_turn = free[:, k, None] * _change_per_rad(light, angle)[k]
+    columns = np.concatenate([free[:, None] * light.T, by_turn[..., None]], axis=2)  # (K − 3, P, K + 1)
+    size = columns.shape[2]
+    ridge = 1e-12 * np.eye(size)
+    weight: Floats = np.ones(residual.shape[1])
+    for _ in range(4):  # moved edges and highlights close with no angle
+        weighted = columns * weight[:, None]
+        square = np.einsum("npi,npj->ij", weighted, columns, optimize=True)
+        right = np.einsum("npi,np->i", weighted, residual)
+        noise = float((weight * (residual**2).sum(0)).sum() / max(weight.sum(), 1e-9))
+        held = np.zeros((size, size))
+        held[:-1, :-1] = prior * noise
+        found = np.linalg.solve(square + held + ridge, right)
+        off = np.linalg.norm(residual - columns @ found, axis=0)
+        weight = biweight(off, spread(off))
+    total = float((weight * (residual**2).sum(0)).sum())
+    gains_alone = np.linalg.solve((square + held + ridge)[:-1, :-1], right[:-1])
+    stated = total - float(right[:-1] @ gains_alone)
+    without = []
+    for p in np.unique(part):
+        some = part != p
+        normal = np.einsum("npi,npj->ij", weighted[:, some], columns[:, some], optimize=True) + held
+        without.append(
+            np.linalg.solve(normal + ridge, np.einsum("npi,np->i", weighted[:, some], residual[:, some]))[-1]
+        )
+    by_noise = np.sqrt(noise * np.linalg.inv(square + held + ridge)[-1, -1])
+    sigma = float(np.hypot(jackknife(np.array(without)), by_noise))
+    return _TurnFit(start + float(found[-1]), sigma, stated, stated - (total - float(right @ found)))
+
+
+@dataclass(frozen=True)
+class FoundAngles:
+    """Angles that nobody noted."""
+
+    angle: Floats  # (K,) rad, in 0…π
+    sigma: float  # rad, 1σ of each; π/2 where nothing is known
+
+
+def find(at: Rim, cells: Floats, row: NDArray[np.int_]) -> FoundAngles:
+    """The angles that outline and inside support together, of four or more shots without their gains.
+
+    cells (K, P) are means of small blocks of the inside, row (P,) the row of each; neighbors share their errors. The
+    outline counts by parts of equal φ, whose sums obey the same law, the inside by its distance from the space that
+    A(θ) spans, each by its own scatter. The error joins the jackknife over sides and over parts of the inside, the
+    change when the outline is believed more or less, and the distance to other solutions that fit as well.
+    """
+    shots = len(cells)
+    unknown = FoundAngles(np.zeros(shots), np.pi / 2)
+    around, part = _by_direction(at)
+    lit = around.min(axis=1) > 0
+    if lit.sum() < _LEAST_BINS or cells.shape[1] < 10 * shots:
+        return unknown
+    around, part = around[lit], part[lit]
+    inside = _condensed(cells)
+    ends = [_solve(around, part, inside, start, _COARSE) for start in _starts(shots)]
+    ends.sort(key=lambda end: end[0])
+    best = _best([_solve(around, part, inside, one, _FINE) for _, one in ends[:_POLISHED]])
+    if not best:
+        return unknown
+    angle = best[0][1]
+    others = [one for cost, one in best[1:] if cost < _AS_GOOD * best[0][0]]
+    elsewhere = max((float(np.abs(_difference(one, angle)).max()) for one in others), default=0.0)
+    side = np.arange(len(part)) * _SIDES // len(part)
+    place = np.argsort(np.argsort(row, kind="stable")) * _SIDES // len(row)
+    by_side = [_solve(around[side != s], part[side != s], inside, angle, _FINE)[1] for s in range(_SIDES)]
+    by_place = [_solve(around, part, _condensed(cells[:, place != s]), angle, _FINE)[1] for s in range(_SIDES)]
+    by_law = [_difference(_solve(around, part, inside, angle, _FINE, law)[1], angle) for law in _OTHER_LAWS]
+    variance = np.mean(np.square(by_law), axis=0)  # (K,)
+    for without in (by_side, by_place):
+        variance = variance + jackknife(np.array([_difference(one, angle) for one in without]), about=0.0) ** 2
+    return FoundAngles(angle % np.pi, min(float(np.sqrt(_FLOOR**2 + variance.max() + elsewhere**2)), np.pi / 2))
+
+
+def _by_direction(at: Rim) -> tuple[Floats, Floats]:
+    """Light of the outline summed over bins of its direction, (B, K), and those directions (B,) rad."""
+    number = np.floor(at.azimuth / (2 * np.pi) * _BINS).astype(int) % _BINS
+    light = np.stack([np.bincount(number, shot, _BINS) for shot in at.light], axis=1).astype(np.float64)
+    weight = at.light.sum(axis=0)
+    sums = [np.bincount(number, weight * wave, _BINS) for wave in (np.cos(at.azimuth), np.sin(at.azimuth))]
+    return light, np.arctan2(sums[1], sums[0])
+
+
+def _condensed(cells: Floats) -> Floats:
+    """(K, K) with the same distances from any span as all cells (K, P), each relative to its light.
+
+    Their mean is subtracted, for errors of the gains act upon it.
+    """
+    relative = cells / cells.mean(axis=0)
+    relative = relative - relative.mean(axis=1, keepdims=True)
+    values, vectors = np.linalg.eigh(relative @ relative.T / relative.shape[1])
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))
+
+
+def _starts(shots: int) -> list[Floats]:
+    random = np.random.default_rng(outline.SECTORS)
+    return [random.uniform(0, np.pi, shots) for _ in range(_STARTS)]
+
+
+def _best(ends: list[tuple[float, Floats]]) -> list[tuple[float, Floats]]:
+    """Misfits and angles, the best first, each once."""
+    found: list[tuple[float, Floats]] = []
+    for cost, angle in sorted(ends, key=lambda end: end[0]):
+        if np.isfinite(cost) and all(np.abs(_difference(angle, known)).max() > np.radians(0.2) for _, known in found):
+            found.append((cost, angle))
+    return found
+
+
+def _solve(
+    around: Floats, part: Floats, inside: Floats, start: Floats, until: float, law: float = _LAW
+) -> tuple[float, Floats]:
+    """Misfit and angles (K,) of least squares from a start; of two solutions, 90° from one another, the diffuse one."""
+    relative = around / around.mean(axis=1, keepdims=True)
+    from scipy.optimize import least_squares  # here: importing it costs .3 s of every start
+
+    end = least_squares(_residual, start, args=(relative, part, inside, law), method="lm", ftol=until, max_nfev=150)
+    along = np.cos(2 * (part[:, None] - end.x))
+    along -= along.mean(axis=1, keepdims=True)
+    angle = end.x if float((along * relative).sum()) > 0 else end.x + np.pi / 2
+    return float(end.cost), np.asarray(angle)
+
+
+def _residual(angle: Floats, relative: Floats, part: Floats, inside: Floats, law: float) -> Floats:
+    """The outline's light outside the span of 1 and cos 2(φ − θ), and the inside's outside A(θ), over their 1σ."""
+    ones = np.ones(len(angle)) / np.sqrt(len(angle))
+    wave = np.cos(2 * (part[:, None] - angle))
+    wave = wave - (wave @ ones)[:, None] * ones
+    wave = wave / np.maximum(np.linalg.norm(wave, axis=1, keepdims=True), 1e-9)
+    left = relative - (relative @ ones)[:, None] * ones
+    left = left - (left * wave).sum(axis=1, keepdims=True) * wave
+    rows = np.stack([np.ones_like(angle), np.cos(2 * angle), np.sin(2 * angle)], axis=1)
+    basis, _ = np.linalg.qr(rows)
+    out = inside - basis @ (basis.T @ inside)
+    return np.concatenate([left.ravel() / law / np.sqrt(len(part)), out.ravel() / _INSIDE])
+
+
+def _difference(a: Floats, b: Floats) -> Floats:
+    """From axis b to axis a, −π/2…π/2."""
+    return np.asarray((a - b + np.pi / 2) % np.pi - np.pi / 2)

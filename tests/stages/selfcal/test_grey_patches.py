@@ -1,0 +1,84 @@
+"""Grey patches give the gains within their error; gloss shows on the dark ones; hidden ones do not count."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from polcap.config import Config
+from polcap.images import ColorCalibration, SelfCalibration
+from polcap.quality import light
+from polcap.quality.gate import Evidence
+from polcap.quality.limits import GateLimits
+from polcap.stages import selfcal
+from polcap.stages.selfcal import grey_patches
+from polcap.stages.whitebalance.patches import PatchUse
+from tests import scenes
+
+GAIN = np.array([1.0, 1.013, 0.981])
+SHOTS = scenes.stack(gain=GAIN, noise=0.004)
+GREYS = np.arange(24) >= 18
+
+
+def board(**fields: object) -> ColorCalibration:
+    """24 squares on the scene's unpolarized board, as a chart's patches."""
+    quads = []
+    for row in range(4):
+        for column in range(6):
+            x, y = 230 + 11 * column, 36 + 38 * row
+            quads.append([[x, y], [x + 9, y], [x + 9, y + 30], [x, y + 30]])
+    return replace(scenes.no_color(), quads=np.array(quads, float), source="chart", **fields)  # type: ignore[arg-type]
+
+
+def solve(radiance, color) -> SelfCalibration:
+    return selfcal.solve(radiance, scenes.still(), scenes.ball_object(), color, Config().selfcal)
+
+
+def test_grey_patches_give_the_gains_within_their_error():
+    found = solve(SHOTS, board()).gains
+    assert found.source == "grey patches"
+    assert np.abs(found.gain.mean(1) / GAIN - 1).max() < 0.002
+    z = (found.gain[1:] - GAIN[1:, None]) / found.sigma[1:]
+    assert np.abs(z).max() < 4
+
+
+@pytest.mark.parametrize("reason", [PatchUse.UNEVEN, PatchUse.ODD])
+def test_hidden_grey_patches_do_not_count(reason):
+    """A cloth over the grey row, brighter in one shot: the gains come from the patches that serve, or the object."""
+    value = SHOTS.value.copy()
+    value[:, 150:190, 224:300] = 0.02 * np.random.default_rng(1).uniform(0.5, 1.5, size=(3, 40, 76, 1))
+    covered = replace(SHOTS, value=value)
+    use = np.where(GREYS, reason, PatchUse.USED).astype(np.uint8)
+    found = solve(covered, board(patch_use=use)).gains
+    assert found.source == "object"
+    assert np.abs(found.gain.mean(1) / GAIN - 1).max() < 0.005
+    use[[18, 19]] = PatchUse.USED  # white and neutral 8 show: they alone serve
+    value[:, 150:190, 230:252] = SHOTS.value[:, 150:190, 230:252]
+    half = solve(replace(SHOTS, value=value), board(patch_use=use)).gains
+    assert half.source == "grey patches" and np.isnan(half.grey_slope)
+    assert np.abs(half.gain.mean(1) / GAIN - 1).max() < 0.003
+
+
+def test_grey_patches_with_a_large_error_are_doubted():
+    """Their distance from the object's gains is then within the error of both: the error itself is judged."""
+    found = solve(SHOTS, board())
+    gains = replace(found.gains, gain=found.gains.gain * [[1], [1.11], [1.13]], sigma=np.full((3, 3), 0.31))
+    vague = Evidence.partial(selfcal=replace(found, gains=replace(gains, disagreement=0.0)))
+    gate = light._gain_doubt(vague, GateLimits())
+    assert gate.state == "fail" and gate.value == pytest.approx(0.31) and gate.limit == GateLimits().max_gain_doubt
+    assert light._gain_doubt(Evidence.partial(selfcal=found), GateLimits()).state == "pass"
+
+
+def test_a_polarized_chart_disagrees_with_the_object():
+    radiance = scenes.stack(noise=0.002)
+    value = radiance.value.copy()
+    value[2, :, 224:300] *= 1.05  # as a chart turned away would
+    assert solve(replace(radiance, value=value), board()).gains.disagreement > 0.02
+    assert solve(radiance, board()).gains.disagreement < 1e-4
+
+
+def test_gloss_on_the_chart_shows_on_its_dark_patches():
+    value, variance = np.ones((3, 6)) * (0.9, 0.6, 0.36, 0.2, 0.09, 0.03), np.full((3, 6), 1e-8)
+    assert grey_patches._gloss(value * GAIN[:, None], variance) == 0
+    value[1] += 0.02  # the same light on dark and light ones, in one shot
+    assert grey_patches._gloss(value, variance) == pytest.approx(0.02 / 0.9, rel=0.3)
