@@ -102,6 +102,8 @@ def _plan(given: dict[str, Any], target: Path) -> None:
 
 def _process(given: dict[str, Any], target: Path, request: str | None) -> None:
     """Write the result folder; print the path of the asset and the verdict."""
+    from dataclasses import replace
+
     from polcap.formats.capture import reader as captures
     from polcap.pipeline import run as pipeline
     from polcap.pipeline import unchanged
@@ -111,8 +113,8 @@ def _process(given: dict[str, Any], target: Path, request: str | None) -> None:
     table = captures.table(capture)
     terminal.tell(table)
     with terminal.progress(len(STAGES) + 1) as bar:
-        decode = pipeline.counted(capture, bar.frame)
-        about = pipeline.process(capture, supplied, config, target, given["until"], given["force"], bar.stage, decode)
+        supplied = replace(supplied, decode=pipeline.counted(capture, bar.frame))
+        about = pipeline.process(capture, supplied, config, target, given["until"], given["force"], bar.stage)
     if about is None:
         work = str(target / "work")
         terminal.say({"until": given["until"], "work": work} if given["json"] else work)

@@ -23,7 +23,7 @@ def train(
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint.")] = False,
     start: Annotated[Path | None, typer.Option(metavar="ONNX", help="Begin with this model's weights.")] = None,
     done: Annotated[
-        int, typer.Option(min=0, help="Of --samples, pictures that --start has learned from: goes on with their rate.")
+        int, typer.Option(min=0, help="Pictures of --samples that --start has seen; sets the learning rate.")
     ] = 0,
     rate: Annotated[float, typer.Option(min=0, help="Of Muon; less to go on from trained weights.")] = 1e-3,
     views: Annotated[int | None, typer.Option(min=1, help="Views of each mesh.")] = None,

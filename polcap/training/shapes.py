@@ -53,7 +53,7 @@ def _displaced(rng: np.random.Generator) -> tuple[Floats, NDArray[np.int32]]:
 def _dented(rng: np.random.Generator) -> tuple[Floats, NDArray[np.int32]]:
     """A smooth dome with hollows and bosses of one size range, some flat inside, and often a patch of fine relief.
 
-    A hollow and a boss polarize alike: only outline, shadow and neighbours say which of the two a place is.
+    A hollow and a boss polarize alike: only the outline, shadows and neighbours decide which one it is.
     """
     unit, faces = _sphere(2 * _RINGS, 2 * _SECTORS)
     radius = np.ones(len(unit))
