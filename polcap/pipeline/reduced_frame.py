@@ -17,7 +17,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
-class Glance:
+class ReducedFrame:
     """A frame, reduced."""
 
     picture: SensorImage  # (h, w, 3) means of blocks, black 0, white 1; 1 where part of a block is clipped
@@ -41,7 +41,7 @@ def first(image: SensorImage, clip: float, most_pixels: float) -> tuple[dict[str
 
 
 def take(image: SensorImage, clip: float, times: int, corners: list[list[int]]) -> tuple[dict[str, Any], Arrays]:
-    """The parts of a `Glance`: blocks of `times` merged pixels a side, tiles at `corners` (T, 2) px."""
+    """The parts of a `ReducedFrame`: blocks of `times` merged pixels a side, tiles at `corners` (T, 2) px."""
     shares = _averaged((~sensor.usable(image, clip)).astype(np.float32), times)
     value = _means(image, times)
     value[shares > 0] = 1  # the stages drop pixels that are clipped in part
@@ -54,8 +54,8 @@ def take(image: SensorImage, clip: float, times: int, corners: list[list[int]]) 
     return {"lossy": image.lossy}, arrays
 
 
-def joined(meta: dict[str, Any], arrays: Arrays) -> Glance:
-    """The `Glance` of the parts (h, w) from `take`."""
+def joined(meta: dict[str, Any], arrays: Arrays) -> ReducedFrame:
+    """The `ReducedFrame` of the parts (h, w) from `take`."""
     picture = SensorImage(
         value=arrays["value"],
         black=np.zeros((1, 1)),
@@ -65,7 +65,7 @@ def joined(meta: dict[str, Any], arrays: Arrays) -> Glance:
         white_balance=arrays.get("white_balance"),
         lossy=meta["lossy"],
     )
-    return Glance(picture, arrays["clipped"], sharpness.Tiles(arrays["light"], arrays["usable"]))
+    return ReducedFrame(picture, arrays["clipped"], sharpness.Tiles(arrays["light"], arrays["usable"]))
 
 
 def _means(image: SensorImage, times: int) -> Floats:
