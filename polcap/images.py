@@ -398,22 +398,36 @@ class ChartLight:
 
 
 @dataclass(frozen=True)
+class ChartPlace:
+    """A chart in the reference shot, on its full-frame grid."""
+
+    quads: Floats  # (24, 4, 2) inner patch quads (x, y), px
+    corners: Floats  # (4, 2) outer patch corners, px
+
+
+@dataclass(frozen=True)
+class PatchColors:
+    """The fit of a chart's patches to its maker's colors."""
+
+    delta_e: Floats  # (24,) CIEDE2000 residual; NaN for patches left out
+    use: Bits | None = None  # (24,) 0 served; else why not, `whitebalance.patches.PatchUse`; None: unknown
+    predicted: Floats | None = None  # (24,) CIEDE2000 of each patch by the matrix of all others
+    falloff: tuple[float, float] = (0.0, 0.0)  # relative change of the light per patch, to the chart's right, down
+    glare: float = 0.0  # white light that the chart's gloss and the lens add to every patch [reflectance]
+    edition: str = ""  # of the chart whose colors fit, `ChartReference.name`
+
+
+@dataclass(frozen=True)
 class ColorCalibration:
     """From camera channels to linear Rec.709 on the scale of the chart's white patch."""
 
     matrix: Floats  # (3, 3) camera radiance (S0 scale: I₀ + I₉₀) → linear Rec.709 reflectance
-    quads: Floats | None  # (24, 4, 2) inner patch quads (x, y), full-frame grid px of the reference shot
-    corners: Floats | None  # (4, 2) outer patch corners, same grid
-    delta_e: Floats | None  # (24,) CIEDE2000 residual per patch
     source: Literal["chart", "corners", "profile", "camera", "none"]
-    cost: float  # the detector's; NaN without a chart
-    metres_per_px: float | None  # at the chart's distance, on this grid; None without a known chart size
-    falloff: tuple[float, float] = (0.0, 0.0)  # relative change of the light per patch, to the chart's right, down
-    glare: float = 0.0  # white light that the chart's gloss and the lens add to every patch [reflectance]
-    predicted: Floats | None = None  # (24,) CIEDE2000 of each patch by the matrix of all others
-    patch_use: Bits | None = None  # (24,) 0 served; else why not, `whitebalance.patches.PatchUse`
-    edition: str = ""  # whose colors its patches were held against, `ChartReference.name`
-    light: ChartLight | None = None  # None without a chart in the picture
+    cost: float = float("nan")  # of the chart's detector; NaN without it
+    metres_per_px: float | None = None  # at the chart's distance, on this grid; None without a known chart size
+    place: ChartPlace | None = None  # None without a chart in the picture
+    light: ChartLight | None = None  # the same
+    patches: PatchColors | None = None  # None without a chart, here or in the capture of the profile
 
 
 @dataclass(frozen=True)

@@ -61,8 +61,7 @@ LIMITS: dict[str, dict[str, Limit]] = {  # stage → array → limit; the first 
         "variance": Limit("relative", 4e-3, 5e-4),  # its fit bins equally bright tiles in any order: 2e-3 was seen
     },
     "whitebalance": {
-        "quads": Limit("absolute", 0.02),  # px; corners are found on 8-bit pictures
-        "corners": Limit("absolute", 0.02),
+        "place.*": Limit("absolute", 0.02),  # px; corners are found on 8-bit pictures
     },
     "align": {
         "transform": Limit("px", 0.01),  # 1e-3 px was seen; the registration's own error is 0.02 px
@@ -213,8 +212,7 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
     color = replace(
         scenes.no_color(),
         matrix=inputs["matrix"],
-        quads=inputs["quads"],
-        corners=inputs["corners"],
+        place=images.ChartPlace(inputs["quads"], inputs["corners"]),
         source="chart",
         light=images.ChartLight(*(inputs[f"light.{name}"] for name in ("white", "normal", "flash", "covariance"))),
     )
@@ -404,9 +402,9 @@ def make_inputs() -> Arrays:
     registered = align.register(shots, color, config.align)
     object_ = mask.segment(shots, registered, color, None, models.load_mask_network(1), onnx.run, config.mask)
     calibration = selfcal.solve(shots, registered, object_, color, config.selfcal)
-    assert color.quads is not None and color.corners is not None and color.light is not None
+    assert color.place is not None and color.light is not None
     found = {f"light.{name}": array for name, array in vars(color.light).items()}
-    found |= {"matrix": color.matrix, "quads": color.quads, "corners": color.corners}
+    found |= {"matrix": color.matrix, "quads": color.place.quads, "corners": color.place.corners}
     found |= {"transform": registered.transform, "mask": object_.mask, "crop": np.array(object_.crop)}
     found |= {"gain": calibration.gains.gain, "sigma": calibration.gains.sigma}
     seen = cues.compute(stokes.solve(shots, registered, calibration, object_, config.stokes), color)

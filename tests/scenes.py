@@ -114,7 +114,7 @@ def before_backdrop(transforms: Sequence[Floats]) -> AngleStack:
 
 def no_color(scale: float = 0.5) -> ColorCalibration:
     """The colour calibration of these shots, which are Rec.709 at `scale`; as from another capture's chart."""
-    return ColorCalibration(np.eye(3) / scale, None, None, None, "profile", float("nan"), None)
+    return ColorCalibration(np.eye(3) / scale, "profile")
 
 
 def still(shots: int = 3) -> Alignment:

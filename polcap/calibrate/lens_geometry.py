@@ -178,9 +178,9 @@ def _color_checker(image: SensorImage) -> BoardView | None:
         )
     except ChartError:
         return None
-    if found.corners is None:
+    if found.place is None:
         return None
-    place, at, seen = chart.from_corners(found.corners).homography, [], []
+    place, at, seen = chart.from_corners(found.place.corners).homography, [], []
     light = np.asarray(value.sum(axis=-1), np.float32)
     for center in chart.centers():
         point = _patch_center(light, place, center)

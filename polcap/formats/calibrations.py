@@ -16,7 +16,17 @@ from msgspec import Meta
 
 from polcap.errors import CaptureError, ChartError
 from polcap.formats import atomic, own_folders, text_file
-from polcap.images import Calibration, ColorCalibration, Distortion, Exif, Floats, LensGeometry, Polarizer
+from polcap.images import (
+    Calibration,
+    ChartPlace,
+    ColorCalibration,
+    Distortion,
+    Exif,
+    Floats,
+    LensGeometry,
+    PatchColors,
+    Polarizer,
+)
 from polcap.optics import distortion
 
 _FULL_TURN = 360.0  # degrees
@@ -216,15 +226,18 @@ def write_profile(path: Path, color: ColorCalibration) -> None:
         "matrix": _rounded(color.matrix, 9),
         "source": color.source,
         "cost": float(color.cost),
-        "delta_e": _rounded(color.delta_e, 3),
         "metres_per_px": color.metres_per_px,
-        "quads": _rounded(color.quads, 3),
-        "corners": _rounded(color.corners, 3),
-        "falloff": list(color.falloff),
-        "glare": color.glare,
-        "predicted": _rounded(color.predicted, 3),
-        "patch_use": None if color.patch_use is None else color.patch_use.tolist(),
     }
+    if color.place is not None:
+        document |= {"quads": _rounded(color.place.quads, 3), "corners": _rounded(color.place.corners, 3)}
+    if (colors := color.patches) is not None:
+        document |= {
+            "delta_e": _rounded(colors.delta_e, 3),
+            "falloff": list(colors.falloff),
+            "glare": colors.glare,
+            "predicted": _rounded(colors.predicted, 3),
+            "patch_use": None if colors.use is None else colors.use.tolist(),
+        }
     text = (
         "# polcap color profile. matrix: camera radiance (I0 + I90) -> linear Rec.709 reflectance.\n"
         "# quads, corners: px of the grid it was measured on. metres_per_px: at the chart's distance.\n"
@@ -255,18 +268,17 @@ def read_profile(path: Path) -> ColorCalibration:
     matrix = np.array(profile.matrix)
     if not np.isfinite(matrix).all() or np.linalg.matrix_rank(matrix, rtol=1e-6) < 3:
         raise ChartError(f"{path}: its color matrix cannot be inverted; write the profile again")
+    quads, corners, delta_e = (_array(one) for one in (profile.quads, profile.corners, profile.delta_e))
+    use = None if profile.patch_use is None else np.array(profile.patch_use, np.uint8)
     return ColorCalibration(
         matrix=matrix,
-        quads=_array(profile.quads),
-        corners=_array(profile.corners),
-        delta_e=_array(profile.delta_e),
         source=profile.source,
         cost=profile.cost,
         metres_per_px=profile.metres_per_px,
-        falloff=profile.falloff,
-        glare=profile.glare,
-        predicted=_array(profile.predicted),
-        patch_use=None if profile.patch_use is None else np.array(profile.patch_use, np.uint8),
+        place=None if quads is None or corners is None else ChartPlace(quads, corners),
+        patches=None
+        if delta_e is None
+        else PatchColors(delta_e, use, _array(profile.predicted), profile.falloff, profile.glare),
     )
 
 

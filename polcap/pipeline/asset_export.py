@@ -15,8 +15,8 @@ from polcap.config import Config
 from polcap.errors import SettingError
 from polcap.formats import atomic
 from polcap.formats.export import exr_layers, gltf, materialx, obj, provenance, texture_set, usd
-from polcap.formats.export.encoders import Encoder, Kind
-from polcap.formats.export.presets import PRESETS, Format, Preset
+from polcap.formats.export.encoders import Kind, TextureEncoder
+from polcap.formats.export.presets import PRESETS, ExportPreset, Format
 from polcap.formats.export.texture_set import Key, Texture
 from polcap.formats.maps import maps_folder
 from polcap.images import Asset
@@ -114,9 +114,9 @@ def write(
     return written
 
 
-def _preset(wanted: ExportRequest) -> Preset:
+def _preset(wanted: ExportRequest) -> ExportPreset:
     if wanted.preset is None:
-        return Preset(wanted.formats, "normals +Y")
+        return ExportPreset(wanted.formats, "normals +Y")
     if wanted.preset not in PRESETS:
         raise SettingError(f"--preset {wanted.preset} is none of {', '.join(PRESETS)}")
     return PRESETS[wanted.preset]
@@ -131,7 +131,7 @@ class _Export:
     asset: Asset
     levels: tuple[DetailLevel, ...]
     name: str
-    preset: Preset
+    preset: ExportPreset
     images: Kind
     color: str
     record: Mapping[str, Any]
@@ -156,7 +156,7 @@ class _Export:
     def description(self) -> dict[str, Any]:
         """The entry of the export in maps.json."""
         return {
-            "for": self.preset.says,
+            "for": self.preset.description,
             "unit": self.unit,
             "glb": self._embedded(),
             "lods": {
@@ -168,7 +168,7 @@ class _Export:
                 }
                 for k, level in enumerate(self.levels, 1)
             },
-            "textures": {file: texture.says for file, texture in sorted(self.loose.items())},
+            "textures": {file: texture.meaning for file, texture in sorted(self.loose.items())},
         }
 
     def _embedded(self) -> dict[str, str]:
@@ -176,12 +176,12 @@ class _Export:
         if "gltf" not in self.preset.formats:
             return {}
         held = gltf.textures(self.asset)
-        return {f"{self.stem}_{key}": f"{texture.says}; {self.images}" for key, texture in held.items()}
+        return {f"{self.stem}_{key}": f"{texture.meaning}; {self.images}" for key, texture in held.items()}
 
     @cached_property
-    def encoder(self) -> Encoder:
+    def encoder(self) -> TextureEncoder:
         """Encodes a picture once for all files that hold it."""
-        return Encoder()
+        return TextureEncoder()
 
     @cached_property
     def loose(self) -> dict[str, Texture]:

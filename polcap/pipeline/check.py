@@ -53,7 +53,7 @@ def inspect(capture: Capture, networks: Networks, config: Config, chart: ChartRe
     with ThreadPoolExecutor(_THREADS) as pool:
         try:
             small = small_capture.reduce(capture, config.hdr.clip, pool)
-            supplied = UserInput(_moved(chart, small.step), None, *networks)
+            supplied = UserInput(_moved(chart, small.step), None, *networks, small.decode)
             lines = tuple(_judged(small, supplied, config))
         finally:
             pool.shutdown(cancel_futures=True)
@@ -67,16 +67,10 @@ def inspect(capture: Capture, networks: Networks, config: Config, chart: ChartRe
 
 def _judged(small: SmallCapture, supplied: UserInput, config: Config) -> list[Gate]:
     """The gates in the order of the path; where a stage gives up, its error is the last of them."""
-    cache, settings = MemoryCache(until="infer"), _settings(config, small.step)
-    chart_missing, failure = "", None
+    cache, failure = MemoryCache(until="infer"), None
+    chart_missing = ""
     try:
-        try:
-            path(small.capture, supplied, settings, cache, small.decode)
-        except ChartError as error:
-            if supplied.chart.mode != "auto":
-                raise
-            chart_missing = str(error).partition(" (")[2].partition(")")[0] or str(error)
-            path(small.capture, replace(supplied, chart=ChartRequest("none")), settings, cache)
+        chart_missing = _run_path(small, supplied, _settings(config, small.step), cache)
     except DecodeError:
         raise
     except InputError as error:
@@ -90,17 +84,28 @@ def _judged(small: SmallCapture, supplied: UserInput, config: Config) -> list[Ga
         grid_px=small.step / (small.merged_px if config.hdr.demosaic == "superpixel" else 1),
         chart_missing=chart_missing,
     )
-    lines = list[Gate]()
+    lines = []
     try:
-        lines.extend(gates.judge(evidence, config.gates, config.align))
+        for gate in gates.judge(evidence, config.gates, config.align):
+            lines.append(gate)
     except NotReached:
-        if failure is None:
-            raise
-    if failure is not None and not any(line.name == "order" and line.state == "fail" for line in lines):
+        assert failure is not None  # only an error ends the path before its gates
         reason, _, remedy = str(failure).partition("; ")
         name = type(failure).__name__.removesuffix("Error").lower()
         lines.append(Gate(name, "fail", None, None, reason, remedy, _ERROR_COST_DEG))
     return lines
+
+
+def _run_path(small: SmallCapture, supplied: UserInput, settings: Config, cache: MemoryCache) -> str:
+    """Run the path into the cache; without a chart where none is found, and then the reason, else ""."""
+    try:
+        path(small.capture, supplied, settings, cache)
+    except ChartError as error:
+        if supplied.chart.mode != "auto":
+            raise
+        path(small.capture, replace(supplied, chart=ChartRequest("none")), settings, cache)
+        return str(error).partition(" (")[2].partition(")")[0] or str(error)
+    return ""
 
 
 def _settings(config: Config, step: int) -> Config:

@@ -27,7 +27,6 @@ from polcap.images import (
     Decode,
     Mesh,
     Network,
-    RunNetwork,
     SurfaceMaps,
 )
 from polcap.pipeline.cache import MemoryCache, StageReached, StageResult
@@ -44,35 +43,29 @@ STAGES = tuple(_FIELD)
 
 @dataclass(frozen=True)
 class UserInput:
-    """Inputs of the path besides the photographs."""
+    """Inputs of the path besides the list of photographs."""
 
     chart: ChartRequest = AUTO
     mask: NDArray[np.bool_] | None = None  # on the RAW pixels or on the grid of the merged picture
     network: Network | None = None  # None: the analytic estimator
     mask_network: Network | None = None  # None: the object is found by its contrast to the backdrop
+    decode: Decode = frame_decoder.decode  # the pixels of a photograph
 
 
-def path(
-    capture: Capture | None,
-    supplied: UserInput,
-    config: Config,
-    cache: MemoryCache,
-    decode: Decode = frame_decoder.decode,
-    run: RunNetwork = onnx.run,
-) -> Results:
+def path(capture: Capture | None, supplied: UserInput, config: Config, cache: MemoryCache) -> Results:
     """The results of all stages, or of the first ones where the cache stops the path."""
     with suppress(StageReached):
         reference = shipped_data.colorchecker(config.whitebalance.chart)
-        radiance = cache.run(hdr.merge, capture, decode, config=config.hdr)
+        radiance = cache.run(hdr.merge, capture, supplied.decode, config=config.hdr)
         color = cache.run(whitebalance.measure, radiance, reference, supplied.chart, config=config.whitebalance)
         alignment = cache.run(align.register, radiance, color, config=config.align)
         drawn = cache.derive(on_grid, supplied.mask, radiance)
         finder = supplied.mask_network
-        object_ = cache.run(mask.segment, radiance, alignment, color, drawn, finder, run, config=config.mask)
+        object_ = cache.run(mask.segment, radiance, alignment, color, drawn, finder, onnx.run, config=config.mask)
         calibration = cache.run(selfcal.solve, radiance, alignment, object_, color, config=config.selfcal)
         stokes_ = cache.run(stokes.solve, radiance, alignment, calibration, object_, config=config.stokes)
         cues_ = cache.run(cues.compute, stokes_, color)
-        maps = cache.run(infer.estimate, cues_, supplied.network, run, config=config.infer)
+        maps = cache.run(infer.estimate, cues_, supplied.network, onnx.run, config=config.infer)
         distance = cache.derive(distance_m, color, radiance)
         mesh = cache.run(surface.integrate, maps, distance, config=config.surface)
         # from the maps as their files hold them: `polcap export` then makes the same bytes

@@ -15,7 +15,7 @@ from polcap import parallel, report, resource_limits
 from polcap.config import Config, restored
 from polcap.errors import SettingError
 from polcap.formats import calibrations
-from polcap.formats.export import animation, provenance
+from polcap.formats.export import encoders, provenance
 from polcap.formats.maps import maps_folder, png
 from polcap.formats.raw import frame_decoder
 from polcap.images import Capture, ColorCalibration, Decode, Frame, SensorImage
@@ -38,11 +38,8 @@ def process(
     until: str | None = None,
     force: str | None = None,
     progress: Progress = silent,
-    decode: Decode = frame_decoder.decode,
 ) -> dict[str, Any] | None:
     """Run the path and write the result folder; returns report.json's content, None with `until`.
-
-    The parameters are the options of the command.
 
     Raises
     ------
@@ -55,7 +52,7 @@ def process(
         with result_folder.locked(out):
             facts = _facts(capture, supplied, config)
             result_folder.write_run(out, facts)
-            results = path(capture, supplied, config, cache, decode)
+            results = path(capture, supplied, config, cache)
             if until is not None:
                 return None
             cache.begin("write")
@@ -170,10 +167,10 @@ def animate(out: Path, motion: moving.Motion) -> list[Path]:
     ior = float(about["settings"]["infer"]["ior"])
     frames = moving.light(results.maps, ior) if motion == "light" else moving.turntable(results.maps, results.mesh, ior)
     written = [out / "work" / f"{motion}.webp"]
-    animation.webp(written[0], frames, moving.SECONDS)
-    if animation.encoder():
+    encoders.webp(written[0], frames, moving.SECONDS)
+    if encoders.ffmpeg():
         written.append(out / "work" / f"{motion}.mp4")
-        animation.mp4(written[1], frames, moving.SECONDS)
+        encoders.mp4(written[1], frames, moving.SECONDS)
     return written
 
 

@@ -60,6 +60,7 @@ def _in_order(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iter
     yield light.ambient(found, limits)
     yield from light.crossed(found, limits)
     yield polarization.ill_posed(found, limits)
+    yield geometry.inward_outline(found, limits)
     yield geometry.focal_length(found)
 
 

@@ -1,16 +1,22 @@
-"""GateLimits of geometry: alignment, mask, mesh, sharpness, focal length."""
+"""GateLimits of geometry: alignment, mask, mesh, outline, sharpness, focal length."""
 
 import numpy as np
 
 from polcap.formats import shipped_data
 from polcap.images import Floats, Mesh, SurfaceMaps
+from polcap.optics import frames, outline
 from polcap.optics.projection import picture_corners, transform_points
+from polcap.optics.resize import area_mean
 from polcap.optics.sharpness import TILE
 from polcap.quality.gate import Evidence, Gate, State, Unit, at_most, blamed
 from polcap.quality.limits import GateLimits
 from polcap.stages.align import Settings as AlignSettings
 from polcap.stages.align import object_motion
 from polcap.stages.whitebalance import chart_in_mask
+
+_LONGEST, _OUTLINE_PX, _OUTLINE_BLUR_PX = 256, 3.0, 2.0  # px of the reduced maps; band inside the outline; 1σ
+_INWARD = 0.2  # sine of the zenith from which a normal leans inward
+_INWARD_DEG = 25.0  # mean error of objects beyond the limit (docs/benchmarks/half-turns.md)
 
 
 def alignment(found: Evidence, limits: GateLimits, align: AlignSettings) -> Gate:
@@ -52,9 +58,7 @@ def _pushed(found: Evidence, limits: GateLimits) -> Gate | None:
     if not bad.any():
         return None
     worst = int(np.nanargmax(displacement))
-    message = (
-        f"The object moved by {displacement[worst]:.1f} px against its surroundings in {found.names[worst]}"
-    )
+    message = f"The object moved by {displacement[worst]:.1f} px against its surroundings in {found.names[worst]}"
     figure: float | None = round(float(displacement[worst]), 3)
     if np.isinf(displacement[worst]):
         figure, message = None, f"The {found.names[worst]} shot shows another object in the same surroundings"
@@ -72,15 +76,13 @@ def mask(found: Evidence, limits: GateLimits) -> Gate:
     object_, limit, doubt = found.object_, limits.max_mask_doubt, found.object_.doubt
     faults: list[tuple[str, float, float]] = []  # in words, its figure, its limit
     charted = 0.0
-    if found.color.corners is None:
+    if found.color.place is None:
         charted = _charted(found)
     if charted:
         faults.append((f"{charted:.0%} of the object's mask looks like a color chart that was not found", charted, 0))
     doubted = doubt is not None and doubt > limit
     if doubt is not None and doubt > limit / 2:
-        faults.append(
-            (f"About {100 * doubt:.0f} % of the mask may be wrong", doubt, limit if doubted else limit / 2)
-        )
+        faults.append((f"About {100 * doubt:.0f} % of the mask may be wrong", doubt, limit if doubted else limit / 2))
     for message, figure, most in (
         ("The object touches {:.0%} of the picture's border, where it has no outline",
          object_.border, limits.max_mask_border),
@@ -161,6 +163,34 @@ def focal_length(found: Evidence) -> Gate:
     message = f"The focal length is assumed and may be wrong by a factor of {times:.1f}, which bends shape and depth"
     remedy = "State focal_length_mm and sensor_width_mm in capture.toml"
     return Gate("focal length", "warn", "assumed", "known", message, remedy, round(cost, 1), unit="")
+
+
+def inward_outline(found: Evidence, limits: GateLimits) -> Gate:
+    """Share of the outline's normals that point into the object; those of a closed surface point out of it."""
+    share = _inward_share(found.maps)
+    message = f"{100 * share:.0f} % of the normals at the outline point into the object"
+    if share > limits.max_inward_outline:
+        message += ": parts of the shape are inside out, most often on black gloss that mirrors its surroundings"
+    remedy = (
+        "Dull the object with chalk spray, or keep bright things and the backdrop away from it; "
+        "where the mask is wrong, give --mask PNG"
+    )
+    return at_most("outline", share, limits.max_inward_outline, message, remedy, cost_deg=_INWARD_DEG)
+
+
+def _inward_share(maps: SurfaceMaps) -> float:
+    """Share of a band inside the outline in which normals lean into the object, on at most _LONGEST px a side."""
+    across = frames.to_ray_frame(maps.normal, frames.rays(maps.view, *maps.mask.shape))[..., :2]
+    shrink = max(1.0, max(maps.mask.shape) / _LONGEST)
+    shape = tuple(round(side / shrink) for side in maps.mask.shape)
+    mask = area_mean(maps.mask, shape) > 0.99
+    lean = area_mean((across * maps.mask[..., None]).astype(np.float32), shape)
+    away, _slope = outline.outward(mask.astype(np.float32), _OUTLINE_BLUR_PX)
+    band = mask & (outline.depth(mask) <= _OUTLINE_PX)
+    for edge in (band[:3], band[-3:], band[:, :3], band[:, -3:]):  # where a picture ends is no outline
+        edge[:] = False
+    outwards = (lean[..., 0] * away[0] + lean[..., 1] * away[1])[band]
+    return float((outwards < -_INWARD).mean()) if outwards.size else 0.0
 
 
 def _lean(maps: SurfaceMaps, least: float, most: float) -> float:

@@ -66,7 +66,7 @@ def tone(found: Evidence, limits: GateLimits) -> Gate:
             abs(power - 1),
             f"Exposures follow the stated ones to the power {power:.2f}, not 1",
         )
-    slope = found.selfcal.gains.grey_slope if found.color.quads is not None else float("nan")
+    slope = found.selfcal.gains.grey_slope if found.color.place is not None else float("nan")
     if np.isfinite(slope) and abs(slope - 1) / 2 > worst:  # glare flattens greys too
         worst, reason = (
             abs(slope - 1) / 2,
@@ -120,15 +120,15 @@ def chart(found: Evidence, limits: GateLimits) -> Gate:
         )
         message = f"No chart was found ({found.chart_missing}); `polcap process` needs a chart or --no-chart"
         return Gate("chart", "warn", None, limit, message, remedy, unit="ΔE2000")
-    error = found.color.delta_e
-    if error is None:
+    colors = found.color.patches
+    if colors is None:
         return Gate("chart", "not measured", None, limit, "No chart was used", unit="ΔE2000")
-    mean = float(np.nanmean(error))
+    mean = float(np.nanmean(colors.delta_e))
     message = f"Chart colors match within ΔE {mean:.1f}"
-    if found.color.predicted is not None:
-        message += f" ({float(np.nanmean(found.color.predicted)):.1f} when cross-checked)"
-    if found.color.patch_use is not None and found.color.patch_use.any():
-        message += f"; {patches.left_out(found.color.patch_use)}"
+    if colors.predicted is not None:
+        message += f" ({float(np.nanmean(colors.predicted)):.1f} when cross-checked)"
+    if colors.use is not None and colors.use.any():
+        message += f"; {patches.left_out(colors.use)}"
     if found.color.light is not None and found.color.light.tilt > _TURNED:
         message += f"; it is turned by {np.degrees(found.color.light.tilt):.0f}° from the lens, which is corrected"
     if found.radiance.sensor.lossy:

@@ -68,6 +68,9 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float,
         Meta(ge=0, le=90, description="median zenith of a weakly polarized shape; less is flattened [degrees]"),
     ] = 33.0
+    max_inward_outline: Annotated[
+        float, Meta(ge=0, le=1, description="share of the outline's normals that point into the object [1]")
+    ] = 0.06
     min_concentration: Annotated[
         float, Meta(ge=0, le=1, description="how well polarization follows the outline, 1 is all round [1]")
     ] = 0.5

@@ -140,9 +140,7 @@ def _angles(
         remedy = "Turn the ring to its mark and take the shot again"
         return Gate("angles", "fail", round(degrees, 1), limit, message, remedy, cost, shots, "°")
     times = 1 / found.misfit
-    message = (
-        f"The {names[found.shot]} shot looks turned by {degrees:+.0f}°: the outline fits {times:.1f} times better"
-    )
+    message = f"The {names[found.shot]} shot looks turned by {degrees:+.0f}°: the outline fits {times:.1f} times better"
     remedy = "Set the ring to its mark and take the shot again, or state its true angle"
     return Gate("angles", "fail", round(degrees, 1), limit, message, remedy, cost, (names[found.shot],), "°")
 
@@ -225,9 +223,7 @@ def _light_of_body(body: rim.Body, found: Evidence, limits: GateLimits) -> Gate:
         )
         return Gate("body", "warn", round(body.dolp, 4), limit, message, hint, round(weak, 1))
     if body.one_sided > (most := limits.max_one_sided * _lopsided(body)):
-        message = (
-            f"One side of the object is {100 * body.one_sided:.0f} % brighter than the mean: light from the side"
-        )
+        message = f"One side of the object is {100 * body.one_sided:.0f} % brighter than the mean: light from the side"
         return Gate("body", "warn", round(body.one_sided, 2), round(most, 2), message, remedy, 10.0, unit="")
     message = f"The outline is polarized by {100 * body.dolp:.1f} %"
     if body.dolp < limit:

@@ -100,6 +100,8 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
 def figures(results: Results) -> dict[str, dict[str, Any]]:
     """Every measured figure, by the part of the path that it tells of."""
     radiance, color = results.radiance, results.color
+    colors = color.patches
+    predicted = None if colors is None else colors.predicted
     found, gains, image = results.alignment, results.selfcal.gains, results.stokes
     cues, maps, mesh, object_ = results.cues, results.maps, results.mesh, results.object_
     ring, outline = results.selfcal.ring, results.selfcal.outline
@@ -114,15 +116,15 @@ def figures(results: Results) -> dict[str, dict[str, Any]]:
         },
         "chart": {
             "source": color.source,
-            "edition": color.edition or None,
+            "edition": None if colors is None else colors.edition or None,
             "tilt_deg": None if color.light is None else _number(np.degrees(color.light.tilt)),
             "flash": None if color.light is None else _list(color.light.flash[:2], 3),
-            "delta_e_mean": None if color.delta_e is None else _number(np.nanmean(color.delta_e)),
-            "delta_e_max": None if color.delta_e is None else _number(np.nanmax(color.delta_e)),
-            "delta_e": None if color.delta_e is None else _list(color.delta_e, 2),
-            "predicted_mean": None if color.predicted is None else _number(np.nanmean(color.predicted)),
-            "predicted": None if color.predicted is None else _list(color.predicted, 2),
-            "left_out": None if color.patch_use is None else patches.left_out(color.patch_use),
+            "delta_e_mean": None if colors is None else _number(np.nanmean(colors.delta_e)),
+            "delta_e_max": None if colors is None else _number(np.nanmax(colors.delta_e)),
+            "delta_e": None if colors is None else _list(colors.delta_e, 2),
+            "predicted_mean": None if predicted is None else _number(np.nanmean(predicted)),
+            "predicted": None if predicted is None else _list(predicted, 2),
+            "left_out": None if colors is None or colors.use is None else patches.left_out(colors.use),
             "detector_cost": _number(color.cost),
             "metres_per_px": color.metres_per_px,
             "scale_doubt": scale.doubt(image, color),

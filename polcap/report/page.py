@@ -168,12 +168,12 @@ def _chart(about: Mapping[str, Any], results: Results) -> str:
     """The chart as photographed beside the maker's colors; nothing where none was read."""
     color = results.color
     measured = shown.patches(results.radiance, color)
-    if measured is None or color.delta_e is None:
+    if measured is None or color.patches is None:
         return ""
     known = shipped_data.colorchecker(about["settings"]["whitebalance"]["chart"])
-    reference = next((one for one in known.editions if one.name == color.edition), known)
+    reference = next((one for one in known.editions if one.name == color.patches.edition), known)
     drawing = plots.chart(
-        srgb_eight_bits(reference.rec709), srgb_eight_bits(measured), color.delta_e, reference.patches
+        srgb_eight_bits(reference.rec709), srgb_eight_bits(measured), color.patches.delta_e, reference.patches
     )
     figures = about["figures"]["chart"]
     mean, ahead = labels.number(figures["delta_e_mean"], 2), figures["predicted_mean"]

@@ -108,10 +108,10 @@ def photograph(radiance: AngleStack, calibration: ColorCalibration, view: View, 
 
 def patches(radiance: AngleStack, found: ColorCalibration) -> Floats | None:
     """The chart's colors as measured, (24, 3) linear Rec.709, without the light's slope and glare; None: no chart."""
-    if found.quads is None:
+    if found.place is None:
         return None
     camera = np.zeros((24, 3))
-    for index, quad in enumerate(found.quads):
+    for index, quad in enumerate(found.place.quads):
         corners = np.round(quad).astype(np.int32)
         low = np.clip(corners.min(axis=0), 0, None)  # x, y
         part = radiance.value[0][low[1] : corners[:, 1].max() + 1, low[0] : corners[:, 0].max() + 1]
@@ -123,5 +123,7 @@ def patches(radiance: AngleStack, found: ColorCalibration) -> Floats | None:
     row, column = np.divmod(np.arange(24), _COLUMNS)
     white_row, white_column = divmod(WHITE_PATCH, _COLUMNS)
     offset = np.stack([column - white_column, row - white_row], axis=-1)
-    light = 1 + offset @ np.array(found.falloff)
-    return np.asarray((camera @ found.matrix.T - found.glare) / light[:, None])
+    colors = found.patches
+    light = 1 + offset @ np.array((0.0, 0.0) if colors is None else colors.falloff)
+    glare = 0.0 if colors is None else colors.glare
+    return np.asarray((camera @ found.matrix.T - glare) / light[:, None])

@@ -79,9 +79,9 @@ def chart(radiance: AngleStack, color: ColorCalibration, widest: int | None = No
     times = max(1, round(2 * WIDTH / picture.shape[1]))
     picture = np.asarray(np.repeat(np.repeat(picture, times, 0), times, 1), np.uint8)
     zoom = picture.shape[1] / radiance.value.shape[2]
-    outlines = [(quad, (0, 255, 0)) for quad in (color.quads if color.quads is not None else ())]
-    if color.corners is not None:
-        outlines.append((color.corners, (255, 255, 0)))
+    outlines: list[tuple[Floats, tuple[int, int, int]]] = []
+    if color.place is not None:
+        outlines = [*((quad, (0, 255, 0)) for quad in color.place.quads), (color.place.corners, (255, 255, 0))]
     for corners, paint in outlines:
         points = np.round((corners + 0.5) * zoom - 0.5).astype(np.int32)
         cv2.polylines(picture, [points], True, paint, 1, cv2.LINE_AA)

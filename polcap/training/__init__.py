@@ -8,7 +8,7 @@ Training of the main network, in the order in which a picture passes:
     materials         a view -> diffuse, specular, roughness, refractive index, bumped normal; `gloss` draws their gloss
     camera_errors     Stokes parameters -> measurements by three noisy photographs
     simulator         all of these -> a batch: network channels and truth
-    main_network      channels -> maps; `gloss_profiles` and `recurring_colors` are parts of it, `variants` its ablations
+    main_network      channels -> maps; its parts `gloss_profiles` and `recurring_colors`, its ablations `variants`
     loss              estimated maps against truth
     loop              optimizers (`muon`), learning rate, averaged weights, checkpoints; `precision`: bf16 or fp32
     train             the main network in that loop

@@ -248,4 +248,4 @@ def _relative_depth(subject: _Subject) -> Floats:
 
 
 def white() -> ColorCalibration:
-    return ColorCalibration(np.eye(3, dtype=np.float32), None, None, None, "profile", 0.0, None)
+    return ColorCalibration(np.eye(3, dtype=np.float32), "profile")

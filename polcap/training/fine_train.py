@@ -105,7 +105,7 @@ def load_example(file: Path) -> NDArray[np.float16]:
     channels = picture[:_COUNT].astype(np.float32)
     truth, known = picture[_COUNT : _COUNT + 3].astype(np.float32), picture[-1] > 0
     shrink = float(np.exp(channels[-1].max()))
-    relief = fine.finer(np.moveaxis(truth - channels[_NORMAL : _NORMAL + 3], 0, -1), known, shrink)
+    relief = fine.high_pass(np.moveaxis(truth - channels[_NORMAL : _NORMAL + 3], 0, -1), known, shrink)
     return np.concatenate([picture[:_COUNT], np.moveaxis(relief, -1, 0), known[None]]).astype(np.float16)
 
 

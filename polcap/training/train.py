@@ -35,7 +35,7 @@ class TrainingOptions:
     samples: int | None = None  # the budget in pictures instead
     resume: bool = False  # go on from out/last.pt
     start: Path | None = None  # ONNX model with the first weights; else random ones
-    done: int = 0  # pictures of `samples` that `start` has learned from: the schedule goes on from there
+    done: int = 0  # pictures of `samples` that `start` has seen; the schedule goes on from there
     views: int | None = None  # of each mesh, instead of the preset's
     procedural: int | None = None  # random shapes, instead of the preset's
     threads: int = 2  # learners on a CPU, each with a batch of its own; one more thread makes the batches

@@ -63,8 +63,8 @@ def measure(truth_file: Path, network: Network | None, rough: bool) -> list[floa
 def capture_errors(found: Results, capture: Capture, told: dict, meta: dict) -> list[float]:  # type: ignore[type-arg]
     """Chart centres and alignment [RAW px, worst], gains and bracket ratios [%, worst]."""
     centers = (np.array(meta["chart"]["patch_corners_px"]) - 1).mean(1) / 2  # their pixel centres lie at .5
-    assert found.color.quads is not None
-    chart = 2 * np.linalg.norm(found.color.quads.mean(1) - centers, axis=1).max()
+    assert found.color.place is not None
+    chart = 2 * np.linalg.norm(found.color.place.quads.mean(1) - centers, axis=1).max()
 
     files = {shot["file"].split("/", 1)[1]: shot for shot in told["shots"]}
     frames = [

@@ -47,8 +47,9 @@ def photographs() -> None:
     ]:
         color = whitebalance.measure(radiance, CLASSIC, AUTO, WhitebalanceSettings())
         plain = opencv(radiance)
-        assert color.delta_e is not None and color.predicted is not None
-        own = (100 * corners_off(color, MARKED[name]), np.nanmean(color.delta_e), np.nanmean(color.predicted))
+        colors = color.patches
+        assert colors is not None and colors.predicted is not None
+        own = (100 * corners_off(color, MARKED[name]), np.nanmean(colors.delta_e), np.nanmean(colors.predicted))
         there = f"{'not found':>20}" if plain is None else f"{100 * far(plain[0], MARKED[name]):12.2f}{plain[1]:8.2f}"
         print(f"{name:22}{own[0]:10.2f}{own[1]:8.2f}{own[2]:10.2f}{there}", flush=True)
 
@@ -63,8 +64,8 @@ def chart_free(pictures: int, first: int) -> None:
             print(seen, by_polcap, by_opencv, by_cost, flush=True)
         try:
             color = whitebalance.measure(radiance, CLASSIC, AUTO, WhitebalanceSettings())
-            assert color.delta_e is not None
-            by_polcap.append((name, float(np.nanmean(color.delta_e))))
+            assert color.patches is not None
+            by_polcap.append((name, float(np.nanmean(color.patches.delta_e))))
         except ChartError:
             pass
         found = opencv(radiance)

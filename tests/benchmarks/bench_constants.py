@@ -25,7 +25,7 @@ from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
 from polcap.results import Results
 from polcap.stages import align, infer, selfcal
-from polcap.stages.infer import analytic, azimuth, body_law, learned
+from polcap.stages.infer import analytic, fine, half_turns, learned, zenith
 from polcap.stages.selfcal import object_gains
 
 FACTORS = (0.5, 2.0)
@@ -44,15 +44,17 @@ SELFCAL: Mapping[ModuleType, tuple[str, ...]] = {
 }
 ANALYTIC = {
     analytic: ("_BLURS_PX", "_SAME", "_MODEL_ERROR_DEG"),
-    azimuth: ("_MOST_PIXELS", "_RIM_PX", "_BLUR_PX", "_CONVEXITY"),
-    body_law: (
+    half_turns: ("_LONGEST", "_OUTLINE", "_INSIDE", "_AHEAD", "_BLUR", "_AROUND"),
+    zenith: (
         "_FLAT", "_FLATTEST", "_SMOOTH_LIKELIER", "_DEPOLARIZED_LIKELIER", "_PATCHES", "_UNEVEN", "_RADIUS_SPREAD",
         "_OUTLINE_DEG", "_SHARP",
     ),
 }  # fmt: skip
 LEARNED: Mapping[ModuleType, tuple[str, ...]] = {
-    learned: ("_INVERSION", "_DETAIL", "_CELLS", "_BRIGHTEST"),
+    learned: ("_INVERSION", "_CELLS", "_BRIGHTEST"),
+    fine: ("_COARSEST",),
     analytic: ("_MODEL_ERROR_DEG", "_SAME"),
+    half_turns: ("_LONGEST", "_OUTLINE", "_INSIDE", "_NETWORK", "_AHEAD", "_BLUR", "_SURE_DEG", "_SUREST"),
 }
 
 
@@ -89,12 +91,12 @@ def measured(module: ModuleType, name: str, factor: float, measure: Callable[[],
     """The measure with one number changed."""
     usual = getattr(module, name)
     setattr(module, name, scaled(usual, factor))
-    body_law_tables()
+    clear_laws()
     try:
         return measure()
     finally:
         setattr(module, name, usual)
-        body_law_tables()
+        clear_laws()
 
 
 def scaled(value: Any, factor: float) -> Any:
@@ -104,10 +106,10 @@ def scaled(value: Any, factor: float) -> Any:
     return type(value)(value * factor) if isinstance(value, float) else max(1, round(value * factor))
 
 
-def body_law_tables() -> None:
-    """What was kept of tables that depend on the numbers is forgotten."""
-    for name in ("laws",):
-        getattr(getattr(body_law, name), "cache_clear", lambda: None)()
+def clear_laws() -> None:
+    """Clear the cached tables, which depend on the numbers."""
+    for name in ("candidate_laws",):
+        getattr(getattr(zenith, name), "cache_clear", lambda: None)()
 
 
 class Judge:
@@ -171,7 +173,7 @@ class Gained:
             self.results.radiance,
             self.results.alignment,
             self.results.object_,
-            replace(self.results.color, quads=None),
+            replace(self.results.color, place=None),
             Config().selfcal,
         ).gains.gain
 

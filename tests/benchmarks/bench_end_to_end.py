@@ -84,7 +84,7 @@ def measure(place: Path, network: Network | None) -> list[float]:
         measured.view,
         None,
     )
-    white = ColorCalibration(np.eye(3, dtype=np.float32), None, None, None, "profile", 0.0, None)
+    white = ColorCalibration(np.eye(3, dtype=np.float32), "profile")
     ideal = infer.estimate(cues.compute(clean, white), network, onnx.run, Config().infer)
     both = inside & maps.mask
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)

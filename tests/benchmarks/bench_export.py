@@ -21,8 +21,8 @@ import numpy as np
 
 from polcap.config import Config
 from polcap.formats.export import exr_layers, gltf, texture_set
-from polcap.formats.export.encoders import Encoder
-from polcap.formats.export.presets import PRESETS, Preset
+from polcap.formats.export.encoders import TextureEncoder
+from polcap.formats.export.presets import PRESETS, ExportPreset
 from polcap.formats.maps import maps_folder
 from polcap.formats.raw import worker
 from polcap.images import Asset, Cues, Floats, Mesh, StokesImage, SurfaceMaps, View
@@ -64,9 +64,9 @@ def spent() -> float:
     return sum(sum(resource.getrusage(whose)[:2]) for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
 
 
-def alone(folder: Path, built: Asset, preset: Preset) -> None:
+def alone(folder: Path, built: Asset, preset: ExportPreset) -> None:
     """Encode what the preset holds in pictures, and nothing else."""
-    encoder = Encoder()
+    encoder = TextureEncoder()
     for texture in gltf.textures(built).values():
         encoder(texture, preset.images)
     for make in (*preset.textures.values(), *(texture_set.LOOSE.values() if "obj" in preset.formats else ())):

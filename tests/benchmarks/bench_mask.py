@@ -19,7 +19,17 @@ from numpy.typing import NDArray
 
 from polcap.errors import ObjectError
 from polcap.formats import onnx
-from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Network, ObjectMask, View, single_frames
+from polcap.images import (
+    Alignment,
+    AngleStack,
+    ChartPlace,
+    ColorCalibration,
+    Floats,
+    Network,
+    ObjectMask,
+    View,
+    single_frames,
+)
 from polcap.optics import mueller
 from polcap.stages import mask
 from polcap.stages.mask.mask_channels import ENCODING
@@ -109,9 +119,8 @@ def _photographed(name: str, file: Path, rng: np.random.Generator) -> Case:
         view=View(1000.0, ((width - 1) / 2, (height - 1) / 2), 2.0), bracket=single_frames(3),
     )  # fmt: skip
     charted = len(corners) > 0
-    color = ColorCalibration(
-        np.eye(3), None, corners if charted else None, None, "chart" if charted else "none", float("nan"), None
-    )
+    place = ChartPlace(np.zeros((24, 4, 2)), corners) if charted else None
+    color = ColorCalibration(np.eye(3), "chart" if charted else "none", place=place)
     return Case(name, radiance, color, Alignment(np.stack(transforms), np.zeros(3), np.ones(3)), held["mask"])
 
 

@@ -67,7 +67,7 @@ def read(file: Path, clean: bool, rough: bool, seed: int) -> Case:
         torch.manual_seed(seed)
         errors = CameraErrors.none(1, one.device) if clean else CameraErrors.stated(1, one.device)
         seen = photograph(scene[0][:, None], diffuse, given, v, torch.from_numpy(at), errors)
-    white = ColorCalibration(np.eye(3, dtype=np.float32), None, None, None, "profile", 0.0, None)
+    white = ColorCalibration(np.eye(3, dtype=np.float32), "profile")
     measured = cues.compute(stokes_image(seen, at, mask, view), white)
     depth = np.where(mask, (made["depth"] - made["middle"]) / made["unit"], 0).astype(np.float32)
     truth = SurfaceMaps(

@@ -43,6 +43,7 @@ from polcap.images import (
     Levels,
     Linearity,
     NoiseLine,
+    PatchColors,
     Polarizer,
     StokesImage,
     View,
@@ -202,7 +203,7 @@ _VALUES = {  # by the name that each has in its manifest
         np.ones((3, 4, 4, 3), np.float32), np.ones((6, 4, 4, 3), np.float32), np.zeros((4, 4), np.uint8),
         np.ones((4, 4), bool), View(900.0, (1.0, 2.0), 2.0, (0.0, 0.0), True), None,
     ),
-    "color": ColorCalibration(np.eye(3), None, None, np.ones(24), "chart", float("nan"), 0.001),
+    "color": ColorCalibration(np.eye(3), "chart", metres_per_px=0.001, patches=PatchColors(np.ones(24))),
 }  # fmt: skip
 _ARRAYS: npy_folder.Arrays = {}
 _MANIFEST = {name: json.dumps(npy_folder.encode(value, name, _ARRAYS)).encode() for name, value in _VALUES.items()}

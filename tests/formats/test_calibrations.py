@@ -1,6 +1,7 @@
 """The user's calibrations: the newest that fits is used, nothing impossible is; color profiles are read back whole."""
 
 import dataclasses
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from polcap.formats import calibrations
 from polcap.formats.capture import reader as capture
 from polcap.images import (
     Calibration,
+    ChartPlace,
     ColorCalibration,
     Exif,
     Falloff,
@@ -18,6 +20,7 @@ from polcap.images import (
     LensGeometry,
     Levels,
     NoiseLine,
+    PatchColors,
     Polarizer,
 )
 
@@ -134,16 +137,17 @@ def test_figures_that_cannot_be_are_refused(users, change):
 
 PROFILE = ColorCalibration(
     matrix=np.array([[2.1, -0.4, 0.1], [-0.2, 1.5, -0.3], [0.05, -0.6, 1.9]]),
-    quads=np.arange(192.0).reshape(24, 4, 2),
-    corners=np.array([[1.0, 2], [30, 2], [30, 22], [1, 22]]),
-    delta_e=np.where(np.arange(24) == 18, np.nan, 1.25),
     source="chart",
     cost=0.004,
     metres_per_px=0.00072,
-    falloff=(0.01, -0.02),
-    glare=0.015,
-    predicted=np.where(np.arange(24) == 18, np.nan, 1.5),
-    patch_use=np.where(np.arange(24) == 18, 1, 0).astype(np.uint8),
+    place=ChartPlace(np.arange(192.0).reshape(24, 4, 2), np.array([[1.0, 2], [30, 2], [30, 22], [1, 22]])),
+    patches=PatchColors(
+        delta_e=np.where(np.arange(24) == 18, np.nan, 1.25),
+        use=np.where(np.arange(24) == 18, 1, 0).astype(np.uint8),
+        predicted=np.where(np.arange(24) == 18, np.nan, 1.5),
+        falloff=(0.01, -0.02),
+        glare=0.015,
+    ),
 )
 
 
@@ -151,27 +155,22 @@ def test_profile_comes_back_as_it_went(tmp_path):
     path = tmp_path / "set-up.toml"
     calibrations.write_profile(path, PROFILE)
     back = calibrations.read_profile(path)
-    for name in (
-        "matrix",
-        "quads",
-        "corners",
-        "delta_e",
-        "cost",
-        "metres_per_px",
-        "falloff",
-        "glare",
-        "predicted",
-        "patch_use",
+    for part, names in (
+        ("", ["matrix", "cost", "metres_per_px"]),
+        ("place.", ["quads", "corners"]),
+        ("patches.", ["delta_e", "use", "predicted", "falloff", "glare"]),
     ):
-        np.testing.assert_allclose(getattr(back, name), getattr(PROFILE, name), atol=1e-8)  # NaN equals NaN
+        for name in names:
+            found, expected = (attrgetter(part + name)(profile) for profile in (back, PROFILE))
+            np.testing.assert_allclose(found, expected, atol=1e-8)  # NaN equals NaN
     assert back.source == "chart"
 
 
 def test_profile_without_a_chart_comes_back_without(tmp_path):
-    bare = dataclasses.replace(PROFILE, quads=None, corners=None, delta_e=None, metres_per_px=None, source="camera")
+    bare = ColorCalibration(PROFILE.matrix, "camera")
     calibrations.write_profile(tmp_path / "p.toml", bare)
     back = calibrations.read_profile(tmp_path / "p.toml")
-    assert (back.quads, back.corners, back.delta_e, back.metres_per_px) == (None, None, None, None)
+    assert (back.place, back.patches, back.metres_per_px) == (None, None, None)
 
 
 @pytest.mark.parametrize(

@@ -304,7 +304,7 @@ def test_mask_may_be_drawn_on_either_grid() -> None:
 
 def test_distance_follows_from_the_size_of_the_chart() -> None:
     """Similar triangles: 1 mm per pixel at a focal length of 100 px is 0.1 m away."""
-    color = ColorCalibration(np.eye(3), None, None, None, "chart", 0.0, 1e-3)
+    color = ColorCalibration(np.eye(3), "chart", metres_per_px=1e-3)
     assert distance_m(color, stack(2, 2, 1.0)) == pytest.approx(0.1)
 
 

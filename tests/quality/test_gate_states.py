@@ -18,6 +18,7 @@ from polcap.config import Config
 from polcap.images import (
     AngleStack,
     OutlineCheck,
+    PatchColors,
     RingZero,
     ShotOrder,
     TurnedShot,
@@ -36,6 +37,7 @@ BODY = {
 }  # fmt: skip
 TURN = {"shot": None, "angle": 0.0, "misfit": 1.0, "sigmas": 0.0}
 FIGURES = {
+    "inward_outline": 0.0,
     "object_motion": np.array([0.0, 0.1, 0.1]), "charted": 0.0, "noise": 0.001, "ill_posed": 0.0, "shape": [45.0, 0.2],
     "normal_error": 4.0, "lean": 2.0, "crossed": {"left": 0.0, "clipped": 0, "over": 0.0, "mirrored": 0.1},
 }  # fmt: skip
@@ -43,7 +45,7 @@ MEASURES = {  # the function that measures each figure
     "object_motion": (geometry, "_displacement"), "charted": (geometry, "_charted"), "lean": (geometry, "_lean"),
     "noise": (light, "_noise"), "crossed": (light, "_crossed"), "ill_posed": (polarization, "_ill_posed"),
     "shape": (polarization, "_median_shape"), "outline": (polarization, "_outline"),
-    "normal_error": (gates, "_own_error"),
+    "normal_error": (gates, "_own_error"), "inward_outline": (geometry, "_inward_share"),
 }  # fmt: skip
 MESH = {"pieces": 1, "cuts": 0.3, "cut_px": 40.0, "raggedness": 0.1}
 FAR = np.array([[[1.0, 0, 50 * k], [0, 1, 0], [0, 0, 1]] for k in range(3)])
@@ -98,8 +100,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("source", "warn", {"sensor": {"lossy": True}}),
     ("stillness", "pass", {}),
     ("stillness", "fail", {"bracket": {"ghost_fraction": np.array([0.0, 0.05, 0.0])}}),
-    ("chart", "pass", {"color": {"delta_e": np.full(24, 1.0)}}),
-    ("chart", "fail", {"color": {"delta_e": np.full(24, 9.0)}}),
+    ("chart", "pass", {"color": {"patches": PatchColors(np.full(24, 1.0))}}),
+    ("chart", "fail", {"color": {"patches": PatchColors(np.full(24, 9.0))}}),
     ("chart", "warn", {"chart_missing": "nothing like one"}),
     ("chart", "not measured", {}),
     ("alignment", "pass", {}),
@@ -169,6 +171,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
                          "figures": {"crossed": {"left": 0.0, "clipped": 0, "over": 0.9, "mirrored": 0.1}}}),
     ("ill-posed", "pass", {}),
     ("ill-posed", "fail", {"figures": {"ill_posed": 0.5}}),
+    ("outline", "pass", {}),
+    ("outline", "fail", {"figures": {"inward_outline": 0.3}}),
     ("focal length", "pass", {}),
     ("focal length", "warn", {"focal_doubt": (-0.7, 0.7)}),
     ("normal error", "pass", {}),

@@ -17,6 +17,7 @@ from polcap.images import (
     SurfaceMaps,
     TurnedShot,
 )
+from polcap.optics import frames
 from polcap.quality import gates
 from polcap.quality.gate import Evidence
 from polcap.quality.gates import Gate
@@ -282,6 +283,20 @@ def test_what_is_beside_a_gate_s_words_is_the_figure_that_they_are_of(good: Evid
     ):
         gate = judged(changed(good, **fields))[name]
         assert gate.state in ("warn", "fail") and not _within(gate, least), gate
+
+
+@pytest.mark.parametrize(("turned", "state"), [(0.0, "pass"), (0.03, "pass"), (0.3, "fail")])
+def test_a_shape_that_is_turned_inside_out_fails_at_its_outline(good: Evidence, turned: float, state: str) -> None:
+    """A ball of which a sector is its half-turn about the ray: as much of its outline points inward."""
+    rows, columns = np.mgrid[: good.maps.mask.shape[0], : good.maps.mask.shape[1]]
+    y, x = (part - part[good.maps.mask].mean() for part in (rows, columns))
+    around = np.arctan2(y, x) / (2 * np.pi) + 0.5
+    local = np.where((around < turned)[..., None], [-1, -1, 1], 1) * scenes.truth()[0]
+    view = frames.rays(good.maps.view, *good.maps.mask.shape)
+    normal = frames.from_ray_frame(local, view).astype(np.float32)
+    gate = judged(changed(good, maps=replace(good.maps, normal=normal)))["outline"]
+    assert gate.state == state
+    assert gate.value == pytest.approx(turned, abs=0.02)
 
 
 def test_four_angles_are_not_asked_of_who_has_shot_four(good: Evidence) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import ModelError, ObjectError
+from polcap.images import ChartPlace
 from polcap.stages import mask
 from polcap.stages.mask import graph_cut, mask_channels, regions
 from polcap.stages.mask import network as mask_network
@@ -30,7 +31,7 @@ def segment(radiance, color, user=None, model=None):
 
 def chart_color():
     corners = np.array([[223, 29], [301, 29], [301, 201], [223, 201]], float)
-    return dataclasses.replace(scenes.no_color(), corners=corners, source="chart")
+    return dataclasses.replace(scenes.no_color(), place=ChartPlace(np.zeros((24, 4, 2)), corners), source="chart")
 
 
 @pytest.mark.parametrize("model", [None, network()])

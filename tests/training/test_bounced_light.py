@@ -1,5 +1,6 @@
 """Bounced light of training against the traced kind, on a bowl seen from inside and from outside."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -94,12 +95,11 @@ def test_outline_of_dark_gloss_shows_the_backdrop_polarized_across_the_normal() 
     surface = Surface(normal, 0.03 * torch.ones(60, 3), 0.04 * torch.ones(60, 3), 0.2 * ones, 1.5 * ones)
     place, flash = 0.2 * normal - v, torch.zeros(1, 3)
     seen = SimpleNamespace(v=v, owner=torch.zeros(60).long(), place=place, open=ones)
+    mirrored = partial(bounced_light.mirrored_surroundings, seen, flash, normal, surface, torch.ones(1))
     torch.manual_seed(1)
-    rooms = torch.stack(
-        [bounced_light.mirrored_surroundings(seen, flash, normal, surface, torch.ones(1)) for _ in range(40)]
-    )
+    rooms = torch.stack([mirrored() for _ in range(40)])
     light, along = rooms[:, 0].mean(dim=-1), rooms[:, 1].mean(dim=-1)  # the normals lean along x
     assert 0.4 < (light[:, -1] > 0).float().mean() < 0.9  # some objects have no surroundings
     assert (along <= 1e-6).all() and light[:, -1].mean() > 5 * light[:, 20].mean()
     seen.open = torch.zeros(60)
-    assert shown().abs().max() == 0
+    assert mirrored().abs().max() == 0

@@ -23,7 +23,7 @@ def test_channels_are_those_of_the_cue_stage(simulator: Simulator) -> None:
     image = evaluation_protocol.stokes_image(
         measured, photo.at.numpy(), photo.input_mask[0].numpy(), View(focal, (x, y), 1.0)
     )
-    chart = ColorCalibration(np.eye(3, dtype=np.float32), None, None, None, "profile", 0.0, None)
+    chart = ColorCalibration(np.eye(3, dtype=np.float32), "profile")
     theirs = cues.channels(cues.compute(image, chart))
     np.testing.assert_allclose(ours, theirs, atol=2e-4)  # float32 in another order; arccos near 1 is touchy
 

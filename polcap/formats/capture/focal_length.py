@@ -7,7 +7,7 @@ from functools import cache
 from typing import NamedTuple
 
 from polcap.formats import shipped_data
-from polcap.images import Exif
+from polcap.images import Exif, LensGeometry
 
 FULL_FRAME_MM = (36.0, 24.0)
 _CONTRADICTION = 0.1  # ln of the ratio of two statements; focus breathing and rounding stay below
@@ -56,6 +56,12 @@ def find(exif: Exif, stated_mm: float | None, stated_width_mm: float | None) -> 
     px = NORMAL_MM / math.hypot(*FULL_FRAME_MM) * diagonal
     note = "unknown: 50 mm full-frame equivalent assumed; state focal_length_mm in capture.toml"
     return FocalLength(px, _ASSUMED, note)
+
+
+def calibrated(geometry: LensGeometry) -> FocalLength:
+    """The focal length that `polcap calibrate` measured."""
+    note = f"{geometry.focal_px:.0f} px ± {geometry.focal_sigma_px:.1f} (calibrated)"
+    return FocalLength(geometry.focal_px, _KNOWN, note)
 
 
 @cache

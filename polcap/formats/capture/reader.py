@@ -45,34 +45,25 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
     plan = layouts.plan(folder, stated, angles_deg)
     _check_angles(folder, [angle for angle, _ in plan.shots], "the shots' angles are")
 
-    used: dict[Path, Source] = {}
-    for source in (source for _, bracket in plan.shots for source in bracket):
-        used.setdefault(source.path, source)
-    if plan.layout != "sensor" and len(used) < sum(len(bracket) for _, bracket in plan.shots):
-        raise CaptureError(f"{folder / capture_toml.NAME}: names a file twice; give each frame one entry")
-    every = used | {source.path: source for source in plan.others}
-    if len(every) < len(used) + len(plan.others):
-        raise CaptureError(f"{folder / capture_toml.NAME}: names a file twice; give each frame one entry")
+    every = _photographs(folder, plan)
     _check_one_camera({path: source.probe.exif for path, source in every.items()})
     _check_no_duplicate({path: source.probe.digest for path, source in every.items()})
     shots = tuple(_shot(plan, stated, angle, bracket) for angle, bracket in plan.shots)
     _check_brackets(shots)
     crossed = None if plan.layout == "sensor" else _crossed(folder, plan, stated)
-    reference = shots[0].frames[0].exif
-    lens = focal_length.find(reference, stated.focal_length_mm, stated.sensor_width_mm)
+    reference, first = shots[0].frames[0].exif, plan.shots[0][1][0]
     step = 2 if plan.layout == "sensor" else 1  # a plane of a sensor mosaic has half its sides
     width, height = (reference.width or 0) // step, (reference.height or 0) // step
-    notes = _notes(plan.layout, plan.others, plan.shots[0][1][0], shots, stated)
+    notes = _notes(plan.layout, plan.others, first, shots, stated)
     calibration, calibration_notes = None, list[str]()
-    if plan.layout != "sensor" and plan.shots[0][1][0].probe.kind == "raw":  # through a ring, the sensor's own counts
+    if plan.layout != "sensor" and first.probe.kind == "raw":  # polarizer on a ring, the sensor's own counts
         calibration, calibration_notes = calibrations.choose(reference, stated.filter, stated.focal_length_mm)
+    lens = focal_length.find(reference, stated.focal_length_mm, stated.sensor_width_mm)
+    principal = ((width - 1) / 2, (height - 1) / 2)
     geometry = calibration.geometry if calibration is not None else None
     if geometry is not None and geometry.size_px == (width, height):
-        focal_px, principal = geometry.focal_px, geometry.principal_px
-        note = f"{focal_px:.0f} px ± {geometry.focal_sigma_px:.1f} (calibrated)"
-        lens = focal_length.FocalLength(focal_px, (0.0, 0.0), note)
-    else:
-        principal = ((width - 1) / 2, (height - 1) / 2)
+        principal = geometry.principal_px
+        lens = focal_length.calibrated(geometry)
     return Capture(
         name=atomic.safe_name(stated.name or Path(os.path.realpath(folder)).name),
         folder=str(folder),
@@ -88,6 +79,19 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
         calibration=calibration,
         crossed=crossed,
     )
+
+
+def _photographs(folder: Path, plan: layouts.Plan) -> dict[Path, Source]:
+    """Every photograph of a plan, each named once."""
+    used: dict[Path, Source] = {}
+    for source in (source for _, bracket in plan.shots for source in bracket):
+        used.setdefault(source.path, source)
+    if plan.layout != "sensor" and len(used) < sum(len(bracket) for _, bracket in plan.shots):
+        raise CaptureError(f"{folder / capture_toml.NAME}: names a file twice; give each frame one entry")
+    every = used | {source.path: source for source in plan.others}
+    if len(every) < len(used) + len(plan.others):
+        raise CaptureError(f"{folder / capture_toml.NAME}: names a file twice; give each frame one entry")
+    return every
 
 
 def table(capture: Capture) -> str:

@@ -1,1 +1,12 @@
-"""Assets for other programs: glTF, OBJ, USD, MaterialX, layered EXR."""
+"""Assets for other programs.
+
+gltf          GLB with mesh, material and textures
+obj           OBJ, MTL and EXR textures
+usd           USD with OpenPBR and UsdPreviewSurface
+materialx     MaterialX 1.39, and the OpenPBR node graph
+exr_layers    all maps as layers of one EXR, in a chosen color space
+texture_set   the textures, packed for each kind of program
+presets       files and names for Blender, Unreal, Unity, the web, archives
+encoders      PNG, JPEG, WebP, KTX2; animated WebP and MP4
+provenance    the origin of an asset, as a sidecar file
+"""

@@ -1,7 +1,7 @@
-"""In: a picture of 8 or 16 bits. Out: the bytes of a PNG, JPEG, WebP or KTX2.
+"""Encodes textures as PNG, JPEG, WebP or KTX2, and animations as WebP or MP4.
 
-Data (normals, roughness, packed channels) is kept without loss wherever the kind can; colours are
-compressed as their kind usually is. KTX2 needs one of Khronos' encoders (`ktx`, `toktx`) on the PATH.
+Data (normals, roughness, packed channels) is lossless where the kind allows it; colors are compressed as usual for
+their kind. KTX2 needs one of Khronos' encoders (`ktx`, `toktx`) on the PATH, MP4 needs FFmpeg.
 """
 
 import os
@@ -20,21 +20,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import SettingError, StorageError
+from polcap.formats import atomic
 from polcap.formats.export.texture_set import Pixels, Texture
 from polcap.formats.maps import png
 
 Kind = Literal["png", "jpeg", "webp", "ktx2"]
 MIME: dict[Kind, str] = {"png": "image/png", "jpeg": "image/jpeg", "webp": "image/webp", "ktx2": "image/ktx2"}
+Frames = list[NDArray[np.uint8]]
+_ANIMATION_QUALITY = 80
 _PROGRAMS = ("ktx", "toktx")
-_QUALITY = {"jpeg": (95, 92), "webp": (101, 90)}  # data, colour; WebP over 100 is lossless
+_QUALITY = {"jpeg": (95, 92), "webp": (101, 90)}  # data, color; WebP over 100 is lossless
 
 
-class Encoder:
-    """Encodes each picture once, whichever files of an export hold it and in whichever threads they are written."""
+class TextureEncoder:
+    """Encodes each texture of an export once, also when several files hold it and threads write them."""
 
     def __init__(self) -> None:
         self._lock = Lock()
-        # the pixels stay with their bytes: no other array can then have their id
+        # holds the pixels too, so that no other array can get their id
         self._made: dict[tuple[int, Kind, bool], tuple[Pixels, Future[bytes]]] = {}
 
     def __call__(self, texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
@@ -49,31 +52,18 @@ class Encoder:
             except BaseException as error:
                 made.set_exception(error)
         data = made.result()
-        return png.described(data, {"Description": texture.says}) if text and kind == "png" else data
+        return png.described(data, {"Description": texture.meaning}) if text and kind == "png" else data
 
     def all(self, textures: Mapping[str, Texture], kind: Kind) -> dict[str, bytes]:
-        """The bytes of each picture, in threads; the same whatever their number.
-
-        Raises
-        ------
-        SettingError
-            KTX2 was asked for and no encoder is on the PATH.
-        """
+        """The bytes of each texture, encoded on threads; SettingError as `encode`."""
         with ThreadPoolExecutor(min(len(textures), os.cpu_count() or 1) or 1) as pool:
             return dict(zip(textures, pool.map(partial(self, kind=kind), textures.values())))
 
 
 def encode(texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
-    """The bytes of one picture; JPEG and WebP hold 8 bits, PNG what it is given.
+    """The bytes of one texture; JPEG and WebP hold 8 bits, PNG the bits of the texture.
 
-    Parameters
-    ----------
-    texture
-        The picture and what it means.
-    kind
-        Of the file.
-    text
-        Write into a PNG what it holds (a tEXt chunk), for files that lie beside the asset.
+    With `text` a PNG holds the texture's meaning in a tEXt chunk, for files next to the asset.
 
     Raises
     ------
@@ -84,14 +74,14 @@ def encode(texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
     """
     if kind == "png":
         plain = png.encode(texture.pixels)
-        return png.described(plain, {"Description": texture.says}) if text else plain
+        return png.described(plain, {"Description": texture.meaning}) if text else plain
     if kind == "ktx2":
         return _ktx2(texture)
     quality = _QUALITY[kind][texture.color]
     pixels = png.swapped(_eight_bits(texture))
     if kind == "jpeg":
         if pixels.shape[-1] == 4:
-            raise SettingError(f"{texture.says}: JPEG holds no fourth channel; choose png or webp")
+            raise SettingError(f"{texture.meaning}: JPEG holds no fourth channel; choose png or webp")
         options = [cv2.IMWRITE_JPEG_QUALITY, quality]
         options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
     else:
@@ -103,12 +93,12 @@ def encode(texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
 
 
 def ktx2_encoder() -> str | None:
-    """`ktx` or `toktx` of Khronos' KTX software, where it is installed."""
+    """The path of `ktx` or `toktx` of Khronos' KTX software, if it is installed."""
     return next((found for name in _PROGRAMS if (found := shutil.which(name))), None)
 
 
 def _ktx2(texture: Texture) -> bytes:
-    """UASTC with mipmaps, which keeps normals; its transfer function as the texture says."""
+    """UASTC with mipmaps, which preserves normals, with the texture's transfer function."""
     program = ktx2_encoder()
     if program is None:
         raise SettingError("KTX2 needs `ktx` or `toktx` of Khronos' KTX software on the PATH; choose webp or png")
@@ -117,8 +107,8 @@ def _ktx2(texture: Texture) -> bytes:
         source.write_bytes(png.encode(_eight_bits(texture)))
         done = subprocess.run([program, *_ktx2_options(program, texture, source, target)], capture_output=True)
         if done.returncode or not target.exists():
-            said = " ".join(done.stderr.decode(errors="replace").split())
-            raise SettingError(f"{Path(program).name} failed ({said[:200]}); choose webp or png")
+            reason = " ".join(done.stderr.decode(errors="replace").split())
+            raise SettingError(f"{Path(program).name} failed ({reason[:200]}); choose webp or png")
         return target.read_bytes()
 
 
@@ -137,3 +127,50 @@ def _eight_bits(texture: Texture) -> NDArray[np.uint8]:
     if texture.pixels.dtype == np.uint8:
         return np.asarray(texture.pixels, dtype=np.uint8)
     return np.asarray(np.rint(texture.pixels / 257.0), dtype=np.uint8)
+
+
+def webp(path: Path, frames: Frames, seconds: float) -> None:
+    """Write sRGB frames (H, W, 3) as an animated WebP that lasts `seconds` and repeats.
+
+    Raises
+    ------
+    StorageError
+        The file cannot be written, or OpenCV was built without WebP.
+    """
+    moving = cv2.Animation()
+    moving.frames = [np.ascontiguousarray(frame[..., ::-1]) for frame in frames]
+    moving.durations = [round(1000 * seconds / len(frames))] * len(frames)
+    done, data = cv2.imencodeanimation(".webp", moving, [cv2.IMWRITE_WEBP_QUALITY, _ANIMATION_QUALITY])
+    if not done:
+        raise StorageError(f"{path}: this OpenCV writes no WebP; install opencv-contrib-python-headless from PyPI")
+    with atomic.path(path) as temporary:
+        temporary.write_bytes(data.tobytes())
+
+
+def ffmpeg() -> str | None:
+    """The path of FFmpeg, if it is installed."""
+    return shutil.which("ffmpeg")
+
+
+def mp4(path: Path, frames: Frames, seconds: float) -> None:
+    """Write frames (H, W, 3) as H.264, by FFmpeg.
+
+    Raises
+    ------
+    StorageError
+        FFmpeg is missing, or fails.
+    """
+    program = ffmpeg()
+    if program is None:
+        raise StorageError(f"{path}: needs FFmpeg on the PATH; install it")
+    height, width = (edge - edge % 2 for edge in frames[0].shape[:2])  # H.264 stores colors at half size
+    command = [
+        program, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
+        "-r", f"{len(frames) / seconds:.4f}", "-i", "-", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "18",
+        "-f", "mp4",
+    ]  # fmt: skip
+    content = b"".join(np.ascontiguousarray(frame[:height, :width]).tobytes() for frame in frames)
+    with atomic.path(path) as temporary:
+        done = subprocess.run([*command, str(temporary)], input=content, capture_output=True)
+        if done.returncode:
+            raise StorageError(f"{path}: ffmpeg failed: {done.stderr.decode(errors='replace').strip()[-200:]}")

@@ -1,7 +1,7 @@
-"""In: an Asset. Out: one binary glTF 2.0 file (GLB), written by hand.
+"""Writes an asset as binary glTF 2.0 (GLB).
 
-The camera frame is already glTF's: right-handed, y up, the viewer on +z, metres. The object is moved
-to the origin; `asset.extras` says from where. What the asset was made from stands in an XMP packet.
+The camera frame is that of glTF: right-handed, y up, the viewer on +z, metres. The object is moved
+to the origin; its place in the camera frame is in `asset.extras`. The provenance is in an XMP packet.
 
 References
 ----------
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from polcap import __version__
 from polcap.formats import atomic
 from polcap.formats.export import encoders, texture_set
-from polcap.formats.export.encoders import Encoder, Kind
+from polcap.formats.export.encoders import Kind, TextureEncoder
 from polcap.formats.export.texture_set import Texture
 from polcap.images import Asset, Floats, Mesh
 
@@ -43,29 +43,17 @@ def write(
     name: str,
     images: Kind = "png",
     provenance: Mapping[str, str] | None = None,
-    encoder: Encoder | None = None,
+    encoder: TextureEncoder | None = None,
 ) -> None:
     """Write a GLB with embedded textures; the same asset gives the same bytes.
 
-    Parameters
-    ----------
-    path
-        The file.
-    asset
-        Mesh and textures.
-    name
-        Of scene, node, mesh and material.
-    images
-        Kind of the embedded pictures.
-    provenance
-        Goes into the XMP packet (KHR_xmp_json_ld).
-    encoder
-        What it has encoded for other files of the same export is not encoded again.
+    `name` is that of scene, node, mesh and material; `provenance` goes into the XMP packet (KHR_xmp_json_ld); an
+    `encoder` that is shared by the files of an export encodes no texture twice.
 
     Raises
     ------
     SettingError
-        No encoder for the kind of images.
+        There is no encoder for this kind of images.
     StorageError
         The file cannot be written.
     """
@@ -78,14 +66,9 @@ def encode(
     name: str,
     images: Kind = "png",
     provenance: Mapping[str, str] | None = None,
-    encoder: Encoder | None = None,
+    encoder: TextureEncoder | None = None,
 ) -> bytes:
-    """The bytes of the GLB.
-
-    Parameters
-    ----------
-    asset, name, images, provenance, encoder
-        As in `write`.
+    """The bytes of the GLB that `write` writes.
 
     References
     ----------
@@ -96,7 +79,7 @@ def encode(
     held = textures(asset)
     pictures = [
         blob.image(f"{name}_{key}", data, encoders.MIME[images])
-        for key, data in (encoder or Encoder()).all(held, images).items()
+        for key, data in (encoder or TextureEncoder()).all(held, images).items()
     ]
     used = ["KHR_materials_specular", "KHR_materials_ior", "KHR_xmp_json_ld"]
     required = [_IMAGE_EXTENSION[images]] if images in _IMAGE_EXTENSION else []
@@ -111,7 +94,7 @@ def encode(
                 "cuts": asset.mesh.cuts,
                 "cut_px": asset.mesh.cut_px,
                 "raggedness": asset.mesh.raggedness,
-                "textures": {f"{name}_{key}": texture.says for key, texture in held.items()},
+                "textures": {f"{name}_{key}": texture.meaning for key, texture in held.items()},
             },
             "extensions": {"KHR_xmp_json_ld": {"packet": 0}},
         },
@@ -149,7 +132,7 @@ def _file(document: Mapping[str, Any], blob: bytes | bytearray) -> bytes:
 
 
 def textures(asset: Asset) -> dict[str, Texture]:
-    """What the GLB embeds, by the ends of their names, in the order of the material."""
+    """The embedded textures, by the end of their names, in the order of the material."""
     return {
         "basecolor": texture_set.base_color(asset),
         "orm": texture_set.packed(asset),
@@ -199,44 +182,44 @@ def _texture(source: int, images: Kind) -> dict[str, Any]:
 
 
 def _packet(name: str, provenance: Mapping[str, str]) -> dict[str, Any]:
-    """Dublin Core and polcap's own words, as JSON-LD."""
+    """Title and provenance in Dublin Core and polcap's own terms, as JSON-LD."""
     return {
         "@context": _CONTEXT,
         "@id": "",
         "dc:title": {"@type": "rdf:Alt", "rdf:_1": {"@language": "x-default", "@value": name}},
         "dc:format": "model/gltf-binary",
         "xmp:CreatorTool": f"polcap {__version__}",
-        **{f"polcap:{key}": said for key, said in provenance.items()},
+        **{f"polcap:{key}": value for key, value in provenance.items()},
     }
 
 
 def center(vertices: Floats) -> Floats:
     """Middle (3,) of the bounding box of vertices (V, 3): the asset's origin.
 
-    It is taken from a mesh's float32 vertices without loss: they stand on a grid (`surface.triangles.on_grid`).
+    Subtracting it from float32 vertices loses nothing: they lie on a grid (`surface.triangles.on_grid`).
     """
     least, greatest = _bounds(vertices)
     return np.asarray((least.astype(np.float64) + greatest) / 2)
 
 
 def _bounds(vertices: Floats) -> tuple[Floats, Floats]:
-    """Least and greatest coordinates (3,), axis by axis: a third of the time that NumPy takes for all at once."""
+    """Least and greatest coordinates (3,); axis by axis, which is three times faster."""
     axes = vertices.T
     return np.array([axis.min() for axis in axes]), np.array([axis.max() for axis in axes])
 
 
 def is_open(faces: NDArray[np.int32]) -> bool:
-    """Whether some edge of faces (F, 3) belongs to one triangle only: the surface has a back that can be seen."""
+    """Whether some edge of faces (F, 3) belongs to one triangle only, so that the back of the surface is visible."""
     few = int(faces.max()) // 256
     first = faces[np.minimum(np.minimum(faces[:, 0], faces[:, 1]), faces[:, 2]) <= few]
-    # what was photographed from one side has its rim among the first vertices too: no need to sort all edges
+    # a surface photographed from one side has border edges among its first vertices: all edges need not be sorted
     return _single_edge(first, few) or _single_edge(faces, int(faces.max()))
 
 
 def _single_edge(faces: NDArray[np.int32], last: int) -> bool:
-    """Whether an edge with an end among the vertices up to `last` belongs to one triangle only.
+    """Whether an edge that starts at a vertex up to `last` belongs to one triangle only.
 
-    Faces (F, 3) hold all triangles at these vertices.
+    Faces (F, 3) include all triangles at these vertices.
     """
     start, end = faces.T.astype(np.int64).ravel(), faces[:, [1, 2, 0]].T.ravel()
     low, high = np.minimum(start, end), np.maximum(start, end)
@@ -245,11 +228,11 @@ def _single_edge(faces: NDArray[np.int32], last: int) -> bool:
         return False
     edge.sort()
     new = np.concatenate([[True], edge[1:] != edge[:-1], [True]])
-    return bool((new[1:] & new[:-1]).any())  # an edge unlike the one before and the one after it
+    return bool((new[1:] & new[:-1]).any())  # an edge that differs from the previous and the next one
 
 
 class _Blob:
-    """The binary chunk as it grows, each part on a multiple of four bytes."""
+    """The binary chunk; each part starts at a multiple of four bytes."""
 
     def __init__(self) -> None:
         self.data = bytearray()

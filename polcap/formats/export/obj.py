@@ -1,9 +1,9 @@
-"""In: an Asset. Out: NAME.obj, NAME.mtl and the two EXRs that only they name, for programs that read no glTF.
+"""Writes OBJ and MTL, with two EXR textures, for programs that read no glTF.
 
-The material is written for readers old (Kd, Ks, Ns, Ni) and new (Pr, Pm, norm). MTL has no word for
-colour space. Blender takes every 8- or 16-bit picture of an MTL for sRGB, so what is data (roughness,
-and the normals under map_Bump, which is where Blender looks for them) goes out as EXR, which everyone
-reads as it is; `norm` names the PNG for the others. OBJ counts v upwards where glTF counts it down.
+The material has keys for old readers (Kd, Ks, Ns, Ni) and new ones (Pr, Pm, norm). MTL cannot state a color space,
+and Blender takes every 8- or 16-bit picture of an MTL for sRGB. So data (roughness, and the normals under map_Bump,
+where Blender looks for them) are written as EXR, which every program reads unchanged; `norm` names the PNG for the
+other programs. OBJ counts v upwards, glTF downwards.
 """
 
 import re
@@ -22,36 +22,12 @@ from polcap.images import Asset, Floats
 
 
 def stem(name: str) -> str:
-    """A name as OBJ and MTL take it, which know no quotes."""
+    """A name without spaces: OBJ and MTL have no quotes."""
     return re.sub(r"\s+", "_", name)
 
 
-def write(
-    path: Path,
-    asset: Asset,
-    name: str,
-    files: Mapping[Key, str],
-    says: str = "",
-) -> list[Path]:
-    """Write `path` (.obj) and beside it the .mtl and two EXRs.
-
-    Parameters
-    ----------
-    path
-        The .obj; the others take its stem.
-    asset
-        Mesh and textures.
-    name
-        Of the material.
-    files
-        Names of the PNGs beside it, which are there already.
-    says
-        Comment at the head of both texts.
-
-    Returns
-    -------
-    list of Path
-        The files written.
+def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], comment: str = "") -> list[Path]:
+    """Write `path` (.obj), its .mtl and two EXRs, and return their paths; `files` name the PNGs in the same folder.
 
     Raises
     ------
@@ -64,7 +40,7 @@ def write(
     _data(normal, {c: asset.normal[..., k] for k, c in enumerate("RGB")})
     _data(roughness, {"Y": np.ascontiguousarray(asset.occlusion_roughness_metallic[..., 1])})
     data: dict[Key, str] = {"roughness": roughness.name, "normal": normal.name}
-    header = "".join(f"# {line}\n" for line in says.splitlines())
+    header = "".join(f"# {line}\n" for line in comment.splitlines())
     with atomic.path(library) as temporary:
         temporary.write_text(header + _material(asset, stem(name), files, data), encoding="utf-8")
     with atomic.path(path) as temporary:
@@ -73,12 +49,12 @@ def write(
 
 
 def _data(file: Path, channels: Mapping[str, NDArray[Any]]) -> None:
-    """Whole numbers of any depth as the share of their greatest, in half."""
+    """Write integers as the share of their greatest value, in half."""
     exr.write(file, {name: one / np.float32(np.iinfo(one.dtype).max) for name, one in channels.items()}, half=True)
 
 
 def _geometry(asset: Asset, material: str, library: str) -> bytes:
-    """The text of the mesh. Numbers are filled up with zeros: whole columns are then written at once."""
+    """The text of the mesh. Numbers have leading zeros, so that whole columns are written at once."""
     mesh = asset.mesh
     head = f"mtllib {library}\no {material}\n".encode()
     vertices = _decimals(b"v", mesh.vertices - gltf.center(mesh.vertices), 8)
@@ -88,7 +64,7 @@ def _geometry(asset: Asset, material: str, library: str) -> bytes:
 
 
 def _decimals(word: bytes, values: Floats, places: int) -> bytes:
-    """A line for each row of (N, k) numbers, with so many decimals."""
+    """One line for each row of (N, k) numbers, with `places` decimals."""
     count, columns = values.shape
     if not count:
         return b""
@@ -104,7 +80,7 @@ def _decimals(word: bytes, values: Floats, places: int) -> bytes:
 
 
 def _faces(faces: NDArray[np.int32]) -> bytes:
-    """f a/a/a b/b/b c/c/c: vertex, texture corner and normal have one number, from 1."""
+    """Lines f a/a/a b/b/b c/c/c: vertex, texture corner and normal share a number, from 1."""
     if not len(faces):
         return b""
     number = faces.astype(np.uint64) + np.uint64(1)
@@ -117,7 +93,7 @@ def _faces(faces: NDArray[np.int32]) -> bytes:
 
 
 def _digits(out: NDArray[np.uint8], number: NDArray[np.uint64]) -> None:
-    """Decimal digits of whole numbers into the last axis, from its end."""
+    """Write the decimal digits of whole numbers into the last axis, from its end."""
     left = number.astype(np.uint32) if number.max() < 2**32 else number
     ten = left.dtype.type(10)
     for place in range(out.shape[-1] - 1, -1, -1):

@@ -1,4 +1,4 @@
-"""In: the name of a program or purpose. Out: what it is given: formats, names, packing, direction of normals."""
+"""Presets of `polcap export`: formats, file names, packing and direction of normals for a program or purpose."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -15,24 +15,24 @@ FORMATS: tuple[Format, ...] = ("gltf", "obj", "usd", "materialx", "exr")
 
 
 @dataclass(frozen=True)
-class Preset:
-    """What one export holds; names are patterns of the asset's name."""
+class ExportPreset:
+    """The files of one export; `{}` in a name is the asset's name."""
 
     formats: tuple[Format, ...]
-    says: str
+    description: str
     name: str = "{}"  # of the asset itself
     images: Kind = "png"  # inside the GLB
-    textures: Mapping[str, Callable[[Asset], Texture]] = field(default_factory=dict)  # loose ones, PNG
+    textures: Mapping[str, Callable[[Asset], Texture]] = field(default_factory=dict)  # PNG files next to the asset
 
 
-PRESETS: Mapping[str, Preset] = {
-    "blender": Preset(
+PRESETS: Mapping[str, ExportPreset] = {
+    "blender": ExportPreset(
         formats=("gltf",),
-        says="File > Import > glTF, or polcap's extension for camera, flash and photograph; normals +Y",
+        description="File > Import > glTF, or polcap's extension for camera, flash and photograph; normals +Y",
     ),
-    "unreal": Preset(
+    "unreal": ExportPreset(
         formats=("gltf",),
-        says="Interchange imports the GLB, whose normals are +Y; the loose T_*_N is -Y as Unreal's materials want it",
+        description="Interchange imports the GLB (normals +Y); the loose T_*_N is -Y, as Unreal's materials need it",
         name="SM_{}",
         textures={
             "T_{}_BC": texture_set.base_color,
@@ -41,9 +41,9 @@ PRESETS: Mapping[str, Preset] = {
             "T_{}_S": texture_set.specular_level,
         },
     ),
-    "unity": Preset(
+    "unity": ExportPreset(
         formats=("gltf",),
-        says="glTFast imports the GLB; loose maps for HDRP and for the specular set-ups of URP; normals +Y",
+        description="glTFast imports the GLB; loose maps for HDRP and for the specular set-ups of URP; normals +Y",
         textures={
             "{}_BaseMap": texture_set.base_color,
             "{}_Normal": texture_set.normal,
@@ -51,13 +51,13 @@ PRESETS: Mapping[str, Preset] = {
             "{}_SpecularMap": texture_set.unity_specular,
         },
     ),
-    "web": Preset(
+    "web": ExportPreset(
         formats=("gltf",),
-        says="one small GLB; colours lossy, data lossless WebP (EXT_texture_webp); normals +Y",
+        description="one small GLB; colours lossy, data lossless WebP (EXT_texture_webp); normals +Y",
         images="webp",
     ),
-    "archive": Preset(
+    "archive": ExportPreset(
         formats=FORMATS,
-        says="every format, without loss; normals +Y; values in full precision in the layered EXR",
+        description="every format, without loss; normals +Y; values in full precision in the layered EXR",
     ),
 }

@@ -25,7 +25,7 @@ class Texture:
 
     pixels: Pixels  # (H, W), (H, W, 3) or (H, W, 4)
     color: bool  # sRGB-encoded color; else numbers
-    says: str
+    meaning: str
 
 
 def base_color(asset: Asset) -> Texture:
@@ -44,36 +44,36 @@ def normal(asset: Asset, *, up: bool = True) -> Texture:
 
 def roughness(asset: Asset) -> Texture:
     """The roughness channel of the packed texture."""
-    says = "perceptual roughness (GGX alpha = roughness squared), linear"
-    return Texture(np.ascontiguousarray(asset.occlusion_roughness_metallic[..., 1]), False, says)
+    meaning = "perceptual roughness (GGX alpha = roughness squared), linear"
+    return Texture(np.ascontiguousarray(asset.occlusion_roughness_metallic[..., 1]), False, meaning)
 
 
 def packed(asset: Asset) -> Texture:
     """Occlusion, roughness and metallic in one picture, as in glTF."""
-    says = "R occlusion (1: none measured), G perceptual roughness, B metallic (0); linear"
-    return Texture(asset.occlusion_roughness_metallic, False, says)
+    meaning = "R occlusion (1: none measured), G perceptual roughness, B metallic (0); linear"
+    return Texture(asset.occlusion_roughness_metallic, False, meaning)
 
 
 def relative_specular(asset: Asset) -> Texture:
     """F0 as KHR_materials_specular needs it, to be multiplied by the asset's factor."""
-    says = f"F0 over {asset.specular_factor[0] * _index_reflectance(asset):.5g}, sRGB-encoded"
-    return Texture(asset.specular_color, True, says)
+    meaning = f"F0 over {asset.specular_factor[0] * _index_reflectance(asset):.5g}, sRGB-encoded"
+    return Texture(asset.specular_color, True, meaning)
 
 
 def specular(asset: Asset) -> Texture:
     """F0 on a fixed scale, in color."""
-    says = f"F0 / {SPECULAR_RANGE:g}, sRGB-encoded; F0 beyond {SPECULAR_RANGE:g} is clipped"
+    meaning = f"F0 / {SPECULAR_RANGE:g}, sRGB-encoded; F0 beyond {SPECULAR_RANGE:g} is clipped"
     values = np.arange(np.iinfo(asset.specular_color.dtype).max + 1, dtype=asset.specular_color.dtype)
     table = replace(asset, specular_color=np.repeat(values[:, None], 3, axis=1))  # all values of a channel
     encoded = _quantized(color.encode_srgb(_level(table)), values)
     channels = [encoded[asset.specular_color[..., c], c] for c in range(3)]
-    return Texture(np.stack(channels, axis=-1), True, says)
+    return Texture(np.stack(channels, axis=-1), True, meaning)
 
 
 def specular_level(asset: Asset) -> Texture:
     """The luminance of F0 on a fixed scale."""
-    says = f"specular level: F0 / {SPECULAR_RANGE:g}, linear; F0 beyond {SPECULAR_RANGE:g} is clipped"
-    return Texture(_quantized(color.luminance(_level(asset)), asset.specular_color), False, says)
+    meaning = f"specular level: F0 / {SPECULAR_RANGE:g}, linear; F0 beyond {SPECULAR_RANGE:g} is clipped"
+    return Texture(_quantized(color.luminance(_level(asset)), asset.specular_color), False, meaning)
 
 
 def unity_mask(asset: Asset) -> Texture:
@@ -81,8 +81,8 @@ def unity_mask(asset: Asset) -> Texture:
     orm = asset.occlusion_roughness_metallic
     top = np.iinfo(orm.dtype).max
     channels = [orm[..., 2], orm[..., 0], np.zeros_like(orm[..., 0]), top - orm[..., 1]]
-    says = "R metallic (0), G occlusion (1), B detail mask (0), A smoothness = 1 - perceptual roughness; linear"
-    return Texture(np.stack(channels, axis=-1), False, says)
+    meaning = "R metallic (0), G occlusion (1), B detail mask (0), A smoothness = 1 - perceptual roughness; linear"
+    return Texture(np.stack(channels, axis=-1), False, meaning)
 
 
 def unity_specular(asset: Asset) -> Texture:
@@ -90,8 +90,8 @@ def unity_specular(asset: Asset) -> Texture:
     rough = asset.occlusion_roughness_metallic[..., 1:2]
     smooth = 1 - rough / np.float64(np.iinfo(rough.dtype).max)
     reflected = color.encode_srgb(np.clip(_reflectance(asset), 0.0, 1.0))
-    says = "RGB F0, sRGB-encoded; A smoothness = 1 - perceptual roughness, linear"
-    return Texture(_quantized(np.concatenate([reflected, smooth], axis=-1), asset.specular_color), True, says)
+    meaning = "RGB F0, sRGB-encoded; A smoothness = 1 - perceptual roughness, linear"
+    return Texture(_quantized(np.concatenate([reflected, smooth], axis=-1), asset.specular_color), True, meaning)
 
 
 LOOSE: Mapping[Key, Callable[[Asset], Texture]] = {

@@ -1,7 +1,9 @@
-"""In: the parts of a page. Out: one HTML file that needs nothing else, not even a network.
+"""Writes a page as one HTML file that needs no other file and no network.
 
-Beside this module lie what every page carries: its style (`page.css`), the light's law on a graphics
-chip (`law.glsl`, that of `optics/shade.py`) and what answers the pointer (`probe.js`, `relight.js`).
+page.css      style of every page
+law.glsl      the shading of `optics/shade.py` for the graphics card
+probe.js      shows the values under the pointer
+relight.js    lights the maps from the pointer's direction
 """
 
 import gzip
@@ -25,18 +27,7 @@ _SCRIPTS = ("probe.js", "relight.js")
 
 
 def write(path: str | Path, title: str, body: Iterable[str], data: Mapping[str, Any]) -> None:
-    """Write a page that needs no other file and no network.
-
-    Parameters
-    ----------
-    path
-        The file.
-    title
-        Plain text.
-    body
-        Fragments of HTML, whose texts are escaped.
-    data
-        What the page's scripts read, as JSON.
+    """Write a page of HTML fragments, whose texts are escaped; `data` is read by its scripts, as JSON.
 
     Raises
     ------
@@ -57,12 +48,12 @@ def write(path: str | Path, title: str, body: Iterable[str], data: Mapping[str, 
             + f'\n</main>\n<script type="application/json" id="data">{_json(known)}</script>'
             f"\n<script>\n{scripts}</script>\n</html>\n",
             encoding="utf-8",
-            errors="backslashreplace",  # names of files are bytes
+            errors="backslashreplace",  # a file name may not be text
         )
 
 
 def jpeg(picture: NDArray[np.uint8], whole_color: bool = False) -> str:
-    """A picture (H, W, 3) sRGB as a data address; `whole_color` keeps a color per pixel."""
+    """A picture (H, W, 3) sRGB as a data URL; `whole_color` stores colors at full resolution."""
     ratio = cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444 if whole_color else cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420
     options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY + 6 * whole_color, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, ratio]
     _, encoded = cv2.imencode(".jpg", picture[..., ::-1], options)
@@ -70,12 +61,12 @@ def jpeg(picture: NDArray[np.uint8], whole_color: bool = False) -> str:
 
 
 def lossless(picture: NDArray[np.uint8]) -> str:
-    """A picture (H, W, 3) or (H, W, 4) as the data address of a PNG."""
+    """A picture (H, W, 3) or (H, W, 4) as the data URL of a PNG."""
     return _address("image/png", png.encode(picture))
 
 
 def indexed(level: NDArray[np.uint8], colors: NDArray[np.uint8]) -> str:
-    """Levels (H, W) in their colors (255, 3) as the data address of a PNG; level 0 is transparent."""
+    """Levels (H, W) in their colors (255, 3) as the data URL of a PNG; level 0 is transparent."""
     return _address("image/png", png.indexed(level, colors))
 
 
@@ -91,7 +82,7 @@ def text(content: bytes) -> str:
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """A table of text; what it holds is escaped."""
+    """An HTML table; its texts are escaped."""
     top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
     lines = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
     return f"<table><tr>{top}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
@@ -102,5 +93,5 @@ def _address(kind: str, content: bytes) -> str:
 
 
 def _json(data: Mapping[str, Any]) -> str:
-    """JSON that may stand in a script element."""
+    """JSON that is safe inside a script element."""
     return json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")

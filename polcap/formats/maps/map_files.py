@@ -1,4 +1,4 @@
-"""In: the maps of an object. Out: what each file of maps/ holds: channels of an .exr, pixels of a .png."""
+"""The content of each file of maps/: channels of an .exr, or pixels of a .png."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
@@ -14,7 +14,7 @@ Source = Literal["maps", "mesh", "stokes", "cues"]
 
 
 def object_depth(maps: SurfaceMaps, mesh: Mesh) -> Floats:
-    """Depth (H, W) on the object, 0 beside it."""
+    """Depth (H, W) on the object, 0 outside."""
     return np.where(inside(maps) & np.isfinite(mesh.depth), mesh.depth, 0.0).astype(np.float32)
 
 
@@ -42,13 +42,13 @@ def inside(maps: SurfaceMaps) -> NDArray[np.bool_]:
     return np.asarray(maps.mask, dtype=bool)
 
 
-def seen(maps: SurfaceMaps, values: Floats) -> Floats:
-    """A map (H, W[, C]) on the object, 0 beside it."""
-    return kept(values, inside(maps))
+def on_object(maps: SurfaceMaps, values: Floats) -> Floats:
+    """A map (H, W[, C]) on the object, 0 outside."""
+    return masked(values, inside(maps))
 
 
-def kept(values: Floats, inside: NDArray[np.bool_]) -> Floats:
-    """Values (H, W[, C]) inside, 0 beside."""
+def masked(values: Floats, inside: NDArray[np.bool_]) -> Floats:
+    """Values (H, W[, C]) inside, 0 outside."""
     return np.where(inside if values.ndim == 2 else inside[..., None], values, 0).astype(np.float32)
 
 
@@ -73,31 +73,31 @@ def _cue_channels(cues: Cues) -> dict[str, Floats]:
 
 
 def _separated(cues: Cues) -> dict[str, Floats]:
-    """S0 in two parts, where a crossed shot tells them apart; else nothing."""
+    """The two parts of S0, where a crossed shot separates them."""
     if cues.body is None or cues.body_known is None:
         return {}
-    body = kept(cues.body, cues.body_known)
-    mirrored = kept(np.maximum(cues.radiance - cues.body, 0), cues.body_known)
+    body = masked(cues.body, cues.body_known)
+    mirrored = masked(np.maximum(cues.radiance - cues.body, 0), cues.body_known)
     parts = {"scattered": body, "mirrored": mirrored}
     return {f"{name}.{c}": part[..., k] for name, part in parts.items() for k, c in enumerate("RGB")}
 
 
-WHOLE = ("depth", "normal")  # .exr of 32 bits; the others are half
-# what a file is made from, and its content; those that take longest first
+FLOAT_FILES = ("depth", "normal")  # .exr files of 32 bits; the others are half
+# inputs of each file, and the function for its content; the slowest first
 FILES: Mapping[str, tuple[tuple[Source, ...], Callable[..., Any]]] = {
     "stokes.exr": (("stokes",), _stokes_channels),
     "cues.exr": (("cues",), _cue_channels),
-    "normal.exr": (("maps",), lambda maps: _channels("RGB", seen(maps, maps.normal))),
+    "normal.exr": (("maps",), lambda maps: _channels("RGB", on_object(maps, maps.normal))),
     "normal.png": (("maps",), _normal_picture),
     "photograph.png": (("cues",), lambda cues: color.srgb_eight_bits(cues.radiance)),
-    "diffuse.png": (("maps",), lambda maps: color.srgb_eight_bits(seen(maps, maps.diffuse))),
-    "diffuse.exr": (("maps",), lambda maps: _channels("RGB", seen(maps, maps.diffuse))),
-    "specular.png": (("maps",), lambda maps: color.srgb_eight_bits(seen(maps, maps.specular))),
-    "specular.exr": (("maps",), lambda maps: _channels("RGB", seen(maps, maps.specular))),
+    "diffuse.png": (("maps",), lambda maps: color.srgb_eight_bits(on_object(maps, maps.diffuse))),
+    "diffuse.exr": (("maps",), lambda maps: _channels("RGB", on_object(maps, maps.diffuse))),
+    "specular.png": (("maps",), lambda maps: color.srgb_eight_bits(on_object(maps, maps.specular))),
+    "specular.exr": (("maps",), lambda maps: _channels("RGB", on_object(maps, maps.specular))),
     "depth.exr": (("maps", "mesh"), lambda maps, mesh: {"Z": object_depth(maps, mesh)}),
     "depth.png": (("maps", "mesh"), _depth_picture),
-    "roughness.exr": (("maps",), lambda maps: {"Y": seen(maps, maps.roughness)}),
-    "roughness.png": (("maps",), lambda maps: png.sixteen_bits(seen(maps, maps.roughness))),
-    "confidence.exr": (("maps",), lambda maps: {"Y": seen(maps, maps.confidence)}),
+    "roughness.exr": (("maps",), lambda maps: {"Y": on_object(maps, maps.roughness)}),
+    "roughness.png": (("maps",), lambda maps: png.sixteen_bits(on_object(maps, maps.roughness))),
+    "confidence.exr": (("maps",), lambda maps: {"Y": on_object(maps, maps.confidence)}),
     "mask.png": (("maps",), lambda maps: np.where(inside(maps), 255, 0).astype(np.uint8)),
 }

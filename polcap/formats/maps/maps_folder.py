@@ -1,4 +1,4 @@
-"""In: the maps of an object. Out: the folder maps/ of a result, as docs/reference/result.md says; and back."""
+"""Writes and reads the folder maps/ of a result (docs/reference/result.md)."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -46,7 +46,7 @@ class _Depth(Struct, frozen=True):
 
 
 class _Description(Struct, frozen=True):
-    """What is read back of maps.json."""
+    """The keys of maps.json that `read` needs."""
 
     crop: tuple[_Place, _Place, _Place, _Place]
     size: tuple[_Side, _Side]
@@ -57,8 +57,8 @@ class _Description(Struct, frozen=True):
 
 
 @dataclass(frozen=True)
-class Stored:
-    """What a result's maps/ tells."""
+class StoredMaps:
+    """The maps of a result as read from its files."""
 
     maps: SurfaceMaps
     depth: Floats  # (H, W) NaN outside the mask
@@ -68,8 +68,8 @@ class Stored:
 def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues: Cues) -> None:
     """Write every map as EXR, the main ones as PNG too, and maps.json last; the same values give the same bytes.
 
-    Of the mesh its depth (H, W) is written. All images lie on the crop (H, W) of `maps`. Files are encoded on
-    threads, and get their names together: where one fails, those of an earlier run are left.
+    Of the mesh its depth (H, W) is written. All images are on the crop (H, W) of `maps`. Files are encoded on
+    threads and renamed together: where one fails, the files of an earlier run stay.
 
     Raises
     ------
@@ -92,23 +92,23 @@ def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues
 
 
 def _write(file: Path, content: Callable[[], Any], held: atomic.Held) -> None:
-    """One file; an .exr of channels, a .png of pixels."""
+    """Write one file: an .exr of channels, or a .png of pixels."""
     if file.suffix == ".exr":
-        exr.write(file, content(), half=file.stem not in map_files.WHOLE, held=held)
+        exr.write(file, content(), half=file.stem not in map_files.FLOAT_FILES, held=held)
     else:
         png.write(file, content(), held)
 
 
 def as_stored(maps: SurfaceMaps) -> SurfaceMaps:
-    """The maps that `read` gives of the folder that `write` makes of these: half where the files are half."""
+    """The maps (H, W) as `read` returns them after `write`: rounded to half where the files are half."""
     inside = map_files.inside(maps)
     return SurfaceMaps(
-        normal=map_files.kept(maps.normal, inside),
-        diffuse=_kept_half(maps.diffuse, inside),
-        specular=_kept_half(maps.specular, inside),
-        roughness=_kept_half(maps.roughness, inside),
+        normal=map_files.masked(maps.normal, inside),
+        diffuse=_masked_half(maps.diffuse, inside),
+        specular=_masked_half(maps.specular, inside),
+        roughness=_masked_half(maps.roughness, inside),
         depth_prior=None,
-        confidence=_kept_half(maps.confidence, inside),
+        confidence=_masked_half(maps.confidence, inside),
         mask=inside,
         view=maps.view,
         estimator=maps.estimator,
@@ -116,61 +116,61 @@ def as_stored(maps: SurfaceMaps) -> SurfaceMaps:
 
 
 def stored_depth(maps: SurfaceMaps, mesh: Mesh) -> Floats:
-    """The depth (H, W) that `read` gives of that folder; NaN outside the mask."""
+    """The depth (H, W) as `read` returns it after `write`; NaN outside the mask."""
     return np.where(map_files.inside(maps), map_files.object_depth(maps, mesh), np.nan).astype(np.float32)
 
 
-def _kept_half(values: Floats, inside: NDArray[np.bool_]) -> Floats:
-    """As `map_files.kept`, rounded to half; pixels beside the object are not computed."""
+def _masked_half(values: Floats, inside: NDArray[np.bool_]) -> Floats:
+    """`map_files.masked`, rounded to half; only pixels inside are computed."""
     rows, limit = np.flatnonzero(inside), np.finfo(np.float16).max
     flat = values.reshape(inside.size, -1)
-    kept = np.zeros(flat.shape, np.float32)
-    kept[rows] = np.clip(flat.take(rows, axis=0), -limit, limit).astype(np.float16)
-    return kept.reshape(values.shape)
+    masked = np.zeros(flat.shape, np.float32)
+    masked[rows] = np.clip(flat.take(rows, axis=0), -limit, limit).astype(np.float16)
+    return masked.reshape(values.shape)
 
 
-def read(folder: Path) -> Stored:
-    """Read back what `write` wrote, from the EXRs, mask.png and maps.json.
+def read(folder: Path) -> StoredMaps:
+    """Read the folder that `write` wrote: EXRs, mask.png and maps.json.
 
     Raises
     ------
     DecodeError
-        A file is missing, damaged, or of another size than maps.json says.
+        A file is missing, damaged, or not of the size in maps.json.
     """
     folder = Path(folder)
     try:
-        said = msgspec.convert(text_file.read_json(folder / "maps.json"), _Description)
+        about = msgspec.convert(text_file.read_json(folder / "maps.json"), _Description)
     except OSError as error:
-        raise DecodeError(f"{folder} holds no maps.json ({error.strerror}); give a result's folder") from error
+        raise DecodeError(f"{folder} has no maps.json ({error.strerror}); give a result's folder") from error
     except ValueError as error:
-        raise DecodeError(f"{folder / 'maps.json'} is not as polcap wrote it ({error}); process again") from error
-    width, height = said.size
-    origin = (said.crop[0] / said.scale, said.crop[1] / said.scale)
-    view = View(said.camera.focal_px, said.camera.center_px, said.scale, origin, said.camera.focal_known)
+        raise DecodeError(f"{folder / 'maps.json'} is not a maps.json of polcap ({error}); process again") from error
+    width, height = about.size
+    origin = (about.crop[0] / about.scale, about.crop[1] / about.scale)
+    view = View(about.camera.focal_px, about.camera.center_px, about.scale, origin, about.camera.focal_known)
 
     mask = png.read(folder / "mask.png")
     if mask.shape != (height, width):
         raise DecodeError(f"{folder / 'mask.png'} is not {width} × {height}; process again")
     inside = mask > 127
-    return Stored(
+    return StoredMaps(
         maps=SurfaceMaps(
-            normal=_read_map(folder / "normal.exr", "RGB", said.size),
-            diffuse=_read_map(folder / "diffuse.exr", "RGB", said.size),
-            specular=_read_map(folder / "specular.exr", "RGB", said.size),
-            roughness=_read_map(folder / "roughness.exr", "Y", said.size),
+            normal=_read_map(folder / "normal.exr", "RGB", about.size),
+            diffuse=_read_map(folder / "diffuse.exr", "RGB", about.size),
+            specular=_read_map(folder / "specular.exr", "RGB", about.size),
+            roughness=_read_map(folder / "roughness.exr", "Y", about.size),
             depth_prior=None,
-            confidence=_read_map(folder / "confidence.exr", "Y", said.size),
+            confidence=_read_map(folder / "confidence.exr", "Y", about.size),
             mask=inside,
             view=view,
-            estimator=said.estimator,
+            estimator=about.estimator,
         ),
-        depth=np.where(inside, _read_map(folder / "depth.exr", "Z", said.size), np.nan).astype(np.float32),
-        metric=said.depth.unit == "m",
+        depth=np.where(inside, _read_map(folder / "depth.exr", "Z", about.size), np.nan).astype(np.float32),
+        metric=about.depth.unit == "m",
     )
 
 
-def note_export(folder: Path, where: str, said: Mapping[str, Any]) -> None:
-    """Write into maps.json what the export in the result's folder `where` holds.
+def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
+    """Note in maps.json the content of the export in the result's folder `where`.
 
     Raises
     ------
@@ -180,7 +180,7 @@ def note_export(folder: Path, where: str, said: Mapping[str, Any]) -> None:
     file = folder / "maps.json"
     known = text_file.read_json(file)
     earlier = known.get("exports")
-    known["exports"] = dict(sorted({**(earlier if isinstance(earlier, dict) else {}), where: said}.items()))
+    known["exports"] = dict(sorted({**(earlier if isinstance(earlier, dict) else {}), where: about}.items()))
     _write_json(file, known)
 
 

@@ -4,11 +4,11 @@ Both estimators work in the frame of each view ray, where polarization speaks of
 hand back camera-frame maps.
 
     analytic       the inversion: zenith from DoLP, azimuth from AoLP
-        azimuth        which of the two half-turns an AoLP means
-        body_law       which law of the body the DoLP follows, and the zenith it means
-    body_light     albedo in highlights, where a crossed shot shows what lies under them
+        zenith         zenith from DoLP, by the object's law of diffuse polarization
+    half_turns     side of the ray to which a normal leans, for both estimators
+    highlight_albedo   albedo in highlights, from a crossed shot
     learned        the network, joined with the inversion
-    fine           relief that the network is shown too small to see
+    fine           relief finer than the network's pixels
         augmentation   the network's answers to turned and mirrored pictures, made one
 """
 
@@ -19,7 +19,7 @@ from msgspec import Meta
 
 from polcap.images import Cues, Network, RunNetwork, SurfaceMaps
 from polcap.stages import stage
-from polcap.stages.infer import analytic, body_light, learned
+from polcap.stages.infer import analytic, highlight_albedo, learned
 
 
 class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -35,7 +35,7 @@ class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
 
 
-@stage(version=15)
+@stage(version=16)
 def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: InferSettings) -> SurfaceMaps:
     """Normal, diffuse, specular, roughness and expected error; network None means analytic.
 
@@ -48,4 +48,4 @@ def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: Inf
         maps = analytic.estimate(cues, settings.ior)
     else:
         maps = learned.estimate(cues, network, run, settings.ior, settings.symmetries, fine_pass=settings.fine)
-    return body_light.albedo(maps, cues, settings.ior)
+    return highlight_albedo.correct_highlights(maps, cues, settings.ior)

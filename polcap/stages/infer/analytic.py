@@ -11,8 +11,8 @@ import numpy as np
 from polcap import parallel
 from polcap.images import Cues, Floats, Quality, SurfaceMaps
 from polcap.optics import brdf, frames, fresnel
-from polcap.stages.infer import azimuth, body_law
-from polcap.stages.infer.body_law import Zeniths
+from polcap.stages.infer import half_turns
+from polcap.stages.infer.zenith import ZenithEstimate, candidate_laws, estimate_zenith
 
 _BLURS_PX = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0)  # in steps of 1.5, in which noise falls by a third
 _SAME = 2.0  # standard deviations that two averages of the same thing may differ by: 95 %
@@ -41,7 +41,7 @@ def estimate(cues: Cues, ior: float) -> SurfaceMaps:
 
 def prepare(cues: Cues, ior: float) -> tuple[Floats, Floats]:
     """S1/S0 and S2/S0 (2, H, W) averaged, and their 1σ (H, W): what `invert` needs before it has a guide."""
-    body_law.laws(ior)  # kept from here on
+    candidate_laws(ior)  # cached from here on
     return _smoothed(cues)
 
 
@@ -53,7 +53,7 @@ def invert(
 ) -> tuple[Floats, Floats, Floats]:
     """Normals (H, W, 3), their expected error (H, W) in degrees and cosines of the zenith (H, W).
 
-    Zenith by the DoLP and the law of the body that the cues speak for (`body_law.py`).
+    Zenith by the DoLP and the law of the body that the cues speak for (`zenith.py`).
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def invert(
         Refractive index.
     guide
         Normals (H, W, 3) in the frame of each ray and their expected error (H, W), degrees, by which the half-turn of
-        the azimuth is chosen; without it by `stages/infer/azimuth.py`.
+        the azimuth is chosen; without it by `half_turns.py`.
     prepared
         What `prepare` gives, where that is known.
     """
@@ -73,18 +73,20 @@ def invert(
     known = None
     if guide is not None:
         known = np.arccos(np.clip(guide[0][..., 2], 0, 1)), np.radians(guide[1])
-    read = body_law.zeniths(dolp, cues, ior, known)
+    read = estimate_zenith(dolp, cues, ior, known)
     zenith = read.angle
     cos_zenith = np.cos(zenith)
     axis = ratio / np.sqrt(squared + 1e-12)
     if guide is None:
-        phi, certainty = azimuth.resolve(axis, np.sin(zenith), cues.mask)
+        phi = np.arctan2(axis[1], axis[0]) / 2
+        found = half_turns.resolve(_local(cos_zenith, phi, cues.rays), cues.mask)
+        phi, certainty = phi + np.where(found.turned, np.pi, 0.0), 1 - 2 * found.doubt
     else:
         phi, certainty = _guided(axis, cues.rays, *guide)
-    error, normal = parallel.both(
-        partial(_expected_error, read, dolp, sigma, certainty, cues), partial(_from_angles, cos_zenith, phi, cues.rays)
+    error, local = parallel.both(
+        partial(_expected_error, read, dolp, sigma, certainty, cues), partial(_local, cos_zenith, phi, cues.rays)
     )
-    return normal, error, cos_zenith
+    return np.asarray(frames.from_ray_frame(local, cues.rays)), error, cos_zenith
 
 
 def _guided(axis: Floats, rays: Floats, normal: Floats, sigma: Floats) -> tuple[Floats, Floats]:
@@ -129,12 +131,11 @@ def _smoothed(cues: Cues) -> tuple[Floats, Floats]:
     return ratio, sigma
 
 
-def _from_angles(cos_zenith: Floats, phi: Floats, rays: Floats) -> Floats:
-    """Unit normals (H, W, 3) in the camera frame from zenith and image azimuth about each ray."""
+def _local(cos_zenith: Floats, phi: Floats, rays: Floats) -> Floats:
+    """Unit normals (H, W, 3) in the frame of each ray from zenith and image azimuth about it."""
     x, y = frames.axis_across(phi, rays)
     share = np.sqrt(np.maximum(1 - cos_zenith**2, 0) / (x * x + y * y))
-    local = np.stack([share * x, share * y, cos_zenith], axis=-1)
-    return np.asarray(frames.from_ray_frame(local, rays))
+    return np.stack([share * x, share * y, cos_zenith], axis=-1)
 
 
 def _albedo(cues: Cues, cos_zenith: Floats, ior: float) -> tuple[Floats, Floats]:
@@ -206,7 +207,7 @@ def _gloss(highlight: Floats, cos_zenith: Floats, cues: Cues) -> tuple[float, fl
     return roughness, f0
 
 
-def _expected_error(read: Zeniths, dolp: Floats, sigma: Floats, certainty: Floats, cues: Cues) -> Floats:
+def _expected_error(read: ZenithEstimate, dolp: Floats, sigma: Floats, certainty: Floats, cues: Cues) -> Floats:
     """Expected normal error (H, W), degrees: noise through the inversion, doubts of half-turn and law, the model's.
 
     A wrong half-turn costs 2θ and happens with probability (1 − certainty)/2.

@@ -26,14 +26,22 @@ def combined(cues: Cues, network: Network, run: RunNetwork, symmetries: int) -> 
     """The network's maps (H, W[, 3]) of the whole object seen from several positions; normals in the camera frame.
 
     Normals are the median of the positions' directions, weighed by their stated errors: where they part it is often
-    by half a turn, and the mean of both is neither. All other maps are means.
+    by half a turn, and the mean of both is neither. `opposed` (H, W) is the share of positions whose normal leans to
+    the other side of the ray. All other maps are means.
     """
     picture = np.moveaxis(channels(cues), 0, -1)
     looks = [partial(_answer, picture, cues.rays, network, run, *position) for position in _POSITIONS[:symmetries]]
     answers = parallel.results(looks, network.at_once)
     maps = {name: np.asarray(np.mean([maps[name] for maps in answers], axis=0), np.float32) for name in _OUTPUTS}
     normals, errors = (np.stack([maps[name] for maps in answers]) for name in ("normal", "sigma"))
-    return maps | {"normal": _median(normals, errors)}
+    middle = _median(normals, errors)
+    return maps | {"normal": middle, "opposed": _opposed(normals, middle, cues.rays)}
+
+
+def _opposed(normals: Floats, middle: Floats, rays: Floats) -> Floats:
+    """Share (H, W) of K normals (K, H, W, 3) that lean to the other side of the ray than the middle one (H, W, 3)."""
+    towards = middle - frames.dot(middle, rays)[..., None] * rays
+    return np.asarray(np.mean([frames.dot(normal, towards) < 0 for normal in normals], axis=0), np.float32)
 
 
 def _answer(

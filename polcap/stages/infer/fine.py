@@ -1,8 +1,8 @@
-"""The fine pass: relief that the network, which sees the object small, could not see.
+"""Refinement of the normals: relief finer than the main network's pixels, by a second, small network.
 
-A second, small network looks at tiles of the crop at its own pixels, beside what is known by then, and says how the
-normals deviate. Of its answer only what is finer than the first network sees is kept, so that shape stays as it was.
-Training (`training/fine_*.py`) makes its channels by `encode` too.
+It sees tiles of the crop at full resolution with the estimate so far, and returns a deviation of the normals. Only the
+part of it that is finer than the main network's pixels counts, so the shape stays. Training (`training/fine_*.py`)
+makes its input by `encode` too.
 """
 
 from collections.abc import Iterator
@@ -18,82 +18,68 @@ from polcap.errors import ModelError
 from polcap.images import Cues, Floats, Network, RunNetwork
 from polcap.optics import frames
 from polcap.optics.resize import area_mean
-from polcap.stages import cues as seen
+from polcap.stages import cues as cue_channels
 
 ENCODING = "fine 1"
-GUESSED = (
-    "normal_x", "normal_y", "normal_z",  # joined so far, frame of each ray
-    "smooth_x", "smooth_y", "smooth_z",  # the first network's alone
-    "log_sigma",  # ln of the first network's expected error, degrees
+Window = tuple[slice, slice]
+
+CHANNELS = (
+    *cue_channels.CHANNELS,
+    "normal_x", "normal_y", "normal_z",  # by network and inversion, frame of each ray
+    "smooth_x", "smooth_y", "smooth_z",  # by the main network alone
+    "log_sigma",  # ln of the main network's expected error, degrees
     "roughness",
-    "log_shrink",  # ln of how many pixels one is that the first network sees
+    "log_shrink",  # ln of the crop's pixels per pixel of the main network
 )  # fmt: skip
-CHANNELS = (*seen.CHANNELS, *GUESSED)
 SIZE_MULTIPLE = 8
-COARSEST = 2.0  # pixels that the first network sees, 1σ: what is coarser is not the fine pass's to tell
-_TILE, _MARGIN = 512, 64  # px, multiples of SIZE_MULTIPLE; the network looks 62 px far
+_COARSEST = 2.0  # 1σ in the main network's pixels: it resolves structure that is coarser
+_TILE, _MARGIN = 512, 64  # px, multiples of SIZE_MULTIPLE; the network's receptive field reaches 62 px
 
 
 @dataclass(frozen=True)
-class Guess:
-    """What is known before the fine pass, on the crop's grid (H, W)."""
+class CoarseEstimate:
+    """Estimate before refinement, on the crop's grid (H, W)."""
 
-    normal: Floats  # (H, W, 3) joined, camera frame
-    smooth: Floats  # (H, W, 3) the first network's alone, camera frame
+    normal: Floats  # (H, W, 3) by network and inversion, camera frame
+    smooth: Floats  # (H, W, 3) by the main network alone, camera frame
     sigma: Floats  # (H, W) its expected error, degrees
     roughness: Floats  # (H, W)
-    shrink: float  # px of the crop that it saw as one
+    shrink: float  # the crop's pixels per pixel of the main network
 
 
-def encode(cues: Cues, guess: Guess) -> Floats:
-    """The fine network's input, CHANNELS in order, (N, H, W) float32, 0 outside the mask."""
-    plane = np.full(cues.mask.shape, np.log(guess.shrink))
-    guessed = [
-        *np.moveaxis(frames.to_ray_frame(guess.normal, cues.rays), -1, 0),
-        *np.moveaxis(frames.to_ray_frame(guess.smooth, cues.rays), -1, 0),
-        np.log(np.maximum(guess.sigma, 0.5)), guess.roughness, plane,
+def encode(cues: Cues, estimate: CoarseEstimate) -> Floats:
+    """The refinement network's input, CHANNELS in order, (N, H, W) float32, 0 outside the mask."""
+    channels = [
+        *np.moveaxis(frames.to_ray_frame(estimate.normal, cues.rays), -1, 0),
+        *np.moveaxis(frames.to_ray_frame(estimate.smooth, cues.rays), -1, 0),
+        np.log(np.maximum(estimate.sigma, 0.5)), estimate.roughness, np.full(cues.mask.shape, np.log(estimate.shrink)),
     ]  # fmt: skip
-    return np.concatenate([seen.channels(cues), np.stack(guessed) * cues.mask]).astype(np.float32)
+    return np.concatenate([cue_channels.channels(cues), np.stack(channels) * cues.mask]).astype(np.float32)
 
 
-def refined(cues: Cues, guess: Guess, network: Network, run: RunNetwork) -> Floats:
-    """Normals (H, W, 3), camera frame, with the fine network's relief.
+def refine(cues: Cues, estimate: CoarseEstimate, network: Network, run: RunNetwork) -> Floats:
+    """Normals (H, W, 3), camera frame, with the relief of the refinement network.
 
     Raises
     ------
     ModelError
-        The network was made for other channels, or gives something else.
+        The network was made for other channels, or returns other maps.
     """
     if network.channels != CHANNELS:
-        raise ModelError(f"fine model {network.digest[:8]} expects other channels; use the one of this version")
+        raise ModelError(f"fine model {network.digest[:8]} expects other channels; use the model of this version")
     relief = np.zeros((*cues.mask.shape, 3), np.float32)
     tiles = list(_tiles(cues.mask))
-    looks = [partial(_answer, cues, guess, inner, outer, network, run) for inner, outer in tiles]
-    for (inner, _), found in zip(tiles, parallel.results(looks, network.at_once), strict=True):
+    calls = [partial(_tile_relief, cues, estimate, inner, outer, network, run) for inner, outer in tiles]
+    for (inner, _), found in zip(tiles, parallel.results(calls, network.at_once), strict=True):
         relief[inner] = found
-    relief = finer(relief, cues.mask, guess.shrink)
-    local = frames.to_ray_frame(guess.normal, cues.rays) + relief
-    moved = frames.from_ray_frame(local, cues.rays)
-    return np.asarray(moved / np.maximum((frames.dot(moved, moved) ** 0.5)[..., None], 1e-6))
-
-
-def finer(image: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:
-    """An image (H, W, 3) without what is coarser than COARSEST, 0 outside the mask."""
-    height, width = mask.shape
-    small = max(1, round(height / shrink)), max(1, round(width / shrink))
-    inside = mask.astype(np.float32)
-    coarse, share = (
-        cv2.GaussianBlur(area_mean(part, small), (0, 0), COARSEST) for part in (image * inside[..., None], inside)
-    )
-    back = cv2.resize(coarse / np.maximum(share, 1e-3)[..., None], (width, height))
-    return np.asarray((image - back) * inside[..., None])
-
-
-Window = tuple[slice, slice]
+    relief = high_pass(relief, cues.mask, estimate.shrink)
+    local = frames.to_ray_frame(estimate.normal, cues.rays) + relief
+    refined = frames.from_ray_frame(local, cues.rays)
+    return np.asarray(refined / np.maximum((frames.dot(refined, refined) ** 0.5)[..., None], 1e-6))
 
 
 def _tiles(mask: NDArray[np.bool_]) -> Iterator[tuple[Window, Window]]:
-    """Tiles that show the object, and the same with a margin, cut at the picture's edge."""
+    """Tiles that show the object: each without and with its margin, cut at the picture's edge."""
     height, width = mask.shape
     for y in range(0, height, _TILE):
         for x in range(0, width, _TILE):
@@ -103,24 +89,45 @@ def _tiles(mask: NDArray[np.bool_]) -> Iterator[tuple[Window, Window]]:
                 yield inner, outer
 
 
-def _part(cues: Cues, guess: Guess, window: Window) -> tuple[Cues, Guess]:
-    """What `encode` takes of a window, so that no channels of the whole crop are ever held."""
+def _window(cues: Cues, estimate: CoarseEstimate, window: Window) -> tuple[Cues, CoarseEstimate]:
+    """A window of cues and estimate: channels of the whole crop would fill the memory."""
     single = ("radiance", "ratio_sigma", "dolp", "rays", "mask", "quality")
     double = ("ratio", "normalized_stokes")
-    shown = {name: getattr(cues, name)[window] for name in single}
-    shown |= {name: getattr(cues, name)[(slice(None), *window)] for name in double}
-    known = {name: getattr(guess, name)[window] for name in ("normal", "smooth", "sigma", "roughness")}
-    return replace(cues, **shown), replace(guess, **known)
+    cut = {name: getattr(cues, name)[window] for name in single}
+    cut |= {name: getattr(cues, name)[(slice(None), *window)] for name in double}
+    part = {name: getattr(estimate, name)[window] for name in ("normal", "smooth", "sigma", "roughness")}
+    return replace(cues, **cut), replace(estimate, **part)
 
 
-def _answer(cues: Cues, guess: Guess, inner: Window, outer: Window, network: Network, run: RunNetwork) -> Floats:
-    """Deviation of the normals (h, w, 3) of the tile `inner`, ray frame, by what `outer` shows."""
-    picture = encode(*_part(cues, guess, outer))
+def _tile_relief(
+    cues: Cues, estimate: CoarseEstimate, inner: Window, outer: Window, network: Network, run: RunNetwork
+) -> Floats:
+    """Deviation of the normals (h, w, 3) of the tile `inner`, ray frame, by the network's view of `outer`."""
+    picture = encode(*_window(cues, estimate, outer))
     _, height, width = picture.shape
     more = ((0, 0), (0, -height % SIZE_MULTIPLE), (0, -width % SIZE_MULTIPLE))
     relief = run(network, np.pad(picture, more)[None]).get("relief")
     if relief is None or relief.shape[1] != 3:
-        raise ModelError(f"fine model {network.digest[:8]} makes no relief; use the one of this version")
+        raise ModelError(f"fine model {network.digest[:8]} returns no relief; use the model of this version")
     y, x = (within.start - around.start for within, around in zip(inner, outer))
     high, wide = (within.stop - within.start for within in inner)
     return np.moveaxis(relief[0, :, y : y + high, x : x + wide], 0, -1)
+
+
+def high_pass(image: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:
+    """The part of an image (H, W, 3) that is finer than the main network resolves, 0 outside the mask (H, W)."""
+    return np.asarray((image - low_pass(image, mask, shrink)) * mask.astype(np.float32)[..., None])
+
+
+def low_pass(image: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:
+    """The part of an image (H, W, 3) inside the mask (H, W) that the main network resolves.
+
+    Averaged down by `shrink`, blurred, and interpolated back.
+    """
+    height, width = mask.shape
+    small = max(1, round(height / shrink)), max(1, round(width / shrink))
+    inside = mask.astype(np.float32)
+    coarse, share = (
+        cv2.GaussianBlur(area_mean(part, small), (0, 0), _COARSEST) for part in (image * inside[..., None], inside)
+    )
+    return np.asarray(cv2.resize(coarse / np.maximum(share, 1e-3)[..., None], (width, height)))

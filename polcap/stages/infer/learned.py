@@ -16,11 +16,10 @@ from polcap.images import Cues, Floats, Network, Quality, RunNetwork, SurfaceMap
 from polcap.optics import frames
 from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stages.cues import CHANNELS, FLOOR
-from polcap.stages.infer import analytic, augmentation, fine
+from polcap.stages.infer import analytic, augmentation, fine, half_turns
 from polcap.stages.infer.analytic import REACHED, fill_highlights
 
 _INVERSION = 4.0  # factor on the inversion's expected error in the join: the network has seen what it has seen
-_DETAIL = 2.0  # pixels that the network sees, 1σ: what is finer is the inversion's to tell
 # error = min(a·statedᵇ·exp(r·roughness), c), degrees: likeliest on traced training meshes (decision 28)
 _CALIBRATION = (0.515, 1.12, 0.906, 50.0)
 _CELLS = 2.0  # cells of the network's grid, 1σ, over which its pattern is taken as the same
@@ -60,11 +59,12 @@ def estimate(
         A network was made for other channels, or gives other maps.
     """
     maps, guess, stated = known(cues, network, run, ior, symmetries)
-    normal = fine.refined(cues, guess, network.fine, run) if fine_pass and network.fine else guess.normal
+    normal = fine.refine(cues, guess, network.fine, run) if fine_pass and network.fine else guess.normal
     lit = (np.maximum(cues.radiance, 0) + FLOOR) * np.exp(maps["factor"])
     diffuse = fill_highlights(lit / _shading(normal, cues.rays) - FLOOR, _bounded(cues))
     scale, power, rougher, most = _CALIBRATION
     expected = np.minimum(scale * stated**power * np.exp(rougher * np.clip(maps["roughness"], 0, 1)), most)
+    expected = half_turns.error_with_doubt(expected, maps["doubt"], frames.dot(normal, cues.rays))
     inside = cues.mask[..., None]
     return SurfaceMaps(
         normal=(normal * inside).astype(np.float32),
@@ -81,7 +81,7 @@ def estimate(
 
 def known(
     cues: Cues, network: Network, run: RunNetwork, ior: float, symmetries: int
-) -> tuple[dict[str, Floats], fine.Guess, Floats]:
+) -> tuple[dict[str, Floats], fine.CoarseEstimate, Floats]:
     """What stands before the fine pass, whose training begins here too.
 
     Parameters
@@ -93,8 +93,8 @@ def known(
     -------
     tuple
         The network's maps (H, W[, 3]) at the crop's size, of which `factor` is the logarithm of the light that its
-        albedo sends back under the shading of its normals over S0; what the fine pass is told; the error (H, W)
-        stated for the normals, degrees.
+        albedo sends back under the shading of its normals over S0, and `doubt` the probability of a wrong half-turn;
+        what the fine pass is told; the error (H, W) stated for the normals, degrees.
     """
     _check(network)
     size = cues.mask.shape[::-1]
@@ -104,6 +104,7 @@ def known(
     small, averaged = parallel.both(looks, partial(analytic.prepare, cues, ior), network.at_once)
     # beside the object the network guesses: zeros there leave an edge's direction to the object's own pixels
     small["normal"] = _without_grid(small["normal"], seen.mask) * seen.mask[..., None]
+    small["normal"], small["doubt"] = _sided(small["normal"], seen, small["sigma"], small.pop("opposed"))
     small["factor"] = _factor(small["diffuse"] * _shading(small["normal"], seen.rays), seen)
     for name in ("specular", "roughness"):
         small[name] = _blended(small[name], seen.mask)
@@ -113,7 +114,15 @@ def known(
     by_pixel, doubt, _ = analytic.invert(cues, ior, guide, averaged)
     detailed = _detailed(ahead, by_pixel, cues.mask, shrink)
     normal, stated = _joined((ahead, maps["sigma"]), (detailed, _INVERSION * doubt))
-    return maps, fine.Guess(normal, ahead, maps["sigma"], maps["roughness"], shrink), stated
+    return maps, fine.CoarseEstimate(normal, ahead, maps["sigma"], maps["roughness"], shrink), stated
+
+
+def _sided(normal: Floats, seen: Cues, sigma: Floats, opposed: Floats) -> tuple[Floats, Floats]:
+    """Normals (H, W, 3), regions that the network took for their half-turn turned back; doubt of the side (H, W)."""
+    local = frames.to_ray_frame(normal / np.maximum(_length(normal), 1e-6), seen.rays)
+    found = half_turns.resolve(local, seen.mask, half_turns.NetworkDoubt(sigma, opposed))
+    opposite = 2 * frames.dot(normal, seen.rays)[..., None] * seen.rays - normal
+    return np.where(found.turned[..., None], opposite, normal).astype(np.float32), found.doubt
 
 
 def _bounded(cues: Cues) -> Cues:
@@ -155,14 +164,7 @@ def _detailed(coarse: Floats, by_pixel: Floats, mask: NDArray[np.bool_], shrink:
 
     Interreflection, index and half-turns bend the inversion's normals over whole regions; relief is finer.
     """
-    height, width = mask.shape
-    small = round(height / shrink), round(width / shrink)
-    inside = mask.astype(np.float32)
-    difference, share = (
-        cv2.GaussianBlur(area_mean(image, small), (0, 0), _DETAIL)
-        for image in ((coarse - by_pixel).astype(np.float32) * inside[..., None], inside)
-    )
-    moved = by_pixel + cv2.resize(difference / np.maximum(share, 1e-3)[..., None], (width, height))
+    moved = by_pixel + fine.low_pass((coarse - by_pixel).astype(np.float32), mask, shrink)
     return np.asarray(moved / np.maximum(_length(moved), 1e-6))
 
 

@@ -120,8 +120,8 @@ def _mean_picture(radiance: AngleStack, alignment: Alignment, color: ColorCalibr
 def _chart_zone(radiance: AngleStack, color: ColorCalibration, margin: float) -> Bits:
     """(H, W) 1 on the chart's patches and up to `margin` patch widths around them."""
     zone = np.zeros(radiance.value.shape[1:3], np.uint8)
-    if color.corners is not None:
-        corners = np.asarray(color.corners, np.float64)
+    if color.place is not None:
+        corners = np.asarray(color.place.corners, np.float64)
         center = corners.mean(0)
         patch = np.linalg.norm(corners[1] - corners[0]) / 6
         outward = corners - center

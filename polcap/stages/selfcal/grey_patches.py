@@ -37,10 +37,10 @@ def measure(radiance: AngleStack, alignment: Alignment, color: ColorCalibration)
 
     Each patch is averaged in every shot's own pixels; patches are pooled by their light.
     """
-    if color.quads is None:
+    if color.place is None:
         return None
     seen = [
-        [_patch(radiance.shot(k), transform, color.quads[p]) for p in _GREYS]
+        [_patch(radiance.shot(k), transform, color.place.quads[p]) for p in _GREYS]
         for k, transform in enumerate(alignment.transform)
     ]
     mean = np.array([[one.mean for one in shot] for shot in seen], np.float64)  # (K, P, 3)
@@ -63,11 +63,11 @@ def measure(radiance: AngleStack, alignment: Alignment, color: ColorCalibration)
 
 def crossed_factor(radiance: AngleStack, alignment: Alignment, color: ColorCalibration, gain: Floats) -> Floats | None:
     """S0 of the light greys over the crossed shot's light (3,); None for fewer than two patches. gain (K, 3)."""
-    if color.quads is None or radiance.crossed is None or alignment.crossed is None:
+    if color.place is None or radiance.crossed is None or alignment.crossed is None:
         return None
     ratios = []
     for serves, patch in zip(_serving(color), _GREYS[:_LIGHT]):
-        quad = color.quads[patch]
+        quad = color.place.quads[patch]
         shots = [_patch(radiance.shot(k), transform, quad) for k, transform in enumerate(alignment.transform)]
         crossed = _patch(radiance.crossed.picture, alignment.crossed, quad)
         sound = serves and all(one.sound and one.mean.min() > 0 for one in (*shots, crossed))
@@ -78,7 +78,9 @@ def crossed_factor(radiance: AngleStack, alignment: Alignment, color: ColorCalib
 
 def _serving(color: ColorCalibration) -> Bools:
     """The grey patches (6,) that white balance used."""
-    return np.ones(len(_GREYS), bool) if color.patch_use is None else np.asarray(color.patch_use[list(_GREYS)] == 0)
+    if color.patches is None or color.patches.use is None:
+        return np.ones(len(_GREYS), bool)
+    return np.asarray(color.patches.use[list(_GREYS)] == 0)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,16 @@ import numpy as np
 from msgspec import Meta
 
 from polcap.errors import ChartError
-from polcap.images import AngleStack, ChartReference, ChartRequest, ColorCalibration, Floats, View
+from polcap.images import (
+    AngleStack,
+    ChartPlace,
+    ChartReference,
+    ChartRequest,
+    ColorCalibration,
+    Floats,
+    PatchColors,
+    View,
+)
 from polcap.optics.projection import transform_points
 from polcap.stages import stage
 from polcap.stages.whitebalance import chart, chart_light, chart_search, patches
@@ -79,7 +88,7 @@ def measure(
     if request.mode == "profile":
         if request.profile is None:
             raise ChartError("a color profile was asked for and none was named; use --chart FILE")
-        return replace(request.profile, source="profile", quads=None, corners=None)
+        return replace(request.profile, source="profile", place=None)
     if request.mode == "corners":
         found = _at_corners(radiance, reference, request.corners, settings)
     elif settings.chart == "sg":
@@ -92,18 +101,19 @@ def measure(
     fit = found.seen.fit
     return ColorCalibration(
         matrix=fit.matrix,
-        quads=found.place.quads(settings.patch_share),
-        corners=found.place.corners(),
-        delta_e=fit.delta_e,
         source="corners" if request.mode == "corners" else "chart",
         cost=found.cost,
         metres_per_px=_scale(found.place, radiance.view, settings.chart_width_m),
-        falloff=(float(fit.slope[0]), float(fit.slope[1])),
-        glare=fit.glare,
-        predicted=patches.predicted(found.seen, edition),
-        patch_use=found.seen.use,
-        edition=edition.name,
+        place=ChartPlace(found.place.quads(settings.patch_share), found.place.corners()),
         light=chart_light.measure(found.place, radiance.view, fit.slope, found.error),
+        patches=PatchColors(
+            delta_e=fit.delta_e,
+            use=found.seen.use,
+            predicted=patches.predicted(found.seen, edition),
+            falloff=(float(fit.slope[0]), float(fit.slope[1])),
+            glare=fit.glare,
+            edition=edition.name,
+        ),
     )
 
 
@@ -262,15 +272,7 @@ def _from_camera(radiance: AngleStack) -> ColorCalibration:
         matrix = np.diag(np.asarray(radiance.sensor.white_balance, np.float64))
     if radiance.sensor.camera_matrix is not None:
         matrix = np.asarray(radiance.sensor.camera_matrix, np.float64)
-    return ColorCalibration(
-        matrix=matrix / 2,
-        quads=None,
-        corners=None,
-        delta_e=None,
-        source="camera" if known else "none",
-        cost=float("nan"),
-        metres_per_px=None,
-    )
+    return ColorCalibration(matrix=matrix / 2, source="camera" if known else "none")
 
 
 def _scale(place: Placement, view: View, width_m: float | None) -> float | None:

@@ -7,7 +7,7 @@ import pytest
 
 from polcap.errors import SettingError
 from polcap.formats.export import encoders
-from polcap.formats.export.encoders import Encoder
+from polcap.formats.export.encoders import TextureEncoder
 from polcap.formats.export.texture_set import Texture
 from polcap.formats.maps import png
 
@@ -25,7 +25,7 @@ def test_a_picture_is_encoded_once_whoever_asks(monkeypatch: pytest.MonkeyPatch)
         return whole(texture, kind)
 
     monkeypatch.setattr(encoders, "encode", counted)
-    texture, encoder = picture(), Encoder()
+    texture, encoder = picture(), TextureEncoder()
     with ThreadPoolExecutor(8) as pool:
         made = set(pool.map(lambda _: encoder(texture, "png"), range(16)))
     assert made == {whole(texture, "png")}
@@ -34,20 +34,20 @@ def test_a_picture_is_encoded_once_whoever_asks(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_words_go_into_the_loose_file_alone() -> None:
-    texture, encoder = picture(), Encoder()
+    texture, encoder = picture(), TextureEncoder()
     plain, said = encoder(texture, "png"), encoder(texture, "png", text=True)
     assert b"a color" in said and b"a color" not in plain
     assert said == encoders.encode(texture, "png", text=True) == png.described(plain, {"Description": "a color"})
 
 
 def test_two_kinds_of_one_picture_are_two() -> None:
-    texture, encoder = picture(), Encoder()
+    texture, encoder = picture(), TextureEncoder()
     data = Texture(texture.pixels, False, "numbers")
     assert encoder(texture, "jpeg") != encoder(data, "jpeg")
 
 
 def test_what_cannot_be_encoded_is_said_each_time() -> None:
-    texture, encoder = picture(4), Encoder()
+    texture, encoder = picture(4), TextureEncoder()
     for _ in range(2):
         with pytest.raises(SettingError, match="no fourth channel"):
             encoder(texture, "jpeg")

@@ -31,12 +31,12 @@ def seen() -> Cues:
 
 
 @pytest.fixture
-def guess(seen: Cues) -> fine.Guess:
-    return fine.Guess(seen.rays, seen.rays, np.full((SIDE, SIDE), 5.0), np.full((SIDE, SIDE), 0.4), 2.0)
+def guess(seen: Cues) -> fine.CoarseEstimate:
+    return fine.CoarseEstimate(seen.rays, seen.rays, np.full((SIDE, SIDE), 5.0), np.full((SIDE, SIDE), 0.4), 2.0)
 
 
 def network(relief: Floats | None = None) -> FakeNetwork:
-    """One that says how bright each pixel is, to the right, or what it is told to."""
+    """A network that answers with a relief, or with the brightness of each pixel as one to the right."""
 
     def answer(channels: Floats) -> dict[str, Floats]:
         first = channels[:, :1]
@@ -45,46 +45,46 @@ def network(relief: Floats | None = None) -> FakeNetwork:
     return FakeNetwork("0" * 32, fine.CHANNELS, {"native_size": "256", "size_multiple": "8"}, answer=answer)
 
 
-def test_tiles_leave_no_seam(seen: Cues, guess: fine.Guess, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tiles_leave_no_seam(seen: Cues, guess: fine.CoarseEstimate, monkeypatch: pytest.MonkeyPatch) -> None:
     """The shipped network sees the same about a pixel in a tile as in the whole picture."""
     found = models.load_network("network", None, "cpu", 1)
     assert found is not None and found.fine is not None
-    whole = fine.refined(seen, guess, found.fine, run)
+    whole = fine.refine(seen, guess, found.fine, run)
     monkeypatch.setattr(fine, "_TILE", 64)
-    assert np.abs(fine.refined(seen, guess, found.fine, run) - whole).max() < 1e-4
+    assert np.abs(fine.refine(seen, guess, found.fine, run) - whole).max() < 1e-4
 
 
 def test_tiles_side_by_side_are_those_one_after_another(
-    seen: Cues, guess: fine.Guess, monkeypatch: pytest.MonkeyPatch
+    seen: Cues, guess: fine.CoarseEstimate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fine, "_TILE", 64)
-    one, three = (fine.refined(seen, guess, dataclasses.replace(network(), at_once=n), run) for n in (1, 3))
+    one, three = (fine.refine(seen, guess, dataclasses.replace(network(), at_once=n), run) for n in (1, 3))
     assert one.tobytes() == three.tobytes()
-    with pytest.raises(ModelError, match="makes no relief"):  # in whichever thread it is found out
-        fine.refined(seen, guess, dataclasses.replace(network(), answer=lambda _: {}, at_once=3), run)
+    with pytest.raises(ModelError, match="returns no relief"):  # in whichever thread it is found out
+        fine.refine(seen, guess, dataclasses.replace(network(), answer=lambda _: {}, at_once=3), run)
 
 
-def test_relief_moves_the_normals(seen: Cues, guess: fine.Guess, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_relief_moves_the_normals(seen: Cues, guess: fine.CoarseEstimate, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fine, "_TILE", 128)
-    normal = fine.refined(seen, guess, network(), run)
-    whole = fine.finer(np.stack([fine.encode(seen, guess)[0], *np.zeros((2, SIDE, SIDE))], -1), seen.mask, 2.0)
+    normal = fine.refine(seen, guess, network(), run)
+    whole = fine.high_pass(np.stack([fine.encode(seen, guess)[0], *np.zeros((2, SIDE, SIDE))], -1), seen.mask, 2.0)
     local = frames.to_ray_frame(normal, seen.rays)
     moved = (local[..., 0] / local[..., 2])[seen.mask]
     assert np.abs(moved - whole[..., 0][seen.mask]).max() < 1e-5 and moved.std() > 0.1
     assert np.allclose(np.linalg.norm(normal, axis=-1), 1, atol=1e-5)
 
 
-def test_what_is_coarser_than_the_first_network_sees_is_not_added(seen: Cues, guess: fine.Guess) -> None:
+def test_what_is_coarser_than_the_first_network_sees_is_not_added(seen: Cues, guess: fine.CoarseEstimate) -> None:
     slope = np.linspace(-1, 1, SIDE, dtype=np.float32)[None, :, None] * np.ones((SIDE, 1, 3), np.float32)
-    left = fine.finer(slope, seen.mask, 2.0)
+    left = fine.high_pass(slope, seen.mask, 2.0)
     inner = left[40:-40, 50:-40]
     assert np.abs(inner).max() < 0.01 and not left[~seen.mask].any()
     wave = np.sin(np.arange(SIDE) * 2 * np.pi / 6).astype(np.float32)[None, :, None] * np.ones((SIDE, 1, 3), np.float32)
-    assert np.abs(fine.finer(wave, seen.mask, 2.0) - wave)[40:-40, 50:-40].max() < 0.05
+    assert np.abs(fine.high_pass(wave, seen.mask, 2.0) - wave)[40:-40, 50:-40].max() < 0.05
 
 
-def test_a_network_of_other_channels_or_maps_is_refused(seen: Cues, guess: fine.Guess) -> None:
+def test_a_network_of_other_channels_or_maps_is_refused(seen: Cues, guess: fine.CoarseEstimate) -> None:
     with pytest.raises(ModelError, match="other channels"):
-        fine.refined(seen, guess, dataclasses.replace(network(), channels=("red",)), run)
+        fine.refine(seen, guess, dataclasses.replace(network(), channels=("red",)), run)
     with pytest.raises(ModelError, match="no relief"):
-        fine.refined(seen, guess, network(np.zeros((1, 1, SIDE, SIDE), np.float32)), run)
+        fine.refine(seen, guess, network(np.zeros((1, 1, SIDE, SIDE), np.float32)), run)

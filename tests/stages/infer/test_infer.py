@@ -173,7 +173,7 @@ def test_relief_that_the_network_does_not_see_leaves_the_albedo(monkeypatch):
     middle = np.s_[rows.min() + 60 : rows.max() - 60, columns.min() + 60 : columns.max() - 60]
     spread = []
     for normal in (found.rays, waves):
-        monkeypatch.setattr(fine, "refined", lambda cues_, guess, network_, run_, known=normal: known)
+        monkeypatch.setattr(fine, "refine", lambda cues_, guess, network_, run_, known=normal: known)
         albedo = infer.estimate(found, half, run, infer.InferSettings()).diffuse[middle]
         spread.append(np.log(albedo + cues.FLOOR).std())
     assert spread[1] == pytest.approx(spread[0] / 2, rel=0.1)

@@ -71,9 +71,9 @@ _MARK = 0.02  # of the chart's longer side
 
 def corners_off(color: ColorCalibration, marked: tuple[tuple[float, float], ...]) -> float:
     """Greatest distance of a corner from its mark, of the chart's longer side."""
-    assert color.corners is not None
+    assert color.place is not None
     side = max(np.linalg.norm(np.subtract(marked[0], marked[1])), np.linalg.norm(np.subtract(marked[1], marked[2])))
-    return float(np.linalg.norm(color.corners - np.array(marked), axis=-1).max() / side)
+    return float(np.linalg.norm(color.place.corners - np.array(marked), axis=-1).max() / side)
 
 
 @needs_data
@@ -81,7 +81,7 @@ def corners_off(color: ColorCalibration, marked: tuple[tuple[float, float], ...]
 def test_classic_is_found_in_every_real_photograph(path):
     color = whitebalance.measure(photo(path), CLASSIC, AUTO, WhitebalanceSettings())
     linear = path.stem in ("TL84_colorchecker", "exposure30")  # not gamma-encoded: decoding them bends their greys
-    assert np.nanmean(color.delta_e) < (14 if linear else 7)
+    assert np.nanmean(color.patches.delta_e) < (14 if linear else 7)
     assert corners_off(color, MARKED[path.stem]) < _MARK
 
 
@@ -89,8 +89,8 @@ def test_classic_is_found_in_every_real_photograph(path):
 @pytest.mark.parametrize(("name", "fitted", "ahead"), [("CRW_0101.CRW", 2.6, 3.2), ("P003910.KDC", 5.0, 6.0)])
 def test_classic_is_found_in_real_raw_files(name, fitted, ahead):
     color = whitebalance.measure(stack(superpixels(REAL / "raw_chart" / name)), CLASSIC, AUTO, WhitebalanceSettings())
-    assert np.nanmean(color.delta_e) < fitted
-    assert np.nanmean(color.predicted) < ahead
+    assert np.nanmean(color.patches.delta_e) < fitted
+    assert np.nanmean(color.patches.predicted) < ahead
     assert corners_off(color, MARKED[name]) < _MARK
 
 
@@ -121,12 +121,12 @@ def test_path_traced_chart_is_found_and_its_camera_matrix_recovered(name):
     radiance, meta, truth = rendered(name)
     printed = ChartReference("as rendered", np.array(meta["chart"]["reference_linear_srgb"]), CLASSIC.size_m)
     color = whitebalance.measure(radiance, printed, AUTO, WhitebalanceSettings(chart_width_m=0.0165 * 5.862))
-    true = (np.array(meta["chart"]["patch_corners_px"]) - 1) / 2  # RAW px with centres on +½ → binned px
-    error = np.linalg.norm(color.quads.mean(axis=1) - true.mean(axis=1), axis=-1)
+    true = (np.array(meta["chart"]["patch_corners_px"]) - 1) / 2  # RAW px with centers on +½ → binned px
+    error = np.linalg.norm(color.place.quads.mean(axis=1) - true.mean(axis=1), axis=-1)
     assert np.median(error) < 0.05 and error.max() < 0.15
     identity = color.matrix @ np.array(truth["camera_matrix_from_linear_srgb"])
     assert identity / np.trace(identity) * 3 == pytest.approx(np.eye(3), abs=0.006)
-    assert np.nanmean(color.delta_e) < 0.3
+    assert np.nanmean(color.patches.delta_e) < 0.3
     assert color.metres_per_px == pytest.approx(-meta["chart"]["c"][2] / radiance.view.focal, rel=3e-3)
 
 

@@ -22,14 +22,14 @@ def plain() -> tuple[Floats, Floats]:
 
 
 def centers_off(color: ColorCalibration, homography: Floats) -> Floats:
-    """Distance of each found patch centre from the true one (24,), px."""
-    assert color.quads is not None
-    found = np.array([_center(quad) for quad in color.quads])
+    """Distance of each found patch center from the true one (24,), px."""
+    assert color.place is not None
+    found = np.array([_center(quad) for quad in color.place.quads])
     return np.linalg.norm(found - transform_points(homography, chart.centers()), axis=-1)
 
 
 def _center(quad: Floats) -> Floats:
-    """Where a quad's diagonals cross: the image of the square's centre."""
+    """Where a quad's diagonals cross: the image of the square's center."""
     first, second = quad[2] - quad[0], quad[3] - quad[1]
     share = np.linalg.solve(np.stack([first, -second], axis=1), quad[1] - quad[0])[0]
     return quad[0] + share * first
@@ -44,7 +44,7 @@ def test_chart_is_placed_within_a_tenth_of_a_pixel(pitch, turn, tilt):
     color = whitebalance.measure(stack(photograph(place)), CLASSIC, AUTO, WhitebalanceSettings())
     assert color.source == "chart"
     assert centers_off(color, place).max() < 0.1
-    assert np.nanmean(color.delta_e) < 1  # noise only
+    assert np.nanmean(color.patches.delta_e) < 1  # noise only
 
 
 def test_chart_of_eight_pixel_patches_is_known_by_its_colors():
@@ -56,7 +56,7 @@ def test_chart_of_eight_pixel_patches_is_known_by_its_colors():
     assert chart.refine(image / image.max(), start).explained < 0.9
     color = whitebalance.measure(stack(image), CLASSIC, AUTO, WhitebalanceSettings())
     assert color.source == "chart" and centers_off(color, place).max() < 0.3
-    assert np.nanmean(color.delta_e) < 1
+    assert np.nanmean(color.patches.delta_e) < 1
 
 
 def test_chart_that_was_taken_for_the_object_is_recognized():
@@ -84,10 +84,10 @@ def test_s0_of_the_white_patch_is_its_reflectance():
 
 
 @pytest.mark.parametrize("edition", [CLASSIC, *CLASSIC.editions], ids=["since 2014", "before", "sRGB values"])
-def test_the_edition_of_the_chart_is_told_by_its_colors(edition: ChartReference):
+def test_colors_decide_the_edition_of_the_chart(edition: ChartReference):
     _, place = plain()
     color = whitebalance.measure(stack(photograph(place, edition.rec709)), CLASSIC, AUTO, WhitebalanceSettings())
-    assert color.edition == edition.name
+    assert color.patches.edition == edition.name
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.02)
 
 
@@ -96,14 +96,14 @@ def test_faded_patches_do_not_change_the_edition():
     _, place = plain()
     before = CLASSIC.editions[0].rec709 * (1 + 0.03 * np.random.default_rng(3).normal(size=(24, 3)))
     color = whitebalance.measure(stack(photograph(place, before)), CLASSIC, AUTO, WhitebalanceSettings())
-    assert color.edition == CLASSIC.name
+    assert color.patches.edition == CLASSIC.name
 
 
 def test_matrix_ignores_exposure_and_the_place_does_too():
     image, _ = plain()
     one, other = (whitebalance.measure(stack(k * image), CLASSIC, AUTO, WhitebalanceSettings()) for k in (1.0, 0.01))
     assert 0.01 * other.matrix == pytest.approx(one.matrix, rel=1e-3)
-    assert other.quads == pytest.approx(one.quads, abs=1e-2)
+    assert other.place.quads == pytest.approx(one.place.quads, abs=1e-2)
 
 
 def test_sloping_light_and_glare_are_taken_out_of_the_matrix():
@@ -113,8 +113,8 @@ def test_sloping_light_and_glare_are_taken_out_of_the_matrix():
     light = 1 + 0.03 * (u - 0.5) - 0.02 * (v - 3.5)
     veil = 0.02 * CAMERA.sum(axis=1) / 2
     color = whitebalance.measure(stack(image * light[..., None] + veil), CLASSIC, AUTO, WhitebalanceSettings())
-    assert color.falloff == pytest.approx((0.03, -0.02), abs=0.002)
-    assert color.glare == pytest.approx(0.02, abs=0.002)
+    assert color.patches.falloff == pytest.approx((0.03, -0.02), abs=0.002)
+    assert color.patches.glare == pytest.approx(0.02, abs=0.002)
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.02)
 
 
@@ -122,8 +122,8 @@ def test_overexposed_patches_are_left_out():
     image, _ = plain()
     clip = 0.5 * float((CLASSIC.rec709[19] @ CAMERA.T)[1]) * 0.9  # white and neutral 8 saturate, and more
     color = whitebalance.measure(stack(image, clip=clip), CLASSIC, AUTO, WhitebalanceSettings())
-    assert color.delta_e is not None
-    left_out = np.isnan(color.delta_e)
+    assert color.patches.delta_e is not None
+    left_out = np.isnan(color.patches.delta_e)
     assert left_out[18] and left_out[19] and left_out.sum() < 12
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.03)
 
@@ -151,27 +151,27 @@ def test_hidden_patches_are_left_out_and_named():
     place = plain()[1]
     image = painted(place, slice(4.2, 7), slice(0, 1.9), CAMERA @ np.array([0.45, 0.25, 0.17]) / 2)
     color = whitebalance.measure(stack(image), CLASSIC, AUTO, WhitebalanceSettings())
-    assert color.patch_use is not None and color.predicted is not None
-    assert set(np.flatnonzero(color.patch_use)) >= {5, 10, 11} and (color.patch_use > 0).sum() <= 5
+    assert color.patches.use is not None and color.patches.predicted is not None
+    assert set(np.flatnonzero(color.patches.use)) >= {5, 10, 11} and (color.patches.use > 0).sum() <= 5
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.02)
-    assert np.isnan(color.predicted[11]) and np.nanmean(color.predicted) < 1
-    assert "12" in patches.left_out(color.patch_use)
+    assert np.isnan(color.patches.predicted[11]) and np.nanmean(color.patches.predicted) < 1
+    assert "12" in patches.left_out(color.patches.use)
 
 
 def test_patches_in_shade_are_left_out():
     place = plain()[1]
     image = painted(place, slice(4.5, 7), slice(-1, 5), 0.5)  # the last column, and an edge across the one before
     color = whitebalance.measure(stack(image), CLASSIC, AUTO, WhitebalanceSettings())
-    assert color.patch_use is not None
-    assert (color.patch_use[[4, 5, 10, 11, 16, 17, 22, 23]] > 0).sum() >= 6
-    assert (color.patch_use.reshape(4, 6)[:, :4] == 0).all()
+    assert color.patches.use is not None
+    assert (color.patches.use[[4, 5, 10, 11, 16, 17, 22, 23]] > 0).sum() >= 6
+    assert (color.patches.use.reshape(4, 6)[:, :4] == 0).all()
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.03)
 
 
 def test_left_out_patch_is_predicted_about_as_well_as_noise_lets():
     color = whitebalance.measure(stack(plain()[0]), CLASSIC, AUTO, WhitebalanceSettings())
-    assert color.predicted is not None and color.delta_e is not None
-    assert np.nanmean(color.delta_e) <= np.nanmean(color.predicted) < 1
+    assert color.patches.predicted is not None and color.patches.delta_e is not None
+    assert np.nanmean(color.patches.delta_e) <= np.nanmean(color.patches.predicted) < 1
 
 
 def test_block_of_an_sg_chart_is_read_at_its_corners_and_only_there():
@@ -181,7 +181,7 @@ def test_block_of_an_sg_chart_is_read_at_its_corners_and_only_there():
     request = ChartRequest("corners", corners=2 * exact + 0.5)
     color = whitebalance.measure(stack(image), sg, request, WhitebalanceSettings(chart="sg"))
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.03)
-    assert np.nanmean(color.delta_e) < 1
+    assert np.nanmean(color.patches.delta_e) < 1
     with pytest.raises(ChartError, match=r"E2, J2, J5, E5 with --chart"):
         whitebalance.measure(stack(image), sg, AUTO, WhitebalanceSettings(chart="sg"))
 
@@ -199,7 +199,7 @@ def test_a_mirrored_chart_is_refused():
         whitebalance.measure(stack(image[:, ::-1]), CLASSIC, AUTO, WhitebalanceSettings())
 
 
-def test_a_chart_too_small_to_be_read_is_told_with_the_size_it_needs():
+def test_a_chart_that_is_too_small_is_named_with_the_size_it_needs():
     small = photograph(pose(7.6, 3, (260, 170)))
     with pytest.raises(ChartError, match=r"patches are spaced by 15 RAW px, at least 16 are needed: show it larger"):
         whitebalance.measure(stack(small), CLASSIC, AUTO, WhitebalanceSettings())
@@ -219,7 +219,7 @@ def test_manual_corners_in_raw_pixels_are_drawn_to_the_chart():
     color = whitebalance.measure(stack(image), CLASSIC, request, WhitebalanceSettings())
     assert color.source == "corners" and np.isnan(color.cost)
     assert centers_off(color, place).max() < 0.1
-    assert color.corners == pytest.approx(exact, abs=0.15)
+    assert color.place.corners == pytest.approx(exact, abs=0.15)
 
 
 def test_corners_from_the_wrong_end_are_named():
@@ -253,7 +253,7 @@ def test_profile_brings_its_matrix_and_leaves_its_chart_behind():
         stack(0 * image), CLASSIC, ChartRequest("profile", profile=profile), WhitebalanceSettings()
     )
     assert color.matrix is profile.matrix
-    assert (color.source, color.quads, color.corners) == ("profile", None, None)
+    assert (color.source, color.place) == ("profile", None)
 
 
 def test_without_a_chart_the_camera_is_believed_with_sensor_white_at_one():

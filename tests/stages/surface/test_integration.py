@@ -1,86 +1,39 @@
-"""Normals to depth to mesh: scenes whose depth is known in closed form."""
+"""Integration: depth from normals, with cuts where one part hides another."""
 
 import json
 import os
 from dataclasses import replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from polcap.errors import ObjectError
-from polcap.images import Floats, Mesh, SurfaceMaps, View
+from polcap.images import Floats, View
 from polcap.stages import surface
 from polcap.stages.surface import integration
 from polcap.stages.surface.slope_equations import normal_field
-from polcap.stages.surface.triangles import boundary_edges
+from tests.stages.surface.depth_scenes import (
+    SHAPE,
+    VIEW,
+    ball_in_a_ramp,
+    error_share,
+    from_depth,
+    maps,
+    slopes,
+    sphere,
+    two_balls,
+    waved,
+)  # fmt: skip
 
 SETTINGS = surface.SurfaceSettings()
-VIEW = View(focal=400.0, center=(63.5, 55.5), scale=2.0)
-SHAPE = (112, 128)
-
-
-def slopes(view: View = VIEW, shape: tuple[int, int] = SHAPE) -> tuple[Floats, Floats]:
-    """a, b of every pixel: its point is d (a, b, −1)."""
-    row, column = np.mgrid[: shape[0], : shape[1]]
-    return (column - view.center[0]) / view.focal, -(row - view.center[1]) / view.focal
-
-
-def maps(normal: Floats, mask: NDArray[np.bool_], view: View = VIEW) -> SurfaceMaps:
-    flat = np.ones((*mask.shape, 3), dtype=np.float32)
-    return SurfaceMaps(
-        normal=normal.astype(np.float32),
-        diffuse=0.5 * flat,
-        specular=0.04 * flat,
-        roughness=0.5 * flat[..., 0],
-        depth_prior=None,
-        confidence=5 * flat[..., 0],
-        mask=mask,
-        view=view,
-        estimator="truth",
-    )
-
-
-def sphere(
-    view: View = VIEW,
-    shape: tuple[int, int] = SHAPE,
-    center: tuple[float, float, float] = (0.02, 0.01, -1.0),
-    radius: float = 0.1,
-) -> tuple[SurfaceMaps, Floats]:
-    """A sphere about 1 m away, and its depth [m]."""
-    a, b = slopes(view, shape)
-    ray = np.stack([a, b, -np.ones_like(a)], axis=-1)
-    along, square = ray @ np.array(center), np.sum(ray * ray, axis=-1)
-    root = along**2 - square * (np.dot(center, center) - radius**2)
-    mask = root > 1e-4 * radius**2
-    depth = (along - np.sqrt(np.maximum(root, 0))) / square
-    normal = (ray * depth[..., None] - center) / radius
-    return maps(np.where(mask[..., None], normal, 0), mask, view), np.where(mask, depth, np.nan)
-
-
-def from_depth(d: Floats, view: View = VIEW) -> Floats:
-    """Normals of a depth map by central differences."""
-    a, b = slopes(view, d.shape)
-    point = d[..., None] * np.stack([a, b, -np.ones_like(a)], axis=-1)
-    down, right = np.gradient(point, axis=(0, 1))
-    normal = np.cross(right, -down)
-    return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
-
-
-def error_share(mesh: Mesh, truth: Floats, mask: NDArray[np.bool_]) -> float:
-    """RMSE after the best scale, over the depth range."""
-    d, t = mesh.depth[mask].astype(np.float64), truth[mask]
-    scale = (d @ t) / (d @ d)
-    return float(np.sqrt(np.mean((scale * d - t) ** 2)) / np.ptp(t))
 
 
 def test_sphere_in_perspective() -> None:
     truth_maps, truth = sphere()
     mesh = surface.integrate(truth_maps, 0.95, SETTINGS)
-    assert error_share(mesh, truth, truth_maps.mask) < 0.01  # the limb is a pixel wide and infinitely steep
+    assert error_share(mesh, truth, truth_maps.mask) < 0.01  # the outermost pixels are infinitely steep
     assert np.isnan(mesh.depth[~truth_maps.mask]).all()
 
 
@@ -99,17 +52,7 @@ def test_pyramid_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert error_share(mesh, truth, truth_maps.mask) < 0.01
 
 
-def ball_in_a_ramp() -> tuple[SurfaceMaps, Floats, NDArray[np.bool_]]:
-    """A ball sunk into a plane that recedes upwards: it hides the plane above, and meets it below."""
-    _, b = slopes()
-    ball, near = sphere(center=(0.0, 0.0, -1.0), radius=0.06)
-    ramp = 1 / (1 - 0.8 * b)
-    front = ball.mask & (np.nan_to_num(near, nan=9.0) < ramp)
-    normal = np.where(front[..., None], ball.normal, from_depth(ramp))
-    return maps(normal, np.ones(SHAPE, dtype=bool)), np.where(front, near, ramp), front
-
-
-def test_jump_is_kept_as_a_jump_and_cut() -> None:
+def test_occlusion_is_a_depth_step_and_a_cut() -> None:
     scene, truth, front = ball_in_a_ramp()
     offset = []  # of the ball against the ramp, px of depth
     for settings in (SETTINGS, surface.SurfaceSettings(stiffness=0.0)):
@@ -126,7 +69,7 @@ def test_jump_is_kept_as_a_jump_and_cut() -> None:
     assert np.abs(joints).max() > 20  # it is there, in the depth map
 
 
-def test_prior_sets_the_offset_between_separate_pieces() -> None:
+def test_prior_sets_the_offset_of_separate_parts() -> None:
     a, b = slopes()
     left = a < 0
     mask = np.abs(a) > 0.01
@@ -162,34 +105,6 @@ def test_distance_is_the_median_depth_in_metres() -> None:
     assert np.nanmedian(known.depth) == pytest.approx(0.7, rel=1e-5)
     assert np.nanmedian(unknown.depth) == pytest.approx(1.0, rel=1e-5)
     assert np.allclose(known.vertices, 0.7 * unknown.vertices, rtol=1e-5, atol=2e-7)  # two grids of 1.2e-7
-
-
-def test_mesh_faces_the_camera_and_keeps_its_frames() -> None:
-    truth_maps, _ = sphere()
-    mesh = surface.integrate(truth_maps, 0.95, SETTINGS)
-    p, q, r = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
-    facing = np.sum(np.cross(q - p, r - p) * -p, axis=-1)  # the camera is at the origin
-    assert (facing > 0).all()
-    u, v = (mesh.uv * [SHAPE[1], SHAPE[0]] - 0.5).T
-    assert np.allclose(-mesh.vertices[:, 0] / mesh.vertices[:, 2], (u - VIEW.center[0]) / VIEW.focal, atol=1e-5)
-    assert np.allclose(-mesh.vertices[:, 1] / mesh.vertices[:, 2], (VIEW.center[1] - v) / VIEW.focal, atol=1e-5)
-    row, column = np.rint(v).astype(int), np.rint(u).astype(int)
-    agreement = np.sum(mesh.normals * truth_maps.normal[row, column], axis=-1)
-    assert np.percentile(agreement, 5) > np.cos(np.radians(5))
-    tangent = mesh.tangents[:, :3]
-    assert np.abs(np.sum(tangent * mesh.normals, axis=-1)).max() < 1e-5
-    assert np.allclose(np.linalg.norm(tangent, axis=-1), 1, atol=1e-5)
-    assert (tangent[:, 0] > 0).all() and (mesh.tangents[:, 3] == 1).all()
-    assert (np.cross(mesh.normals, tangent)[:, 1] > 0).mean() > 0.99  # the bitangent points up the picture
-
-
-def test_vertices_are_thinned_to_the_limit() -> None:
-    view = View(800.0, (127.5, 111.5), 1.0)
-    truth_maps, _ = sphere(view, (224, 256))
-    mesh = surface.integrate(truth_maps, None, surface.SurfaceSettings(max_vertices=3000))
-    assert 1500 < len(mesh.vertices) <= 3000
-    assert mesh.depth.shape == (224, 256)
-    assert len(np.unique(mesh.faces)) == len(mesh.vertices)
 
 
 def test_empty_object_is_refused() -> None:
@@ -237,21 +152,8 @@ def test_rendered_normals_give_the_rendered_depth(name: str, alone: float, guide
     assert error_share(mesh, truth, mask) < guided
 
 
-def waved(size: int, degrees: float) -> tuple[SurfaceMaps, Floats]:
-    """A ball `size` px across whose normals err by `degrees` in waves of some px, as a network's do."""
-    view = View(5.0 * size, (size / 2 - 0.5, size / 2 - 0.5), 1.0)
-    ball, truth = sphere(view, (size, size), (0.0, 0.0, -1.0), 0.098)
-    rng = np.random.default_rng(size)
-    error = sum(ndimage.gaussian_filter(rng.normal(size=(size, size, 2)), (s, s, 0)) * s for s in (2, 8))
-    error *= np.radians(degrees) / np.sqrt(np.mean(np.sum(error**2, axis=-1)))
-    normal = ball.normal + np.concatenate([error, np.zeros((size, size, 1))], axis=-1)
-    normal[..., 2] = np.maximum(normal[..., 2], 0.02)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    return replace(ball, normal=np.where(ball.mask[..., None], normal, 0).astype(np.float32)), truth
-
-
 @pytest.mark.parametrize("size", [200, 560])
-def test_noise_tears_no_smooth_surface_at_any_resolution(size: int) -> None:
+def test_noise_does_not_cut_a_smooth_surface(size: int) -> None:
     scene, truth = waved(size, 6.0)
     mesh = surface.integrate(scene, None, SETTINGS)
     plain = surface.integrate(scene, None, surface.SurfaceSettings(stiffness=0.0))
@@ -276,7 +178,7 @@ def test_cut_that_strains_the_surface_is_removed(step: float, removed: bool) -> 
     assert np.allclose(level.z, plain, atol=1e-6)
 
 
-def test_cut_that_relieves_the_surface_stays() -> None:
+def test_cut_that_relieves_the_surface_remains() -> None:
     balls, _ = two_balls(0.12)
     level = integration.PyramidLevel(normal_field(balls, np.radians(84), 0.0), SETTINGS.stiffness, SETTINGS.jump / 2)
     level.cut_contours()
@@ -290,7 +192,7 @@ def test_cut_that_relieves_the_surface_stays() -> None:
     assert len(level.contours.link) == links
 
 
-def test_prior_weighs_alike_at_any_resolution() -> None:
+def test_prior_has_the_same_weight_at_any_resolution() -> None:
     """A wrong prior, half as deep again, bends the ball's inner part by as much at 200 and at 400 px."""
     bend = []
     for size in (200, 400):
@@ -306,60 +208,14 @@ def test_prior_weighs_alike_at_any_resolution() -> None:
     assert bend[1] == pytest.approx(bend[0], rel=0.1)
 
 
-def test_vertices_are_the_same_once_moved_from_their_middle_and_back() -> None:
-    scene, _ = sphere()
-    vertices = surface.integrate(scene, None, SETTINGS).vertices
-    middle = (vertices.min(axis=0).astype(np.float64) + vertices.max(axis=0)) / 2
-    assert np.array_equal(((vertices - middle).astype(np.float32) + middle).astype(np.float32), vertices)
-
-
-def test_boundary_is_a_curve_not_stairs() -> None:
-    """Distance of the rim's vertices from the ball's outline, in px of the picture: 1/√12 for pixels' stairs.
-
-    Its depth: a stair of one pixel is ten deep where the surface leans by 84°.
-    """
-    ball, _ = sphere(View(1000.0, (99.5, 99.5), 1.0), (200, 200), (0.0, 0.0, -1.0), 0.09)
-    mesh = surface.integrate(ball, None, SETTINGS)
-    rim = np.unique(boundary_edges(mesh.faces))
-    away = np.linalg.norm(mesh.uv[rim] * 200 - 100, axis=1)
-    assert np.std(away) < 0.2
-    follows = dict(boundary_edges(mesh.faces).tolist())
-    depth = 1000 * mesh.vertices[:, 2].astype(np.float64)  # px
-    bends = [depth[a] - 2 * depth[b] + depth[follows[b]] for a, b in follows.items()]
-    assert np.sqrt(np.mean(np.square(bends))) < 0.3
-    assert 0 < mesh.raggedness < 0.15
-
-
-@pytest.mark.parametrize(("back", "holes"), [("open", True), ("skirt", True), ("closed", False)])
-def test_back_closes_the_mesh_where_it_is_asked_to(back: str, holes: bool) -> None:
-    truth_maps, _ = sphere()
-    seen = surface.integrate(truth_maps, 0.95, SETTINGS)
-    mesh = surface.integrate(truth_maps, 0.95, msgspec.structs.replace(SETTINGS, back=back))
-    assert bool(len(boundary_edges(mesh.faces))) == holes
-    assert (mesh.faces[: len(seen.faces)] == seen.faces).all()
-    p, q, r = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
-    volume = np.sum(p * np.cross(q, r)) / 6
-    if back == "closed":
-        assert 0.0015 < volume < np.pi * 0.1**3  # the cap that is seen holds 0.0018, the cylinder about a half more
-
-
-def two_balls(gap: float) -> tuple[SurfaceMaps, Floats]:
-    """A small ball whose limb hides part of a large one, `gap` m behind it, and their depth [m]."""
-    small, near = sphere(center=(0.04, 0.0, -1.0), radius=0.045)
-    large, far = sphere(center=(-0.02, 0.0, -1.045 - gap - 0.09), radius=0.09)
-    front = small.mask
-    normal = np.where(front[..., None], small.normal, large.normal)
-    return maps(normal, front | large.mask), np.where(front, near, far)
-
-
-def test_part_behind_a_limb_stands_apart_where_no_slope_tells_by_how_much() -> None:
+def test_part_behind_an_occluding_contour_is_separated() -> None:
     scene, truth = two_balls(0.03)
     plain, ours = (surface.integrate(scene, None, surface.SurfaceSettings(stiffness=s)) for s in (0.0, 2.0))
     assert plain.cuts == 0 and ours.cuts > 0.3
     assert error_share(ours, truth, scene.mask) < 0.8 * error_share(plain, truth, scene.mask)
 
 
-def test_crease_where_two_parts_touch_is_no_limb() -> None:
+def test_crease_between_touching_parts_is_not_cut() -> None:
     a, _ = slopes()
     valley = 1 - 0.6 * np.abs(a)  # two planes that lean by 31° towards a crease
     scene = maps(from_depth(valley), np.ones(SHAPE, dtype=bool))

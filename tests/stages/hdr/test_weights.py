@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from polcap.images import Falloff, MaskedImage, NoiseLine, View
-from polcap.stages.hdr import noise, weights
+from polcap.images import Falloff, MaskedImage, View
+from polcap.stages.hdr import weights
 
 LAW = Falloff(((-0.25, 0.05, 0.0),) * 3, ((0.0, 0.0, 0.0),) * 3, (0.8, 0.8, 0.8), 11.0, 60.0)
 
@@ -20,13 +20,3 @@ def test_light_of_a_falling_off_lens_becomes_even():
     weights.divide_by_falloff(image, view, (120, 80), LAW)
     assert value == pytest.approx(np.broadcast_to([0.5, 1.0, 0.7], value.shape), rel=1e-3)
     assert variance * light == pytest.approx(1e-4 * value**2, rel=2e-3)  # the error relative to the light is as before
-
-
-def test_calibrated_noise_is_not_learnt_again():
-    line = NoiseLine(100.0, (1e-4,), (0.0,), (2e-8,), (0.0,), (1e4,), (1.4,))
-    lines = noise.Lines([line])
-    rich = noise.Samples(np.full((500, 1), 0.3), np.full((500, 1), 1.0), flat=False)
-    lines.learn(100.0, rich)
-    assert lines.knows(100.0)
-    assert lines.line(100.0, 0.0).slope == pytest.approx([1e-4])
-    assert not lines.knows(200.0)

@@ -1,6 +1,6 @@
-"""A decoded frame in, a small one out, with what the averaging would hide: clipping, and tiles at full size.
+"""Reduces a decoded frame for `polcap check`: a small picture, clipped shares, and tiles at full size.
 
-Runs where the frame was decoded, in a process of its own: what is small crosses to the one that judges.
+It runs in the child process that decodes, so that only the small parts are sent.
 """
 
 from dataclasses import dataclass
@@ -17,32 +17,19 @@ Arrays = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
-class Glance:
-    """What is kept of a frame."""
+class ReducedFrame:
+    """A frame, reduced."""
 
-    picture: SensorImage  # (h, w, 3) means of blocks, black 0, white 1; 1 where a part of a block is clipped
+    picture: SensorImage  # (h, w, 3) means of blocks, black 0, white 1; 1 where part of a block is clipped
     clipped: Floats  # (h, w) share of each block that is clipped
     tiles: sharpness.Tiles
 
 
 def first(image: SensorImage, clip: float, most_pixels: float) -> tuple[dict[str, Any], Arrays]:
-    """As `take`, of the frame that decides how far a capture is averaged down, and where it is looked at closely.
+    """`take` of the first frame, which decides by how much to reduce a capture, and where its tiles are.
 
-    Parameters
-    ----------
-    image
-        The frame.
-    clip
-        Counts from here on are clipped [white level].
-    most_pixels
-        Of the small picture.
-
-    Returns
-    -------
-    dict
-        Beside that of `take`: `times`, merged pixels per side of a block; `superpixel`, RAW pixels per merged pixel.
-    dict
-        Beside those of `take`: `corners` (T, 2) of the tiles, px.
+    `clip` [white level]: counts from here on are clipped. The facts get `times`, merged pixels per side of a block, and
+    `superpixel`, RAW pixels per merged pixel; the arrays get `corners` (T, 2) of the tiles, px.
     """
     side = image.superpixel
     pixels = (image.value.shape[0] // side) * (image.value.shape[1] // side)
@@ -54,22 +41,10 @@ def first(image: SensorImage, clip: float, most_pixels: float) -> tuple[dict[str
 
 
 def take(image: SensorImage, clip: float, times: int, corners: list[list[int]]) -> tuple[dict[str, Any], Arrays]:
-    """The parts of a `Glance`, as `joined` takes them.
-
-    Parameters
-    ----------
-    image
-        The frame.
-    clip
-        Counts from here on are clipped [white level].
-    times
-        Merged pixels per side of a block.
-    corners
-        (T, 2) of the tiles, px.
-    """
+    """The parts of a `ReducedFrame`: blocks of `times` merged pixels a side, tiles at `corners` (T, 2) px."""
     shares = _averaged((~sensor.usable(image, clip)).astype(np.float32), times)
     value = _means(image, times)
-    value[shares > 0] = 1  # the stages drop a pixel of which a part is clipped
+    value[shares > 0] = 1  # the stages drop pixels that are clipped in part
     tiles = sharpness.take(image, np.asarray(corners, np.int64).reshape(-1, 2), clip)
     arrays: Arrays = {"value": value, "clipped": shares, "light": tiles.light, "usable": tiles.usable}
     if image.camera_matrix is not None:
@@ -79,8 +54,8 @@ def take(image: SensorImage, clip: float, times: int, corners: list[list[int]]) 
     return {"lossy": image.lossy}, arrays
 
 
-def joined(meta: dict[str, Any], arrays: Arrays) -> Glance:
-    """A `Glance` of what `take` has sent."""
+def joined(meta: dict[str, Any], arrays: Arrays) -> ReducedFrame:
+    """The `ReducedFrame` of the parts (h, w) from `take`."""
     picture = SensorImage(
         value=arrays["value"],
         black=np.zeros((1, 1)),
@@ -90,7 +65,7 @@ def joined(meta: dict[str, Any], arrays: Arrays) -> Glance:
         white_balance=arrays.get("white_balance"),
         lossy=meta["lossy"],
     )
-    return Glance(picture, arrays["clipped"], sharpness.Tiles(arrays["light"], arrays["usable"]))
+    return ReducedFrame(picture, arrays["clipped"], sharpness.Tiles(arrays["light"], arrays["usable"]))
 
 
 def _means(image: SensorImage, times: int) -> Floats:
@@ -109,7 +84,7 @@ def _means(image: SensorImage, times: int) -> Floats:
 
 
 def _sums(mosaic: NDArray[np.uint16], times: int) -> NDArray[np.uint32]:
-    """Sums of the counts of each phase over blocks of times × times quads, (2, 2, h, w); what is left is dropped."""
+    """Sums of the counts of each phase over whole blocks of times × times quads, (2, 2, h, w)."""
     height, width = (side // (2 * times) for side in mosaic.shape)
     rows = mosaic[: 2 * times * height, : 2 * times * width].reshape(height, times, 2, -1)
     down = np.zeros((height, 2, rows.shape[-1]), np.uint32)

@@ -38,7 +38,7 @@ def result() -> Result:
         view=of.view,
         residual=None,
     )
-    color = ColorCalibration(np.eye(3), None, None, None, "none", np.nan, None)
+    color = ColorCalibration(np.eye(3), "none")
     return of, surfaces.mesh(of), image, cues.compute(image, color)
 
 
@@ -159,7 +159,7 @@ def test_relative_depth_is_called_so(result: Result, tmp_path: Path) -> None:
 
 
 def test_damaged_folder_is_one_line(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(DecodeError, match="holds no maps"):
+    with pytest.raises(DecodeError, match="has no maps"):
         maps.read(tmp_path)
     (tmp_path / "maps.json").write_text("{}")
     with pytest.raises(DecodeError, match="process again"):

@@ -1,0 +1,267 @@
+"""Half-turns: the side of the view ray to which each normal leans, and how sure it is.
+
+Polarization shows the plane through a normal n and the view ray r, not the side: n and n′ = 2 (n·r) r − n look
+alike. The network sometimes takes a whole region for its half-turn, most often on black gloss; the inversion knows
+no side at all. Both are decided here, by one minimum over the whole object. Every cell of a coarse grid keeps n or
+turns it. With t the part of n across the ray, of length sin θ, the energy is the sum of
+
+    outline      3 e, e: share of object ahead of t less that behind it. A closed surface leans towards its outline;
+                 where t runs along an outline (a neck that the mask cuts), e is 0
+    inside       −0.015 t·o, o the direction away from the object's inside: decides where nothing else does
+    network      0.04 sin θ · 30°/σ for turning, σ the network's error
+    neighbours   ∓2 min(sin θ, sin θ′)² cos Δ |cos Δ| for equal and unequal choices, Δ the angle between t and t′
+
+Half of the neighbour terms favor unequal choices, so the minimum is found by quadratic pseudo-Boolean optimization:
+one minimum cut with two nodes for each cell. The cells that it leaves open keep their normals.
+
+Turned cells of the network make connected regions. The sum of weak terms over a large region is no strong evidence,
+so each region is judged as a whole, by a logistic law that was fitted to path-traced captures with known normals.
+
+References
+----------
+Kolmogorov, Rother, Minimizing nonsubmodular functions with graph cuts, IEEE TPAMI 2007.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Floats
+from polcap.optics import outline
+from polcap.optics.resize import area_mean, weighted_area_mean
+
+Bools = NDArray[np.bool_]
+
+_LONGEST = 128  # cells of the grid's longer side
+_OUTLINE, _INSIDE, _NETWORK = 3.0, 0.015, 0.04  # weights of the terms; the neighbours' is 1
+_AHEAD = 1.5  # cells from a cell to where it is asked for the object
+_BLUR = 3.0  # cells, 1σ, of the depth inside the mask
+_SURE_DEG, _SUREST = 30.0, 3.0  # a network's error that counts 1, and the most that a small one counts
+_INTEGER = 1000  # capacities per unit of energy: the flow is one of whole numbers
+# ln odds that a region of the cut is turned: constant, outline evidence over √cells, mean inward lean, share of the
+# network's positions that disagree, ln of its error in degrees; tests/benchmarks/fit_half_turns.py
+_REGION = (-9.65, 0.89, 5.41, 10.22, 1.85)
+_MOST_OUTLINE, _MOST_OPPOSED = 2.0, 0.5  # larger values say no more
+# ln odds that a cell of the inversion is on the wrong side: constant, energy of turning it alone, ln of the share of
+# links around it that contradict each other, mean lean away from the inside around it; same benchmark
+_CELL = (3.46, -0.20, 1.02, -3.69)
+_AROUND = 8.0  # cells, 1σ
+
+
+@dataclass(frozen=True)
+class NetworkDoubt:
+    """The network's own doubt of its normals."""
+
+    sigma: Floats  # (H, W) expected error, degrees
+    opposed: Floats  # (H, W) share of its positions in which the normal leans to the other side
+
+
+@dataclass(frozen=True)
+class HalfTurns:
+    """The choice for each pixel of a normal map."""
+
+    turned: Bools  # (H, W) the half-turn of the normal is the better one
+    doubt: Floats  # (H, W) probability that the chosen side is wrong
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Normals on coarse cells."""
+
+    mask: Bools  # (h, w)
+    lean: Floats  # (2, h, w) across the ray, x right, y up, length sin θ
+
+
+def resolve(normal: Floats, mask: Bools, network: NetworkDoubt | None = None) -> HalfTurns:
+    """The half-turns of a normal map.
+
+    Parameters
+    ----------
+    normal
+        (H, W, 3) unit, in the frame of each ray.
+    mask
+        (H, W).
+    network
+        Doubt of the network that made them; None: they are the inversion's, and their sides are arbitrary.
+    """
+    grid = coarse(normal, mask)
+    if not grid.mask.any():
+        return HalfTurns(np.zeros(mask.shape, dtype=bool), np.zeros(mask.shape, dtype=np.float32))
+    if network is None:
+        turned, terms = sides(grid)
+        x, y = (_enlarged(part, mask.shape) for part in np.where(turned, -1, 1) * grid.lean)
+        doubt = _chance(terms @ np.array(_CELL))
+        return HalfTurns(x * normal[..., 0] + y * normal[..., 1] < 0, _enlarged(doubt, mask.shape))
+    sigma, opposed = (weighted_area_mean(image, mask, grid.mask.shape) for image in (network.sigma, network.opposed))
+    region, terms = proposals(grid, sigma, opposed)
+    chance = _chance(terms @ np.array(_REGION))
+    chance[0] = 0  # cells that the cut keeps: the network's error covers them
+    doubt = np.minimum(chance, 1 - chance)[region]
+    return HalfTurns(_enlarged((chance > 0.5)[region], mask.shape) > 0.5, _enlarged(doubt, mask.shape))
+
+
+def error_with_doubt(error: Floats, doubt: Floats, cos_zenith: Floats) -> Floats:
+    """Expected error (H, W), degrees, of normals that are on the wrong side with some probability: 2 θ off there."""
+    return np.asarray((1 - doubt) * error + doubt * 2 * np.degrees(np.arccos(np.clip(cos_zenith, 0, 1))))
+
+
+def coarse(normal: Floats, mask: Bools) -> Grid:
+    """Cells of normals (H, W, 3) in a mask (H, W): mean double azimuth and zenith, and the side of the mean vector."""
+    shrink = max(1.0, max(mask.shape) / _LONGEST)
+    shape = tuple(max(8, round(side / shrink)) for side in mask.shape)
+    x, y = normal[..., 0] * mask, normal[..., 1] * mask
+    parts = (mask, x, y, x * x - y * y, 2 * x * y, np.hypot(x, y), np.maximum(normal[..., 2] * mask, 0))
+    share, x, y, cos2, sin2, sine, cosine = (area_mean(part.astype(np.float32), shape) for part in parts)
+    inside = share > 0.5
+    azimuth = np.arctan2(sin2, cos2) / 2
+    axis = np.stack([np.cos(azimuth), np.sin(azimuth)])
+    sign = np.where(axis[0] * x + axis[1] * y < 0, -1, 1)
+    return Grid(inside, axis * sign * sine / np.maximum(np.hypot(sine, cosine), 1e-6) * inside)
+
+
+def sides(grid: Grid) -> tuple[Bools, Floats]:
+    """Cells of the inversion that turn (h, w), and what speaks for a wrong side: terms (h, w, 4) of `_CELL`."""
+    outwards = _outwards(grid)
+    cost = (_OUTLINE * _outline_evidence(grid) + _INSIDE * outwards)[grid.mask]  # of turning less that of keeping
+    first, second, alike = _links(grid)
+    turned = _cut(grid.mask, cost, first, second, alike)
+    sign = np.where(turned, -1, 1)
+    side = sign[grid.mask]
+    bound = alike * side[first] * side[second]  # negative: the two contradict each other
+
+    def cells(of_link: Floats) -> Floats:
+        out = np.zeros(grid.mask.shape)
+        out[grid.mask] = sum(np.bincount(ends, of_link, len(side)) for ends in (first, second))
+        return out
+
+    def around(image: Floats) -> Floats:
+        return np.asarray(cv2.GaussianBlur(image, (0, 0), _AROUND)) + 1e-9
+
+    energy = cells(bound)
+    energy[grid.mask] += side * cost
+    contradiction = around(cells(np.maximum(-bound, 0))) / around(cells(np.abs(bound)))
+    lean = around(sign * outwards * grid.mask) / around(grid.mask.astype(float))
+    return turned, np.stack([np.ones(turned.shape), energy, np.log(contradiction + 0.01), lean], axis=-1)
+
+
+def proposals(grid: Grid, sigma: Floats, opposed: Floats) -> tuple[NDArray[np.int32], Floats]:
+    """Regions of the network's normals that the cut turns, and what speaks for turning them.
+
+    Parameters
+    ----------
+    grid
+        Of its normals.
+    sigma, opposed
+        (h, w), of `NetworkDoubt`.
+
+    Returns
+    -------
+    tuple
+        Number (h, w) of each cell's region, 0: it keeps its normal; terms (R, 5) of the regions' odds, see `_REGION`.
+    """
+    evidence, outwards = _outline_evidence(grid), _outwards(grid)
+    sure = np.minimum(_SURE_DEG / np.maximum(sigma, 1), _SUREST) / _SUREST
+    cost = _OUTLINE * evidence + _INSIDE * outwards + _NETWORK * np.hypot(*grid.lean) * sure
+    turned = _cut(grid.mask, cost[grid.mask], *_links(grid))
+    count, region = cv2.connectedComponents(turned.astype(np.uint8), connectivity=4)
+    cells = np.maximum(np.bincount(region.ravel(), minlength=count), 1)
+    clear, inward, against, error = (
+        np.bincount(region.ravel(), image.ravel(), count) / cells for image in (-evidence, -outwards, opposed, sigma)
+    )
+    terms = [
+        np.ones(count),
+        np.clip(clear * np.sqrt(cells), -1, _MOST_OUTLINE),
+        inward,
+        np.minimum(against, _MOST_OPPOSED),
+        np.log(np.maximum(error, 1)),
+    ]
+    return region.astype(np.int32), np.stack(terms, axis=1)
+
+
+def _chance(odds: Floats) -> Floats:
+    """Probability of the logarithm of odds."""
+    return np.asarray(1 / (1 + np.exp(-odds)))
+
+
+def _enlarged(cells: Floats | Bools, shape: tuple[int, ...]) -> Floats:
+    return np.asarray(cv2.resize(cells.astype(np.float32), (shape[1], shape[0])))
+
+
+def _outline_evidence(grid: Grid) -> Floats:
+    """How clearly the normals point out of the object (h, w): sin θ (object behind t − object ahead of it).
+
+    Where the grid ends the object may go on: no evidence.
+    """
+    y, x = np.indices(grid.mask.shape, np.float32)
+    sine = np.hypot(*grid.lean)
+    step = _AHEAD * grid.lean / np.maximum(sine, 1e-6)
+    inside = grid.mask.astype(np.float32)
+    behind, ahead = (
+        cv2.remap(
+            inside, (x + k * step[0]).astype(np.float32), (y - k * step[1]).astype(np.float32), cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        for k in (-1, 1)
+    )  # fmt: skip
+    return np.asarray(sine * (behind - ahead))
+
+
+def _outwards(grid: Grid) -> Floats:
+    """How far the normals lean away from the object's inside (h, w), −1…1."""
+    away, _ = outline.outward(outline.depth(grid.mask), _BLUR)
+    return np.asarray((grid.lean * away).sum(axis=0))
+
+
+def _links(grid: Grid) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
+    """Neighbouring cells, numbered within the mask (M,) and (M,), and how alike they are (M,), −2…2.
+
+    A flat neighbour tells little of a steep one, and so do axes that cross.
+    """
+    number = np.full(grid.mask.shape, -1)
+    number[grid.mask] = np.arange(int(grid.mask.sum()))
+    first, second, alike = [], [], []
+    sine = np.hypot(*grid.lean)
+    x, y = grid.lean / np.maximum(sine, 1e-6)
+    for one, other in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        both = grid.mask[one] & grid.mask[other]
+        first.append(number[one][both])
+        second.append(number[other][both])
+        cosine = x[one] * x[other] + y[one] * y[other]
+        alike.append((2 * np.minimum(sine[one], sine[other]) ** 2 * cosine * np.abs(cosine))[both])
+    return np.concatenate(first), np.concatenate(second), np.concatenate(alike)
+
+
+def _cut(mask: Bools, cost: Floats, first: NDArray[np.intp], second: NDArray[np.intp], alike: Floats) -> Bools:
+    """Cells (h, w) that turn in the least Σ cost · x + Σ alike · (x ≠ x′), x 0 or 1; open ones do not.
+
+    `cost` (N,) is of the mask's cells, `alike` (M,) of the links between its cells `first` and `second`.
+
+    Each cell has a node that is with the source where x is 0, and one that is with it where x is 1.
+    """
+    from scipy import sparse  # here: importing it costs .3 s of every start
+    from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+    count = int(mask.sum())
+    source, sink, cell = 2 * count, 2 * count + 1, np.arange(count)
+    single = np.rint(_INTEGER * cost).astype(int)
+    pair = np.rint(_INTEGER * alike).astype(int)
+    more, less, same, other = single > 0, single < 0, pair > 0, pair < 0
+    a, b, c, d = first[same], second[same], first[other], second[other]
+    edges = [
+        (0 * cell[more] + source, cell[more], single[more]), (cell[more] + count, 0 * cell[more] + sink, single[more]),
+        (0 * cell[less] + source, cell[less] + count, -single[less]),
+        (cell[less], 0 * cell[less] + sink, -single[less]),
+        *((p, q, pair[same]) for p, q in ((a, b), (b, a), (a + count, b + count), (b + count, a + count))),
+        *((p, q, -pair[other]) for p, q in ((c, d + count), (d + count, c), (c + count, d), (d, c + count))),
+    ]  # fmt: skip
+    start, end, capacity = (np.concatenate(column) for column in zip(*edges))
+    graph = sparse.csr_array((capacity.astype(np.int32), (start, end)), shape=(2 * count + 2, 2 * count + 2))
+    rest = sparse.csr_array(graph - maximum_flow(graph, source, sink).flow)
+    rest.eliminate_zeros()
+    reached = np.zeros(2 * count + 2, dtype=bool)
+    reached[breadth_first_order(rest, source, return_predecessors=False)] = True
+    turned = np.zeros(mask.shape, dtype=bool)
+    turned[mask] = ~reached[:count] & reached[count : 2 * count]
+    return turned

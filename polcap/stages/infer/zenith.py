@@ -1,0 +1,185 @@
+"""Zenith angles from the DoLP, by the law of diffuse polarization that the object follows.
+
+One law for the object, estimated among candidates: facets of several roughnesses, weighed in two ways
+(`optics/body.py`), times a factor on the polarization, even or falling towards the outline. The smooth interface is one
+of them. A candidate is likely if
+
+* albedo then does not depend on the zenith, for some flatness of the shading,
+* the surface then turns away from the outline as a ball's does, and
+* its zeniths are those of a guide, where there is one.
+
+The answer is the mean over all candidates, and their spread is part of its error.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise, product
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Cues, Floats, Quality
+from polcap.optics import body, frames
+from polcap.optics.outline import disc_radius
+
+_ALPHAS = (0.0, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
+_FACTORS = (1.0, 0.9, 0.8, 0.7, 0.5)  # on the polarization, everywhere
+_EDGE_LOSSES = (0.0, 0.15, 0.3, 0.45, 0.6)  # share lost edge-on, times sin²θ elsewhere: two real balls lose about .55
+_ZENITHS = np.radians(np.linspace(0, 88, 177))  # of the tables from DoLP to zenith
+_SMOOTH_LIKELIER = 1.5  # log prior of the smooth interface over any other candidate: most captures so far
+_DEPOLARIZED_LIKELIER = -8.0  # log prior, times the share of the polarization that is lost everywhere
+
+_PATCHES = 20  # independent ones in an object, however many pixels it has
+_SAMPLES = 2000  # pixels
+_LEAST_LIGHT = 1e-3  # S0
+_LEAST_GUIDE_SIGMA = np.radians(2.0)
+_MOST_MISFIT = 9.0  # of a pixel against the guide, σ²
+
+_TENTHS = 10
+_UNEVEN = 0.07  # 1σ of the logarithm of an even albedo's patches: shading is not known better
+_FLAT = 0.2  # α of the rough body whose shading is the unit of flatness
+_FLATTEST = 2.0  # in that unit: α = .4
+
+_OUTLINE_PX = 1.0  # from the outline: nearer, pixels mix with the backdrop
+_RINGS = (0.015, 0.05, 0.1, 0.16)  # distances from the outline between which the DoLP is read, in radii of the disc
+_RADII = np.exp(np.linspace(-0.5, 0.5, 21))  # of the ball that a round outline resembles, over that of the disc
+_RADIUS_SPREAD = 0.1  # 1σ of their logarithm
+_OUTLINE_DEG = 2.5  # 1σ of a ring's zenith
+_SHARP = 0.005  # probability that the outline is an edge, not round
+
+
+@dataclass(frozen=True)
+class ZenithEstimate:
+    """Zeniths by the laws that the object may follow."""
+
+    angle: Floats  # (H, W) rad
+    spread: Floats  # (H, W) rad, 1σ between laws
+    alpha: float  # expected GGX α of the diffuse law
+    smooth: float  # probability of the smooth interface
+    _dolps: Floats  # (C, Z) of all laws
+    _weights: Floats  # (C,)
+
+    def at(self, dolp: Floats) -> Floats:
+        """Zeniths of other DoLPs of any shape, rad: expected over the laws."""
+        return _mean_zenith(dolp, self._dolps, self._weights)[0]
+
+
+@dataclass(frozen=True)
+class DiffuseLaws:
+    """The C candidates, at the Z zeniths of `_ZENITHS`."""
+
+    alpha: Floats  # (C,)
+    factor: Floats  # (C,) on the DoLP
+    edge_loss: Floats  # (C,) share of the DoLP that is lost edge-on, times sin²θ elsewhere
+    prior: Floats  # (C,) logarithm
+    dolp: Floats  # (C, Z), never falling
+    shading: Floats  # (Z,) logarithm of S0 over albedo, of a smooth body
+    flatter: Floats  # (Z,) logarithm of a rough body's over it
+
+
+def estimate_zenith(dolp: Floats, cues: Cues, ior: float, guide: tuple[Floats, Floats] | None = None) -> ZenithEstimate:
+    """Zeniths of the debiased DoLPs (H, W).
+
+    `guide` are zeniths (H, W) of another estimator and their 1σ (H, W), rad.
+    """
+    laws = candidate_laws(ior)
+    score = laws.prior.copy()
+    light = frames.total(cues.radiance) / 3
+    inside = cues.mask & ((cues.quality & Quality.CLIPPED) == 0) & (light > _LEAST_LIGHT)
+    sample = _sample(np.flatnonzero(inside))
+    if len(sample) > _PATCHES:
+        angles = np.stack([np.interp(dolp.flat[sample], row, _ZENITHS) for row in laws.dolp])  # (C, N)
+        score += _even_albedo(angles, light.flat[sample], laws)
+        score += _round_outline(dolp, cues, laws)
+        if guide is not None:
+            deviation = (angles - guide[0].flat[sample]) / np.maximum(guide[1].flat[sample], _LEAST_GUIDE_SIGMA)
+            score -= _PATCHES / 2 * np.minimum(deviation**2, _MOST_MISFIT).mean(axis=1)
+    weights = np.exp(score - score.max())
+    weights /= weights.sum()
+    angle, spread = _mean_zenith(dolp, laws.dolp, weights)
+    smooth = weights[(laws.alpha == 0) & (laws.factor == 1) & (laws.edge_loss == 0)].sum()
+    return ZenithEstimate(angle, spread, float(weights @ laws.alpha), float(smooth), laws.dolp, weights)
+
+
+@lru_cache(maxsize=4)
+def candidate_laws(ior: float) -> DiffuseLaws:
+    """All candidates of a refractive index, made once."""
+    cosine = np.cos(_ZENITHS)
+    rows = []
+    for local in (0.0, 1.0):
+        for alpha in _ALPHAS:
+            if alpha == 0 and local:
+                continue
+            plus, minus = body.leaving(cosine, alpha, ior, local)
+            for even, loss in product(_FACTORS, _EDGE_LOSSES):
+                smooth = alpha == 0 and even == 1 and loss == 0
+                prior = _DEPOLARIZED_LIKELIER * (1 - even) + (_SMOOTH_LIKELIER if smooth else 0.0)
+                left = even * (1 - loss * (1 - cosine**2))
+                rows.append((alpha, even, loss, prior, np.maximum.accumulate(left * minus / plus)))
+    plus, _ = body.leaving(cosine, 0.0, ior)
+    shading = np.log(np.maximum(cosine * plus * plus, 1e-4))
+    flatter = np.log(body.flatter(cosine, cosine, np.ones_like(cosine), _FLAT + 0 * cosine))
+    alphas, factors, losses, priors, dolps = (np.array(column) for column in zip(*rows))
+    return DiffuseLaws(alphas, factors, losses, priors, dolps, shading, flatter)
+
+
+def _sample(pixels: NDArray[np.intp]) -> NDArray[np.intp]:
+    """About `_SAMPLES` of the pixels, evenly spread."""
+    return pixels[:: max(1, len(pixels) // _SAMPLES)]
+
+
+def _even_albedo(angles: Floats, light: Floats, laws: DiffuseLaws) -> Floats:
+    """Log likelihood (C,): the albedo is the same where zeniths are small and where they are large.
+
+    The pixels are sorted by DoLP into the same ten parts for all candidates. The mean albedo of a part may differ by
+    the scatter within it, over the patches that it holds. Rough bodies shade flatter than smooth ones; the amount is
+    fitted to make the albedo most even, apart from the polarization. If no candidate fits (cast light, concave
+    parts), all are trusted less.
+    """
+    order = np.argsort(angles.sum(axis=0), kind="stable")
+    order = order[len(order) % _TENTHS :]
+    zenith = angles[:, order]
+    shading, flatter = (np.interp(zenith, _ZENITHS, values) for values in (laws.shading, laws.flatter))
+    albedo = np.log(light[order]) - shading
+    # without the first part, which faces the flash: highlights
+    albedo, flatter = (x.reshape(len(zenith), _TENTHS, -1)[:, 1:] for x in (albedo, flatter))
+    within = albedo.std(axis=2).mean(axis=1)
+    middle, flat = (x.mean(axis=2) for x in (albedo, flatter))  # (C, tenths)
+    middle, flat = (x - x.mean(axis=1, keepdims=True) for x in (middle, flat))
+    amount = (middle * flat).sum(axis=1) / np.maximum((flat * flat).sum(axis=1), 1e-9)
+    uneven = middle - np.clip(amount, 0, _FLATTEST)[:, None] * flat
+    misfit = _PATCHES * (uneven**2).mean(axis=1) / (within**2 + _UNEVEN**2)
+    return np.asarray(-misfit / 2 / max(1.0, float(misfit.min())))
+
+
+def _round_outline(dolp: Floats, cues: Cues, laws: DiffuseLaws) -> Floats:
+    """Log likelihood (C,): inside its outline a round object turns away as a ball does, cos θ = √(2x − x²).
+
+    x is the distance from the outline over a radius, which is about that of the disc of as many pixels, and the same
+    for all rings. Where half of a ring is nearer to an edge than to a ball, all laws are equal.
+    """
+    distance = cv2.distanceTransform(cues.mask.astype(np.uint8), cv2.DIST_L2, 5) - 0.5
+    radius = disc_radius(cues.mask)
+    high, middle = [], []
+    for near, far in pairwise(np.maximum(np.array(_RINGS) * radius, _OUTLINE_PX)):
+        ring = cues.mask & (distance > near) & (distance < far)
+        if ring.sum() >= _PATCHES and far - near > 1:
+            high.append(np.median(dolp[ring]))
+            middle.append((near + far) / 2)
+    if len(middle) < 2:
+        return np.zeros(len(laws.alpha))
+    away = np.clip(np.array(middle) / (radius * _RADII[:, None]), 0, 1)  # (R, rings)
+    ball = np.degrees(np.arccos(np.sqrt(away * (2 - away))))
+    found = np.degrees([np.interp(high, row, _ZENITHS) for row in laws.dolp])  # (C, rings)
+    misfit = (((found[:, None] - ball) / _OUTLINE_DEG) ** 2).sum(axis=-1) + (np.log(_RADII) / _RADIUS_SPREAD) ** 2
+    return np.asarray(np.log(np.exp(-misfit.min(axis=1) / 2) + _SHARP))
+
+
+def _mean_zenith(dolp: Floats, dolps: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    """Mean and deviation (...,) of the zeniths of a DoLP under laws with DoLPs (C, Z) and weights (C,), rad."""
+    grid = np.linspace(0, float(dolps.max()), 600)
+    zenith = np.stack([np.interp(grid, row, _ZENITHS) for row in dolps])
+    mean = weights @ zenith
+    deviation = np.sqrt(np.maximum(weights @ zenith**2 - mean**2, 0))
+    return np.interp(dolp, grid, mean), np.interp(dolp, grid, deviation)

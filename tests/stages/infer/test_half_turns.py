@@ -1,0 +1,129 @@
+"""Half-turns against shapes with known normals."""
+
+import numpy as np
+import pytest
+
+from polcap.optics import frames
+from polcap.stages import cues, infer, stokes
+from polcap.stages.infer import half_turns
+from tests import scenes
+
+SIZE = 120
+Y, X = np.mgrid[:SIZE, :SIZE].astype(float)
+
+
+def ball(x0=59.5, y0=59.5, radius=50.0):
+    """Normals (H, W, 3) of a ball in the frame of each ray, and its mask."""
+    u, v = (X - x0) / radius, -(Y - y0) / radius
+    mask = u * u + v * v < 1
+    z = np.sqrt(np.maximum(1 - u * u - v * v, 1e-4))
+    return np.stack([u, v, z], axis=-1) / np.sqrt(u * u + v * v + z * z)[..., None], mask
+
+
+def opposite(normal):
+    return normal * [-1, -1, 1]
+
+
+def doubt(mask, sigma=20.0, opposed=0.0):
+    ones = np.ones(mask.shape)
+    return half_turns.NetworkDoubt(sigma * ones, opposed * ones)
+
+
+def leaning(normal):
+    return np.hypot(normal[..., 0], normal[..., 1]) > 0.3
+
+
+@pytest.mark.parametrize("region", ["whole", "half", "patch at the outline"])
+def test_a_region_of_a_ball_that_was_turned_is_turned_back(region: str) -> None:
+    normal, mask = ball()
+    wrong = mask & {"whole": X > -1, "half": X > 60, "patch at the outline": np.hypot(X - 100, Y - 60) < 22}[region]
+    given = np.where(wrong[..., None], opposite(normal), normal)
+    found = half_turns.resolve(given, mask, doubt(mask, 25.0))
+    judged = mask & leaning(normal)
+    assert (found.turned == wrong)[judged].mean() > 0.97
+
+
+def test_a_right_ball_keeps_its_normals_without_doubt() -> None:
+    normal, mask = ball()
+    found = half_turns.resolve(normal, mask, doubt(mask))
+    assert not found.turned.any()
+    assert found.doubt.max() == 0
+
+
+def test_a_true_dent_stays_a_dent() -> None:
+    """A hollow inside a ball: its normals lean inward, and the network is as sure of it as of the rest."""
+    normal, mask = ball()
+    dent = np.hypot(X - 59.5, Y - 59.5) < 22
+    u, v = (X - 59.5) / 30, -(Y - 59.5) / 30
+    hollow = np.stack([-u, -v, np.sqrt(np.maximum(1 - u * u - v * v, 0.1))], axis=-1)
+    hollow /= np.linalg.norm(hollow, axis=-1, keepdims=True)
+    given = np.where(dent[..., None], hollow, normal)
+    assert not half_turns.resolve(given, mask, doubt(mask, 10.0)).turned.any()
+
+
+def test_a_neck_that_the_mask_cuts_does_not_anchor() -> None:
+    """A cylinder leans to its two sides; the straight ends of its mask say nothing of it."""
+    across = np.clip((X - 59.5) / 40, -1, 1)
+    normal = np.stack([across, 0 * X, np.sqrt(np.maximum(1 - across**2, 1e-4))], axis=-1)
+    mask = (np.abs(X - 59.5) < 40) & (Y > 10) & (Y < 100)
+    evidence = half_turns._outline_evidence(half_turns.coarse(normal, mask))
+    ends = mask & ((Y < 14) | (Y > 96)) & (np.abs(X - 59.5) < 35)
+    sides = mask & (np.abs(X - 59.5) > 38) & (Y > 14) & (Y < 96)
+    assert np.abs(evidence[ends]).max() < 0.05
+    assert evidence[sides].min() > 0.2
+
+
+def test_where_the_picture_ends_nothing_anchors() -> None:
+    """Half of a ball that leaves the picture: the cut edge is no outline."""
+    normal, mask = ball(x0=0.0)
+    evidence = half_turns._outline_evidence(half_turns.coarse(normal, mask))
+    assert np.abs(evidence[:, 0][mask[:, 0]][3:-3]).max() < 1e-6
+
+
+def test_axes_of_a_ball_get_their_sides_and_a_bulge_its_own() -> None:
+    """Sides drawn at random come out as those of the truth, on a ball with a smaller one before it."""
+    normal, mask = ball()
+    small, front = ball(52.0, 65.0, 20.0)
+    normal = np.where(front[..., None], small, normal)
+    random = np.random.default_rng(0).random(mask.shape) < 0.5
+    axes = np.where(random[..., None], opposite(normal), normal)
+    found = half_turns.resolve(axes, mask)
+    right = (found.turned == random)[mask & leaning(normal)]
+    assert right.mean() > 0.97
+    assert found.doubt[mask & leaning(normal)].mean() < 0.1
+
+
+def test_positions_that_disagree_raise_the_odds_of_a_region() -> None:
+    """The same wrong patch, at the edge of being believed: with the network's positions at odds it is turned."""
+    normal, mask = ball()
+    wrong = np.hypot(X - 95, Y - 60) < 18
+    given = np.where(wrong[..., None], opposite(normal), normal)
+    agreed, split = (half_turns.resolve(given, mask, doubt(mask, 8.0, opposed)) for opposed in (0.0, 0.5))
+    assert not agreed.turned.any() and agreed.doubt.max() > 0.02
+    assert split.turned[wrong & mask & leaning(normal)].mean() > 0.9
+
+
+def test_the_expected_error_is_the_mean_over_both_sides() -> None:
+    """A normal at 40° whose side is wrong one time in four: ¾ · 4° + ¼ · 80°."""
+    error = half_turns.error_with_doubt(np.array(4.0), np.array(0.25), np.cos(np.radians(40.0)))
+    assert error == pytest.approx(23.0)
+
+
+def test_the_inversion_of_a_ball_leans_outward_and_knows_it() -> None:
+    solved = stokes.solve(
+        scenes.stack(noise=0.004), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings()
+    )
+    found = cues.compute(solved, scenes.no_color())
+    maps = infer.estimate(found, None, lambda network, picture: {}, infer.InferSettings())
+    local, mask = scenes.truth()
+    true = frames.from_ray_frame(local, found.rays)
+    tilted = mask & maps.mask & (local[..., 2] < 0.9)
+    error = np.degrees(np.arccos(np.clip((maps.normal * true).sum(-1), -1, 1)))
+    assert (error[tilted] < 90).mean() > 0.995
+    assert maps.confidence[tilted].mean() < 10
+
+
+def test_an_empty_mask_has_no_half_turns() -> None:
+    normal, mask = ball()
+    found = half_turns.resolve(normal, np.zeros_like(mask))
+    assert not found.turned.any() and not found.doubt.any()
