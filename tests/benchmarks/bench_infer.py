@@ -25,7 +25,7 @@ from polcap.pipeline import models
 from polcap.stages import infer
 from polcap.stages.cues import channels
 from polcap.stages.infer import augmentation, learned
-from polcap.training.protocol import Protocol
+from polcap.training.evaluation_protocol import Protocol
 
 
 def main() -> None:
