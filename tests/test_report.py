@@ -12,8 +12,7 @@ import pytest
 
 from polcap import report
 from polcap.errors import StorageError
-from polcap.report import compare, keys, labels, map_figures, page
-from polcap.report import mesh_preview
+from polcap.report import compare, keys, labels, map_figures, mesh_preview, page
 from tests import surfaces
 
 
