@@ -165,7 +165,10 @@ def animate(out: Path, motion: animation.Motion) -> list[Path]:
     """Move the light or the object; returns the paths of the WebP and, where FFmpeg is present, the MP4."""
     results, about = reopen(out)
     ior = float(about["settings"]["infer"]["ior"])
-    frames = animation.light(results.maps, ior) if motion == "light" else animation.turntable(results.maps, results.mesh, ior)
+    if motion == "light":
+        frames = animation.light(results.maps, ior)
+    else:
+        frames = animation.turntable(results.maps, results.mesh, ior)
     written = [out / "work" / f"{motion}.webp"]
     encoders.webp(written[0], frames, animation.SECONDS)
     if encoders.ffmpeg():
