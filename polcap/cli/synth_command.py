@@ -53,9 +53,9 @@ def synth(
     from polcap.synth import shooting as synthetic
 
     if dataset is not None:
-        corpus = extras.training("corpus")
+        corpus = extras.training("dataset_files")
         named = {"seed": seed, "mesh": str(mesh or ""), "material": str(material or ""), "law": law}
-        corpus.main(folder, dataset, settings.fill(corpus.Recipe, named, assignments or ()))
+        corpus.main(folder, dataset, settings.fill(corpus.DatasetRecipe, named, assignments or ()))
         _print_written(folder / "dataset.json", json)
         return
     if calibration:

@@ -69,10 +69,10 @@ def evaluate(
     if (data is None) == (real is None):
         raise SettingError("evaluate takes DATA, a folder with meshes/ and materials/, or --real DIR; give one of them")
     if real is not None:
-        extras.training("real").main(real, model, out)
+        extras.training("evaluation_photographs").main(real, model, out)
         terminal.print_data(str(out / "real.md"))
         return
-    judge, fixed = extras.training("evaluate"), extras.training("protocol")
+    judge, fixed = extras.training("evaluate"), extras.training("evaluation_protocol")
     usual = (fixed.QUICK_COUNT, fixed.QUICK_SIZE) if quick else (fixed.COUNT, fixed.SIZE)
-    judge.main(judge.Params(model, data, out, ablations, count or usual[0], size or usual[1], protocol))
+    judge.main(judge.EvaluationOptions(model, data, out, ablations, count or usual[0], size or usual[1], protocol))
     terminal.print_data(str(out / "evaluation.md"))

@@ -20,7 +20,7 @@ from polcap.optics.body import Law
 
 
 @dataclass(frozen=True)
-class Family:
+class GlossFamily:
     share: float  # of surfaces
     roughness: tuple[float, float]  # perceptual, evenly between
     tail: float  # share with an F0 above common dielectrics
@@ -30,12 +30,12 @@ class Family:
 
 
 FAMILIES = {
-    "glossy": Family(0.25, (0.10, 0.35), 0.40),  # plastics, glazes, varnish
-    "satin": Family(0.27, (0.28, 0.60), 0.28),  # paints, leather, waxed wood
-    "matte": Family(0.27, (0.50, 0.95), 0.08),  # plaster, clay, paper, stone
-    "brushed": Family(0.08, (0.25, 0.65), 0.30, grain=1.0),  # sanded, scratched, grained
-    "fibrous": Family(0.08, (0.65, 1.00), 0.00, kept=(0.3, 0.9), grain=1.0),  # cloth, felt, unsized paper
-    "dark gloss": Family(0.05, (0.05, 0.30), 0.00, dark=True),  # black plastic, lacquer, leather, dark glaze
+    "glossy": GlossFamily(0.25, (0.10, 0.35), 0.40),  # plastics, glazes, varnish
+    "satin": GlossFamily(0.27, (0.28, 0.60), 0.28),  # paints, leather, waxed wood
+    "matte": GlossFamily(0.27, (0.50, 0.95), 0.08),  # plaster, clay, paper, stone
+    "brushed": GlossFamily(0.08, (0.25, 0.65), 0.30, grain=1.0),  # sanded, scratched, grained
+    "fibrous": GlossFamily(0.08, (0.65, 1.00), 0.00, kept=(0.3, 0.9), grain=1.0),  # cloth, felt, unsized paper
+    "dark gloss": GlossFamily(0.05, (0.05, 0.30), 0.00, dark=True),  # black plastic, lacquer, leather, dark glaze
 }
 _ALL_DARK = 0.10  # of objects that are dark gloss everywhere; the parts' share comes on top
 _DARK = (0.01, 0.06)  # albedo
@@ -69,7 +69,7 @@ def dark_albedo(shape: tuple[int, ...], device: torch.device) -> Tensor:
     return value * torch.exp(0.15 * torch.randn((*shape, 3), device=device))
 
 
-def draw(shape: tuple[int, ...], device: torch.device, all_dark: Tensor | None = None) -> Gloss:
+def draw_gloss(shape: tuple[int, ...], device: torch.device, all_dark: Tensor | None = None) -> Gloss:
     """A family for each surface, and its gloss; `all_dark` (bool, broadcast to the shape) forces the dark family."""
     share = torch.tensor([family.share for family in FAMILIES.values()], device=device)
     which = torch.multinomial(share, torch.Size(shape).numel(), replacement=True).reshape(shape)
@@ -95,7 +95,7 @@ def draw(shape: tuple[int, ...], device: torch.device, all_dark: Tensor | None =
     )
 
 
-def laws(count: int, device: torch.device, smooth_share: float = SMOOTH_SHARE) -> Law:
+def draw_laws(count: int, device: torch.device, smooth_share: float = SMOOTH_SHARE) -> Law:
     """How the bodies of `count` objects polarize, (B,) each: half by the smooth law, half by rough facets.
 
     What light does inside is not known, so rough ones have either weighting of facets or one between, and a factor

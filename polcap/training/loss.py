@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from polcap.optics import shade
 from polcap.optics.body import Law
 from polcap.stages.cues import NOMINAL_IOR
-from polcap.training.dataset import Batch
+from polcap.training.simulator import Batch
 
 WEIGHTS = {
     "normal": 2.0, "region": 1.0, "depth": 1.0, "diffuse": 1.0, "specular": 60.0, "roughness": 8.0, "highlight": 2.0,

@@ -16,59 +16,59 @@ from polcap.formats import atomic
 from polcap.images import Floats
 from polcap.stages.mask.mask_channels import ReducedPicture
 from polcap.synth.mesh_tracer import Tracer, Triangles, centred
-from polcap.training import gbuffers, limbs, mask_scenes, mask_views, materials, shapes
+from polcap.training import mask_scenes, mask_views, materials, random_shapes, traced_views
 
 SIZE = (288, 384)  # H, W, traced; half of it is kept
 _VIEWS, _DRESSES = 3, 2  # of each mesh, of each view
 _UNSEEN = 0.15  # of the charts are in the picture but not found
 
 
-def main(out: Path, data: Path, count: int, seed: int = 5) -> None:
+def make_pictures(out: Path, data: Path, count: int, seed: int = 5) -> None:
     """Make what is missing of pictures 0…count − 1 from the training meshes and materials."""
     torch.set_num_threads(1)
-    files = gbuffers.training_meshes(data)
-    library = materials.Library(data / "materials" / "train", torch.device("cpu"))
+    files = traced_views.training_meshes(data)
+    library = materials.MaterialLibrary(data / "materials" / "train", torch.device("cpu"))
     out.mkdir(parents=True, exist_ok=True)
     for group in range(-(-count // (_VIEWS * _DRESSES))):
         first = group * _VIEWS * _DRESSES
         if all((out / f"{n:06d}.npy").exists() for n in range(first, first + _VIEWS * _DRESSES)):
             continue
-        for number, picture in enumerate(_group(files, library, seed, group), start=first):
+        for number, picture in enumerate(_make_group(files, library, seed, group), start=first):
             with atomic.path(out / f"{number:06d}.npy") as beside, beside.open("wb") as file:
                 np.save(file, picture)
 
 
-def _group(files: list[Path], library: materials.Library, seed: int, group: int) -> Iterator[Floats]:
+def _make_group(files: list[Path], library: materials.MaterialLibrary, seed: int, group: int) -> Iterator[Floats]:
     """The pictures of one mesh."""
     rng = np.random.default_rng([seed, group])
     torch.manual_seed(int(rng.integers(1 << 62)))
     tracer = Tracer(_mesh(files, rng))
     made = 0
     while made < _VIEWS:
-        traced = mask_views.look(tracer, mask_views.any_kind(rng), SIZE, rng)
+        traced = mask_views.trace_view(tracer, mask_views.draw_kind(rng), SIZE, rng)
         if traced is None:
             continue
         made += 1
         for _ in range(_DRESSES):
             mode = rng.choice(list(mask_scenes.MODES), p=list(mask_scenes.MODES.values()))
-            yield packed(mask_scenes.draw(traced, library, mode, rng))
+            yield pack(mask_scenes.make_scene(traced, library, mode, rng))
 
 
 def _mesh(files: list[Path], rng: np.random.Generator) -> Triangles:
     """A scan, a random shape, one with limbs, or two or three of them apart."""
     if rng.random() < 0.75:
         return _one(files, rng)
-    return mask_views.several([_one(files, rng) for _ in range(rng.integers(2, 4))], rng)
+    return mask_views.side_by_side([_one(files, rng) for _ in range(rng.integers(2, 4))], rng)
 
 
 def _one(files: list[Path], rng: np.random.Generator) -> Triangles:
     kind = rng.random()
     if kind < 0.4:
-        return centred(gbuffers.read_mesh(files[rng.integers(len(files))]))
-    return shapes.compose(rng) if kind < 0.7 else limbs.grown(rng)
+        return centred(traced_views.read_mesh(files[rng.integers(len(files))]))
+    return random_shapes.compose(rng) if kind < 0.7 else random_shapes.compose_with_branches(rng)
 
 
-def packed(picture: mask_scenes.Picture) -> Floats:
+def pack(picture: mask_scenes.MaskScene) -> Floats:
     """What a file holds, means of 2 × 2 pixels; radiance in units of its own 95th percentile."""
     stokes = picture.stokes / max(float(np.percentile(picture.stokes[0].mean(-1), 95)), 1e-9)
     sums = np.moveaxis(stokes[1:].sum(-1), 0, -1)
@@ -78,7 +78,7 @@ def packed(picture: mask_scenes.Picture) -> Floats:
     return np.asarray(whole.reshape(height // 2, 2, width // 2, 2, count).mean((1, 3)), np.float16)
 
 
-def drawn(file: Path, rng: np.random.Generator, other: Path | None = None) -> tuple[ReducedPicture, Floats]:
+def load_varied(file: Path, rng: np.random.Generator, other: Path | None = None) -> tuple[ReducedPicture, Floats]:
     """A picture under new light, a part of it, turned or mirrored, and measured; and its truth (H, W).
 
     other: a picture whose object is laid into this one, too.
@@ -104,7 +104,7 @@ def drawn(file: Path, rng: np.random.Generator, other: Path | None = None) -> tu
     sums = np.stack([color.sum(-1), *(np.moveaxis(stokes[..., 3:], -1, 0) * light * rng.uniform(0.6, 1.1))])
     if rng.random() < _UNSEEN:
         chart = np.zeros_like(chart)
-    return mask_scenes.measured(color, sums, chart, rng), mask
+    return mask_scenes.simulate_measurement(color, sums, chart, rng), mask
 
 
 def _window(held: Floats, rng: np.random.Generator) -> Floats:

@@ -1,4 +1,4 @@
-"""Traced views -> pictures to find the object in: dressed, lit, with a chart, and measured with a camera's errors.
+"""MaskView views -> pictures to find the object in: dressed, lit, with a chart, and measured with a camera's errors.
 
 What makes objects hard to find is drawn often: black gloss on black cloth, white on white, the backdrop's own
 colour, deep shadow, printed backdrops, a chart that touches. Backdrops polarize too: cloth and paper little,
@@ -18,8 +18,8 @@ from polcap.formats import shipped_data
 from polcap.images import Floats
 from polcap.optics import frames, shade
 from polcap.stages.mask.mask_channels import ReducedPicture, grid
-from polcap.training import backdrop_prints, materials
-from polcap.training.mask_views import Traced, backdrop
+from polcap.training import backdrop_patterns, materials
+from polcap.training.mask_views import MaskView, backdrop
 from polcap.training.materials import Surface
 
 Mode = Literal["any", "dark", "black", "white", "alike", "shadow", "printed", "pictured"]
@@ -32,7 +32,7 @@ _PITCH = 16  # px per patch of the chart's own picture
 
 
 @dataclass(frozen=True)
-class Picture:
+class MaskScene:
     """What the camera saw, before noise, and the truth."""
 
     stokes: Floats  # (3, H, W, 3) S0, S1, S2 in linear Rec.709
@@ -41,10 +41,10 @@ class Picture:
     mask: NDArray[np.bool_]  # (H, W)
 
 
-def draw(
-    traced: Traced, library: materials.Library, mode: Mode, rng: np.random.Generator, charted: float = 0.75,
+def make_scene(
+    traced: MaskView, library: materials.MaterialLibrary, mode: Mode, rng: np.random.Generator, charted: float = 0.75,
     touching: float = 0.4,
-) -> Picture:  # fmt: skip
+) -> MaskScene:  # fmt: skip
     """Dress and light a view; draws from `rng` and from torch's global random state.
 
     charted, touching: how likely a chart stands there, and that it stands as near to the object as can be.
@@ -59,7 +59,7 @@ def draw(
     position = np.concatenate([traced.position.astype(np.float32), place[len(traced.inside) :]])
     owner = torch.cat([torch.zeros(len(traced.inside), dtype=torch.long), torch.ones(len(outside), dtype=torch.long)])
     turn = torch.stack([torch.from_numpy(traced.turn).float(), torch.eye(3)])
-    surface = materials.dress(
+    surface = materials.draw_surface(
         library, torch.from_numpy(normal).float(), torch.from_numpy(position).float(), turn, owner, 2
     )
     number = np.concatenate([np.full(len(traced.inside), -1), plane[outside]])
@@ -74,10 +74,12 @@ def draw(
     chart, corners = np.zeros(traced.size, bool), None
     if rng.random() < charted:
         chart, corners = _add_chart(image, traced, touching, rng)
-    return Picture(_blurred(image, rng.uniform(0.35, 0.9)), chart, corners, traced.mask)
+    return MaskScene(_blurred(image, rng.uniform(0.35, 0.9)), chart, corners, traced.mask)
 
 
-def measured(color: Floats, sums: Floats, chart: NDArray[np.bool_], rng: np.random.Generator) -> ReducedPicture:
+def simulate_measurement(
+    color: Floats, sums: Floats, chart: NDArray[np.bool_], rng: np.random.Generator
+) -> ReducedPicture:
     """S0 (H, W, 3) and the sums over colours (3, H, W) with noise, gains not yet known, shots not quite aligned."""
     bright = float(np.percentile(color.mean(-1), 98)) + 1e-9
     color, sums = (np.asarray(a / bright, np.float32) for a in (color, sums))
@@ -140,7 +142,7 @@ def _dressed(
         elif mode == "printed":
             diffuse[wall] = _printed(position[wall], rng)
         elif mode == "pictured":
-            diffuse[wall] = backdrop_prints.drawn(position[wall], rng)
+            diffuse[wall] = backdrop_patterns.draw_pattern(position[wall], rng)
         elif rng.random() < 0.5:  # plain paper, cloth or board
             _recolored(diffuse, wall, np.exp(rng.uniform(np.log(0.02), np.log(0.9))), rng.uniform(0, 0.3), rng)
         specular[wall] = rng.uniform(0.03, 0.05) if gloss else rng.uniform(0.0, 0.02)
@@ -190,7 +192,7 @@ def _soft(lit: NDArray[np.bool_], at: NDArray[np.intp], size: tuple[int, int], r
 
 
 def _light(
-    traced: Traced, surface: Surface, v: Floats, place: Floats, lit: Floats, polarizing: Tensor,
+    traced: MaskView, surface: Surface, v: Floats, place: Floats, lit: Floats, polarizing: Tensor,
     rng: np.random.Generator,
 ) -> Floats:  # fmt: skip
     """Stokes parameters (3, M, 3) of flash and of what walls throw back."""
@@ -211,7 +213,7 @@ def _light(
 
 
 def _add_chart(
-    image: Floats, traced: Traced, touching: float, rng: np.random.Generator
+    image: Floats, traced: MaskView, touching: float, rng: np.random.Generator
 ) -> tuple[NDArray[np.bool_], Floats | None]:
     """A ColorChecker beside or behind the object, drawn into S0; where the detector puts it, and its corners.
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from polcap.images import Floats, View
 from polcap.optics import frames
 from polcap.synth.mesh_tracer import Tracer, Triangles, centred, union
-from polcap.training import shapes
+from polcap.training import random_shapes
 
 Framing = Literal["whole", "small", "cut", "full"]
 Stage = Literal["wall", "table", "cloth"]
@@ -27,7 +27,7 @@ _MOST: dict[Framing, float] = {"whole": 0.8, "small": 0.4, "cut": 0.85, "full": 
 
 
 @dataclass(frozen=True)
-class Kind:
+class ViewKind:
     """What a view is to show."""
 
     framing: Framing
@@ -36,7 +36,7 @@ class Kind:
 
 
 @dataclass(frozen=True)
-class Traced:
+class MaskView:
     """A view of H×W pixels, of which M show the object."""
 
     view: View
@@ -59,18 +59,18 @@ class Traced:
         return out
 
 
-def any_kind(rng: np.random.Generator) -> Kind:
+def draw_kind(rng: np.random.Generator) -> ViewKind:
     """As photographs come, and the hard ones among them more often."""
     framing: Framing = rng.choice(["whole", "small", "cut", "full"], p=[0.66, 0.12, 0.16, 0.06])
     stage: Stage = rng.choice(["wall", "table", "cloth"], p=[0.4, 0.4, 0.2])
-    return Kind(framing, stage, (0.2, 0.7) if rng.random() < 0.3 else (0.0, 0.15))
+    return ViewKind(framing, stage, (0.2, 0.7) if rng.random() < 0.3 else (0.0, 0.15))
 
 
-def several(meshes: list[Triangles], rng: np.random.Generator) -> Triangles:
+def side_by_side(meshes: list[Triangles], rng: np.random.Generator) -> Triangles:
     """Meshes of longest side 1 beside one another, apart or nearly so."""
     parts, edge = [], 0.0
     for mesh in meshes:
-        turned = mesh.vertices @ shapes.rotation(rng).T * rng.uniform(0.4, 1.0)
+        turned = mesh.vertices @ random_shapes.rotation(rng).T * rng.uniform(0.4, 1.0)
         low = turned.min(axis=0)
         turned = turned - low + [edge, rng.uniform(-0.2, 0.2), rng.uniform(-0.2, 0.2)]
         edge = float(turned[:, 0].max()) + rng.uniform(-0.05, 0.3)
@@ -88,10 +88,10 @@ def _corner_normals(vertices: Floats, faces: NDArray[np.int32]) -> Floats:
     return np.asarray(total[faces], dtype=np.float32)
 
 
-def look(tracer: Tracer, kind: Kind, size: tuple[int, int], rng: np.random.Generator) -> Traced | None:
+def trace_view(tracer: Tracer, kind: ViewKind, size: tuple[int, int], rng: np.random.Generator) -> MaskView | None:
     """The object from a random side; None where it cannot be framed so."""
     for _ in range(_TRIES):
-        turn = shapes.rotation(rng)
+        turn = random_shapes.rotation(rng)
         view, place = _framed(tracer.mesh.vertices @ turn.T, kind.framing, size, rng)
         if place[2] > -0.8:  # not with the nose in the lens
             continue
@@ -117,7 +117,7 @@ def look(tracer: Tracer, kind: Kind, size: tuple[int, int], rng: np.random.Gener
     outside = np.flatnonzero(~buffer.mask)
     shadow = np.zeros(size, bool)
     shadow.reshape(-1)[outside] = tracer.hidden((-v[outside] * behind[outside, None] - place) @ turn, source)
-    return Traced(
+    return MaskView(
         view, size, inside.astype(np.int32), normal.astype(np.float16), buffer.position[buffer.mask].astype(np.float16),
         buffer.depth[buffer.mask], lit, turn, flash, distance, planes, shadow,
     )  # fmt: skip
@@ -149,7 +149,7 @@ def _framed(turned: Floats, framing: Framing, size: tuple[int, int], rng: np.ran
 
 
 def _planes(place: Floats, stage: Stage, rng: np.random.Generator) -> Floats:
-    """`Traced.planes` for vertices (V, 3) of the object in the camera frame."""
+    """`MaskView.planes` for vertices (V, 3) of the object in the camera frame."""
     tilt = np.radians(rng.uniform(-12, 12, 2))
     wall = np.array([np.sin(tilt[0]), np.sin(tilt[1]), 1.0])
     if stage == "cloth":

@@ -38,7 +38,7 @@ class Surface:
     law: Law = SMOOTH  # (M,)
 
 
-class Library:
+class MaterialLibrary:
     """Texture sets and a volume of tileable noise on one device."""
 
     def __init__(self, folder: Path | None, device: torch.device, seed: int = 3) -> None:
@@ -66,8 +66,8 @@ class Library:
         return F.grid_sample(self.noise, grid, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0, 0].T
 
 
-def dress(
-    library: Library,
+def draw_surface(
+    library: MaterialLibrary,
     normal: Tensor,
     position: Tensor,
     turn: Tensor,
@@ -120,7 +120,7 @@ def dress(
     reflectance = reflectance * torch.exp(own["f0_step"] * pattern)
     specular = (reflectance[:, None] * own["f0_tint"]).clamp(0.015, 0.4)
 
-    law = gloss.laws(count, device, smooth_share).at(owner)
+    law = gloss.draw_laws(count, device, smooth_share).at(owner)
     fibers = torch.where(law.rough > 0, own["kept"] + own["kept_step"] * pattern, 1.0)
 
     relief = fine[:, 4:7] * torch.where(raised, 4 * pattern * (1 - pattern), 1.0)[:, None]
@@ -140,7 +140,7 @@ def dress(
     )
 
 
-def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tensor]:
+def _draw(library: MaterialLibrary, count: int, device: torch.device) -> dict[str, Tensor]:
     """Levels of each material slot, (B, 3, ·)."""
     shape = (count, _MATERIALS)
 
@@ -151,7 +151,7 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
         return deviation * torch.randn(shape, device=device)
 
     all_dark = gloss.dark_objects(count, device)[:, None]
-    one, other = (gloss.draw(shape, device, all_dark) for _ in range(2))
+    one, other = (gloss.draw_gloss(shape, device, all_dark) for _ in range(2))
     two = u(0, 1) < 0.8  # surfaces in one pattern
     stuff = u(0, 1) < 0.5  # of which both are of one stuff
     f0_step = torch.where(stuff, normal(0.2), torch.log(other.f0 / one.f0))

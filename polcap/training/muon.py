@@ -12,7 +12,7 @@ Liu et al., Muon is scalable for LLM training, 2025: length of the step.
 import torch
 from torch import Tensor
 
-from polcap.training import arithmetic
+from polcap.training import precision
 
 
 class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without types here
@@ -44,7 +44,7 @@ def orthogonal(matrix: Tensor) -> Tensor:
     Singular values end between 0.7 and 1.2: five steps are too few for exactly 1, and enough for training.
     """
     wide = matrix if matrix.shape[-2] <= matrix.shape[-1] else matrix.mT
-    x = (wide / (torch.linalg.matrix_norm(wide, keepdim=True) + 1e-7)).to(arithmetic.kind(matrix.device))
+    x = (wide / (torch.linalg.matrix_norm(wide, keepdim=True) + 1e-7)).to(precision.compute_type(matrix.device))
     for _ in range(5):
         square = x @ x.mT
         x = torch.baddbmm(x, torch.baddbmm(square, square, square, beta=-4.7750, alpha=2.0315), x, beta=3.4445)

@@ -18,8 +18,8 @@ from torch import Tensor
 
 from polcap.errors import InputError
 from polcap.formats.maps import png
-from polcap.training import arithmetic, export, gbuffers, loop, loss, materials, model
-from polcap.training.dataset import Batch, Simulator
+from polcap.training import loop, loss, main_network, materials, onnx_export, precision, traced_views
+from polcap.training.simulator import Batch, Simulator
 from polcap.training.validation import HeldOutPictures
 from polcap.training.variants import VARIANTS
 
@@ -45,10 +45,10 @@ class TrainingOptions:
 
 
 @dataclass(frozen=True)
-class Preset:
+class TrainingPreset:
     """Size of the network, of its training views and of a batch."""
 
-    shape: model.Shape
+    shape: main_network.NetworkShape
     views: int  # per training mesh
     procedural: int  # random shapes, 6 views each
     size: int  # of traced views, px
@@ -59,15 +59,24 @@ class Preset:
 
 
 PRESETS = {
-    "cpu": Preset(
-        model.SMALL, 80, 1200, 192, (96, 128, 160, 192), (0.4, 0.35, 0.15, 0.1), (0.1, 0.25, 0.3, 0.35), 10 * 128**2
+    "cpu": TrainingPreset(
+        main_network.SMALL,
+        80,
+        1200,
+        192,
+        (96, 128, 160, 192),
+        (0.4, 0.35, 0.15, 0.1),
+        (0.1, 0.25, 0.3, 0.35),
+        10 * 128**2,
     ),
-    "gpu": Preset(model.LARGE, 400, 3000, 256, (128, 192, 256), (0.5, 0.3, 0.2), (0.1, 0.4, 0.5), 64 * 256**2),
+    "gpu": TrainingPreset(
+        main_network.LARGE, 400, 3000, 256, (128, 192, 256), (0.5, 0.3, 0.2), (0.1, 0.4, 0.5), 64 * 256**2
+    ),
 }
 
 
 def main(options: TrainingOptions) -> Path:
-    """Train; returns model.onnx, beside which last.pt, metrics.csv, watch.csv and watch.png are left.
+    """Train; returns main_network.onnx, beside which last.pt, metrics.csv, watch.csv and watch.png are left.
 
     Raises
     ------
@@ -85,7 +94,7 @@ def main(options: TrainingOptions) -> Path:
         network.load(options.out / "last.pt")
     elif options.start:
         network.begin(options.start, options.done)
-    simulator = Simulator(traced_views(options, preset), library(options, "train", device), device)
+    simulator = Simulator(open_views(options, preset), library(options, "train", device), device)
     network.held_out = HeldOutPictures(options.data, options.out / "watch", device)
     torch.set_num_threads(1)
     budget = loop.Budget(options.minutes, options.samples)
@@ -111,23 +120,23 @@ def _check(options: TrainingOptions) -> None:
         raise InputError(f"{test_meshes} holds no mesh; put one there: training is validated on it")
 
 
-def traced_views(options: TrainingOptions, preset: Preset) -> dict[str, Any]:
+def open_views(options: TrainingOptions, preset: TrainingPreset) -> dict[str, Any]:
     """Views of all training meshes and random shapes, traced now where the cache lacks them."""
-    meshes = gbuffers.training_meshes(options.data)
+    meshes = traced_views.training_meshes(options.data)
     views = preset.views if options.views is None else options.views
     procedural = preset.procedural if options.procedural is None else options.procedural
-    recipe = gbuffers.Recipe(views=views, procedural=procedural, size=preset.size, seed=13)
-    return gbuffers.cached(options.out / "views", meshes, recipe)
+    recipe = traced_views.ViewsRecipe(views=views, procedural=procedural, size=preset.size, seed=13)
+    return traced_views.open_cache(options.out / "views", meshes, recipe)
 
 
-def library(options: TrainingOptions, split: str, device: torch.device) -> materials.Library:
+def library(options: TrainingOptions, split: str, device: torch.device) -> materials.MaterialLibrary:
     """The texture sets of a split; noise alone where there are none."""
     folder = options.data / "materials" / split
-    return materials.Library(folder if folder.exists() else None, device)
+    return materials.MaterialLibrary(folder if folder.exists() else None, device)
 
 
 def _made_ahead(
-    simulator: Simulator, preset: Preset, seed: int, made: int, progress: Callable[[int], float]
+    simulator: Simulator, preset: TrainingPreset, seed: int, made: int, progress: Callable[[int], float]
 ) -> Generator[Batch, None, None]:
     """Endless batches, made in a thread of their own while the network learns from earlier ones.
 
@@ -147,7 +156,7 @@ def _made_ahead(
                 size = int(chooser.choice(preset.sizes, p=preset.early if progress(made) < 0.5 else preset.late))
                 count = max(preset.pixels // size**2, 1)
                 made += count
-                waiting.put(simulator.draw(count, size))
+                waiting.put(simulator.draw_batch(count, size))
         except BaseException as error:  # raised again by the loop
             waiting.put(error)
 
@@ -174,12 +183,17 @@ class NetworkTraining(loop.Trainee):
     """
 
     schedule = loop.Schedule(hold=0.2, warm_up=100, averaging=0.999, burst=200.0)
-    network: model.Network
+    network: main_network.MainNetwork
 
     def __init__(
-        self, shape: model.Shape, device: torch.device, rate: float, learners: int = 1, variant: str = "ours"
+        self,
+        shape: main_network.NetworkShape,
+        device: torch.device,
+        rate: float,
+        learners: int = 1,
+        variant: str = "ours",
     ) -> None:
-        super().__init__(model.Network(shape, variant).to(device, memory_format=torch.channels_last), rate)
+        super().__init__(main_network.MainNetwork(shape, variant).to(device, memory_format=torch.channels_last), rate)
         self.device = device
         self.weights = list(self.network.parameters())
         self.lights = [torch.Generator(device).manual_seed(k) for k in range(learners)]  # of the rendering loss
@@ -203,7 +217,7 @@ class NetworkTraining(loop.Trainee):
 
     def _gradient(self, batch: Batch, lights: torch.Generator) -> tuple[tuple[Tensor, ...], dict[str, float]]:
         """Gradient of one batch's loss, and the parts of that loss."""
-        with arithmetic.fast(self.device):
+        with precision.autocast(self.device):
             maps = self.network(batch.channels.contiguous(memory_format=torch.channels_last))
         polarized = VARIANTS[self.network.variant].polarized_loss
         value, figures = loss.total(maps, batch, lights, polarized=polarized)
@@ -223,7 +237,7 @@ class NetworkTraining(loop.Trainee):
         }  # fmt: skip
 
     def begin(self, path: Path, done: int = 0) -> None:
-        """Take the first weights from a model that `export.write` wrote.
+        """Take the first weights from a model that `onnx_export.write` wrote.
 
         `done` pictures count as learned from: with a budget of pictures the schedule goes on from there.
 
@@ -232,7 +246,7 @@ class NetworkTraining(loop.Trainee):
         InputError
             It is another network's model.
         """
-        weights, metadata = export.read(path)
+        weights, metadata = onnx_export.read_weights(path)
         for name, own in self.network.state_dict().items():
             if name in weights:
                 weights[name] = _with_new_channels(weights[name], own)
@@ -271,10 +285,10 @@ def _with_new_channels(weight: Tensor, own: Tensor) -> Tensor:
     return torch.cat([weight, weight.new_zeros(len(weight), more, *weight.shape[2:])], dim=1)
 
 
-def load_average(path: Path) -> tuple[model.Network, dict[str, Any]]:
+def load_average(path: Path) -> tuple[main_network.MainNetwork, dict[str, Any]]:
     """The network with a checkpoint's averaged weights, on the CPU, and the checkpoint's other facts."""
     state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-    network = model.Network(model.Shape(**state["shape"]), state["variant"])
+    network = main_network.MainNetwork(main_network.NetworkShape(**state["shape"]), state["variant"])
     network.load_state_dict(state["average"])
     return network.eval(), {k: state[k] for k in ("step", "samples", "elapsed", "begun", "done")}
 
@@ -287,4 +301,4 @@ def ship(checkpoint: Path, path: Path, version: str, licence: str = "Apache-2.0"
     if facts["begun"]:
         training += f", after {facts['begun']}"
     metadata = {"version": version, "licence": licence, "variant": network.variant, "training": training}
-    return export.write(network, path, metadata)
+    return onnx_export.export_main(network, path, metadata)
