@@ -35,9 +35,7 @@ def test_the_page_opens_with_the_error_that_its_checks_judge(result: Path) -> No
     gate = next(gate for gate in about["gates"] if gate["name"] == "normal error")
     assert f"within {labels.number(gate['value'])}° of the surface's." in page.verdict(about)[1]
     gate |= {"value": 31.74, "says": "Expected error of the normals: 31.7° (median), mostly due to: body"}
-    assert page.verdict(about)[1].endswith(
-        "within 31.74° of the surface's; mostly due to these checks: body."
-    )
+    assert page.verdict(about)[1].endswith("within 31.74° of the surface's; mostly due to these checks: body.")
     about["gates"].remove(gate)  # as where the shots are out of order
     assert page.verdict(about)[1] == ""
 

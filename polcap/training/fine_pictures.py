@@ -68,7 +68,7 @@ class FinePictureMaker:
         estimated = cues.compute(image, evaluation_protocol.white())
         size = int(_FIRST_SIZES[0] * (_FIRST_SIZES[1] / _FIRST_SIZES[0]) ** rng.random())
         network = replace(self.network, metadata={**self.network.metadata, "native_size": str(size)})
-        _, guess, _ = learned.known(estimated, network, onnx.run, _IOR, 1)
+        _, guess, _ = learned.estimate_coarse(estimated, network, onnx.run, _IOR, 1)
         truth = np.moveaxis(photo.truth["normal"][0].numpy(), -1, 0)
         known = (photo.mask[0].numpy() & mask)[None]
         rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))

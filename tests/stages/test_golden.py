@@ -67,7 +67,7 @@ def test_network_makes_the_same_without_graph_optimizations(name: str, monkeypat
         return used[-1]
 
     monkeypatch.setattr(onnxruntime, "SessionOptions", plain)
-    onnx._session.cache_clear()  # sessions of other tests are optimized
+    onnx._session.cache_clear()
     check(name, made.__wrapped__(name))
     onnx._session.cache_clear()
     assert used
