@@ -132,7 +132,7 @@ def report(
         pairs.write(file, (result, compare), abouts)
         rows = pairs.rows(*abouts)
         named = [{"name": name, "here": here, "there": there} for name, here, there in rows]
-        spoken = (pairs.spoken(row) for row in rows)
+        spoken = (pairs.labelled(row) for row in rows)
         if json or rows:
             terminal.print_data(
                 named if json else "\n".join(f"{title}: {here}  |  {there}" for title, here, there in spoken)

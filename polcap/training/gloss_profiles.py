@@ -1,8 +1,8 @@
-"""How the light of each material falls with the angle: radiance over zenith, gathered from soft groups of places.
+"""Gloss from profiles in the main network: radiance against zenith angle, averaged over soft groups of places.
 
-A material's gloss shows wherever it faces the flash, and nowhere else. Places sort themselves into groups
-by learned features; each group's light is averaged in bins of the estimated zenith, and what that profile
-says of gloss is told to every place of the group.
+The gloss of a material is visible only where it faces the flash. Learned features divide places into groups. The light
+of each group is averaged in bins of the estimated zenith, and every place of the group gets the gloss read from this
+profile.
 """
 
 from dataclasses import dataclass
@@ -20,21 +20,21 @@ _EDGES_DEG = (0.0, 4.0, 8.0, 12.0, 17.0, 23.0, 30.0, 40.0, 52.0, 66.0, 90.0)
 _BINS = len(_EDGES_DEG) - 1
 _FIGURES = 6  # per bin
 PROFILE = _BINS * _FIGURES
-_BLOCK = 64  # divides the places of every picture: sides are multiples of 32, profiles read every second place
+_BLOCK = 64  # divides the number of places of every picture: every second one, sides are multiples of 32
 
 
 @dataclass(frozen=True)
 class GlossEvidence:
-    """What is known of each place when gloss is asked for, (B, ·, H, W)."""
+    """Inputs of the gloss estimate at each place, (B, ·, H, W)."""
 
     figures: Tensor  # 5 channels of `figures_of`
     cosine: Tensor  # of the zenith
     diffuse: Tensor  # 3 channels
-    usable: Tensor  # 1 on the object where it is not clipped
+    usable: Tensor  # 1 on the object where it is not clipped, else 0
 
 
 class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """Features of each place and what the picture shows there -> messages (B, outputs, H, W)."""
+    """Features and evidence of each place -> the readings of its groups (B, outputs, H, W)."""
 
     def __init__(self, coarse: int, fine: int, outputs: int) -> None:
         super().__init__()
@@ -45,7 +45,7 @@ class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types he
         nn.init.zeros_(self.part[-1].bias)
 
     def forward(self, coarse: Tensor, fine: Tensor, seen: GlossEvidence) -> Tensor:
-        """coarse (B, ·, H/2, W/2) and fine features (B, ·, H, W) sort the places: a region, and what in it is alike."""
+        """Features sort the places: coarse ones (B, ·, H/2, W/2) by region, fine ones (B, ·, H, W) within it."""
         color = torch.log(seen.diffuse + 0.02)
         weight = seen.usable + 1e-4
         deviation = color - (color * weight).sum(dim=(2, 3), keepdim=True) / weight.sum(dim=(2, 3), keepdim=True)
@@ -58,10 +58,10 @@ class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types he
 
 
 def figures_of(level: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) -> Tensor:
-    """What is averaged, (B, 5, H, W).
+    """The five quantities that profiles average, (B, 5, H, W).
 
-    Log of light over shading, its excess over the diffuse light, the excess squared and as a factor, and the share by
-    which the DoLP falls short of the diffuse one.
+    Log of light / shading; log of light / diffuse light; its square; its square as a factor; missing share of the DoLP
+    of diffuse light.
 
     level (B, 3, H, W) log radiance, ratio (B, 2, H, W) S1/S0 and S2/S0, normal and diffuse (B, 3, H, W).
     """
@@ -77,9 +77,9 @@ def figures_of(level: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) ->
 
 
 def profile(weight: Tensor, figures: Tensor, cosine: Tensor) -> Tensor:
-    """weight (B, groups, N), figures (B, 5, N), cosine (B, 1, N) -> figures per group and bin, (B, groups, bins · 6).
+    """Profiles (B, groups, bins · 6) of groups with weights (B, groups, N), of figures (B, 5, N) and cosines (B, 1, N).
 
-    Log share of the group, then the figures' means, 0 where there is nothing.
+    Each bin has the log share of its group, then the means of the figures; 0 where it is empty.
     """
     edges = cosine.new_tensor([cos(radians(angle)) for angle in _EDGES_DEG]).view(1, -1, 1)
     at = ((cosine <= edges[:, :-1]) & (cosine > edges[:, 1:])).to(weight.dtype)  # (B, bins, N)
@@ -97,9 +97,10 @@ def profile(weight: Tensor, figures: Tensor, cosine: Tensor) -> Tensor:
 
 
 def summed(weight: Tensor, values: Tensor) -> Tensor:
-    """weight (B, G, N) @ values (B, N, K), in blocks of N added in one order.
+    """weight (B, G, N) @ values (B, N, K), in blocks of N that are added in a fixed order.
 
-    onnxruntime 1.32 cuts a long sum of few rows into as many parts as it has threads, and the last bits follow.
+    onnxruntime 1.32 divides a long sum by its number of threads, so that the last bits of one product would depend on
+    it.
     """
     blocks = weight.unflatten(2, (-1, _BLOCK)).transpose(1, 2) @ values.unflatten(1, (-1, _BLOCK))  # (B, ·, G, K)
     return blocks.sum(dim=1)

@@ -1,13 +1,12 @@
-"""The network: cue channels of a crop -> normal, depth, diffuse, specular, roughness and expected error.
+"""The main network: cue channels of a crop -> normal, depth, diffuse, specular, roughness and expected error.
 
-One encoder, three decoder branches (normal + depth + error; diffuse; specular + roughness), each with
-residual blocks and a convolution of its own on every skip, as the paper. No normalization layers: the
-absolute level of radiance and DoLP is information. At the bottom every place sees every other (attention
-over the object's cells and their mean). Diffuse color that is in doubt is drawn towards the colors that
-recur in the picture. Gloss comes last: it is shown the other branches' normal and diffuse color and how much
-brighter the picture is than they explain, and shares what it finds among all places that look alike or have
-the same color, so that a highlight here tells the roughness there; where rough bodies polarize less, so does the
-DoLP that is missing.
+One encoder and three decoders (normal, depth and error; diffuse; specular and roughness). Each decoder has residual
+blocks and a convolution of its own on every skip connection, as in the paper below. There is no normalization: the
+absolute levels of radiance and DoLP carry information. At the coarsest level every cell sees all cells of the object
+(attention, and their mean). Uncertain diffuse color is moved towards the colors that recur in the picture. Gloss comes
+last. Its inputs are the normal and diffuse color of the other decoders, and the light and polarization that these do
+not explain. It shares its estimates between places of similar features or the same color, so that a highlight in one
+place gives the roughness in another.
 
 References
 ----------
@@ -24,14 +23,15 @@ from torch.nn import functional as F
 from polcap.stages.cues import CHANNELS, FLOOR
 from polcap.training.gloss_profiles import GlossEvidence, Profiles, figures_of
 from polcap.training.recurring_colors import ColorGloss, Recolor
+from polcap.training.unet import ResidualBlock
 from polcap.training.variants import VARIANTS
 
 SIZE_MULTIPLE = 32
 OUTPUTS = ("normal", "depth", "diffuse", "specular", "roughness", "sigma")
 _COLOR_OUTPUTS = 5  # diffuse, doubt of its lightness and of its hue
 _GLOSS_OUTPUTS = 5  # specular, roughness, highlight
-_HINTS = 10  # to the gloss branch: normal, diffuse, light over what they explain, DoLP missing from what they explain
-_SHARED = (2, 1)  # decoder levels of 1/8 and 1/4 of the resolution
+_HINTS = 10  # inputs of the gloss decoder: normal, diffuse, light above their shading, DoLP missing from theirs
+_SHARED = (2, 1)  # decoder levels with attention, at 1/8 and 1/4 of the resolution
 _MASK = CHANNELS.index("mask")
 _CLIPPED = CHANNELS.index("clipped")
 _RATIO = slice(CHANNELS.index("s1"), CHANNELS.index("s2") + 1)
@@ -40,10 +40,10 @@ COLOR = slice(CHANNELS.index("log_r"), CHANNELS.index("log_b") + 1)
 
 @dataclass(frozen=True)
 class NetworkShape:
-    """Widths per level, from half resolution down."""
+    """Channels per level, from half resolution down."""
 
     encoder: tuple[int, ...] = (32, 64, 128, 192, 256)
-    geometry: tuple[int, ...] = (32, 64, 96, 128)  # decoder widths, from half resolution down
+    geometry: tuple[int, ...] = (32, 64, 96, 128)  # decoders
     color: tuple[int, ...] = (32, 32, 64, 96)
     gloss: tuple[int, ...] = (32, 48, 64, 96)
     blocks: tuple[int, ...] = (1, 2, 2, 2, 1)  # residual blocks per encoder level
@@ -59,10 +59,10 @@ LARGE = NetworkShape(
 class MainNetwork(nn.Module):  # type: ignore[misc]  # torch comes without types here
     """Channels (B, 14, H, W) -> maps (B, ·, H, W) by name; H and W multiples of 32.
 
-    normal: unit, in the frame of each pixel's ray. depth: growing away from the camera, mean about 0, in
-    units of `gbuffers.depth_unit`. diffuse, specular: ρ_d and F0, linear. roughness: perceptual.
-    sigma: expected angle between this normal and the true one, degrees. highlight: share of S0 that the
-    surface reflects; it is learned for what it teaches the rest and is not exported.
+    normal: unit, in the frame of each pixel's ray. depth: growing away from the camera, mean about 0, in units of
+    `traced_views.depth_unit`. diffuse, specular: ρ_d and F0, linear. roughness: perceptual. sigma: expected angle
+    between estimated and true normal, degrees. highlight: share of S0 that the surface reflects; it is learned because
+    it helps the other maps, and is not exported.
     """
 
     def __init__(self, shape: NetworkShape = SMALL, variant: str = "ours") -> None:
@@ -75,12 +75,12 @@ class MainNetwork(nn.Module):  # type: ignore[misc]  # torch comes without types
         self.levels = nn.ModuleList(_residuals(w, n) for w, n in zip(widths, shape.blocks))
         self.down = nn.ModuleList(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(widths))
         self.context = Context(widths[-1])
-        self.geometry = Branch(widths, shape.geometry, shape.skip_blocks, skips, 5)
-        self.color = Branch(widths, shape.color, shape.skip_blocks, skips, _COLOR_OUTPUTS)
+        self.geometry = Decoder(widths, shape.geometry, shape.skip_blocks, skips, 5)
+        self.color = Decoder(widths, shape.color, shape.skip_blocks, skips, _COLOR_OUTPUTS)
         self.recolor = Recolor()
         self.profiles = Profiles(widths[1], widths[0], shape.gloss[1] + _GLOSS_OUTPUTS)
         self.color_gloss = ColorGloss(_GLOSS_OUTPUTS)
-        self.gloss = Branch(widths, shape.gloss, shape.skip_blocks, skips, _GLOSS_OUTPUTS, hints=_HINTS)
+        self.gloss = Decoder(widths, shape.gloss, shape.skip_blocks, skips, _GLOSS_OUTPUTS, hints=_HINTS)
 
     def forward(self, x: Tensor) -> dict[str, Tensor]:
         seen = self.inputs(x)
@@ -96,15 +96,15 @@ class MainNetwork(nn.Module):  # type: ignore[misc]  # torch comes without types
         cosine, usable = normal[:, 2:].detach(), inside * (1 - clipped)
         with torch.autocast(x.device.type, enabled=False):
             diffuse, member, colors = self.recolor(own, color[:, 3:], cosine, inside.float(), clipped.float())
-        body = torch.log(0.9 * diffuse * normal[:, 2:].clamp(min=0) + FLOOR)  # what the diffuse light would be
+        body = torch.log(0.9 * diffuse * normal[:, 2:].clamp(min=0) + FLOOR)  # log S0 of diffuse light alone
         figures = figures_of(level, self.sees_dolp * x[:, _RATIO].float() / 10, normal, diffuse)
         hints = torch.cat([normal, diffuse, level - body, figures[:, -1:]], dim=1).detach() * inside
         thinned = GlossEvidence(*(part[:, :, ::2, ::2].detach() for part in (figures, normal[:, 2:], diffuse, usable)))
         parts = [self.shape.gloss[1], _GLOSS_OUTPUTS]
-        readings, itself = self.profiles(features[1], features[0], thinned).split(parts, dim=1)
+        readings, direct = self.profiles(features[1], features[0], thinned).split(parts, dim=1)
         shown = torch.cat([seen, hints.to(seen.dtype)], dim=1)
         gloss = self.gloss(features, shown, inside, F.avg_pool2d(readings, 2)).float()
-        gloss = gloss + F.interpolate(itself, scale_factor=2.0, mode="bilinear", align_corners=False)
+        gloss = gloss + F.interpolate(direct, scale_factor=2.0, mode="bilinear", align_corners=False)
         with torch.autocast(x.device.type, enabled=False):
             corrected = self.color_gloss(thinned, gloss[:, :, ::2, ::2], member[:, :, ::2, ::2].detach(), colors)
         gloss = gloss + F.interpolate(corrected, scale_factor=2.0, mode="bilinear", align_corners=False)
@@ -119,25 +119,12 @@ class MainNetwork(nn.Module):  # type: ignore[misc]  # torch comes without types
         }
 
 
-class Residual(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """x + conv(relu(conv(relu(x)))), the second convolution born as zero."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.first = nn.Conv2d(width, width, 3, padding=1)
-        self.second = nn.Conv2d(width, width, 3, padding=1)
-        nn.init.zeros_(self.second.weight)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x + self.second(F.relu(self.first(F.relu(x))))
-
-
 def _residuals(width: int, count: int) -> nn.Sequential:
-    return nn.Sequential(*[Residual(width) for _ in range(count)])
+    return nn.Sequential(*[ResidualBlock(width) for _ in range(count)])
 
 
 class Context(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """Each cell of the coarsest level looks at all the object's cells, and at their mean."""
+    """Attention of each cell of the coarsest level to all cells of the object, and their mean."""
 
     def __init__(self, width: int, heads: int = 4) -> None:
         super().__init__()
@@ -161,7 +148,7 @@ class Context(nn.Module):  # type: ignore[misc]  # torch comes without types her
 
 
 class LinearAttention(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """Places sort themselves softly into groups, and each is told the mean of its groups: cost linear in area.
+    """Soft groups of places, each place receiving the means of its groups; the cost is linear in area.
 
     References
     ----------
@@ -187,8 +174,8 @@ class LinearAttention(nn.Module):  # type: ignore[misc]  # torch comes without t
         return x + self.proj((means @ member).reshape(batch, width, height, across).to(x.dtype))
 
 
-class Branch(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """One decoder: from the coarsest level up to full resolution; `hints` more channels are seen at every level."""
+class Decoder(nn.Module):  # type: ignore[misc]  # torch comes without types here
+    """Decoder from the coarsest level to full resolution; `hints` more input channels reach every level."""
 
     def __init__(
         self,
@@ -200,7 +187,7 @@ class Branch(nn.Module):  # type: ignore[misc]  # torch comes without types here
         hints: int = 0,
     ) -> None:
         super().__init__()
-        coarse = (*widths[1:], encoder[-1])  # what each level receives from below
+        coarse = (*widths[1:], encoder[-1])  # channels from the next coarser level
         self.up = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in zip(coarse, widths))
         self.skip = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in zip(encoder, widths))
         self.block = nn.ModuleList(_residuals(w, blocks) for w in widths)
@@ -208,7 +195,7 @@ class Branch(nn.Module):  # type: ignore[misc]  # torch comes without types here
         self.fine = nn.Conv2d(widths[0], 64, 3, padding=1)  # 16 channels at full resolution
         self.raw = nn.Conv2d(len(CHANNELS) + hints, 16, 3, padding=1)
         self.mix = nn.Conv2d(16, 16, 3, padding=1)
-        self.out = nn.Conv2d(16, outputs, 3, padding=1)  # a smoothing kernel after the shuffle: no grid
+        self.out = nn.Conv2d(16, outputs, 3, padding=1)  # a convolution after the shuffle avoids a grid pattern
         nn.init.normal_(self.out.weight, std=1e-2)
         nn.init.zeros_(self.out.bias)
         self.hint = nn.ModuleList()

@@ -1,6 +1,6 @@
-"""Write a network as the ONNX file that `formats/onnx.py` loads, any size, weights in fp16; read its weights back.
+"""ONNX export of networks for `formats/onnx.py`, with weights in fp16; reads the weights of exported models too.
 
-The stored halves are widened when the model is opened, so arithmetic stays fp32.
+Pictures may have any size. Weights are converted to fp32 when a model is opened, so that arithmetic is fp32.
 """
 
 from collections.abc import Mapping
@@ -21,14 +21,14 @@ from polcap.stages.cues import CHANNELS
 from polcap.training import main_network
 
 OPSET = 17
-NATIVE_SIZE = 256  # px of the longer side that inference shows it: more than it was trained on; measured best
-_OWNER, _HALF = "network.", ".half"  # around the names of stored weights
+NATIVE_SIZE = 256  # px of the longer side in inference; larger than in training, measured to be best
+_PREFIX, _HALF = "network.", ".half"  # of the names of stored weights
 _EARLIER_NAMES = {".ask.": ".qkv.", ".tell.": ".proj.", ".share.": ".attention."}
-_GREATEST_IR = 10  # what onnxruntime 1.20 and later read
+_GREATEST_IR = 10  # read by onnxruntime 1.20 and later
 
 
 def export_main(network: main_network.MainNetwork, path: Path, facts: Mapping[str, str]) -> int:
-    """Export to `path`; `facts` joins the metadata (licence, version, training…). Returns its bytes."""
+    """Export the main network; `facts` joins its metadata (licence, version, training…). Returns the file size."""
     metadata = {
         "channels": ",".join(CHANNELS), "encoding": ENCODING, "native_size": str(NATIVE_SIZE),
         "size_multiple": str(main_network.SIZE_MULTIPLE),
@@ -36,60 +36,60 @@ def export_main(network: main_network.MainNetwork, path: Path, facts: Mapping[st
         "in radii of the disc that covers as many pixels as the object; diffuse, specular: linear; "
         "roughness: perceptual; sigma: expected normal error, degrees",
     }  # fmt: skip
-    return export_network(_Ordered(network), path, main_network.OUTPUTS, metadata | dict(facts))
+    return export_network(_OrderedOutputs(network), path, main_network.OUTPUTS, metadata | dict(facts))
 
 
 def export_network(network: nn.Module, path: Path, outputs: tuple[str, ...], metadata: Mapping[str, str]) -> int:
-    """Any network of channels (1, N, H, W) to named maps, with what `formats/onnx.py` asks a file to say."""
+    """Export a network from channels (1, N, H, W) to named maps, with the metadata that `formats/onnx.py` requires."""
     names = metadata["channels"].split(",")
     side = 2 * int(metadata["size_multiple"])
     dynamic = {name: {2: "height", 3: "width"} for name in ("channels", *outputs)}
-    with atomic.path(path) as beside:
+    with atomic.path(path) as temporary:
         torch.onnx.export(
-            network.eval().float(), (torch.zeros(1, len(names), side, side),), str(beside),
+            network.eval().float(), (torch.zeros(1, len(names), side, side),), str(temporary),
             input_names=["channels"], output_names=list(outputs), dynamic_axes=dynamic,
-            opset_version=OPSET, dynamo=False, do_constant_folding=False,  # that would take weights' names
+            opset_version=OPSET, dynamo=False, do_constant_folding=False,  # folding would rename weights
         )  # fmt: skip
-        graph = onnx.load(str(beside))
+        graph = onnx.load(str(temporary))
         _halve(graph)
         graph.ir_version = min(graph.ir_version, _GREATEST_IR)
         helper.set_model_props(graph, dict(metadata))
         onnx.checker.check_model(graph)
-        onnx.save(graph, str(beside))
+        onnx.save(graph, str(temporary))
     return path.stat().st_size
 
 
 def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Weights of a model that `export_main` wrote, as the network's state, and its metadata.
+    """Weights of a model written by `export_main`, as the network's state, and its metadata.
 
-    The file holds equal tensors once, so what has not learned yet may be missing.
+    The file stores equal tensors once, so that weights without any training may be missing.
 
     Raises
     ------
     InputError
-        Not there, or not such a model.
+        The file does not exist or is no ONNX model.
     """
     try:
         graph = onnx.load(str(path))
     except (OSError, DecodeError) as error:
         raise InputError(f"{path}: cannot be read as an ONNX model ({error}); name one that polcap wrote") from error
     state = {
-        _named(tensor.name): torch.tensor(numpy_helper.to_array(tensor)).float()
+        _present_name(tensor.name): torch.tensor(numpy_helper.to_array(tensor)).float()
         for tensor in graph.graph.initializer
-        if tensor.name.startswith(_OWNER)
+        if tensor.name.startswith(_PREFIX)
     }
     return state, {entry.key: entry.value for entry in graph.metadata_props}
 
 
-def _named(name: str) -> str:
-    """Today's name of a weight in the network: models up to number 8 were written under earlier ones."""
-    name = name.removeprefix(_OWNER).removesuffix(_HALF)
+def _present_name(name: str) -> str:
+    """Present name of a stored weight; models up to number 8 were written with other names."""
+    name = name.removeprefix(_PREFIX).removesuffix(_HALF)
     for before, now in _EARLIER_NAMES.items():
         name = name.replace(before, now)
     return name
 
 
-class _Ordered(nn.Module):  # type: ignore[misc]  # torch comes without types here
+class _OrderedOutputs(nn.Module):  # type: ignore[misc]  # torch comes without types here
     """The network's maps as a tuple, in the order of OUTPUTS."""
 
     def __init__(self, network: main_network.MainNetwork) -> None:

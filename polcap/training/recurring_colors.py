@@ -1,9 +1,9 @@
-"""The colors of a picture as a few that recur: what a place's albedo is, and what its color says of its gloss.
+"""Recurring colors of a picture in the main network: they correct uncertain albedos and estimate gloss by color.
 
-An object wears few colors, seen under many angles. Where a place is seen badly, at the limb or under a
-wide highlight, the colors seen well elsewhere tell what its albedo can be; and a color that shows no
-highlight wherever it faces the flash is rough, however glossy the print beside it. The colors are the
-picture's own, a mixture of Gaussians found anew in each; nothing about them is learned.
+An object has few colors, seen under many angles. Where a place is seen badly, near the outline or under a wide
+highlight, its albedo is probably one of the colors seen well elsewhere. A color without a highlight where it faces the
+flash is rough, even next to a glossy print. The colors are a mixture of Gaussians, fitted to each picture; only their
+use is learned.
 """
 
 from dataclasses import dataclass
@@ -15,17 +15,18 @@ from torch import Tensor, nn
 from polcap.training.gloss_profiles import PROFILE, GlossEvidence, profile
 
 COLORS = 8
-_OFFSET = 0.02  # of albedo, before its logarithm
-_AXES = ((3**-0.5, 3**-0.5, 3**-0.5), (2**-0.5, -(2**-0.5), 0.0), (6**-0.5, 6**-0.5, -2 * 6**-0.5))  # light, hues
+_OFFSET = 0.02  # added to albedo before its logarithm
+# lightness and two hues
+_AXES = ((3**-0.5, 3**-0.5, 3**-0.5), (2**-0.5, -(2**-0.5), 0.0), (6**-0.5, 6**-0.5, -2 * 6**-0.5))
 _KNOTS_DEG = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 65.0, 70.0, 75.0, 80.0, 90.0)
-_LIGHT_DOUBT = (0.4, 0.35, 0.3, 0.2, 0.17, 0.17, 0.27, 0.37, 0.48, 0.6, 0.7, 0.8)  # 1σ along the axes at these
-_HUE_DOUBT = 0.3  # of that
-_CLIPPED = 0.5  # 1σ more
-_MOST = 3.0  # that a place's doubt may differ from what its zenith lets expect, in the logarithm
-_SURE = 0.2  # doubt of lightness under which a place has its whole say in what the colors are
-_WIDTH = 0.2  # of a color before its own is known
-_FINEST = 0.05
-_ROUNDS = (5, 7)  # with that width, with their own
+_LIGHT_DOUBT = (0.4, 0.35, 0.3, 0.2, 0.17, 0.17, 0.27, 0.37, 0.48, 0.6, 0.7, 0.8)  # 1σ of log lightness at these
+_HUE_DOUBT = 0.3  # 1σ of the hues, of that
+_CLIPPED = 0.5  # added to 1σ where the picture is clipped
+_MAX_CHANGE = 3.0  # of the logarithm of 1σ from its value by zenith
+_SURE = 0.2  # 1σ of lightness below which a place has full weight in the fit of the colors
+_WIDTH = 0.2  # 1σ of all colors in the first rounds of the fit
+_MIN_WIDTH = 0.05  # 1σ of a color
+_ROUNDS = (5, 7)  # of the fit: with that width, with a width for each color
 
 
 @dataclass(frozen=True)
@@ -38,55 +39,55 @@ class ColorMixture:
 
 
 class Recolor(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """Albedo drawn towards the colors of its picture, as far as it is in doubt."""
+    """Albedo moved towards the colors of its picture, by its uncertainty."""
 
     def __init__(self) -> None:
         super().__init__()
         light = torch.log(torch.tensor(_LIGHT_DOUBT))
         hue = light + torch.log(torch.tensor(_HUE_DOUBT))
-        self.knots = nn.Parameter(torch.stack([light, hue]))  # log of 1σ over zenith
+        self.knots = nn.Parameter(torch.stack([light, hue]))  # log of 1σ against zenith
 
     def forward(
         self, diffuse: Tensor, doubt: Tensor, cosine: Tensor, inside: Tensor, clipped: Tensor
     ) -> tuple[Tensor, Tensor, ColorMixture]:
         """Albedo (B, 3, H, W), each place's share in the colors (B, COLORS, H, W), and the colors.
 
-        doubt (B, 2, H, W) is added to the logarithm of what the zenith lets expect, for light and for hue; cosine of
-        the zenith, inside and clipped (B, 1, H, W).
+        doubt (B, 2, H, W) is added to the log of 1σ by zenith, for lightness and for hue; cosine of the zenith, inside
+        and clipped (B, 1, H, W).
         """
         color = _opponent(diffuse)
-        expected = _hats(cosine.flatten(2)) @ self.knots.T
-        sigma = torch.exp(expected.transpose(1, 2).reshape(doubt.shape) + doubt.clamp(-_MOST, _MOST))
+        expected = _interpolation_weights(cosine.flatten(2)) @ self.knots.T
+        sigma = torch.exp(expected.transpose(1, 2).reshape(doubt.shape) + doubt.clamp(-_MAX_CHANGE, _MAX_CHANGE))
         weight = inside * (1 - clipped) * (_SURE / sigma[:, :1]).square().clamp(max=1) + 1e-6
         colors = fit_mixture(*(part[:, :, ::2, ::2].flatten(2).detach() for part in (color, weight)))
         spread = (sigma + _CLIPPED * clipped)[:, [0, 1, 1]].square()
-        moved, member = _drawn(color.flatten(2), spread.flatten(2), colors)
+        corrected, member = _correct(color.flatten(2), spread.flatten(2), colors)
         axes = color.new_tensor(_AXES)
-        out = (torch.exp(axes.T @ moved) - _OFFSET).clamp(1e-3, 1.0)
+        out = (torch.exp(axes.T @ corrected) - _OFFSET).clamp(1e-3, 1.0)
         batch, _, height, width = diffuse.shape
         return out.reshape(batch, 3, height, width), member.reshape(batch, COLORS, height, width), colors
 
 
 def _opponent(diffuse: Tensor) -> Tensor:
-    """Logarithms of albedo (B, 3, H, W) on the axes of lightness and of two hues."""
+    """Logarithms of albedo (B, 3, H, W) on the axes of lightness and two hues."""
     return torch.einsum("ij,bjhw->bihw", diffuse.new_tensor(_AXES), torch.log(diffuse + _OFFSET))
 
 
-def _hats(cosine: Tensor) -> Tensor:
+def _interpolation_weights(cosine: Tensor) -> Tensor:
     """Weights (B, N, knots) of linear interpolation between the knots at cosines (B, 1, N)."""
     knots = cosine.new_tensor(_KNOTS_DEG)
     angle = (torch.acos(cosine.clamp(0, 1 - 1e-6)) * (180 / pi)).transpose(1, 2)
-    steps = ((angle - knots[:-1]) / (knots[1:] - knots[:-1])).clamp(0, 1)  # how far past each knot
+    steps = ((angle - knots[:-1]) / (knots[1:] - knots[:-1])).clamp(0, 1)  # 0…1 from each knot to the next
     one = torch.ones_like(angle)
     return torch.cat([one, steps], dim=2) - torch.cat([steps, 0 * one], dim=2)
 
 
 @torch.no_grad()  # type: ignore[untyped-decorator]
 def fit_mixture(color: Tensor, weight: Tensor) -> ColorMixture:
-    """Expectation-maximization for colors (B, 3, N) with weights (B, 1, N).
+    """Fit a mixture to colors (B, 3, N) with weights (B, 1, N) by expectation-maximization.
 
-    The centers begin at the corners of the colors' spread; first all have one width, so that centers of one color
-    fall together, then each its own.
+    Centers start at the corners of the colors' spread. At first all have one width, so that centers of the same color
+    meet; then each has its own.
     """
     total = weight.sum(dim=2, keepdim=True)
     mean = (color * weight).sum(dim=2, keepdim=True) / total
@@ -105,13 +106,13 @@ def fit_mixture(color: Tensor, weight: Tensor) -> ColorMixture:
         area = sums[..., 6:] + 1e-3
         center = (sums[..., :3] + 1e-3 * center) / area
         if step >= _ROUNDS[0]:
-            variance = (sums[..., 3:6] / area - center * center).clamp(min=0) + _FINEST**2
+            variance = (sums[..., 3:6] / area - center * center).clamp(min=0) + _MIN_WIDTH**2
         share = area / area.sum(dim=1, keepdim=True)
     return ColorMixture(center, variance, share)
 
 
-def _drawn(color: Tensor, spread: Tensor, colors: ColorMixture) -> tuple[Tensor, Tensor]:
-    """Expected true colors (B, 3, N) behind measured ones with variances `spread`, and membership (B, COLORS, N)."""
+def _correct(color: Tensor, spread: Tensor, colors: ColorMixture) -> tuple[Tensor, Tensor]:
+    """Expected true colors (B, 3, N) of measured ones with variances `spread`, and membership (B, COLORS, N)."""
     difference = color[:, None] - colors.center[..., None]  # (B, COLORS, 3, N)
     wide = spread[:, None] + colors.variance[..., None]
     pull = difference / wide
@@ -121,37 +122,37 @@ def _drawn(color: Tensor, spread: Tensor, colors: ColorMixture) -> tuple[Tensor,
 
 
 class ColorGloss(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """What each color of the picture says of its gloss: a correction (B, outputs, H, W) to a first reading."""
+    """Gloss by color: a correction (B, outputs, H, W) to a first estimate."""
 
     def __init__(self, outputs: int) -> None:
         super().__init__()
-        known = 2 * PROFILE + 7 + outputs
+        features = 2 * PROFILE + 7 + outputs
         self.read = nn.Sequential(
-            nn.Linear(known, 256), nn.GELU(), nn.Linear(256, 256), nn.GELU(), nn.Linear(256, outputs)
+            nn.Linear(features, 256), nn.GELU(), nn.Linear(256, 256), nn.GELU(), nn.Linear(256, outputs)
         )
         nn.init.zeros_(self.read[-1].weight)
         nn.init.zeros_(self.read[-1].bias)
 
     def forward(self, seen: GlossEvidence, first: Tensor, member: Tensor, colors: ColorMixture) -> Tensor:
-        """first (B, outputs, H, W): the reading that is corrected, before its sigmoids."""
+        """first (B, outputs, H, W): the estimate to correct, before its sigmoids."""
         outputs = self.read(describe_colors(seen, first, member, colors))  # (B, COLORS, outputs)
         batch, _, height, width = member.shape
         return (outputs.transpose(1, 2) @ member.flatten(2)).reshape(batch, -1, height, width)
 
 
 def describe_colors(seen: GlossEvidence, first: Tensor, member: Tensor, colors: ColorMixture) -> Tensor:
-    """What is known of each color, (B, COLORS, ·).
+    """Features of each color, (B, COLORS, ·).
 
-    Its own profile and the whole object's, the color itself and beside the object's mean, its share, the mean of the
-    first reading.
+    Its profile and the whole object's; the color, and relative to the object's mean; its share; the mean of the first
+    estimate.
     """
     usable, figures, cosine = (part.flatten(2) for part in (seen.usable, seen.figures, seen.cosine))
-    mine = member.flatten(2) * usable
-    area = mine.sum(dim=2, keepdim=True)
+    own = member.flatten(2) * usable
+    area = own.sum(dim=2, keepdim=True)
     share = area / (area.sum(dim=1, keepdim=True) + 1e-3)
     center = colors.center @ usable.new_tensor(_AXES)  # logarithms of red, green, blue
     mean = (share * center).sum(dim=1, keepdim=True)
     whole = profile(usable, figures, cosine).expand(-1, COLORS, -1)
-    said = (mine @ first.flatten(2).transpose(1, 2)) / (area + 1e-3)
-    known = [profile(mine, figures, cosine), whole, center, center - mean, torch.log(share + 1e-3) / 3, said]
-    return torch.cat(known, dim=2)
+    estimate = (own @ first.flatten(2).transpose(1, 2)) / (area + 1e-3)
+    own_profile = profile(own, figures, cosine)
+    return torch.cat([own_profile, whole, center, center - mean, torch.log(share + 1e-3) / 3, estimate], dim=2)

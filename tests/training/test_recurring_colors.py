@@ -71,7 +71,7 @@ def test_what_is_seen_well_keeps_its_shades() -> None:
 def test_doubt_is_interpolated_between_its_knots() -> None:
     knots = torch.tensor(recurring_colors._KNOTS_DEG)
     at = torch.deg2rad(torch.cat([knots, torch.tensor([35.0])]))
-    weights = recurring_colors._hats(torch.cos(at).view(1, 1, -1))[0]
+    weights = recurring_colors._interpolation_weights(torch.cos(at).view(1, 1, -1))[0]
     torch.testing.assert_close(weights.sum(dim=1), torch.ones(len(at)))
     torch.testing.assert_close(weights @ knots, torch.rad2deg(at), atol=0.1, rtol=0)
     assert abs(float(weights[-1, 3]) - 0.5) < 0.01

@@ -125,14 +125,14 @@ def test_resume_without_a_checkpoint_says_so(data: Path, tmp_path: Path, monkeyp
 
 def test_a_run_is_not_begun_over_another(data: Path, tmp_path: Path) -> None:
     train.NetworkTraining(TINY, torch.device("cpu"), 1e-3).save(tmp_path / "last.pt")
-    with pytest.raises(InputError, match="go on from it with --resume"):
+    with pytest.raises(InputError, match="continue from it with --resume"):
         train.main(train.TrainingOptions(data=data, out=tmp_path))
 
 
 def test_a_run_is_resumed_as_it_began(tmp_path: Path) -> None:
     train.NetworkTraining(TINY, torch.device("cpu"), 1e-3, variant="published inputs").save(tmp_path / "last.pt")
     for shape, variant in ((TINY, "ours"), (main_network.SMALL, "published inputs")):
-        with pytest.raises(InputError, match="as 'published inputs'; resume it as it began"):
+        with pytest.raises(InputError, match=r"variant \('published inputs'\); resume it with the same ones"):
             train.NetworkTraining(shape, torch.device("cpu"), 1e-3, variant=variant).load(tmp_path / "last.pt")
 
 
