@@ -1,4 +1,4 @@
-"""A cross-polarised shot, from its folder to the albedo under a clipped highlight."""
+"""A cross-polarized shot, from its folder to the albedo under a clipped highlight."""
 
 from collections.abc import Callable
 from dataclasses import replace

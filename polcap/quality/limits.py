@@ -87,7 +87,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float, Meta(gt=0, le=1, description="share of the light that is there without the flash [1]")
     ] = 0.1
     max_crossed_misfit: Annotated[
-        float, Meta(gt=0, le=1, description="share of the object brighter in the cross-polarised shot than in S0 [1]")
+        float, Meta(gt=0, le=1, description="share of the object brighter in the cross-polarized shot than in S0 [1]")
     ] = 0.05
     max_ill_posed: Annotated[
         float, Meta(ge=0, le=1, description="share of the object whose DoLP no dielectric can have [1]")

@@ -237,7 +237,7 @@ def _description(maps: SurfaceMaps, depth: Mapping[str, str | float]) -> dict[st
             "confidence.exr": "expected error of the normal, degrees; half",
             "stokes.exr": "S0.R ... S2.B in camera channels, linear, sensor white at the reference exposure = 1; half",
             "cues.exr": "dolp; aolp in degrees, 0 ... 180; normalized.S1, normalized.S2; diffuse_color.R, .G, .B; "
-            "with a cross-polarised shot the two parts of S0 as photograph.png has it, linear: scattered.R, .G, .B and "
+            "with a cross-polarized shot the two parts of S0 as photograph.png has it, linear: scattered.R, .G, .B and "
             "mirrored.R, .G, .B; half",
         },
     }

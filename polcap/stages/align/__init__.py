@@ -65,7 +65,7 @@ def register(radiance: AngleStack, color: ColorCalibration, settings: Settings) 
         transform[k], residual[k], correlation[k] = _register_shot(name, reference, shot, step, settings)
     if radiance.crossed is not None:
         shot = detail(radiance.crossed.picture, detail_px, step)
-        crossed, _, _ = _register_shot("the cross-polarised shot", reference, shot, step, settings)
+        crossed, _, _ = _register_shot("the cross-polarized shot", reference, shot, step, settings)
     return Alignment(transform, residual, correlation, crossed)
 
 

@@ -1,12 +1,14 @@
 """Stage 1: merge the RAW bracket of each polarizer angle into radiance, variance and quality.
 
-For one angle, with the frames' exposures e relative to the reference frame (e = 1 there):
+For one angle, with Y the signals of the frames and e their exposures relative to the reference frame:
 
-1. every frame is binned and compared with the reference frame: motion, exposure ratio per channel, noise of its ISO,
-   pixels that disagree (`bracket`, with `exposure`, `noise` and `ghosts`);
-2. a first estimate X₀ = Σ Y/a / Σ e/a (a = noise slope; the Poisson maximum-likelihood merge, unbiased because no
-   weight depends on a noisy pixel) is smoothed where it is flat (`ghosts.FirstEstimate`);
-3. X = Σ w (Y/e) / Σ w with w = e² / (a e X₀ + b) from that smoothed estimate, clipped pixels left out (`weights`).
+1. Each frame is binned and compared with the reference frame: motion, exposure ratio per channel, sensor noise, and
+   pixels that disagree (`bracket`, with `exposure`, `noise` and `ghosts`).
+2. A first estimate X₀ = Σ Y/a / Σ e/a, with a the slope of the noise line, is smoothed where the picture is flat
+   (`ghosts.FirstEstimate`). It is the maximum-likelihood merge of Poisson counts, and unbiased because no weight
+   depends on a noisy pixel.
+3. X = Σ w (Y/e) / Σ w with weights w = e² / (a e X₀ + b) from the smoothed estimate, without clipped pixels
+   (`weights`).
 
 References
 ----------
@@ -45,7 +47,7 @@ from polcap.stages.hdr import exposure, noise, planes, weights
 from polcap.stages.hdr.bracket import Bracket, Link, compare
 from polcap.stages.hdr.planes import Reader, same_size
 
-_LEAST_PX = 48  # of a merged picture's side: tiles of noise, and registration at a quarter of the size
+_LEAST_PX = 48  # least side of a merged picture: noise and motion are measured in tiles
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -66,16 +68,19 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @stage(version=11)
 def merge(capture: Capture, decode: Decode, settings: Settings) -> AngleStack:
-    """Radiance of every shot on the scale of its reference frame.
+    """Radiance (K, H, W, 3) of every shot, on the scale of its reference frame.
 
-    The reference frame is the one of middle brightness in the first shot, and of the same index in every
-    shot, so that the flash energy of one pop stands for a whole shot. Clipped pixels are taken from the
-    darkest frame and flagged CLIPPED where even that one clips; pixels whose frames disagree are taken
-    from the reference frame alone (from the darkest where that clips) and flagged GHOST. Exposure ratios
-    come from the pixels; the metadata's serve only where pixels cannot tell and no flash fired. Ambient
-    frames are subtracted in proportion to the exposure by their settings; they are not registered.
+    The reference frame is the frame of middle brightness in the first shot, and the frame of the same index in the
+    other shots. So a shot has the flash energy of its reference frame. Pixels clipped in every frame are taken from the
+    darkest frame and flagged CLIPPED. Pixels whose frames disagree are taken from the reference frame alone, or from
+    the darkest where that clips, and flagged GHOST. Exposure ratios are measured in the pixels; those of the metadata
+    are used only where pixels do not suffice and no flash fired. Ambient frames are subtracted in proportion to the
+    exposure by their settings; they are not registered.
 
-    Raises CaptureError for unequal brackets, frames of different size, unknown ratios and too much motion.
+    Raises
+    ------
+    CaptureError
+        Brackets of unequal length, frames of different size, unknown exposure ratios or too much motion.
     """
     _check_counts(capture.shots)
     shots = (*capture.shots, *(() if capture.crossed is None else (capture.crossed,)))
@@ -93,9 +98,9 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
     image = read(first.frames[_middle(order)])
     _check_grid(first.frames[_middle(order)], image, settings)
     sensor, view, side = _sensor(capture, image, settings), _view(capture, image, settings), image.superpixel
-    # chosen in the frame of the middle by the metadata, as in `check`, which reads each frame once
+    # in the middle frame by the metadata, as in `check`, which reads each frame only once
     places = sharpness.places(read(first.frames[(len(first.frames) - 1) // 2]), settings.clip)
-    del image  # the reader alone decides how long a frame is held
+    del image  # so that the reader can free the frame
     lines = noise.Lines(() if capture.calibration is None else capture.calibration.noise)
     shape, stack = (0, 0, 0), _empty(0, (0, 0, 0))
     links, ambient_shares, tiles = [], [], []
@@ -136,7 +141,7 @@ def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
 
 
 def _check_counts(shots: tuple[Shot, ...]) -> None:
-    """Raises CaptureError where brackets have different numbers of frames."""
+    """Raise CaptureError for brackets with different numbers of frames."""
     for shot in shots:
         if len(shot.frames) != len(shots[0].frames):
             raise CaptureError(
@@ -146,7 +151,7 @@ def _check_counts(shots: tuple[Shot, ...]) -> None:
 
 
 def _memory_plan(capture: Capture, image: SensorImage, settings: Settings) -> planes.MemoryPlan:
-    """Memory to hold, by the first frame's size; a binned mosaic's pixels are a quarter of its photosites."""
+    """Memory that the merge may use, by the size of the first frame; binning leaves a quarter of the pixels."""
     height, width = image.value.shape[:2]
     pixels = height * width // (4 if image.cfa is not None and settings.demosaic == "superpixel" else 1)
     return planes.plan_memory(len(capture.shots), len(capture.shots[0].frames), pixels, image.value.nbytes)
@@ -159,7 +164,7 @@ def _by_brightness(shot: Shot, read: Reader) -> tuple[int, ...]:
         image = read(frame)
         black = float(image.black.mean())
         value = image.value[: image.value.shape[0] // 2 * 2]
-        rows = value[::8].mean(dtype=np.float64) + value[1::8].mean(dtype=np.float64)  # of both phases
+        rows = value[::8].mean(dtype=np.float64) + value[1::8].mean(dtype=np.float64)  # both CFA rows
         return (float(rows) / 2 - black) / (image.white - black)
 
     if len(shot.frames) == 1:
@@ -168,12 +173,12 @@ def _by_brightness(shot: Shot, read: Reader) -> tuple[int, ...]:
 
 
 def _middle(order: tuple[int, ...]) -> int:
-    """The frame of middle brightness."""
+    """Index of the frame of middle brightness."""
     return order[(len(order) - 1) // 2]
 
 
 def _check_grid(frame: Frame, image: SensorImage, settings: Settings) -> None:
-    """Raises CaptureError where the sensor cannot be interpolated as asked, or has too few pixels."""
+    """Raise CaptureError if the mosaic cannot be demosaiced as requested, or the frame has too few pixels."""
     (height, width), side = image.value.shape[:2], image.superpixel
     if settings.demosaic == "full" and side == 3:
         raise CaptureError(
@@ -187,13 +192,13 @@ def _check_grid(frame: Frame, image: SensorImage, settings: Settings) -> None:
 
 
 def _sensor(capture: Capture, image: SensorImage, settings: Settings) -> ColorSensor:
-    """The sensor by its first shot's reference frame."""
+    """Properties of the sensor, from the first shot's reference frame."""
     binned = image.cfa is not None and settings.demosaic == "superpixel" and capture.layout != "sensor"
     return ColorSensor(image.camera_matrix, image.white_balance, image.site_px if binned else None)
 
 
 def _view(capture: Capture, image: SensorImage, settings: Settings) -> View:
-    """The pinhole camera on the grid of the merge, whose pixel (0, 0) lies in the middle of a superpixel."""
+    """The pinhole camera of the merged picture, in which pixel (0, 0) is the center of a superpixel."""
     scale = 1.0 if settings.demosaic == "full" else float(image.superpixel)
     x, y = capture.principal_px
     center = (x - (scale - 1) / 2) / scale, (y - (scale - 1) / 2) / scale
@@ -201,7 +206,7 @@ def _view(capture: Capture, image: SensorImage, settings: Settings) -> View:
 
 
 def _empty(shots: int, shape: tuple[int, int, int]) -> MaskedImage:
-    """Memory for all shots of C, H, W, (K, H, W, 3)."""
+    """Unfilled memory (K, H, W, 3) for all shots, of shape (C, H, W) each."""
     _, height, width = shape
     value, variance = (np.empty((shots, height, width, 3), np.float32) for _ in range(2))
     return MaskedImage(value, variance, np.empty((shots, height, width), np.uint8))
@@ -210,7 +215,7 @@ def _empty(shots: int, shape: tuple[int, int, int]) -> MaskedImage:
 def _weigh(
     shot: Shot, order: tuple[int, ...], lines: noise.Lines, read: Reader, settings: Settings
 ) -> weights.WeightedFrames:
-    """The frames of a shot, compared in an order and ready to be summed."""
+    """Compare the frames of a shot in the order of brightness, and weigh them."""
     bracket = Bracket(shot, order, _middle(order))
     compared = compare(bracket, lines, read, settings.max_motion_px)
     full = settings.demosaic == "full" and read(shot.frames[bracket.reference]).cfa is not None
@@ -220,9 +225,9 @@ def _weigh(
 def _crossed(
     shot: Shot, shape: tuple[int, int, int], lines: noise.Lines, read: Reader, settings: Settings
 ) -> MaskedImage:
-    """The crossed shot merged like the others, on the scale of its own middle frame: its flash has another power."""
+    """Merge the cross-polarized shot, on the scale of its own middle frame: its flash has another energy."""
     weighted = _weigh(shot, _by_brightness(shot, read), lines, read, settings)
-    same_size("the cross-polarised shot", weighted.shape, shape)
+    same_size("the cross-polarized shot", weighted.shape, shape)
     one = _empty(1, shape)
     picture = MaskedImage(one.value[0], one.variance[0], one.quality[0])
     weighted.merge_into(picture)
@@ -234,7 +239,7 @@ def _crossed(
 def _divide_by_falloff(
     capture: Capture, view: View, stack: MaskedImage, crossed: MaskedImage | None, settings: Settings
 ) -> None:
-    """Divide all shots by the lens's light, in place, where it was calibrated."""
+    """Divide all shots by the lens's falloff, in place, if it was calibrated."""
     light = None if capture.calibration is None else capture.calibration.falloff
     if light is None or not settings.falloff:
         return
@@ -244,13 +249,13 @@ def _divide_by_falloff(
 
 
 def _exposure_ratios(links: list[list[Link]]) -> Floats:
-    """(K, E, 3) of the frames of all shots; a monochrome channel counts as three."""
+    """Exposure ratios (K, E, 3) of the frames of all shots; a monochrome channel is repeated."""
     ratios = np.array([[link.ratio.astype(np.float64) for link in shot] for shot in links])
     return np.repeat(ratios, 3 // ratios.shape[2], axis=2)
 
 
 def _equipment(capture: Capture, view: View) -> Equipment:
-    """Light, lens and polarizer of a capture; the lens on the grid of `view`."""
+    """Light, lens and polarizer of a capture, with the lens's distortion in pixels of `view`."""
     light, known = _light(capture), capture.calibration
     if known is None:
         return Equipment(light)
@@ -265,7 +270,7 @@ def _equipment(capture: Capture, view: View) -> Equipment:
 
 
 def _light(capture: Capture) -> Literal["flash", "steady", "one exposure", "unknown"]:
-    """The light of the shots by the metadata."""
+    """Kind of light, from the metadata."""
     if capture.layout == "sensor":
         return "one exposure"
     fired = {frame.exif.flash_fired for shot in capture.shots for frame in shot.frames}
@@ -273,5 +278,5 @@ def _light(capture: Capture) -> Literal["flash", "steady", "one exposure", "unkn
 
 
 def _offsets(shots: tuple[Shot, ...]) -> Floats:
-    """Offsets of the planes of one polarizer mosaic against the first, (K, 2) px."""
+    """Offsets (K, 2) px of the planes of a polarization mosaic from the first plane."""
     return np.asarray([np.subtract(shot.place_px, shots[0].place_px) for shot in shots])

@@ -14,19 +14,19 @@ from polcap.images import Floats, Shot
 from polcap.optics import sensor
 from polcap.optics.registration import Pyramid, register
 from polcap.stages.hdr import exposure, noise
-from polcap.stages.hdr.ghosts import Anchor, Exposed, FirstEstimate
+from polcap.stages.hdr.ghosts import Anchor, ExposedFrame, FirstEstimate
 from polcap.stages.hdr.planes import Planes, Reader, Signals, blocks, planar, resample, same_size, signals
 
 Bools = NDArray[np.bool_]
 
 _SMOOTH = cv2.getGaussianKernel(7, 0.8, cv2.CV_32F)
-_STILL_PX = 0.05  # less motion than this is not worth a resampling
-_MOTION_SIGMAS = 3.0  # nor is motion that is not known better
+_STILL_PX = 0.05  # frames that moved less are not resampled
+_MOTION_SIGMAS = 3.0  # nor are frames that moved by less than this many of its standard deviations
 
 
 @dataclass(frozen=True)
 class Bracket:
-    """A shot, and the order in which its frames are compared."""
+    """A shot, the order in which its frames are compared, and its reference frame."""
 
     shot: Shot
     order: tuple[int, ...]  # of the frames, darkest first
@@ -34,18 +34,18 @@ class Bracket:
 
     @property
     def others(self) -> list[int]:
-        """The frames but the reference frame."""
+        """All frames except the reference frame."""
         return [e for e in self.order if e != self.reference]
 
 
 @dataclass(frozen=True)
 class Link:
-    """A frame against the reference frame, on the binned grid."""
+    """A frame compared with the reference frame, on the binned grid."""
 
-    ratio: Floats  # (C,) float32, exposure relative to the reference
-    motion: Floats | None  # (3, 3) reference px → frame px; None: it did not move
-    misfit: Floats  # (C,) float32 px²; variance per squared gradient left by registration and aliasing
-    curvature: float = 0.0  # of its tone against the reference's; 0: linear, NaN: unknown
+    ratio: Floats  # (C,) float32 exposure relative to the reference
+    motion: Floats | None  # (3, 3) reference px → frame px; None: no motion
+    misfit: Floats  # (C,) float32 px²; variance per squared gradient, from registration errors and aliasing
+    curvature: float = 0.0  # of `exposure.curvature`; 0: linear, NaN: unknown
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class RegisteredFrame:
     """A frame on the reference frame's grid."""
 
     signals: Signals
-    gain: Floats | None  # (H, W) noise variance gain of resampling; None: it was not resampled
+    gain: Floats | None  # (H, W) factor on the noise variance by resampling; None: not resampled
 
     @property
     def mean_gain(self) -> float:
@@ -62,7 +62,7 @@ class RegisteredFrame:
 
 @dataclass(frozen=True)
 class AmbientLight:
-    """Light without the flash, at the settings of the reference frame."""
+    """Light without the flash, for the exposure of the reference frame."""
 
     value: Floats  # (C, H, W)
     variance: Floats  # (C, H, W)
@@ -70,26 +70,29 @@ class AmbientLight:
 
 @dataclass(frozen=True)
 class ComparedBracket:
-    """A bracket, measured on the binned grid."""
+    """Everything that the comparison measured in a bracket, on the binned grid."""
 
     links: list[Link]
     noises: list[noise.Noise]
     ghost: Bools  # (H, W)
     estimate: Floats  # (C, H, W) the smoothed first estimate
-    ambient_share: float  # of all light, present without the flash; NaN where that was not photographed
-    frames: list[RegisteredFrame] | None  # as they will be merged; None where ambient light was subtracted
+    ambient_share: float  # of all light that is not from the flash; NaN without ambient frames
+    frames: list[RegisteredFrame] | None  # None where ambient light was subtracted
 
 
 def compare(bracket: Bracket, lines: noise.Lines, read: Reader, limit_px: float) -> ComparedBracket:
-    """Compare every frame with the reference frame; `lines` learns the noise of their ISO.
+    """Compare every frame with the reference frame, and add to `lines` the noise of their ISO.
 
-    Raises CaptureError: motion above `limit_px` visible RAW px, no common exposure, frames of different size.
+    Raises
+    ------
+    CaptureError
+        Motion of more than `limit_px` visible RAW px, unknown exposure ratios, or frames of different size.
     """
     source = _BracketSignals(bracket, lines, read)
     still = source.signals(bracket.reference)
     channels = still.shape[0]
     if not bracket.others and source.ambient is None:
-        source.learn(bracket.reference, noise.alone(still))
+        source.learn(bracket.reference, noise.sample_frame(still))
     same = Link(np.ones(channels, np.float32), None, np.zeros(channels, np.float32))
     links, frames = {bracket.reference: same}, {bracket.reference: RegisteredFrame(still, None)}
     ghost = np.zeros(still.usable.shape, bool)
@@ -99,14 +102,14 @@ def compare(bracket: Bracket, lines: noise.Lines, read: Reader, limit_px: float)
     for e in bracket.others:
         assert pyramid is not None
         links[e], frames[e] = _compare_frame(source, e, still, pyramid, limit_px)
-        frame = Exposed(frames[e].signals, links[e].ratio, source.line(e))
-        anchor = anchor or Anchor(Exposed(still, same.ratio, source.line(bracket.reference)))
+        frame = ExposedFrame(frames[e].signals, links[e].ratio, source.line(e))
+        anchor = anchor or Anchor(ExposedFrame(still, same.ratio, source.line(bracket.reference)))
         new = anchor.ghosts(frame, links[e].misfit, frames[e].mean_gain)
         estimate.add(frame, frame.signals.usable & ~new)
         ghost |= new
         if e == bracket.order[0]:
             anchor.fill(frame)
-    estimate.add(Exposed(still, same.ratio, source.line(bracket.reference)), still.usable)
+    estimate.add(ExposedFrame(still, same.ratio, source.line(bracket.reference)), still.usable)
     smoothed = estimate.smoothed(still if anchor is None else anchor, ghost)
     every = range(len(links))
     return ComparedBracket(
@@ -120,7 +123,7 @@ def compare(bracket: Bracket, lines: noise.Lines, read: Reader, limit_px: float)
 
 
 class _BracketSignals:
-    """Signals and noise of a bracket's frames, less the ambient light."""
+    """Signals and noise of a bracket's frames, with the ambient light subtracted."""
 
     def __init__(self, bracket: Bracket, lines: noise.Lines, read: Reader) -> None:
         self.frames, self.reference = bracket.shot.frames, bracket.reference
@@ -128,25 +131,25 @@ class _BracketSignals:
         self.name = f"shot {bracket.shot.name}"
         self._iso = [frame.exif.iso or f"frame {e}" for e, frame in enumerate(self.frames)]
         still = read(self.frames[self.reference])
-        self.raw_px = still.superpixel  # of one pixel
-        self._rounding = sensor.rounding_variance(still) / 2  # variance of a binned green
+        self.raw_px = still.superpixel  # RAW px per px
+        self._rounding = sensor.rounding_variance(still) / 2  # variance of binned green, the mean of two photosites
         self.ambient = ambient_light(bracket, lines, read)
 
     def signals(self, e: int) -> Signals:
-        """Signals of a frame, less its ambient light."""
+        """Signals of frame e, with its ambient light subtracted."""
         found = self._read.signals(self._shot, e)
         if self.ambient is None:
             return found
         if not self.settled(e):
-            self.learn(e, noise.alone(found))
+            self.learn(e, noise.sample_frame(found))
         value = found.rows(slice(0, found.shape[1])) - self._ambient_exposure(e) * self.ambient.value
         return Planes(value, found.usable)
 
     def line(self, e: int) -> noise.Noise:
-        """Noise of a frame, with that of the ambient light that was subtracted."""
+        """Noise of frame e, with the noise of the ambient light that was subtracted."""
         if self.ambient is None:
             return self.sensor_line(e)
-        return self.sensor_line(e).lit(self._ambient_exposure(e) * self.ambient.value.mean(axis=(1, 2)))
+        return self.sensor_line(e).with_ambient(self._ambient_exposure(e) * self.ambient.value.mean(axis=(1, 2)))
 
     def sensor_line(self, e: int) -> noise.Noise:
         return self._lines.line(self._iso[e], self._rounding)
@@ -172,16 +175,16 @@ def _compare_frame(
     motion = measure_motion(name, pyramid, brightness_pyramid(found), limit_px / source.raw_px)
     learn = source.ambient is None and not source.settled(e, reference)
     frame = RegisteredFrame(found, None)
-    if motion is not None:  # the scene's detail does not cancel between the frames as they are
+    if motion is not None:  # before resampling, the scene's detail does not cancel between the frames
         if learn:
-            source.learn(e, noise.alone(found))
-            source.learn(reference, noise.alone(still))
+            source.learn(e, noise.sample_frame(found))
+            source.learn(reference, noise.sample_frame(still))
         frame = RegisteredFrame(*resample(found, motion))
     tiles = exposure.common_tiles(still, frame.signals)
     measured = exposure.of_tiles(*tiles)
     ratio = exposure.measured_or_stated(name, measured, still.shape[0], source.frames[e], source.frames[reference])
     if motion is None and learn:
-        for number, samples in zip((reference, e), noise.paired(still, frame.signals, ratio)):
+        for number, samples in zip((reference, e), noise.sample_pair(still, frame.signals, ratio)):
             source.learn(number, samples)
     noises = source.line(reference), source.line(e)
     misfit = noise.misfit(still, frame.signals, ratio, noises, frame.mean_gain)
@@ -189,7 +192,7 @@ def _compare_frame(
 
 
 def brightness_pyramid(frame: Signals) -> Pyramid:
-    """The square root of all channels together, lightly smoothed: about even noise."""
+    """Pyramid of the square root of all channels' sum, lightly smoothed; its noise is nearly uniform."""
     _, height, width = frame.shape
     out = np.empty((height, width), np.float32)
     for rows, inner, target in blocks(height, _SMOOTH.size // 2):
@@ -204,9 +207,12 @@ def brightness_pyramid(frame: Signals) -> Pyramid:
 
 
 def measure_motion(name: str, still: Pyramid, other: Pyramid, limit_px: float) -> Floats | None:
-    """Reference px → frame px (3, 3), or None where the frame did not move measurably.
+    """Motion (3, 3), reference px → frame px; None for a frame that did not move measurably.
 
-    Raises CaptureError, with the frame's name, where it moved by more than `limit_px` px of the pyramids.
+    Raises
+    ------
+    CaptureError
+        The frame `name` moved by more than `limit_px` px of the pyramids.
     """
     found = register(still, other)
     if found.shift_px > limit_px:
@@ -218,9 +224,12 @@ def measure_motion(name: str, still: Pyramid, other: Pyramid, limit_px: float) -
 
 
 def ambient_light(bracket: Bracket, lines: noise.Lines, read: Reader, full: bool = False) -> AmbientLight | None:
-    """The mean of a bracket's ambient frames, on the full grid with `full`; None where it has none.
+    """Mean of a bracket's ambient frames, on the full grid with `full`; None without ambient frames.
 
-    Raises CaptureError where the frames are of different size.
+    Raises
+    ------
+    CaptureError
+        The frames have different sizes.
     """
     shot, reference = bracket.shot, bracket.shot.frames[bracket.reference]
     if not shot.ambient:
@@ -239,7 +248,7 @@ def ambient_light(bracket: Bracket, lines: noise.Lines, read: Reader, full: bool
         image = read(frame)
         iso = frame.exif.iso or "ambient"
         if not lines.knows(iso):
-            lines.learn(iso, noise.alone(signals(image, read.clip)))
+            lines.learn(iso, noise.sample_frame(signals(image, read.clip)))
         line = lines.line(iso, sensor.rounding_variance(image) / 2)
         level = np.stack([cv2.blur(plane, (5, 5)) for plane in value]) * np.float32(one)
         variance += noise.of_pixels(level, line, image.cfa if full else None) / np.float32(sum(share) ** 2)
@@ -247,7 +256,7 @@ def ambient_light(bracket: Bracket, lines: noise.Lines, read: Reader, full: bool
 
 
 def _ambient_share(ambient: AmbientLight, flash: Floats) -> float:
-    """Of all light in the brighter half of the picture, the part that the flash (C, H, W) did not bring."""
+    """Share of ambient light in all light, in the brighter half of the picture; `flash` (C, H, W) is the flash's."""
     without, lit = (picture[:, ::4, ::4].sum(0) for picture in (ambient.value, flash))
     bright = lit + without >= np.median(lit + without)
     return float(without[bright].sum() / max(float((lit + without)[bright].sum()), 1e-9))

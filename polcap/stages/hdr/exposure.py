@@ -1,4 +1,4 @@
-"""Exposure of a frame relative to another: measured in their pixels, or stated by the metadata."""
+"""Exposure ratio of two frames: measured in their pixels, or from metadata."""
 
 from dataclasses import dataclass
 
@@ -10,32 +10,33 @@ from polcap.images import Floats, Frame
 from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.stages.hdr.planes import Signals, tile_means
 
-_TONE_RANGE, _TONE_BINS, _TONE_SPAN = (0.01, 0.9), 8, 0.7  # of the sensor's range; bins; ln of brightness, one stop
+# For the tone curve: brightness in the sensor's range, bins of brightness, and their least span in ln (one stop).
+_TONE_RANGE, _TONE_BINS, _TONE_SPAN = (0.01, 0.9), 8, 0.7
 TILE = 16  # px
 _LEAST_TILES = 30
-_SURE, _LEAST_SURE = 0.01, 0.03  # relative 1σ of a channel's ratio, of that of all channels
-_DIM, _DIMMEST = 4e-3, 4e-4  # of the sensor's range: tiles below are left to black-level errors
+_SURE, _LEAST_SURE = 0.01, 0.03  # largest relative 1σ of a ratio: of one channel, of all channels together
+_DIM, _DIMMEST = 4e-3, 4e-4  # of the sensor's range: darker tiles suffer from errors of the black level
 
 
 @dataclass(frozen=True)
 class Ratio:
-    """Exposure of one frame over that of another."""
+    """Exposure ratio of two frames, per channel."""
 
     value: Floats  # (C,)
     sigma: Floats  # (C,) 1σ, relative
 
 
 def ratio(reference: Signals, other: Signals) -> Ratio | None:
-    """other / reference (C,) of registered signals; None where their pixels cannot tell."""
+    """Exposure ratio other / reference (C,) of registered signals; None if their pixels do not suffice."""
     return of_tiles(*common_tiles(reference, other))
 
 
 def of_tiles(a: Floats, b: Floats) -> Ratio | None:
-    """The same of tiles (T, C) of both, see `common_tiles`.
+    """Exposure ratio b / a (C,) from tiles (T, C) of both frames, see `common_tiles`; None if they do not suffice.
 
-    The quotient of sums over tiles: of Poisson counts the maximum-likelihood estimate, and free of the bias of a mean
-    of quotients or of logarithms. Tiles that disagree (something moved) are dropped. A channel too dim to be known to
-    1 % takes the ratio of all channels together.
+    It is the quotient of sums over tiles: the maximum-likelihood estimate for Poisson counts, without the bias of a
+    mean of quotients or of logarithms. Tiles that disagree, because something moved, are dropped. A channel with an
+    error above 1 % takes the ratio of all channels together.
     """
     if not len(a):
         return None
@@ -48,22 +49,25 @@ def of_tiles(a: Floats, b: Floats) -> Ratio | None:
 
 
 def common_tiles(reference: Signals, other: Signals) -> tuple[Floats, Floats]:
-    """Means (T, C) of the tiles that are usable throughout in both."""
+    """Means (T, C) in both frames of the tiles that are fully usable in both."""
     channels, height, width = reference.shape
     usable = (reference.usable & other.usable).view(np.uint8) * np.uint8(255)
     tiled = usable[: height // TILE * TILE, : width // TILE * TILE]
     if not tiled.size:
         return np.zeros((0, channels)), np.zeros((0, channels))
-    # one unusable pixel of the 256 takes the mean to 254
+    # with one unusable pixel of 256 the mean is 254
     inside = cv2.resize(tiled, (width // TILE, height // TILE), interpolation=cv2.INTER_AREA) == 255
     a, b = (tile_means(picture, TILE)[inside].astype(np.float64) for picture in (reference, other))
     return a, b
 
 
 def measured_or_stated(name: str, measured: Ratio | None, channels: int, frame: Frame, reference: Frame) -> Floats:
-    """Exposure relative to the reference frame, (C,) float32.
+    """Exposure (C,) float32 relative to the reference frame: the measured one, else that of the metadata.
 
-    Raises CaptureError, with the frame's name, where neither pixels nor metadata tell it.
+    Raises
+    ------
+    CaptureError
+        Neither pixels nor metadata of the frame `name` give a ratio.
     """
     if measured is not None:
         return measured.value.astype(np.float32)
@@ -81,14 +85,14 @@ def measured_or_stated(name: str, measured: Ratio | None, channels: int, frame: 
 
 
 def stated(frame: Frame, reference: Frame) -> float:
-    """Exposure relative to the reference frame as stated, or by the camera's settings; NaN if unknown."""
+    """Exposure relative to the reference frame, by capture.toml or the camera's settings; NaN if unknown."""
     if frame.exposure and reference.exposure:
         return frame.exposure / reference.exposure
     return _by_settings(frame, reference)
 
 
 def of_ambient(frame: Frame, reference: Frame) -> float:
-    """Ambient light that a frame gathers, relative to the reference frame; 1 where the metadata do not tell."""
+    """Exposure to ambient light relative to the reference frame, by the camera's settings; 1 if unknown."""
     settings = _by_settings(frame, reference)
     return settings if np.isfinite(settings) else 1.0
 
@@ -99,10 +103,10 @@ def _by_settings(frame: Frame, reference: Frame) -> float:
 
 
 def curvature(a: Floats, b: Floats) -> float:
-    """How the exposure ratio of two frames changes with brightness: d ln(other/reference) / d ln(both); 0: linear.
+    """Change of the exposure ratio with brightness, d ln(b/a) / d ln √(a b), from tiles (T, C) of `common_tiles`.
 
-    A tone curve, unlike a lamp, changes the ratio from shadows to highlights. NaN where the frames span too little.
-    a, b (T, C): of `common_tiles`.
+    It is 0 for linear files. A tone curve makes the ratio differ between shadows and highlights; a change of the light
+    does not. NaN if the tiles span too little brightness.
     """
     a, b = a.mean(axis=1), b.mean(axis=1)
     lit = (a > _TONE_RANGE[0]) & (b > _TONE_RANGE[0]) & (a < _TONE_RANGE[1]) & (b < _TONE_RANGE[1])
@@ -119,7 +123,7 @@ def curvature(a: Floats, b: Floats) -> float:
 
 
 def _quotient(a: Floats, b: Floats) -> tuple[float, float] | None:
-    """Σb / Σa over the tiles that agree, and its relative 1σ."""
+    """Σb / Σa over the tiles (T,) that agree, and its relative 1σ; None for too few tiles."""
     for dim in (_DIM, _DIMMEST):
         bright = (a > dim) & (b > dim)
         if bright.sum() >= _LEAST_TILES:
@@ -132,7 +136,7 @@ def _quotient(a: Floats, b: Floats) -> tuple[float, float] | None:
     r = float((b / a)[order][np.searchsorted(weight, weight[-1] / 2)])  # weighted median
     keep = np.ones(len(a), bool)
     for _ in range(6):
-        error = (b - r * a) / np.sqrt(b)  # even noise, were it photons alone
+        error = (b - r * a) / np.sqrt(b)  # uniform noise if there is photon noise only
         scale = MAD_TO_SIGMA * float(np.median(np.abs(error)))
         keep = np.abs(error) <= 4 * scale + 0.003 * np.sqrt(b)
         if keep.sum() < _LEAST_TILES / 2:

@@ -1,7 +1,7 @@
-"""What the exposures of one scene agree on: a first radiance, and the pixels where they do not agree.
+"""Ghost detection between the frames of a bracket, and a first estimate of the radiance.
 
-Frames come registered, in units of the sensor's range, with their exposure ratio to the reference frame.
-Radiance is on the reference frame's scale. All work goes in blocks of rows, channel by channel.
+A ghost is a pixel whose frames disagree, because something moved. Frames are registered; signals are in units of the
+sensor's range, radiance on the scale of the reference frame. All work is done in blocks of rows, channel by channel.
 """
 
 from dataclasses import dataclass
@@ -19,38 +19,39 @@ from polcap.stages.hdr.planes import Signals, blocks
 
 Bools = NDArray[np.bool_]
 
-_WINDOW = 5  # px, side of the window of the comparison and of the smoothing
+_WINDOW = 5  # px, side of the window for comparison and smoothing
 _EVEN = np.full(_WINDOW, 1 / _WINDOW, np.float32)
-_SIGMA = 6.0  # of noise
-_MISFIT = 3.0  # of the registration's own error at edges
-_SHARE = 0.02  # of the radiance: flare and shading may differ by this much between exposures
-_NEIGHBOURS = 1.5  # variance of a window's mean over that of independent pixels: neighbours share some noise
+# A window is a ghost if its frames differ by more than the sum of these three:
+_SIGMA = 6.0  # standard deviations of noise
+_MISFIT = 3.0  # standard deviations of the registration error at edges
+_SHARE = 0.02  # of the radiance: flare and shading differ by as much between exposures
+_CORRELATED = 1.5  # variance of a window's mean over that of independent pixels: neighbors share some noise
 
 
 @dataclass(frozen=True)
-class Exposed:
-    """One registered frame with what was measured of it."""
+class ExposedFrame:
+    """A registered frame with its exposure ratio and noise."""
 
     signals: Signals
-    ratio: Floats  # (C,) float32, exposure relative to the reference frame
+    ratio: Floats  # (C,) float32 exposure relative to the reference frame
     noise: Noise
 
 
 class Anchor:
-    """The exposure that rules each pixel: the reference frame, or the darkest where that one clips."""
+    """Radiance that other frames are compared with: the reference frame, or the darkest where the reference clips."""
 
-    def __init__(self, reference: Exposed) -> None:
+    def __init__(self, reference: ExposedFrame) -> None:
         self.known = reference.signals.usable  # (H, W)
         self._reference = reference
-        self._dark: Exposed | None = None
+        self._dark: ExposedFrame | None = None
 
-    def fill(self, darkest: Exposed) -> None:
-        """Take the darkest frame for the pixels that the reference frame cannot give."""
+    def fill(self, darkest: ExposedFrame) -> None:
+        """Use the darkest frame for pixels that are not usable in the reference frame."""
         self.known = self._reference.signals.usable | darkest.signals.usable
         self._dark = darkest
 
     def rows(self, rows: slice) -> Floats:
-        """Radiance, (C, h, W)."""
+        """Radiance (C, h, W) of some rows."""
         value = self._reference.signals.rows(rows)
         if self._dark is None:
             return value
@@ -61,17 +62,17 @@ class Anchor:
         return np.stack([np.where(own, a, b / r) for a, b, r in zip(value, other, dark.ratio)])
 
     def variance(self, level: Floats, channel: int, rows: slice) -> Floats:
-        """Noise of one pixel of the given rows in a channel, for an expected radiance `level` (h, W)."""
-        own, seen = self._reference.noise.of(channel, level), self._reference.signals.usable[rows]
+        """Noise variance (h, W) in some rows of a channel, for an expected radiance `level` (h, W)."""
+        own, seen = self._reference.noise.of_channel(channel, level), self._reference.signals.usable[rows]
         if self._dark is None or seen.all():
             return own
-        return np.where(seen, own, self._dark.noise.of_radiance(self._dark.ratio).of(channel, level))
+        return np.where(seen, own, self._dark.noise.of_radiance(self._dark.ratio).of_channel(channel, level))
 
-    def ghosts(self, frame: Exposed, misfit: Floats, gain: float) -> Bools:
-        """Pixels (H, W) where a frame differs over a whole window by more than noise, misfit and flare.
+    def ghosts(self, frame: ExposedFrame, misfit: Floats, gain: float) -> Bools:
+        """Pixels (H, W) around which the mean of a window differs by more than noise, registration error and flare.
 
-        misfit: (C,) variance per squared gradient; gain: what resampling made of the frame's noise.
-        Single deviant windows are dropped, the rest is grown by a window.
+        misfit (C,) is the variance per squared gradient, gain the factor on the frame's noise variance by resampling.
+        Isolated windows are dropped, the others are grown by a window.
         """
         _, height, width = frame.signals.shape
         found = np.zeros((height, width), bool)
@@ -82,18 +83,18 @@ class Anchor:
         return _any_around(core, _WINDOW // 2 + 2)
 
     def _block(
-        self, frame: Exposed, misfit: Floats, gain: float, found: Bools, rows: slice, inner: slice, target: slice
+        self, frame: ExposedFrame, misfit: Floats, gain: float, found: Bools, rows: slice, inner: slice, target: slice
     ) -> None:
-        """Windows that differ, `inner` of some rows, into their part `target` of `found`."""
+        """Mark windows that differ: read `rows`, and write their part `inner` to the rows `target` of `found`."""
         anchor, value = self.rows(rows), frame.signals.rows(rows)
         off = np.zeros(anchor.shape[1:], bool)
-        theirs = frame.noise.of_radiance(frame.ratio, gain)
+        noise = frame.noise.of_radiance(frame.ratio, gain)
         for c in range(len(anchor)):
             level = box(anchor[c])
             own = self.variance(level, c, rows)
-            limit = theirs.of(c, level)
+            limit = noise.of_channel(c, level)
             limit += own
-            limit *= np.float32(_SIGMA**2 * _NEIGHBOURS / _WINDOW**2)
+            limit *= np.float32(_SIGMA**2 * _CORRELATED / _WINDOW**2)
             np.sqrt(limit, out=limit)
             if misfit[c]:
                 beyond = box(squared_gradient(anchor[c]))
@@ -112,29 +113,30 @@ class Anchor:
 
 
 class FirstEstimate:
-    """X₀ = Σ Y/a / Σ e/a over usable pixels, smoothed where it is flat."""
+    """First estimate of the radiance, X₀ = Σ Y/a / Σ e/a over usable pixels, smoothed where the picture is flat."""
 
     def __init__(self) -> None:
-        self._parts: list[tuple[Exposed, Bools]] = []
+        self._parts: list[tuple[ExposedFrame, Bools]] = []
 
-    def add(self, frame: Exposed, serves: Bools) -> None:
-        """A frame for the pixels (H, W) that it serves."""
+    def add(self, frame: ExposedFrame, serves: Bools) -> None:
+        """Add a frame, to be used for some pixels (H, W)."""
         self._parts.append((frame, serves))
 
     def smoothed(self, otherwise: Signals | Anchor, ghost: Bools) -> Floats:
-        """The local mean, and of each pixel's distance to it what noise does not explain, (C, H, W).
+        """The estimate (C, H, W) after a local Wiener filter (Lee, IEEE PAMI 1980).
 
-        A local Wiener filter (Lee, IEEE PAMI 1980), deaf to distances under 1.5 times the noise.
-        `otherwise` stands in where no frame served, and at ghosts.
+        Each pixel is moved towards the mean of its window, by the share of the window's variance that noise explains;
+        the filter assumes 1.5 times the noise variance. `otherwise` is used where no frame was added, and at ghosts.
         """
         out = np.empty(self._parts[0][0].signals.shape, np.float32)
-        halo = 2 * (_WINDOW // 2)  # the spread is a window of distances to the mean of a window
+        halo = 2 * (_WINDOW // 2)  # windows of distances from means of windows
         parallel.results(partial(self._block, otherwise, ghost, out, *block) for block in blocks(out.shape[1], halo))
         return out
 
     def _block(
         self, otherwise: Signals | Anchor, ghost: Bools, out: Floats, rows: slice, inner: slice, target: slice
     ) -> None:
+        """Smooth `rows`, and write their part `inner` to the rows `target` of `out`."""
         values = [frame.signals.rows(rows) for frame, _ in self._parts]
         serves = [_weight(serve[rows]) for _, serve in self._parts]
         clear = ~ghost[rows]
@@ -158,12 +160,12 @@ class FirstEstimate:
 
 
 def _weight(serves: Bools) -> Floats | np.float32:
-    """Where a frame serves, 1, else 0: (h, w), or one number where it serves everywhere."""
+    """1 where a frame is used and 0 elsewhere, (h, w); the number 1 where it is used everywhere."""
     return np.float32(1) if serves.all() else serves.astype(np.float32)
 
 
 def _wiener(x: Floats, electrons: Floats | np.float32, floor: Floats | np.float32) -> Floats:
-    """Smoothed (h, w): `electrons` per unit of x, `floor` the read noise's variance in electrons."""
+    """Wiener-filtered x (h, w), with `electrons` per unit of x and `floor` the variance of read noise [electrons²]."""
     mean = box(x)
     distance = x - mean
     spread = box(distance * distance)
@@ -177,18 +179,18 @@ def _wiener(x: Floats, electrons: Floats | np.float32, floor: Floats | np.float3
 
 
 def box(picture: Floats) -> Floats:
-    """Mean (h, w) over the window around each pixel of a picture (h, w), whose border repeats."""
-    # half the time of cv2.blur, which sums in doubles
+    """Mean (h, w) over the window around each pixel of a picture (h, w); border pixels are repeated."""
+    # twice as fast as cv2.blur, which sums in float64
     return np.asarray(cv2.sepFilter2D(picture, -1, _EVEN, _EVEN, borderType=cv2.BORDER_REPLICATE))
 
 
 def _any_around(mask: Bools, reach: int) -> Bools:
-    """Grown by `reach` px in all eight directions."""
+    """The mask grown by `reach` px in all eight directions."""
     kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     return np.asarray(cv2.dilate(mask.view(np.uint8), kernel)).view(bool)
 
 
 def _all_around(mask: Bools, reach: int) -> Bools:
-    """What is left when everything else grows by `reach` px; beyond the border nothing grows."""
+    """The mask shrunk by `reach` px in all eight directions, except from the picture's border."""
     kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     return np.asarray(cv2.erode(mask.view(np.uint8), kernel)).view(bool)

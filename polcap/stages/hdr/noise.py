@@ -1,7 +1,7 @@
-"""Sensor noise as a straight line, variance = slope · signal + floor, read off the pictures themselves.
+"""Sensor noise as a line, variance = slope · signal + floor, measured in the photographs themselves.
 
-Signals are in units of the sensor's range (white − black = 1). Then 1/slope is the number of electrons
-that fill the range, and √floor · (1/slope) the read noise in electrons.
+Signals are in units of the sensor's range (white − black = 1). Then 1/slope is the full well in electrons, and
+√floor · (1/slope) the read noise in electrons.
 
 References
 ----------
@@ -21,12 +21,12 @@ from polcap.optics import demosaic
 from polcap.optics.robust import fit_noise_line
 from polcap.stages.hdr.planes import Signals
 
-TILE = 16  # px; about 68 independent second differences, so that one tile knows its variance to 17 %
+TILE = 16  # px; about 68 independent second differences, which give a tile's variance to 17 %
 FREEDOM = TILE * TILE / 3.78  # 3.78 = Σ ρ² over the autocorrelation of [1, −2, 1] ⊗ [1, −2, 1]
 _SECOND = np.array([1, -2, 1]) / 6**0.5
 _LEAST_TILES = 40
 _TYPICAL_ELECTRONS, _TYPICAL_READ = 20000.0, 4.0  # at ISO 100; e⁻
-_SANE_ELECTRONS = (100.0, 1e6)
+_SANE_ELECTRONS = (100.0, 1e6)  # range of a plausible full well
 
 
 @dataclass(frozen=True)
@@ -37,30 +37,30 @@ class Noise:
     floor: Floats  # (C,)
 
     def variance(self, signal: Floats) -> Floats:
-        """Of pixels whose expected signal (N, C), or any (…, C), is known; a negative one counts as 0."""
+        """Variance (…, C) of pixels for their expected signals (…, C); negative signals count as 0."""
         return np.maximum(signal, 0) * self.slope + self.floor
 
-    def of(self, channel: int, signal: Floats, into: Floats | None = None) -> Floats:
-        """The same for one channel's picture (h, w), a new array unless one to write to is given."""
+    def of_channel(self, channel: int, signal: Floats, into: Floats | None = None) -> Floats:
+        """Variance (h, w) of one channel for its expected signals (h, w), written to `into` or a new array."""
         out: Floats = np.maximum(signal, 0, out=into)
         out *= self.slope[channel]
         out += self.floor[channel]
         return out
 
     def of_radiance(self, ratio: Floats, gain: float = 1.0) -> "Noise":
-        """The same of radiance: of signals divided by their frame's ratio (C,), their variance times a gain."""
+        """The noise line of radiance: signals over their exposure ratio (C,), with `gain` on the variance."""
         return Noise(self.slope * np.float32(gain) / ratio, self.floor * np.float32(gain) / ratio**2)
 
-    def lit(self, level: Floats) -> "Noise":
-        """The same sensor where light of a `level` per channel (C,) was subtracted: its noise stays."""
+    def with_ambient(self, level: Floats) -> "Noise":
+        """The noise line after ambient light of `level` (C,) was subtracted: its noise remains."""
         return Noise(self.slope, self.floor + self.slope * np.maximum(level, 0))
 
 
 def of_pixels(light: Floats, line: Noise, cfa: Bits | None) -> Floats:
-    """Variance of pixels of known expected signal (C, h, w); cfa where they were interpolated from it, not binned."""
+    """Variance (C, h, w) for expected signals (C, h, w); `cfa` for pixels interpolated from it, None if binned."""
     expected = np.empty_like(light)
     for c, plane in enumerate(light):
-        line.of(c, plane, expected[c])
+        line.of_channel(c, plane, expected[c])
     if cfa is None:
         return expected
     expected[1] *= 2  # binned green is the mean of two photosites
@@ -72,31 +72,31 @@ def of_pixels(light: Floats, line: Noise, cfa: Bits | None) -> Floats:
 
 @dataclass(frozen=True)
 class Samples:
-    """Signal and noise variance of small tiles of one frame; unusable ones NaN."""
+    """Signal and variance of small tiles of one frame; NaN for unusable tiles."""
 
     signal: Floats  # (T, C)
     variance: Floats  # (T, C)
-    flat: bool  # the scene's own detail is still in the variance: only the lowest count
+    flat: bool  # the variance includes detail of the scene: only the smallest variances count
 
 
 def roughness(picture: Floats) -> Floats:
-    """Second differences along both axes, (C, H, W) → (C, H−2, W−2); white noise keeps its variance.
+    """Second differences along both axes, (C, H, W) → (C, H−2, W−2); the variance of white noise is unchanged.
 
-    [1, −2, 1] ⊗ [1, −2, 1] / 6 is blind to a ramp.
+    The filter [1, −2, 1] ⊗ [1, −2, 1] / 6 does not respond to a ramp.
     """
     return np.stack([np.asarray(cv2.sepFilter2D(plane, -1, _SECOND, _SECOND))[1:-1, 1:-1] for plane in picture])
 
 
 def strips(height: int, width: int, most: float = 0.75e6) -> list[slice]:
-    """Rows enough for the statistics: whole tile rows (plus the 2 that `roughness` eats), evenly spread."""
+    """Evenly spaced strips of rows: whole rows of tiles, plus 2 px for `roughness`; at most about `most` px in all."""
     rows = max((height - 2) // TILE, 0)
     wanted = max(1, min(rows, int(most / (TILE * max(width, 1)))))
     first = np.unique(np.linspace(0, rows - 1, wanted).astype(int)) if rows else np.zeros(0, int)
     return [slice(TILE * int(r), TILE * int(r) + TILE + 2) for r in first]
 
 
-def alone(picture: Signals) -> Samples:
-    """Tiles of a single frame."""
+def sample_frame(picture: Signals) -> Samples:
+    """Signal and variance in tiles of a single frame."""
     signal, variance = [], []
     for rows in strips(*picture.usable.shape):
         part, whole = picture.rows(rows), usable_tiles(picture.usable[rows])
@@ -106,11 +106,11 @@ def alone(picture: Signals) -> Samples:
     return _samples(signal, variance, True, picture.shape[0])
 
 
-def paired(first: Signals, second: Signals, ratio: Floats) -> tuple[Samples, Samples]:
-    """Tiles of two frames of the same scene in the same place, second = ratio · first but for noise; ratio (C, ).
+def sample_pair(first: Signals, second: Signals, ratio: Floats) -> tuple[Samples, Samples]:
+    """Signal and variance in tiles of two registered frames, second = ratio (C,) · first except for noise.
 
-    With h₁ = t + n₁ and h₂ = r t + n₂ the detail t drops out of ⟨h₁ (h₁ − h₂/r)⟩ = var n₁ and of
-    ⟨h₂ (h₂ − r h₁)⟩ = var n₂, however rich it is and whatever the two gains are.
+    With h₁ = t + n₁ and h₂ = r t + n₂, the scene's detail t cancels in ⟨h₁ (h₁ − h₂/r)⟩ = var n₁ and
+    ⟨h₂ (h₂ − r h₁)⟩ = var n₂.
     """
     columns: tuple[list[Floats], ...] = ([], [], [], [])
     r = np.asarray(ratio, np.float32)
@@ -132,11 +132,11 @@ def paired(first: Signals, second: Signals, ratio: Floats) -> tuple[Samples, Sam
 
 
 def fit(samples: list[Samples], iso: float | None, least_floor: float) -> Noise:
-    """The line through the tiles of all frames of one ISO, channel by channel.
+    """Fit the noise line of each channel to the tiles of all frames of one ISO.
 
-    Tiles are binned by signal, and each bin counts as its median (of `flat` samples: its 15 % quantile, corrected to
-    the mean by the χ² law). Where too few tiles are usable, or the line is absurd, a typical sensor is assumed.
-    `least_floor`: the variance of rounding to whole counts.
+    Tiles are binned by signal. Each bin is represented by the median of its variances; for `flat` samples by the 15 %
+    quantile, converted to the mean by the χ² law. A typical sensor is assumed if there are too few usable tiles or the
+    line is implausible. `least_floor` is the variance from rounding to whole counts.
     """
     channels = samples[0].signal.shape[1]
     line = np.array([_line(samples, c, iso, least_floor) for c in range(channels)], np.float32)
@@ -144,10 +144,10 @@ def fit(samples: list[Samples], iso: float | None, least_floor: float) -> Noise:
 
 
 def misfit(first: Signals, second: Signals, ratio: Floats, lines: tuple[Noise, Noise], gain: float) -> Floats:
-    """How two registered frames differ beyond noise: variance per squared gradient, (C,) px².
+    """Excess variance between two registered frames, per squared gradient, (C,) px²; 0 if not significant.
 
-    Registration errors and aliasing show at edges. From the tiles that have edges; 0 where it is not significant.
-    second = ratio (C,) · first, of noise `lines`; `gain`: of the second frame's noise variance by resampling.
+    It comes from registration errors and aliasing, and is measured in tiles with edges. second = ratio (C,) · first;
+    `lines` are their noise lines, `gain` is the factor on the second frame's noise variance by resampling.
     """
     r = np.asarray(ratio, np.float32)
     columns: tuple[list[Floats], ...] = ([], [], [])
@@ -174,7 +174,7 @@ def misfit(first: Signals, second: Signals, ratio: Floats, lines: tuple[Noise, N
 
 
 def _per_edge(expected: Floats, seen: Floats, edge: Floats) -> float:
-    """k of seen = expected + k · edge by relative least squares, the worst 3 % of the tiles left out."""
+    """Fit k in seen = expected + k · edge by relative least squares, without the worst 3 % of the tiles."""
     good = np.isfinite(seen) & (edge > 0.5 * expected)
     if good.sum() < _LEAST_TILES:
         return 0.0
@@ -191,7 +191,7 @@ def _per_edge(expected: Floats, seen: Floats, edge: Floats) -> float:
 
 
 class Lines:
-    """The noise lines of a capture by ISO: calibrated, or learnt from the first shot of that ISO."""
+    """The noise lines of a capture by ISO: calibrated, or measured in the first shot of that ISO."""
 
     def __init__(self, calibrated: Iterable[NoiseLine] = ()) -> None:
         self._samples: dict[object, list[Samples]] = {}
@@ -201,29 +201,30 @@ class Lines:
         self._settled: set[object] = set(self._known)
 
     def learn(self, iso: object, samples: Samples) -> None:
-        """Add the tiles of a frame, unless the line of its ISO is settled."""
+        """Add the tiles of a frame, unless the line of its ISO is final."""
         if iso not in self._settled:
             self._samples.setdefault(iso, []).append(samples)
             self._known.pop(iso, None)
 
     def line(self, iso: object, least_floor: float) -> Noise:
-        """Noise at an ISO; a key that is not a number is an unknown ISO."""
+        """Noise line at an ISO; a key that is not a number means an unknown ISO."""
         if iso not in self._known:
             number = float(iso) if isinstance(iso, int | float) else None
             self._known[iso] = fit(self._samples[iso], number, least_floor)
         return self._known[iso]
 
     def knows(self, iso: object) -> bool:
-        """Whether the line of an ISO is settled."""
+        """Whether the line of an ISO is final."""
         return iso in self._settled
 
     def settle(self) -> None:
-        """Later shots use the lines known by now."""
+        """Make the present lines final: later shots use them."""
         self._settled = set(self._known)
         self._samples.clear()
 
 
 def _line(samples: list[Samples], channel: int, iso: float | None, least: float) -> tuple[float, float]:
+    """Slope and floor of one channel's noise line."""
     electrons = _TYPICAL_ELECTRONS * 100 / max(iso or 100.0, 1.0)
     typical = 1 / electrons, max(least, (_TYPICAL_READ / electrons) ** 2)
     parts: list[tuple[Floats, Floats, bool]] = []  # (B, n) each: B bins of n tiles
@@ -232,12 +233,12 @@ def _line(samples: list[Samples], channel: int, iso: float | None, least: float)
         if good.sum() < _LEAST_TILES:
             continue
         signal, variance = sample.signal[good, channel], sample.variance[good, channel]
-        for bins in _alike(signal, int(np.clip(len(signal) // 25, 2, 32))):
+        for bins in _bins(signal, int(np.clip(len(signal) // 25, 2, 32))):
             parts.append((signal[bins], variance[bins], sample.flat))
     if not parts:
         return typical
     line = typical
-    for _ in range(3):  # within a bin the signal varies: compare each tile with the line so far
+    for _ in range(3):  # the signal varies within a bin, so each tile is compared with the present line
         x, y, n = [], [], []
         for signal, variance, flat in parts:
             level = signal.mean(axis=1)
@@ -249,14 +250,14 @@ def _line(samples: list[Samples], channel: int, iso: float | None, least: float)
         freedom = FREEDOM * np.concatenate(n)
         signal, seen = np.concatenate(x), np.maximum(np.concatenate(y), least)
         fit = fit_noise_line(signal, seen, freedom, least=least, least_floor=least, outliers=True)
-        if not 1 / _SANE_ELECTRONS[1] < fit.slope < 1 / _SANE_ELECTRONS[0]:  # also of signals all alike: NaN
+        if not 1 / _SANE_ELECTRONS[1] < fit.slope < 1 / _SANE_ELECTRONS[0]:  # NaN if all signals are equal
             return typical
         line = fit.slope, fit.floor
     return line
 
 
-def _alike(signal: Floats, count: int) -> list[NDArray[np.int64]]:
-    """Tiles (T,) in bins by their signal, as even as may be: two arrays (B, n), the second's bins a tile shorter."""
+def _bins(signal: Floats, count: int) -> list[NDArray[np.int64]]:
+    """Indices of tiles in `count` bins by signal (T,): two arrays (B, n), bins of the second one tile shorter."""
     order = np.argsort(signal)
     n, longer = divmod(len(order), count)
     cut = longer * (n + 1)
@@ -264,13 +265,13 @@ def _alike(signal: Floats, count: int) -> list[NDArray[np.int64]]:
 
 
 def _low_quantile(variance: Floats) -> Floats:
-    """Mean variances (B,) of pure noise from the 15 % quantiles of tile variances (B, n) (Wilson and Hilferty's χ²)."""
+    """Mean noise variances (B,) from the 15 % quantiles of tile variances (B, n), by Wilson and Hilferty's χ² law."""
     spread = 2 / (9 * FREEDOM)
     return np.asarray(np.quantile(variance, 0.15, axis=1) / (1 - spread - 1.0364 * spread**0.5) ** 3)
 
 
 def usable_tiles(usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Tiles (T,) of one of `strips` (h, W) that touch no pixel that is not usable."""
+    """Whether each tile (T,) of a strip (h, W) of `strips` has only usable pixels, also around it."""
     bad = np.asarray(~usable.all(axis=0))  # (W,)
     before = np.concatenate([[0], np.cumsum(bad)])
     first = TILE * np.arange((usable.shape[1] - 2) // TILE)
@@ -278,7 +279,7 @@ def usable_tiles(usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def tiles(values: Floats, whole: NDArray[np.bool_]) -> Floats:
-    """Means over the tiles of one of `strips` (C, h, w), (T, C); NaN but where a tile is `whole` (T,)."""
+    """Means (T, C) over the tiles of a strip (C, h, w) of `strips`; NaN for tiles that are not `whole` (T,)."""
     count = len(whole)
     mean = np.empty((count, len(values)))
     for c, plane in enumerate(values):

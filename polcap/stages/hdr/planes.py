@@ -1,7 +1,7 @@
-"""Decoded frames as planes of signal, one per channel, in blocks of rows: decoding ahead, binning, resampling.
+"""Reads frames as planes of linear signals: decoding ahead, binning, resampling, limits of memory.
 
-A limit on memory (`--memory`, `ulimit -d`) decides how much is held: with little room frames are decoded again for
-every pass and planes are computed block by block. The pixels are the same.
+A limit on memory (`--memory`, `ulimit -d`) decides how much stays in memory. With little room, frames are decoded
+again for every pass, and planes are computed block by block. The pixels are the same.
 """
 
 import math
@@ -24,12 +24,12 @@ from polcap.optics.projection import coordinates
 
 Bools = NDArray[np.bool_]
 
-_ROWS = 64  # a block of one channel of a 24 MP picture then fits a core's own cache
-_AHEAD = 2  # frames decoded ahead of the merge, on threads: each waits for a process that decodes
-_PLANES_BYTES = 400_000_000  # of a shot's signals; those of larger shots are computed again for every pass
-_HELD_BYTES = 1_100_000_000  # of decoded frames; more are decoded again when they are needed again
-_WORK_BYTES = 60  # per pixel of the grid: first estimate, registration, masks and blocks
-_FRACTIONS = 32  # of a pixel, to which cv2's Lanczos kernel is tabulated
+_ROWS = 64  # of a block: one channel of a 24 MP picture then fits a core's cache
+_AHEAD = 2  # frames decoded ahead of the merge; each thread waits for a decoding process
+_PLANES_BYTES = 400_000_000  # most for a shot's signals; with more they are computed again for every pass
+_HELD_BYTES = 1_100_000_000  # most for decoded frames; others are decoded again when needed
+_WORK_BYTES = 60  # per pixel, for the first estimate, registration, masks and blocks
+_FRACTIONS = 32  # steps per pixel in the table of cv2's Lanczos kernel
 
 
 class Signals(Protocol):
@@ -46,7 +46,7 @@ class Signals(Protocol):
         ...
 
     def rows(self, rows: slice) -> Floats:
-        """Some rows, (C, h, W) float32: a new array, or a view that must not be written to."""
+        """Some rows (C, h, W) float32; a new array, or a view that must not be changed."""
         ...
 
 
@@ -63,13 +63,13 @@ class Planes:
         return channels, height, width
 
     def rows(self, rows: slice) -> Floats:
-        """As `Signals.rows`: a view, (C, h, W)."""
+        """Some rows (C, h, W), as a view."""
         return self.value[:, rows]
 
 
 @dataclass(frozen=True)
 class Quads:
-    """Signals of a binned mosaic, computed from its counts: a third of the memory of `Planes`."""
+    """Signals of a binned mosaic, computed from its counts when read: a third of the memory of `Planes`."""
 
     image: SensorImage
     usable: Bools
@@ -80,14 +80,14 @@ class Quads:
         return 3, height // self.image.superpixel, width // self.image.superpixel
 
     def rows(self, rows: slice) -> Floats:
-        """As `optics.sensor.signal`, (C, h, W), to the bit."""
+        """Some rows (C, h, W), identical to `optics.sensor.signal`."""
         start, stop, _ = rows.indices(self.shape[1])
         out = np.empty((3, stop - start, self.shape[2]), np.float32)
         self.into(rows, out)
         return out
 
     def into(self, rows: slice, out: Floats) -> None:
-        """The same, written to `out` (C, h, W)."""
+        """Write some rows to `out` (C, h, W)."""
         image = self.image
         assert image.cfa is not None
         _, height, width = self.shape
@@ -113,9 +113,9 @@ class Quads:
 
 
 def signals(image: SensorImage, clip: float, full: bool = False, planes_bytes: float = math.inf) -> Signals:
-    """Signals of a decoded frame, and its usable pixels: unclipped below `clip` [white level].
+    """Signals of a decoded frame; pixels with counts from `clip` [white level] on are not usable.
 
-    A mosaic is binned by superpixels, or with `full` interpolated; planes above `planes_bytes` stay counts (`Quads`).
+    A mosaic is binned by superpixels, or interpolated with `full`. Above `planes_bytes` the result is `Quads`.
     """
     usable = sensor.usable(image, clip, full)
     if image.cfa is None or full:
@@ -135,7 +135,7 @@ def planar(picture: Floats) -> Floats:
 
 
 def blocks(height: int, halo: int = 0, rows: int = _ROWS) -> Iterator[tuple[slice, slice, slice]]:
-    """Rows to read (with a halo, cut at the border), the wanted part of them, and its rows in the picture."""
+    """Blocks of rows: the rows to read, with a halo; their part without the halo; the picture's rows of that part."""
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
         start = max(top - halo, 0)
@@ -147,7 +147,7 @@ def blocks(height: int, halo: int = 0, rows: int = _ROWS) -> Iterator[tuple[slic
 
 
 def tile_means(picture: Signals, side: int) -> Floats:
-    """Means (rows, columns, C) float32 over tiles of side × side px; what is left of a tile is dropped."""
+    """Means (rows, columns, C) float32 over tiles of side × side px; incomplete tiles are dropped."""
     channels, height, width = picture.shape
     down, across = height // side, width // side
     out = np.zeros((down, across, channels), np.float32)
@@ -162,9 +162,9 @@ def tile_means(picture: Signals, side: int) -> Floats:
 
 
 def resample(signals: Signals, matrix: Floats) -> tuple[Planes, Floats]:
-    """A frame on the reference frame's grid by Lanczos interpolation, and the gain of its noise variance (H, W).
+    """Resample a frame on the reference frame's grid by Lanczos interpolation.
 
-    matrix: (3, 3) reference px → frame px.
+    matrix (3, 3) maps reference px → frame px. Also returns the factor (H, W) on the noise variance.
     """
     _, h, w = signals.shape
     inverse = cv2.WARP_INVERSE_MAP
@@ -176,7 +176,7 @@ def resample(signals: Signals, matrix: Floats) -> tuple[Planes, Floats]:
             for plane in signals.rows(slice(0, h))
         ]
     )
-    # no clipped pixel, nor the border, within the main lobes of the kernel
+    # unusable if a clipped pixel or the border is within the main lobes of the kernel
     inner = cv2.erode(signals.usable.view(np.uint8) * 255, np.ones((5, 5), np.uint8), borderValue=0)
     seen = cv2.warpPerspective(inner, matrix, (w, h), flags=inverse | cv2.INTER_LINEAR, borderValue=0) == 255
     gain = np.empty((h, w), np.float32)
@@ -192,7 +192,7 @@ def resample(signals: Signals, matrix: Floats) -> tuple[Planes, Floats]:
 
 @lru_cache(maxsize=1)
 def _kernel_gain() -> Floats:
-    """Σ of squared weights of cv2's Lanczos kernel at fractions 0, 1/32 … 1 of a pixel, (33,)."""
+    """Sums (33,) of the squared weights of cv2's Lanczos kernel at fractions 0, 1/32 … 1 of a pixel."""
     impulse = np.zeros((17, 33), np.float32)
     impulse[:, 16] = 1
     x = np.arange(33, dtype=np.float32)[None] + np.arange(33, dtype=np.float32)[:, None] / 32
@@ -202,16 +202,19 @@ def _kernel_gain() -> Floats:
 
 @dataclass(frozen=True)
 class MemoryPlan:
-    """Memory that the merge may hold, bytes."""
+    """Memory that the merge may use for signals and decoded frames, bytes."""
 
     planes: int = _PLANES_BYTES
     frames: int = _HELD_BYTES
 
 
 def plan_memory(shots: int, frames: int, pixels: int, frame_bytes: int) -> MemoryPlan:
-    """Memory to hold of shots of so many frames each, decoded frames of `frame_bytes`, merged to so many pixels.
+    """Divide the memory under the limit: for `shots` of `frames` each, `frame_bytes` decoded, `pixels` merged.
 
-    Raises SettingError where the merge needs more than the limit even without holding anything.
+    Raises
+    ------
+    SettingError
+        The merge needs more than the limit.
     """
     taken, limit = process_memory()
     if limit is None:
@@ -231,7 +234,7 @@ def plan_memory(shots: int, frames: int, pixels: int, frame_bytes: int) -> Memor
 
 
 def process_memory() -> tuple[int, int | None]:
-    """Bytes of private, writable memory that this process has taken, and its limit; None without one."""
+    """Private, writable memory of this process and its limit [bytes]; None without a limit."""
     try:
         import resource
 
@@ -244,7 +247,7 @@ def process_memory() -> tuple[int, int | None]:
 
 
 class Reader:
-    """Decoded frames: the last few held, the next few being decoded."""
+    """Decodes frames: the last few stay in memory, the next few are decoded ahead."""
 
     def __init__(self, coming: Iterable[Frame], decode: Decode, clip: float) -> None:
         """Frames in the order in which they will be read; counts from `clip` [white level] on are clipped."""
@@ -259,7 +262,7 @@ class Reader:
         self._decoding: dict[int, Future[SensorImage]] = {}
 
     def __call__(self, frame: Frame) -> SensorImage:
-        """Raises DecodeError."""
+        """The decoded frame; raises DecodeError."""
         if id(frame) not in self._held:
             decoding = self._decoding.pop(id(frame), None) or self._pool.submit(self._decode, frame)
             image = decoding.result()
@@ -279,13 +282,13 @@ class Reader:
         self._channels = self._channels or found.shape[0]
         if not isinstance(found, Planes) or found.shape[0] == self._channels:
             return found
-        even = np.ptp(found.value) == 0  # all clipped: the other frames show how many channels it has
-        if even or found.shape[0] == 1:  # a grey picture among coloured ones
+        uniform = np.ptp(found.value) == 0  # fully clipped: its number of channels is that of the other frames
+        if uniform or found.shape[0] == 1:  # a grey picture among colored ones
             return Planes(np.repeat(found.value[:1], self._channels, axis=0), found.usable)
         return found
 
     def forget(self, frames: Iterable[Frame]) -> None:
-        """Drop frames that are not needed any more."""
+        """Free frames that are no longer needed."""
         for frame in frames:
             self._held.pop(id(frame), None)
         self._look_ahead(None, len(self._held) + 2 * _AHEAD)
@@ -295,7 +298,7 @@ class Reader:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _look_ahead(self, now: Frame | None, room: int) -> None:
-        """Begin to decode the next frames, as long as they and those held have room."""
+        """Start to decode the next frames while they and those in memory fit."""
         self._coming = deque(frame for frame in self._coming if frame is not now)
         while self._coming and len(self._decoding) < _AHEAD and len(self._held) + len(self._decoding) < room:
             following = self._coming.popleft()
@@ -304,7 +307,7 @@ class Reader:
 
 
 def same_size(name: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> None:
-    """Raises CaptureError where two frames (C, H, W) do not fit together."""
+    """Raise CaptureError for a frame (C, H, W) with another shape than the frames before it."""
     if shape != expected:
         a, b = (f"{s[2]}×{s[1]}×{s[0]}" for s in (shape, expected))
-        raise CaptureError(f"{name} is {a}, the frames before it {b} [px, px, channels]: use one camera")
+        raise CaptureError(f"{name} is {a}, the frames before it {b} [px × px × channels]: use one camera")

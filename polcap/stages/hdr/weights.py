@@ -1,7 +1,7 @@
-"""Weighted mean of a bracket's frames: radiance, its variance and quality, in one pass over blocks of rows.
+"""Weighted mean of a bracket's frames: radiance, its variance and quality.
 
-X = Σ w (Y/e) / Σ w with w = e² / (a e X₀ + b): e the frame's exposure, a and b its noise line, X₀ the smoothed first
-estimate. Weights fall towards saturation and are 0 where a frame is clipped or disagrees.
+X = Σ w (Y/e) / Σ w with w = e² / (a e X₀ + b), where e is the frame's exposure, a and b its noise line, and X₀ the
+smoothed first estimate. Weights fall towards saturation, and are 0 where a frame is clipped or a ghost.
 
 References
 ----------
@@ -24,12 +24,12 @@ from polcap.stages.hdr.planes import Reader, Signals, blocks, resample
 
 Bools = NDArray[np.bool_]
 
-_FALL = 0.05  # [white level]; over this range below saturation a frame's weight falls to _LEAST
+_FALL = 0.05  # [white level] range below saturation in which a frame's weight falls from 1 to _LEAST
 _LEAST = 1e-3
-_BLOCK_PX = 64_000  # of one channel: all planes of a block then stay in a core's own cache
-_SOME = 1e-9  # weight of the reference frame where no frame is usable: some value for every pixel
-_AS_DARK = 1.02  # a frame not brighter by more than this counts as the darkest
-_DARK_SIGMAS = np.float32(2)
+_BLOCK_PX = 64_000  # px of a block and channel: all planes of a block then fit a core's cache
+_SOME = 1e-9  # weight of the reference frame where no frame is usable, so that every pixel has a value
+_AS_DARK = 1.02  # a frame at most this factor brighter than the darkest counts as darkest too
+_DARK_SIGMAS = np.float32(2)  # pixels below this many standard deviations are flagged DARK
 
 
 @dataclass(frozen=True)
@@ -37,25 +37,25 @@ class _Frame:
     """One frame on the reference frame's grid."""
 
     signals: Signals
-    serves: Bools  # (H, W)
-    blur: Floats | None  # (H, W) noise variance gain of resampling
+    serves: Bools  # (H, W) pixels for which the frame is used
+    blur: Floats | None  # (H, W) factor on the noise variance by resampling
     ratio: Floats  # (C,)
     noise: noise.Noise
     misfit: Floats  # (C,)
-    lit: np.float32  # ambient light in it, relative to the reference frame
-    last: bool  # there is no darker one to fall back on
-    cfa: Bits | None  # where it was interpolated, not binned
-    least: np.float32  # weight even where it does not serve
+    ambient: np.float32  # exposure to ambient light, relative to the reference frame
+    last: bool  # no frame is darker: used up to saturation
+    cfa: Bits | None  # of an interpolated mosaic; None: binned
+    least: np.float32  # weight where the frame is not used
 
 
 @dataclass(frozen=True)
 class WeightedFrames:
-    """The frames of a bracket, ready to be summed."""
+    """The frames of a bracket with everything that their weights need."""
 
     frames: list[_Frame]
     compared: ComparedBracket  # on the grid of the frames
     ambient: AmbientLight | None
-    served: Bools  # (H, W) where some frame is usable
+    served: Bools  # (H, W) pixels with at least one usable frame
     clip: float
 
     @property
@@ -63,7 +63,7 @@ class WeightedFrames:
         return self.frames[0].signals.shape
 
     def merge_into(self, out: MaskedImage) -> None:
-        """Write the weighted mean; a single channel goes into all three, with 3 times its variance."""
+        """Write the weighted mean to `out`; a single channel is copied to all three, with 3 times its variance."""
         _, height, width = self.shape
         rows_of_block = max(_BLOCK_PX // width, 1)
         parallel.results(partial(self._block, out, rows) for rows, _, _ in blocks(height, rows=rows_of_block))
@@ -83,10 +83,10 @@ class WeightedFrames:
         cv2.merge(list(variance), out.variance[rows])
 
     def _rows(self, rows: slice) -> tuple[Floats, Floats]:
-        """Weighted mean and its variance of some rows, (C, h, W).
+        """Weighted mean and its variance in some rows, (C, h, W).
 
-        With frames' weights w = trust / v, v the variance of their radiance, Σ w² v is Σ trust · w. Sums are made of
-        w / ratio, so that counts need not be brought to radiance.
+        With weights w = trust / v and v the variance of a frame's radiance, Σ w² v = Σ trust · w. The sums use
+        w / ratio, so that signals need not be converted to radiance.
         """
         estimate = self.compared.estimate[:, rows]
         light = np.maximum(estimate, 0)
@@ -99,8 +99,8 @@ class WeightedFrames:
                 ratio, plane = float(frame.ratio[c]), sample[c]
                 np.divide(trust, weight, out=weight)
                 if self.ambient is not None and shares is not None:
-                    plane = plane - frame.lit * self.ambient.value[c, rows]
-                    cv2.scaleAdd(weight, float(frame.lit), shares[c], shares[c])
+                    plane = plane - frame.ambient * self.ambient.value[c, rows]
+                    cv2.scaleAdd(weight, float(frame.ambient), shares[c], shares[c])
                 cv2.accumulateProduct(weight, plane, number[c])
                 cv2.scaleAdd(weight, ratio, weights[c], weights[c])
                 if np.ndim(trust):
@@ -115,16 +115,16 @@ class WeightedFrames:
         return number, variance
 
     def _trust(self, frame: _Frame, estimate: Floats, rows: slice) -> Floats | np.float32:
-        """Factor of a frame's weight, lower where it clips or nearly does, (h, W) or one number."""
+        """Factor on a frame's weight, lower near and at saturation; (h, W) or one number."""
         serves = frame.serves[rows]
         trust: Floats | np.float32 = np.float32(1) if serves.all() else np.maximum(serves, frame.least)
         return trust if frame.last else trust * self._ramp(frame, estimate)
 
     def _noise(self, frame: _Frame, rows: slice, light: Floats, steep: Floats | None) -> Floats:
-        """Expected variance of a frame's radiance `light` (C, h, W) times its ratio."""
+        """Expected variance of a frame's radiance `light` (C, h, W), times its exposure ratio."""
         if self.ambient is not None:
-            lit = (frame.lit / frame.ratio)[:, None, None]
-            light = light + lit * np.maximum(self.ambient.value[:, rows], 0)
+            exposure_ = (frame.ambient / frame.ratio)[:, None, None]
+            light = light + exposure_ * np.maximum(self.ambient.value[:, rows], 0)
         if frame.cfa is None:
             out = np.empty_like(light)
             for c, plane in enumerate(light):
@@ -136,13 +136,13 @@ class WeightedFrames:
             out /= ratio
         if frame.blur is not None:
             out *= frame.blur[rows]
-        if steep is not None:  # registration and aliasing show at edges
+        if steep is not None:  # registration errors and aliasing, at edges
             for c, plane in enumerate(out):
                 cv2.scaleAdd(steep[c], float(frame.misfit[c] * frame.ratio[c]), plane, plane)
         return out
 
     def _ramp(self, frame: _Frame, estimate: Floats) -> Floats:
-        """1 well below saturation, falling towards 0 at it, so that no frame drops out in a step; (h, W)."""
+        """Factor (h, W) that falls smoothly from 1 to _LEAST at saturation, so that weights have no step."""
         peak = estimate[0] * frame.ratio[0]
         for plane, ratio in zip(estimate[1:], frame.ratio[1:]):
             np.maximum(peak, plane * ratio, out=peak)
@@ -154,7 +154,7 @@ class WeightedFrames:
 def prepare(
     bracket: Bracket, compared: ComparedBracket, lines: noise.Lines, read: Reader, full: bool
 ) -> WeightedFrames:
-    """The frames of a compared bracket, registered, on the full grid with `full`; each with the pixels it serves."""
+    """The registered frames of a compared bracket, on the full grid with `full`, and the pixels each is used for."""
     ambient = ambient_light(bracket, lines, read, full)
     if full:
         ghost = np.repeat(np.repeat(compared.ghost, 2, axis=0), 2, axis=1)
@@ -175,7 +175,7 @@ def prepare(
 
 
 def _frame(bracket: Bracket, e: int, compared: ComparedBracket, read: Reader, full: bool, last: bool) -> _Frame:
-    """Frame e on the grid of the merge; it serves wherever it is usable, the last one everywhere."""
+    """Frame e on the grid of the merge, used where it is usable; a frame with no darker one is used everywhere."""
     shot, link = bracket.shot, compared.links[e]
     image = read(shot.frames[e])
     if compared.frames is not None and not full:
@@ -192,7 +192,7 @@ def _frame(bracket: Bracket, e: int, compared: ComparedBracket, read: Reader, fu
         ratio=link.ratio,
         noise=compared.noises[e],
         misfit=link.misfit * (4 if full else 1),
-        lit=np.float32(exposure.of_ambient(shot.frames[e], shot.frames[bracket.reference])),
+        ambient=np.float32(exposure.of_ambient(shot.frames[e], shot.frames[bracket.reference])),
         last=last,
         cfa=image.cfa if full else None,
         least=np.float32(_SOME if is_reference else 0),
@@ -200,27 +200,27 @@ def _frame(bracket: Bracket, e: int, compared: ComparedBracket, read: Reader, fu
 
 
 def _flagged(where: Bools, flag: Quality) -> Bits:
-    """A flag where it holds, else 0."""
+    """The flag's bit where a mask holds, else 0."""
     return np.asarray(where.view(np.uint8) * np.uint8(flag))
 
 
 def _edges(estimate: Floats, rows: slice) -> Floats:
-    """Squared gradient of some rows of an estimate (C, H, W)."""
+    """Squared gradient (C, h, W) of some rows of an estimate (C, H, W)."""
     top = max(rows.start - 1, 0)
     found = np.stack([squared_gradient(plane[top : rows.stop + 1]) for plane in estimate])
     return np.asarray(found[:, rows.start - top :][:, : rows.stop - rows.start])
 
 
 def _twice(picture: Floats) -> Floats:
-    """A binned picture (C, H, W) on the full grid; cv2 keeps the half-pixel offset of the two."""
+    """A binned picture (C, H, W) enlarged to the full grid; cv2.resize respects the half-pixel offset."""
     _, h, w = picture.shape
     return np.stack([cv2.resize(plane, (2 * w, 2 * h)) for plane in picture])
 
 
 def divide_by_falloff(image: MaskedImage, view: View, size_px: tuple[int, int], light: Falloff) -> None:
-    """Divide merged radiance (H, W, 3) by the lens's light, its variance by the light's square, in place.
+    """Divide merged radiance (H, W, 3) by the lens's relative illumination, and its variance by the square, in place.
 
-    `view`: of its grid; `size_px`: width and height of the visible RAW, in the corners of which the law's r is 1.
+    `view` is the camera of the picture; `size_px` the width and height of the visible RAW, where r = 1 in the corners.
     """
     coefficient = np.broadcast_to(np.array(light.coefficient), (3, 3))
     half = np.hypot(*size_px) / 2 / view.scale  # px of this grid

@@ -135,8 +135,8 @@ def test_hand_held_nikon_bracket():
         usable = other.usable & found.frames[1].signals.usable & ~ghost
         z = []
         for c, ratio in enumerate(link.ratio):
-            variance = found.noises[1].of(c, first[c])
-            variance += found.noises[e].of(c, first[c] * ratio) / ratio**2 * gain
+            variance = found.noises[1].of_channel(c, first[c])
+            variance += found.noises[e].of_channel(c, first[c] * ratio) / ratio**2 * gain
             variance += squared_gradient(first[c]) * link.misfit[c]
             z.append(((other.rows(slice(None))[c] / ratio - own[c]) / np.sqrt(variance))[usable])
         assert np.all(np.abs(np.mean(z, axis=1)) < 0.1)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from polcap.stages.hdr import ghosts
-from polcap.stages.hdr.ghosts import Exposed
+from polcap.stages.hdr.ghosts import ExposedFrame
 from polcap.stages.hdr.noise import Noise
 from polcap.stages.hdr.planes import blocks
 from tests.stages.hdr.brackets import planes
@@ -15,7 +15,7 @@ ONE = np.ones(3, np.float32)
 
 def exposed(picture, exposure=1.0, usable=None):
     """A frame (H, W, C) of known exposure and noise."""
-    return Exposed(planes(picture, usable), np.float32(exposure) * ONE, LINE)
+    return ExposedFrame(planes(picture, usable), np.float32(exposure) * ONE, LINE)
 
 
 def interleaved(picture):

@@ -34,7 +34,7 @@ def test_pairs_find_both_gains_under_strong_texture():
     """Texture of 30 % at the pixel scale, two unlike exposures: gain to 5 %, read noise to 1 e⁻."""
     rng = np.random.default_rng(1)
     a, b = picture(rng), picture(rng, 0.25)
-    for samples in noise.paired(planes(a), planes(b), np.full(3, 0.25)):
+    for samples in noise.sample_pair(planes(a), planes(b), np.full(3, 0.25)):
         well, read = found([samples])
         np.testing.assert_allclose(well, WELL, rtol=0.05)
         np.testing.assert_allclose(read, READ, atol=1.5)
@@ -44,7 +44,7 @@ def test_single_frame_finds_its_gain_in_flat_tiles():
     rng = np.random.default_rng(2)
     a = picture(rng, texture=0)
     a[:200] *= 1 + 0.3 * np.sin(np.arange(640) * 0.9)[None, :, None]  # two fifths are textured
-    well, _ = found([noise.alone(planes(a))])
+    well, _ = found([noise.sample_frame(planes(a))])
     np.testing.assert_allclose(well, WELL, rtol=0.1)
 
 
@@ -54,19 +54,19 @@ def test_unusable_pixels_take_no_part():
     usable = np.ones(a.shape[:2], bool)
     usable[:, 300:340] = False
     a[:, 300:340] += rng.normal(0, 1, (512, 40, 3)).astype(np.float32)
-    well, _ = found([noise.alone(planes(a, usable))])
+    well, _ = found([noise.sample_frame(planes(a, usable))])
     np.testing.assert_allclose(well, WELL, rtol=0.1)
 
 
 @pytest.mark.parametrize("iso", [100.0, 800.0, None])
 def test_too_few_tiles_mean_a_typical_sensor(iso):
-    line = noise.fit([noise.alone(planes(np.zeros((40, 40, 3))))], iso, 1e-9)
+    line = noise.fit([noise.sample_frame(planes(np.zeros((40, 40, 3))))], iso, 1e-9)
     np.testing.assert_allclose(1 / line.slope, 20000 * 100 / (iso or 100), rtol=1e-5)
 
 
 def test_a_noiseless_picture_keeps_a_variance():
     flat = np.broadcast_to(np.linspace(0.1, 0.9, 400, dtype=np.float32)[:, None, None], (400, 400, 3))
-    line = noise.fit([noise.alone(planes(flat))], 100.0, 1e-9)
+    line = noise.fit([noise.sample_frame(planes(flat))], 100.0, 1e-9)
     assert (line.variance(np.zeros((1, 3))) >= 1e-9).all()
 
 
@@ -90,10 +90,10 @@ def test_lines_are_learnt_once_per_iso():
     rng = np.random.default_rng(5)
     usable = np.ones((512, 640), bool)
     lines = noise.Lines()
-    lines.learn(100.0, noise.alone(planes(picture(rng, texture=0), usable)))
+    lines.learn(100.0, noise.sample_frame(planes(picture(rng, texture=0), usable)))
     first = lines.line(100.0, 1e-12)
     lines.settle()
-    lines.learn(100.0, noise.alone(planes(np.zeros((512, 640, 3)), usable)))
+    lines.learn(100.0, noise.sample_frame(planes(np.zeros((512, 640, 3)), usable)))
     assert lines.knows(100.0) and not lines.knows(200.0)
     assert lines.line(100.0, 1e-12) is first
 
