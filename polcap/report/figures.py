@@ -63,7 +63,7 @@ def _colors(color: ColorCalibration, image: StokesImage) -> dict[str, Any]:
         "left_out": None if fit is None or fit.use is None else patches.left_out(fit.use),
         "detector_cost": _number(color.cost),
         "metres_per_px": color.metres_per_px,
-        "scale_doubt": scale.doubt(image, color),
+        "scale_doubt": scale.sigma(image, color),
         "matrix": _list(color.matrix),
     }
 

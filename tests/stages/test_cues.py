@@ -60,8 +60,8 @@ def test_albedo_of_a_ball_is_within_the_error_of_the_chart_s_depth():
     """Inverse squares over the visible half, seen and lit along the axis; the chart anywhere beside the ball."""
     solved = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
     color = dataclasses.replace(scenes.no_color(), source="chart")
-    doubt = cues.scale.doubt(solved, color)
-    assert cues.scale.doubt(solved, scenes.no_color()) is None
+    doubt = cues.scale.sigma(solved, color)
+    assert cues.scale.sigma(solved, scenes.no_color()) is None
     radius = np.sqrt(solved.mask.sum() / np.pi) / solved.view.focal
     ahead = radius * np.sqrt(np.linspace(0, 1, 1001))  # cos θ of places that are spread evenly over the disc
     rule = (1 - radius / 2) ** 2
@@ -177,4 +177,4 @@ def test_the_scale_follows_a_flash_at_the_chart_s_side_and_its_doubt_widens_the_
     doubtful.light.normal.flags.writeable = False  # as the store hands them out
     lit = (1.01 / 1.04) ** -1.5 * (ahead**2 + 0.01) / ahead**2
     assert cues.scale.factor(found, beside) / cues.scale.factor(found, at_lens) == pytest.approx(lit, rel=1e-6)
-    assert cues.scale.doubt(found, doubtful) > cues.scale.doubt(found, beside) + 0.002
+    assert cues.scale.sigma(found, doubtful) > cues.scale.sigma(found, beside) + 0.002

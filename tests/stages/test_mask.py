@@ -173,7 +173,7 @@ def test_an_empty_picture_is_refused():
     with pytest.raises(ObjectError, match="no object stands out"):
         segment(dark, chart_color())
     nothing = network(lambda inputs: {"logit": np.full((1, 1, *inputs.shape[2:]), -9.0)})
-    with pytest.raises(ObjectError, match=r"no object is seen.*--mask"):
+    with pytest.raises(ObjectError, match=r"no object found.*--mask"):
         segment(dark, chart_color(), model=nothing)
 
 

@@ -1,7 +1,7 @@
-"""Stage 7: from Stokes parameters to the estimators' inputs: radiance, DoLP, AoLP, network channels.
+"""Stage 7: inputs of the estimators from the Stokes parameters: radiance, DoLP, AoLP, network channels.
 
-Training calls `channels` and the functions below it too, so these are written to the array API: the namespace comes
-from the arguments, no cv2, no torch. Pixel axes are (..., H, W).
+Training calls `channels` and its helpers too. So these use the array API only, with the namespace of their arguments:
+no cv2, no torch. Pixel axes are (..., H, W).
 """
 
 from typing import Any
@@ -18,7 +18,7 @@ CHANNELS = (
     "s1", "s2",  # 10 S1/S0, 10 S2/S0
     "zenith_x", "zenith_y",  # θ(DoLP, n = 1.5) (cos 2φ, sin 2φ) [rad]
     "cos_2phi", "sin_2phi",  # normalized Stokes map
-    "noise",  # zenith that noise alone would show [rad]
+    "noise",  # zenith angle that noise alone would give [rad]
     "mask", "clipped", "ray_x", "ray_y",
 )  # fmt: skip
 
@@ -29,23 +29,23 @@ FLOOR = 0.02  # added to a radiance before its logarithm, in the channels and in
 def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
     """All cues of a crop (H, W).
 
-    The color matrix acts on S0 only; DoLP and AoLP are taken in camera channels, summed before any ratio. The chart
-    is level with the object's middle, so the visible surface, nearer to the flash, gets more light (`scale`). A
-    capture without a chart has no absolute scale: its 99th percentile is set to 0.8.
+    The color matrix is applied to S0 only. DoLP and AoLP are computed in camera channels, which are summed before any
+    ratio. The visible surface of the object is nearer to the flash than the chart, and gets more light: `scale`
+    corrects for it. A capture without a chart has no absolute scale: its 99th percentile of radiance becomes 0.8.
     """
     import numpy as np
 
     ratio, sigma, dolp, normalized = polarization(stokes.stokes, stokes.covariance)
     radiance = np.asarray(stokes.stokes[0] @ color.matrix.T, dtype=np.float32)
-    whole = 1.0
+    factor = 1.0
     if color.source in ("chart", "corners"):
-        whole = scale.factor(stokes, color)
+        factor = scale.factor(stokes, color)
     if color.source in ("camera", "none") and stokes.mask.any():
-        whole = 0.8 / max(float(np.percentile(radiance[stokes.mask], 99)), 1e-9)
-    radiance = radiance * np.float32(whole)
+        factor = 0.8 / max(float(np.percentile(radiance[stokes.mask], 99)), 1e-9)
+    radiance = radiance * np.float32(factor)
     body, body_known = None, None
     if stokes.body is not None:
-        body = np.asarray(stokes.body.value @ color.matrix.T, dtype=np.float32) * np.float32(whole)
+        body = np.asarray(stokes.body.value @ color.matrix.T, dtype=np.float32) * np.float32(factor)
         unknown = Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST
         body_known = stokes.mask & ((stokes.body.quality & np.uint8(unknown)) == 0)
     height, width = stokes.mask.shape
@@ -66,10 +66,10 @@ def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
 
 
 def polarization(stokes: Any, covariance: Any) -> tuple[Any, Any, Any, Any]:
-    """S1/S0 and S2/S0 (2, ...), their 1σ (...), debiased DoLP (...), normalized Stokes map (2, ...).
+    """S1/S0 and S2/S0 (2, ...), their 1σ (...), DoLP without its noise bias (...), normalized Stokes map (2, ...).
 
-    stokes (3, ..., 3) and covariance (6, ..., 3) in camera channels. The DoLP of noise is not zero:
-    E[ρ̂²] = ρ² + 2σ², and √(ρ̂² − σ²) has the least bias where ρ > σ (Wardle & Kronberg, ApJ 1974).
+    stokes (3, ..., 3) and covariance (6, ..., 3) are in camera channels. Noise increases the DoLP,
+    E[ρ̂²] = ρ² + 2σ²; √(ρ̂² − σ²) has the least bias where ρ > σ (Wardle & Kronberg, ApJ 1974).
     """
     xp = array_namespace(stokes)
     total = frames.total(stokes)  # (3, ...)
@@ -83,7 +83,7 @@ def polarization(stokes: Any, covariance: Any) -> tuple[Any, Any, Any, Any]:
 
 
 def least_intensity_color(stokes: Any, matrix: Any) -> Any:
-    """The paper's diffuse color: ½(S0 − √(S1² + S2²)) per channel, in Rec.709, unit length; 0 where dark."""
+    """Color of the light at the polarizer angle of least intensity, ½(S0 − √(S1² + S2²)); unit length, 0 if dark."""
     xp = array_namespace(stokes)
     least = (stokes[0] - (stokes[1] ** 2 + stokes[2] ** 2) ** 0.5) / 2
     color = xp.clip(least @ matrix.T, 0.0, None)
@@ -92,15 +92,15 @@ def least_intensity_color(stokes: Any, matrix: Any) -> Any:
 
 
 def zenith(dolp: Any, ior: float = NOMINAL_IOR) -> Any:
-    """Zenith angle (...) of a diffuse DoLP (...), rad."""
+    """Zenith angle (...) [rad] of a surface from the DoLP (...) of its diffuse reflection."""
     xp = array_namespace(dolp)
     return xp.acos(xp.clip(fresnel.cos_zenith_from_dolp(dolp, ior), 0.0, 1.0))
 
 
 def channels(cues: Any) -> Any:
-    """The network's input in the order of CHANNELS, (..., N, H, W) float32, 0 outside the mask.
+    """Network input (..., N, H, W) float32, in the order of CHANNELS; 0 outside the mask.
 
-    `cues` has the fields of `Cues`; in training they are torch tensors with a leading batch axis
+    `cues` has the fields of `Cues`; in training these are torch tensors, with a leading batch axis
     on each pixel map ((B, H, W), (B, H, W, 3), (2, B, H, W)).
     """
     xp = array_namespace(cues.radiance)

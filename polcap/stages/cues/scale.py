@@ -1,7 +1,7 @@
-"""The scale of the albedo and its error, by the chart's place and light.
+"""Absolute scale of the albedo and its error, from the chart's position and light.
 
-The chart gives the ratio of reflectance to radiance at its own place and turn. The object is at another place: its
-visible surface is nearer to the flash than its middle, and at another angle to the optical axis.
+The chart gives the ratio of reflectance to radiance for its own position and orientation. The object is elsewhere: its
+visible surface is nearer to the flash than its center, and in another direction from the lens.
 """
 
 from dataclasses import replace
@@ -13,17 +13,17 @@ from polcap.images import ChartLight, ColorCalibration, Floats, StokesImage
 from polcap.optics import point_light
 from polcap.optics.projection import back_project
 
-_BULGE = 0.5  # mean distance of the visible surface before the middle, in radii: a cone's 1/3 to a ball's 2/3
-_BULGE_SPREAD = 0.4  # 1σ of it over 204 views of training meshes and random shapes (decision 8)
+_BULGE = 0.5  # radii; mean distance of the visible surface in front of the center: 1/3 for a cone, 2/3 for a ball
+_BULGE_SPREAD = 0.4  # radii; its 1σ over 204 views of training meshes and random shapes (decision 8)
 _CHART_SPREAD = 3**-0.5  # radii: 1σ of the depth of a chart anywhere between the object's front and back
-_LARGEST_RADIUS = 0.5  # of an object, over its distance; beyond, the law of the far field ends
+_LARGEST_RADIUS = 0.5  # of an object, over its distance; for larger ones the far-field law does not hold
 _STEP = 1e-4
 
 
 def factor(stokes: StokesImage, color: ColorCalibration) -> float:
-    """Factor on the radiance after which 1 is a white plane on the axis, at the object's distance, facing the flash.
+    """Factor on the radiance after which 1 is a white plane that faces the flash, on the axis at the object's distance.
 
-    Light falls off over the object, with distance and to the sides, as in the pictures of the network's training.
+    The falloff of light over the object, with distance and to the sides, remains, as in the training pictures.
     """
     ahead = 1 - _BULGE * _radius(stokes)
     if color.light is None:
@@ -31,11 +31,11 @@ def factor(stokes: StokesImage, color: ColorCalibration) -> float:
     return float(np.exp(_log_factor(color.light, _middle(stokes, ahead))))
 
 
-def doubt(stokes: StokesImage, color: ColorCalibration) -> float | None:
-    """Relative 1σ of the scale of all albedos; None where no chart in the picture gives it.
+def sigma(stokes: StokesImage, color: ColorCalibration) -> float | None:
+    """Relative 1σ of the scale of all albedos; None without a chart in the picture.
 
-    The light falls with the square of the distance: a chart level with the object's front makes albedo too dark, one
-    behind it too bright. The flash's place is known by the light's slope across the chart.
+    Light falls with the square of the distance: a chart at the object's front makes the albedo too dark, a chart
+    behind the object too bright. The position of the flash comes from the slope of the light across the chart.
     """
     if color.source not in ("chart", "corners"):
         return None
@@ -51,7 +51,7 @@ def doubt(stokes: StokesImage, color: ColorCalibration) -> float | None:
 
 
 def _log_factor(light: ChartLight, middle: Floats) -> float:
-    """ln of the chart's irradiance over the object's, the latter relative to a flash at the lens."""
+    """ln of the chart's irradiance over the object's, relative to the same ratio for a flash at the lens."""
     flash, power = light.flash[:2], float(light.flash[2])
     chart = point_light.irradiance(light.white, flash, power, light.normal)
     object_ = point_light.irradiance(middle, flash, power)
@@ -60,19 +60,19 @@ def _log_factor(light: ChartLight, middle: Floats) -> float:
 
 
 def _changed(light: ChartLight, step: Floats) -> ChartLight:
-    """The light with flash and falloff moved by a step (5,), and the chart turned about x and y."""
-    from scipy.spatial.transform import Rotation  # here: importing it costs .2 s of every start
+    """The light with flash position and falloff changed by step[:3], and the chart turned about x and y by step[3:]."""
+    from scipy.spatial.transform import Rotation  # here: the import takes 0.2 s
 
     turned = Rotation.from_rotvec([*step[3:], 0.0]).apply(np.array(light.normal))  # SciPy takes no read-only array
     return replace(light, flash=light.flash + step[:3], normal=turned)
 
 
 def _middle(stokes: StokesImage, distance: float) -> Floats:
-    """The middle of the object's pixels (3,), camera frame, at a distance along the axis."""
+    """Center (3,) of the object's pixels in the camera frame, at a depth along the optical axis."""
     row, column = (axis.mean() for axis in np.nonzero(stokes.mask)) if stokes.mask.any() else (0.0, 0.0)
     return distance * back_project(stokes.view, np.array(column), np.array(row))
 
 
 def _radius(stokes: StokesImage) -> float:
-    """Radius of a disc of as many pixels as the object, over its distance."""
+    """Radius of a disc with as many pixels as the object, over the object's distance."""
     return min(sqrt(stokes.mask.sum() / pi) / stokes.view.focal, _LARGEST_RADIUS)

@@ -1,11 +1,11 @@
-"""Stage 4: the object's mask, and how much of it may be wrong.
+"""Stage 4: segmentation of the object, with the expected error of its mask.
 
-1. A network gives each pixel a probability of being the object (`network`, by the channels of `mask_channels`).
-2. Its likely pixels become a mask without specks (`regions`).
-3. The outline moves to edges of color, as far as the network agrees (`graph_cut`).
+1. A network gives each pixel a probability of being the object (`network`, with the input of `mask_channels`).
+2. Pixels of high probability become a mask without specks (`regions`).
+3. The outline is moved to edges of color, where the probabilities allow it (`graph_cut`).
 
-Without a network, or where it finds nothing, the object is found by its difference from the `backdrop`. A mask that
-the user has drawn is taken as it is.
+Without a network, or if it finds nothing, the object is found by its difference from the `backdrop`. A mask drawn by
+the user is not changed.
 """
 
 import contextlib
@@ -48,27 +48,14 @@ def segment(
     run: RunNetwork,
     settings: MaskSettings,
 ) -> ObjectMask:
-    """The object on the reference grid, and a crop around it.
+    """The object's mask (H, W) on the reference grid, and a crop around it.
 
-    Parameters
-    ----------
-    radiance
-        The shots (K, H, W, 3), each on its own grid.
-    alignment
-        Registration of the shots.
-    color
-        Color matrix, and the place of the chart, which is not the object.
-    user_mask
-        (H, W) on the reference grid; replaces the search.
-    network
-        Of the probabilities; None: by the backdrop.
-    settings
-        Borders around object and chart, and the least area.
+    `user_mask` (H, W) replaces the search. Without a network the object is found by its difference from the backdrop.
 
     Raises
     ------
     ObjectError
-        No object is found, or the user's mask is empty or of another size.
+        No object is found, or the user's mask is empty or has another size.
     """
     if user_mask is not None:
         _check(user_mask, radiance.value.shape[1:3])
@@ -87,8 +74,8 @@ def segment(
             mask = backdrop.find_object(picture, zone, settings.min_area)
     if mask.mean() < settings.min_area:
         raise ObjectError(
-            f"no object is seen: {100 * mask.mean():.2f} % of the picture, less than "
-            f"mask.min_area = {100 * settings.min_area:g} %; let the object fill more of it, or give --mask PNG"
+            f"no object found: the mask covers {100 * mask.mean():.2f} % of the picture, less than "
+            f"mask.min_area = {100 * settings.min_area:g} %; show the object larger, or draw a mask (--mask PNG)"
         )
     return _object(mask, "automatic", regions.expected_error(mask, probability), settings)
 
@@ -96,11 +83,11 @@ def segment(
 def _check(user_mask: Bools, shape: tuple[int, ...]) -> None:
     if user_mask.shape != shape:
         raise ObjectError(
-            f"mask is {user_mask.shape[1]}×{user_mask.shape[0]} px, the picture's grid {shape[1]}×{shape[0]}; "
-            "draw it on the RAW picture or this grid"
+            f"the mask has {user_mask.shape[1]}×{user_mask.shape[0]} px, the picture {shape[1]}×{shape[0]}; "
+            "draw it on the RAW picture, or on a picture of this size"
         )
     if not user_mask.any():
-        raise ObjectError("mask is empty: no pixel is 128 or brighter; paint the object white")
+        raise ObjectError("the mask is empty: no pixel is 128 or brighter; paint the object white")
 
 
 def _object(

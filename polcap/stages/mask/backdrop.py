@@ -1,6 +1,6 @@
-"""Separation from the backdrop: the object is brighter than the picture's border, or of another color.
+"""Separation of object and backdrop: the object is brighter than the picture's border, or has another color.
 
-Under a flash near the lens the object, which is near, is bright; the backdrop, far or black, is dark.
+Under a flash near the lens, the near object is bright, and the far or black backdrop is dark.
 """
 
 import cv2
@@ -11,27 +11,28 @@ from polcap.images import Bits, Floats
 from polcap.stages.mask import graph_cut
 from polcap.stages.mask.regions import Bools, fill_holes
 
-STOPS = 10  # of radiance below the bright parts that can be distinguished
+STOPS = 10  # range of radiance, below the bright parts, that is distinguished
 _BRIGHT = 95  # percentile of the picture's radiance that counts as 1
-_BORDER = 20  # the border's width is the picture's shorter side over this
-_BRIGHTER = (0.8, 1.6)  # least and most stops above the backdrop that make an object, by the backdrop's spread
-_OTHER_CHROMA = 0.15  # |Δr| + |Δg| + |Δb| of r + g + b = 1 that makes another color
+_BORDER = 20  # shorter side of the picture over the width of its border
+_BRIGHTER = (0.8, 1.6)  # stops above the backdrop that mark an object: least and most, by the backdrop's spread
+_OTHER_CHROMA = 0.15  # |Δr| + |Δg| + |Δb|, for r + g + b = 1, that marks another color
 _SOFT_STOPS, _SOFT_CHROMA = 0.4, 0.04  # widths of the transition from backdrop to object
 
-_HOLE = 0.01  # of the mask: smaller holes are dark texture
-_PART = 1 / 20  # of the largest region: smaller ones are not the object's (an object may be in pieces)
-_ALONG_EDGE = 0.1  # most share of a region's outline along the picture's edge, beyond which it is a wall or a table
+_HOLE = 0.01  # of the mask; smaller holes are dark texture
+_PART = 1 / 20  # of the largest region; smaller regions are not the object (an object may be in pieces)
+_ALONG_EDGE = 0.1  # share of a region's outline along the picture's edge; with more it is a wall or a table
 
 
 def brightness(color: Floats) -> float:
-    """The level that counts as 1, of a whole picture's S0 (H, W, 3)."""
+    """Level of a whole picture's S0 (H, W, 3) that counts as 1: its 95th percentile."""
     return max(float(np.percentile(color.mean(-1), _BRIGHT)), 1e-9)
 
 
 def probability(color: Floats, chart: Bools) -> Floats:
-    """Probability (H, W) of the object, 0 on the chart (H, W): brighter than the border varies, or of another color.
+    """Probability (H, W) of being the object: clearly brighter than the picture's border, or of another color.
 
-    `color` is linear Rec.709 (H, W, 3) of a whole picture, on any scale. Part of the mask network's input.
+    `color` is linear Rec.709 (H, W, 3) of a whole picture, on any scale. The result is 0 on the `chart` (H, W). It is
+    also an input of the mask's network.
     """
     color = np.maximum(color, 0)
     bright = brightness(color)
@@ -53,7 +54,7 @@ def probability(color: Floats, chart: Bools) -> Floats:
 
 
 def find_object(picture: Floats, chart: Bits, min_area: float) -> Bools:
-    """The object in linear Rec.709 (H, W, 3), outside the chart's zone (H, W).
+    """Mask (H, W) of the object in a picture (H, W, 3) in linear Rec.709, outside the chart's zone (H, W).
 
     Raises
     ------
@@ -66,15 +67,15 @@ def find_object(picture: Floats, chart: Bits, min_area: float) -> Bools:
     seed = fill_holes(_object_regions(seed, min_area), _HOLE).astype(np.uint8)
     if seed.mean() < min_area:
         raise ObjectError(
-            f"no object stands out from the backdrop: {100 * seed.mean():.2f} % of the picture, "
-            f"less than mask.min_area = {100 * min_area:g} %; use a darker backdrop, or give --mask PNG"
+            f"no object differs from the backdrop: only {100 * seed.mean():.2f} % of the picture, "
+            f"less than mask.min_area = {100 * min_area:g} %; use a darker backdrop, or draw a mask (--mask PNG)"
         )
     cut = _object_regions(graph_cut.cut(small, seed, outside), 0.0)
     return graph_cut.enlarge(fill_holes(cut, _HOLE), chart)
 
 
 def _object_regions(mask: Bits, min_area: float) -> Bits:
-    """The large regions; those that lie along the picture's edge, as a wall or a table does, go where others remain."""
+    """The large regions, without those along the picture's edge (a wall, a table) if there are others."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     if count < 2:
         return mask

@@ -1,4 +1,4 @@
-"""Graph cut: moves a mask's outline to the picture's edges of color.
+"""Graph cut: moves the outline of a mask to color edges of the picture.
 
 References
 ----------
@@ -12,25 +12,17 @@ from polcap.images import Bits, Floats
 from polcap.optics.resize import area_mean
 from polcap.stages.mask.regions import Bools
 
-_WORK_PIXELS = 3e5  # about, of the reduced picture that is cut
-_REACH = 0.006  # of the picture's longer side, by which the outline may move
+_WORK_PIXELS = 3e5  # approximate size of the reduced picture that is cut
+_REACH = 0.006  # of the picture's longer side: largest movement of the outline
 _ROUNDS = 3  # of GrabCut
-_SURE = 0.996  # probability of the object, or of the backdrop, from which colors decide nothing (decision 37)
+_SURE = 0.996  # probability of object or backdrop; above it colors are not considered (decision 37)
 
 
 def sharpen(picture: Floats, mask: Bools, chart: Bits, probability: Floats) -> Bools:
-    """A mask moved to the picture's edges, and decided by color where its probabilities leave it open.
+    """The mask (H, W) with its outline at the picture's color edges; colors decide where probabilities are uncertain.
 
-    Parameters
-    ----------
-    picture
-        (H, W, 3) linear Rec.709.
-    mask
-        (H, W) right to a few pixels, or wherever its probabilities are near 0 or 1.
-    chart
-        (H, W) 1 on the chart.
-    probability
-        (H, W) 0…1 of each pixel to be the object.
+    picture (H, W, 3) is linear Rec.709, chart (H, W) 1 on the chart, probability (H, W) 0…1 that of being the object.
+    The mask must be right to a few pixels, or where its probabilities are near 0 or 1.
     """
     small, outside = reduce_picture(picture, chart)
     seed = cv2.resize(mask.astype(np.uint8), small.shape[1::-1], interpolation=cv2.INTER_NEAREST)
@@ -38,7 +30,7 @@ def sharpen(picture: Floats, mask: Bools, chart: Bits, probability: Floats) -> B
 
 
 def reduce_picture(picture: Floats, chart: Bits) -> tuple[Floats, Bools]:
-    """Picture (h, w, 3) and chart (h, w) at the size of the cut."""
+    """Picture (h, w, 3) and chart (h, w), reduced for the graph cut."""
     height, width = chart.shape
     shrink = max(1.0, float(np.sqrt(height * width / _WORK_PIXELS)))
     size = (round(width / shrink), round(height / shrink))
@@ -46,7 +38,7 @@ def reduce_picture(picture: Floats, chart: Bits) -> tuple[Floats, Bools]:
 
 
 def cut(picture: Floats, seed: Bits, outside: Bools, probability: Floats | None = None) -> Bits:
-    """The seed (h, w) with its outline at the picture's edges; open wherever the probabilities (h, w) are not sure."""
+    """The seed (h, w) with its outline moved to color edges; colors also decide where probabilities are uncertain."""
     tone = np.log2(np.clip(picture, 0, 4) + 0.002)
     display = (255 * (tone - tone.min()) / (np.ptp(tone) + 1e-9)).astype(np.uint8)
     reach = max(3, round(_REACH * max(seed.shape)))
@@ -68,7 +60,7 @@ def cut(picture: Floats, seed: Bits, outside: Bools, probability: Floats | None 
 
 
 def enlarge(mask: Bools, chart: Bits) -> Bools:
-    """A mask (h, w) at the size of the chart's zone (H, W), and outside it."""
+    """The mask (h, w) enlarged to the size of the chart's zone (H, W), without that zone."""
     large = mask.astype(np.float32)
     if mask.shape != chart.shape:
         large = cv2.resize(large, chart.shape[::-1], interpolation=cv2.INTER_LINEAR)

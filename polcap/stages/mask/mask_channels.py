@@ -1,7 +1,7 @@
-"""Input channels of the mask's network: log radiance, color, polarization, chart, an earlier estimate, and position.
+"""Input channels of the mask's network: log radiance, color, polarization, chart, previous estimate, position.
 
-Radiance is relative to the picture's bright parts, so exposure and light do not matter. Polarization distinguishes
-black gloss from black cloth.
+Radiance is relative to the picture's bright parts, so the input does not depend on exposure and light. Polarization
+distinguishes black gloss from black cloth.
 """
 
 from dataclasses import dataclass
@@ -15,19 +15,19 @@ from polcap.stages.mask.backdrop import STOPS, brightness
 
 __all__ = ["CHANNELS", "ENCODING", "SIZE_MULTIPLE", "ReducedPicture", "brightness", "encode", "grid", "mirror"]
 
-ENCODING = "mask 1"  # raised when a formula below changes
-CHANNELS = ("log", "red", "blue", "s1", "s2", "dolp", "chart", "looked", "chance", "x", "y")  # as in the models' files
-SIZE_MULTIPLE = 16  # of the network's height and width
+ENCODING = "mask 1"  # changed with every formula below
+CHANNELS = ("log", "red", "blue", "s1", "s2", "dolp", "chart", "looked", "chance", "x", "y")  # names in the model files
+SIZE_MULTIPLE = 16  # the network's height and width are multiples of this
 
 
 @dataclass(frozen=True)
 class ReducedPicture:
-    """A picture, or a part of it, on a reduced grid."""
+    """A picture or a part of it, averaged down."""
 
     color: Floats  # (H, W, 3) S0 in linear Rec.709, any scale
     stokes: Floats  # (3, H, W) S0, S1, S2 summed over the camera's channels
     chart: NDArray[np.bool_]  # (H, W)
-    place: Floats  # (2, H, W) x right and y down, −1…1 over the whole picture
+    place: Floats  # (2, H, W) position: x right and y down, −1…1 over the whole picture
 
 
 def grid(height: int, width: int) -> Floats:
@@ -37,9 +37,9 @@ def grid(height: int, width: int) -> Floats:
 
 
 def encode(picture: ReducedPicture, bright: float, estimate: Floats | None = None) -> Floats:
-    """The channels, (11, H, W) float32, of a picture and an earlier estimate (H, W) of the object's probability.
+    """The channels (11, H, W) float32 of a picture and a previous estimate (H, W) of the object's probability.
 
-    Without an estimate the picture is a whole one, and its difference from the backdrop is the estimate. `bright` is
+    Without an estimate, the picture must be whole; its difference from the backdrop is then the estimate. `bright` is
     the `brightness` of the whole picture.
     """
     floor = 2.0**-STOPS
@@ -68,7 +68,7 @@ def encode(picture: ReducedPicture, bright: float, estimate: Floats | None = Non
 
 
 def mirror(channels: Floats, axes: tuple[int, ...]) -> Floats:
-    """Channels (11, H, W) of the scene mirrored along the image's axes, 0 y and 1 x."""
+    """Channels (11, H, W) of the scene mirrored along axes of the picture: 0 y, 1 x."""
     out: Floats = np.flip(channels, tuple(1 + axis for axis in axes)).copy()
     for axis in axes:
         out[[CHANNELS.index("s2"), CHANNELS.index("yx"[axis])]] *= -1

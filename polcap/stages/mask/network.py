@@ -1,6 +1,6 @@
-"""Object probability by the mask's network: on the whole picture, then twice on the part that it found.
+"""Object probability by the mask's network: on the whole picture, then twice on the part that contains the object.
 
-Pictures are reduced before they are registered, so the time does not grow with the sensor.
+Pictures are averaged down before registration, so the time does not grow with the sensor's size.
 """
 
 from functools import partial
@@ -16,10 +16,10 @@ from polcap.optics.warp import warp
 from polcap.stages.mask.mask_channels import SIZE_MULTIPLE, ReducedPicture, brightness, encode, mirror
 from polcap.stages.mask.regions import Box, box_around
 
-_CLOSE_UP_PX = 256  # most, of a close-up's longer side
-_CLOSE_UPS = 2  # passes over the found part; the second finds parts that the first estimate lacked
-_ROOM = 0.12  # around the found part, of its longer side
-_LIKELY = 0.3  # least probability of pixels that a close-up shows
+_CLOSE_UP_PX = 256  # greatest longer side of a close-up
+_CLOSE_UPS = 2  # passes over the part with the object; the second adds parts that the first estimate lacked
+_ROOM = 0.12  # margin around that part, of its longer side
+_LIKELY = 0.3  # least probability of pixels that a close-up must include
 _MIRRORS = ((), (0,), (1,), (0, 1))  # axes of the mirror images that are averaged (decision 37)
 
 
@@ -27,7 +27,7 @@ def object_probability(
     radiance: AngleStack, alignment: Alignment, color: ColorCalibration, chart: Bits, network: Network,
     run: RunNetwork,
 ) -> Floats:  # fmt: skip
-    """Probability (H, W) 0…1 of each pixel of the reference grid to be the object; `chart` (H, W) is 1 on the chart."""
+    """Probability (H, W) 0…1 that a pixel of the reference grid is the object; `chart` (H, W) is 1 on the chart."""
     height, width = chart.shape
     whole = (0, 0, width, height)
     picture = reduced_picture(radiance, alignment, color, chart, whole, int(network.metadata["native_size"]))
@@ -76,7 +76,7 @@ def reduced_picture(
 
 
 def _run(network: Network, run: RunNetwork, channels: Floats) -> Floats:
-    """Probability at each pixel, (H, W), of channels of any size: mean logit of the picture and its mirror images."""
+    """Probability (H, W) from channels (11, H, W): the mean logit of the picture and its mirror images."""
     logits = parallel.results([partial(_logit, network, run, channels, axes) for axes in _MIRRORS], network.at_once)
     total = np.zeros(channels.shape[1:], np.float32)
     for logit in logits:
@@ -85,7 +85,7 @@ def _run(network: Network, run: RunNetwork, channels: Floats) -> Floats:
 
 
 def _logit(network: Network, run: RunNetwork, channels: Floats, axes: tuple[int, ...]) -> Floats:
-    """The network's logit (H, W) of the picture mirrored along these axes, mirrored back."""
+    """The network's logit (H, W) for the picture mirrored along these axes, mirrored back."""
     height, width = channels.shape[1:]
     more = [(0, -n % SIZE_MULTIPLE) for n in (height, width)]
     shown = np.pad(mirror(channels, axes), [(0, 0), *more], mode="edge")

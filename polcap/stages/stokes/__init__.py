@@ -1,7 +1,7 @@
 """Stage 6: linear Stokes parameters of each pixel from K polarizer angles.
 
-Gains, transforms, the places of a mosaic's colors and the lens's distortion are applied here and nowhere else, so
-every pixel is resampled once. The result is the picture of a pinhole camera.
+Gains, registration, the photosite offsets of a mosaic's colors and the lens's distortion are applied here and nowhere
+else, so every pixel is resampled once. The result is the picture of a pinhole camera.
 """
 
 from dataclasses import dataclass
@@ -31,12 +31,13 @@ from polcap.optics import crossing, distortion, fresnel, mueller
 from polcap.optics.warp import covered, warp
 from polcap.stages import stage
 
-_MOST_CONDITION = 50.0  # of three angles 12° apart, where S1 has 26 times the noise of a shot; 0, 45, 90° have 2.4
-_METAL_DOLP, _METAL_DEG, _METAL_SIGMA = 0.05, 10.0, 5.0  # of red and blue: DoLP, and difference of their AoLPs; set by
-# hand, beyond the effect of noise and registration on a dielectric, and not measured on metals
-_LEAST_ROWS, _BLOCK = 64, 200_000  # rows and pixels of a block: its planes fit the cache, and little is cut out with it
+_MOST_CONDITION = 50.0  # that of three angles in steps of 12°: S1 has 26 times a shot's noise; 0, 45, 90° have 2.4
+# A pixel is metal if red and blue have this DoLP and their AoLPs differ by this angle, at this many σ. Set by hand,
+# above the effects of noise and registration on a dielectric; not measured on metals.
+_METAL_DOLP, _METAL_DEG, _METAL_SIGMA = 0.05, 10.0, 5.0
+_LEAST_ROWS, _BLOCK = 64, 200_000  # rows and pixels of a block: its planes fit the cache, with few rows resampled twice
 _LEAST_VARIANCE = np.float32(1e-14)
-_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # the rows of a covariance
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # Stokes indices of a covariance's six rows
 
 Box = tuple[int, int, int, int]  # x0, y0, x1, y1 px of the reference grid
 
@@ -64,15 +65,15 @@ def solve(
     object_: ObjectMask,
     settings: StokesSettings,
 ) -> StokesImage:
-    """Weighted least squares s = (AᵀWA)⁻¹ AᵀW I per pixel and channel over the object's crop.
+    """Stokes parameters of the object's crop by weighted least squares, s = (AᵀWA)⁻¹ AᵀW I per pixel and channel.
 
-    Rows of A are `mueller.analyzer`, W the inverse variances; the covariance is (AᵀWA)⁻¹. Three angles are solved
-    exactly; with more, the mean residual is stored as a check.
+    The rows of A are `mueller.analyzer`, W holds the inverse variances of the intensities I. The covariance is
+    (AᵀWA)⁻¹. Three angles are solved exactly; with more, the mean residual is stored as a check.
 
     Raises
     ------
     CaptureError
-        The angles leave a Stokes parameter undetermined.
+        The angles do not determine all Stokes parameters.
 
     References
     ----------
@@ -108,7 +109,7 @@ def solve(
 
 
 def _check_condition(analyzers: Floats, angle: Floats) -> None:
-    """CaptureError for angles (K,) rad that do not determine S0, S1 and S2."""
+    """Raise CaptureError for angles (K,) rad that do not determine S0, S1 and S2."""
     condition = np.linalg.cond(analyzers)
     if condition > _MOST_CONDITION:
         angles = ", ".join(f"{np.degrees(a):.4g}°" for a in angle)
@@ -120,7 +121,7 @@ def _check_condition(analyzers: Floats, angle: Floats) -> None:
 
 @dataclass(frozen=True)
 class _Shots:
-    """The shots, and the mapping from the reference grid to each."""
+    """The shots, their gains, and the mapping from the reference grid to each."""
 
     radiance: AngleStack
     transform: Floats  # (K, 3, 3)
@@ -152,20 +153,20 @@ def _solve_in_blocks(
             difference = np.abs(value - fitted).sum(3).mean(0)
             residual[rows] = difference / np.maximum(solved[0].sum(2), 1e-9)
         if shots.radiance.equipment.extinction is not None:
-            _undilute(solved, doubt, shots.radiance.equipment.extinction)
-        quality[rows] = _judged(solved, doubt, flagged, settings)
+            _correct_extinction(solved, doubt, shots.radiance.equipment.extinction)
+        quality[rows] = _with_solution_flags(solved, doubt, flagged, settings)
     return stokes, covariance, quality, residual
 
 
 def _body(
     shots: _Shots, transform: Floats | None, factor: Floats | None, stokes: Floats, seen: Bits, crop: Box
 ) -> MaskedImage | None:
-    """S0 without mirrored light (h, w, 3): the crossed shot, which has none, registered and times its factor (3,)."""
+    """S0 of diffuse reflection (h, w, 3): the cross-polarized shot, registered and multiplied by its factor (3,)."""
     crossed = shots.radiance.crossed
     if crossed is None or transform is None or factor is None:
         return None
     picture, factor = crossed.picture, factor.astype(np.float32)
-    clipped = (seen & np.uint8(Quality.CLIPPED)) > 0  # polarization is unknown there, and small: it faces the camera
+    clipped = (seen & np.uint8(Quality.CLIPPED)) > 0  # S1, S2 are unknown there, and small: highlights face the camera
     across = np.where(clipped[..., None], 0, crossing.polarization_along(stokes[1], stokes[2], crossed.angle))
     value = crossing.diffuse_light(_resampled(shots, picture.value, transform, crop) * factor, across)
     variance = np.maximum(warp(picture.variance, transform, crop, 1, shots.lens), _LEAST_VARIANCE) * factor**2
@@ -176,7 +177,7 @@ def _body(
 
 
 def _flagged(quality: Bits) -> list[tuple[Quality, Bits]]:
-    """The bits of a shot (H, W) that are resampled, each with its plane."""
+    """The quality bits of a shot (H, W) that are resampled and occur, each with its plane."""
     planes = [(bit, quality & np.uint8(bit)) for bit in (Quality.CLIPPED, Quality.GHOST)]
     return [(bit, plane) for bit, plane in planes if plane.any()]
 
@@ -184,11 +185,13 @@ def _flagged(quality: Bits) -> list[tuple[Quality, Bits]]:
 def _add_flags(
     quality: Bits, flags: list[tuple[Quality, Bits]], transform: Floats, box: Box, lens: Distortion | None
 ) -> None:
+    """Set the bits of pixels to which a flagged pixel contributes more than 1 %, in place."""
     for bit, plane in flags:
         quality |= np.where(warp(plane, transform, box, 1, lens) > 0.01 * bit, np.uint8(bit), np.uint8(0))
 
 
 def _add_outside(quality: Bits, shape: tuple[int, int], transform: Floats, box: Box, lens: Distortion | None) -> None:
+    """Set OUTSIDE for pixels beyond a shot's edge, in place."""
     inside = covered(shape, transform, box, lens=lens)
     if not inside.all():
         quality |= np.where(inside, np.uint8(0), np.uint8(Quality.OUTSIDE))
@@ -197,15 +200,20 @@ def _add_outside(quality: Bits, shape: tuple[int, int], transform: Floats, box: 
 def _register(
     shots: _Shots, flags: list[list[tuple[Quality, Bits]]], box: Box, values: Floats, variances: Floats
 ) -> Bits:
-    """Every shot over its gain on a box of the reference grid and its variance, into (K, h, w, 3) each; its quality."""
+    """Resample all shots on a box of the reference grid, divided by their gains; returns the quality (h, w).
+
+    The results go to `values` and `variances`, (K, h, w, 3) each.
+    """
     radiance, lens, width = shots.radiance, shots.lens, box[2] - box[0]
     quality: Bits = np.zeros((box[3] - box[1], width), np.uint8)
     mosaic = radiance.offset_px is not None
     part = shots.transform[:, :2, 2] % 1
-    shares = np.prod(part**2 + (1 - part) ** 2, axis=1).mean()  # alike for all, lest the sharpest shot counts least
+    shares = np.prod(
+        part**2 + (1 - part) ** 2, axis=1
+    ).mean()  # one for all shots: the sharpest would get the least weight
     for k, transform in enumerate(shots.transform):
         gain = shots.gain[k].astype(np.float32)
-        if mosaic:  # the mean of two or four neighbors, as is usual: splines ring at the edges of so coarse a grid
+        if mosaic:  # mean of 2 or 4 neighbors, as usual for a mosaic: splines ring at edges of so coarse a grid
             shot = warp(radiance.value[k], transform, box, 1, lens)
         else:
             shot = _resampled(shots, radiance.value[k], transform, box)
@@ -221,12 +229,12 @@ def _register(
 
 
 def _rows(picture: Floats) -> Floats:
-    """A picture (h, w, 3) as lines (h, 3 w), the same memory: NumPy's loops over lines are faster than over three."""
+    """A picture (h, w, 3) as (h, 3 w) in the same memory: NumPy's inner loops are faster over long rows."""
     return picture.reshape(len(picture), -1)
 
 
 def _resampled(shots: _Shots, picture: Floats, transform: Floats, box: Box) -> Floats:
-    """A shot (H, W, 3) on a box of the reference grid (h, w, 3): every channel where its photosites are."""
+    """A shot (H, W, 3) resampled on a box (h, w, 3) of the reference grid, each channel from its own photosites."""
     site_px = shots.radiance.sensor.site_px
     if site_px is None or not site_px.any():
         return warp(picture, transform, box, lens=shots.lens)
@@ -238,7 +246,7 @@ def _resampled(shots: _Shots, picture: Floats, transform: Floats, box: Box) -> F
 
 
 def _exact(analyzers: Floats, value: Floats, variance: Floats, solved: Floats, doubt: Floats) -> None:
-    """Three angles, which need no weights: s = A⁻¹ I, and its covariance A⁻¹ diag(var) A⁻ᵀ."""
+    """Solve three angles, which need no weights: s = A⁻¹ I, with covariance A⁻¹ diag(var) A⁻ᵀ."""
     inverse = np.linalg.inv(analyzers)  # (3, K)
     squares = np.stack([inverse[i] * inverse[j] for i, j in _PAIRS])  # (6, K)
     np.matmul(inverse.astype(np.float32), value.reshape(3, -1), out=solved.reshape(3, -1))
@@ -246,7 +254,7 @@ def _exact(analyzers: Floats, value: Floats, variance: Floats, solved: Floats, d
 
 
 def _weighted_least_squares(analyzers: Floats, value: Floats, variance: Floats, solved: Floats, doubt: Floats) -> None:
-    """Stokes parameters (3, h, w, C) and their covariance (6, h, w, C) from both (K, h, w, C) and A (K, 3)."""
+    """Write Stokes parameters (3, h, w, C) and covariance (6, h, w, C) from values and variances (K, h, w, C)."""
     w = 1.0 / variance.astype(np.float64).reshape(len(value), -1)
     products = np.stack([analyzers[:, i] * analyzers[:, j] for i, j in _PAIRS])
     m00, m01, m02, m11, m12, m22 = products @ w  # the symmetric AᵀWA of every pixel
@@ -261,8 +269,8 @@ def _weighted_least_squares(analyzers: Floats, value: Floats, variance: Floats, 
         plane[:] = (a * right[0] + b * right[1] + c * right[2]).reshape(plane.shape)
 
 
-def _undilute(stokes: Floats, covariance: Floats, extinction: Floats) -> None:
-    """Scale S1 and S2 to an ideal polarizer's: one of extinction ratio E (C,) shows (E − 1)/(E + 1) of them."""
+def _correct_extinction(stokes: Floats, covariance: Floats, extinction: Floats) -> None:
+    """Divide S1 and S2 by the polarizer's contrast (E − 1)/(E + 1), for extinction ratios E (C,), in place."""
     ratio = np.asarray(extinction, np.float64)
     contrast = (1 - 1 / ratio) / (1 + 1 / ratio)
     up = (1 / np.stack([np.ones_like(contrast), contrast, contrast])).astype(np.float32)  # (3, C)
@@ -270,8 +278,8 @@ def _undilute(stokes: Floats, covariance: Floats, extinction: Floats) -> None:
     covariance *= np.stack([up[i] * up[j] for i, j in _PAIRS])[:, None, None]
 
 
-def _judged(stokes: Floats, covariance: Floats, quality: Bits, settings: StokesSettings) -> Bits:
-    """Quality bits (h, w), with those that follow from the solution: ILL_POSED, DARK, METAL."""
+def _with_solution_flags(stokes: Floats, covariance: Floats, quality: Bits, settings: StokesSettings) -> Bits:
+    """Quality bits (h, w) with those from the solution added: ILL_POSED, DARK, METAL."""
     s0, s1, s2 = (_total(plane) for plane in stokes)
     sigma0 = np.sqrt(_total(covariance[0]))
     sigma = np.sqrt((_total(covariance[3]) + _total(covariance[5])) / 2)
@@ -284,15 +292,15 @@ def _judged(stokes: Floats, covariance: Floats, quality: Bits, settings: StokesS
 
 
 def _total(picture: Floats) -> Floats:
-    """Sum over the channels of (h, w, 3)."""
+    """Sum (h, w) over the channels of a picture (h, w, 3)."""
     return np.asarray(cv2.transform(picture, np.ones((1, 3), np.float32)))
 
 
 def _metal(stokes: Floats, covariance: Floats) -> Bools:
-    """(H, W) whether the polarization of red and blue differs by more than a dielectric's can, at 5σ.
+    """Pixels (H, W) in which the AoLPs of red and blue differ by more than those of a dielectric can, at 5σ.
 
-    In a dielectric every channel has the same azimuth and a highlight only shortens the vectors; in a
-    conductor the complex index changes with wavelength.
+    In a dielectric all channels have the same AoLP, and a highlight only lowers the DoLP. In a metal the complex
+    refractive index changes with wavelength, and the AoLP with it.
     """
     (x0, y0, square0, noise0), (x1, y1, square1, noise1) = (_polarization(stokes, covariance, c) for c in (0, 2))
     enough = np.minimum(square0, square1) > np.float32(_METAL_DOLP**2)
@@ -302,7 +310,7 @@ def _metal(stokes: Floats, covariance: Floats) -> Bools:
 
 
 def _polarization(stokes: Floats, covariance: Floats, channel: int) -> tuple[Floats, Floats, Floats, Floats]:
-    """S1/S0, S2/S0, their squared length and their variance in one channel, each (H, W)."""
+    """S1/S0, S2/S0, the sum of their squares, and their variance in one channel, each (H, W)."""
     s0, s1, s2, v1, v2 = (
         np.asarray(cv2.extractChannel(plane, channel)) for plane in (*stokes, covariance[3], covariance[5])
     )

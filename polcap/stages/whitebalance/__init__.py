@@ -1,8 +1,8 @@
-"""Stage 2: the matrix from camera channels to colors, by the ColorChecker in the reference shot.
+"""Stage 2: color calibration, the matrix from camera channels to Rec.709, by a ColorChecker in the reference shot.
 
-The chart is searched in 8-bit gamma pictures of the merged radiance (`chart_search`), and placed to a fraction of a
-pixel on the radiance itself (`chart`). Its patches are sampled in the linear radiance (`patches`). A candidate counts
-only if detector, drawing and colors all agree with a ColorChecker Classic.
+The chart is searched in 8-bit gamma pictures of the merged radiance (`chart_search`), and located to a fraction of a
+pixel in the radiance itself (`chart`). Its patches are sampled in the linear radiance (`patches`). A candidate is
+accepted only if detector, drawn model and colors all agree with a ColorChecker Classic.
 
 References
 ----------
@@ -33,11 +33,11 @@ from polcap.stages.whitebalance import chart, chart_light, chart_search, patches
 from polcap.stages.whitebalance.chart import Placement
 from polcap.stages.whitebalance.patches import ChartFit
 
-_LEAST_PITCH_PX = 8.0  # below, a patch has too few pixels to be sampled
-_CLEARLY_BETTER = 0.5  # of the residual: of 15 photographs none comes below .93 with another edition
-_SMALL_PART = 0.05  # of the variance that edges of patches under ten pixels take: colors decide there
-_SAME_PLACE = 0.25  # patches; candidates nearer than this are one
-_MOST_MOVED = 0.35  # patches by which stated corners are refined at most
+_LEAST_PITCH_PX = 8.0  # with less, a patch has too few pixels
+_CLEARLY_BETTER = 0.5  # residual with another edition of the chart over that with the stated one: 15 charts had ≥ 0.93
+_SMALL_PART = 0.05  # of the variance, for edges of small patches: there colors decide
+_SAME_PLACE = 0.25  # patches; candidates nearer than this are the same
+_MOST_MOVED = 0.35  # patches; largest refinement of corners from the user
 _REMEDY = "give its corners with --chart x0,y0,…,x3,y3, a profile with --chart FILE, or --no-chart"
 
 
@@ -47,7 +47,7 @@ class WhitebalanceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     chart: Annotated[
         Literal["classic", "classic_before_2014", "classic_srgb", "sg"],
         Meta(
-            description="kind of chart; classic: the edition since 2014 unless another suits its colors much better; "
+            description="kind of chart; classic: the edition since 2014 unless another fits its colors much better; "
             "of a (Digital) SG the block E2 to J5, whose corners --chart states"
         ),
     ] = "classic"
@@ -72,28 +72,27 @@ def measure(
 ) -> ColorCalibration:
     """The color matrix of a capture, on the scale of S0 = I₀ + I₉₀, with the chart's place and residuals.
 
-    The patches of the reference shot, the first of (K, H, W, 3), give 2·I = S0: a matt chart that faces the camera is
-    unpolarized. The matrix holds at the white patch, less the chart's glare: matrix @ S0 = reflectance + glare there.
-    `light` describes how much less light the patch got than one that faces the flash; `cues` corrects for it together
-    with the object's place. `delta_e` is NaN for patches that were left out. `metres_per_px` needs
-    `settings.chart_width_m`: nothing is assumed about the chart's size.
+    Patches of the reference shot, the first of (K, H, W, 3), give S0 = 2·I, because a matt chart that faces the camera
+    is unpolarized. At the white patch matrix @ S0 = reflectance + glare. `light` describes how much less light this
+    patch receives than a surface that faces the flash; `cues` corrects for it. `delta_e` is NaN for patches that were
+    left out. `metres_per_px` needs `settings.chart_width_m`: the chart's size is not assumed.
 
     Raises
     ------
     ChartError
-        No ColorChecker Classic found, or corners or exposure that do not show one.
+        No ColorChecker Classic is found, or it is not visible at the corners from the user, or it is over-exposed.
     """
     if request.mode == "none" or (request.mode == "auto" and _monochrome(radiance.value[0])):
         return _from_camera(radiance)
     if request.mode == "profile":
         if request.profile is None:
-            raise ChartError("a color profile was asked for and none was named; use --chart FILE")
+            raise ChartError("a color profile is needed; name its file with --chart FILE")
         return replace(request.profile, source="profile", place=None)
     if request.mode == "corners":
         found = _at_corners(radiance, reference, request.corners, settings)
     elif settings.chart == "sg":
         raise ChartError(
-            "a ColorChecker SG is not searched for; give the outer corners of its patches E2, J2, J5, E5 with --chart"
+            "polcap cannot search for a ColorChecker SG; give the outer corners of patches E2, J2, J5, E5 with --chart"
         )
     else:
         found = _search(radiance, reference, settings)
@@ -118,7 +117,7 @@ def measure(
 
 
 def _monochrome(value: Floats) -> bool:
-    """Whether the three channels are one: without colors no chart is searched for."""
+    """Whether the three channels are equal; then no chart is searched."""
     step = max(1, int(np.sqrt(value[..., 0].size / 1e5)))
     few = value[::step, ::step]
     return bool(np.array_equal(few[..., 0], few[..., 1]) and np.array_equal(few[..., 0], few[..., 2]))
@@ -136,7 +135,7 @@ class _Find:
 
 
 def _search(radiance: AngleStack, reference: ChartReference, settings: WhitebalanceSettings) -> _Find:
-    """The first candidate that passes every test with ease, else the best one that passes."""
+    """The first candidate that passes all tests with half the permitted residual, else the best one that passes."""
     value = radiance.value[0]
     known: list[Placement] = []
     best: _Find | None = None
@@ -159,7 +158,7 @@ def _search(radiance: AngleStack, reference: ChartReference, settings: Whitebala
             exposed = error
             continue
         best = min([*ways, *([] if best is None else [best])], key=lambda find: find.error, default=None)
-        if best is not None and best.error <= settings.max_delta_e / 2:  # beyond, a later picture may be better
+        if best is not None and best.error <= settings.max_delta_e / 2:  # otherwise a later picture may be better
             return best
     if best is not None and best.error <= settings.max_delta_e:
         return best
@@ -172,7 +171,7 @@ def _search(radiance: AngleStack, reference: ChartReference, settings: Whitebala
 def _both_ways(
     radiance: AngleStack, reference: ChartReference, place: Placement, cost: float, settings: WhitebalanceSettings
 ) -> list[_Find]:
-    """A candidate as it is and upside down, as the detector may read it; neither where its colors decide against it."""
+    """A candidate as detected and upside down, for the detector may confuse them; empty if its colors do not fit."""
     seen = patches.sample(radiance.value[0], radiance.quality[0], place, settings.patch_share)
     ways = [
         _Find(place, patches.fit(seen, reference), cost),
@@ -186,13 +185,13 @@ def _both_ways(
 def _reason(
     best: _Find | None, small_px: float, least_px: float, cheapest: float, settings: WhitebalanceSettings
 ) -> str:
-    """Why no candidate was accepted; pitches of patches in RAW px, cheapest the least cost of a candidate."""
+    """The reason that no candidate was accepted; pitches of patches in RAW px, `cheapest` the least cost."""
     if best is not None:
         return f"best mean residual ΔE {best.error:.1f}, whitebalance.max_delta_e = {settings.max_delta_e:g}"
     if 0 < small_px < least_px:
         return f"its patches are spaced by {small_px:.0f} RAW px, at least {least_px:.0f} are needed: show it larger"
     if cheapest == np.inf:
-        return "the detector found nothing similar"
+        return "the detector found nothing like it"
     if cheapest > settings.max_cost:
         return f"best detector cost {cheapest:.3f}, limit whitebalance.max_cost = {settings.max_cost:g}"
     return f"the best candidate (cost {cheapest:.3f}) does not show 6 × 4 patches on a dark card"
@@ -201,18 +200,18 @@ def _reason(
 def _at_corners(
     radiance: AngleStack, reference: ChartReference, corners_px: Floats | None, settings: WhitebalanceSettings
 ) -> _Find:
-    """The chart at the corners (4, 2) RAW px that the user stated, placed more finely where the image allows it."""
+    """The chart at corners (4, 2) RAW px from the user, refined in the picture if possible."""
     if corners_px is None or np.shape(corners_px) != (4, 2):
-        raise ChartError("--chart needs the four outer patch corners x0,y0,…,x3,y3, dark skin first, clockwise")
+        raise ChartError("--chart needs the four outer corners of the patches x0,y0,…,x3,y3, clockwise from dark skin")
     height, width = radiance.value.shape[1:3]
     scale = radiance.view.scale
     corners = (np.asarray(corners_px, np.float64) - (scale - 1) / 2) / scale
     placement = chart.from_corners(corners)
     stated = "chart corners " + ", ".join(f"({x:g}, {y:g})" for x, y in corners_px)
     if not chart.is_view(placement.homography):
-        raise ChartError(f"{stated} do not go round clockwise; start at the dark-skin patch, go along its row")
+        raise ChartError(f"{stated} are not clockwise; start at the dark-skin patch and go along its row")
     if (corners < -0.5).any() or (corners > np.array([width, height]) - 0.5).any():
-        raise ChartError(f"{stated} reach outside the image of {width * scale:g} × {height * scale:g} px; check them")
+        raise ChartError(f"{stated} are outside the picture of {width * scale:g} × {height * scale:g} px; check them")
     if placement.pitch_px < _LEAST_PITCH_PX:
         raise ChartError(
             f"{stated} space the patches by {placement.pitch_px:.1f} px on the merged image, at least "
@@ -241,7 +240,7 @@ def _fit(radiance: AngleStack, place: Placement, reference: ChartReference, sett
 def _edition(
     radiance: AngleStack, found: _Find, reference: ChartReference, settings: WhitebalanceSettings
 ) -> tuple[_Find, ChartReference]:
-    """The find by the edition of the chart that fits its colors, and that edition."""
+    """The chart with colors of the edition that fits best, and that edition."""
     residuals = [patches.residual(found.seen, other) for other in (reference, *reference.editions)]
     least = int(np.argmin(residuals))
     if residuals[least] >= _CLEARLY_BETTER * residuals[0]:
@@ -255,7 +254,7 @@ def _plausible(place: Placement, min_explained: float) -> bool:
 
 
 def _among(places: list[Placement], start: Placement) -> bool:
-    """Whether a start leads to a known place: all centers within a quarter of a patch."""
+    """Whether a candidate is at a known place: all patch centers within a quarter of a patch."""
     here = transform_points(start.homography, chart.centers())
     return any(
         np.abs(transform_points(way.homography, chart.centers()) - here).max() < _SAME_PLACE * place.pitch_px
@@ -265,7 +264,7 @@ def _among(places: list[Placement], start: Placement) -> bool:
 
 
 def _from_camera(radiance: AngleStack) -> ColorCalibration:
-    """The camera's own matrix or white balance with sensor white at 1; else colors as they are."""
+    """The camera's matrix or white balance from metadata, with sensor white at 1; without either, the identity."""
     matrix = np.eye(3)
     known = radiance.sensor.camera_matrix is not None or radiance.sensor.white_balance is not None
     if radiance.sensor.white_balance is not None:
@@ -276,10 +275,10 @@ def _from_camera(radiance: AngleStack) -> ColorCalibration:
 
 
 def _scale(place: Placement, view: View, width_m: float | None) -> float | None:
-    """Metres per pixel in the plane across the optical axis through the chart's center: Z/f.
+    """Metres per pixel (Z/f) in the plane through the chart's center, perpendicular to the optical axis.
 
-    With K the camera and H the homography from metres along the chart's width, K⁻¹H ∝ (r₁, r₂, t) and
-    |r₁| = 1 (Zhang, IEEE PAMI 2000): neither the chart's height nor its tilt is needed.
+    With K the camera and H the homography from metres along the chart's width, K⁻¹H ∝ (r₁, r₂, t) with
+    |r₁| = 1 (Zhang, IEEE PAMI 2000). So neither the chart's height nor its tilt is needed.
     """
     if width_m is None:
         return None

@@ -1,11 +1,11 @@
-"""The ColorChecker Classic's geometry, and its place in an image to a fraction of a pixel.
+"""Geometry of the ColorChecker Classic, and its subpixel location in an image.
 
 Chart coordinates (u, v) count patches: patch (row, column) is centered on (column + ½, row + ½), so the
 chart spans 0…6 × 0…4; each patch is a square of side `patch` (its share of the pitch) on a dark card.
 
-The place is found by synthesis: the chart is drawn with its own patch colors through a blurred homography,
-and the homography, the patch side and the blur are changed until the drawing fits the image
-(Gauss–Newton on every pixel at once, with a robust loss for dust, labels and highlights).
+The chart is located by synthesis: it is drawn with its patch colors through a homography, with blurred edges.
+Homography, patch side and blur are fitted to all pixels of the image by Gauss–Newton steps, with a robust loss for
+dust, labels and highlights.
 
 References
 ----------
@@ -24,21 +24,21 @@ from polcap.optics.robust import MAD_TO_SIGMA
 
 ROWS, COLUMNS = 4, 6
 USUAL_PATCH = 0.88  # side of a patch / pitch
-_GREATEST_BLUR = 0.12  # 1σ of the edges [pitch]
-_PIXEL_BLUR_PX = 0.29  # 1σ of a pixel's own width, 1/√12: no edge is sharper
+_GREATEST_BLUR = 0.12  # 1σ of edges [pitch]
+_PIXEL_BLUR_PX = 0.29  # 1/√12, 1σ of a pixel's width: edges cannot be sharper
 _GAMMA = 2.2
-_DARKEST = 1e-3  # of white; darker counts as this
-_MARGIN = 0.045  # how far beyond the outer patches the card is compared [pitch]
+_DARKEST = 1e-3  # of white; darker values are set to this
+_MARGIN = 0.045  # width of card around the outer patches that is compared [pitch]
 
 
 @dataclass(frozen=True)
 class Placement:
-    """A chart in an image."""
+    """Location of a chart in an image."""
 
     homography: Floats  # (3, 3) chart (u, v, 1) → image px (x, y, 1)
     patch: float  # side of a patch / pitch
     blur: float  # 1σ of its edges / pitch
-    explained: float  # share of the variance that the drawing accounts for, ≤ 1
+    explained: float  # share of the image's variance that the drawing explains, ≤ 1
 
     @property
     def pitch_px(self) -> float:
@@ -56,12 +56,12 @@ class Placement:
         return transform_points(self.homography, _outer(self.patch))
 
     def turned(self) -> "Placement":
-        """The same place, read upside down."""
+        """The same location read upside down."""
         half_turn = np.array([[-1.0, 0, COLUMNS], [0, -1.0, ROWS], [0, 0, 1]])
         return Placement(self.homography @ half_turn, self.patch, self.blur, self.explained)
 
     def moved(self, transform: Floats) -> "Placement":
-        """The place in another image; transform (3, 3) takes this image's px to the other's."""
+        """The location in another image; transform (3, 3) maps px of this image to px of the other."""
         return Placement(transform @ self.homography, self.patch, self.blur, self.explained)
 
 
@@ -76,17 +76,17 @@ def centers() -> Floats:
 
 
 def from_centers(points: Floats) -> Placement:
-    """The placement that brings the patch centers nearest to 24 image points (24, 2) px."""
+    """The placement whose patch centers fit image points (24, 2) px, by least squares."""
     return Placement(_homography(centers(), points), USUAL_PATCH, _GREATEST_BLUR / 3, 0.0)
 
 
 def from_corners(points: Floats, patch: float = USUAL_PATCH) -> Placement:
-    """The placement of four outer patch corners (4, 2) px, dark skin first, clockwise on the chart."""
+    """The placement with outer patch corners (4, 2) px, dark skin first, clockwise on the chart."""
     return Placement(_homography(_outer(patch), points), patch, _GREATEST_BLUR / 3, 0.0)
 
 
 def is_view(homography: Floats) -> bool:
-    """Whether a flat chart can look like this homography (3, 3): convex, not mirrored, nowhere behind the camera."""
+    """Whether a photograph can show a chart like this (3, 3): convex, not mirrored, in front of the camera."""
     corners = _outer(1.0)
     depth = corners @ homography[2, :2] + homography[2, 2]
     if not np.isfinite(homography).all() or not (depth * depth[0] > 0).all():
@@ -98,12 +98,12 @@ def is_view(homography: Floats) -> bool:
 
 
 def refine(image: Floats, start: Placement, steps: int = 12) -> Placement:
-    """The placement whose drawing fits the image best, in `steps` at most from one that is right to a third of a patch.
+    """Refine a placement that is right to a third of a patch until its drawing fits the image best.
 
-    The image (H, W, 3) is linear, with white about 1 and 8 pixels per patch or more. Light mixes linearly at an edge,
-    but the difference is judged through a gamma of 2.2, so that dark patches count.
+    The image (H, W, 3) is linear, with white about 1, and has 8 pixels per patch or more. Light mixes linearly at an
+    edge; residuals are computed after a gamma of 2.2, so that dark patches count too.
     """
-    frame = _frame(start)  # image px → about the chart's own, so that all unknowns have one scale
+    frame = _frame(start)  # in units of the chart, so that all unknowns have a similar scale
     at = pixels_inside(transform_points(start.homography, _AROUND), image.shape)
     value = np.ascontiguousarray(image[at[:, 1], at[:, 0]].T, np.float32)
     if value.shape[1] < 24 * 16:
@@ -119,7 +119,7 @@ def refine(image: Floats, start: Placement, steps: int = 12) -> Placement:
         if drawing is None:
             return start
         normal, right = drawing.equations()
-        if not np.trace(normal) > 0:  # an even picture
+        if not np.trace(normal) > 0:  # a uniform picture
             return start
         damping = 1e-3 * np.diag(normal) + 1e-9 * np.trace(normal)
         change = np.linalg.solve(normal + np.diag(damping), right)
@@ -135,15 +135,15 @@ def refine(image: Floats, start: Placement, steps: int = 12) -> Placement:
 
 @dataclass(frozen=True)
 class _Drawing:
-    """A chart drawn over N pixels, float32: the residual and its derivatives by the ten unknowns."""
+    """A chart drawn at N pixels, float32: residuals, and derivatives of the drawing by the ten unknowns."""
 
     seen: Floats  # (3, N) encoded
     residual: Floats  # (3, N) seen − drawn
-    contrast: Floats  # (3, N) derivative of the drawing by cover
+    contrast: Floats  # (3, N) derivative of the drawn value by cover, the patch's share of the pixel
     cover_by: Floats  # (10, N) derivative of cover by the homography's eight numbers, patch and blur
 
     def equations(self) -> tuple[Floats, Floats]:
-        """JᵀWJ (10, 10) and JᵀWr (10,) with Huber weights W; a pixel's J is contrast times cover_by."""
+        """JᵀWJ (10, 10) and JᵀWr (10,) with Huber weights W; the J of a pixel is contrast · cover_by."""
         off = np.abs(self.residual)
         scale = np.float32(MAD_TO_SIGMA * np.median(off) + 1e-4)
         weight = np.minimum(np.float32(1), np.float32(2.5) * scale / (off + np.float32(1e-12)))
@@ -153,17 +153,18 @@ class _Drawing:
         return ((self.cover_by * slope) @ self.cover_by.T).astype(np.float64), (self.cover_by @ pull).astype(np.float64)
 
     def explained(self) -> float:
-        """Share of the variance that the drawing accounts for."""
+        """Share of the image's variance that the drawing explains."""
         spread = self.seen - np.median(self.seen, axis=1)[:, None]
         return 1 - float(np.mean(np.minimum(self.residual**2, 0.25)) / max(float(np.mean(spread**2)), 1e-9))
 
 
 def _encoded(linear: Floats) -> Floats:
+    """Gamma encoding of positive linear values."""
     return np.asarray(np.exp(np.log(linear) * np.float32(1 / _GAMMA)))
 
 
 def _draw(point: Floats, value: Floats, seen: Floats, inverse: Floats, patch: float, blur: float) -> _Drawing | None:
-    """The chart over points (2, N) of its frame that show `value` (3, N), encoded `seen`; None if it lies outside."""
+    """Draw the chart at points (2, N) with linear values (3, N), encoded `seen`; None with too few pixels on it."""
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v, depth = inverse[:, :2] @ point + inverse[:, 2:]
         u, v = u / depth, v / depth
@@ -201,8 +202,8 @@ def _draw(point: Floats, value: Floats, seen: Floats, inverse: Floats, patch: fl
 
 
 def _box(offset: Floats, patch: float, blur: float) -> tuple[Floats, Floats, Floats, Floats]:
-    """A blurred box over −patch/2…patch/2, and its derivatives by offset, patch and blur; float32."""
-    from scipy.special import ndtr  # here: importing it costs .2 s of every start
+    """A blurred box from −patch/2 to patch/2, and its derivatives by offset, patch and blur; float32."""
+    from scipy.special import ndtr  # here: the import takes 0.2 s
 
     over = np.float32(1 / blur)
     low, high = (offset + np.float32(patch / 2)) * over, (offset - np.float32(patch / 2)) * over
@@ -217,7 +218,7 @@ def _box(offset: Floats, patch: float, blur: float) -> tuple[Floats, Floats, Flo
 
 
 def _colors(value: Floats, cover: Floats, cell: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Color of each patch (24, 3) and of the card (3,), medians of pixels (3, N)."""
+    """Color of each patch (24, 3) and of the card (3,): medians of the pixels (3, N)."""
     bare = cover < max(0.1, float(np.percentile(cover, 2)))
     card = np.median(value[:, bare], axis=1)
     colors = np.tile(card, (ROWS * COLUMNS, 1))
@@ -232,14 +233,14 @@ def _colors(value: Floats, cover: Floats, cell: NDArray[np.intp]) -> tuple[Float
 
 
 def _medians(value: Floats) -> Floats:
-    """Medians of rows (C, N), faster than np.median on so few values."""
+    """Medians (C,) of rows (C, N), faster than np.median for few values."""
     low, high = (value.shape[1] - 1) // 2, value.shape[1] // 2
     ordered = np.partition(value, (low, high), axis=1)
     return np.asarray((ordered[:, low] + ordered[:, high]) / 2)
 
 
 def pixels_inside(quad: Floats, shape: tuple[int, ...]) -> NDArray[np.int_]:
-    """(N, 2) x, y of the pixels of a picture (H, W, …) in a convex quad (4, 2) px, clockwise."""
+    """Pixels x, y (N, 2) of a picture (H, W, …) inside a convex, clockwise quad (4, 2) px."""
     x0, y0 = np.maximum(np.floor(quad.min(axis=0)).astype(int), 0)
     x1, y1 = np.minimum(np.ceil(quad.max(axis=0)).astype(int) + 1, [shape[1], shape[0]])
     y, x = np.mgrid[y0 : max(y1, y0), x0 : max(x1, x0)]
@@ -250,19 +251,20 @@ def pixels_inside(quad: Floats, shape: tuple[int, ...]) -> NDArray[np.int_]:
 
 
 def _frame(placement: Placement) -> Floats:
-    """Image px → units of the pitch about the chart's center, (3, 3)."""
+    """Transform (3, 3) from image px to units of the pitch, with the chart's center at the origin."""
     middle = transform_points(placement.homography, np.array([COLUMNS / 2, ROWS / 2]))
     pitch = placement.pitch_px
     return np.array([[1 / pitch, 0, -middle[0] / pitch], [0, 1 / pitch, -middle[1] / pitch], [0, 0, 1]])
 
 
 def _outer(patch: float) -> Floats:
+    """Outer corners (4, 2) of the outer patches in chart coordinates."""
     gap = (1 - patch) / 2
     return np.array([[gap, gap], [COLUMNS - gap, gap], [COLUMNS - gap, ROWS - gap], [gap, ROWS - gap]])
 
 
 def _homography(source: Floats, target: Floats) -> Floats:
-    """Direct linear transform of (N ≥ 4, 2) points, on normalized coordinates."""
+    """Homography (3, 3) from points (N ≥ 4, 2) by the direct linear transform, on normalized coordinates."""
     frames = []
     for points in (source, target):
         (x, y), unit = points.mean(axis=0), 1 / (points.std() + 1e-12)

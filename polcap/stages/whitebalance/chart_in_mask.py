@@ -1,4 +1,4 @@
-"""Whether a part of the object's mask is a ColorChecker that the search did not find."""
+"""Detects a ColorChecker in the object's mask that the chart search did not find."""
 
 import cv2
 import numpy as np
@@ -8,18 +8,18 @@ from polcap.errors import ChartError
 from polcap.images import AngleStack, ChartReference
 from polcap.stages.whitebalance import chart, patches
 
-_LEAST_SHARE = 0.05  # of the mask; less spoils little
-_LEAST_PITCH_PX = 6.0  # of patches that differ from texture
-_MOST_SIDE_PX = 320  # the part is averaged down to this
-_FILLED = 0.9  # of its rectangle, by a flat card
-_ASPECT = (1.15, 1.8)  # of a card of 6 × 4 patches with its border, seen obliquely
-_EXPLAINED = 0.75  # of its variance by 24 flat patches on a card; of 106 textures of that outline 17 have that
-_DELTA_E = 15.0  # of its colors, as `whitebalance.max_delta_e`: the textures have 20 and more
-_PATCH_SHARE = 0.6  # of a patch's side that is sampled
+_LEAST_SHARE = 0.05  # of the mask; smaller parts do little harm
+_LEAST_PITCH_PX = 6.0  # smaller patches cannot be distinguished from texture
+_MOST_SIDE_PX = 320  # longer side to which the part is averaged down
+_FILLED = 0.9  # least share of its bounding rectangle that a card fills
+_ASPECT = (1.15, 1.8)  # range of aspect ratios of a card with 6 × 4 patches, also when tilted
+_EXPLAINED = 0.75  # least share of variance that 24 flat patches explain; 17 of 106 textures have it too
+_DELTA_E = 15.0  # largest mean ΔE of its colors, as `whitebalance.max_delta_e`; these textures have 20 and more
+_PATCH_SHARE = 0.6  # sampled share of a patch's side
 
 
 def share(radiance: AngleStack, mask: NDArray[np.bool_], reference: ChartReference) -> float:
-    """Share of the mask (H, W) where the first shot shows 6 × 4 flat patches of a chart's colors on a card."""
+    """Share of the mask (H, W) whose part in the first shot is a ColorChecker."""
     count, label, about, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     total = max(int(mask.sum()), 1)
     parts = [n for n in range(1, count) if about[n, cv2.CC_STAT_AREA] > _LEAST_SHARE * total]
@@ -27,6 +27,7 @@ def share(radiance: AngleStack, mask: NDArray[np.bool_], reference: ChartReferen
 
 
 def _is_chart(radiance: AngleStack, part: NDArray[np.bool_], reference: ChartReference) -> bool:
+    """Whether a connected part (H, W) of the mask shows 6 × 4 flat patches of a chart's colors on a card."""
     y, x = np.nonzero(part)
     center, (a, b), turn = cv2.minAreaRect(np.stack([x, y], axis=-1).astype(np.float32))
     long, short = max(a, b) + 1, min(a, b) + 1  # from pixel centers to their edges
@@ -34,7 +35,7 @@ def _is_chart(radiance: AngleStack, part: NDArray[np.bool_], reference: ChartRef
         return False
     if long / chart.COLUMNS < _LEAST_PITCH_PX:
         return False
-    box = cv2.boxPoints((center, (a, b), turn)).astype(np.float64)  # clockwise as seen
+    box = cv2.boxPoints((center, (a, b), turn)).astype(np.float64)  # clockwise
     if np.linalg.norm(box[1] - box[0]) < np.linalg.norm(box[2] - box[1]):
         box = np.roll(box, -1, axis=0)
     x0, y0 = x.min(), y.min()

@@ -1,9 +1,9 @@
-"""The chart's plane, the flash's place and the light's falloff, from the chart's outline and the light across it.
+"""Estimates the chart's plane, the position of the flash and the falloff of light, from the chart in one shot.
 
-A flash at L lights points P of a chart with normal n as n·(L − P)/|L − P|³. Across the chart n·(L − P) is constant,
-so the slope of the light gives the flash's position over the chart's plane: per patch it is 3 pitches over the
-distance, times the sine of the angle from the normal to the flash. The chart's turn comes from its outline: a
-homography's first two columns point along rows and columns, whatever the card's sides are.
+A flash at L lights points P of a chart with normal n as n·(L − P)/|L − P|³. Across the chart n·(L − P) is constant.
+So the slope of the light gives the flash's position over the chart's plane: per patch it is 3 pitches over the
+distance, times the sine of the angle from the normal to the flash. The chart's orientation comes from its outline: the
+first two columns of its homography point along rows and columns.
 
 References
 ----------
@@ -19,28 +19,30 @@ from polcap.optics import point_light
 from polcap.stages.whitebalance import chart, patches
 from polcap.stages.whitebalance.chart import Placement
 
-# 1σ before the measurement: the flash right of the lens and above it [distances], the falloff's power. A hot shoe
-# is .1 to .15 m above the lens, objects at about 1 m; cos⁴ is a lens's natural falloff, 0 a corrected one.
+# 1σ before the measurement: flash right of the lens, above the lens [chart distances], power of the falloff. A hot shoe
+# is 0.1 to 0.15 m above the lens, objects at about 1 m; cos⁴ is a lens's natural falloff, cos⁰ a corrected one.
 _PRIOR = np.array([0.1, 0.1, 2.0])
-# 1σ of the chart's turn by its outline [rad]: corners within .2 % of the chart, lenses that bend by 1 %; and of the
-# focal length where the sensor's size is a guess, relative; the turn has the same relative error
+# 1σ of the chart's tilt by its outline [rad]: corners are right to 0.2 % of the chart, lenses distort by 1 %. Then
+# relative 1σ of a focal length that is a guess; the tilt has the same relative error.
 _TURN_SIGMA, _FOCAL_SPREAD = 0.03, 0.3
-_FARTHEST = 0.3  # a flash beyond is no flash at the camera [distances]
-_LIGHT_PER_DELTA_E = 0.02  # a patch that is off by ΔE2000 = 1 is off by about 2 % in Y: half of it lightness
+_FARTHEST = 0.3  # largest distance of the flash from the lens [chart distances]
+_LIGHT_PER_DELTA_E = 0.02  # relative error of Y per ΔE2000; about half of a ΔE is lightness
 _LEAST_PATCH_ERROR = 0.005
 _STEP = 1e-4
 _ROUNDS = 4
-_STRAIGHT = np.linalg.pinv(np.column_stack([np.ones(24), patches.position()]))  # (3, 24) light → level and slope
+_STRAIGHT = np.linalg.pinv(
+    np.column_stack([np.ones(24), patches.position()])
+)  # (3, 24) maps the light of patches to level and slope
 
 
 def measure(place: Placement, view: View, slope: Floats, delta_e: float) -> ChartLight:
-    """The chart's plane, the most probable place of the flash and falloff of the light, and their covariance.
+    """The chart's plane, the most probable position of the flash and falloff of light, and their covariance.
 
-    slope (2,) is the relative change of the light per patch, to the chart's right and down, from the white patch;
-    delta_e, the mean residual of the patches, gives its error.
+    slope (2,) is the relative change of the light per patch, towards the chart's right and down, at the white patch.
+    delta_e, the mean residual of the patches, determines its error.
     """
     outlined = _ChartPlane(*_plane(place, view))
-    aslant = np.hypot(*outlined.normal[:2]) / outlined.normal[2]  # tangent of the turn from the image's plane
+    aslant = np.hypot(*outlined.normal[:2]) / outlined.normal[2]  # tangent of the tilt from the image plane
     turn = _TURN_SIGMA if view.known else float(np.hypot(_TURN_SIGMA, _FOCAL_SPREAD * min(aslant, 1.0)))
     prior = np.diag(1 / np.array([*_PRIOR, turn, turn]) ** 2)
     error = max(_LEAST_PATCH_ERROR, _LIGHT_PER_DELTA_E * delta_e)
@@ -59,11 +61,11 @@ def measure(place: Placement, view: View, slope: Floats, delta_e: float) -> Char
 
 @dataclass(frozen=True)
 class _ChartPlane:
-    point: Floats  # (24, 3) patch centers, in distances of the chart's middle, camera frame
+    point: Floats  # (24, 3) patch centers in the camera frame, in units of the distance of the chart's center
     normal: Floats  # (3,)
 
     def turned(self, turn: Floats) -> "_ChartPlane":
-        """Turned about its middle by a small turn (2,) about x and y [rad]."""
+        """The plane after a small rotation (2,) about x and y [rad] through its center."""
         from scipy.spatial.transform import Rotation  # here: importing it costs .2 s of every start
 
         rotation, middle = Rotation.from_rotvec([*turn, 0.0]), self.point.mean(axis=0)
@@ -71,14 +73,14 @@ class _ChartPlane:
 
 
 def _slope(outlined: _ChartPlane, state: Floats) -> Floats:
-    """Relative change (2,) of a flash's light per patch, by the fit of a straight slope."""
+    """Relative change (2,) of the light per patch for a state (5,), by a linear fit over the patches."""
     plane = outlined.turned(state[3:])
     level, *slope = _STRAIGHT @ point_light.irradiance(plane.point, state[:2], state[2], plane.normal)
     return np.asarray(np.array(slope) / level)
 
 
 def _plane(place: Placement, view: View) -> tuple[Floats, Floats]:
-    """Patch centers (24, 3) in distances of the chart's middle, and the chart's normal (3,), camera frame."""
+    """Patch centers (24, 3) in units of the distance of the chart's center, and normal (3,), in the camera frame."""
     camera = np.array([[view.focal, 0, view.center[0]], [0, view.focal, view.center[1]], [0, 0, 1]])
     pose = np.diag([1.0, -1.0, -1.0]) @ np.linalg.solve(camera, place.homography)
     pose = -pose / (pose[2] @ [chart.COLUMNS / 2, chart.ROWS / 2, 1])

@@ -1,4 +1,4 @@
-"""Candidates for a ColorChecker in a picture: OpenCV's detector at several scales and exposures, then placed finely."""
+"""Searches a picture for a ColorChecker, with OpenCV's detector at several scales and exposures."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -12,12 +12,12 @@ from polcap.optics.projection import transform_points
 from polcap.stages.whitebalance import chart
 from polcap.stages.whitebalance.chart import Placement
 
-_WORK_PITCH_PX = 32.0  # the chart is placed at no more pixels per patch than this
-_NEAR_PITCH_PX, _LAST_STEPS = 10.0, 4  # first at these, which lead to within .01 patch; then so many steps are left
+_WORK_PITCH_PX = 32.0  # a chart with more pixels per patch is averaged down before it is refined
+_NEAR_PITCH_PX, _LAST_STEPS = 10.0, 4  # pitch of the first refinement, right to 0.01 patch; steps of the second
 _TILE_PX, _TILE_STEP_PX = 900, 600
 _GAMMA = (255 * np.linspace(0, 1, 2**14) ** (1 / 2.2)).astype(np.uint8)
-_QUICK_SIDE = 600  # px of the picture that is searched first, in a tenth of the time
-# Its detector's parameters: the defaults for a picture of .4 times its side, and five thresholds in place of nine.
+_QUICK_SIDE = 600  # px of the picture that is searched first: ten times as fast
+# Detector parameters for it: the defaults scaled by 0.4, with five thresholds instead of nine.
 _QUICK = {
     "minImageSize": 400,
     "minContourLengthAllowed": 40,
@@ -26,11 +26,11 @@ _QUICK = {
     "adaptiveThreshWinSizeMax": 61,
     "adaptiveThreshWinSizeStep": 12,
 }
-_CANDIDATES = 3  # per picture: texture may look more like a chart than the chart
+_CANDIDATES = 3  # per picture, because the detector may prefer a texture to the chart
 
 
 def candidates(value: Floats) -> Iterator[tuple[Floats, float]]:
-    """Patch centers (24, 2) px in a picture (H, W, 3) where the detector finds a chart, and its cost."""
+    """Patch centers (24, 2) px and detector cost of possible charts in a picture (H, W, 3)."""
     small = _resized(value, min(1.0, _QUICK_SIDE / max(value.shape[:2])))
     yield from _detected(_detector(_QUICK), _eight_bits(small, _white(value)), _scaling(small.shape, value.shape))
     detector = _detector({})
@@ -39,7 +39,7 @@ def candidates(value: Floats) -> Iterator[tuple[Floats, float]]:
 
 
 def refine(value: Floats, start: Placement) -> Placement:
-    """Place the chart on its surroundings in a picture (H, W, 3), averaged down where they are large."""
+    """Refine the location of a chart in a picture (H, W, 3); large charts are averaged down."""
     around = transform_points(start.homography, np.array([[-1.0, -1], [7, -1], [7, 5], [-1, 5]]))
     x0, y0 = np.maximum(np.floor(around.min(axis=0)).astype(int), 0)
     x1, y1 = np.minimum(np.ceil(around.max(axis=0)).astype(int) + 1, [value.shape[1], value.shape[0]])
@@ -56,7 +56,7 @@ def refine(value: Floats, start: Placement) -> Placement:
 
 
 def _refined(seen: Floats, start: Placement, transform: Floats, steps: int = 12) -> Placement:
-    """On a part `seen`; `transform` (3, 3) takes the picture's px to its px."""
+    """Refine in a part `seen` of the picture; `transform` (3, 3) maps the picture's px to the part's px."""
     return chart.refine(seen, start.moved(transform), steps).moved(np.linalg.inv(transform))
 
 
@@ -70,7 +70,7 @@ def _detector(parameters: dict[str, float]) -> Any:
 
 
 def _detected(detector: Any, picture: NDArray[np.uint8], transform: Floats) -> Iterator[tuple[Floats, float]]:
-    """Patch centers (24, 2) and cost in one picture; `transform` takes px of the radiance to its px."""
+    """Patch centers (24, 2) and costs in one picture; `transform` maps px of the radiance to px of the picture."""
     if detector.process(picture, _CANDIDATES):
         for checker in detector.getListColorChecker():
             quads = np.asarray(checker.getColorCharts(), dtype=np.float64).reshape(24, 4, 2)
@@ -80,8 +80,8 @@ def _detected(detector: Any, picture: NDArray[np.uint8], transform: Floats) -> I
 def _pictures(value: Floats) -> Iterator[tuple[NDArray[np.uint8], Floats]]:
     """8-bit BGR pictures to search, the most promising first, each with the transform radiance px → picture px.
 
-    Whole frames at several scales and exposures, channels balanced or not; last, for small charts,
-    the frame enlarged, or overlapping enlarged tiles of a large frame: the detector shrinks large pictures.
+    First the whole frame at several scales and exposures, with channels balanced or not. Last, for small charts, the
+    enlarged frame, or enlarged and overlapping tiles of a large frame, because the detector reduces large pictures.
     """
     height, width = value.shape[:2]
     longest, white = max(height, width), _white(value)
@@ -108,12 +108,13 @@ def _pictures(value: Floats) -> Iterator[tuple[NDArray[np.uint8], Floats]]:
 
 
 def _white(value: Floats) -> Floats:
-    """99th percentile of each channel (3,), of about 10⁵ pixels."""
+    """99th percentile of each channel (3,), from about 10⁵ pixels."""
     step = max(1, int(np.sqrt(value[..., 0].size / 1e5)))
     return np.maximum(np.percentile(value[::step, ::step], 99, axis=(0, 1)), 1e-9)
 
 
 def _eight_bits(value: Floats, white: Floats) -> NDArray[np.uint8]:
+    """Gamma-encoded 8-bit BGR picture, 255 at `white`."""
     level = np.clip(value * np.asarray((len(_GAMMA) - 1) / white, np.float32), 0, len(_GAMMA) - 1)
     return np.ascontiguousarray(_GAMMA[level.astype(np.uint16)][..., ::-1])
 
@@ -125,6 +126,6 @@ def _resized(image: Floats, factor: float) -> Floats:
 
 
 def _scaling(small: tuple[int, ...], large: tuple[int, ...]) -> Floats:
-    """Large px → small px, with pixel centers on whole numbers."""
+    """Transform (3, 3) from large px to small px, with pixel centers at integers."""
     x, y = small[1] / large[1], small[0] / large[0]
     return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]])

@@ -1,7 +1,7 @@
-"""The colors of a chart's patches, the reasons to leave patches out, and their matrix.
+"""Samples the colors of a chart's patches, excludes unreliable patches, and fits the color matrix.
 
-A patch serves unless it is clipped, outside the picture, uneven (an edge of a shadow or of a finger lies on it), or
-at odds with the matrix that suits most of the others (it is hidden, in shade, or it shines).
+A patch is used unless it is clipped, outside the picture, uneven (a shadow's edge or a finger is on it), or an outlier
+of the color matrix that fits most patches (it is hidden, in shade, or glossy).
 """
 
 from dataclasses import dataclass
@@ -16,15 +16,15 @@ from polcap.stages.whitebalance import chart
 from polcap.stages.whitebalance.chart import Placement
 
 WHITE = 18  # index of the white patch, the first of six greys
-_LEAST = 12  # patches for 9 + 2 unknowns per three channels
+_LEAST = 12  # patches; the fit has 12 unknowns and three equations per patch
 _CLIPPED = 0.02  # share of a patch's pixels that may be clipped
-_UNEVEN, _UNEVEN_WHITE = 0.15, 0.01  # a quarter of a patch may differ by so much of it and of the white patch
-_ODD, _LEAST_ODD = 6.0, 4.0  # times the median ΔE, and ΔE at least, beyond which a patch is at odds with the others
-_MOST_COUNTED = 30.0  # ΔE of a patch left out in the mean that accepts a chart: 40 is no worse than 30
+_UNEVEN, _UNEVEN_WHITE = 0.15, 0.01  # largest difference of a patch's quarter: of the patch, plus of the white patch
+_ODD, _LEAST_ODD = 6.0, 4.0  # an outlier has more than this many times the median ΔE, and at least this ΔE
+_MOST_COUNTED = 30.0  # largest ΔE of an excluded patch in the mean that decides whether it is a chart
 
 
 class PatchUse(IntEnum):
-    """Why a patch did not serve."""
+    """Whether a patch was used, or the reason that it was not."""
 
     USED = 0
     CLIPPED = 1
@@ -39,19 +39,19 @@ class ChartFit:
 
     fit: color.MatrixFit
     use: Bits  # (24,) PatchUse
-    mean: float  # ΔE2000 over all unclipped patches, those left out too: judges whether it is a chart
+    mean: float  # mean ΔE2000 of all unclipped patches, excluded ones too: decides whether it is a chart
     color: Floats  # (24, 3) S0 of the patches, camera channels
 
 
 @dataclass(frozen=True)
 class PatchSamples:
-    """The colors of the patches in one shot, before anything is fitted."""
+    """The colors of the patches in one shot."""
 
     color: Floats  # (24, 3) S0 of the patches, camera channels
     use: Bits  # (24,) PatchUse
 
     def turned(self) -> "PatchSamples":
-        """The same chart, read upside down."""
+        """The same chart read upside down."""
         return PatchSamples(self.color[::-1], self.use[::-1])
 
 
@@ -61,14 +61,14 @@ def fit(samples: PatchSamples, reference: ChartReference) -> ChartFit:
     Raises
     ------
     ChartError
-        Fewer than 12 patches may serve.
+        Fewer than 12 patches are usable.
     """
     seen, use = samples.color, samples.use
     _check(use)
     error = color.trimmed_residuals(seen, reference.rec709, position(), use == PatchUse.USED)
     odd = error > max(_LEAST_ODD, _ODD * float(np.median(error[use == PatchUse.USED])))
     use = np.where((use == PatchUse.USED) & odd, PatchUse.ODD, use).astype(np.uint8)
-    if (use == PatchUse.USED).sum() < _LEAST:  # no matrix suits most of them: then all count
+    if (use == PatchUse.USED).sum() < _LEAST:  # no matrix fits most patches: use all
         use = np.where(use == PatchUse.ODD, PatchUse.USED, use).astype(np.uint8)
     found = color.fit_matrix(seen, reference.rec709, position(), use == PatchUse.USED)
     every = np.where(use == PatchUse.ODD, np.minimum(error, _MOST_COUNTED), found.delta_e)
@@ -76,7 +76,7 @@ def fit(samples: PatchSamples, reference: ChartReference) -> ChartFit:
 
 
 def cross_validate(found: ChartFit, reference: ChartReference) -> Floats | None:
-    """ΔE2000 (24,) of each patch by the matrix of all others; None where too few are left for that."""
+    """ΔE2000 (24,) of each patch under the matrix fitted to all others; None for too few patches."""
     used = found.use == PatchUse.USED
     return color.cross_validate(found.color, reference.rec709, position(), used) if used.sum() > _LEAST else None
 
@@ -88,12 +88,12 @@ def residual(found: ChartFit, reference: ChartReference) -> float:
 
 
 def position() -> Floats:
-    """(24, 2) of the patches from the white one, in patches."""
+    """Positions (24, 2) of the patches relative to the white one, in pitches."""
     return np.asarray(chart.centers() - chart.centers()[WHITE])
 
 
 def sample(value: Floats, quality: Bits, place: Placement, share: float) -> PatchSamples:
-    """S0 of each patch in a shot (H, W, 3) with its quality (H, W): twice the trimmed mean over its inner part.
+    """S0 of each patch in a shot (H, W, 3) with quality (H, W): twice the trimmed mean over its inner part.
 
     `share` of each patch's side is sampled.
     """
@@ -117,7 +117,7 @@ def sample(value: Floats, quality: Bits, place: Placement, share: float) -> Patc
 
 
 def left_out(use: Bits) -> str:
-    """The patches that did not serve and why, by their use (24,), for a message; empty where all did."""
+    """Text that lists the patches that were not used and why, from their use (24,); empty if all were used."""
     words = {
         PatchUse.CLIPPED: "over-exposed",
         PatchUse.OUTSIDE: "outside the picture",
@@ -133,7 +133,7 @@ def left_out(use: Bits) -> str:
 
 
 def _between_quarters(pixels: Floats, x: Floats, y: Floats) -> float:
-    """Greatest difference of the light (sum of channels) between a patch's quarter and the whole."""
+    """Largest difference of the light (sum of channels) between a quarter of the patch and the whole patch."""
     light = pixels.sum(axis=1)
     quarter = 2 * (x > 0) + (y > 0)
     means = [np.median(light[quarter == q]) for q in range(4) if (quarter == q).sum() >= 4]
@@ -141,6 +141,7 @@ def _between_quarters(pixels: Floats, x: Floats, y: Floats) -> float:
 
 
 def _check(use: Bits) -> None:
+    """Raise ChartError if fewer than 12 patches are usable."""
     used = int((use == PatchUse.USED).sum())
     if used >= _LEAST:
         return
