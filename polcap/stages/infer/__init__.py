@@ -35,7 +35,7 @@ class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
 
 
-@stage(version=16)
+@stage(version=17)
 def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: InferSettings) -> SurfaceMaps:
     """Normal, diffuse, specular, roughness and expected error; network None means analytic.
 
