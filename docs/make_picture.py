@@ -11,7 +11,7 @@ import numpy as np
 
 from polcap.formats import atomic
 from polcap.pipeline import run as pipeline
-from polcap.report import keys, moving
+from polcap.report import animation, keys
 from polcap.report import stage_pictures as pictures
 
 WIDTH, GAP = 400, 8  # px
@@ -21,7 +21,7 @@ result, file = map(Path, sys.argv[1:3])
 found, about = pipeline.reopen(result)
 cues, maps = found.cues, found.maps
 turn = np.degrees(np.arctan2(cues.normalized_stokes[1], cues.normalized_stokes[0]) / 2) % 180
-relit = moving.light(maps, about["settings"]["infer"]["ior"])
+relit = animation.light(maps, about["settings"]["infer"]["ior"])
 inside = maps.mask[..., None]
 tiles = [
     pictures.display(cues.radiance),

@@ -11,18 +11,18 @@ from pathlib import Path
 
 import numpy as np
 
-from polcap.training import model, shapes, train
+from polcap.training import main_network, random_shapes, train
 
 source, out = map(Path, sys.argv[1:3])
 for seed, split in enumerate(("train", "test")):  # training looks at pictures of the latter as it goes
-    mesh, folder = shapes.compose(np.random.default_rng(seed)), out / "data" / "meshes" / split
+    mesh, folder = random_shapes.compose(np.random.default_rng(seed)), out / "data" / "meshes" / split
     low, size = mesh.vertices.min(axis=0), np.ptp(mesh.vertices, axis=0).max()
     corners = np.rint((mesh.vertices - low) / size * 65535).astype(np.uint16)
     folder.mkdir(parents=True, exist_ok=True)
     np.savez(folder / "shape.npz", vq=corners, vmin=low, vscale=np.float32(size), faces=mesh.faces)
 
-tiny = model.Shape((8, 16, 16, 16, 16), (8, 8, 16, 16), (8, 8, 8, 8), (8, 8, 8, 8), (1, 1, 1, 1, 1))
-train.PRESETS["cpu"] = train.Preset(tiny, 4, 1, 64, (32, 64), (0.5, 0.5), (0.2, 0.8), 4 * 64**2)
+tiny = main_network.NetworkShape((8, 16, 16, 16, 16), (8, 8, 16, 16), (8, 8, 8, 8), (8, 8, 8, 8), (1, 1, 1, 1, 1))
+train.PRESETS["cpu"] = train.TrainingPreset(tiny, 4, 1, 64, (32, 64), (0.5, 0.5), (0.2, 0.8), 4 * 64**2)
 own = train.main(train.TrainingOptions(data=out / "data", out=out / "mine", minutes=10 / 60, threads=1))
 
 polcap = [sys.executable, "-m", "polcap", "process", str(source), "--model", str(own), "--out", str(out / "result")]

@@ -1,4 +1,4 @@
-"""In: what a command found, or what befell it. Out: data on stdout, all else on stderr, an exit code."""
+"""Output of the commands: data on stdout, messages and progress on stderr, exit codes."""
 
 import functools
 import os
@@ -25,45 +25,47 @@ _QUIET_S = 5.0  # between two lines about frames, where there is no terminal to 
 
 
 def reported(command: Callable[..., None]) -> Callable[..., None]:
-    """Turn what a command raises into one line on stderr and an exit code."""
+    """Report a command's error in one line on stderr and by its exit code."""
 
     @functools.wraps(command)
     def run(context: typer.Context, *args: Any, **kwargs: Any) -> None:
         try:
             command(context, *args, **kwargs)
-        except BrokenPipeError:  # whoever read stdout has seen enough
+        except BrokenPipeError:  # the reader of stdout has ended
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             code = 0
         except KeyboardInterrupt:
             again = " with --resume" if kwargs.get("resume") is False else ""
-            says = f"interrupted; run the same command again{again} to go on"
-            print(f"polcap: {says}", file=sys.stderr)
+            message = f"interrupted; run the same command again{again} to go on"
+            print(f"polcap: {message}", file=sys.stderr)
             code = 130
-            if not kwargs.get("watch"):  # it ends like that; its reports stand on stdout
-                tell_program(kwargs, KeyboardInterrupt(says), code)
+            if not kwargs.get("watch"):  # Ctrl-C is its normal end
+                print_error_document(kwargs, KeyboardInterrupt(message), code)
         except PolcapError as error:
             traceback_of(error, context)
-            tell(f"polcap: error: {line(error)}")
+            print_message(f"polcap: error: {line(error)}")
             code = error.exit_code
-            tell_program(kwargs, error, code)
+            print_error_document(kwargs, error, code)
         except (typer.Exit, typer.Abort):
             raise
         except Exception as error:
             traceback_of(error, context)
             if resource_limits.is_shortfall(error):
-                tell("polcap: error: out of memory; raise --memory or take a larger machine")
+                print_message("polcap: error: out of memory; raise --memory or take a larger machine")
                 code = SettingError.exit_code
-                tell_program(kwargs, error, code)
-            elif isinstance(error, OSError):  # what the system refuses is not of our making
+                print_error_document(kwargs, error, code)
+            elif isinstance(error, OSError):  # refused by the system: no bug
                 name = f"{error.filename}: " if error.filename else ""
-                tell(f"polcap: error: {name}{error.strerror or line(error)}; check the path and its permissions")
+                print_message(
+                    f"polcap: error: {name}{error.strerror or line(error)}; check the path and its permissions"
+                )
                 code = SettingError.exit_code
-                tell_program(kwargs, error, code)
+                print_error_document(kwargs, error, code)
             else:
                 kind, how = type(error).__name__, "with the lines above" if context.obj else "run with --debug and"
-                tell(f"polcap: bug: {kind}: {line(error)}; {how} report it")
+                print_message(f"polcap: bug: {kind}: {line(error)}; {how} report it")
                 code = 1
-                tell_program(kwargs, error, code)
+                print_error_document(kwargs, error, code)
         else:
             return
         raise typer.Exit(code)
@@ -72,37 +74,37 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def traceback_of(error: BaseException, context: typer.Context) -> None:
-    """With --debug, where an error came from; what is said of it and the exit code stay the same."""
+    """Print the traceback, with --debug."""
     if context.obj:
         import traceback
 
-        tell("".join(traceback.format_exception(error)).rstrip())
+        print_message("".join(traceback.format_exception(error)).rstrip())
 
 
-def tell_program(options: dict[str, Any], error: BaseException, code: int) -> None:
-    """With --json, what befell a command as a document on stdout; a failed gate's report stands there already."""
+def print_error_document(options: dict[str, Any], error: BaseException, code: int) -> None:
+    """Print an error as JSON on stdout, with --json; a failed gate has printed its report already."""
     if options.get("json") and not isinstance(error, GateError):
-        say({"error": {"kind": type(error).__name__, "says": line(error), "exit_code": code}})
+        print_data({"error": {"kind": type(error).__name__, "says": line(error), "exit_code": code}})
 
 
 def line(error: BaseException) -> str:
-    """What an error says, on one line of bearable length."""
+    """An error's text on one line of at most 600 characters."""
     text = " ".join(str(error).split())
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 100]} … {text[-100:]}"
 
 
 def printable(text: str) -> str:
-    """Without what a terminal takes for a command: names of files and cameras may hold anything."""
+    """Text without control characters: names of files and cameras may hold anything."""
     return "".join(c if c.isprintable() or c in "\n\t" or "\ud800" <= c <= "\udfff" else "\ufffd" for c in text)
 
 
-def tell(text: str) -> None:
-    """Progress and messages, on stderr."""
+def print_message(text: str) -> None:
+    """Print a message on stderr."""
     print(printable(text), file=sys.stderr, flush=True)
 
 
-def say(data: Any) -> None:
-    """Data on stdout: printable text, all else as one JSON document."""
+def print_data(data: Any) -> None:
+    """Print data on stdout: text as it is, anything else as one JSON document."""
     if not isinstance(data, str):
         import json
 
@@ -111,7 +113,7 @@ def say(data: Any) -> None:
 
 
 def preview(drawn: "list[Path]") -> None:
-    """Pictures on a terminal that knows colors, two pixels a character; on stderr, for stdout carries data."""
+    """Show pictures on a color terminal, two pixels per character, on stderr."""
     if not sys.stderr.isatty() or os.environ.get("TERM") in (None, "dumb"):
         return
     from rich.console import Console
@@ -131,28 +133,28 @@ def preview(drawn: "list[Path]") -> None:
             console.print(line_)
 
 
-def tell_result(about: dict[str, Any], out: "Path", json: bool) -> None:
-    """The asset's path, or the report, on stdout; the verdict on stderr; a failed gate ends with exit code 3."""
-    say(about if json else str(out / "asset" / f"{about['capture']['name']}.glb"))
-    tell(f"verdict {about['verdict']}; {out / 'report.html'}")
-    tell_gates(about)
+def print_result(about: dict[str, Any], out: "Path", json: bool) -> None:
+    """Print the asset's path or the report, and the verdict. Raises GateError where a gate failed."""
+    print_data(about if json else str(out / "asset" / f"{about['capture']['name']}.glb"))
+    print_message(f"verdict {about['verdict']}; {out / 'report.html'}")
+    print_gates(about)
 
 
-def tell_gates(about: dict[str, Any]) -> None:
-    """Tell failed gates and assumptions; a failed gate ends with exit code 3."""
+def print_gates(about: dict[str, Any]) -> None:
+    """Print failed gates and warnings. Raises GateError where a gate failed."""
     failed = 0
     for gate in about["gates"]:
         if gate["state"] in ("fail", "warn"):
             word = "gate failed" if gate["state"] == "fail" else "warning"
             cost = f", costs about {gate['cost_deg']:.0f}°" if gate["cost_deg"] >= 1 else ""
-            tell(f"polcap: {word}: {gate['name']}: {gate['says']}{cost}. {gate['remedy']}.")
+            print_message(f"polcap: {word}: {gate['name']}: {gate['says']}{cost}. {gate['remedy']}.")
             failed += gate["state"] == "fail"
     if failed:
         raise GateError(f"{failed} of {len(about['gates'])} gates failed; the asset was written, see report.html")
 
 
 class Steps:
-    """What a long command tells while it works: a line per finished stage, and now and then one of the frames."""
+    """Progress without a terminal: a line per finished stage, and one per five seconds of frames."""
 
     def __init__(self) -> None:
         self._begun = self._last = time.monotonic()
@@ -175,7 +177,7 @@ class Steps:
 
 
 class Bar(Steps):
-    """The same on a terminal, in one line that changes."""
+    """Progress on a terminal: one bar."""
 
     def __init__(self, bar: "RichProgress", task: "TaskID") -> None:
         super().__init__()

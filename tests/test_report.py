@@ -1,4 +1,4 @@
-"""The report tells what was measured, and its gates mean what they say."""
+"""The report shows every measured figure, and `read` refuses files that are no report."""
 
 import json
 import re
@@ -12,8 +12,7 @@ import pytest
 
 from polcap import report
 from polcap.errors import StorageError
-from polcap.report import compare, keys, labels, map_figures, page
-from polcap.report import mesh_preview as lean
+from polcap.report import compare, keys, labels, map_figures, mesh_preview, page
 from tests import surfaces
 
 
@@ -33,11 +32,9 @@ def test_report_is_plain_json_with_figures_gates_and_settings(result: Path) -> N
 def test_the_page_opens_with_the_error_that_its_checks_judge(result: Path) -> None:
     about = report.read(result)
     gate = next(gate for gate in about["gates"] if gate["name"] == "normal error")
-    assert f"within {labels.number(gate['value'])}° of the surface's." in page.verdict(about)[1]
+    assert f"half of the normals is below {labels.number(gate['value'])}°." in page.verdict(about)[1]
     gate |= {"value": 31.74, "says": "Expected error of the normals: 31.7° (median), mostly due to: body"}
-    assert page.verdict(about)[1].endswith(
-        "within 31.74° of the surface's; mostly due to these checks: body."
-    )
+    assert page.verdict(about)[1].endswith("half of the normals is below 31.74°; mostly due to these checks: body.")
     about["gates"].remove(gate)  # as where the shots are out of order
     assert page.verdict(about)[1] == ""
 
@@ -58,11 +55,11 @@ def test_page_shows_every_figure_with_words_and_unit(result: Path) -> None:
     assert not re.search(r"<td>(?:\[|\{|None|True|False|nan)", page)
 
 
-def test_agreement_is_drawn_grey_and_registration_is_told_in_words(result: Path) -> None:
+def test_agreement_is_drawn_gray_and_registration_has_a_caption(result: Path) -> None:
     middle = keys.colors(keys.DIFFERENCE.palette)[keys.LEVELS // 2]
     assert np.ptp(middle) < 3 and 100 < middle.mean() < 180  # neither black, which is no object, nor white
     page = unescape((result / "report.html").read_text())
-    assert re.search(r"<b>45° on the first: [+-][.\d]+, [+-][.\d]+ px ± [.\d]+</b>", page)
+    assert re.search(r"<b>45° shot moved by [+-][.\d]+, [+-][.\d]+ ± [.\d]+ px</b>", page)
 
 
 def test_photographs_and_their_rerendering_agree(result: Path) -> None:
@@ -93,7 +90,7 @@ def test_comparison_is_a_page_like_the_report(result: Path, tmp_path: Path) -> N
 
 def test_mesh_of_a_page_has_few_vertices_where_the_surface_is() -> None:
     mesh = surfaces.mesh(surfaces.maps())
-    vertices, uv, faces = lean.thinned(mesh, 600)
+    vertices, uv, faces = mesh_preview.thinned(mesh, 600)
     assert 200 < len(vertices) <= 900 and faces.max() < len(vertices) and len(uv) == len(vertices)
     radius = np.linalg.norm(vertices - mesh.vertices.mean(0), axis=1)
     assert radius.max() <= np.linalg.norm(mesh.vertices - mesh.vertices.mean(0), axis=1).max()
@@ -110,12 +107,12 @@ def test_missing_or_foreign_report_is_one_line(tmp_path: Path, text: str | None)
         report.read(tmp_path)
 
 
-def test_what_is_no_result_is_told_apart(tmp_path: Path) -> None:
+def test_a_folder_that_is_no_result_is_named_with_its_remedy(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="no such folder"):
         report.read(tmp_path / "elsewhere")
     (tmp_path / "report.json").write_text("{}")
     (tmp_path / "maps").mkdir()
-    with pytest.raises(StorageError, match=f"a part of a result; give the whole, {tmp_path}"):
+    with pytest.raises(StorageError, match=f"only a part of a result; give the whole, {tmp_path}"):
         report.read(tmp_path / "maps")
 
 
@@ -145,7 +142,7 @@ def test_a_report_of_strange_gates_is_one_line(result: Path, tmp_path: Path, str
         report.read(tmp_path)
 
 
-def test_a_list_of_nothing_says_so() -> None:
+def test_an_empty_list_is_shown_as_none() -> None:
     assert labels.text("chart.unused", []) == "none"
     assert labels.text("chart.unused", [1, 2]) == "1, 2"
 
@@ -154,5 +151,5 @@ def test_an_object_too_thin_for_the_page_leaves_its_figures_out() -> None:
     nothing = np.zeros((4, 5))
     small: Any = SimpleNamespace(angle=np.zeros(1), maps=SimpleNamespace(mask=nothing > 0))  # all that is read of it
     again: Any = SimpleNamespace(measured=[nothing], predicted=[nothing])
-    told = "".join(map_figures.rerendered(small, again, {"figures": {"rerendering": {"rms": [None]}}}))
-    assert "Polarizer at 0°" in told and "rms" not in told
+    section = "".join(map_figures.rerendered(small, again, {"figures": {"rerendering": {"rms": [None]}}}))
+    assert "Polarizer at 0°" in section and "rms" not in section

@@ -1,4 +1,4 @@
-"""In: a command line. Out: one call into polcap, its answer on stdout, an exit code.
+"""The command line: one module per command.
 
 stdout carries data only; progress and messages go to stderr. Exit codes: 0 done, 2 the input or a
 setting is at fault, 3 the asset was written but a gate failed, 4 hardware, 130 interrupted (run again
@@ -6,14 +6,14 @@ to go on), 1 a bug. Heavy imports happen inside the commands, so that `--help` a
 
 process_command    the path over one capture
 batch_command      over many
-result_commands    export, show, status, report: what is done with a result
+result_commands    export, show, status, report
 check_command      keep a capture or reshoot it
-calibrate_command  what camera, lens, polarizer and flash are in fact
-doctor_command     what works on this machine
+calibrate_command  measured camera, lens, polarizer and flash
+doctor_command     check of this machine or of one photograph
 synth_command      captures of objects that do not exist
 capture_command    shooting with a rig
 training_commands  train, evaluate
-options            what several commands share, and the values it means
+options            options that several commands share
 """
 
 import os
@@ -40,7 +40,7 @@ from polcap.errors import SettingError
 
 
 class OneLine(TyperGroup):
-    """The commands, and what was wrong with a command line in one line as any other fault."""
+    """Command group that reports a wrong command line in one line, as every other error."""
 
     def main(
         self,
@@ -51,40 +51,40 @@ class OneLine(TyperGroup):
         windows_expand_args: bool = True,
         **extra: Any,
     ) -> Any:
-        """Parse, run, and unless in another program's hands end with the exit code."""
+        """Parse and run; end with the exit code unless `standalone_mode` is false."""
         run = partial(super().main, args, prog_name, complete_var, False, windows_expand_args, **extra)
         if not standalone_mode:
             return run()
         try:
             code = run()
         except TyperException as error:
-            said = _spoken(error)
-            terminal.tell(said)
+            text = _one_line(error)
+            terminal.print_message(text)
             code = error.exit_code
             asked = {"json": "--json" in (sys.argv[1:] if args is None else args)}
-            terminal.tell_program(asked, SettingError(said.removeprefix("polcap: error: ")), code)
+            terminal.print_error_document(asked, SettingError(text.removeprefix("polcap: error: ")), code)
         except typer.Abort:  # a question that got no answer
-            terminal.tell("polcap: aborted")
+            terminal.print_message("polcap: aborted")
             code = 1
         sys.exit(code or 0)
 
 
-def _spoken(error: TyperException) -> str:
-    """What was wrong with a command line; a page of help as it is."""
-    said = error.format_message()
-    if "\n" in said:
-        return said
-    said = said.rstrip(".").replace("Value error, ", "")
+def _one_line(error: TyperException) -> str:
+    """The error of a command line with a hint to --help; a page of help stays as it is."""
+    text = error.format_message()
+    if "\n" in text:
+        return text
+    text = text.rstrip(".").replace("Value error, ", "")
     context = getattr(error, "ctx", None)
     asked = "polcap" if context is None or context.parent is None else f"polcap {context.info_name}"
-    see = "" if said.endswith("?") else f"; see `{asked} --help`"
-    return f"polcap: error: {said[:1].lower()}{said[1:]}{see}"
+    see = "" if text.endswith("?") else f"; see `{asked} --help`"
+    return f"polcap: error: {text[:1].lower()}{text[1:]}{see}"
 
 
 COMMANDS = (process, batch, export, show, status, report, check, calibrate, doctor, synth, capture, train, evaluate)
 app = typer.Typer(
     cls=OneLine,
-    help="Photographs through a turned polarizer, under a flash: in. A relightable 3-D asset: out.",
+    help="Turns flash photographs taken through a rotating polarizer into a relightable 3-D asset.",
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode=None,  # plain help: half the start-up time
@@ -96,7 +96,7 @@ for command in COMMANDS:
 
 def main() -> None:
     """The `polcap` command."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # else the order of its sums follows the number of threads
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # results must not depend on the number of threads
     arguments = sys.argv[1:]
     if "--debug" in arguments:  # wherever it stands
         arguments = ["--debug", *(argument for argument in arguments if argument != "--debug")]
@@ -106,7 +106,7 @@ def main() -> None:
 
 
 def _version(asked: bool) -> None:
-    """Before anything else is asked for."""
+    """Print the version and end."""
     if asked:
         print(__version__)
         raise typer.Exit

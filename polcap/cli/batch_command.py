@@ -1,4 +1,4 @@
-"""In: a folder of captures. Out: their results, a summary, or a farm's job file: `polcap batch`."""
+"""`polcap batch`: process every capture below a folder, or write a job file for a farm."""
 
 import os
 from pathlib import Path
@@ -13,18 +13,19 @@ from polcap.cli.options import Angles, Assignments, ConfigFile, Device, Estimato
 
 def batch(
     context: typer.Context,
-    root: Annotated[Path, typer.Argument(help="Folder with captures, however deep.")],
+    root: Annotated[Path, typer.Argument(help="Folder with captures, at any depth.")],
     out: Annotated[Path | None, typer.Option(help="Folder for the results; by default CAPTURE/polcap each.")] = None,
     config: ConfigFile = None,
     assignments: Assignments = None,
     shard: Annotated[
-        str | None, typer.Option(metavar="K/N", help="The K-th of N parts; else what Slurm, AWS, Kubernetes, PBS say.")
+        str | None,
+        typer.Option(metavar="K/N", help="The K-th of N parts; by default from Slurm, AWS, Kubernetes or PBS."),
     ] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, tcp://host:8786 or local (extra [batch]).")
     ] = None,
     workers: Annotated[int, typer.Option(min=1, help="Captures at a time on this machine.")] = 1,
-    retries: Annotated[int, typer.Option(min=0, help="Tries more for a capture whose process died.")] = 2,
+    retries: Annotated[int, typer.Option(min=0, help="Further tries for a capture whose process died.")] = 2,
     keep_going: Annotated[
         bool, typer.Option("--keep-going/--fail-fast", help="Go on after a failure, or stop at the first.")
     ] = True,
@@ -47,7 +48,7 @@ def batch(
     estimator: Estimator = None,
     model: Model = None,
 ) -> None:
-    """Process every capture below a folder; what is finished is left alone, what breaks does not stop the rest."""
+    """Process every capture below a folder. Finished ones are skipped; a failure does not stop the others."""
     if scheduler is not None and write_jobs is None:
         from polcap.batch import cluster
 
@@ -66,8 +67,8 @@ def batch(
         command = job_files.batch_command(root, context.params)
         job = job_files.BatchJob(command, root.resolve(), jobs or min(len(found), 1000), memory_gb=memory or 4.0)
         file = job_files.write(write_jobs, job, (out or root).resolve() / unit.FOLDER)
-        terminal.tell(f"start it: {job_files.submit_hint(write_jobs, file)}")
-        terminal.say({"file": str(file), "shards": job.shards} if json else str(file))
+        terminal.print_message(f"To start it: {job_files.submit_hint(write_jobs, file)}")
+        terminal.print_data({"file": str(file), "shards": job.shards} if json else str(file))
         return
     order = unit.Order(
         settings=msgspec.to_builtins(settings.load(config, assignments or ())),
@@ -81,16 +82,16 @@ def batch(
     )
     part = shards.from_environment(os.environ) if shard is None else shards.parse(shard)
     how = batches.How(part, scheduler, workers, retries, keep_going)
-    summary = batches.run(root, out, order, how, terminal.tell)
-    terminal.say(summary if json else str((out or root) / unit.FOLDER / "summary.html"))
+    summary = batches.run(root, out, order, how, terminal.print_message)
+    terminal.print_data(summary if json else str((out or root) / unit.FOLDER / "summary.html"))
     if code := batches.exit_code(summary):
         raise typer.Exit(code)
 
 
 def _check_model(estimator: Literal["network", "analytic"] | None, model: Path | None) -> None:
-    """A model that cannot be used is told once, here, not by every capture; ModelError, SettingError.
+    """Refuse an unusable model once, before any capture; ModelError, SettingError.
 
-    On the CPU: the machine that hands out the work may lack what its workers have.
+    On the CPU: this machine may lack the workers' GPU.
     """
     from polcap.pipeline import models
 

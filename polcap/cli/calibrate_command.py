@@ -1,4 +1,4 @@
-"""In: photographs of what is known. Out: a dated calibration that `process` finds by itself: `polcap calibrate`."""
+"""`polcap calibrate`: measure camera, lens, polarizer and flash from photographs of known things."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,7 +16,7 @@ def calibrate(
     context: typer.Context,
     folder: Annotated[
         Path,
-        typer.Argument(help="Folder that holds dark/, flat/, bracket/, flash/, polarizer/, lens/, or some of them."),
+        typer.Argument(help="Folder with some of dark/, flat/, bracket/, flash/, polarizer/, lens/."),
     ],
     lens_filter: Annotated[str, typer.Option("--filter", metavar="NAME", help="The polarizer's name.")] = "",
     axis: Annotated[
@@ -42,8 +42,8 @@ def calibrate(
     made = datetime.now(UTC).isoformat(timespec="seconds")
     found = calibration.measure(folder, made, lens_filter, axis, squares(board))
     path = calibrations.write(out or own_folders.calibrations(), found)
-    terminal.tell("\n".join(lines(found)))
-    terminal.say({"file": str(path), "calibration": msgspec.to_builtins(found)} if json else str(path))
+    terminal.print_message("\n".join(lines(found)))
+    terminal.print_data({"file": str(path), "calibration": msgspec.to_builtins(found)} if json else str(path))
 
 
 def squares(board: str) -> tuple[int, int]:
@@ -57,7 +57,7 @@ def squares(board: str) -> tuple[int, int]:
 
 
 def lines(found: "Calibration") -> list[str]:
-    """What was measured, for a person."""
+    """The measurements as lines of text."""
     rows = [" · ".join(part for part in (found.camera, found.lens, found.filter) if part)]
     for line in found.noise:
         doubt = 100 * max(sigma / slope for sigma, slope in zip(line.slope_sigma, line.slope, strict=True))
@@ -65,8 +65,8 @@ def lines(found: "Calibration") -> list[str]:
         if line.read_noise_sigma:
             read += f" ± {max(line.read_noise_sigma):.1f}"
         source = "a bracket" if line.source == "bracket" else line.source
-        said = f"{electrons} e⁻ at white ± {doubt:.1f} %, read noise {read} e⁻, from {source}"
-        rows.append(f"noise      ISO {line.iso:g}: {said}")
+        text = f"{electrons} e⁻ at white ± {doubt:.1f} %, read noise {read} e⁻, from {source}"
+        rows.append(f"noise      ISO {line.iso:g}: {text}")
     if (levels := found.levels) is not None:
         black, stated = _listed(levels.black, ".2f"), _listed(levels.black_stated, "g")
         white = "no frame saturates" if levels.white is None else f"white {levels.white:g}"
@@ -84,11 +84,11 @@ def lines(found: "Calibration") -> list[str]:
             f"{lens.residual_px:.2f} px (without distortion {lens.pinhole_residual_px:.2f} px)"
         )
     if (ring := found.polarizer) is not None:
-        sense = "as the picture" if ring.sense > 0 else "the other way"
-        told = f"counts {sense}" if ring.sense_known else "sense not measured: light of a second axis tells"
+        sense = "counter-clockwise" if ring.sense > 0 else "clockwise"
+        sense = f"counts {sense}" if ring.sense_known else "sense unknown: photograph light of a second axis"
         doubt = max(sigma / ratio for sigma, ratio in zip(ring.extinction_sigma, ring.extinction, strict=True))
         extinction = f"extinction {_listed(ring.extinction, '.0f')} ± {100 * doubt:.0f} %"
-        rows.append(f"polarizer  zero {ring.zero_deg:+.2f}° ± {ring.zero_sigma_deg:.2f}°, {told}, {extinction}")
+        rows.append(f"polarizer  zero {ring.zero_deg:+.2f}° ± {ring.zero_sigma_deg:.2f}°, {sense}, {extinction}")
     if (flash := found.flash) is not None:
         drift = f"drift {100 * flash.drift_per_pop:+.3f} % ± {100 * flash.drift_sigma:.3f} % a pop"
         spread = f"{100 * flash.spread:.2f} % ± {100 * flash.spread_sigma:.2f} % from pop to pop"

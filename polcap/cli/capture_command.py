@@ -1,4 +1,4 @@
-"""In: a rig and how to shoot. Out: a capture folder and the verdict on it: `polcap capture`."""
+"""`polcap capture`: shoot a capture with a motorized polarizer and a camera."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +13,9 @@ from polcap.errors import GateError, InputError
 
 def capture(
     context: typer.Context,
-    folder: Annotated[Path, typer.Argument(help="Folder to shoot into; new, or begun with --resume.")],
+    folder: Annotated[
+        Path, typer.Argument(help="Folder for the photographs: a new one, or with --resume a begun one.")
+    ],
     rotator: Annotated[
         str | None, typer.Option(metavar="URL", help="elliptec:PORT, grbl:PORT, line:PORT, manual or simulated.")
     ] = None,
@@ -26,20 +28,20 @@ def capture(
     ] = None,
     repeat: Annotated[
         str | None,
-        typer.Option(metavar="DEG,…", help="Angles whose bracket is taken twice, to see the flash's spread."),
+        typer.Option(metavar="DEG,…", help="Angles whose bracket is taken twice, to measure the spread of the flash."),
     ] = None,
     ambient: Annotated[bool, typer.Option("--ambient", help="Also frames without the flash.")] = False,
     chart: Annotated[bool, typer.Option("--chart", help="Also a frame of the chart alone.")] = False,
     cross: Annotated[
-        bool, typer.Option("--cross", help="Also the bracket under a polarized flash, crossed: highlights apart.")
+        bool, typer.Option("--cross", help="Also a bracket under a cross-polarized flash, to separate highlights.")
     ] = False,
     tries: Annotated[int, typer.Option(min=0, help="How often a bad frame is taken again.")] = 2,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on: take what is missing.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a stopped capture.")] = False,
     no_check: Annotated[bool, typer.Option("--no-check", help="Leave out the verdict at the end.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan with its times, and stop.")] = False,
     json: Json = False,
 ) -> None:
-    """Shoot a capture: turn the polarizer, take the bracket, check every frame as it lands."""
+    """Shoot a capture: turn the polarizer, take the brackets, check every frame."""
     from polcap.rig import dry_run as plans
     from polcap.rig import exposure_bracket, sequence
     from polcap.rig.resume import complete_order
@@ -57,17 +59,17 @@ def capture(
     wanted = complete_order(folder, stated, resume)
     if dry_run:
         planned = plans.dry_run(wanted)
-        terminal.say(planned if json else plans.table(planned))
+        terminal.print_data(planned if json else plans.table(planned))
         return
-    done = sequence.shoot(folder, wanted, resume=resume, tries=tries, tell=terminal.tell)
+    done = sequence.shoot(folder, wanted, resume=resume, tries=tries, tell=terminal.print_message)
     verdict = None if no_check else _verdict(folder)
-    terminal.say(done | {"check": verdict} if json else str(folder))
+    terminal.print_data(done | {"check": verdict} if json else str(folder))
     if verdict and verdict["verdict"] != "keep":
         raise typer.Exit(GateError.exit_code)
 
 
 def _verdict(folder: Path) -> dict[str, Any] | None:
-    """What `polcap check` says of a capture, on stderr too; None where it cannot be judged."""
+    """Verdict of `polcap check`, also printed; None where the capture cannot be judged."""
     from polcap.config import Config
     from polcap.formats.capture import reader as captures
     from polcap.pipeline import check as checks
@@ -76,7 +78,7 @@ def _verdict(folder: Path) -> dict[str, Any] | None:
     try:
         verdict = checks.inspect(captures.read(folder), models.shipped(), Config())
     except InputError as error:
-        terminal.tell(f"polcap: not judged: {terminal.line(error)}")
+        terminal.print_message(f"polcap: not judged: {terminal.line(error)}")
         return None
-    terminal.tell(checks.table(verdict))
+    terminal.print_message(checks.table(verdict))
     return checks.shown(verdict)

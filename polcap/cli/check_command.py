@@ -1,4 +1,4 @@
-"""In: a capture folder. Out: keep or reshoot, and why: `polcap check`."""
+"""`polcap check`: keep a capture or reshoot it."""
 
 from typing import Annotated
 
@@ -15,16 +15,18 @@ def check(
     capture: CaptureFolder,
     config: ConfigFile = None,
     assignments: Annotated[
-        list[str] | None, typer.Option("--set", metavar="K=V", help="A setting, as gates.max_blur_px=2; repeatable.")
+        list[str] | None,
+        typer.Option("--set", metavar="K=V", help="A setting, such as gates.max_blur_px=2; repeatable."),
     ] = None,
     angles: Angles = None,
     chart: Annotated[
-        str | None, typer.Option(metavar="X0,Y0,…|FILE", help="As given to process: the chart's corners, or a profile.")
+        str | None,
+        typer.Option(metavar="X0,Y0,…|FILE", help="The same as for process: corners of the chart, or a profile."),
     ] = None,
-    no_chart: Annotated[bool, typer.Option("--no-chart", help="As given to process: there is no chart.")] = False,
+    no_chart: Annotated[bool, typer.Option("--no-chart", help="The same as for process: there is no chart.")] = False,
     json: Json = False,
 ) -> None:
-    """Keep a capture or reshoot it, and why: seconds after its last frame. Writes nothing."""
+    """Judge a capture seconds after its last frame: keep or reshoot, and why. Writes nothing."""
     from concurrent.futures import ThreadPoolExecutor
 
     from polcap import config as settings
@@ -37,6 +39,6 @@ def check(
         reading = pool.submit(captures.read, capture, options.angles_deg(angles))
         networks = models.shipped()
         verdict = checks.inspect(reading.result(), networks, chosen, request)
-    terminal.say(checks.shown(verdict) if json else checks.table(verdict))
+    terminal.print_data(checks.shown(verdict) if json else checks.table(verdict))
     if not verdict.keep:
         raise typer.Exit(GateError.exit_code)

@@ -1,4 +1,4 @@
-"""In: this machine, or one photograph. Out: what works, what does not, the remedy: `polcap doctor`."""
+"""`polcap doctor`: check this machine, or one photograph."""
 
 import functools
 import sys
@@ -16,21 +16,21 @@ def doctor(
     context: typer.Context,
     ask_ports: Annotated[
         bool | None,
-        typer.Option("--ports/--no-ports", help="Write to the serial ports to learn who answers; else you are asked."),
+        typer.Option("--ports/--no-ports", help="Write to the serial ports to find motors; by default you are asked."),
     ] = None,
     json: Json = False,
     file: Annotated[
-        Path | None, typer.Argument(metavar="[FILE.RAW]", help="One photograph: can polcap use it, what does it tell?")
+        Path | None, typer.Argument(metavar="[FILE.RAW]", help="One photograph: can polcap use it?")
     ] = None,
 ) -> None:
-    """What works on this machine, or with one photograph; what does not, and the remedy."""
+    """Check this machine or one photograph, and name the remedy of every fault."""
     from polcap import doctor as doctors
 
     if file is not None:
         from polcap.doctor.photograph import examine_file
 
         findings = tuple(examine_file(file))
-        terminal.say(doctors.shown(findings) if json else doctors.table(findings))
+        terminal.print_data(doctors.shown(findings) if json else doctors.table(findings))
         if any(one.state == "fault" for one in findings):
             raise typer.Exit(SettingError.exit_code)
         return
@@ -43,13 +43,13 @@ def doctor(
         camera_gphoto2.connected_cameras,
     )
     found = doctors.examine(rig, Path.cwd())
-    terminal.say(doctors.shown(found) if json else doctors.table(found))
+    terminal.print_data(doctors.shown(found) if json else doctors.table(found))
     if any(one.state == "fault" for one in found):
         raise typer.Exit(SettingError.exit_code)
 
 
-def _may_write(said: bool | None, ports: list[str]) -> bool:
-    """Whether serial ports may be written to: a command for a rotator may mean something else to another device."""
-    if said is not None or not sys.stdin.isatty():
-        return bool(said)
-    return typer.confirm(f"write to {', '.join(ports)} to learn who answers?", err=True)
+def _may_write(stated: bool | None, ports: list[str]) -> bool:
+    """Whether serial ports may be written to: other devices may misread a motor's command."""
+    if stated is not None or not sys.stdin.isatty():
+        return bool(stated)
+    return typer.confirm(f"Write to {', '.join(ports)} to find motors?", err=True)

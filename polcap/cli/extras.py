@@ -1,4 +1,4 @@
-"""In: the name of a module that needs an extra. Out: the module, or what to install."""
+"""Modules that need an extra, or the command that installs it."""
 
 from importlib import import_module
 from typing import Any
@@ -7,7 +7,7 @@ from polcap.errors import SettingError
 
 
 def training(module: str) -> Any:
-    """A module of polcap.training; an error with the remedy where torch is not installed."""
+    """A module of polcap.training. Raises SettingError where torch is not installed."""
     try:
         return import_module(f"polcap.training.{module}")
     except ModuleNotFoundError as error:

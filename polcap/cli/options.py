@@ -1,4 +1,4 @@
-"""In: words of the command line that several commands know. Out: their declarations, and the values they mean."""
+"""Options that several commands share, and the values they stand for."""
 
 import math
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def result_folder(named: Path | None) -> Path | None:
-    """The result folder that is meant, where a capture with its result in it was named."""
+    """The result folder; of a capture folder, the result in it."""
     if named is None or any((named / name).exists() for name in ("work", "report.json", "maps")):
         return named
     inside = named / "polcap"
@@ -29,22 +29,24 @@ CaptureFolder = Annotated[Path, typer.Argument(help="Folder with the photographs
 Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
 ConfigFile = Annotated[Path | None, typer.Option(help="TOML file of settings, a section per stage.")]
 Assignments = Annotated[
-    list[str] | None, typer.Option("--set", metavar="K=V", help="A setting, as hdr.clip=0.95; repeatable.")
+    list[str] | None, typer.Option("--set", metavar="K=V", help="A setting, such as hdr.clip=0.95; repeatable.")
 ]
-Angles = Annotated[str | None, typer.Option(metavar="DEG,…", help="Angles of the shots in order, as 0,45,90.")]
+Angles = Annotated[str | None, typer.Option(metavar="DEG,…", help="Angles of the shots in order, such as 0,45,90.")]
 Chart = Annotated[
     str | None,
-    typer.Option(metavar="X0,Y0,…|FILE", help="Chart corners in RAW px, dark skin first, clockwise; or a profile."),
+    typer.Option(
+        metavar="X0,Y0,…|FILE", help="Chart corners in RAW px, dark skin first, clockwise; or a color profile."
+    ),
 ]
-NoChart = Annotated[bool, typer.Option("--no-chart", help="Use the camera's own colours.")]
+NoChart = Annotated[bool, typer.Option("--no-chart", help="Use the camera's own colors.")]
 Estimator = Annotated[
     Literal["network", "analytic"] | None,
-    typer.Option(case_sensitive=False, help="By default the network where one is shipped."),
+    typer.Option(case_sensitive=False, help="How normals and materials are estimated; by default by the network."),
 ]
-Model = Annotated[Path | None, typer.Option(metavar="ONNX", help="Another model than the shipped one.")]
+Model = Annotated[Path | None, typer.Option(metavar="ONNX", help="A model of your own instead of the shipped one.")]
 Device = Annotated[
     Literal["cpu", "cuda", "auto"],
-    typer.Option(case_sensitive=False, help="Where the network runs; cuda never falls back."),
+    typer.Option(case_sensitive=False, help="Where the network runs; cuda fails where CUDA does not start."),
 ]
 Until = Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")]
 Force = Annotated[str | None, typer.Option(metavar="STAGE", help="Compute this stage and all after it again.")]
@@ -53,7 +55,7 @@ Memory = Annotated[float, typer.Option(min=0, help="Most memory to take, GB; 0 i
 
 
 def angles_deg(text: str | None) -> tuple[float, ...] | None:
-    """--angles in degrees; None where nothing was said."""
+    """--angles in degrees; None without it."""
     return None if text is None else numbers("--angles", text)
 
 
@@ -64,7 +66,7 @@ def numbers(flag: str, text: str) -> tuple[float, ...]:
     except ValueError:
         raise SettingError(f"{flag} {text}: not numbers separated by commas") from None
     if not all(map(math.isfinite, found)):
-        raise SettingError(f"{flag} {text}: every number has to be finite")
+        raise SettingError(f"{flag} {text}: every number must be finite")
     return found
 
 
@@ -78,7 +80,7 @@ def check_stages(named: Mapping[str, str | None]) -> None:
 
 
 def chart_request(text: str | None, no_chart: bool) -> "ChartRequest":
-    """--chart and --no-chart: corners in RAW px, a color profile, the camera's own colors, or what is found."""
+    """--chart and --no-chart: corners, a profile or no chart; by default the chart is searched for."""
     import numpy as np
 
     from polcap.formats import calibrations

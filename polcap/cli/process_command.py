@@ -1,4 +1,4 @@
-"""`polcap process`: a capture folder and options in; maps, asset and verdict out, once or at every change."""
+"""`polcap process`: turn a capture folder into maps, asset and report."""
 
 from functools import partial
 from pathlib import Path
@@ -21,10 +21,12 @@ def process(
     assignments: options.Assignments = None,
     until: options.Until = None,
     force: options.Force = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what was understood, and stop.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print the understood capture and the stages to run, and stop.")
+    ] = False,
     watch: Annotated[
         bool,
-        typer.Option("--watch", help="Stay: process again whenever the folder or --config has changed; Ctrl-C ends."),
+        typer.Option("--watch", help="Process again whenever the folder or --config changes, until Ctrl-C."),
     ] = False,
     json: options.Json = False,
     device: options.Device = "cpu",
@@ -41,12 +43,12 @@ def process(
     from polcap.pipeline import unchanged
 
     paths = {"capture": capture, "config": config, "mask": mask, "model": model}
-    given = {**context.params, **paths}  # there they are text
+    given = {**context.params, **paths}  # context.params has paths as text
     target = out or capture / "polcap"
     request = None if until or force or dry_run or watch else _request(given, target)
     if (finished := unchanged.find(target, request)) is not None:
-        terminal.tell(f"{finished.table}\nnothing has changed since the last run")
-        terminal.tell_result(finished.report, target, json)
+        terminal.print_message(f"{finished.table}\nNothing has changed since the last run.")
+        terminal.print_result(finished.report, target, json)
         return
     resource_limits.set_threads(threads)  # before the libraries that start them
     resource_limits.set_memory(memory)
@@ -59,7 +61,7 @@ def process(
 
 
 def _request(given: dict[str, Any], target: Path) -> str | None:
-    """Digest of the options and of all files that the run would read; None where it has to run in any case."""
+    """Digest of the options and of all files that the run reads; None where it must run in any case."""
     from polcap.pipeline import unchanged
 
     asked = {name: value for name, value in given.items() if name not in _NO_EFFECT}
@@ -88,7 +90,7 @@ def _inputs(given: dict[str, Any]) -> tuple[Any, Any, Any]:
 
 
 def _plan(given: dict[str, Any], target: Path) -> None:
-    """Print what was understood and what would be computed."""
+    """Print how the capture is understood and which stages would run."""
     from polcap import report
     from polcap.formats.capture import reader as captures
     from polcap.pipeline import run as pipeline
@@ -97,7 +99,7 @@ def _plan(given: dict[str, Any], target: Path) -> None:
     stages = pipeline.plan(capture, supplied, config, target, given["force"])
     rows = [f"{name:14}{state}" for name, state in stages.items()]
     table = "\n".join([captures.table(capture), "", *rows])
-    terminal.say({"capture": report.capture_facts(capture), "stages": stages} if given["json"] else table)
+    terminal.print_data({"capture": report.capture_facts(capture), "stages": stages} if given["json"] else table)
 
 
 def _process(given: dict[str, Any], target: Path, request: str | None) -> None:
@@ -111,13 +113,13 @@ def _process(given: dict[str, Any], target: Path, request: str | None) -> None:
 
     capture, supplied, config = _inputs(given)
     table = captures.table(capture)
-    terminal.tell(table)
+    terminal.print_message(table)
     with terminal.progress(len(STAGES) + 1) as bar:
         supplied = replace(supplied, decode=pipeline.counted(capture, bar.frame))
         about = pipeline.process(capture, supplied, config, target, given["until"], given["force"], bar.stage)
     if about is None:
         work = str(target / "work")
-        terminal.say({"until": given["until"], "work": work} if given["json"] else work)
+        terminal.print_data({"until": given["until"], "work": work} if given["json"] else work)
         return
     unchanged.remember(target, request, table)
-    terminal.tell_result(about, target, given["json"])
+    terminal.print_result(about, target, given["json"])

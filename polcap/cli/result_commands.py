@@ -1,4 +1,4 @@
-"""In: a result folder of `process`. Out: its asset again, pictures, what it holds, its verdict: export to report."""
+"""`polcap export`, `show`, `status` and `report`: commands on a result folder."""
 
 import sys
 from pathlib import Path
@@ -22,24 +22,30 @@ def export(
     exr: Annotated[bool, typer.Option("--exr", help="asset/NAME_layers.exr, every map as a layer")] = False,
     preset: Annotated[
         Literal["blender", "unreal", "unity", "web", "archive"] | None,
-        typer.Option(case_sensitive=False, help="For which program, into asset/NAME/; archive needs the extra [usd]."),
+        typer.Option(
+            case_sensitive=False, help="Program that reads the files, in asset/NAME/; archive needs the extra [usd]."
+        ),
     ] = None,
     images: Annotated[
         Literal["png", "jpeg", "webp", "ktx2"] | None,
-        typer.Option(case_sensitive=False, help="Kind of the pictures in the GLB."),
+        typer.Option(case_sensitive=False, help="Picture format in the GLB."),
     ] = None,
     color: Annotated[
-        str, typer.Option(metavar="SPACE", help="Colour space or OCIO role of the EXR's colours, as ACEScg.")
+        str, typer.Option(metavar="SPACE", help="Color space or OCIO role of the colors in the EXR, such as ACEScg.")
     ] = "lin_rec709",
     texture_size: Annotated[
-        int | None, typer.Option(min=16, max=16384, help="Px of the textures' longer side; by default the maps'.")
+        int | None,
+        typer.Option(min=16, max=16384, help="Longer side of the textures, px; by default that of the maps."),
     ] = None,
     lod: Annotated[
-        int, typer.Option(min=0, max=6, help="Further GLBs, each in a quarter of the triangles of the one before.")
+        int,
+        typer.Option(
+            min=0, max=6, help="Number of further GLBs, each with a quarter of the triangles of the one before."
+        ),
     ] = 0,
     json: Json = False,
 ) -> None:
-    """Write the asset again from the maps of a result; without a flag GLB and OBJ, as `process` does."""
+    """Write the asset again from a result's maps; without a flag as GLB and OBJ."""
     from polcap.formats.export import presets
     from polcap.pipeline import run as pipeline
     from polcap.pipeline.asset_export import ExportRequest
@@ -50,7 +56,7 @@ def export(
         raise SettingError(f"--preset {preset} brings its formats; leave out --{formats[0]}")
     wanted = ExportRequest(formats or ("gltf", "obj"), preset, images, color, texture_size, lod)
     written = [str(file) for file in pipeline.export(result, wanted)]
-    terminal.say({"written": written} if json else "\n".join(written))
+    terminal.print_data({"written": written} if json else "\n".join(written))
 
 
 def show(
@@ -64,12 +70,12 @@ def show(
         Literal["light", "turntable"] | None,
         typer.Option(
             case_sensitive=False,
-            help="WebP, and MP4 where FFmpeg is present: a light that goes round, or the surface turned.",
+            help="WebP, and MP4 where FFmpeg is present: a moving light, or the turning surface.",
         ),
     ] = None,
     json: Json = False,
 ) -> None:
-    """Draw what a stage made; prints the picture's path, and on a terminal shows it."""
+    """Draw a stage's result; prints the picture's path, and shows it on a terminal."""
     from polcap.pipeline import run as pipeline
     from polcap.pipeline.path import STAGES
 
@@ -79,12 +85,12 @@ def show(
         drawn = pipeline.animate(result, animate)
     else:
         drawn = pipeline.show(result, STAGES if stage is None else (stage,))
-    terminal.say({"written": [str(file) for file in drawn]} if json else "\n".join(map(str, drawn)))
+    terminal.print_data({"written": [str(file) for file in drawn]} if json else "\n".join(map(str, drawn)))
     terminal.preview(drawn)
 
 
 def status(context: typer.Context, result: Result, json: Json = False) -> None:
-    """What a result folder holds, stage by stage; or how far a batch of captures is."""
+    """List the stored stages of a result folder, or the progress of a batch."""
     from polcap.pipeline import cache
 
     if not result.is_dir():
@@ -94,17 +100,17 @@ def status(context: typer.Context, result: Result, json: Json = False) -> None:
         from polcap import batch as batches
 
         about = batches.status(batches.reopen(result))
-        terminal.say(about if json else batches.lines(about))
+        terminal.print_data(about if json else batches.lines(about))
         return
     if not found:
         raise SettingError(f"{result} holds no stage cache; run `polcap process` or `polcap batch` on it first")
     rows = [{name: about[name] for name in ("stage", "version", "key", "seconds", "bytes")} for about in found]
     complete = (result / "report.json").exists()
     if json:
-        terminal.say({"stages": rows, "complete": complete})
+        terminal.print_data({"stages": rows, "complete": complete})
         return
     lines = [f"{r['stage']:14}{r['seconds']:8.2f} s {r['bytes'] / 1e6:9.2f} MB   {r['key'][:12]}" for r in rows]
-    terminal.say("\n".join([*lines, "complete" if complete else "not complete: run `polcap process` to go on"]))
+    terminal.print_data("\n".join([*lines, "complete" if complete else "not complete: run `polcap process` to go on"]))
 
 
 def report(
@@ -115,7 +121,7 @@ def report(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Judge a result again from its stage cache, or show in which figures two results differ."""
+    """Judge a result again from its stage cache, or compare it with another."""
     from polcap import report as reports
 
     if compare is not None:
@@ -126,15 +132,17 @@ def report(
         pairs.write(file, (result, compare), abouts)
         rows = pairs.rows(*abouts)
         named = [{"name": name, "here": here, "there": there} for name, here, there in rows]
-        spoken = (pairs.spoken(row) for row in rows)
+        spoken = (pairs.labelled(row) for row in rows)
         if json or rows:
-            terminal.say(named if json else "\n".join(f"{title}: {here}  |  {there}" for title, here, there in spoken))
+            terminal.print_data(
+                named if json else "\n".join(f"{title}: {here}  |  {there}" for title, here, there in spoken)
+            )
         if not rows:
-            terminal.tell("polcap: no figure and no setting differs")
-        print(f"polcap: both side by side: {file}", file=sys.stderr)
+            terminal.print_message("polcap: no figure and no setting differs")
+        print(f"polcap: comparison: {file}", file=sys.stderr)
         return
     from polcap.pipeline import run as pipeline
 
     about = pipeline.judge_again(result)
-    terminal.say(about if json else str(result / "report.html"))
-    terminal.tell_gates(about)
+    terminal.print_data(about if json else str(result / "report.html"))
+    terminal.print_gates(about)

@@ -25,5 +25,5 @@ def at_every_change(capture: Path, target: Path, config: Path | None, once: Call
         try:
             once()
         except (InputError, GateError, OSError) as error:  # a frame may have gone while it was read
-            terminal.tell(f"polcap: {terminal.line(error)}")
-        terminal.tell(f"watching {capture}; Ctrl-C ends")
+            terminal.print_message(f"polcap: {terminal.line(error)}")
+        terminal.print_message(f"watching {capture}; Ctrl-C ends")

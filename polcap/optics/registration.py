@@ -26,8 +26,8 @@ Indices = NDArray[np.int64]
 Model = Literal["translation", "similarity", "homography", "simplest"]  # simplest: that explains the shifts (BIC)
 
 _SIZES = {"translation": (2,), "similarity": (4,), "homography": (8,), "simplest": (8, 4, 2)}  # numbers of parameters
-_TILE = 20  # px; of 16 to 32 px and 3 to 12 a cell, the least error over brackets and shots (docs/benchmarks)
-_CELLS, _PER_CELL = 10, 6  # tiles are spread over a grid of cells: the best few of each
+_TILE = 20  # px; of 16 to 32 px the least error over frames and shots (docs/benchmarks/registration.md)
+_CELLS, _PER_CELL = 10, 8  # tiles are spread over a grid of cells: the best few of each
 _COARSEST_PX = 256  # of the shorter side: a smaller picture has too few tiles
 _TILES_AT_ONCE = 64  # so that their equations fit a core's cache
 _LEAST_USABLE, _USABLE = 0.6, 0.7  # shares of a tile's pixels: in the other picture, to be chosen in the reference
@@ -38,7 +38,8 @@ _LEAST_TILES = 6
 _TILE_ERROR_PX = 0.02  # of interpolation and aliasing, in the richest tile
 _PRIOR_PX = 0.1  # what the tiles do not know to this, hardly moves in one step
 _AGREE_PX = 0.3  # a tile that is left over by less agrees with the motion
-_LEAST_AGREE, _SURE_AGREE = 0.4, 0.6  # shares of the tiles: fewer show no motion; with more the first match is taken
+_LEAST_AGREE = 0.4  # share of the matched tiles: if fewer agree there is no motion
+_SURE_AGREE = 0.6  # share of all usable tiles: if more agree the first match is taken
 _FAR_BETTER = 1.25  # so many more tiles must agree with a far match: detail may repeat
 _STILL_PX = 1.0  # pictures that moved less need no coarse scales
 _SETTLED_PX = 0.005  # a smaller step ends the search; four times that on coarse scales
@@ -101,6 +102,7 @@ class _Matches:
     point: Floats  # (T, 2) tile centres x, y in the reference
     shift: Floats  # (T, 2) px
     information: Floats  # (T, 2, 2) inverse covariance of the shift
+    tried: int  # tiles that both pictures can use, also those that were not matched
 
 
 def register(reference: Pyramid, other: Pyramid, model: Model = "simplest") -> Registration:
@@ -109,20 +111,22 @@ def register(reference: Pyramid, other: Pyramid, model: Model = "simplest") -> R
     Tried from the identity, then from a phase correlation. Nothing to match, or tiles that do not agree: the identity,
     with no tiles.
     """
-    still, agree = _refine(reference, other, model, 1, np.eye(3))
-    if still.shift_px < _STILL_PX and agree > _SURE_AGREE * still.tiles:
+    still, _, share = _refine(reference, other, model, 1, np.eye(3))
+    if still.shift_px < _STILL_PX and share > _SURE_AGREE:
         return still
     scales = reference.scales
-    near, agree = _refine(reference, other, model, scales, np.eye(3))
+    near, agree, _ = _refine(reference, other, model, scales, np.eye(3))
     start = _phase_correlation(*reference[scales - 1], *other[scales - 1])
-    far, more = _refine(reference, other, model, scales, start)
+    if not start[:2, 2].any():
+        return near
+    far, more, _ = _refine(reference, other, model, scales, start)
     return far if more > _FAR_BETTER * agree else near
 
 
 def refine(reference: Pyramid, other: Pyramid, model: Model, start: Floats) -> Registration:
     """The same from a first guess (3, 3), which stays where there is nothing to match."""
     scales = reference.scales
-    found, _ = _refine(reference, other, model, scales, scaled(start, 1 / 2 ** (scales - 1)))
+    found, _, _ = _refine(reference, other, model, scales, scaled(start, 1 / 2 ** (scales - 1)))
     return found if found.tiles else replace(found, matrix=start)
 
 
@@ -209,9 +213,12 @@ def _phase_correlation(a: Floats, ok_a: Bools, b: Floats, ok_b: Bools) -> Floats
 
 def _refine(
     reference: Pyramid, other: Pyramid, model: Model, scales: int, matrix: Floats
-) -> tuple[Registration, float]:
-    """From a first guess on the coarsest of some scales to the full size; with it the number of tiles that agree."""
-    sigma, agree = np.inf, 0.0
+) -> tuple[Registration, int, float]:
+    """From a first guess on the coarsest of some scales to the full size.
+
+    With it the number of tiles that agree, and their share of the tiles that both pictures can use.
+    """
+    sigma, agree, tried = np.inf, 0, 0
     points: Floats = np.zeros((0, 2))
     covariance: Floats = np.zeros((2, 2))
     for level in range(scales - 1, -1, -1):
@@ -226,17 +233,17 @@ def _refine(
             points = matches.point
             step = transform_points(update, points) - points
             rest = matches.shift - step
-            agree = float(np.sum(np.hypot(rest[:, 0], rest[:, 1]) < _AGREE_PX))
+            agree, tried = int(np.sum(np.hypot(rest[:, 0], rest[:, 1]) < _AGREE_PX)), matches.tried
             if float(np.abs(step).max()) < _SETTLED_PX * (4 if level else 1):
                 break
         if level:
             matrix = scaled(matrix, 2)
     if not len(points) or agree < _LEAST_AGREE * len(points):
-        return Registration(np.eye(3), 0.0, np.inf, 0, covariance, reference.shape), 0.0
+        return Registration(np.eye(3), 0.0, np.inf, 0, covariance, reference.shape), 0, 0.0
     matrix = matrix / matrix[2, 2]
     moved = transform_points(matrix, points) - points
     shift_px = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
-    return Registration(matrix, shift_px, sigma, len(points), covariance, reference.shape), agree
+    return Registration(matrix, shift_px, sigma, len(points), covariance, reference.shape), agree, agree / tried
 
 
 def _match(a: tuple[Floats, Bools], b: tuple[Floats, Bools], corner: Indices, matrix: Floats) -> _Matches:
@@ -247,12 +254,13 @@ def _match(a: tuple[Floats, Bools], b: tuple[Floats, Bools], corner: Indices, ma
         np.concatenate([one.point for one in some]),
         np.concatenate([one.shift for one in some]),
         np.concatenate([one.information for one in some]),
+        sum(one.tried for one in some),
     )
 
 
 def _match_some(a: tuple[Floats, Bools], b: tuple[Floats, Bools], corner: Indices, matrix: Floats) -> _Matches:
     """The same for some tiles at once: reference(x) = gain · (other(x + s) + ∇·δ) + offset is solved for δ."""
-    nothing = _Matches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    nothing = _Matches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)), 0)
     if not len(corner):
         return nothing
     center = corner[:, ::-1] + (_TILE - 1) / 2  # x, y
@@ -262,13 +270,13 @@ def _match_some(a: tuple[Floats, Bools], b: tuple[Floats, Bools], corner: Indice
     shape = np.array(a[0].shape)
     inside = np.all((first >= _MARGIN) & (first + _TILE + _MARGIN < shape), axis=1)
     inside &= np.all((corner >= 1) & (corner + _TILE + 1 < shape), axis=1)
-    seen = _windows(b[1], first[inside], _TILE)
-    enough = seen.mean(axis=(1, 2)) > _LEAST_USABLE
+    clear = _windows(b[1], first[inside], _TILE)
+    enough = clear.mean(axis=(1, 2)) > _LEAST_USABLE
     inside[inside] = enough
     if not inside.any():
         return nothing
     corner, first, center = corner[inside], first[inside], center[inside]
-    usable = np.asarray(seen[enough] & _windows(a[1], corner, _TILE), np.float64)
+    usable = np.asarray(clear[enough] & _windows(a[1], corner, _TILE), np.float64)
     patch = _windows(a[0], corner - 1, _TILE + 2).astype(np.float64)  # (T, _TILE + 2, _TILE + 2)
     fraction = np.asarray(shift - whole, np.float64)[inside]
     other = _sample(_windows(b[0], first - 1, _TILE + 3).astype(np.float64), fraction)  # cubic: 1 before, 2 after
@@ -286,7 +294,7 @@ def _match_some(a: tuple[Floats, Bools], b: tuple[Floats, Bools], corner: Indice
     missing, information = _without_noise(solution[:, :2], normal, count, variance)
     good = np.all(np.abs(missing) < _REACH_PX, axis=1) & np.any(information != 0, axis=(1, 2))
     good &= (solution[:, 2] > _GAIN[0]) & (solution[:, 2] < _GAIN[1])
-    return _Matches(center[good], missing[good], information[good])
+    return _Matches(center[good], missing[good], information[good], len(corner))
 
 
 def _without_noise(shift: Floats, normal: Floats, count: Floats, variance: Floats) -> tuple[Floats, Floats]:

@@ -23,7 +23,7 @@ from polcap.pipeline import asset_export, result_folder
 from polcap.pipeline.asset_export import ExportRequest
 from polcap.pipeline.cache import ArchiveCache, DryRunCache, Progress, StageCache, contents, silent
 from polcap.pipeline.path import STAGES, UserInput, path
-from polcap.report import moving
+from polcap.report import animation
 from polcap.report import stage_pictures as pictures
 from polcap.results import Results
 
@@ -161,16 +161,19 @@ def show(out: Path, stages: Sequence[str]) -> list[Path]:
     return drawn
 
 
-def animate(out: Path, motion: moving.Motion) -> list[Path]:
+def animate(out: Path, motion: animation.Motion) -> list[Path]:
     """Move the light or the object; returns the paths of the WebP and, where FFmpeg is present, the MP4."""
     results, about = reopen(out)
     ior = float(about["settings"]["infer"]["ior"])
-    frames = moving.light(results.maps, ior) if motion == "light" else moving.turntable(results.maps, results.mesh, ior)
+    if motion == "light":
+        frames = animation.light(results.maps, ior)
+    else:
+        frames = animation.turntable(results.maps, results.mesh, ior)
     written = [out / "work" / f"{motion}.webp"]
-    encoders.webp(written[0], frames, moving.SECONDS)
+    encoders.webp(written[0], frames, animation.SECONDS)
     if encoders.ffmpeg():
         written.append(out / "work" / f"{motion}.mp4")
-        encoders.mp4(written[1], frames, moving.SECONDS)
+        encoders.mp4(written[1], frames, animation.SECONDS)
     return written
 
 

@@ -7,10 +7,11 @@ from functools import cached_property
 
 import numpy as np
 
-from polcap.formats.raw import frame_decoder, glance
-from polcap.formats.raw.glance import Glance
+from polcap.formats.raw import frame_decoder
 from polcap.images import Capture, Floats, Frame, SensorImage
 from polcap.optics import sharpness
+from polcap.pipeline import reduced_frame
+from polcap.pipeline.reduced_frame import ReducedFrame
 
 _MOST_PIXELS = 0.6e6  # of the pictures that the stages see
 
@@ -22,11 +23,11 @@ class SmallCapture:
     capture: Capture
     step: int  # visible RAW px per px
     merged_px: int  # visible RAW px per px of the picture that `process` merges
-    glances: Mapping[Frame, Future[Glance]]
+    reduced: Mapping[Frame, Future[ReducedFrame]]
 
     def decode(self, frame: Frame) -> SensorImage:
         """The reduced picture of a frame; DecodeError."""
-        return self.glances[frame].result().picture
+        return self.reduced[frame].result().picture
 
     @cached_property
     def clipped(self) -> Floats:
@@ -38,9 +39,9 @@ class SmallCapture:
         """(K, E) of each frame beyond the sharpest of its exposure, 1σ [visible RAW px]."""
         return sharpness.frames_blur([[one.tiles for one in shot] for shot in self._shots()], self.merged_px)
 
-    def _shots(self) -> list[list[Glance]]:
+    def _shots(self) -> list[list[ReducedFrame]]:
         """(K, E) of the capture's frames."""
-        return [[self.glances[frame].result() for frame in shot.frames] for shot in self.capture.shots]
+        return [[self.reduced[frame].result() for frame in shot.frames] for shot in self.capture.shots]
 
 
 def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapture:
@@ -55,13 +56,13 @@ def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapt
         Of the reference frame at once, of another one when it is used.
     """
     first = capture.shots[0].frames[(len(capture.shots[0].frames) - 1) // 2]
-    meta, arrays = frame_decoder.apply(first, glance.first, clip=clip, most_pixels=_MOST_PIXELS)
+    meta, arrays = frame_decoder.apply(first, reduced_frame.first, clip=clip, most_pixels=_MOST_PIXELS)
     times, half, corners = int(meta["times"]), int(meta["superpixel"]), arrays["corners"].tolist()
-    decoded = Future[Glance]()
-    decoded.set_result(glance.joined(meta, arrays))
+    decoded = Future[ReducedFrame]()
+    decoded.set_result(reduced_frame.joined(meta, arrays))
 
-    def begin(frame: Frame) -> Future[Glance]:
-        return decoded if frame == first else pool.submit(_glance, frame, clip, times, corners)
+    def begin(frame: Frame) -> Future[ReducedFrame]:
+        return decoded if frame == first else pool.submit(_reduced, frame, clip, times, corners)
 
     crossed = () if capture.crossed is None else (capture.crossed,)
     every = [frame for shot in (*capture.shots, *crossed) for frame in (*shot.frames, *shot.ambient)]
@@ -77,5 +78,6 @@ def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapt
     return SmallCapture(small, step, half, {frame: begin(frame) for frame in every})
 
 
-def _glance(frame: Frame, clip: float, times: int, corners: list[list[int]]) -> Glance:
-    return glance.joined(*frame_decoder.apply(frame, glance.take, clip=clip, times=times, corners=corners))
+def _reduced(frame: Frame, clip: float, times: int, corners: list[list[int]]) -> ReducedFrame:
+    parts = frame_decoder.apply(frame, reduced_frame.take, clip=clip, times=times, corners=corners)
+    return reduced_frame.joined(*parts)

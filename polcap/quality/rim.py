@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Floats
 from polcap.optics import outline
+from polcap.optics.robust import jackknife
 
 Bools = NDArray[np.bool_]
 
@@ -119,8 +120,7 @@ def _sigmas(at: Rim, angle: Floats, way: Floats) -> float:
     if len(used) < _LEAST_SECTORS:
         return 0.0
     without = (asked.sum() - asked[used]) / (room.sum() - room[used])
-    doubt = np.sqrt((len(used) - 1) / len(used) * ((without - without.mean()) ** 2).sum())
-    return float(asked.sum() / room.sum() / max(doubt, 1e-9))
+    return float(asked.sum() / room.sum() / max(float(jackknife(without)), 1e-9))
 
 
 def body(at: Rim, angle: Floats) -> Body:

@@ -1,4 +1,4 @@
-"""In: two results. Out: the figures and settings in which they differ, and a page that shows both."""
+"""Comparison of two results: differing figures and settings, and a page that shows both."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
@@ -13,33 +13,33 @@ from polcap.formats.maps import maps_folder
 from polcap.images import Floats
 from polcap.report import keys, labels, map_figures, page
 from polcap.report.keys import Palette
-from polcap.report.smaller import Smaller
+from polcap.report.reduction import ObjectReduction
 
-_LONGEST = 640  # px of a map
-_DIFFERENCE = keys.Key(-0.2, 0.2, "", (-0.2, -0.1, 0, 0.1, 0.2), "balance", digits=3)
-Row = tuple[str, Any, Any]  # name, here, there
+_LONGEST = 640  # px, longest side of a map
+_DIFFERENCE = keys.ColorKey(-0.2, 0.2, "", (-0.2, -0.1, 0, 0.1, 0.2), "balance", digits=3)
+Row = tuple[str, Any, Any]  # name, value in the first result, value in the second
 
 
 def rows(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[Row]:
-    """The figures and settings in which two reports differ: part.section.name, here, there."""
+    """Figures and settings that differ between two reports, named part.section.name."""
     found = []
     for part in ("figures", "settings"):
-        here, there = _flat(one[part]), _flat(other[part])
-        for name in dict.fromkeys([*here, *there]):
-            if here.get(name) != there.get(name):
-                found.append((f"{part}.{name}", here.get(name), there.get(name)))
+        first, second = _flat(one[part]), _flat(other[part])
+        for name in dict.fromkeys([*first, *second]):
+            if first.get(name) != second.get(name):
+                found.append((f"{part}.{name}", first.get(name), second.get(name)))
     return found
 
 
-def spoken(row: Row) -> tuple[str, str, str]:
-    """A row as a reader wants it."""
+def labelled(row: Row) -> tuple[str, str, str]:
+    """A row with label, numbers and units in words."""
     kind, _, name = row[0].partition(".")
     title = f"{labels.part(name.partition('.')[0])}: {labels.label(name)}" if kind == "figures" else name
     return title, labels.text(name, row[1]), labels.text(name, row[2])
 
 
 def write(file: Path, folders: tuple[Path, Path], abouts: tuple[Mapping[str, Any], Mapping[str, Any]]) -> None:
-    """A page of two results, in the form of their reports.
+    """Write a page that shows two results next to each other.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def write(file: Path, folders: tuple[Path, Path], abouts: tuple[Mapping[str, Any
 
 
 def _names(folders: tuple[Path, Path]) -> tuple[str, str]:
-    """The shortest ends of two paths that tell them apart."""
+    """The shortest ends of two paths that differ."""
     parts = [folder.resolve().parts for folder in folders]
     for count in range(1, max(map(len, parts)) + 1):
         one, other = ("/".join(path[-count:]) for path in parts)
@@ -84,18 +84,18 @@ def _maps(folders: Sequence[Path], names: Sequence[str]) -> Iterator[str]:
     except DecodeError as error:
         yield f"<p class='note'>No maps to compare: {escape(str(error))}</p>"
         return
-    small = [Smaller(maps.mask, _LONGEST).maps(maps) for maps in stored]
+    small = [ObjectReduction(maps.mask, _LONGEST).maps(maps) for maps in stored]
     same = stored[0].mask.shape == stored[1].mask.shape
     both = small[0].mask & small[1].mask if same else np.zeros((1, 1), bool)
-    yield "<h2>Maps</h2><p class='hint'>The pointer over one map reads all of them at that place.</p>"
+    yield "<h2>Maps</h2><p class='hint'>Move the pointer over a map to read the values of all maps at that place.</p>"
     yield "" if same else "<p class='note'>The crops differ in size, so no differences are drawn.</p>"
     yield "<h3>Normal</h3><div class='grid'>"
     for place, (maps, name) in enumerate(zip(small, names, strict=True)):
         yield map_figures.normal(f"normal-{place}", name, maps.normal, maps.mask)
     if same:
         difference = _degrees(small[0].normal, small[1].normal)
-        says = f"median {labels.number(float(np.median(difference[both])), 2)}°" if both.any() else ""
-        yield map_figures.scalar("normal-apart", "Angle between them", says, difference, both, keys.ERROR)
+        note = f"median {labels.number(float(np.median(difference[both])), 2)}°" if both.any() else ""
+        yield map_figures.scalar("normal-difference", "Angle between the normals", note, difference, both, keys.ERROR)
     yield "</div>"
     scalars = (
         ("roughness", "Roughness", keys.ROUGHNESS, [maps.roughness for maps in small]),
@@ -107,8 +107,8 @@ def _maps(folders: Sequence[Path], names: Sequence[str]) -> Iterator[str]:
         for place, (maps, name) in enumerate(zip(small, names, strict=True)):
             yield map_figures.scalar(f"{kind}-{place}", name, "", values[place], maps.mask, key)
         if same and kind != "error":
-            says = f"{names[1]} less {names[0]}"
-            yield map_figures.scalar(f"{kind}-apart", "Difference", says, values[1] - values[0], both, _DIFFERENCE)
+            note = f"{names[1]} minus {names[0]}"
+            yield map_figures.scalar(f"{kind}-difference", "Difference", note, values[1] - values[0], both, _DIFFERENCE)
         yield "</div>"
 
 
@@ -118,7 +118,7 @@ def _degrees(one: Floats, other: Floats) -> Floats:
 
 def _differences(found: Sequence[Row], names: Sequence[str]) -> Iterator[str]:
     for kind, title in (("figures", "Figures that differ"), ("settings", "Settings that differ")):
-        lines = [spoken(row) for row in found if row[0].startswith(kind)]
+        lines = [labelled(row) for row in found if row[0].startswith(kind)]
         yield f"<h2>{title}</h2>"
         yield f"<div class='scroll'>{html.table(('', *names), lines)}</div>" if lines else "<p>None.</p>"
 

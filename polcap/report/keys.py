@@ -1,7 +1,7 @@
-"""In: a number per pixel. Out: its colour, and the key that turns the colour back into the number.
+"""Color keys: how the numbers of a map become colors, and colors numbers again.
 
-A map's picture holds one of 255 levels per pixel; level 0 lies outside the object. Every level has a
-colour of its own, so a program that reads the picture finds the number again.
+Each pixel of a map's picture has one of 255 levels; level 0 is outside the object. No two levels share a color, so
+a program can read the numbers back from the picture.
 """
 
 from dataclasses import dataclass
@@ -19,19 +19,19 @@ _STEPS = np.linspace(0, 1, LEVELS)
 
 
 @dataclass(frozen=True)
-class Key:
-    """How the numbers of one map are shown."""
+class ColorKey:
+    """Range, unit and palette of one map."""
 
     low: float
     high: float
-    unit: str  # as it stands behind a number
-    ticks: tuple[float, ...]
+    unit: str  # printed after a number
+    ticks: tuple[float, ...]  # numbers marked on the bar
     palette: Palette = "viridis"
-    power: float = 1.0  # number = low + (high − low)·level^power: 2 leaves small numbers more room
+    power: float = 1.0  # number = low + (high − low)·level^power: 2 gives small numbers more levels
     digits: int = 2  # behind the decimal point
 
     def level(self, value: Floats, inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
-        """1…255 for low…high, beyond them the nearest; 0 outside and where there is no number."""
+        """Levels 1…255 for low…high, clipped; 0 outside the object and where the number is not finite."""
         known = inside & np.isfinite(value)
         share = (np.where(known, value, self.low) - self.low) / (self.high - self.low)
         if self.palette == "wheel":
@@ -41,30 +41,25 @@ class Key:
         return np.where(known, steps + 1, 0).astype(np.uint8)
 
     def place(self, value: float) -> float:
-        """Where a number stands on the bar, 0…1."""
+        """Position of a number on the bar, 0…1."""
         return float(np.clip((value - self.low) / (self.high - self.low), 0, 1) ** (1 / self.power))
 
     def picture(self, value: Floats, inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
-        """The colours (H, W, 3), black outside."""
+        """Colors (H, W, 3), black outside the object."""
         return np.concatenate([np.zeros((1, 3), np.uint8), colors(self.palette)])[self.level(value, inside)]
 
     def bar(self, width: int, height: int) -> NDArray[np.uint8]:
-        """The colours from low to high, (height, width, 3)."""
+        """Color bar from low to high, (height, width, 3)."""
         steps = np.rint(np.linspace(0, LEVELS - 1, width)).astype(int)
         return np.broadcast_to(colors(self.palette)[steps], (height, width, 3)).copy()
 
 
-def plain(value: float) -> str:
-    """A tick's number, three significant digits."""
-    return f"{value:.3g}"
-
-
 def colors(palette: Palette) -> NDArray[np.uint8]:
-    """The colours (255, 3) of levels 1…255, sRGB, no two alike."""
+    """Colors (255, 3) of levels 1…255, sRGB, all different."""
     if palette == "wheel":  # one turn of hue, red at both ends
         hsv = np.stack([360 * np.arange(LEVELS) / LEVELS, np.full(LEVELS, 0.78), np.ones(LEVELS)], axis=-1)
         rgb: Any = cv2.cvtColor(hsv[None].astype(np.float32), cv2.COLOR_HSV2RGB)[0]
-    elif palette == "balance":  # blue, grey where nothing is, red
+    elif palette == "balance":  # blue, gray at zero, red
         ends = np.array([[0.10, 0.42, 0.90], [0.55, 0.55, 0.55], [0.95, 0.35, 0.10]])
         rgb = np.stack([np.interp(_STEPS, [0, 0.5, 1], ends[:, channel]) for channel in range(3)], axis=-1)
     else:
@@ -75,7 +70,7 @@ def colors(palette: Palette) -> NDArray[np.uint8]:
 
 
 def _distinct(rgb: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """The same colours, a repeated one moved by a step of blue: a colour stands for one level."""
+    """The colors, with repeated ones shifted by one step of blue so that each has one level."""
     seen: set[tuple[int, ...]] = set()
     out = rgb.copy()
     for color in out:
@@ -85,20 +80,20 @@ def _distinct(rgb: NDArray[np.int64]) -> NDArray[np.uint8]:
     return out.astype(np.uint8)
 
 
-DOLP = Key(0, 0.2, "", (0, 0.05, 0.1, 0.15, 0.2), "inferno", digits=3)
-AOLP = Key(0, 180, "°", (0, 45, 90, 135, 180), "wheel", digits=0)
-ALBEDO = Key(0, 1, "", (0, 0.25, 0.5, 0.75, 1))
-ROUGHNESS = Key(0, 1, "", (0, 0.25, 0.5, 0.75, 1))
-F0 = Key(0, 0.16, "", (0, 0.04, 0.08, 0.12, 0.16), digits=3)
-ERROR = Key(0, 30, "°", (0, 1, 3, 10, 20, 30), "inferno", power=2, digits=1)  # 3° at a third of the bar
-DIFFERENCE = Key(-20, 20, " %", (-20, -10, 0, 10, 20), "balance", digits=1)
-SIGMA = Key(0, 0.01, "", (0, 0.0025, 0.005, 0.01), "inferno", digits=4)
+DOLP = ColorKey(0, 0.2, "", (0, 0.05, 0.1, 0.15, 0.2), "inferno", digits=3)
+AOLP = ColorKey(0, 180, "°", (0, 45, 90, 135, 180), "wheel", digits=0)
+ALBEDO = ColorKey(0, 1, "", (0, 0.25, 0.5, 0.75, 1))
+ROUGHNESS = ColorKey(0, 1, "", (0, 0.25, 0.5, 0.75, 1))
+F0 = ColorKey(0, 0.16, "", (0, 0.04, 0.08, 0.12, 0.16), digits=3)
+ERROR = ColorKey(0, 30, "°", (0, 1, 3, 10, 20, 30), "inferno", power=2, digits=1)  # 3° at a third of the bar
+DIFFERENCE = ColorKey(-20, 20, " %", (-20, -10, 0, 10, 20), "balance", digits=1)
+SIGMA = ColorKey(0, 0.01, "", (0, 0.0025, 0.005, 0.01), "inferno", digits=4)
 
 
-def depth(values: Floats, metric: bool) -> Key:
-    """From the nearest to the farthest point of the object, in mm where the scale is known."""
+def depth(values: Floats, metric: bool) -> ColorKey:
+    """Key from the nearest to the farthest point of the object, in mm where the scale is known."""
     low, high = (float(edge) for edge in np.percentile(values, [0.5, 99.5])) if values.size else (0.0, 1.0)
     if high - low < 1e-9:
         high = low + 1.0
     ticks = tuple(float(tick) for tick in np.linspace(low, high, 4))
-    return Key(low, high, " mm" if metric else "", ticks, digits=1 if metric else 3)
+    return ColorKey(low, high, " mm" if metric else "", ticks, digits=1 if metric else 3)

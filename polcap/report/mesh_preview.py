@@ -1,19 +1,23 @@
-"""In: a mesh. Out: one light enough for a page: few vertices, 16-bit positions and texture coordinates, packed."""
+"""Mesh preview of the report page: few vertices, stored with 16 bits and compressed."""
 
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array, csgraph
 
 from polcap.formats import html
 from polcap.images import Floats, Mesh
 
-_MOST_VERTICES = 60_000  # 0.7 MB of a page; three per pixel of a 640 px view that the surface fills
+_MOST_VERTICES = 60_000  # 0.7 MB of the page
 _STEPS = 65535
 
 
 def packed(mesh: Mesh) -> dict[str, Any]:
-    """Positions (V, 3) in 1/65535 of their box, texture coordinates (V, 2) likewise, faces as differences."""
+    """Base64 texts of positions (V, 3), texture coordinates (V, 2) and differences between face indices.
+
+    Positions are shares of the box `low`, `extent`; a share of 1 is stored as 65535.
+    """
     vertices, uv, faces = thinned(mesh, _MOST_VERTICES)
     low = vertices.min(axis=0)
     extent = np.maximum(vertices.max(axis=0) - low, 1e-9)
@@ -28,27 +32,25 @@ def packed(mesh: Mesh) -> dict[str, Any]:
 
 
 def thinned(mesh: Mesh, most: int) -> tuple[Floats, Floats, NDArray[np.int32]]:
-    """Vertices (V, 3), texture coordinates (V, 2) and faces (F, 3) of about `most` vertices or fewer.
+    """Vertices (V, 3), texture coordinates (V, 2) and faces (F, 3), reduced to about `most` vertices.
 
-    Vertices that lie in one cell of a grid over the texture and hang together there become their mean: two
-    surfaces, one before the other, stay two.
+    Connected vertices in the same cell of a grid over the texture are replaced by their mean. Two surfaces that
+    overlap in the picture are not connected, so they stay separate.
     """
-    from scipy.sparse import coo_array, csgraph  # here: importing it costs .3 s of every start
-
     count = len(mesh.vertices)
     if count <= most:
         return mesh.vertices, mesh.uv, mesh.faces
-    side = float(np.sqrt(_covered(mesh.uv) / most))  # of a cell, in texture coordinates
+    side = float(np.sqrt(_covered(mesh.uv) / most))  # of a cell [texture coordinates]
     column, row = np.floor(mesh.uv / side).astype(np.int64).T
     cell = row * (int(1 / side) + 2) + column
     edges = np.concatenate([mesh.faces[:, pair] for pair in ((0, 1), (1, 2), (2, 0))])
     edges = edges[cell[edges[:, 0]] == cell[edges[:, 1]]]
     links = coo_array((np.ones(len(edges), np.int8), edges.T), shape=(count, count))
-    kept, label = csgraph.connected_components(links, directed=False)
-    share = 1 / np.bincount(label, minlength=kept)
+    groups, label = csgraph.connected_components(links, directed=False)
+    share = 1 / np.bincount(label, minlength=groups)
 
     def mean(values: Floats) -> Floats:
-        return np.stack([np.bincount(label, column, kept) * share for column in values.T], axis=-1)
+        return np.stack([np.bincount(label, column, groups) * share for column in values.T], axis=-1)
 
     faces = label[mesh.faces]
     whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
@@ -56,7 +58,7 @@ def thinned(mesh: Mesh, most: int) -> tuple[Floats, Floats, NDArray[np.int32]]:
 
 
 def _covered(uv: Floats) -> float:
-    """Share of the texture's square that has vertices, on a grid of 64 cells a side."""
+    """Share of the texture that has vertices, counted in 64 × 64 cells."""
     cells = np.unique(np.floor(np.clip(uv, 0, 1 - 1e-6) * 64).astype(int) @ [64, 1])
     return len(cells) / 64**2
 

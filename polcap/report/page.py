@@ -1,4 +1,4 @@
-"""In: a report's figures and the results of its run. Out: report.html, the page that people look at."""
+"""report.html: verdict, interactive pictures, maps, plots and tables of one result."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
@@ -10,29 +10,29 @@ from numpy.typing import NDArray
 
 from polcap.formats import html, shipped_data
 from polcap.optics.color import srgb_eight_bits
-from polcap.report import keys, labels, map_figures, mesh_preview, plots, shown
+from polcap.report import keys, labels, map_figures, mesh_preview, page_data, plots
 from polcap.report import stage_pictures as pictures
 from polcap.report.keys import Palette
 from polcap.results import Results
 
-_LONGEST = 1024  # px of a map on the page
-_WIDEST = 1000  # px of a picture of what was photographed
+_LONGEST = 1024  # px, longest side of a map
+_WIDEST = 1000  # px, of a photograph
 _HEADLINE = {
     "pass": "Good to use",
-    "warn": "Good to use, with an assumption to check",
-    "fail": "Look before you use this",
+    "warn": "Good to use, but check an assumption",
+    "fail": "Check the result before you use it",
 }
 
 
 def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
-    """report.html in a result folder.
+    """Write report.html into a result folder.
 
     Raises
     ------
     StorageError
         The file cannot be written.
     """
-    drawn = _of_maps(about, results)
+    drawn = _maps(about, results)
     body = [
         *_verdict(about),
         drawn["relit"],
@@ -50,16 +50,16 @@ def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
     html.write(folder / "report.html", f"{about['capture']['name']}: polcap report", body, data)
 
 
-def _of_maps(about: Mapping[str, Any], results: Results) -> dict[str, Any]:
-    """What the page shows of the maps, and how its viewer looks at them."""
+def _maps(about: Mapping[str, Any], results: Results) -> dict[str, Any]:
+    """Sections drawn from the maps, and the camera of the interactive pictures."""
     radiance, maps, mesh = results.radiance, results.maps, results.mesh
-    small = shown.reduce(maps, mesh, results.cues, radiance.angle, _LONGEST)
+    small = page_data.reduce(maps, mesh, results.cues, radiance.angle, _LONGEST)
     ior = float(about["settings"]["infer"]["ior"])
-    again = shown.rerender(small, ior)
-    bright = shown.exposure(small)
+    again = page_data.rerender(small, ior)
+    bright = page_data.exposure(small)
     size = small.maps.mask.shape[1::-1]
-    taken = shown.photograph(radiance, results.color, small.maps.view, size)
-    relit = _relit(srgb_eight_bits(bright * taken), srgb_eight_bits(bright * again.scale * again.flashed))
+    photograph = page_data.photograph(radiance, results.color, small.maps.view, size)
+    relit = _relit(srgb_eight_bits(bright * photograph), srgb_eight_bits(bright * again.scale * again.flashed))
     return {
         "relit": "".join(relit),
         "maps": "".join([*map_figures.maps(small, mesh.metric), *map_figures.rerendered(small, again, about)]),
@@ -77,7 +77,7 @@ def _of_maps(about: Mapping[str, Any], results: Results) -> dict[str, Any]:
 
 
 def verdict(about: Mapping[str, Any]) -> tuple[str, str]:
-    """One sentence on a result, and one on how good it is."""
+    """Headline of a result, and a sentence about the expected error of its normals."""
     gates = about["gates"]
     failed = [gate for gate in gates if gate["state"] == "fail"]
     headline = _HEADLINE[about["verdict"]]
@@ -86,7 +86,7 @@ def verdict(about: Mapping[str, Any]) -> tuple[str, str]:
     judged = [gate for gate in gates if gate["name"] == "normal error" and gate["value"] is not None]
     if not judged:  # the shots are out of order, or there is no object
         return headline, ""
-    within = f"Half of the normals are expected within {_gate_value(judged[0], 'value')} of the surface's"
+    within = f"The expected error of half of the normals is below {_gate_value(judged[0], 'value')}"
     because = judged[0]["says"].partition(", mostly due to: ")[2]
     return headline, f"{within}; mostly due to these checks: {because}." if because else f"{within}."
 
@@ -106,17 +106,17 @@ def _verdict(about: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _advice(gate: Mapping[str, Any]) -> str:
-    """A gate that did not pass: its value and limit, what it means, what to do."""
+    """A gate that did not pass: value, limit, finding and remedy."""
     value, limit = escape(_gate_value(gate, "value")), ""
     if gate["limit"] is not None:
         limit = f" (limit {escape(_gate_value(gate, 'limit'))})"
-    cost = f" It costs about {_cost(gate)}." if _cost(gate) else ""
-    says = f"{escape(gate['says'])}.{cost}{_remedy(gate)}"
-    return f"<b>{escape(gate['name'].capitalize())}</b> {value}{limit}: {says}"
+    cost = f" This adds about {_cost(gate)} to the error of the normals." if _cost(gate) else ""
+    finding = f"{escape(gate['says'])}.{cost}{_remedy(gate)}"
+    return f"<b>{escape(gate['name'].capitalize())}</b> {value}{limit}: {finding}"
 
 
 def _cost(gate: Mapping[str, Any]) -> str:
-    """Degrees of normal error that what the gate found costs; nothing under one."""
+    """Normal error that the finding causes; empty below one degree."""
     return f"{gate['cost_deg']:.0f}°" if (gate.get("cost_deg") or 0) >= 1 else ""
 
 
@@ -136,38 +136,39 @@ def _gate_value(gate: Mapping[str, Any], name: str) -> str:
 
 def _relit(photograph: NDArray[np.uint8], flashed: NDArray[np.uint8]) -> Iterator[str]:
     yield (
-        '<h2>Photograph and relit</h2><p class="hint">Move the pointer over the right picture, or use the arrow keys: '
-        "the light comes from there. At first it is the photograph's flash, and the two should look alike.</p>"
+        '<h2>Photograph and relit object</h2><p class="hint">Move the pointer over the right picture, or use the arrow '
+        "keys, to move the light. At first the light is the photograph's flash, so both pictures should agree.</p>"
         f'<div class="pair"><figure><div class="picture"><img alt="The reference photograph" '
         f'src="{html.jpeg(photograph)}"></div><figcaption><b>Photograph</b> <span>first angle, calibrated colors</span>'
         '</figcaption></figure><figure><div class="picture" id="relit"><img alt="The maps under the flash" '
-        f'src="{html.jpeg(flashed)}"><canvas id="relight" tabindex="0" aria-label="The maps under a light that the '
-        'pointer moves"></canvas></div><figcaption><b>Relit</b> <span>from the maps alone</span></figcaption></figure>'
-        '</div><p class="note needs-gl" hidden>This browser draws no WebGL: the picture shows the maps under the flash.'
+        f'src="{html.jpeg(flashed)}"><canvas id="relight" tabindex="0" aria-label="The maps under a light that '
+        'the pointer moves"></canvas></div><figcaption><b>Relit</b> <span>rendered from the maps</span></figcaption>'
+        '</figure></div><p class="note needs-gl" hidden>This '
+        "browser has no WebGL: the picture shows the maps under the flash only."
         "</p>"
     )
 
 
 def _solid(metric: bool, about: Mapping[str, Any]) -> Iterator[str]:
     asset = f"asset/{about['capture']['name']}.glb"
-    scale = "Lengths are metres." if metric else "Lengths are relative: nothing told the scale."
+    scale = "Lengths are in metres." if metric else "Lengths are relative, because the scale is unknown."
     modes = ("Material", "Clay", "Normals")
     buttons = "".join(
         f'<button data-mode="{mode}" aria-pressed="{str(mode == 0).lower()}">{name}</button>'
         for mode, name in enumerate(modes)
     )
     yield (
-        '<section class="needs-pointer"><h2>The surface</h2><p class="hint">Drag to turn it, wheel or two fingers to '
-        f'come nearer. What the camera did not see is not there. {scale} The whole mesh: <a href="{escape(asset)}">'
+        '<section class="needs-pointer"><h2>The surface</h2><p class="hint">Drag to turn it; use the wheel or two '
+        f'fingers to zoom. Parts that the camera did not see are missing. {scale} Full mesh: <a href="{escape(asset)}">'
         f'{escape(asset)}</a>.</p><div class="buttons">{buttons}</div><div class="picture">'
         '<canvas id="solid" tabindex="0" aria-label="The surface in three dimensions"></canvas></div></section>'
     )
 
 
 def _chart(about: Mapping[str, Any], results: Results) -> str:
-    """The chart as photographed beside the maker's colors; nothing where none was read."""
+    """Plot of the measured and the maker's chart colors; empty without a chart."""
     color = results.color
-    measured = shown.patches(results.radiance, color)
+    measured = page_data.patches(results.radiance, color)
     if measured is None or color.patches is None:
         return ""
     known = shipped_data.colorchecker(about["settings"]["whitebalance"]["chart"])
@@ -177,53 +178,53 @@ def _chart(about: Mapping[str, Any], results: Results) -> str:
     )
     figures = about["figures"]["chart"]
     mean, ahead = labels.number(figures["delta_e_mean"], 2), figures["predicted_mean"]
-    says = f"outside the maker's colors, inside as photographed; below ΔE2000, mean {mean}"
-    says += "" if ahead is None else f", {labels.number(ahead, 2)} where the patch itself is left out of the fit"
-    return _drawn("Chart", says, drawing)
+    note = f"outside: the maker's color; inside: the photographed color; below: ΔE2000, mean {mean}"
+    note += "" if ahead is None else f" ({labels.number(ahead, 2)} when each patch is left out of the fit)"
+    return _plot("Chart", note, drawing)
 
 
 def _measured(results: Results, about: Mapping[str, Any], angles: Sequence[float], chart: str) -> Iterator[str]:
-    """Plots of what was measured; `angles` in degrees, `chart` drawn."""
+    """Section of plots; `angles` in degrees, `chart` as HTML."""
     gains, moved = results.selfcal.gains, results.alignment
     yield "<h2>How it was measured</h2><div class='grid'>" + chart
     merge = about["figures"]["merge"]
-    yield _drawn(
+    yield _plot(
         "Exposures",
-        "measured in the pixels (dots) and as the camera states them (rings)",
+        "measured in the pixels (dots) and stated by the camera (rings)",
         plots.exposures(merge["exposure_ratio"], merge["exif_ratio"], angles),
     )
-    yield _drawn(
+    yield _plot(
         "Light of the shots",
-        f"against the first; from the {gains.source}, crosses from the object's facing pixels",
+        f"relative to the first; dots: from {gains.source}; crosses: from pixels that face the camera",
         plots.gains(gains.gain, gains.sigma, gains.anchor, angles),
     )
-    yield _drawn(
+    yield _plot(
         "Shift of the shots",
-        "of the merged picture, against the first; the circle is 1σ",
+        "relative to the first, in pixels of the merged picture; circles are 1σ",
         plots.shifts(moved.transform, moved.residual_px, angles),
     )
     if about.get("timings"):
-        yield _drawn("Time", "of each stage, when it was computed", plots.timings(about["timings"]))
+        yield _plot("Time", "computing time of each stage", plots.timings(about["timings"]))
     yield "</div>"
 
 
-def _drawn(title: str, says: str, drawing: str) -> str:
-    return f"<figure>{drawing}<figcaption><b>{escape(title)}</b><br><span>{escape(says)}</span></figcaption></figure>"
+def _plot(title: str, note: str, drawing: str) -> str:
+    return f"<figure>{drawing}<figcaption><b>{escape(title)}</b><br><span>{escape(note)}</span></figcaption></figure>"
 
 
 def _pictures(results: Results) -> str:
     radiance, color = results.radiance, results.color
     notable: Sequence[tuple[str, str, NDArray[np.uint8]]] = (
-        ("Reference shot", "the chart as it was read", pictures.chart(radiance, color, _WIDEST)),
-        ("Object", "what was taken for it", pictures.outline(radiance, color, results.object_, _WIDEST)),
+        ("Reference shot", "with the detected chart", pictures.chart(radiance, color, _WIDEST)),
+        ("Object", "darkened outside its outline", pictures.outline(radiance, color, results.object_, _WIDEST)),
         *((tile.caption, tile.note, tile.picture) for tile in pictures.registered(radiance, results.alignment)),
     )
     figures = "".join(
         f'<figure><div class="picture"><img alt="{title}" src="{html.jpeg(pictures.shrink(picture, _WIDEST))}"></div>'
-        f"<figcaption><b>{title}</b><br><span>{says}</span></figcaption></figure>"
-        for title, says, picture in notable
+        f"<figcaption><b>{title}</b><br><span>{note}</span></figcaption></figure>"
+        for title, note, picture in notable
     )
-    return f'<h2>What polcap saw</h2><div class="grid">{figures}</div>'
+    return f'<h2>Photographs as polcap read them</h2><div class="grid">{figures}</div>'
 
 
 def _tables(about: Mapping[str, Any]) -> Iterator[str]:
@@ -235,7 +236,7 @@ def _tables(about: Mapping[str, Any]) -> Iterator[str]:
         ]
         table = html.table(("", ""), rows)
         yield f'<div><h3>{escape(labels.part(part))}</h3><div class="scroll figures">{table}</div></div>'
-    yield "</div><h2>Photographs</h2>" + _shots(about["capture"])
+    yield "</div><h2>Photograph files</h2>" + _shots(about["capture"])
     notes = about["capture"]["notes"]
     if notes:
         yield f"<ul>{''.join(f'<li>{escape(note)}</li>' for note in notes)}</ul>"
@@ -245,11 +246,11 @@ def _tables(about: Mapping[str, Any]) -> Iterator[str]:
         for name, value in values.items()
     )
     yield f"<details><summary>Settings of this run</summary>{html.table(('setting', 'value'), settings)}</details>"
-    yield f"<p class='soft'>polcap {escape(str(about['polcap']))}. The same figures for programs: report.json.</p>"
+    yield f"<p class='soft'>polcap {escape(str(about['polcap']))}. report.json holds the same figures for programs.</p>"
 
 
 def gates(judged: Sequence[Mapping[str, Any]]) -> str:
-    """The checks as a table, the failed first."""
+    """Table of the checks, failed ones first."""
     order = {"fail": 0, "warn": 1, "pass": 2, "not measured": 3}
     rows = "".join(
         f"<tr><td>{escape(gate['name'].capitalize())}</td>"
@@ -258,7 +259,7 @@ def gates(judged: Sequence[Mapping[str, Any]]) -> str:
         f"<td>{_cost(gate)}</td><td>{escape(gate['says'])}.{_remedy(gate)}</td></tr>"
         for gate in sorted(judged, key=lambda gate: order.get(gate["state"], 4))
     )
-    head = "<tr><th>Check</th><th></th><th>Value</th><th>Limit</th><th>Cost</th><th>Finding</th></tr>"
+    head = "<tr><th>Check</th><th></th><th>Value</th><th>Limit</th><th>Error</th><th>Finding</th></tr>"
     return f'<div class="scroll"><table class="checks">{head}{rows}</table></div>'
 
 

@@ -1,4 +1,4 @@
-"""In: figures. Out: small drawings of them as SVG, in the colors of the page's theme."""
+"""Plots of the report as SVG drawings, in the colors of the page's theme."""
 
 from collections.abc import Sequence
 from html import escape
@@ -21,7 +21,7 @@ def svg(width: float, height: float, parts: Sequence[str], title: str) -> str:
 
 
 def hexed(color: NDArray[np.uint8]) -> str:
-    """8-bit sRGB as CSS has it."""
+    """8-bit sRGB as a CSS color."""
     return "#" + bytes(color.astype(np.uint8)).hex()
 
 
@@ -30,7 +30,7 @@ def _text(x: float, y: float, words: str, anchor: str = "start", style: str = ""
 
 
 def chart(reference: NDArray[np.uint8], measured: NDArray[np.uint8], delta_e: Floats, names: Sequence[str]) -> str:
-    """24 patches, outside as its maker measured it, inside as photographed; below each its ΔE."""
+    """24 patches: the maker's color outside, the photographed color inside, ΔE below."""
     cell = 76
     parts: list[str] = []
     for index in range(24):
@@ -38,17 +38,17 @@ def chart(reference: NDArray[np.uint8], measured: NDArray[np.uint8], delta_e: Fl
         x, y = column * cell + 4, row * (cell + 14) + 4
         outer, inner = hexed(reference[index]), hexed(measured[index])
         error = float(delta_e[index])
-        says = f"{names[index]}: " + ("left out" if np.isnan(error) else f"ΔE {error:.2f}")
+        label = f"{names[index]}: " + ("left out" if np.isnan(error) else f"ΔE {error:.2f}")
         parts.append(
-            f'<g><title>{escape(says)}</title><rect x="{x}" y="{y}" width="{cell - 8}" height="{cell - 8}" rx="4" '
+            f'<g><title>{escape(label)}</title><rect x="{x}" y="{y}" width="{cell - 8}" height="{cell - 8}" rx="4" '
             f'fill="{outer}"/><rect x="{x + 16}" y="{y + 16}" width="{cell - 40}" height="{cell - 40}" fill="{inner}"/>'
             "</g>" + _text(x + cell / 2 - 4, y + cell + 4, "left out" if np.isnan(error) else f"{error:.1f}", "middle")
         )
-    return svg(6 * cell, 4 * (cell + 14) + 6, parts, "Chart: measured inside, reference outside, residual ΔE2000 below")
+    return svg(6 * cell, 4 * (cell + 14) + 6, parts, "Chart: measured color inside, reference outside, ΔE2000 below")
 
 
 def exposures(measured: list[list[float]], stated: list[list[float | None]], angles: Sequence[float]) -> str:
-    """Each frame's light on a scale of stops: measured in the pixels (filled), stated by the camera (ring)."""
+    """Exposure of each frame in stops: measured in the pixels (dot) and stated by the camera (ring)."""
     known: list[float] = [value for rows in (measured, stated) for row in rows for value in row if value]
     low, high = np.floor(np.log2(min(known)) - 0.3), np.ceil(np.log2(max(known)) + 0.3)
     left, width, step = 56, 440, 34
@@ -65,12 +65,12 @@ def exposures(measured: list[list[float]], stated: list[list[float | None]], ang
         y = 22 + step * row
         parts.append(_text(0, y + 4, f"{angle:g}°"))
         for frame, value in enumerate(measured[row]):
-            said = stated[row][frame] if row < len(stated) and frame < len(stated[row]) else None
-            if said:
-                parts.append(f'<circle cx="{at(said):.1f}" cy="{y}" r="9" fill="none" stroke="currentColor"/>')
+            claim = stated[row][frame] if row < len(stated) and frame < len(stated[row]) else None
+            if claim:
+                parts.append(f'<circle cx="{at(claim):.1f}" cy="{y}" r="9" fill="none" stroke="currentColor"/>')
             if value:
                 title = f"{angle:g}°, frame {frame + 1}: {number(value)} ×" + (
-                    f", stated {number(said)}" if said else ""
+                    f", stated {number(claim)}" if claim else ""
                 )
                 parts.append(
                     f'<circle cx="{at(value):.1f}" cy="{y}" r="5" fill="{CHANNELS[2]}"><title>{title}</title></circle>'
@@ -80,7 +80,7 @@ def exposures(measured: list[list[float]], stated: list[list[float | None]], ang
 
 
 def gains(gain: Floats, sigma: Floats, anchor: Floats, angles: Sequence[float]) -> str:
-    """Light of each shot against the first's, per channel with 1σ; crosses: from the object's facing pixels."""
+    """Light of each shot relative to the first, per channel with 1σ; crosses: from pixels that face the camera."""
     far = np.concatenate([(gain - 1).ravel(), np.nan_to_num(anchor - 1).ravel()])
     span = max(0.005, 1.15 * float(np.abs(far).max()))
     left, width, step, parts = 56, 440, 46, []
@@ -107,11 +107,11 @@ def gains(gain: Floats, sigma: Floats, anchor: Floats, angles: Sequence[float]) 
             if np.isfinite(anchor[row, channel]):
                 cross = at(float(anchor[row, channel]))
                 parts.append(f'<path d="M{cross - 4:.1f} {y - 4}l8 8m0 -8l-8 8" stroke="{paint}" stroke-width="1.5"/>')
-    return svg(width, bottom + 24, parts, "Light of each shot against the first's")
+    return svg(width, bottom + 24, parts, "Light of each shot relative to the first")
 
 
 def shifts(transform: Floats, residual_px: Floats, angles: Sequence[float]) -> str:
-    """Where each shot's picture lies against the first's: an arrow per shot, its 1σ as a circle."""
+    """Shift of each shot relative to the first: a line per shot, its 1σ as a circle."""
     moved = transform[:, :2, 2]
     span = max(0.5, 1.2 * float(np.abs(moved).max() + residual_px.max()))
     side, parts = 240, []
@@ -138,7 +138,7 @@ def shifts(transform: Floats, residual_px: Floats, angles: Sequence[float]) -> s
 
 
 def timings(seconds: dict[str, float]) -> str:
-    """A bar per stage."""
+    """Computing time: one bar per stage."""
     if not seconds:
         return ""
     most, step, left, width, parts = max(max(seconds.values()), 1e-3), 22, 110, 440, []
@@ -153,7 +153,7 @@ def timings(seconds: dict[str, float]) -> str:
 
 
 def wheel() -> str:
-    """The angles of linear polarization on their wheel: once around the colors in half a turn."""
+    """Color wheel of the angle of linear polarization; 180° run once through all hues."""
     paint, middle, parts = keys.colors("wheel"), 60, []
     for step in range(72):
         turn = np.radians([5 * step, 5 * step + 5.3])
@@ -167,7 +167,7 @@ def wheel() -> str:
 
 
 def ball() -> NDArray[np.uint8]:
-    """A ball in the colors of the normals, (96, 96, 4), transparent around it."""
+    """Ball colored by its normals, (96, 96, 4), on a transparent background."""
     side = 96
     y, x = np.mgrid[1 : -1 : side * 1j, -1 : 1 : side * 1j]
     z2 = 1 - x * x - y * y

@@ -1,4 +1,4 @@
-"""In: pictures with captions and keys. Out: one sheet of them."""
+"""Sheets: several captioned pictures with their color keys in one picture."""
 
 from dataclasses import dataclass
 
@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.report import keys
-from polcap.report.keys import Key
+from polcap.optics.resize import area_mean
+from polcap.report.keys import ColorKey
 
 Picture = NDArray[np.uint8]
 WIDTH = 640  # px of one tile
@@ -18,16 +18,16 @@ _LETTERS = cv2.FontFace("sans")
 
 @dataclass(frozen=True)
 class Tile:
-    """A picture (h, w, 3), what it shows, and how its colors are read."""
+    """A picture (h, w, 3) with its caption and its color key or a note."""
 
     picture: Picture
     caption: str
-    key: Key | None = None
-    note: str = ""  # in place of a key
+    key: ColorKey | None = None
+    note: str = ""  # shown where there is no key
 
 
 def sheet(tiles: list[Tile]) -> Picture:
-    """Tiles three in a row, each under its caption and above its key."""
+    """Tiles three in a row, each with its caption above and its key below."""
     framed = [_framed(tile) for tile in tiles]
     columns = min(3, len(framed))
     rows = []
@@ -46,17 +46,19 @@ def sheet(tiles: list[Tile]) -> Picture:
 
 
 def write(picture: Picture, words: str, at: tuple[int, int], paint: tuple[int, int, int], size: int = 20) -> None:
-    """Words on a picture, their baseline's left end at (x, y)."""
+    """Write words on a picture; (x, y) is the left end of the baseline."""
     cv2.putText(picture, words, at, paint, _LETTERS, size, 400)
 
 
 def _framed(tile: Tile) -> Picture:
     height = max(1, round(tile.picture.shape[0] * WIDTH / tile.picture.shape[1]))
-    way = cv2.INTER_AREA if tile.picture.shape[1] > WIDTH else cv2.INTER_NEAREST
     head = np.full((_HEAD, WIDTH, 3), _GROUND, np.uint8)
     write(head, tile.caption, (2, 30), _INK, 22)
-    shown = cv2.resize(tile.picture, (WIDTH, height), interpolation=way)
-    return np.vstack([head, shown, _foot(tile)])
+    if tile.picture.shape[1] > WIDTH:
+        scaled = area_mean(tile.picture, (height, WIDTH))
+    else:
+        scaled = np.asarray(cv2.resize(tile.picture, (WIDTH, height), interpolation=cv2.INTER_NEAREST))
+    return np.vstack([head, scaled, _foot(tile)])
 
 
 def _foot(tile: Tile) -> Picture:
@@ -68,7 +70,7 @@ def _foot(tile: Tile) -> Picture:
     foot[8:20] = tile.key.bar(WIDTH, 12)
     last = len(tile.key.ticks) - 1
     for number, tick in enumerate(tile.key.ticks):
-        words = keys.plain(tick) + tile.key.unit
+        words = f"{tick:.3g}{tile.key.unit}"
         wide = cv2.getTextSize((WIDTH, 60), words, (0, 0), _LETTERS, 17, 400)[2]
         place = round(tile.key.place(tick) * (WIDTH - 1))
         left = place - (0 if number == 0 else wide if number == last else wide // 2)

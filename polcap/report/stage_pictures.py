@@ -1,7 +1,7 @@
-"""In: a value of images.py. Out: a picture of it, (H, W, 3) uint8 sRGB, for a person to judge.
+"""Pictures of each stage's result, (H, W, 3) uint8 sRGB, for people to check.
 
-Colour codes, the same everywhere (`keys.py`): normals n·½+½ (x right red, y up green); AoLP as hue, 0° red, a
-turn of 180° once around the wheel; DoLP, depth and errors from dark (small) to bright (large).
+Color codes (`keys.py`): normals as n·½+½ (x right is red, y up is green); AoLP as hue, 0° is red and 180° run once
+around the wheel; DoLP, depth and errors from dark (small) to bright (large).
 """
 
 from collections.abc import Callable
@@ -26,19 +26,19 @@ from polcap.images import (
     SurfaceMaps,
 )
 from polcap.optics import color, frames
+from polcap.optics.resize import area_mean
 from polcap.optics.warp import warp
 from polcap.report import keys
 from polcap.report.sheets import WIDTH, Tile, sheet, write
 from polcap.report.sheets import Picture as Picture
-from polcap.report.smaller import area
 from polcap.results import Results
 
-_AGREE = "first shot magenta, this one green: grey where they agree"
+_AGREE = "first shot magenta, this shot green: gray where both agree"
 _DIRECTIONS = "red right, green up, blue toward the camera"
 
 
 def of_stage(results: Results, stage: str) -> Picture:
-    """What a stage made, for a person to look at."""
+    """Picture of the result of a stage."""
     paint: dict[str, Callable[[], Picture]] = {
         "hdr": lambda: merged(results.radiance),
         "whitebalance": lambda: chart(results.radiance, results.color),
@@ -55,14 +55,14 @@ def of_stage(results: Results, stage: str) -> Picture:
 
 
 def reference(radiance: AngleStack, color: ColorCalibration, widest: int | None = None) -> Picture:
-    """The reference shot in the calibrated colours, brightest parts just below white; averaged down to `widest` px."""
+    """The reference shot in calibrated colors, at most `widest` px wide."""
     first = radiance.value[0]
-    shown = np.asarray(first, np.float32) if widest is None else area(first, _no_wider(first, widest))
-    return display(cv2.transform(shown, 2 * color.matrix.astype(np.float32)))
+    reduced = np.asarray(first if widest is None else _narrow(first, widest), np.float32)
+    return display(cv2.transform(reduced, 2 * color.matrix.astype(np.float32)))
 
 
 def merged(radiance: AngleStack) -> Picture:
-    """Every shot; clipped pixels red, ghosts magenta."""
+    """Every merged shot; clipped pixels red, moved pixels magenta."""
     top = _top(radiance.value[0])
     tiles = []
     for value, quality, angle in zip(radiance.value, radiance.quality, np.degrees(radiance.angle), strict=True):
@@ -74,7 +74,7 @@ def merged(radiance: AngleStack) -> Picture:
 
 
 def chart(radiance: AngleStack, color: ColorCalibration, widest: int | None = None) -> Picture:
-    """The reference shot with the chart's patches as they were read."""
+    """The reference shot with the detected chart patches."""
     picture = reference(radiance, color, widest)
     times = max(1, round(2 * WIDTH / picture.shape[1]))
     picture = np.asarray(np.repeat(np.repeat(picture, times, 0), times, 1), np.uint8)
@@ -89,25 +89,24 @@ def chart(radiance: AngleStack, color: ColorCalibration, widest: int | None = No
 
 
 def registered(radiance: AngleStack, found: Alignment) -> list[Tile]:
-    """Brightness of each shot after registration (green) over the reference (magenta): grey where they agree."""
-    size = _no_wider(radiance.value[0], 2 * WIDTH)
-    zoom = np.diag([*np.divide(size, radiance.value.shape[2:0:-1]), 1.0])
-    zoom[:2, 2] = (zoom.diagonal()[:2] - 1) / 2  # pixel centres stand on whole numbers
-    first = _grey(area(radiance.value[0], size))
+    """Each registered shot (green) over the reference (magenta): gray where both agree."""
+    first = _gray(_narrow(radiance.value[0], 2 * WIDTH))
+    zoom = np.diag([*np.divide(first.shape[::-1], radiance.value.shape[2:0:-1]), 1.0])
+    zoom[:2, 2] = (zoom.diagonal()[:2] - 1) / 2  # pixel centers are whole numbers
     tiles = []
     shots = zip(radiance.value, found.transform, found.residual_px, np.degrees(radiance.angle), strict=True)
     for value, transform, residual, angle in list(shots)[1:]:
-        on_first = warp(_grey(area(value, size)), zoom @ transform @ np.linalg.inv(zoom), order=1)
+        on_first = warp(_gray(_narrow(value, 2 * WIDTH)), zoom @ transform @ np.linalg.inv(zoom), order=1)
         moved = display(np.stack([first, on_first, first], -1), _top(first))
         x, y = transform[:2, 2]
-        tiles.append(Tile(moved, f"{angle:g}° on the first: {x:+.2f}, {y:+.2f} px ± {residual:.3f}", note=_AGREE))
+        tiles.append(Tile(moved, f"{angle:g}° shot moved by {x:+.2f}, {y:+.2f} ± {residual:.3f} px", note=_AGREE))
     return tiles
 
 
 def outline(radiance: AngleStack, color: ColorCalibration, object_: ObjectMask, widest: int | None = None) -> Picture:
-    """The reference shot, darkened outside the mask, with the crop's box."""
+    """The reference shot, darkened outside the mask, with the box of the crop."""
     picture = reference(radiance, color, widest)
-    outside = area(object_.mask.astype(np.float32), picture.shape[1::-1]) < 0.5
+    outside = area_mean(object_.mask, picture.shape) < 0.5
     picture[outside] = picture[outside] // 3
     x0, y0, x1, y1 = (round(edge * picture.shape[1] / radiance.value.shape[2]) for edge in object_.crop)
     cv2.rectangle(picture, (x0, y0), (x1 - 1, y1 - 1), (255, 255, 0), 2)
@@ -115,7 +114,7 @@ def outline(radiance: AngleStack, color: ColorCalibration, object_: ObjectMask, 
 
 
 def gains(found: Gains, angle: Floats) -> Picture:
-    """Gains of the shots with their 1σ; crosses are the cross-check."""
+    """Gains of the shots with 1σ; crosses are the gains from pixels that face the camera."""
     height, left = 60 * len(found.gain) + 40, 120
     picture = np.full((height, WIDTH, 3), 255, np.uint8)
     span = max(0.02, 1.2 * float(np.abs(np.stack([found.gain, found.anchor]) - 1).max()))
@@ -133,7 +132,8 @@ def gains(found: Gains, angle: Floats) -> Picture:
             cv2.circle(picture, (column(gain), row), 4, paint, -1)
             anchor = (column(float(found.anchor[shot, channel])), row)
             cv2.drawMarker(picture, anchor, paint, cv2.MARKER_CROSS, 10, 1)
-    write(picture, f"1 ± {span:.3f}, from {found.source}; crosses: facing pixels", (left, height - 10), (0, 0, 0), 17)
+    note = f"1 ± {span:.3f}, from {found.source}; crosses: pixels facing the camera"
+    write(picture, note, (left, height - 10), (0, 0, 0), 17)
     return picture
 
 
@@ -154,17 +154,18 @@ def stokes(image: StokesImage) -> Picture:
 
 
 def cues(found: Cues) -> Picture:
-    """What the estimators see: DoLP, AoLP, the paper's normalised Stokes map and diffuse colour."""
+    """Inputs of the estimators: S0, DoLP, AoLP, normalized Stokes parameters, diffuse color and noise."""
     cos, sin = found.normalized_stokes
     turn = np.degrees(np.arctan2(sin, cos) / 2) % 180
-    normalized = _eight(np.stack([np.full_like(cos, 0.5), cos / 2 + 0.5, sin / 2 + 0.5], -1) * found.mask[..., None])
+    inside = found.mask[..., None]
+    normalized = _eight_bits(np.stack([np.full_like(cos, 0.5), cos / 2 + 0.5, sin / 2 + 0.5], -1) * inside)
     return sheet(
         [
             Tile(display(found.radiance), "S0", note="calibrated colors, brightest parts white"),
             Tile(keys.DOLP.picture(found.dolp, found.mask), "Degree of linear polarization", keys.DOLP),
             Tile(keys.AOLP.picture(turn, found.mask), "Angle of linear polarization", keys.AOLP),
-            Tile(normalized, "Normalised Stokes map", note="green S1, blue S2: 0.5 is none"),
-            Tile(display(found.diffuse_color * found.mask[..., None], 1.0), "Diffuse color", note="of unit length"),
+            Tile(normalized, "Normalized Stokes parameters", note="green S1, blue S2: 0.5 is zero"),
+            Tile(display(found.diffuse_color * inside, 1.0), "Diffuse color", note="normalized to unit length"),
             Tile(keys.SIGMA.picture(found.ratio_sigma, found.mask), "Noise of S1/S0 and S2/S0, 1σ", keys.SIGMA),
         ]
     )
@@ -185,24 +186,24 @@ def maps(found: SurfaceMaps) -> Picture:
 
 
 def normal(found: SurfaceMaps) -> Picture:
-    return _eight((found.normal / 2 + 0.5) * found.mask[..., None])
+    return _eight_bits((found.normal / 2 + 0.5) * found.mask[..., None])
 
 
 def surface(mesh: Mesh, found: SurfaceMaps) -> Picture:
-    """The depth map, and the surface it makes under a light from the upper left."""
+    """The depth map, and its shape under a light from the upper left."""
     inside = np.isfinite(mesh.depth)
     factor = 1000.0 if mesh.metric else 1.0
     key = keys.depth(factor * mesh.depth[inside], mesh.metric)
     return sheet(
         [
             Tile(key.picture(factor * mesh.depth, inside), "Depth", key),
-            Tile(shaded(mesh, found), "Shape", note="its depth's own normals under a light from the upper left"),
+            Tile(shaded(mesh, found), "Shape", note="normals of the depth map, under a light from the upper left"),
         ]
     )
 
 
 def shaded(mesh: Mesh, found: SurfaceMaps) -> Picture:
-    """The shape alone: its depth's own normals under one light, no colour of the object."""
+    """The shape without colors: the normals of the depth map under one light."""
     inside = np.isfinite(mesh.depth)
     depth = np.where(inside, mesh.depth, np.nan)
     footprint = np.nanmedian(depth) / found.view.focal if inside.any() else 1.0  # size of a pixel there
@@ -211,16 +212,16 @@ def shaded(mesh: Mesh, found: SurfaceMaps) -> Picture:
     facing = facing / (frames.dot(facing, facing) ** 0.5)[..., None]
     light = np.array([-0.5, 0.6, 0.62])
     shade = np.clip(np.nan_to_num(facing) @ (light / np.linalg.norm(light)), 0, 1)
-    return _eight(np.repeat((0.1 + 0.85 * shade)[..., None], 3, -1) * inside[..., None])
+    return _eight_bits(np.repeat((0.1 + 0.85 * shade)[..., None], 3, -1) * inside[..., None])
 
 
 def asset(built: Asset) -> Picture:
-    """The textures as they stand in the file."""
+    """The textures as stored in the file."""
     tiles = [
         (built.base_color, "Base color", "sRGB"),
         (built.normal, "Normal", "tangent space, +Y"),
         (built.occlusion_roughness_metallic, "Occlusion, roughness, metallic", "red, green, blue"),
-        (built.specular_color, "Specular color", f"of F0 {max(built.specular_factor):.3g} × the index's"),
+        (built.specular_color, "Specular color", f"white is {max(built.specular_factor):.3g} × F0 of the index"),
     ]
     return sheet([Tile(np.array(picture), caption, note=note) for picture, caption, note in tiles])
 
@@ -231,8 +232,8 @@ def display(linear: Floats, top: float | None = None) -> Picture:
 
 
 def scale(value: Floats, low: float, high: float, inside: NDArray[np.bool_]) -> Picture:
-    """A number per pixel as a colour from dark to bright, black outside."""
-    level = _eight((np.nan_to_num(value, nan=low) - low) / max(high - low, 1e-12))
+    """Numbers as colors from dark to bright, black outside."""
+    level = _eight_bits((np.nan_to_num(value, nan=low) - low) / max(high - low, 1e-12))
     picture = cv2.cvtColor(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
     picture[~inside] = 0
     return np.asarray(picture, np.uint8)
@@ -248,23 +249,22 @@ def hue(aolp: Floats, inside: NDArray[np.bool_]) -> Picture:
 
 def shrink(picture: Picture, width: int) -> Picture:
     """A picture no wider than `width`."""
-    size = _no_wider(picture, width)
-    return picture if picture.shape[1] <= width else cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(_narrow(picture, width), np.uint8)
 
 
-def _no_wider(picture: NDArray[Any], width: int) -> tuple[int, int]:
-    """Width and height of a picture (h, w, …) made no wider than that."""
+def _narrow(picture: NDArray[Any], width: int) -> NDArray[Any]:
+    """A picture (H, W, …) averaged down to at most `width` pixels wide."""
     tall, wide = picture.shape[:2]
-    return (wide, tall) if wide <= width else (width, max(1, round(tall * width / wide)))
+    return picture if wide <= width else area_mean(picture, (max(1, round(tall * width / wide)), width))
 
 
 def _top(linear: Floats) -> float:
     return max(float(np.percentile(linear[::4, ::4], 99.5)), 1e-6)
 
 
-def _grey(value: Floats) -> Floats:
+def _gray(value: Floats) -> Floats:
     return np.asarray(frames.total(value) / 3, np.float32)
 
 
-def _eight(value: Any) -> Picture:
+def _eight_bits(value: Any) -> Picture:
     return np.asarray(np.round(np.clip(value, 0, 1) * 255), np.uint8)

@@ -4,7 +4,7 @@ Kept at the vertices and interpolated, so that every shot sees the same light an
 cannot fake polarization. Left out: what facets mirror, and that bounced light arrives a little polarized.
 One of three such simulations, each for its own traffic: this one per vertex for pictures of several samples per
 pixel, `training/light_transport.py` per pixel with facets for the evaluation's single pictures, and
-`training/bounce.py` on ways traced once, for materials that change at every step of training.
+`training/bounced_light.py` on ways traced once, for materials that change at every step of training.
 """
 
 from collections.abc import Callable

@@ -1,11 +1,10 @@
-"""The camera in training: Stokes parameters -> what three imperfect photographs would have measured.
+"""Camera noise and errors in training: Stokes parameters -> measurements by three imperfect photographs.
 
-Each error is drawn per object. Shot noise and read noise of a merged bracket, flash energy that is
-left after self-calibration, polarizer angle errors, misregistration and blur, stray light,
-depolarization, saturation.
+Drawn per object: shot and read noise of a merged bracket, residual errors of flash energy and polarizer angle,
+misregistration, blur, stray light, depolarization, saturation.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import pi
 
 import torch
@@ -17,22 +16,24 @@ ANGLES = (0.0, pi / 4, pi / 2)  # rad
 
 
 @dataclass(frozen=True)
-class Errors:
-    """What befalls the photographs of each object; all (B,) unless said."""
+class CameraErrors:
+    """Errors of the photographs of each object; all (B,) unless noted."""
 
-    full_well: Tensor  # electrons at radiance 1 in the middle exposure, where it saturates
-    bracket: Tensor  # ratio of the longer and of the shorter exposure to the middle one
+    full_well: Tensor  # electrons at radiance 1 in the middle exposure, which saturates there
+    bracket: Tensor  # ratio between neighboring exposures
     read_noise: Tensor  # electrons
     gain: Tensor  # (3, B) factor on each shot
     angle: Tensor  # (3, B) rad
     shift: Tensor  # (3, B, 2) px
     blur: Tensor  # px, 1σ
     depolarization: Tensor  # factor on S1, S2
-    ambient: Tensor  # S0 of stray light on a white surface
-    noise_belief: Tensor  # factor on the variance that the solver believes in
+    ambient: Tensor  # S0 of a white surface in the stray light
+    noise_belief: Tensor  # factor on the variance that the cues get
 
     @staticmethod
-    def draw(count: int, device: torch.device) -> "Errors":
+    def draw(count: int, device: torch.device) -> "CameraErrors":
+        """Random errors for training."""
+
         def u(low: float, high: float, *shape: int) -> Tensor:
             return low + (high - low) * torch.rand(*shape, count, device=device)
 
@@ -43,7 +44,7 @@ class Errors:
         turn = torch.randn(3, count, device=device) * 0.5 + torch.randn(count, device=device) * 0.3
         moved = u(0, 0.1) * sometimes(0.7) * torch.randn(2, 3, count, device=device)
         moved[:, 0] = 0.0
-        return Errors(
+        return CameraErrors(
             full_well=torch.exp(u(9.2, 11.0)),
             bracket=u(1, 5),
             read_noise=u(2, 8),
@@ -57,22 +58,20 @@ class Errors:
         )
 
     @staticmethod
-    def none(count: int, device: torch.device) -> "Errors":
+    def none(count: int, device: torch.device) -> "CameraErrors":
+        """No errors but a trace of shot noise."""
         one, zero = torch.ones(count, device=device), torch.zeros(count, device=device)
         three = torch.zeros(3, count, device=device)
-        return Errors(
+        return CameraErrors(
             1e9 * one, 1e3 * one, zero, three + 1, three, torch.zeros(3, count, 2, device=device),
             zero, one, zero, one,
         )  # fmt: skip
 
     @staticmethod
-    def stated(count: int, device: torch.device) -> "Errors":
-        """The fixed conditions of the evaluation: 20 ke⁻, 5 e⁻, three exposures ×4 apart, gain 0.3 %, angle 0.5°."""
-        from dataclasses import replace
-
-        clean = Errors.none(count, device)
+    def stated(count: int, device: torch.device) -> "CameraErrors":
+        """Errors of the evaluation: 20 ke⁻, 5 e⁻, three exposures at ratios of 4, gain 0.3 %, angle 0.5°."""
         return replace(
-            clean,
+            CameraErrors.none(count, device),
             full_well=2e4 * torch.ones(count, device=device),
             bracket=4 * torch.ones(count, device=device),
             read_noise=5 * torch.ones(count, device=device),
@@ -82,12 +81,12 @@ class Errors:
 
 
 def photograph(
-    stokes: Tensor, diffuse: Tensor, mask: Tensor, rays: Tensor, at: Tensor, errors: Errors
+    stokes: Tensor, diffuse: Tensor, mask: Tensor, rays: Tensor, at: Tensor, errors: CameraErrors
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Measured Stokes parameters (3, M, 3), their covariance (6, M, 3) and clipped pixels (M,) at pixels `at`.
 
     stokes (3, B, H, W, 3) in the frame of each ray; diffuse (B, H, W, 3); mask (B, H, W); rays (B, H, W, 3); at (M,)
-    indices into B·H·W. The solve takes the angles as they are in the image, as `stages/stokes` does.
+    indices into B·H·W. The solution uses nominal angles in the image, as `stages/stokes` does.
     """
     count, height, width = mask.shape
     wide = (count, 1, 1, 1)
@@ -98,11 +97,11 @@ def photograph(
     s1, s2 = (stokes[k] * errors.depolarization.view(wide) for k in (1, 2))
 
     shots, variance, clipped = [], [], torch.zeros_like(at, dtype=torch.bool)
-    brightest = errors.bracket[owner, None]  # where the shortest exposure saturates
+    brightest = errors.bracket[owner, None]  # radiance at which the shortest exposure saturates
     for k, angle in enumerate(ANGLES):
         cos, sin = _double_axis((angle + errors.angle[k]).view(count, 1, 1), rays)
         light = (s0 + s1 * cos[..., None] + s2 * sin[..., None]) / 2
-        light = _moved(light, errors.shift[k], errors.blur).reshape(-1, 3)[at] * errors.gain[k][owner, None]
+        light = _shift_and_blur(light, errors.shift[k], errors.blur).reshape(-1, 3)[at] * errors.gain[k][owner, None]
         clipped = clipped | (light > brightest).any(dim=-1)
         light = torch.minimum(light, brightest)
         noise = _merged_variance(light.clamp(min=0), errors, owner)
@@ -117,22 +116,22 @@ def photograph(
 
 
 def _double_axis(angle: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """cos and sin of twice `frames.axis_on_ray`, without the arc."""
+    """cos and sin of twice `frames.axis_on_ray`, without trigonometric functions."""
     x, y = frames.axis_across(angle, rays)
     length = x * x + y * y
     return (x * x - y * y) / length, 2 * x * y / length
 
 
-def _merged_variance(light: Tensor, errors: Errors, owner: Tensor) -> Tensor:
-    """Variance of radiance (M, C) merged from the unsaturated ones of three exposures, by exposure time."""
+def _merged_variance(light: Tensor, errors: CameraErrors, owner: Tensor) -> Tensor:
+    """Variance of radiance (M, C) merged from the unsaturated of three exposures, weighted by exposure time."""
     ratio, well, read = (x[owner, None] for x in (errors.bracket, errors.full_well, errors.read_noise))
     long, middle = (light * ratio < 1).to(light.dtype), (light < 1).to(light.dtype)
     time = 1 / ratio + middle + ratio * long
     return light / (well * time) + (read / (well * time)) ** 2 * (1 + middle + long)
 
 
-def _moved(image: Tensor, shift: Tensor, blur: Tensor) -> Tensor:
-    """Shift by less than a pixel and blur with three taps per axis, right to second order; (B, H, W, C)."""
+def _shift_and_blur(image: Tensor, shift: Tensor, blur: Tensor) -> Tensor:
+    """Images (B, H, W, C) shifted by less than a pixel and blurred: three taps per axis, exact to second order."""
     for axis, d in ((2, shift[:, 0]), (1, shift[:, 1])):
         spread = (blur**2 + d**2).view(-1, 1, 1, 1) / 2
         slope = d.view(-1, 1, 1, 1) / 2

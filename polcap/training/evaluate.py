@@ -26,10 +26,10 @@ from polcap.formats.maps import png
 from polcap.images import Cues, Network, SurfaceMaps
 from polcap.pipeline import models
 from polcap.stages import cues, infer
-from polcap.training import baselines, panel, protocol, tables
-from polcap.training.baselines import Estimator, Means
-from polcap.training.protocol import Protocol
-from polcap.training.score import MAPS, Judge, Score, angle, deciles
+from polcap.training import evaluation_baselines, evaluation_page, evaluation_picture, evaluation_protocol
+from polcap.training.evaluation_baselines import Estimator, Means
+from polcap.training.evaluation_protocol import Protocol
+from polcap.training.map_errors import MAPS, Judge, Score, angle, deciles
 
 _PANEL = 8  # pictures shown
 _SAMPLE = 500  # pixels of a picture that the calibration is judged by
@@ -42,42 +42,46 @@ Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Params:
+class EvaluationOptions:
     """What one evaluation is told."""
 
     model: Path
     data: Path = Path("data")
     out: Path = Path("runs/evaluate")
     ablations: Path | None = None  # holds NAME/last.pt
-    count: int = protocol.COUNT  # pictures
-    size: int = protocol.SIZE  # px
-    protocol: int = 1  # 1 | 2, of protocol.py
+    count: int = evaluation_protocol.COUNT  # pictures
+    size: int = evaluation_protocol.SIZE  # px
+    protocol: int = 1  # 1 | 2, of evaluation_protocol.py
 
 
-def main(params: Params) -> dict[str, Score]:
+def main(options: EvaluationOptions) -> dict[str, Score]:
     """Score all columns; writes out/evaluation.json, out/evaluation.md and out/panel.png."""
     torch.set_num_threads(1)
-    network = models.open_network(params.model)
-    found = {} if params.ablations is None else baselines.checkpoints(params.ablations)
-    head = _head(params, network, found)
-    made = Protocol(params.data, params.size, params.protocol)
-    rows = _judged(params, baselines.means(made, params.count), head)
+    network = models.open_network(options.model)
+    found = {} if options.ablations is None else evaluation_baselines.find_checkpoints(options.ablations)
+    head = _head(options, network, found)
+    made = Protocol(options.data, options.size, options.protocol)
+    rows = _judged(options, evaluation_baselines.mean_maps(made, options.count), head)
     result = _summary(head, rows, list(found))
-    shown = (made.case(number) for number in range(min(_PANEL, params.count)))
-    strips = [panel.row(case, _estimated(case.cues, network)) for case in shown]
-    for name, text in (("evaluation.json", json.dumps(result, indent=1)), ("evaluation.md", tables.page(result))):
-        with atomic.path(params.out / name) as beside:
+    shown = (made.case(number) for number in range(min(_PANEL, options.count)))
+    strips = [evaluation_picture.make_row(case, _estimated(case.cues, network)) for case in shown]
+    for name, text in (
+        ("evaluation.json", json.dumps(result, indent=1)),
+        ("evaluation.md", evaluation_page.make_page(result)),
+    ):
+        with atomic.path(options.out / name) as beside:
             beside.write_text(text)
-    png.write(params.out / "panel.png", panel.sheet(strips))
+    png.write(options.out / "panel.png", evaluation_picture.make_sheet(strips))
     return {**result["table"], **result["ablations"]}
 
 
-def _head(params: Params, network: Network, found: dict[str, Path]) -> dict[str, Any]:
+def _head(options: EvaluationOptions, network: Network, found: dict[str, Path]) -> dict[str, Any]:
     """All that the figures depend on."""
     return {
-        "pictures": params.count, "size": params.size, "protocol": f"{params.protocol}.{protocol.VERSION}",
-        "materials": protocol.PROTOCOLS[params.protocol], "camera": protocol.CONDITIONS,
-        "model": network.digest, "version": network.metadata.get("version", ""), "data": _digest(params.data),
+        "pictures": options.count, "size": options.size,
+        "protocol": f"{options.protocol}.{evaluation_protocol.VERSION}",
+        "materials": evaluation_protocol.PROTOCOLS[options.protocol], "camera": evaluation_protocol.CONDITIONS,
+        "model": network.digest, "version": network.metadata.get("version", ""), "data": _digest(options.data),
         "stages": {stage.name: stage.version for stage in (cues.compute, infer.estimate)},
         "ablations": {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in found.items()},
     }  # fmt: skip
@@ -100,53 +104,53 @@ def _estimated(seen: Cues, network: Network | None) -> SurfaceMaps:
     return infer.estimate(seen, network, onnx.run, infer.InferSettings())
 
 
-def _judged(params: Params, means: Means, head: dict[str, Any]) -> list[Row]:
+def _judged(options: EvaluationOptions, means: Means, head: dict[str, Any]) -> list[Row]:
     """A row per picture, those of an earlier run with the same head first."""
-    path = params.out / "pictures.jsonl"
+    path = options.out / "pictures.jsonl"
     rows = _kept(path, head)
     with atomic.path(path) as beside:
         beside.write_text("".join(json.dumps(row) + "\n" for row in [head, *rows]))
     started = reported = time.monotonic()
     first = len(rows)
     with path.open("a") as file:
-        for row in _made(params, means, range(first, params.count)):
+        for row in _made(options, means, range(first, options.count)):
             rows.append(row)
             file.write(json.dumps(row) + "\n")
             file.flush()
             now = time.monotonic()
-            if now - reported > _QUIET or len(rows) == params.count:
+            if now - reported > _QUIET or len(rows) == options.count:
                 reported = now
                 each = (now - started) / (len(rows) - first)
-                left = each * (params.count - len(rows)) / 60
+                left = each * (options.count - len(rows)) / 60
                 mean = np.mean([row["scores"][OURS]["normal_mean"] for row in rows])
                 print(
-                    f"{len(rows)}/{params.count}  {each:.1f} s per picture, {left:.0f} min left; "
+                    f"{len(rows)}/{options.count}  {each:.1f} s per picture, {left:.0f} min left; "
                     f"{OURS}: normals {mean:.2f}° on average",
                     file=sys.stderr, flush=True,
                 )  # fmt: skip
     return rows
 
 
-def _made(params: Params, means: Means, numbers: range) -> Iterator[Row]:
+def _made(options: EvaluationOptions, means: Means, numbers: range) -> Iterator[Row]:
     """Rows in order, by as many processes as there are cores and work for."""
     workers = min(os.cpu_count() or 1, len(numbers) // _SHARE)
     if workers < 2:
-        bench = Bench(params, means)
+        bench = PictureEvaluator(options, means)
         yield from map(bench.row, numbers)
         return
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, spawn, initializer=_begin, initargs=(params, means)) as pool:
+    with ProcessPoolExecutor(workers, spawn, initializer=_begin, initargs=(options, means)) as pool:
         yield from pool.map(_row, numbers)
 
 
-_bench: "Bench | None" = None  # of this worker
+_bench: "PictureEvaluator | None" = None  # of this worker
 
 
-def _begin(params: Params, means: Means) -> None:
+def _begin(options: EvaluationOptions, means: Means) -> None:
     global _bench
     threading.Thread(target=_follow, daemon=True).start()
     torch.set_num_threads(1)
-    _bench = Bench(params, means)
+    _bench = PictureEvaluator(options, means)
 
 
 def _follow() -> None:
@@ -176,21 +180,21 @@ def _kept(path: Path, head: dict[str, Any]) -> list[Row]:
     return rows
 
 
-class Bench:
+class PictureEvaluator:
     """Pictures and all ways of estimating, ready to judge."""
 
-    def __init__(self, params: Params, means: Means) -> None:
-        self.made = Protocol(params.data, params.size, params.protocol)
-        network = models.open_network(params.model, threads=1)
-        found = {} if params.ablations is None else baselines.checkpoints(params.ablations)
+    def __init__(self, options: EvaluationOptions, means: Means) -> None:
+        self.made = Protocol(options.data, options.size, options.protocol)
+        network = models.open_network(options.model, threads=1)
+        found = {} if options.ablations is None else evaluation_baselines.find_checkpoints(options.ablations)
         self.columns: dict[str, Estimator] = {
             OURS: lambda case: _estimated(case.cues, network),
             CLEAN: lambda case: _estimated(case.clean, network),
             ANALYTIC: lambda case: _estimated(case.cues, None),
-            "frontal": lambda case: baselines.frontal(case.cues),
-            "silhouette": lambda case: baselines.inflated(case.cues),
-            MEAN: lambda case: baselines.constant(case.cues, means),
-        } | {_alone(name): baselines.alone(path) for name, path in found.items()}
+            "frontal": lambda case: evaluation_baselines.frontal(case.cues),
+            "silhouette": lambda case: evaluation_baselines.inflated(case.cues),
+            MEAN: lambda case: evaluation_baselines.constant(case.cues, means),
+        } | {_alone(name): evaluation_baselines.network_alone(path) for name, path in found.items()}
 
     def row(self, number: int) -> Row:
         """Scores, seconds and what else is needed of one picture."""

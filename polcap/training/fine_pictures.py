@@ -1,7 +1,7 @@
-"""Pictures for the fine pass: traced views in relief, photographed, and what the shipped network says of them.
+"""Training pictures of the refinement network: traced views with added relief, photographed, and the first estimate.
 
-One file a picture: the channels of `stages/infer/fine.py`, then the true normal in the frame of each ray, then
-where it is known; (N + 4, H, W) in halves.
+One file per picture, (N + 4, H, W) fp16: the channels of `stages/infer/fine.py`, the true normal in the frame of each
+ray (3), the mask of known normals (1).
 """
 
 from dataclasses import dataclass, replace
@@ -16,78 +16,82 @@ from polcap.formats import atomic, onnx
 from polcap.images import Floats, Network, View
 from polcap.stages import cues
 from polcap.stages.infer import fine, learned
-from polcap.training import bounce, gbuffers, materials, protocol, relief
-from polcap.training.camera_errors import Errors
-from polcap.training.dataset import Indices, Simulator
+from polcap.training import bounced_light, evaluation_protocol, materials, relief, traced_views
+from polcap.training.camera_errors import CameraErrors
+from polcap.training.simulator import Indices, SimulatedPhotographs, Simulator
 
 SIDE = 448  # px
-_SHOWN = (80, 400)  # px of the longer side that the first network is shown
+_FIRST_SIZES = (80, 400)  # px of the longer side at which the main network sees a picture
 _IOR = 1.5
-_MOVED = 2.5  # times the misregistration of the first network's training, which counts in larger pixels
-RECIPE = gbuffers.Recipe(views=2, procedural=14, size=SIDE, seed=51, per_shape=4)
+_SHIFT = 2.5  # times the misregistration of the main network's training, whose pixels are larger
+RECIPE = traced_views.ViewsRecipe(views=2, procedural=14, size=SIDE, seed=51, per_shape=4)
 
 
-class WithoutBounces(Simulator):
-    """Light from the lamp alone: the cache's indices end at 256² pixels.
+class SimulatorWithoutBounces(Simulator):
+    """Light from the flash alone, because the cache can index bounces only up to 256² pixels.
 
-    What bounces is coarser than relief, but in shadows beside a limb, which nothing else lights (decision 29).
+    Bounced light varies more slowly than relief. It is missing only in shadows next to an outline (decision 29).
     """
 
-    def _met(
-        self, first: Indices, y: Indices, x: Indices, order: Indices, mask: Any, owner: Indices
+    def _seen_pixels(
+        self, view: Indices, y: Indices, x: Indices, order: Indices, mask: Any, owner: Indices
     ) -> tuple[Indices, NDArray[np.float32]]:
-        return np.full((len(owner), bounce.RAYS), -1), np.zeros(len(owner), np.float32)
+        return np.full((len(owner), bounced_light.RAYS), -1), np.zeros(len(owner), np.float32)
 
 
 @dataclass(frozen=True)
-class Studio:
-    """Views, materials and the first network."""
+class FinePictureMaker:
+    """Views and materials, and the main network."""
 
     simulator: Simulator
     network: Network
 
     @staticmethod
-    def open(views: Path, data: Path, network: Network) -> "Studio":
-        """Trace what is missing of the views of the training meshes."""
-        meshes = gbuffers.training_meshes(data)
-        library = materials.Library(data / "materials" / "train", torch.device("cpu"))
-        simulator = WithoutBounces(gbuffers.cached(views, meshes, RECIPE), library, torch.device("cpu"))
-        return Studio(simulator, network)
+    def open(views: Path, data: Path, network: Network) -> "FinePictureMaker":
+        """Trace the views of the training meshes if the folder `views` lacks them."""
+        meshes, device = traced_views.training_meshes(data), torch.device("cpu")
+        library = materials.MaterialLibrary(data / "materials" / "train", device)
+        cache = traced_views.open_cache(views, meshes, RECIPE)
+        return FinePictureMaker(SimulatorWithoutBounces(cache, library, device), network)
 
     def picture(self, number: int) -> NDArray[np.float16]:
-        """Channels, true normal, and where it is known; the object's crop."""
+        """Channels, true normal and mask of known normals (N + 4, H, W), cropped to the object."""
         rng = np.random.default_rng([RECIPE.seed, number])
+        focal, x, y, middle = self.simulator.camera[number % len(self.simulator.camera)][:4]
         with torch.random.fork_rng():
             torch.manual_seed(number)
-            seen = self.simulator.look(np.array([number % len(self.simulator.camera)]), SIDE, flip=False)
-            focal, x, y, middle = self.simulator.camera[number % len(self.simulator.camera)][:4]
-            slope = relief.slopes(seen.position.numpy(), float(middle / focal), rng) @ seen.turn[0].numpy().T
-            normal = torch.from_numpy(relief.bent(seen.normal.numpy(), slope))
-            seen = replace(seen, normal=normal)
-            errors = Errors.draw(1, normal.device)
-            errors = replace(errors, shift=_MOVED * errors.shift)
-            photo = self.simulator.shoot(seen, torch.ones(1), errors)
-        mask = photo.given[0].numpy()
+            photo = self._photograph(number, float(middle / focal), rng)
+        mask = photo.input_mask[0].numpy()
         view = View(focal=float(focal), center=(float(x), float(y)), scale=1.0)
         measured = (photo.stokes, photo.covariance, photo.clipped)
-        image = protocol.stokes_image(measured, photo.at.numpy(), mask, view)
-        found = cues.compute(image, protocol.white())
-        shown = int(_SHOWN[0] * (_SHOWN[1] / _SHOWN[0]) ** rng.random())
-        first = replace(self.network, metadata={**self.network.metadata, "native_size": str(shown)})
-        _, guess, _ = learned.known(found, first, onnx.run, _IOR, 1)
+        image = evaluation_protocol.stokes_image(measured, photo.at.numpy(), mask, view)
+        estimated = cues.compute(image, evaluation_protocol.white())
+        size = int(_FIRST_SIZES[0] * (_FIRST_SIZES[1] / _FIRST_SIZES[0]) ** rng.random())
+        network = replace(self.network, metadata={**self.network.metadata, "native_size": str(size)})
+        _, guess, _ = learned.estimate_coarse(estimated, network, onnx.run, _IOR, 1)
         truth = np.moveaxis(photo.truth["normal"][0].numpy(), -1, 0)
         known = (photo.mask[0].numpy() & mask)[None]
         rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
         crop = np.s_[:, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        both: Floats = np.concatenate([fine.encode(found, guess), truth, known])
-        return np.ascontiguousarray(both[crop].astype(np.float16))
+        layers: Floats = np.concatenate([fine.encode(estimated, guess), truth, known])
+        return np.ascontiguousarray(layers[crop].astype(np.float16))
+
+    def _photograph(self, number: int, px: float, rng: np.random.Generator) -> SimulatedPhotographs:
+        """Photographs of a view with random relief; px is the length that a pixel shows."""
+        views = self.simulator.gather(np.array([number % len(self.simulator.camera)]), SIDE, flip=False)
+        pixels = views.pixels
+        slope = relief.random_slopes(pixels.position.numpy(), px, rng) @ views.turn[0].numpy().T
+        normal = torch.from_numpy(relief.tilt_normals(pixels.normal.numpy(), slope))
+        errors = CameraErrors.draw(1, normal.device)
+        errors = replace(errors, shift=_SHIFT * errors.shift)
+        return self.simulator.photograph(replace(views, pixels=replace(pixels, normal=normal)), torch.ones(1), errors)
 
 
-def main(folder: Path, studio: Studio, count: int) -> None:
-    """Make the pictures that are missing of `count`."""
+def make_pictures(folder: Path, maker: FinePictureMaker, count: int) -> None:
+    """Make those of `count` pictures that the folder lacks."""
     folder.mkdir(parents=True, exist_ok=True)
     for number in range(count):
         path = folder / f"{number:05d}.npy"
         if not path.exists():
-            with atomic.path(path) as beside, beside.open("wb") as file:
-                np.save(file, studio.picture(number))
+            with atomic.path(path) as temporary, temporary.open("wb") as file:
+                np.save(file, maker.picture(number))

@@ -1,7 +1,7 @@
-"""Gloss as real surfaces have it: roughness, F0 and depolarization by families, and the law of each body.
+"""Random gloss of the training materials: roughness and F0 by families, and the polarization of diffuse light.
 
-Families are drawn for each surface, not for each picture: a print and what it is printed on are two. F0 mostly lies
-where plastics, paints, glazes, paper, wood, stone and cloth lie, with a tail of coatings and gems among glossy ones.
+A family is drawn for each surface: a print and its paper are two. F0 is mostly that of plastics, paints, glazes,
+paper, wood, stone and cloth; some glossy surfaces have the higher F0 of coatings and gems.
 
 References
 ----------
@@ -20,57 +20,59 @@ from polcap.optics.body import Law
 
 
 @dataclass(frozen=True)
-class Family:
+class GlossFamily:
+    """Distribution of the gloss of one kind of surface."""
+
     share: float  # of surfaces
-    roughness: tuple[float, float]  # perceptual, evenly between
+    roughness: tuple[float, float]  # perceptual, uniform between these
     tail: float  # share with an F0 above common dielectrics
-    kept: tuple[float, float] = (1.0, 1.0)  # factor on the body's polarization
-    grain: float = 0.5  # share whose gloss is speckled
-    dark: bool = False  # hardly any diffuse reflection: most of the light is mirrored from other parts of the object
+    kept: tuple[float, float] = (1.0, 1.0)  # factor on the polarization of diffuse light
+    grain: float = 0.5  # share with speckled gloss
+    dark: bool = False  # hardly any diffuse reflection: most light is mirrored from other parts of the object
 
 
 FAMILIES = {
-    "glossy": Family(0.25, (0.10, 0.35), 0.40),  # plastics, glazes, varnish
-    "satin": Family(0.27, (0.28, 0.60), 0.28),  # paints, leather, waxed wood
-    "matte": Family(0.27, (0.50, 0.95), 0.08),  # plaster, clay, paper, stone
-    "brushed": Family(0.08, (0.25, 0.65), 0.30, grain=1.0),  # sanded, scratched, grained
-    "fibrous": Family(0.08, (0.65, 1.00), 0.00, kept=(0.3, 0.9), grain=1.0),  # cloth, felt, unsized paper
-    "dark gloss": Family(0.05, (0.05, 0.30), 0.00, dark=True),  # black plastic, lacquer, leather, dark glaze
+    "glossy": GlossFamily(0.25, (0.10, 0.35), 0.40),  # plastics, glazes, varnish
+    "satin": GlossFamily(0.27, (0.28, 0.60), 0.28),  # paints, leather, waxed wood
+    "matte": GlossFamily(0.27, (0.50, 0.95), 0.08),  # plaster, clay, paper, stone
+    "brushed": GlossFamily(0.08, (0.25, 0.65), 0.30, grain=1.0),  # sanded, scratched, grained
+    "fibrous": GlossFamily(0.08, (0.65, 1.00), 0.00, kept=(0.3, 0.9), grain=1.0),  # cloth, felt, unsized paper
+    "dark gloss": GlossFamily(0.05, (0.05, 0.30), 0.00, dark=True),  # black plastic, lacquer, leather, dark glaze
 }
-_ALL_DARK = 0.10  # of objects that are dark gloss everywhere; the parts' share comes on top
+_ALL_DARK = 0.10  # share of objects that are dark gloss everywhere; other objects may have dark parts
 _DARK = (0.01, 0.06)  # albedo
-_F0, _F0_SPREAD = 0.042, 0.13  # common dielectrics: n = 1.45–1.58 within 1σ, in the logarithm
-_TAIL = (0.055, 1.5)  # least F0, and the logarithm of the greatest over it; small ones are commoner
-SMOOTH_SHARE = 0.5  # of objects whose body leaves light through a smooth interface
-_OWN_ROUGHNESS = 0.6  # of rough ones whose body is as rough as their gloss; coats and cores differ in the others
-_DEPOLARIZED = 0.08  # of rough ones that are translucent
+_F0, _F0_SPREAD = 0.042, 0.13  # median and 1σ of the logarithm for common dielectrics, n = 1.45–1.58
+_TAIL = (0.055, 1.5)  # least F0, and the logarithm of the greatest one over it; small ones are more frequent
+SMOOTH_SHARE = 0.5  # of objects with a smooth interface for diffuse light
+_SAME_ROUGHNESS = 0.6  # of rough interfaces that are as rough for diffuse light as for gloss; coated ones differ
+_TRANSLUCENT = 0.08  # of rough interfaces, and so depolarized
 
 
 @dataclass(frozen=True)
 class Gloss:
-    """Of surfaces, any shape."""
+    """Gloss of surfaces; all fields have one shape."""
 
     roughness: Tensor
     f0: Tensor
-    kept: Tensor
+    kept: Tensor  # factor on the polarization of diffuse light
     grained: Tensor  # bool
     dark: Tensor  # bool
 
 
 def dark_objects(count: int, device: torch.device) -> Tensor:
-    """Which of `count` objects are dark gloss everywhere, (B,) bool."""
+    """Draw which of `count` objects are dark gloss everywhere, (B,) bool."""
     return torch.rand(count, device=device) < _ALL_DARK
 
 
 def dark_albedo(shape: tuple[int, ...], device: torch.device) -> Tensor:
-    """Albedos of the dark family, (*shape, 3): nearly grey."""
+    """Draw albedos of dark gloss, (*shape, 3): nearly gray."""
     low, high = _DARK
     value = low * (high / low) ** torch.rand((*shape, 1), device=device)
     return value * torch.exp(0.15 * torch.randn((*shape, 3), device=device))
 
 
-def draw(shape: tuple[int, ...], device: torch.device, all_dark: Tensor | None = None) -> Gloss:
-    """A family for each surface, and its gloss; `all_dark` (bool, broadcast to the shape) forces the dark family."""
+def draw_gloss(shape: tuple[int, ...], device: torch.device, all_dark: Tensor | None = None) -> Gloss:
+    """Draw a family for each surface, and its gloss; `all_dark` (bool, broadcast to the shape) forces dark gloss."""
     share = torch.tensor([family.share for family in FAMILIES.values()], device=device)
     which = torch.multinomial(share, torch.Size(shape).numel(), replacement=True).reshape(shape)
     if all_dark is not None:
@@ -95,11 +97,11 @@ def draw(shape: tuple[int, ...], device: torch.device, all_dark: Tensor | None =
     )
 
 
-def laws(count: int, device: torch.device, smooth_share: float = SMOOTH_SHARE) -> Law:
-    """How the bodies of `count` objects polarize, (B,) each: half by the smooth law, half by rough facets.
+def draw_laws(count: int, device: torch.device, smooth_share: float = SMOOTH_SHARE) -> Law:
+    """Draw the polarization of diffuse light for `count` objects, fields (B,): a smooth interface or rough facets.
 
-    What light does inside is not known, so rough ones have either weighting of facets or one between, and a factor
-    of .8–1 on their polarization, far less for a few.
+    The path of light inside a body is not known. So rough interfaces have either weighting of facets or one between
+    them, and a factor of 0.8–1 on the polarization, less for translucent ones.
     """
 
     def u(low: float, high: float) -> Tensor:
@@ -107,7 +109,7 @@ def laws(count: int, device: torch.device, smooth_share: float = SMOOTH_SHARE) -
 
     rough = (u(0, 1) >= smooth_share).float()
     other = torch.exp(0.25 * torch.randn(count, device=device)).clamp(0.5, 1.6)
-    scale = torch.where(u(0, 1) < _OWN_ROUGHNESS, torch.ones(count, device=device), other)
+    scale = torch.where(u(0, 1) < _SAME_ROUGHNESS, torch.ones(count, device=device), other)
     local = u(-1, 2).clamp(0, 1)  # a third each: 0, 1, between
-    kept = torch.where(u(0, 1) < _DEPOLARIZED, u(0.25, 0.8), u(0.8, 1.0))
+    kept = torch.where(u(0, 1) < _TRANSLUCENT, u(0.25, 0.8), u(0.8, 1.0))
     return Law(rough * scale, rough * local, 1 - rough * (1 - kept))

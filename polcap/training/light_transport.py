@@ -40,7 +40,7 @@ class Pose:
 
 
 @dataclass(frozen=True)
-class Places:
+class SurfacePoints:
     """The M visible pixels of a picture, dressed."""
 
     mask: NDArray[np.bool_]  # (H, W)
@@ -54,13 +54,13 @@ class Places:
     ior: float
     law: Law = SMOOTH
 
-    def take(self, which: Indices) -> "Places":
+    def take(self, which: Indices) -> "SurfacePoints":
         """Some of them; the mask stays, and what all have in common."""
         held = {name: value[which] for name, value in vars(self).items() if name not in ("mask", "ior", "law")}
         return replace(self, **held)
 
 
-class Scene:
+class MeshScene:
     """A mesh, ready for rays of any kind."""
 
     def __init__(self, mesh: Triangles) -> None:
@@ -91,7 +91,7 @@ class Scene:
         return to_flash, np.where(hidden, 0, pose.strength / far**2)
 
 
-def stokes(scene: Scene, places: Places, pose: Pose, albedo: Albedo, rng: np.random.Generator) -> Floats:
+def stokes(scene: MeshScene, places: SurfacePoints, pose: Pose, albedo: Albedo, rng: np.random.Generator) -> Floats:
     """Stokes parameters (3, M, 3) of the visible pixels, in the frame of each ray."""
     to_flash, irradiance = scene.lit(places.position, places.flat, pose)
     toward = frames.to_ray_frame(to_flash @ pose.rotation.T, places.rays)
@@ -101,7 +101,12 @@ def stokes(scene: Scene, places: Places, pose: Pose, albedo: Albedo, rng: np.ran
 
 
 def _shaded(
-    places: Places, diffuse: Floats, specular: Floats, toward: Floats, irradiance: Floats, ior: Floats | None = None
+    places: SurfacePoints,
+    diffuse: Floats,
+    specular: Floats,
+    toward: Floats,
+    irradiance: Floats,
+    ior: Floats | None = None,
 ) -> Floats:
     index = np.full(len(toward), places.ior) if ior is None else ior
     lit = places.roughness, index, toward, irradiance
@@ -111,7 +116,7 @@ def _shaded(
 class _Gather:
     """Light that reaches the places from other parts of the mesh."""
 
-    def __init__(self, scene: Scene, places: Places, pose: Pose, albedo: Albedo) -> None:
+    def __init__(self, scene: MeshScene, places: SurfacePoints, pose: Pose, albedo: Albedo) -> None:
         self.scene, self.places, self.pose, self.albedo = scene, places, pose, albedo
         self.e_x, self.e_y = frames.basis(places.normal)
 

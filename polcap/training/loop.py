@@ -1,7 +1,7 @@
-"""The training loop of every network: optimizers, learning rate, averaged weights, checkpoints and metrics.
+"""The training loop of all networks: optimizers, learning rate, averaged weights, checkpoints and metrics.
 
-A budget is a length of time, so that a run ends on any machine when it should, or a number of pictures, so that runs
-can be compared. A stopped run goes on from its last checkpoint with the rest of its budget.
+A budget is a time, so that a run ends when planned on any machine, or a number of pictures, so that runs can be
+compared. A stopped run continues from its last checkpoint with the rest of its budget.
 """
 
 import csv
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -20,18 +20,19 @@ from torch import Tensor, nn
 
 from polcap.errors import InputError
 from polcap.formats import atomic
+from polcap.training import onnx_export
 from polcap.training.muon import Muon
 
-_OUTER_LAYERS = ("stem", "raw", "out", "hint.0")  # beside the pixels: learned by AdamW, the others by Muon
+_OUTER_LAYERS = ("stem", "raw", "out", "hint.0")  # next to the pixels: AdamW trains them, Muon all others
 _OUTER_RATE = 0.5  # AdamW's rate relative to Muon's
-_STEEPEST = 1.0  # norm to which gradients are clipped
-_METRICS_STEPS = 50
-_VALIDATION_S, _CHECKPOINT_S = 240, 60
+_MAX_GRADIENT_NORM = 1.0  # longer gradients are scaled down to it
+_METRICS_STEPS = 50  # from one row of metrics.csv to the next
+_VALIDATION_S, _CHECKPOINT_S = 240, 60  # s between two validations, two checkpoints
 
 
 @dataclass(frozen=True)
 class Budget:
-    """How long a run lasts: pictures where their number is stated, else minutes."""
+    """Length of a run: a number of pictures if `samples` is set, otherwise minutes."""
 
     minutes: float
     samples: int | None = None
@@ -39,12 +40,12 @@ class Budget:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Learning rate and averaging over the steps of a run."""
+    """Learning rate and weight averaging during a run."""
 
-    hold: float  # share of the budget at the full rate; then it falls linearly to nothing
+    hold: float  # share of the budget at the full rate; after it the rate falls linearly to 0
     warm_up: int  # steps over which the rate rises
     averaging: float  # decay of the averaged weights per step
-    burst: float = math.inf  # norm of a gradient that is skipped
+    burst: float = math.inf  # steps with a longer gradient are skipped
 
 
 class Trainee(ABC):
@@ -60,28 +61,28 @@ class Trainee(ABC):
 
     @abstractmethod
     def advance(self, batch: Any, progress: float) -> dict[str, float]:
-        """One step; returns losses. `progress` is the share of the budget that is spent, 0…1."""
+        """Do one step and return its losses. `progress` is the spent share of the budget, 0…1."""
 
     @abstractmethod
     def validate(self, out: Path) -> dict[str, float]:
-        """Errors on pictures that the network never learned from; may leave pictures in `out`."""
+        """Errors on held-out pictures; may write example pictures to `out`."""
 
     def facts(self) -> dict[str, Any]:
         """Further entries of the checkpoint."""
         return {}
 
     def progress(self, budget: Budget, samples: int | None = None) -> float:
-        """Share of the budget that is spent, after so many pictures where their number limits the run."""
+        """Spent share of the budget; with a budget of pictures, the share at `samples` pictures (default: now)."""
         if budget.samples:
             return (self.samples if samples is None else samples) / budget.samples
         return self.elapsed / (60 * budget.minutes)
 
     def update(self, progress: float) -> float:
-        """Step along the gathered gradients and average the weights; returns the gradient's norm."""
-        fall = min(1.0, (1 - min(progress, 1.0)) / (1 - self.schedule.hold))
+        """Apply the gradients, update the averaged weights and return the gradient's norm."""
+        decline = min(1.0, (1 - min(progress, 1.0)) / (1 - self.schedule.hold))
         for group in (g for optimizer in self.optimizers for g in optimizer.param_groups):
-            group["lr"] = group["full"] * fall * min(1.0, (self.step + 1) / self.schedule.warm_up)
-        norm = float(torch.nn.utils.clip_grad_norm_(self.network.parameters(), _STEEPEST, foreach=True))
+            group["lr"] = group["full"] * decline * min(1.0, (self.step + 1) / self.schedule.warm_up)
+        norm = float(torch.nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM, foreach=True))
         skip = not norm < self.schedule.burst
         for optimizer in self.optimizers:
             if not skip:
@@ -95,7 +96,7 @@ class Trainee(ABC):
 
     @contextmanager
     def averaged(self) -> Iterator[nn.Module]:
-        """The network with its averaged weights, inside the block."""
+        """The network with its averaged weights, for the duration of the block."""
         current = {k: v.clone() for k, v in self.network.state_dict().items()}
         self.network.load_state_dict(self.average)
         try:
@@ -115,7 +116,7 @@ class Trainee(ABC):
             torch.save(state | self.facts(), temporary)
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a checkpoint's content."""
+        """Continue from the content of a checkpoint."""
         self.network.load_state_dict(state["network"])
         self.average = {k: v.clone() for k, v in state["average"].items()}
         for optimizer, saved in zip(self.optimizers, state["optimizers"]):
@@ -125,37 +126,47 @@ class Trainee(ABC):
 
 
 class PictureTraining(Trainee):
-    """Training of a small network on picture files, some of which are held out for validation."""
+    """Training of a small network on picture files, of which the first are held out for validation."""
 
-    held_out: int
-    per_step: int
+    held_out: int  # pictures
+    per_step: int  # pictures
+    output: str  # name of the network's map
+    metadata: ClassVar[Mapping[str, str]]  # of the exported model
 
     def __init__(self, network: nn.Module, rate: float, files: list[Path], seed: int) -> None:
         super().__init__(network.to(memory_format=torch.channels_last), rate)
         self.files, self.seed = files, seed
         self.random = np.random.default_rng([seed, 0])
 
-    def resume(self, checkpoint: Path) -> None:
-        """Go on from the checkpoint where there is one.
+    def train(self, minutes: float, out: Path) -> None:
+        """Continue from out/last.pt if it exists, and train until `minutes` are spent, earlier parts included.
 
         Raises
         ------
         InputError
-            There are no more pictures than are held out.
+            There are too few pictures to hold some out.
         """
         if len(self.files) <= self.held_out:
             raise InputError(f"{len(self.files)} pictures; training needs more than the {self.held_out} held out")
-        if checkpoint.exists():
-            self.restore(torch.load(checkpoint, weights_only=True))
+        if (out / "last.pt").exists():
+            self.restore(torch.load(out / "last.pt", weights_only=True))
         self.random = np.random.default_rng([self.seed, self.step])
+        run(self, self.draw, Budget(minutes), out)
 
     def draw(self) -> list[Path]:
-        """Pictures of a step."""
+        """Picture files of a step."""
         return [self.files[n] for n in self.random.integers(self.held_out, len(self.files), self.per_step)]
+
+    def export(self, path: Path) -> None:
+        """Write the averaged weights as an ONNX model that `formats/onnx.py` loads."""
+        training = f"{self.samples} samples in {self.step} steps"
+        metadata = {"licence": "Apache-2.0", "training": training, **self.metadata}
+        with self.averaged() as network:
+            onnx_export.export_network(network, path, (self.output,), metadata)
 
 
 def run(trainee: Trainee, draw: Callable[[], Any], budget: Budget, out: Path) -> None:
-    """Learn until the budget is spent. Leaves last.pt, metrics.csv and watch.csv in `out`."""
+    """Train until the budget is spent. Writes last.pt, metrics.csv and watch.csv to `out`."""
     saved = validated = trainee.elapsed
     before, losses = time.monotonic(), []
     while trainee.progress(budget) < 1:
@@ -169,7 +180,7 @@ def run(trainee: Trainee, draw: Callable[[], Any], budget: Budget, out: Path) ->
         if trainee.elapsed - validated > _VALIDATION_S or done:
             validated = trainee.elapsed
             _append(out / "watch.csv", trainee, trainee.validate(out))
-            before = time.monotonic()  # validation is no training time
+            before = time.monotonic()  # validation does not count as training time
         if trainee.elapsed - saved > _CHECKPOINT_S:
             saved = trainee.elapsed
             trainee.save(out / "last.pt")
@@ -177,7 +188,7 @@ def run(trainee: Trainee, draw: Callable[[], Any], budget: Budget, out: Path) ->
 
 
 def make_optimizers(network: nn.Module, rate: float) -> list[torch.optim.Optimizer]:
-    """Muon for hidden matrices; AdamW for layers beside the pixels, biases and knots of curves."""
+    """Muon for hidden layers; AdamW for layers next to the pixels, biases and the knots of curves."""
     hidden: list[Tensor] = []
     outer: list[Tensor] = []
     plain: list[Tensor] = []
@@ -189,14 +200,15 @@ def make_optimizers(network: nn.Module, rate: float) -> list[torch.optim.Optimiz
         else:
             hidden.append(weight)
     others = [{"params": outer, "weight_decay": 1e-2}, {"params": plain, "weight_decay": 0.0}]
-    both = [Muon(hidden, rate), torch.optim.AdamW(others, _OUTER_RATE * rate, betas=(0.9, 0.98), fused=True)]
-    for group in (g for optimizer in both for g in optimizer.param_groups):
+    adamw = torch.optim.AdamW(others, _OUTER_RATE * rate, betas=(0.9, 0.98), fused=True)
+    optimizers: list[torch.optim.Optimizer] = [Muon(hidden, rate), adamw]
+    for group in (g for optimizer in optimizers for g in optimizer.param_groups):
         group["full"] = group["lr"]  # before warm-up and decay
-    return both
+    return optimizers
 
 
 def _append(path: Path, trainee: Trainee, figures: Mapping[str, float]) -> None:
-    """Add a row of figures to a CSV file."""
+    """Append a row of figures to a CSV file."""
     numbers = {"step": trainee.step, "samples": trainee.samples, "seconds": round(trainee.elapsed, 1), **figures}
     row = {name: f"{value:.7g}" for name, value in numbers.items()}
     fresh = not path.exists()

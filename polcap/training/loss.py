@@ -1,8 +1,8 @@
-"""What training minimizes: each map against truth, and pictures rendered from all maps together.
+"""Loss of the main network: the error of each map, and of pictures rendered from all maps.
 
-The rendering loss is the paper's: the polarized renderer (`optics/shade.py`, the same that made the
-input) draws truth and estimate under new random lights and from new sides, by the law of each object's body, and
-compares S0 in log and the linear polarization relative to it. It couples the maps where each alone is ambiguous.
+The rendering loss is that of Deschaintre, Lin & Ghosh (CVPR 2021). The polarized renderer (`optics/shade.py`, which
+made the input too) renders truth and estimate under random lights and from other sides. Compared are log S0 and the
+linear polarization relative to it. This couples maps that are ambiguous one by one.
 """
 
 import torch
@@ -12,20 +12,20 @@ from torch.nn import functional as F
 from polcap.optics import shade
 from polcap.optics.body import Law
 from polcap.stages.cues import NOMINAL_IOR
-from polcap.training.dataset import Batch
+from polcap.training.simulator import Batch
 
 WEIGHTS = {
     "normal": 2.0, "region": 1.0, "depth": 1.0, "diffuse": 1.0, "specular": 60.0, "roughness": 8.0, "highlight": 2.0,
     "sigma": 0.05, "render": 0.3,
 }  # fmt: skip
-_BLOCKS = (8, 16, 32)  # px: regions whose mean direction counts
-_FLAT = 0.2  # mean tangential part below which a region has hardly a direction
+_BLOCKS = (8, 16, 32)  # px: sizes of regions
+_FLAT = 0.2  # mean tangential part of the normals below which a region has no clear direction
 
 
 def total(
     maps: dict[str, Tensor], truth: Batch, random: torch.Generator | None, *, polarized: bool = True
 ) -> tuple[Tensor, dict[str, float]]:
-    """The weighted sum, and each part as a number. maps and truth (B, ·, H, W); `random` draws the lights."""
+    """Weighted sum of all parts, and each part as a number; maps and truth (B, ·, H, W). `random` draws the lights."""
     mask = truth.mask
     inside = mask[:, None].float()
     area = inside.sum().clamp(min=1)
@@ -40,11 +40,11 @@ def total(
         "region": _region(maps["normal"], truth.normal, inside),
         "depth": mean((centred(maps["depth"], inside) - centred(truth.depth, inside)).abs()),
         "diffuse": mean((maps["diffuse"] - truth.diffuse).abs() + 2 * (maps["diffuse"] - truth.diffuse) ** 2),
-        # squares: of what a picture leaves open the mean is wanted; the median of F0 ignores its long tail
+        # squares: they lead to the mean of what is possible; the median of F0 would ignore its long tail
         "specular": mean((maps["specular"] - truth.specular) ** 2),
         "roughness": mean((maps["roughness"] - truth.roughness) ** 2),
         "highlight": mean((maps["highlight"] - truth.highlight) ** 2),
-        "sigma": mean(torch.log(maps["sigma"]) + angle.detach() / maps["sigma"]),  # least where sigma = E[angle]
+        "sigma": mean(torch.log(maps["sigma"]) + angle.detach() / maps["sigma"]),  # minimal at sigma = E[angle]
     }
     parts["render"] = _rendered(maps, truth, random, polarized)
     loss = sum((WEIGHTS[name] * value for name, value in parts.items()), torch.zeros((), device=mask.device))
@@ -53,35 +53,35 @@ def total(
 
 
 def _region(estimate: Tensor, truth: Tensor, inside: Tensor) -> Tensor:
-    """Cost of regions that are turned about the ray as a whole; pixel by pixel they cost no more than scattered errors.
+    """Cost of regions with a common error of azimuth, which cost no more than scattered errors pixel by pixel.
 
-    For blocks of 8, 16 and 32 px, 1 − the cosine between the mean tangential parts of estimate and truth, times the
-    length of the truth's. Parts shorter than `_FLAT` are not made unit vectors: a turned one may pass through 0.
+    For blocks of 8, 16 and 32 px: 1 − cosine between the mean tangential parts of estimate and truth, times the length
+    of the truth's. Parts shorter than `_FLAT` are not scaled to unit length, so that the estimate can turn through 0.
     """
     cost, area = truth.new_zeros(()), truth.new_zeros(())
     for block in _BLOCKS:
         share = F.avg_pool2d(inside, block)
-        own, other = (F.avg_pool2d(n[:, :2] * inside, block) / share.clamp(min=1e-3) for n in (estimate, truth))
-        way, right = (v / (v.square().sum(dim=1, keepdim=True) + _FLAT**2).sqrt() for v in (own, other))
-        missed = 0.5 * (way - right).square().sum(dim=1, keepdim=True)  # 1 − cosine
-        cost = cost + (missed * other.norm(dim=1, keepdim=True) * share).sum()
+        estimated, true = (F.avg_pool2d(n[:, :2] * inside, block) / share.clamp(min=1e-3) for n in (estimate, truth))
+        way, true_way = (v / (v.square().sum(dim=1, keepdim=True) + _FLAT**2).sqrt() for v in (estimated, true))
+        missed = 0.5 * (way - true_way).square().sum(dim=1, keepdim=True)  # 1 − cosine
+        cost = cost + (missed * true.norm(dim=1, keepdim=True) * share).sum()
         area = area + share.sum()
     return cost / area.clamp(min=1)
 
 
 def centred(depth: Tensor, inside: Tensor) -> Tensor:
-    """Depth (B, 1, H, W) with its mean inside (B, 1, H, W; 0 or 1) taken away."""
+    """Depth (B, 1, H, W) minus its mean over `inside` (B, 1, H, W; 0 or 1)."""
     return depth - (depth * inside).sum(dim=(2, 3), keepdim=True) / inside.sum(dim=(2, 3), keepdim=True).clamp(min=1)
 
 
 def _rendered(maps: dict[str, Tensor], truth: Batch, random: torch.Generator | None, polarized: bool) -> Tensor:
-    """Polarized rendering loss on every second pixel of every second row, a new light and side for each pixel."""
+    """Polarized rendering loss at every second pixel of every second row, with a light and a side for each pixel."""
     at = truth.mask[:, ::2, ::2].reshape(-1).nonzero()[:, 0]
 
     def flat(image: Tensor) -> Tensor:
         return image[:, :, ::2, ::2].permute(0, 2, 3, 1).reshape(-1, image.shape[1])[at]
 
-    # a side: turn the truth by up to ~30° about a random axis across the ray, as long as it stays visible
+    # a side: normals are turned by up to about 30° about a random axis perpendicular to the ray
     turn = _small_rotations(len(at), truth.normal.device, random)
     ones = torch.ones(len(at), device=turn.device)
     light = 0.6 * torch.randn(len(at), 3, device=turn.device, generator=random)
@@ -93,15 +93,16 @@ def _rendered(maps: dict[str, Tensor], truth: Batch, random: torch.Generator | N
         rough = flat(source["roughness"])[:, 0].clamp(min=0.08)
         diffuse, specular = flat(source["diffuse"]), flat(source["specular"])
         pictures.append(shade.stokes(normal, diffuse, specular, rough, NOMINAL_IOR * ones, light, ones, law))
-    estimate, goal = pictures
-    intensity = (torch.log(estimate[0] + 0.05) - torch.log(goal[0] + 0.05)).abs().mean()
+    estimate, target = pictures
+    intensity = (torch.log(estimate[0] + 0.05) - torch.log(target[0] + 0.05)).abs().mean()
     if not polarized:
         return intensity
-    polarization = (estimate[1:] - goal[1:]).abs() / (goal[0] + 0.05)
+    polarization = (estimate[1:] - target[1:]).abs() / (target[0] + 0.05)
     return intensity + 2.0 * polarization.clamp(max=1.0).mean()
 
 
 def _small_rotations(count: int, device: torch.device, random: torch.Generator | None) -> Tensor:
+    """Rotations (M, 3, 3) by up to 0.5 rad about random axes perpendicular to z."""
     way = 2 * torch.pi * torch.rand(count, device=device, generator=random)
     c, s = torch.cos(way), torch.sin(way)
     tilt = 0.5 * torch.rand(count, device=device, generator=random)

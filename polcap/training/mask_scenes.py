@@ -1,8 +1,8 @@
-"""Traced views -> pictures to find the object in: dressed, lit, with a chart, and measured with a camera's errors.
+"""Pictures for the mask's training: traced views with materials, light and a chart, measured with camera errors.
 
-What makes objects hard to find is drawn often: black gloss on black cloth, white on white, the backdrop's own
-colour, deep shadow, printed backdrops, a chart that touches. Backdrops polarize too: cloth and paper little,
-tables as their gloss has it.
+Cases in which objects are hard to find are drawn often: black gloss on black cloth, white on white, an object in the
+backdrop's color, deep shadow, printed backdrops, a chart that touches the object. Backdrops polarize too: cloth and
+paper a little, tables by their gloss.
 """
 
 from dataclasses import dataclass, replace
@@ -18,8 +18,8 @@ from polcap.formats import shipped_data
 from polcap.images import Floats
 from polcap.optics import frames, shade
 from polcap.stages.mask.mask_channels import ReducedPicture, grid
-from polcap.training import backdrop_prints, materials
-from polcap.training.mask_views import Traced, backdrop
+from polcap.training import backdrop_patterns, materials
+from polcap.training.mask_views import MaskView, meet_planes
 from polcap.training.materials import Surface
 
 Mode = Literal["any", "dark", "black", "white", "alike", "shadow", "printed", "pictured"]
@@ -27,58 +27,63 @@ MODES: dict[Mode, float] = {
     "any": 0.2, "dark": 0.12, "black": 0.1, "white": 0.08, "alike": 0.12, "shadow": 0.11, "printed": 0.12,
     "pictured": 0.15,
 }  # fmt: skip
-_BANK = np.random.default_rng(0).standard_normal(1 << 21, dtype=np.float32)
-_PITCH = 16  # px per patch of the chart's own picture
+_NOISE = np.random.default_rng(0).standard_normal(1 << 21, dtype=np.float32)
+_PITCH = 16  # px per patch in the picture of the chart
 
 
 @dataclass(frozen=True)
-class Picture:
-    """What the camera saw, before noise, and the truth."""
+class MaskScene:
+    """Light at the camera, before noise, and the truth."""
 
     stokes: Floats  # (3, H, W, 3) S0, S1, S2 in linear Rec.709
-    chart: NDArray[np.bool_]  # (H, W) where the detector would say that the chart is
-    corners: Floats | None  # (4, 2) px, outer corners of the patches, dark skin first; None: not found
+    chart: NDArray[np.bool_]  # (H, W) the chart, where it is found
+    corners: Floats | None  # (4, 2) px, of the outer patches, dark skin first; None: not found
     mask: NDArray[np.bool_]  # (H, W)
 
 
-def draw(
-    traced: Traced, library: materials.Library, mode: Mode, rng: np.random.Generator, charted: float = 0.75,
+def make_scene(
+    view: MaskView, library: materials.MaterialLibrary, mode: Mode, rng: np.random.Generator, charted: float = 0.75,
     touching: float = 0.4,
-) -> Picture:  # fmt: skip
-    """Dress and light a view; draws from `rng` and from torch's global random state.
+) -> MaskScene:  # fmt: skip
+    """Draw materials and light for a view, from `rng` and from torch's global random state.
 
-    charted, touching: how likely a chart stands there, and that it stands as near to the object as can be.
+    charted, touching: probability of a chart, and that it is placed as near to the object as possible.
     """
-    height, width = traced.size
-    v = frames.rays(traced.view, height, width).reshape(-1, 3)
-    far, facing, plane = backdrop(traced.planes, v)
-    outside = np.flatnonzero(np.isfinite(far) & ~traced.mask.reshape(-1))
+    height, width = view.size
+    traced = view.object
+    v = frames.rays(view.view, height, width).reshape(-1, 3)
+    far, facing, plane = meet_planes(view.planes, v)
+    outside = np.flatnonzero(np.isfinite(far) & ~view.mask.reshape(-1))
     place = np.concatenate([-v[traced.inside] * (traced.depth / v[traced.inside, 2])[:, None],
                             -v[outside] * far[outside, None]])  # fmt: skip
     normal = np.concatenate([traced.normal.astype(np.float32), facing[outside]])
     position = np.concatenate([traced.position.astype(np.float32), place[len(traced.inside) :]])
     owner = torch.cat([torch.zeros(len(traced.inside), dtype=torch.long), torch.ones(len(outside), dtype=torch.long)])
     turn = torch.stack([torch.from_numpy(traced.turn).float(), torch.eye(3)])
-    surface = materials.dress(
+    surface = materials.draw_surface(
         library, torch.from_numpy(normal).float(), torch.from_numpy(position).float(), turn, owner, 2
     )
     number = np.concatenate([np.full(len(traced.inside), -1), plane[outside]])
-    surface, polarizing = _dressed(surface, position, number, mode, rng)
+    surface, polarizing = _change_materials(surface, position, number, mode, rng)
     at = np.concatenate([traced.inside, outside])
-    lit = np.concatenate([traced.lit, ~traced.shadow.reshape(-1)[outside]])
-    light = _light(traced, surface, v[at], place, _soft(lit, at, traced.size, rng), polarizing, rng)
+    lit = np.concatenate([traced.lit, ~view.shadow.reshape(-1)[outside]])
+    light = _light(view, surface, v[at], place, _soften(lit, at, view.size, rng), polarizing, rng)
     flat = np.zeros((3, height * width, 3), np.float32)
     flat[:, at] = light
     flat[0] += 1e-4 * rng.uniform(0, 1, 3)  # stray light
     image = flat.reshape(3, height, width, 3)
-    chart, corners = np.zeros(traced.size, bool), None
+    chart, corners = np.zeros(view.size, bool), None
     if rng.random() < charted:
-        chart, corners = _add_chart(image, traced, touching, rng)
-    return Picture(_blurred(image, rng.uniform(0.35, 0.9)), chart, corners, traced.mask)
+        chart, corners = _add_chart(image, view.mask, touching, rng)
+    sigma = rng.uniform(0.35, 0.9)
+    blurred = np.stack([cv2.GaussianBlur(one, (0, 0), sigma) for one in image])
+    return MaskScene(blurred, chart, corners, view.mask)
 
 
-def measured(color: Floats, sums: Floats, chart: NDArray[np.bool_], rng: np.random.Generator) -> ReducedPicture:
-    """S0 (H, W, 3) and the sums over colours (3, H, W) with noise, gains not yet known, shots not quite aligned."""
+def simulate_measurement(
+    color: Floats, sums: Floats, chart: NDArray[np.bool_], rng: np.random.Generator
+) -> ReducedPicture:
+    """Add noise and errors of gain and alignment to S0 (H, W, 3) and to the sums over colors (3, H, W)."""
     bright = float(np.percentile(color.mean(-1), 98)) + 1e-9
     color, sums = (np.asarray(a / bright, np.float32) for a in (color, sums))
     noise = float(np.exp(rng.uniform(np.log(3e-4), np.log(6e-3))))
@@ -97,31 +102,31 @@ def measured(color: Floats, sums: Floats, chart: NDArray[np.bool_], rng: np.rand
 
 
 def _noise(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
-    """Of unit deviation, from a bank: drawing it anew costs as much as a tenth of a step of training."""
+    """Noise of standard deviation 1, from a stored table: drawing it would take a tenth of the training time."""
     count = int(np.prod(shape))
-    start = int(rng.integers(len(_BANK) - count))
-    return _BANK[start : start + count].reshape(shape)
+    start = int(rng.integers(len(_NOISE) - count))
+    return _NOISE[start : start + count].reshape(shape)
 
 
-def _dressed(
+def _change_materials(
     surface: Surface, position: Floats, number: NDArray[np.intp], mode: Mode, rng: np.random.Generator
 ) -> tuple[Surface, Tensor]:
-    """The materials changed as `mode` asks, and how much of its polarization each pixel keeps (M,).
+    """Surface changed by `mode`, and a factor on the polarization of each pixel (M,).
 
-    number (M,): −1 the object, 0 the plane it stands on or before, 1 the wall behind that.
+    number (M,): −1 for the object, 0 for the plane below or behind it, 1 for the wall behind that plane.
     """
     diffuse, rough, specular = surface.diffuse.numpy(), surface.roughness.numpy(), surface.specular.numpy()
-    kept = np.full(len(diffuse), rng.uniform(0.35, 1.0), np.float32)
+    factor = np.full(len(diffuse), rng.uniform(0.35, 1.0), np.float32)
     object_ = number < 0
     tone = _tone(diffuse, object_)
     if mode == "black":
-        _recolored(diffuse, object_, np.exp(rng.uniform(np.log(0.003), np.log(0.05))), rng.uniform(0, 0.6), rng)
+        _recolor(diffuse, object_, np.exp(rng.uniform(np.log(0.003), np.log(0.05))), rng.uniform(0, 0.6), rng)
         rough[object_] = np.clip(0.3 * rough[object_] + rng.uniform(0.05, 0.35), 0.08, 1)
         specular[object_] = rng.uniform(0.03, 0.06)
     elif mode == "white":
-        _recolored(diffuse, object_, rng.uniform(0.55, 0.9), rng.uniform(0, 0.2), rng)
+        _recolor(diffuse, object_, rng.uniform(0.55, 0.9), rng.uniform(0, 0.2), rng)
     elif mode == "shadow" or rng.random() < 0.1:
-        _recolored(diffuse, object_, tone * rng.uniform(0.2, 1.0), rng.uniform(0.3, 1), rng)
+        _recolor(diffuse, object_, tone * rng.uniform(0.2, 1.0), rng.uniform(0.3, 1), rng)
     for plane in (0, 1):
         wall = number == plane
         if not wall.any():
@@ -129,76 +134,58 @@ def _dressed(
         gloss = mode not in ("dark", "black") and rng.random() < 0.3
         if mode in ("dark", "black", "shadow"):
             level = np.exp(rng.uniform(np.log(0.004), np.log(0.06)))
-            _recolored(diffuse, wall, level, rng.choice([0.0, rng.uniform(0, 0.6)]), rng)
+            _recolor(diffuse, wall, level, rng.choice([0.0, rng.uniform(0, 0.6)]), rng)
         elif mode == "white":
-            _recolored(diffuse, wall, rng.uniform(0.45, 0.92), rng.choice([0.0, rng.uniform(0, 0.2)]), rng)
+            _recolor(diffuse, wall, rng.uniform(0.45, 0.92), rng.choice([0.0, rng.uniform(0, 0.2)]), rng)
         elif mode == "alike":
             mean = diffuse[object_].mean(axis=0) * rng.uniform(0.6, 1.5)
             share = rng.uniform(0, 0.8)
             relative = diffuse[wall] / max(_tone(diffuse, wall), 1e-3)
             diffuse[wall] = mean * (1 - share + share * relative)
         elif mode == "printed":
-            diffuse[wall] = _printed(position[wall], rng)
+            diffuse[wall] = backdrop_patterns.draw_print(position[wall], rng)
         elif mode == "pictured":
-            diffuse[wall] = backdrop_prints.drawn(position[wall], rng)
+            diffuse[wall] = backdrop_patterns.draw_pattern(position[wall], rng)
         elif rng.random() < 0.5:  # plain paper, cloth or board
-            _recolored(diffuse, wall, np.exp(rng.uniform(np.log(0.02), np.log(0.9))), rng.uniform(0, 0.3), rng)
+            _recolor(diffuse, wall, np.exp(rng.uniform(np.log(0.02), np.log(0.9))), rng.uniform(0, 0.3), rng)
         specular[wall] = rng.uniform(0.03, 0.05) if gloss else rng.uniform(0.0, 0.02)
         rough[wall] = rng.uniform(0.15, 0.6) if gloss else rng.uniform(0.6, 1.0)
-        kept[wall] = rng.uniform(0.4, 1.0) if gloss else rng.uniform(0.0, 0.35)
+        factor[wall] = rng.uniform(0.4, 1.0) if gloss else rng.uniform(0.0, 0.35)
     maps = (torch.from_numpy(a) for a in (np.clip(diffuse, 0.0, 0.97), np.clip(specular, 0.0, 0.97), rough))
-    return replace(surface, **dict(zip(("diffuse", "specular", "roughness"), maps))), torch.from_numpy(kept)
+    return replace(surface, **dict(zip(("diffuse", "specular", "roughness"), maps))), torch.from_numpy(factor)
 
 
 def _tone(diffuse: Floats, where: NDArray[np.bool_]) -> float:
+    """Mean albedo."""
     return float(diffuse[where].mean()) if where.any() else 0.2
 
 
-def _recolored(
+def _recolor(
     diffuse: Floats, where: NDArray[np.bool_], level: float, contrast: float, rng: np.random.Generator
 ) -> None:
-    """That mean albedo, nearly grey half of the time, with so much of the pattern that was there; in place."""
+    """Set the mean albedo to `level`, nearly gray in half of the cases, and scale the pattern's contrast; in place."""
     pattern = diffuse[where] / max(_tone(diffuse, where), 1e-3)
     hue = np.exp(rng.normal(0, rng.choice([0.03, 0.3]), 3))
     diffuse[where] = np.clip(level * hue * (1 - contrast + contrast * pattern), 0.002, 0.95)
 
 
-def _printed(position: Floats, rng: np.random.Generator) -> Floats:
-    """Checks, stripes, dots or markers in two colours, (M, 3)."""
-    u, w = (position @ frame for frame in np.linalg.qr(rng.normal(size=(3, 3)))[0][:2])
-    size = float(np.exp(rng.uniform(np.log(0.04), np.log(0.5))))
-    u, w = u / size, w / size
-    kind = rng.integers(4)
-    if kind == 0:
-        second = (np.floor(u) + np.floor(w)) % 2 > 0
-    elif kind == 1:
-        second = u % 1 < rng.uniform(0.2, 0.8)
-    elif kind == 2:
-        second = np.hypot(u % 1 - 0.5, w % 1 - 0.5) < rng.uniform(0.15, 0.45)
-    else:  # squares with random cells, as boards of markers have
-        cells = rng.random((7, 7)) < 0.5
-        second = cells[np.floor(5 * u).astype(int) % 7, np.floor(5 * w).astype(int) % 7]
-    colors = np.exp(rng.uniform(np.log(0.02), np.log(0.9), (2, 1))) * np.exp(rng.normal(0, 0.25, (2, 3)))
-    return np.asarray(np.clip(colors[second.astype(int)], 0.005, 0.95))
-
-
-def _soft(lit: NDArray[np.bool_], at: NDArray[np.intp], size: tuple[int, int], rng: np.random.Generator) -> Floats:
-    """The flash has a size: shadows with soft edges, (M,)."""
+def _soften(lit: NDArray[np.bool_], at: NDArray[np.intp], size: tuple[int, int], rng: np.random.Generator) -> Floats:
+    """Lit pixels (M,) with soft edges of shadows, because the flash has a size."""
     image = np.ones(size, np.float32)
     image.reshape(-1)[at] = lit
     return np.asarray(cv2.GaussianBlur(image, (0, 0), rng.uniform(0.4, 2.5)).reshape(-1)[at])
 
 
 def _light(
-    traced: Traced, surface: Surface, v: Floats, place: Floats, lit: Floats, polarizing: Tensor,
+    view: MaskView, surface: Surface, v: Floats, place: Floats, lit: Floats, polarizing: Tensor,
     rng: np.random.Generator,
 ) -> Floats:  # fmt: skip
-    """Stokes parameters (3, M, 3) of flash and of what walls throw back."""
-    to_light = torch.from_numpy(traced.flash - place).float()
+    """Stokes parameters (3, M, 3) under the flash and the weak light from the walls of the room."""
+    to_light = torch.from_numpy(view.flash - place).float()
     squared = (to_light**2).sum(dim=1)
     rays = torch.from_numpy(v).float()
     way = frames.to_ray_frame(to_light / squared.sqrt()[:, None], rays)
-    irradiance = torch.from_numpy(lit) * float(traced.distance) ** 2 / squared
+    irradiance = torch.from_numpy(lit) * float(view.distance) ** 2 / squared
     normal = frames.lifted(frames.to_ray_frame(surface.normal, rays))
     stokes = shade.stokes(
         normal, surface.diffuse.float(), surface.specular.float(), surface.roughness.float(), surface.ior, way,
@@ -211,14 +198,14 @@ def _light(
 
 
 def _add_chart(
-    image: Floats, traced: Traced, touching: float, rng: np.random.Generator
+    image: Floats, mask: NDArray[np.bool_], touching: float, rng: np.random.Generator
 ) -> tuple[NDArray[np.bool_], Floats | None]:
-    """A ColorChecker beside or behind the object, drawn into S0; where the detector puts it, and its corners.
+    """Draw a ColorChecker next to or behind the object into S0; returns its found area (H, W) and corners (4, 2).
 
     One in fourteen is not found.
     """
-    height, width = traced.size
-    mask = traced.mask
+    height, width = mask.shape
+    none = np.zeros(mask.shape, bool), None
     frame = rng.uniform(0.15, 0.5)
     picture, ratio = _chart_picture(frame), (4 + 2 * frame) / (6 + 2 * frame)
     best: tuple[float, Floats] | None = None
@@ -231,7 +218,7 @@ def _add_chart(
         quad = half @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
         quad *= 1 + rng.normal(0, 0.02, (4, 2))
         quad += rng.uniform(0, 1, 2) * [width, height]
-        zone = cv2.fillConvexPoly(np.zeros(traced.size, np.uint8), np.round(quad).astype(np.int32), 1) > 0
+        zone = _fill(quad, mask.shape)
         if (quad < 0).any() or (quad >= [width, height]).any() or not zone.any():
             continue
         hidden = mask[zone].mean()
@@ -241,7 +228,7 @@ def _add_chart(
         if best is None or cost < best[0]:
             best = cost, quad
     if best is None:
-        return np.zeros(traced.size, bool), None
+        return none
     quad = best[1]
     tall, wide = picture.shape[:2]
     source = np.array([[0, 0], [wide, 0], [wide, tall], [0, tall]], np.float32) - 0.5
@@ -257,14 +244,16 @@ def _add_chart(
     inner = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * frame * _PITCH + source  # outer corners of the patches
     corners = cv2.perspectiveTransform(inner[None].astype(np.float32), matrix)[0]
     corners += rng.normal(0, 0.004 * max(height, width), (4, 2)) * (rng.random() < 0.3)
-    if rng.random() < 1 / 14:
-        return np.zeros(traced.size, bool), None
-    zone = cv2.fillConvexPoly(np.zeros(traced.size, np.uint8), np.round(corners).astype(np.int32), 1)
-    return zone > 0, corners
+    return none if rng.random() < 1 / 14 else (_fill(corners, mask.shape), corners)
+
+
+def _fill(quad: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Pixels (H, W) inside a quadrangle (4, 2)."""
+    return np.asarray(cv2.fillConvexPoly(np.zeros(shape, np.uint8), np.round(quad).astype(np.int32), 1) > 0)
 
 
 def _chart_picture(frame: float) -> Floats:
-    """A chart seen straight on, (h, w, 3), with a black frame `frame` patches wide."""
+    """A chart seen from the front, (h, w, 3), with a black frame `frame` patches wide."""
     colors = shipped_data.colorchecker().rec709.reshape(4, 6, 3)
     border = round(frame * _PITCH)
     out = np.full((4 * _PITCH + 2 * border, 6 * _PITCH + 2 * border, 3), 0.03, np.float32)
@@ -273,7 +262,3 @@ def _chart_picture(frame: float) -> Floats:
             y, x = border + row * _PITCH, border + column * _PITCH
             out[y + 1 : y + _PITCH - 1, x + 1 : x + _PITCH - 1] = colors[row, column]
     return out
-
-
-def _blurred(image: Floats, sigma: float) -> Floats:
-    return np.stack([cv2.GaussianBlur(one, (0, 0), sigma) for one in image])

@@ -1,11 +1,10 @@
-"""Random materials on traced views: diffuse, specular, roughness, refractive index and bumped normals.
+"""Random materials for training: diffuse, specular, roughness, refractive index and bumped normals of each pixel.
 
-Works on flat lists of the object's pixels (M, ·), because two thirds of a view are background. An
-object wears one to three materials in regions of solid noise. Each takes its pattern from a texture
-set, projected along the nearest axis, or from solid noise; specular reflectance and roughness follow
-the pattern of the albedo as in real materials, around levels drawn per material. Many patterns are two
-surfaces in one, as print, glaze, inlay and wear are: two glosses a few pixels apart, often in relief. Gloss and the
-law of the body are drawn by `gloss.py`.
+Functions take flat lists of the object's pixels (M, ·), because two thirds of a view are background. An object has one
+to three materials in regions of solid noise. The pattern of a material comes from a texture set, projected along the
+nearest axis, or from solid noise. F0 and roughness follow the pattern of the albedo, as in real materials, about levels
+drawn per material. Many patterns mix two surfaces, as print, glaze, inlay and wear do: two glosses a few pixels from
+each other, often in relief. `gloss.py` draws gloss and diffuse polarization.
 """
 
 import math
@@ -22,23 +21,23 @@ from polcap.optics.body import SMOOTH, Law
 from polcap.training import gloss
 
 _MATERIALS = 3  # slots per object
-_SIDE = 48  # of the noise volume
-_TEXELS = 256
+_SIDE = 48  # of the noise volume, cells
+_TEXELS = 256  # side of a texture
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Per pixel of the object; camera frame."""
+    """Surface at M pixels; camera frame."""
 
     normal: Tensor  # (M, 3) with bumps
     diffuse: Tensor  # (M, 3)
     specular: Tensor  # (M, 3) F0
     roughness: Tensor  # (M,)
     ior: Tensor  # (M,)
-    law: Law = SMOOTH  # (M,)
+    law: Law = SMOOTH  # (M,) diffuse polarization
 
 
-class Library:
+class MaterialLibrary:
     """Texture sets and a volume of tileable noise on one device."""
 
     def __init__(self, folder: Path | None, device: torch.device, seed: int = 3) -> None:
@@ -53,21 +52,21 @@ class Library:
         self.noise = _noise_volume(seed).to(device)  # (1, 7, D, D, D)
 
     def sample_textures(self, which: Tensor, u: Tensor, v: Tensor) -> Tensor:
-        """(M, 6): albedo, roughness, slope along u and v; mirrored at each whole number of u, v."""
+        """(M, 6): albedo, roughness, slope along u and v; mirrored at integer u, v."""
         count = self.texture.shape[2]
         slot = which.float() * (2.0 / max(count - 1, 1)) - 1.0
         grid = torch.stack([_mirror(u), _mirror(v), slot], dim=-1)[None, None, None]
-        taken = F.grid_sample(self.texture, grid, mode="bilinear", padding_mode="border", align_corners=True)
-        return taken[0, :, 0, 0].T
+        sampled = F.grid_sample(self.texture, grid, mode="bilinear", padding_mode="border", align_corners=True)
+        return sampled[0, :, 0, 0].T
 
     def sample_noise(self, position: Tensor) -> Tensor:
-        """(M, 7): four noises of unit deviation, then the gradient of the fourth."""
+        """(M, 7): four noises of standard deviation 1, then the gradient of the fourth."""
         grid = _mirror(position)[None, None, None]
         return F.grid_sample(self.noise, grid, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0, 0].T
 
 
-def dress(
-    library: Library,
+def draw_surface(
+    library: MaterialLibrary,
     normal: Tensor,
     position: Tensor,
     turn: Tensor,
@@ -77,70 +76,86 @@ def dress(
 ) -> Surface:
     """Draw a material for each of `count` objects and evaluate it at their pixels.
 
-    normal (M, 3) camera frame, position (M, 3) object frame, turn (B, 3, 3) object → camera,
-    owner (M,) the object of each pixel; smooth_share of objects with the smooth law of the body.
+    normal (M, 3) camera frame, position (M, 3) object frame, turn (B, 3, 3) from object to camera, owner (M,) the
+    object of each pixel; smooth_share: of objects with a smooth interface (`optics/body.py`).
     """
     device = normal.device
-    frame = _rotations(count, device)  # object → pattern
-    inner = _turned(frame, position, owner)
-    facing = _turned(frame @ turn.transpose(1, 2), normal, owner)
-
-    coarse, fine, printed = (
+    frame = _rotations(count, device)  # from object to pattern
+    inner = _rotate(frame, position, owner)
+    facing = _rotate(frame @ turn.transpose(1, 2), normal, owner)
+    regions, fine, printed = (
         library.sample_noise(inner * _log_uniform((count, 1), low, high, device)[owner] + _u((count, 3), device)[owner])
         for low, high in ((0.5, 2.5), (2.0, 9.0), (4.0, 28.0))
     )
-
-    used = 1 + torch.bucketize(_u((count,), device), torch.tensor([0.5, 0.85], device=device))  # most wear one or two
+    used = 1 + torch.bucketize(_u((count,), device), torch.tensor([0.5, 0.85], device=device))  # mostly one or two
     active = torch.arange(_MATERIALS, device=device)[None] < used[:, None]
-    score = torch.where(active[owner], coarse[:, :_MATERIALS], -9.0)
-    table = _draw(library, count, device)
-    flat = owner * _MATERIALS + score.argmax(dim=1)
-    own = {name: value.reshape(count * _MATERIALS, -1)[flat].squeeze(-1) for name, value in table.items()}
+    slot = torch.where(active[owner], regions[:, :_MATERIALS], -9.0).argmax(dim=1)
+    levels = _draw_levels(library, count, device)
+    chosen = owner * _MATERIALS + slot
+    own = {name: value.reshape(count * _MATERIALS, -1)[chosen].squeeze(-1) for name, value in levels.items()}
 
-    axis = facing.abs().argmax(dim=1)
+    axis = facing.abs().argmax(dim=1)  # of the texture's projection
+    across, up = ((axis + step) % 3 for step in (1, 2))
     scale = _log_uniform((count,), 0.4, 3.0, device)[owner]
-    u = inner.gather(1, ((axis + 1) % 3)[:, None])[:, 0] * scale + own["shift"]
-    v = inner.gather(1, ((axis + 2) % 3)[:, None])[:, 0] * scale
-    slot = own["texture"].long()
-    picture = library.sample_textures(slot, u, v)
+    u = inner.gather(1, across[:, None])[:, 0] * scale + own["shift"]
+    v = inner.gather(1, up[:, None])[:, 0] * scale
+    texture = own["texture"].long()
+    picture = library.sample_textures(texture, u, v)
+    lightness = (picture[:, :3].mean(dim=1) ** 0.45 - library.middle[texture]) / library.spread[texture]
 
-    raised = own["raised"] > 0.5  # the pattern is the relief's
-    pattern = torch.sigmoid(own["contrast"] * (torch.where(raised, fine[:, 3], printed[:, 0]) + own["level"]))
-    painted = own["color"] * (1 - pattern[:, None]) + own["color2"] * pattern[:, None]
-    textured = own["from_texture"] > 0.5
-    tone = (picture[:, :3].mean(dim=1) ** 0.45 - library.middle[slot]) / library.spread[slot]
-    toned = textured & (own["toned"] > 0.5)  # two surfaces that go with the texture set's own light and dark
-    pattern = torch.where(toned, torch.sigmoid(own["contrast"] * (tone + 0.5 * own["level"])), pattern)
-    diffuse = torch.where(textured[:, None], picture[:, :3] * own["tint"], painted).clamp(0.005, 0.95)
-    lightness = diffuse.mean(dim=1) ** 0.45
-    deviation = (lightness - own["mid"]) * own["follow"] + 0.5 * own["speckle"] * fine[:, 1]
-    rough = torch.where(textured, picture[:, 3] * own["rough_gain"] + own["rough_shift"], own["rough"] + deviation)
-    rough = rough + own["rough_step"] * pattern
-    reflectance = own["f0"] * (1 + own["f0_follow"] * (lightness - own["mid"]) + own["speckle"] * fine[:, 2])
-    reflectance = reflectance * torch.exp(own["f0_step"] * pattern)
-    specular = (reflectance[:, None] * own["f0_tint"]).clamp(0.015, 0.4)
-
-    law = gloss.laws(count, device, smooth_share).at(owner)
+    pattern, diffuse = _albedo(own, fine, printed, picture, lightness)
+    rough, specular = _reflection(own, fine, picture, pattern, diffuse)
+    law = gloss.draw_laws(count, device, smooth_share).at(owner)
     fibers = torch.where(law.rough > 0, own["kept"] + own["kept_step"] * pattern, 1.0)
 
-    relief = fine[:, 4:7] * torch.where(raised, 4 * pattern * (1 - pattern), 1.0)[:, None]
-    slope = torch.zeros_like(facing).scatter(1, ((axis + 1) % 3)[:, None], picture[:, 4:5])
-    slope = slope.scatter(1, ((axis + 2) % 3)[:, None], picture[:, 5:6])
-    slope = torch.where(textured[:, None], slope, relief)  # in the pattern's frame
-    slope = _turned(turn, _turned(frame.transpose(1, 2), slope, owner), owner)
+    relief = fine[:, 4:7] * torch.where(own["raised"] > 0.5, 4 * pattern * (1 - pattern), 1.0)[:, None]
+    slope = torch.zeros_like(facing).scatter(1, across[:, None], picture[:, 4:5])
+    slope = slope.scatter(1, up[:, None], picture[:, 5:6])
+    slope = torch.where((own["from_texture"] > 0.5)[:, None], slope, relief)  # in the pattern's frame
+    slope = _rotate(turn, _rotate(frame.transpose(1, 2), slope, owner), owner)
     along = (slope * normal).sum(dim=1, keepdim=True)
-    bent = normal + own["bump"][:, None] * (slope - along * normal)
+    tilted = normal + own["bump"][:, None] * (slope - along * normal)
     return Surface(
-        normal=F.normalize(bent, dim=1),
+        normal=F.normalize(tilted, dim=1),
         diffuse=diffuse,
         specular=specular,
-        roughness=rough.clamp(0.05, 1.0),
+        roughness=rough,
         ior=own["ior"],
         law=Law(law.rough, law.local, law.kept * fibers),
     )
 
 
-def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tensor]:
+def _albedo(
+    own: dict[str, Tensor], fine: Tensor, printed: Tensor, picture: Tensor, lightness: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Pattern (M,) 0…1 that mixes two surfaces, and diffuse albedo (M, 3).
+
+    The pattern is that of the relief, or a print, or the lightness of the texture.
+    """
+    noise = torch.where(own["raised"] > 0.5, fine[:, 3], printed[:, 0])
+    pattern = torch.sigmoid(own["contrast"] * (noise + own["level"]))
+    painted = own["color"] * (1 - pattern[:, None]) + own["color2"] * pattern[:, None]
+    textured = own["from_texture"] > 0.5
+    by_lightness = textured & (own["by_lightness"] > 0.5)
+    pattern = torch.where(by_lightness, torch.sigmoid(own["contrast"] * (lightness + 0.5 * own["level"])), pattern)
+    return pattern, torch.where(textured[:, None], picture[:, :3] * own["tint"], painted).clamp(0.005, 0.95)
+
+
+def _reflection(
+    own: dict[str, Tensor], fine: Tensor, picture: Tensor, pattern: Tensor, diffuse: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Roughness (M,) and F0 (M, 3): levels of the material that follow its pattern, lightness and speckles."""
+    lightness = diffuse.mean(dim=1) ** 0.45
+    deviation = (lightness - own["mid"]) * own["follow"] + 0.5 * own["speckle"] * fine[:, 1]
+    from_texture = picture[:, 3] * own["rough_gain"] + own["rough_shift"]
+    rough = torch.where(own["from_texture"] > 0.5, from_texture, own["rough"] + deviation)
+    rough = rough + own["rough_step"] * pattern
+    reflectance = own["f0"] * (1 + own["f0_follow"] * (lightness - own["mid"]) + own["speckle"] * fine[:, 2])
+    reflectance = reflectance * torch.exp(own["f0_step"] * pattern)
+    return rough.clamp(0.05, 1.0), (reflectance[:, None] * own["f0_tint"]).clamp(0.015, 0.4)
+
+
+def _draw_levels(library: MaterialLibrary, count: int, device: torch.device) -> dict[str, Tensor]:
     """Levels of each material slot, (B, 3, ·)."""
     shape = (count, _MATERIALS)
 
@@ -151,11 +166,11 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
         return deviation * torch.randn(shape, device=device)
 
     all_dark = gloss.dark_objects(count, device)[:, None]
-    one, other = (gloss.draw(shape, device, all_dark) for _ in range(2))
+    one, other = (gloss.draw_gloss(shape, device, all_dark) for _ in range(2))
     two = u(0, 1) < 0.8  # surfaces in one pattern
-    stuff = u(0, 1) < 0.5  # of which both are of one stuff
-    f0_step = torch.where(stuff, normal(0.2), torch.log(other.f0 / one.f0))
-    as_is = u(0, 1) < 0.5  # roughness of the texture set
+    similar = u(0, 1) < 0.5  # F0 of the two
+    f0_step = torch.where(similar, normal(0.2), torch.log(other.f0 / one.f0))
+    as_is = u(0, 1) < 0.5  # roughness is that of the texture set
     color, color2 = _colors(shape, device), _colors(shape, device)
     near = (u(0, 1) < 0.5)[..., None]
     color2 = torch.where(near, color * (0.4 + 1.2 * _u((*shape, 1), device)), color2)
@@ -166,9 +181,9 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
     color2 = torch.where(other.dark[..., None], gloss.dark_albedo(shape, device), color2)
     tint = torch.where(one.dark[..., None], black / library.middle[texture][..., None] ** (1 / 0.45), tint)
     from_texture = (u(0, 1) < 0.4) if library.has_textures else torch.zeros(shape, device=device)
-    coloured = (one.f0 > 0.08) & (u(0, 1) < 0.3)
-    f0_tint = torch.where(coloured[..., None], 1 + 0.4 * (_u((*shape, 3), device) - 0.5), torch.ones(1, device=device))
-    # solid noise has a slope of unit deviation: 14° at most; textures slope less, so theirs are raised
+    tinted = (one.f0 > 0.08) & (u(0, 1) < 0.3)
+    f0_tint = torch.where(tinted[..., None], 1 + 0.4 * (_u((*shape, 3), device) - 0.5), torch.ones(1, device=device))
+    # slopes of solid noise have a standard deviation of 1, textures are flatter, so theirs are raised; 14° at most
     bump = 0.25 * torch.exp(u(-3, 0)) * torch.sign(u(-1, 1)) * (u(0, 1) < 0.7)
     bump = bump * torch.where(from_texture > 0.5, 2.5, 1.0)
     return {
@@ -183,16 +198,15 @@ def _draw(library: Library, count: int, device: torch.device) -> dict[str, Tenso
         "f0": one.f0, "f0_follow": normal(0.3),
         "rough_step": two * (other.roughness - one.roughness), "f0_step": two * f0_step,
         "kept": one.kept, "kept_step": two * (other.kept - one.kept), "raised": (u(0, 1) < 0.4).float(),
-        "toned": (u(0, 1) < 0.6).float(),
+        "by_lightness": (u(0, 1) < 0.6).float(),
         "ior": (1.5 + normal(0.06)).clamp(1.35, 1.7), "bump": bump,
     }  # fmt: skip
 
 
 def _colors(shape: tuple[int, int], device: torch.device) -> Tensor:
-    """Reflectances (B, 3, 3): grey to saturated, dark to light.
+    """Reflectances (B, 3, 3), gray to saturated, dark to light.
 
-    Every second one is a pure hue mixed as on a display, which leaves vivid colors a channel with hardly any light, as
-    paints and plastics have.
+    Every second one is mixed as on a display, so that vivid colors have one dark channel, as in paints and plastics.
     """
     value = 0.02 + 0.88 * _u((*shape, 1), device) ** 1.3
     hue = _u((*shape, 3), device)
@@ -217,11 +231,11 @@ def _noise_volume(seed: int) -> Tensor:
 
 
 def _mirror(x: Tensor) -> Tensor:
-    """Fold all numbers into −1…1, mirrored at the whole odd ones."""
+    """Fold numbers into −1…1, mirrored at odd integers."""
     return (torch.remainder(x + 1, 4) - 2).abs() - 1
 
 
-def _turned(matrix: Tensor, vector: Tensor, owner: Tensor) -> Tensor:
+def _rotate(matrix: Tensor, vector: Tensor, owner: Tensor) -> Tensor:
     return torch.einsum("mij,mj->mi", matrix[owner], vector)
 
 

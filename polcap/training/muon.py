@@ -1,7 +1,7 @@
-"""Muon: momentum whose matrix is made orthogonal before each step.
+"""The Muon optimizer: momentum, made orthogonal as a matrix before each step.
 
-So no direction of a filter bank starves. From nothing, after 1,316 pictures, normals err by 15.9° where AdamW reaches
-20.2°.
+All directions of a filter bank learn at the same rate. After 1,316 pictures from random weights, normals are off by
+15.9°, with AdamW by 20.2°.
 
 References
 ----------
@@ -12,11 +12,11 @@ Liu et al., Muon is scalable for LLM training, 2025: length of the step.
 import torch
 from torch import Tensor
 
-from polcap.training import arithmetic
+from polcap.training import precision
 
 
 class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without types here
-    """For convolutions, seen as (out, in·kh·kw) matrices, and for linear layers."""
+    """Optimizer of convolutions, as matrices (out, in·kh·kw), and of linear layers."""
 
     def __init__(self, weights: list[Tensor], rate: float, momentum: float = 0.95, decay: float = 0.1) -> None:
         super().__init__(weights, {"lr": rate, "momentum": momentum, "decay": decay})
@@ -24,7 +24,7 @@ class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without 
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def step(self) -> None:
         for group in self.param_groups:
-            by_shape: dict[torch.Size, list[tuple[Tensor, Tensor]]] = {}  # weight and direction
+            by_shape: dict[torch.Size, list[tuple[Tensor, Tensor]]] = {}  # weights and directions
             for weight in group["params"]:
                 gradient = _matrix(_channels_last(weight.grad))
                 mean = self.state[weight].setdefault("mean", torch.zeros_like(gradient))
@@ -33,18 +33,18 @@ class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without 
                 by_shape.setdefault(direction.shape, []).append((_matrix(weight), direction))
             for shape, pairs in by_shape.items():
                 steps = orthogonal(torch.stack([direction for _, direction in pairs]))
-                length = 0.2 * max(shape) ** 0.5 * group["lr"]  # an rms of 0.2 rate per weight
+                length = 0.2 * max(shape) ** 0.5 * group["lr"]  # RMS step of a weight: 0.2 × rate
                 for (matrix, _), step in zip(pairs, steps):
                     matrix.mul_(1 - group["lr"] * group["decay"]).add_(step, alpha=-length)
 
 
 def orthogonal(matrix: Tensor) -> Tensor:
-    """About U Vᵀ of the singular value decompositions U S Vᵀ of (N, rows, columns), by five Newton–Schulz steps.
+    """Approximate U Vᵀ of the singular value decompositions U S Vᵀ of (N, rows, columns), by 5 Newton–Schulz steps.
 
-    Singular values end between 0.7 and 1.2: five steps are too few for exactly 1, and enough for training.
+    Singular values end between 0.7 and 1.2. More steps would bring them to 1; training does not need it.
     """
     wide = matrix if matrix.shape[-2] <= matrix.shape[-1] else matrix.mT
-    x = (wide / (torch.linalg.matrix_norm(wide, keepdim=True) + 1e-7)).to(arithmetic.kind(matrix.device))
+    x = (wide / (torch.linalg.matrix_norm(wide, keepdim=True) + 1e-7)).to(precision.compute_type(matrix.device))
     for _ in range(5):
         square = x @ x.mT
         x = torch.baddbmm(x, torch.baddbmm(square, square, square, beta=-4.7750, alpha=2.0315), x, beta=3.4445)
@@ -52,7 +52,7 @@ def orthogonal(matrix: Tensor) -> Tensor:
 
 
 def _matrix(weight: Tensor) -> Tensor:
-    """(out, in) of a linear layer, (out, kh·kw·in) of a convolution with channels last; shares memory."""
+    """Weights of a layer as a matrix (out, in) or (out, kh·kw·in), of the same memory."""
     return weight if weight.ndim == 2 else weight.permute(0, 2, 3, 1).view(len(weight), -1)
 
 

@@ -1,6 +1,6 @@
-"""Relief finer than the meshes have: engraving, grooves, weave and grain, bent into traced normals.
+"""Random fine relief for training: waves, embossing, grooves and weave, added to traced normals.
 
-Each is a height over places in space whose gradient is known, so that the truth is exact at every pixel.
+Each relief is a height field in space with a known gradient, so that the true normals are exact at every pixel.
 """
 
 from math import pi
@@ -10,22 +10,22 @@ from numpy.typing import NDArray
 
 from polcap.images import Floats
 
-_WAVES = 16  # that a random height is the sum of
-_WIDEST, _FINEST = 40.0, 4.0  # wavelengths, px
-_STEEPEST = 1.2  # slope; beyond, relief would hide itself
-_NONE = 0.2  # share of objects without
+_WAVES = 16  # plane waves in a random height field
+_LONGEST, _SHORTEST = 40.0, 4.0  # wavelengths, px
+_MAX_SLOPE = 1.2  # steeper relief would hide parts of itself
+_NONE = 0.2  # share of objects without relief
 
 
-def slopes(position: Floats, px: float, rng: np.random.Generator) -> Floats:
-    """Gradients (M, 3) of a random relief at places (M, 3), in their frame; px is the length that a pixel shows."""
+def random_slopes(position: Floats, px: float, rng: np.random.Generator) -> Floats:
+    """Gradients (M, 3) of a random relief at positions (M, 3), in the same frame; px: length shown by a pixel."""
     if rng.random() < _NONE:
         return np.zeros_like(position)
-    wavelength = px * _FINEST * (_WIDEST / _FINEST) ** rng.random()
+    wavelength = px * _SHORTEST * (_LONGEST / _SHORTEST) ** rng.random()
     height, gradient = _waves(position, wavelength, rng)
     kind = rng.integers(4)
     if kind == 1:  # embossed: two levels with a flank between them
         gradient = gradient / np.cosh(rng.uniform(2, 6) * (height + rng.normal(0, 0.5)))[:, None] ** 2
-    elif kind == 2:  # grooves along the lines where the height is nothing
+    elif kind == 2:  # grooves along the lines of height 0
         width = rng.uniform(0.15, 0.5)
         gradient = (height / width * np.exp(-((height / width) ** 2)))[:, None] * gradient
     elif kind == 3:  # weave
@@ -36,17 +36,17 @@ def slopes(position: Floats, px: float, rng: np.random.Generator) -> Floats:
         where, _ = _waves(position, px * rng.uniform(80, 300), rng)
         gradient = gradient / (1 + np.exp(-8 * where))[:, None]
     length = np.linalg.norm(gradient, axis=1, keepdims=True)
-    return np.asarray(gradient * np.minimum(1, _STEEPEST / np.maximum(length, 1e-9)), np.float32)
+    return np.asarray(gradient * np.minimum(1, _MAX_SLOPE / np.maximum(length, 1e-9)), np.float32)
 
 
-def bent(normal: Floats, slope: Floats) -> Floats:
-    """Unit normals (M, 3) of a surface whose height has this gradient (M, 3), in one frame."""
+def tilt_normals(normal: Floats, slope: Floats) -> Floats:
+    """Unit normals (M, 3) after adding a height field with gradients `slope` (M, 3); both in one frame."""
     out = normal - slope + np.sum(slope * normal, axis=1, keepdims=True) * normal
     return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True), np.float32)
 
 
 def _waves(position: Floats, wavelength: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """A sum of plane waves of about one length and unit deviation: its height (M,) and gradient (M, 3)."""
+    """Height (M,), of standard deviation 1, and gradient (M, 3) of a sum of plane waves of similar length."""
     way = rng.normal(size=(_WAVES, 3))
     way *= (2 * pi / wavelength * rng.uniform(0.5, 1.3, _WAVES) / np.linalg.norm(way, axis=1))[:, None]
     phase: NDArray[np.float64] = position @ way.T + rng.uniform(0, 2 * pi, _WAVES)
@@ -55,7 +55,7 @@ def _waves(position: Floats, wavelength: float, rng: np.random.Generator) -> tup
 
 
 def _woven(position: Floats, wavelength: float, rng: np.random.Generator) -> Floats:
-    """Gradient (M, 3) of two crossing sets of threads."""
+    """Gradient (M, 3) of two sets of threads that cross."""
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0][:2] * 2 * pi / wavelength
     phase = position @ axes.T + rng.uniform(0, 2 * pi, 2)
     return np.asarray(np.cos(phase) @ axes)

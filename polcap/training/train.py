@@ -1,6 +1,6 @@
-"""Train the main network with one command: traced views, simulated pictures, the loop, the exported model.
+"""Training of the main network, `polcap train`: traced views, simulated pictures, training loop, exported model.
 
-With a budget of pictures the weights of an uninterrupted run follow, on one machine, from the seed.
+With a budget of pictures, an uninterrupted run gives the same weights for the same seed on the same machine.
 """
 
 import queue
@@ -18,61 +18,70 @@ from torch import Tensor
 
 from polcap.errors import InputError
 from polcap.formats.maps import png
-from polcap.training import arithmetic, export, gbuffers, loop, loss, materials, model
-from polcap.training.dataset import Batch, Simulator
+from polcap.training import loop, loss, main_network, materials, onnx_export, precision, traced_views
+from polcap.training.simulator import Batch, Simulator
 from polcap.training.validation import HeldOutPictures
 from polcap.training.variants import VARIANTS
 
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """One training run, as `polcap train` takes it."""
+    """One training run; a field for each option of `polcap train`."""
 
     preset: str = "cpu"  # cpu | gpu: size of the network, of the views and of a batch
     data: Path = Path("data")  # holds meshes/ and materials/
     out: Path = Path("runs/train")  # traced views, checkpoints, metrics
     minutes: float = 90.0  # training time, resumed parts included; tracing is extra
-    samples: int | None = None  # the budget in pictures instead
-    resume: bool = False  # go on from out/last.pt
+    samples: int | None = None  # budget in pictures, instead of minutes
+    resume: bool = False  # continue from out/last.pt
     start: Path | None = None  # ONNX model with the first weights; else random ones
-    done: int = 0  # pictures of `samples` that `start` has learned from: the schedule goes on from there
+    done: int = 0  # pictures of `samples` that `start` has seen; the schedule goes on from there
     views: int | None = None  # of each mesh, instead of the preset's
     procedural: int | None = None  # random shapes, instead of the preset's
-    threads: int = 2  # learners on a CPU, each with a batch of its own; one more thread makes the batches
+    threads: int = 2  # on a CPU, each with a batch of its own; one more thread makes the batches
     seed: int = 1
-    rate: float = 1e-3  # of Muon; at twice that, weights without normalization grew until training diverged
-    variant: str = "ours"  # of variants.py
+    rate: float = 1e-3  # of Muon; at twice this rate weights grew until training diverged
+    variant: str = "ours"  # key of VARIANTS
 
 
 @dataclass(frozen=True)
-class Preset:
+class TrainingPreset:
     """Size of the network, of its training views and of a batch."""
 
-    shape: model.Shape
+    shape: main_network.NetworkShape
     views: int  # per training mesh
     procedural: int  # random shapes, 6 views each
     size: int  # of traced views, px
-    sizes: tuple[int, ...]  # that a batch may have, px; drawn with the weights below
-    early: tuple[float, ...]  # in the first half of the budget: many objects
-    late: tuple[float, ...]  # in the second: detail
+    sizes: tuple[int, ...]  # of the pictures of a batch, px
+    early: tuple[float, ...]  # probabilities of the sizes in the first half of the budget: many objects
+    late: tuple[float, ...]  # in the second half: detail
     pixels: int  # of a batch
 
 
 PRESETS = {
-    "cpu": Preset(
-        model.SMALL, 80, 1200, 192, (96, 128, 160, 192), (0.4, 0.35, 0.15, 0.1), (0.1, 0.25, 0.3, 0.35), 10 * 128**2
+    "cpu": TrainingPreset(
+        main_network.SMALL,
+        80,
+        1200,
+        192,
+        (96, 128, 160, 192),
+        (0.4, 0.35, 0.15, 0.1),
+        (0.1, 0.25, 0.3, 0.35),
+        10 * 128**2,
     ),
-    "gpu": Preset(model.LARGE, 400, 3000, 256, (128, 192, 256), (0.5, 0.3, 0.2), (0.1, 0.4, 0.5), 64 * 256**2),
+    "gpu": TrainingPreset(
+        main_network.LARGE, 400, 3000, 256, (128, 192, 256), (0.5, 0.3, 0.2), (0.1, 0.4, 0.5), 64 * 256**2
+    ),
 }
 
 
 def main(options: TrainingOptions) -> Path:
-    """Train; returns model.onnx, beside which last.pt, metrics.csv, watch.csv and watch.png are left.
+    """Train and return the path of model.onnx; its folder also gets last.pt, metrics.csv, watch.csv and watch.png.
 
     Raises
     ------
     InputError
-        An option is not known, contradicts another or what `out` holds, or the data lack meshes.
+        An option is unknown, or contradicts another one or the content of `out`; or there are no test meshes.
     """
     _check(options)
     preset = PRESETS[options.preset]
@@ -85,11 +94,11 @@ def main(options: TrainingOptions) -> Path:
         network.load(options.out / "last.pt")
     elif options.start:
         network.begin(options.start, options.done)
-    simulator = Simulator(traced_views(options, preset), library(options, "train", device), device)
+    simulator = Simulator(_open_views(options, preset), _open_library(options.data, device), device)
     network.held_out = HeldOutPictures(options.data, options.out / "watch", device)
     torch.set_num_threads(1)
     budget = loop.Budget(options.minutes, options.samples)
-    batches = _made_ahead(
+    batches = _make_ahead(
         simulator, preset, options.seed + network.step, network.samples, lambda made: network.progress(budget, made)
     )
     loop.run(network, lambda: [next(batches) for _ in range(learners)], budget, options.out)
@@ -104,35 +113,35 @@ def _check(options: TrainingOptions) -> None:
             raise InputError(f"{name} {value!r} is not one of {', '.join(known)}")
     last, test_meshes = options.out / "last.pt", options.data / "meshes" / "test"
     if options.resume and options.start:
-        raise InputError(f"--resume goes on from {last}, --start begins with {options.start}; give one of them")
+        raise InputError(f"--resume continues from {last}, --start starts from {options.start}; give one of them")
     if last.exists() and not options.resume:
-        raise InputError(f"{last} exists already; go on from it with --resume, or choose another --out")
+        raise InputError(f"{last} exists already; continue from it with --resume, or choose another --out")
     if not any(test_meshes.glob("*.npz")):
-        raise InputError(f"{test_meshes} holds no mesh; put one there: training is validated on it")
+        raise InputError(f"{test_meshes} holds no mesh; put at least one there, for validation")
 
 
-def traced_views(options: TrainingOptions, preset: Preset) -> dict[str, Any]:
-    """Views of all training meshes and random shapes, traced now where the cache lacks them."""
-    meshes = gbuffers.training_meshes(options.data)
+def _open_views(options: TrainingOptions, preset: TrainingPreset) -> dict[str, Any]:
+    """Views of all training meshes and random shapes; traced first if the cache is empty."""
+    meshes = traced_views.training_meshes(options.data)
     views = preset.views if options.views is None else options.views
     procedural = preset.procedural if options.procedural is None else options.procedural
-    recipe = gbuffers.Recipe(views=views, procedural=procedural, size=preset.size, seed=13)
-    return gbuffers.cached(options.out / "views", meshes, recipe)
+    recipe = traced_views.ViewsRecipe(views=views, procedural=procedural, size=preset.size, seed=13)
+    return traced_views.open_cache(options.out / "views", meshes, recipe)
 
 
-def library(options: TrainingOptions, split: str, device: torch.device) -> materials.Library:
-    """The texture sets of a split; noise alone where there are none."""
-    folder = options.data / "materials" / split
-    return materials.Library(folder if folder.exists() else None, device)
+def _open_library(data: Path, device: torch.device) -> materials.MaterialLibrary:
+    """Training texture sets; solid noise alone if there are none."""
+    folder = data / "materials" / "train"
+    return materials.MaterialLibrary(folder if folder.exists() else None, device)
 
 
-def _made_ahead(
-    simulator: Simulator, preset: Preset, seed: int, made: int, progress: Callable[[int], float]
+def _make_ahead(
+    simulator: Simulator, preset: TrainingPreset, seed: int, made: int, progress: Callable[[int], float]
 ) -> Generator[Batch, None, None]:
-    """Endless batches, made in a thread of their own while the network learns from earlier ones.
+    """Endless batches, made in a thread while the network learns from earlier ones.
 
-    Only that thread draws from torch's global random state, so the batches follow from the seed. `made` pictures were
-    made before; progress(made) is the share of the budget.
+    Only this thread draws from torch's global random state, so batches follow from the seed. `made`: pictures made
+    before; progress(made) is the spent share of the budget.
     """
     waiting: queue.Queue[Batch | BaseException] = queue.Queue(maxsize=4)
     ended = threading.Event()
@@ -147,7 +156,7 @@ def _made_ahead(
                 size = int(chooser.choice(preset.sizes, p=preset.early if progress(made) < 0.5 else preset.late))
                 count = max(preset.pixels // size**2, 1)
                 made += count
-                waiting.put(simulator.draw(count, size))
+                waiting.put(simulator.draw_batch(count, size))
         except BaseException as error:  # raised again by the loop
             waiting.put(error)
 
@@ -169,27 +178,32 @@ def _made_ahead(
 class NetworkTraining(loop.Trainee):
     """The main network in training.
 
-    Each learner is a thread that computes the gradient of one batch; a step follows their mean. Threads that meet once
-    a step waste less of a busy machine than threads that meet in every operation.
+    Each learner is a thread that computes the gradient of one batch; a step uses their mean. Threads that wait for each
+    other once per step use a busy machine better than threads that share each operation.
     """
 
     schedule = loop.Schedule(hold=0.2, warm_up=100, averaging=0.999, burst=200.0)
-    network: model.Network
+    network: main_network.MainNetwork
 
     def __init__(
-        self, shape: model.Shape, device: torch.device, rate: float, learners: int = 1, variant: str = "ours"
+        self,
+        shape: main_network.NetworkShape,
+        device: torch.device,
+        rate: float,
+        learners: int = 1,
+        variant: str = "ours",
     ) -> None:
-        super().__init__(model.Network(shape, variant).to(device, memory_format=torch.channels_last), rate)
+        super().__init__(main_network.MainNetwork(shape, variant).to(device, memory_format=torch.channels_last), rate)
         self.device = device
         self.weights = list(self.network.parameters())
-        self.lights = [torch.Generator(device).manual_seed(k) for k in range(learners)]  # of the rendering loss
+        self.lights = [torch.Generator(device).manual_seed(k) for k in range(learners)]  # for the rendering loss
         self.pool = ThreadPoolExecutor(learners, initializer=torch.set_num_threads, initargs=(1,))
-        self.begun = ""  # pictures that the first weights had learned from, in words
-        self.done = 0  # pictures of the budget among them
+        self.begun = ""  # training of the first weights, in words
+        self.done = 0  # pictures of that training that count for the budget
         self.held_out: HeldOutPictures | None = None
 
     def advance(self, batch: list[Batch], progress: float) -> dict[str, float]:
-        """One step on a batch per learner."""
+        """Do one step on a batch per learner; returns the mean losses."""
         self.network.train()
         learned = list(self.pool.map(self._gradient, batch, self.lights))
         for weight, gradient in zip(self.weights, learned[0][0]):
@@ -202,15 +216,15 @@ class NetworkTraining(loop.Trainee):
         return {k: float(np.mean([p[k] for p in parts])) for k in parts[0]} | {"gradient": norm}
 
     def _gradient(self, batch: Batch, lights: torch.Generator) -> tuple[tuple[Tensor, ...], dict[str, float]]:
-        """Gradient of one batch's loss, and the parts of that loss."""
-        with arithmetic.fast(self.device):
+        """Gradient of the loss of one batch, and the parts of that loss."""
+        with precision.autocast(self.device):
             maps = self.network(batch.channels.contiguous(memory_format=torch.channels_last))
         polarized = VARIANTS[self.network.variant].polarized_loss
         value, figures = loss.total(maps, batch, lights, polarized=polarized)
         return torch.autograd.grad(value, self.weights), figures
 
     def validate(self, out: Path) -> dict[str, float]:
-        """Mean errors on test meshes; watch.png shows eight of them."""
+        """Mean errors on test meshes; watch.png shows eight of the pictures."""
         assert self.held_out is not None
         with self.averaged() as network:
             png.write(out / "watch.png", self.held_out.picture(network))
@@ -223,58 +237,60 @@ class NetworkTraining(loop.Trainee):
         }  # fmt: skip
 
     def begin(self, path: Path, done: int = 0) -> None:
-        """Take the first weights from a model that `export.write` wrote.
+        """Start with the weights of an exported model.
 
-        `done` pictures count as learned from: with a budget of pictures the schedule goes on from there.
+        With a budget of pictures, `done` of them count as spent, and the schedule continues from there.
 
         Raises
         ------
         InputError
-            It is another network's model.
+            The model is that of another network.
         """
-        weights, metadata = export.read(path)
+        weights, metadata = onnx_export.read_weights(path)
         for name, own in self.network.state_dict().items():
             if name in weights:
                 weights[name] = _with_new_channels(weights[name], own)
         try:
             self.network.load_state_dict(weights)
         except RuntimeError as error:
-            raise InputError(f"{path} is not a network of this preset; start from one that is, or without") from error
+            remedy = "give --start one that is, or leave it out"
+            raise InputError(f"{path} is not a network of this preset; {remedy}") from error
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.begun = metadata.get("training", "unknown")
         self.samples = self.done = done
 
     def load(self, path: Path) -> None:
-        """Go on from a checkpoint.
+        """Continue from a checkpoint.
 
         Raises
         ------
         InputError
-            There is none, or it is another preset's or variant's.
+            There is no checkpoint, or it is one of another preset or variant.
         """
         if not path.exists():
-            raise InputError(f"{path} does not exist: nothing to resume; train without --resume first")
+            raise InputError(f"{path} does not exist, so there is nothing to resume; train without --resume first")
         state = torch.load(path, map_location=self.device, weights_only=True)
         if (state["shape"], state["variant"]) != (asdict(self.network.shape), self.network.variant):
-            raise InputError(f"{path} began with another preset or as {state['variant']!r}; resume it as it began")
+            began = f"{path} was started with another preset or variant ({state['variant']!r})"
+            raise InputError(f"{began}; resume it with the same ones")
         self.restore(state)
         self.begun, self.done = state["begun"], state["done"]
-        for k, generator in enumerate(self.lights):  # other lights than before
+        for k, generator in enumerate(self.lights):  # not the same lights again
             generator.manual_seed(1000 * self.step + k)
 
 
 def _with_new_channels(weight: Tensor, own: Tensor) -> Tensor:
-    """Weights of a convolution that has gained input channels; the new ones come last and start at zero."""
+    """Weights of a convolution that now has more input channels; the new ones come last and start at 0."""
     more = own.shape[1] - weight.shape[1] if own.ndim == weight.ndim == 4 else 0
     if more <= 0 or own.shape[0] != weight.shape[0] or own.shape[2:] != weight.shape[2:]:
         return weight
     return torch.cat([weight, weight.new_zeros(len(weight), more, *weight.shape[2:])], dim=1)
 
 
-def load_average(path: Path) -> tuple[model.Network, dict[str, Any]]:
-    """The network with a checkpoint's averaged weights, on the CPU, and the checkpoint's other facts."""
+def load_average(path: Path) -> tuple[main_network.MainNetwork, dict[str, Any]]:
+    """Network with the averaged weights of a checkpoint, on the CPU, and facts of the training."""
     state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-    network = model.Network(model.Shape(**state["shape"]), state["variant"])
+    network = main_network.MainNetwork(main_network.NetworkShape(**state["shape"]), state["variant"])
     network.load_state_dict(state["average"])
     return network.eval(), {k: state[k] for k in ("step", "samples", "elapsed", "begun", "done")}
 
@@ -287,4 +303,4 @@ def ship(checkpoint: Path, path: Path, version: str, licence: str = "Apache-2.0"
     if facts["begun"]:
         training += f", after {facts['begun']}"
     metadata = {"version": version, "licence": licence, "variant": network.variant, "training": training}
-    return export.write(network, path, metadata)
+    return onnx_export.export_main(network, path, metadata)

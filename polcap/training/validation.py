@@ -1,4 +1,4 @@
-"""Errors on held-out pictures while training runs; no choice depends on them."""
+"""Errors on held-out pictures during training; nothing is chosen by them."""
 
 from pathlib import Path
 
@@ -10,29 +10,31 @@ from polcap.images import Floats
 from polcap.report import stage_pictures as pictures
 from polcap.report.stage_pictures import Picture
 from polcap.stages.cues import FLOOR
-from polcap.training import arithmetic, gbuffers, loss, materials, protocol
-from polcap.training.camera_errors import Errors
-from polcap.training.dataset import Batch, Simulator, batch
-from polcap.training.model import COLOR
+from polcap.training import evaluation_protocol, loss, materials, precision, traced_views
+from polcap.training.camera_errors import CameraErrors
+from polcap.training.main_network import COLOR
+from polcap.training.simulator import Batch, Simulator, to_batch
 
-_FLASH = (0.0, protocol.FLASH)
+_FLASH = (0.0, evaluation_protocol.FLASH)
 
 
 class HeldOutPictures:
-    """Fixed pictures of test meshes with test materials, at the stated camera and flash."""
+    """Fixed pictures of test meshes and test materials, with the camera and flash of the evaluation."""
 
     def __init__(self, data: Path, folder: Path, device: torch.device, *, count: int = 48, size: int = 128) -> None:
-        simulator = held_out(data, folder, device, views=20, size=size)
+        simulator = open_simulator(data, folder, device, views=20, size=size)
         total = len(simulator.camera)
         order = np.random.default_rng(5).permutation(total)[:count]
         self.batches = []
         with torch.random.fork_rng():
             torch.manual_seed(6)
             for first in range(0, len(order), 8):
-                seen = simulator.look(order[first : first + 8], size, flip=False)
-                number = len(seen.mask)
-                photo = simulator.shoot(seen, torch.ones(number, device=device), Errors.stated(number, device))
-                self.batches.append(batch(photo))
+                views = simulator.gather(order[first : first + 8], size, flip=False)
+                number = len(views.mask)
+                photo = simulator.photograph(
+                    views, torch.ones(number, device=device), CameraErrors.stated(number, device)
+                )
+                self.batches.append(to_batch(photo))
 
     def errors(self, network: nn.Module) -> dict[str, float]:
         """Mean errors over all pixels of all pictures."""
@@ -40,18 +42,18 @@ class HeldOutPictures:
         return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
     def picture(self, network: nn.Module) -> Picture:
-        """The first batch, a row each: S0, then normal, diffuse, F0, roughness and depth, truth left of estimate."""
-        seen = self.batches[0]
-        truth = {name: getattr(seen, name) for name in ("normal", "diffuse", "specular", "roughness", "depth")}
-        sides = [_drawn(maps, seen.mask) for maps in (truth, run(network, seen))]
-        light = (torch.exp(seen.channels[:, COLOR].float()) - FLOOR) * seen.mask[:, None]
+        """First batch, one row per picture: S0, then truth and estimate of normal, diffuse, F0, roughness, depth."""
+        batch = self.batches[0]
+        truth = {name: getattr(batch, name) for name in ("normal", "diffuse", "specular", "roughness", "depth")}
+        sides = [_display(maps, batch.mask) for maps in (truth, run(network, batch))]
+        light = (torch.exp(batch.channels[:, COLOR].float()) - FLOOR) * batch.mask[:, None]
         columns = [[pictures.display(s0, 1.0) for s0 in _arrays(light)]]
         columns += [tiles for pair in zip(*sides) for tiles in pair]
         return np.hstack([np.vstack(tiles) for tiles in columns])
 
 
-def _drawn(maps: dict[str, Tensor], mask: Tensor) -> list[list[Picture]]:
-    """Normal (in each ray's frame), diffuse, F0 0…0.3, roughness and depth of every picture."""
+def _display(maps: dict[str, Tensor], mask: Tensor) -> list[list[Picture]]:
+    """Images of normal (in each ray's frame), diffuse, F0 0…0.3, roughness and depth of all pictures."""
     inside = mask.cpu().numpy()
     normal, diffuse, specular, roughness, depth = (
         _arrays(maps[name] * mask[:, None]) for name in ("normal", "diffuse", "specular", "roughness", "depth")
@@ -70,25 +72,27 @@ def _arrays(images: Tensor) -> Floats:
     return np.asarray(images.float().permute(0, 2, 3, 1).cpu().numpy())
 
 
-def held_out(data: Path, folder: Path, device: torch.device, *, views: int, size: int) -> Simulator:
-    """Test meshes, test texture sets and a noise volume that training never saw; traced once into `folder`."""
+def open_simulator(data: Path, folder: Path, device: torch.device, *, views: int, size: int) -> Simulator:
+    """Simulator of test meshes with test materials, unknown to training; traced once into `folder`."""
     meshes = sorted((data / "meshes" / "test").glob("*.npz"))
-    cache = gbuffers.cached(folder, meshes, gbuffers.Recipe(views, procedural=0, size=size, seed=99, flash=_FLASH))
+    cache = traced_views.open_cache(
+        folder, meshes, traced_views.ViewsRecipe(views, procedural=0, size=size, seed=99, flash=_FLASH)
+    )
     textures = data / "materials" / "test"
-    library = materials.Library(textures if textures.exists() else None, device, seed=4)
+    library = materials.MaterialLibrary(textures if textures.exists() else None, device, seed=4)
     return Simulator(cache, library, device)
 
 
 def run(network: nn.Module, batch: Batch) -> dict[str, Tensor]:
-    """The maps of a batch, without gradients."""
+    """Estimated maps of a batch, without gradients."""
     device = batch.channels.device
-    with torch.no_grad(), arithmetic.fast(device):
+    with torch.no_grad(), precision.autocast(device):
         maps: dict[str, Tensor] = network(batch.channels.contiguous(memory_format=torch.channels_last))
     return maps
 
 
 def figures(maps: dict[str, Tensor], batch: Batch) -> dict[str, float]:
-    """Errors over the masked pixels of one batch; `·_constant` is what the best constant map would score."""
+    """Errors over the masked pixels of one batch; `·_constant` is the error of the best constant map."""
     mask = batch.mask
     half = (maps["normal"] - batch.normal).norm(dim=1).clamp(max=2) / 2
     error = torch.rad2deg(2 * torch.asin(half))[mask]
@@ -108,7 +112,7 @@ def figures(maps: dict[str, Tensor], batch: Batch) -> dict[str, float]:
 
 
 def _depth_error(depth: Tensor, batch: Batch) -> Tensor:
-    """Difference of depths centred within each mask, by the truth's greatest minus least; masked pixels."""
+    """Error of relative depth at the masked pixels (M,), in units of the truth's range; both centred in the mask."""
     mask = batch.mask[:, None]
     inside = mask.float()
     low = torch.where(mask, batch.depth, torch.inf).amin(dim=(2, 3), keepdim=True)

@@ -1,7 +1,6 @@
-"""The network with one thing taken away: what the ablations of the paper ask, and what the inputs are worth.
+"""Ablations of the main network: variants without one part, or with other inputs.
 
-All are trained by the same code on the same pictures. Inputs are functions of the channels, so that a
-variant sees the very pictures that the others see.
+All are trained by the same code on the same pictures: their inputs are functions of the channels.
 
 References
 ----------
@@ -24,22 +23,24 @@ _UNPOLARIZED = ("log_r", "log_g", "log_b", "mask", "clipped", "ray_x", "ray_y")
 
 @dataclass(frozen=True)
 class Variant:
-    inputs: Callable[[Tensor], Tensor] = lambda x: x  # channels (B, N, H, W) -> what the layers see, as many
-    sees_dolp: bool = True  # in the profiles of gloss
-    skip_convolutions: bool = True  # a convolution and residual blocks on every skip, else its projection alone
+    """One ablation."""
+
+    inputs: Callable[[Tensor], Tensor] = lambda x: x  # channels (B, N, H, W) -> inputs of the same shape
+    sees_dolp: bool = True  # in the gloss profiles
+    skip_convolutions: bool = True  # residual blocks on every skip connection, else its projection alone
     polarized_loss: bool = True  # Stokes parameters in the rendering loss, else S0 alone
 
 
 def _unpolarized(x: Tensor) -> Tensor:
-    """One picture under the flash: radiance, mask, saturation and rays."""
+    """Channels of one unpolarized flash photograph: radiance, mask, saturation and rays."""
     keep = x.new_tensor([float(name in _UNPOLARIZED) for name in CHANNELS])
     return x * keep.view(1, -1, 1, 1)
 
 
 def _published(x: Tensor) -> Tensor:
-    """The paper's five inputs: pictures at 0°, 45° and 90°, normalised Stokes map, diffuse color; linear.
+    """The paper's five inputs: pictures at 0°, 45° and 90°, normalized Stokes map, diffuse color; linear.
 
-    The pictures' polarization is the mean over the color channels, which are alike but for noise.
+    The polarization of the pictures is the mean over the color channels, which differ by noise only.
     """
     s0 = torch.exp(x[:, _AT["log_r"] : _AT["log_b"] + 1]) - FLOOR
     s1, s2 = (x[:, _AT[name]].unsqueeze(1) / 10 for name in ("s1", "s2"))

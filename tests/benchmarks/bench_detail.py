@@ -24,7 +24,7 @@ from polcap.formats import onnx
 from polcap.images import Floats, Network
 from polcap.pipeline import models
 from polcap.stages import infer
-from polcap.training.protocol import Case, Protocol
+from polcap.training.evaluation_protocol import Case, Protocol
 
 Mask = NDArray[np.bool_]  # (H, W)
 _HALF = 0.375  # σ of the Gaussian that halves a wave of two, in units of half its length: √(2 ln 2)/π

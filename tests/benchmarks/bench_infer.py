@@ -25,7 +25,7 @@ from polcap.pipeline import models
 from polcap.stages import infer
 from polcap.stages.cues import channels
 from polcap.stages.infer import augmentation, learned
-from polcap.training.protocol import Protocol
+from polcap.training.evaluation_protocol import Protocol
 
 
 def main() -> None:
@@ -46,7 +46,7 @@ def _measured(seen: Cues, model: Path | None, symmetries: Literal[1, 2, 4, 8]) -
     """Best seconds of the stage, of one run of the network at its own size; greatest resident memory, GB."""
     network = models.load_network("network", model, "cpu", 0)
     assert network is not None
-    small = learned._resized(seen, int(network.metadata["native_size"]) / max(seen.mask.shape))
+    small = learned._reduce(seen, int(network.metadata["native_size"]) / max(seen.mask.shape))
     settings = infer.InferSettings(symmetries=symmetries)
     floor = _best(lambda: augmentation._run(channels(small), network, onnx.run))
     stage = _best(lambda: infer.estimate(seen, network, onnx.run, settings))

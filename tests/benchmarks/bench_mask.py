@@ -34,22 +34,22 @@ from polcap.optics import mueller
 from polcap.stages import mask
 from polcap.stages.mask.mask_channels import ENCODING
 from polcap.synth.mesh_tracer import Tracer, Triangles, centred
-from polcap.training import gbuffers, mask_scenes, mask_views, materials
-from polcap.training.mask_views import Kind
+from polcap.training import mask_scenes, mask_views, materials, traced_views
+from polcap.training.mask_views import ViewKind
 
 SIZE = (360, 480)
 NEAR, FAR = (0.0, 0.12), (0.3, 0.7)  # flash from the lens [object distances]
-DIFFICULTIES: dict[str, tuple[Kind, mask_scenes.Mode, float]] = {  # view, materials, how likely the chart touches
-    "dark backdrop": (Kind("whole", "wall", NEAR), "dark", 0.0),
-    "black gloss on black cloth": (Kind("whole", "cloth", NEAR), "black", 0.0),
-    "white on white": (Kind("whole", "table", NEAR), "white", 0.0),
-    "deep shadow": (Kind("whole", "wall", FAR), "shadow", 0.0),
-    "patterned backdrop": (Kind("whole", "table", NEAR), "printed", 0.0),
-    "chart touching": (Kind("whole", "wall", NEAR), "any", 1.0),
-    "cut by the frame": (Kind("cut", "wall", NEAR), "dark", 0.0),
-    "several parts": (Kind("whole", "table", NEAR), "any", 0.0),
-    "backdrop's color": (Kind("whole", "cloth", NEAR), "alike", 0.0),
-    "fills the frame": (Kind("full", "wall", NEAR), "any", 0.0),
+DIFFICULTIES: dict[str, tuple[ViewKind, mask_scenes.Mode, float]] = {  # view, materials, how likely the chart touches
+    "dark backdrop": (ViewKind("whole", "wall", NEAR), "dark", 0.0),
+    "black gloss on black cloth": (ViewKind("whole", "cloth", NEAR), "black", 0.0),
+    "white on white": (ViewKind("whole", "table", NEAR), "white", 0.0),
+    "deep shadow": (ViewKind("whole", "wall", FAR), "shadow", 0.0),
+    "patterned backdrop": (ViewKind("whole", "table", NEAR), "printed", 0.0),
+    "chart touching": (ViewKind("whole", "wall", NEAR), "any", 1.0),
+    "cut by the frame": (ViewKind("cut", "wall", NEAR), "dark", 0.0),
+    "several parts": (ViewKind("whole", "table", NEAR), "any", 0.0),
+    "backdrop's color": (ViewKind("whole", "cloth", NEAR), "alike", 0.0),
+    "fills the frame": (ViewKind("full", "wall", NEAR), "any", 0.0),
 }
 
 
@@ -68,8 +68,8 @@ def cases(data: Path, kept: Path) -> Iterator[Case]:
     """The sixty."""
     kept.mkdir(parents=True, exist_ok=True)
     files = sorted((data / "meshes" / "test").glob("*.npz"))
-    library = materials.Library(data / "materials" / "test", torch.device("cpu"))
-    meshes = {file.stem: centred(gbuffers.read_mesh(file)) for file in files}
+    library = materials.MaterialLibrary(data / "materials" / "test", torch.device("cpu"))
+    meshes = {file.stem: centred(traced_views.read_mesh(file)) for file in files}
     for number, difficulty in enumerate(DIFFICULTIES):
         for own, (stem, mesh) in enumerate(meshes.items()):
             rng = np.random.default_rng([77, number, own])
@@ -77,20 +77,20 @@ def cases(data: Path, kept: Path) -> Iterator[Case]:
             if not file.exists():
                 torch.manual_seed(1000 * number + own)
                 if difficulty == "several parts":
-                    mesh = mask_views.several([mesh, meshes[files[(own + 1) % len(files)].stem]], rng)
+                    mesh = mask_views.side_by_side([mesh, meshes[files[(own + 1) % len(files)].stem]], rng)
                 _write(file, mesh, DIFFICULTIES[difficulty], library, rng)
             yield _photographed(f"{difficulty}: {stem}", file, np.random.default_rng([78, number, own]))
 
 
 def _write(
-    file: Path, mesh: Triangles, wanted: tuple[Kind, mask_scenes.Mode, float], library: materials.Library,
+    file: Path, mesh: Triangles, wanted: tuple[ViewKind, mask_scenes.Mode, float], library: materials.MaterialLibrary,
     rng: np.random.Generator,
 ) -> None:  # fmt: skip
     kind, mode, touching = wanted
     tracer, traced = Tracer(mesh), None
     while traced is None:
-        traced = mask_views.look(tracer, kind, SIZE, rng)
-    picture = mask_scenes.draw(traced, library, mode, rng, charted=1.0 if touching else 0.7, touching=touching)
+        traced = mask_views.trace_view(tracer, kind, SIZE, rng)
+    picture = mask_scenes.make_scene(traced, library, mode, rng, charted=1.0 if touching else 0.7, touching=touching)
     stokes = picture.stokes / np.percentile(picture.stokes[0], 97)
     corners = np.zeros((0, 2)) if picture.corners is None else picture.corners
     np.savez_compressed(file, stokes=stokes.astype(np.float16), mask=picture.mask, corners=corners)

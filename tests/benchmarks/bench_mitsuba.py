@@ -20,9 +20,9 @@ from polcap.images import ColorCalibration, SurfaceMaps, View
 from polcap.optics import frames
 from polcap.pipeline import models
 from polcap.stages import cues, infer
-from polcap.training.camera_errors import Errors, photograph
-from polcap.training.protocol import Case, stokes_image
-from polcap.training.score import Judge
+from polcap.training.camera_errors import CameraErrors, photograph
+from polcap.training.evaluation_protocol import Case, stokes_image
+from polcap.training.map_errors import Judge
 
 ROWS = ("normal_mean", "normal_median", "normal_mean_core", "diffuse", "specular", "roughness", "depth", "rendering")
 
@@ -65,7 +65,7 @@ def read(file: Path, clean: bool, rough: bool, seed: int) -> Case:
     at = np.flatnonzero(mask)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        errors = Errors.none(1, one.device) if clean else Errors.stated(1, one.device)
+        errors = CameraErrors.none(1, one.device) if clean else CameraErrors.stated(1, one.device)
         seen = photograph(scene[0][:, None], diffuse, given, v, torch.from_numpy(at), errors)
     white = ColorCalibration(np.eye(3, dtype=np.float32), "profile")
     measured = cues.compute(stokes_image(seen, at, mask, view), white)

@@ -20,9 +20,9 @@ from polcap.images import Floats, Network
 from polcap.pipeline import models
 from polcap.stages import infer
 from polcap.stages.infer import learned
-from polcap.training import gbuffers, patterns, protocol
-from polcap.training.protocol import MESHES, PROTOCOLS, Case, Protocol
-from polcap.training.score import angle, deciles
+from polcap.training import evaluation_materials, evaluation_protocol, traced_views
+from polcap.training.evaluation_protocol import MESHES, PROTOCOLS, Case, Protocol
+from polcap.training.map_errors import angle, deciles
 
 SIZES, SAMPLE = (256, 512), 3000  # px; pixels of each picture
 GREATEST_DEG = 60.0  # errors that count: a wrong half-turn weighs no more
@@ -40,7 +40,7 @@ def main() -> None:
     network = models.load_network("network", options.model, "cpu", 1)
     assert network is not None
     learned._CALIBRATION = _AS_STATED  # what the join itself states
-    patterns._SEED, protocol._SEED = OTHER_SEEDS
+    evaluation_materials._SEED, evaluation_protocol._SEED = OTHER_SEEDS
     options.out.mkdir(parents=True, exist_ok=True)
     shown = [(size, which) for size in SIZES for which in PROTOCOLS]
     found = {key: drawn(options.data, options.out, network, *key, options.rounds) for key in shown}
@@ -55,7 +55,7 @@ def main() -> None:
 def drawn(data: Path, out: Path, network: Network, size: int, which: int, rounds: int) -> Floats:
     """Stated error, roughness and true error (3, N) of pixels of one size and protocol."""
     parts = []
-    meshes = len(gbuffers.training_meshes(data))
+    meshes = len(traced_views.training_meshes(data))
     for first in range(0, rounds * meshes, MESHES):
         files = {number: out / f"{size}_{which}_{number:03d}.npy" for number in range(first, first + MESHES)}
         missing = {number: file for number, file in files.items() if not file.exists()}
@@ -74,9 +74,9 @@ def linked(data: Path, folder: Path, sixth: int, meshes: int) -> None:
     """Six training meshes and ten training materials where `Protocol` looks for the evaluation's."""
     turn, place = divmod(sixth, meshes // MESHES)
     own = np.random.default_rng(turn).permutation(meshes)[place * MESHES :][:MESHES]
-    files = gbuffers.training_meshes(data)
+    files = traced_views.training_meshes(data)
     sets = sorted(path.parent for path in (data / "materials" / "train").glob("*/albedo.jpg"))
-    worn = np.random.default_rng([sixth]).permutation(len(sets))[: patterns.TEXTURES]
+    worn = np.random.default_rng([sixth]).permutation(len(sets))[: evaluation_materials.TEXTURES]
     for kind, chosen in (("meshes", [files[k] for k in own]), ("materials", [sets[k] for k in worn])):
         (folder / kind / "test").mkdir(parents=True)
         for path in chosen:

@@ -29,7 +29,7 @@ from polcap.images import Floats, View
 from polcap.optics import fresnel
 from polcap.synth import render, scene_materials
 from polcap.synth.mesh_tracer import Triangles
-from polcap.training import gbuffers
+from polcap.training import traced_views
 
 FACES = 100_000  # at least, after subdivision: each has one colour
 TEXELS = 1024  # side of the bitmap that holds the faces' colours
@@ -63,8 +63,12 @@ def main() -> None:
         random = np.random.default_rng([2026, index])
         texture = sets[index // 2 % len(sets)] if index % 2 else None
         began = time.monotonic()
+<<<<<<< HEAD
         wear = Wear(texture, options.black)
         made, about = build(mi, gbuffers.read_mesh(mesh), wear, options.size, options.depth, random)
+=======
+        made, about = build(mi, traced_views.read_mesh(mesh), texture, options.size, options.depth, random)
+>>>>>>> main
         with atomic.path(file) as temporary:
             np.savez_compressed(temporary, allow_pickle=False, about=np.array(json.dumps(about)), **made)
         print(file.name, json.dumps(about), f"{time.monotonic() - began:.0f} s", flush=True)
@@ -82,7 +86,7 @@ def build(
     mi: Any, mesh: Triangles, wear: Wear, size: int, depth: int, random: np.random.Generator
 ) -> tuple[dict[str, Floats], dict[str, Any]]:
     """Stokes parameters (3, H, W, 3) in the frame of each ray, truth maps, camera; and how it was made."""
-    rotation, translation, view = gbuffers.pose(mesh, size, random)
+    rotation, translation, view = traced_views.random_pose(mesh, size, random)
     corner, normal = subdivided(mesh)
     coat = black_gloss(len(corner), random) if wear.black else dressed(corner, wear.texture, random)
     if not trimesh.Trimesh(mesh.vertices, mesh.faces).is_watertight:
@@ -101,7 +105,7 @@ def build(
     ]
     truth = seen(mi, parts, view, size)
     mask = truth["mask"]
-    middle, unit = gbuffers.depth_unit(mask, truth["depth"], view.focal)
+    middle, unit = traced_views.depth_unit(mask, truth["depth"], view.focal)
     halves = np.zeros((2, 3, size, size, 3))
     passes, error = 0, [np.inf, np.inf]
     around = cloth(mi, np.concatenate([part["position"] for part in parts]), random) if wear.black else {}

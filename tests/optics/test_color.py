@@ -1,4 +1,4 @@
-"""Colour against the standard's own numbers, published colour-difference pairs and charts of known light."""
+"""Color against the standard's own numbers, published color-difference pairs and charts of known light."""
 
 import json
 import re
@@ -48,7 +48,7 @@ def test_curve_and_matrix_are_those_of_colour_science():
     np.testing.assert_array_equal(color.REC709_TO_XYZ, srgb.matrix_RGB_to_XYZ)
 
 
-def test_luminance_is_a_colours_y():
+def test_luminance_is_y():
     assert color.luminance(np.eye(3)) == pytest.approx([0.2126, 0.7152, 0.0722])
 
 

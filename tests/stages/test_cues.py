@@ -56,7 +56,7 @@ def test_diffuse_color_is_the_fitted_least_intensity(ball):
     assert np.allclose(ball.diffuse_color[inside], expected, atol=1e-3)
 
 
-def test_albedo_of_a_ball_is_within_what_the_chart_s_depth_leaves_open():
+def test_albedo_of_a_ball_is_within_the_error_of_the_chart_s_depth():
     """Inverse squares over the visible half, seen and lit along the axis; the chart anywhere beside the ball."""
     solved = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
     color = dataclasses.replace(scenes.no_color(), source="chart")
@@ -94,7 +94,7 @@ def test_torch_and_numpy_give_the_same_channels(ball):
     assert np.allclose(found[0].numpy(), expected, atol=1e-4)
 
 
-def test_the_network_sees_what_the_names_of_its_channels_say(ball):
+def test_channels_hold_the_values_of_their_names(ball):
     seen, length = dict(zip(cues.CHANNELS, cues.channels(ball))), np.maximum(np.hypot(*ball.ratio), 1e-9)
     turned = ball.mask & (np.abs(ball.ratio[0]) > 0.01) & (np.abs(ball.ratio[1]) > 0.01)  # no two directions alike
     told = {
@@ -133,7 +133,7 @@ def test_clipping_reaches_the_network(ball):
 
 
 @pytest.mark.parametrize("size", [0.05, 0.1, 0.2])
-def test_the_chart_stands_beside_the_middle_of_what_bulges_forward(size: float):
+def test_the_chart_is_level_with_the_middle_of_the_object(size: float):
     """Irradiance of the chart by that of the visible surface lies between those of a cone and of a ball.
 
     size: radius over distance; inverse-square law, both solids as deep as half their width.
@@ -151,7 +151,7 @@ def test_the_chart_stands_beside_the_middle_of_what_bulges_forward(size: float):
 
 
 @pytest.mark.parametrize(("turn", "aside"), [(0.0, 0.0), (0.4, 0.0), (0.0, 0.15)])
-def test_a_chart_that_is_turned_or_stands_aside_gets_less_light_than_the_object(turn: float, aside: float):
+def test_a_turned_or_offset_chart_gets_less_light_than_the_object(turn: float, aside: float):
     """n·l / d² of a chart under a flash at the lens: cos of its turn, or cos³ of the angle to the axis."""
     found = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
     white, normal = np.array([aside, 0.0, -1.0]), np.array([np.sin(turn), 0.0, np.cos(turn)])

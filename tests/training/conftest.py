@@ -13,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 
 from polcap.images import Floats
-from polcap.training import gbuffers, materials, patterns, protocol, shapes
-from polcap.training.dataset import Simulator
+from polcap.training import evaluation_materials, evaluation_protocol, materials, random_shapes, traced_views
+from polcap.training.simulator import Simulator
 
-RECIPE = gbuffers.Recipe(views=6, procedural=2, size=64, seed=5, per_shape=3)
+RECIPE = traced_views.ViewsRecipe(views=6, procedural=2, size=64, seed=5, per_shape=3)
 
 
 @pytest.fixture(autouse=True)
@@ -27,13 +27,13 @@ def seeded() -> None:
 
 def write_mesh(path: Path, seed: int) -> None:
     """A mesh in the data folder's format."""
-    mesh = shapes.compose(np.random.default_rng(seed))
+    mesh = random_shapes.compose(np.random.default_rng(seed))
     write(path, mesh.vertices, mesh.faces)
 
 
 def write_blob(path: Path, seed: int) -> None:
     """A coarse lumpy ellipsoid, soon traced."""
-    unit, faces = shapes._sphere(24, 32)
+    unit, faces = random_shapes._sphere(24, 32)
     rng = np.random.default_rng(seed)
     lumps = 1 + 0.15 * np.sin(unit @ rng.normal(size=(3, 3)) * 4).sum(axis=1, keepdims=True)
     write(path, unit * lumps * rng.uniform(0.5, 1, 3), faces)
@@ -59,9 +59,9 @@ def write_textures(folder: Path, seed: int) -> None:
 def test_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """As many test meshes and texture sets as the evaluation takes."""
     folder = tmp_path_factory.mktemp("test-data")
-    for k in range(protocol.MESHES):
+    for k in range(evaluation_protocol.MESHES):
         write_blob(folder / "meshes" / "test" / f"shape-{k}.npz", k)
-    for k in range(patterns.TEXTURES):
+    for k in range(evaluation_materials.TEXTURES):
         write_textures(folder / "materials" / "test" / f"set-{k}", k)
     return folder
 
@@ -77,11 +77,11 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def views(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("views")
-    gbuffers.build(folder, [data / "meshes" / "train" / "one.npz"], RECIPE)
+    traced_views.build_cache(folder, [data / "meshes" / "train" / "one.npz"], RECIPE)
     return folder
 
 
 @pytest.fixture(scope="session")
 def simulator(views: Path) -> Simulator:
     device = torch.device("cpu")
-    return Simulator(gbuffers.load(views), materials.Library(None, device), device)
+    return Simulator(traced_views.load_cache(views), materials.MaterialLibrary(None, device), device)

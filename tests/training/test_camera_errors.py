@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from polcap.optics import frames
-from polcap.training.camera_errors import Errors, photograph
+from polcap.training.camera_errors import CameraErrors, photograph
 
 CPU = torch.device("cpu")
 B, S = 2, 48
@@ -22,13 +22,15 @@ def scene(s1: float = 0.05, s2: float = -0.03) -> tuple[Tensor, ...]:
     return stokes, torch.full((B, S, S, 3), 0.4), torch.ones(B, S, S, dtype=torch.bool), rays
 
 
-def shoot(errors: Errors, stokes: Tensor, diffuse: Tensor, mask: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def shoot(
+    errors: CameraErrors, stokes: Tensor, diffuse: Tensor, mask: Tensor, rays: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     return photograph(stokes, diffuse, mask, rays, torch.arange(B * S * S), errors)
 
 
 def test_perfect_camera_returns_the_stokes_parameters() -> None:
     images = scene()
-    measured, _, clipped = shoot(Errors.none(B, CPU), *images)
+    measured, _, clipped = shoot(CameraErrors.none(B, CPU), *images)
     torch.testing.assert_close(measured, images[0].reshape(3, -1, 3), atol=3e-4, rtol=0)  # 1e9 electrons
     assert not clipped.any()
 
@@ -39,7 +41,7 @@ def test_off_axis_the_angles_of_the_image_are_carried_to_the_ray() -> None:
     rays = torch.nn.functional.normalize(torch.tensor([0.2, 0.15, 1.0]), dim=0).expand(B, S, S, 3)
     axis = frames.axis_on_ray(torch.tensor(torch.pi / 4), rays)
     stokes[1], stokes[2] = (0.5 * f(2 * axis)[..., None] for f in (torch.cos, torch.sin))
-    measured, _, _ = shoot(Errors.none(B, CPU), stokes, diffuse, mask, rays)
+    measured, _, _ = shoot(CameraErrors.none(B, CPU), stokes, diffuse, mask, rays)
     through_45 = (measured[0] + measured[2]) / 2
     torch.testing.assert_close(through_45, torch.full_like(through_45, 0.5), atol=2e-4, rtol=0)  # 9σ of the noise left
 
@@ -47,7 +49,7 @@ def test_off_axis_the_angles_of_the_image_are_carried_to_the_ray() -> None:
 def test_noise_has_the_variance_it_states() -> None:
     torch.manual_seed(0)
     images = scene()
-    errors = replace(Errors.none(B, CPU), full_well=torch.full((B,), 2e4), read_noise=torch.full((B,), 5.0))
+    errors = replace(CameraErrors.none(B, CPU), full_well=torch.full((B,), 2e4), read_noise=torch.full((B,), 5.0))
     errors = replace(errors, bracket=torch.full((B,), 3.0))
     measured, covariance, _ = shoot(errors, *images)
     difference = measured - images[0].reshape(3, -1, 3)
@@ -63,7 +65,7 @@ def test_shift_moves_a_ramp_by_what_it_says(axis: int) -> None:
     stokes, *rest = scene(0, 0)
     ramp = torch.arange(S) * 0.01
     stokes[0] = ramp[None, None, :, None] if axis == 0 else ramp[None, :, None, None]
-    none = Errors.none(B, CPU)
+    none = CameraErrors.none(B, CPU)
     shift = torch.zeros(3, B, 2)
     shift[:, :, axis] = 0.1
     measured, _, _ = shoot(replace(none, shift=shift), stokes, *rest)
@@ -74,7 +76,7 @@ def test_shift_moves_a_ramp_by_what_it_says(axis: int) -> None:
 def test_saturation_is_flagged_and_stays_finite() -> None:
     stokes, *rest = scene()
     stokes[:, 0] *= 20
-    errors = replace(Errors.none(B, CPU), bracket=torch.full((B,), 4.0))
+    errors = replace(CameraErrors.none(B, CPU), bracket=torch.full((B,), 4.0))
     measured, _, clipped = shoot(errors, stokes, *rest)
     assert clipped[: S * S].all() and not clipped[S * S :].any() and measured.isfinite().all()
 
@@ -82,7 +84,7 @@ def test_saturation_is_flagged_and_stays_finite() -> None:
 def test_drawn_errors_are_reproducible() -> None:
     def draw() -> dict[str, Any]:
         torch.manual_seed(3)
-        return vars(Errors.draw(4, CPU))
+        return vars(CameraErrors.draw(4, CPU))
 
     first, second = draw(), draw()
     for name in first:

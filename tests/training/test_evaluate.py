@@ -10,10 +10,10 @@ from typer.testing import CliRunner
 
 from polcap.cli import app
 from polcap.errors import InputError
-from polcap.training import evaluate, model, tables, train
+from polcap.training import evaluate, evaluation_page, main_network, train
 
 MODEL = Path(__file__).parents[2] / "calib" / "models" / "polcap.onnx"
-TINY = model.Shape((8, 8, 8, 8, 8), (8, 8, 8, 8), (8, 8, 8, 8), (8, 8, 8, 8), (1, 1, 1, 1, 1))
+TINY = main_network.NetworkShape((8, 8, 8, 8, 8), (8, 8, 8, 8), (8, 8, 8, 8), (8, 8, 8, 8), (1, 1, 1, 1, 1))
 shipped = pytest.mark.skipif(not MODEL.exists(), reason="no model is shipped")
 
 
@@ -48,7 +48,7 @@ def test_the_command_judges_all_columns(test_data: Path, networks: Path, tmp_pat
 @shipped
 def test_a_stopped_run_goes_on(test_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And judging by several processes changes nothing."""
-    params = evaluate.Params(MODEL, test_data, tmp_path, count=2, size=64)
+    params = evaluate.EvaluationOptions(MODEL, test_data, tmp_path, count=2, size=64)
     whole = evaluate.main(params)
     journal = tmp_path / "pictures.jsonl"
     head, first, second = journal.read_text().splitlines()
@@ -63,21 +63,21 @@ def test_a_stopped_run_goes_on(test_data: Path, tmp_path: Path, monkeypatch: pyt
 
 
 def test_published_figures_stand_only_in_rows_that_exist() -> None:
-    for table in (tables.PUBLISHED, tables.PUBLISHED_ABLATIONS):
-        assert all(figures.keys() <= tables.ROWS.keys() for figures in table.values())
+    for table in (evaluation_page.PUBLISHED, evaluation_page.PUBLISHED_ABLATIONS):
+        assert all(figures.keys() <= evaluation_page.ROWS.keys() for figures in table.values())
 
 
 @shipped
 def test_a_folder_without_networks_is_named(test_data: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"holds no NAME/last\.pt"):
-        evaluate.main(evaluate.Params(MODEL, test_data, tmp_path, ablations=tmp_path, count=1, size=64))
+        evaluate.main(evaluate.EvaluationOptions(MODEL, test_data, tmp_path, ablations=tmp_path, count=1, size=64))
 
 
 @shipped
 @pytest.mark.skipif(not os.environ.get("POLCAP_DATA"), reason="POLCAP_DATA is not set")
 def test_shipped_model_beats_what_needs_no_network(tmp_path: Path) -> None:
     data = Path(os.environ["POLCAP_DATA"])
-    table = evaluate.main(evaluate.Params(MODEL, data, tmp_path, count=6, size=128))
+    table = evaluate.main(evaluate.EvaluationOptions(MODEL, data, tmp_path, count=6, size=128))
     ours = table["ours"]
     assert ours["normal_mean"] < table["analytic"]["normal_mean"] + 1.5
     for baseline in ("frontal", "silhouette", "mean of each map"):

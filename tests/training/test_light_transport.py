@@ -6,27 +6,27 @@ import pytest
 from polcap.images import Floats
 from polcap.optics import fresnel
 from polcap.synth.mesh_tracer import Triangles, smooth
-from polcap.training import light_transport, shapes
+from polcap.training import light_transport, random_shapes
 
 _RADIUS, _ALBEDO = 0.5, 0.6
 
 
 def _sphere() -> Triangles:
-    points, faces = shapes._sphere(96, 128)
+    points, faces = random_shapes._sphere(96, 128)
     return smooth(_RADIUS * points, faces)
 
 
 def _inside(
     roughness: float, specular: float, ior: float
-) -> tuple[light_transport.Scene, light_transport.Places, light_transport.Pose]:
+) -> tuple[light_transport.MeshScene, light_transport.SurfacePoints, light_transport.Pose]:
     """Places inside a sphere, each seen along its normal; the flash in the middle."""
-    scene = light_transport.Scene(_sphere())
+    scene = light_transport.MeshScene(_sphere())
     rng = np.random.default_rng(3)
     out = rng.normal(size=(400, 3))
     out /= np.linalg.norm(out, axis=1, keepdims=True)
     distance, flat = scene.facing(0 * out, out)
     one = np.ones((len(out), 3))
-    places = light_transport.Places(
+    places = light_transport.SurfacePoints(
         np.ones((20, 20), bool), out * distance[:, None], flat, np.tile([0.0, 0.0, 1.0], (len(out), 1)), -out,
         _ALBEDO * one, specular * one, np.full(len(out), roughness), ior,
     )  # fmt: skip
@@ -56,10 +56,10 @@ def test_smooth_surface_mirrors_the_bounce() -> None:
 
 def test_flash_casts_shadows() -> None:
     """A small sphere before a large one: its shadow, seen from the flash, is the cone behind it."""
-    points, faces = shapes._sphere(48, 64)
+    points, faces = random_shapes._sphere(48, 64)
     ball = points * 0.05 + [0, 0, 0.8]
     mesh = smooth(np.concatenate([points * 0.5, ball]), np.concatenate([faces, faces + len(points)]))
-    scene = light_transport.Scene(mesh)
+    scene = light_transport.MeshScene(mesh)
     x = np.linspace(-0.2, 0.2, 201)
     place = np.stack([x, 0 * x, np.sqrt(0.25 - x**2)], axis=1)
     pose = light_transport.Pose(np.eye(3), np.zeros(3), np.array([0, 0, 2.0]), 1.0)

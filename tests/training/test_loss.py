@@ -5,13 +5,13 @@ import torch
 from torch import Tensor
 
 from polcap.training import loss
-from polcap.training.dataset import Batch, Simulator
+from polcap.training.simulator import Batch, Simulator
 
 
 @pytest.fixture(scope="module")
 def batch(simulator: Simulator) -> Batch:
     torch.manual_seed(0)
-    return simulator.draw(3, 64)
+    return simulator.draw_batch(3, 64)
 
 
 def maps_of(batch: Batch, sigma: float = 10.0) -> dict[str, Tensor]:

@@ -12,8 +12,10 @@ def dressed() -> tuple[materials.Surface, torch.Tensor]:
     torch.manual_seed(0)
     normal = torch.nn.functional.normalize(torch.randn(OBJECTS * PLACES, 3), dim=1)
     owner = torch.arange(OBJECTS).repeat_interleave(PLACES)
-    library = materials.Library(None, torch.device("cpu"))
-    return materials.dress(library, normal, normal / 2, torch.eye(3).expand(OBJECTS, 3, 3), owner, OBJECTS), normal
+    library = materials.MaterialLibrary(None, torch.device("cpu"))
+    return materials.draw_surface(
+        library, normal, normal / 2, torch.eye(3).expand(OBJECTS, 3, 3), owner, OBJECTS
+    ), normal
 
 
 def test_materials_stay_within_their_bounds() -> None:

@@ -8,16 +8,16 @@ import pytest
 import torch
 
 from polcap.errors import InputError
-from polcap.training import export, loop, model, muon, train
-from polcap.training.dataset import Simulator
+from polcap.training import loop, main_network, muon, onnx_export, train
+from polcap.training.simulator import Simulator
 from tests.conftest import ROOT
-from tests.training.test_export import settled
-from tests.training.test_model import TINY
+from tests.training.test_main_network import TINY
+from tests.training.test_onnx_export import settled
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning", "ignore::UserWarning"
 )
-PRESET = train.Preset(TINY, 4, 1, 64, (32, 64), (0.5, 0.5), (0.2, 0.8), 4 * 64**2)
+PRESET = train.TrainingPreset(TINY, 4, 1, 64, (32, 64), (0.5, 0.5), (0.2, 0.8), 4 * 64**2)
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -42,7 +42,7 @@ def test_run_stops_in_time_and_resumes(data: Path, tmp_path: Path, monkeypatch: 
     params = train.TrainingOptions(data=data, out=tmp_path, minutes=0.07, threads=1)
     made, last = train.main(params), tmp_path / "last.pt"
     first, facts = train.load_average(last)
-    weights, told = export.read(made)
+    weights, told = onnx_export.read_weights(made)
     assert told["training"].startswith(f"{facts['samples']} samples") and told["version"] == tmp_path.name
     assert all(torch.allclose(w, weights[k], rtol=1e-3, atol=1e-4) for k, w in first.state_dict().items())  # halves
     assert 4.2 <= facts["elapsed"] < 5 and facts["samples"] > facts["step"] > 0
@@ -60,14 +60,14 @@ def test_run_stops_in_time_and_resumes(data: Path, tmp_path: Path, monkeypatch: 
 
 def test_training_starts_from_a_shipped_model(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(train.PRESETS, "cpu", PRESET)
-    export.write(settled(TINY), tmp_path / "first.onnx", {"training": "10 samples", "licence": "x"})
-    weights, _ = export.read(tmp_path / "first.onnx")
+    onnx_export.export_main(settled(TINY), tmp_path / "first.onnx", {"training": "10 samples", "licence": "x"})
+    weights, _ = onnx_export.read_weights(tmp_path / "first.onnx")
     run = train.NetworkTraining(TINY, torch.device("cpu"), 1e-3)
     run.begin(tmp_path / "first.onnx")
     for state in (run.network.state_dict(), run.average):
         assert all(torch.equal(value, weights[name]) for name, value in state.items())
     params = train.TrainingOptions(data=data, out=tmp_path / "out", samples=8, threads=1, start=tmp_path / "first.onnx")
-    _, facts = export.read(train.main(params))
+    _, facts = onnx_export.read_weights(train.main(params))
     assert facts["training"].endswith("minutes, after 10 samples")
 
 
@@ -75,17 +75,17 @@ def test_a_schedule_goes_on_where_the_shipped_weights_left_it(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(train.PRESETS, "cpu", PRESET)
-    export.write(settled(TINY), tmp_path / "first.onnx", {"training": "92 samples", "licence": "x"})
+    onnx_export.export_main(settled(TINY), tmp_path / "first.onnx", {"training": "92 samples", "licence": "x"})
     out = tmp_path / "out"
     params = train.TrainingOptions(data=data, out=out, samples=100, done=92, threads=1, start=tmp_path / "first.onnx")
-    _, facts = export.read(train.main(params))
+    _, facts = onnx_export.read_weights(train.main(params))
     _, state = train.load_average(out / "last.pt")
     assert 100 <= state["samples"] < 120  # eight pictures are left of a hundred
     assert facts["training"].startswith(f"{state['samples'] - 92} samples")
 
 
 def test_the_shipped_model_can_start_training() -> None:
-    run = train.NetworkTraining(model.SMALL, torch.device("cpu"), 1e-3)
+    run = train.NetworkTraining(main_network.SMALL, torch.device("cpu"), 1e-3)
     run.begin(ROOT / "calib" / "models" / "polcap.onnx")
     assert run.begun.split()[1] == "samples"
 
@@ -104,14 +104,14 @@ def test_resume_and_start_exclude_each_other(tmp_path: Path) -> None:
 
 
 def test_a_model_of_another_size_cannot_start_it(tmp_path: Path) -> None:
-    export.write(model.Network(TINY), tmp_path / "tiny.onnx", {"licence": "x"})
+    onnx_export.export_main(main_network.MainNetwork(TINY), tmp_path / "tiny.onnx", {"licence": "x"})
     with pytest.raises(InputError, match="not a network of this preset"):
-        train.NetworkTraining(model.SMALL, torch.device("cpu"), 1e-3).begin(tmp_path / "tiny.onnx")
+        train.NetworkTraining(main_network.SMALL, torch.device("cpu"), 1e-3).begin(tmp_path / "tiny.onnx")
 
 
 def test_steps_on_one_batch_lower_its_loss(simulator: Simulator) -> None:
     torch.manual_seed(0)
-    run, batch = train.NetworkTraining(TINY, torch.device("cpu"), 3e-3, 2), simulator.draw(4, 64)
+    run, batch = train.NetworkTraining(TINY, torch.device("cpu"), 3e-3, 2), simulator.draw_batch(4, 64)
     run.step = 200  # past the warm-up
     losses = [run.advance([batch, batch], 0.0)["loss"] for _ in range(25)]
     assert losses[-1] < 0.8 * losses[0] and run.skipped == 0
@@ -125,14 +125,14 @@ def test_resume_without_a_checkpoint_says_so(data: Path, tmp_path: Path, monkeyp
 
 def test_a_run_is_not_begun_over_another(data: Path, tmp_path: Path) -> None:
     train.NetworkTraining(TINY, torch.device("cpu"), 1e-3).save(tmp_path / "last.pt")
-    with pytest.raises(InputError, match="go on from it with --resume"):
+    with pytest.raises(InputError, match="continue from it with --resume"):
         train.main(train.TrainingOptions(data=data, out=tmp_path))
 
 
 def test_a_run_is_resumed_as_it_began(tmp_path: Path) -> None:
     train.NetworkTraining(TINY, torch.device("cpu"), 1e-3, variant="published inputs").save(tmp_path / "last.pt")
-    for shape, variant in ((TINY, "ours"), (model.SMALL, "published inputs")):
-        with pytest.raises(InputError, match="as 'published inputs'; resume it as it began"):
+    for shape, variant in ((TINY, "ours"), (main_network.SMALL, "published inputs")):
+        with pytest.raises(InputError, match=r"variant \('published inputs'\); resume it with the same ones"):
             train.NetworkTraining(shape, torch.device("cpu"), 1e-3, variant=variant).load(tmp_path / "last.pt")
 
 
@@ -163,7 +163,7 @@ def test_unknown_preset_is_named() -> None:
 
 
 def test_rate_falls_to_nothing_over_the_last_part_of_the_budget(data: Path) -> None:
-    from polcap.training.dataset import Batch
+    from polcap.training.simulator import Batch
 
     device = torch.device("cpu")
     run = train.NetworkTraining(TINY, device, 1e-3)
@@ -200,7 +200,7 @@ def test_orthogonal_keeps_directions_and_levels_strengths(shape: tuple[int, int]
 
 
 def test_every_weight_is_in_one_optimizer() -> None:
-    network = model.Network(TINY)
+    network = main_network.MainNetwork(TINY)
     optimizers = loop.make_optimizers(network, 1e-3)
     held = [w for o in optimizers for g in o.param_groups for w in g["params"]]
     assert sorted(map(id, held)) == sorted(map(id, network.parameters()))

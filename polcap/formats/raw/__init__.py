@@ -9,5 +9,4 @@ file_kind     RAW, picture or other, by the first bytes; the directories of a TI
 file_checks   refuses files that are cut, stripped or wrongly decoded
 file_bytes    the bytes of a file, read once, and their digest
 dng           writes a mosaic as a DNG
-glance        reduces a decoded frame for `polcap check`
 """

@@ -1,6 +1,7 @@
-"""Test-time augmentation: what the network's answers from the symmetries of the square say together.
+"""Test-time augmentation: the network's predictions in turned and mirrored positions, averaged.
 
-A turn or mirror of the picture is one of the scene: polarization turns twice as fast, rays with it.
+The symmetries of the square: a turn or mirror of the picture is one of the scene. Stokes parameters turn twice as
+fast, and rays turn with the picture.
 """
 
 from functools import partial
@@ -19,35 +20,37 @@ _POSITIONS = tuple(
 )
 _STEPS = 4  # of the median's iteration
 _LEAST_ERROR = 0.5  # degrees
-_NEAREST = 0.05  # between unit vectors, about 3°: what is nearer weighs no more
+_NEAREST = 0.05  # least distance between unit vectors, about 3°: nearer ones weigh the same
 
 
-def combined(cues: Cues, network: Network, run: RunNetwork, symmetries: int) -> dict[str, Floats]:
-    """The network's maps (H, W[, 3]) of the whole object seen from several positions; normals in the camera frame.
+def predict(cues: Cues, network: Network, run: RunNetwork, symmetries: int) -> dict[str, Floats]:
+    """The network's maps (H, W[, 3]) over 1, 2, 4 or 8 positions; normals in the camera frame.
 
-    Normals are the median of the positions' directions, weighed by their stated errors: where they part it is often
-    by half a turn, and the mean of both is neither. `opposed` (H, W) is the share of positions whose normal leans to
+    The normal is the median direction, weighed by the stated errors: where positions differ it is often by half a turn,
+    and the mean of two half-turns is neither. `opposed` (H, W) is the share of positions in which the normal leans to
     the other side of the ray. All other maps are means.
     """
     picture = np.moveaxis(channels(cues), 0, -1)
-    looks = [partial(_answer, picture, cues.rays, network, run, *position) for position in _POSITIONS[:symmetries]]
-    answers = parallel.results(looks, network.at_once)
-    maps = {name: np.asarray(np.mean([maps[name] for maps in answers], axis=0), np.float32) for name in _OUTPUTS}
-    normals, errors = (np.stack([maps[name] for maps in answers]) for name in ("normal", "sigma"))
-    middle = _median(normals, errors)
-    return maps | {"normal": middle, "opposed": _opposed(normals, middle, cues.rays)}
+    calls = [
+        partial(_predict_turned, picture, cues.rays, network, run, *position) for position in _POSITIONS[:symmetries]
+    ]
+    predictions = parallel.results(calls, network.at_once)
+    maps = {name: np.asarray(np.mean([maps[name] for maps in predictions], axis=0), np.float32) for name in _OUTPUTS}
+    normals, errors = (np.stack([maps[name] for maps in predictions]) for name in ("normal", "sigma"))
+    median = _median_direction(normals, errors)
+    return maps | {"normal": median, "opposed": _opposed_share(normals, median, cues.rays)}
 
 
-def _opposed(normals: Floats, middle: Floats, rays: Floats) -> Floats:
-    """Share (H, W) of K normals (K, H, W, 3) that lean to the other side of the ray than the middle one (H, W, 3)."""
-    towards = middle - frames.dot(middle, rays)[..., None] * rays
+def _opposed_share(normals: Floats, median: Floats, rays: Floats) -> Floats:
+    """Share (H, W) of K normals (K, H, W, 3) that lean to the other side of the ray than the median (H, W, 3)."""
+    towards = median - frames.dot(median, rays)[..., None] * rays
     return np.asarray(np.mean([frames.dot(normal, towards) < 0 for normal in normals], axis=0), np.float32)
 
 
-def _answer(
+def _predict_turned(
     picture: Floats, rays: Floats, network: Network, run: RunNetwork, quarters: int, mirror: bool
 ) -> dict[str, Floats]:
-    """The network's maps of channels (H, W, N) that it sees turned, turned back."""
+    """The network's maps of turned channels (H, W, N), turned back."""
     turned = _turn_channels(_turn(picture, quarters, mirror), quarters, mirror)
     maps = _run(np.moveaxis(turned, -1, 0), network, run)
     own = np.array(_turn(rays, quarters, mirror))
@@ -63,30 +66,30 @@ def _answer(
     return maps
 
 
-def _median(normals: Floats, errors: Floats) -> Floats:
+def _median_direction(normals: Floats, errors: Floats) -> Floats:
     """Direction (H, W, 3) with the least sum of distances from K normals (K, H, W, 3), each over its error (K, H, W).
 
-    Weiszfeld's iteration: a mean weighed by the reciprocal of the distances from the one before. At most 1 long,
-    shorter where the directions part.
+    Weiszfeld's iteration: a mean weighed by the reciprocal of the distances from the previous one. Its length is at
+    most 1, and less where the directions differ.
     """
     directions = normals / np.maximum(frames.dot(normals, normals) ** 0.5, 1e-6)[..., None]
     trust = 1 / np.maximum(errors, _LEAST_ERROR)
     weights = trust
     for _ in range(_STEPS):
-        middle = _weighed(directions, weights)
+        middle = _weighted_mean(directions, weights)
         middle /= np.maximum(frames.dot(middle, middle) ** 0.5, 1e-6)[..., None]
-        apart = directions - middle
-        weights = trust / np.maximum(frames.dot(apart, apart) ** 0.5, _NEAREST)
-    return _weighed(directions, weights)
+        difference = directions - middle
+        weights = trust / np.maximum(frames.dot(difference, difference) ** 0.5, _NEAREST)
+    return _weighted_mean(directions, weights)
 
 
-def _weighed(directions: Floats, weights: Floats) -> Floats:
+def _weighted_mean(directions: Floats, weights: Floats) -> Floats:
     """Mean (H, W, 3) of directions (K, H, W, 3) with weights (K, H, W)."""
     return np.asarray((weights[..., None] * directions).sum(axis=0) / weights.sum(axis=0)[..., None], np.float32)
 
 
 def _turn(image: Floats, quarters: int, mirror: bool) -> Floats:
-    """Pixels mirrored left to right, then turned counter-clockwise."""
+    """Pixels (H, W, …) mirrored left to right, then turned counter-clockwise."""
     return np.asarray(np.rot90(image[:, ::-1] if mirror else image, quarters))
 
 
@@ -99,7 +102,7 @@ def _turn_vectors(vector: Floats, quarters: int, mirror: bool) -> Floats:
 
 
 def _turn_channels(picture: Floats, quarters: int, mirror: bool) -> Floats:
-    """Channels (H, W, N) whose pixels were turned, their directions turned too."""
+    """Channels (H, W, N) of turned pixels with their directions turned too."""
     out = np.array(picture)
     for first in ("s1", "zenith_x", "cos_2phi"):  # twice the angle: a quarter negates, a mirror conjugates
         at = CHANNELS.index(first)
@@ -119,7 +122,7 @@ def _run(picture: Floats, network: Network, run: RunNetwork) -> dict[str, Floats
     found = {name: value.shape[1] for name, value in output.items()}
     if any(found.get(name) != count for name, count in _OUTPUTS.items()):
         raise ModelError(
-            f"model {network.digest[:8]} makes {found}; this version needs {_OUTPUTS}; use a model of this version"
+            f"model {network.digest[:8]} returns {found}; this version needs {_OUTPUTS}; use a model of this version"
         )
     images = {name: np.moveaxis(output[name][0], 0, -1)[:height, :width] for name in _OUTPUTS}
     return {name: image[..., 0] if image.shape[-1] == 1 else image for name, image in images.items()}

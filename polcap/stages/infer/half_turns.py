@@ -1,17 +1,17 @@
 """Half-turns: the side of the view ray to which each normal leans, and how sure it is.
 
-Polarization shows the plane through a normal n and the view ray r, not the side: n and n′ = 2 (n·r) r − n look
-alike. The network sometimes takes a whole region for its half-turn, most often on black gloss; the inversion knows
-no side at all. Both are decided here, by one minimum over the whole object. Every cell of a coarse grid keeps n or
-turns it. With t the part of n across the ray, of length sin θ, the energy is the sum of
+Polarization shows the plane through a normal n and the view ray r, not the side: n and n′ = 2 (n·r) r − n give the same
+Stokes parameters. The network sometimes takes a whole region for its half-turn, most often on black gloss; the
+inversion knows no side at all. Both are decided here, by one minimum over the whole object. Every cell of a coarse grid
+keeps n or turns it. With t the part of n across the ray, of length sin θ, the energy is the sum of
 
     outline      3 e, e: share of object ahead of t less that behind it. A closed surface leans towards its outline;
                  where t runs along an outline (a neck that the mask cuts), e is 0
     inside       −0.015 t·o, o the direction away from the object's inside: decides where nothing else does
     network      0.04 sin θ · 30°/σ for turning, σ the network's error
-    neighbours   ∓2 min(sin θ, sin θ′)² cos Δ |cos Δ| for equal and unequal choices, Δ the angle between t and t′
+    neighbors   ∓2 min(sin θ, sin θ′)² cos Δ |cos Δ| for equal and unequal choices, Δ the angle between t and t′
 
-Half of the neighbour terms favor unequal choices, so the minimum is found by quadratic pseudo-Boolean optimization:
+Half of the neighbor terms favor unequal choices, so the minimum is found by quadratic pseudo-Boolean optimization:
 one minimum cut with two nodes for each cell. The cells that it leaves open keep their normals.
 
 Turned cells of the network make connected regions. The sum of weak terms over a large region is no strong evidence,
@@ -35,15 +35,20 @@ from polcap.optics.resize import area_mean, weighted_area_mean
 Bools = NDArray[np.bool_]
 
 _LONGEST = 128  # cells of the grid's longer side
-_OUTLINE, _INSIDE, _NETWORK = 3.0, 0.015, 0.04  # weights of the terms; the neighbours' is 1
-_AHEAD = 1.5  # cells from a cell to where it is asked for the object
+_OUTLINE, _INSIDE, _NETWORK = 3.0, 0.015, 0.04  # weights of the terms; the neighbors' is 1
+_AHEAD = 1.5  # cells from a cell to the places ahead and behind
 _BLUR = 3.0  # cells, 1σ, of the depth inside the mask
 _SURE_DEG, _SUREST = 30.0, 3.0  # a network's error that counts 1, and the most that a small one counts
 _INTEGER = 1000  # capacities per unit of energy: the flow is one of whole numbers
 # ln odds that a region of the cut is turned: constant, outline evidence over √cells, mean inward lean, share of the
 # network's positions that disagree, ln of its error in degrees; tests/benchmarks/fit_half_turns.py
+<<<<<<< HEAD
 _REGION = (-6.85, 1.05, 0.87, 8.09, 1.52)
 _MOST_OUTLINE, _MOST_OPPOSED = 2.0, 0.5  # larger values say no more
+=======
+_REGION = (-9.65, 0.89, 5.41, 10.22, 1.85)
+_MOST_OUTLINE, _MOST_OPPOSED = 2.0, 0.5  # larger values count as these
+>>>>>>> main
 # ln odds that a cell of the inversion is on the wrong side: constant, energy of turning it alone, ln of the share of
 # links around it that contradict each other, mean lean away from the inside around it; same benchmark
 _CELL = (2.94, -0.176, 1.04, -2.31)
@@ -97,7 +102,7 @@ def resolve(normal: Floats, mask: Bools, network: NetworkDoubt | None = None) ->
     sigma, opposed = (weighted_area_mean(image, mask, grid.mask.shape) for image in (network.sigma, network.opposed))
     region, terms = proposals(grid, sigma, opposed)
     chance = _chance(terms @ np.array(_REGION))
-    chance[0] = 0  # cells that the cut keeps: the network's error covers them
+    chance[0] = 0  # cells that the cut does not turn: the network's error covers them
     doubt = np.minimum(chance, 1 - chance)[region]
     return HalfTurns(_enlarged((chance > 0.5)[region], mask.shape) > 0.5, _enlarged(doubt, mask.shape))
 
@@ -122,7 +127,7 @@ def coarse(normal: Floats, mask: Bools) -> Grid:
 
 
 def sides(grid: Grid) -> tuple[Bools, Floats]:
-    """Cells of the inversion that turn (h, w), and what speaks for a wrong side: terms (h, w, 4) of `_CELL`."""
+    """Cells of the inversion that turn (h, w), and the evidence of a wrong side: terms (h, w, 4) of `_CELL`."""
     outwards = _outwards(grid)
     cost = (_OUTLINE * _outline_evidence(grid) + _INSIDE * outwards)[grid.mask]  # of turning less that of keeping
     first, second, alike = _links(grid)
@@ -147,7 +152,7 @@ def sides(grid: Grid) -> tuple[Bools, Floats]:
 
 
 def proposals(grid: Grid, sigma: Floats, opposed: Floats) -> tuple[NDArray[np.int32], Floats]:
-    """Regions of the network's normals that the cut turns, and what speaks for turning them.
+    """Regions of the network's normals that the cut turns, and the evidence for it.
 
     Parameters
     ----------
@@ -215,9 +220,9 @@ def _outwards(grid: Grid) -> Floats:
 
 
 def _links(grid: Grid) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
-    """Neighbouring cells, numbered within the mask (M,) and (M,), and how alike they are (M,), −2…2.
+    """Neighboring cells, numbered within the mask (M,) and (M,), and how alike they are (M,), −2…2.
 
-    A flat neighbour tells little of a steep one, and so do axes that cross.
+    Flat neighbors and axes that cross weigh little.
     """
     number = np.full(grid.mask.shape, -1)
     number[grid.mask] = np.arange(int(grid.mask.sum()))

@@ -134,7 +134,7 @@ def _even_albedo(angles: Floats, light: Floats, laws: DiffuseLaws) -> Floats:
 
     The pixels are sorted by DoLP into the same ten parts for all candidates. The mean albedo of a part may differ by
     the scatter within it, over the patches that it holds. Rough bodies shade flatter than smooth ones; the amount is
-    fitted to make the albedo most even, apart from the polarization. If no candidate fits (cast light, concave
+    fitted to make the albedo most even, independently of the polarization. If no candidate fits (cast light, concave
     parts), all are trusted less.
     """
     order = np.argsort(angles.sum(axis=0), kind="stable")

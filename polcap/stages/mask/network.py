@@ -17,7 +17,7 @@ from polcap.stages.mask.mask_channels import SIZE_MULTIPLE, ReducedPicture, brig
 from polcap.stages.mask.regions import Box, box_around
 
 _CLOSE_UP_PX = 256  # most, of a close-up's longer side
-_CLOSE_UPS = 2  # passes over the found part; a second finds what the first estimate lacked
+_CLOSE_UPS = 2  # passes over the found part; the second finds parts that the first estimate lacked
 _ROOM = 0.12  # around the found part, of its longer side
 _LIKELY = 0.3  # least probability of pixels that a close-up shows
 _MIRRORS = ((), (0,), (1,), (0, 1))  # axes of the mirror images that are averaged (decision 37)

@@ -297,10 +297,8 @@ def _metal(stokes: Floats, covariance: Floats) -> Bools:
     (x0, y0, square0, noise0), (x1, y1, square1, noise1) = (_polarization(stokes, covariance, c) for c in (0, 2))
     enough = np.minimum(square0, square1) > np.float32(_METAL_DOLP**2)
     excess = np.abs(x0 * y1 - y0 * x1) - np.float32(np.sin(2 * np.radians(_METAL_DEG))) * np.sqrt(square0 * square1)
-    noise0 *= square1
-    noise1 *= square0
-    noise0 += noise1
-    return np.asarray(enough & (excess > np.float32(_METAL_SIGMA) * np.sqrt(noise0, out=noise0)))
+    noise = np.sqrt(noise0 * square1 + noise1 * square0)
+    return np.asarray(enough & (excess > np.float32(_METAL_SIGMA) * noise))
 
 
 def _polarization(stokes: Floats, covariance: Floats, channel: int) -> tuple[Floats, Floats, Floats, Floats]:
@@ -308,11 +306,6 @@ def _polarization(stokes: Floats, covariance: Floats, channel: int) -> tuple[Flo
     s0, s1, s2, v1, v2 = (
         np.asarray(cv2.extractChannel(plane, channel)) for plane in (*stokes, covariance[3], covariance[5])
     )
-    over = np.float32(1) / np.maximum(s0, np.float32(1e-9), out=s0)
-    s1 *= over
-    s2 *= over
-    v1 += v2
-    over *= over
-    v1 *= over
-    v1 *= np.float32(0.5)
-    return s1, s2, s1 * s1 + s2 * s2, v1
+    s0 = np.maximum(s0, np.float32(1e-9))
+    x, y = s1 / s0, s2 / s0
+    return x, y, x * x + y * y, (v1 + v2) / (2 * s0 * s0)

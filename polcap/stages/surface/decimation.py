@@ -15,7 +15,7 @@ from polcap.optics.projection import project
 from polcap.stages.surface.triangles import Back, face_areas, vertex_frames
 
 _FEWEST = 16  # triangles
-_MEASURED = 20_000  # vertices, at most, whose distance is measured
+_MEASURED = 20_000  # vertices, at most, of which the distance is measured
 
 
 @dataclass(frozen=True)

@@ -73,9 +73,9 @@ def log_depth(field: NormalField, stiffness: float, iterations: int, tolerance: 
     level = PyramidLevel(fields.pop(), stiffness, jump / 2)
     level.decide(iterations, tolerance)
     while fields:
-        finer = PyramidLevel(fields.pop(), stiffness, jump / 2)
-        finer.refine(level)
-        level = finer
+        coarse = level.z, level.near_cuts(), level.solver
+        level = PyramidLevel(fields.pop(), stiffness, jump / 2)
+        level.refine(*coarse)
     return level.z
 
 
@@ -156,14 +156,14 @@ class PyramidLevel:
         self.remove_useless_cuts()
         self.join_contacts()
 
-    def refine(self, coarse: "PyramidLevel") -> None:
-        """Find z from that of half the resolution; only pixels near its cuts choose between neighbors."""
+    def refine(self, coarse: Floats, near_cuts: Bools, solver: Any) -> None:
+        """Find z from that of the n blocks (n,) at half the resolution; only pixels near their cuts (n,) choose."""
         block = block_numbers(self.field.mask)
-        self.z = self._interpolated(coarse.z, block)
-        self.choosing = self.cuttable = coarse.near_cuts()[block] & (self.stiffness > 0)
+        self.z = self._interpolated(coarse, block)
+        self.choosing = self.cuttable = near_cuts[block] & (self.stiffness > 0)
         for _ in range(_FINER_SOLVES if self.choosing.any() else 1):
             matrix, right, _ = self.equations(self.stiffness, self.field.pull)
-            self.solver = TwoGrid(matrix, block, coarse.solver)
+            self.solver = TwoGrid(matrix, block, solver)
             self.z, _ = conjugate_gradients(matrix, right, self.z, self.solver, _PRECISION, 20)
 
     def _interpolated(self, coarse: Floats, block: NDArray[np.intp]) -> Floats:

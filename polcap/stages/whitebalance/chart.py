@@ -42,7 +42,7 @@ class Placement:
 
     @property
     def pitch_px(self) -> float:
-        """Mean distance of neighbouring patches, px."""
+        """Mean distance of neighboring patches, px."""
         outline = transform_points(self.homography, _outer(1.0))
         return float(np.sqrt(_area(outline) / (ROWS * COLUMNS)))
 

@@ -1,7 +1,6 @@
 """EXIF by content: headers of every maker built here, real files where they are at hand."""
 
 import io
-import time
 from types import SimpleNamespace
 
 import cv2
@@ -163,8 +162,8 @@ def test_damaged_exif_counts_as_none(tmp_path):
             broken[at] ^= 0xFF
         path = tmp_path / "a.dng"
         path.write_bytes(broken)
-        exif.tags(path.read_bytes())
-        _kind(path)
+        assert isinstance(exif.tags(path.read_bytes()), Exif)
+        assert _kind(path) in ("raw", "photo", "other", "unknown")
 
 
 def test_looping_directories_end(tmp_path):
@@ -205,17 +204,6 @@ def test_real_files():
     kodak = _exif(DATA / "real/raw_chart/P003910.KDC")
     assert kodak.iso == 160  # the DC120's only one
     assert (kodak.width, kodak.height, kodak.model) == (848, 976, "Kodak DC120 ZOOM Digital Camera")
-
-
-@needs_data
-def test_a_folder_is_scanned_in_milliseconds():
-    files = sorted((DATA / "real").glob("raw_*/*.[dDC]*"))
-    modern = [str(path) for path in files if path.suffix != ".CRW"]
-    probe.examine(modern[0])  # imports what it needs
-    start = time.process_time()
-    for path in modern:
-        probe.examine(path)
-    assert (time.process_time() - start) / len(modern) < 0.5  # 60 ms, of which 45 hash up to 13 MB
 
 
 @pytest.mark.parametrize("head", [b"\0MRM\0\0\1", b"\0MRM", b"FUJIFILMCCD-RAW ", b"\0\0\0\x18ftypcrx CMT1"])

@@ -173,11 +173,3 @@ def test_a_child_in_a_loop_dies_with_its_parent(worker, tmp_path, loop):
         time.sleep(0.05)
     os.kill(child, signal.SIGKILL)
     pytest.fail("the child outlived its parent")
-
-
-def test_fifty_megabytes_cross_in_less_time_than_they_take_to_decode(worker):
-    pid(worker)
-    start = time.process_time()
-    _, arrays = worker.call(worker.module.ramp, "large.raw", count=50_000_000)  # 50 MB of every other column
-    assert arrays["ramp"].nbytes == 50_000_000
-    assert time.process_time() - start < 2.0  # of this process' own; measured 0.15 s

@@ -4,15 +4,9 @@ import numpy as np
 import pytest
 
 from polcap.stages.hdr import exposure
-from polcap.stages.hdr.planes import Planes, planar
+from tests.stages.hdr.brackets import planes
 
 WELL = 30000.0
-
-
-def planes(picture, usable=None):
-    """(H, W, C) as the merge sees it."""
-    everywhere = np.ones(picture.shape[:2], bool)
-    return Planes(planar(picture.astype(np.float32)), everywhere if usable is None else usable)
 
 
 def picture(rng, factor, low=0.005, high=0.5, size=(320, 400)):

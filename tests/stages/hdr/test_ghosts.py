@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from polcap.stages.hdr import ghosts, planes
+from polcap.stages.hdr import ghosts
 from polcap.stages.hdr.ghosts import Exposed
 from polcap.stages.hdr.noise import Noise
-from polcap.stages.hdr.planes import Planes, planar
+from polcap.stages.hdr.planes import blocks
+from tests.stages.hdr.brackets import planes
 
 WELL = 30000.0
 LINE = Noise(np.full(3, 1 / WELL, np.float32), np.full(3, 1e-9, np.float32))
@@ -14,13 +15,11 @@ ONE = np.ones(3, np.float32)
 
 def exposed(picture, exposure=1.0, usable=None):
     """A frame (H, W, C) of known exposure and noise."""
-    everywhere = np.ones(picture.shape[:2], bool)
-    signals = Planes(planar(picture.astype(np.float32)), everywhere if usable is None else usable)
-    return Exposed(signals, np.float32(exposure) * ONE, LINE)
+    return Exposed(planes(picture, usable), np.float32(exposure) * ONE, LINE)
 
 
-def interleaved(planes):
-    return np.moveaxis(planes, 0, -1)
+def interleaved(picture):
+    return np.moveaxis(picture, 0, -1)
 
 
 def shoot(rng, scene, exposure=1.0):
@@ -79,7 +78,7 @@ def test_anchor_takes_the_darkest_frame_where_the_reference_clips():
 
 def test_blocks_cover_every_row_once_with_their_halo():
     seen = np.zeros(1000, int)
-    for rows, inner, target in planes.blocks(1000, 3):
+    for rows, inner, target in blocks(1000, 3):
         np.testing.assert_array_equal(np.arange(1000)[rows][inner], np.arange(1000)[target])
         assert rows.start == max(target.start - 3, 0) and rows.stop == min(target.stop + 3, 1000)
         seen[target] += 1

@@ -3,16 +3,11 @@
 import numpy as np
 import pytest
 
+from polcap.images import NoiseLine
 from polcap.stages.hdr import noise
-from polcap.stages.hdr.planes import Planes, planar
+from tests.stages.hdr.brackets import planes
 
 WELL, READ = 30000.0, 4.0
-
-
-def planes(picture, usable=None):
-    """(H, W, C) as the merge sees it."""
-    everywhere = np.ones(picture.shape[:2], bool)
-    return Planes(planar(picture.astype(np.float32)), everywhere if usable is None else usable)
 
 
 def picture(rng, exposure=1.0, texture=0.3, size=(512, 640)):
@@ -101,3 +96,13 @@ def test_lines_are_learnt_once_per_iso():
     lines.learn(100.0, noise.alone(planes(np.zeros((512, 640, 3)), usable)))
     assert lines.knows(100.0) and not lines.knows(200.0)
     assert lines.line(100.0, 1e-12) is first
+
+
+def test_calibrated_noise_is_not_learnt_again():
+    line = NoiseLine(100.0, (1e-4,), (0.0,), (2e-8,), (0.0,), (1e4,), (1.4,))
+    lines = noise.Lines([line])
+    rich = noise.Samples(np.full((500, 1), 0.3), np.full((500, 1), 1.0), flat=False)
+    lines.learn(100.0, rich)
+    assert lines.knows(100.0)
+    assert lines.line(100.0, 0.0).slope == pytest.approx([1e-4])
+    assert not lines.knows(200.0)

@@ -238,7 +238,7 @@ def test_detail_is_kept_and_a_bend_is_not():
     truth[..., 1] += relief
     coarse, fine, truth = (n / np.linalg.norm(n, axis=-1, keepdims=True) for n in (coarse, fine, truth))
     mask = np.hypot(x - 64, y - 64) < 55
-    found = learned._detailed(coarse, fine, mask, 4.0)
+    found = learned._add_detail(coarse, fine, mask, 4.0)
     error = np.degrees(np.arccos(np.clip((found * truth).sum(-1), -1, 1)))
     assert np.median(error[mask]) < 1.0 and np.quantile(error[mask], 0.99) < 6.0
 
@@ -248,7 +248,7 @@ def test_a_guide_is_as_sure_as_its_error_is_small():
     axis, rays = np.array([[[1.0, 1.0]], [[0.0, 0.0]]]), np.full((1, 2, 3), [0.0, 0.0, 1.0])
     tilt = np.radians(10.0)
     normal = np.full((1, 2, 3), [-tilt, 0.0, 1.0])
-    phi, certainty = analytic._guided(axis, rays, normal, np.array([[10.0, 2.0]]))
+    phi, certainty = analytic._azimuth_by_guide(axis, rays, normal, np.array([[10.0, 2.0]]))
     np.testing.assert_allclose(np.cos(phi), -1)
     np.testing.assert_allclose(certainty, [[0.6827, 1.0]], atol=1e-3)
 
@@ -302,7 +302,7 @@ def test_averaged_over_turns_a_turned_object_gets_the_turned_maps(quarters: int,
         },
     )  # fmt: skip
     moved.rays[..., :2] = augmentation._turn_vectors(moved.rays[..., :2], quarters, mirror)
-    whole, turned = (augmentation.combined(c, lopsided(), run, 8) for c in (found, moved))
+    whole, turned = (augmentation.predict(c, lopsided(), run, 8) for c in (found, moved))
     np.testing.assert_allclose(turned["depth"], augmentation._turn(whole["depth"], quarters, mirror), atol=1e-4)
     expected = np.array(augmentation._turn(whole["normal"], quarters, mirror))
     expected[..., :2] = augmentation._turn_vectors(expected[..., :2], quarters, mirror)

@@ -1,4 +1,4 @@
-"""Pictures of a ColorChecker Classic at a known place, through a camera of known colours."""
+"""Pictures of a ColorChecker Classic at a known place, through a camera of known colors."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ AUTO = ChartRequest("auto")
 
 
 def pose(pitch: float, turn_deg: float, at: tuple[float, float], tilt: tuple[float, float] = (0, 0)) -> Floats:
-    """Homography chart → px of a chart centred `at`, turned and (by its horizon) tilted."""
+    """Homography chart → px of a chart centered `at`, turned and (by its horizon) tilted."""
     c, s = pitch * np.cos(np.radians(turn_deg)), pitch * np.sin(np.radians(turn_deg))
     flat = np.array([[c, -s, 0], [s, c, 0], [tilt[0], tilt[1], 1]]) @ np.array([[1, 0, -3], [0, 1, -2], [0, 0, 1]])
     return np.array([[1, 0, at[0]], [0, 1, at[1]], [0, 0, 1]]) @ flat

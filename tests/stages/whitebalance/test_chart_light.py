@@ -53,7 +53,7 @@ def test_the_normal_of_a_tilted_chart_is_found_whatever_its_cells_sides(turn: tu
 
 
 @pytest.mark.parametrize("flash", [(0.09, 0.0), (0.0, 0.12), (-0.05, 0.07)])
-def test_the_light_s_slope_tells_where_the_flash_stands(flash: tuple[float, float]):
+def test_the_slope_of_the_light_gives_the_flash_s_place(flash: tuple[float, float]):
     place, point, normal = seen((5, 12, 3), (0.02, 0.0))  # on the axis the lens's falloff slopes nothing
     found = chart_light.measure(place, VIEW, slope(point, normal, flash), 0.1)
     error = found.flash[:2] - flash
@@ -61,7 +61,7 @@ def test_the_light_s_slope_tells_where_the_flash_stands(flash: tuple[float, floa
     assert (np.abs(error) < 1.5 * np.sqrt(np.diag(found.covariance)[:2])).all()
 
 
-def test_a_slope_that_says_little_leaves_the_flash_at_the_lens():
+def test_an_uncertain_slope_leaves_the_flash_at_the_lens():
     """Patches that are off by 10 % each."""
     place, point, normal = seen((0, 0, 0), (0.02, 0.0))
     found = chart_light.measure(place, VIEW, slope(point, normal, (0.1, 0.0)), 5.0)

@@ -121,7 +121,7 @@ def test_path_traced_chart_is_found_and_its_camera_matrix_recovered(name):
     radiance, meta, truth = rendered(name)
     printed = ChartReference("as rendered", np.array(meta["chart"]["reference_linear_srgb"]), CLASSIC.size_m)
     color = whitebalance.measure(radiance, printed, AUTO, WhitebalanceSettings(chart_width_m=0.0165 * 5.862))
-    true = (np.array(meta["chart"]["patch_corners_px"]) - 1) / 2  # RAW px with centres on +½ → binned px
+    true = (np.array(meta["chart"]["patch_corners_px"]) - 1) / 2  # RAW px with centers on +½ → binned px
     error = np.linalg.norm(color.place.quads.mean(axis=1) - true.mean(axis=1), axis=-1)
     assert np.median(error) < 0.05 and error.max() < 0.15
     identity = color.matrix @ np.array(truth["camera_matrix_from_linear_srgb"])

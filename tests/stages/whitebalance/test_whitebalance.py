@@ -22,14 +22,14 @@ def plain() -> tuple[Floats, Floats]:
 
 
 def centers_off(color: ColorCalibration, homography: Floats) -> Floats:
-    """Distance of each found patch centre from the true one (24,), px."""
+    """Distance of each found patch center from the true one (24,), px."""
     assert color.place is not None
     found = np.array([_center(quad) for quad in color.place.quads])
     return np.linalg.norm(found - transform_points(homography, chart.centers()), axis=-1)
 
 
 def _center(quad: Floats) -> Floats:
-    """Where a quad's diagonals cross: the image of the square's centre."""
+    """Where a quad's diagonals cross: the image of the square's center."""
     first, second = quad[2] - quad[0], quad[3] - quad[1]
     share = np.linalg.solve(np.stack([first, -second], axis=1), quad[1] - quad[0])[0]
     return quad[0] + share * first
@@ -84,7 +84,7 @@ def test_s0_of_the_white_patch_is_its_reflectance():
 
 
 @pytest.mark.parametrize("edition", [CLASSIC, *CLASSIC.editions], ids=["since 2014", "before", "sRGB values"])
-def test_the_edition_of_the_chart_is_told_by_its_colors(edition: ChartReference):
+def test_colors_decide_the_edition_of_the_chart(edition: ChartReference):
     _, place = plain()
     color = whitebalance.measure(stack(photograph(place, edition.rec709)), CLASSIC, AUTO, WhitebalanceSettings())
     assert color.patches.edition == edition.name
@@ -199,7 +199,7 @@ def test_a_mirrored_chart_is_refused():
         whitebalance.measure(stack(image[:, ::-1]), CLASSIC, AUTO, WhitebalanceSettings())
 
 
-def test_a_chart_too_small_to_be_read_is_told_with_the_size_it_needs():
+def test_a_chart_that_is_too_small_is_named_with_the_size_it_needs():
     small = photograph(pose(7.6, 3, (260, 170)))
     with pytest.raises(ChartError, match=r"patches are spaced by 15 RAW px, at least 16 are needed: show it larger"):
         whitebalance.measure(stack(small), CLASSIC, AUTO, WhitebalanceSettings())

@@ -1,0 +1,83 @@
+"""Highlights: filled where they are clipped, and their albedo from a crossed shot.
+
+A crossed shot shows the diffuse reflection under a highlight. Around the highlight, the estimator's albedo over the
+diffuse reflection gives the shading that it assumed. The ratio to the shading of the normals is continued into the
+highlight, and turns the diffuse reflection there into an albedo.
+"""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Cues, Floats, Quality, SurfaceMaps
+from polcap.optics import frames, fresnel
+from polcap.optics.outline import disc_radius
+
+REACHED = 0.05  # least share of known pixels under a Gaussian for a mean
+# specular share of S0: below the first the estimator's albedo stays, above the second the crossed shot's counts
+_GLOSS = (0.03, 0.1)
+_AROUND = 0.05  # 1σ of the continuation, over the object's radius
+_LEAST_PX = 2.0
+_LEAST_COSINE = 0.2  # of the shading that divides
+_LEAST_MATTE = 1e-3  # share of matte pixels in a neighborhood
+_FLOOR = 1e-3  # albedo
+
+
+def fill_highlights(image: Floats, cues: Cues) -> Floats:
+    """An image (H, W, 3) with means of the pixels around in highlights that saturate the shortest exposure."""
+    clipped = cues.mask & ((cues.quality & Quality.CLIPPED) > 0)
+    hole = cues.mask & (cv2.dilate(clipped.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+    known = cues.mask & ~hole
+    out = np.array(image, np.float32)
+    if hole.any() and known.any():
+        around, far = mean_around(out, known, hole, blur=2.0, least=REACHED)
+        out[hole] = around[hole]
+        out[far] = out[known].mean(axis=0)
+    return out
+
+
+def mean_around(
+    image: Floats, known: NDArray[np.bool_], wanted: NDArray[np.bool_], blur: float, least: float
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Means (H, W, 3) of the known pixels about each wanted one (H, W), and the wanted ones without a mean (H, W).
+
+    By the narrowest Gaussian, doubled from 1σ = `blur` px, in which known pixels have a share of `least`.
+    """
+    weight = known.astype(np.float32)
+    weighted = (image * weight[..., None]).astype(np.float32)
+    out, left = np.zeros_like(weighted), wanted.copy()
+    while left.any() and blur < 2 * max(known.shape):
+        share = cv2.GaussianBlur(weight, (0, 0), blur)
+        mean = cv2.GaussianBlur(weighted, (0, 0), blur) / np.maximum(share, 1e-9)[..., None]
+        reached = left & (share > least)
+        out[reached] = mean[reached]
+        left, blur = left & ~reached, 2 * blur
+    return out, left
+
+
+def correct_highlights(maps: SurfaceMaps, cues: Cues, ior: float) -> SurfaceMaps:
+    """The maps (H, W, …) with the albedo of highlights from the crossed shot (`cues.body`); unchanged without one."""
+    if cues.body is None or cues.body_known is None:
+        return maps
+    low, high = _GLOSS
+    share = np.clip((specular_share(cues) - low) / (high - low), 0, 1) * cues.body_known  # of the crossed shot
+    share = cv2.GaussianBlur(share.astype(np.float32), (0, 0), 1.0) * cues.body_known
+    cosine = np.clip(frames.dot(maps.normal, cues.rays), _LEAST_COSINE, 1)
+    shading = cosine * fresnel.transmission(cosine, ior)[0] * fresnel.transmission(1.0, ior)[0]
+    by_shading = np.log(np.maximum(cues.body, _FLOOR)) - np.log(shading)[..., None]
+    estimated = np.log(np.maximum(maps.diffuse, _FLOOR))
+    matte = (share < 0.5) & cues.body_known & (maps.diffuse.min(-1) > _FLOOR)
+    reach = max(_AROUND * disc_radius(cues.mask), _LEAST_PX)
+    continued, _ = mean_around(estimated - by_shading, matte, np.ones_like(matte), blur=reach, least=_LEAST_MATTE)
+    corrected = np.exp(by_shading + continued)
+    diffuse = np.where(share[..., None] > 0, maps.diffuse + share[..., None] * (corrected - maps.diffuse), maps.diffuse)
+    return replace(maps, diffuse=(np.clip(diffuse, 0, 1) * cues.mask[..., None]).astype(np.float32))
+
+
+def specular_share(cues: Cues) -> Floats:
+    """Specular share of S0, (H, W); 0 where the crossed shot shows nothing. Clipped light counts as specular."""
+    assert cues.body is not None and cues.body_known is not None
+    share = np.clip(1 - cues.body.sum(-1) / np.maximum(cues.radiance.sum(-1), 1e-6), 0, 1)
+    return np.where(cues.body_known & cues.mask, share, 0).astype(np.float32)

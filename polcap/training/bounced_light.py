@@ -1,0 +1,195 @@
+"""One bounce of light between parts of the object, for training: traced once per view, computed at every step.
+
+The flash is next to the lens, so the camera sees the places that the flash lights: bounced light comes from pixels of
+the same picture. `trace_visibility` traces a few rays from every second pixel of every second row and stores the pixels
+that they meet. `bounced_stokes` computes the light along these rays for the materials of a step.
+`mirrored_surroundings` adds the mirror image of a backdrop and of the ground where no part of the object hides them.
+Neglected, as in `light_transport.py`: further bounces, and the weak polarization of the light that arrives.
+"""
+
+from math import log, pi
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional as F
+
+from polcap.images import Floats, GBuffer
+from polcap.optics import brdf, frames, fresnel, shade
+from polcap.optics.projection import project
+from polcap.training import light_transport
+from polcap.training.materials import Surface
+
+COARSE = 2  # pixels of the cache between traced pixels
+_COSINE_RAYS = 4  # rays of a pixel, distributed by the cosine about the smooth normal
+_LOBES = ((3, 0.5**2), (3, 0.2**2))  # more rays: their number, and the α of the GGX facets that distribute them
+RAYS = _COSINE_RAYS + sum(count for count, _ in _LOBES)
+SHARP = _LOBES[-1][0]  # the last rays, nearest to the mirror direction
+NOWHERE = 65535  # the ray meets a place that the camera does not see
+ESCAPED = 65534  # the ray leaves the object
+_MIN_ROUGHNESS = 0.2  # smoother surfaces mirror bounced light as if they had this roughness
+_SAME_PLACE = 2  # px of the cache: hits nearer than this are the place itself
+_MAX_DISTANCE = 0.01  # sides of the object between a hit and the place that its pixel shows
+
+_LOG_ALBEDO = (log(0.01), log(0.5))  # of backdrop and ground: dark cloth to paper
+
+Indices = NDArray[np.integer[Any]]
+
+
+def trace_visibility(
+    scene: light_transport.MeshScene, buffer: GBuffer, pose: light_transport.Pose, rng: np.random.Generator
+) -> tuple[NDArray[np.bool_], NDArray[np.uint16]]:
+    """Pixels (H, W) that the flash reaches, and the flat indices (H/2, W/2, RAYS) of the pixels that rays meet.
+
+    An index is ESCAPED or NOWHERE for rays that meet no pixel.
+    """
+    mask = buffer.mask
+    height, width = mask.shape
+    v = frames.rays(buffer.view, height, width)
+    eye = -pose.translation @ pose.rotation
+    _, flat = scene.facing(np.broadcast_to(eye, (int(mask.sum()), 3)), -v[mask] @ pose.rotation)
+    lit = np.zeros_like(mask)
+    lit[mask] = scene.lit(buffer.position[mask], flat, pose)[1] > 0
+
+    above: Floats = np.zeros((height, width, 3), np.float32)
+    above[mask] = flat
+    places = np.zeros_like(mask)
+    places[::COARSE, ::COARSE] = True
+    places &= mask
+    normal = frames.to_ray_frame(buffer.normal[places], v[places])
+    way = frames.from_ray_frame(_draw_directions(normal, rng), v[places][:, None])  # (M, RAYS, 3)
+    origin = buffer.position[places] + light_transport.LIFT * scene.size * above[places]
+    start = np.broadcast_to(origin[:, None], way.shape).reshape(-1, 3)
+    direction = way.reshape(-1, 3) @ pose.rotation
+    distance, _ = scene.facing(start, direction)
+    met = np.flatnonzero(np.isfinite(distance) & (distance > light_transport.LIFT * scene.size))
+    there = start[met] + distance[met, None] * direction[met]
+    found = np.where(np.isfinite(distance), NOWHERE, ESCAPED).astype(np.uint16)
+    found[met] = _find_pixels(there, np.argwhere(places)[met // RAYS], buffer, pose, scene.size)
+    out = np.full((height, width, RAYS), NOWHERE, np.uint16)
+    out[places] = found.reshape(-1, RAYS)
+    return lit, out[::COARSE, ::COARSE]
+
+
+def _draw_directions(normal: Floats, rng: np.random.Generator) -> Floats:
+    """Random directions (M, RAYS, 3) about normals (M, 3), in the frame of each view ray; `_density` is theirs."""
+    e_x, e_y = frames.basis(normal)
+    turn, shift = rng.uniform(0, 1, (2, len(normal)))
+    ways = []
+    for number, alpha in ((_COSINE_RAYS, None), *_LOBES):
+        for k in range(number):
+            u = (k + shift) / number
+            cosine = np.sqrt(1 - u if alpha is None else (1 - u) / (1 + (alpha**2 - 1) * u))
+            azimuth = 2 * pi * (k * 0.618034 + turn)
+            sine = np.sqrt(1 - cosine**2)
+            x, y = (a[:, None] for a in (sine * np.cos(azimuth), sine * np.sin(azimuth)))
+            axis = x * e_x + y * e_y + cosine[:, None] * normal
+            ways.append(axis if alpha is None else 2 * axis[:, 2:] * axis - [0, 0, 1])
+    return np.stack(ways, axis=1)
+
+
+def _find_pixels(
+    place: Floats, origin: Indices, buffer: GBuffer, pose: light_transport.Pose, size: float
+) -> NDArray[np.uint16]:
+    """Flat index of the pixel in which the camera sees each place (N, 3).
+
+    NOWHERE if the camera does not see the place, or sees it next to the pixel `origin` (N, 2) that the ray came from,
+    because the grid is too coarse for the direction between neighbors.
+    """
+    height, width = buffer.mask.shape
+    seen = place @ pose.rotation.T + pose.translation
+    x, y = np.round(project(buffer.view, seen)).astype(np.int64).T
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    x, y = np.where(inside, x, 0), np.where(inside, y, 0)
+    inside &= np.linalg.norm(buffer.position[y, x] - place, axis=1) < _MAX_DISTANCE * size
+    inside &= np.maximum(np.abs(y - origin[:, 0]), np.abs(x - origin[:, 1])) > _SAME_PLACE
+    return np.where(inside & buffer.mask[y, x], y * width + x, NOWHERE).astype(np.uint16)
+
+
+def bounced_stokes(pixels: Any, normal: Tensor, surface: Surface, body: Tensor) -> Tensor:
+    """Stokes parameters (3, M, 3) of light after one bounce, before smoothing.
+
+    pixels: `simulator.ObjectPixels`; normal (M, 3) with bumps, in the frames of the rays; body (M, 3) diffuse S0 under
+    the flash alone. All rays are used for diffuse and mirrored light, weighted by the balance heuristic.
+
+    References
+    ----------
+    Veach & Guibas, Optimally combining sampling techniques for Monte Carlo rendering, SIGGRAPH 1995.
+    """
+    here, ray = (pixels.met >= 0).nonzero(as_tuple=True)
+    there = pixels.met[here, ray]
+    v, light = pixels.v[here], body[there] / RAYS
+    way = frames.to_ray_frame(F.normalize(pixels.place[there] - pixels.place[here], dim=1), v)
+    irradiance = 1 / (pi * _density(frames.to_ray_frame(pixels.normal[here], v), way).clamp(min=1e-3))
+    n, rough, ior = normal[here], surface.roughness[here].clamp(min=_MIN_ROUGHNESS), surface.ior[here]
+    diffuse, specular = surface.diffuse[here] * light, surface.specular[here]
+    diffuse_part = shade.stokes(n, diffuse, 0 * specular, rough, ior, way, irradiance, surface.law.at(here))
+    mirrored = shade.stokes(n, 0 * diffuse, specular * light, rough, _facet_ior(specular, ior), way, irradiance)
+    return normal.new_zeros(3, len(normal), 3).index_add(1, here, diffuse_part + mirrored)
+
+
+def mirrored_surroundings(pixels: Any, flash: Tensor, normal: Tensor, surface: Surface, strength: Tensor) -> Tensor:
+    """Stokes parameters (3, M, 3) of the mirror image of backdrop and ground in the surface.
+
+    Near the outline this is most of the light: reflectance tends to 1 there, and the mirrored ray points away from the
+    camera. Each pixel has one ray, about its own normal, weighted by the share of the sharpest rays that leave the
+    object. strength (B,) as in `Simulator.photograph`, flash (B, 3) as in `ViewBatch`. A third of the objects have
+    neither backdrop nor ground.
+    """
+    count, device, own = len(strength), normal.device, pixels.owner
+
+    def u(low: float, high: float, columns: int = 1) -> Tensor:
+        return low + (high - low) * torch.rand(count, columns, device=device)
+
+    albedo = torch.exp(u(*_LOG_ALBEDO)) * torch.exp(0.1 * torch.randn(count, 3, device=device)) * (u(0, 1) > 1 / 3)
+    turn = u(0, 2 * pi)
+    down = torch.cat([torch.cos(turn), torch.sin(turn), 0 * turn], dim=1)  # the ground's normal points the other way
+    low = (pixels.place * down[own]).sum(dim=1)  # the object lies on the ground
+    ground = torch.full((count,), -9.0, device=device).scatter_reduce(0, own, low, "amax") + 9 * (u(0, 1)[:, 0] > 0.6)
+    behind = 1.35 + 1.5 * u(0, 1)[:, 0] ** 2
+
+    half = frames.from_ray_frame(normal, pixels.v)
+    way = 2 * normal[:, 2:] * half - pixels.v
+    to_ground = (ground[own] - low) / (way * down[own]).sum(dim=1).clamp(min=1e-4)
+    to_backdrop = (behind[own] + pixels.place[:, 2]) / (-way[:, 2]).clamp(min=1e-4)
+    place = pixels.place + torch.minimum(to_ground, to_backdrop)[:, None] * way
+    facing = torch.where((to_ground < to_backdrop)[:, None], -down[own], down.new_tensor([0.0, 0.0, 1.0]))
+    to_flash = flash[own] - place
+    far = to_flash.norm(dim=1)
+    received = strength[own] * pixels.open * (to_flash * facing).sum(dim=1).clamp(min=0) / far**3
+    light = albedo[own] * received[:, None]
+
+    rough = surface.roughness.clamp(min=_MIN_ROUGHNESS)
+    mirror = 2 * normal[:, 2:] * normal - normal.new_tensor([0.0, 0.0, 1.0])
+    irradiance = 4 * normal[:, 2] * rough**4  # 1 / (π × density of facets that mirror exactly)
+    ior = _facet_ior(surface.specular, surface.ior)
+    return shade.stokes(normal, 0 * light, surface.specular * light, rough, ior, mirror, irradiance)
+
+
+def _facet_ior(specular: Tensor, ior: Tensor) -> Tensor:
+    """Refractive index (M,) that gives F0 (M, 3), at least the body's (M,); reason in `light_transport.py`."""
+    root = torch.maximum(specular.mean(dim=1), fresnel.normal_reflectance(ior)).sqrt()
+    return (1 + root) / (1 - root)
+
+
+def _density(normal: Tensor, way: Tensor) -> Tensor:
+    """Density of `_draw_directions` per steradian; normal and way (N, 3) in the frame of each view ray."""
+    density = _COSINE_RAYS / RAYS * (normal * way).sum(dim=1).clamp(min=0) / pi
+    half = F.normalize(way + way.new_tensor([0.0, 0.0, 1.0]), dim=1)
+    cosine = (normal * half).sum(dim=1).clamp(min=0)
+    for number, alpha in _LOBES:
+        facets = brdf.ggx_distribution(cosine, alpha) * cosine / (4 * half[:, 2].clamp(min=1e-3))
+        density = density + number / RAYS * facets
+    return density
+
+
+def smooth(stokes: Tensor, mask: Tensor) -> Tensor:
+    """Stokes parameters (3, B, H, W, 3) averaged over 3 × 3 pixels of the object (B, H, W)."""
+    count, height, width = mask.shape
+    flat = stokes.permute(1, 0, 4, 2, 3).reshape(count, 9, height, width)
+    inside = mask[:, None].to(stokes.dtype)
+    share = F.avg_pool2d(inside, 3, 1, 1).clamp(min=0.1)
+    mean = F.avg_pool2d(flat * inside, 3, 1, 1) / share * inside
+    return mean.reshape(count, 3, 3, height, width).permute(1, 0, 3, 4, 2)

@@ -1,0 +1,221 @@
+"""The paper's data set as files: random shapes and materials under a flash -> photographs at four angles, and truth.
+
+::
+
+    FOLDER/dataset.json               what was asked for, and how every file's numbers are to be read
+    FOLDER/000000/I000.png … I135.png  what a polarizer at 0, 45, 90, 135° passes, with noise
+                  stokes.png          (S1, S2)/√(S1² + S2²), from the noisy photographs
+                  diffuse_color.png   ½(S0 − √(S1² + S2²)) per channel, unit length
+                  normal.png depth.png diffuse.png specular.png roughness.png mask.png
+                  sample.json         camera, flash, depth's limits
+
+A sample follows from the seed and its number. Each is there whole or not at all; a run that was
+stopped goes on, one asked for more samples adds them.
+
+References
+----------
+Deschaintre, Lin, Ghosh, Deep Polarization Imaging for 3D Shape and SVBRDF Acquisition, CVPR 2021, §4.
+"""
+
+import json
+from math import log1p
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+import torch
+from msgspec import Meta
+
+from polcap.errors import InputError
+from polcap.formats import atomic
+from polcap.formats.maps import png
+from polcap.images import Bits, Floats
+from polcap.optics import frames, mueller, shade
+from polcap.stages import cues
+from polcap.synth.mesh_tracer import Tracer, centred
+from polcap.training import materials, random_shapes, traced_views
+
+ANGLES_DEG = (0, 45, 90, 135)
+_LARGEST, _KNEE = 16.0, 0.01  # of the HDR encoding: radiance at 65535, and where it turns from linear to logarithmic
+
+
+class DatasetRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What all samples have in common."""
+
+    seed: int = 0
+    size: Annotated[int, Meta(ge=64, le=4096)] = 512  # px
+    noise: Annotated[float, Meta(ge=0)] = 0.002  # 1σ at radiance 1, growing as its root; a tenth of it in the dark
+    mesh: str = ""  # a file, or a folder of them; else random shapes
+    material: str = ""  # a folder of texture sets; else solid noise
+    law: Literal["smooth", "rough"] = "smooth"  # of the bodies
+
+
+def main(out: Path, count: int, recipe: DatasetRecipe) -> int:
+    """Make what is missing of samples 0…count − 1; returns how many were made now."""
+    library, files = _library(recipe.material), _meshes(recipe.mesh)
+    _describe(out, recipe)
+    made = 0
+    for number in range(count):
+        place = out / f"{number:06d}"
+        if place.exists():
+            continue
+        with atomic.folder(place) as folder:
+            _write(folder, *make_sample(recipe, library, files, number))
+        made += 1
+    return made
+
+
+def make_sample(
+    recipe: DatasetRecipe, library: materials.MaterialLibrary, files: list[Path], number: int
+) -> tuple[dict[str, Floats], dict[str, Any]]:
+    """Pictures by file name, as numbers, and sample.json. Without mesh `files` the shape is random."""
+    rng = np.random.default_rng([recipe.seed, number])
+    file = files[rng.integers(len(files))] if files else None
+    mesh = centred(traced_views.read_mesh(file)) if file else random_shapes.compose(rng)
+    buffer, turn, _ = traced_views.trace_random_view(str(file or "a random shape"), Tracer(mesh), recipe.size, rng)
+    mask, view = buffer.mask, buffer.view
+    middle, unit = traced_views.depth_unit(mask, buffer.depth, view.focal)
+    rays = frames.rays(view, *mask.shape)
+    v, bare, position = (torch.from_numpy(a[mask]) for a in (rays, buffer.normal, buffer.position))
+    with torch.random.fork_rng():
+        torch.manual_seed(int(rng.integers(1 << 62)))
+        owner, smooth = torch.zeros(len(v), dtype=torch.long), float(recipe.law == "smooth")
+        surface = materials.draw_surface(
+            library, bare, position, torch.from_numpy(turn).float()[None], owner, 1, smooth
+        )
+    normal = frames.lifted(frames.to_ray_frame(surface.normal, v))
+    way, off = rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.1)
+    flash = [off * np.cos(way) * middle, off * np.sin(way) * middle, 0.0]
+    point = -v * (torch.from_numpy(buffer.depth[mask]) / v[:, 2])[:, None]
+    to_light = torch.tensor(flash, dtype=torch.float32) - point
+    squared = (to_light**2).sum(dim=1)
+    to_light = frames.to_ray_frame(to_light / squared.sqrt()[:, None], v)
+    light = shade.stokes(
+        normal,
+        surface.diffuse,
+        surface.specular,
+        surface.roughness,
+        surface.ior,
+        to_light,
+        middle**2 / squared,
+        surface.law,
+    ).numpy()
+
+    passed = _photographs(light, rays[mask], recipe.noise, rng)
+    i0, i45, i90, i135 = passed
+    stokes = np.stack([passed.sum(axis=0) / 2, i0 - i90, i45 - i135])
+    pictures = {
+        **{f"I{angle:03d}": picture for angle, picture in zip(ANGLES_DEG, passed)},
+        "stokes": np.moveaxis(cues.polarization(stokes, np.zeros((6, *stokes.shape[1:])))[3], 0, -1),
+        "diffuse_color": cues.least_intensity_color(stokes, np.eye(3)),
+        "normal": np.asarray(frames.from_ray_frame(normal, v)),
+        "depth": buffer.depth[mask],
+        "diffuse": surface.diffuse.numpy(),
+        "specular": surface.specular.numpy(),
+        "roughness": surface.roughness.numpy(),
+    }
+    near, far = (float(f(buffer.depth[mask])) for f in (np.min, np.max))
+    about: dict[str, Any] = {
+        "focal_px": view.focal, "center_px": view.center, "flash": flash, "depth": {"near": near, "far": far},
+        "middle": middle, "depth_unit": unit, "ior": float(surface.ior.mean()),
+    }  # fmt: skip
+    return {"mask": mask.astype(np.float32)} | {name: _image(value, mask) for name, value in pictures.items()}, about
+
+
+def encode(radiance: Floats) -> Floats:
+    """Linear radiance → 0…1: ln(1 + x/k)/ln(1 + m/k), m = 16, k = 0.01; clipped."""
+    return np.asarray(np.log1p(np.clip(radiance, 0, _LARGEST) / _KNEE) / log1p(_LARGEST / _KNEE))
+
+
+def decode(code: Floats) -> Floats:
+    """And back; code = value / 65535."""
+    return np.asarray(_KNEE * np.expm1(code * log1p(_LARGEST / _KNEE)))
+
+
+def _library(material: str) -> materials.MaterialLibrary:
+    library = materials.MaterialLibrary(Path(material) if material else None, torch.device("cpu"))
+    if material and not library.has_textures:
+        raise InputError(f"{material} holds no texture set; give a folder of folders with albedo.jpg")
+    return library
+
+
+def _meshes(mesh: str) -> list[Path]:
+    """The files to take from; none for random shapes."""
+    if not mesh:
+        return []
+    place = Path(mesh)
+    files = sorted(p for p in place.iterdir() if p.suffix != ".json") if place.is_dir() else [place]
+    if not files:
+        raise InputError(f"{place} holds no mesh; give a file or a folder of them")
+    return files
+
+
+def _photographs(light: Floats, rays: Floats, noise: float, rng: np.random.Generator) -> Floats:
+    """What the polarizer passes at each angle, (4, M, 3), with noise."""
+    passed = []
+    for angle in np.radians(ANGLES_DEG):
+        weights = mueller.analyzer(frames.axis_on_ray(np.asarray(angle), rays), np.inf)
+        one = np.einsum("ms,smc->mc", weights, light)
+        passed.append(one + noise * np.hypot(np.sqrt(np.maximum(one, 0)), 0.1) * rng.normal(size=one.shape))
+    return np.stack(passed)
+
+
+def _image(value: Floats, mask: Any) -> Floats:
+    out = np.zeros((*mask.shape, *value.shape[1:]), np.float32)
+    out[mask] = value
+    return out
+
+
+def _write(folder: Path, pictures: dict[str, Floats], about: dict[str, Any]) -> None:
+    near, far = about["depth"]["near"], about["depth"]["far"]
+    mask = pictures["mask"] > 0
+    for name, value in pictures.items():
+        if name == "mask":
+            drawn: Bits = np.where(mask, 255, 0).astype(np.uint8)
+            png.write(folder / "mask.png", drawn)
+            continue
+        if name.startswith("I"):
+            value = encode(value)
+        elif name == "normal":
+            value = np.where(mask[..., None], value / 2 + 0.5, 0)
+        elif name == "stokes":  # S0's slot first, as in the paper
+            value = np.where(mask[..., None], np.dstack([np.full(mask.shape, 0.5), value / 2 + 0.5]), 0)
+        elif name == "depth":
+            value = np.where(mask, (value - near) / max(far - near, 1e-9), 0)
+        png.write(folder / f"{name}.png", png.sixteen_bits(value))
+    (folder / "sample.json").write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+
+
+def _describe(out: Path, recipe: DatasetRecipe) -> None:
+    """dataset.json; samples of another recipe are never mixed in."""
+    asked, file = msgspec.to_builtins(recipe), out / "dataset.json"
+    if file.exists():
+        there = json.loads(file.read_text(encoding="utf-8"))["recipe"]
+        if there != asked:
+            raise InputError(f"{out} was begun with {there}, not {asked}; choose another folder")
+        return
+    if out.exists() and any(out.iterdir()):
+        raise InputError(f"{out} is not an empty folder; choose another place for the data set")
+    code = f"x = {_KNEE} * expm1(value / 65535 * ln(1 + {_LARGEST} / {_KNEE}))"
+    document = {
+        "format": "polcap dataset 1",
+        "recipe": asked,
+        "frame": "camera: x right, y up, z toward the camera; row 0 on top; pixel centres on whole numbers",
+        "angles": "polarizer axis from image x toward image up, degrees; projected across each ray off axis",
+        "unit": "the longest side of the object",
+        "light": "one flash, in the camera frame (sample.json), with inverse-square fall-off; "
+        "radiance 1: S0 of a white matt plane facing it at the object's middle depth; no interreflection",
+        "files": {
+            "I000.png … I135.png": f"HDR, 16 bit RGB, linear Rec.709 radiance {code}",
+            "stokes.png": "16 bit: R 0.5; G, B (S1, S2)/√(S1² + S2²) * 0.5 + 0.5, from the photographs",
+            "diffuse_color.png": "16 bit RGB: least intensity of each pixel's sinusoid, unit length",
+            "normal.png": "16 bit: n * 0.5 + 0.5, camera frame",
+            "depth.png": "16 bit: (depth − near)/(far − near) of sample.json, along the optical axis, growing away",
+            "diffuse.png, specular.png": "16 bit RGB, linear: diffuse albedo; F0",
+            "roughness.png": "16 bit, linear: perceptual roughness, GGX alpha = roughness²",
+            "mask.png": "8 bit, 255 on the object; elsewhere every picture is 0",
+        },
+    }
+    with atomic.path(file) as temporary:
+        temporary.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

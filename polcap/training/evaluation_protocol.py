@@ -1,0 +1,251 @@
+"""The evaluation's fixed pictures: 6 test meshes × 30 test materials -> what the camera measured, and the truth.
+
+Protocol 1: bodies leave light through a smooth interface, half of the materials have a high F0. Protocol 2: through
+the facets of their own roughness (`optics/body.py`), with F0 as it is met. Shapes, patterns and cameras are the same.
+Every picture follows from its number, at any size. Conditions: `CONDITIONS`. Made one at a time.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from polcap.errors import InputError
+from polcap.images import Bits, ColorCalibration, Cues, Floats, GBuffer, Quality, StokesImage, SurfaceMaps, View
+from polcap.optics import frames
+from polcap.optics.body import SMOOTH, Law
+from polcap.stages import cues
+from polcap.synth.mesh_tracer import Tracer, Triangles, centred
+from polcap.training import evaluation_materials, light_transport, random_shapes, traced_views
+from polcap.training.camera_errors import CameraErrors, photograph
+
+VERSION = 1  # raise it when the same number gives other pixels
+COUNT, SIZE = 250, 512
+QUICK_COUNT, QUICK_SIZE = 50, 256
+MESHES = 6
+LIGHTS = 20
+_SEED = 20211121
+_FIELD_OF_VIEW = 30.0  # degrees, of the picture's side
+FLASH = 0.05  # of the distance, above the lens
+_NATIVE = 160  # px: about the size that networks compared with each other are shown
+CONDITIONS = (
+    "three exposures ×4 apart of a sensor with a full well of 20 ke⁻ and read noise 5 e⁻; gain error 0.3 % per shot "
+    "(1σ); polarizer angle error 0.5° (1σ); flash 5 cm above the lens at 1 m distance; field of view 30°, object "
+    "over 70–90 % of it; refractive index 1.4–1.6; cast shadows and one diffuse bounce between parts of the object, "
+    "traced; seeds fixed"
+)
+PROTOCOLS = {1: "smooth bodies, F0 .03–.26", 2: "rough bodies, F0 as it is met"}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One picture; camera frame."""
+
+    name: str  # mesh and material
+    cues: Cues  # of the camera as stated
+    clean: Cues  # of a camera without errors, in the same light
+    small: Cues  # as stated, binned to about the size that networks are trained on
+    truth: SurfaceMaps
+    depth: Floats  # (H, W) units of traced_views.depth_unit, mean 0
+
+
+@dataclass(frozen=True)
+class _Subject:
+    """Geometry and material of a picture, before any light."""
+
+    name: str
+    pose: light_transport.Pose
+    buffer: GBuffer
+    places: light_transport.SurfacePoints
+    albedo: light_transport.Albedo
+    unit: tuple[float, float]  # middle depth and unit of relative depth
+
+
+class Protocol:
+    """The pictures of one size and protocol; meshes and materials are read once."""
+
+    def __init__(self, data: Path, size: int, protocol: int = 1) -> None:
+        files = sorted((data / "meshes" / "test").glob("*.npz"))
+        if len(files) != MESHES:
+            raise InputError(f"{data}/meshes/test holds {len(files)} meshes, the evaluation takes {MESHES}")
+        self.size, self.protocol = size, protocol
+        self.names = [file.stem for file in files]
+        self.meshes = [centred(traced_views.read_mesh(file)) for file in files]
+        self.scenes = [light_transport.MeshScene(mesh) for mesh in self.meshes]
+        self.tracers = [Tracer(mesh) for mesh in self.meshes]
+        self.materials = evaluation_materials.test_materials(data / "materials" / "test", met=protocol == 2)
+
+    def case(self, number: int) -> Case:
+        """Picture `number`."""
+        subject = self._subject(number, self.size)
+        buffer, places = subject.buffer, subject.places
+        mesh, _ = combination(number)
+        rng = np.random.default_rng([_SEED, number, 1])
+        light = light_transport.stokes(self.scenes[mesh], places, subject.pose, subject.albedo, rng)
+        with torch.random.fork_rng():
+            torch.manual_seed(_SEED + number)
+            one = torch.ones(1)
+            stated = _measured(light, places, buffer.view, CameraErrors.stated(1, one.device))
+            clean = _measured(light, places, buffer.view, CameraErrors.none(1, one.device))
+        return Case(
+            name=subject.name,
+            cues=cues.compute(stated, white()),
+            clean=cues.compute(clean, white()),
+            small=cues.compute(_binned(stated, max(1, round(self.size / _NATIVE))), white()),
+            truth=_truth(subject),
+            depth=_relative_depth(subject),
+        )
+
+    def truth(self, number: int, size: int) -> SurfaceMaps:
+        """The maps of a picture alone, without light: soon made."""
+        return _truth(self._subject(number, size))
+
+    def _subject(self, number: int, size: int) -> _Subject:
+        index, which = combination(number)
+        mesh, material = self.meshes[index], self.materials[which]
+        rng = np.random.default_rng([_SEED, number])
+        while True:
+            turn, translation = _placed(mesh, rng)
+            focal = size / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))
+            view = View(focal=float(focal), center=((size - 1) / 2, (size - 1) / 2), scale=1.0)
+            buffer = self.tracers[index].trace(turn, translation, view, size, size)
+            if buffer.mask.mean() > traced_views.LEAST_SHARE:
+                break
+        inside = buffer.mask
+        middle, unit = traced_views.depth_unit(inside, buffer.depth, view.focal)
+        pose = light_transport.Pose(turn, translation, np.array([0, FLASH * middle, 0]), middle**2)
+        laid, shift = random_shapes.rotation(rng), rng.uniform(-0.5, 0.5, 3)  # the material's own turn and place
+        position, v = buffer.position[inside].astype(np.float64), frames.rays(view, size, size)[inside]
+
+        def albedo(place: Floats, facing: Floats) -> Floats:
+            return material.at(place @ laid.T + shift, facing @ laid.T).diffuse
+
+        normal = buffer.normal[inside]
+        pattern = position @ laid.T + shift, normal @ turn @ laid.T  # places and facing directions in its frame
+        look, slope = material.at(*pattern), material.slope(*pattern) @ laid @ turn.T
+        bent = frames.to_ray_frame(normal - slope + np.sum(slope * normal, axis=1, keepdims=True) * normal, v)
+        bent = np.asarray(frames.lifted(bent))
+        _, flat = self.scenes[index].facing(position + 0.01 * (v @ turn), -v @ turn)
+        places = light_transport.SurfacePoints(
+            inside, position, flat, bent, v, look.diffuse, look.specular, look.roughness, material.ior,
+            body_law(number) if self.protocol == 2 else SMOOTH,
+        )  # fmt: skip
+        return _Subject(f"{self.names[index]}, {material.name}", pose, buffer, places, albedo, (middle, unit))
+
+
+def combination(number: int) -> tuple[int, int]:
+    """Mesh and material of a picture: every 30 show each material once and each mesh five times; 180 are all."""
+    order = np.random.default_rng(_SEED).permutation(evaluation_materials.TEXTURES + evaluation_materials.PATTERNS)
+    mesh = number % MESHES
+    return mesh, int(order[(number // MESHES + 5 * mesh) % len(order)])
+
+
+def body_law(number: int) -> Law:
+    """The law of the body of a picture of protocol 2.
+
+    Facets counted evenly in every even one, by the flash's light in every odd one; .8–1 of the polarization left, .4–.8
+    in every tenth.
+    """
+    low, high = (0.4, 0.8) if number % 10 == 9 else (0.8, 1.0)
+    kept = np.random.default_rng([_SEED, number, 2]).uniform(low, high)
+    return Law(rough=1.0, local=float(number % 2), kept=float(kept))
+
+
+def render_lights() -> Floats:
+    """The stored lights (20, 3): unit vectors evenly over 60° about the direction from the object to the camera."""
+    k = np.arange(LIGHTS) + 0.5
+    z, azimuth = 1 - k / LIGHTS * (1 - np.cos(np.radians(60))), np.pi * (3 - np.sqrt(5)) * k
+    across = np.sqrt(1 - z**2)
+    return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=1)
+
+
+def stokes_image(
+    measured: tuple[Tensor, Tensor, Tensor], at: NDArray[np.integer[Any]], mask: NDArray[np.bool_], view: View
+) -> StokesImage:
+    """Stokes parameters, covariance and clipped pixels of the places `at`, as the stages know them."""
+
+    def image(flat: Tensor) -> Floats:
+        out = np.zeros((flat.shape[0], mask.size, 3), dtype=np.float32)
+        out[:, at] = flat.numpy()
+        return out.reshape(-1, *mask.shape, 3)
+
+    quality: Bits = np.zeros(mask.size, dtype=np.uint8)
+    quality[at[measured[2].numpy()]] = int(Quality.CLIPPED)
+    return StokesImage(image(measured[0]), image(measured[1]), quality.reshape(mask.shape), mask, view, None)
+
+
+def _placed(mesh: Triangles, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Random turn, on the optical axis, so far away that the object fills 70–90 % of the picture's side."""
+    turn, fill = random_shapes.rotation(rng), rng.uniform(0.7, 0.9)
+    seen = mesh.vertices.astype(np.float64) @ turn.T
+    seen -= (middle := (seen.min(axis=0) + seen.max(axis=0)) / 2)
+    slope = fill * np.tan(np.radians(_FIELD_OF_VIEW / 2))
+    distance = float((np.abs(seen[:, :2]).max(axis=1) / slope + seen[:, 2]).max())
+    return turn, np.array([0, 0, -distance]) - middle
+
+
+def _measured(light: Floats, places: light_transport.SurfacePoints, view: View, errors: CameraErrors) -> StokesImage:
+    mask = places.mask
+    at = np.flatnonzero(mask)
+
+    def image(flat: Floats) -> Tensor:
+        out = np.zeros((mask.size, flat.shape[1]), dtype=np.float32)
+        out[at] = flat
+        return torch.from_numpy(out.reshape(1, *mask.shape, -1))
+
+    scene = torch.stack([image(part) for part in light])
+    rays = torch.from_numpy(frames.rays(view, *mask.shape))[None]
+    whole = torch.from_numpy(mask)[None]
+    seen = photograph(scene, image(places.diffuse), whole, rays, torch.from_numpy(at), errors)
+    return stokes_image(seen, at, mask, view)
+
+
+def _binned(image: StokesImage, by: int) -> StokesImage:
+    """by × by pixels in one, those of the object alone; a bin is the object's where half of it is."""
+    height, width = (side // by for side in image.mask.shape)
+
+    def summed(value: Floats) -> Floats:  # the last two axes of pixels
+        cut = value[..., : height * by, : width * by].reshape(*value.shape[:-2], height, by, width, by)
+        return np.asarray(cut.sum(axis=(-3, -1)))
+
+    inside = image.mask.astype(np.float32)
+    count = summed(inside)
+    mask, share = count * 2 >= by * by, np.maximum(count, 1)
+    stokes, covariance = (
+        np.moveaxis(summed(np.moveaxis(value * inside[..., None], -1, 1)) / share**power * mask, 1, -1)
+        for value, power in ((image.stokes, 1), (image.covariance, 2))
+    )
+    clipped = summed(((image.quality & Quality.CLIPPED) > 0) * inside) * 2 > share
+    view = replace(
+        image.view, focal=image.view.focal / by, scale=by,
+        center=((image.view.center[0] + 0.5) / by - 0.5, (image.view.center[1] + 0.5) / by - 0.5),
+    )  # fmt: skip
+    return StokesImage(stokes, covariance, clipped.astype(np.uint8) * np.uint8(Quality.CLIPPED), mask, view, None)
+
+
+def _truth(subject: _Subject) -> SurfaceMaps:
+    places, mask = subject.places, subject.places.mask
+
+    def image(flat: Floats) -> Floats:
+        out = np.zeros((*mask.shape, *flat.shape[1:]), np.float32)
+        out[mask] = flat
+        return out
+
+    return SurfaceMaps(
+        normal=image(frames.from_ray_frame(places.normal, places.rays)), diffuse=image(places.diffuse),
+        specular=image(places.specular), roughness=image(places.roughness), depth_prior=_relative_depth(subject),
+        confidence=np.zeros(mask.shape, np.float32), mask=mask, view=subject.buffer.view, estimator="truth",
+    )  # fmt: skip
+
+
+def _relative_depth(subject: _Subject) -> Floats:
+    middle, unit = subject.unit
+    return np.where(subject.places.mask, (subject.buffer.depth - middle) / unit, 0).astype(np.float32)
+
+
+def white() -> ColorCalibration:
+    return ColorCalibration(np.eye(3, dtype=np.float32), "profile")

@@ -1,0 +1,106 @@
+"""Gloss from profiles in the main network: radiance against zenith angle, averaged over soft groups of places.
+
+The gloss of a material is visible only where it faces the flash. Learned features divide places into groups. The light
+of each group is averaged in bins of the estimated zenith, and every place of the group gets the gloss read from this
+profile.
+"""
+
+from dataclasses import dataclass
+from math import cos, radians
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from polcap.optics import fresnel
+from polcap.stages.cues import FLOOR, NOMINAL_IOR
+
+_GROUPS = 16
+_EDGES_DEG = (0.0, 4.0, 8.0, 12.0, 17.0, 23.0, 30.0, 40.0, 52.0, 66.0, 90.0)
+_BINS = len(_EDGES_DEG) - 1
+_FIGURES = 6  # per bin
+PROFILE = _BINS * _FIGURES
+_BLOCK = 64  # divides the number of places of every picture: every second one, sides are multiples of 32
+
+
+@dataclass(frozen=True)
+class GlossEvidence:
+    """Inputs of the gloss estimate at each place, (B, ·, H, W)."""
+
+    figures: Tensor  # 5 channels of `figures_of`
+    cosine: Tensor  # of the zenith
+    diffuse: Tensor  # 3 channels
+    usable: Tensor  # 1 on the object where it is not clipped, else 0
+
+
+class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types here
+    """Features and evidence of each place -> the readings of its groups (B, outputs, H, W)."""
+
+    def __init__(self, coarse: int, fine: int, outputs: int) -> None:
+        super().__init__()
+        self.sort = nn.Conv2d(coarse, _GROUPS, 1)
+        self.part = nn.Sequential(nn.Conv2d(fine + 6, 32, 1), nn.ReLU(), nn.Conv2d(32, _GROUPS, 1))
+        self.read = nn.Sequential(nn.Linear(PROFILE, 96), nn.ReLU(), nn.Linear(96, outputs))
+        nn.init.zeros_(self.part[-1].weight)
+        nn.init.zeros_(self.part[-1].bias)
+
+    def forward(self, coarse: Tensor, fine: Tensor, seen: GlossEvidence) -> Tensor:
+        """Features sort the places: coarse ones (B, ·, H/2, W/2) by region, fine ones (B, ·, H, W) within it."""
+        color = torch.log(seen.diffuse + 0.02)
+        weight = seen.usable + 1e-4
+        deviation = color - (color * weight).sum(dim=(2, 3), keepdim=True) / weight.sum(dim=(2, 3), keepdim=True)
+        region = F.interpolate(self.sort(coarse).float(), scale_factor=2.0, mode="bilinear", align_corners=False)
+        kind = self.part(torch.cat([fine, color.to(fine.dtype), deviation.to(fine.dtype)], dim=1)).float()
+        member = torch.softmax(region + kind, dim=1)
+        outputs = self.read(profile((member * seen.usable).flatten(2), seen.figures.flatten(2), seen.cosine.flatten(2)))
+        # (B, groups, outputs) and (B, groups, H·W)
+        return (outputs.transpose(1, 2) @ member.flatten(2)).unflatten(2, member.shape[2:])
+
+
+def figures_of(level: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) -> Tensor:
+    """The five quantities that profiles average, (B, 5, H, W).
+
+    Log of light / shading; log of light / diffuse light; its square; its square as a factor; missing share of the DoLP
+    of diffuse light.
+
+    level (B, 3, H, W) log radiance, ratio (B, 2, H, W) S1/S0 and S2/S0, normal and diffuse (B, 3, H, W).
+    """
+    cosine = normal[:, 2:].clamp(0.03, 1.0)
+    plus, minus = fresnel.transmission(cosine, NOMINAL_IOR)
+    shading = 0.96 * cosine * plus
+    light = (torch.exp(level) - FLOOR).clamp(0, 50).mean(dim=1, keepdim=True)
+    body = diffuse.mean(dim=1, keepdim=True) * shading
+    excess = torch.log((light + 0.02) / (body + 0.02)).clamp(-3, 4)
+    dolp = ratio.square().sum(dim=1, keepdim=True).sqrt()
+    short = (1 - dolp / (minus / plus + 0.005)).clamp(-1, 1)
+    return torch.cat([torch.log(light / shading + 0.02), excess, excess**2, torch.exp(2 * excess), short], dim=1)
+
+
+def profile(weight: Tensor, figures: Tensor, cosine: Tensor) -> Tensor:
+    """Profiles (B, groups, bins · 6) of groups with weights (B, groups, N), of figures (B, 5, N) and cosines (B, 1, N).
+
+    Each bin has the log share of its group, then the means of the figures; 0 where it is empty.
+    """
+    edges = cosine.new_tensor([cos(radians(angle)) for angle in _EDGES_DEG]).view(1, -1, 1)
+    at = ((cosine <= edges[:, :-1]) & (cosine > edges[:, 1:])).to(weight.dtype)  # (B, bins, N)
+    seen = torch.cat([torch.ones_like(cosine), figures], dim=1)
+    sums = summed(weight, (at[:, :, None] * seen[:, None]).flatten(1, 2).transpose(1, 2))
+    sums = sums.unflatten(2, (_BINS, _FIGURES))
+    share, total = sums[..., :1], sums[..., :1].sum(dim=2, keepdim=True) + 1e-3
+    mean = sums[..., 1:] / (share + 1e-4 * total)
+    light, excess, square, factor, short = mean.unbind(dim=-1)
+    whole = sums[..., 1].sum(dim=2, keepdim=True) / total[..., 0]  # of the light over shading
+    columns = (
+        torch.log(share[..., 0] / total[..., 0] + 1e-3) / 3, light - whole, excess, torch.log1p(factor), square, short,
+    )  # fmt: skip
+    return torch.stack(columns, dim=-1).flatten(2)
+
+
+def summed(weight: Tensor, values: Tensor) -> Tensor:
+    """weight (B, G, N) @ values (B, N, K), in blocks of N that are added in a fixed order.
+
+    onnxruntime 1.32 divides a long sum by its number of threads, so that the last bits of one product would depend on
+    it.
+    """
+    blocks = weight.unflatten(2, (-1, _BLOCK)).transpose(1, 2) @ values.unflatten(1, (-1, _BLOCK))  # (B, ·, G, K)
+    return blocks.sum(dim=1)

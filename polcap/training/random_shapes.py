@@ -1,0 +1,216 @@
+"""Random closed meshes to train on: one to seven simple bodies in one, some with arms, legs or branches."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Floats
+from polcap.synth.mesh_tracer import Triangles, centred, smooth, union
+
+_RINGS, _SECTORS = 96, 128  # vertices of a body
+_BRANCH_RINGS, _BRANCH_SECTORS = 24, 14  # vertices of a branch
+
+Faces = NDArray[np.int32]  # (F, 3)
+
+
+def compose(rng: np.random.Generator) -> Triangles:
+    """A random object of one to seven parts, longest side 1, centred."""
+    count = 1 if rng.random() < 0.35 else int(rng.integers(2, 8))
+    parts = []
+    centre = np.zeros(3)
+    for index in range(count):
+        vertices, faces = _PARTS[rng.integers(len(_PARTS))](rng)
+        size = 1.0 if index == 0 else rng.uniform(0.25, 0.9)
+        vertices = size * vertices @ rotation(rng).T + centre
+        parts.append(smooth(vertices, faces))
+        anchor = vertices[rng.integers(len(vertices))]  # the next part grows out of this one's surface
+        centre = centre * 0.2 + anchor * 0.8 if rng.random() < 0.6 else anchor * 0.5
+    return centred(union(parts))
+
+
+def compose_with_branches(rng: np.random.Generator) -> Triangles:
+    """A random object with 2–14 thin branches, mirrored left to right in half of the cases; longest side 1, centred."""
+    body = compose(rng)
+    parts = [body]
+    size, twins = rng.uniform(0.012, 0.05), rng.random() < 0.5
+    squash = np.array([1.0, 1.0, rng.choice([1.0, 0.5])])
+    for _ in range(int(rng.integers(2, 8 if twins else 15))):
+        start = body.vertices[rng.integers(len(body.vertices))]
+        vertices, faces = _branch(start, size * rng.uniform(0.6, 1.6), rng.uniform(0.25, 1.0), squash, rng)
+        parts.append(smooth(vertices, faces))
+        if twins:
+            parts.append(smooth(vertices * [-1, 1, 1], faces[:, ::-1]))
+    return centred(union(parts))
+
+
+def rotation(rng: np.random.Generator) -> Floats:
+    """A uniformly random rotation, (3, 3)."""
+    w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _displaced(rng: np.random.Generator) -> tuple[Floats, Faces]:
+    """An ellipsoid with waves on it."""
+    unit, faces = _sphere(_RINGS, _SECTORS)
+    field = np.zeros(len(unit))
+    for _ in range(int(rng.integers(2, 9))):
+        frequency = np.exp(rng.uniform(np.log(1.5), np.log(14)))
+        wave = unit @ (rng.normal(size=3) * frequency)
+        field = field + rng.normal() * np.sin(wave + rng.uniform(0, 6.28)) / frequency
+    radius = 0.5 * (1 + rng.uniform(0.2, 0.9) * np.tanh(field))
+    return unit * radius[:, None] * rng.uniform(0.4, 1.0, 3), faces
+
+
+def _dented(rng: np.random.Generator) -> tuple[Floats, Faces]:
+    """An ellipsoid with hollows and bosses, some with a flat floor, and often a patch of fine relief.
+
+    A hollow and a boss polarize light in the same way. Only outline, shadow and neighbors distinguish them.
+    """
+    unit, faces = _sphere(2 * _RINGS, 2 * _SECTORS)
+    radius = np.ones(len(unit))
+    widest = np.exp(rng.uniform(np.log(0.2), np.log(0.9)))  # rad
+    for _ in range(int(rng.integers(3, 17))):
+        width = widest * rng.uniform(0.4, 1.0)
+        away = np.arccos(np.clip(unit @ rotation(rng)[0], -1, 1)) / width
+        steep = rng.uniform(1, 4)  # 1: a Gaussian; more: a pit with a wall and a floor
+        radius += rng.choice([-1, -1, 1]) * width * rng.uniform(0.2, 0.8) * np.exp(-0.5 * away ** (2 * steep))
+    if rng.random() < 0.5:
+        away = np.arccos(np.clip(unit @ rotation(rng)[0], -1, 1))
+        wave = np.ones(len(unit))
+        frequency = rng.uniform(12, 40)
+        for _ in range(int(rng.integers(1, 3))):
+            wave *= np.sin(frequency * (unit @ rotation(rng)[0]) + rng.uniform(0, 6.28))
+        radius += rng.uniform(0.1, 0.5) / frequency * wave * (away < rng.uniform(0.3, 1.2))
+    return 0.5 * unit * np.clip(radius, 0.25, None)[:, None] * rng.uniform(0.5, 1.0, 3), faces
+
+
+def _superquadric(rng: np.random.Generator) -> tuple[Floats, Faces]:
+    """Superquadric: box, cylinder, ellipsoid, star and shapes between them."""
+    unit, faces = _sphere(_RINGS, _SECTORS)
+    east, north = np.exp(rng.uniform(np.log(0.12), np.log(2.2), 2))
+    latitude = np.arcsin(np.clip(unit[:, 2], -1, 1))
+    longitude = np.arctan2(unit[:, 1], unit[:, 0])
+    ring = _power(np.cos(latitude), north)
+    xyz = [
+        ring * _power(np.cos(longitude), east),
+        ring * _power(np.sin(longitude), east),
+        _power(unit[:, 2], north),
+    ]
+    return 0.5 * np.stack(xyz, axis=1) * rng.uniform(0.25, 1.0, 3), faces
+
+
+def _lathed(rng: np.random.Generator) -> tuple[Floats, Faces]:
+    """Solid of revolution, sometimes with lobes or a twist."""
+    unit, faces = _sphere(_RINGS, _SECTORS)
+    height = np.linspace(1, -1, _RINGS)
+    profile = np.full(_RINGS, rng.uniform(0.3, 0.6))
+    for k in range(1, 7):
+        profile = profile + rng.normal() * 0.3 / k * np.cos(k * np.pi * (height + 1) / 2 + rng.uniform(0, 6.28))
+    profile = np.clip(np.abs(profile), 0.05, 1.2) * (1 - np.abs(height) ** rng.uniform(4, 40)) ** 0.5
+    ring = np.repeat(profile, _SECTORS)
+    longitude = np.arctan2(unit[:, 1], unit[:, 0])
+    if rng.random() < 0.4:
+        lobes = rng.integers(2, 14) * longitude + rng.uniform(-4, 4) * np.repeat(height, _SECTORS)
+        ring = ring * (1 + rng.uniform(0.02, 0.2) * np.cos(lobes))
+    stretch = rng.uniform(0.4, 1.2)
+    xyz = [ring * np.cos(longitude), ring * np.sin(longitude), stretch * np.repeat(height, _SECTORS)]
+    return 0.45 * np.stack(xyz, axis=1), faces
+
+
+def _vessel(rng: np.random.Generator) -> tuple[Floats, Faces]:
+    """Plate, bowl, cup or vase: an open solid of revolution with a wall and a rim."""
+    unit, faces = _sphere(_RINGS, _SECTORS)
+    outside = _RINGS // 2
+    rise = np.linspace(0, 1, outside)  # from the foot up
+    mouth, waist = rng.uniform(0.25, 0.6), rng.normal() * 0.12
+    radius = mouth * rise ** rng.uniform(0.15, 0.9) + waist * np.sin(np.pi * rise) * rise
+    radius = np.clip(radius + rng.normal() * 0.03 * np.sin(rng.uniform(2, 9) * rise), 0.02, 0.7)
+    radius[0] = 0.0
+    wall, tall = rng.uniform(0.01, 0.06), np.exp(rng.uniform(np.log(0.12), np.log(1.3)))
+    inner = np.clip(radius[::-1] - wall, 0.0, None)
+    height = np.concatenate([rise * tall, np.maximum(rise[::-1] * tall, wall)])
+    ring = np.repeat(np.concatenate([radius, inner]), _SECTORS)
+    around = np.arctan2(unit[:, 1], unit[:, 0])
+    lobes = 1 + (rng.random() < 0.3) * rng.uniform(0, 0.15) * np.cos(rng.integers(3, 13) * around)
+    squash = rng.uniform(0.7, 1.0)
+    xyz = [ring * lobes * np.cos(around), squash * ring * lobes * np.sin(around), np.repeat(height, _SECTORS)]
+    return np.stack(xyz, axis=1) - [0, 0, tall / 2], faces[:, ::-1]
+
+
+def _tube(rng: np.random.Generator) -> tuple[Floats, Faces]:
+    """Tube along a closed random curve: handle, knot or ring."""
+    t = np.linspace(0, 2 * np.pi, 160, endpoint=False)
+    around = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    curve = np.zeros((len(t), 3))
+    for k in range(1, int(rng.integers(2, 5))):
+        curve += (np.outer(np.cos(k * t), rng.normal(size=3)) + np.outer(np.sin(k * t), rng.normal(size=3))) / k**1.5
+    curve /= 2 * np.abs(curve).max()
+    tangent = np.roll(curve, -1, 0) - np.roll(curve, 1, 0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    side = np.cross(tangent, rng.normal(size=3))
+    side /= np.linalg.norm(side, axis=1, keepdims=True) + 1e-9
+    other = np.cross(tangent, side)
+    radius = rng.uniform(0.05, 0.18) * (1 + rng.uniform(0, 0.4) * np.sin(rng.integers(1, 6) * t))
+    offset = side[:, None] * np.cos(around)[None, :, None] + other[:, None] * np.sin(around)[None, :, None]
+    vertices = (curve[:, None] + radius[:, None, None] * offset).reshape(-1, 3)
+    a, b, c, d = _quads(len(t), len(around), closed=True)
+    return vertices, np.stack([a, d, c, a, c, b], axis=-1).reshape(-1, 3)
+
+
+def _branch(
+    start: Floats, radius: float, length: float, squash: Floats, rng: np.random.Generator
+) -> tuple[Floats, Faces]:
+    """A bent, tapering tube that starts inside the body and leaves it at `start` (3,)."""
+    t = np.linspace(0, 1, _BRANCH_RINGS)[:, None]
+    out = start / max(float(np.linalg.norm(start)), 1e-6)
+    bend, wave = (rng.normal(size=3) * length * k for k in (0.5, 0.12))
+    curve = start * 0.7 + (out * length * t + bend * t**2 + wave * np.sin(rng.uniform(3, 12) * t)) * squash
+    tangent = np.gradient(curve, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True) + 1e-9
+    side = np.cross(tangent, rng.normal(size=3))
+    side /= np.linalg.norm(side, axis=1, keepdims=True) + 1e-9
+    other = np.cross(tangent, side)
+    knots = 1 + rng.uniform(0, 0.5) * np.sin(rng.uniform(0, 40) * t[:, 0])
+    thickness = radius * (1 - rng.uniform(0, 0.8) * t[:, 0]) * knots
+    thickness[[0, -1]] = 1e-4  # closed ends
+    around = np.linspace(0, 2 * np.pi, _BRANCH_SECTORS, endpoint=False)[:, None]
+    ring = side[:, None] * np.cos(around) + other[:, None] * np.sin(around)
+    vertices = (curve[:, None] + thickness[:, None, None] * ring).reshape(-1, 3)
+    a, b, c, d = (corner.ravel() for corner in _quads(_BRANCH_RINGS, _BRANCH_SECTORS, closed=False))
+    return vertices, np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)])
+
+
+_PARTS: list[Callable[[np.random.Generator], tuple[Floats, Faces]]] = [
+    _displaced, _displaced, _dented, _dented, _dented, _superquadric, _superquadric, _lathed, _vessel, _vessel, _tube,
+]  # fmt: skip
+
+
+def _sphere(rings: int, sectors: int) -> tuple[Floats, Faces]:
+    """Unit sphere of latitudes and longitudes from the north pole down, faces counter-clockwise from outside."""
+    polar = np.linspace(0, np.pi, rings)
+    around = np.linspace(0, 2 * np.pi, sectors, endpoint=False)
+    theta, phi = np.meshgrid(polar, around, indexing="ij")
+    vertices = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
+    a, b, c, d = _quads(rings, sectors, closed=False)
+    return vertices.reshape(-1, 3), np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
+
+
+def _quads(rings: int, sectors: int, *, closed: bool) -> tuple[Faces, Faces, Faces, Faces]:
+    """Vertex indices of the corners of all quads between rings of vertices; closed: the last ring meets the first."""
+    i, j = np.meshgrid(np.arange(rings - (not closed)), np.arange(sectors), indexing="ij")
+    here, next_ring = i * sectors, (i + 1) % rings * sectors
+    next_sector = (j + 1) % sectors
+    corners = (here + j, next_ring + j, next_ring + next_sector, here + next_sector)
+    a, b, c, d = (corner.astype(np.int32) for corner in corners)
+    return a, b, c, d
+
+
+def _power(value: Floats, exponent: float) -> Floats:
+    return np.asarray(np.sign(value) * np.abs(value) ** exponent)

@@ -1,0 +1,252 @@
+"""Simulated photographs for training: traced views, random materials, flash and camera -> channels and truth.
+
+Every step gets a new batch. Cues are computed by `stages/cues`, the same code as for captures.
+"""
+
+from dataclasses import dataclass
+from math import isqrt
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional as F
+
+from polcap.images import Quality
+from polcap.optics import frames, shade
+from polcap.stages import cues
+from polcap.training import bounced_light, gloss, materials, traced_views
+from polcap.training.camera_errors import CameraErrors, photograph
+
+Indices = NDArray[np.integer[Any]]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Input and target of the network; pixels outside `mask` are ignored."""
+
+    channels: Tensor  # (B, N, H, W)
+    mask: Tensor  # (B, H, W) bool: on the object and in the mask that the network sees
+    normal: Tensor  # (B, 3, H, W) in the frame of each ray
+    depth: Tensor  # (B, 1, H, W) units of traced_views.depth_unit, mean 0
+    diffuse: Tensor  # (B, 3, H, W)
+    specular: Tensor  # (B, 3, H, W)
+    roughness: Tensor  # (B, 1, H, W)
+    highlight: Tensor  # (B, 1, H, W) share of S0 that the surface reflects
+    law: Tensor  # (B, 3, H, W) fields of `body.Law`, for the rendering loss
+
+
+@dataclass(frozen=True)
+class SimulatedPhotographs:
+    """Measurements at the M pixels `at` of the input mask, and the truth at every pixel."""
+
+    stokes: Tensor  # (3, M, 3)
+    covariance: Tensor  # (6, M, 3)
+    clipped: Tensor  # (M,) bool
+    at: Tensor  # (M,) indices into B·H·W
+    input_mask: Tensor  # (B, H, W) bool, the mask that the network sees
+    rays: Tensor  # (B, H, W, 3)
+    mask: Tensor  # (B, H, W) bool, the object
+    truth: dict[str, Tensor]  # (B, H, W, ·): normal (ray frame), depth, diffuse, specular, roughness, highlight, law
+
+
+@dataclass(frozen=True)
+class ObjectPixels:
+    """The M pixels of all objects of a `ViewBatch`, one object after the other."""
+
+    index: Tensor  # (M,) into B·H·W
+    owner: Tensor  # (M,) number of the object
+    v: Tensor  # (M, 3) ray, camera frame, surface to camera
+    normal: Tensor  # (M, 3) camera frame, without bumps
+    position: Tensor  # (M, 3) object frame
+    place: Tensor  # (M, 3) camera frame, in units of the object's distance
+    depth: Tensor  # (M,) units of traced_views.depth_unit, mean 0
+    lit: Tensor  # (M,) 1 where the flash reaches, else 0
+    met: Tensor  # (M, bounced_light.RAYS) number, among the M, of the pixel that each ray meets; −1 for none
+    open: Tensor  # (M,) share of the rays near the mirror direction that leave the object
+
+
+@dataclass(frozen=True)
+class ViewBatch:
+    """Some of the traced views at one size."""
+
+    mask: Tensor  # (B, H, W) bool
+    rays: Tensor  # (B, H, W, 3) camera frame, surface to camera
+    turn: Tensor  # (B, 3, 3) rotation from the object's frame to the camera's
+    flash: Tensor  # (B, 3) camera frame, in units of the object's distance
+    pixels: ObjectPixels
+
+
+class Simulator:
+    """Traced views and materials on one device; draws batches from torch's global random state."""
+
+    def __init__(
+        self, views: dict[str, NDArray[Any]], library: materials.MaterialLibrary, device: torch.device
+    ) -> None:
+        self.library, self.device = library, device
+        self.size = views["mask"].shape[1]
+        self.camera = views["camera"]
+        self.views = {
+            name: views[name].reshape(-1, views[name].shape[-1]) for name in traced_views.ARRAYS
+        }  # one row per pixel
+
+    def draw_batch(self, count: int, size: int) -> Batch:
+        """Photographs of `count` random objects at size² pixels (at most the cache's), with all augmentations."""
+        pick = torch.randint(len(self.camera), (count,)).numpy()
+        views = self.gather(pick, size, flip=True)
+        strength = 0.92 + 0.16 * torch.rand(count, device=self.device)  # error of the chart's exposure
+        jitter = torch.rand(count, device=self.device)
+        return to_batch(self.photograph(views, strength, CameraErrors.draw(count, self.device), jitter))
+
+    def gather(self, pick: NDArray[np.integer[Any]], size: int, *, flip: bool) -> ViewBatch:
+        """Read the traced views `pick`, thinned to size² pixels and, with `flip`, mirrored at random."""
+        full, area = self.size, size * size
+        mirrored, change = _mirror(np.arange(area).reshape(size, size), flip)
+        order = mirrored.reshape(-1)  # thinned pixels in their mirrored places
+        where = np.floor((np.arange(size) + 0.5) * (full / size)).astype(np.int64)  # rows and columns that are used
+        y, x = where[order // size], where[order % size]
+        mask = self.views["mask"].reshape(-1, full * full)[pick][:, y * full + x]
+        inside = np.flatnonzero(mask)
+        owner, at = np.divmod(inside, area)
+        view = pick[owner]  # of each pixel
+        met, escaped = self._seen_pixels(view, y[at], x[at], order, mask, owner)
+        rows = (view * full + y[at]) * full + x[at]
+
+        def tensor(array: NDArray[Any]) -> Tensor:
+            return torch.from_numpy(array).to(self.device)
+
+        def read(name: str) -> Tensor:
+            return tensor(self.views[name].take(rows, axis=0)).float()
+
+        camera, mirror, owners = tensor(self.camera[pick]), tensor(change), tensor(owner)
+        focal, middle, unit = camera[:, 0, None], camera[:, 3], camera[:, 4]
+        right, low = ((tensor(a).float() - camera[:, k : k + 1]) / focal for a, k in ((x, 1), (y, 2)))
+        rays = F.normalize(torch.stack([-right, low, torch.ones_like(low)], dim=-1), dim=-1) @ mirror.T
+        v, depth = rays.reshape(-1, 3)[tensor(inside)], read("depth")[:, 0]
+        far = 1 + depth * (unit / middle)[owners]
+        pixels = ObjectPixels(
+            index=tensor(inside), owner=owners, v=v, normal=read("normal") @ mirror.T, position=read("position"),
+            place=-v * (far / v[:, 2])[:, None], depth=depth, lit=read("lit")[:, 0], met=tensor(met),
+            open=tensor(escaped),
+        )  # fmt: skip
+        return ViewBatch(
+            mask=tensor(mask).reshape(-1, size, size),
+            rays=rays.reshape(-1, size, size, 3),
+            turn=mirror @ camera[:, 5:14].reshape(-1, 3, 3),
+            flash=F.pad(camera[:, 14:16], (0, 1)) @ mirror.T,
+            pixels=pixels,
+        )
+
+    def _seen_pixels(
+        self, view: Indices, y: Indices, x: Indices, order: Indices, mask: NDArray[np.bool_], owner: Indices
+    ) -> tuple[Indices, NDArray[np.float32]]:
+        """ObjectPixels.met and ObjectPixels.open of pixels (y, x) of the cached views `view`.
+
+        The thinned pixels of a view are in `order`, their masks are (B, H·W).
+        """
+        full, area = self.size, len(order)
+        size, coarse = isqrt(area), full // bounced_light.COARSE
+        new_place = np.full(2**16, -1, np.int64)  # of each pixel of the cache, in the thinned and mirrored view
+        thinned = np.arange(full) * size // full
+        new_place[: full * full] = np.argsort(order)[(thinned[:, None] * size + thinned).reshape(-1)]
+        new_place[[bounced_light.NOWHERE, bounced_light.ESCAPED]] = -1
+        row = np.where(mask.reshape(-1), np.cumsum(mask) - 1, -1)
+        cell = (view * coarse + y // bounced_light.COARSE) * coarse + x // bounced_light.COARSE
+        found = self.views["met"].take(cell, axis=0)  # (M, RAYS)
+        to, escaped = new_place[found], found[:, -bounced_light.SHARP :] == bounced_light.ESCAPED
+        return np.where(to >= 0, row[to + owner[:, None] * area], -1), escaped.mean(axis=1, dtype=np.float32)
+
+    def photograph(
+        self,
+        views: ViewBatch,
+        strength: Tensor,
+        errors: CameraErrors,
+        jitter: Tensor | None = None,
+        smooth_share: float = gloss.SMOOTH_SHARE,
+    ) -> SimulatedPhotographs:
+        """Draw materials, light the objects and measure them.
+
+        strength (B,): S0 of a white plane that faces the flash at the object's distance. jitter (B,) 0…1: thins or
+        widens the input mask. smooth_share: of objects with a smooth interface (`optics/body.py`).
+        """
+        count, height, width = views.mask.shape
+        pixels = views.pixels
+        surface = materials.draw_surface(
+            self.library, pixels.normal, pixels.position, views.turn, pixels.owner, count, smooth_share
+        )
+        normal = frames.lifted(frames.to_ray_frame(surface.normal, pixels.v))
+        to_flash = views.flash[pixels.owner] - pixels.place
+        squared = (to_flash * to_flash).sum(dim=1)
+        to_flash = frames.to_ray_frame(to_flash / squared.sqrt()[:, None], pixels.v)
+        irradiance = pixels.lit * strength[pixels.owner] / squared
+        nothing, lit = torch.zeros_like(surface.specular), (surface.roughness, surface.ior, to_flash, irradiance)
+        body = shade.stokes(normal, surface.diffuse, nothing, *lit, surface.law)
+        stokes = body + shade.stokes(normal, nothing, surface.specular, *lit)
+        highlight = 1 - (body[0].sum(dim=1) + 1e-4) / (stokes[0].sum(dim=1) + 1e-4)
+
+        def image(flat: Tensor) -> Tensor:
+            out = flat.new_zeros(count * height * width, flat.shape[1])
+            return out.index_copy(0, pixels.index, flat).reshape(count, height, width, -1)
+
+        truth = {
+            "normal": image(normal), "depth": image(pixels.depth[:, None]), "diffuse": image(surface.diffuse),
+            "specular": image(surface.specular), "roughness": image(surface.roughness[:, None]),
+            "highlight": image(highlight[:, None]),
+            "law": image(torch.stack([surface.law.rough, surface.law.local, surface.law.kept], dim=1)),
+        }  # fmt: skip
+        indirect = bounced_light.bounced_stokes(pixels, normal, surface, body[0])
+        indirect = indirect + bounced_light.mirrored_surroundings(pixels, views.flash, normal, surface, strength)
+        indirect = torch.stack([image(part) for part in indirect])
+        scene = torch.stack([image(part) for part in stokes]) + bounced_light.smooth(indirect, views.mask)
+        input_mask = views.mask if jitter is None else _jitter_mask(views.mask, jitter)
+        at = input_mask.reshape(-1).nonzero()[:, 0]
+        measured, covariance, clipped = photograph(scene, truth["diffuse"], views.mask, views.rays, at, errors)
+        return SimulatedPhotographs(measured, covariance, clipped, at, input_mask, views.rays, views.mask, truth)
+
+
+def to_batch(photo: SimulatedPhotographs) -> Batch:
+    """Input and target of the network for these photographs."""
+    return Batch(
+        channels=channels(photo),
+        mask=photo.input_mask & photo.mask,
+        **{name: value.permute(0, 3, 1, 2) for name, value in photo.truth.items()},
+    )
+
+
+def channels(photo: SimulatedPhotographs) -> Tensor:
+    """Cue channels (B, N, H, W) by `stages/cues`, 0 outside the input mask; channels last in memory."""
+    count, height, width = photo.rays.shape[:3]
+    ratio, sigma, dolp, normalized = cues.polarization(photo.stokes, photo.covariance)
+    clipped, at = photo.clipped, photo.at
+    row = SimpleNamespace(  # all pixels as one image row
+        radiance=photo.stokes[0][None], ratio=ratio[:, None], ratio_sigma=sigma[None], dolp=dolp[None],
+        normalized_stokes=normalized[:, None], rays=photo.rays.reshape(1, -1, 3)[:, at],
+        mask=torch.ones_like(clipped)[None], quality=(clipped.to(torch.uint8) * int(Quality.CLIPPED))[None],
+    )  # fmt: skip
+    flat = cues.channels(row)[:, 0].T  # (M, N)
+    out = flat.new_zeros(count * height * width, flat.shape[1]).index_copy(0, at, flat)
+    return out.reshape(count, height, width, -1).permute(0, 3, 1, 2)
+
+
+def _mirror(pixels: Indices, flip: bool) -> tuple[Indices, NDArray[np.float32]]:
+    """Pixels (H, W) mirrored at random in x, in y and at the diagonal, and the matrix (3, 3) that mirrors vectors."""
+    change = np.eye(3, dtype=np.float32)
+    for axis in range(3):
+        if not flip or torch.rand(()) < 0.5:
+            continue
+        if axis < 2:
+            pixels, change[axis] = np.flip(pixels, 1 - axis), -change[axis]
+        else:  # transposing the array takes (x, y up) to (−y, −x)
+            pixels, change[:2] = pixels.T, -change[1::-1]
+    return pixels, change
+
+
+def _jitter_mask(mask: Tensor, jitter: Tensor) -> Tensor:
+    """Masks (B, H, W), a third of them one pixel wider, a third one pixel thinner."""
+    solid = mask[:, None].float()
+    wider = F.max_pool2d(solid, 3, 1, 1)[:, 0] > 0.5
+    thinner = -F.max_pool2d(-solid, 3, 1, 1)[:, 0] > 0.5
+    part = jitter[:, None, None]
+    return torch.where(part < 0.33, wider, torch.where(part < 0.66, thinner, mask))

@@ -1,0 +1,105 @@
+"""Bounced light of training against the traced kind, on a bowl seen from inside and from outside."""
+
+from functools import partial
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from polcap.images import Floats, View
+from polcap.optics import frames, shade
+from polcap.synth.mesh_tracer import Tracer, Triangles, smooth
+from polcap.training import bounced_light, light_transport, traced_views
+from polcap.training.materials import Surface
+from polcap.training.simulator import Simulator
+
+SIZE, ALBEDO, F0, ROUGHNESS = 96, 0.6, 0.08, 0.35
+
+
+def _bowl() -> Triangles:
+    """A thin half sphere, open towards z."""
+    polar, around = np.meshgrid(np.linspace(np.pi / 2, np.pi, 60), np.linspace(0, 2 * np.pi, 121)[:-1], indexing="ij")
+    unit = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], axis=-1)
+    rows, columns = np.meshgrid(np.arange(59), np.arange(120), indexing="ij")
+    a, b = rows * 120 + columns, rows * 120 + (columns + 1) % 120
+    faces = np.stack([a, a + 120, b + 120, a, b + 120, b], axis=-1).reshape(-1, 3)
+    inner = smooth(0.48 * unit.reshape(-1, 3), faces[:, ::-1])
+    outer = smooth(0.5 * unit.reshape(-1, 3), faces)
+    return Triangles(
+        np.concatenate([inner.vertices, outer.vertices]),
+        np.concatenate([inner.faces, outer.faces + len(inner.vertices)]).astype(np.int32),
+        np.concatenate([inner.corner_normals, outer.corner_normals]),
+    )
+
+
+def _both(turn: Floats) -> tuple[Floats, Floats]:
+    """Once-bounced light (3, M, 3) of training, and as `light_transport.py` traces it."""
+    mesh = _bowl()
+    translation, view = np.array([0, 0, -4.0]), View(3.3 * SIZE, ((SIZE - 1) / 2, (SIZE - 1) / 2), 1.0)
+    scene = light_transport.MeshScene(mesh)
+    buffer = Tracer(mesh).trace(turn, translation, view, SIZE, SIZE)
+    pose, mask = light_transport.Pose(turn, translation, np.zeros(3), 16.0), buffer.mask
+    lit, met = bounced_light.trace_visibility(scene, buffer, pose, np.random.default_rng(1))
+    middle, unit = traced_views.depth_unit(mask, buffer.depth, view.focal)
+    camera = np.array([[view.focal, *view.center, middle, unit, *turn.reshape(-1), 0, 0]], np.float32)
+    depth = np.where(mask, (buffer.depth - middle) / unit, 0)
+    cache = {"normal": buffer.normal, "depth": depth[..., None], "position": buffer.position, "met": met}
+    cache |= {"mask": mask[..., None], "lit": lit[..., None]}
+    simulator = Simulator({k: v[None] for k, v in cache.items()} | {"camera": camera}, None, torch.device("cpu"))
+    seen = simulator.gather(np.array([0]), SIZE, flip=False).pixels
+
+    v, ones = frames.rays(view, SIZE, SIZE)[mask].astype(float), np.ones((int(mask.sum()), 3))
+    normal = frames.to_ray_frame(buffer.normal[mask], v).astype(float)
+    look = (ALBEDO * ones, F0 * ones, np.full(len(ones), ROUGHNESS))
+    _, flat = scene.facing(np.broadcast_to(-translation @ turn, v.shape), -v @ turn)
+    places = light_transport.SurfacePoints(mask, buffer.position[mask].astype(float), flat, normal, v, *look, ior=1.5)
+    gather = light_transport._Gather(scene, places, pose, lambda place, facing: ALBEDO * np.ones((len(place), 3)))
+    traced = gather.diffuse(np.random.default_rng(2)) + gather.mirrored(np.random.default_rng(3))
+
+    local = torch.from_numpy(normal).float()
+    flash = frames.to_ray_frame(-seen.place / seen.place.norm(dim=1, keepdim=True), seen.v)
+    dressed = SimpleNamespace(diffuse=look[0], specular=look[1], roughness=look[2], ior=np.full(len(ones), 1.5))
+    surface = Surface(local, *(torch.from_numpy(a).float() for a in vars(dressed).values()))
+    squared = (seen.place**2).sum(dim=1)
+    body = shade.stokes(
+        local, surface.diffuse, 0 * surface.specular, surface.roughness, surface.ior, flash, seen.lit / squared
+    )
+    return bounced_light.bounced_stokes(seen, local, surface, body[0]).numpy(), traced
+
+
+def _turned(degrees: float) -> Floats:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+
+
+@pytest.mark.parametrize("degrees", [0, 25])
+def test_inside_of_a_bowl_gets_the_light_that_tracing_finds(degrees: float) -> None:
+    trained, traced = _both(_turned(degrees))
+    assert trained[0].sum() == pytest.approx(traced[0].sum(), rel=0.2)
+    for k in (1, 2):  # mirrored light is polarized: the same places, the same way, as much
+        assert np.corrcoef(trained[k].mean(axis=-1), traced[k].mean(axis=-1))[0, 1] > 0.7
+        assert np.abs(trained[k]).sum() == pytest.approx(np.abs(traced[k]).sum(), rel=0.4)
+
+
+def test_outside_of_a_bowl_gets_next_to_nothing() -> None:
+    inside, outside = (_both(_turned(degrees))[0] for degrees in (0, 180))
+    assert outside[0].mean() < 0.03 * inside[0].mean()
+
+
+def test_outline_of_dark_gloss_shows_the_backdrop_polarized_across_the_normal() -> None:
+    polar = torch.linspace(0.05, 1.55, 60)
+    normal = torch.stack([torch.sin(polar), 0 * polar, torch.cos(polar)], dim=1)
+    v = torch.tensor([[0.0, 0.0, 1.0]]).expand(60, 3)
+    ones = torch.ones(60)
+    surface = Surface(normal, 0.03 * torch.ones(60, 3), 0.04 * torch.ones(60, 3), 0.2 * ones, 1.5 * ones)
+    place, flash = 0.2 * normal - v, torch.zeros(1, 3)
+    seen = SimpleNamespace(v=v, owner=torch.zeros(60).long(), place=place, open=ones)
+    mirrored = partial(bounced_light.mirrored_surroundings, seen, flash, normal, surface, torch.ones(1))
+    torch.manual_seed(1)
+    rooms = torch.stack([mirrored() for _ in range(40)])
+    light, along = rooms[:, 0].mean(dim=-1), rooms[:, 1].mean(dim=-1)  # the normals lean along x
+    assert 0.4 < (light[:, -1] > 0).float().mean() < 0.9  # some objects have no surroundings
+    assert (along <= 1e-6).all() and light[:, -1].mean() > 5 * light[:, 20].mean()
+    seen.open = torch.zeros(60)
+    assert mirrored().abs().max() == 0

@@ -1,0 +1,65 @@
+"""Test materials: fixed by their number, within the stated ranges, with the stated spread of F0."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polcap.errors import InputError
+from polcap.images import Floats
+from polcap.training import evaluation_materials
+
+
+@pytest.fixture(scope="module")
+def library(test_data: Path) -> list[evaluation_materials.TestMaterial]:
+    return evaluation_materials.test_materials(test_data / "materials" / "test")
+
+
+@pytest.fixture(scope="module")
+def places() -> tuple[Floats, Floats]:
+    rng = np.random.default_rng(0)
+    facing = rng.normal(size=(3000, 3))
+    return rng.uniform(-0.5, 0.5, (3000, 3)), facing / np.linalg.norm(facing, axis=1, keepdims=True)
+
+
+def test_library_is_what_the_protocol_states(
+    library: list[evaluation_materials.TestMaterial], places: tuple[Floats, Floats]
+) -> None:
+    assert len(library) == 30 and len({m.name for m in library}) == 30
+    looks = [material.at(*places) for material in library]
+    assert np.std([look.specular for look in looks]) > 0.04
+    assert min(m.ior for m in library) >= 1.4 and max(m.ior for m in library) <= 1.6
+    for look in looks:
+        assert look.diffuse.min() >= 0.005 and look.diffuse.max() <= 0.95
+        assert look.roughness.min() >= 0.12 and look.roughness.max() <= 1
+        assert look.specular.min() > 0.015 and look.specular.max() < 0.41
+
+
+def test_a_materials_maps_follow_one_pattern(
+    library: list[evaluation_materials.TestMaterial], places: tuple[Floats, Floats]
+) -> None:
+    related = 0
+    for material in library[evaluation_materials.TEXTURES :]:
+        look = material.at(*places)
+        assert look.diffuse.std(axis=0).max() > 0.002, material.name
+        related += abs(np.corrcoef(look.diffuse.mean(axis=1), look.roughness)[0, 1]) > 0.4
+    assert related >= 15
+
+
+def test_slope_is_the_relief_s_and_bounded(
+    library: list[evaluation_materials.TestMaterial], places: tuple[Floats, Floats]
+) -> None:
+    for material in library[evaluation_materials.TEXTURES :]:
+        steep = np.linalg.norm(material.slope(*places), axis=1)
+        assert 0 < np.sqrt(np.mean(steep**2)) < 0.4 and steep.max() < 0.61, material.name
+
+
+def test_no_places_have_no_looks(library: list[evaluation_materials.TestMaterial]) -> None:
+    none = np.zeros((0, 3))
+    for material in library:
+        assert material.at(none, none).diffuse.shape == material.slope(none, none).shape == (0, 3), material.name
+
+
+def test_missing_texture_sets_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds 0 texture sets"):
+        evaluation_materials.test_materials(tmp_path)

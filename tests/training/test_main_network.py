@@ -1,0 +1,117 @@
+"""The network: any size, outputs in their units, and ready to learn."""
+
+import pytest
+import torch
+
+from polcap.stages.cues import CHANNELS
+from polcap.training import main_network
+from polcap.training.variants import VARIANTS
+
+TINY = main_network.NetworkShape((8, 16, 16, 16, 16), (8, 8, 16, 16), (8, 8, 8, 8), (8, 8, 8, 8), (1, 1, 1, 1, 1), 1)
+
+
+def inputs(height: int, width: int) -> torch.Tensor:
+    torch.manual_seed(0)
+    x = torch.randn(2, len(CHANNELS), height, width)
+    x[:, CHANNELS.index("mask")] = 1
+    x[:, CHANNELS.index("clipped")] = (x[:, CHANNELS.index("clipped")] > 2).float()
+    return x
+
+
+@pytest.mark.parametrize("size", [(32, 32), (64, 160), (96, 32)])
+def test_any_multiple_of_32_gives_every_map_its_range(size: tuple[int, int]) -> None:
+    maps = main_network.MainNetwork(TINY)(inputs(*size))
+    assert set(maps) == {*main_network.OUTPUTS, "highlight"}
+    for name, count in {"normal": 3, "depth": 1, "diffuse": 3, "specular": 3, "roughness": 1, "sigma": 1}.items():
+        assert maps[name].shape == (2, count, *size) and maps[name].isfinite().all()
+    torch.testing.assert_close(maps["normal"].norm(dim=1), torch.ones(2, *size))
+    assert maps["sigma"].min() > 0 and maps["sigma"].max() < 60
+
+
+def test_every_weight_gets_a_gradient_once_the_zero_born_ones_moved() -> None:
+    torch.manual_seed(1)
+    network = main_network.MainNetwork(TINY)
+    optimizer = torch.optim.Adam(network.parameters(), 1e-3)
+    for _ in range(3):
+        optimizer.zero_grad()
+        maps = network(inputs(64, 64))
+        sum(((m - 0.3) ** 2).mean() for m in maps.values()).backward()
+        optimizer.step()
+    still = [name for name, p in network.named_parameters() if p.grad is None or float(p.grad.abs().sum()) == 0]
+    assert not still
+
+
+def test_a_far_pixel_reaches_the_whole_object() -> None:
+    """Global context: a change in one corner is felt in the other, as sharing a highlight's meaning needs."""
+    torch.manual_seed(2)
+    network = main_network.MainNetwork(TINY).eval()
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.15)
+    x = inputs(256, 256)
+    changed = x.clone()
+    changed[:, :, :16, :16] += 1
+    difference = (network(x)["roughness"] - network(changed)["roughness"]).abs()
+    assert difference[:, :, -16:, -16:].max() > 0
+
+
+def test_context_tells_every_cell_of_the_object_of_every_other() -> None:
+    torch.manual_seed(6)
+    context = main_network.Context(16, heads=2)
+    torch.nn.init.normal_(context.proj.weight)
+    x, inside = torch.randn(1, 16, 4, 4), torch.ones(1, 1, 4, 4)
+    inside[..., 3] = 0
+    before = context(x, inside)
+    for column, seen in ((0, True), (3, False)):  # of the object, beside it
+        changed = x.clone()
+        changed[..., 0, column] += 1
+        moved = (context(changed, inside) - before)[..., 3, 1].abs().max()
+        assert (moved > 1e-2) if seen else (moved < 1e-2)
+
+
+def test_groups_tell_alike_places_the_same() -> None:
+    """What `LinearAttention` adds depends on a place's own features and the whole picture's, not on where it lies."""
+    torch.manual_seed(3)
+    share = main_network.LinearAttention(16, heads=2, groups=4)
+    torch.nn.init.normal_(share.proj.weight)
+    x, inside = torch.randn(1, 16, 6, 6), torch.ones(1, 1, 6, 6)
+    order = torch.randperm(36)
+    mixed = x.flatten(2)[:, :, order].reshape(x.shape)
+    expected = share(x, inside).flatten(2)[:, :, order].reshape(x.shape)
+    torch.testing.assert_close(share(mixed, inside), expected, rtol=1e-4, atol=1e-5)
+    assert (share(x, inside) - x).abs().max() > 1e-3
+
+
+def test_groups_do_not_see_what_is_outside_the_mask() -> None:
+    torch.manual_seed(4)
+    share = main_network.LinearAttention(16, heads=2, groups=4)
+    torch.nn.init.normal_(share.proj.weight)
+    x, inside = torch.randn(1, 16, 8, 8), torch.ones(1, 1, 8, 8)
+    inside[..., 4:] = 0
+    changed = x.clone()
+    changed[..., 4:] += 1
+    assert (share(x, inside) - share(changed, inside))[..., :4].abs().max() < 1e-2
+
+
+@pytest.mark.parametrize("name", [name for name, v in VARIANTS.items() if v.inputs is not VARIANTS["ours"].inputs])
+def test_variants_see_no_more_than_their_inputs(name: str) -> None:
+    """Without polarization, changing it changes nothing; the published inputs do not hold DoLP beyond the pictures."""
+    torch.manual_seed(5)
+    x = inputs(32, 32)
+    changed = x.clone()
+    blind = ["noise", "zenith_x"] if name == "published inputs" else ["s1", "s2", "zenith_x", "cos_2phi", "noise"]
+    for channel in blind:
+        changed[:, CHANNELS.index(channel)] += 1
+    network = main_network.MainNetwork(TINY, name)
+    for a, b in zip(network(x).values(), network(changed).values()):
+        torch.testing.assert_close(a, b)
+
+
+def test_published_pictures_are_what_an_analyzer_lets_through() -> None:
+    """Malus: the pictures at 0° and 90° add up to S0, and their difference is S1."""
+    x = inputs(32, 32)
+    at = {name: x[:, CHANNELS.index(name)] for name in CHANNELS}
+    seen = VARIANTS["published inputs"].inputs(x)
+    s0 = torch.exp(at["log_g"]) - 0.02
+    torch.testing.assert_close(seen[:, 1] + seen[:, 7], s0)
+    torch.testing.assert_close(seen[:, 1] - seen[:, 7], s0 * at["s1"] / 10)
+    assert seen.shape == x.shape

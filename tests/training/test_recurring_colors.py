@@ -1,0 +1,104 @@
+"""The colors of a picture: found, used where a place is seen badly, and asked for their gloss."""
+
+import torch
+
+from polcap.training import gloss_profiles, recurring_colors
+
+RED, BLUE = (0.6, 0.1, 0.1), (0.1, 0.1, 0.6)
+
+
+def print_of(colors: list[tuple[float, float, float]], side: int = 24) -> tuple[torch.Tensor, torch.Tensor]:
+    """A print (1, 3, H, W) whose squares take the colors in turn, 5 % uneven, and which color each pixel has (H, W)."""
+    torch.manual_seed(0)
+    square = torch.arange(side) // 3
+    which = (square[:, None] + square) % len(colors)
+    even = torch.tensor(colors)[which].permute(2, 0, 1)[None]
+    return even * torch.exp(0.05 * torch.randn(1, 1, side, side)), which
+
+
+def found(picture: torch.Tensor) -> recurring_colors.ColorMixture:
+    color = recurring_colors._opponent(picture).flatten(2)
+    return recurring_colors.fit_mixture(color, torch.ones_like(color[:, :1]))
+
+
+def albedo(colors: recurring_colors.ColorMixture) -> torch.Tensor:
+    """(COLORS, 3)"""
+    return torch.exp(colors.center[0] @ torch.tensor(recurring_colors._AXES)) - recurring_colors._OFFSET
+
+
+def recolored(
+    picture: torch.Tensor, cosine: float | torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, recurring_colors.ColorMixture]:
+    """With the doubt that the zenith lets expect, all of it inside and unclipped."""
+    one = torch.ones_like(picture[:, :1])
+    none = torch.zeros(1, 2, *picture.shape[2:])
+    with torch.no_grad():
+        return recurring_colors.Recolor()(picture, none, one * cosine, one, 0 * one)
+
+
+def test_the_colors_of_a_print_are_found() -> None:
+    colors = [(0.6, 0.6, 0.6), (0.3, 0.3, 0.3), (0.6, 0.05, 0.05)]  # two greys and a red
+    mixture = found(print_of(colors)[0])
+    for color in colors:
+        near = (albedo(mixture) / torch.tensor(color)).log().abs().amax(dim=1) < 0.05
+        assert abs(float(mixture.share[0, near].sum()) - 1 / 3) < 0.02
+
+
+def test_one_color_is_found_once() -> None:
+    centers = found(print_of([(0.5, 0.4, 0.3)])[0]).center[0]
+    assert (centers.amax(dim=0) - centers.amin(dim=0)).max() < 0.05
+
+
+def test_a_color_seen_badly_is_one_that_is_seen_well() -> None:
+    """Towards the limb a third of the places come out 40 % too dark; hue tells whose they are."""
+    truth, which = print_of([RED, BLUE])
+    limb = torch.arange(which.numel()).reshape(which.shape) % 24 < 8
+    seen = torch.where(limb, 0.6 * truth, truth)
+    cosine = torch.where(limb, 0.2, 0.8)[None, None]
+    got = recolored(seen, cosine)[0]
+    before, after = ((x / truth).log().abs()[0].mean(dim=0) for x in (seen, got))
+    assert after[limb].mean() < 0.3 * before[limb].mean()
+    assert after[~limb].mean() < 0.06
+    assert (got / truth).log().abs()[..., limb].mean() < 0.15  # in every channel: no red has become blue
+
+
+def test_what_is_seen_well_keeps_its_shades() -> None:
+    """A smooth run of colors from dark to light, three stops, is not made into steps."""
+    run = torch.exp(torch.linspace(-2.5, -0.4, 64 * 64)).reshape(1, 1, 64, 64).expand(1, 3, 64, 64)
+    assert (recolored(run, 0.8)[0] / run).log().abs().max() < 0.15
+
+
+def test_doubt_is_interpolated_between_its_knots() -> None:
+    knots = torch.tensor(recurring_colors._KNOTS_DEG)
+    at = torch.deg2rad(torch.cat([knots, torch.tensor([35.0])]))
+    weights = recurring_colors._interpolation_weights(torch.cos(at).view(1, 1, -1))[0]
+    torch.testing.assert_close(weights.sum(dim=1), torch.ones(len(at)))
+    torch.testing.assert_close(weights @ knots, torch.rad2deg(at), atol=0.1, rtol=0)
+    assert abs(float(weights[-1, 3]) - 0.5) < 0.01
+
+
+def test_each_color_is_described_by_its_own_light() -> None:
+    picture, which = print_of([RED, BLUE])
+    red = (which == 0)[None, None].float()
+    zenith, one = torch.rand_like(red), torch.ones_like(red)
+    figures, first = torch.rand(2, 1, 5, *which.shape)
+    _, member, colors = recolored(picture, 0.8)
+
+    def known(light: torch.Tensor) -> torch.Tensor:
+        return recurring_colors.describe_colors(
+            gloss_profiles.GlossEvidence(light, zenith, picture, one), first, member, colors
+        )
+
+    moved = (known(figures + red) - known(figures))[0, :, : gloss_profiles.PROFILE].abs().amax(dim=1)
+    of_red = (member[0].flatten(1) @ red.flatten()) / member[0].flatten(1).sum(dim=1)
+    assert moved[of_red > 0.9].min() > 0.1
+    assert moved[of_red < 0.1].max() < 0.05
+
+
+def test_what_has_learned_nothing_corrects_nothing() -> None:
+    picture, which = print_of([RED, BLUE])
+    one = torch.ones(1, 1, *which.shape)
+    figures, first = torch.rand(2, 1, 5, *which.shape)
+    _, member, colors = recolored(picture, 1.0)
+    seen = gloss_profiles.GlossEvidence(figures, one, picture, one)
+    assert recurring_colors.ColorGloss(5)(seen, first, member, colors).abs().max() == 0

@@ -1,0 +1,69 @@
+"""The cache of views: whole, reproducible, and true to its own conventions."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polcap.errors import InputError
+from polcap.synth.mesh_tracer import Tracer, Triangles
+from polcap.training import traced_views
+from tests.training.conftest import RECIPE
+
+
+def test_same_seed_traces_the_same_views(data: Path, views: Path, tmp_path: Path) -> None:
+    meshes = [data / "meshes" / "train" / "one.npz"]
+    traced_views.build_cache(tmp_path / "again", meshes, RECIPE)
+    first, second = traced_views.load_cache(views), traced_views.load_cache(tmp_path / "again")
+    for name in first:
+        np.testing.assert_array_equal(first[name], second[name])
+
+
+def test_depth_is_centred_and_in_units_of_the_equivalent_disc(views: Path) -> None:
+    cache = traced_views.load_cache(views)
+    for index, camera in enumerate(cache["camera"]):
+        mask = cache["mask"][index, ..., 0]
+        assert abs(cache["depth"][index, ..., 0][mask].astype(float).mean()) < 2e-3  # fp16
+        assert camera[4] == pytest.approx(np.sqrt(mask.sum() / np.pi) * camera[3] / camera[0], rel=1e-5)
+
+
+def test_objects_lie_inside_the_frame_and_turns_are_rotations(views: Path) -> None:
+    cache = traced_views.load_cache(views)
+    border = np.ones((64, 64), bool)
+    border[1:-1, 1:-1] = False
+    assert (cache["mask"][..., 0] & border).mean() < 0.002
+    assert cache["mask"].mean(axis=(1, 2, 3)).min() > 0.05
+    turn = cache["camera"][:, 5:14].reshape(-1, 3, 3)
+    np.testing.assert_allclose(turn @ turn.transpose(0, 2, 1), np.broadcast_to(np.eye(3), turn.shape), atol=1e-5)
+
+
+def test_interrupted_build_is_not_taken_for_a_cache(views: Path, tmp_path: Path) -> None:
+    for file in views.glob("*.npy"):
+        (tmp_path / file.name).symlink_to(file)
+    with pytest.raises(InputError, match="no complete G-buffer cache"):
+        traced_views.load_cache(tmp_path)
+
+
+def test_a_cache_of_other_views_is_not_taken_for_this_one(data: Path, views: Path) -> None:
+    meshes = [data / "meshes" / "train" / "one.npz"]
+    assert traced_views.open_cache(views, meshes, RECIPE)["mask"].shape[1] == RECIPE.size
+    for asked in ((meshes, replace(RECIPE, seed=6)), ([data / "meshes" / "test" / "two.npz"], RECIPE)):
+        with pytest.raises(InputError, match="views of other meshes or of another preset"):
+            traced_views.open_cache(views, *asked)
+
+
+def test_a_mesh_that_no_side_shows_is_named_not_waited_for() -> None:
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 0.01, 0]], np.float32)
+    needle = Triangles(corners, np.array([[0, 1, 2]], np.int32), np.tile(np.array([0, 0, 1], np.float32), (1, 3, 1)))
+    with pytest.raises(InputError, match="the needle covers less than 6% of the picture"):
+        traced_views.trace_random_view("the needle", Tracer(needle), 32, np.random.default_rng(0))
+
+
+def test_withheld_meshes_are_not_trained_on(tmp_path: Path) -> None:
+    for name in ("some", "statue_maria"):
+        (tmp_path / "meshes" / "train").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "meshes" / "train" / f"{name}.npz").touch()
+    assert [mesh.stem for mesh in traced_views.training_meshes(tmp_path)] == ["some"] and len(
+        traced_views.WITHHELD
+    ) == 20
