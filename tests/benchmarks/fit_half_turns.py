@@ -28,8 +28,8 @@ from polcap.optics import frames
 from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.pipeline import models
 from polcap.stages.infer import analytic, augmentation, half_turns, learned
-from polcap.training import gbuffers, patterns, protocol
-from polcap.training.protocol import Case
+from polcap.training import evaluation_materials, evaluation_protocol, traced_views
+from polcap.training.evaluation_protocol import MESHES, Case, Protocol
 
 MOST_DEG = 0.5  # that one region counts for
 CLEAR_DEG = 10.0  # cells whose two sides differ by less say nothing
@@ -68,21 +68,21 @@ def path_traced(folders: list[Path]) -> Iterator[Case]:
 
 def pictures(data: Path, sixths: int) -> Iterator[Case]:
     """Training meshes and materials as `polcap evaluate` draws its own, in either protocol by turns."""
-    patterns._SEED, protocol._SEED = fit_expected_error.OTHER_SEEDS
-    meshes = len(gbuffers.training_meshes(data))
+    evaluation_materials._SEED, evaluation_protocol._SEED = fit_expected_error.OTHER_SEEDS
+    meshes = len(traced_views.training_meshes(data))
     for sixth in range(sixths):
         with tempfile.TemporaryDirectory() as folder:
             fit_expected_error.linked(data, Path(folder), sixth, meshes)
-            drawn = [protocol.Protocol(Path(folder), SIZE, which) for which in (2, 1)]
-            for number in range(protocol.MESHES):
-                yield drawn[number % 2].case(sixth * protocol.MESHES + number)
+            drawn = [Protocol(Path(folder), SIZE, which) for which in (2, 1)]
+            for number in range(MESHES):
+                yield drawn[number % 2].case(sixth * MESHES + number)
 
 
 def proposed(case: Case, network: Network) -> tuple[Floats, Floats, Floats]:
     """Regions that the cut turns: terms (R, 5), by how much each lowers the mean error [degrees], weights (R,)."""
     shrink = max(1.0, max(case.cues.mask.shape) / int(network.metadata["native_size"]))
-    seen = learned._resized(learned._bounded(case.cues), 1 / shrink)
-    maps = augmentation.combined(seen, network, onnx.run, 4)
+    seen = learned._reduce(learned._limit_radiance(case.cues), 1 / shrink)
+    maps = augmentation.predict(seen, network, onnx.run, 4)
     normal = frames.to_ray_frame(maps["normal"], seen.rays)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
     grid = half_turns.coarse(normal, seen.mask)

@@ -53,7 +53,7 @@ def main() -> None:
     mi.set_log_level(mi.LogLevel.Error)
     training = options.meshes == "train"
     folder = options.data / "meshes" / "test"
-    meshes = gbuffers.training_meshes(options.data) if training else sorted(folder.glob("*.npz"))
+    meshes = traced_views.training_meshes(options.data) if training else sorted(folder.glob("*.npz"))
     sets = sorted(p.parent for p in (options.data / "materials" / "test").glob("*/albedo.jpg"))
     for index in range(options.scenes):
         mesh = meshes[index % len(meshes)]
@@ -63,12 +63,8 @@ def main() -> None:
         random = np.random.default_rng([2026, index])
         texture = sets[index // 2 % len(sets)] if index % 2 else None
         began = time.monotonic()
-<<<<<<< HEAD
         wear = Wear(texture, options.black)
-        made, about = build(mi, gbuffers.read_mesh(mesh), wear, options.size, options.depth, random)
-=======
-        made, about = build(mi, traced_views.read_mesh(mesh), texture, options.size, options.depth, random)
->>>>>>> main
+        made, about = build(mi, traced_views.read_mesh(mesh), wear, options.size, options.depth, random)
         with atomic.path(file) as temporary:
             np.savez_compressed(temporary, allow_pickle=False, about=np.array(json.dumps(about)), **made)
         print(file.name, json.dumps(about), f"{time.monotonic() - began:.0f} s", flush=True)

@@ -42,13 +42,8 @@ _SURE_DEG, _SUREST = 30.0, 3.0  # a network's error that counts 1, and the most 
 _INTEGER = 1000  # capacities per unit of energy: the flow is one of whole numbers
 # ln odds that a region of the cut is turned: constant, outline evidence over √cells, mean inward lean, share of the
 # network's positions that disagree, ln of its error in degrees; tests/benchmarks/fit_half_turns.py
-<<<<<<< HEAD
 _REGION = (-6.85, 1.05, 0.87, 8.09, 1.52)
-_MOST_OUTLINE, _MOST_OPPOSED = 2.0, 0.5  # larger values say no more
-=======
-_REGION = (-9.65, 0.89, 5.41, 10.22, 1.85)
 _MOST_OUTLINE, _MOST_OPPOSED = 2.0, 0.5  # larger values count as these
->>>>>>> main
 # ln odds that a cell of the inversion is on the wrong side: constant, energy of turning it alone, ln of the share of
 # links around it that contradict each other, mean lean away from the inside around it; same benchmark
 _CELL = (2.94, -0.176, 1.04, -2.31)
