@@ -109,7 +109,7 @@ def photograph(scene: Scene, falloff: float, printed: float, random: np.random.G
     v = render.view_rays(
         _VIEW, *(axis.reshape(-1) for axis in (x + np.tile(steps, _SAMPLES), y + np.repeat(steps, _SAMPLES)))
     )
-    at, distance, albedo = color_checker.seen(scene.chart, v)
+    at, distance, albedo = color_checker.intersect(scene.chart, v)
     point = -v[at] * distance[:, None]
     light = np.full((len(v), 3), 0.01)
     arriving = point_light.irradiance(point, np.array(scene.light[:2]), falloff, scene.chart.axes[0])

@@ -31,7 +31,7 @@ def test_as_opencv_projects():
 def test_simulated_lens_is_undone(k1, k2):
     lens = Distortion(500.0, (150.0, 100.0), k1, k2)
     y, x = np.mgrid[:200:25.0, :300:25.0]
-    ideal = simulated.looked_at(View(500.0, (150.0, 100.0), 1.0), (k1, k2), x, y)
+    ideal = simulated.undistort(View(500.0, (150.0, 100.0), 1.0), (k1, k2), x, y)
     assert np.allclose(distortion.distorted(lens, *ideal), (x, y), atol=1e-4)
     assert np.allclose(distortion.undistorted(lens, x, y), ideal, atol=1e-4)
 

@@ -15,7 +15,7 @@ from polcap.images import Floats, View
 from polcap.synth import interreflection, mesh_tracer, render
 from polcap.synth.distance_fields import Cluster, Model
 from polcap.synth.render import Scene
-from polcap.synth.scene_materials import Coat, Material, evaluate, relieved
+from polcap.synth.scene_materials import Coat, Material, add_relief, evaluate
 from polcap.synth.scenes import with_textures
 
 VIEW = View(focal=160.0, center=(47.5, 35.5), scale=1.0)
@@ -100,7 +100,7 @@ def test_a_texture_set_gives_colour_roughness_and_relief(texture: Path) -> None:
     diffuse, _, roughness, _ = evaluate(coat, position, facing)
     np.testing.assert_allclose(diffuse, [[0, 0, 0.503]] * 2, atol=0.02)  # sRGB 188
     np.testing.assert_allclose(roughness, 0.4, atol=0.01)
-    bent = relieved(coat, position, facing)
+    bent = add_relief(coat, position, facing)
     assert bent[0, 0] < -0.02 and bent[1, 0] > 0.02  # up the ramp, and down its mirror image
     np.testing.assert_allclose(bent[:, 1], 0, atol=0.02)
 
