@@ -95,7 +95,7 @@ def proposed(case: Case, network: Network) -> tuple[Floats, Floats, Floats]:
         terms.append(of_region[1:])
         gains.append(np.bincount(region.ravel(), change.ravel(), len(of_region))[1:])
     half_turns._NETWORK = usual
-    gain = np.concatenate(gains)
+    gain = np.asarray(np.concatenate(gains), np.float64)
     return np.concatenate(terms), gain, np.full(len(gain), 1 / np.sqrt(max(len(gain), 1)))
 
 
@@ -120,7 +120,7 @@ def gain_of_turning(grid: half_turns.Grid, case: Case) -> Floats:
     cosine = np.sqrt(np.maximum(1 - (lean**2).sum(axis=-1), 0)) * truth[..., 2]
     across = (lean * truth[..., :2]).sum(axis=-1)
     kept, turned = (np.degrees(np.arccos(np.clip(cosine + sign * across, -1, 1))) for sign in (1, -1))
-    return (kept - turned) * grid.mask
+    return np.asarray((kept - turned) * grid.mask)
 
 
 def fit(terms: Floats, true: NDArray[np.bool_], weight: Floats, shrink: float) -> Floats:
