@@ -26,8 +26,8 @@ import trimesh
 
 from polcap.formats import atomic, scene_files
 from polcap.images import Floats, View
-from polcap.optics import fresnel
-from polcap.synth import render, scene_materials
+from polcap.optics import frames, fresnel
+from polcap.synth import scene_materials
 from polcap.synth.mesh_tracer import Triangles
 from polcap.training import traced_views
 
@@ -272,7 +272,7 @@ def shot(mi: Any, one: Any, view: View, seed: int) -> Floats:
 def seen(mi: Any, parts: list[Any], view: View, size: int) -> dict[str, Any]:
     """Truth at the pixel centres: normal (camera frame, facing it), depth, mask and the material."""
     y, x = np.mgrid[:size, :size].astype(np.float64)
-    v = render.view_rays(view, x, y).reshape(-1, 3)
+    v = frames.rays_at(view, x, y).reshape(-1, 3)
     found = mi.load_dict({"type": "scene", **{f"part{k}": body(mi, p, "r") for k, p in enumerate(parts)}})
     ray = mi.Ray3f(mi.Point3f(0, 0, 0), mi.Vector3f(np.ascontiguousarray(-v.T, np.float32)))
     hit = found.ray_intersect(ray)
