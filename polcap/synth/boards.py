@@ -6,9 +6,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from polcap.images import Floats, View
+from polcap.optics import frames
 from polcap.synth import color_checker, lens
 from polcap.synth.color_checker import Chart
-from polcap.synth.render import view_rays
 
 _SAMPLES = 3  # rays per pixel side
 _SQUARES = 9, 6  # inner corners
@@ -35,7 +35,7 @@ def pictures(view: View, bend: tuple[float, float], size: tuple[int, int], count
         y, x = np.mgrid[:height, :width].astype(float)
         for dy in offsets:
             for dx in offsets:
-                ray = view_rays(view, *lens.undistort(view, bend, x + dx, y + dy)).reshape(-1, 3)
+                ray = frames.rays_at(view, *lens.undistort(view, bend, x + dx, y + dy)).reshape(-1, 3)
                 total += _albedo(ray, center, turn, pitch, kind).reshape(height, width, 3)
         yield total / _SAMPLES**2
 

@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from polcap.errors import SettingError
 from polcap.images import Floats, GBuffer, View
 from polcap.optics import body, frames, fresnel, mueller, shade
-from polcap.optics.projection import back_project
 from polcap.synth import color_checker as charts
 from polcap.synth import interreflection, mesh_tracer, scene_materials, trace
 from polcap.synth.color_checker import Chart
@@ -57,7 +56,7 @@ def stokes(
     A white matt plane at the object's distance that faces the flash has S0 = 1. `start` comes from `guide`.
     The flash is polarized along `flash_axis` [rad, in the picture], or unpolarized with the same brightness.
     """
-    v = view_rays(view, x, y).reshape(-1, 3)
+    v = frames.rays_at(view, x, y).reshape(-1, 3)
     if start is not None:
         row = np.clip(np.rint(y), 0, start.shape[0] - 1).astype(np.intp)
         column = np.clip(np.rint(x), 0, start.shape[1] - 1).astype(np.intp)
@@ -85,7 +84,7 @@ class ObjectBuffer(GBuffer):
 def gbuffer(scene: Scene, view: View, height: int, width: int) -> ObjectBuffer:
     """The object's surface at the center of each pixel."""
     y, x = np.mgrid[:height, :width].astype(np.float64)
-    hits, _ = _visible(scene, view_rays(view, x, y).reshape(-1, 3))
+    hits, _ = _visible(scene, frames.rays_at(view, x, y).reshape(-1, 3))
     normal, position, facing = np.zeros((3, height * width, 3), np.float32)
     depth = np.full(height * width, np.nan, np.float32)
     mask = np.zeros(height * width, bool)
@@ -106,14 +105,8 @@ def guide(buffer: GBuffer) -> Floats:
     """Distance (H, W) [m] up to which rays near each pixel meet nothing; infinite where they miss the object."""
     height, width = buffer.mask.shape
     y, x = np.mgrid[:height, :width].astype(np.float64)
-    distance = buffer.depth / view_rays(buffer.view, x, y)[..., 2]
+    distance = buffer.depth / frames.rays_at(buffer.view, x, y)[..., 2]
     return np.asarray(minimum_filter(np.where(buffer.mask, distance, np.inf), 5))
-
-
-def view_rays(view: View, x: Floats, y: Floats) -> Floats:
-    """`frames.rays` at any pixel positions: unit vectors from the surface to the lens, (..., 3) float64."""
-    towards = -back_project(view, x, y)
-    return np.asarray(towards / np.sqrt((towards**2).sum(axis=-1, keepdims=True)))
 
 
 def white_level(scene: Scene) -> float:

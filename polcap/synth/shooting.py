@@ -24,7 +24,7 @@ from polcap.errors import CaptureError
 from polcap.formats import atomic
 from polcap.formats.capture import layouts
 from polcap.images import Exif, Floats, GBuffer, View
-from polcap.optics import projection
+from polcap.optics import frames, projection
 from polcap.synth import color_checker as charts
 from polcap.synth import forward_camera, lens, render, scene_materials
 from polcap.synth.forward_camera import COLOR_MATRIX, SENSOR_WIDTH_MM, Sensor
@@ -188,7 +188,7 @@ class Studio:
         shoot = self.shoot
         back = np.linalg.inv(np.array(pose["transform"]))
         y, x = np.mgrid[: shoot.height, : shoot.width].astype(np.float64)
-        v = render.view_rays(shoot.view, *_reference_px(shoot, back, x, y))
+        v = frames.rays_at(shoot.view, *_reference_px(shoot, back, x, y))
         angle = np.radians(pose["actual_deg"] - pose["rot_deg"])
         passed = render.polarize(stokes, v, angle, shoot.extinction_ratio)
         return np.asarray(_blur(shoot, passed) @ self.to_camera.T)

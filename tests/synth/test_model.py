@@ -12,6 +12,7 @@ pytest.importorskip("embreex")
 
 from polcap.errors import DecodeError, SettingError
 from polcap.images import Floats, View
+from polcap.optics import frames
 from polcap.synth import interreflection, mesh_tracer, render
 from polcap.synth.distance_fields import Cluster, Model
 from polcap.synth.render import Scene
@@ -48,7 +49,7 @@ def test_the_shadow_lies_where_lines_to_the_flash_meet_the_ball(model: Model, ki
     scene = replace(BALL, light=(0.3, 0.0, 0.0), **({"shape": model} if kind == "mesh" else {}))
     bright = render.stokes(scene, VIEW, X, Y)[0, ..., 0]
     dark = render.stokes(replace(scene, cast_shadows=True), VIEW, X, Y)[0, ..., 0]
-    v = render.view_rays(VIEW, X, Y)
+    v = frames.rays_at(VIEW, X, Y)
     wall = -v * (scene.backdrop / v[..., 2])[..., None]
     light, middle = np.array(scene.light), np.array(scene.position)
     way = (light - wall) / np.linalg.norm(light - wall, axis=-1, keepdims=True)
