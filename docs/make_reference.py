@@ -65,7 +65,7 @@ def api_page() -> str:
         "# From Python", "", _MADE, "",
         "```python", "import polcap", "", 'result = polcap.process("CAPTURE")', "print(result.verdict)",
         'maps = polcap.read_maps(result.folder / "maps").maps', "```", "",
-        "`examples/from_python.py` is a complete program. A name is imported when it is first used. The package is typed.",
+        "`examples/from_python.py` is a complete program. Names are imported at their first use. The package is typed.",
     ]  # fmt: skip
     for name in sorted(polcap.__all__, key=lambda name: (name[0].isupper(), name)):
         source = inspect.getsource(getattr(polcap, name))
