@@ -4,12 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from polcap.formats import onnx
-from polcap.images import Floats, Network
+from polcap.images import NOT_IN_KEY, Floats, Network
 
 
 @dataclass(frozen=True)
 class FakeNetwork(Network):
-    answer: Callable[[Floats], dict[str, Floats]] = field(default=None, compare=False)
+    answer: Callable[[Floats], dict[str, Floats]] = field(default=None, compare=False, metadata=NOT_IN_KEY)
 
 
 def run(network: Network, inputs: Floats) -> dict[str, Floats]:
