@@ -1,10 +1,11 @@
-"""Light that leaves a rough body: through visible GGX facets, each a smooth Fresnel interface.
+"""Diffuse reflection of rough bodies: its intensity and polarization, through visible GGX facets.
 
-Below the surface light is unpolarized. The camera at zenith θ sees the distribution of visible normals m about the
-ray v, so S0 ∝ ⟨T₊(v·m)⟩ and, along the projected normal, S1 ∝ ⟨T₋(v·m) cos 2φ_m⟩ with φ_m the facet's azimuth about
-the ray. Facets count evenly where light spreads farther inside the body than a facet is wide (`local` 0), or by the
-flash light that falls into them, (v·m) T₊(v·m), where it does not (`local` 1). α = 0 is the smooth interface.
-Means over facets come from a table that is integrated at first use. Works on NumPy and torch.
+Each facet is a smooth Fresnel interface. Below the surface light is unpolarized. The camera at zenith angle θ sees the
+distribution of visible normals m about the ray v. So S0 ∝ ⟨T₊(v·m)⟩, and S1 along the projected normal is
+∝ ⟨T₋(v·m) cos 2φ_m⟩, with φ_m the facet's azimuth about the ray. Where light spreads farther inside the body than a
+facet is wide (`local` 0), all facets count alike. Where it does not (`local` 1), each facet counts by the flash light
+that enters it, (v·m) T₊(v·m). α = 0 is the smooth interface. Means over facets come from a table that is integrated at
+first use. Works on NumPy and torch.
 
 References
 ----------
@@ -27,87 +28,71 @@ from polcap.optics.namespace import array_namespace
 _COSINES = np.linspace(0, 1, 49)
 _ALPHAS = np.linspace(0, 1, 21)
 _INDICES = np.linspace(1.3, 1.7, 3)
-_AROUND, _ALONG = 48, 96  # facets of the quadrature: azimuths and slopes
+_AROUND, _ALONG = 48, 96  # azimuths and slopes of the facets that are summed
 _LEAST_COSINE = 1e-4
-_GRAZING = 0.1  # cosine below which shading flattens no further
-_SEEN = 0.25  # least cosine of the zeniths, up to 75°, at which the shading is fitted
+_GRAZING = 0.1  # cosine; at smaller ones the shading factor stays constant
+_SEEN = 0.25  # least cosine at which the shading is fitted: zenith angles up to 75°
 
 
 @dataclass(frozen=True)
 class Law:
-    """How the body of each place polarizes; fields broadcast to its pixels."""
+    """Parameters of the diffuse reflection of each pixel; fields broadcast to the pixels."""
 
-    rough: Any = 0.0  # the body's α by the gloss's: 0 is the smooth interface
-    local: Any = 0.0  # 0…1: how far light leaves through the facet it came in by
-    kept: Any = 1.0  # factor on S1 and S2: depth, fibers and dust depolarize further
+    rough: Any = 0.0  # α for diffuse reflection over α of the gloss; 0: a smooth interface
+    local: Any = 0.0  # 0…1: share of light that leaves through the facet by which it entered
+    dolp_factor: Any = 1.0  # factor on S1 and S2, for depolarization by depth, fibers and dust
 
     def at(self, which: Any) -> "Law":
-        """The law of some of the places."""
-        return Law(*(x if isinstance(x, float) else x[which] for x in (self.rough, self.local, self.kept)))
+        """The law of the pixels that an index or mask selects."""
+        return Law(*(x if isinstance(x, float) else x[which] for x in (self.rough, self.local, self.dolp_factor)))
 
 
 SMOOTH = Law()
 
 
 def leaving(c: Any, alpha: Any, ior: Any, local: Any = 0.0) -> tuple[Any, Any]:
-    """Mean T₊ of the visible facets, and the part of it that is polarized along the projected normal.
+    """Mean transmittance T₊ of the visible facets, and its part that is polarized along the projected normal.
 
-    Parameters
-    ----------
-    c
-        (...,) cosine of the zenith.
-    alpha, ior, local
-        GGX α 0…1, refractive index and `Law.local`, broadcast with c.
+    c (...,) is the cosine of the zenith angle, alpha the GGX α 0…1, ior the refractive index, local `Law.local`; all
+    broadcast.
     """
     plus, minus = fresnel.transmission(c, ior)
-    more, even, weighed = _looked_up(c, alpha, ior)
-    kept = even + local * (weighed - even)
-    return plus + more, (plus + more) * kept * minus / plus
+    extra, even, weighted = _interpolate_table(c, alpha, ior)
+    share = even + local * (weighted - even)
+    return plus + extra, (plus + extra) * share * minus / plus
 
 
 def dolp(c: Any, alpha: Any, ior: Any, local: Any = 0.0) -> Any:
-    """Degree of linear polarization of body light.
-
-    Parameters
-    ----------
-    c, alpha, ior, local
-        As in `leaving`.
-    """
+    """Degree of linear polarization (...,) of diffuse reflection; arguments of `leaving`."""
     plus, minus = leaving(c, alpha, ior, local)
     return minus / plus
 
 
-def flatter(cos_i: Any, cos_o: Any, between: Any, alpha: Any) -> Any:
-    """Factor on Lambert's shading of a rough body whose light stays local: 1 where surface or light face the camera.
+def flattening(cos_i: Any, cos_o: Any, between: Any, alpha: Any) -> Any:
+    """Factor (...,) on Lambert's shading of a rough body with `local` 1; it is 1 where the surface faces the camera.
 
-    Facets that turn towards a light beside the camera brighten the limb: 1 + B(α) sin θᵢ sin θₒ max(0, cos Δφ) /
-    (g (1 + g)), g = max(cos θᵢ, cos θₒ), close to Oren & Nayar's form; B is fitted to the facets. Where the flash
-    stands at the lens it is 1 + B (1/cos θ − 1). What they call A is 1 here: albedo is what a facing surface shows.
+    Facets that face a light near the camera brighten the occluding contour: 1 + B(α) sin θᵢ sin θₒ max(0, cos Δφ) /
+    (g (1 + g)), g = max(cos θᵢ, cos θₒ), close to Oren & Nayar's form; B is fitted to the facets. With the flash at
+    the lens it is 1 + B (1/cos θ − 1). Oren & Nayar's A is 1 here: albedo is that of a surface facing the camera.
 
-    Parameters
-    ----------
-    cos_i, cos_o
-        (...,) cosines of light and camera against the normal.
-    between
-        (...,) cosine of the angle between light and camera.
-    alpha
-        (...,) GGX α 0…1.
+    cos_i and cos_o (...,) are the cosines of light and camera against the normal, between (...,) the cosine of the
+    angle from light to camera, alpha (...,) the GGX α 0…1.
     """
     xp = array_namespace(cos_o)
-    strength = _between(xp, xp.asarray(_strengths(), dtype=cos_o.dtype, device=device(cos_o)), alpha, _ALPHAS)
+    strength = _interpolate(xp, xp.asarray(_strengths(), dtype=cos_o.dtype, device=device(cos_o)), alpha, _ALPHAS)
     greater = xp.where(cos_i > cos_o, cos_i, cos_o)
     greater = xp.clip(greater, _GRAZING, None)
     return 1 + strength * xp.clip(between - cos_i * cos_o, 0.0, None) / (greater * (1 + greater))
 
 
 def make_tables() -> None:
-    """Make what `leaving` and `flatter` look up: a third of a second that else the first of them to be called takes."""
+    """Compute the tables of `leaving` and `flattening` now: 0.3 s that the first call would take otherwise."""
     _table()
     _strengths()
 
 
-def _looked_up(c: Any, alpha: Any, ior: Any) -> tuple[Any, Any, Any]:
-    """`_table` at any place, trilinear."""
+def _interpolate_table(c: Any, alpha: Any, ior: Any) -> tuple[Any, Any, Any]:
+    """Trilinear interpolation of `_table`, three values (...,)."""
     xp = array_namespace(c)
     table = xp.asarray(_table().reshape(-1, 3), dtype=c.dtype, device=device(c))
     zero = 0 * c
@@ -122,13 +107,14 @@ def _looked_up(c: Any, alpha: Any, ior: Any) -> tuple[Any, Any, Any]:
     return out[..., 0], out[..., 1], out[..., 2]
 
 
-def _between(xp: Any, values: Any, x: Any, nodes: Floats) -> Any:
+def _interpolate(xp: Any, values: Any, x: Any, nodes: Floats) -> Any:
+    """Linear interpolation between values at evenly spaced nodes."""
     at, share = _step(xp, x, nodes)
     return values[at] * (1 - share) + values[at + 1] * share
 
 
 def _step(xp: Any, x: Any, nodes: Floats) -> tuple[Any, Any]:
-    """Node before each x and how far it is to the next, 0…1; x is kept within the nodes."""
+    """Index of the node before each x, and the fraction 0…1 of the way to the next; x is clipped to the nodes."""
     place = xp.clip((x - float(nodes[0])) * ((len(nodes) - 1) / float(nodes[-1] - nodes[0])), 0.0, len(nodes) - 1.0)
     at = xp.astype(xp.clip(xp.floor(place), 0.0, len(nodes) - 2.0), xp.int64)
     return at, place - at
@@ -136,7 +122,7 @@ def _step(xp: Any, x: Any, nodes: Floats) -> tuple[Any, Any]:
 
 @lru_cache(maxsize=1)
 def _table() -> Floats:
-    """Over index, α and cosine (3, 21, 49, 3): ⟨T₊⟩ − T₊, and the DoLP over the smooth one's, evenly and locally."""
+    """By index, α and cosine (3, 21, 49, 3): ⟨T₊⟩ − T₊; DoLP over the smooth interface's, for `local` 0 and 1."""
     out = np.zeros((len(_INDICES), len(_ALPHAS), len(_COSINES), 3))
     out[..., 1:] = 1.0
     cosine = np.maximum(_COSINES, _LEAST_COSINE)
@@ -150,7 +136,7 @@ def _table() -> Floats:
             weighted = weight * c * plus
             local = (weighted * minus * turned).sum(axis=1) / (weighted * plus).sum(axis=1)
             out[i, j, :, 0] = mean - smooth_plus
-            # towards the normal both vanish with sin²θ: the limit of the ratio is the next node's
+            # near the normal both DoLPs go to 0 as sin²θ: their ratio there is extrapolated
             ratio = np.stack([even, local], axis=1)[:-1] / (smooth_minus / smooth_plus)[:-1, None]
             out[i, j, :, 1:] = np.concatenate([ratio, 2 * ratio[-1:] - ratio[-2:-1]])
     return out
@@ -158,7 +144,7 @@ def _table() -> Floats:
 
 @lru_cache(maxsize=1)
 def _strengths() -> Floats:
-    """B of `flatter` at each α (21,), index 1.5, least squares over zeniths up to 75°."""
+    """B of `flattening` at each α (21,), index 1.5, least squares over zeniths up to 75°."""
     cosine = np.linspace(_SEEN, 1, 40)
     term = 1 / cosine - 1
     out = np.zeros(len(_ALPHAS))

@@ -1,4 +1,4 @@
-"""GGX microfacets: distribution and Smith masking. α = roughness². Works on NumPy and torch.
+"""The GGX microfacet model: normal distribution and Smith masking. α = roughness². Works on NumPy and torch.
 
 References
 ----------

@@ -1,6 +1,6 @@
-"""colour-science without its plots: color differences, chart colors, chromatic adaptation.
+"""The package colour-science (color differences, chart colors, chromatic adaptation), imported without its plots.
 
-The import takes .2 s, so functions import this module where they call it, and `process` while it decodes photographs.
+The import takes 0.2 s, so functions import this module only where they call it.
 """
 
 import sys

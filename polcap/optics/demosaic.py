@@ -1,9 +1,9 @@
-"""From one colour per photosite to three per pixel: binning by superpixels, or linear interpolation.
+"""Demosaicing: from one color per photosite to three per pixel, by superpixel binning or linear interpolation.
 
-Both are linear and the same for every picture, so that they add no polarization of their own and a
-pixel's variance follows from its photosites'. The CFA is a (2, 2) of 0 R, 1 G, 2 B; of X-Trans a (6, 6), which
-is binned 3×3: five greens in a cross of corners and middle, two reds and two blues on opposite sides, so
-that every colour has its centroid in the middle.
+Both are linear and the same for every picture. So they add no polarization, and a pixel's variance follows from the
+variances of its photosites. A color filter array (CFA) is a (2, 2) array of 0 R, 1 G, 2 B. X-Trans has (6, 6), binned
+in blocks of 3×3: green in the corners and the middle, two reds and two blues on opposite sides. The centroid of each
+color is then the middle of the block.
 """
 
 from functools import lru_cache
@@ -15,15 +15,15 @@ from polcap.images import Bits, Floats
 
 
 def superpixel(mosaic: Any, cfa: Bits) -> Floats:
-    """Each 2×2 quad, or 3×3 block of X-Trans, as one pixel of colour means, (H, W) → (H//n, W//n, 3) float32.
+    """Each 2×2 quad, or 3×3 block of X-Trans, as one pixel of color means, (H, W) → (H//n, W//n, 3) float32.
 
-    Last rows and columns that fill no block are dropped.
+    Rows and columns after the last whole block are dropped.
     """
     period = len(cfa)
     side, blocks = (2, 1) if period == 2 else (3, 2)  # of a block; blocks per period
     h, w = mosaic.shape[0] // side, mosaic.shape[1] // side
     out = np.zeros((h, w, 3), np.float32)
-    share = np.bincount(np.ravel(cfa), minlength=3) / blocks**2  # photosites per colour and block
+    share = np.bincount(np.ravel(cfa), minlength=3) / blocks**2  # photosites per color and block
     for i, j in np.ndindex(period, period):
         color = int(cfa[i, j])
         sites = mosaic[i : side * h : period, j : side * w : period]
@@ -32,7 +32,7 @@ def superpixel(mosaic: Any, cfa: Bits) -> Floats:
 
 
 def x_trans_corner(cfa: Bits) -> tuple[int, int] | None:
-    """Row and column of the first 3×3 block of X-Trans in a (6, 6); None where it is another mosaic."""
+    """Row and column of the first 3×3 block in a (6, 6) X-Trans CFA; None for another mosaic."""
     for down, right in np.ndindex(3, 3):
         moved = np.roll(cfa, (-down, -right), (0, 1))
         blocks = moved.reshape(2, 3, 2, 3).transpose(0, 2, 1, 3).reshape(4, 9)
@@ -45,10 +45,10 @@ def x_trans_corner(cfa: Bits) -> tuple[int, int] | None:
 
 
 def interpolate(mosaic: Floats, cfa: Bits) -> Floats:
-    """All three colours at every photosite, (H, W) → (H, W, 3) float32.
+    """All three colors at every photosite, (H, W) → (H, W, 3) float32.
 
-    Green from its four neighbours, corrected by the curvature of the colour on the spot; red and blue
-    from bilinear differences to green. Measured values are kept.
+    Green is the mean of its four neighbors, corrected by the curvature of the color measured there. Red and blue are
+    interpolated bilinearly as differences from green. Measured values stay unchanged.
 
     References
     ----------
@@ -74,9 +74,9 @@ def interpolate(mosaic: Floats, cfa: Bits) -> Floats:
 
 
 def variance_gain(cfa: Bits) -> Floats:
-    """What `interpolate` makes of noise: (2, 2, 3, 3) = [row phase, column phase, colour out, colour in].
+    """Noise propagation of `interpolate`, (2, 2, 3, 3) = [row phase, column phase, output color, input color].
 
-    Variance of a colour at a phase = Σ over colours in of gain · variance of one such photosite.
+    Variance of an output color = Σ over input colors of gain · variance of one such photosite.
     """
     return _variance_gain(tuple(int(c) for c in np.ravel(cfa)))
 
@@ -95,6 +95,6 @@ def _variance_gain(colors: tuple[int, ...]) -> Floats:
 
 
 def _at(padded: Floats, margin: int, dy: int, dx: int) -> Floats:
-    """The unpadded picture as seen (dy, dx) px further down and right."""
+    """The unpadded picture, shifted: pixel (y, x) shows the value at (y + dy, x + dx)."""
     h, w = padded.shape[0] - 2 * margin, padded.shape[1] - 2 * margin
     return padded[margin + dy : margin + dy + h, margin + dx : margin + dx + w]

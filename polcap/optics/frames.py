@@ -1,9 +1,8 @@
-"""Camera frame, view rays, and the frame that stands on each ray.
+"""Coordinate frames: the camera frame, view rays, and a right-handed frame for each ray.
 
-Camera: x right, y up, z towards the camera; the scene lies at negative z. On a ray v (unit, surface
-to camera) stands the right-handed frame (e_x, e_y, v) with e_x the camera's x axis projected across
-the ray. A polarizer's axis is carried to an oblique ray by the same projection. Works on NumPy and
-torch; vectors on the last axis.
+Camera frame: x right, y up, z towards the camera; the scene lies at negative z. A ray v (unit vector, surface to
+camera) has the frame (e_x, e_y, v), with e_x the camera's x axis projected onto the plane across the ray. The axis of
+a polarizer is projected onto an oblique ray in the same way. Works on NumPy and torch; vectors on the last axis.
 """
 
 from typing import Any
@@ -12,70 +11,73 @@ import numpy as np
 
 from polcap.images import Floats, View
 from polcap.optics.namespace import array_namespace
+from polcap.optics.projection import back_project
 
 
 def rays(view: View, height: int, width: int) -> Floats:
-    """Unit vectors from the surface to a pinhole camera, (H, W, 3)."""
-    x = (np.arange(width, dtype=np.float32) - view.center[0]) / view.focal
-    y = (np.arange(height, dtype=np.float32) - view.center[1]) / view.focal
-    xx, yy = np.meshgrid(x, y)
-    v = np.stack([-xx, yy, np.ones_like(xx)], axis=-1)
-    return np.asarray(v / (dot(v, v) ** 0.5)[..., None])
+    """Unit vectors (H, W, 3) from the surface to a pinhole camera, for each pixel."""
+    return rays_at(view, *np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)))
+
+
+def rays_at(view: View, x: Floats, y: Floats) -> Floats:
+    """Unit vectors (..., 3) from the surface to a pinhole camera, for pixel positions x, y (...,)."""
+    towards = -back_project(view, x, y)
+    return np.asarray(towards / (dot(towards, towards) ** 0.5)[..., None])
 
 
 def basis(v: Any) -> tuple[Any, Any]:
     """(e_x, e_y) of the frame on each ray, a unit vector v (..., 3): e_x = x − (x·v) v made unit, e_y = v × e_x."""
     xp = array_namespace(v)
     vx, vy, vz = v[..., 0], v[..., 1], v[..., 2]
-    long = _across(vx)
-    e_x = xp.stack([long, -vx * vy / long, -vx * vz / long], axis=-1)
-    return e_x, xp.stack([0 * vx, vz / long, -vy / long], axis=-1)
+    length = _x_length(vx)
+    e_x = xp.stack([length, -vx * vy / length, -vx * vz / length], axis=-1)
+    return e_x, xp.stack([0 * vx, vz / length, -vy / length], axis=-1)
 
 
-def _across(vx: Any) -> Any:
-    """How long what is left of the x axis is across rays whose x is vx."""
+def _x_length(vx: Any) -> Any:
+    """Length of the camera's x axis after its projection across rays with x component vx."""
     return (1 - vx * vx) ** 0.5
 
 
 def cross(a: Any, b: Any) -> Any:
-    """a × b on the last axis."""
+    """a × b of vectors (..., 3)."""
     xp = array_namespace(a)
     ax, ay, az, bx, by, bz = a[..., 0], a[..., 1], a[..., 2], b[..., 0], b[..., 1], b[..., 2]
     return xp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
 def dot(a: Any, b: Any) -> Any:
-    """a · b on the last axis, in a quarter of the time that a sum over three numbers takes."""
+    """a · b of vectors (..., 3), four times as fast as a sum over the last axis."""
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
 def total(a: Any) -> Any:
-    """Sum of three numbers on the last axis, in a quarter of the time."""
+    """Sum of the three numbers on the last axis, four times as fast as the namespace's `sum`."""
     return a[..., 0] + a[..., 1] + a[..., 2]
 
 
 def to_ray_frame(n: Any, v: Any) -> Any:
-    """Camera-frame vectors n (..., 3) in the frames of the rays v (..., 3); see `basis`."""
+    """Vectors n (..., 3), from the camera frame to the frames of the rays v (..., 3); see `basis`."""
     xp = array_namespace(n)
-    vx, long, along = v[..., 0], _across(v[..., 0]), dot(n, v)
-    turned = n[..., 1] * v[..., 2] - n[..., 2] * v[..., 1]
-    return xp.stack([(n[..., 0] - vx * along) / long, turned / long, along], axis=-1)
+    vx, length, along = v[..., 0], _x_length(v[..., 0]), dot(n, v)
+    across = n[..., 1] * v[..., 2] - n[..., 2] * v[..., 1]
+    return xp.stack([(n[..., 0] - vx * along) / length, across / length, along], axis=-1)
 
 
 def from_ray_frame(m: Any, v: Any) -> Any:
-    """Back to the camera frame."""
+    """Vectors m (..., 3), from the frames of the rays v (..., 3) to the camera frame."""
     xp = array_namespace(m)
     vx, vy, vz = v[..., 0], v[..., 1], v[..., 2]
-    long = _across(vx)
-    x, y = m[..., 0] / long, m[..., 1] / long
+    length = _x_length(vx)
+    x, y = m[..., 0] / length, m[..., 1] / length
     along = m[..., 2] - vx * x
     return xp.stack([x + vx * along, y * vz + vy * along, vz * along - y * vy], axis=-1)
 
 
 def lifted(m: Any) -> Any:
-    """Unit vectors m (..., 3) in the frames of rays, all turned to where they can be seen.
+    """Unit vectors (..., 3) in the frames of rays, turned so that all face the camera.
 
-    Those that turn away from the camera are brought to z = 0.02 before they are made unit again.
+    z below 0.02 becomes 0.02, then vectors are normalized again.
     """
     xp = array_namespace(m)
     up = xp.concat([m[..., :2], xp.clip(m[..., 2:], 0.02, None)], axis=-1)
@@ -83,9 +85,9 @@ def lifted(m: Any) -> Any:
 
 
 def axis_across(angle: Any, v: Any) -> tuple[Any, Any]:
-    """Where an image-plane axis at `angle` rad (broadcast to v's pixels) points in (e_x, e_y); x, y of any length.
+    """Direction (x, y), of any length, in (e_x, e_y) of each ray v (..., 3), of an axis in the image plane.
 
-    The axis a = (cos θ, sin θ, 0) projected across the ray, a − (a·v)v; see `basis`.
+    The axis a = (cos θ, sin θ, 0), θ = `angle` [rad], is projected across the ray, a − (a·v)v; see `basis`.
     """
     xp = array_namespace(v)
     vx, sine = v[..., 0], xp.sin(angle)
@@ -93,6 +95,6 @@ def axis_across(angle: Any, v: Any) -> tuple[Any, Any]:
 
 
 def axis_on_ray(angle: Any, v: Any) -> Any:
-    """The angle of `axis_across`, rad."""
+    """Angle of `axis_across` from e_x, rad."""
     x, y = axis_across(angle, v)
     return array_namespace(v).atan2(y, x)

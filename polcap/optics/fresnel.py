@@ -1,8 +1,8 @@
-"""Fresnel's equations for a dielectric in air, and the zenith angle they hide in the DoLP.
+"""Fresnel's equations of a dielectric in air, and the zenith angle of a surface from its DoLP.
 
-c = cos θ is the angle in air, n the refractive index, g = √(n² − sin²θ). `plus` is the mean of the
-s and p coefficients and `minus` half their difference: what unpolarized light keeps, and what of it
-turns linear. Works on NumPy and torch.
+c = cos θ with θ the angle in air, n the refractive index, g = √(n² − sin²θ). `plus` is the mean of the s and p
+coefficients: the intensity from unpolarized light of intensity 1. `minus` is half their difference: its linearly
+polarized part. Works on NumPy and torch.
 
 References
 ----------
@@ -38,20 +38,20 @@ def normal_reflectance(ior: Any) -> Any:
 
 
 def diffuse_dolp(c: Any, ior: Any) -> Any:
-    """ρ(θ) = T₋/T₊: the degree of linear polarization of light that left the body at angle θ."""
+    """ρ(θ) = T₋/T₊: the degree of linear polarization (DoLP) of diffuse reflection at zenith angle θ."""
     plus, minus = transmission(c, ior)
     return minus / plus
 
 
 def greatest_diffuse_dolp(ior: float) -> float:
-    """ρ at grazing emission, (n² − 1)/(n² + 1)."""
+    """Largest DoLP of diffuse reflection, at θ = 90°: (n² − 1)/(n² + 1)."""
     return (ior**2 - 1) / (ior**2 + 1)
 
 
 def cos_zenith_from_dolp(dolp: Any, ior: float) -> Any:
-    """The exact inverse of `diffuse_dolp`: cos θ = (n − S)/√(S((1 + n²)S − 2n)), S = √((1 + ρ)/(1 − ρ)).
+    """Exact inverse of `diffuse_dolp`: cos θ = (n − S)/√(S((1 + n²)S − 2n)), S = √((1 + ρ)/(1 − ρ)); (...,) in 0…1.
 
-    dolp (...,) is clipped to what the material can emit, so the answer is always in 0…1.
+    dolp (...,) is clipped to the range of the material.
     """
     xp = array_namespace(dolp)
     rho = xp.clip(dolp, 0.0, greatest_diffuse_dolp(ior) - 1e-6)

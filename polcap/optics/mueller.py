@@ -1,7 +1,7 @@
-"""Stokes parameters seen through linear polarizers: the analyzer's weights and the turn of a frame.
+"""Mueller calculus: the weights with which a linear polarizer passes the Stokes parameters.
 
-Signs: angles run from image x towards image up, counter-clockwise as the photographer
-sees the picture, so S1 > 0 is horizontal and S2 > 0 is 45° up-right. Works on NumPy and torch.
+Signs: angles run from image x towards image up, counter-clockwise in the picture. So S1 > 0 is horizontal and
+S2 > 0 is 45° up-right. Works on NumPy and torch.
 """
 
 from typing import Any
@@ -13,8 +13,8 @@ def analyzer(angle: Any, extinction_ratio: float = float("inf")) -> Any:
     """Intensity weights of linear polarizers on (S0, S1, S2).
 
     Rows ½ (1, c cos 2θ, c sin 2θ), (..., 3), for axes θ (...,) rad; c = (E − 1)/(E + 1) for an
-    extinction ratio E, 1 for an ideal polarizer: the first row of the polarizer's Mueller matrix
-    over the greatest transmittance, up to the factor (E + 1)/E that a white balance takes out.
+    extinction ratio E, and 1 for an ideal polarizer. This is the first row of the Mueller matrix over the
+    greatest transmittance, without the factor (E + 1)/E, which the white balance absorbs.
 
     References
     ----------

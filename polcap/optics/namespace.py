@@ -1,4 +1,4 @@
-"""In: arrays of NumPy or torch. Out: the namespace whose functions take them: physics is written once for both."""
+"""The array namespace, NumPy or torch, of arrays: physics is written once for both."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def array_namespace(*arrays: Any) -> Any:
-    """The array API of these arrays; NumPy 2 is one itself, and needs no wrapper (.15 s of every start)."""
+    """The array API namespace of these arrays; `array_api_compat` is imported only where torch needs it."""
     if all(isinstance(array, (np.ndarray, np.generic)) for array in arrays):
         return np
     import array_api_compat

@@ -1,7 +1,7 @@
-"""An object's outline: how deep a pixel lies inside it, which way is out, and how the light there is polarized.
+"""The outline of an object: distance of pixels to it, its outward direction, and the polarization along it.
 
-Where a closed surface turns edge-on its normal points out across the outline; that is what order,
-handedness and half-turns are settled by.
+At the outline of a closed surface the normal is perpendicular to the view and points outward. This decides the order
+and sense of the polarizer angles, and the half-turns of normals.
 """
 
 from dataclasses import dataclass
@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 from polcap.images import Floats
 from polcap.optics import mueller
 
-SECTORS = 24  # of an outline, 15° each as seen from the object's middle; their scatter is the doubt
-DOLP_CAP = 0.4  # weights end here: edge-on, a smooth body of index 1.5 emits 0.385 and none more (optics.fresnel)
+SECTORS = 24  # parts of an outline, 15° each from the object's center; their scatter gives the error
+DOLP_CAP = 0.4  # largest weight: the DoLP of a smooth body of index 1.5 is 0.385 edge-on (optics.fresnel)
 
 
 @dataclass(frozen=True)
-class Rim:
-    """The band inside the outline."""
+class OutlineBand:
+    """The pixels just inside the outline."""
 
-    light: Floats  # (K, N) of the registered shots, gains taken out
+    light: Floats  # (K, N) registered shots, divided by their gains
     azimuth: Floats  # (N,) rad, outward direction of the outline, from image x towards image up
-    sector: NDArray[np.int_]  # (N,) part of the outline, 0…23, seen from the object's middle
+    sector: NDArray[np.int_]  # (N,) 0…23, part of the outline by direction from the object's center
 
 
 def disc_radius(mask: NDArray[np.bool_]) -> float:
@@ -38,22 +38,11 @@ def depth(mask: NDArray[np.bool_]) -> Floats:
 
 
 def outward(inside: Floats, blur_px: float) -> tuple[Floats, Floats]:
-    """The way out, and how clear it is.
+    """Outward unit vectors (2, H, W), x right, y up, and the slope (H, W) that they come from.
 
-    Parameters
-    ----------
-    inside
-        (H, W), a mask as floats or its `depth`: larger further in. The mask tells the way near the outline
-        alone, the depth everywhere.
-    blur_px
-        1σ of the Gaussian that rounds its pixels off first.
-
-    Returns
-    -------
-    direction
-        (2, H, W) unit vectors, x right, y up; zero where nothing tells.
-    slope
-        (H, W) of the blurred `inside` per px, times 8 (Sobel's weights).
+    `inside` (H, W) is a mask as floats, for directions near the outline only, or its `depth`, for directions
+    everywhere. It is blurred by a Gaussian of `blur_px` (1σ) first. The slope is 8 times that per px (Sobel's weights);
+    where it is 0, so is the vector.
     """
     smooth = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), blur_px)
     dx, dy = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
@@ -68,38 +57,27 @@ def sectors(band: NDArray[np.bool_]) -> NDArray[np.int_]:
     return np.floor((around + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS
 
 
-def polarization(at: Rim, angle: Floats) -> NDArray[Any]:
-    """(S1 + i S2)/S0 along the rim, (N,), of shots through polarizers at angle (K,) rad."""
-    s0, s1, s2 = np.linalg.lstsq(mueller.analyzer(angle), at.light, rcond=None)[0]
+def polarization(band: OutlineBand, angle: Floats) -> NDArray[Any]:
+    """(S1 + i S2)/S0 of the band, (N,), from polarizer angles (K,) rad."""
+    s0, s1, s2 = np.linalg.lstsq(mueller.analyzer(angle), band.light, rcond=None)[0]
     return np.asarray((s1 + 1j * s2) / np.maximum(s0, 1e-9))
 
 
-def phasor(at: Rim, angle: Floats) -> tuple[NDArray[Any], Floats]:
-    """How the polarization lies to the contour, sector by sector.
+def phasor(band: OutlineBand, angle: Floats) -> tuple[NDArray[Any], Floats]:
+    """Polarization relative to the contour, by sector: Σ w e^{2i(φ − φ_contour)} (24,) and Σ w (24,).
 
-    Parameters
-    ----------
-    at
-        The rim's light.
-    angle
-        (K,) rad, of the shots' polarizers.
-
-    Returns
-    -------
-    total
-        (24,) Σ w e^{2i(φ − φ_contour)}, φ the AoLP; real and positive where it crosses the contour as a body's does.
-    weight
-        (24,) Σ w, w the DoLP up to what a body has.
+    φ is the AoLP from polarizer angles (K,) rad, φ_contour the outward direction, w the DoLP up to DOLP_CAP. The sum is
+    real and positive for diffuse reflection, which is polarized across the contour.
     """
-    along = polarization(at, angle)
+    along = polarization(band, angle)
     weight = np.minimum(np.abs(along), DOLP_CAP)
-    lying = weight * along / np.maximum(np.abs(along), 1e-12) * np.exp(-2j * at.azimuth)
-    real, imaginary = (np.bincount(at.sector, part, SECTORS) for part in (lying.real, lying.imag))
-    return real + 1j * imaginary, np.asarray(np.bincount(at.sector, weight, SECTORS), np.float64)
+    relative = weight * along / np.maximum(np.abs(along), 1e-12) * np.exp(-2j * band.azimuth)
+    real, imaginary = (np.bincount(band.sector, part, SECTORS) for part in (relative.real, relative.imag))
+    return real + 1j * imaginary, np.asarray(np.bincount(band.sector, weight, SECTORS), np.float64)
 
 
-def mean_and_doubt(total: NDArray[Any], weight: Floats) -> tuple[complex, float]:
-    """The mean of what `phasor` gives, (24,) each, and 1σ of half its argument: the common turn of all angles, rad."""
+def mean_and_sigma(total: NDArray[Any], weight: Floats) -> tuple[complex, float]:
+    """Mean of `phasor`'s sums, (24,) each, and 1σ [rad] of half its argument, the common turn of all angles."""
     mean = complex(total.sum() / max(float(weight.sum()), 1e-9))
     used = weight > 0
     across = (total[used] / weight[used] * np.exp(-1j * np.angle(mean))).imag

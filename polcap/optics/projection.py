@@ -9,12 +9,12 @@ from polcap.images import Floats, View
 
 
 def transform_points(matrix: Floats, point: Floats) -> Floats:
-    """Points x, y (…, 2) through a homography (3, 3), (…, 2)."""
+    """Images (…, 2) of points x, y (…, 2) under a homography (3, 3)."""
     return np.stack(coordinates(matrix, point[..., 0], point[..., 1]), axis=-1)
 
 
 def coordinates(matrix: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """The same for x, y of any shapes that broadcast; float64."""
+    """`transform_points` for separate x, y of any shapes that broadcast; float64."""
     h = np.asarray(matrix, np.float64)
     u, v = (h[k, 0] * x + (h[k, 1] * y + h[k, 2]) for k in (0, 1))
     if abs(h[2, 0]) + abs(h[2, 1]) > 0 or h[2, 2] != 1:
@@ -24,23 +24,23 @@ def coordinates(matrix: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def picture_corners(width: int, height: int) -> Floats:
-    """Centres of the four corner pixels, x, y (4, 2)."""
+    """Centers x, y (4, 2) of the four corner pixels."""
     return np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], float)
 
 
 def project(view: View, point: Floats) -> Floats:
-    """Pixels x, y (…, 2) that show points (…, 3) of the camera frame (x right, y up, z towards the camera)."""
+    """Pixels x, y (…, 2) of points (…, 3) in the camera frame (x right, y up, z towards the camera)."""
     x = view.center[0] - view.focal * point[..., 0] / point[..., 2]
     y = view.center[1] + view.focal * point[..., 1] / point[..., 2]
     return np.stack([x, y], axis=-1)
 
 
 def back_project(view: View, x: Floats, y: Floats) -> Floats:
-    """Points (…, 3) of the camera frame at distance 1 along the optical axis, that pixels x, y show."""
+    """Points (…, 3) in the camera frame at depth 1 (z = −1) that project onto pixels x, y (…,)."""
     across, up = ray_slopes(view, x, y)
     return np.stack([across, up, -np.ones_like(across)], axis=-1)
 
 
 def ray_slopes(view: View, x: NDArray[Any], y: NDArray[Any]) -> tuple[Floats, Floats]:
-    """x/−z and y/−z of the points (camera frame) that pixels x, y show; (…,) each, any shape."""
+    """x/−z and y/−z (…,) in the camera frame of the points that project onto pixels x, y (…,)."""
     return (x - view.center[0]) / view.focal, (view.center[1] - y) / view.focal

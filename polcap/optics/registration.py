@@ -1,8 +1,8 @@
-"""Registration of two pictures of one scene: translation, similarity or homography, to a fiftieth of a pixel.
+"""Registration of two pictures of one scene by a translation, similarity or homography, to 0.02 px.
 
-1. The pictures are averaged down to pyramids; tiles with most detail are chosen on each scale.
-2. From coarse to fine, every tile is matched by itself: Gauss-Newton steps on its brightness, with a gain and an
-   offset of its own, so that exposure, lighting and polarization may differ from tile to tile.
+1. The pictures are averaged down to pyramids. On each scale the tiles with most detail are chosen.
+2. From coarse to fine, each tile is matched independently by Gauss-Newton steps on its brightness. Each tile has its
+   own gain and offset, so exposure, lighting and polarization may differ between tiles.
 3. One motion is fitted robustly to the shifts of all tiles.
 
 References
@@ -20,28 +20,29 @@ from numpy.typing import NDArray
 
 from polcap.images import Floats
 from polcap.optics.projection import transform_points
+from polcap.optics.tiles import spread_over_cells
 
 Bools = NDArray[np.bool_]
 Indices = NDArray[np.int64]
-Model = Literal["translation", "similarity", "homography", "simplest"]  # simplest: that explains the shifts (BIC)
+Model = Literal["translation", "similarity", "homography", "simplest"]  # simplest: the model of least BIC
 
 _SIZES = {"translation": (2,), "similarity": (4,), "homography": (8,), "simplest": (8, 4, 2)}  # numbers of parameters
-_TILE = 20  # px; of 16 to 32 px the least error over frames and shots (docs/benchmarks/registration.md)
-_CELLS, _PER_CELL = 10, 8  # tiles are spread over a grid of cells: the best few of each
-_COARSEST_PX = 256  # of the shorter side: a smaller picture has too few tiles
-_TILES_AT_ONCE = 64  # so that their equations fit a core's cache
-_LEAST_USABLE, _USABLE = 0.6, 0.7  # shares of a tile's pixels: in the other picture, to be chosen in the reference
+_TILE = 20  # px; least error of sizes from 16 to 32 px (docs/benchmarks/registration.md)
+_CELLS, _PER_CELL = 10, 8  # cells along each side of the picture; tiles chosen in each cell
+_COARSEST_PX = 256  # least shorter side of a pyramid's picture: a smaller one has too few tiles
+_TILES_AT_ONCE = 64  # matched together: their equations fit a core's cache
+_LEAST_USABLE, _USABLE = 0.6, 0.7  # least usable share of a tile: in the other picture, in the reference
 _MARGIN = 2  # px around a tile that interpolation reads
-_REACH_PX = 2.0  # a tile may move in one step
-_GAIN = 0.2, 5.0  # of a tile; beyond, it shows something else
+_REACH_PX = 2.0  # largest movement of a tile in one step
+_GAIN = 0.2, 5.0  # range of a tile's gain; beyond, the two tiles show different things
 _LEAST_TILES = 6
 _TILE_ERROR_PX = 0.02  # of interpolation and aliasing, in the richest tile
-_PRIOR_PX = 0.1  # what the tiles do not know to this, hardly moves in one step
-_AGREE_PX = 0.3  # a tile that is left over by less agrees with the motion
-_LEAST_AGREE = 0.4  # share of the matched tiles: if fewer agree there is no motion
-_SURE_AGREE = 0.6  # share of all usable tiles: if more agree the first match is taken
-_FAR_BETTER = 1.25  # so many more tiles must agree with a far match: detail may repeat
-_STILL_PX = 1.0  # pictures that moved less need no coarse scales
+_PRIOR_PX = 0.1  # 1σ of a parameter's change in one step, before the tiles are used
+_AGREE_PX = 0.3  # a tile with a smaller residual agrees with the motion
+_LEAST_AGREE = 0.4  # share of the matched tiles; if fewer agree, no motion is found
+_SURE_AGREE = 0.6  # share of all usable tiles; if more agree, the first match is taken
+_FAR_BETTER = 1.25  # factor by which more tiles must agree with a distant match: detail may repeat
+_STILL_PX = 1.0  # smaller motions need no coarse scales
 _SETTLED_PX = 0.005  # a smaller step ends the search; four times that on coarse scales
 _STEPS, _COARSE_STEPS = 6, 4
 
@@ -52,13 +53,13 @@ class Registration:
 
     matrix: Floats  # (3, 3) reference px (x, y, 1) → px of the other picture
     shift_px: float  # rms displacement of the matched tiles
-    sigma_px: float  # 1σ of a typical displacement
-    tiles: int  # matched; 0: nothing to match, and the matrix is the identity
+    sigma_px: float  # 1σ of the displacement, rms over the tiles
+    tiles: int  # matched; 0: no match, and the matrix is the identity
     covariance: Floats  # (P, P) of the motion's parameters, see `_design`
-    shape: tuple[int, int]  # of the reference
+    shape: tuple[int, int]  # (H, W) of the reference
 
     def sigma_at(self, point: Floats) -> float:
-        """1σ per axis of where the motion puts a point x, y (2,), px; it grows with the distance from the tiles."""
+        """1σ [px] per axis of the image of a point x, y (2,); it grows with the distance from the tiles."""
         if not self.tiles:
             return np.inf
         lever = _design(_normalized(point[None], self.shape))[0, :, : len(self.covariance)]
@@ -66,10 +67,10 @@ class Registration:
 
 
 class Pyramid:
-    """A picture at full size, half, a quarter …; scales and tiles are computed when they are first needed."""
+    """A picture at full size, half, a quarter …; scales and tiles are computed at first use."""
 
     def __init__(self, picture: Floats, usable: Bools) -> None:
-        """A picture (H, W) of about even noise, lightly smoothed; usable (H, W): pixels that may be compared."""
+        """Start from a lightly smoothed picture (H, W) of nearly uniform noise, and its usable pixels (H, W)."""
         self._levels = [(picture, usable)]
         self._tiles: dict[int, Indices] = {}
         self.scales = 1
@@ -82,7 +83,7 @@ class Pyramid:
         return height, width
 
     def __getitem__(self, scale: int) -> tuple[Floats, Bools]:
-        """Picture and usable pixels at 2^-scale of the size."""
+        """Picture and usable pixels at 2^-scale of the full size."""
         while len(self._levels) <= scale:
             picture, usable = self._levels[-1]
             self._levels.append((_half(picture), _half(usable) > 0.99))
@@ -97,19 +98,19 @@ class Pyramid:
 
 @dataclass(frozen=True)
 class _Matches:
-    """Shifts that tiles still lack under a motion."""
+    """Residual shifts of tiles under a motion."""
 
     point: Floats  # (T, 2) tile centres x, y in the reference
     shift: Floats  # (T, 2) px
     information: Floats  # (T, 2, 2) inverse covariance of the shift
-    tried: int  # tiles that both pictures can use, also those that were not matched
+    tried: int  # tiles usable in both pictures, matched or not
 
 
 def register(reference: Pyramid, other: Pyramid, model: Model = "simplest") -> Registration:
     """The motion from a reference to another picture.
 
-    Tried from the identity, then from a phase correlation. Nothing to match, or tiles that do not agree: the identity,
-    with no tiles.
+    The search starts from the identity, then from a phase correlation. Where no tiles match or agree, the result is the
+    identity with `tiles` 0.
     """
     still, _, share = _refine(reference, other, model, 1, np.eye(3))
     if still.shift_px < _STILL_PX and share > _SURE_AGREE:
@@ -124,14 +125,14 @@ def register(reference: Pyramid, other: Pyramid, model: Model = "simplest") -> R
 
 
 def refine(reference: Pyramid, other: Pyramid, model: Model, start: Floats) -> Registration:
-    """The same from a first guess (3, 3), which stays where there is nothing to match."""
+    """The motion from a first guess (3, 3); the guess itself where no tiles match."""
     scales = reference.scales
     found, _, _ = _refine(reference, other, model, scales, scaled(start, 1 / 2 ** (scales - 1)))
     return found if found.tiles else replace(found, matrix=start)
 
 
 def correlation(reference: Pyramid, other: Pyramid, matrix: Floats) -> float:
-    """Pearson's correlation of the usable pixels of two pictures under a motion (3, 3); 0 where there are none."""
+    """Pearson's correlation of two pictures under a motion (3, 3), over pixels usable in both; 0 without any."""
     (a, ok_a), (b, ok_b) = reference[0], other[0]
     size, inverse = a.shape[::-1], cv2.WARP_INVERSE_MAP
     warped = cv2.warpPerspective(b, matrix, size, flags=inverse | cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
@@ -144,13 +145,13 @@ def correlation(reference: Pyramid, other: Pyramid, matrix: Floats) -> float:
 
 
 def scaled(matrix: Floats, step: float) -> Floats:
-    """A motion (3, 3) on a grid averaged by `step`, on the grid that it was averaged from; 1/step: the other way."""
+    """Convert a motion (3, 3) from a grid averaged down by `step` to the full grid; with 1/step, back."""
     up = np.array([[step, 0, (step - 1) / 2], [0, step, (step - 1) / 2], [0, 0, 1.0]])
     return np.asarray(up @ matrix @ np.linalg.inv(up))
 
 
 def squared_gradient(picture: Floats) -> Floats:
-    """Of a picture (h, w) by central differences, per px²; (h, w)."""
+    """Squared gradient (h, w) of a picture (h, w) by central differences, per px²."""
     gx, gy = (
         np.asarray(cv2.Sobel(picture, cv2.CV_32F, x, 1 - x, ksize=1, scale=0.5, borderType=cv2.BORDER_REPLICATE))
         for x in (1, 0)
@@ -168,7 +169,7 @@ def _half(picture: Floats | Bools) -> Floats:
 
 
 def _choose_tiles(picture: Floats, usable: Bools) -> Indices:
-    """Corners (T, 2) = (row, column): the tiles of most squared gradient in each cell of a coarse grid."""
+    """Corners (T, 2) = (row, column) of the tiles with the largest squared gradient in each cell of a coarse grid."""
     rows, columns = (picture.shape[0] - 2) // _TILE, (picture.shape[1] - 2) // _TILE
     if rows < 1 or columns < 1:
         return np.zeros((0, 2), np.int64)
@@ -181,19 +182,11 @@ def _choose_tiles(picture: Floats, usable: Bools) -> Indices:
         detail = detail * usable[top : top + _TILE, cut[1]]
         score[n] = cv2.resize(detail, (columns, 1), interpolation=cv2.INTER_AREA)
     score *= cv2.resize(usable[cut].view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) > _USABLE * 255
-    found = []
-    for cell_rows in np.array_split(np.arange(rows), min(_CELLS, rows)):
-        for cell_columns in np.array_split(np.arange(columns), min(_CELLS, columns)):
-            cell = score[np.ix_(cell_rows, cell_columns)]
-            for k in np.argsort(cell, axis=None)[::-1][:_PER_CELL]:
-                i, j = np.unravel_index(k, cell.shape)
-                if cell[i, j] > 0:
-                    found.append((_TILE * cell_rows[i], _TILE * cell_columns[j]))
-    return np.array(found, np.int64).reshape(-1, 2)
+    return _TILE * spread_over_cells(score, (_CELLS, _CELLS), _PER_CELL)
 
 
 def _phase_correlation(a: Floats, ok_a: Bools, b: Floats, ok_b: Bools) -> Floats:
-    """Whole-pixel shift (3, 3) of the pixels that both can use; the identity unless clearly better."""
+    """Whole-pixel shift (3, 3) of pixels usable in both; the identity unless the shift is clearly better."""
     window = np.outer(np.hanning(a.shape[0]), np.hanning(a.shape[1]))
     both = ok_a & ok_b
     if both.mean() < 0.05:
@@ -201,7 +194,7 @@ def _phase_correlation(a: Floats, ok_a: Bools, b: Floats, ok_b: Bools) -> Floats
     flat = [window * np.where(both, p - p[both].mean(), 0) for p in (a, b)]
     cross = np.conj(np.fft.rfft2(flat[0])) * np.fft.rfft2(flat[1])
     strength = np.abs(cross)
-    if not strength.max() > 0:  # one of them is even
+    if not strength.max() > 0:  # one picture is uniform
         return np.eye(3)
     peaks = np.fft.irfft2(cross / (strength + 1e-3 * strength.max()), s=a.shape)
     dy, dx = (int(v) for v in np.unravel_index(int(np.argmax(peaks)), a.shape))
@@ -214,9 +207,9 @@ def _phase_correlation(a: Floats, ok_a: Bools, b: Floats, ok_b: Bools) -> Floats
 def _refine(
     reference: Pyramid, other: Pyramid, model: Model, scales: int, matrix: Floats
 ) -> tuple[Registration, int, float]:
-    """From a first guess on the coarsest of some scales to the full size.
+    """Refine a first guess from the coarsest of some scales to the full size.
 
-    With it the number of tiles that agree, and their share of the tiles that both pictures can use.
+    Returns the registration, the number of tiles that agree with it, and their share of the tiles usable in both.
     """
     sigma, agree, tried = np.inf, 0, 0
     points: Floats = np.zeros((0, 2))
@@ -247,7 +240,7 @@ def _refine(
 
 
 def _match(a: tuple[Floats, Bools], b: tuple[Floats, Bools], corner: Indices, matrix: Floats) -> _Matches:
-    """One Gauss-Newton step for every tile."""
+    """Residual shifts of all tiles by one Gauss-Newton step."""
     parts = np.split(corner, range(_TILES_AT_ONCE, len(corner), _TILES_AT_ONCE))
     some = [_match_some(a, b, part, matrix) for part in parts]
     return _Matches(
@@ -259,7 +252,7 @@ def _match(a: tuple[Floats, Bools], b: tuple[Floats, Bools], corner: Indices, ma
 
 
 def _match_some(a: tuple[Floats, Bools], b: tuple[Floats, Bools], corner: Indices, matrix: Floats) -> _Matches:
-    """The same for some tiles at once: reference(x) = gain · (other(x + s) + ∇·δ) + offset is solved for δ."""
+    """Solve reference(x) = gain · (other(x + s) + ∇·δ) + offset for δ, for some tiles at once."""
     nothing = _Matches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)), 0)
     if not len(corner):
         return nothing
@@ -298,10 +291,10 @@ def _match_some(a: tuple[Floats, Bools], b: tuple[Floats, Bools], corner: Indice
 
 
 def _without_noise(shift: Floats, normal: Floats, count: Floats, variance: Floats) -> tuple[Floats, Floats]:
-    """Shifts (T, 2) and their information (T, 2, 2), freed of the noise in the gradients that made them too small.
+    """Shifts (T, 2) and their information (T, 2, 2), corrected for gradient noise, which makes shifts too small.
 
-    The normal matrix (T, 4, 4), gain and offset eliminated, is that of the scene's gradients plus that of the noise's:
-    half the variance (T,) of each of `count` (T,) pixels. Directions in which noise prevails are left out.
+    The normal matrix (T, 4, 4), with gain and offset eliminated, is the sum of the scene's gradients and the noise's:
+    half the variance (T,) of each of `count` (T,) pixels. Directions dominated by noise are left out.
     """
     both = np.linalg.inv(np.linalg.inv(normal)[:, :2, :2])
     power, axes = np.linalg.eigh(both)
@@ -320,12 +313,12 @@ def _windows(picture: NDArray[Any], corner: Indices, size: int) -> NDArray[Any]:
 
 
 def _sample(patch: Floats, fraction: Floats) -> Floats:
-    """Catmull-Rom interpolation of whole tiles at one (x, y) fraction each."""
+    """Catmull-Rom interpolation of tiles (T, n, n), each shifted by one fraction (x, y) of a pixel (T, 2)."""
     return np.asarray(_bands(fraction[:, 1]) @ patch @ _bands(fraction[:, 0]).transpose(0, 2, 1))
 
 
 def _bands(f: Floats) -> Floats:
-    """Weights (T, _TILE, _TILE + 3) of the samples of lines that begin a sample early, at fractions (T,)."""
+    """Catmull-Rom weights (T, _TILE, _TILE + 3) at fractions (T,), of lines that start one sample early."""
     weights = (
         ((-f + 2) * f - 1) * f / 2,
         ((3 * f - 5) * f * f + 2) / 2,
@@ -340,15 +333,15 @@ def _bands(f: Floats) -> Floats:
 
 
 def _fit(matches: _Matches, shape: tuple[int, ...], model: Model) -> tuple[Floats, Floats, float]:
-    """The motion (3, 3) that explains the tiles' shifts, its parameters' covariance (P, P), and its typical 1σ, px."""
+    """Motion (3, 3) fitted to the tiles' shifts, covariance (P, P) of its parameters, rms 1σ of the shifts [px]."""
     design = _design(_normalized(matches.point, shape))
-    # the richest tiles know less than their noise says
+    # interpolation limits the tiles with most detail
     power, axes = np.linalg.eigh(matches.information)
     limited = 1 / (1 / np.maximum(power, 1e-9) + _TILE_ERROR_PX**2)
     information = np.einsum("tik,tk,tjk->tij", axes, limited, axes)
     sizes = [k for k in _SIZES[model] if k <= len(matches.point)] or [2]
     fits = [_robust(design[..., :k], matches.shift, information) for k in sizes]
-    # how far off the tiles' own errors are, by the richest model
+    # χ² per degree of freedom, by the model with most parameters
     spread = max(1.0, fits[0].chi2 / max(2 * float(fits[0].weight.sum()) - sizes[0], 1.0))
     bic = [fit.chi2 / spread + k * np.log(2 * len(matches.point)) for k, fit in zip(sizes, fits)]
     k, best = sizes[int(np.argmin(bic))], fits[int(np.argmin(bic))]
@@ -358,14 +351,14 @@ def _fit(matches: _Matches, shape: tuple[int, ...], model: Model) -> tuple[Float
 
 
 def _normalized(point: Floats, shape: tuple[int, ...]) -> Floats:
-    """Points x, y (T, 2) px from the picture's middle, in halves of its longer side."""
+    """Points x, y (T, 2) px relative to the picture's center, in units of half its longer side."""
     return np.asarray((point - [(shape[1] - 1) / 2, (shape[0] - 1) / 2]) / (max(shape) / 2))
 
 
 def _design(u: Floats) -> Floats:
     """Displacement (T, 2, 8) px per parameter at normalized points (T, 2).
 
-    In turn: a translation adds columns 0 and 1, a similarity 2 and 3, a homography the rest.
+    Parameters 0 and 1 are a translation, 2 and 3 complete a similarity, 4 to 7 a homography.
     """
     x, y = u[:, 0], u[:, 1]
     one, zero = np.ones_like(x), np.zeros_like(x)
@@ -375,7 +368,7 @@ def _design(u: Floats) -> Floats:
 
 
 def _motion(parameters: Floats, shape: tuple[int, ...]) -> Floats:
-    """Parameters of `_design` as a homography (3, 3), px."""
+    """Homography (3, 3) in px from parameters of `_design`."""
     h, w = shape
     scale = max(h, w) / 2
     p = np.zeros(8)
@@ -393,16 +386,16 @@ def _motion(parameters: Floats, shape: tuple[int, ...]) -> Floats:
 
 @dataclass(frozen=True)
 class _RobustFit:
-    """Weighted least squares."""
+    """Result of a robust least-squares fit."""
 
     parameters: Floats  # (P,)
     covariance: Floats  # (P, P)
     chi2: float
-    weight: Floats  # (T,) of the tiles
+    weight: Floats  # (T,)
 
 
 def _robust(design: Floats, shift: Floats, information: Floats) -> _RobustFit:
-    """Parameters of the shifts (T, 2), least squares reweighted by Tukey's biweight."""
+    """Fit the parameters to shifts (T, 2) by least squares, reweighted by Tukey's biweight."""
     weight = np.ones(len(shift))
     k = design.shape[2]
     parameters: Floats = np.zeros(k)

@@ -1,4 +1,4 @@
-"""From a sensor's counts to signals, and which of them can be believed."""
+"""Conversion of sensor counts to linear signals, and detection of clipped pixels."""
 
 import math
 
@@ -15,8 +15,8 @@ Bools = NDArray[np.bool_]
 def signal(image: SensorImage, full: bool = False) -> Floats:
     """Linear signal (H, W, C) float32, black = 0 and white = 1; negative noise is kept.
 
-    A mosaic is binned by superpixels, or interpolated if `full`. C = 1 where the three channels of a
-    file without a mosaic are one and the same (a monochrome sensor).
+    A mosaic is binned by superpixels, or interpolated if `full`. C = 1 for a monochrome sensor, whose file
+    has three equal channels and no mosaic.
     """
     span = np.float32(image.white - float(image.black.mean()))
     if image.cfa is None:
@@ -37,40 +37,40 @@ def signal(image: SensorImage, full: bool = False) -> Floats:
 
 
 def monochrome(image: SensorImage) -> bool:
-    """Whether three channels repeat one; an even picture, as where all is clipped, does not tell."""
+    """Whether all three channels are equal; False for uniform pictures, such as fully clipped ones."""
     v = image.value
     alike = image.cfa is None and np.array_equal(v[..., 0], v[..., 1]) and np.array_equal(v[..., 0], v[..., 2])
     return alike and bool(np.ptp(v[..., 0]) > 0)
 
 
 def usable(image: SensorImage, clip: float, full: bool = False) -> Bools:
-    """Pixels (H, W) of `signal` with no clipped photosite in them nor in their eight neighbours.
+    """Pixels (H, W) of `signal` with no clipped photosite in them or in their eight neighbors.
 
-    Judged on raw counts over whole superpixels, so that all colours of a pixel go together; a single noisy
-    photosite at the limit rules out its surroundings, which keeps the choice from favouring low noise.
+    Raw counts of whole superpixels are compared, so all colors of a pixel are treated alike. One clipped photosite
+    excludes its surroundings, so pixels near the limit are not selected by their noise.
     """
     return below(image, clip * saturation(image), full)
 
 
 def below(image: SensorImage, level: float, full: bool = False) -> Bools:
-    """Pixels (H, W) as of `usable`, of counts that reach `level`."""
+    """Pixels (H, W) of `signal` with no count of `level` or more in them or in their eight neighbors."""
     value = image.value
     over = _at_least(value, level)
     if image.cfa is None:
-        over = over[..., 0] | over[..., 1] | over[..., 2]  # a tenth of the time of `any`
+        over = over[..., 0] | over[..., 1] | over[..., 2]  # ten times as fast as `any`
     elif image.superpixel == 3:
         h, w = value.shape[0] // 3, value.shape[1] // 3
         over = np.asarray(over[: 3 * h, : 3 * w].reshape(h, 3, w, 3).any((1, 3)))
     else:
         h, w = value.shape[0] // 2, value.shape[1] // 2
         over = over[: 2 * h : 2, : 2 * w] | over[1 : 2 * h : 2, : 2 * w]
-        over = np.ascontiguousarray(over).view(np.uint16) != 0  # either of two neighbours
+        over = np.ascontiguousarray(over).view(np.uint16) != 0  # two neighbors at once
     over = _grown(over)
     return ~(np.repeat(np.repeat(over, 2, axis=0), 2, axis=1) if full and image.cfa is not None else over)
 
 
 def _at_least(value: Floats | NDArray[np.uint16], level: float) -> Bools:
-    """value ≥ level; counts are compared as the whole numbers they are."""
+    """value ≥ level; integer counts are compared as integers."""
     if value.dtype == np.uint16:
         least = math.ceil(level)
         return np.zeros(value.shape, bool) if least > 65535 else np.asarray(value >= np.uint16(least))
@@ -78,19 +78,19 @@ def _at_least(value: Floats | NDArray[np.uint16], level: float) -> Bools:
 
 
 def saturation(image: SensorImage) -> float:
-    """The stated white, or the plateau below it that the picture's highest count shows."""
-    part = np.ascontiguousarray(image.value[::3, ::3])  # looked through twice
+    """The count at which pixels saturate: the stated white level, or the highest count where many pixels share it."""
+    part = np.ascontiguousarray(image.value[::3, ::3])
     top = float(part.max())
     crowded = np.count_nonzero(part == top) > max(1e-3 * part.size, 20)
     return top if crowded and 0.6 * image.white < top < image.white else image.white
 
 
-def rounding(image: SensorImage) -> float:
-    """Variance of whole counts in units of `signal`; as good as none for floats."""
+def rounding_variance(image: SensorImage) -> float:
+    """Variance from rounding to whole counts, in units of `signal`; nearly 0 for floating-point images."""
     step = 1.0 if np.issubdtype(image.value.dtype, np.integer) else 1e-3
     return float(step**2 / 12 / (image.white - float(image.black.mean())) ** 2)
 
 
 def _grown(mask: Bools) -> Bools:
-    """Grown by one pixel in all eight directions."""
+    """The mask grown by one pixel in all eight directions."""
     return np.asarray(cv2.dilate(mask.view(np.uint8), np.ones((3, 3), np.uint8))).view(bool)

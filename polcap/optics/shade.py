@@ -1,9 +1,8 @@
-"""The one renderer of maps: normals and material under one light -> Stokes parameters of every pixel.
+"""Polarized shading: Stokes parameters of each pixel from its normal, material and one light.
 
-A dielectric lit by an unpolarized point: diffuse light enters and leaves through two Fresnel
-transmissions, of a smooth interface or of rough facets (`optics/body.py`), GGX facets reflect with Fresnel's
-coefficients. Local: no shadow, no interreflection
-(those belong to whoever owns the geometry). Works on NumPy and torch.
+A dielectric is lit by a point. Diffuse light enters and leaves through two Fresnel transmissions, of a smooth interface
+or of rough facets (`optics/body.py`). GGX facets reflect light with Fresnel's coefficients. Shadows and interreflection
+are not included: they need the geometry of the whole scene. Works on NumPy and torch.
 
 References
 ----------
@@ -31,27 +30,28 @@ def stokes(
     law: bodies.Law = bodies.SMOOTH,
     axis: Any = None,
 ) -> Any:
-    """Stokes parameters (3, ..., 3) towards the camera, in the frame of `optics/frames.py` on each ray.
+    """Stokes parameters (3, ..., 3) towards the camera, in the frame of each ray (`optics/frames.py`).
 
     Parameters
     ----------
     normal, to_light
-        (..., 3) unit vectors in the frame of each ray, where the camera lies along
-        (0, 0, 1): see `frames.to_ray_frame`.
+        (..., 3) unit vectors in the frame of each ray, where (0, 0, 1) points to the camera; see
+        `frames.to_ray_frame`.
     diffuse, specular
         (..., 3) ρ_d and F0, linear.
     roughness, ior
         (...,) perceptual roughness; refractive index of the body and its surface.
     irradiance
-        (...,) on a plane facing the light, so that a white Lambertian plane has S0 = irradiance.
+        (...,) on a plane that faces the light; a white Lambertian plane there has S0 = irradiance.
     law
-        How the body lets light in and out.
+        Parameters of diffuse reflection.
     axis
-        (..., 3) unit vectors across the light's way along which it is polarized; None: it is not.
+        (..., 3) unit vectors along which the light is polarized, across its direction; None: unpolarized.
 
     Notes
     -----
     Diffuse light is polarized along the projected normal, reflected light across the projected half vector.
+    Nine parameters, because training passes each as a tensor of its own.
     """
     xp = array_namespace(normal)
     cos_o = xp.clip(normal[..., 2], _LEAST_COSINE, 1.0)
@@ -66,8 +66,8 @@ def stokes(
     else:
         in_plus, _ = bodies.leaving(cos_i, law.rough * alpha, ior)
         out_plus, out_minus = bodies.leaving(cos_o, law.rough * alpha, ior, law.local)
-        in_plus = in_plus * (1 + law.local * (bodies.flatter(cos_i, cos_o, to_light[..., 2], law.rough * alpha) - 1))
-        out_minus = out_minus * law.kept
+        in_plus = in_plus * (1 + law.local * (bodies.flattening(cos_i, cos_o, to_light[..., 2], law.rough * alpha) - 1))
+        out_minus = out_minus * law.dolp_factor
     if axis is not None:
         in_plus = in_plus + _entering(normal, to_light, axis, alpha, ior, law)
     body = irradiance * cos_i * in_plus
@@ -86,7 +86,7 @@ def stokes(
     half_cos, half_sin = _double_angle(half)
     mirrored = reflect_plus, -reflect_minus * half_cos, -reflect_minus * half_sin
     if axis is not None:
-        mirrored = _mirrored(to_light, axis, cos_d, ior)
+        mirrored = _reflected(to_light, axis, cos_d, ior)
     leaving = out_plus, out_minus * diffuse_cos, out_minus * diffuse_sin
     parts = list(zip(leaving, mirrored))
     return xp.stack(
@@ -98,7 +98,7 @@ def stokes(
 
 
 def _entering(normal: Any, to_light: Any, axis: Any, alpha: Any, ior: Any, law: bodies.Law) -> Any:
-    """What polarization along `axis` adds to T₊ of light that enters: T₋ cos 2Δ, Δ between axis and azimuth, (...,)."""
+    """Change of T₊ (...,) for light that enters polarized along `axis`: T₋ cos 2Δ, Δ from the azimuth to the axis."""
     xp = array_namespace(normal)
     cos_i = xp.clip(frames.dot(normal, to_light), _LEAST_COSINE, 1.0)
     if law is bodies.SMOOTH:
@@ -109,18 +109,18 @@ def _entering(normal: Any, to_light: Any, axis: Any, alpha: Any, ior: Any, law: 
     return minus * (2 * along**2 / (1 - cos_i**2 + 1e-12) - 1)
 
 
-def _mirrored(to_light: Any, axis: Any, cos_d: Any, ior: Any) -> tuple[Any, Any, Any]:
-    """Stokes parameters of what a facet mirrors of unit light polarized along `axis`, in the frame of the ray.
+def _reflected(to_light: Any, axis: Any, cos_d: Any, ior: Any) -> tuple[Any, Any, Any]:
+    """Stokes parameters (...,) of unit light polarized along `axis` after reflection by a facet, in the ray's frame.
 
-    The field's part across the plane of light and ray is multiplied by r_s, its part in that plane by r_p, where
-    the directions p stand across their rays: at normal incidence the axis is kept.
+    The field component across the plane of light and ray is multiplied by r_s, the component in that plane by r_p.
+    Signs are such that at normal incidence the axis does not change.
     """
     xp = array_namespace(to_light)
     x, y = to_light[..., 0], to_light[..., 1]
     length = (x * x + y * y) ** 0.5
-    beside = length < 1e-9  # light and ray are one: any plane will do
-    safe = xp.where(beside, xp.ones_like(length), length)
-    across_x, across_y = xp.where(beside, 1.0 + 0 * x, -y / safe), xp.where(beside, 0 * y, x / safe)
+    parallel = length < 1e-9  # light along the ray: any plane contains both
+    safe = xp.where(parallel, xp.ones_like(length), length)
+    across_x, across_y = xp.where(parallel, 1.0 + 0 * x, -y / safe), xp.where(parallel, 0 * y, x / safe)
     zero = xp.zeros_like(across_x)
     across = xp.stack([across_x, across_y, zero], axis=-1)
     inwards = frames.cross(-to_light, across)
@@ -133,7 +133,7 @@ def _mirrored(to_light: Any, axis: Any, cos_d: Any, ior: Any) -> tuple[Any, Any,
 
 
 def _double_angle(vector: Any) -> tuple[Any, Any]:
-    """cos 2φ, sin 2φ of the azimuth of (..., 3) vectors; (0, 0) along the ray, where it has no meaning."""
+    """cos 2φ, sin 2φ of the azimuth φ of vectors (..., 3); (0, 0) for vectors along the ray, which have no azimuth."""
     x, y = vector[..., 0], vector[..., 1]
     length2 = x * x + y * y + 1e-12
     return (x * x - y * y) / length2, 2 * x * y / length2

@@ -1,8 +1,8 @@
-"""How much more one photograph is blurred than another of the same scene, from small tiles of both.
+"""Relative blur of photographs of the same scene, measured in small tiles.
 
-Blur takes fine detail and leaves coarse: the energy of differences over one pixel against that over four, in
-four directions, so that a motion along one of them shows. What blur that means is read off by blurring the
-sharper one's own tiles until they look alike: the measure needs no knowledge of the scene.
+Blur removes fine detail and leaves coarse detail. So the energy of differences over one pixel is compared with that
+over four, in four directions, so that motion blur along one of them is found. To convert this ratio to px, the tiles
+of the sharpest photograph are blurred until their ratio is equal: no knowledge of the scene is needed.
 """
 
 from collections.abc import Sequence
@@ -14,23 +14,23 @@ from numpy.typing import NDArray
 
 from polcap.images import Floats, SensorImage
 from polcap.optics import sensor
+from polcap.optics.tiles import spread_over_cells
 
-TILE = 32  # px of the frames, mosaics binned
-_CELLS = (8, 12)  # of the picture; each gives its tiles of most detail
-_PER_CELL = 3
-_FINE, _COARSE = 1, 4  # px
+TILE = 32  # px of the binned frames
+_CELLS, _PER_CELL = (8, 12), 3  # rows and columns of cells in the picture; tiles chosen in each cell
+_FINE, _COARSE = 1, 4  # px, distances of the differences
 _WAYS = ((0, 1), (1, 0), (1, 1), (1, -1))
 _LADDER = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # px, 1σ
 _LEAST_TILES = 4
-_LEAST_LIGHT = 0.01  # of the sensor's range; in darker tiles noise is detail
-_SURE = 0.999  # of Student's t: a loss of detail beyond is one
+_LEAST_LIGHT = 0.01  # of the sensor's range; in darker tiles noise would count as detail
+_SURE = 0.999  # quantile of Student's t beyond which a loss of detail is significant
 _MEDIAN_SE = (np.pi / 2) ** 0.5  # standard error of a median over that of a mean, of normal scatter
-_DETAIL = -0.5  # log of fine over coarse energy: noise has 0, detail less
+_DETAIL = -0.5  # largest log of fine over coarse energy of a tile with detail; noise has 0
 
 
 @dataclass(frozen=True)
 class Tiles:
-    """What one photograph shows at the places that were chosen."""
+    """Tiles of one photograph, at the places that were chosen for all."""
 
     light: Floats  # (T, TILE, TILE) mean of its photosites
     usable: NDArray[np.bool_]  # (T,) unclipped and bright enough
@@ -38,13 +38,13 @@ class Tiles:
 
 def places(image: SensorImage, clip: float) -> NDArray[np.int64]:
     """Corners (T, 2) of the tiles to compare, chosen in one decoded photograph of the capture."""
-    return choose(_whole_light(image), sensor.usable(image, clip))
+    return choose_tiles(_whole_light(image), sensor.usable(image, clip))
 
 
 def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
-    """The tiles of one decoded photograph at corners (T, 2) px; only they are binned."""
+    """The tiles of one decoded photograph at corners (T, 2) px; nothing else is binned."""
     step = image.superpixel
-    margin = 1 if image.cfa is None else len(image.cfa)  # a clipped photosite rules out its neighbours
+    margin = 1 if image.cfa is None else len(image.cfa)  # a clipped photosite makes its neighbors unusable
     side, spare = TILE * step, margin // step
     padded = [(margin, margin), (margin, margin), *[(0, 0)] * (image.value.ndim - 2)]
     around = [
@@ -55,7 +55,7 @@ def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
     ]
     if not around:
         return Tiles(np.zeros((0, TILE, TILE), np.float32), np.zeros(0, bool))
-    strip = replace(image, value=np.concatenate(around))  # whole periods of rows each keep the mosaic's phase
+    strip = replace(image, value=np.concatenate(around))  # tiles have whole CFA periods: the phase is unchanged
     shape = (len(corners), TILE + 2 * spare, TILE + 2 * spare)
     inner = np.s_[:, spare:-spare, spare:-spare]
     light = _whole_light(strip).reshape(shape)[inner]
@@ -64,7 +64,7 @@ def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
 
 
 def frames_blur(shots: Sequence[Sequence[Tiles]], px: float) -> Floats:
-    """1σ that every frame is blurred by beyond the sharpest of the same exposure, (K, E), NaN where none can tell.
+    """Extra blur (K, E) of each frame, 1σ [RAW px], against the sharpest of the same exposure; NaN: not measurable.
 
     shots: K brackets of E photographs; px: RAW px per px of the tiles.
     """
@@ -76,7 +76,7 @@ def frames_blur(shots: Sequence[Sequence[Tiles]], px: float) -> Floats:
 
 
 def _whole_light(image: SensorImage) -> Floats:
-    """`_light` of a whole photograph; of a Bayer mosaic without the three channels that make it, ten times as fast."""
+    """`_light` of a photograph; for Bayer mosaics directly from the counts, ten times as fast as from channels."""
     if image.cfa is None or image.superpixel != 2:
         return _light(sensor.signal(image))
     height, width = (side // 2 for side in image.value.shape)
@@ -93,8 +93,8 @@ def _light(signal: Floats) -> Floats:
     return signal[..., 0] if signal.shape[2] == 1 else cv2.transform(signal, np.array([[0.25, 0.5, 0.25]]))
 
 
-def choose(light: Floats, usable: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Corners (T, 2) = (row, column) of the tiles with most detail, spread over the picture (H, W)."""
+def choose_tiles(light: Floats, usable: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Corners (T, 2) = (row, column) of the tiles with most detail in each part of a picture (H, W)."""
     rows, columns = light.shape[0] // TILE, light.shape[1] // TILE
     if not rows or not columns:
         return np.zeros((0, 2), np.int64)
@@ -104,25 +104,17 @@ def choose(light: Floats, usable: NDArray[np.bool_]) -> NDArray[np.int64]:
     detail = cv2.Sobel(picture, cv2.CV_32F, 1, 0) ** 2 + cv2.Sobel(picture, cv2.CV_32F, 0, 1) ** 2
     score = detail.reshape(tiled).mean((1, 3)) / np.maximum(picture.reshape(tiled).mean((1, 3)), 1e-3)
     score *= usable[cut].reshape(tiled).all((1, 3))
-    found = []
-    for some_rows in np.array_split(np.arange(rows), min(_CELLS[0], rows)):
-        for some_columns in np.array_split(np.arange(columns), min(_CELLS[1], columns)):
-            cell = score[np.ix_(some_rows, some_columns)]
-            for k in np.argsort(cell, axis=None)[::-1][:_PER_CELL]:
-                i, j = np.unravel_index(k, cell.shape)
-                if cell[i, j] > 0:
-                    found.append((TILE * some_rows[i], TILE * some_columns[j]))
-    return np.array(found, np.int64).reshape(-1, 2)
+    return TILE * spread_over_cells(score, _CELLS, _PER_CELL)
 
 
 def extra_blur(tiles: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """1σ of the Gaussian that each photograph is blurred by beyond the sharpest, (K,) px; NaN: cannot tell.
+    """Extra Gaussian blur (K,) of each photograph, 1σ [px], against the sharpest; NaN: not measurable.
 
-    A blur that the tiles' scatter explains counts as none; it is taken from the photograph that scatters least, since
-    blur itself takes more from tiles of much detail than from others.
-    tiles (K, T, n, n) of K photographs of equal exposure; usable (K, T).
+    tiles (K, T, n, n) are from K photographs of equal exposure; usable (K, T). A blur within the scatter of the tiles
+    counts as 0. The scatter is that of the photograph where it is least: blur itself adds scatter, because tiles with
+    much detail lose more.
     """
-    from scipy.special import stdtrit  # here: importing it costs .2 s of every start
+    from scipy.special import stdtrit  # here: the import takes 0.2 s
 
     fineness = np.stack([_fineness(shot) for shot in tiles])  # (K, 4, T)
     every = usable.all(0) & (fineness.mean((0, 1)) < _DETAIL)
@@ -144,11 +136,12 @@ def extra_blur(tiles: Floats, usable: NDArray[np.bool_]) -> Floats:
 
 
 def _fineness(tiles: Floats) -> Floats:
-    """Logarithm of fine over coarse energy in four directions, (4, T)."""
+    """Logarithm (4, T) of fine over coarse energy, in four directions."""
     return np.stack([np.log(_energy(tiles, way, _FINE) / _energy(tiles, way, _COARSE)) for way in _WAYS])
 
 
 def _energy(tiles: Floats, way: tuple[int, int], lag: int) -> Floats:
+    """Mean squared difference (T,) of pixels `lag` px from each other in a direction."""
     down, across = way[0] * lag, abs(way[1]) * lag
     flipped = tiles[:, :, ::-1] if way[1] < 0 else tiles
     n = tiles.shape[-1]

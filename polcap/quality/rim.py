@@ -25,7 +25,7 @@ _STEP_DEG, _MOST_DEG = 3.0, 48.0  # of the angles tried; beyond, order and sense
 
 
 @dataclass(frozen=True)
-class Rim(outline.Rim):
+class Rim(outline.OutlineBand):
     """The band inside the outline; `light` is relative to the mean of the shots."""
 
     total: Floats  # (N,) mean of the shots, of the object's mean
@@ -125,7 +125,7 @@ def _sigmas(at: Rim, angle: Floats, way: Floats) -> float:
 
 def body(at: Rim, angle: Floats) -> Body:
     """How the rim is polarized, and how its light is spread; angle (K,) rad."""
-    mean, turned_sigma = outline.mean_and_doubt(*outline.phasor(at, angle))
+    mean, turned_sigma = outline.mean_and_sigma(*outline.phasor(at, angle))
     dolp = np.abs(outline.polarization(at, angle))
     basis = np.stack([np.ones_like(at.azimuth), np.cos(at.azimuth), np.sin(at.azimuth)], axis=1)
     found = np.linalg.lstsq(basis, at.total, rcond=None)[0]

@@ -1,4 +1,4 @@
-"""In: a lens and a board. Out: what the camera sees of it at poses drawn at random, for `calibration_frames`."""
+"""Simulated pictures of a checkerboard or color chart in random poses, to calibrate the lens."""
 
 from collections.abc import Iterator
 
@@ -6,44 +6,47 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from polcap.images import Floats, View
+from polcap.optics import frames
 from polcap.synth import color_checker, lens
 from polcap.synth.color_checker import Chart
-from polcap.synth.render import view_rays
 
 _SAMPLES = 3  # rays per pixel side
 _SQUARES = 9, 6  # inner corners
-_WALL = 0.18
-_LEAN_DEG = 35.0
+_WALL = 0.18  # albedo of the wall behind
+_MOST_TILT_DEG = 35.0
 
 
 def pictures(view: View, bend: tuple[float, float], size: tuple[int, int], count: int, kind: str, seed: int
 ) -> Iterator[Floats]:  # fmt: skip
-    """Albedo (H, W, 3) of `count` poses of a "checkerboard" of 9×6 inner corners or a "chart", before a gray wall."""
+    """Albedo (H, W, 3) of `count` pictures of a board in front of a gray wall.
+
+    `kind` is "checkerboard", with 9 × 6 inner corners, or "chart"; `bend` is k₁, k₂ of the lens.
+    """
     width, height = size
     random = np.random.default_rng([seed, 9])
     for _ in range(count):
-        turn = random.uniform(-1, 1, 3) * (_LEAN_DEG, _LEAN_DEG, 15)
+        turn = random.uniform(-1, 1, 3) * (_MOST_TILT_DEG, _MOST_TILT_DEG, 15)
         share = random.uniform(-1, 1, 2) * (0.2, 0.16)
-        away = random.uniform(0.85, 1.1)
-        center = np.array([share[0] * width / view.focal, share[1] * height / view.focal, -1.0]) * away
+        distance = random.uniform(0.85, 1.1)
+        center = np.array([share[0] * width / view.focal, share[1] * height / view.focal, -1.0]) * distance
         pitch = 0.6 * width / view.focal / 6 if kind == "chart" else 0.6 * width / view.focal / (_SQUARES[0] + 1)
         total = np.zeros((height, width, 3))
         offsets = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
         y, x = np.mgrid[:height, :width].astype(float)
         for dy in offsets:
             for dx in offsets:
-                ray = view_rays(view, *lens.looked_at(view, bend, x + dx, y + dy)).reshape(-1, 3)
-                total += _seen(ray, center, turn, pitch, kind).reshape(height, width, 3)
+                ray = frames.rays_at(view, *lens.undistort(view, bend, x + dx, y + dy)).reshape(-1, 3)
+                total += _albedo(ray, center, turn, pitch, kind).reshape(height, width, 3)
         yield total / _SAMPLES**2
 
 
-def _seen(ray: Floats, center: Floats, turn_deg: Floats, pitch: float, kind: str) -> Floats:
-    """Albedo (P, 3) along rays (P, 3), which point from the surface to the lens."""
+def _albedo(ray: Floats, center: Floats, turn_deg: Floats, pitch: float, kind: str) -> Floats:
+    """Albedo (P, 3) at the end of rays (P, 3), which point from the surface to the lens."""
     out = np.full((len(ray), 3), _WALL)
     if kind == "chart":
         x, y, z = (float(v) for v in center)
         a, b, c = (float(v) for v in turn_deg)
-        at, _, albedo = color_checker.seen(Chart(center=(x, y, z), turn_deg=(a, b, c), pitch=pitch), ray)
+        at, _, albedo = color_checker.intersect(Chart(center=(x, y, z), turn_deg=(a, b, c), pitch=pitch), ray)
         out[at] = albedo
         return out
     turn = Rotation.from_rotvec(turn_deg, degrees=True)

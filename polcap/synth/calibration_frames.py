@@ -1,6 +1,6 @@
-"""In: what a camera, lens, polarizer and flash are. Out: the photographs that calibrate them, and the truth beside.
+"""Simulated calibration photographs of a camera, lens, polarizer and flash, with their true properties.
 
-The folder is as `polcap calibrate` reads it: dark/, flat/, flash/, lens/, polarizer/axis000/pol000/ …
+The folder has the layout that `polcap calibrate` reads: dark/, flat/, flash/, lens/, polarizer/axis000/pol000/ …
 """
 
 from collections.abc import Iterator
@@ -11,66 +11,60 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from polcap.errors import CaptureError
 from polcap.formats import atomic
 from polcap.formats.capture import layouts
-from polcap.formats.raw import dng
 from polcap.images import Exif, Floats, View
-from polcap.optics.color import REC709_TO_XYZ
 from polcap.synth import boards, forward_camera, lens
-from polcap.synth.forward_camera import Sensor
+from polcap.synth.forward_camera import COLOR_MATRIX, Sensor
 
 _CFA = np.array([[0, 1], [1, 2]], np.uint8)
-_MATRIX = np.array([[0.87, -0.27, -0.075], [-0.44, 1.23, 0.235], [-0.09, 0.19, 0.69]])  # XYZ → camera
-Extinction = Annotated[float, Meta(ge=1)]  # greatest over least transmittance
+Extinction = Annotated[float, Meta(ge=1)]  # largest over smallest transmittance
 _TINT = np.array([0.8, 1.0, 0.7])  # of the light, in camera channels
 
 
 class CalibrationShoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The set-up, and how it is photographed."""
+    """The simulated equipment and the photographs to take. One flat list, because users set the fields by name."""
 
     seed: Annotated[int, Meta(ge=0)] = 0
     width: Annotated[int, Meta(ge=64, le=20000, multiple_of=2)] = 384  # visible RAW px
     height: Annotated[int, Meta(ge=64, le=20000, multiple_of=2)] = 256
     sensor: Sensor = Sensor()
-    black_error: Annotated[float, Meta(ge=-1000, le=1000)] = 0.0  # counts, of the sensor's black over the stated one
+    black_error: Annotated[float, Meta(ge=-1000, le=1000)] = 0.0  # counts, true black level minus the stated one
     isos: tuple[Annotated[float, Meta(ge=1, le=1e6)], ...] = (100.0, 400.0)
-    levels: tuple[Annotated[float, Meta(gt=0, le=10)], ...] = (0.05, 0.15, 0.4, 0.8)  # of white, in the middle of green
-    power: Annotated[float, Meta(gt=0, le=10)] = 1.0  # of the exposure that the sensor follows; 1 is linear
-    falloff: tuple[float, float, float] = (-0.25, 0.05, 0.0)  # of r², r⁴, r⁶; r = 1 in the corners
-    slope: tuple[float, float] = (0.03, -0.02)  # of the flat surface's light, from the middle to the edge
-    zero_deg: float = 1.7  # of the polarizer's ring
-    sense: Literal[1, -1] = 1  # 1: the ring counts as the picture does
+    levels: tuple[Annotated[float, Meta(gt=0, le=10)], ...] = (0.05, 0.15, 0.4, 0.8)  # green in the middle / white
+    power: Annotated[float, Meta(gt=0, le=10)] = 1.0  # exponent of the sensor's response; 1 is linear
+    falloff: tuple[float, float, float] = (-0.25, 0.05, 0.0)  # factors of r², r⁴, r⁶; r = 1 in the corners
+    slope: tuple[float, float] = (0.03, -0.02)  # of the flat surface's light per half diagonal, right and down
+    zero_deg: float = 1.7  # zero error of the polarizer's ring
+    sense: Literal[1, -1] = 1  # 1: the ring counts from image x towards image up; −1: the other way
     extinction: tuple[Extinction, Extinction, Extinction] = (300.0, 500.0, 200.0)
-    axes_deg: tuple[Annotated[float, Meta(ge=0, le=360)], ...] = (0.0, 30.0)  # of the polarized light
+    axes_deg: tuple[Annotated[float, Meta(ge=0, le=360)], ...] = (0.0, 30.0)  # axes of the polarized light
     ring_step_deg: Annotated[float, Meta(ge=1, le=180)] = 15.0
     ring_error_deg: Annotated[float, Meta(ge=0, le=90)] = 0.05  # 1σ of the ring's angle
-    lamp_jitter: Annotated[float, Meta(ge=0, le=0.2)] = 0.0005  # 1σ of a steady lamp
-    flash_jitter: Annotated[float, Meta(ge=0, le=0.2)] = 0.012  # 1σ of the flash
-    pops: Annotated[int, Meta(ge=0, le=10000)] = 24
-    boards: Annotated[int, Meta(ge=0, le=10000)] = 0  # photographs of a board from all sides
+    lamp_jitter: Annotated[float, Meta(ge=0, le=0.2)] = 0.0005  # 1σ of a steady lamp, relative
+    flash_jitter: Annotated[float, Meta(ge=0, le=0.2)] = 0.012  # 1σ of the flash's energy, relative
+    pops: Annotated[int, Meta(ge=0, le=10000)] = 24  # photographs with flash
+    boards: Annotated[int, Meta(ge=0, le=10000)] = 0  # photographs of a board in random poses
     board: Literal["checkerboard", "chart"] = "checkerboard"
-    distortion: tuple[lens.Bend, lens.Bend] = (-0.12, 0.05)  # k1, k2, see synth/lens.py; only boards show it
+    distortion: tuple[lens.Bend, lens.Bend] = (-0.12, 0.05)  # k1, k2 of synth/lens.py; only in photographs of boards
     focal_mm: Annotated[float, Meta(ge=1, le=10000)] = 60.0  # on a sensor 36 mm wide
 
     @property
     def view(self) -> View:
-        """The camera over its own RAW pixels."""
-        return View(self.focal_mm / 36.0 * self.width, ((self.width - 1) / 2, (self.height - 1) / 2), scale=1)
+        return forward_camera.pinhole(self.focal_mm, self.width, self.height)
 
 
 def write(folder: Path, shoot: CalibrationShoot) -> None:
-    """Photograph everything into `folder`, which is made; the same arguments give the same bytes.
+    """Write all photographs into the new folder; the same arguments give the same bytes.
 
     Raises
     ------
     CaptureError
-        `folder` holds something already.
+        The folder holds something already.
     StorageError
-        It cannot be written.
+        The folder cannot be written.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise CaptureError(f"{folder} is not an empty folder; choose another place")
+    forward_camera.require_empty(folder)
     with atomic.folder(folder) as place:
         for number, (name, radiance, iso, time, flash) in enumerate(_frames(shoot)):
             _photograph(place / name, shoot, radiance, iso, time, flash, number)
@@ -79,7 +73,7 @@ def write(folder: Path, shoot: CalibrationShoot) -> None:
 
 
 def _frames(shoot: CalibrationShoot) -> Iterator[tuple[str, Floats, float, float, bool]]:
-    """Name, light (H, W, 3) at base sensitivity, ISO, exposure time [s] and whether a flash fired, of each frame."""
+    """File name, light (H, W, 3) at ISO 100, ISO, exposure time [s] and whether the flash fired, of each frame."""
     random = np.random.default_rng([shoot.seed, 7])
     light, number = _surface(shoot), 0
     for iso in shoot.isos:
@@ -91,21 +85,15 @@ def _frames(shoot: CalibrationShoot) -> Iterator[tuple[str, Floats, float, float
             for _ in range(2):
                 jitter = 1 + shoot.lamp_jitter * random.normal()
                 time = level / amplification * 0.1
-                yield (
-                    f"flat/IMG_{number:04d}.DNG",
-                    light * (level**shoot.power / amplification * jitter),
-                    iso,
-                    time,
-                    False,
-                )
+                flat = light * (level**shoot.power / amplification * jitter)
+                yield f"flat/IMG_{number:04d}.DNG", flat, iso, time, False
                 number += 1
     for _ in range(shoot.pops):
         jitter = 1 + shoot.flash_jitter * random.normal()
         yield f"flash/IMG_{number:04d}.DNG", light * (0.5 * jitter), 100.0, 1 / 160, True
         number += 1
-    for albedo in boards.pictures(
-        shoot.view, shoot.distortion, (shoot.width, shoot.height), shoot.boards, shoot.board, shoot.seed
-    ):
+    size = shoot.width, shoot.height
+    for albedo in boards.pictures(shoot.view, shoot.distortion, size, shoot.boards, shoot.board, shoot.seed):
         yield f"lens/IMG_{number:04d}.DNG", albedo * (0.8 * _TINT), 100.0, 0.05, False
         number += 1
     contrast = (np.array(shoot.extinction) - 1) / (np.array(shoot.extinction) + 1)
@@ -120,7 +108,7 @@ def _frames(shoot: CalibrationShoot) -> Iterator[tuple[str, Floats, float, float
 
 
 def _surface(shoot: CalibrationShoot) -> Floats:
-    """An almost evenly lit surface through the lens, (H, W, 3), 1 in the middle of green."""
+    """Light of an almost evenly lit surface, (H, W, 3); 1 for green in the middle."""
     y, x = np.mgrid[0 : shoot.height, 0 : shoot.width].astype(float)
     x, y = x - (shoot.width - 1) / 2, y - (shoot.height - 1) / 2
     half = np.hypot(shoot.width, shoot.height) / 2
@@ -135,9 +123,8 @@ def _photograph(
 ) -> None:
     random = np.random.default_rng([shoot.seed, 8, number])
     mosaic = forward_camera.mosaic(radiance, _CFA)
-    real = msgspec.structs.replace(shoot.sensor, black=shoot.sensor.black + shoot.black_error)
-    counts = forward_camera.expose(mosaic, real, iso / 100, random)
-    to_camera = _MATRIX @ REC709_TO_XYZ
+    actual = msgspec.structs.replace(shoot.sensor, black=shoot.sensor.black + shoot.black_error)
+    counts = forward_camera.expose(mosaic, actual, iso / 100, random)
     exif = Exif(
         make="Polcap",
         model="Synthetic",
@@ -149,13 +136,4 @@ def _photograph(
         taken="2026-03-14T12:00:00.000",
         flash_fired=flash,
     )
-    dng.write(
-        path,
-        counts,
-        cfa=_CFA,
-        black=shoot.sensor.black,
-        white=shoot.sensor.white,
-        exif=exif,
-        color_matrix=_MATRIX,
-        as_shot_neutral=to_camera.sum(axis=1) / to_camera[1].sum(),
-    )
+    forward_camera.write_dng(path, counts, shoot.sensor, _CFA, COLOR_MATRIX, exif)

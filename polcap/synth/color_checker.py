@@ -1,4 +1,4 @@
-"""A ColorChecker Classic in the scene: flat, matt, unpolarized patches in a black frame."""
+"""Simulated ColorChecker Classic: flat, matt, unpolarized patches in a black frame."""
 
 import msgspec
 import numpy as np
@@ -12,7 +12,7 @@ _MIDDLE = np.array([3, 2]) - (1 - _PATCH) / 2  # column and row of the chart's m
 
 
 class Chart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where it hangs. Unturned it faces the lens, dark skin at the top left."""
+    """Pose and size of the chart. Without a turn it faces the lens, dark skin at the top left."""
 
     center: tuple[float, float, float] = (0.105, 0.0, -0.70)  # m, camera frame
     turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # rotation vector
@@ -25,25 +25,25 @@ class Chart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def axes(self) -> tuple[Floats, Floats, Floats]:
-        """Unit vectors out of the chart, along its rows and down its columns."""
+        """Unit vectors: the normal, along the rows, down the columns."""
         turn = Rotation.from_rotvec(self.turn_deg, degrees=True)
         return turn.apply([0.0, 0.0, 1.0]), turn.apply([1.0, 0.0, 0.0]), turn.apply([0.0, -1.0, 0.0])
 
 
 def corners(chart: Chart) -> Floats:
-    """The outer corners of the patches (4, 3) [m, camera frame], dark skin first, clockwise."""
+    """Outer corners of the patches (4, 3) [m, camera frame], dark skin first, clockwise."""
     return _points(chart, np.array([[0, 0], [5 + _PATCH, 0], [5 + _PATCH, 3 + _PATCH], [0, 3 + _PATCH]]))
 
 
 def patches(chart: Chart, margin: float = 0.0) -> Floats:
-    """The corners of every patch (24, 4, 3) [m, camera frame], `margin` of its side cut off all round."""
+    """Corners of every patch (24, 4, 3) [m, camera frame], each side moved inwards by `margin` of the patch's side."""
     origin = np.stack(np.meshgrid(np.arange(6), np.arange(4)), axis=-1).reshape(24, 1, 2)
     near, far = _PATCH * margin, _PATCH * (1 - margin)
     return _points(chart, origin + np.array([[near, near], [far, near], [far, far], [near, far]]))
 
 
-def seen(chart: Chart, v: Floats) -> tuple[Floats, Floats, Floats]:
-    """Which rays v (P, 3) meet the chart: their indices (N,), the distance along them [m] and albedo (N, 3)."""
+def intersect(chart: Chart, v: Floats) -> tuple[Floats, Floats, Floats]:
+    """Indices (N,) of the rays v (P, 3) that meet the chart, their lengths (N,) [m] and the albedo (N, 3)."""
     facing, across, down = chart.axes
     center = np.array(chart.center)
     near = np.flatnonzero(-(v @ center) > np.linalg.norm(center) * np.cos(5 * chart.pitch / np.linalg.norm(center)))

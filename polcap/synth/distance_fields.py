@@ -1,7 +1,7 @@
-"""Solids as distance fields, in their own frame, metres: what sphere tracing walks through.
+"""Shapes as distance fields for sphere tracing; each in its own frame, in metres.
 
-Each has `distance(p)`, (..., 3) -> (...,), never more than the true distance to its surface for points
-outside it, 0 on the surface; and `radius`, of a sphere about the origin that holds it.
+`distance(p)`, (..., 3) -> (...,), is 0 on the surface and outside at most the true distance. `radius` is that of a
+sphere about the origin that contains the shape.
 
 References
 ----------
@@ -22,10 +22,10 @@ Wave = tuple[float, float, float, float, float]  # amplitude, wave vector x y z 
 
 
 class Cluster(msgspec.Struct, frozen=True, tag="cluster", forbid_unknown_fields=True):
-    """Balls that touch, hide and cut one another."""
+    """Several balls that overlap."""
 
-    balls: tuple[tuple[float, float, float, float], ...]  # centre x y z, radius [m]
-    blend: float = 0.0  # m over which neighbours melt together; 0 keeps the crease
+    balls: tuple[tuple[float, float, float, float], ...]  # center x y z, radius [m]
+    blend: float = 0.0  # m, width of the smooth transition between balls; 0: a sharp crease
 
     @property
     def radius(self) -> float:
@@ -39,7 +39,7 @@ class Cluster(msgspec.Struct, frozen=True, tag="cluster", forbid_unknown_fields=
 
 
 class Bumps(msgspec.Struct, frozen=True, tag="bumps", forbid_unknown_fields=True):
-    """An ellipsoid whose surface is raised and lowered by smooth waves over the direction from its centre."""
+    """An ellipsoid with smooth waves on its surface."""
 
     size: tuple[float, float, float]  # semi-axes [m]
     waves: tuple[Wave, ...]  # amplitude relative to the semi-axis, over the unit sphere
@@ -74,13 +74,13 @@ class Superquadric(msgspec.Struct, frozen=True, tag="superquadric", forbid_unkno
 
 
 class Vase(msgspec.Struct, frozen=True, tag="vase", forbid_unknown_fields=True):
-    """A turned body about y, its wall lobed like a gadrooned vase, with knobs on it."""
+    """A body of revolution about y, with vertical lobes and small waves on its wall."""
 
     height: float  # m
-    profile: tuple[tuple[float, float], ...]  # height 0…1 (foot to lip), radius [m], joined smoothly
+    profile: tuple[tuple[float, float], ...]  # height 0…1 from foot to lip, radius [m]; joined smoothly
     lobes: int = 0
     depth: float = 0.0  # of the lobes, relative to the radius
-    waves: tuple[Wave, ...] = ()  # raised on the wall [m; rad/m]
+    waves: tuple[Wave, ...] = ()  # on the wall [m; rad/m]
 
     @property
     def radius(self) -> float:
@@ -101,10 +101,10 @@ class Vase(msgspec.Struct, frozen=True, tag="vase", forbid_unknown_fields=True):
 
 
 class Model(msgspec.Struct, frozen=True, tag="model", forbid_unknown_fields=True):
-    """Triangles of a file, their middle at the origin. No distance field: `mesh_tracer.py` traces it."""
+    """A mesh file, centered at the origin. It has no distance field; `mesh_tracer.py` traces it."""
 
     file: str
-    radius: float  # m, of the sphere about the origin that just holds it
+    radius: float  # m, of the smallest sphere about the origin that contains it
 
 
 Shape = Cluster | Bumps | Superquadric | Vase
@@ -112,7 +112,7 @@ Shape = Cluster | Bumps | Superquadric | Vase
 
 @lru_cache
 def _turned(profile: tuple[tuple[float, float], ...]) -> tuple[CubicSpline, float]:
-    """The wall's radius over height 0…1, and its greatest slope [m per height]."""
+    """The wall's radius over height 0…1, and its steepest slope [m per height]."""
     at, radius = np.array(profile).T
     curve = CubicSpline(at, radius, bc_type="natural")
     return curve, float(np.abs(curve(np.linspace(0, 1, 257), 1)).max())
@@ -123,7 +123,7 @@ def _length(p: Floats) -> Floats:
 
 
 def _blend(a: Floats, b: Floats, over: float) -> Floats:
-    """The lesser of two distances, its crease rounded over `over` metres."""
+    """The smaller of two distances, its crease rounded over `over` metres."""
     if not over:
         return np.minimum(a, b)
     near = np.maximum(over - np.abs(a - b), 0.0) / over
@@ -134,5 +134,5 @@ def _waves(waves: tuple[Wave, ...], p: Floats) -> Floats:
     total = np.zeros(p.shape[:-1])
     for amplitude, x, y, z, phase in waves:
         angle = p[..., 0] * x + p[..., 1] * y + p[..., 2] * z + phase
-        total += amplitude * np.sin(angle.astype(np.float32))  # three times as fast, 1e-7 of the amplitude off
+        total += amplitude * np.sin(angle.astype(np.float32))  # three times as fast; error 1e-7 of the amplitude
     return total

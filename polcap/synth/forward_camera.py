@@ -1,10 +1,12 @@
-"""The camera run forwards: radiance per channel -> the counts of a colour mosaic, with noise and clipping.
+"""Simulated camera: from radiance to the DNG file of a color mosaic, with noise and clipping.
 
 References
 ----------
 Granados et al., Optimal HDR reconstruction with linear digital cameras, CVPR 2010, §3.
 """
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
@@ -12,11 +14,17 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from polcap.images import Bits, Floats
+from polcap.errors import CaptureError
+from polcap.formats.raw import dng
+from polcap.images import Bits, Exif, Floats, View
+from polcap.optics.color import REC709_TO_XYZ
+
+SENSOR_WIDTH_MM = 36.0
+COLOR_MATRIX = (0.87, -0.27, -0.075, -0.44, 1.23, 0.235, -0.09, 0.19, 0.69)  # XYZ → camera, row by row
 
 
 class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A pixel at base sensitivity."""
+    """A photosite at base sensitivity."""
 
     full_well: Annotated[float, Meta(gt=0, le=1e9)] = 30000.0  # e⁻ at the white level
     read_noise: Annotated[float, Meta(ge=0, le=1e6)] = 3.0  # e⁻, 1σ
@@ -24,8 +32,19 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     white: Annotated[int, Meta(gt=0, le=65535)] = 15871  # counts
 
 
+def pinhole(focal_mm: float, width: int, height: int) -> View:
+    """The camera over its own RAW pixels."""
+    return View(focal_mm / SENSOR_WIDTH_MM * width, ((width - 1) / 2, (height - 1) / 2), scale=1)
+
+
+def rec709_to_camera(color_matrix: Sequence[float]) -> Floats:
+    """Linear Rec.709 → camera channels (3, 3), scaled so that green of white is 1; color_matrix: XYZ → camera."""
+    matrix = np.reshape(color_matrix, (3, 3)) @ REC709_TO_XYZ
+    return np.asarray(matrix / matrix[1].sum())
+
+
 def mosaic(image: Floats, cfa: Bits) -> Floats:
-    """Every pixel of (H, W, 3) through its own colour filter, (H, W); cfa (n, n) of 0 R, 1 G, 2 B."""
+    """The channel of each pixel's color filter, (H, W), of an image (H, W, 3); cfa (n, n) of 0 R, 1 G, 2 B."""
     out = np.empty(image.shape[:2], image.dtype)
     period = len(cfa)
     for row, column in np.ndindex(period, period):
@@ -34,12 +53,34 @@ def mosaic(image: Floats, cfa: Bits) -> Floats:
 
 
 def expose(radiance: Floats, sensor: Sensor, amplification: float, random: np.random.Generator) -> NDArray[np.uint16]:
-    """Counts of a mosaic whose radiance 1 fills the well at base sensitivity.
+    """Counts of a mosaic (H, W); a radiance of 1 fills the well.
 
-    Photons are Poisson, read noise is Gaussian, counts are rounded and clipped to 0…white; the well
-    saturates too. `amplification` is 1 at base sensitivity (ISO 100), 2 a stop up.
+    Photon noise is Poisson, read noise is Gaussian. The well saturates; counts are rounded and clipped to 0…white.
+    `amplification` is ISO/100.
     """
     electrons: NDArray[Any] = random.poisson(np.maximum(radiance, 0.0) * sensor.full_well).astype(np.float64)
     electrons = np.minimum(electrons, sensor.full_well) + random.normal(0.0, sensor.read_noise, radiance.shape)
     counts = sensor.black + electrons * amplification * (sensor.white - sensor.black) / sensor.full_well
     return np.clip(np.rint(counts), 0, sensor.white).astype(np.uint16)
+
+
+def write_dng(
+    path: Path, counts: NDArray[np.uint16], sensor: Sensor, cfa: Bits, color_matrix: Sequence[float], exif: Exif
+) -> None:
+    """Write the counts of one photograph. Raises StorageError."""
+    dng.write(
+        path,
+        counts,
+        cfa=cfa,
+        black=sensor.black,
+        white=sensor.white,
+        exif=exif,
+        color_matrix=np.reshape(color_matrix, (3, 3)),
+        as_shot_neutral=rec709_to_camera(color_matrix).sum(axis=1),
+    )
+
+
+def require_empty(folder: Path) -> None:
+    """Raise CaptureError if the folder holds something already."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise CaptureError(f"{folder} is not an empty folder; choose another folder")

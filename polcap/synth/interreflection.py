@@ -1,10 +1,9 @@
-"""A lit mesh -> the light that its own parts throw on each of its vertices: one diffuse bounce.
+"""Light between the parts of a mesh: one diffuse bounce, computed at the vertices.
 
-Kept at the vertices and interpolated, so that every shot sees the same light and its sampling noise
-cannot fake polarization. Left out: what facets mirror, and that bounced light arrives a little polarized.
-One of three such simulations, each for its own traffic: this one per vertex for pictures of several samples per
-pixel, `training/light_transport.py` per pixel with facets for the evaluation's single pictures, and
-`training/bounced_light.py` on ways traced once, for materials that change at every step of training.
+All shots use the same interpolated values, so sampling noise cannot look like polarization. Neglected: specular
+reflection, and the slight polarization of the bounced light. There are two other simulations of this light:
+`training/light_transport.py` works per pixel and includes specular reflection; `training/bounced_light.py` reuses
+traced paths while the materials change during training.
 """
 
 from collections.abc import Callable
@@ -15,18 +14,18 @@ from polcap.images import Floats
 from polcap.optics import fresnel
 from polcap.synth.mesh_tracer import Tracer
 
-_RAYS = 48  # per vertex, spread by their cosine
+_RAYS = 48  # per vertex, distributed by their cosine
 _LIFT = 5e-4  # m above the surface, where a ray starts
-_SMOOTH = 2  # times that each vertex takes the mean of its faces
+_SMOOTH = 2  # smoothing passes: each vertex takes the mean of its faces
 
 Lit = Callable[[Floats, Floats, Floats], Floats]
 
 
 def received(tracer: Tracer, lit: Lit, camera: Floats, ior: float) -> Floats:
-    """What enters the surface at each vertex (V, 3), in units of the light that leaves a white plane.
+    """Light that enters the surface at each vertex, (V, 3), relative to the light from a white plane.
 
-    lit(point, normal, towards) is S0 (N, 3) that places of the mesh's own frame send `towards` by diffuse
-    reflection; camera (3,) in that frame: an open surface counts as facing it.
+    lit(point, normal, towards) gives the diffusely reflected S0 (N, 3) of points in the mesh's own frame in the
+    direction `towards`. camera (3,) is in the same frame; open surfaces are taken to face it.
     """
     mesh = tracer.mesh
     normal: Floats = np.zeros(mesh.vertices.shape)

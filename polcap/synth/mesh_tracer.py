@@ -1,7 +1,6 @@
-"""G-buffers of triangle meshes: what a ray through each pixel of a pinhole camera meets.
+"""Ray tracing of triangle meshes by Embree: intersections, shadows, and G-buffers of a pinhole camera.
 
-One ray through each pixel centre, traced by Embree. Closed meshes that overlap are seen as their
-union, so shapes can be combined by putting them together.
+Closed meshes that overlap render as their union.
 """
 
 from collections.abc import Sequence
@@ -17,7 +16,7 @@ from polcap.formats import scene_files
 from polcap.images import Floats, GBuffer, View
 from polcap.optics import frames
 
-_LEAST_FACING = 0.01  # shading normals that smoothing turned away from the camera are brought back to here
+_LEAST_FACING = 0.01  # least cosine between normal and view; smoothing may turn normals away from the camera
 
 
 @dataclass(frozen=True)
@@ -30,9 +29,9 @@ class Triangles:
 
 
 def smooth(vertices: Floats, faces: NDArray[np.integer], crease: float = 0.75) -> Triangles:
-    """Give a mesh angle-weighted normals, smooth across edges flatter than `crease` rad.
+    """A mesh with angle-weighted normals, smooth across edges with an angle below `crease` rad.
 
-    Vertices at the same place count as one, so seams of a texture atlas do not show.
+    Vertices at the same position count as one, so that seams of a texture atlas stay invisible.
     """
     vertices = np.ascontiguousarray(vertices, dtype=np.float32)
     index = np.ascontiguousarray(faces, dtype=np.int32)
@@ -54,7 +53,7 @@ def smooth(vertices: Floats, faces: NDArray[np.integer], crease: float = 0.75) -
 
 
 def union(parts: Sequence[Triangles]) -> Triangles:
-    """Several meshes in one; where closed ones overlap a ray meets the outer surface."""
+    """Several meshes joined into one."""
     offset = np.cumsum([0] + [len(p.vertices) for p in parts[:-1]])
     return Triangles(
         np.concatenate([p.vertices for p in parts]),
@@ -64,7 +63,7 @@ def union(parts: Sequence[Triangles]) -> Triangles:
 
 
 def centred(mesh: Triangles) -> Triangles:
-    """The mesh about the origin, its longest side 1; InputError where it has no extent."""
+    """The mesh with its middle at the origin and its longest side 1. Raises InputError if it has no extent."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     longest = (high - low).max()
     if not 0 < longest < np.inf:
@@ -73,18 +72,18 @@ def centred(mesh: Triangles) -> Triangles:
 
 
 @dataclass(frozen=True)
-class Met:
-    """Where rays first meet a mesh, in the order of their index; the mesh's own frame."""
+class MeshHits:
+    """First intersections of rays with a mesh, sorted by the ray's index; the mesh's own frame."""
 
     index: NDArray[np.intp]  # (N,) of the ray
     position: Floats  # (N, 3)
-    normal: Floats  # (N, 3) unit, smooth, as the mesh has it
+    normal: Floats  # (N, 3) unit, interpolated from the corners
     face: NDArray[np.integer]  # (N,)
     weight: Floats  # (N, 3) of the face's corners
 
 
 class Tracer:
-    """A mesh made ready for tracing; build once, look from many sides."""
+    """A mesh prepared for tracing."""
 
     def __init__(self, mesh: Triangles) -> None:
         try:
@@ -97,9 +96,9 @@ class Tracer:
         TriangleMesh(self._scene, mesh.vertices, mesh.faces)
 
     def trace(self, rotation: Floats, translation: Floats, view: View, height: int, width: int) -> GBuffer:
-        """See the mesh at camera position = rotation @ vertex + translation [m].
+        """G-buffer of the mesh with vertices at rotation @ vertex + translation [m, camera frame].
 
-        rotation (3, 3) from the object's frame to the camera's, translation (3,).
+        rotation (3, 3), translation (3,).
         """
         v = frames.rays(view, height, width).reshape(-1, 3)  # surface to camera, camera frame
         origin = np.broadcast_to(-translation @ rotation, v.shape)
@@ -119,7 +118,7 @@ class Tracer:
             view=view,
         )
 
-    def meet(self, origin: Floats, direction: Floats) -> Met:
+    def meet(self, origin: Floats, direction: Floats) -> MeshHits:
         """First hits of rays (P, 3)."""
         start, way = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, direction))
         hit = self._scene.run(start, way, query="INTERSECT", output=True)
@@ -129,10 +128,10 @@ class Tracer:
         weight = np.stack([1 - b - c, b, c], axis=1)
         position = np.sum(self.mesh.vertices[self.mesh.faces[face]] * weight[..., None], axis=1)
         normal = _unit(np.sum(self.mesh.corner_normals[face] * weight[..., None], axis=1))
-        return Met(index, position, normal, face, weight)
+        return MeshHits(index, position, normal, face, weight)
 
     def hidden(self, origin: Floats, target: Floats) -> NDArray[np.bool_]:
-        """Whether the mesh stands between points (P, 3) and another (3,)."""
+        """True where the mesh hides points (P, 3) from the target (3,)."""
         way = target - origin
         far = np.linalg.norm(way, axis=1)
         ray = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, way / far[:, None], far))
@@ -141,7 +140,7 @@ class Tracer:
 
 @lru_cache(maxsize=2)
 def tracer(file: str, radius: float) -> Tracer:
-    """A mesh file about its middle, scaled so that a sphere of `radius` just holds it."""
+    """Tracer of a mesh file, centered and scaled to fill a sphere of `radius`."""
     vertices, faces = scene_files.read_mesh(Path(file))
     used = vertices[np.unique(faces)]
     vertices = vertices - (used.min(axis=0) + used.max(axis=0)) / 2
@@ -152,7 +151,7 @@ def tracer(file: str, radius: float) -> Tracer:
 
 
 def face_camera(normal: Floats, v: Floats) -> Floats:
-    """Turn round normals of faces seen from behind; lift those that smoothing bent just past the limb."""
+    """Flip normals of back faces; tilt normals that smoothing turned slightly away back towards the camera."""
     facing = np.sum(normal * v, axis=-1, keepdims=True)
     normal = np.where(facing < -0.3, -normal, normal)
     facing = np.where(facing < -0.3, -facing, facing)

@@ -1,7 +1,7 @@
-"""A scene -> what a polarizer passes at every pixel, its Stokes parameters, and the surface seen there.
+"""Renderer of synthetic scenes: Stokes parameters and surface geometry at any pixel positions.
 
-Everything is rendered where a shot's own pixels look; nothing is ever resampled. Camera frame of
-`optics/frames.py`, metres, the lens at the origin. Radiance is in linear Rec.709.
+Every shot is rendered on its own pixels, so nothing is resampled. Camera frame of `optics/frames.py`, metres, the lens
+at the origin. Radiance is linear Rec.709.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from polcap.errors import SettingError
 from polcap.images import Floats, GBuffer, View
 from polcap.optics import body, frames, fresnel, mueller, shade
-from polcap.optics.projection import back_project
 from polcap.synth import color_checker as charts
 from polcap.synth import interreflection, mesh_tracer, scene_materials, trace
 from polcap.synth.color_checker import Chart
@@ -25,11 +24,11 @@ from polcap.synth.distance_fields import Model, Shape
 from polcap.synth.scene_materials import Coat
 from polcap.synth.trace import Hits, Vector
 
-_ROUGH = body.Law(rough=1.0)  # facets of the gloss's roughness, counted evenly
+_ROUGH = body.Law(rough=1.0)  # facets with the roughness of the gloss, all with the same weight
 
 
 class Scene(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One object under one flash, in front of a dark backdrop, with a chart beside it."""
+    """An object and a chart under a flash, in front of a dark backdrop. One flat list, as stored in truth.json."""
 
     shape: Shape | Model
     coat: Coat
@@ -37,12 +36,12 @@ class Scene(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     turn_deg: Vector = (0.0, 0.0, 0.0)  # rotation vector of the object
     light: Vector = (0.0, 0.05, 0.0)  # m, of the flash
     chart: Chart | None = Chart()
-    backdrop: float = 1.3  # m before the lens
+    backdrop: float = 1.3  # m, distance from the lens
     backdrop_albedo: float = 0.03
     shadows: bool = True  # of the object on itself
     cast_shadows: bool | UnsetType = UNSET  # of the object on chart and backdrop
     interreflection: bool | UnsetType = UNSET  # one diffuse bounce between parts of the object; meshes only
-    law: Literal["smooth", "rough"] | UnsetType = UNSET  # interface that body light leaves through; unset: smooth
+    law: Literal["smooth", "rough"] | UnsetType = UNSET  # surface model of the diffuse reflection; unset: smooth
 
     @property
     def turn(self) -> Rotation:
@@ -54,10 +53,10 @@ def stokes(
 ) -> Floats:
     """Stokes parameters (3, H, W, 3) at pixel positions x, y (H, W) of `view`, in the frame of each ray.
 
-    A white matt plane at the object's distance that faces the flash has S0 = 1. `start` is of `guide`. A flash that is
-    polarized along `flash_axis` [rad, in the picture] is as bright as one that is not.
+    A white matt plane at the object's distance that faces the flash has S0 = 1. `start` comes from `guide`.
+    The flash is polarized along `flash_axis` [rad, in the picture], or unpolarized with the same brightness.
     """
-    v = view_rays(view, x, y).reshape(-1, 3)
+    v = frames.rays_at(view, x, y).reshape(-1, 3)
     if start is not None:
         row = np.clip(np.rint(y), 0, start.shape[0] - 1).astype(np.intp)
         column = np.clip(np.rint(x), 0, start.shape[1] - 1).astype(np.intp)
@@ -70,29 +69,29 @@ def stokes(
 
 
 def polarize(stokes: Floats, v: Floats, angle: float, extinction_ratio: float) -> Floats:
-    """What a polarizer at `angle` [rad, in the picture] passes of (3, H, W, 3) along the rays v (H, W, 3)."""
+    """Intensity (H, W, 3) of Stokes parameters (3, H, W, 3) on rays v (H, W, 3) behind a polarizer at `angle` [rad]."""
     weights = mueller.analyzer(frames.axis_on_ray(np.asarray(angle), v), extinction_ratio)
     return np.asarray(np.einsum("hws,shwc->hwc", weights.astype(np.float32), stokes))
 
 
 @dataclass(frozen=True)
-class Seen(GBuffer):
-    """With the relief in `normal`, and what it was laid on."""
+class ObjectBuffer(GBuffer):
+    """G-buffer of an object with relief: `normal` includes the relief, `facing` does not."""
 
-    facing: Floats  # (H, W, 3) unit, normals of the bare shape in the object's own frame; 0 outside
+    facing: Floats  # (H, W, 3) unit, normals without relief, object's own frame; 0 outside
 
 
-def gbuffer(scene: Scene, view: View, height: int, width: int) -> Seen:
-    """What the ray through each pixel's centre meets of the object."""
+def gbuffer(scene: Scene, view: View, height: int, width: int) -> ObjectBuffer:
+    """The object's surface at the center of each pixel."""
     y, x = np.mgrid[:height, :width].astype(np.float64)
-    hits, _ = _visible(scene, view_rays(view, x, y).reshape(-1, 3))
+    hits, _ = _visible(scene, frames.rays_at(view, x, y).reshape(-1, 3))
     normal, position, facing = np.zeros((3, height * width, 3), np.float32)
     depth = np.full(height * width, np.nan, np.float32)
     mask = np.zeros(height * width, bool)
     at = hits.index
     bare, bent = _normals(scene, hits)
     normal[at], position[at], depth[at], mask[at], facing[at] = bent, hits.local, -hits.point[:, 2], True, bare
-    return Seen(
+    return ObjectBuffer(
         normal=normal.reshape(height, width, 3),
         depth=depth.reshape(height, width),
         mask=mask.reshape(height, width),
@@ -103,21 +102,15 @@ def gbuffer(scene: Scene, view: View, height: int, width: int) -> Seen:
 
 
 def guide(buffer: GBuffer) -> Floats:
-    """Where rays close to each pixel's may begin (H, W) [m]; infinite where none can meet the object."""
+    """Distance (H, W) [m] up to which rays near each pixel meet nothing; infinite where they miss the object."""
     height, width = buffer.mask.shape
     y, x = np.mgrid[:height, :width].astype(np.float64)
-    distance = buffer.depth / view_rays(buffer.view, x, y)[..., 2]
+    distance = buffer.depth / frames.rays_at(buffer.view, x, y)[..., 2]
     return np.asarray(minimum_filter(np.where(buffer.mask, distance, np.inf), 5))
 
 
-def view_rays(view: View, x: Floats, y: Floats) -> Floats:
-    """`frames.rays` at any pixel positions: unit vectors from the surface to the lens, (..., 3) float64."""
-    towards = -back_project(view, x, y)
-    return np.asarray(towards / np.sqrt((towards**2).sum(axis=-1, keepdims=True)))
-
-
 def white_level(scene: Scene) -> float:
-    """S0 of a perfect matt white at the chart's white patch; 1 without a chart."""
+    """S0 of an ideal white surface at the chart's white patch; 1 without a chart."""
     if scene.chart is None:
         return 1.0
     point = charts.patches(scene.chart)[18].mean(axis=0, keepdims=True)
@@ -125,29 +118,29 @@ def white_level(scene: Scene) -> float:
 
 
 def _visible(scene: Scene, v: Floats, start: Floats | None = None) -> tuple[Hits, Floats]:
-    """The object where nothing stands before it, and S0 (P, 3) of the matt, unpolarized surroundings."""
+    """Visible hits on the object, and S0 (P, 3) of chart and backdrop, which are matt and unpolarized."""
     out = np.empty((len(v), 3))
     distance = scene.backdrop / v[:, 2]
-    wall = scene.backdrop_albedo * _arriving(scene, -v * distance[:, None], np.array([0.0, 0.0, 1.0]))
+    wall = scene.backdrop_albedo * _unshadowed_irradiance(scene, -v * distance[:, None], np.array([0.0, 0.0, 1.0]))
     out[:] = wall[:, None]
     hits = trace.trace(scene.shape, scene.position, scene.turn, v, start)
     if scene.chart is not None:
-        at, to_chart, albedo = charts.seen(scene.chart, v)
+        at, to_chart, albedo = charts.intersect(scene.chart, v)
         distance[at] = to_chart
-        out[at] = albedo * _arriving(scene, -v[at] * distance[at, None], scene.chart.axes[0])[:, None]
+        out[at] = albedo * _unshadowed_irradiance(scene, -v[at] * distance[at, None], scene.chart.axes[0])[:, None]
     return hits.take(np.flatnonzero(hits.distance < distance[hits.index])), out
 
 
-def _arriving(scene: Scene, point: Floats, normal: Floats) -> Floats:
-    """`_irradiance`, none of it where the object stands before the flash."""
+def _unshadowed_irradiance(scene: Scene, point: Floats, normal: Floats) -> Floats:
+    """`_irradiance`, and 0 in the object's cast shadow."""
     light = _irradiance(scene, point, normal)
     if scene.cast_shadows:
-        light[trace.behind(scene.shape, scene.position, scene.turn, point, scene.light)] = 0.0
+        light[trace.in_cast_shadow(scene.shape, scene.position, scene.turn, point, scene.light)] = 0.0
     return light
 
 
 def _irradiance(scene: Scene, point: Floats, normal: Floats) -> Floats:
-    """On surfaces at points (N, 3) with `normal`, (N,): 1 facing the flash at the object's distance from it."""
+    """Irradiance (N,) of points (N, 3) with `normal`: 1 facing the flash at the object's distance."""
     to_light = np.array(scene.light) - point
     squared = np.einsum("ni,ni->n", to_light, to_light)
     reference = np.sum((np.array(scene.light) - np.array(scene.position)) ** 2)
@@ -162,7 +155,7 @@ def _shade(scene: Scene, ray: Floats, hits: Hits, flash_axis: float | None = Non
     irradiance = _irradiance(scene, hits.point, to_light)
     if scene.shadows:
         lit = np.flatnonzero(np.einsum("ni,ni->n", hits.normal, to_light) > 0)
-        hidden = trace.shadowed(scene.shape, scene.position, scene.turn, hits.take(lit), scene.light)
+        hidden = trace.in_own_shadow(scene.shape, scene.position, scene.turn, hits.take(lit), scene.light)
         irradiance[lit[hidden]] = 0.0
     facing, bent = _normals(scene, hits)
     diffuse, specular, roughness, ior = scene_materials.evaluate(scene.coat, hits.local, facing)
@@ -177,15 +170,15 @@ def _shade(scene: Scene, ray: Floats, hits: Hits, flash_axis: float | None = Non
     if not scene.interreflection:
         return np.asarray(direct)
     bounced = np.einsum("nkc,nk->nc", _bounced(scene)[hits.face], hits.weight)
-    entered, _ = fresnel.transmission(1.0, ior)  # already in what came
+    entered, _ = fresnel.transmission(1.0, ior)  # `bounced` already includes it
     once = shade.stokes(normal, diffuse * bounced, 0 * specular, roughness, ior, normal, 1 / entered, law)
     return np.asarray(direct + once)
 
 
 def _normals(scene: Scene, hits: Hits) -> tuple[Floats, Floats]:
-    """Bare normals (N, 3) in the object's frame; normals with relief, still towards the lens, in the camera's."""
+    """Normals (N, 3) without relief in the object's frame, and with relief in the camera's frame, facing the lens."""
     facing = scene.turn.inv().apply(hits.normal)
-    bent = scene_materials.relieved(scene.coat, hits.local, facing)
+    bent = scene_materials.add_relief(scene.coat, hits.local, facing)
     if bent is facing:
         return facing, hits.normal
     return facing, mesh_tracer.face_camera(scene.turn.apply(bent), -hits.point / hits.distance[:, None])
@@ -193,9 +186,9 @@ def _normals(scene: Scene, hits: Hits) -> tuple[Floats, Floats]:
 
 @lru_cache(maxsize=2)
 def _bounced(scene: Scene) -> Floats:
-    """Light that other parts of a mesh throw on the corners of each face, (F, 3, 3)."""
+    """Light from other parts of a mesh on the corners of each face, (F, 3, 3)."""
     if not isinstance(scene.shape, Model):
-        raise SettingError("interreflection is traced between triangles; give the object as a mesh")
+        raise SettingError("interreflection needs triangles; give the object as a mesh")
     tracer = mesh_tracer.tracer(scene.shape.file, scene.shape.radius)
     source, lens = (scene.turn.inv().apply(np.array(at) - scene.position) for at in (scene.light, (0.0, 0.0, 0.0)))
     reference = np.sum((np.array(scene.light) - scene.position) ** 2)

@@ -1,7 +1,7 @@
-"""Solid textures and texture sets: position in the object's own frame -> albedo, F0, roughness, index, relief.
+"""Materials of synthetic objects: albedo, F0, roughness, refractive index and relief at a position.
 
-Every pattern is smooth at the scale of a pixel, so that a few samples per pixel do not alias. A texture
-set is laid on along the axis nearest to the bare surface's normal, and mirrored at its sides.
+Patterns are smooth at the scale of a pixel, so that few samples per pixel do not alias. A texture set is projected
+along the axis nearest to the surface's normal, and mirrored at its sides.
 """
 
 from functools import lru_cache
@@ -17,20 +17,20 @@ from polcap.images import Floats
 from polcap.optics import fresnel
 
 Color = tuple[float, float, float]  # linear Rec.709
-_TEXELS = 256  # side of a texture: of 0.1 m, about a pixel each, so that it does not alias
+_TEXELS = 256  # side of a texture; about one texel per pixel for 0.1 m, so that it does not alias
 
 
 class Material(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Two colours mixed by a pattern; the second one's share moves the roughness as well.
+    """Two colors mixed by a pattern, which mixes their roughness in the same proportion.
 
-    With a texture set its albedo times `first` is the colour, and its roughness the share.
+    With a texture set, the color is its albedo times `first`, and the proportion is its roughness.
     """
 
     first: Color
     second: Color
     pattern: Literal["plain", "noise", "chequer", "veins"] = "noise"
-    size: Annotated[float, Meta(gt=0)] = 0.02  # m, of the pattern's features; side of the texture
-    roughness: tuple[float, float] = (0.4, 0.4)  # perceptual, of the first and of the second
+    size: Annotated[float, Meta(gt=0)] = 0.02  # m, of the pattern's features, or side of the texture
+    roughness: tuple[float, float] = (0.4, 0.4)  # perceptual, of the first and of the second color
     specular: Annotated[float, Meta(ge=0)] = 1.0  # k_s: F0 = k_s ((n − 1)/(n + 1))²
     ior: Annotated[float, Meta(gt=1)] = 1.5
     seed: int = 0
@@ -38,7 +38,7 @@ class Material(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Coat(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What an object is made of: one material, or two in regions whose border winds through the solid."""
+    """The material of an object: one, or two in separate regions."""
 
     materials: tuple[Material, ...]  # one or two
     region_size: float = 0.08  # m
@@ -48,7 +48,7 @@ class Coat(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def evaluate(coat: Coat, position: Floats, facing: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Diffuse albedo (..., 3), specular F0 (..., 3), roughness (...,) and index (...,) at positions (..., 3) [m].
 
-    facing (..., 3): the bare surface's normal in the object's own frame.
+    facing (..., 3): normals without relief, object's own frame.
     """
     parts = [_one(material, position, facing) for material in coat.materials]
     if len(parts) == 1:
@@ -63,8 +63,8 @@ def evaluate(coat: Coat, position: Floats, facing: Floats) -> tuple[Floats, Floa
     )
 
 
-def relieved(coat: Coat, position: Floats, facing: Floats) -> Floats:
-    """The normals that the relief of the texture sets makes of the bare ones; those where there is none."""
+def add_relief(coat: Coat, position: Floats, facing: Floats) -> Floats:
+    """Normals with the relief of the texture sets; without a texture set `facing` itself."""
     if all(material.texture is UNSET for material in coat.materials):
         return facing
     slopes = [_slope(material, position, facing) for material in coat.materials]
@@ -96,7 +96,7 @@ def _one(material: Material, position: Floats, facing: Floats) -> tuple[Floats, 
         share = _pattern(material, position / material.size)
         diffuse = first + (second - first) * share[..., None]
     else:
-        picture, _, _ = _laid(material, position, facing)
+        picture, _, _ = _project(material, position, facing)
         diffuse, share = first * picture[..., :3], picture[..., 3]
     f0 = material.specular * fresnel.normal_reflectance(material.ior)
     roughness = material.roughness[0] + (material.roughness[1] - material.roughness[0]) * share
@@ -107,14 +107,14 @@ def _slope(material: Material, position: Floats, facing: Floats) -> Floats:
     """Slope of the relief along the object's axes, (..., 3)."""
     out = np.zeros_like(facing)
     if material.texture is not UNSET:
-        picture, axis, sign = _laid(material, position, facing)
+        picture, axis, sign = _project(material, position, facing)
         for k in (0, 1):
             np.put_along_axis(out, (axis + k + 1) % 3, picture[..., 4 + k, None] * sign[..., k, None], axis=-1)
     return out
 
 
-def _laid(material: Material, position: Floats, facing: Floats) -> tuple[Floats, Any, Floats]:
-    """The texture's six numbers (..., 6), the axis it is laid on along (..., 1), and whether u, v run back (..., 2)."""
+def _project(material: Material, position: Floats, facing: Floats) -> tuple[Floats, Any, Floats]:
+    """Texture values (..., 6), axis of projection (..., 1), and signs of u and v, −1 where mirrored (..., 2)."""
     texture = _texture(str(material.texture))
     axis = np.abs(facing).argmax(axis=-1)[..., None]
     across = np.concatenate([np.take_along_axis(position, (axis + k) % 3, axis=-1) for k in (1, 2)], axis=-1)
@@ -134,7 +134,7 @@ def _texture(folder: str) -> Floats:
 
 
 def _pattern(material: Material, p: Floats) -> Floats:
-    """Share 0…1 of the second colour, (...,)."""
+    """Share 0…1 of the second color, (...,)."""
     if material.pattern == "plain":
         return np.zeros(p.shape[:-1])
     if material.pattern == "chequer":

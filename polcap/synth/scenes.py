@@ -1,4 +1,4 @@
-"""A seed -> a scene: textured bumps, clusters of balls that hide one another, vases, or what a file holds."""
+"""Random synthetic scenes from a seed: bumps, clusters of balls, vases, or a mesh from a file."""
 
 import colorsys
 from pathlib import Path
@@ -18,14 +18,14 @@ Kind = Literal["bumps", "clusters", "vase"]
 
 
 def random_scene(seed: int, kind: Kind) -> Scene:
-    """An object 0.1 to 0.17 m across at 0.7 m, beside a chart, under a flash 4 to 7 cm above the lens.
+    """An object 0.1 to 0.17 m wide at 0.7 m, next to a chart, under a flash 4 to 7 cm above the lens.
 
-    It wears one or two textured dielectrics of roughness 0.3–0.6 and index 1.4–1.6.
+    Its one or two materials are dielectrics of roughness 0.3–0.6 and refractive index 1.4–1.6.
 
     Raises SettingError for an unknown kind.
     """
     if kind not in get_args(Kind):
-        raise SettingError(f'no scene is called "{kind}"; choose one of {", ".join(get_args(Kind))}')
+        raise SettingError(f'there is no scene "{kind}"; choose one of {", ".join(get_args(Kind))}')
     random = np.random.default_rng([seed, get_args(Kind).index(kind)])
     shape = {"bumps": _bumps, "clusters": _cluster, "vase": _vase}[kind](random)
     ior = random.uniform(1.4, 1.6)
@@ -45,7 +45,7 @@ def random_scene(seed: int, kind: Kind) -> Scene:
 
 
 def with_model(scene: Scene, file: Path, seed: int) -> Scene:
-    """A mesh in the place of the scene's object, turned at random, casting its shadow."""
+    """The scene with a mesh as its object, in a random orientation, with cast shadows."""
     turn = np.random.default_rng([seed, 0x3E54]).normal(size=4)
     vector = _vector(Rotation.from_quat(turn).as_rotvec(degrees=True))
     model = Model(str(file), radius=0.08)
@@ -53,7 +53,7 @@ def with_model(scene: Scene, file: Path, seed: int) -> Scene:
 
 
 def with_textures(scene: Scene, folder: Path) -> Scene:
-    """A texture set in the place of the scene's first material, over all of the object."""
+    """The scene with a texture set as the only material."""
     material = scene.coat.materials[0]
     laid = msgspec.structs.replace(
         material, first=(1.0, 1.0, 1.0), second=(1.0, 1.0, 1.0), size=0.1, roughness=(0.0, 1.0), texture=str(folder)
@@ -71,9 +71,9 @@ def _cluster(random: np.random.Generator) -> Shape:
     balls = [np.array([0, 0, 0, random.uniform(0.034, 0.044)])]
     while len(balls) < 4 + random.integers(0, 5):
         radius = random.uniform(0.02, 0.036)
-        neighbour = balls[random.integers(len(balls))]
-        away = random.normal(size=3)
-        center = neighbour[:3] + away / np.linalg.norm(away) * 0.85 * (neighbour[3] + radius)
+        neighbor = balls[random.integers(len(balls))]
+        direction = random.normal(size=3)
+        center = neighbor[:3] + direction / np.linalg.norm(direction) * 0.85 * (neighbor[3] + radius)
         if np.linalg.norm(center) + radius < 0.085:
             balls.append(np.array([*center, radius]))
     return Cluster(tuple((_rounded(x), _rounded(y), _rounded(z), _rounded(r)) for x, y, z, r in balls))

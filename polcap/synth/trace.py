@@ -1,4 +1,4 @@
-"""Rays of the camera -> where they meet a shape that stands somewhere before it: sphere tracing, Embree for meshes.
+"""Intersection of rays with a shape: sphere tracing of distance fields, Embree for meshes.
 
 References
 ----------
@@ -18,21 +18,22 @@ from polcap.synth.distance_fields import Model, Shape
 
 Vector = tuple[float, float, float]
 Indices = NDArray[np.integer[Any]]
-_TOLERANCE = 1e-6  # m, a ray this near has arrived
-_STEPS, _GRAZING = 300, 1e-4  # m, a ray that has crawled along the surface for so long has arrived too
+_TOLERANCE = 1e-6  # m, distance at which a ray has arrived
+_STEPS = 300  # most steps of a ray
+_GRAZING = 1e-4  # m, the same after the last step, for rays along the surface
 LIFT = 5e-4  # m above the surface, where a shadow ray starts
 
 
 @dataclass(frozen=True)
 class Hits:
-    """Where rays meet a shape, in the order of their index."""
+    """Intersections of rays with a shape, sorted by the ray's index."""
 
     index: Indices  # (N,) of the ray
-    distance: Floats  # (N,) along it, m
+    distance: Floats  # (N,) along the ray, m
     point: Floats  # (N, 3) camera frame, m
     local: Floats  # (N, 3) shape's own frame, m
     normal: Floats  # (N, 3) camera frame, unit
-    face: Indices  # (N,) of a mesh, else −1
+    face: Indices  # (N,) of a mesh; −1 otherwise
     weight: Floats  # (N, 3) of the face's corners
 
     def take(self, which: Indices) -> "Hits":
@@ -40,9 +41,9 @@ class Hits:
 
 
 def trace(shape: Shape | Model, position: Vector, turn: Rotation, v: Floats, start: Floats | None = None) -> Hits:
-    """What the rays that leave the lens along −v (P, 3) meet of a shape turned by `turn` and put at `position` [m].
+    """First intersections of rays from the lens along −v (P, 3) with a shape turned by `turn` at `position` [m].
 
-    `start` (P,) [m] is where to begin, nearer than the surface; infinite where a ray is known to miss.
+    The search begins at the distance `start` (P,) [m], in front of the surface; infinite: the ray misses.
     """
     to_middle = -(v @ np.array(position))
     near = to_middle**2 > np.dot(position, position) - shape.radius**2
@@ -65,14 +66,18 @@ def trace(shape: Shape | Model, position: Vector, turn: Rotation, v: Floats, sta
     return Hits(at, distance, point, local, normal, np.full(len(at), -1), np.zeros((len(at), 3)))
 
 
-def shadowed(shape: Shape | Model, position: Vector, turn: Rotation, hits: Hits, light: Vector) -> NDArray[np.bool_]:
-    """Which of the hits (N,) the shape itself hides from a light [m, camera frame]."""
+def in_own_shadow(
+    shape: Shape | Model, position: Vector, turn: Rotation, hits: Hits, light: Vector
+) -> NDArray[np.bool_]:
+    """True for hits (N,) that the shape itself hides from a light [m, camera frame]."""
     lifted = hits.local + LIFT * turn.inv().apply(hits.normal)
     return _hidden(shape, lifted, turn.inv().apply(np.array(light) - np.array(position)))
 
 
-def behind(shape: Shape | Model, position: Vector, turn: Rotation, point: Floats, light: Vector) -> NDArray[np.bool_]:
-    """Which of the points (N, 3) elsewhere [m, camera frame] the shape hides from a light."""
+def in_cast_shadow(
+    shape: Shape | Model, position: Vector, turn: Rotation, point: Floats, light: Vector
+) -> NDArray[np.bool_]:
+    """True for points (N, 3) off the shape [m, camera frame] that it hides from a light."""
     source = turn.inv().apply(np.array(light) - np.array(position))
     return _hidden(shape, turn.inv().apply(point - np.array(position)), source)
 
@@ -89,7 +94,7 @@ def _hidden(shape: Shape | Model, origin: Floats, source: Floats) -> NDArray[np.
 
 
 def _march(shape: Shape, origin: Floats, direction: Floats, start: Floats | float) -> tuple[Indices, Floats]:
-    """Indices of the rays (P, 3) that arrive at the shape, and how far they travelled."""
+    """Indices of the rays (P, 3) that arrive at the shape, and their lengths [m]."""
     middle = -np.einsum("pi,pi->p", origin, direction)
     missed = np.einsum("pi,pi->p", origin, origin) - middle**2
     half = np.sqrt(np.maximum(shape.radius**2 - missed, 0.0))

@@ -154,7 +154,7 @@ def body_law(number: int) -> Law:
     """
     low, high = (0.4, 0.8) if number % 10 == 9 else (0.8, 1.0)
     kept = np.random.default_rng([_SEED, number, 2]).uniform(low, high)
-    return Law(rough=1.0, local=float(number % 2), kept=float(kept))
+    return Law(rough=1.0, local=float(number % 2), dolp_factor=float(kept))
 
 
 def render_lights() -> Floats:

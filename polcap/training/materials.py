@@ -121,7 +121,7 @@ def draw_surface(
         specular=specular,
         roughness=rough,
         ior=own["ior"],
-        law=Law(law.rough, law.local, law.kept * fibers),
+        law=Law(law.rough, law.local, law.dolp_factor * fibers),
     )
 
 

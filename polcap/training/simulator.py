@@ -194,7 +194,7 @@ class Simulator:
             "normal": image(normal), "depth": image(pixels.depth[:, None]), "diffuse": image(surface.diffuse),
             "specular": image(surface.specular), "roughness": image(surface.roughness[:, None]),
             "highlight": image(highlight[:, None]),
-            "law": image(torch.stack([surface.law.rough, surface.law.local, surface.law.kept], dim=1)),
+            "law": image(torch.stack([surface.law.rough, surface.law.local, surface.law.dolp_factor], dim=1)),
         }  # fmt: skip
         indirect = bounced_light.bounced_stokes(pixels, normal, surface, body[0])
         indirect = indirect + bounced_light.mirrored_surroundings(pixels, views.flash, normal, surface, strength)

@@ -32,7 +32,7 @@ from polcap.quality.gate import Evidence
 from polcap.quality.limits import GateLimits
 from polcap.stages import cues, infer, stokes
 from polcap.synth import scene_materials
-from polcap.synth.render import Seen
+from polcap.synth.render import ObjectBuffer
 from polcap.synth.scenes import random_scene
 from polcap.synth.shooting import Shoot, Studio
 from tests import scenes
@@ -202,7 +202,7 @@ def _probe(seed: int, turn: float) -> Floats:
     return np.roll(small / small.mean(), int(turn / (2 * np.pi) * 128), 1)
 
 
-def _around(buffer: Seen, coat: Any, probe: Floats, metal: complex | None) -> Floats:
+def _around(buffer: ObjectBuffer, coat: Any, probe: Floats, metal: complex | None) -> Floats:
     """Stokes parameters (3, H, W, 3) under the probe: mirrored light, spread by one lobe, and body light."""
     normal = buffer.normal.astype(np.float64)
     diffuse, specular, roughness, ior = scene_materials.evaluate(coat, buffer.position, buffer.facing)

@@ -23,6 +23,7 @@ import msgspec
 import numpy as np
 
 from polcap.images import Floats, Mesh, SurfaceMaps, View
+from polcap.optics import frames
 from polcap.stages import surface
 from polcap.stages.surface.occlusion import least_step
 from polcap.stages.surface.slope_equations import Bools
@@ -217,7 +218,7 @@ def true_links(scene: render.Scene, view: View, depth: Floats, mask: Bools, axis
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
         at = np.full(len(middle), np.inf)  # a gap between the two is a contour, too
-        hits = trace.trace(scene.shape, scene.position, scene.turn, render.view_rays(view, middle[:, 1], middle[:, 0]))
+        hits = trace.trace(scene.shape, scene.position, scene.turn, frames.rays_at(view, middle[:, 1], middle[:, 0]))
         at[hits.index] = view.focal * np.log(-hits.point[:, 2])
         first = np.abs(at - from_) >= np.abs(to - at)
         high, to = np.where(first[:, None], middle, high), np.where(first, at, to)

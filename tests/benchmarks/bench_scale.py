@@ -21,7 +21,7 @@ import numpy as np
 from polcap.errors import ChartError
 from polcap.formats import shipped_data
 from polcap.images import AngleStack, ChartRequest, GBuffer, StokesImage, View, single_frames
-from polcap.optics import point_light, projection
+from polcap.optics import frames, point_light, projection
 from polcap.stages import whitebalance
 from polcap.stages.cues import scale
 from polcap.stages.whitebalance import WhitebalanceSettings
@@ -106,10 +106,10 @@ def photograph(scene: Scene, falloff: float, printed: float, random: np.random.G
     assert scene.chart is not None
     steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
     y, x = (axis.reshape(-1, 1) for axis in np.mgrid[:480, :640])
-    v = render.view_rays(
+    v = frames.rays_at(
         _VIEW, *(axis.reshape(-1) for axis in (x + np.tile(steps, _SAMPLES), y + np.repeat(steps, _SAMPLES)))
     )
-    at, distance, albedo = color_checker.seen(scene.chart, v)
+    at, distance, albedo = color_checker.intersect(scene.chart, v)
     point = -v[at] * distance[:, None]
     light = np.full((len(v), 3), 0.01)
     arriving = point_light.irradiance(point, np.array(scene.light[:2]), falloff, scene.chart.axes[0])
@@ -140,7 +140,7 @@ def truth(scene: Scene, object_: GBuffer, falloff: float) -> float:
     white = color_checker.patches(scene.chart)[18].mean(axis=0)
     chart = point_light.irradiance(white, flash, falloff, scene.chart.axes[0])
     y, x = np.mgrid[: object_.mask.shape[0], : object_.mask.shape[1]].astype(np.float64)
-    v = render.view_rays(object_.view, x, y)[object_.mask]
+    v = frames.rays_at(object_.view, x, y)[object_.mask]
     z = object_.depth[object_.mask]
     point = -v * (z / v[:, 2])[:, None]
     reached = point_light.irradiance(point, flash, falloff).mean()

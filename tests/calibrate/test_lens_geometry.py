@@ -36,7 +36,7 @@ def found(folder) -> Calibration:
 
 def rays(lens: Distortion, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Directions of photograph pixels, without their mean: the camera's direction does not matter."""
-    u, v = distortion.undistorted(lens, x, y)
+    u, v = distortion.undistort(lens, x, y)
     direction = np.stack([u - lens.center[0], v - lens.center[1]]) / lens.focal
     return direction - direction.mean(axis=(1, 2), keepdims=True)
 

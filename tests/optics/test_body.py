@@ -89,7 +89,7 @@ def test_rough_bodies_are_flatter_than_lambert() -> None:
         facet, _, weight = body.facets(c, alpha)
         plus, _ = fresnel.transmission(facet, 1.5)
         light = (weight * facet * plus**2).sum(axis=1) / (c * (weight * plus).sum(axis=1) ** 2)
-        np.testing.assert_allclose(body.flatter(c, c, np.ones(5), alpha + 0 * c), light / light[0], rtol=0.08)
+        np.testing.assert_allclose(body.flattening(c, c, np.ones(5), alpha + 0 * c), light / light[0], rtol=0.08)
 
 
 def test_renderer_draws_the_law() -> None:

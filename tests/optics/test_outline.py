@@ -13,11 +13,11 @@ AZIMUTH = np.arctan2(-Y, X)[BAND]  # rows run down
 ANGLES = np.radians([0.0, 60.0, 120.0])
 
 
-def lit(turned: float, dolp: float = 0.2) -> outline.Rim:
+def lit(turned: float, dolp: float = 0.2) -> outline.OutlineBand:
     """A rim polarized by `dolp` across the contour, seen through polarizers that stood `turned` rad further."""
     stokes = np.stack([np.ones_like(AZIMUTH), dolp * np.cos(2 * AZIMUTH), dolp * np.sin(2 * AZIMUTH)])
     light: Floats = mueller.analyzer(ANGLES + turned) @ stokes
-    return outline.Rim(light, AZIMUTH, outline.sectors(BAND))
+    return outline.OutlineBand(light, AZIMUTH, outline.sectors(BAND))
 
 
 def test_way_out_of_a_disc_is_its_radius() -> None:
@@ -35,7 +35,7 @@ def test_sectors_part_a_ring_evenly() -> None:
 @pytest.mark.parametrize("turned_deg", [-20, 0, 7])
 def test_common_turn_of_the_polarizer_is_read_off_the_rim(turned_deg: int) -> None:
     """The stated angles are `turned` too small, so every AoLP is told that much too small."""
-    mean, sigma = outline.mean_and_doubt(*outline.phasor(lit(np.radians(turned_deg)), ANGLES))
+    mean, sigma = outline.mean_and_sigma(*outline.phasor(lit(np.radians(turned_deg)), ANGLES))
     assert abs(mean) == pytest.approx(1, abs=1e-6)
     assert np.degrees(np.angle(mean) / 2) == pytest.approx(-turned_deg, abs=1e-4)
     assert sigma < 1e-6
@@ -52,5 +52,5 @@ def test_what_no_body_emits_weighs_no_more_than_the_most_it_can() -> None:
 
 
 def test_no_rim_tells_nothing() -> None:
-    empty = outline.Rim(np.zeros((3, 0)), np.zeros(0), np.zeros(0, int))
-    assert outline.mean_and_doubt(*outline.phasor(empty, ANGLES)) == (0, np.pi / 2)
+    empty = outline.OutlineBand(np.zeros((3, 0)), np.zeros(0), np.zeros(0, int))
+    assert outline.mean_and_sigma(*outline.phasor(empty, ANGLES)) == (0, np.pi / 2)

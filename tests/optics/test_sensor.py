@@ -51,4 +51,4 @@ def test_a_plateau_is_saturation_but_a_dark_picture_is_not():
 
 
 def test_rounding_of_whole_counts():
-    assert sensor.rounding(mosaic(np.zeros((4, 4)), black=[[100]])) == pytest.approx(1 / 12 / 1000**2)
+    assert sensor.rounding_variance(mosaic(np.zeros((4, 4)), black=[[100]])) == pytest.approx(1 / 12 / 1000**2)

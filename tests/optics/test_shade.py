@@ -134,5 +134,5 @@ def test_crossed_filters_show_the_body_alone(zenith: float) -> None:
     both = polarized(normal, UP, np.degrees(flash), diffuse=0.6, specular=0.04)
     seen = 0.5 * (both[0] + both[1] * np.cos(2 * angle) + both[2] * np.sin(2 * angle))
     s0, s1, s2 = render(normal, UP, diffuse=0.6)
-    p = crossing.polarized(np.array(s1), np.array(s2), angle)
-    np.testing.assert_allclose(crossing.body_light(np.array(2 * seen), p), s0, rtol=1e-6)
+    p = crossing.polarization_along(np.array(s1), np.array(s2), angle)
+    np.testing.assert_allclose(crossing.diffuse_light(np.array(2 * seen), p), s0, rtol=1e-6)

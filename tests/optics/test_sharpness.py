@@ -18,7 +18,7 @@ def scene(seed: int = 0) -> Floats:
 def measured(pictures: list[Floats], noise: float = 0.002) -> Floats:
     random = np.random.default_rng(1)
     noisy = [np.asarray(p + noise * random.normal(size=p.shape), np.float32) for p in pictures]
-    corners = sharpness.choose(noisy[0], np.ones(noisy[0].shape, bool))
+    corners = sharpness.choose_tiles(noisy[0], np.ones(noisy[0].shape, bool))
     tiles = np.stack([[p[y : y + TILE, x : x + TILE] for y, x in corners] for p in noisy])
     return sharpness.extra_blur(tiles, np.ones(tiles.shape[:2], bool))
 
@@ -33,7 +33,7 @@ def test_defocus_is_measured_in_pixels(sigma: float) -> None:
 
 def test_few_noisy_tiles_of_one_scene_show_no_blur() -> None:
     """The loss of detail of some photograph along some way is always the greatest; its scatter says that it is none."""
-    corners = sharpness.choose(scene(), np.ones((256, 384), bool))[:4]
+    corners = sharpness.choose_tiles(scene(), np.ones((256, 384), bool))[:4]
     tiles = np.stack([scene()[y : y + TILE, x : x + TILE] for y, x in corners])
     random = np.random.default_rng(3)
     noisy = tiles + 0.03 * random.normal(size=(20, 4, *tiles.shape))  # twenty captures of four shots

@@ -82,8 +82,8 @@ def test_a_ball_hides_another_from_a_light_behind_it() -> None:
     hits = trace.trace(pair, place, still, np.array([[0.0, 0.0, 1.0]]))  # the middle of the rear ball
     np.testing.assert_allclose(hits.point, [[0, 0, -0.67]], atol=2e-6)
     behind = hits.point[0] + 5 * (front + place - hits.point[0])
-    assert trace.shadowed(pair, place, still, hits, tuple(behind)).tolist() == [True]
-    assert trace.shadowed(pair, place, still, hits, (behind[0], -behind[1], behind[2])).tolist() == [False]
+    assert trace.in_own_shadow(pair, place, still, hits, tuple(behind)).tolist() == [True]
+    assert trace.in_own_shadow(pair, place, still, hits, (behind[0], -behind[1], behind[2])).tolist() == [False]
 
 
 @pytest.mark.parametrize("kind", ["bumps", "clusters", "vase"])

@@ -10,6 +10,7 @@ import plastic
 import pytest
 
 from polcap.images import Floats, View
+from polcap.optics import frames
 from polcap.synth import distance_fields, render, trace
 from polcap.synth.render import Scene
 from polcap.synth.scene_materials import Coat, Material
@@ -60,7 +61,7 @@ def ours(which: Scene) -> tuple[Floats, Floats]:
     stokes, facing = [], []
     for dy in offsets:
         for dx in offsets:
-            v = render.view_rays(VIEW, x + dx, y + dy)
+            v = frames.rays_at(VIEW, x + dx, y + dy)
             stokes.append(render.stokes(which, VIEW, x + dx, y + dy)[..., 0])
             hits = trace.trace(which.shape, which.position, which.turn, v.reshape(-1, 3))
             cosine = np.zeros(SIDE * SIDE)

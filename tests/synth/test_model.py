@@ -12,10 +12,11 @@ pytest.importorskip("embreex")
 
 from polcap.errors import DecodeError, SettingError
 from polcap.images import Floats, View
+from polcap.optics import frames
 from polcap.synth import interreflection, mesh_tracer, render
 from polcap.synth.distance_fields import Cluster, Model
 from polcap.synth.render import Scene
-from polcap.synth.scene_materials import Coat, Material, evaluate, relieved
+from polcap.synth.scene_materials import Coat, Material, add_relief, evaluate
 from polcap.synth.scenes import with_textures
 
 VIEW = View(focal=160.0, center=(47.5, 35.5), scale=1.0)
@@ -48,7 +49,7 @@ def test_the_shadow_lies_where_lines_to_the_flash_meet_the_ball(model: Model, ki
     scene = replace(BALL, light=(0.3, 0.0, 0.0), **({"shape": model} if kind == "mesh" else {}))
     bright = render.stokes(scene, VIEW, X, Y)[0, ..., 0]
     dark = render.stokes(replace(scene, cast_shadows=True), VIEW, X, Y)[0, ..., 0]
-    v = render.view_rays(VIEW, X, Y)
+    v = frames.rays_at(VIEW, X, Y)
     wall = -v * (scene.backdrop / v[..., 2])[..., None]
     light, middle = np.array(scene.light), np.array(scene.position)
     way = (light - wall) / np.linalg.norm(light - wall, axis=-1, keepdims=True)
@@ -100,7 +101,7 @@ def test_a_texture_set_gives_colour_roughness_and_relief(texture: Path) -> None:
     diffuse, _, roughness, _ = evaluate(coat, position, facing)
     np.testing.assert_allclose(diffuse, [[0, 0, 0.503]] * 2, atol=0.02)  # sRGB 188
     np.testing.assert_allclose(roughness, 0.4, atol=0.01)
-    bent = relieved(coat, position, facing)
+    bent = add_relief(coat, position, facing)
     assert bent[0, 0] < -0.02 and bent[1, 0] > 0.02  # up the ramp, and down its mirror image
     np.testing.assert_allclose(bent[:, 1], 0, atol=0.02)
 

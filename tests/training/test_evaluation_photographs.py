@@ -12,7 +12,7 @@ from polcap.images import Floats
 from polcap.optics import fresnel
 from polcap.pipeline import models
 from polcap.training import evaluation_photographs
-from tests.fake_network import run
+from tests import fake_network
 from tests.stages.infer.test_infer import network
 
 SIZE, RADIUS = 160, 60
@@ -43,7 +43,7 @@ def _write(file: Path, picture: Floats) -> None:
 
 def test_a_ball_in_this_layout_is_scored(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(models, "open_network", lambda path: network())
-    monkeypatch.setattr(onnx, "run", run)
+    monkeypatch.setattr(onnx, "run", fake_network.run)
     table = evaluation_photographs.main(folder, Path("model.onnx"), tmp_path)
     # the lens is not stated, 50 mm is assumed: rays of the ball's side are off by 13°
     assert table["analytic"]["mean"] < 9 and table["analytic"]["covered"] > 0.97

@@ -63,7 +63,8 @@ def test_bodies_of_the_second_protocol_polarize_as_rough_ones(made: Protocol, te
         assert np.array_equal(smooth.truth.roughness, rough.truth.roughness)
         local = frames.to_ray_frame(smooth.truth.normal, smooth.clean.rays)
         law = evaluation_protocol.body_law(number)
-        expected = law.kept * body.dolp(np.maximum(local[..., 2], 0.1), smooth.truth.roughness**2, 1.5, law.local)
+        alpha = smooth.truth.roughness**2
+        expected = law.dolp_factor * body.dolp(np.maximum(local[..., 2], 0.1), alpha, 1.5, law.local)
         expected = expected / fresnel.diffuse_dolp(np.maximum(local[..., 2], 0.1), 1.5)
         tilted = smooth.truth.mask & (smooth.clean.dolp > 0.03) & (local[..., 2] > 0.3)
         found = rough.clean.dolp[tilted] / smooth.clean.dolp[tilted]

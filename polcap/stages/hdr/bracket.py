@@ -129,7 +129,7 @@ class _BracketSignals:
         self._iso = [frame.exif.iso or f"frame {e}" for e, frame in enumerate(self.frames)]
         still = read(self.frames[self.reference])
         self.raw_px = still.superpixel  # of one pixel
-        self._rounding = sensor.rounding(still) / 2  # variance of a binned green
+        self._rounding = sensor.rounding_variance(still) / 2  # variance of a binned green
         self.ambient = ambient_light(bracket, lines, read)
 
     def signals(self, e: int) -> Signals:
@@ -240,7 +240,7 @@ def ambient_light(bracket: Bracket, lines: noise.Lines, read: Reader, full: bool
         iso = frame.exif.iso or "ambient"
         if not lines.knows(iso):
             lines.learn(iso, noise.alone(signals(image, read.clip)))
-        line = lines.line(iso, sensor.rounding(image) / 2)
+        line = lines.line(iso, sensor.rounding_variance(image) / 2)
         level = np.stack([cv2.blur(plane, (5, 5)) for plane in value]) * np.float32(one)
         variance += noise.of_pixels(level, line, image.cfa if full else None) / np.float32(sum(share) ** 2)
     return AmbientLight(value, variance)

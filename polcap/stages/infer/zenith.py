@@ -119,7 +119,7 @@ def candidate_laws(ior: float) -> DiffuseLaws:
                 rows.append((alpha, even, loss, prior, np.maximum.accumulate(left * minus / plus)))
     plus, _ = body.leaving(cosine, 0.0, ior)
     shading = np.log(np.maximum(cosine * plus * plus, 1e-4))
-    flatter = np.log(body.flatter(cosine, cosine, np.ones_like(cosine), _FLAT + 0 * cosine))
+    flatter = np.log(body.flattening(cosine, cosine, np.ones_like(cosine), _FLAT + 0 * cosine))
     alphas, factors, losses, priors, dolps = (np.array(column) for column in zip(*rows))
     return DiffuseLaws(alphas, factors, losses, priors, dolps, shading, flatter)
 

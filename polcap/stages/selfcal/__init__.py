@@ -21,7 +21,7 @@ from polcap import parallel
 from polcap.errors import CaptureError
 from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Gains, ObjectMask, RingZero, SelfCalibration
 from polcap.optics import frames
-from polcap.optics.outline import Rim
+from polcap.optics.outline import OutlineBand
 from polcap.stages import stage
 from polcap.stages.selfcal import angles, crossed_light, grey_patches, integrability, object_gains, ring_zero
 from polcap.stages.selfcal.grey_patches import GreyPatches
@@ -172,7 +172,9 @@ def _prior(radiance: AngleStack) -> float:
     return _PRIOR[radiance.equipment.light]
 
 
-def _find_angles(rim: Rim, even: ObjectShots, gain_sigma: float, settings: SelfcalSettings) -> tuple[Floats, float]:
+def _find_angles(
+    band: OutlineBand, even: ObjectShots, gain_sigma: float, settings: SelfcalSettings
+) -> tuple[Floats, float]:
     """Angles (K,) rad that nobody noted, and their 1σ, of shots without their gains."""
     shots = len(even.light)
     otherwise = "or note the angles, and --set selfcal.unknown_angles=false"
@@ -184,7 +186,7 @@ def _find_angles(rim: Rim, even: ObjectShots, gain_sigma: float, settings: Selfc
             f"the light of the shots is {known}; to find unknown angles it must be known to {100 * _MOST_GAIN:g} %: "
             f"put a color chart next to the object, {otherwise}"
         )
-    found = angles.find(rim, *object_gains.cells(even.light, even.inside))
+    found = angles.find(band, *object_gains.cells(even.light, even.inside))
     sigma = float(np.degrees(found.sigma))
     if sigma > settings.max_unknown_sigma_deg:
         raise CaptureError(

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Floats, OutlineCheck, ShotOrder, TurnedShot
 from polcap.optics import mueller, outline
-from polcap.optics.outline import Rim
+from polcap.optics.outline import OutlineBand
 from polcap.optics.robust import biweight, jackknife, spread
 from polcap.stages.selfcal.object_gains import ObjectShots
 
@@ -59,7 +59,7 @@ _INSIDE = 0.0001  # the same of the inside: interpolation and gains
 _FLOOR = np.radians(0.3)  # 1σ; where all sides agree (200 simulated cases)
 
 
-def rim(shots: ObjectShots) -> Rim:
+def rim(shots: ObjectShots) -> OutlineBand:
     """The band inside the object's outline; where the object leaves the picture its outline is no contour of shape."""
     mask, (x0, y0, x1, y1), (height, width) = shots.mask, shots.crop, shots.full
     depth = outline.depth(mask)
@@ -70,7 +70,7 @@ def rim(shots: ObjectShots) -> Rim:
     band[mask.shape[0] - max(0, y1 - (height - _EDGE_PX)) :] = False
     band[:, mask.shape[1] - max(0, x1 - (width - _EDGE_PX)) :] = False
     light = np.asarray(shots.light[:, band], np.float64)
-    return Rim(light, np.arctan2(outward[1], outward[0])[band], outline.sectors(band))
+    return OutlineBand(light, np.arctan2(outward[1], outward[0])[band], outline.sectors(band))
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class OrderFit:
     best_score: float
 
 
-def check_order(at: Rim, angle: Floats, margin: float, least_score: float) -> OrderFit:
+def check_order(at: OutlineBand, angle: Floats, margin: float, least_score: float) -> OrderFit:
     """The order and sense of the stated angles (K,) rad that the rim supports.
 
     Another order must score `least_score` or more, and `margin` more than the stated one.
@@ -91,7 +91,7 @@ def check_order(at: Rim, angle: Floats, margin: float, least_score: float) -> Or
     if at.light.shape[1] == 0:
         return OrderFit(OutlineCheck(stated, 0.0), 0.0, 0.0)
     total, weight = outline.phasor(at, angle)
-    mean, _ = outline.mean_and_doubt(total, weight)
+    mean, _ = outline.mean_and_sigma(total, weight)
     along = (total * np.exp(-1j * np.angle(mean))).real
     here = _misfit(at, angle)
     best, best_score = stated, abs(mean)
@@ -138,7 +138,7 @@ def _exchanged(shots: int) -> list[tuple[int, ...]]:
     return found
 
 
-def _misfit(at: Rim, angle: Floats) -> float:
+def _misfit(at: OutlineBand, angle: Floats) -> float:
     """Median relative residual of more than three shots; 1 for three, which always fit."""
     if len(angle) < 4:
         return 1.0
@@ -269,7 +269,7 @@ class FoundAngles:
     sigma: float  # rad, 1σ of each; π/2 where nothing is known
 
 
-def find(at: Rim, cells: Floats, row: NDArray[np.int_]) -> FoundAngles:
+def find(at: OutlineBand, cells: Floats, row: NDArray[np.int_]) -> FoundAngles:
     """The angles that outline and inside support together, of four or more shots without their gains.
 
     cells (K, P) are means of small blocks of the inside, row (P,) the row of each; neighbors share their errors. The
@@ -304,7 +304,7 @@ def find(at: Rim, cells: Floats, row: NDArray[np.int_]) -> FoundAngles:
     return FoundAngles(angle % np.pi, min(float(np.sqrt(_FLOOR**2 + variance.max() + elsewhere**2)), np.pi / 2))
 
 
-def _by_direction(at: Rim) -> tuple[Floats, Floats]:
+def _by_direction(at: OutlineBand) -> tuple[Floats, Floats]:
     """Light of the outline summed over bins of its direction, (B, K), and those directions (B,) rad."""
     number = np.floor(at.azimuth / (2 * np.pi) * _BINS).astype(int) % _BINS
     light = np.stack([np.bincount(number, shot, _BINS) for shot in at.light], axis=1).astype(np.float64)

@@ -41,7 +41,7 @@ def measure(
     sound = warp(flags, alignment.crossed, shots.crop, order=1) == 0
     solve = np.linalg.pinv(mueller.analyzer(angle))
     s0, s1, s2 = np.einsum("jk,khwc->jhwc", solve, shots.value / gain[:, None, None])
-    across = crossing.polarized(s1, s2, radiance.crossed.angle)
+    across = crossing.polarization_along(s1, s2, radiance.crossed.angle)
     inside = shots.mask & (shots.quality == 0) & sound
     share = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), _BLUR_PX)
     whole, crossed = (

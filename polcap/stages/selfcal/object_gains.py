@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from polcap import parallel
 from polcap.images import Alignment, AngleStack, Bits, Bools, Floats, ObjectMask, Quality
 from polcap.optics import frames, mueller
-from polcap.optics.outline import Rim
+from polcap.optics.outline import OutlineBand
 from polcap.optics.robust import biweight, jackknife, spread
 from polcap.optics.warp import warp
 
@@ -141,7 +141,7 @@ def closure(light: Floats, usable: Bools, angle: Floats) -> GainEstimate:
     return _null_vector(equations, angle, part, _CLOSURE_ERROR)
 
 
-def outline(rim: Rim, angle: Floats) -> GainEstimate:
+def outline(rim: OutlineBand, angle: Floats) -> GainEstimate:
     """Gains (K,) for which the polarization of the rim points across the contour; its light includes the gains."""
     shots = len(angle)
     parts = np.unique(rim.sector)

@@ -82,7 +82,7 @@ def solve(
     _check_condition(analyzers, calibration.angle - calibration.ring.correction)
     lens = radiance.equipment.distortion if settings.undistort else None
     height, width = radiance.value.shape[1:3]
-    crop = object_.crop if lens is None else distortion.box_of(lens, object_.crop, (width, height))
+    crop = object_.crop if lens is None else distortion.pinhole_box(lens, object_.crop, (width, height))
     x0, y0, x1, y1 = crop
     shots = _Shots(radiance, alignment.transform, calibration.gains.gain, lens)
     stokes, covariance, quality, residual = _solve_in_blocks(shots, analyzers, crop, settings)
@@ -166,8 +166,8 @@ def _body(
         return None
     picture, factor = crossed.picture, factor.astype(np.float32)
     clipped = (seen & np.uint8(Quality.CLIPPED)) > 0  # polarization is unknown there, and small: it faces the camera
-    across = np.where(clipped[..., None], 0, crossing.polarized(stokes[1], stokes[2], crossed.angle))
-    value = crossing.body_light(_resampled(shots, picture.value, transform, crop) * factor, across)
+    across = np.where(clipped[..., None], 0, crossing.polarization_along(stokes[1], stokes[2], crossed.angle))
+    value = crossing.diffuse_light(_resampled(shots, picture.value, transform, crop) * factor, across)
     variance = np.maximum(warp(picture.variance, transform, crop, 1, shots.lens), _LEAST_VARIANCE) * factor**2
     quality: Bits = np.zeros(value.shape[:2], np.uint8)
     _add_flags(quality, _flagged(picture.quality), transform, crop, shots.lens)

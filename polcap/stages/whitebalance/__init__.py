@@ -109,7 +109,7 @@ def measure(
         patches=PatchColors(
             delta_e=fit.delta_e,
             use=found.seen.use,
-            predicted=patches.predicted(found.seen, edition),
+            predicted=patches.cross_validate(found.seen, edition),
             falloff=(float(fit.slope[0]), float(fit.slope[1])),
             glare=fit.glare,
             edition=edition.name,

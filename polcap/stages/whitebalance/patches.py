@@ -65,7 +65,7 @@ def fit(samples: PatchSamples, reference: ChartReference) -> ChartFit:
     """
     seen, use = samples.color, samples.use
     _check(use)
-    error = color.fitting(seen, reference.rec709, position(), use == PatchUse.USED)
+    error = color.trimmed_residuals(seen, reference.rec709, position(), use == PatchUse.USED)
     odd = error > max(_LEAST_ODD, _ODD * float(np.median(error[use == PatchUse.USED])))
     use = np.where((use == PatchUse.USED) & odd, PatchUse.ODD, use).astype(np.uint8)
     if (use == PatchUse.USED).sum() < _LEAST:  # no matrix suits most of them: then all count
@@ -75,10 +75,10 @@ def fit(samples: PatchSamples, reference: ChartReference) -> ChartFit:
     return ChartFit(found, use, float(np.nanmean(every)), seen)
 
 
-def predicted(found: ChartFit, reference: ChartReference) -> Floats | None:
+def cross_validate(found: ChartFit, reference: ChartReference) -> Floats | None:
     """ΔE2000 (24,) of each patch by the matrix of all others; None where too few are left for that."""
     used = found.use == PatchUse.USED
-    return color.predicted(found.color, reference.rec709, position(), used) if used.sum() > _LEAST else None
+    return color.cross_validate(found.color, reference.rec709, position(), used) if used.sum() > _LEAST else None
 
 
 def residual(found: ChartFit, reference: ChartReference) -> float:

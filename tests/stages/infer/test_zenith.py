@@ -82,7 +82,7 @@ def test_real_balls_are_read_within_2_degrees(which: str, shading: str) -> None:
     cues, truth = ball(measured, 0.27, chequered() if shading == "chequered" else 0.4)
     if shading == "flat":
         cosine = np.cos(truth)
-        flatter = body.flatter(cosine, cosine, np.ones_like(cosine), 0.15 + 0 * cosine)
+        flatter = body.flattening(cosine, cosine, np.ones_like(cosine), 0.15 + 0 * cosine)
         cues = replace(cues, radiance=(cues.radiance * flatter[..., None]).astype(np.float32))
     found = bias_deg(estimate_zenith(cues.dolp, cues, 1.5).angle, truth, cues.mask)
     smooth = bias_deg(np.arccos(fresnel.cos_zenith_from_dolp(cues.dolp.astype(float), 1.5)), truth, cues.mask)

@@ -8,7 +8,7 @@ import pytest
 from polcap.errors import CaptureError
 from polcap.images import Equipment, ShotOrder
 from polcap.optics import mueller
-from polcap.optics.outline import Rim
+from polcap.optics.outline import OutlineBand
 from polcap.stages import selfcal, stokes
 from polcap.stages.selfcal import angles as angles_
 from tests import scenes
@@ -59,7 +59,7 @@ def test_angles_counted_clockwise_are_refused():
 def test_an_outline_without_information_supports_no_order(sectors):
     """Unpolarized all round, or visible at one place only: its scatter is unknown."""
     wave = 0.2 * (sectors == 1) * np.cos(2 * np.radians([[0], [60], [120]]))
-    rim = Rim(1.0 + wave + np.zeros((3, 240)), np.zeros(240), np.arange(240) % sectors)
+    rim = OutlineBand(1.0 + wave + np.zeros((3, 240)), np.zeros(240), np.arange(240) % sectors)
     found = angles_.check_order(rim, np.radians([0.0, 60.0, 120.0]), 0.2, 0.25).check
     assert found.as_stated
     # an axis along x is its own mirror image
@@ -139,5 +139,5 @@ def test_unknown_angles_that_cannot_be_found_are_refused(shots, light, most_deg,
 
 
 def test_without_an_outline_angles_stay_unknown():
-    rim = Rim(np.zeros((4, 0)), np.zeros(0), np.zeros(0, int))
+    rim = OutlineBand(np.zeros((4, 0)), np.zeros(0), np.zeros(0, int))
     assert angles_.find(rim, np.ones((4, 100)), np.zeros(100, int)).sigma == np.pi / 2
