@@ -17,9 +17,9 @@ from msgspec import Meta
 from polcap.errors import SettingError, StorageError
 from polcap.formats import text_file
 from polcap.quality.limits import GateLimits
-from polcap.stages.align import Settings as Align
+from polcap.stages.align import AlignSettings
 from polcap.stages.asset import AssetSettings
-from polcap.stages.hdr import Settings as Hdr
+from polcap.stages.hdr import HdrSettings
 from polcap.stages.infer import InferSettings
 from polcap.stages.mask import MaskSettings
 from polcap.stages.selfcal import SelfcalSettings
@@ -35,9 +35,9 @@ _BARE_POINT = re.compile(r"(?<![\w.])\.(?=\d)")  # of a number written without i
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Every setting of a run."""
 
-    hdr: Hdr = Hdr()
+    hdr: HdrSettings = HdrSettings()
     whitebalance: WhitebalanceSettings = WhitebalanceSettings()
-    align: Align = Align()
+    align: AlignSettings = AlignSettings()
     mask: MaskSettings = MaskSettings()
     selfcal: SelfcalSettings = SelfcalSettings()
     stokes: StokesSettings = StokesSettings()

@@ -48,7 +48,7 @@ from polcap.stages.hdr.planes import Reader, same_size
 _LEAST_PX = 48  # of a merged picture's side: tiles of noise, and registration at a quarter of the size
 
 
-class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class HdrSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How brackets are merged."""
 
     clip: Annotated[float, Meta(ge=0.5, le=1.0, description="counts from here on are clipped [white level]")] = 0.98
@@ -65,7 +65,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @stage(version=11)
-def merge(capture: Capture, decode: Decode, settings: Settings) -> AngleStack:
+def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack:
     """Radiance of every shot on the scale of its reference frame.
 
     The reference frame is the one of middle brightness in the first shot, and of the same index in every
@@ -86,7 +86,7 @@ def merge(capture: Capture, decode: Decode, settings: Settings) -> AngleStack:
         read.close()
 
 
-def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
+def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
     shots, first = capture.shots, capture.shots[0]
     read.plan = _memory_plan(capture, read(first.frames[0]), settings)
     order = _by_brightness(first, read)
@@ -145,7 +145,7 @@ def _check_counts(shots: tuple[Shot, ...]) -> None:
             )
 
 
-def _memory_plan(capture: Capture, image: SensorImage, settings: Settings) -> planes.MemoryPlan:
+def _memory_plan(capture: Capture, image: SensorImage, settings: HdrSettings) -> planes.MemoryPlan:
     """Memory to hold, by the first frame's size; a binned mosaic's pixels are a quarter of its photosites."""
     height, width = image.value.shape[:2]
     pixels = height * width // (4 if image.cfa is not None and settings.demosaic == "superpixel" else 1)
@@ -172,7 +172,7 @@ def _middle(order: tuple[int, ...]) -> int:
     return order[(len(order) - 1) // 2]
 
 
-def _check_grid(frame: Frame, image: SensorImage, settings: Settings) -> None:
+def _check_grid(frame: Frame, image: SensorImage, settings: HdrSettings) -> None:
     """Raises CaptureError where the sensor cannot be interpolated as asked, or has too few pixels."""
     (height, width), side = image.value.shape[:2], image.superpixel
     if settings.demosaic == "full" and side == 3:
@@ -186,13 +186,13 @@ def _check_grid(frame: Frame, image: SensorImage, settings: Settings) -> None:
         )
 
 
-def _sensor(capture: Capture, image: SensorImage, settings: Settings) -> ColorSensor:
+def _sensor(capture: Capture, image: SensorImage, settings: HdrSettings) -> ColorSensor:
     """The sensor by its first shot's reference frame."""
     binned = image.cfa is not None and settings.demosaic == "superpixel" and capture.layout != "sensor"
     return ColorSensor(image.camera_matrix, image.white_balance, image.site_px if binned else None)
 
 
-def _view(capture: Capture, image: SensorImage, settings: Settings) -> View:
+def _view(capture: Capture, image: SensorImage, settings: HdrSettings) -> View:
     """The pinhole camera on the grid of the merge, whose pixel (0, 0) lies in the middle of a superpixel."""
     scale = 1.0 if settings.demosaic == "full" else float(image.superpixel)
     x, y = capture.principal_px
@@ -208,7 +208,7 @@ def _empty(shots: int, shape: tuple[int, int, int]) -> MaskedImage:
 
 
 def _weigh(
-    shot: Shot, order: tuple[int, ...], lines: noise.Lines, read: Reader, settings: Settings
+    shot: Shot, order: tuple[int, ...], lines: noise.Lines, read: Reader, settings: HdrSettings
 ) -> weights.WeightedFrames:
     """The frames of a shot, compared in an order and ready to be summed."""
     bracket = Bracket(shot, order, _middle(order))
@@ -218,7 +218,7 @@ def _weigh(
 
 
 def _crossed(
-    shot: Shot, shape: tuple[int, int, int], lines: noise.Lines, read: Reader, settings: Settings
+    shot: Shot, shape: tuple[int, int, int], lines: noise.Lines, read: Reader, settings: HdrSettings
 ) -> MaskedImage:
     """The crossed shot merged like the others, on the scale of its own middle frame: its flash has another power."""
     weighted = _weigh(shot, _by_brightness(shot, read), lines, read, settings)
@@ -232,7 +232,7 @@ def _crossed(
 
 
 def _divide_by_falloff(
-    capture: Capture, view: View, stack: MaskedImage, crossed: MaskedImage | None, settings: Settings
+    capture: Capture, view: View, stack: MaskedImage, crossed: MaskedImage | None, settings: HdrSettings
 ) -> None:
     """Divide all shots by the lens's light, in place, where it was calibrated."""
     light = None if capture.calibration is None else capture.calibration.falloff
