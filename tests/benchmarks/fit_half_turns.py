@@ -7,8 +7,8 @@ rough law. Added to them are six pictures for each of --sixths: training meshes 
 
 The cut is made with half, the usual and twice the weight of the network, for more regions to learn from. A region
 counts by what turning it changes of the mean normal error, 0.5° at most, over the root of the regions of its picture;
-cells of the inversion count alike. Then the odds are scaled so that the doubt is likeliest when each region counts by all
-that it costs. Prints both laws, and what the accepted regions gain and lose.
+cells of the inversion count alike. Then the odds are scaled until the doubt is likeliest where each region counts by
+its whole error. Prints both laws, and what the accepted regions gain and lose.
 """
 
 import argparse
