@@ -104,6 +104,44 @@ def test_a_files_name_is_unique_in_the_house() -> None:
     assert sorted(names) == sorted(set(names))
 
 
+def test_a_class_name_is_unique_in_the_house() -> None:
+    homes: dict[str, list[str]] = {}
+    for name, file in MODULES.items():
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                homes.setdefault(node.name, []).append(name)
+    assert {name: found for name, found in homes.items() if len(found) > 1} == {}
+
+
+def test_a_stage_folder_has_at_most_seven_files() -> None:
+    folders = {file.parent for name, file in MODULES.items() if name.startswith("polcap.stages.")}
+    counts = {folder.name: len([*folder.glob("*.py")]) - 1 for folder in folders}
+    assert {name: count for name, count in counts.items() if count > 7} == {}
+
+
+MOST_LINES, MOST_PARAMETERS = 60, 7  # of a function, its docstring not counted
+LARGE = {  # functions beyond that, and why
+    "polcap.api.process": "the options of `polcap process`, by keyword",
+    "polcap.formats.raw.dng.write": "the tags of a DNG, by keyword",
+    "polcap.optics.shade.stokes": "geometry, material and light of each pixel; training calls it with tensors",
+    "polcap.quality.gate.at_most": "the fields of a gate",
+}
+
+
+def test_functions_are_of_human_size() -> None:
+    """Commands declare an option per parameter, so they are not counted."""
+    large = {}
+    for name, file in MODULES.items():
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.FunctionDef) or name.startswith("polcap.cli."):
+                continue
+            doc = ast.get_docstring(node, clean=False)
+            lines = node.end_lineno - node.lineno + 1 - (doc.count("\n") + 1 if doc else 0)
+            if lines > MOST_LINES or len(parameters(node)) > MOST_PARAMETERS:
+                large[f"{name}.{node.name}"] = (lines, len(parameters(node)))
+    assert large.keys() == LARGE.keys(), large
+
+
 def test_stages_stand_in_the_order_of_the_path() -> None:
     from polcap import stages
     from polcap.pipeline.path import STAGES

@@ -1,7 +1,6 @@
-"""In: units and the address of a Dask scheduler. Out: their records (extra [batch]).
+"""Batch processing on a Dask cluster (extra [batch]).
 
-A worker that is lost takes nothing with it: the scheduler gives its capture to another, which goes on from the
-stages that are stored.
+If a worker is lost, the scheduler passes its capture to another one, which continues from the stage cache.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -10,47 +9,52 @@ from typing import Any
 from polcap.batch import unit as units
 from polcap.batch import worker_start
 from polcap.batch.processes import prepare
-from polcap.batch.unit import Order, Record, Unit
+from polcap.batch.unit import ProcessOptions, Unit, UnitRecord
 from polcap.errors import SettingError
 
 _LOCAL = "local"
-_SETTINGS = {  # each of what Dask does beside the work takes its time from a core that works
-    "distributed.worker.profile.enabled": False,  # looks into each thread every 10 ms: 6 % of small captures
-    "distributed.admin.tick.interval": "1s",  # by default a look at the clock every 20 ms
+_SETTINGS = {  # less background work of Dask, which shares the cores with the captures
+    "distributed.worker.profile.enabled": False,  # samples every thread every 10 ms; 6 % of a small capture's time
+    "distributed.admin.tick.interval": "1s",  # by default 20 ms
     "distributed.admin.tick.limit": "30s",
-    "distributed.nanny.pre-spawn-environ": {  # without MALLOC_TRIM_THRESHOLD_, which fetches every array's pages anew
+    "distributed.nanny.pre-spawn-environ": {  # without MALLOC_TRIM_THRESHOLD_, which slows down every large array
         "OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS": 1,
     },
     "distributed.worker.multiprocessing-method": worker_start.method(),
 }  # fmt: skip
 
 
-def begin(address: str) -> None:
-    """Have what workers of this machine need imported, while the caller imports what it needs itself."""
+def preload(address: str) -> None:
+    """Start importing the modules of local workers in the background."""
     if address == _LOCAL:
-        worker_start.begin("distributed")
+        worker_start.preload("distributed")
 
 
 def run(
-    wanted: Sequence[Unit], order: Order, address: str, workers: int, retries: int, tell: Callable[[str], None]
-) -> Iterator[Record]:
-    """Records in the order in which units end.
+    wanted: Sequence[Unit],
+    options: ProcessOptions,
+    address: str,
+    workers: int,
+    retries: int,
+    print_line: Callable[[str], None],
+) -> Iterator[UnitRecord]:
+    """Records of the units, in the order in which they end.
 
-    `address` is that of a running scheduler, as tcp://host:8786, whose workers see the same folders; `local`
-    starts one with `workers` processes here. With device cuda a unit asks for the resource GPU.
+    `address` names a running scheduler, for example tcp://host:8786, and its workers must see the same folders;
+    `local` starts one with `workers` processes on this machine. With device cuda a unit requests the resource GPU.
 
     Raises
     ------
     SettingError
-        Dask is not installed, or nobody answers at that address.
+        Dask is not installed, or no scheduler answers at the address.
     """
-    begin(address)
+    preload(address)
     try:
         import dask
         import distributed
     except ModuleNotFoundError as error:
         raise SettingError(f"{error.name} is not installed; pip install 'polcap[batch]'") from error
-    resources = {"GPU": 1.0} if order.device == "cuda" else None
+    resources = {"GPU": 1.0} if options.device == "cuda" else None
     with dask.config.set({"distributed.scheduler.allowed-failures": retries, **_SETTINGS}):
         try:
             target: Any = address
@@ -62,8 +66,8 @@ def run(
         except (OSError, TimeoutError, ValueError) as error:
             raise SettingError(f"--scheduler {address}: no scheduler answers there ({error}); start one") from error
         try:
-            tell(f"dashboard {client.dashboard_link}")
-            yield from _gather(client, wanted, order, resources, retries)
+            print_line(f"dashboard {client.dashboard_link}")
+            yield from _gather(client, wanted, options, resources, retries)
         finally:
             client.close()
             if address == _LOCAL:
@@ -71,23 +75,23 @@ def run(
 
 
 def _gather(
-    client: Any, wanted: Sequence[Unit], order: Order, resources: dict[str, float] | None, retries: int
-) -> Iterator[Record]:
+    client: Any, wanted: Sequence[Unit], options: ProcessOptions, resources: dict[str, float] | None, retries: int
+) -> Iterator[UnitRecord]:
     import distributed
 
     attempts = dict.fromkeys(wanted, 1)
-    client.run(prepare, order)  # those that join later work with what they were started with
-    doing = {client.submit(units.run, unit, order, pure=False, resources=resources): unit for unit in wanted}
-    landing = distributed.as_completed(list(doing))
-    for future in landing:
-        unit = doing.pop(future)
+    client.run(prepare, options)  # workers that join later use the settings they were started with
+    running = {client.submit(units.run, unit, options, pure=False, resources=resources): unit for unit in wanted}
+    ended = distributed.as_completed(list(running))
+    for future in ended:
+        unit = running.pop(future)
         if future.status == "finished":
             yield future.result()
-        elif attempts[unit] <= retries:  # its workers died, or it could not be sent
+        elif attempts[unit] <= retries:  # its worker died, or it could not be sent
             attempts[unit] += 1
-            again = client.submit(units.run, unit, order, attempts[unit], pure=False, resources=resources)
-            doing[again] = unit
-            landing.add(again)
+            again = client.submit(units.run, unit, options, attempts[unit], pure=False, resources=resources)
+            running[again] = unit
+            ended.add(again)
         else:
-            why = f"lost with its workers ({future.exception()}); give them more memory, or take it out of the batch"
-            yield units.crashed(unit, " ".join(why.split()), attempts[unit])
+            message = f"its workers died ({future.exception()}); give them more memory, or remove it from the batch"
+            yield units.crashed(unit, " ".join(message.split()), attempts[unit])

@@ -60,7 +60,7 @@ class BatchJob:
 
 
 def batch_command(root: Path, options: Mapping[str, Any]) -> tuple[str, ...]:
-    """`polcap batch ROOT …` with the given options, named as in `cli.batch_command`."""
+    """`polcap batch ROOT …` with its options, named as in `cli.batch_command`."""
     words = ["polcap", "batch", str(root.resolve())]
     for name, value in options.items():
         if name == "keep_going":
@@ -80,7 +80,7 @@ def batch_command(root: Path, options: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def submit_hint(scheduler: Scheduler, file: Path) -> str:
-    """How a user hands the job file to the scheduler."""
+    """Instruction to submit the job file."""
     return _SUBMIT[scheduler].format(file=shlex.quote(str(file)), literal=repr(str(file)))
 
 
@@ -118,7 +118,7 @@ def _command(scheduler: Scheduler, job: BatchJob) -> str:
         return _json(job.shell("{{Task.Param.Shard}}/" + str(job.shards)))
     if scheduler == "opencue":  # it replaces #IFRAME# by the frame number, here the shard
         return escape(f"/bin/sh -c {shlex.quote(job.shell(f'#IFRAME#/{job.shards}'))}")
-    if scheduler == "snakemake":  # braces are its placeholders: only that of the shard stays single
+    if scheduler == "snakemake":  # braces are its placeholders, so all but the shard's are doubled
         before, _, after = job.shell("@/" + str(job.shards)).replace("{", "{{").replace("}", "}}").rpartition("@/")
         return _json(f"{before}{{wildcards.k}}/{after}")
     return job.shell() if scheduler == "slurm" else _json(job.shell())

@@ -1,4 +1,4 @@
-"""In: units. Out: their records, from processes of this machine that are replaced when one of them dies."""
+"""Batch processing in several processes of this machine; a process that dies is replaced."""
 
 import os
 import signal
@@ -11,100 +11,101 @@ from typing import Any
 from polcap import resource_limits
 from polcap.batch import unit as units
 from polcap.batch import worker_start
-from polcap.batch.unit import Order, Record, Unit
+from polcap.batch.unit import ProcessOptions, Unit, UnitRecord
+
+_DIED = (
+    "its process died {attempts} times, most often from lack of memory; run fewer --workers, lower --memory, "
+    "or remove it from the batch"
+)
 
 
 @dataclass
-class _Hand:
-    """A child process and what it is busy with."""
+class _BatchProcess:
+    """A child process, its pipe and its current unit."""
 
     process: Any
     pipe: connection.Connection
-    busy: tuple[Unit, int] | None = None  # with the number of the attempt
+    busy: tuple[Unit, int] | None = None  # with the attempt's number
 
     @staticmethod
-    def start(order: Order) -> "_Hand":
+    def start(options: ProcessOptions) -> "_BatchProcess":
         context = worker_start.context()
         here, there = context.Pipe()
-        process = context.Process(target=_serve, args=(there, order, dict(os.environ)), daemon=False)
+        process = context.Process(target=_serve, args=(there, options, dict(os.environ)), daemon=False)
         process.start()
         there.close()
-        return _Hand(process, here)
+        return _BatchProcess(process, here)
 
-    def give(self, unit: Unit, attempt: int) -> None:
+    def send(self, unit: Unit, attempt: int) -> None:
         self.busy = unit, attempt
         self.pipe.send((unit, attempt))
 
     def stop(self) -> None:
-        self.pipe.close()  # an idle child ends of itself
+        self.pipe.close()  # an idle child then ends
         if self.busy:
             self.process.terminate()
         self.process.join()
 
 
-def run(wanted: Sequence[Unit], order: Order, workers: int, retries: int) -> Iterator[Record]:
-    """Records in the order in which units end; a unit that kills its process is tried `retries` times more."""
-    worker_start.begin()
+def run(wanted: Sequence[Unit], options: ProcessOptions, workers: int, retries: int) -> Iterator[UnitRecord]:
+    """Records of the units, in the order in which they end; if its process dies, a unit is retried `retries` times."""
+    worker_start.preload()
     queue = deque((unit, 1) for unit in wanted)
-    hands = [_Hand.start(order) for _ in range(min(workers, len(wanted)))]
+    children = [_BatchProcess.start(options) for _ in range(min(workers, len(wanted)))]
     try:
-        for hand in hands:
-            hand.give(*queue.popleft())
-        while busy := [hand for hand in hands if hand.busy]:
-            heard = connection.wait([item for hand in busy for item in (hand.pipe, hand.process.sentinel)])
-            for hand in busy:
-                if hand.pipe not in heard and hand.process.sentinel not in heard:
+        for child in children:
+            child.send(*queue.popleft())
+        while busy := [child for child in children if child.busy]:
+            ready = connection.wait([item for child in busy for item in (child.pipe, child.process.sentinel)])
+            for child in busy:
+                if child.pipe not in ready and child.process.sentinel not in ready:
                     continue
-                record = _answer(hand)
+                record = _answer(child)
                 if record is None:
-                    assert hand.busy is not None
-                    unit, attempt = hand.busy
-                    hand.busy = None
-                    hand.stop()
-                    hands[hands.index(hand)] = hand = _Hand.start(order)
+                    assert child.busy is not None
+                    unit, attempt = child.busy
+                    child.busy = None
+                    child.stop()
+                    children[children.index(child)] = child = _BatchProcess.start(options)
                     if attempt <= retries:
                         queue.append((unit, attempt + 1))
                     else:
-                        yield units.crashed(unit, _cause_of_death(attempt), attempt)
+                        yield units.crashed(unit, _DIED.format(attempts=attempt), attempt)
                 else:
-                    hand.busy = None
+                    child.busy = None
                     yield record
                 if queue:
-                    hand.give(*queue.popleft())
+                    child.send(*queue.popleft())
     finally:
-        for hand in hands:
-            hand.stop()
+        for child in children:
+            child.stop()
 
 
-def _answer(hand: _Hand) -> Record | None:
+def _answer(child: _BatchProcess) -> UnitRecord | None:
     try:
-        return hand.pipe.recv() if hand.pipe.poll() else None
+        return child.pipe.recv() if child.pipe.poll() else None
     except (EOFError, OSError):
         return None
 
 
-def _cause_of_death(attempts: int) -> str:
-    return (
-        f"its process died {attempts} times; most often memory runs out: run fewer --workers, lower --memory, "
-        "or take it out of the batch"
-    )
+def _serve(pipe: connection.Connection, options: ProcessOptions, environment: dict[str, str]) -> None:
+    """Main function of a child: process units until the pipe closes.
 
-
-def _serve(pipe: connection.Connection, order: Order, environment: dict[str, str]) -> None:
-    """Work until the pipe closes; in the child, which may come of a server that began in another environment."""
+    The environment is set first, because the child may be forked from an older server process.
+    """
     os.environ.clear()
     os.environ.update(environment)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    prepare(order)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
+    prepare(options)
     while True:
         try:
             unit, attempt = pipe.recv()
         except (EOFError, OSError):
             return
-        pipe.send(units.run(unit, order, attempt))
+        pipe.send(units.run(unit, options, attempt))
 
 
-def prepare(order: Order) -> None:
-    """Threads and memory of this process."""
-    resource_limits.set_threads(order.threads)
-    resource_limits.set_memory(order.memory_gb)
+def prepare(options: ProcessOptions) -> None:
+    """Limit the threads and the memory of this process."""
+    resource_limits.set_threads(options.threads)
+    resource_limits.set_memory(options.memory_gb)

@@ -1,4 +1,4 @@
-"""In: `--shard K/N`, or what a cluster's scheduler put into the environment. Out: which captures are this process's."""
+"""Shards: the part of a batch that this process handles, from `--shard K/N` or a scheduler's environment."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -8,7 +8,7 @@ from typing import TypeVar
 from polcap.errors import SettingError
 
 T = TypeVar("T")
-COUNT = "POLCAP_SHARDS"  # for schedulers that tell a task its index, but not how many there are
+COUNT = "POLCAP_SHARDS"  # set by the user where a scheduler states the index of a task only
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Shard:
         return f"{self.index + 1}/{self.count}"
 
     def of(self, items: Sequence[T]) -> list[T]:
-        """Every `count`-th item, so that parts stay equal whatever the order means."""
+        """Every `count`-th item, so that large captures spread over all parts."""
         return list(items[self.index :: self.count])
 
 
@@ -30,7 +30,7 @@ WHOLE = Shard(0, 1)
 
 
 def parse(text: str) -> Shard:
-    """K/N, counted from 1.
+    """Read K/N; K counts from 1.
 
     Raises
     ------
@@ -44,16 +44,16 @@ def parse(text: str) -> Shard:
 
 
 def from_environment(environment: Mapping[str, str]) -> Shard:
-    """The part that Slurm, AWS Batch, Kubernetes or PBS gave this process; the whole where none did.
+    """The shard assigned by Slurm, AWS Batch, Kubernetes or PBS; `WHOLE` without such a scheduler.
 
-    Slurm tells an array task its id, the least id, the step and the count; AWS Batch index and size. A task of a
-    Kubernetes indexed job or of a PBS array knows its index only: `POLCAP_SHARDS` says of how many, and job
-    files written by polcap set it. PBS counts from 1 (Torque from whatever `-t` says: take 1 there).
+    Slurm and AWS Batch state index and count. Kubernetes indexed jobs and PBS arrays state the index only, so
+    `POLCAP_SHARDS` must hold the count; job files written by polcap set it. PBS counts from 1, and Torque from the
+    first number of its option -t, which must be 1.
 
     Raises
     ------
     SettingError
-        An index without a count, or beyond it.
+        The count is missing, or the index is not below it.
     """
     known = {name: value for name, value in environment.items() if value}
     if "SLURM_ARRAY_TASK_ID" in known and "SLURM_ARRAY_TASK_COUNT" in known:
@@ -66,7 +66,7 @@ def from_environment(environment: Mapping[str, str]) -> Shard:
     for name, first in (("JOB_COMPLETION_INDEX", 0), ("PBS_ARRAY_INDEX", 1), ("PBS_ARRAYID", 1)):
         if name in known:
             if COUNT not in known:
-                raise SettingError(f"{name}={known[name]} says which shard, nothing says of how many; set {COUNT}")
+                raise SettingError(f"{name}={known[name]} gives the shard, but not the number of shards; set {COUNT}")
             return _checked(name, _number(known, name) - first, _number(known, COUNT))
     return WHOLE
 
@@ -77,10 +77,10 @@ def _number(known: Mapping[str, str], name: str, otherwise: int | None = None) -
     try:
         return int(known[name])
     except ValueError:
-        raise SettingError(f"{name}={known[name]} is no whole number; give --shard K/N") from None
+        raise SettingError(f"{name}={known[name]} is not a whole number; give --shard K/N") from None
 
 
 def _checked(name: str, index: int, count: int) -> Shard:
     if not 0 <= index < count:
-        raise SettingError(f"{name} stands for shard {index + 1} of {count}; number the tasks 1 to {count}")
+        raise SettingError(f"{name} means shard {index + 1} of {count}; number the tasks 1 to {count}")
     return Shard(index, count)

@@ -1,14 +1,12 @@
-"""In: nothing. Out: the way in which worker processes start, with all that a capture needs loaded.
+"""Start of worker processes.
 
-On Linux they are forked from a server that has imported it once and runs no thread: nothing is copied amid work, a
-worker is there in a tenth of a second, and what all of them read lies in memory once. Elsewhere each imports alone.
+On Linux, workers are forked from a server process that has imported all modules and runs no threads, so that workers
+share its memory. On other systems each worker imports the modules itself.
 """
 
 import multiprocessing
 import sys
 from typing import Any
-
-_LOADED = ["polcap.batch.loaded"]
 
 
 def method() -> str:
@@ -16,12 +14,12 @@ def method() -> str:
     return "forkserver" if sys.platform == "linux" else "spawn"
 
 
-def begin(*also: str) -> None:
-    """Have the server import what workers need, and these modules, while the caller goes on."""
+def preload(*modules: str) -> None:
+    """Start the server process, which imports the modules of `preloaded` and these in the background."""
     if method() == "forkserver":
         from multiprocessing import forkserver
 
-        forkserver.set_forkserver_preload([*_LOADED, *also])
+        forkserver.set_forkserver_preload(["polcap.batch.preloaded", *modules])
         forkserver.ensure_running()
 
 

@@ -52,7 +52,7 @@ def batch(
     if scheduler is not None and write_jobs is None:
         from polcap.batch import cluster
 
-        cluster.begin(scheduler)
+        cluster.preload(scheduler)
     import msgspec
 
     from polcap import batch as batches
@@ -70,7 +70,7 @@ def batch(
         terminal.print_message(f"To start it: {job_files.submit_hint(write_jobs, file)}")
         terminal.print_data({"file": str(file), "shards": job.shards} if json else str(file))
         return
-    order = unit.Order(
+    process_options = unit.ProcessOptions(
         settings=msgspec.to_builtins(settings.load(config, assignments or ())),
         chart=options.chart_request(None if chart is None else str(chart), no_chart),
         estimator=estimator,
@@ -81,8 +81,8 @@ def batch(
         angles_deg=options.angles_deg(angles),
     )
     part = shards.from_environment(os.environ) if shard is None else shards.parse(shard)
-    how = batches.How(part, scheduler, workers, retries, keep_going)
-    summary = batches.run(root, out, order, how, terminal.print_message)
+    plan = batches.BatchPlan(part, scheduler, workers, retries, keep_going)
+    summary = batches.run(root, out, process_options, plan, terminal.print_message)
     terminal.print_data(summary if json else str((out or root) / unit.FOLDER / "summary.html"))
     if code := batches.exit_code(summary):
         raise typer.Exit(code)

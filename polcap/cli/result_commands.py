@@ -100,7 +100,7 @@ def status(context: typer.Context, result: Result, json: Json = False) -> None:
         from polcap import batch as batches
 
         about = batches.status(batches.reopen(result))
-        terminal.print_data(about if json else batches.lines(about))
+        terminal.print_data(about if json else batches.table(about))
         return
     if not found:
         raise SettingError(f"{result} holds no stage cache; run `polcap process` or `polcap batch` on it first")

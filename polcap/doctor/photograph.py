@@ -14,7 +14,7 @@ from polcap.images import Exif, SensorImage
 from polcap.optics import sensor
 from polcap.stages import hdr
 
-_CLIP = hdr.Settings().clip
+_CLIP = hdr.HdrSettings().clip
 _PATTERNS = {0: "R", 1: "G", 2: "B"}
 
 

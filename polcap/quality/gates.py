@@ -13,7 +13,7 @@ from polcap.images import SurfaceMaps
 from polcap.quality import geometry, light, polarization
 from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, Unit
 from polcap.quality.limits import GateLimits
-from polcap.stages.align import Settings as AlignSettings
+from polcap.stages.align import AlignSettings
 
 __all__ = ["Evidence", "Gate", "State", "Unit", "judge", "verdict"]
 

@@ -10,8 +10,7 @@ from polcap.optics.resize import area_mean
 from polcap.optics.sharpness import TILE
 from polcap.quality.gate import Evidence, Gate, State, Unit, at_most, blamed
 from polcap.quality.limits import GateLimits
-from polcap.stages.align import Settings as AlignSettings
-from polcap.stages.align import object_motion
+from polcap.stages.align import AlignSettings, object_motion
 from polcap.stages.whitebalance import chart_in_mask
 
 _LONGEST, _OUTLINE_PX, _OUTLINE_BLUR_PX = 256, 3.0, 2.0  # px of the reduced maps; band inside the outline; 1σ

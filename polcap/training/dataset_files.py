@@ -1,16 +1,16 @@
-"""The paper's data set as files: random shapes and materials under a flash -> photographs at four angles, and truth.
+"""Data set files, `polcap synth --dataset`: photographs of random objects at four polarizer angles, and the truth.
 
 ::
 
-    FOLDER/dataset.json               what was asked for, and how every file's numbers are to be read
-    FOLDER/000000/I000.png … I135.png  what a polarizer at 0, 45, 90, 135° passes, with noise
+    FOLDER/dataset.json               the settings, and the encoding of all files
+    FOLDER/000000/I000.png … I135.png  light behind a polarizer at 0, 45, 90, 135°, with noise
                   stokes.png          (S1, S2)/√(S1² + S2²), from the noisy photographs
                   diffuse_color.png   ½(S0 − √(S1² + S2²)) per channel, unit length
                   normal.png depth.png diffuse.png specular.png roughness.png mask.png
                   sample.json         camera, flash, depth's limits
 
-A sample follows from the seed and its number. Each is there whole or not at all; a run that was
-stopped goes on, one asked for more samples adds them.
+A sample follows from the seed and its number. Incomplete samples are never left; a stopped run can continue, and a run
+with a larger number adds samples.
 
 References
 ----------
@@ -37,22 +37,22 @@ from polcap.synth.mesh_tracer import Tracer, centred
 from polcap.training import materials, random_shapes, traced_views
 
 ANGLES_DEG = (0, 45, 90, 135)
-_LARGEST, _KNEE = 16.0, 0.01  # of the HDR encoding: radiance at 65535, and where it turns from linear to logarithmic
+_LARGEST, _KNEE = 16.0, 0.01  # HDR encoding: radiance at 65535, and the limit between linear and logarithmic parts
 
 
 class DatasetRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What all samples have in common."""
+    """Settings of all samples."""
 
     seed: int = 0
     size: Annotated[int, Meta(ge=64, le=4096)] = 512  # px
-    noise: Annotated[float, Meta(ge=0)] = 0.002  # 1σ at radiance 1, growing as its root; a tenth of it in the dark
-    mesh: str = ""  # a file, or a folder of them; else random shapes
-    material: str = ""  # a folder of texture sets; else solid noise
-    law: Literal["smooth", "rough"] = "smooth"  # of the bodies
+    noise: Annotated[float, Meta(ge=0)] = 0.002  # 1σ at radiance 1; ∝ √radiance, in the dark a tenth
+    mesh: str = ""  # file or folder of files; empty: random shapes
+    material: str = ""  # folder of texture sets; empty: solid noise
+    law: Literal["smooth", "rough"] = "smooth"  # interface of diffuse light
 
 
 def main(out: Path, count: int, recipe: DatasetRecipe) -> int:
-    """Make what is missing of samples 0…count − 1; returns how many were made now."""
+    """Make the missing ones of samples 0…count − 1; returns the number of new samples."""
     library, files = _library(recipe.material), _meshes(recipe.mesh)
     _describe(out, recipe)
     made = 0
@@ -69,7 +69,7 @@ def main(out: Path, count: int, recipe: DatasetRecipe) -> int:
 def make_sample(
     recipe: DatasetRecipe, library: materials.MaterialLibrary, files: list[Path], number: int
 ) -> tuple[dict[str, Floats], dict[str, Any]]:
-    """Pictures by file name, as numbers, and sample.json. Without mesh `files` the shape is random."""
+    """Pictures (H, W, ·) by file name, and the content of sample.json; without mesh `files` the shape is random."""
     rng = np.random.default_rng([recipe.seed, number])
     file = files[rng.integers(len(files))] if files else None
     mesh = centred(traced_views.read_mesh(file)) if file else random_shapes.compose(rng)
@@ -129,30 +129,30 @@ def encode(radiance: Floats) -> Floats:
 
 
 def decode(code: Floats) -> Floats:
-    """And back; code = value / 65535."""
+    """Linear radiance of a code 0…1, the inverse of `encode`; code = value / 65535."""
     return np.asarray(_KNEE * np.expm1(code * log1p(_LARGEST / _KNEE)))
 
 
 def _library(material: str) -> materials.MaterialLibrary:
     library = materials.MaterialLibrary(Path(material) if material else None, torch.device("cpu"))
     if material and not library.has_textures:
-        raise InputError(f"{material} holds no texture set; give a folder of folders with albedo.jpg")
+        raise InputError(f"{material} holds no texture set; give a folder of folders, each with albedo.jpg")
     return library
 
 
 def _meshes(mesh: str) -> list[Path]:
-    """The files to take from; none for random shapes."""
+    """Mesh files; none for random shapes."""
     if not mesh:
         return []
     place = Path(mesh)
     files = sorted(p for p in place.iterdir() if p.suffix != ".json") if place.is_dir() else [place]
     if not files:
-        raise InputError(f"{place} holds no mesh; give a file or a folder of them")
+        raise InputError(f"{place} holds no mesh; give a mesh file or a folder of mesh files")
     return files
 
 
 def _photographs(light: Floats, rays: Floats, noise: float, rng: np.random.Generator) -> Floats:
-    """What the polarizer passes at each angle, (4, M, 3), with noise."""
+    """Light behind the polarizer at each angle, (4, M, 3), with noise."""
     passed = []
     for angle in np.radians(ANGLES_DEG):
         weights = mueller.analyzer(frames.axis_on_ray(np.asarray(angle), rays), np.inf)
@@ -188,15 +188,15 @@ def _write(folder: Path, pictures: dict[str, Floats], about: dict[str, Any]) -> 
 
 
 def _describe(out: Path, recipe: DatasetRecipe) -> None:
-    """dataset.json; samples of another recipe are never mixed in."""
+    """Write dataset.json; a folder with samples of other settings is refused."""
     asked, file = msgspec.to_builtins(recipe), out / "dataset.json"
     if file.exists():
         there = json.loads(file.read_text(encoding="utf-8"))["recipe"]
         if there != asked:
-            raise InputError(f"{out} was begun with {there}, not {asked}; choose another folder")
+            raise InputError(f"{out} was started with the settings {there}, not {asked}; choose another folder")
         return
     if out.exists() and any(out.iterdir()):
-        raise InputError(f"{out} is not an empty folder; choose another place for the data set")
+        raise InputError(f"{out} is not empty; choose another folder for the data set")
     code = f"x = {_KNEE} * expm1(value / 65535 * ln(1 + {_LARGEST} / {_KNEE}))"
     document = {
         "format": "polcap dataset 1",

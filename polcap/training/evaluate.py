@@ -1,8 +1,7 @@
-"""Error of every map on the protocol's pictures: the shipped way of estimating beside its baselines.
+"""Evaluation of a model, `polcap evaluate`: errors of all maps on the protocol's pictures, and of baselines.
 
-What is measured is what a capture gets: the same cues, the same inference stage, the model file itself.
-Every core judges pictures of its own; what is done is kept in out/pictures.jsonl, so that a run that was
-stopped goes on.
+Cues, inference and model file are those of captures. Each core evaluates other pictures. Results of pictures are
+stored in out/pictures.jsonl, so that a stopped run can continue.
 """
 
 import hashlib
@@ -31,10 +30,10 @@ from polcap.training.evaluation_baselines import Estimator, Means
 from polcap.training.evaluation_protocol import Protocol
 from polcap.training.map_errors import MAPS, Judge, Score, angle, deciles
 
-_PANEL = 8  # pictures shown
-_SAMPLE = 500  # pixels of a picture that the calibration is judged by
-_QUIET = 20  # s between two lines of progress
-_SHARE = 3  # pictures that a process of its own is worth, at least
+_PANEL = 8  # pictures in panel.png
+_SAMPLE = 500  # pixels of a picture for the check of the expected error
+_PROGRESS_S = 20  # s between two lines of progress
+_MIN_SHARE = 3  # pictures per process
 OURS, CLEAN, ANALYTIC, MEAN = "ours", "ours, noise-free", "analytic", "mean of each map"
 _INTEGRATED = (OURS, CLEAN, ANALYTIC)  # columns whose normals are integrated
 
@@ -43,7 +42,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class EvaluationOptions:
-    """What one evaluation is told."""
+    """Options of one evaluation."""
 
     model: Path
     data: Path = Path("data")
@@ -55,28 +54,28 @@ class EvaluationOptions:
 
 
 def main(options: EvaluationOptions) -> dict[str, Score]:
-    """Score all columns; writes out/evaluation.json, out/evaluation.md and out/panel.png."""
+    """Evaluate the model and all baselines; writes evaluation.json, evaluation.md and panel.png to `out`."""
     torch.set_num_threads(1)
     network = models.open_network(options.model)
     found = {} if options.ablations is None else evaluation_baselines.find_checkpoints(options.ablations)
     head = _head(options, network, found)
     made = Protocol(options.data, options.size, options.protocol)
-    rows = _judged(options, evaluation_baselines.mean_maps(made, options.count), head)
+    rows = _evaluate_pictures(options, evaluation_baselines.mean_maps(made, options.count), head)
     result = _summary(head, rows, list(found))
     shown = (made.case(number) for number in range(min(_PANEL, options.count)))
-    strips = [evaluation_picture.make_row(case, _estimated(case.cues, network)) for case in shown]
+    strips = [evaluation_picture.make_row(case, _estimate(case.cues, network)) for case in shown]
     for name, text in (
         ("evaluation.json", json.dumps(result, indent=1)),
         ("evaluation.md", evaluation_page.make_page(result)),
     ):
-        with atomic.path(options.out / name) as beside:
-            beside.write_text(text)
+        with atomic.path(options.out / name) as temporary:
+            temporary.write_text(text)
     png.write(options.out / "panel.png", evaluation_picture.make_sheet(strips))
     return {**result["table"], **result["ablations"]}
 
 
 def _head(options: EvaluationOptions, network: Network, found: dict[str, Path]) -> dict[str, Any]:
-    """All that the figures depend on."""
+    """All inputs of the figures."""
     return {
         "pictures": options.count, "size": options.size,
         "protocol": f"{options.protocol}.{evaluation_protocol.VERSION}",
@@ -88,37 +87,38 @@ def _head(options: EvaluationOptions, network: Network, found: dict[str, Path]) 
 
 
 def _digest(data: Path) -> str:
-    """Of all test meshes and texture sets."""
+    """SHA-256 of all test meshes and texture sets."""
     digest = hashlib.sha256()
     for file in sorted([*(data / "meshes" / "test").glob("*.npz"), *(data / "materials" / "test").glob("*/*")]):
         digest.update(file.relative_to(data).as_posix().encode() + file.read_bytes())
     return digest.hexdigest()
 
 
-def _alone(name: str) -> str:
-    """A column of the second table; "ours" stands in both."""
+def _network_alone(name: str) -> str:
+    """Name of a column of the second table; "ours" is in both tables."""
     return f"{name}, network alone"
 
 
-def _estimated(seen: Cues, network: Network | None) -> SurfaceMaps:
+def _estimate(seen: Cues, network: Network | None) -> SurfaceMaps:
+    """Maps by the inference stage; without a network by the analytic estimate alone."""
     return infer.estimate(seen, network, onnx.run, infer.InferSettings())
 
 
-def _judged(options: EvaluationOptions, means: Means, head: dict[str, Any]) -> list[Row]:
-    """A row per picture, those of an earlier run with the same head first."""
+def _evaluate_pictures(options: EvaluationOptions, means: Means, head: dict[str, Any]) -> list[Row]:
+    """Results of all pictures; those of an earlier run with the same inputs are used again."""
     path = options.out / "pictures.jsonl"
-    rows = _kept(path, head)
-    with atomic.path(path) as beside:
-        beside.write_text("".join(json.dumps(row) + "\n" for row in [head, *rows]))
+    rows = _read_results(path, head)
+    with atomic.path(path) as temporary:
+        temporary.write_text("".join(json.dumps(row) + "\n" for row in [head, *rows]))
     started = reported = time.monotonic()
     first = len(rows)
     with path.open("a") as file:
-        for row in _made(options, means, range(first, options.count)):
+        for row in _evaluate_range(options, means, range(first, options.count)):
             rows.append(row)
             file.write(json.dumps(row) + "\n")
             file.flush()
             now = time.monotonic()
-            if now - reported > _QUIET or len(rows) == options.count:
+            if now - reported > _PROGRESS_S or len(rows) == options.count:
                 reported = now
                 each = (now - started) / (len(rows) - first)
                 left = each * (options.count - len(rows)) / 60
@@ -131,30 +131,30 @@ def _judged(options: EvaluationOptions, means: Means, head: dict[str, Any]) -> l
     return rows
 
 
-def _made(options: EvaluationOptions, means: Means, numbers: range) -> Iterator[Row]:
-    """Rows in order, by as many processes as there are cores and work for."""
-    workers = min(os.cpu_count() or 1, len(numbers) // _SHARE)
+def _evaluate_range(options: EvaluationOptions, means: Means, numbers: range) -> Iterator[Row]:
+    """Results in order, by one process per core if there are enough pictures."""
+    workers = min(os.cpu_count() or 1, len(numbers) // _MIN_SHARE)
     if workers < 2:
-        bench = PictureEvaluator(options, means)
-        yield from map(bench.row, numbers)
+        evaluator = PictureEvaluator(options, means)
+        yield from map(evaluator.row, numbers)
         return
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, spawn, initializer=_begin, initargs=(options, means)) as pool:
+    with ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=(options, means)) as pool:
         yield from pool.map(_row, numbers)
 
 
-_bench: "PictureEvaluator | None" = None  # of this worker
+_evaluator: "PictureEvaluator | None" = None  # of this worker
 
 
-def _begin(options: EvaluationOptions, means: Means) -> None:
-    global _bench
-    threading.Thread(target=_follow, daemon=True).start()
+def _start_worker(options: EvaluationOptions, means: Means) -> None:
+    global _evaluator
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
-    _bench = PictureEvaluator(options, means)
+    _evaluator = PictureEvaluator(options, means)
 
 
-def _follow() -> None:
-    """End with the process that asked, however that ends."""
+def _end_with_parent() -> None:
+    """End this process when its parent ends, also after a crash of the parent."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
@@ -162,12 +162,12 @@ def _follow() -> None:
 
 
 def _row(number: int) -> Row:
-    assert _bench is not None
-    return _bench.row(number)
+    assert _evaluator is not None
+    return _evaluator.row(number)
 
 
-def _kept(path: Path, head: dict[str, Any]) -> list[Row]:
-    """What an earlier run with the same head wrote, up to a line it could not finish."""
+def _read_results(path: Path, head: dict[str, Any]) -> list[Row]:
+    """Results of an earlier run with the same inputs, without an unfinished last line."""
     lines = path.read_text().splitlines() if path.exists() else []
     if not lines or lines[0] != json.dumps(head):
         return []
@@ -181,23 +181,23 @@ def _kept(path: Path, head: dict[str, Any]) -> list[Row]:
 
 
 class PictureEvaluator:
-    """Pictures and all ways of estimating, ready to judge."""
+    """Makes pictures and evaluates all estimators on them."""
 
     def __init__(self, options: EvaluationOptions, means: Means) -> None:
         self.made = Protocol(options.data, options.size, options.protocol)
         network = models.open_network(options.model, threads=1)
         found = {} if options.ablations is None else evaluation_baselines.find_checkpoints(options.ablations)
         self.columns: dict[str, Estimator] = {
-            OURS: lambda case: _estimated(case.cues, network),
-            CLEAN: lambda case: _estimated(case.clean, network),
-            ANALYTIC: lambda case: _estimated(case.cues, None),
+            OURS: lambda case: _estimate(case.cues, network),
+            CLEAN: lambda case: _estimate(case.clean, network),
+            ANALYTIC: lambda case: _estimate(case.cues, None),
             "frontal": lambda case: evaluation_baselines.frontal(case.cues),
             "silhouette": lambda case: evaluation_baselines.inflated(case.cues),
             MEAN: lambda case: evaluation_baselines.constant(case.cues, means),
-        } | {_alone(name): evaluation_baselines.network_alone(path) for name, path in found.items()}
+        } | {_network_alone(name): evaluation_baselines.network_alone(path) for name, path in found.items()}
 
     def row(self, number: int) -> Row:
-        """Scores, seconds and what else is needed of one picture."""
+        """Result of one picture: scores, seconds, sample of expected errors, moments of F0."""
         before = time.monotonic()
         case = self.made.case(number)
         seconds, scores, calibration = {"making the picture": time.monotonic() - before}, {}, []
@@ -228,8 +228,8 @@ def _summary(head: dict[str, Any], rows: list[Row], alone: list[str]) -> dict[st
     deviation = float(np.sqrt(square - f0**2))
     return {
         "conditions": head | {"f0_deviation": deviation},
-        "table": {name: mean[name] for name in names if name not in map(_alone, alone)},
-        "ablations": {name: mean[_alone(name)] for name in alone},
+        "table": {name: mean[name] for name in names if name not in map(_network_alone, alone)},
+        "ablations": {name: mean[_network_alone(name)] for name in alone},
         "of_mean_maps": {name: mean[OURS][name] / mean[MEAN][name] for name in MAPS},
         "calibration": deciles(predicted, actual),
         "seconds": _mean([row["seconds"] for row in rows]),
@@ -238,6 +238,6 @@ def _summary(head: dict[str, Any], rows: list[Row], alone: list[str]) -> dict[st
 
 
 def _mean(rows: list[Score]) -> Score:
-    """Of each figure, over the pictures that have it."""
+    """Mean of each figure over the rows that have it."""
     keys = dict.fromkeys(key for row in rows for key in row)
     return {key: float(np.mean([row[key] for row in rows if key in row])) for key in keys}

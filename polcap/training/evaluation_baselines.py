@@ -1,4 +1,4 @@
-"""What an estimate is worth: maps made without a network, and by networks alone at a reduced size."""
+"""Baselines of the evaluation: maps estimated without a network, and by networks alone at a reduced size."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,11 +16,11 @@ from polcap.training import main_network, train
 from polcap.training.evaluation_protocol import Case, Protocol
 
 Estimator = Callable[[Case], SurfaceMaps]
-_MEAN_SIZE = 96  # px, of the pictures whose maps are averaged
+_MEAN_SIZE = 96  # px, of the pictures for the mean maps
 
 
 def frontal(seen: Cues) -> SurfaceMaps:
-    """Every normal towards the camera; albedo as it looks, a common dielectric's gloss."""
+    """All normals towards the camera, the radiance as albedo, the gloss of a common dielectric."""
     shape = seen.mask.shape
     return SurfaceMaps(
         normal=seen.rays, diffuse=np.clip(seen.radiance, 0, 1), specular=np.full((*shape, 3), 0.04, np.float32),
@@ -30,7 +30,7 @@ def frontal(seen: Cues) -> SurfaceMaps:
 
 
 def inflated(seen: Cues) -> SurfaceMaps:
-    """Normals of a balloon: zenith from the distance to the silhouette, azimuth away from the inside."""
+    """Normals of an inflated silhouette: zenith by the distance to the outline, azimuth towards the outline."""
     distance = cv2.distanceTransform(seen.mask.astype(np.uint8), cv2.DIST_L2, 5)
     reach = max(float(distance.max()), 1.0)
     height = np.sqrt(np.maximum(reach**2 - (reach - distance) ** 2, 0))
@@ -49,7 +49,7 @@ Means = tuple[Floats, Floats, Floats, Floats]  # normal in the frame of a ray, d
 
 
 def mean_maps(protocol: Protocol, count: int) -> Means:
-    """The mean of each map over the pictures to be judged, each counting once: the hardest constants to beat."""
+    """Mean of each map over all pictures of the evaluation, with equal weights: the best constants."""
     rows = []
     for number in range(count):
         truth = protocol.truth(number, min(_MEAN_SIZE, protocol.size))
@@ -61,7 +61,7 @@ def mean_maps(protocol: Protocol, count: int) -> Means:
 
 
 def constant(seen: Cues, values: Means) -> SurfaceMaps:
-    """These values everywhere."""
+    """Maps with the same values at all pixels."""
     normal, diffuse, specular, roughness = values
     shape = (*seen.mask.shape, 3)
     return replace(
@@ -72,15 +72,21 @@ def constant(seen: Cues, values: Means) -> SurfaceMaps:
 
 
 def find_checkpoints(folder: Path) -> dict[str, Path]:
-    """Name -> checkpoint of each network in `folder`, NAME/last.pt."""
+    """Checkpoints folder/NAME/last.pt by name.
+
+    Raises
+    ------
+    InputError
+        There are none.
+    """
     found = {path.parent.name: path for path in sorted(folder.glob("*/last.pt"))}
     if not found:
-        raise InputError(f"{folder} holds no NAME/last.pt; train with `polcap train DATA --out {folder}/NAME` first")
+        raise InputError(f"{folder} holds no NAME/last.pt; first train with `polcap train DATA --out {folder}/NAME`")
     return found
 
 
 def network_alone(checkpoint: Path) -> Estimator:
-    """A checkpoint's EMA weights on the picture binned to about the size of training; no inversion joins in."""
+    """Estimates by the averaged weights of a checkpoint alone, on the picture binned to about the size of training."""
     network, _ = train.load_average(checkpoint)
 
     def estimate(case: Case) -> SurfaceMaps:
@@ -92,17 +98,17 @@ def network_alone(checkpoint: Path) -> Estimator:
             maps = network(torch.from_numpy(padded)[None])
         by = int(case.small.view.scale)
 
-        def full(name: str) -> Floats:
+        def enlarged(name: str) -> Floats:
             image = np.ascontiguousarray(maps[name][0].float().permute(1, 2, 0).numpy()[:height, :width])
             larger = cv2.resize(image, (width * by, height * by))
             rest = [(0, n - m) for n, m in zip(case.cues.mask.shape, larger.shape)]
             return np.asarray(np.pad(larger, [*rest, *[(0, 0)] * (larger.ndim - 2)], mode="edge"))
 
-        normal = frames.from_ray_frame(full("normal"), case.cues.rays)
+        normal = frames.from_ray_frame(enlarged("normal"), case.cues.rays)
         return SurfaceMaps(
             normal=np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)),
-            diffuse=full("diffuse"), specular=full("specular"), roughness=full("roughness"),
-            depth_prior=full("depth"), confidence=full("sigma"), mask=case.cues.mask, view=case.cues.view,
+            diffuse=enlarged("diffuse"), specular=enlarged("specular"), roughness=enlarged("roughness"),
+            depth_prior=enlarged("depth"), confidence=enlarged("sigma"), mask=case.cues.mask, view=case.cues.view,
             estimator=checkpoint.parent.name,
         )  # fmt: skip
 

@@ -1,8 +1,7 @@
-"""The evaluation's 30 materials: 10 texture sets, 20 solid patterns of families that training never draws.
+"""The 30 test materials of the evaluation: 10 texture sets, 20 solid patterns of kinds that training does not use.
 
-Wood rings, marble veins, Voronoi cells, stripes, checks, dots, brushed grain. Everything about a
-material follows from its number: colours, relief, roughness and F0 go with one pattern, as in real ones.
-Positions are those of an object whose longest side is 1.
+Wood, marble, Voronoi cells, stripes, checks, dots, brushed grain. A material follows from its number. Color, relief,
+roughness and F0 share one pattern, as in real materials. Unit of length: the longest side of the object.
 """
 
 from collections.abc import Callable
@@ -21,11 +20,10 @@ from polcap.images import Floats
 
 TEXTURES, PATTERNS = 10, 20
 _SEED = 2021
-_STEP = 1e-3  # of the gradient
-_STEEPEST = 0.6  # slope of the relief
-_ORDINARY = (0.030, 0.052)  # F0 of every second material; the others lie evenly in the logarithm between
-_STRONG = (0.06, 0.26)
-_COMMON, _RARE = (0.034, 0.055), (0.06, 0.18)  # F0 of materials as they are met: four of five, and the fifth
+_STEP = 1e-3  # of the numerical gradient
+_MAX_SLOPE = 0.6  # of the relief
+_ORDINARY, _STRONG = (0.030, 0.052), (0.06, 0.26)  # protocol 1: F0 of every second material, and of the others
+_COMMON, _RARE = (0.034, 0.055), (0.06, 0.18)  # protocol 2: F0 of four of five materials, and of the fifth
 
 Indices = NDArray[np.integer[Any]]
 Field = Callable[[Floats], tuple[Floats, Floats]]  # (M, 3) -> tone 0…1, depth of grooves 0…1; (M,) each
@@ -33,7 +31,7 @@ Field = Callable[[Floats], tuple[Floats, Floats]]  # (M, 3) -> tone 0…1, depth
 
 @dataclass(frozen=True)
 class MaterialSample:
-    """A material at M places."""
+    """A material at M positions."""
 
     diffuse: Floats  # (M, 3)
     specular: Floats  # (M, 3) F0
@@ -42,7 +40,7 @@ class MaterialSample:
 
 @dataclass(frozen=True)
 class TestMaterial:
-    """A name, a refractive index, and what is found at places (M, 3) where the surface faces (M, 3)."""
+    """A material as functions of position (M, 3) and facing direction (M, 3)."""
 
     name: str
     ior: float
@@ -51,14 +49,19 @@ class TestMaterial:
 
 
 def test_materials(folder: Path, *, met: bool = False) -> list[TestMaterial]:
-    """All test materials: the texture sets of `folder` in alphabetic order, then the patterns.
+    """All test materials: the texture sets of `folder` in alphabetical order, then the patterns.
 
-    met: F0 as it is met, most about .045, instead of half about .04 and half far above.
+    met: F0 as in everyday objects, mostly about 0.045; else about 0.04 for one half and far higher for the other.
+
+    Raises
+    ------
+    InputError
+        The folder has too few texture sets.
     """
     sets = sorted(p for p in folder.iterdir() if (p / "albedo.jpg").exists()) if folder.exists() else []
     if len(sets) < TEXTURES:
         raise InputError(
-            f"{folder} holds {len(sets)} texture sets, the evaluation takes {TEXTURES}; give DATA as it was"
+            f"{folder} holds {len(sets)} texture sets, the evaluation needs {TEXTURES}; give the unchanged DATA folder"
         )
     names = list(_FAMILIES)
     patterned = [_pattern(names[k % len(names)], TEXTURES + k, met) for k in range(PATTERNS)]
@@ -66,7 +69,7 @@ def test_materials(folder: Path, *, met: bool = False) -> list[TestMaterial]:
 
 
 def _levels(number: int, met: bool) -> tuple[np.random.Generator, float, float]:
-    """Random state, refractive index and F0 level of a material."""
+    """Random generator, refractive index and mean F0 of a material."""
     rng = np.random.default_rng([_SEED, number])
     ior = 1.4 + 0.2 * ((7 * number) % 30) / 29
     if met:
@@ -109,36 +112,33 @@ def _textured(folder: Path, number: int, met: bool) -> TestMaterial:
 
 
 def _mirror(x: Floats) -> Floats:
-    """Fold all numbers into 0…1, mirrored at whole ones."""
+    """Fold numbers into 0…1, mirrored at integers."""
     return np.asarray(1 - np.abs(np.mod(x, 2) - 1))
 
 
 def _sampled(image: Floats, u: Floats, v: Floats) -> Floats:
-    """Bilinear, (M, C)."""
-    side = 2**14  # remap takes pictures under 2^15 px a side
+    """Image (H, W, 6) at coordinates u, v (M,), bilinear, (M, 6)."""
+    side = 2**14  # remap is limited to pictures under 2^15 px a side
     wide = (len(u) // side + 1) * side
     x, y = (np.pad(a, (0, wide - len(u))).astype(np.float32).reshape(-1, side) for a in (u, v))
-    parts = [cv2.remap(part, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for part in _halves(image)]
+    halves = (np.ascontiguousarray(image[..., part]) for part in (slice(0, 3), slice(3, 6)))
+    parts = [cv2.remap(half, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for half in halves]
     return np.concatenate([p.reshape(wide, 3)[: len(u)] for p in parts], axis=1)
-
-
-def _halves(image: Floats) -> tuple[Floats, Floats]:
-    return np.ascontiguousarray(image[..., :3]), np.ascontiguousarray(image[..., 3:])
 
 
 # --- patterns -----------------------------------------------------------------------------------
 
 
 def _pattern(family: str, number: int, met: bool) -> TestMaterial:
-    """Two colours, two glosses and a relief laid out by a field."""
+    """Two colors, two glosses and a relief that follow one field."""
     rng, ior, level = _levels(number, met)
     field = _FAMILIES[family](rng)
     first, second = _color(rng), _color(rng)
-    if rng.random() < 0.5:  # two shades of one colour
+    if rng.random() < 0.5:  # two shades of one color
         second = first * rng.uniform(0.2, 0.6)
     rough, change = rng.uniform(0.2, 0.7), rng.uniform(0.08, 0.3) * rng.choice([-1, 1])
     follow, raised, steep = rng.uniform(-0.6, 0.6), rng.uniform(-0.4, 0.4), rng.uniform(0.03, 0.2)
-    strong = _levels(number, met=False)[2] >= 0.1  # drawn alike, so that relief is the same in both protocols
+    strong = _levels(number, met=False)[2] >= 0.1  # as in protocol 1, so that both protocols have the same relief
     tint = 1 + rng.uniform(-0.15, 0.15, 3) if strong else np.array([1.0, 1.0, 1.0])
 
     def height(place: Floats) -> Floats:
@@ -158,7 +158,7 @@ def _pattern(family: str, number: int, met: bool) -> TestMaterial:
 
     def slope(place: Floats, facing: Floats) -> Floats:
         out = _gradient(height, place) * (steep / usual)
-        return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True) / _STEEPEST, 1))
+        return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True) / _MAX_SLOPE, 1))
 
     return TestMaterial(f"{family} {number}", ior, at, slope)
 
@@ -169,14 +169,14 @@ def _gradient(field: Callable[[Floats], Floats], place: Floats) -> Floats:
 
 
 def _color(rng: np.random.Generator) -> Floats:
-    """Linear reflectance (3,), dark to light, grey to vivid."""
+    """Linear reflectance (3,), dark to light, gray to vivid."""
     hue, saturation, value = rng.uniform(0, 360), rng.uniform(0, 1) ** 1.5, rng.uniform(0.25, 0.95)
     display = cv2.cvtColor(np.array([[[hue, saturation, value]]], np.float32), cv2.COLOR_HSV2RGB)[0, 0]
     return np.asarray(display.astype(np.float64) ** 2.2)
 
 
 def _waves(rng: np.random.Generator, low: float, high: float, count: int = 10) -> Callable[[Floats], Floats]:
-    """A smooth random field of unit deviation or so: sines of `low` to `high` cycles over the object."""
+    """Smooth random field with a standard deviation of about 1: sines of `low` to `high` cycles over the object."""
     cycles = np.exp(np.linspace(np.log(low), np.log(high), count))
     way = rng.normal(size=(3, count))
     way *= 2 * np.pi * cycles / np.linalg.norm(way, axis=0)
@@ -216,7 +216,7 @@ def _marble(rng: np.random.Generator) -> Field:
 
 
 def _scattered(rng: np.random.Generator, side: int) -> Floats:
-    """side³ points over the object and some way around, one in each cell of a grid."""
+    """side³ points over the object and around it, one in each cell of a grid."""
     cells = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     return (cells + rng.uniform(0.05, 0.95, cells.shape)) / side * 2 - 1
 

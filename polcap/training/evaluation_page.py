@@ -1,4 +1,4 @@
-"""The evaluation's figures as one readable page, beside those that the papers print."""
+"""Page of the evaluation's figures, with the published ones: evaluation.md."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -61,13 +61,13 @@ ROWS = {
 }
 _AVERAGED = (
     "RMSE is the root of the mean square over a picture's masked pixels and channels (for renderings over the 20 "
-    "lights too); each figure is the mean of the pictures, as the paper's tables suggest. Depth is the "
-    "estimator's map, centred within the mask and divided by the truth's greatest minus least, no scale fitted; "
-    "after integration: the surface that stage 9 makes of the normals with it, at about 128 px. Renderings are "
-    "linear, the flash-lit truth's 99th percentile is 1, clipped to 0…1, drawn with refractive index 1.5 and "
-    "without cast shadows. The eroded mask is 2 px thinner. Over the whole picture means with nothing wrong beside the "
-    "object: RMSE times the root of the object's share of it, L1 times the share. The paper says L1 in its text and "
-    "RMSE in its captions, and not over what; its figures stand in the first row of each."
+    "lights too); each figure is the mean of all pictures, as the paper's tables suggest. Depth is the estimated map, "
+    "centred within the mask and divided by the truth's range, without a fitted scale; after integration: the surface "
+    "of stage 9 from the normals and this map, at about 128 px. Renderings are linear and clipped to 0…1, where 1 is "
+    "the 99th percentile of the truth under the flash; refractive index 1.5, no cast shadows. The eroded mask is 2 px "
+    "thinner. Over the whole picture the error outside the object is zero: RMSE times the root of the object's share "
+    "of the picture, L1 times the share. The paper's text mentions L1, its captions RMSE, and neither names the area; "
+    "its figures are in the first row of each."
 )
 Table = Mapping[str, Mapping[str, float]]
 
@@ -83,14 +83,14 @@ def make_page(result: Mapping[str, Any]) -> str:
         f"Standard deviation of the truth's F0 over all pictures: {conditions['f0_deviation']:.3f}.",
         _table(main),
         _AVERAGED,
-        "*As published*: on the authors' own test set, which is not public: not like for like.",
+        "*As published*: on the authors' test set, which is not public, so the columns cannot be compared directly.",
     ]
     ratios = [f"{name} {value:.2f}" for name, value in result["of_mean_maps"].items()]
-    parts.append(f"RMSE of ours over that of the best constant map: {', '.join(ratios)}.")
+    parts.append(f"RMSE of ours divided by that of the best constant map: {', '.join(ratios)}.")
     if result["ablations"]:
         parts += [
             "## Networks alone, at one reduced budget",
-            "Each sees the picture binned to about the size of training; no inversion joins in, and maps are enlarged.",
+            "Each sees the picture binned to about the size of training. Its maps are enlarged, without inversion.",
             _table({**result["ablations"], **_published(PUBLISHED_ABLATIONS)}),
         ]
     parts += ["## Expected normal error, by tenths of the pixels", _calibration(result["calibration"])]

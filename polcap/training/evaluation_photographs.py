@@ -1,13 +1,13 @@
-"""Photographs with measured normals -> how far polcap's are from them.
+"""Evaluation on photographs with measured normals, `polcap evaluate --real`: errors of the estimated normals.
 
-The layout is that of the public shape-from-polarization sets, which are not bundled.
+The folder has the layout of public shape-from-polarization data sets, which are not included.
 
     DIR/pol000/NAME.png  pol045  pol090  pol135   photographs behind a polarizer, or of a polarization sensor
     DIR/mask/NAME.png                             not 0 on the object
     DIR/normal/NAME.png                           n/2 + ½, camera frame, y up; 8 or 16 bit
 
-Any angle may be missing down to three. Pictures are taken as the whole path takes them, with the mask that is given and
-no chart; light from all sides, as in most of these sets, is not the flash that polcap asks for.
+At least three angles are needed. Photographs pass the whole path, with the mask of the folder and without a chart. Most
+of these sets have light from all sides, not the flash that polcap needs.
 """
 
 import json
@@ -28,26 +28,26 @@ from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
 
-_MISSED_DEG = 90.0  # what an object's pixel without a normal counts as
+_MISSED_DEG = 90.0  # error of a pixel of the object without an estimated normal
 _LIMITS_DEG = (11.25, 22.5, 30.0)
 _ROWS = ("mean", "median", *(f"within {limit:g}°" for limit in _LIMITS_DEG), "covered", "as a body")
-_LEAST_DOLP, _LEAST_TILT = 0.03, 0.3  # of pixels whose AoLP and azimuth are compared; tilt: sine of the zenith
+_MIN_DOLP, _MIN_TILT = 0.03, 0.3  # for the comparison of AoLP and azimuth; tilt: sine of the zenith
 
 Score = dict[str, float]
 
 
 def main(folder: Path, model: Path, out: Path) -> dict[str, Score]:
-    """Score every picture with the network and without; writes out/real.json and out/real.md.
+    """Evaluate every picture with and without the network; writes real.json and real.md to `out`.
 
     Raises
     ------
     InputError
-        The folder has not this layout.
+        The folder does not have this layout.
     """
     names, angles = _contents(folder)
     network = models.open_network(model)
     rows: dict[str, dict[str, Score]] = {
-        name: {"ours": scored(folder, angles, name, network), "analytic": scored(folder, angles, name, None)}
+        name: {"ours": score(folder, angles, name, network), "analytic": score(folder, angles, name, None)}
         for name in names
     }
     table = {
@@ -56,29 +56,31 @@ def main(folder: Path, model: Path, out: Path) -> dict[str, Score]:
     }
     result = {"folder": str(folder), "model": network.digest, "table": table, "pictures": rows}
     for file, text in (("real.json", json.dumps(result, indent=1)), ("real.md", _page(folder, rows, table))):
-        with atomic.path(out / file) as beside:
-            beside.write_text(text, encoding="utf-8")
+        with atomic.path(out / file) as temporary:
+            temporary.write_text(text, encoding="utf-8")
     return table
 
 
 def _contents(folder: Path) -> tuple[list[str], list[str]]:
-    """Names of the pictures that have a mask and a normal map, and the folders of angles."""
+    """Names of the pictures with a normal map, and of the folders of angles; checks that no file is missing."""
     angles = sorted(place.name for place in folder.glob("pol*") if place.is_dir())
     names = sorted(place.name for place in (folder / "normal").glob("*.png"))
     if len(angles) < 3 or not names:
         raise InputError(
-            f"{folder} holds {len(angles)} folders pol… and {len(names)} normal maps; --real takes pol000 pol045 "
-            "pol090 [pol135], mask and normal, with pictures of the same names"
+            f"{folder} holds {len(angles)} folders pol… and {len(names)} normal maps; --real needs the folders pol000 "
+            "pol045 pol090 [pol135], mask and normal, with pictures of the same names"
         )
     for name in names:
         missing = [part for part in (*angles, "mask") if not (folder / part / name).exists()]
         if missing:
-            raise InputError(f"{folder / missing[0] / name} is missing; every normal map needs its pictures and mask")
+            raise InputError(
+                f"{folder / missing[0] / name} is missing; a normal map needs a mask and a picture per angle"
+            )
     return names, angles
 
 
-def scored(folder: Path, angles: list[str], name: str, network: Network | None) -> Score:
-    """Angles between estimated and given normals over the mask that is given, degrees; shares 0…1; and `as_a_body`."""
+def score(folder: Path, angles: list[str], name: str, network: Network | None) -> Score:
+    """Errors of one picture: angles between estimated and measured normals, degrees; shares 0…1; `as_a_body`."""
     mask, truth = _mask(folder / "mask" / name), _normal(folder / "normal" / name)
     with tempfile.TemporaryDirectory() as place:
         for angle in angles:
@@ -102,8 +104,8 @@ def scored(folder: Path, angles: list[str], name: str, network: Network | None) 
 
 
 def as_a_body(cues: Cues, normal: Floats) -> float:
-    """Mean cos 2(AoLP − azimuth) where DoLP and tilt show: 1 light from inside a body, −1 mirrored from around it."""
-    use = cues.mask & (cues.dolp > _LEAST_DOLP) & (np.hypot(normal[..., 0], normal[..., 1]) > _LEAST_TILT)
+    """Mean cos 2(AoLP − azimuth) where DoLP and tilt are large enough: 1 for diffuse, −1 for mirrored light."""
+    use = cues.mask & (cues.dolp > _MIN_DOLP) & (np.hypot(normal[..., 0], normal[..., 1]) > _MIN_TILT)
     turned = 2 * np.arctan2(normal[..., 1], normal[..., 0])[use]
     cos, sin = cues.normalized_stokes[:, use]
     return float((cos * np.cos(turned) + sin * np.sin(turned)).mean()) if use.any() else 0.0
@@ -128,9 +130,10 @@ def _page(folder: Path, rows: dict[str, dict[str, Score]], table: dict[str, Scor
     lines += [
         f"| {name} | " + " | ".join(f"{figures[row]:.3g}" for row in _ROWS) + " |" for name, figures in summary.items()
     ]
-    lines += ["", f"Degrees over the mask that is given; a pixel without a normal counts as {_MISSED_DEG:g}°.", ""]
+    lines += ["", f"Degrees, over the mask of the folder; a pixel without a normal counts as {_MISSED_DEG:g}°.", ""]
     lines += [
-        "`as a body`: mean cos 2(AoLP − azimuth of the given normals). 1 is light from inside the body, as under a "
-        "flash by the lens; below 0 most of it is mirrored from around, under light that polcap's inversion is not for."
+        "`as a body`: mean cos 2(AoLP − azimuth of the measured normals). It is 1 for diffuse reflection, as under a "
+        "flash next to the lens. Below 0 most light is mirrored from the surroundings, which polcap's inversion is not "
+        "made for."
     ]
     return "\n".join(lines) + "\n"

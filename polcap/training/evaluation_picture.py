@@ -1,4 +1,4 @@
-"""One picture of a few cases: what the camera saw, and each map, truth above estimate."""
+"""Picture of a few cases of the evaluation, panel.png: photograph and maps, truth above estimate."""
 
 import cv2
 import numpy as np
@@ -26,7 +26,7 @@ _LIGHT = np.array([-0.6, 0.5, 0.62])
 
 
 def make_row(case: Case, maps: SurfaceMaps) -> Picture:
-    """Truth above, estimate below; in the last column the error above its forecast."""
+    """Row of a case: truth above, estimate below; in the last column the error above the predicted error."""
     seen, mask = case.cues, case.truth.mask
     s1, s2 = seen.ratio
     depth = [case.depth, case.depth * 0 if maps.depth_prior is None else maps.depth_prior]
@@ -54,7 +54,7 @@ def make_row(case: Case, maps: SurfaceMaps) -> Picture:
 
 
 def _relit(case: Case, maps: SurfaceMaps) -> list[Picture]:
-    """Truth and estimate under a light from the upper left."""
+    """Renderings of truth and estimate under a light from the upper left."""
     images = [_lit(case, one, _LIGHT / np.linalg.norm(_LIGHT)) for one in (case.truth, maps)]
     white = float(np.percentile(images[0][case.truth.mask], 99))
     return [pictures.display(image, white) for image in images]
@@ -67,7 +67,7 @@ def _lit(case: Case, maps: SurfaceMaps, light: Floats) -> Floats:
 
 
 def make_sheet(rows: list[Picture]) -> Picture:
-    """Rows under the names of their columns."""
+    """All rows, below the names of the columns."""
     head = np.zeros((_HEAD, rows[0].shape[1], 3), np.uint8)
     for k, name in enumerate(COLUMNS):
         _write(head, name, (k * _TILE + 4, 15))
@@ -75,7 +75,7 @@ def make_sheet(rows: list[Picture]) -> Picture:
 
 
 def _box(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """The square around the object."""
+    """Square crop around the object."""
     y, x = np.nonzero(mask)
     side = min(max(np.ptp(x), np.ptp(y)) + 5, min(mask.shape))
     starts = (int(np.clip((a.min() + a.max() - side) // 2, 0, n - side)) for a, n in zip((y, x), mask.shape))

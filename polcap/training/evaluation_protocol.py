@@ -1,8 +1,8 @@
-"""The evaluation's fixed pictures: 6 test meshes × 30 test materials -> what the camera measured, and the truth.
+"""The evaluation protocol: fixed pictures of 6 test meshes × 30 test materials, as cues and truth.
 
-Protocol 1: bodies leave light through a smooth interface, half of the materials have a high F0. Protocol 2: through
-the facets of their own roughness (`optics/body.py`), with F0 as it is met. Shapes, patterns and cameras are the same.
-Every picture follows from its number, at any size. Conditions: `CONDITIONS`. Made one at a time.
+Protocol 1: diffuse light leaves through a smooth interface, and half of the materials have a high F0. Protocol 2: it
+leaves through facets of the gloss's roughness (`optics/body.py`), and F0 is that of everyday objects. Shapes, patterns
+and cameras are the same. A picture follows from its number, at any size. `CONDITIONS` states the camera.
 """
 
 from dataclasses import dataclass, replace
@@ -23,15 +23,15 @@ from polcap.synth.mesh_tracer import Tracer, Triangles, centred
 from polcap.training import evaluation_materials, light_transport, random_shapes, traced_views
 from polcap.training.camera_errors import CameraErrors, photograph
 
-VERSION = 1  # raise it when the same number gives other pixels
+VERSION = 1  # to be raised when a number gives other pixels
 COUNT, SIZE = 250, 512
 QUICK_COUNT, QUICK_SIZE = 50, 256
 MESHES = 6
 LIGHTS = 20
 _SEED = 20211121
-_FIELD_OF_VIEW = 30.0  # degrees, of the picture's side
+_FIELD_OF_VIEW = 30.0  # degrees, of the side of the picture
 FLASH = 0.05  # of the distance, above the lens
-_NATIVE = 160  # px: about the size that networks compared with each other are shown
+_REDUCED = 160  # px: approximate size for the comparison of networks alone
 CONDITIONS = (
     "three exposures ×4 apart of a sensor with a full well of 20 ke⁻ and read noise 5 e⁻; gain error 0.3 % per shot "
     "(1σ); polarizer angle error 0.5° (1σ); flash 5 cm above the lens at 1 m distance; field of view 30°, object "
@@ -43,12 +43,12 @@ PROTOCOLS = {1: "smooth bodies, F0 .03–.26", 2: "rough bodies, F0 as it is met
 
 @dataclass(frozen=True)
 class Case:
-    """One picture; camera frame."""
+    """One picture of the evaluation; camera frame."""
 
     name: str  # mesh and material
-    cues: Cues  # of the camera as stated
-    clean: Cues  # of a camera without errors, in the same light
-    small: Cues  # as stated, binned to about the size that networks are trained on
+    cues: Cues  # with the camera errors of CONDITIONS
+    clean: Cues  # without camera errors, in the same light
+    small: Cues  # `cues` binned to about the size of training pictures
     truth: SurfaceMaps
     depth: Floats  # (H, W) units of traced_views.depth_unit, mean 0
 
@@ -66,12 +66,14 @@ class _Subject:
 
 
 class Protocol:
-    """The pictures of one size and protocol; meshes and materials are read once."""
+    """All pictures of one size and protocol."""
 
     def __init__(self, data: Path, size: int, protocol: int = 1) -> None:
         files = sorted((data / "meshes" / "test").glob("*.npz"))
         if len(files) != MESHES:
-            raise InputError(f"{data}/meshes/test holds {len(files)} meshes, the evaluation takes {MESHES}")
+            raise InputError(
+                f"{data}/meshes/test holds {len(files)} meshes, not {MESHES}; give the unchanged DATA folder"
+            )
         self.size, self.protocol = size, protocol
         self.names = [file.stem for file in files]
         self.meshes = [centred(traced_views.read_mesh(file)) for file in files]
@@ -80,7 +82,7 @@ class Protocol:
         self.materials = evaluation_materials.test_materials(data / "materials" / "test", met=protocol == 2)
 
     def case(self, number: int) -> Case:
-        """Picture `number`."""
+        """Simulate picture `number`."""
         subject = self._subject(number, self.size)
         buffer, places = subject.buffer, subject.places
         mesh, _ = combination(number)
@@ -89,19 +91,19 @@ class Protocol:
         with torch.random.fork_rng():
             torch.manual_seed(_SEED + number)
             one = torch.ones(1)
-            stated = _measured(light, places, buffer.view, CameraErrors.stated(1, one.device))
-            clean = _measured(light, places, buffer.view, CameraErrors.none(1, one.device))
+            stated = _photograph(light, places, buffer.view, CameraErrors.stated(1, one.device))
+            clean = _photograph(light, places, buffer.view, CameraErrors.none(1, one.device))
         return Case(
             name=subject.name,
             cues=cues.compute(stated, white()),
             clean=cues.compute(clean, white()),
-            small=cues.compute(_binned(stated, max(1, round(self.size / _NATIVE))), white()),
+            small=cues.compute(_bin(stated, max(1, round(self.size / _REDUCED))), white()),
             truth=_truth(subject),
             depth=_relative_depth(subject),
         )
 
     def truth(self, number: int, size: int) -> SurfaceMaps:
-        """The maps of a picture alone, without light: soon made."""
+        """True maps of a picture, without simulating light."""
         return _truth(self._subject(number, size))
 
     def _subject(self, number: int, size: int) -> _Subject:
@@ -109,7 +111,7 @@ class Protocol:
         mesh, material = self.meshes[index], self.materials[which]
         rng = np.random.default_rng([_SEED, number])
         while True:
-            turn, translation = _placed(mesh, rng)
+            turn, translation = _random_placement(mesh, rng)
             focal = size / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))
             view = View(focal=float(focal), center=((size - 1) / 2, (size - 1) / 2), scale=1.0)
             buffer = self.tracers[index].trace(turn, translation, view, size, size)
@@ -118,37 +120,37 @@ class Protocol:
         inside = buffer.mask
         middle, unit = traced_views.depth_unit(inside, buffer.depth, view.focal)
         pose = light_transport.Pose(turn, translation, np.array([0, FLASH * middle, 0]), middle**2)
-        laid, shift = random_shapes.rotation(rng), rng.uniform(-0.5, 0.5, 3)  # the material's own turn and place
+        frame, shift = random_shapes.rotation(rng), rng.uniform(-0.5, 0.5, 3)  # of the material's pattern
         position, v = buffer.position[inside].astype(np.float64), frames.rays(view, size, size)[inside]
 
         def albedo(place: Floats, facing: Floats) -> Floats:
-            return material.at(place @ laid.T + shift, facing @ laid.T).diffuse
+            return material.at(place @ frame.T + shift, facing @ frame.T).diffuse
 
         normal = buffer.normal[inside]
-        pattern = position @ laid.T + shift, normal @ turn @ laid.T  # places and facing directions in its frame
-        look, slope = material.at(*pattern), material.slope(*pattern) @ laid @ turn.T
-        bent = frames.to_ray_frame(normal - slope + np.sum(slope * normal, axis=1, keepdims=True) * normal, v)
-        bent = np.asarray(frames.lifted(bent))
+        pattern = position @ frame.T + shift, normal @ turn @ frame.T  # in that frame
+        sample, slope = material.at(*pattern), material.slope(*pattern) @ frame @ turn.T
+        tilted = frames.to_ray_frame(normal - slope + np.sum(slope * normal, axis=1, keepdims=True) * normal, v)
+        tilted = np.asarray(frames.lifted(tilted))
         _, flat = self.scenes[index].facing(position + 0.01 * (v @ turn), -v @ turn)
         places = light_transport.SurfacePoints(
-            inside, position, flat, bent, v, look.diffuse, look.specular, look.roughness, material.ior,
+            inside, position, flat, tilted, v, sample.diffuse, sample.specular, sample.roughness, material.ior,
             body_law(number) if self.protocol == 2 else SMOOTH,
         )  # fmt: skip
         return _Subject(f"{self.names[index]}, {material.name}", pose, buffer, places, albedo, (middle, unit))
 
 
 def combination(number: int) -> tuple[int, int]:
-    """Mesh and material of a picture: every 30 show each material once and each mesh five times; 180 are all."""
+    """Mesh and material of a picture. 30 pictures show each material once and each mesh 5 times; 180 show all pairs."""
     order = np.random.default_rng(_SEED).permutation(evaluation_materials.TEXTURES + evaluation_materials.PATTERNS)
     mesh = number % MESHES
     return mesh, int(order[(number // MESHES + 5 * mesh) % len(order)])
 
 
 def body_law(number: int) -> Law:
-    """The law of the body of a picture of protocol 2.
+    """Polarization of diffuse light in a picture of protocol 2.
 
-    Facets counted evenly in every even one, by the flash's light in every odd one; .8–1 of the polarization left, .4–.8
-    in every tenth.
+    Facets have equal weights in even pictures, and are weighted by the flash's light in odd ones. The factor on the
+    polarization is 0.8–1, in every tenth picture 0.4–0.8.
     """
     low, high = (0.4, 0.8) if number % 10 == 9 else (0.8, 1.0)
     kept = np.random.default_rng([_SEED, number, 2]).uniform(low, high)
@@ -156,7 +158,7 @@ def body_law(number: int) -> Law:
 
 
 def render_lights() -> Floats:
-    """The stored lights (20, 3): unit vectors evenly over 60° about the direction from the object to the camera."""
+    """Directions to the 20 lights of the rendering error (20, 3): evenly over 60° about the direction to the camera."""
     k = np.arange(LIGHTS) + 0.5
     z, azimuth = 1 - k / LIGHTS * (1 - np.cos(np.radians(60))), np.pi * (3 - np.sqrt(5)) * k
     across = np.sqrt(1 - z**2)
@@ -166,7 +168,7 @@ def render_lights() -> Floats:
 def stokes_image(
     measured: tuple[Tensor, Tensor, Tensor], at: NDArray[np.integer[Any]], mask: NDArray[np.bool_], view: View
 ) -> StokesImage:
-    """Stokes parameters, covariance and clipped pixels of the places `at`, as the stages know them."""
+    """Stokes parameters, covariance and clipped pixels of the pixels `at` as a `StokesImage`."""
 
     def image(flat: Tensor) -> Floats:
         out = np.zeros((flat.shape[0], mask.size, 3), dtype=np.float32)
@@ -178,8 +180,8 @@ def stokes_image(
     return StokesImage(image(measured[0]), image(measured[1]), quality.reshape(mask.shape), mask, view, None)
 
 
-def _placed(mesh: Triangles, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Random turn, on the optical axis, so far away that the object fills 70–90 % of the picture's side."""
+def _random_placement(mesh: Triangles, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Random rotation, and translation along the optical axis: the object fills 70–90 % of the picture's side."""
     turn, fill = random_shapes.rotation(rng), rng.uniform(0.7, 0.9)
     seen = mesh.vertices.astype(np.float64) @ turn.T
     seen -= (middle := (seen.min(axis=0) + seen.max(axis=0)) / 2)
@@ -188,7 +190,8 @@ def _placed(mesh: Triangles, rng: np.random.Generator) -> tuple[Floats, Floats]:
     return turn, np.array([0, 0, -distance]) - middle
 
 
-def _measured(light: Floats, places: light_transport.SurfacePoints, view: View, errors: CameraErrors) -> StokesImage:
+def _photograph(light: Floats, places: light_transport.SurfacePoints, view: View, errors: CameraErrors) -> StokesImage:
+    """Measurement of Stokes parameters (3, M, 3) by a camera with these errors."""
     mask = places.mask
     at = np.flatnonzero(mask)
 
@@ -204,8 +207,8 @@ def _measured(light: Floats, places: light_transport.SurfacePoints, view: View, 
     return stokes_image(seen, at, mask, view)
 
 
-def _binned(image: StokesImage, by: int) -> StokesImage:
-    """by × by pixels in one, those of the object alone; a bin is the object's where half of it is."""
+def _bin(image: StokesImage, by: int) -> StokesImage:
+    """Means over by × by pixels of the object; a bin is part of the object if half of it is."""
     height, width = (side // by for side in image.mask.shape)
 
     def summed(value: Floats) -> Floats:  # the last two axes of pixels
@@ -248,4 +251,5 @@ def _relative_depth(subject: _Subject) -> Floats:
 
 
 def white() -> ColorCalibration:
+    """Color calibration that changes nothing."""
     return ColorCalibration(np.eye(3, dtype=np.float32), "profile")

@@ -1,8 +1,7 @@
-"""Flash light on a mesh: direct, with cast shadows, and after one diffuse bounce between its parts.
+"""Traced flash light on a mesh, for the evaluation's pictures: direct, with shadows, and after one diffuse bounce.
 
-What is traced: which places the flash reaches, and what each place sees of the others by lit diffuse
-light, reflected there diffusely and by the surface's facets. Left out: more bounces, and that bounced
-light is itself a little polarized when it arrives.
+Traced are the places that the flash reaches, and the diffuse light that each place receives from others; it reflects
+this light diffusely and by its facets. Neglected: further bounces, and the weak polarization of the light that arrives.
 """
 
 from collections.abc import Callable
@@ -21,9 +20,9 @@ from polcap.optics import brdf, frames, fresnel, shade
 from polcap.optics.body import SMOOTH, Law
 from polcap.synth.mesh_tracer import Triangles
 
-LIFT = 1e-3  # longest sides of the mesh, from the surface to where a ray starts; nearer hits are the place itself
-_AROUND, _MIRRORED = 12, 6  # rays per place over the hemisphere, and about the mirror direction
-_SMOOTH = 0.004  # picture sides, 1σ, over which traced light is averaged
+LIFT = 1e-3  # longest sides of the mesh, from the surface to the start of a ray; nearer hits are the place itself
+_HEMISPHERE_RAYS, _MIRROR_RAYS = 12, 6  # per place: over the hemisphere, and about the mirror direction
+_SMOOTH = 0.004  # 1σ of the average of traced light, picture sides
 
 Indices = NDArray[np.integer[Any]]
 Albedo = Callable[[Floats, Floats], Floats]  # places, facing directions (M, 3) -> diffuse albedo (M, 3)
@@ -31,21 +30,21 @@ Albedo = Callable[[Floats, Floats], Floats]  # places, facing directions (M, 3) 
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the mesh and the flash are: camera = rotation @ vertex + translation."""
+    """Position of mesh and flash: camera = rotation @ vertex + translation."""
 
     rotation: Floats  # (3, 3)
     translation: Floats  # (3,)
     flash: Floats  # (3,) camera frame
-    strength: float  # S0 of a white plane facing the flash at distance 1
+    strength: float  # S0 of a white plane that faces the flash at distance 1
 
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """The M visible pixels of a picture, dressed."""
+    """Surface at the M visible pixels of a picture."""
 
     mask: NDArray[np.bool_]  # (H, W)
     position: Floats  # (M, 3) mesh frame
-    flat: Floats  # (M, 3) the triangles' own normals, mesh frame, towards the camera
+    flat: Floats  # (M, 3) geometric normals of the triangles, mesh frame, towards the camera
     normal: Floats  # (M, 3) in the frame of each ray, with relief
     rays: Floats  # (M, 3) camera frame, surface to camera
     diffuse: Floats  # (M, 3)
@@ -55,13 +54,13 @@ class SurfacePoints:
     law: Law = SMOOTH
 
     def take(self, which: Indices) -> "SurfacePoints":
-        """Some of them; the mask stays, and what all have in common."""
-        held = {name: value[which] for name, value in vars(self).items() if name not in ("mask", "ior", "law")}
-        return replace(self, **held)
+        """The points `which`; mask, ior and law stay."""
+        taken = {name: value[which] for name, value in vars(self).items() if name not in ("mask", "ior", "law")}
+        return replace(self, **taken)
 
 
 class MeshScene:
-    """A mesh, ready for rays of any kind."""
+    """A mesh prepared for tracing rays."""
 
     def __init__(self, mesh: Triangles) -> None:
         self.scene = EmbreeScene()
@@ -72,7 +71,7 @@ class MeshScene:
         self.flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
 
     def facing(self, origin: Floats, direction: Floats) -> tuple[Floats, Floats]:
-        """First hits of rays: distance (M,), infinite for none, and the triangle's normal towards the origin."""
+        """First hits of rays (M, 3): distance (M,), infinite for none, and the triangle's normal towards the origin."""
         start, way = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, direction))
         hit = self.scene.run(start, way, query="INTERSECT", output=True)
         struck = hit["primID"] >= 0
@@ -81,7 +80,7 @@ class MeshScene:
         return np.where(struck, hit["tfar"], np.inf), normal
 
     def lit(self, place: Floats, flat: Floats, pose: Pose) -> tuple[Floats, Floats]:
-        """Unit vectors towards the flash (M, 3), mesh frame, and S0 of a white plane facing it (M,), 0 in shadow."""
+        """Unit vectors to the flash (M, 3), mesh frame, and S0 of a white plane that faces it (M,), 0 in shadow."""
         to_flash = (pose.flash - pose.translation) @ pose.rotation - place
         far = np.linalg.norm(to_flash, axis=1)
         to_flash = to_flash / far[:, None]
@@ -95,12 +94,12 @@ def stokes(scene: MeshScene, places: SurfacePoints, pose: Pose, albedo: Albedo, 
     """Stokes parameters (3, M, 3) of the visible pixels, in the frame of each ray."""
     to_flash, irradiance = scene.lit(places.position, places.flat, pose)
     toward = frames.to_ray_frame(to_flash @ pose.rotation.T, places.rays)
-    direct = _shaded(places, places.diffuse, places.specular, toward, irradiance)
-    gather = _Gather(scene, places, pose, albedo)
-    return np.asarray(direct + gather.diffuse(rng) + gather.mirrored(rng))
+    direct = _shade(places, places.diffuse, places.specular, toward, irradiance)
+    indirect = IndirectLight(scene, places, pose, albedo)
+    return np.asarray(direct + indirect.diffuse(rng) + indirect.mirrored(rng))
 
 
-def _shaded(
+def _shade(
     places: SurfacePoints,
     diffuse: Floats,
     specular: Floats,
@@ -113,42 +112,42 @@ def _shaded(
     return np.asarray(shade.stokes(places.normal, diffuse, specular, *lit, places.law))
 
 
-class _Gather:
-    """Light that reaches the places from other parts of the mesh."""
+class IndirectLight:
+    """Light at the places from other parts of the mesh."""
 
     def __init__(self, scene: MeshScene, places: SurfacePoints, pose: Pose, albedo: Albedo) -> None:
         self.scene, self.places, self.pose, self.albedo = scene, places, pose, albedo
         self.e_x, self.e_y = frames.basis(places.normal)
 
     def diffuse(self, rng: np.random.Generator) -> Floats:
-        """Reflected diffusely: irradiance from rays spread by their cosine over the hemisphere."""
+        """Diffuse reflection (3, M, 3): irradiance by rays over the hemisphere, distributed by their cosine."""
         places, count = self.places, len(self.places.normal)
         turn = rng.uniform(0, 1, (count, 2))
         received: Floats = np.zeros((count, 3))
-        for k in range(_AROUND):
-            cosine = np.sqrt(1 - (k + turn[:, 0]) / _AROUND)
+        for k in range(_HEMISPHERE_RAYS):
+            cosine = np.sqrt(1 - (k + turn[:, 0]) / _HEMISPHERE_RAYS)
             way = self._around(cosine, 2 * pi * (k * 0.618034 + turn[:, 1]))
             met, incoming = self.light(way, np.arange(count))
             received[met] += incoming * fresnel.transmission(np.maximum(cosine[met], 1e-3), places.ior)[0][:, None]
         entered = fresnel.transmission(1.0, places.ior)[0]
-        received = self.smooth(received / (_AROUND * entered))
-        # as if all of it had come straight down, which enters through `entered`
+        received = self.smooth(received / (_HEMISPHERE_RAYS * entered))
+        # shaded as light along the normal, of which the share `entered` passes the surface
         one = np.ones(count)
-        return _shaded(places, places.diffuse * received, 0 * places.specular, places.normal, one)
+        return _shade(places, places.diffuse * received, 0 * places.specular, places.normal, one)
 
     def mirrored(self, rng: np.random.Generator) -> Floats:
-        """Reflected by facets drawn from the GGX distribution.
+        """Mirror reflection (3, M, 3) by facets drawn from the GGX distribution.
 
-        Where F0 is more than the body's index gives, facets have the index that gives it: a multiple of Fresnel's
-        curve would send back more light than comes, at grazing angles, where most of this light is.
+        Facets have the refractive index that gives F0, if F0 is higher than that of the body's index. A multiple of
+        the Fresnel curve would reflect more than 100 % at grazing angles, where most of this light is.
         """
         places, count = self.places, len(self.places.normal)
         root = np.sqrt(np.maximum(places.specular.mean(axis=1), fresnel.normal_reflectance(places.ior)))
         ior = (1 + root) / (1 - root)
         alpha = places.roughness**2
         turn, total = rng.uniform(0, 1, (count, 2)), np.zeros((3, count, 3))
-        for k in range(_MIRRORED):
-            u = (k + turn[:, 0]) / _MIRRORED
+        for k in range(_MIRROR_RAYS):
+            u = (k + turn[:, 0]) / _MIRROR_RAYS
             cos_h = np.sqrt((1 - u) / (1 + (alpha**2 - 1) * u))
             half = self._around(cos_h, 2 * pi * (k * 0.618034 + turn[:, 1]))
             cos_d = half[:, 2]
@@ -156,14 +155,14 @@ class _Gather:
             possible = (cos_d > 0.01) & (np.sum(way * places.normal, axis=1) > 0.01)
             met, incoming = self.light(way, np.flatnonzero(possible))
             density = pi * brdf.ggx_distribution(cos_h[met], alpha[met]) * cos_h[met] / (4 * cos_d[met])
-            irradiance = 1 / np.maximum(density * _MIRRORED, 1e-9)
-            total[:, met] += _shaded(
+            irradiance = 1 / np.maximum(density * _MIRROR_RAYS, 1e-9)
+            total[:, met] += _shade(
                 places.take(met), 0 * incoming, places.specular[met] * incoming, way[met], irradiance, ior[met]
             )
         return np.stack([self.smooth(part) for part in total])
 
     def light(self, way: Floats, which: Indices) -> tuple[Indices, Floats]:
-        """Those of the places `which` that see another one along `way` (M, 3, rays' frames), and its S0 (·, 3)."""
+        """Places among `which` that see another one along `way` (M, 3; rays' frames), and the S0 (·, 3) of that one."""
         scene, places, pose = self.scene, self.places, self.pose
         direction = frames.from_ray_frame(way[which], places.rays[which]) @ pose.rotation
         origin = (places.position + LIFT * scene.size * places.flat)[which]
@@ -178,7 +177,7 @@ class _Gather:
         return which[met], self.albedo(there, flat) * (irradiance * cos_i * into * out)[:, None]
 
     def smooth(self, value: Floats) -> Floats:
-        """(M, C) averaged over the object's near pixels."""
+        """Values (M, C) averaged over nearby pixels of the object."""
         mask = self.places.mask
         sigma = _SMOOTH * max(mask.shape)
         image = np.zeros((*mask.shape, value.shape[1]), np.float32)
@@ -187,7 +186,7 @@ class _Gather:
         return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma)[mask] / weight[mask][:, None])
 
     def _around(self, cosine: Floats, azimuth: Floats) -> Floats:
-        """Directions (M, 3) at an angle about the normals."""
+        """Directions (M, 3) at angles with the given cosines (M,) and azimuths (M,) about the normals."""
         sine = np.sqrt(np.maximum(1 - cosine**2, 0))
         x, y = (a[:, None] for a in (sine * np.cos(azimuth), sine * np.sin(azimuth)))
         return np.asarray(x * self.e_x + y * self.e_y + cosine[:, None] * self.places.normal)

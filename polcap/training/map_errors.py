@@ -1,4 +1,4 @@
-"""Errors of one picture's maps against its truth, over the truth's mask."""
+"""Errors of the estimated maps of one picture, over the true mask."""
 
 from dataclasses import replace
 
@@ -12,36 +12,35 @@ from polcap.stages import surface
 from polcap.training.evaluation_protocol import Case, render_lights
 
 MAPS = ("diffuse", "specular", "roughness")
-_IOR = 1.5  # of the rendering error: the maps do not say it
-_DRAWN = 20_000  # pixels of the rendering error, at most: every second, third... of the mask
-_INTEGRATED = 128  # px, about: integrating 512² takes longer than all else
-_FLASH = np.array([0.0, 0.0, 1.0])  # where the light that sets white stands
-_LEAST_CLIPPED = 10  # pixels, for a highlight's error to count
+_IOR = 1.5  # for renderings; it is not among the maps
+_MAX_PIXELS = 20_000  # of a rendering: every second, third … pixel of the mask
+_INTEGRATED = 128  # px, approximate side for integration, which takes too long at 512²
+_FLASH = np.array([0.0, 0.0, 1.0])  # direction to the light that defines white
+_MIN_CLIPPED = 10  # clipped pixels needed for an error in highlights
 
 Score = dict[str, float]
 Bools = NDArray[np.bool_]
 
 
 class Judge:
-    """Scores estimates of one picture; what depends on the truth alone is worked out once."""
+    """Measures errors of estimates of one picture."""
 
     def __init__(self, case: Case) -> None:
         self.case, self.mask = case, case.truth.mask
         self.core = cv2.erode(self.mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         clipped = self.mask & ((case.cues.quality & Quality.CLIPPED) > 0)
-        self.clipped = clipped if clipped.sum() >= _LEAST_CLIPPED else None
-        self.drawn = np.zeros_like(self.mask)
-        self.drawn.flat[np.flatnonzero(self.mask)[:: -(-int(self.mask.sum()) // _DRAWN)]] = True
-        self.white = float(np.percentile(render_intensity(case.truth, case, self.drawn, _FLASH), 99))
+        self.clipped = clipped if clipped.sum() >= _MIN_CLIPPED else None
+        self.rendered_mask = np.zeros_like(self.mask)
+        self.rendered_mask.flat[np.flatnonzero(self.mask)[:: -(-int(self.mask.sum()) // _MAX_PIXELS)]] = True
+        self.white = float(np.percentile(render_intensity(case.truth, case, self.rendered_mask, _FLASH), 99))
         self.rendered = self._rendered(case.truth)
 
     def score(self, maps: SurfaceMaps) -> Score:
-        """RMSE unless said, angles in degrees, shares of pixels in 0…1. `·_core`: mask eroded by 2 px.
+        """RMSE unless the name differs; angles in degrees, shares of pixels 0…1. `·_core`: mask eroded by 2 px.
 
-        `·_picture`: over the whole square picture, where nothing is wrong beside the object.
-
-        depth: both centred in the mask, over the truth's greatest minus least; `depth_fitted`: after the best
-        scale and shift. diffuse_clipped: where every exposure is saturated; absent where fewer than ten pixels are.
+        `·_picture`: over the whole square picture, with zero error outside the object. depth: both centred in the mask,
+        in units of the truth's range; `depth_fitted`: after the best scale and shift. diffuse_clipped: where all
+        exposures are saturated; absent for fewer than ten such pixels.
         """
         case, mask, error = self.case, self.mask, angle(maps, self.case)
         out = {}
@@ -68,7 +67,7 @@ class Judge:
         }  # fmt: skip
 
     def integrated(self, maps: SurfaceMaps) -> Score:
-        """depth_integrated: depth's error once stage 9 has made a surface of the maps, on every n-th pixel."""
+        """depth_integrated: error of the depth that stage 9 integrates from the maps, on every n-th pixel."""
         by = max(1, round(max(self.mask.shape) / _INTEGRATED))
         thin = _thinned(maps, by)
         mask = thin.mask & self.mask[::by, ::by]
@@ -77,10 +76,10 @@ class Judge:
         return {"depth_integrated": _depth(depth / unit, self.case.depth[::by, ::by][mask])["depth"]}
 
     def _rendered(self, maps: SurfaceMaps) -> Floats:
-        """S0 (20, M, 3) under the stored lights, clipped to 0…1; 1 is the flash-lit truth's 99th percentile."""
+        """S0 (20, M, 3) under 20 lights, clipped to 0…1; 1: 99th percentile of the truth under the flash."""
         return np.stack(
             [
-                np.clip(render_intensity(maps, self.case, self.drawn, light) / self.white, 0, 1)
+                np.clip(render_intensity(maps, self.case, self.rendered_mask, light) / self.white, 0, 1)
                 for light in render_lights()
             ]
         )
@@ -93,7 +92,7 @@ def angle(maps: SurfaceMaps, case: Case) -> Floats:
 
 
 def deciles(predicted: Floats, actual: Floats) -> list[dict[str, float]]:
-    """Mean predicted and mean actual normal error in each tenth of the pixels, by predicted error."""
+    """Mean predicted and mean actual normal error of each tenth of the pixels, sorted by predicted error."""
     order = np.argsort(predicted)
     return [
         {"predicted": float(predicted[part].mean()), "actual": float(actual[part].mean())}
@@ -102,7 +101,7 @@ def deciles(predicted: Floats, actual: Floats) -> list[dict[str, float]]:
 
 
 def _thinned(maps: SurfaceMaps, by: int) -> SurfaceMaps:
-    """Every by-th pixel of every by-th row."""
+    """Maps at every by-th pixel of every by-th row."""
     thin = np.s_[::by, ::by]
     x, y = maps.view.center
     return replace(
@@ -114,7 +113,7 @@ def _thinned(maps: SurfaceMaps, by: int) -> SurfaceMaps:
 
 
 def render_intensity(maps: SurfaceMaps, case: Case, mask: Bools, light: Floats) -> Floats:
-    """S0 (M, 3) of the masked pixels under a distant light (3,), camera frame; as `optics/shade.py`, no shadow."""
+    """S0 (M, 3) of the masked pixels under a distant light (3,), camera frame, without shadows."""
     rays = case.cues.rays[mask].astype(np.float32)
     normal = frames.to_ray_frame(maps.normal[mask], rays).astype(np.float32)
     toward = frames.to_ray_frame(np.broadcast_to(light.astype(np.float32), rays.shape), rays)
@@ -128,8 +127,8 @@ def _rmse(difference: Floats) -> float:
     return float(np.sqrt(np.mean(np.square(difference, dtype=np.float64))))
 
 
-def _depth(ahead: Floats, truth: Floats) -> Score:
-    ahead, truth = (x.astype(np.float64) - x.mean(dtype=np.float64) for x in (ahead, truth))
-    scale = (ahead @ truth) / max(float(ahead @ ahead), 1e-12)
+def _depth(estimate: Floats, truth: Floats) -> Score:
+    estimate, truth = (x.astype(np.float64) - x.mean(dtype=np.float64) for x in (estimate, truth))
+    scale = (estimate @ truth) / max(float(estimate @ estimate), 1e-12)
     span = float(np.ptp(truth))
-    return {"depth": _rmse(ahead - truth) / span, "depth_fitted": _rmse(scale * ahead - truth) / span}
+    return {"depth": _rmse(estimate - truth) / span, "depth_fitted": _rmse(scale * estimate - truth) / span}

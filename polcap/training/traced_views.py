@@ -60,7 +60,7 @@ def open_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe) -> dict[st
         build_cache(folder, meshes, recipe)
     elif json.loads(index.read_text()) != _index(meshes, recipe):
         raise InputError(
-            f"{folder} holds views of other meshes or of another preset; remove it or choose another --out"
+            f"{folder} holds views of other meshes or of another preset; remove it, or choose another --out"
         )
     return load_cache(folder)
 
@@ -115,7 +115,7 @@ def load_cache(folder: Path) -> dict[str, NDArray[Any]]:
     missing = [n for n in ("index.json", *(f"{name}.npy" for name in (*ARRAYS, "camera"))) if not (folder / n).exists()]
     if missing:
         raise InputError(
-            f"{folder} holds no complete G-buffer cache: {missing[0]} is missing; remove it and run `polcap train`"
+            f"{folder} holds no complete cache of views: {missing[0]} is missing; remove it and run `polcap train`"
         )
     arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in ARRAYS}
     return arrays | {"camera": np.load(folder / "camera.npy")}

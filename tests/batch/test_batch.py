@@ -1,4 +1,4 @@
-"""A batch ends whatever breaks in it, and does nothing twice."""
+"""A batch ends although captures fail, and processes no capture twice."""
 
 import json
 import os
@@ -36,7 +36,7 @@ def test_captures_are_found_however_deep_and_results_are_not(captures: Path, tmp
         ("noise.onnx", "analytic", "--model and --estimator analytic exclude each other"),
     ],
 )
-def test_a_model_that_cannot_be_used_is_told_before_any_capture(
+def test_an_unusable_model_is_refused_before_any_capture(
     tmp_path: Path, polcap: Command, model: str, estimator: str, says: str, more: tuple[str, ...]
 ) -> None:
     (tmp_path / "captures" / "obj" / "pol000").mkdir(parents=True)
@@ -60,7 +60,7 @@ def finished(captures: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_broken_capture_stops_no_other_and_is_told_with_its_remedy(finished: Path) -> None:
+def test_broken_capture_stops_no_other_and_is_listed_with_its_remedy(finished: Path) -> None:
     rows = {row["name"]: row for row in json.loads((finished / "polcap-batch/summary.json").read_text())["rows"]}
     assert rows["broken"]["state"] == "failed" and "copy it from the card again" in rows["broken"]["says"]
     for name in ("obj0", "deeper/obj1"):
@@ -77,14 +77,14 @@ def test_second_run_opens_no_finished_capture(captures: Path, finished: Path, po
     assert (finished / "obj0/report.json").stat().st_mtime_ns == before
 
 
-def test_changed_setting_is_done_again(captures: Path, finished: Path) -> None:
+def test_a_changed_setting_is_processed_again(captures: Path, finished: Path) -> None:
     units = [unit for unit in batch.find(captures, finished) if unit.name == "obj0"]
-    order = one.Order({"hdr": {}})
-    assert one.finished(units[0], order) is None
-    assert one.request(units[0], order) != one.request(units[0], one.Order({"hdr": {"clip": 0.9}}))
+    options = one.ProcessOptions({"hdr": {}})
+    assert one.finished(units[0], options) is None
+    assert one.request(units[0], options) != one.request(units[0], one.ProcessOptions({"hdr": {"clip": 0.9}}))
 
 
-def test_status_tells_every_capture(finished: Path, polcap: Command) -> None:
+def test_status_lists_every_capture(finished: Path, polcap: Command) -> None:
     about = json.loads(polcap("status", finished, "--json").stdout)
     assert about["states"]["failed"] == 1 and about["finished"] == 2
     assert "2 of 3 finished" in polcap("status", finished).stdout

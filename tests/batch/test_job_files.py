@@ -1,4 +1,4 @@
-"""Job files say what the farms' own rules ask for; their validators are run where they are installed."""
+"""Job files follow the rules of each scheduler; its own validator runs where it is installed."""
 
 import json
 import shlex
@@ -21,7 +21,7 @@ def job() -> BatchJob:
     return BatchJob(job_files.batch_command(ROOT, {"assignments": ["hdr.clip=0.9"], "keep_going": True}), ROOT, 12)
 
 
-def test_what_submits_a_job_survives_any_folder_name() -> None:
+def test_submit_commands_quote_any_folder_name() -> None:
     file = ROOT / "slurm.sh"
     assert shlex.split(job_files.submit_hint("slurm", file)) == ["sbatch", str(file)]
     assert repr(str(file)) in job_files.submit_hint("opencue", file)
@@ -65,7 +65,7 @@ def test_kubernetes_job_is_valid(job: BatchJob, tmp_path: Path) -> None:
     validate.validate(document, validate.latest_version(), strict=True)
 
 
-def test_snakefile_takes_a_root_as_it_is_called(tmp_path: Path) -> None:
+def test_snakefile_quotes_the_name_of_the_root(tmp_path: Path) -> None:
     root = Path("/shows/me@/raw")
     text = written("snakemake", BatchJob(job_files.batch_command(root, {}), root, 12), tmp_path)
     assert f"polcap batch {root} --shard {{wildcards.k}}/12" in text

@@ -1,4 +1,4 @@
-"""Every capture belongs to one shard, whoever numbers the shards."""
+"""Every capture belongs to exactly one shard, under every scheduler."""
 
 import pytest
 
@@ -32,11 +32,11 @@ def test_wrong_shard_is_refused(text: str) -> None:
         {"PBS_ARRAY_INDEX": "3", "POLCAP_SHARDS": "4"},
     ],
 )  # fmt: skip
-def test_environment_says_third_of_four(environment: dict[str, str]) -> None:
+def test_every_scheduler_environment_gives_shard_three_of_four(environment: dict[str, str]) -> None:
     assert str(shards.from_environment(environment)) == "3/4"
 
 
-def test_no_array_is_the_whole() -> None:
+def test_no_scheduler_means_the_whole_batch() -> None:
     assert shards.from_environment({"SLURM_JOB_ID": "7"}) == shards.WHOLE
 
 
@@ -44,6 +44,6 @@ def test_no_array_is_the_whole() -> None:
     "environment",
     [{"JOB_COMPLETION_INDEX": "2"}, {"PBS_ARRAY_INDEX": "0", "POLCAP_SHARDS": "4"}, {"PBS_ARRAY_INDEX": "x"}],
 )
-def test_index_without_a_meaning_is_refused(environment: dict[str, str]) -> None:
+def test_index_without_count_or_beyond_it_is_refused(environment: dict[str, str]) -> None:
     with pytest.raises(SettingError):
         shards.from_environment(environment)

@@ -1,4 +1,4 @@
-"""A unit's record, whatever its folder is called and whatever became of its process."""
+"""A capture of any name gets a record, and the record knows whether its process still runs."""
 
 import ctypes
 import json
@@ -11,10 +11,10 @@ from types import SimpleNamespace
 import pytest
 
 from polcap import batch
-from polcap.batch import sheet
+from polcap.batch import contact_sheet
 from polcap.batch import unit as one
 
-ANALYTIC = one.Order({}, estimator="analytic")
+ANALYTIC = one.ProcessOptions({}, estimator="analytic")
 
 
 def only_unit(root: Path, name: str) -> one.Unit:
@@ -32,20 +32,20 @@ def only_unit(root: Path, name: str) -> one.Unit:
 def test_a_capture_of_any_name_is_recorded(tmp_path: Path, name: str) -> None:
     unit = only_unit(tmp_path, name)
     record = one.run(unit, ANALYTIC)
-    assert record.state == "failed" and "holds no photograph" in record.says
+    assert record.state == "failed" and "holds no photograph" in record.message
     assert one.read_record(unit) == record
-    sheet.write(Path(unit.desk), [unit], [record])
-    (row,) = json.loads((Path(unit.desk) / "summary.json").read_text(encoding="utf-8"))["rows"]
+    contact_sheet.write(Path(unit.batch_folder), [unit], [record])
+    (row,) = json.loads((Path(unit.batch_folder) / "summary.json").read_text(encoding="utf-8"))["rows"]
     assert row["name"] == name
 
 
 @pytest.mark.parametrize(("handle", "waited", "alive"), [(0, 0, False), (7, 0x102, True), (7, 0, False)])
-def test_windows_is_asked_without_a_signal(
+def test_windows_processes_are_checked_without_a_signal(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, handle: int, waited: int, alive: bool
 ) -> None:
     """There `os.kill(pid, 0)` would be Ctrl-C to the batch that is asked about."""
     unit = only_unit(tmp_path, "obj")
-    one.write_record(unit, one.Record("obj", "running", host=socket.gethostname(), pid=4711))
+    one.write_record(unit, one.UnitRecord("obj", "running", host=socket.gethostname(), pid=4711))
     kernel = SimpleNamespace(
         OpenProcess=lambda access, inherit, pid: handle if pid == 4711 else 0,
         WaitForSingleObject=lambda opened, milliseconds: waited,

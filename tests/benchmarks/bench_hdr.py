@@ -80,7 +80,7 @@ def compare(title: str, theirs: Any, quads: Floats, exposures: tuple[float, ...]
         )  # fmt: skip
     shot = Shot(0.0, tuple(frame(p, e / 100) for p, e in zip(paths, exposures)))
     capture = Capture("", "", (shot,), "folders", 1000.0, True, (0.0, 0.0), SIZE[::-1])
-    stack, ours_s = timed(lambda: hdr.merge(capture, decode, hdr.Settings()))
+    stack, ours_s = timed(lambda: hdr.merge(capture, decode, hdr.HdrSettings()))
     reference = int(np.argmax(np.all(stack.bracket.exposure_ratio[0] == 1, axis=1)))
     truth = quads * true[reference] / GAIN / (WHITE - BLACK)
     clear = (stack.quality[0] & 1) == 0

@@ -68,7 +68,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     folder = bench_speed.made(given.folder, given.megapixels)
     capture = captures.read(folder)
-    stack = hdr.merge(capture, frame_decoder.decode, hdr.Settings())
+    stack = hdr.merge(capture, frame_decoder.decode, hdr.HdrSettings())
     rows = []
     for row in chain(solving(stack), charting(stack), registering(stack, folder), merging(capture), integrating()):
         print(table([row]), file=sys.stderr)
@@ -93,10 +93,10 @@ def merging(capture: Capture) -> Iterator[Row]:
 
 def _merges(capture: Capture, times: int = 10) -> tuple[float, float]:
     """CPU seconds of one of several merges, its decoders' among them, and of this process alone."""
-    hdr.merge(capture, frame_decoder.decode, hdr.Settings())
+    hdr.merge(capture, frame_decoder.decode, hdr.HdrSettings())
     before, here = bench_speed.tree_cpu(), time.process_time()
     for _ in range(times):
-        hdr.merge(capture, frame_decoder.decode, hdr.Settings())
+        hdr.merge(capture, frame_decoder.decode, hdr.HdrSettings())
     return (bench_speed.tree_cpu() - before) / times, (time.process_time() - here) / times
 
 
@@ -132,8 +132,8 @@ def registering(stack: AngleStack, folder: Path) -> Iterator[Row]:
 
     theirs = least(ecc)
     color = whitebalance.measure(stack, shipped_data.colorchecker(), ChartRequest("none"), WhitebalanceSettings())
-    ours = least(lambda: align.register(stack, color, align.Settings()))
-    own = align.register(stack, color, align.Settings()).transform[1:]
+    ours = least(lambda: align.register(stack, color, align.AlignSettings()))
+    own = align.register(stack, color, align.AlignSettings()).transform[1:]
     size = stack.value.shape[1:3]
     errors = [", ".join(f"{_error(m, t, size):.3f}" for m, t in zip(some, true[1:])) for some in (own, found)]
     yield Row("registration", "cv2.findTransformECC", ours, theirs, f"error {errors[0]} px, theirs {errors[1]} px")

@@ -1,18 +1,22 @@
 """Path-traced test scenes by Mitsuba 3, with interreflection: noise-free Stokes parameters and the truth of every map.
 
     python tests/benchmarks/make_mitsuba.py FOLDER [--data $POLCAP_DATA] [--scenes 12] [--size 256] [--depth 5]
+        [--meshes test|train] [--black]
 
-Test meshes in turn, posed as `polcap evaluate` poses them, under a flash 5 % of the distance above the lens. Each
+Meshes in turn, posed as `polcap evaluate` poses them, under a flash 5 % of the distance above the lens. Each
 wears two regions of plastic, each of three grades: albedo from a test texture set or solid noise, a face at a time;
-one index per region, one k_s and roughness per grade. One .npz per scene; a scene that stands there already is
-kept. Every scene is rendered until the Monte-Carlo error of its DoLP, from two halves of independent seeds, is
-below 0.1 %.
+one index per region, one k_s and roughness per grade. With --black the whole object is black gloss before dark cloth:
+albedo .01–.06, roughness .05–.3, F0 about .04, and a floor, a wall and sometimes a chart that it mirrors.
+
+One .npz per scene; a scene that exists already is not made again. Every scene is rendered until the Monte-Carlo error
+of its DoLP, from two halves of independent seeds, is below 0.1 %.
 """
 
 import argparse
 import json
 import os
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +44,16 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=12)
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--depth", type=int, default=5, help="longest path; 2 is direct light only")
+    parser.add_argument("--meshes", choices=("test", "train"), default="test")
+    parser.add_argument("--black", action="store_true", help="black gloss before dark cloth")
     options = parser.parse_args()
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_mono_polarized")
     mi.set_log_level(mi.LogLevel.Error)
-    meshes = sorted((options.data / "meshes" / "test").glob("*.npz"))
+    training = options.meshes == "train"
+    folder = options.data / "meshes" / "test"
+    meshes = traced_views.training_meshes(options.data) if training else sorted(folder.glob("*.npz"))
     sets = sorted(p.parent for p in (options.data / "materials" / "test").glob("*/albedo.jpg"))
     for index in range(options.scenes):
         mesh = meshes[index % len(meshes)]
@@ -55,19 +63,28 @@ def main() -> None:
         random = np.random.default_rng([2026, index])
         texture = sets[index // 2 % len(sets)] if index % 2 else None
         began = time.monotonic()
-        made, about = build(mi, traced_views.read_mesh(mesh), texture, options.size, options.depth, random)
+        wear = Wear(texture, options.black)
+        made, about = build(mi, traced_views.read_mesh(mesh), wear, options.size, options.depth, random)
         with atomic.path(file) as temporary:
             np.savez_compressed(temporary, allow_pickle=False, about=np.array(json.dumps(about)), **made)
         print(file.name, json.dumps(about), f"{time.monotonic() - began:.0f} s", flush=True)
 
 
+@dataclass(frozen=True)
+class Wear:
+    """Material and surroundings of an object."""
+
+    texture: Path | None  # None: solid noise
+    black: bool  # black gloss before dark cloth, whatever the texture
+
+
 def build(
-    mi: Any, mesh: Triangles, texture: Path | None, size: int, depth: int, random: np.random.Generator
+    mi: Any, mesh: Triangles, wear: Wear, size: int, depth: int, random: np.random.Generator
 ) -> tuple[dict[str, Floats], dict[str, Any]]:
     """Stokes parameters (3, H, W, 3) in the frame of each ray, truth maps, camera; and how it was made."""
     rotation, translation, view = traced_views.random_pose(mesh, size, random)
     corner, normal = subdivided(mesh)
-    coat = dressed(corner, texture, random)
+    coat = black_gloss(len(corner), random) if wear.black else dressed(corner, wear.texture, random)
     if not trimesh.Trimesh(mesh.vertices, mesh.faces).is_watertight:
         corner, normal = facing(corner, normal, -translation @ rotation)
     far = float(-translation[2] - np.mean(corner @ rotation[2]))
@@ -87,7 +104,8 @@ def build(
     middle, unit = traced_views.depth_unit(mask, truth["depth"], view.focal)
     halves = np.zeros((2, 3, size, size, 3))
     passes, error = 0, [np.inf, np.inf]
-    scenes = [scene(mi, parts, channel, light, np.pi * middle**2, view, size, depth) for channel in "rgb"]
+    around = cloth(mi, np.concatenate([part["position"] for part in parts]), random) if wear.black else {}
+    scenes = [scene(mi, parts, channel, light, np.pi * middle**2, view, size, depth, around) for channel in "rgb"]
     while passes < LEAST or (error[1] > 2 * GOAL and passes < MOST):
         for k, one in enumerate(scenes):
             halves[passes % 2, ..., k] += shot(mi, one, view, seed=3 * passes + k)
@@ -95,7 +113,7 @@ def build(
         if passes % 2 == 0:
             error = dolp_error(halves, mask)
     about = {
-        "texture": texture.name if texture else "noise",
+        "texture": "black gloss" if wear.black else wear.texture.name if wear.texture else "noise",
         "grades": coat["grades"],
         "light": light,
         "depth": depth,
@@ -159,6 +177,37 @@ def dressed(corner: Floats, texture: Path | None, random: np.random.Generator) -
     return {**maps, "grade": 3 * second + level, "grades": grades}
 
 
+def black_gloss(faces: int, random: np.random.Generator) -> dict[str, Any]:
+    """One black glossy material, as `dressed` returns it."""
+    albedo = random.uniform(0.01, 0.06) * np.exp(random.normal(0, 0.1, 3))
+    ior = float(random.uniform(1.45, 1.55))
+    f0 = 0.04 * np.exp(0.1 * random.normal())
+    alpha = float(random.uniform(0.05, 0.3) ** 2)
+    grade = {"strength": float(f0 / fresnel.normal_reflectance(ior)), "alpha": alpha, "ior": ior}
+    maps = {name: np.full(faces, albedo[k]) for k, name in enumerate("rgb")}
+    return {**maps, "grade": np.zeros(faces, int), "grades": [grade]}
+
+
+def cloth(mi: Any, corners: Floats, random: np.random.Generator) -> dict[str, Any]:
+    """A floor, a wall and in two of five scenes a chart, about corners (..., 3) that face a camera at the origin."""
+    points = corners.reshape(-1, 3)
+    low, high = points.min(axis=0), points.max(axis=0)
+    x, y, _ = (float(one) for one in (low + high) / 2)
+    side, depth = float((high - low).max()), float(low[2] + high[2]) / 2
+    dark = {"type": "diffuse", "reflectance": float(random.uniform(0.02, 0.08))}
+    place, tilt = mi.ScalarTransform4f(), float(random.uniform(0, 8))
+    wall = float(low[2]) - float(random.uniform(0.2, 1)) * side
+    found = {"wall": (place.translate([x, y, wall]).scale(6 * side), dark)}
+    if low[1] < -0.3 * side:  # else it would hide the object
+        floor = place.translate([x, float(low[1]) - 0.01 * side, depth]).rotate([1, 0, 0], tilt - 90)
+        found["floor"] = (floor.scale(4 * side), dark)
+    if random.random() < 0.4 and high[0] > -0.1 * side:
+        chart = place.translate([float(high[0]) + float(random.uniform(0.3, 0.8)) * side, y, depth])
+        grey = {"type": "diffuse", "reflectance": 0.2}
+        found["chart"] = (chart.rotate([0, 1, 0], -90).scale(0.35 * side), grey)
+    return {name: {"type": "rectangle", "to_world": at, "bsdf": body} for name, (at, body) in found.items()}
+
+
 def projected(picture: Floats, corner: Floats, scale: float) -> Floats:
     """A picture (3, T, T), mirrored at its sides, on faces (F, 3, 3) along the nearest axis; (F, 3)."""
     axis = np.abs(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])).argmax(axis=1)
@@ -169,9 +218,10 @@ def projected(picture: Floats, corner: Floats, scale: float) -> Floats:
 
 
 def scene(
-    mi: Any, parts: list[Any], channel: str, light: list[float], power: float, view: View, size: int, depth: int
-) -> Any:
-    """What Mitsuba renders of one colour channel."""
+    mi: Any, parts: list[Any], channel: str, light: list[float], power: float, view: View, size: int, depth: int,
+    around: dict[str, Any],
+) -> Any:  # fmt: skip
+    """What Mitsuba renders of one colour channel, with other shapes around."""
     sensor = plastic.camera(mi, view, size, "independent", PASS)
     sensor["film"]["pixel_format"] = "luminance"
     return mi.load_dict(
@@ -181,6 +231,7 @@ def scene(
             "sensor": sensor,
             "light": {"type": "point", "position": light, "intensity": power},
             **{f"part{k}": body(mi, part, channel) for k, part in enumerate(parts)},
+            **around,
         }
     )
 

@@ -54,8 +54,10 @@ def _both(turn: Floats) -> tuple[Floats, Floats]:
     look = (ALBEDO * ones, F0 * ones, np.full(len(ones), ROUGHNESS))
     _, flat = scene.facing(np.broadcast_to(-translation @ turn, v.shape), -v @ turn)
     places = light_transport.SurfacePoints(mask, buffer.position[mask].astype(float), flat, normal, v, *look, ior=1.5)
-    gather = light_transport._Gather(scene, places, pose, lambda place, facing: ALBEDO * np.ones((len(place), 3)))
-    traced = gather.diffuse(np.random.default_rng(2)) + gather.mirrored(np.random.default_rng(3))
+    indirect = light_transport.IndirectLight(
+        scene, places, pose, lambda place, facing: ALBEDO * np.ones((len(place), 3))
+    )
+    traced = indirect.diffuse(np.random.default_rng(2)) + indirect.mirrored(np.random.default_rng(3))
 
     local = torch.from_numpy(normal).float()
     flash = frames.to_ray_frame(-seen.place / seen.place.norm(dim=1, keepdim=True), seen.v)

@@ -62,9 +62,9 @@ def test_a_stopped_run_goes_on_and_gives_the_same_bytes(made: Path) -> None:
 
 
 def test_samples_of_two_recipes_are_not_mixed(made: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="was begun with"):
+    with pytest.raises(InputError, match="was started with the settings"):
         dataset_files.main(made, 2, dataset_files.DatasetRecipe(seed=5, size=96, noise=0.0))
     (tmp_path / "holiday.jpg").write_text("mine")
-    with pytest.raises(InputError, match="not an empty folder"):
+    with pytest.raises(InputError, match="is not empty"):
         dataset_files.main(tmp_path, 1, RECIPE)
     assert json.loads((made / "dataset.json").read_text())["recipe"]["seed"] == 4

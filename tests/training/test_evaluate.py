@@ -57,7 +57,7 @@ def test_a_stopped_run_goes_on(test_data: Path, tmp_path: Path, monkeypatch: pyt
     journal.write_text("\n".join([head, json.dumps(kept), second[:50]]))
     assert evaluate.main(params)["ours"]["normal_mean"] == pytest.approx(whole["ours"]["normal_mean"] + 5)
     journal.write_text("\n".join(["another run", json.dumps(kept)]))
-    monkeypatch.setattr(evaluate, "_SHARE", 1)
+    monkeypatch.setattr(evaluate, "_MIN_SHARE", 1)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     assert evaluate.main(params) == whole
 

@@ -49,9 +49,9 @@ def test_smooth_surface_mirrors_the_bounce() -> None:
     """A near mirror seen along its normal shows F0 times the wall opposite."""
     ior, f0 = 1.5, 0.1
     scene, places, pose = _inside(0.12, f0, ior)
-    gather = light_transport._Gather(scene, places, pose, _albedo)
+    indirect = light_transport.IndirectLight(scene, places, pose, _albedo)
     wall = _ALBEDO * fresnel.transmission(1.0, ior)[0] ** 2
-    assert gather.mirrored(np.random.default_rng(0))[0].mean() == pytest.approx(f0 * wall, rel=0.03)
+    assert indirect.mirrored(np.random.default_rng(0))[0].mean() == pytest.approx(f0 * wall, rel=0.03)
 
 
 def test_flash_casts_shadows() -> None:

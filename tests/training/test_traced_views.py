@@ -41,7 +41,7 @@ def test_objects_lie_inside_the_frame_and_turns_are_rotations(views: Path) -> No
 def test_interrupted_build_is_not_taken_for_a_cache(views: Path, tmp_path: Path) -> None:
     for file in views.glob("*.npy"):
         (tmp_path / file.name).symlink_to(file)
-    with pytest.raises(InputError, match="no complete G-buffer cache"):
+    with pytest.raises(InputError, match="no complete cache of views"):
         traced_views.load_cache(tmp_path)
 
 

@@ -24,7 +24,7 @@ _MOST_PIXELS = 0.5e6  # a larger picture is averaged down first: it has detail t
 _FLOOR_PX = 0.02  # error that aliasing leaves whatever the noise: the bundled capture's is .026 and .025 (decision 19)
 
 
-class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class AlignSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The section `align` of a settings file."""
 
     model: Annotated[
@@ -44,7 +44,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @stage(version=8)
-def register(radiance: AngleStack, color: ColorCalibration, settings: Settings) -> Alignment:
+def register(radiance: AngleStack, color: ColorCalibration, settings: AlignSettings) -> Alignment:
     """Transforms (K, 3, 3) from the reference grid to each shot's, px.
 
     Raises AlignmentError, which names the shot: it moved too far, or shows another scene.
@@ -77,7 +77,7 @@ def _of_mosaic(offset_px: Floats) -> Alignment:
 
 
 def _register_shot(
-    name: str, reference: Pyramid, shot: Pyramid, step: int, settings: Settings
+    name: str, reference: Pyramid, shot: Pyramid, step: int, settings: AlignSettings
 ) -> tuple[Floats, float, float]:
     """Transform (3, 3) of a shot and its 1σ, full-grid px, and the correlation of detail. Raises AlignmentError."""
     if not (shows_detail(reference) and shows_detail(shot)):
@@ -103,7 +103,7 @@ def _register_shot(
     return transform, step * float(np.hypot(found.sigma_px, _FLOOR_PX)), correlation
 
 
-def _best_match(reference: Pyramid, shot: Pyramid, settings: Settings) -> tuple[registration.Registration, float]:
+def _best_match(reference: Pyramid, shot: Pyramid, settings: AlignSettings) -> tuple[registration.Registration, float]:
     """The motion under which the detail of two shots correlates best, or else their edges; and that correlation.
 
     Strong polarization may change which side of an edge is brighter, but not where the edge is.

@@ -50,7 +50,7 @@ from polcap.stages.hdr.planes import Reader, same_size
 _LEAST_PX = 48  # least side of a merged picture: noise and motion are measured in tiles
 
 
-class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class HdrSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How brackets are merged."""
 
     clip: Annotated[float, Meta(ge=0.5, le=1.0, description="counts from here on are clipped [white level]")] = 0.98
@@ -67,7 +67,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @stage(version=11)
-def merge(capture: Capture, decode: Decode, settings: Settings) -> AngleStack:
+def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack:
     """Radiance (K, H, W, 3) of every shot, on the scale of its reference frame.
 
     The reference frame is the frame of middle brightness in the first shot, and the frame of the same index in the
@@ -91,7 +91,7 @@ def merge(capture: Capture, decode: Decode, settings: Settings) -> AngleStack:
         read.close()
 
 
-def _merge(capture: Capture, read: Reader, settings: Settings) -> AngleStack:
+def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
     shots, first = capture.shots, capture.shots[0]
     read.plan = _memory_plan(capture, read(first.frames[0]), settings)
     order = _by_brightness(first, read)
@@ -150,7 +150,7 @@ def _check_counts(shots: tuple[Shot, ...]) -> None:
             )
 
 
-def _memory_plan(capture: Capture, image: SensorImage, settings: Settings) -> planes.MemoryPlan:
+def _memory_plan(capture: Capture, image: SensorImage, settings: HdrSettings) -> planes.MemoryPlan:
     """Memory that the merge may use, by the size of the first frame; binning leaves a quarter of the pixels."""
     height, width = image.value.shape[:2]
     pixels = height * width // (4 if image.cfa is not None and settings.demosaic == "superpixel" else 1)
@@ -177,7 +177,7 @@ def _middle(order: tuple[int, ...]) -> int:
     return order[(len(order) - 1) // 2]
 
 
-def _check_grid(frame: Frame, image: SensorImage, settings: Settings) -> None:
+def _check_grid(frame: Frame, image: SensorImage, settings: HdrSettings) -> None:
     """Raise CaptureError if the mosaic cannot be demosaiced as requested, or the frame has too few pixels."""
     (height, width), side = image.value.shape[:2], image.superpixel
     if settings.demosaic == "full" and side == 3:
@@ -191,13 +191,13 @@ def _check_grid(frame: Frame, image: SensorImage, settings: Settings) -> None:
         )
 
 
-def _sensor(capture: Capture, image: SensorImage, settings: Settings) -> ColorSensor:
+def _sensor(capture: Capture, image: SensorImage, settings: HdrSettings) -> ColorSensor:
     """Properties of the sensor, from the first shot's reference frame."""
     binned = image.cfa is not None and settings.demosaic == "superpixel" and capture.layout != "sensor"
     return ColorSensor(image.camera_matrix, image.white_balance, image.site_px if binned else None)
 
 
-def _view(capture: Capture, image: SensorImage, settings: Settings) -> View:
+def _view(capture: Capture, image: SensorImage, settings: HdrSettings) -> View:
     """The pinhole camera of the merged picture, in which pixel (0, 0) is the center of a superpixel."""
     scale = 1.0 if settings.demosaic == "full" else float(image.superpixel)
     x, y = capture.principal_px
@@ -213,7 +213,7 @@ def _empty(shots: int, shape: tuple[int, int, int]) -> MaskedImage:
 
 
 def _weigh(
-    shot: Shot, order: tuple[int, ...], lines: noise.Lines, read: Reader, settings: Settings
+    shot: Shot, order: tuple[int, ...], lines: noise.Lines, read: Reader, settings: HdrSettings
 ) -> weights.WeightedFrames:
     """Compare the frames of a shot in the order of brightness, and weigh them."""
     bracket = Bracket(shot, order, _middle(order))
@@ -223,7 +223,7 @@ def _weigh(
 
 
 def _crossed(
-    shot: Shot, shape: tuple[int, int, int], lines: noise.Lines, read: Reader, settings: Settings
+    shot: Shot, shape: tuple[int, int, int], lines: noise.Lines, read: Reader, settings: HdrSettings
 ) -> MaskedImage:
     """Merge the cross-polarized shot, on the scale of its own middle frame: its flash has another energy."""
     weighted = _weigh(shot, _by_brightness(shot, read), lines, read, settings)
@@ -237,7 +237,7 @@ def _crossed(
 
 
 def _divide_by_falloff(
-    capture: Capture, view: View, stack: MaskedImage, crossed: MaskedImage | None, settings: Settings
+    capture: Capture, view: View, stack: MaskedImage, crossed: MaskedImage | None, settings: HdrSettings
 ) -> None:
     """Divide all shots by the lens's falloff, in place, if it was calibrated."""
     light = None if capture.calibration is None else capture.calibration.falloff

@@ -42,11 +42,11 @@ _SURE_DEG, _SUREST = 30.0, 3.0  # a network's error that counts 1, and the most 
 _INTEGER = 1000  # capacities per unit of energy: the flow is one of whole numbers
 # ln odds that a region of the cut is turned: constant, outline evidence over √cells, mean inward lean, share of the
 # network's positions that disagree, ln of its error in degrees; tests/benchmarks/fit_half_turns.py
-_REGION = (-9.65, 0.89, 5.41, 10.22, 1.85)
+_REGION = (-15.8, 2.42, 2.00, 18.6, 3.50)
 _MOST_OUTLINE, _MOST_OPPOSED = 2.0, 0.5  # larger values count as these
 # ln odds that a cell of the inversion is on the wrong side: constant, energy of turning it alone, ln of the share of
 # links around it that contradict each other, mean lean away from the inside around it; same benchmark
-_CELL = (3.46, -0.20, 1.02, -3.69)
+_CELL = (2.94, -0.176, 1.04, -2.31)
 _AROUND = 8.0  # cells, 1σ
 
 

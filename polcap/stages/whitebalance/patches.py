@@ -147,7 +147,7 @@ def _check(use: Bits) -> None:
         return
     clipped, uneven = int((use == PatchUse.CLIPPED).sum()), int((use == PatchUse.UNEVEN).sum())
     raise ChartError(
-        f"{24 - used} of the chart's 24 patches are over-exposed or outside the image ({clipped} over-exposed, "
-        f"{uneven} partly hidden or in shade), at most {24 - _LEAST} may be; add a shorter exposure to the "
+        f"{24 - used} of the chart's 24 patches cannot be used ({clipped} over-exposed, "
+        f"{uneven} partly hidden or in shade), more than the {24 - _LEAST} allowed; add a shorter exposure to the "
         "bracket, or show the whole chart"
     )

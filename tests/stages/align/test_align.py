@@ -35,7 +35,7 @@ def test_polarized_textured_shots_are_registered_to_a_twentieth_of_a_pixel(seed)
     rng = np.random.default_rng(seed)
     true = [np.eye(3)] + [pose(rng.uniform(-20, 20), rng.uniform(-20, 20), rng.uniform(-0.5, 0.5)) for _ in range(2)]
     radiance = scenes.stack(true, noise=0.004, seed=seed)
-    found = align.register(radiance, scenes.no_color(), align.Settings())
+    found = align.register(radiance, scenes.no_color(), align.AlignSettings())
     error = np.concatenate([errors_px(found.transform[k], true[k]) for k in (1, 2)])
     assert np.median(error) < 0.05
     assert error.max() < 0.15
@@ -43,7 +43,7 @@ def test_polarized_textured_shots_are_registered_to_a_twentieth_of_a_pixel(seed)
 
 def test_a_shift_of_a_quarter_pixel_is_not_pulled_to_a_whole_one():
     true = [np.eye(3), pose(0.25, -0.25, 0), pose(-0.25, 0.25, 0)]
-    found = align.register(scenes.stack(true, noise=0.002), scenes.no_color(), align.Settings())
+    found = align.register(scenes.stack(true, noise=0.002), scenes.no_color(), align.AlignSettings())
     for k in (1, 2):
         assert errors_px(found.transform[k], true[k]).max() < 0.03
 
@@ -71,7 +71,7 @@ def test_place_far_from_all_detail_is_known_as_badly_as_its_scatter_says():
 
 def test_flash_energy_does_not_move_a_shot():
     radiance = scenes.stack(gain=np.array([1.0, 0.9, 1.1]), noise=0.002)
-    found = align.register(radiance, scenes.no_color(), align.Settings())
+    found = align.register(radiance, scenes.no_color(), align.AlignSettings())
     assert errors_px(found.transform[2], np.eye(3)).max() < 0.03
 
 
@@ -80,17 +80,17 @@ def test_another_scene_is_refused_by_name():
     value = radiance.value.copy()
     value[1] = np.random.default_rng(0).uniform(0, 0.5, value[1].shape)
     with pytest.raises(AlignmentError, match="shot 45° shows another scene"):
-        align.register(dataclasses.replace(radiance, value=value), scenes.no_color(), align.Settings())
+        align.register(dataclasses.replace(radiance, value=value), scenes.no_color(), align.AlignSettings())
 
 
 def test_a_shot_that_moved_too_far_is_refused_by_name_and_limit():
     radiance = scenes.stack([np.eye(3), np.eye(3), pose(12, 0, 0)], noise=0.002)
     with pytest.raises(AlignmentError, match=r"shot 90° moved by 1\d\.\d px, more than align.max_shift_px = 5"):
-        align.register(radiance, scenes.no_color(), align.Settings(max_shift_px=5))
+        align.register(radiance, scenes.no_color(), align.AlignSettings(max_shift_px=5))
 
 
 def test_a_locked_camera_is_left_alone():
-    found = align.register(scenes.stack(noise=0.01), scenes.no_color(), align.Settings(model="none"))
+    found = align.register(scenes.stack(noise=0.01), scenes.no_color(), align.AlignSettings(model="none"))
     assert np.array_equal(found.transform, np.tile(np.eye(3), (3, 1, 1)))
 
 
@@ -104,18 +104,19 @@ def test_strong_polarization_is_no_other_scene() -> None:
     y, x = np.mgrid[: scenes.HEIGHT, : scenes.WIDTH].astype(float)
     value = scenes.texture(x, y) * wave[..., None]
     value = value.astype(np.float32)
-    found = align.register(dataclasses.replace(radiance, value=value), scenes.no_color(), align.Settings())
+    found = align.register(dataclasses.replace(radiance, value=value), scenes.no_color(), align.AlignSettings())
     assert np.abs(found.transform - np.eye(3))[:, :2, 2].max() < 0.5
     other = np.stack([value[0], value[1][::-1], value[2][:, ::-1]])
     with pytest.raises(AlignmentError, match="another scene"):
-        align.register(dataclasses.replace(radiance, value=other), scenes.no_color(), align.Settings(max_shift_px=500))
+        far = align.AlignSettings(max_shift_px=500)
+        align.register(dataclasses.replace(radiance, value=other), scenes.no_color(), far)
 
 
 def test_shots_with_nothing_to_compare_are_named() -> None:
     radiance = scenes.stack()
     clipped = dataclasses.replace(radiance, quality=np.full_like(radiance.quality, 1))
     with pytest.raises(AlignmentError, match="no unclipped detail"):
-        align.register(clipped, scenes.no_color(), align.Settings())
+        align.register(clipped, scenes.no_color(), align.AlignSettings())
 
 
 def test_an_object_that_moved_before_a_still_backdrop_is_told_from_a_moved_camera():
@@ -123,7 +124,7 @@ def test_an_object_that_moved_before_a_still_backdrop_is_told_from_a_moved_camer
     ball = scenes.ball_object()
     for true, expected in (([np.eye(3), pose(3, 0, 0), np.eye(3)], 3.0), ([np.eye(3)] * 3, 0.0)):
         stack = scenes.before_backdrop(true)
-        found = align.register(stack, scenes.no_color(), align.Settings())
+        found = align.register(stack, scenes.no_color(), align.AlignSettings())
         assert object_motion.measure(stack, found, ball)[1] == pytest.approx(expected, abs=0.5)
     radiance = scenes.stack(noise=0.002)
     assert np.nanmax(object_motion.measure(radiance, scenes.still(3), ball)) < 0.5

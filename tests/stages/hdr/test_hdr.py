@@ -38,7 +38,7 @@ def test_no_bias_from_20_electrons_up_and_honest_variance(name):
     """
     quads = ramp(768, 1024)
     frames, exposures, isos = bracket(quads, BRACKETS[name], seed=len(name))
-    stack = merge(capture(frames), hdr.Settings())
+    stack = merge(capture(frames), hdr.HdrSettings())
     r = reference_of(stack)
     light = quads * exposures[r]
     truth = electrons_to_signal(light, isos[r])
@@ -60,7 +60,7 @@ def test_no_bias_from_20_electrons_up_and_honest_variance(name):
 
 def test_negative_values_are_kept():
     dark = np.zeros((64, 64, 3))
-    stack = merge(capture([frame(expose(dark, 1, np.random.default_rng(1)))]), hdr.Settings())
+    stack = merge(capture([frame(expose(dark, 1, np.random.default_rng(1)))]), hdr.HdrSettings())
     assert (stack.value < 0).mean() > 0.3
     assert abs(stack.value.mean()) < 4 * np.sqrt(stack.variance.mean() / stack.value.size)
     assert (stack.quality & Quality.DARK).astype(bool).mean() > 0.9
@@ -70,7 +70,7 @@ def test_darkest_frame_serves_where_the_others_clip():
     """Only pixels that clip in the darkest frame, or touch one that does, are flagged; all stay finite."""
     quads = ramp(256, 512, high=4e5, ripple=0)
     frames, exposures, _ = bracket(quads, BRACKETS["time"])
-    stack = merge(capture(frames), hdr.Settings())
+    stack = merge(capture(frames), hdr.HdrSettings())
     full = 0.98 * WHITE - BLACK  # counts
     expected = quads.max(axis=2) * exposures[0] / GAIN
     clipped = (stack.quality[0] & Quality.CLIPPED) > 0
@@ -88,7 +88,7 @@ def test_no_seam_where_a_frame_drops_out():
     """Along a ramp through two clipping limits the mean of columns follows the truth to its noise."""
     quads = ramp(512, 1024, ripple=0)
     frames, exposures, _ = bracket(quads, BRACKETS["time"])
-    stack = merge(capture(frames), hdr.Settings())
+    stack = merge(capture(frames), hdr.HdrSettings())
     truth = electrons_to_signal(quads * exposures[1])
     clear = ((stack.quality[0] & Quality.CLIPPED) == 0).all(axis=0)
     z = ((stack.value[0] - truth).sum(axis=0) / np.sqrt(stack.variance[0].sum(axis=0)))[clear]
@@ -100,8 +100,8 @@ def test_flash_makes_the_shutter_time_a_lie():
     quads = ramp(256, 384, high=2e4)
     rng = np.random.default_rng(2)
     frames = [frame(expose(quads, 1, rng), iso=100.0, exposure_time=t, flash_fired=True) for t in (0.001, 0.004, 0.016)]
-    stack = merge(capture(frames), hdr.Settings())
-    one = merge(capture(frames[:1]), hdr.Settings())
+    stack = merge(capture(frames), hdr.HdrSettings())
+    one = merge(capture(frames[:1]), hdr.HdrSettings())
     np.testing.assert_allclose(stack.bracket.exposure_ratio, 1, rtol=2e-3)
     r = reference_of(stack)
     np.testing.assert_allclose(stack.bracket.exif_ratio[0], np.array([1, 4, 16]) / 4.0**r)
@@ -115,13 +115,13 @@ def test_metadata_serve_only_where_pixels_cannot_tell_and_no_flash_fired():
         rng = np.random.default_rng(0)
         return [frame(expose(dark, e, rng), iso=100.0, exposure_time=e, **exif) for e in (1, 4)]
 
-    stack = merge(capture(frames(flash_fired=False)), hdr.Settings())
+    stack = merge(capture(frames(flash_fired=False)), hdr.HdrSettings())
     assert sorted(stack.bracket.exposure_ratio[0, :, 0] / stack.bracket.exposure_ratio[0, :, 0].min()) == [1, 4]
     with pytest.raises(CaptureError, match="flash fired"):
-        merge(capture(frames(flash_fired=True)), hdr.Settings())
+        merge(capture(frames(flash_fired=True)), hdr.HdrSettings())
     rng = np.random.default_rng(0)
     stated = [frame(expose(dark, e, rng), flash_fired=True, exposure=e) for e in (1.0, 4.0)]
-    assert merge(capture(stated), hdr.Settings()).bracket.exposure_ratio.max() in (1, 4)
+    assert merge(capture(stated), hdr.HdrSettings()).bracket.exposure_ratio.max() in (1, 4)
 
 
 def test_ambient_light_is_subtracted_with_its_variance():
@@ -134,7 +134,7 @@ def test_ambient_light_is_subtracted_with_its_variance():
         frame(expose(quads + room * t / 0.04, 1, rng), iso=100.0, exposure_time=t, flash_fired=True) for t in times
     ]
     ambient = [frame(expose(room * t / 0.04, 1, rng), iso=100.0, exposure_time=t, flash_fired=False) for t in times]
-    stack = merge(capture(frames, ambient=ambient), hdr.Settings())
+    stack = merge(capture(frames, ambient=ambient), hdr.HdrSettings())
     np.testing.assert_allclose(stack.bracket.exposure_ratio, 1, rtol=3e-3)
     z = scores(stack, electrons_to_signal(quads))
     assert abs(z.mean()) < 0.05
@@ -148,7 +148,7 @@ def test_ghost_is_flagged_and_taken_from_the_reference_alone():
     other = quads.copy()
     other[100:140, 60:110] *= 1.5
     frames = [frame(expose(q, e, rng), iso=100.0) for q, e in ((quads, 0.25), (quads, 1), (other, 4))]
-    stack = merge(capture(frames), hdr.Settings())
+    stack = merge(capture(frames), hdr.HdrSettings())
     ghost = (stack.quality[0] & Quality.GHOST) > 0
     assert ghost[102:138, 62:108].all()
     ghost[94:146, 54:116] = False
@@ -163,7 +163,7 @@ def test_shots_share_the_reference_index_and_keep_their_own_flash_energy():
     quads = ramp(256, 384, high=2e4)
     one, a, _ = bracket(quads, BRACKETS["time"], seed=1)
     two, b, _ = bracket(quads, BRACKETS["time"], seed=2)
-    stack = merge(capture(one, two), hdr.Settings())
+    stack = merge(capture(one, two), hdr.HdrSettings())
     assert np.all(stack.bracket.exposure_ratio[:, 1] == 1)
     clear = ((stack.quality & Quality.CLIPPED) == 0).all(axis=0)
     gain = stack.value[1][clear].sum() / stack.value[0][clear].sum()
@@ -174,9 +174,9 @@ def test_unequal_brackets_and_sizes_are_refused_by_name():
     rng = np.random.default_rng(0)
     small, large = expose(ramp(192, 192), 1, rng), expose(ramp(192, 256), 1, rng)
     with pytest.raises(CaptureError, match=r"shot 45° has 1 frames, shot 0° has 2"):
-        merge(capture([frame(small)] * 2, [frame(small)]), hdr.Settings())
+        merge(capture([frame(small)] * 2, [frame(small)]), hdr.HdrSettings())
     with pytest.raises(CaptureError, match=r"^shot 45° is 128×96"):
-        merge(capture([frame(small)], [frame(large)]), hdr.Settings())
+        merge(capture([frame(small)], [frame(large)]), hdr.HdrSettings())
 
 
 def test_a_plateau_below_the_stated_white_is_saturation():
@@ -185,7 +185,7 @@ def test_a_plateau_below_the_stated_white_is_saturation():
     quads[:, 32:] = 1e5
     image = expose(quads, 1, np.random.default_rng(0))
     early = SensorImage(np.minimum(image.value, np.uint16(12000)), image.black, WHITE, RGGB)
-    stack = merge(capture([frame(early)]), hdr.Settings())
+    stack = merge(capture([frame(early)]), hdr.HdrSettings())
     clipped = (stack.quality[0] & Quality.CLIPPED) > 0
     assert clipped[:, 32:].all() and not clipped[:, :31].any()
 
@@ -197,7 +197,7 @@ def test_rendered_captures_give_their_exposure_ratios(name):
     folder = Path(DATA) / "rendered"
     shots = json.loads((folder / f"{name}.truth.json").read_text())["shots"]
     frames = [raw_file(folder / s["file"], iso=float(s["iso"]), flash_fired=True) for s in shots]
-    stack = merge(capture(frames[:3], frames[3:6], frames[6:]), hdr.Settings())
+    stack = merge(capture(frames[:3], frames[3:6], frames[6:]), hdr.HdrSettings())
     exposure = np.array([s["relative_exposure"] * s["flash_factor"] for s in shots]).reshape(3, 3)
     expected = np.repeat((exposure / exposure[:, 1:2])[..., None], 3, axis=2)
     np.testing.assert_allclose(stack.bracket.exposure_ratio, expected, rtol=1e-3)

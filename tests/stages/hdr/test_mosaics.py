@@ -28,7 +28,7 @@ from tests.stages.hdr.brackets import (
 
 def test_view_is_that_of_the_binned_grid():
     frames, _, _ = bracket(ramp(192, 288), [(1, 100)])
-    view = merge(capture(frames), hdr.Settings()).view
+    view = merge(capture(frames), hdr.HdrSettings()).view
     assert (view.scale, view.focal, view.center) == (2, 500, (50.0, 40.0))
 
 
@@ -43,7 +43,7 @@ def test_full_size_keeps_bias_and_variance_honest():
         return SensorImage(np.clip(np.round(counts), 0, WHITE).astype(np.uint16), np.full((2, 2), BLACK), WHITE, RGGB)
 
     frames = [frame(shoot(e), iso=100.0) for e in (0.25, 1, 4)]
-    stack = merge(capture(frames), hdr.Settings(demosaic="full"))
+    stack = merge(capture(frames), hdr.HdrSettings(demosaic="full"))
     assert stack.value.shape == (1, 512, 640, 3)
     assert (stack.view.scale, stack.view.focal, stack.view.center) == (1, 1000, (100.5, 80.5))
     inner = np.s_[4:-4, 4:-4]
@@ -60,10 +60,10 @@ def test_x_trans_brackets_give_the_light_of_a_bayer_camera(tmp_path):
     for cfa in ("RGGB", "X-Trans"):
         shooting.write(tmp_path / cfa, shooting.random_scene(3, "bumps"), structs.replace(shoot, cfa=cfa))
         capture = captures.read(tmp_path / cfa)
-        merged[cfa] = hdr.merge(capture, frame_decoder.decode, hdr.Settings())
+        merged[cfa] = hdr.merge(capture, frame_decoder.decode, hdr.HdrSettings())
         if cfa == "X-Trans":
             with pytest.raises(CaptureError, match="X-Trans"):
-                hdr.merge(capture, frame_decoder.decode, hdr.Settings(demosaic="full"))
+                hdr.merge(capture, frame_decoder.decode, hdr.HdrSettings(demosaic="full"))
     bayer, x_trans = merged.values()
     assert x_trans.view.scale == 3 and x_trans.value.shape == (3, 78, 104, 3)
     assert x_trans.view.focal == pytest.approx(bayer.view.focal * 2 / 3)
@@ -86,7 +86,7 @@ def test_monochrome_channel_stands_in_three_with_three_times_the_variance():
         gray = np.clip(np.round(rng.poisson(light * exposure) / GAIN + BLACK), 0, WHITE).astype(np.uint16)
         return SensorImage(np.repeat(gray[..., None], 3, 2), np.full((1, 1), BLACK), WHITE, None)
 
-    stack = merge(capture([frame(shoot(e), iso=100.0) for e in (0.5, 1, 2)]), hdr.Settings())
+    stack = merge(capture([frame(shoot(e), iso=100.0) for e in (0.5, 1, 2)]), hdr.HdrSettings())
     assert stack.value.shape == (1, 300, 400, 3)
     assert (stack.view.scale, stack.view.center) == (1, (100.5, 80.5))
     total = stack.value[0].mean(axis=2) - electrons_to_signal(light)
@@ -107,7 +107,7 @@ def test_wholly_clipped_frame_has_the_channels_of_the_others(channels, order):
         frame(SensorImage(value, np.zeros((1, 1)), 1.0, None), exposure_time=e) for value, e in zip(pictures, order)
     ]
     assert (frames[order.index(80)].load().value == 1).all()
-    stack = merge(capture(frames), hdr.Settings())
+    stack = merge(capture(frames), hdr.HdrSettings())
     assert stack.value.shape == (1, 90, 120, 3) and np.isfinite(stack.value).all()
 
 
@@ -118,7 +118,7 @@ def test_three_channel_frames_pass_unbinned_and_lossy_is_told():
         frame(SensorImage(rng.poisson(light * e).astype(np.float32) / 2e4, np.zeros((1, 1)), 1.0, None, lossy=e == 1))
         for e in (0.5, 1, 2)
     ]
-    stack = merge(capture(frames), hdr.Settings())
+    stack = merge(capture(frames), hdr.HdrSettings())
     assert stack.value.shape == (1, 200, 300, 3) and stack.sensor.lossy
     z = scores(stack, light / 2e4)
     assert abs(z.mean()) < 0.05 and abs(z.var() - 1) < 0.1

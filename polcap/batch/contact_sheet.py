@@ -1,17 +1,18 @@
-"""In: the records of a batch. Out: its contact sheet and summary tables: summary.html, .csv and .json."""
+"""Contact sheet and tables of a batch: summary.html, summary.csv and summary.json."""
 
 import csv
 import io
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict
 from html import escape
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from polcap.batch.unit import FINISHED, FOLDER, Record, Unit
+import msgspec
+
+from polcap.batch.unit import FINISHED, FOLDER, Unit, UnitRecord
 from polcap.formats import atomic
 
 _STYLE = """
@@ -22,20 +23,20 @@ table { border-collapse: collapse } td, th { text-align: left; padding: .2em .8e
 """
 
 
-def summary(records: Sequence[Record]) -> dict[str, Any]:
-    """Counts and rows, as summary.json has them."""
+def summary(records: Sequence[UnitRecord]) -> dict[str, Any]:
+    """Content of summary.json: counts, and one row per capture."""
     counts = Counter(record.state for record in records)
     return {
         "captures": len(records),
         "finished": sum(counts[state] for state in FINISHED),
         "states": dict(sorted(counts.items())),
         "seconds": round(sum(record.seconds for record in records), 3),
-        "rows": [asdict(record) for record in records],
+        "rows": [msgspec.to_builtins(record) for record in records],
     }
 
 
-def write(desk: Path, units: Sequence[Unit], records: Sequence[Record]) -> None:
-    """The three summaries into the batch's folder. Raises StorageError."""
+def write(batch_folder: Path, units: Sequence[Unit], records: Sequence[UnitRecord]) -> None:
+    """Write the three files into the batch's folder. Raises StorageError."""
     totals = summary(records)
     text = io.StringIO()
     table = csv.DictWriter(text, ["name", "state", "seconds", "attempts", "says"], extrasaction="ignore")
@@ -47,11 +48,11 @@ def write(desk: Path, units: Sequence[Unit], records: Sequence[Record]) -> None:
         "summary.html": _page(totals, units, records),
     }
     for name, content in written.items():
-        with atomic.path(desk / name) as temporary:
+        with atomic.path(batch_folder / name) as temporary:
             temporary.write_text(content, encoding="utf-8", errors="backslashreplace")  # names of folders are bytes
 
 
-def _page(totals: dict[str, Any], units: Sequence[Unit], records: Sequence[Record]) -> str:
+def _page(totals: dict[str, Any], units: Sequence[Unit], records: Sequence[UnitRecord]) -> str:
     states = ", ".join(f"{count} {state}" for state, count in totals["states"].items())
     lines = [
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{FOLDER}</title><style>{_STYLE}</style>',
@@ -59,9 +60,9 @@ def _page(totals: dict[str, Any], units: Sequence[Unit], records: Sequence[Recor
     ]
     wrong = [record for record in records if record.state != "done"]
     if wrong:
-        lines.append("<table><tr><th>capture</th><th></th><th>what and what to do</th></tr>")
+        lines.append("<table><tr><th>capture</th><th></th><th>reason and remedy</th></tr>")
         lines += [
-            f'<tr><td>{escape(r.name)}</td><td class="{r.state}">{r.state}</td><td>{escape(r.says)}</td></tr>'
+            f'<tr><td>{escape(r.name)}</td><td class="{r.state}">{r.state}</td><td>{escape(r.message)}</td></tr>'
             for r in wrong
         ]
         lines.append("</table>")

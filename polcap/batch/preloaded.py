@@ -1,7 +1,7 @@
-"""In: nothing. Out: what every capture needs, imported or made, also what the path itself comes to only later.
+"""Modules and tables that workers import before they fork.
 
-Imported by the process that workers are forked from. Nothing here may start a thread: a fork would not copy it. So
-onnxruntime, whose import starts one, is left to each worker.
+Nothing here may start a thread, because a fork does not copy threads. Each worker therefore imports onnxruntime
+itself.
 """
 
 import scipy.sparse.linalg

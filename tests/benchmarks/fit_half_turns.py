@@ -1,0 +1,141 @@
+"""Objects with known normals in, `_REGION` and `_CELL` of `infer/half_turns.py` out.
+
+    python tests/benchmarks/fit_half_turns.py DATA SCENES … [--sixths 27] [--model ONNX]
+
+SCENES are folders of `make_mitsuba.py`, of training meshes: black gloss and others; every third is seen under the
+rough law. Added to them are six pictures for each of --sixths: training meshes and materials in both protocols at 256².
+
+The cut is made with half, the usual and twice the weight of the network, for more regions to learn from. A region
+counts by what turning it changes of the mean normal error, 0.5° at most, over the root of the regions of its picture;
+cells of the inversion count alike. Then the odds are scaled until the doubt is likeliest where each region counts by
+its whole error. Prints both laws, and what the accepted regions gain and lose.
+"""
+
+import argparse
+import tempfile
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+
+import fit_expected_error
+import numpy as np
+from bench_mitsuba import read
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from polcap.formats import onnx
+from polcap.images import Cues, Floats, Network
+from polcap.optics import frames
+from polcap.optics.resize import area_mean, weighted_area_mean
+from polcap.pipeline import models
+from polcap.stages.infer import analytic, augmentation, half_turns, learned
+from polcap.training import evaluation_materials, evaluation_protocol, traced_views
+from polcap.training.evaluation_protocol import MESHES, Case, Protocol
+
+MOST_DEG = 0.5  # that one region counts for
+CLEAR_DEG = 10.0  # cells whose two sides differ by less say nothing
+SHRINK = 1e-4  # weight of the squared coefficients
+SIZE = 256  # px, of the protocols' pictures
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("scenes", type=Path, nargs="+")
+    parser.add_argument("--sixths", type=int, default=27)
+    parser.add_argument("--model", type=Path)
+    options = parser.parse_args()
+    network = models.load_network("network", options.model, "cpu", 1)
+    assert network is not None
+    regions, cells = [], []
+    for case in chain(path_traced(options.scenes), pictures(options.data, options.sixths)):
+        regions.append(proposed(case, network))
+        cells.append(inverted(case))
+        print(case.name, len(regions[-1][0]), "regions", flush=True)
+    x, gain, weight = (np.concatenate(column) for column in zip(*regions))
+    law = fit(x, gain > 0, np.minimum(np.abs(gain), MOST_DEG) * weight, SHRINK)
+    law = (
+        law * fit((x @ law)[:, None], gain > 0, np.abs(gain) * weight, 0.0)[0]
+    )  # same decisions; doubts by all they cost
+    accepted = x @ law > 0
+    gained, lost = (gain[accepted & side].sum() for side in (gain > 0, gain < 0))
+    print("_REGION =", tuple(float(f"{one:.3g}") for one in law), f"gains {gained:.1f}°, loses {-lost:.1f}° in all")
+    x, bad, weight = (np.concatenate(column) for column in zip(*cells))
+    print("_CELL =", tuple(float(f"{one:.3g}") for one in fit(x, bad, weight, 0.0)))
+
+
+def path_traced(folders: list[Path]) -> Iterator[Case]:
+    """Scenes of `make_mitsuba.py` as a camera measures them."""
+    for number, file in enumerate(file for folder in folders for file in sorted(folder.glob("*.npz"))):
+        yield read(file, clean=False, rough=number % 3 == 1, seed=number)
+
+
+def pictures(data: Path, sixths: int) -> Iterator[Case]:
+    """Training meshes and materials as `polcap evaluate` draws its own, in either protocol by turns."""
+    evaluation_materials._SEED, evaluation_protocol._SEED = fit_expected_error.OTHER_SEEDS
+    meshes = len(traced_views.training_meshes(data))
+    for sixth in range(sixths):
+        with tempfile.TemporaryDirectory() as folder:
+            fit_expected_error.linked(data, Path(folder), sixth, meshes)
+            drawn = [Protocol(Path(folder), SIZE, which) for which in (2, 1)]
+            for number in range(MESHES):
+                yield drawn[number % 2].case(sixth * MESHES + number)
+
+
+def proposed(case: Case, network: Network) -> tuple[Floats, Floats, Floats]:
+    """Regions that the cut turns: terms (R, 5), by how much each lowers the mean error [degrees], weights (R,)."""
+    shrink = max(1.0, max(case.cues.mask.shape) / int(network.metadata["native_size"]))
+    seen = learned._reduce(learned._limit_radiance(case.cues), 1 / shrink)
+    maps = augmentation.predict(seen, network, onnx.run, 4)
+    normal = frames.to_ray_frame(maps["normal"], seen.rays)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+    grid = half_turns.coarse(normal, seen.mask)
+    sigma, opposed = (weighted_area_mean(maps[name], seen.mask, grid.mask.shape) for name in ("sigma", "opposed"))
+    change, usual = gain_of_turning(grid, case) / max(int(grid.mask.sum()), 1), half_turns._NETWORK
+    terms, gains = [], []
+    for factor in (0.5, 1.0, 2.0):
+        half_turns._NETWORK = factor * usual
+        region, of_region = half_turns.proposals(grid, sigma, opposed)
+        terms.append(of_region[1:])
+        gains.append(np.bincount(region.ravel(), change.ravel(), len(of_region))[1:])
+    half_turns._NETWORK = usual
+    gain = np.asarray(np.concatenate(gains), np.float64)
+    return np.concatenate(terms), gain, np.full(len(gain), 1 / np.sqrt(max(len(gain), 1)))
+
+
+def inverted(case: Case) -> tuple[Floats, NDArray[np.bool_], Floats]:
+    """Cells of the inversion: terms (N, 4), whether each is on the wrong side (N,), weights (N,)."""
+    cues: Cues = case.cues
+    normal, _, _ = analytic.invert(cues, 1.5)
+    grid = half_turns.coarse(frames.to_ray_frame(normal, cues.rays), cues.mask)
+    turned, terms = half_turns.sides(grid)
+    gain = gain_of_turning(grid, case)
+    clear = np.abs(gain) > CLEAR_DEG
+    weight = np.full(int(clear.sum()), 1 / max(int(grid.mask.sum()), 1))
+    return terms[clear], (np.where(turned, -gain, gain) > 0)[clear], weight
+
+
+def gain_of_turning(grid: half_turns.Grid, case: Case) -> Floats:
+    """Error of each cell's normal less that of its half-turn, degrees (h, w); 0 outside."""
+    local = frames.to_ray_frame(case.truth.normal, case.cues.rays) * case.truth.mask[..., None]
+    truth = area_mean(local.astype(np.float32), grid.mask.shape)
+    truth /= np.maximum(np.linalg.norm(truth, axis=-1, keepdims=True), 1e-6)
+    lean = np.moveaxis(grid.lean, 0, -1)
+    cosine = np.sqrt(np.maximum(1 - (lean**2).sum(axis=-1), 0)) * truth[..., 2]
+    across = (lean * truth[..., :2]).sum(axis=-1)
+    kept, turned = (np.degrees(np.arccos(np.clip(cosine + sign * across, -1, 1))) for sign in (1, -1))
+    return np.asarray((kept - turned) * grid.mask)
+
+
+def fit(terms: Floats, true: NDArray[np.bool_], weight: Floats, shrink: float) -> Floats:
+    """Coefficients of the likeliest logistic law, each row counted by its weight; all but the first are shrunk."""
+    sign = np.where(true, 1.0, -1.0)
+
+    def unlikely(law: Floats) -> float:
+        return float(weight @ np.logaddexp(0, -sign * (terms @ law)) / weight.sum() + shrink * (law[1:] ** 2).sum())
+
+    return np.asarray(minimize(unlikely, np.zeros(terms.shape[1])).x)
+
+
+if __name__ == "__main__":
+    main()
