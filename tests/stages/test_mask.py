@@ -170,7 +170,7 @@ def test_a_mask_of_another_size_is_refused():
 def test_an_empty_picture_is_refused():
     radiance = scenes.stack()
     dark = dataclasses.replace(radiance, value=np.full_like(radiance.value, 0.002))
-    with pytest.raises(ObjectError, match="no object stands out"):
+    with pytest.raises(ObjectError, match="no object differs"):
         segment(dark, chart_color())
     nothing = network(lambda inputs: {"logit": np.full((1, 1, *inputs.shape[2:]), -9.0)})
     with pytest.raises(ObjectError, match=r"no object found.*--mask"):

@@ -233,9 +233,9 @@ def test_corners_from_the_wrong_end_are_named():
 @pytest.mark.parametrize(
     ("corners", "says"),
     [
-        (None, "four outer patch corners"),
+        (None, "four outer corners of the patches"),
         ([[10, 10], [10, 200], [300, 200], [300, 10]], "clockwise"),
-        ([[10, 10], [3000, 10], [3000, 2000], [10, 2000]], "outside the image"),
+        ([[10, 10], [3000, 10], [3000, 2000], [10, 2000]], "outside the picture"),
         ([[10, 10], [40, 10], [40, 30], [10, 30]], "space the patches by"),
         ([[10, 10], [310, 10], [310, 210], [10, 210]], "do not show a ColorChecker Classic"),
     ],
