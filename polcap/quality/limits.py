@@ -11,7 +11,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     max_delta_e: Annotated[float, Meta(gt=0, description="mean color error of the chart's patches [CIEDE2000]")] = 5.0
     max_tone_curvature: Annotated[
-        float, Meta(gt=0, le=1, description="slope of an exposure ratio over brightness, both as logarithms; 0 is linear [1]")
+        float, Meta(gt=0, le=1, description="slope of ln exposure ratio over ln brightness; 0 is linear [1]")
     ] = 0.1
     max_gain_disagreement: Annotated[
         float,
@@ -39,9 +39,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_mask_islands: Annotated[
         float, Meta(ge=0, le=1, description="share of the mask outside its largest part [1]")
     ] = 0.02
-    max_mask_holes: Annotated[
-        float, Meta(ge=0, le=1, description="area of holes relative to the mask [1]")
-    ] = 0.05
+    max_mask_holes: Annotated[float, Meta(ge=0, le=1, description="area of holes relative to the mask [1]")] = 0.05
     max_mask_border: Annotated[
         float, Meta(ge=0, le=1, description="share of the picture's border that the object touches [1]")
     ] = 0.0
@@ -56,14 +54,15 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 8.0
     max_ring_turn_deg: Annotated[
         float,
-        Meta(gt=0, le=45, description="error of the ring's zero with three angles, where it may be one shot's [degrees]"),
+        Meta(gt=0, le=45, description="error of the ring's zero, with three angles [degrees]"),
     ] = 3.0
     max_turn_fit: Annotated[
-        float, Meta(gt=0, lt=1, description="ratio of the outline's misfit with and without a turn, to accept the turn [1]")
+        float,
+        Meta(gt=0, lt=1, description="ratio of the outline's misfit with and without a turn, to accept the turn [1]"),
     ] = 0.68
-    min_outline_dolp: Annotated[
-        float, Meta(ge=0, le=1, description="least median polarization of the outline [1]")
-    ] = 0.03
+    min_outline_dolp: Annotated[float, Meta(ge=0, le=1, description="least median polarization of the outline [1]")] = (
+        0.03
+    )
     min_zenith_deg: Annotated[
         float,
         Meta(ge=0, le=90, description="least median tilt of a weakly polarized shape; below it is flattened [degrees]"),
@@ -77,17 +76,14 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_one_sided: Annotated[
         float, Meta(gt=0, description="uneven light round the outline, amplitude over mean [1]")
     ] = 0.4
-    max_side_light: Annotated[
-        float, Meta(gt=0, le=1, description="excess light on one side in one shot [1]")
-    ] = 0.07
+    max_side_light: Annotated[float, Meta(gt=0, le=1, description="excess light on one side in one shot [1]")] = 0.07
     max_dolp_noise: Annotated[
         float, Meta(gt=0, le=1, description="false polarization from noise, median over the object [1]")
     ] = 0.04
-    max_ambient: Annotated[
-        float, Meta(gt=0, le=1, description="share of ambient light [1]")
-    ] = 0.1
+    max_ambient: Annotated[float, Meta(gt=0, le=1, description="share of ambient light [1]")] = 0.1
     max_crossed_misfit: Annotated[
-        float, Meta(gt=0, le=1, description="share of the object that is brighter in the cross-polarized shot than in S0 [1]")
+        float,
+        Meta(gt=0, le=1, description="share of the object that is brighter in the cross-polarized shot than in S0 [1]"),
     ] = 0.05
     max_ill_posed: Annotated[
         float, Meta(ge=0, le=1, description="share of the object with a DoLP above that of any dielectric [1]")
