@@ -46,7 +46,7 @@ class StokesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     greatest_ior: Annotated[
         float,
-        Meta(ge=1.2, le=3, description="greatest refractive index; a DoLP beyond its range is flagged as not dielectric"),
+        Meta(ge=1.2, le=3, description="greatest refractive index; a DoLP beyond it is flagged"),
     ] = 1.8
     undistort: Annotated[
         bool, Meta(description="correct the distortion of a calibrated lens while the shots are resampled")
