@@ -1,4 +1,4 @@
-"""Write the reference pages that follow from the code: settings, options of the commands, the Python interface.
+"""Write the reference pages that are generated from the code: settings, options of the commands, Python interface.
 
 python docs/make_reference.py
 """
@@ -21,7 +21,7 @@ _MADE = "<!-- made by docs/make_reference.py; do not edit -->"
 
 
 def pages() -> dict[Path, str]:
-    """Path of each page and its text as it should be."""
+    """The text of each page, by its path."""
     commands = REFERENCE / "commands.md"
     filled = _OPTIONS.sub(lambda m: f"{m[1]}{options_table(m[2])}\n{m[3]}", commands.read_text(encoding="utf-8"))
     return {
@@ -32,7 +32,7 @@ def pages() -> dict[Path, str]:
 
 
 def options_table(command_name: str) -> str:
-    """Arguments and options of a command, as its --help has them."""
+    """Table of the arguments and options of a command, from its --help."""
     command = get_command(app).commands[command_name]  # type: ignore[attr-defined]
     context = command.make_context(command_name, [], resilient_parsing=True)
     rows = [record for one in command.params if (record := one.get_help_record(context))]
@@ -43,10 +43,10 @@ def options_table(command_name: str) -> str:
 
 
 def settings_page() -> str:
-    """Every setting with type, default, range and meaning."""
+    """The page of all settings with type, default, range and meaning."""
     lines = [
         "# Settings", "", _MADE, "",
-        "Defaults < `--config FILE.toml` (a section per stage) < `--set stage.name=value`.",
+        "`--config FILE.toml` (a section per stage) overrides the defaults; `--set stage.name=value` overrides both.",
         "An unknown name or a value outside its range is an error that names it.", "",
     ]  # fmt: skip
     for name, rows in groupby(settings(), lambda setting: setting.key.partition(".")[0]):
@@ -60,12 +60,12 @@ def settings_page() -> str:
 
 
 def api_page() -> str:
-    """Signatures and docstrings of the public functions, source of the public values."""
+    """The page of public functions, with signature and docstring, and of public values, with their source."""
     lines = [
         "# From Python", "", _MADE, "",
         "```python", "import polcap", "", 'result = polcap.process("CAPTURE")', "print(result.verdict)",
         'maps = polcap.read_maps(result.folder / "maps").maps', "```", "",
-        "`examples/from_python.py` is a whole program. Names are loaded at first use; the package is typed.",
+        "`examples/from_python.py` is a complete program. Names are imported at their first use. The package is typed.",
     ]  # fmt: skip
     for name in sorted(polcap.__all__, key=lambda name: (name[0].isupper(), name)):
         source = inspect.getsource(getattr(polcap, name))

@@ -1,13 +1,13 @@
-"""polcap: photographs through a turned polarizer in, a relightable 3-D asset out.
+"""polcap: turns flash photographs taken through a rotating polarizer into a relightable 3-D asset.
 
-From Python, what `polcap process` does::
+The Python form of `polcap process`::
 
     import polcap
 
     result = polcap.process("CAPTURE")                  # the folder's photographs -> maps, asset, report
     maps = polcap.read_maps(result.folder / "maps").maps
 
-Names are loaded when they are first used, so that `import polcap` costs nothing.
+Names are imported when they are first used.
 """
 
 from importlib import import_module
@@ -56,7 +56,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, from where it lives."""
+    """Import a public name from its module."""
     if name not in _HOME:
         raise AttributeError(f"module 'polcap' has no attribute {name!r}")
     module, there = _HOME[name]

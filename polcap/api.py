@@ -1,4 +1,4 @@
-"""`polcap.process`: the command `polcap process` from Python."""
+"""Python interface: `polcap.process` does the same as the command `polcap process`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +25,7 @@ class Result:
 
     @property
     def verdict(self) -> str:
-        """`pass`, `warn` (an assumption to check) or `fail` (a gate failed: do not trust it unseen)."""
+        """`pass`, `warn` (check an assumption) or `fail` (a gate failed: check the result before use)."""
         return str(self.report["verdict"])
 
 
@@ -46,28 +46,29 @@ def process(
     Parameters
     ----------
     capture
-        Folder with the RAW brackets.
+        Folder with the photographs.
     out
-        Result folder; by default `CAPTURE/polcap`. Stages that an earlier run has stored there are not computed again.
+        Result folder; by default `CAPTURE/polcap`. Stages stored there by an earlier run are not computed again.
     config
         Settings; by default those of `docs/reference/settings.md`. `polcap.load_config` reads a file.
     angles_deg
-        Polarizer angles of the shots in order, where names do not state them, degrees.
+        Polarizer angles of the shots in order, degrees; by default from the names of folders or files.
     chart
-        How the ColorChecker is found; by default in the reference shot.
+        Source of the color calibration; by default a ColorChecker in the reference shot.
     mask
-        (H, W), true on the object, on the RAW pixels; by default the object is found.
+        (H, W), true on the object, in RAW pixels; by default the object is detected.
     estimator
-        By default the shipped network, as on the command line; "analytic" inverts the equations.
+        "network" or "analytic", which inverts the equations; by default the shipped network.
     model
-        Another ONNX file than the shipped one.
+        ONNX file to use instead of the shipped one.
     progress
-        Called with a stage's name as it begins (None) and ends (its seconds), and whether it was found in the cache.
+        Called at the begin and the end of each stage, with its name, seconds (None at the begin) and whether it was
+        cached.
 
     Raises
     ------
     PolcapError
-        With one line that names the thing, the value, the limit and the remedy.
+        Its message is one line: the thing, its value, the limit and the remedy.
     """
     folder = Path(capture)
     target = folder / "polcap" if out is None else Path(out)

@@ -1,7 +1,7 @@
-"""In: a TOML file and `--set` assignments. Out: one frozen `Config`, a section per stage.
+"""Settings of a run: read from defaults, a TOML file and `--set` assignments, later ones first.
 
-Defaults < file < assignments. Strict: an unknown key or a value out of range is an error that
-names it, its value and its limit. The settings themselves stand in the stages that use them.
+Each stage declares its own settings; `Config` has one section per stage. An unknown key or a value out of range is an
+error that names the key, the value and the limit.
 """
 
 import difflib
@@ -29,11 +29,11 @@ from polcap.stages.whitebalance import WhitebalanceSettings
 
 S = TypeVar("S", bound=msgspec.Struct)
 
-_BARE_POINT = re.compile(r"(?<![\w.])\.(?=\d)")  # of a number written without its 0
+_BARE_POINT = re.compile(r"(?<![\w.])\.(?=\d)")  # of a number without a leading 0
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Every setting of a run."""
+    """All settings of a run, one section per stage."""
 
     hdr: HdrSettings = HdrSettings()
     whitebalance: WhitebalanceSettings = WhitebalanceSettings()
@@ -48,7 +48,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Setting(NamedTuple):
-    """One row of the settings page."""
+    """One row of the settings reference."""
 
     key: str
     kind: str
@@ -58,7 +58,7 @@ class Setting(NamedTuple):
 
 
 def load(file: Path | None = None, assignments: Sequence[str] = ()) -> Config:
-    """Read the settings of a run.
+    """Settings from a TOML file and assignments of the form stage.name=value.
 
     Raises
     ------
@@ -68,12 +68,12 @@ def load(file: Path | None = None, assignments: Sequence[str] = ()) -> Config:
     stated = _read(file) if file else {}
     for section, values in stated.items():
         if not isinstance(values, dict):
-            raise SettingError(f"{file}: `{section}` is not a section; write [stage] and below it name = value")
+            raise SettingError(f"{file}: `{section}` is not a section; write [stage], and name = value below it")
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         section, dot, name = key.strip().partition(".")
         if not equals or not dot:
-            raise SettingError(f"--set {assignment}: not of the form stage.name=value, as in hdr.clip=0.95")
+            raise SettingError(f"--set {assignment}: write stage.name=value, for example hdr.clip=0.95")
         stated.setdefault(section, {})[name] = _parse(text.strip())
     _check_finite(stated)
     known = {setting.key: setting for setting in settings()}
@@ -85,30 +85,30 @@ def load(file: Path | None = None, assignments: Sequence[str] = ()) -> Config:
     except msgspec.ValidationError as error:
         raise _explain(error, stated, known) from error
     except UnicodeError as error:
-        raise SettingError("--set: a value is no UTF-8 text; write it in ASCII") from error
+        raise SettingError("--set: a value is not UTF-8 text; write it in ASCII") from error
 
 
 def restored(about: Mapping[str, Any], file: Path) -> Config:
-    """The settings that a file of an earlier run tells.
+    """Settings stored in `about`, the content of a file of an earlier run.
 
     Raises
     ------
     StorageError
-        They are those of another polcap, or no settings.
+        The settings are missing or belong to another version of polcap.
     """
     try:
         return msgspec.convert(about["settings"], Config)
     except (msgspec.ValidationError, KeyError) as error:
-        raise StorageError(f"{file}: its settings are not this polcap's ({error}); run `polcap process`") from error
+        raise StorageError(f"{file}: its settings are of another polcap ({error}); run `polcap process`") from error
 
 
 def fill(kind: type[S], stated: dict[str, Any], assignments: Sequence[str]) -> S:
-    """A single struct from given values and name=value assignments, as strict as `load`.
+    """A struct from values and name=value assignments, checked as strictly as by `load`.
 
     Raises
     ------
     SettingError
-        No such name, or a value of another type or outside its range.
+        A name is unknown, or a value has the wrong type or is out of range.
     """
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
@@ -127,7 +127,7 @@ def fill(kind: type[S], stated: dict[str, Any], assignments: Sequence[str]) -> S
 
 
 def settings() -> Iterator[Setting]:
-    """Every setting in the order of the stages, as the settings page lists them."""
+    """All settings in the order of the stages, for the settings reference."""
     for section in msgspec.structs.fields(Config):
         hints = get_type_hints(section.type, include_extras=True)
         for field in msgspec.structs.fields(section.type):
@@ -154,7 +154,7 @@ def _read(file: Path) -> dict[str, Any]:
 
 
 def _parse(text: str) -> Any:
-    """A TOML value; a bare word is a string, what has commas outside brackets is a list (0,60,120), .5 is a number."""
+    """A TOML value; also accepted are words without quotes, lists without brackets (0,60,120) and .5 for 0.5."""
     for written in (text, f"[{text}]" if "," in text else text, _BARE_POINT.sub("0.", text)):
         try:
             return tomllib.loads(f"value = {written}")["value"]
@@ -164,7 +164,7 @@ def _parse(text: str) -> Any:
 
 
 def _check_finite(stated: dict[str, Any]) -> None:
-    """No limit of a setting stops a NaN."""
+    """Refuse NaN and infinity, which pass every range check."""
     try:
         text_file.check_finite(stated)
     except ValueError as error:

@@ -1,26 +1,26 @@
-"""Every error polcap raises on purpose, and the exit code it ends with.
+"""Errors of polcap, and their exit codes.
 
 ::
 
-    PolcapError                    never raised itself
-    ├── InputError          exit 2   what the user gave is at fault
+    PolcapError                    base of all errors
+    ├── InputError          exit 2   the user's input is wrong
     │   ├── SettingError             a setting, flag or TOML key
-    │   ├── CaptureError             the folder, its layout, a missing or mixed-up shot
+    │   ├── CaptureError             the folder, its layout, missing or swapped shots
     │   ├── DecodeError              one RAW or image file
     │   ├── ChartError               the ColorChecker
-    │   ├── AlignmentError           a shot that cannot be registered
+    │   ├── AlignmentError           registration of a shot
     │   ├── ObjectError              the object's mask
     │   ├── ModelError               the ONNX file or its provider
-    │   └── StorageError             disk full, read-only, locked
-    ├── GateError           exit 3   the asset was written, but a quality gate failed
+    │   └── StorageError             a full, read-only or locked disk
+    ├── GateError           exit 3   a quality gate failed; the asset was written
     └── HardwareError       exit 4   camera, rotator, port
 
-A message is one line: the thing, the value, the limit, the remedy.
+A message is one line: the thing, its value, the limit and the remedy.
 """
 
 
 class PolcapError(Exception):
-    """What polcap tells in one line: the thing, the value, the limit, the remedy."""
+    """An error with a message of one line: the thing, its value, the limit and the remedy."""
 
     exit_code = 1
 

@@ -1,4 +1,4 @@
-"""The results of all stages for one capture: plain values, arrays as read-only memory maps."""
+"""Results of all stages for one capture."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,12 +19,12 @@ from polcap.images import (
 
 
 class NotReached(AttributeError):
-    """A stage did not run, because the path stopped before it."""
+    """A result was requested from a stage that did not run."""
 
 
 @dataclass(frozen=True)
 class Results:
-    """One value per stage. A path that was stopped early has only the first of them."""
+    """One value per stage, and the cache keys; after an early stop only the first stages have values."""
 
     radiance: AngleStack
     color: ColorCalibration
@@ -36,11 +36,11 @@ class Results:
     maps: SurfaceMaps
     mesh: Mesh
     asset: Asset
-    keys: Mapping[str, str]  # cache key of each stage that has run, by stage
+    keys: Mapping[str, str]  # cache key of each stage that ran, by stage
 
     @classmethod
     def partial(cls, **made: Any) -> Self:
-        """The results that exist; any other raises NotReached when it is used."""
+        """Results of the stages that ran; access to any other raises NotReached."""
         found = object.__new__(cls)
         vars(found).update(made)
         return found

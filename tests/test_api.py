@@ -16,7 +16,7 @@ def test_importing_polcap_imports_nothing_heavy() -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_importing_the_path_leaves_to_those_who_need_it_what_is_heavy() -> None:
+def test_importing_the_path_imports_no_heavy_library() -> None:
     heavy = ("OpenImageIO", "scipy", "onnxruntime", "trimesh", "rawpy")
     code = f"import sys, polcap.pipeline.run; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -24,7 +24,7 @@ def test_importing_the_path_leaves_to_those_who_need_it_what_is_heavy() -> None:
 
 
 @pytest.mark.parametrize("name", polcap.__all__)
-def test_every_public_name_is_there_and_tells_what_it_is(name: str) -> None:
+def test_every_public_name_exists_and_is_described(name: str) -> None:
     assert getattr(polcap, name).__doc__ and name in dir(polcap)
 
 

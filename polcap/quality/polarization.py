@@ -79,18 +79,18 @@ def of_outline(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
 class OutlineFigures:
     """Measurements along the object's outline."""
 
-    body: rim.Body
-    turn: rim.Turn
+    body: rim.RimFigures
+    turn: rim.AngleError
     side: Floats  # (K,) excess brightness of one side over the other in each shot
 
 
 def _outline(found: Evidence, limit_deg: float, angle: Floats) -> OutlineFigures | None:
     """Measurements at angles (K,) rad; turns below the limit are not tried. None: the outline is too short."""
-    band = rim.take(*_reduced(found.stokes, angle))
+    band = rim.sample(*_reduced(found.stokes, angle))
     if len(band.azimuth) < _LEAST_RIM:
         return None
-    turn = rim.turn(band, angle, np.radians(limit_deg))
-    return OutlineFigures(rim.body(band, angle), turn, rim.side_light(band))
+    turn = rim.fit_angle_error(band, angle, np.radians(limit_deg))
+    return OutlineFigures(rim.summarize(band, angle), turn, rim.side_light(band))
 
 
 def ill_posed(found: Evidence, limits: GateLimits) -> Gate:
@@ -110,7 +110,12 @@ def _ill_posed(found: Evidence) -> float:
 
 
 def _angles(
-    found: rim.Turn, body: rim.Body, angle: Floats, selfcal: SelfCalibration, names: list[str], limits: GateLimits
+    found: rim.AngleError,
+    body: rim.RimFigures,
+    angle: Floats,
+    selfcal: SelfCalibration,
+    names: list[str],
+    limits: GateLimits,
 ) -> Gate:
     """A wrong angle of one shot, or of all, beyond the error of its estimate."""
     limit = limits.max_turn_deg
@@ -183,7 +188,7 @@ def _with_ring(gate: Gate, selfcal: SelfCalibration, limits: GateLimits) -> Gate
     return Gate("angles", "warn", value, limit if noted else limits.max_turn_deg, message, remedy, cost, unit="°")
 
 
-def _light_of_body(body: rim.Body, found: Evidence, limits: GateLimits) -> Gate:
+def _light_of_body(body: rim.RimFigures, found: Evidence, limits: GateLimits) -> Gate:
     """Whether the outline is polarized as a dielectric under a flash at the lens: across the contour, and enough.
 
     Rough and translucent objects polarize equally little. The estimators allow for roughness, so a rough object keeps a
@@ -231,7 +236,7 @@ def _light_of_body(body: rim.Body, found: Evidence, limits: GateLimits) -> Gate:
     return Gate("body", "pass", round(body.dolp, 4), limit, message)
 
 
-def _lopsided(body: rim.Body) -> float:
+def _lopsided(body: rim.RimFigures) -> float:
     """Factor on the limit of uneven light; light from the side lowers the polarization of the side it falls on."""
     if body.concentration <= _CLEAR or body.dolp_lit < _WEAK_DOLP:
         return 1.0

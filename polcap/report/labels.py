@@ -143,7 +143,7 @@ def _plain(value: Any, factor: float) -> str:
         nested = any(isinstance(item, (list, tuple)) for item in value)
         return (" / " if nested else ", ").join(_plain(item, factor) for item in value)
     if isinstance(value, dict):
-        return ", ".join(f"{_words(str(key))} {_plain(item, factor)}" for key, item in value.items())
+        return ", ".join(f"{_words(str(key))} {_plain(item, factor)}" for key, item in value.items()) or "none"
     return str(value)
 
 

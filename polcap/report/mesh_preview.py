@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csgraph
 
 from polcap.formats import html
 from polcap.images import Floats, Mesh
@@ -37,6 +36,8 @@ def thinned(mesh: Mesh, most: int) -> tuple[Floats, Floats, NDArray[np.int32]]:
     Connected vertices in the same cell of a grid over the texture are replaced by their mean. Two surfaces that
     overlap in the picture are not connected, so they stay separate.
     """
+    from scipy.sparse import coo_array, csgraph  # importing scipy takes 0.3 s
+
     count = len(mesh.vertices)
     if count <= most:
         return mesh.vertices, mesh.uv, mesh.faces

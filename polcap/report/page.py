@@ -86,7 +86,7 @@ def verdict(about: Mapping[str, Any]) -> tuple[str, str]:
     judged = [gate for gate in gates if gate["name"] == "normal error" and gate["value"] is not None]
     if not judged:  # the shots are out of order, or there is no object
         return headline, ""
-    within = f"The expected error of half of the normals is below {_gate_value(judged[0], 'value')}"
+    within = f"For half of the normals, the expected error is below {_gate_value(judged[0], 'value')}"
     because = judged[0]["says"].partition(", mostly due to: ")[2]
     return headline, f"{within}; mostly due to these checks: {because}." if because else f"{within}."
 

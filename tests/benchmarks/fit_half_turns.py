@@ -7,7 +7,8 @@ rough law. Added to them are six pictures for each of --sixths: training meshes 
 
 The cut is made with half, the usual and twice the weight of the network, for more regions to learn from. A region
 counts by what turning it changes of the mean normal error, 0.5° at most, over the root of the regions of its picture;
-cells of the inversion count alike. Prints both laws, and what the accepted regions gain and lose.
+cells of the inversion count alike. Then the odds are scaled until the doubt is likeliest where each region counts by
+its whole error. Prints both laws, and what the accepted regions gain and lose.
 """
 
 import argparse
@@ -53,6 +54,9 @@ def main() -> None:
         print(case.name, len(regions[-1][0]), "regions", flush=True)
     x, gain, weight = (np.concatenate(column) for column in zip(*regions))
     law = fit(x, gain > 0, np.minimum(np.abs(gain), MOST_DEG) * weight, SHRINK)
+    law = (
+        law * fit((x @ law)[:, None], gain > 0, np.abs(gain) * weight, 0.0)[0]
+    )  # same decisions; doubts by all they cost
     accepted = x @ law > 0
     gained, lost = (gain[accepted & side].sum() for side in (gain > 0, gain < 0))
     print("_REGION =", tuple(float(f"{one:.3g}") for one in law), f"gains {gained:.1f}°, loses {-lost:.1f}° in all")

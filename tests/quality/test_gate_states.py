@@ -77,7 +77,7 @@ def exposures(*ratio: float, **fields: Any) -> dict[str, Any]:
 
 def outline(turn: dict[str, Any] | None = None, side: float = 0.02, **body: float) -> dict[str, Any]:
     """Measured figures with this outline."""
-    found = rim.Body(**in_numpy(BODY | body)), rim.Turn(**in_numpy(TURN | (turn or {})))
+    found = rim.RimFigures(**in_numpy(BODY | body)), rim.AngleError(**in_numpy(TURN | (turn or {})))
     return {"outline": polarization.OutlineFigures(*found, np.array([0.0, 0.01, side]))}
 
 

@@ -1,4 +1,4 @@
-"""The outline of a ball tells which shot's angle is wrong, and where another lamp stood."""
+"""The outline of a ball shows which shot's angle is wrong, and that a lamp shone from the side."""
 
 import numpy as np
 import pytest
@@ -15,27 +15,27 @@ def ball_rim(actual_deg: tuple[float, ...], lamp: float = 0.0) -> rim.Rim:
     shots = np.einsum("kj,jhw->khw", mueller.analyzer(np.radians(actual_deg)), STOKES.sum(-1))
     shots *= 1 + 0.004 * np.random.default_rng(0).normal(size=shots.shape)
     shots[1] *= 1 + lamp * scenes.normals(X, Y)[0][..., 0]
-    return rim.take(shots, BALL, np.ones_like(BALL))
+    return rim.sample(shots, BALL, np.ones_like(BALL))
 
 
 @pytest.mark.parametrize("shot", [0, 1, 2])
 def test_wrong_angle_of_one_shot_is_found(shot: int) -> None:
     actual = [0.0, 45.0, 90.0]
     actual[shot] += 15
-    found = rim.turn(ball_rim(tuple(actual)), scenes.ANGLES, np.radians(8))
+    found = rim.fit_angle_error(ball_rim(tuple(actual)), scenes.ANGLES, np.radians(8))
     assert found.shot == shot
     assert np.degrees(found.angle) == pytest.approx(15, abs=rim._STEP_DEG)
     assert found.misfit < 0.5
 
 
-def test_ring_off_its_mark_is_no_single_shots_fault() -> None:
-    found = rim.turn(ball_rim((-12, 33, 78)), scenes.ANGLES, np.radians(8))
+def test_a_zero_error_of_the_ring_is_shared_by_all_shots() -> None:
+    found = rim.fit_angle_error(ball_rim((-12, 33, 78)), scenes.ANGLES, np.radians(8))
     assert found.shot is None
     assert np.degrees(found.angle) == pytest.approx(-12, abs=rim._STEP_DEG)
 
 
-def test_an_outline_bent_at_random_asks_for_no_turn_that_its_parts_agree_on() -> None:
-    """The best of a hundred turns explains it better than none does: that is how it was chosen."""
+def test_random_errors_of_the_outline_give_no_significant_angle_error() -> None:
+    """The best of a hundred angle errors always fits better than none, because it is the best."""
     angle = np.radians([62.0, 134.0, 165.0])
     fooled, sure = 0, 0
     for seed in range(40):
@@ -43,17 +43,17 @@ def test_an_outline_bent_at_random_asks_for_no_turn_that_its_parts_agree_on() ->
         azimuth, sector = np.linspace(-np.pi, np.pi, 480, endpoint=False), np.repeat(np.arange(24), 20)
         bent = azimuth + np.repeat(random.normal(0, np.radians(20), 24), 20)  # contour beside the surface's azimuth
         light = 1 + 0.1 * np.cos(2 * (angle[:, None] - bent))
-        found = rim.turn(rim.Rim(light, azimuth, sector, np.ones(480)), angle, np.radians(8))
+        found = rim.fit_angle_error(rim.Rim(light, azimuth, sector, np.ones(480)), angle, np.radians(8))
         fooled += found.shot is not None and found.misfit < 0.9
         sure += found.shot is not None and found.sigmas > 2.5
     assert fooled > 5 and sure < 3
 
 
-def test_true_angles_stand_unchallenged() -> None:
-    assert rim.turn(ball_rim((0.5, 44.6, 90.3)), scenes.ANGLES, np.radians(8)).misfit > 0.9
+def test_no_angle_error_fits_better_than_true_angles() -> None:
+    assert rim.fit_angle_error(ball_rim((0.5, 44.6, 90.3)), scenes.ANGLES, np.radians(8)).misfit > 0.9
 
 
-def test_lamp_at_the_side_is_told_from_polarization() -> None:
+def test_a_lamp_at_the_side_is_distinguished_from_polarization() -> None:
     assert rim.side_light(ball_rim((0, 45, 90))).max() < 0.02
     side = rim.side_light(ball_rim((0, 45, 90), lamp=0.15))
     assert int(np.argmax(side)) == 1
@@ -61,5 +61,5 @@ def test_lamp_at_the_side_is_told_from_polarization() -> None:
 
 
 def test_diffuse_polarization_grows_towards_the_outline() -> None:
-    dolp = rim.body(ball_rim((0, 45, 90)), scenes.ANGLES).dolp
+    dolp = rim.summarize(ball_rim((0, 45, 90)), scenes.ANGLES).dolp
     assert 0.05 < dolp < 0.4  # Fresnel, n = 1.5: 3 % at 40°, 39 % at 90°

@@ -1,4 +1,4 @@
-"""The capture bundled in examples/ is what its script makes."""
+"""The capture in examples/ is the one that its script writes."""
 
 import importlib.util
 import json

@@ -1,4 +1,4 @@
-"""Distance fields never promise more room than there is, and their surfaces are where geometry says."""
+"""Distance fields never exceed the true distance, and their surfaces are where geometry puts them."""
 
 from typing import Literal
 
@@ -35,7 +35,7 @@ def surface(shape: Shape, seed: int, count: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_a_step_of_the_promised_length_never_enters_the_shape(name: str) -> None:
+def test_a_step_of_the_stated_distance_never_enters_the_shape(name: str) -> None:
     shape = SHAPES[name]
     points = surface(shape, 0, 3000)
     assert len(points) > 600 and np.linalg.norm(points, axis=-1).max() <= shape.radius
@@ -49,7 +49,7 @@ def test_a_step_of_the_promised_length_never_enters_the_shape(name: str) -> None
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_rays_that_arrive_stand_on_the_surface_and_see_its_front(name: str) -> None:
+def test_rays_end_on_the_front_of_the_surface(name: str) -> None:
     shape = SHAPES[name]
     v = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 60), np.linspace(-0.1, 0.1, 60), [1.0]), axis=-1).reshape(-1, 3)
     v /= np.linalg.norm(v, axis=-1, keepdims=True)
@@ -62,7 +62,7 @@ def test_rays_that_arrive_stand_on_the_surface_and_see_its_front(name: str) -> N
     np.testing.assert_allclose(hits.point, -v[hits.index] * hits.distance[:, None], atol=1e-12)
 
 
-def test_sphere_is_met_where_the_quadratic_says() -> None:
+def test_sphere_hits_solve_the_quadratic_equation() -> None:
     ball, middle = Cluster(((0, 0, 0, 0.06),)), np.array([0.05, -0.02, -0.7])
     v = -np.array([[0.05, -0.02, -0.7], [0.08, 0.0, -0.7], [0.2, 0.2, -0.7]])
     v /= np.linalg.norm(v, axis=-1, keepdims=True)
@@ -87,5 +87,5 @@ def test_a_ball_hides_another_from_a_light_behind_it() -> None:
 
 
 @pytest.mark.parametrize("kind", ["bumps", "clusters", "vase"])
-def test_a_seed_is_a_scene(kind: Literal["bumps", "clusters", "vase"]) -> None:
+def test_a_seed_gives_one_scene(kind: Literal["bumps", "clusters", "vase"]) -> None:
     assert random_scene(4, kind) == random_scene(4, kind) != random_scene(5, kind)

@@ -1,4 +1,4 @@
-"""The forward sensor model: whose colour, how much noise, where it ends."""
+"""Simulated sensor: color filter of each photosite, noise and saturation."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from polcap.synth import forward_camera
 from polcap.synth.forward_camera import Sensor
 
 
-def test_each_photosite_sees_its_own_colour() -> None:
+def test_each_photosite_measures_the_color_of_its_filter() -> None:
     image = np.broadcast_to(np.array([1.0, 2.0, 3.0]), (4, 6, 3))
     mosaic = forward_camera.mosaic(image, np.array([[1, 0], [2, 1]], np.uint8))  # GRBG
     np.testing.assert_array_equal(mosaic[:2, :2], [[2, 1], [3, 2]])

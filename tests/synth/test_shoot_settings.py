@@ -1,4 +1,4 @@
-"""How a simulated capture is shot: what no camera does is told on one line, folders say the angle that was set."""
+"""Impossible settings of a simulated capture are refused in one line; folder names state the angle."""
 
 from pathlib import Path
 
@@ -23,13 +23,13 @@ CALIBRATION = ["sense=0", "ring_step_deg=0", "isos=[0]", "power=0", "extinction=
 @pytest.mark.parametrize(
     ("kind", "text"), [*((Shoot, t) for t in SHOOT), *((CalibrationShoot, t) for t in CALIBRATION)]
 )
-def test_what_no_camera_does_is_one_line(kind: type[msgspec.Struct], text: str) -> None:
+def test_impossible_settings_are_refused_in_one_line(kind: type[msgspec.Struct], text: str) -> None:
     with pytest.raises(SettingError, match=text.partition("=")[0]) as told:
         fill(kind, {}, [text])
     assert "\n" not in str(told.value)
 
 
-def test_folders_say_the_angle_that_was_set(tmp_path: Path) -> None:
+def test_folder_names_state_the_angle(tmp_path: Path) -> None:
     angles = (22.25, 67.5, 112.125)
     shoot = Shoot(width=64, height=64, samples=1, exposures=1, cross=True, angles_deg=angles)
     shooting.write(tmp_path / "capture", scenes.random_scene(0, "bumps"), shoot)

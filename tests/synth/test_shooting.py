@@ -1,4 +1,4 @@
-"""Synthetic captures: the files carry the physics, and the truth beside says what was done."""
+"""Synthetic captures: files follow the physics, and truth.json states how they were made."""
 
 import json
 from itertools import pairwise
@@ -57,7 +57,7 @@ def still(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return taken(tmp_path_factory.mktemp("still") / "capture", BALL, shoot)
 
 
-def test_limbs_of_a_ball_glow_through_the_polarizer_that_points_at_them(still: Any) -> None:
+def test_the_outline_of_a_ball_is_bright_through_a_polarizer_along_its_azimuth(still: Any) -> None:
     """Diffuse light vibrates along the projected normal: the right limb in 0°, the upper in 90°, up-right in 45°."""
     pictures, _, maps = still
     i0, i45, i90, i135 = (p[0::2, 1::2] for p in pictures)  # one of the greens
@@ -103,7 +103,7 @@ def test_white_patch_has_its_reflectance(still: Any) -> None:
         )
 
 
-def test_ball_stands_where_the_projection_says(still: Any) -> None:
+def test_ball_is_where_the_projection_puts_it(still: Any) -> None:
     _, truth, maps = still
     middle, radius, f = np.array(BALL.position), 0.08, truth["focal_px"]
     y, x = np.mgrid[:216, :288]
@@ -131,7 +131,7 @@ def centroid(picture: np.ndarray, quad: np.ndarray) -> np.ndarray:
     return np.asarray(2 * at + 0.5)
 
 
-def test_transform_says_where_a_shot_sees_the_chart(tmp_path: Path) -> None:
+def test_transform_maps_the_chart_to_its_place_in_a_shot(tmp_path: Path) -> None:
     scene = Scene(BALL.shape, GREY, position=(-0.09, 0, -0.7), chart=Chart(center=(0.1, 0.02, -0.69), pitch=0.024))
     pictures, truth, _ = taken(
         tmp_path / "c", scene, replaced(STILL, width=576, height=432, nudge_px=12.0, nudge_deg=1.0, seed=6)
@@ -170,7 +170,7 @@ def test_same_seed_same_bytes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("bracket", ["time", "aperture", "iso", "flash"])
-def test_bracket_steps_by_four_whatever_turns_the_screw(tmp_path: Path, bracket: str) -> None:
+def test_every_kind_of_bracket_steps_by_four(tmp_path: Path, bracket: str) -> None:
     shoot = replaced(STILL, width=96, height=72, samples=1, exposures=3, angles_deg=(0.0,), bracket=bracket)
     pictures, truth, maps = taken(tmp_path / "c", BALL, shoot)
     dim = maps["mask"] & (pictures[2] < 0.9)
@@ -182,7 +182,7 @@ def test_bracket_steps_by_four_whatever_turns_the_screw(tmp_path: Path, bracket:
 
 
 @pytest.mark.parametrize("kind", ["bumps", "clusters", "vase"])
-def test_object_and_chart_are_whole_and_apart_in_every_scene(kind: Any) -> None:
+def test_object_and_chart_are_complete_and_separate_in_every_scene(kind: Any) -> None:
     shoot = Shoot(width=144, height=108)
     for seed in range(20):
         scene = shooting.random_scene(seed, kind)
@@ -195,7 +195,7 @@ def test_object_and_chart_are_whole_and_apart_in_every_scene(kind: Any) -> None:
         assert np.flatnonzero(mask.any(axis=0)).max() + 2 < corners[:, 0].min(), seed
 
 
-def test_what_is_there_already_is_kept(tmp_path: Path) -> None:
+def test_existing_files_are_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "holiday.jpg").write_text("mine")
     with pytest.raises(CaptureError, match="not an empty folder"):
         shooting.write(tmp_path, BALL, STILL)

@@ -42,7 +42,7 @@ _SURE_DEG, _SUREST = 30.0, 3.0  # a network's error that counts 1, and the most 
 _INTEGER = 1000  # capacities per unit of energy: the flow is one of whole numbers
 # ln odds that a region of the cut is turned: constant, outline evidence over √cells, mean inward lean, share of the
 # network's positions that disagree, ln of its error in degrees; tests/benchmarks/fit_half_turns.py
-_REGION = (-6.85, 1.05, 0.87, 8.09, 1.52)
+_REGION = (-15.8, 2.42, 2.00, 18.6, 3.50)
 _MOST_OUTLINE, _MOST_OPPOSED = 2.0, 0.5  # larger values count as these
 # ln odds that a cell of the inversion is on the wrong side: constant, energy of turning it alone, ln of the share of
 # links around it that contradict each other, mean lean away from the inside around it; same benchmark

@@ -1,4 +1,4 @@
-"""Meshes as objects of the synthetic camera: the same light as on solids, shadows, one bounce, texture sets."""
+"""Meshes in synthetic scenes: same light as on distance fields, shadows, one bounce, texture sets."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Model:
     return Model(str(file), 0.08)
 
 
-def test_a_ball_of_triangles_shines_as_a_ball(model: Model) -> None:
+def test_a_ball_of_triangles_renders_like_a_ball(model: Model) -> None:
     solid = render.stokes(BALL, VIEW, X, Y)
     triangles = render.stokes(replace(BALL, shape=model), VIEW, X, Y)
     seen = render.gbuffer(BALL, VIEW, 72, 96)
@@ -45,7 +45,7 @@ def test_a_ball_of_triangles_shines_as_a_ball(model: Model) -> None:
 
 
 @pytest.mark.parametrize("kind", ["solid", "mesh"])
-def test_the_shadow_lies_where_lines_to_the_flash_meet_the_ball(model: Model, kind: str) -> None:
+def test_points_are_in_shadow_where_the_line_to_the_flash_crosses_the_ball(model: Model, kind: str) -> None:
     scene = replace(BALL, light=(0.3, 0.0, 0.0), **({"shape": model} if kind == "mesh" else {}))
     bright = render.stokes(scene, VIEW, X, Y)[0, ..., 0]
     dark = render.stokes(replace(scene, cast_shadows=True), VIEW, X, Y)[0, ..., 0]
@@ -61,7 +61,7 @@ def test_the_shadow_lies_where_lines_to_the_flash_meet_the_ball(model: Model, ki
     assert (dark[shadow] == 0).all() and (dark[free] == bright[free]).all()
 
 
-def test_every_point_of_a_hemispherical_bowl_sees_half_of_a_sphere() -> None:
+def test_every_point_of_a_hemispherical_bowl_receives_the_light_of_half_a_sphere() -> None:
     """Between any two patches of a sphere the form factor is area/4πR²; a bowl's is ½."""
     whole = trimesh.creation.icosphere(subdivisions=4, radius=0.08)
     bowl = whole.faces[whole.triangles_center[:, 2] < 0]
@@ -77,7 +77,7 @@ def test_every_point_of_a_hemispherical_bowl_sees_half_of_a_sphere() -> None:
     assert np.abs(found - 0.5).max() < 0.1  # 48 rays each
 
 
-def test_a_ball_throws_no_light_on_itself_and_solids_cannot(model: Model) -> None:
+def test_a_ball_does_not_light_itself_and_distance_fields_are_refused(model: Model) -> None:
     direct = render.stokes(replace(BALL, shape=model), VIEW, X, Y)
     np.testing.assert_allclose(
         render.stokes(replace(BALL, shape=model, interreflection=True), VIEW, X, Y), direct, atol=1e-6
@@ -95,7 +95,7 @@ def texture(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_texture_set_gives_colour_roughness_and_relief(texture: Path) -> None:
+def test_a_texture_set_gives_color_roughness_and_relief(texture: Path) -> None:
     coat = with_textures(BALL, texture).coat
     position, facing = np.array([[0.03, 0.045, 0.0], [0.13, 0.045, 0.0]]), np.array([[0.0, 0.0, 1.0]] * 2)
     diffuse, _, roughness, _ = evaluate(coat, position, facing)
@@ -106,7 +106,7 @@ def test_a_texture_set_gives_colour_roughness_and_relief(texture: Path) -> None:
     np.testing.assert_allclose(bent[:, 1], 0, atol=0.02)
 
 
-def test_what_cannot_be_read_is_one_line(tmp_path: Path, texture: Path) -> None:
+def test_unreadable_files_are_refused_in_one_line(tmp_path: Path, texture: Path) -> None:
     (tmp_path / "nothing.ply").write_text("ply?")
     for broken in ("nothing.ply", "absent.obj", "absent.npz"):
         with pytest.raises(DecodeError, match=broken):

@@ -1,4 +1,4 @@
-"""The simulator draws rough bodies by the table, smooth ones as ever."""
+"""Diffuse polarization follows the law of the surface model, rough or smooth."""
 
 import msgspec
 import numpy as np

@@ -1,0 +1,43 @@
+"""report.html needs no other file and shows every figure with a label and its unit."""
+
+import re
+from html import unescape
+from pathlib import Path
+
+import numpy as np
+
+from polcap import report
+from polcap.report import keys, labels, page
+
+
+def test_the_page_opens_with_the_error_that_its_checks_judge(result: Path) -> None:
+    about = report.read(result)
+    gate = next(gate for gate in about["gates"] if gate["name"] == "normal error")
+    assert f"the expected error is below {labels.number(gate['value'])}°." in page.verdict(about)[1]
+    gate |= {"value": 31.74, "says": "Expected error of the normals: 31.7° (median), mostly due to: body"}
+    assert page.verdict(about)[1].endswith("the expected error is below 31.74°; mostly due to these checks: body.")
+    about["gates"].remove(gate)  # as where the shots are out of order
+    assert page.verdict(about)[1] == ""
+
+
+def test_page_needs_no_other_file_and_no_network(result: Path) -> None:
+    page = (result / "report.html").read_text()
+    assert [found[:40] for found in re.findall(r'(?:src|href)=["\']?(?!["\']|data:|asset/)[^\s>]*', page)] == []
+    assert re.findall(r"https?://|@import|url\(|fetch\(|XMLHttp", page) == []
+
+
+def test_page_shows_every_figure_with_words_and_unit(result: Path) -> None:
+    page = unescape((result / "report.html").read_text())
+    about = report.read(result)
+    for part, values in about["figures"].items():
+        for name, value in values.items():
+            assert f"{part}.{name}" in labels.LABELS, f"{part}.{name} has no words of its own"
+            assert f"<td>{labels.text(f'{part}.{name}', value)}</td>" in page
+    assert not re.search(r"<td>(?:\[|\{|None|True|False|nan)", page)
+
+
+def test_agreement_is_drawn_gray_and_registration_has_a_caption(result: Path) -> None:
+    middle = keys.colors(keys.DIFFERENCE.palette)[keys.LEVELS // 2]
+    assert np.ptp(middle) < 3 and 100 < middle.mean() < 180  # neither black, which is no object, nor white
+    page = unescape((result / "report.html").read_text())
+    assert re.search(r"<b>45° shot moved by [+-][.\d]+, [+-][.\d]+ ± [.\d]+ px</b>", page)

@@ -1,0 +1,66 @@
+"""report.json holds figures, gates and settings, and files that are no report are refused in one line."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from polcap import report
+from polcap.errors import StorageError
+
+
+def test_report_is_plain_json_with_figures_gates_and_settings(result: Path) -> None:
+    about = json.loads((result / "report.json").read_text(), parse_constant=pytest.fail)  # no NaN, no Infinity
+    assert {"capture", "gates", "figures", "settings", "keys", "verdict"} <= about.keys()
+    assert about["verdict"] == "pass"
+    assert {gate["state"] for gate in about["gates"]} <= {"pass", "not measured"}
+    assert len(about["figures"]["chart"]["delta_e"]) == 24
+
+
+def test_photographs_and_their_rerendering_agree(result: Path) -> None:
+    found = report.read(result)["figures"]["rerendering"]
+    assert len(found["rms"]) == 3 and max(found["rms"]) < 0.15 and 0.5 < found["scale"] < 2
+
+
+@pytest.mark.parametrize("text", [None, "{", "[]", "{}"])
+def test_missing_or_foreign_report_is_one_line(tmp_path: Path, text: str | None) -> None:
+    if text is not None:
+        (tmp_path / "report.json").write_text(text)
+    with pytest.raises(StorageError, match="polcap process"):
+        report.read(tmp_path)
+
+
+def test_a_folder_that_is_no_result_is_named_with_its_remedy(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="no such folder"):
+        report.read(tmp_path / "elsewhere")
+    (tmp_path / "report.json").write_text("{}")
+    (tmp_path / "maps").mkdir()
+    with pytest.raises(StorageError, match=f"only a part of a result; give the whole, {tmp_path}"):
+        report.read(tmp_path / "maps")
+
+
+@pytest.mark.parametrize(
+    "left_out", ["verdict", "gates", "keys", "model", "figures.maps", "gates.0.state", "gates.0.says"]
+)
+def test_a_report_of_another_polcap_is_one_line(result: Path, tmp_path: Path, left_out: str) -> None:
+    about = json.loads((result / "report.json").read_text("utf-8"))
+    *outer, last = left_out.split(".")
+    place = about
+    for name in outer:
+        place = place[int(name) if name.isdecimal() else name]
+    del place[last]
+    (tmp_path / "report.json").write_text(json.dumps(about), "utf-8")
+    with pytest.raises(StorageError, match=rf"report\.json is no report of this polcap \(.*{last}.*\); run"):
+        report.read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "strange", [{"state": "splendid"}, {"value": []}, {"name": None}, {"cost_deg": "much"}, {"unit": "ell"}]
+)
+def test_a_report_of_strange_gates_is_one_line(result: Path, tmp_path: Path, strange: dict[str, Any]) -> None:
+    about = json.loads((result / "report.json").read_text("utf-8"))
+    about["gates"][0] |= strange
+    (tmp_path / "report.json").write_text(json.dumps(about), "utf-8")
+    with pytest.raises(StorageError, match=r"\$\.gates\[0\]"):
+        report.read(tmp_path)
