@@ -112,9 +112,9 @@ def figures(maps: dict[str, Tensor], batch: Batch) -> dict[str, float]:
 
 
 def _depth_error(depth: Tensor, batch: Batch) -> Tensor:
-    """Error of relative depth at the masked pixels (M,), in units of the truth's range; both centred in the mask."""
+    """Error of relative depth at the masked pixels (M,), in units of the truth's range; both centered in the mask."""
     mask = batch.mask[:, None]
     inside = mask.float()
     low = torch.where(mask, batch.depth, torch.inf).amin(dim=(2, 3), keepdim=True)
     high = torch.where(mask, batch.depth, -torch.inf).amax(dim=(2, 3), keepdim=True)
-    return ((loss.centred(depth, inside) - loss.centred(batch.depth, inside)) / (high - low))[mask]
+    return ((loss.centered(depth, inside) - loss.centered(batch.depth, inside)) / (high - low))[mask]
