@@ -40,7 +40,7 @@ def total(
         "region": _region(maps["normal"], truth.normal, inside),
         "depth": mean((centered(maps["depth"], inside) - centered(truth.depth, inside)).abs()),
         "diffuse": mean((maps["diffuse"] - truth.diffuse).abs() + 2 * (maps["diffuse"] - truth.diffuse) ** 2),
-        # squares: they lead to the mean of what is possible; the median of F0 would ignore its long tail
+        # squares: their minimum is the mean of all possible values; the median of F0 would ignore its long tail
         "specular": mean((maps["specular"] - truth.specular) ** 2),
         "roughness": mean((maps["roughness"] - truth.roughness) ** 2),
         "highlight": mean((maps["highlight"] - truth.highlight) ** 2),

@@ -38,7 +38,7 @@ class Surface:
 
 
 class MaterialLibrary:
-    """Texture sets and a volume of tileable noise on one device."""
+    """Texture sets of a folder, if it exists, and a volume of tileable noise, on one device."""
 
     def __init__(self, folder: Path | None, device: torch.device, seed: int = 3) -> None:
         sets = sorted(p.parent for p in folder.glob("*/albedo.jpg")) if folder else []

@@ -89,7 +89,8 @@ def main(options: TrainingOptions) -> Path:
         network.load(options.out / "last.pt")
     elif options.start:
         network.begin(options.start, options.done)
-    simulator = Simulator(_open_views(options, preset), _open_library(options.data, device), device)
+    library = materials.MaterialLibrary(options.data / "materials" / "train", device)
+    simulator = Simulator(_open_views(options, preset), library, device)
     network.held_out = HeldOutPictures(options.data, options.out / "watch", device)
     torch.set_num_threads(1)
     budget = loop.Budget(options.minutes, options.samples)
@@ -122,12 +123,6 @@ def _open_views(options: TrainingOptions, preset: TrainingPreset) -> dict[str, A
     procedural = preset.procedural if options.procedural is None else options.procedural
     recipe = traced_views.ViewsRecipe(views=views, procedural=procedural, size=preset.size, seed=13)
     return traced_views.open_cache(options.out / "views", meshes, recipe)
-
-
-def _open_library(data: Path, device: torch.device) -> materials.MaterialLibrary:
-    """Training texture sets; solid noise alone if there are none."""
-    folder = data / "materials" / "train"
-    return materials.MaterialLibrary(folder if folder.exists() else None, device)
 
 
 def _make_ahead(

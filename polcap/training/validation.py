@@ -78,8 +78,7 @@ def open_simulator(data: Path, folder: Path, device: torch.device, *, views: int
     cache = traced_views.open_cache(
         folder, meshes, traced_views.ViewsRecipe(views, procedural=0, size=size, seed=99, flash=_FLASH)
     )
-    textures = data / "materials" / "test"
-    library = materials.MaterialLibrary(textures if textures.exists() else None, device, seed=4)
+    library = materials.MaterialLibrary(data / "materials" / "test", device, seed=4)
     return Simulator(cache, library, device)
 
 
