@@ -1,4 +1,4 @@
-"""GateLimits of polarization: order and zero of the angles, material and light."""
+"""Gates of polarization: order and zero of the angles, material and light."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
