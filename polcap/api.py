@@ -41,7 +41,7 @@ def process(
     model: str | Path | None = None,
     progress: Progress = silent,
 ) -> Result:
-    """Turn the photographs of an object into maps and a 3-D asset.
+    """Turn the photographs of an object into maps and a 3-D asset. One argument per option of the command.
 
     Parameters
     ----------

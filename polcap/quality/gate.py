@@ -25,7 +25,7 @@ class Gate(msgspec.Struct, frozen=True):
     value: float | str | None  # a share, not per cent
     limit: float | str | None
     message: str = msgspec.field(name="says")  # the finding, in one sentence; "says" in report.json
-    remedy: str = ""  # what the user can do, unless it passed
+    remedy: str = ""  # advice to the user, unless it passed
     cost_deg: float = 0.0  # added to the expected error of the normals, squared
     shots: tuple[str, ...] = ()  # to take again, if single ones are at fault
     unit: Unit = "%"
@@ -53,7 +53,7 @@ class Evidence(Results):
 
 
 def full_size(results: Results, focal_doubt: tuple[float, float]) -> Evidence:
-    """The evidence of a run of `process`; of its merged pictures one stands for all exposures."""
+    """The evidence of a run of `process`, with one merged picture in place of all exposures."""
     radiance = results.radiance
     return Evidence.partial(
         **vars(results),
@@ -79,7 +79,7 @@ def at_most(
 ) -> Gate:
     """A gate on a value that must not exceed its limit; None or not finite: not measured.
 
-    `beyond` is the state of a value over the limit, `shots` those at fault.
+    `beyond` is the state of a value over the limit, `shots` are those at fault. One argument per field of `Gate`.
     """
     if value is None or not np.isfinite(value):
         return Gate(name, "not measured", None, limit, message, unit=unit)

@@ -1,6 +1,6 @@
 """Every gate of a capture in the order of the path, for `process` and `check` alike.
 
-A gate that fails means: do not trust the result unseen (`process` ends with exit code 3, `check` message reshoot). One
+A gate that fails means: do not trust the result unseen (`process` ends with exit code 3, `check` asks to reshoot). One
 that warns states an assumption or a loss. Each has a finding, a cost in degrees and a remedy; a comparison counts only
 beyond its own error.
 """

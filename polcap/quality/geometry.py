@@ -1,4 +1,4 @@
-"""GateLimits of geometry: alignment, mask, mesh, outline, sharpness, focal length."""
+"""Gates of geometry: alignment, mask, mesh, outline, sharpness, focal length."""
 
 import numpy as np
 

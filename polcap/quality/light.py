@@ -1,4 +1,4 @@
-"""GateLimits of the light: bracket, tone curve, chart, gains, clipping, ambient light."""
+"""Gates of the light: bracket, tone curve, chart, gains, clipping, ambient light."""
 
 from collections.abc import Iterator
 from typing import Any

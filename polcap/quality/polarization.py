@@ -1,4 +1,4 @@
-"""GateLimits of polarization: order and zero of the angles, material and light."""
+"""Gates of polarization: order and zero of the angles, material and light."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ _SAME_DEG = 5.0  # axes nearer than this are the same angle
 _SURE = 2.5  # σ between sectors of the outline: least significance of a turn
 _CLEAR = 0.8  # least concentration of the AoLP about the outline, to estimate a common turn
 _LOPSIDED = 1.4  # factor on the limit of uneven light for an object that is polarized all round: its shape is uneven
-_LIT_DOLP = 0.07  # of an outline's brighter half: above, its light is the flash's (13 with a lamp beside: up to .049)
+_LIT_DOLP = 0.07  # of an outline's brighter half; above, the flash lights it (13 captures with a lamp: up to .049)
 _USUAL_DOLP = 0.1  # of an outline under a flash; a share q of it gives √q of the true zenith
 _FLATTENED_DEG = 34.0  # lost of a sphere's median zenith of 45° (two wax-like captures)
 _BALL_DEG = 45.0  # median zenith over the disc of a ball

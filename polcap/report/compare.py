@@ -70,10 +70,10 @@ def _names(folders: tuple[Path, Path]) -> tuple[str, str]:
 def _verdicts(abouts: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Iterator[str]:
     yield f"<p class='kicker'>two results</p><h1>{escape(names[0])} and {escape(names[1])}</h1><div class='pair wide'>"
     for about, name in zip(abouts, names, strict=True):
-        headline, good = page.verdict(about)
+        headline, detail = page.verdict(about)
         yield (
             f'<section class="verdict {escape(about["verdict"])}"><p class="kicker">{escape(name)}</p>'
-            f"<p><b>{escape(headline)}.</b></p><p>{escape(good)}</p></section>"
+            f"<p><b>{escape(headline)}.</b></p><p>{escape(detail)}</p></section>"
         )
     yield "</div>"
 

@@ -48,7 +48,7 @@ def maps(small: PageMaps, metric: bool) -> Iterator[str]:
     yield "</div>"
 
 
-def rerendered(small: PageMaps, again: Rerendering, about: Mapping[str, Any]) -> Iterator[str]:
+def rerendered(small: PageMaps, rendering: Rerendering, about: Mapping[str, Any]) -> Iterator[str]:
     """Section with the difference between each photograph and its re-rendering."""
     yield (
         "<h2>Photographs minus re-rendering</h2><p>The maps are rendered under the light and polarizer angles of the "
@@ -57,8 +57,8 @@ def rerendered(small: PageMaps, again: Rerendering, about: Mapping[str, Any]) ->
         'brighter, for example in shadows.</p><div class="grid">'
     )
     inside = small.maps.mask
-    rms = about["figures"].get("rerendering", {}).get("rms") or again.rms(inside)
-    shots = zip(small.angle, again.measured, again.predicted, rms)
+    rms = about["figures"].get("rerendering", {}).get("rms") or rendering.rms(inside)
+    shots = zip(small.angle, rendering.measured, rendering.predicted, rms)
     for number, (angle, measured, predicted, difference) in enumerate(shots, 1):
         yield scalar(
             f"difference-{number}",  # not by angle: two shots may share one

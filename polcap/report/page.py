@@ -32,19 +32,19 @@ def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
     StorageError
         The file cannot be written.
     """
-    drawn = _maps(about, results)
+    sections = _maps(about, results)
     body = [
         *_verdict(about),
-        drawn["relit"],
-        *_solid(drawn["metric"], about),
-        drawn["maps"],
-        *_measured(results, about, drawn["angles_deg"], _chart(about, results)),
+        sections["relit"],
+        *_solid(sections["metric"], about),
+        sections["maps"],
+        *_measured(results, about, sections["angles_deg"], _chart(about, results)),
         _pictures(results),
         *_tables(about),
     ]
     data = {
         "palettes": {name: html.text(keys.colors(name).tobytes()) for name in get_args(Palette)},
-        "view": drawn["view"],
+        "view": sections["view"],
         "mesh": mesh_preview.packed(results.mesh),
     }
     html.write(folder / "report.html", f"{about['capture']['name']}: polcap report", body, data)
@@ -55,14 +55,14 @@ def _maps(about: Mapping[str, Any], results: Results) -> dict[str, Any]:
     radiance, maps, mesh = results.radiance, results.maps, results.mesh
     small = page_data.reduce(maps, mesh, results.cues, radiance.angle, _LONGEST)
     ior = float(about["settings"]["infer"]["ior"])
-    again = page_data.rerender(small, ior)
+    rendered = page_data.rerender(small, ior)
     bright = page_data.exposure(small)
     size = small.maps.mask.shape[1::-1]
     photograph = page_data.photograph(radiance, results.color, small.maps.view, size)
-    relit = _relit(srgb_eight_bits(bright * photograph), srgb_eight_bits(bright * again.scale * again.flashed))
+    relit = _relit(srgb_eight_bits(bright * photograph), srgb_eight_bits(bright * rendered.scale * rendered.flashed))
     return {
         "relit": "".join(relit),
-        "maps": "".join([*map_figures.maps(small, mesh.metric), *map_figures.rerendered(small, again, about)]),
+        "maps": "".join([*map_figures.maps(small, mesh.metric), *map_figures.rerendered(small, rendered, about)]),
         "metric": mesh.metric,
         "angles_deg": [float(angle) for angle in np.degrees(radiance.angle)],
         "view": {
@@ -70,7 +70,7 @@ def _maps(about: Mapping[str, Any], results: Results) -> dict[str, Any]:
             "center": [float(edge) for edge in small.maps.view.center],
             "focal": float(small.maps.view.focal),
             "ior": ior,
-            "exposure": bright * again.scale,
+            "exposure": bright * rendered.scale,
             "top": keys.F0.high,
         },
     }
@@ -92,12 +92,12 @@ def verdict(about: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _verdict(about: Mapping[str, Any]) -> Iterator[str]:
-    headline, good = verdict(about)
+    headline, detail = verdict(about)
     capture, state = about["capture"], escape(about["verdict"])
     yield (
         f'<p class="kicker">{escape(capture["name"])} · {escape(capture["camera"])} · '
         f"{len(capture['shots'])} polarizer angles · {escape(about['figures']['maps']['estimator'])}</p>"
-        f'<section class="verdict {state}"><h1>{escape(headline)}.</h1><p>{escape(good)}</p>'
+        f'<section class="verdict {state}"><h1>{escape(headline)}.</h1><p>{escape(detail)}</p>'
     )
     notable = [gate for gate in about["gates"] if gate["state"] in ("fail", "warn")]
     if notable:
@@ -110,7 +110,7 @@ def _advice(gate: Mapping[str, Any]) -> str:
     value, limit = escape(_gate_value(gate, "value")), ""
     if gate["limit"] is not None:
         limit = f" (limit {escape(_gate_value(gate, 'limit'))})"
-    cost = f" This adds about {_cost(gate)} to the error of the normals." if _cost(gate) else ""
+    cost = f" This causes a normal error of about {_cost(gate)}." if _cost(gate) else ""
     finding = f"{escape(gate['says'])}.{cost}{_remedy(gate)}"
     return f"<b>{escape(gate['name'].capitalize())}</b> {value}{limit}: {finding}"
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from polcap.images import Floats, GBuffer
-from polcap.optics import brdf, frames, fresnel, shade
+from polcap.optics import brdf, frames, shade
 from polcap.optics.projection import project
 from polcap.training import light_transport
 from polcap.training.materials import Surface
@@ -75,7 +75,6 @@ def trace_visibility(
 
 def _draw_directions(normal: Floats, rng: np.random.Generator) -> Floats:
     """Random directions (M, RAYS, 3) about normals (M, 3), in the frame of each view ray; `_density` is theirs."""
-    e_x, e_y = frames.basis(normal)
     turn, shift = rng.uniform(0, 1, (2, len(normal)))
     ways = []
     for number, alpha in ((_COSINE_RAYS, None), *_LOBES):
@@ -83,9 +82,7 @@ def _draw_directions(normal: Floats, rng: np.random.Generator) -> Floats:
             u = (k + shift) / number
             cosine = np.sqrt(1 - u if alpha is None else (1 - u) / (1 + (alpha**2 - 1) * u))
             azimuth = 2 * pi * (k * 0.618034 + turn)
-            sine = np.sqrt(1 - cosine**2)
-            x, y = (a[:, None] for a in (sine * np.cos(azimuth), sine * np.sin(azimuth)))
-            axis = x * e_x + y * e_y + cosine[:, None] * normal
+            axis = light_transport.directions_about(normal, cosine, azimuth)
             ways.append(axis if alpha is None else 2 * axis[:, 2:] * axis - [0, 0, 1])
     return np.stack(ways, axis=1)
 
@@ -126,7 +123,9 @@ def bounced_stokes(pixels: Any, normal: Tensor, surface: Surface, body: Tensor) 
     n, rough, ior = normal[here], surface.roughness[here].clamp(min=_MIN_ROUGHNESS), surface.ior[here]
     diffuse, specular = surface.diffuse[here] * light, surface.specular[here]
     diffuse_part = shade.stokes(n, diffuse, 0 * specular, rough, ior, way, irradiance, surface.law.at(here))
-    mirrored = shade.stokes(n, 0 * diffuse, specular * light, rough, _facet_ior(specular, ior), way, irradiance)
+    mirrored = shade.stokes(
+        n, 0 * diffuse, specular * light, rough, light_transport.facet_ior(specular.mean(dim=1), ior), way, irradiance
+    )
     return normal.new_zeros(3, len(normal), 3).index_add(1, here, diffuse_part + mirrored)
 
 
@@ -164,14 +163,8 @@ def mirrored_surroundings(pixels: Any, flash: Tensor, normal: Tensor, surface: S
     rough = surface.roughness.clamp(min=_MIN_ROUGHNESS)
     mirror = 2 * normal[:, 2:] * normal - normal.new_tensor([0.0, 0.0, 1.0])
     irradiance = 4 * normal[:, 2] * rough**4  # 1 / (π × density of facets that mirror exactly)
-    ior = _facet_ior(surface.specular, surface.ior)
+    ior = light_transport.facet_ior(surface.specular.mean(dim=1), surface.ior)
     return shade.stokes(normal, 0 * light, surface.specular * light, rough, ior, mirror, irradiance)
-
-
-def _facet_ior(specular: Tensor, ior: Tensor) -> Tensor:
-    """Refractive index (M,) that gives F0 (M, 3), at least the body's (M,); reason in `light_transport.py`."""
-    root = torch.maximum(specular.mean(dim=1), fresnel.normal_reflectance(ior)).sqrt()
-    return (1 + root) / (1 - root)
 
 
 def _density(normal: Tensor, way: Tensor) -> Tensor:

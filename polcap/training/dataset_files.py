@@ -120,7 +120,9 @@ def make_sample(
         "focal_px": view.focal, "center_px": view.center, "flash": flash, "depth": {"near": near, "far": far},
         "middle": middle, "depth_unit": unit, "ior": float(surface.ior.mean()),
     }  # fmt: skip
-    return {"mask": mask.astype(np.float32)} | {name: _image(value, mask) for name, value in pictures.items()}, about
+    return {"mask": mask.astype(np.float32)} | {
+        name: traced_views.fill(mask, value) for name, value in pictures.items()
+    }, about
 
 
 def encode(radiance: Floats) -> Floats:
@@ -161,12 +163,6 @@ def _photographs(light: Floats, rays: Floats, noise: float, rng: np.random.Gener
     return np.stack(passed)
 
 
-def _image(value: Floats, mask: Any) -> Floats:
-    out = np.zeros((*mask.shape, *value.shape[1:]), np.float32)
-    out[mask] = value
-    return out
-
-
 def _write(folder: Path, pictures: dict[str, Floats], about: dict[str, Any]) -> None:
     near, far = about["depth"]["near"], about["depth"]["far"]
     mask = pictures["mask"] > 0
@@ -201,7 +197,7 @@ def _describe(out: Path, recipe: DatasetRecipe) -> None:
     document = {
         "format": "polcap dataset 1",
         "recipe": asked,
-        "frame": "camera: x right, y up, z toward the camera; row 0 on top; pixel centres on whole numbers",
+        "frame": "camera: x right, y up, z toward the camera; row 0 on top; pixel centers at integers",
         "angles": "polarizer axis from image x toward image up, degrees; projected across each ray off axis",
         "unit": "the longest side of the object",
         "light": "one flash, in the camera frame (sample.json), with inverse-square fall-off; "

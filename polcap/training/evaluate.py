@@ -35,7 +35,7 @@ _SAMPLE = 500  # pixels of a picture for the check of the expected error
 _PROGRESS_S = 20  # s between two lines of progress
 _MIN_SHARE = 3  # pictures per process
 OURS, CLEAN, ANALYTIC, MEAN = "ours", "ours, noise-free", "analytic", "mean of each map"
-_INTEGRATED = (OURS, CLEAN, ANALYTIC)  # columns whose normals are integrated
+_INTEGRATED = (OURS, CLEAN, ANALYTIC)  # columns with integrated normals
 
 Row = dict[str, Any]
 

@@ -62,7 +62,7 @@ ROWS = {
 _AVERAGED = (
     "RMSE is the root of the mean square over a picture's masked pixels and channels (for renderings over the 20 "
     "lights too); each figure is the mean of all pictures, as the paper's tables suggest. Depth is the estimated map, "
-    "centred within the mask and divided by the truth's range, without a fitted scale; after integration: the surface "
+    "centered within the mask and divided by the truth's range, without a fitted scale; after integration: the surface "
     "of stage 9 from the normals and this map, at about 128 px. Renderings are linear and clipped to 0…1, where 1 is "
     "the 99th percentile of the truth under the flash; refractive index 1.5, no cast shadows. The eroded mask is 2 px "
     "thinner. Over the whole picture the error outside the object is zero: RMSE times the root of the object's share "

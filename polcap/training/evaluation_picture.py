@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from polcap.images import Floats, SurfaceMaps
 from polcap.report import stage_pictures as pictures
 from polcap.report.stage_pictures import Picture
+from polcap.training import traced_views
 from polcap.training.evaluation_protocol import Case
 from polcap.training.map_errors import angle, render_intensity
 
@@ -30,8 +31,8 @@ def make_row(case: Case, maps: SurfaceMaps) -> Picture:
     seen, mask = case.cues, case.truth.mask
     s1, s2 = seen.ratio
     depth = [case.depth, case.depth * 0 if maps.depth_prior is None else maps.depth_prior]
-    centred = [d - d[mask].mean() for d in depth]
-    span = float(np.abs(centred[0][mask]).max())
+    centered = [d - d[mask].mean() for d in depth]
+    span = float(np.abs(centered[0][mask]).max())
     columns = [
         [pictures.display(seen.radiance, 1.0), pictures.display(_lit(case, maps, np.array([0.0, 0.0, 1.0])), 1.0)],
         [pictures.scale(seen.dolp, 0, 0.4, mask), pictures.hue(np.arctan2(s2, s1) / 2, mask)],
@@ -44,7 +45,7 @@ def make_row(case: Case, maps: SurfaceMaps) -> Picture:
                 lambda one: pictures.scale(one.roughness, 0, 1, mask),
             )
         ),
-        [pictures.scale(-d, -span, span, mask) for d in centred],
+        [pictures.scale(-d, -span, span, mask) for d in centered],
         _relit(case, maps),
         [pictures.scale(e, 0, 30, mask) for e in (angle(maps, case), maps.confidence)],
     ]
@@ -61,9 +62,7 @@ def _relit(case: Case, maps: SurfaceMaps) -> list[Picture]:
 
 
 def _lit(case: Case, maps: SurfaceMaps, light: Floats) -> Floats:
-    image = np.zeros((*case.truth.mask.shape, 3), np.float32)
-    image[case.truth.mask] = render_intensity(maps, case, case.truth.mask, light)
-    return image
+    return traced_views.fill(case.truth.mask, render_intensity(maps, case, case.truth.mask, light))
 
 
 def make_sheet(rows: list[Picture]) -> Picture:

@@ -6,6 +6,7 @@ and cameras are the same. A picture follows from its number, at any size. `CONDI
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -153,8 +154,8 @@ def body_law(number: int) -> Law:
     polarization is 0.8–1, in every tenth picture 0.4–0.8.
     """
     low, high = (0.4, 0.8) if number % 10 == 9 else (0.8, 1.0)
-    kept = np.random.default_rng([_SEED, number, 2]).uniform(low, high)
-    return Law(rough=1.0, local=float(number % 2), dolp_factor=float(kept))
+    factor = np.random.default_rng([_SEED, number, 2]).uniform(low, high)
+    return Law(rough=1.0, local=float(number % 2), dolp_factor=float(factor))
 
 
 def render_lights() -> Floats:
@@ -194,17 +195,13 @@ def _photograph(light: Floats, places: light_transport.SurfacePoints, view: View
     """Measurement of Stokes parameters (3, M, 3) by a camera with these errors."""
     mask = places.mask
     at = np.flatnonzero(mask)
-
-    def image(flat: Floats) -> Tensor:
-        out = np.zeros((mask.size, flat.shape[1]), dtype=np.float32)
-        out[at] = flat
-        return torch.from_numpy(out.reshape(1, *mask.shape, -1))
-
-    scene = torch.stack([image(part) for part in light])
-    rays = torch.from_numpy(frames.rays(view, *mask.shape))[None]
-    whole = torch.from_numpy(mask)[None]
-    seen = photograph(scene, image(places.diffuse), whole, rays, torch.from_numpy(at), errors)
-    return stokes_image(seen, at, mask, view)
+    scene = torch.from_numpy(np.stack([traced_views.fill(mask, part)[None] for part in light]))
+    diffuse, inside, rays = (
+        torch.from_numpy(image)[None]
+        for image in (traced_views.fill(mask, places.diffuse), mask, frames.rays(view, *mask.shape))
+    )
+    measured = photograph(scene, diffuse, inside, rays, torch.from_numpy(at), errors)
+    return stokes_image(measured, at, mask, view)
 
 
 def _bin(image: StokesImage, by: int) -> StokesImage:
@@ -232,12 +229,7 @@ def _bin(image: StokesImage, by: int) -> StokesImage:
 
 def _truth(subject: _Subject) -> SurfaceMaps:
     places, mask = subject.places, subject.places.mask
-
-    def image(flat: Floats) -> Floats:
-        out = np.zeros((*mask.shape, *flat.shape[1:]), np.float32)
-        out[mask] = flat
-        return out
-
+    image = partial(traced_views.fill, mask)
     return SurfaceMaps(
         normal=image(frames.from_ray_frame(places.normal, places.rays)), diffuse=image(places.diffuse),
         specular=image(places.specular), roughness=image(places.roughness), depth_prior=_relative_depth(subject),

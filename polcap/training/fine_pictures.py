@@ -23,7 +23,7 @@ from polcap.training.simulator import Indices, SimulatedPhotographs, Simulator
 SIDE = 448  # px
 _FIRST_SIZES = (80, 400)  # px of the longer side at which the main network sees a picture
 _IOR = 1.5
-_SHIFT = 2.5  # times the misregistration of the main network's training, whose pixels are larger
+_SHIFT = 2.5  # factor on the misregistration of the main network's training, which has larger pixels
 RECIPE = traced_views.ViewsRecipe(views=2, procedural=14, size=SIDE, seed=51, per_shape=4)
 
 

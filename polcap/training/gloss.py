@@ -26,7 +26,7 @@ class GlossFamily:
     share: float  # of surfaces
     roughness: tuple[float, float]  # perceptual, uniform between these
     tail: float  # share with an F0 above common dielectrics
-    kept: tuple[float, float] = (1.0, 1.0)  # factor on the polarization of diffuse light
+    dolp_factor: tuple[float, float] = (1.0, 1.0)  # factor on the polarization of diffuse light
     grain: float = 0.5  # share with speckled gloss
     dark: bool = False  # hardly any diffuse reflection: most light is mirrored from other parts of the object
 
@@ -36,7 +36,7 @@ FAMILIES = {
     "satin": GlossFamily(0.27, (0.28, 0.60), 0.28),  # paints, leather, waxed wood
     "matte": GlossFamily(0.27, (0.50, 0.95), 0.08),  # plaster, clay, paper, stone
     "brushed": GlossFamily(0.08, (0.25, 0.65), 0.30, grain=1.0),  # sanded, scratched, grained
-    "fibrous": GlossFamily(0.08, (0.65, 1.00), 0.00, kept=(0.3, 0.9), grain=1.0),  # cloth, felt, unsized paper
+    "fibrous": GlossFamily(0.08, (0.65, 1.00), 0.00, dolp_factor=(0.3, 0.9), grain=1.0),  # cloth, felt, unsized paper
     "dark gloss": GlossFamily(0.05, (0.05, 0.30), 0.00, dark=True),  # black plastic, lacquer, leather, dark glaze
 }
 _ALL_DARK = 0.10  # share of objects that are dark gloss everywhere; other objects may have dark parts
@@ -54,7 +54,7 @@ class Gloss:
 
     roughness: Tensor
     f0: Tensor
-    kept: Tensor  # factor on the polarization of diffuse light
+    dolp_factor: Tensor  # factor on the polarization of diffuse light
     grained: Tensor  # bool
     dark: Tensor  # bool
 
@@ -85,13 +85,13 @@ def draw_gloss(shape: tuple[int, ...], device: torch.device, all_dark: Tensor | 
         return torch.tensor([getattr(family, name) for family in FAMILIES.values()], device=device)[which]
 
     low, high = of("roughness").unbind(dim=-1)
-    least, most = of("kept").unbind(dim=-1)
+    least, most = of("dolp_factor").unbind(dim=-1)
     common = (_F0 * torch.exp(_F0_SPREAD * torch.randn(shape, device=device))).clamp(0.028, 0.06)
     rare = _TAIL[0] * torch.exp(_TAIL[1] * u() ** 1.5)
     return Gloss(
         roughness=low + (high - low) * u(),
         f0=torch.where(u() < of("tail"), rare, common),
-        kept=least + (most - least) * u(),
+        dolp_factor=least + (most - least) * u(),
         grained=u() < of("grain"),
         dark=of("dark"),
     )
@@ -111,5 +111,5 @@ def draw_laws(count: int, device: torch.device, smooth_share: float = SMOOTH_SHA
     other = torch.exp(0.25 * torch.randn(count, device=device)).clamp(0.5, 1.6)
     scale = torch.where(u(0, 1) < _SAME_ROUGHNESS, torch.ones(count, device=device), other)
     local = u(-1, 2).clamp(0, 1)  # a third each: 0, 1, between
-    kept = torch.where(u(0, 1) < _TRANSLUCENT, u(0.25, 0.8), u(0.8, 1.0))
-    return Law(rough * scale, rough * local, 1 - rough * (1 - kept))
+    dolp_factor = torch.where(u(0, 1) < _TRANSLUCENT, u(0.25, 0.8), u(0.8, 1.0))
+    return Law(rough * scale, rough * local, 1 - rough * (1 - dolp_factor))

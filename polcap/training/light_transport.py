@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from polcap.images import Floats
 from polcap.optics import brdf, frames, fresnel, shade
 from polcap.optics.body import SMOOTH, Law
+from polcap.optics.namespace import array_namespace
 from polcap.synth.mesh_tracer import Triangles
 
 LIFT = 1e-3  # longest sides of the mesh, from the surface to the start of a ray; nearer hits are the place itself
@@ -117,7 +118,6 @@ class IndirectLight:
 
     def __init__(self, scene: MeshScene, places: SurfacePoints, pose: Pose, albedo: Albedo) -> None:
         self.scene, self.places, self.pose, self.albedo = scene, places, pose, albedo
-        self.e_x, self.e_y = frames.basis(places.normal)
 
     def diffuse(self, rng: np.random.Generator) -> Floats:
         """Diffuse reflection (3, M, 3): irradiance by rays over the hemisphere, distributed by their cosine."""
@@ -126,7 +126,7 @@ class IndirectLight:
         received: Floats = np.zeros((count, 3))
         for k in range(_HEMISPHERE_RAYS):
             cosine = np.sqrt(1 - (k + turn[:, 0]) / _HEMISPHERE_RAYS)
-            way = self._around(cosine, 2 * pi * (k * 0.618034 + turn[:, 1]))
+            way = directions_about(places.normal, cosine, 2 * pi * (k * 0.618034 + turn[:, 1]))
             met, incoming = self.light(way, np.arange(count))
             received[met] += incoming * fresnel.transmission(np.maximum(cosine[met], 1e-3), places.ior)[0][:, None]
         entered = fresnel.transmission(1.0, places.ior)[0]
@@ -138,18 +138,17 @@ class IndirectLight:
     def mirrored(self, rng: np.random.Generator) -> Floats:
         """Mirror reflection (3, M, 3) by facets drawn from the GGX distribution.
 
-        Facets have the refractive index that gives F0, if F0 is higher than that of the body's index. A multiple of
-        the Fresnel curve would reflect more than 100 % at grazing angles, where most of this light is.
+        Their index is `facet_ior`: a multiple of the Fresnel curve of the body's index would reflect more than 100 %
+        at grazing angles, where most of this light is.
         """
         places, count = self.places, len(self.places.normal)
-        root = np.sqrt(np.maximum(places.specular.mean(axis=1), fresnel.normal_reflectance(places.ior)))
-        ior = (1 + root) / (1 - root)
+        ior = facet_ior(places.specular.mean(axis=1), np.full(count, places.ior))
         alpha = places.roughness**2
         turn, total = rng.uniform(0, 1, (count, 2)), np.zeros((3, count, 3))
         for k in range(_MIRROR_RAYS):
             u = (k + turn[:, 0]) / _MIRROR_RAYS
             cos_h = np.sqrt((1 - u) / (1 + (alpha**2 - 1) * u))
-            half = self._around(cos_h, 2 * pi * (k * 0.618034 + turn[:, 1]))
+            half = directions_about(places.normal, cos_h, 2 * pi * (k * 0.618034 + turn[:, 1]))
             cos_d = half[:, 2]
             way = 2 * cos_d[:, None] * half - [0, 0, 1]
             possible = (cos_d > 0.01) & (np.sum(way * places.normal, axis=1) > 0.01)
@@ -185,8 +184,17 @@ class IndirectLight:
         weight = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), sigma)
         return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma)[mask] / weight[mask][:, None])
 
-    def _around(self, cosine: Floats, azimuth: Floats) -> Floats:
-        """Directions (M, 3) at angles with the given cosines (M,) and azimuths (M,) about the normals."""
-        sine = np.sqrt(np.maximum(1 - cosine**2, 0))
-        x, y = (a[:, None] for a in (sine * np.cos(azimuth), sine * np.sin(azimuth)))
-        return np.asarray(x * self.e_x + y * self.e_y + cosine[:, None] * self.places.normal)
+
+def directions_about(normal: Floats, cosine: Floats, azimuth: Floats) -> Floats:
+    """Directions (M, 3) about normals (M, 3), by the cosine of the angle (M,) and the azimuth (M,)."""
+    e_x, e_y = frames.basis(normal)
+    sine = np.sqrt(np.maximum(1 - cosine**2, 0))
+    x, y = (a[:, None] for a in (sine * np.cos(azimuth), sine * np.sin(azimuth)))
+    return np.asarray(x * e_x + y * e_y + cosine[:, None] * normal)
+
+
+def facet_ior(f0: Any, ior: Any) -> Any:
+    """Refractive index (M,) that gives F0 (M,), at least the body's `ior` (M,)."""
+    xp = array_namespace(f0)
+    root = xp.sqrt(xp.maximum(f0, fresnel.normal_reflectance(ior)))
+    return (1 + root) / (1 - root)

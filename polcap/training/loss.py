@@ -38,9 +38,9 @@ def total(
     parts = {
         "normal": mean(1 - cosine) + 0.25 * mean((maps["normal"] - truth.normal).abs()),
         "region": _region(maps["normal"], truth.normal, inside),
-        "depth": mean((centred(maps["depth"], inside) - centred(truth.depth, inside)).abs()),
+        "depth": mean((centered(maps["depth"], inside) - centered(truth.depth, inside)).abs()),
         "diffuse": mean((maps["diffuse"] - truth.diffuse).abs() + 2 * (maps["diffuse"] - truth.diffuse) ** 2),
-        # squares: they lead to the mean of what is possible; the median of F0 would ignore its long tail
+        # squares: their minimum is the mean of all possible values; the median of F0 would ignore its long tail
         "specular": mean((maps["specular"] - truth.specular) ** 2),
         "roughness": mean((maps["roughness"] - truth.roughness) ** 2),
         "highlight": mean((maps["highlight"] - truth.highlight) ** 2),
@@ -69,7 +69,7 @@ def _region(estimate: Tensor, truth: Tensor, inside: Tensor) -> Tensor:
     return cost / area.clamp(min=1)
 
 
-def centred(depth: Tensor, inside: Tensor) -> Tensor:
+def centered(depth: Tensor, inside: Tensor) -> Tensor:
     """Depth (B, 1, H, W) minus its mean over `inside` (B, 1, H, W; 0 or 1)."""
     return depth - (depth * inside).sum(dim=(2, 3), keepdim=True) / inside.sum(dim=(2, 3), keepdim=True).clamp(min=1)
 

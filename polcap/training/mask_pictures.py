@@ -82,7 +82,7 @@ def pack(picture: mask_scenes.MaskScene) -> Floats:
 def load_varied(file: Path, rng: np.random.Generator, other: Path | None = None) -> tuple[ReducedPicture, Floats]:
     """Read a picture with random light, crop, mirroring and noise; returns it and its truth (H, W).
 
-    other: a picture whose object is inserted into this one.
+    other: file of another picture; its object is inserted into this one.
     """
     layers = np.load(file).astype(np.float32)
     if other is not None:

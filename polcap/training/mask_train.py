@@ -26,7 +26,7 @@ _FIRST_WIDTHS = (80, 96, 112, 128, 144)  # px, of pictures in the first pass: on
 _FIRST_WIDTH = 112  # px, in validation and in use
 _PARTS, _PART_SIZE = 4, (96, 128)  # pictures of a step in the second pass; height and width of their parts, px
 _ZOOM = (0.35, 1.0)  # width of a part, of the picture's
-_REPEATED = 0.3  # share of steps whose second pass takes its hint from a second pass
+_REPEATED = 0.3  # share of steps with another second pass before, as the source of the hint
 _INSERTED = 0.12  # share of pictures into which the object of another one is inserted
 
 

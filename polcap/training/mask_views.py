@@ -18,7 +18,7 @@ from polcap.training import random_shapes
 Framing = Literal["whole", "small", "cut", "full"]
 Backdrop = Literal["wall", "table", "cloth"]
 _LIFT = 2e-3  # from a surface to the start of a ray to the flash
-_TRIES = 60  # random sides before a framing is given up
+_TRIES = 60  # random sides per framing
 _MIN_COVER = 0.004  # least share of the picture that the object covers
 _FILL: dict[Framing, tuple[float, float]] = {  # extent of the object over that of the picture
     "whole": (0.35, 0.95), "small": (0.15, 0.35), "cut": (0.6, 1.2), "full": (1.3, 2.2),

@@ -38,7 +38,7 @@ class Surface:
 
 
 class MaterialLibrary:
-    """Texture sets and a volume of tileable noise on one device."""
+    """Texture sets of a folder, if it exists, and a volume of tileable noise, on one device."""
 
     def __init__(self, folder: Path | None, device: torch.device, seed: int = 3) -> None:
         sets = sorted(p.parent for p in folder.glob("*/albedo.jpg")) if folder else []
@@ -106,7 +106,7 @@ def draw_surface(
     pattern, diffuse = _albedo(own, fine, printed, picture, lightness)
     rough, specular = _reflection(own, fine, picture, pattern, diffuse)
     law = gloss.draw_laws(count, device, smooth_share).at(owner)
-    fibers = torch.where(law.rough > 0, own["kept"] + own["kept_step"] * pattern, 1.0)
+    fibers = torch.where(law.rough > 0, own["dolp_factor"] + own["dolp_step"] * pattern, 1.0)
 
     relief = fine[:, 4:7] * torch.where(own["raised"] > 0.5, 4 * pattern * (1 - pattern), 1.0)[:, None]
     slope = torch.zeros_like(facing).scatter(1, across[:, None], picture[:, 4:5])
@@ -197,7 +197,8 @@ def _draw_levels(library: MaterialLibrary, count: int, device: torch.device) -> 
         "rough_shift": torch.where(one.dark, one.roughness - 0.05, torch.where(as_is, 0.0, u(-0.1, 0.4))),
         "f0": one.f0, "f0_follow": normal(0.3),
         "rough_step": two * (other.roughness - one.roughness), "f0_step": two * f0_step,
-        "kept": one.kept, "kept_step": two * (other.kept - one.kept), "raised": (u(0, 1) < 0.4).float(),
+        "dolp_factor": one.dolp_factor, "dolp_step": two * (other.dolp_factor - one.dolp_factor),
+        "raised": (u(0, 1) < 0.4).float(),
         "by_lightness": (u(0, 1) < 0.6).float(),
         "ior": (1.5 + normal(0.06)).clamp(1.35, 1.7), "bump": bump,
     }  # fmt: skip

@@ -131,6 +131,13 @@ def read_mesh(path: Path) -> Triangles:
     return smooth(*scene_files.read_mesh(path))
 
 
+def fill(mask: NDArray[np.bool_], values: Floats) -> Floats:
+    """Image (H, W, ·) with values (M, ·) at the pixels of the mask, 0 elsewhere."""
+    image = np.zeros((*mask.shape, *values.shape[1:]), np.float32)
+    image[mask] = values
+    return image
+
+
 def depth_unit(mask: NDArray[np.bool_], depth: Floats, focal: float) -> tuple[float, float]:
     """Middle depth of the object and the unit of relative depth.
 

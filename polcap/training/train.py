@@ -60,19 +60,14 @@ class TrainingPreset:
 
 PRESETS = {
     "cpu": TrainingPreset(
-        main_network.SMALL,
-        80,
-        1200,
-        192,
-        (96, 128, 160, 192),
-        (0.4, 0.35, 0.15, 0.1),
-        (0.1, 0.25, 0.3, 0.35),
-        10 * 128**2,
+        main_network.SMALL, views=80, procedural=1200, size=192, sizes=(96, 128, 160, 192),
+        early=(0.4, 0.35, 0.15, 0.1), late=(0.1, 0.25, 0.3, 0.35), pixels=10 * 128**2,
     ),
     "gpu": TrainingPreset(
-        main_network.LARGE, 400, 3000, 256, (128, 192, 256), (0.5, 0.3, 0.2), (0.1, 0.4, 0.5), 64 * 256**2
+        main_network.LARGE, views=400, procedural=3000, size=256, sizes=(128, 192, 256),
+        early=(0.5, 0.3, 0.2), late=(0.1, 0.4, 0.5), pixels=64 * 256**2,
     ),
-}
+}  # fmt: skip
 
 
 def main(options: TrainingOptions) -> Path:
@@ -94,7 +89,8 @@ def main(options: TrainingOptions) -> Path:
         network.load(options.out / "last.pt")
     elif options.start:
         network.begin(options.start, options.done)
-    simulator = Simulator(_open_views(options, preset), _open_library(options.data, device), device)
+    library = materials.MaterialLibrary(options.data / "materials" / "train", device)
+    simulator = Simulator(_open_views(options, preset), library, device)
     network.held_out = HeldOutPictures(options.data, options.out / "watch", device)
     torch.set_num_threads(1)
     budget = loop.Budget(options.minutes, options.samples)
@@ -103,7 +99,7 @@ def main(options: TrainingOptions) -> Path:
     )
     loop.run(network, lambda: [next(batches) for _ in range(learners)], budget, options.out)
     batches.close()
-    ship(options.out / "last.pt", options.out / "model.onnx", version=options.out.resolve().name)
+    network.export(options.out / "model.onnx", version=options.out.resolve().name)
     return options.out / "model.onnx"
 
 
@@ -127,12 +123,6 @@ def _open_views(options: TrainingOptions, preset: TrainingPreset) -> dict[str, A
     procedural = preset.procedural if options.procedural is None else options.procedural
     recipe = traced_views.ViewsRecipe(views=views, procedural=procedural, size=preset.size, seed=13)
     return traced_views.open_cache(options.out / "views", meshes, recipe)
-
-
-def _open_library(data: Path, device: torch.device) -> materials.MaterialLibrary:
-    """Training texture sets; solid noise alone if there are none."""
-    folder = data / "materials" / "train"
-    return materials.MaterialLibrary(folder if folder.exists() else None, device)
 
 
 def _make_ahead(
@@ -278,6 +268,15 @@ class NetworkTraining(loop.Trainee):
         for k, generator in enumerate(self.lights):  # not the same lights again
             generator.manual_seed(1000 * self.step + k)
 
+    def export(self, path: Path, version: str, licence: str = "Apache-2.0") -> None:
+        """Write the averaged weights, with the facts of their training, as an ONNX model."""
+        training = f"{self.samples - self.done} samples in {self.step} steps, {self.elapsed / 60:.0f} minutes"
+        training += f", after {self.begun}" if self.begun else ""
+        facts = {"version": version, "licence": licence, "variant": self.network.variant, "training": training}
+        average = main_network.MainNetwork(self.network.shape, self.network.variant)
+        average.load_state_dict(self.average)
+        onnx_export.export_main(average, path, facts)
+
 
 def _with_new_channels(weight: Tensor, own: Tensor) -> Tensor:
     """Weights of a convolution that now has more input channels; the new ones come last and start at 0."""
@@ -293,14 +292,3 @@ def load_average(path: Path) -> tuple[main_network.MainNetwork, dict[str, Any]]:
     network = main_network.MainNetwork(main_network.NetworkShape(**state["shape"]), state["variant"])
     network.load_state_dict(state["average"])
     return network.eval(), {k: state[k] for k in ("step", "samples", "elapsed", "begun", "done")}
-
-
-def ship(checkpoint: Path, path: Path, version: str, licence: str = "Apache-2.0") -> int:
-    """Export a checkpoint's averaged weights with the facts of their training; returns the file's bytes."""
-    network, facts = load_average(checkpoint)
-    learned = facts["samples"] - facts["done"]
-    training = f"{learned} samples in {facts['step']} steps, {facts['elapsed'] / 60:.0f} minutes"
-    if facts["begun"]:
-        training += f", after {facts['begun']}"
-    metadata = {"version": version, "licence": licence, "variant": network.variant, "training": training}
-    return onnx_export.export_main(network, path, metadata)

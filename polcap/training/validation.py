@@ -78,8 +78,7 @@ def open_simulator(data: Path, folder: Path, device: torch.device, *, views: int
     cache = traced_views.open_cache(
         folder, meshes, traced_views.ViewsRecipe(views, procedural=0, size=size, seed=99, flash=_FLASH)
     )
-    textures = data / "materials" / "test"
-    library = materials.MaterialLibrary(textures if textures.exists() else None, device, seed=4)
+    library = materials.MaterialLibrary(data / "materials" / "test", device, seed=4)
     return Simulator(cache, library, device)
 
 
@@ -112,9 +111,9 @@ def figures(maps: dict[str, Tensor], batch: Batch) -> dict[str, float]:
 
 
 def _depth_error(depth: Tensor, batch: Batch) -> Tensor:
-    """Error of relative depth at the masked pixels (M,), in units of the truth's range; both centred in the mask."""
+    """Error of relative depth at the masked pixels (M,), in units of the truth's range; both centered in the mask."""
     mask = batch.mask[:, None]
     inside = mask.float()
     low = torch.where(mask, batch.depth, torch.inf).amin(dim=(2, 3), keepdim=True)
     high = torch.where(mask, batch.depth, -torch.inf).amax(dim=(2, 3), keepdim=True)
-    return ((loss.centred(depth, inside) - loss.centred(batch.depth, inside)) / (high - low))[mask]
+    return ((loss.centered(depth, inside) - loss.centered(batch.depth, inside)) / (high - low))[mask]

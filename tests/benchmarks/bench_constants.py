@@ -21,6 +21,7 @@ import numpy as np
 from polcap.config import Config
 from polcap.formats import onnx
 from polcap.images import Floats, Network
+from polcap.optics import registration
 from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
 from polcap.results import Results
@@ -30,7 +31,10 @@ from polcap.stages.selfcal import object_gains
 
 FACTORS = (0.5, 2.0)
 ROOMS = ["align", "selfcal", "analytic", "network"]
-ALIGN = {align: ("_ALIASING_PX2", "_FLOOR_PX", "_MOST_POINTS", "_SURE_LIKENESS", "_MOST_PIXELS")}
+ALIGN = {
+    align: ("_FLOOR_PX", "_MOST_PIXELS"),
+    registration: ("_TILE_ERROR_PX", "_PRIOR_PX", "_AGREE_PX"),
+}
 SELFCAL: Mapping[ModuleType, tuple[str, ...]] = {
     object_gains: (
         "_PEAK_WIDTH",

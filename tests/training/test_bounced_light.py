@@ -76,7 +76,7 @@ def _turned(degrees: float) -> Floats:
 
 
 @pytest.mark.parametrize("degrees", [0, 25])
-def test_inside_of_a_bowl_gets_the_light_that_tracing_finds(degrees: float) -> None:
+def test_bounced_light_inside_a_bowl_agrees_with_tracing(degrees: float) -> None:
     trained, traced = _both(_turned(degrees))
     assert trained[0].sum() == pytest.approx(traced[0].sum(), rel=0.2)
     for k in (1, 2):  # mirrored light is polarized: the same places, the same way, as much
@@ -84,7 +84,7 @@ def test_inside_of_a_bowl_gets_the_light_that_tracing_finds(degrees: float) -> N
         assert np.abs(trained[k]).sum() == pytest.approx(np.abs(traced[k]).sum(), rel=0.4)
 
 
-def test_outside_of_a_bowl_gets_next_to_nothing() -> None:
+def test_the_outside_of_a_bowl_gets_almost_no_bounced_light() -> None:
     inside, outside = (_both(_turned(degrees))[0] for degrees in (0, 180))
     assert outside[0].mean() < 0.03 * inside[0].mean()
 

@@ -35,7 +35,7 @@ def test_perfect_camera_returns_the_stokes_parameters() -> None:
     assert not clipped.any()
 
 
-def test_off_axis_the_angles_of_the_image_are_carried_to_the_ray() -> None:
+def test_polarizer_angles_are_projected_on_oblique_rays() -> None:
     """Light that vibrates along what the polarizer at 45° is on an oblique ray passes it whole."""
     stokes, diffuse, mask, _ = scene()
     rays = torch.nn.functional.normalize(torch.tensor([0.2, 0.15, 1.0]), dim=0).expand(B, S, S, 3)
@@ -61,7 +61,7 @@ def test_noise_has_the_variance_it_states() -> None:
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_shift_moves_a_ramp_by_what_it_says(axis: int) -> None:
+def test_shift_moves_a_ramp_by_its_length(axis: int) -> None:
     stokes, *rest = scene(0, 0)
     ramp = torch.arange(S) * 0.01
     stokes[0] = ramp[None, None, :, None] if axis == 0 else ramp[None, :, None, None]

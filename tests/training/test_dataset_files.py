@@ -53,7 +53,7 @@ def test_hdr_encoding_keeps_a_thousandth_over_four_decades() -> None:
     np.testing.assert_allclose(dataset_files.decode(stored), radiance, rtol=1e-3)
 
 
-def test_a_stopped_run_goes_on_and_gives_the_same_bytes(made: Path) -> None:
+def test_a_stopped_run_continues_with_the_same_bytes(made: Path) -> None:
     before = {file.name: file.read_bytes() for file in (made / SAMPLE).iterdir()}
     assert len(before) == 13
     shutil.rmtree(made / SAMPLE)
@@ -61,7 +61,7 @@ def test_a_stopped_run_goes_on_and_gives_the_same_bytes(made: Path) -> None:
     assert {file.name: file.read_bytes() for file in (made / SAMPLE).iterdir()} == before
 
 
-def test_samples_of_two_recipes_are_not_mixed(made: Path, tmp_path: Path) -> None:
+def test_samples_of_two_settings_are_not_mixed(made: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="was started with the settings"):
         dataset_files.main(made, 2, dataset_files.DatasetRecipe(seed=5, size=96, noise=0.0))
     (tmp_path / "holiday.jpg").write_text("mine")

@@ -27,7 +27,7 @@ def networks(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @shipped
-def test_the_command_judges_all_columns(test_data: Path, networks: Path, tmp_path: Path) -> None:
+def test_the_command_evaluates_all_columns(test_data: Path, networks: Path, tmp_path: Path) -> None:
     told = ["--count", "2", "--size", "96", "--ablations", str(networks), "--out", str(tmp_path)]
     done = CliRunner().invoke(app, ["evaluate", str(MODEL), str(test_data), *told])
     assert done.exit_code == 0, done.output
@@ -46,7 +46,7 @@ def test_the_command_judges_all_columns(test_data: Path, networks: Path, tmp_pat
 
 
 @shipped
-def test_a_stopped_run_goes_on(test_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stopped_run_continues(test_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And judging by several processes changes nothing."""
     params = evaluate.EvaluationOptions(MODEL, test_data, tmp_path, count=2, size=64)
     whole = evaluate.main(params)
@@ -62,20 +62,20 @@ def test_a_stopped_run_goes_on(test_data: Path, tmp_path: Path, monkeypatch: pyt
     assert evaluate.main(params) == whole
 
 
-def test_published_figures_stand_only_in_rows_that_exist() -> None:
+def test_published_figures_have_rows() -> None:
     for table in (evaluation_page.PUBLISHED, evaluation_page.PUBLISHED_ABLATIONS):
         assert all(figures.keys() <= evaluation_page.ROWS.keys() for figures in table.values())
 
 
 @shipped
-def test_a_folder_without_networks_is_named(test_data: Path, tmp_path: Path) -> None:
+def test_a_folder_without_networks_is_refused(test_data: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"holds no NAME/last\.pt"):
         evaluate.main(evaluate.EvaluationOptions(MODEL, test_data, tmp_path, ablations=tmp_path, count=1, size=64))
 
 
 @shipped
 @pytest.mark.skipif(not os.environ.get("POLCAP_DATA"), reason="POLCAP_DATA is not set")
-def test_shipped_model_beats_what_needs_no_network(tmp_path: Path) -> None:
+def test_shipped_model_beats_the_baselines_without_a_network(tmp_path: Path) -> None:
     data = Path(os.environ["POLCAP_DATA"])
     table = evaluate.main(evaluate.EvaluationOptions(MODEL, data, tmp_path, count=6, size=128))
     ours = table["ours"]

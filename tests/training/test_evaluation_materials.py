@@ -22,7 +22,7 @@ def places() -> tuple[Floats, Floats]:
     return rng.uniform(-0.5, 0.5, (3000, 3)), facing / np.linalg.norm(facing, axis=1, keepdims=True)
 
 
-def test_library_is_what_the_protocol_states(
+def test_materials_are_those_of_the_protocol(
     library: list[evaluation_materials.TestMaterial], places: tuple[Floats, Floats]
 ) -> None:
     assert len(library) == 30 and len({m.name for m in library}) == 30
@@ -46,7 +46,7 @@ def test_a_materials_maps_follow_one_pattern(
     assert related >= 15
 
 
-def test_slope_is_the_relief_s_and_bounded(
+def test_slopes_of_materials_are_bounded(
     library: list[evaluation_materials.TestMaterial], places: tuple[Floats, Floats]
 ) -> None:
     for material in library[evaluation_materials.TEXTURES :]:
@@ -54,12 +54,12 @@ def test_slope_is_the_relief_s_and_bounded(
         assert 0 < np.sqrt(np.mean(steep**2)) < 0.4 and steep.max() < 0.61, material.name
 
 
-def test_no_places_have_no_looks(library: list[evaluation_materials.TestMaterial]) -> None:
+def test_materials_accept_zero_places(library: list[evaluation_materials.TestMaterial]) -> None:
     none = np.zeros((0, 3))
     for material in library:
         assert material.at(none, none).diffuse.shape == material.slope(none, none).shape == (0, 3), material.name
 
 
-def test_missing_texture_sets_are_named(tmp_path: Path) -> None:
+def test_missing_texture_sets_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds 0 texture sets"):
         evaluation_materials.test_materials(tmp_path)

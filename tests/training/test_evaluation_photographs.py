@@ -41,7 +41,7 @@ def _write(file: Path, picture: Floats) -> None:
     png.write(file, png.sixteen_bits(np.clip(picture, 0, 1)))
 
 
-def test_a_ball_in_this_layout_is_scored(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_normals_of_a_ball_are_evaluated(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(models, "open_network", lambda path: network())
     monkeypatch.setattr(onnx, "run", fake_network.run)
     table = evaluation_photographs.main(folder, Path("model.onnx"), tmp_path)
@@ -53,7 +53,7 @@ def test_a_ball_in_this_layout_is_scored(folder: Path, tmp_path: Path, monkeypat
     assert "| ball.png, ours |" in page and "counts as 90°" in page
 
 
-def test_a_folder_of_another_layout_is_named(folder: Path, tmp_path: Path) -> None:
+def test_a_folder_of_another_layout_is_refused(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds 0 folders pol… and 0 normal maps"):
         evaluation_photographs.main(tmp_path, Path("model.onnx"), tmp_path)
     for part in ("pol000", "pol045", "pol090", "normal"):

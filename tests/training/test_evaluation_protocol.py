@@ -72,13 +72,13 @@ def test_bodies_of_the_second_protocol_polarize_as_rough_ones(made: Protocol, te
     assert np.abs(ratios).max() < 0.1
 
 
-def test_f0_of_the_second_protocol_is_as_met(test_data: Path) -> None:
+def test_f0_of_the_second_protocol_is_that_of_everyday_objects(test_data: Path) -> None:
     second = Protocol(test_data, 96, protocol=2)
     f0 = [float(np.median(second.truth(number, 48).specular[second.truth(number, 48).mask])) for number in range(30)]
     assert 0.035 < np.median(f0) < 0.055 and 2 <= sum(value > 0.06 for value in f0) <= 8
 
 
-def test_noise_is_the_stated_camera_s(made: Protocol) -> None:
+def test_noise_is_that_of_the_stated_camera(made: Protocol) -> None:
     """1σ of S1/S0 and S2/S0, their mean square: 1/√(electrons of a shot), read noise adding a little."""
     case = made.case(3)
     mask = case.truth.mask & (case.cues.radiance.max(-1) < 0.4) & (case.cues.radiance.min(-1) > 0.05)
@@ -95,13 +95,13 @@ def test_binning_keeps_light_and_lowers_noise(test_data: Path) -> None:
     assert np.median(case.small.ratio_sigma[inner]) < 0.6 * np.median(case.cues.ratio_sigma[case.cues.mask])
 
 
-def test_lights_stand_around_the_camera() -> None:
+def test_lights_surround_the_camera() -> None:
     lights = evaluation_protocol.render_lights()
     assert lights.shape == (20, 3) and np.allclose(np.linalg.norm(lights, axis=1), 1)
     assert np.degrees(np.arccos(lights[:, 2])).max() < 60
     assert np.abs(lights[:, :2].mean(axis=0)).max() < 0.06
 
 
-def test_missing_meshes_are_named(tmp_path: Path) -> None:
+def test_missing_meshes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds 0 meshes"):
         Protocol(tmp_path, 96)

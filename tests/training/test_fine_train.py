@@ -29,7 +29,7 @@ def picture() -> NDArray[np.float16]:
     return out.astype(np.float16)
 
 
-def test_a_scene_turned_four_times_is_itself(picture: NDArray[np.float16]) -> None:
+def test_four_quarter_turns_change_nothing(picture: NDArray[np.float16]) -> None:
     rng = np.random.default_rng(3)
     shown = rng.normal(size=(COUNT + 4, 16, 16)).astype(np.float32)
     twice = fine_train.rotate(fine_train.rotate(shown, 1, False), 3, False)
@@ -40,7 +40,7 @@ def test_a_scene_turned_four_times_is_itself(picture: NDArray[np.float16]) -> No
     assert np.allclose(fine_train.rotate(right, 1, False)[COUNT + 1], 1)
 
 
-def test_it_learns_and_ships(tmp_path: Path, picture: NDArray[np.float16]) -> None:
+def test_the_network_learns_and_is_exported(tmp_path: Path, picture: NDArray[np.float16]) -> None:
     file = tmp_path / "00000.npy"
     np.save(file, picture)
     torch.manual_seed(0)

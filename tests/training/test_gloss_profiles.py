@@ -42,7 +42,7 @@ def test_a_matte_ball_has_no_excess_and_its_whole_polarization() -> None:
     assert table[7:, 5].abs().max() < 0.12  # missing DoLP, where there is any to miss
 
 
-def test_the_excess_at_the_pole_is_the_lobe() -> None:
+def test_excess_light_at_normal_incidence_is_the_specular_lobe() -> None:
     """ln(1 + F0 π D G/(4 cos) / (ρ cos T₊²)) at normal incidence, from the textbook formulas alone."""
     alpha = ROUGHNESS**2
     lobe = np.pi * (1 / (np.pi * alpha**2)) / 4
@@ -55,7 +55,7 @@ def test_the_excess_at_the_pole_is_the_lobe() -> None:
     assert float(found[0]) > float(found[1]) > float(found[2]) > float(found[4])
 
 
-def test_two_colors_in_a_fine_print_are_told_apart() -> None:
+def test_two_colors_in_a_fine_print_are_distinguished() -> None:
     """With groups made of color alone, each color of a checkerboard hears what it would hear alone."""
     torch.manual_seed(0)
     side, reader = 32, gloss_profiles.Profiles(2, 2, 3)

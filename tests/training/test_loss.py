@@ -30,7 +30,7 @@ def test_truth_costs_nothing(batch: Batch) -> None:
 
 
 @pytest.mark.parametrize("name", ["normal", "diffuse", "specular", "roughness"])
-def test_rendering_sees_an_error_of_every_map(batch: Batch, name: str) -> None:
+def test_rendering_loss_depends_on_every_map(batch: Batch, name: str) -> None:
     maps = maps_of(batch)
     maps[name] = (maps[name] * 0.7 + 0.05).contiguous()
     maps["normal"] = torch.nn.functional.normalize(maps["normal"], dim=1)

@@ -28,7 +28,7 @@ def test_any_multiple_of_32_gives_every_map_its_range(size: tuple[int, int]) -> 
     assert maps["sigma"].min() > 0 and maps["sigma"].max() < 60
 
 
-def test_every_weight_gets_a_gradient_once_the_zero_born_ones_moved() -> None:
+def test_every_weight_gets_a_gradient_after_a_few_steps() -> None:
     torch.manual_seed(1)
     network = main_network.MainNetwork(TINY)
     optimizer = torch.optim.Adam(network.parameters(), 1e-3)
@@ -54,7 +54,7 @@ def test_a_far_pixel_reaches_the_whole_object() -> None:
     assert difference[:, :, -16:, -16:].max() > 0
 
 
-def test_context_tells_every_cell_of_the_object_of_every_other() -> None:
+def test_attention_connects_all_cells_of_the_object() -> None:
     torch.manual_seed(6)
     context = main_network.Context(16, heads=2)
     torch.nn.init.normal_(context.proj.weight)
@@ -68,7 +68,7 @@ def test_context_tells_every_cell_of_the_object_of_every_other() -> None:
         assert (moved > 1e-2) if seen else (moved < 1e-2)
 
 
-def test_groups_tell_alike_places_the_same() -> None:
+def test_groups_depend_on_features_not_on_position() -> None:
     """What `LinearAttention` adds depends on a place's own features and the whole picture's, not on where it lies."""
     torch.manual_seed(3)
     share = main_network.LinearAttention(16, heads=2, groups=4)
@@ -81,7 +81,7 @@ def test_groups_tell_alike_places_the_same() -> None:
     assert (share(x, inside) - x).abs().max() > 1e-3
 
 
-def test_groups_do_not_see_what_is_outside_the_mask() -> None:
+def test_groups_ignore_pixels_outside_the_mask() -> None:
     torch.manual_seed(4)
     share = main_network.LinearAttention(16, heads=2, groups=4)
     torch.nn.init.normal_(share.proj.weight)
@@ -106,7 +106,7 @@ def test_variants_see_no_more_than_their_inputs(name: str) -> None:
         torch.testing.assert_close(a, b)
 
 
-def test_published_pictures_are_what_an_analyzer_lets_through() -> None:
+def test_published_inputs_obey_malus_law() -> None:
     """Malus: the pictures at 0° and 90° add up to S0, and their difference is S1."""
     x = inputs(32, 32)
     at = {name: x[:, CHANNELS.index(name)] for name in CHANNELS}

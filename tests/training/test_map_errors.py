@@ -24,7 +24,7 @@ def test_truth_scores_zero_and_all_within(case: Case) -> None:
     assert figures["normal_within_11.25"] == figures["normal_within_30_core"] == 1
 
 
-def test_known_errors_score_what_they_are(case: Case) -> None:
+def test_known_errors_are_measured(case: Case) -> None:
     c, s = np.cos(np.radians(15)), np.sin(np.radians(15))
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     wrong = replace(
@@ -57,7 +57,7 @@ def test_true_normals_integrate_to_nearly_the_true_depth(
     assert found < 0.5 * inside.std() / np.ptp(inside)
 
 
-def test_clipped_highlights_are_judged_alone(case: Case) -> None:
+def test_clipped_highlights_have_their_own_error(case: Case) -> None:
     quality = np.zeros_like(case.cues.quality)
     y, x = np.nonzero(case.truth.mask)
     quality[y[:20], x[:20]] = int(Quality.CLIPPED)
@@ -71,7 +71,7 @@ def test_clipped_highlights_are_judged_alone(case: Case) -> None:
     assert "diffuse_clipped" not in Judge(none).score(case.truth)
 
 
-def test_rendering_error_ignores_nothing_but_what_clipping_hides(case: Case) -> None:
+def test_rendering_error_ignores_clipped_light_only(case: Case) -> None:
     """Half the albedo of a matte picture halves its renderings: an error of half their level, at most ½."""
     matte = replace(case.truth, specular=0 * case.truth.specular)
     judge = Judge(replace(case, truth=matte))

@@ -54,7 +54,7 @@ def test_black_objects_are_black_and_polarization_is_possible(picture: mask_scen
     assert (np.hypot(s1, s2) <= s0 * 1.001 + 1e-6).all()
 
 
-def test_a_mirrored_picture_has_the_other_s2(tmp_path: Path, picture: mask_scenes.MaskScene) -> None:
+def test_mirroring_negates_s2(tmp_path: Path, picture: mask_scenes.MaskScene) -> None:
     held = mask_pictures.pack(picture)
     assert held.shape == (36, 48, 7)
     held[..., 3], held[..., 4] = 0.2 * held[..., :3].sum(-1), 0.3 * held[..., :3].sum(-1)
@@ -70,7 +70,7 @@ def test_a_mirrored_picture_has_the_other_s2(tmp_path: Path, picture: mask_scene
     assert (True, True) in signs and (False, False) in signs and (True, False) not in signs
 
 
-def test_the_network_learns_and_ships(tmp_path: Path, picture: mask_scenes.MaskScene) -> None:
+def test_the_network_learns_and_is_exported(tmp_path: Path, picture: mask_scenes.MaskScene) -> None:
     file = tmp_path / "0.npy"
     held = mask_pictures.pack(picture)
     np.save(file, np.tile(held, (2, 2, 1)))
@@ -92,7 +92,7 @@ def test_loss_is_small_where_the_network_is_right_and_sure() -> None:
     )
 
 
-def test_an_object_laid_into_a_picture_is_part_of_the_truth(tmp_path: Path, picture: mask_scenes.MaskScene) -> None:
+def test_an_inserted_object_is_part_of_the_truth(tmp_path: Path, picture: mask_scenes.MaskScene) -> None:
     held = mask_pictures.pack(picture)
     np.save(tmp_path / "0.npy", held)
     np.save(tmp_path / "1.npy", held[:, ::-1])

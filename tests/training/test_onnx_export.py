@@ -62,7 +62,7 @@ def test_weights_and_facts_are_read_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [None, b"not a model"])
-def test_what_is_no_model_is_named(content: bytes | None, tmp_path: Path) -> None:
+def test_a_file_that_is_no_model_is_refused(content: bytes | None, tmp_path: Path) -> None:
     path = tmp_path / "m.onnx"
     if content is not None:
         path.write_bytes(content)
@@ -70,7 +70,7 @@ def test_what_is_no_model_is_named(content: bytes | None, tmp_path: Path) -> Non
         onnx_export.read_weights(path)
 
 
-def test_stored_in_halves_the_small_network_fits_the_limit() -> None:
+def test_the_small_network_in_fp16_fits_the_size_limit() -> None:
     weights = sum(p.numel() for p in main_network.MainNetwork().parameters())
     assert 2 * weights < 16e6  # bytes; the limit for a shipped file is 24 MB
 

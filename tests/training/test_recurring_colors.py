@@ -49,7 +49,7 @@ def test_one_color_is_found_once() -> None:
     assert (centers.amax(dim=0) - centers.amin(dim=0)).max() < 0.05
 
 
-def test_a_color_seen_badly_is_one_that_is_seen_well() -> None:
+def test_uncertain_albedo_moves_to_a_color_seen_well() -> None:
     """Towards the limb a third of the places come out 40 % too dark; hue tells whose they are."""
     truth, which = print_of([RED, BLUE])
     limb = torch.arange(which.numel()).reshape(which.shape) % 24 < 8
@@ -62,13 +62,13 @@ def test_a_color_seen_badly_is_one_that_is_seen_well() -> None:
     assert (got / truth).log().abs()[..., limb].mean() < 0.15  # in every channel: no red has become blue
 
 
-def test_what_is_seen_well_keeps_its_shades() -> None:
+def test_well_seen_shades_are_preserved() -> None:
     """A smooth run of colors from dark to light, three stops, is not made into steps."""
     run = torch.exp(torch.linspace(-2.5, -0.4, 64 * 64)).reshape(1, 1, 64, 64).expand(1, 3, 64, 64)
     assert (recolored(run, 0.8)[0] / run).log().abs().max() < 0.15
 
 
-def test_doubt_is_interpolated_between_its_knots() -> None:
+def test_uncertainty_is_interpolated_between_its_knots() -> None:
     knots = torch.tensor(recurring_colors._KNOTS_DEG)
     at = torch.deg2rad(torch.cat([knots, torch.tensor([35.0])]))
     weights = recurring_colors._interpolation_weights(torch.cos(at).view(1, 1, -1))[0]
@@ -95,7 +95,7 @@ def test_each_color_is_described_by_its_own_light() -> None:
     assert moved[of_red < 0.1].max() < 0.05
 
 
-def test_what_has_learned_nothing_corrects_nothing() -> None:
+def test_untrained_color_gloss_corrects_nothing() -> None:
     picture, which = print_of([RED, BLUE])
     one = torch.ones(1, 1, *which.shape)
     figures, first = torch.rand(2, 1, 5, *which.shape)

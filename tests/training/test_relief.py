@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from polcap.training import relief
 
 
-def test_slopes_are_those_of_a_surface() -> None:
+def test_slopes_are_gradients_of_a_height_field() -> None:
     """The gradient of a height has no curl: what it adds up to does not depend on the way."""
     rng = np.random.default_rng(0)
     place = rng.uniform(-1, 1, (200, 3))
@@ -25,6 +25,6 @@ def test_slopes_are_those_of_a_surface() -> None:
         assert slope.shape == (200, 3) and np.linalg.norm(slope, axis=1).max() < 1.3
 
 
-def test_bent_normals_lean_away_from_the_slope() -> None:
+def test_normals_lean_away_from_the_slope() -> None:
     up, slope = np.array([[0.0, 0, 1]]), np.array([[0.5, 0, 0.7]])
     assert np.allclose(relief.tilt_normals(up, slope), np.array([[-0.5, 0, 1]]) / np.sqrt(1.25), atol=1e-6)

@@ -87,7 +87,7 @@ def test_batches_follow_from_the_seed(simulator: Simulator) -> None:
     torch.testing.assert_close(draw(), draw(), rtol=0, atol=0)
 
 
-def test_materials_keep_their_ranges_and_vary(simulator: Simulator) -> None:
+def test_materials_vary_within_their_ranges(simulator: Simulator) -> None:
     torch.manual_seed(2)
     batch = simulator.draw_batch(24, 32)
     reflectance = torch.stack([b[:, m].mean() for b, m in zip(batch.specular, batch.mask)])

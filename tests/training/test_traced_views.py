@@ -20,7 +20,7 @@ def test_same_seed_traces_the_same_views(data: Path, views: Path, tmp_path: Path
         np.testing.assert_array_equal(first[name], second[name])
 
 
-def test_depth_is_centred_and_in_units_of_the_equivalent_disc(views: Path) -> None:
+def test_depth_is_centered_and_in_units_of_the_equivalent_disc(views: Path) -> None:
     cache = traced_views.load_cache(views)
     for index, camera in enumerate(cache["camera"]):
         mask = cache["mask"][index, ..., 0]
@@ -38,14 +38,14 @@ def test_objects_lie_inside_the_frame_and_turns_are_rotations(views: Path) -> No
     np.testing.assert_allclose(turn @ turn.transpose(0, 2, 1), np.broadcast_to(np.eye(3), turn.shape), atol=1e-5)
 
 
-def test_interrupted_build_is_not_taken_for_a_cache(views: Path, tmp_path: Path) -> None:
+def test_an_interrupted_cache_is_refused(views: Path, tmp_path: Path) -> None:
     for file in views.glob("*.npy"):
         (tmp_path / file.name).symlink_to(file)
     with pytest.raises(InputError, match="no complete cache of views"):
         traced_views.load_cache(tmp_path)
 
 
-def test_a_cache_of_other_views_is_not_taken_for_this_one(data: Path, views: Path) -> None:
+def test_a_cache_of_other_views_is_refused(data: Path, views: Path) -> None:
     meshes = [data / "meshes" / "train" / "one.npz"]
     assert traced_views.open_cache(views, meshes, RECIPE)["mask"].shape[1] == RECIPE.size
     for asked in ((meshes, replace(RECIPE, seed=6)), ([data / "meshes" / "test" / "two.npz"], RECIPE)):
@@ -53,7 +53,7 @@ def test_a_cache_of_other_views_is_not_taken_for_this_one(data: Path, views: Pat
             traced_views.open_cache(views, *asked)
 
 
-def test_a_mesh_that_no_side_shows_is_named_not_waited_for() -> None:
+def test_a_mesh_too_thin_for_any_view_is_refused() -> None:
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 0.01, 0]], np.float32)
     needle = Triangles(corners, np.array([[0, 1, 2]], np.int32), np.tile(np.array([0, 0, 1], np.float32), (1, 3, 1)))
     with pytest.raises(InputError, match="the needle covers less than 6% of the picture"):

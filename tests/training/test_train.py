@@ -71,7 +71,7 @@ def test_training_starts_from_a_shipped_model(data: Path, tmp_path: Path, monkey
     assert facts["training"].endswith("minutes, after 10 samples")
 
 
-def test_a_schedule_goes_on_where_the_shipped_weights_left_it(
+def test_a_schedule_continues_after_the_pictures_of_the_first_weights(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(train.PRESETS, "cpu", PRESET)
@@ -90,7 +90,7 @@ def test_the_shipped_model_can_start_training() -> None:
     assert run.begun.split()[1] == "samples"
 
 
-def test_a_layer_that_came_to_see_more_starts_as_if_it_did_not(tmp_path: Path) -> None:
+def test_new_input_channels_start_with_zero_weights(tmp_path: Path) -> None:
     """New channels come last and begin at zero; a layer with other outputs is another network's."""
     own = torch.rand(4, 6, 3, 3)
     grown = train._with_new_channels(own[:, :5], own)
@@ -103,7 +103,7 @@ def test_resume_and_start_exclude_each_other(tmp_path: Path) -> None:
         train.main(train.TrainingOptions(out=tmp_path, resume=True, start=tmp_path / "m.onnx"))
 
 
-def test_a_model_of_another_size_cannot_start_it(tmp_path: Path) -> None:
+def test_training_cannot_start_from_a_model_of_another_size(tmp_path: Path) -> None:
     onnx_export.export_main(main_network.MainNetwork(TINY), tmp_path / "tiny.onnx", {"licence": "x"})
     with pytest.raises(InputError, match="not a network of this preset"):
         train.NetworkTraining(main_network.SMALL, torch.device("cpu"), 1e-3).begin(tmp_path / "tiny.onnx")
@@ -117,19 +117,19 @@ def test_steps_on_one_batch_lower_its_loss(simulator: Simulator) -> None:
     assert losses[-1] < 0.8 * losses[0] and run.skipped == 0
 
 
-def test_resume_without_a_checkpoint_says_so(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_resume_needs_a_checkpoint(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(train.PRESETS, "cpu", PRESET)
     with pytest.raises(InputError, match="nothing to resume"):
         train.main(train.TrainingOptions(data=data, out=tmp_path, resume=True))
 
 
-def test_a_run_is_not_begun_over_another(data: Path, tmp_path: Path) -> None:
+def test_a_finished_run_is_not_overwritten(data: Path, tmp_path: Path) -> None:
     train.NetworkTraining(TINY, torch.device("cpu"), 1e-3).save(tmp_path / "last.pt")
     with pytest.raises(InputError, match="continue from it with --resume"):
         train.main(train.TrainingOptions(data=data, out=tmp_path))
 
 
-def test_a_run_is_resumed_as_it_began(tmp_path: Path) -> None:
+def test_a_run_resumes_only_with_its_own_preset_and_variant(tmp_path: Path) -> None:
     train.NetworkTraining(TINY, torch.device("cpu"), 1e-3, variant="published inputs").save(tmp_path / "last.pt")
     for shape, variant in ((TINY, "ours"), (main_network.SMALL, "published inputs")):
         with pytest.raises(InputError, match=r"variant \('published inputs'\); resume it with the same ones"):
@@ -157,7 +157,7 @@ def test_same_seed_same_weights(data: Path, tmp_path: Path, monkeypatch: pytest.
     assert all(same) and not any(other)
 
 
-def test_unknown_preset_is_named() -> None:
+def test_unknown_preset_is_refused() -> None:
     with pytest.raises(InputError, match="'tpu' is not one of cpu, gpu"):
         train.main(train.TrainingOptions(preset="tpu"))
 

@@ -29,7 +29,7 @@ class AlignSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     model: Annotated[
         Literal["none", "translation", "similarity", "homography"],
-        Meta(description="how a shot may have moved; none: trust a locked camera"),
+        Meta(description="motion model between shots; none: the camera was locked"),
     ] = "similarity"
     max_shift_px: Annotated[
         float, Meta(ge=0.5, le=500, description="greatest accepted movement of any shot [grid px]")

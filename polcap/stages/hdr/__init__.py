@@ -53,7 +53,7 @@ _LEAST_PX = 48  # least side of a merged picture: noise and motion are measured 
 class HdrSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How brackets are merged."""
 
-    clip: Annotated[float, Meta(ge=0.5, le=1.0, description="counts from here on are clipped [white level]")] = 0.98
+    clip: Annotated[float, Meta(ge=0.5, le=1.0, description="clipping threshold [white level]")] = 0.98
     demosaic: Annotated[
         Literal["superpixel", "full"],
         Meta(description="a pixel per 2×2 quad (X-Trans 3×3), or Bayer interpolated to full size"),
@@ -62,7 +62,7 @@ class HdrSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float, Meta(ge=0.0, le=500.0, description="a bracket that moved more is refused [visible RAW px]")
     ] = 60.0
     falloff: Annotated[
-        bool, Meta(description="take out the lens's falloff, where `polcap calibrate` has measured it")
+        bool, Meta(description="correct the lens's falloff if `polcap calibrate` has measured it")
     ] = True
 
 

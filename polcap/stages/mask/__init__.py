@@ -34,7 +34,7 @@ class MaskSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_area: Annotated[float, Meta(gt=0, le=1, description="least part of the picture that an object covers")] = 0.002
     chart_margin: Annotated[
         float,
-        Meta(ge=0, le=2, description="border around the chart that is not the object; no network [patch widths]"),
+        Meta(ge=0, le=2, description="border around the chart without object, if there is no network [patch widths]"),
     ] = 0.7
 
 

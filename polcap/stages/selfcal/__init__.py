@@ -52,7 +52,7 @@ class SelfcalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = True
     order_margin: Annotated[
         float,
-        Meta(ge=0, le=2, description="how much better another order must fit the outline to be believed"),
+        Meta(ge=0, le=2, description="least lead of another order's fit of the outline over the stated one's"),
     ] = 0.2
     correct_ring: Annotated[
         bool, Meta(description="correct all angles by the measured error of the ring's zero, where it is certain")

@@ -47,10 +47,10 @@ class StokesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     greatest_ior: Annotated[
         float,
-        Meta(ge=1.2, le=3, description="a DoLP no dielectric up to this refractive index emits is flagged"),
+        Meta(ge=1.2, le=3, description="greatest refractive index; a DoLP beyond it is flagged"),
     ] = 1.8
     undistort: Annotated[
-        bool, Meta(description="take a calibrated lens's distortion out, where the shots are resampled anyway")
+        bool, Meta(description="correct the distortion of a calibrated lens while the shots are resampled")
     ] = True
     dark_sigma: Annotated[
         float, Meta(ge=0, le=100, description="S0 below this many standard deviations is flagged dark")

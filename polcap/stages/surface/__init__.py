@@ -33,21 +33,21 @@ class SurfaceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     stiffness: Annotated[
         float,
-        Meta(ge=0.0, le=20.0, description="how firmly depth steps are left open; 0 = plain least squares [1]"),
+        Meta(ge=0.0, le=20.0, description="tendency to cut at depth steps; 0: plain least squares [1]"),
     ] = 2.0
     iterations: Annotated[
-        int, Meta(ge=1, le=200, description="most reweightings on the grid that decides on depth steps")
+        int, Meta(ge=1, le=200, description="greatest number of reweightings on the grid that decides on depth steps")
     ] = 25
     tolerance: Annotated[
         float, Meta(ge=1e-8, le=0.1, description="relative change of the energy that ends the reweightings [1]")
     ] = 1e-3
     steepest_deg: Annotated[
         float,
-        Meta(ge=45.0, le=89.0, description="normals leaning farther from the camera are capped [degrees]"),
+        Meta(ge=45.0, le=89.0, description="greatest tilt of a normal from the camera; more is capped [degrees]"),
     ] = 84.0
     prior_weight: Annotated[
         float,
-        Meta(ge=0.0, le=1000.0, description="pull of the coarse depth on the whole surface, against its stiffness [1]"),
+        Meta(ge=0.0, le=1000.0, description="weight of the network's coarse depth against the normals [1]"),
     ] = 0.15
     jump: Annotated[
         float,
