@@ -186,7 +186,7 @@ def networks() -> tuple[Network | None, Network | None]:
 def _name(error: InputError) -> str:
     """The error's class; what it is about where that names another fault."""
     name = type(error).__name__.removesuffix("Error").lower()
-    order = "order " if "contradict the object's outline" in str(error) else ""
+    order = "order " if "contradict the polarization at the object's outline" in str(error) else ""
     exposed = " exposure" * ("well exposed" in str(error))
     return f"error {order}{name}{' chart' * ('ColorChecker' in str(error))}{exposed}"
 

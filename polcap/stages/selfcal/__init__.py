@@ -1,12 +1,12 @@
-"""Stage 5: differences between the shots: flash energy, and the polarizer's order, sense and zero.
+"""Stage 5: self-calibration of the shots: gains, and the polarizer's order, sense and zero.
 
-One per cent of flash energy fakes, where a surface faces the camera, the polarization of one tilted by 24° (over a
-whole object it costs normals about 6° on average). A matt grey patch is unpolarized, so its brightness must be the
-same in every shot (`grey_patches`). Without a chart the gains come from the object (`object_gains`), most of them from
-its slopes (`integrability`), averaged with the known repeatability of lamps and flashes. One exposure of a
-polarization mosaic has one gain. `angles` checks the order and sense of the angles on the outline, finds one turned
-shot among more than three, and finds angles that nobody noted. `ring_zero` measures the zero of the polarizer's ring;
-its error is corrected where it is certain, averaged with a calibrated zero by the errors of both.
+An error of 1 % in flash energy gives a surface that faces the camera the polarization of a surface tilted by 24°; over
+a whole object it costs about 6° of the normals on average. A matt grey patch is unpolarized, so its brightness must be
+the same in every shot (`grey_patches`). Without a chart, the gains come from the object (`object_gains`,
+`integrability`), averaged with the known repeatability of lamps and flashes. One exposure of a polarization mosaic has
+one gain. `angles` checks the order and sense of the angles at the outline, detects one turned shot among more than
+three, and finds unknown angles. `ring_zero` measures the zero of the polarizer's ring. Its error is corrected if it is
+significant; a calibrated zero is averaged with it by the errors of both.
 """
 
 from dataclasses import replace
@@ -27,14 +27,15 @@ from polcap.stages.selfcal import angles, crossed_light, grey_patches, integrabi
 from polcap.stages.selfcal.grey_patches import GreyPatches
 from polcap.stages.selfcal.object_gains import GainEstimate, ObjectShots
 
-_PRIOR = {"flash": 0.03, "steady": 0.01, "unknown": 0.03}  # 1σ of a shot's light before anything is measured: makers
-# of studio flashes state 0.5–2 % from pop to pop at full recycling, of LED and HMI lamps under 1 %
-_LEAST_PRIOR = 0.001  # of any light, whatever a calibration states of its flash
-_SURPRISE = 3.0  # σ beyond which two measurements contradict one another
-_REMOUNTED = np.radians(0.3)  # 1σ of a filter's zero from one screwing on to the next: a thread's play; assumed
-_SOLID_ORDER, _GUESSED_ORDER = 0.25, 0.45  # least score of another order; guessed gains turn AoLPs too. Set by hand;
-# none of 32 simulated captures in order was refused with them (tests/benchmarks/bench_verdicts.py)
-_MOST_GAIN = 0.005  # 1σ of a shot's light; with more, other angles explain the shots as well
+_PRIOR = {"flash": 0.03, "steady": 0.01, "unknown": 0.03}  # prior 1σ of a shot's light; makers
+# state 0.5–2 % from flash to flash for studio flashes at full recycling, and under 1 % for LED and HMI lamps
+_LEAST_PRIOR = 0.001  # least prior 1σ, also of a calibrated flash
+_SURPRISE = 3.0  # two measurements contradict each other if they differ by more than this many σ
+_REMOUNTED = np.radians(0.3)  # 1σ of the zero after a filter is screwed on again (play of the thread); assumed
+# Least score of another order, with measured and with estimated gains, which turn AoLPs too. Set by hand; none of 32
+# simulated captures in the right order was refused (tests/benchmarks/bench_verdicts.py).
+_SOLID_ORDER, _GUESSED_ORDER = 0.25, 0.45
+_MOST_GAIN = 0.005  # largest 1σ of a shot's light with which unknown angles can be found
 
 
 class SelfcalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -42,10 +43,10 @@ class SelfcalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     unknown_angles: Annotated[
         bool,
-        Meta(description="the stated angles are names only: find the true ones, of four or more shots with a chart"),
+        Meta(description="ignore the stated angles and find them, from four or more shots with a chart"),
     ] = False
     max_unknown_sigma_deg: Annotated[
-        float, Meta(gt=0, le=20, description="greatest 1σ of angles that are found; more ends the run [degrees]")
+        float, Meta(gt=0, le=20, description="greatest 1σ of found angles; more ends the run [degrees]")
     ] = 4.0
     check_order: Annotated[
         bool, Meta(description="refuse a capture whose outline contradicts the order or sense of its angles")
@@ -55,7 +56,7 @@ class SelfcalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Meta(ge=0, le=2, description="least lead of another order's fit of the outline over the stated one's"),
     ] = 0.2
     correct_ring: Annotated[
-        bool, Meta(description="correct all angles by the measured error of the ring's zero, where it is certain")
+        bool, Meta(description="correct all angles by the measured error of the ring's zero, if it is significant")
     ] = True
     ring_sigmas: Annotated[
         float,
@@ -66,7 +67,9 @@ class SelfcalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 1.0
     max_ring_turn_deg: Annotated[
         float,
-        Meta(gt=0, le=20, description="greatest correction of the ring's zero; more is no zero set by eye [degrees]"),
+        Meta(
+            gt=0, le=20, description="greatest correction of the ring's zero; a larger error is not corrected [degrees]"
+        ),
     ] = 12.0
 
 
@@ -78,9 +81,9 @@ def solve(
     color: ColorCalibration,
     settings: SelfcalSettings,
 ) -> SelfCalibration:
-    """Gain of every shot and channel, and the polarizer's angles, checked and corrected.
+    """Gains (K, 3) of all shots and channels, and the checked and corrected polarizer angles (K,).
 
-    The shots (K, H, W, 3) are compared on the object's crop and on the chart's grey patches, if any.
+    The shots (K, H, W, 3) are compared in the object's crop and on the chart's grey patches, if any.
 
     Raises
     ------
@@ -105,7 +108,9 @@ def solve(
         raise CaptureError(_wrong_order(order, angle))
 
     ring = _ring(even, angle, first, object_.border > 0)
-    if radiance.equipment.light != "one exposure" or found_sigma is not None:  # etched angles are exact
+    if (
+        radiance.equipment.light != "one exposure" or found_sigma is not None
+    ):  # the angles of a polarization mosaic are exact
         ring = corrected(ring, radiance.equipment.ring_sigma if found_sigma is None else found_sigma, settings)
     angle = angle + ring.correction
 
@@ -130,7 +135,7 @@ def solve(
 
 
 def _gains_without_angles(radiance: AngleStack, greys: GreyPatches | None, facing: GainEstimate) -> GainEstimate:
-    """Gains (K,) that do not depend on the angles, which are still to be checked."""
+    """Gains (K,) by methods that do not need the angles, because the angles are not checked yet."""
     if radiance.equipment.light == "one exposure":
         shots = len(radiance.angle)
         return GainEstimate(np.ones(shots), np.zeros(shots))
@@ -140,7 +145,7 @@ def _gains_without_angles(radiance: AngleStack, greys: GreyPatches | None, facin
 
 
 def _gains(radiance: AngleStack, greys: GreyPatches | None, anchor: GainEstimate) -> Gains:
-    """Gains (K, 3) by the best source at hand, with the object's own (`anchor`) as the cross-check."""
+    """Gains (K, 3) by the best available source, with those of the object (`anchor`) as a cross-check."""
     gain: Floats
     sigma: Floats
     source: Literal["grey patches", "object", "one exposure", "none"]
@@ -166,51 +171,53 @@ def _gains(radiance: AngleStack, greys: GreyPatches | None, anchor: GainEstimate
 
 
 def _prior(radiance: AngleStack) -> float:
-    """1σ of a shot's light before anything is measured in this capture: of its kind of lamp, or as calibrated."""
+    """Prior relative 1σ of a shot's light, by the kind of lamp or from a calibration."""
     if radiance.equipment.light == "flash" and radiance.equipment.flash_spread is not None:
-        return max(2**0.5 * radiance.equipment.flash_spread, _LEAST_PRIOR)  # of one pop against another
+        return max(2**0.5 * radiance.equipment.flash_spread, _LEAST_PRIOR)  # difference of two flashes
     return _PRIOR[radiance.equipment.light]
 
 
 def _find_angles(
     band: OutlineBand, even: ObjectShots, gain_sigma: float, settings: SelfcalSettings
 ) -> tuple[Floats, float]:
-    """Angles (K,) rad that nobody noted, and their 1σ, of shots without their gains."""
+    """Unknown angles (K,) and their 1σ [rad], from shots divided by their gains."""
     shots = len(even.light)
-    otherwise = "or note the angles, and --set selfcal.unknown_angles=false"
+    otherwise = "or state the angles with --set selfcal.unknown_angles=false"
     if shots < 4:
-        raise CaptureError(f"{shots} shots at unknown angles: four are needed, better five; take more, {otherwise}")
-    if gain_sigma > _MOST_GAIN:
-        known = f"known to {100 * gain_sigma:.1f} % only" if np.isfinite(gain_sigma) else "not known without a chart"
         raise CaptureError(
-            f"the light of the shots is {known}; to find unknown angles it must be known to {100 * _MOST_GAIN:g} %: "
+            f"{shots} shots at unknown angles: at least four are needed, five are better; take more, {otherwise}"
+        )
+    if gain_sigma > _MOST_GAIN:
+        known = f"known to only {100 * gain_sigma:.1f} %" if np.isfinite(gain_sigma) else "not known without a chart"
+        raise CaptureError(
+            f"the flash energy of the shots is {known}; to find unknown angles, {100 * _MOST_GAIN:g} % is needed: "
             f"put a color chart next to the object, {otherwise}"
         )
     found = angles.find(band, *object_gains.cells(even.light, even.inside))
     sigma = float(np.degrees(found.sigma))
     if sigma > settings.max_unknown_sigma_deg:
         raise CaptureError(
-            f"the polarizer's angles are found to {sigma:.1f}° only, "
+            f"the error of the polarizer angles found is {sigma:.1f}° (1σ), more than "
             f"selfcal.max_unknown_sigma_deg = {settings.max_unknown_sigma_deg:g}; take five or more shots spread over "
-            f"180° of a rounded object that is all in view, {otherwise}"
+            f"180°, of a rounded object inside the picture, {otherwise}"
         )
     return found.angle, found.sigma
 
 
 def _wrong_order(found: angles.OrderFit, angle: Floats) -> str:
-    """The message for shots whose outline contradicts their angles (K,) rad."""
+    """The message for shots with an outline that contradicts their angles (K,) rad."""
     stated = ", ".join(f"{np.degrees(a):g}°" for a in angle)
     best = ", ".join(f"{np.degrees(angle[i]):g}°" for i in found.check.best.shots)
     mirrored = " counted the other way (the ring turned clockwise)" if found.check.best.mirrored else ""
     return (
-        f"shots {stated} contradict the object's outline (fit {found.score:.2f}): it supports "
-        f"{best}{mirrored} (fit {found.best_score:.2f}); correct the folders or --angles, shoot without ambient light "
-        "(reflections turn polarization by 90°), or --set selfcal.check_order=false"
+        f"the angles {stated} contradict the polarization at the object's outline (fit {found.score:.2f}); "
+        f"{best}{mirrored} fit better ({found.best_score:.2f}): correct the folders or --angles, shoot without "
+        "ambient light (reflections turn polarization by 90°), or --set selfcal.check_order=false"
     )
 
 
 def _ring(even: ObjectShots, angle: Floats, gains: GainEstimate, leaves_picture: bool) -> RingZero:
-    """The error of the ring's zero by outline and slopes together; not corrected yet."""
+    """The error of the ring's zero, combined from outline and slopes; without a correction."""
     gain_sigma = float(gains.sigma.max())
     total = frames.total(even.value) / gains.gain[:, None, None]
     return ring_zero.combined(
@@ -220,11 +227,11 @@ def _ring(even: ObjectShots, angle: Floats, gains: GainEstimate, leaves_picture:
 
 
 def corrected(ring: RingZero, calibrated: float | None, settings: SelfcalSettings) -> RingZero:
-    """The ring's zero with the correction that is added to the angles.
+    """The ring's zero with the correction to be added to the angles.
 
-    `calibrated` is 1σ (rad) of a zero that the angles already include, by calibration or because they were found; None
-    without one. It and the ring's measured error are averaged by their errors where they agree. Where they do not, the
-    filter was mounted again, and the measurement counts alone.
+    `calibrated` is 1σ [rad] of a zero that the angles already include, by calibration or because the angles were found;
+    None without one. If it agrees with the measured error, the two are averaged by their errors. If not, the filter was
+    probably mounted again, and only the measurement is used.
     """
     uncertain = ring.sigma > np.radians(settings.max_ring_sigma_deg)
     if calibrated is not None:

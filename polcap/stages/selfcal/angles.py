@@ -1,19 +1,20 @@
-"""The polarizer's angles: their order and sense, one shot that was turned, angles that nobody noted.
+"""Checks the polarizer angles (order, sense, one turned shot) and finds unknown angles.
 
-The first is judged by the outline, where diffuse reflection is polarized across the contour all round. Orders that
-give the same analyzers are one: (0°, 120°, 60°) counted clockwise is (0°, 60°, 120°). A common turn of all angles is
-no other order. The stated order wins ties.
+Order and sense are checked at the outline, where diffuse reflection is polarized across the contour. Orders with the
+same analyzers are the same order: (0°, 120°, 60°) clockwise is (0°, 60°, 120°). A common turn of all angles does not
+change the order. If two orders fit equally well, the stated one is taken.
 
-The second needs K > 3 shots of known gains g. They lie in a space of three dimensions: with N spanning the rest of
-A = ½ (1, cos 2θ, sin 2θ), N·(I/g) = 0. A shot k turned by δ leaves N_k δ dI_k/dθ, which goes with the polarization; a
-gain that is off by ε leaves N_j ε I_j, which goes with the light. Guessed gains can take the place of turns, so they
-enter with their errors.
+One turned shot is found among K > 3 shots with known gains g. The intensities I of a pixel lie in the three-dimensional
+column space of A = ½ (1, cos 2θ, sin 2θ). With N spanning its complement, N·(I/g) = 0. Shot k turned by δ leaves the
+residual N_k δ dI_k/dθ, proportional to the polarization. A gain with error ε leaves N_j ε I_j, proportional to the
+light. Errors of the gains can imitate a turn, so the gains are fitted too, with their errors as prior.
 
-The third needs four shots of well known gains. Shots at angles θ are I = A(θ) S, of rank three. Another A′ = A B
-explains them as well if its rows are (1, cos, sin) too: points on the unit circle that an affine map takes from one
-another. Through five points goes one ellipse, so five shots fix θ up to a common turn and the sense; four leave one
-more parameter free. The outline gives the rest: light there is polarized along the contour's normal φ, so I lies
-between 1 and cos 2(φ − θ) for every part of it. A common turn that remains is found by `ring_zero.by_slopes`.
+Unknown angles need four shots with well known gains. Shots at angles θ are I = A(θ) S, of rank three. Another A′ = A B
+explains them equally well if its rows have the form (1, cos, sin): an affine map then takes points of the unit circle
+to points of the unit circle. Five points determine an ellipse, so five shots determine θ up to a common turn and the
+sense; with four shots one more parameter is free. The outline determines the rest: light there is polarized along the
+contour's normal φ, so I is in the span of 1 and cos 2(φ − θ) in every part of it. `ring_zero.by_slopes` finds the
+remaining common turn.
 """
 
 from dataclasses import dataclass, replace
@@ -29,38 +30,38 @@ from polcap.optics.robust import biweight, jackknife, spread
 from polcap.stages.selfcal.object_gains import ObjectShots
 
 # Order and sense.
-_EDGE_PX = 3  # of the picture; nearer, an outline is no contour of shape
-_MOST_PERMUTED = 4  # shots; beyond, only exchanges of two of them, and the reversal, are tried
-_CLOSES = 3.0  # factor on the misfit of more than three shots that rules an order out, or in; set by hand
-_AHEAD = 2.0  # σ by which the stated order must be better than another to exclude it
-_BETTER = 3.0  # σ by which another order must be better than the stated one
-_LEAST_RIVAL = 0.25  # score of an order that the object could have as well: half of chance's greatest; set by hand
-_ROUGH = 0.01  # misfit that gains and interpolation leave at most, relative to the light: a flash repeats within 1 %
+_EDGE_PX = 3  # from the picture's edge; nearer pixels are not on the object's contour
+_MOST_PERMUTED = 4  # shots; with more, only exchanges of two shots and the reversal are tried
+_CLOSES = 3.0  # factor of misfit (K > 3) with which an order is excluded, or accepted; set by hand
+_AHEAD = 2.0  # σ; another order is excluded if the stated one is better by more
+_BETTER = 3.0  # σ by which another order must be better to be accepted
+_LEAST_RIVAL = 0.25  # least score of an order that may be true too; set by hand
+_ROUGH = 0.01  # largest relative misfit by gains and interpolation: a flash repeats within 1 %
 # One turned shot.
-_PARTS = 12  # of the object; their scatter is the error
+_PARTS = 12  # of the object; their scatter gives the error
 _LEAST_CELLS = 60
-_LEAST_GAIN = 0.5  # of the misfit with the stated angles, to be believed; 15° takes 0.8 or more, good captures < 0.3
-_LEAST_SIGMAS = 3.5
-_ALIKE = 0.9  # of the best shot's gain in misfit: then it cannot be decided which of them was turned
-_FAR = np.radians(np.arange(20.0, 91.0, 5.0))  # turns that no tangent reaches: a ring that was not turned at all
-_MOST_LEFT = 0.25  # of the median residual with the angles as stated, for such a turn to be started from
-_ANGLE_ERROR = np.radians(0.5)  # 1σ of every angle, set by hand or motor, against its mark
+_LEAST_GAIN = 0.5  # least reduction of the misfit by a turn; 15° gives 0.8 or more, right angles < 0.3
+_LEAST_SIGMAS = 3.5  # least turn, in its σ
+_ALIKE = 0.9  # of the best shot's reduction of the misfit; shots above cannot be distinguished
+_FAR = np.radians(np.arange(20.0, 91.0, 5.0))  # large turns, beyond the linear fit: a ring that was not turned at all
+_MOST_LEFT = 0.25  # largest residual after a large turn, over that with the stated angles
+_ANGLE_ERROR = np.radians(0.5)  # 1σ of each angle, set by hand or motor
 # Unknown angles.
 _BINS = 36  # of φ, 10° each
-_LEAST_BINS = 24  # with light in them; fewer sides do not determine turn and sense
-_STARTS = 20  # drawn at random, the same every time
-_COARSE, _FINE = 1e-3, 1e-7  # relative change of the misfit at which the search ends: of all starts, of the best
-_POLISHED = 4  # of the starts, the best ones
-_AS_GOOD = 1.3  # of the least misfit: angles that end there are possible too
-_LAW = 0.012  # relative, of the outline's light: residuals of its parts that are no ideal diffuse reflectors
-_OTHER_LAWS = (0.004, 0.03)  # that it may be as well: parts of an outline are off by up to 3 %
+_LEAST_BINS = 24  # bins with light; fewer do not determine turn and sense
+_STARTS = 20  # random starts, the same every time
+_COARSE, _FINE = 1e-3, 1e-7  # relative change of the misfit that ends a search: from all starts, from the best ones
+_POLISHED = 4  # number of best starts
+_AS_GOOD = 1.3  # of the least misfit; solutions up to here are possible too
+_LAW = 0.012  # relative 1σ of the outline's light from ideal diffuse reflection
+_OTHER_LAWS = (0.004, 0.03)  # the range of this 1σ: parts of an outline differ by up to 3 %
 _SIDES = 8  # parts of the outline and of the inside, left out one at a time
-_INSIDE = 0.0001  # the same of the inside: interpolation and gains
-_FLOOR = np.radians(0.3)  # 1σ; where all sides agree (200 simulated cases)
+_INSIDE = 0.0001  # relative 1σ inside, by interpolation and gains
+_FLOOR = np.radians(0.3)  # least 1σ (200 simulated cases)
 
 
 def rim(shots: ObjectShots) -> OutlineBand:
-    """The band inside the object's outline; where the object leaves the picture its outline is no contour of shape."""
+    """The band of pixels just inside the object's outline, without those at the picture's edge."""
     mask, (x0, y0, x1, y1), (height, width) = shots.mask, shots.crop, shots.full
     depth = outline.depth(mask)
     outward, slope = outline.outward(mask.astype(np.float32), 3.0)
@@ -75,34 +76,34 @@ def rim(shots: ObjectShots) -> OutlineBand:
 
 @dataclass(frozen=True)
 class OrderFit:
-    """The check of order and sense, with the scores −1…1 of the stated order and of the best one."""
+    """Result of the check of order and sense, with the scores −1…1 of the stated and the best order."""
 
     check: OutlineCheck
     score: float  # mean of w cos 2(φ − φ_contour)
     best_score: float
 
 
-def check_order(at: OutlineBand, angle: Floats, margin: float, least_score: float) -> OrderFit:
-    """The order and sense of the stated angles (K,) rad that the rim supports.
+def check_order(band: OutlineBand, angle: Floats, margin: float, least_score: float) -> OrderFit:
+    """Find the order and sense of the stated angles (K,) rad that fit the outline.
 
-    Another order must score `least_score` or more, and `margin` more than the stated one.
+    Another order must have a score of `least_score` or more, and be better than the stated one by `margin`.
     """
     stated = ShotOrder(tuple(range(len(angle))))
-    if at.light.shape[1] == 0:
+    if band.light.shape[1] == 0:
         return OrderFit(OutlineCheck(stated, 0.0), 0.0, 0.0)
-    total, weight = outline.phasor(at, angle)
+    total, weight = outline.phasor(band, angle)
     mean, _ = outline.mean_and_sigma(total, weight)
     along = (total * np.exp(-1j * np.angle(mean))).real
-    here = _misfit(at, angle)
+    here = _misfit(band, angle)
     best, best_score = stated, abs(mean)
     rival, nearest = None, -np.inf
     for order, turned in hypotheses(angle).items():
-        misfit = _misfit(at, turned)
+        misfit = _misfit(band, turned)
         if order == stated or misfit > _CLOSES * here:
             continue
         closes_alone = _CLOSES * misfit < here > _ROUGH  # more than three shots agree in this order only
         least = 0.0 if closes_alone else margin
-        other, others = outline.phasor(at, turned)
+        other, others = outline.phasor(band, turned)
         score = float(other.sum().real / max(others.sum(), 1e-9))
         sigma = _sigma_of_difference(other.real, others, along, weight)
         if score > _LEAST_RIVAL and least and score - abs(mean) > max(nearest, -_AHEAD * sigma):
@@ -114,7 +115,7 @@ def check_order(at: OutlineBand, angle: Floats, margin: float, least_score: floa
 
 
 def hypotheses(angle: Floats) -> dict[ShotOrder, Floats]:
-    """Angles (K,) rad of every order and sense that gives analyzers of its own; the stated one first."""
+    """Angles (K,) rad of every order and sense with different analyzers; the stated one first."""
     shots = len(angle)
     nominal = tuple(range(shots))
     orders = list(permutations(nominal)) if shots <= _MOST_PERMUTED else [nominal, *_exchanged(shots), nominal[::-1]]
@@ -129,7 +130,7 @@ def hypotheses(angle: Floats) -> dict[ShotOrder, Floats]:
 
 
 def _exchanged(shots: int) -> list[tuple[int, ...]]:
-    """Every exchange of two of the shots."""
+    """All orders that exchange two shots."""
     found = []
     for i, j in combinations(range(shots), 2):
         order = list(range(shots))
@@ -138,18 +139,18 @@ def _exchanged(shots: int) -> list[tuple[int, ...]]:
     return found
 
 
-def _misfit(at: OutlineBand, angle: Floats) -> float:
-    """Median relative residual of more than three shots; 1 for three, which always fit."""
+def _misfit(band: OutlineBand, angle: Floats) -> float:
+    """Median relative residual of more than three shots; 1 for three shots, which always fit."""
     if len(angle) < 4:
         return 1.0
     weights = mueller.analyzer(angle)
-    stokes = np.linalg.lstsq(weights, at.light, rcond=None)[0]
-    residual = np.linalg.norm(at.light - weights @ stokes, axis=0) / np.maximum(at.light.sum(0), 1e-9)
+    stokes = np.linalg.lstsq(weights, band.light, rcond=None)[0]
+    residual = np.linalg.norm(band.light - weights @ stokes, axis=0) / np.maximum(band.light.sum(0), 1e-9)
     return float(np.median(residual)) + 1e-4
 
 
 def _sigma_of_difference(one: Floats, one_weight: Floats, other: Floats, other_weight: Floats) -> float:
-    """1σ of Σone/Σone_weight − Σother/Σother_weight, sums over sectors (24,); 1 for fewer than two sectors."""
+    """1σ of Σone/Σone_weight − Σother/Σother_weight, sums over sectors (24,); 1 with fewer than two sectors."""
     used = np.flatnonzero(one_weight + other_weight)
     if len(used) < 2:
         return 1.0
@@ -161,10 +162,10 @@ def _sigma_of_difference(one: Floats, one_weight: Floats, other: Floats, other_w
 
 
 def turned_shot(light: Floats, row: NDArray[np.int_], angle: Floats, gain_sigma: Floats) -> TurnedShot:
-    """The single turn that more than three shots ask for beyond its error; none for three shots, or few cells.
+    """A significant turn of a single shot among more than three; none for three shots or too few cells.
 
-    light (K, P) are means of small cells of the object without their gains, row (P,) the row of each (neighbors fall
-    into the same part), angle (K,) rad as stated, gain_sigma (K,) 1σ of each gain.
+    light (K, P) are means of small cells of the object, divided by the gains; row (P,) is the row of each cell:
+    neighbors belong to the same part. angle (K,) rad are the stated angles, gain_sigma (K,) 1σ of the gains.
     """
     shots = len(angle)
     if shots < 4 or light.shape[1] < _LEAST_CELLS:
@@ -182,8 +183,10 @@ def turned_shot(light: Floats, row: NDArray[np.int_], angle: Floats, gain_sigma:
     alike = [k for k in range(shots) if fits[k].gained >= _ALIKE * most]
     alike.sort(key=lambda k: -abs(fits[k].turn))  # a small turn of one shot can be a large one of another
     found = fits[alike[0]]
-    # An error of one angle is a greater one of another to which the closure is less sensitive.
-    sensitivity = np.linalg.norm(_free(angle), axis=0) * np.sqrt((_change_per_rad(light, angle) ** 2).mean(axis=1))
+    # An error of one angle looks like a larger error of another, to which the residual is less sensitive.
+    sensitivity = np.linalg.norm(_complement(angle), axis=0) * np.sqrt(
+        (_change_per_rad(light, angle) ** 2).mean(axis=1)
+    )
     by_angles = _ANGLE_ERROR * float(np.linalg.norm(sensitivity) / max(sensitivity[alike[0]], 1e-9))
     sigma = float(np.hypot(found.sigma, by_angles))
     if found.gained < _LEAST_GAIN * found.stated or abs(found.turn) < _LEAST_SIGMAS * sigma:
@@ -200,7 +203,7 @@ class _TurnFit:
 
 
 def _far_turns(light: Floats, angle: Floats) -> list[tuple[int, float]]:
-    """Great turns (shot, rad) that leave next to no residual of closure."""
+    """Large turns (shot, rad) that remove most of the residual."""
     stated = _median_residual(light, angle)
     found = []
     for k in range(len(angle)):
@@ -212,11 +215,12 @@ def _far_turns(light: Floats, angle: Floats) -> list[tuple[int, float]]:
 
 
 def _median_residual(light: Floats, angle: Floats) -> float:
-    return float(np.median(np.linalg.norm(_free(angle) @ light, axis=0)))
+    """Median length of the part of light (K, P) outside the space of shots at these angles."""
+    return float(np.median(np.linalg.norm(_complement(angle) @ light, axis=0)))
 
 
-def _free(angle: Floats) -> Floats:
-    """N (K − 3, K), across the space of shots at these angles."""
+def _complement(angle: Floats) -> Floats:
+    """N (K − 3, K), the orthogonal complement of the space of shots at these angles."""
     return np.asarray(np.linalg.svd(mueller.analyzer(angle))[0][:, 3:].T)
 
 
@@ -227,59 +231,59 @@ def _change_per_rad(light: Floats, angle: Floats) -> Floats:
 
 
 def _fit_turn(k: int, start: float, light: Floats, angle: Floats, part: NDArray[np.intp], prior: Floats) -> _TurnFit:
-    """Gains and one turn of shot k, after a turn by `start` rad, by least squares with biweights."""
+    """Fit the gains and the turn of shot k, starting from a turn of `start` rad, by least squares with biweights."""
     angle = angle + start * np.eye(len(angle))[k]
-    free = _free(angle)
+    free = _complement(angle)
     residual = free @ light  # (K − 3, P)
     by_turn = free[:, k, None] * _change_per_rad(light, angle)[k]
     columns = np.concatenate([free[:, None] * light.T, by_turn[..., None]], axis=2)  # (K − 3, P, K + 1)
     size = columns.shape[2]
     ridge = 1e-12 * np.eye(size)
     weight: Floats = np.ones(residual.shape[1])
-    for _ in range(4):  # moved edges and highlights close with no angle
+    for _ in range(4):  # biweights: moved edges and highlights fit no angle
         weighted = columns * weight[:, None]
         square = np.einsum("npi,npj->ij", weighted, columns, optimize=True)
         right = np.einsum("npi,np->i", weighted, residual)
         noise = float((weight * (residual**2).sum(0)).sum() / max(weight.sum(), 1e-9))
-        held = np.zeros((size, size))
-        held[:-1, :-1] = prior * noise
-        found = np.linalg.solve(square + held + ridge, right)
+        by_prior = np.zeros((size, size))
+        by_prior[:-1, :-1] = prior * noise
+        found = np.linalg.solve(square + by_prior + ridge, right)
         off = np.linalg.norm(residual - columns @ found, axis=0)
         weight = biweight(off, spread(off))
     total = float((weight * (residual**2).sum(0)).sum())
-    gains_alone = np.linalg.solve((square + held + ridge)[:-1, :-1], right[:-1])
+    gains_alone = np.linalg.solve((square + by_prior + ridge)[:-1, :-1], right[:-1])
     stated = total - float(right[:-1] @ gains_alone)
     without = []
     for p in np.unique(part):
         some = part != p
-        normal = np.einsum("npi,npj->ij", weighted[:, some], columns[:, some], optimize=True) + held
+        normal = np.einsum("npi,npj->ij", weighted[:, some], columns[:, some], optimize=True) + by_prior
         without.append(
             np.linalg.solve(normal + ridge, np.einsum("npi,np->i", weighted[:, some], residual[:, some]))[-1]
         )
-    by_noise = np.sqrt(noise * np.linalg.inv(square + held + ridge)[-1, -1])
+    by_noise = np.sqrt(noise * np.linalg.inv(square + by_prior + ridge)[-1, -1])
     sigma = float(np.hypot(jackknife(np.array(without)), by_noise))
     return _TurnFit(start + float(found[-1]), sigma, stated, stated - (total - float(right @ found)))
 
 
 @dataclass(frozen=True)
 class FoundAngles:
-    """Angles that nobody noted."""
+    """Unknown angles that were found."""
 
     angle: Floats  # (K,) rad, in 0…π
     sigma: float  # rad, 1σ of each; π/2 where nothing is known
 
 
-def find(at: OutlineBand, cells: Floats, row: NDArray[np.int_]) -> FoundAngles:
-    """The angles that outline and inside support together, of four or more shots without their gains.
+def find(band: OutlineBand, cells: Floats, row: NDArray[np.int_]) -> FoundAngles:
+    """Find the angles of four or more shots, divided by their gains, from the outline and the inside of the object.
 
-    cells (K, P) are means of small blocks of the inside, row (P,) the row of each; neighbors share their errors. The
-    outline counts by parts of equal φ, whose sums obey the same law, the inside by its distance from the space that
-    A(θ) spans, each by its own scatter. The error joins the jackknife over sides and over parts of the inside, the
-    change when the outline is believed more or less, and the distance to other solutions that fit as well.
+    cells (K, P) are means of small blocks of the inside, row (P,) the row of each block; neighbors have common errors.
+    The outline is summed over bins of φ, and the residual of the inside is its distance from the column space of A(θ);
+    both are weighted by their scatter. The error combines the jackknife over parts of outline and inside, the change
+    with the assumed 1σ of the outline, and the distance to other solutions that fit equally well.
     """
     shots = len(cells)
     unknown = FoundAngles(np.zeros(shots), np.pi / 2)
-    around, part = _by_direction(at)
+    around, part = _by_direction(band)
     lit = around.min(axis=1) > 0
     if lit.sum() < _LEAST_BINS or cells.shape[1] < 10 * shots:
         return unknown
@@ -304,19 +308,19 @@ def find(at: OutlineBand, cells: Floats, row: NDArray[np.int_]) -> FoundAngles:
     return FoundAngles(angle % np.pi, min(float(np.sqrt(_FLOOR**2 + variance.max() + elsewhere**2)), np.pi / 2))
 
 
-def _by_direction(at: OutlineBand) -> tuple[Floats, Floats]:
-    """Light of the outline summed over bins of its direction, (B, K), and those directions (B,) rad."""
-    number = np.floor(at.azimuth / (2 * np.pi) * _BINS).astype(int) % _BINS
-    light = np.stack([np.bincount(number, shot, _BINS) for shot in at.light], axis=1).astype(np.float64)
-    weight = at.light.sum(axis=0)
-    sums = [np.bincount(number, weight * wave, _BINS) for wave in (np.cos(at.azimuth), np.sin(at.azimuth))]
+def _by_direction(band: OutlineBand) -> tuple[Floats, Floats]:
+    """Light of the outline summed over bins of its direction (B, K), and the mean directions (B,) rad."""
+    number = np.floor(band.azimuth / (2 * np.pi) * _BINS).astype(int) % _BINS
+    light = np.stack([np.bincount(number, shot, _BINS) for shot in band.light], axis=1).astype(np.float64)
+    weight = band.light.sum(axis=0)
+    sums = [np.bincount(number, weight * wave, _BINS) for wave in (np.cos(band.azimuth), np.sin(band.azimuth))]
     return light, np.arctan2(sums[1], sums[0])
 
 
 def _condensed(cells: Floats) -> Floats:
-    """(K, K) with the same distances from any span as all cells (K, P), each relative to its light.
+    """A matrix (K, K) with the same sum of squared distances from any subspace as the cells (K, P).
 
-    Their mean is subtracted, for errors of the gains act upon it.
+    Each cell is relative to its light. The mean over the cells is subtracted, because errors of the gains affect it.
     """
     relative = cells / cells.mean(axis=0)
     relative = relative - relative.mean(axis=1, keepdims=True)
@@ -325,12 +329,13 @@ def _condensed(cells: Floats) -> Floats:
 
 
 def _starts(shots: int) -> list[Floats]:
+    """Random angles (K,) rad to start from."""
     random = np.random.default_rng(outline.SECTORS)
     return [random.uniform(0, np.pi, shots) for _ in range(_STARTS)]
 
 
 def _best(ends: list[tuple[float, Floats]]) -> list[tuple[float, Floats]]:
-    """Misfits and angles, the best first, each once."""
+    """Distinct solutions (misfit, angles), the best first."""
     found: list[tuple[float, Floats]] = []
     for cost, angle in sorted(ends, key=lambda end: end[0]):
         if np.isfinite(cost) and all(np.abs(_difference(angle, known)).max() > np.radians(0.2) for _, known in found):
@@ -341,9 +346,9 @@ def _best(ends: list[tuple[float, Floats]]) -> list[tuple[float, Floats]]:
 def _solve(
     around: Floats, part: Floats, inside: Floats, start: Floats, until: float, law: float = _LAW
 ) -> tuple[float, Floats]:
-    """Misfit and angles (K,) of least squares from a start; of two solutions, 90° from one another, the diffuse one."""
+    """Misfit and angles (K,) by least squares from a start; of two solutions 90° from each other, the diffuse one."""
     relative = around / around.mean(axis=1, keepdims=True)
-    from scipy.optimize import least_squares  # here: importing it costs .3 s of every start
+    from scipy.optimize import least_squares  # here: the import takes 0.3 s
 
     end = least_squares(_residual, start, args=(relative, part, inside, law), method="lm", ftol=until, max_nfev=150)
     along = np.cos(2 * (part[:, None] - end.x))
@@ -353,7 +358,7 @@ def _solve(
 
 
 def _residual(angle: Floats, relative: Floats, part: Floats, inside: Floats, law: float) -> Floats:
-    """The outline's light outside the span of 1 and cos 2(φ − θ), and the inside's outside A(θ), over their 1σ."""
+    """Residuals over their 1σ: outline outside the span of 1 and cos 2(φ − θ), inside outside that of A(θ)."""
     ones = np.ones(len(angle)) / np.sqrt(len(angle))
     wave = np.cos(2 * (part[:, None] - angle))
     wave = wave - (wave @ ones)[:, None] * ones
@@ -367,5 +372,5 @@ def _residual(angle: Floats, relative: Floats, part: Floats, inside: Floats, law
 
 
 def _difference(a: Floats, b: Floats) -> Floats:
-    """From axis b to axis a, −π/2…π/2."""
+    """Angles from axes b to axes a, −π/2…π/2."""
     return np.asarray((a - b + np.pi / 2) % np.pi - np.pi / 2)

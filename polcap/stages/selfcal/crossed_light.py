@@ -1,9 +1,9 @@
-"""The factor between a crossed shot's light and S0, by the chart, else by the object.
+"""Calibrates the factor from the cross-polarized shot's light to S0, by the chart or by the object.
 
-The flash behind a polarizer has another energy, and diffuse light is halved once more before the lens. So the
-factor is measured where nothing is mirrored: on a chart's matt greys, or on the object, where S0 over the crossed
-shot's light is least. Gloss only adds to S0; over most of an object it adds little, and the ratios pile up there. The
-object's own factor errs by about 3 %: a wide, even gloss is part of it.
+The flash behind a polarizer has another energy, and the polarizer at the lens halves diffuse light once more. So the
+factor is measured without mirror reflection: on a chart's matt grey patches, or on the object where the ratio of S0 to
+the crossed shot's light is smallest. Gloss only adds to S0. On most of an object it adds little, so most ratios are
+close to the smallest. The factor from an object has an error of about 3 %, because it includes wide, uniform gloss.
 """
 
 import cv2
@@ -16,8 +16,8 @@ from polcap.optics.warp import warp
 from polcap.stages.selfcal import grey_patches
 from polcap.stages.selfcal.object_gains import ObjectShots
 
-_BLUR_PX = 2.0  # noise is averaged before the ratio is taken
-_SHORTEST = 0.25  # share of the pixels with the most similar ratios: they have hardly any gloss
+_BLUR_PX = 2.0  # 1σ; averages noise before the ratio
+_SHORTEST = 0.25  # share of the pixels, with the most similar ratios: they have hardly any gloss
 _LEAST_PX = 100
 
 
@@ -29,7 +29,7 @@ def measure(
     gain: Floats,
     angle: Floats,
 ) -> Floats | None:
-    """The factor (3,) of a crossed shot, if any; of registered shots with gains (K, 3) at angles (K,) rad."""
+    """Factor (3,) of the crossed shot, or None, from registered shots with gains (K, 3) at angles (K,) rad."""
     if radiance.crossed is None or alignment.crossed is None:
         return None
     by_chart = grey_patches.crossed_factor(radiance, alignment, color, gain)
@@ -57,7 +57,7 @@ def measure(
 
 
 def _closest(ratio: Floats) -> NDArray[np.intp]:
-    """Indices of the ratios (N,) in the shortest interval that holds `_SHORTEST` of them."""
+    """Indices of the ratios (N,) in the shortest interval that contains the share `_SHORTEST` of them."""
     order = np.argsort(ratio)
     count = max(int(_SHORTEST * len(ratio)), 2)
     width = ratio[order[count - 1 :]] - ratio[order[: len(ratio) - count + 1]]

@@ -1,9 +1,9 @@
-"""Gains of the shots from a chart's grey patches, and the chart's gloss.
+"""Gains of the shots from a chart's grey patches, and the gloss of the chart.
 
-A matt patch is unpolarized: its light is the same in every shot but for the gain. Gloss adds light that is the same
-on dark and light patches, and polarized where the chart does not face flash and camera. So the ratio of two
-shots against 1/(light of the patch) is a straight line: its height at 0 is the gain, its slope the chart's gloss.
-Patches that white balance left out (hidden, in shade, shining) do not count.
+A matt patch is unpolarized: its light in two shots differs only by the gain. Gloss adds the same light to dark and
+bright patches, and this light is polarized if the chart does not face flash and camera. So the ratio of two shots is a
+line over 1/(light of the patch): its value at 0 is the gain, its slope the gloss of the chart. Patches that white
+balance excluded (hidden, in shade, glossy) are not used.
 """
 
 from dataclasses import dataclass
@@ -15,27 +15,27 @@ from polcap.images import Alignment, AngleStack, Bools, ColorCalibration, Floats
 from polcap.optics.projection import transform_points
 
 _GREYS = (18, 19, 20, 21, 22, 23)  # white to black
-_LIGHT = 4  # the first so many serve for the gains; the darker two reflect 9 and 3 % and are mostly noise
-_REFLECTANCE = np.array([0.900, 0.591, 0.362, 0.198])  # of the light ones, as the chart's maker states them
-_SCATTER = 0.001  # between patches, of print, registration, falling light: gains by them err by .0009 (decision 6)
+_LIGHT = 4  # number of light patches, used for the gains; the two dark ones reflect 9 and 3 % and are mostly noise
+_REFLECTANCE = np.array([0.900, 0.591, 0.362, 0.198])  # of the light patches, from the chart's maker
+_SCATTER = 0.001  # between patches, by print, registration and falloff; measured gains err by 0.0009 (decision 6)
 _LEAST_PX = 9  # of a patch
-_SURE = 4.0  # σ beyond which gloss is believed
+_SURE = 4.0  # least significance of gloss, σ
 
 
 @dataclass(frozen=True)
 class GreyPatches:
-    """Gains by the grey patches."""
+    """Gains from the grey patches, with the linearity and gloss of the chart."""
 
     gain: Floats  # (K, 3)
     sigma: Floats  # (K, 3) 1σ
-    slope: float  # of ln light over ln reflectance from white to neutral 5; 1: linear; NaN: fewer than three patches
-    gloss: float  # greatest part of a shot's ratio on the white patch that is the chart's gloss, beyond 4σ
+    slope: float  # of ln light over ln reflectance, white to neutral 5; 1: linear; NaN: fewer than three patches
+    gloss: float  # largest part of a ratio of shots on the white patch that comes from gloss, minus 4σ
 
 
 def measure(radiance: AngleStack, alignment: Alignment, color: ColorCalibration) -> GreyPatches | None:
-    """Gains from the light grey patches; None without a chart, or where all of them are hidden or clipped.
+    """Gains from the light grey patches; None without a chart, or if all of them are hidden or clipped.
 
-    Each patch is averaged in every shot's own pixels; patches are pooled by their light.
+    Each patch is averaged in the pixels of each shot; the patches are then summed.
     """
     if color.place is None:
         return None
@@ -62,7 +62,7 @@ def measure(radiance: AngleStack, alignment: Alignment, color: ColorCalibration)
 
 
 def crossed_factor(radiance: AngleStack, alignment: Alignment, color: ColorCalibration, gain: Floats) -> Floats | None:
-    """S0 of the light greys over the crossed shot's light (3,); None for fewer than two patches. gain (K, 3)."""
+    """S0 of the light patches over the crossed shot's light (3,), for gains (K, 3); None for fewer than two patches."""
     if color.place is None or radiance.crossed is None or alignment.crossed is None:
         return None
     ratios = []
@@ -77,7 +77,7 @@ def crossed_factor(radiance: AngleStack, alignment: Alignment, color: ColorCalib
 
 
 def _serving(color: ColorCalibration) -> Bools:
-    """The grey patches (6,) that white balance used."""
+    """Whether white balance used each grey patch (6,)."""
     if color.patches is None or color.patches.use is None:
         return np.ones(len(_GREYS), bool)
     return np.asarray(color.patches.use[list(_GREYS)] == 0)
@@ -87,11 +87,11 @@ def _serving(color: ColorCalibration) -> Bools:
 class _Patch:
     mean: Floats  # (3,)
     variance: Floats  # (3,) of the mean
-    sound: bool  # unclipped, of nine pixels or more
+    sound: bool  # unclipped, with nine pixels or more
 
 
 def _patch(picture: MaskedImage, transform: Floats, quad: Floats) -> _Patch:
-    """One shot's pixels inside a quad (4, 2) of the reference grid, one pixel within its edge."""
+    """Mean of a shot's pixels inside a quad (4, 2) px of the reference grid, one pixel or more from its edge."""
     place = transform_points(transform, quad)  # (4, 2) x, y
     height, width = picture.quality.shape
     low = np.clip(np.floor(place.min(axis=0)).astype(int) - 2, 0, [width, height])
@@ -110,14 +110,14 @@ def _patch(picture: MaskedImage, transform: Floats, quad: Floats) -> _Patch:
 
 
 def _slope(light: Floats, usable: Bools) -> float:
-    """Slope of ln light (4,) over ln reflectance; NaN for fewer than three patches."""
+    """Slope of ln light (4,) over ln reflectance; NaN for fewer than three usable patches."""
     if usable.sum() < 3:
         return float("nan")
     return float(np.polyfit(np.log(_REFLECTANCE[usable]), np.log(light[usable]), 1)[0])
 
 
 def _gloss(light: Floats, variance: Floats) -> float:
-    """Part of a shot's ratio on the lightest patch that is gloss, beyond 4σ; light and variance (K, P)."""
+    """Largest part of a ratio of shots on the lightest patch that is gloss, minus 4σ; light and variance (K, P)."""
     if light.shape[1] < 4:
         return 0.0
     ratio = light / light[0]
@@ -137,7 +137,7 @@ def _gloss(light: Floats, variance: Floats) -> float:
 
 
 def _one_for_all_channels(gain: Floats, sigma: Floats) -> tuple[Floats, Floats]:
-    """One gain for all channels of a shot where they agree within 3σ: most flashes do not change their color."""
+    """One gain for all channels of a shot if they agree within 3σ: the color of most flashes does not change."""
     weight = 1 / np.maximum(sigma, 1e-6) ** 2
     mean = (gain * weight).sum(1, keepdims=True) / weight.sum(1, keepdims=True)
     agree = (np.abs(gain - mean) <= 3 * np.maximum(sigma, 1e-6)).all(1, keepdims=True)

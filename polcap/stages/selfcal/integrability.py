@@ -1,15 +1,15 @@
-"""Gains from integrability: the slopes of every surface are those of a height, whatever its shape and color.
+"""Gains of the shots from integrability: the slopes of any surface are derivatives of one height field.
 
-A gain that is off by one per cent adds the same wrong polarization δ to every pixel. Let q = (S1 + i S2)/S0, and
-w = tan²θ e^{2iφ} the surface that it implies, so that z = √w = h_x + i h_y are the slopes of its height h. Then the
-derivative z_ζ = ½(∂x − i∂y) z = ½ Δh is real, and without a square root, which has no sign,
+An error of a gain adds the same wrong polarization δ to every pixel. Let q = (S1 + i S2)/S0, and w = tan²θ e^{2iφ} be
+computed from it, so that z = √w = h_x + i h_y are the slopes of the height h. Then the derivative
+z_ζ = ½(∂x − i∂y) z = ½ Δh is real. The sign of the square root is unknown, so the law is used in the form
 
     Im(w_ζ² w*) = 0,   for w = z², w_ζ = 2 z z_ζ, w_ζ² w* = 4 |z|⁴ z_ζ².
 
-Each pixel with some curvature is an equation for the gains; near facing pixels, where w is small, δ weighs most. No
-outline is needed, and nothing has to face the camera. Where the sum is not positive, the polarization is no diffuse
-reflection's: the gains are unknown. A common turn of the angles turns w_ζ² w* by the same for all pixels: here it is
-free, `ring_zero.by_slopes` solves for it.
+Each pixel with curvature gives an equation for the gains. The effect of δ is largest near facing pixels, where w is
+small. Neither an outline nor a facing surface is needed. If the sum of w_ζ² w* is not positive, the polarization does
+not come from diffuse reflection, and the gains are unknown. A common turn of the angles turns w_ζ² w* by the same angle
+in all pixels: it is a free parameter here, and `ring_zero.by_slopes` measures it.
 
 References
 ----------
@@ -29,28 +29,28 @@ from polcap.optics.robust import biweight, jackknife, spread
 from polcap.stages.selfcal.object_gains import GainEstimate, unknown
 
 _SHOTS = 3
-_SIDE = 110.0  # px; the root of the object's area is reduced to it, where it is larger: noise is averaged before slopes
+_SIDE = 110.0  # px; larger objects are averaged down to this root of their area, to average noise
 BLUR = 2.0  # px of the reduced picture, 1σ of the Gaussian whose derivative is taken
 _LEAST = 300  # pixels of the reduced object
 _IOR = 1.5
-_STEEPEST = 0.25  # DoLP up to which diffuse reflection is believed: 64° for index 1.5
-_NEAR = (0.6, 0.6, 0.6, 0.3, 0.3, *[0.15] * 8)  # |w| of the pixels that count, from step to step: from far starts too
+_STEEPEST = 0.25  # largest DoLP that is used: 64° for index 1.5
+_NEAR = (0.6, 0.6, 0.6, 0.3, 0.3, *[0.15] * 8)  # largest |w| of the pixels used in each step; decreasing
 _NOISE = 0.012  # of w, 1σ
 _LAW = 0.3  # of w, relative: highlights and other indices
 _SLOPE_NOISE = 0.15  # of w_ζ, relative to its median
 _STEP = 1e-4
-_MOST_STEP = 0.03  # in one go
+_MOST_STEP = 0.03  # largest step
 COHERENT = 0.25  # least share of w_ζ² w* that is positive for diffuse reflection
 _PARTS = 4  # to a side of the object, left out one at a time
-_ERROR = 0.0013  # of gains on simulated objects, besides their scatter (decision 6)
-_TIMES = 2.0  # their error over the scatter of the parts (decision 6)
+_ERROR = 0.0013  # least error, from simulated objects (decision 6)
+_TIMES = 2.0  # error over the scatter of the parts (decision 6)
 
 
 def gains(light: Floats, usable: Bools, angle: Floats, start: Floats) -> GainEstimate:
-    """Gains (K,) at which the slopes are those of a surface; unknown unless K = 3.
+    """Gains (K,) with which the slopes are those of a surface; unknown unless K = 3.
 
-    light (K, H, W) is registered and little blurred, usable (H, W) the object's sound pixels, angle (K,) rad, start
-    (K,) first guesses. Of more than three gains some leave S0, S1 and S2 as they are: `object_gains.closure`.
+    light (K, H, W) is registered and slightly blurred, usable (H, W) are the object's unflagged pixels, angle (K,) rad,
+    start (K,) first guesses. With more than three shots, use `object_gains.closure`.
     """
     shots = len(angle)
     slopes = reduced_slopes(light, usable, angle) if shots == _SHOTS else None
@@ -61,7 +61,7 @@ def gains(light: Floats, usable: Bools, angle: Floats, start: Floats) -> GainEst
         found = linearize(slopes, unknowns, near)
         if near < _NEAR[0]:
             step = found.step(found.weight)
-        else:  # far from the answer the turn would absorb the error of the gains
+        else:  # far from the solution the turn would absorb the error of the gains
             step = np.append(replace(found, rows=found.rows[:, :-1]).step(found.weight), 0.0)
         unknowns = unknowns + np.clip(step, -_MOST_STEP, _MOST_STEP)
         if near == _NEAR[-1] and np.abs(step).max() < _STEP / 10:
@@ -76,14 +76,14 @@ def gains(light: Floats, usable: Bools, angle: Floats, start: Floats) -> GainEst
 
 @dataclass(frozen=True)
 class SlopeField:
-    """The shots reduced to about 110 px a side, where derivatives can be taken."""
+    """The shots averaged down to about 110 px a side, and the pixels with derivatives."""
 
     light: Floats  # (K, h, w)
     inside: Bools  # (h, w)
     angle: Floats  # (K,) rad
 
     def at(self, unknowns: Floats) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-        """w_ζ² w*, w and w_ζ (N,) for gains after the first (K − 1,) and a common turn of the angles, rad."""
+        """w_ζ² w*, w and w_ζ (N,) for unknowns (K,): gains after the first, and the common turn of the angles [rad]."""
         gain = np.concatenate([[1.0], unknowns[:-1]])
         s0, s1, s2 = np.einsum(
             "jk,khw->jhw", np.linalg.pinv(mueller.analyzer(self.angle)), self.light / gain[:, None, None]
@@ -97,7 +97,7 @@ class SlopeField:
 
 @dataclass(frozen=True)
 class Equations:
-    """Im(w_ζ² w*) = 0 about a guess, in units of its noise."""
+    """Im(w_ζ² w*) = 0, linearized about a guess, in units of its noise."""
 
     residual: Floats  # (N,)
     rows: Floats  # (N, K) derivatives by the unknowns
@@ -105,7 +105,7 @@ class Equations:
     product: NDArray[Any]  # (N,) w_ζ² w*
 
     def step(self, weight: Floats, prior: Floats | float = 0.0, moved: Floats | float = 0.0) -> Floats:
-        """The least-squares step (K,); weights `prior` (K,) hold unknowns that have `moved` (K,) from their start."""
+        """The least-squares step (K,); `prior` (K,) are weights that pull unknowns back by `moved` (K,)."""
         square = self.rows.T @ (self.rows * weight[:, None]) + prior * np.eye(self.rows.shape[1])
         damped = square + (1e-9 * np.trace(square) + 1e-12) * np.eye(len(square))
         return np.asarray(np.linalg.solve(damped, -self.rows.T @ (self.residual * weight) - prior * moved))
@@ -118,7 +118,7 @@ class Equations:
 
 
 def reduced_slopes(light: Floats, usable: Bools, angle: Floats) -> SlopeField | None:
-    """Means of blocks of the shots, and where their derivatives exist; None where that is next to nothing.
+    """Average the shots down, and find the pixels with derivatives; None if there are too few.
 
     light (K, H, W), usable (H, W) and angle (K,) as of `gains`.
     """
@@ -133,7 +133,7 @@ def reduced_slopes(light: Floats, usable: Bools, angle: Floats) -> SlopeField | 
 
 
 def linearize(slopes: SlopeField, unknowns: Floats, near: float) -> Equations:
-    """The equations about `unknowns` (K,), of the pixels with |w| < near."""
+    """The equations about `unknowns` (K,), for pixels with |w| < near."""
     product, w, slope = slopes.at(unknowns)
     length, size = np.abs(slope), np.abs(w)
     noise = 2 * length * size * _SLOPE_NOISE * np.median(length), length**2 * (_NOISE + _LAW * size)
@@ -146,7 +146,7 @@ def linearize(slopes: SlopeField, unknowns: Floats, near: float) -> Equations:
 
 
 def part_of(inside: Bools) -> NDArray[np.int_]:
-    """The part, of 4 × 4, of each of the pixels (N,)."""
+    """Index of the part, of 4 × 4, for each pixel (N,)."""
     y, x = np.nonzero(inside)
     rows, columns = ((axis - axis.min()) * _PARTS // (np.ptp(axis) + 1) for axis in (y, x))
     return np.asarray(rows * _PARTS + columns)

@@ -1,15 +1,15 @@
-"""Gains of the shots from the object itself: by closure, by the outline, by the pixels that face the camera.
+"""Gains of the shots from the object: by closure, by its outline, and by pixels that face the camera.
 
 With h = 1/gain, hₖIₖ = ½(S0 + S1 cos 2θₖ + S2 sin 2θₖ) holds in every pixel:
 
-* closure: K > 3 shots lie in a space of three dimensions, so K − 3 sums N·(h∘I) vanish;
-* outline: where the surface turns edge-on the polarization points across the contour of azimuth φ, so the shots
-  lie in the span of 1 and cos 2(θₖ − φ), and K − 2 sums vanish;
-* facing pixels: a surface that faces the camera is unpolarized, so there hₖIₖ is the same in all shots.
+* closure: the h∘I of K > 3 shots are in a space of three dimensions, so K − 3 sums N·(h∘I) are 0;
+* outline: at the outline, polarization is along the contour's normal of azimuth φ, so the h∘I are in the span of 1 and
+  cos 2(θₖ − φ), and K − 2 sums are 0;
+* facing pixels: a surface that faces the camera is unpolarized, so hₖIₖ is the same in all shots.
 
-The first two are least squares for the null vector h; their error is the scatter between parts of the object. The
-third fails where nothing faces the camera; several peaks of the ratios are the sign of it. A fourth is in
-`integrability`.
+The first two find the null vector h by least squares; their error is the scatter between parts of the object. The third
+fails if no surface faces the camera; then the ratios of the shots have several peaks. `integrability` is a fourth
+method.
 
 References
 ----------
@@ -31,28 +31,34 @@ from polcap.optics.outline import OutlineBand
 from polcap.optics.robust import biweight, jackknife, spread
 from polcap.optics.warp import warp
 
-_KERNELS = (0.04, 0.02, 0.01, 0.007, 0.005)  # of the mean shift, of S1/S0; ended at .01 a vase errs 12 × (decision 6)
-_KERNEL_REACH = 8.0  # widths; beyond, less one that a climb may have moved, a Gaussian is under 10⁻¹⁰
+_KERNELS = (
+    0.04,
+    0.02,
+    0.01,
+    0.007,
+    0.005,
+)  # widths of the mean shift, in S1/S0; with 0.01 as the last, a vase errs 12 × (decision 6)
+_KERNEL_REACH = 8.0  # widths; a Gaussian is below 10⁻¹⁰ beyond, also after a climb of one width
 _STARTS = 12  # of the mean shift, besides the median and equal gains
-_PEAK_WIDTH = 0.02  # kernel in which peaks are compared, of S1/S0; set by hand
+_PEAK_WIDTH = 0.02  # width of the kernel that compares peaks, in S1/S0; set by hand
 _CELL_PX = 6  # side of the blocks that closure averages: three times the blur of the light
 _BLUR_PX = 2.0  # 1σ of the blur of the light
-_PARTS = 12  # of the object, left out one at a time: gives a 1σ to a fifth of itself
-_ANGLE_ERROR = np.radians(0.5)  # 1σ of a ring set against its mark: half a degree, the step of its scale; assumed
+_PARTS = 12  # of the object, left out one at a time: gives 1σ to 20 %
+_ANGLE_ERROR = np.radians(0.5)  # 1σ of each angle, half a degree, the step of the ring's scale; assumed
 _LEAST_RIM, _MOST_RIM = 200, 20_000  # pixels of the outline
-_FACING_ERROR = 0.003  # error of facing pixels on simulated objects, whatever their scatter (decision 6)
-_ONE_SIDED = 0.02  # the same where slopes lie on one side of them only, as a leaning ridge's (decision 6)
-_RING = (0.006, 0.02)  # polarization of the slopes that are tested for that
-_OUTLINE_ERROR = 0.002  # of the outline, besides its own scatter
-_OUTLINE_TIMES = 3.0  # its error over the scatter of its parts: neighbors share their errors (decision 6)
-_CLOSURE_ERROR = 0.001  # registration and interpolation; assumed, the angles' error is most of its doubt (decision 20)
-_SURPRISE = 3.0  # σ from the prior beyond which gains are not averaged with it
-_CERTAIN = 10.0  # σ of its own error from 1 beyond which such a gain is applied: the flash failed
+_FACING_ERROR = 0.003  # least error by facing pixels, from simulated objects (decision 6)
+_ONE_SIDED = 0.02  # the error if all slopes are on one side of the facing pixels (decision 6)
+_RING = (0.006, 0.02)  # DoLP of the slopes that are tested for that
+_OUTLINE_ERROR = 0.002  # least error by the outline
+_OUTLINE_TIMES = 3.0  # error by the outline over the scatter of its parts: neighbors have common errors (decision 6)
+_CLOSURE_ERROR = 0.001  # least error by closure, from registration; assumed. The angles add more (decision 20)
+_SURPRISE = 3.0  # σ; gains farther from the prior are not averaged with it
+_CERTAIN = 10.0  # σ of its own error; such a gain is applied if it is farther from 1: the flash failed
 
 
 @dataclass(frozen=True)
 class GainEstimate:
-    """Gains of the shots relative to the first."""
+    """Gains of the shots relative to the first shot."""
 
     gain: Floats  # (K,)
     sigma: Floats  # (K,) 1σ; inf: unknown
@@ -64,15 +70,15 @@ class ObjectShots:
 
     value: Floats  # (K, h, w, 3)
     light: Floats  # (K, h, w) sum over channels, blurred by 2 px
-    quality: Bits  # (h, w) 0: sound in every shot
+    quality: Bits  # (h, w) 0: unflagged in every shot
     mask: Bools  # (h, w)
-    inside: Bools  # (h, w) the object's sound pixels, away from its edge where there are enough
+    inside: Bools  # (h, w) the object's unflagged pixels, away from its edge if there are enough
     crop: tuple[int, int, int, int]  # x0, y0, x1, y1 on the reference grid, px
     full: tuple[int, int]  # (H, W) of that grid
 
 
 def register(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> ObjectShots:
-    """The shots on the object's crop."""
+    """Register the shots on the object's crop."""
     x0, y0, x1, y1 = crop = object_.crop
     value = np.stack([warp(v, t, crop, order=1) for v, t in zip(radiance.value, alignment.transform)])
     flagged = [warp(q.astype(np.float32), t, crop, order=1) > 0 for q, t in zip(radiance.quality, alignment.transform)]
@@ -86,12 +92,12 @@ def register(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) ->
 
 
 def unknown(shots: int) -> GainEstimate:
-    """Gains before anything is measured."""
+    """Gains of which nothing is known: 1, with infinite 1σ."""
     return GainEstimate(np.ones(shots), np.where(np.arange(shots) > 0, np.inf, 0.0))
 
 
 def combined(estimates: list[GainEstimate]) -> GainEstimate:
-    """The mean of estimates by their inverse variances; a difference beyond their errors adds to its error."""
+    """Mean of estimates, weighted by inverse variance; differences beyond their errors increase its error."""
     gain = np.stack([one.gain for one in estimates])
     sigma = np.stack([one.sigma for one in estimates])
     weight = 1 / np.maximum(sigma, 1e-6) ** 2
@@ -106,9 +112,9 @@ def combined(estimates: list[GainEstimate]) -> GainEstimate:
 
 
 def with_prior(measured: GainEstimate, prior: float) -> GainEstimate:
-    """Measured gains (K,) averaged with light that repeats within `prior` (1σ).
+    """Measured gains (K,), averaged with gains of 1 with 1σ = `prior`.
 
-    A gain far from 1 with a large error is not applied: its distance from 1 then becomes its error.
+    A gain far from 1 with a large error is replaced by 1, with its distance from 1 as the error.
     """
     later = np.arange(len(measured.gain)) > 0
     sigma = np.where(np.isfinite(measured.sigma), measured.sigma, 1e6)
@@ -124,7 +130,7 @@ def with_prior(measured: GainEstimate, prior: float) -> GainEstimate:
 
 
 def closure(light: Floats, usable: Bools, angle: Floats) -> GainEstimate:
-    """Gains (K,) that let more than three shots (K, H, W) agree; unknown for K = 3."""
+    """Gains (K,) with which more than three shots (K, H, W) are consistent; unknown for K = 3."""
     shots = len(angle)
     if shots < 4:
         return unknown(shots)
@@ -142,7 +148,7 @@ def closure(light: Floats, usable: Bools, angle: Floats) -> GainEstimate:
 
 
 def outline(rim: OutlineBand, angle: Floats) -> GainEstimate:
-    """Gains (K,) for which the polarization of the rim points across the contour; its light includes the gains."""
+    """Gains (K,) with which polarization at the outline is across the contour; `rim.light` includes the gains."""
     shots = len(angle)
     parts = np.unique(rim.sector)
     if len(rim.azimuth) < _LEAST_RIM or len(parts) < _PARTS // 2:
@@ -163,12 +169,12 @@ def outline(rim: OutlineBand, angle: Floats) -> GainEstimate:
 
 
 def facing(light: Floats, usable: Bools, angle: Floats) -> GainEstimate:
-    """Gains (K,) at which the ratios of the shots (K, H, W) pile up; the angles (K,) rad affect the error only.
+    """Gains (K,) at the densest ratios of the shots (K, H, W); the angles (K,) rad affect only the error.
 
-    Over a rounded object the density of (S1, S2)/S0 grows as 1/θ² towards its zero, whatever the albedo. Mean shift
-    with a shrinking kernel climbs there from several places. The peak with most pixels is taken. Other peaks that hold
-    nearly as many add to its error: flat faces, or light from all sides, have many. A leaning ridge has its peak where
-    it leans least, with slopes on one side of it only.
+    On a rounded object the density of (S1, S2)/S0 grows as 1/θ² towards 0, independent of the albedo. Mean shift with a
+    shrinking kernel finds peaks from several starts, and the peak with most pixels is taken. Other peaks with nearly as
+    many pixels increase the error: flat faces and light from all sides have several. The peak of a tilted ridge is
+    wrong; the slopes around it are then all on one side, which increases the error too.
     """
     shots = len(light)
     usable = usable & (light.sum(0) > np.quantile(light.sum(0)[usable], 0.2)) if usable.any() else usable
@@ -201,7 +207,7 @@ def _one_sided(ratio: Floats, angle: Floats) -> float:
 
 
 def _climb(ratio: Floats, start: Floats) -> list[Floats]:
-    """Mean shift over ratios (K, N) from a start (K,): its end for each kernel."""
+    """Mean shift over ratios (K, N) from a start (K,): the end point for each kernel width."""
     at: Floats = start.astype(np.float32)
     found: list[Floats] = []
     for width in _KERNELS:
@@ -221,14 +227,14 @@ def _climb(ratio: Floats, start: Floats) -> list[Floats]:
 
 
 def _near(ratio: Floats, at: Floats, width: float) -> Floats:
-    """Those of the ratios (K, N) that a kernel of this width at a place (K,) reaches, float32."""
+    """The ratios (K, n) float32 within reach of a kernel of this width at a point (K,)."""
     distance = ratio - at[:, None]
     near = np.einsum("kn,kn->n", distance, distance) < (_KERNEL_REACH * width) ** 2
     return np.asarray(ratio[:, near], np.float32)
 
 
 def cells(light: Floats, usable: Bools) -> tuple[Floats, NDArray[np.int_]]:
-    """Means (K, P) of whole blocks inside the object, and the row of blocks of each (P,)."""
+    """Means (K, P) of blocks that are entirely inside the object, and the block row (P,) of each."""
     height, width = (size // _CELL_PX for size in usable.shape)
     cut = np.s_[..., : height * _CELL_PX, : width * _CELL_PX]
     shape = (height, _CELL_PX, width, _CELL_PX)
@@ -241,9 +247,9 @@ def cells(light: Floats, usable: Bools) -> tuple[Floats, NDArray[np.int_]]:
 def _null_vector(
     equations: Callable[[Floats], Floats], angle: Floats, part: NDArray[np.int_], floor: float, times: float = 1.0
 ) -> GainEstimate:
-    """Gains 1/h from the h with h₀ = 1 for which rows (P, C, K) · h are least, by biweight.
+    """Gains 1/h from the h with h₀ = 1 that minimizes rows (P, C, K) · h, by biweights.
 
-    The error: the jackknife over parts, `times` larger, with the effect of an error of each angle, and `floor`.
+    The error combines `times` the jackknife over parts, the effect of an error of each angle, and `floor`.
     """
     rows = equations(angle)
     weight: Floats = np.ones(len(rows))

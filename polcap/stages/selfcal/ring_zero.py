@@ -1,15 +1,15 @@
-"""The error of the polarizer ring's zero, by the object's outline and by the slopes inside it.
+"""Error of the zero of the polarizer's ring, from the object's outline and from the slopes inside it.
 
 Diffuse reflection is polarized along the slope g = tan θ (cos φ, sin φ) of the surface. A slope has no curl: along a
 closed curve inside the outline, ∮ g·t = 0 on any smooth surface, symmetrical or not. A ring whose zero is off by δ
 turns g, and then ∮ g·t / ∮ g·n = tan δ, n pointing out of the curve. Instead of one curve a band of them is taken: the
 contours of a blurred mask. The DoLP serves as tan θ; any weight does on a symmetrical object. The law does not hold
-for hidden parts, sharp edges, reflected light and light thrown from fold to fold. These act differently at different
-depths, so the spread over depths gives the error (decision 26).
+for occluded parts, sharp edges, reflected light and interreflection. Their effects differ with the depth, so the spread
+over depths gives the error (decision 26).
 
 Inside, Im(w_ζ² w*) = 0 (`integrability`) holds for one common turn of the angles only: an error δ turns w_ζ² w* by 2δ
 at every pixel. Contours, edges and highlights are outliers. Neither outline nor symmetry is needed. The gains, which
-act where a surface faces the camera, are solved for as well, held by their own error (decision 26).
+matter where a surface faces the camera, are fitted too, with their error as prior (decision 26).
 """
 
 from functools import partial
@@ -29,27 +29,27 @@ Complexes = NDArray[np.complex128]
 UNKNOWN = RingZero(0.0, np.pi / 2)
 
 # By the outline.
-_RIM_PX = 3.0  # 1σ of the blur of the mask for the outermost contours: as near to the outline as pixels allow
-_FINE_PX = 8.0  # 1σ of a blur in px of the grid that it is made on: an eighth of it is all that the grid adds
+_RIM_PX = 3.0  # 1σ of the mask's blur for the outermost contours
+_FINE_PX = 8.0  # 1σ of a blur in px of the coarser grid on which it is computed
 _DEEPER = (0.1, 0.2)  # further blurs, in radii of the object
-_PLATEAU = 0.3  # radii; the contours of the depth up to here are the last band
+_PLATEAU = 0.3  # radii; the last band has contours of the depth up to this
 _SMOOTH_PX = 1.0  # of the light, inside the object only
 _LEAST_DEPTH_PX = 1.5  # nearer, a pixel is partly backdrop
-_SPREAD_TO_SIGMA = 2.0  # error of the rim's answer over its rms distance from the deeper ones (decision 26)
-_FLOOR = np.radians(0.25)  # where all depths agree (decision 26)
+_SPREAD_TO_SIGMA = 2.0  # error of the outermost result over its rms difference from the deeper ones (decision 26)
+_FLOOR = np.radians(0.25)  # least error (decision 26)
 _LEAST_RIM_PX = 200
-_TURNS = 4  # of the answer into the angles, until it no longer changes
+_TURNS = 4  # iterations
 # By the slopes.
-_STEEPEST = 9.0  # tan²θ of the pixels that count; beyond, the law of diffuse reflection is another
+_STEEPEST = 9.0  # largest tan²θ of the pixels used
 _ROUNDS = 12
-_SETTLED = 1e-5  # change that ends them
-_MOST_STEP = 0.1  # rad, and of a gain, in one go
-_CORRELATED = 2 * np.pi * integrability.BLUR**2  # px that share their noise
-_SLOPES_FLOOR = np.radians(0.1)  # 1σ where all parts agree (decision 26)
+_SETTLED = 1e-5  # a smaller step ends the rounds
+_MOST_STEP = 0.1  # largest step, rad or relative gain
+_CORRELATED = 2 * np.pi * integrability.BLUR**2  # px with common noise
+_SLOPES_FLOOR = np.radians(0.1)  # least 1σ (decision 26)
 
 
 def combined(one: RingZero, other: RingZero) -> RingZero:
-    """The mean of two measurements of one ring; its error is their distance where they contradict one another."""
+    """Weighted mean of two measurements of one ring; its error grows with their difference if they contradict."""
     weight = one.sigma**-2, other.sigma**-2
     offset = (weight[0] * one.offset + weight[1] * other.offset) / sum(weight)
     sigmas = abs(one.offset - other.offset) / float(np.hypot(one.sigma, other.sigma))
@@ -61,8 +61,8 @@ def by_outline(
 ) -> RingZero:
     """The ring's error from the outline of registered shots (K, H, W) without their gains.
 
-    sound (H, W) are the pixels to use, angle (K,) rad as stated, gain_sigma 1σ of the gains, relative. Where the
-    object leaves the picture there is no closed curve, and the error is unknown.
+    sound (H, W) are the pixels to use, angle (K,) rad the stated angles, gain_sigma the relative 1σ of the gains. If
+    the object leaves the picture there is no closed curve, and the result is UNKNOWN.
     """
     margin = int(np.ceil(4 * _RIM_PX))
     light = np.pad(light, ((0, 0), (margin, margin), (margin, margin)))
@@ -102,14 +102,14 @@ def by_outline(
 
 
 def _smoothed(light: Floats, used: Bools) -> Floats:
-    """Shots (K, H, W) blurred over the used pixels alone."""
+    """Shots (K, H, W), blurred over the used pixels only."""
     ok = used.astype(np.float32)
     share = cv2.GaussianBlur(ok, (0, 0), _SMOOTH_PX) + 1e-6
     return np.stack([cv2.GaussianBlur((shot * ok).astype(np.float32), (0, 0), _SMOOTH_PX) / share for shot in light])
 
 
 def _outward(inside: Floats) -> Complexes:
-    """The downward gradient (H, W) as x + iy, y up, of a picture that is larger further in."""
+    """Negative gradient (H, W) as x + iy, y up, of a picture with larger values inside: the outward direction."""
     return np.asarray(-cv2.Sobel(inside, cv2.CV_64F, 1, 0) + 1j * cv2.Sobel(inside, cv2.CV_64F, 0, 1))
 
 
@@ -125,7 +125,7 @@ def _outward_of(mask: Bools, sigma: float) -> Complexes:
 
 
 def _turn(slope: Complexes, outward: Complexes) -> float:
-    """Angle of Σ g conj(out), rad; of the two opposite slopes of an AoLP the one nearer to the way out."""
+    """Angle of Σ g conj(out), rad; of the two slopes of an AoLP, opposite to each other, the outward one is used."""
     across = slope * np.conj(outward)
     real, imaginary = np.ascontiguousarray(across.real), np.ascontiguousarray(across.imag)
     turn = 0.0
@@ -167,7 +167,7 @@ def by_slopes(light: Floats, usable: Bools, angle: Floats, gain_sigma: float) ->
 
 
 def _step(found: integrability.Equations, weight: Floats, moved: Floats, gain_sigma: float) -> Floats:
-    """The step (K,) of gains and turn; gains that `moved` from 1 are held by their 1σ."""
+    """Step (K,) of gains and turn; `moved` is the change of the gains so far, limited by their 1σ."""
     noise = float((weight * found.residual**2).sum() / max(float(weight.sum()), 1e-9))
     prior = np.append(np.full(len(moved) - 1, 1 / max(gain_sigma, 1e-4) ** 2), 0.0) * noise * _CORRELATED
     return found.step(weight, prior, moved)
