@@ -165,7 +165,7 @@ class Steps:
             print(f"{name:14}{'cached' if cached else f'{seconds:.2f} s'}", file=sys.stderr, flush=True)
 
     def frame(self, done: int, total: int) -> None:
-        """So many of so many photographs are done."""
+        """Report that `done` of `total` photographs are done."""
         now = time.monotonic()
         if now - self._last > _QUIET_S:
             self._last = now
@@ -188,7 +188,7 @@ class Bar(Steps):
         self._bar.update(self._task, description=name, advance=0 if seconds is None else 1)
 
     def frame(self, done: int, total: int) -> None:
-        """So many of so many photographs are done."""
+        """Report that `done` of `total` photographs are done."""
         left = self._left(done, total, time.monotonic())
         self._bar.update(self._task, description=f"{done} of {total} frames, {left} left")
 

@@ -138,8 +138,8 @@ class IndirectLight:
     def mirrored(self, rng: np.random.Generator) -> Floats:
         """Mirror reflection (3, M, 3) by facets drawn from the GGX distribution.
 
-        Their index is `facet_ior`: a multiple of the Fresnel curve of the body's index would reflect more than 100 %
-        at grazing angles, where most of this light is.
+        Facets have an index of their own, `facet_ior`, for the F0 of the material. A scaled Fresnel curve of the body's
+        index would reflect more than 100 % at grazing angles.
         """
         places, count = self.places, len(self.places.normal)
         ior = facet_ior(places.specular.mean(axis=1), np.full(count, places.ior))

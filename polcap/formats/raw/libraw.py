@@ -191,7 +191,7 @@ def _counts(path: str, raw: Any) -> tuple[dict[str, Any], worker.Arrays]:
 
 
 def unsupported(shape: tuple[int, ...] | None, rotated: bool = False) -> str:
-    """Why a color filter of this period (rows, columns), or None of a Foveon, cannot be used, and the remedy.
+    """Reason why a color filter of this period (rows, columns) cannot be used, and the remedy; None: a Foveon sensor.
 
     rotated : its rows and columns run at 45° to the picture's.
     """

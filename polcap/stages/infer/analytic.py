@@ -132,7 +132,7 @@ def _azimuth_by_guide(axis: Floats, rays: Floats, normal: Floats, sigma: Floats)
 
 
 def _local(cos_zenith: Floats, phi: Floats, rays: Floats) -> Floats:
-    """Unit normals (H, W, 3) in the frame of each ray from zenith and image azimuth about it."""
+    """Unit normals (H, W, 3) in the frames of the view rays, from zenith and azimuth (H, W)."""
     x, y = frames.axis_across(phi, rays)
     share = np.sqrt(np.maximum(1 - cos_zenith**2, 0) / (x * x + y * y))
     return np.stack([share * x, share * y, cos_zenith], axis=-1)

@@ -43,7 +43,7 @@ def mean_around(
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Means (H, W, 3) of the known pixels about each wanted one (H, W), and the wanted ones without a mean (H, W).
 
-    By the narrowest Gaussian, doubled from 1σ = `blur` px, in which known pixels have a share of `least`.
+    The Gaussian weights start at 1σ = `blur` px and double until known pixels have a share of `least`.
     """
     weight = known.astype(np.float32)
     weighted = (image * weight[..., None]).astype(np.float32)

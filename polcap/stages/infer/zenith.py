@@ -132,8 +132,8 @@ def _sample(pixels: NDArray[np.intp]) -> NDArray[np.intp]:
 def _even_albedo(angles: Floats, light: Floats, laws: DiffuseLaws) -> Floats:
     """Log likelihood (C,): the albedo is the same where zeniths are small and where they are large.
 
-    The pixels are sorted by DoLP into the same ten parts for all candidates. The mean albedo of a part may differ by
-    the scatter within it, over the patches that it holds. Rough bodies shade flatter than smooth ones; the amount is
+    The pixels are sorted by DoLP into the same ten parts for all candidates. The error of a part's mean albedo is its
+    scatter over the root of its number of patches. Rough bodies shade flatter than smooth ones; the amount is
     fitted to make the albedo most even, independently of the polarization. If no candidate fits (cast light, concave
     parts), all are trusted less.
     """
@@ -156,8 +156,8 @@ def _even_albedo(angles: Floats, light: Floats, laws: DiffuseLaws) -> Floats:
 def _round_outline(dolp: Floats, cues: Cues, laws: DiffuseLaws) -> Floats:
     """Log likelihood (C,): inside its outline a round object turns away as a ball does, cos θ = √(2x − x²).
 
-    x is the distance from the outline over a radius, which is about that of the disc of as many pixels, and the same
-    for all rings. Where half of a ring is nearer to an edge than to a ball, all laws are equal.
+    x is the distance from the outline over a radius, about that of a disc with the object's area, and the same for all
+    rings. If at least half of a ring looks like a sharp edge, the outline favors no law.
     """
     distance = cv2.distanceTransform(cues.mask.astype(np.uint8), cv2.DIST_L2, 5) - 0.5
     radius = disc_radius(cues.mask)

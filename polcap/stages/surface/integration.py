@@ -203,7 +203,7 @@ class PyramidLevel:
             self.z, taken = conjugate_gradients(matrix, right, self.z, solver, _PRECISION, 30)
 
     def restore_contours(self) -> None:
-        """Give their slopes back to contours behind which z has opened no gap: the surface is whole around them."""
+        """Restore the slope terms across occluding contours where no depth step has opened."""
         link, gap = self.contours.link, self.contours.gap
         p, q = self.grid.p[link], self.grid.q[link]
         opened = (self.z[q] - self.z[p] - self.contours.step + gap) / gap

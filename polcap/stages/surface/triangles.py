@@ -115,9 +115,9 @@ def _count_pieces(faces: Faces, count: int) -> int:
 
 
 def smooth_boundary(place: Floats, z: Floats, faces: Faces, step: int) -> tuple[Floats, Floats]:
-    """Vertices x, y (V, 2) px and scaled log depth z (V,) with the boundary's averaged along it, z over a longer way.
+    """Vertices x, y (V, 2) px and scaled log depth z (V,), smoothed along the mesh's boundary, z more strongly.
 
-    The boundary follows pixels' stairs before, and the curve that they sample after.
+    The boundary follows the stairs of the pixels before, and the curve that they sample after.
     """
     edge = boundary_edges(faces)
     move = _average_along(place, edge, _ROUNDS) - place
