@@ -1,4 +1,4 @@
-"""Independent calls on as many threads as this process may use."""
+"""Runs independent calls on threads."""
 
 import os
 from collections.abc import Callable, Iterable
@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 
 def threads() -> int:
-    """Threads that may run: by OMP_NUM_THREADS, which `--threads` sets, else the cores that this process may use."""
+    """Number of threads to use: OMP_NUM_THREADS, which `--threads` sets, or the cores that this process may use."""
     asked = os.environ.get("OMP_NUM_THREADS", "")
     if asked.isascii() and asked.isdecimal() and int(asked):
         return int(asked)
@@ -19,9 +19,9 @@ def threads() -> int:
 
 
 def results(functions: Iterable[Callable[[], T]], most: int | None = None) -> list[T]:
-    """The result of each call, in their order, on at most `most` threads; of errors the first in order is raised.
+    """Results of the calls in their order, from at most `most` threads; raises the first error in this order.
 
-    With one thread they run in the caller's. After an error, or Ctrl-C, no further call begins.
+    A single thread is the caller's. After an error or Ctrl-C, no further call starts.
     """
     calls = list(functions)
     workers = min(len(calls), threads() if most is None else most)
@@ -35,7 +35,7 @@ def results(functions: Iterable[Callable[[], T]], most: int | None = None) -> li
 
 
 def both(first: Callable[[], A], second: Callable[[], B], most: int | None = None) -> tuple[A, B]:
-    """The results of two calls, as of `results`."""
+    """Results of two calls at once; see `results`."""
     calls: list[Callable[[], Any]] = [first, second]
     one, other = results(calls, most)
     return cast(A, one), cast(B, other)

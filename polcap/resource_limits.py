@@ -1,4 +1,4 @@
-"""Limits of threads and memory for this process, and the message when memory runs out."""
+"""Limits the threads and memory of this process, and explains errors when memory runs out."""
 
 import math
 import os
@@ -7,14 +7,17 @@ from typing import Any
 
 from polcap.errors import SettingError
 
-_MOST_GB = 1e9  # more than any system counts
-_LEAST_GB = 0.8  # for libraries, networks and a capture of 1 MP: with .75 one fails, with .4 a library hangs
+_MOST_GB = 1e9  # largest limit that systems accept
+_LEAST_GB = 0.8  # for libraries, networks and a capture of 1 MP; it fails with 0.75, and a library hangs with 0.4
 OUT_OF_MEMORY = (  # messages of OpenCV, pybind11, onnxruntime, threads, the loader of libraries and the system
     "Insufficient memory", "bad_alloc", "bad allocation", "Failed to allocate memory", "can't start new thread",
     "failed to map segment", "Cannot allocate memory",
 )  # fmt: skip
-_GB_PER_PIXEL, _GB_FIXED = 60e-9, 0.3  # of a whole run, per RAW pixel: measured, docs/explanations/scale.md
-_ROOM = 1.1  # over the request at which memory ran out: later ones may be larger
+_GB_PER_PIXEL, _GB_FIXED = (
+    60e-9,
+    0.3,
+)  # memory of a run: per RAW pixel, and fixed (measured, docs/explanations/scale.md)
+_ROOM = 1.1  # factor on the memory at which a request failed, because later requests may be larger
 _ASKED = re.compile(r"allocate ([\d.]+) (bytes|KiB|MiB|GiB)")  # numpy, OpenCV
 _BYTES = {"bytes": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 
@@ -30,12 +33,12 @@ def set_threads(count: int) -> None:
 
 
 def check_memory(gigabytes: float) -> None:
-    """Refuse a limit that `set_memory` cannot set.
+    """Check that `set_memory` can set this limit.
 
     Raises
     ------
     SettingError
-        It is no amount of memory, less than any capture needs, or the system has no such limit.
+        It is not a valid amount, less than any capture needs, or the system has no such limit.
     """
     if not 0 <= gigabytes <= _MOST_GB:
         raise SettingError(f"--memory {gigabytes:g}: give a number of GB up to {_MOST_GB:g}, or leave it out")
@@ -49,19 +52,19 @@ def check_memory(gigabytes: float) -> None:
 
 
 def set_memory(gigabytes: float) -> None:
-    """Limit the process's own memory, without mapped files: beyond it, allocations fail at once; 0 sets no limit.
+    """Limit the private memory of the process, so that larger allocations fail; 0 sets no limit.
 
     Raises
     ------
     SettingError
-        As of `check_memory`.
+        See `check_memory`.
     """
     check_memory(gigabytes)
     if not gigabytes:
         return
     resource = _resource(gigabytes)
     size, most = int(gigabytes * 1e9), resource.getrlimit(resource.RLIMIT_DATA)[1]
-    if most != resource.RLIM_INFINITY:  # of the machine's owner: never raised
+    if most != resource.RLIM_INFINITY:  # the administrator's limit is not raised
         size = min(size, most)
     resource.setrlimit(resource.RLIMIT_DATA, (size, most))
 
@@ -83,9 +86,9 @@ def is_shortfall(error: BaseException | None) -> bool:
 
 
 def shortfall(error: BaseException, stage: str, pixels: int) -> SettingError:
-    """The error to raise for a shortfall: memory in use and requested by the stage, estimate for the run, remedy.
+    """The error to raise when a stage runs out of memory: memory used and requested, estimate for the run, remedy.
 
-    `pixels` are those of a RAW frame.
+    `pixels` is the number of pixels of a RAW frame.
     """
     from polcap.stages.hdr import planes
 
@@ -96,8 +99,8 @@ def shortfall(error: BaseException, stage: str, pixels: int) -> SettingError:
     enough = math.ceil(10 * whole) / 10
     message = f"{stage}: out of memory"
     if taken:
-        message += f" with {taken / 1e9:.2f} GB taken" + (f" and {more / 1e9:.2g} GB more asked for" if more else "")
+        message += f" with {taken / 1e9:.2f} GB used" + (f" and {more / 1e9:.2g} GB more requested" if more else "")
     message += f"; a capture of {pixels / 1e6:.3g} MP takes about {enough:.1f} GB in all"
     if limit is None:
-        return SettingError(f"{message}: free that much, run fewer at a time, or take a larger machine")
+        return SettingError(f"{message}: free that much, process fewer captures at a time, or use a larger machine")
     return SettingError(f"{message}: raise --memory from {limit / 1e9:.3g} to that, or leave it out")

@@ -62,7 +62,7 @@ def test_a_lack_of_memory_names_the_stage_what_it_would_take_and_the_remedy(
     with pytest.raises(SettingError) as caught:
         pipeline.process(capture, UserInput(), Config(), tmp_path, until="align")
     said = str(caught.value)
-    assert said.startswith("align: out of memory with 2.00 GB taken and 3.2 GB more asked for; a capture of 0.995 MP")
+    assert said.startswith("align: out of memory with 2.00 GB used and 3.2 GB more requested; a capture of 0.995 MP")
     assert said.endswith("takes about 5.8 GB in all: raise --memory from 4 to that, or leave it out")
 
 

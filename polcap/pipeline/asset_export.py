@@ -1,7 +1,7 @@
-"""The asset of a result in the formats of a program or purpose, and a record of what it was made from.
+"""Exports the asset of a result in the formats of a preset, with a record of its provenance.
 
-The asset is built from the maps as their files hold them, by `process` as by `polcap export`: the same result gives
-the same bytes, whenever and with however many threads.
+Both `process` and `polcap export` build the asset from the maps as stored in their files. So the same result gives the
+same bytes, with any number of threads.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -22,31 +22,31 @@ from polcap.formats.maps import maps_folder
 from polcap.images import Asset
 from polcap.stages import asset, surface
 
-_SHARING = {"obj", "usd", "materialx"}  # formats that share the textures beside them
+_SHARING = {"obj", "usd", "materialx"}  # formats that share texture files
 
 
 @dataclass(frozen=True)
 class ExportRequest:
-    """The content of an export; a preset excludes formats."""
+    """Content of an export; with a preset, `formats` is ignored."""
 
     formats: tuple[Format, ...] = ("gltf", "obj")
     preset: str | None = None
     images: Kind | None = None  # inside the GLB; by default the preset's, or PNG
     color: str = exr_layers.LINEAR_REC709  # color space or role of the colors in the layered EXR
     texture_size: int | None = None  # px of the longer side; by default the maps'
-    lod: int = 0  # further GLBs, each in a quarter of the triangles of the one before
+    lod: int = 0  # number of further GLBs, each with a quarter of the triangles of the previous one
 
 
 @dataclass(frozen=True)
 class DetailLevel:
-    """A coarser asset and how far its surface is from the full one."""
+    """A coarser asset, and the distance of its surface from the full one."""
 
     asset: Asset
     decimated: surface.DecimatedMesh
 
 
 def check(wanted: ExportRequest) -> None:
-    """Refuse what cannot be exported, before anything is computed.
+    """Check that a request can be exported, before anything is computed.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def check(wanted: ExportRequest) -> None:
 
 
 def from_maps(folder: Path, config: Config, wanted: ExportRequest) -> tuple[Asset, list[DetailLevel]]:
-    """The asset of stored maps (`folder`), and its levels of detail.
+    """The asset of the maps in a folder, and its levels of detail.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def write(
         A file cannot be written.
     """
     preset = _preset(wanted)
-    name = atomic.safe_name(str(about["capture"].get("name")))  # whatever the report says, files stay in the folder
+    name = atomic.safe_name(str(about["capture"].get("name")))  # files stay in the folder, whatever name the report has
     export = _Export(
         folder=out / "asset" / (wanted.preset or ""),
         maps=out / "maps",
@@ -137,7 +137,7 @@ class _Export:
     record: Mapping[str, Any]
 
     def write(self) -> list[Path]:
-        """Every file of the export, and the record of provenance. Pictures are encoded on threads."""
+        """Write all files of the export and the record of provenance; pictures are encoded on threads."""
         writers: dict[Format, Callable[[], list[Path]]] = {
             "gltf": self._gltf,
             "obj": self._obj,
@@ -172,7 +172,7 @@ class _Export:
         }
 
     def _embedded(self) -> dict[str, str]:
-        """The GLB's pictures and their meaning, where there is a GLB."""
+        """The GLB's pictures and their meaning; empty without a GLB."""
         if "gltf" not in self.preset.formats:
             return {}
         held = gltf.textures(self.asset)
@@ -180,12 +180,12 @@ class _Export:
 
     @cached_property
     def encoder(self) -> TextureEncoder:
-        """Encodes a picture once for all files that hold it."""
+        """Encodes a picture once for all files that contain it."""
         return TextureEncoder()
 
     @cached_property
     def loose(self) -> dict[str, Texture]:
-        """The textures that lie beside the asset, by file name."""
+        """The textures in files of their own, by file name."""
         named = {pattern.format(obj.stem(self.name)): make for pattern, make in self.preset.textures.items()}
         textures = {f"{name}.png": make(self.asset) for name, make in named.items()}
         if _SHARING.intersection(self.preset.formats):
@@ -194,7 +194,7 @@ class _Export:
 
     @property
     def stem(self) -> str:
-        """The asset's name, spelled as those of the textures beside it."""
+        """Name of the asset's files, spelled like those of its texture files."""
         return self.preset.name.format(obj.stem(self.name) if self.preset.textures else self.name)
 
     @property
@@ -208,12 +208,12 @@ class _Export:
 
     @property
     def words(self) -> dict[str, str]:
-        """The record of provenance, for formats that hold texts."""
+        """The record of provenance, for formats with metadata texts."""
         return {"unit": self.unit, "normals": "+Y (OpenGL)", **provenance.words(self.record)}
 
     @property
     def line(self) -> str:
-        """For formats that hold a comment."""
+        """A comment line, for formats with comments."""
         return f"polcap; unit of length: {self.unit}; normals +Y (OpenGL); made from: {self.stem}.provenance.json"
 
     def _texture(self, name: str, texture: Texture) -> list[Path]:

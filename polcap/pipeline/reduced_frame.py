@@ -1,6 +1,6 @@
 """Reduces a decoded frame for `polcap check`: a small picture, clipped shares, and tiles at full size.
 
-It runs in the child process that decodes, so that only the small parts are sent.
+It runs in the decoding child process, so that only small arrays are sent back.
 """
 
 from dataclasses import dataclass
@@ -18,18 +18,18 @@ Arrays = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True)
 class ReducedFrame:
-    """A frame, reduced."""
+    """A reduced frame."""
 
-    picture: SensorImage  # (h, w, 3) means of blocks, black 0, white 1; 1 where part of a block is clipped
+    picture: SensorImage  # (h, w, 3) means of blocks, black 0, white 1; 1 for partly clipped blocks
     clipped: Floats  # (h, w) share of each block that is clipped
     tiles: sharpness.Tiles
 
 
 def first(image: SensorImage, clip: float, most_pixels: float) -> tuple[dict[str, Any], Arrays]:
-    """`take` of the first frame, which decides by how much to reduce a capture, and where its tiles are.
+    """`take` for the first frame, which determines the reduction of a capture and the corners of its tiles.
 
-    `clip` [white level]: counts from here on are clipped. The facts get `times`, merged pixels per side of a block, and
-    `superpixel`, RAW pixels per merged pixel; the arrays get `corners` (T, 2) of the tiles, px.
+    Counts from `clip` [white level] on are clipped. The first result also has `times`, merged pixels per block side,
+    and `superpixel`, RAW pixels per merged pixel; the arrays also have `corners` (T, 2) px of the tiles.
     """
     side = image.superpixel
     pixels = (image.value.shape[0] // side) * (image.value.shape[1] // side)
@@ -44,7 +44,7 @@ def take(image: SensorImage, clip: float, times: int, corners: list[list[int]]) 
     """The parts of a `ReducedFrame`: blocks of `times` merged pixels a side, tiles at `corners` (T, 2) px."""
     shares = _averaged((~sensor.usable(image, clip)).astype(np.float32), times)
     value = _means(image, times)
-    value[shares > 0] = 1  # the stages drop pixels that are clipped in part
+    value[shares > 0] = 1  # so that the stages exclude partly clipped pixels
     tiles = sharpness.take(image, np.asarray(corners, np.int64).reshape(-1, 2), clip)
     arrays: Arrays = {"value": value, "clipped": shares, "light": tiles.light, "usable": tiles.usable}
     if image.camera_matrix is not None:
@@ -84,7 +84,7 @@ def _means(image: SensorImage, times: int) -> Floats:
 
 
 def _sums(mosaic: NDArray[np.uint16], times: int) -> NDArray[np.uint32]:
-    """Sums of the counts of each phase over whole blocks of times × times quads, (2, 2, h, w)."""
+    """Sums (2, 2, h, w) of the counts of each CFA phase over blocks of times × times quads."""
     height, width = (side // (2 * times) for side in mosaic.shape)
     rows = mosaic[: 2 * times * height, : 2 * times * width].reshape(height, times, 2, -1)
     down = np.zeros((height, 2, rows.shape[-1]), np.uint32)
@@ -98,7 +98,7 @@ def _sums(mosaic: NDArray[np.uint16], times: int) -> NDArray[np.uint32]:
 
 
 def _averaged(picture: Floats, times: int) -> Floats:
-    """Means of times × times pixels; an incomplete last block is dropped."""
+    """Means of times × times pixels; incomplete blocks are dropped."""
     height, width = picture.shape[0] // times, picture.shape[1] // times
     whole = picture[: height * times, : width * times]
     return np.array(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)

@@ -1,4 +1,4 @@
-"""A capture averaged down to at most 0.6 MP, and facts that averaging hides: clipping and sharpness."""
+"""Reduces a capture to at most 0.6 MP for `polcap check`, and measures clipping and sharpness at full size."""
 
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -13,20 +13,20 @@ from polcap.optics import sharpness
 from polcap.pipeline import reduced_frame
 from polcap.pipeline.reduced_frame import ReducedFrame
 
-_MOST_PIXELS = 0.6e6  # of the pictures that the stages see
+_MOST_PIXELS = 0.6e6  # of the pictures that the stages process
 
 
 @dataclass(frozen=True)
 class SmallCapture:
-    """A capture averaged down; its frames are decoded meanwhile, and waited for when they are used."""
+    """A capture averaged down; frames are decoded in the background, and waited for when they are used."""
 
     capture: Capture
-    step: int  # visible RAW px per px
-    merged_px: int  # visible RAW px per px of the picture that `process` merges
+    step: int  # visible RAW px per px of this capture
+    merged_px: int  # visible RAW px per px of the merged picture of `process`
     reduced: Mapping[Frame, Future[ReducedFrame]]
 
     def decode(self, frame: Frame) -> SensorImage:
-        """The reduced picture of a frame; DecodeError."""
+        """The reduced picture of a frame; raises DecodeError."""
         return self.reduced[frame].result().picture
 
     @cached_property
@@ -36,24 +36,24 @@ class SmallCapture:
 
     @cached_property
     def blur_px(self) -> Floats:
-        """(K, E) of each frame beyond the sharpest of its exposure, 1σ [visible RAW px]."""
+        """(K, E) extra blur of each frame against the sharpest of its exposure, 1σ [visible RAW px]."""
         return sharpness.frames_blur([[one.tiles for one in shot] for shot in self._shots()], self.merged_px)
 
     def _shots(self) -> list[list[ReducedFrame]]:
-        """(K, E) of the capture's frames."""
+        """The capture's frames as K shots of E frames."""
         return [[self.reduced[frame].result() for frame in shot.frames] for shot in self.capture.shots]
 
 
 def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapture:
-    """Decode every frame once, as many at a time as the pool has threads, and average it down where it is decoded.
+    """Decode every frame once, on the threads of the pool, and average it down in the decoding process.
 
-    The reference frame comes first: it decides by how much to reduce, and where sharpness is measured. The others
-    follow in the order in which they are merged. `clip` [white level]: counts from here on are clipped.
+    The reference frame is first: it determines the reduction, and the tiles in which sharpness is measured. The others
+    follow in the order of the merge. Counts from `clip` [white level] on are clipped.
 
     Raises
     ------
     DecodeError
-        Of the reference frame at once, of another one when it is used.
+        Of the reference frame immediately, of another frame when it is used.
     """
     first = capture.shots[0].frames[(len(capture.shots[0].frames) - 1) // 2]
     meta, arrays = frame_decoder.apply(first, reduced_frame.first, clip=clip, most_pixels=_MOST_PIXELS)
@@ -73,7 +73,8 @@ def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapt
         focal_px=capture.focal_px / step,
         principal_px=((x - (step - 1) / 2) / step, (y - (step - 1) / 2) / step),
         size_px=(width // step, height // step),
-        calibration=capture.calibration and replace(capture.calibration, noise=()),  # of pixels, not of their means
+        calibration=capture.calibration
+        and replace(capture.calibration, noise=()),  # it holds for pixels, not for means
     )
     return SmallCapture(small, step, half, {frame: begin(frame) for frame in every})
 
