@@ -96,9 +96,8 @@ def run(unit: Unit, options: ProcessOptions, attempt: int = 1) -> UnitRecord:
     except MemoryError:
         record = replace(record, state="failed", message="out of memory; raise --memory or run fewer workers")
     except Exception as error:
-        message = f"{type(error).__name__}: {_line(error)}; the traceback is in {unit.record_file.with_suffix('.txt')}"
+        message = f"{type(error).__name__}: {_line(error)}; {_write_traceback(unit)}"
         record = replace(record, state="bug", message=message)
-        _write_traceback(unit)
     record = replace(record, seconds=round(time.perf_counter() - start, 3))
     try:
         write_record(unit, record)
@@ -201,13 +200,15 @@ def _alive(pid: int) -> bool:
     return True
 
 
-def _write_traceback(unit: Unit) -> None:
-    text = traceback.format_exc()
+def _write_traceback(unit: Unit) -> str:
+    """Write the traceback of the present exception; returns where it is, or why it could not be written."""
+    file, text = unit.record_file.with_suffix(".txt"), traceback.format_exc()
     try:
-        with atomic.path(unit.record_file.with_suffix(".txt")) as temporary:
+        with atomic.path(file) as temporary:
             temporary.write_text(text, encoding="utf-8")
-    except InputError:
-        pass  # the record has the error; a full disk may be its reason
+    except InputError as error:
+        return f"the traceback could not be written: {_line(error)}"
+    return f"the traceback is in {file}"
 
 
 def _line(error: BaseException) -> str:

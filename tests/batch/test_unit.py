@@ -55,3 +55,17 @@ def test_windows_processes_are_checked_without_a_signal(
     monkeypatch.setattr(os, "kill", lambda *_: pytest.fail("a signal was sent"))
     monkeypatch.setattr(sys, "platform", "win32")
     assert one.read_record(unit).state == ("running" if alive else "interrupted")
+
+
+@pytest.mark.parametrize("blocked", [False, True])
+def test_the_record_of_a_bug_states_where_its_traceback_is(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, blocked: bool
+) -> None:
+    unit = only_unit(tmp_path, "obj")
+    file = unit.record_file.with_suffix(".txt")
+    if blocked:
+        file.mkdir(parents=True)  # no file can have this name
+    monkeypatch.setattr(one, "_process", lambda unit, options: 1 / 0)
+    record = one.run(unit, ANALYTIC)
+    assert record.state == "bug" and record.message.startswith("ZeroDivisionError: division by zero; the traceback ")
+    assert record.message.endswith(f"is in {file}") != blocked and file.is_file() != blocked
