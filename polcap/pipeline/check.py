@@ -121,7 +121,7 @@ def _settings(config: Config, step: int) -> Config:
 
 
 def _moved(chart: ChartRequest, step: int) -> ChartRequest:
-    """The chart's corners on the small pictures, where a pixel stands for `step` × `step` RAW pixels."""
+    """The chart's corners on the small pictures, where a pixel covers `step` × `step` RAW pixels."""
     return chart if chart.corners is None else replace(chart, corners=(chart.corners - (step - 1) / 2) / step)
 
 

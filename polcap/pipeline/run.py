@@ -27,7 +27,7 @@ from polcap.report import animation
 from polcap.report import stage_pictures as pictures
 from polcap.results import Results
 
-PROFILE = "color.toml"  # beside the report
+PROFILE = "color.toml"  # in the result folder, with the report
 
 
 def process(

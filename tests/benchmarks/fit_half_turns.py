@@ -7,8 +7,8 @@ rough law. Added to them are six pictures for each of --sixths: training meshes 
 
 The cut is made with half, the usual and twice the weight of the network, for more regions to learn from. A region
 counts by what turning it changes of the mean normal error, 0.5° at most, over the root of the regions of its picture;
-cells of the inversion count alike. Then the odds are scaled until the doubt is likeliest where each region counts by
-its whole error. Prints both laws, and what the accepted regions gain and lose.
+cells of the inversion count alike. Then the odds are scaled by maximum likelihood, each region
+weighted by its whole error. Prints both laws, and what the accepted regions gain and lose.
 """
 
 import argparse
@@ -128,7 +128,7 @@ def gain_of_turning(grid: half_turns.Grid, case: Case) -> Floats:
 
 
 def fit(terms: Floats, true: NDArray[np.bool_], weight: Floats, shrink: float) -> Floats:
-    """Coefficients of the likeliest logistic law, each row counted by its weight; all but the first are shrunk."""
+    """Logistic coefficients of maximum likelihood, rows weighted by `weight`; all but the first are shrunk."""
     sign = np.where(true, 1.0, -1.0)
 
     def unlikely(law: Floats) -> float:

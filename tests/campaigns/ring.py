@@ -86,7 +86,7 @@ def at_stokes_level(case: lit_objects.Lit, seed: int, number: int, turn: float, 
         scenes.no_color(),
         selfcal.SelfcalSettings(check_order=False),
     )
-    return told(found.ring, KINDS[seed // 2 % 3])
+    return error_of(found.ring, KINDS[seed // 2 % 3])
 
 
 def from_raw(seed: int, turn: float) -> dict[str, Any]:
@@ -104,7 +104,7 @@ def from_raw(seed: int, turn: float) -> dict[str, Any]:
         supplied = UserInput(mask_network=models.load_mask_network(1))
         try:
             results = path(replace(capture, shots=shots), supplied, Config(), MemoryCache(until="selfcal"))
-            return told(results.selfcal.ring, kind)
+            return error_of(results.selfcal.ring, kind)
         except InputError as error:
             return {"kind": kind, "refused": str(error)}
 
@@ -114,7 +114,7 @@ def _apart(a: float, b: float) -> float:
     return abs((a - b + math.pi / 2) % math.pi - math.pi / 2)
 
 
-def told(found: RingZero, kind: str) -> dict[str, Any]:
+def error_of(found: RingZero, kind: str) -> dict[str, Any]:
     """A row: what was found of the ring, and what was done about it, degrees."""
     turn, sigma, applied = np.degrees([found.offset, found.sigma, found.correction])
     return {"kind": kind, "turn": float(turn), "sigma": float(sigma), "applied": float(applied)}

@@ -120,9 +120,9 @@ def test_a_push_counts_in_pixels_of_the_processed_picture(good: Evidence, grid_p
 
 
 def test_what_follows_a_wrong_order_is_not_judged(good: Evidence) -> None:
-    told = judged(changed(good, selfcal=replace(good.selfcal, outline=OutlineCheck(ShotOrder((2, 1, 0)), 0.9))))
-    assert list(told)[-1] == "focal length" or told["order"].state == "fail"
-    assert "angles" not in told
+    by_name = judged(changed(good, selfcal=replace(good.selfcal, outline=OutlineCheck(ShotOrder((2, 1, 0)), 0.9))))
+    assert list(by_name)[-1] == "focal length" or by_name["order"].state == "fail"
+    assert "angles" not in by_name
 
 
 def test_flash_bracketed_by_the_shutter_is_named(good: Evidence) -> None:

@@ -103,7 +103,7 @@ def _exif(found: Mapping[str, Any]) -> Exif:
 
 
 def _iso(found: Mapping[str, Any]) -> float | None:
-    """ISO; 65535 stands for a value above 16 bits, which is in another tag; of a pair (0, 200) the second counts."""
+    """ISO; 65535 means a value above 16 bits, which is in another tag; of a pair (0, 200) the second counts."""
     names = ("EXIF ISOSpeedRatings", "Image ISOSpeedRatings", "Image Tag 0x0017")  # the last: RW2
     beyond = ("EXIF RecommendedExposureIndex", "EXIF StandardOutputSensitivity", "EXIF ISOSpeed")
     numbers = [number for name in (*names, *beyond) for number in _numbers(found, name)]

@@ -61,9 +61,9 @@ class HdrSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_motion_px: Annotated[
         float, Meta(ge=0.0, le=500.0, description="a bracket that moved more is refused [visible RAW px]")
     ] = 60.0
-    falloff: Annotated[
-        bool, Meta(description="correct the lens's falloff if `polcap calibrate` has measured it")
-    ] = True
+    falloff: Annotated[bool, Meta(description="correct the lens's falloff if `polcap calibrate` has measured it")] = (
+        True
+    )
 
 
 @stage(version=11)

@@ -52,8 +52,7 @@ class WhitebalanceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
         ),
     ] = "classic"
     chart_width_m: (
-        Annotated[float, Meta(gt=0, le=2, description="width between outer patch corners; unset: unknown [m]")]
-        | None
+        Annotated[float, Meta(gt=0, le=2, description="width between outer patch corners; unset: unknown [m]")] | None
     ) = None
     max_cost: Annotated[float, Meta(gt=0, le=1, description="greatest accepted cost of the chart detector")] = 0.06
     max_delta_e: Annotated[

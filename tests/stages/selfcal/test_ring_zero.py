@@ -86,7 +86,7 @@ def test_a_calibrated_zero_and_the_measured_one_are_averaged_by_their_errors():
     assert averaged.sigma == pytest.approx(before * 0.4 / np.hypot(before, 0.4) * DEG)
     vague = selfcal.corrected(RingZero(3 * DEG, 2 * DEG), 0.01 * DEG, settings)
     assert vague.offset == vague.correction == 0 and vague.sigma == pytest.approx(before * DEG)
-    another = RingZero(5 * DEG, 0.4 * DEG)  # the filter was screwed on anew
+    another = RingZero(5 * DEG, 0.4 * DEG)  # the filter was screwed on again
     assert selfcal.corrected(another, 0.01 * DEG, settings) == replace(another, correction=another.offset)
     assert selfcal.corrected(measured, None, settings) == measured  # set by eye: within its error
 
