@@ -6,6 +6,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -55,11 +56,17 @@ FUNCTIONS = """
 """
 
 
+class Misled(Worker):
+    """A worker that is given functions that misbehave."""
+
+    module: ModuleType
+
+
 @pytest.fixture
 def worker(tmp_path, monkeypatch):
     (tmp_path / "misbehaving.py").write_text(textwrap.dedent(FUNCTIONS))
     monkeypatch.syspath_prepend(tmp_path)
-    worker = Worker(timeout_s=300, memory_gib=1.5)
+    worker = Misled(timeout_s=300, memory_gib=1.5)
     worker.module = importlib.import_module("misbehaving")
     yield worker
     sys.modules.pop("misbehaving")
