@@ -2,6 +2,7 @@
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from polcap.formats import shipped_data
@@ -42,7 +43,7 @@ def patches(chart: Chart, margin: float = 0.0) -> Floats:
     return _points(chart, origin + np.array([[near, near], [far, near], [far, far], [near, far]]))
 
 
-def intersect(chart: Chart, v: Floats) -> tuple[Floats, Floats, Floats]:
+def intersect(chart: Chart, v: Floats) -> tuple[NDArray[np.integer], Floats, Floats]:
     """Indices (N,) of the rays v (P, 3) that meet the chart, their lengths (N,) [m] and the albedo (N, 3)."""
     center = np.array(chart.center)
     near = np.flatnonzero(-(v @ center) > np.linalg.norm(center) * np.cos(5 * chart.pitch / np.linalg.norm(center)))

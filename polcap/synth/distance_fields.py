@@ -77,7 +77,7 @@ class Vase(msgspec.Struct, frozen=True, tag="vase", forbid_unknown_fields=True):
         side = (across - wall * lobes - _waves(self.waves, p)) / hypot(1, slope)
         end, over = np.abs(p[..., 1]) - self.height / 2, 0.06 * self.height
         near = np.maximum(over - np.abs(side - end), 0.0) / over
-        return np.maximum(side, end) + near * near * (over / 4)  # the rim is rounded over `over` metres
+        return np.asarray(np.maximum(side, end) + near * near * (over / 4))  # the rim is rounded over `over` metres
 
 
 class Model(msgspec.Struct, frozen=True, tag="model", forbid_unknown_fields=True):

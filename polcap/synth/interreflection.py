@@ -12,7 +12,6 @@ import numpy as np
 
 from polcap.images import Floats
 from polcap.optics import fresnel
-from polcap.synth import mesh_tracer
 from polcap.synth.mesh_tracer import Tracer
 
 _RAYS = 48  # per vertex, distributed by their cosine
@@ -35,15 +34,20 @@ def received(tracer: Tracer, lit: Lit, camera: Floats, ior: float) -> Floats:
     towards = camera - mesh.vertices
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     normal = np.where(np.sum(normal * towards, axis=1, keepdims=True) < -0.3, -normal, normal)
+    e_x = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
+    e_x /= np.maximum(np.linalg.norm(e_x, axis=1, keepdims=True), 1e-12)
+    e_y = np.cross(normal, e_x)
     turn = np.random.default_rng(0).uniform(0, 2 * np.pi, len(normal))
     total: Floats = np.zeros(normal.shape)
     for k in range(_RAYS):
-        cosine = np.full(len(normal), np.sqrt(1 - (k + 0.5) / _RAYS))
-        way = mesh_tracer.directions_about(normal, cosine, turn + k * np.pi * (3 - np.sqrt(5)))
+        cosine = np.sqrt(1 - (k + 0.5) / _RAYS)
+        angle = turn + k * np.pi * (3 - np.sqrt(5))
+        across = np.cos(angle)[:, None] * e_x + np.sin(angle)[:, None] * e_y
+        way = cosine * normal + np.sqrt(1 - cosine**2) * across
         met = tracer.meet(mesh.vertices + _LIFT * normal, way)
         back = -way[met.index]
         there = np.where(np.sum(met.normal * back, axis=1, keepdims=True) < 0, -met.normal, met.normal)
-        entered, _ = fresnel.transmission(cosine[0], ior)
+        entered, _ = fresnel.transmission(np.float64(cosine), ior)
         total[met.index] += entered * lit(met.position, there, back)
     return _smoothed(total / _RAYS, tracer)
 

@@ -134,7 +134,7 @@ class Tracer:
         return np.where(struck, hit["tfar"], np.inf), normal
 
     def hidden(self, origin: Floats, target: Floats) -> NDArray[np.bool_]:
-        """True where the mesh hides points (P, 3) from the target (3,)."""
+        """True where the mesh hides points (P, 3) from targets, (P, 3) or (3,)."""
         way = target - origin
         far = np.linalg.norm(way, axis=1)
         ray = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, way / far[:, None], far))
@@ -166,14 +166,6 @@ def scatter(value: Floats, at: NDArray[np.integer], size: tuple[int, ...], empty
     out = np.full((size[0] * size[1], *value.shape[1:]), empty, dtype=np.float32)
     out[at] = value
     return out.reshape(*size, *value.shape[1:])
-
-
-def directions_about(normal: Floats, cosine: Floats, azimuth: Floats) -> Floats:
-    """Directions (M, 3) about normals (M, 3), by the cosine of the angle (M,) and the azimuth (M,)."""
-    e_x, e_y = frames.basis(normal)
-    sine = np.sqrt(np.maximum(1 - cosine**2, 0))
-    x, y = (a[:, None] for a in (sine * np.cos(azimuth), sine * np.sin(azimuth)))
-    return np.asarray(x * e_x + y * e_y + cosine[:, None] * normal)
 
 
 def _unit(v: Floats) -> Floats:

@@ -138,4 +138,4 @@ def _pattern(material: Material, p: Floats) -> Floats:
         noise = solid_noise(p, material.seed)
         edge = (0.25 - np.abs(noise)) / 0.15 if material.pattern == "veins" else noise / 1.2
     t = np.clip((edge + 1) / 2, 0, 1)  # 0 below −1, 1 above 1, smooth between
-    return t * t * (3 - 2 * t)
+    return np.asarray(t * t * (3 - 2 * t))

@@ -293,6 +293,6 @@ def _write_truth(place: Path, studio: Studio, files: list[dict[str, Any]]) -> No
         "normal": buffer.normal, "diffuse": diffuse * inside, "specular": specular * inside,
         "roughness": roughness * buffer.mask, "ior": ior * buffer.mask, "S": _blur(shoot, reference) / white * inside,
     }  # fmt: skip
-    halves = {name: value.astype(np.float16) for name, value in maps.items()}
+    halves: dict[str, Any] = {name: value.astype(np.float16) for name, value in maps.items()}
     with atomic.path(place / "truth.npz") as temporary:
         np.savez_compressed(temporary, depth=buffer.depth, mask=buffer.mask, **halves)
