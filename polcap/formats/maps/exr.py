@@ -21,12 +21,10 @@ def write(
     attributes: Mapping[str, Attribute] | None = None,
     *,
     half: bool | Collection[str] = False,
-    held: atomic.Held | None = None,
 ) -> None:
     """Write channels (H, W) by name ("R", "normal.x", "S0.R"), ZIP; the same input gives the same bytes.
 
     `half` makes all channels, or those named, 16 bits instead of 32; values beyond the range of half are clipped to it.
-    `held` collects files that get their names together.
 
     Raises
     ------
@@ -53,7 +51,7 @@ def write(
             spec.attribute(key, oiio.TypeDesc(f"float[{len(value)}]"), value)
         else:
             spec.attribute(key, value)
-    with atomic.path(path, held=held) as temporary:
+    with atomic.path(path) as temporary:
         temporary.touch()  # an OSError here is clearer than OpenImageIO's message
         output = oiio.ImageOutput.create(str(temporary))
         if output is None:

@@ -26,17 +26,15 @@ _SWAPS = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}  # seven times faster th
 _HEADER = 33  # bytes of the signature and IHDR, which comes first
 
 
-def write(path: Path, array: Pixels, held: atomic.Held | None = None) -> None:
+def write(path: Path, array: Pixels) -> None:
     """Write (H, W), (H, W, 3) RGB or (H, W, 4) RGBA, uint8 or uint16; the same array gives the same bytes.
-
-    `held` collects files that get their names together.
 
     Raises
     ------
     StorageError
         The file cannot be written.
     """
-    with atomic.path(path, held=held) as temporary:
+    with atomic.path(path) as temporary:
         temporary.write_bytes(encode(array))
 
 
