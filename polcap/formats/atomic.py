@@ -46,10 +46,7 @@ def path(final: str | Path, synced: bool = True) -> Iterator[Path]:
     exception it is removed, and an old file under `final` is untouched. Without `synced` the file may be incomplete
     after a power cut: for files whose reader checks them.
 
-    Raises
-    ------
-    StorageError
-        Any OSError of making, writing, syncing or renaming, inside the block too.
+    Raises StorageError: any OSError of making, writing, syncing or renaming, inside the block too.
     """
     final = Path(final)
     temporary = final.with_name(f".{final.stem}.{os.getpid()}.part{final.suffix}")
@@ -69,10 +66,7 @@ def path(final: str | Path, synced: bool = True) -> Iterator[Path]:
 def folder(final: str | Path, synced: bool = True) -> Iterator[Path]:
     """`path` for a folder; an old folder under `final` is replaced as a whole.
 
-    Raises
-    ------
-    StorageError
-        Any OSError of making, writing, syncing or renaming, inside the block too.
+    Raises StorageError: any OSError of making, writing, syncing or renaming, inside the block too.
     """
     final = Path(final)
     temporary = final.with_name(f".{final.name}.{os.getpid()}.part")

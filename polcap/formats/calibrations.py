@@ -50,10 +50,7 @@ def text(found: Calibration) -> str:
 def read(path: Path) -> Calibration:
     """Read a file that `write` wrote.
 
-    Raises
-    ------
-    CaptureError
-        It is not such a file, or cannot be read.
+    Raises CaptureError: it is not such a file, or cannot be read.
     """
     try:
         found = msgspec.convert(text_file.read_toml(path), Calibration)
@@ -72,10 +69,7 @@ def choose(exif: Exif, lens_filter: str | None, focal_length_mm: float | None) -
     Parts that were measured at another aperture or focal length are left out. Without `lens_filter`, the filter is
     the only one in the calibrations of this camera and lens; with several, none is used.
 
-    Raises
-    ------
-    CaptureError
-        A file in the folder is not a calibration.
+    Raises CaptureError: a file in the folder is not a calibration.
     """
     camera = f"{exif.make} {exif.model}".strip()
     fitting = []
@@ -225,10 +219,7 @@ def write_profile(path: Path, color: ColorCalibration) -> None:
 def read_profile(path: Path) -> ColorCalibration:
     """Read a file that `write_profile` wrote.
 
-    Raises
-    ------
-    ChartError
-        The file is missing, not a profile, or its matrix cannot be inverted.
+    Raises ChartError: the file is missing, not a profile, or its matrix cannot be inverted.
     """
     document: dict[str, Any] = {}
     try:

@@ -48,11 +48,8 @@ def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: s
     `device` cuda fails where CUDA is missing or does not start; auto uses it where it starts. `threads` 0 is as many
     as polcap may use. `encoding` is the version of the channels that the model must take.
 
-    Raises
-    ------
-    ModelError
-        No such file, not a model that this runtime can run, metadata missing or of another encoding,
-        or no such device.
+    Raises ModelError: there is no such file, not a model that this runtime can run, metadata missing or of another encoding, or
+    no such device.
     """
     path = Path(path)
     mark = digest(_bytes(path))
@@ -76,17 +73,14 @@ def digest(data: bytes) -> str:
 def run(network: Network, inputs: Floats) -> dict[str, Floats]:
     """Run a network on channels (1, N, H, W): maps by name, (1, n, H, W) each.
 
-    Raises
-    ------
-    ModelError
-        It fails on this input, does not end, returns something else, or its file has changed.
+    Raises ModelError: it fails on this input, does not end, returns something else, or its file has changed.
     """
     session = _session(network.path, network.digest, network.device, network.threads)
     return run_session(session, Path(network.path), inputs)
 
 
 def run_session(session: Any, path: Path, inputs: Floats, limit_s: float = _RUN_S) -> dict[str, Floats]:
-    """`run` of an open session on (1, N, H, W); `path` is for messages."""
+    """`run` of an open session on (1, N, H, W); `path` is for messages. Raises ModelError."""
     entry = session.get_inputs()[0]
     dtype = np.float16 if entry.type == "tensor(float16)" else np.float32
     names = [output.name for output in session.get_outputs()]

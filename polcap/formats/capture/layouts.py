@@ -63,10 +63,7 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
     `angles_deg` is the order of a flat folder; where folders, names or capture.toml state the angles, it picks from
     them, the first being the reference.
 
-    Raises
-    ------
-    CaptureError
-        The folder and its names do not form a capture.
+    Raises CaptureError: the folder and its names do not form a capture.
     """
     if stated.frame:
         return _toml(folder, stated, angles_deg)

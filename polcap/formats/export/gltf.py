@@ -50,12 +50,8 @@ def write(
     `name` is that of scene, node, mesh and material; `provenance` goes into the XMP packet (KHR_xmp_json_ld); an
     `encoder` that is shared by the files of an export encodes no texture twice.
 
-    Raises
-    ------
-    SettingError
-        There is no encoder for this kind of images.
-    StorageError
-        The file cannot be written.
+    Raises SettingError: there is no encoder for this kind of images.
+    Raises StorageError: the file cannot be written.
     """
     with atomic.path(path) as temporary:
         temporary.write_bytes(encode(asset, name, images, provenance, encoder))

@@ -29,10 +29,7 @@ def stem(name: str) -> str:
 def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], comment: str = "") -> list[Path]:
     """Write `path` (.obj), its .mtl and two EXRs, and return their paths; `files` name the PNGs in the same folder.
 
-    Raises
-    ------
-    StorageError
-        A file cannot be written.
+    Raises StorageError: a file cannot be written.
     """
     base = stem(path.stem)
     written = [path, *(path.with_name(f"{base}{ending}") for ending in (".mtl", "_roughness.exr", "_normal.exr"))]

@@ -40,12 +40,8 @@ def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], facts: 
 
     `facts` go into the layer's custom data.
 
-    Raises
-    ------
-    SettingError
-        usd-core is not installed.
-    StorageError
-        The file cannot be written.
+    Raises SettingError: usd-core is not installed.
+    Raises StorageError: the file cannot be written.
     """
     require()
     from pxr import Usd, UsdGeom, UsdShade

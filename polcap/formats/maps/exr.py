@@ -26,10 +26,7 @@ def write(
 
     `half` makes all channels, or those named, 16 bits instead of 32; values beyond the range of half are clipped to it.
 
-    Raises
-    ------
-    StorageError
-        The file cannot be written.
+    Raises StorageError: the file cannot be written.
     """
     import OpenImageIO as oiio
 
@@ -64,10 +61,7 @@ def write(
 def read(path: Path) -> tuple[dict[str, Floats], dict[str, object]]:
     """Channels by name, each (H, W) float32, and the file's attributes.
 
-    Raises
-    ------
-    DecodeError
-        The file is missing, cut short, not an OpenEXR file, or larger than any picture.
+    Raises DecodeError: the file is missing, cut short, not an OpenEXR file, or larger than any picture.
     """
     meta, channels = worker.call(decode, path)
     return {name: channels[name] for name in meta["names"]}, meta["attributes"]

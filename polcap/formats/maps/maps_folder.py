@@ -71,10 +71,7 @@ def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues
     Of the mesh its depth (H, W) is written. All images are on the crop (H, W) of `maps`. Files are encoded on
     threads. The folder is replaced as a whole: if one file fails, the folder of an earlier run stays.
 
-    Raises
-    ------
-    StorageError
-        A file cannot be written.
+    Raises StorageError: a file cannot be written.
     """
     made = {"maps": maps, "mesh": mesh, "stokes": stokes, "cues": cues}
     near, median, far = map_files.depth_range(maps, mesh)
@@ -125,10 +122,7 @@ def _masked_half(values: Floats, inside: NDArray[np.bool_]) -> Floats:
 def read(folder: Path) -> StoredMaps:
     """Read the folder that `write` wrote: EXRs, mask.png and maps.json.
 
-    Raises
-    ------
-    DecodeError
-        A file is missing, damaged, or not of the size in maps.json.
+    Raises DecodeError: a file is missing, damaged, or not of the size in maps.json.
     """
     folder = Path(folder)
     try:
@@ -157,10 +151,7 @@ def read(folder: Path) -> StoredMaps:
 def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
     """Note in maps.json the content of the export in the result's folder `where`.
 
-    Raises
-    ------
-    StorageError
-        The file cannot be written.
+    Raises StorageError: the file cannot be written.
     """
     file = folder / "maps.json"
     known = text_file.read_json(file)
