@@ -48,8 +48,8 @@ def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: s
     `device` cuda fails where CUDA is missing or does not start; auto uses it where it starts. `threads` 0 is as many
     as polcap may use. `encoding` is the version of the channels that the model must take.
 
-    Raises ModelError: there is no such file, not a model that this runtime can run, metadata missing or of another encoding, or
-    no such device.
+    Raises ModelError: the file is missing or no model that this runtime can run, its metadata are missing or of another
+    encoding, or there is no such device.
     """
     path = Path(path)
     mark = digest(_bytes(path))
