@@ -256,6 +256,11 @@ def rewrite(place, change):
     return lambda folder: (folder / place).write_bytes(change((folder / place).read_bytes()))
 
 
+def empty(folder):
+    for path in folder.iterdir():
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
 FRAME = "pol045/IMG_1.dng"
 TOO_FEW = "2 different polarizer angles where 3 are needed"
 SPOILS = {
@@ -265,12 +270,9 @@ SPOILS = {
         rf"angles are 0, 90: {TOO_FEW}; add the missing shot, or name angle45 as",
     ),
     "axes that coincide": (lambda vase: (vase / "pol045").rename(vase / "pol180"), TOO_FEW),
-    "empty angle": (
-        lambda vase: [path.unlink() for path in (vase / "pol045").iterdir()],
-        "pol045: holds no photograph",
-    ),
+    "empty angle": (lambda vase: empty(vase / "pol045"), "pol045: holds no photograph"),
     "empty folder": (
-        lambda vase: [shutil.rmtree(path) for path in vase.iterdir()],
+        empty,
         "holds no photograph that polcap reads; give the folder that holds the photographs",
     ),
     "no folder": (shutil.rmtree, "no such folder"),
