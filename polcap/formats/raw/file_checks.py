@@ -128,10 +128,7 @@ def check_jpeg(path: str, data: bytes, start: int = 0) -> None:
 def check_levels(path: str, value: NDArray[Any], black: float, white: float, lossy: bool) -> None:
     """Refuse counts (H, W) or (H, W, C) that contradict the stated levels.
 
-    Raises
-    ------
-    DecodeError
-        Counts far beyond the white level, rows that were never written, or nothing but zeros.
+    Raises DecodeError: counts far beyond the white level, rows that were never written, or nothing but zeros.
     """
     if lossy and not value.any():
         raise DecodeError(

@@ -68,12 +68,8 @@ class Worker:
 
         `limit_s` is a tighter time limit than the worker's.
 
-        Raises
-        ------
-        DecodeError
-            The function refused the file, crashed, or exceeded its time or memory.
-        ChildBug
-            The function failed in a way that no file may cause.
+        Raises DecodeError: the function refused the file, crashed, or exceeded its time or memory.
+        Raises ChildBug: the function failed in a way that no file may cause.
         """
         name, limit = os.fspath(path), min(self.timeout_s, limit_s or self.timeout_s)
         request = [function.__module__, function.__qualname__, name, options, limit]
