@@ -256,8 +256,8 @@ def _cut(mask: Bools, cost: Floats, first: NDArray[np.intp], second: NDArray[np.
         *((p, q, pair[same]) for p, q in ((a, b), (b, a), (a + count, b + count), (b + count, a + count))),
         *((p, q, -pair[other]) for p, q in ((c, d + count), (d + count, c), (c + count, d), (d, c + count))),
     ]  # fmt: skip
-    start, end, capacity = (np.concatenate(column) for column in zip(*edges))
-    graph = sparse.csr_array((capacity.astype(np.int32), (start, end)), shape=(2 * count + 2, 2 * count + 2))
+    start, end, capacity = (np.concatenate(column).astype(np.int32) for column in zip(*edges))
+    graph = sparse.csr_array((capacity, (start, end)), shape=(2 * count + 2, 2 * count + 2))
     rest = sparse.csr_array(graph - maximum_flow(graph, source, sink).flow)
     rest.eliminate_zeros()
     reached = np.zeros(2 * count + 2, dtype=bool)
