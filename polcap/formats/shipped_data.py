@@ -34,10 +34,7 @@ def data_path(name: str) -> Path:
 
     In a checkout it is in `calib/` next to the package, in an installed wheel in `polcap/_calib/`.
 
-    Raises
-    ------
-    StorageError
-        Neither folder has it: the installation is incomplete.
+    Raises StorageError: neither folder has it: the installation is incomplete.
     """
     for root in (_PACKAGE / "_calib", _PACKAGE.parent / "calib"):
         if (root / name).exists():

@@ -103,25 +103,6 @@ def test_bytes_reach_the_disk_before_their_name_does(tmp_path: Path, monkeypatch
     assert not named
 
 
-def test_held_files_get_their_names_together_or_never(tmp_path: Path) -> None:
-    (tmp_path / "a.bin").write_bytes(b"old")
-    held = atomic.Held()
-    for name in ("a.bin", "b.bin"):
-        with atomic.path(tmp_path / name, held=held) as temporary:
-            temporary.write_bytes(b"new")
-    assert (tmp_path / "a.bin").read_bytes() == b"old" and not (tmp_path / "b.bin").exists()
-    with pytest.raises(RuntimeError), atomic.path(tmp_path / "c.bin", held=held) as temporary:
-        temporary.write_bytes(b"half")
-        raise RuntimeError
-    held.release()
-    held.drop()
-    assert names(tmp_path) == ["a.bin", "b.bin"] and (tmp_path / "a.bin").read_bytes() == b"new"
-    with atomic.path(tmp_path / "a.bin", held=held) as temporary:
-        temporary.write_bytes(b"third")
-    held.drop()
-    assert names(tmp_path) == ["a.bin", "b.bin"] and (tmp_path / "a.bin").read_bytes() == b"new"
-
-
 @pytest.mark.parametrize(
     ("text", "name"),
     [

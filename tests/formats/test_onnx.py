@@ -167,11 +167,12 @@ def test_metadata_that_are_no_text_are_refused(tmp_path: Path) -> None:
         load(path)
 
 
-def test_runs_side_by_side_are_as_many_as_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert [formats_onnx._at_once(formats_onnx.CPU, threads) for threads in (1, 2, 16)] == [1, 2, 4]
-    assert formats_onnx._at_once(formats_onnx.CUDA, 16) == 1
+@pytest.mark.parametrize(("threads", "at_once"), [(1, 1), (2, 2), (16, 4), (0, 3)])
+def test_parallel_runs_are_as_many_as_threads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int, at_once: int
+) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    assert formats_onnx._at_once(formats_onnx.CPU, 0) == 3
+    assert load(write(tmp_path / "m.onnx", SAID), "cpu", threads).at_once == at_once
 
 
 def test_a_file_that_changes_after_it_was_opened_is_refused_where_it_is_opened_again(tmp_path: Path) -> None:

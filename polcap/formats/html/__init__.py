@@ -29,10 +29,7 @@ _SCRIPTS = ("probe.js", "relight.js")
 def write(path: str | Path, title: str, body: Iterable[str], data: Mapping[str, Any]) -> None:
     """Write a page of HTML fragments, whose texts are escaped; `data` is read by its scripts, as JSON.
 
-    Raises
-    ------
-    StorageError
-        The file cannot be written.
+    Raises StorageError: the file cannot be written.
     """
     here = files(__name__)
     style = here.joinpath("page.css").read_text("utf-8")
@@ -79,13 +76,6 @@ def packed(array: NDArray[Any]) -> str:
 def text(content: bytes) -> str:
     """Bytes as base64."""
     return b64encode(content).decode()
-
-
-def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """An HTML table; its texts are escaped."""
-    top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
-    lines = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
-    return f"<table><tr>{top}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
 
 
 def _address(kind: str, content: bytes) -> str:
