@@ -238,8 +238,8 @@ def _cut(mask: Bools, cost: Floats, first: NDArray[np.intp], second: NDArray[np.
         (costless, np.full(count, sink), single),
         *((one, two, pair) for a, b in ((first, same), (first + count, other)) for one, two in ((a, b), (b, a))),
     ]
-    start, end, capacity = (np.concatenate(column) for column in zip(*edges))
-    graph = sparse.csr_array((np.abs(capacity).astype(np.int32), (start, end)), shape=(2 * count + 2, 2 * count + 2))
+    start, end, capacity = (np.concatenate(column).astype(np.int32) for column in zip(*edges))
+    graph = sparse.csr_array((np.abs(capacity), (start, end)), shape=(2 * count + 2, 2 * count + 2))
     rest = sparse.csr_array(graph - maximum_flow(graph, source, sink).flow)
     rest.eliminate_zeros()
     reached = np.zeros(2 * count + 2, dtype=bool)
