@@ -8,8 +8,7 @@ from typing import NoReturn
 import pytest
 
 from polcap import doctor
-from polcap.doctor import Rig
-from polcap.doctor.finding import Finding
+from polcap.doctor import Finding, Rig
 from polcap.errors import DecodeError, HardwareError, ModelError, SettingError
 from polcap.formats import onnx
 from polcap.formats.raw import libraw as raw
