@@ -116,14 +116,10 @@ def test_a_model_for_other_channels_is_refused():
         estimate(seen(noise=0.002), network(("red",)))
 
 
-def test_positions_side_by_side_give_the_bytes_of_one_after_another():
-    found = seen(noise=0.002)
-    one, four = (estimate(found, dataclasses.replace(network(), at_once=n)) for n in (1, 4))
-    for name in ("normal", "diffuse", "roughness", "confidence"):
-        assert getattr(one, name).tobytes() == getattr(four, name).tobytes()
-    lost = dataclasses.replace(network(), answer=lambda _: {"normal": np.zeros((1, 3, 32, 32))}, at_once=4)
+def test_a_model_of_other_maps_is_refused():
+    lost = dataclasses.replace(network(), answer=lambda _: {"normal": np.zeros((1, 3, 32, 32))})
     with pytest.raises(ModelError, match="this version needs"):
-        estimate(found, lost)
+        estimate(seen(noise=0.002), lost)
 
 
 def test_a_crop_larger_than_the_network_sees_keeps_its_texture():
