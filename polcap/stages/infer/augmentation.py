@@ -86,10 +86,9 @@ def _turn(image: Floats, quarters: int, mirror: bool) -> Floats:
 
 def _turn_vectors(vector: Floats, quarters: int, mirror: bool) -> Floats:
     """Vectors (..., 2), y up, mirrored and turned likewise."""
-    x, y = (-vector[..., 0] if mirror else vector[..., 0]), vector[..., 1]
-    for _ in range(quarters % 4):
-        x, y = -y, x
-    return np.stack([x, y], axis=-1)
+    direction = vector[..., 0] + 1j * vector[..., 1]
+    turned = 1j**quarters * (-direction.conj() if mirror else direction)
+    return np.stack([turned.real, turned.imag], axis=-1)
 
 
 def _turn_channels(picture: Floats, quarters: int, mirror: bool) -> Floats:

@@ -1,7 +1,7 @@
 """Error of the zero of the polarizer's ring, from the object's outline and from the slopes inside it.
 
 Diffuse reflection is polarized along the slope g = tan θ (cos φ, sin φ) of the surface. A slope has no curl: along a
-closed curve inside the outline, ∮ g·t = 0 on any smooth surface, symmetrical or not. A ring whose zero is off by δ
+closed curve inside the outline, ∮ g·t = 0 on any smooth surface, symmetrical or not. A ring with a zero off by δ
 turns g, and then ∮ g·t / ∮ g·n = tan δ, n pointing out of the curve. Instead of one curve a band of them is taken: the
 contours of a blurred mask. The DoLP serves as tan θ; any weight does on a symmetrical object. The law does not hold
 for occluded parts, sharp edges, reflected light and interreflection. Their effects differ with the depth, so the spread
