@@ -77,7 +77,7 @@ def centers() -> Floats:
 
 
 def from_centers(points: Floats) -> Placement:
-    """The placement whose patch centers fit image points (24, 2) px, by least squares."""
+    """The placement of a chart with patch centers at image points (24, 2) px, by least squares."""
     return Placement(_homography(centers(), points))
 
 

@@ -60,7 +60,7 @@ def test_chart_is_placed_within_a_tenth_of_a_pixel(pitch, turn, tilt):
 
 
 def test_chart_of_eight_pixel_patches_is_known_by_its_colors():
-    """Superpixels see red and blue half a pixel apart: of patches this small, that leaves 24 flat ones under .9."""
+    """In superpixels red and blue are half a pixel apart, so 24 flat patches explain less than 0.9 of small ones."""
     raw = photograph(pose(17, 2, (235, 185)), samples=1)
     image = np.stack([raw[::2, ::2, 0], raw[::2, 1::2, 1], raw[1::2, 1::2, 2]], axis=-1)
     place = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]]) @ pose(17, 2, (235, 185))
@@ -228,7 +228,7 @@ def test_corners_from_the_wrong_end_are_named():
 
 
 @pytest.mark.parametrize(
-    ("corners", "says"),
+    ("corners", "message"),
     [
         (None, "four outer corners of the patches"),
         ([[10, 10], [10, 200], [300, 200], [300, 10]], "clockwise"),
@@ -237,9 +237,9 @@ def test_corners_from_the_wrong_end_are_named():
         ([[10, 10], [310, 10], [310, 210], [10, 210]], "do not show a ColorChecker Classic"),
     ],
 )
-def test_impossible_corners_are_one_clear_line(corners, says):
+def test_impossible_corners_are_one_clear_line(corners, message):
     request = ChartRequest("corners", corners=None if corners is None else np.array(corners, float))
-    with pytest.raises(ChartError, match=says):
+    with pytest.raises(ChartError, match=message):
         measure(plain()[0], request)
 
 
