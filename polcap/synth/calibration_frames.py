@@ -56,7 +56,7 @@ class CalibrationShoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def write(folder: Path, shoot: CalibrationShoot) -> None:
-    """Write all photographs into the new folder; the same arguments give the same bytes.
+    """Write simulated calibration photographs into a new folder; the same arguments give the same bytes.
 
     Raises
     ------

@@ -24,7 +24,7 @@ COLOR_MATRIX = (0.87, -0.27, -0.075, -0.44, 1.23, 0.235, -0.09, 0.19, 0.69)  # X
 
 
 class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A photosite at base sensitivity."""
+    """Photosite of the simulated sensor at base sensitivity."""
 
     full_well: Annotated[float, Meta(gt=0, le=1e9)] = 30000.0  # e⁻ at the white level
     read_noise: Annotated[float, Meta(ge=0, le=1e6)] = 3.0  # e⁻, 1σ
@@ -33,7 +33,7 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def pinhole(focal_mm: float, width: int, height: int) -> View:
-    """The camera over its own RAW pixels."""
+    """View of a camera without distortion, over its own RAW pixels."""
     return View(focal_mm / SENSOR_WIDTH_MM * width, ((width - 1) / 2, (height - 1) / 2), scale=1)
 
 

@@ -84,7 +84,7 @@ class Shoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def write(folder: Path, scene: Scene, shoot: Shoot, frame_written: Callable[[int, int], None] | None = None) -> None:
-    """Write photographs of `scene` into the new folder; the same arguments give the same bytes.
+    """Write a simulated capture of `scene` into a new folder; the same arguments give the same bytes.
 
     `frame_written` is called with the number of photographs written so far and in all.
 
@@ -207,7 +207,7 @@ def _pose(shoot: Shoot, shot: int) -> dict[str, Any]:
 
 
 def _light(scene: Scene, shoot: Shoot, buffer: GBuffer, back: Floats, flash_axis: float | None = None) -> Floats:
-    """Mean Stokes parameters over each pixel's area, (3, H, W, 3).
+    """Stokes parameters (3, H, W, 3) of a shot, averaged over each pixel's area.
 
     `back` (3, 3) maps the shot's pixels to those of the reference shot.
     """
@@ -232,7 +232,7 @@ def _blur(shoot: Shoot, image: Floats) -> Floats:
 
 
 def _middle_exposure(scene: Scene, shoot: Shoot, buffer: GBuffer, s0: Floats) -> float:
-    """Exposure of the middle frame, for s0 (H, W, 3) in camera channels.
+    """Automatic exposure of the middle frame of a bracket, for s0 (H, W, 3) in camera channels.
 
     The 90th percentile of the object and the white patch reach at most 0.35 of the white level in that frame, and
     99.9 % of the object at most 0.95 in the darkest frame.

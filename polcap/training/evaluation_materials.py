@@ -31,7 +31,7 @@ Field = Callable[[Floats], tuple[Floats, Floats]]  # (M, 3) -> tone 0…1, depth
 
 @dataclass(frozen=True)
 class MaterialSample:
-    """A material at M positions."""
+    """Appearance of a test material at M positions."""
 
     diffuse: Floats  # (M, 3)
     specular: Floats  # (M, 3) F0
@@ -40,7 +40,7 @@ class MaterialSample:
 
 @dataclass(frozen=True)
 class TestMaterial:
-    """A material as functions of position (M, 3) and facing direction (M, 3)."""
+    """A test material as functions of position (M, 3) and of the surface's direction (M, 3)."""
 
     name: str
     ior: float
@@ -83,7 +83,7 @@ def _levels(number: int, met: bool) -> tuple[np.random.Generator, float, float]:
 
 
 def _textured(folder: Path, number: int, met: bool) -> TestMaterial:
-    """A texture set projected along the nearest axis, mirrored at its edges."""
+    """Test material from a texture set, projected along the nearest axis and mirrored at its edges."""
     rng, ior, level = _levels(number, met)
     maps = np.ascontiguousarray(scene_files.read_textures(folder).transpose(1, 2, 0))  # albedo, roughness, two slopes
     mean = float((maps[..., :3].mean(axis=-1) ** 0.45).mean())
@@ -130,7 +130,7 @@ def _sampled(image: Floats, u: Floats, v: Floats) -> Floats:
 
 
 def _pattern(family: str, number: int, met: bool) -> TestMaterial:
-    """Two colors, two glosses and a relief that follow one field."""
+    """Test material with two colors, two glosses and a relief that follow one pattern."""
     rng, ior, level = _levels(number, met)
     field = _FAMILIES[family](rng)
     first, second = _color(rng), _color(rng)
@@ -169,7 +169,7 @@ def _gradient(field: Callable[[Floats], Floats], place: Floats) -> Floats:
 
 
 def _color(rng: np.random.Generator) -> Floats:
-    """Linear reflectance (3,), dark to light, gray to vivid."""
+    """Random linear reflectance (3,), dark to light, gray to vivid."""
     hue, saturation, value = rng.uniform(0, 360), rng.uniform(0, 1) ** 1.5, rng.uniform(0.25, 0.95)
     display = cv2.cvtColor(np.array([[[hue, saturation, value]]], np.float32), cv2.COLOR_HSV2RGB)[0, 0]
     return np.asarray(display.astype(np.float64) ** 2.2)

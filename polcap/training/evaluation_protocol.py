@@ -43,7 +43,7 @@ PROTOCOLS = {1: "smooth bodies, F0 .03–.26", 2: "rough bodies, F0 as it is met
 
 @dataclass(frozen=True)
 class Case:
-    """One picture of the evaluation; camera frame."""
+    """One simulated picture of the evaluation with its truth; camera frame."""
 
     name: str  # mesh and material
     cues: Cues  # with the camera errors of CONDITIONS
@@ -55,7 +55,7 @@ class Case:
 
 @dataclass(frozen=True)
 class _Subject:
-    """Geometry and material of a picture, before any light."""
+    """Geometry and material of an evaluation picture, before light is simulated."""
 
     pose: light_transport.Pose
     places: light_transport.SurfacePoints
@@ -65,7 +65,7 @@ class _Subject:
 
 
 class Protocol:
-    """All pictures of one size and protocol."""
+    """All evaluation pictures of one size and protocol."""
 
     def __init__(self, data: Path, size: int, protocol: int = 1) -> None:
         files = sorted((data / "meshes" / "test").glob("*.npz"))
@@ -196,7 +196,7 @@ def _random_placement(mesh: Triangles, rng: np.random.Generator) -> tuple[Floats
 
 
 def _photograph(light: Floats, places: light_transport.SurfacePoints, view: View, errors: CameraErrors) -> StokesImage:
-    """Measurement of Stokes parameters (3, M, 3) by a camera with these errors."""
+    """Measure Stokes parameters (3, M, 3) with a camera that has these errors."""
     mask = places.mask
     at = np.flatnonzero(mask)
     images = np.stack([traced_views.fill(mask, part) for part in light]), traced_views.fill(mask, places.diffuse)
@@ -207,7 +207,7 @@ def _photograph(light: Floats, places: light_transport.SurfacePoints, view: View
 
 
 def _bin(image: StokesImage, by: int) -> StokesImage:
-    """Means over by × by pixels of the object; a bin is part of the object if half of it is."""
+    """Picture with fewer pixels: means over by × by pixels. A new pixel is on the object if half of its pixels are."""
     height, width = (side // by for side in image.mask.shape)
 
     def summed(value: Floats) -> Floats:  # the last two axes of pixels

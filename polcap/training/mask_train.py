@@ -36,7 +36,7 @@ _INSERTED = 0.12  # share of pictures into which the object of another one is in
 
 
 def main(data: Path, out: Path, minutes: float) -> None:
-    """Make the missing pictures, train for `minutes`, export."""
+    """Train the mask's network: make the missing pictures, train for `minutes`, export."""
     torch.set_num_threads(1)
     make_pictures(out / "pictures", data, _PICTURES)
     torch.manual_seed(1)
@@ -153,7 +153,7 @@ class MaskTraining(loop.PictureTraining):
         super().__init__(unet.mask_network(), rate, files)
 
     def advance(self, batch: list[Path], progress: float) -> dict[str, float]:
-        """Do one step; returns the losses of both passes."""
+        """Do one training step; returns the losses of both passes."""
         rng = self.random
         others = [batch[n - 1] if rng.random() < _INSERTED else None for n in range(len(batch))]
         examples = [load_varied(file, rng, other) for file, other in zip(batch, others)]
