@@ -125,7 +125,7 @@ class Tracer:
         return MeshHits(index, position, normal, face, weight)
 
     def facing(self, origin: Floats, direction: Floats) -> tuple[Floats, Floats]:
-        """Distances (M,) to the first hits of rays, infinite for none, and normals of the triangles towards the rays."""
+        """Distances (M,) to the first hits of rays, infinite for none, and normals of the triangles facing the rays."""
         start, way = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, direction))
         hit = self._scene.run(start, way, query="INTERSECT", output=True)
         struck = hit["primID"] >= 0

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from polcap.errors import InputError
 from polcap.images import Bits, ColorCalibration, Cues, Floats, Quality, StokesImage, SurfaceMaps, View
-from polcap.optics import frames
+from polcap.optics import frames, resize
 from polcap.optics.body import SMOOTH, Law
 from polcap.stages import cues
 from polcap.synth.mesh_tracer import Tracer, Triangles, centred
@@ -208,25 +208,21 @@ def _photograph(light: Floats, places: light_transport.SurfacePoints, view: View
 
 def _bin(image: StokesImage, by: int) -> StokesImage:
     """Picture with fewer pixels: means over by × by pixels. A new pixel is on the object if half of its pixels are."""
-    height, width = (side // by for side in image.mask.shape)
-
-    def summed(value: Floats) -> Floats:  # the last two axes of pixels
-        cut = value[..., : height * by, : width * by].reshape(*value.shape[:-2], height, by, width, by)
-        return np.asarray(cut.sum(axis=(-3, -1)))
-
     inside = image.mask.astype(np.float32)
-    count = summed(inside)
-    mask, share = count * 2 >= by * by, np.maximum(count, 1)
-    stokes, covariance = (
-        np.moveaxis(summed(np.moveaxis(value * inside[..., None], -1, 1)) / share**power * mask, 1, -1)
-        for value, power in ((image.stokes, 1), (image.covariance, 2))
-    )
-    clipped = summed(((image.quality & Quality.CLIPPED) > 0) * inside) * 2 > share
+    share = resize.block_means(inside, by)
+    mask, least = share >= 0.5, np.maximum(share, 1 / by**2)[..., None]
+
+    def object_means(layers: Floats) -> Floats:
+        return np.asarray([resize.block_means(layer * inside[..., None], by) / least for layer in layers])
+
+    stokes, covariance = object_means(image.stokes), object_means(image.covariance) / (least * by**2)
+    clipped = resize.block_means(((image.quality & Quality.CLIPPED) > 0) * inside, by) * 2 > share
     view = replace(
         image.view, focal=image.view.focal / by, scale=by,
         center=((image.view.center[0] + 0.5) / by - 0.5, (image.view.center[1] + 0.5) / by - 0.5),
     )  # fmt: skip
-    return StokesImage(stokes, covariance, clipped.astype(np.uint8) * np.uint8(Quality.CLIPPED), mask, view, None)
+    quality = clipped.astype(np.uint8) * np.uint8(Quality.CLIPPED)
+    return StokesImage(stokes * mask[..., None], covariance * mask[..., None], quality, mask, view, None)
 
 
 def white() -> ColorCalibration:

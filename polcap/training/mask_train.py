@@ -19,6 +19,7 @@ from torch.nn import functional as F
 
 from polcap.formats import atomic
 from polcap.images import Bools, Floats
+from polcap.optics.resize import area_mean, block_means
 from polcap.stages.mask.mask_channels import CHANNELS, ENCODING, SIZE_MULTIPLE, ReducedPicture, brightness, encode
 from polcap.synth.mesh_tracer import Tracer, Triangles, centred
 from polcap.training import loop, mask_scenes, mask_views, materials, random_shapes, traced_views, unet
@@ -91,9 +92,7 @@ def pack(picture: mask_scenes.MaskScene) -> Floats:
     stokes = picture.stokes / max(float(np.percentile(picture.stokes[0].mean(-1), 95)), 1e-9)
     sums = np.moveaxis(stokes[1:].sum(-1), 0, -1)
     whole = np.concatenate([stokes[0], sums, picture.mask[..., None], picture.chart[..., None]], axis=-1)
-    height, width, count = whole.shape
-    blocks = np.clip(whole, -6e4, 6e4).reshape(height // 2, 2, width // 2, 2, count)
-    return np.asarray(blocks.mean((1, 3)), np.float16)
+    return block_means(np.clip(whole, -6e4, 6e4), 2).astype(np.float16)
 
 
 def load_varied(file: Path, rng: np.random.Generator, other: Path | None = None) -> tuple[ReducedPicture, Floats]:
@@ -244,8 +243,7 @@ def _map_layers(picture: ReducedPicture, change: Callable[[Floats], Floats]) -> 
 
 def _reduce(image: Floats, width: int) -> Floats:
     """Area means of an image (H, W, ·) at `width` pixels across."""
-    size = width, round(image.shape[0] * width / image.shape[1])
-    return np.asarray(cv2.resize(np.asarray(image, np.float32), size, interpolation=cv2.INTER_AREA))
+    return area_mean(np.asarray(image, np.float32), (round(image.shape[0] * width / image.shape[1]), width))
 
 
 def _stack_channels(channels: list[Floats]) -> Tensor:
