@@ -76,7 +76,7 @@ class Protocol:
         self.size, self.protocol = size, protocol
         self.names = [file.stem for file in files]
         self.tracers = [Tracer(centred(traced_views.read_mesh(file))) for file in files]
-        self.materials = evaluation_materials.test_materials(data / "materials" / "test", met=protocol == 2)
+        self.materials = evaluation_materials.test_materials(data / "materials" / "test", everyday=protocol == 2)
 
     def case(self, number: int) -> Case:
         """Simulate picture `number`."""

@@ -188,14 +188,9 @@ class Decoder(nn.Module):  # type: ignore[misc]  # torch comes without types her
     """Decoder from the coarsest level to full resolution; `hints` more input channels reach every level."""
 
     def __init__(
-        self,
-        encoder: tuple[int, ...],
-        widths: tuple[int, ...],
-        blocks: int,
-        skip_blocks: int,
-        outputs: int,
+        self, encoder: tuple[int, ...], widths: tuple[int, ...], blocks: int, skip_blocks: int, outputs: int,
         hints: int = 0,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__()
         coarse = (*widths[1:], encoder[-1])  # channels from the next coarser level
         self.up = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in zip(coarse, widths))

@@ -157,13 +157,9 @@ class NetworkTraining(loop.Trainee):
     network: main_network.MainNetwork
 
     def __init__(
-        self,
-        shape: main_network.NetworkShape,
-        device: torch.device,
-        rate: float,
-        learners: int = 1,
+        self, shape: main_network.NetworkShape, device: torch.device, rate: float, learners: int = 1,
         variant: str = "ours",
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__(main_network.MainNetwork(shape, variant).to(device, memory_format=torch.channels_last), rate)
         self.device = device
         self.weights = list(self.network.parameters())
