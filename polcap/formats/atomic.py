@@ -44,7 +44,7 @@ def path(final: str | Path, synced: bool = True) -> Iterator[Path]:
 
     Parent folders are made. The temporary name has the same suffix, for writers that choose a format by it. On any
     exception it is removed, and an old file under `final` is untouched. Without `synced` the file may be incomplete
-    after a power cut: for files whose reader checks them.
+    after a power cut: for files that their reader checks.
 
     Raises StorageError: any OSError of making, writing, syncing or renaming, inside the block too.
     """

@@ -21,7 +21,7 @@ from polcap.optics import distortion
 
 _FULL_TURN = 360.0  # degrees
 _MAX_SIDE = 1_000_000  # px of a picture
-_MAX_DISTORTION = 1000.0  # of k1 and k2; a lens whose picture does not fold over itself has less
+_MAX_DISTORTION = 1000.0  # of k1 and k2; only a picture that folds over itself has more
 _LEAST_LIGHT = 0.02  # in a corner of the lens, relative to the middle
 _SAME_SETTING = 0.05  # relative change of f-number or focal length
 _CHANNELS = (1, 3)
@@ -124,7 +124,7 @@ def _parts(found: Calibration) -> list[str]:
 
 
 def _impossible_parts(found: Calibration) -> list[str]:
-    """The parts whose figures are physically impossible."""
+    """Names of the parts of a calibration with physically impossible figures."""
     ring, light, lens, flash = found.polarizer, found.falloff, found.geometry, found.flash
     possible = {
         "noise": all(

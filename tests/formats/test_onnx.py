@@ -1,4 +1,4 @@
-"""A model is taken for what its file says, or refused with the reason."""
+"""A model is used as its metadata state, or refused with the reason."""
 
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ SAID = {"channels": "s1,s2", "encoding": ENCODING, "native_size": "128", "size_m
 
 
 def write(path: Path, metadata: dict[str, str], opset: int = 17, channels: int = 2) -> Path:
-    """A model whose one output is twice its input."""
+    """A model with one output, twice its input."""
     from onnx import TensorProto, helper
 
     shape = ["n", channels, "h", "w"]
@@ -34,7 +34,7 @@ def write(path: Path, metadata: dict[str, str], opset: int = 17, channels: int =
     return path
 
 
-def test_a_model_runs_and_tells_what_it_eats(tmp_path: Path) -> None:
+def test_a_model_runs_and_states_its_channels(tmp_path: Path) -> None:
     network = load(write(tmp_path / "m.onnx", SAID), "cpu", 1)
     assert network.channels == ("s1", "s2") and network.metadata["licence"] == "Apache-2.0"
     x = np.random.default_rng(0).normal(size=(1, 2, 8, 16)).astype(np.float32)

@@ -174,7 +174,7 @@ def _folders(folder: Path, sub_folders: dict[float, Path], crossed: Path | None,
 
 
 def numbered(folder: Path) -> list[str]:
-    """Sub-folders whose names hold a number but are not read as an angle: 045, angle45."""
+    """Sub-folders with a number in their names that are not read as an angle: 045, angle45."""
     return [
         path.name
         for path in children(folder)
@@ -231,7 +231,7 @@ def _sensor_shots(sources: Sequence[Source], angles_deg: _Order) -> Shots:
 
 
 def _by_name(pictures: list[Source]) -> dict[float, list[Source]]:
-    """Finished pictures whose names differ in one number that can only be an angle, by this angle; else nothing."""
+    """Finished pictures by the angle in their names; empty unless one number differs that can be an angle."""
     stems = [source.path.stem for source in pictures]
     raw = any(source.probe.kind == "raw" for source in pictures)  # numbers of a camera's counter
     if raw or len({_NUMBER.sub("#", stem) for stem in stems}) != 1:

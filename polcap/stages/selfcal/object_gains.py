@@ -244,9 +244,9 @@ def _null_vector(
         h = _least(_squares(rows, weight))
         residual = np.linalg.norm(rows @ h, axis=1)
         weight = biweight(residual, spread(residual))
-    each = [_squares(rows[part == p], weight[part == p]) for p in np.unique(part)]
-    total = np.sum(each, axis=0)
-    variance = (times * jackknife(np.stack([_least(total - one) for one in each]))) ** 2
+    total = _squares(rows, weight)
+    without = [_least(total - _squares(rows[part == p], weight[part == p])) for p in np.unique(part)]
+    variance = (times * jackknife(np.stack(without))) ** 2
     for k in range(len(angle)):
         turned = angle + _ANGLE_ERROR * (np.arange(len(angle)) == k)
         variance = variance + (_least(_squares(equations(turned), weight)) - h) ** 2

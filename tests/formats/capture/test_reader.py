@@ -1,4 +1,4 @@
-"""Capture folders: what each layout means, and one clear line for what does not add up."""
+"""Capture folders: the meaning of each layout, and one clear line for each fault."""
 
 import shutil
 from itertools import count
@@ -55,7 +55,7 @@ def names(shot):
     return [frame.path.rpartition("/")[2] for frame in shot.frames]
 
 
-# ---------------------------------------------------------------- what is understood
+# ---------------------------------------------------------------- layouts
 
 
 def test_sub_folders_state_the_angles(tmp_path):
@@ -85,7 +85,7 @@ def test_flat_folder_is_cut_into_equal_brackets_by_time(tmp_path):
     ]
 
 
-def test_flat_folder_follows_the_order_given(tmp_path):
+def test_flat_folder_follows_the_stated_order(tmp_path):
     understood = capture.read(flat(tmp_path, shots=4), (0.0, 45.0, 90.0, 135.0))
     assert degrees(understood) == [0, 45, 90, 135]
     assert degrees(capture.read(flat(tmp_path, shots=4), (135.0, 90.0, 45.0, 0.0))) == [135, 90, 45, 0]
@@ -155,14 +155,14 @@ def test_the_folder_of_one_angle_is_no_capture(tmp_path):
         capture.read(tmp_path / "pol045")
 
 
-def test_a_folder_of_captures_is_told_so(tmp_path):
+def test_a_folder_of_captures_is_named_as_such(tmp_path):
     folders(tmp_path / "krug")
     with pytest.raises(CaptureError, match="sub-folders krug hold captures: give one of them, or run `polcap batch`"):
         capture.read(tmp_path)
 
 
 def test_untimed_brackets_in_one_folder_are_to_be_sorted(tmp_path):
-    """No order of angles tells them apart: none is asked for."""
+    """No order of angles can separate them, so the message asks for none."""
     folder = pictures(tmp_path, [f"krug_{angle}_grad_{number}.png" for angle in (0, 45, 90) for number in range(3)])
     for angles in (None, (0.0, 45.0, 90.0)):
         with pytest.raises(CaptureError, match="cannot be assigned to angles; sort the frames into pol000") as caught:
@@ -243,12 +243,12 @@ def test_digest_follows_the_bytes(tmp_path):
     assert capture.read(folder).shots[0].frames[0].digest != before
 
 
-# ---------------------------------------------------------------- what is refused
+# ---------------------------------------------------------------- faults
 
 
-def remake(place, *given, **settings):
+def remake(place, *time, **settings):
     """Replace a photograph by another one."""
-    return lambda folder: shoot(folder / place, *given, **settings)
+    return lambda folder: shoot(folder / place, *time, **settings)
 
 
 def rewrite(place, change):
