@@ -4,6 +4,7 @@ The folder has the layout that `polcap calibrate` reads: dark/, flat/, flash/, l
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -65,46 +66,46 @@ def write(folder: Path, shoot: CalibrationShoot) -> None:
         The folder cannot be written.
     """
     forward_camera.require_empty(folder)
+    actual = msgspec.structs.replace(shoot.sensor, black=shoot.sensor.black + shoot.black_error)
+    base = Exif(
+        make="Polcap", model="Synthetic", lens="Synthetic 60mm", f_number=11.0, focal_length_mm=shoot.focal_mm,
+        taken="2026-03-14T12:00:00.000",
+    )  # fmt: skip
     with atomic.folder(folder) as place:
-        for number, (name, radiance, iso, time, flash) in enumerate(_frames(shoot)):
-            _photograph(place / name, shoot, radiance, iso, time, flash, number)
+        for number, (name, radiance, iso, time) in enumerate(_photographs(shoot)):
+            random = np.random.default_rng([shoot.seed, 8, number])
+            counts = forward_camera.expose(forward_camera.mosaic(radiance, _CFA), actual, iso / 100, random)
+            exif = replace(base, exposure_time=time, iso=iso, flash_fired=name == "flash")
+            file = place / name / f"IMG_{number:04d}.DNG"
+            forward_camera.write_dng(file, counts, shoot.sensor, _CFA, COLOR_MATRIX, exif)
         with atomic.path(place / "truth.json") as temporary:
             temporary.write_bytes(msgspec.json.format(msgspec.json.encode(shoot), indent=1))
 
 
-def _frames(shoot: CalibrationShoot) -> Iterator[tuple[str, Floats, float, float, bool]]:
-    """File name, light (H, W, 3) at ISO 100, ISO, exposure time [s] and whether the flash fired, of each frame."""
+def _photographs(shoot: CalibrationShoot) -> Iterator[tuple[str, Floats, float, float]]:
+    """Folder, light (H, W, 3) at ISO 100, ISO and exposure time [s] of each photograph."""
     random = np.random.default_rng([shoot.seed, 7])
-    light, number = _surface(shoot), 0
+    light = _surface(shoot)
     for iso in shoot.isos:
         amplification = iso / 100
         for _ in range(2):
-            yield f"dark/IMG_{number:04d}.DNG", 0 * light, iso, 0.01, False
-            number += 1
-        for level in shoot.levels:
-            for _ in range(2):
-                jitter = 1 + shoot.lamp_jitter * random.normal()
-                time = level / amplification * 0.1
-                flat = light * (level**shoot.power / amplification * jitter)
-                yield f"flat/IMG_{number:04d}.DNG", flat, iso, time, False
-                number += 1
+            yield "dark", 0 * light, iso, 0.01
+        for level in np.repeat(shoot.levels, 2).tolist():
+            jitter = 1 + shoot.lamp_jitter * random.normal()
+            yield "flat", light * (level**shoot.power / amplification * jitter), iso, level / amplification * 0.1
     for _ in range(shoot.pops):
-        jitter = 1 + shoot.flash_jitter * random.normal()
-        yield f"flash/IMG_{number:04d}.DNG", light * (0.5 * jitter), 100.0, 1 / 160, True
-        number += 1
+        yield "flash", light * (0.5 * (1 + shoot.flash_jitter * random.normal())), 100.0, 1 / 160
     size = shoot.width, shoot.height
     for albedo in boards.pictures(shoot.view, shoot.distortion, size, shoot.boards, shoot.board, shoot.seed):
-        yield f"lens/IMG_{number:04d}.DNG", albedo * (0.8 * _TINT), 100.0, 0.05, False
-        number += 1
+        yield "lens", albedo * (0.8 * _TINT), 100.0, 0.05
     contrast = (np.array(shoot.extinction) - 1) / (np.array(shoot.extinction) + 1)
     for axis in shoot.axes_deg:
         for ring in np.arange(0, 180, shoot.ring_step_deg):
             actual = shoot.sense * (ring + shoot.ring_error_deg * random.normal()) + shoot.zero_deg
             passed = 0.5 * (1 + contrast * np.cos(2 * np.radians(actual - axis)))
             jitter = 1 + shoot.lamp_jitter * random.normal()
-            name = f"polarizer/axis{layouts.degrees(axis)}/pol{layouts.degrees(ring)}/IMG_{number:04d}.DNG"
-            yield name, light * (0.8 * jitter) * passed, 100.0, 0.05, False
-            number += 1
+            name = f"polarizer/axis{layouts.degrees(axis)}/pol{layouts.degrees(ring)}"
+            yield name, light * (0.8 * jitter) * passed, 100.0, 0.05
 
 
 def _surface(shoot: CalibrationShoot) -> Floats:
@@ -116,24 +117,3 @@ def _surface(shoot: CalibrationShoot) -> Floats:
     vignette = 1 + sum(a * r2 ** (k + 1) for k, a in enumerate(shoot.falloff))
     uneven = 1 + shoot.slope[0] * x / half + shoot.slope[1] * y / half
     return np.asarray((vignette * uneven)[..., None] * _TINT)
-
-
-def _photograph(
-    path: Path, shoot: CalibrationShoot, radiance: Floats, iso: float, time: float, flash: bool, number: int
-) -> None:
-    random = np.random.default_rng([shoot.seed, 8, number])
-    mosaic = forward_camera.mosaic(radiance, _CFA)
-    actual = msgspec.structs.replace(shoot.sensor, black=shoot.sensor.black + shoot.black_error)
-    counts = forward_camera.expose(mosaic, actual, iso / 100, random)
-    exif = Exif(
-        make="Polcap",
-        model="Synthetic",
-        lens="Synthetic 60mm",
-        exposure_time=time,
-        f_number=11.0,
-        iso=iso,
-        focal_length_mm=shoot.focal_mm,
-        taken="2026-03-14T12:00:00.000",
-        flash_fired=flash,
-    )
-    forward_camera.write_dng(path, counts, shoot.sensor, _CFA, COLOR_MATRIX, exif)

@@ -211,6 +211,6 @@ def test_a_camera_that_rolls_turns_its_polarizer_with_it() -> None:
     rolled = shooting.transform(studio.shoot, (0.0, 0.0), 20.0)
     pose = {"actual_deg": 30.0, "rot_deg": 20.0, "transform": rolled.tolist()}
     upright, other = studio.through(30.0), studio.through(70.0)
-    found = studio.radiance(pose, first=False)
+    found = studio.radiance(pose)
     inside = studio.buffer.mask & (studio.buffer.normal[..., 2] > 0.35)
     assert np.abs(found - upright)[inside].max() < 0.02 * np.abs(other - upright)[inside].max()

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from polcap.errors import DecodeError, StorageError
 from polcap.formats import atomic
-from polcap.formats.raw import file_bytes, file_checks, worker
+from polcap.formats.raw import file_bytes, photo, worker
 from polcap.images import Floats
 
 _MAGIC = b"\x89PNG\r\n\x1a\n"
@@ -92,22 +92,12 @@ def read(path: Path) -> Pixels:
 
 def decode(path: str) -> worker.Answer:
     """`read`, in the child process; DecodeError."""
-    return {}, {"pixels": pixels(path, file_bytes.load(path))}
-
-
-def pixels(path: str, data: bytes) -> Pixels:
-    """The pixels (H, W[, C]) of the bytes of the PNG `path`; DecodeError. In the child process."""
-    if data[:8] != _MAGIC or len(data) < 24:
-        raise DecodeError(f"{path} is not a whole PNG ({len(data)} bytes); write it again")
-    file_checks.check_png(path, data)
-    try:
-        array = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        array = None
-    if array is None or array.dtype not in (np.uint8, np.uint16):
-        raise DecodeError(f"{path} is not a whole PNG ({len(data)} bytes); write it again")
-    found: Pixels = swapped(array)
-    return found
+    data = file_bytes.load(path)
+    if data[:8] != _MAGIC:
+        raise DecodeError(f"{path} is not a PNG; write it again")
+    with photo.opened(path, data) as file:
+        pixels = photo.every_channel(path, file)
+    return {}, {"pixels": pixels[..., 0] if pixels.shape[2] < 3 else pixels}  # grey, its alpha left out
 
 
 def fitted(picture: Pixels, width: int) -> NDArray[np.uint8]:

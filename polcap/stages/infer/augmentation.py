@@ -68,13 +68,12 @@ def _median_direction(normals: Floats, errors: Floats) -> Floats:
     Weiszfeld's iteration: a mean weighed by the reciprocal of the distances from the previous one. Its length is at
     most 1, and less where the directions differ.
     """
-    directions = normals / np.maximum(frames.dot(normals, normals) ** 0.5, 1e-6)[..., None]
+    directions = frames.unit(normals)
     trust = 1 / np.maximum(errors, _LEAST_ERROR)
     weights = trust
     for _ in range(_STEPS):
         mean = (weights[..., None] * directions).sum(axis=0) / weights.sum(axis=0)[..., None]
-        middle = mean / np.maximum(frames.dot(mean, mean) ** 0.5, 1e-6)[..., None]
-        difference = directions - middle
+        difference = directions - frames.unit(mean)
         weights = trust / np.maximum(frames.dot(difference, difference) ** 0.5, _NEAREST)
     return np.asarray(mean, np.float32)
 
@@ -86,10 +85,9 @@ def _turn(image: Floats, quarters: int, mirror: bool) -> Floats:
 
 def _turn_vectors(vector: Floats, quarters: int, mirror: bool) -> Floats:
     """Vectors (..., 2), y up, mirrored and turned likewise."""
-    x, y = (-vector[..., 0] if mirror else vector[..., 0]), vector[..., 1]
-    for _ in range(quarters % 4):
-        x, y = -y, x
-    return np.stack([x, y], axis=-1)
+    direction = vector[..., 0] + 1j * vector[..., 1]
+    turned = 1j**quarters * (-direction.conj() if mirror else direction)
+    return np.stack([turned.real, turned.imag], axis=-1)
 
 
 def _turn_channels(picture: Floats, quarters: int, mirror: bool) -> Floats:

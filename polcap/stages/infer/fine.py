@@ -74,8 +74,7 @@ def refine(cues: Cues, estimate: CoarseEstimate, network: Network, run: RunNetwo
         relief[inner] = found
     relief = high_pass(relief, cues.mask, estimate.shrink)
     local = frames.to_ray_frame(estimate.normal, cues.rays) + relief
-    refined = frames.from_ray_frame(local, cues.rays)
-    return np.asarray(refined / np.maximum((frames.dot(refined, refined) ** 0.5)[..., None], 1e-6))
+    return frames.unit(frames.from_ray_frame(local, cues.rays))
 
 
 def _tiles(mask: NDArray[np.bool_]) -> Iterator[tuple[Window, Window]]:

@@ -88,7 +88,7 @@ def estimate_coarse(
     for name in ("specular", "roughness"):
         small[name] = _smooth_gloss(small[name], seen.mask)
     maps = {name: np.asarray(cv2.resize(image, size)) for name, image in small.items()}
-    smooth = _unit(maps["normal"])
+    smooth = frames.unit(maps["normal"])
     guide = np.asarray(frames.to_ray_frame(smooth, cues.rays)), maps["sigma"]
     by_pixel, error, _ = analytic.invert(cues, ior, guide)
     detailed = _add_detail(smooth, by_pixel, cues.mask, shrink)
@@ -156,7 +156,7 @@ def _without_grid(normal: Floats, mask: NDArray[np.bool_]) -> Floats:
 def _correct_half_turns(normal: Floats, seen: Cues, sigma: Floats, opposed: Floats) -> tuple[Floats, Floats]:
     """Normals (H, W, 3) with wrong regions turned to the other side of the ray, and the doubt of the side (H, W)."""
     found = half_turns.resolve(
-        frames.to_ray_frame(_unit(normal), seen.rays), seen.mask, half_turns.NetworkDoubt(sigma, opposed)
+        frames.to_ray_frame(frames.unit(normal), seen.rays), seen.mask, half_turns.NetworkDoubt(sigma, opposed)
     )
     opposite = 2 * frames.dot(normal, seen.rays)[..., None] * seen.rays - normal
     return np.where(found.turned[..., None], opposite, normal).astype(np.float32), found.doubt
@@ -200,7 +200,7 @@ def _add_detail(coarse: Floats, by_pixel: Floats, mask: NDArray[np.bool_], shrin
 
     Interreflection, refractive index and half-turns bend the inversion's normals over whole regions; relief is finer.
     """
-    return _unit(by_pixel + fine.low_pass((coarse - by_pixel).astype(np.float32), mask, shrink))
+    return frames.unit(by_pixel + fine.low_pass((coarse - by_pixel).astype(np.float32), mask, shrink))
 
 
 def _join(*estimates: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
@@ -209,11 +209,9 @@ def _join(*estimates: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
     If the estimates agree, the error is that of independent ones; if they differ, their distance adds to it.
     """
     weights = [1 / np.maximum(sigma, 1.0) ** 2 for _, sigma in estimates]
-    total = np.asarray(sum(w[..., None] * n / np.maximum(_length(n), 1e-6) for w, (n, _) in zip(weights, estimates)))
-    length = _length(total)
-    share = np.clip(length[..., 0] / sum(weights), 1e-3, 1)  # 1 where all directions agree
-    spread = np.degrees(np.arccos(share))
-    return np.asarray(total / np.maximum(length, 1e-12)), np.hypot(1 / np.sqrt(sum(weights)), spread)
+    total = np.asarray(sum(w[..., None] * frames.unit(normal) for w, (normal, _) in zip(weights, estimates)))
+    share = np.clip(frames.dot(total, total) ** 0.5 / sum(weights), 1e-3, 1)  # 1 where all directions agree
+    return frames.unit(total), np.hypot(1 / np.sqrt(sum(weights)), np.degrees(np.arccos(share)))
 
 
 def _shading(normal: Floats, rays: Floats) -> Floats:
@@ -222,12 +220,4 @@ def _shading(normal: Floats, rays: Floats) -> Floats:
     The square root of Lambert's law left the least error of the albedo, on pictures of both protocols, engraved or
     not, and on path-traced captures: normals err, and light from around brightens surfaces that turn away.
     """
-    return np.asarray(np.sqrt(np.maximum(frames.to_ray_frame(_unit(normal), rays)[..., 2:], _GRAZING)))
-
-
-def _unit(vectors: Floats) -> Floats:
-    return np.asarray(vectors / np.maximum(_length(vectors), 1e-6))
-
-
-def _length(vectors: Floats) -> Floats:
-    return np.asarray(frames.dot(vectors, vectors)[..., None] ** 0.5)
+    return np.asarray(np.sqrt(np.maximum(frames.to_ray_frame(frames.unit(normal), rays)[..., 2:], _GRAZING)))

@@ -93,7 +93,8 @@ def solve(
     shots = object_gains.register(radiance, alignment, object_)
     greys = grey_patches.measure(radiance, alignment, color)
     facing = object_gains.facing(shots.light, shots.inside, radiance.angle)
-    first = _gains_without_angles(radiance, greys, facing)
+    gain, sigma, _ = _believed(radiance, greys, facing)  # without the angles, because these are not checked yet
+    first = GainEstimate(gain.mean(1), sigma.mean(1))
     even = replace(shots, light=shots.light / first.gain[:, None, None])
     rim = angles.rim(even)
     one_exposure = radiance.equipment.light == "one exposure"
@@ -133,29 +134,23 @@ def solve(
     )
 
 
-def _gains_without_angles(radiance: AngleStack, greys: GreyPatches | None, facing: GainEstimate) -> GainEstimate:
-    """Gains (K,) by methods that do not need the angles, because the angles are not checked yet."""
+def _believed(
+    radiance: AngleStack, greys: GreyPatches | None, by_object: GainEstimate
+) -> tuple[Floats, Floats, Literal["grey patches", "object", "one exposure", "none"]]:
+    """Gains (K, 3), their 1σ, and their source: the best that is available."""
+    shape = len(radiance.angle), 3
     if radiance.equipment.light == "one exposure":
-        shots = len(radiance.angle)
-        return GainEstimate(np.ones(shots), np.zeros(shots))
+        return np.ones(shape), np.zeros(shape), "one exposure"
     if greys is not None:
-        return GainEstimate(greys.gain.mean(1), greys.sigma.mean(1))
-    return object_gains.with_prior(facing, _prior(radiance))
+        return greys.gain, greys.sigma, "grey patches"
+    known = object_gains.with_prior(by_object, _prior(radiance))
+    source: Literal["object", "none"] = "object" if np.isfinite(by_object.sigma).all() else "none"
+    return known.gain[:, None].repeat(3, axis=1), known.sigma[:, None].repeat(3, axis=1), source
 
 
 def _gains(radiance: AngleStack, greys: GreyPatches | None, anchor: GainEstimate) -> Gains:
     """Gains (K, 3) by the best available source, with those of the object (`anchor`) as a cross-check."""
-    gain: Floats
-    sigma: Floats
-    source: Literal["grey patches", "object", "one exposure", "none"]
-    if radiance.equipment.light == "one exposure":
-        gain, sigma, source = np.ones((len(anchor.gain), 3)), np.zeros((len(anchor.gain), 3)), "one exposure"
-    elif greys is not None:
-        gain, sigma, source = greys.gain, greys.sigma, "grey patches"
-    else:
-        believed = object_gains.with_prior(anchor, _prior(radiance))
-        gain, sigma = (np.repeat(part[:, None], 3, axis=1) for part in (believed.gain, believed.sigma))
-        source = "object" if np.isfinite(anchor.sigma).all() else "none"
+    gain, sigma, source = _believed(radiance, greys, anchor)
     both = np.hypot(anchor.sigma, sigma.mean(1))
     difference = np.abs(gain.mean(1) / anchor.gain - 1)
     return Gains(

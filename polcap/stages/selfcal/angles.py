@@ -178,7 +178,7 @@ def turned_shot(light: Floats, row: NDArray[np.int_], angle: Floats, gain_sigma:
     alike = [k for k in range(shots) if gained[k] >= _ALIKE * max(gained)]
     alike.sort(key=lambda k: -abs(fits[k].turn))  # a small turn of one shot can be a large one of another
     found = fits[alike[0]]
-    # An error of one angle looks like a larger error of another, to which the residual is less sensitive.
+    # An error of one angle has the effect of a larger error of an angle to which the residual is less sensitive.
     change = np.sqrt((_change_per_rad(light, angle) ** 2).mean(axis=1))
     sensitivity = np.linalg.norm(_complement(angle), axis=0) * change
     by_angles = _ANGLE_ERROR * float(np.linalg.norm(sensitivity) / max(sensitivity[alike[0]], 1e-9))

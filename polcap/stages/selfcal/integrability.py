@@ -30,7 +30,7 @@ from polcap.stages.selfcal.object_gains import GainEstimate, unknown
 
 _SHOTS = 3
 _SIDE = 110.0  # px; larger objects are averaged down to this root of their area, to average noise
-BLUR = 2.0  # px of the reduced picture, 1σ of the Gaussian whose derivative is taken
+BLUR = 2.0  # px of the reduced picture, 1σ of the Gaussian that the derivative uses
 _LEAST = 300  # pixels of the reduced object
 _IOR = 1.5
 _STEEPEST = 0.25  # largest DoLP that is used: 64° for index 1.5

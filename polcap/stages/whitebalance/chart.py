@@ -33,8 +33,8 @@ _DARKEST = 1e-3  # of white; darker values are set to this
 _MARGIN = 0.045  # width of card around the outer patches that is compared [pitch]
 _AROUND = 0.3  # width around the chart in which pixels are fitted [pitch]
 _LEAST_PX = 24 * 16  # pixels of a chart that is fitted
-_WORK_PITCH_PX, _WORK_STEPS = 32.0, 4  # pixels per patch to which the picture is averaged down, and steps of the fit
-_FIRST_PITCH_PX, _FIRST_STEPS = 10.0, 12  # the same of a first fit
+_WORK_PITCH_PX = 32.0  # a chart with more pixels per patch is averaged down before it is fitted
+_STEPS = 12
 _STEP = 1e-6  # of the unknowns, for derivatives
 _SQUARE = np.array([[-1.0, -1.0], [1, -1], [1, 1], [-1, 1]])
 
@@ -77,7 +77,7 @@ def centers() -> Floats:
 
 
 def from_centers(points: Floats) -> Placement:
-    """The placement whose patch centers fit image points (24, 2) px, by least squares."""
+    """The placement of a chart with patch centers at image points (24, 2) px, by least squares."""
     return Placement(_homography(centers(), points))
 
 
@@ -101,20 +101,17 @@ def is_view(homography: Floats) -> bool:
 def refine(picture: Floats, start: Placement) -> Placement:
     """Refine the location of a chart, right to a third of a patch, in a linear picture (H, W, 3).
 
-    It is fitted to the picture averaged down to 10 pixels per patch, then to 32.
+    A chart with more than 32 pixels per patch is averaged down first.
     """
     around = transform_points(start.homography, np.array([[-1.0, -1], [7, -1], [7, 5], [-1, 5]]))
     x0, y0 = np.maximum(np.floor(around.min(axis=0)).astype(int), 0)
     x1, y1 = np.minimum(np.ceil(around.max(axis=0)).astype(int) + 1, picture.shape[1::-1])
     if x1 - x0 < 2 or y1 - y0 < 2:
         return start
-    seen, place = resize(picture[y0:y1, x0:x1], min(1.0, _WORK_PITCH_PX / start.pitch_px)), start
-    seen = np.clip(seen / white(seen), 0, 4)
-    first = resize(seen, min(1.0, _FIRST_PITCH_PX / min(start.pitch_px, _WORK_PITCH_PX)))
-    for image, steps in ((first, _FIRST_STEPS), (seen, _WORK_STEPS)):
-        to_image = scaling(image.shape, (y1 - y0, x1 - x0)) @ np.array([[1.0, 0, -x0], [0, 1, -y0], [0, 0, 1]])
-        place = _fit(image, place.moved(to_image), steps).moved(np.linalg.inv(to_image))
-    return place
+    crop = picture[y0:y1, x0:x1]
+    seen = resize(crop, min(1.0, _WORK_PITCH_PX / start.pitch_px))
+    to_seen = scaling(seen.shape, crop.shape) @ np.array([[1.0, 0, -x0], [0, 1, -y0], [0, 0, 1]])
+    return _fit(np.clip(seen / white(seen), 0, 4), start.moved(to_seen)).moved(np.linalg.inv(to_seen))
 
 
 def white(picture: Floats) -> Floats:
@@ -136,7 +133,7 @@ def scaling(small: tuple[int, ...], large: tuple[int, ...]) -> Floats:
     return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]])
 
 
-def _fit(image: Floats, start: Placement, steps: int) -> Placement:
+def _fit(image: Floats, start: Placement) -> Placement:
     """Fit the drawing of a chart to an image (H, W, 3) with white about 1.
 
     Light mixes linearly at an edge; residuals are computed after a gamma of 2.2, so that dark patches count too.
@@ -152,7 +149,7 @@ def _fit(image: Floats, start: Placement, steps: int) -> Placement:
     low = [*[-np.inf] * 8, _LEAST_PATCH, min(_PIXEL_BLUR_PX / pitch, _GREATEST_BLUR)]
     high = [*[np.inf] * 8, _GREATEST_PATCH, _GREATEST_BLUR]
     explained = 0.0
-    for step in range(steps):
+    for step in range(_STEPS):
         cover, cell, used = _cover(point, unknowns)
         if used.sum() < _LEAST_PX:
             return start
