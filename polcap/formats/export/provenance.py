@@ -60,9 +60,8 @@ def words(facts: Mapping[str, Any]) -> dict[str, str]:
 
 def write(path: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> None:
     """Write the sidecar: the record, and the digest of every file of the export; StorageError."""
-    with atomic.path(path) as temporary:
-        text = json.dumps({**facts, "files": dict(sorted(digests.items()))}, indent=1, ensure_ascii=False)
-        temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")  # a file name may not be text
+    text = json.dumps({**facts, "files": dict(sorted(digests.items()))}, indent=1, ensure_ascii=False)
+    atomic.write(path, text + "\n")
 
 
 def digest(file: Path) -> str:
