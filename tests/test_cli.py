@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from polcap import cli
-from polcap.cli import extras
+from polcap.cli import options
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import STAGES
 from tests.conftest import Command, shell
@@ -43,7 +43,7 @@ def test_an_interrupted_command_says_how_to_go_on(command: str, how: str, monkey
     def stop(module: str) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(extras, "training", stop)
+    monkeypatch.setattr(options, "training", stop)
     done = CliRunner().invoke(cli.app, [command, *["x"] * (1 if command == "train" else 2)])
     assert done.exit_code == 130
     assert done.stderr == f"polcap: interrupted; run the same command again{how} to go on\n"

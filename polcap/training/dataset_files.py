@@ -31,7 +31,7 @@ from polcap.errors import InputError
 from polcap.formats import atomic
 from polcap.formats.maps import png
 from polcap.images import Floats
-from polcap.optics import frames, mueller, shade
+from polcap.optics import frames, mueller
 from polcap.stages import cues
 from polcap.synth.mesh_tracer import Tracer, centred
 from polcap.training import materials, random_shapes, traced_views
@@ -83,16 +83,11 @@ def _write_sample(
         owner, smooth = torch.zeros(len(v), dtype=torch.long), float(recipe.law == "smooth")
         turned = torch.from_numpy(turn).float()[None]
         surface = materials.draw_surface(library, bare, position, turned, owner, 1, smooth)
-    normal = frames.lifted(frames.to_ray_frame(surface.normal, v))
     way, off = rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.1)
     flash = [off * np.cos(way) * middle, off * np.sin(way) * middle, 0.0]
     to_light = torch.tensor(flash, dtype=torch.float32) + v * (depth / v[:, 2])[:, None]
-    squared = (to_light**2).sum(dim=1)
-    lit = frames.to_ray_frame(to_light / squared.sqrt()[:, None], v), middle**2 / squared
-    reflection = surface.diffuse, surface.specular, surface.roughness, surface.ior
-    light = shade.stokes(normal, *reflection, *lit, surface.law).numpy()
-
-    passed = _photograph(light, v.numpy(), recipe.noise, rng)
+    normal, diffuse, specular = materials.reflect(surface, v, to_light, torch.full((len(v),), middle**2))
+    passed = _photograph((diffuse + specular).numpy(), v.numpy(), recipe.noise, rng)
     i0, i45, i90, i135 = passed
     stokes = np.stack([passed.sum(axis=0) / 2, i0 - i90, i45 - i135])
     cos, sin = cues.polarization(stokes, np.zeros((6, *stokes.shape[1:])))[3]

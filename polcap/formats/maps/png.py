@@ -31,8 +31,7 @@ def write(path: Path, array: Pixels) -> None:
 
     Raises StorageError: the file cannot be written.
     """
-    with atomic.path(path) as temporary:
-        temporary.write_bytes(encode(array))
+    atomic.write(path, encode(array))
 
 
 def encode(array: Pixels) -> bytes:
