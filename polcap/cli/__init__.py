@@ -19,7 +19,6 @@ options            options that several commands share
 import os
 import sys
 from collections.abc import Sequence
-from functools import partial
 from typing import Annotated, Any
 
 import typer
@@ -42,31 +41,26 @@ from polcap.errors import SettingError
 class OneLine(TyperGroup):
     """Command group that reports a wrong command line in one line, as every other error."""
 
-    def main(
-        self,
-        args: Sequence[str] | None = None,
-        prog_name: str | None = None,
-        complete_var: str | None = None,
-        standalone_mode: bool = True,
-        windows_expand_args: bool = True,
-        **extra: Any,
-    ) -> Any:
+    def main(self, args: Sequence[str] | None = None, *rest: Any, standalone_mode: bool = True, **extra: Any) -> Any:
         """Parse and run; end with the exit code unless `standalone_mode` is false."""
-        run = partial(super().main, args, prog_name, complete_var, False, windows_expand_args, **extra)
-        if not standalone_mode:
-            return run()
+        words = list(sys.argv[1:] if args is None else args)
+        if "--debug" in words:  # at any place
+            words = ["--debug", *(word for word in words if word != "--debug")]
         try:
-            code = run()
+            code = super().main(words, *rest, **{**extra, "standalone_mode": False})
         except TyperException as error:
-            text = _one_line(error)
+            if not standalone_mode:
+                raise
+            text, code = _one_line(error), error.exit_code
             terminal.print_message(text)
-            code = error.exit_code
-            asked = {"json": "--json" in (sys.argv[1:] if args is None else args)}
-            terminal.print_error_document(asked, SettingError(text.removeprefix("polcap: error: ")), code)
-        except typer.Abort:  # a question that got no answer
+            asked = {"json": "--json" in words}
+            terminal.print_error_document(asked, SettingError(), text.removeprefix("polcap: error: "), code)
+        except typer.Abort:  # a question without an answer
             terminal.print_message("polcap: aborted")
             code = 1
-        sys.exit(code or 0)
+        if standalone_mode:
+            sys.exit(code or 0)
+        return code
 
 
 def _one_line(error: TyperException) -> str:
@@ -97,12 +91,9 @@ for command in COMMANDS:
 def main() -> None:
     """The `polcap` command."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # results must not depend on the number of threads
-    arguments = sys.argv[1:]
-    if "--debug" in arguments:  # wherever it stands
-        arguments = ["--debug", *(argument for argument in arguments if argument != "--debug")]
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]  # names of files are bytes
-    app(arguments)
+    app()
 
 
 def _version(asked: bool) -> None:

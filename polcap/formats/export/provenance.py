@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from functools import cache
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -19,17 +19,10 @@ _PARTS = (
 
 def versions() -> dict[str, str]:
     """Installed versions of polcap and of the packages that affect pixels."""
-    return dict(_installed())
-
-
-@cache
-def _installed() -> dict[str, str]:
     found = {"polcap": __version__}
     for name in _PARTS:
-        try:
+        with suppress(PackageNotFoundError):
             found[name] = version(name)
-        except PackageNotFoundError:
-            continue
     return found
 
 
