@@ -71,10 +71,9 @@ def _verdict(folder: Path) -> dict[str, Any] | None:
     from polcap.config import Config
     from polcap.formats.capture import reader as captures
     from polcap.pipeline import check as checks
-    from polcap.pipeline import models
 
     try:
-        verdict = checks.inspect(captures.read(folder), models.shipped(), Config())
+        verdict = checks.inspect(captures.read(folder), Config())
     except InputError as error:
         terminal.print_message(f"polcap: not judged: {terminal.line(error)}")
         return None
