@@ -13,11 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.errors import ModelError
 from polcap.images import Cues, Floats, Network, Quality, RunNetwork, SurfaceMaps
 from polcap.optics import frames
 from polcap.optics.resize import area_mean, weighted_area_mean
-from polcap.stages.cues import CHANNELS, FLOOR
+from polcap.stages.cues import FLOOR
 from polcap.stages.infer import analytic, augmentation, fine, half_turns
 from polcap.stages.infer.highlights import REACHED, fill_highlights
 
@@ -72,11 +71,6 @@ def estimate_coarse(
     Returns the network's maps (H, W[, 3]) at the crop's size, with `factor`, see `_log_factor`, and `doubt`, the
     probability of a wrong half-turn; then the normals before refinement, and their stated error (H, W) in degrees.
     """
-    if network.channels != CHANNELS:
-        raise ModelError(
-            f"model {network.digest[:8]} expects channels {', '.join(network.channels)}; "
-            f"this version makes {', '.join(CHANNELS)}; use a model of this version, or --estimator analytic"
-        )
     size = cues.mask.shape[::-1]
     shrink = max(1.0, max(size) / int(network.metadata["native_size"]))
     seen = _reduce(_limit_radiance(cues), 1 / shrink)

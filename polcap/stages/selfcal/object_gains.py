@@ -179,7 +179,7 @@ def facing(light: Floats, usable: Bools, angle: Floats) -> GainEstimate:
     if usable.sum() < 100:
         return unknown(shots)
     ratio = light[:, usable] / np.maximum(light[0, usable], 1e-12)  # (K, N)
-    ratio = ratio[:, :: max(1, ratio.shape[1] // 40_000)]
+    ratio = ratio[:, :: max(1, ratio.shape[1] // 20_000)]
     seeds = ratio[:, np.linspace(0, ratio.shape[1] - 1, _STARTS).astype(int)].T
     starts = (np.median(ratio, axis=1), np.ones(shots), *seeds)
     climbs = parallel.results(partial(_climb, ratio, start) for start in starts)

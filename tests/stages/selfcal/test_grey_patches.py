@@ -5,15 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from polcap.config import Config
-from polcap.images import Bits, ChartPlace, ColorCalibration, PatchColors, SelfCalibration
+from polcap.images import Bits, ChartPlace, ColorCalibration, PatchColors
 from polcap.quality import light
 from polcap.quality.gate import Evidence
 from polcap.quality.limits import GateLimits
-from polcap.stages import selfcal
 from polcap.stages.selfcal import grey_patches
 from polcap.stages.whitebalance.patches import PatchUse
 from tests import scenes
+from tests.stages.selfcal.shapes import solve
 
 GAIN = np.array([1.0, 1.013, 0.981])
 SHOTS = scenes.stack(gain=GAIN, noise=0.004)
@@ -29,10 +28,6 @@ def board(use: Bits | None = None) -> ColorCalibration:
             quads.append([[x, y], [x + 9, y], [x + 9, y + 30], [x, y + 30]])
     place = ChartPlace(np.array(quads, float), np.zeros((4, 2)))
     return replace(scenes.no_color(), place=place, source="chart", patches=PatchColors(np.zeros(24), use))
-
-
-def solve(radiance, color) -> SelfCalibration:
-    return selfcal.solve(radiance, scenes.still(), scenes.ball_object(), color, Config().selfcal)
 
 
 def test_grey_patches_give_the_gains_within_their_error():
