@@ -18,11 +18,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.images import Bools, Floats
 from polcap.optics.projection import transform_points
+from polcap.optics.resize import block_means
 from polcap.optics.tiles import spread_over_cells
 
-Bools = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 Model = Literal["translation", "similarity", "homography", "simplest"]  # simplest: the model of least BIC
 
@@ -86,7 +86,7 @@ class Pyramid:
         """Picture and usable pixels at 2^-scale of the full size."""
         while len(self._levels) <= scale:
             picture, usable = self._levels[-1]
-            self._levels.append((_half(picture), _half(usable) > 0.99))
+            self._levels.append((block_means(picture, 2), block_means(usable, 2) > 0.99))
         return self._levels[scale]
 
     def tiles(self, scale: int) -> Indices:
@@ -162,26 +162,14 @@ def squared_gradient(picture: Floats) -> Floats:
     return gx
 
 
-def _half(picture: Floats | Bools) -> Floats:
-    h, w = picture.shape[0] // 2, picture.shape[1] // 2
-    even = picture[: 2 * h, : 2 * w].astype(np.float32, copy=False)
-    return np.asarray(cv2.resize(even, (w, h), interpolation=cv2.INTER_AREA))
-
-
 def _choose_tiles(picture: Floats, usable: Bools) -> Indices:
     """Corners (T, 2) = (row, column) of the tiles with the largest squared gradient in each cell of a coarse grid."""
     rows, columns = (picture.shape[0] - 2) // _TILE, (picture.shape[1] - 2) // _TILE
     if rows < 1 or columns < 1:
         return np.zeros((0, 2), np.int64)
-    cut, size = (slice(0, rows * _TILE), slice(0, columns * _TILE)), (columns, rows)
-    score = np.empty((rows, columns), np.float32)
-    for n in range(rows):  # a row of tiles stays in a core's cache
-        top = _TILE * n
-        around = slice(max(top - 1, 0), top + _TILE + 1)
-        detail = squared_gradient(picture[around])[top - around.start :][:_TILE, cut[1]]
-        detail = detail * usable[top : top + _TILE, cut[1]]
-        score[n] = cv2.resize(detail, (columns, 1), interpolation=cv2.INTER_AREA)
-    score *= cv2.resize(usable[cut].view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) > _USABLE * 255
+    cut = np.s_[: rows * _TILE, : columns * _TILE]
+    score = block_means((squared_gradient(picture) * usable)[cut], _TILE)
+    score *= block_means(usable[cut], _TILE) > _USABLE
     return _TILE * spread_over_cells(score, (_CELLS, _CELLS), _PER_CELL)
 
 

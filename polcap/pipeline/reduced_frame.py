@@ -6,12 +6,12 @@ It runs in the decoding child process, so that only small arrays are sent back.
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats, SensorImage
 from polcap.optics import sensor, sharpness
+from polcap.optics.resize import block_means
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -42,7 +42,7 @@ def first(image: SensorImage, clip: float, most_pixels: float) -> tuple[dict[str
 
 def take(image: SensorImage, clip: float, times: int, corners: list[list[int]]) -> tuple[dict[str, Any], Arrays]:
     """The parts of a `ReducedFrame`: blocks of `times` merged pixels a side, tiles at `corners` (T, 2) px."""
-    shares = _averaged((~sensor.usable(image, clip)).astype(np.float32), times)
+    shares = block_means((~sensor.usable(image, clip)).astype(np.float32), times)
     value = _means(image, times)
     value[shares > 0] = 1  # so that the stages exclude partly clipped pixels
     tiles = sharpness.take(image, np.asarray(corners, np.int64).reshape(-1, 2), clip)
@@ -72,7 +72,7 @@ def _means(image: SensorImage, times: int) -> Floats:
     """Signal (h, w, 3) over blocks of times × times merged pixels."""
     if image.superpixel != 2 or image.cfa is None or image.value.dtype != np.uint16:
         signal = sensor.signal(image)
-        return _averaged(np.repeat(signal, 3, axis=2) if signal.shape[2] == 1 else signal, times)
+        return block_means(np.repeat(signal, 3, axis=2) if signal.shape[2] == 1 else signal, times)
     sites = _sums(image.value.astype(np.uint16, copy=False), times)  # (2, 2, h, w)
     out = np.empty((*sites.shape[2:], 3), np.float32)
     black = np.broadcast_to(image.black, (2, 2))
@@ -95,10 +95,3 @@ def _sums(mosaic: NDArray[np.uint16], times: int) -> NDArray[np.uint32]:
     for n in range(times):
         out += across[:, :, :, n].transpose(1, 3, 0, 2)
     return out
-
-
-def _averaged(picture: Floats, times: int) -> Floats:
-    """Means of times × times pixels; incomplete blocks are dropped."""
-    height, width = picture.shape[0] // times, picture.shape[1] // times
-    whole = picture[: height * times, : width * times]
-    return np.array(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)

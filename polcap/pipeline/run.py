@@ -102,7 +102,7 @@ def _write_profile(file: Path, color: ColorCalibration) -> None:
 
 def counted(capture: Capture, frame_read: Callable[[int, int], None]) -> Decode:
     """A decode function that calls `frame_read` with the number of decoded photographs, and of all."""
-    brackets = [*capture.shots, *(() if capture.crossed is None else (capture.crossed,))]
+    brackets = capture.all_shots
     total, number = sum(len(shot.frames) for shot in brackets), count(1)
 
     def decode(frame: Frame) -> SensorImage:

@@ -64,8 +64,7 @@ def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapt
     def begin(frame: Frame) -> Future[ReducedFrame]:
         return decoded if frame == first else pool.submit(_reduced, frame, clip, times, corners)
 
-    crossed = () if capture.crossed is None else (capture.crossed,)
-    every = [frame for shot in (*capture.shots, *crossed) for frame in (*shot.frames, *shot.ambient)]
+    every = [frame for shot in capture.all_shots for frame in (*shot.frames, *shot.ambient)]
     step = half * times
     (x, y), (width, height) = capture.principal_px, capture.size_px
     small = replace(

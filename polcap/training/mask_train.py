@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from polcap.images import Floats
+from polcap.optics.resize import area_mean
 from polcap.stages.mask.mask_channels import CHANNELS, ENCODING, SIZE_MULTIPLE, ReducedPicture, brightness, encode
 from polcap.training import loop, mask_pictures, unet
 
@@ -163,8 +164,7 @@ def cut_part(picture: ReducedPicture, truth: Floats, chance: Floats, rng: np.ran
 
 def reduce(image: Floats, width: int) -> Floats:
     """Area means of an image (H, W, ·) at `width` pixels across."""
-    size = width, round(image.shape[0] * width / image.shape[1])
-    return np.asarray(cv2.resize(np.asarray(image, np.float32), size, interpolation=cv2.INTER_AREA))
+    return area_mean(np.asarray(image, np.float32), (round(image.shape[0] * width / image.shape[1]), width))
 
 
 def stack_channels(channels: list[Floats]) -> Tensor:

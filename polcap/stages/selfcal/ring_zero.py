@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from polcap import parallel
 from polcap.images import Bools, Floats, RingZero
 from polcap.optics import mueller, outline
+from polcap.optics.resize import area_mean
 from polcap.optics.robust import jackknife
 from polcap.stages.selfcal import integrability
 
@@ -117,7 +118,7 @@ def _outward_of(mask: Bools, sigma: float) -> Complexes:
     """`_outward` of a mask blurred by `sigma` px; a large blur is made on a coarser grid."""
     step = max(1, int(sigma / _FINE_PX))
     height, width = mask.shape
-    small = cv2.resize(mask.astype(np.float32), (-(-width // step), -(-height // step)), interpolation=cv2.INTER_AREA)
+    small = area_mean(mask, (-(-height // step), -(-width // step)))
     way = _outward(cv2.GaussianBlur(small, (0, 0), sigma / step))
     if step == 1:
         return way

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from polcap.errors import ChartError
 from polcap.images import AngleStack, ChartReference
+from polcap.optics.resize import area_mean
 from polcap.stages.whitebalance import chart, patches
 
 _LEAST_SHARE = 0.05  # of the mask; smaller parts do little harm
@@ -41,8 +42,7 @@ def _is_chart(radiance: AngleStack, part: NDArray[np.bool_], reference: ChartRef
     x0, y0 = x.min(), y.min()
     crop = radiance.value[0, y0 : y.max() + 1, x0 : x.max() + 1]
     small = min(1.0, _MOST_SIDE_PX / long)
-    size = (max(1, round(crop.shape[1] * small)), max(1, round(crop.shape[0] * small)))
-    crop = cv2.resize(crop, size, interpolation=cv2.INTER_AREA)
+    crop = area_mean(crop, (max(1, round(crop.shape[0] * small)), max(1, round(crop.shape[1] * small))))
     white = np.maximum(np.percentile(crop, 99, axis=(0, 1)), 1e-9)
     start = chart.from_corners((box - (x0, y0) + 0.5) * small - 0.5, patch=1.0)
     if not chart.is_view(start.homography):
