@@ -10,10 +10,11 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from polcap.batch import contact_sheet
+from polcap.batch import contact_sheet, processes
 from polcap.batch import unit as units
 from polcap.batch.shards import WHOLE, Shard
 from polcap.batch.unit import FINISHED, FOLDER, ProcessOptions, Unit, UnitRecord
@@ -36,10 +37,7 @@ class BatchPlan:
 def find(root: Path, out: Path | None = None) -> list[Unit]:
     """The captures below a folder, sorted by name; the folder may itself be one capture.
 
-    Raises
-    ------
-    CaptureError
-        There is no capture.
+    Raises CaptureError: there is no capture.
     """
     if not root.is_dir():
         raise CaptureError(f"{root}: no such folder; give the folder that holds the captures")
@@ -52,15 +50,11 @@ def find(root: Path, out: Path | None = None) -> list[Unit]:
 
 def reopen(place: Path) -> list[Unit]:
     """The captures of an earlier batch; `place` was its root or its --out."""
-    return find(*_places(place))
-
-
-def _places(place: Path) -> tuple[Path, Path | None]:
     try:
         about = json.loads((place / FOLDER / "batch.json").read_text(encoding="utf-8"))
-        return Path(about["root"]), None if about["out"] is None else Path(about["out"])
+        return find(Path(about["root"]), None if about["out"] is None else Path(about["out"]))
     except (OSError, ValueError, KeyError, TypeError):
-        return place, None
+        return find(place)
 
 
 def _captures(root: Path) -> Iterator[str]:
@@ -88,18 +82,19 @@ def run(
     found = find(root, out)
     mine = plan.shard.of(found)
     batch_folder = Path(found[0].batch_folder)
-    with atomic.path(batch_folder / "batch.json") as temporary:  # `polcap status` reads it when --out was used
-        places = {"root": str(root.resolve()), "out": None if out is None else str(out.resolve())}
-        temporary.write_text(json.dumps(places) + "\n", encoding="utf-8")
+    places = {"root": str(root.resolve()), "out": None if out is None else str(out.resolve())}
+    atomic.write(batch_folder / "batch.json", json.dumps(places) + "\n")  # for `reopen`
     records = {unit: record for unit in mine if (record := units.finished(unit, options)) is not None}
     wanted = [unit for unit in mine if unit not in records]
     print_line(f"{len(found)} captures, shard {plan.shard}: {len(mine)}, finished before: {len(records)}")
     by_name = {unit.name: unit for unit in wanted}
     start = time.monotonic()
-    for record in _process(wanted, options, plan, print_line) if wanted else ():
+    for done, record in enumerate(_process(wanted, options, plan, print_line) if wanted else (), 1):
         records[by_name[record.name]] = record
-        done = len(records) - (len(mine) - len(wanted))
-        print_line(progress(record, done, len(wanted), time.monotonic() - start))
+        left = timedelta(seconds=round((time.monotonic() - start) / done * (len(wanted) - done)))
+        message = f": {record.message}" if record.message else ""
+        state = f"{done}/{len(wanted)} {record.name} {record.state} {record.seconds:.1f} s"
+        print_line(f"{state}, {left} left{message}")
         if record.state not in FINISHED and not plan.keep_going:
             print_line("stopped at the first failure; --keep-going processes the others")
             break
@@ -114,22 +109,7 @@ def _process(
         from polcap.batch import cluster
 
         return cluster.run(wanted, options, plan.scheduler, plan.workers, plan.retries, print_line)
-    from polcap.batch import processes
-
     return processes.run(wanted, options, plan.workers, plan.retries)
-
-
-def progress(record: UnitRecord, done: int, total: int, seconds: float) -> str:
-    """One line: number of finished captures, the last one's result, and the estimated time left."""
-    left = seconds / done * (total - done)
-    message = f": {record.message}" if record.message else ""
-    return f"{done}/{total} {record.name} {record.state} {record.seconds:.1f} s, {format_time(left)} left{message}"
-
-
-def format_time(seconds: float) -> str:
-    """h:mm:ss."""
-    whole = round(seconds)
-    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
 
 
 def status(found: Sequence[Unit]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import io
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum, IntEnum, IntFlag
-from hashlib import sha256
+from hashlib import file_digest, sha256
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -49,10 +49,7 @@ def encode(value: Any, name: str, arrays: Arrays) -> Any:
 def decode(tree: Any, hint: Any, folder: Path) -> Any:
     """The value of type `hint` from the JSON of `encode`; arrays are read from `folder`.
 
-    Raises
-    ------
-    StorageError
-        The tree is not of that type, or an array file cannot be read.
+    Raises StorageError: the tree is not of that type, or an array file cannot be read.
     """
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
@@ -125,10 +122,7 @@ def save(file: Path, array: NDArray[Any]) -> list[Any]:
 def load(file: Path) -> NDArray[Any]:
     """An array of any shape: a read-only memory map, or in memory where it is small.
 
-    Raises
-    ------
-    StorageError
-        The file is missing or no .npy.
+    Raises StorageError: the file is missing or no .npy.
     """
     try:
         if file.stat().st_size > _MAPPED:
@@ -142,11 +136,8 @@ def load(file: Path) -> NDArray[Any]:
 
 def checksum(file: Path) -> list[Any]:
     """Size in bytes and SHA-256 digest of a file."""
-    summed = sha256()
     with file.open("rb") as stream:
-        while block := stream.read(1 << 22):
-            summed.update(block)
-    return [file.stat().st_size, summed.hexdigest()]
+        return [file.stat().st_size, file_digest(stream, "sha256").hexdigest()]
 
 
 def freeze(value: Any) -> None:

@@ -63,8 +63,7 @@ class SimulatedCamera:
         self._studio = self._studio or Studio(random_scene(self._subject.seed, self._subject.scene), self._shoot)
         shot, step, angle = self._next
         if (angle, self._crossed) not in self._rendered:
-            render = self._studio.crossed_at if self._crossed else self._studio.through
-            self._rendered = {(angle, self._crossed): render(angle)}
+            self._rendered = {(angle, self._crossed): self._studio.through(angle, self._crossed)}
         time_s = exposure.time_s or MIDDLE_S
         take = Take(shot, step, time_s / MIDDLE_S, self._taken[shot, step, flash], flash)
         self._taken[shot, step, flash] += 1

@@ -37,7 +37,7 @@ def settled(shape: main_network.NetworkShape) -> main_network.MainNetwork:
 def test_onnxruntime_agrees_with_torch_at_any_size(tmp_path: Path) -> None:
     network = settled(TINY)
     path = tmp_path / "m.onnx"
-    assert onnx_export.export_main(network, path, {"licence": "Apache-2.0", "version": "test"}) == path.stat().st_size
+    onnx_export.export_main(network, path, {"licence": "Apache-2.0", "version": "test"})
     loaded = onnx.load(path, threads=1)
     assert loaded.channels == CHANNELS and loaded.metadata["licence"] == "Apache-2.0"
     for size in ((64, 64), (160, 96), (32, 224)):
@@ -68,11 +68,6 @@ def test_a_file_that_is_no_model_is_refused(content: bytes | None, tmp_path: Pat
         path.write_bytes(content)
     with pytest.raises(InputError, match="cannot be read as an ONNX model"):
         onnx_export.read_weights(path)
-
-
-def test_the_small_network_in_fp16_fits_the_size_limit() -> None:
-    weights = sum(p.numel() for p in main_network.MainNetwork().parameters())
-    assert 2 * weights < 16e6  # bytes; the limit for a shipped file is 24 MB
 
 
 def test_the_example_trains_a_network_and_uses_it(example: Path, tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ class TextureEncoder:
         self._made: dict[tuple[int, Kind, bool], tuple[Pixels, Future[bytes]]] = {}
 
     def __call__(self, texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
-        """As `encode`."""
+        """As `encode`; with `text` a PNG holds the texture's meaning in a tEXt chunk, for files next to the asset."""
         key = (id(texture.pixels), kind, texture.color)
         with self._lock:
             first = key not in self._made
@@ -60,21 +60,14 @@ class TextureEncoder:
             return dict(zip(textures, pool.map(partial(self, kind=kind), textures.values())))
 
 
-def encode(texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
+def encode(texture: Texture, kind: Kind) -> bytes:
     """The bytes of one texture; JPEG and WebP hold 8 bits, PNG the bits of the texture.
 
-    With `text` a PNG holds the texture's meaning in a tEXt chunk, for files next to the asset.
-
-    Raises
-    ------
-    SettingError
-        The kind cannot hold the picture's channels, or its encoder is not installed.
-    StorageError
-        The encoder failed.
+    Raises SettingError: the kind cannot hold the picture's channels, or its encoder is not installed.
+    Raises StorageError: the encoder failed.
     """
     if kind == "png":
-        plain = png.encode(texture.pixels)
-        return png.described(plain, {"Description": texture.meaning}) if text else plain
+        return png.encode(texture.pixels)
     if kind == "ktx2":
         return _ktx2(texture)
     quality = _QUALITY[kind][texture.color]
@@ -132,10 +125,7 @@ def _eight_bits(texture: Texture) -> NDArray[np.uint8]:
 def webp(path: Path, frames: Frames, seconds: float) -> None:
     """Write sRGB frames (H, W, 3) as an animated WebP that lasts `seconds` and repeats.
 
-    Raises
-    ------
-    StorageError
-        The file cannot be written, or OpenCV was built without WebP.
+    Raises StorageError: the file cannot be written, or OpenCV was built without WebP.
     """
     moving = cv2.Animation()
     moving.frames = [np.ascontiguousarray(frame[..., ::-1]) for frame in frames]
@@ -143,8 +133,7 @@ def webp(path: Path, frames: Frames, seconds: float) -> None:
     done, data = cv2.imencodeanimation(".webp", moving, [cv2.IMWRITE_WEBP_QUALITY, _ANIMATION_QUALITY])
     if not done:
         raise StorageError(f"{path}: this OpenCV writes no WebP; install opencv-contrib-python-headless from PyPI")
-    with atomic.path(path) as temporary:
-        temporary.write_bytes(data.tobytes())
+    atomic.write(path, data.tobytes())
 
 
 def ffmpeg() -> str | None:
@@ -155,10 +144,7 @@ def ffmpeg() -> str | None:
 def mp4(path: Path, frames: Frames, seconds: float) -> None:
     """Write frames (H, W, 3) as H.264, by FFmpeg.
 
-    Raises
-    ------
-    StorageError
-        FFmpeg is missing, or fails.
+    Raises StorageError: FFmpeg is missing, or fails.
     """
     program = ffmpeg()
     if program is None:

@@ -27,29 +27,24 @@ _SCRIPTS = ("probe.js", "relight.js")
 
 
 def write(path: str | Path, title: str, body: Iterable[str], data: Mapping[str, Any]) -> None:
-    """Write a page of HTML fragments, whose texts are escaped; `data` is read by its scripts, as JSON.
+    """Write a page of HTML fragments with escaped texts; its scripts read `data` as JSON.
 
-    Raises
-    ------
-    StorageError
-        The file cannot be written.
+    Raises StorageError: the file cannot be written.
     """
     here = files(__name__)
     style = here.joinpath("page.css").read_text("utf-8")
     scripts = "\n".join(here.joinpath(name).read_text("utf-8") for name in _SCRIPTS)
     known = {**data, "law": here.joinpath("law.glsl").read_text("utf-8")}
-    with atomic.path(path) as temporary:
-        temporary.write_text(
-            '<!doctype html><html lang="en"><meta charset="utf-8">'
-            '<meta name="viewport" content="width=device-width, initial-scale=1">'
-            '<meta name="color-scheme" content="light dark">'
-            f"<title>{escape(title)}</title><link rel=icon href=data:,>\n<style>\n{style}</style>\n<main>\n"
-            + "\n".join(body)
-            + f'\n</main>\n<script type="application/json" id="data">{_json(known)}</script>'
-            f"\n<script>\n{scripts}</script>\n</html>\n",
-            encoding="utf-8",
-            errors="backslashreplace",  # a file name may not be text
-        )
+    atomic.write(
+        path,
+        '<!doctype html><html lang="en"><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        '<meta name="color-scheme" content="light dark">'
+        f"<title>{escape(title)}</title><link rel=icon href=data:,>\n<style>\n{style}</style>\n<main>\n"
+        + "\n".join(body)
+        + f'\n</main>\n<script type="application/json" id="data">{_json(known)}</script>'
+        f"\n<script>\n{scripts}</script>\n</html>\n",
+    )
 
 
 def jpeg(picture: NDArray[np.uint8], whole_color: bool = False) -> str:
@@ -79,13 +74,6 @@ def packed(array: NDArray[Any]) -> str:
 def text(content: bytes) -> str:
     """Bytes as base64."""
     return b64encode(content).decode()
-
-
-def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """An HTML table; its texts are escaped."""
-    top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
-    lines = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
-    return f"<table><tr>{top}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
 
 
 def _address(kind: str, content: bytes) -> str:

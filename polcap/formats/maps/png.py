@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from polcap.errors import DecodeError, StorageError
 from polcap.formats import atomic
-from polcap.formats.raw import file_bytes, file_checks, worker
+from polcap.formats.raw import file_bytes, photo, worker
 from polcap.images import Floats
 from polcap.optics.resize import area_mean
 
@@ -27,29 +27,19 @@ _SWAPS = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}  # seven times faster th
 _HEADER = 33  # bytes of the signature and IHDR, which comes first
 
 
-def write(path: Path, array: Pixels, held: atomic.Held | None = None) -> None:
+def write(path: Path, array: Pixels) -> None:
     """Write (H, W), (H, W, 3) RGB or (H, W, 4) RGBA, uint8 or uint16; the same array gives the same bytes.
 
-    `held` collects files that get their names together.
-
-    Raises
-    ------
-    StorageError
-        The file cannot be written.
+    Raises StorageError: the file cannot be written.
     """
-    with atomic.path(path, held=held) as temporary:
-        temporary.write_bytes(encode(array))
+    atomic.write(path, encode(array))
 
 
 def encode(array: Pixels) -> bytes:
     """The bytes of a PNG, of an array as in `write`: (H, W[, C]).
 
-    Raises
-    ------
-    TypeError
-        The values are neither uint8 nor uint16.
-    StorageError
-        OpenCV cannot encode them.
+    Raises TypeError: the values are neither uint8 nor uint16.
+    Raises StorageError: OpenCV cannot encode them.
     """
     if array.dtype not in (np.uint8, np.uint16):
         raise TypeError(f"PNG holds uint8 or uint16, not {array.dtype}")
@@ -95,32 +85,19 @@ def indexed(level: NDArray[np.uint8], colors: NDArray[np.uint8]) -> bytes:
 def read(path: Path) -> Pixels:
     """Read a PNG; channels in RGB(A) order.
 
-    Raises
-    ------
-    DecodeError
-        The file is missing, cut short, not a PNG, or larger than any picture.
+    Raises DecodeError: the file is missing, cut short, not a PNG, or larger than any picture.
     """
     return worker.call(decode, path)[1]["pixels"]
 
 
 def decode(path: str) -> worker.Answer:
     """`read`, in the child process; DecodeError."""
-    return {}, {"pixels": pixels(path, file_bytes.load(path))}
-
-
-def pixels(path: str, data: bytes) -> Pixels:
-    """The pixels (H, W[, C]) of the bytes of the PNG `path`; DecodeError. In the child process."""
-    if data[:8] != _MAGIC or len(data) < 24:
-        raise DecodeError(f"{path} is not a whole PNG ({len(data)} bytes); write it again")
-    file_checks.check_png(path, data)
-    try:
-        array = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        array = None
-    if array is None or array.dtype not in (np.uint8, np.uint16):
-        raise DecodeError(f"{path} is not a whole PNG ({len(data)} bytes); write it again")
-    found: Pixels = swapped(array)
-    return found
+    data = file_bytes.load(path)
+    if data[:8] != _MAGIC:
+        raise DecodeError(f"{path} is not a PNG; write it again")
+    with photo.opened(path, data) as file:
+        pixels = photo.every_channel(path, file)
+    return {}, {"pixels": pixels[..., 0] if pixels.shape[2] < 3 else pixels}  # grey, its alpha left out
 
 
 def fitted(picture: Pixels, width: int) -> NDArray[np.uint8]:

@@ -3,10 +3,10 @@
 The only module that imports rawpy.
 """
 
-import importlib
 import io
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -34,38 +34,14 @@ def read(path: str | Path, digest: str | None = None) -> SensorImage:
     the shot, 1/`white_balance`, to (1, 1, 1).
     With the `digest` of `probe.read`, the file must still hold the bytes that were probed.
 
-    Raises
-    ------
-    DecodeError
-        Not a RAW, damaged, changed since, of another mosaic or Foveon; or the decoder crashed, hung or ran out
-        of memory.
+    Raises DecodeError: not a RAW, damaged, changed since, of another mosaic or Foveon; or the decoder crashed, hung or
+    ran out of memory.
     """
-    return _image(*worker.call(decode, path, digest=digest))
+    return image(*worker.call(decode, path, digest=digest))
 
 
-def within(
-    path: str | Path, digest: str | None, function: Callable[..., worker.Answer], **options: Any
-) -> worker.Answer:
-    """Decode in the child process and apply `function(image, **options)` there: only its answer comes back.
-
-    The function is a module's, the options plain JSON values.
-
-    Raises
-    ------
-    DecodeError
-        As `read`.
-    """
-    return worker.call(apply, path, digest=digest, module=function.__module__, name=function.__name__, options=options)
-
-
-def apply(path: str, digest: str | None, module: str, name: str, options: dict[str, Any]) -> worker.Answer:
-    """`within`, in the child process; the function is `name` in `module`."""
-    function = getattr(importlib.import_module(module), name)
-    answer: worker.Answer = function(_image(*decode(path, digest)), **options)
-    return answer
-
-
-def _image(meta: dict[str, Any], arrays: worker.Arrays) -> SensorImage:
+def image(meta: dict[str, Any], arrays: worker.Arrays) -> SensorImage:
+    """The photograph from the answer of `decode`."""
     balance = None if meta["balance"] is None else np.array(meta["balance"])
     xyz_to_camera = meta["xyz_to_camera"]
     return SensorImage(
@@ -100,22 +76,36 @@ def camera_matrix(xyz_to_camera: Floats, balance: Floats | None) -> Floats | Non
     return np.asarray(to_rec709 * gain)
 
 
-def size(path: str, data: bytes, unpack: bool) -> dict[str, Any]:
-    """Size in visible pixels, and with `unpack` LibRaw's own reading of the metadata. In the child process."""
+@contextmanager
+def _opened(path: str, data: bytes) -> Iterator[Any]:
+    """The bytes as an open RAW of LibRaw, of a possible size; its errors become a DecodeError."""
     import rawpy
 
     try:
-        with rawpy.RawPy() as raw:
-            raw.open_buffer(io.BytesIO(data))
-            sizes = raw.sizes  # unpacks nothing, unlike every other property
-            file_checks.check_size(path, sizes.width, sizes.height)
-            file_checks.check_bytes(path, sizes.width, sizes.height, len(data))
-            meta: dict[str, Any] = {"width": sizes.width, "height": sizes.height}
-            if unpack:
-                meta["exif"] = _settings(raw.other, raw.lens)
+        raw = rawpy.RawPy()  # never closed: the counts are a view into it, which keeps it alive
+        raw.open_buffer(io.BytesIO(data))
+        sizes = raw.sizes  # unpacks nothing, unlike every other property
+        file_checks.check_size(path, sizes.width, sizes.height)
+        file_checks.check_size(path, sizes.raw_width, sizes.raw_height)
+        file_checks.check_bytes(path, sizes.width, sizes.height, len(data))
+        yield raw
     except (rawpy.LibRawError, NotImplementedError) as error:
-        raise _refusal(path, error) from None
-    return meta
+        reason = next(iter(error.args), type(error).__name__)
+        reason = reason.decode(errors="replace") if isinstance(reason, bytes) else str(reason)
+        if isinstance(error, rawpy.LibRawFileUnsupportedError):
+            message = f"not a RAW format that LibRaw knows ({reason}); is the file complete?"
+        elif isinstance(error, NotImplementedError):
+            message = f"a RAW layout that is not supported ({reason}); convert it to DNG"
+        else:
+            message = f"truncated or damaged ({reason}); {file_checks.COPY_AGAIN}"
+        raise DecodeError(f"{path}: {message}") from None
+
+
+def size(path: str, data: bytes, unpack: bool) -> dict[str, Any]:
+    """Size in visible pixels, and with `unpack` LibRaw's own reading of the metadata. In the child process."""
+    with _opened(path, data) as raw:
+        meta: dict[str, Any] = {"width": raw.sizes.width, "height": raw.sizes.height}
+        return meta | ({"exif": _settings(raw.other, raw.lens)} if unpack else {})
 
 
 def _settings(other: Any, lens: Any) -> dict[str, Any]:
@@ -133,36 +123,23 @@ def _settings(other: Any, lens: Any) -> dict[str, Any]:
 
 
 def version() -> str:
-    """LibRaw's version, asked in the child process; raises DecodeError where that does not run."""
-    return str(worker.call(about, "LibRaw")[0]["version"])
-
-
-def about(path: str) -> worker.Answer:
-    """`version`, in the child process."""
+    """LibRaw's version."""
     import rawpy
 
-    return {"version": ".".join(map(str, rawpy.libraw_version))}, {}
+    return ".".join(map(str, rawpy.libraw_version))
 
 
 def decode(path: str, digest: str | None = None) -> worker.Answer:
     """`read`, in the child process: the counts (H, W) or (H, W, 3), their levels and colors; DecodeError."""
-    import rawpy
-
     data = file_bytes.load(path, digest)
-    if file_kind.is_foveon(data):
+    if data[:4] == b"FOVb":  # Sigma's X3F
         raise DecodeError(f"{path}: {unsupported(None)}")
-    structure = file_kind.structure(io.BytesIO(data))
+    structure = file_kind.structure(data)
     file_checks.check_structure(path, structure, data)
     if structure.dng and structure.truncated:  # LibRaw would return whatever was in memory
         raise DecodeError(f"{path}: its image data run past the end of the file; {file_checks.COPY_AGAIN}")
-    try:
-        raw = rawpy.RawPy()  # never closed: the counts are a view into it, which keeps it alive
-        raw.open_buffer(io.BytesIO(data))
-        file_checks.check_size(path, raw.sizes.raw_width, raw.sizes.raw_height)
-        file_checks.check_bytes(path, raw.sizes.width, raw.sizes.height, len(data))
+    with _opened(path, data) as raw:
         meta, arrays = _counts(path, raw)
-    except (rawpy.LibRawError, NotImplementedError) as error:
-        raise _refusal(path, error) from None
     lossy = file_checks.is_lossy(structure)
     file_checks.check_levels(path, arrays["value"], float(np.max(meta["black"])), meta["white"], lossy)
     stated = exif.tags(data).color_matrix
@@ -173,7 +150,11 @@ def decode(path: str, digest: str | None = None) -> worker.Answer:
 def _counts(path: str, raw: Any) -> tuple[dict[str, Any], worker.Arrays]:
     """The visible counts as stored in the file, their levels and colors."""
     value: NDArray[Any] = raw.raw_image_visible
-    meta: dict[str, Any] = {"balance": _balance(raw), "xyz_to_camera": _xyz_to_camera(raw)}
+    balance, matrix = raw.camera_whitebalance[:3], raw.rgb_xyz_matrix[:3]
+    meta: dict[str, Any] = {
+        "balance": [gain / balance[1] for gain in balance] if min(balance) > 0 else None,
+        "xyz_to_camera": matrix.tolist() if matrix.any() else None,
+    }
     if value.ndim == 3 and value.shape[2] >= 3:
         if raw.num_colors != 3:
             raise DecodeError(f"{path}: has {raw.num_colors} color channels where 3 are supported")
@@ -184,8 +165,13 @@ def _counts(path: str, raw: Any) -> tuple[dict[str, Any], worker.Arrays]:
         black = [[float(raw.black_level_per_channel[0])]]
     else:
         cfa, black = _mosaic(raw, path)
-        if cfa.shape == (6, 6):
-            value, cfa, black = _from_whole_block(path, value, cfa, black)
+        if cfa.shape == (6, 6):  # X-Trans, from its first whole 3×3 block on
+            corner = demosaic.x_trans_corner(cfa)
+            if corner is None:
+                raise DecodeError(f"{path}: {unsupported((6, 6))}")
+            down, right = corner
+            cfa, levels = (np.roll(part, (-down, -right), (0, 1)) for part in (cfa, np.array(black)))
+            value, black = np.ascontiguousarray(value[down:, right:]), levels.tolist()
         arrays = {"value": value, "cfa": cfa}
     return meta | {"black": black, "white": _white(raw, float(np.max(black)))}, arrays
 
@@ -223,42 +209,8 @@ def _mosaic(raw: Any, path: str) -> tuple[Bits, list[list[float]]]:
     return cfa, [[float(levels[i]) for i in row] for row in index]
 
 
-def _from_whole_block(
-    path: str, value: NDArray[Any], cfa: Bits, black: list[list[float]]
-) -> tuple[NDArray[Any], Bits, list[list[float]]]:
-    """An X-Trans mosaic from its first whole 3×3 block on: up to two rows and columns are dropped."""
-    corner = demosaic.x_trans_corner(cfa)
-    if corner is None:
-        raise DecodeError(f"{path}: {unsupported((6, 6))}")
-    down, right = corner
-    cfa, levels = (np.roll(part, (-down, -right), (0, 1)) for part in (cfa, np.array(black)))
-    return np.ascontiguousarray(value[down:, right:]), cfa, levels.tolist()
-
-
 def _white(raw: Any, black: float) -> float:
     """Saturation: LibRaw's maximum, or the lower level that the camera states."""
     stated = [level for level in raw.camera_white_level_per_channel or () if level > black]
     lowest = min([raw.white_level, *stated])
     return float(lowest if lowest > raw.white_level / 2 else raw.white_level)
-
-
-def _balance(raw: Any) -> list[float] | None:
-    balance = raw.camera_whitebalance[:3]
-    return [value / balance[1] for value in balance] if min(balance) > 0 else None
-
-
-def _xyz_to_camera(raw: Any) -> list[list[float]] | None:
-    matrix: NDArray[Any] = raw.rgb_xyz_matrix[:3]
-    return matrix.tolist() if matrix.any() else None
-
-
-def _refusal(path: str, error: Exception) -> DecodeError:
-    import rawpy
-
-    reason = error.args[0] if error.args else type(error).__name__
-    reason = reason.decode(errors="replace") if isinstance(reason, bytes) else str(reason)
-    if isinstance(error, rawpy.LibRawFileUnsupportedError):
-        return DecodeError(f"{path}: not a RAW format that LibRaw knows ({reason}); is the file complete?")
-    if isinstance(error, NotImplementedError):
-        return DecodeError(f"{path}: a RAW layout that is not supported ({reason}); convert it to DNG")
-    return DecodeError(f"{path}: truncated or damaged ({reason}); {file_checks.COPY_AGAIN}")

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import DecodeError
-from polcap.formats.maps import exr
 from polcap.formats.raw import file_bytes, file_checks, file_kind, libraw, worker
-from polcap.images import Floats, SensorImage
+from polcap.images import SensorImage
 from polcap.optics import color
 
 Encoding = Literal["linear", "srgb"]
@@ -42,20 +41,20 @@ def read(
     `lossy`, as every 8-bit one is. By default `encoding` is sRGB for 8 bits, else linear; `white` the greatest value
     of the type. With the `digest` of `probe.read`, the file must still hold the bytes that were probed.
 
-    Raises
-    ------
-    DecodeError
-        Not a picture, damaged, or changed since it was probed.
+    Raises DecodeError: not a picture, damaged, or changed since it was probed.
     """
-    pixels = _pixels(path, digest)
+    pixels, full = _pixels(path, digest)
     lossy = pixels.dtype == np.uint8
-    full = float(np.iinfo(pixels.dtype).max) if np.issubdtype(pixels.dtype, np.integer) else 1.0
     encoding = encoding_of(8 * pixels.itemsize, encoding)
     if pixels.shape[2] == 1:
         pixels = np.repeat(pixels, 3, axis=2)
-    if encoding == "srgb":
-        return SensorImage(_decoded(pixels, full), np.zeros((1, 1)), 1.0, None, lossy=True)
-    return SensorImage(_counts(pixels), np.full((1, 1), black), white or full, None, lossy=lossy)
+    if encoding == "linear":
+        return SensorImage(_counts(pixels), np.full((1, 1), black), white or full, None, lossy=lossy)
+    if pixels.dtype.kind == "f":
+        value = color.decode_srgb(pixels).astype(np.float32)
+    else:
+        value = color.decode_srgb(np.arange(full + 1) / full).astype(np.float32)[pixels]
+    return SensorImage(value, np.zeros((1, 1)), 1.0, None, lossy=True)
 
 
 def read_mosaic(
@@ -69,23 +68,19 @@ def read_mosaic(
     """One angle (0, 45, 90 or 135°) of a polarization sensor's raw frame, (H/2, W/2, 3), linear.
 
     The frame's 2×2 cell is 90 45 / 135 0 degrees. `white` and `black` are counts; by default those that the file
-    states, or the greatest of the type and 0. `kind` tells whether `path` is a RAW or a picture; `digest` as in `read`.
+    states, or the greatest of the type and 0. `kind` is that of the file; `digest` as in `read`.
 
-    Raises
-    ------
-    DecodeError
-        The frame is in color, or cannot be read.
+    Raises DecodeError: the frame is in color, or cannot be read.
     """
     y, x = dict(SENSOR_DEG)[angle_deg]
     if kind == "photo":
-        pixels = _pixels(path, digest)
+        pixels, full = _pixels(path, digest)
         if pixels.shape[2] != 1:
             raise DecodeError(
                 f"{path}: has {pixels.shape[2]} channels, but the frame of a polarization sensor has one; "
                 "save the camera's raw frame, or give one picture per angle"
             )
         mosaic, lossy, level = pixels[..., 0], pixels.dtype == np.uint8, black
-        full = float(np.iinfo(pixels.dtype).max) if np.issubdtype(pixels.dtype, np.integer) else 1.0
     else:
         sensor = libraw.read(path, digest)
         mosaic = sensor.value if sensor.value.ndim == 2 else sensor.value[..., 0]
@@ -109,16 +104,9 @@ def encoding_of(bits: int, stated: Encoding | None) -> Encoding:
     return stated or ("srgb" if bits == 8 else "linear")
 
 
-def _decoded(pixels: NDArray[Any], full: float) -> Floats:
-    if pixels.dtype.kind == "f":
-        return np.asarray(color.decode_srgb(pixels), np.float32)
-    table = color.decode_srgb(np.arange(full + 1) / full).astype(np.float32)
-    return np.asarray(table[pixels])  # a table is twenty times faster than the formula per pixel
-
-
 def size(path: str, data: bytes) -> dict[str, int]:
     """Size, channels and bits of a picture, without its pixels. In the child process."""
-    with _opened(path, data) as file:
+    with opened(path, data) as file:
         spec = file.spec()
         count, bits = len(_channels(path, spec)), 8 * spec.format.size()
     return {"width": spec.width, "height": spec.height, "channels": count, "bits": bits}
@@ -126,31 +114,47 @@ def size(path: str, data: bytes) -> dict[str, int]:
 
 def decode(path: str, digest: str | None = None) -> worker.Answer:
     """The stored values (H, W, 1 or 3) in their stored type; DecodeError. In the child process."""
-    import OpenImageIO as oiio
-
-    with _opened(path, file_bytes.load(path, digest)) as file:
-        spec = file.spec()
-        channels = _channels(path, spec)
-        kind = "float" if spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE) else str(spec.format)
-        pixels = file.read_image(0, 0, 0, spec.nchannels, kind)
-        reason = exr.reason(file)
-    if pixels is None:
-        raise DecodeError(f"{path}: truncated or damaged ({reason}); copy it from the card again")
-    pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)[..., channels]
+    with opened(path, file_bytes.load(path, digest)) as file:
+        channels = _channels(path, file.spec())
+        pixels = every_channel(path, file)[..., channels]
     if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
         bad = int((~np.isfinite(pixels)).sum())
         raise DecodeError(f"{path}: {bad} values are not finite numbers; write the file without NaN and infinity")
     return {}, {"pixels": pixels}
 
 
-def _pixels(path: str | Path, digest: str | None) -> NDArray[Any]:
-    _, arrays = worker.call(decode, path, digest=digest)
-    return arrays["pixels"]
+def every_channel(path: str, file: Any) -> NDArray[Any]:
+    """All channels (H, W, C) of an open file of OpenImageIO: float32, or integers of their stored type. DecodeError."""
+    import OpenImageIO as oiio
+
+    spec = file.spec()
+    kind = "float" if spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE) else str(spec.format)
+    pixels = file.read_image(0, 0, 0, spec.nchannels, kind)
+    if pixels is None:
+        raise DecodeError(f"{path}: truncated or damaged ({reason(file)}); {file_checks.COPY_AGAIN}, or write it again")
+    return np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
+
+
+def reason(source: Any) -> str:
+    """The last error of OpenImageIO (the module, an input or an output), in one line.
+
+    Its message may repeat bytes of the file; where these are not UTF-8, the binding raises instead of returning it.
+    """
+    try:
+        return " ".join(source.geterror().split()) or "no reason stated"
+    except UnicodeDecodeError:
+        return "the reason is not readable text"
+
+
+def _pixels(path: str | Path, digest: str | None) -> tuple[NDArray[Any], float]:
+    """The stored values of a picture, and the greatest of their type; 1 in floating point."""
+    pixels = worker.call(decode, path, digest=digest)[1]["pixels"]
+    return pixels, 1.0 if pixels.dtype.kind == "f" else float(np.iinfo(pixels.dtype).max)
 
 
 @contextmanager
-def _opened(path: str, data: bytes) -> Iterator[Any]:
-    """The bytes as an open file of OpenImageIO, which reads by name only."""
+def opened(path: str, data: bytes) -> Iterator[Any]:
+    """The bytes as an open file of OpenImageIO, which reads by name only. DecodeError."""
     import OpenImageIO as oiio
 
     if data[:3] == b"\xff\xd8\xff":
@@ -161,13 +165,13 @@ def _opened(path: str, data: bytes) -> Iterator[Any]:
     with file_bytes.named(data) as name:
         file = oiio.ImageInput.open(name, options)
         if file is None:
-            reason = exr.reason(oiio).replace(name, Path(path).name)
-            raise DecodeError(f"{path}: not a readable picture ({reason}); is the file complete?")
+            cause = reason(oiio).replace(name, Path(path).name)
+            raise DecodeError(f"{path}: not a readable picture ({cause}); is the file complete?")
         try:
             spec = file.spec()
             file_checks.check_size(path, spec.width, spec.height)
             if spec.nchannels > _MOST_CHANNELS or spec.depth > 1:
-                raise DecodeError(f"{path}: has {spec.nchannels} channels; polcap reads flat R, G, B")
+                raise DecodeError(f"{path}: has {spec.nchannels} channels; polcap reads flat pictures")
             yield file
         finally:
             file.close()

@@ -73,7 +73,7 @@ class SelfcalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 12.0
 
 
-@stage(version=14)
+@stage(version=15)
 def solve(
     radiance: AngleStack,
     alignment: Alignment,
@@ -93,24 +93,24 @@ def solve(
     shots = object_gains.register(radiance, alignment, object_)
     greys = grey_patches.measure(radiance, alignment, color)
     facing = object_gains.facing(shots.light, shots.inside, radiance.angle)
-    first = _gains_without_angles(radiance, greys, facing)
+    gain, sigma, _ = _believed(radiance, greys, facing)  # without the angles, because these are not checked yet
+    first = GainEstimate(gain.mean(1), sigma.mean(1))
     even = replace(shots, light=shots.light / first.gain[:, None, None])
     rim = angles.rim(even)
+    one_exposure = radiance.equipment.light == "one exposure"
+    well_known = greys is not None or one_exposure
 
     angle, found_sigma = radiance.angle, None
     if settings.unknown_angles:
-        well_known = greys is not None or radiance.equipment.light == "one exposure"
         angle, found_sigma = _find_angles(rim, even, float(first.sigma.max()) if well_known else np.inf, settings)
         facing = object_gains.facing(shots.light, shots.inside, angle)
-    guessed = greys is None and radiance.equipment.light != "one exposure"
-    order = angles.check_order(rim, angle, settings.order_margin, _GUESSED_ORDER if guessed else _SOLID_ORDER)
+    least_score = _SOLID_ORDER if well_known else _GUESSED_ORDER
+    order = angles.check_order(rim, angle, settings.order_margin, least_score)
     if settings.check_order and not order.check.as_stated:
         raise CaptureError(_wrong_order(order, angle))
 
     ring = _ring(even, angle, first, object_.border > 0)
-    if (
-        radiance.equipment.light != "one exposure" or found_sigma is not None
-    ):  # the angles of a polarization mosaic are exact
+    if found_sigma is not None or not one_exposure:  # the angles of a polarization mosaic are exact
         ring = corrected(ring, radiance.equipment.ring_sigma if found_sigma is None else found_sigma, settings)
     angle = angle + ring.correction
 
@@ -134,29 +134,23 @@ def solve(
     )
 
 
-def _gains_without_angles(radiance: AngleStack, greys: GreyPatches | None, facing: GainEstimate) -> GainEstimate:
-    """Gains (K,) by methods that do not need the angles, because the angles are not checked yet."""
+def _believed(
+    radiance: AngleStack, greys: GreyPatches | None, by_object: GainEstimate
+) -> tuple[Floats, Floats, Literal["grey patches", "object", "one exposure", "none"]]:
+    """Gains (K, 3), their 1σ, and their source: the best that is available."""
+    shape = len(radiance.angle), 3
     if radiance.equipment.light == "one exposure":
-        shots = len(radiance.angle)
-        return GainEstimate(np.ones(shots), np.zeros(shots))
+        return np.ones(shape), np.zeros(shape), "one exposure"
     if greys is not None:
-        return GainEstimate(greys.gain.mean(1), greys.sigma.mean(1))
-    return object_gains.with_prior(facing, _prior(radiance))
+        return greys.gain, greys.sigma, "grey patches"
+    known = object_gains.with_prior(by_object, _prior(radiance))
+    source: Literal["object", "none"] = "object" if np.isfinite(by_object.sigma).all() else "none"
+    return known.gain[:, None].repeat(3, axis=1), known.sigma[:, None].repeat(3, axis=1), source
 
 
 def _gains(radiance: AngleStack, greys: GreyPatches | None, anchor: GainEstimate) -> Gains:
     """Gains (K, 3) by the best available source, with those of the object (`anchor`) as a cross-check."""
-    gain: Floats
-    sigma: Floats
-    source: Literal["grey patches", "object", "one exposure", "none"]
-    if radiance.equipment.light == "one exposure":
-        gain, sigma, source = np.ones((len(anchor.gain), 3)), np.zeros((len(anchor.gain), 3)), "one exposure"
-    elif greys is not None:
-        gain, sigma, source = greys.gain, greys.sigma, "grey patches"
-    else:
-        believed = object_gains.with_prior(anchor, _prior(radiance))
-        gain, sigma = (np.repeat(part[:, None], 3, axis=1) for part in (believed.gain, believed.sigma))
-        source = "object" if np.isfinite(anchor.sigma).all() else "none"
+    gain, sigma, source = _believed(radiance, greys, anchor)
     both = np.hypot(anchor.sigma, sigma.mean(1))
     difference = np.abs(gain.mean(1) / anchor.gain - 1)
     return Gains(
@@ -193,15 +187,15 @@ def _find_angles(
             f"the flash energy of the shots is {known}; to find unknown angles, {100 * _MOST_GAIN:g} % is needed: "
             f"put a color chart next to the object, {otherwise}"
         )
-    found = angles.find(band, *object_gains.cells(even.light, even.inside))
-    sigma = float(np.degrees(found.sigma))
-    if sigma > settings.max_unknown_sigma_deg:
+    found, sigma = angles.find(band, *object_gains.cells(even.light, even.inside))
+    sigma_deg = float(np.degrees(sigma))
+    if sigma_deg > settings.max_unknown_sigma_deg:
         raise CaptureError(
-            f"the error of the polarizer angles found is {sigma:.1f}° (1σ), more than "
+            f"the error of the polarizer angles found is {sigma_deg:.1f}° (1σ), more than "
             f"selfcal.max_unknown_sigma_deg = {settings.max_unknown_sigma_deg:g}; take five or more shots spread over "
             f"180°, of a rounded object inside the picture, {otherwise}"
         )
-    return found.angle, found.sigma
+    return found, sigma
 
 
 def _wrong_order(found: angles.OrderFit, angle: Floats) -> str:

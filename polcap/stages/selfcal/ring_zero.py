@@ -1,7 +1,7 @@
 """Error of the zero of the polarizer's ring, from the object's outline and from the slopes inside it.
 
 Diffuse reflection is polarized along the slope g = tan θ (cos φ, sin φ) of the surface. A slope has no curl: along a
-closed curve inside the outline, ∮ g·t = 0 on any smooth surface, symmetrical or not. A ring whose zero is off by δ
+closed curve inside the outline, ∮ g·t = 0 on any smooth surface, symmetrical or not. A ring with a zero off by δ
 turns g, and then ∮ g·t / ∮ g·n = tan δ, n pointing out of the curve. Instead of one curve a band of them is taken: the
 contours of a blurred mask. The DoLP serves as tan θ; any weight does on a symmetrical object. The law does not hold
 for occluded parts, sharp edges, reflected light and interreflection. Their effects differ with the depth, so the spread
@@ -12,18 +12,16 @@ at every pixel. Contours, edges and highlights are outliers. Neither outline nor
 matter where a surface faces the camera, are fitted too, with their error as prior (decision 26).
 """
 
-from functools import partial
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap import parallel
 from polcap.images import Bools, Floats, RingZero
 from polcap.optics import mueller, outline
 from polcap.optics.resize import area_mean
 from polcap.optics.robust import jackknife
 from polcap.stages.selfcal import integrability
+from polcap.stages.selfcal.object_gains import weighted_mean
 
 Complexes = NDArray[np.complex128]
 
@@ -51,10 +49,8 @@ _SLOPES_FLOOR = np.radians(0.1)  # least 1σ (decision 26)
 
 def combined(one: RingZero, other: RingZero) -> RingZero:
     """Weighted mean of two measurements of one ring; its error grows with their difference if they contradict."""
-    weight = one.sigma**-2, other.sigma**-2
-    offset = (weight[0] * one.offset + weight[1] * other.offset) / sum(weight)
-    sigmas = abs(one.offset - other.offset) / float(np.hypot(one.sigma, other.sigma))
-    return RingZero(offset, min(max(1.0, sigmas) / float(np.sqrt(sum(weight))), np.pi / 2))
+    offset, sigma = weighted_mean(np.array([one.offset, other.offset]), np.array([one.sigma, other.sigma]))
+    return RingZero(float(offset), min(float(sigma), np.pi / 2))
 
 
 def by_outline(
@@ -83,9 +79,9 @@ def by_outline(
     strength = np.abs(polarization)
     weight = np.minimum(strength, outline.DOLP_CAP)
     slope = np.sqrt(polarization / np.maximum(strength, 1e-9)) * weight  # along it or against it: half the angle
-    outward = parallel.results(partial(_outward_of, mask, sigma) for sigma in (_RIM_PX, *(d * radius for d in _DEEPER)))
+    outward = [_outward_of(mask, sigma) for sigma in (_RIM_PX, *(d * radius for d in _DEEPER))]
     outward.append(_outward(cv2.GaussianBlur(np.minimum(depth, _PLATEAU * radius), (0, 0), 2.0)))
-    rim, *deeper = parallel.results(partial(_turn, slope, way[seen]) for way in outward)
+    rim, *deeper = (_turn(slope, way[seen]) for way in outward)
     scatter = float(np.sqrt(np.mean([(other - rim) ** 2 for other in deeper])))
     at_rim = outward[0][seen]
     length = np.abs(at_rim)
@@ -93,10 +89,12 @@ def by_outline(
     hidden /= max(hidden + float(length.sum()), 1e-9)
     lopsided = abs(complex((np.conj(at_rim) ** 2 / np.maximum(length, 1e-30)).sum()))
     lopsided /= max(float(length @ weight), 1e-9)
+    sector = outline.sectors(seen)
+    by_part = [_turn(slope[sector == part], at_rim[sector == part]) for part in np.unique(sector)]
     variance = (
         _FLOOR**2
         + (_SPREAD_TO_SIGMA * scatter) ** 2
-        + (hidden * _scatter(slope, at_rim, outline.sectors(seen))) ** 2
+        + (hidden * np.std(by_part)) ** 2
         + (gain_sigma * lopsided / 2) ** 2
     )
     return RingZero(-rim, min(float(np.sqrt(variance)), np.pi / 2))
@@ -134,12 +132,6 @@ def _turn(slope: Complexes, outward: Complexes) -> float:
         way = np.copysign(1.0, real * np.cos(turn) + imaginary * np.sin(turn))
         turn = float(np.arctan2(imaginary @ way, real @ way))
     return turn
-
-
-def _scatter(slope: Complexes, outward: Complexes, sector: NDArray[np.int_]) -> float:
-    """1σ between parts of the outline, rad."""
-    parts = parallel.results(partial(_turn, slope[sector == s], outward[sector == s]) for s in np.unique(sector))
-    return float(np.std(parts))
 
 
 def by_slopes(light: Floats, usable: Bools, angle: Floats, gain_sigma: float) -> RingZero:
