@@ -44,14 +44,13 @@ def detail(shot: MaskedImage, detail_px: float, step: int) -> Pyramid:
 
 def edge_strength(shot: Pyramid) -> Pyramid:
     """Where edges are and how strong, whichever side is brighter: the root of the gradient."""
-    picture, usable = shot[0]
-    return Pyramid(np.asarray(np.sqrt(cv2.GaussianBlur(np.sqrt(squared_gradient(picture)), (0, 0), 1.0))), usable)
+    strength = np.sqrt(cv2.GaussianBlur(np.sqrt(squared_gradient(shot[0].picture)), (0, 0), 1.0))
+    return Pyramid(np.asarray(strength), shot[0].usable)
 
 
 def shows_detail(shot: Pyramid) -> bool:
     """Whether there is anything to compare."""
-    picture, usable = shot[0]
-    seen = picture[usable]
+    seen = shot[0].picture[shot[0].usable]
     return len(seen) > _LEAST_PIXELS and bool(np.ptp(seen) > 0)
 
 
