@@ -14,19 +14,16 @@ if TYPE_CHECKING:
 
 def calibrate(
     context: Context,
-    folder: Annotated[
-        Path,
-        Argument(help="Folder with some of dark/, flat/, bracket/, flash/, polarizer/, lens/."),
-    ],
+    folder: Annotated[Path, Argument(help="Folder with some of dark/, flat/, bracket/, flash/, polarizer/, lens/.")],
     lens_filter: Annotated[str, Option("--filter", metavar="NAME", help="The polarizer's name.")] = "",
     axis: Annotated[
         float,
         Option(min=-360, max=360, metavar="DEG", help="Axis of the light in polarizer/pol…, image x to image up."),
     ] = 0.0,
-    board: Annotated[
-        str, Option(metavar="AxB", help="Inner corners of the checkerboard in lens/, across and down.")
-    ] = "9x6",
-    out: Annotated[Path | None, Option(help="Folder for the file; by default the user's calibrations.")] = None,
+    board: Annotated[str, Option(metavar="AxB", help="Inner corners of the board in lens/, across and down.")] = "9x6",
+    out: Annotated[
+        Path | None, Option("--out", "-o", help="Folder for the file; by default the user's calibrations.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Measure camera, lens, polarizer and flash once; `process` and `check` use it for the same camera and lens."""
@@ -40,7 +37,7 @@ def calibrate(
     made = datetime.now(UTC).isoformat(timespec="seconds")
     found = calibration.measure(folder, made, lens_filter, axis, squares(board))
     path = calibrations.write(out or own_folders.calibrations(), found)
-    terminal.print_message("\n".join(lines(found)))
+    terminal.print_progress("\n".join(lines(found)))
     terminal.print_data({"file": str(path), "calibration": msgspec.to_builtins(found)} if json else str(path))
 
 

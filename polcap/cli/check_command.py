@@ -23,13 +23,12 @@ def check(
     from polcap import config as settings
     from polcap.formats.capture import reader as captures
     from polcap.pipeline import check as checks
-    from polcap.pipeline import models
 
     chosen, request = settings.load(config, assignments or ()), options.chart_request(chart, no_chart)
-    with ThreadPoolExecutor(1) as pool:  # photographs are read while models are opened
-        reading = pool.submit(captures.read, capture, options.angles_deg(angles))
-        networks = models.shipped()
-        verdict = checks.inspect(reading.result(), networks, chosen, request)
+    with ThreadPoolExecutor(1) as pool:  # networks are opened while photographs are read
+        opening = pool.submit(checks.shipped_networks)
+        found = captures.read(capture, options.angles_deg(angles))
+        verdict = checks.inspect(found, chosen, request, opening.result)
     terminal.print_data(checks.shown(verdict) if json else checks.table(verdict))
     if not verdict.keep:
         raise typer.Exit(GateError.exit_code)
