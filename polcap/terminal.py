@@ -23,7 +23,14 @@ if TYPE_CHECKING:
 
 
 _LONGEST = 600  # characters of a message
-_QUIET_S = 5.0  # between two lines about frames, where there is no terminal to write over
+_FRAMES_S = 5.0  # between two lines about frames, where there is no terminal to write over
+_verbosity = 0  # -1 with --quiet, 1 with --verbose
+
+
+def set_verbosity(quiet: bool, verbose: bool) -> None:
+    """Print no progress, or a line per frame and stage in place of a bar."""
+    global _verbosity
+    _verbosity = -1 if quiet else int(verbose)
 
 
 def reported(command: Callable[..., None]) -> Callable[..., None]:
@@ -89,6 +96,12 @@ def print_message(text: str) -> None:
     print(printable(text), file=sys.stderr, flush=True)
 
 
+def print_progress(text: str) -> None:
+    """Print a message on stderr that --quiet suppresses."""
+    if _verbosity >= 0:
+        print_message(text)
+
+
 def print_data(data: Any) -> None:
     """Print data on stdout: text as it is, anything else as one JSON document."""
     text = data if isinstance(data, str) else json.dumps(data, ensure_ascii=False, indent=1)
@@ -119,7 +132,7 @@ def preview(drawn: "list[Path]") -> None:
 def print_result(about: dict[str, Any], out: "Path", json: bool) -> None:
     """Print the asset's path or the report, and the verdict. Raises GateError where a gate failed."""
     print_data(about if json else str(out / "asset" / f"{about['capture']['name']}.glb"))
-    print_message(f"verdict {about['verdict']}; {out / 'report.html'}")
+    print_progress(f"verdict {about['verdict']}; {out / 'report.html'}")
     print_gates(about)
 
 
@@ -145,14 +158,14 @@ class Steps:
     def stage(self, name: str, seconds: float | None, cached: bool) -> None:
         """Report that a stage begins (no seconds) or has ended."""
         if seconds is not None:
-            print_message(f"{name:14}{'cached' if cached else f'{seconds:.2f} s'}")
+            print_progress(f"{name:14}{'cached' if cached else f'{seconds:.2f} s'}")
 
     def frame(self, done: int, total: int) -> None:
         """Report that `done` of `total` photographs are done."""
         now = time.monotonic()
-        if now - self._last > _QUIET_S:
+        if now - self._last > _FRAMES_S or _verbosity > 0:
             self._last = now
-            print_message(self._frames(done, total, now))
+            print_progress(self._frames(done, total, now))
 
     def _frames(self, done: int, total: int, now: float) -> str:
         seconds = (now - self._begun) / done * (total - done)
@@ -179,7 +192,7 @@ class Bar(Steps):
 @contextmanager
 def progress(total: int) -> Iterator[Steps]:
     """A bar on a terminal, else a line per finished stage."""
-    if not sys.stderr.isatty():
+    if _verbosity or not sys.stderr.isatty():
         yield Steps()
         return
     from rich.console import Console

@@ -3,11 +3,12 @@
 import json
 import time
 from itertools import chain
+from pathlib import Path
 from typing import get_args, get_type_hints
 
 import pytest
 
-from polcap import __version__, cli, terminal
+from polcap import __version__, cli, config, terminal
 from polcap.cli import options
 from polcap.pipeline import run as pipeline
 from tests.conftest import Command
@@ -17,6 +18,30 @@ def test_short_help_and_completion_are_there(polcap: Command) -> None:
     text = polcap("-h").stdout
     assert "--version" in text and "--install-completion" in text
     assert polcap("--version") == (0, f"{__version__}\n", "")
+
+
+def test_help_has_complete_summaries_and_explains_a_command(polcap: Command) -> None:
+    text = polcap("help").stdout
+    assert text == polcap("--help").stdout and "..." not in text.partition("Commands")[2]
+    assert all(f"  {command.__name__} " in text for command in cli.COMMANDS)
+    assert polcap("help", "export").stdout == polcap("export", "-h").stdout
+    assert "Did you mean 'export'" in polcap("help", "exprt").stderr
+
+
+def test_settings_are_listed_with_default_range_and_meaning(polcap: Command) -> None:
+    every = json.loads(polcap("settings", "--json").stdout)
+    assert [row["name"] for row in every] == [setting.key for setting in config.settings()]
+    of_stage = json.loads(polcap("settings", "hdr", "--json").stdout)
+    assert of_stage == [row for row in every if row["name"].startswith("hdr.")]
+    assert "hdr.clip = 0.98  (≥ 0.5, ≤ 1.0)\n    clipping threshold" in polcap("settings", "hdr").stdout
+    assert "stokes.undistort = true\n" in polcap("settings", "stokes").stdout
+    assert "choose one of hdr, whitebalance" in polcap("settings", "polish").stderr
+
+
+def test_quiet_prints_only_data_and_errors_wherever_it_is(polcap: Command, tmp_path: Path) -> None:
+    small = ("--rotator", "simulated?settle=0", "--camera", "simulated?width=96&height=72&samples=1", "--no-check")
+    assert polcap("capture", tmp_path / "c", *small, "-q") == (0, f"{tmp_path / 'c'}\n", "")
+    assert polcap("-q", "process", tmp_path / "none").stderr.startswith("polcap: error: ")
 
 
 @pytest.mark.parametrize(
@@ -64,9 +89,13 @@ def test_no_choice_depends_on_case() -> None:
 def test_frames_are_reported_every_five_seconds_with_the_time_left(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    clock = iter([0.0, 2.0, 6.0, 8.0, 12.0])
+    clock = iter([0.0, 2.0, 6.0, 8.0, 12.0, 12.1])
     monkeypatch.setattr(time, "monotonic", lambda: next(clock))
     steps = terminal.Steps()
     for done in (1, 2, 3, 4):
         steps.frame(done, 9)
     assert capsys.readouterr().err.splitlines() == ["2 of 9 frames, 21 s left", "4 of 9 frames, 15 s left"]
+    terminal.set_verbosity(quiet=False, verbose=True)
+    steps.frame(5, 9)
+    terminal.set_verbosity(quiet=False, verbose=False)
+    assert capsys.readouterr().err.startswith("5 of 9 frames")

@@ -14,7 +14,9 @@ from polcap.cli.options import Angles, Assignments, ConfigFile, Device, Estimato
 def batch(
     context: Context,
     root: Annotated[Path, Argument(help="Folder with captures, at any depth.")],
-    out: Annotated[Path | None, Option(help="Folder for the results; by default CAPTURE/polcap each.")] = None,
+    out: Annotated[
+        Path | None, Option("--out", "-o", help="Folder for the results; by default CAPTURE/polcap each.")
+    ] = None,
     config: ConfigFile = None,
     assignments: Assignments = None,
     shard: Annotated[
@@ -24,7 +26,7 @@ def batch(
     scheduler: Annotated[
         str | None, Option(metavar="ADDRESS", help="A Dask scheduler, tcp://host:8786 or local (extra [batch]).")
     ] = None,
-    workers: Annotated[int, Option(min=1, help="Captures at a time on this machine.")] = 1,
+    workers: Annotated[int, Option("--workers", "-j", min=1, help="Captures at a time on this machine.")] = 1,
     retries: Annotated[int, Option(min=0, help="Further tries for a capture whose process died.")] = 2,
     keep_going: Annotated[
         bool, Option("--keep-going/--fail-fast", help="Go on after a failure, or stop at the first.")
@@ -78,7 +80,7 @@ def batch(
     )
     part = shards.from_environment(os.environ) if shard is None else shards.parse(shard)
     plan = batches.BatchPlan(part, scheduler, workers, retries, keep_going)
-    summary = batches.run(root, out, process_options, plan, terminal.print_message)
+    summary = batches.run(root, out, process_options, plan, terminal.print_progress)
     terminal.print_data(summary if json else str((out or root) / unit.FOLDER / "summary.html"))
     if code := batches.exit_code(summary):
         raise Exit(code)

@@ -26,7 +26,9 @@ def calibrate(
     board: Annotated[
         str, Option(metavar="AxB", help="Inner corners of the checkerboard in lens/, across and down.")
     ] = "9x6",
-    out: Annotated[Path | None, Option(help="Folder for the file; by default the user's calibrations.")] = None,
+    out: Annotated[
+        Path | None, Option("--out", "-o", help="Folder for the file; by default the user's calibrations.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Measure camera, lens, polarizer and flash once; `process` and `check` use it for the same camera and lens."""
@@ -40,7 +42,7 @@ def calibrate(
     made = datetime.now(UTC).isoformat(timespec="seconds")
     found = calibration.measure(folder, made, lens_filter, axis, squares(board))
     path = calibrations.write(out or own_folders.calibrations(), found)
-    terminal.print_message("\n".join(lines(found)))
+    terminal.print_progress("\n".join(lines(found)))
     terminal.print_data({"file": str(path), "calibration": msgspec.to_builtins(found)} if json else str(path))
 
 

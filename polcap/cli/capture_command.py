@@ -36,7 +36,7 @@ def capture(
     tries: Annotated[int, Option(min=0, help="How often a bad frame is taken again.")] = 2,
     resume: Annotated[bool, Option("--resume", help="Go on with a stopped capture.")] = False,
     no_check: Annotated[bool, Option("--no-check", help="Leave out the verdict at the end.")] = False,
-    dry_run: Annotated[bool, Option("--dry-run", help="Print the plan with its times, and stop.")] = False,
+    dry_run: Annotated[bool, Option("--dry-run", "-n", help="Print the plan with its times, and stop.")] = False,
     json: Json = False,
 ) -> None:
     """Shoot a capture: turn the polarizer, take the brackets, check every frame."""
@@ -59,7 +59,7 @@ def capture(
         planned = plans.dry_run(wanted)
         terminal.print_data(planned if json else plans.table(planned))
         return
-    done = sequence.shoot(folder, wanted, resume=resume, tries=tries, report=terminal.print_message)
+    done = sequence.shoot(folder, wanted, resume=resume, tries=tries, report=terminal.print_progress)
     verdict = None if no_check else _verdict(folder)
     terminal.print_data(done | {"check": verdict} if json else str(folder))
     if verdict and verdict["verdict"] != "keep":
@@ -77,5 +77,5 @@ def _verdict(folder: Path) -> dict[str, Any] | None:
     except InputError as error:
         terminal.print_message(f"polcap: not judged: {terminal.line(error)}")
         return None
-    terminal.print_message(checks.table(verdict))
+    terminal.print_progress(checks.table(verdict))
     return checks.shown(verdict)

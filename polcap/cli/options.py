@@ -42,7 +42,7 @@ _DEVICE = "Where the network runs; cuda fails where CUDA does not start."
 Device = Annotated[Literal["cpu", "cuda", "auto"], Option(case_sensitive=False, help=_DEVICE)]
 Until = Annotated[str | None, Option(metavar="STAGE", help="Stop after this stage.")]
 Force = Annotated[str | None, Option(metavar="STAGE", help="Compute this stage and all after it again.")]
-Threads = Annotated[int, Option(min=0, help="Threads to use; 0 is all.")]
+Threads = Annotated[int, Option("--threads", "-j", min=0, help="Threads to use; 0 is all.")]
 Memory = Annotated[float, Option(min=0, help="Most memory to take, GB; 0 is no limit.")]
 
 

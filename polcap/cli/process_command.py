@@ -16,13 +16,13 @@ _NO_EFFECT = ("capture", "out", "json", "dry_run", "watch", "threads", "memory")
 def process(
     context: Context,
     capture: options.CaptureFolder,
-    out: Annotated[Path | None, Option(help="Result folder; by default CAPTURE/polcap.")] = None,
+    out: Annotated[Path | None, Option("--out", "-o", help="Result folder; by default CAPTURE/polcap.")] = None,
     config: options.ConfigFile = None,
     assignments: options.Assignments = None,
     until: options.Until = None,
     force: options.Force = None,
     dry_run: Annotated[
-        bool, Option("--dry-run", help="Print the understood capture and the stages, and stop.")
+        bool, Option("--dry-run", "-n", help="Print the understood capture and the stages, and stop.")
     ] = False,
     watch: Annotated[
         bool, Option("--watch", help="Process again after each change of the folder or --config.")
@@ -49,7 +49,7 @@ def process(
         files = [Path(name) for name in (config, mask, model, chart) if name is not None and Path(name).is_file()]
         request = unchanged.request(asked, capture, target, files)
     if (finished := unchanged.find(target, request)) is not None:
-        terminal.print_message(f"{finished.table}\nNothing has changed since the last run.")
+        terminal.print_progress(f"{finished.table}\nNothing has changed since the last run.")
         terminal.print_result(finished.report, target, json)
         return
     resource_limits.set_threads(threads)  # before the libraries that start them
@@ -105,7 +105,7 @@ def _process(stated: dict[str, Any], target: Path, request: str | None) -> None:
 
     capture, supplied, config = _inputs(stated)
     table = captures.table(capture)
-    terminal.print_message(table)
+    terminal.print_progress(table)
     with terminal.progress(len(STAGES) + 1) as bar:
         supplied = replace(supplied, decode=pipeline.counted(capture, bar.frame))
         about = pipeline.process(capture, supplied, config, target, stated["until"], stated["force"], bar.stage)

@@ -13,7 +13,7 @@ from polcap.errors import SettingError
 def train(
     context: Context,
     data: Annotated[Path, Argument(help="Folder with meshes/ and materials/.")],
-    out: Annotated[Path, Option(help="Checkpoints and metrics.")] = Path("runs/train"),
+    out: Annotated[Path, Option("--out", "-o", help="Checkpoints and metrics.")] = Path("runs/train"),
     preset: Annotated[
         Literal["cpu", "gpu"], Option(case_sensitive=False, help="Size of the network and of a batch.")
     ] = "cpu",
@@ -28,7 +28,7 @@ def train(
     rate: Annotated[float, Option(min=0, help="Learning rate of Muon; lower for trained weights.")] = 1e-3,
     views: Annotated[int | None, Option(min=1, help="Views of each mesh.")] = None,
     procedural: Annotated[int | None, Option(min=0, help="Random shapes, six views each.")] = None,
-    threads: Annotated[int, Option(min=1, help="Batches learned from at a time.")] = 2,
+    threads: Annotated[int, Option("--threads", "-j", min=1, help="Batches learned from at a time.")] = 2,
     seed: Annotated[int, Option(min=0, help="Of views, batches and first weights.")] = 1,
 ) -> None:
     """Train the network (extra [train])."""
@@ -43,7 +43,9 @@ def evaluate(
     context: Context,
     model: Annotated[Path, Argument(help="ONNX model.")],
     data: Annotated[Path | None, Argument(help="Folder with meshes/ and materials/.")] = None,
-    out: Annotated[Path, Option(help="Tables and pictures; a stopped evaluation goes on.")] = Path("runs/evaluate"),
+    out: Annotated[Path, Option("--out", "-o", help="Tables and pictures; a stopped evaluation goes on.")] = Path(
+        "runs/evaluate"
+    ),
     ablations: Annotated[
         Path | None, Option(metavar="DIR", help="Networks to compare, DIR/NAME/last.pt of `polcap train`.")
     ] = None,

@@ -23,4 +23,4 @@ def at_every_change(capture: Path, target: Path, config: Path | None, once: Call
             once()
         except (InputError, GateError, OSError) as error:  # a frame may have gone while it was read
             terminal.print_message(f"polcap: {terminal.line(error)}")
-        terminal.print_message(f"watching {capture}; Ctrl-C ends")
+        terminal.print_progress(f"watching {capture}; Ctrl-C ends")

@@ -26,7 +26,7 @@ class Chart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def axes(self) -> tuple[Floats, Floats, Floats]:
-        """Unit vectors: the normal, along the rows, down the columns."""
+        """Unit vectors of the chart: its normal, along the rows, down the columns."""
         turn = Rotation.from_rotvec(self.turn_deg, degrees=True)
         return turn.apply([0.0, 0.0, 1.0]), turn.apply([1.0, 0.0, 0.0]), turn.apply([0.0, -1.0, 0.0])
 

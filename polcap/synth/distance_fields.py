@@ -92,7 +92,7 @@ Shape = Cluster | Bumps | Vase
 
 @lru_cache
 def _turned(profile: tuple[tuple[float, float], ...]) -> tuple[CubicSpline, float]:
-    """The wall's radius over height 0…1, and its steepest slope [m per height]."""
+    """Radius of a vase's wall over height 0…1, and its steepest slope [m per height]."""
     at, radius = np.array(profile).T
     curve = CubicSpline(at, radius, bc_type="natural")
     return curve, float(np.abs(curve(np.linspace(0, 1, 257), 1)).max())

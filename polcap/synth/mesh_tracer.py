@@ -83,7 +83,7 @@ class MeshHits:
 
 
 class Tracer:
-    """A mesh prepared for tracing."""
+    """A mesh prepared for ray tracing by Embree."""
 
     def __init__(self, mesh: Triangles) -> None:
         try:
@@ -113,7 +113,7 @@ class Tracer:
         return GBuffer(normal, depth, np.isfinite(depth), scatter(met.position, met.index, size), view)
 
     def meet(self, origin: Floats, direction: Floats) -> MeshHits:
-        """First hits of rays (P, 3)."""
+        """First intersections of rays (P, 3) with the mesh."""
         start, way = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, direction))
         hit = self._scene.run(start, way, query="INTERSECT", output=True)
         index = np.flatnonzero(hit["primID"] >= 0)
@@ -125,7 +125,7 @@ class Tracer:
         return MeshHits(index, position, normal, face, weight)
 
     def facing(self, origin: Floats, direction: Floats) -> tuple[Floats, Floats]:
-        """First hits of rays (M, 3): distance (M,), infinite for none, and the triangle's normal towards the origin."""
+        """Distances (M,) to the first hits of rays, infinite for none, and normals of the triangles facing the rays."""
         start, way = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, direction))
         hit = self._scene.run(start, way, query="INTERSECT", output=True)
         struck = hit["primID"] >= 0

@@ -82,7 +82,7 @@ class ObjectBuffer(GBuffer):
 
 
 def gbuffer(scene: Scene, view: View, height: int, width: int) -> ObjectBuffer:
-    """The object's surface at the center of each pixel."""
+    """G-buffer of a scene's object at the center of each pixel."""
     y, x = np.mgrid[:height, :width].astype(np.float64)
     hits, _ = _visible(scene, frames.rays_at(view, x, y).reshape(-1, 3))
     facing, bent = _normals(scene, hits)
@@ -121,7 +121,7 @@ def _visible(scene: Scene, v: Floats, start: Floats | None = None) -> tuple[Hits
 
 
 def _unshadowed_irradiance(scene: Scene, point: Floats, normal: Floats) -> Floats:
-    """`_irradiance`, and 0 in the object's cast shadow."""
+    """Irradiance (N,) as of `_irradiance`; 0 in the object's cast shadow, if the scene has cast shadows."""
     light = _irradiance(scene, point, normal)
     if scene.cast_shadows:
         light[trace.in_shadow(scene.shape, scene.position, scene.turn, point, scene.light)] = 0.0
@@ -138,7 +138,7 @@ def _irradiance(scene: Scene, point: Floats, normal: Floats) -> Floats:
 
 
 def _shade(scene: Scene, ray: Floats, hits: Hits, flash_axis: float | None = None) -> Floats:
-    """Stokes parameters (3, N, 3) of the object's surface."""
+    """Stokes parameters (3, N, 3) of the light that the object reflects towards the lens."""
     to_light = np.array(scene.light) - hits.point
     to_light /= np.linalg.norm(to_light, axis=-1, keepdims=True)
     irradiance = _irradiance(scene, hits.point, to_light)
@@ -176,7 +176,7 @@ def _normals(scene: Scene, hits: Hits) -> tuple[Floats, Floats]:
 
 @lru_cache(maxsize=2)
 def _bounced(scene: Scene) -> Floats:
-    """Light from other parts of a mesh on the corners of each face, (F, 3, 3)."""
+    """Bounced light (F, 3, 3) that the corners of each face receive from other parts of the mesh."""
     if not isinstance(scene.shape, Model):
         raise SettingError("interreflection needs triangles; give the object as a mesh")
     tracer = mesh_tracer.tracer(scene.shape.file, scene.shape.radius)

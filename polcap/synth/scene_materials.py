@@ -78,7 +78,7 @@ def solid_noise(p: Floats, seed: int) -> Floats:
 
 
 def _choose(coat: Coat, position: Floats, parts: list[Floats]) -> Floats:
-    """The values (..., C) of the material whose region contains each position."""
+    """Select the values (..., C) of the first or the second material by the region of each position."""
     if len(parts) == 1:
         return parts[0]
     second = solid_noise(position / coat.region_size, coat.seed) > 0
@@ -99,7 +99,7 @@ def _evaluate_one(material: Material, position: Floats, facing: Floats) -> tuple
 
 
 def _slope(material: Material, position: Floats, facing: Floats) -> Floats:
-    """Slope of the relief along the object's axes, (..., 3)."""
+    """Slope of a texture set's relief along the object's axes, (..., 3); 0 without a texture set."""
     out = np.zeros_like(facing)
     if material.texture is not UNSET:
         picture, axis, sign = _project(material, position, facing)
@@ -129,7 +129,7 @@ def _texture(folder: str) -> Floats:
 
 
 def _pattern(material: Material, p: Floats) -> Floats:
-    """Share 0…1 of the second color, (...,)."""
+    """Share 0…1 of the material's second color at positions p, (...,)."""
     if material.pattern == "plain":
         return np.zeros(p.shape[:-1])
     if material.pattern == "chequer":

@@ -26,8 +26,8 @@ from polcap.formats.capture import layouts
 from polcap.images import Exif, Floats, GBuffer, View
 from polcap.optics import frames, projection
 from polcap.synth import color_checker as charts
-from polcap.synth import forward_camera, lens, render, scene_materials
-from polcap.synth.forward_camera import COLOR_MATRIX, SENSOR_WIDTH_MM, Sensor
+from polcap.synth import forward_camera, render, scene_materials
+from polcap.synth.forward_camera import COLOR_MATRIX, SENSOR_WIDTH_MM, Bend, Sensor
 from polcap.synth.render import Scene
 from polcap.synth.scenes import Kind, random_scene
 
@@ -71,7 +71,7 @@ class Shoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     extinction_ratio: Annotated[float, Meta(ge=1)] = 1000.0
     cross: bool = False  # one more shot, its flash polarized at right angles to the first angle
     flash_extinction: Annotated[float, Meta(ge=1)] = 1000.0  # extinction ratio of the flash's polarizer
-    distortion: tuple[lens.Bend, lens.Bend] = (0.0, 0.0)  # k1, k2 of synth/lens.py
+    distortion: tuple[Bend, Bend] = (0.0, 0.0)  # k1, k2 of `forward_camera.undistort`
     blur_px: Annotated[float, Meta(ge=0, le=50)] = 0.4  # 1σ of the lens's point spread
     samples: Annotated[int, Meta(ge=1, le=4)] = 2  # rays per pixel side
     sensor: Sensor = Sensor()
@@ -84,7 +84,7 @@ class Shoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def write(folder: Path, scene: Scene, shoot: Shoot, frame_written: Callable[[int, int], None] | None = None) -> None:
-    """Write photographs of `scene` into the new folder; the same arguments give the same bytes.
+    """Write a simulated capture of `scene` into a new folder; the same arguments give the same bytes.
 
     `frame_written` is called with the number of photographs written so far and in all.
 
@@ -207,7 +207,7 @@ def _pose(shoot: Shoot, shot: int) -> dict[str, Any]:
 
 
 def _light(scene: Scene, shoot: Shoot, buffer: GBuffer, back: Floats, flash_axis: float | None = None) -> Floats:
-    """Mean Stokes parameters over each pixel's area, (3, H, W, 3).
+    """Stokes parameters (3, H, W, 3) of a shot, averaged over each pixel's area.
 
     `back` (3, 3) maps the shot's pixels to those of the reference shot.
     """
@@ -223,7 +223,7 @@ def _light(scene: Scene, shoot: Shoot, buffer: GBuffer, back: Floats, flash_axis
 
 def _reference_px(shoot: Shoot, back: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """Undistorted pixels of the reference shot that see the same points as pixels x, y of a moved shot."""
-    return projection.coordinates(back, *lens.undistort(shoot.view, shoot.distortion, x, y))
+    return projection.coordinates(back, *forward_camera.undistort(shoot.view, shoot.distortion, x, y))
 
 
 def _blur(shoot: Shoot, image: Floats) -> Floats:
@@ -232,7 +232,7 @@ def _blur(shoot: Shoot, image: Floats) -> Floats:
 
 
 def _middle_exposure(scene: Scene, shoot: Shoot, buffer: GBuffer, s0: Floats) -> float:
-    """Exposure of the middle frame, for s0 (H, W, 3) in camera channels.
+    """Automatic exposure of the middle frame of a bracket, for s0 (H, W, 3) in camera channels.
 
     The 90th percentile of the object and the white patch reach at most 0.35 of the white level in that frame, and
     99.9 % of the object at most 0.95 in the darkest frame.

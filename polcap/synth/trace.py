@@ -79,7 +79,7 @@ def in_shadow(shape: Shape | Model, position: Vector, turn: Rotation, point: Flo
 
 
 def _march(shape: Shape, origin: Floats, direction: Floats, start: Floats | float) -> tuple[Indices, Floats]:
-    """Indices of the rays (P, 3) that arrive at the shape, and their lengths [m]."""
+    """Sphere tracing: indices of the rays (P, 3) that meet the shape, and their lengths [m]."""
     middle = -np.einsum("pi,pi->p", origin, direction)
     missed = np.einsum("pi,pi->p", origin, origin) - middle**2
     half = np.sqrt(np.maximum(shape.radius**2 - missed, 0.0))
@@ -103,7 +103,7 @@ def _march(shape: Shape, origin: Floats, direction: Floats, start: Floats | floa
 
 
 def _gradient(shape: Shape, p: Floats) -> Floats:
-    """Unit normals (N, 3) by central differences."""
+    """Unit normals (N, 3) of a distance field by central differences."""
     steps = 1e-4 * np.eye(3)  # m
     slope = np.stack([shape.distance(p + step) - shape.distance(p - step) for step in steps], axis=-1)
     return np.asarray(slope / np.linalg.norm(slope, axis=-1, keepdims=True))

@@ -76,7 +76,7 @@ def trace_visibility(
 
 
 def _draw_directions(normal: Floats, rng: np.random.Generator) -> Floats:
-    """Random directions (M, RAYS, 3) about normals (M, 3), in the frame of each view ray; `_density` is theirs."""
+    """Random directions (M, RAYS, 3) about normals (M, 3), in the frames of view rays; `_density` is their density."""
     turn, shift = rng.uniform(0, 1, (2, len(normal)))
     ways = []
     for number, alpha in ((_COSINE_RAYS, None), *_LOBES):
@@ -108,7 +108,7 @@ def _find_pixels(
 
 
 def bounced_stokes(pixels: Any, normal: Tensor, surface: Surface, body: Tensor) -> Tensor:
-    """Stokes parameters (3, M, 3) of light after one bounce, before smoothing.
+    """Stokes parameters (3, M, 3) of flash light that reaches each pixel by one bounce on the object, before smoothing.
 
     pixels: `simulator.ObjectPixels`; normal (M, 3) with bumps, in the frames of the rays; body (M, 3) diffuse S0 under
     the flash alone. All rays are used for diffuse and mirrored light, weighted by the balance heuristic.
@@ -169,7 +169,7 @@ def mirrored_surroundings(pixels: Any, flash: Tensor, normal: Tensor, surface: S
 
 
 def _density(normal: Tensor, way: Tensor) -> Tensor:
-    """Density of `_draw_directions` per steradian; normal and way (N, 3) in the frame of each view ray."""
+    """Probability density [1/sr] with which `_draw_directions` draws `way` (N, 3) about `normal` (N, 3)."""
     density = _COSINE_RAYS / RAYS * (normal * way).sum(dim=1).clamp(min=0) / pi
     half = F.normalize(way + way.new_tensor([0.0, 0.0, 1.0]), dim=1)
     cosine = (normal * half).sum(dim=1).clamp(min=0)

@@ -41,7 +41,7 @@ _LARGEST, _KNEE = 16.0, 0.01  # HDR encoding: radiance at 65535, and the limit b
 
 
 class DatasetRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Settings of all samples."""
+    """Settings of a data set, common to all its samples."""
 
     seed: int = 0
     size: Annotated[int, Meta(ge=64, le=4096)] = 512  # px
@@ -52,7 +52,7 @@ class DatasetRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def main(out: Path, count: int, recipe: DatasetRecipe) -> int:
-    """Make the missing ones of samples 0…count − 1; returns the number of new samples."""
+    """Make the samples 0…count − 1 that the folder lacks; returns the number of new samples."""
     library, files = _open_library(recipe.material), _list_meshes(recipe.mesh)
     _describe(out, recipe)
     made = 0
@@ -69,7 +69,7 @@ def main(out: Path, count: int, recipe: DatasetRecipe) -> int:
 def _write_sample(
     folder: Path, recipe: DatasetRecipe, library: materials.MaterialLibrary, files: list[Path], number: int
 ) -> None:
-    """Write the files of a sample; without mesh `files` the shape is random."""
+    """Simulate one object and write its pictures and sample.json; without mesh `files` its shape is random."""
     rng = np.random.default_rng([recipe.seed, number])
     file = files[rng.integers(len(files))] if files else None
     mesh = centred(traced_views.read_mesh(file)) if file else random_shapes.compose(rng)
@@ -130,7 +130,7 @@ def _open_library(material: str) -> materials.MaterialLibrary:
 
 
 def _list_meshes(mesh: str) -> list[Path]:
-    """Mesh files; none for random shapes."""
+    """Mesh files that the setting `mesh` names; none means random shapes."""
     if not mesh:
         return []
     place = Path(mesh)
@@ -151,7 +151,7 @@ def _photograph(light: Floats, rays: Floats, noise: float, rng: np.random.Genera
 
 
 def _describe(out: Path, recipe: DatasetRecipe) -> None:
-    """Write dataset.json; a folder with samples of other settings is refused."""
+    """Write dataset.json. Raises InputError if the folder has samples of other settings, or other files."""
     asked, file = msgspec.to_builtins(recipe), out / "dataset.json"
     if file.exists():
         there = json.loads(file.read_text(encoding="utf-8"))["recipe"]

@@ -42,7 +42,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class EvaluationOptions:
-    """Options of one evaluation."""
+    """One evaluation; a field for each option of `polcap evaluate`."""
 
     model: Path
     data: Path = Path("data")
@@ -72,7 +72,7 @@ def main(options: EvaluationOptions) -> dict[str, Score]:
 
 
 def _head(options: EvaluationOptions, network: Network) -> dict[str, Any]:
-    """All inputs of the figures."""
+    """Inputs of an evaluation: if one changes, earlier results cannot be used again."""
     digest = hashlib.sha256()
     tests = [(options.data / "meshes" / "test").glob("*.npz"), (options.data / "materials" / "test").glob("*/*")]
     for file in sorted(file for files in tests for file in files):
@@ -94,7 +94,7 @@ def _estimate(seen: Cues, network: Network | None) -> SurfaceMaps:
 
 
 def _evaluate_pictures(options: EvaluationOptions, means: Means, head: dict[str, Any]) -> list[Row]:
-    """Results of all pictures; those of an earlier run with the same inputs are used again."""
+    """Results of all evaluation pictures; those of an earlier run with the same inputs are used again."""
     path = options.out / "pictures.jsonl"
     rows = _read_results(path, head)
     with atomic.path(path) as temporary:
@@ -117,7 +117,7 @@ def _evaluate_pictures(options: EvaluationOptions, means: Means, head: dict[str,
 
 
 def _read_results(path: Path, head: dict[str, Any]) -> list[Row]:
-    """Results of an earlier run with the same inputs, without an unfinished last line."""
+    """Results of pictures in pictures.jsonl of an earlier run with the same inputs, without an unfinished last line."""
     lines = path.read_text().splitlines(keepends=True) if path.exists() else []
     if not lines or lines[0] != json.dumps(head) + "\n":
         return []
@@ -125,7 +125,7 @@ def _read_results(path: Path, head: dict[str, Any]) -> list[Row]:
 
 
 def _evaluate_range(options: EvaluationOptions, means: Means, numbers: range) -> Iterator[Row]:
-    """Results in order, by one process per core if there are enough pictures."""
+    """Results of the pictures `numbers` in order; one process per core if there are enough pictures."""
     workers = min(os.cpu_count() or 1, len(numbers) // _MIN_SHARE)
     row = partial(evaluate_picture, options, means)
     if workers < 2:
@@ -138,7 +138,7 @@ def _evaluate_range(options: EvaluationOptions, means: Means, numbers: range) ->
 
 @cache
 def _open(options: EvaluationOptions, means: Means) -> tuple[Protocol, dict[str, Estimator]]:
-    """The pictures, and the estimators of all columns by name."""
+    """The evaluation's pictures, and the estimators to compare, by the name of their column."""
     network = models.open_network(options.model, threads=1)
     columns: dict[str, Estimator] = {
         OURS: lambda case: _estimate(case.cues, network),
@@ -154,7 +154,7 @@ def _open(options: EvaluationOptions, means: Means) -> tuple[Protocol, dict[str,
 
 
 def evaluate_picture(options: EvaluationOptions, means: Means, number: int) -> Row:
-    """Result of one picture: scores, seconds, sample of expected errors, moments of F0."""
+    """Evaluate all estimators on one picture: scores, seconds, a sample of expected errors, moments of F0."""
     made, columns = _open(options, means)
     before = time.monotonic()
     case = made.case(number)
@@ -194,6 +194,6 @@ def _summary(head: dict[str, Any], rows: list[Row]) -> dict[str, Any]:
 
 
 def _mean(rows: list[Score]) -> Score:
-    """Mean of each figure over the rows that have it."""
+    """Mean of each figure over the pictures that have it."""
     keys = dict.fromkeys(key for row in rows for key in row)
     return {key: float(np.mean([row[key] for row in rows if key in row])) for key in keys}

@@ -74,7 +74,7 @@ def _list_pictures(folder: Path) -> tuple[list[str], list[str]]:
 
 
 def score(folder: Path, angles: list[str], name: str, network: Network | None) -> Score:
-    """Errors of one picture: angles between estimated and measured normals, degrees; shares 0…1; `as_a_body`."""
+    """Run the path on one picture; returns the angles between estimated and measured normals [°], and shares 0…1."""
     picture, vector = png.read(folder / "mask" / name), png.read(folder / "normal" / name)
     mask = np.asarray(picture > 0 if picture.ndim == 2 else (picture[..., :3] > 0).any(axis=-1))
     truth = vector[..., :3].astype(np.float64) / np.iinfo(vector.dtype).max * 2 - 1

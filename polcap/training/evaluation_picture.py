@@ -19,7 +19,7 @@ _LIGHT = np.array([-0.6, 0.5, 0.62])
 
 
 def make_row(case: Case, maps: SurfaceMaps) -> Picture:
-    """Row of a case: truth above, estimate below; in the last column the error above the predicted error."""
+    """Picture of one case: truth above, estimate below; in the last column the error above the predicted error."""
     seen, mask, both = case.cues, case.truth.mask, (case.truth, maps)
     s1, s2 = seen.ratio
     depth = [case.depth, case.depth * 0 if maps.depth_prior is None else maps.depth_prior]
@@ -46,7 +46,7 @@ def make_row(case: Case, maps: SurfaceMaps) -> Picture:
 
 
 def make_sheet(rows: list[Picture]) -> Picture:
-    """All rows, below the names of the columns."""
+    """Picture of all cases, below the names of the columns."""
     head = np.zeros((_HEAD, rows[0].shape[1], 3), np.uint8)
     for k, name in enumerate(COLUMNS):
         _write(head, name, k * _TILE + 4)
@@ -58,7 +58,7 @@ def _render(case: Case, maps: SurfaceMaps, light: Floats) -> Floats:
 
 
 def _box(mask: Bools) -> tuple[slice, ...]:
-    """Square crop around the object."""
+    """Square crop around the object, as slices of rows and columns."""
     y, x = np.nonzero(mask)
     side = int(min(max(np.ptp(x), np.ptp(y)) + 5, min(mask.shape)))
     starts = (int(np.clip((a.min() + a.max() - side) // 2, 0, n - side)) for a, n in zip((y, x), mask.shape))

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from polcap.errors import InputError
 from polcap.images import Bits, ColorCalibration, Cues, Floats, Quality, StokesImage, SurfaceMaps, View
-from polcap.optics import frames
+from polcap.optics import frames, resize
 from polcap.optics.body import SMOOTH, Law
 from polcap.stages import cues
 from polcap.synth.mesh_tracer import Tracer, Triangles, centred
@@ -43,7 +43,7 @@ PROTOCOLS = {1: "smooth bodies, F0 .03–.26", 2: "rough bodies, F0 as it is met
 
 @dataclass(frozen=True)
 class Case:
-    """One picture of the evaluation; camera frame."""
+    """One simulated picture of the evaluation with its truth; camera frame."""
 
     name: str  # mesh and material
     cues: Cues  # with the camera errors of CONDITIONS
@@ -55,7 +55,7 @@ class Case:
 
 @dataclass(frozen=True)
 class _Subject:
-    """Geometry and material of a picture, before any light."""
+    """Geometry and material of an evaluation picture, before light is simulated."""
 
     pose: light_transport.Pose
     places: light_transport.SurfacePoints
@@ -65,7 +65,7 @@ class _Subject:
 
 
 class Protocol:
-    """All pictures of one size and protocol."""
+    """All evaluation pictures of one size and protocol."""
 
     def __init__(self, data: Path, size: int, protocol: int = 1) -> None:
         files = sorted((data / "meshes" / "test").glob("*.npz"))
@@ -76,7 +76,7 @@ class Protocol:
         self.size, self.protocol = size, protocol
         self.names = [file.stem for file in files]
         self.tracers = [Tracer(centred(traced_views.read_mesh(file))) for file in files]
-        self.materials = evaluation_materials.test_materials(data / "materials" / "test", met=protocol == 2)
+        self.materials = evaluation_materials.test_materials(data / "materials" / "test", everyday=protocol == 2)
 
     def case(self, number: int) -> Case:
         """Simulate picture `number`."""
@@ -196,7 +196,7 @@ def _random_placement(mesh: Triangles, rng: np.random.Generator) -> tuple[Floats
 
 
 def _photograph(light: Floats, places: light_transport.SurfacePoints, view: View, errors: CameraErrors) -> StokesImage:
-    """Measurement of Stokes parameters (3, M, 3) by a camera with these errors."""
+    """Measure Stokes parameters (3, M, 3) with a camera that has these errors."""
     mask = places.mask
     at = np.flatnonzero(mask)
     images = np.stack([traced_views.fill(mask, part) for part in light]), traced_views.fill(mask, places.diffuse)
@@ -207,26 +207,22 @@ def _photograph(light: Floats, places: light_transport.SurfacePoints, view: View
 
 
 def _bin(image: StokesImage, by: int) -> StokesImage:
-    """Means over by × by pixels of the object; a bin is part of the object if half of it is."""
-    height, width = (side // by for side in image.mask.shape)
-
-    def summed(value: Floats) -> Floats:  # the last two axes of pixels
-        cut = value[..., : height * by, : width * by].reshape(*value.shape[:-2], height, by, width, by)
-        return np.asarray(cut.sum(axis=(-3, -1)))
-
+    """Picture with fewer pixels: means over by × by pixels. A new pixel is on the object if half of its pixels are."""
     inside = image.mask.astype(np.float32)
-    count = summed(inside)
-    mask, share = count * 2 >= by * by, np.maximum(count, 1)
-    stokes, covariance = (
-        np.moveaxis(summed(np.moveaxis(value * inside[..., None], -1, 1)) / share**power * mask, 1, -1)
-        for value, power in ((image.stokes, 1), (image.covariance, 2))
-    )
-    clipped = summed(((image.quality & Quality.CLIPPED) > 0) * inside) * 2 > share
+    share = resize.block_means(inside, by)
+    mask, least = share >= 0.5, np.maximum(share, 1 / by**2)[..., None]
+
+    def object_means(layers: Floats) -> Floats:
+        return np.asarray([resize.block_means(layer * inside[..., None], by) / least for layer in layers])
+
+    stokes, covariance = object_means(image.stokes), object_means(image.covariance) / (least * by**2)
+    clipped = resize.block_means(((image.quality & Quality.CLIPPED) > 0) * inside, by) * 2 > share
     view = replace(
         image.view, focal=image.view.focal / by, scale=by,
         center=((image.view.center[0] + 0.5) / by - 0.5, (image.view.center[1] + 0.5) / by - 0.5),
     )  # fmt: skip
-    return StokesImage(stokes, covariance, clipped.astype(np.uint8) * np.uint8(Quality.CLIPPED), mask, view, None)
+    quality = clipped.astype(np.uint8) * np.uint8(Quality.CLIPPED)
+    return StokesImage(stokes * mask[..., None], covariance * mask[..., None], quality, mask, view, None)
 
 
 def white() -> ColorCalibration:

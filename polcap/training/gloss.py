@@ -50,7 +50,7 @@ _TRANSLUCENT = 0.08  # of rough interfaces, and so depolarized
 
 @dataclass(frozen=True)
 class Gloss:
-    """Gloss of surfaces; all fields have one shape."""
+    """Random gloss of training surfaces; all fields have one shape."""
 
     roughness: Tensor
     f0: Tensor
@@ -60,7 +60,7 @@ class Gloss:
 
 
 def dark_albedo(shape: tuple[int, ...], device: torch.device) -> Tensor:
-    """Draw albedos of dark gloss, (*shape, 3): nearly gray."""
+    """Draw nearly gray, dark albedos (*shape, 3), as of black plastic or lacquer."""
     low, high = _DARK
     value = low * (high / low) ** torch.rand((*shape, 1), device=device)
     return value * torch.exp(0.15 * torch.randn((*shape, 3), device=device))

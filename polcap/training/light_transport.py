@@ -29,7 +29,7 @@ Albedo = Callable[[Floats, Floats], Floats]  # places, facing directions (M, 3) 
 
 @dataclass(frozen=True)
 class Pose:
-    """Position of mesh and flash: camera = rotation @ vertex + translation."""
+    """Position of mesh and flash in the camera frame: point = rotation @ vertex + translation."""
 
     rotation: Floats  # (3, 3)
     translation: Floats  # (3,)
@@ -53,7 +53,7 @@ class SurfacePoints:
     law: Law = SMOOTH
 
     def take(self, which: Indices) -> "SurfacePoints":
-        """The points `which`; mask, ior and law stay."""
+        """Select the points `which`; mask, ior and law do not change."""
         taken = {name: value[which] for name, value in vars(self).items() if name not in ("mask", "ior", "law")}
         return replace(self, **taken)
 
@@ -69,7 +69,7 @@ def flash_light(tracer: Tracer, place: Floats, flat: Floats, pose: Pose) -> tupl
 
 
 def stokes(tracer: Tracer, places: SurfacePoints, pose: Pose, albedo: Albedo, rng: np.random.Generator) -> Floats:
-    """Stokes parameters (3, M, 3) of the visible pixels, in the frame of each ray."""
+    """Stokes parameters (3, M, 3) of a mesh under the flash, with shadows and one bounce, in the frame of each ray."""
     to_flash, irradiance = flash_light(tracer, places.position, places.flat, pose)
     toward = frames.to_ray_frame(to_flash @ pose.rotation.T, places.rays)
     direct = _shade(places, places.diffuse, places.specular, places.ior, toward, irradiance)
@@ -85,13 +85,13 @@ def _shade(
 
 
 class IndirectLight:
-    """Light at the places from other parts of the mesh."""
+    """Flash light that reaches visible places of a mesh by one bounce on its other parts."""
 
     def __init__(self, tracer: Tracer, places: SurfacePoints, pose: Pose, albedo: Albedo) -> None:
         self.tracer, self.places, self.pose, self.albedo = tracer, places, pose, albedo
 
     def diffuse(self, rng: np.random.Generator) -> Floats:
-        """Diffuse reflection (3, M, 3): irradiance by rays over the hemisphere, distributed by their cosine."""
+        """Bounced light that is reflected diffusely (3, M, 3), from rays over the hemisphere, cosine-distributed."""
         places, count = self.places, len(self.places.normal)
         turn = rng.uniform(0, 1, (count, 2))
         received: Floats = np.zeros((count, 3))
@@ -107,7 +107,7 @@ class IndirectLight:
         return _shade(places, places.diffuse * received, 0 * places.specular, places.ior, places.normal, one)
 
     def mirrored(self, rng: np.random.Generator) -> Floats:
-        """Mirror reflection (3, M, 3) by facets drawn from the GGX distribution.
+        """Bounced light that is mirrored (3, M, 3), by facets drawn from the GGX distribution.
 
         Facets have an index of their own, `facet_ior`, for the F0 of the material. A scaled Fresnel curve of the body's
         index would reflect more than 100 % at grazing angles.
@@ -131,7 +131,7 @@ class IndirectLight:
         return np.stack([self.smooth(part) for part in total])
 
     def light(self, way: Floats, which: Indices) -> tuple[Indices, Floats]:
-        """Places among `which` that see another one along `way` (M, 3; rays' frames), and the S0 (·, 3) of that one."""
+        """Places among `which` that see the mesh along `way` (M, 3; rays' frames), and S0 (·, 3) of the seen point."""
         tracer, places, pose = self.tracer, self.places, self.pose
         direction = frames.from_ray_frame(way[which], places.rays[which]) @ pose.rotation
         origin = (places.position + LIFT * tracer.size * places.flat)[which]

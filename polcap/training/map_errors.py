@@ -21,7 +21,7 @@ Score = dict[str, float]
 
 
 class Judge:
-    """Measures errors of estimates of one picture."""
+    """Measures the errors of estimated maps of one evaluation picture."""
 
     def __init__(self, case: Case) -> None:
         self.case, self.mask = case, case.truth.mask
@@ -33,7 +33,7 @@ class Judge:
         self.rendered = self._render(case.truth)
 
     def score(self, maps: SurfaceMaps) -> Score:
-        """RMSE unless the name differs; angles in degrees, shares of pixels 0…1. `·_core`: mask eroded by 2 px.
+        """Errors of all maps: RMSE unless the name differs; degrees; shares 0…1. `·_core`: mask eroded by 2 px.
 
         `·_picture`: over the whole square picture, with zero error outside the object. depth: both centred in the mask,
         in units of the truth's range; `depth_fitted`: after the best scale and shift. diffuse_clipped: where all
@@ -59,7 +59,7 @@ class Judge:
         return out
 
     def integrated(self, maps: SurfaceMaps) -> Score:
-        """depth_integrated: error of the depth that stage 9 integrates from the maps, on every n-th pixel."""
+        """`depth_integrated`: error of depth integrated from the maps by the stage `surface`, on every n-th pixel."""
         by = max(1, round(max(self.mask.shape) / _INTEGRATED))
         thin = np.s_[::by, ::by]
         mask, (x, y) = (maps.mask & self.mask)[thin], maps.view.center

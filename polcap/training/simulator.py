@@ -24,7 +24,7 @@ Indices = NDArray[np.integer[Any]]
 
 @dataclass(frozen=True)
 class Batch:
-    """Input and target of the network; pixels outside `mask` are ignored."""
+    """Training batch of the main network: input and target; pixels outside `mask` are ignored."""
 
     channels: Tensor  # (B, N, H, W)
     mask: Tensor  # (B, H, W) bool: on the object and in the mask that the network sees
@@ -69,7 +69,7 @@ class ObjectPixels:
 
 @dataclass(frozen=True)
 class ViewBatch:
-    """Some of the traced views at one size."""
+    """Traced views of B objects at one size, before materials and light."""
 
     mask: Tensor  # (B, H, W) bool
     rays: Tensor  # (B, H, W, 3) camera frame, surface to camera
@@ -145,7 +145,7 @@ class Simulator:
     def _seen_pixels(
         self, view: Indices, y: Indices, x: Indices, order: Indices, mask: NDArray[np.bool_], owner: Indices
     ) -> tuple[Indices, NDArray[np.float32]]:
-        """ObjectPixels.met and ObjectPixels.open of pixels (y, x) of the cached views `view`.
+        """Fields `met` and `open` of `ObjectPixels`, of pixels (y, x) of the cached views `view`.
 
         The thinned pixels of a view are in `order`, their masks are (B, H·W).
         """
@@ -164,7 +164,7 @@ class Simulator:
     def photograph(
         self, views: ViewBatch, strength: Tensor, errors: CameraErrors, jitter: Tensor | None = None
     ) -> SimulatedPhotographs:
-        """Draw materials, light the objects and measure them.
+        """Draw materials, simulate the light of the flash and measure it with a camera.
 
         strength (B,): S0 of a white plane that faces the flash at the object's distance. jitter (B,) 0…1: thins or
         widens the input mask.
@@ -199,7 +199,7 @@ class Simulator:
 
 
 def to_batch(photo: SimulatedPhotographs) -> Batch:
-    """Input and target of the network for these photographs."""
+    """Training batch of the main network from simulated photographs."""
     return Batch(
         channels=channels(photo),
         mask=photo.input_mask & photo.mask,

@@ -37,7 +37,7 @@ _MAX_OFFSET = 0.1  # of the distance, between lens and a random flash
 
 @dataclass(frozen=True)
 class ViewsRecipe:
-    """Which views are traced."""
+    """Settings of a cache of traced views."""
 
     views: int  # of each mesh
     procedural: int  # random shapes
@@ -48,7 +48,7 @@ class ViewsRecipe:
 
 
 def open_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe) -> dict[str, NDArray[Any]]:
-    """Open the cache; trace it first if the folder has no complete one.
+    """Open a cache of traced views; trace the views first if the folder has no complete cache.
 
     Returns the arrays of ARRAYS (N, S, S, ·) as memory maps, and camera (N, 16): focal length, center x, y [px]; middle
     depth [m]; depth unit [m]; rotation from object to camera (9); flash to the right of the lens and above it [middle
@@ -74,7 +74,7 @@ def open_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe) -> dict[st
 
 
 def _build_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe) -> None:
-    """Trace all views."""
+    """Trace all views of a recipe and write their arrays."""
     folder.mkdir(parents=True, exist_ok=True)
     size = recipe.size
     total = recipe.views * len(meshes) + recipe.per_shape * recipe.procedural
@@ -110,7 +110,7 @@ def training_meshes(data: Path) -> list[Path]:
 
 
 def read_mesh(path: Path) -> Triangles:
-    """A mesh file with shading normals."""
+    """Read a mesh file and add shading normals."""
     return smooth(*scene_files.read_mesh(path))
 
 

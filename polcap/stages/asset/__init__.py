@@ -86,7 +86,7 @@ def resize_textures(asset: Asset, size: int) -> Asset:
 
 
 def _resize(texture: NDArray[np.uint8], shape: tuple[int, int]) -> Floats:
-    """(height, width, 3) of 0…255, by area where both sides shrink, else by cubic interpolation."""
+    """Resize a texture (H, W, 3) of 0…255: by area means if both sides shrink, else by cubic interpolation."""
     image = texture.astype(np.float32)
     if shape[0] <= image.shape[0] and shape[1] <= image.shape[1]:
         return area_mean(image, shape)
@@ -101,7 +101,7 @@ def _without_outline(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def fill_outward(value: Any, known: NDArray[np.bool_]) -> Any:
-    """(H, W, C) with the value of a nearest known pixel wherever none is known."""
+    """Fill an image (H, W, C) where it is unknown with the value of a nearest known pixel."""
     if known.all() or not known.any():
         return value
     label = cv2.distanceTransformWithLabels(

@@ -46,7 +46,7 @@ def predict(cues: Cues, network: Network, run: RunNetwork, symmetries: int) -> d
 def _predict_turned(
     picture: Floats, rays: Floats, network: Network, run: RunNetwork, quarters: int, mirror: bool
 ) -> dict[str, Floats]:
-    """The network's maps of turned channels (H, W, N), turned back."""
+    """Maps of the network for a turned or mirrored picture (H, W, N), turned back."""
     turned = _turn_channels(_turn(picture, quarters, mirror), quarters, mirror)
     maps = run_network(np.moveaxis(turned, -1, 0), network, run, CHANNELS, OUTPUTS)
     own = np.array(_turn(rays, quarters, mirror))
@@ -84,7 +84,7 @@ def _turn(image: Floats, quarters: int, mirror: bool) -> Floats:
 
 
 def _turn_vectors(vector: Floats, quarters: int, mirror: bool) -> Floats:
-    """Vectors (..., 2), y up, mirrored and turned likewise."""
+    """Vectors (..., 2), y up, mirrored left to right, then turned counter-clockwise by quarters."""
     direction = vector[..., 0] + 1j * vector[..., 1]
     turned = 1j**quarters * (-direction.conj() if mirror else direction)
     return np.stack([turned.real, turned.imag], axis=-1)

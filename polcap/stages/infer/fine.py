@@ -87,7 +87,7 @@ def _tiles(mask: NDArray[np.bool_]) -> Iterator[tuple[Window, Window]]:
 
 
 def _window(cues: Cues, estimate: CoarseEstimate, window: Window) -> tuple[Cues, CoarseEstimate]:
-    """A window of cues and estimate: channels of the whole crop would fill the memory."""
+    """Cut a window out of cues and estimate; channels of the whole crop would fill the memory."""
     single = ("radiance", "ratio_sigma", "dolp", "rays", "mask", "quality")
     double = ("ratio", "normalized_stokes")
     cut = {name: getattr(cues, name)[window] for name in single}
@@ -99,7 +99,7 @@ def _window(cues: Cues, estimate: CoarseEstimate, window: Window) -> tuple[Cues,
 def _tile_relief(
     cues: Cues, estimate: CoarseEstimate, inner: Window, outer: Window, network: Network, run: RunNetwork
 ) -> Floats:
-    """Deviation of the normals (h, w, 3) of the tile `inner`, ray frame, by the network's view of `outer`."""
+    """Relief of the normals (h, w, 3) in the tile `inner`, ray frame, by the refinement network's view of `outer`."""
     relief = run_network(encode(*_window(cues, estimate, outer)), network, run, CHANNELS, {"relief": 3})["relief"]
     y, x = (within.start - around.start for within, around in zip(inner, outer))
     high, wide = (within.stop - within.start for within in inner)

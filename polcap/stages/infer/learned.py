@@ -32,7 +32,7 @@ _BRIGHTEST = 2.0  # greatest S0 of diffuse reflection; white paper that faces th
 def estimate(
     cues: Cues, network: Network, run: RunNetwork, ior: float, symmetries: int, *, fine_pass: bool
 ) -> SurfaceMaps:
-    """The maps of an object's crop (H, W), seen in 1, 2, 4 or 8 turned and mirrored positions.
+    """Maps of an object's crop (H, W) by the network, in 1, 2, 4 or 8 turned and mirrored positions, and the inversion.
 
     `network` takes the channels of `stages.cues`; `run` runs a network; `ior` is the refractive index of the inversion;
     `fine_pass` adds relief by the refinement network, if there is one.
@@ -66,7 +66,7 @@ def estimate(
 def estimate_coarse(
     cues: Cues, network: Network, run: RunNetwork, ior: float, symmetries: int
 ) -> tuple[dict[str, Floats], fine.CoarseEstimate, Floats]:
-    """Estimate before refinement; also the input of the refinement network's training.
+    """Estimate of normals and material before refinement; also the input of the refinement network's training.
 
     Returns the network's maps (H, W[, 3]) at the crop's size, with `factor`, see `_log_factor`, and `doubt`, the
     probability of a wrong half-turn; then the normals before refinement, and their stated error (H, W) in degrees.
@@ -98,7 +98,7 @@ def _limit_radiance(cues: Cues) -> Cues:
 
 
 def _reduce(cues: Cues, scale: float) -> Cues:
-    """The cues of a picture with fewer pixels: light is averaged, ratios are weighted by it."""
+    """Reduce cues to fewer pixels: light is averaged, ratios of Stokes parameters are averaged with its weight."""
     if scale >= 1.0:
         return cues
     height, width = cues.mask.shape
@@ -190,7 +190,7 @@ def _masked_filter(
 
 
 def _add_detail(coarse: Floats, by_pixel: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:
-    """The coarse normals (H, W, 3) with the detail of others, finer than the network resolves.
+    """Add to coarse normals (H, W, 3) the detail of other normals that is finer than the network resolves.
 
     Interreflection, refractive index and half-turns bend the inversion's normals over whole regions; relief is finer.
     """
@@ -198,7 +198,7 @@ def _add_detail(coarse: Floats, by_pixel: Floats, mask: NDArray[np.bool_], shrin
 
 
 def _join(*estimates: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
-    """Mean direction of normals (H, W, 3) weighed by 1/σ² of their expected errors (H, W), and its own error.
+    """Mean direction of several normals (H, W, 3), weighted by 1/σ² of their expected errors (H, W), and its error.
 
     If the estimates agree, the error is that of independent ones; if they differ, their distance adds to it.
     """

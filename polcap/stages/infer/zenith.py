@@ -50,7 +50,7 @@ _SHARP = 0.005  # probability that the outline is an edge, not round
 
 @dataclass(frozen=True)
 class ZenithEstimate:
-    """Zeniths by the laws that the object may follow."""
+    """Zenith angles, averaged over the laws of diffuse polarization that the object may follow."""
 
     angle: Floats  # (H, W) rad
     spread: Floats  # (H, W) rad, 1σ between laws
@@ -58,13 +58,13 @@ class ZenithEstimate:
     _weights: Floats  # (C,)
 
     def at(self, dolp: Floats) -> Floats:
-        """Zeniths of other DoLPs of any shape, rad: expected over the laws."""
+        """Zeniths [rad] of other DoLPs of any shape, averaged over the laws."""
         return _mean_zenith(dolp, self._dolps, self._weights)[0]
 
 
 @dataclass(frozen=True)
 class DiffuseLaws:
-    """The C candidates, at the Z zeniths of `_ZENITHS`."""
+    """C candidate laws of diffuse polarization, each at the Z zeniths of `_ZENITHS`."""
 
     prior: Floats  # (C,) logarithm
     dolp: Floats  # (C, Z), never falling
@@ -73,7 +73,7 @@ class DiffuseLaws:
 
 
 def estimate_zenith(dolp: Floats, cues: Cues, ior: float, guide: tuple[Floats, Floats] | None = None) -> ZenithEstimate:
-    """Zeniths of the debiased DoLPs (H, W).
+    """Estimate zenith angles (H, W) from DoLPs (H, W) without their noise bias.
 
     `guide` are zeniths (H, W) of another estimator and their 1σ (H, W), rad.
     """
@@ -98,7 +98,7 @@ def estimate_zenith(dolp: Floats, cues: Cues, ior: float, guide: tuple[Floats, F
 
 @lru_cache(maxsize=4)
 def candidate_laws(ior: float) -> DiffuseLaws:
-    """All candidates of a refractive index, made once."""
+    """All candidate laws of diffuse polarization for a refractive index; cached."""
     cosine = np.cos(_ZENITHS)
     rows = []
     for local, alpha in [(0.0, 0.0), *product((0.0, 1.0), _ALPHAS)]:

@@ -137,7 +137,7 @@ def solve(
 def _believed(
     radiance: AngleStack, greys: GreyPatches | None, by_object: GainEstimate
 ) -> tuple[Floats, Floats, Literal["grey patches", "object", "one exposure", "none"]]:
-    """Gains (K, 3), their 1σ, and their source: the best that is available."""
+    """Gains (K, 3) of the shots, their 1σ, and their source: one exposure, grey patches, or else the object."""
     shape = len(radiance.angle), 3
     if radiance.equipment.light == "one exposure":
         return np.ones(shape), np.zeros(shape), "one exposure"
@@ -174,7 +174,7 @@ def _prior(radiance: AngleStack) -> float:
 def _find_angles(
     band: OutlineBand, even: ObjectShots, gain_sigma: float, settings: SelfcalSettings
 ) -> tuple[Floats, float]:
-    """Unknown angles (K,) and their 1σ [rad], from shots divided by their gains."""
+    """Find unknown polarizer angles (K,) and their 1σ, rad, from shots divided by their gains."""
     shots = len(even.light)
     otherwise = "or state the angles with --set selfcal.unknown_angles=false"
     if shots < 4:
@@ -199,7 +199,7 @@ def _find_angles(
 
 
 def _wrong_order(found: angles.OrderFit, angle: Floats) -> str:
-    """The message for shots with an outline that contradicts their angles (K,) rad."""
+    """Error message for shots with angles (K,) rad that contradict the polarization at the object's outline."""
     stated = ", ".join(f"{np.degrees(a):g}°" for a in angle)
     best = ", ".join(f"{np.degrees(angle[i]):g}°" for i in found.check.best.shots)
     mirrored = " counted the other way (the ring turned clockwise)" if found.check.best.mirrored else ""
@@ -211,7 +211,7 @@ def _wrong_order(found: angles.OrderFit, angle: Floats) -> str:
 
 
 def _ring(even: ObjectShots, angle: Floats, gains: GainEstimate, leaves_picture: bool) -> RingZero:
-    """The error of the ring's zero, combined from outline and slopes; without a correction."""
+    """Measure the error of the polarizer ring's zero by the object's outline and slopes; without a correction."""
     gain_sigma = float(gains.sigma.max())
     total = frames.total(even.value) / gains.gain[:, None, None]
     return ring_zero.combined(
@@ -221,7 +221,7 @@ def _ring(even: ObjectShots, angle: Floats, gains: GainEstimate, leaves_picture:
 
 
 def corrected(ring: RingZero, calibrated: float | None, settings: SelfcalSettings) -> RingZero:
-    """The ring's zero with the correction to be added to the angles.
+    """Decide by how much the polarizer angles are corrected for the measured error of the ring's zero.
 
     `calibrated` is 1σ [rad] of a zero that the angles already include, by calibration or because the angles were found;
     None without one. If it agrees with the measured error, the two are averaged by their errors. If not, the filter was

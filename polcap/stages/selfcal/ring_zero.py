@@ -47,7 +47,7 @@ _SLOPES_FLOOR = np.radians(0.1)  # least 1σ (decision 26)
 
 
 def combined(one: RingZero, other: RingZero) -> RingZero:
-    """Weighted mean of two measurements of one ring; its error grows with their difference if they contradict."""
+    """Weighted mean of two measurements of a ring's zero; if they contradict, its error grows with the difference."""
     offset, sigma = weighted_mean(np.array([one.offset, other.offset]), np.array([one.sigma, other.sigma]))
     return RingZero(float(offset), min(float(sigma), np.pi / 2))
 
@@ -55,7 +55,7 @@ def combined(one: RingZero, other: RingZero) -> RingZero:
 def by_outline(
     light: Floats, sound: Bools, mask: Bools, angle: Floats, gain_sigma: float, leaves_picture: bool
 ) -> RingZero:
-    """The ring's error from the outline of registered shots (K, H, W) without their gains.
+    """Error of the polarizer ring's zero, from the outline of registered shots (K, H, W) without their gains.
 
     sound (H, W) are the pixels to use, angle (K,) rad the stated angles, gain_sigma the relative 1σ of the gains. If
     the object leaves the picture there is no closed curve, and the result is UNKNOWN.
@@ -123,7 +123,7 @@ def _outward_of(mask: Bools, sigma: float) -> Complexes:
 
 
 def _turn(slope: Complexes, outward: Complexes) -> float:
-    """Angle of Σ g conj(out), rad; of the two slopes of an AoLP, opposite to each other, the outward one is used."""
+    """Mean angle [rad] from outward directions to slopes; of the two slopes of an AoLP, the outward one is used."""
     across = slope * np.conj(outward)
     real, imaginary = np.ascontiguousarray(across.real), np.ascontiguousarray(across.imag)
     turn = 0.0
@@ -134,7 +134,7 @@ def _turn(slope: Complexes, outward: Complexes) -> float:
 
 
 def by_slopes(light: Floats, usable: Bools, angle: Floats, gain_sigma: float) -> RingZero:
-    """The ring's error from the slopes inside, of registered shots (K, H, W), little blurred, without their gains.
+    """Error of the polarizer ring's zero, from slopes inside registered shots (K, H, W) without their gains.
 
     usable (H, W) are the object's sound pixels, angle (K,) rad as stated, gain_sigma 1σ of the gains, relative.
     """

@@ -62,7 +62,7 @@ class Placement:
         return transform_points(self.homography, _outer(self.patch))
 
     def turned(self) -> "Placement":
-        """The same location read upside down."""
+        """The location of the same chart, read upside down."""
         return replace(self, homography=self.homography @ [[-1.0, 0, COLUMNS], [0, -1.0, ROWS], [0, 0, 1]])
 
     def moved(self, transform: Floats) -> "Placement":
@@ -82,12 +82,12 @@ def from_centers(points: Floats) -> Placement:
 
 
 def from_corners(points: Floats, patch: float = USUAL_PATCH) -> Placement:
-    """The placement with outer patch corners (4, 2) px, dark skin first, clockwise on the chart."""
+    """The placement of a chart with outer patch corners (4, 2) px, dark skin first, clockwise on the chart."""
     return Placement(_homography(_outer(patch), points), patch)
 
 
 def is_view(homography: Floats) -> bool:
-    """Whether a photograph can show a chart like this (3, 3): convex, not mirrored, in front of the camera."""
+    """Whether a homography (3, 3) is a possible view of a chart: convex, not mirrored, in front of the camera."""
     corners = _outer(1.0)
     depth = corners @ homography[2, :2] + homography[2, 2]
     if not np.isfinite(homography).all() or not (depth * depth[0] > 0).all():
@@ -115,13 +115,13 @@ def refine(picture: Floats, start: Placement) -> Placement:
 
 
 def white(picture: Floats) -> Floats:
-    """99th percentile of each channel (3,), from about 10⁵ pixels."""
+    """White level of a picture (H, W, 3): 99th percentile of each channel (3,), from about 10⁵ pixels."""
     step = max(1, int(np.sqrt(picture[..., 0].size / 1e5)))
     return np.maximum(np.percentile(picture[::step, ::step], 99, axis=(0, 1)), 1e-9)
 
 
 def resize(picture: Floats, factor: float) -> Floats:
-    """The picture (H, W, 3) averaged down, or enlarged by cubic interpolation."""
+    """Resize a picture (H, W, 3) by a factor: by area means below 1, by cubic interpolation above."""
     method = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
     size = (max(1, round(picture.shape[1] * factor)), max(1, round(picture.shape[0] * factor)))
     return np.asarray(cv2.resize(np.asarray(picture, np.float32), size, interpolation=method))
@@ -178,7 +178,7 @@ def _fit(image: Floats, start: Placement) -> Placement:
 
 
 def _cover(point: Floats, unknowns: Floats) -> tuple[Floats, NDArray[np.intp], NDArray[np.bool_]]:
-    """Share of each pixel that its nearest patch covers, the index of this patch, and whether the chart has the pixel.
+    """Share of each pixel that a chart's patch covers, the index of the patch, and whether the pixel is on the chart.
 
     point (3, N) are homogeneous coordinates; the ten unknowns are a homography to chart coordinates without its last
     number, the side of a patch, and the blur.
@@ -205,7 +205,7 @@ def _colors(value: Floats, cover: Floats, cell: NDArray[np.intp]) -> tuple[Float
 
 
 def _outer(patch: float) -> Floats:
-    """Outer corners (4, 2) of the outer patches in chart coordinates, dark skin first, clockwise."""
+    """Outer corners (4, 2) of the corner patches in chart coordinates, dark skin first, clockwise."""
     gap = (1 - patch) / 2
     return np.array([[gap, gap], [COLUMNS - gap, gap], [COLUMNS - gap, ROWS - gap], [gap, ROWS - gap]])
 

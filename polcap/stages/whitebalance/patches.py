@@ -36,7 +36,7 @@ class PatchUse(IntEnum):
 
 @dataclass(frozen=True)
 class ChartFit:
-    """A color matrix by the patches of one shot."""
+    """Color matrix that was fitted to the patches of a chart in one shot."""
 
     fit: color.MatrixFit
     use: Bits  # (24,) PatchUse
@@ -46,18 +46,18 @@ class ChartFit:
 
 @dataclass(frozen=True)
 class PatchSamples:
-    """The colors of the patches in one shot."""
+    """Colors of a chart's patches in one shot."""
 
     color: Floats  # (24, 3) S0 of the patches, camera channels
     use: Bits  # (24,) PatchUse
 
     def turned(self) -> "PatchSamples":
-        """The same chart read upside down."""
+        """Colors of the patches of the same chart, read upside down."""
         return PatchSamples(self.color[::-1], self.use[::-1])
 
 
 def fit(samples: PatchSamples, reference: ChartReference) -> ChartFit:
-    """The matrix (3, 3) from one shot's patches to a chart's colors.
+    """Fit the color matrix (3, 3) from the patches of one shot to the known colors of the chart.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def left_out(use: Bits) -> str:
 
 
 def _between_quarters(pixels: Floats, x: Floats, y: Floats) -> float:
-    """Largest difference of the light (sum of channels) between a quarter of the patch and the whole patch."""
+    """Unevenness of a patch: largest difference of light (sum of channels) between a quarter and the whole patch."""
     light = pixels.sum(axis=1)
     quarter = 2 * (x > 0) + (y > 0)
     means = [np.median(light[quarter == q]) for q in range(4) if (quarter == q).sum() >= 4]
