@@ -8,7 +8,9 @@ from typer import Argument, Context, Exit, Option
 
 from polcap import resource_limits, terminal
 from polcap.cli import options
-from polcap.cli.options import Angles, Assignments, ConfigFile, Device, Estimator, Json, Model, NoChart
+from polcap.cli.options import Angles, Assignments, ConfigFile, Device, Estimator, Json, Model, NoChart, choice
+
+JobKind = Literal["slurm", "openjd", "opencue", "snakemake", "kubernetes"]
 
 
 def batch(
@@ -31,14 +33,7 @@ def batch(
     keep_going: Annotated[
         bool, Option("--keep-going/--fail-fast", help="Go on after a failure, or stop at the first.")
     ] = True,
-    write_jobs: Annotated[
-        Literal["slurm", "openjd", "opencue", "snakemake", "kubernetes"] | None,
-        Option(
-            metavar="KIND",
-            case_sensitive=False,
-            help="Only write the job file for slurm, openjd, opencue, snakemake, kubernetes.",
-        ),
-    ] = None,
+    write_jobs: Annotated[JobKind | None, choice("Only write the job file for a farm.")] = None,
     jobs: Annotated[int, Option(min=0, help="Shards of the job file; 0 is one per capture, 1000 at most.")] = 0,
     json: Json = False,
     device: Device = "cpu",

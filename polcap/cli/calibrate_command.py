@@ -14,18 +14,13 @@ if TYPE_CHECKING:
 
 def calibrate(
     context: Context,
-    folder: Annotated[
-        Path,
-        Argument(help="Folder with some of dark/, flat/, bracket/, flash/, polarizer/, lens/."),
-    ],
+    folder: Annotated[Path, Argument(help="Folder with some of dark/, flat/, bracket/, flash/, polarizer/, lens/.")],
     lens_filter: Annotated[str, Option("--filter", metavar="NAME", help="The polarizer's name.")] = "",
     axis: Annotated[
         float,
         Option(min=-360, max=360, metavar="DEG", help="Axis of the light in polarizer/pol…, image x to image up."),
     ] = 0.0,
-    board: Annotated[
-        str, Option(metavar="AxB", help="Inner corners of the checkerboard in lens/, across and down.")
-    ] = "9x6",
+    board: Annotated[str, Option(metavar="AxB", help="Inner corners of the board in lens/, across and down.")] = "9x6",
     out: Annotated[
         Path | None, Option("--out", "-o", help="Folder for the file; by default the user's calibrations.")
     ] = None,

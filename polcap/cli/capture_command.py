@@ -30,9 +30,7 @@ def capture(
     ] = None,
     ambient: Annotated[bool, Option("--ambient", help="Also frames without the flash.")] = False,
     chart: Annotated[bool, Option("--chart", help="Also a frame of the chart alone.")] = False,
-    cross: Annotated[
-        bool, Option("--cross", help="Also a bracket under a cross-polarized flash, to separate highlights.")
-    ] = False,
+    cross: Annotated[bool, Option("--cross", help="Also a bracket under a cross-polarized flash.")] = False,
     tries: Annotated[int, Option(min=0, help="How often a bad frame is taken again.")] = 2,
     resume: Annotated[bool, Option("--resume", help="Go on with a stopped capture.")] = False,
     no_check: Annotated[bool, Option("--no-check", help="Leave out the verdict at the end.")] = False,

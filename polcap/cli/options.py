@@ -22,6 +22,11 @@ def result_folder(named: Path | None) -> Path | None:
     return inside if (inside / "report.json").exists() or (inside / "work").is_dir() else named
 
 
+def choice(meaning: str) -> Any:
+    """An option with a list of values in any case."""
+    return Option(case_sensitive=False, help=meaning)
+
+
 Result = Annotated[
     Path, Argument(help="Result folder of `polcap process`, or the capture that holds it.", callback=result_folder)
 ]
@@ -36,10 +41,10 @@ _CHART = "Chart corners in RAW px, dark skin first, clockwise; or a color profil
 Chart = Annotated[str | None, Option(metavar="X0,Y0,…|FILE", help=_CHART)]
 NoChart = Annotated[bool, Option("--no-chart", help="Use the camera's own colors.")]
 _ESTIMATOR = "How normals and materials are estimated; by default by the network."
-Estimator = Annotated[Literal["network", "analytic"] | None, Option(case_sensitive=False, help=_ESTIMATOR)]
+Estimator = Annotated[Literal["network", "analytic"] | None, choice(_ESTIMATOR)]
 Model = Annotated[Path | None, Option(metavar="ONNX", help="A model of your own instead of the shipped one.")]
 _DEVICE = "Where the network runs; cuda fails where CUDA does not start."
-Device = Annotated[Literal["cpu", "cuda", "auto"], Option(case_sensitive=False, help=_DEVICE)]
+Device = Annotated[Literal["cpu", "cuda", "auto"], choice(_DEVICE)]
 Until = Annotated[str | None, Option(metavar="STAGE", help="Stop after this stage.")]
 Force = Annotated[str | None, Option(metavar="STAGE", help="Compute this stage and all after it again.")]
 Threads = Annotated[int, Option("--threads", "-j", min=0, help="Threads to use; 0 is all.")]

@@ -24,9 +24,7 @@ def process(
     dry_run: Annotated[
         bool, Option("--dry-run", "-n", help="Print the understood capture and the stages, and stop.")
     ] = False,
-    watch: Annotated[
-        bool, Option("--watch", help="Process again after each change of the folder or --config.")
-    ] = False,
+    watch: Annotated[bool, Option("--watch", help="Process again after changes of the folder or --config.")] = False,
     json: options.Json = False,
     device: options.Device = "cpu",
     threads: options.Threads = 0,

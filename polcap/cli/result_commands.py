@@ -7,8 +7,10 @@ from typer import Argument, Context, Option
 
 from polcap import terminal
 from polcap.cli import options
-from polcap.cli.options import Json, Result
+from polcap.cli.options import Json, Result, choice
 from polcap.errors import SettingError
+
+Preset = Literal["blender", "unreal", "unity", "web", "archive"]
 
 
 def export(
@@ -19,16 +21,8 @@ def export(
     usd: Annotated[bool, Option("--usd", help="asset/NAME.usdc and textures (extra [usd])")] = False,
     materialx: Annotated[bool, Option("--materialx", help="asset/NAME.mtlx and textures")] = False,
     exr: Annotated[bool, Option("--exr", help="asset/NAME_layers.exr, every map as a layer")] = False,
-    preset: Annotated[
-        Literal["blender", "unreal", "unity", "web", "archive"] | None,
-        Option(
-            case_sensitive=False, help="Program that reads the files, in asset/NAME/; archive needs the extra [usd]."
-        ),
-    ] = None,
-    images: Annotated[
-        Literal["png", "jpeg", "webp", "ktx2"] | None,
-        Option(case_sensitive=False, help="Picture format in the GLB."),
-    ] = None,
+    preset: Annotated[Preset | None, choice("Program that reads asset/NAME/; archive needs the extra [usd].")] = None,
+    images: Annotated[Literal["png", "jpeg", "webp", "ktx2"] | None, choice("Picture format in the GLB.")] = None,
     color: Annotated[
         str, Option(metavar="SPACE", help="Color space or OCIO role of the colors in the EXR, such as ACEScg.")
     ] = "lin_rec709",
@@ -36,10 +30,7 @@ def export(
         int | None,
         Option(min=16, max=16384, help="Longer side of the textures, px; by default that of the maps."),
     ] = None,
-    lod: Annotated[
-        int,
-        Option(min=0, max=6, help="Number of further GLBs, each with a quarter of the triangles of the one before."),
-    ] = 0,
+    lod: Annotated[int, Option(min=0, max=6, help="Further GLBs, each with a quarter of the triangles.")] = 0,
     json: Json = False,
 ) -> None:
     """Write the asset again from a result's maps; without a flag as GLB and OBJ."""

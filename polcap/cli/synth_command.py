@@ -7,16 +7,14 @@ from typer import Argument, Context, Option
 
 from polcap import terminal
 from polcap.cli import options
-from polcap.cli.options import Json
+from polcap.cli.options import Json, choice
 from polcap.errors import SettingError
 
 
 def synth(
     context: Context,
     folder: Annotated[Path, Argument(help="Folder to make; must be new or empty.")],
-    scene: Annotated[
-        Literal["bumps", "clusters", "vase"], Option(case_sensitive=False, help="Kind of object.")
-    ] = "bumps",
+    scene: Annotated[Literal["bumps", "clusters", "vase"], choice("Kind of object.")] = "bumps",
     seed: Annotated[int, Option(min=0, help="Of shape, material, light and noise.")] = 0,
     assignments: Annotated[
         list[str] | None,
@@ -32,13 +30,8 @@ def synth(
     interreflection: Annotated[
         bool, Option("--interreflection", help="One bounce of light between parts of the mesh.")
     ] = False,
-    law: Annotated[
-        Literal["smooth", "rough"],
-        Option(case_sensitive=False, help="Interface through which diffuse light leaves."),
-    ] = "smooth",
-    calibration: Annotated[
-        bool, Option("--calibration", help="Make photographs for `polcap calibrate` instead.")
-    ] = False,
+    law: Annotated[Literal["smooth", "rough"], choice("Interface through which diffuse light leaves.")] = "smooth",
+    calibration: Annotated[bool, Option("--calibration", help="Photographs for `polcap calibrate` instead.")] = False,
     dataset: Annotated[
         int | None,
         Option(min=1, metavar="N", help="Make N samples of a data set instead (extra [train]); resumable."),

@@ -7,6 +7,7 @@ from typer import Argument, Context, Option
 
 from polcap import terminal
 from polcap.cli import options
+from polcap.cli.options import choice
 from polcap.errors import SettingError
 
 
@@ -14,9 +15,7 @@ def train(
     context: Context,
     data: Annotated[Path, Argument(help="Folder with meshes/ and materials/.")],
     out: Annotated[Path, Option("--out", "-o", help="Checkpoints and metrics.")] = Path("runs/train"),
-    preset: Annotated[
-        Literal["cpu", "gpu"], Option(case_sensitive=False, help="Size of the network and of a batch.")
-    ] = "cpu",
+    preset: Annotated[Literal["cpu", "gpu"], choice("Size of the network and of a batch.")] = "cpu",
     minutes: Annotated[float, Option(min=0.1, help="Training time, resumed parts included.")] = 90,
     samples: Annotated[int | None, Option(min=1, help="Pictures to learn from, instead of minutes.")] = None,
     variant: Annotated[str, Option(help="Leave one thing out, for ablations; see training/variants.py.")] = "ours",

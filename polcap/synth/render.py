@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from polcap.errors import SettingError
 from polcap.images import Floats, GBuffer, View
-from polcap.optics import body, frames, fresnel, mueller, shade
+from polcap.optics import body, frames, fresnel, shade
 from polcap.synth import color_checker as charts
 from polcap.synth import interreflection, mesh_tracer, scene_materials, trace
 from polcap.synth.color_checker import Chart
@@ -66,12 +66,6 @@ def stokes(
     out[0] = surroundings
     out[:, hits.index] = _shade(scene, v[hits.index], hits, flash_axis)
     return out.reshape(3, *x.shape, 3)
-
-
-def polarize(stokes: Floats, v: Floats, angle: float, extinction_ratio: float) -> Floats:
-    """Intensity (H, W, 3) of Stokes parameters (3, H, W, 3) on rays v (H, W, 3) behind a polarizer at `angle` [rad]."""
-    weights = mueller.analyzer(frames.axis_on_ray(np.asarray(angle), v), extinction_ratio)
-    return np.asarray(np.einsum("hws,shwc->hwc", weights.astype(np.float32), stokes))
 
 
 @dataclass(frozen=True)

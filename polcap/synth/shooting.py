@@ -24,7 +24,7 @@ from polcap.errors import CaptureError
 from polcap.formats import atomic
 from polcap.formats.capture import layouts
 from polcap.images import Exif, Floats, GBuffer, View
-from polcap.optics import frames, projection
+from polcap.optics import frames, mueller, projection
 from polcap.synth import color_checker as charts
 from polcap.synth import forward_camera, render, scene_materials
 from polcap.synth.forward_camera import COLOR_MATRIX, SENSOR_WIDTH_MM, Bend, Sensor
@@ -156,8 +156,9 @@ class Studio:
             stokes = 0.5 * (degree * polarized + (1 - degree) * stokes)
         y, x = np.mgrid[: shoot.height, : shoot.width].astype(np.float64)
         v = frames.rays_at(shoot.view, *_reference_px(shoot, back, x, y))
-        angle = np.radians(pose["actual_deg"] - pose["rot_deg"])
-        return np.asarray(_blur(shoot, render.polarize(stokes, v, angle, shoot.extinction_ratio)) @ self.to_camera.T)
+        axis = frames.axis_on_ray(np.radians(pose["actual_deg"] - pose["rot_deg"]), v)
+        weights = mueller.analyzer(axis, shoot.extinction_ratio).astype(np.float32)  # (H, W, 3)
+        return np.asarray(_blur(shoot, np.einsum("hws,shwc->hwc", weights, stokes)) @ self.to_camera.T)
 
     def photograph(self, path: Path, radiance: Floats, take: Take) -> dict[str, Any]:
         """Write one DNG of `radiance` (H, W, 3); returns its exposure for truth.json. Raises StorageError."""

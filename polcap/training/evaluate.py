@@ -25,7 +25,7 @@ from polcap.formats.maps import png
 from polcap.images import Cues, Network, SurfaceMaps
 from polcap.pipeline import models
 from polcap.stages import cues, infer
-from polcap.training import evaluation_baselines, evaluation_page, evaluation_picture, evaluation_protocol
+from polcap.training import evaluation_baselines, evaluation_page, evaluation_protocol
 from polcap.training.evaluation_baselines import Estimator, Means
 from polcap.training.evaluation_protocol import Protocol
 from polcap.training.map_errors import MAPS, Judge, Score, angle, deciles
@@ -62,8 +62,8 @@ def main(options: EvaluationOptions) -> dict[str, Score]:
     rows = _evaluate_pictures(options, evaluation_baselines.mean_maps(made, options.count), head)
     result = _summary(head, rows)
     shown = (made.case(number) for number in range(min(_PANEL, options.count)))
-    strips = [evaluation_picture.make_row(case, _estimate(case.cues, network)) for case in shown]
-    png.write(options.out / "panel.png", evaluation_picture.make_sheet(strips))
+    strips = [evaluation_page.make_row(case, _estimate(case.cues, network)) for case in shown]
+    png.write(options.out / "panel.png", evaluation_page.make_sheet(strips))
     page = evaluation_page.make_page(result)
     for name, text in (("evaluation.json", json.dumps(result, indent=1)), ("evaluation.md", page)):
         with atomic.path(options.out / name) as temporary:

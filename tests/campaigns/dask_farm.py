@@ -66,7 +66,7 @@ def main(captures: int, kills: int, tiny: int, seed: int) -> int:
 
 
 def adopt() -> None:
-    """Processes whose parent has ended are this one's from now on, and so are their CPU seconds."""
+    """Make this process the parent of orphaned processes, so that their CPU seconds are counted."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
@@ -105,18 +105,18 @@ def timed(root: Path, out: Path, *more: str) -> dict[str, Any]:
 
 
 def capture_seconds(out: Path) -> float:
-    """Mean of the wall seconds of a capture: what start and end of the batch cost is not in it."""
+    """Mean wall seconds of a capture, without start and end of the batch."""
     taken = [json.loads(file.read_text(encoding="utf-8"))["seconds"] for file in out.rglob("records/*.json")]
     return round(float(np.mean(taken)), 3)
 
 
 def products(out: Path, captures: int) -> list[dict[str, str]]:
-    """Digests of every capture's files, without what tells the time."""
+    """Digests of every capture's files, without measured times."""
     return [kill.digests(out / f"capture{number:03d}") for number in range(captures)]
 
 
 def different(wanted: list[dict[str, str]], found: list[dict[str, str]]) -> int:
-    """Captures whose result lacks a file, has one more, or other bytes."""
+    """Number of captures with a missing, additional or different file."""
     return sum(not one or one != other for one, other in zip(wanted, found, strict=True))
 
 

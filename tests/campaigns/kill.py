@@ -103,7 +103,7 @@ def kill_amid(step: Step, out: Path, moment_s: float) -> bool:
 
 
 def broken_names(folder: Path, *whole: dict[str, str]) -> list[str]:
-    """Files under a final name that are as in none of the whole results; what is missing is not broken."""
+    """Files under a final name that differ from every undisturbed result; missing files are not broken."""
     found = digests(folder) if folder.exists() else {}
     final = {name: digest for name, digest in found.items() if not _partial(name)}
     strange = [name for name, digest in final.items() if all(one.get(name) != digest for one in whole)]

@@ -50,10 +50,10 @@ def _disc(noise: Floats) -> Floats:
     return np.where(x * x + y * y < 0.3, 6000 + 80 * noise, BLACK + 100 + 8 * noise)
 
 
-def write(folder: Path, what: list[str], size: tuple[int, int], exposures: int, random: Random) -> None:
-    """A capture of a shot per angle, 0, 45 and 90 degrees, whose frames hold what is named."""
+def write(folder: Path, contents: list[str], size: tuple[int, int], exposures: int, random: Random) -> None:
+    """Write a capture at 0, 45 and 90 degrees; `contents` names the content of each shot."""
     taken = 0
-    for angle, name in zip((0, 45, 90), what):
+    for angle, name in zip((0, 45, 90), contents):
         place = folder / f"pol{angle:03d}"
         place.mkdir(parents=True)
         for e in range(exposures):
@@ -72,7 +72,7 @@ def mask(kind: str, size: tuple[int, int], random: Random) -> np.ndarray | None:
 
 
 def run(folder: Path, drawn: np.ndarray | None) -> str:
-    """The outcome of a run in a word; what was written is checked."""
+    """The outcome of a run in a word; written maps are checked."""
     out = folder / "polcap"
     try:
         found = captures.read(folder)
@@ -82,7 +82,7 @@ def run(folder: Path, drawn: np.ndarray | None) -> str:
     except InputError as error:
         assert "\n" not in str(error), error
         return type(error).__name__
-    stored = maps.read(out / "maps")  # refuses what is not finite
+    stored = maps.read(out / "maps")  # refuses values that are not finite
     assert about is not None and stored.maps.mask.any()
     return f"verdict {about['verdict']}"
 
@@ -94,17 +94,17 @@ def main(count: int, seed: int) -> int:
     failures, slowest = 0, 0.0
     for _ in range(count):
         alike = random.random() < 0.6
-        what = [str(random.choice(list(CONTENT)))] * 3 if alike else [str(x) for x in random.choice(list(CONTENT), 3)]
+        contents = [str(name) for name in random.choice(list(CONTENT), 1 if alike else 3)] * (3 if alike else 1)
         size = (2 * int(random.integers(40, 100)), 2 * int(random.integers(40, 100)))
         kind = str(random.choice(["none", "none", "one pixel", "all", "random"]))
         start = time.process_time()  # independent of the load of the machine
         with tempfile.TemporaryDirectory() as place:
             try:
-                write(Path(place) / "c", what, size, int(random.integers(1, 4)), random)
+                write(Path(place) / "c", contents, size, int(random.integers(1, 4)), random)
                 outcomes[run(Path(place) / "c", mask(kind, size, random))] += 1
             except Exception:
                 failures += 1
-                print(f"{what}, {size}, mask {kind}:\n{traceback.format_exc()}")
+                print(f"{contents}, {size}, mask {kind}:\n{traceback.format_exc()}")
         spent = time.process_time() - start
         slowest = max(slowest, spent)
         failures += spent > LIMIT_S

@@ -65,7 +65,7 @@ def at_stokes_level(case: lit_objects.Lit, seed: int, number: int, turn: float, 
     gain = 1 + repeats * np.random.default_rng([seed, 18, number]).normal(size=len(_ANGLE))
     radiance = lit_objects.stack(case, _ANGLE + np.radians(turn), seed, gain, _ANGLE)
     if chart:
-        spread = _GAIN_ERROR / 2**0.5  # as well as a chart would tell
+        spread = _GAIN_ERROR / 2**0.5  # as with a chart
         radiance = replace(radiance, equipment=replace(radiance.equipment, flash_spread=spread))
     settings = selfcal.SelfcalSettings(check_order=False)
     object_, still = lit_objects.object_of(case), scenes.still(len(_ANGLE))

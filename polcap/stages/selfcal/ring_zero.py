@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Bools, Floats, RingZero
 from polcap.optics import mueller, outline
+from polcap.optics.resize import area_mean
 from polcap.optics.robust import jackknife
 from polcap.stages.selfcal import integrability
 from polcap.stages.selfcal.object_gains import weighted_mean
@@ -78,8 +79,8 @@ def by_outline(
     strength = np.abs(polarization)
     weight = np.minimum(strength, outline.DOLP_CAP)
     slope = np.sqrt(polarization / np.maximum(strength, 1e-9)) * weight  # along it or against it: half the angle
-    outward = [_outward_of(mask, sigma) for sigma in (_RIM_PX, *(d * radius for d in _DEEPER))]
-    outward.append(_outward(cv2.GaussianBlur(np.minimum(depth, _PLATEAU * radius), (0, 0), 2.0)))
+    outward = [_outward(mask, sigma) for sigma in (_RIM_PX, *(d * radius for d in _DEEPER))]
+    outward.append(_outward(np.minimum(depth, _PLATEAU * radius), 2.0))
     rim, *deeper = (_turn(slope, way[seen]) for way in outward)
     scatter = float(np.sqrt(np.mean([(other - rim) ** 2 for other in deeper])))
     at_rim = outward[0][seen]
@@ -106,20 +107,14 @@ def _smoothed(light: Floats, used: Bools) -> Floats:
     return np.stack([cv2.GaussianBlur((shot * ok).astype(np.float32), (0, 0), _SMOOTH_PX) / share for shot in light])
 
 
-def _outward(inside: Floats) -> Complexes:
-    """Negative gradient (H, W) as x + iy, y up, of a picture with larger values inside: the outward direction."""
-    return np.asarray(-cv2.Sobel(inside, cv2.CV_64F, 1, 0) + 1j * cv2.Sobel(inside, cv2.CV_64F, 0, 1))
-
-
-def _outward_of(mask: Bools, sigma: float) -> Complexes:
-    """`_outward` of a mask blurred by `sigma` px; a large blur is made on a coarser grid."""
+def _outward(inside: Floats | Bools, sigma: float) -> Complexes:
+    """Outward gradient (H, W) as x + iy, y up, of a picture blurred by `sigma` px; a large blur on a coarser grid."""
     step = max(1, int(sigma / _FINE_PX))
-    height, width = mask.shape
-    small = cv2.resize(mask.astype(np.float32), (-(-width // step), -(-height // step)), interpolation=cv2.INTER_AREA)
-    way = _outward(cv2.GaussianBlur(small, (0, 0), sigma / step))
-    if step == 1:
-        return way
-    return np.asarray(cv2.resize(way.view(np.float64).reshape(*way.shape, 2), (width, height)) @ np.array([1, 1j]))
+    height, width = inside.shape
+    small = area_mean(inside.astype(np.float32), (-(-height // step), -(-width // step)))
+    direction, slope = outline.outward(small, sigma / step)
+    x, y = (cv2.resize(part, (width, height)) for part in direction * slope)
+    return np.asarray(x + 1j * y, np.complex128)
 
 
 def _turn(slope: Complexes, outward: Complexes) -> float:

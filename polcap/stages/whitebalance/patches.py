@@ -65,7 +65,14 @@ def fit(samples: PatchSamples, reference: ChartReference) -> ChartFit:
         Fewer than 12 patches are usable.
     """
     seen, use = samples.color, samples.use
-    _check(use)
+    used = int((use == PatchUse.USED).sum())
+    if used < _LEAST:
+        clipped, uneven = (int((use == reason).sum()) for reason in (PatchUse.CLIPPED, PatchUse.UNEVEN))
+        raise ChartError(
+            f"{24 - used} of the chart's 24 patches cannot be used ({clipped} over-exposed, "
+            f"{uneven} partly hidden or in shade), more than the {24 - _LEAST} allowed; add a shorter exposure to the "
+            "bracket, or show the whole chart"
+        )
     error = color.trimmed_residuals(seen, reference.rec709, position(), use == PatchUse.USED)
     odd = error > max(_LEAST_ODD, _ODD * float(np.median(error[use == PatchUse.USED])))
     use = np.where((use == PatchUse.USED) & odd, PatchUse.ODD, use).astype(np.uint8)
@@ -139,16 +146,3 @@ def _between_quarters(pixels: Floats, x: Floats, y: Floats) -> float:
     quarter = 2 * (x > 0) + (y > 0)
     means = [np.median(light[quarter == q]) for q in range(4) if (quarter == q).sum() >= 4]
     return float(np.abs(np.array(means) - np.median(light)).max()) if means else 0.0
-
-
-def _check(use: Bits) -> None:
-    """Raise ChartError if fewer than 12 patches are usable."""
-    used = int((use == PatchUse.USED).sum())
-    if used >= _LEAST:
-        return
-    clipped, uneven = int((use == PatchUse.CLIPPED).sum()), int((use == PatchUse.UNEVEN).sum())
-    raise ChartError(
-        f"{24 - used} of the chart's 24 patches cannot be used ({clipped} over-exposed, "
-        f"{uneven} partly hidden or in shade), more than the {24 - _LEAST} allowed; add a shorter exposure to the "
-        "bracket, or show the whole chart"
-    )
