@@ -104,7 +104,7 @@ def counted(capture: Capture, frame_read: Callable[[int, int], None]) -> Decode:
 
 
 def plan(capture: Capture, supplied: UserInput, config: Config, out: Path, force: str | None = None) -> dict[str, str]:
-    """What `process` would do with each stage: cached, compute, or on demand. Nothing is done."""
+    """The state of each stage before a run of `process`: cached, compute, or on demand. Nothing is computed."""
     cache = DryRunCache(out, force)
     path(capture, supplied, config, cache)
     return cache.states
