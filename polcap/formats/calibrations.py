@@ -21,7 +21,7 @@ from polcap.optics import distortion
 
 _FULL_TURN = 360.0  # degrees
 _MAX_SIDE = 1_000_000  # px of a picture
-_MAX_DISTORTION = 1000.0  # of k1 and k2; a lens whose picture does not fold over itself has less
+_MAX_DISTORTION = 1000.0  # of k1 and k2; only a picture that folds over itself has more
 _LEAST_LIGHT = 0.02  # in a corner of the lens, relative to the middle
 _SAME_SETTING = 0.05  # relative change of f-number or focal length
 _CHANNELS = (1, 3)
@@ -37,8 +37,7 @@ def write(place: Path, found: Calibration) -> Path:
     """Write a dated file into the folder `place` and return its path; StorageError."""
     parts = [found.made[:19].replace(":", ""), found.camera, found.lens, found.filter]
     path = place / (atomic.safe_name(" ".join(part for part in parts if part)) + ".toml")
-    with atomic.path(path) as temporary:
-        temporary.write_text(text(found), encoding="utf-8")
+    atomic.write(path, text(found))
     return path
 
 
@@ -124,7 +123,7 @@ def _parts(found: Calibration) -> list[str]:
 
 
 def _impossible_parts(found: Calibration) -> list[str]:
-    """The parts whose figures are physically impossible."""
+    """Names of the parts of a calibration with physically impossible figures."""
     ring, light, lens, flash = found.polarizer, found.falloff, found.geometry, found.flash
     possible = {
         "noise": all(
@@ -212,8 +211,7 @@ def write_profile(path: Path, color: ColorCalibration) -> None:
         "# polcap color profile. matrix: camera radiance (I0 + I90) -> linear Rec.709 reflectance.\n"
         "# quads, corners: px of the grid it was measured on. metres_per_px: at the chart's distance.\n"
     )
-    with atomic.path(path) as temporary:
-        temporary.write_text(head + tomli_w.dumps(_plain(document)), encoding="utf-8")
+    atomic.write(path, head + tomli_w.dumps(_plain(document)))
 
 
 def read_profile(path: Path) -> ColorCalibration:

@@ -43,7 +43,7 @@ def data_path(name: str) -> Path:
 
 
 def model_files(name: str = "") -> list[Path]:
-    """The shipped models whose names begin so, the newest last."""
+    """The shipped models with names that begin with `name`, the newest last."""
     return sorted(data_path("colorchecker").parent.glob(f"models/{name}*.onnx"))
 
 

@@ -27,12 +27,11 @@ _DARKEST = 1e-4  # luminance below which the tint of a specular texel means noth
 
 
 def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], doc: str) -> None:
-    """Write a MaterialX document whose textures `files` are in the same folder; `doc` is its doc string.
+    """Write a MaterialX document; its textures `files` are in the same folder, `doc` is its doc string.
 
     Raises StorageError: the file cannot be written.
     """
-    with atomic.path(path) as temporary:
-        temporary.write_text(document(asset, name, files, doc), encoding="utf-8")
+    atomic.write(path, document(asset, name, files, doc))
 
 
 def document(asset: Asset, name: str, files: Mapping[Key, str], doc: str) -> str:

@@ -1,6 +1,6 @@
 """Writes an asset as USD: the mesh, and its material as OpenPBR and as UsdPreviewSurface.
 
-Renderers that read MaterialX use `outputs:mtlx:surface`; all others the UsdPreviewSurface, whose specular
+Renderers that read MaterialX use `outputs:mtlx:surface`; all others read the UsdPreviewSurface. Its specular
 workflow takes F0 from a texture. Blender reads that texture as a tint of F0 in either workflow. So
 the mesh is bound twice: for every purpose to the material in the specular workflow, and for the purpose
 `full`, which Blender prefers, to a copy with F0 as a tint. Needs usd-core (extra [usd]).
@@ -36,7 +36,7 @@ def require() -> None:
 
 
 def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], facts: Mapping[str, str]) -> None:
-    """Write a USD layer (.usdc or .usda) whose textures `files` are in the same folder.
+    """Write a USD layer (.usdc or .usda); its textures `files` are in the same folder.
 
     `facts` go into the layer's custom data.
 

@@ -93,7 +93,7 @@ def _is_sensor(directory: Directory) -> bool:
 
 
 def _check_strips(path: str, directory: Directory, dng: bool) -> None:
-    """Refuse a DNG whose strips are shorter than its pixels need."""
+    """Refuse a DNG with strips shorter than its pixels need."""
     held = sum(length for _, length in file_kind.strips(directory))
     width, height = first(directory, file_kind.WIDTH), first(directory, file_kind.LENGTH)
     check_size(path, max(width, 1), max(height, 1))

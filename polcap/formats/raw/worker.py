@@ -146,7 +146,7 @@ class Worker:
 
     def _spawn(self) -> subprocess.Popen[bytes]:
         self.close()
-        # OpenCV adds a folder inside itself to `sys.path`, whose `typing` a child would import instead of Python's.
+        # OpenCV adds a folder of its package to `sys.path`; a child would import `typing` from there, not Python's.
         folders = [one for one in sys.path if not os.path.isfile(os.path.join(one, "__init__.py"))]
         with contextlib.suppress(OSError):  # no temporary files: a crash is reported without its last line
             self._log = tempfile.TemporaryFile()  # noqa: SIM115 — read at the child's death, closed in `close`
