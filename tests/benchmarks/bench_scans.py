@@ -46,8 +46,8 @@ def main() -> None:
 
 def scan(folder: Path) -> tuple[SurfaceMaps, Floats]:
     """Maps of an object, and its true depth (H, W) [mm]."""
-    mask = cv2.imread(str(folder / "mask.png"), cv2.IMREAD_UNCHANGED) > 0
-    normal = cv2.imread(str(folder / "normal_map.png"), cv2.IMREAD_UNCHANGED)[..., ::-1] / 65535 * 2 - 1
+    mask = np.asarray(cv2.imread(str(folder / "mask.png"), cv2.IMREAD_GRAYSCALE)) > 0
+    normal = np.asarray(cv2.imread(str(folder / "normal_map.png"), cv2.IMREAD_UNCHANGED))[..., ::-1] / 65535 * 2 - 1
     camera = np.loadtxt(folder / "K.txt")
     flat = np.ones(mask.shape, dtype=np.float32)
     maps = SurfaceMaps(
