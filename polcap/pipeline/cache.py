@@ -77,12 +77,9 @@ class MemoryCache:
             raise StageReached(stage.name)
         return self.results[stage.name]
 
-    def derive(self, function: Callable[..., T], *inputs: Any, version: int = 1) -> StageResult[T]:
-        """A value that is cheap to compute from results; never stored.
-
-        `version` is raised whenever the same inputs give another value.
-        """
-        return StageResult(_derived_key(function, inputs, version), function(*map(value_of, inputs)))
+    def derive(self, function: Callable[..., T], *inputs: Any) -> StageResult[T]:
+        """A value that is cheap to compute from results; never stored. Its key names the function."""
+        return StageResult(_derived_key(function, inputs), function(*map(value_of, inputs)))
 
     def begin(self, stage: str) -> None:
         """Work on a stage begins."""
@@ -163,9 +160,9 @@ class DryRunCache(StageCache):
         super().__init__(folder, force=force)
         self.states: dict[str, str] = {}  # of every stage: cached, compute, or on demand where it is never stored
 
-    def derive(self, function: Callable[..., T], *inputs: Any, version: int = 1) -> StageResult[T]:
+    def derive(self, function: Callable[..., T], *inputs: Any) -> StageResult[T]:
         """The key of a derived value, without the value."""
-        return StageResult[Any](_derived_key(function, inputs, version), None)
+        return StageResult[Any](_derived_key(function, inputs), None)
 
     def _value(
         self, stage: Stage[..., T], inputs: tuple[Any, ...], config: msgspec.Struct | None, about: dict[str, Any]
@@ -206,8 +203,8 @@ def _about(stage: Stage[..., Any], inputs: tuple[Any, ...], config: msgspec.Stru
     return {**about, "key": digest(list(about.values()))}
 
 
-def _derived_key(function: Callable[..., Any], inputs: tuple[Any, ...], version: int) -> str:
-    return digest(["derived", function.__name__, version, [key_of(one) for one in inputs]])
+def _derived_key(function: Callable[..., Any], inputs: tuple[Any, ...]) -> str:
+    return digest(["derived", function.__name__, [key_of(one) for one in inputs]])
 
 
 def manifest(place: Path) -> dict[str, Any]:

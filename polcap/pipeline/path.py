@@ -2,7 +2,7 @@
 
 Each line's work is the folder of the same name in `stages/`. Measure, then apply once: white balance, alignment and
 self-calibration return small values; `stokes` applies gains and transforms, `cues` the color matrix. Images are
-resampled once. `cache.run` looks a result up, or computes it. `process`, `check`, `show` and a dry run all follow
+resampled once. `cache.run` finds a stored result, or computes it. `process`, `check`, `show` and a dry run all follow
 this path; they differ in the cache.
 """
 

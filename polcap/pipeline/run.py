@@ -92,7 +92,7 @@ def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -
 
 def counted(capture: Capture, frame_read: Callable[[int, int], None]) -> Decode:
     """A decode function that calls `frame_read` with the number of decoded photographs, and of all."""
-    brackets = [*capture.shots, *(() if capture.crossed is None else (capture.crossed,))]
+    brackets = capture.all_shots
     total, number = sum(len(shot.frames) for shot in brackets), count(1)
 
     def decode(frame: Frame) -> SensorImage:
@@ -104,7 +104,7 @@ def counted(capture: Capture, frame_read: Callable[[int, int], None]) -> Decode:
 
 
 def plan(capture: Capture, supplied: UserInput, config: Config, out: Path, force: str | None = None) -> dict[str, str]:
-    """What `process` would do with each stage: cached, compute, or on demand. Nothing is done."""
+    """The state of each stage before a run of `process`: cached, compute, or on demand. Nothing is computed."""
     cache = DryRunCache(out, force)
     path(capture, supplied, config, cache)
     return cache.states

@@ -72,9 +72,8 @@ def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapt
     first = capture.shots[0].frames[(len(capture.shots[0].frames) - 1) // 2]
     meta, arrays = frame_decoder.apply(first, reduce_first, clip=clip, most_pixels=_MOST_PIXELS)
     times, half, corners = int(meta["times"]), int(meta["superpixel"]), arrays["corners"].tolist()
-    shots = (*capture.shots, *(() if capture.crossed is None else (capture.crossed,)))
     reduced = {first: pool.submit(_joined, meta, arrays)}
-    for frame in (frame for shot in shots for frame in (*shot.frames, *shot.ambient) if frame != first):
+    for frame in (frame for shot in capture.all_shots for frame in (*shot.frames, *shot.ambient) if frame != first):
         reduced[frame] = pool.submit(_decode_reduced, frame, clip, times, corners)
     step = half * times
     x, y = ((edge - (step - 1) / 2) / step for edge in capture.principal_px)

@@ -14,7 +14,7 @@ from polcap.rig.shooting_plan import CaptureOrder
 
 
 def complete_order(folder: Path, options: dict[str, Any], resume: bool) -> CaptureOrder:
-    """The options that are not None; the others from the begun capture with `resume`, else by default.
+    """Options of a capture: the stated ones; the others from the begun capture with `resume`, else defaults.
 
     Raises SettingError if rotator or camera is missing, or the angles make no capture; CaptureError if the capture was
     begun with other options.

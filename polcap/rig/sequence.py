@@ -97,7 +97,7 @@ def _take_missing(
 
 @dataclass
 class CaptureLoop:
-    """The loop that takes the missing frames."""
+    """Takes the missing frames of a capture, one after the other."""
 
     record: CaptureRecord
     check: BackgroundCheck

@@ -18,6 +18,7 @@ from polcap.errors import DecodeError, StorageError
 from polcap.formats import atomic
 from polcap.formats.raw import file_bytes, photo, worker
 from polcap.images import Floats
+from polcap.optics.resize import area_mean
 
 _MAGIC = b"\x89PNG\r\n\x1a\n"
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
@@ -103,7 +104,7 @@ def fitted(picture: Pixels, width: int) -> NDArray[np.uint8]:
     """An 8-bit picture (H, W, 3) reduced to at most `width` px, with an even number of rows."""
     width = min(width, picture.shape[1])
     height = max(2, 2 * round(picture.shape[0] * width / picture.shape[1] / 2))
-    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    return np.asarray(area_mean(picture, (height, width)), np.uint8)
 
 
 def sixteen_bits(value: Floats) -> NDArray[np.uint16]:

@@ -11,6 +11,7 @@ from polcap.images import Alignment, AngleStack, Floats, ObjectMask
 from polcap.optics import registration
 from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.registration import Pyramid, Registration
+from polcap.optics.resize import area_mean
 from polcap.stages.align.detail import averaging_step, detail
 
 _DETAIL_PX = 4.0  # as `align.detail_px`
@@ -35,10 +36,10 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
     if not object_.mask.any():
         return shift
     step = averaging_step(object_.mask.shape, _MOST_PIXELS)
-    picture, usable = detail(radiance.shot(0), _DETAIL_PX, step)[0]
-    small = cv2.resize(object_.mask.astype(np.uint8), picture.shape[::-1], interpolation=cv2.INTER_AREA)
+    reference = detail(radiance.shot(0), _DETAIL_PX, step)[0]
+    small = area_mean(object_.mask.astype(np.uint8), reference.picture.shape)
     near = cv2.dilate(small, np.ones((2 * _RIM_PX + 1,) * 2, np.uint8)) > 0
-    regions = [Pyramid(picture, usable & region) for region in (near, ~near)]
+    regions = [Pyramid(reference.picture, reference.usable & region) for region in (near, ~near)]
     middle = np.argwhere(small).mean(axis=0)[::-1] if small.any() else np.array(small.shape[::-1]) / 2
     for k in range(1, shots):
         shot = detail(radiance.shot(k), _DETAIL_PX, step)
