@@ -42,7 +42,7 @@ class ExportRequest:
 
 
 @dataclass(frozen=True)
-class Source:
+class ExportSource:
     """The maps of a result, with the full mesh and asset made from them."""
 
     stored: maps_folder.StoredMaps
@@ -67,7 +67,7 @@ def check(wanted: ExportRequest) -> None:
     glb_geometry.require(preset.geometry)
 
 
-def read(folder: Path, config: Config) -> Source:
+def read(folder: Path, config: Config) -> ExportSource:
     """The maps in a folder, and the full asset made from them.
 
     Raises
@@ -79,10 +79,10 @@ def read(folder: Path, config: Config) -> Source:
     """
     stored = maps_folder.read(folder)
     mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, config.surface)
-    return Source(stored, mesh, asset.build(stored.maps, mesh, config.asset), config.surface.back)
+    return ExportSource(stored, mesh, asset.build(stored.maps, mesh, config.asset), config.surface.back)
 
 
-def levels(source: Source, wanted: ExportRequest) -> list[DetailLevel]:
+def levels(source: ExportSource, wanted: ExportRequest) -> list[DetailLevel]:
     """The asset with at most the triangles and the texture size of an export, then its levels of detail.
 
     Raises
@@ -100,7 +100,7 @@ def levels(source: Source, wanted: ExportRequest) -> list[DetailLevel]:
     return [replace(level, asset=asset.resize_textures(level.asset, size)) for level in found]
 
 
-def _decimated(source: Source, triangles: int) -> DetailLevel:
+def _decimated(source: ExportSource, triangles: int) -> DetailLevel:
     maps = source.stored.maps
     decimated = surface.decimate(source.mesh, maps.view, triangles, source.back)
     return DetailLevel(asset.with_mesh(source.asset, maps, decimated.mesh), decimated)
