@@ -43,7 +43,7 @@ def data_path(name: str) -> Path:
 
 
 def model_files(name: str = "") -> list[Path]:
-    """The shipped models with names that begin with `name`, the newest last."""
+    """Paths of the shipped network files with names that begin with `name`, the newest last."""
     return sorted(data_path("colorchecker").parent.glob(f"models/{name}*.onnx"))
 
 
@@ -52,7 +52,7 @@ class _SrgbChart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def colorchecker(kind: str = "classic") -> ChartReference:
-    """Reference colors of a kind of ColorChecker: classic, classic_before_2014, classic_srgb or sg.
+    """Reference colors of a ColorChecker: classic, classic_before_2014, classic_srgb or sg.
 
     The maker's measurements under D50 as tabulated by colour-science, adapted to D65 (Bradford). classic_srgb is
     the maker's sRGB table, a file of ours. Of an SG it is the block E2 to J5, which repeats the Classic's colors.

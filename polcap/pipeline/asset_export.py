@@ -40,7 +40,7 @@ class ExportRequest:
 
 @dataclass(frozen=True)
 class DetailLevel:
-    """A coarser asset, and the distance of its surface from the full one."""
+    """A coarser level of detail of an asset, and how far its surface is from the full one."""
 
     asset: Asset
     decimated: surface.DecimatedMesh
@@ -53,7 +53,7 @@ def check(wanted: ExportRequest) -> None:
 
 
 def from_maps(folder: Path, config: Config, wanted: ExportRequest) -> tuple[Asset, list[DetailLevel]]:
-    """The asset of the maps in a folder, and its levels of detail.
+    """Build the asset (mesh and textures) of the maps in a folder, and its levels of detail.
 
     Raises
     ------
@@ -138,7 +138,7 @@ def _preset(wanted: ExportRequest) -> ExportPreset:
 
 
 def _one(write_file: Callable[..., None], file: Path, *content: Any) -> list[Path]:
-    """Write one file of an export; returns it."""
+    """Write one file of an export by the function `write_file`; returns the file in a list."""
     write_file(file, *content)
     return [file]
 

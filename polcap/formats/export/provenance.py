@@ -27,7 +27,7 @@ def versions() -> dict[str, str]:
 
 
 def record(about: Mapping[str, Any]) -> dict[str, Any]:
-    """The origin of a result, from the content of its report.json."""
+    """The origin of a result (photographs, versions, settings), from the content of its report.json."""
     capture, model = about["capture"], about["model"]
     return {
         "format": "polcap provenance 1",
@@ -47,18 +47,18 @@ def record(about: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def words(facts: Mapping[str, Any]) -> dict[str, str]:
-    """The record as texts, for formats that hold only texts."""
+    """The origin of a result as texts by key, for file formats that store only texts."""
     return {key: value if isinstance(value, str) else _plain(value) for key, value in facts.items()}
 
 
 def write(path: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> None:
-    """Write the sidecar: the record, and the digest of every file of the export; StorageError."""
+    """Write the sidecar file of an export: its origin and the digest of each of its files. Raises StorageError."""
     text = json.dumps({**facts, "files": dict(sorted(digests.items()))}, indent=1, ensure_ascii=False)
     atomic.write(path, text + "\n")
 
 
 def digest(file: Path) -> str:
-    """The digest of a file, as in the sidecar."""
+    """SHA-256 of an exported file, as in the sidecar file."""
     return file_bytes.digest(file.read_bytes())
 
 
