@@ -263,7 +263,7 @@ def _angle_folders(folder: Path) -> tuple[dict[float, Path], Path | None]:
 
 
 def _degrees_of_cross(path: Path) -> float | None:
-    """Angle of the lens's filter, degrees, in the name cross045; None for cross."""
+    """Angle [degrees] of the lens's polarizer in a folder name such as cross045; None for cross."""
     match = _FOLDER.fullmatch(path.name)
     return float(match["cross"]) if match and match["cross"] else None
 

@@ -66,7 +66,7 @@ def indexed(level: NDArray[np.uint8], colors: NDArray[np.uint8]) -> str:
 
 
 def packed(array: NDArray[Any]) -> str:
-    """Encode an array as base64 text of its gzipped little-endian bytes, for the scripts of an HTML page."""
+    """Encode an array of any shape as base64 text of its gzipped little-endian bytes, for a page's scripts."""
     solid = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
     return text(gzip.compress(solid.tobytes(), 6, mtime=0))
 
