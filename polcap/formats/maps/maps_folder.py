@@ -149,14 +149,19 @@ def read(folder: Path) -> StoredMaps:
 
 
 def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
-    """Add a record of an export to maps.json: its folder `where`, inside the result's folder, and its content `about`.
+    """Add a record `about` an export to maps.json, merged with earlier records of the folder `where`.
 
     Raises StorageError: the file cannot be written.
     """
     file = folder / "maps.json"
     known = text_file.read_json(file)
-    earlier = known.get("exports")
-    known["exports"] = dict(sorted({**(earlier if isinstance(earlier, dict) else {}), where: about}.items()))
+    exports = known.get("exports", {})
+    earlier = exports.get(where, {})
+    note = {
+        key: {**earlier.get(key, {}), **value} if isinstance(value, dict) and key != "mesh" else value
+        for key, value in about.items()
+    }
+    known["exports"] = dict(sorted({**exports, where: note}.items()))
     _write_json(file, known)
 
 
