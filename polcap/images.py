@@ -383,13 +383,14 @@ def single_frames(shots: int) -> BracketMeasurement:
 
 @dataclass(frozen=True)
 class ChartReference:
-    """Patch colors of a color chart, from its maker."""
+    """Patch colors of a color chart, from its maker or measured."""
 
     name: str
     rec709: Floats  # (24, 3) linear Rec.709/D65 reflectance, row by row from dark skin
     size_m: tuple[float, float] | None  # width, height between the outer patch corners; None: unknown
     patches: tuple[str, ...] = ()  # (24,) their names
     editions: tuple["ChartReference", ...] = ()  # versions of the chart from other years
+    is_block: bool = False  # part of a larger chart, which cannot be searched for
 
 
 @dataclass(frozen=True)
