@@ -395,6 +395,7 @@ class ChartLight:
     normal: Floats  # (3,) unit, towards the camera
     flash: Floats  # (3,) position right of and above the lens; exponent of the cosine of its angular falloff
     covariance: Floats  # (5, 5) of these three and of the chart's rotations about x and y [rad]
+    uneven: float = 0.0  # relative 1σ of the light's level from a slope of the light that the flash does not cause
 
     @property
     def tilt(self) -> float:
