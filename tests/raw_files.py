@@ -22,6 +22,5 @@ def write_raw(path: Path, mosaic: NDArray[np.uint16], exif: Exif, black: float =
         exif=exif,
         color_matrix=np.eye(3),
         as_shot_neutral=np.ones(3),
-        compression="none",
     )
     return path.read_bytes()

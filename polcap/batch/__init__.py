@@ -10,10 +10,11 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from polcap.batch import contact_sheet
+from polcap.batch import contact_sheet, processes
 from polcap.batch import unit as units
 from polcap.batch.shards import WHOLE, Shard
 from polcap.batch.unit import FINISHED, FOLDER, ProcessOptions, Unit, UnitRecord
@@ -52,15 +53,11 @@ def find(root: Path, out: Path | None = None) -> list[Unit]:
 
 def reopen(place: Path) -> list[Unit]:
     """The captures of an earlier batch; `place` was its root or its --out."""
-    return find(*_places(place))
-
-
-def _places(place: Path) -> tuple[Path, Path | None]:
     try:
         about = json.loads((place / FOLDER / "batch.json").read_text(encoding="utf-8"))
-        return Path(about["root"]), None if about["out"] is None else Path(about["out"])
+        return find(Path(about["root"]), None if about["out"] is None else Path(about["out"]))
     except (OSError, ValueError, KeyError, TypeError):
-        return place, None
+        return find(place)
 
 
 def _captures(root: Path) -> Iterator[str]:
@@ -114,22 +111,14 @@ def _process(
         from polcap.batch import cluster
 
         return cluster.run(wanted, options, plan.scheduler, plan.workers, plan.retries, print_line)
-    from polcap.batch import processes
-
     return processes.run(wanted, options, plan.workers, plan.retries)
 
 
 def progress(record: UnitRecord, done: int, total: int, seconds: float) -> str:
     """One line: number of finished captures, the last one's result, and the estimated time left."""
-    left = seconds / done * (total - done)
+    left = timedelta(seconds=round(seconds / done * (total - done)))
     message = f": {record.message}" if record.message else ""
-    return f"{done}/{total} {record.name} {record.state} {record.seconds:.1f} s, {format_time(left)} left{message}"
-
-
-def format_time(seconds: float) -> str:
-    """h:mm:ss."""
-    whole = round(seconds)
-    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+    return f"{done}/{total} {record.name} {record.state} {record.seconds:.1f} s, {left} left{message}"
 
 
 def status(found: Sequence[Unit]) -> dict[str, Any]:

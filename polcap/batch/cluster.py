@@ -7,27 +7,16 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from polcap.batch import unit as units
-from polcap.batch import worker_start
 from polcap.batch.processes import prepare
 from polcap.batch.unit import ProcessOptions, Unit, UnitRecord
 from polcap.errors import SettingError
 
-_LOCAL = "local"
-_SETTINGS = {  # less background work of Dask, which shares the cores with the captures
-    "distributed.worker.profile.enabled": False,  # samples every thread every 10 ms; 6 % of a small capture's time
-    "distributed.admin.tick.interval": "1s",  # by default 20 ms
-    "distributed.admin.tick.limit": "30s",
+_SETTINGS = {
+    "distributed.worker.profile.enabled": False,  # costs 6 % of a small capture's time
     "distributed.nanny.pre-spawn-environ": {  # without MALLOC_TRIM_THRESHOLD_, which slows down every large array
         "OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS": 1,
     },
-    "distributed.worker.multiprocessing-method": worker_start.method(),
 }  # fmt: skip
-
-
-def preload(address: str) -> None:
-    """Start importing the modules of local workers in the background."""
-    if address == _LOCAL:
-        worker_start.preload("distributed")
 
 
 def run(
@@ -48,7 +37,6 @@ def run(
     SettingError
         Dask is not installed, or no scheduler answers at the address.
     """
-    preload(address)
     try:
         import dask
         import distributed
@@ -56,9 +44,9 @@ def run(
         raise SettingError(f"{error.name} is not installed; pip install 'polcap[batch]'") from error
     resources = {"GPU": 1.0} if options.device == "cuda" else None
     with dask.config.set({"distributed.scheduler.allowed-failures": retries, **_SETTINGS}):
+        target: Any = address
         try:
-            target: Any = address
-            if address == _LOCAL:
+            if address == "local":
                 target = distributed.LocalCluster(
                     n_workers=workers, threads_per_worker=1, processes=True, resources=resources, dashboard_address=":0"
                 )
@@ -70,7 +58,7 @@ def run(
             yield from _gather(client, wanted, options, resources, retries)
         finally:
             client.close()
-            if address == _LOCAL:
+            if target is not address:
                 target.close()
 
 
@@ -79,19 +67,20 @@ def _gather(
 ) -> Iterator[UnitRecord]:
     import distributed
 
-    attempts = dict.fromkeys(wanted, 1)
+    def submit(unit: Unit, attempt: int) -> Any:
+        future = client.submit(units.run, unit, options, attempt, pure=False, resources=resources)
+        running[future] = unit, attempt
+        return future
+
     client.run(prepare, options)  # workers that join later use the settings they were started with
-    running = {client.submit(units.run, unit, options, pure=False, resources=resources): unit for unit in wanted}
-    ended = distributed.as_completed(list(running))
+    running: dict[Any, tuple[Unit, int]] = {}
+    ended = distributed.as_completed([submit(unit, 1) for unit in wanted])
     for future in ended:
-        unit = running.pop(future)
+        unit, attempt = running.pop(future)
         if future.status == "finished":
             yield future.result()
-        elif attempts[unit] <= retries:  # its worker died, or it could not be sent
-            attempts[unit] += 1
-            again = client.submit(units.run, unit, options, attempts[unit], pure=False, resources=resources)
-            running[again] = unit
-            ended.add(again)
+        elif attempt <= retries:  # its worker died, or it could not be sent
+            ended.add(submit(unit, attempt + 1))
         else:
             message = f"its workers died ({future.exception()}); give them more memory, or remove it from the batch"
-            yield units.crashed(unit, " ".join(message.split()), attempts[unit])
+            yield units.crashed(unit, " ".join(message.split()), attempt)

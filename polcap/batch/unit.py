@@ -8,10 +8,11 @@ import hashlib
 import json
 import os
 import socket
+import subprocess
 import sys
 import time
 import traceback
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -19,15 +20,19 @@ from typing import Any, Literal
 import msgspec
 from msgspec.structs import replace
 
+from polcap.batch import thumbnail
+from polcap.config import Config
 from polcap.errors import InputError, PolcapError, StorageError
 from polcap.formats import atomic, own_folders
+from polcap.formats.capture import reader
 from polcap.images import ChartRequest, Network
-from polcap.pipeline import unchanged
+from polcap.pipeline import models, unchanged
+from polcap.pipeline import run as pipeline
 from polcap.pipeline.cache import fingerprint
+from polcap.pipeline.path import UserInput
 
 State = Literal["todo", "running", "interrupted", "done", "gates", "failed", "bug", "crashed"]
 FINISHED: tuple[State, ...] = ("done", "gates")  # the asset is there
-_SYNCHRONIZE, _WAIT_TIMEOUT = 0x00100000, 0x102  # Windows: winnt.h, winbase.h
 FOLDER = own_folders.BATCH  # in ROOT or --out: records, thumbnails, summary, job files; safe to delete
 
 
@@ -107,21 +112,12 @@ def run(unit: Unit, options: ProcessOptions, attempt: int = 1) -> UnitRecord:
 
 
 def _process(unit: Unit, options: ProcessOptions) -> dict[str, Any]:
-    from polcap.batch import thumbnail
-    from polcap.config import Config
-    from polcap.formats.capture import reader as captures
-    from polcap.pipeline import run as pipeline
-    from polcap.pipeline.path import UserInput
-
     config = msgspec.convert(options.settings, Config)
-    supplied = UserInput(
-        chart=options.chart,
-        network=_network(options.estimator, options.model, options.device, options.threads),
-        mask_network=_mask_network(options.threads),
-    )
+    network, mask_network = _networks(options.estimator, options.model, options.device, options.threads)
     asked = request(unit, options)
-    found = captures.read(unit.capture, options.angles_deg)
-    about = pipeline.process(found, supplied, config, Path(unit.out))
+    capture = reader.read(unit.capture, options.angles_deg)
+    supplied = UserInput(chart=options.chart, network=network, mask_network=mask_network)
+    about = pipeline.process(capture, supplied, config, Path(unit.out))
     assert about is not None  # only `until` leaves it out
     unchanged.remember(Path(unit.out), asked)
     thumbnail.write(unit.thumbnail_file, Path(unit.out))
@@ -129,24 +125,18 @@ def _process(unit: Unit, options: ProcessOptions) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=1)
-def _network(estimator: Any, model: str | None, device: Any, threads: int) -> Network | None:
-    """The estimator's network, loaded once per process."""
-    from polcap.pipeline import models
-
-    return models.load_network(estimator, None if model is None else Path(model), device, threads)
-
-
-@lru_cache(maxsize=1)
-def _mask_network(threads: int) -> Network | None:
-    """The mask's network, loaded once per process."""
-    from polcap.pipeline import models
-
-    return models.load_mask_network(threads)
+def _networks(estimator: Any, model: str | None, device: Any, threads: int) -> tuple[Network | None, Network | None]:
+    """The networks of the estimator and of the mask, loaded once per process."""
+    file = None if model is None else Path(model)
+    return models.load_network(estimator, file, device, threads), models.load_mask_network(threads)
 
 
 def request(unit: Unit, options: ProcessOptions) -> str | None:
     """Digest of everything that decides the result, for `pipeline/unchanged.py`; None: unknown."""
-    stated = {**asdict(dataclasses.replace(options, threads=0, memory_gb=0.0)), "chart": fingerprint(options.chart)}
+    stated = {
+        **dataclasses.asdict(dataclasses.replace(options, threads=0, memory_gb=0.0)),
+        "chart": fingerprint(options.chart),
+    }
     files = [] if options.model is None else [Path(options.model)]
     return unchanged.request(stated, Path(unit.capture), Path(unit.out), files)
 
@@ -184,19 +174,14 @@ def crashed(unit: Unit, message: str, attempt: int) -> UnitRecord:
 
 def _alive(pid: int) -> bool:
     if sys.platform == "win32":  # there signal 0 is Ctrl-C
-        import ctypes
-
-        kernel = ctypes.windll.kernel32
-        handle = kernel.OpenProcess(_SYNCHRONIZE, False, pid)
-        runs = bool(handle) and kernel.WaitForSingleObject(handle, 0) == _WAIT_TIMEOUT
-        kernel.CloseHandle(handle)
-        return runs
+        listed = subprocess.run(["tasklist", "/fi", f"PID eq {pid}", "/fo", "csv"], capture_output=True, text=True)
+        return f'"{pid}"' in listed.stdout
     try:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
-        return True
+        pass
     return True
 
 

@@ -49,10 +49,6 @@ def batch(
     model: Model = None,
 ) -> None:
     """Process every capture below a folder. Finished ones are skipped; a failure does not stop the others."""
-    if scheduler is not None and write_jobs is None:
-        from polcap.batch import cluster
-
-        cluster.preload(scheduler)
     import msgspec
 
     from polcap import batch as batches

@@ -61,7 +61,7 @@ def capture(
         planned = plans.dry_run(wanted)
         terminal.print_data(planned if json else plans.table(planned))
         return
-    done = sequence.shoot(folder, wanted, resume=resume, tries=tries, tell=terminal.print_message)
+    done = sequence.shoot(folder, wanted, resume=resume, tries=tries, report=terminal.print_message)
     verdict = None if no_check else _verdict(folder)
     terminal.print_data(done | {"check": verdict} if json else str(folder))
     if verdict and verdict["verdict"] != "keep":

@@ -44,3 +44,17 @@ def back_project(view: View, x: Floats, y: Floats) -> Floats:
 def ray_slopes(view: View, x: NDArray[Any], y: NDArray[Any]) -> tuple[Floats, Floats]:
     """x/−z and y/−z (…,) in the camera frame of the points that project onto pixels x, y (…,)."""
     return (x - view.center[0]) / view.focal, (view.center[1] - y) / view.focal
+
+
+def pixels_inside(quad: Floats, shape: tuple[int, ...], margin_px: float = 0.0) -> NDArray[np.int_]:
+    """Pixels x, y (N, 2) of a picture (H, W, …) inside a convex quad (4, 2) px, clockwise on the screen.
+
+    Pixels nearer than `margin_px` to one of its sides are left out.
+    """
+    x0, y0 = np.maximum(np.floor(quad.min(axis=0)).astype(int), 0)
+    x1, y1 = np.minimum(np.ceil(quad.max(axis=0)).astype(int) + 1, [shape[1], shape[0]])
+    y, x = np.mgrid[y0 : max(y1, y0), x0 : max(x1, x0)]
+    inside = np.ones(x.shape, bool)
+    for (ax, ay), (bx, by) in zip(quad, np.roll(quad, -1, axis=0), strict=True):
+        inside &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= margin_px * np.hypot(bx - ax, by - ay)
+    return np.stack([x[inside], y[inside]], axis=-1)

@@ -1,18 +1,15 @@
 """Comparison of two results: differing figures and settings, and a page that shows both."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from html import escape
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
 from polcap.errors import DecodeError
-from polcap.formats import html
 from polcap.formats.maps import maps_folder
-from polcap.images import Floats
 from polcap.report import keys, labels, map_figures, page
-from polcap.report.keys import Palette
+from polcap.report.map_figures import MapFigure
 from polcap.report.reduction import ObjectReduction
 
 _LONGEST = 640  # px, longest side of a map
@@ -22,13 +19,9 @@ Row = tuple[str, Any, Any]  # name, value in the first result, value in the seco
 
 def rows(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[Row]:
     """Figures and settings that differ between two reports, named part.section.name."""
-    found = []
-    for part in ("figures", "settings"):
-        first, second = _flat(one[part]), _flat(other[part])
-        for name in dict.fromkeys([*first, *second]):
-            if first.get(name) != second.get(name):
-                found.append((f"{part}.{name}", first.get(name), second.get(name)))
-    return found
+    first, second = _flat(one), _flat(other)
+    names = dict.fromkeys([*first, *second])
+    return [(name, first.get(name), second.get(name)) for name in names if first.get(name) != second.get(name)]
 
 
 def labelled(row: Row) -> tuple[str, str, str]:
@@ -47,14 +40,28 @@ def write(file: Path, folders: tuple[Path, Path], abouts: tuple[Mapping[str, Any
         The file cannot be written.
     """
     names = _names(folders)
-    body = [
-        *_verdicts(abouts, names),
-        *_maps(folders, names),
-        *_differences(rows(*abouts), names),
-        *_gates(abouts, names),
-    ]
-    data = {"palettes": {name: html.text(keys.colors(name).tobytes()) for name in get_args(Palette)}}
-    html.write(file, f"{names[0]} and {names[1]}: polcap", body, data)
+    results = []
+    for name, about in zip(names, abouts):
+        headline, expected_error = page.verdict(about)
+        results.append(
+            {
+                "name": name,
+                "verdict": about["verdict"],
+                "headline": headline,
+                "expected_error": expected_error,
+                "checks": page.checks(about["gates"]),
+            }
+        )
+    found = rows(*abouts)
+    content = {
+        "results": results,
+        **_maps(folders, names),
+        "differences": [
+            (f"{kind} that differ", [labelled(row) for row in found if row[0].startswith(kind.lower())])
+            for kind in ("Figures", "Settings")
+        ],
+    }
+    page.render("compare.html", file, f"{names[0]} and {names[1]}: polcap", content)
 
 
 def _names(folders: tuple[Path, Path]) -> tuple[str, str]:
@@ -67,66 +74,48 @@ def _names(folders: tuple[Path, Path]) -> tuple[str, str]:
     return "first", "second"
 
 
-def _verdicts(abouts: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Iterator[str]:
-    yield f"<p class='kicker'>two results</p><h1>{escape(names[0])} and {escape(names[1])}</h1><div class='pair wide'>"
-    for about, name in zip(abouts, names, strict=True):
-        headline, detail = page.verdict(about)
-        yield (
-            f'<section class="verdict {escape(about["verdict"])}"><p class="kicker">{escape(name)}</p>'
-            f"<p><b>{escape(headline)}.</b></p><p>{escape(detail)}</p></section>"
-        )
-    yield "</div>"
-
-
-def _maps(folders: Sequence[Path], names: Sequence[str]) -> Iterator[str]:
+def _maps(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Any]:
+    """Figures of the maps by title, with differences where the crops have the same size."""
     try:
         stored = [maps_folder.read(folder / "maps").maps for folder in folders]
     except DecodeError as error:
-        yield f"<p class='note'>No maps to compare: {escape(str(error))}</p>"
-        return
+        return {"fault": str(error)}
     small = [ObjectReduction(maps.mask, _LONGEST).maps(maps) for maps in stored]
     same = stored[0].mask.shape == stored[1].mask.shape
     both = small[0].mask & small[1].mask if same else np.zeros((1, 1), bool)
-    yield "<h2>Maps</h2><p class='hint'>Move the pointer over a map to read the values of all maps at that place.</p>"
-    yield "" if same else "<p class='note'>The crops differ in size, so no differences are drawn.</p>"
-    yield "<h3>Normal</h3><div class='grid'>"
-    for place, (maps, name) in enumerate(zip(small, names, strict=True)):
-        yield map_figures.normal(f"normal-{place}", name, maps.normal, maps.mask)
+    normals = [
+        map_figures.normal(f"normal-{place}", name, maps.normal, maps.mask)
+        for place, (maps, name) in enumerate(zip(small, names))
+    ]
     if same:
-        difference = _degrees(small[0].normal, small[1].normal)
-        note = f"median {labels.number(float(np.median(difference[both])), 2)}°" if both.any() else ""
-        yield map_figures.scalar("normal-difference", "Angle between the normals", note, difference, both, keys.ERROR)
-    yield "</div>"
-    scalars = (
+        cosine = np.sum(small[0].normal * small[1].normal, axis=-1)
+        angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+        note = f"median {labels.number(float(np.median(angle[both])), 2)}°" if both.any() else ""
+        normals.append(
+            map_figures.scalar("normal-difference", "Angle between the normals", note, angle, both, keys.ERROR)
+        )
+    sections: list[tuple[str, list[MapFigure]]] = [("Normal", normals)]
+    for kind, title, key, values in (
         ("roughness", "Roughness", keys.ROUGHNESS, [maps.roughness for maps in small]),
         ("error", "Expected error of the normal", keys.ERROR, [maps.confidence for maps in small]),
         ("diffuse", "Diffuse albedo, mean of the channels", keys.ALBEDO, [maps.diffuse.mean(-1) for maps in small]),
-    )
-    for kind, title, key, values in scalars:
-        yield f"<h3>{title}</h3><div class='grid'>"
-        for place, (maps, name) in enumerate(zip(small, names, strict=True)):
-            yield map_figures.scalar(f"{kind}-{place}", name, "", values[place], maps.mask, key)
+    ):
+        figures = [
+            map_figures.scalar(f"{kind}-{place}", name, "", values[place], small[place].mask, key)
+            for place, name in enumerate(names)
+        ]
         if same and kind != "error":
-            note = f"{names[1]} minus {names[0]}"
-            yield map_figures.scalar(f"{kind}-difference", "Difference", note, values[1] - values[0], both, _DIFFERENCE)
-        yield "</div>"
+            note, change = f"{names[1]} minus {names[0]}", values[1] - values[0]
+            figures.append(map_figures.scalar(f"{kind}-difference", "Difference", note, change, both, _DIFFERENCE))
+        sections.append((title, figures))
+    return {"fault": "", "same_size": same, "maps": sections}
 
 
-def _degrees(one: Floats, other: Floats) -> Floats:
-    return np.asarray(np.degrees(np.arccos(np.clip(np.sum(one * other, axis=-1), -1, 1))))
-
-
-def _differences(found: Sequence[Row], names: Sequence[str]) -> Iterator[str]:
-    for kind, title in (("figures", "Figures that differ"), ("settings", "Settings that differ")):
-        lines = [labelled(row) for row in found if row[0].startswith(kind)]
-        yield f"<h2>{title}</h2>"
-        yield f"<div class='scroll'>{html.table(('', *names), lines)}</div>" if lines else "<p>None.</p>"
-
-
-def _gates(abouts: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Iterator[str]:
-    for about, name in zip(abouts, names, strict=True):
-        yield f"<h2>Checks: {escape(name)}</h2>{page.gates(about['gates'])}"
-
-
-def _flat(tree: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    return {f"{section}.{name}": value for section, part in tree.items() for name, value in part.items()}
+def _flat(about: Mapping[str, Any]) -> dict[str, Any]:
+    """Figures and settings of a report by full name."""
+    return {
+        f"{part}.{section}.{name}": value
+        for part in ("figures", "settings")
+        for section, values in about[part].items()
+        for name, value in values.items()
+    }

@@ -1,8 +1,7 @@
-"""HTML figures of maps: picture, color key and caption; the pointer shows the values."""
+"""Figures of maps for report.html: picture, color scale and caption; the pointer shows the values."""
 
-import json
-from collections.abc import Iterator, Mapping
-from html import escape
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -12,115 +11,111 @@ from numpy.typing import NDArray
 from polcap.formats import html
 from polcap.images import Floats
 from polcap.optics.color import srgb_eight_bits
-from polcap.report import keys, labels, plots
+from polcap.report import keys
 from polcap.report.keys import ColorKey
+from polcap.report.labels import number
 from polcap.report.page_data import PageMaps, Rerendering
 
 _BORDER_PX = 4  # colors continue beyond the outline, because textures are interpolated
+_WHEEL_STEPS = 72
 
 
-def maps(small: PageMaps, metric: bool) -> Iterator[str]:
-    """Section with the maps of a result."""
+@dataclass(frozen=True)
+class MapFigure:
+    """A map as the template `parts.html` draws it: with a color bar, a color wheel or the ball of normals."""
+
+    name: str
+    title: str
+    note: str
+    image: str  # data URL
+    probe: dict[str, Any]  # from colors back to numbers, for probe.js
+    colors: tuple[str, ...] = ()  # CSS colors of bar or wheel
+    ticks: tuple[tuple[float, str], ...] = ()  # place 0…1 and text; none: a wheel
+    ball: str = ""  # data URL
+
+
+def of_result(small: PageMaps, metric: bool) -> list[MapFigure]:
+    """Figures of all maps of a result."""
     found, inside = small.maps, small.maps.mask
     depth = small.depth * (1000.0 if metric else 1.0)
-    yield (
-        '<h2>Maps</h2><p class="hint">Move the pointer over a map to read the values of all maps at that pixel.</p>'
-        '<div class="grid" id="maps">'
-    )
-    yield normal("normal", "Normal", found.normal, inside)
-    yield _color("diffuse", "Diffuse albedo", "ρ_d, linear: red, green, blue", found.diffuse, inside, 1.0)
-    yield _color("specular", "Specular albedo F0", "linear: red, green, blue", found.specular, inside, keys.F0.high)
-    scalars: list[tuple[str, str, str, Floats, ColorKey]] = [
-        ("roughness", "Roughness", "perceptual: 0 is a mirror, 1 is matt", found.roughness, keys.ROUGHNESS),
-        (
-            "depth",
-            "Depth",
-            "distance along the optical axis",
-            depth,
-            keys.depth(depth[inside & np.isfinite(depth)], metric),
+    depth_key = keys.depth(depth[inside & np.isfinite(depth)], metric)
+    error_note = "smaller is better; 3° is very good"
+    return [
+        normal("normal", "Normal", found.normal, inside),
+        _albedo("diffuse", "Diffuse albedo", "ρ_d, linear: red, green, blue", found.diffuse, inside, 1.0),
+        _albedo("specular", "Specular albedo F0", "linear: red, green, blue", found.specular, inside, keys.F0.high),
+        scalar(
+            "roughness", "Roughness", "perceptual: 0 is a mirror, 1 is matt", found.roughness, inside, keys.ROUGHNESS
         ),
-        ("error", "Expected error of the normal", "smaller is better; 3° is very good", found.confidence, keys.ERROR),
-        ("dolp", "Degree of linear polarization", "share of the light", small.dolp, keys.DOLP),
-        ("aolp", "Angle of linear polarization", "from image right, counter-clockwise", small.aolp, keys.AOLP),
+        scalar("depth", "Depth", "distance along the optical axis", depth, inside, depth_key),
+        scalar("error", "Expected error of the normal", error_note, found.confidence, inside, keys.ERROR),
+        scalar("dolp", "Degree of linear polarization", "share of the light", small.dolp, inside, keys.DOLP),
+        scalar(
+            "aolp", "Angle of linear polarization", "from image right, counter-clockwise", small.aolp, inside, keys.AOLP
+        ),
     ]
-    for name, title, note, value, key in scalars:
-        yield scalar(name, title, note, value, inside, key)
-    yield "</div>"
 
 
-def rerendered(small: PageMaps, rendering: Rerendering, about: Mapping[str, Any]) -> Iterator[str]:
-    """Section with the difference between each photograph and its re-rendering."""
-    yield (
-        "<h2>Photographs minus re-rendering</h2><p>The maps are rendered under the light and polarizer angles of the "
-        "photographs and subtracted from them. Gray: both agree. Red: the photograph is brighter, for example from "
-        "light reflected between parts of the object, or from a highlight that the maps lack. Blue: the rendering is "
-        'brighter, for example in shadows.</p><div class="grid">'
-    )
-    inside = small.maps.mask
-    rms = about["figures"].get("rerendering", {}).get("rms") or rendering.rms(inside)
+def differences(small: PageMaps, rendering: Rerendering, rms: Sequence[float | None]) -> list[MapFigure]:
+    """A figure per angle: photograph minus re-rendering; `rms` are their differences relative to white."""
     shots = zip(small.angle, rendering.measured, rendering.predicted, rms)
-    for number, (angle, measured, predicted, difference) in enumerate(shots, 1):
-        yield scalar(
-            f"difference-{number}",  # not by angle: two shots may share one
+    return [
+        scalar(
+            f"difference-{count}",  # not by angle: two shots may share one
             f"Polarizer at {np.degrees(angle):g}°",
-            "" if difference is None else f"rms {labels.number(100 * difference, 2)} % of white",
+            "" if difference is None else f"rms {number(100 * difference, 2)} % of white",
             100 * (measured - predicted),
-            inside,
+            small.maps.mask,
             keys.DIFFERENCE,
         )
-    yield "</div>"
+        for count, (angle, measured, predicted, difference) in enumerate(shots, 1)
+    ]
 
 
-def scalar(name: str, title: str, note: str, value: Floats, inside: NDArray[np.bool_], key: ColorKey) -> str:
+def scalar(name: str, title: str, note: str, value: Floats, inside: NDArray[np.bool_], key: ColorKey) -> MapFigure:
     """Figure of a map of numbers."""
-    about = {
-        "kind": "scalar", "low": key.low, "high": key.high, "power": key.power, "palette": key.palette,
-        "unit": key.unit, "digits": key.digits,
-    }  # fmt: skip
-    image = html.indexed(key.level(value, inside), keys.colors(key.palette))
-    legend = f'<div class="key">{plots.wheel()}<span>the hue shows the angle; it repeats after 180°</span></div>'
-    return _figure(name, title, note, about, image, legend if key.palette == "wheel" else bar(key))
+    probe = {name: getattr(key, name) for name in ("low", "high", "power", "palette", "unit", "digits")}
+    palette = keys.colors(key.palette)
+    image = html.indexed(key.level(value, inside), palette)
+    if key.palette == "wheel":  # once around in 180°
+        steps = [round(2 * k / _WHEEL_STEPS % 1 * keys.LEVELS) % keys.LEVELS for k in range(_WHEEL_STEPS)]
+        return MapFigure(name, title, note, image, {"kind": "scalar", **probe}, css_colors(palette[steps]))
+    ticks = tuple((key.place(tick), f"{number(tick, 3)}{key.unit}") for tick in key.ticks)
+    bar = css_colors(palette[:: keys.LEVELS // 17])
+    return MapFigure(name, title, note, image, {"kind": "scalar", **probe}, bar, ticks)
 
 
-def bar(key: ColorKey) -> str:
-    """Color bar with ticks."""
-    stops = keys.colors(key.palette)[:: keys.LEVELS // 17]
-    paint = ",".join(plots.hexed(color) for color in stops)
-    ticks = "".join(
-        f'<span style="left:{100 * key.place(tick):.1f}%">{labels.number(tick, 3)}{key.unit}</span>'
-        for tick in key.ticks
-    )
-    return f'<div class="bar" style="background:linear-gradient(90deg,{paint})"></div><div class="ticks">{ticks}</div>'
-
-
-def normal(name: str, title: str, vectors: Floats, inside: NDArray[np.bool_]) -> str:
+def normal(name: str, title: str, vectors: Floats, inside: NDArray[np.bool_]) -> MapFigure:
     """Figure of a map of normals."""
-    filled = _extend(np.rint(255 * (vectors / 2 + 0.5)).astype(np.uint8), inside)
-    legend = (
-        f'<div class="key"><img width="72" height="72" alt="" src="{html.lossless(plots.ball())}">'
-        "<span>the colors of a ball: red is right, green is up, blue is toward the camera</span></div>"
+    y, x = np.mgrid[1:-1:96j, -1:1:96j]
+    z2 = 1 - x * x - y * y
+    ball = np.dstack([_normal_colors(np.stack([x, y, np.sqrt(np.maximum(z2, 0))], -1)), np.uint8(255) * (z2 > 0)])
+    return MapFigure(
+        name,
+        title,
+        "x right, y up, z toward the camera",
+        html.lossless(_extend(_normal_colors(vectors), inside)),
+        {"kind": "normal", "unit": "", "digits": 2},
+        ball=html.lossless(ball),
     )
-    about = {"kind": "normal", "unit": "", "digits": 2}
-    return _figure(name, title, "x right, y up, z toward the camera", about, html.lossless(filled), legend)
 
 
-def _color(name: str, title: str, note: str, linear: Floats, inside: NDArray[np.bool_], top: float) -> str:
-    about = {"kind": "color", "top": top, "unit": "", "digits": 2 if top == 1 else 3}
+def css_colors(rgb: NDArray[np.uint8]) -> tuple[str, ...]:
+    """8-bit sRGB colors (N, 3) as CSS colors."""
+    return tuple(f"#{bytes(color).hex()}" for color in rgb)
+
+
+def _albedo(name: str, title: str, note: str, linear: Floats, inside: NDArray[np.bool_], top: float) -> MapFigure:
+    """Figure of a color map from 0 to `top`."""
     image = html.jpeg(_extend(srgb_eight_bits(linear / top), inside), whole_color=True)
-    ramp = ",".join(f"rgb({v},{v},{v})" for v in srgb_eight_bits(np.linspace(0, 1, 17)).tolist())
-    ticks = "".join(
-        f'<span style="left:{100 * share:g}%">{labels.number(top * share)}</span>' for share in (0, 0.25, 0.5, 0.75, 1)
-    )
-    legend = f'<div class="bar" style="background:linear-gradient(90deg,{ramp})"></div><div class="ticks">{ticks}</div>'
-    return _figure(name, title, note, about, image, legend)
+    bar = srgb_eight_bits(np.linspace(0, 1, 17))[:, None].repeat(3, axis=1)
+    ticks = tuple((share, number(top * share)) for share in (0, 0.25, 0.5, 0.75, 1))
+    probe = {"kind": "color", "top": top, "unit": "", "digits": 2 if top == 1 else 3}
+    return MapFigure(name, title, note, image, probe, css_colors(bar), ticks)
 
 
-def _figure(name: str, title: str, note: str, about: Mapping[str, Any], image: str, legend: str) -> str:
-    return (
-        f'<figure class="map" id="map-{name}" data-map="{escape(json.dumps(about))}"><div class="picture">'
-        f'<img alt="{escape(title)}" src="{image}"><div class="cross"></div></div>{legend}'
-        f"<figcaption><b>{escape(title)}</b> <output></output><br><span>{escape(note)}</span></figcaption></figure>"
-    )
+def _normal_colors(vectors: Floats) -> NDArray[np.uint8]:
+    return np.rint(255 * (vectors / 2 + 0.5)).astype(np.uint8)
 
 
 def _extend(picture: NDArray[np.uint8], inside: NDArray[np.bool_]) -> NDArray[np.uint8]:

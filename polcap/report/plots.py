@@ -1,176 +1,121 @@
-"""Plots of the report as SVG drawings, in the colors of the page's theme."""
+"""Plots of report.html as data; the templates in `parts.html` draw them in the colors of the page's theme."""
 
-from collections.abc import Sequence
-from html import escape
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from polcap.images import Floats
-from polcap.report import keys
+from polcap.images import Alignment, ChartReference, Floats, Gains, PatchColors
+from polcap.optics.color import srgb_eight_bits
 from polcap.report.labels import number
+from polcap.report.map_figures import css_colors
 
-CHANNELS = ("#e0434c", "#2f9e4d", "#3f78e0")  # red, green, blue on light and dark
-
-
-def svg(width: float, height: float, parts: Sequence[str], title: str) -> str:
-    return (
-        f'<svg viewBox="0 0 {width:g} {height:g}" width="{width:g}" height="{height:g}" role="img" '
-        f'aria-label="{escape(title)}">{"".join(parts)}</svg>'
-    )
+_CHANNELS = {"red": "#e0434c", "green": "#2f9e4d", "blue": "#3f78e0"}  # on light and dark
+_BLUE = _CHANNELS["blue"]
 
 
-def hexed(color: NDArray[np.uint8]) -> str:
-    """8-bit sRGB as a CSS color."""
-    return "#" + bytes(color.astype(np.uint8)).hex()
+@dataclass(frozen=True)
+class Mark:
+    """A value on the axis of a `RowPlot`."""
+
+    place: float  # 0…1 along the axis
+    title: str  # shown under the pointer; beside a bar
+    shape: Literal["dot", "ring", "cross", "bar"] = "dot"
+    color: str = _BLUE
+    error: float = 0.0  # 1σ, share of the axis
+    down_px: int = 0
 
 
-def _text(x: float, y: float, words: str, anchor: str = "start", style: str = "") -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"{style}>{escape(words)}</text>'
+@dataclass(frozen=True)
+class RowPlot:
+    """Named rows of marks over one axis."""
+
+    title: str
+    note: str
+    ticks: list[tuple[float, str]]  # place 0…1 and text
+    rows: list[tuple[str, list[Mark]]]  # by name; names may repeat
+    row_px: int
 
 
-def chart(reference: NDArray[np.uint8], measured: NDArray[np.uint8], delta_e: Floats, names: Sequence[str]) -> str:
-    """24 patches: the maker's color outside, the photographed color inside, ΔE below."""
-    cell = 76
-    parts: list[str] = []
-    for index in range(24):
-        row, column = divmod(index, 6)
-        x, y = column * cell + 4, row * (cell + 14) + 4
-        outer, inner = hexed(reference[index]), hexed(measured[index])
-        error = float(delta_e[index])
-        label = f"{names[index]}: " + ("left out" if np.isnan(error) else f"ΔE {error:.2f}")
-        parts.append(
-            f'<g><title>{escape(label)}</title><rect x="{x}" y="{y}" width="{cell - 8}" height="{cell - 8}" rx="4" '
-            f'fill="{outer}"/><rect x="{x + 16}" y="{y + 16}" width="{cell - 40}" height="{cell - 40}" fill="{inner}"/>'
-            "</g>" + _text(x + cell / 2 - 4, y + cell + 4, "left out" if np.isnan(error) else f"{error:.1f}", "middle")
-        )
-    return svg(6 * cell, 4 * (cell + 14) + 6, parts, "Chart: measured color inside, reference outside, ΔE2000 below")
-
-
-def exposures(measured: list[list[float]], stated: list[list[float | None]], angles: Sequence[float]) -> str:
+def exposures(measured: list[list[float]], stated: list[list[float | None]], names: Sequence[str]) -> RowPlot:
     """Exposure of each frame in stops: measured in the pixels (dot) and stated by the camera (ring)."""
-    known: list[float] = [value for rows in (measured, stated) for row in rows for value in row if value]
-    low, high = np.floor(np.log2(min(known)) - 0.3), np.ceil(np.log2(max(known)) + 0.3)
-    left, width, step = 56, 440, 34
-    parts, bottom = [], step * len(measured) + 8
-
-    def at(value: float) -> float:
-        return float(left + (np.log2(value) - low) / (high - low) * (width - left - 16))
-
-    for stop in range(int(low), int(high) + 1):
-        x = at(2.0**stop)
-        parts.append(f'<line class="faint" x1="{x:.1f}" x2="{x:.1f}" y1="6" y2="{bottom}"/>')
-        parts.append(_text(x, bottom + 16, "0" if stop == 0 else f"{stop:+d}", "middle", ' class="soft"'))
-    for row, angle in enumerate(angles):
-        y = 22 + step * row
-        parts.append(_text(0, y + 4, f"{angle:g}°"))
-        for frame, value in enumerate(measured[row]):
-            claim = stated[row][frame] if row < len(stated) and frame < len(stated[row]) else None
+    known = np.log2([value for rows in (measured, stated) for row in rows for value in row if value])
+    low, high = np.floor(known.min() - 0.3), np.ceil(known.max() + 0.3)
+    rows: list[tuple[str, list[Mark]]] = []
+    for name, values, claims in zip(names, measured, stated):
+        marks: list[Mark] = []
+        rows.append((name, marks))
+        for frame, (value, claim) in enumerate(zip(values, claims), 1):
             if claim:
-                parts.append(f'<circle cx="{at(claim):.1f}" cy="{y}" r="9" fill="none" stroke="currentColor"/>')
+                title = f"{name}, frame {frame}: stated {number(claim)} ×"
+                marks.append(Mark((np.log2(claim) - low) / (high - low), title, "ring"))
             if value:
-                title = f"{angle:g}°, frame {frame + 1}: {number(value)} ×" + (
-                    f", stated {number(claim)}" if claim else ""
-                )
-                parts.append(
-                    f'<circle cx="{at(value):.1f}" cy="{y}" r="5" fill="{CHANNELS[2]}"><title>{title}</title></circle>'
-                )
-    parts.append(_text(width - 8, bottom + 32, "stops", "end", ' class="soft"'))
-    return svg(width, bottom + 38, parts, "Exposures: measured (dots) and stated by the camera (rings)")
+                title = f"{name}, frame {frame}: {number(value)} ×"
+                marks.append(Mark((np.log2(value) - low) / (high - low), title))
+    stops = range(int(low), int(high) + 1)
+    ticks = [((stop - low) / (high - low), "0" if stop == 0 else f"{stop:+d}") for stop in stops]
+    note = "in stops; measured in the pixels (dots) and stated by the camera (rings)"
+    return RowPlot("Exposures", note, ticks, rows, 34)
 
 
-def gains(gain: Floats, sigma: Floats, anchor: Floats, angles: Sequence[float]) -> str:
+def gains(found: Gains, names: Sequence[str]) -> RowPlot:
     """Light of each shot relative to the first, per channel with 1σ; crosses: from pixels that face the camera."""
-    far = np.concatenate([(gain - 1).ravel(), np.nan_to_num(anchor - 1).ravel()])
+    far = np.concatenate([(found.gain - 1).ravel(), np.nan_to_num(found.anchor - 1).ravel()])
     span = max(0.005, 1.15 * float(np.abs(far).max()))
-    left, width, step, parts = 56, 440, 46, []
-    bottom = step * len(gain) + 6
-
-    def at(value: float) -> float:
-        return float(left + (0.5 + 0.5 * np.clip((value - 1) / span, -1, 1)) * (width - left - 24))
-
-    for share in (-1, -0.5, 0, 0.5, 1):
-        x = at(1 + share * span)
-        parts.append(f'<line class="faint" x1="{x:.1f}" x2="{x:.1f}" y1="4" y2="{bottom}"/>')
-        words = "equal" if share == 0 else f"{100 * share * span:+.1f} %"
-        parts.append(_text(x, bottom + 16, words, "middle", ' class="soft"'))
-    for row, angle in enumerate(angles):
-        parts.append(_text(0, 26 + step * row, f"{angle:g}°"))
-        for channel, paint in enumerate(CHANNELS):
-            y, value, error = 12 + step * row + 11 * channel, float(gain[row, channel]), float(sigma[row, channel])
-            x = at(value)
-            parts.append(
-                f'<line x1="{at(value - error):.1f}" x2="{at(value + error):.1f}" y1="{y}" y2="{y}" stroke="{paint}" '
-                f'stroke-width="2"/><circle cx="{x:.1f}" cy="{y}" r="4" fill="{paint}"><title>{angle:g}°, '
-                f"{('red', 'green', 'blue')[channel]}: {value:.4f} ± {error:.4f}</title></circle>"
-            )
-            if np.isfinite(anchor[row, channel]):
-                cross = at(float(anchor[row, channel]))
-                parts.append(f'<path d="M{cross - 4:.1f} {y - 4}l8 8m0 -8l-8 8" stroke="{paint}" stroke-width="1.5"/>')
-    return svg(width, bottom + 24, parts, "Light of each shot relative to the first")
+    rows: list[tuple[str, list[Mark]]] = []
+    for name, gain, sigma, anchor in zip(names, found.gain, found.sigma, found.anchor):
+        marks: list[Mark] = []
+        rows.append((name, marks))
+        for channel, (word, color) in enumerate(_CHANNELS.items()):
+            title, down = f"{name}, {word}: {gain[channel]:.4f} ± {sigma[channel]:.4f}", 11 * (channel - 1)
+            place, error = 0.5 + (gain[channel] - 1) / (2 * span), sigma[channel] / (2 * span)
+            marks.append(Mark(place, title, color=color, error=error, down_px=down))
+            if np.isfinite(anchor[channel]):
+                place = 0.5 + (anchor[channel] - 1) / (2 * span)
+                marks.append(Mark(place, f"{name}, {word}: {anchor[channel]:.4f}", "cross", color, down_px=down))
+    shares = (-1, -0.5, 0, 0.5, 1)
+    ticks = [(0.5 + share / 2, f"{100 * share * span:+.1f} %" if share else "equal") for share in shares]
+    note = f"relative to the first; dots: from {found.source}; crosses: from pixels that face the camera"
+    return RowPlot("Light of the shots", note, ticks, rows, 46)
 
 
-def shifts(transform: Floats, residual_px: Floats, angles: Sequence[float]) -> str:
-    """Shift of each shot relative to the first: a line per shot, its 1σ as a circle."""
-    moved = transform[:, :2, 2]
-    span = max(0.5, 1.2 * float(np.abs(moved).max() + residual_px.max()))
-    side, parts = 240, []
-    half = side / 2
-
-    def at(value: float) -> float:
-        return float(half + value / span * (half - 12))
-
-    for share in (-1, 0, 1):
-        line = at(share * span)
-        parts.append(f'<line class="faint" x1="{line}" x2="{line}" y1="12" y2="{side - 12}"/>')
-        parts.append(f'<line class="faint" y1="{line}" y2="{line}" x1="12" x2="{side - 12}"/>')
-    for (x, y), sigma, angle in zip(moved, residual_px, angles):
-        right, down = at(float(x)), at(float(y))
-        radius = max(2.5, float(sigma) / span * (half - 12))
-        parts.append(
-            f'<line x1="{half}" y1="{half}" x2="{right:.1f}" y2="{down:.1f}" stroke="currentColor" opacity=".5"/>'
-            f'<circle cx="{right:.1f}" cy="{down:.1f}" r="{radius:.1f}" fill="{CHANNELS[2]}">'
-            f"<title>{angle:g}°: {x:+.2f}, {y:+.2f} px ± {sigma:.3f}</title></circle>"
-        )
-        parts.append(_text(right + 7, down - 6, f"{angle:g}°"))
-    parts.append(_text(side - 12, half - 6, f"{number(span, 2)} px", "end", ' class="soft"'))
-    return svg(side, side, parts, "Shift of each shot")
-
-
-def timings(seconds: dict[str, float]) -> str:
+def timings(seconds: Mapping[str, float]) -> RowPlot:
     """Computing time: one bar per stage."""
-    if not seconds:
-        return ""
-    most, step, left, width, parts = max(max(seconds.values()), 1e-3), 22, 110, 440, []
-    for row, (name, spent) in enumerate(seconds.items()):
-        y, length = 4 + step * row, spent / most * (width - left - 70)
-        parts.append(_text(0, y + 13, name))
-        parts.append(
-            f'<rect x="{left}" y="{y + 2}" width="{max(length, 1):.1f}" height="14" rx="2" fill="{CHANNELS[2]}"/>'
-        )
-        parts.append(_text(left + length + 8, y + 13, f"{spent:.2f} s"))
-    return svg(width, step * len(seconds) + 8, parts, "Seconds of each stage")
+    most = max([*seconds.values(), 1e-3])
+    rows = [(name, [Mark(spent / most, f"{spent:.2f} s", "bar")]) for name, spent in seconds.items()]
+    return RowPlot("Time", "computing time of each stage", [], rows, 22)
 
 
-def wheel() -> str:
-    """Color wheel of the angle of linear polarization; 180° run once through all hues."""
-    paint, middle, parts = keys.colors("wheel"), 60, []
-    for step in range(72):
-        turn = np.radians([5 * step, 5 * step + 5.3])
-        x, y = middle + 40 * np.cos(turn), middle - 40 * np.sin(turn)
-        color = hexed(paint[round((5 * step % 180) / 180 * keys.LEVELS) % keys.LEVELS])
-        parts.append(f'<path d="M{middle} {middle}L{x[0]:.1f} {y[0]:.1f}L{x[1]:.1f} {y[1]:.1f}Z" fill="{color}"/>')
-    for angle in (0, 45, 90, 135):
-        x_, y_ = middle + 51 * np.cos(np.radians(angle)), middle - 51 * np.sin(np.radians(angle))
-        parts.append(_text(float(x_), float(y_) + 4, f"{angle}°", "middle", ' style="font-size:10px"'))
-    return svg(2 * middle, 2 * middle, parts, "Wheel of the angle of linear polarization")
+def shifts(found: Alignment, names: Sequence[str]) -> dict[str, Any]:
+    """Shift of each shot relative to the first: a line per shot, its 1σ as a circle."""
+    moved = found.transform[:, :2, 2]
+    span = max(0.5, 1.2 * float(np.abs(moved).max() + found.residual_px.max()))
+    shots = [
+        {
+            "name": name,
+            "right": float(x / span),
+            "down": float(y / span),
+            "error": float(sigma / span),
+            "title": f"{name}: {x:+.2f}, {y:+.2f} px ± {sigma:.3f}",
+        }
+        for name, (x, y), sigma in zip(names, moved, found.residual_px)
+    ]
+    note = "relative to the first, in pixels of the merged picture; circles are 1σ"
+    title = "Shift of the shots"
+    return {"title": title, "note": note, "shots": shots, "span": f"{number(span, 2)} px", "color": _BLUE}
 
 
-def ball() -> NDArray[np.uint8]:
-    """Ball colored by its normals, (96, 96, 4), on a transparent background."""
-    side = 96
-    y, x = np.mgrid[1 : -1 : side * 1j, -1 : 1 : side * 1j]
-    z2 = 1 - x * x - y * y
-    normal = np.stack([x, y, np.sqrt(np.maximum(z2, 0))], axis=-1)
-    rgb = np.rint(255 * (normal / 2 + 0.5)).astype(np.uint8)
-    return np.concatenate([rgb, np.where(z2 > 0, 255, 0).astype(np.uint8)[..., None]], axis=-1)
+def chart(reference: ChartReference, measured: Floats, fit: PatchColors, figures: Mapping[str, Any]) -> dict[str, Any]:
+    """24 patches with the maker's color, the photographed color `measured` (24, 3) in linear Rec.709, and ΔE."""
+    note = "outside: the maker's color; inside: the photographed color; below: ΔE2000, mean "
+    note += number(figures["delta_e_mean"], 2)
+    if figures["predicted_mean"] is not None:
+        note += f" ({number(figures['predicted_mean'], 2)} when each patch is left out of the fit)"
+    colors = (css_colors(srgb_eight_bits(linear)) for linear in (reference.rec709, measured))
+    errors = ["left out" if np.isnan(error) else f"{error:.1f}" for error in fit.delta_e]
+    patches = [
+        {"name": name, "reference": outer, "measured": inner, "error": error}
+        for name, outer, inner, error in zip(reference.patches, *colors, errors)
+    ]
+    return {"title": "Chart", "note": note, "patches": patches}

@@ -9,7 +9,7 @@ Angles are in degrees throughout, as the devices use them.
     background_check        save and check photographs while the rig goes on
     retake_criteria         which frame is retaken, and why
     capture_record          accepted and rejected frames: rig.json, capture.toml
-    resume                  continue an interrupted capture
+    resume                  options and record of the begun capture
     preview                 first picture of the polarization
 
     device_urls             opens the rotator or camera that a URL names
@@ -24,7 +24,6 @@ Angles are in degrees throughout, as the devices use them.
     camera_gphoto2          a camera on a USB cable
     camera_watch_folder     a tethering program writes RAWs into a folder
     camera_simulated        no hardware
-    call_timeout            a time limit for calls into a library that may hang
     person                  questions at the terminal
     device_log              every command and every answer: rig.log
 """

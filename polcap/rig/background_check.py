@@ -63,28 +63,16 @@ class BackgroundCheck:
         accepted = self._record.accepted()
         in_bracket = slot.role in _BRACKET_ROLES
         shortest = in_bracket and relative_exposure(slot.exposure) == self._shortest
-        same_exposure = {
-            name: frame
-            for name, frame in accepted.items()
-            if in_bracket and frame.role in _BRACKET_ROLES and frame.step == slot.step
-        }
+        step = slot.step if in_bracket else None
+        same_exposure = {n: f for n, f in accepted.items() if f.role in _BRACKET_ROLES and f.step == step}
         sharpest = max((frame.facts.sharpness for frame in same_exposure.values()), default=0.0)
         others = [frame.facts for frame in accepted.values()]
         reason = retake_criteria.retake_reason(facts, photograph.exposure, slot.flash, shortest, others, sharpest)
         if reason is not None:
             self._reject(slot.name, file, read_deg, reason)
             return
-        frame = AcceptedFrame(
-            file=name,
-            role=slot.role,
-            angle_deg=slot.angle_deg,
-            step=slot.step,
-            read_deg=read_deg,
-            exposure=photograph.exposure,
-            flash=slot.flash,
-            camera_file=photograph.name,
-            facts=facts,
-        )
+        of_slot = slot.role, slot.angle_deg, slot.step
+        frame = AcceptedFrame(name, *of_slot, read_deg, photograph.exposure, slot.flash, photograph.name, facts)
         self._record.accept(slot, frame)
         self.small[slot.name] = small
         for earlier, other in same_exposure.items():  # an early frame may be the blurred one
@@ -94,6 +82,6 @@ class BackgroundCheck:
     def _reject(self, slot_name: str, file: Path, read_deg: float | None, reason: str) -> None:
         moved = self._record.reject(slot_name, file, read_deg, reason)
         self._rejections[slot_name] += 1
-        self._log.write("check", "!", f"{slot_name}: {reason}; moved to {moved.relative_to(self._record.folder)}")
+        self._log.write("check", "!", f"{slot_name}: {reason}; moved to {moved}")
         if self._rejections[slot_name] > self._tries:
             raise CaptureError(f"{slot_name} {reason} ({self._rejections[slot_name]} times)")

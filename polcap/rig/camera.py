@@ -1,6 +1,5 @@
 """The protocol of camera drivers: take one photograph with an exposure, and return its file."""
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -39,7 +38,7 @@ class CameraFile:
             if self.data.startswith(signature, offset):
                 return suffix
         if self.data[:4] in (b"II*\0", b"MM\0*"):
-            if file_kind.structure(io.BytesIO(self.data)).dng:
+            if file_kind.structure(self.data).dng:
                 return ".dng"
             head = self.data[:4096].lower()
             return next((suffix for maker, suffix in _MAKERS.items() if maker.encode() in head), ".tif")

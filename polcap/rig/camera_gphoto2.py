@@ -7,13 +7,13 @@ changed.
 import re
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future, wait
 from contextlib import suppress
 from functools import partial
 from typing import Any, TypeVar
 
 from polcap.errors import HardwareError, SettingError
 from polcap.images import Role
-from polcap.rig.call_timeout import CallTimeout, call_within
 from polcap.rig.camera import CameraFile
 from polcap.rig.device_log import Log
 from polcap.rig.exposure_bracket import Exposure, bracket_by_iso, bracket_by_shutter, nearest
@@ -40,10 +40,15 @@ _JPEG = b"\xff\xd8\xff"
 _SECOND_FILE_MS = 2000  # a camera that writes RAW and JPEG announces the second file within this time
 
 
+class CallTimeout(HardwareError):
+    """A call of libgphoto2 did not return. Its thread still runs, so the camera must not be used again."""
+
+
 class Gphoto2Camera:
     """The camera on port `which` or with `which` in its model; the only one if `which` is empty."""
 
     frame_bytes = 60_000_000
+    polarizes_flash = False
 
     def __init__(self, which: str, log: Log, timeout_s: float = 30.0) -> None:
         """`timeout_s` limits release and transfer, without the exposure. Raises HardwareError, SettingError."""
@@ -51,14 +56,15 @@ class Gphoto2Camera:
         self._log = log
         self._which = which
         self._timeout_s = timeout_s
-        self._busy = threading.Lock()  # held during a call
+        self._hangs = False
         self.model = "camera"
         self._camera: Any = self._ask("connect", self._connect)
         names = [*(name for names, _ in _WIDGETS.values() for name in names), _FLASH_MODE]
         self._choices = {name: self._ask(f"choices of {name}", partial(self._list_choices, name)) for name in names}
-        self.switches_flash = self._dark() is not None
-        self.polarizes_flash = False
-        self._lit = self._ask("flash mode", lambda: self._value(_FLASH_MODE)) if self._choices[_FLASH_MODE] else None
+        modes = self._choices[_FLASH_MODE]
+        self._flash_off = next((text for text in modes if "off" in text.lower()), None)
+        self._flash_on = self._ask("flash mode", lambda: self._value(_FLASH_MODE)) if modes else None
+        self.switches_flash = self._flash_off is not None
 
     def bracket(self, flash: bool) -> tuple[Exposure, ...]:
         """Two stops below and above the camera's shutter speed; under a flash steps of ISO."""
@@ -78,38 +84,35 @@ class Gphoto2Camera:
             raise
         except HardwareError as error:
             self._log.write("camera", "!", f"{error}; connecting again")
-            with suppress(HardwareError):
-                self._ask("disconnect", self._camera.exit)
+            self.close()
             self._camera = self._ask("connect", self._connect)
             return self._shoot(exposure, flash)
 
     def close(self) -> None:
-        if self._busy.acquire(timeout=self._timeout_s):  # else a call hangs, and this one would too
-            self._busy.release()
+        if not self._hangs:
             with suppress(HardwareError):
                 self._ask("disconnect", self._camera.exit)
 
     def _shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
         done = {field: self._set(field, getattr(exposure, field)) for field in _WIDGETS}
-        self._switch_flash(flash)
+        if self._flash_off is not None and self._flash_on is not None:
+            self._turn(_FLASH_MODE, self._flash_on if flash else self._flash_off)
         seconds = done["time_s"] or exposure.time_s or 0.0
         data, name = self._ask("capture", self._capture, seconds)
         return CameraFile(data, name, Exposure(**done))
 
     def _connect(self) -> Any:
-        gp = self._gp
         found = connected_cameras()
         fitting = [(name, port) for name, port in found if self._which.lower() in name.lower() or port == self._which]
+        listed = ", ".join(f"{name} at {port}" for name, port in fitting or found) or "none"
         if not fitting:
-            listed = ", ".join(f"{name} at {port}" for name, port in found) or "none"
             raise HardwareError(f"no camera {self._which or 'on any cable'} ({listed}); plug it in and switch it on")
         if len(fitting) > 1:
-            listed = ", ".join(f"{name} at {port}" for name, port in fitting)
             raise SettingError(f"--camera gphoto2: there are {listed}; give gphoto2:PORT")
         self.model, port = fitting[0]
-        ports = gp.PortInfoList()
+        ports = self._gp.PortInfoList()
         ports.load()
-        camera = gp.Camera()
+        camera = self._gp.Camera()
         camera.set_port_info(ports[ports.lookup_path(port)])
         camera.init()
         return camera
@@ -121,17 +124,8 @@ class Gphoto2Camera:
             return None
         offered = {value: text for text in self._choices[name] if (value := _number(text))}
         value = nearest(field, wanted, list(offered), _WIDGETS[field][1])
-        self._ask(f"{name} = {offered[value]}", lambda: self._turn(name, offered[value]))
+        self._turn(name, offered[value])
         return value
-
-    def _switch_flash(self, flash: bool) -> None:
-        dark = self._dark()
-        if dark is not None and self._lit is not None:
-            mode = self._lit if flash else dark
-            self._ask(f"{_FLASH_MODE} = {mode}", lambda: self._turn(_FLASH_MODE, mode))
-
-    def _dark(self) -> str | None:
-        return next((text for text in self._choices[_FLASH_MODE] if "off" in text.lower()), None)
 
     def _widget(self, field: str) -> str | None:
         return next((name for name in _WIDGETS[field][0] if self._choices[name]), None)
@@ -152,9 +146,12 @@ class Gphoto2Camera:
         return str(self._camera.get_single_config(name).get_value())
 
     def _turn(self, name: str, text: str) -> None:
-        widget = self._camera.get_single_config(name)
-        widget.set_value(text)
-        self._camera.set_single_config(name, widget)
+        def turn() -> None:
+            widget = self._camera.get_single_config(name)
+            widget.set_value(text)
+            self._camera.set_single_config(name, widget)
+
+        self._ask(f"{name} = {text}", turn)
 
     def _capture(self) -> tuple[bytes, str]:
         """Release, and fetch the RAW; the JPEG only if the camera writes no RAW."""
@@ -174,20 +171,35 @@ class Gphoto2Camera:
 
     def _ask(self, request: str, call: Callable[[], T], extra_s: float = 0.0) -> T:
         """One call of libgphoto2: logged, limited in time, its failure a HardwareError of one line."""
-
-        def run() -> T:
-            with self._busy:
-                return call()
-
         self._log.write("camera", ">", request)
         try:
-            answer = call_within(self._timeout_s + extra_s, f"{self.model}: {request}", run)
+            answer = call_within(self._timeout_s + extra_s, f"{self.model}: {request}", call)
+        except CallTimeout:
+            self._hangs = True
+            raise
         except self._gp.GPhoto2Error as error:
             self._log.write("camera", "<", f"{error.code} {error.string}")
             remedy = _REMEDY.get(error.code, "check the cable, switch it off and on")
             raise HardwareError(f"{self.model}: {request}: {error.string} ({error.code}); {remedy}") from None
-        self._log.write("camera", "<", _summary(answer))
+        text = f"{answer[1]}, {len(answer[0])} bytes" if isinstance(answer, tuple) else answer
+        self._log.write("camera", "<", str(text) if isinstance(text, str | list) else "ok")
         return answer
+
+
+def call_within(timeout_s: float, name: str, call: Callable[[], T]) -> T:
+    """Run `call` in its own thread, so that Ctrl-C works meanwhile. Raises CallTimeout after `timeout_s`."""
+    answer: Future[T] = Future()
+
+    def run() -> None:
+        try:
+            answer.set_result(call())
+        except BaseException as error:
+            answer.set_exception(error)
+
+    threading.Thread(target=run, daemon=True, name=name).start()
+    if not wait([answer], timeout_s).done:
+        raise CallTimeout(f"{name} took more than {timeout_s:g} s; switch the device off and on, check its cable")
+    return answer.result()
 
 
 def connected_cameras() -> list[tuple[str, str]]:
@@ -211,13 +223,7 @@ def _gphoto2() -> Any:
 def _number(text: str) -> float | None:
     """A dial's value: 1/200, 0.0050s, f/11, 100; None for Auto, bulb and the like."""
     match = _VALUE.fullmatch(text.strip().replace(",", "."))
-    value = float(match["value"]) if match else 0.0
-    if match is None or not value:
+    if match is None or not float(match["value"]):
         return None
+    value = float(match["value"])
     return float(match["over"][:-1]) / value if match["over"] else value
-
-
-def _summary(answer: object) -> str:
-    if isinstance(answer, tuple):
-        return f"{answer[1]}, {len(answer[0])} bytes"
-    return str(answer) if isinstance(answer, str | list) else "ok"

@@ -14,7 +14,7 @@ from polcap.rig.device_log import Log
 from polcap.rig.exposure_bracket import Exposure
 
 _POLL_S = 0.1
-_STABLE_S = 0.5  # a file that has not unchanged for this long is complete
+_STABLE_S = 0.5  # a file that has not grown for this long is complete
 
 
 class WatchFolderCamera:
@@ -49,25 +49,24 @@ class WatchFolderCamera:
         """The next new RAW, when it is complete; files that arrive together are taken in the order of their names."""
         self._log.write("camera", ">", f"{exposure}, {'lit' if flash else 'dark'}: waiting")
         end = time.monotonic() + self._timeout_s
-        unchanged: dict[Path, tuple[int, float]] = {}  # size, and since when
-        refused: dict[Path, int] = {}  # size at which the file was not a RAW
+        unchanged: dict[tuple[Path, int], float] = {}  # time at which a file first had a size
+        refused: set[tuple[Path, int]] = set()  # files that were no RAW at a size
         why = ""
         while time.monotonic() < end:
             for file in sorted(set(self._files()) - self._seen):
-                size, now = _size(file), time.monotonic()
-                if file not in unchanged or unchanged[file][0] != size:
-                    unchanged[file] = size, now
-                if not size or now - unchanged[file][1] < self._stable_s or refused.get(file) == size:
-                    continue
                 try:
-                    if probe.read(file).kind == "raw":  # not a JPEG, nor a RAW that is still being written
+                    key = file, file.stat().st_size
+                    complete = time.monotonic() - unchanged.setdefault(key, time.monotonic()) >= self._stable_s
+                    if not complete or key in refused:
+                        continue
+                    refused.add(key)  # a JPEG, or a RAW that is still being written
+                    if probe.read(file).kind == "raw":
                         data = file.read_bytes()
                         self._seen.add(file)
                         self._log.write("camera", "<", f"{file.name}, {len(data)} bytes")
                         return CameraFile(data, file.name, exposure)
                 except (DecodeError, OSError) as error:  # removed, or damaged
                     why = f" ({error})"
-                refused[file] = size
             time.sleep(_POLL_S)
         raise HardwareError(
             f"no new RAW file in {self._folder} within {self._timeout_s:g} s{why}; "
@@ -81,13 +80,5 @@ class WatchFolderCamera:
         try:
             return [path for path in self._folder.iterdir() if path.is_file() and not path.name.startswith(".")]
         except OSError as error:
-            raise HardwareError(
-                f"{self._folder} cannot be listed ({error.strerror}); is its disk still there?"
-            ) from None
-
-
-def _size(file: Path) -> int:
-    try:
-        return file.stat().st_size
-    except OSError:
-        return 0
+            reason = f"{error.strerror}; is its disk still there?"
+            raise HardwareError(f"{self._folder} cannot be listed: {reason}") from None

@@ -15,6 +15,7 @@ import tomli_w
 from polcap.errors import CaptureError
 from polcap.formats import atomic
 from polcap.formats.capture import capture_toml
+from polcap.formats.raw import file_bytes
 from polcap.images import Role
 from polcap.rig.exposure_bracket import Exposure
 from polcap.rig.retake_criteria import FrameFacts
@@ -29,7 +30,7 @@ class AcceptedFrame(msgspec.Struct, frozen=True):
 
     file: str
     role: Role
-    angle_deg: float | None  # ordered
+    angle_deg: float | None  # requested
     step: int  # within the bracket
     read_deg: float | None  # read back from the rotator; near angle_deg, not modulo 360
     exposure: Exposure  # as the camera really set it
@@ -67,9 +68,8 @@ class CaptureRecord:
         self._lock = threading.RLock()
 
     def missing(self, pending: Iterable[Slot] = ()) -> list[Slot]:
-        """Slots without a frame, and without one that is being checked."""
-        with self._lock:
-            return [slot for slot in self.slots if slot.name not in self.content.frames and slot not in pending]
+        """Slots without a frame, and without a frame that is being checked."""
+        return [slot for slot in self.slots if slot.name not in self.content.frames and slot not in pending]
 
     def accepted(self) -> dict[str, AcceptedFrame]:
         with self._lock:
@@ -80,34 +80,54 @@ class CaptureRecord:
             self.content.frames[slot.name] = frame
             self.write()
 
-    def reject(self, slot_name: str, file: Path, read_deg: float | None, reason: str) -> Path:
+    def reject(self, slot_name: str, file: Path, read_deg: float | None, reason: str) -> str:
         """Move a photograph to `rejected`, never over another; its slot is empty again. Raises StorageError."""
         with self._lock:
             stem = slot_name.replace("/", "_")
-            places = (self.folder / REJECTED / f"{stem}.try{n}{file.suffix}" for n in range(1, 1 << 20))
-            target = next(place for place in places if not place.exists())
+            names = (f"{REJECTED}/{stem}.try{n}{file.suffix}" for n in range(1, 1 << 20))
+            name = next(name for name in names if not (self.folder / name).exists())
             self.content.frames.pop(slot_name, None)
             try:
-                target.parent.mkdir(exist_ok=True)
-                os.replace(file, target)
+                (self.folder / REJECTED).mkdir(exist_ok=True)
+                os.replace(file, self.folder / name)
             except OSError as error:
-                raise atomic.failure(target, error) from error
-            name = target.relative_to(self.folder).as_posix()
+                raise atomic.failure(self.folder / name, error) from error
             self.content.rejected.append(RejectedFrame(name, slot_name, read_deg, reason))
             self.write()
-            return target
+            return name
 
     def reject_other_angle(self, slot: Slot, read_deg: float) -> list[str]:
         """After the ring has returned to a bracket that was begun: reject its frames if they are at another angle."""
-        with self._lock:
-            begun = {name: frame for name, frame in self.content.frames.items() if _bracket(frame) == _bracket(slot)}
-            read = [frame.read_deg for frame in begun.values() if frame.read_deg is not None]
-            if not read or max(abs(one - read_deg) for one in read) <= _SAME_DEG:
-                return []
-            for name, frame in begun.items():
-                reason = f"the ring came back to {read_deg:.3f}°, not {frame.read_deg:.3f}°"
-                self.reject(name, self.folder / frame.file, frame.read_deg, reason)
-            return list(begun)
+        begun = {name: frame for name, frame in self.accepted().items() if _bracket(frame) == _bracket(slot)}
+        read = [frame.read_deg for frame in begun.values() if frame.read_deg is not None]
+        if not read or max(abs(one - read_deg) for one in read) <= _SAME_DEG:
+            return []
+        for name, frame in begun.items():
+            reason = f"the ring came back to {read_deg:.3f}°, not {frame.read_deg:.3f}°"
+            self.reject(name, self.folder / frame.file, frame.read_deg, reason)
+        return list(begun)
+
+    def verify(self) -> list[str]:
+        """Reject frames that have changed, and files that no record names; returns a message for each."""
+        messages = []
+        for name, frame in self.accepted().items():
+            file = self.folder / frame.file
+            if not file.is_file():
+                del self.content.frames[name]
+                messages.append(f"{frame.file}: the file is missing; the frame is taken again")
+            elif file_bytes.digest(file.read_bytes()) != frame.facts.digest:
+                self.reject(name, file, frame.read_deg, "changed since it was taken")
+                messages.append(f"{frame.file}: changed since it was taken; the frame is taken again")
+        recorded = {self.folder / frame.file for frame in self.content.frames.values()}
+        for slot in self.slots:
+            for file in sorted(self.folder.glob(f"{slot.name}.*")):
+                if file not in recorded:
+                    self.reject(slot.name, file, None, "left by an interrupted run before it was checked")
+                    relative = file.relative_to(self.folder)
+                    messages.append(f"{relative}: was not checked before the interruption; the frame is taken again")
+        for temporary in self.folder.rglob(".*.part*"):
+            atomic.discard(temporary)
+        return messages
 
     def write(self) -> None:
         """Write rig.json, then capture.toml. Raises StorageError."""
@@ -128,10 +148,7 @@ class CaptureRecord:
 
     def _toml(self) -> dict[str, Any]:
         entries = []
-        for slot in self.slots:
-            frame = self.content.frames.get(slot.name)
-            if frame is None:
-                continue
+        for frame in (self.content.frames[slot.name] for slot in self.slots if slot.name in self.content.frames):
             stated = self.stated_deg(frame)
             entry: dict[str, Any] = {"file": frame.file}
             entry |= {} if stated is None else {"angle": stated}
@@ -144,10 +161,8 @@ class CaptureRecord:
 def load(folder: Path) -> RigFile | None:
     """The rig.json of an earlier run, or None. Raises CaptureError."""
     file = folder / NAME
-    if not file.exists():
-        return None
     try:
-        return msgspec.json.decode(file.read_bytes(), type=RigFile)
+        return msgspec.json.decode(file.read_bytes(), type=RigFile) if file.exists() else None
     except (OSError, msgspec.MsgspecError) as error:
         raise CaptureError(f"{file}: cannot be read ({error}); shoot into another folder") from None
 

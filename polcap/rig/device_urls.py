@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from contextlib import closing, suppress
-from typing import Any, TypeVar
+from typing import Any
 from urllib.parse import parse_qsl
 
 import msgspec
@@ -13,15 +13,12 @@ from polcap.rig import camera_gphoto2, camera_watch_folder, motor_by_hand, motor
 from polcap.rig import motor_line_protocol as motor_line
 from polcap.rig.camera import Camera
 from polcap.rig.device_log import Log
-from polcap.rig.motor_by_hand import MotorByHand
 from polcap.rig.motor_elliptec_ell14 import ElliptecMotor, ElliptecSettings
 from polcap.rig.motor_grbl import GrblMotor, GrblSettings
 from polcap.rig.motor_line_protocol import LineMotor, LineSettings
 from polcap.rig.motor_simulated import SimulatedMotor, SimulatedMotorSettings
 from polcap.rig.rotator import PolarizerRotator
-from polcap.rig.serial_port import NoAnswer, Port
-
-T = TypeVar("T")
+from polcap.rig.serial_port import NoAnswer, Port, retry
 
 _MOTORS: dict[str, tuple[Any, Any]] = {
     "elliptec": (ElliptecMotor, ElliptecSettings),
@@ -29,10 +26,9 @@ _MOTORS: dict[str, tuple[Any, Any]] = {
     "line": (LineMotor, LineSettings),
     "simulated": (SimulatedMotor, SimulatedMotorSettings),
 }
-ROTATORS = (*_MOTORS, "manual")
-
-_Recognizer = Callable[[str], str | None]
-_QUESTIONS: list[tuple[int, str, float, tuple[_Recognizer, ...]]] = [  # baud, question, time limit [s], who may answer
+_WITHOUT_PORT = ("simulated", "manual")
+_QUESTIONS: list[tuple[int, str, float, tuple[Callable[[str], str | None], ...]]] = [
+    # baud, question, time limit [s], recognizers of the devices that may answer
     (ElliptecMotor.baud, "0in", 0.5, (motor_elliptec_ell14.recognize,)),
     (GrblMotor.baud, "\n?\n", 3.0, (motor_grbl.recognize, motor_line.recognize)),
 ]
@@ -45,26 +41,24 @@ def open_rotator(url: str, log: Log) -> PolarizerRotator:
     """
     head, _, query = url.partition("?")
     kind, _, address = head.partition(":")
-    pairs = _pairs(url, query)
-    if kind not in ROTATORS:
-        raise SettingError(f"rotator {url!r}: unknown kind {kind!r}; choose one of {', '.join(ROTATORS)}")
+    if kind not in (*_MOTORS, "manual"):
+        raise SettingError(f"rotator {url!r}: unknown kind; choose one of {', '.join(_MOTORS)}, manual")
+    if kind in _WITHOUT_PORT and address:
+        raise SettingError(f"rotator {url!r}: {kind} takes no port; write {kind}")
     if kind == "manual":
-        if address or pairs:
-            raise SettingError(f"rotator {url!r}: manual takes no port and no settings; write manual")
-        return PolarizerRotator(MotorByHand(log), motor_by_hand.SETTINGS, log, by_hand=True)
+        if query:
+            raise SettingError(f"rotator {url!r}: manual takes no settings; write manual")
+        return PolarizerRotator(motor_by_hand.MotorByHand(log), motor_by_hand.SETTINGS, log, by_hand=True)
     motor_class, settings_class = _MOTORS[kind]
-    settings = _settings(url, pairs, settings_class)
+    settings = _settings(url, query, settings_class)
     if kind == "simulated":
-        if address:
-            raise SettingError(f"rotator {url!r}: the simulated motor has no port; write simulated")
-        return PolarizerRotator(SimulatedMotor(settings, log), settings, log)
+        return PolarizerRotator(motor_class(settings, log), settings, log)
     if not address:
-        raise SettingError(
-            f"rotator {url!r} names no port; write {kind}:/dev/ttyUSB0, {kind}:COM3 or {kind}:socket://…"
-        )
+        ports = f"{kind}:/dev/ttyUSB0, {kind}:COM3 or {kind}:socket://…"
+        raise SettingError(f"rotator {url!r} names no port; write {ports}")
     port = Port(address, motor_class.baud, log)
     try:
-        return PolarizerRotator(motor_class(port, settings), settings, log, port)
+        return PolarizerRotator(retry(lambda: motor_class(port, settings)), settings, log, port)
     except BaseException:
         port.close()
         raise
@@ -102,25 +96,21 @@ def probe(port_url: str) -> str | None:
             while (left := end - time.monotonic()) > 0:
                 with suppress(NoAnswer):
                     line = port.read_line(left)
-                    for recognize in recognizers:
-                        if name := recognize(line):
-                            return name
+                    if name := next(filter(None, (recognize(line) for recognize in recognizers)), None):
+                        return name
     return None
 
 
-def _pairs(url: str, query: str) -> dict[str, str]:
+def _settings(url: str, query: str, settings_class: type[msgspec.Struct]) -> Any:
+    """The settings in a rotator's URL. Raises SettingError."""
+    names = settings_class.__struct_fields__
     try:
         pairs = parse_qsl(query.replace("+", "%2B"), keep_blank_values=True, strict_parsing=bool(query))
-    except ValueError as error:
-        raise SettingError(f"rotator {url!r}: {error}; write settings as ?offset=12&settle=0.5") from None
-    return {key: text.removeprefix("+") for key, text in pairs}
-
-
-def _settings(url: str, pairs: dict[str, str], settings_class: type[T]) -> T:
-    for key in pairs:
-        if key not in (names := settings_class.__struct_fields__):  # type: ignore[attr-defined]
-            raise SettingError(f"rotator {url!r}: unknown setting {key!r}; the settings are {', '.join(names)}")
-    try:
-        return msgspec.convert(pairs, settings_class, strict=False)
+        for key, _ in pairs:
+            if key not in names:
+                raise SettingError(f"rotator {url!r}: unknown setting {key!r}; the settings are {', '.join(names)}")
+        return msgspec.convert({key: text.removeprefix("+") for key, text in pairs}, settings_class, strict=False)
     except msgspec.ValidationError as error:
         raise SettingError(f"rotator {url!r}: {error}; see the reference page on rotators") from None
+    except ValueError as error:
+        raise SettingError(f"rotator {url!r}: {error}; write settings as ?offset=12&settle=0.5") from None

@@ -1,7 +1,7 @@
 """Times of a shooting plan: for `polcap capture --dry-run`, and for the time that is left."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 from urllib.parse import parse_qsl
 
@@ -14,8 +14,8 @@ from polcap.rig.shooting_plan import CaptureOrder, Slot, light_note, plan_slots,
 PAPER_S = 60.0  # Deschaintre et al. 2021: a capture "takes about a minute"
 FINISH_S = 1.0  # the last frame's check, and the preview
 SPEED_DEG_S = {"elliptec": 430.0, "grbl": 60.0, "line": 60.0, "manual": 9.0, "simulated": 360.0}  # nominal
-SETTLE_S = {"manual": 0.0}  # else 0.2
 OVERHEAD_S = {"gphoto2": 2.0, "folder": 4.0, "simulated": 0.5}  # per frame: release, 24 MP over USB, a person
+_SETTLE_S = 0.2  # of a motor
 _DIAL = [100.0, 400.0, 1600.0]  # ISO values of any camera
 _USUAL_S = 0.02  # shutter time in the middle of a bracket
 
@@ -28,34 +28,26 @@ class Pace:
     settle_s: float
     overhead_s: float  # per frame, without the exposure
 
-    def frame_s(self, slot: Slot) -> float:
-        return (slot.exposure.time_s or 0.0) + self.overhead_s
-
-    def turn_s(self, from_deg: float, to_deg: float | None) -> float:
-        if to_deg is None or to_deg == from_deg:
-            return 0.0
-        return abs(to_deg - from_deg) / self.speed_deg_s + self.settle_s
-
-    def total_s(self, slots: Iterable[Slot], at_deg: float) -> float:
-        """Time for the rest of a capture, from the present angle on."""
-        seconds = FINISH_S
+    def steps(self, slots: Iterable[Slot], at_deg: float) -> list[tuple[Slot, float, float]]:
+        """The frames in the order of taking, each with the time of the turn before it and of the frame itself [s]."""
+        steps = []
         for slot in schedule(slots, at_deg):
-            seconds += self.turn_s(at_deg, slot.angle_deg) + self.frame_s(slot)
-            at_deg = at_deg if slot.angle_deg is None else slot.angle_deg
-        return seconds
+            turn_s = 0.0
+            if slot.angle_deg is not None and slot.angle_deg != at_deg:
+                turn_s = abs(slot.angle_deg - at_deg) / self.speed_deg_s + self.settle_s
+                at_deg = slot.angle_deg
+            steps.append((slot, turn_s, (slot.exposure.time_s or 0.0) + self.overhead_s))
+        return steps
+
+    def left(self, slots: Iterable[Slot], at_deg: float) -> str:
+        """Time for the rest of a capture from the present angle on, such as 1:40."""
+        seconds = round(FINISH_S + sum(turn_s + frame_s for _, turn_s, frame_s in self.steps(slots, at_deg)))
+        return f"{seconds // 60}:{seconds % 60:02}"
 
 
 def overhead_s(camera: str) -> float:
     """Nominal time per frame of a camera, by its name. Raises SettingError."""
-    kind = camera.partition(":")[0].partition("?")[0]
-    if kind not in OVERHEAD_S:
-        raise SettingError(f"--camera {camera}: no such camera; choose one of {', '.join(OVERHEAD_S)}")
-    return OVERHEAD_S[kind]
-
-
-def minutes(seconds: float) -> str:
-    """Such as 1:40."""
-    return f"{round(seconds) // 60}:{round(seconds) % 60:02}"
+    return _by_kind("--camera", camera, OVERHEAD_S)
 
 
 def dry_run(order: CaptureOrder) -> dict[str, Any]:
@@ -63,26 +55,22 @@ def dry_run(order: CaptureOrder) -> dict[str, Any]:
 
     The default bracket is ISO 100 to 1600 under a flash, else three shutter times around 1/50 s.
     """
-    head, _, query = order.rotator.partition("?")
-    kind = head.partition(":")[0]
-    if kind not in SPEED_DEG_S:
-        raise SettingError(f"--rotator {order.rotator}: no such rotator; choose one of {', '.join(SPEED_DEG_S)}")
+    speed = _by_kind("--rotator", order.rotator, SPEED_DEG_S)
+    usual_s = 0.0 if order.rotator == "manual" else _SETTLE_S
     try:
-        settle = float(dict(parse_qsl(query)).get("settle", SETTLE_S.get(kind, 0.2)))
+        settle = float(dict(parse_qsl(order.rotator.partition("?")[2])).get("settle", usual_s))
     except ValueError:
         raise SettingError(f"--rotator {order.rotator}: settle is not a number of seconds") from None
-    pace = Pace(SPEED_DEG_S[kind], settle, overhead_s(order.camera))
+    pace = Pace(speed, settle, overhead_s(order.camera))
     simulated = order.camera.startswith("simulated")
     usual = bracket_by_iso(_DIAL) if uses_flash(order) and not simulated else bracket_by_shutter(_USUAL_S)
     order = msgspec.structs.replace(order, bracket=order.bracket or usual)
     slots = plan_slots(order, simulated)
-    parts = _parts(order, slots, pace)
+    parts = _parts(pace.steps(slots, 0.0), 0.0 if order.rotator == "manual" else 360.0 / speed)
     return {
         "rotator": order.rotator,
         "camera": order.camera,
-        "speed_deg_s": pace.speed_deg_s,
-        "settle_s": pace.settle_s,
-        "overhead_s": pace.overhead_s,
+        **asdict(pace),
         "frames": len(slots),
         "parts": parts,
         "seconds": sum(part["seconds"] for part in parts),
@@ -93,21 +81,24 @@ def dry_run(order: CaptureOrder) -> dict[str, Any]:
     }
 
 
-def _parts(order: CaptureOrder, slots: Iterable[Slot], pace: Pace) -> list[dict[str, Any]]:
+def _by_kind(option: str, url: str, values: dict[str, float]) -> float:
+    kind = url.partition("?")[0].partition(":")[0]
+    if kind not in values:
+        raise SettingError(f"{option} {url}: no such {option[2:]}; choose one of {', '.join(values)}")
+    return values[kind]
+
+
+def _parts(steps: list[tuple[Slot, float, float]], home_s: float) -> list[dict[str, Any]]:
     """Homing, turns, groups of frames and the end, each with its time [s]."""
-    at_deg = 0.0
-    home_s = 0.0 if order.rotator == "manual" else 360.0 / pace.speed_deg_s
     parts: list[dict[str, Any]] = [{"part": "home", "frames": 0, "seconds": home_s}]
-    for slot in schedule(slots):
-        turn_s = pace.turn_s(at_deg, slot.angle_deg)
-        at_deg = at_deg if slot.angle_deg is None else slot.angle_deg
+    for slot, turn_s, frame_s in steps:
+        angle = "" if slot.angle_deg is None else f" {slot.angle_deg:g}°"
         if turn_s:
-            parts.append({"part": f"turn to {at_deg:g}° and settle", "frames": 0, "seconds": turn_s})
-        label = slot.role if slot.angle_deg is None else f"{slot.role} {at_deg:g}°"
-        if parts[-1]["part"] != label:
-            parts.append({"part": label, "frames": 0, "seconds": 0.0, "exposures": []})
+            parts.append({"part": f"turn to{angle} and settle", "frames": 0, "seconds": turn_s})
+        if parts[-1]["part"] != slot.role + angle:
+            parts.append({"part": slot.role + angle, "frames": 0, "seconds": 0.0, "exposures": []})
         parts[-1]["frames"] += 1
-        parts[-1]["seconds"] += pace.frame_s(slot)
+        parts[-1]["seconds"] += frame_s
         parts[-1]["exposures"].append(str(slot.exposure))
     return [*parts, {"part": "last check and preview", "frames": 0, "seconds": FINISH_S}]
 
@@ -126,5 +117,4 @@ def table(plan: dict[str, Any]) -> str:
         f"camera   {plan['camera']}: {plan['overhead_s']:g} s per frame, without the exposure",
         f"paper    about a minute (Deschaintre et al. 2021); this takes {share:.2f} of it",
     ]
-    lines += [f"light    {plan['note']}"] if plan["note"] else []
-    return "\n".join(lines)
+    return "\n".join(lines + ([f"light    {plan['note']}"] if plan["note"] else []))

@@ -10,9 +10,9 @@ from msgspec import Meta
 from polcap.errors import SettingError
 
 Positive = Annotated[float, Meta(gt=0)]
-_WORD = re.compile(
-    r"(?P<kind>f/|iso|flash)?(?P<over>\d+(?:\.\d+)?/)?(?P<value>\d+(?:\.\d+)?)s?", re.IGNORECASE
-)  # f/11, iso100, flash1/16, 1/200, 0.5s
+_NUMBER = r"\d+(?:\.\d+)?"
+_WORD = re.compile(rf"(f/|iso|flash)?(?:({_NUMBER})/)?({_NUMBER})s?")  # f/11, iso100, flash1/16, 1/200, 0.5s
+_FIELDS = {None: "time_s", "f/": "f_number", "iso": "iso", "flash": "flash"}
 _BASE_ISO = 100.0  # below, many cameras only scale the counts, and clip earlier
 _NEAREST_STOPS = 0.5  # greatest distance of the camera's nearest setting from the requested one
 
@@ -27,9 +27,7 @@ class Exposure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __str__(self) -> str:
         """As in `--bracket`."""
-        words = []
-        if self.time_s:
-            words.append(f"1/{1 / self.time_s:.4g}s" if self.time_s < 0.3 else f"{self.time_s:.3g}s")
+        words = [f"1/{1 / self.time_s:.4g}s" if self.time_s < 0.3 else f"{self.time_s:.3g}s"] if self.time_s else []
         words += [f"f/{self.f_number:g}"] if self.f_number else []
         words += [f"iso{self.iso:g}"] if self.iso else []
         words += [f"flash1/{1 / self.flash:.4g}"] if self.flash else []
@@ -45,14 +43,10 @@ def parse_bracket(text: str) -> tuple[Exposure, ...]:
     for part in text.split(","):
         values: dict[str, float] = msgspec.structs.asdict(exposures[-1]) if exposures else {}
         for word in part.split() or [part]:
-            match = _WORD.fullmatch(word)
-            value = float(match["value"]) if match else 0.0
-            if match is None or not value:
+            match = _WORD.fullmatch(word.lower())
+            if match is None or not float(match[3]):
                 raise SettingError(f"--bracket: {word!r} is no exposure; write 1/200, f/11, iso100 or flash1/16")
-            if match["over"]:
-                value = float(match["over"][:-1]) / value
-            names = {"f/": "f_number", "iso": "iso", "flash": "flash"}
-            values[names.get((match["kind"] or "").lower(), "time_s")] = value
+            values[_FIELDS[match[1]]] = float(match[2]) / float(match[3]) if match[2] else float(match[3])
         exposures.append(Exposure(**values))
     if len(set(exposures)) < len(exposures):
         raise SettingError(f"--bracket {text}: two frames have the same exposure; change one of them")
@@ -61,8 +55,8 @@ def parse_bracket(text: str) -> tuple[Exposure, ...]:
 
 def relative_exposure(exposure: Exposure) -> float:
     """Time × ISO × flash power / f-number²."""
-    values = exposure.time_s or 1.0, exposure.iso or 100.0, exposure.flash or 1.0
-    return values[0] * values[1] * values[2] / (exposure.f_number or 1.0) ** 2
+    light = (exposure.time_s or 1.0) * (exposure.flash or 1.0) / (exposure.f_number or 1.0) ** 2
+    return light * (exposure.iso or 100.0)
 
 
 def bracket_by_shutter(middle_s: float | None) -> tuple[Exposure, ...]:

@@ -28,16 +28,14 @@ class MotorByHand:
 
     def go(self, angle_deg: float) -> None:
         question = f"turn the polarizer to {angle_deg:g}°, then press Enter; or type the angle on its scale: "
-        while text := person.ask(question, self._log):
-            try:
-                typed = float(text.removesuffix("°").replace(",", "."))
-            except ValueError:
-                typed = math.nan
-            if math.isfinite(typed):
-                self._angle_deg = typed
-                return
+        self._angle_deg = math.nan
+        while not math.isfinite(self._angle_deg):
+            text = person.ask(question, self._log)
             question = f"{text!r} is not an angle; type degrees, or press Enter for {angle_deg:g}: "
-        self._angle_deg = angle_deg
+            try:
+                self._angle_deg = float(text.removesuffix("°").replace(",", ".") or angle_deg)
+            except ValueError:
+                continue
 
     def position(self) -> float:
         return self._angle_deg

@@ -14,13 +14,14 @@ ELLx protocol, 9600 8N1: the device's bus address, two letters, upper-case hexad
 
 import re
 import time
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
 from msgspec import Meta
 
 from polcap.errors import HardwareError
 from polcap.rig.rotator import RotatorSettings
-from polcap.rig.serial_port import NoAnswer, Port, retry
+from polcap.rig.serial_port import NoAnswer, Port
 
 STATUS = {
     0x01: "the bus timed out; check the cable",
@@ -38,7 +39,6 @@ STATUS = {
     0x0D: "over-current; free the ring, check the supply",
 }
 _OK, _BUSY = "00", "09"
-_MOST_ANSWERS = 4  # the answer, after up to three late ones
 _FULL_SPEED = 430.0  # degrees/s, nominal
 _ANSWER = re.compile(r"([0-9A-F])(IN|GS|PO|HO)([0-9A-F]+)")
 _DIGITS = {"IN": 30, "GS": 2, "PO": 8, "HO": 8}  # of an answer's data
@@ -54,7 +54,7 @@ class ElliptecSettings(RotatorSettings, frozen=True):
 
 
 class ElliptecMotor:
-    """One rotation mount on a bus."""
+    """One Elliptec rotation mount on a bus."""
 
     baud = 9600
     wraps = True
@@ -64,8 +64,8 @@ class ElliptecMotor:
         self._settings = settings
         self._address = settings.address.upper()
         self.model = "Elliptec"
-        retry(lambda: self._ask("gs", "GS"))  # clears an old fault
-        identity = retry(lambda: self._ask("in", "IN"))
+        self._ask("gs", "GS")  # clears an old fault
+        identity = self._ask("in", "IN")
         self.model = f"Elliptec ELL{int(identity[0:2], 16)}"
         self._pulses = int(identity[22:30], 16)  # per revolution
         if int(identity[18:22], 16) != 360 or self._pulses < 360:
@@ -74,7 +74,10 @@ class ElliptecMotor:
         if settings.velocity is not None:
             self._set(f"sv{settings.velocity:02X}")
         if settings.zero is not None:
-            self._save_zero(self._hexadecimal(settings.zero))
+            offset = self._hexadecimal(settings.zero)
+            if self._ask("go", "HO") != offset:  # the device's memory wears
+                self._set("so" + offset)
+                self._set("us")
 
     def home(self) -> None:
         self._move("ho0" if self._settings.home == "cw" else "ho1")
@@ -95,19 +98,14 @@ class ElliptecMotor:
 
     def _move(self, command: str) -> None:
         """Send a movement and wait for its end: a position, or status ok if the position was lost."""
-        self._send(command)
         end = time.monotonic() + self._settings.timeout
-        asked = False
+        self._port.send(self._address + command)
         while time.monotonic() < end:
             try:
-                kind, data = self._answer()
-            except NoAnswer:
-                if asked:
-                    raise
-                self._send("gs")
-                asked = True
-                continue
-            asked = False
+                kind, data = next(self._answers())
+            except NoAnswer:  # a moving device is silent, but answers questions
+                self._port.send(f"{self._address}gs", discard=False)
+                kind, data = next(self._answers())
             if kind == "PO" or (kind, data) == ("GS", _OK):
                 return
             if kind != "GS":
@@ -120,50 +118,31 @@ class ElliptecMotor:
         )
 
     def _ask(self, command: str, expected: str) -> str:
-        """Data of the answer of kind `expected`; skips late answers, asks a busy device again."""
+        """Data of the answer of kind `expected`; a busy device is asked again. Raises NoAnswer, HardwareError."""
         end = time.monotonic() + self._settings.timeout
-        while True:
-            self._send(command)
-            busy = False
-            try:
-                for _ in range(_MOST_ANSWERS):
-                    kind, data = self._answer()
-                    busy = (kind, data) == ("GS", _BUSY)
-                    if kind == expected and not busy:
-                        return data
-                    if kind == "GS" and data not in (_OK, _BUSY):
-                        raise self._fault(data)
-                if not busy:
-                    raise self._port.unknown_answer(kind + data)
-            except NoAnswer:
-                if not busy:
-                    raise
-            if time.monotonic() >= end:
-                raise self._fault(_BUSY)
+        while time.monotonic() < end:
+            self._port.send(self._address + command)
+            for kind, data in self._answers():  # those of an earlier command are skipped
+                if (kind, data) == ("GS", _BUSY):
+                    break
+                if kind == expected:
+                    return data
+                if kind == "GS" and data != _OK:
+                    raise self._fault(data)
+        raise self._fault(_BUSY)
 
     def _set(self, command: str) -> None:
-        status = retry(lambda: self._ask(command, "GS"))
-        if status != _OK:
+        if (status := self._ask(command, "GS")) != _OK:
             raise self._fault(status)
 
-    def _save_zero(self, offset: str) -> None:
-        """Write the home offset, unless the device has it: its memory wears."""
-        if retry(lambda: self._ask("go", "HO")) != offset:
-            self._set("so" + offset)
-            self._set("us")
-
-    def _send(self, command: str) -> None:
-        self._port.send(self._address + command)
-
-    def _answer(self) -> tuple[str, str]:
-        """Kind and data of this device's next answer; other addresses of the bus are skipped."""
-        lines = self._port.read_lines()
-        while True:
-            match = _ANSWER.fullmatch(line := next(lines))
+    def _answers(self) -> Iterator[tuple[str, str]]:
+        """Kind and data of this device's answers; other addresses of the bus are skipped. Raises NoAnswer."""
+        for line in self._port.read_lines():
+            match = _ANSWER.fullmatch(line)
             if match is None or len(match[3]) != _DIGITS[match[2]]:
                 raise self._port.unknown_answer(line)
             if match[1] == self._address:
-                return match[2], match[3]
+                yield match[2], match[3]
 
     def _fault(self, status: str) -> HardwareError:
         text = STATUS.get(int(status, 16), f"unknown status {status}; switch the device off and on")

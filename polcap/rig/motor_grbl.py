@@ -18,35 +18,25 @@ from msgspec import Meta
 from polcap.errors import HardwareError
 from polcap.rig import person, serial_port
 from polcap.rig.rotator import Backlash, RotatorSettings
-from polcap.rig.serial_port import NoAnswer, Port, retry
+from polcap.rig.serial_port import NoAnswer, Port
 
-ALARM = {
-    1: "a limit switch was hit; free the ring",
-    2: "the target is beyond the axis' travel; set $20=0 or raise $130",
-    3: "reset during a movement, the position is lost; home again",
-    4: "the probe was not in its expected state",
-    5: "the probe found no contact",
-    6: "homing was interrupted by a reset; home again",
-    7: "homing was interrupted by the safety door; close it",
-    8: "homing could not leave the switch; raise the pull-off $27",
-    9: "homing found no switch; check its wiring, $23 and $24",
-}
-ERROR = {
-    1: "a command letter was expected",
-    2: "a number is malformed",
-    3: "the $ command is unknown; update to GRBL 1.1",
-    4: "a value is negative",
-    5: "homing is off; wire a switch and set $22=1, or add home=ask to the rotator's URL",
-    7: "its stored settings were unreadable and reset; set them again",
-    8: "it is not idle; wait, or reset it",
-    9: "it is locked by an alarm; home it",
-    10: "soft limits need homing; set $20=0 or $22=1",
-    11: "the line is too long",
-    12: "the step rate is too high; lower $110",
-    13: "the safety door is open",
-    15: "the target is beyond the axis' travel; raise $130",
-    20: "the command is not supported",
-    33: "the target is invalid",
+MEANING = {  # of the codes that polcap's commands can cause
+    "ALARM:1": "a limit switch was hit; free the ring",
+    "ALARM:2": "the target is beyond the axis' travel; set $20=0 or raise $130",
+    "ALARM:3": "reset during a movement, the position is lost; home again",
+    "ALARM:6": "homing was interrupted by a reset; home again",
+    "ALARM:7": "homing was interrupted by the safety door; close it",
+    "ALARM:8": "homing could not leave the switch; raise the pull-off $27",
+    "ALARM:9": "homing found no switch; check its wiring, $23 and $24",
+    "error:3": "the $ command is unknown; update to GRBL 1.1",
+    "error:5": "homing is off; wire a switch and set $22=1, or add home=ask to the rotator's URL",
+    "error:7": "its stored settings were unreadable and reset; set them again",
+    "error:8": "it is not idle; wait, or reset it",
+    "error:9": "it is locked by an alarm; home it",
+    "error:10": "soft limits need homing; set $20=0 or $22=1",
+    "error:12": "the step rate is too high; lower $110",
+    "error:13": "the safety door is open",
+    "error:15": "the target is beyond the axis' travel; raise $130",
 }
 _START_S = 2.5  # for a board that restarts when its port is opened
 _HOLD_S = 2.0  # longest deceleration
@@ -75,11 +65,15 @@ class GrblMotor:
     def __init__(self, port: Port, settings: GrblSettings) -> None:
         self._port = port
         self._settings = settings
-        self._timeout_s = settings.timeout
         self._axis = "XYZ".index(settings.axis)
         self._zero = 0.0  # machine units
-        self.model = f"GRBL {retry(self._reset)}"
-        steps_per_unit, units_per_minute = retry(self._stored_settings)
+        self.model = f"GRBL {self._reset()}"
+        matches = [match for line in self._command("$$") if (match := _STORED.fullmatch(line))]
+        stored = {int(match[1]): float(match[2]) for match in matches}
+        for key in (100 + self._axis, 110 + self._axis):
+            if not stored.get(key, 0.0) > 0.0:
+                raise NoAnswer(f"{self.model} on {port.url} did not state ${key}; set it in GRBL, or try again")
+        steps_per_unit, units_per_minute = stored[100 + self._axis], stored[110 + self._axis]
         self._units_per_degree = 1.0 if settings.steps is None else settings.steps / steps_per_unit
         self.speed_deg_s = units_per_minute / 60.0 / self._units_per_degree
 
@@ -87,7 +81,7 @@ class GrblMotor:
         """Reset, which ends an alarm; then search the switch or ask a person."""
         self._reset()
         if self._settings.home == "switch":
-            self._until_ok("$H", quiet_s=inf)  # GRBL reports no state while it homes
+            self._wait_for_ok("$H", quiet_s=inf)  # GRBL reports no state while it homes
         else:
             self._command("$X")
             person.ask(person.RING_TO_ZERO, self._port.log)
@@ -96,7 +90,7 @@ class GrblMotor:
     def go(self, angle_deg: float) -> None:
         target = self._zero + angle_deg * self._units_per_degree
         self._command(f"G21G90G53G0{self._settings.axis}{target:.4f}")
-        self._until_ok("G4P0.01", quiet_s=1.5 * serial_port.ANSWER_S)  # a pause begins when the motor has stopped
+        self._wait_for_ok("G4P0.01", quiet_s=1.5 * serial_port.ANSWER_S)  # a pause begins when the motor has stopped
 
     def position(self) -> float:
         return (self._machine_position() - self._zero) / self._units_per_degree
@@ -124,15 +118,6 @@ class GrblMotor:
                 continue  # noise while the board starts
         raise NoAnswer(f"no GRBL 1.1 answers on {self._port.url}; check the cable, the power and the firmware")
 
-    def _stored_settings(self) -> tuple[float, float]:
-        """The axis' steps per unit and fastest rate [units/min], from `$$`."""
-        matches = [match for line in self._command("$$") if (match := _STORED.fullmatch(line))]
-        stored = {int(match[1]): float(match[2]) for match in matches}
-        for key in (100 + self._axis, 110 + self._axis):
-            if not stored.get(key, 0.0) > 0.0:
-                raise NoAnswer(f"{self.model} on {self._port.url} did not state ${key}; set it in GRBL, or try again")
-        return stored[100 + self._axis], stored[110 + self._axis]
-
     def _command(self, text: str) -> list[str]:
         """Send a line; returns the lines before its ok. Raises NoAnswer, HardwareError."""
         self._port.send(f"{text}\n")
@@ -142,7 +127,7 @@ class GrblMotor:
             answer.append(line)
         return answer
 
-    def _until_ok(self, text: str, quiet_s: float) -> None:
+    def _wait_for_ok(self, text: str, quiet_s: float) -> None:
         """Send a line that is answered when the motor has stopped, and wait for the answer.
 
         After a second without a line GRBL is asked for its state; without any line for `quiet_s` it is lost.
@@ -150,32 +135,27 @@ class GrblMotor:
         Raises NoAnswer, HardwareError.
         """
         self._port.send(f"{text}\n")
-        heard = time.monotonic()
-        end = heard + self._timeout_s
+        last = time.monotonic()  # time of the last line
+        end = last + self._settings.timeout
         while time.monotonic() < end:
             try:
                 line = self._port.read_line()
             except NoAnswer:
-                if time.monotonic() > heard + quiet_s:
+                if time.monotonic() > last + quiet_s:
                     raise
                 self._port.send("?", discard=False)
                 continue
-            heard = time.monotonic()
-            if self._is_ok(line):
-                return
+            last = time.monotonic()
             status = _STATUS.fullmatch(line)
-            if status and status[1] == "Idle":  # the ok was lost
+            if self._is_ok(line) or (status and status[1] == "Idle"):  # idle: the ok was lost
                 return
             if status and status[1] in ("Hold", "Door", "Check", "Sleep"):
                 raise self._failed(f"does not move: state {status[1]}; resume or reset it")
-        raise self._failed(
-            f"takes more than timeout = {self._timeout_s:g} s for {text}; free the ring, or raise timeout in the "
-            "rotator's URL"
-        )
+        raise self._too_slow(text)
 
     def _machine_position(self) -> float:
         """Position of the axis in machine units, when it has stopped: the last ok may have been an older one."""
-        end = time.monotonic() + self._timeout_s
+        end = time.monotonic() + self._settings.timeout
         while time.monotonic() < end:
             state, position = self._state()
             if state == "Alarm":
@@ -183,32 +163,31 @@ class GrblMotor:
             if state not in ("Run", "Jog"):
                 return position
             time.sleep(_POLL_S)
-        raise self._failed(f"still moves after timeout = {self._timeout_s:g} s; raise timeout in the rotator's URL")
+        raise self._too_slow("the last movement")
 
     def _state(self) -> tuple[str, float]:
         """State and machine position of the axis."""
         self._port.send("?")
         lines = self._port.read_lines()
-        while True:
-            line = next(lines)
-            if match := _STATUS.fullmatch(line):
-                return match[1], float(match[2 + self._axis])
+        while (match := _STATUS.fullmatch(line := next(lines))) is None:
             if "|WPos:" in line:
                 raise self._failed("reports work positions; set $10=1")
             self._is_ok(line)  # raises on errors
+        return match[1], float(match[2 + self._axis])
 
     def _is_ok(self, line: str) -> bool:
         """Whether a line ends a command; reports and messages do not. Raises NoAnswer, HardwareError."""
-        if line == "ok":
-            return True
-        if match := re.fullmatch(r"(error|ALARM):(\d+)", line):
-            meaning = (ERROR if match[1] == "error" else ALARM).get(int(match[2]), "see GRBL's list of codes")
-            raise self._failed(f"answers {line}: {meaning}")
+        if re.fullmatch(r"(error|ALARM):\d+", line):
+            raise self._failed(f"answers {line}: {MEANING.get(line, 'see the list of codes of GRBL')}")
         if _BANNER.fullmatch(line):
             raise self._failed("restarted and lost its position; check its supply")
-        if line[0] not in "<[$>":
+        if line != "ok" and line[0] not in "<[$>":
             raise self._port.unknown_answer(line)
-        return False
+        return line == "ok"
+
+    def _too_slow(self, text: str) -> HardwareError:
+        limit = f"timeout = {self._settings.timeout:g} s"
+        return self._failed(f"takes more than {limit} for {text}; free the ring, or raise timeout in the rotator's URL")
 
     def _failed(self, text: str) -> HardwareError:
         return HardwareError(f"{self.model} on {self._port.url} {text}")

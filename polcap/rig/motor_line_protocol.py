@@ -14,6 +14,7 @@
 
 import re
 import time
+from contextlib import suppress
 from typing import Literal
 
 from polcap.errors import HardwareError
@@ -22,7 +23,7 @@ from polcap.rig.rotator import Backlash, RotatorSettings
 from polcap.rig.serial_port import NoAnswer, Port
 
 _START_S = 3.0  # for a board that restarts when its port is opened
-_ASK_S = 0.5  # between two questions meanwhile
+_ASK_S = 0.5  # between two questions while it starts
 _HELLO = re.compile(r"polcap-rotator 1 (\S+) (\d+(?:\.\d+)?)( started)?")
 _POSITION = re.compile(r"(ok|busy) (-?\d{1,9}(?:\.\d+)?)")
 
@@ -43,16 +44,14 @@ class LineMotor:
     def __init__(self, port: Port, settings: LineSettings) -> None:
         self._port = port
         self._settings = settings
-        name, speed = self._hello()
+        name, speed = self._greet()
         self.model = f"polcap-rotator {name}"
         self.speed_deg_s = max(speed, 0.1)
 
     def home(self) -> None:
         if self._settings.home == "ask":
             person.ask(person.RING_TO_ZERO, self._port.log)
-            self._command("zero")
-        else:
-            self._command("home")
+        self._command("zero" if self._settings.home == "ask" else "home")
 
     def go(self, angle_deg: float) -> None:
         self._command(f"go {angle_deg:.3f}")
@@ -63,37 +62,33 @@ class LineMotor:
     def halt(self) -> None:
         self._command("stop")
 
-    def _hello(self) -> tuple[str, float]:
-        """Name and speed [degrees/s]; a board that is starting is asked repeatedly."""
+    def _greet(self) -> tuple[str, float]:
+        """Name and speed [degrees/s] of the board; a board that is starting is asked repeatedly."""
         end = time.monotonic() + _START_S
-        self._port.send("?\n", discard=False)
-        while (left := end - time.monotonic()) > 0:
-            try:
-                if match := _HELLO.fullmatch(self._port.read_line(min(left, _ASK_S))):
+        while time.monotonic() < end:
+            self._port.send("?\n", discard=False)
+            with suppress(NoAnswer):
+                if match := _HELLO.fullmatch(self._port.read_line(_ASK_S)):
                     return match[1], float(match[2])
-            except NoAnswer:
-                self._port.send("?\n", discard=False)
         raise NoAnswer(
             f"no polcap-rotator answers on {self._port.url}; load examples/rotator_firmware, check the cable"
         )
 
     def _command(self, command: str) -> float:
-        """Send, wait for the end, return the position."""
+        """Send a command, wait for its end, return the position."""
         self._port.send(f"{command}\n")
         end = time.monotonic() + self._settings.timeout
         while time.monotonic() < end:
             line = self._port.read_line()
+            hello, position = _HELLO.fullmatch(line), _POSITION.fullmatch(line)
             if line.startswith("error "):
                 raise self._failed(f": {line[6:]}")
-            if hello := _HELLO.fullmatch(line):
-                if hello[3]:
-                    raise self._failed(" restarted and lost its zero; check its supply")
-                continue  # the answer to an earlier `?`
-            match = _POSITION.fullmatch(line)
-            if match is None:
+            if hello and hello[3]:
+                raise self._failed(" restarted and lost its zero; check its supply")
+            if not hello and not position:  # a hello answers an earlier `?`
                 raise self._port.unknown_answer(line)
-            if match[1] == "ok":
-                return float(match[2])
+            if position and position[1] == "ok":
+                return float(position[2])
         raise self._failed(
             f" is busy for more than timeout = {self._settings.timeout:g} s at `{command}`; "
             "free the ring, or raise timeout in the rotator's URL"

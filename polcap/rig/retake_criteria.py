@@ -77,18 +77,19 @@ def retake_reason(
     """
     if any(facts.digest == other.digest for other in others):
         return "is the same photograph as an earlier one"
-    if reason := _wrong_exposure(facts.exif, wanted):
-        return reason
-    if flash is False and facts.exif.flash_fired:
-        return "the flash fired, although it should be off"
-    if shortest and facts.clipped > _MOST_CLIPPED:
-        return (
+    reason = _wrong_exposure(facts.exif, wanted)
+    if reason is None and not flash and facts.exif.flash_fired:
+        reason = "the flash fired, although it should be off"
+    if reason is None and shortest and facts.clipped > _MOST_CLIPPED:
+        reason = (
             f"{100 * facts.clipped:.2g} % of the picture is clipped in the shortest exposure, "
             f"more than {100 * _MOST_CLIPPED:g} %; give a shorter --bracket or less light"
         )
-    if others and (reason := _other_equipment(facts.exif, others[0].exif)):
-        return reason
-    return BLURRED if is_blurred(facts.sharpness, sharpest) else None
+    if reason is None and others:
+        reason = _other_equipment(facts.exif, others[0].exif)
+    if reason is None and is_blurred(facts.sharpness, sharpest):
+        reason = BLURRED
+    return reason
 
 
 def is_blurred(sharpness: float, sharpest: float) -> bool:
@@ -109,13 +110,12 @@ def _wrong_exposure(stated: Exif, wanted: Exposure) -> str | None:
 
 
 def _other_equipment(here: Exif, first: Exif) -> str | None:
-    if (here.make, here.model) != (first.make, first.model):
-        return f"was taken with {here.make} {here.model}, not {first.make} {first.model}"
-    if here.lens and first.lens and here.lens != first.lens:
-        return f"was taken through {here.lens}, not {first.lens}"
-    if (here.width, here.height) != (first.width, first.height):
-        return f"has {here.width}×{here.height} px, not {first.width}×{first.height}"
     lengths = here.focal_length_mm, first.focal_length_mm
-    if lengths[0] and lengths[1] and abs(lengths[0] / lengths[1] - 1) > _ZOOM:
-        return f"was taken at {lengths[0]:g} mm, not {lengths[1]:g} mm"
-    return None
+    zoomed = lengths[0] and lengths[1] and abs(lengths[0] / lengths[1] - 1) > _ZOOM
+    rows = (
+        ("taken with the camera", f"{here.make} {here.model}", f"{first.make} {first.model}"),
+        ("taken through the lens", here.lens or first.lens, first.lens or here.lens),
+        ("recorded with a size of", f"{here.width}×{here.height} px", f"{first.width}×{first.height} px"),
+        ("taken at", f"{lengths[0]:g} mm" if zoomed else "", f"{lengths[1]:g} mm" if zoomed else ""),
+    )
+    return next((f"was {text} {found}, not {wanted}" for text, found, wanted in rows if found != wanted), None)

@@ -84,7 +84,7 @@ class PolarizerRotator:
         for _ in range(_APPROACHES):
             self._approach(target)
             time.sleep(self._settings.settle)
-            error = _signed(retry(self._motor.position) - target)
+            error = self._distance(target)
             if abs(error) <= self._settings.tolerance:
                 self._stopped_at = target
                 return (angle_deg + sense * error) % 360.0 % 360.0  # twice: rounding may leave 360
@@ -93,15 +93,11 @@ class PolarizerRotator:
             f"{self._settings.tolerance:g}°; free the ring, check the mount, or raise tolerance in the rotator's URL"
         )
 
-    def stop(self) -> None:
-        """Stop and release the motor; never raises."""
+    def close(self) -> None:
+        """Stop and release the motor, and close its port; never raises."""
         self._homed = False  # a released ring may be turned by hand
         with suppress(PolcapError):
             self._motor.halt()
-
-    def close(self) -> None:
-        """Stop, and close the port; never raises."""
-        self.stop()
         if self._port is not None:
             self._port.close()
 
@@ -110,7 +106,7 @@ class PolarizerRotator:
         if self._stopped_at is None:
             return False
         try:
-            away = _signed(retry(self._motor.position) - self._stopped_at)
+            away = self._distance(self._stopped_at)
             if abs(away) <= self._settings.tolerance:
                 return False
             reason = f"is {away:+.2f}° away from where it stopped"
@@ -129,7 +125,6 @@ class PolarizerRotator:
             retry(lambda: self._motor.go(target - backlash))
         retry(lambda: self._motor.go(target))
 
-
-def _signed(angle_deg: float) -> float:
-    """The same angle in [-180, 180)."""
-    return (angle_deg + 180.0) % 360.0 - 180.0
+    def _distance(self, target: float) -> float:
+        """The motor's position relative to `target`, in [-180, 180) degrees."""
+        return (retry(self._motor.position) - target + 180.0) % 360.0 - 180.0

@@ -23,11 +23,11 @@ from polcap.rig.background_check import MOST_PENDING, BackgroundCheck
 from polcap.rig.camera import Camera, CameraFile
 from polcap.rig.capture_record import CaptureRecord, RigFile
 from polcap.rig.device_log import Log
-from polcap.rig.resume import open_folder, verify
+from polcap.rig.resume import open_folder
 from polcap.rig.rotator import PolarizerRotator
 from polcap.rig.shooting_plan import CaptureOrder, Slot
 
-Tell = Callable[[str], None]
+Report = Callable[[str], None]
 _SPARE = 1.2  # free disk space over the size of the frames
 
 
@@ -37,7 +37,7 @@ def shoot(
     *,
     resume: bool = False,
     tries: int = 2,
-    tell: Tell = lambda line: None,
+    report: Report = lambda line: None,
 ) -> dict[str, Any]:
     """Shoot the capture that was ordered into `folder`; returns a summary.
 
@@ -63,40 +63,34 @@ def shoot(
             content = RigFile(msgspec.structs.replace(order, bracket=bracket))
         content.camera = camera.model
         record = CaptureRecord(folder, content, shooting_plan.plan_slots(content.order, camera.switches_flash))
-        for message in verify(record):
-            tell(message)
+        for message in record.verify():
+            report(message)
         missing = record.missing()
         _check_disk(folder, len(missing) * camera.frame_bytes)
         check = BackgroundCheck(record, tries, log)
         if missing:
             if note := shooting_plan.light_note(content.order):
-                tell(f"polcap: {note}")
+                report(f"polcap: {note}")
             _check_person(missing, camera)
-            _take_missing(order.rotator, record, check, camera, log, tell)
+            _take_missing(order.rotator, record, check, camera, log, report)
         summary = _finish(record, check)
     return summary | {"taken": len(missing), "seconds": round(time.monotonic() - start, 1)}
 
 
 def _take_missing(
-    url: str, record: CaptureRecord, check: BackgroundCheck, camera: Camera, log: Log, tell: Tell
+    url: str, record: CaptureRecord, check: BackgroundCheck, camera: Camera, log: Log, report: Report
 ) -> None:
     """Run the rotator; however the run ends, the motor is stopped and released."""
-    rotator = device_urls.open_rotator(url, log)
-    try:
-        record.content.rotator = rotator.model
-        log.write("polcap", "!", f"{len(record.missing())} frames to take with {rotator.model} and {camera.model}")
-        record.write()
-        pace = dry_run.Pace(rotator.speed_deg_s, rotator.settle_s, dry_run.overhead_s(record.content.order.camera))
-        CaptureLoop(record, check, rotator, camera, pace, log, tell).run()
-    except PolcapError as error:
-        log.write("polcap", "!", str(error))
-        raise type(error)(f"{error}; the frames so far are saved, --resume continues") from error
-    finally:
-        rotator.stop()
+    with closing(check), closing(device_urls.open_rotator(url, log)) as rotator:
         try:
-            check.close()
-        finally:
-            rotator.close()
+            record.content.rotator = rotator.model
+            log.write("polcap", "!", f"{len(record.missing())} frames to take with {rotator.model} and {camera.model}")
+            record.write()
+            pace = dry_run.Pace(rotator.speed_deg_s, rotator.settle_s, dry_run.overhead_s(record.content.order.camera))
+            CaptureLoop(record, check, rotator, camera, pace, log, report).run()
+        except PolcapError as error:
+            log.write("polcap", "!", str(error))
+            raise type(error)(f"{error}; the frames so far are saved, --resume continues") from error
 
 
 @dataclass
@@ -109,7 +103,7 @@ class CaptureLoop:
     camera: Camera
     pace: dry_run.Pace
     log: Log
-    tell: Tell
+    report: Report
     angle_deg: float = 0.0  # requested last
     read_deg: float | None = None  # read back there
     filter_on_flash: bool = False
@@ -132,12 +126,15 @@ class CaptureLoop:
     def _take(self, slot: Slot, missing: list[Slot]) -> None:
         if slot.angle_deg is not None:
             self._turn(slot, slot.angle_deg)
-        total = len(self.record.slots)
-        left = dry_run.minutes(self.pace.total_s(missing, self.angle_deg))
-        self.tell(f"{slot.name:24}{total - len(missing) + 1:3}/{total}  {slot.exposure}  {left} left")
-        self._ask_for_filter(slot.role == "cross")
+        total, left = len(self.record.slots), self.pace.left(missing, self.angle_deg)
+        self.report(f"{slot.name:24}{total - len(missing) + 1:3}/{total}  {slot.exposure}  {left} left")
         photograph = self._photograph(slot)
-        self._check_different(slot, photograph)
+        for name, frame in self.record.accepted().items():
+            if slot.role == frame.role == "shot" and frame.step != slot.step and frame.exposure == photograph.exposure:
+                raise SettingError(
+                    f"--bracket: the camera took {slot.name} ({slot.exposure}) with {photograph.exposure}, as {name}; "
+                    "give exposures that differ more"
+                )
         self.check.submit(slot, None if slot.angle_deg is None else self.read_deg, photograph)
 
     def _turn(self, slot: Slot, angle_deg: float) -> None:
@@ -146,39 +143,29 @@ class CaptureLoop:
             read_deg = self.rotator.move(angle_deg)
             self.read_deg = round(angle_deg + (read_deg - angle_deg + 180.0) % 360.0 - 180.0, 4)  # not modulo 360
         for name in self.record.reject_other_angle(slot, self.read_deg):
-            self.tell(f"{name} is taken again: the ring came back to {self.read_deg:.2f}°")
-
-    def _ask_for_filter(self, wanted: bool) -> None:
-        """Ask a person to put the flash's filter on or to take it off."""
-        if wanted != self.filter_on_flash and not self.camera.polarizes_flash:
-            on = "put the second polarizer on the flash and turn it until the highlights vanish"
-            off = "take the polarizer off the flash again"
-            person.ask(f"{on if wanted else off}, then press Enter: ", self.log)
-        self.filter_on_flash = wanted
+            self.report(f"{name} is taken again: the ring came back to {self.read_deg:.2f}°")
 
     def _photograph(self, slot: Slot) -> CameraFile:
-        """Take one frame; a person handles the chart, and the flash if the camera cannot switch it."""
+        """Take one frame; a person handles the chart, and the flash and its filter if the camera cannot."""
+        crossed = slot.role == "cross"
+        if crossed != self.filter_on_flash and not self.camera.polarizes_flash:
+            on = "put the second polarizer on the flash and turn it until the highlights vanish"
+            self._ask_person(on if crossed else "take the polarizer off the flash again")
+        self.filter_on_flash = crossed
         self.camera.prepare(slot.angle_deg, slot.role, slot.step)
         before = after = ""
         if slot.role == "chart":
             before, after = "put the chart in the place of the object", "remove the chart"
         elif not slot.flash and not self.camera.switches_flash:
             before, after = "switch the flash off", "switch the flash on again"
-        if before:
-            person.ask(f"{before}, then press Enter: ", self.log)
+        self._ask_person(before)
         photograph = self.camera.shoot(slot.exposure, slot.flash)
-        if after:
-            person.ask(f"{after}, then press Enter: ", self.log)
+        self._ask_person(after)
         return photograph
 
-    def _check_different(self, slot: Slot, photograph: CameraFile) -> None:
-        """Raise SettingError if the camera's dials gave two frames of the bracket the same exposure."""
-        for name, frame in self.record.accepted().items():
-            if slot.role == frame.role == "shot" and frame.step != slot.step and frame.exposure == photograph.exposure:
-                raise SettingError(
-                    f"--bracket: the camera took {slot.name} ({slot.exposure}) with {photograph.exposure}, as {name}; "
-                    "give exposures that differ more"
-                )
+    def _ask_person(self, request: str) -> None:
+        if request:
+            person.ask(f"{request}, then press Enter: ", self.log)
 
 
 def _finish(record: CaptureRecord, check: BackgroundCheck) -> dict[str, Any]:
@@ -206,7 +193,7 @@ def _finish(record: CaptureRecord, check: BackgroundCheck) -> dict[str, Any]:
     }
 
 
-def _check_disk(folder: Path, needed: int) -> None:
+def _check_disk(folder: Path, needed: float) -> None:
     free = shutil.disk_usage(folder).free
     if free < _SPARE * needed:
         raise StorageError(
@@ -238,10 +225,9 @@ def _locked(folder: Path) -> AbstractContextManager[Any]:
 @contextmanager
 def _signals_as_ctrl_c() -> Iterator[None]:
     """SIGTERM and SIGHUP end a run as Ctrl-C does, so that the motor stops."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    if threading.current_thread() is not threading.main_thread():
+        numbers = []
     before = [(number, signal.signal(number, signal.default_int_handler)) for number in numbers]
     try:
         yield

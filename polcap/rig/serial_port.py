@@ -24,8 +24,7 @@ with suppress(ImportError):  # Windows
 
 ANSWER_S = 1.0  # time limit of one answer
 _READ_S = 0.05  # pyserial's timeout; a new one for every read would configure the port again
-_QUIET_S = 0.25  # after so long without a byte no answer is on its way; a USB adapter delivers within 16 ms
-_LATE_S = 2.0  # longest wait for late answers
+_LATE_S = 1.0  # an answer may be late by up to this
 _LONGEST_LINE = 1024  # bytes; more without a line end is noise
 _CANNOT_OPEN = {
     errno.ENOENT: "there is no such port; plug the device in, `polcap doctor` lists the ports",
@@ -66,7 +65,6 @@ class Port:
         self.log = log
         self._question = ""
         self._answer_missing = False  # it may still come, and must not be taken for the next answer
-        self._heard = False  # something has come since
         try:
             self._serial = serial.serial_for_url(
                 url, baudrate=baud, timeout=_READ_S, write_timeout=ANSWER_S, exclusive=True
@@ -85,8 +83,9 @@ class Port:
         with self._named_failures():
             if discard:
                 if self._answer_missing:
-                    self._discard_late_answers()
+                    time.sleep(_LATE_S)
                 self._serial.reset_input_buffer()
+                self._answer_missing = False
             self._serial.write(text.encode("ascii"))
         self._question = _printable(text.encode("ascii"))
         self.log.write("rotator", ">", self._question)
@@ -94,29 +93,29 @@ class Port:
     def read_line(self, limit_s: float | None = None) -> str:
         """The next line that is not empty, without its end. Raises NoAnswer, Unplugged."""
         limit_s = ANSWER_S if limit_s is None else limit_s
-        end = time.monotonic() + limit_s
-        received, over = b"", False
+        end, received = time.monotonic() + limit_s, b""
         with self._named_failures():
-            while not over and not received.endswith(b"\n") and len(received) < _LONGEST_LINE:
-                over = time.monotonic() >= end  # read once more: a line that has arrived by now counts
-                received += self._serial.read_until(b"\n", _LONGEST_LINE)
-                if received.endswith(b"\n") and not received.strip():
-                    received = b""
+            while not received.endswith(b"\n") and len(received) < _LONGEST_LINE:
+                late = time.monotonic() >= end  # a line that has arrived by now counts
+                received = (received + self._serial.read_until(b"\n", _LONGEST_LINE)).lstrip(b"\r\n")
+                if late:
+                    break
+        shown = _printable(received)
+        if not received.endswith(b"\n"):
+            self._answer_missing = True
+            if not received:
+                raise self._no_answer(f"nothing within {limit_s:.3g} s; check the cable, the power and the URL")
+            self.log.write("rotator", "<", f"{shown} …")
+            raise self._no_answer(f"only '{shown:.40}' within {limit_s:.3g} s; check the cable and the baud rate")
+        self.log.write("rotator", "<", shown)
         line = received.strip()
-        if received.endswith(b"\n"):
-            return self._decoded(line)
-        self._answer_missing, self._heard = True, False
-        if line:
-            self.log.write("rotator", "<", _printable(line) + " …")
-            raise NoAnswer(
-                f"{self._subject} only '{_printable(line):.40}' within {limit_s:.3g} s; "
-                "check the cable and the baud rate"
-            )
-        raise NoAnswer(f"{self._subject} nothing within {limit_s:.3g} s; check the cable, the power and the URL")
+        if not all(32 <= byte < 127 or byte == 9 for byte in line):
+            raise self._no_answer(f"'{shown:.40}', which is not text; check the cable and the baud rate")
+        return line.decode("ascii")
 
-    def read_lines(self, limit_s: float | None = None) -> Iterator[str]:
-        """Lines as they come. Raises NoAnswer when the time is over, Unplugged."""
-        end = time.monotonic() + (ANSWER_S if limit_s is None else limit_s)
+    def read_lines(self) -> Iterator[str]:
+        """Lines as they come. Raises NoAnswer when the time for an answer is over, Unplugged."""
+        end = time.monotonic() + ANSWER_S
         while True:
             yield self.read_line(max(0.0, end - time.monotonic()))
 
@@ -126,30 +125,11 @@ class Port:
 
     def unknown_answer(self, line: str) -> NoAnswer:
         """The error for a line that is no answer of the protocol."""
-        return NoAnswer(
-            f"{self._subject} '{line:.40}', an unknown answer; check the cable and that the URL names this device"
-        )
+        return self._no_answer(f"'{line:.40}', an unknown answer; check the cable and that the URL names this device")
 
-    @property
-    def _subject(self) -> str:
-        return f"rotator on {self.url} answered '{self._question}' with" if self._question else f"{self.url} sent"
-
-    def _decoded(self, line: bytes) -> str:
-        self.log.write("rotator", "<", _printable(line))
-        self._heard = True
-        if not all(32 <= byte < 127 or byte == 9 for byte in line):
-            raise NoAnswer(
-                f"{self._subject} '{_printable(line):.40}', which is not text; check the cable and the baud rate"
-            )
-        return line.decode("ascii")
-
-    def _discard_late_answers(self) -> None:
-        end = time.monotonic() + _LATE_S
-        quiet = time.monotonic() + _QUIET_S
-        while time.monotonic() < min(quiet, end):
-            if self._serial.read(_LONGEST_LINE):
-                self._heard, quiet = True, time.monotonic() + _QUIET_S
-        self._answer_missing = not self._heard
+    def _no_answer(self, text: str) -> NoAnswer:
+        asked = f"rotator on {self.url} answered '{self._question}' with" if self._question else f"{self.url} sent"
+        return NoAnswer(f"{asked} {text}")
 
     @contextmanager
     def _named_failures(self) -> Iterator[None]:

@@ -25,18 +25,15 @@ class CaptureOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         """Raises SettingError for angles that make no capture."""
-        for angle in self.angles_deg:
-            if not 0 <= angle < 360:
-                raise SettingError(f"--angles {angle:g}: not in 0 to 360 degrees; give the angle modulo 360")
-        names = [layouts.degrees(angle) for angle in self.angles_deg]
-        if len(set(names)) < len(names):
-            raise SettingError("--angles names an angle twice; take a bracket again with --repeat")
+        listed = ",".join(f"{angle:g}" for angle in self.angles_deg)
+        if not all(0 <= angle < 360 for angle in self.angles_deg):
+            raise SettingError(f"--angles {listed}: not all in 0 to 360 degrees; give angles modulo 360")
+        if len({layouts.degrees(angle) for angle in self.angles_deg}) < len(self.angles_deg):
+            raise SettingError(f"--angles {listed} names an angle twice; take a bracket again with --repeat")
         if layouts.different(self.angles_deg) < 3:
-            listed = ", ".join(f"{angle:g}" for angle in self.angles_deg)
             raise SettingError(f"--angles {listed}: fewer than 3 different polarizer angles; give 3 or more")
-        for angle in self.repeat_deg:
-            if angle not in self.angles_deg:
-                raise SettingError(f"--repeat {angle:g}: is not among --angles; give one of them")
+        for angle in set(self.repeat_deg) - set(self.angles_deg):
+            raise SettingError(f"--repeat {angle:g}: is not among --angles; give one of {listed}")
 
 
 @dataclass(frozen=True)
@@ -63,16 +60,16 @@ def plan_slots(order: CaptureOrder, switches_flash: bool) -> tuple[Slot, ...]:
 
     If a person has to switch the flash, there is one ambient frame for all angles.
     """
-    slots = [Slot("shot", angle, e, x) for angle in order.angles_deg for e, x in enumerate(order.bracket)]
-    slots += [Slot("repeat", angle, e, x) for angle in order.repeat_deg for e, x in enumerate(order.bracket)]
-    last, middle = len(order.bracket) - 1, len(order.bracket) // 2
+    bracket, middle = list(enumerate(order.bracket)), len(order.bracket) // 2
+    slots = [Slot("shot", angle, *frame) for angle in order.angles_deg for frame in bracket]
+    slots += [Slot("repeat", angle, *frame) for angle in order.repeat_deg for frame in bracket]
     if order.ambient:
         angles: Iterable[float | None] = order.angles_deg if switches_flash else (None,)
-        slots += [Slot("ambient", angle, last, order.bracket[last], flash=False) for angle in angles]
+        slots += [Slot("ambient", angle, *bracket[-1], flash=False) for angle in angles]
     if order.chart:
-        slots.append(Slot("chart", None, middle, order.bracket[middle]))
+        slots.append(Slot("chart", None, *bracket[middle]))
     if order.cross:
-        slots += [Slot("cross", order.angles_deg[0], e, x) for e, x in enumerate(order.bracket)]
+        slots += [Slot("cross", order.angles_deg[0], *frame) for frame in bracket]
     return tuple(slots)
 
 
@@ -82,16 +79,15 @@ def next_slot(missing: Sequence[Slot], at_deg: float) -> Slot:
     First the chart; then all frames at the present angle; then from the nearer end of the remaining angles through
     them. Frames for which a person switches the flash follow, and last those with the filter on the flash.
     """
-    for slot in missing:
-        if slot.role == "chart":
-            return slot
-    turning = [slot for slot in missing if slot.angle_deg is not None and slot.role != "cross"]
-    if not turning:
-        return next((slot for slot in missing if slot.role != "cross"), missing[0])
-    angles = [slot.angle_deg for slot in turning if slot.angle_deg is not None]
-    ends = min(angles), max(angles)
-    goal = at_deg if at_deg in angles else min(ends, key=lambda angle: abs(angle - at_deg))
-    return next(slot for slot in turning if slot.angle_deg == goal)
+    angles = [slot.angle_deg for slot in missing if slot.angle_deg is not None and slot.role != "cross"]
+    goal = at_deg
+    if angles and at_deg not in angles:
+        goal = min(min(angles), max(angles), key=lambda angle: abs(angle - at_deg))
+
+    def place(slot: Slot) -> tuple[bool, bool, bool]:
+        return slot.role != "chart", slot.role == "cross", slot.angle_deg != goal
+
+    return min(missing, key=place)
 
 
 def schedule(slots: Iterable[Slot], at_deg: float = 0.0) -> list[Slot]:
@@ -120,12 +116,8 @@ def light_note(order: CaptureOrder) -> str:
     """Warning that shutter times do not change a flash exposure; empty for other brackets and the simulated lamp."""
     if not steps_shutter(order.bracket) or order.camera.startswith("simulated"):
         return ""
+    remedy = "step power, aperture or ISO, as in --bracket iso100,iso400,iso1600"
     if uses_flash(order):
-        return (
-            "the bracket changes only the shutter time, which does not change a flash exposure: all its frames would "
-            "be equal; step power, aperture or ISO, as in --bracket iso100,iso400,iso1600"
-        )
-    return (
-        "the bracket changes the shutter time, which is right for a steady lamp; under a flash step power, aperture "
-        "or ISO, as in --bracket iso100,iso400,iso1600"
-    )
+        effect = "does not change a flash exposure: all its frames would be equal"
+        return f"the bracket changes only the shutter time, which {effect}; {remedy}"
+    return f"the bracket changes the shutter time, which is right for a steady lamp; under a flash {remedy}"

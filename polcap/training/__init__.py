@@ -10,14 +10,14 @@ Training of the main network, in the order in which a picture passes:
     simulator         all of these -> a batch: network channels and truth
     main_network      channels -> maps; its parts `gloss_profiles` and `recurring_colors`, its ablations `variants`
     loss              estimated maps against truth
-    loop              optimizers (`muon`), learning rate, averaged weights, checkpoints; `precision`: bf16 or fp32
+    loop              optimizers (`muon`), learning rate, averaged weights, checkpoints
     train             the main network in that loop
     validation        errors on held-out pictures during training
     onnx_export       weights -> ONNX
 
 The mask's network: `mask_views` traces objects before a backdrop, `mask_scenes` adds materials, light and chart
-(`backdrop_patterns`), `mask_pictures` stores them, `mask_train` trains. The refinement network: `relief` changes traced
-normals, `fine_pictures` photographs them and runs the main network, `fine_train` trains. Both are a `unet`.
+(`backdrop_patterns`), `mask_train` stores them and trains. The refinement network: `relief` changes traced normals,
+`fine_train` photographs them, runs the main network and trains. Both are a `unet`.
 
 Evaluation: `evaluate` measures the error of every map (`map_errors`) on fixed pictures (`evaluation_protocol`, of
 `evaluation_materials` in `light_transport`) against `evaluation_baselines`; `evaluation_page` and `evaluation_picture`

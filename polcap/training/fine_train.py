@@ -1,12 +1,14 @@
-"""Training of the refinement network, and its loss: `python -m polcap.training.fine_train DATA MODEL OUT MINUTES`.
+"""Training of the refinement network: `python -m polcap.training.fine_train DATA MODEL OUT MINUTES`.
 
-MODEL is the file of the main network. Pictures are made first (`fine_pictures.py`), then tiles of them are learned.
-A stopped run continues. Writes OUT/fine.onnx, last.pt, metrics.csv and watch.csv.
+MODEL is the file of the main network. First, traced views get a random relief, are photographed, and pass the main
+network; then tiles of these pictures are learned. A stopped run continues. Writes OUT/fine.onnx, last.pt, metrics.csv
+and watch.csv. One file per picture, (N + 4, H, W) fp16: the channels of `stages/infer/fine.py`, the true normal in the
+frame of each ray (3), the mask of known normals (1).
 """
 
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import ClassVar
@@ -16,86 +18,112 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from polcap.formats import onnx
-from polcap.images import Floats
-from polcap.stages.infer import fine
-from polcap.training import fine_pictures, loop, unet
+from polcap.formats import atomic, onnx
+from polcap.images import Floats, Network, View
+from polcap.stages import cues
+from polcap.stages.infer import fine, learned
+from polcap.training import evaluation_protocol, loop, materials, relief, traced_views, unet
+from polcap.training.camera_errors import CameraErrors
+from polcap.training.simulator import Simulator
 
+_PICTURES = 400
+_SIDE = 448  # px
+_RECIPE = traced_views.ViewsRecipe(views=2, procedural=14, size=_SIDE, seed=51, per_shape=4)
+_FIRST_SIZES = (80, 400)  # px of the longer side at which the main network sees a picture
+_IOR = 1.5
+_SHIFT = 2.5  # factor on the misregistration of the main network's training, which has larger pixels
+_RATE = 2e-3  # of Muon
 _TILES, _TILE = 4, 96  # tiles of a picture in a step; their side, px
 _DOUBLE_ANGLES = tuple(fine.CHANNELS.index(name) for name in ("s1", "zenith_x", "cos_2phi"))  # first of two channels
 _VECTORS = tuple(fine.CHANNELS.index(name) for name in ("ray_x", "normal_x", "smooth_x"))  # first of the channels
 _NORMAL, _COUNT = fine.CHANNELS.index("normal_x"), len(fine.CHANNELS)
 
 
-@dataclass(frozen=True)
-class FineTrainingOptions:
-    """One training run of the refinement network."""
-
-    data: Path  # holds meshes/ and materials/
-    model: Path  # of the main network
-    out: Path
-    minutes: float = 40.0  # of training, resumed parts included
-    pictures: int = 400
-    rate: float = 2e-3  # of Muon
-    seed: int = 1
-
-
-def main(options: FineTrainingOptions) -> Path:
-    """Make the missing pictures, train, export."""
+def main(data: Path, model: Path, out: Path, minutes: float) -> None:
+    """Make the missing pictures, train for `minutes`, export."""
     torch.set_num_threads(1)
-    folder, model = options.out / "pictures", options.out / "fine.onnx"
-    if len(list(folder.glob("[0-9]*.npy"))) < options.pictures:
-        network = onnx.load(options.model, threads=1)
-        maker = fine_pictures.FinePictureMaker.open(options.out / "views", options.data, network)
-        fine_pictures.make_pictures(folder, maker, options.pictures)
-    torch.manual_seed(options.seed)
-    training = FineTraining(options.rate, sorted(folder.glob("[0-9]*.npy")), options.seed)
-    training.train(options.minutes, options.out)
-    training.export(model)
-    return model
+    files = [out / "pictures" / f"{number:05d}.npy" for number in range(_PICTURES)]
+    if not all(file.exists() for file in files):
+        network = onnx.load(model, threads=1)
+        library = materials.MaterialLibrary(data / "materials" / "train", torch.device("cpu"))
+        views = traced_views.open_cache(out / "views", traced_views.training_meshes(data), _RECIPE)
+        # light from the flash alone, because the cache indexes bounces only up to 256² pixels (decision 29)
+        simulator = Simulator(views, library, torch.device("cpu"), bounces=False)
+        for number, path in enumerate(files):
+            if not path.exists():
+                with atomic.path(path) as temporary, temporary.open("wb") as file:
+                    np.save(file, make_picture(simulator, network, number))
+    torch.manual_seed(1)
+    training = FineTraining(_RATE, files)
+    training.train(minutes, out)
+    training.export(out / "fine.onnx")
+
+
+def make_picture(simulator: Simulator, network: Network, number: int) -> NDArray[np.float16]:
+    """Photograph a view with random relief; returns the layers of a picture file, cropped to the object."""
+    rng = np.random.default_rng([_RECIPE.seed, number])
+    view = number % len(simulator.camera)
+    focal, x, y, middle = (float(value) for value in simulator.camera[view, :4])
+    with torch.random.fork_rng():
+        torch.manual_seed(number)
+        views = simulator.gather(np.array([view]), _SIDE, flip=False)
+        pixels = views.pixels
+        slope = relief.random_slopes(pixels.position.numpy(), middle / focal, rng) @ views.turn[0].numpy().T
+        normal = torch.from_numpy(relief.tilt_normals(pixels.normal.numpy(), slope))
+        errors = CameraErrors.draw(1, normal.device)
+        errors = replace(errors, shift=_SHIFT * errors.shift)
+        photo = simulator.photograph(replace(views, pixels=replace(pixels, normal=normal)), torch.ones(1), errors)
+    mask = photo.input_mask[0].numpy()
+    measured = (photo.stokes, photo.covariance, photo.clipped)
+    image = evaluation_protocol.stokes_image(measured, photo.at.numpy(), mask, View(focal, (x, y), scale=1.0))
+    estimated = cues.compute(image, evaluation_protocol.white())
+    size = int(_FIRST_SIZES[0] * (_FIRST_SIZES[1] / _FIRST_SIZES[0]) ** rng.random())
+    network = replace(network, metadata={**network.metadata, "native_size": str(size)})
+    _, guess, _ = learned.estimate_coarse(estimated, network, onnx.run, _IOR, 1)
+    truth = np.moveaxis(photo.truth["normal"][0].numpy(), -1, 0)
+    known = (photo.mask[0].numpy() & mask)[None]
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    crop = np.s_[:, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    layers: Floats = np.concatenate([fine.encode(estimated, guess), truth, known])
+    return np.ascontiguousarray(layers[crop].astype(np.float16))
 
 
 class FineTraining(loop.PictureTraining):
     """The refinement network in training."""
 
-    schedule = loop.Schedule(hold=0.35, warm_up=30, averaging=0.995)
+    hold, warm_up, averaging = 0.35, 30, 0.995
     held_out, per_step = 24, 4
     output = "relief"
     metadata: ClassVar[Mapping[str, str]] = {
-        "channels": ",".join(fine.CHANNELS), "encoding": fine.ENCODING, "native_size": str(fine_pictures.SIDE),
+        "channels": ",".join(fine.CHANNELS), "encoding": fine.ENCODING, "native_size": str(_SIDE),
         "size_multiple": str(fine.SIZE_MULTIPLE), "outputs": "relief: added to the first normal, in each ray's frame",
     }  # fmt: skip
 
-    def __init__(self, rate: float, files: list[Path], seed: int = 1) -> None:
-        super().__init__(unet.fine_network(), rate, files, seed)
+    def __init__(self, rate: float, files: list[Path]) -> None:
+        super().__init__(unet.fine_network(), rate, files)
 
     def advance(self, batch: list[Path], progress: float) -> dict[str, float]:
         """Do one step on some tiles of each picture; returns the loss."""
         tiles = [cut_tile(load_example(file), self.random) for file in batch for _ in range(_TILES)]
-        loss = fine_loss(*predict(self.network, np.stack(tiles)))
+        relief, target, known = _predict(self.network, np.stack(tiles))
+        square = (relief - target).square().sum(dim=1, keepdim=True)
+        loss = ((square + 0.5 * (square + 1e-4).sqrt()) * known).sum() / known.sum().clamp(min=1)
         loss.backward()
         self.update(progress)
         self.samples += len(tiles)
         return {"loss": float(loss.detach())}
 
+    @torch.no_grad()  # type: ignore[untyped-decorator]
     def validate(self, out: Path) -> dict[str, float]:
         """RMS error of the estimated relief, `off`, and of zero relief, `off_without`, on held-out pictures."""
-        squares, squares_without = [], []
-        with self.averaged() as network:
-            for file in self.files[: self.held_out]:
-                picture = load_example(file)
-                height, width = (side - side % fine.SIZE_MULTIPLE for side in picture.shape[1:])
-                with torch.no_grad():
-                    relief, target, known = predict(network, picture[None, :, :height, :width])
-                squares.append(float((((relief - target) * known) ** 2).sum() / known.sum()))
-                squares_without.append(float(((target * known) ** 2).sum() / known.sum()))
-        return {"off": float(np.sqrt(np.mean(squares))), "off_without": float(np.sqrt(np.mean(squares_without)))}
-
-
-def fine_loss(relief: Tensor, target: Tensor, known: Tensor) -> Tensor:
-    """Squared distance plus half the distance between relief and target (B, 3, H, W), where `known` (B, 1, H, W)."""
-    square = (relief - target).square().sum(dim=1, keepdim=True)
-    return ((square + 0.5 * (square + 1e-4).sqrt()) * known).sum() / known.sum().clamp(min=1)
+        squares = []
+        for file in self.files[: self.held_out]:
+            picture = load_example(file)
+            height, width = (side - side % fine.SIZE_MULTIPLE for side in picture.shape[1:])
+            relief, target, known = _predict(self.average, picture[None, :, :height, :width])
+            squares.append([float((((r - target) * known) ** 2).sum() / known.sum()) for r in (relief, 0 * relief)])
+        off, without = np.sqrt(np.mean(squares, axis=0))
+        return {"off": float(off), "off_without": float(without)}
 
 
 @cache
@@ -113,12 +141,12 @@ def cut_tile(picture: NDArray[np.float16], rng: np.random.Generator) -> Floats:
     """A square (C, 96, 96) about a random pixel of the object, rotated and mirrored at random."""
     inside = np.flatnonzero(picture[-1])
     y, x = divmod(int(inside[rng.integers(len(inside))]), picture.shape[2])
-    pad = _TILE // 2
-    top, left = max(0, pad - y), max(0, pad - x)
-    part = picture[:, max(0, y - pad) : y + pad, max(0, x - pad) : x + pad]
-    out = np.zeros((len(picture), _TILE, _TILE), np.float32)
-    out[:, top : top + part.shape[1], left : left + part.shape[2]] = part
-    return rotate(out, int(rng.integers(4)), bool(rng.integers(2)))
+    half = _TILE // 2
+    top, left = max(0, half - y), max(0, half - x)
+    part = picture[:, max(0, y - half) : y + half, max(0, x - half) : x + half]
+    tile = np.zeros((len(picture), _TILE, _TILE), np.float32)
+    tile[:, top : top + part.shape[1], left : left + part.shape[2]] = part
+    return rotate(tile, int(rng.integers(4)), bool(rng.integers(2)))
 
 
 def rotate(picture: Floats, quarters: int, mirror: bool) -> Floats:
@@ -138,7 +166,7 @@ def rotate(picture: Floats, quarters: int, mirror: bool) -> Floats:
     return out
 
 
-def predict(network: nn.Module, pictures: Floats) -> tuple[Tensor, Tensor, Tensor]:
+def _predict(network: nn.Module, pictures: Floats) -> tuple[Tensor, Tensor, Tensor]:
     """Estimated relief, target relief and mask of known relief of pictures (B, N + 4, H, W)."""
     batch = torch.from_numpy(pictures.astype(np.float32))
     channels = batch[:, :_COUNT].contiguous(memory_format=torch.channels_last)
@@ -146,4 +174,4 @@ def predict(network: nn.Module, pictures: Floats) -> tuple[Tensor, Tensor, Tenso
 
 
 if __name__ == "__main__":
-    main(FineTrainingOptions(Path(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3]), float(sys.argv[4])))
+    main(Path(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3]), float(sys.argv[4]))

@@ -4,12 +4,12 @@ A budget is a time, so that a run ends when planned on any machine, or a number 
 compared. A stopped run continues from its last checkpoint with the rest of its budget.
 """
 
+import copy
 import csv
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -37,27 +37,24 @@ class Budget:
     minutes: float
     samples: int | None = None
 
-
-@dataclass(frozen=True)
-class Schedule:
-    """Learning rate and weight averaging during a run."""
-
-    hold: float  # share of the budget at the full rate; after it the rate falls linearly to 0
-    warm_up: int  # steps over which the rate rises
-    averaging: float  # decay of the averaged weights per step
-    burst: float = math.inf  # steps with a longer gradient are skipped
+    def spent(self, samples: int, elapsed: float) -> float:
+        """Spent share of the budget after `samples` pictures and `elapsed` seconds."""
+        return samples / self.samples if self.samples else elapsed / (60 * self.minutes)
 
 
 class Trainee(ABC):
     """A network in training: weights, averaged weights, optimizers and progress."""
 
-    schedule: Schedule
+    hold: float  # share of the budget at the full learning rate, which then falls linearly to 0
+    warm_up: int  # steps over which the rate rises
+    averaging: float  # decay of the averaged weights per step
+    burst = math.inf  # steps with a longer gradient are skipped
 
     def __init__(self, network: nn.Module, rate: float) -> None:
         self.network = network
-        self.average = {k: v.detach().clone() for k, v in network.state_dict().items()}
+        self.average = copy.deepcopy(network).eval().requires_grad_(False)  # the network with averaged weights
         self.optimizers = make_optimizers(network, rate)
-        self.step, self.samples, self.elapsed, self.skipped = 0, 0, 0.0, 0
+        self.step, self.samples, self.elapsed = 0, 0, 0.0
 
     @abstractmethod
     def advance(self, batch: Any, progress: float) -> dict[str, float]:
@@ -71,45 +68,27 @@ class Trainee(ABC):
         """Further entries of the checkpoint."""
         return {}
 
-    def progress(self, budget: Budget, samples: int | None = None) -> float:
-        """Spent share of the budget; with a budget of pictures, the share at `samples` pictures (default: now)."""
-        if budget.samples:
-            return (self.samples if samples is None else samples) / budget.samples
-        return self.elapsed / (60 * budget.minutes)
-
     def update(self, progress: float) -> float:
         """Apply the gradients, update the averaged weights and return the gradient's norm."""
-        decline = min(1.0, (1 - min(progress, 1.0)) / (1 - self.schedule.hold))
-        for group in (g for optimizer in self.optimizers for g in optimizer.param_groups):
-            group["lr"] = group["full"] * decline * min(1.0, (self.step + 1) / self.schedule.warm_up)
+        decline = min(1.0, (1 - min(progress, 1.0)) / (1 - self.hold))
         norm = float(torch.nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM, foreach=True))
-        skip = not norm < self.schedule.burst
         for optimizer in self.optimizers:
-            if not skip:
+            for group in optimizer.param_groups:
+                group["lr"] = group["full"] * decline * min(1.0, (self.step + 1) / self.warm_up)
+            if norm < self.burst:
                 optimizer.step()
             optimizer.zero_grad()
-        self.step, self.skipped = self.step + 1, self.skipped + skip
-        decay = min(self.schedule.averaging, (1 + self.step) / (10 + self.step))
+        self.step += 1
+        decay = min(self.averaging, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
-            torch._foreach_lerp_(list(self.average.values()), list(self.network.state_dict().values()), 1 - decay)
+            torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1 - decay)
         return norm
-
-    @contextmanager
-    def averaged(self) -> Iterator[nn.Module]:
-        """The network with its averaged weights, for the duration of the block."""
-        current = {k: v.clone() for k, v in self.network.state_dict().items()}
-        self.network.load_state_dict(self.average)
-        try:
-            yield self.network.eval()
-        finally:
-            self.network.load_state_dict(current)
-            self.network.train()
 
     def save(self, path: Path) -> None:
         """Write a checkpoint. Raises StorageError."""
         state = {
-            "network": self.network.state_dict(), "average": self.average, "step": self.step, "samples": self.samples,
-            "elapsed": self.elapsed, "skipped": self.skipped,
+            "network": self.network.state_dict(), "average": self.average.state_dict(), "step": self.step,
+            "samples": self.samples, "elapsed": self.elapsed,
             "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
         }  # fmt: skip
         with atomic.path(path) as temporary:
@@ -118,11 +97,10 @@ class Trainee(ABC):
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from the content of a checkpoint."""
         self.network.load_state_dict(state["network"])
-        self.average = {k: v.clone() for k, v in state["average"].items()}
+        self.average.load_state_dict(state["average"])
         for optimizer, saved in zip(self.optimizers, state["optimizers"]):
             optimizer.load_state_dict(saved)
-        self.step, self.samples = state["step"], state["samples"]
-        self.elapsed, self.skipped = state["elapsed"], state["skipped"]
+        self.step, self.samples, self.elapsed = state["step"], state["samples"], state["elapsed"]
 
 
 class PictureTraining(Trainee):
@@ -133,10 +111,10 @@ class PictureTraining(Trainee):
     output: str  # name of the network's map
     metadata: ClassVar[Mapping[str, str]]  # of the exported model
 
-    def __init__(self, network: nn.Module, rate: float, files: list[Path], seed: int) -> None:
+    def __init__(self, network: nn.Module, rate: float, files: list[Path]) -> None:
         super().__init__(network.to(memory_format=torch.channels_last), rate)
-        self.files, self.seed = files, seed
-        self.random = np.random.default_rng([seed, 0])
+        self.files = files
+        self.random = np.random.default_rng([1, 0])
 
     def train(self, minutes: float, out: Path) -> None:
         """Continue from out/last.pt if it exists, and train until `minutes` are spent, earlier parts included.
@@ -150,7 +128,7 @@ class PictureTraining(Trainee):
             raise InputError(f"{len(self.files)} pictures; training needs more than the {self.held_out} held out")
         if (out / "last.pt").exists():
             self.restore(torch.load(out / "last.pt", weights_only=True))
-        self.random = np.random.default_rng([self.seed, self.step])
+        self.random = np.random.default_rng([1, self.step])
         run(self, self.draw, Budget(minutes), out)
 
     def draw(self) -> list[Path]:
@@ -161,23 +139,23 @@ class PictureTraining(Trainee):
         """Write the averaged weights as an ONNX model that `formats/onnx.py` loads."""
         training = f"{self.samples} samples in {self.step} steps"
         metadata = {"licence": "Apache-2.0", "training": training, **self.metadata}
-        with self.averaged() as network:
-            onnx_export.export_network(network, path, (self.output,), metadata)
+        onnx_export.export_network(self.average, path, (self.output,), metadata)
 
 
 def run(trainee: Trainee, draw: Callable[[], Any], budget: Budget, out: Path) -> None:
     """Train until the budget is spent. Writes last.pt, metrics.csv and watch.csv to `out`."""
     saved = validated = trainee.elapsed
     before, losses = time.monotonic(), []
-    while trainee.progress(budget) < 1:
-        losses.append(trainee.advance(draw(), trainee.progress(budget)))
+    progress = budget.spent(trainee.samples, trainee.elapsed)
+    while progress < 1:
+        losses.append(trainee.advance(draw(), progress))
         now = time.monotonic()
         trainee.elapsed, before = trainee.elapsed + now - before, now
-        done = trainee.progress(budget) >= 1
-        if trainee.step % _METRICS_STEPS == 0 or trainee.step == 10 or done:
+        progress = budget.spent(trainee.samples, trainee.elapsed)
+        if trainee.step % _METRICS_STEPS == 0 or trainee.step == 10 or progress >= 1:
             _append(out / "metrics.csv", trainee, {k: float(np.mean([part[k] for part in losses])) for k in losses[0]})
             losses = []
-        if trainee.elapsed - validated > _VALIDATION_S or done:
+        if trainee.elapsed - validated > _VALIDATION_S or progress >= 1:
             validated = trainee.elapsed
             _append(out / "watch.csv", trainee, trainee.validate(out))
             before = time.monotonic()  # validation does not count as training time
@@ -209,11 +187,10 @@ def make_optimizers(network: nn.Module, rate: float) -> list[torch.optim.Optimiz
 
 def _append(path: Path, trainee: Trainee, figures: Mapping[str, float]) -> None:
     """Append a row of figures to a CSV file."""
-    numbers = {"step": trainee.step, "samples": trainee.samples, "seconds": round(trainee.elapsed, 1), **figures}
-    row = {name: f"{value:.7g}" for name, value in numbers.items()}
+    row = {"step": trainee.step, "samples": trainee.samples, "seconds": round(trainee.elapsed, 1), **figures}
     fresh = not path.exists()
     with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, row.keys())
+        writer = csv.writer(file)
         if fresh:
-            writer.writeheader()
-        writer.writerow(row)
+            writer.writerow(row)
+        writer.writerow(f"{value:.7g}" for value in row.values())

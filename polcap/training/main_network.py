@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from polcap.stages.cues import CHANNELS, FLOOR
+from polcap.training import muon
 from polcap.training.gloss_profiles import GlossEvidence, Profiles, figures_of
 from polcap.training.recurring_colors import ColorGloss, Recolor
 from polcap.training.unet import ResidualBlock
@@ -117,6 +118,15 @@ class MainNetwork(nn.Module):  # type: ignore[misc]  # torch comes without types
             "sigma": 60 * torch.sigmoid(shape[:, 4:5] - 1.5),
             "highlight": torch.sigmoid(gloss[:, 4:5] - 1.0),
         }
+
+
+def run(network: nn.Module, channels: Tensor) -> dict[str, Tensor]:
+    """Maps of a network, computed in the machine's fastest number type."""
+    kind = channels.device.type
+    half = muon.compute_type(channels.device) == torch.bfloat16
+    with torch.autocast(kind, torch.bfloat16, enabled=half, cache_enabled=False):  # threads would share the cache
+        maps: dict[str, Tensor] = network(channels.contiguous(memory_format=torch.channels_last))
+    return maps
 
 
 def _residuals(width: int, count: int) -> nn.Sequential:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from polcap.formats import shipped_data
-from polcap.images import Floats
+from polcap.images import Bools, Floats
 from polcap.optics import frames, shade
 from polcap.stages.mask.mask_channels import ReducedPicture, grid
 from polcap.training import backdrop_patterns, materials
@@ -27,7 +27,6 @@ MODES: dict[Mode, float] = {
     "any": 0.2, "dark": 0.12, "black": 0.1, "white": 0.08, "alike": 0.12, "shadow": 0.11, "printed": 0.12,
     "pictured": 0.15,
 }  # fmt: skip
-_NOISE = np.random.default_rng(0).standard_normal(1 << 21, dtype=np.float32)
 _PITCH = 16  # px per patch in the picture of the chart
 
 
@@ -36,9 +35,9 @@ class MaskScene:
     """Light at the camera, before noise, and the truth."""
 
     stokes: Floats  # (3, H, W, 3) S0, S1, S2 in linear Rec.709
-    chart: NDArray[np.bool_]  # (H, W) the chart, where it is found
+    chart: Bools  # (H, W) the chart, where it is found
     corners: Floats | None  # (4, 2) px, of the outer patches, dark skin first; None: not found
-    mask: NDArray[np.bool_]  # (H, W)
+    mask: Bools  # (H, W)
 
 
 def make_scene(
@@ -49,63 +48,54 @@ def make_scene(
 
     charted, touching: probability of a chart, and that it is placed as near to the object as possible.
     """
-    height, width = view.size
+    mask = view.object.mask
+    size = mask.shape
+    v = frames.rays(view.object.view, *size).reshape(-1, 3)
+    behind, facing, plane = meet_planes(view.planes, v)
+    at = np.flatnonzero(mask.reshape(-1) | np.isfinite(behind))  # pixels of the object or of the backdrop
+    on, v = mask.reshape(-1)[at], v[at]
     traced = view.object
-    v = frames.rays(view.view, height, width).reshape(-1, 3)
-    far, facing, plane = meet_planes(view.planes, v)
-    outside = np.flatnonzero(np.isfinite(far) & ~view.mask.reshape(-1))
-    place = np.concatenate([-v[traced.inside] * (traced.depth / v[traced.inside, 2])[:, None],
-                            -v[outside] * far[outside, None]])  # fmt: skip
-    normal = np.concatenate([traced.normal.astype(np.float32), facing[outside]])
-    position = np.concatenate([traced.position.astype(np.float32), place[len(traced.inside) :]])
-    owner = torch.cat([torch.zeros(len(traced.inside), dtype=torch.long), torch.ones(len(outside), dtype=torch.long)])
-    turn = torch.stack([torch.from_numpy(traced.turn).float(), torch.eye(3)])
-    surface = materials.draw_surface(
-        library, torch.from_numpy(normal).float(), torch.from_numpy(position).float(), turn, owner, 2
+    depth, normal, position = (
+        image.reshape(len(behind), -1)[at] for image in (traced.depth, traced.normal, traced.position)
     )
-    number = np.concatenate([np.full(len(traced.inside), -1), plane[outside]])
-    surface, polarizing = _change_materials(surface, position, number, mode, rng)
-    at = np.concatenate([traced.inside, outside])
-    lit = np.concatenate([traced.lit, ~view.shadow.reshape(-1)[outside]])
-    light = _light(view, surface, v[at], place, _soften(lit, at, view.size, rng), polarizing, rng)
-    flat = np.zeros((3, height * width, 3), np.float32)
-    flat[:, at] = light
-    flat[0] += 1e-4 * rng.uniform(0, 1, 3)  # stray light
-    image = flat.reshape(3, height, width, 3)
-    chart, corners = np.zeros(view.size, bool), None
+    place = -v * np.where(on, depth[:, 0] / v[:, 2], behind[at])[:, None]
+    normal = np.where(on[:, None], normal, facing[at])
+    position = np.where(on[:, None], position, place)
+    owner = torch.from_numpy(np.where(on, 0, 1))
+    turn = torch.stack([torch.from_numpy(view.turn).float(), torch.eye(3)])
+    facing, points = (torch.from_numpy(a).float() for a in (normal, position))
+    surface = materials.draw_surface(library, facing, points, turn, owner, 2)
+    surface, polarizing = _change_materials(surface, position, np.where(on, -1, plane[at]), mode, rng)
+    lit = cv2.GaussianBlur(view.lit.astype(np.float32), (0, 0), rng.uniform(0.4, 2.5)).reshape(-1)[
+        at
+    ]  # the flash has a size
+    image = np.zeros((3, *size, 3), np.float32)
+    image.reshape(3, -1, 3)[:, at] = _light(view, surface, v, place, lit, polarizing, rng)
+    image[0] += 1e-4 * rng.uniform(0, 1, 3)  # stray light
+    chart, corners = np.zeros(size, bool), None
     if rng.random() < charted:
-        chart, corners = _add_chart(image, view.mask, touching, rng)
+        chart, corners = _add_chart(image, mask, touching, rng)
     sigma = rng.uniform(0.35, 0.9)
     blurred = np.stack([cv2.GaussianBlur(one, (0, 0), sigma) for one in image])
-    return MaskScene(blurred, chart, corners, view.mask)
+    return MaskScene(blurred, chart, corners, mask)
 
 
-def simulate_measurement(
-    color: Floats, sums: Floats, chart: NDArray[np.bool_], rng: np.random.Generator
-) -> ReducedPicture:
+def simulate_measurement(color: Floats, sums: Floats, chart: Bools, rng: np.random.Generator) -> ReducedPicture:
     """Add noise and errors of gain and alignment to S0 (H, W, 3) and to the sums over colors (3, H, W)."""
     bright = float(np.percentile(color.mean(-1), 98)) + 1e-9
-    color, sums = (np.asarray(a / bright, np.float32) for a in (color, sums))
+    color, sums = color / bright, sums / bright
     noise = float(np.exp(rng.uniform(np.log(3e-4), np.log(6e-3))))
     spread = noise * np.hypot(np.sqrt(np.maximum(color, 0)), rng.uniform(0.02, 0.2))
-    color = color + spread * _noise(spread.shape, rng)
+    color = color + spread * rng.standard_normal(spread.shape, np.float32)
     total = spread.sum(-1) / np.sqrt(3)
     slope = np.gradient(sums[0])
     seen = [color.sum(-1)]
     for k in (1, 2):
         off = rng.normal(0, 0.008) * sums[0] + sum(rng.normal(0, 0.08) * s for s in slope)
-        seen.append(sums[k] + off + 1.5 * total * _noise(total.shape, rng))
+        seen.append(sums[k] + off + 1.5 * total * rng.standard_normal(total.shape, np.float32))
     tint = np.exp(rng.normal(0, 0.04, 3))
-    return ReducedPicture(
-        (color * tint).astype(np.float32), np.stack(seen).astype(np.float32), chart, grid(*chart.shape)
-    )
-
-
-def _noise(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
-    """Noise of standard deviation 1, from a stored table: drawing it would take a tenth of the training time."""
-    count = int(np.prod(shape))
-    start = int(rng.integers(len(_NOISE) - count))
-    return _NOISE[start : start + count].reshape(shape)
+    stokes = np.stack(seen).astype(np.float32)
+    return ReducedPicture((color * tint).astype(np.float32), stokes, chart, grid(*chart.shape))
 
 
 def _change_materials(
@@ -118,62 +108,50 @@ def _change_materials(
     diffuse, rough, specular = surface.diffuse.numpy(), surface.roughness.numpy(), surface.specular.numpy()
     factor = np.full(len(diffuse), rng.uniform(0.35, 1.0), np.float32)
     object_ = number < 0
-    tone = _tone(diffuse, object_)
     if mode == "black":
-        _recolor(diffuse, object_, np.exp(rng.uniform(np.log(0.003), np.log(0.05))), rng.uniform(0, 0.6), rng)
+        _recolor(diffuse, object_, _log_uniform(0.003, 0.05, rng), rng.uniform(0, 0.6), rng)
         rough[object_] = np.clip(0.3 * rough[object_] + rng.uniform(0.05, 0.35), 0.08, 1)
         specular[object_] = rng.uniform(0.03, 0.06)
     elif mode == "white":
         _recolor(diffuse, object_, rng.uniform(0.55, 0.9), rng.uniform(0, 0.2), rng)
     elif mode == "shadow" or rng.random() < 0.1:
-        _recolor(diffuse, object_, tone * rng.uniform(0.2, 1.0), rng.uniform(0.3, 1), rng)
-    for plane in (0, 1):
+        _recolor(diffuse, object_, diffuse[object_].mean() * rng.uniform(0.2, 1.0), rng.uniform(0.3, 1), rng)
+    for plane in np.unique(number[number >= 0]):
         wall = number == plane
-        if not wall.any():
-            continue
         gloss = mode not in ("dark", "black") and rng.random() < 0.3
         if mode in ("dark", "black", "shadow"):
-            level = np.exp(rng.uniform(np.log(0.004), np.log(0.06)))
+            level = _log_uniform(0.004, 0.06, rng)
             _recolor(diffuse, wall, level, rng.choice([0.0, rng.uniform(0, 0.6)]), rng)
         elif mode == "white":
             _recolor(diffuse, wall, rng.uniform(0.45, 0.92), rng.choice([0.0, rng.uniform(0, 0.2)]), rng)
         elif mode == "alike":
             mean = diffuse[object_].mean(axis=0) * rng.uniform(0.6, 1.5)
             share = rng.uniform(0, 0.8)
-            relative = diffuse[wall] / max(_tone(diffuse, wall), 1e-3)
-            diffuse[wall] = mean * (1 - share + share * relative)
+            diffuse[wall] = mean * (1 - share + share * diffuse[wall] / max(diffuse[wall].mean(), 1e-3))
         elif mode == "printed":
             diffuse[wall] = backdrop_patterns.draw_print(position[wall], rng)
         elif mode == "pictured":
             diffuse[wall] = backdrop_patterns.draw_pattern(position[wall], rng)
         elif rng.random() < 0.5:  # plain paper, cloth or board
-            _recolor(diffuse, wall, np.exp(rng.uniform(np.log(0.02), np.log(0.9))), rng.uniform(0, 0.3), rng)
+            _recolor(diffuse, wall, _log_uniform(0.02, 0.9, rng), rng.uniform(0, 0.3), rng)
         specular[wall] = rng.uniform(0.03, 0.05) if gloss else rng.uniform(0.0, 0.02)
         rough[wall] = rng.uniform(0.15, 0.6) if gloss else rng.uniform(0.6, 1.0)
         factor[wall] = rng.uniform(0.4, 1.0) if gloss else rng.uniform(0.0, 0.35)
-    maps = (torch.from_numpy(a) for a in (np.clip(diffuse, 0.0, 0.97), np.clip(specular, 0.0, 0.97), rough))
-    return replace(surface, **dict(zip(("diffuse", "specular", "roughness"), maps))), torch.from_numpy(factor)
+    diffuse, specular, rough, factor = (
+        torch.from_numpy(a) for a in (np.clip(diffuse, 0.0, 0.97), np.clip(specular, 0.0, 0.97), rough, factor)
+    )
+    return replace(surface, diffuse=diffuse, specular=specular, roughness=rough), factor
 
 
-def _tone(diffuse: Floats, where: NDArray[np.bool_]) -> float:
-    """Mean albedo."""
-    return float(diffuse[where].mean()) if where.any() else 0.2
+def _log_uniform(low: float, high: float, rng: np.random.Generator) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
-def _recolor(
-    diffuse: Floats, where: NDArray[np.bool_], level: float, contrast: float, rng: np.random.Generator
-) -> None:
+def _recolor(diffuse: Floats, where: Bools, level: float, contrast: float, rng: np.random.Generator) -> None:
     """Set the mean albedo to `level`, nearly gray in half of the cases, and scale the pattern's contrast; in place."""
-    pattern = diffuse[where] / max(_tone(diffuse, where), 1e-3)
+    pattern = diffuse[where] / max(diffuse[where].mean(), 1e-3)
     hue = np.exp(rng.normal(0, rng.choice([0.03, 0.3]), 3))
     diffuse[where] = np.clip(level * hue * (1 - contrast + contrast * pattern), 0.002, 0.95)
-
-
-def _soften(lit: NDArray[np.bool_], at: NDArray[np.intp], size: tuple[int, int], rng: np.random.Generator) -> Floats:
-    """Lit pixels (M,) with soft edges of shadows, because the flash has a size."""
-    image = np.ones(size, np.float32)
-    image.reshape(-1)[at] = lit
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), rng.uniform(0.4, 2.5)).reshape(-1)[at])
 
 
 def _light(
@@ -185,57 +163,30 @@ def _light(
     squared = (to_light**2).sum(dim=1)
     rays = torch.from_numpy(v).float()
     way = frames.to_ray_frame(to_light / squared.sqrt()[:, None], rays)
-    irradiance = torch.from_numpy(lit) * float(view.distance) ** 2 / squared
+    irradiance = torch.from_numpy(lit) * view.distance**2 / squared
     normal = frames.lifted(frames.to_ray_frame(surface.normal, rays))
-    stokes = shade.stokes(
-        normal, surface.diffuse.float(), surface.specular.float(), surface.roughness.float(), surface.ior, way,
-        irradiance,
-    )  # fmt: skip
+    stokes = shade.stokes(normal, surface.diffuse, surface.specular, surface.roughness, surface.ior, way, irradiance)
     stokes[1:] *= polarizing[None, :, None]
-    fill = float(np.exp(rng.uniform(np.log(5e-4), np.log(0.08))))
-    stokes[0] += fill * surface.diffuse * (0.4 + 0.6 * normal[:, 2:])
+    stokes[0] += _log_uniform(5e-4, 0.08, rng) * surface.diffuse * (0.4 + 0.6 * normal[:, 2:])
     return np.asarray(stokes.numpy(), dtype=np.float32)
 
 
-def _add_chart(
-    image: Floats, mask: NDArray[np.bool_], touching: float, rng: np.random.Generator
-) -> tuple[NDArray[np.bool_], Floats | None]:
+def _add_chart(image: Floats, mask: Bools, touching: float, rng: np.random.Generator) -> tuple[Bools, Floats | None]:
     """Draw a ColorChecker next to or behind the object into S0; returns its found area (H, W) and corners (4, 2).
 
     One in fourteen is not found.
     """
     height, width = mask.shape
-    none = np.zeros(mask.shape, bool), None
     frame = rng.uniform(0.15, 0.5)
     picture, ratio = _chart_picture(frame), (4 + 2 * frame) / (6 + 2 * frame)
-    best: tuple[float, Floats] | None = None
-    near = rng.random() < touching
-    distance = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3)
-    for _ in range(14):
-        across = max(height, width) * rng.uniform(0.14, 0.36)
-        turn = rng.normal(0, 0.08) + rng.choice([0, np.pi / 2, -np.pi / 2, np.pi], p=[0.7, 0.12, 0.12, 0.06])
-        half = np.array([[-1, -ratio], [1, -ratio], [1, ratio], [-1, ratio]]) * across / 2
-        quad = half @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-        quad *= 1 + rng.normal(0, 0.02, (4, 2))
-        quad += rng.uniform(0, 1, 2) * [width, height]
-        zone = _fill(quad, mask.shape)
-        if (quad < 0).any() or (quad >= [width, height]).any() or not zone.any():
-            continue
-        hidden = mask[zone].mean()
-        if hidden > (0.06 if near else 0.0):
-            continue
-        cost = float(distance[zone].min()) if near else rng.uniform()
-        if best is None or cost < best[0]:
-            best = cost, quad
-    if best is None:
-        return none
-    quad = best[1]
+    quad = _place_chart(mask, ratio, rng.random() < touching, rng)
+    if quad is None:
+        return np.zeros(mask.shape, bool), None
     tall, wide = picture.shape[:2]
     source = np.array([[0, 0], [wide, 0], [wide, tall], [0, tall]], np.float32) - 0.5
     matrix = cv2.getPerspectiveTransform(source, quad.astype(np.float32))
     laid = cv2.warpPerspective(picture, matrix, (width, height), flags=cv2.INTER_AREA)
-    cover = cv2.warpPerspective(np.ones((tall, wide), np.float32), matrix, (width, height))
-    cover *= ~mask
+    cover = cv2.warpPerspective(np.ones((tall, wide), np.float32), matrix, (width, height)) * ~mask
     y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
     light = rng.uniform(0.6, 1.4) * (1 + rng.normal(0, 0.08) * x + rng.normal(0, 0.08) * y)
     sheen = rng.uniform(0, 0.01)
@@ -244,21 +195,40 @@ def _add_chart(
     inner = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * frame * _PITCH + source  # outer corners of the patches
     corners = cv2.perspectiveTransform(inner[None].astype(np.float32), matrix)[0]
     corners += rng.normal(0, 0.004 * max(height, width), (4, 2)) * (rng.random() < 0.3)
-    return none if rng.random() < 1 / 14 else (_fill(corners, mask.shape), corners)
+    if rng.random() < 1 / 14:
+        return np.zeros(mask.shape, bool), None
+    return _fill(corners, mask.shape), corners
 
 
-def _fill(quad: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _place_chart(mask: Bools, ratio: float, near: bool, rng: np.random.Generator) -> Floats | None:
+    """Corners (4, 2) of the best of 14 random places: `near` the object, else any; None if none is free."""
+    size = np.array(mask.shape[::-1])
+    found: list[tuple[float, Floats]] = []
+    distance = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3)
+    for _ in range(14):
+        across = size.max() * rng.uniform(0.14, 0.36)
+        turn = rng.normal(0, 0.08) + rng.choice([0, np.pi / 2, -np.pi / 2, np.pi], p=[0.7, 0.12, 0.12, 0.06])
+        half = np.array([[-1, -ratio], [1, -ratio], [1, ratio], [-1, ratio]]) * across / 2
+        quad = half @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+        quad *= 1 + rng.normal(0, 0.02, (4, 2))
+        quad += rng.uniform(0, 1, 2) * size
+        zone = _fill(quad, mask.shape)
+        if (quad < 0).any() or (quad >= size).any() or not zone.any():
+            continue
+        if mask[zone].mean() <= (0.06 if near else 0.0):
+            found.append((float(distance[zone].min()) if near else rng.uniform(), quad))
+    return min(found, key=lambda place: place[0])[1] if found else None
+
+
+def _fill(quad: Floats, shape: tuple[int, ...]) -> Bools:
     """Pixels (H, W) inside a quadrangle (4, 2)."""
     return np.asarray(cv2.fillConvexPoly(np.zeros(shape, np.uint8), np.round(quad).astype(np.int32), 1) > 0)
 
 
 def _chart_picture(frame: float) -> Floats:
     """A chart seen from the front, (h, w, 3), with a black frame `frame` patches wide."""
+    patch = np.pad(np.ones((_PITCH - 2, _PITCH - 2, 1), np.float32), ((1, 1), (1, 1), (0, 0)))
     colors = shipped_data.colorchecker().rec709.reshape(4, 6, 3)
+    picture = np.maximum(np.kron(colors, patch), 0.03).astype(np.float32)
     border = round(frame * _PITCH)
-    out = np.full((4 * _PITCH + 2 * border, 6 * _PITCH + 2 * border, 3), 0.03, np.float32)
-    for row in range(4):
-        for column in range(6):
-            y, x = border + row * _PITCH, border + column * _PITCH
-            out[y + 1 : y + _PITCH - 1, x + 1 : x + _PITCH - 1] = colors[row, column]
-    return out
+    return np.pad(picture, ((border, border), (border, border), (0, 0)), constant_values=0.03)

@@ -1,27 +1,32 @@
-"""Training of the mask's network, and its loss: `python -m polcap.training.mask_train DATA OUT MINUTES`.
+"""Training of the mask's network: `python -m polcap.training.mask_train DATA OUT MINUTES`.
 
-Pictures are made first (`mask_pictures.py`). Each step has two passes: over whole pictures at a reduced size, then
-over parts of them, with the first result as a hint. A stopped run continues. Writes OUT/mask.onnx, last.pt,
-metrics.csv and watch.csv.
+Pictures are made first; each follows from its number. Each step reads some with random light, noise and crop, and has
+two passes: over whole pictures at a reduced size, then over parts of them, with the first result as a hint. A stopped
+run continues. Writes OUT/mask.onnx, last.pt, metrics.csv and watch.csv. Picture files OUT/pictures/000017.npy hold
+(H, W, 7) fp16: S0 in linear Rec.709, S1 and S2 summed over colors, object, chart.
 """
 
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import ClassVar
 
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from polcap.images import Floats
+from polcap.formats import atomic
+from polcap.images import Bools, Floats
 from polcap.stages.mask.mask_channels import CHANNELS, ENCODING, SIZE_MULTIPLE, ReducedPicture, brightness, encode
-from polcap.training import loop, mask_pictures, unet
+from polcap.synth.mesh_tracer import Tracer, Triangles, centred
+from polcap.training import loop, mask_scenes, mask_views, materials, random_shapes, traced_views, unet
 
+_PICTURES, _SIZE = 1600, (288, 384)  # H, W, traced; files have half of it
+_VIEWS, _SCENES = 3, 2  # views of each mesh, scenes of each view
+_MISSED = 0.15  # share of charts that are in the picture but not found
+_RATE = 1.5e-3  # of Muon
 _FIRST_WIDTHS = (80, 96, 112, 128, 144)  # px, of pictures in the first pass: one is drawn for each step
 _FIRST_WIDTH = 112  # px, in validation and in use
 _PARTS, _PART_SIZE = 4, (96, 128)  # pictures of a step in the second pass; height and width of their parts, px
@@ -30,34 +35,113 @@ _REPEATED = 0.3  # share of steps with another second pass before, as the source
 _INSERTED = 0.12  # share of pictures into which the object of another one is inserted
 
 
-@dataclass(frozen=True)
-class MaskTrainingOptions:
-    """One training run of the mask's network."""
-
-    data: Path  # holds meshes/ and materials/
-    out: Path
-    minutes: float = 40.0  # of training, resumed parts included
-    pictures: int = 1600
-    rate: float = 1.5e-3  # of Muon
-    seed: int = 1
-
-
-def main(options: MaskTrainingOptions) -> Path:
-    """Make the missing pictures, train, export."""
-    folder, model = options.out / "pictures", options.out / "mask.onnx"
-    mask_pictures.make_pictures(folder, options.data, options.pictures)
+def main(data: Path, out: Path, minutes: float) -> None:
+    """Make the missing pictures, train for `minutes`, export."""
     torch.set_num_threads(1)
-    torch.manual_seed(options.seed)
-    training = MaskTraining(options.rate, sorted(folder.glob("[0-9]*.npy")), options.seed)
-    training.train(options.minutes, options.out)
-    training.export(model)
-    return model
+    make_pictures(out / "pictures", data, _PICTURES)
+    torch.manual_seed(1)
+    training = MaskTraining(_RATE, sorted((out / "pictures").glob("[0-9]*.npy")))
+    training.train(minutes, out)
+    training.export(out / "mask.onnx")
+
+
+def make_pictures(out: Path, data: Path, count: int) -> None:
+    """Make those of pictures 0…count − 1 that the folder lacks, from the training meshes and materials."""
+    files = traced_views.training_meshes(data)
+    library = materials.MaterialLibrary(data / "materials" / "train", torch.device("cpu"))
+    each = _VIEWS * _SCENES
+    for group in range(-(-count // each)):
+        paths = [out / f"{number:06d}.npy" for number in range(group * each, (group + 1) * each)]
+        if all(path.exists() for path in paths):
+            continue
+        for path, picture in zip(paths, _make_group(files, library, group)):
+            with atomic.path(path) as temporary, temporary.open("wb") as file:
+                np.save(file, picture)
+
+
+def _make_group(files: list[Path], library: materials.MaterialLibrary, group: int) -> Iterator[Floats]:
+    """The pictures of one object, or of two or three side by side."""
+    rng = np.random.default_rng([5, group])
+    torch.manual_seed(int(rng.integers(1 << 62)))
+    if rng.random() < 0.75:
+        mesh = _draw_mesh(files, rng)
+    else:
+        mesh = mask_views.side_by_side([_draw_mesh(files, rng) for _ in range(rng.integers(2, 4))], rng)
+    tracer, made = Tracer(mesh), 0
+    while made < _VIEWS:
+        view = mask_views.trace_view(tracer, mask_views.draw_kind(rng), _SIZE, rng)
+        if view is None:
+            continue
+        made += 1
+        for _ in range(_SCENES):
+            mode = rng.choice(list(mask_scenes.MODES), p=list(mask_scenes.MODES.values()))
+            yield pack(mask_scenes.make_scene(view, library, mode, rng))
+
+
+def _draw_mesh(files: list[Path], rng: np.random.Generator) -> Triangles:
+    """A scanned mesh, or a random shape, with branches or without."""
+    kind = rng.random()
+    if kind < 0.4:
+        return centred(traced_views.read_mesh(files[rng.integers(len(files))]))
+    return random_shapes.compose(rng) if kind < 0.7 else random_shapes.compose_with_branches(rng)
+
+
+def pack(picture: mask_scenes.MaskScene) -> Floats:
+    """Layers (H/2, W/2, 7) of a file: means of 2 × 2 pixels; radiance in units of its 95th percentile."""
+    stokes = picture.stokes / max(float(np.percentile(picture.stokes[0].mean(-1), 95)), 1e-9)
+    sums = np.moveaxis(stokes[1:].sum(-1), 0, -1)
+    whole = np.concatenate([stokes[0], sums, picture.mask[..., None], picture.chart[..., None]], axis=-1)
+    height, width, count = whole.shape
+    blocks = np.clip(whole, -6e4, 6e4).reshape(height // 2, 2, width // 2, 2, count)
+    return np.asarray(blocks.mean((1, 3)), np.float16)
+
+
+def load_varied(file: Path, rng: np.random.Generator, other: Path | None = None) -> tuple[ReducedPicture, Floats]:
+    """Read a picture with random light, crop, mirroring and noise; returns it and its truth (H, W).
+
+    other: file of another picture; its object is inserted into this one.
+    """
+    layers = np.load(file).astype(np.float32)
+    if other is not None:
+        more = np.load(other).astype(np.float32)
+        more[..., 6] = 0
+        cover = more[..., 5:6] > 0.5
+        layers = np.where(cover & (layers[..., 6:] < 0.5), more, layers)
+    layers = _crop(layers, rng)
+    stokes, mask, chart = layers[..., :5], layers[..., 5], layers[..., 6] > 0.5
+    if not chart.any() and rng.random() < 0.3:
+        stokes = stokes[..., [*rng.permutation(3), 3, 4]]
+    if rng.random() < 0.5:
+        stokes, mask, chart = stokes[:, ::-1] * [1, 1, 1, 1, -1], mask[:, ::-1], chart[:, ::-1]
+    if rng.random() < 0.1:  # camera upside down
+        stokes, mask, chart = stokes[::-1] * [1, 1, 1, 1, -1], mask[::-1], chart[::-1]
+    light = np.exp(rng.normal(0, 0.25)) * mask + np.exp(rng.normal(0, 0.25)) * (1 - mask)
+    light = light * (1 - chart) + chart
+    tint = np.exp(rng.normal(0, 0.1, (2, 3)))
+    color = stokes[..., :3] * light[..., None] * np.where((mask > 0)[..., None], tint[0], tint[1])
+    sums = np.stack([color.sum(-1), *(np.moveaxis(stokes[..., 3:], -1, 0) * light * rng.uniform(0.6, 1.1))])
+    if rng.random() < _MISSED:
+        chart = np.zeros_like(chart)
+    return mask_scenes.simulate_measurement(color, sums, chart, rng), mask
+
+
+def _crop(layers: Floats, rng: np.random.Generator) -> Floats:
+    """The picture (H, W, 7), or in half of the cases a part with enough of the object, enlarged to the same size."""
+    height, width = layers.shape[:2]
+    for _ in range(4 if rng.random() < 0.5 else 0):
+        share = rng.uniform(0.6, 0.95)
+        tall, wide = int(height * share), int(width * share)
+        y, x = rng.integers(height - tall + 1), rng.integers(width - wide + 1)
+        part = layers[y : y + tall, x : x + wide]
+        if 0.01 < part[..., 5].mean() < 0.9:
+            return np.asarray(cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR))
+    return layers
 
 
 class MaskTraining(loop.PictureTraining):
     """The mask's network in training."""
 
-    schedule = loop.Schedule(hold=0.35, warm_up=50, averaging=0.998)
+    hold, warm_up, averaging = 0.35, 50, 0.998
     held_out, per_step = 40, 8
     output = "logit"
     metadata: ClassVar[Mapping[str, str]] = {
@@ -65,48 +149,45 @@ class MaskTraining(loop.PictureTraining):
         "size_multiple": str(SIZE_MULTIPLE), "outputs": "logit: of being the object",
     }  # fmt: skip
 
-    def __init__(self, rate: float, files: list[Path], seed: int = 1) -> None:
-        super().__init__(unet.mask_network(), rate, files, seed)
+    def __init__(self, rate: float, files: list[Path]) -> None:
+        super().__init__(unet.mask_network(), rate, files)
 
     def advance(self, batch: list[Path], progress: float) -> dict[str, float]:
         """Do one step; returns the losses of both passes."""
         rng = self.random
         others = [batch[n - 1] if rng.random() < _INSERTED else None for n in range(len(batch))]
-        examples = [mask_pictures.load_varied(file, rng, other) for file, other in zip(batch, others)]
+        examples = [load_varied(file, rng, other) for file, other in zip(batch, others)]
         width = int(rng.choice(_FIRST_WIDTHS))
-        truths = stack([reduce(truth, width) for _, truth in examples])
-        logits = self.network(stack_channels([encode_reduced(picture, width) for picture, _ in examples]))
+        truths = _stack([_reduce(truth, width) for _, truth in examples])
+        logits = self.network(_stack_channels([_encode_reduced(picture, width) for picture, _ in examples]))
         logits = logits[..., : truths.shape[2], :width]
         loss_whole = mask_loss(logits, truths)
         loss_whole.backward()
         chances = torch.sigmoid(logits.detach())[:, 0].numpy()
-        parts = [cut_part(*example, chance, rng) for example, chance in zip(examples[:_PARTS], chances)]
-        channels = stack_channels([channels for channels, _ in parts])
+        parts = [_cut_part(*example, chance, rng) for example, chance in zip(examples[:_PARTS], chances)]
+        channels = _stack_channels([channels for channels, _ in parts])
         if rng.random() < _REPEATED:
             with torch.no_grad():
                 channels[:, CHANNELS.index("chance")] = 2 * torch.sigmoid(self.network(channels)[:, 0]) - 1
-        loss_part = mask_loss(self.network(channels), stack([truth for _, truth in parts]))
+        loss_part = mask_loss(self.network(channels), _stack([truth for _, truth in parts]))
         loss_part.backward()
         self.update(progress)
         self.samples += len(batch)
         return {"loss_whole": float(loss_whole.detach()), "loss_part": float(loss_part.detach())}
 
+    @torch.no_grad()  # type: ignore[untyped-decorator]
     def validate(self, out: Path) -> dict[str, float]:
         """IoU of both passes on held-out pictures; here the second pass sees the whole picture."""
-        coarse, fine = [], []
-        with self.averaged() as network, torch.no_grad():
-            for number, file in enumerate(self.files[: self.held_out]):
-                picture, truth = mask_pictures.load_varied(file, np.random.default_rng(number))
-                channels = encode_reduced(picture, _FIRST_WIDTH)
-                chance = torch.sigmoid(network(stack_channels([channels])))[0, 0].numpy()
-                hint = cv2.resize(
-                    chance[: channels.shape[1], : channels.shape[2]], truth.shape[::-1], interpolation=cv2.INTER_LINEAR
-                )
-                channels = encode(picture, brightness(picture.color), hint)
-                logit = network(stack_channels([channels]))[0, 0].numpy()
-                coarse.append(iou(hint > 0.5, truth > 0.5))
-                fine.append(iou(logit > 0, truth > 0.5))
-        return {"iou_whole": float(np.mean(coarse)), "iou": float(np.mean(fine)), "iou_least": min(fine)}
+        rows = []
+        for number, file in enumerate(self.files[: self.held_out]):
+            picture, truth = load_varied(file, np.random.default_rng(number))
+            channels = _encode_reduced(picture, _FIRST_WIDTH)
+            chance = torch.sigmoid(self.average(_stack_channels([channels])))[0, 0].numpy()
+            hint = cv2.resize(chance[: channels.shape[1], : channels.shape[2]], truth.shape[::-1])
+            logit = self.average(_stack_channels([encode(picture, brightness(picture.color), hint)]))[0, 0].numpy()
+            rows.append([_iou(found, truth > 0.5) for found in (hint > 0.5, logit > 0)])
+        coarse, fine = np.array(rows).T
+        return {"iou_whole": float(coarse.mean()), "iou": float(fine.mean()), "iou_least": float(fine.min())}
 
 
 def mask_loss(logits: Tensor, truth: Tensor) -> Tensor:
@@ -121,16 +202,15 @@ def mask_loss(logits: Tensor, truth: Tensor) -> Tensor:
     return entropy + 0.3 * (1 - (both + 1) / (either + 1)).mean()
 
 
-def encode_reduced(picture: ReducedPicture, width: int) -> Floats:
+def _encode_reduced(picture: ReducedPicture, width: int) -> Floats:
     """Channels (N, h, width) of the whole picture, reduced."""
-    smaller = ReducedPicture(
-        reduce(picture.color, width), np.stack([reduce(s, width) for s in picture.stokes]),
-        reduce(picture.chart.astype(np.float32), width) > 0.5, np.stack([reduce(p, width) for p in picture.place]),
-    )  # fmt: skip
+    smaller = _map_layers(picture, lambda image: _reduce(image, width))
     return encode(smaller, brightness(smaller.color))
 
 
-def cut_part(picture: ReducedPicture, truth: Floats, chance: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
+def _cut_part(
+    picture: ReducedPicture, truth: Floats, chance: Floats, rng: np.random.Generator
+) -> tuple[Floats, Floats]:
     """Channels and truth of a rectangle near the outline; the hint is `chance` (h, w), the result of the first pass.
 
     Four in ten are placed where the first pass is wrong.
@@ -144,43 +224,44 @@ def cut_part(picture: ReducedPicture, truth: Floats, chance: Floats, rng: np.ran
     wrong = np.argwhere((hint > 0.5) != (solid > 0))
     places = wrong if len(wrong) and rng.random() < 0.4 else outline
     y, x = places[rng.integers(len(places))] if len(places) else (height // 2, width // 2)
-    y, x = (
-        int(np.clip(a - rng.uniform(0.2, 0.8) * side, 0, n - side))
-        for a, n, side in ((y, height, tall), (x, width, wide))
-    )
+    y = int(np.clip(y - rng.uniform(0.2, 0.8) * tall, 0, height - tall))
+    x = int(np.clip(x - rng.uniform(0.2, 0.8) * wide, 0, width - wide))
     kind = cv2.INTER_AREA if tall > _PART_SIZE[0] else cv2.INTER_LINEAR
 
     def cut(image: Floats) -> Floats:
         part = np.ascontiguousarray(image[y : y + tall, x : x + wide])
         return np.asarray(cv2.resize(part, _PART_SIZE[::-1], interpolation=kind))
 
-    part = ReducedPicture(
-        cut(picture.color), np.stack([cut(s) for s in picture.stokes]), cut(picture.chart.astype(np.float32)) > 0.5,
-        np.stack([cut(p) for p in picture.place]),
-    )  # fmt: skip
-    return encode(part, brightness(picture.color), cut(hint)), cut(truth)
+    return encode(_map_layers(picture, cut), brightness(picture.color), cut(hint)), cut(truth)
 
 
-def reduce(image: Floats, width: int) -> Floats:
+def _map_layers(picture: ReducedPicture, change: Callable[[Floats], Floats]) -> ReducedPicture:
+    """The picture with `change` applied to each image."""
+    chart = change(picture.chart.astype(np.float32)) > 0.5
+    stokes, place = (np.stack([change(layer) for layer in layers]) for layers in (picture.stokes, picture.place))
+    return ReducedPicture(change(picture.color), stokes, chart, place)
+
+
+def _reduce(image: Floats, width: int) -> Floats:
     """Area means of an image (H, W, ·) at `width` pixels across."""
     size = width, round(image.shape[0] * width / image.shape[1])
     return np.asarray(cv2.resize(np.asarray(image, np.float32), size, interpolation=cv2.INTER_AREA))
 
 
-def stack_channels(channels: list[Floats]) -> Tensor:
+def _stack_channels(channels: list[Floats]) -> Tensor:
     """Batch of channels (N, H, W) of one size; the edge is repeated up to a size that the network takes."""
     more = [(0, -side % SIZE_MULTIPLE) for side in channels[0].shape[1:]]
     padded = np.pad(np.stack(channels), [(0, 0), (0, 0), *more], mode="edge")
     return torch.from_numpy(padded).contiguous(memory_format=torch.channels_last)
 
 
-def stack(truths: list[Floats]) -> Tensor:
+def _stack(truths: list[Floats]) -> Tensor:
     return torch.from_numpy(np.stack(truths)[:, None].astype(np.float32))
 
 
-def iou(found: NDArray[np.bool_], truth: NDArray[np.bool_]) -> float:
+def _iou(found: Bools, truth: Bools) -> float:
     return float((found & truth).sum() / max((found | truth).sum(), 1))
 
 
 if __name__ == "__main__":
-    main(MaskTrainingOptions(Path(sys.argv[1]), Path(sys.argv[2]), float(sys.argv[3])))
+    main(Path(sys.argv[1]), Path(sys.argv[2]), float(sys.argv[3]))

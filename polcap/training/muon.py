@@ -9,10 +9,21 @@ Jordan et al., Muon: an optimizer for hidden layers in neural networks, 2024.
 Liu et al., Muon is scalable for LLM training, 2025: length of the step.
 """
 
+from functools import cache
+
 import torch
 from torch import Tensor
 
-from polcap.training import precision
+
+@cache
+def compute_type(device: torch.device) -> torch.dtype:
+    """Fastest type for convolutions and matrix products: bfloat16 where the machine has it, else float32.
+
+    bfloat16 doubles the speed of a GPU, and of a CPU with bfloat16 instructions. On other CPUs it is emulated and a
+    dozen times slower.
+    """
+    half = device.type != "cpu" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    return torch.bfloat16 if half else torch.float32
 
 
 class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without types here
@@ -44,7 +55,7 @@ def orthogonal(matrix: Tensor) -> Tensor:
     Singular values end between 0.7 and 1.2. More steps would bring them to 1; training does not need it.
     """
     wide = matrix if matrix.shape[-2] <= matrix.shape[-1] else matrix.mT
-    x = (wide / (torch.linalg.matrix_norm(wide, keepdim=True) + 1e-7)).to(precision.compute_type(matrix.device))
+    x = (wide / (torch.linalg.matrix_norm(wide, keepdim=True) + 1e-7)).to(compute_type(matrix.device))
     for _ in range(5):
         square = x @ x.mT
         x = torch.baddbmm(x, torch.baddbmm(square, square, square, beta=-4.7750, alpha=2.0315), x, beta=3.4445)

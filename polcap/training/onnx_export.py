@@ -3,6 +3,7 @@
 Pictures may have any size. Weights are converted to fp32 when a model is opened, so that arithmetic is fp32.
 """
 
+import copy
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,12 +24,11 @@ from polcap.training import main_network
 OPSET = 17
 NATIVE_SIZE = 256  # px of the longer side in inference; larger than in training, measured to be best
 _PREFIX, _HALF = "network.", ".half"  # of the names of stored weights
-_EARLIER_NAMES = {".ask.": ".qkv.", ".tell.": ".proj.", ".share.": ".attention."}
 _GREATEST_IR = 10  # read by onnxruntime 1.20 and later
 
 
-def export_main(network: main_network.MainNetwork, path: Path, facts: Mapping[str, str]) -> int:
-    """Export the main network; `facts` joins its metadata (licence, version, training…). Returns the file size."""
+def export_main(network: main_network.MainNetwork, path: Path, facts: Mapping[str, str]) -> None:
+    """Export the main network; `facts` joins its metadata (licence, version, training…)."""
     metadata = {
         "channels": ",".join(CHANNELS), "encoding": ENCODING, "native_size": str(NATIVE_SIZE),
         "size_multiple": str(main_network.SIZE_MULTIPLE),
@@ -36,18 +36,18 @@ def export_main(network: main_network.MainNetwork, path: Path, facts: Mapping[st
         "in radii of the disc that covers as many pixels as the object; diffuse, specular: linear; "
         "roughness: perceptual; sigma: expected normal error, degrees",
     }  # fmt: skip
-    return export_network(_OrderedOutputs(network), path, main_network.OUTPUTS, metadata | dict(facts))
+    export_network(_OrderedOutputs(network), path, main_network.OUTPUTS, metadata | dict(facts))
 
 
-def export_network(network: nn.Module, path: Path, outputs: tuple[str, ...], metadata: Mapping[str, str]) -> int:
+def export_network(network: nn.Module, path: Path, outputs: tuple[str, ...], metadata: Mapping[str, str]) -> None:
     """Export a network from channels (1, N, H, W) to named maps, with the metadata that `formats/onnx.py` requires."""
-    names = metadata["channels"].split(",")
     side = 2 * int(metadata["size_multiple"])
-    dynamic = {name: {2: "height", 3: "width"} for name in ("channels", *outputs)}
+    sample = torch.zeros(1, len(metadata["channels"].split(",")), side, side)
     with atomic.path(path) as temporary:
         torch.onnx.export(
-            network.eval().float(), (torch.zeros(1, len(names), side, side),), str(temporary),
-            input_names=["channels"], output_names=list(outputs), dynamic_axes=dynamic,
+            copy.deepcopy(network).cpu().float().eval(), (sample,), str(temporary),
+            input_names=["channels"], output_names=list(outputs),
+            dynamic_axes={name: {2: "height", 3: "width"} for name in ("channels", *outputs)},
             opset_version=OPSET, dynamo=False, do_constant_folding=False,  # folding would rename weights
         )  # fmt: skip
         graph = onnx.load(str(temporary))
@@ -56,13 +56,10 @@ def export_network(network: nn.Module, path: Path, outputs: tuple[str, ...], met
         helper.set_model_props(graph, dict(metadata))
         onnx.checker.check_model(graph)
         onnx.save(graph, str(temporary))
-    return path.stat().st_size
 
 
 def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Weights of a model written by `export_main`, as the network's state, and its metadata.
-
-    The file stores equal tensors once, so that weights without any training may be missing.
 
     Raises
     ------
@@ -74,19 +71,11 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     except (OSError, DecodeError) as error:
         raise InputError(f"{path}: cannot be read as an ONNX model ({error}); name one that polcap wrote") from error
     state = {
-        _present_name(tensor.name): torch.tensor(numpy_helper.to_array(tensor)).float()
+        tensor.name.removeprefix(_PREFIX).removesuffix(_HALF): torch.tensor(numpy_helper.to_array(tensor)).float()
         for tensor in graph.graph.initializer
         if tensor.name.startswith(_PREFIX)
     }
     return state, {entry.key: entry.value for entry in graph.metadata_props}
-
-
-def _present_name(name: str) -> str:
-    """Present name of a stored weight; models up to number 8 were written with other names."""
-    name = name.removeprefix(_PREFIX).removesuffix(_HALF)
-    for before, now in _EARLIER_NAMES.items():
-        name = name.replace(before, now)
-    return name
 
 
 class _OrderedOutputs(nn.Module):  # type: ignore[misc]  # torch comes without types here

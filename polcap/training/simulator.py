@@ -83,9 +83,10 @@ class Simulator:
     """Traced views and materials on one device; draws batches from torch's global random state."""
 
     def __init__(
-        self, views: dict[str, NDArray[Any]], library: materials.MaterialLibrary, device: torch.device
+        self, views: dict[str, NDArray[Any]], library: Any, device: torch.device, *, bounces: bool = True
     ) -> None:
-        self.library, self.device = library, device
+        """library: `MaterialLibrary`; bounces: whether parts of an object light each other."""
+        self.library, self.device, self.bounces = library, device, bounces
         self.size = views["mask"].shape[1]
         self.camera = views["camera"]
         self.views = {
@@ -111,7 +112,9 @@ class Simulator:
         inside = np.flatnonzero(mask)
         owner, at = np.divmod(inside, area)
         view = pick[owner]  # of each pixel
-        met, escaped = self._seen_pixels(view, y[at], x[at], order, mask, owner)
+        met, escaped = np.full((len(at), bounced_light.RAYS), -1), np.zeros(len(at), np.float32)
+        if self.bounces:
+            met, escaped = self._seen_pixels(view, y[at], x[at], order, mask, owner)
         rows = (view * full + y[at]) * full + x[at]
 
         def tensor(array: NDArray[Any]) -> Tensor:

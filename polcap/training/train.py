@@ -3,11 +3,9 @@
 With a budget of pictures, an uninterrupted run gives the same weights for the same seed on the same machine.
 """
 
-import queue
-import threading
-from collections.abc import Callable, Generator
+from collections import deque
+from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,10 +16,12 @@ from torch import Tensor
 
 from polcap.errors import InputError
 from polcap.formats.maps import png
-from polcap.training import loop, loss, main_network, materials, onnx_export, precision, traced_views
+from polcap.training import loop, loss, main_network, materials, onnx_export, traced_views
 from polcap.training.simulator import Batch, Simulator
 from polcap.training.validation import HeldOutPictures
 from polcap.training.variants import VARIANTS
+
+_AHEAD = 4  # batches that wait for the network
 
 
 @dataclass(frozen=True)
@@ -89,14 +89,16 @@ def main(options: TrainingOptions) -> Path:
         network.load(options.out / "last.pt")
     elif options.start:
         network.begin(options.start, options.done)
+    views = preset.views if options.views is None else options.views
+    procedural = preset.procedural if options.procedural is None else options.procedural
+    recipe = traced_views.ViewsRecipe(views=views, procedural=procedural, size=preset.size, seed=13)
+    cache = traced_views.open_cache(options.out / "views", traced_views.training_meshes(options.data), recipe)
     library = materials.MaterialLibrary(options.data / "materials" / "train", device)
-    simulator = Simulator(_open_views(options, preset), library, device)
     network.held_out = HeldOutPictures(options.data, options.out / "watch", device)
     torch.set_num_threads(1)
     budget = loop.Budget(options.minutes, options.samples)
-    batches = _make_ahead(
-        simulator, preset, options.seed + network.step, network.samples, lambda made: network.progress(budget, made)
-    )
+    made = _make_batches(Simulator(cache, library, device), preset, network, budget, options.seed + network.step)
+    batches = _run_ahead(made)
     loop.run(network, lambda: [next(batches) for _ in range(learners)], budget, options.out)
     batches.close()
     network.export(options.out / "model.onnx", version=options.out.resolve().name)
@@ -110,59 +112,38 @@ def _check(options: TrainingOptions) -> None:
     last, test_meshes = options.out / "last.pt", options.data / "meshes" / "test"
     if options.resume and options.start:
         raise InputError(f"--resume continues from {last}, --start starts from {options.start}; give one of them")
+    if options.resume and not last.exists():
+        raise InputError(f"{last} does not exist, so there is nothing to resume; train without --resume first")
     if last.exists() and not options.resume:
         raise InputError(f"{last} exists already; continue from it with --resume, or choose another --out")
     if not any(test_meshes.glob("*.npz")):
         raise InputError(f"{test_meshes} holds no mesh; put at least one there, for validation")
 
 
-def _open_views(options: TrainingOptions, preset: TrainingPreset) -> dict[str, Any]:
-    """Views of all training meshes and random shapes; traced first if the cache is empty."""
-    meshes = traced_views.training_meshes(options.data)
-    views = preset.views if options.views is None else options.views
-    procedural = preset.procedural if options.procedural is None else options.procedural
-    recipe = traced_views.ViewsRecipe(views=views, procedural=procedural, size=preset.size, seed=13)
-    return traced_views.open_cache(options.out / "views", meshes, recipe)
+def _make_batches(
+    simulator: Simulator, preset: TrainingPreset, network: loop.Trainee, budget: loop.Budget, seed: int
+) -> Iterator[Batch]:
+    """Endless batches that follow from the seed: nothing else draws from torch's global random state."""
+    torch.manual_seed(seed)
+    chooser, made = np.random.default_rng(seed), network.samples
+    while True:
+        early = budget.spent(made, network.elapsed) < 0.5
+        size = int(chooser.choice(preset.sizes, p=preset.early if early else preset.late))
+        count = max(preset.pixels // size**2, 1)
+        made += count
+        yield simulator.draw_batch(count, size)
 
 
-def _make_ahead(
-    simulator: Simulator, preset: TrainingPreset, seed: int, made: int, progress: Callable[[int], float]
-) -> Generator[Batch, None, None]:
-    """Endless batches, made in a thread while the network learns from earlier ones.
-
-    Only this thread draws from torch's global random state, so batches follow from the seed. `made`: pictures made
-    before; progress(made) is the spent share of the budget.
-    """
-    waiting: queue.Queue[Batch | BaseException] = queue.Queue(maxsize=4)
-    ended = threading.Event()
-
-    def make() -> None:
-        nonlocal made
-        try:
-            torch.set_num_threads(1)
-            torch.manual_seed(seed)
-            chooser = np.random.default_rng(seed)
-            while not ended.is_set():
-                size = int(chooser.choice(preset.sizes, p=preset.early if progress(made) < 0.5 else preset.late))
-                count = max(preset.pixels // size**2, 1)
-                made += count
-                waiting.put(simulator.draw_batch(count, size))
-        except BaseException as error:  # raised again by the loop
-            waiting.put(error)
-
-    maker = threading.Thread(target=make, daemon=True)
-    maker.start()
+def _run_ahead(batches: Iterator[Batch]) -> Generator[Batch, None, None]:
+    """The same batches, made in a thread while the network learns from earlier ones."""
+    pool = ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,))
     try:
+        waiting = deque(pool.submit(next, batches) for _ in range(_AHEAD))
         while True:
-            batch = waiting.get()
-            if isinstance(batch, BaseException):
-                raise batch
-            yield batch
+            waiting.append(pool.submit(next, batches))
+            yield waiting.popleft().result()
     finally:
-        ended.set()
-        while maker.is_alive():
-            with suppress(queue.Empty):
-                waiting.get(timeout=0.1)
+        pool.shutdown(cancel_futures=True)
 
 
 class NetworkTraining(loop.Trainee):
@@ -172,7 +153,7 @@ class NetworkTraining(loop.Trainee):
     other once per step use a busy machine better than threads that share each operation.
     """
 
-    schedule = loop.Schedule(hold=0.2, warm_up=100, averaging=0.999, burst=200.0)
+    hold, warm_up, averaging, burst = 0.2, 100, 0.999, 200.0
     network: main_network.MainNetwork
 
     def __init__(
@@ -195,20 +176,16 @@ class NetworkTraining(loop.Trainee):
     def advance(self, batch: list[Batch], progress: float) -> dict[str, float]:
         """Do one step on a batch per learner; returns the mean losses."""
         self.network.train()
-        learned = list(self.pool.map(self._gradient, batch, self.lights))
-        for weight, gradient in zip(self.weights, learned[0][0]):
-            weight.grad = gradient
-        for number, (gradients, _) in enumerate(learned[1:], start=2):  # running mean
-            torch._foreach_lerp_([weight.grad for weight in self.weights], list(gradients), 1 / number)
+        gradients, figures = zip(*self.pool.map(self._gradient, batch, self.lights))
+        for weight, parts in zip(self.weights, zip(*gradients)):
+            weight.grad = sum(parts) / len(parts)
         norm = self.update(progress)
         self.samples += sum(len(one.mask) for one in batch)
-        parts = [figures for _, figures in learned]
-        return {k: float(np.mean([p[k] for p in parts])) for k in parts[0]} | {"gradient": norm}
+        return {name: float(np.mean([f[name] for f in figures])) for name in figures[0]} | {"gradient": norm}
 
     def _gradient(self, batch: Batch, lights: torch.Generator) -> tuple[tuple[Tensor, ...], dict[str, float]]:
         """Gradient of the loss of one batch, and the parts of that loss."""
-        with precision.autocast(self.device):
-            maps = self.network(batch.channels.contiguous(memory_format=torch.channels_last))
+        maps = main_network.run(self.network, batch.channels)
         polarized = VARIANTS[self.network.variant].polarized_loss
         value, figures = loss.total(maps, batch, lights, polarized=polarized)
         return torch.autograd.grad(value, self.weights), figures
@@ -216,15 +193,14 @@ class NetworkTraining(loop.Trainee):
     def validate(self, out: Path) -> dict[str, float]:
         """Mean errors on test meshes; watch.png shows eight of the pictures."""
         assert self.held_out is not None
-        with self.averaged() as network:
-            png.write(out / "watch.png", self.held_out.picture(network))
-            return self.held_out.errors(network)
+        png.write(out / "watch.png", self.held_out.picture(self.average))
+        errors: dict[str, float] = self.held_out.errors(self.average)
+        return errors
 
     def facts(self) -> dict[str, Any]:
         """Shape and variant of the network, and the origin of its first weights."""
-        return {
-            "shape": asdict(self.network.shape), "variant": self.network.variant, "begun": self.begun, "done": self.done
-        }  # fmt: skip
+        shape, variant = asdict(self.network.shape), self.network.variant
+        return {"shape": shape, "variant": variant, "begun": self.begun, "done": self.done}
 
     def begin(self, path: Path, done: int = 0) -> None:
         """Start with the weights of an exported model.
@@ -237,28 +213,17 @@ class NetworkTraining(loop.Trainee):
             The model is that of another network.
         """
         weights, metadata = onnx_export.read_weights(path)
-        for name, own in self.network.state_dict().items():
-            if name in weights:
-                weights[name] = _with_new_channels(weights[name], own)
         try:
-            self.network.load_state_dict(weights)
+            for network in (self.network, self.average):
+                network.load_state_dict(weights)
         except RuntimeError as error:
             remedy = "give --start one that is, or leave it out"
             raise InputError(f"{path} is not a network of this preset; {remedy}") from error
-        self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.begun = metadata.get("training", "unknown")
         self.samples = self.done = done
 
     def load(self, path: Path) -> None:
-        """Continue from a checkpoint.
-
-        Raises
-        ------
-        InputError
-            There is no checkpoint, or it is one of another preset or variant.
-        """
-        if not path.exists():
-            raise InputError(f"{path} does not exist, so there is nothing to resume; train without --resume first")
+        """Continue from a checkpoint. Raises InputError if it is one of another preset or variant."""
         state = torch.load(path, map_location=self.device, weights_only=True)
         if (state["shape"], state["variant"]) != (asdict(self.network.shape), self.network.variant):
             began = f"{path} was started with another preset or variant ({state['variant']!r})"
@@ -268,27 +233,17 @@ class NetworkTraining(loop.Trainee):
         for k, generator in enumerate(self.lights):  # not the same lights again
             generator.manual_seed(1000 * self.step + k)
 
-    def export(self, path: Path, version: str, licence: str = "Apache-2.0") -> None:
+    def export(self, path: Path, version: str) -> None:
         """Write the averaged weights, with the facts of their training, as an ONNX model."""
         training = f"{self.samples - self.done} samples in {self.step} steps, {self.elapsed / 60:.0f} minutes"
         training += f", after {self.begun}" if self.begun else ""
-        facts = {"version": version, "licence": licence, "variant": self.network.variant, "training": training}
-        average = main_network.MainNetwork(self.network.shape, self.network.variant)
-        average.load_state_dict(self.average)
-        onnx_export.export_main(average, path, facts)
-
-
-def _with_new_channels(weight: Tensor, own: Tensor) -> Tensor:
-    """Weights of a convolution that now has more input channels; the new ones come last and start at 0."""
-    more = own.shape[1] - weight.shape[1] if own.ndim == weight.ndim == 4 else 0
-    if more <= 0 or own.shape[0] != weight.shape[0] or own.shape[2:] != weight.shape[2:]:
-        return weight
-    return torch.cat([weight, weight.new_zeros(len(weight), more, *weight.shape[2:])], dim=1)
+        facts = {"version": version, "licence": "Apache-2.0", "variant": self.network.variant, "training": training}
+        onnx_export.export_main(self.average, path, facts)
 
 
 def load_average(path: Path) -> tuple[main_network.MainNetwork, dict[str, Any]]:
-    """Network with the averaged weights of a checkpoint, on the CPU, and facts of the training."""
+    """Network with the averaged weights of a checkpoint, on the CPU, and the whole checkpoint."""
     state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
     network = main_network.MainNetwork(main_network.NetworkShape(**state["shape"]), state["variant"])
     network.load_state_dict(state["average"])
-    return network.eval(), {k: state[k] for k in ("step", "samples", "elapsed", "begun", "done")}
+    return network.eval(), state

@@ -98,7 +98,9 @@ def test_fail_fast_stops(captures: Path, tmp_path: Path, polcap: Command) -> Non
 
 def start(captures: Path, out: Path, *more: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "polcap", "batch", str(captures / "obj0"), "--out", str(out), *OPTIONS, *more]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    long = out / ("t" * 120)  # longer than the path of a Unix socket may be
+    long.mkdir()
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(long)}
     return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
 
 
@@ -116,7 +118,7 @@ def kill_worker(out: Path) -> None:
 
 
 @pytest.mark.parametrize("how", [(), ("--scheduler", "local", "--workers", "2")], ids=["processes", "dask"])
-def test_killed_worker_costs_nothing_but_time(
+def test_killed_worker_costs_nothing_but_time_under_a_temporary_folder_of_any_length(
     captures: Path, finished: Path, tmp_path: Path, how: tuple[str, ...]
 ) -> None:
     if how:

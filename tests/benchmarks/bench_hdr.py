@@ -76,7 +76,7 @@ def compare(title: str, theirs: Any, quads: Floats, exposures: tuple[float, ...]
         paths.append(place / f"{k}.dng")
         dng.write(
             paths[-1], np.clip(np.round(counts), 0, WHITE).astype(np.uint16), cfa=RGGB, black=BLACK, white=WHITE,
-            exif=exif, color_matrix=np.eye(3), as_shot_neutral=np.ones(3), compression="none",
+            exif=exif, color_matrix=np.eye(3), as_shot_neutral=np.ones(3),
         )  # fmt: skip
     shot = Shot(0.0, tuple(frame(p, e / 100) for p, e in zip(paths, exposures)))
     capture = Capture("", "", (shot,), "folders", 1000.0, True, (0.0, 0.0), SIZE[::-1])

@@ -67,8 +67,6 @@ class Rotator:
     def move(self, angle_deg: float) -> float:
         return angle_deg
 
-    def stop(self) -> None: ...
-
     def close(self) -> None: ...
 
 

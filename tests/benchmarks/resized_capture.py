@@ -55,7 +55,6 @@ def _frame(source: Path, target: Path, megapixels: float, rng: np.random.Generat
         exif=known.exif,
         color_matrix=_SRGB_FROM_XYZ if stated is None else np.reshape(stated, (3, 3)),
         as_shot_neutral=_DAYLIGHT if image.white_balance is None else 1 / image.white_balance,
-        compression="none",
     )
 
 

@@ -155,10 +155,9 @@ def _report(data: bytes, folder: Path) -> object:
 
 
 def _header(data: bytes, folder: Path) -> object:
-    file = io.BytesIO(data)
-    structure = file_kind.structure(file)
+    structure = file_kind.structure(data)
     file_checks.check_structure("fuzz", structure, data)
-    return file_kind.kind(file, ".dng"), structure.truncated, structure.dng
+    return file_kind.kind(io.BytesIO(data), ".dng"), structure.truncated, structure.dng
 
 
 def _tags(data: bytes, folder: Path) -> object:

@@ -41,3 +41,8 @@ def test_agreement_is_drawn_gray_and_registration_has_a_caption(result: Path) ->
     assert np.ptp(middle) < 3 and 100 < middle.mean() < 180  # neither black, which is no object, nor white
     page = unescape((result / "report.html").read_text())
     assert re.search(r"<b>45° shot moved by [+-][.\d]+, [+-][.\d]+ ± [.\d]+ px</b>", page)
+
+
+def test_an_empty_list_is_shown_as_none() -> None:
+    assert labels.text("chart.unused", []) == labels.text("chart.unused", {}) == "none"
+    assert labels.text("chart.unused", [1, 2]) == "1, 2"

@@ -14,8 +14,8 @@ import numpy as np
 from polcap.errors import HardwareError
 from polcap.formats.raw.file_bytes import digest
 from polcap.images import Exif, Role
-from polcap.rig.call_timeout import call_within
 from polcap.rig.camera import CameraFile
+from polcap.rig.camera_gphoto2 import call_within
 from polcap.rig.exposure_bracket import Exposure
 from polcap.rig.shooting_plan import CaptureOrder
 from polcap.synth.shooting import MIDDLE_S, Shoot, Studio, Take, random_scene

@@ -11,8 +11,7 @@ import pytest
 
 from polcap.errors import HardwareError, SettingError
 from polcap.rig import camera_gphoto2
-from polcap.rig.call_timeout import CallTimeout
-from polcap.rig.camera_gphoto2 import Gphoto2Camera
+from polcap.rig.camera_gphoto2 import CallTimeout, Gphoto2Camera
 from polcap.rig.device_log import Log
 from polcap.rig.device_urls import open_camera
 from polcap.rig.exposure_bracket import Exposure

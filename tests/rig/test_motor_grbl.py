@@ -8,7 +8,7 @@ import pytest
 from polcap.errors import HardwareError
 from polcap.rig import person
 from polcap.rig.device_log import Log
-from polcap.rig.motor_grbl import ALARM, ERROR, GrblMotor, GrblSettings
+from polcap.rig.motor_grbl import MEANING, GrblMotor, GrblSettings
 from polcap.rig.serial_port import NoAnswer, Port
 from tests.rig import devices, virtual
 
@@ -140,8 +140,8 @@ def test_work_positions_are_refused() -> None:
 
 
 def test_codes_have_grbl_s_meaning() -> None:
-    assert "limit switch" in ALARM[1]
-    assert "reset during a movement" in ALARM[3]
-    assert "no switch" in ALARM[9]
-    assert "homing is off" in ERROR[5]
-    assert "locked" in ERROR[9]
+    assert "limit switch" in MEANING["ALARM:1"]
+    assert "reset during a movement" in MEANING["ALARM:3"]
+    assert "no switch" in MEANING["ALARM:9"]
+    assert "homing is off" in MEANING["error:5"]
+    assert "locked" in MEANING["error:9"]

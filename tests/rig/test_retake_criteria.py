@@ -41,9 +41,9 @@ def test_a_frame_as_asked_passes() -> None:
         (facts("b", exposure_time=0.04), r"exposure time \[s\] 0.04, but 0.02"),
         (facts("b", f_number=16.0), "f-number 16"),
         (facts("b", iso=200.0), "ISO 200"),
-        (facts("b", model="Two"), "taken with M Two, not M One"),
-        (facts("b", lens="K"), "through K, not L"),
-        (facts("b", width=48), "48×72 px, not 96×72"),
+        (facts("b", model="Two"), "taken with the camera M Two, not M One"),
+        (facts("b", lens="K"), "through the lens K, not L"),
+        (facts("b", width=48), "48×72 px, not 96×72 px"),
         (facts("b", focal_length_mm=70.0), "at 70 mm, not 60 mm"),
     ],
 )

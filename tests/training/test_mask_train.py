@@ -10,7 +10,6 @@ from polcap.formats import onnx
 from polcap.stages.mask.mask_channels import CHANNELS, ENCODING
 from polcap.synth.mesh_tracer import Tracer, smooth
 from polcap.training import (
-    mask_pictures,
     mask_scenes,
     mask_train,
     mask_views,
@@ -39,10 +38,9 @@ def picture(traced: mask_views.MaskView) -> mask_scenes.MaskScene:
 
 
 def test_the_object_touches_no_edge_and_throws_its_shadow_away_from_the_flash(traced: mask_views.MaskView) -> None:
-    mask = traced.mask
+    mask = traced.object.mask
     assert mask.any() and not mask[[0, -1]].any() and not mask[:, [0, -1]].any()
-    assert not (traced.shadow & mask).any()
-    shadow, object_ = (np.argwhere(a).mean(0) for a in (traced.shadow, mask))  # row, column
+    shadow, object_ = (np.argwhere(a).mean(0) for a in (~traced.lit & ~mask, mask))  # row, column
     right, up = shadow[1] - object_[1], object_[0] - shadow[0]
     assert right * traced.flash[0] + up * traced.flash[1] < 0
 
@@ -55,13 +53,13 @@ def test_black_objects_are_black_and_polarization_is_possible(picture: mask_scen
 
 
 def test_mirroring_negates_s2(tmp_path: Path, picture: mask_scenes.MaskScene) -> None:
-    held = mask_pictures.pack(picture)
+    held = mask_train.pack(picture)
     assert held.shape == (36, 48, 7)
     held[..., 3], held[..., 4] = 0.2 * held[..., :3].sum(-1), 0.3 * held[..., :3].sum(-1)
     np.save(tmp_path / "0.npy", held)
     signs = set()
     for seed in range(12):
-        look, truth = mask_pictures.load_varied(tmp_path / "0.npy", np.random.default_rng(seed))
+        look, truth = mask_train.load_varied(tmp_path / "0.npy", np.random.default_rng(seed))
         _, s1, s2 = (float(part.sum()) for part in look.stokes)
         as_is = np.array_equal(truth, held[..., 5].astype(np.float32))
         mirrored = np.array_equal(truth, held[:, ::-1, 5].astype(np.float32))
@@ -72,7 +70,7 @@ def test_mirroring_negates_s2(tmp_path: Path, picture: mask_scenes.MaskScene) ->
 
 def test_the_network_learns_and_is_exported(tmp_path: Path, picture: mask_scenes.MaskScene) -> None:
     file = tmp_path / "0.npy"
-    held = mask_pictures.pack(picture)
+    held = mask_train.pack(picture)
     np.save(file, np.tile(held, (2, 2, 1)))
     torch.manual_seed(0)
     run = mask_train.MaskTraining(3e-3, [file])
@@ -93,11 +91,11 @@ def test_loss_is_small_where_the_network_is_right_and_sure() -> None:
 
 
 def test_an_inserted_object_is_part_of_the_truth(tmp_path: Path, picture: mask_scenes.MaskScene) -> None:
-    held = mask_pictures.pack(picture)
+    held = mask_train.pack(picture)
     np.save(tmp_path / "0.npy", held)
     np.save(tmp_path / "1.npy", held[:, ::-1])
     shares = []
     for other in (None, tmp_path / "1.npy"):
-        _, truth = mask_pictures.load_varied(tmp_path / "0.npy", np.random.default_rng(4), other)
+        _, truth = mask_train.load_varied(tmp_path / "0.npy", np.random.default_rng(4), other)
         shares.append(truth.mean())
     assert shares[1] >= shares[0] > 0

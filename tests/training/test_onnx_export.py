@@ -37,7 +37,7 @@ def settled(shape: main_network.NetworkShape) -> main_network.MainNetwork:
 def test_onnxruntime_agrees_with_torch_at_any_size(tmp_path: Path) -> None:
     network = settled(TINY)
     path = tmp_path / "m.onnx"
-    assert onnx_export.export_main(network, path, {"licence": "Apache-2.0", "version": "test"}) == path.stat().st_size
+    onnx_export.export_main(network, path, {"licence": "Apache-2.0", "version": "test"})
     loaded = onnx.load(path, threads=1)
     assert loaded.channels == CHANNELS and loaded.metadata["licence"] == "Apache-2.0"
     for size in ((64, 64), (160, 96), (32, 224)):

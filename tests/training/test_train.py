@@ -64,8 +64,8 @@ def test_training_starts_from_a_shipped_model(data: Path, tmp_path: Path, monkey
     weights, _ = onnx_export.read_weights(tmp_path / "first.onnx")
     run = train.NetworkTraining(TINY, torch.device("cpu"), 1e-3)
     run.begin(tmp_path / "first.onnx")
-    for state in (run.network.state_dict(), run.average):
-        assert all(torch.equal(value, weights[name]) for name, value in state.items())
+    for network in (run.network, run.average):
+        assert all(torch.equal(value, weights[name]) for name, value in network.state_dict().items())
     params = train.TrainingOptions(data=data, out=tmp_path / "out", samples=8, threads=1, start=tmp_path / "first.onnx")
     _, facts = onnx_export.read_weights(train.main(params))
     assert facts["training"].endswith("minutes, after 10 samples")
@@ -90,14 +90,6 @@ def test_the_shipped_model_can_start_training() -> None:
     assert run.begun.split()[1] == "samples"
 
 
-def test_new_input_channels_start_with_zero_weights(tmp_path: Path) -> None:
-    """New channels come last and begin at zero; a layer with other outputs is another network's."""
-    own = torch.rand(4, 6, 3, 3)
-    grown = train._with_new_channels(own[:, :5], own)
-    assert torch.equal(grown[:, :5], own[:, :5]) and not grown[:, 5].any()
-    assert train._with_new_channels(own[:3, :5], own).shape == (3, 5, 3, 3)
-
-
 def test_resume_and_start_exclude_each_other(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="give one of them"):
         train.main(train.TrainingOptions(out=tmp_path, resume=True, start=tmp_path / "m.onnx"))
@@ -114,7 +106,7 @@ def test_steps_on_one_batch_lower_its_loss(simulator: Simulator) -> None:
     run, batch = train.NetworkTraining(TINY, torch.device("cpu"), 3e-3, 2), simulator.draw_batch(4, 64)
     run.step = 200  # past the warm-up
     losses = [run.advance([batch, batch], 0.0)["loss"] for _ in range(25)]
-    assert losses[-1] < 0.8 * losses[0] and run.skipped == 0
+    assert losses[-1] < 0.8 * losses[0]
 
 
 def test_resume_needs_a_checkpoint(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

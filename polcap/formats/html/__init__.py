@@ -81,13 +81,6 @@ def text(content: bytes) -> str:
     return b64encode(content).decode()
 
 
-def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """An HTML table; its texts are escaped."""
-    top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
-    lines = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
-    return f"<table><tr>{top}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
-
-
 def _address(kind: str, content: bytes) -> str:
     return f"data:{kind};base64,{text(content)}"
 

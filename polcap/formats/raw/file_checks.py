@@ -3,6 +3,7 @@
 Decoders return pixels from such files too: black, grey, or whatever was in memory. Runs in the child process.
 """
 
+import re
 import struct
 from typing import Any
 
@@ -25,7 +26,7 @@ DEVELOP = (
     "denoising, one white balance), or use a camera with a Bayer, X-Trans or monochrome sensor"
 )
 COPY_AGAIN = "copy it from the card again"
-_SEARCH_BYTES = 1 << 20  # of coded data, searched at a time
+_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")  # of a JPEG, after a scan
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_SAMPLES = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # per pixel, by color type
 _DEFLATE = 1032  # greatest compression of zlib (zlib.net, Technical Details: Maximum Compression Factor)
@@ -109,9 +110,7 @@ def _check_strips(path: str, directory: Directory, dng: bool) -> None:
 def check_jpeg(path: str, data: bytes, start: int = 0) -> None:
     """Refuse a JPEG from byte `start` on that has no end marker: decoders fill the rest with grey. DecodeError."""
     at = start + 2
-    while at + 4 <= len(data):
-        if data[at] != 0xFF:
-            break
+    while at + 4 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]
         if marker == 0xD9:
             return
@@ -119,23 +118,11 @@ def check_jpeg(path: str, data: bytes, start: int = 0) -> None:
             at += 1
             continue
         at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-        if marker == 0xDA:  # coded data follow
-            at = _end_of_scan(data, at)
+        if marker == 0xDA:  # coded data follow, up to a marker that is neither stuffing nor a restart
+            end = _MARKER.search(data, at)
+            at = end.start() if end else len(data)
     if data[at : at + 2] != b"\xff\xd9":
         raise DecodeError(f"{path}: is cut short, its JPEG data have no end; {COPY_AGAIN}")
-
-
-def _end_of_scan(data: bytes, start: int) -> int:
-    """Offset of the first marker after a JPEG scan: FF, not followed by stuffing or a restart."""
-    coded = np.frombuffer(data, np.uint8)
-    for at in range(start, len(data), _SEARCH_BYTES):
-        part = coded[at : at + _SEARCH_BYTES + 1]
-        marks = np.flatnonzero(part[:-1] == 0xFF)
-        code = part[marks + 1]
-        ends = marks[(code != 0) & (code != 0xFF) & ((code < 0xD0) | (code > 0xD7))]
-        if len(ends):
-            return at + int(ends[0])
-    return len(data)
 
 
 def check_levels(path: str, value: NDArray[Any], black: float, white: float, lossy: bool) -> None:

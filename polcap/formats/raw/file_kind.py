@@ -1,4 +1,4 @@
-"""What kind of file it is, judged by its content and never by its name; the image directories of a TIFF.
+"""Kind of a file, judged by its content and never by its name; the image directories of a TIFF.
 
 All of it runs in the child process of `worker`.
 """
@@ -58,25 +58,21 @@ def strips(directory: Directory) -> list[tuple[int, int]]:
 
 def first(directory: Directory, tag: int, default: int = 0) -> int:
     """The first value of a tag; the default where it is absent, empty or not a whole number."""
-    values = directory.get(tag, ())
-    return values[0] if values else default
+    return next(iter(directory.get(tag, ())), default)
 
 
 def kind(file: BinaryIO, suffix: str) -> Kind:
     """A RAW, a finished picture, some other known file, or unknown bytes."""
-    file.seek(0)
     head = file.read(512)
     if head[:3] == b"\xff\xd8\xff" or head[:8] == b"\x89PNG\r\n\x1a\n" or head[:4] == b"\x76\x2f\x31\x01":
         return "photo"
-    if is_raw_magic(head):
+    if _is_raw_magic(head):
         return "raw"
     if head[:4] in _TIFF_MAGIC:
-        return "raw" if _is_raw(structure(file)) else "photo"
-    if head[4:8] == b"ftyp" or head[:4] == b"RIFF":  # HEIC, AVIF or WebP next to a RAW; films; sounds
-        return "other"
-    if suffix.lower() in _SIDECARS:
-        return "other"
-    return "other" if _is_text(file) else "unknown"
+        return "raw" if _is_raw(structure(head + file.read())) else "photo"
+    # HEIC, AVIF or WebP next to a RAW; films; sounds
+    known = head[4:8] == b"ftyp" or head[:4] == b"RIFF" or suffix.lower() in _SIDECARS
+    return "other" if known or _is_text(file) else "unknown"
 
 
 def _is_text(file: BinaryIO) -> bool:
@@ -89,7 +85,7 @@ def _is_text(file: BinaryIO) -> bool:
     return bool(pieces[0]) and not any(byte < 9 or 13 < byte < 27 for byte in set(b"".join(pieces)))
 
 
-def is_raw_magic(head: bytes) -> bool:
+def _is_raw_magic(head: bytes) -> bool:
     """The first bytes are those of a RAW format that is not an ordinary TIFF."""
     return (
         head[:15] == b"FUJIFILMCCD-RAW"
@@ -100,77 +96,50 @@ def is_raw_magic(head: bytes) -> bool:
     )
 
 
-def is_foveon(head: bytes) -> bool:
-    """The first bytes are those of Sigma's X3F."""
-    return head[:4] == b"FOVb"
-
-
 def _is_raw(tiff: TiffStructure) -> bool:
-    if tiff.dng:
+    if tiff.dng or any(
+        first(directory, PHOTOMETRIC) in (CFA, LINEAR_RAW) or first(directory, COMPRESSION) in _RAW_COMPRESSION
+        for directory in tiff.directories
+    ):
         return True
-    for directory in tiff.directories:
-        if first(directory, PHOTOMETRIC) in (CFA, LINEAR_RAW):
-            return True
-        if first(directory, COMPRESSION) in _RAW_COMPRESSION:
-            return True
     main = tiff.directories[0] if tiff.directories else {}
     return MAKE in main and SUB_IFDS in main and main.get(SUBTYPE) == (1,)  # a preview in front of sensor data
 
 
-def structure(file: BinaryIO) -> TiffStructure:
+def structure(data: bytes) -> TiffStructure:
     """The image directories of a TIFF, as far as they can be read; none where the file is not a TIFF."""
-    size = file.seek(0, 2)
-    file.seek(0)
-    head = file.read(8)
     directories: list[Directory] = []
-    if head[:4] in _TIFF_MAGIC and len(head) == 8:
-        order = "<" if head[:2] == b"II" else ">"
-        pending = deque(struct.unpack(order + "I", head[4:]))
+    if data[:4] in _TIFF_MAGIC and len(data) >= 8:
+        order = "<" if data[:2] == b"II" else ">"
+        pending = deque(struct.unpack_from(order + "I", data, 4))
         seen: set[int] = set()
         left = _MAX_VALUES
         while pending and len(directories) < _MAX_DIRECTORIES and left > 0:
             offset = pending.popleft()
-            if offset in seen or not 8 <= offset < size:
+            if offset in seen or not 8 <= offset <= len(data) - 2:
                 continue
             seen.add(offset)
-            file.seek(offset)
-            directory, following = _directory(file, order, size, left)
+            (count,) = struct.unpack_from(order + "H", data, offset)
+            end = offset + 2 + 12 * count
+            directory = dict(_entries(data, order, range(offset + 2, min(end, len(data) - 11), 12), left))
             left -= sum(map(len, directory.values()))
             directories.append(directory)
-            pending.extend((*directory.get(SUB_IFDS, ()), following))
-    return TiffStructure(tuple(directories), size)
+            following = struct.unpack_from(order + "I", data, end) if end + 4 <= len(data) else ()
+            pending.extend((*directory.get(SUB_IFDS, ()), *following))
+    return TiffStructure(tuple(directories), len(data))
 
 
-def _directory(file: BinaryIO, order: str, size: int, most: int) -> tuple[Directory, int]:
-    """The tags of the directory at the file's position, and the offset of the next directory."""
-    count = _unpack(file.read(2), order + "H")
-    body = file.read(12 * count + 4)
-    following = _unpack(body[12 * count :], order + "I")
-    return dict(_entries(body[: 12 * count], file, order, size, most)), following
-
-
-def _entries(body: bytes, file: BinaryIO, order: str, size: int, most: int) -> Iterator[tuple[int, tuple[int, ...]]]:
-    """Tag and values of each entry of a directory; at most `most` values."""
-    for at in range(0, len(body) - 11, 12):
-        tag, form, count = struct.unpack_from(order + "HHI", body, at)
+def _entries(data: bytes, order: str, places: range, most: int) -> Iterator[tuple[int, tuple[int, ...]]]:
+    """Tag and values of the directory entries at `places`; at most `most` values."""
+    for at in places:
+        tag, form, count = struct.unpack_from(order + "HHI", data, at)
         if tag not in _TAGS_READ or count > most:
             continue
+        code = f"{order}{count}{_INTEGERS.get(form, 'x')}"  # other forms have no whole numbers
+        length = struct.calcsize(code)
+        start = at + 8 if length <= 4 else struct.unpack_from(order + "I", data, at + 8)[0]
         if form not in _INTEGERS:
             yield tag, ()
-            continue
-        code = f"{order}{count}{_INTEGERS[form]}"
-        length = struct.calcsize(code)
-        if length <= 4:
+        elif start + length <= len(data):
             most -= count
-            yield tag, struct.unpack_from(code, body, at + 8)
-            continue
-        (offset,) = struct.unpack_from(order + "I", body, at + 8)
-        if offset + length <= size:
-            most -= count
-            file.seek(offset)
-            yield tag, struct.unpack(code, file.read(length))
-
-
-def _unpack(data: bytes, code: str) -> int:
-    length = struct.calcsize(code)
-    return int(struct.unpack(code, data[:length])[0]) if len(data) >= length else 0
+            yield tag, struct.unpack_from(code, data, start)

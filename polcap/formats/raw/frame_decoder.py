@@ -1,7 +1,7 @@
 """Decodes a frame of a capture: a RAW file, a finished picture, or one angle of a polarization sensor."""
 
+import importlib
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from polcap.formats.raw import libraw, photo, worker
@@ -16,7 +16,7 @@ def decode(frame: Frame) -> SensorImage:
     DecodeError
         The file is damaged, has changed since it was probed, or is in color where the sensor is monochrome.
     """
-    path, digest, reading = Path(frame.path), _file_digest(frame), frame.reading
+    path, digest, reading = frame.path, _file_digest(frame), frame.reading
     if reading.sensor_deg is not None:
         return photo.read_mosaic(path, reading.sensor_deg, reading.white, reading.black, digest, reading.kind)
     if reading.kind == "raw":
@@ -27,16 +27,18 @@ def decode(frame: Frame) -> SensorImage:
 def apply(frame: Frame, function: Callable[..., worker.Answer], **options: Any) -> worker.Answer:
     """`function(image, **options)` of a frame's pixels; of a RAW in the child process, which returns only the answer.
 
-    The function is a module's, the options plain JSON values.
-
-    Raises
-    ------
-    DecodeError
-        As `decode`.
+    The function is a module's, the options plain JSON values. Raises DecodeError as `decode`.
     """
-    if frame.reading.kind == "raw" and frame.reading.sensor_deg is None:
-        return libraw.within(frame.path, _file_digest(frame), function, **options)
-    return function(decode(frame), **options)
+    if frame.reading.kind != "raw" or frame.reading.sensor_deg is not None:
+        return function(decode(frame), **options)
+    digest, module, name = _file_digest(frame), function.__module__, function.__name__
+    return worker.call(apply_to_raw, frame.path, digest=digest, module=module, name=name, options=options)
+
+
+def apply_to_raw(path: str, digest: str | None, module: str, name: str, options: dict[str, Any]) -> worker.Answer:
+    """`apply`, in the child process; the function is `name` in `module`."""
+    function: Callable[..., worker.Answer] = getattr(importlib.import_module(module), name)
+    return function(libraw.image(*libraw.decode(path, digest)), **options)
 
 
 def _file_digest(frame: Frame) -> str | None:

@@ -3,10 +3,8 @@
 The only module that imports rawpy.
 """
 
-import importlib
 import io
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -40,32 +38,11 @@ def read(path: str | Path, digest: str | None = None) -> SensorImage:
         Not a RAW, damaged, changed since, of another mosaic or Foveon; or the decoder crashed, hung or ran out
         of memory.
     """
-    return _image(*worker.call(decode, path, digest=digest))
+    return image(*worker.call(decode, path, digest=digest))
 
 
-def within(
-    path: str | Path, digest: str | None, function: Callable[..., worker.Answer], **options: Any
-) -> worker.Answer:
-    """Decode in the child process and apply `function(image, **options)` there: only its answer comes back.
-
-    The function is a module's, the options plain JSON values.
-
-    Raises
-    ------
-    DecodeError
-        As `read`.
-    """
-    return worker.call(apply, path, digest=digest, module=function.__module__, name=function.__name__, options=options)
-
-
-def apply(path: str, digest: str | None, module: str, name: str, options: dict[str, Any]) -> worker.Answer:
-    """`within`, in the child process; the function is `name` in `module`."""
-    function = getattr(importlib.import_module(module), name)
-    answer: worker.Answer = function(_image(*decode(path, digest)), **options)
-    return answer
-
-
-def _image(meta: dict[str, Any], arrays: worker.Arrays) -> SensorImage:
+def image(meta: dict[str, Any], arrays: worker.Arrays) -> SensorImage:
+    """The photograph from the answer of `decode`."""
     balance = None if meta["balance"] is None else np.array(meta["balance"])
     xyz_to_camera = meta["xyz_to_camera"]
     return SensorImage(
@@ -133,15 +110,10 @@ def _settings(other: Any, lens: Any) -> dict[str, Any]:
 
 
 def version() -> str:
-    """LibRaw's version, asked in the child process; raises DecodeError where that does not run."""
-    return str(worker.call(about, "LibRaw")[0]["version"])
-
-
-def about(path: str) -> worker.Answer:
-    """`version`, in the child process."""
+    """LibRaw's version."""
     import rawpy
 
-    return {"version": ".".join(map(str, rawpy.libraw_version))}, {}
+    return ".".join(map(str, rawpy.libraw_version))
 
 
 def decode(path: str, digest: str | None = None) -> worker.Answer:
@@ -149,9 +121,9 @@ def decode(path: str, digest: str | None = None) -> worker.Answer:
     import rawpy
 
     data = file_bytes.load(path, digest)
-    if file_kind.is_foveon(data):
+    if data[:4] == b"FOVb":  # Sigma's X3F
         raise DecodeError(f"{path}: {unsupported(None)}")
-    structure = file_kind.structure(io.BytesIO(data))
+    structure = file_kind.structure(data)
     file_checks.check_structure(path, structure, data)
     if structure.dng and structure.truncated:  # LibRaw would return whatever was in memory
         raise DecodeError(f"{path}: its image data run past the end of the file; {file_checks.COPY_AGAIN}")
@@ -173,7 +145,11 @@ def decode(path: str, digest: str | None = None) -> worker.Answer:
 def _counts(path: str, raw: Any) -> tuple[dict[str, Any], worker.Arrays]:
     """The visible counts as stored in the file, their levels and colors."""
     value: NDArray[Any] = raw.raw_image_visible
-    meta: dict[str, Any] = {"balance": _balance(raw), "xyz_to_camera": _xyz_to_camera(raw)}
+    balance, matrix = raw.camera_whitebalance[:3], raw.rgb_xyz_matrix[:3]
+    meta: dict[str, Any] = {
+        "balance": [gain / balance[1] for gain in balance] if min(balance) > 0 else None,
+        "xyz_to_camera": matrix.tolist() if matrix.any() else None,
+    }
     if value.ndim == 3 and value.shape[2] >= 3:
         if raw.num_colors != 3:
             raise DecodeError(f"{path}: has {raw.num_colors} color channels where 3 are supported")
@@ -184,8 +160,13 @@ def _counts(path: str, raw: Any) -> tuple[dict[str, Any], worker.Arrays]:
         black = [[float(raw.black_level_per_channel[0])]]
     else:
         cfa, black = _mosaic(raw, path)
-        if cfa.shape == (6, 6):
-            value, cfa, black = _from_whole_block(path, value, cfa, black)
+        if cfa.shape == (6, 6):  # X-Trans, from its first whole 3×3 block on
+            corner = demosaic.x_trans_corner(cfa)
+            if corner is None:
+                raise DecodeError(f"{path}: {unsupported((6, 6))}")
+            down, right = corner
+            cfa, levels = (np.roll(part, (-down, -right), (0, 1)) for part in (cfa, np.array(black)))
+            value, black = np.ascontiguousarray(value[down:, right:]), levels.tolist()
         arrays = {"value": value, "cfa": cfa}
     return meta | {"black": black, "white": _white(raw, float(np.max(black)))}, arrays
 
@@ -223,18 +204,6 @@ def _mosaic(raw: Any, path: str) -> tuple[Bits, list[list[float]]]:
     return cfa, [[float(levels[i]) for i in row] for row in index]
 
 
-def _from_whole_block(
-    path: str, value: NDArray[Any], cfa: Bits, black: list[list[float]]
-) -> tuple[NDArray[Any], Bits, list[list[float]]]:
-    """An X-Trans mosaic from its first whole 3×3 block on: up to two rows and columns are dropped."""
-    corner = demosaic.x_trans_corner(cfa)
-    if corner is None:
-        raise DecodeError(f"{path}: {unsupported((6, 6))}")
-    down, right = corner
-    cfa, levels = (np.roll(part, (-down, -right), (0, 1)) for part in (cfa, np.array(black)))
-    return np.ascontiguousarray(value[down:, right:]), cfa, levels.tolist()
-
-
 def _white(raw: Any, black: float) -> float:
     """Saturation: LibRaw's maximum, or the lower level that the camera states."""
     stated = [level for level in raw.camera_white_level_per_channel or () if level > black]
@@ -242,20 +211,10 @@ def _white(raw: Any, black: float) -> float:
     return float(lowest if lowest > raw.white_level / 2 else raw.white_level)
 
 
-def _balance(raw: Any) -> list[float] | None:
-    balance = raw.camera_whitebalance[:3]
-    return [value / balance[1] for value in balance] if min(balance) > 0 else None
-
-
-def _xyz_to_camera(raw: Any) -> list[list[float]] | None:
-    matrix: NDArray[Any] = raw.rgb_xyz_matrix[:3]
-    return matrix.tolist() if matrix.any() else None
-
-
 def _refusal(path: str, error: Exception) -> DecodeError:
     import rawpy
 
-    reason = error.args[0] if error.args else type(error).__name__
+    reason = next(iter(error.args), type(error).__name__)
     reason = reason.decode(errors="replace") if isinstance(reason, bytes) else str(reason)
     if isinstance(error, rawpy.LibRawFileUnsupportedError):
         return DecodeError(f"{path}: not a RAW format that LibRaw knows ({reason}); is the file complete?")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from polcap.errors import DecodeError
 from polcap.formats.maps import exr
 from polcap.formats.raw import file_bytes, file_checks, file_kind, libraw, worker
-from polcap.images import Floats, SensorImage
+from polcap.images import SensorImage
 from polcap.optics import color
 
 Encoding = Literal["linear", "srgb"]
@@ -47,15 +47,18 @@ def read(
     DecodeError
         Not a picture, damaged, or changed since it was probed.
     """
-    pixels = _pixels(path, digest)
+    pixels, full = _pixels(path, digest)
     lossy = pixels.dtype == np.uint8
-    full = float(np.iinfo(pixels.dtype).max) if np.issubdtype(pixels.dtype, np.integer) else 1.0
     encoding = encoding_of(8 * pixels.itemsize, encoding)
     if pixels.shape[2] == 1:
         pixels = np.repeat(pixels, 3, axis=2)
-    if encoding == "srgb":
-        return SensorImage(_decoded(pixels, full), np.zeros((1, 1)), 1.0, None, lossy=True)
-    return SensorImage(_counts(pixels), np.full((1, 1), black), white or full, None, lossy=lossy)
+    if encoding == "linear":
+        return SensorImage(_counts(pixels), np.full((1, 1), black), white or full, None, lossy=lossy)
+    if pixels.dtype.kind == "f":
+        value = color.decode_srgb(pixels).astype(np.float32)
+    else:
+        value = color.decode_srgb(np.arange(full + 1) / full).astype(np.float32)[pixels]
+    return SensorImage(value, np.zeros((1, 1)), 1.0, None, lossy=True)
 
 
 def read_mosaic(
@@ -69,7 +72,7 @@ def read_mosaic(
     """One angle (0, 45, 90 or 135°) of a polarization sensor's raw frame, (H/2, W/2, 3), linear.
 
     The frame's 2×2 cell is 90 45 / 135 0 degrees. `white` and `black` are counts; by default those that the file
-    states, or the greatest of the type and 0. `kind` tells whether `path` is a RAW or a picture; `digest` as in `read`.
+    states, or the greatest of the type and 0. `kind` is that of the file; `digest` as in `read`.
 
     Raises
     ------
@@ -78,14 +81,13 @@ def read_mosaic(
     """
     y, x = dict(SENSOR_DEG)[angle_deg]
     if kind == "photo":
-        pixels = _pixels(path, digest)
+        pixels, full = _pixels(path, digest)
         if pixels.shape[2] != 1:
             raise DecodeError(
                 f"{path}: has {pixels.shape[2]} channels, but the frame of a polarization sensor has one; "
                 "save the camera's raw frame, or give one picture per angle"
             )
         mosaic, lossy, level = pixels[..., 0], pixels.dtype == np.uint8, black
-        full = float(np.iinfo(pixels.dtype).max) if np.issubdtype(pixels.dtype, np.integer) else 1.0
     else:
         sensor = libraw.read(path, digest)
         mosaic = sensor.value if sensor.value.ndim == 2 else sensor.value[..., 0]
@@ -107,13 +109,6 @@ def place_px(angle_deg: float) -> tuple[float, float]:
 def encoding_of(bits: int, stated: Encoding | None) -> Encoding:
     """The encoding that `read` assumes for a picture of so many bits per channel."""
     return stated or ("srgb" if bits == 8 else "linear")
-
-
-def _decoded(pixels: NDArray[Any], full: float) -> Floats:
-    if pixels.dtype.kind == "f":
-        return np.asarray(color.decode_srgb(pixels), np.float32)
-    table = color.decode_srgb(np.arange(full + 1) / full).astype(np.float32)
-    return np.asarray(table[pixels])  # a table is twenty times faster than the formula per pixel
 
 
 def size(path: str, data: bytes) -> dict[str, int]:
@@ -143,9 +138,10 @@ def decode(path: str, digest: str | None = None) -> worker.Answer:
     return {}, {"pixels": pixels}
 
 
-def _pixels(path: str | Path, digest: str | None) -> NDArray[Any]:
-    _, arrays = worker.call(decode, path, digest=digest)
-    return arrays["pixels"]
+def _pixels(path: str | Path, digest: str | None) -> tuple[NDArray[Any], float]:
+    """The stored values of a picture, and the greatest of their type; 1 in floating point."""
+    pixels = worker.call(decode, path, digest=digest)[1]["pixels"]
+    return pixels, 1.0 if pixels.dtype.kind == "f" else float(np.iinfo(pixels.dtype).max)
 
 
 @contextmanager

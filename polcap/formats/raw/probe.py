@@ -3,7 +3,6 @@
 One call into the child process and one reading of the file: metadata and digest are of the same bytes.
 """
 
-import io
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from polcap.errors import DecodeError
 from polcap.formats.raw import exif, file_bytes, file_checks, file_kind, libraw, photo, worker
 from polcap.images import Exif
 
-_LIMIT_S, _LIMIT_GIB = 30.0, 2.0  # a sound file takes milliseconds and three times its size
+_LIMIT_S = 30.0  # a sound file takes milliseconds
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ def read(path: str | Path) -> Probe:
     DecodeError
         The file cannot be read, no decoder recognises it, it is cut short or of a form that polcap refuses.
     """
-    answer, _ = worker.call(examine, path, limit_s=_LIMIT_S, limit_gib=_LIMIT_GIB)
+    answer, _ = worker.call(examine, path, limit_s=_LIMIT_S)
     found = msgspec.convert(answer["probe"], Probe)
     if answer["doubtful"]:  # some cameras store odd offsets for previews: only decoding shows whether it is cut
         libraw.read(path) if found.kind == "raw" else photo.read(path)
@@ -47,8 +46,7 @@ def read(path: str | Path) -> Probe:
 
 def kind(path: str | Path) -> file_kind.Kind:
     """The kind only, by the first bytes. Raises DecodeError where the file cannot be read."""
-    answer, _ = worker.call(examine_kind, path, limit_s=_LIMIT_S, limit_gib=_LIMIT_GIB)
-    found: file_kind.Kind = answer["kind"]
+    found: file_kind.Kind = worker.call(examine_kind, path, limit_s=_LIMIT_S)[0]["kind"]
     return found
 
 
@@ -63,30 +61,29 @@ def examine(path: str) -> worker.Answer:
     with file_bytes.opened(path) as file:
         found = file_kind.kind(file, Path(path).suffix)
         if found == "other":
-            return _answer(Probe(found))
+            return {"probe": asdict(Probe(found)), "doubtful": False}, {}
         file.seek(0)
         data = file.read()
     if not data:
         raise DecodeError(f"{path}: is empty; copy it from the card again, or remove it")
-    if found == "photo":
-        return _photo(path, data)
     try:
-        return _raw(path, data)
+        probe, doubtful = _photo(path, data) if found == "photo" else _raw(path, data)
     except DecodeError:
-        if found == "raw":
+        if found != "unknown":
             raise
-        return _answer(Probe("unknown"))
+        probe, doubtful = Probe("unknown"), False
+    return {"probe": asdict(probe), "doubtful": doubtful}, {}
 
 
-def _photo(path: str, data: bytes) -> worker.Answer:
+def _photo(path: str, data: bytes) -> tuple[Probe, bool]:
     size = photo.size(path, data)
     stated = exif.sized(exif.tags(data), size["width"], size["height"])
-    found = Probe("photo", file_bytes.digest(data), stated, size["channels"], size["bits"])
-    return _answer(found, file_kind.structure(io.BytesIO(data)).truncated)
+    probe = Probe("photo", file_bytes.digest(data), stated, size["channels"], size["bits"])
+    return probe, file_kind.structure(data).truncated
 
 
-def _raw(path: str, data: bytes) -> worker.Answer:
-    structure = file_kind.structure(io.BytesIO(data))
+def _raw(path: str, data: bytes) -> tuple[Probe, bool]:
+    structure = file_kind.structure(data)
     file_checks.check_structure(path, structure, data)
     known = exif.tags(data)
     no_settings = known.exposure_time is None and not known.make  # CRW: LibRaw knows them, but has to unpack
@@ -95,8 +92,4 @@ def _raw(path: str, data: bytes) -> worker.Answer:
     decoded = {k: value for k, value in size.get("exif", {}).items() if no_settings or not getattr(known, k)}
     stated = replace(exif.sized(known, size["width"], size["height"]), **decoded)
     lossy = file_checks.is_lossy(structure)
-    return _answer(Probe("raw", file_bytes.digest(data), stated, lossy=lossy), structure.truncated or lossy)
-
-
-def _answer(found: Probe, doubtful: bool = False) -> worker.Answer:
-    return {"probe": asdict(found), "doubtful": doubtful}, {}
+    return Probe("raw", file_bytes.digest(data), stated, lossy=lossy), structure.truncated or lossy

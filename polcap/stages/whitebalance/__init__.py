@@ -27,7 +27,6 @@ from polcap.images import (
     PatchColors,
     View,
 )
-from polcap.optics.projection import transform_points
 from polcap.stages import stage
 from polcap.stages.whitebalance import chart, chart_light, chart_search, patches
 from polcap.stages.whitebalance.chart import Placement
@@ -36,7 +35,6 @@ from polcap.stages.whitebalance.patches import ChartFit
 _LEAST_PITCH_PX = 8.0  # with less, a patch has too few pixels
 _CLEARLY_BETTER = 0.5  # residual with another edition of the chart over that with the stated one: 15 charts had ≥ 0.93
 _SMALL_PART = 0.05  # of the variance, for edges of small patches: there colors decide
-_SAME_PLACE = 0.25  # patches; candidates nearer than this are the same
 _MOST_MOVED = 0.35  # patches; largest refinement of corners from the user
 _REMEDY = "give its corners with --chart x0,y0,…,x3,y3, a profile with --chart FILE, or --no-chart"
 
@@ -81,7 +79,8 @@ def measure(
     ChartError
         No ColorChecker Classic is found, or it is not visible at the corners from the user, or it is over-exposed.
     """
-    if request.mode == "none" or (request.mode == "auto" and _monochrome(radiance.value[0])):
+    monochrome = (radiance.value[0] == radiance.value[0, ..., :1]).all()
+    if request.mode == "none" or (request.mode == "auto" and monochrome):
         return _from_camera(radiance)
     if request.mode == "profile":
         if request.profile is None:
@@ -115,18 +114,11 @@ def measure(
     )
 
 
-def _monochrome(value: Floats) -> bool:
-    """Whether the three channels are equal; then no chart is searched."""
-    step = max(1, int(np.sqrt(value[..., 0].size / 1e5)))
-    few = value[::step, ::step]
-    return bool(np.array_equal(few[..., 0], few[..., 1]) and np.array_equal(few[..., 0], few[..., 2]))
-
-
 @dataclass(frozen=True)
 class _Find:
     place: Placement
     seen: ChartFit
-    cost: float  # the detector's; NaN at corners that the user stated
+    cost: float  # the detector's; NaN at corners from the user
 
     @property
     def error(self) -> float:
@@ -135,65 +127,48 @@ class _Find:
 
 def _search(radiance: AngleStack, reference: ChartReference, settings: WhitebalanceSettings) -> _Find:
     """The first candidate that passes all tests with half the permitted residual, else the best one that passes."""
-    value = radiance.value[0]
-    known: list[Placement] = []
-    best: _Find | None = None
-    cheapest, small = np.inf, 0.0
+    finds: list[_Find] = []
+    cheapest, small_px = np.inf, 0.0
     exposed: ChartError | None = None
-    for centers, cost in chart_search.candidates(value):
+    for centers, cost in chart_search.candidates(radiance.value[0]):
         cheapest = min(cheapest, cost)
         start = chart.from_centers(centers)
-        if cost > settings.max_cost or not chart.is_view(start.homography) or _among(known, start):
+        if cost > settings.max_cost or not chart.is_view(start.homography):
             continue
-        place = chart_search.refine(value, start)
+        place = chart.refine(radiance.value[0], start)
         if not _plausible(place, settings.min_explained - _SMALL_PART):
             if place.explained >= settings.min_explained:
-                small = max(small, place.pitch_px)
+                small_px = max(small_px, place.pitch_px)
             continue
-        known.append(place)
-        try:
-            ways = _both_ways(radiance, reference, place, cost, settings)
+        try:  # the detector may see it upside down
+            ways = [_find(radiance, way, reference, settings, cost) for way in (place, place.turned())]
         except ChartError as error:
             exposed = error
             continue
-        best = min([*ways, *([] if best is None else [best])], key=lambda find: find.error, default=None)
-        if best is not None and best.error <= settings.max_delta_e / 2:  # otherwise a later picture may be better
-            return best
+        most = np.inf if place.explained >= settings.min_explained else settings.max_delta_e / 3
+        finds += [way for way in ways if way.error <= most]
+        if any(find.error <= settings.max_delta_e / 2 for find in finds):  # otherwise a later picture may be better
+            break
+    best = min(finds, key=lambda find: find.error, default=None)
     if best is not None and best.error <= settings.max_delta_e:
         return best
     if exposed is not None:
         raise exposed
-    why = _reason(best, small * radiance.view.scale, _LEAST_PITCH_PX * radiance.view.scale, cheapest, settings)
-    raise ChartError(f"no ColorChecker Classic in the reference shot, at any scale or exposure ({why}); {_REMEDY}")
-
-
-def _both_ways(
-    radiance: AngleStack, reference: ChartReference, place: Placement, cost: float, settings: WhitebalanceSettings
-) -> list[_Find]:
-    """A candidate as detected and upside down, for the detector may confuse them; empty if its colors do not fit."""
-    seen = patches.sample(radiance.value[0], radiance.quality[0], place, settings.patch_share)
-    ways = [
-        _Find(place, patches.fit(seen, reference), cost),
-        _Find(place.turned(), patches.fit(seen.turned(), reference), cost),
-    ]
-    if place.explained < settings.min_explained:
-        ways = [way for way in ways if way.error <= settings.max_delta_e / 3]
-    return ways
-
-
-def _reason(
-    best: _Find | None, small_px: float, least_px: float, cheapest: float, settings: WhitebalanceSettings
-) -> str:
-    """The reason that no candidate was accepted; pitches of patches in RAW px, `cheapest` the least cost."""
+    scale = radiance.view.scale
     if best is not None:
-        return f"best mean residual ΔE {best.error:.1f}, whitebalance.max_delta_e = {settings.max_delta_e:g}"
-    if 0 < small_px < least_px:
-        return f"its patches are spaced by {small_px:.0f} RAW px, at least {least_px:.0f} are needed: show it larger"
-    if cheapest == np.inf:
-        return "the detector found nothing like it"
-    if cheapest > settings.max_cost:
-        return f"best detector cost {cheapest:.3f}, limit whitebalance.max_cost = {settings.max_cost:g}"
-    return f"the best candidate (cost {cheapest:.3f}) does not show 6 × 4 patches on a dark card"
+        why = f"best mean residual ΔE {best.error:.1f}, whitebalance.max_delta_e = {settings.max_delta_e:g}"
+    elif 0 < small_px < _LEAST_PITCH_PX:
+        why = (
+            f"its patches are spaced by {small_px * scale:.0f} RAW px, at least {_LEAST_PITCH_PX * scale:.0f} are "
+            "needed: show it larger"
+        )
+    elif cheapest == np.inf:
+        why = "the detector found nothing like it"
+    elif cheapest > settings.max_cost:
+        why = f"best detector cost {cheapest:.3f}, limit whitebalance.max_cost = {settings.max_cost:g}"
+    else:
+        why = f"the best candidate (cost {cheapest:.3f}) does not show 6 × 4 patches on a dark card"
+    raise ChartError(f"no ColorChecker Classic in the reference shot, at any scale or exposure ({why}); {_REMEDY}")
 
 
 def _at_corners(
@@ -216,15 +191,14 @@ def _at_corners(
             f"{stated} space the patches by {placement.pitch_px:.1f} px on the merged image, at least "
             f"{_LEAST_PITCH_PX:g} are needed; show the chart larger, or demosaic at full size"
         )
-    refined = chart_search.refine(radiance.value[0], placement)
+    refined = chart.refine(radiance.value[0], placement)
     moved = float(np.abs(refined.corners() - corners).max()) / placement.pitch_px
     place = refined if _plausible(refined, settings.min_explained) and moved < _MOST_MOVED else placement
-    find = _Find(place, _fit(radiance, place, reference, settings), float("nan"))
+    find = _find(radiance, place, reference, settings)
     if find.error > settings.max_delta_e:
-        turned = _Find(place.turned(), _fit(radiance, place.turned(), reference, settings), float("nan"))
-        remedy = "check them"
-        if turned.error <= settings.max_delta_e:
-            remedy = "the chart is upside down: start from the opposite corner"
+        turned = _find(radiance, place.turned(), reference, settings)
+        upside_down = turned.error <= settings.max_delta_e
+        remedy = "the chart is upside down: start from the opposite corner" if upside_down else "check them"
         raise ChartError(
             f"{stated} do not show a ColorChecker Classic: mean color residual ΔE {find.error:.1f}, "
             f"limit whitebalance.max_delta_e = {settings.max_delta_e:g}; {remedy}"
@@ -232,8 +206,16 @@ def _at_corners(
     return find
 
 
-def _fit(radiance: AngleStack, place: Placement, reference: ChartReference, settings: WhitebalanceSettings) -> ChartFit:
-    return patches.fit(patches.sample(radiance.value[0], radiance.quality[0], place, settings.patch_share), reference)
+def _find(
+    radiance: AngleStack,
+    place: Placement,
+    reference: ChartReference,
+    settings: WhitebalanceSettings,
+    cost: float = float("nan"),
+) -> _Find:
+    """The colors of a chart at a place of the reference shot; the detector's cost is NaN at corners from the user."""
+    samples = patches.sample(radiance.value[0], radiance.quality[0], place, settings.patch_share)
+    return _Find(place, patches.fit(samples, reference), cost)
 
 
 def _edition(
@@ -245,31 +227,21 @@ def _edition(
     if residuals[least] >= _CLEARLY_BETTER * residuals[0]:
         return found, reference
     edition = reference.editions[least - 1]
-    return replace(found, seen=_fit(radiance, found.place, edition, settings)), edition
+    return _find(radiance, found.place, edition, settings, found.cost), edition
 
 
 def _plausible(place: Placement, min_explained: float) -> bool:
     return chart.is_view(place.homography) and place.pitch_px >= _LEAST_PITCH_PX and place.explained >= min_explained
 
 
-def _among(places: list[Placement], start: Placement) -> bool:
-    """Whether a candidate is at a known place: all patch centers within a quarter of a patch."""
-    here = transform_points(start.homography, chart.centers())
-    return any(
-        np.abs(transform_points(way.homography, chart.centers()) - here).max() < _SAME_PLACE * place.pitch_px
-        for place in places
-        for way in (place, place.turned())
-    )
-
-
 def _from_camera(radiance: AngleStack) -> ColorCalibration:
     """The camera's matrix or white balance from metadata, with sensor white at 1; without either, the identity."""
-    matrix = np.eye(3)
-    known = radiance.sensor.camera_matrix is not None or radiance.sensor.white_balance is not None
-    if radiance.sensor.white_balance is not None:
-        matrix = np.diag(np.asarray(radiance.sensor.white_balance, np.float64))
-    if radiance.sensor.camera_matrix is not None:
-        matrix = np.asarray(radiance.sensor.camera_matrix, np.float64)
+    sensor = radiance.sensor
+    if sensor.camera_matrix is not None:
+        matrix = np.asarray(sensor.camera_matrix, np.float64)
+    else:
+        matrix = np.diag(np.ones(3) if sensor.white_balance is None else np.asarray(sensor.white_balance, np.float64))
+    known = sensor.camera_matrix is not None or sensor.white_balance is not None
     return ColorCalibration(matrix=matrix / 2, source="camera" if known else "none")
 
 

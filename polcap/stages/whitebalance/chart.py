@@ -12,23 +12,31 @@ References
 Triggs et al., Bundle Adjustment, 2000, §4 (Gauss–Newton); Huber & Ronchetti, Robust Statistics, 2009.
 """
 
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
-from polcap.optics.projection import transform_points
-from polcap.optics.robust import MAD_TO_SIGMA
+from polcap.optics.projection import pixels_inside, transform_points
+from polcap.optics.robust import spread
 
 ROWS, COLUMNS = 4, 6
 USUAL_PATCH = 0.88  # side of a patch / pitch
+_LEAST_PATCH, _GREATEST_PATCH = 0.6, 0.97
 _GREATEST_BLUR = 0.12  # 1σ of edges [pitch]
+_START_BLUR = 0.04
 _PIXEL_BLUR_PX = 0.29  # 1/√12, 1σ of a pixel's width: edges cannot be sharper
 _GAMMA = 2.2
 _DARKEST = 1e-3  # of white; darker values are set to this
 _MARGIN = 0.045  # width of card around the outer patches that is compared [pitch]
+_AROUND = 0.3  # width around the chart in which pixels are fitted [pitch]
+_LEAST_PX = 24 * 16  # pixels of a chart that is fitted
+_WORK_PITCH_PX, _WORK_STEPS = 32.0, 4  # pixels per patch to which the picture is averaged down, and steps of the fit
+_FIRST_PITCH_PX, _FIRST_STEPS = 10.0, 12  # the same of a first fit
+_STEP = 1e-6  # of the unknowns, for derivatives
+_SQUARE = np.array([[-1.0, -1.0], [1, -1], [1, 1], [-1, 1]])
 
 
 @dataclass(frozen=True)
@@ -36,20 +44,18 @@ class Placement:
     """Location of a chart in an image."""
 
     homography: Floats  # (3, 3) chart (u, v, 1) → image px (x, y, 1)
-    patch: float  # side of a patch / pitch
-    blur: float  # 1σ of its edges / pitch
-    explained: float  # share of the image's variance that the drawing explains, ≤ 1
+    patch: float = USUAL_PATCH  # side of a patch / pitch
+    explained: float = 0.0  # share of the image's variance that the drawing explains, ≤ 1
 
     @property
     def pitch_px(self) -> float:
         """Mean distance of neighboring patches, px."""
-        outline = transform_points(self.homography, _outer(1.0))
-        return float(np.sqrt(_area(outline) / (ROWS * COLUMNS)))
+        area = cv2.contourArea(transform_points(self.homography, _outer(1.0)).astype(np.float32))
+        return float(np.sqrt(area / (ROWS * COLUMNS)))
 
     def quads(self, share: float = 1.0) -> Floats:
         """(24, 4, 2) corners of each patch, shrunk to `share` of its side; px, from dark skin, row by row."""
-        half = share * self.patch / 2
-        return transform_points(self.homography, centers()[:, None] + half * _SQUARE)
+        return transform_points(self.homography, centers()[:, None] + share * self.patch / 2 * _SQUARE)
 
     def corners(self) -> Floats:
         """(4, 2) outer corners of the outer patches, dark skin first, clockwise on the chart; px."""
@@ -57,16 +63,11 @@ class Placement:
 
     def turned(self) -> "Placement":
         """The same location read upside down."""
-        half_turn = np.array([[-1.0, 0, COLUMNS], [0, -1.0, ROWS], [0, 0, 1]])
-        return Placement(self.homography @ half_turn, self.patch, self.blur, self.explained)
+        return replace(self, homography=self.homography @ [[-1.0, 0, COLUMNS], [0, -1.0, ROWS], [0, 0, 1]])
 
     def moved(self, transform: Floats) -> "Placement":
         """The location in another image; transform (3, 3) maps px of this image to px of the other."""
-        return Placement(transform @ self.homography, self.patch, self.blur, self.explained)
-
-
-_SQUARE = np.array([[-1.0, -1.0], [1, -1], [1, 1], [-1, 1]])
-_AROUND = np.array([[-0.3, -0.3], [6.3, -0.3], [6.3, 4.3], [-0.3, 4.3]])  # the compared part, in chart coordinates
+        return replace(self, homography=transform @ self.homography)
 
 
 def centers() -> Floats:
@@ -77,12 +78,12 @@ def centers() -> Floats:
 
 def from_centers(points: Floats) -> Placement:
     """The placement whose patch centers fit image points (24, 2) px, by least squares."""
-    return Placement(_homography(centers(), points), USUAL_PATCH, _GREATEST_BLUR / 3, 0.0)
+    return Placement(_homography(centers(), points))
 
 
 def from_corners(points: Floats, patch: float = USUAL_PATCH) -> Placement:
     """The placement with outer patch corners (4, 2) px, dark skin first, clockwise on the chart."""
-    return Placement(_homography(_outer(patch), points), patch, _GREATEST_BLUR / 3, 0.0)
+    return Placement(_homography(_outer(patch), points), patch)
 
 
 def is_view(homography: Floats) -> bool:
@@ -97,191 +98,122 @@ def is_view(homography: Floats) -> bool:
     return bool((side[:, 0] * after[:, 1] - side[:, 1] * after[:, 0] > 0).all())
 
 
-def refine(image: Floats, start: Placement, steps: int = 12) -> Placement:
-    """Refine a placement that is right to a third of a patch until its drawing fits the image best.
+def refine(picture: Floats, start: Placement) -> Placement:
+    """Refine the location of a chart, right to a third of a patch, in a linear picture (H, W, 3).
 
-    The image (H, W, 3) is linear, with white about 1, and has 8 pixels per patch or more. Light mixes linearly at an
-    edge; residuals are computed after a gamma of 2.2, so that dark patches count too.
+    It is fitted to the picture averaged down to 10 pixels per patch, then to 32.
     """
-    frame = _frame(start)  # in units of the chart, so that all unknowns have a similar scale
-    at = pixels_inside(transform_points(start.homography, _AROUND), image.shape)
-    value = np.ascontiguousarray(image[at[:, 1], at[:, 0]].T, np.float32)
-    if value.shape[1] < 24 * 16:
+    around = transform_points(start.homography, np.array([[-1.0, -1], [7, -1], [7, 5], [-1, 5]]))
+    x0, y0 = np.maximum(np.floor(around.min(axis=0)).astype(int), 0)
+    x1, y1 = np.minimum(np.ceil(around.max(axis=0)).astype(int) + 1, picture.shape[1::-1])
+    if x1 - x0 < 2 or y1 - y0 < 2:
         return start
-    point = transform_points(frame, at.astype(np.float64)).T
+    seen, place = resize(picture[y0:y1, x0:x1], min(1.0, _WORK_PITCH_PX / start.pitch_px)), start
+    seen = np.clip(seen / white(seen), 0, 4)
+    first = resize(seen, min(1.0, _FIRST_PITCH_PX / min(start.pitch_px, _WORK_PITCH_PX)))
+    for image, steps in ((first, _FIRST_STEPS), (seen, _WORK_STEPS)):
+        to_image = scaling(image.shape, (y1 - y0, x1 - x0)) @ np.array([[1.0, 0, -x0], [0, 1, -y0], [0, 0, 1]])
+        place = _fit(image, place.moved(to_image), steps).moved(np.linalg.inv(to_image))
+    return place
+
+
+def white(picture: Floats) -> Floats:
+    """99th percentile of each channel (3,), from about 10⁵ pixels."""
+    step = max(1, int(np.sqrt(picture[..., 0].size / 1e5)))
+    return np.maximum(np.percentile(picture[::step, ::step], 99, axis=(0, 1)), 1e-9)
+
+
+def resize(picture: Floats, factor: float) -> Floats:
+    """The picture (H, W, 3) averaged down, or enlarged by cubic interpolation."""
+    method = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
+    size = (max(1, round(picture.shape[1] * factor)), max(1, round(picture.shape[0] * factor)))
+    return np.asarray(cv2.resize(np.asarray(picture, np.float32), size, interpolation=method))
+
+
+def scaling(small: tuple[int, ...], large: tuple[int, ...]) -> Floats:
+    """Transform (3, 3) from px of a large picture to px of a small one, with pixel centers at integers."""
+    x, y = small[1] / large[1], small[0] / large[0]
+    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]])
+
+
+def _fit(image: Floats, start: Placement, steps: int) -> Placement:
+    """Fit the drawing of a chart to an image (H, W, 3) with white about 1.
+
+    Light mixes linearly at an edge; residuals are computed after a gamma of 2.2, so that dark patches count too.
+    """
+    middle, pitch = transform_points(start.homography, np.array([COLUMNS / 2, ROWS / 2])), start.pitch_px
+    frame = np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, pitch]]) / pitch  # px → units of the pitch
+    ring = np.array([COLUMNS, ROWS]) / 2 * (1 + _SQUARE) + _AROUND * _SQUARE
+    at = pixels_inside(transform_points(start.homography, ring), image.shape)
+    value = np.maximum(image[at[:, 1], at[:, 0]], _DARKEST)  # (N, 3)
+    point = frame @ np.column_stack([at, np.ones(len(at))]).T
     inverse = np.linalg.inv(frame @ start.homography)
-    inverse = inverse / inverse[2, 2]
-    least_blur = min(_PIXEL_BLUR_PX / start.pitch_px, _GREATEST_BLUR)
-    patch, blur, drawing = start.patch, max(start.blur, 0.04), None
-    seen = _encoded(np.maximum(value, np.float32(_DARKEST)))
+    unknowns = np.array([*(inverse / inverse[2, 2]).ravel()[:8], start.patch, _START_BLUR])
+    low = [*[-np.inf] * 8, _LEAST_PATCH, min(_PIXEL_BLUR_PX / pitch, _GREATEST_BLUR)]
+    high = [*[np.inf] * 8, _GREATEST_PATCH, _GREATEST_BLUR]
+    explained = 0.0
     for step in range(steps):
-        drawing = _draw(point, value, seen, inverse, patch, blur)
-        if drawing is None:
+        cover, cell, used = _cover(point, unknowns)
+        if used.sum() < _LEAST_PX:
             return start
-        normal, right = drawing.equations()
+        cover, cell, seen = cover[used], cell[used], value[used]
+        colors, card = _colors(seen, cover, cell)
+        contrast = colors[cell] - card
+        linear = np.maximum(contrast * cover[:, None] + card, _DARKEST)
+        drawn = linear ** (1 / _GAMMA)
+        contrast = contrast * drawn / linear / _GAMMA  # derivative of the drawn value by the cover
+        seen = seen ** (1 / _GAMMA)
+        residual = seen - drawn
+        by_cover = [(_cover(point[:, used], unknowns + h)[0] - cover) / _STEP for h in _STEP * np.eye(10)]
+        weight = np.minimum(1, 2.5 * spread(residual) / (np.abs(residual) + 1e-12)) * contrast  # Huber
+        normal = np.asarray(by_cover) * (weight * contrast).sum(axis=1) @ np.transpose(by_cover)
         if not np.trace(normal) > 0:  # a uniform picture
             return start
         damping = 1e-3 * np.diag(normal) + 1e-9 * np.trace(normal)
-        change = np.linalg.solve(normal + np.diag(damping), right)
-        inverse = inverse + np.append(change[:8], 0.0).reshape(3, 3)
-        patch = float(np.clip(patch + change[8], 0.6, 0.97))
-        blur = float(np.clip(blur + change[9], least_blur, _GREATEST_BLUR))
+        change = np.linalg.solve(normal + np.diag(damping), by_cover @ (weight * residual).sum(axis=1))
+        unknowns = np.clip(unknowns + change, low, high)
+        variance = float(np.mean((seen - np.median(seen, axis=0)) ** 2))
+        explained = 1 - float(np.mean(np.minimum(residual**2, 0.25))) / max(variance, 1e-9)
         if step > 3 and np.abs(change[:8]).max() < 1e-5:
             break
-    homography = np.linalg.inv(frame) @ np.linalg.inv(inverse)
-    explained = 0.0 if drawing is None else drawing.explained()
-    return Placement(homography / homography[2, 2], patch, blur, explained)
+    homography = np.linalg.inv(np.append(unknowns[:8], 1.0).reshape(3, 3) @ frame)
+    return Placement(homography / homography[2, 2], float(unknowns[8]), explained)
 
 
-@dataclass(frozen=True)
-class _Drawing:
-    """A chart drawn at N pixels, float32: residuals, and derivatives of the drawing by the ten unknowns."""
+def _cover(point: Floats, unknowns: Floats) -> tuple[Floats, NDArray[np.intp], NDArray[np.bool_]]:
+    """Share of each pixel that its nearest patch covers, the index of this patch, and whether the chart has the pixel.
 
-    seen: Floats  # (3, N) encoded
-    residual: Floats  # (3, N) seen − drawn
-    contrast: Floats  # (3, N) derivative of the drawn value by cover, the patch's share of the pixel
-    cover_by: Floats  # (10, N) derivative of cover by the homography's eight numbers, patch and blur
-
-    def equations(self) -> tuple[Floats, Floats]:
-        """JᵀWJ (10, 10) and JᵀWr (10,) with Huber weights W; the J of a pixel is contrast · cover_by."""
-        off = np.abs(self.residual)
-        scale = np.float32(MAD_TO_SIGMA * np.median(off) + 1e-4)
-        weight = np.minimum(np.float32(1), np.float32(2.5) * scale / (off + np.float32(1e-12)))
-        weight *= self.contrast
-        slope = np.sum(weight * self.contrast, axis=0)
-        pull = np.sum(weight * self.residual, axis=0)
-        return ((self.cover_by * slope) @ self.cover_by.T).astype(np.float64), (self.cover_by @ pull).astype(np.float64)
-
-    def explained(self) -> float:
-        """Share of the image's variance that the drawing explains."""
-        spread = self.seen - np.median(self.seen, axis=1)[:, None]
-        return 1 - float(np.mean(np.minimum(self.residual**2, 0.25)) / max(float(np.mean(spread**2)), 1e-9))
-
-
-def _encoded(linear: Floats) -> Floats:
-    """Gamma encoding of positive linear values."""
-    return np.asarray(np.exp(np.log(linear) * np.float32(1 / _GAMMA)))
-
-
-def _draw(point: Floats, value: Floats, seen: Floats, inverse: Floats, patch: float, blur: float) -> _Drawing | None:
-    """Draw the chart at points (2, N) with linear values (3, N), encoded `seen`; None with too few pixels on it."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v, depth = inverse[:, :2] @ point + inverse[:, 2:]
-        u, v = u / depth, v / depth
-    edge = (1 - patch) / 2 - _MARGIN
-    used = (u > edge) & (u < COLUMNS - edge) & (v > edge) & (v < ROWS - edge) & (depth > 0)
-    if used.sum() < 24 * 16:
-        return None
-    u, v, x, y, over = (a[used].astype(np.float32) for a in (u, v, *point, 1 / depth))
-    value, seen = value[:, used], seen[:, used]
-    column, row = np.clip(np.floor(u), 0, COLUMNS - 1), np.clip(np.floor(v), 0, ROWS - 1)
-    cell = (row * COLUMNS + column).astype(np.intp)
-    half = np.float32(0.5)
-    across, across_du, across_patch, across_blur = _box(u - column - half, patch, blur)
-    along, along_dv, along_patch, along_blur = _box(v - row - half, patch, blur)
-    cover = across * along
-    colors, card = _colors(value, cover, cell)
-    contrast = np.take((colors - card).T.astype(np.float32), cell, axis=1)
-    linear = np.maximum(contrast * cover + card.astype(np.float32)[:, None], np.float32(_DARKEST))
-    drawn = _encoded(linear)
-    contrast *= drawn
-    contrast /= linear
-    contrast *= np.float32(1 / _GAMMA)
-    du, dv = along * across_du * over, across * along_dv * over  # ∂u/∂h₁ = x/w, ∂u/∂h₃ = −u x/w
-    both = -(du * u + dv * v)
-    cover_by = np.stack(
-        [
-            *(du * x, du * y, du),
-            *(dv * x, dv * y, dv),
-            *(both * x, both * y),
-            across_patch * along + across * along_patch,
-            across_blur * along + across * along_blur,
-        ]
-    )
-    return _Drawing(seen, seen - drawn, contrast, cover_by)
-
-
-def _box(offset: Floats, patch: float, blur: float) -> tuple[Floats, Floats, Floats, Floats]:
-    """A blurred box from −patch/2 to patch/2, and its derivatives by offset, patch and blur; float32."""
+    point (3, N) are homogeneous coordinates; the ten unknowns are a homography to chart coordinates without its last
+    number, the side of a patch, and the blur.
+    """
     from scipy.special import ndtr  # here: the import takes 0.2 s
 
-    over = np.float32(1 / blur)
-    low, high = (offset + np.float32(patch / 2)) * over, (offset - np.float32(patch / 2)) * over
-    peak = over / np.float32(np.sqrt(2 * np.pi))
-    bell_low, bell_high = (peak * np.exp(np.float32(-0.5) * t * t) for t in (low, high))
-    return (
-        ndtr(low) - ndtr(high),
-        bell_low - bell_high,
-        (bell_low + bell_high) / 2,
-        bell_high * high - bell_low * low,
-    )
+    patch, blur = unknowns[8:]
+    place = np.append(unknowns[:8], 1.0).reshape(3, 3) @ point
+    with np.errstate(divide="ignore", invalid="ignore"):
+        uv = place[:2] / place[2]
+    edge, last = (1 - patch) / 2 - _MARGIN, np.array([[COLUMNS], [ROWS]])
+    used = ((uv > edge) & (uv < last - edge)).all(axis=0) & (place[2] > 0)
+    index = np.clip(np.nan_to_num(np.floor(uv)), 0, last - 1)
+    from_center = uv - index - 0.5
+    sides = ndtr((from_center + patch / 2) / blur) - ndtr((from_center - patch / 2) / blur)
+    return sides[0] * sides[1], (index[1] * COLUMNS + index[0]).astype(np.intp), used
 
 
 def _colors(value: Floats, cover: Floats, cell: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Color of each patch (24, 3) and of the card (3,): medians of the pixels (3, N)."""
-    bare = cover < max(0.1, float(np.percentile(cover, 2)))
-    card = np.median(value[:, bare], axis=1)
-    colors = np.tile(card, (ROWS * COLUMNS, 1))
-    full = np.flatnonzero(cover > 0.9)
-    full = full[np.argsort(cell[full], kind="stable")]
-    ends = np.searchsorted(cell[full], np.arange(ROWS * COLUMNS + 1))
-    inside = value[:, full]
-    for index, (start, end) in enumerate(pairwise(ends)):
-        if end > start:
-            colors[index] = _medians(inside[:, start:end])
-    return colors, card
-
-
-def _medians(value: Floats) -> Floats:
-    """Medians (C,) of rows (C, N), faster than np.median for few values."""
-    low, high = (value.shape[1] - 1) // 2, value.shape[1] // 2
-    ordered = np.partition(value, (low, high), axis=1)
-    return np.asarray((ordered[:, low] + ordered[:, high]) / 2)
-
-
-def pixels_inside(quad: Floats, shape: tuple[int, ...]) -> NDArray[np.int_]:
-    """Pixels x, y (N, 2) of a picture (H, W, …) inside a convex, clockwise quad (4, 2) px."""
-    x0, y0 = np.maximum(np.floor(quad.min(axis=0)).astype(int), 0)
-    x1, y1 = np.minimum(np.ceil(quad.max(axis=0)).astype(int) + 1, [shape[1], shape[0]])
-    y, x = np.mgrid[y0 : max(y1, y0), x0 : max(x1, x0)]
-    inside = np.ones(x.shape, bool)
-    for (ax, ay), (bx, by) in zip(quad, np.roll(quad, -1, axis=0), strict=True):
-        inside &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= 0
-    return np.stack([x[inside], y[inside]], axis=-1)
-
-
-def _frame(placement: Placement) -> Floats:
-    """Transform (3, 3) from image px to units of the pitch, with the chart's center at the origin."""
-    middle = transform_points(placement.homography, np.array([COLUMNS / 2, ROWS / 2]))
-    pitch = placement.pitch_px
-    return np.array([[1 / pitch, 0, -middle[0] / pitch], [0, 1 / pitch, -middle[1] / pitch], [0, 0, 1]])
+    """Color of each patch (24, 3) and of the card (3,): medians of the pixels (N, 3)."""
+    card = np.median(value[cover < max(0.1, float(np.percentile(cover, 2)))], axis=0)
+    full = [value[(cell == index) & (cover > 0.9)] for index in range(ROWS * COLUMNS)]
+    return np.array([np.median(inside, axis=0) if len(inside) else card for inside in full]), card
 
 
 def _outer(patch: float) -> Floats:
-    """Outer corners (4, 2) of the outer patches in chart coordinates."""
+    """Outer corners (4, 2) of the outer patches in chart coordinates, dark skin first, clockwise."""
     gap = (1 - patch) / 2
     return np.array([[gap, gap], [COLUMNS - gap, gap], [COLUMNS - gap, ROWS - gap], [gap, ROWS - gap]])
 
 
 def _homography(source: Floats, target: Floats) -> Floats:
-    """Homography (3, 3) from points (N ≥ 4, 2) by the direct linear transform, on normalized coordinates."""
-    frames = []
-    for points in (source, target):
-        (x, y), unit = points.mean(axis=0), 1 / (points.std() + 1e-12)
-        frames.append(np.array([[unit, 0, -x * unit], [0, unit, -y * unit], [0, 0, 1]]))
-    (u, v), (x, y) = transform_points(frames[0], source).T, transform_points(frames[1], target).T
-    one, zero = np.ones_like(u), np.zeros_like(u)
-    rows = np.concatenate(
-        [
-            np.stack([u, v, one, zero, zero, zero, -x * u, -x * v, -x], axis=-1),
-            np.stack([zero, zero, zero, u, v, one, -y * u, -y * v, -y], axis=-1),
-        ]
-    )
-    h = np.linalg.svd(rows)[2][-1].reshape(3, 3)
-    h = np.linalg.inv(frames[1]) @ h @ frames[0]
-    return np.asarray(h / h[2, 2])
-
-
-def _area(polygon: Floats) -> float:
-    x, y = polygon.T
-    return float(abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2)
+    """Homography (3, 3) from points (N ≥ 4, 2) to points (N, 2); NaN if there is none."""
+    found = cv2.findHomography(source, np.asarray(target, np.float64))[0]
+    return np.full((3, 3), np.nan) if found is None else np.asarray(found)

@@ -12,6 +12,7 @@ import numpy as np
 from polcap.errors import ChartError
 from polcap.images import Bits, ChartReference, Floats, Quality
 from polcap.optics import color
+from polcap.optics.projection import pixels_inside
 from polcap.stages.whitebalance import chart
 from polcap.stages.whitebalance.chart import Placement
 
@@ -100,7 +101,7 @@ def sample(value: Floats, quality: Bits, place: Placement, share: float) -> Patc
     color_, uneven = np.zeros((24, 3)), np.zeros(24)
     use = np.zeros(24, np.uint8)
     for index, quad in enumerate(place.quads(share)):
-        x, y = chart.pixels_inside(quad, value.shape[:2]).T
+        x, y = pixels_inside(quad, value.shape).T
         if len(x) < 4:
             use[index] = PatchUse.OUTSIDE
             continue

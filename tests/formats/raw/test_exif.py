@@ -1,6 +1,5 @@
 """EXIF by content: headers of every maker built here, real files where they are at hand."""
 
-import io
 from types import SimpleNamespace
 
 import cv2
@@ -86,7 +85,7 @@ def test_iso_that_no_tag_states_is_asked_of_the_decoder(tmp_path, monkeypatch):
     """Nikon's first bodies tell it in their maker's tags, old Kodaks have but one; what tags do tell stands."""
     raw_directory = {file_kind.PHOTOMETRIC: (file_kind.CFA,)}
     of_a_maker = SimpleNamespace(dng=False, truncated=False, directories=(raw_directory,))
-    monkeypatch.setattr(file_kind, "structure", lambda file: of_a_maker)
+    monkeypatch.setattr(file_kind, "structure", lambda data: of_a_maker)
     monkeypatch.setattr(file_checks, "check_structure", lambda *known: None)
     monkeypatch.setattr(file_checks, "is_lossy", lambda structure: False)
     asked = []
@@ -168,7 +167,7 @@ def test_damaged_exif_counts_as_none(tmp_path):
 
 def test_looping_directories_end(tmp_path):
     loop = headers.tiff(headers.camera(), {SUB_IFDS: {330: (4, (8,))}})
-    assert len(file_kind.structure(io.BytesIO(loop)).directories) == 2
+    assert len(file_kind.structure(loop).directories) == 2
 
 
 def test_not_a_picture_is_one_error(tmp_path):

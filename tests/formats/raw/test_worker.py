@@ -2,12 +2,11 @@
 
 import importlib
 import os
-import signal
 import subprocess
 import sys
 import textwrap
 import time
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -60,7 +59,7 @@ FUNCTIONS = """
 class Misled(Worker):
     """A worker that is given functions that misbehave."""
 
-    module: Any
+    module: ModuleType
 
 
 @pytest.fixture
@@ -142,27 +141,23 @@ def test_an_answer_beyond_its_bounds_is_refused(worker, answer):
     assert pid(worker)
 
 
-def test_a_call_may_have_tighter_limits(worker):
+def test_a_call_may_have_a_tighter_limit(worker):
     with pytest.raises(DecodeError, match=r"slow\.raw: not decoded within 0\.5 s"):
         worker.call(worker.module.hang, "slow.raw", limit_s=0.5)
-    with pytest.raises(DecodeError, match=r"large\.raw.*more than 0\.2 GiB"):
-        worker.call(worker.module.ramp, "large.raw", limit_gib=0.2, count=2**28)
-    assert worker.call(worker.module.ramp, "large.raw", count=2**28)[1]["ramp"].size == 2**27
 
 
-@pytest.mark.skipif(os.name != "posix", reason="elsewhere the time limit ends it")
 @pytest.mark.parametrize("loop", ["spin", "hang"])
-def test_a_child_in_a_loop_dies_with_its_parent(worker, tmp_path, loop):
+def test_a_child_in_a_loop_ends_when_its_parent_was_killed(worker, tmp_path, loop):
     code = (
         "import sys; sys.path.insert(0, sys.argv[1]); import misbehaving\n"
         "from polcap.formats.raw.worker import Worker\n"
         "w = Worker(); print(w.call(misbehaving.ramp, 'a')[0]['pid'], flush=True)\n"
-        f"w.call(misbehaving.{loop}, 'b')"
+        f"w.call(misbehaving.{loop}, 'b', limit_s=2)"
     )
     parent = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE)
     child = int(parent.stdout.readline())
     time.sleep(0.3)  # it is in the loop
-    parent.send_signal(signal.SIGKILL)
+    parent.kill()
     parent.wait()
     parent.stdout.close()
     for _ in range(2000):
@@ -171,5 +166,4 @@ def test_a_child_in_a_loop_dies_with_its_parent(worker, tmp_path, loop):
         except ProcessLookupError:
             return
         time.sleep(0.05)
-    os.kill(child, signal.SIGKILL)
     pytest.fail("the child outlived its parent")

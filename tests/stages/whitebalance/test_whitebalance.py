@@ -177,7 +177,7 @@ def test_left_out_patch_is_predicted_about_as_well_as_noise_lets():
 def test_block_of_an_sg_chart_is_read_at_its_corners_and_only_there():
     sg, place = shipped_data.colorchecker("sg"), pose(24, 8, (260, 170))
     image = photograph(place, sg.rec709)
-    exact = chart.Placement(place, 0.87, 0.01, 1.0).corners()
+    exact = chart.Placement(place, 0.87).corners()
     request = ChartRequest("corners", corners=2 * exact + 0.5)
     color = whitebalance.measure(stack(image), sg, request, WhitebalanceSettings(chart="sg"))
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.03)
@@ -213,7 +213,7 @@ def test_an_image_without_a_chart_is_refused_with_the_remedies():
 
 def test_manual_corners_in_raw_pixels_are_drawn_to_the_chart():
     image, place = plain()
-    exact = chart.Placement(place, 0.87, 0.01, 1.0).corners()
+    exact = chart.Placement(place, 0.87).corners()
     rough = exact + np.array([[3.0, -2], [-3, 2], [2, 3], [-2, -3]])  # an unsteady hand
     request = ChartRequest("corners", corners=2 * rough + 0.5)  # binned px (i, j) ↔ RAW px (2i + ½, 2j + ½)
     color = whitebalance.measure(stack(image), CLASSIC, request, WhitebalanceSettings())
@@ -224,7 +224,7 @@ def test_manual_corners_in_raw_pixels_are_drawn_to_the_chart():
 
 def test_corners_from_the_wrong_end_are_named():
     image, place = plain()
-    corners = 2 * chart.Placement(place, 0.87, 0.01, 1.0).corners() + 0.5
+    corners = 2 * chart.Placement(place, 0.87).corners() + 0.5
     with pytest.raises(ChartError, match="upside down"):
         request = ChartRequest("corners", corners=np.roll(corners, 2, axis=0))
         whitebalance.measure(stack(image), CLASSIC, request, WhitebalanceSettings())
