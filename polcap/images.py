@@ -552,6 +552,7 @@ class Cues:
     mask: NDArray[np.bool_]  # (H, W)
     quality: Bits  # (H, W)
     view: View
+    scale_sigma: float | None = None  # relative 1σ of the light on the chart against that on the object; None: no chart
     body: Floats | None = None  # (H, W, 3) radiance of the diffuse reflection only, from a crossed shot
     body_known: NDArray[np.bool_] | None = None  # (H, W) where the crossed shot is valid
 
@@ -586,6 +587,7 @@ class SurfaceMaps:
     mask: NDArray[np.bool_]  # (H, W)
     view: View
     estimator: str
+    albedo_sigma: float | None = None  # relative 1σ of the scale of all albedos; None: unknown, albedos are relative
 
 
 @dataclass(frozen=True)
@@ -616,6 +618,7 @@ class Asset:
     specular_color: NDArray[np.uint8]  # (H, W, 3) sRGB, to be multiplied by the factor
     specular_factor: tuple[float, float, float]  # KHR_materials_specular specularColorFactor
     ior: float
+    albedo_sigma: float | None = None  # as in `SurfaceMaps`
 
 
 @dataclass(frozen=True)

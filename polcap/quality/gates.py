@@ -47,10 +47,10 @@ def _in_order(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iter
     yield light.bracket(found)
     yield light.tone(found, limits)
     yield light.source(found)
-    yield light.stillness(found, limits)
     yield light.chart(found, limits)
     yield geometry.alignment(found, limits, align)
     yield geometry.mask(found, limits)
+    yield light.stillness(found, limits)
     yield light.clipping(found, limits)
     yield geometry.sharpness(found, limits)
     yield from light.gains(found, limits)
@@ -58,9 +58,11 @@ def _in_order(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iter
     yield from polarization.of_outline(found, limits)
     yield light.noise(found, limits)
     yield light.ambient(found, limits)
+    yield light.room(found, limits)
     yield from light.crossed(found, limits)
     yield polarization.ill_posed(found, limits)
     yield geometry.inward_outline(found, limits)
+    yield light.albedo_scale(found, limits)
     yield geometry.focal_length(found)
 
 

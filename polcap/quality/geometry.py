@@ -85,7 +85,7 @@ def mask(found: Evidence, limits: GateLimits) -> Gate:
     for message, figure, most in (
         ("The object touches {:.0%} of the picture's border, where it has no outline",
          object_.border, limits.max_mask_border),
-        ("{:.0%} of the object's mask is separate from its largest part", object_.islands, limits.max_mask_islands),
+        ("{:.0%} of the object's mask is separate from its largest part; one asset holds all parts", object_.islands, limits.max_mask_islands),
         ("The object's mask has holes of {:.0%} of its area", object_.holes, limits.max_mask_holes),
     ):  # fmt: skip
         if figure > most:
@@ -98,6 +98,8 @@ def mask(found: Evidence, limits: GateLimits) -> Gate:
         return Gate("mask", "pass" if known else "not measured", None, limit, message)
     state: State = "fail" if charted or doubted else "warn"
     remedy = "Look at mask.png; where it is wrong, draw one and use --mask PNG, or show backdrop all around the object"
+    if object_.islands > limits.max_mask_islands:
+        remedy = f"Which object is it? --set mask.part=1 takes the largest, mask.part=2 the next. {remedy}"
     cost = 10 * object_.border if state == "warn" else 5.0
     _, value, most = faults[0]
     return Gate("mask", state, round(value, 5), most, "; ".join(fault[0] for fault in faults), remedy, cost)
@@ -149,7 +151,9 @@ def sharpness(found: Evidence, limits: GateLimits) -> Gate:
     message = f"Frame {e + 1} of the {found.names[k]} shot is blurred by {blur[k, e]:.1f} px more than the sharpest"
     bad = blamed(found.names, np.nanmax(np.nan_to_num(blur), axis=1) > limit)
     remedy = "Focus by hand and tape the ring, use a remote release, and take it again"
-    return at_most("sharpness", float(blur[k, e]), limit, message, remedy, bad, 3, "px")
+    of_shot = float(np.nan_to_num(blur).mean(axis=1).max())  # a single frame is only a part of its shot
+    state: State = "fail" if of_shot > limit else "warn"
+    return at_most("sharpness", float(blur[k, e]), limit, message, remedy, bad, 2 * of_shot, "px", state)
 
 
 def focal_length(found: Evidence) -> Gate:

@@ -10,6 +10,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Beyond a limit `check` asks to reshoot, and `process` writes the asset and ends with exit code 3."""
 
     max_delta_e: Annotated[float, Meta(gt=0, description="mean color error of the chart's patches [CIEDE2000]")] = 5.0
+    max_scale_doubt: Annotated[float, Meta(gt=0, le=1, description="1σ of the scale of all albedos [1]")] = 0.2
     max_tone_curvature: Annotated[
         float, Meta(gt=0, le=1, description="slope of ln exposure ratio over ln brightness; 0 is linear [1]")
     ] = 0.1
@@ -80,7 +81,10 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_dolp_noise: Annotated[
         float, Meta(gt=0, le=1, description="false polarization from noise, median over the object [1]")
     ] = 0.04
-    max_ambient: Annotated[float, Meta(gt=0, le=1, description="share of ambient light [1]")] = 0.1
+    max_ambient: Annotated[float, Meta(gt=0, le=1, description="share of ambient light, which is subtracted [1]")] = 0.3
+    max_room_dolp: Annotated[
+        float, Meta(gt=0, le=1, description="polarization of the surroundings, common to all of them [1]")
+    ] = 0.015
     max_crossed_misfit: Annotated[
         float,
         Meta(gt=0, le=1, description="share of the object that is brighter in the cross-polarized shot than in S0 [1]"),
@@ -89,7 +93,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float, Meta(ge=0, le=1, description="share of the object with a DoLP above that of any dielectric [1]")
     ] = 0.05
     max_ghost: Annotated[
-        float, Meta(ge=0, le=1, description="share of a shot with exposures that disagree beyond noise [1]")
+        float, Meta(ge=0, le=1, description="share of the object where the exposures of a shot disagree beyond noise [1]")
     ] = 0.02
     max_normal_error_deg: Annotated[
         float, Meta(gt=0, le=90, description="median expected error of the normals [degrees]")

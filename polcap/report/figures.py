@@ -9,7 +9,6 @@ from polcap.formats.maps import maps_folder
 from polcap.images import Alignment, AngleStack, ColorCalibration, Cues, Floats, Mesh, Quality, StokesImage
 from polcap.report import page_data
 from polcap.results import Results
-from polcap.stages.cues import scale
 from polcap.stages.whitebalance import patches
 
 _COMPARED_PX = 512  # longest side on which photographs and their re-rendering are compared
@@ -20,7 +19,7 @@ def measured(results: Results) -> dict[str, dict[str, Any]]:
     """All figures by subject; `labels.LABELS` describes each of them."""
     return {
         "merge": _exposures(results.radiance),
-        "chart": _colors(results.color, results.stokes),
+        "chart": _colors(results.color, results.maps.albedo_sigma),
         "alignment": _registration(results.alignment),
         "gains": _gains(results),
         "angles": _angles(results),
@@ -47,7 +46,7 @@ def _exposures(radiance: AngleStack) -> dict[str, Any]:
     }
 
 
-def _colors(color: ColorCalibration, image: StokesImage) -> dict[str, Any]:
+def _colors(color: ColorCalibration, albedo_sigma: float | None) -> dict[str, Any]:
     fit, light = color.patches, color.light
     predicted = None if fit is None else fit.predicted
     return {
@@ -63,7 +62,7 @@ def _colors(color: ColorCalibration, image: StokesImage) -> dict[str, Any]:
         "left_out": None if fit is None or fit.use is None else patches.left_out(fit.use),
         "detector_cost": _number(color.cost),
         "metres_per_px": color.metres_per_px,
-        "scale_doubt": scale.sigma(image, color),
+        "scale_doubt": albedo_sigma,
         "matrix": _list(color.matrix),
     }
 

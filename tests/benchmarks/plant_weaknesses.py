@@ -163,7 +163,8 @@ def _plant(plan: Plan, kind: str, random: Random) -> None:
         x = -0.17 - float(random.uniform(0.02, 0.05))
         plan.scene = replace(scene, position=(x, *scene.position[1:]))
     elif kind == "two objects":
-        balls = [(x, float(random.uniform(-0.02, 0.02)), 0.0, float(random.uniform(0.024, 0.034))) for x in (-0.04, 0.04)]
+        up, radius = random.uniform(-0.02, 0.02, 2).tolist(), random.uniform(0.024, 0.034, 2).tolist()
+        balls = [(x, y, 0.0, r) for x, y, r in zip((-0.04, 0.04), up, radius)]
         plan.scene = replace(scene, shape=Cluster(tuple(balls)), turn_deg=(0.0, 0.0, float(random.uniform(-60, 60))))
     elif kind in ("ambient frame", "polarized ambient frames", "polarized room", "polarized room with a frame"):
         plan.shift[:] = 0

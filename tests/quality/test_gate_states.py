@@ -173,6 +173,9 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("ill-posed", "fail", {"figures": {"ill_posed": 0.5}}),
     ("outline", "pass", {}),
     ("outline", "fail", {"figures": {"inward_outline": 0.3}}),
+    ("albedo scale", "pass", {}),
+    ("albedo scale", "warn", {"maps": SimpleNamespace(albedo_sigma=0.5)}),
+    ("albedo scale", "warn", {"maps": SimpleNamespace(albedo_sigma=None)}),
     ("focal length", "pass", {}),
     ("focal length", "warn", {"focal_doubt": (-0.7, 0.7)}),
     ("normal error", "pass", {}),
@@ -206,7 +209,8 @@ def good() -> dict[str, Any]:
         "radiance": with_field(scenes.stack(), "bracket", exposures(1.0, 4.0)),
         "color": scenes.no_color(), "alignment": scenes.still(), "object_": replace(scenes.ball_object(), doubt=0.01),
         "selfcal": replace(scenes.equal(), gains=GAINS, outline=OutlineCheck(STATED, 0.95)),
-        "stokes": SimpleNamespace(body=True), "maps": None, "mesh": SimpleNamespace(**MESH),
+        "stokes": SimpleNamespace(body=True), "maps": SimpleNamespace(albedo_sigma=0.1),
+        "mesh": SimpleNamespace(**MESH),
         "figures": FIGURES | outline(),
     }  # fmt: skip
 

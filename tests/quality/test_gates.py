@@ -37,7 +37,7 @@ def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> Evidence:
     image = stokes.solve(radiance, scenes.still(shots), calibration, object_, stokes.StokesSettings())
     normal = scenes.truth()[0].astype(np.float32)
     flat = np.full(image.mask.shape, 0.5, np.float32)
-    maps = SurfaceMaps(normal, normal, normal, flat, None, 8 * flat, image.mask, image.view, "analytic")
+    maps = SurfaceMaps(normal, normal, normal, flat, None, 8 * flat, image.mask, image.view, "analytic", 0.1)
     given = {
         "names": [f"{np.degrees(a):g}°" for a in radiance.angle], "focal_doubt": (0.0, 0.0), "grid_px": 1.0,
         "chart_missing": "", "clipped": clipped(), "blur_px": radiance.bracket.blur_px, "radiance": radiance,

@@ -23,6 +23,7 @@ from polcap.formats import atomic
 from polcap.formats.export import encoders, texture_set
 from polcap.formats.export.encoders import Kind, TextureEncoder
 from polcap.formats.export.texture_set import Texture
+from polcap.formats.maps import maps_folder
 from polcap.images import Asset, Floats, Mesh
 
 _FLOAT, _UINT32 = 5126, 5125
@@ -89,6 +90,7 @@ def encode(
             "generator": f"polcap {__version__}",
             "extras": {
                 "unit": "metre" if asset.mesh.metric else "relative",
+                "albedo": maps_folder.albedo_scale(asset.albedo_sigma),
                 "origin_in_camera": [float(x) for x in center(asset.mesh.vertices)],
                 "pieces": asset.mesh.pieces,
                 "cuts": asset.mesh.cuts,

@@ -45,6 +45,10 @@ class _Depth(Struct, frozen=True):
     unit: Literal["m", "relative"]
 
 
+class _Albedo(Struct, frozen=True):
+    uncertainty_percent: Annotated[float, Meta(ge=0)] | None = None
+
+
 class _Description(Struct, frozen=True):
     """The keys of maps.json that `read` needs."""
 
@@ -54,6 +58,7 @@ class _Description(Struct, frozen=True):
     camera: _Camera
     depth: _Depth
     estimator: str
+    albedo: _Albedo = _Albedo()
 
 
 @dataclass(frozen=True)
@@ -112,6 +117,7 @@ def as_stored(maps: SurfaceMaps) -> SurfaceMaps:
         mask=inside,
         view=maps.view,
         estimator=maps.estimator,
+        albedo_sigma=None if maps.albedo_sigma is None else round(maps.albedo_sigma, 3),
     )
 
 
@@ -144,6 +150,7 @@ def read(folder: Path) -> StoredMaps:
         raise DecodeError(f"{folder} has no maps.json ({error.strerror}); give a result's folder") from error
     except ValueError as error:
         raise DecodeError(f"{folder / 'maps.json'} is not a maps.json of polcap ({error}); process again") from error
+    percent = about.albedo.uncertainty_percent
     width, height = about.size
     origin = (about.crop[0] / about.scale, about.crop[1] / about.scale)
     view = View(about.camera.focal_px, about.camera.center_px, about.scale, origin, about.camera.focal_known)
@@ -163,6 +170,7 @@ def read(folder: Path) -> StoredMaps:
             mask=inside,
             view=view,
             estimator=about.estimator,
+            albedo_sigma=None if percent is None else round(percent / 100, 3),
         ),
         depth=np.where(inside, _read_map(folder / "depth.exr", "Z", about.size), np.nan).astype(np.float32),
         metric=about.depth.unit == "m",
@@ -220,6 +228,7 @@ def _description(maps: SurfaceMaps, depth: Mapping[str, str | float]) -> dict[st
         },
         "depth": dict(depth),
         "estimator": maps.estimator,
+        "albedo": albedo_scale(maps.albedo_sigma),
         "conventions": CONVENTIONS,
         "maps": {
             "normal.exr": "unit vectors: R x, G y, B z; float",
@@ -240,6 +249,14 @@ def _description(maps: SurfaceMaps, depth: Mapping[str, str | float]) -> dict[st
             "with a cross-polarized shot the two parts of S0 as photograph.png has it, linear: scattered.R, .G, .B and "
             "mirrored.R, .G, .B; half",
         },
+    }
+
+
+def albedo_scale(sigma: float | None) -> dict[str, Any]:
+    """Whether the scale of all albedos is known, and its 1σ, for maps.json and the GLB; None: no chart."""
+    return {
+        "scale": "relative" if sigma is None else "known",
+        "uncertainty_percent": None if sigma is None else round(100 * sigma, 1),
     }
 
 
