@@ -54,6 +54,14 @@ NUMBERS = Limit("relative", 1e-3)  # sums over many pixels: rounding averages ou
 BITS = Limit("absolute", 0.0, 1e-3)  # pixels on a threshold: 4 of 250,000 were seen to flip
 CHOICES = Limit("absolute", 0.0)  # counts, orders, names
 
+INFER = {
+    "mask": BITS,
+    "normal": Limit("degrees", 0.1, 1e-3),  # pixels choose between hypotheses of almost equal cost
+    "diffuse": Limit("absolute", 3e-4, 1e-3),  # albedo
+    "confidence": Limit("relative", 2e-3, 1e-3),
+    "*": FLOAT32,
+}
+
 LIMITS: dict[str, dict[str, Limit]] = {  # stage → array → limit; the first pattern that fits
     "hdr": {
         "quality": BITS,
@@ -76,20 +84,8 @@ LIMITS: dict[str, dict[str, Limit]] = {  # stage → array → limit; the first 
     },
     "stokes": {"quality": BITS, "mask": BITS, "*": FLOAT32},
     "cues": {"quality": BITS, "mask": BITS, "*": FLOAT32},
-    "infer": {
-        "mask": BITS,
-        "normal": Limit("degrees", 0.1, 1e-3),  # pixels choose between hypotheses of almost equal cost
-        "diffuse": Limit("absolute", 3e-4, 1e-3),  # albedo
-        "confidence": Limit("relative", 2e-3, 1e-3),
-        "*": FLOAT32,
-    },
-    "infer by network": {
-        "mask": BITS,
-        "normal": Limit("degrees", 0.1, 1e-3),  # 0.007° was seen between graph optimizations on and off
-        "diffuse": Limit("absolute", 3e-4, 1e-3),  # albedo
-        "confidence": Limit("relative", 2e-3, 1e-3),
-        "*": FLOAT32,
-    },
+    "infer": INFER,
+    "infer by network": INFER,
     "surface": {
         "normals": Limit("degrees", 0.1, 1e-3),
         "faces": Limit("absolute", 0.0, 1e-3),
@@ -124,7 +120,7 @@ def other_names(stage: str, expected: Arrays, found: Arrays) -> list[str]:
 def other_values(stage: str, expected: Arrays, found: Arrays) -> list[str]:
     """One line for each array beyond its limit."""
     lines = []
-    for name in [name for name in expected if name in found]:
+    for name in expected.keys() & found.keys():
         before, now = expected[name], found[name]
         if before.shape != now.shape:
             lines.append(f"{stage}: {name} has shape {now.shape}, expected {before.shape}.")
@@ -137,14 +133,18 @@ def other_values(stage: str, expected: Arrays, found: Arrays) -> list[str]:
                 f"{stage}: {name} differs by more than {allowed.most:g} ({allowed.unit}) in {share:.2%} of its values "
                 f"(limit {allowed.share:.2%}); the largest difference is {np.max(change):.3g}."
             )
-    return lines
+    return sorted(lines)
 
 
 def difference(before: NDArray[Any], now: NDArray[Any], unit: str) -> Any:
-    """How far each value changed, in a unit of `Limit`; infinite where only one of the two is a number."""
+    """Change of each value in a unit of `Limit`; infinite where only one of the two is a number."""
     if before.dtype.kind == "U":
-        return (before != now).astype(float) * np.inf if (before != now).any() else np.zeros(before.shape)
+        return np.where(before == now, 0, np.inf)
     before, now = before.astype(np.float64), now.astype(np.float64)
+    if unit == "px":  # movement of the corners of the picture by transforms (K, 3, 3)
+        corners = np.array([[0, 575, 0, 575], [0, 0, 431, 431], [1, 1, 1, 1]])
+        places = [(moved := transform @ corners)[:, :2] / moved[:, 2:] for transform in (before, now)]
+        return np.linalg.norm(places[1] - places[0], axis=1)
     one_is_nan = np.isnan(before) != np.isnan(now)
     before, now = np.nan_to_num(before), np.nan_to_num(now)
     change = np.abs(now - before)
@@ -153,18 +153,8 @@ def difference(before: NDArray[Any], now: NDArray[Any], unit: str) -> Any:
         change = change / np.maximum(np.maximum(np.abs(before), 0.1 * rms), 1e-30)
     elif unit == "degrees":
         vectors = before.ndim > 1 and before.shape[-1] == 3
-        change = np.degrees(np.linalg.norm(now - before, axis=-1) if vectors else change)
-        one_is_nan = one_is_nan.any(axis=-1) if vectors else one_is_nan
-    elif unit == "px":
-        return np.linalg.norm(_moved(now) - _moved(before), axis=1)
+        change = np.degrees(np.linalg.norm(change, axis=-1, keepdims=True) if vectors else change)
     return np.where(one_is_nan, np.inf, change)
-
-
-def _moved(transform: NDArray[Any]) -> Any:
-    """Where transforms (K, 3, 3) move the corners of the picture: (K, 2, 4) px."""
-    corner = np.array([[0, 575, 0, 575], [0, 0, 431, 431], [1, 1, 1, 1]])
-    moved = transform @ corner
-    return moved[:, :2] / moved[:, 2:]
 
 
 # Run the stages on stored inputs.
@@ -224,58 +214,27 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
     equal = scenes.equal(gain=inputs["gain"])
     calibration = replace(equal, gains=replace(equal.gains, sigma=inputs["sigma"]))
 
-    def network() -> images.Network:
-        found = models.load_network("network", None, "cpu", threads)
-        assert found is not None
-        return found
-
-    def merge() -> Any:
-        return hdr.merge(read_capture(CAPTURE), frame_decoder.decode, config.hdr)
-
-    def measure() -> Any:
-        chart = shipped_data.colorchecker(config.whitebalance.chart)
-        return whitebalance.measure(shots(), chart, images.ChartRequest("auto"), config.whitebalance)
-
-    def register() -> Any:
-        return align.register(shots(), color, config.align)
-
-    def segment() -> Any:
-        found = models.load_mask_network(threads)
-        return mask.segment(shots(), registered, color, None, found, onnx.run, config.mask)
-
-    def calibrate() -> Any:
-        return selfcal.solve(shots(), registered, object_, color, config.selfcal)
-
-    def solve() -> Any:
-        return stokes.solve(shots(), registered, calibration, object_, config.stokes)
-
-    def compute() -> Any:
-        return cues.compute(plain_stokes(shots(), object_), color)
-
-    def estimate() -> Any:
-        return infer.estimate(stored_cues(inputs), None, onnx.run, config.infer)
-
-    def estimate_by_network() -> Any:
-        return infer.estimate(stored_cues(inputs), network(), onnx.run, config.infer)
-
-    def integrate() -> Any:
-        return surface.integrate(stored_maps(inputs), 0.7, config.surface)
-
-    def build() -> Any:
-        return asset.build(stored_maps(inputs), stored_mesh(inputs), config.asset)
-
+    chart = shipped_data.colorchecker(config.whitebalance.chart)
+    network = cache(lambda: models.load_network("network", None, "cpu", threads))
+    mask_network = cache(lambda: models.load_mask_network(threads))
+    cue, maps, run = stored_cues(inputs), stored_maps(inputs), onnx.run
     return {
-        "hdr": Golden(hdr.merge, merge),
-        "whitebalance": Golden(whitebalance.measure, measure),
-        "align": Golden(align.register, register),
-        "mask": Golden(mask.segment, segment),
-        "selfcal": Golden(selfcal.solve, calibrate),
-        "stokes": Golden(stokes.solve, solve),
-        "cues": Golden(cues.compute, compute),
-        "infer": Golden(infer.estimate, estimate),
-        "infer by network": Golden(infer.estimate, estimate_by_network),
-        "surface": Golden(surface.integrate, integrate),
-        "asset": Golden(asset.build, build),
+        "hdr": Golden(hdr.merge, lambda: hdr.merge(read_capture(CAPTURE), frame_decoder.decode, config.hdr)),
+        "whitebalance": Golden(
+            whitebalance.measure,
+            lambda: whitebalance.measure(shots(), chart, images.ChartRequest("auto"), config.whitebalance),
+        ),
+        "align": Golden(align.register, lambda: align.register(shots(), color, config.align)),
+        "mask": Golden(
+            mask.segment, lambda: mask.segment(shots(), registered, color, None, mask_network(), run, config.mask)
+        ),
+        "selfcal": Golden(selfcal.solve, lambda: selfcal.solve(shots(), registered, object_, color, config.selfcal)),
+        "stokes": Golden(stokes.solve, lambda: stokes.solve(shots(), registered, calibration, object_, config.stokes)),
+        "cues": Golden(cues.compute, lambda: cues.compute(plain_stokes(shots(), object_), color)),
+        "infer": Golden(infer.estimate, lambda: infer.estimate(cue, None, run, config.infer)),
+        "infer by network": Golden(infer.estimate, lambda: infer.estimate(cue, network(), run, config.infer)),
+        "surface": Golden(surface.integrate, lambda: surface.integrate(maps, 0.7, config.surface)),
+        "asset": Golden(asset.build, lambda: asset.build(maps, stored_mesh(inputs), config.asset)),
     }
 
 
@@ -363,16 +322,14 @@ def outputs(value: Any, name: str = "") -> Arrays:
 
 
 def samples(arrays: Arrays) -> Arrays:
-    """A stage's outputs as they are stored."""
+    """A stage's outputs as they are stored: of a large array at most `SAMPLES` pixels; masks whole."""
     return {name: sample(array) for name, array in arrays.items()}
 
 
 def sample(array: NDArray[Any]) -> NDArray[Any]:
-    """An array as it is stored: of a large one at most `SAMPLES` pixels; masks whole."""
     if array.dtype == bool or array.size <= 200:
         return array
-    width = array.shape[-1] if array.shape[-1] <= 4 else 1
-    rows = array.reshape(-1, width)
+    rows = array.reshape(-1, array.shape[-1] if array.shape[-1] <= 4 else 1)
     count = min(SAMPLES, len(rows))
     return short(rows[np.arange(count) * len(rows) // count])
 
@@ -405,22 +362,25 @@ def make_inputs() -> Arrays:
     object_ = mask.segment(shots, registered, color, None, models.load_mask_network(1), onnx.run, config.mask)
     calibration = selfcal.solve(shots, registered, object_, color, config.selfcal)
     assert color.place is not None and color.light is not None
-    found = {f"light.{name}": array for name, array in vars(color.light).items()}
-    found |= {"matrix": color.matrix, "quads": color.place.quads, "corners": color.place.corners}
-    found |= {"transform": registered.transform, "mask": object_.mask, "crop": np.array(object_.crop)}
-    found |= {"gain": calibration.gains.gain, "sigma": calibration.gains.sigma}
     seen = cues.compute(stokes.solve(shots, registered, calibration, object_, config.stokes), color)
     inside = seen.mask[::STEP, ::STEP]
-    found["cues.mask"] = inside
-    found["cues.radiance"] = short(seen.radiance[::STEP, ::STEP] * inside[..., None])
-    found["cues.ratio"] = short(seen.ratio[:, ::STEP, ::STEP] * inside)
-    found["cues.ratio_sigma"] = short(seen.ratio_sigma[::STEP, ::STEP])
+    found = {f"light.{name}": array for name, array in vars(color.light).items()} | {
+        "matrix": color.matrix, "quads": color.place.quads, "corners": color.place.corners,
+        "transform": registered.transform, "mask": object_.mask, "crop": np.array(object_.crop),
+        "gain": calibration.gains.gain, "sigma": calibration.gains.sigma,
+        "cues.mask": inside,
+        "cues.radiance": short(seen.radiance[::STEP, ::STEP] * inside[..., None]),
+        "cues.ratio": short(seen.ratio[:, ::STEP, ::STEP] * inside),
+        "cues.ratio_sigma": short(seen.ratio_sigma[::STEP, ::STEP]),
+    }  # fmt: skip
     maps = infer.estimate(stored_cues(found), models.load_network("network", None, "cpu", 1), onnx.run, config.infer)
-    found["maps.normal"] = short(np.moveaxis(maps.normal[..., :2] * inside[..., None], -1, 0))
-    found["maps.diffuse"] = short(maps.diffuse * inside[..., None])
-    found["maps.specular"] = short(maps.specular[..., 0] * inside)
-    found["maps.roughness"] = short(maps.roughness * inside)
-    found["maps.confidence"] = short(maps.confidence * inside)
+    found |= {
+        "maps.normal": short(np.moveaxis(maps.normal[..., :2] * inside[..., None], -1, 0)),
+        "maps.diffuse": short(maps.diffuse * inside[..., None]),
+        "maps.specular": short(maps.specular[..., 0] * inside),
+        "maps.roughness": short(maps.roughness * inside),
+        "maps.confidence": short(maps.confidence * inside),
+    }
     few = MESH_STEP // STEP
     small = replace(
         stored_maps(found),
@@ -428,8 +388,7 @@ def make_inputs() -> Arrays:
         view=crop_view((int(found["crop"][0]), int(found["crop"][1])), MESH_STEP),
     )
     mesh = surface.integrate(small, 0.7, config.surface)
-    found |= {f"mesh.{name}": getattr(mesh, name) for name in ("vertices", "normals", "uv", "tangents", "faces")}
-    return found
+    return found | {f"mesh.{name}": getattr(mesh, name) for name in ("vertices", "normals", "uv", "tangents", "faces")}
 
 
 def main() -> None:

@@ -8,8 +8,7 @@ from typing import NoReturn
 import pytest
 
 from polcap import doctor
-from polcap.doctor import Rig
-from polcap.doctor.finding import Finding
+from polcap.doctor import Finding, Rig
 from polcap.errors import DecodeError, HardwareError, ModelError, SettingError
 from polcap.formats import onnx
 from polcap.formats.raw import libraw as raw
@@ -34,7 +33,7 @@ def test_this_machine_can_process(tmp_path: Path) -> None:
     assert not any(tmp_path.iterdir())
 
 
-def test_ports_and_cameras_are_listed_with_what_answers(tmp_path: Path) -> None:
+def test_ports_and_cameras_are_listed_with_their_answers(tmp_path: Path) -> None:
     answers = {"/dev/ttyUSB0": "Elliptec ELL14", "/dev/ttyUSB1": None}
 
     def probe(url: str) -> str | None:
@@ -73,7 +72,7 @@ def test_a_missing_rig_is_no_fault(tmp_path: Path) -> None:
 
 def test_broken_decoder_model_and_provider_are_faults(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(raw, "version", lambda: raising(DecodeError("the decoder crashed")))
-    monkeypatch.setattr(onnx, "load", lambda *given, **stated: raising(ModelError("model.onnx is cut short")))
+    monkeypatch.setattr(onnx, "load", lambda *_, **options: raising(ModelError("model.onnx is cut short")))
     monkeypatch.setattr(onnx, "providers", lambda file: {onnx.CUDA: "does not start", onnx.CPU: "illegal instruction"})
     found = named(doctor.examine(NO_RIG, tmp_path))
     assert {name for name, one in found.items() if one.state == "fault"} == {"LibRaw", "model", "on CPU"}

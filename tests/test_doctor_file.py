@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polcap.doctor.finding import Finding
+from polcap.doctor import Finding
 from polcap.doctor.photograph import examine_file
 from polcap.formats.maps import png
 from polcap.formats.raw import libraw as raw

@@ -1,4 +1,4 @@
-"""Input that means harm, through the command line: one clear line and exit code 2, and nothing outside the result."""
+"""Hostile input on the command line gives one clear line and exit code 2, and no file outside the result."""
 
 import json
 import os
@@ -55,7 +55,7 @@ def test_a_hostile_capture_toml_is_one_line(polcap: Command, capture: Path, text
 
 @pytest.fixture
 def nameless(capture: Path) -> Path:
-    """The capture in a folder whose name is no text."""
+    """The capture in a folder with a name that is no text."""
     try:
         return capture.rename(capture.with_name(os.fsdecode(b"bad\xff")))
     except OSError as error:
@@ -193,7 +193,7 @@ def test_a_hostile_report_is_one_line(polcap: Command, spoilt: Path, text: str) 
 def test_an_edited_cache_is_one_line(polcap: Command, spoilt: Path, name: str) -> None:
     file = spoilt / "work" / name
     if not file.exists():
-        pytest.skip("this stage is not kept")
+        pytest.skip("this stage is not cached")
     text = file.read_text("utf-8")
     file.write_text(text.replace('"focal', '"local', 1) if '"focal' in text else text[:-9], "utf-8")
     refused(polcap("report", spoilt), "polcap process")

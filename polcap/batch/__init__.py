@@ -37,10 +37,7 @@ class BatchPlan:
 def find(root: Path, out: Path | None = None) -> list[Unit]:
     """The captures below a folder, sorted by name; the folder may itself be one capture.
 
-    Raises
-    ------
-    CaptureError
-        There is no capture.
+    Raises CaptureError: there is no capture.
     """
     if not root.is_dir():
         raise CaptureError(f"{root}: no such folder; give the folder that holds the captures")

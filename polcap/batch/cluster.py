@@ -32,10 +32,7 @@ def run(
     `address` names a running scheduler, for example tcp://host:8786, and its workers must see the same folders;
     `local` starts one with `workers` processes on this machine. With device cuda a unit requests the resource GPU.
 
-    Raises
-    ------
-    SettingError
-        Dask is not installed, or no scheduler answers at the address.
+    Raises SettingError: Dask is not installed, or no scheduler answers at the address.
     """
     try:
         import dask

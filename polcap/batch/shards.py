@@ -49,10 +49,7 @@ def from_environment(environment: Mapping[str, str]) -> Shard:
     Kubernetes indexed jobs and PBS arrays do not state the number of tasks: `POLCAP_SHARDS` must hold it. Job files
     written by polcap set it.
 
-    Raises
-    ------
-    SettingError
-        The number of tasks is missing, or the index is not below it.
+    Raises SettingError: the number of tasks is missing, or the index is not below it.
     """
     for name, first, total in _SCHEDULERS:
         if not environment.get(name):

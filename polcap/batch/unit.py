@@ -166,7 +166,7 @@ def write_record(unit: Unit, record: UnitRecord) -> None:
 
 
 def crashed(unit: Unit, message: str, attempt: int) -> UnitRecord:
-    """Write and return the record of a unit whose process died."""
+    """Write and return the record of a unit after its process died."""
     record = UnitRecord(unit.name, "crashed", message, 0.0, socket.gethostname(), 0, attempt)
     write_record(unit, record)
     return record

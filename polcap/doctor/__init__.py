@@ -10,22 +10,29 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 import numpy as np
 
 from polcap import __version__
-from polcap.doctor.finding import Finding, State
 from polcap.errors import PolcapError
 from polcap.formats import onnx, shipped_data
-from polcap.formats.raw import dng
-from polcap.formats.raw import libraw as raw
+from polcap.formats.raw import dng, libraw
 from polcap.images import Exif
 from polcap.pipeline import models
 
 _ENOUGH_GB, _LEAST_GB = 10.0, 1.0  # free disk: a capture of 24 MP with its result takes about 2
 _EDGE_PX = 64  # of the RAW that is written and decoded as a trial
-_CFA = np.array([[0, 1], [1, 2]], np.uint8)
+
+
+class Finding(msgspec.Struct, frozen=True):
+    """One thing that `polcap doctor` checked, and the remedy if it is not ok."""
+
+    name: str
+    state: Literal["ok", "warning", "fault"]
+    message: str = msgspec.field(name="says")  # the key in the JSON output
+    remedy: str = ""
 
 
 @dataclass(frozen=True)
@@ -40,9 +47,12 @@ class Rig:
 
 def examine(rig: Rig, folder: Path) -> tuple[Finding, ...]:
     """Check everything on this machine; the disk is that of `folder`."""
+    import cv2
+
+    about = f"{__version__}, Python {sys.version.split()[0]}, numpy {np.__version__}, OpenCV {cv2.__version__}"
     model = next(reversed(shipped_data.model_files("polcap")), None)
     return (
-        _libraries(),
+        Finding("polcap", "ok", about),
         _decoder(),
         _model(model),
         *(_providers(model) if model else ()),
@@ -68,35 +78,23 @@ def shown(found: Iterable[Finding]) -> dict[str, object]:
     return {"polcap": __version__, "process_works": works, "findings": msgspec.to_builtins(found)}
 
 
-def _libraries() -> Finding:
-    import cv2
-
-    version = ", ".join(f"{name} {module}" for name, module in (("numpy", np.__version__), ("OpenCV", cv2.__version__)))
-    return Finding("polcap", "ok", f"{__version__}, Python {sys.version.split()[0]}, {version}")
-
-
 def _decoder() -> Finding:
     """LibRaw's version, and whether it decodes a RAW file written for this test."""
+    counts = np.arange(_EDGE_PX**2, dtype=np.uint16).reshape(_EDGE_PX, _EDGE_PX)
+    exif, cfa = Exif(make="Polcap", model="Doctor"), np.array([[0, 1], [1, 2]], np.uint8)
+    colors = {"color_matrix": np.eye(3), "as_shot_neutral": np.ones(3)}
+    message = ""
     try:
-        name = raw.version()
+        name = libraw.version()
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "trial.dng"
-            counts = np.arange(_EDGE_PX**2, dtype=np.uint16).reshape(_EDGE_PX, _EDGE_PX)
-            dng.write(
-                file,
-                counts,
-                cfa=_CFA,
-                black=0,
-                white=16383,
-                exif=Exif(make="Polcap", model="Doctor"),
-                color_matrix=np.eye(3),
-                as_shot_neutral=np.ones(3),
-            )
-            same = np.array_equal(raw.read(file).value, counts)
+            dng.write(file, counts, cfa=cfa, black=0, white=16383, exif=exif, **colors)
+            if not np.array_equal(libraw.read(file).value, counts):
+                message = f"{name} decodes a RAW wrongly"
     except (PolcapError, OSError) as error:
-        return Finding("LibRaw", "fault", str(error), "pip install --force-reinstall rawpy")
-    if not same:
-        return Finding("LibRaw", "fault", f"{name} decodes a RAW wrongly", "pip install --force-reinstall rawpy")
+        message = str(error)
+    if message:
+        return Finding("LibRaw", "fault", message, "pip install --force-reinstall rawpy")
     return Finding("LibRaw", "ok", f"{name}, decodes a RAW in a process of its own")
 
 
@@ -109,8 +107,8 @@ def _model(file: Path | None) -> Finding:
         small = [one for one in (network.fine, models.load_mask_network()) if one is not None]
     except PolcapError as error:
         return Finding("model", "fault", str(error), "install polcap again, or use --estimator analytic")
-    version = network.metadata.get("version", network.digest[:8])
-    about = f"{file.name}, version {version}, {file.stat().st_size / 1e6:.1f} MB, loads, and {len(small)} smaller ones"
+    release = network.metadata.get("version", network.digest[:8])
+    about = f"{file.name}, version {release}, {file.stat().st_size / 1e6:.1f} MB, loads, and {len(small)} smaller ones"
     return Finding("model", "ok", about)
 
 
@@ -121,15 +119,14 @@ def _providers(model: Path) -> Iterator[Finding]:
     except ImportError as error:
         yield Finding("onnxruntime", "fault", str(error), "pip install onnxruntime")
         return
-    for name, failure in found.items():
-        short = name.removesuffix("ExecutionProvider")
+    for provider, failure in found.items():
+        name = f"on {provider.removesuffix('ExecutionProvider')}"
         if not failure:
-            yield Finding(f"on {short}", "ok", f"onnxruntime {version('onnxruntime')} runs the model")
-        elif name == onnx.CPU:
-            yield Finding(f"on {short}", "fault", failure, "pip install --force-reinstall onnxruntime")
+            yield Finding(name, "ok", f"onnxruntime {version('onnxruntime')} runs the model")
+        elif provider == onnx.CPU:
+            yield Finding(name, "fault", failure, "pip install --force-reinstall onnxruntime")
         else:
-            remedy = "install matching driver, CUDA and cuDNN, or use --device cpu"
-            yield Finding(f"on {short}", "warning", failure, remedy)
+            yield Finding(name, "warning", failure, "install matching driver, CUDA and cuDNN, or use --device cpu")
 
 
 def _disk(folder: Path) -> Finding:
@@ -137,9 +134,8 @@ def _disk(folder: Path) -> Finding:
     message = f"{free:.1f} GB free at {folder}"
     if free >= _ENOUGH_GB:
         return Finding("disk", "ok", message)
-    state: State = "fault" if free < _LEAST_GB else "warning"
     remedy = "a capture of 24 MP with its result takes 2 GB: free some space, or use --out"
-    return Finding("disk", state, message, remedy)
+    return Finding("disk", "fault" if free < _LEAST_GB else "warning", message, remedy)
 
 
 def _ports(rig: Rig) -> Iterator[Finding]:
@@ -151,7 +147,8 @@ def _ports(rig: Rig) -> Iterator[Finding]:
     if not ports:
         remedy = "plug the rotator in; under Linux its cable appears as /dev/ttyUSB0 or /dev/ttyACM0"
         yield Finding("serial ports", "warning", "none", remedy)
-    allowed = bool(ports) and rig.may_write([device for device, _ in ports])
+        return
+    allowed = rig.may_write([device for device, _ in ports])
     for device, description in ports:
         if not allowed:
             yield Finding(device, "ok", f"{description}: not asked", "`polcap doctor --ports` asks, and writes to it")

@@ -5,17 +5,15 @@ from pathlib import Path
 
 import numpy as np
 
-from polcap.doctor.finding import Finding
+from polcap.doctor import Finding
 from polcap.errors import DecodeError
 from polcap.formats.capture import focal_length
-from polcap.formats.raw import libraw as raw
-from polcap.formats.raw import photo, probe
+from polcap.formats.raw import libraw, photo, probe
 from polcap.images import Exif, SensorImage
 from polcap.optics import sensor
 from polcap.stages import hdr
 
 _CLIP = hdr.HdrSettings().clip
-_PATTERNS = {0: "R", 1: "G", 2: "B"}
 
 
 def examine_file(path: Path) -> Iterator[Finding]:
@@ -24,35 +22,30 @@ def examine_file(path: Path) -> Iterator[Finding]:
         remedy = "give one photograph; `polcap process FOLDER --dry-run` lists a folder"
         yield Finding("file", "fault", f"{path} is a folder", remedy)
         return
+    part = "file"
     try:
         found = probe.read(path)
+        if found.kind not in ("raw", "photo"):
+            message = f"{path.name} is not a photograph that polcap can read"
+            yield Finding("file", "fault", message, "give a RAW, TIFF, PNG or EXR")
+            return
+        kind = "RAW" if found.kind == "raw" else f"finished picture of {found.bits} bits"
+        size = f"{path.stat().st_size / 1e6:.1f} MB"
+        yield Finding("file", "ok", f"{path.name}: {kind}, {size}, digest {found.digest[:12]}")
+        yield from _metadata(found.exif)
+        part = "pixels"
+        image = libraw.read(path) if found.kind == "raw" else photo.read(path)
+        yield from _pixels(image, found.exif)
     except DecodeError as error:
         message, _, remedy = str(error).partition("; ")
-        yield Finding("file", "fault", message, remedy or "send this report in with the file")
-        return
-    if found.kind not in ("raw", "photo"):
-        yield Finding(
-            "file", "fault", f"{path.name} is not a photograph that polcap can read", "give a RAW, TIFF, PNG or EXR"
-        )
-        return
-    kind = "RAW" if found.kind == "raw" else f"finished picture of {found.bits} bits"
-    yield Finding("file", "ok", f"{path.name}: {kind}, {path.stat().st_size / 1e6:.1f} MB, digest {found.digest[:12]}")
-    yield from _metadata(found.exif)
-    try:
-        image = raw.read(path) if found.kind == "raw" else photo.read(path)
-    except DecodeError as error:
-        message, _, remedy = str(error).partition("; ")
-        yield Finding("pixels", "fault", message, remedy)
-        return
-    yield from _pixels(image, found.exif)
+        yield Finding(part, "fault", message, remedy or "send this report in with the file")
 
 
 def _metadata(exif: Exif) -> Iterator[Finding]:
     camera = f"{exif.make} {exif.model}".strip()
     if camera:
-        yield Finding(
-            "camera", "ok", f"{camera}, {exif.lens or 'lens not stated'}, taken {exif.taken or 'at no stated time'}"
-        )
+        message = f"{camera}, {exif.lens or 'lens not stated'}, taken {exif.taken or 'at no stated time'}"
+        yield Finding("camera", "ok", message)
     else:
         yield Finding("camera", "warning", "not stated", "copy the file without a program that strips EXIF")
     parts = {
@@ -74,8 +67,8 @@ def _pixels(image: SensorImage, exif: Exif) -> Iterator[Finding]:
     height, width = image.value.shape[:2]
     size = f"{width}×{height} px"
     if image.cfa is not None:
-        pattern = "".join(_PATTERNS[int(color)] for color in image.cfa.ravel())
-        name = f"Bayer {pattern}" if image.superpixel == 2 else "X-Trans, merged as 3×3 superpixels"
+        bayer = "".join("RGB"[color] for color in image.cfa.ravel())
+        name = f"Bayer {bayer}" if image.superpixel == 2 else "X-Trans, merged as 3×3 superpixels"
         yield Finding("pattern", "ok", f"{name}, {size}")
     elif sensor.monochrome(image):
         remedy = "gains, normals and shape work; colors are grey, and no ColorChecker can be read"
@@ -84,9 +77,8 @@ def _pixels(image: SensorImage, exif: Exif) -> Iterator[Finding]:
         yield Finding("pattern", "ok", f"three channels a pixel, {size}: developed or linear DNG, no mosaic left")
     missing = (exif.width or width) - width, (exif.height or height) - height
     if not all(0 <= side < image.superpixel for side in missing):  # a mosaic begins with a whole superpixel
-        yield Finding(
-            "size", "warning", f"{size} decoded, but {exif.width}×{exif.height} are stated", "send this report in"
-        )
+        message = f"{size} decoded, but {exif.width}×{exif.height} are stated"
+        yield Finding("size", "warning", message, "send this report in")
     black, white = float(image.black.mean()), image.white
     least, most = float(image.value.min()), float(image.value.max())
     clipped = float(np.mean(image.value >= _CLIP * sensor.saturation(image)))
@@ -97,9 +89,9 @@ def _pixels(image: SensorImage, exif: Exif) -> Iterator[Finding]:
         yield Finding("levels", "warning", message, "nothing can be measured: change the exposure")
     else:
         yield Finding("levels", "ok", message)
-    known = image.camera_matrix is not None
-    yield Finding(
-        "color matrix", "ok" if known else "warning", "known" if known else "not known", "" if known else "use a chart"
-    )
+    if image.camera_matrix is None:
+        yield Finding("color matrix", "warning", "not known", "use a chart")
+    else:
+        yield Finding("color matrix", "ok", "known")
     if image.lossy:
         yield Finding("encoding", "warning", "8 bits or display-encoded", "shoot RAW: normals and albedo lose accuracy")

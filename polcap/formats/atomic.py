@@ -38,40 +38,15 @@ def failure(target: Path, error: OSError) -> StorageError:
     return StorageError(f"cannot write {target}: {reason}")
 
 
-class Held:
-    """Complete files that get their final names together."""
-
-    def __init__(self) -> None:
-        self._files: list[tuple[Path, Path]] = []
-
-    def take(self, temporary: Path, final: Path) -> None:
-        """Keep a file until `release` or `drop`."""
-        self._files.append((temporary, final))
-
-    def release(self) -> None:
-        """Rename all; StorageError where the system refuses one, the rest stays held."""
-        while self._files:
-            _rename(*self._files[0])
-            del self._files[0]
-
-    def drop(self) -> None:
-        """Remove the files that are still held."""
-        for temporary, _ in self._files:
-            discard(temporary)
-
-
 @contextmanager
-def path(final: str | Path, synced: bool = True, held: Held | None = None) -> Iterator[Path]:
-    """A temporary path for writing, renamed to `final` when the block ends well, or later where it is `held`.
+def path(final: str | Path, synced: bool = True) -> Iterator[Path]:
+    """A temporary path for writing, renamed to `final` when the block ends well.
 
     Parent folders are made. The temporary name has the same suffix, for writers that choose a format by it. On any
     exception it is removed, and an old file under `final` is untouched. Without `synced` the file may be incomplete
-    after a power cut: for files whose reader checks them.
+    after a power cut: for files that their reader checks.
 
-    Raises
-    ------
-    StorageError
-        Any OSError of making, writing, syncing or renaming, inside the block too.
+    Raises StorageError: any OSError of making, writing, syncing or renaming, inside the block too.
     """
     final = Path(final)
     temporary = final.with_name(f".{final.stem}.{os.getpid()}.part{final.suffix}")
@@ -80,36 +55,18 @@ def path(final: str | Path, synced: bool = True, held: Held | None = None) -> It
         yield temporary
         if synced:
             sync(temporary)
-    except OSError as error:
-        discard(temporary)
-        raise failure(final, error) from error
-    except BaseException:
-        discard(temporary)
-        raise
-    if held is not None:
-        held.take(temporary, final)
-        return
-    try:
-        _rename(temporary, final)
-    finally:
-        discard(temporary)
-
-
-def _rename(temporary: Path, final: Path) -> None:
-    try:
         os.replace(temporary, final)
     except OSError as error:
         raise failure(final, error) from error
+    finally:
+        discard(temporary)
 
 
 @contextmanager
 def folder(final: str | Path, synced: bool = True) -> Iterator[Path]:
     """`path` for a folder; an old folder under `final` is replaced as a whole.
 
-    Raises
-    ------
-    StorageError
-        Any OSError of making, writing, syncing or renaming, inside the block too.
+    Raises StorageError: any OSError of making, writing, syncing or renaming, inside the block too.
     """
     final = Path(final)
     temporary = final.with_name(f".{final.name}.{os.getpid()}.part")
@@ -128,6 +85,8 @@ def folder(final: str | Path, synced: bool = True) -> Iterator[Path]:
         if old.exists() and not final.exists():
             os.replace(old, final)
         raise failure(final, error) from error
+    except StorageError as error:  # of a file inside: named as in `final`
+        raise StorageError(str(error).replace(str(temporary), str(final))) from error
     finally:
         discard(temporary)
         discard(old)

@@ -16,23 +16,15 @@ from msgspec import Meta
 
 from polcap.errors import CaptureError, ChartError
 from polcap.formats import atomic, own_folders, text_file
-from polcap.images import (
-    Calibration,
-    ChartPlace,
-    ColorCalibration,
-    Distortion,
-    Exif,
-    Floats,
-    LensGeometry,
-    PatchColors,
-    Polarizer,
-)
+from polcap.images import Calibration, ChartPlace, ColorCalibration, Distortion, Exif, LensGeometry, PatchColors
 from polcap.optics import distortion
 
 _FULL_TURN = 360.0  # degrees
 _MAX_SIDE = 1_000_000  # px of a picture
-_MAX_DISTORTION = 1000.0  # of k1 and k2; a lens whose picture does not fold over itself has less
+_MAX_DISTORTION = 1000.0  # of k1 and k2; only a picture that folds over itself has more
 _LEAST_LIGHT = 0.02  # in a corner of the lens, relative to the middle
+_SAME_SETTING = 0.05  # relative change of f-number or focal length
+_CHANNELS = (1, 3)
 _HEAD = """\
 # polcap calibration. Signals: 1 is the sensor's white. Each sigma is 1σ. Angles from image x towards image up.
 # noise: variance of a pixel of the merged picture (half size) = slope * signal + floor.
@@ -52,16 +44,13 @@ def write(place: Path, found: Calibration) -> Path:
 
 def text(found: Calibration) -> str:
     """The content of the file that `write` writes."""
-    return _HEAD + tomli_w.dumps(_bare(msgspec.to_builtins(found)))
+    return _HEAD + tomli_w.dumps(_plain(msgspec.to_builtins(found)))
 
 
 def read(path: Path) -> Calibration:
     """Read a file that `write` wrote.
 
-    Raises
-    ------
-    CaptureError
-        It is not such a file, or cannot be read.
+    Raises CaptureError: it is not such a file, or cannot be read.
     """
     try:
         found = msgspec.convert(text_file.read_toml(path), Calibration)
@@ -69,8 +58,7 @@ def read(path: Path) -> Calibration:
         raise CaptureError(f"{path}: cannot be read ({error.strerror}); repair or remove it") from None
     except ValueError as error:
         raise CaptureError(f"{path}: not a polcap calibration ({error}); calibrate again, or remove it") from None
-    wrong = [name for name, possible in _possible_parts(found).items() if not possible]
-    if wrong:
+    if wrong := _impossible_parts(found):
         raise CaptureError(f"{path}: its {', '.join(wrong)} is impossible; calibrate again, or remove the file")
     return found
 
@@ -81,10 +69,7 @@ def choose(exif: Exif, lens_filter: str | None, focal_length_mm: float | None) -
     Parts that were measured at another aperture or focal length are left out. Without `lens_filter`, the filter is
     the only one in the calibrations of this camera and lens; with several, none is used.
 
-    Raises
-    ------
-    CaptureError
-        A file in the folder is not a calibration.
+    Raises CaptureError: a file in the folder is not a calibration.
     """
     camera = f"{exif.make} {exif.model}".strip()
     fitting = []
@@ -104,10 +89,13 @@ def choose(exif: Exif, lens_filter: str | None, focal_length_mm: float | None) -
         return None, [f'calibration: none of filter "{wanted}" for this camera and lens']
     found, path = max(of_filter, key=lambda pair: pair[0].made)
     notes = [f"calibration {path.name}: {', '.join(_parts(found))}"]
-    if found.falloff is not None and not _same_lens_setting(found, exif, focal_length_mm):
+    focal = focal_length_mm or exif.focal_length_mm
+    light, lens = found.falloff, found.geometry
+    if light is not None and not _alike((light.f_number, exif.f_number), (light.focal_length_mm, focal)):
         found = replace(found, falloff=None)
         notes.append("calibration: the falloff was measured at another aperture or focal length and is not used")
-    if found.geometry is not None and not _same_geometry(found.geometry, exif, focal_length_mm):
+    size = exif.width, exif.height
+    if lens is not None and not (lens.size_px == size and _alike((lens.focal_length_mm, focal))):
         found = replace(found, geometry=None)
         notes.append(
             "calibration: the lens was measured at another focal length or picture size; its geometry is not used"
@@ -115,19 +103,9 @@ def choose(exif: Exif, lens_filter: str | None, focal_length_mm: float | None) -
     return found, notes
 
 
-def _same_geometry(geometry: LensGeometry, exif: Exif, focal_length_mm: float | None) -> bool:
-    stated = focal_length_mm or exif.focal_length_mm
-    alike = not stated or not geometry.focal_length_mm or abs(stated / geometry.focal_length_mm - 1) < 0.05
-    return alike and geometry.size_px == (exif.width, exif.height)
-
-
-def _same_lens_setting(found: Calibration, exif: Exif, focal_length_mm: float | None) -> bool:
-    assert found.falloff is not None
-    pairs = (
-        (found.falloff.f_number, exif.f_number),
-        (found.falloff.focal_length_mm, focal_length_mm or exif.focal_length_mm),
-    )
-    return all(not one or not other or abs(one / other - 1) < 0.05 for one, other in pairs)
+def _alike(*pairs: tuple[float | None, float | None]) -> bool:
+    """Whether two settings of a lens are equal, as far as both are known."""
+    return all(not one or not other or abs(one / other - 1) < _SAME_SETTING for one, other in pairs)
 
 
 def _parts(found: Calibration) -> list[str]:
@@ -136,66 +114,57 @@ def _parts(found: Calibration) -> list[str]:
         parts.append("noise at ISO " + ", ".join(f"{line.iso:g}" for line in found.noise))
     if found.falloff is not None:
         parts.append("falloff of the lens")
-    if found.geometry is not None:
-        lens = found.geometry
+    if (lens := found.geometry) is not None:
         parts.append(f"lens {lens.focal_px:.0f} ± {lens.focal_sigma_px:.1f} px, k1 {lens.k1:+.4f}, k2 {lens.k2:+.4f}")
-    if found.polarizer is not None:
-        ring = found.polarizer
+    if (ring := found.polarizer) is not None:
         parts.append(f"polarizer {ring.zero_deg:+.2f}° ± {ring.zero_sigma_deg:.2f}°{', mirrored' * (ring.sense < 0)}")
     if found.flash is not None:
         parts.append(f"flash ± {100 * found.flash.spread:.2f} %")
     return parts
 
 
-def _possible_parts(found: Calibration) -> dict[str, bool]:
-    """For each part, whether its figures are physically possible."""
-    ring, light, channels = found.polarizer, found.falloff, (1, 3)
-    return {
+def _impossible_parts(found: Calibration) -> list[str]:
+    """Names of the parts of a calibration with physically impossible figures."""
+    ring, light, lens, flash = found.polarizer, found.falloff, found.geometry, found.flash
+    possible = {
         "noise": all(
-            line.iso > 0
-            and len(line.slope) == len(line.floor)
-            and len(line.slope) in channels
-            and _possible_noise(line.slope, line.floor)
+            line.iso > 0 and len(line.slope) == len(line.floor) in _CHANNELS
+            and 0 < min(line.slope) <= max(line.slope) < 1 and 0 <= min(line.floor) <= max(line.floor) < 1
             for line in found.noise
         ),
-        "falloff": light is None
-        or (len(light.coefficient) in channels and all(_lights_corners(one) for one in light.coefficient)),
-        "geometry": found.geometry is None or _possible_lens(found.geometry),
-        "polarizer": ring is None or (len(ring.extinction) in channels and _possible_ring(ring)),
-        "flash": found.flash is None or 0 < found.flash.spread < 1,
-    }
-
-
-def _possible_noise(slope: tuple[float, ...], floor: tuple[float, ...]) -> bool:
-    return min(slope) > 0 and max(slope) < 1 and min(floor) >= 0 and max(floor) < 1
-
-
-def _possible_ring(ring: Polarizer) -> bool:
-    angles = abs(ring.zero_deg) <= _FULL_TURN and 0 <= ring.zero_sigma_deg <= _FULL_TURN
-    return ring.sense in (-1, 1) and min(ring.extinction) > 1 and angles
+        "falloff": not light or (len(light.coefficient) in _CHANNELS and all(map(_lights_corners, light.coefficient))),
+        "geometry": not lens or _possible_lens(lens),
+        "polarizer": not ring or (
+            len(ring.extinction) in _CHANNELS and min(ring.extinction) > 1 and ring.sense in (-1, 1)
+            and abs(ring.zero_deg) <= _FULL_TURN and 0 <= ring.zero_sigma_deg <= _FULL_TURN
+        ),
+        "flash": not flash or 0 < flash.spread < 1,
+    }  # fmt: skip
+    return [name for name, holds in possible.items() if not holds]
 
 
 def _possible_lens(lens: LensGeometry) -> bool:
     """A principal point inside the picture, and a distortion that does not fold it over itself."""
+    inside = all(0 < c < side <= _MAX_SIDE for c, side in zip(lens.principal_px, lens.size_px))
+    small = lens.focal_px >= 1 and max(abs(lens.k1), abs(lens.k2)) <= _MAX_DISTORTION
     known = Distortion(lens.focal_px, lens.principal_px, lens.k1, lens.k2)
-    inside = all(0 < c < side for c, side in zip(lens.principal_px, lens.size_px))
-    small = max(lens.size_px) <= _MAX_SIDE and max(abs(lens.k1), abs(lens.k2)) <= _MAX_DISTORTION
-    return lens.focal_px >= 1 and inside and small and not distortion.folds(known, *lens.size_px)
+    return inside and small and not distortion.folds(known, *lens.size_px)
 
 
 def _lights_corners(law: tuple[float, float, float]) -> bool:
     """Whether 1 + a r² + b r⁴ + c r⁶ stays positive up to the corners."""
-    steps = [k / 16 for k in range(17)]
-    return all(1 + r2 * (law[0] + r2 * (law[1] + r2 * law[2])) > _LEAST_LIGHT for r2 in steps)
+    return bool(np.min(np.polyval([*reversed(law), 1], np.linspace(0, 1, 17))) > _LEAST_LIGHT)
 
 
-def _bare(tree: Any) -> Any:
-    """Plain data without None, which TOML cannot hold; numbers of eight digits."""
+def _plain(tree: Any) -> Any:
+    """Data for TOML, which knows no None and no array; numbers of nine digits."""
     if isinstance(tree, dict):
-        return {key: _bare(value) for key, value in tree.items() if value is not None}
+        return {key: _plain(value) for key, value in tree.items() if value is not None}
+    if isinstance(tree, np.ndarray):
+        return _plain(tree.tolist())
     if isinstance(tree, Sequence) and not isinstance(tree, str):
-        return [_bare(value) for value in tree]
-    return float(f"{tree:.8g}") if isinstance(tree, float) else tree
+        return [_plain(value) for value in tree]
+    return float(f"{tree:.9g}") if isinstance(tree, float) else tree
 
 
 _Point = tuple[float, float]
@@ -222,37 +191,35 @@ class _Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def write_profile(path: Path, color: ColorCalibration) -> None:
     """Write a color profile for other captures of the same camera, light and exposure; StorageError."""
+    place, patches = color.place, color.patches
     document: dict[str, Any] = {
-        "matrix": _rounded(color.matrix, 9),
+        "matrix": color.matrix,
         "source": color.source,
         "cost": float(color.cost),
         "metres_per_px": color.metres_per_px,
+        "quads": place and place.quads,
+        "corners": place and place.corners,
     }
-    if color.place is not None:
-        document |= {"quads": _rounded(color.place.quads, 3), "corners": _rounded(color.place.corners, 3)}
-    if (colors := color.patches) is not None:
+    if patches is not None:
         document |= {
-            "delta_e": _rounded(colors.delta_e, 3),
-            "falloff": list(colors.falloff),
-            "glare": colors.glare,
-            "predicted": _rounded(colors.predicted, 3),
-            "patch_use": None if colors.use is None else colors.use.tolist(),
+            "delta_e": patches.delta_e,
+            "falloff": patches.falloff,
+            "glare": patches.glare,
+            "predicted": patches.predicted,
+            "patch_use": patches.use,
         }
-    text = (
+    head = (
         "# polcap color profile. matrix: camera radiance (I0 + I90) -> linear Rec.709 reflectance.\n"
         "# quads, corners: px of the grid it was measured on. metres_per_px: at the chart's distance.\n"
-    ) + tomli_w.dumps({key: value for key, value in document.items() if value is not None})
+    )
     with atomic.path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(head + tomli_w.dumps(_plain(document)), encoding="utf-8")
 
 
 def read_profile(path: Path) -> ColorCalibration:
     """Read a file that `write_profile` wrote.
 
-    Raises
-    ------
-    ChartError
-        The file is missing, not a profile, or its matrix cannot be inverted.
+    Raises ChartError: the file is missing, not a profile, or its matrix cannot be inverted.
     """
     document: dict[str, Any] = {}
     try:
@@ -260,31 +227,25 @@ def read_profile(path: Path) -> ColorCalibration:
         profile = msgspec.convert(document, _Profile)
     except OSError as error:
         raise ChartError(f"{path}: cannot be read ({error.strerror}); give a profile's path") from error
-    except msgspec.ValidationError as error:
-        fault = text_file.fault(error, document, _Profile)
-        raise ChartError(f"{path}: not a polcap color profile ({fault}); write the profile again") from error
     except ValueError as error:
-        raise ChartError(f"{path}: not a polcap color profile ({error}); write the profile again") from error
+        fault: object = error
+        if isinstance(error, msgspec.ValidationError):
+            fault = text_file.fault(error, document, _Profile)
+        raise ChartError(f"{path}: not a polcap color profile ({fault}); write the profile again") from error
     matrix = np.array(profile.matrix)
     if not np.isfinite(matrix).all() or np.linalg.matrix_rank(matrix, rtol=1e-6) < 3:
         raise ChartError(f"{path}: its color matrix cannot be inverted; write the profile again")
-    quads, corners, delta_e = (_array(one) for one in (profile.quads, profile.corners, profile.delta_e))
+    quads, corners, delta_e, predicted = (
+        None if values is None else np.array(values, np.float64)
+        for values in (profile.quads, profile.corners, profile.delta_e, profile.predicted)
+    )
     use = None if profile.patch_use is None else np.array(profile.patch_use, np.uint8)
+    patches = delta_e is not None and PatchColors(delta_e, use, predicted, profile.falloff, profile.glare)
     return ColorCalibration(
         matrix=matrix,
         source=profile.source,
         cost=profile.cost,
         metres_per_px=profile.metres_per_px,
         place=None if quads is None or corners is None else ChartPlace(quads, corners),
-        patches=None
-        if delta_e is None
-        else PatchColors(delta_e, use, _array(profile.predicted), profile.falloff, profile.glare),
+        patches=patches or None,
     )
-
-
-def _rounded(values: Floats | None, digits: int) -> Any:
-    return None if values is None else np.round(np.asarray(values, np.float64), digits).tolist()
-
-
-def _array(values: Any) -> Floats | None:
-    return None if values is None else np.array(values, np.float64)

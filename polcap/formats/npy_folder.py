@@ -49,10 +49,7 @@ def encode(value: Any, name: str, arrays: Arrays) -> Any:
 def decode(tree: Any, hint: Any, folder: Path) -> Any:
     """The value of type `hint` from the JSON of `encode`; arrays are read from `folder`.
 
-    Raises
-    ------
-    StorageError
-        The tree is not of that type, or an array file cannot be read.
+    Raises StorageError: the tree is not of that type, or an array file cannot be read.
     """
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
@@ -125,10 +122,7 @@ def save(file: Path, array: NDArray[Any]) -> list[Any]:
 def load(file: Path) -> NDArray[Any]:
     """An array of any shape: a read-only memory map, or in memory where it is small.
 
-    Raises
-    ------
-    StorageError
-        The file is missing or no .npy.
+    Raises StorageError: the file is missing or no .npy.
     """
     try:
         if file.stat().st_size > _MAPPED:

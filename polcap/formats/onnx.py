@@ -14,9 +14,9 @@ The only module that imports onnxruntime: in `_onnxruntime`, which turns its tel
 """
 
 import os
+import re
 import threading
-from collections.abc import Mapping
-from functools import cache, lru_cache
+from functools import lru_cache
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -48,20 +48,20 @@ def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: s
     `device` cuda fails where CUDA is missing or does not start; auto uses it where it starts. `threads` 0 is as many
     as polcap may use. `encoding` is the version of the channels that the model must take.
 
-    Raises
-    ------
-    ModelError
-        No such file, not a model that this runtime can run, metadata missing or of another encoding,
-        or no such device.
+    Raises ModelError: the file is missing or no model that this runtime can run, its metadata are missing or of another
+    encoding, or there is no such device.
     """
     path = Path(path)
     mark = digest(_bytes(path))
-    if path not in _shipped_files() and mark not in _shipped():
-        _try(path, mark, encoding)
+    if mark not in {digest(file.read_bytes()) for file in shipped_data.model_files()}:
+        try:
+            worker.call(trial, path, limit_s=_TRIAL_S, expected=mark, encoding=encoding)
+        except DecodeError as error:
+            raise ModelError(f"a trial run of the model failed: {error}") from error
     session = _session(str(path), mark, device, threads)
-    metadata = _metadata(path, session)
-    channels = _check(path, session, metadata, encoding)
-    at_once = _at_once(session.get_providers()[0], threads)
+    channels, metadata = _check(path, session, encoding)
+    # two runs on one thread each end sooner than one after the other on two threads
+    at_once = min(threads or parallel.threads(), _AT_ONCE) if session.get_providers()[0] == CPU else 1
     return Network(mark, channels, metadata, None, str(path), device, threads, at_once)
 
 
@@ -73,23 +73,14 @@ def digest(data: bytes) -> str:
 def run(network: Network, inputs: Floats) -> dict[str, Floats]:
     """Run a network on channels (1, N, H, W): maps by name, (1, n, H, W) each.
 
-    Raises
-    ------
-    ModelError
-        It fails on this input, does not end, returns something else, or its file has changed.
+    Raises ModelError: it fails on this input, does not end, returns something else, or its file has changed.
     """
     session = _session(network.path, network.digest, network.device, network.threads)
     return run_session(session, Path(network.path), inputs)
 
 
 def run_session(session: Any, path: Path, inputs: Floats, limit_s: float = _RUN_S) -> dict[str, Floats]:
-    """`run` of an open session (1, N, H, W); `path` is for messages.
-
-    Raises
-    ------
-    ModelError
-        As `run`.
-    """
+    """`run` of an open session on (1, N, H, W); `path` is for messages. Raises ModelError."""
     entry = session.get_inputs()[0]
     dtype = np.float16 if entry.type == "tensor(float16)" else np.float32
     names = [output.name for output in session.get_outputs()]
@@ -105,17 +96,14 @@ def run_session(session: Any, path: Path, inputs: Floats, limit_s: float = _RUN_
         raise ModelError(f"{path} failed on an input of shape {inputs.shape}: {_line(error)}") from error
     finally:
         overdue.cancel()
-    return {name: _map(path, name, value, inputs) for name, value in zip(names, results, strict=True)}
-
-
-def _map(path: Path, name: str, value: Any, inputs: Floats) -> Floats:
-    if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
-        raise ModelError(f"{path}: its output {name} is not an array of floating-point numbers; use another model")
-    if value.ndim != 4 or value.shape[0] != 1 or value.shape[2:] != inputs.shape[2:]:
-        raise ModelError(f"{path}: its output {name} is {value.shape} for an input of {inputs.shape}")
-    if not np.isfinite(value).all():
-        raise ModelError(f"{path}: its output {name} holds NaN or infinity; use another model")
-    return np.asarray(value, dtype=np.float32)
+    for name, value in zip(names, results):
+        if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
+            raise ModelError(f"{path}: its output {name} is not an array of floating-point numbers; use another model")
+        if value.ndim != 4 or value.shape[0] != 1 or value.shape[2:] != inputs.shape[2:]:
+            raise ModelError(f"{path}: its output {name} is {value.shape} for an input of {inputs.shape}")
+        if not np.isfinite(value).all():
+            raise ModelError(f"{path}: its output {name} holds NaN or infinity; use another model")
+    return {name: np.asarray(value, dtype=np.float32) for name, value in zip(names, results)}
 
 
 @lru_cache(_OPEN_SESSIONS)
@@ -136,36 +124,11 @@ def _session(path: str, expected: str, device: Device, threads: int) -> Any:
 def trial(path: str, expected: str, encoding: str) -> worker.Answer:
     """Load a model and run it on a small picture of noise; ModelError as `load`. In the child process."""
     session = _session(path, expected, "cpu", 1)
-    metadata = _metadata(Path(path), session)
-    channels = _check(Path(path), session, metadata, encoding)
+    channels, metadata = _check(Path(path), session, encoding)
     side = max(_TRIAL_PX, int(metadata["size_multiple"]))
     noise = np.random.default_rng(1).normal(size=(1, len(channels), side, side))
     run_session(session, Path(path), noise.astype(np.float32))
     return {}, {}
-
-
-def _at_once(provider: str, threads: int) -> int:
-    """Runs in parallel: two on one thread each end sooner than one after the other on two threads."""
-    return min(threads or parallel.threads(), _AT_ONCE) if provider == CPU else 1
-
-
-def _try(path: Path, expected: str, encoding: str) -> None:
-    try:
-        worker.call(trial, path, limit_s=_TRIAL_S, expected=expected, encoding=encoding)
-    except DecodeError as error:
-        raise ModelError(f"a trial run of the model failed: {error}") from error
-
-
-@cache
-def _shipped_files() -> frozenset[Path]:
-    """The models that ship with polcap."""
-    return frozenset(shipped_data.model_files())
-
-
-@cache
-def _shipped() -> frozenset[str]:
-    """Their digests."""
-    return frozenset(digest(file.read_bytes()) for file in _shipped_files())
 
 
 def _bytes(path: Path) -> bytes:
@@ -173,13 +136,6 @@ def _bytes(path: Path) -> bytes:
         return text_file.read_bytes(path, _MAX_BYTES)
     except OSError as error:
         raise ModelError(f"{path}: {error.strerror or error}; name a model file with --model") from error
-
-
-def _metadata(path: Path, session: Any) -> Mapping[str, str]:
-    try:
-        return {str(k): str(v) for k, v in session.get_modelmeta().custom_metadata_map.items()}
-    except UnicodeError as error:
-        raise ModelError(f"{path}: its metadata are not text ({error}); export it with polcap") from error
 
 
 def providers(path: Path) -> dict[str, str]:
@@ -214,19 +170,12 @@ def _open(path: Path, data: bytes, providers: list[str], threads: int) -> Any:
         ) from error
 
 
-def _check(path: Path, session: Any, metadata: Mapping[str, str], encoding: str) -> tuple[str, ...]:
-    """The names of the channels, whose number the model takes."""
-    channels = _stated(path, metadata, encoding)
-    entry = session.get_inputs()
-    shape = entry[0].shape if entry else []
-    if len(entry) != 1 or len(shape) != 4 or (isinstance(shape[1], int) and shape[1] != len(channels)):
-        takes = [one.shape for one in entry]
-        raise ModelError(f"{path}: takes inputs {takes}, but its metadata names {len(channels)} channels of one input")
-    return channels
-
-
-def _stated(path: Path, metadata: Mapping[str, str], encoding: str) -> tuple[str, ...]:
-    """The names of the channels in the metadata, which are complete and possible."""
+def _check(path: Path, session: Any, encoding: str) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Names of the channels that the model takes, and its metadata; ModelError where they are not complete."""
+    try:
+        metadata = {str(k): str(v) for k, v in session.get_modelmeta().custom_metadata_map.items()}
+    except UnicodeError as error:
+        raise ModelError(f"{path}: its metadata are not text ({error}); export it with polcap") from error
     missing = [name for name in REQUIRED if not metadata.get(name)]
     if missing:
         raise ModelError(f"{path}: its metadata does not state {', '.join(missing)}; export it with polcap")
@@ -236,14 +185,14 @@ def _stated(path: Path, metadata: Mapping[str, str], encoding: str) -> tuple[str
             "take a model of the same release"
         )
     for name in NUMBERS:
-        if not _usable(metadata[name]):
+        if not re.fullmatch("[0-9]{1,8}", metadata[name]) or not 1 <= int(metadata[name]) <= _MAX_NUMBER:
             value = metadata[name][:20]
             raise ModelError(f"{path}: {name} = {value!r} in its metadata is not a whole number of 1 to {_MAX_NUMBER}")
-    return tuple(name.strip() for name in metadata["channels"].split(","))
-
-
-def _usable(number: str) -> bool:
-    return len(number) < 9 and number.isascii() and number.isdecimal() and 1 <= int(number) <= _MAX_NUMBER
+    channels = tuple(name.strip() for name in metadata["channels"].split(","))
+    shapes = [one.shape for one in session.get_inputs()]
+    if len(shapes) != 1 or len(shapes[0]) != 4 or (isinstance(shapes[0][1], int) and shapes[0][1] != len(channels)):
+        raise ModelError(f"{path}: takes inputs {shapes}, but its metadata names {len(channels)} channels of one input")
+    return channels, metadata
 
 
 def _onnxruntime() -> Any:

@@ -1,6 +1,6 @@
 """Folders of polcap: for results among photographs, and for the user's calibrations.
 
-Imports no library: a run with nothing to do looks here first.
+Imports no library: a run that finds nothing changed needs only these names.
 """
 
 import os

@@ -17,10 +17,7 @@ def read_mesh(path: Path) -> tuple[Floats, NDArray[np.int64]]:
     An .npz holds `vq` uint16 (V, 3), position = vq/65535·vscale + vmin, and `faces`. Of a scene of
     several meshes all are read, each in its place.
 
-    Raises
-    ------
-    DecodeError
-        The file is missing, of an unknown format, damaged, or holds no triangle.
+    Raises DecodeError: the file is missing, of an unknown format, damaged, or holds no triangle.
     """
     try:
         vertices, faces = _compact(path) if path.suffix == ".npz" else _any(path)
@@ -51,10 +48,7 @@ def read_textures(folder: Path, side: int = 256) -> Floats:
     albedo.jpg (sRGB) and roughness.jpg must be there; normal.jpg (tangent space, green down as in DirectX) or
     height.jpg may be.
 
-    Raises
-    ------
-    DecodeError
-        A picture is missing or cannot be read.
+    Raises DecodeError: a picture is missing or cannot be read.
     """
     albedo = _picture(folder / "albedo.jpg", side)[..., ::-1]
     linear = color.decode_srgb(albedo)

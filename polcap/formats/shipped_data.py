@@ -34,10 +34,7 @@ def data_path(name: str) -> Path:
 
     In a checkout it is in `calib/` next to the package, in an installed wheel in `polcap/_calib/`.
 
-    Raises
-    ------
-    StorageError
-        Neither folder has it: the installation is incomplete.
+    Raises StorageError: neither folder has it: the installation is incomplete.
     """
     for root in (_PACKAGE / "_calib", _PACKAGE.parent / "calib"):
         if (root / name).exists():
@@ -46,7 +43,7 @@ def data_path(name: str) -> Path:
 
 
 def model_files(name: str = "") -> list[Path]:
-    """The shipped models whose names begin so, the newest last."""
+    """The shipped models with names that begin with `name`, the newest last."""
     return sorted(data_path("colorchecker").parent.glob(f"models/{name}*.onnx"))
 
 

@@ -1,4 +1,4 @@
-"""Reads TOML and JSON from files that anybody may have written, and explains what is wrong with a key.
+"""Reads TOML and JSON from files that anybody may have written, and explains the fault of a key.
 
 Files are UTF-8, with or without a byte order mark. The reader gets plain data, or an `OSError` or `ValueError` of one
 line: a pipe, a huge file, deep nesting and infinite numbers are refused.

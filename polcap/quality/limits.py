@@ -93,7 +93,8 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float, Meta(ge=0, le=1, description="share of the object with a DoLP above that of any dielectric [1]")
     ] = 0.05
     max_ghost: Annotated[
-        float, Meta(ge=0, le=1, description="share of the object where the exposures of a shot disagree beyond noise [1]")
+        float,
+        Meta(ge=0, le=1, description="share of the object where the exposures of a shot disagree beyond noise [1]"),
     ] = 0.02
     max_normal_error_deg: Annotated[
         float, Meta(gt=0, le=90, description="median expected error of the normals [degrees]")

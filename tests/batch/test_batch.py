@@ -29,7 +29,7 @@ def test_captures_are_found_however_deep_and_results_are_not(captures: Path, tmp
 
 @pytest.mark.parametrize("more", [(), ("--write-jobs", "slurm")], ids=["run", "job file"])
 @pytest.mark.parametrize(
-    ("model", "estimator", "says"),
+    ("model", "estimator", "words"),
     [
         ("none.onnx", "network", "No such file or directory; name a model file with --model"),
         ("noise.onnx", "network", "noise.onnx"),
@@ -37,7 +37,7 @@ def test_captures_are_found_however_deep_and_results_are_not(captures: Path, tmp
     ],
 )
 def test_an_unusable_model_is_refused_before_any_capture(
-    tmp_path: Path, polcap: Command, model: str, estimator: str, says: str, more: tuple[str, ...]
+    tmp_path: Path, polcap: Command, model: str, estimator: str, words: str, more: tuple[str, ...]
 ) -> None:
     (tmp_path / "captures" / "obj" / "pol000").mkdir(parents=True)
     (tmp_path / "noise.onnx").write_bytes(b"no model")
@@ -45,7 +45,7 @@ def test_an_unusable_model_is_refused_before_any_capture(
     done = polcap("batch", tmp_path / "captures", *order, *more)
     assert done.returncode == 2 and done.stdout == ""
     (line,) = done.stderr.splitlines()
-    assert says in line
+    assert words in line
     assert not (tmp_path / "out").exists()
 
 
@@ -105,7 +105,7 @@ def start(captures: Path, out: Path, *more: str) -> subprocess.Popen[str]:
 
 
 def kill_worker(out: Path) -> None:
-    """The process that works on the capture now, as its record tells."""
+    """Kill the process that works on the capture, by the number in its record."""
     for _ in range(8000):
         for file in (out / "polcap-batch" / "records").glob("*.json"):
             record = json.loads(file.read_text())
@@ -125,8 +125,8 @@ def test_killed_worker_costs_nothing_but_time_under_a_temporary_folder_of_any_le
         pytest.importorskip("distributed")
     running = start(captures, tmp_path, *how)
     kill_worker(tmp_path)
-    _, told = running.communicate(timeout=300)
-    assert running.returncode in (0, 3), told
+    _, errors = running.communicate(timeout=300)
+    assert running.returncode in (0, 3), errors
     again = (tmp_path / "obj0/asset/obj0.glb").read_bytes()
     assert again == (finished / "obj0/asset/obj0.glb").read_bytes()
 

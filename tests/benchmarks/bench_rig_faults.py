@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from polcap.config import Config
+from polcap.errors import PolcapError
 from polcap.formats.capture import reader as captures
 from polcap.images import ChartRequest
 from polcap.pipeline import run as pipeline
@@ -43,7 +44,7 @@ def main() -> None:
             folder = root / f"{fault}-{seed}"
             try:
                 outcome = faults.trial(fault, seed, pool, folder)
-            except AssertionError as error:
+            except (AssertionError, PolcapError) as error:
                 broken += 1
                 print(f"| {fault} | {seed} | | BROKEN: {error} | | | | |", flush=True)
                 continue

@@ -1,4 +1,4 @@
-"""Atomic writing: a final name never stands for half a file."""
+"""Atomic writing: a partial file never has its final name."""
 
 import errno
 import os
@@ -48,7 +48,7 @@ def test_refusals_of_the_disk_are_one_line(
     assert names(tmp_path) == []
 
 
-def test_a_name_too_long_is_told_and_not_what_cleaning_up_met(tmp_path: Path) -> None:
+def test_a_name_too_long_is_reported_rather_than_the_failed_cleaning(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="the name is too long"), atomic.path(tmp_path / ("a" * 250)) as temporary:
         temporary.write_bytes(b"abc")
 
@@ -80,13 +80,13 @@ def test_failed_folder_leaves_the_old_one(tmp_path: Path) -> None:
 
 
 def test_bytes_reach_the_disk_before_their_name_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    named: list[tuple[str, list[str]]] = []  # what is synced, and which names stand then
+    named: list[tuple[str, list[str]]] = []  # synced file, and the names at that time
 
     def note(handle: int) -> None:
         named.append((Path(f"/proc/self/fd/{handle}").readlink().name, names(tmp_path)))
 
     if not Path("/proc/self/fd").exists():
-        pytest.skip("this system does not tell what a handle stands for")
+        pytest.skip("this system does not name the file of a handle")
     monkeypatch.setattr(os, "fsync", note)
     with atomic.path(tmp_path / "a.bin") as temporary:
         temporary.write_bytes(b"abc")
@@ -96,30 +96,11 @@ def test_bytes_reach_the_disk_before_their_name_does(tmp_path: Path, monkeypatch
         (folder / "one").write_text("1")
         (folder / "two").write_text("2")
     assert sorted(name for name, _ in named) == sorted(["one", "two", folder.name])
-    assert not any("stage" in standing for _, standing in named)
+    assert not any("stage" in present for _, present in named)
     named.clear()
     with atomic.path(tmp_path / "b.bin", synced=False) as temporary:
         temporary.write_bytes(b"abc")
     assert not named
-
-
-def test_held_files_get_their_names_together_or_never(tmp_path: Path) -> None:
-    (tmp_path / "a.bin").write_bytes(b"old")
-    held = atomic.Held()
-    for name in ("a.bin", "b.bin"):
-        with atomic.path(tmp_path / name, held=held) as temporary:
-            temporary.write_bytes(b"new")
-    assert (tmp_path / "a.bin").read_bytes() == b"old" and not (tmp_path / "b.bin").exists()
-    with pytest.raises(RuntimeError), atomic.path(tmp_path / "c.bin", held=held) as temporary:
-        temporary.write_bytes(b"half")
-        raise RuntimeError
-    held.release()
-    held.drop()
-    assert names(tmp_path) == ["a.bin", "b.bin"] and (tmp_path / "a.bin").read_bytes() == b"new"
-    with atomic.path(tmp_path / "a.bin", held=held) as temporary:
-        temporary.write_bytes(b"third")
-    held.drop()
-    assert names(tmp_path) == ["a.bin", "b.bin"] and (tmp_path / "a.bin").read_bytes() == b"new"
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The user's calibrations: the newest that fits is used, nothing impossible is; color profiles are read back whole."""
+"""The newest calibration that fits is used, an impossible one is refused; color profiles are read back complete."""
 
 import dataclasses
 from operator import attrgetter
@@ -51,7 +51,7 @@ def users(tmp_path, monkeypatch) -> Path:
     return tmp_path / "calib"
 
 
-def test_what_systems_hide_beside_a_calibration_is_none(users):
+def test_hidden_files_are_no_calibrations(users):
     path = calibrations.write(users, KNOWN)
     (users / f"._{path.name}").write_bytes(b"\0\5\x16\7")
     assert calibrations.choose(EXIF, None, None)[0] == KNOWN
@@ -63,7 +63,7 @@ def test_calibration_comes_back_as_it_went(users):
     assert path.name.startswith("2026-11-22")
 
 
-def test_what_was_not_seen_is_left_out_and_comes_back_unknown(users):
+def test_parts_that_were_not_measured_come_back_as_none(users):
     levels = Levels((512.0,) * 4, (0.1,) * 4, (512.0,) * 4, 15871.0)
     unsaid = dataclasses.replace(FALLOFF, f_number=None, focal_length_mm=None)
     bare = dataclasses.replace(KNOWN, levels=levels, falloff=unsaid, polarizer=None)

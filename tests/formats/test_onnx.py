@@ -1,4 +1,4 @@
-"""A model is taken for what its file says, or refused with the reason."""
+"""A model is used as its metadata state, or refused with the reason."""
 
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ SAID = {"channels": "s1,s2", "encoding": ENCODING, "native_size": "128", "size_m
 
 
 def write(path: Path, metadata: dict[str, str], opset: int = 17, channels: int = 2) -> Path:
-    """A model whose one output is twice its input."""
+    """A model with one output, twice its input."""
     from onnx import TensorProto, helper
 
     shape = ["n", channels, "h", "w"]
@@ -34,7 +34,7 @@ def write(path: Path, metadata: dict[str, str], opset: int = 17, channels: int =
     return path
 
 
-def test_a_model_runs_and_tells_what_it_eats(tmp_path: Path) -> None:
+def test_a_model_runs_and_states_its_channels(tmp_path: Path) -> None:
     network = load(write(tmp_path / "m.onnx", SAID), "cpu", 1)
     assert network.channels == ("s1", "s2") and network.metadata["licence"] == "Apache-2.0"
     x = np.random.default_rng(0).normal(size=(1, 2, 8, 16)).astype(np.float32)
@@ -167,11 +167,12 @@ def test_metadata_that_are_no_text_are_refused(tmp_path: Path) -> None:
         load(path)
 
 
-def test_runs_side_by_side_are_as_many_as_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert [formats_onnx._at_once(formats_onnx.CPU, threads) for threads in (1, 2, 16)] == [1, 2, 4]
-    assert formats_onnx._at_once(formats_onnx.CUDA, 16) == 1
+@pytest.mark.parametrize(("threads", "at_once"), [(1, 1), (2, 2), (16, 4), (0, 3)])
+def test_parallel_runs_are_as_many_as_threads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int, at_once: int
+) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    assert formats_onnx._at_once(formats_onnx.CPU, 0) == 3
+    assert load(write(tmp_path / "m.onnx", SAID), "cpu", threads).at_once == at_once
 
 
 def test_a_file_that_changes_after_it_was_opened_is_refused_where_it_is_opened_again(tmp_path: Path) -> None:

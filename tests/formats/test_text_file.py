@@ -1,4 +1,4 @@
-"""What is wrong with what a user stated is told by its key, its value and its limit."""
+"""The message about a wrong setting names its key, its value and its limit."""
 
 from typing import Any
 

@@ -10,80 +10,66 @@ from tests.rig.far_end import SPOKEN, Device
 
 
 class Elliptec(Device):
-    """ELL14: 9600 8N1, `0in gs ho ma mr gp so go sv gv us st`, with or without CR LF behind a command."""
+    """ELL14: 9600 8N1, `0in gs ho ma mr gp so go sv us st`, with or without CR LF behind a command."""
 
     FAULTS = (*SPOKEN, "busy", "mechanical-timeout", "wrong-position", "unplug")
     PULSES = 143360  # per revolution
     JITTER = 3  # pulses between the position asked for and the one reached
     LENGTH: ClassVar[dict[str, int]] = {"ho": 1, "ma": 8, "mr": 8, "so": 8, "sv": 2}  # digits of data
-    KNOWN = ("in", "gs", "gp", "go", "gv", "us", "st", *LENGTH)
 
     def __init__(self, *, address: str = "0", kind: int = 14, travel: int = 360, **planted: object) -> None:
         super().__init__(**planted)  # type: ignore[arg-type]
         self.address = address
         self.identity = f"{kind:02X}1234567820241701{travel:04X}{self.PULSES:08X}"
         self.saved_offset = self.offset = 0  # pulses
-        self.velocity = 100
         self._zero_deg = self.angle_deg  # until homed, it counts from where it woke
-        self._status = 0
-        self._kept = ""
+        self._fault = 0
+        self._input = ""
 
     def receive(self, data: bytes) -> None:
-        self._kept += data.decode("latin-1").replace("\r", "").replace("\n", "")
-        while len(self._kept) >= 3:
-            letters = self._kept[1:3]
-            need = 3 + self.LENGTH.get(letters, 0)
-            if len(self._kept) < need:
-                return
-            command, self._kept = self._kept[:need], self._kept[need:]
+        self._input += data.decode("latin-1").replace("\r", "").replace("\n", "")
+        while len(self._input) >= (need := 3 + self.LENGTH.get(self._input[1:3], 0)):
+            command, self._input = self._input[:need], self._input[need:]
             self.heard.append(command)
             if command[0] == self.address:
-                self.obey(letters, command[3:])
+                self.obey(command[1:3], command[3:])
 
     def obey(self, letters: str, data: str) -> None:
         if letters == "st":
             self.freeze()
             self.status(0)
         elif letters == "gs":
-            self.status(9 if self.moving else self._status)
-            self._status = 0
+            self.status(9 if self.moving else self._fault)
+            self._fault = 0
         elif self.moving:
             self.status(9)
         elif letters == "in":
             self.reply("IN" + self.identity)
         elif letters == "gp":
-            self.reply(f"PO{self.number(self.pulses)}")
+            self.arrived()
         elif letters == "go":
             self.reply(f"HO{self.number(self.offset)}")
-        elif letters == "gv":
-            self.reply(f"GV{self.velocity:02X}")
-        elif letters == "us":
-            self.saved_offset = self.offset
-            self.status(0)
-        elif letters == "so":
-            self.offset = self.signed(data)
-            self.status(0)
-        elif letters == "sv":
-            self.velocity = int(data, 16)
+        elif letters in ("us", "so", "sv"):
+            self.offset = self.signed(data) if letters == "so" else self.offset
+            self.saved_offset = self.offset if letters == "us" else self.saved_offset
             self.status(0)
         elif letters == "ho":
-            home_deg = self.offset / self.PULSES * 360
-            self.turn(home_deg, lambda: self.home(home_deg))
+            self.turn(self.offset / self.PULSES * 360, self.home)
         elif letters in ("ma", "mr"):
             pulses = self.signed(data) + self.JITTER + (self.pulses if letters == "mr" else 0)
             self.turn(self._zero_deg + pulses / self.PULSES * 360, self.arrived)
         else:
             self.status(3)
 
-    def home(self, home_deg: float) -> None:
-        self._zero_deg = home_deg
+    def home(self) -> None:
+        self._zero_deg = self.offset / self.PULSES * 360
         self.arrived()
 
     def arrived(self) -> None:
         self.reply(f"PO{self.number(self.pulses)}")
 
     def halfway(self) -> None:
-        self._status = 2
+        self._fault = 2
         self.status(2)
 
     @property
@@ -121,32 +107,33 @@ class Grbl(Device):
         self.state = "Alarm" if homing else "Idle"
         self._critical = False  # a limit switch was hit: only reset helps
         self._zero_deg = self.angle_deg  # machine zero
-        self._kept = b""
+        self._forget()
+
+    def _forget(self) -> None:
+        """What GRBL loses at a reset."""
+        self._input = b""
         self._lines: list[str] = []
         self._planned: list[float] = []  # ring degrees
         self._waiting = False  # for the ring to stop, before it answers ok
 
     def receive(self, data: bytes) -> None:
-        for byte in data:
-            character = bytes([byte])
+        for character in (bytes([byte]) for byte in data):
+            if character in b"\x18?!":
+                self.heard.append("reset" if character == b"\x18" else character.decode())
             if character == b"\x18":
-                self.heard.append("reset")
                 self.reset()
-            elif character == b"?":
-                self.heard.append("?")
-                if self.state != "Home":
-                    self.report()
+            elif character == b"?" and self.state != "Home":
+                self.report()
             elif character == b"!":
-                self.heard.append("!")
                 self.freeze()
                 self._planned = []
                 self.state = "Hold" if self.state in ("Run", "Idle") else self.state
             elif character in b"\r\n":
-                line, self._kept = self._kept.decode("ascii", "replace"), b""
+                line, self._input = self._input.decode("ascii", "replace"), b""
                 self.heard.extend([line] if line else [])
                 self._lines.append(line)
-            else:
-                self._kept += character
+            elif character != b"?":
+                self._input += character
 
     def tick(self) -> None:
         """Obey lines in order, while none waits for the ring."""
@@ -155,28 +142,18 @@ class Grbl(Device):
 
     def obey(self, line: str) -> None:
         text = line.replace(" ", "").upper()
-        axis = re.search(r"X(-?\d+\.?\d*)", text)
         if self._critical or self.state == "Sleep":
             return
-        if text == "":
-            self.say("ok")
-        elif text == "$$":
-            for number, value in self.settings.items():
-                self.say(f"${number}={value:.3f}")
-            self.say("ok")
-        elif text == "$X":
-            self.state = "Idle"
-            self.say("[MSG:Caution: Unlocked]")
-            self.say("ok")
-        elif text == "$SLP":
-            self.state = "Sleep"
-            self.say("ok")
-            self.say("[MSG:Sleeping]")
-        elif text == "$H" and not self.settings[22]:
-            self.say("error:5")
-        elif text == "$H":
+        if text == "$H" and self.settings[22]:
             self.state, self._waiting = "Home", True
             self.turn(0.0, self.homed)
+        elif text in ("$H", "$SLP", "$X", "$$", ""):
+            self.state = {"$SLP": "Sleep", "$X": "Idle"}.get(text, self.state)
+            stored = [f"${number}={value:.3f}" for number, value in self.settings.items()]
+            for answer in {"$H": ["error:5"], "$X": ["[MSG:Caution: Unlocked]", "ok"], "$$": [*stored, "ok"]}.get(
+                text, ["ok"]
+            ):
+                self.say(answer)
         elif text.startswith("$"):
             self.say("error:3")
         elif self.state == "Alarm":
@@ -185,7 +162,7 @@ class Grbl(Device):
             self._waiting = self.moving
             if not self.moving:
                 self.say("ok")
-        elif "G0" in text and "G53" in text and axis:
+        elif axis := re.fullmatch(r"G21G90G53G0X(-?\d+\.?\d*)", text):
             self.say("ok")
             self._planned.append(self._zero_deg + float(axis[1]) * self.degrees)
             if not self.moving:
@@ -206,20 +183,21 @@ class Grbl(Device):
             self.say("ok")
 
     def halfway(self) -> None:
+        self._forget()
         if self._struck == "alarm":
-            self.state, self._critical, self._waiting = "Alarm", True, False
+            self.state, self._critical = "Alarm", True
             self.say("ALARM:1")
             self.say("[MSG:Reset to continue]")
         else:  # restart
             self._zero_deg = self.angle_deg
-            self.state, self._waiting = "Alarm" if self.settings[22] else "Idle", False
-            self._lines, self._planned = [], []
+            self.state = "Alarm" if self.settings[22] else "Idle"
             self.say(self.BANNER)
 
     def reset(self) -> None:
         lost = self.state in ("Run", "Home")
         self.freeze()
-        self._kept, self._lines, self._planned, self._waiting, self._critical = b"", [], [], False, False
+        self._forget()
+        self._critical = False
         if lost:
             self.say("ALARM:3")
         self.state = "Alarm" if lost or self.state in ("Alarm", "Sleep") else "Idle"
@@ -229,8 +207,7 @@ class Grbl(Device):
 
     def report(self) -> None:
         position = (self.angle_deg - self._zero_deg) / self.degrees
-        state = "Hold:0" if self.state == "Hold" else self.state
-        self.say(f"<{state}|MPos:{position:.3f},0.000,0.000|FS:0,0>")
+        self.say(f"<{self.state.replace('Hold', 'Hold:0')}|MPos:{position:.3f},0.000,0.000|FS:0,0>")
 
 
 class Line(Device):
@@ -247,11 +224,11 @@ class Line(Device):
         self.homed = False
         self.released = True
         self._zero_deg = self.angle_deg
-        self._kept = ""
+        self._input = ""
         self._beat = 0.0
 
     def receive(self, data: bytes) -> None:
-        *lines, self._kept = (self._kept + data.decode("latin-1")).split("\n")
+        *lines, self._input = (self._input + data.decode("latin-1")).split("\n")
         for line in lines:
             self.heard.append(line.strip())
             self.obey(line.strip())
@@ -290,11 +267,8 @@ class Line(Device):
 
     def halfway(self) -> None:
         self.homed, self.released = False, True
-        self.say(
-            "error the motor stalled; free the ring"
-            if self._struck == "mechanical-timeout"
-            else f"{self.HELLO} started"
-        )
+        stalled = self._struck == "mechanical-timeout"
+        self.say("error the motor stalled; free the ring" if stalled else f"{self.HELLO} started")
 
     def tick(self) -> None:
         if self.moving and self._clock.monotonic() - self._beat > 0.2:

@@ -3,18 +3,15 @@
     with virtual.time(), Elliptec(fault="half-line", at=3) as device:
         rotator = open_rotator(f"elliptec:{device.port}", Log(None))
 
-They use the clock of `virtual` and run while their port is read; with `real=True` they run in a thread on a
+They use the clock of `virtual` and run while their port is read. With `real=True` they run in a thread on a
 pseudo-terminal, for another process.
 
-`fault` is one of the class's FAULTS or `late`; `at` is the first moment it strikes, `times` the number of moments
-(`ALWAYS`: all).
+`fault` is one of the class's FAULTS or `late`; `at` is the first moment at which it strikes, `times` the number of
+moments (`ALWAYS`: all). The first moment is 1.
 
     moments are answers:    no-answer, garbage, half-line, late (after `serial_port` has given it up)
     moments are movements:  busy (never ends), mechanical-timeout, wrong-position (stops 5° away, and reports that);
-                            halfway: unplug (the port vanishes), alarm (a limit switch), restart (power lost)
-
-Homing is a movement; the first moment is 1. `heard` lists the commands, `angle_deg` is the ring's true angle, `moves`
-and `answers` count. `unplug()` pulls the cable.
+    (homing is one)         halfway: unplug (the port vanishes), alarm (a limit switch), restart (power lost)
 """
 
 import os
@@ -30,8 +27,8 @@ from tests.rig import virtual
 
 ALWAYS = 1 << 30
 SPOKEN = ("no-answer", "garbage", "half-line")
-LATENCY_S = 0.016  # of a USB adapter's buffer, for each answer
-LATE_S = 1.4 * serial_port.ANSWER_S
+_LATENCY_S = 0.016  # of a USB adapter's buffer, for each answer
+_LATE_S = 1.4 * serial_port.ANSWER_S
 _OFF_DEG = 5.0  # of a wrong position
 
 
@@ -52,43 +49,38 @@ class Device:
         real: bool = False,
     ) -> None:
         assert not fault or fault in (*self.FAULTS, "late"), f"{fault} is none of {self.FAULTS}"
-        self.fault, self.at, self.times = fault, at, times
+        self.fault, self.struck_moments = fault, range(at, at + times)
         self.speed_deg_s = speed_deg_s
-        self.angle_deg = start_deg
-        self.heard: list[str] = []
-        self.moves = 0
-        self.answers = 0
-        self.delivered = b""
-        self._wire = Terminal(self) if real else None
-        self.port = self._wire.name if self._wire else f"virtual://{id(self)}"
+        self.angle_deg = start_deg  # true angle of the ring
+        self.heard: list[str] = []  # commands
+        self.moves = self.answers = 0
+        self.delivered = b""  # answers that came through the wire and were not read yet
+        self.gone = False  # the cable was pulled
+        self.port = f"virtual://{id(self)}"
         self._clock: Any = time if real else virtual.CLOCK
         self._target_deg = start_deg
         self._struck = ""  # the fault of this movement
-        self._ends: float | None = None  # monotonic; None: the ring stands
+        self._ends: float | None = None  # monotonic time; None: the ring does not turn
         self._then: Callable[[], None] = lambda: None
-        self._said: list[tuple[float, bytes]] = []  # answers on their way, and when they arrive
-        self._gone = threading.Event()
+        self._wire: list[tuple[float, bytes]] = []  # answers on their way, and when they arrive
+        self._thread = threading.Thread(target=self._serve, daemon=True) if real else None
+        if real:
+            self._master, self._slave = os.openpty()
+            tty.setraw(self._slave)
+            self.port = os.ttyname(self._slave)
 
     def __enter__(self) -> Self:
-        if self._wire:
-            self._wire.start()
+        if self._thread:
+            self._thread.start()
         else:
             virtual.PLUGGED[self.port] = self
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.unplug()
+        self.gone = True
         virtual.PLUGGED.pop(self.port, None)
-
-    @property
-    def gone(self) -> bool:
-        return self._gone.is_set()
-
-    def unplug(self) -> None:
-        """Pull the cable."""
-        self._gone.set()
-        if self._wire:
-            self._wire.join()
+        if self._thread:
+            self._thread.join(5)
 
     def receive(self, data: bytes) -> None:
         """Handle bytes that were sent to the device."""
@@ -98,23 +90,23 @@ class Device:
         """The planted fault of a movement strikes: mechanical-timeout, alarm, restart."""
         raise NotImplementedError
 
+    def tick(self) -> None:
+        """Called every few milliseconds."""
+
     def say(self, text: str) -> None:
         """Answer a line, unless a fault is due."""
         self.answers += 1
         data, late_s = text.encode() + self.END, 0.0
-        if self.at <= self.answers < self.at + self.times:
+        if self.answers in self.struck_moments:
             spoilt = {"no-answer": b"", "garbage": b"\xff\x00\x87~\xf3" + self.END, "half-line": data[: len(text) // 2]}
             data = spoilt.get(self.fault, data)
-            late_s = LATE_S if self.fault == "late" else 0.0
+            late_s = _LATE_S if self.fault == "late" else 0.0
         self.send(data, late_s)
 
     def send(self, data: bytes, late_s: float = 0.0) -> None:
         """Put bytes on the wire, after those already on it."""
-        before = max((due for due, _ in self._said), default=0.0)
-        self._said.append((max(self._clock.monotonic() + late_s, before) + LATENCY_S, data))
-
-    def tick(self) -> None:
-        """Called every few milliseconds."""
+        before = max((due for due, _ in self._wire), default=0.0)
+        self._wire.append((max(self._clock.monotonic() + late_s, before) + _LATENCY_S, data))
 
     @property
     def moving(self) -> bool:
@@ -123,7 +115,7 @@ class Device:
     def turn(self, target_deg: float, then: Callable[[], None]) -> None:
         """Start turning; call `then` when the ring has stopped."""
         self.moves += 1
-        due = self.fault not in (*SPOKEN, "late") and self.at <= self.moves < self.at + self.times
+        due = self.fault not in (*SPOKEN, "late") and self.moves in self.struck_moments
         self._struck = self.fault if due else ""
         seconds = abs(target_deg - self.angle_deg) / self.speed_deg_s
         if self._struck == "wrong-position":
@@ -144,49 +136,26 @@ class Device:
     def step(self) -> None:
         """Finish movements and deliver answers that are due."""
         self.tick()
-        if self._ends is not None and self._clock.monotonic() >= self._ends:
-            self._arrive()
-        while self._said and self._said[0][0] <= self._clock.monotonic():
-            self.delivered += self._said.pop(0)[1]
+        now = self._clock.monotonic()
+        if self._ends is not None and now >= self._ends:
+            self.angle_deg = self._target_deg
+            self._ends = float("inf") if self._struck == "busy" else None
+            if self._struck == "unplug":
+                self.gone = True
+            elif self._struck in ("mechanical-timeout", "alarm", "restart"):
+                self.halfway()
+            elif self._struck != "busy":
+                self._then()
+        while self._wire and self._wire[0][0] <= now:
+            self.delivered += self._wire.pop(0)[1]
 
-    def _arrive(self) -> None:
-        self.angle_deg = self._target_deg
-        if self._struck == "busy":
-            self._ends = float("inf")
-        elif self._struck == "unplug":
-            self._ends = None
-            self._gone.set()
-        elif self._struck in ("mechanical-timeout", "alarm", "restart"):
-            self._ends = None
-            self.halfway()
-        else:
-            self._ends = None
-            self._then()
-
-
-class Terminal:
-    """A pseudo-terminal, and the thread of its device."""
-
-    def __init__(self, device: Device) -> None:
-        self._device = device
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        self.name = os.ttyname(self._slave)
-        self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def start(self) -> None:
-        self._thread.start()
-
-    def join(self) -> None:
-        self._thread.join(5)
-
-    def _run(self) -> None:
-        device = self._device
-        while not device.gone:
-            if select.select([self._master], [], [], 0.002 if device.moving else 0.02)[0]:
-                device.receive(os.read(self._master, 4096))
-            device.step()
-            os.write(self._master, device.delivered)
-            device.delivered = b""
+    def _serve(self) -> None:
+        """Answer on the pseudo-terminal until the cable is pulled."""
+        while not self.gone:
+            if select.select([self._master], [], [], 0.002 if self.moving else 0.02)[0]:
+                self.receive(os.read(self._master, 4096))
+            self.step()
+            os.write(self._master, self.delivered)
+            self.delivered = b""
         os.close(self._master)
         os.close(self._slave)

@@ -1,6 +1,5 @@
 """A camera that returns prepared photographs, with a planted fault; much faster than rendering each."""
 
-import os
 import resource
 import signal
 import tempfile
@@ -8,7 +7,6 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
 from polcap.errors import HardwareError
@@ -63,15 +61,10 @@ class PoolCamera:
     switches_flash = polarizes_flash = True
 
     def __init__(
-        self,
-        pool: dict[Key, bytes],
-        true_deg: Callable[[], float] | None = None,
-        fault: str = "",
-        at: int = 1,
-        timeout_s: float = 0.5,
+        self, pool: dict[Key, bytes], true_deg: Callable[[], float] | None = None, fault: str = "", at: int = 1
     ) -> None:
         assert not fault or fault in CAMERA_FAULTS
-        self.pool, self.true_deg, self.fault, self.at, self.timeout_s = pool, true_deg, fault, at, timeout_s
+        self.pool, self.true_deg, self.fault, self.at = pool, true_deg, fault, at
         self.delivered: list[tuple[Key, str]] = []
         self.closed = False
         self._last = b""
@@ -88,22 +81,20 @@ class PoolCamera:
 
     def shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
         data = self.pool[self._key]
-        if len(self.delivered) + 1 == self.at and self.fault:
-            fault, self.fault = self.fault, ""
-            if fault == "stall":
-                call_within(self.timeout_s, "camera: capture", threading.Event().wait)
-            if fault in ("disconnect", "card-full"):
-                raise HardwareError(f"camera: capture: {fault}")
-            if fault == "corrupt":
-                data = data[: len(data) // 2]
-            if fault == "stale":
-                data = self._last or bytes(len(data))
-            if fault == "disk-full":
-                resource.setrlimit(resource.RLIMIT_FSIZE, (8192, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
-            if fault == "ctrl-c":
-                signal.raise_signal(signal.SIGINT)
-            if fault == "kill":
-                os.kill(os.getpid(), signal.SIGKILL)
+        due = len(self.delivered) + 1 == self.at
+        fault, self.fault = (self.fault, "") if due else ("", self.fault)
+        if fault == "stall":
+            call_within(0.5, "camera: capture", threading.Event().wait)
+        elif fault in ("disconnect", "card-full"):
+            raise HardwareError(f"camera: capture: {fault}")
+        elif fault == "corrupt":
+            data = data[: len(data) // 2]
+        elif fault == "stale":
+            data = self._last or bytes(len(data))
+        elif fault == "disk-full":
+            resource.setrlimit(resource.RLIMIT_FSIZE, (8192, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+        elif fault in ("ctrl-c", "kill"):
+            signal.raise_signal(signal.SIGINT if fault == "ctrl-c" else signal.SIGKILL)
         self._last = data
         self.delivered.append((self._key, digest(data)))
         return CameraFile(data, "POOL.DNG", exposure)
@@ -112,13 +103,3 @@ class PoolCamera:
         self.closed = True
         limit = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-
-
-def saved(pool: dict[Key, bytes], file: Path) -> None:
-    """The pool as a file, for another process."""
-    file.write_bytes(msgspec.msgpack.encode([[*key, data] for key, data in pool.items()]))
-
-
-def loaded(file: Path) -> dict[Key, bytes]:
-    rows = msgspec.msgpack.decode(file.read_bytes())
-    return {(role, float(angle), step): data for role, angle, step, data in rows}

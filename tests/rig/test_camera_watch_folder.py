@@ -48,7 +48,7 @@ def watched(folder: Path, timeout_s: float = 20.0) -> WatchFolderCamera:
     return WatchFolderCamera(str(folder), Log(None), timeout_s=timeout_s, stable_s=0.2)
 
 
-def test_a_file_written_slowly_is_taken_when_whole_and_stays_where_it_is(
+def test_a_file_written_slowly_is_taken_when_complete_and_is_not_changed(
     tether: Path, tmp_path: Path, clock: Clock
 ) -> None:
     camera, data = watched(tether), tiny(tmp_path / "new.dng", iso=200.0)
@@ -61,12 +61,11 @@ def test_a_file_written_slowly_is_taken_when_whole_and_stays_where_it_is(
     clock.meanwhile = write
     camera.prepare(0.0, "shot", 0)
     shot = camera.shoot(ANY, flash=True)
-    assert shot.data == data and shot.name == "IMG_1.dng"
-    assert (tether / "IMG_1.dng").read_bytes() == data
+    assert shot.data == data == (tether / "IMG_1.dng").read_bytes() and shot.name == "IMG_1.dng"
 
 
-def test_a_file_whose_writing_pauses_is_waited_for(tether: Path, tmp_path: Path) -> None:
-    """Half a DNG looks like a TIFF picture, or like a RAW with data beyond its end."""
+def test_polcap_waits_for_a_file_when_its_writing_pauses(tether: Path, tmp_path: Path) -> None:
+    """Half a DNG resembles a TIFF picture, or a RAW with data beyond its end."""
     camera, data = watched(tether, timeout_s=1.5), tiny(tmp_path / "new.dng", iso=200.0)
     camera.prepare(0.0, "shot", 0)
     for part in (100, 1200):
@@ -98,23 +97,17 @@ def test_a_frame_from_before_the_turn_is_not_taken_for_the_next_angle(tether: Pa
 
 def test_a_file_that_cannot_be_decoded_is_named(tether: Path) -> None:
     camera = watched(tether, timeout_s=1.5)
-    (tether / "IMG_1.CR3").write_bytes(b"\0\0\0\x18ftypcrx " + bytes(500))
-    with pytest.raises(HardwareError, match=r"IMG_1.CR3"):
+    (tether / "IMG_2.CR3").write_bytes(b"\0\0\0\x18ftypcrx " + bytes(500))
+    with pytest.raises(HardwareError, match=r"IMG_2.CR3"):
         camera.shoot(ANY, flash=True)
 
 
-def test_a_folder_that_is_not_there_is_the_users_fault(tmp_path: Path) -> None:
+def test_a_missing_folder_bracket_or_disk_is_one_error(tether: Path, tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="no such folder"):
         open_camera(f"folder:{tmp_path / 'none'}", Log(None))
-
-
-def test_a_bracket_must_be_given(tether: Path) -> None:
-    with pytest.raises(SettingError, match="--bracket"):
-        watched(tether).bracket(flash=False)
-
-
-def test_a_disk_that_vanishes_is_a_hardware_fault(tether: Path) -> None:
     camera = watched(tether)
+    with pytest.raises(SettingError, match="--bracket"):
+        camera.bracket(flash=False)
     (tether / "yesterday.dng").unlink()
     tether.rmdir()
     with pytest.raises(HardwareError, match="still there"):

@@ -76,7 +76,7 @@ def test_wrong_flag_is_one_line_and_exit_2(
         assert done.returncode == 2 and words in done.stderr and done.stderr.count("\n") == 1, done.stderr
 
 
-def test_a_port_that_is_not_there_is_exit_4(polcap: Command, tmp_path: Path) -> None:
+def test_a_missing_port_is_exit_4(polcap: Command, tmp_path: Path) -> None:
     done = polcap("capture", tmp_path / "c", "--rotator", "elliptec:/dev/ttyNONE", *SIMULATED[2:4])
     assert done.returncode == 4 and done.stderr.count("\n") == 1 and "/dev/ttyNONE" in done.stderr
 
@@ -121,7 +121,7 @@ def test_a_motor_on_a_port_and_a_camera_on_a_cable_make_a_capture(
     assert "rotator > 0ma" in log and "camera > shutterspeed = 0.0050s" in log
 
 
-def test_the_template_for_those_who_shoot_by_hand_is_understood(tmp_path: Path) -> None:
+def test_the_template_and_the_card_for_shooting_by_hand_are_understood(tmp_path: Path) -> None:
     template = ROOT / "examples" / "capture.toml"
     (tmp_path / "capture.toml").write_bytes(template.read_bytes())
     (tmp_path / "angles.txt").write_text("as read off the ring")
@@ -131,9 +131,5 @@ def test_the_template_for_those_who_shoot_by_hand_is_understood(tmp_path: Path) 
     assert {entry.angle for entry in stated.frame if entry.role == "shot"} == {0.0, 45.0, 90.0}
     keys = {line.lstrip("# ").partition(" ")[0] for line in template.read_text().splitlines() if " = " in line}
     assert set(capture_toml.CaptureFile.__struct_fields__) - {"frame", "rotator"} <= keys  # every key is explained
-
-
-def test_the_shooting_card_names_the_folders_that_polcap_reads() -> None:
     card = (ROOT / "examples" / "shooting-card.html").read_text()
-    for folder in ("pol000", "pol045", "pol090"):
-        assert folder in card
+    assert all(folder in card for folder in ("pol000", "pol045", "pol090"))

@@ -22,32 +22,25 @@ def typed(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "angle"),
     [
-        ("\n", 45),
-        ("44.5\n", 44.5),
-        (" 44,5° \n", 44.5),
-        ("-10\n", 350),
-        ("405\n", 45),
-        ("north\nnan\n46\n", 46),
+        ("\n", 45), ("44.5\n", 44.5), (" 44,5° \n", 44.5), ("-10\n", 350), ("405\n", 45), ("north\nnan\n46\n", 46),
         ("oops\n\n", 45),
     ],
-)
-def test_enter_or_the_angle_it_stands_at(monkeypatch: pytest.MonkeyPatch, text: str, angle: float) -> None:
+)  # fmt: skip
+def test_enter_confirms_the_angle_and_a_number_replaces_it(
+    monkeypatch: pytest.MonkeyPatch, text: str, angle: float
+) -> None:
     typed(monkeypatch, text)
     assert open_rotator("manual", Log(None)).move(45) == angle
 
 
-def test_the_question_goes_to_stderr(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    typed(monkeypatch, "\n")
-    open_rotator("manual", Log(None)).move(22.5)
-    output = capsys.readouterr()
-    assert output.out == ""
-    assert "turn the polarizer to 22.5°" in output.err
-
-
-def test_the_end_of_input_is_an_error_with_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_question_goes_to_stderr_and_the_end_of_input_is_an_error(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     typed(monkeypatch, "north\n")
     with pytest.raises(HardwareError, match="the input has ended; run in a terminal"):
-        open_rotator("manual", Log(None)).move(45)
+        open_rotator("manual", Log(None)).move(22.5)
+    output = capsys.readouterr()
+    assert output.out == "" and "turn the polarizer to 22.5°" in output.err
 
 
 @pytest.mark.parametrize("stdin", [io.StringIO("\n"), None])

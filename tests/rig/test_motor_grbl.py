@@ -1,6 +1,5 @@
 """GRBL 1.1 over the wire: scaling, homing, alarms, and a stop that loses no position."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -10,24 +9,19 @@ from polcap.rig import person
 from polcap.rig.device_log import Log
 from polcap.rig.motor_grbl import MEANING, GrblMotor, GrblSettings
 from polcap.rig.serial_port import NoAnswer, Port
-from tests.rig import devices, virtual
+from tests.rig import virtual
+from tests.rig.devices import Grbl
 
-pytestmark = pytest.mark.timeout(60)
-
-
-@pytest.fixture(autouse=True)
-def clock() -> Iterator[virtual.Clock]:
-    with virtual.time() as clock:
-        yield clock
+pytestmark = [pytest.mark.timeout(60), pytest.mark.usefixtures("clock")]
 
 
-def motor(device: devices.Grbl, limit_s: float = 2.0, **settings: Any) -> GrblMotor:
+def motor(device: Grbl, limit_s: float = 2.0, **settings: Any) -> GrblMotor:
     port = Port(device.port, GrblMotor.baud, Log(None))
     return GrblMotor(port, GrblSettings(timeout=limit_s, **settings))
 
 
-def test_grbl_s_unit_is_a_degree() -> None:
-    with devices.Grbl(speed_deg_s=720) as device:
+def test_the_unit_of_grbl_is_a_degree() -> None:
+    with Grbl(speed_deg_s=720) as device:
         board = motor(device)
         assert (board.model, board.speed_deg_s) == ("GRBL 1.1h", 720)
         board.home()
@@ -36,8 +30,8 @@ def test_grbl_s_unit_is_a_degree() -> None:
         assert (device.angle_deg, board.position()) == pytest.approx((45, 45))
 
 
-def test_or_steps_say_how_much_of_a_unit_a_degree_is() -> None:
-    with devices.Grbl(steps=80, degrees=4.5, speed_deg_s=900) as device:  # 80 steps/unit, so 17.78 steps a degree
+def test_steps_state_the_motor_steps_of_a_degree() -> None:
+    with Grbl(steps=80, degrees=4.5, speed_deg_s=900) as device:  # 80 steps/unit, so 17.78 steps a degree
         board = motor(device, steps=80 / 4.5)
         board.home()
         board.go(90)
@@ -45,15 +39,15 @@ def test_or_steps_say_how_much_of_a_unit_a_degree_is() -> None:
         assert board.speed_deg_s == pytest.approx(900)
 
 
-def test_without_a_switch_the_error_names_both_ways_out() -> None:
+def test_without_a_switch_the_error_names_both_remedies() -> None:
     words = r"error:5: homing is off; wire a switch and set \$22=1, or add home=ask"
-    with devices.Grbl(homing=False) as device, pytest.raises(HardwareError, match=words):
+    with Grbl(homing=False) as device, pytest.raises(HardwareError, match=words):
         motor(device).home()
 
 
-def test_or_a_person_puts_the_ring_to_zero(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_person_puts_the_ring_to_zero(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
-    with devices.Grbl(homing=False, start_deg=10) as device:
+    with Grbl(homing=False, start_deg=10) as device:
         monkeypatch.setattr(person, "ask", lambda question, log: asked.append(question))
         board = motor(device, home="ask")
         board.home()
@@ -63,11 +57,15 @@ def test_or_a_person_puts_the_ring_to_zero(monkeypatch: pytest.MonkeyPatch) -> N
     assert asked == ["turn the polarizer's ring to 0°, then press Enter: "]
 
 
-def test_an_alarm_is_explained_and_ended_by_homing() -> None:
-    with devices.Grbl(fault="alarm", at=2) as device:
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [("alarm", "ALARM:1: a limit switch was hit; free the ring"), ("restart", "restarted and lost its position")],
+)
+def test_an_alarm_or_a_restart_is_explained_and_ended_by_homing(fault: str, words: str) -> None:
+    with Grbl(fault=fault, at=2) as device:
         board = motor(device)
         board.home()
-        with pytest.raises(HardwareError, match="ALARM:1: a limit switch was hit; free the ring"):
+        with pytest.raises(HardwareError, match=words):
             board.go(45)
         with pytest.raises(HardwareError, match="locked by an alarm"):
             board.position()
@@ -76,19 +74,8 @@ def test_an_alarm_is_explained_and_ended_by_homing() -> None:
         assert device.angle_deg == pytest.approx(45)
 
 
-def test_a_restart_during_a_move_is_reported_and_ended_by_homing() -> None:
-    with devices.Grbl(fault="restart", at=2) as device:
-        board = motor(device)
-        board.home()
-        with pytest.raises(HardwareError, match="restarted and lost its position"):
-            board.go(45)
-        board.home()
-        board.go(45)
-        assert device.angle_deg == pytest.approx(45)
-
-
 def test_a_stop_holds_before_it_resets_and_the_motor_sleeps(clock: virtual.Clock) -> None:
-    with devices.Grbl(speed_deg_s=45) as device:
+    with Grbl(speed_deg_s=45) as device:
         device.angle_deg = 0.0
         board = motor(device)
         board.home()
@@ -103,14 +90,14 @@ def test_a_stop_holds_before_it_resets_and_the_motor_sleeps(clock: virtual.Clock
 
 
 def test_homing_may_be_longer_than_one_answer() -> None:
-    with devices.Grbl(speed_deg_s=10) as device:  # four seconds, in which GRBL is silent
+    with Grbl(speed_deg_s=10) as device:  # four seconds, in which GRBL is silent
         motor(device, limit_s=20).home()
         assert device.angle_deg == 0
 
 
 @pytest.mark.parametrize("at", [1, 2])
 def test_a_movement_without_end_ends_with_the_limit(at: int) -> None:
-    with devices.Grbl(fault="busy", at=at) as device:
+    with Grbl(fault="busy", at=at) as device:
         board = motor(device, limit_s=2.0)
         with pytest.raises(HardwareError, match=r"takes more than timeout = 2 s for (\$H|G4P0.01)"):
             board.home()
@@ -120,8 +107,8 @@ def test_a_movement_without_end_ends_with_the_limit(at: int) -> None:
 @pytest.mark.parametrize(
     ("banner", "error"), [("Grbl 0.9j ['$' for help]", NoAnswer), ("GrblHAL 1.1f ['$' or '$HELP' for help]", None)]
 )
-def test_only_version_1_1_is_spoken(banner: str, error: type[Exception] | None) -> None:
-    with devices.Grbl() as device:
+def test_only_version_1_1_is_accepted(banner: str, error: type[Exception] | None) -> None:
+    with Grbl() as device:
         device.BANNER = banner
         if error:
             with pytest.raises(error, match=r"no GRBL 1\.1"):
@@ -131,7 +118,7 @@ def test_only_version_1_1_is_spoken(banner: str, error: type[Exception] | None) 
 
 
 def test_work_positions_are_refused() -> None:
-    class Work(devices.Grbl):
+    class Work(Grbl):
         def report(self) -> None:
             self.say("<Idle|WPos:0.000,0.000,0.000|FS:0,0>")
 
@@ -139,9 +126,7 @@ def test_work_positions_are_refused() -> None:
         motor(device).home()
 
 
-def test_codes_have_grbl_s_meaning() -> None:
-    assert "limit switch" in MEANING["ALARM:1"]
-    assert "reset during a movement" in MEANING["ALARM:3"]
-    assert "no switch" in MEANING["ALARM:9"]
-    assert "homing is off" in MEANING["error:5"]
-    assert "locked" in MEANING["error:9"]
+def test_codes_have_the_meaning_of_grbl() -> None:
+    words = {"ALARM:1": "limit switch", "ALARM:3": "reset during a movement", "ALARM:9": "no switch"}
+    words |= {"error:5": "homing is off", "error:9": "locked"}
+    assert all(word in MEANING[code] for code, word in words.items())

@@ -1,6 +1,5 @@
 """The line protocol of home-made rotators, over the wire."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -10,17 +9,10 @@ from polcap.rig import person
 from polcap.rig.device_log import Log
 from polcap.rig.motor_line_protocol import LineMotor, LineSettings
 from polcap.rig.serial_port import NoAnswer, Port
-from tests.rig import devices, virtual
+from tests.rig import devices
 from tests.rig.far_end import Device
 
-pytestmark = pytest.mark.timeout(120)
-
-
-@pytest.fixture(autouse=True)
-def clock() -> Iterator[virtual.Clock]:
-    """Of the simulated boards."""
-    with virtual.time() as clock:
-        yield clock
+pytestmark = [pytest.mark.timeout(120), pytest.mark.usefixtures("clock")]
 
 
 def motor(device: Device, limit_s: float = 2.0, **settings: Any) -> LineMotor:

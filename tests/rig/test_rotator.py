@@ -1,6 +1,6 @@
 """With every motor: the angle returned is the true one, or there is an error."""
 
-from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -11,89 +11,77 @@ from polcap.rig.device_log import Log
 from polcap.rig.device_urls import open_rotator, probe
 from polcap.rig.rotator import PolarizerRotator, RotatorSettings
 from polcap.rig.serial_port import Unplugged
-from tests.rig import virtual
 from tests.rig.devices import Elliptec, Grbl, Line
 from tests.rig.far_end import ALWAYS, SPOKEN, Device
 
-pytestmark = pytest.mark.timeout(120)
+pytestmark = [pytest.mark.timeout(120), pytest.mark.usefixtures("clock")]
 KINDS: dict[str, type[Elliptec | Grbl | Line]] = {"elliptec": Elliptec, "grbl": Grbl, "line": Line}
-QUICK = "settle=0&timeout=4"
 
 
-@pytest.fixture(autouse=True)
-def clock() -> Iterator[virtual.Clock]:
-    with virtual.time() as clock:
-        yield clock
-
-
-@pytest.fixture
-def rotators() -> Iterator[list[PolarizerRotator]]:
-    """Closed at the end."""
-    opened: list[PolarizerRotator] = []
-    yield opened
-    for rotator in opened:
-        rotator.close()
+def opened(kind: str, device: Device, settings: str = "", log: Log | None = None) -> PolarizerRotator:
+    return open_rotator(f"{kind}:{device.port}?settle=0&timeout=4{settings}", log or Log(None))
 
 
 def off(a: float, b: float) -> float:
     return abs((a - b + 180) % 360 - 180)
 
 
+def shoot_round(device: Device, rotator: PolarizerRotator, angles: tuple[float, ...] = (10.0, 45.0, 90.0)) -> None:
+    """Every angle is reached, or an error is raised; the coarsest device steps 0.09°."""
+    for angle in angles:
+        read = rotator.move(angle)
+        assert 0 <= read < 360 and off(read, angle) <= 0.06 and off(device.angle_deg, angle) <= 0.06
+
+
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("drive", "axis"), [("", 1), ("&offset=12.5", 1), ("&offset=100&reverse=1", -1)])
-def test_angles_are_reached_with_offset_and_sense(
-    kind: str, drive: str, axis: int, rotators: list[PolarizerRotator]
-) -> None:
-    with KINDS[kind]() as device:
-        rotator = open_rotator(f"{kind}:{device.port}?{QUICK}{drive}", Log(None))
-        rotators.append(rotator)
-        offset = {"": 0.0, "&offset=12.5": 12.5}.get(drive, 100.0)
+@pytest.mark.parametrize(("settings", "axis", "offset"), [("offset=12.5", 1, 12.5), ("offset=100&reverse=1", -1, 100)])
+def test_angles_are_reached_with_offset_and_sense(kind: str, settings: str, axis: int, offset: float) -> None:
+    with KINDS[kind]() as device, closing(opened(kind, device, f"&{settings}")) as rotator:
         for angle in (0.0, 45.0, 90.0, 30.0, 0.0, 300.0):
-            read = rotator.move(angle)
-            assert 0 <= read < 360
-            assert off(read, angle) <= 0.06  # the coarsest device steps 0.09°
+            assert off(rotator.move(angle), angle) <= 0.06
             assert off(device.angle_deg, offset + axis * angle) <= 0.06
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("at", [1, 2, 3, 5, 8, 12])
 @pytest.mark.parametrize("fault", [*SPOKEN, "late"])
-def test_a_lost_or_spoilt_answer_is_asked_again(
-    kind: str, at: int, fault: str, rotators: list[PolarizerRotator]
-) -> None:
-    with KINDS[kind](fault=fault, at=at) as device:
-        rotators.append(open_rotator(f"{kind}:{device.port}?{QUICK}", Log(None)))
-        for angle in (0.0, 45.0, 90.0):
-            assert off(rotators[0].move(angle), angle) < 0.06
-            assert off(device.angle_deg, angle) < 0.06
+def test_a_lost_or_damaged_answer_is_asked_for_again(kind: str, at: int, fault: str) -> None:
+    with KINDS[kind](fault=fault, at=at) as device, closing(opened(kind, device)) as rotator:
+        shoot_round(device, rotator)
 
 
 @pytest.mark.parametrize(
     ("kind", "fault"), [(kind, fault) for kind, device in KINDS.items() for fault in device.FAULTS]
 )
 @pytest.mark.parametrize("at", [1, 6])
-def test_a_lasting_fault_is_one_error_and_no_wrong_angle(
-    kind: str, fault: str, at: int, rotators: list[PolarizerRotator]
-) -> None:
+def test_a_lasting_fault_is_one_error_and_no_wrong_angle(kind: str, fault: str, at: int) -> None:
     with KINDS[kind](fault=fault, at=at, times=ALWAYS) as device:
-        with pytest.raises(HardwareError, match=r"rotator|GRBL|ELL14") as raised:
-            rotators.append(open_rotator(f"{kind}:{device.port}?{QUICK}", Log(None)))
-            for angle in (10.0, 45.0, 90.0, 0.0, 45.0, 90.0):
-                read = rotators[0].move(angle)
-                assert off(read, angle) < 0.06
-                assert off(device.angle_deg, angle) < 0.06
+        with (
+            pytest.raises(HardwareError, match=r"rotator|GRBL|ELL14") as raised,
+            closing(opened(kind, device)) as rotator,
+        ):
+            shoot_round(device, rotator, (10.0, 45.0, 90.0, 0.0, 45.0, 90.0))
         assert "\n" not in str(raised.value)
         assert isinstance(raised.value, Unplugged) == (fault == "unplug")
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_wrong_position_is_approached_once_more(kind: str, rotators: list[PolarizerRotator]) -> None:
-    with KINDS[kind](fault="wrong-position", at=4) as device:
-        rotators.append(open_rotator(f"{kind}:{device.port}?{QUICK}", Log(None)))
-        for angle in (10.0, 45.0, 90.0):
-            assert off(rotators[0].move(angle), angle) < 0.06
-            assert off(device.angle_deg, angle) < 0.06
+def test_a_wrong_position_is_approached_once_more(kind: str) -> None:
+    with KINDS[kind](fault="wrong-position", at=4) as device, closing(opened(kind, device)) as rotator:
+        shoot_round(device, rotator)
         assert device.moves >= 5
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_ring_turned_by_hand_or_a_lost_zero_is_homed_again(kind: str, tmp_path: Path) -> None:
+    with KINDS[kind]() as device, closing(opened(kind, device, log=Log(tmp_path / "rig.log"))) as rotator:
+        rotator.move(45)
+        if isinstance(device, Line):
+            device.homed = False
+        else:  # its counter starts again
+            device._zero_deg = device.angle_deg
+        shoot_round(device, rotator, (90.0,))
+    assert "homed again" in (tmp_path / "rig.log").read_text()
 
 
 class Recorder:
@@ -124,56 +112,34 @@ def driven(motor: Recorder, query: str) -> PolarizerRotator:
     return PolarizerRotator(motor, settings, Log(None))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_ring_turned_by_hand_or_a_lost_zero_is_homed_again(
-    kind: str, rotators: list[PolarizerRotator], tmp_path: Path
-) -> None:
-    log = Log(tmp_path / "rig.log")
-    with KINDS[kind]() as device:
-        rotators.append(open_rotator(f"{kind}:{device.port}?{QUICK}", log))
-        rotators[0].move(45)
-        if isinstance(device, Line):
-            device.homed = False
-        else:  # its counter starts again
-            device._zero_deg = device.angle_deg
-        assert off(rotators[0].move(90), 90) < 0.06
-        assert off(device.angle_deg, 90) < 0.06
-    log.close()
-    assert "homed again" in (tmp_path / "rig.log").read_text()
-
-
-def test_the_last_stretch_is_always_upwards() -> None:
+@pytest.mark.parametrize(
+    ("settings", "angles", "commands"),
+    [
+        ("backlash=2", (0, 45, 90, 30, 30), ["home", -2, 0, 45, 90, 28, 30, 30]),
+        ("backlash=2&reverse=1", (0, 45), ["home", -2, 0, -47, -45]),
+    ],
+)
+def test_every_angle_is_reached_upwards(settings: str, angles: tuple[float, ...], commands: list[object]) -> None:
     motor = Recorder()
-    rotator = driven(motor, "settle=0&backlash=2")
-    for angle in (0, 45, 90, 30, 30):
+    rotator = driven(motor, f"settle=0&{settings}")
+    for angle in angles:
         rotator.move(angle)
-    assert motor.commands == ["home", -2, 0, 45, 90, 28, 30, 30]
-
-
-def test_a_reversed_motor_comes_from_its_own_side() -> None:
-    motor = Recorder()
-    rotator = driven(motor, "settle=0&backlash=2&reverse=1")
-    for angle in (0, 45):
-        rotator.move(angle)
-    assert motor.commands == ["home", -2, 0, -47, -45]
+    assert motor.commands == commands
 
 
 @pytest.mark.parametrize(("error_deg", "reverse", "read"), [(0.2, 0, 45.2), (0.2, 1, 44.8), (-0.25, 0, 44.75)])
-def test_what_was_read_back_is_returned(error_deg: float, reverse: int, read: float) -> None:
+def test_the_angle_read_back_is_returned(error_deg: float, reverse: int, read: float) -> None:
     assert driven(Recorder(error_deg), f"settle=0&reverse={reverse}").move(45) == pytest.approx(read)
+    assert driven(Recorder(-1e-14), "settle=0").move(0) == 0.0  # not 360
 
 
-def test_just_below_zero_is_not_360() -> None:
-    assert driven(Recorder(-1e-14), "settle=0").move(0) == 0.0
-
-
-def test_beyond_the_tolerance_is_an_error_that_says_how_far() -> None:
+def test_beyond_the_tolerance_is_an_error_with_the_distance() -> None:
     with pytest.raises(HardwareError, match=r"\+0\.40° away from 45°, more than tolerance = 0\.3°"):
         driven(Recorder(0.4), "settle=0").move(45)
     assert driven(Recorder(0.4), "settle=0&tolerance=0.5").move(45) == pytest.approx(45.4)
 
 
-def test_stop_never_raises_and_the_ring_is_homed_again() -> None:
+def test_closing_never_raises_and_the_ring_is_homed_again() -> None:
     motor = Recorder()
     rotator = driven(motor, "settle=0")
     rotator.move(10)
@@ -199,7 +165,7 @@ def test_stop_never_raises_and_the_ring_is_homed_again() -> None:
         ("simulated:/dev/x", "no port"),
     ],
 )
-def test_a_wrong_url_says_what_is_right(url: str, words: str) -> None:
+def test_a_wrong_url_is_an_error_with_the_remedy(url: str, words: str) -> None:
     with pytest.raises(SettingError, match=words):
         open_rotator(url, Log(None))
 
@@ -214,7 +180,7 @@ def test_the_simulated_motor_needs_no_port() -> None:
     ("device", "name"),
     [(Elliptec(), "Elliptec ELL14 at address 0"), (Grbl(), "GRBL"), (Line(), "polcap-rotator simulated")],
 )
-def test_probe_names_what_answers_and_moves_nothing(device: Device, name: str) -> None:
+def test_probe_names_the_device_and_moves_nothing(device: Device, name: str) -> None:
     with device:
         assert probe(device.port) == name
         assert device.moves == 0

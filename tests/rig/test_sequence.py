@@ -3,8 +3,8 @@
 import shutil
 import signal
 import tomllib
-from collections import namedtuple
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -20,6 +20,7 @@ from polcap.rig.resume import complete_order
 from polcap.rig.shooting_plan import CaptureOrder
 from tests.rig import pool as pools
 from tests.rig.pool import BRACKET, Key, PoolCamera
+from tests.rig.test_retake_criteria import blur
 
 ORDER = msgspec.structs.replace(pools.ORDER, rotator="simulated")
 
@@ -27,12 +28,11 @@ ORDER = msgspec.structs.replace(pools.ORDER, rotator="simulated")
 class Turner:
     """A rotator that moves at once, to an angle that is wrong by `error_deg`."""
 
-    model, speed_deg_s, settle_s, by_hand = "turner", 100.0, 0.0, False
+    model, speed_deg_s, settle_s, by_hand, closed = "turner", 100.0, 0.0, False, False
 
     def __init__(self, error_deg: float = 0.0) -> None:
         self.error_deg = error_deg
         self.moves: list[float] = []
-        self.ended: list[str] = []
 
     def home(self) -> None: ...
 
@@ -41,7 +41,7 @@ class Turner:
         return (angle_deg + self.error_deg) % 360
 
     def close(self) -> None:
-        self.ended.append("close")
+        self.closed = True
 
 
 class Rig:
@@ -57,8 +57,14 @@ class Rig:
     def shoot(self, order: CaptureOrder = ORDER, resume: bool = False, **options: int) -> dict[str, Any]:
         return sequence.shoot(self.folder, order, resume=resume, report=self.messages.append, **options)
 
-    def again(self) -> dict[str, Any]:
-        self.camera, self.turner = PoolCamera(self.pool), Turner()
+    def stop_at(self, frame: int = 9) -> None:
+        """Begin the capture; the camera fails at a frame."""
+        self.camera = PoolCamera(self.pool, fault="disconnect", at=frame)
+        with pytest.raises(HardwareError, match="--resume continues"):
+            self.shoot()
+
+    def again(self, error_deg: float = 0.0) -> dict[str, Any]:
+        self.camera, self.turner = PoolCamera(self.pool), Turner(error_deg)
         return self.shoot(resume=True)
 
     @property
@@ -74,12 +80,10 @@ def rig(monkeypatch: pytest.MonkeyPatch, pool: dict[Key, bytes], tmp_path: Path)
 def test_every_angle_is_visited_once_and_the_capture_reads_as_ordered(rig: Rig) -> None:
     rig.turner.error_deg = -0.01
     done = rig.shoot()
-    assert rig.turner.moves == [0.0, 45.0, 90.0]
-    assert rig.turner.ended == ["close"] and rig.camera.closed
+    assert rig.turner.moves == [0.0, 45.0, 90.0] and rig.turner.closed and rig.camera.closed
     understood = captures.read(rig.folder)
     assert [shot.name for shot in understood.shots] == ["-0.01°", "44.99°", "89.99°", "44.99°"]
-    assert [len(shot.frames) for shot in understood.shots] == [3, 3, 3, 3]
-    assert [len(shot.ambient) for shot in understood.shots] == [1, 1, 1, 1]
+    assert [(len(shot.frames), len(shot.ambient)) for shot in understood.shots] == [(3, 1)] * 4
     assert done["frames"] == 15 and done["rejected"] == []
     assert done["angles"][1] == {"asked_deg": 45.0, "read_deg": 44.99, "stated_deg": 44.99}
     assert (rig.folder / "preview.png").exists()
@@ -87,26 +91,15 @@ def test_every_angle_is_visited_once_and_the_capture_reads_as_ordered(rig: Rig) 
     assert stated["rotator"] == {"model": "turner", "log": "rig.log"}
 
 
-def test_a_bad_frame_is_taken_again_at_once_and_kept_aside(rig: Rig) -> None:
-    rig.camera = PoolCamera(rig.pool, fault="corrupt", at=5)
-    done = rig.shoot()
-    assert len(rig.taken) == 16 and done["frames"] == 15
-    (bad,) = done["rejected"]
-    assert bad["slot"] == "ambient/pol000" or bad["slot"].startswith("pol")
-    assert (rig.folder / bad["file"]).stat().st_size > 0
-
-
-def test_a_person_at_the_ring_is_not_sent_back(rig: Rig) -> None:
+def test_a_bad_frame_is_moved_to_rejected_and_taken_again_before_a_person_turns_the_ring(rig: Rig) -> None:
     rig.camera, rig.turner.by_hand = PoolCamera(rig.pool, fault="corrupt", at=4), True  # the last at 0°
-    rig.shoot()
-    assert rig.turner.moves == [0.0, 45.0, 90.0] and len(rig.taken) == 16
+    done = rig.shoot()
+    assert rig.turner.moves == [0.0, 45.0, 90.0] and len(rig.taken) == 16 and done["frames"] == 15
+    (bad,) = done["rejected"]
+    assert bad["slot"] == "ambient/pol000" and (rig.folder / bad["file"]).stat().st_size > 0
 
 
-def test_a_person_is_asked_for_what_no_device_can(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-    monkeypatch.setattr("polcap.rig.person.ask", lambda question, log: asked.append(question))
-    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
-
+def test_a_person_is_asked_for_everything_that_no_device_can_do(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     class Plain(PoolCamera):
         switches_flash = polarizes_flash = False
 
@@ -117,103 +110,90 @@ def test_a_person_is_asked_for_what_no_device_can(rig: Rig, monkeypatch: pytest.
                 super().prepare(angle_deg, role, step)
 
     rig.camera = Plain(rig.pool)
-    rig.shoot(msgspec.structs.replace(ORDER, chart=True))
-    assert [question.partition(",")[0] for question in asked] == [
-        "put the chart in the place of the object",
-        "remove the chart",
-        "switch the flash off",
-        "switch the flash on again",
-    ]
+    order = msgspec.structs.replace(ORDER, chart=True)
+    with pytest.raises(SettingError, match="a person at a terminal is needed"):
+        rig.shoot(order)
+    assert rig.taken == [] and [path.name for path in rig.folder.iterdir() if not path.name.startswith(".")] == []
+    asked: list[str] = []
+    monkeypatch.setattr("polcap.rig.person.ask", lambda question, log: asked.append(question.partition(",")[0]))
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    rig.shoot(order)
+    flash = ["switch the flash off", "switch the flash on again"]
+    assert asked == ["put the chart in the place of the object", "remove the chart", *flash]
     understood = captures.read(rig.folder)
     assert len(understood.chart_frames) == 1 and {len(shot.ambient) for shot in understood.shots} == {1}
 
 
-class Stubborn(PoolCamera):
-    """Underexposes one slot for ever."""
+class Faulty(PoolCamera):
+    """Returns another photograph for one slot, always or `times` times, and may report another exposure."""
+
+    def __init__(
+        self, pool: dict[Key, bytes], slot: Key, other: bytes, times: int = 99, exposure: Exposure | None = None
+    ) -> None:
+        super().__init__(pool)
+        self.slot, self.other, self.times, self.exposure = slot, other, times, exposure
 
     def shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
         shot = super().shoot(exposure, flash)
-        if self._key == ("shot", 45.0, 2):
-            shot = CameraFile(self.pool["shot", 135.0, 1], shot.name, exposure)
-        return shot
+        if self._key != self.slot or self.times == 0:
+            return shot
+        self.times -= 1
+        return CameraFile(self.other, shot.name, self.exposure or exposure)
 
 
 def test_a_frame_that_stays_bad_ends_the_run_with_its_reason(rig: Rig) -> None:
-    rig.camera = Stubborn(rig.pool)
-    with pytest.raises(
-        CaptureError, match=r"pol045/frame_3 .*exposure time.* \(1 times\); the frames so far are saved"
-    ):
+    rig.camera = Faulty(rig.pool, ("shot", 45.0, 2), rig.pool["shot", 135.0, 1])  # underexposed
+    words = r"pol045/frame_3 .*exposure time.* \(1 times\); the frames so far are saved"
+    with pytest.raises(CaptureError, match=words):
         rig.shoot(tries=0)
-    assert rig.turner.ended == ["close"]
+    assert rig.turner.closed
     rig.again()
     assert ("shot", 45.0, 2) in rig.taken
 
 
-class Shaken(PoolCamera):
-    """Its first frame of the middle exposure is blurred."""
-
-    def shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
-        shot = super().shoot(exposure, flash)
-        first = self._key == ("shot", 0.0, 1) and len(self.delivered) < 5
-        return CameraFile(self.pool["blurred", 0.0, 1], shot.name, exposure) if first else shot
-
-
-def test_an_early_frame_is_judged_by_its_later_neighbours(rig: Rig, tmp_path: Path) -> None:
-    from tests.rig.test_retake_criteria import blur
-
+def test_an_early_frame_is_judged_by_its_later_neighbors(rig: Rig, tmp_path: Path) -> None:
     (tmp_path / "sharp.dng").write_bytes(rig.pool["shot", 0.0, 1])
     blur(tmp_path / "sharp.dng", tmp_path / "blurred.dng", 2.0)
-    blurred = {("blurred", 0.0, 1): (tmp_path / "blurred.dng").read_bytes()}
-    rig.camera = Shaken({**rig.pool, **blurred})
+    rig.camera = Faulty(rig.pool, ("shot", 0.0, 1), (tmp_path / "blurred.dng").read_bytes(), times=1)
     done = rig.shoot(msgspec.structs.replace(ORDER, repeat_deg=(), ambient=False))
     (bad,) = done["rejected"]
     assert bad["slot"] == "pol000/frame_2" and "less sharp" in bad["reason"]
     assert rig.taken.count(("shot", 0.0, 1)) == 2 and rig.turner.moves.count(0.0) == 2
 
 
-def _stopped(rig: Rig, at: int = 9) -> None:
-    rig.camera = PoolCamera(rig.pool, fault="disconnect", at=at)
-    with pytest.raises(HardwareError, match="--resume continues"):
+def test_dials_that_set_two_frames_to_one_exposure_end_the_run(rig: Rig) -> None:
+    rig.camera = Faulty(rig.pool, ("shot", 0.0, 2), rig.pool["shot", 0.0, 1], exposure=BRACKET[1])
+    with pytest.raises(SettingError, match="give exposures that differ more"):
         rig.shoot()
 
 
-def test_resume_takes_what_is_missing_and_nothing_else(rig: Rig) -> None:
-    _stopped(rig)
+def test_resume_takes_only_missing_frames(rig: Rig) -> None:
+    rig.stop_at(9)
     assert len(tomllib.loads((rig.folder / "capture.toml").read_text())["frame"]) == 8
     rig.again()
     assert len(rig.taken) == 7
-
-
-def test_resume_of_a_finished_capture_touches_no_device(rig: Rig) -> None:
-    rig.shoot()
     rig.again()
     assert rig.taken == [] and rig.turner.moves == []
 
 
-def test_a_frame_that_changed_meanwhile_is_put_aside_and_taken_again(rig: Rig) -> None:
-    _stopped(rig)
+def test_resume_rejects_changed_and_unchecked_files_and_takes_them_again(rig: Rig) -> None:
+    rig.stop_at()
     (rig.folder / "pol000/frame_2.dng").write_bytes(b"overwritten")
     (rig.folder / "pol000/frame_3.dng").unlink()
-    rig.again()
-    assert {("shot", 0.0, 1), ("shot", 0.0, 2)} <= set(rig.taken)
-    assert (rig.folder / "rejected/pol000_frame_2.try1.dng").read_bytes() == b"overwritten"
-    assert any("frame_3.dng: the file is missing" in line for line in rig.messages)
-
-
-def test_a_file_that_was_never_checked_is_put_aside(rig: Rig) -> None:
-    _stopped(rig)
     (rig.folder / "pol090").mkdir(exist_ok=True)
-    (rig.folder / "pol090/frame_3.dng").write_bytes(b"landed, not judged")
+    (rig.folder / "pol090/frame_3.dng").write_bytes(b"saved, not judged")
     (rig.folder / "pol090/.frame_1.7.part.dng").write_bytes(b"half")
     rig.again()
+    assert {("shot", 0.0, 1), ("shot", 0.0, 2), ("shot", 90.0, 2)} <= set(rig.taken)
+    assert (rig.folder / "rejected/pol000_frame_2.try1.dng").read_bytes() == b"overwritten"
     assert (rig.folder / "rejected/pol090_frame_3.try1.dng").exists()
+    assert any("frame_3.dng: the file is missing" in line for line in rig.messages)
     assert not list(rig.folder.rglob(".*.part*"))
 
 
-def test_a_bracket_is_of_one_angle_even_if_the_ring_comes_back_elsewhere(rig: Rig) -> None:
-    _stopped(rig, at=7)  # in the middle of 45°
-    rig.camera, rig.turner = PoolCamera(rig.pool), Turner(error_deg=0.25)
-    rig.shoot(resume=True)
+def test_a_bracket_has_one_angle_even_if_the_ring_returns_to_another(rig: Rig) -> None:
+    rig.stop_at(7)  # in the middle of 45°
+    rig.again(error_deg=0.25)
     content = capture_record.load(rig.folder)
     assert content is not None
     for angle in (45.0, 90.0):
@@ -223,7 +203,7 @@ def test_a_bracket_is_of_one_angle_even_if_the_ring_comes_back_elsewhere(rig: Ri
 
 
 @pytest.mark.parametrize(
-    ("changes", "flag"),
+    ("changes", "option"),
     [
         ({"angles_deg": (0.0, 60.0, 120.0), "repeat_deg": ()}, "--angles; leave it out"),
         ({"bracket": BRACKET[:2]}, "--bracket"),
@@ -231,19 +211,21 @@ def test_a_bracket_is_of_one_angle_even_if_the_ring_comes_back_elsewhere(rig: Ri
         ({"rotator": "simulated?offset=3"}, "--rotator"),
     ],
 )
-def test_resume_with_other_settings_is_one_line(rig: Rig, changes: dict[str, object], flag: str) -> None:
-    _stopped(rig)
-    with pytest.raises(CaptureError, match=f"begun with another {flag}"):
+def test_resume_with_other_options_is_one_line(rig: Rig, changes: dict[str, object], option: str) -> None:
+    rig.stop_at()
+    with pytest.raises(CaptureError, match=f"begun with another {option}"):
         rig.shoot(msgspec.structs.replace(ORDER, **changes), resume=True)
 
 
-def test_resume_without_settings_has_those_it_was_begun_with(rig: Rig) -> None:
-    _stopped(rig)
+def test_resume_takes_the_options_of_the_begun_capture(rig: Rig) -> None:
+    rig.stop_at()
     assert complete_order(rig.folder, {"angles_deg": None, "camera": None}, resume=True) == ORDER
     with pytest.raises(SettingError, match="--rotator is missing"):
         complete_order(rig.folder, {"camera": "simulated"}, resume=False)
     with pytest.raises(SettingError, match="nothing to resume"):
         complete_order(rig.folder / "other", {}, resume=True)
+    with pytest.raises(CaptureError, match="continue with --resume"):
+        rig.shoot()
 
 
 def test_the_port_may_be_another_after_the_cable_was_plugged_in_again(rig: Rig) -> None:
@@ -254,36 +236,25 @@ def test_the_port_may_be_another_after_the_cable_was_plugged_in_again(rig: Rig) 
     rig.shoot(new, resume=True)
 
 
-def test_a_folder_in_use_is_left_alone(rig: Rig) -> None:
+def test_a_folder_with_other_files_or_of_another_run_is_refused(rig: Rig) -> None:
     rig.folder.mkdir()
+    with sequence._locked(rig.folder), pytest.raises(StorageError, match="another polcap"):
+        rig.shoot()
     (rig.folder / "holiday.jpg").write_text("mine")
     with pytest.raises(CaptureError, match=r"is not empty \(holiday.jpg\)"):
         rig.shoot()
-    assert [file.name for file in rig.folder.iterdir()] == ["holiday.jpg"]
+    assert [file.name for file in rig.folder.iterdir() if file.name != ".lock"] == ["holiday.jpg"]
 
 
-def test_a_begun_capture_asks_for_resume(rig: Rig) -> None:
-    _stopped(rig)
-    with pytest.raises(CaptureError, match="continue with --resume"):
-        rig.shoot()
-
-
-def test_a_disk_too_small_is_told_before_the_first_frame(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**9, 10**9, 10**6))
+def test_a_small_disk_is_an_error_before_the_first_frame(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=10**6))
     with pytest.raises(StorageError, match="1 MB are free, and the frames need about 2 MB"):
         rig.shoot()
     assert rig.taken == []
 
 
-def test_two_polcaps_do_not_share_a_folder(rig: Rig) -> None:
-    rig.folder.mkdir()
-    with sequence._locked(rig.folder), pytest.raises(StorageError, match="another polcap"):
-        rig.shoot()
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_whatever_ends_a_run_the_motor_stops(rig: Rig, number: int) -> None:
+def test_a_signal_stops_the_motor_and_saves_the_frames(rig: Rig, number: int) -> None:
     class Ended(PoolCamera):
         def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:
             super().prepare(angle_deg, role, step)
@@ -293,22 +264,5 @@ def test_whatever_ends_a_run_the_motor_stops(rig: Rig, number: int) -> None:
     rig.camera = Ended(rig.pool)
     with pytest.raises(KeyboardInterrupt):
         rig.shoot()
-    assert rig.turner.ended == ["close"] and rig.camera.closed
-    assert len(tomllib.loads((rig.folder / "capture.toml").read_text())["frame"]) == 4  # saved on the way out
-
-
-def test_dials_that_cannot_tell_two_exposures_apart_end_the_run(rig: Rig) -> None:
-    class Coarse(PoolCamera):
-        def shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
-            shot = super().shoot(exposure, flash)
-            return CameraFile(self.pool["shot", 0.0, 1], shot.name, BRACKET[1]) if self._key[2] else shot
-
-    rig.camera = Coarse(rig.pool)
-    with pytest.raises(SettingError, match="give exposures that differ more"):
-        rig.shoot()
-
-
-def test_what_needs_a_person_is_refused_where_there_is_none(rig: Rig) -> None:
-    with pytest.raises(SettingError, match="a person at a terminal is needed"):
-        rig.shoot(msgspec.structs.replace(ORDER, chart=True))
-    assert rig.taken == [] and [path.name for path in rig.folder.iterdir() if not path.name.startswith(".")] == []
+    assert rig.turner.closed and rig.camera.closed
+    assert len(tomllib.loads((rig.folder / "capture.toml").read_text())["frame"]) == 4

@@ -16,7 +16,7 @@ Positive = Annotated[float, Meta(gt=0)]
 
 
 class FrameEntry(Struct, frozen=True, forbid_unknown_fields=True):
-    """One photograph: its file, relative to the folder, and what it is."""
+    """One photograph: its file, relative to the folder, and its role."""
 
     file: str
     angle: Annotated[float, Meta(ge=-360, le=360)] | None = None  # degrees; of shots and repeats
@@ -42,7 +42,7 @@ class CaptureFile(Struct, frozen=True, forbid_unknown_fields=True):
     encoding: Literal["linear", "srgb"] | None = None  # of finished pictures; by default 8 bits are sRGB
     white: Positive | None = None  # stored value at which linear pictures saturate; by default the type's largest
     black: Annotated[float, Meta(ge=0)] = 0.0  # stored value of darkness, linear pictures
-    filter: str | None = None  # the polarizer's name, as given to `polcap calibrate --filter`
+    filter: str | None = None  # the polarizer's name, as in `polcap calibrate --filter`
     rotator: Rotator | None = None
     frame: tuple[FrameEntry, ...] = ()
 

@@ -8,7 +8,7 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -26,8 +26,7 @@ from polcap.images import Role
 DEFAULT_DEG = (0.0, 45.0, 90.0)
 SEPARATION_DEG = 5.0  # closer angles count as one
 EQUAL_STOPS = 0.15  # EXIF rounds exposure times to a sixth of a stop at most
-_POL_FOLDER = re.compile(r"pol[ _-]?(\d+(?:\.\d+)?)", re.IGNORECASE)
-_CROSS_FOLDER = re.compile(r"cross(?:[ _-]?(\d+(?:\.\d+)?))?", re.IGNORECASE)
+_FOLDER = re.compile(r"pol[ _-]?(?P<pol>\d+(?:\.\d+)?)|cross(?:[ _-]?(?P<cross>\d+(?:\.\d+)?))?", re.IGNORECASE)
 _AT_ONCE = 2  # files read in parallel: as many child processes as decode them later
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
@@ -44,56 +43,65 @@ class Source:
     flash_energy: float | None = None  # stated
 
 
+Shots = tuple[tuple[float, tuple[Source, ...]], ...]  # degrees, bracket; in the order of the capture
+_Order = Sequence[float] | None  # of the angles, degrees; None: as found
+
+
 @dataclass(frozen=True)
 class Plan:
     """The shots of a capture, and its other photographs."""
 
     layout: Literal["folders", "toml", "flat", "sensor"]
-    shots: tuple[tuple[float, tuple[Source, ...]], ...]  # degrees, bracket; in the order of the capture
+    shots: Shots
     others: tuple[Source, ...] = ()  # ambient, chart, cross
     notes: tuple[str, ...] = ()
 
 
-@dataclass
-class _Listing:
-    pictures: list[Source] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-
-
-def plan(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None) -> Plan:
+def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
     """Plan the shots of a folder with its capture.toml.
 
     `angles_deg` is the order of a flat folder; where folders, names or capture.toml state the angles, it picks from
     them, the first being the reference.
 
-    Raises
-    ------
-    CaptureError
-        The folder and its names do not form a capture.
+    Raises CaptureError: the folder and its names do not form a capture.
     """
     if stated.frame:
         return _toml(folder, stated, angles_deg)
-    sub_folders = _pol_folders(folder)
+    sub_folders, crossed = _angle_folders(folder)
     if sub_folders:
-        return _folders(folder, sub_folders, angles_deg)
-    listing = _list(folder)
-    if not listing.pictures:
-        inside = [path for path in children(folder) if path.is_dir()]
-        named = f"{', '.join(path.name for path in inside[:4])}{', …' if len(inside) > 4 else ''}"
-        hint = "; give the folder that holds the photographs"
-        if any(_pol_folders(path) for path in inside):
-            hint = f"; its sub-folders {named} hold captures: give one of them, or run `polcap batch` on the folder"
-        elif (folder / "report.json").is_file() and (folder / "maps").is_dir():
-            hint = "; it is a result of polcap: give the folder of the photographs"
-        elif inside:
-            hint = f"; its sub-folders are {named}, but polcap looks for pol000, pol045, …"
-        raise CaptureError(f"{folder}: holds no photograph that polcap reads{hint}")
-    if stated.sensor or _is_sensor(listing.pictures, angles_deg):
-        return _sensor(listing, angles_deg)
+        return _folders(folder, sub_folders, crossed, angles_deg)
+    pictures, notes = _list(folder)
+    if not pictures:
+        raise CaptureError(f"{folder}: holds no photograph that polcap reads; {_hint(folder)}")
+    if stated.sensor or _is_sensor(pictures, angles_deg):
+        notes.append("frames taken as a polarization sensor's, 90 45 / 135 0")
+        return Plan("sensor", _sensor_shots(pictures, angles_deg), notes=tuple(notes))
     whole = Path(os.path.abspath(folder))
-    if is_angle_folder(whole.name) and len(_pol_folders(whole.parent)) > 1:
+    if is_angle_folder(whole.name) and len(_angle_folders(whole.parent)[0]) > 1:
         raise CaptureError(f"{folder}: holds one angle of a capture; give the folder of all, {whole.parent}")
-    return _named(folder, listing, angles_deg) or _by_time(folder, listing, angles_deg or DEFAULT_DEG)
+    groups = _by_name(pictures)
+    if groups:
+        notes.append("angles read from the file names")
+        return Plan("flat", _select(folder, groups, angles_deg), notes=tuple(notes))
+    shots, note = _by_time(folder, pictures, angles_deg or DEFAULT_DEG)
+    return Plan("flat", shots, notes=(*notes, note))
+
+
+def _hint(folder: Path) -> str:
+    """The likely mistake of a user who gave a folder without photographs."""
+    inside = [path for path in children(folder) if path.is_dir()]
+    named = _listed([path.name for path in inside])
+    if any(_angle_folders(path)[0] for path in inside):
+        return f"its sub-folders {named} hold captures: give one of them, or run `polcap batch` on the folder"
+    if (folder / "report.json").is_file() and (folder / "maps").is_dir():
+        return "it is a result of polcap: give the folder of the photographs"
+    if inside:
+        return f"its sub-folders are {named}, but polcap looks for pol000, pol045, …"
+    return "give the folder that holds the photographs"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return f"{', '.join(names[:4])}{', …' if len(names) > 4 else ''}"
 
 
 def looks_like_a_capture(folder: Path, inside: Iterable[str], files: Iterable[str]) -> bool:
@@ -101,14 +109,14 @@ def looks_like_a_capture(folder: Path, inside: Iterable[str], files: Iterable[st
 
     Photographs in a folder that has sub-folders are taken for notes, unless there is a capture.toml.
     """
-    if capture_toml.NAME in files or any(_POL_FOLDER.fullmatch(name) for name in inside):
+    if capture_toml.NAME in files or any((match := _FOLDER.fullmatch(name)) and match["pol"] for name in inside):
         return True
     if any(name not in OURS and not name.startswith(".") for name in inside):
         return False
     return any(probe.kind(folder / name) in ("raw", "photo") for name in sorted(files) if not name.startswith("."))
 
 
-def _toml(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None) -> Plan:
+def _toml(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
     sources = []
     for entry in stated.frame:
         path = folder / entry.file
@@ -126,15 +134,14 @@ def _toml(folder: Path, stated: CaptureFile, angles_deg: Sequence[float] | None)
     others = tuple(source for source in sources if source.role not in ("shot", "repeat"))
     if stated.sensor:
         return Plan("sensor", _sensor_shots(shots, angles_deg), others)
-    repeats = [source for source in sources if source.role == "repeat"]
     brackets = _select(folder, _group(shots), angles_deg)
-    repeated = [(angle, tuple(bracket)) for angle, bracket in _group(repeats).items() if _near(angle, dict(brackets))]
+    repeats = _group(source for source in sources if source.role == "repeat")
+    repeated = [
+        (angle, tuple(bracket))
+        for angle, bracket in repeats.items()  # a motor repeats an angle within its tolerance
+        if any(abs((angle - known + 90) % 180 - 90) < SEPARATION_DEG for known, _ in brackets)
+    ]
     return Plan("toml", (*brackets, *repeated), others)
-
-
-def _near(angle_deg: float, known_deg: Iterable[float]) -> bool:
-    """Whether an angle equals a known one but for a motor's tolerance."""
-    return any(abs((angle_deg - known + 90) % 180 - 90) < SEPARATION_DEG for known in known_deg)
 
 
 def _group(sources: Iterable[Source]) -> dict[float, list[Source]]:
@@ -145,57 +152,34 @@ def _group(sources: Iterable[Source]) -> dict[float, list[Source]]:
     return groups
 
 
-def _folders(folder: Path, sub_folders: dict[float, Path], angles_deg: Sequence[float] | None) -> Plan:
+def _folders(folder: Path, sub_folders: dict[float, Path], crossed: Path | None, angles_deg: _Order) -> Plan:
     groups: dict[float, list[Source]] = {}
     notes = []
     for angle, sub_folder in sub_folders.items():
-        listing = _list(sub_folder)
-        if not listing.pictures:
-            raise CaptureError(
-                f"{sub_folder}: holds no photograph that polcap reads; shoot this angle again, or remove the folder"
-            )
-        groups[angle] = listing.pictures
-        notes += [f"{sub_folder.name}: {note}" for note in listing.notes]
-    crossed = _crossed(folder)
-    unused = sorted(
-        path.name
-        for path in children(folder)
-        if path.is_dir() and path not in sub_folders.values() and path.name not in OURS and not _is_crossed(path.name)
-    )
+        groups[angle], found = _list(sub_folder, "shoot this angle again, or remove the folder")
+        notes += [f"{sub_folder.name}: {note}" for note in found]
+    others: tuple[Source, ...] = ()
+    if crossed is not None:
+        text = _number_in(crossed.name)
+        angle_deg = float(text) if text else None
+        pictures, _ = _list(crossed, "shoot it again, or remove the folder")
+        others = tuple(replace(source, role="cross", angle_deg=angle_deg) for source in pictures)
+    inside = children(folder)
+    unused = [path.name for path in inside if path.is_dir() and not is_angle_folder(path.name)]
+    unused = [name for name in unused if name not in OURS]
     notes += [f"not used: the folders {', '.join(unused)}"] if unused else []
-    loose = sorted(path.name for path in children(folder) if path.is_file() and path.name != capture_toml.NAME)
-    notes += [f"not used: the files {', '.join(loose[:4])}{', …' if len(loose) > 4 else ''}"] if loose else []
-    return Plan("folders", _select(folder, groups, angles_deg), crossed, tuple(notes))
+    loose = [path.name for path in inside if path.is_file() and path.name != capture_toml.NAME]
+    notes += [f"not used: the files {_listed(loose)}"] if loose else []
+    return Plan("folders", _select(folder, groups, angles_deg), others, tuple(notes))
 
 
 def numbered(folder: Path) -> list[str]:
-    """Sub-folders whose names hold a number but are not read as an angle: 045, angle45."""
+    """Sub-folders with a number in their names that are not read as an angle: 045, angle45."""
     return [
         path.name
         for path in children(folder)
         if path.is_dir() and not is_angle_folder(path.name) and path.name not in OURS and _NUMBER.search(path.name)
     ]
-
-
-def _crossed(folder: Path) -> tuple[Source, ...]:
-    """The photographs of cross/ or cross045/, whose number is the angle of the filter before the lens."""
-    places = [path for path in children(folder) if path.is_dir() and _is_crossed(path.name)]
-    if len(places) > 1:
-        raise CaptureError(f"{places[1]}: {places[0].name} holds a cross-polarized shot too; remove one of the two")
-    if not places:
-        return ()
-    match = _CROSS_FOLDER.fullmatch(places[0].name)
-    angle = float(match[1]) if match and match[1] else None
-    if angle is not None and angle > 360:
-        raise CaptureError(f"{places[0]}: {angle:g}° is not an angle of a polarizer; name it by 0 to 360 degrees")
-    found = tuple(replace(source, role="cross", angle_deg=angle) for source in _list(places[0]).pictures)
-    if not found:
-        raise CaptureError(f"{places[0]}: holds no photograph that polcap reads; shoot it again, or remove the folder")
-    return found
-
-
-def _is_crossed(name: str) -> bool:
-    return _CROSS_FOLDER.fullmatch(name) is not None
 
 
 def degrees(angle_deg: float) -> str:
@@ -206,71 +190,65 @@ def degrees(angle_deg: float) -> str:
 
 def is_angle_folder(name: str) -> bool:
     """Whether a folder of this name inside a capture holds the shots of one angle, or the crossed one."""
-    return _POL_FOLDER.fullmatch(name) is not None or _is_crossed(name)
+    return _FOLDER.fullmatch(name) is not None
 
 
-def _pol_folders(folder: Path) -> dict[float, Path]:
+def _number_in(name: str) -> str | None:
+    match = _FOLDER.fullmatch(name)
+    return match and (match["pol"] or match["cross"])
+
+
+def _angle_folders(folder: Path) -> tuple[dict[float, Path], Path | None]:
+    """The folders pol000, pol045, … by angle [degrees], and cross or cross045, the angle of the lens's filter."""
     found: dict[float, Path] = {}
+    crossed: Path | None = None
     for path in children(folder):
-        match = _POL_FOLDER.fullmatch(path.name) if path.is_dir() else None
-        if match:
-            angle = float(match[1])
-            if angle > 360:
-                raise CaptureError(f"{path}: {angle:g}° is not an angle of a polarizer; name it by 0 to 360 degrees")
-            if angle in found:
-                raise CaptureError(f"{path}: {angle:g}° is also in {found[angle].name}; remove one of the two folders")
+        if not path.is_dir() or not is_angle_folder(path.name):
+            continue
+        angle = float(_number_in(path.name) or 0)
+        if angle > 360:
+            raise CaptureError(f"{path}: {angle:g}° is not an angle of a polarizer; name it by 0 to 360 degrees")
+        if path.name.lower().startswith("cross"):
+            if crossed is not None:
+                raise CaptureError(f"{path}: {crossed.name} holds a cross-polarized shot too; remove one of the two")
+            crossed = path
+        elif angle in found:
+            raise CaptureError(f"{path}: {angle:g}° is also in {found[angle].name}; remove one of the two folders")
+        else:
             found[angle] = path
-    return dict(sorted(found.items()))
+    return dict(sorted(found.items())), crossed
 
 
-def _is_sensor(pictures: list[Source], angles_deg: Sequence[float] | None) -> bool:
+def _is_sensor(pictures: list[Source], angles_deg: _Order) -> bool:
     """One or two grey pictures: three angles can only be a polarization sensor's."""
-    return len(pictures) <= 2 and not angles_deg and all(_is_grey(source) for source in pictures)
+    grey = [source.probe.kind == "photo" and source.probe.channels == 1 for source in pictures]
+    return len(grey) <= 2 and not angles_deg and all(grey)
 
 
-def _is_grey(source: Source) -> bool:
-    return source.probe.kind == "photo" and source.probe.channels == 1
-
-
-def _sensor(listing: _Listing, angles_deg: Sequence[float] | None) -> Plan:
-    shots = _sensor_shots(listing.pictures, angles_deg)
-    return Plan("sensor", shots, notes=(*listing.notes, "frames taken as a polarization sensor's, 90 45 / 135 0"))
-
-
-def _sensor_shots(
-    sources: Sequence[Source], angles_deg: Sequence[float] | None
-) -> tuple[tuple[float, tuple[Source, ...]], ...]:
+def _sensor_shots(sources: Sequence[Source], angles_deg: _Order) -> Shots:
     groups = {angle: list(sources) for angle, _ in photo.SENSOR_DEG}
     return _select(sources[0].path.parent, groups, angles_deg) if sources else ()
 
 
-def _named(folder: Path, listing: _Listing, angles_deg: Sequence[float] | None) -> Plan | None:
-    """Finished pictures whose names differ in one number that can only be an angle."""
-    pictures = listing.pictures
-    if any(source.probe.kind == "raw" for source in pictures):  # a camera's file numbers
-        return None
+def _by_name(pictures: list[Source]) -> dict[float, list[Source]]:
+    """Finished pictures by the angle in their names; empty unless one number differs that can be an angle."""
     stems = [source.path.stem for source in pictures]
-    if len({_NUMBER.sub("#", stem) for stem in stems}) != 1:
-        return None
+    raw = any(source.probe.kind == "raw" for source in pictures)  # numbers of a camera's counter
+    if raw or len({_NUMBER.sub("#", stem) for stem in stems}) != 1:
+        return {}
     columns = [column for column in zip(*(_NUMBER.findall(stem) for stem in stems)) if len(set(column)) > 1]
     if len(columns) != 1 or any(len(text.partition(".")[0]) > 3 for text in columns[0]):
-        return None
-    angles = [float(text) for text in columns[0]]
-    if max(angles) >= 180 or len(set(angles)) < len(angles) or different(angles) < max(3, len(angles)):
-        return None
-    groups = {angle: [source] for angle, source in sorted(zip(angles, pictures), key=lambda pair: pair[0])}
-    notes = (*listing.notes, "angles read from the file names")
-    return Plan("flat", _select(folder, groups, angles_deg), notes=notes)
+        return {}
+    groups = {float(text): [source] for text, source in zip(columns[0], pictures)}
+    if max(groups) >= 180 or different(groups) < max(3, len(pictures)):
+        return {}
+    return dict(sorted(groups.items()))
 
 
-def _by_time(folder: Path, listing: _Listing, angles_deg: Sequence[float]) -> Plan:
-    """K equal brackets one after the other."""
-    facts = {source.path: source.probe.exif for source in listing.pictures}
-    timed = all(fact.taken for fact in facts.values())
-    order = sorted(
-        listing.pictures,
-        key=lambda source: (facts[source.path].taken if timed else "", natural(source.path.name)),
-    )
+def _by_time(folder: Path, pictures: list[Source], angles_deg: Sequence[float]) -> tuple[Shots, str]:
+    """K equal brackets one after the other, and a note on their order."""
+    timed = all(source.probe.exif.taken for source in pictures)
+    order = sorted(pictures, key=lambda one: (one.probe.exif.taken if timed else "", natural(one.path.name)))
     count, shots = len(order), len(angles_deg)
     by = "by their EXIF times" if timed else "by name"
     listed = ", ".join(f"{angle:g}" for angle in angles_deg)
@@ -281,19 +259,16 @@ def _by_time(folder: Path, listing: _Listing, angles_deg: Sequence[float]) -> Pl
     size = count // shots
     if not timed and size > 1:
         raise CaptureError(f"{folder}: {count} frames without EXIF times cannot be assigned to angles; {sort}")
-    brackets = [order[at : at + size] for at in range(0, count, size)]
-    first = [facts[source.path].relative_exposure for source in brackets[0]]
-    for angle, bracket in zip(angles_deg, brackets):
-        for source, reference in zip(bracket, first):
-            value = facts[source.path].relative_exposure
-            if not equal(value, reference):
-                raise CaptureError(
-                    f"{source.path}: its exposure is {_times(value, reference)} that of the same frame of the first "
-                    f"bracket; these {count} frames {by} are not {shots} equal brackets ({angle:g}°); {remedy}"
-                )
+    for at, source in enumerate(order):
+        value, reference = source.probe.exif.relative_exposure, order[at % size].probe.exif.relative_exposure
+        if not equal(value, reference):
+            times = f"{value / reference:.3g} times" if value and reference else "not stated like"
+            raise CaptureError(
+                f"{source.path}: its exposure is {times} that of the same frame of the first bracket; these {count} "
+                f"frames {by} are not {shots} equal brackets ({angles_deg[at // size]:g}°); {remedy}"
+            )
     note = f"{count} frames {by} taken as {shots} brackets of {size}, in the order {listed}°"
-    shots_ = tuple((angle, tuple(bracket)) for angle, bracket in zip(angles_deg, brackets))
-    return Plan("flat", shots_, notes=(*listing.notes, note))
+    return tuple((angle, tuple(order[k * size : (k + 1) * size])) for k, angle in enumerate(angles_deg)), note
 
 
 def equal(value: float | None, reference: float | None) -> bool:
@@ -303,13 +278,7 @@ def equal(value: float | None, reference: float | None) -> bool:
     return max(value / reference, reference / value) < 2**EQUAL_STOPS
 
 
-def _times(value: float | None, reference: float | None) -> str:
-    return f"{value / reference:.3g} times" if value and reference else "not stated like"
-
-
-def _select(
-    folder: Path, groups: dict[float, list[Source]], angles_deg: Sequence[float] | None
-) -> tuple[tuple[float, tuple[Source, ...]], ...]:
+def _select(folder: Path, groups: dict[float, list[Source]], angles_deg: _Order) -> Shots:
     wanted = list(groups) if angles_deg is None else list(angles_deg)
     for angle in wanted:
         if angle not in groups:
@@ -325,24 +294,27 @@ def different(angles_deg: Iterable[float]) -> int:
     return max(sum(gap >= SEPARATION_DEG for gap in gaps), 1 if axes else 0)
 
 
-def _list(folder: Path) -> _Listing:
-    """The photographs of one folder; finished pictures are left out where there is a RAW."""
-    listing = _Listing()
+def _list(folder: Path, remedy: str = "") -> tuple[list[Source], list[str]]:
+    """The photographs of one folder, and notes; finished pictures are left out where there is a RAW.
+
+    With a `remedy`, a folder without photographs is a CaptureError.
+    """
     files = [path for path in children(folder) if path.is_file()]
     probes = parallel.results([partial(_probe, path) for path in files], min(_AT_ONCE, parallel.threads()))
     found = list(map(Source, files, probes))
-    pictures = [source for source in found if source.probe.kind in ("raw", "photo")]
-    raws = [source for source in pictures if source.probe.kind == "raw"]
-    if raws and len(raws) < len(pictures):
+    raws = [source for source in found if source.probe.kind == "raw"]
+    extra = [source for source in found if source.probe.kind == "photo"]
+    if remedy and not raws and not extra:
+        raise CaptureError(f"{folder}: holds no photograph that polcap reads; {remedy}")
+    notes = []
+    if raws and extra:
         stems = {source.path.stem.lower() for source in raws}
-        extra = [source.path for source in pictures if source.probe.kind == "photo"]
-        paired = sum(path.stem.lower() in stems for path in extra)
+        paired = sum(source.path.stem.lower() in stems for source in extra)
         if paired:
-            listing.notes.append(f"{paired} pictures have a RAW of the same name: the RAW is used")
+            notes.append(f"{paired} pictures have a RAW of the same name: the RAW is used")
         if paired < len(extra):
-            listing.notes.append(f"not used: {len(extra) - paired} finished pictures among RAW files")
-    listing.pictures = sorted(raws or pictures, key=lambda source: natural(source.path.name))
-    return listing
+            notes.append(f"not used: {len(extra) - paired} finished pictures among RAW files")
+    return sorted(raws or extra, key=lambda source: natural(source.path.name)), notes
 
 
 def _probe(path: Path) -> Probe:

@@ -27,12 +27,8 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
     the brackets of a flat folder (0, 45, 90 by default); elsewhere it picks from the angles that
     the folder states, the first being the reference.
 
-    Raises
-    ------
-    CaptureError
-        The photographs do not form a capture; the message names the file, the reason and the remedy.
-    DecodeError
-        A file is cut short, or no decoder recognises it.
+    Raises CaptureError: the photographs do not form a capture; the message names the file, the reason and the remedy.
+    Raises DecodeError: a file is cut short, or no decoder recognises it.
     """
     folder = Path(folder)
     if folder.is_file():

@@ -65,12 +65,8 @@ def encode(texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
 
     With `text` a PNG holds the texture's meaning in a tEXt chunk, for files next to the asset.
 
-    Raises
-    ------
-    SettingError
-        The kind cannot hold the picture's channels, or its encoder is not installed.
-    StorageError
-        The encoder failed.
+    Raises SettingError: the kind cannot hold the picture's channels, or its encoder is not installed.
+    Raises StorageError: the encoder failed.
     """
     if kind == "png":
         plain = png.encode(texture.pixels)
@@ -132,10 +128,7 @@ def _eight_bits(texture: Texture) -> NDArray[np.uint8]:
 def webp(path: Path, frames: Frames, seconds: float) -> None:
     """Write sRGB frames (H, W, 3) as an animated WebP that lasts `seconds` and repeats.
 
-    Raises
-    ------
-    StorageError
-        The file cannot be written, or OpenCV was built without WebP.
+    Raises StorageError: the file cannot be written, or OpenCV was built without WebP.
     """
     moving = cv2.Animation()
     moving.frames = [np.ascontiguousarray(frame[..., ::-1]) for frame in frames]
@@ -155,10 +148,7 @@ def ffmpeg() -> str | None:
 def mp4(path: Path, frames: Frames, seconds: float) -> None:
     """Write frames (H, W, 3) as H.264, by FFmpeg.
 
-    Raises
-    ------
-    StorageError
-        FFmpeg is missing, or fails.
+    Raises StorageError: FFmpeg is missing, or fails.
     """
     program = ffmpeg()
     if program is None:

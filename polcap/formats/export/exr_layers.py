@@ -46,14 +46,9 @@ class ColorSpace:
 def write(path: Path, maps: Path, color: str, header: Mapping[str, str]) -> None:
     """Write the maps of a result's folder `maps` as layers, their colors in the space or role `color`.
 
-    Raises
-    ------
-    SettingError
-        There is no such space.
-    DecodeError
-        A map is missing or damaged.
-    StorageError
-        The file cannot be written.
+    Raises SettingError: there is no such space.
+    Raises DecodeError: a map is missing or damaged.
+    Raises StorageError: the file cannot be written.
     """
     space = find_space(color)
     layers: dict[str, Floats] = {}
@@ -86,10 +81,7 @@ def _attributes(space: ColorSpace, header: Mapping[str, str]) -> dict[str, exr.A
 def find_space(wanted: str) -> ColorSpace:
     """The color space with this role, name or alias.
 
-    Raises
-    ------
-    SettingError
-        The configuration has no such space, or it is data or a display.
+    Raises SettingError: the configuration has no such space, or it is data or a display.
     """
     import OpenImageIO as oiio
 
@@ -112,10 +104,7 @@ def find_space(wanted: str) -> ColorSpace:
 def convert(rgb: Floats, space: ColorSpace) -> Floats:
     """Convert linear Rec.709 (H, W, 3) to the space.
 
-    Raises
-    ------
-    SettingError
-        The configuration cannot convert from linear Rec.709.
+    Raises SettingError: the configuration cannot convert from linear Rec.709.
     """
     import OpenImageIO as oiio
 

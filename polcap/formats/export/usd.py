@@ -1,6 +1,6 @@
 """Writes an asset as USD: the mesh, and its material as OpenPBR and as UsdPreviewSurface.
 
-Renderers that read MaterialX use `outputs:mtlx:surface`; all others the UsdPreviewSurface, whose specular
+Renderers that read MaterialX use `outputs:mtlx:surface`; all others read the UsdPreviewSurface. Its specular
 workflow takes F0 from a texture. Blender reads that texture as a tint of F0 in either workflow. So
 the mesh is bound twice: for every purpose to the material in the specular workflow, and for the purpose
 `full`, which Blender prefers, to a copy with F0 as a tint. Needs usd-core (extra [usd]).
@@ -10,9 +10,10 @@ References
 OpenUSD, UsdPreviewSurface specification (normal maps: scale 2, bias -1, raw); UsdMtlx.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -35,16 +36,12 @@ def require() -> None:
 
 
 def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], facts: Mapping[str, str]) -> None:
-    """Write a USD layer (.usdc or .usda) whose textures `files` are in the same folder.
+    """Write a USD layer (.usdc or .usda); its textures `files` are in the same folder.
 
     `facts` go into the layer's custom data.
 
-    Raises
-    ------
-    SettingError
-        usd-core is not installed.
-    StorageError
-        The file cannot be written.
+    Raises SettingError: usd-core is not installed.
+    Raises StorageError: the file cannot be written.
     """
     require()
     from pxr import Usd, UsdGeom, UsdShade
@@ -101,35 +98,37 @@ def _material(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str], tin
 
 
 def _openpbr(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str]) -> Any:
-    """The nodes of `materialx.describe` as shaders; returns the surface's output."""
+    """The nodes of the MaterialX document as shaders; returns the surface's output."""
     from pxr import Sdf, UsdShade
 
-    types = {
-        "float": Sdf.ValueTypeNames.Float,
-        "integer": Sdf.ValueTypeNames.Int,
-        "string": Sdf.ValueTypeNames.String,
-        "color3": Sdf.ValueTypeNames.Color3f,
-        "vector3": Sdf.ValueTypeNames.Float3,
-        "filename": Sdf.ValueTypeNames.Asset,
-        "surfaceshader": Sdf.ValueTypeNames.Token,
+    kinds = Sdf.ValueTypeNames
+    numbers = {"color3": kinds.Color3f, "vector3": kinds.Float3}
+    types: dict[str, tuple[Any, Callable[[str], Any]]] = {
+        "float": (kinds.Float, float),
+        "integer": (kinds.Int, int),
+        "string": (kinds.String, str),
+        "filename": (kinds.Asset, "./{}".format),
+        "surfaceshader": (kinds.Token, str),
+        **{name: (kind, lambda text: tuple(map(float, text.split(",")))) for name, kind in numbers.items()},
     }
     outputs: dict[str, Any] = {}
-    for node in materialx.describe(asset, files):
-        shader = UsdShade.Shader.Define(stage, path.AppendChild(f"mtlx_{node.name}"))
-        shader.CreateIdAttr(node.definition)
-        for one in node.inputs:
-            put = shader.CreateInput(one.name, types[one.type])
-            match one.value:
-                case materialx.NodeOutput(source):
-                    put.ConnectToSource(outputs[source])
-                case materialx.TextureFile(file, colorspace):
-                    put.Set(f"./{file}")
-                    if colorspace is not None:
-                        put.GetAttr().SetColorSpace(colorspace)
-                case plain:
-                    put.Set(plain)
-        outputs[node.name] = shader.CreateOutput("out", types[node.type])
-    return outputs[node.name]
+    for node in ElementTree.fromstring(materialx.document(asset, "material", files, "")):
+        if node.tag == "surfacematerial":
+            break
+        name = node.attrib["name"]
+        shader = UsdShade.Shader.Define(stage, path.AppendChild(f"mtlx_{name}"))
+        shader.CreateIdAttr(node.attrib["nodedef"])
+        for one in node:
+            kind, parse = types[one.attrib["type"]]
+            put = shader.CreateInput(one.attrib["name"], kind)
+            if "nodename" in one.attrib:
+                put.ConnectToSource(outputs[one.attrib["nodename"]])
+            else:
+                put.Set(parse(one.attrib["value"]))
+            if "colorspace" in one.attrib:
+                put.GetAttr().SetColorSpace(one.attrib["colorspace"])
+        outputs[name] = shader.CreateOutput("out", types[node.attrib["type"]][0])
+    return outputs[name]
 
 
 def _preview(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str], tint: bool) -> Any:

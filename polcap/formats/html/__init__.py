@@ -27,12 +27,9 @@ _SCRIPTS = ("probe.js", "relight.js")
 
 
 def write(path: str | Path, title: str, body: Iterable[str], data: Mapping[str, Any]) -> None:
-    """Write a page of HTML fragments, whose texts are escaped; `data` is read by its scripts, as JSON.
+    """Write a page of HTML fragments with escaped texts; its scripts read `data` as JSON.
 
-    Raises
-    ------
-    StorageError
-        The file cannot be written.
+    Raises StorageError: the file cannot be written.
     """
     here = files(__name__)
     style = here.joinpath("page.css").read_text("utf-8")

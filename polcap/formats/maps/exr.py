@@ -21,17 +21,12 @@ def write(
     attributes: Mapping[str, Attribute] | None = None,
     *,
     half: bool | Collection[str] = False,
-    held: atomic.Held | None = None,
 ) -> None:
     """Write channels (H, W) by name ("R", "normal.x", "S0.R"), ZIP; the same input gives the same bytes.
 
     `half` makes all channels, or those named, 16 bits instead of 32; values beyond the range of half are clipped to it.
-    `held` collects files that get their names together.
 
-    Raises
-    ------
-    StorageError
-        The file cannot be written.
+    Raises StorageError: the file cannot be written.
     """
     import OpenImageIO as oiio
 
@@ -53,7 +48,7 @@ def write(
             spec.attribute(key, oiio.TypeDesc(f"float[{len(value)}]"), value)
         else:
             spec.attribute(key, value)
-    with atomic.path(path, held=held) as temporary:
+    with atomic.path(path) as temporary:
         temporary.touch()  # an OSError here is clearer than OpenImageIO's message
         output = oiio.ImageOutput.create(str(temporary))
         if output is None:
@@ -66,10 +61,7 @@ def write(
 def read(path: Path) -> tuple[dict[str, Floats], dict[str, object]]:
     """Channels by name, each (H, W) float32, and the file's attributes.
 
-    Raises
-    ------
-    DecodeError
-        The file is missing, cut short, not an OpenEXR file, or larger than any picture.
+    Raises DecodeError: the file is missing, cut short, not an OpenEXR file, or larger than any picture.
     """
     meta, channels = worker.call(decode, path)
     return {name: channels[name] for name in meta["names"]}, meta["attributes"]

@@ -74,34 +74,27 @@ def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues
     """Write every map as EXR, the main ones as PNG too, and maps.json last; the same values give the same bytes.
 
     Of the mesh its depth (H, W) is written. All images are on the crop (H, W) of `maps`. Files are encoded on
-    threads and renamed together: where one fails, the files of an earlier run stay.
+    threads. The folder is replaced as a whole: if one file fails, the folder of an earlier run stays.
 
-    Raises
-    ------
-    StorageError
-        A file cannot be written.
+    Raises StorageError: a file cannot be written.
     """
     made = {"maps": maps, "mesh": mesh, "stokes": stokes, "cues": cues}
-    held = atomic.Held()
-    try:
+    near, median, far = map_files.depth_range(maps, mesh)
+    depth = {"unit": "m" if mesh.metric else "relative", "near": near, "median": median, "far": far}
+    with atomic.folder(folder) as temporary:
         parallel.results(
-            partial(_write, folder / name, partial(encode, *(made[source] for source in sources)), held)
+            partial(_write, temporary / name, partial(encode, *(made[source] for source in sources)))
             for name, (sources, encode) in map_files.FILES.items()
         )
-        held.release()
-    finally:
-        held.drop()
-    near, median, far = map_files.depth_range(maps, mesh)
-    depth: dict[str, str | float] = {"unit": "m" if mesh.metric else "relative"}
-    _write_json(folder / "maps.json", _description(maps, {**depth, "near": near, "median": median, "far": far}))
+        _write_json(temporary / "maps.json", _description(maps, depth))
 
 
-def _write(file: Path, content: Callable[[], Any], held: atomic.Held) -> None:
+def _write(file: Path, content: Callable[[], Any]) -> None:
     """Write one file: an .exr of channels, or a .png of pixels."""
     if file.suffix == ".exr":
-        exr.write(file, content(), half=file.stem not in map_files.FLOAT_FILES, held=held)
+        exr.write(file, content(), half=file.stem not in map_files.FLOAT_FILES)
     else:
-        png.write(file, content(), held)
+        png.write(file, content())
 
 
 def as_stored(maps: SurfaceMaps) -> SurfaceMaps:
@@ -127,21 +120,15 @@ def stored_depth(maps: SurfaceMaps, mesh: Mesh) -> Floats:
 
 
 def _masked_half(values: Floats, inside: NDArray[np.bool_]) -> Floats:
-    """`map_files.masked`, rounded to half; only pixels inside are computed."""
-    rows, limit = np.flatnonzero(inside), np.finfo(np.float16).max
-    flat = values.reshape(inside.size, -1)
-    masked = np.zeros(flat.shape, np.float32)
-    masked[rows] = np.clip(flat.take(rows, axis=0), -limit, limit).astype(np.float16)
-    return masked.reshape(values.shape)
+    """`map_files.masked`, clipped and rounded to half."""
+    limit = np.finfo(np.float16).max
+    return np.clip(map_files.masked(values, inside), -limit, limit).astype(np.float16).astype(np.float32)
 
 
 def read(folder: Path) -> StoredMaps:
     """Read the folder that `write` wrote: EXRs, mask.png and maps.json.
 
-    Raises
-    ------
-    DecodeError
-        A file is missing, damaged, or not of the size in maps.json.
+    Raises DecodeError: a file is missing, damaged, or not of the size in maps.json.
     """
     folder = Path(folder)
     try:
@@ -151,39 +138,28 @@ def read(folder: Path) -> StoredMaps:
     except ValueError as error:
         raise DecodeError(f"{folder / 'maps.json'} is not a maps.json of polcap ({error}); process again") from error
     percent = about.albedo.uncertainty_percent
-    width, height = about.size
     origin = (about.crop[0] / about.scale, about.crop[1] / about.scale)
     view = View(about.camera.focal_px, about.camera.center_px, about.scale, origin, about.camera.focal_known)
-
     mask = png.read(folder / "mask.png")
-    if mask.shape != (height, width):
-        raise DecodeError(f"{folder / 'mask.png'} is not {width} × {height}; process again")
+    if mask.shape != about.size[::-1]:
+        raise DecodeError(f"{folder / 'mask.png'} is not {about.size[0]} × {about.size[1]}; process again")
     inside = mask > 127
-    return StoredMaps(
-        maps=SurfaceMaps(
-            normal=_read_map(folder / "normal.exr", "RGB", about.size),
-            diffuse=_read_map(folder / "diffuse.exr", "RGB", about.size),
-            specular=_read_map(folder / "specular.exr", "RGB", about.size),
-            roughness=_read_map(folder / "roughness.exr", "Y", about.size),
-            depth_prior=None,
-            confidence=_read_map(folder / "confidence.exr", "Y", about.size),
-            mask=inside,
-            view=view,
-            estimator=about.estimator,
-            albedo_sigma=None if percent is None else round(percent / 100, 3),
-        ),
-        depth=np.where(inside, _read_map(folder / "depth.exr", "Z", about.size), np.nan).astype(np.float32),
-        metric=about.depth.unit == "m",
+    normal, diffuse, specular = (
+        _read_map(folder, name, "RGB", about.size) for name in ("normal", "diffuse", "specular")
     )
+    roughness, confidence = (_read_map(folder, name, "Y", about.size) for name in ("roughness", "confidence"))
+    maps = SurfaceMaps(
+        normal, diffuse, specular, roughness, None, confidence, mask=inside, view=view, estimator=about.estimator,
+        albedo_sigma=None if percent is None else round(percent / 100, 3),
+    )  # fmt: skip
+    depth = np.where(inside, _read_map(folder, "depth", "Z", about.size), np.nan).astype(np.float32)
+    return StoredMaps(maps, depth, metric=about.depth.unit == "m")
 
 
 def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
     """Note in maps.json the content of the export in the result's folder `where`.
 
-    Raises
-    ------
-    StorageError
-        The file cannot be written.
+    Raises StorageError: the file cannot be written.
     """
     file = folder / "maps.json"
     known = text_file.read_json(file)
@@ -197,8 +173,9 @@ def _write_json(file: Path, content: Mapping[str, Any]) -> None:
         temporary.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", "utf-8")
 
 
-def _read_map(file: Path, letters: str, size: tuple[int, int]) -> Floats:
-    """The channels `letters` of an EXR, (H, W, C), or (H, W) of one."""
+def _read_map(folder: Path, name: str, letters: str, size: tuple[int, int]) -> Floats:
+    """The channels `letters` of a map's EXR, (H, W, C), or (H, W) of one."""
+    file = folder / f"{name}.exr"
     found, _ = exr.read(file)
     planes = [found[letter] for letter in letters if letter in found]
     if len(planes) != len(letters) or planes[0].shape != size[::-1]:

@@ -26,29 +26,20 @@ _SWAPS = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}  # seven times faster th
 _HEADER = 33  # bytes of the signature and IHDR, which comes first
 
 
-def write(path: Path, array: Pixels, held: atomic.Held | None = None) -> None:
+def write(path: Path, array: Pixels) -> None:
     """Write (H, W), (H, W, 3) RGB or (H, W, 4) RGBA, uint8 or uint16; the same array gives the same bytes.
 
-    `held` collects files that get their names together.
-
-    Raises
-    ------
-    StorageError
-        The file cannot be written.
+    Raises StorageError: the file cannot be written.
     """
-    with atomic.path(path, held=held) as temporary:
+    with atomic.path(path) as temporary:
         temporary.write_bytes(encode(array))
 
 
 def encode(array: Pixels) -> bytes:
     """The bytes of a PNG, of an array as in `write`: (H, W[, C]).
 
-    Raises
-    ------
-    TypeError
-        The values are neither uint8 nor uint16.
-    StorageError
-        OpenCV cannot encode them.
+    Raises TypeError: the values are neither uint8 nor uint16.
+    Raises StorageError: OpenCV cannot encode them.
     """
     if array.dtype not in (np.uint8, np.uint16):
         raise TypeError(f"PNG holds uint8 or uint16, not {array.dtype}")
@@ -94,10 +85,7 @@ def indexed(level: NDArray[np.uint8], colors: NDArray[np.uint8]) -> bytes:
 def read(path: Path) -> Pixels:
     """Read a PNG; channels in RGB(A) order.
 
-    Raises
-    ------
-    DecodeError
-        The file is missing, cut short, not a PNG, or larger than any picture.
+    Raises DecodeError: the file is missing, cut short, not a PNG, or larger than any picture.
     """
     return worker.call(decode, path)[1]["pixels"]
 

@@ -44,12 +44,8 @@ def write(
     color_matrix : (3, 3) XYZ under D65 → camera. as_shot_neutral : (3,) camera values of a grey.
     exif : fields that are None are left out; its width, height and color_matrix are not used.
 
-    Raises
-    ------
-    ValueError
-        The mosaic is not uint16, or its sides are odd.
-    StorageError
-        The file cannot be written.
+    Raises ValueError: the mosaic is not uint16, or its sides are odd.
+    Raises StorageError: the file cannot be written.
     """
     height, width = mosaic.shape
     if mosaic.dtype != np.uint16 or height % 2 or width % 2:

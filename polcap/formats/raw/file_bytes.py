@@ -32,10 +32,7 @@ def digest(data: bytes) -> str:
 def load(path: str, expected: str | None = None) -> bytes:
     """All bytes of a file; with `expected` they must have this digest, so that cache key and pixels agree.
 
-    Raises
-    ------
-    DecodeError
-        The file cannot be read, or has changed.
+    Raises DecodeError: the file cannot be read, or has changed.
     """
     with opened(path) as file:
         data = file.read()

@@ -93,7 +93,7 @@ def _is_sensor(directory: Directory) -> bool:
 
 
 def _check_strips(path: str, directory: Directory, dng: bool) -> None:
-    """Refuse a DNG whose strips are shorter than its pixels need."""
+    """Refuse a DNG with strips shorter than its pixels need."""
     held = sum(length for _, length in file_kind.strips(directory))
     width, height = first(directory, file_kind.WIDTH), first(directory, file_kind.LENGTH)
     check_size(path, max(width, 1), max(height, 1))
@@ -128,10 +128,7 @@ def check_jpeg(path: str, data: bytes, start: int = 0) -> None:
 def check_levels(path: str, value: NDArray[Any], black: float, white: float, lossy: bool) -> None:
     """Refuse counts (H, W) or (H, W, C) that contradict the stated levels.
 
-    Raises
-    ------
-    DecodeError
-        Counts far beyond the white level, rows that were never written, or nothing but zeros.
+    Raises DecodeError: counts far beyond the white level, rows that were never written, or nothing but zeros.
     """
     if lossy and not value.any():
         raise DecodeError(

@@ -11,10 +11,8 @@ from polcap.images import Frame, SensorImage
 def decode(frame: Frame) -> SensorImage:
     """The pixels of a frame.
 
-    Raises
-    ------
-    DecodeError
-        The file is damaged, has changed since it was probed, or is in color where the sensor is monochrome.
+    Raises DecodeError: the file is damaged, has changed since it was probed, or is in color where the sensor is
+    monochrome.
     """
     path, digest, reading = frame.path, _file_digest(frame), frame.reading
     if reading.sensor_deg is not None:

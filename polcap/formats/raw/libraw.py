@@ -32,11 +32,8 @@ def read(path: str | Path, digest: str | None = None) -> SensorImage:
     the shot, 1/`white_balance`, to (1, 1, 1).
     With the `digest` of `probe.read`, the file must still hold the bytes that were probed.
 
-    Raises
-    ------
-    DecodeError
-        Not a RAW, damaged, changed since, of another mosaic or Foveon; or the decoder crashed, hung or ran out
-        of memory.
+    Raises DecodeError: not a RAW, damaged, changed since, of another mosaic or Foveon; or the decoder crashed, hung or
+    ran out of memory.
     """
     return image(*worker.call(decode, path, digest=digest))
 

@@ -42,10 +42,7 @@ def read(
     `lossy`, as every 8-bit one is. By default `encoding` is sRGB for 8 bits, else linear; `white` the greatest value
     of the type. With the `digest` of `probe.read`, the file must still hold the bytes that were probed.
 
-    Raises
-    ------
-    DecodeError
-        Not a picture, damaged, or changed since it was probed.
+    Raises DecodeError: not a picture, damaged, or changed since it was probed.
     """
     pixels, full = _pixels(path, digest)
     lossy = pixels.dtype == np.uint8
@@ -74,10 +71,7 @@ def read_mosaic(
     The frame's 2×2 cell is 90 45 / 135 0 degrees. `white` and `black` are counts; by default those that the file
     states, or the greatest of the type and 0. `kind` is that of the file; `digest` as in `read`.
 
-    Raises
-    ------
-    DecodeError
-        The frame is in color, or cannot be read.
+    Raises DecodeError: the frame is in color, or cannot be read.
     """
     y, x = dict(SENSOR_DEG)[angle_deg]
     if kind == "photo":

@@ -32,10 +32,8 @@ def read(path: str | Path) -> Probe:
 
     A file of unknown content that LibRaw can open is a RAW too.
 
-    Raises
-    ------
-    DecodeError
-        The file cannot be read, no decoder recognises it, it is cut short or of a form that polcap refuses.
+    Raises DecodeError: the file cannot be read, no decoder recognises it, it is cut short or of a form that polcap
+    refuses.
     """
     answer, _ = worker.call(examine, path, limit_s=_LIMIT_S)
     found = msgspec.convert(answer["probe"], Probe)

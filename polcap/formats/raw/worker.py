@@ -68,12 +68,8 @@ class Worker:
 
         `limit_s` is a tighter time limit than the worker's.
 
-        Raises
-        ------
-        DecodeError
-            The function refused the file, crashed, or exceeded its time or memory.
-        ChildBug
-            The function failed in a way that no file may cause.
+        Raises DecodeError: the function refused the file, crashed, or exceeded its time or memory.
+        Raises ChildBug: the function failed in a way that no file may cause.
         """
         name, limit = os.fspath(path), min(self.timeout_s, limit_s or self.timeout_s)
         request = [function.__module__, function.__qualname__, name, options, limit]
@@ -150,7 +146,7 @@ class Worker:
 
     def _spawn(self) -> subprocess.Popen[bytes]:
         self.close()
-        # OpenCV adds a folder inside itself to `sys.path`, whose `typing` a child would import instead of Python's.
+        # OpenCV adds a folder of its package to `sys.path`; a child would import `typing` from there, not Python's.
         folders = [one for one in sys.path if not os.path.isfile(os.path.join(one, "__init__.py"))]
         with contextlib.suppress(OSError):  # no temporary files: a crash is reported without its last line
             self._log = tempfile.TemporaryFile()  # noqa: SIM115 — read at the child's death, closed in `close`

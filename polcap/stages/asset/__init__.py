@@ -42,7 +42,7 @@ def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings) -> Asset:
     The outermost pixels of the object, which mix with the backdrop, are filled from further inside.
     """
     specular = np.clip(maps.specular, 0.0, 1.0)
-    greatest = np.maximum(np.maximum(specular[..., 0], specular[..., 1]), specular[..., 2])  # faster than max(axis=-1)
+    greatest = specular.max(axis=-1)
     top = float(greatest[maps.mask].max(initial=0.0))
     entry, _ = fresnel.transmission(np.float64(1.0), settings.ior)
     roughness = _eight_bits(maps.roughness)
@@ -57,7 +57,7 @@ def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings) -> Asset:
         mesh=mesh,
         base_color=base_color,
         occlusion_roughness_metallic=packed,
-        normal=_normal_texture(maps, mesh),
+        normal=_eight_bits(tangent_space(maps, mesh) / 2 + 0.5),
         specular_color=specular_color,
         specular_factor=(top / float(fresnel.normal_reflectance(settings.ior)),) * 3,
         ior=settings.ior,
@@ -67,7 +67,7 @@ def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings) -> Asset:
 
 def with_mesh(asset: Asset, maps: SurfaceMaps, mesh: Mesh) -> Asset:
     """The asset on another mesh of the same maps, with the normal texture of that mesh."""
-    return replace(asset, mesh=mesh, normal=_normal_texture(maps, mesh))
+    return replace(asset, mesh=mesh, normal=_eight_bits(tangent_space(maps, mesh) / 2 + 0.5))
 
 
 def resize_textures(asset: Asset, size: int) -> Asset:
@@ -79,17 +79,11 @@ def resize_textures(asset: Asset, size: int) -> Asset:
     shorter = max(size * min(height, width) / max(height, width), 1.0)
     other = min(size, 1 << int(np.ceil(np.log2(shorter))))
     shape = (other, size) if width >= height else (size, other)
-    base, orm, normal, specular = (
-        _resize(texture, shape)
-        for texture in (asset.base_color, asset.occlusion_roughness_metallic, asset.normal, asset.specular_color)
-    )
-    return replace(
-        asset,
-        base_color=_eight_bits(base / 255),
-        occlusion_roughness_metallic=_eight_bits(orm / 255),
-        normal=_eight_bits(_unit(normal / 127.5 - 1) / 2 + 0.5),
-        specular_color=_eight_bits(specular / 255),
-    )
+    names = ("base_color", "occlusion_roughness_metallic", "normal", "specular_color")
+    textures = {name: _resize(getattr(asset, name), shape) / 255 for name in names}
+    textures["normal"] = _unit(2 * textures["normal"] - 1) / 2 + 0.5
+    eight_bits: dict[str, Any] = {name: _eight_bits(texture) for name, texture in textures.items()}
+    return replace(asset, **eight_bits)
 
 
 def _resize(texture: NDArray[np.uint8], shape: tuple[int, int]) -> Floats:
@@ -120,10 +114,6 @@ def fill_outward(value: Any, known: NDArray[np.bool_]) -> Any:
     out = value.reshape(-1, value.shape[-1]).copy()
     out[missing] = out.take(source[label[missing]], axis=0)
     return out.reshape(value.shape)
-
-
-def _normal_texture(maps: SurfaceMaps, mesh: Mesh) -> NDArray[np.uint8]:
-    return _eight_bits(tangent_space(maps, mesh) / 2 + 0.5)
 
 
 def tangent_space(maps: SurfaceMaps, mesh: Mesh) -> Floats:

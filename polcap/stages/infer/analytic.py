@@ -3,17 +3,14 @@
 Gives normals with their expected error, an albedo map, and one roughness and one F0 for the object.
 """
 
-from functools import partial
-
 import cv2
 import numpy as np
 
-from polcap import parallel
 from polcap.images import Cues, Floats, Quality, SurfaceMaps
 from polcap.optics import brdf, frames, fresnel
 from polcap.stages.infer import half_turns
 from polcap.stages.infer.highlights import fill_highlights
-from polcap.stages.infer.zenith import ZenithEstimate, candidate_laws, estimate_zenith
+from polcap.stages.infer.zenith import ZenithEstimate, estimate_zenith
 
 _BLURS_PX = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0)  # in steps of 1.5, in which noise falls by a third
 _SAME = 2.0  # σ by which two means of the same value may differ: 95 %
@@ -42,33 +39,13 @@ def estimate(cues: Cues, ior: float) -> SurfaceMaps:
     )
 
 
-def prepare(cues: Cues, ior: float) -> tuple[Floats, Floats]:
-    """The part of `invert` that needs no guide: mean S1/S0 and S2/S0 (2, H, W), and their 1σ (H, W)."""
-    candidate_laws(ior)  # cached from here on
-    return _adaptive_mean(cues)
+def invert(cues: Cues, ior: float, guide: tuple[Floats, Floats] | None = None) -> tuple[Floats, Floats, Floats]:
+    """Normals (H, W, 3), their expected error (H, W) in degrees, and cosines of the zenith (H, W).
 
-
-def invert(
-    cues: Cues,
-    ior: float,
-    guide: tuple[Floats, Floats] | None = None,
-    prepared: tuple[Floats, Floats] | None = None,
-) -> tuple[Floats, Floats, Floats]:
-    """Normals (H, W, 3), their expected error (H, W) in degrees and cosines of the zenith (H, W).
-
-    Parameters
-    ----------
-    cues
-        Of the object's crop (H, W).
-    ior
-        Refractive index.
-    guide
-        Normals (H, W, 3) of another estimator in the frame of each ray, and their expected error (H, W), degrees: they
-        choose the half-turn of the azimuth. None: `half_turns` does.
-    prepared
-        Of `prepare`; None: computed here.
+    `guide` are the normals (H, W, 3) of another estimator in the frame of each ray, and their expected error (H, W) in
+    degrees. They choose the half-turn of the azimuth; without a guide, `half_turns` chooses it.
     """
-    ratio, sigma = prepared or prepare(cues, ior)
+    ratio, sigma = _adaptive_mean(cues)
     squared = ratio[0] ** 2 + ratio[1] ** 2
     dolp = np.sqrt(np.maximum(squared - sigma**2, 0))
     zenith_guide = None
@@ -83,10 +60,8 @@ def invert(
         phi, certainty = phi + np.where(found.turned, np.pi, 0.0), 1 - 2 * found.doubt
     else:
         phi, certainty = _azimuth_by_guide(axis, cues.rays, *guide)
-    error, local = parallel.both(
-        partial(_expected_error, zenith, dolp, sigma, certainty, cues), partial(_local, cos_zenith, phi, cues.rays)
-    )
-    return np.asarray(frames.from_ray_frame(local, cues.rays)), error, cos_zenith
+    normal = frames.from_ray_frame(_local(cos_zenith, phi, cues.rays), cues.rays)
+    return np.asarray(normal), _expected_error(zenith, dolp, sigma, certainty, cues), cos_zenith
 
 
 def _adaptive_mean(cues: Cues) -> tuple[Floats, Floats]:
@@ -183,12 +158,10 @@ def _gloss(highlight: Floats, cos_zenith: Floats, cues: Cues) -> tuple[float, fl
     usable = cues.mask & ((cues.quality & Quality.CLIPPED) == 0) & (cos_zenith > np.cos(np.radians(45)))
     if usable.sum() < 200 or np.quantile(highlight[usable], 0.99) < 0.02:
         return roughness, f0
-    edges = np.cos(np.radians(np.arange(0, 46, 3)))
-    bin_ = np.digitize(cos_zenith[usable], edges)
-    count = np.bincount(bin_, minlength=len(edges) + 1)[1 : len(edges)]
-    if not count.any():
-        return roughness, f0
-    light = np.bincount(bin_, highlight[usable], len(edges) + 1)[1 : len(edges)] / np.maximum(count, 1)
+    edges = np.cos(np.radians(np.arange(45, -1, -3)))
+    seen = usable & (cos_zenith < 1)  # where it is 1, the DoLP is below its noise
+    count, _ = np.histogram(cos_zenith[seen], edges)
+    light = np.histogram(cos_zenith[seen], edges, weights=highlight[seen])[0] / np.maximum(count, 1)
     c = (edges[:-1] + edges[1:]) / 2
     weight = np.sqrt(count)
     best = np.inf

@@ -18,7 +18,7 @@ _OUTPUTS = {"normal": 3, "depth": 1, "diffuse": 3, "specular": 3, "roughness": 1
 _POSITIONS = tuple(
     (quarters, mirror) for first in (0, 1) for mirror in (False, True) for quarters in (first, first + 2)
 )
-_STEPS = 4  # of the median's iteration
+_STEPS = 5  # of the median's iteration
 _LEAST_ERROR = 0.5  # degrees
 _NEAREST = 0.05  # least distance between unit vectors, about 3°: nearer ones weigh the same
 
@@ -38,13 +38,9 @@ def predict(cues: Cues, network: Network, run: RunNetwork, symmetries: int) -> d
     maps = {name: np.asarray(np.mean([maps[name] for maps in predictions], axis=0), np.float32) for name in _OUTPUTS}
     normals, errors = (np.stack([maps[name] for maps in predictions]) for name in ("normal", "sigma"))
     median = _median_direction(normals, errors)
-    return maps | {"normal": median, "opposed": _opposed_share(normals, median, cues.rays)}
-
-
-def _opposed_share(normals: Floats, median: Floats, rays: Floats) -> Floats:
-    """Share (H, W) of K normals (K, H, W, 3) that lean to the other side of the ray than the median (H, W, 3)."""
-    towards = median - frames.dot(median, rays)[..., None] * rays
-    return np.asarray(np.mean([frames.dot(normal, towards) < 0 for normal in normals], axis=0), np.float32)
+    towards = median - frames.dot(median, cues.rays)[..., None] * cues.rays
+    opposed = np.mean([frames.dot(normal, towards) < 0 for normal in normals], axis=0)
+    return maps | {"normal": median, "opposed": opposed.astype(np.float32)}
 
 
 def _predict_turned(
@@ -76,16 +72,11 @@ def _median_direction(normals: Floats, errors: Floats) -> Floats:
     trust = 1 / np.maximum(errors, _LEAST_ERROR)
     weights = trust
     for _ in range(_STEPS):
-        middle = _weighted_mean(directions, weights)
-        middle /= np.maximum(frames.dot(middle, middle) ** 0.5, 1e-6)[..., None]
+        mean = (weights[..., None] * directions).sum(axis=0) / weights.sum(axis=0)[..., None]
+        middle = mean / np.maximum(frames.dot(mean, mean) ** 0.5, 1e-6)[..., None]
         difference = directions - middle
         weights = trust / np.maximum(frames.dot(difference, difference) ** 0.5, _NEAREST)
-    return _weighted_mean(directions, weights)
-
-
-def _weighted_mean(directions: Floats, weights: Floats) -> Floats:
-    """Mean (H, W, 3) of directions (K, H, W, 3) with weights (K, H, W)."""
-    return np.asarray((weights[..., None] * directions).sum(axis=0) / weights.sum(axis=0)[..., None], np.float32)
+    return np.asarray(mean, np.float32)
 
 
 def _turn(image: Floats, quarters: int, mirror: bool) -> Floats:

@@ -75,20 +75,14 @@ class Grid:
 
 
 def resolve(normal: Floats, mask: Bools, network: NetworkDoubt | None = None) -> HalfTurns:
-    """The half-turns of a normal map.
+    """The half-turns of a normal map (H, W, 3), unit vectors in the frame of each ray, inside a mask (H, W).
 
-    Parameters
-    ----------
-    normal
-        (H, W, 3) unit, in the frame of each ray.
-    mask
-        (H, W).
-    network
-        Doubt of the network that made them; None: they are the inversion's, and their sides are arbitrary.
+    `network` is the doubt of the network that made the normals. Without it they are the inversion's, with arbitrary
+    sides.
     """
     grid = coarse(normal, mask)
     if not grid.mask.any():
-        return HalfTurns(np.zeros(mask.shape, dtype=bool), np.zeros(mask.shape, dtype=np.float32))
+        return HalfTurns(np.zeros(mask.shape, bool), np.zeros(mask.shape, np.float32))
     if network is None:
         turned, terms = sides(grid)
         x, y = (_enlarged(part, mask.shape) for part in np.where(turned, -1, 1) * grid.lean)
@@ -147,19 +141,10 @@ def sides(grid: Grid) -> tuple[Bools, Floats]:
 
 
 def proposals(grid: Grid, sigma: Floats, opposed: Floats) -> tuple[NDArray[np.int32], Floats]:
-    """Regions of the network's normals that the cut turns, and the evidence for it.
+    """Regions that the cut turns in a grid of the network's normals, and the evidence for turning each of them.
 
-    Parameters
-    ----------
-    grid
-        Of its normals.
-    sigma, opposed
-        (h, w), of `NetworkDoubt`.
-
-    Returns
-    -------
-    tuple
-        Number (h, w) of each cell's region, 0: it keeps its normal; terms (R, 5) of the regions' odds, see `_REGION`.
+    `sigma` and `opposed` (h, w) are those of `NetworkDoubt`. Returns the number (h, w) of each cell's region, 0 for
+    cells that do not turn, and terms (R, 5) of the regions' odds, see `_REGION`.
     """
     evidence, outwards = _outline_evidence(grid), _outwards(grid)
     sure = np.minimum(_SURE_DEG / np.maximum(sigma, 1), _SUREST) / _SUREST
@@ -245,19 +230,16 @@ def _cut(mask: Bools, cost: Floats, first: NDArray[np.intp], second: NDArray[np.
 
     count = int(mask.sum())
     source, sink, cell = 2 * count, 2 * count + 1, np.arange(count)
-    single = np.rint(_INTEGER * cost).astype(int)
-    pair = np.rint(_INTEGER * alike).astype(int)
-    more, less, same, other = single > 0, single < 0, pair > 0, pair < 0
-    a, b, c, d = first[same], second[same], first[other], second[other]
+    single, pair = np.rint(_INTEGER * cost).astype(int), np.rint(_INTEGER * alike).astype(int)
+    costly, costless = cell + count * (single < 0), cell + count * (single >= 0)  # nodes
+    same, other = second + count * (pair < 0), second + count * (pair >= 0)
     edges = [
-        (0 * cell[more] + source, cell[more], single[more]), (cell[more] + count, 0 * cell[more] + sink, single[more]),
-        (0 * cell[less] + source, cell[less] + count, -single[less]),
-        (cell[less], 0 * cell[less] + sink, -single[less]),
-        *((p, q, pair[same]) for p, q in ((a, b), (b, a), (a + count, b + count), (b + count, a + count))),
-        *((p, q, -pair[other]) for p, q in ((c, d + count), (d + count, c), (c + count, d), (d, c + count))),
-    ]  # fmt: skip
-    start, end, capacity = (np.concatenate(column) for column in zip(*edges))
-    graph = sparse.csr_array((capacity.astype(np.int32), (start, end)), shape=(2 * count + 2, 2 * count + 2))
+        (np.full(count, source), costly, single),
+        (costless, np.full(count, sink), single),
+        *((one, two, pair) for a, b in ((first, same), (first + count, other)) for one, two in ((a, b), (b, a))),
+    ]
+    start, end, capacity = (np.concatenate(column).astype(np.int32) for column in zip(*edges))
+    graph = sparse.csr_array((np.abs(capacity), (start, end)), shape=(2 * count + 2, 2 * count + 2))
     rest = sparse.csr_array(graph - maximum_flow(graph, source, sink).flow)
     rest.eliminate_zeros()
     reached = np.zeros(2 * count + 2, dtype=bool)

@@ -8,13 +8,11 @@
 """
 
 from dataclasses import replace
-from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap import parallel
 from polcap.errors import ModelError
 from polcap.images import Cues, Floats, Network, Quality, RunNetwork, SurfaceMaps
 from polcap.optics import frames
@@ -35,22 +33,10 @@ _BRIGHTEST = 2.0  # greatest S0 of diffuse reflection; white paper that faces th
 def estimate(
     cues: Cues, network: Network, run: RunNetwork, ior: float, symmetries: int, *, fine_pass: bool
 ) -> SurfaceMaps:
-    """The maps of an object's crop (H, W).
+    """The maps of an object's crop (H, W), seen in 1, 2, 4 or 8 turned and mirrored positions.
 
-    Parameters
-    ----------
-    cues
-        Of the crop.
-    network
-        Takes the channels of `stages.cues`.
-    run
-        Runs a network.
-    ior
-        Refractive index of the inversion.
-    symmetries
-        1, 2, 4 or 8 turned and mirrored positions that the network sees.
-    fine_pass
-        Whether the refinement network, if there is one, adds relief.
+    `network` takes the channels of `stages.cues`; `run` runs a network; `ior` is the refractive index of the inversion;
+    `fine_pass` adds relief by the refinement network, if there is one.
 
     Raises
     ------
@@ -83,27 +69,18 @@ def estimate_coarse(
 ) -> tuple[dict[str, Floats], fine.CoarseEstimate, Floats]:
     """Estimate before refinement; also the input of the refinement network's training.
 
-    Parameters are those of `estimate`.
-
-    Returns
-    -------
-    maps : dict[str, Floats]
-        The network's maps (H, W[, 3]) at the crop's size, with `factor`, see `_log_factor`, and `doubt`, the
-        probability of a wrong half-turn.
-    coarse : fine.CoarseEstimate
-        Normals before refinement.
-    sigma : Floats
-        Stated error of these normals (H, W), degrees.
+    Returns the network's maps (H, W[, 3]) at the crop's size, with `factor`, see `_log_factor`, and `doubt`, the
+    probability of a wrong half-turn; then the normals before refinement, and their stated error (H, W) in degrees.
     """
-    _check_channels(network)
+    if network.channels != CHANNELS:
+        raise ModelError(
+            f"model {network.digest[:8]} expects channels {', '.join(network.channels)}; "
+            f"this version makes {', '.join(CHANNELS)}; use a model of this version, or --estimator analytic"
+        )
     size = cues.mask.shape[::-1]
     shrink = max(1.0, max(size) / int(network.metadata["native_size"]))
     seen = _reduce(_limit_radiance(cues), 1 / shrink)
-    small, prepared = parallel.both(
-        partial(augmentation.predict, seen, network, run, symmetries),
-        partial(analytic.prepare, cues, ior),
-        network.at_once,
-    )
+    small = augmentation.predict(seen, network, run, symmetries)
     # zeros outside the object, so that the object's own pixels alone set the direction at its edge when enlarged
     small["normal"] = _without_grid(small["normal"], seen.mask) * seen.mask[..., None]
     small["normal"], small["doubt"] = _correct_half_turns(small["normal"], seen, small["sigma"], small.pop("opposed"))
@@ -113,18 +90,10 @@ def estimate_coarse(
     maps = {name: np.asarray(cv2.resize(image, size)) for name, image in small.items()}
     smooth = _unit(maps["normal"])
     guide = np.asarray(frames.to_ray_frame(smooth, cues.rays)), maps["sigma"]
-    by_pixel, error, _ = analytic.invert(cues, ior, guide, prepared)
+    by_pixel, error, _ = analytic.invert(cues, ior, guide)
     detailed = _add_detail(smooth, by_pixel, cues.mask, shrink)
     normal, stated = _join((smooth, maps["sigma"]), (detailed, _INVERSION * error))
     return maps, fine.CoarseEstimate(normal, smooth, maps["sigma"], maps["roughness"], shrink), stated
-
-
-def _check_channels(network: Network) -> None:
-    if network.channels != CHANNELS:
-        raise ModelError(
-            f"model {network.digest[:8]} expects channels {', '.join(network.channels)}; "
-            f"this version makes {', '.join(CHANNELS)}; use a model of this version, or --estimator analytic"
-        )
 
 
 def _limit_radiance(cues: Cues) -> Cues:

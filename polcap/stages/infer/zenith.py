@@ -17,7 +17,6 @@ from itertools import pairwise, product
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from polcap.images import Cues, Floats, Quality
 from polcap.optics import body, frames
@@ -87,7 +86,8 @@ def estimate_zenith(dolp: Floats, cues: Cues, ior: float, guide: tuple[Floats, F
     score = laws.prior.copy()
     light = frames.total(cues.radiance) / 3
     inside = cues.mask & ((cues.quality & Quality.CLIPPED) == 0) & (light > _LEAST_LIGHT)
-    sample = _sample(np.flatnonzero(inside))
+    pixels = np.flatnonzero(inside)
+    sample = pixels[:: max(1, len(pixels) // _SAMPLES)]  # evenly spread
     if len(sample) > _PATCHES:
         angles = np.stack([np.interp(dolp.flat[sample], row, _ZENITHS) for row in laws.dolp])  # (C, N)
         score += _even_albedo(angles, light.flat[sample], laws)
@@ -122,11 +122,6 @@ def candidate_laws(ior: float) -> DiffuseLaws:
     flatter = np.log(body.flattening(cosine, cosine, np.ones_like(cosine), _FLAT + 0 * cosine))
     alphas, factors, losses, priors, dolps = (np.array(column) for column in zip(*rows))
     return DiffuseLaws(alphas, factors, losses, priors, dolps, shading, flatter)
-
-
-def _sample(pixels: NDArray[np.intp]) -> NDArray[np.intp]:
-    """About `_SAMPLES` of the pixels, evenly spread."""
-    return pixels[:: max(1, len(pixels) // _SAMPLES)]
 
 
 def _even_albedo(angles: Floats, light: Floats, laws: DiffuseLaws) -> Floats:

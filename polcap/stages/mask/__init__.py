@@ -59,7 +59,14 @@ def segment(
         No object is found, or the user's mask is empty or has another size.
     """
     if user_mask is not None:
-        _check(user_mask, radiance.value.shape[1:3])
+        height, width = radiance.value.shape[1:3]
+        if user_mask.shape != (height, width):
+            raise ObjectError(
+                f"the mask has {user_mask.shape[1]}×{user_mask.shape[0]} px, the picture {width}×{height}; "
+                "draw it on the RAW picture, or on a picture of this size"
+            )
+        if not user_mask.any():
+            raise ObjectError("the mask is empty: no pixel is 128 or brighter; paint the object white")
         return _object(user_mask, "user", None, settings)
     picture, zone = _mean_picture(radiance, alignment, color), _chart_zone(radiance, color, settings.chart_margin)
     if network is None:
@@ -79,16 +86,6 @@ def segment(
             f"mask.min_area = {100 * settings.min_area:g} %; show the object larger, or draw a mask (--mask PNG)"
         )
     return _object(mask, "automatic", regions.expected_error(mask, probability), settings)
-
-
-def _check(user_mask: Bools, shape: tuple[int, ...]) -> None:
-    if user_mask.shape != shape:
-        raise ObjectError(
-            f"the mask has {user_mask.shape[1]}×{user_mask.shape[0]} px, the picture {shape[1]}×{shape[0]}; "
-            "draw it on the RAW picture, or on a picture of this size"
-        )
-    if not user_mask.any():
-        raise ObjectError("the mask is empty: no pixel is 128 or brighter; paint the object white")
 
 
 def _object(
@@ -113,9 +110,8 @@ def _chart_zone(radiance: AngleStack, color: ColorCalibration, margin: float) ->
     zone = np.zeros(radiance.value.shape[1:3], np.uint8)
     if color.place is not None:
         corners = np.asarray(color.place.corners, np.float64)
-        center = corners.mean(0)
         patch = np.linalg.norm(corners[1] - corners[0]) / 6
-        outward = corners - center
-        grown = center + outward * (1 + margin * patch / np.linalg.norm(outward, axis=1))[:, None]
+        outward = corners - corners.mean(0)
+        grown = corners + margin * patch * outward / np.linalg.norm(outward, axis=1, keepdims=True)
         cv2.fillConvexPoly(zone, np.round(grown).astype(np.int32), 1)
     return zone

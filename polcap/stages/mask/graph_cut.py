@@ -61,7 +61,5 @@ def cut(picture: Floats, seed: Bits, outside: Bools, probability: Floats | None 
 
 def enlarge(mask: Bools, chart: Bits) -> Bools:
     """The mask (h, w) enlarged to the size of the chart's zone (H, W), without that zone."""
-    large = mask.astype(np.float32)
-    if mask.shape != chart.shape:
-        large = cv2.resize(large, chart.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    large = cv2.resize(mask.astype(np.float32), chart.shape[::-1], interpolation=cv2.INTER_LINEAR)
     return np.asarray((large > 0.5) & (chart == 0))

@@ -32,7 +32,7 @@ def object_probability(
     whole = (0, 0, width, height)
     picture = reduced_picture(radiance, alignment, color, chart, whole, int(network.metadata["native_size"]))
     bright = brightness(picture.color)
-    out = _enlarge(_run(network, run, encode(picture, bright)), whole)
+    out = cv2.resize(_run(network, run, encode(picture, bright)), (width, height))
     for _ in range(_CLOSE_UPS):
         box = box_around(out > _LIKELY, _ROOM, least=8)
         if box is None:
@@ -41,8 +41,9 @@ def object_probability(
         picture = reduced_picture(radiance, alignment, color, chart, box, _CLOSE_UP_PX)
         estimate = area_mean(out[y0:y1, x0:x1], picture.chart.shape)
         out = np.minimum(out, _LIKELY)  # outside the box
-        out[y0:y1, x0:x1] = _enlarge(_run(network, run, encode(picture, bright, estimate)), box)
-    return out
+        close_up = _run(network, run, encode(picture, bright, estimate))
+        out[y0:y1, x0:x1] = cv2.resize(close_up, (x1 - x0, y1 - y0))
+    return np.asarray(out)
 
 
 def reduced_picture(
@@ -78,10 +79,7 @@ def reduced_picture(
 def _run(network: Network, run: RunNetwork, channels: Floats) -> Floats:
     """Probability (H, W) from channels (11, H, W): the mean logit of the picture and its mirror images."""
     logits = parallel.results([partial(_logit, network, run, channels, axes) for axes in _MIRRORS], network.at_once)
-    total = np.zeros(channels.shape[1:], np.float32)
-    for logit in logits:
-        total += logit / len(_MIRRORS)
-    return np.asarray(1 / (1 + np.exp(-total)), np.float32)
+    return np.asarray(1 / (1 + np.exp(-np.mean(logits, axis=0))), np.float32)
 
 
 def _logit(network: Network, run: RunNetwork, channels: Floats, axes: tuple[int, ...]) -> Floats:
@@ -91,8 +89,3 @@ def _logit(network: Network, run: RunNetwork, channels: Floats, axes: tuple[int,
     shown = np.pad(mirror(channels, axes), [(0, 0), *more], mode="edge")
     logit = run(network, shown[None])["logit"][0, 0, :height, :width]
     return np.flip(np.clip(logit, -30, 30), axes)
-
-
-def _enlarge(image: Floats, box: Box) -> Floats:
-    x0, y0, x1, y1 = box
-    return np.asarray(cv2.resize(image, (x1 - x0, y1 - y0), interpolation=cv2.INTER_LINEAR))

@@ -73,7 +73,7 @@ class SelfcalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 12.0
 
 
-@stage(version=14)
+@stage(version=15)
 def solve(
     radiance: AngleStack,
     alignment: Alignment,
@@ -96,21 +96,20 @@ def solve(
     first = _gains_without_angles(radiance, greys, facing)
     even = replace(shots, light=shots.light / first.gain[:, None, None])
     rim = angles.rim(even)
+    one_exposure = radiance.equipment.light == "one exposure"
+    well_known = greys is not None or one_exposure
 
     angle, found_sigma = radiance.angle, None
     if settings.unknown_angles:
-        well_known = greys is not None or radiance.equipment.light == "one exposure"
         angle, found_sigma = _find_angles(rim, even, float(first.sigma.max()) if well_known else np.inf, settings)
         facing = object_gains.facing(shots.light, shots.inside, angle)
-    guessed = greys is None and radiance.equipment.light != "one exposure"
-    order = angles.check_order(rim, angle, settings.order_margin, _GUESSED_ORDER if guessed else _SOLID_ORDER)
+    least_score = _SOLID_ORDER if well_known else _GUESSED_ORDER
+    order = angles.check_order(rim, angle, settings.order_margin, least_score)
     if settings.check_order and not order.check.as_stated:
         raise CaptureError(_wrong_order(order, angle))
 
     ring = _ring(even, angle, first, object_.border > 0)
-    if (
-        radiance.equipment.light != "one exposure" or found_sigma is not None
-    ):  # the angles of a polarization mosaic are exact
+    if found_sigma is not None or not one_exposure:  # the angles of a polarization mosaic are exact
         ring = corrected(ring, radiance.equipment.ring_sigma if found_sigma is None else found_sigma, settings)
     angle = angle + ring.correction
 
@@ -193,15 +192,15 @@ def _find_angles(
             f"the flash energy of the shots is {known}; to find unknown angles, {100 * _MOST_GAIN:g} % is needed: "
             f"put a color chart next to the object, {otherwise}"
         )
-    found = angles.find(band, *object_gains.cells(even.light, even.inside))
-    sigma = float(np.degrees(found.sigma))
-    if sigma > settings.max_unknown_sigma_deg:
+    found, sigma = angles.find(band, *object_gains.cells(even.light, even.inside))
+    sigma_deg = float(np.degrees(sigma))
+    if sigma_deg > settings.max_unknown_sigma_deg:
         raise CaptureError(
-            f"the error of the polarizer angles found is {sigma:.1f}° (1σ), more than "
+            f"the error of the polarizer angles found is {sigma_deg:.1f}° (1σ), more than "
             f"selfcal.max_unknown_sigma_deg = {settings.max_unknown_sigma_deg:g}; take five or more shots spread over "
             f"180°, of a rounded object inside the picture, {otherwise}"
         )
-    return found.angle, found.sigma
+    return found, sigma
 
 
 def _wrong_order(found: angles.OrderFit, angle: Floats) -> str:

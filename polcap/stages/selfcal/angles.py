@@ -62,14 +62,13 @@ _FLOOR = np.radians(0.3)  # least 1σ (200 simulated cases)
 
 def rim(shots: ObjectShots) -> OutlineBand:
     """The band of pixels just inside the object's outline, without those at the picture's edge."""
-    mask, (x0, y0, x1, y1), (height, width) = shots.mask, shots.crop, shots.full
+    mask, (x0, y0, x1, y1) = shots.mask, shots.crop
     depth = outline.depth(mask)
     outward, slope = outline.outward(mask.astype(np.float32), 3.0)
     band = (depth > 1.5) & (depth < max(5.0, 0.02 * max(mask.shape))) & (slope > 1e-4) & (shots.quality == 0)
-    band[: max(0, _EDGE_PX - y0)] = False
-    band[:, : max(0, _EDGE_PX - x0)] = False
-    band[mask.shape[0] - max(0, y1 - (height - _EDGE_PX)) :] = False
-    band[:, mask.shape[1] - max(0, x1 - (width - _EDGE_PX)) :] = False
+    inner = np.zeros(shots.full, bool)
+    inner[_EDGE_PX:-_EDGE_PX, _EDGE_PX:-_EDGE_PX] = True
+    band &= inner[y0:y1, x0:x1]
     light = np.asarray(shots.light[:, band], np.float64)
     return OutlineBand(light, np.arctan2(outward[1], outward[0])[band], outline.sectors(band))
 
@@ -116,26 +115,19 @@ def check_order(band: OutlineBand, angle: Floats, margin: float, least_score: fl
 
 def hypotheses(angle: Floats) -> dict[ShotOrder, Floats]:
     """Angles (K,) rad of every order and sense with different analyzers; the stated one first."""
-    shots = len(angle)
-    nominal = tuple(range(shots))
-    orders = list(permutations(nominal)) if shots <= _MOST_PERMUTED else [nominal, *_exchanged(shots), nominal[::-1]]
+    nominal = tuple(range(len(angle)))
+    if len(angle) <= _MOST_PERMUTED:
+        orders = set(permutations(nominal))
+    else:
+        exchanged = (tuple({i: j, j: i}.get(k, k) for k in nominal) for i, j in combinations(nominal, 2))
+        orders = {nominal, nominal[::-1], *exchanged}
     found: dict[ShotOrder, Floats] = {}
-    for order in sorted(set(orders), key=lambda one: (one != nominal, one)):
+    for order in sorted(orders, key=lambda one: (one != nominal, one)):
         for mirrored in (False, True):
             turned = angle[list(order)] * (-1 if mirrored else 1)
             weights = mueller.analyzer(turned)
             if all(np.abs(weights - mueller.analyzer(known)).max() > 0.02 for known in found.values()):
                 found[ShotOrder(order, mirrored)] = turned
-    return found
-
-
-def _exchanged(shots: int) -> list[tuple[int, ...]]:
-    """All orders that exchange two shots."""
-    found = []
-    for i, j in combinations(range(shots), 2):
-        order = list(range(shots))
-        order[i], order[j] = j, i
-        found.append(tuple(order))
     return found
 
 
@@ -173,23 +165,25 @@ def turned_shot(light: Floats, row: NDArray[np.int_], angle: Floats, gain_sigma:
     light = light / light.mean(0)
     part = np.searchsorted(np.quantile(row, np.linspace(0, 1, _PARTS + 1)[1:-1]), row)
     prior = np.diag(1 / np.maximum(gain_sigma, 1e-4) ** 2)
-    fits = [_fit_turn(k, 0.0, light, angle, part, prior) for k in range(shots)]
-    for k, start in _far_turns(light, angle):
-        further = _fit_turn(k, start, light, angle, part, prior)
-        left = further.stated - further.gained
-        if left < fits[k].stated - fits[k].gained:
-            fits[k] = replace(further, stated=fits[k].stated, gained=fits[k].stated - left)
-    most = max(fit.gained for fit in fits)
-    alike = [k for k in range(shots) if fits[k].gained >= _ALIKE * most]
+    fits = []
+    for k, shot in enumerate(np.eye(shots)):
+        turns = np.concatenate([[0.0], _FAR, -_FAR])
+        left = [_median_residual(light, angle + turn * shot) for turn in turns]
+        fit = _fit_turn(k, 0.0, light, angle, part, prior)
+        if min(left) < _MOST_LEFT * left[0]:
+            far = _fit_turn(k, turns[np.argmin(left)], light, angle, part, prior)
+            fit = replace(min(fit, far, key=lambda one: one.left), stated=fit.stated)
+        fits.append(fit)
+    gained = [fit.stated - fit.left for fit in fits]
+    alike = [k for k in range(shots) if gained[k] >= _ALIKE * max(gained)]
     alike.sort(key=lambda k: -abs(fits[k].turn))  # a small turn of one shot can be a large one of another
     found = fits[alike[0]]
     # An error of one angle looks like a larger error of another, to which the residual is less sensitive.
-    sensitivity = np.linalg.norm(_complement(angle), axis=0) * np.sqrt(
-        (_change_per_rad(light, angle) ** 2).mean(axis=1)
-    )
+    change = np.sqrt((_change_per_rad(light, angle) ** 2).mean(axis=1))
+    sensitivity = np.linalg.norm(_complement(angle), axis=0) * change
     by_angles = _ANGLE_ERROR * float(np.linalg.norm(sensitivity) / max(sensitivity[alike[0]], 1e-9))
     sigma = float(np.hypot(found.sigma, by_angles))
-    if found.gained < _LEAST_GAIN * found.stated or abs(found.turn) < _LEAST_SIGMAS * sigma:
+    if gained[alike[0]] < _LEAST_GAIN * found.stated or abs(found.turn) < _LEAST_SIGMAS * sigma:
         return TurnedShot()
     return TurnedShot(tuple(alike), found.turn, sigma)
 
@@ -198,20 +192,8 @@ def turned_shot(light: Floats, row: NDArray[np.int_], angle: Floats, gain_sigma:
 class _TurnFit:
     turn: float  # rad
     sigma: float  # rad
-    stated: float  # misfit with the angles as stated
-    gained: float  # of it by the turn
-
-
-def _far_turns(light: Floats, angle: Floats) -> list[tuple[int, float]]:
-    """Large turns (shot, rad) that remove most of the residual."""
-    stated = _median_residual(light, angle)
-    found = []
-    for k in range(len(angle)):
-        turns = [float(way * size) for size in _FAR for way in (-1, 1)]
-        left, best = min((_median_residual(light, angle + turn * np.eye(len(angle))[k]), turn) for turn in turns)
-        if left < _MOST_LEFT * stated:
-            found.append((k, best))
-    return found
+    stated: float  # misfit with the stated angles and fitted gains
+    left: float  # misfit with the turn too
 
 
 def _median_residual(light: Floats, angle: Floats) -> float:
@@ -237,66 +219,50 @@ def _fit_turn(k: int, start: float, light: Floats, angle: Floats, part: NDArray[
     residual = free @ light  # (K − 3, P)
     by_turn = free[:, k, None] * _change_per_rad(light, angle)[k]
     columns = np.concatenate([free[:, None] * light.T, by_turn[..., None]], axis=2)  # (K − 3, P, K + 1)
-    size = columns.shape[2]
-    ridge = 1e-12 * np.eye(size)
     weight: Floats = np.ones(residual.shape[1])
-    for _ in range(4):  # biweights: moved edges and highlights fit no angle
+    ridge = 1e-12 * np.eye(columns.shape[2])
+
+    def equations(weight: Floats) -> tuple[Floats, Floats]:
         weighted = columns * weight[:, None]
-        square = np.einsum("npi,npj->ij", weighted, columns, optimize=True)
-        right = np.einsum("npi,np->i", weighted, residual)
+        square = np.einsum("npi,npj->ij", weighted, columns, optimize=True) + ridge
+        square[:-1, :-1] += prior * noise
+        return square, np.einsum("npi,np->i", weighted, residual)
+
+    for _ in range(4):  # biweights: moved edges and highlights fit no angle
         noise = float((weight * (residual**2).sum(0)).sum() / max(weight.sum(), 1e-9))
-        by_prior = np.zeros((size, size))
-        by_prior[:-1, :-1] = prior * noise
-        found = np.linalg.solve(square + by_prior + ridge, right)
+        square, right = equations(weight)
+        found, used = np.linalg.solve(square, right), weight
         off = np.linalg.norm(residual - columns @ found, axis=0)
         weight = biweight(off, spread(off))
     total = float((weight * (residual**2).sum(0)).sum())
-    gains_alone = np.linalg.solve((square + by_prior + ridge)[:-1, :-1], right[:-1])
-    stated = total - float(right[:-1] @ gains_alone)
-    without = []
-    for p in np.unique(part):
-        some = part != p
-        normal = np.einsum("npi,npj->ij", weighted[:, some], columns[:, some], optimize=True) + by_prior
-        without.append(
-            np.linalg.solve(normal + ridge, np.einsum("npi,np->i", weighted[:, some], residual[:, some]))[-1]
-        )
-    by_noise = np.sqrt(noise * np.linalg.inv(square + by_prior + ridge)[-1, -1])
+    stated = total - float(right[:-1] @ np.linalg.solve(square[:-1, :-1], right[:-1]))
+    without = [np.linalg.solve(*equations(used * (part != p)))[-1] for p in np.unique(part)]
+    by_noise = np.sqrt(noise * np.linalg.inv(square)[-1, -1])
     sigma = float(np.hypot(jackknife(np.array(without)), by_noise))
-    return _TurnFit(start + float(found[-1]), sigma, stated, stated - (total - float(right @ found)))
+    return _TurnFit(start + float(found[-1]), sigma, stated, total - float(right @ found))
 
 
-@dataclass(frozen=True)
-class FoundAngles:
-    """Unknown angles that were found."""
+def find(band: OutlineBand, cells: Floats, row: NDArray[np.int_]) -> tuple[Floats, float]:
+    """Polarizer angles (K,) in 0…π of four or more shots, and their 1σ, rad: by the object's outline and inside.
 
-    angle: Floats  # (K,) rad, in 0…π
-    sigma: float  # rad, 1σ of each; π/2 where nothing is known
-
-
-def find(band: OutlineBand, cells: Floats, row: NDArray[np.int_]) -> FoundAngles:
-    """Find the angles of four or more shots, divided by their gains, from the outline and the inside of the object.
-
-    cells (K, P) are means of small blocks of the inside, row (P,) the row of each block; neighbors have common errors.
-    The outline is summed over bins of φ, and the residual of the inside is its distance from the column space of A(θ);
-    both are weighted by their scatter. The error combines the jackknife over parts of outline and inside, the change
-    with the assumed 1σ of the outline, and the distance to other solutions that fit equally well.
+    1σ is π/2 if nothing is known. The shots are divided by their gains. cells (K, P) are means of small blocks of the
+    inside, row (P,) the row of each block; neighbors have common errors. The outline is summed over bins of φ, and the
+    residual of the inside is its distance from the column space of A(θ); both are weighted by their scatter. The error
+    combines the jackknife over parts of outline and inside, the change with the assumed 1σ of the outline, and the
+    distance to other solutions that fit equally well.
     """
     shots = len(cells)
-    unknown = FoundAngles(np.zeros(shots), np.pi / 2)
     around, part = _by_direction(band)
     lit = around.min(axis=1) > 0
     if lit.sum() < _LEAST_BINS or cells.shape[1] < 10 * shots:
-        return unknown
+        return np.zeros(shots), np.pi / 2
     around, part = around[lit], part[lit]
     inside = _condensed(cells)
-    ends = [_solve(around, part, inside, start, _COARSE) for start in _starts(shots)]
-    ends.sort(key=lambda end: end[0])
-    best = _best([_solve(around, part, inside, one, _FINE) for _, one in ends[:_POLISHED]])
-    if not best:
-        return unknown
-    angle = best[0][1]
-    others = [one for cost, one in best[1:] if cost < _AS_GOOD * best[0][0]]
-    elsewhere = max((float(np.abs(_difference(one, angle)).max()) for one in others), default=0.0)
+    random = np.random.default_rng(outline.SECTORS)
+    ends = [_solve(around, part, inside, random.uniform(0, np.pi, shots), _COARSE) for _ in range(_STARTS)]
+    ends = [_solve(around, part, inside, start, _FINE) for _, start in sorted(ends, key=lambda end: end[0])[:_POLISHED]]
+    cost, angle = min(ends, key=lambda end: end[0])
+    elsewhere = max(float(np.abs(_difference(other, angle)).max()) for left, other in ends if left < _AS_GOOD * cost)
     side = np.arange(len(part)) * _SIDES // len(part)
     place = np.argsort(np.argsort(row, kind="stable")) * _SIDES // len(row)
     by_side = [_solve(around[side != s], part[side != s], inside, angle, _FINE)[1] for s in range(_SIDES)]
@@ -305,7 +271,7 @@ def find(band: OutlineBand, cells: Floats, row: NDArray[np.int_]) -> FoundAngles
     variance = np.mean(np.square(by_law), axis=0)  # (K,)
     for without in (by_side, by_place):
         variance = variance + jackknife(np.array([_difference(one, angle) for one in without]), about=0.0) ** 2
-    return FoundAngles(angle % np.pi, min(float(np.sqrt(_FLOOR**2 + variance.max() + elsewhere**2)), np.pi / 2))
+    return angle % np.pi, min(float(np.sqrt(_FLOOR**2 + variance.max() + elsewhere**2)), np.pi / 2)
 
 
 def _by_direction(band: OutlineBand) -> tuple[Floats, Floats]:
@@ -326,21 +292,6 @@ def _condensed(cells: Floats) -> Floats:
     relative = relative - relative.mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(relative @ relative.T / relative.shape[1])
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))
-
-
-def _starts(shots: int) -> list[Floats]:
-    """Random angles (K,) rad to start from."""
-    random = np.random.default_rng(outline.SECTORS)
-    return [random.uniform(0, np.pi, shots) for _ in range(_STARTS)]
-
-
-def _best(ends: list[tuple[float, Floats]]) -> list[tuple[float, Floats]]:
-    """Distinct solutions (misfit, angles), the best first."""
-    found: list[tuple[float, Floats]] = []
-    for cost, angle in sorted(ends, key=lambda end: end[0]):
-        if np.isfinite(cost) and all(np.abs(_difference(angle, known)).max() > np.radians(0.2) for _, known in found):
-            found.append((cost, angle))
-    return found
 
 
 def _solve(

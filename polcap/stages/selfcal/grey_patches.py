@@ -8,17 +8,16 @@ balance excluded (hidden, in shade, glossy) are not used.
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
-from polcap.images import Alignment, AngleStack, Bools, ColorCalibration, Floats, MaskedImage, Quality
-from polcap.optics.projection import transform_points
+from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, MaskedImage, Quality
+from polcap.optics.projection import pixels_inside, transform_points
 
 _GREYS = (18, 19, 20, 21, 22, 23)  # white to black
 _LIGHT = 4  # number of light patches, used for the gains; the two dark ones reflect 9 and 3 % and are mostly noise
 _REFLECTANCE = np.array([0.900, 0.591, 0.362, 0.198])  # of the light patches, from the chart's maker
 _SCATTER = 0.001  # between patches, by print, registration and falloff; measured gains err by 0.0009 (decision 6)
-_LEAST_PX = 9  # of a patch
+_LEAST_PX, _MARGIN_PX = 9, 0.5  # of a patch
 _SURE = 4.0  # least significance of gloss, σ
 
 
@@ -39,14 +38,9 @@ def measure(radiance: AngleStack, alignment: Alignment, color: ColorCalibration)
     """
     if color.place is None:
         return None
-    seen = [
-        [_patch(radiance.shot(k), transform, color.place.quads[p]) for p in _GREYS]
-        for k, transform in enumerate(alignment.transform)
-    ]
-    mean = np.array([[one.mean for one in shot] for shot in seen], np.float64)  # (K, P, 3)
-    variance = np.array([[one.variance for one in shot] for shot in seen], np.float64)
-    sound = np.array([[one.sound for one in shot] for shot in seen]).all(axis=0)
-    usable = sound & (mean > 0).all(axis=(0, 2)) & _serving(color)  # (6,)
+    shots = len(radiance.angle)
+    mean, variance = np.stack([_means(radiance.shot(k), alignment.transform[k], color) for k in range(shots)], axis=1)
+    usable = (mean > 0).all(axis=(0, 2))  # (6,) of mean (K, 6, 3)
     light = usable & (np.arange(len(_GREYS)) < _LIGHT)
     if not light.any():
         return None
@@ -57,7 +51,9 @@ def measure(radiance: AngleStack, alignment: Alignment, color: ColorCalibration)
     sigma = np.hypot(photon, each.std(1) / np.sqrt(light.sum()))
     sigma[0] = 0
     gain, sigma = _one_for_all_channels(gain, sigma)
-    slope = _slope(mean[0, :_LIGHT].sum(-1), light[:_LIGHT])
+    reflectance = np.log(_REFLECTANCE[light[:_LIGHT]])
+    enough = len(reflectance) > 2
+    slope = float(np.polyfit(reflectance, np.log(mean[0, light].sum(-1)), 1)[0]) if enough else float("nan")
     return GreyPatches(gain, sigma, slope, _gloss(mean.sum(-1)[:, usable], variance.sum(-1)[:, usable]))
 
 
@@ -65,55 +61,29 @@ def crossed_factor(radiance: AngleStack, alignment: Alignment, color: ColorCalib
     """S0 of the light patches over the crossed shot's light (3,), for gains (K, 3); None for fewer than two patches."""
     if color.place is None or radiance.crossed is None or alignment.crossed is None:
         return None
-    ratios = []
-    for serves, patch in zip(_serving(color), _GREYS[:_LIGHT]):
-        quad = color.place.quads[patch]
-        shots = [_patch(radiance.shot(k), transform, quad) for k, transform in enumerate(alignment.transform)]
-        crossed = _patch(radiance.crossed.picture, alignment.crossed, quad)
-        sound = serves and all(one.sound and one.mean.min() > 0 for one in (*shots, crossed))
-        if sound:  # unpolarized: every shot is half of S0
-            ratios.append(2 * np.mean([one.mean / g for one, g in zip(shots, gain)], axis=0) / crossed.mean)
-    return np.mean(ratios, axis=0) if len(ratios) > 1 else None
+    shots = [_means(radiance.shot(k), transform, color)[0] for k, transform in enumerate(alignment.transform)]
+    crossed = _means(radiance.crossed.picture, alignment.crossed, color)[0]
+    light = 2 * np.mean(shots / gain[:, None], axis=0)  # (6, 3) unpolarized: every shot is half of S0
+    usable = (np.min([*shots, crossed], axis=(0, 2)) > 0) & (np.arange(len(_GREYS)) < _LIGHT)
+    return (light / crossed)[usable].mean(axis=0) if usable.sum() > 1 else None
 
 
-def _serving(color: ColorCalibration) -> Bools:
-    """Whether white balance used each grey patch (6,)."""
-    if color.patches is None or color.patches.use is None:
-        return np.ones(len(_GREYS), bool)
-    return np.asarray(color.patches.use[list(_GREYS)] == 0)
+def _means(picture: MaskedImage, transform: Floats, color: ColorCalibration) -> Floats:
+    """Means and their variances (2, 6, 3) of a shot on the grey patches; NaN where a patch cannot be used.
 
-
-@dataclass(frozen=True)
-class _Patch:
-    mean: Floats  # (3,)
-    variance: Floats  # (3,) of the mean
-    sound: bool  # unclipped, with nine pixels or more
-
-
-def _patch(picture: MaskedImage, transform: Floats, quad: Floats) -> _Patch:
-    """Mean of a shot's pixels inside a quad (4, 2) px of the reference grid, one pixel or more from its edge."""
-    place = transform_points(transform, quad)  # (4, 2) x, y
-    height, width = picture.quality.shape
-    low = np.clip(np.floor(place.min(axis=0)).astype(int) - 2, 0, [width, height])
-    high = np.clip(np.ceil(place.max(axis=0)).astype(int) + 3, low, [width, height])
-    box = slice(low[1], high[1]), slice(low[0], high[0])
-    drawn = np.zeros(high[::-1] - low[::-1], np.uint8)
-    if drawn.size:
-        cv2.fillConvexPoly(drawn, np.round((place - low) * 16).astype(np.int32), 1, shift=4)
-        drawn = np.asarray(cv2.erode(drawn, np.ones((3, 3), np.uint8)), np.uint8)
-    inside = drawn > 0
-    count = int(inside.sum())
-    clipped = bool((picture.quality[box][inside] & Quality.CLIPPED).any())
-    mean = picture.value[box][inside].mean(0) if count else np.zeros(3)
-    variance = picture.variance[box][inside].sum(0) / max(count, 1) ** 2
-    return _Patch(mean, variance, count >= _LEAST_PX and not clipped)
-
-
-def _slope(light: Floats, usable: Bools) -> float:
-    """Slope of ln light (4,) over ln reflectance; NaN for fewer than three usable patches."""
-    if usable.sum() < 3:
-        return float("nan")
-    return float(np.polyfit(np.log(_REFLECTANCE[usable]), np.log(light[usable]), 1)[0])
+    A patch cannot be used if white balance excluded it, if it is clipped in this shot, or if fewer than nine of its
+    pixels are half a pixel or more from its edge. `transform` maps px of the reference grid to px of the shot.
+    """
+    assert color.place is not None
+    found = np.full((2, len(_GREYS), 3), np.nan)
+    for index, patch in enumerate(_GREYS):
+        quad = transform_points(transform, color.place.quads[patch])
+        x, y = pixels_inside(quad, picture.quality.shape, _MARGIN_PX).T
+        left_out = color.patches is not None and color.patches.use is not None and color.patches.use[patch] > 0
+        if left_out or len(x) < _LEAST_PX or (picture.quality[y, x] & Quality.CLIPPED).any():
+            continue
+        found[:, index] = picture.value[y, x].mean(axis=0), picture.variance[y, x].sum(axis=0) / len(x) ** 2
+    return found
 
 
 def _gloss(light: Floats, variance: Floats) -> float:
@@ -125,14 +95,9 @@ def _gloss(light: Floats, variance: Floats) -> float:
     inverse = light[0].max() / light[0]  # 1 on the lightest patch, ~30 on black
     worst = 0.0
     for k in range(1, len(light)):
-        weight = 1 / sigma[k] ** 2
-        at = (weight * inverse).sum() / weight.sum()
-        square = float((weight * (inverse - at) ** 2).sum())
-        slope = float((weight * (inverse - at) * ratio[k]).sum()) / max(square, 1e-12)
-        error = np.sqrt(1 / max(square, 1e-12))
-        line = (weight * ratio[k]).sum() / weight.sum() + slope * (inverse - at)
-        error *= max(1.0, float(np.sqrt((weight * (ratio[k] - line) ** 2).sum() / (light.shape[1] - 2))))
-        worst = max(worst, abs(slope) - _SURE * error)
+        line, covariance = np.polyfit(inverse, ratio[k], 1, w=1 / sigma[k], cov="unscaled")
+        misfit = float((((ratio[k] - np.polyval(line, inverse)) / sigma[k]) ** 2).sum()) / (light.shape[1] - 2)
+        worst = max(worst, abs(line[0]) - _SURE * np.sqrt(covariance[0, 0] * max(1.0, misfit)))
     return float(worst)
 
 

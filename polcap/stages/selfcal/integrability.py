@@ -85,9 +85,8 @@ class SlopeField:
     def at(self, unknowns: Floats) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
         """w_ζ² w*, w and w_ζ (N,) for unknowns (K,): gains after the first, and the common turn of the angles [rad]."""
         gain = np.concatenate([[1.0], unknowns[:-1]])
-        s0, s1, s2 = np.einsum(
-            "jk,khw->jhw", np.linalg.pinv(mueller.analyzer(self.angle)), self.light / gain[:, None, None]
-        )
+        solve = np.linalg.pinv(mueller.analyzer(self.angle))
+        s0, s1, s2 = np.einsum("jk,khw->jhw", solve, self.light / gain[:, None, None])
         q = (s1 + 1j * s2) / np.maximum(s0, 1e-9)
         w = q * np.interp(np.abs(q), *_SLOPES_OF_DOLP)
         slope = _derivative(w)[self.inside]
@@ -136,8 +135,7 @@ def linearize(slopes: SlopeField, unknowns: Floats, near: float) -> Equations:
     """The equations about `unknowns` (K,), for pixels with |w| < near."""
     product, w, slope = slopes.at(unknowns)
     length, size = np.abs(slope), np.abs(w)
-    noise = 2 * length * size * _SLOPE_NOISE * np.median(length), length**2 * (_NOISE + _LAW * size)
-    scale = np.hypot(*noise) + 1e-12
+    scale = 1e-12 + np.hypot(2 * length * size * _SLOPE_NOISE * np.median(length), length**2 * (_NOISE + _LAW * size))
     residual = product.imag / scale
     rows = [(slopes.at(unknowns + _STEP * one)[0].imag / scale - residual) / _STEP for one in np.eye(len(unknowns))]
     counted = size < near
@@ -155,14 +153,13 @@ def part_of(inside: Bools) -> NDArray[np.int_]:
 def _derivative(w: NDArray[Any]) -> NDArray[Any]:
     """½(∂x − i∂y) w, x right, y up, by the derivative of a Gaussian."""
     at = np.arange(-int(2 * BLUR), int(2 * BLUR) + 1)
-    bell = np.exp(-(at**2) / (2 * BLUR**2))
-    bell = bell / bell.sum()
+    bell = cv2.getGaussianKernel(len(at), BLUR)[:, 0]
     rise = at * bell / (at**2 * bell).sum()
-    parts = np.ascontiguousarray(w.real), np.ascontiguousarray(w.imag)
+    parts = w.view(np.float64).reshape(*w.shape, 2)
     across, down = (
-        [cv2.sepFilter2D(part, cv2.CV_64F, *kernels) for part in parts] for kernels in ((rise, bell), (bell, rise))
+        cv2.sepFilter2D(parts, -1, *kernels).view(np.complex128)[..., 0] for kernels in ((rise, bell), (bell, rise))
     )
-    return np.asarray((across[0] + 1j * across[1] + 1j * (down[0] + 1j * down[1])) / 2)  # rows run down
+    return np.asarray((across + 1j * down) / 2)  # rows run down
 
 
 def _slopes_of_dolp() -> tuple[Floats, Floats]:

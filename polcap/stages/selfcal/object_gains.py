@@ -31,14 +31,8 @@ from polcap.optics.outline import OutlineBand
 from polcap.optics.robust import biweight, jackknife, spread
 from polcap.optics.warp import warp
 
-_KERNELS = (
-    0.04,
-    0.02,
-    0.01,
-    0.007,
-    0.005,
-)  # widths of the mean shift, in S1/S0; with 0.01 as the last, a vase errs 12 × (decision 6)
-_KERNEL_REACH = 8.0  # widths; a Gaussian is below 10⁻¹⁰ beyond, also after a climb of one width
+# widths of the mean shift, in S1/S0; with 0.01 as the last, a vase errs 12 × (decision 6)
+_KERNELS = (0.04, 0.02, 0.01, 0.007, 0.005)
 _STARTS = 12  # of the mean shift, besides the median and equal gains
 _PEAK_WIDTH = 0.02  # width of the kernel that compares peaks, in S1/S0; set by hand
 _CELL_PX = 6  # side of the blocks that closure averages: three times the blur of the light
@@ -97,18 +91,22 @@ def unknown(shots: int) -> GainEstimate:
 
 
 def combined(estimates: list[GainEstimate]) -> GainEstimate:
-    """Mean of estimates, weighted by inverse variance; differences beyond their errors increase its error."""
-    gain = np.stack([one.gain for one in estimates])
-    sigma = np.stack([one.sigma for one in estimates])
+    """Mean of several estimates of the gains; unknown gains do not count."""
+    mean, sigma = weighted_mean(*(np.stack([getattr(one, name) for one in estimates]) for name in ("gain", "sigma")))
+    known = np.isfinite(sigma)
+    return GainEstimate(np.where(known, mean, 1.0), np.where(np.arange(len(sigma)) > 0, sigma, 0.0))
+
+
+def weighted_mean(value: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+    """Mean (...,) of N measurements (N, ...), weighted by inverse variance, and its 1σ; inf if none has a finite 1σ.
+
+    Differences beyond the errors of the measurements increase the error of the mean by Birge's ratio.
+    """
     weight = 1 / np.maximum(sigma, 1e-6) ** 2
-    total = weight.sum(0)
-    known = total > 0
-    mean = np.where(known, (weight * gain).sum(0) / np.maximum(total, 1e-12), 1.0)
-    count = np.maximum((weight > 0).sum(0) - 1, 1)
-    excess = (weight * (gain - mean) ** 2).sum(0) / count  # Birge's ratio, squared
-    error = np.where(known, np.sqrt(np.maximum(excess, 1) / np.maximum(total, 1e-12)), np.inf)
-    error[0] = 0
-    return GainEstimate(mean, error)
+    total = np.maximum(weight.sum(0), 1e-12)
+    mean = (weight * value).sum(0) / total
+    excess = (weight * (value - mean) ** 2).sum(0) / np.maximum((weight > 0).sum(0) - 1, 1)
+    return mean, np.where(weight.sum(0) > 0, np.sqrt(np.maximum(excess, 1) / total), np.inf)
 
 
 def with_prior(measured: GainEstimate, prior: float) -> GainEstimate:
@@ -208,29 +206,17 @@ def _one_sided(ratio: Floats, angle: Floats) -> float:
 
 def _climb(ratio: Floats, start: Floats) -> list[Floats]:
     """Mean shift over ratios (K, N) from a start (K,): the end point for each kernel width."""
-    at: Floats = start.astype(np.float32)
-    found: list[Floats] = []
+    at, found = start, []
     for width in _KERNELS:
-        some, middle = _near(ratio, at, width), at
         for _ in range(50):
-            if np.abs(at - middle).max() > width:
-                some, middle = _near(ratio, at, width), at
-            distance = some - at[:, None]
-            weight = np.exp(np.einsum("kn,kn->n", distance, distance) * np.float32(-0.5 / width**2))
-            total = float(weight.sum())
-            step = distance @ weight / total if total > 1e-9 else np.zeros_like(at)
+            distance = ratio - at[:, None]
+            weight = np.exp(np.einsum("kn,kn->n", distance, distance) / (-2 * width**2))
+            step = distance @ weight / max(float(weight.sum()), 1e-9)
             at = at + step
             if np.abs(step).max() < 1e-5:
                 break
-        found.append(at.astype(np.float64))
+        found.append(at)
     return found
-
-
-def _near(ratio: Floats, at: Floats, width: float) -> Floats:
-    """The ratios (K, n) float32 within reach of a kernel of this width at a point (K,)."""
-    distance = ratio - at[:, None]
-    near = np.einsum("kn,kn->n", distance, distance) < (_KERNEL_REACH * width) ** 2
-    return np.asarray(ratio[:, near], np.float32)
 
 
 def cells(light: Floats, usable: Bools) -> tuple[Floats, NDArray[np.int_]]:
@@ -258,9 +244,9 @@ def _null_vector(
         h = _least(_squares(rows, weight))
         residual = np.linalg.norm(rows @ h, axis=1)
         weight = biweight(residual, spread(residual))
-    each = [_squares(rows[part == p], weight[part == p]) for p in np.unique(part)]
-    total = np.sum(each, axis=0)
-    variance = (times * jackknife(np.stack([_least(total - one) for one in each]))) ** 2
+    total = _squares(rows, weight)
+    without = [_least(total - _squares(rows[part == p], weight[part == p])) for p in np.unique(part)]
+    variance = (times * jackknife(np.stack(without))) ** 2
     for k in range(len(angle)):
         turned = angle + _ANGLE_ERROR * (np.arange(len(angle)) == k)
         variance = variance + (_least(_squares(equations(turned), weight)) - h) ** 2

@@ -23,6 +23,7 @@ from polcap.images import Bools, Floats, RingZero
 from polcap.optics import mueller, outline
 from polcap.optics.robust import jackknife
 from polcap.stages.selfcal import integrability
+from polcap.stages.selfcal.object_gains import weighted_mean
 
 Complexes = NDArray[np.complex128]
 
@@ -50,10 +51,8 @@ _SLOPES_FLOOR = np.radians(0.1)  # least 1σ (decision 26)
 
 def combined(one: RingZero, other: RingZero) -> RingZero:
     """Weighted mean of two measurements of one ring; its error grows with their difference if they contradict."""
-    weight = one.sigma**-2, other.sigma**-2
-    offset = (weight[0] * one.offset + weight[1] * other.offset) / sum(weight)
-    sigmas = abs(one.offset - other.offset) / float(np.hypot(one.sigma, other.sigma))
-    return RingZero(offset, min(max(1.0, sigmas) / float(np.sqrt(sum(weight))), np.pi / 2))
+    offset, sigma = weighted_mean(np.array([one.offset, other.offset]), np.array([one.sigma, other.sigma]))
+    return RingZero(float(offset), min(float(sigma), np.pi / 2))
 
 
 def by_outline(

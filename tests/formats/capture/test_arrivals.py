@@ -1,4 +1,4 @@
-"""A folder that is being filled: told once it rests, and not before."""
+"""A folder that is being filled is reported once it rests, and not before."""
 
 from collections.abc import Callable
 from functools import partial
@@ -10,7 +10,7 @@ from polcap.formats.capture import arrivals
 
 
 class Clock:
-    """Of the one who waits; whoever fills the folder does so meanwhile."""
+    """The clock of the waiting function; `meanwhile` fills the folder during its sleep."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -31,7 +31,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return clock
 
 
-def test_tells_when_a_folder_rests_after_a_change(
+def test_a_folder_that_rests_after_a_change_is_reported(
     tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = tmp_path / "polcap"
@@ -55,7 +55,7 @@ def test_tells_when_a_folder_rests_after_a_change(
     assert len(written) == 4 and clock.now - written[-1] >= 0.6
 
 
-def test_tells_when_a_file_goes(tmp_path: Path, clock: Clock) -> None:
+def test_a_removed_file_is_reported(tmp_path: Path, clock: Clock) -> None:
     (tmp_path / "a.dng").write_bytes(b"a")
     moments = arrivals.settled(tmp_path, tmp_path / "polcap", still_s=0.0)
     next(moments)
@@ -64,7 +64,7 @@ def test_tells_when_a_file_goes(tmp_path: Path, clock: Clock) -> None:
     assert not (tmp_path / "a.dng").exists()
 
 
-def test_an_edited_file_rests_at_once_but_not_beside_photographs_that_come(tmp_path: Path, clock: Clock) -> None:
+def test_an_edited_file_rests_at_once_unless_photographs_arrive(tmp_path: Path, clock: Clock) -> None:
     folder, settings = tmp_path / "capture", tmp_path / "settings.toml"
     folder.mkdir()
     moments = arrivals.settled(folder, folder / "polcap", still_s=2.0, edited=[settings])

@@ -26,7 +26,7 @@ def test_stated_focal_length_that_contradicts_the_photographs_is_no_knowledge() 
     shorter, longer = found.doubt  # it may be as long as they say, and no shorter
     assert shorter == 0.0 and longer == pytest.approx(math.log(50 / 24))
     assert not found.known and "50 mm" in found.note
-    assert found.px == pytest.approx(24 / 23.6 * 4310)  # what the user states is what is taken
+    assert found.px == pytest.approx(24 / 23.6 * 4310)  # the user's statement is used
     assert focal_length.find(exif, 51.0, None).known
 
 

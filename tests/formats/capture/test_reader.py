@@ -1,4 +1,4 @@
-"""Capture folders: what each layout means, and one clear line for what does not add up."""
+"""Capture folders: the meaning of each layout, and one clear line for each fault."""
 
 import shutil
 from itertools import count
@@ -55,7 +55,7 @@ def names(shot):
     return [frame.path.rpartition("/")[2] for frame in shot.frames]
 
 
-# ---------------------------------------------------------------- what is understood
+# ---------------------------------------------------------------- layouts
 
 
 def test_sub_folders_state_the_angles(tmp_path):
@@ -85,7 +85,7 @@ def test_flat_folder_is_cut_into_equal_brackets_by_time(tmp_path):
     ]
 
 
-def test_flat_folder_follows_the_order_given(tmp_path):
+def test_flat_folder_follows_the_stated_order(tmp_path):
     understood = capture.read(flat(tmp_path, shots=4), (0.0, 45.0, 90.0, 135.0))
     assert degrees(understood) == [0, 45, 90, 135]
     assert degrees(capture.read(flat(tmp_path, shots=4), (135.0, 90.0, 45.0, 0.0))) == [135, 90, 45, 0]
@@ -155,14 +155,14 @@ def test_the_folder_of_one_angle_is_no_capture(tmp_path):
         capture.read(tmp_path / "pol045")
 
 
-def test_a_folder_of_captures_is_told_so(tmp_path):
+def test_a_folder_of_captures_is_named_as_such(tmp_path):
     folders(tmp_path / "krug")
     with pytest.raises(CaptureError, match="sub-folders krug hold captures: give one of them, or run `polcap batch`"):
         capture.read(tmp_path)
 
 
 def test_untimed_brackets_in_one_folder_are_to_be_sorted(tmp_path):
-    """No order of angles tells them apart: none is asked for."""
+    """No order of angles can separate them, so the message asks for none."""
     folder = pictures(tmp_path, [f"krug_{angle}_grad_{number}.png" for angle in (0, 45, 90) for number in range(3)])
     for angles in (None, (0.0, 45.0, 90.0)):
         with pytest.raises(CaptureError, match="cannot be assigned to angles; sort the frames into pol000") as caught:
@@ -170,20 +170,7 @@ def test_untimed_brackets_in_one_folder_are_to_be_sorted(tmp_path):
         assert "--angles" not in str(caught.value)
 
 
-def test_a_repeat_is_a_shot_of_its_own(tmp_path):
-    angles = {"a": 0, "b": 45, "c": 90, "d": 0}
-    text = ""
-    for name, angle in angles.items():
-        shoot(tmp_path / f"{name}.dng")
-        role = '\nrole = "repeat"' if name == "d" else ""
-        text += f'[[frame]]\nfile = "{name}.dng"\nangle = {angle}{role}\n'
-    (tmp_path / "capture.toml").write_text(text)
-    understood = capture.read(tmp_path)
-    assert degrees(understood) == [0, 45, 90, 0]
-    assert understood.shots[3].frames[0].role == "repeat"
-
-
-def test_a_repeat_may_stand_a_little_beside_its_angle(tmp_path):
+def test_a_repeat_is_a_shot_of_its_own_at_about_its_angle(tmp_path):
     """A motor that comes back to 45° reads 45.02°; and 179.99° for 0°."""
     text = ""
     for name, angle in {"a": 0, "b": 45, "c": 90, "d": 45.02, "e": 179.99, "f": 60}.items():
@@ -191,7 +178,9 @@ def test_a_repeat_may_stand_a_little_beside_its_angle(tmp_path):
         role = '\nrole = "repeat"' if name in "def" else ""
         text += f'[[frame]]\nfile = "{name}.dng"\nangle = {angle}{role}\n'
     (tmp_path / "capture.toml").write_text(text)
-    assert degrees(capture.read(tmp_path)) == pytest.approx([0, 45, 90, 45.02, 179.99])
+    understood = capture.read(tmp_path)
+    assert degrees(understood) == pytest.approx([0, 45, 90, 45.02, 179.99])
+    assert understood.shots[3].frames[0].role == "repeat"
 
 
 def test_capture_toml_without_frames_only_adds_facts(tmp_path):
@@ -254,106 +243,73 @@ def test_digest_follows_the_bytes(tmp_path):
     assert capture.read(folder).shots[0].frames[0].digest != before
 
 
-# ---------------------------------------------------------------- what is refused
+# ---------------------------------------------------------------- faults
 
 
-def spoil_missing_angle(folder):
-    shutil.rmtree(folder / "pol045")
-    return r"angles are 0, 90: 2 different polarizer angles where 3 are needed"
+def remake(place, *time, **settings):
+    """Replace a photograph by another one."""
+    return lambda folder: shoot(folder / place, *time, **settings)
 
 
-def spoil_name_of_an_angle(folder):
-    (folder / "pol045").rename(folder / "angle45")
-    return (
-        r"angles are 0, 90: 2 different polarizer angles where 3 are needed; add the missing shot, or name angle45 as"
-    )
+def rewrite(place, change):
+    """Change the bytes of a photograph."""
+    return lambda folder: (folder / place).write_bytes(change((folder / place).read_bytes()))
 
 
-def spoil_axes_that_coincide(folder):
-    (folder / "pol045").rename(folder / "pol180")
-    return "2 different polarizer angles where 3"
-
-
-def spoil_empty_angle(folder):
-    for path in (folder / "pol045").iterdir():
-        path.unlink()
-    return "pol045: holds no photograph"
-
-
-def spoil_empty_folder(folder):
+def empty(folder):
     for path in folder.iterdir():
-        shutil.rmtree(path)
-    return "holds no photograph that polcap reads; give the folder that holds the photographs"
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-def spoil_no_folder(folder):
-    shutil.rmtree(folder)
-    return "no such folder"
+FRAME = "pol045/IMG_1.dng"
+TOO_FEW = "2 different polarizer angles where 3 are needed"
+SPOILS = {
+    "missing angle": (lambda vase: shutil.rmtree(vase / "pol045"), rf"angles are 0, 90: {TOO_FEW}"),
+    "name of an angle": (
+        lambda vase: (vase / "pol045").rename(vase / "angle45"),
+        rf"angles are 0, 90: {TOO_FEW}; add the missing shot, or name angle45 as",
+    ),
+    "axes that coincide": (lambda vase: (vase / "pol045").rename(vase / "pol180"), TOO_FEW),
+    "empty angle": (lambda vase: empty(vase / "pol045"), "pol045: holds no photograph"),
+    "empty folder": (
+        empty,
+        "holds no photograph that polcap reads; give the folder that holds the photographs",
+    ),
+    "no folder": (shutil.rmtree, "no such folder"),
+    "camera": (
+        remake("pol045/IMG_0.dng", model=b"Other"),
+        r"pol045/IMG_0\.dng: was taken with Acme Other, not Acme Z1",
+    ),
+    "lens": (remake("pol090/IMG_0.dng", lens=b"Zoom"), r"IMG_0\.dng: was taken through Zoom, not Macro 60"),
+    "zoom": (remake("pol090/IMG_0.dng", focal=70), "was taken at 70 mm, not 60 mm"),
+    "size": (remake("pol090/IMG_0.dng", size=(32, 64)), "has 64×32 px, not 48×32"),
+    "bracket length": (
+        lambda vase: (vase / "pol090" / "IMG_0.dng").unlink(),
+        "pol090: 90° has 1 frames where 0° has 2",
+    ),
+    "bracket exposure": (
+        remake("pol090/IMG_0.dng", 1 / 25),
+        r"pol090/IMG_0\.dng: 1/25 s f/8\.0 ISO 200\.0 where 0° has 1/50 s",
+    ),
+    "duplicate": (
+        lambda vase: shutil.copy(vase / "pol000" / "IMG_0.dng", vase / "pol090" / "IMG_0.dng"),
+        "is the same photograph as",
+    ),
+    "truncated": (rewrite(FRAME, lambda data: data[:-50]), rf"{FRAME}: its image data run past the end"),
+    "zero bytes": (rewrite(FRAME, lambda data: b""), rf"{FRAME}: is empty"),
+    "noise": (rewrite(FRAME, lambda data: np.random.default_rng(3).bytes(5000)), rf"{FRAME}: not a picture"),
+    "same angle twice": (
+        lambda vase: shutil.copytree(vase / "pol045", vase / "pol45"),
+        "45° is also in pol045",
+    ),
+}
 
 
-def spoil_camera(folder):
-    shoot(folder / "pol045" / "IMG_0.dng", 1 / 50, model=b"Other")
-    return r"pol045/IMG_0\.dng: was taken with Acme Other, not Acme Z1"
-
-
-def spoil_lens(folder):
-    shoot(folder / "pol090" / "IMG_0.dng", 1 / 50, lens=b"Zoom")
-    return r"IMG_0\.dng: was taken through Zoom, not Macro 60"
-
-
-def spoil_zoom(folder):
-    shoot(folder / "pol090" / "IMG_0.dng", 1 / 50, focal=70)
-    return r"was taken at 70 mm, not 60 mm"
-
-
-def spoil_size(folder):
-    shoot(folder / "pol090" / "IMG_0.dng", 1 / 50, size=(32, 64))
-    return "has 64×32 px, not 48×32"
-
-
-def spoil_bracket_length(folder):
-    (folder / "pol090" / "IMG_0.dng").unlink()
-    return "pol090: 90° has 1 frames where 0° has 2"
-
-
-def spoil_bracket_exposure(folder):
-    shoot(folder / "pol090" / "IMG_0.dng", 1 / 25)
-    return r"pol090/IMG_0\.dng: 1/25 s f/8\.0 ISO 200\.0 where 0° has 1/50 s"
-
-
-def spoil_duplicate(folder):
-    shutil.copy(folder / "pol000" / "IMG_0.dng", folder / "pol090" / "IMG_0.dng")
-    return "is the same photograph as"
-
-
-def spoil_truncated(folder):
-    path = folder / "pol045" / "IMG_1.dng"
-    path.write_bytes(path.read_bytes()[:-50])
-    return r"pol045/IMG_1\.dng: its image data run past the end"
-
-
-def spoil_zero_bytes(folder):
-    (folder / "pol045" / "IMG_1.dng").write_bytes(b"")
-    return r"pol045/IMG_1\.dng: is empty"
-
-
-def spoil_noise(folder):
-    (folder / "pol045" / "IMG_1.dng").write_bytes(np.random.default_rng(3).bytes(5000))
-    return r"pol045/IMG_1\.dng: not a picture"
-
-
-def spoil_same_angle_twice(folder):
-    shutil.copytree(folder / "pol045", folder / "pol45")
-    return "45° is also in pol045"
-
-
-SPOILS = [value for name, value in list(globals().items()) if name.startswith("spoil_")]
-
-
-@pytest.mark.parametrize("spoil", SPOILS, ids=lambda spoil: spoil.__name__.removeprefix("spoil_"))
-def test_what_does_not_add_up_is_one_clear_line(tmp_path, spoil):
+@pytest.mark.parametrize("fault", SPOILS)
+def test_an_inconsistent_capture_is_one_clear_line(tmp_path, fault):
     folder = folders(tmp_path / "vase")
-    message = spoil(folder)
+    spoil, message = SPOILS[fault]
+    spoil(folder)
     with pytest.raises((CaptureError, DecodeError), match=message) as caught:
         capture.read(folder)
     assert "\n" not in str(caught.value) and str(folder) in str(caught.value)

@@ -1,4 +1,4 @@
-"""What several files of an export hold is encoded once, and is the same in all of them."""
+"""A texture of several files of an export is encoded once, and is the same in all of them."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -46,7 +46,7 @@ def test_two_kinds_of_one_picture_are_two() -> None:
     assert encoder(texture, "jpeg") != encoder(data, "jpeg")
 
 
-def test_what_cannot_be_encoded_is_said_each_time() -> None:
+def test_a_texture_that_cannot_be_encoded_fails_each_time() -> None:
     texture, encoder = picture(4), TextureEncoder()
     for _ in range(2):
         with pytest.raises(SettingError, match="no fourth channel"):

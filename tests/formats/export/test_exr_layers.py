@@ -37,7 +37,7 @@ def test_colours_go_to_acescg_and_data_stays(result: Path, tmp_path: Path) -> No
     assert np.allclose(np.asarray(attributes["chromaticities"])[:2], (0.713, 0.293))  # AP1 red
 
 
-def test_role_finds_its_space_and_a_wrong_name_is_told() -> None:
+def test_role_finds_its_space_and_a_wrong_name_is_refused() -> None:
     assert exr_layers.find_space("scene_linear").name == "ACEScg"
     for wrong in ("ACEScq", "data"):
         with pytest.raises(SettingError, match="ACEScg"):

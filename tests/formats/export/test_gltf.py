@@ -57,7 +57,7 @@ def test_second_reader_finds_the_same_geometry(asset: Asset, tmp_path: Path) -> 
     middle = gltf.center(asset.mesh.vertices)
     assert np.allclose(read.vertices, asset.mesh.vertices - middle, atol=1e-6)
     assert np.array_equal(read.faces, asset.mesh.faces)
-    assert np.allclose(read.bounds.sum(axis=0), 0, atol=1e-6)  # the object stands at the origin
+    assert np.allclose(read.bounds.sum(axis=0), 0, atol=1e-6)  # the object is at the origin
     assert np.allclose(np.ptp(read.bounds, axis=0)[:2], 2 * surfaces.RADIUS, rtol=0.1)  # metres
 
 
@@ -79,7 +79,7 @@ def test_names_outside_ascii_survive(asset: Asset) -> None:
     assert document(gltf.encode(asset, "Krug “ø”"))["nodes"][0]["name"] == "Krug “ø”"
 
 
-def test_provenance_stands_in_the_packet(asset: Asset) -> None:
+def test_provenance_is_in_the_packet(asset: Asset) -> None:
     said = document(gltf.encode(asset, "ball", provenance={"settings": "{}"}))
     packet = said["extensions"]["KHR_xmp_json_ld"]["packets"][said["asset"]["extensions"]["KHR_xmp_json_ld"]["packet"]]
     assert packet["polcap:settings"] == "{}" and packet["dc:title"]["rdf:_1"]["@value"] == "ball"
@@ -93,7 +93,7 @@ def test_open_surface_is_seen_from_behind_too(asset: Asset) -> None:
 
 
 @pytest.mark.parametrize("lost", [0, -1])
-def test_a_lost_triangle_opens_a_closed_surface_wherever_its_vertices_stand(lost: int) -> None:
+def test_a_lost_triangle_opens_a_closed_surface_wherever_its_vertices_are_listed(lost: int) -> None:
     ball = np.asarray(trimesh.creation.icosphere(4).faces, np.int32)  # 2,562 vertices
     ball = ball[np.argsort(ball.min(axis=1))] + 7  # no triangle at the first vertices
     assert not gltf.is_open(ball) and gltf.is_open(np.delete(ball, lost, axis=0))

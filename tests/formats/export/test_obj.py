@@ -60,7 +60,7 @@ def test_data_lies_in_files_that_no_reader_takes_for_srgb(asset: Asset, tmp_path
     assert np.allclose(normal["B"], asset.normal[..., 2] / 255, atol=1e-3)
 
 
-def test_what_was_written_is_told_and_nothing_is_left_half(asset: Asset, tmp_path: Path) -> None:
+def test_written_files_are_listed_and_none_is_partial(asset: Asset, tmp_path: Path) -> None:
     written = obj.write(tmp_path / "ball.obj", asset, "ball", FILES, "one\ntwo")
     assert set(tmp_path.iterdir()) == set(written) and len(written) == 4
     assert (tmp_path / "ball.obj").read_text().startswith("# one\n# two\n")

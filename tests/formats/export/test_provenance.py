@@ -1,4 +1,4 @@
-"""What an asset says it was made from are the very files."""
+"""The provenance record of an asset names its photographs by their digests."""
 
 import hashlib
 from pathlib import Path

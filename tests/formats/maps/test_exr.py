@@ -56,9 +56,7 @@ def test_cut_and_missing_files_are_one_line(tmp_path: Path, rng: np.random.Gener
 
 
 @pytest.mark.parametrize("door", [exr.read, photo.read])
-def test_bytes_of_a_file_that_are_no_text_may_stand_in_a_message(
-    tmp_path: Path, door: Callable[[Path], object]
-) -> None:
+def test_bytes_that_are_no_text_are_left_out_of_a_message(tmp_path: Path, door: Callable[[Path], object]) -> None:
     path = tmp_path / "a.exr"
     exr.write(path, {name: np.ones((8, 8)) for name in "RGB"})
     whole = path.read_bytes()
@@ -71,7 +69,7 @@ def test_bytes_of_a_file_that_are_no_text_may_stand_in_a_message(
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full to play a full disk")
-def test_full_disk_is_told_and_leaves_nothing(
+def test_full_disk_is_reported_and_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
 ) -> None:
     def onto_full_disk(self: Path, **_: object) -> None:

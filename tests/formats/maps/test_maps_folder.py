@@ -1,4 +1,4 @@
-"""The folder maps/: what the design promises is there, and says what it means."""
+"""The folder maps/ holds every promised file and describes each."""
 
 import json
 from dataclasses import replace
@@ -62,10 +62,10 @@ def test_a_file_that_cannot_be_written_leaves_all_as_they_were(
     }
     keep = exr.write
 
-    def refuse(path: Path, *given: Any, **more: Any) -> None:
+    def refuse(path: Path, *values: Any, **more: Any) -> None:
         if path.name == "cues.exr":
             raise StorageError(f"cannot write {path}: the disk is full")
-        keep(path, *given, **more)
+        keep(path, *values, **more)
 
     monkeypatch.setattr(exr, "write", refuse)
     with pytest.raises(StorageError, match=r"cues\.exr: the disk is full"):
@@ -86,7 +86,7 @@ def test_crop_is_in_visible_raw_pixels(folder: Path) -> None:
     assert said["camera"]["focal_px"] == 400 and said["depth"]["unit"] == "m"
 
 
-def test_pictures_mean_what_maps_json_says(folder: Path, result: Result) -> None:
+def test_pictures_hold_the_values_that_maps_json_describes(folder: Path, result: Result) -> None:
     of, mesh, *_ = result
     said = json.loads((folder / "maps.json").read_text("utf-8"))
     inside = of.mask
@@ -133,7 +133,7 @@ def test_stored_maps_come_back(folder: Path, result: Result) -> None:
     assert np.allclose(stored.maps.diffuse[of.mask], of.diffuse[of.mask], rtol=1e-3)
 
 
-def test_what_reading_gives_is_known_before_it_is_read(folder: Path, result: Result) -> None:
+def test_maps_as_stored_equal_the_maps_read(folder: Path, result: Result) -> None:
     of, mesh, *_ = result
     rng = np.random.default_rng(5)
     of = replace(of, diffuse=np.exp(rng.normal(-8, 6, of.diffuse.shape)).astype(np.float32))  # denormals, and too much

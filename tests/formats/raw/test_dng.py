@@ -70,7 +70,7 @@ def test_counts_phase_black_and_white_come_back_exactly(tmp_path: Path, phase: s
         np.testing.assert_allclose(r.camera_whitebalance[:3], [2, 1, 1.25], rtol=1e-4)
 
 
-def test_exif_is_what_other_readers_expect(tmp_path: Path) -> None:
+def test_other_readers_find_the_exif(tmp_path: Path) -> None:
     path = write(tmp_path / "a.DNG", picture(3))
     with path.open("rb") as file:
         tags = exifread.process_file(file, details=False)

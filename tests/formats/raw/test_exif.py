@@ -44,7 +44,7 @@ BUILT = {
 
 @pytest.mark.parametrize("maker", BUILT)
 def test_raw_is_known_by_its_content(tmp_path, maker):
-    path = tmp_path / "photo.jpg"  # the name says nothing
+    path = tmp_path / "photo.jpg"  # the name is wrong
     path.write_bytes(BUILT[maker])
     assert _kind(path) == "raw"
 
@@ -70,7 +70,7 @@ def test_panasonic_states_iso_in_a_tag_of_its_own(tmp_path):
     assert exif.tags(path.read_bytes()).iso == 400
 
 
-def test_iso_beyond_sixteen_bits_is_read_where_it_stands(tmp_path):
+def test_iso_beyond_sixteen_bits_is_read_from_its_tag(tmp_path):
     photo = PHOTO | {34855: (3, (65535,)), 34866: (4, (102400,))}
     path = tmp_path / "a.dng"
     path.write_bytes(headers.dng(np.zeros((32, 32)), photo=photo))
@@ -82,7 +82,7 @@ def test_iso_of_a_pair_whose_first_is_zero_is_the_second():
 
 
 def test_iso_that_no_tag_states_is_asked_of_the_decoder(tmp_path, monkeypatch):
-    """Nikon's first bodies tell it in their maker's tags, old Kodaks have but one; what tags do tell stands."""
+    """Nikon's first bodies state it in their maker's tags, old Kodaks have only one; standard tags come first."""
     raw_directory = {file_kind.PHOTOMETRIC: (file_kind.CFA,)}
     of_a_maker = SimpleNamespace(dng=False, truncated=False, directories=(raw_directory,))
     monkeypatch.setattr(file_kind, "structure", lambda data: of_a_maker)

@@ -1,4 +1,4 @@
-"""Files that lie: cut, stripped, of a form that LibRaw misreads, or with levels that cannot be; each made here."""
+"""Defective files are refused: cut, stripped, of a form that LibRaw misreads, or with impossible levels."""
 
 import io
 
@@ -34,7 +34,7 @@ def test_a_jpeg_cut_anywhere_is_refused(tmp_path, rng):
 
 
 def jpeg_raw(coded):
-    """An old Kodak's RAW: a TIFF whose sensor image is JPEG data."""
+    """An old Kodak's RAW: a TIFF with a sensor image of JPEG data."""
     main = headers.camera(b"Kodak", b"DC240") | {
         254: (4, (0,)), 256: (4, (96,)), 257: (4, (64,)), 258: (3, (8,)), 259: (3, (7,)), 262: (3, (32803,)),
         277: (3, (1,)), 278: (4, (64,)), 279: (4, (len(coded),)), 33421: (3, (2, 2)), 33422: (1, (0, 1, 1, 2)),
@@ -69,7 +69,7 @@ def test_a_stripped_dng_is_refused(tmp_path):
 
 
 def compressed(number):
-    """A DNG that says its image is compressed in this way."""
+    """A DNG with this number as compression of its image."""
     return bytearray(headers.dng(MOSAIC)).replace(
         (259).to_bytes(2, "little") + b"\3\0\1\0\0\0\1\0", (259).to_bytes(2, "little") + b"\3\0\1\0\0\0" + number, 1
     )
@@ -105,7 +105,7 @@ def test_a_remnant_of_a_panasonic_is_refused(tmp_path):
         raw.read(path)
 
 
-def test_a_white_level_that_the_counts_deny_is_told(tmp_path, rng):
+def test_a_white_level_below_the_counts_is_refused(tmp_path, rng):
     scan = rng.integers(1000, 65000, (60, 84, 3)).astype(np.uint16)  # as a film scanner writes it
     path = written(tmp_path, headers.dng(scan, photometric=34892, white=255))
     with pytest.raises(DecodeError, match=r"white level is 255, but its counts reach 6\d{4}"):
@@ -115,7 +115,7 @@ def test_a_white_level_that_the_counts_deny_is_told(tmp_path, rng):
     assert raw.read(written(tmp_path, headers.dng(hot, black=BLACK, white=16383))).white == 16383
 
 
-def test_rows_that_were_never_written_are_told(tmp_path):
+def test_rows_that_were_never_written_are_refused(tmp_path):
     cut = MOSAIC.copy()
     cut[-6:] = 0
     with pytest.raises(DecodeError, match="last rows are empty"):

@@ -1,4 +1,4 @@
-"""RAW decoding: counts, black, white and colours of the mosaic, against files whose content is known."""
+"""RAW decoding: counts, black, white and colours of the mosaic, against files of known content."""
 
 import struct
 
@@ -54,7 +54,7 @@ def test_linear_channels_have_no_mosaic(tmp_path):
     assert image.cfa is None and image.black.shape == (1, 1)
 
 
-def test_monochrome_sensor_stands_in_all_channels(tmp_path):
+def test_monochrome_sensor_fills_all_channels(tmp_path):
     image = raw.read(written(tmp_path, RAMP, photometric=34892, black=[[7]]))
     np.testing.assert_array_equal(image.value, np.stack([RAMP] * 3, -1))
     assert image.cfa is None and image.black.tolist() == [[7]]
@@ -93,7 +93,7 @@ def test_super_ccd_is_refused_by_name(tmp_path, layout):
         raw.read(path)
 
 
-def test_a_turned_mosaic_is_told_from_its_size():
+def test_a_turned_mosaic_is_recognized_by_its_size():
     assert "SuperCCD, turned by 45°" in raw.unsupported((4, 4), rotated=True)
 
 

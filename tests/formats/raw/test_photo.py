@@ -1,4 +1,4 @@
-"""Finished pictures as sources: what is stored, what it means, what is refused."""
+"""Finished pictures as sources: stored values, their meaning, refused files."""
 
 import cv2
 import numpy as np
@@ -40,7 +40,7 @@ def test_half_float_exr_is_linear_of_white_one(tmp_path):
     assert (image.white, image.lossy) == (1, False)
 
 
-def test_grey_stands_in_all_channels(tmp_path):
+def test_grey_fills_all_channels(tmp_path):
     image = photo.read(save(tmp_path / "a.tif", SIXTEEN[..., 0]))
     np.testing.assert_array_equal(image.value, np.stack([SIXTEEN[..., 0]] * 3, -1))
 

@@ -1,4 +1,4 @@
-"""The decode worker: whatever happens in the child is one error here, and the next file is read."""
+"""The decode worker: a failure of the child is one error in the parent, and the next file is read."""
 
 import importlib
 import os
@@ -57,7 +57,7 @@ FUNCTIONS = """
 
 
 class Misled(Worker):
-    """A worker that is given functions that misbehave."""
+    """A worker with a module of misbehaving functions."""
 
     module: ModuleType
 
@@ -86,7 +86,7 @@ def test_arrays_come_back_as_they_were(worker):
     assert arrays["bits"].tolist() == [[True, False]]
 
 
-def test_child_is_kept_for_the_next_file(worker):
+def test_one_child_serves_several_files(worker):
     assert pid(worker) == pid(worker)
 
 

@@ -140,4 +140,4 @@ def test_unknown_angles_that_cannot_be_found_are_refused(shots, light, most_deg,
 
 def test_without_an_outline_angles_stay_unknown():
     rim = OutlineBand(np.zeros((4, 0)), np.zeros(0), np.zeros(0, int))
-    assert angles_.find(rim, np.ones((4, 100)), np.zeros(100, int)).sigma == np.pi / 2
+    assert angles_.find(rim, np.ones((4, 100)), np.zeros(100, int))[1] == np.pi / 2

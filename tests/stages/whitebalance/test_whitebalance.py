@@ -1,6 +1,7 @@
 """The chart found where it is, refused where it is not, and colors on the scale of its white patch."""
 
 import functools
+from typing import Any
 
 import cv2
 import numpy as np
@@ -8,11 +9,22 @@ import pytest
 
 from polcap.errors import ChartError
 from polcap.formats import shipped_data
-from polcap.images import ChartReference, ChartRequest, ColorCalibration, ColorSensor, Floats, View
+from polcap.images import AngleStack, ChartReference, ChartRequest, ColorCalibration, ColorSensor, Floats, View
 from polcap.optics.projection import transform_points
 from polcap.stages import whitebalance
 from polcap.stages.whitebalance import WhitebalanceSettings, chart, chart_in_mask, patches
 from tests.stages.whitebalance.chart_pictures import AUTO, CAMERA, CLASSIC, HEIGHT, WIDTH, draw, photograph, pose, stack
+
+
+def measure(
+    image: Floats | AngleStack,
+    request: ChartRequest = AUTO,
+    reference: ChartReference = CLASSIC,
+    **settings: Any,
+) -> ColorCalibration:
+    """The calibration of one shot, or of an image (H, W, 3) as the only shot."""
+    shot = image if isinstance(image, AngleStack) else stack(image)
+    return whitebalance.measure(shot, reference, request, WhitebalanceSettings(**settings))
 
 
 @functools.cache
@@ -41,7 +53,7 @@ def _center(quad: Floats) -> Floats:
 )
 def test_chart_is_placed_within_a_tenth_of_a_pixel(pitch, turn, tilt):
     place = pose(pitch, turn, (235, 185), tilt)
-    color = whitebalance.measure(stack(photograph(place)), CLASSIC, AUTO, WhitebalanceSettings())
+    color = measure(photograph(place))
     assert color.source == "chart"
     assert centers_off(color, place).max() < 0.1
     assert np.nanmean(color.patches.delta_e) < 1  # noise only
@@ -54,7 +66,7 @@ def test_chart_of_eight_pixel_patches_is_known_by_its_colors():
     place = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]]) @ pose(17, 2, (235, 185))
     start = chart.from_centers(transform_points(place, chart.centers()))
     assert chart.refine(image / image.max(), start).explained < 0.9
-    color = whitebalance.measure(stack(image), CLASSIC, AUTO, WhitebalanceSettings())
+    color = measure(image)
     assert color.source == "chart" and centers_off(color, place).max() < 0.3
     assert np.nanmean(color.patches.delta_e) < 1
 
@@ -76,7 +88,7 @@ def test_chart_that_was_taken_for_the_object_is_recognized():
 
 def test_s0_of_the_white_patch_is_its_reflectance():
     image, place = plain()
-    color = whitebalance.measure(stack(image), CLASSIC, AUTO, WhitebalanceSettings())
+    color = measure(image)
     x, y = np.round(transform_points(place, np.array([0.5, 3.5]))).astype(int)
     s0 = 2 * image[y - 4 : y + 5, x - 4 : x + 5].mean(axis=(0, 1))
     assert color.matrix @ s0 == pytest.approx(CLASSIC.rec709[18], abs=0.01)
@@ -86,7 +98,7 @@ def test_s0_of_the_white_patch_is_its_reflectance():
 @pytest.mark.parametrize("edition", [CLASSIC, *CLASSIC.editions], ids=["since 2014", "before", "sRGB values"])
 def test_colors_decide_the_edition_of_the_chart(edition: ChartReference):
     _, place = plain()
-    color = whitebalance.measure(stack(photograph(place, edition.rec709)), CLASSIC, AUTO, WhitebalanceSettings())
+    color = measure(photograph(place, edition.rec709))
     assert color.patches.edition == edition.name
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.02)
 
@@ -95,13 +107,13 @@ def test_faded_patches_do_not_change_the_edition():
     """Each off by 3 %, as on cards in use: no edition suits them clearly better than another."""
     _, place = plain()
     before = CLASSIC.editions[0].rec709 * (1 + 0.03 * np.random.default_rng(3).normal(size=(24, 3)))
-    color = whitebalance.measure(stack(photograph(place, before)), CLASSIC, AUTO, WhitebalanceSettings())
+    color = measure(photograph(place, before))
     assert color.patches.edition == CLASSIC.name
 
 
 def test_matrix_ignores_exposure_and_the_place_does_too():
     image, _ = plain()
-    one, other = (whitebalance.measure(stack(k * image), CLASSIC, AUTO, WhitebalanceSettings()) for k in (1.0, 0.01))
+    one, other = (measure(k * image) for k in (1.0, 0.01))
     assert 0.01 * other.matrix == pytest.approx(one.matrix, rel=1e-3)
     assert other.place.quads == pytest.approx(one.place.quads, abs=1e-2)
 
@@ -112,7 +124,7 @@ def test_sloping_light_and_glare_are_taken_out_of_the_matrix():
     u, v = np.moveaxis(transform_points(np.linalg.inv(place), np.stack([x, y], axis=-1)), -1, 0)
     light = 1 + 0.03 * (u - 0.5) - 0.02 * (v - 3.5)
     veil = 0.02 * CAMERA.sum(axis=1) / 2
-    color = whitebalance.measure(stack(image * light[..., None] + veil), CLASSIC, AUTO, WhitebalanceSettings())
+    color = measure(image * light[..., None] + veil)
     assert color.patches.falloff == pytest.approx((0.03, -0.02), abs=0.002)
     assert color.patches.glare == pytest.approx(0.02, abs=0.002)
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.02)
@@ -121,7 +133,7 @@ def test_sloping_light_and_glare_are_taken_out_of_the_matrix():
 def test_overexposed_patches_are_left_out():
     image, _ = plain()
     clip = 0.5 * float((CLASSIC.rec709[19] @ CAMERA.T)[1]) * 0.9  # white and neutral 8 saturate, and more
-    color = whitebalance.measure(stack(image, clip=clip), CLASSIC, AUTO, WhitebalanceSettings())
+    color = measure(stack(image, clip=clip))
     assert color.patches.delta_e is not None
     left_out = np.isnan(color.patches.delta_e)
     assert left_out[18] and left_out[19] and left_out.sum() < 12
@@ -132,9 +144,7 @@ def test_a_chart_burnt_out_asks_for_a_shorter_exposure():
     image, place = plain()
     corners = 2 * chart.from_centers(transform_points(place, chart.centers())).corners() + 0.5
     with pytest.raises(ChartError, match=r"over-exposed.*shorter exposure"):
-        whitebalance.measure(
-            stack(image, clip=0.02), CLASSIC, ChartRequest("corners", corners=corners), WhitebalanceSettings()
-        )
+        measure(stack(image, clip=0.02), ChartRequest("corners", corners=corners))
 
 
 def painted(place: Floats, columns: slice, rows: slice, color: Floats | float) -> Floats:
@@ -150,7 +160,7 @@ def test_hidden_patches_are_left_out_and_named():
     """A thumb over three patches and half a fourth."""
     place = plain()[1]
     image = painted(place, slice(4.2, 7), slice(0, 1.9), CAMERA @ np.array([0.45, 0.25, 0.17]) / 2)
-    color = whitebalance.measure(stack(image), CLASSIC, AUTO, WhitebalanceSettings())
+    color = measure(image)
     assert color.patches.use is not None and color.patches.predicted is not None
     assert set(np.flatnonzero(color.patches.use)) >= {5, 10, 11} and (color.patches.use > 0).sum() <= 5
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.02)
@@ -161,7 +171,7 @@ def test_hidden_patches_are_left_out_and_named():
 def test_patches_in_shade_are_left_out():
     place = plain()[1]
     image = painted(place, slice(4.5, 7), slice(-1, 5), 0.5)  # the last column, and an edge across the one before
-    color = whitebalance.measure(stack(image), CLASSIC, AUTO, WhitebalanceSettings())
+    color = measure(image)
     assert color.patches.use is not None
     assert (color.patches.use[[4, 5, 10, 11, 16, 17, 22, 23]] > 0).sum() >= 6
     assert (color.patches.use.reshape(4, 6)[:, :4] == 0).all()
@@ -169,7 +179,7 @@ def test_patches_in_shade_are_left_out():
 
 
 def test_left_out_patch_is_predicted_about_as_well_as_noise_lets():
-    color = whitebalance.measure(stack(plain()[0]), CLASSIC, AUTO, WhitebalanceSettings())
+    color = measure(plain()[0])
     assert color.patches.predicted is not None and color.patches.delta_e is not None
     assert np.nanmean(color.patches.delta_e) <= np.nanmean(color.patches.predicted) < 1
 
@@ -179,36 +189,36 @@ def test_block_of_an_sg_chart_is_read_at_its_corners_and_only_there():
     image = photograph(place, sg.rec709)
     exact = chart.Placement(place, 0.87).corners()
     request = ChartRequest("corners", corners=2 * exact + 0.5)
-    color = whitebalance.measure(stack(image), sg, request, WhitebalanceSettings(chart="sg"))
+    color = measure(image, request, sg, chart="sg")
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.03)
     assert np.nanmean(color.patches.delta_e) < 1
     with pytest.raises(ChartError, match=r"E2, J2, J5, E5 with --chart"):
-        whitebalance.measure(stack(image), sg, AUTO, WhitebalanceSettings(chart="sg"))
+        measure(image, AUTO, sg, chart="sg")
 
 
 def test_24_patches_of_other_colors_are_refused():
     place = pose(24, 8, (260, 170))
     shuffled = np.random.default_rng(5).permutation(CLASSIC.rec709)
     with pytest.raises(ChartError, match=r"max_delta_e = 15.*--no-chart"):
-        whitebalance.measure(stack(photograph(place, shuffled)), CLASSIC, AUTO, WhitebalanceSettings())
+        measure(photograph(place, shuffled))
 
 
 def test_a_mirrored_chart_is_refused():
     image, _ = plain()
     with pytest.raises(ChartError, match="no ColorChecker Classic"):
-        whitebalance.measure(stack(image[:, ::-1]), CLASSIC, AUTO, WhitebalanceSettings())
+        measure(image[:, ::-1])
 
 
 def test_a_chart_that_is_too_small_is_named_with_the_size_it_needs():
     small = photograph(pose(7.6, 3, (260, 170)))
     with pytest.raises(ChartError, match=r"patches are spaced by 15 RAW px, at least 16 are needed: show it larger"):
-        whitebalance.measure(stack(small), CLASSIC, AUTO, WhitebalanceSettings())
+        measure(small)
 
 
 def test_an_image_without_a_chart_is_refused_with_the_remedies():
     empty = draw(pose(24, 0, (-900, -900)), CLASSIC.rec709, samples=1)
     with pytest.raises(ChartError, match=r"no ColorChecker Classic.*--chart x0.*--chart FILE.*--no-chart"):
-        whitebalance.measure(stack(empty), CLASSIC, AUTO, WhitebalanceSettings())
+        measure(empty)
 
 
 def test_manual_corners_in_raw_pixels_are_drawn_to_the_chart():
@@ -216,7 +226,7 @@ def test_manual_corners_in_raw_pixels_are_drawn_to_the_chart():
     exact = chart.Placement(place, 0.87).corners()
     rough = exact + np.array([[3.0, -2], [-3, 2], [2, 3], [-2, -3]])  # an unsteady hand
     request = ChartRequest("corners", corners=2 * rough + 0.5)  # binned px (i, j) ↔ RAW px (2i + ½, 2j + ½)
-    color = whitebalance.measure(stack(image), CLASSIC, request, WhitebalanceSettings())
+    color = measure(image, request)
     assert color.source == "corners" and np.isnan(color.cost)
     assert centers_off(color, place).max() < 0.1
     assert color.place.corners == pytest.approx(exact, abs=0.15)
@@ -227,7 +237,7 @@ def test_corners_from_the_wrong_end_are_named():
     corners = 2 * chart.Placement(place, 0.87).corners() + 0.5
     with pytest.raises(ChartError, match="upside down"):
         request = ChartRequest("corners", corners=np.roll(corners, 2, axis=0))
-        whitebalance.measure(stack(image), CLASSIC, request, WhitebalanceSettings())
+        measure(image, request)
 
 
 @pytest.mark.parametrize(
@@ -243,15 +253,13 @@ def test_corners_from_the_wrong_end_are_named():
 def test_impossible_corners_are_one_clear_line(corners, says):
     request = ChartRequest("corners", corners=None if corners is None else np.array(corners, float))
     with pytest.raises(ChartError, match=says):
-        whitebalance.measure(stack(plain()[0]), CLASSIC, request, WhitebalanceSettings())
+        measure(plain()[0], request)
 
 
 def test_profile_brings_its_matrix_and_leaves_its_chart_behind():
     image, _ = plain()
-    profile = whitebalance.measure(stack(image), CLASSIC, AUTO, WhitebalanceSettings())
-    color = whitebalance.measure(
-        stack(0 * image), CLASSIC, ChartRequest("profile", profile=profile), WhitebalanceSettings()
-    )
+    profile = measure(image)
+    color = measure(0 * image, ChartRequest("profile", profile=profile))
     assert color.matrix is profile.matrix
     assert (color.source, color.place) == ("profile", None)
 
@@ -260,13 +268,13 @@ def test_without_a_chart_the_camera_is_believed_with_sensor_white_at_one():
     image, _ = plain()
     matrix = np.array([[1.9, -0.7, -0.2], [-0.2, 1.5, -0.3], [0.0, -0.5, 1.5]])
     known = stack(image, sensor=ColorSensor(matrix, np.array([2.0, 1, 1.5])))
-    color = whitebalance.measure(known, CLASSIC, ChartRequest("none"), WhitebalanceSettings())
+    color = measure(known, ChartRequest("none"))
     assert color.source == "camera"
     assert 2 * color.matrix == pytest.approx(matrix)
     balance = stack(image, sensor=ColorSensor(white_balance=np.array([2.0, 1, 1.5])))
-    color = whitebalance.measure(balance, CLASSIC, ChartRequest("none"), WhitebalanceSettings())
+    color = measure(balance, ChartRequest("none"))
     assert 2 * color.matrix == pytest.approx(np.diag([2.0, 1, 1.5]))
-    color = whitebalance.measure(stack(image), CLASSIC, ChartRequest("none"), WhitebalanceSettings())
+    color = measure(image, ChartRequest("none"))
     assert (color.source, color.metres_per_px) == ("none", None)
     assert 2 * color.matrix == pytest.approx(np.eye(3))
 
@@ -280,6 +288,6 @@ def test_scale_comes_from_the_charts_width_and_only_from_it():
     place = camera @ flat @ np.array([[1, 0, -3], [0, 1, -2], [0, 0, 1]])
     radiance = stack(photograph(place / place[2, 2]), view)
     width = 0.0155 * 5.87
-    color = whitebalance.measure(radiance, CLASSIC, AUTO, WhitebalanceSettings(chart_width_m=width))
+    color = measure(radiance, chart_width_m=width)
     assert color.metres_per_px == pytest.approx(0.7 / 1100, rel=3e-3)
-    assert whitebalance.measure(radiance, CLASSIC, AUTO, WhitebalanceSettings()).metres_per_px is None
+    assert measure(radiance).metres_per_px is None

@@ -1,0 +1,8 @@
+# docker build -t polcap . && docker run --rm --user "$(id -u):$(id -g)" -v "$PWD/capture:/capture" polcap process /capture
+FROM python:3.13-slim
+COPY . /src
+RUN pip install --no-cache-dir '/src[batch,usd]' && rm -rf /src && useradd --create-home polcap
+USER polcap
+WORKDIR /home/polcap
+ENTRYPOINT ["polcap"]
+CMD ["--help"]
