@@ -59,6 +59,7 @@ def _in_order(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iter
     yield light.noise(found, limits)
     yield light.ambient(found, limits)
     yield light.room(found, limits)
+    yield light.lighting(found, limits)
     yield from light.crossed(found, limits)
     yield polarization.ill_posed(found, limits)
     yield geometry.inward_outline(found, limits)

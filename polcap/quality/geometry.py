@@ -3,7 +3,7 @@
 import numpy as np
 
 from polcap.formats import shipped_data
-from polcap.images import Floats, Mesh, SurfaceMaps
+from polcap.images import Mesh, SurfaceMaps
 from polcap.optics import frames, outline
 from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.resize import area_mean
@@ -14,6 +14,8 @@ from polcap.stages.align import AlignSettings, object_motion
 from polcap.stages.whitebalance import chart_in_mask
 
 _LONGEST, _OUTLINE_PX, _OUTLINE_BLUR_PX = 256, 3.0, 2.0  # px of the reduced maps; band inside the outline; 1σ
+_DEGREES_PER_PUSH, _DEGREES_PER_TURN = 200.0, 350.0  # error of the normals per movement by the object's radius
+_STILL_PX = 0.1  # displacement of inner detail that polarization alone feigns
 _INWARD = 0.2  # sine of the zenith from which a normal leans inward
 _INWARD_DEG = 25.0  # mean error of objects beyond the limit (docs/benchmarks/half-turns.md)
 
@@ -43,30 +45,45 @@ def alignment(found: Evidence, limits: GateLimits, align: AlignSettings) -> Gate
         figure, limit = float(doubt[worst]), limits.max_align_residual_px * max(found.grid_px, 1)
     value = round(figure, 3) if np.isfinite(figure) else None
     if not bad.any():
-        pushed = _pushed(found, limits)
-        return pushed or Gate("alignment", "pass", value, limit, message, unit="px")
+        of_object = _object_moved(found, limits)
+        if of_object.state != "pass":
+            return of_object
+        return Gate("alignment", "pass", value, limit, message, cost_deg=of_object.cost_deg, unit="px")
     remedy = "Lock the camera, do not touch the object, and take that shot again"
     return Gate("alignment", "fail", value, limit, message, remedy, 10.0, blamed(names, bad), unit)
 
 
-def _pushed(found: Evidence, limits: GateLimits) -> Gate | None:
-    """Movement of the object against its surroundings."""
-    displacement = _displacement(found) * found.grid_px
-    limit = limits.max_object_shift_px
-    bad = np.nan_to_num(displacement, posinf=np.inf) > limit
-    if not bad.any():
-        return None
-    worst = int(np.nanargmax(displacement))
-    message = f"The object moved by {displacement[worst]:.1f} px against its surroundings in {found.names[worst]}"
-    figure: float | None = round(float(displacement[worst]), 3)
-    if np.isinf(displacement[worst]):
-        figure, message = None, f"The {found.names[worst]} shot shows another object in the same surroundings"
+def _object_moved(found: Evidence, limits: GateLimits) -> Gate:
+    """Movement of the object against its surroundings, and its cost, which grows with the share of its size."""
+    motion, names = _motion(found), found.names
+    pushed, inside = (np.nan_to_num(one, posinf=np.inf) * found.grid_px for one in (motion.pushed, motion.inside))
+    radius = max(outline.disc_radius(found.object_.mask) * found.grid_px, 1.0)
+    least = limits.min_object_shift * radius
+    cost = float(max(_DEGREES_PER_PUSH * pushed.max(), _DEGREES_PER_TURN * max(inside.max() - _STILL_PX, 0.0)) / radius)
     remedy = "Fix the object, do not touch it between shots, and take that shot again"
-    cost = 45.0 if figure is None else 5.0
-    return Gate("alignment", "fail", figure, limit, message, remedy, cost, blamed(found.names, bad), "px")
+    k = int(np.argmax(pushed))
+    limit = limits.max_object_shift_px
+    bad = blamed(names, pushed > limit)
+    message = f"The object moved by {pushed[k]:.1f} px against its surroundings in {names[k]}"
+    if np.isinf(pushed[k]):
+        message = f"The {names[k]} shot shows another object in the same surroundings"
+        return Gate("alignment", "fail", None, limit, message, remedy, 45.0, bad, "px")
+    figure = round(float(pushed[k]), 3)
+    if bad:
+        return Gate("alignment", "fail", figure, limit, message, remedy, max(cost, 5.0), bad, "px")
+    if pushed[k] > least:
+        return Gate("alignment", "warn", figure, least, message, remedy, cost, blamed(names, pushed > least), "px")
+    turned = inside - _STILL_PX > least
+    if turned.any():
+        k = int(np.argmax(inside))
+        message = f"Detail inside the object moved by {inside[k]:.1f} px in {names[k]}: the object turned"
+        return Gate(
+            "alignment", "warn", round(float(inside[k]), 3), least, message, remedy, cost, blamed(names, turned), "px"
+        )
+    return Gate("alignment", "pass", figure, least, message, cost_deg=cost, unit="px")
 
 
-def _displacement(found: Evidence) -> Floats:
+def _motion(found: Evidence) -> object_motion.ObjectMotion:
     return object_motion.measure(found.radiance, found.alignment, found.object_)
 
 
@@ -85,7 +102,8 @@ def mask(found: Evidence, limits: GateLimits) -> Gate:
     for message, figure, most in (
         ("The object touches {:.0%} of the picture's border, where it has no outline",
          object_.border, limits.max_mask_border),
-        ("{:.0%} of the object's mask is separate from its largest part; one asset holds all parts", object_.islands, limits.max_mask_islands),
+        ("{:.0%} of the mask is separate from its largest part; one asset holds all",
+         object_.islands, limits.max_mask_islands),
         ("The object's mask has holes of {:.0%} of its area", object_.holes, limits.max_mask_holes),
     ):  # fmt: skip
         if figure > most:

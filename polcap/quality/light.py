@@ -20,6 +20,8 @@ _BRIGHTER = 1.08  # times S0: the greatest that scale and registration explain; 
 _EDGE_PX = 2.0  # 1σ over which two shots are compared: edges of a print need not meet
 _STILL_CLIPPED = 0.5  # share of highlights that a crossed filter should have stopped
 _FEW = 20  # px
+_LEAST_ALBEDO = 0.02  # sum of the channels
+_DEGREES_PER_HIGHLIGHT_DOLP = 100.0  # of the normals: 1 to 2° at 1 %, 2 to 11° at 3 to 15 %
 _ROOM_TILE, _LEAST_ROOM_TILES = 16, 20  # px; tiles
 _WITH_FRAME = 1.5  # size of a chart with its frame over the size of its patches
 _DEGREES_PER_ROOM_DOLP = 50.0  # of the normals: 1.3 to 2.6° at 5.5 % (docs/benchmarks/gates.md)
@@ -295,6 +297,31 @@ def ambient(found: Evidence, limits: GateLimits) -> Gate:
     message = f"{100 * worst:.1f} % of the light does not come from the flash; the ambient frames are subtracted"
     remedy = "Darken the room: the noise and changes of so much ambient light remain"
     return at_most("ambient", worst, limit, message, remedy, cost_deg=60 * worst)
+
+
+def lighting(found: Evidence, limits: GateLimits) -> Gate:
+    """Common polarization of the object's brightest parts, relative to their albedo.
+
+    Under a flash at the lens these face the camera, so their polarization points all ways. Two flashes or softboxes at
+    the sides put highlights where reflection polarizes, both in the same direction.
+    """
+    share, limit = _highlight_dolp(found), limits.max_highlight_dolp
+    message = f"The brightest parts of the object share a polarization of {100 * share:.1f} %"
+    if share > limit:
+        message += ": light from the sides (two flashes, softboxes, a window), which bends normals and roughness"
+    remedy = "Use one flash next to the lens, and darken the room"
+    cost = _DEGREES_PER_HIGHLIGHT_DOLP * share
+    return at_most("lighting", share, limit, message, remedy, cost_deg=cost, beyond=_grade(cost))
+
+
+def _highlight_dolp(found: Evidence) -> float:
+    """Median polarization of the 2 % of the object with most light over albedo; NaN without an object."""
+    inside = found.maps.mask & found.cues.mask
+    if not inside.any():
+        return float("nan")
+    light = found.cues.radiance[inside].sum(-1) / np.maximum(found.maps.diffuse[inside].sum(-1), _LEAST_ALBEDO)
+    bright = light >= np.percentile(light, 98)
+    return float(np.hypot(*np.median(found.cues.ratio[:, inside][:, bright], axis=1)))
 
 
 def room(found: Evidence, limits: GateLimits) -> Gate:

@@ -30,6 +30,9 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_align_residual_px: Annotated[
         float, Meta(gt=0, description="1σ error of a shot's registration [px of the merged picture]")
     ] = 0.15
+    min_object_shift: Annotated[
+        float, Meta(gt=0, le=1, description="movement of the object that is reported [radius of the object]")
+    ] = 0.01
     max_object_shift_px: Annotated[
         float,
         Meta(gt=0, description="movement of the object against its surroundings [px of the merged picture]"),
@@ -82,6 +85,9 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float, Meta(gt=0, le=1, description="false polarization from noise, median over the object [1]")
     ] = 0.04
     max_ambient: Annotated[float, Meta(gt=0, le=1, description="share of ambient light, which is subtracted [1]")] = 0.3
+    max_highlight_dolp: Annotated[
+        float, Meta(gt=0, le=1, description="polarization that the brightest parts of the object share [1]")
+    ] = 0.006
     max_room_dolp: Annotated[
         float, Meta(gt=0, le=1, description="polarization of the surroundings, common to all of them [1]")
     ] = 0.015
@@ -94,7 +100,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.05
     max_ghost: Annotated[
         float,
-        Meta(ge=0, le=1, description="share of the object where the exposures of a shot disagree beyond noise [1]"),
+        Meta(ge=0, le=1, description="share of the object where exposures of a shot disagree beyond noise [1]"),
     ] = 0.02
     max_normal_error_deg: Annotated[
         float, Meta(gt=0, le=90, description="median expected error of the normals [degrees]")

@@ -69,6 +69,9 @@ def of_outline(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     yield _with_ring(of_shots, found.selfcal, limits)
     yield _light_of_body(body, found, limits)
     side = seen.side
+    if found.object_.border > limits.max_mask_border:
+        yield Gate("other light", "not measured", None, limits.max_side_light, "The picture cuts the outline off")
+        return
     k = int(np.argmax(side))
     message = f"The {found.names[k]} shot is {100 * side[k]:.1f} % brighter on one side than the others"
     remedy = "Darken the room and take that shot again: another light was on"

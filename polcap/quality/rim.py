@@ -20,7 +20,7 @@ Bools = NDArray[np.bool_]
 
 _INNER_PX, _DEPTH = 3.0, 0.08  # the band: px from the outline, and up to this share of the object's radius
 _SMOOTH_PX = 1.0
-_LEAST_SECTORS, _MOST_SECTORS = 8, 18  # of 24: a third of the outline, and three quarters
+_LEAST_SECTORS = 8  # of 24: a third of the outline
 _STEP_DEG, _MOST_DEG = 3.0, 48.0  # step and limit of the angles tried; larger errors mean a wrong order or sense
 
 
@@ -145,10 +145,7 @@ def side_light(at: Rim) -> Floats:
     """Relative brightness difference between two sides of the rim in each shot, compared with all shots, (K,).
 
     This is the amplitude of the first harmonic in φ. Polarization changes opposite sides equally, a lamp does not.
-    NaN where the picture's border cuts off more than a quarter of the outline.
     """
-    if len(np.unique(at.sector)) < _MOST_SECTORS:
-        return np.full(len(at.light), np.nan)
     phi = at.azimuth
     basis = np.stack([np.ones_like(phi), *(f(n * phi) for n in (1, 2) for f in (np.cos, np.sin))], axis=1)
     found = np.linalg.lstsq(basis, at.light.T, rcond=None)[0]  # (5, K)

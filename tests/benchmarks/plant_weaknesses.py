@@ -152,6 +152,7 @@ def _plant(plan: Plan, kind: str, random: Random) -> None:
             gaussian_filter(light, 1.5, axes=(0, 1)) if (k, e) == (victim, frame) else light
         )
     elif kind == "black level wrong by 2":
+        plan.scene = replace(scene, backdrop_albedo=0.004)
         black = float(random.choice([-2, 2])) / (shoot.sensor.white - shoot.sensor.black)
         middle = _middle(plan)
         plan.after = lambda light, k, e: np.maximum(light + black / (middle * shoot.step ** (e - 1)), 0)

@@ -12,6 +12,7 @@ from polcap.images import (
     AngleStack,
     Equipment,
     OutlineCheck,
+    Quality,
     RingZero,
     ShotOrder,
     SurfaceMaps,
@@ -95,8 +96,8 @@ def test_each_gate_fails_alone(good: Evidence) -> None:
     pairs: dict[str, Any] = {"exposure_ratio": ratios, "exif_ratio": np.array([[1.0, 4.0]] * 3)}
     faults: dict[str, dict[str, Any]] = {
         "tone curve": {"radiance": bracket(radiance, curvature=curved, **pairs)},
-        "stillness": {"radiance": bracket(radiance, ghost_fraction=np.array([0.0, 0.05, 0.0]))},
-        "ambient": {"radiance": bracket(radiance, ambient_share=np.array([0.2, 0.2, 0.2]))},
+        "stillness": {"radiance": replace(radiance, quality=np.full_like(radiance.quality, Quality.GHOST))},
+        "ambient": {"radiance": bracket(radiance, ambient_share=np.array([0.4, 0.4, 0.4]))},
         "alignment": {"alignment": replace(still, transform=away)},
         "clipping": {"clipped": clipped(0.03)},
         "sharpness": {"blur_px": np.array([[0.0], [2.0], [0.1]])},

@@ -102,7 +102,8 @@ def compare(bracket: Bracket, lines: noise.Lines, read: Reader, limit_px: float)
     for e in bracket.others:
         assert pyramid is not None
         links[e], frames[e] = _compare_frame(source, e, still, pyramid, limit_px)
-        frame = ExposedFrame(frames[e].signals, links[e].ratio, source.line(e))
+        shaded = exposure.vignetting(still, frames[e].signals, links[e].ratio)
+        frame = ExposedFrame(frames[e].signals, links[e].ratio, source.line(e), shaded)
         anchor = anchor or Anchor(ExposedFrame(still, same.ratio, source.line(bracket.reference)))
         new = anchor.ghosts(frame, links[e].misfit, frames[e].mean_gain)
         estimate.add(frame, frame.signals.usable & ~new)

@@ -21,10 +21,11 @@ Bools = NDArray[np.bool_]
 
 _WINDOW = 5  # px, side of the window for comparison and smoothing
 _EVEN = np.full(_WINDOW, 1 / _WINDOW, np.float32)
-# A window is a ghost if its frames differ by more than the sum of these three:
+# A window is a ghost if its frames differ by more than the sum of these four:
 _SIGMA = 6.0  # standard deviations of noise
 _MISFIT = 3.0  # standard deviations of the registration error at edges
-_SHARE = 0.02  # of the radiance: flare and shading differ by as much between exposures
+_SHARE = 0.02  # of the radiance: flare differs by as much between exposures
+_BLACK = 2e-4  # of the sensor's range, at each frame's exposure: error of the black level, 3 of 15,000 counts
 _CORRELATED = 1.5  # variance of a window's mean over that of independent pixels: neighbors share some noise
 
 
@@ -35,6 +36,7 @@ class ExposedFrame:
     signals: Signals
     ratio: Floats  # (C,) float32 exposure relative to the reference frame
     noise: Noise
+    vignetting: Floats | None = None  # (H, W) float32 factor on the ratio, as wide apertures darken corners; None: 1
 
 
 class Anchor:
@@ -102,7 +104,10 @@ class Anchor:
                 np.maximum(beyond, 0, out=beyond)
                 beyond *= np.float32(_MISFIT**2 * misfit[c])
                 limit += np.sqrt(beyond, out=beyond)
+            limit += np.float32(_BLACK * (1 + 1 / float(frame.ratio[c])))
             difference = box(value[c])
+            if frame.vignetting is not None:
+                difference /= frame.vignetting[rows]
             cv2.scaleAdd(difference, -1 / float(frame.ratio[c]), level, difference)
             np.abs(difference, out=difference)
             np.abs(level, out=level)

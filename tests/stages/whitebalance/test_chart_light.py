@@ -65,7 +65,7 @@ def test_the_slope_of_the_light_gives_the_flash_s_place(flash: tuple[float, floa
 
 def test_a_slope_that_no_flash_at_the_lens_causes_makes_the_level_doubtful():
     place, point, normal = seen((5, 12, 3), (0.02, 0.0))
-    lamp = slope(point, normal, (0, 0)) + [0.06, 0.0]  # a third from side to side
+    lamp = slope(point, normal, (0, 0)) + np.array([0.06, 0.0])  # a third from side to side
     assert 0.15 < chart_light.measure(place, VIEW, lamp, 0.5).uneven < 0.35
 
 
