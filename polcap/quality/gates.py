@@ -53,6 +53,7 @@ def _in_order(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iter
     yield light.stillness(found, limits)
     yield light.clipping(found, limits)
     yield geometry.sharpness(found, limits)
+    yield geometry.focus(found, limits)
     yield from light.gains(found, limits)
     yield polarization.order(found)
     yield from polarization.of_outline(found, limits)

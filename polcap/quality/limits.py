@@ -52,6 +52,9 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float,
         Meta(gt=0, le=20, description="1σ of a frame's blur beyond the sharpest frame [RAW px]"),
     ] = 1.2
+    max_edge_blur_px: Annotated[
+        float, Meta(gt=0, le=20, description="1σ blur of the object's sharpest edges [px of the merged picture]")
+    ] = 1.65
     max_turn_deg: Annotated[
         float,
         Meta(ge=3, le=45, description="error of an angle, measured from the outline [degrees]"),

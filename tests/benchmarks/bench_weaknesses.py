@@ -73,7 +73,7 @@ def judge(folder: Path, seed: int, kind: str) -> Row:
     row: Row = {"seed": seed, "kind": kind}
     plant_weaknesses.write(place, seed, kind)
     try:
-        row |= _processed(place, ChartRequest("none" if kind == "no chart" else "auto"))
+        row |= _processed(place, ChartRequest("none" if kind in ("no chart", "all out of focus by 3 px") else "auto"))
     except InputError as error:
         row |= {"verdict": "refused", "gates": {type(error).__name__: ["fail", str(error)]}}
     except Exception:

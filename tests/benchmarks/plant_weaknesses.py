@@ -37,7 +37,7 @@ KINDS: dict[str, tuple[str, ...]] = {
     "pushed 1 px": ("alignment",),
     "two softboxes": ("body", "other light", "lighting"),
     "two flashes": ("body", "other light", "lighting"),
-    "all out of focus by 3 px": ("sharpness",),
+    "all out of focus by 3 px": ("focus",),
     "black level wrong by 2": ("stillness",),
     "vignetting of wide apertures": ("stillness",),
     "ambient frame": ("ambient",),

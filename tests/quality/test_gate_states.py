@@ -40,12 +40,14 @@ BODY = {
 TURN = {"shot": None, "angle": 0.0, "misfit": 1.0, "sigmas": 0.0}
 FIGURES = {
     "inward_outline": 0.0, "surroundings": 0.001, "highlight": 0.001,
-    "object_motion": ObjectMotion(np.array([0.0, 0.1, 0.1]), np.array([0.0, 0.1, 0.1])), "charted": 0.0, "noise": 0.001, "ill_posed": 0.0, "shape": [45.0, 0.2],
+    "object_motion": ObjectMotion(np.array([0.0, 0.1, 0.1]), np.array([0.0, 0.1, 0.1])), "edge_blur": 0.8,
+    "charted": 0.0, "noise": 0.001, "ill_posed": 0.0, "shape": [45.0, 0.2],
     "normal_error": 4.0, "lean": 2.0, "crossed": {"left": 0.0, "clipped": 0, "over": 0.0, "mirrored": 0.1},
 }  # fmt: skip
 MEASURES = {  # the function that measures each figure
     "surroundings": (light, "_surroundings_dolp"), "highlight": (light, "_highlight_dolp"),
-    "object_motion": (geometry, "_motion"), "charted": (geometry, "_charted"), "lean": (geometry, "_lean"),
+    "object_motion": (geometry, "_motion"), "edge_blur": (geometry, "_edge_blur"),
+    "charted": (geometry, "_charted"), "lean": (geometry, "_lean"),
     "noise": (light, "_noise"), "crossed": (light, "_crossed"), "ill_posed": (polarization, "_ill_posed"),
     "shape": (polarization, "_median_shape"), "outline": (polarization, "_outline"),
     "normal_error": (gates, "_own_error"), "inward_outline": (geometry, "_inward_share"),
@@ -137,6 +139,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("sharpness", "not measured", {}),
     ("sharpness", "not measured",
      {"blur_px": np.array([[0.0, 0.1]] * 3), "alignment": {"transform": FAR}}),
+    ("focus", "pass", {}),
+    ("focus", "warn", {"figures": {"edge_blur": 2.5}}),
     ("gains", "pass", {}),
     ("gains", "fail", gains(gain=np.array([[1.0] * 3, [1.0] * 3, [0.7] * 3]))),
     ("energy", "pass", {}),
