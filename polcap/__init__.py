@@ -23,17 +23,6 @@ if TYPE_CHECKING:
     from polcap.images import Asset, Capture, ChartRequest, Cues, Frame, Mesh, Shot, StokesImage, SurfaceMaps, View
 
 __version__ = "0.1.0"
-_HOME = {  # public name → module and its name there
-    "process": ("polcap.api", "process"),
-    "Result": ("polcap.api", "Result"),
-    "Config": ("polcap.config", "Config"),
-    "load_config": ("polcap.config", "load"),
-    "PolcapError": ("polcap.errors", "PolcapError"),
-    "read_capture": ("polcap.formats.capture.reader", "read"),
-    "read_maps": ("polcap.formats.maps.maps_folder", "read"),
-}
-_VALUES = ("Asset", "Capture", "ChartRequest", "Cues", "Frame", "Mesh", "Shot", "StokesImage", "SurfaceMaps", "View")
-_HOME |= {name: ("polcap.images", name) for name in _VALUES}
 __all__ = [
     "Asset",
     "Capture",
@@ -53,13 +42,22 @@ __all__ = [
     "read_capture",
     "read_maps",
 ]
+_HOME = {  # public name → module and its name there; the others are values of `polcap.images`
+    "process": ("polcap.api", "process"),
+    "Result": ("polcap.api", "Result"),
+    "Config": ("polcap.config", "Config"),
+    "load_config": ("polcap.config", "load"),
+    "PolcapError": ("polcap.errors", "PolcapError"),
+    "read_capture": ("polcap.formats.capture.reader", "read"),
+    "read_maps": ("polcap.formats.maps.maps_folder", "read"),
+}
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name from its module."""
-    if name not in _HOME:
+    if name not in __all__:
         raise AttributeError(f"module 'polcap' has no attribute {name!r}")
-    module, there = _HOME[name]
+    module, there = _HOME.get(name, ("polcap.images", name))
     return getattr(import_module(module), there)
 
 

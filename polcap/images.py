@@ -265,6 +265,11 @@ class Capture:
     crossed: Shot | None = None  # under a polarized flash; its angle is that of the lens's polarizer
 
     @property
+    def all_shots(self) -> tuple[Shot, ...]:
+        """The shots, and the crossed shot if there is one."""
+        return self.shots if self.crossed is None else (*self.shots, self.crossed)
+
+    @property
     def angle(self) -> Floats:
         """(K,) rad, polarizer axes: as stated, or corrected by the ring's calibration."""
         return self._turned(np.array([shot.angle for shot in self.shots]))

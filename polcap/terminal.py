@@ -1,9 +1,11 @@
 """Output of the commands: data on stdout, messages and progress on stderr, exit codes."""
 
 import functools
+import json
 import os
 import sys
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -21,7 +23,14 @@ if TYPE_CHECKING:
 
 
 _LONGEST = 600  # characters of a message
-_QUIET_S = 5.0  # between two lines about frames, where there is no terminal to write over
+_FRAMES_S = 5.0  # between two lines about frames, where there is no terminal to write over
+_verbosity = 0  # -1 with --quiet, 1 with --verbose
+
+
+def set_verbosity(quiet: bool, verbose: bool) -> None:
+    """Print no progress, or a line per frame and stage in place of a bar."""
+    global _verbosity
+    _verbosity = -1 if quiet else int(verbose)
 
 
 def reported(command: Callable[..., None]) -> Callable[..., None]:
@@ -31,60 +40,44 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
     def run(context: typer.Context, *args: Any, **kwargs: Any) -> None:
         try:
             command(context, *args, **kwargs)
-        except BrokenPipeError:  # the reader of stdout has ended
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            code = 0
-        except KeyboardInterrupt:
-            again = " with --resume" if kwargs.get("resume") is False else ""
-            message = f"interrupted; run the same command again{again} to go on"
-            print(f"polcap: {message}", file=sys.stderr)
-            code = 130
-            if not kwargs.get("watch"):  # Ctrl-C is its normal end
-                print_error_document(kwargs, KeyboardInterrupt(message), code)
-        except PolcapError as error:
-            traceback_of(error, context)
-            print_message(f"polcap: error: {line(error)}")
-            code = error.exit_code
-            print_error_document(kwargs, error, code)
+            return
         except (typer.Exit, typer.Abort):
             raise
-        except Exception as error:
-            traceback_of(error, context)
-            if resource_limits.is_shortfall(error):
-                print_message("polcap: error: out of memory; raise --memory or take a larger machine")
-                code = SettingError.exit_code
-                print_error_document(kwargs, error, code)
-            elif isinstance(error, OSError):  # refused by the system: no bug
-                name = f"{error.filename}: " if error.filename else ""
-                print_message(
-                    f"polcap: error: {name}{error.strerror or line(error)}; check the path and its permissions"
-                )
-                code = SettingError.exit_code
-                print_error_document(kwargs, error, code)
-            else:
-                kind, how = type(error).__name__, "with the lines above" if context.obj else "run with --debug and"
-                print_message(f"polcap: bug: {kind}: {line(error)}; {how} report it")
-                code = 1
-                print_error_document(kwargs, error, code)
-        else:
-            return
+        except BrokenPipeError:  # the reader of stdout has ended
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(0) from None
+        except (Exception, KeyboardInterrupt) as error:
+            if context.obj and isinstance(error, Exception):  # --debug
+                print_message("".join(traceback.format_exception(error)).rstrip())
+            text, code = _explained(error, context.obj, kwargs.get("resume") is False)
+            print_message(f"polcap: {text}")
+            if not (isinstance(error, KeyboardInterrupt) and kwargs.get("watch")):  # Ctrl-C is its normal end
+                print_error_document(kwargs, error, text.removeprefix("error: "), code)
         raise typer.Exit(code)
 
     return run
 
 
-def traceback_of(error: BaseException, context: typer.Context) -> None:
-    """Print the traceback, with --debug."""
-    if context.obj:
-        import traceback
+def _explained(error: BaseException, debug: bool, resumable: bool) -> tuple[str, int]:
+    """Message and exit code of an error."""
+    if isinstance(error, KeyboardInterrupt):
+        return f"interrupted; run the same command again{' with --resume' if resumable else ''} to go on", 130
+    if isinstance(error, PolcapError):
+        return f"error: {line(error)}", error.exit_code
+    if resource_limits.is_shortfall(error):
+        return "error: out of memory; raise --memory or take a larger machine", SettingError.exit_code
+    if isinstance(error, OSError):  # refused by the system: no bug
+        name = f"{error.filename}: " if error.filename else ""
+        reason = f"{name}{error.strerror or line(error)}; check the path and its permissions"
+        return f"error: {reason}", SettingError.exit_code
+    remedy = "with the lines above" if debug else "run with --debug and"
+    return f"bug: {type(error).__name__}: {line(error)}; {remedy} report it", 1
 
-        print_message("".join(traceback.format_exception(error)).rstrip())
 
-
-def print_error_document(options: dict[str, Any], error: BaseException, code: int) -> None:
+def print_error_document(options: dict[str, Any], error: BaseException, text: str, code: int) -> None:
     """Print an error as JSON on stdout, with --json; a failed gate has printed its report already."""
     if options.get("json") and not isinstance(error, GateError):
-        print_data({"error": {"kind": type(error).__name__, "says": line(error), "exit_code": code}})
+        print_data({"error": {"kind": type(error).__name__, "says": text, "exit_code": code}})
 
 
 def line(error: BaseException) -> str:
@@ -103,13 +96,16 @@ def print_message(text: str) -> None:
     print(printable(text), file=sys.stderr, flush=True)
 
 
+def print_progress(text: str) -> None:
+    """Print a message on stderr that --quiet suppresses."""
+    if _verbosity >= 0:
+        print_message(text)
+
+
 def print_data(data: Any) -> None:
     """Print data on stdout: text as it is, anything else as one JSON document."""
-    if not isinstance(data, str):
-        import json
-
-        data = json.dumps(data, ensure_ascii=False, indent=1)
-    print(printable(data), flush=True)
+    text = data if isinstance(data, str) else json.dumps(data, ensure_ascii=False, indent=1)
+    print(printable(text), flush=True)
 
 
 def preview(drawn: "list[Path]") -> None:
@@ -136,7 +132,7 @@ def preview(drawn: "list[Path]") -> None:
 def print_result(about: dict[str, Any], out: "Path", json: bool) -> None:
     """Print the asset's path or the report, and the verdict. Raises GateError where a gate failed."""
     print_data(about if json else str(out / "asset" / f"{about['capture']['name']}.glb"))
-    print_message(f"verdict {about['verdict']}; {out / 'report.html'}")
+    print_progress(f"verdict {about['verdict']}; {out / 'report.html'}")
     print_gates(about)
 
 
@@ -160,20 +156,21 @@ class Steps:
         self._begun = self._last = time.monotonic()
 
     def stage(self, name: str, seconds: float | None, cached: bool) -> None:
-        """A stage begins (no seconds) or has ended."""
+        """Report that a stage begins (no seconds) or has ended."""
         if seconds is not None:
-            print(f"{name:14}{'cached' if cached else f'{seconds:.2f} s'}", file=sys.stderr, flush=True)
+            print_progress(f"{name:14}{'cached' if cached else f'{seconds:.2f} s'}")
 
     def frame(self, done: int, total: int) -> None:
         """Report that `done` of `total` photographs are done."""
         now = time.monotonic()
-        if now - self._last > _QUIET_S:
+        if now - self._last > _FRAMES_S or _verbosity > 0:
             self._last = now
-            print(f"{done} of {total} frames, {self._left(done, total, now)} left", file=sys.stderr, flush=True)
+            print_progress(self._frames(done, total, now))
 
-    def _left(self, done: int, total: int, now: float) -> str:
+    def _frames(self, done: int, total: int, now: float) -> str:
         seconds = (now - self._begun) / done * (total - done)
-        return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+        left = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+        return f"{done} of {total} frames, {left} left"
 
 
 class Bar(Steps):
@@ -184,19 +181,18 @@ class Bar(Steps):
         self._bar, self._task = bar, task
 
     def stage(self, name: str, seconds: float | None, cached: bool) -> None:
-        """A stage begins (no seconds) or has ended."""
+        """Report that a stage begins (no seconds) or has ended."""
         self._bar.update(self._task, description=name, advance=0 if seconds is None else 1)
 
     def frame(self, done: int, total: int) -> None:
         """Report that `done` of `total` photographs are done."""
-        left = self._left(done, total, time.monotonic())
-        self._bar.update(self._task, description=f"{done} of {total} frames, {left} left")
+        self._bar.update(self._task, description=self._frames(done, total, time.monotonic()))
 
 
 @contextmanager
 def progress(total: int) -> Iterator[Steps]:
     """A bar on a terminal, else a line per finished stage."""
-    if not sys.stderr.isatty():
+    if _verbosity or not sys.stderr.isatty():
         yield Steps()
         return
     from rich.console import Console

@@ -96,7 +96,7 @@ def shoot(folder: Path, seed: int, fault: str, width: int) -> str:
             "rot_deg": roll[k],
             "transform": synthetic.transform(how, (shift[k, 0], shift[k, 1]), roll[k]).tolist(),
         }
-        radiance = studio.radiance(pose, first=k == 0)
+        radiance = studio.radiance(pose)
         for e in range(3):
             stops = how.step ** (e - 1)
             file = folder / f"pol{_ANGLES[names[k]]:03.0f}" / f"IMG_{3 * k + e + 1:04d}.DNG"

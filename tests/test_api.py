@@ -10,15 +10,18 @@ from polcap.formats.maps import maps_folder as maps
 from polcap.pipeline import models
 
 
-def test_importing_polcap_imports_nothing_heavy() -> None:
-    code = "import sys, polcap; print([m for m in ('numpy', 'cv2', 'msgspec', 'onnxruntime') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
-def test_importing_the_path_imports_no_heavy_library() -> None:
-    heavy = ("OpenImageIO", "scipy", "onnxruntime", "trimesh", "rawpy")
-    code = f"import sys, polcap.pipeline.run; print([m for m in {heavy} if m in sys.modules])"
+@pytest.mark.parametrize(
+    ("modules", "heavy"),
+    [
+        ("polcap", ("numpy", "cv2", "msgspec", "onnxruntime")),
+        (
+            "polcap.pipeline.run, polcap.pipeline.check",
+            ("OpenImageIO", "scipy", "onnxruntime", "trimesh", "rawpy", "jinja2"),
+        ),
+    ],
+)
+def test_an_import_loads_no_library_that_only_some_runs_need(modules: str, heavy: tuple[str, ...]) -> None:
+    code = f"import sys, {modules}; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

@@ -22,10 +22,6 @@ def test_assignment_beats_file_beats_default(tmp_path: Path) -> None:
     assert config.mask == Config().mask
 
 
-def test_words_need_no_quotes() -> None:
-    assert load(None, ["align.model=homography", "selfcal.check_order=false"]).align.model == "homography"
-
-
 @pytest.mark.parametrize(
     ("assignment", "words"),
     [
@@ -53,19 +49,16 @@ def test_wrong_assignment_is_named_with_value_and_limit(assignment: str, words: 
         ("[hdr", "not TOML"),
         ("[colour]\nx = 1", "colour.x"),
         ("[hdr]\nclip = '0.9'", "hdr.clip"),
+        (None, "--config"),
     ],
 )
-def test_wrong_file_is_one_line(tmp_path: Path, text: str, words: str) -> None:
+def test_wrong_or_missing_file_is_one_line(tmp_path: Path, text: str | None, words: str) -> None:
     file = tmp_path / "polcap.toml"
-    file.write_text(text)
+    if text is not None:
+        file.write_text(text)
     with pytest.raises(SettingError, match=words) as caught:
         load(file)
     assert "\n" not in str(caught.value)
-
-
-def test_missing_file_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(SettingError, match="--config"):
-        load(tmp_path / "none.toml")
 
 
 def test_every_setting_is_described() -> None:
@@ -82,6 +75,7 @@ def test_a_list_may_be_typed_without_brackets(text: str) -> None:
     assert fill(Shoot, {}, [f"angles_deg={text}"]).angles_deg == (0, 60, 120)
 
 
-def test_a_number_needs_no_zero_before_its_point() -> None:
-    assert load(None, ["gates.max_mask_doubt=.3"]).gates.max_mask_doubt == 0.3
+def test_words_need_no_quotes_and_numbers_no_leading_zero() -> None:
+    config = load(None, ["align.model=homography", "gates.max_mask_doubt=.3"])
+    assert (config.align.model, config.gates.max_mask_doubt) == ("homography", 0.3)
     assert fill(Shoot, {}, ["angles_deg=[.5, 45, 90.5]"]).angles_deg == (0.5, 45, 90.5)

@@ -27,7 +27,12 @@ GLOSSY = Coat((Material((0.12, 0.08, 0.06), (0.45, 0.4, 0.3), "chequer", size=0.
 BALL = Scene(
     shape=Cluster(((0, 0, 0, 0.08),)), coat=GLOSSY, position=(0.0, 0.0, -0.7), light=(0.0, 0.05, 0.0), chart=None
 )
-NONE = (None, None)  # no network
+
+
+def no_networks() -> tuple[None, None]:
+    return None, None
+
+
 SHOOT = Shoot(width=320, height=240, exposures=1, samples=1, cross=True, exposure_factor=2.0, gain_jitter=0.002)
 
 
@@ -103,13 +108,13 @@ def test_both_parts_of_the_light_are_written(
 
 
 def test_process_and_check_say_what_the_crossed_shot_shows(capture: Capture, results: tuple[Results, Results]) -> None:
-    lines = {line.name: line for line in check.inspect(capture, NONE, Config(), chart=ChartRequest("none")).lines}
+    lines = {line.name: line for line in check.inspect(capture, Config(), ChartRequest("none"), no_networks).lines}
     assert lines["crossed"].state == "pass" and "mirrored" in lines["crossed"].message
 
 
 def test_a_filter_that_was_not_crossed_is_told(capture: Capture) -> None:
     """The first shot once more for the crossed one: its highlights clip as well."""
     shown = replace(capture, crossed=replace(capture.shots[0], frames=capture.shots[0].frames))
-    lines = {line.name: line for line in check.inspect(shown, NONE, Config(), chart=ChartRequest("none")).lines}
+    lines = {line.name: line for line in check.inspect(shown, Config(), ChartRequest("none"), no_networks).lines}
     assert lines["crossed"].state == "warn" and "clipped" in lines["crossed"].message
     assert gates.verdict(lines.values()) != "pass"

@@ -13,7 +13,7 @@ from polcap.formats.capture import reader as captures
 from polcap.images import Calibration, ChartRequest, LensGeometry
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
-from polcap.synth import lens, scenes, shooting
+from polcap.synth import forward_camera, scenes, shooting
 
 SHOOT = shooting.Shoot(
     seed=5, width=384, height=288, samples=1, exposures=1, focal_mm=35.0, distortion=(-0.25, 0.1), nudge_px=0.8
@@ -47,7 +47,7 @@ def test_stokes_are_those_of_a_pinhole(shot, tmp_path, monkeypatch):
     assert any("k1 -0.2500" in note for note in capture.notes)
     truth = np.load(shot / "truth.npz")
     y, x = np.mgrid[:288.0, :384.0]
-    u, v = (np.rint(at).astype(int) for at in lens.undistort(SHOOT.view, SHOOT.distortion, x, y))
+    u, v = (np.rint(at).astype(int) for at in forward_camera.undistort(SHOOT.view, SHOOT.distortion, x, y))
     inside = (u >= 0) & (v >= 0) & (u < 384) & (v < 288)
     seen = inside & truth["mask"][np.clip(v, 0, 287), np.clip(u, 0, 383)]
     supplied = UserInput(chart=ChartRequest("none"), mask=seen)

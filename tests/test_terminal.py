@@ -1,4 +1,4 @@
-"""What a command says, where, and with which exit code."""
+"""Messages of the commands, their streams and exit codes."""
 
 import json
 import time
@@ -8,7 +8,8 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from polcap import __version__, cli, terminal
+from polcap import __version__, cli, config, terminal
+from polcap.cli import options
 from polcap.pipeline import run as pipeline
 from tests.conftest import Command
 
@@ -19,60 +20,82 @@ def test_short_help_and_completion_are_there(polcap: Command) -> None:
     assert polcap("--version") == (0, f"{__version__}\n", "")
 
 
-def test_with_json_an_error_is_a_document_too(polcap: Command, tmp_path: Path) -> None:
-    done = polcap("process", tmp_path / "none", "--json")
-    said = json.loads(done.stdout)["error"]
-    assert done.returncode == said["exit_code"] == 2 and "no such folder" in said["says"]
-    assert "no such folder" in done.stderr
+def test_help_has_complete_summaries_and_explains_a_command(polcap: Command) -> None:
+    text = polcap("help").stdout
+    assert text == polcap("--help").stdout and "..." not in text.partition("Commands")[2]
+    assert all(f"  {command.__name__} " in text for command in cli.COMMANDS)
+    assert polcap("help", "export").stdout == polcap("export", "-h").stdout
+    assert "Did you mean 'export'" in polcap("help", "exprt").stderr
+
+
+def test_settings_are_listed_with_default_range_and_meaning(polcap: Command) -> None:
+    every = json.loads(polcap("settings", "--json").stdout)
+    assert [row["name"] for row in every] == [setting.key for setting in config.settings()]
+    of_stage = json.loads(polcap("settings", "hdr", "--json").stdout)
+    assert of_stage == [row for row in every if row["name"].startswith("hdr.")]
+    assert "hdr.clip = 0.98  (≥ 0.5, ≤ 1.0)\n    clipping threshold" in polcap("settings", "hdr").stdout
+    assert "stokes.undistort = true\n" in polcap("settings", "stokes").stdout
+    assert "choose one of hdr, whitebalance" in polcap("settings", "polish").stderr
+
+
+def test_quiet_prints_only_data_and_errors_wherever_it_is(polcap: Command, tmp_path: Path) -> None:
+    small = ("--rotator", "simulated?settle=0", "--camera", "simulated?width=96&height=72&samples=1", "--no-check")
+    assert polcap("capture", tmp_path / "c", *small, "-q") == (0, f"{tmp_path / 'c'}\n", "")
+    assert polcap("-q", "process", tmp_path / "none").stderr.startswith("polcap: error: ")
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("words", "message"),
     [
+        (("process", "none"), "no such folder"),
         (("process",), "missing argument"),
         (("batch", "none", "--worker", "2"), "--worker"),
         (("export", "none", "--lod", "many"), "--lod"),
         (("procces", "none"), "procces"),
     ],
 )
-def test_with_json_a_command_line_that_is_none_is_a_document_too(
-    polcap: Command, words: tuple[str, ...], says: str
-) -> None:
+def test_with_json_an_error_is_a_document_too(polcap: Command, words: tuple[str, ...], message: str) -> None:
     done = polcap(*words, "--json")
-    said = json.loads(done.stdout)["error"]
-    assert done.returncode == said["exit_code"] == 2 and said["kind"] == "SettingError"
-    assert says in said["says"] and says in done.stderr
+    error = json.loads(done.stdout)["error"]
+    assert done.returncode == error["exit_code"] == 2 and message in error["says"] and message in done.stderr
     assert polcap(*words).stdout == ""
 
 
-def test_with_json_an_interruption_is_a_document_too(polcap: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("words", "how"),
+    [(("show", "none", "hdr", "--json"), ""), (("train", "x"), " with --resume"), (("evaluate", "x", "y"), "")],
+)
+def test_an_interruption_is_one_line_with_the_remedy(
+    polcap: Command, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], how: str
+) -> None:
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(pipeline, "show", interrupted)
-    done = polcap("show", "none", "hdr", "--json")
-    said = json.loads(done.stdout)["error"]
-    assert done.returncode == said["exit_code"] == 130 and "run the same command again" in said["says"]
+    monkeypatch.setattr(options, "training", interrupted)
+    done = polcap(*words)
+    assert done.returncode == 130
+    assert done.stderr == f"polcap: interrupted; run the same command again{how} to go on\n"
+    assert ("--json" in words) == ("run the same command again" in done.stdout)
 
 
-def test_no_choice_minds_case() -> None:
+def test_no_choice_depends_on_case() -> None:
     hints = [get_type_hints(command.callback, include_extras=True) for command in cli.app.registered_commands]
     declared = [get_args(hint) for hint in chain.from_iterable(one.values() for one in hints)]
     choices = [info for kind, *info in filter(None, declared) if "Literal[" in str(kind)]
     assert len(choices) > 10 and not any(info[0].case_sensitive for info in choices)
 
 
-def test_a_photograph_instead_of_its_folder_is_told(polcap: Command, example: Path) -> None:
-    done = polcap("process", next(example.rglob("*.DNG")))
-    assert done.returncode == 2 and "give the folder that holds all photographs" in done.stderr
-
-
-def test_frames_are_told_now_and_then_with_the_time_left(
+def test_frames_are_reported_every_five_seconds_with_the_time_left(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    clock = iter([0.0, 2.0, 6.0, 8.0, 12.0])
+    clock = iter([0.0, 2.0, 6.0, 8.0, 12.0, 12.1])
     monkeypatch.setattr(time, "monotonic", lambda: next(clock))
     steps = terminal.Steps()
     for done in (1, 2, 3, 4):
         steps.frame(done, 9)
     assert capsys.readouterr().err.splitlines() == ["2 of 9 frames, 21 s left", "4 of 9 frames, 15 s left"]
+    terminal.set_verbosity(quiet=False, verbose=True)
+    steps.frame(5, 9)
+    terminal.set_verbosity(quiet=False, verbose=False)
+    assert capsys.readouterr().err.startswith("5 of 9 frames")

@@ -82,18 +82,19 @@ def run(
     found = find(root, out)
     mine = plan.shard.of(found)
     batch_folder = Path(found[0].batch_folder)
-    with atomic.path(batch_folder / "batch.json") as temporary:  # `polcap status` reads it when --out was used
-        places = {"root": str(root.resolve()), "out": None if out is None else str(out.resolve())}
-        temporary.write_text(json.dumps(places) + "\n", encoding="utf-8")
+    places = {"root": str(root.resolve()), "out": None if out is None else str(out.resolve())}
+    atomic.write(batch_folder / "batch.json", json.dumps(places) + "\n")  # for `reopen`
     records = {unit: record for unit in mine if (record := units.finished(unit, options)) is not None}
     wanted = [unit for unit in mine if unit not in records]
     print_line(f"{len(found)} captures, shard {plan.shard}: {len(mine)}, finished before: {len(records)}")
     by_name = {unit.name: unit for unit in wanted}
     start = time.monotonic()
-    for record in _process(wanted, options, plan, print_line) if wanted else ():
+    for done, record in enumerate(_process(wanted, options, plan, print_line) if wanted else (), 1):
         records[by_name[record.name]] = record
-        done = len(records) - (len(mine) - len(wanted))
-        print_line(progress(record, done, len(wanted), time.monotonic() - start))
+        left = timedelta(seconds=round((time.monotonic() - start) / done * (len(wanted) - done)))
+        message = f": {record.message}" if record.message else ""
+        state = f"{done}/{len(wanted)} {record.name} {record.state} {record.seconds:.1f} s"
+        print_line(f"{state}, {left} left{message}")
         if record.state not in FINISHED and not plan.keep_going:
             print_line("stopped at the first failure; --keep-going processes the others")
             break
@@ -109,13 +110,6 @@ def _process(
 
         return cluster.run(wanted, options, plan.scheduler, plan.workers, plan.retries, print_line)
     return processes.run(wanted, options, plan.workers, plan.retries)
-
-
-def progress(record: UnitRecord, done: int, total: int, seconds: float) -> str:
-    """One line: number of finished captures, the last one's result, and the estimated time left."""
-    left = timedelta(seconds=round(seconds / done * (total - done)))
-    message = f": {record.message}" if record.message else ""
-    return f"{done}/{total} {record.name} {record.state} {record.seconds:.1f} s, {left} left{message}"
 
 
 def status(found: Sequence[Unit]) -> dict[str, Any]:

@@ -48,8 +48,7 @@ def write(batch_folder: Path, units: Sequence[Unit], records: Sequence[UnitRecor
         "summary.html": _page(totals, units, records),
     }
     for name, content in written.items():
-        with atomic.path(batch_folder / name) as temporary:
-            temporary.write_text(content, encoding="utf-8", errors="backslashreplace")  # names of folders are bytes
+        atomic.write(batch_folder / name, content)  # names of folders are bytes
 
 
 def _page(totals: dict[str, Any], units: Sequence[Unit], records: Sequence[UnitRecord]) -> str:

@@ -88,8 +88,7 @@ def write(scheduler: Scheduler, job: BatchJob, folder: Path) -> Path:
     """Fill the scheduler's template; returns the path of the job file. Raises StorageError."""
     template = files("polcap.batch").joinpath("templates", _FILES[scheduler]).read_text(encoding="utf-8")
     text = Template(template).substitute(_fields(scheduler, job, folder))
-    with atomic.path(folder / _FILES[scheduler]) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    atomic.write(folder / _FILES[scheduler], text)
     return folder / _FILES[scheduler]
 
 

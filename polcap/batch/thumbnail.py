@@ -16,8 +16,7 @@ def write(file: Path, result: Path) -> None:
     """Write the normal and the diffuse albedo of a result folder, side by side, as a JPEG."""
     pictures = [_small(result / "maps" / name) for name in ("normal.png", "diffuse.png")]
     _, encoded = cv2.imencode(".jpg", np.hstack(pictures), [cv2.IMWRITE_JPEG_QUALITY, 85])
-    with atomic.path(file) as temporary:
-        temporary.write_bytes(encoded.tobytes())
+    atomic.write(file, encoded.tobytes())
 
 
 def _small(file: Path) -> Any:

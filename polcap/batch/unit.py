@@ -161,8 +161,7 @@ def read_record(unit: Unit) -> UnitRecord:
 
 
 def write_record(unit: Unit, record: UnitRecord) -> None:
-    with atomic.path(unit.record_file, synced=False) as temporary:
-        temporary.write_text(json.dumps(msgspec.to_builtins(record)) + "\n", encoding="utf-8")
+    atomic.write(unit.record_file, json.dumps(msgspec.to_builtins(record)) + "\n", synced=False)
 
 
 def crashed(unit: Unit, message: str, attempt: int) -> UnitRecord:
@@ -189,8 +188,7 @@ def _write_traceback(unit: Unit) -> str:
     """Write the traceback of the present exception; returns where it is, or why it could not be written."""
     file, text = unit.record_file.with_suffix(".txt"), traceback.format_exc()
     try:
-        with atomic.path(file) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        atomic.write(file, text)
     except InputError as error:
         return f"the traceback could not be written: {_line(error)}"
     return f"the traceback is in {file}"

@@ -90,21 +90,17 @@ def measure(brackets: list[list[Photograph]]) -> tuple[NoiseLine, ...]:
 
 def _pair(a: Signals, b: Signals) -> BracketTiles | None:
     """Tiles of two frames, darker and brighter; None if their exposures are too similar."""
-    found = exposure.ratio(a, b)
+    found = exposure.of_tiles(*exposure.common_tiles(a, b))
     if found is None or not np.all(np.maximum(found.value, 1 / found.value) > _LEAST_RATIO):
         return None
     r = found.value.astype(np.float32)[:, None, None]
     weight = 1 / (1 + r * r)
-    columns: tuple[list[Floats], ...] = ([], [], [])
-    for rows in noise.strips(a.usable.shape[0], a.usable.shape[1], _MOST_PX):
-        one, two = a.rows(rows), b.rows(rows)
-        whole = noise.usable_tiles(a.usable[rows] & b.usable[rows])
-        rough = noise.roughness(two - r * one)
-        gx, gy = two[:, 1:-1, 2:] - two[:, 1:-1, :-2], two[:, 2:, 1:-1] - two[:, :-2, 1:-1]
-        maps = ((two + r * r * one)[:, 1:-1, 1:-1] * weight, rough * rough * weight, (gx * gx + gy * gy) / 4 * weight)
-        for column, values in zip(columns, maps):
-            column.append(noise.tiles(values, whole))
-    level, variance, edges = (np.concatenate(column).astype(np.float64) for column in columns)
+
+    def maps(one: Floats, two: Floats) -> tuple[Floats, ...]:
+        level, rough = noise.inner(two + r * r * one), noise.roughness(two - r * one)
+        return level * weight, rough**2 * weight, noise.squared_differences(two) * weight
+
+    level, variance, edges = noise.tile_columns((a, b), maps, _MOST_PX)
     part = np.arange(len(level)) * _PARTS // max(len(level), 1)
     good = np.isfinite(level).all(axis=1)
     return BracketTiles(level[good], variance[good], edges[good], part[good])

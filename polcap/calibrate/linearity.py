@@ -1,9 +1,10 @@
 """Linearity of a sensor: signal against exposure time, from flat frames in steady light."""
 
 import numpy as np
+from scipy import stats
 
 from polcap.calibrate.calibration_photographs import Photograph, by_setting, center
-from polcap.images import Floats, Linearity
+from polcap.images import Linearity
 
 _LEAST = 0.02  # of white; below, the error of black matters more than a curve
 
@@ -28,13 +29,12 @@ def measure(flat: list[Photograph]) -> Linearity | None:
     light = np.array([np.mean([value for at, value in best if at == time]) for time in times])
     gain = float(np.exp(np.mean(np.log(light / exposure))))
     deviation = light / (gain * exposure) - 1
-    power, sigma = _power(np.log(exposure), np.log(light))
-    return Linearity(float(np.abs(deviation).max()), power, sigma, float(light.min()), float(light.max()), len(times))
-
-
-def _power(x: Floats, y: Floats) -> tuple[float, float]:
-    """Slope of a straight line and its 1σ from the scatter about it."""
-    centered = x - x.mean()
-    slope = float(centered @ (y - y.mean()) / (centered @ centered))
-    scatter = y - y.mean() - slope * centered
-    return slope, float(np.sqrt(scatter @ scatter / max(len(x) - 2, 1) / (centered @ centered)))
+    line = stats.linregress(np.log(exposure), np.log(light))
+    return Linearity(
+        greatest_deviation=float(np.abs(deviation).max()),
+        power=float(line.slope),
+        power_sigma=float(line.stderr),
+        darkest=float(light.min()),
+        brightest=float(light.max()),
+        exposures=len(times),
+    )

@@ -10,6 +10,7 @@ result_commands    export, show, status, report
 check_command      keep a capture or reshoot it
 calibrate_command  measured camera, lens, polarizer and flash
 doctor_command     check of this machine or of one photograph
+settings_command   list of all settings
 synth_command      captures of objects that do not exist
 capture_command    shooting with a rig
 training_commands  train, evaluate
@@ -19,7 +20,6 @@ options            options that several commands share
 import os
 import sys
 from collections.abc import Sequence
-from functools import partial
 from typing import Annotated, Any
 
 import typer
@@ -34,39 +34,38 @@ from polcap.cli.check_command import check
 from polcap.cli.doctor_command import doctor
 from polcap.cli.process_command import process
 from polcap.cli.result_commands import export, report, show, status
+from polcap.cli.settings_command import settings
 from polcap.cli.synth_command import synth
 from polcap.cli.training_commands import evaluate, train
 from polcap.errors import SettingError
+
+_ANYWHERE = ("--debug", "-q", "--quiet", "-v", "--verbose")  # flags that may follow the command
 
 
 class OneLine(TyperGroup):
     """Command group that reports a wrong command line in one line, as every other error."""
 
-    def main(
-        self,
-        args: Sequence[str] | None = None,
-        prog_name: str | None = None,
-        complete_var: str | None = None,
-        standalone_mode: bool = True,
-        windows_expand_args: bool = True,
-        **extra: Any,
-    ) -> Any:
+    def main(self, args: Sequence[str] | None = None, *rest: Any, standalone_mode: bool = True, **extra: Any) -> Any:
         """Parse and run; end with the exit code unless `standalone_mode` is false."""
-        run = partial(super().main, args, prog_name, complete_var, False, windows_expand_args, **extra)
-        if not standalone_mode:
-            return run()
+        stated = list(sys.argv[1:] if args is None else args)
+        words = [word for word in stated if word in _ANYWHERE] + [word for word in stated if word not in _ANYWHERE]
+        if "help" in words[:1]:  # polcap help COMMAND
+            words = [*words[1:], "--help"]
         try:
-            code = run()
+            code = super().main(words, *rest, **{**extra, "standalone_mode": False})
         except TyperException as error:
-            text = _one_line(error)
+            if not standalone_mode:
+                raise
+            text, code = _one_line(error), error.exit_code
             terminal.print_message(text)
-            code = error.exit_code
-            asked = {"json": "--json" in (sys.argv[1:] if args is None else args)}
-            terminal.print_error_document(asked, SettingError(text.removeprefix("polcap: error: ")), code)
-        except typer.Abort:  # a question that got no answer
+            asked = {"json": "--json" in words}
+            terminal.print_error_document(asked, SettingError(), text.removeprefix("polcap: error: "), code)
+        except typer.Abort:  # a question without an answer
             terminal.print_message("polcap: aborted")
             code = 1
-        sys.exit(code or 0)
+        if standalone_mode:
+            sys.exit(code or 0)
+        return code
 
 
 def _one_line(error: TyperException) -> str:
@@ -81,28 +80,29 @@ def _one_line(error: TyperException) -> str:
     return f"polcap: error: {text[:1].lower()}{text[1:]}{see}"
 
 
-COMMANDS = (process, batch, export, show, status, report, check, calibrate, doctor, synth, capture, train, evaluate)
+COMMANDS = (
+    process, batch, export, show, status, report, check, settings, calibrate, doctor, synth, capture, train, evaluate,
+)  # fmt: skip
 app = typer.Typer(
     cls=OneLine,
     help="Turns flash photographs taken through a rotating polarizer into a relightable 3-D asset.",
+    epilog="`polcap help COMMAND` explains a command, `polcap settings STAGE` the settings of a stage.",
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode=None,  # plain help: half the start-up time
     pretty_exceptions_enable=False,
 )
 for command in COMMANDS:
-    app.command()(terminal.reported(command))
+    summary = (command.__doc__ or "").partition(". ")[0].rstrip(".")
+    app.command(short_help=f"{summary}.")(terminal.reported(command))
 
 
 def main() -> None:
     """The `polcap` command."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # results must not depend on the number of threads
-    arguments = sys.argv[1:]
-    if "--debug" in arguments:  # wherever it stands
-        arguments = ["--debug", *(argument for argument in arguments if argument != "--debug")]
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]  # names of files are bytes
-    app(arguments)
+    app()
 
 
 def _version(asked: bool) -> None:
@@ -116,8 +116,11 @@ def _version(asked: bool) -> None:
 def front(
     context: typer.Context,
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of a failure.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress, only data and errors.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print a line per frame and stage.")] = False,
     version: Annotated[
         bool, typer.Option("--version", is_eager=True, callback=_version, help="Print the version and end.")
     ] = False,
 ) -> None:
     context.obj = debug
+    terminal.set_verbosity(quiet, verbose)

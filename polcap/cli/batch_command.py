@@ -4,46 +4,43 @@ import os
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
+from typer import Argument, Context, Exit, Option
 
 from polcap import resource_limits, terminal
 from polcap.cli import options
-from polcap.cli.options import Angles, Assignments, ConfigFile, Device, Estimator, Json, Model, NoChart
+from polcap.cli.options import Angles, Assignments, ConfigFile, Device, Estimator, Json, Model, NoChart, choice
+
+JobKind = Literal["slurm", "openjd", "opencue", "snakemake", "kubernetes"]
 
 
 def batch(
-    context: typer.Context,
-    root: Annotated[Path, typer.Argument(help="Folder with captures, at any depth.")],
-    out: Annotated[Path | None, typer.Option(help="Folder for the results; by default CAPTURE/polcap each.")] = None,
+    context: Context,
+    root: Annotated[Path, Argument(help="Folder with captures, at any depth.")],
+    out: Annotated[
+        Path | None, Option("--out", "-o", help="Folder for the results; by default CAPTURE/polcap each.")
+    ] = None,
     config: ConfigFile = None,
     assignments: Assignments = None,
     shard: Annotated[
         str | None,
-        typer.Option(metavar="K/N", help="The K-th of N parts; by default from Slurm, AWS, Kubernetes or PBS."),
+        Option(metavar="K/N", help="The K-th of N parts; by default from Slurm, AWS, Kubernetes or PBS."),
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, tcp://host:8786 or local (extra [batch]).")
+        str | None, Option(metavar="ADDRESS", help="A Dask scheduler, tcp://host:8786 or local (extra [batch]).")
     ] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Captures at a time on this machine.")] = 1,
-    retries: Annotated[int, typer.Option(min=0, help="Further tries for a capture whose process died.")] = 2,
+    workers: Annotated[int, Option("--workers", "-j", min=1, help="Captures at a time on this machine.")] = 1,
+    retries: Annotated[int, Option(min=0, help="Further tries for a capture whose process died.")] = 2,
     keep_going: Annotated[
-        bool, typer.Option("--keep-going/--fail-fast", help="Go on after a failure, or stop at the first.")
+        bool, Option("--keep-going/--fail-fast", help="Go on after a failure, or stop at the first.")
     ] = True,
-    write_jobs: Annotated[
-        Literal["slurm", "openjd", "opencue", "snakemake", "kubernetes"] | None,
-        typer.Option(
-            metavar="KIND",
-            case_sensitive=False,
-            help="Only write the job file for slurm, openjd, opencue, snakemake, kubernetes.",
-        ),
-    ] = None,
-    jobs: Annotated[int, typer.Option(min=0, help="Shards of the job file; 0 is one per capture, 1000 at most.")] = 0,
+    write_jobs: Annotated[JobKind | None, choice("Only write the job file for a farm.")] = None,
+    jobs: Annotated[int, Option(min=0, help="Shards of the job file; 0 is one per capture, 1000 at most.")] = 0,
     json: Json = False,
     device: Device = "cpu",
-    threads: Annotated[int, typer.Option(min=0, help="Threads per capture; 0 is all.")] = 0,
-    memory: Annotated[float, typer.Option(min=0, help="Most memory per process, GB; 0 is no limit.")] = 0,
+    threads: Annotated[int, Option(min=0, help="Threads per capture; 0 is all.")] = 0,
+    memory: Annotated[float, Option(min=0, help="Most memory per process, GB; 0 is no limit.")] = 0,
     angles: Angles = None,
-    chart: Annotated[Path | None, typer.Option(metavar="FILE", help="Color profile for all captures.")] = None,
+    chart: Annotated[Path | None, Option(metavar="FILE", help="Color profile for all captures.")] = None,
     no_chart: NoChart = False,
     estimator: Estimator = None,
     model: Model = None,
@@ -78,10 +75,10 @@ def batch(
     )
     part = shards.from_environment(os.environ) if shard is None else shards.parse(shard)
     plan = batches.BatchPlan(part, scheduler, workers, retries, keep_going)
-    summary = batches.run(root, out, process_options, plan, terminal.print_message)
+    summary = batches.run(root, out, process_options, plan, terminal.print_progress)
     terminal.print_data(summary if json else str((out or root) / unit.FOLDER / "summary.html"))
     if code := batches.exit_code(summary):
-        raise typer.Exit(code)
+        raise Exit(code)
 
 
 def _check_model(estimator: Literal["network", "analytic"] | None, model: Path | None) -> None:

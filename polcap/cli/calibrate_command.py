@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Context, Option
 
 from polcap import terminal
 from polcap.cli.options import Json
@@ -13,22 +13,17 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    context: typer.Context,
-    folder: Annotated[
-        Path,
-        typer.Argument(help="Folder with some of dark/, flat/, bracket/, flash/, polarizer/, lens/."),
-    ],
-    lens_filter: Annotated[str, typer.Option("--filter", metavar="NAME", help="The polarizer's name.")] = "",
+    context: Context,
+    folder: Annotated[Path, Argument(help="Folder with some of dark/, flat/, bracket/, flash/, polarizer/, lens/.")],
+    lens_filter: Annotated[str, Option("--filter", metavar="NAME", help="The polarizer's name.")] = "",
     axis: Annotated[
         float,
-        typer.Option(
-            min=-360, max=360, metavar="DEG", help="Axis of the light in polarizer/pol…, image x to image up."
-        ),
+        Option(min=-360, max=360, metavar="DEG", help="Axis of the light in polarizer/pol…, image x to image up."),
     ] = 0.0,
-    board: Annotated[
-        str, typer.Option(metavar="AxB", help="Inner corners of the checkerboard in lens/, across and down.")
-    ] = "9x6",
-    out: Annotated[Path | None, typer.Option(help="Folder for the file; by default the user's calibrations.")] = None,
+    board: Annotated[str, Option(metavar="AxB", help="Inner corners of the board in lens/, across and down.")] = "9x6",
+    out: Annotated[
+        Path | None, Option("--out", "-o", help="Folder for the file; by default the user's calibrations.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Measure camera, lens, polarizer and flash once; `process` and `check` use it for the same camera and lens."""
@@ -42,7 +37,7 @@ def calibrate(
     made = datetime.now(UTC).isoformat(timespec="seconds")
     found = calibration.measure(folder, made, lens_filter, axis, squares(board))
     path = calibrations.write(out or own_folders.calibrations(), found)
-    terminal.print_message("\n".join(lines(found)))
+    terminal.print_progress("\n".join(lines(found)))
     terminal.print_data({"file": str(path), "calibration": msgspec.to_builtins(found)} if json else str(path))
 
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Context, Exit, Option
 
 from polcap import terminal
 from polcap.cli import options
@@ -12,33 +12,29 @@ from polcap.errors import GateError, InputError
 
 
 def capture(
-    context: typer.Context,
-    folder: Annotated[
-        Path, typer.Argument(help="Folder for the photographs: a new one, or with --resume a begun one.")
-    ],
+    context: Context,
+    folder: Annotated[Path, Argument(help="Folder for the photographs: a new one, or with --resume a begun one.")],
     rotator: Annotated[
-        str | None, typer.Option(metavar="URL", help="elliptec:PORT, grbl:PORT, line:PORT, manual or simulated.")
+        str | None, Option(metavar="URL", help="elliptec:PORT, grbl:PORT, line:PORT, manual or simulated.")
     ] = None,
     camera: Annotated[
-        str | None, typer.Option(metavar="NAME", help="gphoto2, gphoto2:MODEL, folder:PATH or simulated.")
+        str | None, Option(metavar="NAME", help="gphoto2, gphoto2:MODEL, folder:PATH or simulated.")
     ] = None,
-    angles: Annotated[str | None, typer.Option(metavar="DEG,…", help="By default 0,45,90.")] = None,
+    angles: Annotated[str | None, Option(metavar="DEG,…", help="By default 0,45,90.")] = None,
     bracket: Annotated[
-        str | None, typer.Option(metavar="1/200,1/50,…", help="Exposures; also as f/11, iso100, flash1/16.")
+        str | None, Option(metavar="1/200,1/50,…", help="Exposures; also as f/11, iso100, flash1/16.")
     ] = None,
     repeat: Annotated[
         str | None,
-        typer.Option(metavar="DEG,…", help="Angles whose bracket is taken twice, to measure the spread of the flash."),
+        Option(metavar="DEG,…", help="Angles whose bracket is taken twice, to measure the spread of the flash."),
     ] = None,
-    ambient: Annotated[bool, typer.Option("--ambient", help="Also frames without the flash.")] = False,
-    chart: Annotated[bool, typer.Option("--chart", help="Also a frame of the chart alone.")] = False,
-    cross: Annotated[
-        bool, typer.Option("--cross", help="Also a bracket under a cross-polarized flash, to separate highlights.")
-    ] = False,
-    tries: Annotated[int, typer.Option(min=0, help="How often a bad frame is taken again.")] = 2,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a stopped capture.")] = False,
-    no_check: Annotated[bool, typer.Option("--no-check", help="Leave out the verdict at the end.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan with its times, and stop.")] = False,
+    ambient: Annotated[bool, Option("--ambient", help="Also frames without the flash.")] = False,
+    chart: Annotated[bool, Option("--chart", help="Also a frame of the chart alone.")] = False,
+    cross: Annotated[bool, Option("--cross", help="Also a bracket under a cross-polarized flash.")] = False,
+    tries: Annotated[int, Option(min=0, help="How often a bad frame is taken again.")] = 2,
+    resume: Annotated[bool, Option("--resume", help="Go on with a stopped capture.")] = False,
+    no_check: Annotated[bool, Option("--no-check", help="Leave out the verdict at the end.")] = False,
+    dry_run: Annotated[bool, Option("--dry-run", "-n", help="Print the plan with its times, and stop.")] = False,
     json: Json = False,
 ) -> None:
     """Shoot a capture: turn the polarizer, take the brackets, check every frame."""
@@ -61,11 +57,11 @@ def capture(
         planned = plans.dry_run(wanted)
         terminal.print_data(planned if json else plans.table(planned))
         return
-    done = sequence.shoot(folder, wanted, resume=resume, tries=tries, report=terminal.print_message)
+    done = sequence.shoot(folder, wanted, resume=resume, tries=tries, report=terminal.print_progress)
     verdict = None if no_check else _verdict(folder)
     terminal.print_data(done | {"check": verdict} if json else str(folder))
     if verdict and verdict["verdict"] != "keep":
-        raise typer.Exit(GateError.exit_code)
+        raise Exit(GateError.exit_code)
 
 
 def _verdict(folder: Path) -> dict[str, Any] | None:
@@ -73,12 +69,11 @@ def _verdict(folder: Path) -> dict[str, Any] | None:
     from polcap.config import Config
     from polcap.formats.capture import reader as captures
     from polcap.pipeline import check as checks
-    from polcap.pipeline import models
 
     try:
-        verdict = checks.inspect(captures.read(folder), models.shipped(), Config())
+        verdict = checks.inspect(captures.read(folder), Config())
     except InputError as error:
         terminal.print_message(f"polcap: not judged: {terminal.line(error)}")
         return None
-    terminal.print_message(checks.table(verdict))
+    terminal.print_progress(checks.table(verdict))
     return checks.shown(verdict)

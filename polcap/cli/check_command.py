@@ -1,30 +1,21 @@
 """`polcap check`: keep a capture or reshoot it."""
 
-from typing import Annotated
-
 import typer
 
 from polcap import terminal
 from polcap.cli import options
-from polcap.cli.options import Angles, CaptureFolder, ConfigFile, Json
 from polcap.errors import GateError
 
 
 def check(
     context: typer.Context,
-    capture: CaptureFolder,
-    config: ConfigFile = None,
-    assignments: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="K=V", help="A setting, such as gates.max_blur_px=2; repeatable."),
-    ] = None,
-    angles: Angles = None,
-    chart: Annotated[
-        str | None,
-        typer.Option(metavar="X0,Y0,…|FILE", help="The same as for process: corners of the chart, or a profile."),
-    ] = None,
-    no_chart: Annotated[bool, typer.Option("--no-chart", help="The same as for process: there is no chart.")] = False,
-    json: Json = False,
+    capture: options.CaptureFolder,
+    config: options.ConfigFile = None,
+    assignments: options.Assignments = None,
+    angles: options.Angles = None,
+    chart: options.Chart = None,
+    no_chart: options.NoChart = False,
+    json: options.Json = False,
 ) -> None:
     """Judge a capture seconds after its last frame: keep or reshoot, and why. Writes nothing."""
     from concurrent.futures import ThreadPoolExecutor
@@ -32,13 +23,12 @@ def check(
     from polcap import config as settings
     from polcap.formats.capture import reader as captures
     from polcap.pipeline import check as checks
-    from polcap.pipeline import models
 
     chosen, request = settings.load(config, assignments or ()), options.chart_request(chart, no_chart)
-    with ThreadPoolExecutor(1) as pool:  # photographs are read while models are opened
-        reading = pool.submit(captures.read, capture, options.angles_deg(angles))
-        networks = models.shipped()
-        verdict = checks.inspect(reading.result(), networks, chosen, request)
+    with ThreadPoolExecutor(1) as pool:  # networks are opened while photographs are read
+        opening = pool.submit(checks.shipped_networks)
+        found = captures.read(capture, options.angles_deg(angles))
+        verdict = checks.inspect(found, chosen, request, opening.result)
     terminal.print_data(checks.shown(verdict) if json else checks.table(verdict))
     if not verdict.keep:
         raise typer.Exit(GateError.exit_code)

@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
+from typer import Argument, Option
 
 from polcap.errors import SettingError
 
@@ -21,37 +22,33 @@ def result_folder(named: Path | None) -> Path | None:
     return inside if (inside / "report.json").exists() or (inside / "work").is_dir() else named
 
 
+def choice(meaning: str) -> Any:
+    """An option with a list of values in any case."""
+    return Option(case_sensitive=False, help=meaning)
+
+
 Result = Annotated[
-    Path,
-    typer.Argument(help="Result folder of `polcap process`, or the capture that holds it.", callback=result_folder),
+    Path, Argument(help="Result folder of `polcap process`, or the capture that holds it.", callback=result_folder)
 ]
-CaptureFolder = Annotated[Path, typer.Argument(help="Folder with the photographs.")]
-Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
-ConfigFile = Annotated[Path | None, typer.Option(help="TOML file of settings, a section per stage.")]
+CaptureFolder = Annotated[Path, Argument(help="Folder with the photographs.")]
+Json = Annotated[bool, Option("--json", help="One JSON document on stdout.")]
+ConfigFile = Annotated[Path | None, Option(help="TOML file of settings, a section per stage.")]
 Assignments = Annotated[
-    list[str] | None, typer.Option("--set", metavar="K=V", help="A setting, such as hdr.clip=0.95; repeatable.")
+    list[str] | None, Option("--set", metavar="K=V", help="A setting, such as hdr.clip=0.95; repeatable.")
 ]
-Angles = Annotated[str | None, typer.Option(metavar="DEG,…", help="Angles of the shots in order, such as 0,45,90.")]
-Chart = Annotated[
-    str | None,
-    typer.Option(
-        metavar="X0,Y0,…|FILE", help="Chart corners in RAW px, dark skin first, clockwise; or a color profile."
-    ),
-]
-NoChart = Annotated[bool, typer.Option("--no-chart", help="Use the camera's own colors.")]
-Estimator = Annotated[
-    Literal["network", "analytic"] | None,
-    typer.Option(case_sensitive=False, help="How normals and materials are estimated; by default by the network."),
-]
-Model = Annotated[Path | None, typer.Option(metavar="ONNX", help="A model of your own instead of the shipped one.")]
-Device = Annotated[
-    Literal["cpu", "cuda", "auto"],
-    typer.Option(case_sensitive=False, help="Where the network runs; cuda fails where CUDA does not start."),
-]
-Until = Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")]
-Force = Annotated[str | None, typer.Option(metavar="STAGE", help="Compute this stage and all after it again.")]
-Threads = Annotated[int, typer.Option(min=0, help="Threads to use; 0 is all.")]
-Memory = Annotated[float, typer.Option(min=0, help="Most memory to take, GB; 0 is no limit.")]
+Angles = Annotated[str | None, Option(metavar="DEG,…", help="Angles of the shots in order, such as 0,45,90.")]
+_CHART = "Chart corners in RAW px, dark skin first, clockwise; or a color profile."
+Chart = Annotated[str | None, Option(metavar="X0,Y0,…|FILE", help=_CHART)]
+NoChart = Annotated[bool, Option("--no-chart", help="Use the camera's own colors.")]
+_ESTIMATOR = "How normals and materials are estimated; by default by the network."
+Estimator = Annotated[Literal["network", "analytic"] | None, choice(_ESTIMATOR)]
+Model = Annotated[Path | None, Option(metavar="ONNX", help="A model of your own instead of the shipped one.")]
+_DEVICE = "Where the network runs; cuda fails where CUDA does not start."
+Device = Annotated[Literal["cpu", "cuda", "auto"], choice(_DEVICE)]
+Until = Annotated[str | None, Option(metavar="STAGE", help="Stop after this stage.")]
+Force = Annotated[str | None, Option(metavar="STAGE", help="Compute this stage and all after it again.")]
+Threads = Annotated[int, Option("--threads", "-j", min=0, help="Threads to use; 0 is all.")]
+Memory = Annotated[float, Option(min=0, help="Most memory to take, GB; 0 is no limit.")]
 
 
 def angles_deg(text: str | None) -> tuple[float, ...] | None:
@@ -105,3 +102,11 @@ def user_mask(file: Path) -> Any:
     picture = png.read(file)
     half = 128 if picture.dtype.itemsize == 1 else 32768
     return (picture if picture.ndim == 2 else picture[..., :3].max(-1)) >= half
+
+
+def training(module: str) -> Any:
+    """A module of polcap.training. Raises SettingError where torch is not installed."""
+    try:
+        return import_module(f"polcap.training.{module}")
+    except ModuleNotFoundError as error:
+        raise SettingError(f"{error.name} is not installed; pip install 'polcap[train]'") from error

@@ -4,7 +4,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Context, Option
 
 from polcap import resource_limits, terminal
 from polcap.cli import options
@@ -14,20 +14,17 @@ _NO_EFFECT = ("capture", "out", "json", "dry_run", "watch", "threads", "memory")
 
 
 def process(
-    context: typer.Context,
+    context: Context,
     capture: options.CaptureFolder,
-    out: Annotated[Path | None, typer.Option(help="Result folder; by default CAPTURE/polcap.")] = None,
+    out: Annotated[Path | None, Option("--out", "-o", help="Result folder; by default CAPTURE/polcap.")] = None,
     config: options.ConfigFile = None,
     assignments: options.Assignments = None,
     until: options.Until = None,
     force: options.Force = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print the understood capture and the stages to run, and stop.")
+        bool, Option("--dry-run", "-n", help="Print the understood capture and the stages, and stop.")
     ] = False,
-    watch: Annotated[
-        bool,
-        typer.Option("--watch", help="Process again whenever the folder or --config changes, until Ctrl-C."),
-    ] = False,
+    watch: Annotated[bool, Option("--watch", help="Process again after changes of the folder or --config.")] = False,
     json: options.Json = False,
     device: options.Device = "cpu",
     threads: options.Threads = 0,
@@ -35,42 +32,35 @@ def process(
     angles: options.Angles = None,
     chart: options.Chart = None,
     no_chart: options.NoChart = False,
-    mask: Annotated[Path | None, typer.Option(metavar="PNG", help="White where the object is.")] = None,
+    mask: Annotated[Path | None, Option(metavar="PNG", help="White where the object is.")] = None,
     estimator: options.Estimator = None,
     model: options.Model = None,
 ) -> None:
     """Turn a capture into maps and a 3-D asset."""
     from polcap.pipeline import unchanged
 
-    paths = {"capture": capture, "config": config, "mask": mask, "model": model}
-    given = {**context.params, **paths}  # context.params has paths as text
+    stated = {**context.params, "capture": capture, "config": config, "mask": mask, "model": model}  # paths, not text
     target = out or capture / "polcap"
-    request = None if until or force or dry_run or watch else _request(given, target)
+    request = None
+    if not (until or force or dry_run or watch):
+        asked = {name: value for name, value in stated.items() if name not in _NO_EFFECT}
+        files = [Path(name) for name in (config, mask, model, chart) if name is not None and Path(name).is_file()]
+        request = unchanged.request(asked, capture, target, files)
     if (finished := unchanged.find(target, request)) is not None:
-        terminal.print_message(f"{finished.table}\nNothing has changed since the last run.")
+        terminal.print_progress(f"{finished.table}\nNothing has changed since the last run.")
         terminal.print_result(finished.report, target, json)
         return
     resource_limits.set_threads(threads)  # before the libraries that start them
     resource_limits.set_memory(memory)
     options.check_stages({"--until": until, "--force": force})
-    once = partial(_plan, given, target) if dry_run else partial(_process, given, target, request)
+    once = partial(_plan, stated, target) if dry_run else partial(_process, stated, target, request)
     if watch:
         at_every_change(capture, target, config, once)
     else:
         once()
 
 
-def _request(given: dict[str, Any], target: Path) -> str | None:
-    """Digest of the options and of all files that the run reads; None where it must run in any case."""
-    from polcap.pipeline import unchanged
-
-    asked = {name: value for name, value in given.items() if name not in _NO_EFFECT}
-    named = [given[name] for name in ("config", "mask", "model", "chart")]
-    files = [file for file in named if file is not None and Path(file).is_file()]
-    return unchanged.request(asked, given["capture"], target, files)
-
-
-def _inputs(given: dict[str, Any]) -> tuple[Any, Any, Any]:
+def _inputs(stated: dict[str, Any]) -> tuple[Any, Any, Any]:
     """The capture, the user's other inputs and the settings. Models are opened while photographs are read."""
     from concurrent.futures import ThreadPoolExecutor
 
@@ -79,30 +69,30 @@ def _inputs(given: dict[str, Any]) -> tuple[Any, Any, Any]:
     from polcap.pipeline import models
     from polcap.pipeline.path import UserInput
 
-    config = settings.load(given["config"], given["assignments"] or ())
-    chart = options.chart_request(given["chart"], given["no_chart"])
-    mask = None if given["mask"] is None else options.user_mask(given["mask"])
+    config = settings.load(stated["config"], stated["assignments"] or ())
+    chart = options.chart_request(stated["chart"], stated["no_chart"])
+    mask = None if stated["mask"] is None else options.user_mask(stated["mask"])
     with ThreadPoolExecutor(1) as pool:
-        reading = pool.submit(captures.read, given["capture"], options.angles_deg(given["angles"]))
-        network = models.load_network(given["estimator"], given["model"], given["device"], given["threads"])
-        supplied = UserInput(chart, mask, network, models.load_mask_network(given["threads"]))
+        reading = pool.submit(captures.read, stated["capture"], options.angles_deg(stated["angles"]))
+        network = models.load_network(stated["estimator"], stated["model"], stated["device"], stated["threads"])
+        supplied = UserInput(chart, mask, network, models.load_mask_network(stated["threads"]))
         return reading.result(), supplied, config
 
 
-def _plan(given: dict[str, Any], target: Path) -> None:
+def _plan(stated: dict[str, Any], target: Path) -> None:
     """Print how the capture is understood and which stages would run."""
     from polcap import report
     from polcap.formats.capture import reader as captures
     from polcap.pipeline import run as pipeline
 
-    capture, supplied, config = _inputs(given)
-    stages = pipeline.plan(capture, supplied, config, target, given["force"])
+    capture, supplied, config = _inputs(stated)
+    stages = pipeline.plan(capture, supplied, config, target, stated["force"])
     rows = [f"{name:14}{state}" for name, state in stages.items()]
     table = "\n".join([captures.table(capture), "", *rows])
-    terminal.print_data({"capture": report.capture_facts(capture), "stages": stages} if given["json"] else table)
+    terminal.print_data({"capture": report.capture_facts(capture), "stages": stages} if stated["json"] else table)
 
 
-def _process(given: dict[str, Any], target: Path, request: str | None) -> None:
+def _process(stated: dict[str, Any], target: Path, request: str | None) -> None:
     """Write the result folder; print the path of the asset and the verdict."""
     from dataclasses import replace
 
@@ -111,15 +101,15 @@ def _process(given: dict[str, Any], target: Path, request: str | None) -> None:
     from polcap.pipeline import unchanged
     from polcap.pipeline.path import STAGES
 
-    capture, supplied, config = _inputs(given)
+    capture, supplied, config = _inputs(stated)
     table = captures.table(capture)
-    terminal.print_message(table)
+    terminal.print_progress(table)
     with terminal.progress(len(STAGES) + 1) as bar:
         supplied = replace(supplied, decode=pipeline.counted(capture, bar.frame))
-        about = pipeline.process(capture, supplied, config, target, given["until"], given["force"], bar.stage)
+        about = pipeline.process(capture, supplied, config, target, stated["until"], stated["force"], bar.stage)
     if about is None:
         work = str(target / "work")
-        terminal.print_data({"until": given["until"], "work": work} if given["json"] else work)
+        terminal.print_data({"until": stated["until"], "work": work} if stated["json"] else work)
         return
     unchanged.remember(target, request, table)
-    terminal.print_result(about, target, given["json"])
+    terminal.print_result(about, target, stated["json"])

@@ -1,48 +1,36 @@
 """`polcap export`, `show`, `status` and `report`: commands on a result folder."""
 
-import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
+from typer import Argument, Context, Option
 
 from polcap import terminal
 from polcap.cli import options
-from polcap.cli.options import Json, Result
+from polcap.cli.options import Json, Result, choice
 from polcap.errors import SettingError
+
+Preset = Literal["blender", "unreal", "unity", "web", "archive"]
 
 
 def export(
-    context: typer.Context,
+    context: Context,
     result: Result,
-    gltf: Annotated[bool, typer.Option("--gltf", help="asset/NAME.glb")] = False,
-    obj: Annotated[bool, typer.Option("--obj", help="asset/NAME.obj, .mtl and textures")] = False,
-    usd: Annotated[bool, typer.Option("--usd", help="asset/NAME.usdc and textures (extra [usd])")] = False,
-    materialx: Annotated[bool, typer.Option("--materialx", help="asset/NAME.mtlx and textures")] = False,
-    exr: Annotated[bool, typer.Option("--exr", help="asset/NAME_layers.exr, every map as a layer")] = False,
-    preset: Annotated[
-        Literal["blender", "unreal", "unity", "web", "archive"] | None,
-        typer.Option(
-            case_sensitive=False, help="Program that reads the files, in asset/NAME/; archive needs the extra [usd]."
-        ),
-    ] = None,
-    images: Annotated[
-        Literal["png", "jpeg", "webp", "ktx2"] | None,
-        typer.Option(case_sensitive=False, help="Picture format in the GLB."),
-    ] = None,
+    gltf: Annotated[bool, Option("--gltf", help="asset/NAME.glb")] = False,
+    obj: Annotated[bool, Option("--obj", help="asset/NAME.obj, .mtl and textures")] = False,
+    usd: Annotated[bool, Option("--usd", help="asset/NAME.usdc and textures (extra [usd])")] = False,
+    materialx: Annotated[bool, Option("--materialx", help="asset/NAME.mtlx and textures")] = False,
+    exr: Annotated[bool, Option("--exr", help="asset/NAME_layers.exr, every map as a layer")] = False,
+    preset: Annotated[Preset | None, choice("Program that reads asset/NAME/; archive needs the extra [usd].")] = None,
+    images: Annotated[Literal["png", "jpeg", "webp", "ktx2"] | None, choice("Picture format in the GLB.")] = None,
     color: Annotated[
-        str, typer.Option(metavar="SPACE", help="Color space or OCIO role of the colors in the EXR, such as ACEScg.")
+        str, Option(metavar="SPACE", help="Color space or OCIO role of the colors in the EXR, such as ACEScg.")
     ] = "lin_rec709",
     texture_size: Annotated[
         int | None,
-        typer.Option(min=16, max=16384, help="Longer side of the textures, px; by default that of the maps."),
+        Option(min=16, max=16384, help="Longer side of the textures, px; by default that of the maps."),
     ] = None,
-    lod: Annotated[
-        int,
-        typer.Option(
-            min=0, max=6, help="Number of further GLBs, each with a quarter of the triangles of the one before."
-        ),
-    ] = 0,
+    lod: Annotated[int, Option(min=0, max=6, help="Further GLBs, each with a quarter of the triangles.")] = 0,
     json: Json = False,
 ) -> None:
     """Write the asset again from a result's maps; without a flag as GLB and OBJ."""
@@ -60,15 +48,13 @@ def export(
 
 
 def show(
-    context: typer.Context,
+    context: Context,
     result: Result,
-    stage: Annotated[
-        str | None, typer.Argument(help="hdr, whitebalance, align, mask, selfcal, stokes, cues, …")
-    ] = None,
-    all_: Annotated[bool, typer.Option("--all", help="Every stage.")] = False,
+    stage: Annotated[str | None, Argument(help="hdr, whitebalance, align, mask, selfcal, stokes, cues, …")] = None,
+    all_: Annotated[bool, Option("--all", help="Every stage.")] = False,
     animate: Annotated[
         Literal["light", "turntable"] | None,
-        typer.Option(
+        Option(
             case_sensitive=False,
             help="WebP, and MP4 where FFmpeg is present: a moving light, or the turning surface.",
         ),
@@ -89,35 +75,33 @@ def show(
     terminal.preview(drawn)
 
 
-def status(context: typer.Context, result: Result, json: Json = False) -> None:
+def status(context: Context, result: Result, json: Json = False) -> None:
     """List the stored stages of a result folder, or the progress of a batch."""
     from polcap.pipeline import cache
 
     if not result.is_dir():
         raise SettingError(f"{result}: no such folder; give the result folder of `polcap process`, or that of a batch")
     found = cache.contents(result)
-    if not found and (result / "polcap-batch").is_dir():
+    if found:
+        rows = [{name: about[name] for name in ("stage", "version", "key", "seconds", "bytes")} for about in found]
+        complete = (result / "report.json").exists()
+        lines = [f"{r['stage']:14}{r['seconds']:8.2f} s {r['bytes'] / 1e6:9.2f} MB   {r['key'][:12]}" for r in rows]
+        lines.append("complete" if complete else "not complete: run `polcap process` to go on")
+        terminal.print_data({"stages": rows, "complete": complete} if json else "\n".join(lines))
+    elif (result / "polcap-batch").is_dir():
         from polcap import batch as batches
 
         about = batches.status(batches.reopen(result))
         terminal.print_data(about if json else batches.table(about))
-        return
-    if not found:
+    else:
         raise SettingError(f"{result} holds no stage cache; run `polcap process` or `polcap batch` on it first")
-    rows = [{name: about[name] for name in ("stage", "version", "key", "seconds", "bytes")} for about in found]
-    complete = (result / "report.json").exists()
-    if json:
-        terminal.print_data({"stages": rows, "complete": complete})
-        return
-    lines = [f"{r['stage']:14}{r['seconds']:8.2f} s {r['bytes'] / 1e6:9.2f} MB   {r['key'][:12]}" for r in rows]
-    terminal.print_data("\n".join([*lines, "complete" if complete else "not complete: run `polcap process` to go on"]))
 
 
 def report(
-    context: typer.Context,
+    context: Context,
     result: Result,
     compare: Annotated[
-        Path | None, typer.Option(metavar="OTHER", help="Another result folder.", callback=options.result_folder)
+        Path | None, Option(metavar="OTHER", help="Another result folder.", callback=options.result_folder)
     ] = None,
     json: Json = False,
 ) -> None:
@@ -132,14 +116,12 @@ def report(
         pairs.write(file, (result, compare), abouts)
         rows = pairs.rows(*abouts)
         named = [{"name": name, "here": here, "there": there} for name, here, there in rows]
-        spoken = (pairs.labelled(row) for row in rows)
+        lines = [f"{title}: {here}  |  {there}" for title, here, there in map(pairs.labelled, rows)]
         if json or rows:
-            terminal.print_data(
-                named if json else "\n".join(f"{title}: {here}  |  {there}" for title, here, there in spoken)
-            )
+            terminal.print_data(named if json else "\n".join(lines))
         if not rows:
             terminal.print_message("polcap: no figure and no setting differs")
-        print(f"polcap: comparison: {file}", file=sys.stderr)
+        terminal.print_message(f"polcap: comparison: {file}")
         return
     from polcap.pipeline import run as pipeline
 

@@ -3,76 +3,69 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
+from typer import Argument, Context, Option
 
 from polcap import terminal
-from polcap.cli import extras
+from polcap.cli import options
+from polcap.cli.options import choice
 from polcap.errors import SettingError
 
 
 def train(
-    context: typer.Context,
-    data: Annotated[Path, typer.Argument(help="Folder with meshes/ and materials/.")],
-    out: Annotated[Path, typer.Option(help="Checkpoints and metrics.")] = Path("runs/train"),
-    preset: Annotated[
-        Literal["cpu", "gpu"], typer.Option(case_sensitive=False, help="Size of the network and of a batch.")
-    ] = "cpu",
-    minutes: Annotated[float, typer.Option(min=0.1, help="Training time, resumed parts included.")] = 90,
-    samples: Annotated[int | None, typer.Option(min=1, help="Pictures to learn from, instead of minutes.")] = None,
-    variant: Annotated[
-        str, typer.Option(help="Leave one thing out, for ablations; see training/variants.py.")
-    ] = "ours",
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint.")] = False,
-    start: Annotated[Path | None, typer.Option(metavar="ONNX", help="Begin with this model's weights.")] = None,
+    context: Context,
+    data: Annotated[Path, Argument(help="Folder with meshes/ and materials/.")],
+    out: Annotated[Path, Option("--out", "-o", help="Checkpoints and metrics.")] = Path("runs/train"),
+    preset: Annotated[Literal["cpu", "gpu"], choice("Size of the network and of a batch.")] = "cpu",
+    minutes: Annotated[float, Option(min=0.1, help="Training time, resumed parts included.")] = 90,
+    samples: Annotated[int | None, Option(min=1, help="Pictures to learn from, instead of minutes.")] = None,
+    variant: Annotated[str, Option(help="Leave one thing out, for ablations; see training/variants.py.")] = "ours",
+    resume: Annotated[bool, Option("--resume", help="Go on from the last checkpoint.")] = False,
+    start: Annotated[Path | None, Option(metavar="ONNX", help="Begin with this model's weights.")] = None,
     done: Annotated[
-        int, typer.Option(min=0, help="Pictures of --samples that --start has seen; sets the learning rate.")
+        int, Option(min=0, help="Pictures of --samples that --start has seen; sets the learning rate.")
     ] = 0,
-    rate: Annotated[float, typer.Option(min=0, help="Learning rate of Muon; lower for trained weights.")] = 1e-3,
-    views: Annotated[int | None, typer.Option(min=1, help="Views of each mesh.")] = None,
-    procedural: Annotated[int | None, typer.Option(min=0, help="Random shapes, six views each.")] = None,
-    threads: Annotated[int, typer.Option(min=1, help="Batches learned from at a time.")] = 2,
-    seed: Annotated[int, typer.Option(min=0, help="Of views, batches and first weights.")] = 1,
+    rate: Annotated[float, Option(min=0, help="Learning rate of Muon; lower for trained weights.")] = 1e-3,
+    views: Annotated[int | None, Option(min=1, help="Views of each mesh.")] = None,
+    procedural: Annotated[int | None, Option(min=0, help="Random shapes, six views each.")] = None,
+    threads: Annotated[int, Option("--threads", "-j", min=1, help="Batches learned from at a time.")] = 2,
+    seed: Annotated[int, Option(min=0, help="Of views, batches and first weights.")] = 1,
 ) -> None:
     """Train the network (extra [train])."""
-    trainer = extras.training("train")
-    params = trainer.TrainingOptions(
-        preset=preset, data=data, out=out, minutes=minutes, samples=samples, variant=variant, resume=resume,
-        start=start, done=done, rate=rate, views=views, procedural=procedural, threads=threads, seed=seed,
-    )  # fmt: skip
-    terminal.print_data(str(trainer.main(params)))
+    trainer = options.training("train")
+    stated = {"preset": preset, "data": data, "out": out, "minutes": minutes, "samples": samples, "variant": variant}
+    stated |= {"resume": resume, "start": start, "done": done, "rate": rate, "views": views}
+    stated |= {"procedural": procedural, "threads": threads, "seed": seed}
+    terminal.print_data(str(trainer.main(trainer.TrainingOptions(**stated))))
 
 
 def evaluate(
-    context: typer.Context,
-    model: Annotated[Path, typer.Argument(help="ONNX model.")],
-    data: Annotated[Path | None, typer.Argument(help="Folder with meshes/ and materials/.")] = None,
-    out: Annotated[Path, typer.Option(help="Tables and pictures; a stopped evaluation goes on.")] = Path(
+    context: Context,
+    model: Annotated[Path, Argument(help="ONNX model.")],
+    data: Annotated[Path | None, Argument(help="Folder with meshes/ and materials/.")] = None,
+    out: Annotated[Path, Option("--out", "-o", help="Tables and pictures; a stopped evaluation goes on.")] = Path(
         "runs/evaluate"
     ),
     ablations: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Networks to compare, DIR/NAME/last.pt of `polcap train`.")
+        Path | None, Option(metavar="DIR", help="Networks to compare, DIR/NAME/last.pt of `polcap train`.")
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="50 pictures at 256² instead of 250 at 512².")] = False,
-    count: Annotated[int | None, typer.Option(min=1, help="Number of pictures.")] = None,
-    size: Annotated[int | None, typer.Option(min=64, help="Side of the pictures, px.")] = None,
+    quick: Annotated[bool, Option("--quick", help="50 pictures at 256² instead of 250 at 512².")] = False,
+    count: Annotated[int | None, Option(min=1, help="Number of pictures.")] = None,
+    size: Annotated[int | None, Option(min=64, help="Side of the pictures, px.")] = None,
     protocol: Annotated[
-        int,
-        typer.Option(
-            min=1, max=2, help="1: smooth bodies, high F0 in half of the materials; 2: rough bodies, usual F0."
-        ),
+        int, Option(min=1, max=2, help="1: smooth bodies, high F0 in half of the materials; 2: rough bodies, usual F0.")
     ] = 1,
     real: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Photographs with normals instead: pol000/ … mask/ normal/.")
+        Path | None, Option(metavar="DIR", help="Photographs with normals instead: pol000/ … mask/ normal/.")
     ] = None,
 ) -> None:
     """Score a model on test meshes and materials, with baselines and published figures (extra [train])."""
     if (data is None) == (real is None):
         raise SettingError("evaluate takes DATA, a folder with meshes/ and materials/, or --real DIR; give one of them")
     if real is not None:
-        extras.training("evaluation_photographs").main(real, model, out)
+        options.training("evaluation_photographs").main(real, model, out)
         terminal.print_data(str(out / "real.md"))
         return
-    judge, fixed = extras.training("evaluate"), extras.training("evaluation_protocol")
+    judge, fixed = options.training("evaluate"), options.training("evaluation_protocol")
     usual = (fixed.QUICK_COUNT, fixed.QUICK_SIZE) if quick else (fixed.COUNT, fixed.SIZE)
     judge.main(judge.EvaluationOptions(model, data, out, ablations, count or usual[0], size or usual[1], protocol))
     terminal.print_data(str(out / "evaluation.md"))

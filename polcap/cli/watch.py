@@ -8,22 +8,19 @@ from polcap.errors import GateError, InputError, SettingError
 
 
 def at_every_change(capture: Path, target: Path, config: Path | None, once: Callable[[], None]) -> None:
-    """Call `once` for a folder as it is, and after each change of it or of the settings' file; errors are shown.
+    """Call `once` now and after each change of the folder or of the settings' file; its errors are printed.
 
-    Raises
-    ------
-    SettingError
-        There is no such folder, or the settings are wrong from the start.
+    Raises SettingError if there is no such folder, or the settings are wrong from the start.
     """
     from polcap import config as settings
     from polcap.formats.capture import arrivals
 
     if not capture.is_dir():
-        raise SettingError(f"{capture} is no folder; --watch needs the one that the photographs go to")
+        raise SettingError(f"{capture} is no folder; --watch needs the folder that the photographs go to")
     settings.load(config, ())
     for _ in arrivals.settled(capture, target, edited=[] if config is None else [config]):
         try:
             once()
         except (InputError, GateError, OSError) as error:  # a frame may have gone while it was read
             terminal.print_message(f"polcap: {terminal.line(error)}")
-        terminal.print_message(f"watching {capture}; Ctrl-C ends")
+        terminal.print_progress(f"watching {capture}; Ctrl-C ends")

@@ -38,6 +38,14 @@ def failure(target: Path, error: OSError) -> StorageError:
     return StorageError(f"cannot write {target}: {reason}")
 
 
+def write(final: str | Path, content: str | bytes, synced: bool = True) -> None:
+    """Write a file complete or not at all, text as UTF-8, as `path` does. Raises StorageError."""
+    if isinstance(content, str):
+        content = content.encode("utf-8", "backslashreplace")  # the name of a file may not be text
+    with path(final, synced) as temporary:
+        temporary.write_bytes(content)
+
+
 @contextmanager
 def path(final: str | Path, synced: bool = True) -> Iterator[Path]:
     """A temporary path for writing, renamed to `final` when the block ends well.

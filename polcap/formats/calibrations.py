@@ -37,8 +37,7 @@ def write(place: Path, found: Calibration) -> Path:
     """Write a dated file into the folder `place` and return its path; StorageError."""
     parts = [found.made[:19].replace(":", ""), found.camera, found.lens, found.filter]
     path = place / (atomic.safe_name(" ".join(part for part in parts if part)) + ".toml")
-    with atomic.path(path) as temporary:
-        temporary.write_text(text(found), encoding="utf-8")
+    atomic.write(path, text(found))
     return path
 
 
@@ -212,8 +211,7 @@ def write_profile(path: Path, color: ColorCalibration) -> None:
         "# polcap color profile. matrix: camera radiance (I0 + I90) -> linear Rec.709 reflectance.\n"
         "# quads, corners: px of the grid it was measured on. metres_per_px: at the chart's distance.\n"
     )
-    with atomic.path(path) as temporary:
-        temporary.write_text(head + tomli_w.dumps(_plain(document)), encoding="utf-8")
+    atomic.write(path, head + tomli_w.dumps(_plain(document)))
 
 
 def read_profile(path: Path) -> ColorCalibration:

@@ -8,7 +8,7 @@ import io
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum, IntEnum, IntFlag
-from hashlib import sha256
+from hashlib import file_digest, sha256
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -136,11 +136,8 @@ def load(file: Path) -> NDArray[Any]:
 
 def checksum(file: Path) -> list[Any]:
     """Size in bytes and SHA-256 digest of a file."""
-    summed = sha256()
     with file.open("rb") as stream:
-        while block := stream.read(1 << 22):
-            summed.update(block)
-    return [file.stat().st_size, summed.hexdigest()]
+        return [file.stat().st_size, file_digest(stream, "sha256").hexdigest()]
 
 
 def freeze(value: Any) -> None:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from polcap.errors import DecodeError
 from polcap.images import Floats
 from polcap.optics import color
+from polcap.optics.resize import area_mean
 
 
 def read_mesh(path: Path) -> tuple[Floats, NDArray[np.int64]]:
@@ -68,4 +69,4 @@ def _picture(path: Path, side: int) -> Floats:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
         raise DecodeError(f"{path} is missing or not a picture; a texture set has an albedo.jpg and a roughness.jpg")
-    return np.asarray(cv2.resize(image, (side, side), interpolation=cv2.INTER_AREA), dtype=np.float32) / 255
+    return area_mean(image, (side, side)).astype(np.float32) / 255

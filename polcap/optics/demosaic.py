@@ -15,19 +15,18 @@ from polcap.images import Bits, Floats
 
 
 def superpixel(mosaic: Any, cfa: Bits) -> Floats:
-    """Each 2×2 quad, or 3×3 block of X-Trans, as one pixel of color means, (H, W) → (H//n, W//n, 3) float32.
+    """Each 2×2 quad, or 3×3 block of X-Trans, as one pixel of color means, (H, W) → (3, H//n, W//n) float32.
 
     Rows and columns after the last whole block are dropped.
     """
     period = len(cfa)
     side, blocks = (2, 1) if period == 2 else (3, 2)  # of a block; blocks per period
     h, w = mosaic.shape[0] // side, mosaic.shape[1] // side
-    out = np.zeros((h, w, 3), np.float32)
-    share = np.bincount(np.ravel(cfa), minlength=3) / blocks**2  # photosites per color and block
+    out = np.zeros((3, h, w), np.float32)
     for i, j in np.ndindex(period, period):
-        color = int(cfa[i, j])
-        sites = mosaic[i : side * h : period, j : side * w : period]
-        out[i // side :: blocks, j // side :: blocks, color] += sites * np.float32(1 / share[color])
+        out[cfa[i, j], i // side :: blocks, j // side :: blocks] += mosaic[i : side * h : period, j : side * w : period]
+    for color, plane in enumerate(out):
+        plane *= np.float32(blocks**2 / np.sum(cfa == color))  # one over the photosites per color and block
     return out
 
 

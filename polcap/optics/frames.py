@@ -56,6 +56,11 @@ def total(a: Any) -> Any:
     return a[..., 0] + a[..., 1] + a[..., 2]
 
 
+def unit(a: Floats) -> Floats:
+    """Unit vectors along vectors a (..., 3); 0 where a is 0."""
+    return np.asarray(a / np.maximum(dot(a, a) ** 0.5, 1e-12)[..., None])
+
+
 def to_ray_frame(n: Any, v: Any) -> Any:
     """Vectors n (..., 3), from the camera frame to the frames of the rays v (..., 3); see `basis`."""
     xp = array_namespace(n)

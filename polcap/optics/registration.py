@@ -12,17 +12,19 @@ alignment method, 1975 (the start). Beaton and Tukey, Technometrics 1974 (biweig
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats
-from polcap.optics.projection import transform_points
+from polcap.images import Bools, Floats
+from polcap.optics.projection import coordinates, transform_points
+from polcap.optics.resize import block_means
 from polcap.optics.tiles import spread_over_cells
+from polcap.optics.warp import Spline, Taps
 
-Bools = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 Model = Literal["translation", "similarity", "homography", "simplest"]  # simplest: the model of least BIC
 
@@ -66,34 +68,46 @@ class Registration:
         return float(np.sqrt(np.trace(lever @ self.covariance @ lever.T) / 2))
 
 
+@dataclass(frozen=True)
+class Level:
+    """One scale of a pyramid; its tiles and spline are computed at first use."""
+
+    picture: Floats  # (H, W)
+    usable: Bools  # (H, W)
+
+    @cached_property
+    def tiles(self) -> Indices:
+        """Corners (T, 2) = (row, column) of the tiles with most detail, spread over the picture."""
+        rows, columns = (self.picture.shape[0] - 2) // _TILE, (self.picture.shape[1] - 2) // _TILE
+        if rows < 1 or columns < 1:
+            return np.zeros((0, 2), np.int64)
+        cut = np.s_[: rows * _TILE, : columns * _TILE]
+        score = block_means((squared_gradient(self.picture) * self.usable)[cut], _TILE)
+        score *= block_means(self.usable[cut], _TILE) > _USABLE
+        return _TILE * spread_over_cells(score, (_CELLS, _CELLS), _PER_CELL)
+
+    @cached_property
+    def spline(self) -> Spline:
+        return Spline(self.picture)
+
+
 class Pyramid:
-    """A picture at full size, half, a quarter …; scales and tiles are computed at first use."""
+    """A picture at full size, half, a quarter …; coarse levels are computed at first use."""
 
     def __init__(self, picture: Floats, usable: Bools) -> None:
         """Start from a lightly smoothed picture (H, W) of nearly uniform noise, and its usable pixels (H, W)."""
-        self._levels = [(picture, usable)]
-        self._tiles: dict[int, Indices] = {}
+        self._levels = [Level(picture, usable)]
         self.scales = 1
         while min(picture.shape) // 2 ** (self.scales - 1) >= _COARSEST_PX:
             self.scales += 1
+        self.shape = picture.shape[0], picture.shape[1]
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        height, width = self._levels[0][0].shape
-        return height, width
-
-    def __getitem__(self, scale: int) -> tuple[Floats, Bools]:
-        """Picture and usable pixels at 2^-scale of the full size."""
+    def __getitem__(self, scale: int) -> Level:
+        """The picture at 2^-scale of the full size."""
         while len(self._levels) <= scale:
-            picture, usable = self._levels[-1]
-            self._levels.append((_half(picture), _half(usable) > 0.99))
+            finer = self._levels[-1]
+            self._levels.append(Level(block_means(finer.picture, 2), block_means(finer.usable, 2) > 0.99))
         return self._levels[scale]
-
-    def tiles(self, scale: int) -> Indices:
-        """Corners (T, 2) = (row, column) of the tiles with most detail, spread over the picture."""
-        if scale not in self._tiles:
-            self._tiles[scale] = _choose_tiles(*self[scale])
-        return self._tiles[scale]
 
 
 @dataclass(frozen=True)
@@ -102,7 +116,7 @@ class _Matches:
 
     point: Floats  # (T, 2) tile centres x, y in the reference
     shift: Floats  # (T, 2) px
-    information: Floats  # (T, 2, 2) inverse covariance of the shift
+    information: Floats  # (T, 2, 2) inverse covariance of the shift [px⁻²]
     tried: int  # tiles usable in both pictures, matched or not
 
 
@@ -117,7 +131,7 @@ def register(reference: Pyramid, other: Pyramid, model: Model = "simplest") -> R
         return still
     scales = reference.scales
     near, agree, _ = _refine(reference, other, model, scales, np.eye(3))
-    start = _phase_correlation(*reference[scales - 1], *other[scales - 1])
+    start = _phase_correlation(reference[scales - 1], other[scales - 1])
     if not start[:2, 2].any():
         return near
     far, more, _ = _refine(reference, other, model, scales, start)
@@ -133,14 +147,15 @@ def refine(reference: Pyramid, other: Pyramid, model: Model, start: Floats) -> R
 
 def correlation(reference: Pyramid, other: Pyramid, matrix: Floats) -> float:
     """Pearson's correlation of two pictures under a motion (3, 3), over pixels usable in both; 0 without any."""
-    (a, ok_a), (b, ok_b) = reference[0], other[0]
-    size, inverse = a.shape[::-1], cv2.WARP_INVERSE_MAP
-    warped = cv2.warpPerspective(b, matrix, size, flags=inverse | cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    seen = cv2.warpPerspective(ok_b.view(np.uint8), matrix, size, flags=inverse | cv2.INTER_NEAREST, borderValue=0)
-    both = ok_a & (seen > 0)
+    a, b = reference[0], other[0]
+    size, inverse = a.picture.shape[::-1], cv2.WARP_INVERSE_MAP
+    seen = cv2.warpPerspective(b.usable.view(np.uint8), matrix, size, flags=inverse | cv2.INTER_NEAREST, borderValue=0)
+    both = a.usable & (seen > 0)
+    how = {"flags": inverse | cv2.INTER_CUBIC, "borderMode": cv2.BORDER_REPLICATE}
+    warped = cv2.warpPerspective(b.picture, matrix, size, **how)
     if not both.any():
         return 0.0
-    x, y = a[both] - a[both].mean(), warped[both] - warped[both].mean()
+    x, y = a.picture[both] - a.picture[both].mean(), warped[both] - warped[both].mean()
     return float(np.vdot(x, y) / np.sqrt(float(np.vdot(x, x)) * float(np.vdot(y, y)) + 1e-30))
 
 
@@ -162,33 +177,10 @@ def squared_gradient(picture: Floats) -> Floats:
     return gx
 
 
-def _half(picture: Floats | Bools) -> Floats:
-    h, w = picture.shape[0] // 2, picture.shape[1] // 2
-    even = picture[: 2 * h, : 2 * w].astype(np.float32, copy=False)
-    return np.asarray(cv2.resize(even, (w, h), interpolation=cv2.INTER_AREA))
-
-
-def _choose_tiles(picture: Floats, usable: Bools) -> Indices:
-    """Corners (T, 2) = (row, column) of the tiles with the largest squared gradient in each cell of a coarse grid."""
-    rows, columns = (picture.shape[0] - 2) // _TILE, (picture.shape[1] - 2) // _TILE
-    if rows < 1 or columns < 1:
-        return np.zeros((0, 2), np.int64)
-    cut, size = (slice(0, rows * _TILE), slice(0, columns * _TILE)), (columns, rows)
-    score = np.empty((rows, columns), np.float32)
-    for n in range(rows):  # a row of tiles stays in a core's cache
-        top = _TILE * n
-        around = slice(max(top - 1, 0), top + _TILE + 1)
-        detail = squared_gradient(picture[around])[top - around.start :][:_TILE, cut[1]]
-        detail = detail * usable[top : top + _TILE, cut[1]]
-        score[n] = cv2.resize(detail, (columns, 1), interpolation=cv2.INTER_AREA)
-    score *= cv2.resize(usable[cut].view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) > _USABLE * 255
-    return _TILE * spread_over_cells(score, (_CELLS, _CELLS), _PER_CELL)
-
-
-def _phase_correlation(a: Floats, ok_a: Bools, b: Floats, ok_b: Bools) -> Floats:
+def _phase_correlation(reference: Level, other: Level) -> Floats:
     """Whole-pixel shift (3, 3) of pixels usable in both; the identity unless the shift is clearly better."""
+    a, b, both = reference.picture, other.picture, reference.usable & other.usable
     window = np.outer(np.hanning(a.shape[0]), np.hanning(a.shape[1]))
-    both = ok_a & ok_b
     if both.mean() < 0.05:
         return np.eye(3)
     flat = [window * np.where(both, p - p[both].mean(), 0) for p in (a, b)]
@@ -215,13 +207,13 @@ def _refine(
     points: Floats = np.zeros((0, 2))
     covariance: Floats = np.zeros((2, 2))
     for level in range(scales - 1, -1, -1):
-        a, b, tiles = reference[level], other[level], reference.tiles(level)
+        a, b = reference[level], other[level]
         points = np.zeros((0, 2))
         for _ in range(_COARSE_STEPS if level else _STEPS):
-            matches = _match(a, b, tiles, matrix)
+            matches = _match(a, b, a.tiles, matrix)
             if len(matches.point) < _LEAST_TILES:
                 break
-            update, covariance, sigma = _fit(matches, a[0].shape, model)
+            update, covariance, sigma = _fit(matches, a.picture.shape, model)
             matrix = matrix @ update
             points = matches.point
             step = transform_points(update, points) - points
@@ -239,55 +231,50 @@ def _refine(
     return Registration(matrix, shift_px, sigma, len(points), covariance, reference.shape), agree, agree / tried
 
 
-def _match(a: tuple[Floats, Bools], b: tuple[Floats, Bools], corner: Indices, matrix: Floats) -> _Matches:
-    """Residual shifts of all tiles by one Gauss-Newton step."""
-    parts = np.split(corner, range(_TILES_AT_ONCE, len(corner), _TILES_AT_ONCE))
-    some = [_match_some(a, b, part, matrix) for part in parts]
-    return _Matches(
-        np.concatenate([one.point for one in some]),
-        np.concatenate([one.shift for one in some]),
-        np.concatenate([one.information for one in some]),
-        sum(one.tried for one in some),
-    )
+def _match(reference: Level, other: Level, corner: Indices, matrix: Floats) -> _Matches:
+    """Residual shifts of tiles by one Gauss-Newton step: reference(x) = gain · (other(x') + ∇·δ) + offset for δ."""
+    parts = [
+        _match_some(reference, other, part, matrix)
+        for part in np.split(corner, range(_TILES_AT_ONCE, len(corner), _TILES_AT_ONCE))
+    ]
+    point, shift, information, tried = zip(*parts)
+    return _Matches(np.concatenate(point), np.concatenate(shift), np.concatenate(information), sum(tried))
 
 
-def _match_some(a: tuple[Floats, Bools], b: tuple[Floats, Bools], corner: Indices, matrix: Floats) -> _Matches:
-    """Solve reference(x) = gain · (other(x + s) + ∇·δ) + offset for δ, for some tiles at once."""
-    nothing = _Matches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)), 0)
-    if not len(corner):
-        return nothing
-    center = corner[:, ::-1] + (_TILE - 1) / 2  # x, y
-    shift = transform_points(matrix, center) - center
-    whole = np.floor(shift).astype(np.int64)
-    first = corner + whole[:, ::-1]
-    shape = np.array(a[0].shape)
-    inside = np.all((first >= _MARGIN) & (first + _TILE + _MARGIN < shape), axis=1)
-    inside &= np.all((corner >= 1) & (corner + _TILE + 1 < shape), axis=1)
-    clear = _windows(b[1], first[inside], _TILE)
-    enough = clear.mean(axis=(1, 2)) > _LEAST_USABLE
-    inside[inside] = enough
-    if not inside.any():
-        return nothing
-    corner, first, center = corner[inside], first[inside], center[inside]
-    usable = np.asarray(clear[enough] & _windows(a[1], corner, _TILE), np.float64)
-    patch = _windows(a[0], corner - 1, _TILE + 2).astype(np.float64)  # (T, _TILE + 2, _TILE + 2)
-    fraction = np.asarray(shift - whole, np.float64)[inside]
-    other = _sample(_windows(b[0], first - 1, _TILE + 3).astype(np.float64), fraction)  # cubic: 1 before, 2 after
-    inner = patch[:, 1:-1, 1:-1]
+def _match_some(reference: Level, other: Level, corner: Indices, matrix: Floats) -> tuple[Floats, Floats, Floats, int]:
+    """Centers, shifts and information of the tiles that match, and the number of tiles usable in both pictures."""
+    height, width = other.picture.shape
+    each = np.arange(float(_TILE))
+    u, v = coordinates(matrix, corner[:, 1, None, None] + each, corner[:, 0, None, None] + each[:, None])
+    inside = (u.min((1, 2)) >= _MARGIN) & (u.max((1, 2)) < width - 1 - _MARGIN)
+    inside &= (v.min((1, 2)) >= _MARGIN) & (v.max((1, 2)) < height - 1 - _MARGIN) & (corner.min(axis=1) >= 1)
+    corner, u, v = corner[inside], u[inside], v[inside]
+    clear = other.usable[np.rint(v).astype(int), np.rint(u).astype(int)]
+    enough = clear.mean((1, 2)) > _LEAST_USABLE
+    corner, u, v, clear = corner[enough], u[enough], v[enough], clear[enough]
+    count = len(corner)
+    if not count:
+        return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)), 0
+    usable = np.asarray(clear & _windows(reference.usable, corner, _TILE), np.float64)
+    patch = _windows(reference.picture, corner - 1, _TILE + 2).astype(np.float64)
+    taps = Taps(u.reshape(-1, _TILE), v.reshape(-1, _TILE), (height, width))
+    read = other.spline.at(taps).reshape(u.shape).astype(np.float64)
     gx = (patch[:, 1:-1, 2:] - patch[:, 1:-1, :-2]) / 2
     gy = (patch[:, 2:, 1:-1] - patch[:, :-2, 1:-1]) / 2
-    basis = np.stack([gx, gy, other, usable], axis=1).reshape(len(corner), 4, -1) * usable.reshape(len(corner), 1, -1)
+    weight = usable.reshape(count, 1, -1)
+    basis = np.stack([gx, gy, read, usable], axis=1).reshape(count, 4, -1) * weight
     normal = basis @ basis.transpose(0, 2, 1)  # unknowns: shift, gain, offset
     normal += (1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-30) * np.eye(4)
-    target = inner.reshape(len(corner), -1, 1) * usable.reshape(len(corner), -1, 1)
-    solution = np.linalg.solve(normal, basis @ target)[..., 0]
-    residual = target[..., 0] - (solution[:, None] @ basis)[:, 0]
-    count = usable.sum(axis=(1, 2))
-    variance = (residual**2).sum(axis=1) / np.maximum(count - 4, 1) + 1e-12
-    missing, information = _without_noise(solution[:, :2], normal, count, variance)
-    good = np.all(np.abs(missing) < _REACH_PX, axis=1) & np.any(information != 0, axis=(1, 2))
+    target = patch[:, 1:-1, 1:-1].reshape(count, -1) * weight[:, 0]
+    solution = np.linalg.solve(normal, basis @ target[..., None])[..., 0]
+    residual = target - (solution[:, None] @ basis)[:, 0]
+    pixels = usable.sum((1, 2))
+    variance = (residual**2).sum(axis=1) / np.maximum(pixels - 4, 1) + 1e-12
+    shift, information = _without_noise(solution[:, :2], normal, pixels, variance)
+    good = np.all(np.abs(shift) < _REACH_PX, axis=1) & np.any(information != 0, axis=(1, 2))
     good &= (solution[:, 2] > _GAIN[0]) & (solution[:, 2] < _GAIN[1])
-    return _Matches(center[good], missing[good], information[good], len(corner))
+    center = corner[:, ::-1] + (_TILE - 1) / 2  # x, y
+    return center[good], shift[good], information[good], count
 
 
 def _without_noise(shift: Floats, normal: Floats, count: Floats, variance: Floats) -> tuple[Floats, Floats]:
@@ -310,26 +297,6 @@ def _windows(picture: NDArray[Any], corner: Indices, size: int) -> NDArray[Any]:
     """Squares (T, size, size) of a picture (H, W), from their corners (T, 2) = (row, column)."""
     windows = np.lib.stride_tricks.sliding_window_view(picture, (size, size))
     return np.asarray(windows[corner[:, 0], corner[:, 1]])
-
-
-def _sample(patch: Floats, fraction: Floats) -> Floats:
-    """Catmull-Rom interpolation of tiles (T, n, n), each shifted by one fraction (x, y) of a pixel (T, 2)."""
-    return np.asarray(_bands(fraction[:, 1]) @ patch @ _bands(fraction[:, 0]).transpose(0, 2, 1))
-
-
-def _bands(f: Floats) -> Floats:
-    """Catmull-Rom weights (T, _TILE, _TILE + 3) at fractions (T,), of lines that start one sample early."""
-    weights = (
-        ((-f + 2) * f - 1) * f / 2,
-        ((3 * f - 5) * f * f + 2) / 2,
-        ((-3 * f + 4) * f + 1) * f / 2,
-        (f - 1) * f * f / 2,
-    )
-    out = np.zeros((len(f), _TILE, _TILE + 3))
-    each = np.arange(_TILE)
-    for k, weight in enumerate(weights):
-        out[:, each, each + k] = weight[:, None]
-    return out
 
 
 def _fit(matches: _Matches, shape: tuple[int, ...], model: Model) -> tuple[Floats, Floats, float]:

@@ -30,9 +30,20 @@ def signal(image: SensorImage, full: bool = False) -> Floats:
             mosaic[i::2, j::2] -= np.float32(black[i, j])
         mosaic /= span
         return demosaic.interpolate(mosaic, image.cfa)
-    binned = demosaic.superpixel(image.value, image.cfa)
-    binned -= np.array([black[image.cfa == color].mean() for color in range(3)], np.float32)
-    binned /= span
+    return np.ascontiguousarray(np.moveaxis(binned_planes(image), 0, -1))
+
+
+def binned_planes(image: SensorImage, rows: slice = slice(None)) -> Floats:
+    """Linear signal of a mosaic binned by superpixels, or of some rows of superpixels, (3, h, W) float32."""
+    assert image.cfa is not None
+    side = image.superpixel
+    start, stop, _ = rows.indices(image.value.shape[0] // side)
+    cfa = np.roll(image.cfa, -side * start % len(image.cfa), axis=0)  # the first row's phase
+    black = np.broadcast_to(image.black, image.cfa.shape)
+    binned = demosaic.superpixel(image.value[side * start : side * stop], cfa)
+    for color, plane in enumerate(binned):
+        plane -= np.float32(black[image.cfa == color].mean())
+    binned /= np.float32(image.white - float(image.black.mean()))
     return binned
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Floats, SensorImage
 from polcap.optics import sensor
+from polcap.optics.resize import block_means
 from polcap.optics.tiles import spread_over_cells
 
 TILE = 32  # px of the binned frames
@@ -79,13 +80,8 @@ def _whole_light(image: SensorImage) -> Floats:
     """`_light` of a photograph; for Bayer mosaics directly from the counts, ten times as fast as from channels."""
     if image.cfa is None or image.superpixel != 2:
         return _light(sensor.signal(image))
-    height, width = (side // 2 for side in image.value.shape)
-    counts = image.value[: 2 * height, : 2 * width].astype(np.float32)
-    light = cv2.resize(counts, (width, height), interpolation=cv2.INTER_AREA)
     black = float(image.black.mean())
-    light -= np.float32(black)
-    light /= np.float32(image.white - black)
-    return np.asarray(light)
+    return np.asarray((block_means(image.value.astype(np.float32), 2) - black) / (image.white - black))
 
 
 def _light(signal: Floats) -> Floats:

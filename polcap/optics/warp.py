@@ -10,18 +10,15 @@ Thévenaz, Blu, Unser, Interpolation revisited, IEEE TMI 2000. Sigg and Hadwiger
 filtering, GPU Gems 2, ch. 20 (B-splines from linear look-ups).
 """
 
-from collections.abc import Callable
 from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from polcap.images import Bits, Distortion, Floats
+from polcap.images import Bits, Bools, Distortion, Floats
 from polcap.optics import distortion
 from polcap.optics.projection import coordinates
 
-Bools = NDArray[np.bool_]
 Box = tuple[int, int, int, int]
 
 _POLE = np.sqrt(3.0) - 2.0  # of the filter from samples to the coefficients of a cubic spline
@@ -55,95 +52,29 @@ def warp(
         Distortion of the output's grid; the output is then the picture of a pinhole camera.
     """
     x0, y0, x1, y1 = (int(v) for v in box or (0, 0, image.shape[1], image.shape[0]))
-    if lens is not None:
-        return _warp_through_lens(lens, image, transform, (x0, y0, x1, y1), order)
-    if np.array_equal(transform, np.eye(3)) and x0 >= 0 and y0 >= 0 and x1 <= image.shape[1] and y1 <= image.shape[0]:
+    inside = x0 >= 0 and y0 >= 0 and x1 <= image.shape[1] and y1 <= image.shape[0]
+    if lens is None and inside and np.array_equal(transform, np.eye(3)):
         return np.asarray(image[y0:y1, x0:x1], dtype=np.float32)
-    h = np.asarray(transform, np.float64)
-    left, top, right, bottom = _source(image.shape[:2], h, (x0, y0, x1, y1))
-    part = np.ascontiguousarray(image[top:bottom, left:right], np.float32)
-    local = _translation(-left, -top) @ h @ _translation(x0, y0)
-    size = x1 - x0, y1 - y0
-    if _is_translation(local):
-        return _translate(part, local[:2, 2], size, _linear if order == 1 else _cubic)
-    if order == 1:
-        how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        flat = cv2.warpPerspective(part, local, size, flags=how, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(flat, np.float32).reshape(size[1], size[0], *image.shape[2:])
-    planes = [part] if part.ndim == 2 else cv2.split(part)
-    splines = [Spline(np.ascontiguousarray(plane)) for plane in planes]
-    out = np.empty((len(planes), size[1], size[0]), np.float32)
-    for y in range(0, size[1], _ROWS):
-        rows = slice(y, min(y + _ROWS, size[1]))
-        taps = Taps(
-            *coordinates(local, np.arange(float(size[0])), np.arange(float(rows.start), rows.stop)[:, None]),
-            part.shape[:2],
-        )
-        for spline, plane in zip(splines, out):
-            plane[rows] = spline.at(taps)
-    return out[0] if image.ndim == 2 else np.asarray(cv2.merge(list(out))).reshape(size[1], size[0], -1)
-
-
-def _warp_through_lens(
-    lens: Distortion, image: Floats | Bits, transform: Floats, box: Box, order: Literal[1, 3]
-) -> Floats:
-    """`warp` with a lens."""
-    x0, y0, x1, y1 = box
-    left, top, right, bottom = _source(image.shape[:2], transform, box, lens)
+    left, top, right, bottom = _source(image.shape[:2], transform, (x0, y0, x1, y1), lens)
     part = np.asarray(image[top:bottom, left:right], np.float32)
-    local = _translation(-left, -top) @ np.asarray(transform, np.float64)
     planes = [np.ascontiguousarray(plane) for plane in ([part] if part.ndim == 2 else cv2.split(part))]
     splines = [Spline(plane) for plane in planes] if order == 3 else []
     out = np.empty((len(planes), y1 - y0, x1 - x0), np.float32)
     across = np.arange(float(x0), x1)
-    for y in range(0, y1 - y0, _ROWS):
-        rows = slice(y, min(y + _ROWS, y1 - y0))
-        down = np.arange(float(y0 + rows.start), y0 + rows.stop)[:, None]
-        u, v = coordinates(local, *distortion.distort(lens, across, down))
+    for first in range(y0, y1, _ROWS):
+        down = np.arange(float(first), min(first + _ROWS, y1))[:, None]
+        x, y = (across, down) if lens is None else distortion.distort(lens, across, down)
+        u, v = coordinates(transform, x, y)
+        block = out[:, first - y0 : first - y0 + len(down)]
         if order == 3:
-            taps = Taps(u, v, part.shape[:2])
-            for spline, plane in zip(splines, out):
-                plane[rows] = spline.at(taps)
-            continue
-        places = u.astype(np.float32), v.astype(np.float32)
-        for source, plane in zip(planes, out):
-            plane[rows] = cv2.remap(source, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            taps = Taps(u - left, v - top, part.shape[:2])
+            for spline, plane in zip(splines, block):
+                plane[:] = spline.at(taps)
+        else:
+            places = (u - left).astype(np.float32), (v - top).astype(np.float32)
+            for source, plane in zip(planes, block):
+                plane[:] = cv2.remap(source, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return out[0] if image.ndim == 2 else np.asarray(cv2.merge(list(out))).reshape(y1 - y0, x1 - x0, -1)
-
-
-def _is_translation(transform: Floats) -> bool:
-    return np.array_equal(transform, _translation(*transform[:2, 2]))
-
-
-def _translate(image: Floats, by: Floats, size: tuple[int, int], kernel: Callable[[float], Floats]) -> Floats:
-    """An image (H, W[, C]) read at output px + by (2,), (size[1], size[0][, C]).
-
-    All pixels have the same fraction, so interpolation is one separable filter.
-    """
-    whole = np.floor(by).astype(int)
-    across, down = (kernel(float(share)) for share in by - whole)
-    filtered = cv2.sepFilter2D(image, cv2.CV_32F, across, down, borderType=cv2.BORDER_REPLICATE).reshape(image.shape)
-    (x, y), (width, height) = (int(start) for start in whole), size
-    if x >= 0 and y >= 0 and x + width <= image.shape[1] and y + height <= image.shape[0]:
-        return np.asarray(filtered[y : y + height, x : x + width])
-    rows, columns = (
-        np.clip(np.arange(start, start + length), 0, last)
-        for start, length, last in ((y, height, image.shape[0] - 1), (x, width, image.shape[1] - 1))
-    )
-    return np.asarray(filtered[np.ix_(rows, columns)])
-
-
-def _linear(f: float) -> Floats:
-    """Filter (3,) of the samples that interpolates linearly at a fraction f of a pixel."""
-    return np.array([0, 1 - f, f], np.float32)
-
-
-def _cubic(f: float) -> Floats:
-    """Filter of the samples that interpolates with a cubic spline at a fraction f of a pixel."""
-    if f == 0:
-        return np.ones(1, np.float32)
-    taps = np.array([(1 - f) ** 3, 4 - 6 * f**2 + 3 * f**3, 1 + 3 * f + 3 * f**2 - 3 * f**3, f**3]) / 6
-    return np.asarray(np.r_[0, np.convolve(_PREFILTER, taps)], np.float32)  # 0: makes the number of taps odd
 
 
 class Taps:
@@ -197,10 +128,6 @@ def _mix(a: Floats, b: Floats, share: Floats) -> Floats:
     return b
 
 
-def _translation(x: float, y: float) -> Floats:
-    return np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])
-
-
 def _source(shape: tuple[int, ...], transform: Floats, box: Box, lens: Distortion | None = None) -> Box:
     """The box of an image of `shape` (H, W) whose pixels affect its warp over `box`."""
     x0, y0, x1, y1 = box
@@ -228,18 +155,7 @@ def covered(
     `shape` (H, W) is the image's; transform, box and lens as in `warp`.
     """
     x0, y0, x1, y1 = box
-    if lens is not None:
-        grid = np.arange(x0, x1, dtype=np.float64), np.arange(y0, y1, dtype=np.float64)[:, None]
-        return _within(*coordinates(transform, *distortion.distort(lens, *grid)), shape, margin)
-    x, y = np.array([x0, x1 - 1.0, x0, x1 - 1.0]), np.array([y0, y0, y1 - 1.0, y1 - 1.0])
-    if _within(*coordinates(transform, x, y), shape, margin).all():  # then the homography maps all of the box inside
-        return np.ones((y1 - y0, x1 - x0), bool)
-    across, down = np.arange(x0, x1, dtype=np.float64), np.arange(y0, y1, dtype=np.float64)[:, None]
-    if _is_translation(transform):
-        return _within(across + transform[0, 2], down + transform[1, 2], shape, margin)
-    return _within(*coordinates(transform, across, down), shape, margin)
-
-
-def _within(u: Floats, v: Floats, shape: tuple[int, int], margin: float) -> Bools:
+    x, y = np.arange(float(x0), x1), np.arange(float(y0), y1)[:, None]
+    u, v = coordinates(transform, *((x, y) if lens is None else distortion.distort(lens, x, y)))
     across, down = (u >= margin) & (u <= shape[1] - 1 - margin), (v >= margin) & (v <= shape[0] - 1 - margin)
     return np.asarray(across & down)

@@ -6,7 +6,7 @@ same bytes, with any number of threads.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from polcap.formats.maps import maps_folder
 from polcap.images import Asset
 from polcap.stages import asset, surface
 
+_Writer = Callable[[], list[Path]]  # returns the files that it has written
 _SHARING = {"obj", "usd", "materialx"}  # formats that share texture files
 
 
@@ -46,13 +47,7 @@ class DetailLevel:
 
 
 def check(wanted: ExportRequest) -> None:
-    """Check that a request can be exported, before anything is computed.
-
-    Raises
-    ------
-    SettingError
-        No such preset, or the package of a format is missing.
-    """
+    """Raise a SettingError for an unknown preset or a missing package, before anything is computed."""
     if "usd" in _preset(wanted).formats:
         usd.require()
 
@@ -96,22 +91,42 @@ def write(
     StorageError
         A file cannot be written.
     """
-    preset = _preset(wanted)
+    preset, mesh = _preset(wanted), whole.mesh
     name = atomic.safe_name(str(about["capture"].get("name")))  # files stay in the folder, whatever name the report has
-    export = _Export(
-        folder=out / "asset" / (wanted.preset or ""),
-        maps=out / "maps",
-        asset=whole,
-        levels=tuple(levels),
-        name=name,
-        preset=preset,
-        images=wanted.images or preset.images,
-        color=wanted.color,
-        record=provenance.record(about),
-    )
-    written = export.write()
-    maps_folder.note_export(out / "maps", export.folder.relative_to(out).as_posix(), export.description())
-    return written
+    stem = preset.name.format(obj.stem(name) if preset.textures else name)
+    shared: dict[Key, str] = {key: f"{obj.stem(stem)}_{key}.png" for key in texture_set.LOOSE}
+    loose = {f"{pattern.format(obj.stem(name))}.png": make(whole) for pattern, make in preset.textures.items()}
+    if _SHARING.intersection(preset.formats):
+        loose |= {file: texture_set.LOOSE[key](whole) for key, file in shared.items()}
+    folder, images = out / "asset" / (wanted.preset or ""), wanted.images or preset.images
+    unit, record, encoder = "m" if mesh.metric else "relative", provenance.record(about), TextureEncoder()
+    words = {"unit": unit, "normals": "+Y (OpenGL)", **provenance.words(record)}
+    comment = f"polcap; unit of length: {unit}; normals +Y (OpenGL); made from: {stem}.provenance.json"
+    layered = folder / f"{stem}_layers.exr"
+    writers: dict[Format, _Writer] = {
+        "gltf": partial(_write_glb, folder / f"{stem}.glb", whole, images, words, encoder),
+        "obj": partial(obj.write, folder / f"{stem}.obj", whole, stem, shared, comment),
+        "usd": partial(_one, usd.write, folder / f"{stem}.usdc", whole, stem, shared, words),
+        "materialx": partial(_one, materialx.write, folder / f"{stem}.mtlx", whole, stem, shared, comment),
+        "exr": partial(_one, exr_layers.write, layered, out / "maps", wanted.color, words),
+    }
+    coarser = {folder / f"{stem}_lod{k}.glb": level for k, level in enumerate(levels, 1)}
+    tasks = [writers[one] for one in preset.formats]
+    tasks += [partial(_write_glb, file, level.asset, images, words, encoder) for file, level in coarser.items()]
+    tasks += [partial(_write_texture, folder / file, texture, encoder) for file, texture in loose.items()]
+    written = [file for files in parallel.results(tasks) for file in files]  # pictures are encoded on threads
+    sidecar = folder / f"{stem}.provenance.json"
+    provenance.write(sidecar, record, {file.name: provenance.digest(file) for file in written})
+    embedded = gltf.textures(whole) if "gltf" in preset.formats else {}
+    description = {
+        "for": preset.description,
+        "unit": unit,
+        "glb": {f"{stem}_{key}": f"{texture.meaning}; {images}" for key, texture in embedded.items()},
+        "lods": {file.name: _deviation(level.decimated) for file, level in coarser.items()},
+        "textures": {file: texture.meaning for file, texture in sorted(loose.items())},
+    }
+    maps_folder.note_export(out / "maps", folder.relative_to(out).as_posix(), description)
+    return [*written, sidecar]
 
 
 def _preset(wanted: ExportRequest) -> ExportPreset:
@@ -122,132 +137,26 @@ def _preset(wanted: ExportRequest) -> ExportPreset:
     return PRESETS[wanted.preset]
 
 
-@dataclass(frozen=True)
-class _Export:
-    """One export: its content, and a function for each of its files."""
+def _one(write_file: Callable[..., None], file: Path, *content: Any) -> list[Path]:
+    """Write one file of an export; returns it."""
+    write_file(file, *content)
+    return [file]
 
-    folder: Path
-    maps: Path
-    asset: Asset
-    levels: tuple[DetailLevel, ...]
-    name: str
-    preset: ExportPreset
-    images: Kind
-    color: str
-    record: Mapping[str, Any]
 
-    def write(self) -> list[Path]:
-        """Write all files of the export and the record of provenance; pictures are encoded on threads."""
-        writers: dict[Format, Callable[[], list[Path]]] = {
-            "gltf": self._gltf,
-            "obj": self._obj,
-            "usd": self._usd,
-            "materialx": self._materialx,
-            "exr": self._exr,
-        }
-        tasks = [writers[one] for one in self.preset.formats]
-        tasks += [partial(self._level, k) for k in range(1, len(self.levels) + 1)]
-        tasks += [partial(self._texture, file, made) for file, made in self.loose.items()]
-        written = [file for files in parallel.results(tasks) for file in files]
-        sidecar = self.folder / f"{self.stem}.provenance.json"
-        provenance.write(sidecar, self.record, {file.name: provenance.digest(file) for file in written})
-        return [*written, sidecar]
+def _write_glb(
+    file: Path, content: Asset, images: Kind, words: Mapping[str, str], encoder: TextureEncoder
+) -> list[Path]:
+    gltf.write(file, content, file.stem, images, words, encoder)
+    return [file]
 
-    def description(self) -> dict[str, Any]:
-        """The entry of the export in maps.json."""
-        return {
-            "for": self.preset.description,
-            "unit": self.unit,
-            "glb": self._embedded(),
-            "lods": {
-                f"{self.stem}_lod{k}.glb": {
-                    "triangles": len(level.decimated.mesh.faces),
-                    "error": f"{1000 * level.decimated.error:.4g} mm"
-                    if level.decimated.mesh.metric
-                    else f"{level.decimated.error_px:.3g} px",
-                }
-                for k, level in enumerate(self.levels, 1)
-            },
-            "textures": {file: texture.meaning for file, texture in sorted(self.loose.items())},
-        }
 
-    def _embedded(self) -> dict[str, str]:
-        """The GLB's pictures and their meaning; empty without a GLB."""
-        if "gltf" not in self.preset.formats:
-            return {}
-        held = gltf.textures(self.asset)
-        return {f"{self.stem}_{key}": f"{texture.meaning}; {self.images}" for key, texture in held.items()}
+def _write_texture(file: Path, texture: Texture, encoder: TextureEncoder) -> list[Path]:
+    with atomic.path(file) as temporary:
+        temporary.write_bytes(encoder(texture, "png", text=True))
+    return [file]
 
-    @cached_property
-    def encoder(self) -> TextureEncoder:
-        """Encodes a picture once for all files that contain it."""
-        return TextureEncoder()
 
-    @cached_property
-    def loose(self) -> dict[str, Texture]:
-        """The textures in files of their own, by file name."""
-        named = {pattern.format(obj.stem(self.name)): make for pattern, make in self.preset.textures.items()}
-        textures = {f"{name}.png": make(self.asset) for name, make in named.items()}
-        if _SHARING.intersection(self.preset.formats):
-            textures |= {file: texture_set.LOOSE[key](self.asset) for key, file in self.files.items()}
-        return textures
-
-    @property
-    def stem(self) -> str:
-        """Name of the asset's files, spelled like those of its texture files."""
-        return self.preset.name.format(obj.stem(self.name) if self.preset.textures else self.name)
-
-    @property
-    def files(self) -> dict[Key, str]:
-        """Names of the textures that OBJ, USD and MaterialX share."""
-        return {key: f"{obj.stem(self.stem)}_{key}.png" for key in texture_set.LOOSE}
-
-    @property
-    def unit(self) -> str:
-        return "m" if self.asset.mesh.metric else "relative"
-
-    @property
-    def words(self) -> dict[str, str]:
-        """The record of provenance, for formats with metadata texts."""
-        return {"unit": self.unit, "normals": "+Y (OpenGL)", **provenance.words(self.record)}
-
-    @property
-    def line(self) -> str:
-        """A comment line, for formats with comments."""
-        return f"polcap; unit of length: {self.unit}; normals +Y (OpenGL); made from: {self.stem}.provenance.json"
-
-    def _texture(self, name: str, texture: Texture) -> list[Path]:
-        file = self.folder / name
-        with atomic.path(file) as temporary:
-            temporary.write_bytes(self.encoder(texture, "png", text=True))
-        return [file]
-
-    def _gltf(self) -> list[Path]:
-        file = self.folder / f"{self.stem}.glb"
-        gltf.write(file, self.asset, self.stem, self.images, self.words, self.encoder)
-        return [file]
-
-    def _level(self, k: int) -> list[Path]:
-        name = f"{self.stem}_lod{k}"
-        file = self.folder / f"{name}.glb"
-        gltf.write(file, self.levels[k - 1].asset, name, self.images, self.words, self.encoder)
-        return [file]
-
-    def _obj(self) -> list[Path]:
-        file = self.folder / f"{self.stem}.obj"
-        return obj.write(file, self.asset, self.stem, self.files, self.line)
-
-    def _usd(self) -> list[Path]:
-        file = self.folder / f"{self.stem}.usdc"
-        usd.write(file, self.asset, self.stem, self.files, self.words)
-        return [file]
-
-    def _materialx(self) -> list[Path]:
-        file = self.folder / f"{self.stem}.mtlx"
-        materialx.write(file, self.asset, self.stem, self.files, self.line)
-        return [file]
-
-    def _exr(self) -> list[Path]:
-        file = self.folder / f"{self.stem}_layers.exr"
-        exr_layers.write(file, self.maps, self.color, self.words)
-        return [file]
+def _deviation(coarse: surface.DecimatedMesh) -> dict[str, Any]:
+    """Size of a coarser mesh, and its distance from the full one, for maps.json."""
+    error = f"{1000 * coarse.error:.4g} mm" if coarse.mesh.metric else f"{coarse.error_px:.3g} px"
+    return {"triangles": len(coarse.mesh.faces), "error": error}

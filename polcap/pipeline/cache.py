@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, is_dataclass
+from functools import partial
 from hashlib import blake2b, sha256
 from pathlib import Path
 from typing import Any, Generic, TypeVar, get_type_hints
@@ -19,6 +20,7 @@ from typing import Any, Generic, TypeVar, get_type_hints
 import msgspec
 import numpy as np
 
+from polcap import parallel
 from polcap.errors import StorageError
 from polcap.formats import atomic, npy_folder
 from polcap.stages import Stage
@@ -70,29 +72,14 @@ class MemoryCache:
         """
         about = _about(stage, inputs, config)
         self._forced = self._forced or stage.name == self._force
-        value: T | None = None if self._forced else self._find(stage, about["key"])
-        if value is None:
-            value = self._compute(stage, inputs, config, about)
-        elif stage.keep:
-            self.progress(stage.name, 0.0, True)
-        return self._pass(stage, StageResult(about["key"], value))
+        self.results[stage.name] = StageResult(about["key"], self._value(stage, inputs, config, about))
+        if stage.name == self.until:
+            raise StageReached(stage.name)
+        return self.results[stage.name]
 
-    def derive(self, function: Callable[..., T], *inputs: Any, version: int = 1) -> StageResult[T]:
-        """A value that is cheap to compute from results; never stored.
-
-        `version` is raised whenever the same inputs give another value.
-        """
-        key = digest(["derived", function.__name__, version, list(map(key_of, inputs))])
-        return StageResult(key, function(*map(value_of, inputs)))
-
-    def _compute(
-        self, stage: Stage[..., T], inputs: tuple[Any, ...], config: msgspec.Struct | None, about: dict[str, Any]
-    ) -> T:
-        self.begin(stage.name)
-        value = stage(*map(value_of, inputs), *(() if config is None else (config,)))
-        value = self._store(stage, value, about, time.perf_counter() - self._began)
-        self.end()
-        return value
+    def derive(self, function: Callable[..., T], *inputs: Any) -> StageResult[T]:
+        """A value that is cheap to compute from results; never stored. Its key names the function."""
+        return StageResult(_derived_key(function, inputs), function(*map(value_of, inputs)))
 
     def begin(self, stage: str) -> None:
         """Work on a stage begins."""
@@ -103,11 +90,20 @@ class MemoryCache:
         """Work on the stage begun last has ended."""
         self.progress(self.stage, time.perf_counter() - self._began, False)
 
-    def _pass(self, stage: Stage[..., T], result: StageResult[T]) -> StageResult[T]:
-        self.results[stage.name] = result
-        if stage.name == self.until:
-            raise StageReached(stage.name)
-        return result
+    def _value(
+        self, stage: Stage[..., T], inputs: tuple[Any, ...], config: msgspec.Struct | None, about: dict[str, Any]
+    ) -> Any:
+        """The value of a stage, found or computed."""
+        value = None if self._forced else self._find(stage, about["key"])
+        if value is not None:
+            if stage.keep:
+                self.progress(stage.name, 0.0, True)
+            return value
+        self.begin(stage.name)
+        value = stage(*map(value_of, inputs), *(() if config is None else (config,)))
+        value = self._store(stage, value, about, time.perf_counter() - self._began)
+        self.end()
+        return value
 
     def _find(self, stage: Stage[..., T], key: str) -> T | None:
         return self._held.get(key)
@@ -136,10 +132,9 @@ class StageCache(MemoryCache):
         if not stage.keep or manifest(place).get("key") != key:
             return None
         try:
-            found: T = read(place, returns(stage))
+            return read(place, stage)
         except StorageError:  # damaged: computed again
             return None
-        return found
 
     def _store(self, stage: Stage[..., T], value: T, about: dict[str, Any], seconds: float) -> T:
         """Write a result into its folder, whole or not at all; returns it as memory maps."""
@@ -150,12 +145,12 @@ class StageCache(MemoryCache):
         with atomic.folder(place, synced=False) as temporary:
             arrays: npy_folder.Arrays = {}
             tree = npy_folder.encode(value, "value", arrays)
-            files = {f"{name}.npy": npy_folder.save(temporary / f"{name}.npy", a) for name, a in arrays.items()}
+            saves = [partial(npy_folder.save, temporary / f"{name}.npy", array) for name, array in arrays.items()]
+            files = dict(zip([f"{name}.npy" for name in arrays], parallel.results(saves)))
             about = {**about, "seconds": round(seconds, 3), "files": files, "value": tree}
             text = json.dumps({**about, "digest": seal(about)}, indent=1, allow_nan=False)
             (temporary / "manifest.json").write_text(text, encoding="utf-8")
-        written: T = read(place, returns(stage), check=False)
-        return written
+        return read(place, stage, check=False)
 
 
 class DryRunCache(StageCache):
@@ -165,17 +160,15 @@ class DryRunCache(StageCache):
         super().__init__(folder, force=force)
         self.states: dict[str, str] = {}  # of every stage: cached, compute, or on demand where it is never stored
 
-    def run(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
-        """The key of a stage's result, without a value."""
-        key = _about(stage, inputs, config)["key"]
-        self._forced = self._forced or stage.name == self._force
-        cached = not self._forced and manifest(self.place(stage)).get("key") == key
-        self.states[stage.name] = "on demand" if not stage.keep else "cached" if cached else "compute"
-        return self._pass(stage, StageResult[Any](key, None))
-
-    def derive(self, function: Callable[..., T], *inputs: Any, version: int = 1) -> StageResult[T]:
+    def derive(self, function: Callable[..., T], *inputs: Any) -> StageResult[T]:
         """The key of a derived value, without the value."""
-        return StageResult[Any](digest(["derived", function.__name__, version, list(map(key_of, inputs))]), None)
+        return StageResult[Any](_derived_key(function, inputs), None)
+
+    def _value(
+        self, stage: Stage[..., T], inputs: tuple[Any, ...], config: msgspec.Struct | None, about: dict[str, Any]
+    ) -> Any:
+        cached = not self._forced and manifest(self.place(stage)).get("key") == about["key"]
+        self.states[stage.name] = "on demand" if not stage.keep else "cached" if cached else "compute"
 
 
 class ArchiveCache(StageCache):
@@ -192,12 +185,14 @@ class ArchiveCache(StageCache):
         if not stage.keep:
             return super().run(stage, *inputs, config=config)
         place = self.place(stage)
-        value: T = read(place, returns(stage))
-        return self._pass(stage, StageResult(manifest(place)["key"], value))
+        self.results[stage.name] = StageResult(manifest(place).get("key", ""), read(place, stage))
+        if stage.name == self.until:
+            raise StageReached(stage.name)
+        return self.results[stage.name]
 
 
 def _about(stage: Stage[..., Any], inputs: tuple[Any, ...], config: msgspec.Struct | None) -> dict[str, Any]:
-    """What decides a stage's result, and the key made of it."""
+    """The facts that decide a stage's result, and the key made of them."""
     about = {
         "format": FORMAT,
         "stage": stage.name,
@@ -206,6 +201,10 @@ def _about(stage: Stage[..., Any], inputs: tuple[Any, ...], config: msgspec.Stru
         "inputs": [key_of(one) for one in inputs if not callable(one)],  # a function does not change a result
     }
     return {**about, "key": digest(list(about.values()))}
+
+
+def _derived_key(function: Callable[..., Any], inputs: tuple[Any, ...]) -> str:
+    return digest(["derived", function.__name__, [key_of(one) for one in inputs]])
 
 
 def manifest(place: Path) -> dict[str, Any]:
@@ -223,8 +222,8 @@ def seal(about: Mapping[str, Any]) -> str:
     return digest({name: value for name, value in about.items() if name not in _NOT_SEALED})
 
 
-def read(place: Path, hint: Any, check: bool = True) -> Any:
-    """The value of type `hint` in a result folder, its arrays as read-only memory maps; `check` compares digests.
+def read(place: Path, stage: Stage[..., T], check: bool = True) -> T:
+    """The result of a stage in its folder, its arrays as read-only memory maps; `check` compares digests.
 
     Raises
     ------
@@ -240,7 +239,8 @@ def read(place: Path, hint: Any, check: bool = True) -> Any:
             for file, expected, found in zip(files, about["files"].values(), pool.map(_checksum, files)):
                 if found != expected:
                     raise StorageError(f"{file} is damaged; delete {place} and run again")
-    return npy_folder.decode(about["value"], hint, place)
+    value: T = npy_folder.decode(about["value"], get_type_hints(stage.function)["return"], place)
+    return value
 
 
 def _checksum(file: Path) -> list[Any] | None:
@@ -249,11 +249,6 @@ def _checksum(file: Path) -> list[Any] | None:
         return npy_folder.checksum(file)
     except OSError:
         return None
-
-
-def returns(stage: Stage[..., Any]) -> Any:
-    """The type of a stage's result."""
-    return get_type_hints(stage.function)["return"]
 
 
 def digest(value: Any) -> str:
@@ -278,8 +273,8 @@ def fingerprint(value: Any) -> Any:
         summed = sha256(solid.data.cast("B") if solid.size else b"")
         return [str(solid.dtype), list(solid.shape), summed.hexdigest()]
     if is_dataclass(value) and not isinstance(value, type):
-        facts = [one.name for one in fields(value) if one.metadata.get("in_key", True)]
-        return [type(value).__name__, {name: fingerprint(getattr(value, name)) for name in facts}]
+        names = [one.name for one in fields(value) if one.metadata.get("in_key", True)]
+        return [type(value).__name__, {name: fingerprint(getattr(value, name)) for name in names}]
     if isinstance(value, msgspec.Struct):
         return fingerprint(msgspec.to_builtins(value))
     if isinstance(value, Mapping):
@@ -297,8 +292,7 @@ def contents(folder: Path) -> list[dict[str, Any]]:
     """The manifests in a result folder in the order of the stages, each with its size in bytes."""
     found = []
     for place in sorted((folder / "work").glob("[0-9][0-9]-*")):
-        about = manifest(place)
-        if about:
+        if about := manifest(place):
             size = sum(entry.stat().st_size for entry in place.iterdir())
             found.append({**about, "folder": place.name, "bytes": size})
     return found

@@ -4,6 +4,7 @@ The path runs on pictures averaged down to at most 0.6 MP, with a cache in memor
 averaging hides (clipping, sharpness) are measured at full size while frames are decoded.
 """
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from time import perf_counter
@@ -13,7 +14,7 @@ import msgspec
 from polcap.config import Config
 from polcap.errors import ChartError, DecodeError, InputError
 from polcap.images import Capture, ChartRequest, Network
-from polcap.pipeline import small_capture
+from polcap.pipeline import models, small_capture
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import AUTO, UserInput, path, results_of
 from polcap.pipeline.small_capture import SmallCapture
@@ -21,7 +22,6 @@ from polcap.quality import gates
 from polcap.quality.gate import Evidence, Gate
 from polcap.results import NotReached
 
-Networks = tuple[Network | None, Network | None]  # the estimator's, the mask's
 _THREADS = 2  # frames that are decoded at a time
 _SYMMETRIES = 1  # views of the network: gates read medians of its maps, which four views move by 3 % at most
 _ERROR_COST_DEG = 45.0  # of a stage that gives up: nothing is known of the normals
@@ -38,11 +38,21 @@ class Verdict(msgspec.Struct, frozen=True):
     needs: str = ""  # the option without which `polcap process` ends with an error
 
 
-def inspect(capture: Capture, networks: Networks, config: Config, chart: ChartRequest = AUTO) -> Verdict:
+def shipped_networks() -> tuple[Network | None, Network | None]:
+    """The shipped networks of estimator and mask."""
+    return models.load_network(None, None), models.load_mask_network()
+
+
+def inspect(
+    capture: Capture,
+    config: Config,
+    chart: ChartRequest = AUTO,
+    networks: Callable[[], tuple[Network | None, Network | None]] = shipped_networks,
+) -> Verdict:
     """Judge a capture by the gates of `process`.
 
-    Without a network of the estimator, the errors of the analytic estimator are expected; without one of the mask,
-    the object is found by its contrast to the backdrop.
+    `networks` opens those of estimator and mask while frames are decoded. Without the first, the errors of the
+    analytic estimator are expected; without the second, the object is found by its contrast to the backdrop.
 
     Raises
     ------
@@ -53,7 +63,7 @@ def inspect(capture: Capture, networks: Networks, config: Config, chart: ChartRe
     with ThreadPoolExecutor(_THREADS) as pool:
         try:
             small = small_capture.reduce(capture, config.hdr.clip, pool)
-            supplied = UserInput(_moved(chart, small.step), None, *networks, small.decode)
+            supplied = UserInput(_moved(chart, small.step), None, *networks(), small.decode)
             lines = tuple(_judged(small, supplied, config))
         finally:
             pool.shutdown(cancel_futures=True)
@@ -67,8 +77,7 @@ def inspect(capture: Capture, networks: Networks, config: Config, chart: ChartRe
 
 def _judged(small: SmallCapture, supplied: UserInput, config: Config) -> list[Gate]:
     """The gates in the order of the path; where a stage gives up, its error is the last of them."""
-    cache, failure = MemoryCache(until="infer"), None
-    chart_missing = ""
+    cache, failure, chart_missing = MemoryCache(until="infer"), None, ""
     try:
         chart_missing = _run_path(small, supplied, _settings(config, small.step), cache)
     except DecodeError:
@@ -132,19 +141,15 @@ def table(verdict: Verdict) -> str:
         head += f", and process it with {verdict.needs}"
     rows = [f"{head}   ({verdict.capture}, {verdict.seconds:.1f} s)"]
     for line in verdict.lines:
+        limit = ""
+        if isinstance(line.limit, float | int):
+            number = f"{100 * line.limit:g}" if line.unit == "%" else f"{line.limit:g}"
+            limit = f" (limit {number} {line.unit})".replace(" )", ")")
         cost = f", costs about {line.cost_deg:.0f}°" if line.cost_deg >= 1 and line.state in ("warn", "fail") else ""
-        rows.append(f"{line.state:13}{line.name:14}{line.message}{_limit(line)}{cost}")
+        rows.append(f"{line.state:13}{line.name:14}{line.message}{limit}{cost}")
         if line.remedy:
             rows.append(f"{'':27}→ {line.remedy}")
     return "\n".join(rows)
-
-
-def _limit(line: Gate) -> str:
-    if not isinstance(line.limit, float | int):
-        return ""
-    if line.unit == "%":
-        return f" (limit {100 * line.limit:g} %)"
-    return f" (limit {line.limit:g} {line.unit})".replace(" )", ")")
 
 
 def shown(verdict: Verdict) -> dict[str, object]:

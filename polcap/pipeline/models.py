@@ -52,12 +52,6 @@ def load_mask_network(threads: int = 0) -> Network | None:
     return onnx.load(found, "cpu", threads, mask_channels.ENCODING) if found else None
 
 
-def shipped() -> tuple[Network | None, Network | None]:
-    """The shipped networks of estimator and mask."""
-    return load_network(None, None), load_mask_network()
-
-
 def _newest(name: str) -> Path | None:
     """The newest shipped model of a name."""
-    files = shipped_data.model_files(name)
-    return files[-1] if files else None
+    return max(shipped_data.model_files(name), default=None)

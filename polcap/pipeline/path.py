@@ -2,11 +2,12 @@
 
 Each line's work is the folder of the same name in `stages/`. Measure, then apply once: white balance, alignment and
 self-calibration return small values; `stokes` applies gains and transforms, `cues` the color matrix. Images are
-resampled once. `cache.run` looks a result up, or computes it. `process`, `check`, `show` and a dry run all follow
+resampled once. `cache.run` finds a stored result, or computes it. `process`, `check`, `show` and a dry run all follow
 this path; they differ in the cache.
 """
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -54,10 +55,10 @@ class UserInput:
 
 def path(capture: Capture | None, supplied: UserInput, config: Config, cache: MemoryCache) -> Results:
     """The results of all stages, or of the first ones where the cache stops the path."""
-    with suppress(StageReached):
-        reference = shipped_data.colorchecker(config.whitebalance.chart)
+    with suppress(StageReached), ThreadPoolExecutor(1) as background:
+        colors = background.submit(shipped_data.colorchecker, config.whitebalance.chart)  # imports a large library
         radiance = cache.run(hdr.merge, capture, supplied.decode, config=config.hdr)
-        color = cache.run(whitebalance.measure, radiance, reference, supplied.chart, config=config.whitebalance)
+        color = cache.run(whitebalance.measure, radiance, colors.result(), supplied.chart, config=config.whitebalance)
         alignment = cache.run(align.register, radiance, color, config=config.align)
         drawn = cache.derive(on_grid, supplied.mask, radiance)
         finder = supplied.mask_network

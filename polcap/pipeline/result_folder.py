@@ -28,9 +28,9 @@ def check(out: Path, photographs: Path) -> None:
     except UnicodeEncodeError:
         raise SettingError(f"--out {out} is no UTF-8 text, as OpenEXR wants it; name another with --out") from None
     here, there = Path(os.path.realpath(out)), Path(os.path.realpath(photographs))
-    if here == there:
+    inside = here.relative_to(there).parts if here.is_relative_to(there) else ("elsewhere",)
+    if not inside:
         raise SettingError(f"--out {out} is the capture itself; choose a folder of its own")
-    inside = here.relative_to(there).parts if here.is_relative_to(there) else ()
     if any(layouts.is_angle_folder(name) for name in inside):
         raise SettingError(f"--out {out} lies among the capture's shots; choose {photographs / own_folders.OUTPUT}")
 
@@ -52,9 +52,8 @@ def locked(out: Path) -> Iterator[None]:
         work.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except Timeout as error:
-        raise StorageError(
-            f"{out}: process {_first_line(owner)} is working here; wait for it or choose another --out"
-        ) from error
+        other = owner.read_text(encoding="utf-8", errors="replace")[:20].strip() if owner.exists() else "unknown"
+        raise StorageError(f"{out}: process {other} is working here; wait for it or choose another --out") from error
     except OSError as error:
         raise atomic.failure(work / "lock", error) from error
     try:
@@ -97,10 +96,3 @@ def read_run(out: Path) -> dict[str, Any]:
     if not isinstance(about, dict) or about.get("digest") != seal(about):
         raise StorageError(f"{file} is damaged, or of another polcap; run `polcap process` again")
     return about
-
-
-def _first_line(file: Path) -> str:
-    try:
-        return file.read_text(encoding="utf-8", errors="replace")[:20].strip() or "unknown"
-    except OSError:
-        return "unknown"

@@ -18,7 +18,7 @@ from polcap.formats import calibrations
 from polcap.formats.export import encoders, provenance
 from polcap.formats.maps import maps_folder, png
 from polcap.formats.raw import frame_decoder
-from polcap.images import Capture, ColorCalibration, Decode, Frame, SensorImage
+from polcap.images import Capture, Decode, Frame, SensorImage
 from polcap.pipeline import asset_export, result_folder
 from polcap.pipeline.asset_export import ExportRequest
 from polcap.pipeline.cache import ArchiveCache, DryRunCache, Progress, StageCache, contents, silent
@@ -48,9 +48,14 @@ def process(
     """
     result_folder.check(out, Path(capture.folder))
     cache = StageCache(out, progress, force, until)
+    facts = {  # of the run, as report.json has them; they do not come from its pixels
+        "capture": report.capture_facts(capture),
+        "settings": msgspec.to_builtins(config),
+        "model": report.model_facts(supplied.network),
+        "versions": provenance.versions(),
+    }
     try:
         with result_folder.locked(out):
-            facts = _facts(capture, supplied, config)
             result_folder.write_run(out, facts)
             results = path(capture, supplied, config, cache)
             if until is not None:
@@ -63,16 +68,6 @@ def process(
         if not resource_limits.is_shortfall(error):
             raise
         raise resource_limits.shortfall(error, cache.stage, capture.size_px[0] * capture.size_px[1]) from error
-
-
-def _facts(capture: Capture, supplied: UserInput, config: Config) -> dict[str, Any]:
-    """The facts of a run that do not come from its pixels, as report.json has them."""
-    return {
-        "capture": report.capture_facts(capture),
-        "settings": msgspec.to_builtins(config),
-        "model": report.model_facts(supplied.network),
-        "versions": provenance.versions(),
-    }
 
 
 def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -> dict[str, Any]:
@@ -88,21 +83,16 @@ def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -
         partial(report.write, out, about, results),
         partial(asset_export.write, out, about, ExportRequest(), results.asset),
     )
-    _write_profile(out / PROFILE, results.color)
-    return about
-
-
-def _write_profile(file: Path, color: ColorCalibration) -> None:
-    """The color profile for other captures (`--chart FILE.toml`), where this one's chart was read."""
-    if color.source in ("chart", "corners"):
-        calibrations.write_profile(file, color)
+    if results.color.source in ("chart", "corners"):
+        calibrations.write_profile(out / PROFILE, results.color)
     else:
-        file.unlink(missing_ok=True)
+        (out / PROFILE).unlink(missing_ok=True)
+    return about
 
 
 def counted(capture: Capture, frame_read: Callable[[int, int], None]) -> Decode:
     """A decode function that calls `frame_read` with the number of decoded photographs, and of all."""
-    brackets = [*capture.shots, *(() if capture.crossed is None else (capture.crossed,))]
+    brackets = capture.all_shots
     total, number = sum(len(shot.frames) for shot in brackets), count(1)
 
     def decode(frame: Frame) -> SensorImage:
@@ -114,7 +104,7 @@ def counted(capture: Capture, frame_read: Callable[[int, int], None]) -> Decode:
 
 
 def plan(capture: Capture, supplied: UserInput, config: Config, out: Path, force: str | None = None) -> dict[str, str]:
-    """What `process` would do with each stage: cached, compute, or on demand. Nothing is done."""
+    """The state of each stage before a run of `process`: cached, compute, or on demand. Nothing is computed."""
     cache = DryRunCache(out, force)
     path(capture, supplied, config, cache)
     return cache.states
@@ -165,10 +155,8 @@ def animate(out: Path, motion: animation.Motion) -> list[Path]:
     """Move the light or the object; returns the paths of the WebP and, where FFmpeg is present, the MP4."""
     results, about = reopen(out)
     ior = float(about["settings"]["infer"]["ior"])
-    if motion == "light":
-        frames = animation.light(results.maps, ior)
-    else:
-        frames = animation.turntable(results.maps, results.mesh, ior)
+    turning = motion == "turntable"
+    frames = animation.turntable(results.maps, results.mesh, ior) if turning else animation.light(results.maps, ior)
     written = [out / "work" / f"{motion}.webp"]
     encoders.webp(written[0], frames, animation.SECONDS)
     if encoders.ffmpeg():

@@ -1,19 +1,33 @@
-"""Reduces a capture to at most 0.6 MP for `polcap check`, and measures clipping and sharpness at full size."""
+"""Reduces a capture to at most 0.6 MP for `polcap check`, and measures clipping and sharpness at full size.
+
+Frames are reduced in the decoding child process, which imports this module; only small arrays are sent back.
+"""
 
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from polcap.formats.raw import frame_decoder
 from polcap.images import Capture, Floats, Frame, SensorImage
-from polcap.optics import sharpness
-from polcap.pipeline import reduced_frame
-from polcap.pipeline.reduced_frame import ReducedFrame
+from polcap.optics import sensor, sharpness
+from polcap.optics.resize import block_means
 
 _MOST_PIXELS = 0.6e6  # of the pictures that the stages process
+Arrays = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class ReducedFrame:
+    """A reduced frame."""
+
+    picture: SensorImage  # (h, w, 3) means of blocks, black 0, white 1; 1 for partly clipped blocks
+    clipped: Floats  # (h, w) share of each block that is clipped
+    tiles: sharpness.Tiles
 
 
 @dataclass(frozen=True)
@@ -45,7 +59,7 @@ class SmallCapture:
 
 
 def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapture:
-    """Decode every frame once, on the threads of the pool, and average it down in the decoding process.
+    """Decode every frame once, on the threads of the pool, and average it down.
 
     The reference frame is first: it determines the reduction, and the tiles in which sharpness is measured. The others
     follow in the order of the merge. Counts from `clip` [white level] on are clipped.
@@ -56,29 +70,81 @@ def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapt
         Of the reference frame immediately, of another frame when it is used.
     """
     first = capture.shots[0].frames[(len(capture.shots[0].frames) - 1) // 2]
-    meta, arrays = frame_decoder.apply(first, reduced_frame.first, clip=clip, most_pixels=_MOST_PIXELS)
+    meta, arrays = frame_decoder.apply(first, reduce_first, clip=clip, most_pixels=_MOST_PIXELS)
     times, half, corners = int(meta["times"]), int(meta["superpixel"]), arrays["corners"].tolist()
-    decoded = Future[ReducedFrame]()
-    decoded.set_result(reduced_frame.joined(meta, arrays))
-
-    def begin(frame: Frame) -> Future[ReducedFrame]:
-        return decoded if frame == first else pool.submit(_reduced, frame, clip, times, corners)
-
-    crossed = () if capture.crossed is None else (capture.crossed,)
-    every = [frame for shot in (*capture.shots, *crossed) for frame in (*shot.frames, *shot.ambient)]
+    reduced = {first: pool.submit(_joined, meta, arrays)}
+    for frame in (frame for shot in capture.all_shots for frame in (*shot.frames, *shot.ambient) if frame != first):
+        reduced[frame] = pool.submit(_decode_reduced, frame, clip, times, corners)
     step = half * times
-    (x, y), (width, height) = capture.principal_px, capture.size_px
+    x, y = ((edge - (step - 1) / 2) / step for edge in capture.principal_px)
+    width, height = (side // step for side in capture.size_px)
+    calibration = capture.calibration and replace(capture.calibration, noise=())  # it is of pixels, not of means
     small = replace(
         capture,
         focal_px=capture.focal_px / step,
-        principal_px=((x - (step - 1) / 2) / step, (y - (step - 1) / 2) / step),
-        size_px=(width // step, height // step),
-        calibration=capture.calibration
-        and replace(capture.calibration, noise=()),  # it holds for pixels, not for means
+        principal_px=(x, y),
+        size_px=(width, height),
+        calibration=calibration,
     )
-    return SmallCapture(small, step, half, {frame: begin(frame) for frame in every})
+    return SmallCapture(small, step, half, reduced)
 
 
-def _reduced(frame: Frame, clip: float, times: int, corners: list[list[int]]) -> ReducedFrame:
-    parts = frame_decoder.apply(frame, reduced_frame.take, clip=clip, times=times, corners=corners)
-    return reduced_frame.joined(*parts)
+def _decode_reduced(frame: Frame, clip: float, times: int, corners: list[list[int]]) -> ReducedFrame:
+    return _joined(*frame_decoder.apply(frame, reduce_frame, clip=clip, times=times, corners=corners))
+
+
+def _joined(meta: dict[str, Any], arrays: Arrays) -> ReducedFrame:
+    """The `ReducedFrame` of the answer from the child process."""
+    picture = SensorImage(
+        value=arrays["value"],
+        black=np.zeros((1, 1)),
+        white=1.0,
+        cfa=None,
+        camera_matrix=arrays.get("camera_matrix"),
+        white_balance=arrays.get("white_balance"),
+        lossy=meta["lossy"],
+    )
+    return ReducedFrame(picture, arrays["clipped"], sharpness.Tiles(arrays["light"], arrays["usable"]))
+
+
+def reduce_first(image: SensorImage, clip: float, most_pixels: float) -> tuple[dict[str, Any], Arrays]:
+    """`reduce_frame` of the reference frame, and the reduction of the capture. In the child process.
+
+    `times` is the number of merged pixels along a block, `superpixel` that of RAW pixels along a merged pixel;
+    `corners` (T, 2) px are those of the tiles.
+    """
+    pixels = (image.value.shape[0] // image.superpixel) * (image.value.shape[1] // image.superpixel)
+    times = max(1, int(np.ceil(np.sqrt(pixels / most_pixels))))
+    corners = sharpness.places(image, clip)
+    meta, arrays = reduce_frame(image, clip, times, corners.tolist())
+    return {**meta, "times": times, "superpixel": image.superpixel}, {**arrays, "corners": corners}
+
+
+def reduce_frame(
+    image: SensorImage, clip: float, times: int, corners: list[list[int]]
+) -> tuple[dict[str, Any], Arrays]:
+    """Means over blocks of `times` merged pixels a side, and tiles at `corners` (T, 2) px. In the child process."""
+    clipped = block_means(~sensor.usable(image, clip), times)
+    value = _means(image, times)
+    value[clipped > 0] = 1  # so that the stages exclude partly clipped pixels
+    tiles = sharpness.take(image, np.asarray(corners, np.int64).reshape(-1, 2), clip)
+    arrays: Arrays = {"value": value, "clipped": clipped, "light": tiles.light, "usable": tiles.usable}
+    for name in ("camera_matrix", "white_balance"):
+        if getattr(image, name) is not None:
+            arrays[name] = getattr(image, name)
+    return {"lossy": image.lossy}, arrays
+
+
+def _means(image: SensorImage, times: int) -> Floats:
+    """Signal (h, w, 3) over blocks of times × times merged pixels."""
+    if image.cfa is None or image.cfa.shape != (2, 2):
+        signal = sensor.signal(image)
+        return block_means(np.repeat(signal, 3, axis=2) if signal.shape[2] == 1 else signal, times)
+    height, width = (side // (2 * times) for side in image.value.shape)
+    black = np.broadcast_to(image.black, (2, 2))
+    means = np.zeros((height, width, 3), np.float32)
+    for i, j in np.ndindex(2, 2):  # averaged in one step, without the merged picture
+        plane = image.value[i : 2 * times * height : 2, j : 2 * times * width : 2].astype(np.float32)
+        color = image.cfa[i, j]
+        means[..., color] += (block_means(plane, times) - black[i, j]) / (image.cfa == color).sum()
+    return means / np.float32(image.white - float(image.black.mean()))

@@ -1,14 +1,14 @@
 """Whether a result folder already answers a request: same options, same files, and nothing touched since.
 
 Compares sizes and times, as build tools do, before anything heavy is imported or hashed: a run that has nothing to do
-costs milliseconds. Where anything differs, the keys of the stage cache decide what is computed again.
+costs milliseconds. Where anything differs, the keys of the stage cache decide which stages are computed again.
 """
 
 import json
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from functools import cache
 from hashlib import blake2b
 from pathlib import Path
@@ -18,10 +18,10 @@ from polcap.formats import atomic, own_folders, text_file
 from polcap.formats.export import provenance
 
 _FILE = "unchanged.json"
-_OF_A_RUN = ("lock", "owner", _FILE)  # files in work/ that differ from run to run
+_OF_A_RUN = {os.path.join("work", name) for name in ("lock", "owner", _FILE)}  # they differ from run to run
 _PACKAGE = Path(__file__).parents[1]
 _SETTLED_NS = 3_000_000_000  # some file systems have clocks of 2 s steps; within one a file may change unseen
-Stat = list[int]  # size, time of the content, time of the last change of any kind, which file it is
+Stat = list[int]  # size, time of the content, time of the last change of any kind, inode
 
 
 class Finished(NamedTuple):
@@ -31,36 +31,30 @@ class Finished(NamedTuple):
     report: dict[str, Any]
 
 
-class _DoubtError(Exception):
-    """Sizes and times do not decide."""
-
-
 def request(options: Mapping[str, Any], capture: Path, out: Path, files: Iterable[Path] = ()) -> str | None:
     """Digest of options, program, photographs and other input files by size and time; None where these do not decide.
 
     `options` is plain data; the user's calibrations are among the files.
     """
     try:
-        photographs = _folder(capture, out)
+        photographs = _stats(capture, except_=os.path.realpath(out))
         others = {os.path.abspath(file): _stat(file) for file in (*files, *own_folders.calibration_files())}
-        newest = max((stat[1] for stat in [*photographs.values(), *others.values()]), default=0)
-        if newest > time.time_ns() - _SETTLED_NS:
-            return None
-        return _digest([options, os.path.realpath(capture), os.path.realpath(out), photographs, others, _program()])
-    except (OSError, _DoubtError):
+    except OSError:
         return None
+    newest = max((stat[1] for stat in [*photographs.values(), *others.values()]), default=0)
+    if newest > time.time_ns() - _SETTLED_NS:
+        return None
+    return _digest([options, os.path.realpath(capture), os.path.realpath(out), photographs, others, _program()])
 
 
 def find(out: Path, asked: str | None) -> Finished | None:
     """The run that answered this request, if nothing in its result folder was changed since."""
-    if asked is None:
-        return None
     try:
         known = text_file.read_json(out / "work" / _FILE)
-        if known["request"] != asked or known["result"] != _result(out):
+        if asked is None or known["request"] != asked or known["result"] != _result(out):
             return None
         return Finished(str(known["table"]), text_file.read_json(out / "report.json"))
-    except (OSError, ValueError, TypeError, KeyError, _DoubtError):
+    except (OSError, ValueError, TypeError, KeyError):
         return None
 
 
@@ -72,17 +66,16 @@ def remember(out: Path, asked: str | None, table: str = "") -> None:
     StorageError
         The result folder cannot be written.
     """
-    if asked is None:
-        return
-    known = {"request": asked, "table": table, "result": _result(out)}
-    with atomic.path(out / "work" / _FILE, synced=False) as temporary:
-        temporary.write_text(json.dumps(known) + "\n", encoding="utf-8")
+    if asked is not None:
+        text = json.dumps({"request": asked, "table": table, "result": _result(out)})
+        with atomic.path(out / "work" / _FILE, synced=False) as temporary:
+            temporary.write_text(text + "\n", encoding="utf-8")
 
 
 @cache
 def _program() -> str:
     """Digest of the program by its files' sizes and times, and of the packages that decide on pixels."""
-    return _digest([sys.version, provenance.versions(), _folder(_PACKAGE), _folder(_PACKAGE.parent / "calib")])
+    return _digest([sys.version, provenance.versions(), _stats(_PACKAGE), _stats(_PACKAGE.parent / "calib")])
 
 
 def _digest(value: Any) -> str:
@@ -91,23 +84,26 @@ def _digest(value: Any) -> str:
 
 
 def _result(out: Path) -> dict[str, Stat]:
-    own = {os.path.join("work", name) for name in _OF_A_RUN}
-    return {name: stat for name, stat in _folder(out).items() if name not in own}
+    return {name: stat for name, stat in _stats(out).items() if name not in _OF_A_RUN}
 
 
-def _folder(folder: Path, but: Path | None = None) -> dict[str, Stat]:
-    """Size and times of every file below a folder, except those below `but`; empty where there is none."""
-    except_ = None if but is None else os.path.realpath(but)
-    return {os.path.relpath(file, folder): _stat(file) for file in _files(folder, except_)}
+def _stats(folder: Path, except_: str = "") -> dict[str, Stat]:
+    """Size and times of every file below a folder, except those in the folder `except_`; empty where there is none.
 
-
-def _files(folder: Path, except_: str | None) -> Iterator[str]:
+    Raises
+    ------
+    OSError
+        A folder is a link, which is not followed.
+    """
+    found: dict[str, Stat] = {}
     for place, folders, files in os.walk(folder):
-        seen = [name for name in folders if name not in ("__pycache__", own_folders.BATCH)]
-        folders[:] = [name for name in seen if os.path.realpath(os.path.join(place, name)) != except_]
+        folders[:] = [name for name in folders if name not in ("__pycache__", own_folders.BATCH)]
+        folders[:] = [name for name in folders if os.path.realpath(os.path.join(place, name)) != except_]
         if any(os.path.islink(os.path.join(place, name)) for name in folders):
-            raise _DoubtError  # a linked folder is not walked
-        yield from (os.path.join(place, name) for name in files)
+            raise OSError(f"{place}: a folder is a link")
+        paths = [os.path.join(place, name) for name in files]
+        found |= {os.path.relpath(path, folder): _stat(path) for path in paths}
+    return found
 
 
 def _stat(file: str | Path) -> Stat:

@@ -3,12 +3,12 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from polcap.images import Floats, Quality, SelfCalibration, ShotOrder, StokesImage, SurfaceMaps, TurnedShot
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
+from polcap.optics.resize import block_means
 from polcap.quality import rim
 from polcap.quality.gate import Evidence, Gate, at_most
 from polcap.quality.limits import GateLimits
@@ -262,11 +262,6 @@ def _reduced(image: StokesImage, angle: Floats) -> tuple[Floats, rim.Bools, rim.
     light = total(image.stokes)
     mask = image.mask
     if step > 1:
-        size = (mask.shape[1] // step, mask.shape[0] // step)
-        cut = np.s_[: size[1] * step, : size[0] * step]
-        light = np.stack([cv2.resize(part[cut], size, interpolation=cv2.INTER_AREA) for part in light])
-        mask, usable = (
-            cv2.resize(part[cut].astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
-            for part in (mask, usable)
-        )
+        light = np.stack([block_means(part, step) for part in light])
+        mask, usable = (block_means(part, step) > 0.99 for part in (mask, usable))
     return np.einsum("kj,jhw->khw", mueller.analyzer(angle), light), mask, usable

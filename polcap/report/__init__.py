@@ -16,35 +16,27 @@ from polcap import __version__
 from polcap.config import Config
 from polcap.errors import StorageError
 from polcap.formats import atomic, text_file
-from polcap.images import Capture, Frame, Network
+from polcap.images import Capture, Network
 from polcap.quality import gates
 from polcap.quality.gate import Gate, full_size
 from polcap.report import figures, labels, page
 from polcap.results import Results
 
 
-class _Photograph(msgspec.Struct, frozen=True):
+class _PhotographFacts(msgspec.Struct, frozen=True):
     file: str
     digest: str
 
 
-class _Angle(msgspec.Struct, frozen=True):
+class _ShotFacts(msgspec.Struct, frozen=True):
     angle_deg: float
-    frames: list[_Photograph]
+    frames: list[_PhotographFacts]
 
 
 class _CaptureFacts(msgspec.Struct, frozen=True):
     name: str
     camera: str
-    shots: list[_Angle]
-
-
-class _MapFigures(msgspec.Struct, frozen=True):
-    normal_error_deg_median: float | None
-
-
-class _Figures(msgspec.Struct, frozen=True):
-    maps: _MapFigures
+    shots: list[_ShotFacts]
 
 
 class _ReportFile(msgspec.Struct, frozen=True):
@@ -62,10 +54,13 @@ class _ReportFile(msgspec.Struct, frozen=True):
 
 def capture_facts(capture: Capture) -> dict[str, Any]:
     """Camera, angles and photographs of a capture, as report.json has them."""
-
-    def frame(one: Frame) -> dict[str, Any]:
-        return {"file": Path(one.path).name, "exposure_time": one.exif.exposure_time, "digest": one.digest}
-
+    shots = []
+    for shot in capture.shots:
+        frames = [
+            {"file": Path(frame.path).name, "exposure_time": frame.exif.exposure_time, "digest": frame.digest}
+            for frame in shot.frames
+        ]
+        shots.append({"angle_deg": float(np.degrees(shot.angle)), "frames": frames})
     camera = capture.shots[0].frames[0].exif
     return {
         "name": capture.name,
@@ -76,10 +71,7 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
         "focal_px": capture.focal_px,
         "focal_known": capture.focal_known,
         "focal_doubt": list(capture.focal_doubt),
-        "shots": [
-            {"angle_deg": float(np.degrees(shot.angle)), "frames": [frame(one) for one in shot.frames]}
-            for shot in capture.shots
-        ],
+        "shots": shots,
         "notes": list(capture.notes),
     }
 
@@ -138,7 +130,7 @@ def read(folder: Path) -> dict[str, Any]:
     """
     try:
         about: dict[str, Any] = text_file.read_json(folder / "report.json")
-        msgspec.convert(msgspec.convert(about, _ReportFile).figures, _Figures)
+        msgspec.convert(about, _ReportFile)
     except OSError as error:
         if not folder.exists():
             raise StorageError(f"{folder}: no such folder; give the result folder of `polcap process`") from error

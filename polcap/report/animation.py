@@ -26,12 +26,11 @@ def light(maps: SurfaceMaps, ior: float) -> list[Picture]:
     """The maps under a distant light that moves once around the optical axis."""
     small = ObjectReduction(maps.mask, _SIDE).maps(maps)
     ray = frames.rays(small.view, *small.mask.shape)
-    normal = frames.to_ray_frame(small.normal, ray)
     drawn = []
     for turn in np.linspace(0, 2 * np.pi, FRAMES, endpoint=False):
         across = _LIGHT_TILT * np.array([np.sin(turn), np.cos(turn)])
         to_light = np.array([*across, np.sqrt(1 - across @ across)])
-        drawn.append(np.where(small.mask[..., None], _shade(small, normal, ray, to_light, ior), _BACKGROUND))
+        drawn.append(np.where(small.mask[..., None], _shade(small, small.normal, ray, to_light, ior), _BACKGROUND))
     return _to_srgb(drawn)
 
 
@@ -46,23 +45,21 @@ def turntable(maps: SurfaceMaps, mesh: Mesh, ior: float) -> list[Picture]:
     drawn = []
     for angle in _SWING * np.sin(np.linspace(0, 2 * np.pi, FRAMES, endpoint=False)):
         turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-        moved = np.zeros((*inside.shape, 3))
+        moved = np.broadcast_to(middle, (*inside.shape, 3)).copy()
         moved[inside] = (points - middle) @ turn.T + middle
-        moved[~inside] = middle
         ray = -moved / np.linalg.norm(moved, axis=-1, keepdims=True)
-        normal = frames.to_ray_frame(small.normal @ turn.T, ray)
-        shaded = _shade(small, normal, ray, _TURNTABLE_LIGHT, ior)
+        shaded = _shade(small, small.normal @ turn.T, ray, _TURNTABLE_LIGHT, ior)
         drawn.append(_draw_points(moved[inside], shaded[inside], small.view, inside.shape))
     return _to_srgb(drawn)
 
 
 def _shade(maps: SurfaceMaps, normal: Floats, ray: Floats, to_light: Floats, ior: float) -> Floats:
-    """S0 (H, W, 3) of normals in the frames of their rays; to_light (3,) in the camera frame."""
+    """S0 (H, W, 3) of normals (H, W, 3) under a light from `to_light` (3,), all in the camera frame."""
     to_light = to_light / np.linalg.norm(to_light)
     local = frames.to_ray_frame(np.broadcast_to(to_light, ray.shape), ray)
-    index, one = np.full(maps.mask.shape, ior), np.ones(maps.mask.shape)
-    drawn = shade.stokes(normal, maps.diffuse, maps.specular, np.maximum(maps.roughness, 0.02), index, local, one)
-    return np.asarray(drawn[0])
+    facing = frames.to_ray_frame(normal, ray)
+    one, rough = np.ones(maps.mask.shape), np.maximum(maps.roughness, 0.02)
+    return np.asarray(shade.stokes(facing, maps.diffuse, maps.specular, rough, ior * one, local, one)[0])
 
 
 def _draw_points(points: Floats, value: Floats, view: View, shape: tuple[int, int]) -> Floats:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from polcap.formats.maps import maps_folder
-from polcap.images import Alignment, AngleStack, ColorCalibration, Cues, Floats, Mesh, Quality, StokesImage
+from polcap.images import ColorCalibration, Floats, Mesh, Quality, StokesImage
 from polcap.report import page_data
 from polcap.results import Results
 from polcap.stages.whitebalance import patches
@@ -17,14 +17,39 @@ _FLAGS = (Quality.CLIPPED, Quality.DARK, Quality.ILL_POSED, Quality.METAL, Quali
 
 def measured(results: Results) -> dict[str, dict[str, Any]]:
     """All figures by subject; `labels.LABELS` describes each of them."""
+    bracket, moved, gains = results.radiance.bracket, results.alignment, results.selfcal.gains
+    ring, outline = results.selfcal.ring, results.selfcal.outline
     return {
-        "merge": _exposures(results.radiance),
+        "merge": {
+            "exposure_ratio": _plain(bracket.exposure_ratio.mean(-1), 5),
+            "exif_ratio": _plain(bracket.exif_ratio, 5),
+            "ghost_fraction": _plain(bracket.ghost_fraction, 5),
+            "lossy_source": results.radiance.sensor.lossy,
+        },
         "chart": _colors(results.color, results.maps.albedo_sigma),
-        "alignment": _registration(results.alignment),
-        "gains": _gains(results),
-        "angles": _angles(results),
+        "alignment": {
+            "shift_px": _plain(moved.transform[:, :2, 2], 3),
+            "turn_deg": _plain(np.degrees(np.arctan2(moved.transform[:, 1, 0], moved.transform[:, 0, 0])), 4),
+            "residual_px": _plain(moved.residual_px, 4),
+            "correlation": _plain(moved.correlation, 4),
+        },
+        "gains": {
+            "source": gains.source,
+            "gain": _plain(gains.gain, 5),
+            "sigma": _plain(gains.sigma, 5),
+            "anchor": _plain(gains.anchor, 5),
+            "disagreement": _plain(gains.disagreement),
+        },
+        "angles": {
+            "offset_deg": _plain(np.degrees(ring.offset)),
+            "offset_sigma_deg": _plain(np.degrees(ring.sigma)),
+            "applied_deg": _plain(np.degrees(ring.correction)),
+            "concentration": _plain(outline.concentration),
+            "best_order": list(outline.best.shots),
+            "mirrored": outline.best.mirrored,
+        },
         "object": _object(results),
-        "polarization": _polarization(results.cues, results.stokes),
+        "polarization": _polarization(results),
         "maps": _maps(results),
         "mesh": _mesh(results.mesh),
     }
@@ -34,87 +59,48 @@ def rerendering(results: Results, ior: float) -> dict[str, Any]:
     """Difference between each photograph and the maps rendered under the same light and polarizer angle."""
     small = page_data.reduce(results.maps, results.mesh, results.cues, results.radiance.angle, _COMPARED_PX)
     rendered = page_data.rerender(small, ior)
-    return {"rms": [_number(one) for one in rendered.rms(small.maps.mask)], "scale": _number(rendered.scale)}
-
-
-def _exposures(radiance: AngleStack) -> dict[str, Any]:
-    return {
-        "exposure_ratio": _list(radiance.bracket.exposure_ratio.mean(-1)),
-        "exif_ratio": _list(radiance.bracket.exif_ratio),
-        "ghost_fraction": _list(radiance.bracket.ghost_fraction),
-        "lossy_source": radiance.sensor.lossy,
-    }
+    return {"rms": [_plain(one) for one in rendered.rms(small.maps.mask)], "scale": _plain(rendered.scale)}
 
 
 def _colors(color: ColorCalibration, albedo_sigma: float | None) -> dict[str, Any]:
     fit, light = color.patches, color.light
-    predicted = None if fit is None else fit.predicted
+    delta_e, predicted = (None, None) if fit is None else (fit.delta_e, fit.predicted)
     return {
         "source": color.source,
         "edition": None if fit is None else fit.edition or None,
-        "tilt_deg": None if light is None else _number(np.degrees(light.tilt)),
-        "flash": None if light is None else _list(light.flash[:2], 3),
-        "delta_e_mean": None if fit is None else _number(np.nanmean(fit.delta_e)),
-        "delta_e_max": None if fit is None else _number(np.nanmax(fit.delta_e)),
-        "delta_e": None if fit is None else _list(fit.delta_e, 2),
-        "predicted_mean": None if predicted is None else _number(np.nanmean(predicted)),
-        "predicted": None if predicted is None else _list(predicted, 2),
+        "tilt_deg": None if light is None else _plain(np.degrees(light.tilt)),
+        "flash": None if light is None else _plain(light.flash[:2], 3),
+        "delta_e_mean": None if delta_e is None else _plain(np.nanmean(delta_e)),
+        "delta_e_max": None if delta_e is None else _plain(np.nanmax(delta_e)),
+        "delta_e": _plain(delta_e, 2),
+        "predicted_mean": None if predicted is None else _plain(np.nanmean(predicted)),
+        "predicted": _plain(predicted, 2),
         "left_out": None if fit is None or fit.use is None else patches.left_out(fit.use),
-        "detector_cost": _number(color.cost),
+        "detector_cost": _plain(color.cost),
         "metres_per_px": color.metres_per_px,
         "scale_doubt": albedo_sigma,
-        "matrix": _list(color.matrix),
-    }
-
-
-def _registration(alignment: Alignment) -> dict[str, Any]:
-    transform = alignment.transform
-    return {
-        "shift_px": _list(transform[:, :2, 2], 3),
-        "turn_deg": _list(np.degrees(np.arctan2(transform[:, 1, 0], transform[:, 0, 0])), 4),
-        "residual_px": _list(alignment.residual_px, 4),
-        "correlation": _list(alignment.correlation, 4),
-    }
-
-
-def _gains(results: Results) -> dict[str, Any]:
-    gains = results.selfcal.gains
-    return {
-        "source": gains.source,
-        "gain": _list(gains.gain, 5),
-        "sigma": _list(gains.sigma, 5),
-        "anchor": _list(gains.anchor, 5),
-        "disagreement": _number(gains.disagreement),
-    }
-
-
-def _angles(results: Results) -> dict[str, Any]:
-    ring, outline = results.selfcal.ring, results.selfcal.outline
-    return {
-        "offset_deg": _number(np.degrees(ring.offset)),
-        "offset_sigma_deg": _number(np.degrees(ring.sigma)),
-        "applied_deg": _number(np.degrees(ring.correction)),
-        "concentration": _number(outline.concentration),
-        "best_order": list(outline.best.shots),
-        "mirrored": outline.best.mirrored,
+        "matrix": _plain(color.matrix, 5),
     }
 
 
 def _object(results: Results) -> dict[str, Any]:
     image, maps, found = results.stokes, results.maps, results.object_
+    inside = image.quality[image.mask]
+    flagged = {flag: float(((inside & int(flag)) > 0).mean()) if inside.size else 0.0 for flag in _FLAGS}
     return {
         "pixels": int(image.mask.sum()),
         "crop": maps_folder.raw_crop(maps.view, *maps.mask.shape[::-1]),
         "source": found.source,
-        "mask_doubt": None if found.doubt is None else _number(found.doubt),
-        "mask_islands": _number(found.islands),
-        "mask_holes": _number(found.holes),
-        "mask_border": _number(found.border),
-        **{f"{flag.name}_fraction".lower(): _flagged_share(image, flag) for flag in _FLAGS},
+        "mask_doubt": _plain(found.doubt),
+        "mask_islands": _plain(found.islands),
+        "mask_holes": _plain(found.holes),
+        "mask_border": _plain(found.border),
+        **{f"{flag.name}_fraction".lower(): _plain(share, 5) for flag, share in flagged.items()},
     }
 
 
-def _polarization(cues: Cues, image: StokesImage) -> dict[str, Any]:
+def _polarization(results: Results) -> dict[str, Any]:
+    cues, image = results.cues, results.stokes
     return {
         "dolp_median": _percentile(cues.dolp, image, 50),
         "dolp_95": _percentile(cues.dolp, image, 95),
@@ -129,8 +115,8 @@ def _maps(results: Results) -> dict[str, Any]:
         "estimator": maps.estimator,
         "normal_error_deg_median": _percentile(maps.confidence, image, 50),
         "normal_error_deg_90": _percentile(maps.confidence, image, 90),
-        "diffuse_mean": _list(maps.diffuse[maps.mask].mean(0), 4),
-        "specular_median": _list(np.median(maps.specular[maps.mask], axis=0), 4),
+        "diffuse_mean": _plain(maps.diffuse[maps.mask].mean(0), 4),
+        "specular_median": _plain(np.median(maps.specular[maps.mask], axis=0), 4),
         "roughness_median": _percentile(maps.roughness, image, 50),
     }
 
@@ -140,32 +126,21 @@ def _mesh(mesh: Mesh) -> dict[str, Any]:
         "vertices": len(mesh.vertices),
         "faces": len(mesh.faces),
         "metric": mesh.metric,
-        "extent": _list(mesh.vertices.max(0) - mesh.vertices.min(0), 5),
+        "extent": _plain(np.ptp(mesh.vertices, axis=0), 5),
         "pieces": mesh.pieces,
-        "cuts": _number(mesh.cuts),
-        "cut_px": _number(mesh.cut_px),
-        "raggedness": _number(mesh.raggedness),
+        "cuts": _plain(mesh.cuts),
+        "cut_px": _plain(mesh.cut_px),
+        "raggedness": _plain(mesh.raggedness),
     }
 
 
-def _flagged_share(image: StokesImage, flag: Quality) -> float:
-    inside = image.quality[image.mask]
-    return round(float(((inside & int(flag)) > 0).mean()), 5) if inside.size else 0.0
-
-
-def _percentile(value: Floats, image: StokesImage, percentile: float) -> float | None:
+def _percentile(value: Floats, image: StokesImage, percentile: float) -> Any:
     """Percentile of a map over the object; None without an object."""
-    return _number(np.percentile(value[image.mask], percentile)) if image.mask.any() else None
+    return _plain(np.percentile(value[image.mask], percentile)) if image.mask.any() else None
 
 
-def _number(value: Any, digits: int = 6) -> float | None:
-    """A rounded Python number; None where the value is not finite."""
-    return round(float(value), digits) if math.isfinite(value) else None
-
-
-def _list(values: Floats, digits: int = 5) -> list[Any]:
-    """Nested lists of `_number`."""
-    return [
-        _list(value, digits) if isinstance(value, np.ndarray) else _number(value, digits)
-        for value in np.asarray(values)
-    ]
+def _plain(value: Any, digits: int = 6) -> Any:
+    """Rounded Python numbers, as nested lists for an array; None where a number is missing or not finite."""
+    if np.ndim(value):
+        return [_plain(one, digits) for one in value]
+    return round(float(value), digits) if value is not None and math.isfinite(value) else None

@@ -121,13 +121,9 @@ def number(value: float, digits: int = 4) -> str:
         return f"{value:,.0f}".replace(",", " ")
     if abs(value) < 1e-5:
         return f"{value:.1e}"
-    short = f"{value:.{max(0, digits - 1 - _magnitude(value))}f}"
+    magnitude = int(f"{value:e}".partition("e")[2])  # power of ten of the first digit
+    short = f"{value:.{max(0, digits - 1 - magnitude)}f}"
     return short.rstrip("0").rstrip(".") if "." in short else short
-
-
-def _magnitude(value: float) -> int:
-    """Power of ten of a number's first digit."""
-    return int(f"{value:e}".partition("e")[2])
 
 
 def _plain(value: Any, factor: float) -> str:
@@ -137,13 +133,11 @@ def _plain(value: Any, factor: float) -> str:
         return "yes" if value else "no"
     if isinstance(value, (int, float)):
         return number(value * factor)
-    if isinstance(value, (list, tuple)):
-        if not value:
-            return "none"
-        nested = any(isinstance(item, (list, tuple)) for item in value)
-        return (" / " if nested else ", ").join(_plain(item, factor) for item in value)
     if isinstance(value, dict):
         return ", ".join(f"{_words(str(key))} {_plain(item, factor)}" for key, item in value.items()) or "none"
+    if isinstance(value, (list, tuple)):
+        separator = " / " if any(isinstance(item, (list, tuple)) for item in value) else ", "
+        return separator.join(_plain(item, factor) for item in value) or "none"
     return str(value)
 
 

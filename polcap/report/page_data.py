@@ -11,8 +11,7 @@ from polcap.optics import frames, shade
 from polcap.optics.resize import area_mean
 from polcap.report.reduction import ObjectReduction
 
-WHITE_PATCH = 18  # of a ColorChecker Classic, row by row from dark skin
-_COLUMNS = 6
+_WHITE_PATCH = 18  # of a ColorChecker Classic, row by row from dark skin
 _WHITE_QUANTILE = 0.995  # of the object's light; it becomes white
 
 
@@ -69,22 +68,20 @@ def rerender(small: PageMaps, ior: float) -> Rerendering:
     normal = frames.to_ray_frame(maps.normal, ray)
     ahead = np.zeros_like(ray)
     ahead[..., 2] = 1.0
-    index = np.full(maps.mask.shape, ior, np.float32)
-    ones = np.ones_like(index)
-    stokes = shade.stokes(normal, maps.diffuse, maps.specular, np.maximum(maps.roughness, 0.02), index, ahead, ones)
-    flashed = np.asarray(stokes)[0] * maps.mask[..., None]
-    drawn = frames.total(np.asarray(stokes)) / 3 * maps.mask
+    one = np.ones(maps.mask.shape, np.float32)
+    rough = np.maximum(maps.roughness, 0.02)
+    stokes = np.asarray(shade.stokes(normal, maps.diffuse, maps.specular, rough, ior * one, ahead, one))
+    s0, s1, s2 = frames.total(stokes) / 3 * maps.mask
     seen = frames.total(small.radiance) / 3 * maps.mask
-    light, lit = seen[maps.mask], drawn[0][maps.mask]
+    light, lit = seen[maps.mask], s0[maps.mask]
     scale = float(np.median(light[lit > 0] / lit[lit > 0])) if (lit > 0).any() else 1.0
     white = max(float(np.quantile(light, _WHITE_QUANTILE)), 1e-6) if light.size else 1.0
     measured, predicted = [], []
     for angle in small.angle:
         on_ray = frames.axis_on_ray(np.float32(angle), ray)
         measured.append(seen * (1 + small.ratio[0] * np.cos(2 * angle) + small.ratio[1] * np.sin(2 * angle)) / white)
-        predicted.append(
-            scale * (drawn[0] + drawn[1] * np.cos(2 * on_ray) + drawn[2] * np.sin(2 * on_ray)) * maps.mask / white
-        )
+        predicted.append(scale * (s0 + s1 * np.cos(2 * on_ray) + s2 * np.sin(2 * on_ray)) / white)
+    flashed = stokes[0] * maps.mask[..., None]
     return Rerendering(np.minimum(measured, 1.0), np.minimum(predicted, 1.0), flashed, scale)
 
 
@@ -111,20 +108,18 @@ def patches(radiance: AngleStack, found: ColorCalibration) -> Floats | None:
     """Measured chart colors (24, 3), linear Rec.709, corrected for uneven light and glare; None without a chart."""
     if found.place is None:
         return None
-    camera = np.zeros((24, 3))
+    camera = np.full((24, 3), np.nan)
     for index, quad in enumerate(found.place.quads):
         corners = np.round(quad).astype(np.int32)
         low = np.clip(corners.min(axis=0), 0, None)  # x, y
         part = radiance.value[0][low[1] : corners[:, 1].max() + 1, low[0] : corners[:, 0].max() + 1]
-        filled = np.zeros(part.shape[:2], np.uint8)
-        if filled.size:
-            cv2.fillConvexPoly(filled, corners - low, 1)
-        inside = part[filled > 0]
-        camera[index] = 2 * np.median(inside, axis=0) if len(inside) else np.nan
-    row, column = np.divmod(np.arange(24), _COLUMNS)
-    white_row, white_column = divmod(WHITE_PATCH, _COLUMNS)
-    offset = np.stack([column - white_column, row - white_row], axis=-1)
-    colors = found.patches
-    light = 1 + offset @ np.array((0.0, 0.0) if colors is None else colors.falloff)
-    glare = 0.0 if colors is None else colors.glare
+        inside = np.zeros(part.shape[:2], np.uint8)
+        if inside.size:
+            cv2.fillConvexPoly(inside, corners - low, 1)
+        if inside.any():
+            camera[index] = 2 * np.median(part[inside > 0], axis=0)
+    row, column = np.divmod(np.arange(24), 6)
+    offset = np.stack([column - column[_WHITE_PATCH], row - row[_WHITE_PATCH]], axis=-1)
+    falloff, glare = ((0.0, 0.0), 0.0) if found.patches is None else (found.patches.falloff, found.patches.glare)
+    light = 1 + offset @ np.array(falloff)
     return np.asarray((camera @ found.matrix.T - glare) / light[:, None])

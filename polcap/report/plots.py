@@ -20,7 +20,7 @@ class Mark:
     """A value on the axis of a `RowPlot`."""
 
     place: float  # 0…1 along the axis
-    title: str  # shown under the pointer; beside a bar
+    title: str  # shown under the pointer, or next to a bar
     shape: Literal["dot", "ring", "cross", "bar"] = "dot"
     color: str = _BLUE
     error: float = 0.0  # 1σ, share of the axis

@@ -6,9 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats, SurfaceMaps
-from polcap.optics.resize import area_mean
-
-_LEAST_SHARE = 1e-3  # of a pixel: where the object covers less, the mean is 0
+from polcap.optics.resize import area_mean, weighted_area_mean
 
 
 class ObjectReduction:
@@ -23,23 +21,14 @@ class ObjectReduction:
 
     def mean(self, image: Floats) -> Floats:
         """Means of (H, W) or (H, W, C) over the object's pixels; 0 outside the object."""
-        extra = (None,) * (image.ndim - 2)
-        total = area_mean(np.where(self.inside[..., *extra], image, 0).astype(np.float32), self.shape)
-        weight = self.share[..., *extra]
-        return np.asarray(np.where(weight > _LEAST_SHARE, total / np.maximum(weight, _LEAST_SHARE), 0), np.float32)
+        inside = self.inside[(..., *[None] * (image.ndim - 2))]
+        return weighted_area_mean(np.where(inside, image, 0), self.inside, self.shape)
 
     def maps(self, maps: SurfaceMaps) -> SurfaceMaps:
         """All maps, without the coarse depth."""
         normal = self.mean(maps.normal)
         x, y = ((edge + 0.5) * self.factor - 0.5 for edge in maps.view.center)
         left, top = (edge * self.factor for edge in maps.view.origin)
-        view = replace(
-            maps.view,
-            focal=maps.view.focal * self.factor,
-            center=(x, y),
-            scale=maps.view.scale / self.factor,
-            origin=(left, top),
-        )
         return replace(
             maps,
             normal=normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6),
@@ -49,5 +38,11 @@ class ObjectReduction:
             confidence=self.mean(maps.confidence),
             depth_prior=None,
             mask=self.share > 0.5,
-            view=view,
+            view=replace(
+                maps.view,
+                focal=maps.view.focal * self.factor,
+                center=(x, y),
+                scale=maps.view.scale / self.factor,
+                origin=(left, top),
+            ),
         )

@@ -29,20 +29,16 @@ class Tile:
 def sheet(tiles: list[Tile]) -> Picture:
     """Tiles three in a row, each with its caption above and its key below."""
     framed = [_framed(tile) for tile in tiles]
-    columns = min(3, len(framed))
     rows = []
-    for start in range(0, len(framed), columns):
-        row = framed[start : start + columns]
+    for start in range(0, len(framed), 3):
+        row = framed[start : start + 3]
         height = max(tile.shape[0] for tile in row)
-        blank = np.full((height, WIDTH + _GAP, 3), _GROUND, np.uint8)
-        padded = []
-        for place in range(columns):
-            cell = blank.copy()
-            if place < len(row):
-                cell[: row[place].shape[0], :WIDTH] = row[place]
-            padded.append(cell)
-        rows.append(np.hstack(padded))
-    return np.asarray(np.vstack(rows)[:, :-_GAP], np.uint8)
+        strip = np.full((height, min(3, len(framed)) * (WIDTH + _GAP) - _GAP, 3), _GROUND, np.uint8)
+        for place, tile in enumerate(row):
+            left = place * (WIDTH + _GAP)
+            strip[: tile.shape[0], left : left + WIDTH] = tile
+        rows.append(strip)
+    return np.vstack(rows)
 
 
 def write(picture: Picture, words: str, at: tuple[int, int], paint: tuple[int, int, int], size: int = 20) -> None:
@@ -51,29 +47,23 @@ def write(picture: Picture, words: str, at: tuple[int, int], paint: tuple[int, i
 
 
 def _framed(tile: Tile) -> Picture:
+    """A tile with its caption, and with the ticked bar of its key or its note."""
     height = max(1, round(tile.picture.shape[0] * WIDTH / tile.picture.shape[1]))
-    head = np.full((_HEAD, WIDTH, 3), _GROUND, np.uint8)
-    write(head, tile.caption, (2, 30), _INK, 22)
+    framed = np.full((_HEAD + height + _FOOT, WIDTH, 3), _GROUND, np.uint8)
+    write(framed, tile.caption, (2, 30), _INK, 22)
     if tile.picture.shape[1] > WIDTH:
-        scaled = area_mean(tile.picture, (height, WIDTH))
+        framed[_HEAD:-_FOOT] = area_mean(tile.picture, (height, WIDTH))
     else:
-        scaled = np.asarray(cv2.resize(tile.picture, (WIDTH, height), interpolation=cv2.INTER_NEAREST))
-    return np.vstack([head, scaled, _foot(tile)])
-
-
-def _foot(tile: Tile) -> Picture:
-    """The key's bar with its ticks, or the note."""
-    foot = np.full((_FOOT, WIDTH, 3), _GROUND, np.uint8)
+        framed[_HEAD:-_FOOT] = cv2.resize(tile.picture, (WIDTH, height), interpolation=cv2.INTER_NEAREST)
+    foot = framed[-_FOOT:]
     if tile.key is None:
         write(foot, tile.note, (2, 24), _SOFT, 17)
-        return foot
+        return framed
     foot[8:20] = tile.key.bar(WIDTH, 12)
-    last = len(tile.key.ticks) - 1
-    for number, tick in enumerate(tile.key.ticks):
+    for tick in tile.key.ticks:
         words = f"{tick:.3g}{tile.key.unit}"
         wide = cv2.getTextSize((WIDTH, 60), words, (0, 0), _LETTERS, 17, 400)[2]
         place = round(tile.key.place(tick) * (WIDTH - 1))
-        left = place - (0 if number == 0 else wide if number == last else wide // 2)
         foot[20:24, min(place, WIDTH - 2)] = _SOFT
-        write(foot, words, (max(0, left), 42), _SOFT, 17)
-    return foot
+        write(foot, words, (int(np.clip(place - wide // 2, 0, WIDTH - wide)), 42), _SOFT, 17)
+    return framed

@@ -33,73 +33,59 @@ from polcap.report.sheets import WIDTH, Tile, sheet, write
 from polcap.report.sheets import Picture as Picture
 from polcap.results import Results
 
-_AGREE = "first shot magenta, this shot green: gray where both agree"
-_DIRECTIONS = "red right, green up, blue toward the camera"
-
 
 def of_stage(results: Results, stage: str) -> Picture:
     """Picture of the result of a stage."""
-    paint: dict[str, Callable[[], Picture]] = {
-        "hdr": lambda: merged(results.radiance),
+    paint: dict[str, Callable[[], Picture | list[Tile]]] = {
+        "hdr": lambda: _merged(results.radiance),
         "whitebalance": lambda: chart(results.radiance, results.color),
-        "align": lambda: sheet(registered(results.radiance, results.alignment)),
+        "align": lambda: registered(results.radiance, results.alignment),
         "mask": lambda: outline(results.radiance, results.color, results.object_),
-        "selfcal": lambda: gains(results.selfcal.gains, results.radiance.angle),
-        "stokes": lambda: stokes(results.stokes),
-        "cues": lambda: cues(results.cues),
-        "infer": lambda: maps(results.maps),
-        "surface": lambda: surface(results.mesh, results.maps),
-        "asset": lambda: asset(results.asset),
+        "selfcal": lambda: _gains(results.selfcal.gains, results.radiance.angle),
+        "stokes": lambda: _stokes(results.stokes),
+        "cues": lambda: _cues(results.cues),
+        "infer": lambda: _maps(results.maps),
+        "surface": lambda: _surface(results.mesh, results.maps),
+        "asset": lambda: _textures(results.asset),
     }
-    return paint[stage]()
+    drawn = paint[stage]()
+    return sheet(drawn) if isinstance(drawn, list) else drawn
 
 
 def reference(radiance: AngleStack, color: ColorCalibration, widest: int | None = None) -> Picture:
     """The reference shot in calibrated colors, at most `widest` px wide."""
     first = radiance.value[0]
-    reduced = np.asarray(first if widest is None else _narrow(first, widest), np.float32)
+    reduced = np.asarray(first if widest is None else shrink(first, widest), np.float32)
     return display(cv2.transform(reduced, 2 * color.matrix.astype(np.float32)))
-
-
-def merged(radiance: AngleStack) -> Picture:
-    """Every merged shot; clipped pixels red, moved pixels magenta."""
-    top = _top(radiance.value[0])
-    tiles = []
-    for value, quality, angle in zip(radiance.value, radiance.quality, np.degrees(radiance.angle), strict=True):
-        tile = display(value, top)
-        tile[(quality & int(Quality.CLIPPED)) > 0] = (255, 40, 40)
-        tile[(quality & int(Quality.GHOST)) > 0] = (255, 0, 255)
-        tiles.append(Tile(tile, f"Polarizer at {angle:g}°", note="red: clipped in every exposure; magenta: moved"))
-    return sheet(tiles)
 
 
 def chart(radiance: AngleStack, color: ColorCalibration, widest: int | None = None) -> Picture:
     """The reference shot with the detected chart patches."""
     picture = reference(radiance, color, widest)
     times = max(1, round(2 * WIDTH / picture.shape[1]))
-    picture = np.asarray(np.repeat(np.repeat(picture, times, 0), times, 1), np.uint8)
+    picture = np.asarray(picture.repeat(times, 0).repeat(times, 1), np.uint8)
     zoom = picture.shape[1] / radiance.value.shape[2]
-    outlines: list[tuple[Floats, tuple[int, int, int]]] = []
     if color.place is not None:
-        outlines = [*((quad, (0, 255, 0)) for quad in color.place.quads), (color.place.corners, (255, 255, 0))]
-    for corners, paint in outlines:
-        points = np.round((corners + 0.5) * zoom - 0.5).astype(np.int32)
-        cv2.polylines(picture, [points], True, paint, 1, cv2.LINE_AA)
+        outlines = [(quad, (0, 255, 0)) for quad in color.place.quads] + [(color.place.corners, (255, 255, 0))]
+        for corners, paint in outlines:
+            points = np.round((corners + 0.5) * zoom - 0.5).astype(np.int32)
+            cv2.polylines(picture, [points], True, paint, 1, cv2.LINE_AA)
     return picture
 
 
 def registered(radiance: AngleStack, found: Alignment) -> list[Tile]:
     """Each registered shot (green) over the reference (magenta): gray where both agree."""
-    first = _gray(_narrow(radiance.value[0], 2 * WIDTH))
+    first = _gray(shrink(radiance.value[0], 2 * WIDTH))
     zoom = np.diag([*np.divide(first.shape[::-1], radiance.value.shape[2:0:-1]), 1.0])
     zoom[:2, 2] = (zoom.diagonal()[:2] - 1) / 2  # pixel centers are whole numbers
     tiles = []
-    shots = zip(radiance.value, found.transform, found.residual_px, np.degrees(radiance.angle), strict=True)
-    for value, transform, residual, angle in list(shots)[1:]:
-        on_first = warp(_gray(_narrow(value, 2 * WIDTH)), zoom @ transform @ np.linalg.inv(zoom), order=1)
+    for k, degrees in list(enumerate(np.degrees(radiance.angle)))[1:]:
+        shot = _gray(shrink(radiance.value[k], 2 * WIDTH))
+        on_first = warp(shot, zoom @ found.transform[k] @ np.linalg.inv(zoom), order=1)
         moved = display(np.stack([first, on_first, first], -1), _top(first))
-        x, y = transform[:2, 2]
-        tiles.append(Tile(moved, f"{angle:g}° shot moved by {x:+.2f}, {y:+.2f} ± {residual:.3f} px", note=_AGREE))
+        x, y = found.transform[k, :2, 2]
+        caption = f"{degrees:g}° shot moved by {x:+.2f}, {y:+.2f} ± {found.residual_px[k]:.3f} px"
+        tiles.append(Tile(moved, caption, note="first shot magenta, this shot green: gray where both agree"))
     return tiles
 
 
@@ -113,7 +99,60 @@ def outline(radiance: AngleStack, color: ColorCalibration, object_: ObjectMask, 
     return picture
 
 
-def gains(found: Gains, angle: Floats) -> Picture:
+def normal(found: SurfaceMaps) -> Picture:
+    """Normals as colors, black outside the object."""
+    return _eight_bits((found.normal / 2 + 0.5) * found.mask[..., None])
+
+
+def shaded(mesh: Mesh, found: SurfaceMaps) -> Picture:
+    """The shape without colors: the normals of the depth map under a light from the upper left."""
+    inside = np.isfinite(mesh.depth)
+    depth = np.where(inside, mesh.depth, np.nan)
+    footprint = np.nanmedian(depth) / found.view.focal if inside.any() else 1.0  # size of a pixel there
+    down, right = np.gradient(depth / footprint)
+    facing = np.stack([right, -down, np.ones_like(depth)], -1)  # z towards the camera, y up
+    light = np.array([-0.5, 0.6, 0.62])
+    cosine = facing @ (light / np.linalg.norm(light)) / np.linalg.norm(facing, axis=-1)
+    shade = np.clip(np.nan_to_num(cosine), 0, 1)
+    return _eight_bits(np.repeat((0.1 + 0.85 * shade)[..., None], 3, -1) * inside[..., None])
+
+
+def display(linear: Floats, top: float | None = None) -> Picture:
+    """Linear light as sRGB; `top` becomes white, by default the 99.5th percentile."""
+    return color.srgb_eight_bits(np.asarray(linear, np.float32) / np.float32(top or _top(linear)))
+
+
+def scale(value: Floats, low: float, high: float, inside: NDArray[np.bool_]) -> Picture:
+    """Numbers as colors from dark to bright, black outside."""
+    return keys.ColorKey(low, max(high, low + 1e-12), "", (), "inferno").picture(value, inside)
+
+
+def hue(aolp: Floats, inside: NDArray[np.bool_]) -> Picture:
+    """An angle mod π as a hue."""
+    return keys.AOLP.picture(np.degrees(aolp) % 180, inside)
+
+
+def shrink(picture: NDArray[Any], width: int) -> NDArray[Any]:
+    """A picture (H, W, …) averaged down to at most `width` pixels wide."""
+    tall, wide = picture.shape[:2]
+    if wide <= width:
+        return picture
+    return area_mean(picture, (max(1, round(tall * width / wide)), width))
+
+
+def _merged(radiance: AngleStack) -> list[Tile]:
+    """Every merged shot; clipped pixels red, moved pixels magenta."""
+    top = _top(radiance.value[0])
+    tiles = []
+    for value, quality, angle in zip(radiance.value, radiance.quality, np.degrees(radiance.angle)):
+        tile = display(value, top)
+        tile[(quality & int(Quality.CLIPPED)) > 0] = (255, 40, 40)
+        tile[(quality & int(Quality.GHOST)) > 0] = (255, 0, 255)
+        tiles.append(Tile(tile, f"Polarizer at {angle:g}°", note="red: clipped in every exposure; magenta: moved"))
+    return tiles
+
+
+def _gains(found: Gains, angle: Floats) -> Picture:
     """Gains of the shots with 1σ; crosses are the gains from pixels that face the camera."""
     height, left = 60 * len(found.gain) + 40, 120
     picture = np.full((height, WIDTH, 3), 255, np.uint8)
@@ -137,125 +176,64 @@ def gains(found: Gains, angle: Floats) -> Picture:
     return picture
 
 
-def stokes(image: StokesImage) -> Picture:
-    """S0, DoLP and AoLP in camera channels."""
-    total = frames.total(image.stokes)
-    s0 = np.maximum(total[0], 1e-6)
-    dolp = np.hypot(total[1], total[2]) / s0
-    aolp = np.arctan2(total[2], total[1]) / 2
-    turn = np.degrees(aolp) % 180
-    return sheet(
-        [
-            Tile(display(image.stokes[0]), "S0", note="camera channels, brightest parts white"),
-            Tile(keys.DOLP.picture(dolp, image.mask), "Degree of linear polarization", keys.DOLP),
-            Tile(keys.AOLP.picture(turn, image.mask), "Angle of linear polarization", keys.AOLP),
-        ]
-    )
+def _stokes(image: StokesImage) -> list[Tile]:
+    """S0 in camera channels, DoLP and AoLP."""
+    s0, s1, s2 = frames.total(image.stokes)
+    dolp = np.hypot(s1, s2) / np.maximum(s0, 1e-6)
+    tile = Tile(display(image.stokes[0]), "S0", note="camera channels, brightest parts white")
+    return [tile, *_polarization(dolp, np.arctan2(s2, s1) / 2, image.mask)]
 
 
-def cues(found: Cues) -> Picture:
+def _cues(found: Cues) -> list[Tile]:
     """Inputs of the estimators: S0, DoLP, AoLP, normalized Stokes parameters, diffuse color and noise."""
     cos, sin = found.normalized_stokes
-    turn = np.degrees(np.arctan2(sin, cos) / 2) % 180
     inside = found.mask[..., None]
     normalized = _eight_bits(np.stack([np.full_like(cos, 0.5), cos / 2 + 0.5, sin / 2 + 0.5], -1) * inside)
-    return sheet(
-        [
-            Tile(display(found.radiance), "S0", note="calibrated colors, brightest parts white"),
-            Tile(keys.DOLP.picture(found.dolp, found.mask), "Degree of linear polarization", keys.DOLP),
-            Tile(keys.AOLP.picture(turn, found.mask), "Angle of linear polarization", keys.AOLP),
-            Tile(normalized, "Normalized Stokes parameters", note="green S1, blue S2: 0.5 is zero"),
-            Tile(display(found.diffuse_color * inside, 1.0), "Diffuse color", note="normalized to unit length"),
-            Tile(keys.SIGMA.picture(found.ratio_sigma, found.mask), "Noise of S1/S0 and S2/S0, 1σ", keys.SIGMA),
-        ]
-    )
-
-
-def maps(found: SurfaceMaps) -> Picture:
-    """Normal, diffuse albedo, specular albedo, roughness and expected error."""
-    inside = found.mask[..., None]
-    return sheet(
-        [
-            Tile(normal(found), "Normal", note=_DIRECTIONS),
-            Tile(display(found.diffuse * inside, 1.0), "Diffuse albedo", note="white: 1"),
-            Tile(display(found.specular * inside, keys.F0.high), "Specular albedo F0", note=f"white: {keys.F0.high:g}"),
-            Tile(keys.ROUGHNESS.picture(found.roughness, found.mask), "Roughness", keys.ROUGHNESS),
-            Tile(keys.ERROR.picture(found.confidence, found.mask), "Expected error of the normal", keys.ERROR),
-        ]
-    )
-
-
-def normal(found: SurfaceMaps) -> Picture:
-    return _eight_bits((found.normal / 2 + 0.5) * found.mask[..., None])
-
-
-def surface(mesh: Mesh, found: SurfaceMaps) -> Picture:
-    """The depth map, and its shape under a light from the upper left."""
-    inside = np.isfinite(mesh.depth)
-    factor = 1000.0 if mesh.metric else 1.0
-    key = keys.depth(factor * mesh.depth[inside], mesh.metric)
-    return sheet(
-        [
-            Tile(key.picture(factor * mesh.depth, inside), "Depth", key),
-            Tile(shaded(mesh, found), "Shape", note="normals of the depth map, under a light from the upper left"),
-        ]
-    )
-
-
-def shaded(mesh: Mesh, found: SurfaceMaps) -> Picture:
-    """The shape without colors: the normals of the depth map under one light."""
-    inside = np.isfinite(mesh.depth)
-    depth = np.where(inside, mesh.depth, np.nan)
-    footprint = np.nanmedian(depth) / found.view.focal if inside.any() else 1.0  # size of a pixel there
-    down, right = np.gradient(depth / footprint)
-    facing = np.stack([right, -down, np.ones_like(depth)], -1)  # z towards the camera, y up
-    facing = facing / (frames.dot(facing, facing) ** 0.5)[..., None]
-    light = np.array([-0.5, 0.6, 0.62])
-    shade = np.clip(np.nan_to_num(facing) @ (light / np.linalg.norm(light)), 0, 1)
-    return _eight_bits(np.repeat((0.1 + 0.85 * shade)[..., None], 3, -1) * inside[..., None])
-
-
-def asset(built: Asset) -> Picture:
-    """The textures as stored in the file."""
-    tiles = [
-        (built.base_color, "Base color", "sRGB"),
-        (built.normal, "Normal", "tangent space, +Y"),
-        (built.occlusion_roughness_metallic, "Occlusion, roughness, metallic", "red, green, blue"),
-        (built.specular_color, "Specular color", f"white is {max(built.specular_factor):.3g} × F0 of the index"),
+    return [
+        Tile(display(found.radiance), "S0", note="calibrated colors, brightest parts white"),
+        *_polarization(found.dolp, np.arctan2(sin, cos) / 2, found.mask),
+        Tile(normalized, "Normalized Stokes parameters", note="green S1, blue S2: 0.5 is zero"),
+        Tile(display(found.diffuse_color * inside, 1.0), "Diffuse color", note="normalized to unit length"),
+        Tile(keys.SIGMA.picture(found.ratio_sigma, found.mask), "Noise of S1/S0 and S2/S0, 1σ", keys.SIGMA),
     ]
-    return sheet([Tile(np.array(picture), caption, note=note) for picture, caption, note in tiles])
 
 
-def display(linear: Floats, top: float | None = None) -> Picture:
-    """Linear light as sRGB; `top` becomes white, by default the 99.5th percentile."""
-    return color.srgb_eight_bits(np.asarray(linear, np.float32) / np.float32(top or _top(linear)))
+def _polarization(dolp: Floats, aolp: Floats, inside: NDArray[np.bool_]) -> list[Tile]:
+    return [
+        Tile(keys.DOLP.picture(dolp, inside), "Degree of linear polarization", keys.DOLP),
+        Tile(hue(aolp, inside), "Angle of linear polarization", keys.AOLP),
+    ]
 
 
-def scale(value: Floats, low: float, high: float, inside: NDArray[np.bool_]) -> Picture:
-    """Numbers as colors from dark to bright, black outside."""
-    level = _eight_bits((np.nan_to_num(value, nan=low) - low) / max(high - low, 1e-12))
-    picture = cv2.cvtColor(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
-    picture[~inside] = 0
-    return np.asarray(picture, np.uint8)
+def _maps(found: SurfaceMaps) -> list[Tile]:
+    inside = found.mask[..., None]
+    return [
+        Tile(normal(found), "Normal", note="red right, green up, blue toward the camera"),
+        Tile(display(found.diffuse * inside, 1.0), "Diffuse albedo", note="white: 1"),
+        Tile(display(found.specular * inside, keys.F0.high), "Specular albedo F0", note=f"white: {keys.F0.high:g}"),
+        Tile(keys.ROUGHNESS.picture(found.roughness, found.mask), "Roughness", keys.ROUGHNESS),
+        Tile(keys.ERROR.picture(found.confidence, found.mask), "Expected error of the normal", keys.ERROR),
+    ]
 
 
-def hue(aolp: Floats, inside: NDArray[np.bool_]) -> Picture:
-    """An angle mod π as a hue."""
-    turn = np.asarray(np.round(np.mod(aolp, np.pi) / np.pi * 180) % 180, np.uint8)
-    wheel = cv2.cvtColor(np.stack([turn, np.full_like(turn, 200), np.full_like(turn, 255)], -1), cv2.COLOR_HSV2RGB)
-    wheel[~inside] = 0
-    return np.asarray(wheel, np.uint8)
+def _surface(mesh: Mesh, found: SurfaceMaps) -> list[Tile]:
+    """The depth map and its shape."""
+    inside = np.isfinite(mesh.depth)
+    depth = mesh.depth * (1000.0 if mesh.metric else 1.0)
+    key = keys.depth(depth[inside], mesh.metric)
+    note = "normals of the depth map, under a light from the upper left"
+    return [Tile(key.picture(depth, inside), "Depth", key), Tile(shaded(mesh, found), "Shape", note=note)]
 
 
-def shrink(picture: Picture, width: int) -> Picture:
-    """A picture no wider than `width`."""
-    return np.asarray(_narrow(picture, width), np.uint8)
-
-
-def _narrow(picture: NDArray[Any], width: int) -> NDArray[Any]:
-    """A picture (H, W, …) averaged down to at most `width` pixels wide."""
-    tall, wide = picture.shape[:2]
-    return picture if wide <= width else area_mean(picture, (max(1, round(tall * width / wide)), width))
+def _textures(built: Asset) -> list[Tile]:
+    """The textures as stored in the file."""
+    specular_note = f"white is {max(built.specular_factor):.3g} × F0 of the index"
+    return [
+        Tile(built.base_color, "Base color", note="sRGB"),
+        Tile(built.normal, "Normal", note="tangent space, +Y"),
+        Tile(built.occlusion_roughness_metallic, "Occlusion, roughness, metallic", note="red, green, blue"),
+        Tile(built.specular_color, "Specular color", note=specular_note),
+    ]
 
 
 def _top(linear: Floats) -> float:

@@ -3,11 +3,7 @@
 import tempfile
 from collections import Counter
 from pathlib import Path
-from typing import Annotated
 from urllib.parse import parse_qsl
-
-import msgspec
-from msgspec import Meta
 
 from polcap import config
 from polcap.errors import SettingError
@@ -21,11 +17,10 @@ from polcap.synth.shooting import MIDDLE_S, Kind, Shoot, Studio, Take, random_sc
 _NUMBER_OF_ROLE = {"shot": 0, "repeat": 1000, "ambient": 2000, "chart": 3000, "cross": 4000}
 
 
-class SimulatedSubject(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The scene in front of the simulated camera."""
+class SimulatedCameraSettings(Shoot, frozen=True, forbid_unknown_fields=True):
+    """Settings in the URL of the simulated camera: those of `polcap synth`, and the kind of scene."""
 
     scene: Kind = "bumps"
-    seed: Annotated[int, Meta(ge=0)] = 0
 
 
 class SimulatedCamera:
@@ -35,7 +30,7 @@ class SimulatedCamera:
     switches_flash = polarizes_flash = True
 
     def __init__(self, query: str, log: Log) -> None:
-        self._subject, self._shoot = parse_query(query)
+        self._shoot = parse_query(query)
         self._log = log
         self._studio: Studio | None = None
         self._rendered: dict[tuple[float, bool], Floats] = {}  # by angle and by whether the flash has its filter
@@ -60,11 +55,10 @@ class SimulatedCamera:
     def shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
         if exposure.flash or exposure.iso not in (None, 100.0) or exposure.f_number not in (None, 11.0):
             raise SettingError(f"the simulated camera has f/11, ISO 100 and no flash power, not {exposure}; give times")
-        self._studio = self._studio or Studio(random_scene(self._subject.seed, self._subject.scene), self._shoot)
+        self._studio = self._studio or Studio(random_scene(self._shoot.seed, self._shoot.scene), self._shoot)
         shot, step, angle = self._next
         if (angle, self._crossed) not in self._rendered:
-            render = self._studio.crossed_at if self._crossed else self._studio.through
-            self._rendered = {(angle, self._crossed): render(angle)}
+            self._rendered = {(angle, self._crossed): self._studio.through(angle, self._crossed)}
         time_s = exposure.time_s or MIDDLE_S
         take = Take(shot, step, time_s / MIDDLE_S, self._taken[shot, step, flash], flash)
         self._taken[shot, step, flash] += 1
@@ -80,17 +74,14 @@ class SimulatedCamera:
         self._rendered = {}
 
 
-def parse_query(query: str) -> tuple[SimulatedSubject, Shoot]:
-    """Scene and `synth` settings of a URL's query; unknown ones raise SettingError."""
-    pairs = parse_qsl(query, keep_blank_values=True)
-    own = SimulatedSubject.__struct_fields__
-    scene = [f"{name}={value}" for name, value in pairs if name in own]
-    rest = [f"{name}={value}" for name, value in pairs if name not in own or name == "seed"]
+def parse_query(query: str) -> SimulatedCameraSettings:
+    """Settings of a URL's query; unknown ones raise SettingError."""
+    assignments = [f"{name}={value}" for name, value in parse_qsl(query, keep_blank_values=True)]
     defaults = {"width": 768, "height": 576, "nudge_px": 0.0, "nudge_deg": 0.0, "angle_error_deg": 0.0}
     try:
-        subject, shoot = config.fill(SimulatedSubject, {}, scene), config.fill(Shoot, defaults, rest)
+        shoot = config.fill(SimulatedCameraSettings, defaults, assignments)
     except SettingError as error:
         raise SettingError(f"--camera simulated?{query}: {str(error).removeprefix('--set ')}") from None
     if shoot.bracket != "time":
         raise SettingError(f"--camera simulated?bracket={shoot.bracket}: only time is simulated; leave it out")
-    return subject, shoot
+    return shoot

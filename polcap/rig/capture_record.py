@@ -59,7 +59,7 @@ class RigFile(msgspec.Struct):
 
 
 class CaptureRecord:
-    """The frames in a capture folder so far; used by the shooting thread and the checking thread."""
+    """Accepted and rejected frames of a capture folder; used by the shooting thread and the checking thread."""
 
     def __init__(self, folder: Path, content: RigFile, slots: tuple[Slot, ...]) -> None:
         self.folder = folder
@@ -68,7 +68,7 @@ class CaptureRecord:
         self._lock = threading.RLock()
 
     def missing(self, pending: Iterable[Slot] = ()) -> list[Slot]:
-        """Slots without a frame, and without a frame that is being checked."""
+        """Slots that have no accepted frame and no frame under check."""
         return [slot for slot in self.slots if slot.name not in self.content.frames and slot not in pending]
 
     def accepted(self) -> dict[str, AcceptedFrame]:

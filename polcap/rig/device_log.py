@@ -31,5 +31,5 @@ class Log:
                 raise atomic.failure(path, error) from error
 
     def close(self) -> None:
-        """Drop all later lines."""
+        """Write no further lines to the log."""
         self._path = None

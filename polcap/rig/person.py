@@ -9,7 +9,7 @@ RING_TO_ZERO = "turn the polarizer's ring to 0°, then press Enter: "
 
 
 def ask(question: str, log: Log) -> str:
-    """The answer: asked on stderr, read from stdin. Raises HardwareError when the input has ended."""
+    """Ask on stderr, read the answer from stdin. Raises HardwareError when the input has ended."""
     print(question, end="", file=sys.stderr, flush=True)
     log.write("person", ">", question.strip())
     answer = sys.stdin.readline() if sys.stdin else ""
@@ -20,5 +20,5 @@ def ask(question: str, log: Log) -> str:
 
 
 def at_terminal() -> bool:
-    """Whether somebody can be asked."""
+    """Whether polcap runs in a terminal, so that a person can answer."""
     return sys.stdin is not None and sys.stdin.isatty()

@@ -14,31 +14,33 @@ from polcap.rig.shooting_plan import CaptureOrder
 
 
 def complete_order(folder: Path, options: dict[str, Any], resume: bool) -> CaptureOrder:
-    """The options that are not None; the others from the begun capture with `resume`, else by default.
+    """Options of a capture: the stated ones; the others from the begun capture with `resume`, else defaults.
 
-    Raises SettingError if rotator or camera is missing, or the angles make no capture.
+    Raises SettingError if rotator or camera is missing, or the angles make no capture; CaptureError if the capture was
+    begun with other options.
     """
+    stated = {name: value for name, value in options.items() if value is not None}
     begun = capture_record.load(folder) if resume else None
-    values = {"angles_deg": layouts.DEFAULT_DEG, "bracket": ()} | (msgspec.structs.asdict(begun.order) if begun else {})
-    values |= {name: value for name, value in options.items() if value is not None}
+    if begun is not None:
+        _check_same(folder, stated, msgspec.structs.asdict(begun.order))
+        return msgspec.structs.replace(begun.order, **stated)
     for name in ("rotator", "camera"):
-        if name not in values and resume:
+        if name not in stated and resume:
             raise SettingError(
                 f"{folder} holds no capture that was begun: there is nothing to resume; correct the folder, or begin "
                 "with --rotator and --camera"
             )
-        if name not in values:
+        if name not in stated:
             raise SettingError(f"--{name} is missing; name one, or `simulated` to try without")
-    return CaptureOrder(**values)
+    return CaptureOrder(**({"angles_deg": layouts.DEFAULT_DEG, "bracket": ()} | stated))
 
 
-def open_folder(folder: Path, order: CaptureOrder, resume: bool) -> RigFile | None:
-    """The record of an earlier run of the same order; None for a new capture. Creates the folder.
+def open_folder(folder: Path, resume: bool) -> RigFile | None:
+    """The record of an earlier run with `resume`; None for a new capture. Creates the folder.
 
-    Raises CaptureError if the folder holds other files, or a capture that was begun with other options.
+    Raises CaptureError if the folder holds other files.
     """
     if resume and (content := capture_record.load(folder)) is not None:
-        _check_same_order(folder, order, content.order)
         return content
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -52,17 +54,15 @@ def open_folder(folder: Path, order: CaptureOrder, resume: bool) -> RigFile | No
     return None
 
 
-def _check_same_order(folder: Path, order: CaptureOrder, begun: CaptureOrder) -> None:
-    for name, was in msgspec.structs.asdict(begun).items():
-        now = getattr(order, name)
-        if name in ("rotator", "camera"):
-            now, was = _without_port(now), _without_port(was)
-        if now != was and not (name == "bracket" and not now):  # by default, the camera's own bracket
+def _check_same(folder: Path, stated: dict[str, Any], begun: dict[str, Any]) -> None:
+    """Refuse other options than those of the begun capture; ports may differ after a cable was plugged in again."""
+    for name, value in stated.items():
+        device = name in ("rotator", "camera")
+        if (_without_port(value) != _without_port(begun[name])) if device else value != begun[name]:
             option = "--" + name.removesuffix("_deg")
             raise CaptureError(f"{folder} was begun with another {option}; leave it out, or choose a new folder")
 
 
 def _without_port(url: str) -> str:
-    """A device's URL without its port, which may differ after the cable was plugged in again."""
     head, _, query = url.partition("?")
     return f"{head.partition(':')[0]}?{query}"

@@ -71,7 +71,7 @@ def _sharpness(light: Floats) -> float:
 def retake_reason(
     facts: FrameFacts, wanted: Exposure, flash: bool, shortest: bool, others: list[FrameFacts], sharpest: float
 ) -> str | None:
-    """Why a frame must be retaken.
+    """Reason for which a frame must be retaken; None for a good frame.
 
     others : the accepted frames of the capture. sharpest : greatest sharpness of those with the same exposure.
     """

@@ -21,13 +21,13 @@ class Motor(Protocol):
     wraps: bool  # positions are modulo 360
 
     def home(self) -> None:
-        """Find zero."""
+        """Search the zero position."""
 
     def go(self, angle_deg: float) -> None:
-        """Turn there; returns when the motor has stopped."""
+        """Turn to an angle; returns when the motor has stopped."""
 
     def position(self) -> float:
-        """The angle the device reports."""
+        """The angle that the device reports."""
 
     def halt(self) -> None:
         """Stop turning and switch the current off."""
@@ -118,7 +118,7 @@ class PolarizerRotator:
         return True
 
     def _approach(self, target: float) -> None:
-        """Turn to motor degrees, upwards at the end, so that a gear's play does not show."""
+        """Turn the motor to `target` degrees, upwards at the end, so that play of the gear causes no error."""
         previous, self._stopped_at = self._stopped_at, None
         backlash = self._settings.backlash
         if backlash and (previous is None or target < previous):

@@ -39,19 +39,21 @@ def shoot(
     tries: int = 2,
     report: Report = lambda line: None,
 ) -> dict[str, Any]:
-    """Shoot the capture that was ordered into `folder`; returns a summary.
+    """Shoot the capture that was ordered into `folder`; with `resume` the frames that the folder lacks.
+
+    Returns a summary.
 
     Raises
     ------
     CaptureError
-        `folder` is not empty or, with `resume`, holds another capture; or a frame is rejected too often.
+        `folder` is not empty, or a frame is rejected too often.
     HardwareError
         A device failed. The frames so far stay, and `resume` continues.
     StorageError
         The disk is full, or too small.
     """
     start = time.monotonic()
-    content = open_folder(folder, order, resume)
+    content = open_folder(folder, resume)
     with (
         _locked(folder),
         _signals_as_ctrl_c(),
@@ -95,7 +97,7 @@ def _take_missing(
 
 @dataclass
 class CaptureLoop:
-    """The loop that takes the missing frames."""
+    """Takes the missing frames of a capture, one after the other."""
 
     record: CaptureRecord
     check: BackgroundCheck

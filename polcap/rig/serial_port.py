@@ -114,7 +114,7 @@ class Port:
         return line.decode("ascii")
 
     def read_lines(self) -> Iterator[str]:
-        """Lines as they come. Raises NoAnswer when the time for an answer is over, Unplugged."""
+        """Yield the lines of one answer. Raises NoAnswer when the time for an answer is over, Unplugged."""
         end = time.monotonic() + ANSWER_S
         while True:
             yield self.read_line(max(0.0, end - time.monotonic()))

@@ -38,7 +38,7 @@ class CaptureOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Slot:
-    """One frame to take."""
+    """One frame of a shooting plan."""
 
     role: Role
     angle_deg: float | None  # None: at any angle
@@ -74,7 +74,7 @@ def plan_slots(order: CaptureOrder, switches_flash: bool) -> tuple[Slot, ...]:
 
 
 def next_slot(missing: Sequence[Slot], at_deg: float) -> Slot:
-    """The frame to take now.
+    """The frame of a shooting plan to take now.
 
     First the chart; then all frames at the present angle; then from the nearer end of the remaining angles through
     them. Frames for which a person switches the flash follow, and last those with the filter on the flash.

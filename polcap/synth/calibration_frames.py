@@ -4,6 +4,7 @@ The folder has the layout that `polcap calibrate` reads: dark/, flat/, flash/, l
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,12 +15,18 @@ from msgspec import Meta
 from polcap.formats import atomic
 from polcap.formats.capture import layouts
 from polcap.images import Exif, Floats, View
-from polcap.synth import boards, forward_camera, lens
-from polcap.synth.forward_camera import COLOR_MATRIX, Sensor
+from polcap.optics import frames
+from polcap.synth import color_checker, forward_camera
+from polcap.synth.color_checker import Chart
+from polcap.synth.forward_camera import COLOR_MATRIX, Bend, Sensor
 
 _CFA = np.array([[0, 1], [1, 2]], np.uint8)
 Extinction = Annotated[float, Meta(ge=1)]  # largest over smallest transmittance
 _TINT = np.array([0.8, 1.0, 0.7])  # of the light, in camera channels
+_SAMPLES = 3  # rays per pixel side
+_COLUMNS, _ROWS = 10, 7  # squares of the checkerboard
+_WALL, _PAPER, _INK = 0.18, 0.85, 0.04  # albedos: of the wall behind, of the checkerboard
+_MOST_TILT_DEG = 35.0
 
 
 class CalibrationShoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -46,7 +53,7 @@ class CalibrationShoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pops: Annotated[int, Meta(ge=0, le=10000)] = 24  # photographs with flash
     boards: Annotated[int, Meta(ge=0, le=10000)] = 0  # photographs of a board in random poses
     board: Literal["checkerboard", "chart"] = "checkerboard"
-    distortion: tuple[lens.Bend, lens.Bend] = (-0.12, 0.05)  # k1, k2 of synth/lens.py; only in photographs of boards
+    distortion: tuple[Bend, Bend] = (-0.12, 0.05)  # k1, k2 of `undistort`; only in photographs of boards
     focal_mm: Annotated[float, Meta(ge=1, le=10000)] = 60.0  # on a sensor 36 mm wide
 
     @property
@@ -55,7 +62,7 @@ class CalibrationShoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def write(folder: Path, shoot: CalibrationShoot) -> None:
-    """Write all photographs into the new folder; the same arguments give the same bytes.
+    """Write simulated calibration photographs into a new folder; the same arguments give the same bytes.
 
     Raises
     ------
@@ -65,46 +72,45 @@ def write(folder: Path, shoot: CalibrationShoot) -> None:
         The folder cannot be written.
     """
     forward_camera.require_empty(folder)
+    actual = msgspec.structs.replace(shoot.sensor, black=shoot.sensor.black + shoot.black_error)
+    base = Exif(
+        make="Polcap", model="Synthetic", lens="Synthetic 60mm", f_number=11.0, focal_length_mm=shoot.focal_mm,
+        taken="2026-03-14T12:00:00.000",
+    )  # fmt: skip
     with atomic.folder(folder) as place:
-        for number, (name, radiance, iso, time, flash) in enumerate(_frames(shoot)):
-            _photograph(place / name, shoot, radiance, iso, time, flash, number)
+        for number, (name, radiance, iso, time) in enumerate(_photographs(shoot)):
+            random = np.random.default_rng([shoot.seed, 8, number])
+            counts = forward_camera.expose(forward_camera.mosaic(radiance, _CFA), actual, iso / 100, random)
+            exif = replace(base, exposure_time=time, iso=iso, flash_fired=name == "flash")
+            file = place / name / f"IMG_{number:04d}.DNG"
+            forward_camera.write_dng(file, counts, shoot.sensor, _CFA, COLOR_MATRIX, exif)
         with atomic.path(place / "truth.json") as temporary:
             temporary.write_bytes(msgspec.json.format(msgspec.json.encode(shoot), indent=1))
 
 
-def _frames(shoot: CalibrationShoot) -> Iterator[tuple[str, Floats, float, float, bool]]:
-    """File name, light (H, W, 3) at ISO 100, ISO, exposure time [s] and whether the flash fired, of each frame."""
+def _photographs(shoot: CalibrationShoot) -> Iterator[tuple[str, Floats, float, float]]:
+    """Folder, light (H, W, 3) at ISO 100, ISO and exposure time [s] of each photograph."""
     random = np.random.default_rng([shoot.seed, 7])
-    light, number = _surface(shoot), 0
+    light = _surface(shoot)
     for iso in shoot.isos:
         amplification = iso / 100
         for _ in range(2):
-            yield f"dark/IMG_{number:04d}.DNG", 0 * light, iso, 0.01, False
-            number += 1
-        for level in shoot.levels:
-            for _ in range(2):
-                jitter = 1 + shoot.lamp_jitter * random.normal()
-                time = level / amplification * 0.1
-                flat = light * (level**shoot.power / amplification * jitter)
-                yield f"flat/IMG_{number:04d}.DNG", flat, iso, time, False
-                number += 1
+            yield "dark", 0 * light, iso, 0.01
+        for level in np.repeat(shoot.levels, 2).tolist():
+            jitter = 1 + shoot.lamp_jitter * random.normal()
+            yield "flat", light * (level**shoot.power / amplification * jitter), iso, level / amplification * 0.1
     for _ in range(shoot.pops):
-        jitter = 1 + shoot.flash_jitter * random.normal()
-        yield f"flash/IMG_{number:04d}.DNG", light * (0.5 * jitter), 100.0, 1 / 160, True
-        number += 1
-    size = shoot.width, shoot.height
-    for albedo in boards.pictures(shoot.view, shoot.distortion, size, shoot.boards, shoot.board, shoot.seed):
-        yield f"lens/IMG_{number:04d}.DNG", albedo * (0.8 * _TINT), 100.0, 0.05, False
-        number += 1
+        yield "flash", light * (0.5 * (1 + shoot.flash_jitter * random.normal())), 100.0, 1 / 160
+    for albedo in _boards(shoot):
+        yield "lens", albedo * (0.8 * _TINT), 100.0, 0.05
     contrast = (np.array(shoot.extinction) - 1) / (np.array(shoot.extinction) + 1)
     for axis in shoot.axes_deg:
         for ring in np.arange(0, 180, shoot.ring_step_deg):
             actual = shoot.sense * (ring + shoot.ring_error_deg * random.normal()) + shoot.zero_deg
             passed = 0.5 * (1 + contrast * np.cos(2 * np.radians(actual - axis)))
             jitter = 1 + shoot.lamp_jitter * random.normal()
-            name = f"polarizer/axis{layouts.degrees(axis)}/pol{layouts.degrees(ring)}/IMG_{number:04d}.DNG"
-            yield name, light * (0.8 * jitter) * passed, 100.0, 0.05, False
-            number += 1
+            name = f"polarizer/axis{layouts.degrees(axis)}/pol{layouts.degrees(ring)}"
+            yield name, light * (0.8 * jitter) * passed, 100.0, 0.05
 
 
 def _surface(shoot: CalibrationShoot) -> Floats:
@@ -118,22 +124,39 @@ def _surface(shoot: CalibrationShoot) -> Floats:
     return np.asarray((vignette * uneven)[..., None] * _TINT)
 
 
-def _photograph(
-    path: Path, shoot: CalibrationShoot, radiance: Floats, iso: float, time: float, flash: bool, number: int
-) -> None:
-    random = np.random.default_rng([shoot.seed, 8, number])
-    mosaic = forward_camera.mosaic(radiance, _CFA)
-    actual = msgspec.structs.replace(shoot.sensor, black=shoot.sensor.black + shoot.black_error)
-    counts = forward_camera.expose(mosaic, actual, iso / 100, random)
-    exif = Exif(
-        make="Polcap",
-        model="Synthetic",
-        lens="Synthetic 60mm",
-        exposure_time=time,
-        f_number=11.0,
-        iso=iso,
-        focal_length_mm=shoot.focal_mm,
-        taken="2026-03-14T12:00:00.000",
-        flash_fired=flash,
-    )
-    forward_camera.write_dng(path, counts, shoot.sensor, _CFA, COLOR_MATRIX, exif)
+def _boards(shoot: CalibrationShoot) -> Iterator[Floats]:
+    """Albedo (H, W, 3) of pictures of a checkerboard or chart in random poses, in front of a gray wall."""
+    width, height, view, kind = shoot.width, shoot.height, shoot.view, shoot.board
+    random = np.random.default_rng([shoot.seed, 9])
+    across = width / view.focal  # of the picture, at distance 1
+    pitch = 0.6 * across / (6 if kind == "chart" else _COLUMNS)
+    for _ in range(shoot.boards):
+        turn = random.uniform(-1, 1, 3) * (_MOST_TILT_DEG, _MOST_TILT_DEG, 15)
+        share = random.uniform(-1, 1, 2) * (0.2, 0.16)
+        x, y, z = np.array([share[0] * across, share[1] * height / view.focal, -1.0]) * random.uniform(0.85, 1.1)
+        board = Chart((float(x), float(y), float(z)), tuple(turn.tolist()), pitch)
+        total = np.zeros((height, width, 3))
+        offsets = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
+        y, x = np.mgrid[:height, :width].astype(float)
+        for dy in offsets:
+            for dx in offsets:
+                ray = frames.rays_at(view, *forward_camera.undistort(view, shoot.distortion, x + dx, y + dy)).reshape(
+                    -1, 3
+                )
+                total += _albedo(ray, board, kind).reshape(height, width, 3)
+        yield total / _SAMPLES**2
+
+
+def _albedo(ray: Floats, board: Chart, kind: str) -> Floats:
+    """Albedo (P, 3) at the end of rays (P, 3), which point from the surface to the lens."""
+    out = np.full((len(ray), 3), _WALL)
+    if kind == "chart":
+        at, _, albedo = color_checker.intersect(board, ray)
+        out[at] = albedo
+        return out
+    _, column, row = color_checker.meet_plane(board, ray)
+    column, row = column + _COLUMNS / 2, row + _ROWS / 2
+    out[(column > -0.5) & (column < _COLUMNS + 0.5) & (row > -0.5) & (row < _ROWS + 0.5)] = _PAPER
+    on = (column > 0) & (column < _COLUMNS) & (row > 0) & (row < _ROWS)
+    out[on & ((np.floor(column) + np.floor(row)) % 2 == 0)] = _INK
+    return out

@@ -2,6 +2,7 @@
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from polcap.formats import shipped_data
@@ -25,7 +26,7 @@ class Chart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def axes(self) -> tuple[Floats, Floats, Floats]:
-        """Unit vectors: the normal, along the rows, down the columns."""
+        """Unit vectors of the chart: its normal, along the rows, down the columns."""
         turn = Rotation.from_rotvec(self.turn_deg, degrees=True)
         return turn.apply([0.0, 0.0, 1.0]), turn.apply([1.0, 0.0, 0.0]), turn.apply([0.0, -1.0, 0.0])
 
@@ -42,21 +43,25 @@ def patches(chart: Chart, margin: float = 0.0) -> Floats:
     return _points(chart, origin + np.array([[near, near], [far, near], [far, far], [near, far]]))
 
 
-def intersect(chart: Chart, v: Floats) -> tuple[Floats, Floats, Floats]:
+def intersect(chart: Chart, v: Floats) -> tuple[NDArray[np.integer], Floats, Floats]:
     """Indices (N,) of the rays v (P, 3) that meet the chart, their lengths (N,) [m] and the albedo (N, 3)."""
-    facing, across, down = chart.axes
     center = np.array(chart.center)
     near = np.flatnonzero(-(v @ center) > np.linalg.norm(center) * np.cos(5 * chart.pitch / np.linalg.norm(center)))
-    distance = -(center @ facing) / (v[near] @ facing)
-    point = -v[near] * distance[:, None] - center
-    column = point @ across / chart.pitch + _MIDDLE[0]
-    row = point @ down / chart.pitch + _MIDDLE[1]
-    on = (np.abs(column - _MIDDLE[0]) < 3 + _FRAME) & (np.abs(row - _MIDDLE[1]) < 2 + _FRAME) & (distance > 0)
-    column, row = column[on], row[on]
+    distance, column, row = meet_plane(chart, v[near])
+    on = (np.abs(column) < 3 + _FRAME) & (np.abs(row) < 2 + _FRAME) & (distance > 0)
+    column, row = column[on] + _MIDDLE[0], row[on] + _MIDDLE[1]
     patch = (column >= 0) & (row >= 0) & (column % 1 < _PATCH) & (row % 1 < _PATCH) & (column < 6) & (row < 4)
     number = np.where(patch, row.astype(int) * 6 + column.astype(int), 24)
     colors = np.vstack([shipped_data.colorchecker().rec709, np.full((1, 3), _FRAME_ALBEDO)])
     return near[on], distance[on], colors[number]
+
+
+def meet_plane(chart: Chart, v: Floats) -> tuple[Floats, Floats, Floats]:
+    """Lengths (P,) [m] of rays v (P, 3) to the chart's plane, and columns and rows (P,) from the chart's middle."""
+    facing, across, down = chart.axes
+    distance = -(np.array(chart.center) @ facing) / (v @ facing)
+    point = -v * distance[:, None] - chart.center
+    return distance, point @ across / chart.pitch, point @ down / chart.pitch
 
 
 def _points(chart: Chart, column_row: Floats) -> Floats:

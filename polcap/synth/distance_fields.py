@@ -10,7 +10,6 @@ Hart, Sphere tracing, The Visual Computer 1996.
 
 from functools import lru_cache
 from math import hypot
-from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -25,17 +24,13 @@ class Cluster(msgspec.Struct, frozen=True, tag="cluster", forbid_unknown_fields=
     """Several balls that overlap."""
 
     balls: tuple[tuple[float, float, float, float], ...]  # center x y z, radius [m]
-    blend: float = 0.0  # m, width of the smooth transition between balls; 0: a sharp crease
 
     @property
     def radius(self) -> float:
-        return max(hypot(x, y, z) + r for x, y, z, r in self.balls) + self.blend / 2
+        return max(hypot(x, y, z) + r for x, y, z, r in self.balls)
 
     def distance(self, p: Floats) -> Floats:
-        nearest = _length(p - self.balls[0][:3]) - self.balls[0][3]
-        for x, y, z, r in self.balls[1:]:
-            nearest = _blend(nearest, _length(p - (x, y, z)) - r, self.blend)
-        return nearest
+        return np.asarray(np.min([_length(p - (x, y, z)) - r for x, y, z, r in self.balls], axis=0))
 
 
 class Bumps(msgspec.Struct, frozen=True, tag="bumps", forbid_unknown_fields=True):
@@ -54,23 +49,6 @@ class Bumps(msgspec.Struct, frozen=True, tag="bumps", forbid_unknown_fields=True
         slope = sum(abs(a) * hypot(x, y, z) for a, x, y, z, _ in self.waves)
         least = 1 - sum(abs(wave[0]) for wave in self.waves)
         return (r - 1 - _waves(self.waves, q / r[..., None])) * (min(self.size) / hypot(1, slope / least))
-
-
-class Superquadric(msgspec.Struct, frozen=True, tag="superquadric", forbid_unknown_fields=True):
-    """|x/a|^p + |y/b|^p + |z/c|^p = 1: a rounded box for p above 2."""
-
-    size: tuple[float, float, float]  # semi-axes [m]
-    power: Annotated[float, msgspec.Meta(ge=2.0)] = 4.0
-
-    @property
-    def radius(self) -> float:
-        return hypot(*self.size)
-
-    def distance(self, p: Floats) -> Floats:
-        q = np.abs(p / np.array(self.size))
-        largest = np.maximum(q.max(axis=-1), 1e-9)
-        norm = largest * ((q / largest[..., None]) ** self.power).sum(axis=-1) ** (1 / self.power)
-        return np.asarray((norm - 1) * min(self.size))  # the gradient of a p-norm, p ≥ 2, is at most 1
 
 
 class Vase(msgspec.Struct, frozen=True, tag="vase", forbid_unknown_fields=True):
@@ -97,7 +75,9 @@ class Vase(msgspec.Struct, frozen=True, tag="vase", forbid_unknown_fields=True):
         around = self.depth * self.lobes / (1 - self.depth)
         slope = hypot(steepest / self.height * (1 + self.depth), around) + raised
         side = (across - wall * lobes - _waves(self.waves, p)) / hypot(1, slope)
-        return -_blend(-side, self.height / 2 - np.abs(p[..., 1]), 0.06 * self.height)
+        end, over = np.abs(p[..., 1]) - self.height / 2, 0.06 * self.height
+        near = np.maximum(over - np.abs(side - end), 0.0) / over
+        return np.asarray(np.maximum(side, end) + near * near * (over / 4))  # the rim is rounded over `over` metres
 
 
 class Model(msgspec.Struct, frozen=True, tag="model", forbid_unknown_fields=True):
@@ -107,12 +87,12 @@ class Model(msgspec.Struct, frozen=True, tag="model", forbid_unknown_fields=True
     radius: float  # m, of the smallest sphere about the origin that contains it
 
 
-Shape = Cluster | Bumps | Superquadric | Vase
+Shape = Cluster | Bumps | Vase
 
 
 @lru_cache
 def _turned(profile: tuple[tuple[float, float], ...]) -> tuple[CubicSpline, float]:
-    """The wall's radius over height 0…1, and its steepest slope [m per height]."""
+    """Radius of a vase's wall over height 0…1, and its steepest slope [m per height]."""
     at, radius = np.array(profile).T
     curve = CubicSpline(at, radius, bc_type="natural")
     return curve, float(np.abs(curve(np.linspace(0, 1, 257), 1)).max())
@@ -120,14 +100,6 @@ def _turned(profile: tuple[tuple[float, float], ...]) -> tuple[CubicSpline, floa
 
 def _length(p: Floats) -> Floats:
     return np.asarray(np.sqrt(np.einsum("...i,...i->...", p, p)))
-
-
-def _blend(a: Floats, b: Floats, over: float) -> Floats:
-    """The smaller of two distances, its crease rounded over `over` metres."""
-    if not over:
-        return np.minimum(a, b)
-    near = np.maximum(over - np.abs(a - b), 0.0) / over
-    return np.minimum(a, b) - near * near * (over / 4)
 
 
 def _waves(waves: tuple[Wave, ...], p: Floats) -> Floats:

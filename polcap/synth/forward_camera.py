@@ -1,4 +1,4 @@
-"""Simulated camera: from radiance to the DNG file of a color mosaic, with noise and clipping.
+"""Simulated camera: lens distortion, color mosaic, noise, clipping and the DNG file.
 
 References
 ----------
@@ -20,11 +20,13 @@ from polcap.images import Bits, Exif, Floats, View
 from polcap.optics.color import REC709_TO_XYZ
 
 SENSOR_WIDTH_MM = 36.0
+Bend = Annotated[float, Meta(ge=-1, le=1)]  # k₁ or k₂ of the lens
+_RADII = 20001  # in the table of a lens
 COLOR_MATRIX = (0.87, -0.27, -0.075, -0.44, 1.23, 0.235, -0.09, 0.19, 0.69)  # XYZ → camera, row by row
 
 
 class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A photosite at base sensitivity."""
+    """Photosite of the simulated sensor at base sensitivity."""
 
     full_well: Annotated[float, Meta(gt=0, le=1e9)] = 30000.0  # e⁻ at the white level
     read_noise: Annotated[float, Meta(ge=0, le=1e6)] = 3.0  # e⁻, 1σ
@@ -33,8 +35,26 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def pinhole(focal_mm: float, width: int, height: int) -> View:
-    """The camera over its own RAW pixels."""
+    """View of a camera without distortion, over its own RAW pixels."""
     return View(focal_mm / SENSOR_WIDTH_MM * width, ((width - 1) / 2, (height - 1) / 2), scale=1)
+
+
+def undistort(view: View, bend: tuple[float, float], x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Pixels of the pinhole camera `view` that see the same points as pixels x, y of a lens with k₁, k₂.
+
+    A ray at an angle of tangent t to the optical axis reaches the sensor at the radius f · (t + k₁ t³ + k₂ t⁵). The
+    inverse is interpolated in a fine table of this radius.
+    """
+    if not any(bend):
+        return x, y
+    right, down = x - view.center[0], y - view.center[1]
+    radius = np.hypot(right, down) / view.focal
+    tangent = np.linspace(0, 1.5 * radius.max() + 0.01, _RADII)
+    distorted = tangent + bend[0] * tangent**3 + bend[1] * tangent**5
+    rising = np.concatenate([[True], np.maximum.accumulate(distorted)[:-1] < distorted[1:]])
+    true = np.interp(radius, distorted[rising], tangent[rising])
+    share = np.where(radius > 1e-9, true / np.maximum(radius, 1e-9), 1.0)
+    return view.center[0] + right * share, view.center[1] + down * share
 
 
 def rec709_to_camera(color_matrix: Sequence[float]) -> Floats:

@@ -1,6 +1,6 @@
 """Light between the parts of a mesh: one diffuse bounce, computed at the vertices.
 
-All shots use the same interpolated values, so sampling noise cannot look like polarization. Neglected: specular
+All shots use the same interpolated values, so sampling noise adds no false polarization. Neglected: specular
 reflection, and the slight polarization of the bounced light. There are two other simulations of this light:
 `training/light_transport.py` works per pixel and includes specular reflection; `training/bounced_light.py` reuses
 traced paths while the materials change during training.

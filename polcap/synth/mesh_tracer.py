@@ -83,7 +83,7 @@ class MeshHits:
 
 
 class Tracer:
-    """A mesh prepared for tracing."""
+    """A mesh prepared for ray tracing by Embree."""
 
     def __init__(self, mesh: Triangles) -> None:
         try:
@@ -94,6 +94,9 @@ class Tracer:
         self.mesh = mesh
         self._scene = EmbreeScene()
         TriangleMesh(self._scene, mesh.vertices, mesh.faces)
+        self.size = float(np.ptp(mesh.vertices, axis=0).max())
+        corner = mesh.vertices[mesh.faces].astype(np.float64)
+        self._flat = _unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
 
     def trace(self, rotation: Floats, translation: Floats, view: View, height: int, width: int) -> GBuffer:
         """G-buffer of the mesh with vertices at rotation @ vertex + translation [m, camera frame].
@@ -104,22 +107,13 @@ class Tracer:
         origin = np.broadcast_to(-translation @ rotation, v.shape)
         direction = -v @ rotation
         met = self.meet(origin, direction)
-        seen, position = met.index, met.position
-        normal: Floats = met.normal @ rotation.T
-        normal = face_camera(normal, v[seen])
         size = (height, width)
-        depth = np.full(height * width, np.nan, dtype=np.float32)
-        depth[seen] = -(position @ rotation.T + translation)[:, 2]
-        return GBuffer(
-            normal=_scatter(normal, seen, size),
-            depth=depth.reshape(size),
-            mask=np.isfinite(depth).reshape(size),
-            position=_scatter(position, seen, size),
-            view=view,
-        )
+        depth = scatter(-(met.position @ rotation.T + translation)[:, 2], met.index, size, np.nan)
+        normal = scatter(face_camera(met.normal @ rotation.T, v[met.index]), met.index, size)
+        return GBuffer(normal, depth, np.isfinite(depth), scatter(met.position, met.index, size), view)
 
     def meet(self, origin: Floats, direction: Floats) -> MeshHits:
-        """First hits of rays (P, 3)."""
+        """First intersections of rays (P, 3) with the mesh."""
         start, way = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, direction))
         hit = self._scene.run(start, way, query="INTERSECT", output=True)
         index = np.flatnonzero(hit["primID"] >= 0)
@@ -130,8 +124,17 @@ class Tracer:
         normal = _unit(np.sum(self.mesh.corner_normals[face] * weight[..., None], axis=1))
         return MeshHits(index, position, normal, face, weight)
 
+    def facing(self, origin: Floats, direction: Floats) -> tuple[Floats, Floats]:
+        """Distances (M,) to the first hits of rays, infinite for none, and normals of the triangles facing the rays."""
+        start, way = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, direction))
+        hit = self._scene.run(start, way, query="INTERSECT", output=True)
+        struck = hit["primID"] >= 0
+        normal = self._flat[np.where(struck, hit["primID"], 0)]
+        normal = np.where(np.sum(normal * direction, axis=1, keepdims=True) > 0, -normal, normal)
+        return np.where(struck, hit["tfar"], np.inf), normal
+
     def hidden(self, origin: Floats, target: Floats) -> NDArray[np.bool_]:
-        """True where the mesh hides points (P, 3) from the target (3,)."""
+        """True where the mesh hides points (P, 3) from targets, (P, 3) or (3,)."""
         way = target - origin
         far = np.linalg.norm(way, axis=1)
         ray = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, way / far[:, None], far))
@@ -158,10 +161,11 @@ def face_camera(normal: Floats, v: Floats) -> Floats:
     return _unit(normal + np.maximum(_LEAST_FACING - facing, 0.0) * v)
 
 
-def _scatter(value: Floats, seen: NDArray[np.intp], size: tuple[int, int]) -> Floats:
-    out = np.zeros((size[0] * size[1], value.shape[-1]), dtype=np.float32)
-    out[seen] = value
-    return out.reshape(*size, -1)
+def scatter(value: Floats, at: NDArray[np.integer], size: tuple[int, ...], empty: float = 0.0) -> Floats:
+    """Image (H, W, ·) with values (N, ·) at the flat indices `at` (N,), `empty` elsewhere."""
+    out = np.full((size[0] * size[1], *value.shape[1:]), empty, dtype=np.float32)
+    out[at] = value
+    return out.reshape(*size, *value.shape[1:])
 
 
 def _unit(v: Floats) -> Floats:

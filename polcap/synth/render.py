@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from polcap.errors import SettingError
 from polcap.images import Floats, GBuffer, View
-from polcap.optics import body, frames, fresnel, mueller, shade
+from polcap.optics import body, frames, fresnel, shade
 from polcap.synth import color_checker as charts
 from polcap.synth import interreflection, mesh_tracer, scene_materials, trace
 from polcap.synth.color_checker import Chart
@@ -68,12 +68,6 @@ def stokes(
     return out.reshape(3, *x.shape, 3)
 
 
-def polarize(stokes: Floats, v: Floats, angle: float, extinction_ratio: float) -> Floats:
-    """Intensity (H, W, 3) of Stokes parameters (3, H, W, 3) on rays v (H, W, 3) behind a polarizer at `angle` [rad]."""
-    weights = mueller.analyzer(frames.axis_on_ray(np.asarray(angle), v), extinction_ratio)
-    return np.asarray(np.einsum("hws,shwc->hwc", weights.astype(np.float32), stokes))
-
-
 @dataclass(frozen=True)
 class ObjectBuffer(GBuffer):
     """G-buffer of an object with relief: `normal` includes the relief, `facing` does not."""
@@ -82,23 +76,13 @@ class ObjectBuffer(GBuffer):
 
 
 def gbuffer(scene: Scene, view: View, height: int, width: int) -> ObjectBuffer:
-    """The object's surface at the center of each pixel."""
+    """G-buffer of a scene's object at the center of each pixel."""
     y, x = np.mgrid[:height, :width].astype(np.float64)
     hits, _ = _visible(scene, frames.rays_at(view, x, y).reshape(-1, 3))
-    normal, position, facing = np.zeros((3, height * width, 3), np.float32)
-    depth = np.full(height * width, np.nan, np.float32)
-    mask = np.zeros(height * width, bool)
-    at = hits.index
-    bare, bent = _normals(scene, hits)
-    normal[at], position[at], depth[at], mask[at], facing[at] = bent, hits.local, -hits.point[:, 2], True, bare
-    return ObjectBuffer(
-        normal=normal.reshape(height, width, 3),
-        depth=depth.reshape(height, width),
-        mask=mask.reshape(height, width),
-        position=position.reshape(height, width, 3),
-        view=view,
-        facing=facing.reshape(height, width, 3),
-    )
+    facing, bent = _normals(scene, hits)
+    depth = mesh_tracer.scatter(-hits.point[:, 2], hits.index, x.shape, np.nan)
+    normal, position, facing = (mesh_tracer.scatter(a, hits.index, x.shape) for a in (bent, hits.local, facing))
+    return ObjectBuffer(normal, depth, np.isfinite(depth), position, view, facing)
 
 
 def guide(buffer: GBuffer) -> Floats:
@@ -119,10 +103,9 @@ def white_level(scene: Scene) -> float:
 
 def _visible(scene: Scene, v: Floats, start: Floats | None = None) -> tuple[Hits, Floats]:
     """Visible hits on the object, and S0 (P, 3) of chart and backdrop, which are matt and unpolarized."""
-    out = np.empty((len(v), 3))
     distance = scene.backdrop / v[:, 2]
     wall = scene.backdrop_albedo * _unshadowed_irradiance(scene, -v * distance[:, None], np.array([0.0, 0.0, 1.0]))
-    out[:] = wall[:, None]
+    out = np.repeat(wall[:, None], 3, axis=1)
     hits = trace.trace(scene.shape, scene.position, scene.turn, v, start)
     if scene.chart is not None:
         at, to_chart, albedo = charts.intersect(scene.chart, v)
@@ -132,10 +115,10 @@ def _visible(scene: Scene, v: Floats, start: Floats | None = None) -> tuple[Hits
 
 
 def _unshadowed_irradiance(scene: Scene, point: Floats, normal: Floats) -> Floats:
-    """`_irradiance`, and 0 in the object's cast shadow."""
+    """Irradiance (N,) as of `_irradiance`; 0 in the object's cast shadow, if the scene has cast shadows."""
     light = _irradiance(scene, point, normal)
     if scene.cast_shadows:
-        light[trace.in_cast_shadow(scene.shape, scene.position, scene.turn, point, scene.light)] = 0.0
+        light[trace.in_shadow(scene.shape, scene.position, scene.turn, point, scene.light)] = 0.0
     return light
 
 
@@ -149,13 +132,14 @@ def _irradiance(scene: Scene, point: Floats, normal: Floats) -> Floats:
 
 
 def _shade(scene: Scene, ray: Floats, hits: Hits, flash_axis: float | None = None) -> Floats:
-    """Stokes parameters (3, N, 3) of the object's surface."""
+    """Stokes parameters (3, N, 3) of the light that the object reflects towards the lens."""
     to_light = np.array(scene.light) - hits.point
     to_light /= np.linalg.norm(to_light, axis=-1, keepdims=True)
     irradiance = _irradiance(scene, hits.point, to_light)
     if scene.shadows:
         lit = np.flatnonzero(np.einsum("ni,ni->n", hits.normal, to_light) > 0)
-        hidden = trace.in_own_shadow(scene.shape, scene.position, scene.turn, hits.take(lit), scene.light)
+        lifted = hits.point[lit] + trace.LIFT * hits.normal[lit]
+        hidden = trace.in_shadow(scene.shape, scene.position, scene.turn, lifted, scene.light)
         irradiance[lit[hidden]] = 0.0
     facing, bent = _normals(scene, hits)
     diffuse, specular, roughness, ior = scene_materials.evaluate(scene.coat, hits.local, facing)
@@ -186,7 +170,7 @@ def _normals(scene: Scene, hits: Hits) -> tuple[Floats, Floats]:
 
 @lru_cache(maxsize=2)
 def _bounced(scene: Scene) -> Floats:
-    """Light from other parts of a mesh on the corners of each face, (F, 3, 3)."""
+    """Bounced light (F, 3, 3) that the corners of each face receive from other parts of the mesh."""
     if not isinstance(scene.shape, Model):
         raise SettingError("interreflection needs triangles; give the object as a mesh")
     tracer = mesh_tracer.tracer(scene.shape.file, scene.shape.radius)

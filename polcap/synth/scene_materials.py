@@ -50,25 +50,16 @@ def evaluate(coat: Coat, position: Floats, facing: Floats) -> tuple[Floats, Floa
 
     facing (..., 3): normals without relief, object's own frame.
     """
-    parts = [_one(material, position, facing) for material in coat.materials]
-    if len(parts) == 1:
-        return parts[0]
-    second = _is_second(coat, position)
-    a, b = parts
-    return (
-        np.where(second[..., None], b[0], a[0]),
-        np.where(second[..., None], b[1], a[1]),
-        np.where(second, b[2], a[2]),
-        np.where(second, b[3], a[3]),
-    )
+    parts = [_evaluate_one(material, position, facing) for material in coat.materials]
+    joined = _choose(coat, position, [np.concatenate([d, f, r[..., None], n[..., None]], -1) for d, f, r, n in parts])
+    return joined[..., :3], joined[..., 3:6], joined[..., 6], joined[..., 7]
 
 
 def add_relief(coat: Coat, position: Floats, facing: Floats) -> Floats:
     """Normals with the relief of the texture sets; without a texture set `facing` itself."""
     if all(material.texture is UNSET for material in coat.materials):
         return facing
-    slopes = [_slope(material, position, facing) for material in coat.materials]
-    slope = slopes[0] if len(slopes) == 1 else np.where(_is_second(coat, position)[..., None], slopes[1], slopes[0])
+    slope = _choose(coat, position, [_slope(material, position, facing) for material in coat.materials])
     bent = facing - slope + np.sum(slope * facing, axis=-1, keepdims=True) * facing
     return np.asarray(bent / np.maximum(np.linalg.norm(bent, axis=-1, keepdims=True), 1e-12))
 
@@ -86,11 +77,15 @@ def solid_noise(p: Floats, seed: int) -> Floats:
     return np.asarray(total / np.sqrt(2.5 * sum(0.49**octave for octave in range(3))))
 
 
-def _is_second(coat: Coat, position: Floats) -> Floats:
-    return np.asarray(solid_noise(position / coat.region_size, coat.seed) > 0)
+def _choose(coat: Coat, position: Floats, parts: list[Floats]) -> Floats:
+    """Select the values (..., C) of the first or the second material by the region of each position."""
+    if len(parts) == 1:
+        return parts[0]
+    second = solid_noise(position / coat.region_size, coat.seed) > 0
+    return np.where(second[..., None], parts[1], parts[0])
 
 
-def _one(material: Material, position: Floats, facing: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+def _evaluate_one(material: Material, position: Floats, facing: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     first, second = np.array(material.first), np.array(material.second)
     if material.texture is UNSET:
         share = _pattern(material, position / material.size)
@@ -104,7 +99,7 @@ def _one(material: Material, position: Floats, facing: Floats) -> tuple[Floats, 
 
 
 def _slope(material: Material, position: Floats, facing: Floats) -> Floats:
-    """Slope of the relief along the object's axes, (..., 3)."""
+    """Slope of a texture set's relief along the object's axes, (..., 3); 0 without a texture set."""
     out = np.zeros_like(facing)
     if material.texture is not UNSET:
         picture, axis, sign = _project(material, position, facing)
@@ -134,18 +129,13 @@ def _texture(folder: str) -> Floats:
 
 
 def _pattern(material: Material, p: Floats) -> Floats:
-    """Share 0…1 of the second color, (...,)."""
+    """Share 0…1 of the material's second color at positions p, (...,)."""
     if material.pattern == "plain":
         return np.zeros(p.shape[:-1])
     if material.pattern == "chequer":
-        return _step(np.prod(np.sin(np.pi * p), axis=-1) / 0.15)
-    noise = solid_noise(p, material.seed)
-    if material.pattern == "veins":
-        return _step((0.25 - np.abs(noise)) / 0.15)
-    return _step(noise / 1.2)
-
-
-def _step(x: Floats) -> Floats:
-    """0 below −1, 1 above 1, smooth between."""
-    t = np.clip((x + 1) / 2, 0, 1)
-    return t * t * (3 - 2 * t)
+        edge = np.prod(np.sin(np.pi * p), axis=-1) / 0.15
+    else:
+        noise = solid_noise(p, material.seed)
+        edge = (0.25 - np.abs(noise)) / 0.15 if material.pattern == "veins" else noise / 1.2
+    t = np.clip((edge + 1) / 2, 0, 1)  # 0 below −1, 1 above 1, smooth between
+    return np.asarray(t * t * (3 - 2 * t))

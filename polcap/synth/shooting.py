@@ -9,7 +9,7 @@
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from math import sqrt
 from pathlib import Path
@@ -24,10 +24,10 @@ from polcap.errors import CaptureError
 from polcap.formats import atomic
 from polcap.formats.capture import layouts
 from polcap.images import Exif, Floats, GBuffer, View
-from polcap.optics import frames, projection
+from polcap.optics import frames, mueller, projection
 from polcap.synth import color_checker as charts
-from polcap.synth import forward_camera, lens, render, scene_materials
-from polcap.synth.forward_camera import COLOR_MATRIX, SENSOR_WIDTH_MM, Sensor
+from polcap.synth import forward_camera, render, scene_materials
+from polcap.synth.forward_camera import COLOR_MATRIX, SENSOR_WIDTH_MM, Bend, Sensor
 from polcap.synth.render import Scene
 from polcap.synth.scenes import Kind, random_scene
 
@@ -71,7 +71,7 @@ class Shoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     extinction_ratio: Annotated[float, Meta(ge=1)] = 1000.0
     cross: bool = False  # one more shot, its flash polarized at right angles to the first angle
     flash_extinction: Annotated[float, Meta(ge=1)] = 1000.0  # extinction ratio of the flash's polarizer
-    distortion: tuple[lens.Bend, lens.Bend] = (0.0, 0.0)  # k1, k2 of synth/lens.py
+    distortion: tuple[Bend, Bend] = (0.0, 0.0)  # k1, k2 of `forward_camera.undistort`
     blur_px: Annotated[float, Meta(ge=0, le=50)] = 0.4  # 1σ of the lens's point spread
     samples: Annotated[int, Meta(ge=1, le=4)] = 2  # rays per pixel side
     sensor: Sensor = Sensor()
@@ -84,7 +84,7 @@ class Shoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def write(folder: Path, scene: Scene, shoot: Shoot, frame_written: Callable[[int, int], None] | None = None) -> None:
-    """Write photographs of `scene` into the new folder; the same arguments give the same bytes.
+    """Write a simulated capture of `scene` into a new folder; the same arguments give the same bytes.
 
     `frame_written` is called with the number of photographs written so far and in all.
 
@@ -104,10 +104,11 @@ def write(folder: Path, scene: Scene, shoot: Shoot, frame_written: Callable[[int
             shots.append(("cross", shoot.angles_deg[0]))
         for shot, (kind, angle) in enumerate(shots):
             pose = _pose(shoot, shot)
-            radiance = studio.crossed(pose) if kind == "cross" else studio.radiance(pose, first=shot == 0)
+            radiance = studio.radiance(pose, crossed=kind == "cross")
             for frame in range(shoot.exposures):
                 name = f"{kind}{layouts.degrees(angle)}/IMG_{shot * shoot.exposures + frame + 1:04d}.DNG"
-                taken = studio.photograph(place / name, radiance, Take(shot, frame, _stops(shoot, frame)))
+                stops = float(shoot.step ** (frame - shoot.exposures // 2))
+                taken = studio.photograph(place / name, radiance, Take(shot, frame, stops))
                 files.append({"file": name, "nominal_deg": angle, **pose, **taken})
                 if frame_written is not None:
                     frame_written(len(files), len(shots) * shoot.exposures)
@@ -135,26 +136,29 @@ class Studio:
         self.reference = _light(scene, shoot, self.buffer, np.eye(3))
         self.middle = _middle_exposure(scene, shoot, self.buffer, self.reference[0] @ self.to_camera.T)
 
-    def through(self, angle_deg: float) -> Floats:
-        """Light behind the polarizer at this angle, (H, W, 3) camera channels, for a camera that does not move."""
-        return self.radiance(_still(angle_deg), first=True)
+    def through(self, angle_deg: float, crossed: bool = False) -> Floats:
+        """`radiance` behind the polarizer at this angle, for a camera that does not move."""
+        return self.radiance({"actual_deg": angle_deg, "rot_deg": 0.0, "transform": np.eye(3)}, crossed)
 
-    def crossed_at(self, angle_deg: float) -> Floats:
-        """The same under the polarized flash of the crossed shot."""
-        return self.crossed(_still(angle_deg))
+    def radiance(self, pose: dict[str, Any], crossed: bool = False) -> Floats:
+        """Light behind polarizer and lens in a `pose`, (H, W, 3) camera channels.
 
-    def radiance(self, pose: dict[str, Any], first: bool) -> Floats:
-        """Light behind the polarizer, (H, W, 3) camera channels, in a `pose`; the `first` shot is the reference."""
-        stokes = self.reference if first else self._light(pose)
-        return self._through_polarizer(stokes, pose)
-
-    def crossed(self, pose: dict[str, Any]) -> Floats:
-        """The same under a flash polarized at right angles to the first angle; its polarizer takes half the light."""
-        shoot = self.shoot
-        axis = np.radians(shoot.angles_deg[0] + 90.0)
-        unpolarized, polarized = (self._light(pose, flash_axis) for flash_axis in (None, axis))
-        degree = (shoot.flash_extinction - 1) / (shoot.flash_extinction + 1)  # of the flash's polarization
-        return self._through_polarizer(0.5 * (degree * polarized + (1 - degree) * unpolarized), pose)
+        A camera that rolls turns its polarizer too. `crossed`: the flash is polarized at right angles to the first
+        angle; its polarizer takes half the light.
+        """
+        shoot, back = self.shoot, np.linalg.inv(np.array(pose["transform"]))
+        moved = not np.array_equal(back, np.eye(3))
+        stokes = _light(self.scene, shoot, self.buffer, back) if moved else self.reference
+        if crossed:
+            axis = np.radians(shoot.angles_deg[0] + 90.0)
+            polarized = _light(self.scene, shoot, self.buffer, back, axis)
+            degree = (shoot.flash_extinction - 1) / (shoot.flash_extinction + 1)  # of the flash's polarization
+            stokes = 0.5 * (degree * polarized + (1 - degree) * stokes)
+        y, x = np.mgrid[: shoot.height, : shoot.width].astype(np.float64)
+        v = frames.rays_at(shoot.view, *_reference_px(shoot, back, x, y))
+        axis = frames.axis_on_ray(np.radians(pose["actual_deg"] - pose["rot_deg"]), v)
+        weights = mueller.analyzer(axis, shoot.extinction_ratio).astype(np.float32)  # (H, W, 3)
+        return np.asarray(_blur(shoot, np.einsum("hws,shwc->hwc", weights, stokes)) @ self.to_camera.T)
 
     def photograph(self, path: Path, radiance: Floats, take: Take) -> dict[str, Any]:
         """Write one DNG of `radiance` (H, W, 3); returns its exposure for truth.json. Raises StorageError."""
@@ -169,29 +173,11 @@ class Studio:
         counts = forward_camera.expose(mosaic, sensor, amplification, random)
         forward_camera.write_dng(path, counts, sensor, cfa, shoot.color_matrix, exif)
         return {
-            "exposure_index": take.frame,
-            "time": exif.exposure_time,
-            "fnumber": exif.f_number,
-            "iso": exif.iso,
-            "relative_exposure": light * amplification,
-            "flash_factor": energy,
+            "exposure_index": take.frame, "time": exif.exposure_time, "fnumber": exif.f_number, "iso": exif.iso,
+            "relative_exposure": light * amplification, "flash_factor": energy,
             "clipped_fraction_object": float((counts[self.buffer.mask] >= sensor.white).mean()),
             "time_stamp": exif.taken,
-        }
-
-    def _light(self, pose: dict[str, Any], flash_axis: float | None = None) -> Floats:
-        """Stokes parameters (3, H, W, 3) on the pixels of a shot."""
-        return _light(self.scene, self.shoot, self.buffer, np.linalg.inv(np.array(pose["transform"])), flash_axis)
-
-    def _through_polarizer(self, stokes: Floats, pose: dict[str, Any]) -> Floats:
-        """Light behind polarizer and lens, (H, W, 3) camera channels; a camera that rolls turns its polarizer too."""
-        shoot = self.shoot
-        back = np.linalg.inv(np.array(pose["transform"]))
-        y, x = np.mgrid[: shoot.height, : shoot.width].astype(np.float64)
-        v = frames.rays_at(shoot.view, *_reference_px(shoot, back, x, y))
-        angle = np.radians(pose["actual_deg"] - pose["rot_deg"])
-        passed = render.polarize(stokes, v, angle, shoot.extinction_ratio)
-        return np.asarray(_blur(shoot, passed) @ self.to_camera.T)
+        }  # fmt: skip
 
 
 def transform(shoot: Shoot, shift_px: tuple[float, float], rot_deg: float) -> Floats:
@@ -209,11 +195,6 @@ def transform(shoot: Shoot, shift_px: tuple[float, float], rot_deg: float) -> Fl
     return out
 
 
-def _still(angle_deg: float) -> dict[str, Any]:
-    """Pose of a camera that did not move."""
-    return {"actual_deg": angle_deg, "rot_deg": 0.0, "transform": np.eye(3).tolist()}
-
-
 def _pose(shoot: Shoot, shot: int) -> dict[str, Any]:
     """Random camera movement and polarizer angle of one shot; the first shot does not move."""
     random = np.random.default_rng([shoot.seed, 0, shot])
@@ -221,17 +202,13 @@ def _pose(shoot: Shoot, shot: int) -> dict[str, Any]:
     shift = x * shoot.nudge_px, y * shoot.nudge_px
     roll *= shoot.nudge_deg
     nominal = shoot.angles_deg[shot % len(shoot.angles_deg)]  # the crossed shot, after the last, has the first angle
-    actual = nominal + shoot.angle_error_deg * random.normal()
-    return {
-        "actual_deg": float(actual),
-        "shift_px": shift,
-        "rot_deg": roll,
-        "transform": transform(shoot, shift, roll).tolist(),
-    }
+    actual = float(nominal + shoot.angle_error_deg * random.normal())
+    matrix = transform(shoot, shift, roll).tolist()
+    return {"actual_deg": actual, "shift_px": shift, "rot_deg": roll, "transform": matrix}
 
 
 def _light(scene: Scene, shoot: Shoot, buffer: GBuffer, back: Floats, flash_axis: float | None = None) -> Floats:
-    """Mean Stokes parameters over each pixel's area, (3, H, W, 3).
+    """Stokes parameters (3, H, W, 3) of a shot, averaged over each pixel's area.
 
     `back` (3, 3) maps the shot's pixels to those of the reference shot.
     """
@@ -247,7 +224,7 @@ def _light(scene: Scene, shoot: Shoot, buffer: GBuffer, back: Floats, flash_axis
 
 def _reference_px(shoot: Shoot, back: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """Undistorted pixels of the reference shot that see the same points as pixels x, y of a moved shot."""
-    return projection.coordinates(back, *lens.undistort(shoot.view, shoot.distortion, x, y))
+    return projection.coordinates(back, *forward_camera.undistort(shoot.view, shoot.distortion, x, y))
 
 
 def _blur(shoot: Shoot, image: Floats) -> Floats:
@@ -256,7 +233,7 @@ def _blur(shoot: Shoot, image: Floats) -> Floats:
 
 
 def _middle_exposure(scene: Scene, shoot: Shoot, buffer: GBuffer, s0: Floats) -> float:
-    """Exposure of the middle frame, for s0 (H, W, 3) in camera channels.
+    """Automatic exposure of the middle frame of a bracket, for s0 (H, W, 3) in camera channels.
 
     The 90th percentile of the object and the white patch reach at most 0.35 of the white level in that frame, and
     99.9 % of the object at most 0.95 in the darkest frame.
@@ -272,38 +249,25 @@ def _middle_exposure(scene: Scene, shoot: Shoot, buffer: GBuffer, s0: Floats) ->
     return shoot.exposure_factor * min(0.35 / level, 0.95 / peak * shoot.step ** (shoot.exposures // 2))
 
 
-def _stops(shoot: Shoot, frame: int) -> float:
-    """Exposure of a frame relative to the middle frame, as a factor."""
-    return float(shoot.step ** (frame - shoot.exposures // 2))
-
-
 def _exposure(shoot: Shoot, take: Take, middle: float) -> tuple[Exif, float, float]:
     """EXIF data, light and amplification of a photograph."""
     stops, number = take.stops, take.shot * shoot.exposures + take.frame
     taken = datetime(2026, 3, 14, 12) + timedelta(seconds=4.25 * number + 20 * (number // shoot.exposures))
-    exif: dict[str, Any] = {
-        "make": "Polcap",
-        "model": "Synthetic",
-        "lens": f"Synthetic {shoot.focal_mm:g}mm",
-        "exposure_time": 1 / 160,
-        "f_number": 11.0,
-        "iso": 100.0,
-        "focal_length_mm": shoot.focal_mm,
-        "focal_length_35mm": shoot.focal_mm,
-        "pixel_pitch_um": 1000 * SENSOR_WIDTH_MM / shoot.width,
-        "taken": taken.isoformat(timespec="milliseconds"),
-        "flash_fired": shoot.bracket != "time" and take.lit,
-    }
-    light, amplification = middle * stops, 1.0
-    if shoot.bracket == "time":
-        exif["exposure_time"] = MIDDLE_S * stops
-    elif shoot.bracket == "aperture":
-        exif["f_number"] = round(11.0 / sqrt(stops), 1)
-    elif shoot.bracket == "iso":
+    exif = Exif(
+        make="Polcap", model="Synthetic", lens=f"Synthetic {shoot.focal_mm:g}mm", exposure_time=1 / 160, f_number=11.0,
+        iso=100.0, focal_length_mm=shoot.focal_mm, focal_length_35mm=shoot.focal_mm,
+        pixel_pitch_um=1000 * SENSOR_WIDTH_MM / shoot.width, taken=taken.isoformat(timespec="milliseconds"),
+        flash_fired=shoot.bracket != "time" and take.lit,
+    )  # fmt: skip
+    if shoot.bracket == "iso":
         amplification = shoot.step**take.frame
         light = middle / shoot.step ** (shoot.exposures // 2)
-        exif["iso"] = 100.0 * amplification
-    return Exif(**exif), light, amplification
+        return replace(exif, iso=100.0 * amplification), light, amplification
+    if shoot.bracket == "time":
+        exif = replace(exif, exposure_time=MIDDLE_S * stops)
+    elif shoot.bracket == "aperture":
+        exif = replace(exif, f_number=round(11.0 / sqrt(stops), 1))
+    return exif, middle * stops, 1.0
 
 
 def _write_truth(place: Path, studio: Studio, files: list[dict[str, Any]]) -> None:
@@ -315,32 +279,21 @@ def _write_truth(place: Path, studio: Studio, files: list[dict[str, Any]]) -> No
         "size_m": scene.chart.size_m,
     }
     document = {
-        "conventions": _CONVENTIONS,
-        "focal_px": view.focal,
-        "principal_px": view.center,
-        "camera_matrix_from_linear_srgb": studio.to_camera.tolist(),
-        "white_S0": white,
-        "chart": chart,
-        "files": files,
-        "scene": msgspec.to_builtins(scene),
-        "shoot": msgspec.to_builtins(shoot),
-    }
+        "conventions": _CONVENTIONS, "focal_px": view.focal, "principal_px": view.center,
+        "camera_matrix_from_linear_srgb": studio.to_camera.tolist(), "white_S0": white, "chart": chart, "files": files,
+        "scene": msgspec.to_builtins(scene), "shoot": msgspec.to_builtins(shoot),
+    }  # fmt: skip
     with atomic.path(place / "truth.json") as temporary:
         temporary.write_bytes(msgspec.json.format(msgspec.json.encode(document), indent=1))
 
     if any(shoot.distortion):  # the true maps are those of a pinhole camera
         reference = _light(scene, msgspec.structs.replace(shoot, distortion=(0.0, 0.0)), buffer, np.eye(3))
     diffuse, specular, roughness, ior = scene_materials.evaluate(scene.coat, buffer.position, buffer.facing)
-    mask = buffer.mask
+    inside = buffer.mask[..., None]
+    maps = {
+        "normal": buffer.normal, "diffuse": diffuse * inside, "specular": specular * inside,
+        "roughness": roughness * buffer.mask, "ior": ior * buffer.mask, "S": _blur(shoot, reference) / white * inside,
+    }  # fmt: skip
+    halves: dict[str, Any] = {name: value.astype(np.float16) for name, value in maps.items()}
     with atomic.path(place / "truth.npz") as temporary:
-        np.savez_compressed(
-            temporary,
-            normal=buffer.normal.astype(np.float16),
-            depth=buffer.depth,
-            mask=mask,
-            diffuse=(diffuse * mask[..., None]).astype(np.float16),
-            specular=(specular * mask[..., None]).astype(np.float16),
-            roughness=(roughness * mask).astype(np.float16),
-            ior=(ior * mask).astype(np.float16),
-            S=(_blur(shoot, reference) / white * mask[..., None]).astype(np.float16),
-        )
+        np.savez_compressed(temporary, depth=buffer.depth, mask=buffer.mask, **halves)

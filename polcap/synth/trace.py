@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from polcap.images import Floats
+from polcap.images import Bools, Floats
 from polcap.synth import mesh_tracer
 from polcap.synth.distance_fields import Model, Shape
 
@@ -66,24 +66,9 @@ def trace(shape: Shape | Model, position: Vector, turn: Rotation, v: Floats, sta
     return Hits(at, distance, point, local, normal, np.full(len(at), -1), np.zeros((len(at), 3)))
 
 
-def in_own_shadow(
-    shape: Shape | Model, position: Vector, turn: Rotation, hits: Hits, light: Vector
-) -> NDArray[np.bool_]:
-    """True for hits (N,) that the shape itself hides from a light [m, camera frame]."""
-    lifted = hits.local + LIFT * turn.inv().apply(hits.normal)
-    return _hidden(shape, lifted, turn.inv().apply(np.array(light) - np.array(position)))
-
-
-def in_cast_shadow(
-    shape: Shape | Model, position: Vector, turn: Rotation, point: Floats, light: Vector
-) -> NDArray[np.bool_]:
-    """True for points (N, 3) off the shape [m, camera frame] that it hides from a light."""
-    source = turn.inv().apply(np.array(light) - np.array(position))
-    return _hidden(shape, turn.inv().apply(point - np.array(position)), source)
-
-
-def _hidden(shape: Shape | Model, origin: Floats, source: Floats) -> NDArray[np.bool_]:
-    """The same in the shape's own frame; the light lies outside the shape."""
+def in_shadow(shape: Shape | Model, position: Vector, turn: Rotation, point: Floats, light: Vector) -> Bools:
+    """True for points (N, 3) off the shape [m, camera frame] that it hides from a light outside it."""
+    origin, source = (turn.inv().apply(np.array(at) - np.array(position)) for at in (point, light))
     if isinstance(shape, Model):
         return mesh_tracer.tracer(shape.file, shape.radius).hidden(origin, source)
     direction = source - origin
@@ -94,7 +79,7 @@ def _hidden(shape: Shape | Model, origin: Floats, source: Floats) -> NDArray[np.
 
 
 def _march(shape: Shape, origin: Floats, direction: Floats, start: Floats | float) -> tuple[Indices, Floats]:
-    """Indices of the rays (P, 3) that arrive at the shape, and their lengths [m]."""
+    """Sphere tracing: indices of the rays (P, 3) that meet the shape, and their lengths [m]."""
     middle = -np.einsum("pi,pi->p", origin, direction)
     missed = np.einsum("pi,pi->p", origin, origin) - middle**2
     half = np.sqrt(np.maximum(shape.radius**2 - missed, 0.0))
@@ -118,7 +103,7 @@ def _march(shape: Shape, origin: Floats, direction: Floats, start: Floats | floa
 
 
 def _gradient(shape: Shape, p: Floats) -> Floats:
-    """Unit normals (N, 3) by central differences."""
+    """Unit normals (N, 3) of a distance field by central differences."""
     steps = 1e-4 * np.eye(3)  # m
     slope = np.stack([shape.distance(p + step) - shape.distance(p - step) for step in steps], axis=-1)
     return np.asarray(slope / np.linalg.norm(slope, axis=-1, keepdims=True))

@@ -20,8 +20,8 @@ The mask's network: `mask_views` traces objects before a backdrop, `mask_scenes`
 `fine_train` photographs them, runs the main network and trains. Both are a `unet`.
 
 Evaluation: `evaluate` measures the error of every map (`map_errors`) on fixed pictures (`evaluation_protocol`, of
-`evaluation_materials` in `light_transport`) against `evaluation_baselines`; `evaluation_page` and `evaluation_picture`
-show the result. `evaluation_photographs` measures normals on photographs that come with measured ones.
+`evaluation_materials` in `light_transport`) against `evaluation_baselines`; `evaluation_page` shows the result.
+`evaluation_photographs` measures normals on photographs that come with measured ones.
 
 `dataset_files` writes the simulated pictures and their truth as files.
 """

@@ -68,23 +68,23 @@ def _waves(u: Floats, w: Floats, rng: np.random.Generator, octaves: int = 3) -> 
 
 
 def _blotches(u: Floats, w: Floats, rng: np.random.Generator) -> Floats:
-    """Camouflage, stains or clouds."""
+    """Pattern levels (M,) of camouflage, stains or clouds."""
     return 0.5 + 0.3 * _waves(u, w, rng, int(rng.integers(1, 5)))
 
 
 def _bands(u: Floats, w: Floats, rng: np.random.Generator) -> Floats:
-    """Wood, marble or folds."""
+    """Pattern levels (M,) of wood, marble or folds."""
     return 0.5 + 0.5 * np.sin(6.28 * u + rng.uniform(0, 3) * _waves(u, w, rng))
 
 
 def _woven(u: Floats, w: Floats, rng: np.random.Generator) -> Floats:
-    """Crossing stripes of several widths: tartan, tiles or towels."""
+    """Pattern levels (M,) of crossing stripes: tartan, tiles or towels."""
     one, other = (rng.random(7), rng.random(7) * (rng.random() < 0.7))
     return np.asarray(0.6 * one[np.floor(5 * u).astype(int) % 7] + 0.4 * other[np.floor(5 * w).astype(int) % 7])
 
 
 def _cells(u: Floats, w: Floats, rng: np.random.Generator) -> Floats:
-    """Stones, leaves or patchwork: cells of the nearest of random points, in a tile of two periods."""
+    """Pattern levels (M,) of Voronoi cells, in a tile of two periods: stones, leaves or patchwork."""
     seeds, tile = rng.uniform(0, 2, (14, 2)), rng.random(14)
     at = np.stack([u, w], axis=1) % 2
     away = np.abs(at[:, None] - seeds[None])
@@ -93,7 +93,7 @@ def _cells(u: Floats, w: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _blobs(u: Floats, w: Floats, rng: np.random.Generator) -> Floats:
-    """Round and oblong spots of several sizes on a plain ground: flowers or pebbles."""
+    """Pattern levels (M,) of round and oblong spots on a plain ground: flowers or pebbles."""
     out = np.zeros_like(u)
     for _ in range(int(rng.integers(3, 12))):
         center, size, long = rng.uniform(0, 2, 2), rng.uniform(0.08, 0.45), rng.uniform(0.3, 1)
@@ -105,7 +105,7 @@ def _blobs(u: Floats, w: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _lines(u: Floats, w: Floats, rng: np.random.Generator) -> Floats:
-    """Lines of print: newspaper, packaging or keyboards."""
+    """Pattern levels (M,) of lines of print: newspaper, packaging or keyboards."""
     words = rng.random((9, 31)) < rng.uniform(0.4, 0.8)
     inked = words[np.floor(4 * w).astype(int) % 9, np.floor(rng.uniform(6, 14) * u).astype(int) % 31]
     return np.asarray(np.where(inked & (4 * w % 1 < rng.uniform(0.3, 0.8)), 0.9, 0.1))

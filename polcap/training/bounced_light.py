@@ -19,6 +19,8 @@ from torch.nn import functional as F
 from polcap.images import Floats, GBuffer
 from polcap.optics import brdf, frames, shade
 from polcap.optics.projection import project
+from polcap.synth import mesh_tracer
+from polcap.synth.mesh_tracer import Tracer
 from polcap.training import light_transport
 from polcap.training.materials import Surface
 
@@ -39,7 +41,7 @@ Indices = NDArray[np.integer[Any]]
 
 
 def trace_visibility(
-    scene: light_transport.MeshScene, buffer: GBuffer, pose: light_transport.Pose, rng: np.random.Generator
+    tracer: Tracer, buffer: GBuffer, pose: light_transport.Pose, rng: np.random.Generator
 ) -> tuple[NDArray[np.bool_], NDArray[np.uint16]]:
     """Pixels (H, W) that the flash reaches, and the flat indices (H/2, W/2, RAYS) of the pixels that rays meet.
 
@@ -49,32 +51,32 @@ def trace_visibility(
     height, width = mask.shape
     v = frames.rays(buffer.view, height, width)
     eye = -pose.translation @ pose.rotation
-    _, flat = scene.facing(np.broadcast_to(eye, (int(mask.sum()), 3)), -v[mask] @ pose.rotation)
+    _, flat = tracer.facing(np.broadcast_to(eye, (int(mask.sum()), 3)), -v[mask] @ pose.rotation)
     lit = np.zeros_like(mask)
-    lit[mask] = scene.lit(buffer.position[mask], flat, pose)[1] > 0
+    lit[mask] = light_transport.flash_light(tracer, buffer.position[mask], flat, pose)[1] > 0
 
-    above: Floats = np.zeros((height, width, 3), np.float32)
-    above[mask] = flat
+    above = mesh_tracer.scatter(flat, np.flatnonzero(mask), mask.shape)
     places = np.zeros_like(mask)
     places[::COARSE, ::COARSE] = True
     places &= mask
     normal = frames.to_ray_frame(buffer.normal[places], v[places])
     way = frames.from_ray_frame(_draw_directions(normal, rng), v[places][:, None])  # (M, RAYS, 3)
-    origin = buffer.position[places] + light_transport.LIFT * scene.size * above[places]
+    lift = light_transport.LIFT * tracer.size
+    origin = buffer.position[places] + lift * above[places]
     start = np.broadcast_to(origin[:, None], way.shape).reshape(-1, 3)
     direction = way.reshape(-1, 3) @ pose.rotation
-    distance, _ = scene.facing(start, direction)
-    met = np.flatnonzero(np.isfinite(distance) & (distance > light_transport.LIFT * scene.size))
+    distance, _ = tracer.facing(start, direction)
+    met = np.flatnonzero(np.isfinite(distance) & (distance > lift))
     there = start[met] + distance[met, None] * direction[met]
     found = np.where(np.isfinite(distance), NOWHERE, ESCAPED).astype(np.uint16)
-    found[met] = _find_pixels(there, np.argwhere(places)[met // RAYS], buffer, pose, scene.size)
+    found[met] = _find_pixels(there, np.argwhere(places)[met // RAYS], buffer, pose, tracer.size)
     out = np.full((height, width, RAYS), NOWHERE, np.uint16)
     out[places] = found.reshape(-1, RAYS)
     return lit, out[::COARSE, ::COARSE]
 
 
 def _draw_directions(normal: Floats, rng: np.random.Generator) -> Floats:
-    """Random directions (M, RAYS, 3) about normals (M, 3), in the frame of each view ray; `_density` is theirs."""
+    """Random directions (M, RAYS, 3) about normals (M, 3), in the frames of view rays; `_density` is their density."""
     turn, shift = rng.uniform(0, 1, (2, len(normal)))
     ways = []
     for number, alpha in ((_COSINE_RAYS, None), *_LOBES):
@@ -106,7 +108,7 @@ def _find_pixels(
 
 
 def bounced_stokes(pixels: Any, normal: Tensor, surface: Surface, body: Tensor) -> Tensor:
-    """Stokes parameters (3, M, 3) of light after one bounce, before smoothing.
+    """Stokes parameters (3, M, 3) of flash light that reaches each pixel by one bounce on the object, before smoothing.
 
     pixels: `simulator.ObjectPixels`; normal (M, 3) with bumps, in the frames of the rays; body (M, 3) diffuse S0 under
     the flash alone. All rays are used for diffuse and mirrored light, weighted by the balance heuristic.
@@ -123,9 +125,8 @@ def bounced_stokes(pixels: Any, normal: Tensor, surface: Surface, body: Tensor) 
     n, rough, ior = normal[here], surface.roughness[here].clamp(min=_MIN_ROUGHNESS), surface.ior[here]
     diffuse, specular = surface.diffuse[here] * light, surface.specular[here]
     diffuse_part = shade.stokes(n, diffuse, 0 * specular, rough, ior, way, irradiance, surface.law.at(here))
-    mirrored = shade.stokes(
-        n, 0 * diffuse, specular * light, rough, light_transport.facet_ior(specular.mean(dim=1), ior), way, irradiance
-    )
+    facet_ior = light_transport.facet_ior(specular.mean(dim=1), ior)
+    mirrored = shade.stokes(n, 0 * diffuse, specular * light, rough, facet_ior, way, irradiance)
     return normal.new_zeros(3, len(normal), 3).index_add(1, here, diffuse_part + mirrored)
 
 
@@ -168,7 +169,7 @@ def mirrored_surroundings(pixels: Any, flash: Tensor, normal: Tensor, surface: S
 
 
 def _density(normal: Tensor, way: Tensor) -> Tensor:
-    """Density of `_draw_directions` per steradian; normal and way (N, 3) in the frame of each view ray."""
+    """Probability density [1/sr] with which `_draw_directions` draws `way` (N, 3) about `normal` (N, 3)."""
     density = _COSINE_RAYS / RAYS * (normal * way).sum(dim=1).clamp(min=0) / pi
     half = F.normalize(way + way.new_tensor([0.0, 0.0, 1.0]), dim=1)
     cosine = (normal * half).sum(dim=1).clamp(min=0)

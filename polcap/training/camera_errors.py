@@ -17,7 +17,7 @@ ANGLES = (0.0, pi / 4, pi / 2)  # rad
 
 @dataclass(frozen=True)
 class CameraErrors:
-    """Errors of the photographs of each object; all (B,) unless noted."""
+    """Errors of the simulated photographs of B objects; all fields (B,) unless noted."""
 
     full_well: Tensor  # electrons at radiance 1 in the middle exposure, which saturates there
     bracket: Tensor  # ratio between neighboring exposures
@@ -32,7 +32,7 @@ class CameraErrors:
 
     @staticmethod
     def draw(count: int, device: torch.device) -> "CameraErrors":
-        """Random errors for training."""
+        """Draw random camera errors for training."""
 
         def u(low: float, high: float, *shape: int) -> Tensor:
             return low + (high - low) * torch.rand(*shape, count, device=device)
@@ -59,7 +59,7 @@ class CameraErrors:
 
     @staticmethod
     def none(count: int, device: torch.device) -> "CameraErrors":
-        """No errors but a trace of shot noise."""
+        """Camera without errors, except for a trace of shot noise."""
         one, zero = torch.ones(count, device=device), torch.zeros(count, device=device)
         three = torch.zeros(3, count, device=device)
         return CameraErrors(

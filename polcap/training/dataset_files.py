@@ -20,7 +20,7 @@ Deschaintre, Lin, Ghosh, Deep Polarization Imaging for 3D Shape and SVBRDF Acqui
 import json
 from math import log1p
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -30,8 +30,8 @@ from msgspec import Meta
 from polcap.errors import InputError
 from polcap.formats import atomic
 from polcap.formats.maps import png
-from polcap.images import Bits, Floats
-from polcap.optics import frames, mueller, shade
+from polcap.images import Floats
+from polcap.optics import frames, mueller
 from polcap.stages import cues
 from polcap.synth.mesh_tracer import Tracer, centred
 from polcap.training import materials, random_shapes, traced_views
@@ -41,7 +41,7 @@ _LARGEST, _KNEE = 16.0, 0.01  # HDR encoding: radiance at 65535, and the limit b
 
 
 class DatasetRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Settings of all samples."""
+    """Settings of a data set, common to all its samples."""
 
     seed: int = 0
     size: Annotated[int, Meta(ge=64, le=4096)] = 512  # px
@@ -52,8 +52,8 @@ class DatasetRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def main(out: Path, count: int, recipe: DatasetRecipe) -> int:
-    """Make the missing ones of samples 0…count − 1; returns the number of new samples."""
-    library, files = _library(recipe.material), _meshes(recipe.mesh)
+    """Make the samples 0…count − 1 that the folder lacks; returns the number of new samples."""
+    library, files = _open_library(recipe.material), _list_meshes(recipe.mesh)
     _describe(out, recipe)
     made = 0
     for number in range(count):
@@ -61,68 +61,55 @@ def main(out: Path, count: int, recipe: DatasetRecipe) -> int:
         if place.exists():
             continue
         with atomic.folder(place) as folder:
-            _write(folder, *make_sample(recipe, library, files, number))
+            _write_sample(folder, recipe, library, files, number)
         made += 1
     return made
 
 
-def make_sample(
-    recipe: DatasetRecipe, library: materials.MaterialLibrary, files: list[Path], number: int
-) -> tuple[dict[str, Floats], dict[str, Any]]:
-    """Pictures (H, W, ·) by file name, and the content of sample.json; without mesh `files` the shape is random."""
+def _write_sample(
+    folder: Path, recipe: DatasetRecipe, library: materials.MaterialLibrary, files: list[Path], number: int
+) -> None:
+    """Simulate one object and write its pictures and sample.json; without mesh `files` its shape is random."""
     rng = np.random.default_rng([recipe.seed, number])
     file = files[rng.integers(len(files))] if files else None
     mesh = centred(traced_views.read_mesh(file)) if file else random_shapes.compose(rng)
     buffer, turn, _ = traced_views.trace_random_view(str(file or "a random shape"), Tracer(mesh), recipe.size, rng)
     mask, view = buffer.mask, buffer.view
     middle, unit = traced_views.depth_unit(mask, buffer.depth, view.focal)
-    rays = frames.rays(view, *mask.shape)
-    v, bare, position = (torch.from_numpy(a[mask]) for a in (rays, buffer.normal, buffer.position))
+    images = frames.rays(view, *mask.shape), buffer.normal, buffer.position, buffer.depth
+    v, bare, position, depth = (torch.from_numpy(image[mask]) for image in images)
     with torch.random.fork_rng():
         torch.manual_seed(int(rng.integers(1 << 62)))
         owner, smooth = torch.zeros(len(v), dtype=torch.long), float(recipe.law == "smooth")
-        surface = materials.draw_surface(
-            library, bare, position, torch.from_numpy(turn).float()[None], owner, 1, smooth
-        )
-    normal = frames.lifted(frames.to_ray_frame(surface.normal, v))
+        turned = torch.from_numpy(turn).float()[None]
+        surface = materials.draw_surface(library, bare, position, turned, owner, 1, smooth)
     way, off = rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.1)
     flash = [off * np.cos(way) * middle, off * np.sin(way) * middle, 0.0]
-    point = -v * (torch.from_numpy(buffer.depth[mask]) / v[:, 2])[:, None]
-    to_light = torch.tensor(flash, dtype=torch.float32) - point
-    squared = (to_light**2).sum(dim=1)
-    to_light = frames.to_ray_frame(to_light / squared.sqrt()[:, None], v)
-    light = shade.stokes(
-        normal,
-        surface.diffuse,
-        surface.specular,
-        surface.roughness,
-        surface.ior,
-        to_light,
-        middle**2 / squared,
-        surface.law,
-    ).numpy()
-
-    passed = _photographs(light, rays[mask], recipe.noise, rng)
+    to_light = torch.tensor(flash, dtype=torch.float32) + v * (depth / v[:, 2])[:, None]
+    normal, diffuse, specular = materials.reflect(surface, v, to_light, torch.full((len(v),), middle**2))
+    passed = _photograph((diffuse + specular).numpy(), v.numpy(), recipe.noise, rng)
     i0, i45, i90, i135 = passed
     stokes = np.stack([passed.sum(axis=0) / 2, i0 - i90, i45 - i135])
+    cos, sin = cues.polarization(stokes, np.zeros((6, *stokes.shape[1:])))[3]
+    near, far = float(depth.min()), float(depth.max())
     pictures = {
-        **{f"I{angle:03d}": picture for angle, picture in zip(ANGLES_DEG, passed)},
-        "stokes": np.moveaxis(cues.polarization(stokes, np.zeros((6, *stokes.shape[1:])))[3], 0, -1),
+        **{f"I{angle:03d}": encode(picture) for angle, picture in zip(ANGLES_DEG, passed)},
+        "stokes": np.stack([0 * cos, cos, sin], axis=1) / 2 + 0.5,  # S0's slot first, as in the paper
         "diffuse_color": cues.least_intensity_color(stokes, np.eye(3)),
-        "normal": np.asarray(frames.from_ray_frame(normal, v)),
-        "depth": buffer.depth[mask],
+        "normal": frames.from_ray_frame(normal, v).numpy() / 2 + 0.5,
+        "depth": (depth.numpy() - near) / max(far - near, 1e-9),
         "diffuse": surface.diffuse.numpy(),
         "specular": surface.specular.numpy(),
         "roughness": surface.roughness.numpy(),
     }
-    near, far = (float(f(buffer.depth[mask])) for f in (np.min, np.max))
-    about: dict[str, Any] = {
+    for name, value in pictures.items():
+        png.write(folder / f"{name}.png", png.sixteen_bits(traced_views.fill(mask, value)))
+    png.write(folder / "mask.png", np.where(mask, 255, 0).astype(np.uint8))
+    about = {
         "focal_px": view.focal, "center_px": view.center, "flash": flash, "depth": {"near": near, "far": far},
         "middle": middle, "depth_unit": unit, "ior": float(surface.ior.mean()),
     }  # fmt: skip
-    return {"mask": mask.astype(np.float32)} | {
-        name: traced_views.fill(mask, value) for name, value in pictures.items()
-    }, about
+    (folder / "sample.json").write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
 
 
 def encode(radiance: Floats) -> Floats:
@@ -135,15 +122,15 @@ def decode(code: Floats) -> Floats:
     return np.asarray(_KNEE * np.expm1(code * log1p(_LARGEST / _KNEE)))
 
 
-def _library(material: str) -> materials.MaterialLibrary:
+def _open_library(material: str) -> materials.MaterialLibrary:
     library = materials.MaterialLibrary(Path(material) if material else None, torch.device("cpu"))
     if material and not library.has_textures:
         raise InputError(f"{material} holds no texture set; give a folder of folders, each with albedo.jpg")
     return library
 
 
-def _meshes(mesh: str) -> list[Path]:
-    """Mesh files; none for random shapes."""
+def _list_meshes(mesh: str) -> list[Path]:
+    """Mesh files that the setting `mesh` names; none means random shapes."""
     if not mesh:
         return []
     place = Path(mesh)
@@ -153,7 +140,7 @@ def _meshes(mesh: str) -> list[Path]:
     return files
 
 
-def _photographs(light: Floats, rays: Floats, noise: float, rng: np.random.Generator) -> Floats:
+def _photograph(light: Floats, rays: Floats, noise: float, rng: np.random.Generator) -> Floats:
     """Light behind the polarizer at each angle, (4, M, 3), with noise."""
     passed = []
     for angle in np.radians(ANGLES_DEG):
@@ -163,28 +150,8 @@ def _photographs(light: Floats, rays: Floats, noise: float, rng: np.random.Gener
     return np.stack(passed)
 
 
-def _write(folder: Path, pictures: dict[str, Floats], about: dict[str, Any]) -> None:
-    near, far = about["depth"]["near"], about["depth"]["far"]
-    mask = pictures["mask"] > 0
-    for name, value in pictures.items():
-        if name == "mask":
-            drawn: Bits = np.where(mask, 255, 0).astype(np.uint8)
-            png.write(folder / "mask.png", drawn)
-            continue
-        if name.startswith("I"):
-            value = encode(value)
-        elif name == "normal":
-            value = np.where(mask[..., None], value / 2 + 0.5, 0)
-        elif name == "stokes":  # S0's slot first, as in the paper
-            value = np.where(mask[..., None], np.dstack([np.full(mask.shape, 0.5), value / 2 + 0.5]), 0)
-        elif name == "depth":
-            value = np.where(mask, (value - near) / max(far - near, 1e-9), 0)
-        png.write(folder / f"{name}.png", png.sixteen_bits(value))
-    (folder / "sample.json").write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
-
-
 def _describe(out: Path, recipe: DatasetRecipe) -> None:
-    """Write dataset.json; a folder with samples of other settings is refused."""
+    """Write dataset.json. Raises InputError if the folder has samples of other settings, or other files."""
     asked, file = msgspec.to_builtins(recipe), out / "dataset.json"
     if file.exists():
         there = json.loads(file.read_text(encoding="utf-8"))["recipe"]

@@ -7,15 +7,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from torch.nn import functional as F
 
 from polcap.errors import InputError
-from polcap.images import Cues, Floats, SurfaceMaps
+from polcap.images import Cues, SurfaceMaps
 from polcap.optics import frames
 from polcap.stages.cues import channels
 from polcap.training import main_network, train
 from polcap.training.evaluation_protocol import Case, Protocol
 
 Estimator = Callable[[Case], SurfaceMaps]
+Means = tuple[tuple[float, ...], ...]  # normal in the frame of a ray, diffuse, specular, roughness
 _MEAN_SIZE = 96  # px, of the pictures for the mean maps
 
 
@@ -45,42 +47,31 @@ def inflated(seen: Cues) -> SurfaceMaps:
     )  # fmt: skip
 
 
-Means = tuple[Floats, Floats, Floats, Floats]  # normal in the frame of a ray, diffuse, specular, roughness
-
-
 def mean_maps(protocol: Protocol, count: int) -> Means:
     """Mean of each map over all pictures of the evaluation, with equal weights: the best constants."""
     rows = []
     for number in range(count):
         truth = protocol.truth(number, min(_MEAN_SIZE, protocol.size))
-        mask = truth.mask
-        local = frames.to_ray_frame(truth.normal, frames.rays(truth.view, *mask.shape))
-        rows.append([image[mask].mean(axis=0) for image in (local, truth.diffuse, truth.specular, truth.roughness)])
-    normal, diffuse, specular, roughness = (np.mean(part, axis=0) for part in zip(*rows))
-    return normal / np.linalg.norm(normal), diffuse, specular, roughness
+        local = frames.to_ray_frame(truth.normal, frames.rays(truth.view, *truth.mask.shape))
+        images = local, truth.diffuse, truth.specular, truth.roughness[..., None]
+        rows.append([image[truth.mask].mean(axis=0) for image in images])
+    normal, *others = (np.mean(part, axis=0) for part in zip(*rows))
+    return tuple(tuple(mean.tolist()) for mean in (normal / np.linalg.norm(normal), *others))
 
 
 def constant(seen: Cues, values: Means) -> SurfaceMaps:
-    """Maps with the same values at all pixels."""
-    normal, diffuse, specular, roughness = values
-    shape = (*seen.mask.shape, 3)
+    """Baseline maps with the same values at all pixels."""
+    normal, diffuse, specular, roughness = (np.broadcast_to(v, (*seen.mask.shape, len(v))) for v in values)
     return replace(
-        frontal(seen), normal=np.asarray(frames.from_ray_frame(np.broadcast_to(normal, shape), seen.rays)),
-        diffuse=np.broadcast_to(diffuse, shape), specular=np.broadcast_to(specular, shape),
-        roughness=np.full(shape[:2], roughness), estimator="mean",
+        frontal(seen), normal=np.asarray(frames.from_ray_frame(normal, seen.rays)), diffuse=diffuse, specular=specular,
+        roughness=roughness[..., 0], estimator="mean",
     )  # fmt: skip
 
 
-def find_checkpoints(folder: Path) -> dict[str, Path]:
-    """Checkpoints folder/NAME/last.pt by name.
-
-    Raises
-    ------
-    InputError
-        There are none.
-    """
-    found = {path.parent.name: path for path in sorted(folder.glob("*/last.pt"))}
-    if not found:
+def find_checkpoints(folder: Path | None) -> dict[str, Path]:
+    """Checkpoints folder/NAME/last.pt by name. Raises InputError if the folder has none."""
+    found = {path.parent.name: path for path in sorted(folder.glob("*/last.pt"))} if folder else {}
+    if folder and not found:
         raise InputError(f"{folder} holds no NAME/last.pt; first train with `polcap train DATA --out {folder}/NAME`")
     return found
 
@@ -96,20 +87,18 @@ def network_alone(checkpoint: Path) -> Estimator:
         padded = np.pad(picture, ((0, 0), (0, -height % multiple), (0, -width % multiple))).astype(np.float32)
         with torch.no_grad():
             maps = network(torch.from_numpy(padded)[None])
-        by = int(case.small.view.scale)
-
-        def enlarged(name: str) -> Floats:
-            image = np.ascontiguousarray(maps[name][0].float().permute(1, 2, 0).numpy()[:height, :width])
-            larger = cv2.resize(image, (width * by, height * by))
-            rest = [(0, n - m) for n, m in zip(case.cues.mask.shape, larger.shape)]
-            return np.asarray(np.pad(larger, [*rest, *[(0, 0)] * (larger.ndim - 2)], mode="edge"))
-
-        normal = frames.from_ray_frame(enlarged("normal"), case.cues.rays)
+        by, (high, wide) = int(case.small.view.scale), case.cues.mask.shape
+        enlarged = {}
+        for name, image in maps.items():
+            larger = F.interpolate(image[:, :, :height, :width].float(), scale_factor=by, mode="bilinear")
+            larger = F.pad(larger, (0, wide - width * by, 0, high - height * by), mode="replicate")
+            enlarged[name] = larger[0].permute(1, 2, 0).numpy()
+        normal = frames.from_ray_frame(enlarged["normal"], case.cues.rays)
         return SurfaceMaps(
             normal=np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)),
-            diffuse=enlarged("diffuse"), specular=enlarged("specular"), roughness=enlarged("roughness"),
-            depth_prior=enlarged("depth"), confidence=enlarged("sigma"), mask=case.cues.mask, view=case.cues.view,
-            estimator=checkpoint.parent.name,
+            diffuse=enlarged["diffuse"], specular=enlarged["specular"], roughness=enlarged["roughness"][..., 0],
+            depth_prior=enlarged["depth"][..., 0], confidence=enlarged["sigma"][..., 0], mask=case.cues.mask,
+            view=case.cues.view, estimator=checkpoint.parent.name,
         )  # fmt: skip
 
     return estimate

@@ -31,7 +31,7 @@ Field = Callable[[Floats], tuple[Floats, Floats]]  # (M, 3) -> tone 0…1, depth
 
 @dataclass(frozen=True)
 class MaterialSample:
-    """A material at M positions."""
+    """Appearance of a test material at M positions."""
 
     diffuse: Floats  # (M, 3)
     specular: Floats  # (M, 3) F0
@@ -40,7 +40,7 @@ class MaterialSample:
 
 @dataclass(frozen=True)
 class TestMaterial:
-    """A material as functions of position (M, 3) and facing direction (M, 3)."""
+    """A test material as functions of position (M, 3) and of the surface's direction (M, 3)."""
 
     name: str
     ior: float
@@ -48,10 +48,10 @@ class TestMaterial:
     slope: Callable[[Floats, Floats], Floats]  # (M, 3) gradient of the relief; outward is up
 
 
-def test_materials(folder: Path, *, met: bool = False) -> list[TestMaterial]:
+def test_materials(folder: Path, *, everyday: bool = False) -> list[TestMaterial]:
     """All test materials: the texture sets of `folder` in alphabetical order, then the patterns.
 
-    met: F0 as in everyday objects, mostly about 0.045; else about 0.04 for one half and far higher for the other.
+    everyday: F0 as in everyday objects, mostly about 0.045; else about 0.04 for one half and far higher for the other.
 
     Raises
     ------
@@ -64,15 +64,15 @@ def test_materials(folder: Path, *, met: bool = False) -> list[TestMaterial]:
             f"{folder} holds {len(sets)} texture sets, the evaluation needs {TEXTURES}; give the unchanged DATA folder"
         )
     names = list(_FAMILIES)
-    patterned = [_pattern(names[k % len(names)], TEXTURES + k, met) for k in range(PATTERNS)]
-    return [_textured(path, k, met) for k, path in enumerate(sets[:TEXTURES])] + patterned
+    patterned = [_pattern(names[k % len(names)], TEXTURES + k, everyday) for k in range(PATTERNS)]
+    return [_textured(path, k, everyday) for k, path in enumerate(sets[:TEXTURES])] + patterned
 
 
-def _levels(number: int, met: bool) -> tuple[np.random.Generator, float, float]:
+def _levels(number: int, everyday: bool) -> tuple[np.random.Generator, float, float]:
     """Random generator, refractive index and mean F0 of a material."""
     rng = np.random.default_rng([_SEED, number])
     ior = 1.4 + 0.2 * ((7 * number) % 30) / 29
-    if met:
+    if everyday:
         low, high = _COMMON if number % 5 else _RARE
     else:
         low, high = _ORDINARY if number % 2 else _STRONG
@@ -82,9 +82,9 @@ def _levels(number: int, met: bool) -> tuple[np.random.Generator, float, float]:
 # --- texture sets -------------------------------------------------------------------------------
 
 
-def _textured(folder: Path, number: int, met: bool) -> TestMaterial:
-    """A texture set projected along the nearest axis, mirrored at its edges."""
-    rng, ior, level = _levels(number, met)
+def _textured(folder: Path, number: int, everyday: bool) -> TestMaterial:
+    """Test material from a texture set, projected along the nearest axis and mirrored at its edges."""
+    rng, ior, level = _levels(number, everyday)
     maps = np.ascontiguousarray(scene_files.read_textures(folder).transpose(1, 2, 0))  # albedo, roughness, two slopes
     mean = float((maps[..., :3].mean(axis=-1) ** 0.45).mean())
     scale, follow, relief = rng.uniform(0.8, 2.0), rng.uniform(-0.5, 0.5), rng.uniform(0.2, 0.5)
@@ -92,7 +92,8 @@ def _textured(folder: Path, number: int, met: bool) -> TestMaterial:
     def sampled(place: Floats, facing: Floats) -> tuple[Floats, Indices, Indices]:
         axis = np.abs(facing).argmax(axis=1)
         rows, across, up = np.arange(len(axis)), (axis + 1) % 3, (axis + 2) % 3
-        u, v = (_mirror(place[rows, a] * scale) * (len(maps) - 1) for a in (across, up))
+        folded = (1 - np.abs(np.mod(place[rows, a] * scale, 2) - 1) for a in (across, up))  # 0…1, mirrored at integers
+        u, v = (part * (len(maps) - 1) for part in folded)
         return _sampled(maps, u, v), across, up
 
     def at(place: Floats, facing: Floats) -> MaterialSample:
@@ -111,11 +112,6 @@ def _textured(folder: Path, number: int, met: bool) -> TestMaterial:
     return TestMaterial(folder.name, ior, at, slope)
 
 
-def _mirror(x: Floats) -> Floats:
-    """Fold numbers into 0…1, mirrored at integers."""
-    return np.asarray(1 - np.abs(np.mod(x, 2) - 1))
-
-
 def _sampled(image: Floats, u: Floats, v: Floats) -> Floats:
     """Image (H, W, 6) at coordinates u, v (M,), bilinear, (M, 6)."""
     side = 2**14  # remap is limited to pictures under 2^15 px a side
@@ -129,16 +125,16 @@ def _sampled(image: Floats, u: Floats, v: Floats) -> Floats:
 # --- patterns -----------------------------------------------------------------------------------
 
 
-def _pattern(family: str, number: int, met: bool) -> TestMaterial:
-    """Two colors, two glosses and a relief that follow one field."""
-    rng, ior, level = _levels(number, met)
+def _pattern(family: str, number: int, everyday: bool) -> TestMaterial:
+    """Test material with two colors, two glosses and a relief that follow one pattern."""
+    rng, ior, level = _levels(number, everyday)
     field = _FAMILIES[family](rng)
     first, second = _color(rng), _color(rng)
     if rng.random() < 0.5:  # two shades of one color
         second = first * rng.uniform(0.2, 0.6)
     rough, change = rng.uniform(0.2, 0.7), rng.uniform(0.08, 0.3) * rng.choice([-1, 1])
     follow, raised, steep = rng.uniform(-0.6, 0.6), rng.uniform(-0.4, 0.4), rng.uniform(0.03, 0.2)
-    strong = _levels(number, met=False)[2] >= 0.1  # as in protocol 1, so that both protocols have the same relief
+    strong = _levels(number, everyday=False)[2] >= 0.1  # as in protocol 1, so that both protocols have the same relief
     tint = 1 + rng.uniform(-0.15, 0.15, 3) if strong else np.array([1.0, 1.0, 1.0])
 
     def height(place: Floats) -> Floats:
@@ -169,7 +165,7 @@ def _gradient(field: Callable[[Floats], Floats], place: Floats) -> Floats:
 
 
 def _color(rng: np.random.Generator) -> Floats:
-    """Linear reflectance (3,), dark to light, gray to vivid."""
+    """Random linear reflectance (3,), dark to light, gray to vivid."""
     hue, saturation, value = rng.uniform(0, 360), rng.uniform(0, 1) ** 1.5, rng.uniform(0.25, 0.95)
     display = cv2.cvtColor(np.array([[[hue, saturation, value]]], np.float32), cv2.COLOR_HSV2RGB)[0, 0]
     return np.asarray(display.astype(np.float64) ** 2.2)

@@ -1,64 +1,53 @@
-"""Page of the evaluation's figures, with the published ones: evaluation.md."""
+"""Page of the evaluation's figures, with the published ones, evaluation.md; picture of its first cases, panel.png."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import cv2
+import numpy as np
+
+from polcap.images import Bools, Floats, SurfaceMaps
+from polcap.report import stage_pictures as pictures
+from polcap.report.stage_pictures import Picture
+from polcap.training import traced_views
+from polcap.training.evaluation_protocol import Case
+from polcap.training.map_errors import angle, render_intensity
+
 # Deschaintre, Lin & Ghosh, CVPR 2021, tables 1 and 2, on the authors' own test set
-PUBLISHED = {
-    "paper": {
-        "normal_mean": 12.00, "diffuse": 0.0382, "roughness": 0.113, "specular": 0.0293, "depth": 0.174,
-        "rendering": 0.024,
-    },
+_FIGURES = ("normal_mean", "diffuse", "roughness", "specular", "depth", "rendering")
+_PAPER = {"paper": dict(zip(_FIGURES, (12.00, 0.0382, 0.113, 0.0293, 0.174, 0.024)))}
+PUBLISHED = _PAPER | {
     "Li 2018": {"normal_mean": 42.23, "depth": 0.339, "rendering": 0.103},
     "Boss 2020": {"normal_mean": 47.69, "depth": 0.327, "rendering": 0.185},
-}  # fmt: skip
-PUBLISHED_ABLATIONS = {
-    "paper": PUBLISHED["paper"],
-    "paper (a), plain skips": {
-        "normal_mean": 14.17, "diffuse": 0.05, "roughness": 0.115, "specular": 0.07, "depth": 0.176,
-        "rendering": 0.0285,
-    },
-    "paper (b), unpolarized loss": {
-        "normal_mean": 12.38, "diffuse": 0.087, "roughness": 0.131, "specular": 0.0339, "depth": 0.196,
-        "rendering": 0.0351,
-    },
-    "paper (c), no polarization": {
-        "normal_mean": 24.14, "diffuse": 0.0783, "roughness": 0.155, "specular": 0.0555, "depth": 0.223,
-        "rendering": 0.0485,
-    },
-}  # fmt: skip
-ROWS = {
-    "normal_mean": "normal, mean [°]",
-    "normal_median": "normal, median [°]",
-    "normal_within_11.25": "normal under 11.25° [%]",
-    "normal_within_22.5": "normal under 22.5° [%]",
-    "normal_within_30": "normal under 30° [%]",
-    "normal_mean_core": "normal, mean, eroded mask [°]",
-    "normal_median_core": "normal, median, eroded mask [°]",
-    "normal_within_11.25_core": "normal under 11.25°, eroded mask [%]",
-    "normal_within_22.5_core": "normal under 22.5°, eroded mask [%]",
-    "normal_within_30_core": "normal under 30°, eroded mask [%]",
-    "diffuse": "diffuse RMSE",
-    "diffuse_l1": "diffuse L1",
-    "diffuse_picture": "diffuse RMSE, whole picture",
-    "diffuse_l1_picture": "diffuse L1, whole picture",
-    "diffuse_clipped": "diffuse RMSE in clipped highlights",
-    "roughness": "roughness RMSE",
-    "roughness_l1": "roughness L1",
-    "roughness_picture": "roughness RMSE, whole picture",
-    "roughness_l1_picture": "roughness L1, whole picture",
-    "specular": "specular RMSE",
-    "specular_l1": "specular L1",
-    "specular_picture": "specular RMSE, whole picture",
-    "specular_l1_picture": "specular L1, whole picture",
-    "depth": "depth RMSE",
-    "depth_fitted": "depth RMSE, scale and shift fitted",
-    "depth_integrated": "depth RMSE after integration",
-    "rendering": "rendering RMSE",
-    "rendering_l1": "rendering L1",
-    "rendering_picture": "rendering RMSE, whole picture",
-    "rendering_l1_picture": "rendering L1, whole picture",
 }
+PUBLISHED_ABLATIONS = _PAPER | {
+    "paper (a), plain skips": dict(zip(_FIGURES, (14.17, 0.05, 0.115, 0.07, 0.176, 0.0285))),
+    "paper (b), unpolarized loss": dict(zip(_FIGURES, (12.38, 0.087, 0.131, 0.0339, 0.196, 0.0351))),
+    "paper (c), no polarization": dict(zip(_FIGURES, (24.14, 0.0783, 0.155, 0.0555, 0.223, 0.0485))),
+}
+
+
+def _row_names() -> dict[str, str]:
+    """Names of the table's rows by the name of their figure."""
+    names: dict[str, str] = {}
+    for end, core in (("", ""), ("_core", ", eroded mask")):
+        names |= {f"normal_{kind}{end}": f"normal, {kind}{core} [°]" for kind in ("mean", "median")}
+        names |= {
+            f"normal_within_{limit}{end}": f"normal under {limit}°{core} [%]" for limit in ("11.25", "22.5", "30")
+        }
+    errors = {"": "RMSE", "_l1": "L1", "_picture": "RMSE, whole picture", "_l1_picture": "L1, whole picture"}
+    for image in ("diffuse", "roughness", "specular", "rendering"):
+        names |= {image + end: f"{image} {name}" for end, name in errors.items()}
+        if image == "diffuse":
+            names["diffuse_clipped"] = "diffuse RMSE in clipped highlights"
+        if image == "specular":
+            names["depth"] = "depth RMSE"
+            names["depth_fitted"] = "depth RMSE, scale and shift fitted"
+            names["depth_integrated"] = "depth RMSE after integration"
+    return names
+
+
+ROWS = _row_names()
 _AVERAGED = (
     "RMSE is the root of the mean square over a picture's masked pixels and channels (for renderings over the 20 "
     "lights too); each figure is the mean of all pictures, as the paper's tables suggest. Depth is the estimated map, "
@@ -70,41 +59,51 @@ _AVERAGED = (
     "its figures are in the first row of each."
 )
 Table = Mapping[str, Mapping[str, float]]
+COLUMNS = (
+    "S0", "DoLP 0...0.4, AoLP", "normal", "diffuse", "specular 0...0.3", "roughness", "depth", "relit",
+    "error 0...30 deg",
+)  # fmt: skip
+_TILE, _HEAD = 200, 22  # px
+_LIGHT = np.array([-0.6, 0.5, 0.62])
 
 
 def make_page(result: Mapping[str, Any]) -> str:
     """Markdown of evaluation.json's content."""
     conditions = result["conditions"]
-    main = {**result["table"], **_published(PUBLISHED)}
+    ratios = [f"{name} {value:.2f}" for name, value in result["of_mean_maps"].items()]
     parts = [
         f"# Evaluation: {conditions['pictures']} pictures at {conditions['size']}²",
         f"6 test meshes × 30 test materials, protocol {conditions['protocol']} ({conditions['materials']}). "
         f"Model {conditions['model'][:12]} {conditions['version']}. Camera: {conditions['camera']}.",
         f"Standard deviation of the truth's F0 over all pictures: {conditions['f0_deviation']:.3f}.",
-        _table(main),
+        _table(result["table"], PUBLISHED),
         _AVERAGED,
         "*As published*: on the authors' test set, which is not public, so the columns cannot be compared directly.",
+        f"RMSE of ours divided by that of the best constant map: {', '.join(ratios)}.",
     ]
-    ratios = [f"{name} {value:.2f}" for name, value in result["of_mean_maps"].items()]
-    parts.append(f"RMSE of ours divided by that of the best constant map: {', '.join(ratios)}.")
     if result["ablations"]:
         parts += [
             "## Networks alone, at one reduced budget",
             "Each sees the picture binned to about the size of training. Its maps are enlarged, without inversion.",
-            _table({**result["ablations"], **_published(PUBLISHED_ABLATIONS)}),
+            _table(result["ablations"], PUBLISHED_ABLATIONS),
         ]
-    parts += ["## Expected normal error, by tenths of the pixels", _calibration(result["calibration"])]
-    parts += ["## Cost", _cost(result["seconds"])]
+    tenths = [
+        [str(k + 1), *(f"{n:.2f}" for n in (r["predicted"], r["actual"], r["predicted"] / max(r["actual"], 1e-6)))]
+        for k, r in enumerate(result["calibration"])
+    ]
+    parts += [
+        "## Expected normal error, by tenths of the pixels",
+        grid(["tenth", "predicted [°]", "actual [°]", "predicted / actual"], tenths),
+        "## Cost",
+        grid(["", "s per picture"], [[name, f"{value:.2f}"] for name, value in result["seconds"].items()]),
+    ]
     return "\n\n".join(parts) + "\n"
 
 
-def _published(table: Table) -> dict[str, Mapping[str, float]]:
-    return {f"{name} *(as published)*": figures for name, figures in table.items()}
-
-
-def _table(columns: Table) -> str:
+def _table(columns: Table, published: Table) -> str:
+    columns = {**columns, **{f"{name} *(as published)*": figures for name, figures in published.items()}}
     rows = [key for key in ROWS if any(key in figures for figures in columns.values())]
-    return _grid(["", *columns], [[ROWS[key], *(_cell(key, c.get(key)) for c in columns.values())] for key in rows])
+    return grid(["", *columns], [[ROWS[key], *(_cell(key, c.get(key)) for c in columns.values())] for key in rows])
 
 
 def _cell(key: str, value: float | None) -> str:
@@ -115,18 +114,62 @@ def _cell(key: str, value: float | None) -> str:
     return f"{value:.2f}" if key.startswith("normal") else f"{value:.4f}"
 
 
-def _calibration(rows: Sequence[Mapping[str, float]]) -> str:
-    body = [
-        [str(k + 1), f"{r['predicted']:.2f}", f"{r['actual']:.2f}", f"{r['predicted'] / max(r['actual'], 1e-6):.2f}"]
-        for k, r in enumerate(rows)
+def grid(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    """Markdown table."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *body))
+
+
+def make_row(case: Case, maps: SurfaceMaps) -> Picture:
+    """Picture of one case: truth above, estimate below; in the last column the error above the predicted error."""
+    seen, mask, both = case.cues, case.truth.mask, (case.truth, maps)
+    s1, s2 = seen.ratio
+    depth = [case.depth, case.depth * 0 if maps.depth_prior is None else maps.depth_prior]
+    centered = [d - d[mask].mean() for d in depth]
+    span = float(np.abs(centered[0][mask]).max())
+    relit = [_render(case, one, _LIGHT / np.linalg.norm(_LIGHT)) for one in both]
+    white = float(np.percentile(relit[0][mask], 99))
+    columns = [
+        [pictures.display(seen.radiance, 1.0), pictures.display(_render(case, maps, np.array([0.0, 0.0, 1.0])), 1.0)],
+        [pictures.scale(seen.dolp, 0, 0.4, mask), pictures.hue(np.arctan2(s2, s1) / 2, mask)],
+        [pictures.normal(one) for one in both],
+        [pictures.display(one.diffuse * mask[..., None], 1.0) for one in both],
+        [pictures.scale(one.specular.mean(-1), 0, 0.3, mask) for one in both],
+        [pictures.scale(one.roughness, 0, 1, mask) for one in both],
+        [pictures.scale(-d, -span, span, mask) for d in centered],
+        [pictures.display(image, white) for image in relit],
+        [pictures.scale(e, 0, 30, mask) for e in (angle(maps, case), maps.confidence)],
     ]
-    return _grid(["tenth", "predicted [°]", "actual [°]", "predicted / actual"], body)
+    crop = _box(mask)
+    tiles = [np.vstack([_tile(tile[crop]) for tile in column]) for column in columns]
+    head = np.full((_HEAD, len(columns) * _TILE, 3), 48, np.uint8)
+    _write(head, f"{case.name}: truth above, estimate below", 4)
+    return np.vstack([head, np.hstack(tiles)])
 
 
-def _cost(seconds: Mapping[str, float]) -> str:
-    return _grid(["", "s per picture"], [[name, f"{value:.2f}"] for name, value in seconds.items()])
+def make_sheet(rows: list[Picture]) -> Picture:
+    """Picture of all cases, below the names of the columns."""
+    head = np.zeros((_HEAD, rows[0].shape[1], 3), np.uint8)
+    for k, name in enumerate(COLUMNS):
+        _write(head, name, k * _TILE + 4)
+    return np.vstack([head, *rows])
 
 
-def _grid(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    rows = [head, ["---"] * len(head), *body]
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+def _render(case: Case, maps: SurfaceMaps, light: Floats) -> Floats:
+    return traced_views.fill(case.truth.mask, render_intensity(maps, case, case.truth.mask, light))
+
+
+def _box(mask: Bools) -> tuple[slice, ...]:
+    """Square crop around the object, as slices of rows and columns."""
+    y, x = np.nonzero(mask)
+    side = int(min(max(np.ptp(x), np.ptp(y)) + 5, min(mask.shape)))
+    starts = (int(np.clip((a.min() + a.max() - side) // 2, 0, n - side)) for a, n in zip((y, x), mask.shape))
+    return tuple(slice(start, start + side) for start in starts)
+
+
+def _tile(picture: Picture) -> Picture:
+    way = cv2.INTER_AREA if picture.shape[0] > _TILE else cv2.INTER_NEAREST
+    return np.asarray(cv2.resize(picture, (_TILE, _TILE), interpolation=way), np.uint8)
+
+
+def _write(picture: Picture, text: str, x: int) -> None:
+    cv2.putText(picture, text, (x, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 255), 1, cv2.LINE_AA)

@@ -13,10 +13,8 @@ of these sets have light from all sides, not the flash that polcap needs.
 import json
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from polcap.config import Config
 from polcap.errors import InputError
@@ -27,13 +25,12 @@ from polcap.images import ChartRequest, Cues, Floats, Network
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
+from polcap.training.evaluation_page import grid
+from polcap.training.map_errors import Score
 
 _MISSED_DEG = 90.0  # error of a pixel of the object without an estimated normal
 _LIMITS_DEG = (11.25, 22.5, 30.0)
-_ROWS = ("mean", "median", *(f"within {limit:g}°" for limit in _LIMITS_DEG), "covered", "as a body")
 _MIN_DOLP, _MIN_TILT = 0.03, 0.3  # for the comparison of AoLP and azimuth; tilt: sine of the zenith
-
-Score = dict[str, float]
 
 
 def main(folder: Path, model: Path, out: Path) -> dict[str, Score]:
@@ -44,14 +41,14 @@ def main(folder: Path, model: Path, out: Path) -> dict[str, Score]:
     InputError
         The folder does not have this layout.
     """
-    names, angles = _contents(folder)
+    names, angles = _list_pictures(folder)
     network = models.open_network(model)
-    rows: dict[str, dict[str, Score]] = {
+    rows = {
         name: {"ours": score(folder, angles, name, network), "analytic": score(folder, angles, name, None)}
         for name in names
     }
     table = {
-        column: {row: float(np.mean([figures[column][row] for figures in rows.values()])) for row in _ROWS}
+        column: {row: float(np.mean([both[column][row] for both in rows.values()])) for row in rows[names[0]][column]}
         for column in ("ours", "analytic")
     }
     result = {"folder": str(folder), "model": network.digest, "table": table, "pictures": rows}
@@ -61,7 +58,7 @@ def main(folder: Path, model: Path, out: Path) -> dict[str, Score]:
     return table
 
 
-def _contents(folder: Path) -> tuple[list[str], list[str]]:
+def _list_pictures(folder: Path) -> tuple[list[str], list[str]]:
     """Names of the pictures with a normal map, and of the folders of angles; checks that no file is missing."""
     angles = sorted(place.name for place in folder.glob("pol*") if place.is_dir())
     names = sorted(place.name for place in (folder / "normal").glob("*.png"))
@@ -70,18 +67,18 @@ def _contents(folder: Path) -> tuple[list[str], list[str]]:
             f"{folder} holds {len(angles)} folders pol… and {len(names)} normal maps; --real needs the folders pol000 "
             "pol045 pol090 [pol135], mask and normal, with pictures of the same names"
         )
-    for name in names:
-        missing = [part for part in (*angles, "mask") if not (folder / part / name).exists()]
-        if missing:
-            raise InputError(
-                f"{folder / missing[0] / name} is missing; a normal map needs a mask and a picture per angle"
-            )
+    for file in (folder / part / name for name in names for part in (*angles, "mask")):
+        if not file.exists():
+            raise InputError(f"{file} is missing; a normal map needs a mask and a picture per angle")
     return names, angles
 
 
 def score(folder: Path, angles: list[str], name: str, network: Network | None) -> Score:
-    """Errors of one picture: angles between estimated and measured normals, degrees; shares 0…1; `as_a_body`."""
-    mask, truth = _mask(folder / "mask" / name), _normal(folder / "normal" / name)
+    """Run the path on one picture; returns the angles between estimated and measured normals [°], and shares 0…1."""
+    picture, vector = png.read(folder / "mask" / name), png.read(folder / "normal" / name)
+    mask = np.asarray(picture > 0 if picture.ndim == 2 else (picture[..., :3] > 0).any(axis=-1))
+    truth = vector[..., :3].astype(np.float64) / np.iinfo(vector.dtype).max * 2 - 1
+    truth /= np.maximum(np.linalg.norm(truth, axis=-1, keepdims=True), 1e-6)
     with tempfile.TemporaryDirectory() as place:
         for angle in angles:
             (Path(place) / "shots" / angle).mkdir(parents=True)
@@ -89,18 +86,17 @@ def score(folder: Path, angles: list[str], name: str, network: Network | None) -
         capture = captures.read(Path(place) / "shots", None)
         supplied = UserInput(chart=ChartRequest("none"), mask=mask, network=network)
         found = path(capture, supplied, Config(), MemoryCache(until="infer"))
-    maps, cues, (x0, y0, x1, y1) = found.maps, found.cues, found.object_.crop
+    maps, (x0, y0, x1, y1) = found.maps, found.object_.crop
     by = round(mask.shape[0] / found.radiance.value.shape[1])
-    error = np.full(mask[::by, ::by].shape, _MISSED_DEG)
-    there = truth[::by, ::by][y0:y1, x0:x1]
-    cosine = np.clip((maps.normal * there).sum(-1), -1, 1)
-    error[y0:y1, x0:x1] = np.where(maps.mask, np.degrees(np.arccos(cosine)), _MISSED_DEG)
-    covered = np.zeros(error.shape, bool)
-    covered[y0:y1, x0:x1] = maps.mask
-    inside = mask[::by, ::by]
-    figures = {"mean": float(error[inside].mean()), "median": float(np.median(error[inside]))}
-    figures |= {f"within {limit:g}°": float((error[inside] < limit).mean()) for limit in _LIMITS_DEG}
-    return figures | {"covered": float(covered[inside].mean()), "as a body": as_a_body(cues, there)}
+    inside, crop = mask[::by, ::by], np.s_[y0:y1, x0:x1]
+    there = truth[::by, ::by][crop]
+    error = np.full(inside.shape, np.nan)
+    error[crop] = np.where(maps.mask, np.degrees(np.arccos(np.clip((maps.normal * there).sum(-1), -1, 1))), np.nan)
+    covered = float(np.isfinite(error[inside]).mean())
+    error = np.nan_to_num(error[inside], nan=_MISSED_DEG)
+    figures = {"mean": float(error.mean()), "median": float(np.median(error))}
+    figures |= {f"within {limit:g}°": float((error < limit).mean()) for limit in _LIMITS_DEG}
+    return figures | {"covered": covered, "as a body": as_a_body(found.cues, there)}
 
 
 def as_a_body(cues: Cues, normal: Floats) -> float:
@@ -111,29 +107,14 @@ def as_a_body(cues: Cues, normal: Floats) -> float:
     return float((cos * np.cos(turned) + sin * np.sin(turned)).mean()) if use.any() else 0.0
 
 
-def _mask(file: Path) -> NDArray[np.bool_]:
-    picture = png.read(file)
-    return np.asarray((picture if picture.ndim == 2 else picture[..., :3].max(-1)) > 0)
-
-
-def _normal(file: Path) -> Floats:
-    picture = png.read(file)
-    vector = picture[..., :3].astype(np.float64) / np.iinfo(picture.dtype).max * 2 - 1
-    return np.asarray(vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-6))
-
-
 def _page(folder: Path, rows: dict[str, dict[str, Score]], table: dict[str, Score]) -> str:
-    lines = [f"# Photographs with measured normals: {folder.name}", ""]
-    lines += ["| | " + " | ".join(_ROWS) + " |", "|" + " --- |" * (len(_ROWS) + 1)]
-    summary: dict[str, Any] = {f"mean, {column}": figures for column, figures in table.items()}
-    summary |= {f"{name}, {column}": figures for name, both in rows.items() for column, figures in both.items()}
-    lines += [
-        f"| {name} | " + " | ".join(f"{figures[row]:.3g}" for row in _ROWS) + " |" for name, figures in summary.items()
-    ]
-    lines += ["", f"Degrees, over the mask of the folder; a pixel without a normal counts as {_MISSED_DEG:g}°.", ""]
-    lines += [
+    named = [(f"mean, {column}", figures) for column, figures in table.items()]
+    named += [(f"{name}, {column}", figures) for name, both in rows.items() for column, figures in both.items()]
+    body = [[name, *(f"{value:.3g}" for value in figures.values())] for name, figures in named]
+    return (
+        f"# Photographs with measured normals: {folder.name}\n\n{grid(['', *table['ours']], body)}\n\n"
+        f"Degrees, over the mask of the folder; a pixel without a normal counts as {_MISSED_DEG:g}°.\n\n"
         "`as a body`: mean cos 2(AoLP − azimuth of the measured normals). It is 1 for diffuse reflection, as under a "
         "flash next to the lens. Below 0 most light is mirrored from the surroundings, which polcap's inversion is not "
-        "made for."
-    ]
-    return "\n".join(lines) + "\n"
+        "made for.\n"
+    )

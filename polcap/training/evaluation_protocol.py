@@ -6,7 +6,6 @@ and cameras are the same. A picture follows from its number, at any size. `CONDI
 """
 
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from polcap.errors import InputError
-from polcap.images import Bits, ColorCalibration, Cues, Floats, GBuffer, Quality, StokesImage, SurfaceMaps, View
-from polcap.optics import frames
+from polcap.images import Bits, ColorCalibration, Cues, Floats, Quality, StokesImage, SurfaceMaps, View
+from polcap.optics import frames, resize
 from polcap.optics.body import SMOOTH, Law
 from polcap.stages import cues
 from polcap.synth.mesh_tracer import Tracer, Triangles, centred
@@ -44,30 +43,29 @@ PROTOCOLS = {1: "smooth bodies, F0 .03–.26", 2: "rough bodies, F0 as it is met
 
 @dataclass(frozen=True)
 class Case:
-    """One picture of the evaluation; camera frame."""
+    """One simulated picture of the evaluation with its truth; camera frame."""
 
     name: str  # mesh and material
     cues: Cues  # with the camera errors of CONDITIONS
     clean: Cues  # without camera errors, in the same light
     small: Cues  # `cues` binned to about the size of training pictures
     truth: SurfaceMaps
-    depth: Floats  # (H, W) units of traced_views.depth_unit, mean 0
+    depth: Floats  # (H, W) true depth, units of traced_views.depth_unit, mean 0
 
 
 @dataclass(frozen=True)
 class _Subject:
-    """Geometry and material of a picture, before any light."""
+    """Geometry and material of an evaluation picture, before light is simulated."""
 
-    name: str
     pose: light_transport.Pose
-    buffer: GBuffer
     places: light_transport.SurfacePoints
     albedo: light_transport.Albedo
-    unit: tuple[float, float]  # middle depth and unit of relative depth
+    truth: SurfaceMaps
+    depth: Floats  # of the truth
 
 
 class Protocol:
-    """All pictures of one size and protocol."""
+    """All evaluation pictures of one size and protocol."""
 
     def __init__(self, data: Path, size: int, protocol: int = 1) -> None:
         files = sorted((data / "meshes" / "test").glob("*.npz"))
@@ -77,45 +75,42 @@ class Protocol:
             )
         self.size, self.protocol = size, protocol
         self.names = [file.stem for file in files]
-        self.meshes = [centred(traced_views.read_mesh(file)) for file in files]
-        self.scenes = [light_transport.MeshScene(mesh) for mesh in self.meshes]
-        self.tracers = [Tracer(mesh) for mesh in self.meshes]
-        self.materials = evaluation_materials.test_materials(data / "materials" / "test", met=protocol == 2)
+        self.tracers = [Tracer(centred(traced_views.read_mesh(file))) for file in files]
+        self.materials = evaluation_materials.test_materials(data / "materials" / "test", everyday=protocol == 2)
 
     def case(self, number: int) -> Case:
         """Simulate picture `number`."""
-        subject = self._subject(number, self.size)
-        buffer, places = subject.buffer, subject.places
-        mesh, _ = combination(number)
+        subject, (mesh, material) = self._subject(number, self.size), combination(number)
         rng = np.random.default_rng([_SEED, number, 1])
-        light = light_transport.stokes(self.scenes[mesh], places, subject.pose, subject.albedo, rng)
+        light = light_transport.stokes(self.tracers[mesh], subject.places, subject.pose, subject.albedo, rng)
         with torch.random.fork_rng():
             torch.manual_seed(_SEED + number)
-            one = torch.ones(1)
-            stated = _photograph(light, places, buffer.view, CameraErrors.stated(1, one.device))
-            clean = _photograph(light, places, buffer.view, CameraErrors.none(1, one.device))
+            stated, clean = (
+                _photograph(light, subject.places, subject.truth.view, errors(1, torch.device("cpu")))
+                for errors in (CameraErrors.stated, CameraErrors.none)
+            )
         return Case(
-            name=subject.name,
+            name=f"{self.names[mesh]}, {self.materials[material].name}",
             cues=cues.compute(stated, white()),
             clean=cues.compute(clean, white()),
             small=cues.compute(_bin(stated, max(1, round(self.size / _REDUCED))), white()),
-            truth=_truth(subject),
-            depth=_relative_depth(subject),
+            truth=subject.truth,
+            depth=subject.depth,
         )
 
     def truth(self, number: int, size: int) -> SurfaceMaps:
         """True maps of a picture, without simulating light."""
-        return _truth(self._subject(number, size))
+        return self._subject(number, size).truth
 
     def _subject(self, number: int, size: int) -> _Subject:
         index, which = combination(number)
-        mesh, material = self.meshes[index], self.materials[which]
+        tracer, material = self.tracers[index], self.materials[which]
         rng = np.random.default_rng([_SEED, number])
+        focal = size / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))
+        view = View(focal=float(focal), center=((size - 1) / 2, (size - 1) / 2), scale=1.0)
         while True:
-            turn, translation = _random_placement(mesh, rng)
-            focal = size / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))
-            view = View(focal=float(focal), center=((size - 1) / 2, (size - 1) / 2), scale=1.0)
-            buffer = self.tracers[index].trace(turn, translation, view, size, size)
+            turn, translation = _random_placement(tracer.mesh, rng)
+            buffer = tracer.trace(turn, translation, view, size, size)
             if buffer.mask.mean() > traced_views.LEAST_SHARE:
                 break
         inside = buffer.mask
@@ -132,12 +127,21 @@ class Protocol:
         sample, slope = material.at(*pattern), material.slope(*pattern) @ frame @ turn.T
         tilted = frames.to_ray_frame(normal - slope + np.sum(slope * normal, axis=1, keepdims=True) * normal, v)
         tilted = np.asarray(frames.lifted(tilted))
-        _, flat = self.scenes[index].facing(position + 0.01 * (v @ turn), -v @ turn)
+        _, flat = tracer.facing(position + 0.01 * (v @ turn), -v @ turn)
+        law = body_law(number) if self.protocol == 2 else SMOOTH
         places = light_transport.SurfacePoints(
-            inside, position, flat, tilted, v, sample.diffuse, sample.specular, sample.roughness, material.ior,
-            body_law(number) if self.protocol == 2 else SMOOTH,
+            inside, position, flat, tilted, v, sample.diffuse, sample.specular, sample.roughness, material.ior, law
+        )
+        normal, diffuse, specular, roughness, depth = (
+            traced_views.fill(inside, values)
+            for values in (
+                np.asarray(frames.from_ray_frame(tilted, v)), sample.diffuse, sample.specular, sample.roughness,
+                (buffer.depth[inside] - middle) / unit,
+            )
         )  # fmt: skip
-        return _Subject(f"{self.names[index]}, {material.name}", pose, buffer, places, albedo, (middle, unit))
+        confidence = np.zeros(inside.shape, np.float32)
+        truth = SurfaceMaps(normal, diffuse, specular, roughness, depth, confidence, inside, view, "truth")
+        return _Subject(pose, places, albedo, truth, depth)
 
 
 def combination(number: int) -> tuple[int, int]:
@@ -192,54 +196,33 @@ def _random_placement(mesh: Triangles, rng: np.random.Generator) -> tuple[Floats
 
 
 def _photograph(light: Floats, places: light_transport.SurfacePoints, view: View, errors: CameraErrors) -> StokesImage:
-    """Measurement of Stokes parameters (3, M, 3) by a camera with these errors."""
+    """Measure Stokes parameters (3, M, 3) with a camera that has these errors."""
     mask = places.mask
     at = np.flatnonzero(mask)
-    scene = torch.from_numpy(np.stack([traced_views.fill(mask, part)[None] for part in light]))
-    diffuse, inside, rays = (
-        torch.from_numpy(image)[None]
-        for image in (traced_views.fill(mask, places.diffuse), mask, frames.rays(view, *mask.shape))
-    )
-    measured = photograph(scene, diffuse, inside, rays, torch.from_numpy(at), errors)
+    images = np.stack([traced_views.fill(mask, part) for part in light]), traced_views.fill(mask, places.diffuse)
+    scene, diffuse = (torch.from_numpy(image) for image in images)
+    inside, rays = (torch.from_numpy(image)[None] for image in (mask, frames.rays(view, *mask.shape)))
+    measured = photograph(scene[:, None], diffuse[None], inside, rays, torch.from_numpy(at), errors)
     return stokes_image(measured, at, mask, view)
 
 
 def _bin(image: StokesImage, by: int) -> StokesImage:
-    """Means over by × by pixels of the object; a bin is part of the object if half of it is."""
-    height, width = (side // by for side in image.mask.shape)
-
-    def summed(value: Floats) -> Floats:  # the last two axes of pixels
-        cut = value[..., : height * by, : width * by].reshape(*value.shape[:-2], height, by, width, by)
-        return np.asarray(cut.sum(axis=(-3, -1)))
-
+    """Picture with fewer pixels: means over by × by pixels. A new pixel is on the object if half of its pixels are."""
     inside = image.mask.astype(np.float32)
-    count = summed(inside)
-    mask, share = count * 2 >= by * by, np.maximum(count, 1)
-    stokes, covariance = (
-        np.moveaxis(summed(np.moveaxis(value * inside[..., None], -1, 1)) / share**power * mask, 1, -1)
-        for value, power in ((image.stokes, 1), (image.covariance, 2))
-    )
-    clipped = summed(((image.quality & Quality.CLIPPED) > 0) * inside) * 2 > share
+    share = resize.block_means(inside, by)
+    mask, least = share >= 0.5, np.maximum(share, 1 / by**2)[..., None]
+
+    def object_means(layers: Floats) -> Floats:
+        return np.asarray([resize.block_means(layer * inside[..., None], by) / least for layer in layers])
+
+    stokes, covariance = object_means(image.stokes), object_means(image.covariance) / (least * by**2)
+    clipped = resize.block_means(((image.quality & Quality.CLIPPED) > 0) * inside, by) * 2 > share
     view = replace(
         image.view, focal=image.view.focal / by, scale=by,
         center=((image.view.center[0] + 0.5) / by - 0.5, (image.view.center[1] + 0.5) / by - 0.5),
     )  # fmt: skip
-    return StokesImage(stokes, covariance, clipped.astype(np.uint8) * np.uint8(Quality.CLIPPED), mask, view, None)
-
-
-def _truth(subject: _Subject) -> SurfaceMaps:
-    places, mask = subject.places, subject.places.mask
-    image = partial(traced_views.fill, mask)
-    return SurfaceMaps(
-        normal=image(frames.from_ray_frame(places.normal, places.rays)), diffuse=image(places.diffuse),
-        specular=image(places.specular), roughness=image(places.roughness), depth_prior=_relative_depth(subject),
-        confidence=np.zeros(mask.shape, np.float32), mask=mask, view=subject.buffer.view, estimator="truth",
-    )  # fmt: skip
-
-
-def _relative_depth(subject: _Subject) -> Floats:
-    middle, unit = subject.unit
-    return np.where(subject.places.mask, (subject.buffer.depth - middle) / unit, 0).astype(np.float32)
+    quality = clipped.astype(np.uint8) * np.uint8(Quality.CLIPPED)
+    return StokesImage(stokes * mask[..., None], covariance * mask[..., None], quality, mask, view, None)
 
 
 def white() -> ColorCalibration:

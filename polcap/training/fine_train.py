@@ -40,7 +40,7 @@ _NORMAL, _COUNT = fine.CHANNELS.index("normal_x"), len(fine.CHANNELS)
 
 
 def main(data: Path, model: Path, out: Path, minutes: float) -> None:
-    """Make the missing pictures, train for `minutes`, export."""
+    """Train the refinement network: make the missing pictures, train for `minutes`, export."""
     torch.set_num_threads(1)
     files = [out / "pictures" / f"{number:05d}.npy" for number in range(_PICTURES)]
     if not all(file.exists() for file in files):
@@ -128,7 +128,7 @@ class FineTraining(loop.PictureTraining):
 
 @cache
 def load_example(file: Path) -> NDArray[np.float16]:
-    """A picture's channels, its target relief (3 channels) and the mask of known relief (1 channel)."""
+    """Read a picture file: the network's input channels, the target relief (3), the mask of known relief (1)."""
     picture = np.load(file)
     channels = picture[:_COUNT].astype(np.float32)
     truth, known = picture[_COUNT : _COUNT + 3].astype(np.float32), picture[-1] > 0
@@ -138,7 +138,7 @@ def load_example(file: Path) -> NDArray[np.float16]:
 
 
 def cut_tile(picture: NDArray[np.float16], rng: np.random.Generator) -> Floats:
-    """A square (C, 96, 96) about a random pixel of the object, rotated and mirrored at random."""
+    """Cut a training tile (C, 96, 96) about a random pixel of the object, rotated and mirrored at random."""
     inside = np.flatnonzero(picture[-1])
     y, x = divmod(int(inside[rng.integers(len(inside))]), picture.shape[2])
     half = _TILE // 2
@@ -150,7 +150,7 @@ def cut_tile(picture: NDArray[np.float16], rng: np.random.Generator) -> Floats:
 
 
 def rotate(picture: Floats, quarters: int, mirror: bool) -> Floats:
-    """The picture of a scene mirrored left to right, then turned counter-clockwise by quarter turns.
+    """Mirror a scene left to right, then turn it counter-clockwise by quarter turns.
 
     Pixels (C, H, W) move, and so do the vectors and doubled angles in the channels.
     """

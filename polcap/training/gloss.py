@@ -39,7 +39,7 @@ FAMILIES = {
     "fibrous": GlossFamily(0.08, (0.65, 1.00), 0.00, dolp_factor=(0.3, 0.9), grain=1.0),  # cloth, felt, unsized paper
     "dark gloss": GlossFamily(0.05, (0.05, 0.30), 0.00, dark=True),  # black plastic, lacquer, leather, dark glaze
 }
-_ALL_DARK = 0.10  # share of objects that are dark gloss everywhere; other objects may have dark parts
+ALL_DARK = 0.10  # share of objects that are dark gloss everywhere; other objects may have dark parts
 _DARK = (0.01, 0.06)  # albedo
 _F0, _F0_SPREAD = 0.042, 0.13  # median and 1σ of the logarithm for common dielectrics, n = 1.45–1.58
 _TAIL = (0.055, 1.5)  # least F0, and the logarithm of the greatest one over it; small ones are more frequent
@@ -50,7 +50,7 @@ _TRANSLUCENT = 0.08  # of rough interfaces, and so depolarized
 
 @dataclass(frozen=True)
 class Gloss:
-    """Gloss of surfaces; all fields have one shape."""
+    """Random gloss of training surfaces; all fields have one shape."""
 
     roughness: Tensor
     f0: Tensor
@@ -59,24 +59,19 @@ class Gloss:
     dark: Tensor  # bool
 
 
-def dark_objects(count: int, device: torch.device) -> Tensor:
-    """Draw which of `count` objects are dark gloss everywhere, (B,) bool."""
-    return torch.rand(count, device=device) < _ALL_DARK
-
-
 def dark_albedo(shape: tuple[int, ...], device: torch.device) -> Tensor:
-    """Draw albedos of dark gloss, (*shape, 3): nearly gray."""
+    """Draw nearly gray, dark albedos (*shape, 3), as of black plastic or lacquer."""
     low, high = _DARK
     value = low * (high / low) ** torch.rand((*shape, 1), device=device)
     return value * torch.exp(0.15 * torch.randn((*shape, 3), device=device))
 
 
-def draw_gloss(shape: tuple[int, ...], device: torch.device, all_dark: Tensor | None = None) -> Gloss:
+def draw_gloss(all_dark: Tensor, shape: tuple[int, ...]) -> Gloss:
     """Draw a family for each surface, and its gloss; `all_dark` (bool, broadcast to the shape) forces dark gloss."""
+    device = all_dark.device
     share = torch.tensor([family.share for family in FAMILIES.values()], device=device)
     which = torch.multinomial(share, torch.Size(shape).numel(), replacement=True).reshape(shape)
-    if all_dark is not None:
-        which = torch.where(all_dark, list(FAMILIES).index("dark gloss"), which)
+    which = torch.where(all_dark, list(FAMILIES).index("dark gloss"), which)
 
     def u() -> Tensor:
         return torch.rand(shape, device=device)

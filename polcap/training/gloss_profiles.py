@@ -34,7 +34,7 @@ class GlossEvidence:
 
 
 class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """Features and evidence of each place -> the readings of its groups (B, outputs, H, W)."""
+    """Network part that reads gloss (B, outputs, H, W) from profiles of light against zenith, one per group."""
 
     def __init__(self, coarse: int, fine: int, outputs: int) -> None:
         super().__init__()
@@ -58,7 +58,7 @@ class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types he
 
 
 def figures_of(level: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) -> Tensor:
-    """The five quantities that profiles average, (B, 5, H, W).
+    """The five quantities (B, 5, H, W) that gloss profiles average.
 
     Log of light / shading; log of light / diffuse light; its square; its square as a factor; missing share of the DoLP
     of diffuse light.

@@ -11,15 +11,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from polcap.images import Floats
 from polcap.optics import brdf, frames, fresnel, shade
 from polcap.optics.body import SMOOTH, Law
 from polcap.optics.namespace import array_namespace
-from polcap.synth.mesh_tracer import Triangles
+from polcap.synth.mesh_tracer import Tracer
 
 LIFT = 1e-3  # longest sides of the mesh, from the surface to the start of a ray; nearer hits are the place itself
 _HEMISPHERE_RAYS, _MIRROR_RAYS = 12, 6  # per place: over the hemisphere, and about the mirror direction
@@ -31,7 +29,7 @@ Albedo = Callable[[Floats, Floats], Floats]  # places, facing directions (M, 3) 
 
 @dataclass(frozen=True)
 class Pose:
-    """Position of mesh and flash: camera = rotation @ vertex + translation."""
+    """Position of mesh and flash in the camera frame: point = rotation @ vertex + translation."""
 
     rotation: Floats  # (3, 3)
     translation: Floats  # (3,)
@@ -55,72 +53,45 @@ class SurfacePoints:
     law: Law = SMOOTH
 
     def take(self, which: Indices) -> "SurfacePoints":
-        """The points `which`; mask, ior and law stay."""
+        """Select the points `which`; mask, ior and law do not change."""
         taken = {name: value[which] for name, value in vars(self).items() if name not in ("mask", "ior", "law")}
         return replace(self, **taken)
 
 
-class MeshScene:
-    """A mesh prepared for tracing rays."""
-
-    def __init__(self, mesh: Triangles) -> None:
-        self.scene = EmbreeScene()
-        self.size = float(np.ptp(mesh.vertices, axis=0).max())
-        TriangleMesh(self.scene, mesh.vertices, mesh.faces)
-        corner = mesh.vertices[mesh.faces].astype(np.float64)
-        flat = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        self.flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
-
-    def facing(self, origin: Floats, direction: Floats) -> tuple[Floats, Floats]:
-        """First hits of rays (M, 3): distance (M,), infinite for none, and the triangle's normal towards the origin."""
-        start, way = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, direction))
-        hit = self.scene.run(start, way, query="INTERSECT", output=True)
-        struck = hit["primID"] >= 0
-        normal = self.flat[np.where(struck, hit["primID"], 0)]
-        normal = np.where(np.sum(normal * direction, axis=1, keepdims=True) > 0, -normal, normal)
-        return np.where(struck, hit["tfar"], np.inf), normal
-
-    def lit(self, place: Floats, flat: Floats, pose: Pose) -> tuple[Floats, Floats]:
-        """Unit vectors to the flash (M, 3), mesh frame, and S0 of a white plane that faces it (M,), 0 in shadow."""
-        to_flash = (pose.flash - pose.translation) @ pose.rotation - place
-        far = np.linalg.norm(to_flash, axis=1)
-        to_flash = to_flash / far[:, None]
-        start = place + LIFT * self.size * flat
-        ray = (np.ascontiguousarray(a, dtype=np.float32) for a in (start, to_flash, far - LIFT * self.size))
-        hidden = self.scene.run(*ray, query="OCCLUDED") >= 0
-        return to_flash, np.where(hidden, 0, pose.strength / far**2)
+def flash_light(tracer: Tracer, place: Floats, flat: Floats, pose: Pose) -> tuple[Floats, Floats]:
+    """Unit vectors to the flash (M, 3), mesh frame, and S0 of a white plane that faces it (M,), 0 in shadow."""
+    flash = (pose.flash - pose.translation) @ pose.rotation
+    far = np.linalg.norm(flash - place, axis=1)
+    to_flash, lift = (flash - place) / far[:, None], LIFT * tracer.size
+    start = place + lift * flat
+    hidden = tracer.hidden(start, start + to_flash * (far - lift)[:, None])
+    return to_flash, np.where(hidden, 0, pose.strength / far**2)
 
 
-def stokes(scene: MeshScene, places: SurfacePoints, pose: Pose, albedo: Albedo, rng: np.random.Generator) -> Floats:
-    """Stokes parameters (3, M, 3) of the visible pixels, in the frame of each ray."""
-    to_flash, irradiance = scene.lit(places.position, places.flat, pose)
+def stokes(tracer: Tracer, places: SurfacePoints, pose: Pose, albedo: Albedo, rng: np.random.Generator) -> Floats:
+    """Stokes parameters (3, M, 3) of a mesh under the flash, with shadows and one bounce, in the frame of each ray."""
+    to_flash, irradiance = flash_light(tracer, places.position, places.flat, pose)
     toward = frames.to_ray_frame(to_flash @ pose.rotation.T, places.rays)
-    direct = _shade(places, places.diffuse, places.specular, toward, irradiance)
-    indirect = IndirectLight(scene, places, pose, albedo)
+    direct = _shade(places, places.diffuse, places.specular, places.ior, toward, irradiance)
+    indirect = IndirectLight(tracer, places, pose, albedo)
     return np.asarray(direct + indirect.diffuse(rng) + indirect.mirrored(rng))
 
 
 def _shade(
-    places: SurfacePoints,
-    diffuse: Floats,
-    specular: Floats,
-    toward: Floats,
-    irradiance: Floats,
-    ior: Floats | None = None,
+    places: SurfacePoints, diffuse: Floats, specular: Floats, ior: Floats | float, toward: Floats, irradiance: Floats
 ) -> Floats:
-    index = np.full(len(toward), places.ior) if ior is None else ior
-    lit = places.roughness, index, toward, irradiance
+    lit = places.roughness, np.broadcast_to(ior, irradiance.shape), toward, irradiance
     return np.asarray(shade.stokes(places.normal, diffuse, specular, *lit, places.law))
 
 
 class IndirectLight:
-    """Light at the places from other parts of the mesh."""
+    """Flash light that reaches visible places of a mesh by one bounce on its other parts."""
 
-    def __init__(self, scene: MeshScene, places: SurfacePoints, pose: Pose, albedo: Albedo) -> None:
-        self.scene, self.places, self.pose, self.albedo = scene, places, pose, albedo
+    def __init__(self, tracer: Tracer, places: SurfacePoints, pose: Pose, albedo: Albedo) -> None:
+        self.tracer, self.places, self.pose, self.albedo = tracer, places, pose, albedo
 
     def diffuse(self, rng: np.random.Generator) -> Floats:
-        """Diffuse reflection (3, M, 3): irradiance by rays over the hemisphere, distributed by their cosine."""
+        """Bounced light that is reflected diffusely (3, M, 3), from rays over the hemisphere, cosine-distributed."""
         places, count = self.places, len(self.places.normal)
         turn = rng.uniform(0, 1, (count, 2))
         received: Floats = np.zeros((count, 3))
@@ -133,10 +104,10 @@ class IndirectLight:
         received = self.smooth(received / (_HEMISPHERE_RAYS * entered))
         # shaded as light along the normal, of which the share `entered` passes the surface
         one = np.ones(count)
-        return _shade(places, places.diffuse * received, 0 * places.specular, places.normal, one)
+        return _shade(places, places.diffuse * received, 0 * places.specular, places.ior, places.normal, one)
 
     def mirrored(self, rng: np.random.Generator) -> Floats:
-        """Mirror reflection (3, M, 3) by facets drawn from the GGX distribution.
+        """Bounced light that is mirrored (3, M, 3), by facets drawn from the GGX distribution.
 
         Facets have an index of their own, `facet_ior`, for the F0 of the material. A scaled Fresnel curve of the body's
         index would reflect more than 100 % at grazing angles.
@@ -155,21 +126,20 @@ class IndirectLight:
             met, incoming = self.light(way, np.flatnonzero(possible))
             density = pi * brdf.ggx_distribution(cos_h[met], alpha[met]) * cos_h[met] / (4 * cos_d[met])
             irradiance = 1 / np.maximum(density * _MIRROR_RAYS, 1e-9)
-            total[:, met] += _shade(
-                places.take(met), 0 * incoming, places.specular[met] * incoming, way[met], irradiance, ior[met]
-            )
+            reflected = places.specular[met] * incoming
+            total[:, met] += _shade(places.take(met), 0 * incoming, reflected, ior[met], way[met], irradiance)
         return np.stack([self.smooth(part) for part in total])
 
     def light(self, way: Floats, which: Indices) -> tuple[Indices, Floats]:
-        """Places among `which` that see another one along `way` (M, 3; rays' frames), and the S0 (·, 3) of that one."""
-        scene, places, pose = self.scene, self.places, self.pose
+        """Places among `which` that see the mesh along `way` (M, 3; rays' frames), and S0 (·, 3) of the seen point."""
+        tracer, places, pose = self.tracer, self.places, self.pose
         direction = frames.from_ray_frame(way[which], places.rays[which]) @ pose.rotation
-        origin = (places.position + LIFT * scene.size * places.flat)[which]
-        distance, flat = scene.facing(origin, direction)
-        met = np.flatnonzero(np.isfinite(distance) & (distance > LIFT * scene.size))
+        origin = (places.position + LIFT * tracer.size * places.flat)[which]
+        distance, flat = tracer.facing(origin, direction)
+        met = np.flatnonzero(np.isfinite(distance) & (distance > LIFT * tracer.size))
         origin, direction, distance, flat = origin[met], direction[met], distance[met, None], flat[met]
         there = origin + distance * direction
-        to_flash, irradiance = scene.lit(there, flat, pose)
+        to_flash, irradiance = flash_light(tracer, there, flat, pose)
         cos_i = np.clip(np.sum(to_flash * flat, axis=1), 1e-3, 1)
         cos_o = np.clip(-np.sum(direction * flat, axis=1), 1e-2, 1)
         into, out = (fresnel.transmission(c, places.ior)[0] for c in (cos_i, cos_o))

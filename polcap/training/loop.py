@@ -62,10 +62,10 @@ class Trainee(ABC):
 
     @abstractmethod
     def validate(self, out: Path) -> dict[str, float]:
-        """Errors on held-out pictures; may write example pictures to `out`."""
+        """Errors of the averaged weights on held-out pictures; may write example pictures to `out`."""
 
     def facts(self) -> dict[str, Any]:
-        """Further entries of the checkpoint."""
+        """Further entries of the checkpoint file."""
         return {}
 
     def update(self, progress: float) -> float:
@@ -95,7 +95,7 @@ class Trainee(ABC):
             torch.save(state | self.facts(), temporary)
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from the content of a checkpoint."""
+        """Set weights, optimizers and progress from the content of a checkpoint."""
         self.network.load_state_dict(state["network"])
         self.average.load_state_dict(state["average"])
         for optimizer, saved in zip(self.optimizers, state["optimizers"]):
@@ -132,7 +132,7 @@ class PictureTraining(Trainee):
         run(self, self.draw, Budget(minutes), out)
 
     def draw(self) -> list[Path]:
-        """Picture files of a step."""
+        """Draw the picture files of a training step."""
         return [self.files[n] for n in self.random.integers(self.held_out, len(self.files), self.per_step)]
 
     def export(self, path: Path) -> None:

@@ -25,7 +25,7 @@ _FLAT = 0.2  # mean tangential part of the normals below which a region has no c
 def total(
     maps: dict[str, Tensor], truth: Batch, random: torch.Generator | None, *, polarized: bool = True
 ) -> tuple[Tensor, dict[str, float]]:
-    """Weighted sum of all parts, and each part as a number; maps and truth (B, ·, H, W). `random` draws the lights."""
+    """Loss of estimated maps (B, ·, H, W), and its parts as numbers. `random` draws the lights of renderings."""
     mask = truth.mask
     inside = mask[:, None].float()
     area = inside.sum().clamp(min=1)
@@ -53,7 +53,7 @@ def total(
 
 
 def _region(estimate: Tensor, truth: Tensor, inside: Tensor) -> Tensor:
-    """Cost of regions with a common error of azimuth, which cost no more than scattered errors pixel by pixel.
+    """Loss of regions with a common error of azimuth; a loss per pixel counts it like scattered errors.
 
     For blocks of 8, 16 and 32 px: 1 − cosine between the mean tangential parts of estimate and truth, times the length
     of the truth's. Parts shorter than `_FLAT` are not scaled to unit length, so that the estimate can turn through 0.

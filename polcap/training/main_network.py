@@ -41,7 +41,7 @@ COLOR = slice(CHANNELS.index("log_r"), CHANNELS.index("log_b") + 1)
 
 @dataclass(frozen=True)
 class NetworkShape:
-    """Channels per level, from half resolution down."""
+    """Width of the main network: channels per level, from half resolution down."""
 
     encoder: tuple[int, ...] = (32, 64, 128, 192, 256)
     geometry: tuple[int, ...] = (32, 64, 96, 128)  # decoders
@@ -121,7 +121,7 @@ class MainNetwork(nn.Module):  # type: ignore[misc]  # torch comes without types
 
 
 def run(network: nn.Module, channels: Tensor) -> dict[str, Tensor]:
-    """Maps of a network, computed in the machine's fastest number type."""
+    """Run the main network on channels (B, N, H, W) in the machine's fastest number type."""
     kind = channels.device.type
     half = muon.compute_type(channels.device) == torch.bfloat16
     with torch.autocast(kind, torch.bfloat16, enabled=half, cache_enabled=False):  # threads would share the cache
@@ -188,14 +188,9 @@ class Decoder(nn.Module):  # type: ignore[misc]  # torch comes without types her
     """Decoder from the coarsest level to full resolution; `hints` more input channels reach every level."""
 
     def __init__(
-        self,
-        encoder: tuple[int, ...],
-        widths: tuple[int, ...],
-        blocks: int,
-        skip_blocks: int,
-        outputs: int,
+        self, encoder: tuple[int, ...], widths: tuple[int, ...], blocks: int, skip_blocks: int, outputs: int,
         hints: int = 0,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__()
         coarse = (*widths[1:], encoder[-1])  # channels from the next coarser level
         self.up = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in zip(coarse, widths))

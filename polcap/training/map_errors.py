@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from polcap.images import Floats, Quality, SurfaceMaps
+from polcap.images import Bools, Floats, Quality, SurfaceMaps
 from polcap.optics import frames, shade
 from polcap.stages import surface
 from polcap.training.evaluation_protocol import Case, render_lights
@@ -19,24 +18,22 @@ _FLASH = np.array([0.0, 0.0, 1.0])  # direction to the light that defines white
 _MIN_CLIPPED = 10  # clipped pixels needed for an error in highlights
 
 Score = dict[str, float]
-Bools = NDArray[np.bool_]
 
 
 class Judge:
-    """Measures errors of estimates of one picture."""
+    """Measures the errors of estimated maps of one evaluation picture."""
 
     def __init__(self, case: Case) -> None:
         self.case, self.mask = case, case.truth.mask
         self.core = cv2.erode(self.mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-        clipped = self.mask & ((case.cues.quality & Quality.CLIPPED) > 0)
-        self.clipped = clipped if clipped.sum() >= _MIN_CLIPPED else None
+        self.clipped = self.mask & ((case.cues.quality & Quality.CLIPPED) > 0)
         self.rendered_mask = np.zeros_like(self.mask)
         self.rendered_mask.flat[np.flatnonzero(self.mask)[:: -(-int(self.mask.sum()) // _MAX_PIXELS)]] = True
         self.white = float(np.percentile(render_intensity(case.truth, case, self.rendered_mask, _FLASH), 99))
-        self.rendered = self._rendered(case.truth)
+        self.rendered = self._render(case.truth)
 
     def score(self, maps: SurfaceMaps) -> Score:
-        """RMSE unless the name differs; angles in degrees, shares of pixels 0…1. `·_core`: mask eroded by 2 px.
+        """Errors of all maps: RMSE unless the name differs; degrees; shares 0…1. `·_core`: mask eroded by 2 px.
 
         `·_picture`: over the whole square picture, with zero error outside the object. depth: both centred in the mask,
         in units of the truth's range; `depth_fitted`: after the best scale and shift. diffuse_clipped: where all
@@ -49,40 +46,36 @@ class Judge:
             out[f"normal_median{suffix}"] = float(np.median(error[inside]))
             for limit in (11.25, 22.5, 30.0):
                 out[f"normal_within_{limit:g}{suffix}"] = float((error[inside] < limit).mean())
-        for name in MAPS:
-            difference = (getattr(maps, name) - getattr(case.truth, name))[mask]
-            out |= self._counted(name, difference)
-        if self.clipped is not None:
+        share = float(mask.mean())
+        differences = {name: (getattr(maps, name) - getattr(case.truth, name))[mask] for name in MAPS}
+        for name, difference in (differences | {"rendering": self._render(maps) - self.rendered}).items():
+            rmse, l1 = _rmse(difference), float(np.abs(difference).mean())
+            out |= {name: rmse, f"{name}_l1": l1}
+            out |= {f"{name}_picture": rmse * share**0.5, f"{name}_l1_picture": l1 * share}
+        if self.clipped.sum() >= _MIN_CLIPPED:
             out["diffuse_clipped"] = _rmse((maps.diffuse - case.truth.diffuse)[self.clipped])
         if maps.depth_prior is not None:
             out |= _depth(maps.depth_prior[mask], case.depth[mask])
-        difference = self._rendered(maps) - self.rendered
-        return out | self._counted("rendering", difference)
-
-    def _counted(self, name: str, difference: Floats) -> Score:
-        """RMSE and L1, over the object and over the picture."""
-        rmse, l1, share = _rmse(difference), float(np.abs(difference).mean()), float(self.mask.mean())
-        return {
-            name: rmse, f"{name}_l1": l1, f"{name}_picture": rmse * share**0.5, f"{name}_l1_picture": l1 * share,
-        }  # fmt: skip
+        return out
 
     def integrated(self, maps: SurfaceMaps) -> Score:
-        """depth_integrated: error of the depth that stage 9 integrates from the maps, on every n-th pixel."""
+        """`depth_integrated`: error of depth integrated from the maps by the stage `surface`, on every n-th pixel."""
         by = max(1, round(max(self.mask.shape) / _INTEGRATED))
-        thin = _thinned(maps, by)
-        mask = thin.mask & self.mask[::by, ::by]
-        depth = surface.integrate(replace(thin, mask=mask), None, surface.SurfaceSettings()).depth[mask]
-        unit = float(depth.mean() * np.sqrt(mask.sum() / np.pi) / thin.view.focal)
-        return {"depth_integrated": _depth(depth / unit, self.case.depth[::by, ::by][mask])["depth"]}
+        thin = np.s_[::by, ::by]
+        mask, (x, y) = (maps.mask & self.mask)[thin], maps.view.center
+        images = {name: getattr(maps, name)[thin] for name in (*MAPS, "normal", "confidence")}
+        thinned = replace(
+            maps, **images, mask=mask, depth_prior=None if maps.depth_prior is None else maps.depth_prior[thin],
+            view=replace(maps.view, focal=maps.view.focal / by, center=(x / by, y / by), scale=maps.view.scale * by),
+        )  # fmt: skip
+        depth = surface.integrate(thinned, None, surface.SurfaceSettings()).depth[mask]
+        unit = float(depth.mean() * np.sqrt(mask.sum() / np.pi) / thinned.view.focal)
+        return {"depth_integrated": _depth(depth / unit, self.case.depth[thin][mask])["depth"]}
 
-    def _rendered(self, maps: SurfaceMaps) -> Floats:
+    def _render(self, maps: SurfaceMaps) -> Floats:
         """S0 (20, M, 3) under 20 lights, clipped to 0…1; 1: 99th percentile of the truth under the flash."""
-        return np.stack(
-            [
-                np.clip(render_intensity(maps, self.case, self.rendered_mask, light) / self.white, 0, 1)
-                for light in render_lights()
-            ]
-        )
+        images = [render_intensity(maps, self.case, self.rendered_mask, light) for light in render_lights()]
+        return np.asarray(np.clip(np.stack(images) / self.white, 0, 1))
 
 
 def angle(maps: SurfaceMaps, case: Case) -> Floats:
@@ -93,23 +86,8 @@ def angle(maps: SurfaceMaps, case: Case) -> Floats:
 
 def deciles(predicted: Floats, actual: Floats) -> list[dict[str, float]]:
     """Mean predicted and mean actual normal error of each tenth of the pixels, sorted by predicted error."""
-    order = np.argsort(predicted)
-    return [
-        {"predicted": float(predicted[part].mean()), "actual": float(actual[part].mean())}
-        for part in np.array_split(order, 10)
-    ]
-
-
-def _thinned(maps: SurfaceMaps, by: int) -> SurfaceMaps:
-    """Maps at every by-th pixel of every by-th row."""
-    thin = np.s_[::by, ::by]
-    x, y = maps.view.center
-    return replace(
-        maps, normal=maps.normal[thin], diffuse=maps.diffuse[thin], specular=maps.specular[thin],
-        roughness=maps.roughness[thin], confidence=maps.confidence[thin], mask=maps.mask[thin],
-        depth_prior=None if maps.depth_prior is None else maps.depth_prior[thin],
-        view=replace(maps.view, focal=maps.view.focal / by, center=(x / by, y / by), scale=maps.view.scale * by),
-    )  # fmt: skip
+    parts = np.array_split(np.argsort(predicted), 10)
+    return [{"predicted": float(predicted[part].mean()), "actual": float(actual[part].mean())} for part in parts]
 
 
 def render_intensity(maps: SurfaceMaps, case: Case, mask: Bools, light: Floats) -> Floats:

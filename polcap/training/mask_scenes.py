@@ -16,7 +16,8 @@ from torch import Tensor
 
 from polcap.formats import shipped_data
 from polcap.images import Bools, Floats
-from polcap.optics import frames, shade
+from polcap.optics import frames
+from polcap.optics.body import SMOOTH
 from polcap.stages.mask.mask_channels import ReducedPicture, grid
 from polcap.training import backdrop_patterns, materials
 from polcap.training.mask_views import MaskView, meet_planes
@@ -140,7 +141,7 @@ def _change_materials(
     diffuse, specular, rough, factor = (
         torch.from_numpy(a) for a in (np.clip(diffuse, 0.0, 0.97), np.clip(specular, 0.0, 0.97), rough, factor)
     )
-    return replace(surface, diffuse=diffuse, specular=specular, roughness=rough), factor
+    return replace(surface, diffuse=diffuse, specular=specular, roughness=rough, law=SMOOTH), factor
 
 
 def _log_uniform(low: float, high: float, rng: np.random.Generator) -> float:
@@ -159,13 +160,9 @@ def _light(
     rng: np.random.Generator,
 ) -> Floats:  # fmt: skip
     """Stokes parameters (3, M, 3) under the flash and the weak light from the walls of the room."""
-    to_light = torch.from_numpy(view.flash - place).float()
-    squared = (to_light**2).sum(dim=1)
-    rays = torch.from_numpy(v).float()
-    way = frames.to_ray_frame(to_light / squared.sqrt()[:, None], rays)
-    irradiance = torch.from_numpy(lit) * view.distance**2 / squared
-    normal = frames.lifted(frames.to_ray_frame(surface.normal, rays))
-    stokes = shade.stokes(normal, surface.diffuse, surface.specular, surface.roughness, surface.ior, way, irradiance)
+    rays, to_flash = (torch.from_numpy(a).float() for a in (v, view.flash - place))
+    normal, diffuse, specular = materials.reflect(surface, rays, to_flash, torch.from_numpy(lit) * view.distance**2)
+    stokes = diffuse + specular
     stokes[1:] *= polarizing[None, :, None]
     stokes[0] += _log_uniform(5e-4, 0.08, rng) * surface.diffuse * (0.4 + 0.6 * normal[:, 2:])
     return np.asarray(stokes.numpy(), dtype=np.float32)

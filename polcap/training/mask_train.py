@@ -19,6 +19,7 @@ from torch.nn import functional as F
 
 from polcap.formats import atomic
 from polcap.images import Bools, Floats
+from polcap.optics.resize import area_mean, block_means
 from polcap.stages.mask.mask_channels import CHANNELS, ENCODING, SIZE_MULTIPLE, ReducedPicture, brightness, encode
 from polcap.synth.mesh_tracer import Tracer, Triangles, centred
 from polcap.training import loop, mask_scenes, mask_views, materials, random_shapes, traced_views, unet
@@ -36,7 +37,7 @@ _INSERTED = 0.12  # share of pictures into which the object of another one is in
 
 
 def main(data: Path, out: Path, minutes: float) -> None:
-    """Make the missing pictures, train for `minutes`, export."""
+    """Train the mask's network: make the missing pictures, train for `minutes`, export."""
     torch.set_num_threads(1)
     make_pictures(out / "pictures", data, _PICTURES)
     torch.manual_seed(1)
@@ -91,9 +92,7 @@ def pack(picture: mask_scenes.MaskScene) -> Floats:
     stokes = picture.stokes / max(float(np.percentile(picture.stokes[0].mean(-1), 95)), 1e-9)
     sums = np.moveaxis(stokes[1:].sum(-1), 0, -1)
     whole = np.concatenate([stokes[0], sums, picture.mask[..., None], picture.chart[..., None]], axis=-1)
-    height, width, count = whole.shape
-    blocks = np.clip(whole, -6e4, 6e4).reshape(height // 2, 2, width // 2, 2, count)
-    return np.asarray(blocks.mean((1, 3)), np.float16)
+    return block_means(np.clip(whole, -6e4, 6e4), 2).astype(np.float16)
 
 
 def load_varied(file: Path, rng: np.random.Generator, other: Path | None = None) -> tuple[ReducedPicture, Floats]:
@@ -153,7 +152,7 @@ class MaskTraining(loop.PictureTraining):
         super().__init__(unet.mask_network(), rate, files)
 
     def advance(self, batch: list[Path], progress: float) -> dict[str, float]:
-        """Do one step; returns the losses of both passes."""
+        """Do one training step; returns the losses of both passes."""
         rng = self.random
         others = [batch[n - 1] if rng.random() < _INSERTED else None for n in range(len(batch))]
         examples = [load_varied(file, rng, other) for file, other in zip(batch, others)]
@@ -244,8 +243,7 @@ def _map_layers(picture: ReducedPicture, change: Callable[[Floats], Floats]) -> 
 
 def _reduce(image: Floats, width: int) -> Floats:
     """Area means of an image (H, W, ·) at `width` pixels across."""
-    size = width, round(image.shape[0] * width / image.shape[1])
-    return np.asarray(cv2.resize(np.asarray(image, np.float32), size, interpolation=cv2.INTER_AREA))
+    return area_mean(np.asarray(image, np.float32), (round(image.shape[0] * width / image.shape[1]), width))
 
 
 def _stack_channels(channels: list[Floats]) -> Tensor:

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from polcap.formats import scene_files
+from polcap.optics import frames, shade
 from polcap.optics.body import SMOOTH, Law
 from polcap.training import gloss
 
@@ -35,6 +36,19 @@ class Surface:
     roughness: Tensor  # (M,)
     ior: Tensor  # (M,)
     law: Law = SMOOTH  # (M,) diffuse polarization
+
+
+def reflect(surface: Surface, v: Tensor, to_flash: Tensor, strength: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Normals (M, 3) in the frames of rays v, and Stokes parameters (3, M, 3) of diffuse and of specular reflection.
+
+    to_flash (M, 3), camera frame; strength (M,): S0 of a white plane that faces the flash at distance 1.
+    """
+    normal = frames.lifted(frames.to_ray_frame(surface.normal, v))
+    squared = (to_flash * to_flash).sum(dim=1)
+    way = frames.to_ray_frame(to_flash / squared.sqrt()[:, None], v)
+    nothing, lit = torch.zeros_like(surface.specular), (surface.roughness, surface.ior, way, strength / squared)
+    diffuse = shade.stokes(normal, surface.diffuse, nothing, *lit, surface.law)
+    return normal, diffuse, shade.stokes(normal, nothing, surface.specular, *lit)
 
 
 class MaterialLibrary:
@@ -66,21 +80,16 @@ class MaterialLibrary:
 
 
 def draw_surface(
-    library: MaterialLibrary,
-    normal: Tensor,
-    position: Tensor,
-    turn: Tensor,
-    owner: Tensor,
-    count: int,
+    library: MaterialLibrary, normal: Tensor, position: Tensor, turn: Tensor, owner: Tensor, count: int,
     smooth_share: float = gloss.SMOOTH_SHARE,
-) -> Surface:
+) -> Surface:  # fmt: skip
     """Draw a material for each of `count` objects and evaluate it at their pixels.
 
     normal (M, 3) camera frame, position (M, 3) object frame, turn (B, 3, 3) from object to camera, owner (M,) the
     object of each pixel; smooth_share: of objects with a smooth interface (`optics/body.py`).
     """
     device = normal.device
-    frame = _rotations(count, device)  # from object to pattern
+    frame, _ = torch.linalg.qr(torch.randn(count, 3, 3, device=device))  # from object to pattern
     inner = _rotate(frame, position, owner)
     facing = _rotate(frame @ turn.transpose(1, 2), normal, owner)
     regions, fine, printed = (
@@ -115,14 +124,8 @@ def draw_surface(
     slope = _rotate(turn, _rotate(frame.transpose(1, 2), slope, owner), owner)
     along = (slope * normal).sum(dim=1, keepdim=True)
     tilted = normal + own["bump"][:, None] * (slope - along * normal)
-    return Surface(
-        normal=F.normalize(tilted, dim=1),
-        diffuse=diffuse,
-        specular=specular,
-        roughness=rough,
-        ior=own["ior"],
-        law=Law(law.rough, law.local, law.dolp_factor * fibers),
-    )
+    law = Law(law.rough, law.local, law.dolp_factor * fibers)
+    return Surface(F.normalize(tilted, dim=1), diffuse, specular, rough, own["ior"], law)
 
 
 def _albedo(
@@ -165,8 +168,8 @@ def _draw_levels(library: MaterialLibrary, count: int, device: torch.device) -> 
     def normal(deviation: float) -> Tensor:
         return deviation * torch.randn(shape, device=device)
 
-    all_dark = gloss.dark_objects(count, device)[:, None]
-    one, other = (gloss.draw_gloss(shape, device, all_dark) for _ in range(2))
+    all_dark = (_u((count,), device) < gloss.ALL_DARK)[:, None]
+    one, other = (gloss.draw_gloss(all_dark, shape) for _ in range(2))
     two = u(0, 1) < 0.8  # surfaces in one pattern
     similar = u(0, 1) < 0.5  # F0 of the two
     f0_step = torch.where(similar, normal(0.2), torch.log(other.f0 / one.f0))
@@ -238,11 +241,6 @@ def _mirror(x: Tensor) -> Tensor:
 
 def _rotate(matrix: Tensor, vector: Tensor, owner: Tensor) -> Tensor:
     return torch.einsum("mij,mj->mi", matrix[owner], vector)
-
-
-def _rotations(count: int, device: torch.device) -> Tensor:
-    q, _ = torch.linalg.qr(torch.randn(count, 3, 3, device=device))
-    return q
 
 
 def _u(shape: tuple[int, ...], device: torch.device) -> Tensor:

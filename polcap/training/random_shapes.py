@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from polcap.images import Floats
 from polcap.synth.mesh_tracer import Triangles, centred, smooth, union
@@ -46,14 +47,7 @@ def compose_with_branches(rng: np.random.Generator) -> Triangles:
 
 def rotation(rng: np.random.Generator) -> Floats:
     """A uniformly random rotation, (3, 3)."""
-    w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return np.asarray(Rotation.from_quat(np.roll(rng.normal(size=4), -1)).as_matrix())  # scalar last
 
 
 def _displaced(rng: np.random.Generator) -> tuple[Floats, Faces]:
@@ -95,40 +89,30 @@ def _superquadric(rng: np.random.Generator) -> tuple[Floats, Faces]:
     """Superquadric: box, cylinder, ellipsoid, star and shapes between them."""
     unit, faces = _sphere(_RINGS, _SECTORS)
     east, north = np.exp(rng.uniform(np.log(0.12), np.log(2.2), 2))
-    latitude = np.arcsin(np.clip(unit[:, 2], -1, 1))
     longitude = np.arctan2(unit[:, 1], unit[:, 0])
-    ring = _power(np.cos(latitude), north)
-    xyz = [
-        ring * _power(np.cos(longitude), east),
-        ring * _power(np.sin(longitude), east),
-        _power(unit[:, 2], north),
-    ]
-    return 0.5 * np.stack(xyz, axis=1) * rng.uniform(0.25, 1.0, 3), faces
+    circle = np.stack([np.cos(longitude), np.sin(longitude)], axis=1)
+    ring = np.maximum(1 - unit[:, 2:] ** 2, 0) ** (north / 2)
+    heights = _power(unit[:, 2:], north)
+    return 0.5 * np.hstack([ring * _power(circle, east), heights]) * rng.uniform(0.25, 1.0, 3), faces
 
 
 def _lathed(rng: np.random.Generator) -> tuple[Floats, Faces]:
     """Solid of revolution, sometimes with lobes or a twist."""
-    unit, faces = _sphere(_RINGS, _SECTORS)
     height = np.linspace(1, -1, _RINGS)
     profile = np.full(_RINGS, rng.uniform(0.3, 0.6))
     for k in range(1, 7):
         profile = profile + rng.normal() * 0.3 / k * np.cos(k * np.pi * (height + 1) / 2 + rng.uniform(0, 6.28))
     profile = np.clip(np.abs(profile), 0.05, 1.2) * (1 - np.abs(height) ** rng.uniform(4, 40)) ** 0.5
-    ring = np.repeat(profile, _SECTORS)
-    longitude = np.arctan2(unit[:, 1], unit[:, 0])
+    ring, longitude = profile[:, None], _longitudes()
     if rng.random() < 0.4:
-        lobes = rng.integers(2, 14) * longitude + rng.uniform(-4, 4) * np.repeat(height, _SECTORS)
+        lobes = rng.integers(2, 14) * longitude + rng.uniform(-4, 4) * height[:, None]
         ring = ring * (1 + rng.uniform(0.02, 0.2) * np.cos(lobes))
-    stretch = rng.uniform(0.4, 1.2)
-    xyz = [ring * np.cos(longitude), ring * np.sin(longitude), stretch * np.repeat(height, _SECTORS)]
-    return 0.45 * np.stack(xyz, axis=1), faces
+    return _revolve(0.45 * ring, 0.45 * rng.uniform(0.4, 1.2) * height), _faces(_RINGS, _SECTORS, closed=False)
 
 
 def _vessel(rng: np.random.Generator) -> tuple[Floats, Faces]:
     """Plate, bowl, cup or vase: an open solid of revolution with a wall and a rim."""
-    unit, faces = _sphere(_RINGS, _SECTORS)
-    outside = _RINGS // 2
-    rise = np.linspace(0, 1, outside)  # from the foot up
+    rise = np.linspace(0, 1, _RINGS // 2)  # from the foot up
     mouth, waist = rng.uniform(0.25, 0.6), rng.normal() * 0.12
     radius = mouth * rise ** rng.uniform(0.15, 0.9) + waist * np.sin(np.pi * rise) * rise
     radius = np.clip(radius + rng.normal() * 0.03 * np.sin(rng.uniform(2, 9) * rise), 0.02, 0.7)
@@ -136,55 +120,37 @@ def _vessel(rng: np.random.Generator) -> tuple[Floats, Faces]:
     wall, tall = rng.uniform(0.01, 0.06), np.exp(rng.uniform(np.log(0.12), np.log(1.3)))
     inner = np.clip(radius[::-1] - wall, 0.0, None)
     height = np.concatenate([rise * tall, np.maximum(rise[::-1] * tall, wall)])
-    ring = np.repeat(np.concatenate([radius, inner]), _SECTORS)
-    around = np.arctan2(unit[:, 1], unit[:, 0])
-    lobes = 1 + (rng.random() < 0.3) * rng.uniform(0, 0.15) * np.cos(rng.integers(3, 13) * around)
-    squash = rng.uniform(0.7, 1.0)
-    xyz = [ring * lobes * np.cos(around), squash * ring * lobes * np.sin(around), np.repeat(height, _SECTORS)]
-    return np.stack(xyz, axis=1) - [0, 0, tall / 2], faces[:, ::-1]
+    lobes = 1 + (rng.random() < 0.3) * rng.uniform(0, 0.15) * np.cos(rng.integers(3, 13) * _longitudes())
+    vertices = _revolve(np.concatenate([radius, inner])[:, None] * lobes, height - tall / 2)
+    return vertices * [1, rng.uniform(0.7, 1.0), 1], _faces(_RINGS, _SECTORS, closed=False)[:, ::-1]
 
 
 def _tube(rng: np.random.Generator) -> tuple[Floats, Faces]:
     """Tube along a closed random curve: handle, knot or ring."""
     t = np.linspace(0, 2 * np.pi, 160, endpoint=False)
-    around = np.linspace(0, 2 * np.pi, 40, endpoint=False)
     curve = np.zeros((len(t), 3))
     for k in range(1, int(rng.integers(2, 5))):
         curve += (np.outer(np.cos(k * t), rng.normal(size=3)) + np.outer(np.sin(k * t), rng.normal(size=3))) / k**1.5
     curve /= 2 * np.abs(curve).max()
-    tangent = np.roll(curve, -1, 0) - np.roll(curve, 1, 0)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    side = np.cross(tangent, rng.normal(size=3))
-    side /= np.linalg.norm(side, axis=1, keepdims=True) + 1e-9
-    other = np.cross(tangent, side)
+    tangent, axis = np.roll(curve, -1, 0) - np.roll(curve, 1, 0), rng.normal(size=3)
     radius = rng.uniform(0.05, 0.18) * (1 + rng.uniform(0, 0.4) * np.sin(rng.integers(1, 6) * t))
-    offset = side[:, None] * np.cos(around)[None, :, None] + other[:, None] * np.sin(around)[None, :, None]
-    vertices = (curve[:, None] + radius[:, None, None] * offset).reshape(-1, 3)
-    a, b, c, d = _quads(len(t), len(around), closed=True)
-    return vertices, np.stack([a, d, c, a, c, b], axis=-1).reshape(-1, 3)
+    return _sweep(curve, tangent, axis, radius, 40), _faces(len(t), 40, closed=True)[:, ::-1]
 
 
 def _branch(
     start: Floats, radius: float, length: float, squash: Floats, rng: np.random.Generator
 ) -> tuple[Floats, Faces]:
     """A bent, tapering tube that starts inside the body and leaves it at `start` (3,)."""
-    t = np.linspace(0, 1, _BRANCH_RINGS)[:, None]
+    t = np.linspace(0, 1, _BRANCH_RINGS)
     out = start / max(float(np.linalg.norm(start)), 1e-6)
     bend, wave = (rng.normal(size=3) * length * k for k in (0.5, 0.12))
-    curve = start * 0.7 + (out * length * t + bend * t**2 + wave * np.sin(rng.uniform(3, 12) * t)) * squash
-    tangent = np.gradient(curve, axis=0)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True) + 1e-9
-    side = np.cross(tangent, rng.normal(size=3))
-    side /= np.linalg.norm(side, axis=1, keepdims=True) + 1e-9
-    other = np.cross(tangent, side)
-    knots = 1 + rng.uniform(0, 0.5) * np.sin(rng.uniform(0, 40) * t[:, 0])
-    thickness = radius * (1 - rng.uniform(0, 0.8) * t[:, 0]) * knots
+    way = np.outer(t, out * length) + np.outer(t**2, bend) + np.outer(np.sin(rng.uniform(3, 12) * t), wave)
+    curve, axis = start * 0.7 + way * squash, rng.normal(size=3)
+    knots = 1 + rng.uniform(0, 0.5) * np.sin(rng.uniform(0, 40) * t)
+    thickness = radius * (1 - rng.uniform(0, 0.8) * t) * knots
     thickness[[0, -1]] = 1e-4  # closed ends
-    around = np.linspace(0, 2 * np.pi, _BRANCH_SECTORS, endpoint=False)[:, None]
-    ring = side[:, None] * np.cos(around) + other[:, None] * np.sin(around)
-    vertices = (curve[:, None] + thickness[:, None, None] * ring).reshape(-1, 3)
-    a, b, c, d = (corner.ravel() for corner in _quads(_BRANCH_RINGS, _BRANCH_SECTORS, closed=False))
-    return vertices, np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)])
+    vertices = _sweep(curve, np.gradient(curve, axis=0), axis, thickness, _BRANCH_SECTORS)
+    return vertices, _faces(_BRANCH_RINGS, _BRANCH_SECTORS, closed=False)[:, ::-1]
 
 
 _PARTS: list[Callable[[np.random.Generator], tuple[Floats, Faces]]] = [
@@ -194,22 +160,44 @@ _PARTS: list[Callable[[np.random.Generator], tuple[Floats, Faces]]] = [
 
 def _sphere(rings: int, sectors: int) -> tuple[Floats, Faces]:
     """Unit sphere of latitudes and longitudes from the north pole down, faces counter-clockwise from outside."""
-    polar = np.linspace(0, np.pi, rings)
+    polar = np.linspace(0, np.pi, rings)[:, None]
     around = np.linspace(0, 2 * np.pi, sectors, endpoint=False)
-    theta, phi = np.meshgrid(polar, around, indexing="ij")
-    vertices = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
-    a, b, c, d = _quads(rings, sectors, closed=False)
-    return vertices.reshape(-1, 3), np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
+    parts = np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)
+    vertices = np.stack(np.broadcast_arrays(*parts), axis=-1).reshape(-1, 3)
+    return vertices, _faces(rings, sectors, closed=False)
 
 
-def _quads(rings: int, sectors: int, *, closed: bool) -> tuple[Faces, Faces, Faces, Faces]:
-    """Vertex indices of the corners of all quads between rings of vertices; closed: the last ring meets the first."""
+def _longitudes() -> Floats:
+    return np.linspace(0, 2 * np.pi, _SECTORS, endpoint=False)
+
+
+def _revolve(ring: Floats, height: Floats) -> Floats:
+    """Vertices (R · S, 3) of a solid of revolution with radii (R, S) or (R, 1) at heights (R,)."""
+    parts = ring * np.cos(_longitudes()), ring * np.sin(_longitudes()), height[:, None]
+    return np.stack(np.broadcast_arrays(*parts), axis=-1).reshape(-1, 3)
+
+
+def _sweep(curve: Floats, tangent: Floats, axis: Floats, radius: Floats, sectors: int) -> Floats:
+    """Vertices (R · sectors, 3) of a tube about a curve (R, 3); `axis` (3,) fixes the place of the first sector."""
+    tangent = tangent / (np.linalg.norm(tangent, axis=1, keepdims=True) + 1e-9)
+    side = np.cross(tangent, axis)
+    side /= np.linalg.norm(side, axis=1, keepdims=True) + 1e-9
+    other = np.cross(tangent, side)
+    around = np.linspace(0, 2 * np.pi, sectors, endpoint=False)[:, None]
+    ring = side[:, None] * np.cos(around) + other[:, None] * np.sin(around)
+    return np.asarray((curve[:, None] + radius[:, None, None] * ring).reshape(-1, 3))
+
+
+def _faces(rings: int, sectors: int, *, closed: bool) -> Faces:
+    """Triangles between rings of vertices, counter-clockwise from outside if rings are counter-clockwise from above.
+
+    closed: the last ring meets the first.
+    """
     i, j = np.meshgrid(np.arange(rings - (not closed)), np.arange(sectors), indexing="ij")
     here, next_ring = i * sectors, (i + 1) % rings * sectors
     next_sector = (j + 1) % sectors
-    corners = (here + j, next_ring + j, next_ring + next_sector, here + next_sector)
-    a, b, c, d = (corner.astype(np.int32) for corner in corners)
-    return a, b, c, d
+    a, b, c, d = here + j, next_ring + j, next_ring + next_sector, here + next_sector
+    return np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3).astype(np.int32)
 
 
 def _power(value: Floats, exponent: float) -> Floats:

@@ -31,7 +31,7 @@ _ROUNDS = (5, 7)  # of the fit: with that width, with a width for each color
 
 @dataclass(frozen=True)
 class ColorMixture:
-    """Colors of each picture on the axes of `_opponent`, (B, COLORS, ·)."""
+    """Recurring colors of B pictures as mixtures of Gaussians on the axes of `_opponent`; fields (B, COLORS, ·)."""
 
     center: Tensor  # 3
     variance: Tensor  # 3
@@ -39,7 +39,7 @@ class ColorMixture:
 
 
 class Recolor(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """Albedo moved towards the colors of its picture, by its uncertainty."""
+    """Network part that moves uncertain albedo towards the recurring colors of its picture."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -122,7 +122,7 @@ def _correct(color: Tensor, spread: Tensor, colors: ColorMixture) -> tuple[Tenso
 
 
 class ColorGloss(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """Gloss by color: a correction (B, outputs, H, W) to a first estimate."""
+    """Network part that corrects a first estimate of gloss (B, outputs, H, W) by color."""
 
     def __init__(self, outputs: int) -> None:
         super().__init__()
@@ -141,7 +141,7 @@ class ColorGloss(nn.Module):  # type: ignore[misc]  # torch comes without types 
 
 
 def describe_colors(seen: GlossEvidence, first: Tensor, member: Tensor, colors: ColorMixture) -> Tensor:
-    """Features of each color, (B, COLORS, ·).
+    """Features (B, COLORS, ·) from which the gloss of each recurring color is read.
 
     Its profile and the whole object's; the color, and relative to the object's mean; its share; the mean of the first
     estimate.

@@ -55,7 +55,7 @@ def _waves(position: Floats, wavelength: float, rng: np.random.Generator) -> tup
 
 
 def _woven(position: Floats, wavelength: float, rng: np.random.Generator) -> Floats:
-    """Gradient (M, 3) of two sets of threads that cross."""
+    """Gradient (M, 3) of a woven relief: two sets of threads that cross."""
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0][:2] * 2 * pi / wavelength
     phase = position @ axes.T + rng.uniform(0, 2 * pi, 2)
     return np.asarray(np.cos(phase) @ axes)

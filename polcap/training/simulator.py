@@ -15,9 +15,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from polcap.images import Quality
-from polcap.optics import frames, shade
 from polcap.stages import cues
-from polcap.training import bounced_light, gloss, materials, traced_views
+from polcap.training import bounced_light, materials, traced_views
 from polcap.training.camera_errors import CameraErrors, photograph
 
 Indices = NDArray[np.integer[Any]]
@@ -25,7 +24,7 @@ Indices = NDArray[np.integer[Any]]
 
 @dataclass(frozen=True)
 class Batch:
-    """Input and target of the network; pixels outside `mask` are ignored."""
+    """Training batch of the main network: input and target; pixels outside `mask` are ignored."""
 
     channels: Tensor  # (B, N, H, W)
     mask: Tensor  # (B, H, W) bool: on the object and in the mask that the network sees
@@ -70,7 +69,7 @@ class ObjectPixels:
 
 @dataclass(frozen=True)
 class ViewBatch:
-    """Some of the traced views at one size."""
+    """Traced views of B objects at one size, before materials and light."""
 
     mask: Tensor  # (B, H, W) bool
     rays: Tensor  # (B, H, W, 3) camera frame, surface to camera
@@ -83,9 +82,10 @@ class Simulator:
     """Traced views and materials on one device; draws batches from torch's global random state."""
 
     def __init__(
-        self, views: dict[str, NDArray[Any]], library: Any, device: torch.device, *, bounces: bool = True
-    ) -> None:
-        """library: `MaterialLibrary`; bounces: whether parts of an object light each other."""
+        self, views: dict[str, NDArray[Any]], library: materials.MaterialLibrary, device: torch.device,
+        bounces: bool = True,
+    ) -> None:  # fmt: skip
+        """bounces: whether parts of an object light each other."""
         self.library, self.device, self.bounces = library, device, bounces
         self.size = views["mask"].shape[1]
         self.camera = views["camera"]
@@ -145,7 +145,7 @@ class Simulator:
     def _seen_pixels(
         self, view: Indices, y: Indices, x: Indices, order: Indices, mask: NDArray[np.bool_], owner: Indices
     ) -> tuple[Indices, NDArray[np.float32]]:
-        """ObjectPixels.met and ObjectPixels.open of pixels (y, x) of the cached views `view`.
+        """Fields `met` and `open` of `ObjectPixels`, of pixels (y, x) of the cached views `view`.
 
         The thinned pixels of a view are in `order`, their masks are (B, H·W).
         """
@@ -162,31 +162,20 @@ class Simulator:
         return np.where(to >= 0, row[to + owner[:, None] * area], -1), escaped.mean(axis=1, dtype=np.float32)
 
     def photograph(
-        self,
-        views: ViewBatch,
-        strength: Tensor,
-        errors: CameraErrors,
-        jitter: Tensor | None = None,
-        smooth_share: float = gloss.SMOOTH_SHARE,
+        self, views: ViewBatch, strength: Tensor, errors: CameraErrors, jitter: Tensor | None = None
     ) -> SimulatedPhotographs:
-        """Draw materials, light the objects and measure them.
+        """Draw materials, simulate the light of the flash and measure it with a camera.
 
         strength (B,): S0 of a white plane that faces the flash at the object's distance. jitter (B,) 0…1: thins or
-        widens the input mask. smooth_share: of objects with a smooth interface (`optics/body.py`).
+        widens the input mask.
         """
         count, height, width = views.mask.shape
         pixels = views.pixels
-        surface = materials.draw_surface(
-            self.library, pixels.normal, pixels.position, views.turn, pixels.owner, count, smooth_share
-        )
-        normal = frames.lifted(frames.to_ray_frame(surface.normal, pixels.v))
-        to_flash = views.flash[pixels.owner] - pixels.place
-        squared = (to_flash * to_flash).sum(dim=1)
-        to_flash = frames.to_ray_frame(to_flash / squared.sqrt()[:, None], pixels.v)
-        irradiance = pixels.lit * strength[pixels.owner] / squared
-        nothing, lit = torch.zeros_like(surface.specular), (surface.roughness, surface.ior, to_flash, irradiance)
-        body = shade.stokes(normal, surface.diffuse, nothing, *lit, surface.law)
-        stokes = body + shade.stokes(normal, nothing, surface.specular, *lit)
+        own = pixels.owner
+        surface = materials.draw_surface(self.library, pixels.normal, pixels.position, views.turn, own, count)
+        to_flash = views.flash[own] - pixels.place
+        normal, body, specular = materials.reflect(surface, pixels.v, to_flash, pixels.lit * strength[own])
+        stokes = body + specular
         highlight = 1 - (body[0].sum(dim=1) + 1e-4) / (stokes[0].sum(dim=1) + 1e-4)
 
         def image(flat: Tensor) -> Tensor:
@@ -210,7 +199,7 @@ class Simulator:
 
 
 def to_batch(photo: SimulatedPhotographs) -> Batch:
-    """Input and target of the network for these photographs."""
+    """Training batch of the main network from simulated photographs."""
     return Batch(
         channels=channels(photo),
         mask=photo.input_mask & photo.mask,

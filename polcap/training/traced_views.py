@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from polcap.errors import InputError
 from polcap.formats import atomic, scene_files
 from polcap.images import Floats, GBuffer, View
-from polcap.synth.mesh_tracer import Tracer, Triangles, smooth
+from polcap.synth.mesh_tracer import Tracer, Triangles, scatter, smooth
 from polcap.training import bounced_light, light_transport, random_shapes
 
 ARRAYS = {  # step in pixels, channels, type
@@ -37,7 +37,7 @@ _MAX_OFFSET = 0.1  # of the distance, between lens and a random flash
 
 @dataclass(frozen=True)
 class ViewsRecipe:
-    """Which views are traced."""
+    """Settings of a cache of traced views."""
 
     views: int  # of each mesh
     procedural: int  # random shapes
@@ -48,7 +48,11 @@ class ViewsRecipe:
 
 
 def open_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe) -> dict[str, NDArray[Any]]:
-    """Open the cache; trace it first if the folder is empty.
+    """Open a cache of traced views; trace the views first if the folder has no complete cache.
+
+    Returns the arrays of ARRAYS (N, S, S, ·) as memory maps, and camera (N, 16): focal length, center x, y [px]; middle
+    depth [m]; depth unit [m]; rotation from object to camera (9); flash to the right of the lens and above it [middle
+    depths]. index.json is written last, so that an interrupted cache is recognized.
 
     Raises
     ------
@@ -56,20 +60,21 @@ def open_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe) -> dict[st
         The folder holds views of other meshes or another recipe.
     """
     index = folder / "index.json"
+    inputs = json.dumps(asdict(recipe) | {"meshes": [mesh.stem for mesh in meshes]})
     if not index.exists():
-        build_cache(folder, meshes, recipe)
-    elif json.loads(index.read_text()) != _index(meshes, recipe):
+        _build_cache(folder, meshes, recipe)
+        with atomic.path(index) as temporary:
+            temporary.write_text(inputs)
+    elif index.read_text() != inputs:
         raise InputError(
             f"{folder} holds views of other meshes or of another preset; remove it, or choose another --out"
         )
-    return load_cache(folder)
+    arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in ARRAYS}
+    return arrays | {"camera": np.load(folder / "camera.npy")}
 
 
-def build_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe) -> int:
-    """Trace all views and return their number.
-
-    index.json is written last, so that an interrupted cache is recognized.
-    """
+def _build_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe) -> None:
+    """Trace all views of a recipe and write their arrays."""
     folder.mkdir(parents=True, exist_ok=True)
     size = recipe.size
     total = recipe.views * len(meshes) + recipe.per_shape * recipe.procedural
@@ -81,44 +86,22 @@ def build_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe) -> int:
     for index, (buffer, pose, lit, met) in enumerate(_trace_all(meshes, recipe)):
         inside = buffer.mask
         middle, unit = depth_unit(inside, buffer.depth, buffer.view.focal)
-        out["normal"][index] = buffer.normal
-        out["depth"][index, ..., 0] = np.where(inside, (buffer.depth - middle) / unit, 0.0)
-        out["position"][index] = buffer.position
-        out["mask"][index, ..., 0], out["lit"][index, ..., 0], out["met"][index] = inside, lit, met
+        depth = np.where(inside, (buffer.depth - middle) / unit, 0.0)
+        view = {
+            "normal": buffer.normal,
+            "depth": depth,
+            "position": buffer.position,
+            "mask": inside,
+            "lit": lit,
+            "met": met,
+        }
+        for name, value in view.items():
+            out[name][index] = value.reshape(out[name][index].shape)
         offset = pose.flash[:2] / middle
         cameras[index] = [buffer.view.focal, *buffer.view.center, middle, unit, *pose.rotation.reshape(-1), *offset]
     for array in out.values():
         array.flush()
     np.save(folder / "camera.npy", cameras)
-    with atomic.path(folder / "index.json") as temporary:
-        temporary.write_text(json.dumps(_index(meshes, recipe)))
-    return total
-
-
-def _index(meshes: list[Path], recipe: ViewsRecipe) -> dict[str, Any]:
-    """All inputs of the views, as plain JSON values."""
-    plain: dict[str, Any] = json.loads(json.dumps(asdict(recipe)))
-    return plain | {"meshes": [mesh.stem for mesh in meshes]}
-
-
-def load_cache(folder: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of ARRAYS (N, S, S, ·) as memory maps, and camera (N, 16).
-
-    camera: focal length, center x, y [px]; middle depth [m]; depth unit [m]; rotation from object to camera (9);
-    flash to the right of the lens and above it [middle depths].
-
-    Raises
-    ------
-    InputError
-        The cache is incomplete.
-    """
-    missing = [n for n in ("index.json", *(f"{name}.npy" for name in (*ARRAYS, "camera"))) if not (folder / n).exists()]
-    if missing:
-        raise InputError(
-            f"{folder} holds no complete cache of views: {missing[0]} is missing; remove it and run `polcap train`"
-        )
-    arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in ARRAYS}
-    return arrays | {"camera": np.load(folder / "camera.npy")}
 
 
 def training_meshes(data: Path) -> list[Path]:
@@ -127,15 +110,13 @@ def training_meshes(data: Path) -> list[Path]:
 
 
 def read_mesh(path: Path) -> Triangles:
-    """A mesh file with shading normals."""
+    """Read a mesh file and add shading normals."""
     return smooth(*scene_files.read_mesh(path))
 
 
 def fill(mask: NDArray[np.bool_], values: Floats) -> Floats:
     """Image (H, W, ·) with values (M, ·) at the pixels of the mask, 0 elsewhere."""
-    image = np.zeros((*mask.shape, *values.shape[1:]), np.float32)
-    image[mask] = values
-    return image
+    return scatter(values, np.flatnonzero(mask), mask.shape)
 
 
 def depth_unit(mask: NDArray[np.bool_], depth: Floats, focal: float) -> tuple[float, float]:
@@ -148,31 +129,27 @@ def depth_unit(mask: NDArray[np.bool_], depth: Floats, focal: float) -> tuple[fl
     return middle, float(np.sqrt(mask.sum() / np.pi) * middle / focal)
 
 
-TracedView = tuple[
-    GBuffer, light_transport.Pose, NDArray[np.bool_], NDArray[np.uint16]
-]  # and the result of `trace_visibility`
-
-
-def _trace_all(meshes: list[Path], recipe: ViewsRecipe) -> Iterator[TracedView]:
-    for path in meshes:
-        rng = np.random.default_rng([recipe.seed, zlib.crc32(path.stem.encode())])
-        yield from _trace_views(str(path), read_mesh(path), recipe.views, recipe, rng)
-    for shape in range(recipe.procedural):
-        rng = np.random.default_rng([recipe.seed, 7, shape])
-        yield from _trace_views(f"random shape {shape}", random_shapes.compose(rng), recipe.per_shape, recipe, rng)
-
-
-def _trace_views(
-    name: str, mesh: Triangles, count: int, recipe: ViewsRecipe, rng: np.random.Generator
-) -> Iterator[TracedView]:
-    tracer, scene = Tracer(mesh), light_transport.MeshScene(mesh)
-    for _ in range(count):
-        buffer, rotation, translation = trace_random_view(name, tracer, recipe.size, rng)
-        way, off = rng.uniform(0, 2 * np.pi), rng.uniform(0, _MAX_OFFSET)
-        offset = (off * np.cos(way), off * np.sin(way)) if recipe.flash is None else recipe.flash
-        middle = float(buffer.depth[buffer.mask].mean(dtype=np.float64))
-        placed = light_transport.Pose(rotation, translation, middle * np.array([*offset, 0.0]), middle**2)
-        yield buffer, placed, *bounced_light.trace_visibility(scene, buffer, placed, rng)
+def _trace_all(
+    meshes: list[Path], recipe: ViewsRecipe
+) -> Iterator[tuple[GBuffer, light_transport.Pose, NDArray[np.bool_], NDArray[np.uint16]]]:
+    """Each view, the places of mesh and flash, and the result of `trace_visibility`."""
+    for number in range(len(meshes) + recipe.procedural):
+        if number < len(meshes):
+            path = meshes[number]
+            rng = np.random.default_rng([recipe.seed, zlib.crc32(path.stem.encode())])
+            name, mesh, count = str(path), read_mesh(path), recipe.views
+        else:
+            shape = number - len(meshes)
+            rng = np.random.default_rng([recipe.seed, 7, shape])
+            name, mesh, count = f"random shape {shape}", random_shapes.compose(rng), recipe.per_shape
+        tracer = Tracer(mesh)
+        for _ in range(count):
+            buffer, rotation, translation = trace_random_view(name, tracer, recipe.size, rng)
+            way, off = rng.uniform(0, 2 * np.pi), rng.uniform(0, _MAX_OFFSET)
+            offset = (off * np.cos(way), off * np.sin(way)) if recipe.flash is None else recipe.flash
+            middle = float(buffer.depth[buffer.mask].mean(dtype=np.float64))
+            pose = light_transport.Pose(rotation, translation, middle * np.array([*offset, 0.0]), middle**2)
+            yield buffer, pose, *bounced_light.trace_visibility(tracer, buffer, pose, rng)
 
 
 def trace_random_view(name: str, tracer: Tracer, size: int, rng: np.random.Generator) -> tuple[GBuffer, Floats, Floats]:

@@ -123,7 +123,7 @@ def _check(options: TrainingOptions) -> None:
 def _make_batches(
     simulator: Simulator, preset: TrainingPreset, network: loop.Trainee, budget: loop.Budget, seed: int
 ) -> Iterator[Batch]:
-    """Endless batches that follow from the seed: nothing else draws from torch's global random state."""
+    """Endless training batches that follow from the seed: nothing else draws from torch's global random state."""
     torch.manual_seed(seed)
     chooser, made = np.random.default_rng(seed), network.samples
     while True:
@@ -135,7 +135,7 @@ def _make_batches(
 
 
 def _run_ahead(batches: Iterator[Batch]) -> Generator[Batch, None, None]:
-    """The same batches, made in a thread while the network learns from earlier ones."""
+    """Training batches in their order, made in a thread while the network learns from earlier ones."""
     pool = ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,))
     try:
         waiting = deque(pool.submit(next, batches) for _ in range(_AHEAD))
@@ -157,13 +157,9 @@ class NetworkTraining(loop.Trainee):
     network: main_network.MainNetwork
 
     def __init__(
-        self,
-        shape: main_network.NetworkShape,
-        device: torch.device,
-        rate: float,
-        learners: int = 1,
+        self, shape: main_network.NetworkShape, device: torch.device, rate: float, learners: int = 1,
         variant: str = "ours",
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__(main_network.MainNetwork(shape, variant).to(device, memory_format=torch.channels_last), rate)
         self.device = device
         self.weights = list(self.network.parameters())
@@ -174,7 +170,7 @@ class NetworkTraining(loop.Trainee):
         self.held_out: HeldOutPictures | None = None
 
     def advance(self, batch: list[Batch], progress: float) -> dict[str, float]:
-        """Do one step on a batch per learner; returns the mean losses."""
+        """Do one training step on one batch per learner; returns the mean losses."""
         self.network.train()
         gradients, figures = zip(*self.pool.map(self._gradient, batch, self.lights))
         for weight, parts in zip(self.weights, zip(*gradients)):
@@ -203,7 +199,7 @@ class NetworkTraining(loop.Trainee):
         return {"shape": shape, "variant": variant, "begun": self.begun, "done": self.done}
 
     def begin(self, path: Path, done: int = 0) -> None:
-        """Start with the weights of an exported model.
+        """Start training with the weights of an exported model.
 
         With a budget of pictures, `done` of them count as spent, and the schedule continues from there.
 

@@ -37,13 +37,13 @@ class HeldOutPictures:
 
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def errors(self, network: nn.Module) -> dict[str, float]:
-        """Mean errors over all pixels of all pictures."""
+        """Mean errors of a network on the held-out pictures."""
         rows = [_errors(main_network.run(network, batch.channels), batch) for batch in self.batches]
         return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def picture(self, network: nn.Module) -> Picture:
-        """First batch, one row per picture: S0, then truth and estimate of normal, diffuse, F0, roughness, depth."""
+        """Eight pictures in rows: S0, then truth and estimate of normal, diffuse, F0, roughness and depth."""
         batch = self.batches[0]
         sides = [_draw(maps, batch.mask) for maps in (vars(batch), main_network.run(network, batch.channels))]
         light = (torch.exp(batch.channels[:, main_network.COLOR].float()) - FLOOR) * batch.mask[:, None]

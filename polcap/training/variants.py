@@ -23,7 +23,7 @@ _UNPOLARIZED = ("log_r", "log_g", "log_b", "mask", "clipped", "ray_x", "ray_y")
 
 @dataclass(frozen=True)
 class Variant:
-    """One ablation."""
+    """One ablation of the main network."""
 
     inputs: Callable[[Tensor], Tensor] = lambda x: x  # channels (B, N, H, W) -> inputs of the same shape
     sees_dolp: bool = True  # in the gloss profiles

@@ -58,7 +58,7 @@ def load_hdrutils(folder: str) -> Any:
                 shallow.trange = lambda n, **_: range(n)
             sys.modules[name] = shallow
     binned = MagicMock()
-    binned.demosaicing_CFA_Bayer_bilinear = lambda mosaic, pattern: demosaic.superpixel(mosaic, RGGB)
+    binned.demosaicing_CFA_Bayer_bilinear = lambda mosaic, _: np.moveaxis(demosaic.superpixel(mosaic, RGGB), 0, -1)
     sys.modules["colour_demosaicing"] = binned
     return importlib.import_module("HDRutils.merge")
 

@@ -23,7 +23,7 @@ from polcap.images import Cues
 from polcap.optics import frames
 from polcap.pipeline import models
 from polcap.stages import infer
-from polcap.stages.cues import channels
+from polcap.stages.cues import CHANNELS, channels
 from polcap.stages.infer import augmentation, learned
 from polcap.training.evaluation_protocol import Protocol
 
@@ -48,7 +48,7 @@ def _measured(seen: Cues, model: Path | None, symmetries: Literal[1, 2, 4, 8]) -
     assert network is not None
     small = learned._reduce(seen, int(network.metadata["native_size"]) / max(seen.mask.shape))
     settings = infer.InferSettings(symmetries=symmetries)
-    floor = _best(lambda: augmentation._run(channels(small), network, onnx.run))
+    floor = _best(lambda: augmentation.run_network(channels(small), network, onnx.run, CHANNELS, augmentation.OUTPUTS))
     stage = _best(lambda: infer.estimate(seen, network, onnx.run, settings))
     return stage, floor, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 

@@ -79,7 +79,7 @@ def measured(folder: Path, size: str, kind: str, seed: int) -> dict[str, Any]:
     shutil.rmtree(folder, ignore_errors=True)
     scene = scene_of(kind, seed)
     shooting.write(folder, scene, msgspec.structs.replace(SHOOTS[size], seed=seed))
-    network, mask_network = models.shipped()
+    network, mask_network = models.load_network(None, None), models.load_mask_network()
     supplied = UserInput(network=network, mask_network=mask_network)
     found = path(captures.read(folder, None), supplied, Config(), MemoryCache(until="surface"))
     maps, mesh, distance = found.maps, found.mesh, distance_m(found.color, found.radiance)

@@ -1,10 +1,12 @@
-"""Scenes of `make_mitsuba.py` through the cues and the inference stage: errors of every map, scene by scene.
+"""Errors of every map on the scenes of `make_mitsuba.py`: the stages `cues` and `infer`, by scene and by material.
 
-    python tests/benchmarks/bench_mitsuba.py FOLDER [--model ONNX] [--clean] [--rough]
+    python tests/benchmarks/bench_mitsuba.py FOLDER [--model ONNX] [--analytic] [--clean] [--rough]
 
-The camera is the evaluation's: 20 ke⁻, 5 e⁻, three exposures ×4 apart, 0.3 % of gain, 0.5° of angle; --clean has none
-of it; --rough leaves of S1 and S2 what facets of each pixel's roughness leave. Light, interreflection and shadows are
-Mitsuba's. Prints a Markdown row per scene and estimator.
+Light, interreflection and shadows are Mitsuba's. The camera is that of `polcap evaluate`: 20 ke⁻, read noise 5 e⁻,
+three exposures, gain errors of 0.3 %, angle errors of 0.5°; --clean has none of these. With --rough, and for rough
+materials always, S1 and S2 are scaled to the microfacet law of each pixel's roughness. `turned` is the share of the
+object [%] in connected regions of at least 0.1 % of it with normals turned by 180° about the view ray: regions where
+the tangential part of the normal points away from the true one, at true zenith angles above 20°.
 """
 
 import argparse
@@ -14,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from bench_captures import kept
+from scipy import ndimage
 
 from polcap.formats import onnx
 from polcap.images import ColorCalibration, SurfaceMaps, View
@@ -24,39 +27,66 @@ from polcap.training.camera_errors import CameraErrors, photograph
 from polcap.training.evaluation_protocol import Case, stokes_image
 from polcap.training.map_errors import Judge
 
-ROWS = ("normal_mean", "normal_median", "normal_mean_core", "diffuse", "specular", "roughness", "depth", "rendering")
+ROWS = (
+    "normal_mean",
+    "normal_median",
+    "normal_mean_core",
+    "diffuse",
+    "specular",
+    "roughness",
+    "depth",
+    "rendering",
+    "turned",
+)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--model", type=Path)
+    parser.add_argument("--analytic", action="store_true", help="also without a network")
     parser.add_argument("--clean", action="store_true")
     parser.add_argument("--rough", action="store_true")
     options = parser.parse_args()
-    networks = {"network": models.load_network("network", options.model, "cpu", 2), "analytic": None}
-    print("| scene | estimator |", " | ".join(ROWS), "|\n| --- | --- |", " | ".join("---" for _ in ROWS), "|")
-    table: dict[str, list[list[float]]] = {name: [] for name in networks}
+    networks = {"network": models.load_network("network", options.model, "cpu", 2)}
+    if options.analytic:
+        networks["analytic"] = None
+    print("| scene | material | estimator |", " | ".join(ROWS), "|\n| --- | --- | --- |", " --- |" * len(ROWS))
+    table: dict[tuple[str, str], list[list[float]]] = {}
     for number, file in enumerate(sorted(options.folder.glob("*.npz"))):
-        case = read(file, options.clean, options.rough, seed=number)
+        case, material = read(file, options.clean, options.rough, seed=number)
         judge = Judge(case)
         for name, network in networks.items():
-            found = judge.score(infer.estimate(case.cues, network, onnx.run, infer.InferSettings()))
-            row = [found.get(key, np.nan) for key in ROWS]
-            table[name].append(row)
-            print(f"| {case.name} | {name} |", " | ".join(f"{value:.3g}" for value in row), "|", flush=True)
-    for name, rows in table.items():
-        print(f"| mean of {len(rows)} | {name} |", " | ".join(f"{value:.3g}" for value in np.mean(rows, axis=0)), "|")
+            maps = infer.estimate(case.cues, network, onnx.run, infer.InferSettings())
+            errors = judge.score(maps) | {"turned": turned_share(maps, case.truth)}
+            row = [errors.get(key, np.nan) for key in ROWS]
+            table.setdefault((material, name), []).append(row)
+            print(f"| {case.name} | {material} | {name} |", " | ".join(f"{x:.3g}" for x in row), "|", flush=True)
+    for name in networks:
+        table["all", name] = [row for (_, estimator), rows in table.items() if estimator == name for row in rows]
+    for (material, name), rows in table.items():
+        mean = " | ".join(f"{x:.3g}" for x in np.nanmean(rows, axis=0))
+        print(f"| mean of {len(rows)} | {material} | {name} |", mean, "|")
 
 
-def read(file: Path, clean: bool, rough: bool, seed: int) -> Case:
-    """One scene as the camera measures it, and its truth."""
+def turned_share(maps: SurfaceMaps, truth: SurfaceMaps) -> float:
+    """Percent of the object in regions with normals turned by about 180° around the view ray."""
+    both = maps.mask & truth.mask
+    opposite = (maps.normal[..., :2] * truth.normal[..., :2]).sum(axis=-1) < 0
+    turned = both & opposite & (truth.normal[..., 2] < np.cos(np.radians(20)))
+    regions, _ = ndimage.label(turned)
+    area = np.bincount(regions.ravel())[1:]
+    return float(100 * area[area >= 0.001 * both.sum()].sum() / both.sum())
+
+
+def read(file: Path, clean: bool, rough: bool, seed: int) -> tuple[Case, str]:
+    """One scene as the camera measures it with its truth, and the name of its material."""
     with np.load(file) as stored:
         made = {name: stored[name] for name in stored.files}
-    mask = made["mask"]
+    mask, about = made["mask"], json.loads(str(made["about"]))
     view = View(float(made["focal"]), (float(made["center"][0]), float(made["center"][1])), 1.0)
     rays = frames.rays(view, *mask.shape)
-    if rough:
+    if rough or about["rough_law"]:
         made["stokes"][1:] *= kept(made["normal"], made["roughness"] ** 2, made["ior"], rays)[..., None]
     scene, diffuse, given, v = (
         torch.from_numpy(np.asarray(value, order="C"))[None] for value in (made["stokes"], made["diffuse"], mask, rays)
@@ -81,8 +111,7 @@ def read(file: Path, clean: bool, rough: bool, seed: int) -> Case:
         view=view,
         estimator="truth",
     )
-    texture = json.loads(str(made["about"]))["texture"]
-    return Case(f"{file.stem}, {texture}", measured, measured, measured, truth, depth)
+    return Case(file.stem, measured, measured, measured, truth, depth), about["material"]
 
 
 if __name__ == "__main__":

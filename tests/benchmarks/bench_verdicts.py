@@ -95,7 +95,7 @@ def one(folder: Path, seed: int, kind: str, width: int, keep: bool) -> Row:
 
 def judge_check(capture: Capture) -> Row:
     try:
-        found = check.inspect(capture, networks(), Config())
+        found = check.inspect(capture, Config(), networks=networks)
     except InputError as error:
         return {"check": "fail", "check_gates": {_name(error): ["fail", None, 45.0]}, "needs": ""}
     return {"check": gates.verdict(found.lines), "check_gates": _shown(found.lines), "needs": found.needs}

@@ -67,7 +67,7 @@ def main() -> None:
 def path_traced(folders: list[Path]) -> Iterator[Case]:
     """Scenes of `make_mitsuba.py` as a camera measures them."""
     for number, file in enumerate(file for folder in folders for file in sorted(folder.glob("*.npz"))):
-        yield read(file, clean=False, rough=number % 3 == 1, seed=number)
+        yield read(file, clean=False, rough=number % 3 == 1, seed=number)[0]
 
 
 def pictures(data: Path, sixths: int) -> Iterator[Case]:

@@ -1,15 +1,15 @@
-"""Path-traced test scenes by Mitsuba 3, with interreflection: noise-free Stokes parameters and the truth of every map.
+"""Path-trace test scenes with Mitsuba 3, with interreflection: noise-free Stokes parameters and the true maps.
 
     python tests/benchmarks/make_mitsuba.py FOLDER [--data $POLCAP_DATA] [--scenes 12] [--size 256] [--depth 5]
-        [--meshes test|train] [--black]
+        [--meshes test|train|withheld] [--material mixed|kinds|NAME]
 
-Meshes in turn, posed as `polcap evaluate` poses them, under a flash 5 % of the distance above the lens. Each
-wears two regions of plastic, each of three grades: albedo from a test texture set or solid noise, a face at a time;
-one index per region, one k_s and roughness per grade. With --black the whole object is black gloss before dark cloth:
-albedo .01–.06, roughness .05–.3, F0 about .04, and a floor, a wall and sometimes a chart that it mirrors.
+The meshes are used in turn, posed as `polcap evaluate` poses them, under a flash 5 % of the distance above the lens.
+A mixed object has two kinds of plastic with three grades each: the albedo is a texture set or solid noise, each kind
+has one index, each grade one k_s and one roughness. The other materials are in MATERIALS; `kinds` uses them in turn.
+Dark gloss lies on dark cloth: a floor, a wall and sometimes a chart that it reflects.
 
-One .npz per scene; a scene that exists already is not made again. Every scene is rendered until the Monte-Carlo error
-of its DoLP, from two halves of independent seeds, is below 0.1 %.
+The command writes one .npz per scene and skips existing ones. A scene is rendered until the Monte-Carlo error of its
+DoLP, from two halves with independent seeds, is below 0.1 %, or 64 passes are done.
 """
 
 import argparse
@@ -44,16 +44,19 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=12)
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--depth", type=int, default=5, help="longest path; 2 is direct light only")
-    parser.add_argument("--meshes", choices=("test", "train"), default="test")
-    parser.add_argument("--black", action="store_true", help="black gloss before dark cloth")
+    parser.add_argument("--meshes", choices=("test", "train", "withheld"), default="test")
+    parser.add_argument("--material", choices=("mixed", "kinds", *MATERIALS), default="mixed")
     options = parser.parse_args()
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_mono_polarized")
     mi.set_log_level(mi.LogLevel.Error)
-    training = options.meshes == "train"
-    folder = options.data / "meshes" / "test"
-    meshes = traced_views.training_meshes(options.data) if training else sorted(folder.glob("*.npz"))
+    withheld = [options.data / "meshes" / "train" / f"{name}.npz" for name in sorted(traced_views.WITHHELD)]
+    meshes = {
+        "train": traced_views.training_meshes(options.data),
+        "test": sorted((options.data / "meshes" / "test").glob("*.npz")),
+        "withheld": withheld,
+    }[options.meshes]
     sets = sorted(p.parent for p in (options.data / "materials" / "test").glob("*/albedo.jpg"))
     for index in range(options.scenes):
         mesh = meshes[index % len(meshes)]
@@ -62,29 +65,49 @@ def main() -> None:
             continue
         random = np.random.default_rng([2026, index])
         texture = sets[index // 2 % len(sets)] if index % 2 else None
+        name = list(MATERIALS)[index % len(MATERIALS)] if options.material == "kinds" else options.material
         began = time.monotonic()
-        wear = Wear(texture, options.black)
-        made, about = build(mi, traced_views.read_mesh(mesh), wear, options.size, options.depth, random)
+        made, about = build(mi, traced_views.read_mesh(mesh), name, texture, options.size, options.depth, random)
         with atomic.path(file) as temporary:
             np.savez_compressed(temporary, allow_pickle=False, about=np.array(json.dumps(about)), **made)
         print(file.name, json.dumps(about), f"{time.monotonic() - began:.0f} s", flush=True)
 
 
 @dataclass(frozen=True)
-class Wear:
-    """Material and surroundings of an object."""
+class SceneMaterial:
+    """One material of a whole object; ranges from which each scene draws."""
 
-    texture: Path | None  # None: solid noise
-    black: bool  # black gloss before dark cloth, whatever the texture
+    albedo: tuple[float, float]
+    roughness: tuple[float, float]
+    f0: tuple[float, float] = (0.035, 0.05)
+    saturation: float = 0.2  # 1σ of the natural logarithm of one channel
+    textured: bool = False  # albedo is a texture set, scaled to the range
+    rough_law: bool = False  # diffuse light leaves through microfacets; bench_mitsuba scales S1 and S2
+    cloth: bool = False  # dark cloth below and behind the object
+
+
+MATERIALS = {
+    "matte": SceneMaterial((0.2, 0.7), (0.65, 0.85)),
+    "satin": SceneMaterial((0.15, 0.6), (0.4, 0.55)),
+    "glossy": SceneMaterial((0.15, 0.6), (0.15, 0.3)),
+    "white glaze": SceneMaterial((0.65, 0.85), (0.1, 0.25), saturation=0.03),
+    "colored gloss": SceneMaterial((0.1, 0.5), (0.2, 0.4), saturation=0.8),
+    "dark gloss": SceneMaterial((0.01, 0.06), (0.05, 0.3), (0.036, 0.044), cloth=True),
+    "dark satin": SceneMaterial((0.03, 0.08), (0.35, 0.5), cloth=True),
+    "printed": SceneMaterial((0.1, 0.6), (0.3, 0.5), textured=True),
+    "rough": SceneMaterial((0.15, 0.6), (0.5, 0.7), rough_law=True),
+    "rough stone": SceneMaterial((0.15, 0.5), (0.6, 0.8), textured=True, rough_law=True),
+}
 
 
 def build(
-    mi: Any, mesh: Triangles, wear: Wear, size: int, depth: int, random: np.random.Generator
+    mi: Any, mesh: Triangles, name: str, texture: Path | None, size: int, depth: int, random: np.random.Generator
 ) -> tuple[dict[str, Floats], dict[str, Any]]:
     """Stokes parameters (3, H, W, 3) in the frame of each ray, truth maps, camera; and how it was made."""
     rotation, translation, view = traced_views.random_pose(mesh, size, random)
     corner, normal = subdivided(mesh)
-    coat = black_gloss(len(corner), random) if wear.black else dressed(corner, wear.texture, random)
+    material = MATERIALS.get(name)
+    coat = plain(corner, material, texture, random) if material else dressed(corner, texture, random)
     if not trimesh.Trimesh(mesh.vertices, mesh.faces).is_watertight:
         corner, normal = facing(corner, normal, -translation @ rotation)
     far = float(-translation[2] - np.mean(corner @ rotation[2]))
@@ -104,7 +127,9 @@ def build(
     middle, unit = traced_views.depth_unit(mask, truth["depth"], view.focal)
     halves = np.zeros((2, 3, size, size, 3))
     passes, error = 0, [np.inf, np.inf]
-    around = cloth(mi, np.concatenate([part["position"] for part in parts]), random) if wear.black else {}
+    around = (
+        cloth(mi, np.concatenate([part["position"] for part in parts]), random) if material and material.cloth else {}
+    )
     scenes = [scene(mi, parts, channel, light, np.pi * middle**2, view, size, depth, around) for channel in "rgb"]
     while passes < LEAST or (error[1] > 2 * GOAL and passes < MOST):
         for k, one in enumerate(scenes):
@@ -113,7 +138,9 @@ def build(
         if passes % 2 == 0:
             error = dolp_error(halves, mask)
     about = {
-        "texture": "black gloss" if wear.black else wear.texture.name if wear.texture else "noise",
+        "material": name,
+        "rough_law": bool(material and material.rough_law),
+        "texture": texture.name if texture else "noise",
         "grades": coat["grades"],
         "light": light,
         "depth": depth,
@@ -177,15 +204,21 @@ def dressed(corner: Floats, texture: Path | None, random: np.random.Generator) -
     return {**maps, "grade": 3 * second + level, "grades": grades}
 
 
-def black_gloss(faces: int, random: np.random.Generator) -> dict[str, Any]:
-    """One black glossy material, as `dressed` returns it."""
-    albedo = random.uniform(0.01, 0.06) * np.exp(random.normal(0, 0.1, 3))
-    ior = float(random.uniform(1.45, 1.55))
-    f0 = 0.04 * np.exp(0.1 * random.normal())
-    alpha = float(random.uniform(0.05, 0.3) ** 2)
+def plain(corner: Floats, of: SceneMaterial, texture: Path | None, random: np.random.Generator) -> dict[str, Any]:
+    """One material for all faces, as `dressed` returns it."""
+    level = random.uniform(*of.albedo)
+    albedo = level * np.exp(random.normal(0, of.saturation, 3)) * np.ones((len(corner), 1))
+    if of.textured and texture is not None:
+        picture = projected(scene_files.read_textures(texture)[:3], corner, random.uniform(1, 2.5))
+        albedo = level * picture / picture.mean()
+    elif of.textured:
+        noise = scene_materials.solid_noise(corner.mean(axis=1) * 12, int(random.integers(1 << 30)))
+        albedo = albedo * np.exp(0.5 * noise[:, None])
+    ior, f0 = float(random.uniform(1.45, 1.55)), float(random.uniform(*of.f0))
+    alpha = float(random.uniform(*of.roughness) ** 2)
     grade = {"strength": float(f0 / fresnel.normal_reflectance(ior)), "alpha": alpha, "ior": ior}
-    maps = {name: np.full(faces, albedo[k]) for k, name in enumerate("rgb")}
-    return {**maps, "grade": np.zeros(faces, int), "grades": [grade]}
+    maps = {name: np.clip(albedo[:, k], 0.01, 0.9) for k, name in enumerate("rgb")}
+    return {**maps, "grade": np.zeros(len(corner), int), "grades": [grade]}
 
 
 def cloth(mi: Any, corners: Floats, random: np.random.Generator) -> dict[str, Any]:

@@ -90,7 +90,7 @@ def shoot(folder: Path, seed: int, kind: str, width: int) -> dict[str, Any]:
             "rot_deg": roll,
             "transform": synthetic.transform(how, shift, roll).tolist(),
         }
-        radiance = planned.studio.radiance(pose, first=k == 0)
+        radiance = planned.studio.radiance(pose)
         for e in range(3):
             stops = how.step ** (e - 1)
             suffix = "png" if kind in ("tone curve", "lossy") else "DNG"

@@ -1,20 +1,18 @@
-"""A small farm on this machine: `polcap batch` on Dask workers that come late and are killed, beside a serial run.
+"""A small farm on this machine: `polcap batch` on Dask workers that come late and are killed, and a serial run.
 
-python tests/campaigns/dask_farm.py [--captures 40] [--kills 10] [--tiny 1000] [--seed 0]
+python -m tests.campaigns.dask_farm [--captures 40] [--kills 10] [--tiny 1000] [--seed 0]
 
-1. The captures (320 × 240 px, one exposure; copies of four) are processed serially, by one process.
-2. `--scheduler local` with one worker and with two, one thread each: wall and CPU seconds. On a machine that others
-   use too the ratio of wall seconds says little; the CPU seconds say what the second worker costs, and the seconds
-   of a capture what start and end of the batch do, which no second worker halves.
-3. A scheduler of its own on loopback TCP; the batch begins before any worker is there. Two workers join, one of the
-   two is killed (SIGKILL) at a random moment and another takes its place, as often as asked. Every asset must be
-   there and have the bytes of the serial one.
-4. What a batch costs around the work: captures whose first file is no photograph, found, refused and recorded.
+1. One process processes the captures (320 × 240 px, one exposure; copies of four).
+2. `--scheduler local` with one worker and with two, one thread each: wall and CPU seconds. On a busy machine the ratio
+   of wall seconds means little; CPU seconds give the cost of the second worker, and the seconds of a capture exclude
+   start and end of the batch, which no second worker halves.
+3. A scheduler on loopback TCP; the batch begins before any worker. Two workers join; again and again one of the two is
+   killed (SIGKILL) at a random moment and replaced. Every asset must have the bytes of the serial one.
+4. The cost of a batch without its work: captures with a file that is no photograph, found, refused and recorded.
 
 Prints one JSON document; exit code 1 where assets are missing or differ.
 """
 
-import argparse
 import ctypes
 import json
 import os
@@ -30,10 +28,9 @@ from typing import Any
 
 import numpy as np
 
-ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT))
-
-from tests.campaigns import kill, small_capture  # noqa: E402
+from tests.campaigns import kill
+from tests.campaigns.rows import arguments, small_capture
+from tests.conftest import ROOT
 
 _DISTINCT = 4  # captures that are shot; the others are copies
 _PR_SET_CHILD_SUBREAPER = 36  # linux/prctl.h
@@ -46,30 +43,30 @@ Program = subprocess.Popen[bytes]
 
 def main(captures: int, kills: int, tiny: int, seed: int) -> int:
     """Assets that are missing or differ."""
-    told: dict[str, Any] = {"captures": captures}
+    measured: dict[str, Any] = {"captures": captures}
     adopt()
     with tempfile.TemporaryDirectory() as place:
         root, base = Path(place) / "captures", Path(place)
         shoot(root, captures)
-        told["serial"] = timed(root, base / "serial")
+        measured["serial"] = timed(root, base / "serial")
         wanted = products(base / "serial", captures)
         for workers in (1, 2):
             out = base / f"local{workers}"
-            told[f"local, {workers}"] = timed(root, out, "--scheduler", "local", "--workers", str(workers))
-            told[f"local, {workers}"]["capture_s"] = capture_seconds(out)
-            told[f"local, {workers}"]["differ"] = different(wanted, products(out, captures))
+            measured[f"local, {workers}"] = timed(root, out, "--scheduler", "local", "--workers", str(workers))
+            measured[f"local, {workers}"]["capture_s"] = capture_seconds(out)
+            measured[f"local, {workers}"]["differ"] = different(wanted, products(out, captures))
             shutil.rmtree(out)
-        told["wall, 1 worker over 2"] = round(told["local, 1"]["wall_s"] / told["local, 2"]["wall_s"], 2)
-        told["killed"] = killed(root, base / "killed", kills, np.random.default_rng(seed))
-        told["killed"]["differ"] = different(wanted, products(base / "killed", captures))
+        measured["wall, 1 worker over 2"] = round(measured["local, 1"]["wall_s"] / measured["local, 2"]["wall_s"], 2)
+        measured["killed"] = killed(root, base / "killed", kills, np.random.default_rng(seed))
+        measured["killed"]["differ"] = different(wanted, products(base / "killed", captures))
         if tiny:
-            told["around the work"] = around(base, tiny)
-    print(json.dumps(told, indent=1))
-    return sum(part["differ"] for part in told.values() if isinstance(part, dict) and "differ" in part)
+            measured["around the work"] = around(base, tiny)
+    print(json.dumps(measured, indent=1))
+    return sum(part["differ"] for part in measured.values() if isinstance(part, dict) and "differ" in part)
 
 
 def adopt() -> None:
-    """Processes whose parent has ended are this one's from now on, and so are their CPU seconds."""
+    """Make this process the parent of orphaned processes, so that their CPU seconds are counted."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
@@ -79,14 +76,19 @@ def shoot(root: Path, captures: int) -> None:
     for number in range(captures):
         folder = root / f"capture{number:03d}"
         if number < _DISTINCT:
-            small_capture.write(folder, number)
+            small_capture(folder, number)
         else:
             shutil.copytree(root / f"capture{number % _DISTINCT:03d}", folder)
 
 
+def started(*command: str) -> Program:
+    """A Python module as a program."""
+    words = [sys.executable, "-m", *command]
+    return subprocess.Popen(words, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
 def batch(root: Path, out: Path, *more: str) -> Program:
-    command = [sys.executable, "-m", "polcap", "batch", str(root), "--out", str(out), *OPTIONS, *more]
-    return subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    return started("polcap", "batch", str(root), "--out", str(out), *OPTIONS, *more)
 
 
 def timed(root: Path, out: Path, *more: str) -> dict[str, Any]:
@@ -103,18 +105,18 @@ def timed(root: Path, out: Path, *more: str) -> dict[str, Any]:
 
 
 def capture_seconds(out: Path) -> float:
-    """Mean of the wall seconds of a capture: what start and end of the batch cost is not in it."""
+    """Mean wall seconds of a capture, without start and end of the batch."""
     taken = [json.loads(file.read_text(encoding="utf-8"))["seconds"] for file in out.rglob("records/*.json")]
     return round(float(np.mean(taken)), 3)
 
 
 def products(out: Path, captures: int) -> list[dict[str, str]]:
-    """Digests of every capture's files, without what tells the time."""
+    """Digests of every capture's files, without measured times."""
     return [kill.digests(out / f"capture{number:03d}") for number in range(captures)]
 
 
 def different(wanted: list[dict[str, str]], found: list[dict[str, str]]) -> int:
-    """Captures whose result lacks a file, has one more, or other bytes."""
+    """Number of captures with a missing, additional or different file."""
     return sum(not one or one != other for one, other in zip(wanted, found, strict=True))
 
 
@@ -144,8 +146,8 @@ def started_scheduler() -> tuple[str, Program]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    options = ["scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard", "--no-show"]
-    program = dask(*options)
+    where = ["--host", "127.0.0.1", "--port", str(port)]
+    program = started("dask", "scheduler", *where, "--no-dashboard", "--no-show")
     for _ in range(600):
         with socket.socket() as asked:
             if asked.connect_ex(("127.0.0.1", port)) == 0:
@@ -155,12 +157,8 @@ def started_scheduler() -> tuple[str, Program]:
 
 
 def worker(address: str) -> Program:
-    return dask("worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard", "--death-timeout", "300")
-
-
-def dask(*options: str) -> Program:
-    command = [sys.executable, "-m", "dask", *options]
-    return subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    options = ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--death-timeout", "300")
+    return started("dask", "worker", address, *options)
 
 
 def around(base: Path, tiny: int) -> dict[str, Any]:
@@ -171,13 +169,10 @@ def around(base: Path, tiny: int) -> dict[str, Any]:
             folder = root / f"capture{number:04d}" / f"pol{angle:03d}"
             folder.mkdir(parents=True)
             (folder / "IMG_0001.DNG").write_bytes(b"no photograph")
-    told = timed(root, base / "tiny-out")
-    return {**told, "captures": tiny, "cpu_ms_each": round(1000 * told["cpu_s"] / tiny, 1)}
+    measured = timed(root, base / "tiny-out")
+    return {**measured, "captures": tiny, "cpu_ms_each": round(1000 * measured["cpu_s"] / tiny, 1)}
 
 
 if __name__ == "__main__":
-    arguments = argparse.ArgumentParser(description=__doc__)
-    for name, usual in (("captures", 40), ("kills", 10), ("tiny", 1000), ("seed", 0)):
-        arguments.add_argument(f"--{name}", type=int, default=usual)
-    given = arguments.parse_args()
-    sys.exit(1 if main(given.captures, given.kills, given.tiny, given.seed) else 0)
+    stated = arguments(__doc__, captures=40, kills=10, tiny=1000, seed=0)
+    sys.exit(1 if main(stated.captures, stated.kills, stated.tiny, stated.seed) else 0)

@@ -1,31 +1,22 @@
-"""Text, TOML, JSON, serial replies and headers, mutated, through polcap's parsers in this process.
+"""Mutated text, TOML, JSON, serial replies and headers, parsed by polcap in this process.
 
-python tests/campaigns/fuzz_parsers.py [--runs 100000] [--seed 0] [--rows FILE]
+python -m tests.campaigns.fuzz_parsers [--runs 100000] [--seed 0] [--rows FILE]
 
-A parser may give a value or one of its declared errors, within a second of processor time. Prints a table per parser;
-anything else is printed with its input and ends with exit code 1. With --rows a campaign goes on where it was stopped.
+A parser may return a value or raise one of its declared errors, within a second of processor time. Prints a table;
+exit code 1 after a failure.
 """
 
-import argparse
 import io
 import json
 import os
 import sys
-import tempfile
 import time
-import traceback
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
-from math import ceil
 from pathlib import Path
-from random import Random
 from typing import Any
 
 import msgspec
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from polcap import config, report
 from polcap.errors import PolcapError
@@ -48,110 +39,76 @@ from polcap.images import (
     StokesImage,
     View,
 )
-from polcap.rig import exposure_bracket, motor_elliptec_ell14, motor_grbl, motor_line_protocol, serial_port
+from polcap.rig import exposure_bracket, serial_port
 from polcap.rig.device_log import Log
-from tests.campaigns.mutations import mutated
-from tests.campaigns.rows import Rows
+from polcap.rig.motor_elliptec_ell14 import ElliptecMotor, ElliptecSettings
+from polcap.rig.motor_grbl import GrblMotor, GrblSettings
+from polcap.rig.motor_line_protocol import LineMotor, LineSettings
+from tests.campaigns.mutations import Target, campaign
+from tests.campaigns.rows import arguments
 from tests.formats import headers
+from tests.rig import virtual
 
-BATCH = 500  # executions that make a row
-
-
-class Clock:
-    """Time that passes where somebody waits, and nowhere else."""
-
-    def __init__(self) -> None:
-        self._now = 0.0
-
-    def monotonic(self) -> float:
-        return self._now
-
-    def sleep(self, seconds: float) -> None:
-        self._now += max(seconds, 0.001)
-
-
-CLOCK = Clock()
-for driver in (motor_elliptec_ell14, motor_grbl, motor_line_protocol, serial_port):
-    driver.time = CLOCK  # type: ignore[attr-defined]
+_BATCH = 500  # executions that make a row
 
 
 class Replies(serial_port.Port):
-    """A serial port whose answers are written beforehand."""
+    """A serial port with prepared answers."""
 
     def __init__(self, data: bytes) -> None:
-        self.url, self.log = "fuzz://", Log(None)
-        self._lines = [line for line in data.split(b"\n") if line.strip()]  # as Port, which skips empty ones
+        self.url, self.log, self._question = "fuzz://", Log(None), ""
+        self._lines = [line for line in data.split(b"\n") if line.strip()]  # as Port, which skips empty lines
 
     def send(self, text: str, discard: bool = True) -> None: ...
 
     def read_line(self, limit_s: float | None = None) -> str:
         if not self._lines:
-            CLOCK.sleep(serial_port.ANSWER_S if limit_s is None else limit_s)
+            virtual.CLOCK.sleep(max(serial_port.ANSWER_S if limit_s is None else limit_s, 0.001))
             raise serial_port.NoAnswer("fuzz:// answered with nothing")
         line = self._lines.pop(0).strip()
         if not all(32 <= byte < 127 or byte == 9 for byte in line):
             raise serial_port.NoAnswer("fuzz:// answered with no text")
         return line.decode("ascii")
 
-    def unknown_answer(self, line: str) -> serial_port.NoAnswer:
-        return serial_port.NoAnswer(f"fuzz:// answered {line:.40}")
+
+def _motor(motor_class: Any, settings: Any) -> Callable[[bytes, Path], object]:
+    def run(data: bytes, folder: Path) -> object:
+        with virtual.time():
+            motor = motor_class(Replies(data), settings)
+            motor.home()
+            return motor.position()
+
+    return run
 
 
-@dataclass(frozen=True)
-class Parser:
-    seeds: tuple[bytes, ...]
-    run: Callable[[bytes, Path], object]
-    declared: tuple[type[Exception], ...] = (PolcapError,)
-    limit_s: float = 1.0
-    share: float = 1.0  # of the executions: less where one takes long
+def _file(name: str, read: Callable[[Path], object]) -> Callable[[bytes, Path], object]:
+    """A parser that reads the bytes from a file."""
+
+    def run(data: bytes, folder: Path) -> object:
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(data)
+        return read(folder / name)
+
+    return run
 
 
-def _written(data: bytes, folder: Path, name: str) -> Path:
-    file = folder / name
-    file.write_bytes(data)
-    return file
+def _text(parse: Callable[[str], object]) -> Callable[[bytes, Path], object]:
+    return lambda data, folder: parse(data.decode("utf-8", "surrogateescape"))
 
 
-def _settings(data: bytes, folder: Path) -> object:
-    return config.load(_written(data, folder, "settings.toml"))
+def _manifest(kind: type) -> Callable[[bytes, Path], object]:
+    def run(data: bytes, folder: Path) -> object:
+        for name, array in _ARRAYS.items():
+            if not (folder / f"{name}.npy").exists():
+                npy_folder.save(folder / f"{name}.npy", array)
+        return npy_folder.decode(text_file.parse_json(data.decode("utf-8")), kind, folder)
+
+    return run
 
 
-def _assignment(data: bytes, folder: Path) -> object:
-    return config.load(None, [data.decode("utf-8", "surrogateescape")])
-
-
-def _capture(data: bytes, folder: Path) -> object:
-    _written(data, folder, capture_toml.NAME)
-    return capture_toml.load(folder)
-
-
-def _profile(data: bytes, folder: Path) -> object:
-    return calibrations.read_profile(_written(data, folder, "profile.toml"))
-
-
-def _calibration_file(data: bytes, folder: Path) -> object:
-    place = folder / "calib"
-    place.mkdir(exist_ok=True)
-    _written(data, place, "bench.toml")
-    os.environ["POLCAP_CALIB"] = str(place)
+def _calibration_file(file: Path) -> object:
+    os.environ["POLCAP_CALIB"] = str(file.parent)
     return calibrations.choose(_EXIF, None, 60.0)
-
-
-def _maps(data: bytes, folder: Path) -> object:
-    return msgspec.convert(text_file.read_json(_written(data, folder, "maps.json")), maps._Description)
-
-
-def _tree(data: bytes, folder: Path) -> object:
-    return npy_folder.decode(text_file.parse_json(data.decode("utf-8")), StokesImage, folder)
-
-
-def _calibration(data: bytes, folder: Path) -> object:
-    return npy_folder.decode(text_file.parse_json(data.decode("utf-8")), ColorCalibration, folder)
-
-
-def _report(data: bytes, folder: Path) -> object:
-    _written(data, folder, "report.json")
-    return report.read(folder)
 
 
 def _header(data: bytes, folder: Path) -> object:
@@ -160,41 +117,10 @@ def _header(data: bytes, folder: Path) -> object:
     return file_kind.kind(io.BytesIO(data), ".dng"), structure.truncated, structure.dng
 
 
-def _tags(data: bytes, folder: Path) -> object:
-    return exif.sized(exif.tags(data), 640, 480)
-
-
-def _jpeg(data: bytes, folder: Path) -> object:
-    file_checks.check_jpeg("fuzz", data)
-    return None
-
-
-def _bracket(data: bytes, folder: Path) -> object:
-    return exposure_bracket.parse_bracket(data.decode("utf-8", "surrogateescape"))
-
-
-def _name(data: bytes, folder: Path) -> object:
-    name = atomic.safe_name(data.decode("utf-8", "surrogateescape"))
+def _name(text: str) -> object:
+    name = atomic.safe_name(text)
     assert name and len(name.encode()) <= 100 and name.isprintable() and not set(name) & set("/\\:"), name
     return name
-
-
-def _elliptec(data: bytes, folder: Path) -> object:
-    motor = motor_elliptec_ell14.ElliptecMotor(Replies(data), motor_elliptec_ell14.ElliptecSettings(timeout=0.05))
-    motor.home()
-    return motor.position()
-
-
-def _grbl(data: bytes, folder: Path) -> object:
-    board = motor_grbl.GrblMotor(Replies(data), motor_grbl.GrblSettings(timeout=0.05))
-    board.home()
-    return board.position()
-
-
-def _line(data: bytes, folder: Path) -> object:
-    board = motor_line_protocol.LineMotor(Replies(data), motor_line_protocol.LineSettings(timeout=0.05))
-    board.home()
-    return board.position()
 
 
 _VALUES = {  # by the name that each has in its manifest
@@ -250,98 +176,50 @@ _CALIBRATION = calibrations.text(
         FlashEnergy(0.01, 0.002, 1e-4, 1e-4, 20),
     )
 ).encode()  # fmt: skip
+_TOML = (
+    b"[hdr]\nclip = 0.98\n[gates]\nmax_ghost = 0.02\n",
+    b"[selfcal]\nunknown_angles = true\nmax_unknown_sigma_deg = 4.0\n[stokes]\nundistort = false\n",
+)
+_CAPTURE = b'name = "vase"\nfocal_length_mm = 60.0\n[[frame]]\nfile = "a.dng"\nangle = 45\nrole = "shot"\n'
+_PROFILE = b'matrix = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]\nsource = "chart"\ncost = nan\n'
+_ELLIPTEC = b"0GS00\n0IN0E1140041520211501016800023000\n0PO00000000\n0PO00000100\n"
+_LINE = b"polcap-rotator 1 bench 60\nok 0.00\nok 12.50\nok 12.50\n"
+_JPEG = headers.jpeg(b"") + b"\xff\xda\0\x02abc\xff\0\xff\xd9"
+_OF_FILES = (ValueError, OSError, PolcapError)
 PARSERS = {
-    "settings (TOML)": Parser(
-        (
-            b"[hdr]\nclip = 0.98\n[gates]\nmax_ghost = 0.02\n",
-            b"[selfcal]\nunknown_angles = true\nmax_unknown_sigma_deg = 4.0\n[stokes]\nundistort = false\n",
-        ),
-        _settings,
-        share=0.3,
+    "settings (TOML)": Target(_TOML, _file("settings.toml", config.load), share=0.3),
+    "settings (--set)": Target(
+        (b"hdr.clip=0.98", b"gates.max_ghost=0.1"), _text(lambda text: config.load(None, [text])), share=0.06
     ),
-    "settings (--set)": Parser((b"hdr.clip=0.98", b"gates.max_ghost=0.1"), _assignment, share=0.06),
-    "capture.toml": Parser(
-        (b'name = "vase"\nfocal_length_mm = 60.0\n[[frame]]\nfile = "a.dng"\nangle = 45\nrole = "shot"\n',),
-        _capture,
-        share=0.4,
+    "capture.toml": Target(
+        (_CAPTURE,), _file(capture_toml.NAME, lambda file: capture_toml.load(file.parent)), share=0.4
     ),
-    "color profile": Parser(
-        (b'matrix = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]\nsource = "chart"\ncost = nan\n',),
-        _profile,
-        share=0.4,
+    "color profile": Target((_PROFILE,), _file("profile.toml", calibrations.read_profile), share=0.4),
+    "calibration (TOML)": Target((_CALIBRATION,), _file("calib/bench.toml", _calibration_file), share=0.4),
+    "maps.json": Target(
+        (json.dumps(_MAPS).encode(),),
+        _file("maps.json", lambda file: msgspec.convert(text_file.read_json(file), maps._Description)),
+        _OF_FILES,
+        share=0.6,
     ),
-    "calibration (TOML)": Parser((_CALIBRATION,), _calibration_file, share=0.4),
-    "maps.json": Parser((json.dumps(_MAPS).encode(),), _maps, (ValueError, OSError), share=0.6),
-    "report.json": Parser((json.dumps(_REPORT).encode(),), _report, share=0.6),
-    "manifest, Stokes": Parser((_MANIFEST["stokes"],), _tree, (ValueError, PolcapError)),
-    "manifest, color": Parser((_MANIFEST["color"],), _calibration, (ValueError, PolcapError)),
-    "TIFF structure": Parser(_TIFFS, _header),
-    "EXIF": Parser(_TIFFS, _tags, limit_s=30.0, share=0.06),  # the limit of the child that it runs in
-    "JPEG markers": Parser((headers.jpeg(b"") + b"\xff\xda\0\x02abc\xff\0\xff\xd9",), _jpeg),
-    "bracket": Parser((b"1/200,1/50,0.5", b"f/11,iso100", b"flash1/16"), _bracket),
-    "names": Parser((b"My vase, 2nd try", "Büste №3".encode()), _name),
-    "Elliptec replies": Parser((b"0GS00\n0IN0E1140041520211501016800023000\n0PO00000000\n0PO00000100\n",), _elliptec),
-    "GRBL replies": Parser((_GRBL,), _grbl),
-    "line protocol": Parser((b"polcap-rotator 1 bench 60\nok 0.00\nok 12.50\nok 12.50\n",), _line),
+    "report.json": Target(
+        (json.dumps(_REPORT).encode(),), _file("report.json", lambda file: report.read(file.parent)), share=0.6
+    ),
+    "manifest, Stokes": Target((_MANIFEST["stokes"],), _manifest(StokesImage), _OF_FILES),
+    "manifest, color": Target((_MANIFEST["color"],), _manifest(ColorCalibration), _OF_FILES),
+    "TIFF structure": Target(_TIFFS, _header),
+    "EXIF": Target(  # the limit of the child that parses tags in a run
+        _TIFFS, lambda data, folder: exif.sized(exif.tags(data), 640, 480), limit_s=30.0, share=0.06
+    ),
+    "JPEG markers": Target((_JPEG,), lambda data, folder: file_checks.check_jpeg("fuzz", data)),
+    "bracket": Target((b"1/200,1/50,0.5", b"f/11,iso100", b"flash1/16"), _text(exposure_bracket.parse_bracket)),
+    "names": Target((b"My vase, 2nd try", "Büste №3".encode()), _text(_name)),
+    "Elliptec replies": Target((_ELLIPTEC,), _motor(ElliptecMotor, ElliptecSettings(timeout=0.05))),
+    "GRBL replies": Target((_GRBL,), _motor(GrblMotor, GrblSettings(timeout=0.05))),
+    "line protocol": Target((_LINE,), _motor(LineMotor, LineSettings(timeout=0.05))),
 }
 
 
-def campaign(runs: int, seed: int, rows: Rows, say: Callable[[str], None] = print) -> int:
-    """Failures of `runs` executions, by the parsers' shares."""
-    done = rows.done("seed", "parser", "batch")
-    each = runs / sum(parser.share for parser in PARSERS.values())
-    with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as place:
-        folder = Path(place)
-        for name, array in _ARRAYS.items():
-            npy_folder.save(folder / f"{name}.npy", array)
-        for name, parser in PARSERS.items():
-            for batch in range(ceil(parser.share * each / BATCH)):
-                if (seed, name, batch) not in done:
-                    row = _batch(parser, Random(f"{seed} {name} {batch}"), folder, say)
-                    rows.add({"seed": seed, "parser": name, "batch": batch, **row})
-    return summary(rows, say)
-
-
-def _batch(parser: Parser, random: Random, folder: Path, say: Callable[[str], None]) -> dict[str, Any]:
-    """The outcomes of so many executions, and the processor time of all and of the slowest, s."""
-    seen = Counter({"value": 0, "error": 0, "failure": 0})
-    slowest, begun = 0.0, time.process_time()
-    for _ in range(BATCH):
-        data = mutated(random.choice(parser.seeds), random, most=4)
-        start = time.process_time()
-        try:
-            parser.run(data, folder)
-            seen["value"] += 1
-        except parser.declared:
-            seen["error"] += 1
-        except Exception:
-            seen["failure"] += 1
-            say(f"{data[:400]!r}\n{traceback.format_exc()}")
-        took = time.process_time() - start
-        slowest = max(slowest, took)
-        if took > parser.limit_s:
-            seen["failure"] += 1
-            say(f"{took:.1f} s on {data[:400]!r}")
-    return {**seen, "slowest": round(slowest, 4), "processor": round(time.process_time() - begun, 3)}
-
-
-def summary(rows: Rows, say: Callable[[str], None]) -> int:
-    """The table of all executions so far; their failures."""
-    say("| parser | executions | values | declared errors | slowest, ms | failures |\n|" + " --- |" * 6)
-    for name in PARSERS:
-        of_it = [row for row in rows.all if row["parser"] == name]
-        value, error, failure = (sum(row[column] for row in of_it) for column in ("value", "error", "failure"))
-        slowest = 1e3 * max(row["slowest"] for row in of_it)
-        say(f"| {name} | {BATCH * len(of_it)} | {value} | {error} | {slowest:.0f} | {failure} |")
-    spent, failures = (sum(row[column] for row in rows.all) for column in ("processor", "failure"))
-    say(f"{BATCH * len(rows.all)} executions in {spent:.0f} s of processor time, {failures} failures")
-    return int(failures)
-
-
 if __name__ == "__main__":
-    arguments = argparse.ArgumentParser(description=__doc__)
-    arguments.add_argument("--runs", type=int, default=100_000)
-    arguments.add_argument("--seed", type=int, default=0)
-    arguments.add_argument("--rows", type=Path)
-    given = arguments.parse_args()
-    sys.exit(1 if campaign(given.runs, given.seed, Rows(given.rows)) else 0)
+    stated = arguments(__doc__, runs=100_000, seed=0)
+    sys.exit(1 if campaign(PARSERS, stated.runs, stated.seed, stated.rows, _BATCH, time.process_time) else 0)

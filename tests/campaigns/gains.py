@@ -1,13 +1,11 @@
-"""How well the light of the shots is known, without a chart or with one, and whether what is wrong is told.
+"""Error of each shot's gain, without a chart or with one, and whether a wrong gain is flagged.
 
 python -m tests.campaigns.gains [--objects 20] [--first-seed 0] [--angles 0,45,90] [--chart] [--parts]
 
-Objects of `lit_objects` under a flash that repeats within 2 %. A capture is flagged where the gate `gain doubt`
-does not pass, refused where it fails; with --chart where polcap does not find the chart as well. Prints the errors,
-the worst shot's of each capture, and what is promised.
+Objects of `lit_objects` under a flash that repeats within 2 %. A capture is flagged where the gate `gain doubt` does
+not pass, refused where the gate fails; with --chart also where polcap does not find the chart. Prints the errors, the
+worst shot's of each capture, and the promised figures; with --parts also error and 1σ by each property of the object.
 """
-
-import argparse
 
 import numpy as np
 
@@ -22,6 +20,7 @@ from polcap.stages import selfcal, whitebalance
 from polcap.stages.selfcal import angles, integrability, object_gains
 from tests import scenes
 from tests.campaigns import lit_objects
+from tests.campaigns.rows import arguments, table
 
 JITTER = 0.02  # 1σ of a pop
 GOOD, BAD = 0.003, 0.006
@@ -29,43 +28,35 @@ BY_CHART = 0.0015
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--objects", type=int, default=20)
-    parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--angles", default="0,45,90")
-    parser.add_argument("--chart", action="store_true", help="a color chart stands beside the object")
-    parser.add_argument("--parts", action="store_true", help="also what each property of the object says")
-    given = parser.parse_args()
-    angle = np.radians([float(one) for one in given.angles.split(",")])
+    stated = arguments(__doc__, "chart", "parts", objects=20, first_seed=0, angles="0,45,90")
+    angle = np.radians([float(one) for one in stated.angles.split(",")])
     rows, errors, states = [], [], []
-    for seed in range(given.first_seed, given.first_seed + given.objects):
-        case = lit_objects.lit(seed, chart=given.chart)
+    for seed in range(stated.first_seed, stated.first_seed + stated.objects):
+        case = lit_objects.lit(seed, chart=stated.chart)
         true = 1 + JITTER * np.random.default_rng([seed, 13]).normal(size=len(angle))
         true = true / true[0]
         radiance, object_ = lit_objects.stack(case, angle, seed, true), lit_objects.object_of(case)
-        settings = selfcal.SelfcalSettings(check_order=False)
         try:
-            color = measured(radiance) if given.chart else scenes.no_color()
+            color = measured(radiance) if stated.chart else scenes.no_color()
         except ChartError as refusal:
-            print(seed, case.look, "refused:", refusal, flush=True)
+            print(seed, case.finish, "refused:", refusal, flush=True)
             states.append("fail")
             errors.append(np.nan)  # within no limit, beyond none
             continue
+        settings = selfcal.SelfcalSettings(check_order=False)
         found = selfcal.solve(radiance, scenes.still(len(angle)), object_, color, settings)
-        gate = light._gain_doubt(Evidence.partial(selfcal=found), GateLimits())
-        error = np.abs(found.gains.gain.mean(1) / true - 1)
-        errors.append(float(error.max()))
+        evidence = Evidence.partial(selfcal=found, radiance=radiance, names=stated.angles.split(","))
+        states.append(light._gain_doubt(evidence, GateLimits()).state)
+        errors.append(float(np.abs(found.gains.gain.mean(1) / true - 1).max()))
         sigma = float(found.gains.sigma.max())
-        states.append(gate.state)
-        rows.append((seed, case.look, f"{100 * errors[-1]:.2f} %", f"{100 * sigma:.2f} %", gate.state))
-        if given.parts:
-            print(seed, case.look, *parts(radiance, object_, angle, true), flush=True)
-    print(lit_objects.shown(rows, ("seed", "look", "worst error", "1σ", "gate")))
-    if given.chart:
-        print(f"\nwithin {100 * BY_CHART:g} %: {(np.array(errors) <= BY_CHART).sum()} of {len(errors)}")
-    off, flagged = np.array(errors), np.array([state != "pass" for state in states])
-    print(f"\nwithin {100 * GOOD:g} %: {(off <= GOOD).sum()} of {len(off)}")
-    print(f"above {100 * BAD:g} %: {(off > BAD).sum()}, of them unflagged: {((off > BAD) & ~flagged).sum()}")
+        rows.append((seed, case.finish, f"{100 * errors[-1]:.2f} %", f"{100 * sigma:.2f} %", states[-1]))
+        if stated.parts:
+            print(seed, case.finish, *parts(radiance, object_, angle, true), flush=True)
+    print(table(rows, ("seed", "finish", "worst error", "1σ", "gate")), "\n")
+    error, flagged = np.array(errors), np.array([state != "pass" for state in states])
+    for limit in (BY_CHART, GOOD):
+        print(f"within {100 * limit:g} %: {(error <= limit).sum()} of {len(error)}")
+    print(f"above {100 * BAD:g} %: {(error > BAD).sum()}, of them unflagged: {((error > BAD) & ~flagged).sum()}")
     print(f"flagged {flagged.sum()}, refused {sum(state == 'fail' for state in states)}")
 
 

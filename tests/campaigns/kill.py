@@ -1,17 +1,16 @@
 """kill -9 at random moments over `polcap process` and `export`; then the same command again, undisturbed.
 
-python tests/campaigns/kill.py [--kills 30] [--seed 0] [--rows FILE]
+python -m tests.campaigns.kill [--kills 30] [--seed 0] [--rows FILE]
 
 Each round kills one `process` and one `export` of a capture of 320 × 240 px: every other round at any moment of the
-command, else at any moment after it began to write; moments are counted in its own processor time, so that a busy
-machine does not move them. With --rows a campaign goes on where it was stopped. Linux alone.
+command, else at any moment after it began to write. A moment is a processor time of the command, so that a busy
+machine does not move it. Linux only.
 
-Amid the damage every file under a final name is as in a run that nobody disturbed (of JSON, which is written in
-several states, it is whole). After the command was given again all files are (times of measurement apart), none is
-missing or left over, and the photographs are what they were.
+After a kill every file under a final name equals that of an undisturbed run (JSON, which is written in several states,
+is complete). After the repeated command all files are equal (measured times excepted), none is missing or left over,
+and the photographs are unchanged.
 """
 
-import argparse
 import json
 import os
 import shutil
@@ -24,15 +23,12 @@ from pathlib import Path
 
 import numpy as np
 
-ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT))
-
-from tests.campaigns import small_capture  # noqa: E402
-from tests.campaigns.rows import Rows, processor_s  # noqa: E402
+from tests.campaigns.rows import Rows, arguments, processor_s, small_capture
+from tests.conftest import ROOT
 
 _CLOCK = {"seconds", "timings", "time"}  # keys of JSON that hold measured times
 _OWN = ("work/lock", "work/owner", "work/unchanged.json", "report.html")  # hold times, processes
-_LOOK_S = 0.004  # between two looks whether the command writes
+_POLL_S = 0.004  # between two checks whether the command writes
 Step = tuple[str | Path, ...]
 
 
@@ -44,26 +40,25 @@ def polcap(*arguments: object) -> subprocess.Popen[bytes]:
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """Of every file; JSON without the measured times, the page that shows them left out."""
+    """Digest of every file; JSON without the measured times, and without the page that shows them."""
     found = {}
     for file in sorted(path for path in folder.rglob("*") if path.is_file()):
         name = str(file.relative_to(folder))
-        if name in _OWN:
-            continue
-        data = file.read_bytes()
-        if file.suffix == ".json" and not _partial(name):
-            try:
-                data = json.dumps(_timeless(json.loads(data)), sort_keys=True).encode()
-            except ValueError:
-                data = b"damaged: " + data
-        found[name] = blake2b(data, digest_size=16).hexdigest()
+        if name not in _OWN:
+            data = _content(file) if file.suffix == ".json" and not _partial(name) else file.read_bytes()
+            found[name] = blake2b(data or b"damaged: " + file.read_bytes(), digest_size=16).hexdigest()
     return found
 
 
-def _timeless(value: object) -> object:
-    if isinstance(value, dict):
-        return {name: _timeless(item) for name, item in value.items() if name not in _CLOCK}
-    return [_timeless(item) for item in value] if isinstance(value, list) else value
+def _content(file: Path) -> bytes | None:
+    """Canonical bytes of a JSON file, without measured times; None if it is damaged."""
+    try:
+        timeless = json.loads(
+            file.read_bytes(), object_pairs_hook=lambda pairs: {k: v for k, v in pairs if k not in _CLOCK}
+        )
+    except ValueError:
+        return None
+    return json.dumps(timeless, sort_keys=True).encode()
 
 
 def _partial(name: str) -> bool:
@@ -91,7 +86,7 @@ def undisturbed(step: Step, out: Path) -> tuple[float, float]:
         last = spent_s(run.pid)
         if first is None and _writes(out) != before:
             first = last
-        time.sleep(_LOOK_S)
+        time.sleep(_POLL_S)
     assert run.returncode in (0, 3), (step, run.returncode)
     return first or 0.0, last
 
@@ -100,7 +95,7 @@ def kill_amid(step: Step, out: Path, moment_s: float) -> bool:
     """Start the command and kill it once it took so much processor time; False if it ended before."""
     run = polcap(*step, out)
     while run.poll() is None and spent_s(run.pid) < moment_s:
-        time.sleep(_LOOK_S)
+        time.sleep(_POLL_S)
     amid = run.poll() is None
     run.kill()
     run.wait()
@@ -108,26 +103,18 @@ def kill_amid(step: Step, out: Path, moment_s: float) -> bool:
 
 
 def broken_names(folder: Path, *whole: dict[str, str]) -> list[str]:
-    """Files under a final name that are as in none of the whole results; what is missing is not broken."""
+    """Files under a final name that differ from every undisturbed result; missing files are not broken."""
     found = digests(folder) if folder.exists() else {}
     final = {name: digest for name, digest in found.items() if not _partial(name)}
     strange = [name for name, digest in final.items() if all(one.get(name) != digest for one in whole)]
-    return sorted(name for name in strange if not name.endswith(".json") or not _is_json(folder / name))
-
-
-def _is_json(file: Path) -> bool:
-    try:
-        json.loads(file.read_bytes())
-    except ValueError:
-        return False
-    return True
+    return sorted(name for name in strange if not name.endswith(".json") or _content(folder / name) is None)
 
 
 def main(kills: int, seed: int, rows: Rows) -> int:
     """Failures."""
     with tempfile.TemporaryDirectory() as place:
         capture = Path(place) / "capture"
-        small_capture.write(capture)
+        small_capture(capture)
         photographs = digests(capture)
         whole = Path(place) / "whole"
         steps: tuple[Step, ...] = (
@@ -138,8 +125,8 @@ def main(kills: int, seed: int, rows: Rows) -> int:
         stages = [digests(whole)]
         spans.append(undisturbed(steps[1], whole))
         stages.append(digests(whole))
-        told = ", ".join(f"{step[0]} {span[1]:.1f} s" for step, span in zip(steps, spans))
-        print(f"undisturbed: {told}, {len(stages[-1])} files", flush=True)
+        spans_text = ", ".join(f"{step[0]} {span[1]:.1f} s" for step, span in zip(steps, spans))
+        print(f"undisturbed: {spans_text}, {len(stages[-1])} files", flush=True)
         done = rows.done("seed", "number")
         for number in range(-(-kills // len(steps))):
             if (seed, number) in done:
@@ -173,9 +160,5 @@ def summary(rows: Rows) -> int:
 
 
 if __name__ == "__main__":
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--kills", type=int, default=30)
-    arguments.add_argument("--seed", type=int, default=0)
-    arguments.add_argument("--rows", type=Path)
-    given = arguments.parse_args()
-    sys.exit(1 if main(given.kills, given.seed, Rows(given.rows)) else 0)
+    stated = arguments(__doc__, kills=30, seed=0)
+    sys.exit(1 if main(stated.kills, stated.seed, stated.rows) else 0)

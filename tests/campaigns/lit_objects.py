@@ -1,11 +1,10 @@
-"""In: a seed. Out: shots of a simulated object without its photographs, for campaigns on what `selfcal` tells.
+"""Shots of a simulated object without photographs, for campaigns on `selfcal`.
 
 Bumps, clusters and vases of `polcap.synth`, 320 × 240 px, under a flash by the lens, smooth and rough bodies in turn,
-with the looks that gains are hard to tell of: glossy, matt, textured, a white patch at the limb, clipped highlights.
+with finishes that make gains difficult: glossy, matt, textured, a white patch near the outline, clipped highlights.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -17,7 +16,7 @@ from polcap.synth.scenes import random_scene
 from polcap.synth.shooting import Shoot, Studio
 from tests import scenes
 
-LOOKS = ("textured", "glossy", "matt", "white patch", "clipped")
+FINISHES = ("textured", "glossy", "matt", "white patch", "clipped")
 _NOISE = 0.004  # 1σ at S0 = 1, growing with its root: that of a bracket's merged pixel
 _MARGIN = 12  # px of the crop around the object
 
@@ -26,23 +25,23 @@ _MARGIN = 12  # px of the crop around the object
 class Lit:
     """An object under a flash."""
 
-    look: str
+    finish: str
     stokes: Floats  # (3, H, W, 3) in the frame of each ray
     mask: NDArray[np.bool_]
     rays: Floats  # (H, W, 3)
 
 
 def lit(seed: int, thin: bool = False, chart: bool = False) -> Lit:
-    """The seed's object; `thin` takes clusters alone, whose parts hide one another; `chart` leaves one beside it.
+    """The seed's object; `thin` takes clusters alone, with parts that hide one another; `chart` adds a color chart.
 
     With a chart the picture has 640 × 480 px.
     """
     random = np.random.default_rng([seed, 11])
-    look = LOOKS[seed % len(LOOKS)]
+    finish = FINISHES[seed % len(FINISHES)]
     scene = random_scene(seed, "clusters" if thin else ("bumps", "clusters", "vase")[seed // 2 % 3])
     if not chart:
         scene = msgspec.structs.replace(scene, chart=None, position=(0.0, 0.0, scene.position[2]))
-    rough = {"glossy": 0.2, "clipped": 0.25, "matt": 0.8}.get(look)
+    rough = {"glossy": 0.2, "clipped": 0.25, "matt": 0.8}.get(finish)
     if rough is not None:
         worn = tuple(msgspec.structs.replace(one, roughness=(rough, rough)) for one in scene.coat.materials)
         scene = msgspec.structs.replace(scene, coat=msgspec.structs.replace(scene.coat, materials=worn))
@@ -52,24 +51,24 @@ def lit(seed: int, thin: bool = False, chart: bool = False) -> Lit:
     studio = Studio(msgspec.structs.replace(scene, law=law), shoot)
     image, mask = np.asarray(studio.reference, np.float64), studio.buffer.mask
     image = image / (1.0 if chart else np.percentile(image[0][mask], 90))
-    if look == "white patch":
+    if finish == "white patch":
         slope = studio.buffer.normal[..., 2]
-        limb = np.argwhere(mask & (slope > 0.3) & (slope < 0.5))
-        y, x = limb[int(random.integers(len(limb)))]
+        rim = np.argwhere(mask & (slope > 0.3) & (slope < 0.5))
+        y, x = rim[int(random.integers(len(rim)))]
         rows, columns = np.mgrid[: mask.shape[0], : mask.shape[1]]
         image[:, mask & (np.hypot(rows - y, columns - x) < 14)] *= 4
-    return Lit(look, image, mask, frames.rays(shoot.view, *mask.shape))
+    return Lit(finish, image, mask, frames.rays(shoot.view, *mask.shape))
 
 
 def stack(case: Lit, angle: Floats, seed: int, gain: Floats | None = None, stated: Floats | None = None) -> AngleStack:
-    """Shots at angles (K,) rad, with gains (K,) and noise, of which `stated` (K,) rad are told."""
+    """Shots at angles (K,) rad, with gains (K,) and noise, stated as `stated` (K,) rad."""
     random = np.random.default_rng([seed, 12])
     gain = np.ones(len(angle)) if gain is None else gain
     weights = np.stack([mueller.analyzer(frames.axis_on_ray(np.asarray(a), case.rays)) for a in angle])  # (K, H, W, 3)
     shots = np.einsum("khwj,jhwc->khwc", weights, case.stokes) * gain[:, None, None, None]
     variance = _NOISE**2 * np.maximum(shots, 0.02)
     shots = shots + random.normal(size=shots.shape) * np.sqrt(variance)
-    top = 0.75 if case.look == "clipped" else 4.0
+    top = 0.75 if case.finish == "clipped" else 4.0
     clipped = (shots > top).any(-1)
     return AngleStack(
         value=np.minimum(shots, top).astype(np.float32), variance=variance.astype(np.float32),
@@ -79,7 +78,7 @@ def stack(case: Lit, angle: Floats, seed: int, gain: Floats | None = None, state
 
 
 def object_of(case: Lit) -> ObjectMask:
-    """The object as cut out by hand."""
+    """The mask of the object, as drawn by hand."""
     rows, columns = (np.flatnonzero(case.mask.any(axis)) for axis in (1, 0))
     height, width = case.mask.shape
     edge = float(np.concatenate([case.mask[[0, -1]].ravel(), case.mask[:, [0, -1]].ravel()]).mean())
@@ -88,9 +87,3 @@ def object_of(case: Lit) -> ObjectMask:
         min(int(columns[-1]) + 1 + _MARGIN, width), min(int(rows[-1]) + 1 + _MARGIN, height),
     )  # fmt: skip
     return ObjectMask(case.mask, box, "user", border=edge)
-
-
-def shown(rows: list[tuple[Any, ...]], names: tuple[str, ...]) -> str:
-    """A Markdown table."""
-    lines = ["| " + " | ".join(names) + " |", "|" + " --- |" * len(names)]
-    return "\n".join([*lines, *("| " + " | ".join(map(str, row)) + " |" for row in rows)])

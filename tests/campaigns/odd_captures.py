@@ -1,13 +1,12 @@
-"""Captures that are valid and hold next to nothing, drawn at random, through the whole path.
+"""Random valid captures with almost no content, through the whole path.
 
-python tests/campaigns/odd_captures.py [--captures 60] [--seed 0]
+python -m tests.campaigns.odd_captures [--captures 60] [--seed 0]
 
 Frames are all clipped, all dark, flat, a single bright pixel, noise, a ramp, half clipped, or a mixture by shot; sizes
-are tiny; masks are absent, one pixel, all of the frame or random. Every run ends with 0, 2 or 3 within its limit, and
-what was written is finite. Prints the outcomes; anything else is printed and ends with exit code 1.
+are tiny; masks are absent, one pixel, all of the frame or random. Every run must end with 0, 2 or 3 within its limit,
+and all written values must be finite. Prints the outcomes; exit code 1 after a failure.
 """
 
-import argparse
 import sys
 import tempfile
 import time
@@ -18,8 +17,6 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
-
 from polcap.config import Config
 from polcap.errors import GateError, InputError
 from polcap.formats.capture import reader as captures
@@ -27,6 +24,7 @@ from polcap.formats.maps import maps_folder as maps
 from polcap.images import ChartRequest, Floats
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import UserInput
+from tests.campaigns.rows import arguments, table
 from tests.formats import headers
 
 BLACK, WHITE = 512, 16383
@@ -38,17 +36,13 @@ CONTENT: dict[str, Callable[[Floats, Random], Floats]] = {  # from a noise of de
     "zero": lambda noise, random: np.full_like(noise, BLACK),
     "flat": lambda noise, random: np.full_like(noise, 4000),
     "noise": lambda noise, random: 4000 + 300 * noise,
-    "one pixel": lambda noise, random: _one_pixel(noise, random),
+    "one pixel": lambda noise, random: np.where(
+        np.arange(noise.size).reshape(noise.shape) == 999, WHITE, BLACK + 3 * noise
+    ),
     "ramp": lambda noise, random: np.linspace(BLACK, WHITE, noise.size).reshape(noise.shape),
     "half clipped": lambda noise, random: np.where(np.arange(noise.shape[1]) % 40 < 20, WHITE, 4000 + 200 * noise),
     "disc": lambda noise, random: _disc(noise),
 }
-
-
-def _one_pixel(noise: Floats, random: Random) -> Floats:
-    out = BLACK + 3 * noise
-    out[int(random.integers(noise.shape[0])), int(random.integers(noise.shape[1]))] = WHITE
-    return out
 
 
 def _disc(noise: Floats) -> Floats:
@@ -56,10 +50,10 @@ def _disc(noise: Floats) -> Floats:
     return np.where(x * x + y * y < 0.3, 6000 + 80 * noise, BLACK + 100 + 8 * noise)
 
 
-def write(folder: Path, what: list[str], size: tuple[int, int], exposures: int, random: Random) -> None:
-    """A capture of a shot per angle, 0, 45 and 90 degrees, whose frames hold what is named."""
+def write(folder: Path, contents: list[str], size: tuple[int, int], exposures: int, random: Random) -> None:
+    """Write a capture at 0, 45 and 90 degrees; `contents` names the content of each shot."""
     taken = 0
-    for angle, name in zip((0, 45, 90), what):
+    for angle, name in zip((0, 45, 90), contents):
         place = folder / f"pol{angle:03d}"
         place.mkdir(parents=True)
         for e in range(exposures):
@@ -72,18 +66,13 @@ def write(folder: Path, what: list[str], size: tuple[int, int], exposures: int, 
 
 
 def mask(kind: str, size: tuple[int, int], random: Random) -> np.ndarray | None:
-    if kind == "none":
-        return None
-    drawn = np.full(size, kind == "all")
-    if kind == "one pixel":
-        drawn[size[0] // 2, size[1] // 2] = True
-    if kind == "random":
-        drawn = random.random(size) < 0.5
-    return drawn
+    middle = np.zeros(size, bool)
+    middle[size[0] // 2, size[1] // 2] = True
+    return {"none": None, "all": np.ones(size, bool), "one pixel": middle, "random": random.random(size) < 0.5}[kind]
 
 
 def run(folder: Path, drawn: np.ndarray | None) -> str:
-    """The outcome of a run in a word; what was written is checked."""
+    """The outcome of a run in a word; written maps are checked."""
     out = folder / "polcap"
     try:
         found = captures.read(folder)
@@ -93,40 +82,37 @@ def run(folder: Path, drawn: np.ndarray | None) -> str:
     except InputError as error:
         assert "\n" not in str(error), error
         return type(error).__name__
-    stored = maps.read(out / "maps")  # refuses what is not finite
+    stored = maps.read(out / "maps")  # refuses values that are not finite
     assert about is not None and stored.maps.mask.any()
     return f"verdict {about['verdict']}"
 
 
-def campaign(count: int, seed: int, say: Callable[[str], None] = print) -> int:
-    """Failures of so many captures."""
+def main(count: int, seed: int) -> int:
+    """Run so many captures; returns the number of failures."""
     random = np.random.default_rng(seed)
     outcomes: Counter[str] = Counter()
     failures, slowest = 0, 0.0
     for _ in range(count):
         alike = random.random() < 0.6
-        what = [str(random.choice(list(CONTENT)))] * 3 if alike else [str(x) for x in random.choice(list(CONTENT), 3)]
+        contents = [str(name) for name in random.choice(list(CONTENT), 1 if alike else 3)] * (3 if alike else 1)
         size = (2 * int(random.integers(40, 100)), 2 * int(random.integers(40, 100)))
         kind = str(random.choice(["none", "none", "one pixel", "all", "random"]))
-        start = time.process_time()
+        start = time.process_time()  # independent of the load of the machine
         with tempfile.TemporaryDirectory() as place:
             try:
-                write(Path(place) / "c", what, size, int(random.integers(1, 4)), random)
+                write(Path(place) / "c", contents, size, int(random.integers(1, 4)), random)
                 outcomes[run(Path(place) / "c", mask(kind, size, random))] += 1
             except Exception:
                 failures += 1
-                say(f"{what}, {size}, mask {kind}:\n{traceback.format_exc()}")
-        took = time.process_time() - start  # whatever else the machine does
-        slowest = max(slowest, took)
-        failures += took > LIMIT_S
-    say("\n".join(f"| {name} | {number} |" for name, number in outcomes.most_common()))
-    say(f"{count} captures, slowest {slowest:.1f} s, {failures} failures")
+                print(f"{contents}, {size}, mask {kind}:\n{traceback.format_exc()}")
+        spent = time.process_time() - start
+        slowest = max(slowest, spent)
+        failures += spent > LIMIT_S
+    print(table(list(outcomes.most_common()), ("outcome", "captures")))
+    print(f"{count} captures, slowest {slowest:.1f} s, {failures} failures")
     return failures
 
 
 if __name__ == "__main__":
-    arguments = argparse.ArgumentParser(description=__doc__)
-    arguments.add_argument("--captures", type=int, default=60)
-    arguments.add_argument("--seed", type=int, default=0)
-    given = arguments.parse_args()
-    sys.exit(1 if campaign(given.captures, given.seed) else 0)
+    stated = arguments(__doc__, captures=60, seed=0)
+    sys.exit(1 if main(stated.captures, stated.seed) else 0)

@@ -1,14 +1,12 @@
-"""How well angles that nobody noted are found, and whether what is not found is refused.
+"""Error of polarizer angles that nobody noted, and whether unfound angles are refused.
 
 python -m tests.campaigns.unknown [--objects 40] [--shots 5] [--first-seed 0] [--rows FILE]
 
-Objects of `lit_objects` shot at angles drawn at random (such as determine the Stokes parameters), gains known to 0.1 %,
-as of a chart. With --rows it goes on where it stopped.
+Objects of `lit_objects` shot at random angles (that determine the Stokes parameters), gains known to 0.1 %, as with a
+chart.
 """
 
-import argparse
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,30 +17,24 @@ from polcap.optics import mueller
 from polcap.stages import selfcal
 from tests import scenes
 from tests.campaigns import lit_objects
-from tests.campaigns.rows import Rows, processor_s
+from tests.campaigns.rows import arguments, processor_s
 
 _GAIN_ERROR = 0.001
 _MOST_CONDITION = 6.0  # of the analyzers; 0°, 45°, 90° have 3.2
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--objects", type=int, default=40)
-    parser.add_argument("--shots", type=int, default=5)
-    parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--rows", type=Path)
-    given = parser.parse_args()
-    rows = Rows(given.rows)
-    done = rows.done("seed", "shots")
-    for seed in range(given.first_seed, given.first_seed + given.objects):
-        if (seed, given.shots) not in done:
-            rows.add({"seed": seed, "shots": given.shots, **one(seed, given.shots)})
+    stated = arguments(__doc__, objects=40, shots=5, first_seed=0)
+    rows, done = stated.rows, stated.rows.done("seed", "shots")
+    for seed in range(stated.first_seed, stated.first_seed + stated.objects):
+        if (seed, stated.shots) not in done:
+            rows.add({"seed": seed, "shots": stated.shots, **one(seed, stated.shots)})
             print(rows.all[-1], flush=True)
-    some = [row for row in rows.all if row["shots"] == given.shots]
-    told = [row for row in some if "error" in row]
-    print(f"{len(some)} cases: {len(some) - len(told)} refused, {len(told)} found")
-    if told:
-        error, sigma = (np.array([row[key] for row in told]) for key in ("error", "sigma"))
+    some = [row for row in rows.all if row["shots"] == stated.shots]
+    found = [row for row in some if "error" in row]
+    print(f"{len(some)} cases: {len(some) - len(found)} refused, {len(found)} found")
+    if found:
+        error, sigma = (np.array([row[key] for row in found]) for key in ("error", "sigma"))
         print(f"worst angle of a case: median {np.median(error):.2f}°, 90 % {np.quantile(error, 0.9):.2f}°", end=", ")
         print(f"most {error.max():.2f}°; beyond 2σ {(error > 2 * sigma).sum()}, beyond 3σ {(error > 3 * sigma).sum()}")
     print(f"{processor_s():.0f} s of processor time")
@@ -58,7 +50,7 @@ def drawn(seed: int, shots: int) -> Floats:
 
 
 def one(seed: int, shots: int) -> dict[str, Any]:
-    """A row: error of the worst angle and the 1σ that is stated, degrees; or why it was refused."""
+    """A row: error of the worst angle and the stated 1σ, degrees; or the reason of the refusal."""
     case, true = lit_objects.lit(seed), drawn(seed, shots)
     gain = 1 + _GAIN_ERROR * np.random.default_rng([seed, 20]).normal(size=shots)
     names = np.radians(np.arange(shots))
@@ -69,8 +61,8 @@ def one(seed: int, shots: int) -> dict[str, Any]:
     except CaptureError as error:
         return {"refused": str(error)[:60]}
     assert found.found_sigma is not None
-    apart = (found.angle - true + np.pi / 2) % np.pi - np.pi / 2
-    return {"error": float(np.degrees(np.abs(apart)).max()), "sigma": float(np.degrees(found.found_sigma))}
+    off = (found.angle - true + np.pi / 2) % np.pi - np.pi / 2
+    return {"error": float(np.degrees(np.abs(off)).max()), "sigma": float(np.degrees(found.found_sigma))}
 
 
 if __name__ == "__main__":

@@ -16,22 +16,30 @@ SAID = {"channels": "s1,s2", "encoding": ENCODING, "native_size": "128", "size_m
 }
 
 
-def write(path: Path, metadata: dict[str, str], opset: int = 17, channels: int = 2) -> Path:
-    """A model with one output, twice its input."""
+def build(
+    path: Path,
+    nodes: list[Any],
+    outputs: dict[str, list[Any]],
+    tensors: tuple[Any, ...] = (),
+    metadata: dict[str, str] = SAID,
+    opset: int = 17,
+) -> Path:
+    """A model of two channels made of these nodes."""
     from onnx import TensorProto, helper
 
-    shape = ["n", channels, "h", "w"]
-    node = helper.make_node("Add", ["input", "input"], ["normal"])
-    graph = helper.make_graph(
-        [node],
-        "double",
-        [helper.make_tensor_value_info("input", TensorProto.FLOAT, shape)],
-        [helper.make_tensor_value_info("normal", TensorProto.FLOAT, shape)],
-    )
+    values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in outputs.items()]
+    entry = helper.make_tensor_value_info("input", TensorProto.FLOAT, [1, 2, "h", "w"])
+    graph = helper.make_graph(nodes, "model", [entry], values, list(tensors))
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=9)
     helper.set_model_props(model, metadata)
     onnx.save(model, path)
     return path
+
+
+def write(path: Path, metadata: dict[str, str], opset: int = 17) -> Path:
+    """A model with one output, twice its input."""
+    node = onnx.helper.make_node("Add", ["input", "input"], ["normal"])
+    return build(path, [node], {"normal": [1, 2, "h", "w"]}, metadata=metadata, opset=opset)
 
 
 def test_a_model_runs_and_states_its_channels(tmp_path: Path) -> None:
@@ -98,23 +106,6 @@ def test_cuda_is_never_replaced_silently(tmp_path: Path) -> None:
         load(path, "cuda")
     x = np.ones((1, 2, 8, 8), np.float32)
     assert (run(load(path, "auto"), x)["normal"] == 2 * x).all()
-
-
-def build(path: Path, nodes: list[Any], outputs: dict[str, list[Any]], tensors: tuple[Any, ...] = ()) -> Path:
-    """A model of two channels made of these nodes."""
-    from onnx import TensorProto, helper
-
-    graph = helper.make_graph(
-        nodes,
-        "odd",
-        [helper.make_tensor_value_info("input", TensorProto.FLOAT, [1, 2, "h", "w"])],
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in outputs.items()],
-        list(tensors),
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    helper.set_model_props(model, SAID)
-    onnx.save(model, path)
-    return path
 
 
 def endless(path: Path) -> Path:

@@ -6,7 +6,7 @@ import pytest
 from polcap.images import Distortion, View
 from polcap.optics import distortion
 from polcap.optics.warp import covered, warp
-from polcap.synth import lens as simulated
+from polcap.synth import forward_camera as simulated
 
 BARREL = Distortion(500.0, (150.0, 100.0), -0.2, 0.05)
 

@@ -27,7 +27,7 @@ WIDTH = 512  # the chart must be found: without its greys order and angles are t
 
 
 def verdict(folder: Path) -> Verdict:
-    return check.inspect(captures.read(folder), (None, None), Config())
+    return check.inspect(captures.read(folder), Config(), networks=lambda: (None, None))
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -71,7 +71,7 @@ def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path) -> N
     with pytest.raises(ChartError):
         merged = hdr.merge(capture, frame_decoder.decode, Config().hdr)
         whitebalance.measure(merged, shipped_data.colorchecker(), AUTO, Config().whitebalance)
-    asked = check.inspect(capture, (None, None), Config(), chart=ChartRequest("none"))
+    asked = check.inspect(capture, Config(), ChartRequest("none"), lambda: (None, None))
     assert asked.needs == "" and next(line for line in asked.lines if line.name == "chart").state == "not measured"
 
 
@@ -129,14 +129,24 @@ def test_ambient_light_is_measured(example: Path, tmp_path: Path) -> None:
     assert line.value == pytest.approx(0.2, rel=0.05)
 
 
-def test_reduced_picture_keeps_what_is_clipped(example: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reduced_picture_has_the_same_middle_and_clipped_pixels(
+    example: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("polcap.pipeline.small_capture._MOST_PIXELS", 7e4)
-    capture = captures.read(example)
     with ThreadPoolExecutor(2) as pool:
-        taken = reduce(capture, 0.98, pool)
-    assert taken.step == 4
-    assert taken.capture.size_px == (288, 216)
-    brightest = taken.decode(taken.capture.shots[0].frames[2])
+        taken = reduce(captures.read(example), 0.98, pool)
+    found, (width, height) = taken.capture, taken.capture.size_px
+    assert taken.step == 4 and (width, height) == (288, 216)
+    assert found.principal_px == pytest.approx(((width - 1) / 2, (height - 1) / 2))
+    assert found.focal_px * taken.step == pytest.approx(84 / 36 * 1152)
+    brightest = taken.decode(found.shots[0].frames[2])
     assert brightest.cfa is None and brightest.value.shape == (216, 288, 3)
     assert ((taken.clipped[0, 2] > 0) == (brightest.value == 1).all(-1)).all()
     assert taken.clipped[0, 2].mean() > 0.001
+
+
+def test_corners_of_the_chart_are_moved_to_the_reduced_picture() -> None:
+    """The outer edges of a block of RAW pixels are the outer edges of its pixel."""
+    edges = np.array([[-0.5, -0.5], [39.5, -0.5], [39.5, 23.5], [-0.5, 23.5]])
+    moved = check._moved(ChartRequest("corners", corners=edges), 4)
+    np.testing.assert_allclose(moved.corners, [[-0.5, -0.5], [9.5, -0.5], [9.5, 5.5], [-0.5, 5.5]])

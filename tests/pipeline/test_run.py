@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -22,6 +23,8 @@ from polcap.images import AngleStack, ColorCalibration, View, single_frames
 from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import STAGES, UserInput, distance_m, on_grid
+from polcap.synth.scenes import random_scene
+from polcap.synth.shooting import Shoot, write
 from tests.conftest import ROOT, Command
 
 
@@ -70,34 +73,29 @@ def test_normals_of_the_bundled_capture_are_near_the_truth(result: Path, example
     assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean() < 12
 
 
+@pytest.fixture
+def copy(result: Path, tmp_path: Path) -> Path:
+    """A copy of the result, to be changed."""
+    shutil.copytree(result, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
 def test_running_again_computes_nothing_and_gives_the_same_bytes(
-    result: Path, example: Path, polcap: Command, tmp_path: Path
+    result: Path, copy: Path, example: Path, polcap: Command
 ) -> None:
-    copy = tmp_path / "again"
-    shutil.copytree(result, copy)
+    (copy / "maps" / "normal.png").write_bytes(b"touched")
+    (copy / "asset" / "capture.obj").unlink()
     again = polcap("process", example, "--out", copy, "--estimator", "analytic")
     states = [line.split()[1] for line in again.stderr.splitlines() if line.startswith(STAGES)]
     assert states.count("cached") == 8 and again.returncode == 0
     assert product(copy) == product(result)
 
 
-def test_a_touched_or_missing_file_is_written_again(
-    result: Path, example: Path, polcap: Command, tmp_path: Path
-) -> None:
-    copy = tmp_path / "again"
-    shutil.copytree(result, copy)
-    (copy / "maps" / "normal.png").write_bytes(b"touched")
-    (copy / "asset" / "capture.obj").unlink()
-    assert polcap("process", example, "--out", copy, "--estimator", "analytic").returncode == 0
-    assert product(copy) == product(result)
-
-
 def test_late_changes_end_as_a_first_run_with_these_settings_does(
-    result: Path, example: Path, polcap: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    copy: Path, example: Path, polcap: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pipeline, "timings", lambda out: {})  # no two runs take the same time
-    late, first = tmp_path / "late", tmp_path / "first"
-    shutil.copytree(result, late)
+    late, first = copy, tmp_path / "first"
     command = ("process", example, "--estimator", "analytic")
     settings = list[str]()
     for setting in ("gates.max_normal_error_deg=1", "asset.ior=1.4", "gates.max_turn_deg=4"):
@@ -107,7 +105,7 @@ def test_late_changes_end_as_a_first_run_with_these_settings_does(
     assert polcap(*command, "--out", late, *settings).returncode == 3
     assert polcap(*command, "--out", first, *settings).returncode == 3
     assert product(late) == product(first)
-    shutil.rmtree(tmp_path / "late" / "asset")
+    shutil.rmtree(late / "asset")
     assert polcap(*command, "--out", late, *settings).returncode == 3
     assert product(late) == product(first)
     told, again = (json.loads((out / "report.json").read_text(encoding="utf-8")) for out in (late, first))
@@ -198,11 +196,7 @@ def test_faulty_capture_is_one_clear_line_and_leaves_nothing(
 
 
 def test_capture_without_chart_says_so_and_passes_with_no_chart(tmp_path: Path, polcap: Command) -> None:
-    from polcap.synth.scenes import random_scene
-    from polcap.synth.shooting import Shoot, write
-
-    scene = random_scene(3, "bumps")
-    bare = type(scene)(**{**{f: getattr(scene, f) for f in scene.__struct_fields__}, "chart": None})
+    bare = msgspec.structs.replace(random_scene(3, "bumps"), chart=None)
     write(tmp_path / "c", bare, Shoot(seed=3, width=384, height=288, exposures=1, samples=1))
     done = polcap("process", tmp_path / "c", "--until", "whitebalance")
     assert done.returncode == 2 and "--no-chart" in done.stderr.splitlines()[-1]
@@ -238,13 +232,11 @@ def test_full_disk_is_one_clear_line_and_leaves_no_partial_file(example: Path, t
 
 @pytest.mark.parametrize("part", ["formats.maps.exr.write", "report.page._pictures", "pipeline.asset_export.write"])
 def test_an_output_that_cannot_be_written_is_one_clear_line(
-    result: Path, example: Path, polcap: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str
+    copy: Path, example: Path, polcap: Command, monkeypatch: pytest.MonkeyPatch, part: str
 ) -> None:
     def refuse(*_: Any, **__: Any) -> None:
         raise StorageError("cannot write it: the disk is full")
 
-    copy = tmp_path / "again"
-    shutil.copytree(result, copy)
     before = product(copy)
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
     monkeypatch.setattr(f"polcap.{part}", refuse)
@@ -308,27 +300,18 @@ def test_distance_follows_from_the_size_of_the_chart() -> None:
     assert distance_m(color, stack(2, 2, 1.0)) == pytest.approx(0.1)
 
 
-def test_the_example_from_python_runs(result: Path, example: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "copy"
-    shutil.copytree(result, copy)
+def test_the_example_from_python_runs(copy: Path, example: Path) -> None:
     script = ROOT / "examples" / "from_python.py"
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, script, example, copy], env=environment, capture_output=True, text=True)
     assert done.returncode == 0 and "stillness pass" in done.stdout, done.stderr
 
 
-def test_the_gallery_shows_each_result_and_stands_alone(result: Path, tmp_path: Path) -> None:
-    copy, page = tmp_path / "copy", tmp_path / "gallery.html"
-    shutil.copytree(result, copy)
+def test_the_gallery_shows_each_result_and_stands_alone(copy: Path, tmp_path: Path) -> None:
+    page = tmp_path / "gallery.html"
     command = [sys.executable, *map(str, (ROOT / "examples" / "gallery.py", page, copy, copy))]
     done = subprocess.run(command, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     text = page.read_text()
     assert text.count("data:image/webp") == 2 and text.count('<a href="copy/report.html">') == 2
     assert "http" not in text
-
-
-def test_a_start_loads_no_library_that_only_some_runs_need() -> None:
-    loaded = "print([m for m in ('scipy', 'onnxruntime') if m in sys.modules])"
-    code = f"import sys, polcap.pipeline.run, polcap.pipeline.check; {loaded}"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

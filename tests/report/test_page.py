@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from polcap import report
+from polcap.pipeline import run as pipeline
 from polcap.report import keys, labels, page
 
 
@@ -46,3 +47,11 @@ def test_agreement_is_drawn_gray_and_registration_has_a_caption(result: Path) ->
 def test_an_empty_list_is_shown_as_none() -> None:
     assert labels.text("chart.unused", []) == labels.text("chart.unused", {}) == "none"
     assert labels.text("chart.unused", [1, 2]) == "1, 2"
+
+
+def test_a_name_from_a_file_is_text_and_no_markup(result: Path, tmp_path: Path) -> None:
+    about = report.read(result)
+    about["capture"]["name"] = "<i>jug</i>"
+    page.write(tmp_path, about, pipeline.reopen(result)[0])
+    text = (tmp_path / "report.html").read_text()
+    assert "<i>jug" not in text and "&lt;i&gt;jug" in text

@@ -40,9 +40,7 @@ def test_a_folder_that_is_no_result_is_named_with_its_remedy(tmp_path: Path) -> 
         report.read(tmp_path / "maps")
 
 
-@pytest.mark.parametrize(
-    "left_out", ["verdict", "gates", "keys", "model", "figures.maps", "gates.0.state", "gates.0.says"]
-)
+@pytest.mark.parametrize("left_out", ["verdict", "gates", "keys", "model", "figures", "gates.0.state", "gates.0.says"])
 def test_a_report_of_another_polcap_is_one_line(result: Path, tmp_path: Path, left_out: str) -> None:
     about = json.loads((result / "report.json").read_text("utf-8"))
     *outer, last = left_out.split(".")

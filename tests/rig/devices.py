@@ -110,7 +110,7 @@ class Grbl(Device):
         self._forget()
 
     def _forget(self) -> None:
-        """What GRBL loses at a reset."""
+        """Empty the buffers, as at a reset."""
         self._input = b""
         self._lines: list[str] = []
         self._planned: list[float] = []  # ring degrees

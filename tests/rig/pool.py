@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from polcap.errors import HardwareError
 from polcap.formats.raw.file_bytes import digest
@@ -51,6 +52,13 @@ def tiny(path: Path, **exif: object) -> bytes:
     random = np.random.default_rng([*repr(exif).encode()])
     mosaic = random.integers(600, 9000, (24, 32)).astype(np.uint16)
     return write_raw(path, mosaic, Exif(**{**tags, **exif}))  # type: ignore[arg-type]
+
+
+def virtual_gphoto2(monkeypatch: pytest.MonkeyPatch, card: Path) -> None:
+    """Connect libgphoto2's virtual camera, which photographs the file `card`/x.jpg; skips without gphoto2."""
+    gphoto2 = pytest.importorskip("gphoto2")
+    monkeypatch.setenv("IOLIBS", str(Path(gphoto2.__file__).parent / "libgphoto2" / "vusb"))
+    monkeypatch.setenv("VCAMERADIR", f"{card}/")
 
 
 class PoolCamera:

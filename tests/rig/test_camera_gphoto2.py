@@ -1,7 +1,5 @@
 """The camera driver with libgphoto2's own virtual camera: dials, RAW bytes, and failures."""
 
-import importlib.util
-import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +13,7 @@ from polcap.rig.camera_gphoto2 import CallTimeout, Gphoto2Camera
 from polcap.rig.device_log import Log
 from polcap.rig.device_urls import open_camera
 from polcap.rig.exposure_bracket import Exposure
-from tests.rig.pool import tiny
+from tests.rig.pool import tiny, virtual_gphoto2
 
 gphoto2 = pytest.importorskip("gphoto2")
 
@@ -23,12 +21,9 @@ gphoto2 = pytest.importorskip("gphoto2")
 @pytest.fixture
 def card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The virtual camera's card: the camera photographs its file."""
-    spec = importlib.util.find_spec("gphoto2")
-    assert spec is not None and spec.origin is not None
-    monkeypatch.setenv("IOLIBS", os.path.join(os.path.dirname(spec.origin), "libgphoto2", "vusb"))
     card = tmp_path / "card"
     card.mkdir()
-    monkeypatch.setenv("VCAMERADIR", f"{card}/")
+    virtual_gphoto2(monkeypatch, card)
     tiny(card / "x.jpg")
     return card
 

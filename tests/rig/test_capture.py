@@ -1,8 +1,6 @@
 """`polcap capture` as a user's shell runs it."""
 
-import importlib.util
 import json
-import os
 import tomllib
 from pathlib import Path
 
@@ -15,7 +13,7 @@ from polcap.rig import camera_gphoto2
 from tests.conftest import ROOT, Command
 from tests.rig import virtual
 from tests.rig.devices import Elliptec
-from tests.rig.pool import Key
+from tests.rig.pool import Key, virtual_gphoto2
 
 SIMULATED = ("--rotator", "simulated?settle=0", "--camera", "simulated?width=96&height=72&samples=1", "--no-check")
 
@@ -85,11 +83,7 @@ def test_a_motor_on_a_port_and_a_camera_on_a_cable_make_a_capture(
     polcap: Command, tmp_path: Path, pool: dict[Key, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A simulated Elliptec and libgphoto2's virtual camera; the test supplies the camera's view."""
-    spec = importlib.util.find_spec("gphoto2")
-    if spec is None or spec.origin is None:
-        pytest.skip("gphoto2 is not installed")
-    monkeypatch.setenv("IOLIBS", os.path.join(os.path.dirname(spec.origin), "libgphoto2", "vusb"))
-    monkeypatch.setenv("VCAMERADIR", f"{tmp_path}/")
+    virtual_gphoto2(monkeypatch, tmp_path)
     size = max(map(len, pool.values()))  # the virtual camera believes that its files keep their size
 
     def seen(angle: float, step: int) -> bytes:
@@ -103,10 +97,8 @@ def test_a_motor_on_a_port_and_a_camera_on_a_cable_make_a_capture(
     monkeypatch.setattr(camera_gphoto2.Gphoto2Camera, "prepare", prepare)
     folder = tmp_path / "capture"
     with virtual.time(), Elliptec() as device:
-        url = f"elliptec:{device.port}?settle=0"
-        done = polcap(
-            "capture", folder, "--rotator", url, "--camera", "gphoto2", "--bracket", "1/200,1/50,1/13", "--no-check"
-        )
+        options = ("--camera", "gphoto2", "--bracket", "1/200,1/50,1/13", "--no-check")
+        done = polcap("capture", folder, "--rotator", f"elliptec:{device.port}?settle=0", *options)
         assert done.returncode == 0, done.stderr
         assert not device.moving and "0ma" in " ".join(device.heard)
     understood = captures.read(folder)

@@ -13,7 +13,7 @@ import serial
 
 from polcap.rig import device_urls, motor_elliptec_ell14, motor_grbl, motor_line_protocol, rotator, serial_port
 
-_STEP_S = 0.002  # how often a device looks at its clock
+_STEP_S = 0.002  # between two steps of a device
 _BITS = 10  # of a byte on the wire: start, eight, stop
 _MODULES = (serial_port, motor_elliptec_ell14, motor_grbl, motor_line_protocol, rotator, device_urls)
 

@@ -89,20 +89,17 @@ def test_half_a_percent_in_a_patch_is_seen_and_rounding_is_not(name: str) -> Non
 
 
 def changed(array: Any, unit: str) -> Any:
-    """The array with 0.5 % more in a patch of 32×32 pixels, a fiftieth of the rows of a table, or its largest number.
+    """The array with 0.5 % more in a patch of 32×32 pixels (a fiftieth of a long table), or in its largest number.
 
     Whole numbers get 2 more or less, bits are inverted, angles get 0.5 % of a radian.
     """
     other = np.array(array)
-    height_width = [axis for axis, length in enumerate(other.shape) if length > 64]
-    if len(height_width) == 2:
-        patch: Any = [slice(None)] * other.ndim
-        for axis in height_width:
-            middle = other.shape[axis] // 2
-            patch[axis] = slice(middle - 16, middle + 16)
-        patch = tuple(patch)
-    elif height_width:
-        patch = slice(len(other) // 2, len(other) // 2 + len(other) // 50)
+    if max(other.shape, default=0) > 64:
+        half = [max(16, length // 100) for length in other.shape]
+        patch: Any = tuple(
+            slice(length // 2 - width, length // 2 + width) if length > 64 else slice(None)
+            for length, width in zip(other.shape, half)
+        )
     else:
         patch = np.unravel_index(np.argmax(np.abs(np.nan_to_num(other))), other.shape)
     part = other[patch]

@@ -22,7 +22,7 @@ MASKS = ("found", "whole", "one pixel", "line", "two specks", "disc")
 
 
 def hostile(seed: int) -> tuple[AngleStack, np.ndarray | None]:
-    """A stack and a user's mask (None: to be found), drawn at random from what may go wrong."""
+    """A stack and a user's mask (None: to be found), with random defects."""
     random = np.random.default_rng(seed)
     shots = int(random.integers(3, 7))
     angle = np.sort(random.uniform(0, np.pi, shots)) if random.integers(2) else np.arange(shots) * np.pi / shots
@@ -73,7 +73,7 @@ def hostile(seed: int) -> tuple[AngleStack, np.ndarray | None]:
 
 
 def run(radiance: AngleStack, drawn: np.ndarray | None) -> None:
-    """Every stage after the merge, and the gates; what they refuse is fine."""
+    """Every stage after the merge, and the gates; a refusal by an InputError is allowed."""
     config, color = Config(), scenes.no_color()
     try:
         alignment = align.register(radiance, color, config.align)
@@ -95,8 +95,8 @@ def run(radiance: AngleStack, drawn: np.ndarray | None) -> None:
         "radiance": radiance, "color": color, "alignment": alignment, "object_": object_, "selfcal": calibration,
         "stokes": image, "maps": maps, "mesh": mesh,
     }  # fmt: skip
-    told = list(gates.judge(Evidence.partial(**found), config.gates, config.align))
-    assert all(gate.message and gate.state in ("pass", "warn", "fail", "not measured") for gate in told)
+    judged = list(gates.judge(Evidence.partial(**found), config.gates, config.align))
+    assert all(gate.message and gate.state in ("pass", "warn", "fail", "not measured") for gate in judged)
     assert built.base_color.dtype == np.uint8
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from polcap.errors import ModelError, ObjectError
+from polcap.errors import ObjectError
 from polcap.images import ChartPlace
 from polcap.stages import mask
 from polcap.stages.mask import graph_cut, mask_channels, regions
@@ -194,19 +194,3 @@ def test_expected_error_is_one_minus_the_mean_overlap():
     found = chance > 0.5
     overlaps = [((t := rng.random(chance.shape) < chance) & found).sum() / (t | found).sum() for _ in range(20)]
     assert 1 - regions.expected_error(found, chance) == pytest.approx(np.mean(overlaps), abs=0.005)
-
-
-def test_parallel_passes_give_the_bytes_of_sequential_ones():
-    stack, color = scenes.stack(noise=0.004), chart_color()
-    no_chart = np.zeros(stack.value.shape[1:3], np.uint8)
-    found = [
-        mask_network.object_probability(stack, scenes.still(), color, no_chart, model, run)
-        for model in (network(), dataclasses.replace(network(), at_once=3))
-    ]
-    assert found[0].tobytes() == found[1].tobytes()
-
-    def lost(_):
-        raise ModelError("the network failed")
-
-    with pytest.raises(ModelError, match="the network failed"):
-        segment(stack, color, model=dataclasses.replace(network(lost), at_once=3))

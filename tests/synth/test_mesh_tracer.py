@@ -6,7 +6,9 @@ import pytest
 pytest.importorskip("embreex")
 
 from polcap.images import Floats, View
+from polcap.optics import frames
 from polcap.synth import mesh_tracer
+from polcap.training import random_shapes
 
 SIZE = 96
 VIEW = View(focal=300.0, center=(47.5, 47.5), scale=1.0)
@@ -16,12 +18,8 @@ FAR = np.array([0.0, 0.0, -3.0])
 def ball(
     radius: float = 0.4, centre: tuple[float, float, float] = (0, 0, 0), steps: int = 128
 ) -> mesh_tracer.Triangles:
-    polar, around = np.meshgrid(np.linspace(0, np.pi, steps), np.linspace(0, 2 * np.pi, 2 * steps), indexing="ij")
-    unit = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], -1)
-    i, j = np.meshgrid(np.arange(steps - 1), np.arange(2 * steps - 1), indexing="ij")
-    a, b = i * 2 * steps + j, (i + 1) * 2 * steps + j
-    faces = np.stack([a, b, b + 1, a, b + 1, a + 1], -1).reshape(-1, 3)
-    return mesh_tracer.smooth(radius * unit.reshape(-1, 3) + np.array(centre), faces)
+    unit, faces = random_shapes._sphere(steps, 2 * steps)
+    return mesh_tracer.smooth(radius * unit + np.array(centre), faces)
 
 
 def hit_ball(radius: float, centre: Floats) -> Floats:
@@ -80,7 +78,5 @@ def test_normals_face_the_camera_even_inside_an_open_bowl() -> None:
     upper = mesh_tracer.Triangles(bowl.vertices, bowl.faces[: len(bowl.faces) // 2], bowl.corner_normals)
     turn = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # look into it
     seen = mesh_tracer.Tracer(upper).trace(turn, FAR, VIEW, SIZE, SIZE)
-    from polcap.optics import frames
-
     facing = np.sum(seen.normal * frames.rays(VIEW, SIZE, SIZE), axis=-1)
     assert facing[seen.mask].min() > 0

@@ -14,6 +14,7 @@ from polcap.optics import frames
 from polcap.synth import distance_fields, render, trace
 from polcap.synth.render import Scene
 from polcap.synth.scene_materials import Coat, Material
+from polcap.training import random_shapes
 
 SIDE, SAMPLES, FINE, FOV = 96, 256, 6, 36.0
 ALBEDO, ALPHA, IOR, STRENGTH = 0.6, 0.16, 1.55, 0.8
@@ -72,16 +73,12 @@ def ours(which: Scene) -> tuple[Floats, Floats]:
 
 def tessellated(mi: Any, shape: distance_fields.Bumps, at: trace.Vector, rings: int = 500) -> Any:
     """The waved ellipsoid as triangles half a millimetre across, with its own normals at their corners."""
-    polar, around = np.meshgrid(np.linspace(0, np.pi, rings), np.linspace(0, 2 * np.pi, 2 * rings), indexing="ij")
-    unit = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], -1).reshape(-1, 3)
+    unit, faces = random_shapes._sphere(rings, 2 * rings)
     raised = np.sum([a * np.sin(unit @ [x, y, z] + phase) for a, x, y, z, phase in shape.waves], axis=0)
     point = unit * (1 + raised)[:, None] * shape.size
     step = 1e-5 * np.eye(3)
     slope = np.stack([shape.distance(point + s) - shape.distance(point - s) for s in step], -1)
     normal = slope / np.linalg.norm(slope, axis=-1, keepdims=True)
-    i, j = np.meshgrid(np.arange(rings - 1), np.arange(2 * rings - 1), indexing="ij")
-    a, b = i * 2 * rings + j, (i + 1) * 2 * rings + j
-    faces = np.stack([a, b, b + 1, a, b + 1, a + 1], -1).reshape(-1, 3)
     settings = mi.Properties()
     settings["bsdf"] = mi.load_dict(MATERIAL)
     mesh = mi.Mesh("bumps", len(point), len(faces), has_vertex_normals=True, props=settings)

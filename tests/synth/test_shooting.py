@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rawpy
+from msgspec.structs import replace
 
 from polcap.errors import CaptureError, SettingError
 from polcap.formats import shipped_data
@@ -22,21 +23,9 @@ from polcap.synth.shooting import Scene, Shoot
 GREY = Coat((Material((0.6, 0.6, 0.6), (0.6, 0.6, 0.6), "plain", roughness=(0.5, 0.5)),))
 BALL = Scene(shape=Cluster(((0, 0, 0, 0.08),)), coat=GREY, position=(-0.08, 0.0, -0.7), light=(0.0, 0.0, 0.0))
 STILL = Shoot(
-    width=288,
-    height=216,
-    exposures=1,
-    gain_jitter=0.0,
-    nudge_px=0.0,
-    nudge_deg=0.0,
-    angle_error_deg=0.0,
-    extinction_ratio=1e9,
-    samples=2,
-    sensor=Sensor(full_well=1e8, read_noise=0.0),
-)
-
-
-def replaced(shoot: Shoot, **changes: Any) -> Shoot:
-    return Shoot(**{**{name: getattr(shoot, name) for name in shoot.__struct_fields__}, **changes})
+    width=288, height=216, exposures=1, gain_jitter=0.0, nudge_px=0.0, nudge_deg=0.0, angle_error_deg=0.0,
+    extinction_ratio=1e9, sensor=Sensor(full_well=1e8, read_noise=0.0),
+)  # fmt: skip
 
 
 def taken(folder: Path, scene: Scene, shoot: Shoot) -> tuple[list[np.ndarray], dict[str, Any], dict[str, np.ndarray]]:
@@ -53,7 +42,7 @@ def taken(folder: Path, scene: Scene, shoot: Shoot) -> tuple[list[np.ndarray], d
 
 @pytest.fixture(scope="module")
 def still(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    shoot = replaced(STILL, angles_deg=(0.0, 45.0, 90.0, 135.0), blur_px=0.0)
+    shoot = replace(STILL, angles_deg=(0.0, 45.0, 90.0, 135.0), blur_px=0.0)
     return taken(tmp_path_factory.mktemp("still") / "capture", BALL, shoot)
 
 
@@ -134,7 +123,7 @@ def centroid(picture: np.ndarray, quad: np.ndarray) -> np.ndarray:
 def test_transform_maps_the_chart_to_its_place_in_a_shot(tmp_path: Path) -> None:
     scene = Scene(BALL.shape, GREY, position=(-0.09, 0, -0.7), chart=Chart(center=(0.1, 0.02, -0.69), pitch=0.024))
     pictures, truth, _ = taken(
-        tmp_path / "c", scene, replaced(STILL, width=576, height=432, nudge_px=12.0, nudge_deg=1.0, seed=6)
+        tmp_path / "c", scene, replace(STILL, width=576, height=432, nudge_px=12.0, nudge_deg=1.0, seed=6)
     )
     quads = np.array(truth["chart"]["patch_corners_px"])[[18, 19, 20, 15, 5, 10]]
     found = []  # (K, 6, 2)
@@ -171,7 +160,7 @@ def test_same_seed_same_bytes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("bracket", ["time", "aperture", "iso", "flash"])
 def test_every_kind_of_bracket_steps_by_four(tmp_path: Path, bracket: str) -> None:
-    shoot = replaced(STILL, width=96, height=72, samples=1, exposures=3, angles_deg=(0.0,), bracket=bracket)
+    shoot = replace(STILL, width=96, height=72, samples=1, exposures=3, angles_deg=(0.0,), bracket=bracket)
     pictures, truth, maps = taken(tmp_path / "c", BALL, shoot)
     dim = maps["mask"] & (pictures[2] < 0.9)
     assert dim.sum() > 50
@@ -207,10 +196,10 @@ def test_existing_files_are_not_overwritten(tmp_path: Path) -> None:
 def test_a_camera_that_rolls_turns_its_polarizer_with_it() -> None:
     """A ball on the axis under a flash at the lens looks the same however the camera is rolled."""
     scene = Scene(shape=BALL.shape, coat=GREY, position=(0.0, 0.0, -0.7), light=(0.0, 0.0, 0.0), chart=None)
-    studio = shooting.Studio(scene, replaced(STILL, width=96, height=72, samples=1, blur_px=0.0))
+    studio = shooting.Studio(scene, replace(STILL, width=96, height=72, samples=1, blur_px=0.0))
     rolled = shooting.transform(studio.shoot, (0.0, 0.0), 20.0)
     pose = {"actual_deg": 30.0, "rot_deg": 20.0, "transform": rolled.tolist()}
     upright, other = studio.through(30.0), studio.through(70.0)
-    found = studio.radiance(pose, first=False)
+    found = studio.radiance(pose)
     inside = studio.buffer.mask & (studio.buffer.normal[..., 2] > 0.35)
     assert np.abs(found - upright)[inside].max() < 0.02 * np.abs(other - upright)[inside].max()

@@ -77,11 +77,12 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def views(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("views")
-    traced_views.build_cache(folder, [data / "meshes" / "train" / "one.npz"], RECIPE)
+    traced_views.open_cache(folder, [data / "meshes" / "train" / "one.npz"], RECIPE)
     return folder
 
 
 @pytest.fixture(scope="session")
-def simulator(views: Path) -> Simulator:
+def simulator(data: Path, views: Path) -> Simulator:
     device = torch.device("cpu")
-    return Simulator(traced_views.load_cache(views), materials.MaterialLibrary(None, device), device)
+    cache = traced_views.open_cache(views, [data / "meshes" / "train" / "one.npz"], RECIPE)
+    return Simulator(cache, materials.MaterialLibrary(None, device), device)

@@ -9,8 +9,8 @@ import torch
 
 from polcap.images import Floats, View
 from polcap.optics import frames, shade
-from polcap.synth.mesh_tracer import Tracer, Triangles, smooth
-from polcap.training import bounced_light, light_transport, traced_views
+from polcap.synth.mesh_tracer import Tracer, Triangles, smooth, union
+from polcap.training import bounced_light, light_transport, random_shapes, traced_views
 from polcap.training.materials import Surface
 from polcap.training.simulator import Simulator
 
@@ -19,26 +19,17 @@ SIZE, ALBEDO, F0, ROUGHNESS = 96, 0.6, 0.08, 0.35
 
 def _bowl() -> Triangles:
     """A thin half sphere, open towards z."""
-    polar, around = np.meshgrid(np.linspace(np.pi / 2, np.pi, 60), np.linspace(0, 2 * np.pi, 121)[:-1], indexing="ij")
-    unit = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], axis=-1)
-    rows, columns = np.meshgrid(np.arange(59), np.arange(120), indexing="ij")
-    a, b = rows * 120 + columns, rows * 120 + (columns + 1) % 120
-    faces = np.stack([a, a + 120, b + 120, a, b + 120, b], axis=-1).reshape(-1, 3)
-    inner = smooth(0.48 * unit.reshape(-1, 3), faces[:, ::-1])
-    outer = smooth(0.5 * unit.reshape(-1, 3), faces)
-    return Triangles(
-        np.concatenate([inner.vertices, outer.vertices]),
-        np.concatenate([inner.faces, outer.faces + len(inner.vertices)]).astype(np.int32),
-        np.concatenate([inner.corner_normals, outer.corner_normals]),
-    )
+    unit, faces = random_shapes._sphere(121, 120)
+    lower = faces[unit[faces][..., 2].max(axis=1) < 1e-9]
+    return union([smooth(0.48 * unit, lower[:, ::-1]), smooth(0.5 * unit, lower)])
 
 
 def _both(turn: Floats) -> tuple[Floats, Floats]:
     """Once-bounced light (3, M, 3) of training, and as `light_transport.py` traces it."""
     mesh = _bowl()
     translation, view = np.array([0, 0, -4.0]), View(3.3 * SIZE, ((SIZE - 1) / 2, (SIZE - 1) / 2), 1.0)
-    scene = light_transport.MeshScene(mesh)
-    buffer = Tracer(mesh).trace(turn, translation, view, SIZE, SIZE)
+    scene = Tracer(mesh)
+    buffer = scene.trace(turn, translation, view, SIZE, SIZE)
     pose, mask = light_transport.Pose(turn, translation, np.zeros(3), 16.0), buffer.mask
     lit, met = bounced_light.trace_visibility(scene, buffer, pose, np.random.default_rng(1))
     middle, unit = traced_views.depth_unit(mask, buffer.depth, view.focal)
@@ -61,12 +52,9 @@ def _both(turn: Floats) -> tuple[Floats, Floats]:
 
     local = torch.from_numpy(normal).float()
     flash = frames.to_ray_frame(-seen.place / seen.place.norm(dim=1, keepdim=True), seen.v)
-    dressed = SimpleNamespace(diffuse=look[0], specular=look[1], roughness=look[2], ior=np.full(len(ones), 1.5))
-    surface = Surface(local, *(torch.from_numpy(a).float() for a in vars(dressed).values()))
-    squared = (seen.place**2).sum(dim=1)
-    body = shade.stokes(
-        local, surface.diffuse, 0 * surface.specular, surface.roughness, surface.ior, flash, seen.lit / squared
-    )
+    surface = Surface(local, *(torch.from_numpy(a).float() for a in (*look, np.full(len(ones), 1.5))))
+    gloss = 0 * surface.specular, surface.roughness, surface.ior
+    body = shade.stokes(local, surface.diffuse, *gloss, flash, seen.lit / (seen.place**2).sum(dim=1))
     return bounced_light.bounced_stokes(seen, local, surface, body[0]).numpy(), traced
 
 

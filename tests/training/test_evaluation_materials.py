@@ -54,12 +54,6 @@ def test_slopes_of_materials_are_bounded(
         assert 0 < np.sqrt(np.mean(steep**2)) < 0.4 and steep.max() < 0.61, material.name
 
 
-def test_materials_accept_zero_places(library: list[evaluation_materials.TestMaterial]) -> None:
-    none = np.zeros((0, 3))
-    for material in library:
-        assert material.at(none, none).diffuse.shape == material.slope(none, none).shape == (0, 3), material.name
-
-
 def test_missing_texture_sets_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds 0 texture sets"):
         evaluation_materials.test_materials(tmp_path)

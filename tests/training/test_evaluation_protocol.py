@@ -95,13 +95,6 @@ def test_binning_keeps_light_and_lowers_noise(test_data: Path) -> None:
     assert np.median(case.small.ratio_sigma[inner]) < 0.6 * np.median(case.cues.ratio_sigma[case.cues.mask])
 
 
-def test_lights_surround_the_camera() -> None:
-    lights = evaluation_protocol.render_lights()
-    assert lights.shape == (20, 3) and np.allclose(np.linalg.norm(lights, axis=1), 1)
-    assert np.degrees(np.arccos(lights[:, 2])).max() < 60
-    assert np.abs(lights[:, :2].mean(axis=0)).max() < 0.06
-
-
 def test_missing_meshes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds 0 meshes"):
         Protocol(tmp_path, 96)

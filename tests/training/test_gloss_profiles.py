@@ -55,36 +55,6 @@ def test_excess_light_at_normal_incidence_is_the_specular_lobe() -> None:
     assert float(found[0]) > float(found[1]) > float(found[2]) > float(found[4])
 
 
-def test_two_colors_in_a_fine_print_are_distinguished() -> None:
-    """With groups made of color alone, each color of a checkerboard hears what it would hear alone."""
-    torch.manual_seed(0)
-    side, reader = 32, gloss_profiles.Profiles(2, 2, 3)
-    torch.nn.init.zeros_(reader.sort.weight)
-    torch.nn.init.zeros_(reader.sort.bias)
-    first, _, last = reader.part
-    for layer in (first, last):
-        torch.nn.init.zeros_(layer.weight)
-        torch.nn.init.zeros_(layer.bias)
-    with torch.no_grad():
-        first.weight[0, -1], first.weight[1, -1] = 50.0, -50.0  # lighter than the mean, darker
-        last.weight[0, 0] = last.weight[1, 1] = 1.0
-    y, x = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
-    light = ((x + y) % 2 == 0)[None, None]
-    diffuse = torch.where(light, 0.6, 0.1).expand(1, 3, side, side)
-    figures, zenith, one = torch.rand(1, 5, side, side), torch.rand(1, 1, side, side), torch.ones(1, 1, side, side)
-    coarse, fine = torch.rand(1, 2, side // 2, side // 2), torch.rand(1, 2, side, side)
-
-    def told(usable: torch.Tensor) -> torch.Tensor:
-        with torch.no_grad():
-            return reader(coarse, fine, gloss_profiles.GlossEvidence(figures, zenith, diffuse, usable))
-
-    both = told(one)
-    for kind in (light, ~light):
-        alone = told(one * kind)[:, :, kind[0, 0]]
-        torch.testing.assert_close(both[:, :, kind[0, 0]], alone, rtol=1e-3, atol=1e-3)
-    assert (both[:, :, 0, 0] - both[:, :, 0, 1]).abs().max() > 0.01
-
-
 class Alone(torch.nn.Module):  # type: ignore[misc]
     """`profile` as a model of its own: 14 channels are the groups, the figures and the cosine."""
 

@@ -5,7 +5,7 @@ import pytest
 
 from polcap.images import Floats
 from polcap.optics import fresnel
-from polcap.synth.mesh_tracer import Triangles, smooth
+from polcap.synth.mesh_tracer import Tracer, Triangles, smooth
 from polcap.training import light_transport, random_shapes
 
 _RADIUS, _ALBEDO = 0.5, 0.6
@@ -18,9 +18,9 @@ def _sphere() -> Triangles:
 
 def _inside(
     roughness: float, specular: float, ior: float
-) -> tuple[light_transport.MeshScene, light_transport.SurfacePoints, light_transport.Pose]:
+) -> tuple[Tracer, light_transport.SurfacePoints, light_transport.Pose]:
     """Places inside a sphere, each seen along its normal; the flash in the middle."""
-    scene = light_transport.MeshScene(_sphere())
+    scene = Tracer(_sphere())
     rng = np.random.default_rng(3)
     out = rng.normal(size=(400, 3))
     out /= np.linalg.norm(out, axis=1, keepdims=True)
@@ -59,11 +59,11 @@ def test_flash_casts_shadows() -> None:
     points, faces = random_shapes._sphere(48, 64)
     ball = points * 0.05 + [0, 0, 0.8]
     mesh = smooth(np.concatenate([points * 0.5, ball]), np.concatenate([faces, faces + len(points)]))
-    scene = light_transport.MeshScene(mesh)
+    scene = Tracer(mesh)
     x = np.linspace(-0.2, 0.2, 201)
     place = np.stack([x, 0 * x, np.sqrt(0.25 - x**2)], axis=1)
     pose = light_transport.Pose(np.eye(3), np.zeros(3), np.array([0, 0, 2.0]), 1.0)
-    _, irradiance = scene.lit(place, place / 0.5, pose)
+    _, irradiance = light_transport.flash_light(scene, place, place / 0.5, pose)
     cone = np.tan(np.arcsin(0.05 / 1.2))
     dark = np.abs(x) < cone * (2 - place[:, 2])
     assert np.mean((irradiance == 0) == dark) > 0.97

@@ -9,7 +9,7 @@ import pytest
 from polcap.images import Quality
 from polcap.training import map_errors
 from polcap.training.evaluation_protocol import Case, Protocol
-from polcap.training.map_errors import Judge, deciles
+from polcap.training.map_errors import Judge
 
 
 @pytest.fixture(scope="module")
@@ -77,9 +77,3 @@ def test_rendering_error_ignores_clipped_light_only(case: Case) -> None:
     judge = Judge(replace(case, truth=matte))
     figures = judge.score(replace(matte, diffuse=matte.diffuse / 2))
     assert figures["rendering"] == pytest.approx(float(np.sqrt(np.mean((judge.rendered / 2) ** 2))), rel=0.03)
-
-
-def test_deciles_pair_predicted_with_actual() -> None:
-    predicted = np.linspace(1, 20, 1000)
-    rows = deciles(predicted, 2 * predicted)
-    assert len(rows) == 10 and all(r["actual"] == pytest.approx(2 * r["predicted"]) for r in rows)

@@ -9,13 +9,7 @@ import torch
 from polcap.formats import onnx
 from polcap.stages.mask.mask_channels import CHANNELS, ENCODING
 from polcap.synth.mesh_tracer import Tracer, smooth
-from polcap.training import (
-    mask_scenes,
-    mask_train,
-    mask_views,
-    materials,
-    random_shapes,
-)
+from polcap.training import backdrop_patterns, mask_scenes, mask_train, mask_views, materials, random_shapes
 
 SIZE = (72, 96)
 
@@ -99,3 +93,10 @@ def test_an_inserted_object_is_part_of_the_truth(tmp_path: Path, picture: mask_s
         _, truth = mask_train.load_varied(tmp_path / "0.npy", np.random.default_rng(4), other)
         shares.append(truth.mean())
     assert shares[1] >= shares[0] > 0
+
+
+def test_backdrop_patterns_are_albedos_in_color() -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (500, 3))
+    for seed in range(16):
+        albedo = backdrop_patterns.draw_pattern(points, np.random.default_rng(seed))
+        assert albedo.shape == (500, 3) and 0 < albedo.min() <= albedo.max() <= 0.95

@@ -93,12 +93,3 @@ def test_each_color_is_described_by_its_own_light() -> None:
     of_red = (member[0].flatten(1) @ red.flatten()) / member[0].flatten(1).sum(dim=1)
     assert moved[of_red > 0.9].min() > 0.1
     assert moved[of_red < 0.1].max() < 0.05
-
-
-def test_untrained_color_gloss_corrects_nothing() -> None:
-    picture, which = print_of([RED, BLUE])
-    one = torch.ones(1, 1, *which.shape)
-    figures, first = torch.rand(2, 1, 5, *which.shape)
-    _, member, colors = recolored(picture, 1.0)
-    seen = gloss_profiles.GlossEvidence(figures, one, picture, one)
-    assert recurring_colors.ColorGloss(5)(seen, first, member, colors).abs().max() == 0

@@ -65,9 +65,11 @@ def test_pixels_that_see_each_other_face_each_other(simulator: Simulator, size: 
 
 
 @pytest.mark.parametrize("size", [32, 64])
-def test_batch_is_finite_and_empty_outside(simulator: Simulator, size: int) -> None:
+def test_batch_is_finite_empty_outside_and_follows_from_the_seed(simulator: Simulator, size: int) -> None:
     torch.manual_seed(1)
     batch = simulator.draw_batch(5, size)
+    torch.manual_seed(1)
+    assert torch.equal(batch.channels, simulator.draw_batch(5, size).channels)
     assert batch.channels.shape == (5, len(cues.CHANNELS), size, size) and batch.channels.isfinite().all()
     outside = batch.channels[:, cues.CHANNELS.index("mask")] == 0
     assert (batch.channels.abs().sum(dim=1)[outside] == 0).all()
@@ -77,20 +79,3 @@ def test_batch_is_finite_and_empty_outside(simulator: Simulator, size: int) -> N
     torch.testing.assert_close(length, torch.ones_like(length))
     assert batch.normal[:, 2][batch.mask].min() > 0
     assert batch.diffuse.min() >= 0 and batch.diffuse.max() <= 1 and batch.specular.max() <= 0.4
-
-
-def test_batches_follow_from_the_seed(simulator: Simulator) -> None:
-    def draw() -> torch.Tensor:
-        torch.manual_seed(9)
-        return simulator.draw_batch(3, 64).channels
-
-    torch.testing.assert_close(draw(), draw(), rtol=0, atol=0)
-
-
-def test_materials_vary_within_their_ranges(simulator: Simulator) -> None:
-    torch.manual_seed(2)
-    batch = simulator.draw_batch(24, 32)
-    reflectance = torch.stack([b[:, m].mean() for b, m in zip(batch.specular, batch.mask)])
-    assert batch.specular[:, :, :][batch.mask[:, None].expand_as(batch.specular)].min() >= 0.015
-    assert reflectance.std() > 0.005
-    assert torch.stack([b[:, m].mean() for b, m in zip(batch.roughness, batch.mask)]).std() > 0.1

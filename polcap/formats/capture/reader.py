@@ -79,13 +79,11 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
 
 def _photographs(folder: Path, plan: layouts.Plan) -> dict[Path, Source]:
     """Every photograph of a plan, each named once."""
-    used: dict[Path, Source] = {}
-    for source in (source for _, bracket in plan.shots for source in bracket):
-        used.setdefault(source.path, source)
-    if plan.layout != "sensor" and len(used) < sum(len(bracket) for _, bracket in plan.shots):
-        raise CaptureError(f"{folder / capture_toml.NAME}: names a file twice; give each frame one entry")
-    every = used | {source.path: source for source in plan.others}
-    if len(every) < len(used) + len(plan.others):
+    listed = [source for _, bracket in plan.shots for source in bracket]
+    if plan.layout == "sensor":  # a frame holds all angles
+        listed = list({source.path: source for source in listed}.values())
+    every = {source.path: source for source in (*listed, *plan.others)}
+    if len(every) < len(listed) + len(plan.others):
         raise CaptureError(f"{folder / capture_toml.NAME}: names a file twice; give each frame one entry")
     return every
 

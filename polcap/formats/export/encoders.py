@@ -28,7 +28,11 @@ Kind = Literal["png", "jpeg", "webp", "ktx2"]
 MIME: dict[Kind, str] = {"png": "image/png", "jpeg": "image/jpeg", "webp": "image/webp", "ktx2": "image/ktx2"}
 Frames = list[NDArray[np.uint8]]
 _ANIMATION_QUALITY = 80
-_PROGRAMS = ("ktx", "toktx")
+_KTX2 = {  # options of each encoder: UASTC with mipmaps, which preserves normals
+    "ktx": "create --format {pixel} --assign-tf {transfer} --encode uastc --threads 1 "
+    "--generate-mipmap {source} {target}",
+    "toktx": "--t2 --encode uastc --genmipmap --threads 1 --assign_oetf {transfer} {target} {source}",
+}
 _QUALITY = {"jpeg": (95, 92), "webp": (101, 90)}  # data, color; WebP over 100 is lossless
 
 
@@ -41,7 +45,7 @@ class TextureEncoder:
         self._made: dict[tuple[int, Kind, bool], tuple[Pixels, Future[bytes]]] = {}
 
     def __call__(self, texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
-        """As `encode`."""
+        """As `encode`; with `text` a PNG holds the texture's meaning in a tEXt chunk, for files next to the asset."""
         key = (id(texture.pixels), kind, texture.color)
         with self._lock:
             first = key not in self._made
@@ -60,17 +64,14 @@ class TextureEncoder:
             return dict(zip(textures, pool.map(partial(self, kind=kind), textures.values())))
 
 
-def encode(texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
+def encode(texture: Texture, kind: Kind) -> bytes:
     """The bytes of one texture; JPEG and WebP hold 8 bits, PNG the bits of the texture.
-
-    With `text` a PNG holds the texture's meaning in a tEXt chunk, for files next to the asset.
 
     Raises SettingError: the kind cannot hold the picture's channels, or its encoder is not installed.
     Raises StorageError: the encoder failed.
     """
     if kind == "png":
-        plain = png.encode(texture.pixels)
-        return png.described(plain, {"Description": texture.meaning}) if text else plain
+        return png.encode(texture.pixels)
     if kind == "ktx2":
         return _ktx2(texture)
     quality = _QUALITY[kind][texture.color]
@@ -90,33 +91,28 @@ def encode(texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
 
 def ktx2_encoder() -> str | None:
     """The path of `ktx` or `toktx` of Khronos' KTX software, if it is installed."""
-    return next((found for name in _PROGRAMS if (found := shutil.which(name))), None)
+    return next((found for name in _KTX2 if (found := shutil.which(name))), None)
 
 
 def _ktx2(texture: Texture) -> bytes:
-    """UASTC with mipmaps, which preserves normals, with the texture's transfer function."""
     program = ktx2_encoder()
     if program is None:
         raise SettingError("KTX2 needs `ktx` or `toktx` of Khronos' KTX software on the PATH; choose webp or png")
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "picture.png", Path(folder) / "picture.ktx2"
         source.write_bytes(png.encode(_eight_bits(texture)))
-        done = subprocess.run([program, *_ktx2_options(program, texture, source, target)], capture_output=True)
+        values = {
+            "pixel": "R8G8B8" + "A8" * (texture.pixels.shape[-1] == 4) + ("_SRGB" if texture.color else "_UNORM"),
+            "transfer": "srgb" if texture.color else "linear",
+            "source": source,
+            "target": target,
+        }
+        options = [word.format(**values) for word in _KTX2[Path(program).stem].split()]
+        done = subprocess.run([program, *options], capture_output=True)
         if done.returncode or not target.exists():
             reason = " ".join(done.stderr.decode(errors="replace").split())
             raise SettingError(f"{Path(program).name} failed ({reason[:200]}); choose webp or png")
         return target.read_bytes()
-
-
-def _ktx2_options(program: str, texture: Texture, source: Path, target: Path) -> list[str]:
-    transfer = "srgb" if texture.color else "linear"
-    if Path(program).name == "toktx":
-        options = ["--t2", "--encode", "uastc", "--genmipmap", "--threads", "1", "--assign_oetf", transfer]
-        return [*options, str(target), str(source)]
-    channels = "R8G8B8A8" if texture.pixels.shape[-1] == 4 else "R8G8B8"
-    pixel = f"{channels}_{'SRGB' if texture.color else 'UNORM'}"
-    options = ["create", "--format", pixel, "--assign-tf", transfer, "--encode", "uastc", "--threads", "1"]
-    return [*options, "--generate-mipmap", str(source), str(target)]
 
 
 def _eight_bits(texture: Texture) -> NDArray[np.uint8]:
@@ -136,8 +132,7 @@ def webp(path: Path, frames: Frames, seconds: float) -> None:
     done, data = cv2.imencodeanimation(".webp", moving, [cv2.IMWRITE_WEBP_QUALITY, _ANIMATION_QUALITY])
     if not done:
         raise StorageError(f"{path}: this OpenCV writes no WebP; install opencv-contrib-python-headless from PyPI")
-    with atomic.path(path) as temporary:
-        temporary.write_bytes(data.tobytes())
+    atomic.write(path, data.tobytes())
 
 
 def ffmpeg() -> str | None:

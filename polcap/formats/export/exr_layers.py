@@ -14,6 +14,7 @@ import numpy as np
 
 from polcap.errors import SettingError
 from polcap.formats.maps import exr, png
+from polcap.formats.raw import photo
 from polcap.images import Floats
 
 LINEAR_REC709 = "lin_rec709"  # its alias in OpenColorIO configurations
@@ -112,7 +113,7 @@ def convert(rgb: Floats, space: ColorSpace) -> Floats:
     done = oiio.ImageBufAlgo.colorconvert(source, LINEAR_REC709, space.name, colorconfig=_source())
     if done.has_error:
         raise SettingError(
-            f"cannot convert linear Rec.709 to {space.name} ({exr.reason(done)}); choose another --color or $OCIO"
+            f"cannot convert linear Rec.709 to {space.name} ({photo.reason(done)}); choose another --color or $OCIO"
         )
     return np.asarray(done.get_pixels(oiio.FLOAT), dtype=np.float32)
 

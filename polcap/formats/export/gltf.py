@@ -54,8 +54,7 @@ def write(
     Raises SettingError: there is no encoder for this kind of images.
     Raises StorageError: the file cannot be written.
     """
-    with atomic.path(path) as temporary:
-        temporary.write_bytes(encode(asset, name, images, provenance, encoder))
+    atomic.write(path, encode(asset, name, images, provenance, encoder))
 
 
 def encode(

@@ -31,8 +31,7 @@ def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], doc: st
 
     Raises StorageError: the file cannot be written.
     """
-    with atomic.path(path) as temporary:
-        temporary.write_text(document(asset, name, files, doc), encoding="utf-8")
+    atomic.write(path, document(asset, name, files, doc))
 
 
 def document(asset: Asset, name: str, files: Mapping[Key, str], doc: str) -> str:

@@ -38,8 +38,7 @@ def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], comment
     _data(roughness, {"Y": np.ascontiguousarray(asset.occlusion_roughness_metallic[..., 1])})
     data: dict[Key, str] = {"roughness": roughness.name, "normal": normal.name}
     header = "".join(f"# {line}\n" for line in comment.splitlines())
-    with atomic.path(library) as temporary:
-        temporary.write_text(header + _material(asset, stem(name), files, data), encoding="utf-8")
+    atomic.write(library, header + _material(asset, stem(name), files, data))
     with atomic.path(path) as temporary, temporary.open("wb") as file:
         file.write(header.encode())
         _geometry(file, asset, stem(name), library.name)

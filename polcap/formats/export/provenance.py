@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from functools import cache
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -19,17 +19,10 @@ _PARTS = (
 
 def versions() -> dict[str, str]:
     """Installed versions of polcap and of the packages that affect pixels."""
-    return dict(_installed())
-
-
-@cache
-def _installed() -> dict[str, str]:
     found = {"polcap": __version__}
     for name in _PARTS:
-        try:
+        with suppress(PackageNotFoundError):
             found[name] = version(name)
-        except PackageNotFoundError:
-            continue
     return found
 
 
@@ -60,9 +53,8 @@ def words(facts: Mapping[str, Any]) -> dict[str, str]:
 
 def write(path: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> None:
     """Write the sidecar: the record, and the digest of every file of the export; StorageError."""
-    with atomic.path(path) as temporary:
-        text = json.dumps({**facts, "files": dict(sorted(digests.items()))}, indent=1, ensure_ascii=False)
-        temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")  # a file name may not be text
+    text = json.dumps({**facts, "files": dict(sorted(digests.items()))}, indent=1, ensure_ascii=False)
+    atomic.write(path, text + "\n")
 
 
 def digest(file: Path) -> str:

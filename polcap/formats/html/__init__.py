@@ -35,18 +35,16 @@ def write(path: str | Path, title: str, body: Iterable[str], data: Mapping[str, 
     style = here.joinpath("page.css").read_text("utf-8")
     scripts = "\n".join(here.joinpath(name).read_text("utf-8") for name in _SCRIPTS)
     known = {**data, "law": here.joinpath("law.glsl").read_text("utf-8")}
-    with atomic.path(path) as temporary:
-        temporary.write_text(
-            '<!doctype html><html lang="en"><meta charset="utf-8">'
-            '<meta name="viewport" content="width=device-width, initial-scale=1">'
-            '<meta name="color-scheme" content="light dark">'
-            f"<title>{escape(title)}</title><link rel=icon href=data:,>\n<style>\n{style}</style>\n<main>\n"
-            + "\n".join(body)
-            + f'\n</main>\n<script type="application/json" id="data">{_json(known)}</script>'
-            f"\n<script>\n{scripts}</script>\n</html>\n",
-            encoding="utf-8",
-            errors="backslashreplace",  # a file name may not be text
-        )
+    atomic.write(
+        path,
+        '<!doctype html><html lang="en"><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        '<meta name="color-scheme" content="light dark">'
+        f"<title>{escape(title)}</title><link rel=icon href=data:,>\n<style>\n{style}</style>\n<main>\n"
+        + "\n".join(body)
+        + f'\n</main>\n<script type="application/json" id="data">{_json(known)}</script>'
+        f"\n<script>\n{scripts}</script>\n</html>\n",
+    )
 
 
 def jpeg(picture: NDArray[np.uint8], whole_color: bool = False) -> str:

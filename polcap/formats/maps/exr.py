@@ -2,13 +2,12 @@
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from polcap.errors import DecodeError, StorageError
 from polcap.formats import atomic
-from polcap.formats.raw import file_bytes, file_checks, worker
+from polcap.formats.raw import file_bytes, photo, worker
 from polcap.images import Floats
 
 Attribute = str | int | float | tuple[float, ...]
@@ -52,10 +51,10 @@ def write(
         temporary.touch()  # an OSError here is clearer than OpenImageIO's message
         output = oiio.ImageOutput.create(str(temporary))
         if output is None:
-            raise StorageError(f"cannot write {path}: {reason(oiio)}; end its name in .exr")
+            raise StorageError(f"cannot write {path}: {photo.reason(oiio)}; end its name in .exr")
         done = output.open(str(temporary), spec) and output.write_image(pixels)
         if not (output.close() and done):
-            raise StorageError(f"cannot write {path}: {reason(output)}; check the disk's free space")
+            raise StorageError(f"cannot write {path}: {photo.reason(output)}; check the disk's free space")
 
 
 def read(path: Path) -> tuple[dict[str, Floats], dict[str, object]]:
@@ -69,40 +68,16 @@ def read(path: Path) -> tuple[dict[str, Floats], dict[str, object]]:
 
 def decode(path: str) -> worker.Answer:
     """`read`, in the child process; DecodeError."""
-    import OpenImageIO as oiio
-
     data = file_bytes.load(path)
     if data[:4] != _MAGIC:
         raise DecodeError(f"{path} is not an OpenEXR file; write it again")
-    with file_bytes.named(data) as name:
-        source = oiio.ImageInput.open(name)
-        if source is None:
-            raise DecodeError(f"{path} cannot be read ({reason(oiio)}); write it again")
-        try:
-            spec = source.spec()
-            file_checks.check_size(path, spec.width, spec.height * max(spec.nchannels // 4, 1))
-            pixels = source.read_image(oiio.FLOAT)
-            if pixels is None:
-                raise DecodeError(f"{path} is cut short ({reason(source)}); write it again")
-            names = tuple(spec.channelnames)
-            attributes = {item.name: item.value for item in spec.extra_attribs}
-        finally:
-            source.close()
-    pixels = np.asarray(pixels, dtype=np.float32).reshape(spec.height, spec.width, len(names))
+    with photo.opened(path, data) as file:
+        pixels = photo.every_channel(path, file)
+        names = tuple(file.spec().channelnames)
+        attributes = {item.name: item.value for item in file.spec().extra_attribs}
     plain = {
         key: list(value) if isinstance(value, tuple) else value
         for key, value in attributes.items()
         if all(isinstance(part, (str, int, float)) for part in (value if isinstance(value, tuple) else (value,)))
     }
     return {"names": names, "attributes": plain}, {name: pixels[..., k] for k, name in enumerate(names)}
-
-
-def reason(source: Any) -> str:
-    """The last error of OpenImageIO (the module, an input or an output), in one line.
-
-    Its message may repeat bytes of the file; where these are not UTF-8, the binding raises instead of returning it.
-    """
-    try:
-        return " ".join(source.geterror().split()) or "no reason given"
-    except UnicodeDecodeError:
-        return "the reason is not readable text"

@@ -169,8 +169,7 @@ def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
 
 
 def _write_json(file: Path, content: Mapping[str, Any]) -> None:
-    with atomic.path(file) as temporary:
-        temporary.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", "utf-8")
+    atomic.write(file, json.dumps(content, indent=2, ensure_ascii=False) + "\n")
 
 
 def _read_map(folder: Path, name: str, letters: str, size: tuple[int, int]) -> Floats:

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from polcap.errors import DecodeError, StorageError
 from polcap.formats import atomic
-from polcap.formats.raw import file_bytes, file_checks, worker
+from polcap.formats.raw import file_bytes, photo, worker
 from polcap.images import Floats
+from polcap.optics.resize import area_mean
 
 _MAGIC = b"\x89PNG\r\n\x1a\n"
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
@@ -31,8 +32,7 @@ def write(path: Path, array: Pixels) -> None:
 
     Raises StorageError: the file cannot be written.
     """
-    with atomic.path(path) as temporary:
-        temporary.write_bytes(encode(array))
+    atomic.write(path, encode(array))
 
 
 def encode(array: Pixels) -> bytes:
@@ -92,29 +92,19 @@ def read(path: Path) -> Pixels:
 
 def decode(path: str) -> worker.Answer:
     """`read`, in the child process; DecodeError."""
-    return {}, {"pixels": pixels(path, file_bytes.load(path))}
-
-
-def pixels(path: str, data: bytes) -> Pixels:
-    """The pixels (H, W[, C]) of the bytes of the PNG `path`; DecodeError. In the child process."""
-    if data[:8] != _MAGIC or len(data) < 24:
-        raise DecodeError(f"{path} is not a whole PNG ({len(data)} bytes); write it again")
-    file_checks.check_png(path, data)
-    try:
-        array = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        array = None
-    if array is None or array.dtype not in (np.uint8, np.uint16):
-        raise DecodeError(f"{path} is not a whole PNG ({len(data)} bytes); write it again")
-    found: Pixels = swapped(array)
-    return found
+    data = file_bytes.load(path)
+    if data[:8] != _MAGIC:
+        raise DecodeError(f"{path} is not a PNG; write it again")
+    with photo.opened(path, data) as file:
+        pixels = photo.every_channel(path, file)
+    return {}, {"pixels": pixels[..., 0] if pixels.shape[2] < 3 else pixels}  # grey, its alpha left out
 
 
 def fitted(picture: Pixels, width: int) -> NDArray[np.uint8]:
     """An 8-bit picture (H, W, 3) reduced to at most `width` px, with an even number of rows."""
     width = min(width, picture.shape[1])
     height = max(2, 2 * round(picture.shape[0] * width / picture.shape[1] / 2))
-    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    return np.asarray(area_mean(picture, (height, width)), np.uint8)
 
 
 def sixteen_bits(value: Floats) -> NDArray[np.uint16]:

@@ -66,8 +66,7 @@ def write(
     exif_ifd = _ifd(_exif_tags(exif), start)
     offsets = {34665: start, 273: start + len(exif_ifd)}
     main = [(tag, kind, offsets.get(tag, value)) for tag, kind, value in main]
-    with atomic.path(path) as temporary:
-        temporary.write_bytes(b"II*\0" + struct.pack("<I", 8) + _ifd(main, 8) + exif_ifd + image)
+    atomic.write(path, b"II*\0" + struct.pack("<I", 8) + _ifd(main, 8) + exif_ifd + image)
 
 
 def _layout_tags(width: int, height: int) -> list[_Entry]:

@@ -5,6 +5,8 @@ The only module that imports rawpy.
 
 import io
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -74,22 +76,36 @@ def camera_matrix(xyz_to_camera: Floats, balance: Floats | None) -> Floats | Non
     return np.asarray(to_rec709 * gain)
 
 
-def size(path: str, data: bytes, unpack: bool) -> dict[str, Any]:
-    """Size in visible pixels, and with `unpack` LibRaw's own reading of the metadata. In the child process."""
+@contextmanager
+def _opened(path: str, data: bytes) -> Iterator[Any]:
+    """The bytes as an open RAW of LibRaw, of a possible size; its errors become a DecodeError."""
     import rawpy
 
     try:
-        with rawpy.RawPy() as raw:
-            raw.open_buffer(io.BytesIO(data))
-            sizes = raw.sizes  # unpacks nothing, unlike every other property
-            file_checks.check_size(path, sizes.width, sizes.height)
-            file_checks.check_bytes(path, sizes.width, sizes.height, len(data))
-            meta: dict[str, Any] = {"width": sizes.width, "height": sizes.height}
-            if unpack:
-                meta["exif"] = _settings(raw.other, raw.lens)
+        raw = rawpy.RawPy()  # never closed: the counts are a view into it, which keeps it alive
+        raw.open_buffer(io.BytesIO(data))
+        sizes = raw.sizes  # unpacks nothing, unlike every other property
+        file_checks.check_size(path, sizes.width, sizes.height)
+        file_checks.check_size(path, sizes.raw_width, sizes.raw_height)
+        file_checks.check_bytes(path, sizes.width, sizes.height, len(data))
+        yield raw
     except (rawpy.LibRawError, NotImplementedError) as error:
-        raise _refusal(path, error) from None
-    return meta
+        reason = next(iter(error.args), type(error).__name__)
+        reason = reason.decode(errors="replace") if isinstance(reason, bytes) else str(reason)
+        if isinstance(error, rawpy.LibRawFileUnsupportedError):
+            message = f"not a RAW format that LibRaw knows ({reason}); is the file complete?"
+        elif isinstance(error, NotImplementedError):
+            message = f"a RAW layout that is not supported ({reason}); convert it to DNG"
+        else:
+            message = f"truncated or damaged ({reason}); {file_checks.COPY_AGAIN}"
+        raise DecodeError(f"{path}: {message}") from None
+
+
+def size(path: str, data: bytes, unpack: bool) -> dict[str, Any]:
+    """Size in visible pixels, and with `unpack` LibRaw's own reading of the metadata. In the child process."""
+    with _opened(path, data) as raw:
+        meta: dict[str, Any] = {"width": raw.sizes.width, "height": raw.sizes.height}
+        return meta | ({"exif": _settings(raw.other, raw.lens)} if unpack else {})
 
 
 def _settings(other: Any, lens: Any) -> dict[str, Any]:
@@ -115,8 +131,6 @@ def version() -> str:
 
 def decode(path: str, digest: str | None = None) -> worker.Answer:
     """`read`, in the child process: the counts (H, W) or (H, W, 3), their levels and colors; DecodeError."""
-    import rawpy
-
     data = file_bytes.load(path, digest)
     if data[:4] == b"FOVb":  # Sigma's X3F
         raise DecodeError(f"{path}: {unsupported(None)}")
@@ -124,14 +138,8 @@ def decode(path: str, digest: str | None = None) -> worker.Answer:
     file_checks.check_structure(path, structure, data)
     if structure.dng and structure.truncated:  # LibRaw would return whatever was in memory
         raise DecodeError(f"{path}: its image data run past the end of the file; {file_checks.COPY_AGAIN}")
-    try:
-        raw = rawpy.RawPy()  # never closed: the counts are a view into it, which keeps it alive
-        raw.open_buffer(io.BytesIO(data))
-        file_checks.check_size(path, raw.sizes.raw_width, raw.sizes.raw_height)
-        file_checks.check_bytes(path, raw.sizes.width, raw.sizes.height, len(data))
+    with _opened(path, data) as raw:
         meta, arrays = _counts(path, raw)
-    except (rawpy.LibRawError, NotImplementedError) as error:
-        raise _refusal(path, error) from None
     lossy = file_checks.is_lossy(structure)
     file_checks.check_levels(path, arrays["value"], float(np.max(meta["black"])), meta["white"], lossy)
     stated = exif.tags(data).color_matrix
@@ -206,15 +214,3 @@ def _white(raw: Any, black: float) -> float:
     stated = [level for level in raw.camera_white_level_per_channel or () if level > black]
     lowest = min([raw.white_level, *stated])
     return float(lowest if lowest > raw.white_level / 2 else raw.white_level)
-
-
-def _refusal(path: str, error: Exception) -> DecodeError:
-    import rawpy
-
-    reason = next(iter(error.args), type(error).__name__)
-    reason = reason.decode(errors="replace") if isinstance(reason, bytes) else str(reason)
-    if isinstance(error, rawpy.LibRawFileUnsupportedError):
-        return DecodeError(f"{path}: not a RAW format that LibRaw knows ({reason}); is the file complete?")
-    if isinstance(error, NotImplementedError):
-        return DecodeError(f"{path}: a RAW layout that is not supported ({reason}); convert it to DNG")
-    return DecodeError(f"{path}: truncated or damaged ({reason}); {file_checks.COPY_AGAIN}")

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import DecodeError
-from polcap.formats.maps import exr
 from polcap.formats.raw import file_bytes, file_checks, file_kind, libraw, worker
 from polcap.images import SensorImage
 from polcap.optics import color
@@ -107,7 +106,7 @@ def encoding_of(bits: int, stated: Encoding | None) -> Encoding:
 
 def size(path: str, data: bytes) -> dict[str, int]:
     """Size, channels and bits of a picture, without its pixels. In the child process."""
-    with _opened(path, data) as file:
+    with opened(path, data) as file:
         spec = file.spec()
         count, bits = len(_channels(path, spec)), 8 * spec.format.size()
     return {"width": spec.width, "height": spec.height, "channels": count, "bits": bits}
@@ -115,21 +114,36 @@ def size(path: str, data: bytes) -> dict[str, int]:
 
 def decode(path: str, digest: str | None = None) -> worker.Answer:
     """The stored values (H, W, 1 or 3) in their stored type; DecodeError. In the child process."""
-    import OpenImageIO as oiio
-
-    with _opened(path, file_bytes.load(path, digest)) as file:
-        spec = file.spec()
-        channels = _channels(path, spec)
-        kind = "float" if spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE) else str(spec.format)
-        pixels = file.read_image(0, 0, 0, spec.nchannels, kind)
-        reason = exr.reason(file)
-    if pixels is None:
-        raise DecodeError(f"{path}: truncated or damaged ({reason}); copy it from the card again")
-    pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)[..., channels]
+    with opened(path, file_bytes.load(path, digest)) as file:
+        channels = _channels(path, file.spec())
+        pixels = every_channel(path, file)[..., channels]
     if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
         bad = int((~np.isfinite(pixels)).sum())
         raise DecodeError(f"{path}: {bad} values are not finite numbers; write the file without NaN and infinity")
     return {}, {"pixels": pixels}
+
+
+def every_channel(path: str, file: Any) -> NDArray[Any]:
+    """All channels (H, W, C) of an open file of OpenImageIO: float32, or integers of their stored type. DecodeError."""
+    import OpenImageIO as oiio
+
+    spec = file.spec()
+    kind = "float" if spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE) else str(spec.format)
+    pixels = file.read_image(0, 0, 0, spec.nchannels, kind)
+    if pixels is None:
+        raise DecodeError(f"{path}: truncated or damaged ({reason(file)}); {file_checks.COPY_AGAIN}, or write it again")
+    return np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
+
+
+def reason(source: Any) -> str:
+    """The last error of OpenImageIO (the module, an input or an output), in one line.
+
+    Its message may repeat bytes of the file; where these are not UTF-8, the binding raises instead of returning it.
+    """
+    try:
+        return " ".join(source.geterror().split()) or "no reason stated"
+    except UnicodeDecodeError:
+        return "the reason is not readable text"
 
 
 def _pixels(path: str | Path, digest: str | None) -> tuple[NDArray[Any], float]:
@@ -139,8 +153,8 @@ def _pixels(path: str | Path, digest: str | None) -> tuple[NDArray[Any], float]:
 
 
 @contextmanager
-def _opened(path: str, data: bytes) -> Iterator[Any]:
-    """The bytes as an open file of OpenImageIO, which reads by name only."""
+def opened(path: str, data: bytes) -> Iterator[Any]:
+    """The bytes as an open file of OpenImageIO, which reads by name only. DecodeError."""
     import OpenImageIO as oiio
 
     if data[:3] == b"\xff\xd8\xff":
@@ -151,13 +165,13 @@ def _opened(path: str, data: bytes) -> Iterator[Any]:
     with file_bytes.named(data) as name:
         file = oiio.ImageInput.open(name, options)
         if file is None:
-            reason = exr.reason(oiio).replace(name, Path(path).name)
-            raise DecodeError(f"{path}: not a readable picture ({reason}); is the file complete?")
+            cause = reason(oiio).replace(name, Path(path).name)
+            raise DecodeError(f"{path}: not a readable picture ({cause}); is the file complete?")
         try:
             spec = file.spec()
             file_checks.check_size(path, spec.width, spec.height)
             if spec.nchannels > _MOST_CHANNELS or spec.depth > 1:
-                raise DecodeError(f"{path}: has {spec.nchannels} channels; polcap reads flat R, G, B")
+                raise DecodeError(f"{path}: has {spec.nchannels} channels; polcap reads flat pictures")
             yield file
         finally:
             file.close()

@@ -43,7 +43,7 @@ class AlignSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 4.0
 
 
-@stage(version=8)
+@stage(version=9)
 def register(radiance: AngleStack, color: ColorCalibration, settings: AlignSettings) -> Alignment:
     """Transforms (K, 3, 3) from the reference grid to each shot's, px.
 

@@ -5,6 +5,7 @@ import numpy as np
 
 from polcap.images import Floats, MaskedImage, Quality
 from polcap.optics.registration import Pyramid, squared_gradient
+from polcap.optics.resize import block_means
 
 _BLUR_PX = 0.7  # both shots need one resolution; interpolation changes it
 _FLOOR = 0.01  # of the 99th percentile: keeps the logarithm of a dark background from amplifying its noise
@@ -22,8 +23,10 @@ def detail(shot: MaskedImage, detail_px: float, step: int) -> Pyramid:
 
     Multiplied by d² / (d² + σ²), d the typical detail and σ the relative noise, as a Wiener filter does.
     """
-    total = _averaged(_sum_of_channels(shot.value), step)
-    sigma = np.sqrt(_thinned(_sum_of_channels(shot.variance), total.shape, step)) / step
+    total = block_means(_sum_of_channels(shot.value), step)
+    height, width = total.shape
+    variance = _sum_of_channels(shot.variance[: height * step : step, : width * step : step])  # it changes slowly
+    sigma = np.sqrt(variance) / np.float32(step)
     some = (slice(None, None, 5),) * 2  # enough for a percentile
     floor = max(float(np.percentile(total[some], 99)) * _FLOOR, 2 * float(np.median(sigma[some])), 1e-9)
     level = np.maximum(total, 0)
@@ -34,40 +37,23 @@ def detail(shot: MaskedImage, detail_px: float, step: int) -> Pyramid:
     fine -= cv2.GaussianBlur(log, (reach, reach), detail_px)
     sigma /= level
     fine /= 1 + (sigma / np.float32(_TYPICAL_DETAIL)) ** 2
-    clipped = _averaged((shot.quality & Quality.CLIPPED > 0).astype(np.float32), step) > 0
+    clipped = block_means(shot.quality & Quality.CLIPPED > 0, step) > 0
     around = np.ones((int(np.ceil(2 * detail_px)) | 1,) * 2, np.uint8)
     return Pyramid(fine, cv2.dilate(clipped.view(np.uint8), around) == 0)
 
 
 def edge_strength(shot: Pyramid) -> Pyramid:
     """Where edges are and how strong, whichever side is brighter: the root of the gradient."""
-    picture, usable = shot[0]
-    return Pyramid(np.asarray(np.sqrt(cv2.GaussianBlur(np.sqrt(squared_gradient(picture)), (0, 0), 1.0))), usable)
+    strength = np.sqrt(cv2.GaussianBlur(np.sqrt(squared_gradient(shot[0].picture)), (0, 0), 1.0))
+    return Pyramid(np.asarray(strength), shot[0].usable)
 
 
 def shows_detail(shot: Pyramid) -> bool:
     """Whether there is anything to compare."""
-    picture, usable = shot[0]
-    seen = picture[usable]
+    seen = shot[0].picture[shot[0].usable]
     return len(seen) > _LEAST_PIXELS and bool(np.ptp(seen) > 0)
 
 
 def _sum_of_channels(picture: Floats) -> Floats:
     """(H, W, 3) → (H, W)."""
     return np.asarray(cv2.transform(np.asarray(picture, np.float32), np.ones((1, 3), np.float32)))
-
-
-def _averaged(image: Floats, step: int) -> Floats:
-    """Means of step × step blocks of (H, W); an incomplete last block is dropped."""
-    if step == 1:
-        return image
-    height, width = image.shape[0] // step, image.shape[1] // step
-    whole = image[: height * step, : width * step]
-    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA))
-
-
-def _thinned(picture: Floats, shape: tuple[int, ...], step: int) -> Floats:
-    """One pixel of each step × step block of (H, W): of a variance, which changes slowly."""
-    height, width = shape
-    whole = picture[: height * step, : width * step]
-    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_NEAREST))

@@ -13,6 +13,7 @@ from polcap.images import Alignment, AngleStack, Floats, ObjectMask
 from polcap.optics import registration
 from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.registration import Pyramid, Registration
+from polcap.optics.resize import area_mean
 from polcap.stages.align.detail import averaging_step, detail
 
 _DETAIL_PX = 4.0  # as `align.detail_px`
@@ -43,11 +44,11 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
     if not object_.mask.any():
         return ObjectMotion(pushed, inside)
     step = averaging_step(object_.mask.shape, _MOST_PIXELS)
-    picture, usable = detail(radiance.shot(0), _DETAIL_PX, step)[0]
-    small = cv2.resize(object_.mask.astype(np.uint8), picture.shape[::-1], interpolation=cv2.INTER_AREA)
+    reference = detail(radiance.shot(0), _DETAIL_PX, step)[0]
+    small = area_mean(object_.mask.astype(np.uint8), reference.picture.shape)
     near = cv2.dilate(small, np.ones((2 * _RIM_PX + 1,) * 2, np.uint8)) > 0
     core = cv2.erode(small, np.ones((_RIM_PX + 1,) * 2, np.uint8)) > 0
-    regions = [Pyramid(picture, usable & region) for region in (near, ~near, core)]
+    regions = [Pyramid(reference.picture, reference.usable & region) for region in (near, ~near, core)]
     points = np.argwhere(core)[::_EVERY, ::-1].astype(np.float64)
     middle = np.argwhere(small).mean(axis=0)[::-1] if small.any() else np.array(small.shape[::-1]) / 2
     for k in range(1, shots):
@@ -56,8 +57,8 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
         (whole, of_object), (outer, around) = (_registered(region, shot, start) for region in regions[:2])
         inner = registration.refine(regions[2], shot, "similarity", start)
         if inner.tiles and len(points):
-            reference = outer.matrix if around > _SURE_CORRELATION else start
-            moved = transform_points(inner.matrix, points) - transform_points(reference, points)
+            camera = outer.matrix if around > _SURE_CORRELATION else start
+            moved = transform_points(inner.matrix, points) - transform_points(camera, points)
             inside[k] = step * float(np.sqrt((moved**2).sum(axis=1).mean()))
         if around > _SURE_CORRELATION and of_object < _OTHER_CORRELATION:
             pushed[k] = np.inf

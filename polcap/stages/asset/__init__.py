@@ -81,13 +81,13 @@ def resize_textures(asset: Asset, size: int) -> Asset:
     shape = (other, size) if width >= height else (size, other)
     names = ("base_color", "occlusion_roughness_metallic", "normal", "specular_color")
     textures = {name: _resize(getattr(asset, name), shape) / 255 for name in names}
-    textures["normal"] = _unit(2 * textures["normal"] - 1) / 2 + 0.5
+    textures["normal"] = frames.unit(2 * textures["normal"] - 1) / 2 + 0.5
     eight_bits: dict[str, Any] = {name: _eight_bits(texture) for name, texture in textures.items()}
     return replace(asset, **eight_bits)
 
 
 def _resize(texture: NDArray[np.uint8], shape: tuple[int, int]) -> Floats:
-    """(height, width, 3) of 0…255, by area where both sides shrink, else by cubic interpolation."""
+    """Resize a texture (H, W, 3) of 0…255: by area means if both sides shrink, else by cubic interpolation."""
     image = texture.astype(np.float32)
     if shape[0] <= image.shape[0] and shape[1] <= image.shape[1]:
         return area_mean(image, shape)
@@ -102,7 +102,7 @@ def _without_outline(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def fill_outward(value: Any, known: NDArray[np.bool_]) -> Any:
-    """(H, W, C) with the value of a nearest known pixel wherever none is known."""
+    """Fill an image (H, W, C) where it is unknown with the value of a nearest known pixel."""
     if known.all() or not known.any():
         return value
     label = cv2.distanceTransformWithLabels(
@@ -124,7 +124,7 @@ def tangent_space(maps: SurfaceMaps, mesh: Mesh) -> Floats:
     at, covered = rasterize_frames(mesh, *maps.mask.shape)
     at, covered = at[maps.mask[covered]], covered & maps.mask
     # n and t are interpolated separately, so they are neither unit nor square to each other: solve, do not project
-    n, t = _unit(at[:, :3]), _unit(at[:, 3:6])
+    n, t = frames.unit(at[:, :3]), frames.unit(at[:, 3:6])
     b = frames.cross(n, t) * np.where(at[:, 6:] < 0, np.float32(-1), np.float32(1))
     m = maps.normal[covered]
     across = frames.cross(t, b)
@@ -133,12 +133,8 @@ def tangent_space(maps: SurfaceMaps, mesh: Mesh) -> Floats:
     local[:, 2] = np.maximum(local[:, 2], _LEAST_Z)
     out = np.zeros((*covered.shape, 3), np.float32)
     out[..., 2] = 1.0
-    out[covered] = _unit(local)
+    out[covered] = frames.unit(local)
     return np.asarray(fill_outward(out, covered))
-
-
-def _unit(vector: Floats) -> Floats:
-    return np.asarray(vector / np.maximum(np.sqrt(frames.dot(vector, vector)), 1e-12)[..., None])
 
 
 def _eight_bits(value: Floats) -> NDArray[np.uint8]:

@@ -44,7 +44,7 @@ from polcap.images import (
 from polcap.optics import sharpness
 from polcap.stages import stage
 from polcap.stages.hdr import exposure, noise, planes, weights
-from polcap.stages.hdr.bracket import Bracket, Link, compare
+from polcap.stages.hdr.bracket import Bracket, compare
 from polcap.stages.hdr.planes import Reader, same_size
 
 _LEAST_PX = 48  # least side of a merged picture: noise and motion are measured in tiles
@@ -83,8 +83,9 @@ def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack
         Brackets of unequal length, frames of different size, unknown exposure ratios or too much motion.
     """
     _check_counts(capture.shots)
-    shots = (*capture.shots, *(() if capture.crossed is None else (capture.crossed,)))
-    read = Reader((frame for shot in shots for frame in (*shot.frames, *shot.ambient)), decode, settings.clip)
+    read = Reader(
+        (frame for shot in capture.all_shots for frame in (*shot.frames, *shot.ambient)), decode, settings.clip
+    )
     try:
         return _merge(capture, read, settings)
     finally:
@@ -92,7 +93,7 @@ def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack
 
 
 def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
-    shots, first = capture.shots, capture.shots[0]
+    shots, count, first = capture.all_shots, len(capture.shots), capture.shots[0]
     read.plan = _memory_plan(capture, read(first.frames[0]), settings)
     order = _by_brightness(first, read)
     image = read(first.frames[_middle(order)])
@@ -100,43 +101,53 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
     sensor, view, side = _sensor(capture, image, settings), _view(capture, image, settings), image.superpixel
     # in the middle frame by the metadata, as in `check`, which reads each frame only once
     places = sharpness.places(read(first.frames[(len(first.frames) - 1) // 2]), settings.clip)
+    full = settings.demosaic == "full" and image.cfa is not None
     del image  # so that the reader can free the frame
     lines = noise.Lines(() if capture.calibration is None else capture.calibration.noise)
     shape, stack = (0, 0, 0), _empty(0, (0, 0, 0))
-    links, ambient_shares, tiles = [], [], []
+    ratio, curvature, ambient_share, tiles = [], [], [], []
     for k, shot in enumerate(shots):
-        weighted = _weigh(shot, order, lines, read, settings)
+        # the crossed shot is merged on the scale of its own middle frame: its flash has another energy
+        bracket_order = _by_brightness(shot, read) if k == count else order
+        bracket = Bracket(shot, bracket_order, _middle(bracket_order))
+        compared = compare(bracket, lines, read, settings.max_motion_px)
+        weighted = weights.prepare(bracket, compared, lines, read, full)
         if k == 0:
             shape, stack = weighted.shape, _empty(len(shots), weighted.shape)
-        same_size(f"shot {shot.name}", weighted.shape, shape)
+        same_size("the cross-polarized shot" if k == count else f"shot {shot.name}", weighted.shape, shape)
         weighted.merge_into(MaskedImage(stack.value[k], stack.variance[k], stack.quality[k]))
-        links.append(weighted.compared.links)
-        ambient_shares.append(weighted.compared.ambient_share)
-        tiles.append([sharpness.take(read(frame), places, settings.clip) for frame in shot.frames])
+        if k < count:
+            ratio.append([frame.ratio.astype(np.float64) for frame in compared.frames])
+            curvature.append([frame.curvature for frame in compared.frames])
+            ambient_share.append(compared.ambient_share)
+            tiles.append([sharpness.take(read(frame), places, settings.clip) for frame in shot.frames])
+        del weighted, compared
         read.forget((*shot.frames, *shot.ambient))
         lines.settle()
-    crossed = None if capture.crossed is None else _crossed(capture.crossed, shape, lines, read, settings)
-    _divide_by_falloff(capture, view, stack, crossed, settings)
+    falloff = None if capture.calibration is None else capture.calibration.falloff
+    pictures = [MaskedImage(*shot) for shot in zip(stack.value, stack.variance, stack.quality, strict=True)]
+    if falloff is not None and settings.falloff:
+        for picture in pictures:
+            weights.divide_by_falloff(picture, view, capture.size_px, falloff)
+    stated = [[exposure.stated(f, shot.frames[_middle(order)]) for f in shot.frames] for shot in capture.shots]
     return AngleStack(
-        value=stack.value,
-        variance=stack.variance,
-        quality=stack.quality,
+        value=stack.value[:count],
+        variance=stack.variance[:count],
+        quality=stack.quality[:count],
         angle=capture.angle,
         view=view,
         bracket=BracketMeasurement(
-            exposure_ratio=_exposure_ratios(links),
-            exif_ratio=np.array(
-                [[exposure.stated(f, shot.frames[_middle(order)]) for f in shot.frames] for shot in shots]
-            ),
-            curvature=np.array([[link.curvature for link in shot] for shot in links]),
-            ghost_fraction=np.array([np.mean((quality & Quality.GHOST) > 0) for quality in stack.quality]),
-            ambient_share=np.array(ambient_shares),
+            exposure_ratio=np.repeat(ratio, 3 // shape[0], axis=2),
+            exif_ratio=np.array(stated),
+            curvature=np.array(curvature),
+            ghost_fraction=np.array([np.mean((quality & Quality.GHOST) > 0) for quality in stack.quality[:count]]),
+            ambient_share=np.array(ambient_share),
             blur_px=sharpness.frames_blur(tiles, side),
         ),
         sensor=replace(sensor, lossy=read.lossy),
         equipment=_equipment(capture, view),
-        offset_px=_offsets(shots) if capture.layout == "sensor" else None,
-        crossed=None if crossed is None else CrossedShot(crossed, capture.crossed_angle),
+        offset_px=_offsets(capture.shots) if capture.layout == "sensor" else None,
+        crossed=None if capture.crossed is None else CrossedShot(pictures[-1], capture.crossed_angle),
     )
 
 
@@ -210,48 +221,6 @@ def _empty(shots: int, shape: tuple[int, int, int]) -> MaskedImage:
     _, height, width = shape
     value, variance = (np.empty((shots, height, width, 3), np.float32) for _ in range(2))
     return MaskedImage(value, variance, np.empty((shots, height, width), np.uint8))
-
-
-def _weigh(
-    shot: Shot, order: tuple[int, ...], lines: noise.Lines, read: Reader, settings: HdrSettings
-) -> weights.WeightedFrames:
-    """Compare the frames of a shot in the order of brightness, and weigh them."""
-    bracket = Bracket(shot, order, _middle(order))
-    compared = compare(bracket, lines, read, settings.max_motion_px)
-    full = settings.demosaic == "full" and read(shot.frames[bracket.reference]).cfa is not None
-    return weights.prepare(bracket, compared, lines, read, full)
-
-
-def _crossed(
-    shot: Shot, shape: tuple[int, int, int], lines: noise.Lines, read: Reader, settings: HdrSettings
-) -> MaskedImage:
-    """Merge the cross-polarized shot, on the scale of its own middle frame: its flash has another energy."""
-    weighted = _weigh(shot, _by_brightness(shot, read), lines, read, settings)
-    same_size("the cross-polarized shot", weighted.shape, shape)
-    one = _empty(1, shape)
-    picture = MaskedImage(one.value[0], one.variance[0], one.quality[0])
-    weighted.merge_into(picture)
-    read.forget((*shot.frames, *shot.ambient))
-    lines.settle()
-    return picture
-
-
-def _divide_by_falloff(
-    capture: Capture, view: View, stack: MaskedImage, crossed: MaskedImage | None, settings: HdrSettings
-) -> None:
-    """Divide all shots by the lens's falloff, in place, if it was calibrated."""
-    light = None if capture.calibration is None else capture.calibration.falloff
-    if light is None or not settings.falloff:
-        return
-    shots = [MaskedImage(*shot) for shot in zip(stack.value, stack.variance, stack.quality, strict=True)]
-    for picture in [*shots, *([] if crossed is None else [crossed])]:
-        weights.divide_by_falloff(picture, view, capture.size_px, light)
-
-
-def _exposure_ratios(links: list[list[Link]]) -> Floats:
-    """Exposure ratios (K, E, 3) of the frames of all shots; a monochrome channel is repeated."""
-    ratios = np.array([[link.ratio.astype(np.float64) for link in shot] for shot in links])
-    return np.repeat(ratios, 3 // ratios.shape[2], axis=2)
 
 
 def _equipment(capture: Capture, view: View) -> Equipment:

@@ -3,21 +3,18 @@
 Everything is measured on the binned grid, frame by frame against the bracket's reference frame.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from polcap.errors import CaptureError
-from polcap.images import Floats, Shot
+from polcap.images import Bools, Floats, Shot
 from polcap.optics import sensor
 from polcap.optics.registration import Pyramid, register
 from polcap.stages.hdr import exposure, noise
-from polcap.stages.hdr.ghosts import Anchor, ExposedFrame, FirstEstimate
-from polcap.stages.hdr.planes import Planes, Reader, Signals, blocks, planar, resample, same_size, signals
-
-Bools = NDArray[np.bool_]
+from polcap.stages.hdr.ghosts import Anchor, RegisteredFrame, first_estimate
+from polcap.stages.hdr.planes import Reader, Signals, blocks, in_memory, planar, resample, same_size, signals
 
 _SMOOTH = cv2.getGaussianKernel(7, 0.8, cv2.CV_32F)
 _STILL_PX = 0.05  # frames that moved less are not resampled
@@ -39,28 +36,6 @@ class Bracket:
 
 
 @dataclass(frozen=True)
-class Link:
-    """A frame compared with the reference frame, on the binned grid."""
-
-    ratio: Floats  # (C,) float32 exposure relative to the reference
-    motion: Floats | None  # (3, 3) reference px → frame px; None: no motion
-    misfit: Floats  # (C,) float32 px²; variance per squared gradient, from registration errors and aliasing
-    curvature: float = 0.0  # of `exposure.curvature`; 0: linear, NaN: unknown
-
-
-@dataclass(frozen=True)
-class RegisteredFrame:
-    """A frame on the reference frame's grid."""
-
-    signals: Signals
-    gain: Floats | None  # (H, W) factor on the noise variance by resampling; None: not resampled
-
-    @property
-    def mean_gain(self) -> float:
-        return 1.0 if self.gain is None else float(self.gain.mean())
-
-
-@dataclass(frozen=True)
 class AmbientLight:
     """Light without the flash, for the exposure of the reference frame."""
 
@@ -72,12 +47,10 @@ class AmbientLight:
 class ComparedBracket:
     """Everything that the comparison measured in a bracket, on the binned grid."""
 
-    links: list[Link]
-    noises: list[noise.Noise]
+    frames: list[RegisteredFrame]  # (E,) less the ambient light, with the sensor's noise
     ghost: Bools  # (H, W)
     estimate: Floats  # (C, H, W) the smoothed first estimate
     ambient_share: float  # of all light that is not from the flash; NaN without ambient frames
-    frames: list[RegisteredFrame] | None  # None where ambient light was subtracted
 
 
 def compare(bracket: Bracket, lines: noise.Lines, read: Reader, limit_px: float) -> ComparedBracket:
@@ -90,36 +63,30 @@ def compare(bracket: Bracket, lines: noise.Lines, read: Reader, limit_px: float)
     """
     source = _BracketSignals(bracket, lines, read)
     still = source.signals(bracket.reference)
-    channels = still.shape[0]
+    one = np.ones(still.shape[0], np.float32)
     if not bracket.others and source.ambient is None:
         source.learn(bracket.reference, noise.sample_frame(still))
-    same = Link(np.ones(channels, np.float32), None, np.zeros(channels, np.float32))
-    links, frames = {bracket.reference: same}, {bracket.reference: RegisteredFrame(still, None)}
     ghost = np.zeros(still.usable.shape, bool)
-    estimate = FirstEstimate()
+    frames, parts = {}, []
     anchor: Anchor | None = None
     pyramid = brightness_pyramid(still) if bracket.others else None
     for e in bracket.others:
         assert pyramid is not None
-        links[e], frames[e] = _compare_frame(source, e, still, pyramid, limit_px)
-        shaded = exposure.vignetting(still, frames[e].signals, links[e].ratio)
-        frame = ExposedFrame(frames[e].signals, links[e].ratio, source.line(e), shaded)
-        anchor = anchor or Anchor(ExposedFrame(still, same.ratio, source.line(bracket.reference)))
-        new = anchor.ghosts(frame, links[e].misfit, frames[e].mean_gain)
-        estimate.add(frame, frame.signals.usable & ~new)
+        frames[e] = _compare_frame(source, e, still, pyramid, limit_px)
+        anchor = anchor or Anchor(RegisteredFrame(still, one, source.line(bracket.reference), 0 * one))
+        new = anchor.ghosts(frames[e])
+        parts.append((frames[e], frames[e].signals.usable & ~new))
         ghost |= new
         if e == bracket.order[0]:
-            anchor.fill(frame)
-    estimate.add(ExposedFrame(still, same.ratio, source.line(bracket.reference)), still.usable)
-    smoothed = estimate.smoothed(still if anchor is None else anchor, ghost)
-    every = range(len(links))
+            anchor = replace(anchor, darkest=frames[e])
+    frames[bracket.reference] = RegisteredFrame(still, one, source.line(bracket.reference), 0 * one)
+    parts.append((frames[bracket.reference], still.usable))
+    estimate = first_estimate(parts, anchor or still, ghost)
     return ComparedBracket(
-        links=[links[e] for e in every],
-        noises=[source.sensor_line(e) for e in every],
+        frames=[replace(frames[e], noise=source.sensor_line(e)) for e in range(len(frames))],
         ghost=ghost,
-        estimate=smoothed,
-        ambient_share=float("nan") if source.ambient is None else _ambient_share(source.ambient, smoothed),
-        frames=[frames[e] for e in every] if source.ambient is None else None,
+        estimate=estimate,
+        ambient_share=float("nan") if source.ambient is None else _ambient_share(source.ambient, estimate),
     )
 
 
@@ -143,8 +110,7 @@ class _BracketSignals:
             return found
         if not self.settled(e):
             self.learn(e, noise.sample_frame(found))
-        value = found.rows(slice(0, found.shape[1])) - self._ambient_exposure(e) * self.ambient.value
-        return Planes(value, found.usable)
+        return in_memory(found.rows(slice(None)) - self._ambient_exposure(e) * self.ambient.value, found.usable)
 
     def line(self, e: int) -> noise.Noise:
         """Noise of frame e, with the noise of the ambient light that was subtracted."""
@@ -168,28 +134,29 @@ class _BracketSignals:
 
 def _compare_frame(
     source: _BracketSignals, e: int, still: Signals, pyramid: Pyramid, limit_px: float
-) -> tuple[Link, RegisteredFrame]:
+) -> RegisteredFrame:
     """Motion, exposure ratio, noise and misfit of frame e against the reference frame's signals."""
     reference, name = source.reference, f"frame {e + 1} of {source.name}"
-    found = source.signals(e)
+    found, gain = source.signals(e), None
     same_size(name, found.shape, still.shape)
     motion = measure_motion(name, pyramid, brightness_pyramid(found), limit_px / source.raw_px)
     learn = source.ambient is None and not source.settled(e, reference)
-    frame = RegisteredFrame(found, None)
     if motion is not None:  # before resampling, the scene's detail does not cancel between the frames
         if learn:
             source.learn(e, noise.sample_frame(found))
             source.learn(reference, noise.sample_frame(still))
-        frame = RegisteredFrame(*resample(found, motion))
-    tiles = exposure.common_tiles(still, frame.signals)
+        found, gain = resample(found, motion)
+    tiles = exposure.common_tiles(still, found)
     measured = exposure.of_tiles(*tiles)
     ratio = exposure.measured_or_stated(name, measured, still.shape[0], source.frames[e], source.frames[reference])
     if motion is None and learn:
-        for number, samples in zip((reference, e), noise.sample_pair(still, frame.signals, ratio)):
+        for number, samples in zip((reference, e), noise.sample_pair(still, found, ratio)):
             source.learn(number, samples)
-    noises = source.line(reference), source.line(e)
-    misfit = noise.misfit(still, frame.signals, ratio, noises, frame.mean_gain)
-    return Link(ratio, motion, misfit, exposure.curvature(*tiles)), frame
+    misfit = np.zeros_like(ratio)
+    shaded, curvature = exposure.vignetting(still, found, ratio), exposure.curvature(*tiles)
+    frame = RegisteredFrame(found, ratio, source.line(e), misfit, motion, gain, shaded, curvature)
+    lines = source.line(reference), frame.noise
+    return replace(frame, misfit=noise.misfit(still, found, ratio, lines, frame.mean_gain))
 
 
 def brightness_pyramid(frame: Signals) -> Pyramid:

@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from polcap.errors import CaptureError
 from polcap.images import Floats, Frame
+from polcap.optics.resize import block_means
 from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.stages.hdr.planes import Signals, tile_means
 
@@ -25,11 +25,6 @@ class Ratio:
 
     value: Floats  # (C,)
     sigma: Floats  # (C,) 1σ, relative
-
-
-def ratio(reference: Signals, other: Signals) -> Ratio | None:
-    """Exposure ratio other / reference (C,) of registered signals; None if their pixels do not suffice."""
-    return of_tiles(*common_tiles(reference, other))
 
 
 def of_tiles(a: Floats, b: Floats) -> Ratio | None:
@@ -51,13 +46,7 @@ def of_tiles(a: Floats, b: Floats) -> Ratio | None:
 
 def common_tiles(reference: Signals, other: Signals) -> tuple[Floats, Floats]:
     """Means (T, C) in both frames of the tiles that are fully usable in both."""
-    channels, height, width = reference.shape
-    usable = (reference.usable & other.usable).view(np.uint8) * np.uint8(255)
-    tiled = usable[: height // TILE * TILE, : width // TILE * TILE]
-    if not tiled.size:
-        return np.zeros((0, channels)), np.zeros((0, channels))
-    # with one unusable pixel of 256 the mean is 254
-    inside = cv2.resize(tiled, (width // TILE, height // TILE), interpolation=cv2.INTER_AREA) == 255
+    inside = block_means(reference.usable & other.usable, TILE) == 1
     a, b = (tile_means(picture, TILE)[inside].astype(np.float64) for picture in (reference, other))
     return a, b
 
@@ -146,9 +135,7 @@ def curvature(a: Floats, b: Floats) -> float:
     if lit.sum() < 4 * _LEAST_TILES:
         return float("nan")
     level, change = (np.log(a[lit]) + np.log(b[lit])) / 2, np.log(b[lit] / a[lit])
-    edges = np.quantile(level, np.linspace(0, 1, _TONE_BINS + 1))
-    which = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, _TONE_BINS - 1)
-    bins = [which == n for n in range(_TONE_BINS) if (which == n).any()]
+    bins = np.array_split(np.argsort(level.round(6), kind="stable"), _TONE_BINS)
     x, y = (np.array([np.median(values[one]) for one in bins]) for values in (level, change))
     if np.ptp(x) < _TONE_SPAN:
         return float("nan")

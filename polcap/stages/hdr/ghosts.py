@@ -30,138 +30,114 @@ _CORRELATED = 1.5  # variance of a window's mean over that of independent pixels
 
 
 @dataclass(frozen=True)
-class ExposedFrame:
-    """A registered frame with its exposure ratio and noise."""
+class RegisteredFrame:
+    """A frame on the reference frame's grid, with its exposure, noise and motion."""
 
     signals: Signals
     ratio: Floats  # (C,) float32 exposure relative to the reference frame
     noise: Noise
+    misfit: Floats  # (C,) float32 px²; variance per squared gradient, from registration errors and aliasing
+    motion: Floats | None = None  # (3, 3) reference px → frame px; None: no motion
+    gain: Floats | None = None  # (H, W) factor on the noise variance by resampling; None: not resampled
     vignetting: Floats | None = None  # (H, W) float32 factor on the ratio, as wide apertures darken corners; None: 1
+    curvature: float = 0.0  # of `exposure.curvature`; 0: linear, NaN: unknown
+
+    @property
+    def mean_gain(self) -> float:
+        return 1.0 if self.gain is None else float(self.gain.mean())
 
 
+@dataclass(frozen=True)
 class Anchor:
     """Radiance that other frames are compared with: the reference frame, or the darkest where the reference clips."""
 
-    def __init__(self, reference: ExposedFrame) -> None:
-        self.known = reference.signals.usable  # (H, W)
-        self._reference = reference
-        self._dark: ExposedFrame | None = None
+    reference: RegisteredFrame
+    darkest: RegisteredFrame | None = None
 
-    def fill(self, darkest: ExposedFrame) -> None:
-        """Use the darkest frame for pixels that are not usable in the reference frame."""
-        self.known = self._reference.signals.usable | darkest.signals.usable
-        self._dark = darkest
+    @property
+    def known(self) -> Bools:
+        """Pixels (H, W) with a usable frame."""
+        own = self.reference.signals.usable
+        return own if self.darkest is None else own | self.darkest.signals.usable
 
     def rows(self, rows: slice) -> Floats:
         """Radiance (C, h, W) of some rows."""
-        value = self._reference.signals.rows(rows)
-        if self._dark is None:
+        value, own = self.reference.signals.rows(rows), self.reference.signals.usable[rows]
+        if self.darkest is None or own.all():
             return value
-        own, dark = self._reference.signals.usable[rows], self._dark
-        if own.all():
-            return value
-        other = dark.signals.rows(rows)
-        return np.stack([np.where(own, a, b / r) for a, b, r in zip(value, other, dark.ratio)])
+        return np.where(own, value, self.darkest.signals.rows(rows) / self.darkest.ratio[:, None, None])
 
     def variance(self, level: Floats, channel: int, rows: slice) -> Floats:
         """Noise variance (h, W) in some rows of a channel, for an expected radiance `level` (h, W)."""
-        own, seen = self._reference.noise.of_channel(channel, level), self._reference.signals.usable[rows]
-        if self._dark is None or seen.all():
-            return own
-        return np.where(seen, own, self._dark.noise.of_radiance(self._dark.ratio).of_channel(channel, level))
+        variance, own = self.reference.noise.of_channel(channel, level), self.reference.signals.usable[rows]
+        if self.darkest is None or own.all():
+            return variance
+        return np.where(own, variance, self.darkest.noise.of_radiance(self.darkest.ratio).of_channel(channel, level))
 
-    def ghosts(self, frame: ExposedFrame, misfit: Floats, gain: float) -> Bools:
+    def ghosts(self, frame: RegisteredFrame) -> Bools:
         """Pixels (H, W) around which the mean of a window differs by more than noise, registration error and flare.
 
-        misfit (C,) is the variance per squared gradient, gain the factor on the frame's noise variance by resampling.
         Isolated windows are dropped, the others are grown by a window.
         """
         _, height, width = frame.signals.shape
-        found = np.zeros((height, width), bool)
-        parallel.results(
-            partial(self._block, frame, misfit, gain, found, *block) for block in blocks(height, _WINDOW // 2 + 1)
-        )
-        core = _all_around(found, 1)
-        return _any_around(core, _WINDOW // 2 + 2)
+        found, known = np.zeros((height, width), bool), self.known & frame.signals.usable
+        noise = frame.noise.of_radiance(frame.ratio, frame.mean_gain)
 
-    def _block(
-        self, frame: ExposedFrame, misfit: Floats, gain: float, found: Bools, rows: slice, inner: slice, target: slice
-    ) -> None:
-        """Mark windows that differ: read `rows`, and write their part `inner` to the rows `target` of `found`."""
-        anchor, value = self.rows(rows), frame.signals.rows(rows)
-        off = np.zeros(anchor.shape[1:], bool)
-        noise = frame.noise.of_radiance(frame.ratio, gain)
-        for c in range(len(anchor)):
-            level = box(anchor[c])
-            own = self.variance(level, c, rows)
-            limit = noise.of_channel(c, level)
-            limit += own
-            limit *= np.float32(_SIGMA**2 * _CORRELATED / _WINDOW**2)
-            np.sqrt(limit, out=limit)
-            if misfit[c]:
-                beyond = box(squared_gradient(anchor[c]))
-                beyond -= own
-                np.maximum(beyond, 0, out=beyond)
-                beyond *= np.float32(_MISFIT**2 * misfit[c])
-                limit += np.sqrt(beyond, out=beyond)
-            limit += np.float32(_BLACK * (1 + 1 / float(frame.ratio[c])))
-            difference = box(value[c])
-            if frame.vignetting is not None:
-                difference /= frame.vignetting[rows]
-            cv2.scaleAdd(difference, -1 / float(frame.ratio[c]), level, difference)
-            np.abs(difference, out=difference)
-            np.abs(level, out=level)
-            cv2.scaleAdd(level, _SHARE, limit, limit)
-            off |= difference > limit
-        seen = _all_around(self.known[rows] & frame.signals.usable[rows], _WINDOW // 2)
-        found[target] = (off & seen)[inner]
+        def compare(rows: slice, inner: slice, target: slice) -> None:
+            anchor, value = self.rows(rows), frame.signals.rows(rows)
+            off = np.zeros(anchor.shape[1:], bool)
+            for c in range(len(anchor)):
+                level = box(anchor[c])
+                own = self.variance(level, c, rows)
+                limit = np.sqrt((noise.of_channel(c, level) + own) * np.float32(_SIGMA**2 * _CORRELATED / _WINDOW**2))
+                if frame.misfit[c]:
+                    edge = np.maximum(box(squared_gradient(anchor[c])) - own, 0)
+                    limit += np.sqrt(edge * np.float32(_MISFIT**2 * frame.misfit[c]))
+                limit += _SHARE * np.abs(level) + np.float32(_BLACK * (1 + 1 / float(frame.ratio[c])))
+                scaled = box(value[c]) / frame.ratio[c]
+                if frame.vignetting is not None:
+                    scaled /= frame.vignetting[rows]
+                off |= np.abs(scaled - level) > limit
+            found[target] = (off & _all_around(known[rows], _WINDOW // 2))[inner]
+
+        parallel.results(partial(compare, *block) for block in blocks(height, _WINDOW // 2 + 1))
+        return _any_around(_all_around(found, 1), _WINDOW // 2 + 2)
 
 
-class FirstEstimate:
-    """First estimate of the radiance, X₀ = Σ Y/a / Σ e/a over usable pixels, smoothed where the picture is flat."""
+def first_estimate(parts: list[tuple[RegisteredFrame, Bools]], otherwise: Signals | Anchor, ghost: Bools) -> Floats:
+    """First estimate of the radiance, X₀ = Σ Y/a / Σ e/a, (C, H, W), after a local Wiener filter.
 
-    def __init__(self) -> None:
-        self._parts: list[tuple[ExposedFrame, Bools]] = []
+    `parts` are frames, each with the pixels (H, W) for which it is used. `otherwise` is used where no frame is, and at
+    ghosts. The filter (Lee, IEEE PAMI 1980) moves each pixel towards the mean of its window, by the share of the
+    window's variance that noise explains; it assumes 1.5 times the noise variance.
+    """
+    out = np.empty(parts[0][0].signals.shape, np.float32)
 
-    def add(self, frame: ExposedFrame, serves: Bools) -> None:
-        """Add a frame, to be used for some pixels (H, W)."""
-        self._parts.append((frame, serves))
-
-    def smoothed(self, otherwise: Signals | Anchor, ghost: Bools) -> Floats:
-        """The estimate (C, H, W) after a local Wiener filter (Lee, IEEE PAMI 1980).
-
-        Each pixel is moved towards the mean of its window, by the share of the window's variance that noise explains;
-        the filter assumes 1.5 times the noise variance. `otherwise` is used where no frame was added, and at ghosts.
-        """
-        out = np.empty(self._parts[0][0].signals.shape, np.float32)
-        halo = 2 * (_WINDOW // 2)  # windows of distances from means of windows
-        parallel.results(partial(self._block, otherwise, ghost, out, *block) for block in blocks(out.shape[1], halo))
-        return out
-
-    def _block(
-        self, otherwise: Signals | Anchor, ghost: Bools, out: Floats, rows: slice, inner: slice, target: slice
-    ) -> None:
-        """Smooth `rows`, and write their part `inner` to the rows `target` of `out`."""
-        values = [frame.signals.rows(rows) for frame, _ in self._parts]
-        serves = [_weight(serve[rows]) for _, serve in self._parts]
+    def estimate(rows: slice, inner: slice, target: slice) -> None:
+        values = [frame.signals.rows(rows) for frame, _ in parts]
+        serves = [_weight(serve[rows]) for _, serve in parts]
         clear = ~ghost[rows]
-        everywhere = bool(clear.all()) and any(np.ndim(serve) == 0 for serve in serves)
+        everywhere = clear.all() and any(np.ndim(serve) == 0 for serve in serves)
         stand_in = None if everywhere else otherwise.rows(rows)
         for c in range(len(out)):
             number = np.zeros(clear.shape, np.float32)
             exposure: Floats | np.float32 = np.float32(0)
             floor: Floats | np.float32 = np.float32(0)
-            for (frame, _), value, serve in zip(self._parts, values, serves):
-                electrons = 1 / float(frame.noise.slope[c])
-                cv2.scaleAdd(value[c] if np.ndim(serve) == 0 else value[c] * serve, electrons, number, number)
-                exposure = exposure + serve * np.float32(electrons * frame.ratio[c])
-                floor = floor + serve * np.float32(electrons**2 * frame.noise.floor[c])
+            for (frame, _), value, serve in zip(parts, values, serves):
+                electrons = 1 / frame.noise.slope[c]
+                number += value[c] * (serve * electrons)
+                exposure = exposure + serve * (electrons * frame.ratio[c])
+                floor = floor + serve * (electrons**2 * frame.noise.floor[c])
             number /= np.maximum(exposure, np.float32(1e-20))
             if stand_in is not None:
                 served = (exposure > 0) & clear
                 number = np.where(served, number, stand_in[c])
                 exposure = np.where(served, exposure, np.float32(1e15))
             out[c, target] = _wiener(number, exposure, floor)[inner]
+
+    halo = 2 * (_WINDOW // 2)  # windows of distances from means of windows
+    parallel.results(partial(estimate, *block) for block in blocks(out.shape[1], halo))
+    return out
 
 
 def _weight(serves: Bools) -> Floats | np.float32:
@@ -173,14 +149,8 @@ def _wiener(x: Floats, electrons: Floats | np.float32, floor: Floats | np.float3
     """Wiener-filtered x (h, w), with `electrons` per unit of x and `floor` the variance of read noise [electrons²]."""
     mean = box(x)
     distance = x - mean
-    spread = box(distance * distance)
-    np.maximum(spread, np.float32(1e-20), out=spread)
-    noise = np.maximum(mean, 0, out=mean)
-    noise *= np.float32(1.5) / electrons
-    noise += np.float32(1.5) * floor / (electrons * electrons)
-    noise /= spread
-    distance *= np.minimum(noise, 1, out=noise)
-    return x - distance
+    noise = np.float32(1.5) * (np.maximum(mean, 0) / electrons + floor / (electrons * electrons))
+    return x - distance * np.minimum(noise / np.maximum(box(distance * distance), np.float32(1e-20)), 1)
 
 
 def box(picture: Floats) -> Floats:

@@ -9,15 +9,15 @@ Janesick, Photon Transfer, SPIE 2007; Foi et al., Practical Poissonian-Gaussian 
 fitting for single-image raw-data, IEEE TIP 2008 (flat tiles, robust line).
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from polcap.images import Bits, Floats, NoiseLine
+from polcap.images import Bits, Bools, Floats, NoiseLine
 from polcap.optics import demosaic
+from polcap.optics.resize import area_mean
 from polcap.optics.robust import fit_noise_line
 from polcap.stages.hdr.planes import Signals
 
@@ -40,12 +40,9 @@ class Noise:
         """Variance (…, C) of pixels for their expected signals (…, C); negative signals count as 0."""
         return np.maximum(signal, 0) * self.slope + self.floor
 
-    def of_channel(self, channel: int, signal: Floats, into: Floats | None = None) -> Floats:
-        """Variance (h, w) of one channel for its expected signals (h, w), written to `into` or a new array."""
-        out: Floats = np.maximum(signal, 0, out=into)
-        out *= self.slope[channel]
-        out += self.floor[channel]
-        return out
+    def of_channel(self, channel: int, signal: Floats) -> Floats:
+        """Variance (h, w) of one channel for its expected signals (h, w)."""
+        return np.asarray(np.maximum(signal, 0) * self.slope[channel] + self.floor[channel])
 
     def of_radiance(self, ratio: Floats, gain: float = 1.0) -> "Noise":
         """The noise line of radiance: signals over their exposure ratio (C,), with `gain` on the variance."""
@@ -58,9 +55,7 @@ class Noise:
 
 def of_pixels(light: Floats, line: Noise, cfa: Bits | None) -> Floats:
     """Variance (C, h, w) for expected signals (C, h, w); `cfa` for pixels interpolated from it, None if binned."""
-    expected = np.empty_like(light)
-    for c, plane in enumerate(light):
-        line.of_channel(c, plane, expected[c])
+    expected = np.stack([line.of_channel(c, plane) for c, plane in enumerate(light)])
     if cfa is None:
         return expected
     expected[1] *= 2  # binned green is the mean of two photosites
@@ -95,15 +90,25 @@ def strips(height: int, width: int, most: float = 0.75e6) -> list[slice]:
     return [slice(TILE * int(r), TILE * int(r) + TILE + 2) for r in first]
 
 
+def tile_columns(
+    frames: tuple[Signals, ...], maps: Callable[..., tuple[Floats, ...]], most: float = 0.75e6
+) -> list[Floats]:
+    """Tile means (T, C) of each of the maps that `maps` computes from the frames' strips (C, h, w).
+
+    NaN for tiles that are not fully usable in all frames. The maps are 1 px smaller on each side than the strips.
+    """
+    usable = np.logical_and.reduce([frame.usable for frame in frames])
+    columns = []
+    for rows in strips(usable.shape[0], usable.shape[1], most):
+        whole = usable_tiles(usable[rows])
+        columns.append([_tiles(values, whole) for values in maps(*(frame.rows(rows) for frame in frames))])
+    return [np.concatenate(column) for column in zip(*columns, strict=True)]
+
+
 def sample_frame(picture: Signals) -> Samples:
     """Signal and variance in tiles of a single frame."""
-    signal, variance = [], []
-    for rows in strips(*picture.usable.shape):
-        part, whole = picture.rows(rows), usable_tiles(picture.usable[rows])
-        detail = roughness(part)
-        signal.append(tiles(part[:, 1:-1, 1:-1], whole))
-        variance.append(tiles(detail * detail, whole))
-    return _samples(signal, variance, True, picture.shape[0])
+    signal, variance = tile_columns((picture,), lambda part: (inner(part), roughness(part) ** 2))
+    return Samples(signal, variance, flat=True)
 
 
 def sample_pair(first: Signals, second: Signals, ratio: Floats) -> tuple[Samples, Samples]:
@@ -112,23 +117,26 @@ def sample_pair(first: Signals, second: Signals, ratio: Floats) -> tuple[Samples
     With h₁ = t + n₁ and h₂ = r t + n₂, the scene's detail t cancels in ⟨h₁ (h₁ − h₂/r)⟩ = var n₁ and
     ⟨h₂ (h₂ − r h₁)⟩ = var n₂.
     """
-    columns: tuple[list[Floats], ...] = ([], [], [], [])
     r = np.asarray(ratio, np.float32)
-    for rows in strips(*first.usable.shape):
-        one, two, whole = first.rows(rows), second.rows(rows), usable_tiles(first.usable[rows] & second.usable[rows])
+
+    def maps(one: Floats, two: Floats) -> tuple[Floats, ...]:
         h1, h2 = roughness(one), roughness(two)
         difference = h2 - r[:, None, None] * h1
-        h1 *= difference
-        h2 *= difference
-        means = [tiles(values, whole) for values in (one[:, 1:-1, 1:-1], h1, two[:, 1:-1, 1:-1], h2)]
-        means[1] /= -r
-        for column, mean in zip(columns, means):
-            column.append(mean)
-    channels = first.shape[0]
-    return (
-        _samples(columns[0], columns[1], False, channels),
-        _samples(columns[2], columns[3], False, channels),
-    )
+        return inner(one), h1 * difference, inner(two), h2 * difference
+
+    signal1, product1, signal2, product2 = tile_columns((first, second), maps)
+    return Samples(signal1, product1 / -r, flat=False), Samples(signal2, product2, flat=False)
+
+
+def inner(picture: Floats) -> Floats:
+    """A picture (C, h, w) without its outermost pixels."""
+    return picture[:, 1:-1, 1:-1]
+
+
+def squared_differences(picture: Floats) -> Floats:
+    """Squared gradient (C, h−2, w−2) of a picture (C, h, w) by central differences, per px²."""
+    gx, gy = picture[:, 1:-1, 2:] - picture[:, 1:-1, :-2], picture[:, 2:, 1:-1] - picture[:, :-2, 1:-1]
+    return np.asarray((gx * gx + gy * gy) / 4)
 
 
 def fit(samples: list[Samples], iso: float | None, least_floor: float) -> Noise:
@@ -150,27 +158,16 @@ def misfit(first: Signals, second: Signals, ratio: Floats, lines: tuple[Noise, N
     `lines` are their noise lines, `gain` is the factor on the second frame's noise variance by resampling.
     """
     r = np.asarray(ratio, np.float32)
-    columns: tuple[list[Floats], ...] = ([], [], [])
-    for rows in strips(*first.usable.shape):
-        a, whole = first.rows(rows), usable_tiles(first.usable[rows] & second.usable[rows])
-        d = second.rows(rows)[:, 1:-1, 1:-1] * (1 / r)[:, None, None]
-        d -= a[:, 1:-1, 1:-1]
-        gx, gy = a[:, 1:-1, 2:] - a[:, 1:-1, :-2], a[:, 2:, 1:-1] - a[:, :-2, 1:-1]
-        gx *= gx
-        gy *= gy
-        gx += gy
-        level, offset = tiles(a[:, 1:-1, 1:-1], whole), tiles(d, whole)
-        d *= d
-        own = lines[0].variance(level)
-        columns[0].append(own + lines[1].variance(level * r) / r**2 * gain)
-        columns[1].append(tiles(d, whole) - offset**2)
-        columns[2].append(tiles(gx, whole) / 4 - own)
-    out = np.zeros(first.shape[0], np.float32)
-    if columns[0]:
-        expected, seen, edge = (np.concatenate(column) for column in columns)
-        for c in range(len(out)):
-            out[c] = _per_edge(expected[:, c], seen[:, c], edge[:, c])
-    return out
+
+    def maps(a: Floats, b: Floats) -> tuple[Floats, ...]:
+        difference = inner(b) * (1 / r)[:, None, None] - inner(a)
+        return inner(a), difference, difference**2, squared_differences(a)
+
+    level, offset, square, edge = tile_columns((first, second), maps)
+    own = lines[0].variance(level)
+    expected = own + lines[1].variance(level * r) / r**2 * gain
+    columns = zip(expected.T, (square - offset**2).T, (edge - own).T)
+    return np.array([_per_edge(*column) for column in columns], np.float32)
 
 
 def _per_edge(expected: Floats, seen: Floats, edge: Floats) -> float:
@@ -227,50 +224,38 @@ def _line(samples: list[Samples], channel: int, iso: float | None, least: float)
     """Slope and floor of one channel's noise line."""
     electrons = _TYPICAL_ELECTRONS * 100 / max(iso or 100.0, 1.0)
     typical = 1 / electrons, max(least, (_TYPICAL_READ / electrons) ** 2)
-    parts: list[tuple[Floats, Floats, bool]] = []  # (B, n) each: B bins of n tiles
+    bins: list[tuple[Floats, Floats, bool]] = []  # signal and variance (n,) of tiles of like signal
     for sample in samples:
         good = np.isfinite(sample.signal[:, channel])
         if good.sum() < _LEAST_TILES:
             continue
         signal, variance = sample.signal[good, channel], sample.variance[good, channel]
-        for bins in _bins(signal, int(np.clip(len(signal) // 25, 2, 32))):
-            parts.append((signal[bins], variance[bins], sample.flat))
-    if not parts:
+        order = np.argsort(signal.round(6), kind="stable")  # equal on every processor
+        for chosen in np.array_split(order, np.clip(len(order) // 25, 2, 32)):
+            bins.append((signal[chosen], variance[chosen], sample.flat))
+    if not bins:
         return typical
-    line = typical
+    level, number = np.array([(signal.mean(), len(signal)) for signal, _, _ in bins]).T
+    slope, floor = typical
     for _ in range(3):  # the signal varies within a bin, so each tile is compared with the present line
-        x, y, n = [], [], []
-        for signal, variance, flat in parts:
-            level = signal.mean(axis=1)
-            relative = variance / (line[0] * np.maximum(signal, 0) + line[1])
-            quotients = _low_quantile(relative) if flat else np.median(relative, axis=1)
-            x.append(level)
-            y.append(quotients * (line[0] * np.maximum(level, 0) + line[1]))
-            n.append(np.full(len(signal), float(signal.shape[1])))
-        freedom = FREEDOM * np.concatenate(n)
-        signal, seen = np.concatenate(x), np.maximum(np.concatenate(y), least)
-        fit = fit_noise_line(signal, seen, freedom, least=least, least_floor=least, outliers=True)
+        quotient = np.array([_quotient(v / (slope * np.maximum(s, 0) + floor), flat) for s, v, flat in bins])
+        seen = np.maximum(quotient * (slope * np.maximum(level, 0) + floor), least)
+        fit = fit_noise_line(level, seen, FREEDOM * number, least=least, least_floor=least, outliers=True)
         if not 1 / _SANE_ELECTRONS[1] < fit.slope < 1 / _SANE_ELECTRONS[0]:  # NaN if all signals are equal
             return typical
-        line = fit.slope, fit.floor
-    return line
+        slope, floor = fit.slope, fit.floor
+    return slope, floor
 
 
-def _bins(signal: Floats, count: int) -> list[NDArray[np.int64]]:
-    """Indices of tiles in `count` bins by signal (T,): two arrays (B, n), bins of the second one tile shorter."""
-    order = np.argsort(signal)
-    n, longer = divmod(len(order), count)
-    cut = longer * (n + 1)
-    return [order[:cut].reshape(longer, n + 1), order[cut:].reshape(count - longer, n)]
+def _quotient(relative: Floats, flat: bool) -> float:
+    """Mean of a bin's relative tile variances (n,): their median, or from the 15 % quantile for `flat` samples."""
+    if not flat:
+        return float(np.median(relative))
+    spread = 2 / (9 * FREEDOM)  # of a χ² law by Wilson and Hilferty
+    return float(np.quantile(relative, 0.15) / (1 - spread - 1.0364 * spread**0.5) ** 3)
 
 
-def _low_quantile(variance: Floats) -> Floats:
-    """Mean noise variances (B,) from the 15 % quantiles of tile variances (B, n), by Wilson and Hilferty's χ² law."""
-    spread = 2 / (9 * FREEDOM)
-    return np.asarray(np.quantile(variance, 0.15, axis=1) / (1 - spread - 1.0364 * spread**0.5) ** 3)
-
-
-def usable_tiles(usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def usable_tiles(usable: Bools) -> Bools:
     """Whether each tile (T,) of a strip (h, W) of `strips` has only usable pixels, also around it."""
     bad = np.asarray(~usable.all(axis=0))  # (W,)
     before = np.concatenate([[0], np.cumsum(bad)])
@@ -278,16 +263,8 @@ def usable_tiles(usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(before[first + TILE + 2] == before[first])
 
 
-def tiles(values: Floats, whole: NDArray[np.bool_]) -> Floats:
+def _tiles(values: Floats, whole: Bools) -> Floats:
     """Means (T, C) over the tiles of a strip (C, h, w) of `strips`; NaN for tiles that are not `whole` (T,)."""
     count = len(whole)
-    mean = np.empty((count, len(values)))
-    for c, plane in enumerate(values):
-        mean[:, c] = cv2.resize(plane[:TILE, : count * TILE], (count, 1), interpolation=cv2.INTER_AREA)[0]
-    mean[~whole] = np.nan
-    return mean
-
-
-def _samples(signal: list[Floats], variance: list[Floats], flat: bool, channels: int) -> Samples:
-    empty = np.empty((0, channels))
-    return Samples(np.concatenate([empty, *signal]), np.concatenate([empty, *variance]), flat)
+    mean = np.stack([area_mean(plane[:TILE, : count * TILE], (1, count))[0] for plane in values], axis=-1)
+    return np.where(whole[:, None], mean.astype(np.float64), np.nan)

@@ -6,11 +6,10 @@ again for every pass, and planes are computed block by block. The pixels are the
 
 import math
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -21,6 +20,7 @@ from polcap.errors import CaptureError, SettingError
 from polcap.images import Decode, Floats, Frame, SensorImage, Shot
 from polcap.optics import sensor
 from polcap.optics.projection import coordinates
+from polcap.optics.resize import block_means
 
 Bools = NDArray[np.bool_]
 
@@ -32,101 +32,41 @@ _WORK_BYTES = 60  # per pixel, for the first estimate, registration, masks and b
 _FRACTIONS = 32  # steps per pixel in the table of cv2's Lanczos kernel
 
 
-class Signals(Protocol):
+@dataclass(frozen=True)
+class Signals:
     """Linear signals of one frame, black = 0 and white = 1, and its usable pixels."""
 
-    @property
-    def usable(self) -> Bools:
-        """(H, W)."""
-        ...
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """C, H, W."""
-        ...
-
-    def rows(self, rows: slice) -> Floats:
-        """Some rows (C, h, W) float32; a new array, or a view that must not be changed."""
-        ...
+    shape: tuple[int, int, int]  # C, H, W
+    usable: Bools  # (H, W)
+    rows: Callable[[slice], Floats]  # some rows (C, h, W) float32; the result must not be changed
 
 
-@dataclass(frozen=True)
-class Planes:
-    """Signals in memory."""
-
-    value: Floats  # (C, H, W) float32
-    usable: Bools
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        channels, height, width = self.value.shape
-        return channels, height, width
-
-    def rows(self, rows: slice) -> Floats:
-        """Some rows (C, h, W), as a view."""
-        return self.value[:, rows]
-
-
-@dataclass(frozen=True)
-class Quads:
-    """Signals of a binned mosaic, computed from its counts when read: a third of the memory of `Planes`."""
-
-    image: SensorImage
-    usable: Bools
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        height, width = self.image.value.shape
-        return 3, height // self.image.superpixel, width // self.image.superpixel
-
-    def rows(self, rows: slice) -> Floats:
-        """Some rows (C, h, W), identical to `optics.sensor.signal`."""
-        start, stop, _ = rows.indices(self.shape[1])
-        out = np.empty((3, stop - start, self.shape[2]), np.float32)
-        self.into(rows, out)
-        return out
-
-    def into(self, rows: slice, out: Floats) -> None:
-        """Write some rows to `out` (C, h, W)."""
-        image = self.image
-        assert image.cfa is not None
-        _, height, width = self.shape
-        start, stop, _ = rows.indices(height)
-        if image.superpixel == 3:
-            cfa = np.roll(image.cfa, -3 * start % 6, axis=0)
-            out[:] = np.moveaxis(sensor.signal(replace(image, value=image.value[3 * start : 3 * stop], cfa=cfa)), -1, 0)
-            return
-        black = np.broadcast_to(image.black, (2, 2))
-        span = np.float32(image.white - float(image.black.mean()))
-        for color, plane in enumerate(out):
-            sites = [site for site in np.ndindex(2, 2) if image.cfa[site] == color]
-            for n, (i, j) in enumerate(sites):
-                site = image.value[2 * start + i : 2 * stop : 2, j : 2 * width : 2]
-                if n == 0:
-                    plane[:] = site
-                else:
-                    plane += site
-            if len(sites) > 1:
-                plane *= np.float32(1 / len(sites))
-            plane -= np.float32(black[image.cfa == color].mean())
-            plane /= span
+def in_memory(value: Floats, usable: Bools) -> Signals:
+    """Signals (C, H, W) float32 that are held in memory."""
+    channels, height, width = value.shape
+    return Signals((channels, height, width), usable, lambda rows: value[:, rows])
 
 
 def signals(image: SensorImage, clip: float, full: bool = False, planes_bytes: float = math.inf) -> Signals:
     """Signals of a decoded frame; pixels with counts from `clip` [white level] on are not usable.
 
-    A mosaic is binned by superpixels, or interpolated with `full`. Above `planes_bytes` the result is `Quads`.
+    A mosaic is binned by superpixels, or interpolated with `full`. Binned signals of more than `planes_bytes` are
+    computed from the counts whenever rows are read, in a third of the memory.
     """
     usable = sensor.usable(image, clip, full)
     if image.cfa is None or full:
-        return Planes(planar(sensor.signal(image, full)), usable)
-    quads = Quads(image, usable)
-    channels, height, width = quads.shape
-    if 4 * channels * height * width > planes_bytes:
-        return quads
-    value = np.empty(quads.shape, np.float32)
-    parallel.results(partial(quads.into, rows, value[:, rows]) for rows, _, _ in blocks(height))
-    return Planes(value, usable)
+        return in_memory(planar(sensor.signal(image, full)), usable)
+    shape = (3, *usable.shape)
+    read = partial(sensor.binned_planes, image)
+    if 4 * math.prod(shape) > planes_bytes:
+        return Signals(shape, usable, read)
+    value = np.empty(shape, np.float32)
+
+    def bin_rows(rows: slice) -> None:
+        value[:, rows] = read(rows)
+
+    parallel.results(partial(bin_rows, rows) for rows, _, _ in blocks(usable.shape[0]))
+    return in_memory(value, usable)
 
 
 def planar(picture: Floats) -> Floats:
@@ -139,43 +79,26 @@ def blocks(height: int, halo: int = 0, rows: int = _ROWS) -> Iterator[tuple[slic
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
         start = max(top - halo, 0)
-        yield (
-            slice(start, min(bottom + halo, height)),
-            slice(top - start, bottom - start),
-            slice(top, bottom),
-        )
+        yield slice(start, min(bottom + halo, height)), slice(top - start, bottom - start), slice(top, bottom)
 
 
 def tile_means(picture: Signals, side: int) -> Floats:
     """Means (rows, columns, C) float32 over tiles of side × side px; incomplete tiles are dropped."""
-    channels, height, width = picture.shape
-    down, across = height // side, width // side
-    out = np.zeros((down, across, channels), np.float32)
-    per_block = math.ceil(_ROWS / side)
-    for top in range(0, down, per_block):
-        bottom = min(top + per_block, down)
-        part = picture.rows(slice(top * side, bottom * side))
-        for c in range(channels):
-            whole = part[c, :, : across * side]
-            out[top:bottom, :, c] = cv2.resize(whole, (across, bottom - top), interpolation=cv2.INTER_AREA)
-    return out
+    _, height, width = picture.shape
+    parts = [picture.rows(rows) for rows, _, _ in blocks(height // side * side, rows=math.ceil(_ROWS / side) * side)]
+    means = [np.stack([block_means(plane, side) for plane in part], axis=-1) for part in parts]
+    return np.concatenate([np.zeros((0, width // side, picture.shape[0]), np.float32), *means])
 
 
-def resample(signals: Signals, matrix: Floats) -> tuple[Planes, Floats]:
+def resample(signals: Signals, matrix: Floats) -> tuple[Signals, Floats]:
     """Resample a frame on the reference frame's grid by Lanczos interpolation.
 
     matrix (3, 3) maps reference px → frame px. Also returns the factor (H, W) on the noise variance.
     """
     _, h, w = signals.shape
     inverse = cv2.WARP_INVERSE_MAP
-    value = np.stack(
-        [
-            cv2.warpPerspective(
-                plane, matrix, (w, h), flags=inverse | cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE
-            )
-            for plane in signals.rows(slice(0, h))
-        ]
-    )
+    how = {"flags": inverse | cv2.INTER_LANCZOS4, "borderMode": cv2.BORDER_REPLICATE}
+    value = np.stack([cv2.warpPerspective(plane, matrix, (w, h), **how) for plane in signals.rows(slice(None))])
     # unusable if a clipped pixel or the border is within the main lobes of the kernel
     inner = cv2.erode(signals.usable.view(np.uint8) * 255, np.ones((5, 5), np.uint8), borderValue=0)
     seen = cv2.warpPerspective(inner, matrix, (w, h), flags=inverse | cv2.INTER_LINEAR, borderValue=0) == 255
@@ -187,7 +110,7 @@ def resample(signals: Signals, matrix: Floats) -> tuple[Planes, Floats]:
         px, py = coordinates(matrix, x, y)
         gain[rows] = table[((px - np.floor(px)) * _FRACTIONS + 0.5).astype(np.int8)]
         gain[rows] *= table[((py - np.floor(py)) * _FRACTIONS + 0.5).astype(np.int8)]
-    return Planes(value, seen), gain
+    return in_memory(value, seen), gain
 
 
 @lru_cache(maxsize=1)
@@ -280,11 +203,12 @@ class Reader:
         """Signals of frame e of a bracket, with the channels of the first frame read."""
         found = signals(self(shot.frames[e]), self.clip, full, self.plan.planes / len(shot.frames))
         self._channels = self._channels or found.shape[0]
-        if not isinstance(found, Planes) or found.shape[0] == self._channels:
+        if found.shape[0] == self._channels:
             return found
-        uniform = np.ptp(found.value) == 0  # fully clipped: its number of channels is that of the other frames
-        if uniform or found.shape[0] == 1:  # a grey picture among colored ones
-            return Planes(np.repeat(found.value[:1], self._channels, axis=0), found.usable)
+        value = found.rows(slice(None))
+        uniform = np.ptp(value) == 0  # fully clipped: its number of channels is that of the other frames
+        if uniform or len(value) == 1:  # a grey picture among colored ones
+            return in_memory(np.repeat(value[:1], self._channels, axis=0), found.usable)
         return found
 
     def forget(self, frames: Iterable[Frame]) -> None:

@@ -13,16 +13,14 @@ from functools import partial
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from polcap import parallel
-from polcap.images import Bits, Falloff, Floats, MaskedImage, Quality, View
+from polcap.images import Bits, Bools, Falloff, Floats, MaskedImage, Quality, Shot, View
 from polcap.optics.registration import scaled, squared_gradient
 from polcap.stages.hdr import exposure, noise
 from polcap.stages.hdr.bracket import AmbientLight, Bracket, ComparedBracket, ambient_light
-from polcap.stages.hdr.planes import Reader, Signals, blocks, resample
-
-Bools = NDArray[np.bool_]
+from polcap.stages.hdr.ghosts import RegisteredFrame
+from polcap.stages.hdr.planes import Reader, blocks, resample
 
 _FALL = 0.05  # [white level] range below saturation in which a frame's weight falls from 1 to _LEAST
 _LEAST = 1e-3
@@ -33,15 +31,11 @@ _DARK_SIGMAS = np.float32(2)  # pixels below this many standard deviations are f
 
 
 @dataclass(frozen=True)
-class _Frame:
-    """One frame on the reference frame's grid."""
+class WeightedFrame:
+    """One frame on the grid of the merge, with its ambient light."""
 
-    signals: Signals
+    frame: RegisteredFrame
     serves: Bools  # (H, W) pixels for which the frame is used
-    blur: Floats | None  # (H, W) factor on the noise variance by resampling
-    ratio: Floats  # (C,)
-    noise: noise.Noise
-    misfit: Floats  # (C,)
     ambient: np.float32  # exposure to ambient light, relative to the reference frame
     last: bool  # no frame is darker: used up to saturation
     cfa: Bits | None  # of an interpolated mosaic; None: binned
@@ -49,18 +43,19 @@ class _Frame:
 
 
 @dataclass(frozen=True)
-class WeightedFrames:
+class WeightedBracket:
     """The frames of a bracket with everything that their weights need."""
 
-    frames: list[_Frame]
-    compared: ComparedBracket  # on the grid of the frames
+    frames: list[WeightedFrame]
+    estimate: Floats  # (C, H, W) the smoothed first estimate
+    ghost: Bools  # (H, W)
     ambient: AmbientLight | None
     served: Bools  # (H, W) pixels with at least one usable frame
     clip: float
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        return self.frames[0].signals.shape
+        return self.frames[0].frame.signals.shape
 
     def merge_into(self, out: MaskedImage) -> None:
         """Write the weighted mean to `out`; a single channel is copied to all three, with 3 times its variance."""
@@ -70,12 +65,9 @@ class WeightedFrames:
 
     def _block(self, out: MaskedImage, rows: slice) -> None:
         value, variance = self._rows(rows)
-        total, noise_ = (np.sum(planes, axis=0) for planes in (value, variance))
-        np.sqrt(noise_, out=noise_)
-        noise_ *= _DARK_SIGMAS
         quality = _flagged(~self.served[rows], Quality.CLIPPED)
-        quality |= _flagged(self.compared.ghost[rows], Quality.GHOST)
-        quality |= _flagged(total < noise_, Quality.DARK)
+        quality |= _flagged(self.ghost[rows], Quality.GHOST)
+        quality |= _flagged(value.sum(axis=0) < _DARK_SIGMAS * np.sqrt(variance.sum(axis=0)), Quality.DARK)
         out.quality[rows] = quality
         if len(value) == 1:
             value, variance = value.repeat(3, axis=0), variance.repeat(3, axis=0) * np.float32(3)
@@ -88,115 +80,99 @@ class WeightedFrames:
         With weights w = trust / v and v the variance of a frame's radiance, Σ w² v = Σ trust · w. The sums use
         w / ratio, so that signals need not be converted to radiance.
         """
-        estimate = self.compared.estimate[:, rows]
-        light = np.maximum(estimate, 0)
-        number, weights, variance = (np.zeros_like(estimate) for _ in range(3))
-        shares = np.zeros_like(estimate) if self.ambient is not None else None  # of the ambient light
-        steep = _edges(self.compared.estimate, rows) if any(f.misfit.any() for f in self.frames) else None
-        for frame in self.frames:
-            sample, trust = frame.signals.rows(rows), self._trust(frame, estimate, rows)
-            for c, weight in enumerate(self._noise(frame, rows, light, steep)):
-                ratio, plane = float(frame.ratio[c]), sample[c]
+        estimate = self.estimate[:, rows]
+        number, weights, variance, shares = (np.zeros_like(estimate) for _ in range(4))  # shares: of ambient light
+        steep = _edges(self.estimate, rows) if any(one.frame.misfit.any() for one in self.frames) else None
+        for one in self.frames:
+            sample, trust = one.frame.signals.rows(rows), self._trust(one, estimate, rows)
+            for c, weight in enumerate(self._noise(one, rows, np.maximum(estimate, 0), steep)):
+                ratio, plane = float(one.frame.ratio[c]), sample[c]
                 np.divide(trust, weight, out=weight)
-                if self.ambient is not None and shares is not None:
-                    plane = plane - frame.ambient * self.ambient.value[c, rows]
-                    cv2.scaleAdd(weight, float(frame.ambient), shares[c], shares[c])
+                if self.ambient is not None:
+                    plane = plane - one.ambient * self.ambient.value[c, rows]
+                    cv2.scaleAdd(weight, float(one.ambient), shares[c], shares[c])
                 cv2.accumulateProduct(weight, plane, number[c])
                 cv2.scaleAdd(weight, ratio, weights[c], weights[c])
-                if np.ndim(trust):
-                    weight *= trust
+                weight *= trust
                 cv2.scaleAdd(weight, ratio, variance[c], variance[c])
         number /= weights
         variance /= weights
         variance /= weights
-        if self.ambient is not None and shares is not None:
-            shares /= weights
-            variance += shares * shares * self.ambient.variance[:, rows]
+        if self.ambient is not None:
+            variance += (shares / weights) ** 2 * self.ambient.variance[:, rows]
         return number, variance
 
-    def _trust(self, frame: _Frame, estimate: Floats, rows: slice) -> Floats | np.float32:
-        """Factor on a frame's weight, lower near and at saturation; (h, W) or one number."""
-        serves = frame.serves[rows]
-        trust: Floats | np.float32 = np.float32(1) if serves.all() else np.maximum(serves, frame.least)
-        return trust if frame.last else trust * self._ramp(frame, estimate)
+    def _trust(self, one: WeightedFrame, estimate: Floats, rows: slice) -> Floats | np.float32:
+        """Factor on a frame's weight, (h, W) or one number.
 
-    def _noise(self, frame: _Frame, rows: slice, light: Floats, steep: Floats | None) -> Floats:
+        It falls smoothly from 1 to _LEAST at saturation, so that weights have no step, and is least where the frame is
+        not used.
+        """
+        serves = one.serves[rows]
+        trust: Floats | np.float32 = np.float32(1) if serves.all() else np.maximum(serves, one.least)
+        if one.last:
+            return trust
+        peak = np.maximum.reduce([plane * ratio for plane, ratio in zip(estimate, one.frame.ratio)])
+        ramp = (np.float32(self.clip) - peak) * np.float32(1 / _FALL)
+        return np.asarray(trust * np.clip(ramp, np.float32(_LEAST), 1))
+
+    def _noise(self, one: WeightedFrame, rows: slice, light: Floats, steep: Floats | None) -> Floats:
         """Expected variance of a frame's radiance `light` (C, h, W), times its exposure ratio."""
+        frame, ratio = one.frame, one.frame.ratio[:, None, None]
         if self.ambient is not None:
-            exposure_ = (frame.ambient / frame.ratio)[:, None, None]
-            light = light + exposure_ * np.maximum(self.ambient.value[:, rows], 0)
-        if frame.cfa is None:
-            out = np.empty_like(light)
-            for c, plane in enumerate(light):
-                np.multiply(plane, frame.noise.slope[c], out=out[c])
-                out[c] += frame.noise.floor[c] / frame.ratio[c]
-        else:
-            ratio = frame.ratio[:, None, None]
-            out = noise.of_pixels(light * ratio, frame.noise, frame.cfa)
-            out /= ratio
-        if frame.blur is not None:
-            out *= frame.blur[rows]
+            light = light + one.ambient / ratio * np.maximum(self.ambient.value[:, rows], 0)
+        out = noise.of_pixels(light * ratio, frame.noise, one.cfa)
+        out /= ratio
+        if frame.gain is not None:
+            out *= frame.gain[rows]
         if steep is not None:  # registration errors and aliasing, at edges
             for c, plane in enumerate(out):
                 cv2.scaleAdd(steep[c], float(frame.misfit[c] * frame.ratio[c]), plane, plane)
         return out
 
-    def _ramp(self, frame: _Frame, estimate: Floats) -> Floats:
-        """Factor (h, W) that falls smoothly from 1 to _LEAST at saturation, so that weights have no step."""
-        peak = estimate[0] * frame.ratio[0]
-        for plane, ratio in zip(estimate[1:], frame.ratio[1:]):
-            np.maximum(peak, plane * ratio, out=peak)
-        np.subtract(np.float32(self.clip), peak, out=peak)
-        peak *= np.float32(1 / _FALL)
-        return np.asarray(np.clip(peak, np.float32(_LEAST), 1, out=peak))
-
 
 def prepare(
     bracket: Bracket, compared: ComparedBracket, lines: noise.Lines, read: Reader, full: bool
-) -> WeightedFrames:
+) -> WeightedBracket:
     """The registered frames of a compared bracket, on the full grid with `full`, and the pixels each is used for."""
     ambient = ambient_light(bracket, lines, read, full)
+    ghost, estimate = compared.ghost, compared.estimate
     if full:
-        ghost = np.repeat(np.repeat(compared.ghost, 2, axis=0), 2, axis=1)
-        compared = replace(compared, estimate=_twice(compared.estimate), ghost=ghost)
-    bright = [float(link.ratio.mean()) for link in compared.links]
-    darkest = int(np.argmin(bright))
-    served = anchored = np.zeros(compared.ghost.shape, bool)
+        ghost, estimate = np.repeat(np.repeat(ghost, 2, axis=0), 2, axis=1), _twice(estimate)
+    bright = [float(frame.ratio.mean()) for frame in compared.frames]
+    darkest, reference = int(np.argmin(bright)), bracket.shot.frames[bracket.reference]
+    served = anchored = np.zeros(ghost.shape, bool)
     frames = []
     for e in [bracket.reference, *bracket.others]:
-        frame = _frame(bracket, e, compared, read, full, last=bright[e] < _AS_DARK * bright[darkest])
+        frame = compared.frames[e]
+        if full or ambient is not None:
+            frame = _read_again(bracket.shot, e, frame, read, full)
+        last, usable = bright[e] < _AS_DARK * bright[darkest], frame.signals.usable
+        serves = usable if frame.motion is not None or not last else np.ones_like(usable)
         if e == bracket.reference:
-            anchored = frame.serves
-        elif compared.ghost.any():
-            frame = replace(frame, serves=frame.serves & (~compared.ghost | (~anchored & (e == darkest))))
-        served = served | (frame.serves & frame.signals.usable)
-        frames.append(frame)
-    return WeightedFrames(frames, compared, ambient, served, read.clip)
+            anchored = serves
+        else:
+            serves = serves & (~ghost | (~anchored & (e == darkest)))
+        served = served | (serves & usable)
+        frames.append(
+            WeightedFrame(
+                frame=frame,
+                serves=serves,
+                ambient=np.float32(exposure.of_ambient(bracket.shot.frames[e], reference)),
+                last=last,
+                cfa=read(bracket.shot.frames[e]).cfa if full else None,
+                least=np.float32(_SOME if e == bracket.reference else 0),
+            )
+        )
+    return WeightedBracket(frames, estimate, ghost, ambient, served, read.clip)
 
 
-def _frame(bracket: Bracket, e: int, compared: ComparedBracket, read: Reader, full: bool, last: bool) -> _Frame:
-    """Frame e on the grid of the merge, used where it is usable; a frame with no darker one is used everywhere."""
-    shot, link = bracket.shot, compared.links[e]
-    image = read(shot.frames[e])
-    if compared.frames is not None and not full:
-        found, blur = compared.frames[e].signals, compared.frames[e].gain
-    else:
-        found, blur = read.signals(shot, e, full), None
-        if link.motion is not None:
-            found, blur = resample(found, scaled(link.motion, 2) if full else link.motion)
-    is_reference = e == bracket.reference
-    return _Frame(
-        signals=found,
-        serves=found.usable if link.motion is not None or not last else np.ones_like(found.usable),
-        blur=blur,
-        ratio=link.ratio,
-        noise=compared.noises[e],
-        misfit=link.misfit * (4 if full else 1),
-        ambient=np.float32(exposure.of_ambient(shot.frames[e], shot.frames[bracket.reference])),
-        last=last,
-        cfa=image.cfa if full else None,
-        least=np.float32(_SOME if is_reference else 0),
-    )
+def _read_again(shot: Shot, e: int, frame: RegisteredFrame, read: Reader, full: bool) -> RegisteredFrame:
+    """Frame e with its ambient light, on the full grid with `full`, which has half the pixel pitch."""
+    signals, gain = read.signals(shot, e, full), None
+    if frame.motion is not None:
+        signals, gain = resample(signals, scaled(frame.motion, 2) if full else frame.motion)
+    return replace(frame, signals=signals, gain=gain, misfit=frame.misfit * (4 if full else 1))
 
 
 def _flagged(where: Bools, flag: Quality) -> Bits:

@@ -21,7 +21,7 @@ _LEAST_COSINE = 0.2  # of the shading that divides
 
 
 def estimate(cues: Cues, ior: float) -> SurfaceMaps:
-    """Normals by the inversion; albedo and gloss by the highlights."""
+    """Maps of the object without a network: normals by inversion of the DoLP, albedo and gloss by the highlights."""
     normal, error, cos_zenith = invert(cues, ior)
     diffuse, highlight = _albedo(cues, cos_zenith, ior)
     roughness, specular = _gloss(highlight, cos_zenith, cues)
@@ -40,7 +40,7 @@ def estimate(cues: Cues, ior: float) -> SurfaceMaps:
 
 
 def invert(cues: Cues, ior: float, guide: tuple[Floats, Floats] | None = None) -> tuple[Floats, Floats, Floats]:
-    """Normals (H, W, 3), their expected error (H, W) in degrees, and cosines of the zenith (H, W).
+    """Invert polarization: normals (H, W, 3), their expected error (H, W) in degrees, cosines of the zenith (H, W).
 
     `guide` are the normals (H, W, 3) of another estimator in the frame of each ray, and their expected error (H, W) in
     degrees. They choose the half-turn of the azimuth; without a guide, `half_turns` chooses it.
@@ -65,7 +65,7 @@ def invert(cues: Cues, ior: float, guide: tuple[Floats, Floats] | None = None) -
 
 
 def _adaptive_mean(cues: Cues) -> tuple[Floats, Floats]:
-    """S1/S0 and S2/S0 (2, H, W), light-weighted means as wide as they are constant within noise; and 1σ (H, W).
+    """Denoise S1/S0 and S2/S0 (2, H, W): means over areas in which they are constant within noise; and 1σ (H, W).
 
     Each pixel takes the widest Gaussian mean that differs from no narrower one by more than noise explains (Lepski's
     rule), so creases stay and noise in flat parts goes. S1, S2 and S0 are averaged, never the angle. A Gaussian of
@@ -93,7 +93,7 @@ def _adaptive_mean(cues: Cues) -> tuple[Floats, Floats]:
 
 
 def _azimuth_by_guide(axis: Floats, rays: Floats, normal: Floats, sigma: Floats) -> tuple[Floats, Floats]:
-    """Azimuth (H, W) rad of axes (cos 2φ, sin 2φ) (2, H, W) on the side of a normal, and the half-turn's certainty.
+    """Azimuths φ (H, W) rad of axes (cos 2φ, sin 2φ), each on the side of a guide's normal, and the certainty of it.
 
     The normal's error is Gaussian across the axis; the certainty is P(right side) − P(wrong side).
     """

@@ -14,7 +14,7 @@ from polcap.images import Cues, Floats, Network, RunNetwork
 from polcap.optics import frames
 from polcap.stages.cues import CHANNELS, channels
 
-_OUTPUTS = {"normal": 3, "depth": 1, "diffuse": 3, "specular": 3, "roughness": 1, "sigma": 1}  # channels of each map
+OUTPUTS = {"normal": 3, "depth": 1, "diffuse": 3, "specular": 3, "roughness": 1, "sigma": 1}  # channels of each map
 _POSITIONS = tuple(
     (quarters, mirror) for first in (0, 1) for mirror in (False, True) for quarters in (first, first + 2)
 )
@@ -35,7 +35,7 @@ def predict(cues: Cues, network: Network, run: RunNetwork, symmetries: int) -> d
         partial(_predict_turned, picture, cues.rays, network, run, *position) for position in _POSITIONS[:symmetries]
     ]
     predictions = parallel.results(calls, network.at_once)
-    maps = {name: np.asarray(np.mean([maps[name] for maps in predictions], axis=0), np.float32) for name in _OUTPUTS}
+    maps = {name: np.asarray(np.mean([maps[name] for maps in predictions], axis=0), np.float32) for name in OUTPUTS}
     normals, errors = (np.stack([maps[name] for maps in predictions]) for name in ("normal", "sigma"))
     median = _median_direction(normals, errors)
     towards = median - frames.dot(median, cues.rays)[..., None] * cues.rays
@@ -46,9 +46,9 @@ def predict(cues: Cues, network: Network, run: RunNetwork, symmetries: int) -> d
 def _predict_turned(
     picture: Floats, rays: Floats, network: Network, run: RunNetwork, quarters: int, mirror: bool
 ) -> dict[str, Floats]:
-    """The network's maps of turned channels (H, W, N), turned back."""
+    """Maps of the network for a turned or mirrored picture (H, W, N), turned back."""
     turned = _turn_channels(_turn(picture, quarters, mirror), quarters, mirror)
-    maps = _run(np.moveaxis(turned, -1, 0), network, run)
+    maps = run_network(np.moveaxis(turned, -1, 0), network, run, CHANNELS, OUTPUTS)
     own = np.array(_turn(rays, quarters, mirror))
     own[..., :2] = _turn_vectors(own[..., :2], quarters, mirror)
     maps["normal"] = np.array(frames.from_ray_frame(maps["normal"], own))
@@ -68,13 +68,12 @@ def _median_direction(normals: Floats, errors: Floats) -> Floats:
     Weiszfeld's iteration: a mean weighed by the reciprocal of the distances from the previous one. Its length is at
     most 1, and less where the directions differ.
     """
-    directions = normals / np.maximum(frames.dot(normals, normals) ** 0.5, 1e-6)[..., None]
+    directions = frames.unit(normals)
     trust = 1 / np.maximum(errors, _LEAST_ERROR)
     weights = trust
     for _ in range(_STEPS):
         mean = (weights[..., None] * directions).sum(axis=0) / weights.sum(axis=0)[..., None]
-        middle = mean / np.maximum(frames.dot(mean, mean) ** 0.5, 1e-6)[..., None]
-        difference = directions - middle
+        difference = directions - frames.unit(mean)
         weights = trust / np.maximum(frames.dot(difference, difference) ** 0.5, _NEAREST)
     return np.asarray(mean, np.float32)
 
@@ -85,11 +84,10 @@ def _turn(image: Floats, quarters: int, mirror: bool) -> Floats:
 
 
 def _turn_vectors(vector: Floats, quarters: int, mirror: bool) -> Floats:
-    """Vectors (..., 2), y up, mirrored and turned likewise."""
-    x, y = (-vector[..., 0] if mirror else vector[..., 0]), vector[..., 1]
-    for _ in range(quarters % 4):
-        x, y = -y, x
-    return np.stack([x, y], axis=-1)
+    """Vectors (..., 2), y up, mirrored left to right, then turned counter-clockwise by quarters."""
+    direction = vector[..., 0] + 1j * vector[..., 1]
+    turned = 1j**quarters * (-direction.conj() if mirror else direction)
+    return np.stack([turned.real, turned.imag], axis=-1)
 
 
 def _turn_channels(picture: Floats, quarters: int, mirror: bool) -> Floats:
@@ -104,16 +102,31 @@ def _turn_channels(picture: Floats, quarters: int, mirror: bool) -> Floats:
     return out
 
 
-def _run(picture: Floats, network: Network, run: RunNetwork) -> dict[str, Floats]:
-    """All maps (H, W[, 3]) of channels (N, H, W)."""
+def run_network(
+    picture: Floats, network: Network, run: RunNetwork, names: tuple[str, ...], outputs: dict[str, int]
+) -> dict[str, Floats]:
+    """Output maps (H, W[, C]) of a network for input channels (N, H, W), padded to a multiple of the network's size.
+
+    `names` are those of the channels, `outputs` the numbers C by name of the map.
+
+    Raises
+    ------
+    ModelError
+        The network was made for other channels, or returns other maps.
+    """
+    if network.channels != names:
+        raise ModelError(
+            f"model {network.digest[:8]} expects channels {', '.join(network.channels)}; "
+            f"this version makes {', '.join(names)}; use a model of this version, or --estimator analytic"
+        )
     _, height, width = picture.shape
     multiple = int(network.metadata["size_multiple"])
     pad = ((0, 0), (0, -height % multiple), (0, -width % multiple))
     output = run(network, np.pad(picture, pad)[None].astype(np.float32))
     found = {name: value.shape[1] for name, value in output.items()}
-    if any(found.get(name) != count for name, count in _OUTPUTS.items()):
+    if any(found.get(name) != count for name, count in outputs.items()):
         raise ModelError(
-            f"model {network.digest[:8]} returns {found}; this version needs {_OUTPUTS}; use a model of this version"
+            f"model {network.digest[:8]} returns {found}; this version needs {outputs}; use a model of this version"
         )
-    images = {name: np.moveaxis(output[name][0], 0, -1)[:height, :width] for name in _OUTPUTS}
+    images = {name: np.moveaxis(output[name][0], 0, -1)[:height, :width] for name in outputs}
     return {name: image[..., 0] if image.shape[-1] == 1 else image for name, image in images.items()}

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap import parallel
-from polcap.errors import ModelError
 from polcap.images import Cues, Floats, Network, RunNetwork
 from polcap.optics import frames
 from polcap.optics.resize import area_mean
 from polcap.stages import cues as cue_channels
+from polcap.stages.infer.augmentation import run_network
 
 ENCODING = "fine 1"
 Window = tuple[slice, slice]
@@ -65,8 +65,6 @@ def refine(cues: Cues, estimate: CoarseEstimate, network: Network, run: RunNetwo
     ModelError
         The network was made for other channels, or returns other maps.
     """
-    if network.channels != CHANNELS:
-        raise ModelError(f"fine model {network.digest[:8]} expects other channels; use the model of this version")
     relief = np.zeros((*cues.mask.shape, 3), np.float32)
     tiles = list(_tiles(cues.mask))
     calls = [partial(_tile_relief, cues, estimate, inner, outer, network, run) for inner, outer in tiles]
@@ -74,8 +72,7 @@ def refine(cues: Cues, estimate: CoarseEstimate, network: Network, run: RunNetwo
         relief[inner] = found
     relief = high_pass(relief, cues.mask, estimate.shrink)
     local = frames.to_ray_frame(estimate.normal, cues.rays) + relief
-    refined = frames.from_ray_frame(local, cues.rays)
-    return np.asarray(refined / np.maximum((frames.dot(refined, refined) ** 0.5)[..., None], 1e-6))
+    return frames.unit(frames.from_ray_frame(local, cues.rays))
 
 
 def _tiles(mask: NDArray[np.bool_]) -> Iterator[tuple[Window, Window]]:
@@ -90,7 +87,7 @@ def _tiles(mask: NDArray[np.bool_]) -> Iterator[tuple[Window, Window]]:
 
 
 def _window(cues: Cues, estimate: CoarseEstimate, window: Window) -> tuple[Cues, CoarseEstimate]:
-    """A window of cues and estimate: channels of the whole crop would fill the memory."""
+    """Cut a window out of cues and estimate; channels of the whole crop would fill the memory."""
     single = ("radiance", "ratio_sigma", "dolp", "rays", "mask", "quality")
     double = ("ratio", "normalized_stokes")
     cut = {name: getattr(cues, name)[window] for name in single}
@@ -102,16 +99,11 @@ def _window(cues: Cues, estimate: CoarseEstimate, window: Window) -> tuple[Cues,
 def _tile_relief(
     cues: Cues, estimate: CoarseEstimate, inner: Window, outer: Window, network: Network, run: RunNetwork
 ) -> Floats:
-    """Deviation of the normals (h, w, 3) of the tile `inner`, ray frame, by the network's view of `outer`."""
-    picture = encode(*_window(cues, estimate, outer))
-    _, height, width = picture.shape
-    more = ((0, 0), (0, -height % SIZE_MULTIPLE), (0, -width % SIZE_MULTIPLE))
-    relief = run(network, np.pad(picture, more)[None]).get("relief")
-    if relief is None or relief.shape[1] != 3:
-        raise ModelError(f"fine model {network.digest[:8]} returns no relief; use the model of this version")
+    """Relief of the normals (h, w, 3) in the tile `inner`, ray frame, by the refinement network's view of `outer`."""
+    relief = run_network(encode(*_window(cues, estimate, outer)), network, run, CHANNELS, {"relief": 3})["relief"]
     y, x = (within.start - around.start for within, around in zip(inner, outer))
     high, wide = (within.stop - within.start for within in inner)
-    return np.moveaxis(relief[0, :, y : y + high, x : x + wide], 0, -1)
+    return relief[y : y + high, x : x + wide]
 
 
 def high_pass(image: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:

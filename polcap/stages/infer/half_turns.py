@@ -52,7 +52,7 @@ _AROUND = 8.0  # cells, 1σ
 
 @dataclass(frozen=True)
 class NetworkDoubt:
-    """The network's own doubt of its normals."""
+    """Doubt of the normals, as the network states it."""
 
     sigma: Floats  # (H, W) expected error, degrees
     opposed: Floats  # (H, W) share of its positions in which the normal leans to the other side
@@ -60,7 +60,7 @@ class NetworkDoubt:
 
 @dataclass(frozen=True)
 class HalfTurns:
-    """The choice for each pixel of a normal map."""
+    """Choice between each normal of a map and its half-turn about the view ray."""
 
     turned: Bools  # (H, W) the half-turn of the normal is the better one
     doubt: Floats  # (H, W) probability that the chosen side is wrong
@@ -68,14 +68,14 @@ class HalfTurns:
 
 @dataclass(frozen=True)
 class Grid:
-    """Normals on coarse cells."""
+    """Normal map on a coarse grid of cells."""
 
     mask: Bools  # (h, w)
     lean: Floats  # (2, h, w) across the ray, x right, y up, length sin θ
 
 
 def resolve(normal: Floats, mask: Bools, network: NetworkDoubt | None = None) -> HalfTurns:
-    """The half-turns of a normal map (H, W, 3), unit vectors in the frame of each ray, inside a mask (H, W).
+    """Choose the side of the ray for a map of unit normals (H, W, 3), in the frame of each ray, in a mask (H, W).
 
     `network` is the doubt of the network that made the normals. Without it they are the inversion's, with arbitrary
     sides.
@@ -102,7 +102,7 @@ def error_with_doubt(error: Floats, doubt: Floats, cos_zenith: Floats) -> Floats
 
 
 def coarse(normal: Floats, mask: Bools) -> Grid:
-    """Cells of normals (H, W, 3) in a mask (H, W): mean double azimuth and zenith, and the side of the mean vector."""
+    """Average normals (H, W, 3) over cells: mean double azimuth and zenith, and the side of the mean vector."""
     shrink = max(1.0, max(mask.shape) / _LONGEST)
     shape = tuple(max(8, round(side / shrink)) for side in mask.shape)
     x, y = normal[..., 0] * mask, normal[..., 1] * mask
@@ -116,7 +116,7 @@ def coarse(normal: Floats, mask: Bools) -> Grid:
 
 
 def sides(grid: Grid) -> tuple[Bools, Floats]:
-    """Cells of the inversion that turn (h, w), and the evidence of a wrong side: terms (h, w, 4) of `_CELL`."""
+    """Cells (h, w) of the inversion's normals that turn, and evidence of a wrong side: terms (h, w, 4) of `_CELL`."""
     outwards = _outwards(grid)
     cost = (_OUTLINE * _outline_evidence(grid) + _INSIDE * outwards)[grid.mask]  # of turning less that of keeping
     first, second, alike = _links(grid)
@@ -166,7 +166,7 @@ def proposals(grid: Grid, sigma: Floats, opposed: Floats) -> tuple[NDArray[np.in
 
 
 def _chance(odds: Floats) -> Floats:
-    """Probability of the logarithm of odds."""
+    """Probability that belongs to a logarithm of odds (logistic function)."""
     return np.asarray(1 / (1 + np.exp(-odds)))
 
 
@@ -175,7 +175,7 @@ def _enlarged(cells: Floats | Bools, shape: tuple[int, ...]) -> Floats:
 
 
 def _outline_evidence(grid: Grid) -> Floats:
-    """How clearly the normals point out of the object (h, w): sin θ (object behind t − object ahead of it).
+    """Evidence (h, w) that normals point out of the object: sin θ (object behind t − object ahead of it).
 
     Where the grid ends the object may go on: no evidence.
     """
@@ -194,13 +194,13 @@ def _outline_evidence(grid: Grid) -> Floats:
 
 
 def _outwards(grid: Grid) -> Floats:
-    """How far the normals lean away from the object's inside (h, w), −1…1."""
+    """Lean (h, w) of the normals away from the object's inside, −1…1."""
     away, _ = outline.outward(outline.depth(grid.mask), _BLUR)
     return np.asarray((grid.lean * away).sum(axis=0))
 
 
 def _links(grid: Grid) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
-    """Neighboring cells, numbered within the mask (M,) and (M,), and how alike they are (M,), −2…2.
+    """Pairs of neighboring cells, numbered within the mask, (M,) and (M,), and the similarity of their axes (M,), −2…2.
 
     Flat neighbors and axes that cross weigh little.
     """
@@ -219,7 +219,7 @@ def _links(grid: Grid) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
 
 
 def _cut(mask: Bools, cost: Floats, first: NDArray[np.intp], second: NDArray[np.intp], alike: Floats) -> Bools:
-    """Cells (h, w) that turn in the least Σ cost · x + Σ alike · (x ≠ x′), x 0 or 1; open ones do not.
+    """Minimum cut: cells (h, w) with x = 1 in the least Σ cost · x + Σ alike · (x ≠ x′); undecided cells have x = 0.
 
     `cost` (N,) is of the mask's cells, `alike` (M,) of the links between its cells `first` and `second`.
 

@@ -13,11 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.errors import ModelError
 from polcap.images import Cues, Floats, Network, Quality, RunNetwork, SurfaceMaps
 from polcap.optics import frames
 from polcap.optics.resize import area_mean, weighted_area_mean
-from polcap.stages.cues import CHANNELS, FLOOR
+from polcap.stages.cues import FLOOR
 from polcap.stages.infer import analytic, augmentation, fine, half_turns
 from polcap.stages.infer.highlights import REACHED, fill_highlights
 
@@ -33,7 +32,7 @@ _BRIGHTEST = 2.0  # greatest S0 of diffuse reflection; white paper that faces th
 def estimate(
     cues: Cues, network: Network, run: RunNetwork, ior: float, symmetries: int, *, fine_pass: bool
 ) -> SurfaceMaps:
-    """The maps of an object's crop (H, W), seen in 1, 2, 4 or 8 turned and mirrored positions.
+    """Maps of an object's crop (H, W) by the network, in 1, 2, 4 or 8 turned and mirrored positions, and the inversion.
 
     `network` takes the channels of `stages.cues`; `run` runs a network; `ior` is the refractive index of the inversion;
     `fine_pass` adds relief by the refinement network, if there is one.
@@ -67,16 +66,11 @@ def estimate(
 def estimate_coarse(
     cues: Cues, network: Network, run: RunNetwork, ior: float, symmetries: int
 ) -> tuple[dict[str, Floats], fine.CoarseEstimate, Floats]:
-    """Estimate before refinement; also the input of the refinement network's training.
+    """Estimate of normals and material before refinement; also the input of the refinement network's training.
 
     Returns the network's maps (H, W[, 3]) at the crop's size, with `factor`, see `_log_factor`, and `doubt`, the
     probability of a wrong half-turn; then the normals before refinement, and their stated error (H, W) in degrees.
     """
-    if network.channels != CHANNELS:
-        raise ModelError(
-            f"model {network.digest[:8]} expects channels {', '.join(network.channels)}; "
-            f"this version makes {', '.join(CHANNELS)}; use a model of this version, or --estimator analytic"
-        )
     size = cues.mask.shape[::-1]
     shrink = max(1.0, max(size) / int(network.metadata["native_size"]))
     seen = _reduce(_limit_radiance(cues), 1 / shrink)
@@ -88,7 +82,7 @@ def estimate_coarse(
     for name in ("specular", "roughness"):
         small[name] = _smooth_gloss(small[name], seen.mask)
     maps = {name: np.asarray(cv2.resize(image, size)) for name, image in small.items()}
-    smooth = _unit(maps["normal"])
+    smooth = frames.unit(maps["normal"])
     guide = np.asarray(frames.to_ray_frame(smooth, cues.rays)), maps["sigma"]
     by_pixel, error, _ = analytic.invert(cues, ior, guide)
     detailed = _add_detail(smooth, by_pixel, cues.mask, shrink)
@@ -104,7 +98,7 @@ def _limit_radiance(cues: Cues) -> Cues:
 
 
 def _reduce(cues: Cues, scale: float) -> Cues:
-    """The cues of a picture with fewer pixels: light is averaged, ratios are weighted by it."""
+    """Reduce cues to fewer pixels: light is averaged, ratios of Stokes parameters are averaged with its weight."""
     if scale >= 1.0:
         return cues
     height, width = cues.mask.shape
@@ -156,7 +150,7 @@ def _without_grid(normal: Floats, mask: NDArray[np.bool_]) -> Floats:
 def _correct_half_turns(normal: Floats, seen: Cues, sigma: Floats, opposed: Floats) -> tuple[Floats, Floats]:
     """Normals (H, W, 3) with wrong regions turned to the other side of the ray, and the doubt of the side (H, W)."""
     found = half_turns.resolve(
-        frames.to_ray_frame(_unit(normal), seen.rays), seen.mask, half_turns.NetworkDoubt(sigma, opposed)
+        frames.to_ray_frame(frames.unit(normal), seen.rays), seen.mask, half_turns.NetworkDoubt(sigma, opposed)
     )
     opposite = 2 * frames.dot(normal, seen.rays)[..., None] * seen.rays - normal
     return np.where(found.turned[..., None], opposite, normal).astype(np.float32), found.doubt
@@ -196,24 +190,22 @@ def _masked_filter(
 
 
 def _add_detail(coarse: Floats, by_pixel: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:
-    """The coarse normals (H, W, 3) with the detail of others, finer than the network resolves.
+    """Add to coarse normals (H, W, 3) the detail of other normals that is finer than the network resolves.
 
     Interreflection, refractive index and half-turns bend the inversion's normals over whole regions; relief is finer.
     """
-    return _unit(by_pixel + fine.low_pass((coarse - by_pixel).astype(np.float32), mask, shrink))
+    return frames.unit(by_pixel + fine.low_pass((coarse - by_pixel).astype(np.float32), mask, shrink))
 
 
 def _join(*estimates: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
-    """Mean direction of normals (H, W, 3) weighed by 1/σ² of their expected errors (H, W), and its own error.
+    """Mean direction of several normals (H, W, 3), weighted by 1/σ² of their expected errors (H, W), and its error.
 
     If the estimates agree, the error is that of independent ones; if they differ, their distance adds to it.
     """
     weights = [1 / np.maximum(sigma, 1.0) ** 2 for _, sigma in estimates]
-    total = np.asarray(sum(w[..., None] * n / np.maximum(_length(n), 1e-6) for w, (n, _) in zip(weights, estimates)))
-    length = _length(total)
-    share = np.clip(length[..., 0] / sum(weights), 1e-3, 1)  # 1 where all directions agree
-    spread = np.degrees(np.arccos(share))
-    return np.asarray(total / np.maximum(length, 1e-12)), np.hypot(1 / np.sqrt(sum(weights)), spread)
+    total = np.asarray(sum(w[..., None] * frames.unit(normal) for w, (normal, _) in zip(weights, estimates)))
+    share = np.clip(frames.dot(total, total) ** 0.5 / sum(weights), 1e-3, 1)  # 1 where all directions agree
+    return frames.unit(total), np.hypot(1 / np.sqrt(sum(weights)), np.degrees(np.arccos(share)))
 
 
 def _shading(normal: Floats, rays: Floats) -> Floats:
@@ -222,12 +214,4 @@ def _shading(normal: Floats, rays: Floats) -> Floats:
     The square root of Lambert's law left the least error of the albedo, on pictures of both protocols, engraved or
     not, and on path-traced captures: normals err, and light from around brightens surfaces that turn away.
     """
-    return np.asarray(np.sqrt(np.maximum(frames.to_ray_frame(_unit(normal), rays)[..., 2:], _GRAZING)))
-
-
-def _unit(vectors: Floats) -> Floats:
-    return np.asarray(vectors / np.maximum(_length(vectors), 1e-6))
-
-
-def _length(vectors: Floats) -> Floats:
-    return np.asarray(frames.dot(vectors, vectors)[..., None] ** 0.5)
+    return np.asarray(np.sqrt(np.maximum(frames.to_ray_frame(frames.unit(normal), rays)[..., 2:], _GRAZING)))

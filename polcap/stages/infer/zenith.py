@@ -22,7 +22,7 @@ from polcap.images import Cues, Floats, Quality
 from polcap.optics import body, frames
 from polcap.optics.outline import disc_radius
 
-_ALPHAS = (0.0, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
+_ALPHAS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
 _FACTORS = (1.0, 0.9, 0.8, 0.7, 0.5)  # on the polarization, everywhere
 _EDGE_LOSSES = (0.0, 0.15, 0.3, 0.45, 0.6)  # share lost edge-on, times sin²θ elsewhere: two real balls lose about .55
 _ZENITHS = np.radians(np.linspace(0, 88, 177))  # of the tables from DoLP to zenith
@@ -37,7 +37,7 @@ _MOST_MISFIT = 9.0  # of a pixel against the guide, σ²
 
 _TENTHS = 10
 _UNEVEN = 0.07  # 1σ of the logarithm of an even albedo's patches: shading is not known better
-_FLAT = 0.2  # α of the rough body whose shading is the unit of flatness
+_FLAT = 0.2  # α of a rough body; its shading is the unit of flatness
 _FLATTEST = 2.0  # in that unit: α = .4
 
 _OUTLINE_PX = 1.0  # from the outline: nearer, pixels mix with the backdrop
@@ -50,27 +50,22 @@ _SHARP = 0.005  # probability that the outline is an edge, not round
 
 @dataclass(frozen=True)
 class ZenithEstimate:
-    """Zeniths by the laws that the object may follow."""
+    """Zenith angles, averaged over the laws of diffuse polarization that the object may follow."""
 
     angle: Floats  # (H, W) rad
     spread: Floats  # (H, W) rad, 1σ between laws
-    alpha: float  # expected GGX α of the diffuse law
-    smooth: float  # probability of the smooth interface
     _dolps: Floats  # (C, Z) of all laws
     _weights: Floats  # (C,)
 
     def at(self, dolp: Floats) -> Floats:
-        """Zeniths of other DoLPs of any shape, rad: expected over the laws."""
+        """Zeniths [rad] of other DoLPs of any shape, averaged over the laws."""
         return _mean_zenith(dolp, self._dolps, self._weights)[0]
 
 
 @dataclass(frozen=True)
 class DiffuseLaws:
-    """The C candidates, at the Z zeniths of `_ZENITHS`."""
+    """C candidate laws of diffuse polarization, each at the Z zeniths of `_ZENITHS`."""
 
-    alpha: Floats  # (C,)
-    factor: Floats  # (C,) on the DoLP
-    edge_loss: Floats  # (C,) share of the DoLP that is lost edge-on, times sin²θ elsewhere
     prior: Floats  # (C,) logarithm
     dolp: Floats  # (C, Z), never falling
     shading: Floats  # (Z,) logarithm of S0 over albedo, of a smooth body
@@ -78,7 +73,7 @@ class DiffuseLaws:
 
 
 def estimate_zenith(dolp: Floats, cues: Cues, ior: float, guide: tuple[Floats, Floats] | None = None) -> ZenithEstimate:
-    """Zeniths of the debiased DoLPs (H, W).
+    """Estimate zenith angles (H, W) from DoLPs (H, W) without their noise bias.
 
     `guide` are zeniths (H, W) of another estimator and their 1σ (H, W), rad.
     """
@@ -98,30 +93,26 @@ def estimate_zenith(dolp: Floats, cues: Cues, ior: float, guide: tuple[Floats, F
     weights = np.exp(score - score.max())
     weights /= weights.sum()
     angle, spread = _mean_zenith(dolp, laws.dolp, weights)
-    smooth = weights[(laws.alpha == 0) & (laws.factor == 1) & (laws.edge_loss == 0)].sum()
-    return ZenithEstimate(angle, spread, float(weights @ laws.alpha), float(smooth), laws.dolp, weights)
+    return ZenithEstimate(angle, spread, laws.dolp, weights)
 
 
 @lru_cache(maxsize=4)
 def candidate_laws(ior: float) -> DiffuseLaws:
-    """All candidates of a refractive index, made once."""
+    """All candidate laws of diffuse polarization for a refractive index; cached."""
     cosine = np.cos(_ZENITHS)
     rows = []
-    for local in (0.0, 1.0):
-        for alpha in _ALPHAS:
-            if alpha == 0 and local:
-                continue
-            plus, minus = body.leaving(cosine, alpha, ior, local)
-            for even, loss in product(_FACTORS, _EDGE_LOSSES):
-                smooth = alpha == 0 and even == 1 and loss == 0
-                prior = _DEPOLARIZED_LIKELIER * (1 - even) + (_SMOOTH_LIKELIER if smooth else 0.0)
-                left = even * (1 - loss * (1 - cosine**2))
-                rows.append((alpha, even, loss, prior, np.maximum.accumulate(left * minus / plus)))
+    for local, alpha in [(0.0, 0.0), *product((0.0, 1.0), _ALPHAS)]:
+        plus, minus = body.leaving(cosine, alpha, ior, local)
+        for even, loss in product(_FACTORS, _EDGE_LOSSES):
+            smooth = alpha == 0 and even == 1 and loss == 0
+            prior = _DEPOLARIZED_LIKELIER * (1 - even) + (_SMOOTH_LIKELIER if smooth else 0.0)
+            left = even * (1 - loss * (1 - cosine**2))
+            rows.append((prior, np.maximum.accumulate(left * minus / plus)))
     plus, _ = body.leaving(cosine, 0.0, ior)
     shading = np.log(np.maximum(cosine * plus * plus, 1e-4))
     flatter = np.log(body.flattening(cosine, cosine, np.ones_like(cosine), _FLAT + 0 * cosine))
-    alphas, factors, losses, priors, dolps = (np.array(column) for column in zip(*rows))
-    return DiffuseLaws(alphas, factors, losses, priors, dolps, shading, flatter)
+    priors, dolps = (np.array(column) for column in zip(*rows))
+    return DiffuseLaws(priors, dolps, shading, flatter)
 
 
 def _even_albedo(angles: Floats, light: Floats, laws: DiffuseLaws) -> Floats:
@@ -152,7 +143,7 @@ def _round_outline(dolp: Floats, cues: Cues, laws: DiffuseLaws) -> Floats:
     """Log likelihood (C,): inside its outline a round object turns away as a ball does, cos θ = √(2x − x²).
 
     x is the distance from the outline over a radius, about that of a disc with the object's area, and the same for all
-    rings. If at least half of a ring looks like a sharp edge, the outline favors no law.
+    rings. If at least half of a ring has the DoLP of a sharp edge, the outline favors no law.
     """
     distance = cv2.distanceTransform(cues.mask.astype(np.uint8), cv2.DIST_L2, 5) - 0.5
     radius = disc_radius(cues.mask)
@@ -163,7 +154,7 @@ def _round_outline(dolp: Floats, cues: Cues, laws: DiffuseLaws) -> Floats:
             high.append(np.median(dolp[ring]))
             middle.append((near + far) / 2)
     if len(middle) < 2:
-        return np.zeros(len(laws.alpha))
+        return np.zeros(len(laws.prior))
     away = np.clip(np.array(middle) / (radius * _RADII[:, None]), 0, 1)  # (R, rings)
     ball = np.degrees(np.arccos(np.sqrt(away * (2 - away))))
     found = np.degrees([np.interp(high, row, _ZENITHS) for row in laws.dolp])  # (C, rings)

@@ -38,7 +38,7 @@ def reduce_picture(picture: Floats, chart: Bits) -> tuple[Floats, Bools]:
 
 
 def cut(picture: Floats, seed: Bits, outside: Bools, probability: Floats | None = None) -> Bits:
-    """The seed (h, w) with its outline moved to color edges; colors also decide where probabilities are uncertain."""
+    """Move the outline of a mask (h, w) to color edges by GrabCut; probabilities limit the change where certain."""
     tone = np.log2(np.clip(picture, 0, 4) + 0.002)
     display = (255 * (tone - tone.min()) / (np.ptp(tone) + 1e-9)).astype(np.uint8)
     reach = max(3, round(_REACH * max(seed.shape)))

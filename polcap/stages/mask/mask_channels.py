@@ -31,7 +31,7 @@ class ReducedPicture:
 
 
 def grid(height: int, width: int) -> Floats:
-    """`ReducedPicture.place` of a whole picture of this size, (2, H, W)."""
+    """Positions x, y (2, H, W), −1…1, of the pixels of a whole picture; see `ReducedPicture.place`."""
     x, y = (2 * (np.arange(n, dtype=np.float32) + 0.5) / n - 1 for n in (width, height))
     return np.stack(np.meshgrid(x, y))
 

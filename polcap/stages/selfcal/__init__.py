@@ -93,7 +93,8 @@ def solve(
     shots = object_gains.register(radiance, alignment, object_)
     greys = grey_patches.measure(radiance, alignment, color)
     facing = object_gains.facing(shots.light, shots.inside, radiance.angle)
-    first = _gains_without_angles(radiance, greys, facing)
+    gain, sigma, _ = _believed(radiance, greys, facing)  # without the angles, because these are not checked yet
+    first = GainEstimate(gain.mean(1), sigma.mean(1))
     even = replace(shots, light=shots.light / first.gain[:, None, None])
     rim = angles.rim(even)
     one_exposure = radiance.equipment.light == "one exposure"
@@ -133,29 +134,23 @@ def solve(
     )
 
 
-def _gains_without_angles(radiance: AngleStack, greys: GreyPatches | None, facing: GainEstimate) -> GainEstimate:
-    """Gains (K,) by methods that do not need the angles, because the angles are not checked yet."""
+def _believed(
+    radiance: AngleStack, greys: GreyPatches | None, by_object: GainEstimate
+) -> tuple[Floats, Floats, Literal["grey patches", "object", "one exposure", "none"]]:
+    """Gains (K, 3) of the shots, their 1σ, and their source: one exposure, grey patches, or else the object."""
+    shape = len(radiance.angle), 3
     if radiance.equipment.light == "one exposure":
-        shots = len(radiance.angle)
-        return GainEstimate(np.ones(shots), np.zeros(shots))
+        return np.ones(shape), np.zeros(shape), "one exposure"
     if greys is not None:
-        return GainEstimate(greys.gain.mean(1), greys.sigma.mean(1))
-    return object_gains.with_prior(facing, _prior(radiance))
+        return greys.gain, greys.sigma, "grey patches"
+    known = object_gains.with_prior(by_object, _prior(radiance))
+    source: Literal["object", "none"] = "object" if np.isfinite(by_object.sigma).all() else "none"
+    return known.gain[:, None].repeat(3, axis=1), known.sigma[:, None].repeat(3, axis=1), source
 
 
 def _gains(radiance: AngleStack, greys: GreyPatches | None, anchor: GainEstimate) -> Gains:
     """Gains (K, 3) by the best available source, with those of the object (`anchor`) as a cross-check."""
-    gain: Floats
-    sigma: Floats
-    source: Literal["grey patches", "object", "one exposure", "none"]
-    if radiance.equipment.light == "one exposure":
-        gain, sigma, source = np.ones((len(anchor.gain), 3)), np.zeros((len(anchor.gain), 3)), "one exposure"
-    elif greys is not None:
-        gain, sigma, source = greys.gain, greys.sigma, "grey patches"
-    else:
-        believed = object_gains.with_prior(anchor, _prior(radiance))
-        gain, sigma = (np.repeat(part[:, None], 3, axis=1) for part in (believed.gain, believed.sigma))
-        source = "object" if np.isfinite(anchor.sigma).all() else "none"
+    gain, sigma, source = _believed(radiance, greys, anchor)
     both = np.hypot(anchor.sigma, sigma.mean(1))
     difference = np.abs(gain.mean(1) / anchor.gain - 1)
     return Gains(
@@ -179,7 +174,7 @@ def _prior(radiance: AngleStack) -> float:
 def _find_angles(
     band: OutlineBand, even: ObjectShots, gain_sigma: float, settings: SelfcalSettings
 ) -> tuple[Floats, float]:
-    """Unknown angles (K,) and their 1σ [rad], from shots divided by their gains."""
+    """Find unknown polarizer angles (K,) and their 1σ, rad, from shots divided by their gains."""
     shots = len(even.light)
     otherwise = "or state the angles with --set selfcal.unknown_angles=false"
     if shots < 4:
@@ -204,7 +199,7 @@ def _find_angles(
 
 
 def _wrong_order(found: angles.OrderFit, angle: Floats) -> str:
-    """The message for shots with an outline that contradicts their angles (K,) rad."""
+    """Error message for shots with angles (K,) rad that contradict the polarization at the object's outline."""
     stated = ", ".join(f"{np.degrees(a):g}°" for a in angle)
     best = ", ".join(f"{np.degrees(angle[i]):g}°" for i in found.check.best.shots)
     mirrored = " counted the other way (the ring turned clockwise)" if found.check.best.mirrored else ""
@@ -216,7 +211,7 @@ def _wrong_order(found: angles.OrderFit, angle: Floats) -> str:
 
 
 def _ring(even: ObjectShots, angle: Floats, gains: GainEstimate, leaves_picture: bool) -> RingZero:
-    """The error of the ring's zero, combined from outline and slopes; without a correction."""
+    """Measure the error of the polarizer ring's zero by the object's outline and slopes; without a correction."""
     gain_sigma = float(gains.sigma.max())
     total = frames.total(even.value) / gains.gain[:, None, None]
     return ring_zero.combined(
@@ -226,7 +221,7 @@ def _ring(even: ObjectShots, angle: Floats, gains: GainEstimate, leaves_picture:
 
 
 def corrected(ring: RingZero, calibrated: float | None, settings: SelfcalSettings) -> RingZero:
-    """The ring's zero with the correction to be added to the angles.
+    """Decide by how much the polarizer angles are corrected for the measured error of the ring's zero.
 
     `calibrated` is 1σ [rad] of a zero that the angles already include, by calibration or because the angles were found;
     None without one. If it agrees with the measured error, the two are averaged by their errors. If not, the filter was

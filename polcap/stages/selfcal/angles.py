@@ -83,7 +83,7 @@ class OrderFit:
 
 
 def check_order(band: OutlineBand, angle: Floats, margin: float, least_score: float) -> OrderFit:
-    """Find the order and sense of the stated angles (K,) rad that fit the outline.
+    """Find the order and sense of the stated polarizer angles (K,) rad that fit the object's outline best.
 
     Another order must have a score of `least_score` or more, and be better than the stated one by `margin`.
     """
@@ -132,7 +132,7 @@ def hypotheses(angle: Floats) -> dict[ShotOrder, Floats]:
 
 
 def _misfit(band: OutlineBand, angle: Floats) -> float:
-    """Median relative residual of more than three shots; 1 for three shots, which always fit."""
+    """Misfit of shots to polarizer angles: median relative residual; 1 for three shots, which always fit."""
     if len(angle) < 4:
         return 1.0
     weights = mueller.analyzer(angle)
@@ -142,7 +142,7 @@ def _misfit(band: OutlineBand, angle: Floats) -> float:
 
 
 def _sigma_of_difference(one: Floats, one_weight: Floats, other: Floats, other_weight: Floats) -> float:
-    """1σ of Σone/Σone_weight − Σother/Σother_weight, sums over sectors (24,); 1 with fewer than two sectors."""
+    """1σ of the difference of two scores, Σone/Σone_weight − Σother/Σother_weight over sectors (24,), by jackknife."""
     used = np.flatnonzero(one_weight + other_weight)
     if len(used) < 2:
         return 1.0
@@ -154,10 +154,11 @@ def _sigma_of_difference(one: Floats, one_weight: Floats, other: Floats, other_w
 
 
 def turned_shot(light: Floats, row: NDArray[np.int_], angle: Floats, gain_sigma: Floats) -> TurnedShot:
-    """A significant turn of a single shot among more than three; none for three shots or too few cells.
+    """Detect one shot, of more than three, with a polarizer angle that contradicts the others.
 
-    light (K, P) are means of small cells of the object, divided by the gains; row (P,) is the row of each cell:
-    neighbors belong to the same part. angle (K,) rad are the stated angles, gain_sigma (K,) 1σ of the gains.
+    The result is empty for three shots or too few cells. light (K, P) are means of small cells of the object, divided
+    by the gains; row (P,) is the row of each cell: neighbors belong to the same part. angle (K,) rad are the stated
+    angles, gain_sigma (K,) 1σ of the gains.
     """
     shots = len(angle)
     if shots < 4 or light.shape[1] < _LEAST_CELLS:
@@ -178,7 +179,7 @@ def turned_shot(light: Floats, row: NDArray[np.int_], angle: Floats, gain_sigma:
     alike = [k for k in range(shots) if gained[k] >= _ALIKE * max(gained)]
     alike.sort(key=lambda k: -abs(fits[k].turn))  # a small turn of one shot can be a large one of another
     found = fits[alike[0]]
-    # An error of one angle looks like a larger error of another, to which the residual is less sensitive.
+    # An error of one angle has the effect of a larger error of an angle to which the residual is less sensitive.
     change = np.sqrt((_change_per_rad(light, angle) ** 2).mean(axis=1))
     sensitivity = np.linalg.norm(_complement(angle), axis=0) * change
     by_angles = _ANGLE_ERROR * float(np.linalg.norm(sensitivity) / max(sensitivity[alike[0]], 1e-9))
@@ -197,23 +198,23 @@ class _TurnFit:
 
 
 def _median_residual(light: Floats, angle: Floats) -> float:
-    """Median length of the part of light (K, P) outside the space of shots at these angles."""
+    """Median misfit of light (K, P) to polarizer angles (K,): its distance from the column space of A(θ)."""
     return float(np.median(np.linalg.norm(_complement(angle) @ light, axis=0)))
 
 
 def _complement(angle: Floats) -> Floats:
-    """N (K − 3, K), the orthogonal complement of the space of shots at these angles."""
+    """Orthogonal complement N (K − 3, K) of the column space of A(θ), for polarizer angles θ (K,)."""
     return np.asarray(np.linalg.svd(mueller.analyzer(angle))[0][:, 3:].T)
 
 
 def _change_per_rad(light: Floats, angle: Floats) -> Floats:
-    """dI/dθ of every shot, (K, P)."""
+    """Derivative dI/dθ (K, P) of the light of each shot by its polarizer angle."""
     _, s1, s2 = np.linalg.lstsq(mueller.analyzer(angle), light, rcond=None)[0]
     return np.asarray(s2 * np.cos(2 * angle[:, None]) - s1 * np.sin(2 * angle[:, None]))
 
 
 def _fit_turn(k: int, start: float, light: Floats, angle: Floats, part: NDArray[np.intp], prior: Floats) -> _TurnFit:
-    """Fit the gains and the turn of shot k, starting from a turn of `start` rad, by least squares with biweights."""
+    """Fit the turn of the polarizer in shot k, and the gains, from a start in rad, by least squares with biweights."""
     angle = angle + start * np.eye(len(angle))[k]
     free = _complement(angle)
     residual = free @ light  # (K − 3, P)
@@ -297,7 +298,7 @@ def _condensed(cells: Floats) -> Floats:
 def _solve(
     around: Floats, part: Floats, inside: Floats, start: Floats, until: float, law: float = _LAW
 ) -> tuple[float, Floats]:
-    """Misfit and angles (K,) by least squares from a start; of two solutions 90° from each other, the diffuse one."""
+    """Fit polarizer angles (K,) from a start: misfit and angles; of two, 90° from each other, the diffuse one."""
     relative = around / around.mean(axis=1, keepdims=True)
     from scipy.optimize import least_squares  # here: the import takes 0.3 s
 
@@ -309,7 +310,7 @@ def _solve(
 
 
 def _residual(angle: Floats, relative: Floats, part: Floats, inside: Floats, law: float) -> Floats:
-    """Residuals over their 1σ: outline outside the span of 1 and cos 2(φ − θ), inside outside that of A(θ)."""
+    """Residuals of polarizer angles over their 1σ: of outline and span of 1, cos 2(φ − θ), of inside and A(θ)."""
     ones = np.ones(len(angle)) / np.sqrt(len(angle))
     wave = np.cos(2 * (part[:, None] - angle))
     wave = wave - (wave @ ones)[:, None] * ones
@@ -323,5 +324,5 @@ def _residual(angle: Floats, relative: Floats, part: Floats, inside: Floats, law
 
 
 def _difference(a: Floats, b: Floats) -> Floats:
-    """Angles from axes b to axes a, −π/2…π/2."""
+    """Angles from axes b to axes a, −π/2…π/2 rad; axes have no direction."""
     return np.asarray((a - b + np.pi / 2) % np.pi - np.pi / 2)

@@ -29,7 +29,7 @@ def measure(
     gain: Floats,
     angle: Floats,
 ) -> Floats | None:
-    """Factor (3,) of the crossed shot, or None, from registered shots with gains (K, 3) at angles (K,) rad."""
+    """Factor (3,) from the light of the cross-polarized shot to S0; None without such a shot or enough pixels."""
     if radiance.crossed is None or alignment.crossed is None:
         return None
     by_chart = grey_patches.crossed_factor(radiance, alignment, color, gain)

@@ -32,7 +32,7 @@ class GreyPatches:
 
 
 def measure(radiance: AngleStack, alignment: Alignment, color: ColorCalibration) -> GreyPatches | None:
-    """Gains from the light grey patches; None without a chart, or if all of them are hidden or clipped.
+    """Gains of the shots from the chart's light grey patches; None without a usable patch.
 
     Each patch is averaged in the pixels of each shot; the patches are then summed.
     """
@@ -58,7 +58,7 @@ def measure(radiance: AngleStack, alignment: Alignment, color: ColorCalibration)
 
 
 def crossed_factor(radiance: AngleStack, alignment: Alignment, color: ColorCalibration, gain: Floats) -> Floats | None:
-    """S0 of the light patches over the crossed shot's light (3,), for gains (K, 3); None for fewer than two patches."""
+    """Factor (3,) from the cross-polarized shot's light to S0, by the light grey patches; None for fewer than two."""
     if color.place is None or radiance.crossed is None or alignment.crossed is None:
         return None
     shots = [_means(radiance.shot(k), transform, color)[0] for k, transform in enumerate(alignment.transform)]
@@ -69,7 +69,7 @@ def crossed_factor(radiance: AngleStack, alignment: Alignment, color: ColorCalib
 
 
 def _means(picture: MaskedImage, transform: Floats, color: ColorCalibration) -> Floats:
-    """Means and their variances (2, 6, 3) of a shot on the grey patches; NaN where a patch cannot be used.
+    """Mean light of each grey patch in a shot, and the variances of the means: (2, 6, 3); NaN for unusable patches.
 
     A patch cannot be used if white balance excluded it, if it is clipped in this shot, or if fewer than nine of its
     pixels are half a pixel or more from its edge. `transform` maps px of the reference grid to px of the shot.

@@ -30,7 +30,7 @@ from polcap.stages.selfcal.object_gains import GainEstimate, unknown
 
 _SHOTS = 3
 _SIDE = 110.0  # px; larger objects are averaged down to this root of their area, to average noise
-BLUR = 2.0  # px of the reduced picture, 1σ of the Gaussian whose derivative is taken
+BLUR = 2.0  # px of the reduced picture, 1σ of the Gaussian that the derivative uses
 _LEAST = 300  # pixels of the reduced object
 _IOR = 1.5
 _STEEPEST = 0.25  # largest DoLP that is used: 64° for index 1.5
@@ -47,7 +47,7 @@ _TIMES = 2.0  # error over the scatter of the parts (decision 6)
 
 
 def gains(light: Floats, usable: Bools, angle: Floats, start: Floats) -> GainEstimate:
-    """Gains (K,) with which the slopes are those of a surface; unknown unless K = 3.
+    """Gains (K,) of three shots for which the slopes from polarization are those of a surface; unknown unless K = 3.
 
     light (K, H, W) is registered and slightly blurred, usable (H, W) are the object's unflagged pixels, angle (K,) rad,
     start (K,) first guesses. With more than three shots, use `object_gains.closure`.
@@ -117,7 +117,7 @@ class Equations:
 
 
 def reduced_slopes(light: Floats, usable: Bools, angle: Floats) -> SlopeField | None:
-    """Average the shots down, and find the pixels with derivatives; None if there are too few.
+    """Average the shots down to about 110 px a side, and find the pixels with derivatives; None for too few.
 
     light (K, H, W), usable (H, W) and angle (K,) as of `gains`.
     """
@@ -132,7 +132,7 @@ def reduced_slopes(light: Floats, usable: Bools, angle: Floats) -> SlopeField | 
 
 
 def linearize(slopes: SlopeField, unknowns: Floats, near: float) -> Equations:
-    """The equations about `unknowns` (K,), for pixels with |w| < near."""
+    """Linearize Im(w_ζ² w*) = 0 about gains and turn `unknowns` (K,), for pixels with |w| < near."""
     product, w, slope = slopes.at(unknowns)
     length, size = np.abs(slope), np.abs(w)
     scale = 1e-12 + np.hypot(2 * length * size * _SLOPE_NOISE * np.median(length), length**2 * (_NOISE + _LAW * size))
@@ -144,7 +144,7 @@ def linearize(slopes: SlopeField, unknowns: Floats, near: float) -> Equations:
 
 
 def part_of(inside: Bools) -> NDArray[np.int_]:
-    """Index of the part, of 4 × 4, for each pixel (N,)."""
+    """Index 0…15 of the part of the object, of 4 × 4, for each pixel inside (N,)."""
     y, x = np.nonzero(inside)
     rows, columns = ((axis - axis.min()) * _PARTS // (np.ptp(axis) + 1) for axis in (y, x))
     return np.asarray(rows * _PARTS + columns)

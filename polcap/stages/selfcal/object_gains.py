@@ -72,7 +72,7 @@ class ObjectShots:
 
 
 def register(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> ObjectShots:
-    """Register the shots on the object's crop."""
+    """Resample all shots to the reference grid, on the object's crop."""
     x0, y0, x1, y1 = crop = object_.crop
     value = np.stack([warp(v, t, crop, order=1) for v, t in zip(radiance.value, alignment.transform)])
     flagged = [warp(q.astype(np.float32), t, crop, order=1) > 0 for q, t in zip(radiance.quality, alignment.transform)]
@@ -86,7 +86,7 @@ def register(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) ->
 
 
 def unknown(shots: int) -> GainEstimate:
-    """Gains of which nothing is known: 1, with infinite 1σ."""
+    """Unknown gains of the shots: 1, with infinite 1σ."""
     return GainEstimate(np.ones(shots), np.where(np.arange(shots) > 0, np.inf, 0.0))
 
 
@@ -179,7 +179,7 @@ def facing(light: Floats, usable: Bools, angle: Floats) -> GainEstimate:
     if usable.sum() < 100:
         return unknown(shots)
     ratio = light[:, usable] / np.maximum(light[0, usable], 1e-12)  # (K, N)
-    ratio = ratio[:, :: max(1, ratio.shape[1] // 40_000)]
+    ratio = ratio[:, :: max(1, ratio.shape[1] // 20_000)]
     seeds = ratio[:, np.linspace(0, ratio.shape[1] - 1, _STARTS).astype(int)].T
     starts = (np.median(ratio, axis=1), np.ones(shots), *seeds)
     climbs = parallel.results(partial(_climb, ratio, start) for start in starts)
@@ -256,12 +256,12 @@ def _null_vector(
 
 
 def _squares(rows: Floats, weight: Floats) -> Floats:
-    """Σ weight · rowᵀrow, (K, K) of rows (P, C, K)."""
+    """Normal matrix Σ weight · rowᵀrow (K, K) of rows (P, C, K)."""
     return np.asarray(np.einsum("p,pck,pcl->kl", weight, rows, rows, optimize=True))
 
 
 def _least(square: Floats) -> Floats:
-    """The h (K,) with h₀ = 1 that minimizes hᵀQh."""
+    """Vector h (K,) with h₀ = 1 that minimizes hᵀQh for a matrix Q (K, K)."""
     size = len(square) - 1
     inner = square[1:, 1:] + 1e-9 * (np.trace(square) + 1e-12) * np.eye(size)
     return np.concatenate([[1.0], np.linalg.solve(inner, -square[1:, 0])])

@@ -1,7 +1,7 @@
 """Error of the zero of the polarizer's ring, from the object's outline and from the slopes inside it.
 
 Diffuse reflection is polarized along the slope g = tan θ (cos φ, sin φ) of the surface. A slope has no curl: along a
-closed curve inside the outline, ∮ g·t = 0 on any smooth surface, symmetrical or not. A ring whose zero is off by δ
+closed curve inside the outline, ∮ g·t = 0 on any smooth surface, symmetrical or not. A ring with a zero off by δ
 turns g, and then ∮ g·t / ∮ g·n = tan δ, n pointing out of the curve. Instead of one curve a band of them is taken: the
 contours of a blurred mask. The DoLP serves as tan θ; any weight does on a symmetrical object. The law does not hold
 for occluded parts, sharp edges, reflected light and interreflection. Their effects differ with the depth, so the spread
@@ -12,15 +12,13 @@ at every pixel. Contours, edges and highlights are outliers. Neither outline nor
 matter where a surface faces the camera, are fitted too, with their error as prior (decision 26).
 """
 
-from functools import partial
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap import parallel
 from polcap.images import Bools, Floats, RingZero
 from polcap.optics import mueller, outline
+from polcap.optics.resize import area_mean
 from polcap.optics.robust import jackknife
 from polcap.stages.selfcal import integrability
 from polcap.stages.selfcal.object_gains import weighted_mean
@@ -50,7 +48,7 @@ _SLOPES_FLOOR = np.radians(0.1)  # least 1σ (decision 26)
 
 
 def combined(one: RingZero, other: RingZero) -> RingZero:
-    """Weighted mean of two measurements of one ring; its error grows with their difference if they contradict."""
+    """Weighted mean of two measurements of a ring's zero; if they contradict, its error grows with the difference."""
     offset, sigma = weighted_mean(np.array([one.offset, other.offset]), np.array([one.sigma, other.sigma]))
     return RingZero(float(offset), min(float(sigma), np.pi / 2))
 
@@ -58,7 +56,7 @@ def combined(one: RingZero, other: RingZero) -> RingZero:
 def by_outline(
     light: Floats, sound: Bools, mask: Bools, angle: Floats, gain_sigma: float, leaves_picture: bool
 ) -> RingZero:
-    """The ring's error from the outline of registered shots (K, H, W) without their gains.
+    """Error of the polarizer ring's zero, from the outline of registered shots (K, H, W) without their gains.
 
     sound (H, W) are the pixels to use, angle (K,) rad the stated angles, gain_sigma the relative 1σ of the gains. If
     the object leaves the picture there is no closed curve, and the result is UNKNOWN.
@@ -81,9 +79,9 @@ def by_outline(
     strength = np.abs(polarization)
     weight = np.minimum(strength, outline.DOLP_CAP)
     slope = np.sqrt(polarization / np.maximum(strength, 1e-9)) * weight  # along it or against it: half the angle
-    outward = parallel.results(partial(_outward_of, mask, sigma) for sigma in (_RIM_PX, *(d * radius for d in _DEEPER)))
-    outward.append(_outward(cv2.GaussianBlur(np.minimum(depth, _PLATEAU * radius), (0, 0), 2.0)))
-    rim, *deeper = parallel.results(partial(_turn, slope, way[seen]) for way in outward)
+    outward = [_outward(mask, sigma) for sigma in (_RIM_PX, *(d * radius for d in _DEEPER))]
+    outward.append(_outward(np.minimum(depth, _PLATEAU * radius), 2.0))
+    rim, *deeper = (_turn(slope, way[seen]) for way in outward)
     scatter = float(np.sqrt(np.mean([(other - rim) ** 2 for other in deeper])))
     at_rim = outward[0][seen]
     length = np.abs(at_rim)
@@ -91,10 +89,12 @@ def by_outline(
     hidden /= max(hidden + float(length.sum()), 1e-9)
     lopsided = abs(complex((np.conj(at_rim) ** 2 / np.maximum(length, 1e-30)).sum()))
     lopsided /= max(float(length @ weight), 1e-9)
+    sector = outline.sectors(seen)
+    by_part = [_turn(slope[sector == part], at_rim[sector == part]) for part in np.unique(sector)]
     variance = (
         _FLOOR**2
         + (_SPREAD_TO_SIGMA * scatter) ** 2
-        + (hidden * _scatter(slope, at_rim, outline.sectors(seen))) ** 2
+        + (hidden * np.std(by_part)) ** 2
         + (gain_sigma * lopsided / 2) ** 2
     )
     return RingZero(-rim, min(float(np.sqrt(variance)), np.pi / 2))
@@ -107,24 +107,18 @@ def _smoothed(light: Floats, used: Bools) -> Floats:
     return np.stack([cv2.GaussianBlur((shot * ok).astype(np.float32), (0, 0), _SMOOTH_PX) / share for shot in light])
 
 
-def _outward(inside: Floats) -> Complexes:
-    """Negative gradient (H, W) as x + iy, y up, of a picture with larger values inside: the outward direction."""
-    return np.asarray(-cv2.Sobel(inside, cv2.CV_64F, 1, 0) + 1j * cv2.Sobel(inside, cv2.CV_64F, 0, 1))
-
-
-def _outward_of(mask: Bools, sigma: float) -> Complexes:
-    """`_outward` of a mask blurred by `sigma` px; a large blur is made on a coarser grid."""
+def _outward(inside: Floats | Bools, sigma: float) -> Complexes:
+    """Outward gradient (H, W) as x + iy, y up, of a picture blurred by `sigma` px; a large blur on a coarser grid."""
     step = max(1, int(sigma / _FINE_PX))
-    height, width = mask.shape
-    small = cv2.resize(mask.astype(np.float32), (-(-width // step), -(-height // step)), interpolation=cv2.INTER_AREA)
-    way = _outward(cv2.GaussianBlur(small, (0, 0), sigma / step))
-    if step == 1:
-        return way
-    return np.asarray(cv2.resize(way.view(np.float64).reshape(*way.shape, 2), (width, height)) @ np.array([1, 1j]))
+    height, width = inside.shape
+    small = area_mean(inside.astype(np.float32), (-(-height // step), -(-width // step)))
+    direction, slope = outline.outward(small, sigma / step)
+    x, y = (cv2.resize(part, (width, height)) for part in direction * slope)
+    return np.asarray(x + 1j * y, np.complex128)
 
 
 def _turn(slope: Complexes, outward: Complexes) -> float:
-    """Angle of Σ g conj(out), rad; of the two slopes of an AoLP, opposite to each other, the outward one is used."""
+    """Mean angle [rad] from outward directions to slopes; of the two slopes of an AoLP, the outward one is used."""
     across = slope * np.conj(outward)
     real, imaginary = np.ascontiguousarray(across.real), np.ascontiguousarray(across.imag)
     turn = 0.0
@@ -134,14 +128,8 @@ def _turn(slope: Complexes, outward: Complexes) -> float:
     return turn
 
 
-def _scatter(slope: Complexes, outward: Complexes, sector: NDArray[np.int_]) -> float:
-    """1σ between parts of the outline, rad."""
-    parts = parallel.results(partial(_turn, slope[sector == s], outward[sector == s]) for s in np.unique(sector))
-    return float(np.std(parts))
-
-
 def by_slopes(light: Floats, usable: Bools, angle: Floats, gain_sigma: float) -> RingZero:
-    """The ring's error from the slopes inside, of registered shots (K, H, W), little blurred, without their gains.
+    """Error of the polarizer ring's zero, from slopes inside registered shots (K, H, W) without their gains.
 
     usable (H, W) are the object's sound pixels, angle (K,) rad as stated, gain_sigma 1σ of the gains, relative.
     """

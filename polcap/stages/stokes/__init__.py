@@ -140,12 +140,10 @@ def _solve_in_blocks(
     residual = np.empty(size, np.float32) if count > 3 else None
     solve_ = _exact if count == 3 else _weighted_least_squares
     block = max(_LEAST_ROWS, _BLOCK // max(size[1], 1))
-    memory = np.empty((2, count, min(block, size[0]), size[1], 3), np.float32)
     flags = [_flagged(quality_) for quality_ in shots.radiance.quality]
     for top in range(y0, y1, block):
         rows = slice(top - y0, min(top + block, y1) - y0)
-        value, variance = (part[:, : rows.stop - rows.start] for part in memory)
-        flagged = _register(shots, flags, (x0, top, x1, rows.stop + y0), value, variance)
+        value, variance, flagged = _register(shots, flags, (x0, top, x1, rows.stop + y0))
         solved, doubt = stokes[:, rows], covariance[:, rows]
         solve_(analyzers, value, variance, solved, doubt)
         if residual is not None:
@@ -170,9 +168,8 @@ def _body(
     across = np.where(clipped[..., None], 0, crossing.polarization_along(stokes[1], stokes[2], crossed.angle))
     value = crossing.diffuse_light(_resampled(shots, picture.value, transform, crop) * factor, across)
     variance = np.maximum(warp(picture.variance, transform, crop, 1, shots.lens), _LEAST_VARIANCE) * factor**2
-    quality: Bits = np.zeros(value.shape[:2], np.uint8)
-    _add_flags(quality, _flagged(picture.quality), transform, crop, shots.lens)
-    _add_outside(quality, picture.quality.shape, transform, crop, shots.lens)
+    height, width = picture.quality.shape
+    quality = _defects(_flagged(picture.quality), (height, width), transform, crop, shots.lens)
     return MaskedImage(value.astype(np.float32), variance, quality)
 
 
@@ -182,50 +179,42 @@ def _flagged(quality: Bits) -> list[tuple[Quality, Bits]]:
     return [(bit, plane) for bit, plane in planes if plane.any()]
 
 
-def _add_flags(
-    quality: Bits, flags: list[tuple[Quality, Bits]], transform: Floats, box: Box, lens: Distortion | None
-) -> None:
-    """Set the bits of pixels to which a flagged pixel contributes more than 1 %, in place."""
+def _defects(
+    flags: list[tuple[Quality, Bits]], shape: tuple[int, int], transform: Floats, box: Box, lens: Distortion | None
+) -> Bits:
+    """Quality bits (h, w) of a resampled shot (H, W) = `shape`: OUTSIDE, and those of flagged pixels.
+
+    A flagged pixel counts where it contributes more than 1 %.
+    """
+    quality: Bits = np.where(covered(shape, transform, box, lens=lens), np.uint8(0), np.uint8(Quality.OUTSIDE))
     for bit, plane in flags:
         quality |= np.where(warp(plane, transform, box, 1, lens) > 0.01 * bit, np.uint8(bit), np.uint8(0))
+    return quality
 
 
-def _add_outside(quality: Bits, shape: tuple[int, int], transform: Floats, box: Box, lens: Distortion | None) -> None:
-    """Set OUTSIDE for pixels beyond a shot's edge, in place."""
-    inside = covered(shape, transform, box, lens=lens)
-    if not inside.all():
-        quality |= np.where(inside, np.uint8(0), np.uint8(Quality.OUTSIDE))
+def _register(shots: _Shots, flags: list[list[tuple[Quality, Bits]]], box: Box) -> tuple[Floats, Floats, Bits]:
+    """All shots resampled on a box of the reference grid, divided by their gains.
 
-
-def _register(
-    shots: _Shots, flags: list[list[tuple[Quality, Bits]]], box: Box, values: Floats, variances: Floats
-) -> Bits:
-    """Resample all shots on a box of the reference grid, divided by their gains; returns the quality (h, w).
-
-    The results go to `values` and `variances`, (K, h, w, 3) each.
+    Returns values and variances (K, h, w, 3), and the quality (h, w).
     """
-    radiance, lens, width = shots.radiance, shots.lens, box[2] - box[0]
-    quality: Bits = np.zeros((box[3] - box[1], width), np.uint8)
-    mosaic = radiance.offset_px is not None
-    part = shots.transform[:, :2, 2] % 1
-    shares = np.prod(
-        part**2 + (1 - part) ** 2, axis=1
-    ).mean()  # one for all shots: the sharpest would get the least weight
+    radiance, lens, size = shots.radiance, shots.lens, (box[3] - box[1], box[2] - box[0])
+    values, variances = (np.empty((len(shots.transform), *size, 3), np.float32) for _ in range(2))
+    quality: Bits = np.zeros(size, np.uint8)
+    height, width = radiance.quality.shape[1:]
+    mosaic, part = radiance.offset_px is not None, shots.transform[:, :2, 2] % 1
+    # of the variance, by linear interpolation; one for all shots: the sharpest would get the least weight
+    share = np.prod(part**2 + (1 - part) ** 2, axis=1).mean() if mosaic else 1.0
     for k, transform in enumerate(shots.transform):
-        gain = shots.gain[k].astype(np.float32)
+        gain = np.tile(shots.gain[k].astype(np.float32), size[1])
         if mosaic:  # mean of 2 or 4 neighbors, as usual for a mosaic: splines ring at edges of so coarse a grid
             shot = warp(radiance.value[k], transform, box, 1, lens)
         else:
             shot = _resampled(shots, radiance.value[k], transform, box)
-        doubt = warp(radiance.variance[k], transform, box, 1, lens)
-        scale = np.float32(shares if mosaic else 1) / gain**2
-        np.divide(_rows(shot), np.tile(gain, width), out=_rows(values[k]))
-        np.maximum(doubt, _LEAST_VARIANCE, out=variances[k])
-        if (scale != 1).any():
-            _rows(variances[k])[:] *= np.tile(scale, width)
-        _add_flags(quality, flags[k], transform, box, lens)
-        _add_outside(quality, radiance.quality.shape[1:], transform, box, lens)
-    return quality
+        variance = np.maximum(warp(radiance.variance[k], transform, box, 1, lens), _LEAST_VARIANCE)
+        np.divide(_rows(shot), gain, out=_rows(values[k]))
+        np.multiply(_rows(variance), np.float32(share) / gain**2, out=_rows(variances[k]))
+        quality |= _defects(flags[k], (height, width), transform, box, lens)
+    return values, variances, quality
 
 
 def _rows(picture: Floats) -> Floats:

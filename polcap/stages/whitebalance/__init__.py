@@ -63,7 +63,7 @@ class WhitebalanceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     patch_share: Annotated[float, Meta(ge=0.2, le=0.95, description="sampled share of each patch's side")] = 0.6
 
 
-@stage(version=8)
+@stage(version=9)
 def measure(
     radiance: AngleStack, reference: ChartReference, request: ChartRequest, settings: WhitebalanceSettings
 ) -> ColorCalibration:
@@ -126,7 +126,7 @@ class _Find:
 
 
 def _search(radiance: AngleStack, reference: ChartReference, settings: WhitebalanceSettings) -> _Find:
-    """The first candidate that passes all tests with half the permitted residual, else the best one that passes."""
+    """Search the chart: the first candidate with half the permitted color residual, else the one with the least."""
     finds: list[_Find] = []
     cheapest, small_px = np.inf, 0.0
     exposed: ChartError | None = None
@@ -174,7 +174,7 @@ def _search(radiance: AngleStack, reference: ChartReference, settings: Whitebala
 def _at_corners(
     radiance: AngleStack, reference: ChartReference, corners_px: Floats | None, settings: WhitebalanceSettings
 ) -> _Find:
-    """The chart at corners (4, 2) RAW px from the user, refined in the picture if possible."""
+    """Locate the chart at corners (4, 2) RAW px from the user; they are refined in the picture if possible."""
     if corners_px is None or np.shape(corners_px) != (4, 2):
         raise ChartError("--chart needs the four outer corners of the patches x0,y0,…,x3,y3, clockwise from dark skin")
     height, width = radiance.value.shape[1:3]
@@ -221,7 +221,7 @@ def _find(
 def _edition(
     radiance: AngleStack, found: _Find, reference: ChartReference, settings: WhitebalanceSettings
 ) -> tuple[_Find, ChartReference]:
-    """The chart with colors of the edition that fits best, and that edition."""
+    """Choose the edition of the chart (by year of manufacture) with the colors that fit best."""
     residuals = [patches.residual(found.seen, other) for other in (reference, *reference.editions)]
     least = int(np.argmin(residuals))
     if residuals[least] >= _CLEARLY_BETTER * residuals[0]:
@@ -235,7 +235,7 @@ def _plausible(place: Placement, min_explained: float) -> bool:
 
 
 def _from_camera(radiance: AngleStack) -> ColorCalibration:
-    """The camera's matrix or white balance from metadata, with sensor white at 1; without either, the identity."""
+    """Color calibration without a chart: matrix or white balance from the camera's metadata, else the identity."""
     sensor = radiance.sensor
     if sensor.camera_matrix is not None:
         matrix = np.asarray(sensor.camera_matrix, np.float64)

@@ -33,8 +33,8 @@ _DARKEST = 1e-3  # of white; darker values are set to this
 _MARGIN = 0.045  # width of card around the outer patches that is compared [pitch]
 _AROUND = 0.3  # width around the chart in which pixels are fitted [pitch]
 _LEAST_PX = 24 * 16  # pixels of a chart that is fitted
-_WORK_PITCH_PX, _WORK_STEPS = 32.0, 4  # pixels per patch to which the picture is averaged down, and steps of the fit
-_FIRST_PITCH_PX, _FIRST_STEPS = 10.0, 12  # the same of a first fit
+_WORK_PITCH_PX = 32.0  # a chart with more pixels per patch is averaged down before it is fitted
+_STEPS = 12
 _STEP = 1e-6  # of the unknowns, for derivatives
 _SQUARE = np.array([[-1.0, -1.0], [1, -1], [1, 1], [-1, 1]])
 
@@ -62,7 +62,7 @@ class Placement:
         return transform_points(self.homography, _outer(self.patch))
 
     def turned(self) -> "Placement":
-        """The same location read upside down."""
+        """The location of the same chart, read upside down."""
         return replace(self, homography=self.homography @ [[-1.0, 0, COLUMNS], [0, -1.0, ROWS], [0, 0, 1]])
 
     def moved(self, transform: Floats) -> "Placement":
@@ -77,17 +77,17 @@ def centers() -> Floats:
 
 
 def from_centers(points: Floats) -> Placement:
-    """The placement whose patch centers fit image points (24, 2) px, by least squares."""
+    """The placement of a chart with patch centers at image points (24, 2) px, by least squares."""
     return Placement(_homography(centers(), points))
 
 
 def from_corners(points: Floats, patch: float = USUAL_PATCH) -> Placement:
-    """The placement with outer patch corners (4, 2) px, dark skin first, clockwise on the chart."""
+    """The placement of a chart with outer patch corners (4, 2) px, dark skin first, clockwise on the chart."""
     return Placement(_homography(_outer(patch), points), patch)
 
 
 def is_view(homography: Floats) -> bool:
-    """Whether a photograph can show a chart like this (3, 3): convex, not mirrored, in front of the camera."""
+    """Whether a homography (3, 3) is a possible view of a chart: convex, not mirrored, in front of the camera."""
     corners = _outer(1.0)
     depth = corners @ homography[2, :2] + homography[2, 2]
     if not np.isfinite(homography).all() or not (depth * depth[0] > 0).all():
@@ -101,30 +101,27 @@ def is_view(homography: Floats) -> bool:
 def refine(picture: Floats, start: Placement) -> Placement:
     """Refine the location of a chart, right to a third of a patch, in a linear picture (H, W, 3).
 
-    It is fitted to the picture averaged down to 10 pixels per patch, then to 32.
+    A chart with more than 32 pixels per patch is averaged down first.
     """
     around = transform_points(start.homography, np.array([[-1.0, -1], [7, -1], [7, 5], [-1, 5]]))
     x0, y0 = np.maximum(np.floor(around.min(axis=0)).astype(int), 0)
     x1, y1 = np.minimum(np.ceil(around.max(axis=0)).astype(int) + 1, picture.shape[1::-1])
     if x1 - x0 < 2 or y1 - y0 < 2:
         return start
-    seen, place = resize(picture[y0:y1, x0:x1], min(1.0, _WORK_PITCH_PX / start.pitch_px)), start
-    seen = np.clip(seen / white(seen), 0, 4)
-    first = resize(seen, min(1.0, _FIRST_PITCH_PX / min(start.pitch_px, _WORK_PITCH_PX)))
-    for image, steps in ((first, _FIRST_STEPS), (seen, _WORK_STEPS)):
-        to_image = scaling(image.shape, (y1 - y0, x1 - x0)) @ np.array([[1.0, 0, -x0], [0, 1, -y0], [0, 0, 1]])
-        place = _fit(image, place.moved(to_image), steps).moved(np.linalg.inv(to_image))
-    return place
+    crop = picture[y0:y1, x0:x1]
+    seen = resize(crop, min(1.0, _WORK_PITCH_PX / start.pitch_px))
+    to_seen = scaling(seen.shape, crop.shape) @ np.array([[1.0, 0, -x0], [0, 1, -y0], [0, 0, 1]])
+    return _fit(np.clip(seen / white(seen), 0, 4), start.moved(to_seen)).moved(np.linalg.inv(to_seen))
 
 
 def white(picture: Floats) -> Floats:
-    """99th percentile of each channel (3,), from about 10⁵ pixels."""
+    """White level of a picture (H, W, 3): 99th percentile of each channel (3,), from about 10⁵ pixels."""
     step = max(1, int(np.sqrt(picture[..., 0].size / 1e5)))
     return np.maximum(np.percentile(picture[::step, ::step], 99, axis=(0, 1)), 1e-9)
 
 
 def resize(picture: Floats, factor: float) -> Floats:
-    """The picture (H, W, 3) averaged down, or enlarged by cubic interpolation."""
+    """Resize a picture (H, W, 3) by a factor: by area means below 1, by cubic interpolation above."""
     method = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
     size = (max(1, round(picture.shape[1] * factor)), max(1, round(picture.shape[0] * factor)))
     return np.asarray(cv2.resize(np.asarray(picture, np.float32), size, interpolation=method))
@@ -136,7 +133,7 @@ def scaling(small: tuple[int, ...], large: tuple[int, ...]) -> Floats:
     return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]])
 
 
-def _fit(image: Floats, start: Placement, steps: int) -> Placement:
+def _fit(image: Floats, start: Placement) -> Placement:
     """Fit the drawing of a chart to an image (H, W, 3) with white about 1.
 
     Light mixes linearly at an edge; residuals are computed after a gamma of 2.2, so that dark patches count too.
@@ -152,7 +149,7 @@ def _fit(image: Floats, start: Placement, steps: int) -> Placement:
     low = [*[-np.inf] * 8, _LEAST_PATCH, min(_PIXEL_BLUR_PX / pitch, _GREATEST_BLUR)]
     high = [*[np.inf] * 8, _GREATEST_PATCH, _GREATEST_BLUR]
     explained = 0.0
-    for step in range(steps):
+    for step in range(_STEPS):
         cover, cell, used = _cover(point, unknowns)
         if used.sum() < _LEAST_PX:
             return start
@@ -181,7 +178,7 @@ def _fit(image: Floats, start: Placement, steps: int) -> Placement:
 
 
 def _cover(point: Floats, unknowns: Floats) -> tuple[Floats, NDArray[np.intp], NDArray[np.bool_]]:
-    """Share of each pixel that its nearest patch covers, the index of this patch, and whether the chart has the pixel.
+    """Share of each pixel that a chart's patch covers, the index of the patch, and whether the pixel is on the chart.
 
     point (3, N) are homogeneous coordinates; the ten unknowns are a homography to chart coordinates without its last
     number, the side of a patch, and the blur.
@@ -208,7 +205,7 @@ def _colors(value: Floats, cover: Floats, cell: NDArray[np.intp]) -> tuple[Float
 
 
 def _outer(patch: float) -> Floats:
-    """Outer corners (4, 2) of the outer patches in chart coordinates, dark skin first, clockwise."""
+    """Outer corners (4, 2) of the corner patches in chart coordinates, dark skin first, clockwise."""
     gap = (1 - patch) / 2
     return np.array([[gap, gap], [COLUMNS - gap, gap], [COLUMNS - gap, ROWS - gap], [gap, ROWS - gap]])
 

@@ -12,41 +12,18 @@ from polcap.optics.projection import transform_points
 from polcap.stages.whitebalance.chart import resize, scaling, white
 
 _TILE_PX, _TILE_STEP_PX = 900, 600
-_QUICK_SIDE = 600  # px of the picture that is searched first: ten times as fast
-# Detector parameters for it: the defaults scaled by 0.4, with five thresholds instead of nine.
-_QUICK = {
-    "minImageSize": 400,
-    "minContourLengthAllowed": 40,
-    "minContoursArea": 16.0,
-    "adaptiveThreshWinSizeMin": 9,
-    "adaptiveThreshWinSizeMax": 61,
-    "adaptiveThreshWinSizeStep": 12,
-}
 _CANDIDATES = 3  # per picture, because the detector may prefer a texture to the chart
 
 
 def candidates(value: Floats) -> Iterator[tuple[Floats, float]]:
     """Patch centers (24, 2) px and detector cost of possible charts in a picture (H, W, 3)."""
-    small = resize(value, min(1.0, _QUICK_SIDE / max(value.shape[:2])))
-    yield from _detect(_QUICK, _eight_bits(small, white(value)), scaling(small.shape, value.shape))
-    for picture, transform in _pictures(value):
-        yield from _detect({}, picture, transform)
-
-
-def _detect(
-    parameters: dict[str, float], picture: NDArray[np.uint8], transform: Floats
-) -> Iterator[tuple[Floats, float]]:
-    """Patch centers (24, 2) and costs in one picture; `transform` maps px of the radiance to px of the picture."""
     detector: Any = cv2.mcc.CCheckerDetector.create()
-    changed = cv2.mcc.DetectorParametersMCC()
-    for name, value in parameters.items():
-        setattr(changed, name, value)
     detector.setColorChartType(cv2.mcc.MCC24)
-    detector.setDetectionParams(changed)
-    if detector.process(picture, _CANDIDATES):
-        for checker in detector.getListColorChecker():
-            quads = np.asarray(checker.getColorCharts(), dtype=np.float64).reshape(24, 4, 2)
-            yield transform_points(np.linalg.inv(transform), quads.mean(axis=1)), float(checker.getCost())
+    for picture, transform in _pictures(value):
+        if detector.process(picture, _CANDIDATES):
+            for checker in detector.getListColorChecker():
+                quads = np.asarray(checker.getColorCharts(), dtype=np.float64).reshape(24, 4, 2)
+                yield transform_points(np.linalg.inv(transform), quads.mean(axis=1)), float(checker.getCost())
 
 
 def _pictures(value: Floats) -> Iterator[tuple[NDArray[np.uint8], Floats]]:

@@ -36,7 +36,7 @@ class PatchUse(IntEnum):
 
 @dataclass(frozen=True)
 class ChartFit:
-    """A color matrix by the patches of one shot."""
+    """Color matrix that was fitted to the patches of a chart in one shot."""
 
     fit: color.MatrixFit
     use: Bits  # (24,) PatchUse
@@ -46,18 +46,18 @@ class ChartFit:
 
 @dataclass(frozen=True)
 class PatchSamples:
-    """The colors of the patches in one shot."""
+    """Colors of a chart's patches in one shot."""
 
     color: Floats  # (24, 3) S0 of the patches, camera channels
     use: Bits  # (24,) PatchUse
 
     def turned(self) -> "PatchSamples":
-        """The same chart read upside down."""
+        """Colors of the patches of the same chart, read upside down."""
         return PatchSamples(self.color[::-1], self.use[::-1])
 
 
 def fit(samples: PatchSamples, reference: ChartReference) -> ChartFit:
-    """The matrix (3, 3) from one shot's patches to a chart's colors.
+    """Fit the color matrix (3, 3) from the patches of one shot to the known colors of the chart.
 
     Raises
     ------
@@ -65,7 +65,14 @@ def fit(samples: PatchSamples, reference: ChartReference) -> ChartFit:
         Fewer than 12 patches are usable.
     """
     seen, use = samples.color, samples.use
-    _check(use)
+    used = int((use == PatchUse.USED).sum())
+    if used < _LEAST:
+        clipped, uneven = (int((use == reason).sum()) for reason in (PatchUse.CLIPPED, PatchUse.UNEVEN))
+        raise ChartError(
+            f"{24 - used} of the chart's 24 patches cannot be used ({clipped} over-exposed, "
+            f"{uneven} partly hidden or in shade), more than the {24 - _LEAST} allowed; add a shorter exposure to the "
+            "bracket, or show the whole chart"
+        )
     error = color.trimmed_residuals(seen, reference.rec709, position(), use == PatchUse.USED)
     odd = error > max(_LEAST_ODD, _ODD * float(np.median(error[use == PatchUse.USED])))
     use = np.where((use == PatchUse.USED) & odd, PatchUse.ODD, use).astype(np.uint8)
@@ -134,21 +141,8 @@ def left_out(use: Bits) -> str:
 
 
 def _between_quarters(pixels: Floats, x: Floats, y: Floats) -> float:
-    """Largest difference of the light (sum of channels) between a quarter of the patch and the whole patch."""
+    """Unevenness of a patch: largest difference of light (sum of channels) between a quarter and the whole patch."""
     light = pixels.sum(axis=1)
     quarter = 2 * (x > 0) + (y > 0)
     means = [np.median(light[quarter == q]) for q in range(4) if (quarter == q).sum() >= 4]
     return float(np.abs(np.array(means) - np.median(light)).max()) if means else 0.0
-
-
-def _check(use: Bits) -> None:
-    """Raise ChartError if fewer than 12 patches are usable."""
-    used = int((use == PatchUse.USED).sum())
-    if used >= _LEAST:
-        return
-    clipped, uneven = int((use == PatchUse.CLIPPED).sum()), int((use == PatchUse.UNEVEN).sum())
-    raise ChartError(
-        f"{24 - used} of the chart's 24 patches cannot be used ({clipped} over-exposed, "
-        f"{uneven} partly hidden or in shade), more than the {24 - _LEAST} allowed; add a shorter exposure to the "
-        "bracket, or show the whole chart"
-    )

@@ -146,12 +146,6 @@ def test_maps_as_stored_equal_the_maps_read(folder: Path, result: Result) -> Non
         assert np.array_equal(value, other) if isinstance(value, np.ndarray) else value == other, name
 
 
-def test_same_result_gives_the_same_bytes(folder: Path, result: Result, tmp_path: Path) -> None:
-    maps.write(tmp_path / "again", *result)
-    for name in FILES:
-        assert (folder / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
-
-
 def test_relative_depth_is_called_so(result: Result, tmp_path: Path) -> None:
     of, mesh, stokes, cue = result
     maps.write(tmp_path, of, replace(mesh, metric=False), stokes, cue)

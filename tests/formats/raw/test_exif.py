@@ -62,23 +62,17 @@ def test_header_gives_camera_and_settings(tmp_path, maker):
     assert fact.relative_exposure == pytest.approx(1 / 50 * 2 / 64)
 
 
-def test_panasonic_states_iso_in_a_tag_of_its_own(tmp_path):
+def test_panasonic_states_iso_in_a_tag_of_its_own():
     photo = {tag: value for tag, value in PHOTO.items() if tag != 34855}
-    path = tmp_path / "a.rw2"
     main = headers.camera() | {0x17: (3, (400,))}
-    path.write_bytes(headers.tiff(main, {EXIF_IFD: photo}, magic=b"IIU\0"))
-    assert exif.tags(path.read_bytes()).iso == 400
+    assert exif.tags(headers.tiff(main, {EXIF_IFD: photo}, magic=b"IIU\0")).iso == 400
 
 
-def test_iso_beyond_sixteen_bits_is_read_from_its_tag(tmp_path):
-    photo = PHOTO | {34855: (3, (65535,)), 34866: (4, (102400,))}
-    path = tmp_path / "a.dng"
-    path.write_bytes(headers.dng(np.zeros((32, 32)), photo=photo))
-    assert exif.tags(path.read_bytes()).iso == 102400
-
-
-def test_iso_of_a_pair_whose_first_is_zero_is_the_second():
-    assert exif.tags(headers.dng(np.zeros((32, 32)), photo=PHOTO | {34855: (3, (0, 320))})).iso == 320
+@pytest.mark.parametrize(
+    ("tags", "iso"), [({34855: (3, (65535,)), 34866: (4, (102400,))}, 102400), ({34855: (3, (0, 320))}, 320)]
+)
+def test_iso_beyond_sixteen_bits_and_of_a_pair_after_zero_is_read(tags, iso):
+    assert exif.tags(headers.dng(np.zeros((32, 32)), photo=PHOTO | tags)).iso == iso
 
 
 def test_iso_that_no_tag_states_is_asked_of_the_decoder(tmp_path, monkeypatch):
@@ -103,22 +97,16 @@ def test_iso_that_no_tag_states_is_asked_of_the_decoder(tmp_path, monkeypatch):
     assert asked == [False, True]
 
 
-def test_flash_that_is_not_mentioned_is_unknown(tmp_path):
-    for flash, fired in ((None, None), (0x10, False), (0x19, True)):
-        path = tmp_path / "a.dng"
-        path.write_bytes(headers.dng(np.zeros((32, 32)), photo=headers.settings(flash=flash)))
-        assert exif.tags(path.read_bytes()).flash_fired is fired
+@pytest.mark.parametrize(("flash", "fired"), [(None, None), (0x10, False), (0x19, True)])
+def test_flash_that_is_not_mentioned_is_unknown(flash, fired):
+    assert exif.tags(headers.dng(np.zeros((32, 32)), photo=headers.settings(flash=flash))).flash_fired is fired
 
 
-def test_color_matrix_under_daylight_is_preferred(tmp_path):
+def test_color_matrix_under_daylight_is_preferred():
     tungsten, daylight = [1, 0, 0] * 3, [0, 1, 0] * 3
-    main = headers.camera() | {
-        50706: (1, (1, 4, 0, 0)),
-        50721: (10, tungsten), 50778: (3, (17,)), 50722: (10, daylight), 50779: (3, (21,)),
-    }  # fmt: skip
-    path = tmp_path / "a.dng"
-    path.write_bytes(headers.tiff(main))
-    assert exif.tags(path.read_bytes()).color_matrix == tuple(daylight)
+    matrices = {50721: (10, tungsten), 50778: (3, (17,)), 50722: (10, daylight), 50779: (3, (21,))}
+    found = exif.tags(headers.tiff(headers.camera() | {50706: (1, (1, 4, 0, 0))} | matrices))
+    assert found.color_matrix == tuple(daylight)
 
 
 @pytest.mark.parametrize(("unit", "per_unit"), [(2, 25400), (3, 10000), (4, 1000)])

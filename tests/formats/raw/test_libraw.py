@@ -135,11 +135,6 @@ def test_cut_file_is_one_error(tmp_path):
             raw.read(path)
 
 
-def test_missing_file_is_one_error(tmp_path):
-    with pytest.raises(DecodeError, match="No such file"):
-        raw.read(tmp_path / "nothing.cr2")
-
-
 @needs_data
 def test_real_files_open():
     expected = {  # visible pixels, colours of the first cell, white

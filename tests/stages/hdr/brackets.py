@@ -9,7 +9,7 @@ import pytest
 
 from polcap.images import Capture, Exif, Frame, Quality, SensorImage, Shot
 from polcap.stages import hdr
-from polcap.stages.hdr.planes import Planes, planar
+from polcap.stages.hdr.planes import in_memory, planar
 
 RGGB = np.array([[0, 1], [1, 2]], np.uint8)
 BLACK, WHITE, READ, GAIN = 512.0, 15871.0, 3.0, 2.0  # counts, counts, e⁻, e⁻ per count at ISO 100
@@ -52,7 +52,7 @@ def expose(quads, exposure, rng, iso=100.0):
 def planes(picture, usable=None):
     """A picture (H, W, C) as the merge sees it; usable (H, W), everywhere by default."""
     everywhere = np.ones(picture.shape[:2], bool)
-    return Planes(planar(picture.astype(np.float32)), everywhere if usable is None else usable)
+    return in_memory(planar(picture.astype(np.float32)), everywhere if usable is None else usable)
 
 
 def frame(image, **exif):

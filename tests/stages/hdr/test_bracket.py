@@ -128,15 +128,14 @@ def test_hand_held_nikon_bracket():
     shot = Shot(0.0, tuple(frames))
     found = compare(Bracket(shot, (0, 1, 2), 1), noise.Lines(), Reader((), decode, 0.98), 60.0)
     own, first = signals(frames[1].load(), 0.98).rows(slice(None)), found.estimate
-    assert found.frames is not None
     for e in (0, 2):
-        link, (other, gain) = found.links[e], (found.frames[e].signals, found.frames[e].gain)
+        link, other, gain = found.frames[e], found.frames[e].signals, found.frames[e].gain
         assert link.motion is not None
         usable = other.usable & found.frames[1].signals.usable & ~ghost
         z = []
         for c, ratio in enumerate(link.ratio):
-            variance = found.noises[1].of_channel(c, first[c])
-            variance += found.noises[e].of_channel(c, first[c] * ratio) / ratio**2 * gain
+            variance = found.frames[1].noise.of_channel(c, first[c])
+            variance += link.noise.of_channel(c, first[c] * ratio) / ratio**2 * gain
             variance += squared_gradient(first[c]) * link.misfit[c]
             z.append(((other.rows(slice(None))[c] / ratio - own[c]) / np.sqrt(variance))[usable])
         assert np.all(np.abs(np.mean(z, axis=1)) < 0.1)

@@ -37,8 +37,8 @@ def leaning(normal):
 def test_a_region_of_a_ball_that_was_turned_is_turned_back(region: str) -> None:
     normal, mask = ball()
     wrong = mask & {"whole": X > -1, "half": X > 60, "patch at the outline": np.hypot(X - 100, Y - 60) < 22}[region]
-    given = np.where(wrong[..., None], opposite(normal), normal)
-    found = half_turns.resolve(given, mask, doubt(mask, 25.0))
+    normals = np.where(wrong[..., None], opposite(normal), normal)
+    found = half_turns.resolve(normals, mask, doubt(mask, 25.0))
     judged = mask & leaning(normal)
     assert (found.turned == wrong)[judged].mean() > 0.97
 
@@ -57,12 +57,12 @@ def test_a_true_dent_stays_a_dent() -> None:
     u, v = (X - 59.5) / 30, -(Y - 59.5) / 30
     hollow = np.stack([-u, -v, np.sqrt(np.maximum(1 - u * u - v * v, 0.1))], axis=-1)
     hollow /= np.linalg.norm(hollow, axis=-1, keepdims=True)
-    given = np.where(dent[..., None], hollow, normal)
-    assert not half_turns.resolve(given, mask, doubt(mask, 10.0)).turned.any()
+    normals = np.where(dent[..., None], hollow, normal)
+    assert not half_turns.resolve(normals, mask, doubt(mask, 10.0)).turned.any()
 
 
 def test_a_neck_that_the_mask_cuts_does_not_anchor() -> None:
-    """A cylinder leans to its two sides; the straight ends of its mask say nothing of it."""
+    """A cylinder leans to its two sides; the straight ends of its mask are no evidence."""
     across = np.clip((X - 59.5) / 40, -1, 1)
     normal = np.stack([across, 0 * X, np.sqrt(np.maximum(1 - across**2, 1e-4))], axis=-1)
     mask = (np.abs(X - 59.5) < 40) & (Y > 10) & (Y < 100)
@@ -97,14 +97,14 @@ def test_positions_that_disagree_raise_the_odds_of_a_region() -> None:
     """The same wrong patch, at the edge of being believed: with the network's positions at odds it is turned."""
     normal, mask = ball()
     wrong = np.hypot(X - 95, Y - 60) < 18
-    given = np.where(wrong[..., None], opposite(normal), normal)
-    agreed, split = (half_turns.resolve(given, mask, doubt(mask, 8.0, opposed)) for opposed in (0.0, 0.5))
+    normals = np.where(wrong[..., None], opposite(normal), normal)
+    agreed, split = (half_turns.resolve(normals, mask, doubt(mask, 8.0, opposed)) for opposed in (0.0, 0.5))
     assert not agreed.turned.any() and agreed.doubt.max() > 0.02
     assert split.turned[wrong & mask & leaning(normal)].mean() > 0.9
 
 
 def test_the_expected_error_is_the_mean_over_both_sides() -> None:
-    """A normal at 40° whose side is wrong one time in four: ¾ · 4° + ¼ · 80°."""
+    """A normal at 40° with the wrong side one time in four: ¾ · 4° + ¼ · 80°."""
     error = half_turns.error_with_doubt(np.array(4.0), np.array(0.25), np.cos(np.radians(40.0)))
     assert error == pytest.approx(23.0)
 

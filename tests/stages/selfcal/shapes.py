@@ -1,11 +1,14 @@
-"""Shots of smooth surfaces z(x, y), for the laws of their slopes."""
+"""Shots of smooth surfaces z(x, y), for the laws of their slopes; self-calibration of the scene of `tests.scenes`."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
-from polcap.images import Bools, Floats
+from polcap.images import AngleStack, Bools, ColorCalibration, Floats, ObjectMask, SelfCalibration
 from polcap.optics import fresnel, mueller
+from polcap.stages import selfcal
+from tests import scenes
 
 ANGLES = np.radians([0.0, 45.0, 90.0])
 SIZE = 120
@@ -39,3 +42,11 @@ def inside(light: Floats) -> Bools:
     used = np.zeros(light.shape[1:], bool)
     used[4:-4, 4:-4] = True
     return used
+
+
+def solve(
+    radiance: AngleStack, color: ColorCalibration | None = None, object_: ObjectMask | None = None, **settings: Any
+) -> SelfCalibration:
+    """Self-calibration of shots of the scene."""
+    still, ball = scenes.still(len(radiance.angle)), object_ or scenes.ball_object()
+    return selfcal.solve(radiance, still, ball, color or scenes.no_color(), selfcal.SelfcalSettings(**settings))

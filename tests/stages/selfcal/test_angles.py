@@ -9,17 +9,12 @@ from polcap.errors import CaptureError
 from polcap.images import Equipment, ShotOrder
 from polcap.optics import mueller
 from polcap.optics.outline import OutlineBand
-from polcap.stages import selfcal, stokes
+from polcap.stages import stokes
 from polcap.stages.selfcal import angles as angles_
 from tests import scenes
+from tests.stages.selfcal.shapes import solve
 
 FOUR = np.radians([0.0, 45.0, 90.0, 135.0])
-
-
-def solve(radiance, **settings):
-    still = scenes.still(len(radiance.angle))
-    chosen = selfcal.SelfcalSettings(**settings)
-    return selfcal.solve(radiance, still, scenes.ball_object(), scenes.no_color(), chosen)
 
 
 @pytest.mark.parametrize("degrees", [(0, 60, 120), (0, 45, 90, 135), (3, 41, 100, 155, 170)])

@@ -5,17 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from polcap.config import Config
-from polcap.images import Bits, ChartPlace, ColorCalibration, PatchColors, SelfCalibration
-from polcap.optics.projection import transform_points
+from polcap.images import Bits, ChartPlace, ColorCalibration, PatchColors
 from polcap.quality import light
 from polcap.quality.gate import Evidence
 from polcap.quality.limits import GateLimits
-from polcap.stages import selfcal, whitebalance
 from polcap.stages.selfcal import grey_patches
 from polcap.stages.whitebalance.patches import PatchUse
 from tests import scenes
-from tests.stages.whitebalance import chart_pictures
+from tests.stages.selfcal.shapes import solve
 
 GAIN = np.array([1.0, 1.013, 0.981])
 SHOTS = scenes.stack(gain=GAIN, noise=0.004)
@@ -31,10 +28,6 @@ def board(use: Bits | None = None) -> ColorCalibration:
             quads.append([[x, y], [x + 9, y], [x + 9, y + 30], [x, y + 30]])
     place = ChartPlace(np.array(quads, float), np.zeros((4, 2)))
     return replace(scenes.no_color(), place=place, source="chart", patches=PatchColors(np.zeros(24), use))
-
-
-def solve(radiance, color) -> SelfCalibration:
-    return selfcal.solve(radiance, scenes.still(), scenes.ball_object(), color, Config().selfcal)
 
 
 def test_grey_patches_give_the_gains_within_their_error():
@@ -60,29 +53,6 @@ def test_hidden_grey_patches_do_not_count(reason):
     half = solve(replace(SHOTS, value=value), board(use)).gains
     assert half.source == "grey patches" and np.isnan(half.grey_slope)
     assert np.abs(half.gain.mean(1) / GAIN - 1).max() < 0.003
-
-
-def test_a_grey_row_under_a_cloth_is_left_out_from_photograph_to_gains():
-    """White balance leaves the covered patches out, and no gain is taken from the cloth, which shifts by a fold."""
-    place = chart_pictures.pose(34, 3, (240, 180))
-    y, x = np.mgrid[0 : chart_pictures.HEIGHT, 0 : chart_pictures.WIDTH].astype(float)
-    u, v = np.moveaxis(transform_points(np.linalg.inv(place), np.stack([x, y], axis=-1)), -1, 0)
-    cloth = ((u > -0.5) & (u < 6.5) & (v > 3))[..., None]
-    picture, shots = chart_pictures.photograph(place), []
-    for k, gain in enumerate(GAIN):
-        folds = 0.012 + 0.008 * np.sin(x / 6 + k)[..., None] * np.ones(3)
-        shots.append(gain * np.where(cloth, folds, picture))
-    first = chart_pictures.stack(shots[0])
-    color = whitebalance.measure(first, chart_pictures.CLASSIC, chart_pictures.AUTO, Config().whitebalance)
-    assert color.source == "chart" and color.patches is not None and color.patches.use is not None
-    assert (color.patches.use > 0)[GREYS].all() and (color.patches.use[~GREYS] == 0).sum() >= 12
-    value = np.stack(shots).astype(np.float32)
-    radiance = replace(first, value=value, variance=np.full_like(value, 1e-8), angle=scenes.ANGLES,
-                       quality=np.zeros(value.shape[:3], np.uint8))  # fmt: skip
-    assert grey_patches.measure(radiance, scenes.still(), color) is None
-    everything = replace(color, patches=replace(color.patches, use=None))  # the cloth taken for grey patches
-    wrong = grey_patches.measure(radiance, scenes.still(), everything)
-    assert wrong is not None and np.abs(wrong.gain.mean(1) / GAIN - 1).max() > 0.02
 
 
 def test_grey_patches_with_a_large_error_are_doubted():

@@ -4,27 +4,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from polcap.config import Config
 from polcap.images import Equipment
-from polcap.stages import selfcal
 from polcap.stages.selfcal.object_gains import GainEstimate, with_prior
 from tests import scenes
+from tests.stages.selfcal.shapes import solve
 
 GAIN = np.array([1.0, 1.013, 0.981])
 
 
-def solve(radiance):
-    return selfcal.solve(radiance, scenes.still(), scenes.ball_object(), scenes.no_color(), Config().selfcal).gains
-
-
 def test_without_a_chart_the_gains_come_from_the_object():
-    found = solve(scenes.stack(gain=GAIN, noise=0.004))
+    found = solve(scenes.stack(gain=GAIN, noise=0.004)).gains
     assert found.source == "object"
     assert np.abs(found.gain.mean(1) / GAIN - 1).max() < 0.005
 
 
 def test_one_exposure_has_one_gain():
-    found = solve(replace(scenes.stack(gain=GAIN), equipment=Equipment("one exposure")))
+    found = solve(replace(scenes.stack(gain=GAIN), equipment=Equipment("one exposure"))).gains
     assert found.source == "one exposure"
     assert (found.gain == 1).all() and (found.sigma == 0).all()
 

@@ -9,7 +9,7 @@ from polcap.images import Equipment, Floats, RingZero
 from polcap.stages import selfcal, stokes
 from polcap.stages.selfcal import ring_zero
 from tests import scenes
-from tests.stages.selfcal.shapes import ANGLES, SHAPES, inside, shots
+from tests.stages.selfcal.shapes import ANGLES, SHAPES, inside, shots, solve
 
 DEG = np.radians(1.0)
 
@@ -54,12 +54,6 @@ def test_two_measurements_are_averaged_by_their_errors_or_doubted() -> None:
     assert different.sigma == pytest.approx(0.024)  # ten times the distance that their errors let expect
 
 
-def solve(radiance, object_=None, **settings):
-    object_ = object_ or scenes.ball_object()
-    shots_ = scenes.still(len(radiance.angle))
-    return selfcal.solve(radiance, shots_, object_, scenes.no_color(), selfcal.SelfcalSettings(**settings))
-
-
 @pytest.mark.parametrize("turn", [7.0, -2.5])
 def test_a_ring_whose_zero_is_off_is_found_and_corrected(turn):
     radiance = scenes.stack(noise=0.002, angles=ANGLES + turn * DEG)
@@ -102,4 +96,4 @@ def test_a_turn_is_corrected_only_where_asked_and_certain():
     assert solve(misset, correct_ring=False).ring.correction == 0
     assert solve(replace(misset, equipment=Equipment("one exposure"))).ring.correction == 0
     cut = replace(scenes.ball_object(), border=0.1)  # no closed outline: the slopes alone give the turn
-    assert solve(misset, cut).ring.correction == pytest.approx(3 * DEG, abs=0.3 * DEG)
+    assert solve(misset, object_=cut).ring.correction == pytest.approx(3 * DEG, abs=0.3 * DEG)
