@@ -4,6 +4,7 @@ Captures have three angles, 640 × 480 RAW px, the chart next to the object, and
 "none" is the same capture without the weakness.
 """
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -83,8 +84,8 @@ def write(folder: Path, seed: int, kind: str, width: int = 640) -> None:
         if scene is not plan.scene:
             shot = Studio(scene, plan.shoot)
             shot.middle = studio.middle
-        radiance = shot.radiance(pose, first=bool(plan.lamps) or k == 0)
-        indoors = studio._through_polarizer(room, pose) if plan.ambient else np.zeros_like(radiance)
+        radiance = shot.radiance(pose)
+        indoors = room.radiance(pose) if plan.ambient else np.zeros_like(radiance)
         for e in range(plan.shoot.exposures):
             file = folder / f"pol{name:05.1f}" / f"IMG_{next(numbers):04d}.DNG"
             file.parent.mkdir(parents=True, exist_ok=True)
@@ -196,10 +197,11 @@ def _lit(plan: Plan) -> Studio:
     return studio
 
 
-def _room(plan: Plan, studio: Studio, random: Random) -> Floats:
-    """Stokes parameters (3, H, W, 3) of the room's light, from lamps all around, with one polarization throughout."""
+def _room(plan: Plan, studio: Studio, random: Random) -> Studio:
+    """The studio under the room's light, from lamps all around, with one polarization throughout."""
+    room = copy.copy(studio)
     if not plan.ambient:
-        return np.zeros_like(studio.reference)
+        return room
     lamps = [(1.5, 0.5, 0.5), (-1.5, 0.5, 0.5), (0.0, 1.6, 0.0), (0.0, -1.6, 0.3), (0.3, 0.3, 1.2)]
     each = [Studio(msgspec.structs.replace(plan.scene, light=lamp), plan.shoot).reference for lamp in lamps]
     light = np.mean(each, axis=0)
@@ -208,7 +210,8 @@ def _room(plan: Plan, studio: Studio, random: Random) -> Floats:
     if plan.polarized:
         way = float(random.uniform(0, np.pi))
         light[1], light[2] = (plan.polarized * light[0] * f(2 * way) for f in (np.cos, np.sin))
-    return np.asarray(light)
+    room.reference = light
+    return room
 
 
 def _vignette(shoot: Shoot, lost: float) -> Floats:

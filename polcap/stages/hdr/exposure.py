@@ -58,8 +58,7 @@ def vignetting(reference: Signals, other: Signals, ratio: Floats) -> Floats | No
     """
     _, height, width = reference.shape
     a, b = tile_means(reference, TILE).sum(-1), (tile_means(other, TILE) / ratio).sum(-1)
-    usable = (reference.usable & other.usable)[: a.shape[0] * TILE, : a.shape[1] * TILE].astype(np.float32)
-    clear = cv2.resize(usable, a.shape[::-1], interpolation=cv2.INTER_AREA) > 0.999
+    clear = block_means((reference.usable & other.usable).astype(np.float32), TILE) > 0.999
     bright = clear & (a > 3 * _DIM) & (b > 3 * _DIM)
     if bright.sum() < 2 * _LEAST_TILES:
         return None
