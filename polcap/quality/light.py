@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 
 from polcap.images import AngleStack, Floats, Quality, StokesImage
@@ -20,6 +21,7 @@ _BRIGHTER = 1.08  # times S0: the greatest that scale and registration explain; 
 _EDGE_PX = 2.0  # 1σ over which two shots are compared: edges of a print need not meet
 _STILL_CLIPPED = 0.5  # share of highlights that a crossed filter should have stopped
 _FEW = 20  # px
+_DEGREES_PER_AMBIENT = 12.0  # of the normals, with one ambient frame that was subtracted: 1 to 2° at 15 %
 _LEAST_ALBEDO = 0.02  # sum of the channels
 _DEGREES_PER_HIGHLIGHT_DOLP = 100.0  # of the normals: 1 to 2° at 1 %, 2 to 11° at 3 to 15 %
 _ROOM_TILE, _LEAST_ROOM_TILES = 16, 20  # px; tiles
@@ -296,7 +298,8 @@ def ambient(found: Evidence, limits: GateLimits) -> Gate:
     worst = float(np.nanmax(share))
     message = f"{100 * worst:.1f} % of the light does not come from the flash; the ambient frames are subtracted"
     remedy = "Darken the room: the noise and changes of so much ambient light remain"
-    return at_most("ambient", worst, limit, message, remedy, cost_deg=60 * worst)
+    gate = at_most("ambient", worst, limit, message, remedy)
+    return msgspec.structs.replace(gate, cost_deg=round(_DEGREES_PER_AMBIENT * worst, 1))
 
 
 def lighting(found: Evidence, limits: GateLimits) -> Gate:

@@ -38,7 +38,7 @@ from polcap.quality import gates
 from polcap.quality.gate import full_size
 
 Row = dict[str, Any]
-WORSE_DEG, WORSE_ROUGHNESS, WORSE_SCALE = 1.0, 0.03, 0.10  # beyond the capture without the weakness
+WORSE_DEG, WORSE_ROUGHNESS, WORSE_SCALE = 1.0, 0.04, 0.10  # beyond the capture without the weakness
 OUTCOMES = ("handled", "reported", "silent", "false alarm", "crash")
 
 
