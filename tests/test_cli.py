@@ -86,6 +86,7 @@ def test_wrong_flag_is_one_line_and_exit_2(
     ("arguments", "words"),
     [
         (["process", "x", "--wath"], ["--wath", "--watch", "`polcap process --help`"]),
+        (["process", "My", "vase"], ["put a path with spaces in quotes", "`polcap process --help`"]),
         (["process"], ["missing argument 'capture'", "`polcap process --help`"]),
         (["proces", "x"], ["'proces'", "Did you mean 'process'?"]),
         (["synth", "x", "--seed", "-3"], ["'--seed'", "0"]),

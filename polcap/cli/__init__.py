@@ -74,6 +74,8 @@ def _one_line(error: TyperException) -> str:
     if "\n" in text:
         return text
     text = text.rstrip(".").replace("Value error, ", "")
+    if "unexpected extra argument" in text:
+        text += "; put a path with spaces in quotes"
     context = getattr(error, "ctx", None)
     asked = "polcap" if context is None or context.parent is None else f"polcap {context.info_name}"
     see = "" if text.endswith("?") else f"; see `{asked} --help`"

@@ -13,6 +13,7 @@ def check(
     config: options.ConfigFile = None,
     assignments: options.Assignments = None,
     angles: options.Angles = None,
+    clockwise: options.Clockwise = False,
     chart: options.Chart = None,
     no_chart: options.NoChart = False,
     json: options.Json = False,
@@ -27,7 +28,7 @@ def check(
     chosen, request = settings.load(config, assignments or ()), options.chart_request(chart, no_chart)
     with ThreadPoolExecutor(1) as pool:  # networks are opened while photographs are read
         opening = pool.submit(checks.shipped_networks)
-        found = captures.read(capture, options.angles_deg(angles))
+        found = captures.read(capture, options.angles_deg(angles), clockwise)
         verdict = checks.inspect(found, chosen, request, opening.result)
     terminal.print_data(checks.shown(verdict) if json else checks.table(verdict))
     if not verdict.keep:

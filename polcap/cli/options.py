@@ -37,6 +37,7 @@ Assignments = Annotated[
     list[str] | None, Option("--set", metavar="K=V", help="A setting, such as hdr.clip=0.95; repeatable.")
 ]
 Angles = Annotated[str | None, Option(metavar="DEG,…", help="Angles of the shots in order, such as 0,45,90.")]
+Clockwise = Annotated[bool, Option("--clockwise", help="The ring was turned clockwise as seen in the picture.")]
 _CHART = "Chart corners in RAW px, dark skin first, clockwise; or a color profile."
 Chart = Annotated[str | None, Option(metavar="X0,Y0,…|FILE", help=_CHART)]
 NoChart = Annotated[bool, Option("--no-chart", help="Use the camera's own colors.")]

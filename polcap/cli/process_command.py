@@ -30,6 +30,7 @@ def process(
     threads: options.Threads = 0,
     memory: options.Memory = 0,
     angles: options.Angles = None,
+    clockwise: options.Clockwise = False,
     chart: options.Chart = None,
     no_chart: options.NoChart = False,
     mask: Annotated[Path | None, Option(metavar="PNG", help="White where the object is.")] = None,
@@ -73,7 +74,8 @@ def _inputs(stated: dict[str, Any]) -> tuple[Any, Any, Any]:
     chart = options.chart_request(stated["chart"], stated["no_chart"])
     mask = None if stated["mask"] is None else options.user_mask(stated["mask"])
     with ThreadPoolExecutor(1) as pool:
-        reading = pool.submit(captures.read, stated["capture"], options.angles_deg(stated["angles"]))
+        angles_deg = options.angles_deg(stated["angles"])
+        reading = pool.submit(captures.read, stated["capture"], angles_deg, stated["clockwise"])
         network = models.load_network(stated["estimator"], stated["model"], stated["device"], stated["threads"])
         supplied = UserInput(chart, mask, network, models.load_mask_network(stated["threads"]))
         return reading.result(), supplied, config

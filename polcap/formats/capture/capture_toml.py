@@ -38,6 +38,7 @@ class CaptureFile(Struct, frozen=True, forbid_unknown_fields=True):
     name: Annotated[str, Meta(pattern=r"^[^/\\]+$")] = ""
     focal_length_mm: Positive | None = None
     sensor_width_mm: Positive | None = None  # of the visible pixels
+    clockwise: bool = False  # angles count clockwise in the picture
     sensor: Literal["polarization"] | None = None  # every frame is a 2×2 mosaic of 90 45 / 135 0 degrees
     encoding: Literal["linear", "srgb"] | None = None  # of finished pictures; by default 8 bits are sRGB
     white: Positive | None = None  # stored value at which linear pictures saturate; by default the type's largest

@@ -29,6 +29,8 @@ EQUAL_STOPS = 0.15  # EXIF rounds exposure times to a sixth of a stop at most
 _FOLDER = re.compile(r"pol[ _-]?(?P<pol>\d+(?:\.\d+)?)|cross(?:[ _-]?(?P<cross>\d+(?:\.\d+)?))?", re.IGNORECASE)
 _AT_ONCE = 2  # files read in parallel: as many child processes as decode them later
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
+_FOLDER_NUMBER = re.compile(r"\d+(?:[.,]\d+)?")
+_LOSSY_SUFFIXES = {".heic", ".heif", ".hif", ".avif", ".webp"}  # of phones and small cameras; not decoded
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
         notes.append("frames taken as a polarization sensor's, 90 45 / 135 0")
         return Plan("sensor", _sensor_shots(pictures, angles_deg), notes=tuple(notes))
     whole = Path(os.path.abspath(folder))
-    if is_angle_folder(whole.name) and len(_angle_folders(whole.parent)[0]) > 1:
+    if _is_one_angle(whole):
         raise CaptureError(f"{folder}: holds one angle of a capture; give the folder of all, {whole.parent}")
     groups = _by_name(pictures)
     if groups:
@@ -91,6 +93,8 @@ def _hint(folder: Path) -> str:
     """The likely mistake of a user who gave a folder without photographs."""
     inside = [path for path in children(folder) if path.is_dir()]
     named = _listed([path.name for path in inside])
+    if remedy := _lossy_or_packed(folder):
+        return remedy
     if any(_angle_folders(path)[0] for path in inside):
         return f"its sub-folders {named} hold captures: give one of them, or run `polcap batch` on the folder"
     if (folder / "report.json").is_file() and (folder / "maps").is_dir():
@@ -98,6 +102,24 @@ def _hint(folder: Path) -> str:
     if inside:
         return f"its sub-folders are {named}, but polcap looks for pol000, pol045, …"
     return "give the folder that holds the photographs"
+
+
+def _lossy_or_packed(folder: Path) -> str:
+    """The remedy for a folder of HEIC pictures or of a ZIP archive; empty for any other folder."""
+    files = [path for path in children(folder) if path.is_file()]
+    lossy = [path.name for path in files if path.suffix.lower() in _LOSSY_SUFFIXES]
+    packed = [path.name for path in files if path.suffix.lower() == ".zip"]
+    if lossy:
+        return f"{_listed(lossy)} are compressed with loss: set the camera or phone to RAW or DNG, and shoot again"
+    return f"unpack {_listed(packed)} first" if packed else ""
+
+
+def _is_one_angle(folder: Path) -> bool:
+    """Whether a folder is one of the angle folders of a capture."""
+    if not _FOLDER_NUMBER.search(folder.name) or not os.access(folder.parent, os.R_OK):
+        return False
+    siblings = _angle_folders(folder.parent)[0].values()
+    return folder in siblings and len(siblings) > 1
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -109,11 +131,20 @@ def looks_like_a_capture(folder: Path, inside: Iterable[str], files: Iterable[st
 
     Photographs in a folder that has sub-folders are taken for notes, unless there is a capture.toml.
     """
-    if capture_toml.NAME in files or any((match := _FOLDER.fullmatch(name)) and match["pol"] for name in inside):
+    if capture_toml.NAME in files or _degrees_by_name(inside):
         return True
     if any(name not in OURS and not name.startswith(".") for name in inside):
         return False
     return any(probe.kind(folder / name) in ("raw", "photo") for name in sorted(files) if not name.startswith("."))
+
+
+def counted_clockwise(plan: Plan) -> Plan:
+    """The plan with all angles negated: they were counted clockwise in the picture."""
+    turned = tuple((-angle if angle else 0.0, bracket) for angle, bracket in plan.shots)
+    others = tuple(
+        replace(source, angle_deg=-source.angle_deg if source.angle_deg else source.angle_deg) for source in plan.others
+    )
+    return replace(plan, shots=turned, others=others, notes=(*plan.notes, "angles counted clockwise, as stated"))
 
 
 def _toml(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
@@ -160,13 +191,11 @@ def _folders(folder: Path, sub_folders: dict[float, Path], crossed: Path | None,
         notes += [f"{sub_folder.name}: {note}" for note in found]
     others: tuple[Source, ...] = ()
     if crossed is not None:
-        text = _number_in(crossed.name)
-        angle_deg = float(text) if text else None
         pictures, _ = _list(crossed, "shoot it again, or remove the folder")
-        others = tuple(replace(source, role="cross", angle_deg=angle_deg) for source in pictures)
+        others = tuple(replace(source, role="cross", angle_deg=_degrees_of_cross(crossed)) for source in pictures)
     inside = children(folder)
-    unused = [path.name for path in inside if path.is_dir() and not is_angle_folder(path.name)]
-    unused = [name for name in unused if name not in OURS]
+    used = {*sub_folders.values(), crossed}
+    unused = [path.name for path in inside if path.is_dir() and path not in used and path.name not in OURS]
     notes += [f"not used: the folders {', '.join(unused)}"] if unused else []
     loose = [path.name for path in inside if path.is_file() and path.name != capture_toml.NAME]
     notes += [f"not used: the files {_listed(loose)}"] if loose else []
@@ -175,11 +204,9 @@ def _folders(folder: Path, sub_folders: dict[float, Path], crossed: Path | None,
 
 def numbered(folder: Path) -> list[str]:
     """Sub-folders with a number in their names that are not read as an angle: 045, angle45."""
-    return [
-        path.name
-        for path in children(folder)
-        if path.is_dir() and not is_angle_folder(path.name) and path.name not in OURS and _NUMBER.search(path.name)
-    ]
+    inside = [path.name for path in children(folder) if path.is_dir() and path.name not in OURS]
+    read = _degrees_by_name(inside)
+    return [name for name in inside if name not in read and not is_angle_folder(name) and _NUMBER.search(name)]
 
 
 def degrees(angle_deg: float) -> str:
@@ -193,30 +220,52 @@ def is_angle_folder(name: str) -> bool:
     return _FOLDER.fullmatch(name) is not None
 
 
-def _number_in(name: str) -> str | None:
-    match = _FOLDER.fullmatch(name)
-    return match and (match["pol"] or match["cross"])
+def _degrees_by_name(names: Iterable[str]) -> dict[str, float]:
+    """Angle [degrees] by folder name: of pol000, pol045, …, otherwise of names that differ in one number only.
+
+    0, 45, 90; "0 Grad", "45 Grad", "90 Grad"; 角度0, 角度45, 角度90: at least three different axes below 180°, one of
+    them 0°.
+    """
+    names = [name for name in names if name not in OURS and not name.startswith(".")]
+    found = {name: float(match["pol"]) for name in names if (match := _FOLDER.fullmatch(name)) and match["pol"]}
+    if found:
+        return found
+    patterns: dict[str, dict[str, float]] = defaultdict(dict)
+    for name in names:
+        numbers = _FOLDER_NUMBER.findall(name)
+        if len(numbers) == 1:
+            patterns[_FOLDER_NUMBER.sub("#", name)][name] = float(numbers[0].replace(",", "."))
+    for group in patterns.values():
+        angles = sorted(group.values())
+        if angles[0] == 0 and angles[-1] < 180 and different(angles) == len(angles) >= 3:
+            return group
+    return {}
 
 
 def _angle_folders(folder: Path) -> tuple[dict[float, Path], Path | None]:
     """The folders pol000, pol045, … by angle [degrees], and cross or cross045, the angle of the lens's filter."""
+    inside = [path for path in children(folder) if path.is_dir()]
+    crossed = [path for path in inside if (match := _FOLDER.fullmatch(path.name)) and not match["pol"]]
+    if len(crossed) > 1:
+        raise CaptureError(f"{crossed[1]}: {crossed[0].name} holds a cross-polarized shot too; remove one of the two")
+    stated = _degrees_by_name(path.name for path in inside)
     found: dict[float, Path] = {}
-    crossed: Path | None = None
-    for path in children(folder):
-        if not path.is_dir() or not is_angle_folder(path.name):
-            continue
-        angle = float(_number_in(path.name) or 0)
-        if angle > 360:
+    for path in inside:
+        angle = stated.get(path.name, _degrees_of_cross(path) if path in crossed else None)
+        if angle is not None and angle > 360:
             raise CaptureError(f"{path}: {angle:g}° is not an angle of a polarizer; name it by 0 to 360 degrees")
-        if path.name.lower().startswith("cross"):
-            if crossed is not None:
-                raise CaptureError(f"{path}: {crossed.name} holds a cross-polarized shot too; remove one of the two")
-            crossed = path
-        elif angle in found:
+        if angle is None or path in crossed:
+            continue
+        if angle in found:
             raise CaptureError(f"{path}: {angle:g}° is also in {found[angle].name}; remove one of the two folders")
-        else:
-            found[angle] = path
-    return dict(sorted(found.items())), crossed
+        found[angle] = path
+    return dict(sorted(found.items())), next(iter(crossed), None)
+
+
+def _degrees_of_cross(path: Path) -> float | None:
+    """Angle of the lens's filter, degrees, in the name cross045; None for cross."""
+    match = _FOLDER.fullmatch(path.name)
+    return float(match["cross"]) if match and match["cross"] else None
 
 
 def _is_sensor(pictures: list[Source], angles_deg: _Order) -> bool:
@@ -305,7 +354,7 @@ def _list(folder: Path, remedy: str = "") -> tuple[list[Source], list[str]]:
     raws = [source for source in found if source.probe.kind == "raw"]
     extra = [source for source in found if source.probe.kind == "photo"]
     if remedy and not raws and not extra:
-        raise CaptureError(f"{folder}: holds no photograph that polcap reads; {remedy}")
+        raise CaptureError(f"{folder}: holds no photograph that polcap reads; {_lossy_or_packed(folder) or remedy}")
     notes = []
     if raws and extra:
         stems = {source.path.stem.lower() for source in raws}

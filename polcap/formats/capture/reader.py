@@ -2,6 +2,7 @@
 
 import math
 import os
+import zipfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
@@ -18,20 +19,23 @@ from polcap.images import Capture, Exif, Frame, FrameReading, Shot
 
 _ZOOM = 0.01  # relative change of the focal length above rounding
 LOSS = ": normals and albedo lose accuracy against RAW"
+_SHOOT_RAW = "; set the camera to RAW or DNG"
 
 
-def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Capture:
+def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, clockwise: bool = False) -> Capture:
     """Read a capture folder: pol000/ pol045/ …, capture.toml, flat, or polarization-sensor frames.
 
     Every file's metadata and bytes are read, no pixel is decoded. `angles_deg` is the order of
     the brackets of a flat folder (0, 45, 90 by default); elsewhere it picks from the angles that
-    the folder states, the first being the reference.
+    the folder states, the first being the reference. `clockwise`: the stated angles count clockwise in the picture.
 
     Raises CaptureError: the photographs do not form a capture; the message names the file, the reason and the remedy.
     Raises DecodeError: a file is cut short, or no decoder recognises it.
     """
     folder = Path(folder)
     if folder.is_file():
+        if zipfile.is_zipfile(folder):
+            raise CaptureError(f"{folder} is a ZIP archive; unpack it and give the folder that it holds")
         raise CaptureError(f"{folder} is a file; give the folder that holds all photographs of the object")
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder; give the folder that holds the photographs")
@@ -40,6 +44,10 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
         _check_angles(folder, angles_deg, "--angles states")
     plan = layouts.plan(folder, stated, angles_deg)
     _check_angles(folder, [angle for angle, _ in plan.shots], "the shots' angles are")
+    if clockwise or stated.clockwise:
+        if plan.layout == "sensor":
+            raise CaptureError(f"{folder}: clockwise is stated, but a polarization sensor has no ring; leave it out")
+        plan = layouts.counted_clockwise(plan)
 
     every = _photographs(folder, plan)
     _check_one_camera({path: source.probe.exif for path, source in every.items()})
@@ -54,6 +62,11 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None) -> Cap
     calibration, calibration_notes = None, list[str]()
     if plan.layout != "sensor" and first.probe.kind == "raw":  # polarizer on a ring, the sensor's own counts
         calibration, calibration_notes = calibrations.choose(reference, stated.filter, stated.focal_length_mm)
+        ring = None if calibration is None else calibration.polarizer
+        if ring is not None and ring.sense < 0 and (clockwise or stated.clockwise):
+            raise CaptureError(
+                f"{folder}: clockwise is stated, but the ring's calibration turns it already; leave it out"
+            )
     lens = focal_length.find(reference, stated.focal_length_mm, stated.sensor_width_mm)
     principal = ((width - 1) / 2, (height - 1) / 2)
     geometry = calibration.geometry if calibration is not None else None
@@ -265,7 +278,7 @@ def _notes(
     if layout != "sensor" and reference.probe.kind == "photo":
         bits = reference.probe.bits
         encoding = photo.encoding_of(bits, stated.encoding)
-        notes.append(f"finished pictures of {bits} bits, taken as {encoding}" + LOSS * (bits == 8))
+        notes.append(f"finished pictures of {bits} bits, taken as {encoding}" + (LOSS + _SHOOT_RAW) * (bits == 8))
     if reference.probe.lossy:
         notes.append("lossy DNG" + LOSS)
     if stated.rotator:

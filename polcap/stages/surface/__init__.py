@@ -62,7 +62,7 @@ class SurfaceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = "open"
 
 
-@stage(version=12)
+@stage(version=13)
 def integrate(maps: SurfaceMaps, distance_m: float | None, settings: SurfaceSettings) -> Mesh:
     """The visible surface of the object, from its normals.
 

@@ -10,6 +10,10 @@ where noise is small against the bending of the surface, whatever the resolution
 5. Cuts that do not lower the residual around them are removed.
 6. Parts that touch are joined.
 
+Normals with a median error below `_PRECISE_DEG` are limited by the size of a pixel, not by noise. Step 4 then weights
+a link by the variance of the chord between its ends, times the trust of both ends in this link. An estimated gap
+behind a contour counts with its own error, which is as large as the gap. Step 5 is left out: noise makes no cuts.
+
 On each finer grid only pixels near these cuts choose between neighbors. So a finer picture refines the contours and
 cannot tear the surface.
 
@@ -36,10 +40,12 @@ _DECISION_PIXELS = 80_000  # at most, of the grid that decides on cuts (docs/ben
 _DECISION_SOLVES, _FINER_SOLVES = 4, 2  # solutions with choosing pixels, on that grid and on each finer one
 _SOFT, _GROWTH = 0.25, 1.2  # first stiffness, over the setting, and its growth: early errors make few cuts
 _UNDECIDED_PULL = 0.1  # of the prior's pull during the decision: a prior that strains the normals would cut them
+_PRECISE_DEG, _PRECISE_SOLVES = 2.0, 8  # median error of normals below which chords are weighted, and solutions then
 _REACH = 2  # px around a cut within which pixels choose, also on the next finer grid
 _PRECISION = 1e-3  # of each linear solution, relative
 _SLOW = 12  # iterations of a linear solution that call for a new hierarchy, which costs as much as 28
 _PROXIMITY = 1e-8  # pull towards the last estimate: fixes the offset of each separate part
+_LEAST_TRUST = 1e-9  # of a link's ends in it: keeps the equations solvable
 _LEAST_FACING = 0.05  # cosine: flatter views give no slope
 _BEND = 1 / 12  # variance of a step anywhere between its ends' slopes, over their difference squared
 
@@ -108,6 +114,8 @@ class PyramidLevel:
         (N,) pixels at which a finer grid may be cut.
     contours
         Links without slope.
+    chords
+        Whether choosing pixels weight the chord of a link instead of the slopes at its two ends.
     solver
         Preconditioner of the last matrix, which also serves similar ones.
     """
@@ -135,6 +143,8 @@ class PyramidLevel:
         self.choosing: Bools = np.zeros(grid.size, dtype=bool)
         self.cuttable: Bools = np.ones(grid.size, dtype=bool)
         self.contours = _NO_CONTOURS
+        self.precise = field.sigma < np.radians(_PRECISE_DEG)
+        self.chords = False
         self.solver: Any = None
 
     def _slope_at(self, ends: NDArray[np.intp]) -> Floats:
@@ -152,14 +162,17 @@ class PyramidLevel:
         self.choosing = ~dilate(found.torn, _REACH)[self.field.mask] & (self.stiffness > 0) & found.any()
         if not self.choosing.any():
             self.z = np.zeros_like(self.z)  # no cuts: plain least squares, to the last bit
+        self.chords = self.precise
         self.solve()
-        self.remove_useless_cuts()
+        if not self.precise:
+            self.remove_useless_cuts()
         self.join_contacts()
 
     def refine(self, coarse: Floats, near_cuts: Bools, solver: Any) -> None:
         """Find z from that of the n blocks (n,) at half the resolution; only pixels near their cuts (n,) choose."""
         block = block_numbers(self.field.mask)
         self.z = self._interpolated(coarse, block)
+        self.chords = self.precise
         self.choosing = self.cuttable = near_cuts[block] & (self.stiffness > 0)
         for _ in range(_FINER_SOLVES if self.choosing.any() else 1):
             matrix, right, _ = self.equations(self.stiffness, self.field.pull)
@@ -216,7 +229,7 @@ class PyramidLevel:
     def solve(self) -> None:
         """Find z with the pixels that may choose, from the present z and solver."""
         taken = 0
-        for _ in range(_DECISION_SOLVES if self.choosing.any() else 1):
+        for _ in range((_PRECISE_SOLVES if self.chords else _DECISION_SOLVES) if self.choosing.any() else 1):
             matrix, right, _ = self.equations(self.stiffness, self.field.pull)
             if self.solver is None or taken > _SLOW:
                 self.solver = Multigrid(matrix, self.grid.pixel)
@@ -312,7 +325,8 @@ class PyramidLevel:
         if self.choosing.any():
             for part, side in zip((slice(None, grid.turn), slice(grid.turn, None)), self.side):
                 energy += self._weigh_neighbors(part, side, change, stiffness, weight, flux)
-        weight[self.contours.link] = little = _GAP_WEIGHT / max(len(self.contours.link), 1)
+        certainty = (self.field.sigma / (_GAP * disc_radius(self.field.mask))) ** 2 if self.chords else _GAP_WEIGHT
+        weight[self.contours.link] = little = certainty / max(len(self.contours.link), 1)
         flux[self.contours.link] = little * self.contours.step
         diagonal, right = np.full(grid.size, _PROXIMITY), _PROXIMITY * self.z + grid.divergence(flux)
         if self.field.prior is not None:
@@ -326,7 +340,7 @@ class PyramidLevel:
         """Write weight and flux (L,) of the links between choosing pixels of one axis; returns their energy.
 
         With m ∂z on either side of a pixel, the weight of the side ahead is σ(k (behind² − ahead²)), k the stiffness
-        and σ the sigmoid (Cao et al.).
+        and σ the sigmoid (Cao et al.). Of chords, the energy is not computed.
         """
         facing, grid = self.facing, self.grid
         chosen, both = self._choosing_links(part)
@@ -337,13 +351,17 @@ class PyramidLevel:
         forward, backward = (
             _sigmoid(stiffness * (a[e] ** 2 - b[e] ** 2)) for a, b, e in ((behind, ahead, p), (ahead, behind, q))
         )
+        at = chosen if both is None else chosen[both]
+        inside = slice(None) if both is None else both
+        if self.chords:  # a chord holds only where both ends belong to one sheet
+            weight[at] *= np.maximum(4 * (forward * backward)[inside], _LEAST_TRUST)
+            flux[at] = weight[at] * self.step[at]
+            return 0.0
         forward *= self.field.weight[p]
         backward *= self.field.weight[q]
         energy = float(forward @ (ahead - side)[p] ** 2 + backward @ (behind - side)[q] ** 2)
         forward *= first
         backward *= second
-        at = chosen if both is None else chosen[both]
-        inside = slice(None) if both is None else both
         weight[at] = (forward * first + backward * second)[inside]
         flux[at] = (forward * side[p] + backward * side[q])[inside]
         return energy

@@ -1,5 +1,6 @@
 """Capture folders: the meaning of each layout, and one clear line for each fault."""
 
+import re
 import shutil
 from itertools import count
 from pathlib import Path
@@ -66,6 +67,53 @@ def test_sub_folders_state_the_angles(tmp_path):
     assert understood.size_px == (48, 32) and understood.principal_px == (23.5, 15.5)
     image = frame_decoder.decode(understood.shots[1].frames[0])
     assert image.value.shape == (32, 48) and image.cfa.tolist() == [[0, 1], [1, 2]]
+
+
+@pytest.mark.parametrize(
+    "listed",
+    [
+        ("0", "45", "90"),
+        ("0 Grad", "60 Grad", "120 Grad"),
+        ("角度0", "角度45", "角度90"),
+        ("POL0°", "POL22,5°", "POL90°"),
+        ("Filter 0°", "Filter 45°", "Filter 90°"),
+    ],
+)
+def test_folders_whose_names_differ_in_the_angle_only_state_it(tmp_path, listed):
+    for name in listed:
+        shoot(tmp_path / name / "a.dng")
+    (tmp_path / "notes 7").mkdir()
+    understood = capture.read(tmp_path)
+    assert understood.layout == "folders"
+    assert degrees(understood) == [float(re.sub(r"[^\d,]", "", name).replace(",", ".")) for name in listed]
+    assert "not used: the folders notes 7" in understood.notes
+    with pytest.raises(CaptureError, match="holds one angle of a capture"):
+        capture.read(tmp_path / listed[1])
+
+
+@pytest.mark.parametrize(
+    "listed", [("1", "2", "3"), ("10", "20", "30"), ("0", "100", "200"), ("vase 0", "cup 45", "90")]
+)
+def test_numbered_folders_of_objects_are_not_angles(tmp_path, listed):
+    for name in listed:
+        shoot(tmp_path / name / "a.dng")
+    with pytest.raises(CaptureError, match="but polcap looks for pol000"):
+        capture.read(tmp_path)
+
+
+def test_a_clockwise_ring_negates_the_angles(tmp_path):
+    folder = folders(tmp_path)
+    assert degrees(capture.read(folder, clockwise=True)) == [0, -45, -90]
+    assert degrees(capture.read(folder, (90.0, 0.0, 45.0), clockwise=True)) == [-90, 0, -45]
+    (folder / "capture.toml").write_text("clockwise = true\n")
+    understood = capture.read(folder)
+    assert degrees(understood) == [0, -45, -90] and "angles counted clockwise, as stated" in understood.notes
+
+
+def test_a_polarization_sensor_is_never_clockwise(tmp_path):
+    save(tmp_path / "frame.png", mosaic())
+    with pytest.raises(CaptureError, match="a polarization sensor has no ring; leave it out"):
+        capture.read(tmp_path, clockwise=True)
 
 
 def test_angles_pick_from_those_stated_and_set_the_reference(tmp_path):
@@ -209,6 +257,13 @@ def test_raw_wins_over_its_jpeg_and_sidecars_are_passed_over(tmp_path):
     assert not any("not used" in note for note in understood.notes)
 
 
+def test_a_folder_of_jpegs_is_read_and_asks_for_raw(tmp_path):
+    for angle in (0, 45, 90):
+        save(tmp_path / f"bowl_{angle}.jpg", np.full((8, 8, 3), 90 + angle, np.uint8))
+    notes = " ".join(capture.read(tmp_path).notes)
+    assert "lose accuracy against RAW; set the camera to RAW or DNG" in notes and "remove" not in notes
+
+
 @pytest.mark.parametrize(
     ("settings", "known", "focal_px"),
     [
@@ -251,6 +306,19 @@ def remake(place, *time, **settings):
     return lambda folder: shoot(folder / place, *time, **settings)
 
 
+def heic_only(folder):
+    """Replace the RAW files of one angle by a phone's picture."""
+    empty(folder / "pol045")
+    (folder / "pol045" / "IMG_1.HEIC").write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
+
+
+def zipped(folder):
+    """Replace the folder by its archive."""
+    shutil.make_archive(str(folder) + " packed", "zip", folder)
+    shutil.rmtree(folder)
+    Path(str(folder) + " packed.zip").rename(folder)
+
+
 def rewrite(place, change):
     """Change the bytes of a photograph."""
     return lambda folder: (folder / place).write_bytes(change((folder / place).read_bytes()))
@@ -276,6 +344,12 @@ SPOILS = {
         "holds no photograph that polcap reads; give the folder that holds the photographs",
     ),
     "no folder": (shutil.rmtree, "no such folder"),
+    "HEIC": (heic_only, "IMG_1.HEIC are compressed with loss: set the camera or phone to RAW or DNG, and shoot again"),
+    "archive": (zipped, "is a ZIP archive; unpack it and give the folder that it holds"),
+    "archive inside": (
+        lambda vase: (empty(vase), shutil.make_archive(str(vase / "shots"), "zip", Path(__file__).parent)),
+        r"unpack shots\.zip first",
+    ),
     "camera": (
         remake("pol045/IMG_0.dng", model=b"Other"),
         r"pol045/IMG_0\.dng: was taken with Acme Other, not Acme Z1",
