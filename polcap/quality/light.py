@@ -116,7 +116,11 @@ def stillness(found: Evidence, limits: GateLimits) -> Gate:
     message = f"{100 * fraction[k]:.2f} % of the object differs between the exposures of the {found.names[k]} shot"
     remedy = "Take the bracket again: something moved, or the light changed"
     bad = blamed(found.names, fraction > limits.max_ghost)
-    return at_most("stillness", float(fraction[k]), limits.max_ghost, message, remedy, bad, cost_deg=5)
+    blurred = np.nan_to_num(found.blur_px).max() > limits.max_blur_px  # `sharpness` judges this
+    state: State = "warn" if blurred else "fail"
+    return at_most(
+        "stillness", float(fraction[k]), limits.max_ghost, message, remedy, bad, 1 if blurred else 5, beyond=state
+    )
 
 
 def chart(found: Evidence, limits: GateLimits) -> Gate:

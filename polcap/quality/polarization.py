@@ -259,9 +259,6 @@ def _reduced(image: StokesImage, angle: Floats) -> tuple[Floats, rim.Bools, rim.
     step = int(np.ceil(np.sqrt(max(image.mask.size / _MOST_PIXELS, 1))))
     doubtful = Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST
     usable = (image.quality & int(doubtful)) == 0
-    light = total(image.stokes)
-    mask = image.mask
-    if step > 1:
-        light = np.stack([block_means(part, step) for part in light])
-        mask, usable = (block_means(part, step) > 0.99 for part in (mask, usable))
+    light = np.stack([block_means(part, step) for part in total(image.stokes)])
+    mask, usable = (block_means(part.astype(np.float32), step) > 0.99 for part in (image.mask, usable))
     return np.einsum("kj,jhw->khw", mueller.analyzer(angle), light), mask, usable

@@ -9,8 +9,7 @@ the camera frame.
     analytic       the inversion: zenith from DoLP, azimuth from AoLP
         zenith         by the object's law of diffuse polarization
     half_turns     the side of the ray to which a normal leans, for both estimators
-    highlights     filled, and their albedo from a crossed shot
-    albedo_doubt   uncertainty of the scale of all albedos
+    highlights     filled, and their albedo from a crossed shot; uncertainty of the scale of all albedos
 """
 
 from dataclasses import replace
@@ -21,7 +20,7 @@ from msgspec import Meta
 
 from polcap.images import Cues, Network, RunNetwork, SurfaceMaps
 from polcap.stages import stage
-from polcap.stages.infer import albedo_doubt, analytic, highlights, learned
+from polcap.stages.infer import analytic, highlights, learned
 
 
 class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -49,4 +48,4 @@ def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: Inf
     else:
         maps = learned.estimate(cues, network, run, settings.ior, settings.symmetries, fine_pass=settings.fine)
     maps = highlights.correct_highlights(maps, cues, settings.ior)
-    return replace(maps, albedo_sigma=albedo_doubt.albedo_sigma(maps, cues.scale_sigma))
+    return replace(maps, albedo_sigma=highlights.albedo_sigma(maps, cues.scale_sigma))
