@@ -6,7 +6,7 @@ variance, so that sums over channels have their true variance. Arrays may be rea
 one.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntFlag
 from typing import Any, Literal
@@ -483,6 +483,15 @@ class ShotOrder:
 
     shots: tuple[int, ...]  # (K,) index of the stated angle of each shot
     mirrored: bool = False  # angles count clockwise
+
+    def remedy(self, names: Sequence[str]) -> str:
+        """The correction that turns the stated angles into this order and sense; names (K,) are the stated angles."""
+        moved = [(names[k], names[at]) for k, at in enumerate(self.shots) if k != at]
+        renames = " and ".join(f"{old} to {new}" for old, new in moved)
+        sense = "add --clockwise, or clockwise = true in capture.toml" if self.mirrored else ""
+        return ", and ".join(
+            filter(None, (f"rename the folder{'s' * (len(moved) > 1)} {renames}" * bool(moved), sense))
+        )
 
 
 @dataclass(frozen=True)

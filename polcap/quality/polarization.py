@@ -44,7 +44,8 @@ def order(found: Evidence) -> Gate:
         return Gate("order", "pass", "as stated", "as stated", message, unit="")
     best = _named(outline.best, names)
     message = f"The outline fits the order {best} better than the stated one"
-    remedy = "Name the shots by their true angles (folders, or --angles), or take them again in order"
+    steps = outline.best.remedy(names)
+    remedy = f"{steps[:1].upper()}{steps[1:]}; or take the shots again in order"
     return Gate("order", "fail", best, "as stated", message, remedy, 45.0, unit="")
 
 

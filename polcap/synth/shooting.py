@@ -31,7 +31,7 @@ from polcap.synth.forward_camera import COLOR_MATRIX, SENSOR_WIDTH_MM, Bend, Sen
 from polcap.synth.render import Scene
 from polcap.synth.scenes import Kind, random_scene
 
-__all__ = ["MIDDLE_S", "Kind", "Scene", "Shoot", "Studio", "Take", "random_scene", "transform", "write"]
+__all__ = ["MIDDLE_S", "Dials", "Kind", "Scene", "Shoot", "Studio", "Take", "random_scene", "transform", "write"]
 
 Angle = Annotated[float, Meta(ge=0, le=360)]  # degrees, as in folder names
 MIDDLE_S = 0.02  # s, exposure time of the middle frame of a time bracket
@@ -124,6 +124,17 @@ class Take:
     stops: float  # exposure relative to the middle frame, as a factor
     again: int = 0  # number of earlier tries
     lit: bool = True  # False: the light is off
+    dials: "Dials | None" = None  # None: as the bracket of `Shoot`
+
+
+@dataclass(frozen=True)
+class Dials:
+    """Camera settings of one photograph, as EXIF states them."""
+
+    time_s: float
+    f_number: float
+    iso: float
+    flash: bool
 
 
 class Studio:
@@ -259,6 +270,11 @@ def _exposure(shoot: Shoot, take: Take, middle: float) -> tuple[Exif, float, flo
         pixel_pitch_um=1000 * SENSOR_WIDTH_MM / shoot.width, taken=taken.isoformat(timespec="milliseconds"),
         flash_fired=shoot.bracket != "time" and take.lit,
     )  # fmt: skip
+    if take.dials is not None:
+        dials, amplification = take.dials, take.dials.iso / 100.0
+        exif = replace(exif, exposure_time=dials.time_s, f_number=dials.f_number, iso=dials.iso)
+        exif = replace(exif, flash_fired=dials.flash and take.lit)
+        return exif, middle * stops / amplification, amplification
     if shoot.bracket == "iso":
         amplification = shoot.step**take.frame
         light = middle / shoot.step ** (shoot.exposures // 2)

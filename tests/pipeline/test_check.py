@@ -1,6 +1,7 @@
 """`polcap check` keeps what is good, and of what is not it names the fault and the shot."""
 
 import json
+import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -51,6 +52,28 @@ def test_one_turned_shot_of_three_is_told_with_the_ring_that_it_looks_like(tmp_p
     line = next(line for line in verdict(tmp_path / "bad").lines if line.name == "angles")
     assert line.state == "warn" and line.cost_deg > 1
     assert "ring's zero" in line.message and "single shot" in line.message and "take it again" in line.remedy
+
+
+def test_a_clockwise_ring_gets_a_remedy_that_works(tmp_path: Path) -> None:
+    faulty.shoot(tmp_path / "bad", 1, "clockwise", WIDTH)
+    line = next(line for line in verdict(tmp_path / "bad").lines if line.name == "order")
+    assert line.state == "fail" and "dd --clockwise, or clockwise = true in capture.toml" in line.remedy
+    (tmp_path / "bad" / "capture.toml").write_text("clockwise = true\n")
+    found = verdict(tmp_path / "bad")
+    assert found.keep, check.table(found)
+
+
+def test_swapped_folders_get_a_remedy_that_works(tmp_path: Path) -> None:
+    faulty.shoot(tmp_path / "bad", 1, "swapped", WIDTH)
+    remedy = next(line for line in verdict(tmp_path / "bad").lines if line.name == "order").remedy
+    pairs = re.findall(r"(\d+)° to (\d+)°", remedy)
+    assert len(pairs) == 2 and "Rename the folders" in remedy
+    for old, new in pairs:
+        (tmp_path / "bad" / f"pol{int(old):03d}").rename(tmp_path / "bad" / f"new{int(new):03d}")
+    for _, new in pairs:
+        (tmp_path / "bad" / f"new{int(new):03d}").rename(tmp_path / "bad" / f"pol{int(new):03d}")
+    found = verdict(tmp_path / "bad")
+    assert found.keep, check.table(found)
 
 
 def test_process_measures_the_blur_that_check_measures(tmp_path: Path) -> None:

@@ -200,13 +200,13 @@ def _find_angles(
 
 def _wrong_order(found: angles.OrderFit, angle: Floats) -> str:
     """Error message for shots with angles (K,) rad that contradict the polarization at the object's outline."""
-    stated = ", ".join(f"{np.degrees(a):g}°" for a in angle)
-    best = ", ".join(f"{np.degrees(angle[i]):g}°" for i in found.check.best.shots)
-    mirrored = " counted the other way (the ring turned clockwise)" if found.check.best.mirrored else ""
+    names = [f"{np.degrees(a):g}°" for a in angle]
+    stated, best = ", ".join(names), ", ".join(names[i] for i in found.check.best.shots)
+    mirrored = " counted clockwise" if found.check.best.mirrored else ""
     return (
         f"the angles {stated} contradict the polarization at the object's outline (fit {found.score:.2f}); "
-        f"{best}{mirrored} fit better ({found.best_score:.2f}): correct the folders or --angles, shoot without "
-        "ambient light (reflections turn polarization by 90°), or --set selfcal.check_order=false"
+        f"{best}{mirrored} fit better ({found.best_score:.2f}): {found.check.best.remedy(names)}; "
+        "or shoot in a dark room (reflections turn polarization by 90°), or --set selfcal.check_order=false"
     )
 
 

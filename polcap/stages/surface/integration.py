@@ -351,10 +351,9 @@ class PyramidLevel:
         forward, backward = (
             _sigmoid(stiffness * (a[e] ** 2 - b[e] ** 2)) for a, b, e in ((behind, ahead, p), (ahead, behind, q))
         )
-        at = chosen if both is None else chosen[both]
-        inside = slice(None) if both is None else both
+        at = chosen[both]
         if self.chords:  # a chord holds only where both ends belong to one sheet
-            weight[at] *= np.maximum(4 * (forward * backward)[inside], _LEAST_TRUST)
+            weight[at] *= np.maximum(4 * (forward * backward)[both], _LEAST_TRUST)
             flux[at] = weight[at] * self.step[at]
             return 0.0
         forward *= self.field.weight[p]
@@ -362,14 +361,12 @@ class PyramidLevel:
         energy = float(forward @ (ahead - side)[p] ** 2 + backward @ (behind - side)[q] ** 2)
         forward *= first
         backward *= second
-        weight[at] = (forward * first + backward * second)[inside]
-        flux[at] = (forward * side[p] + backward * side[q])[inside]
+        weight[at] = (forward * first + backward * second)[both]
+        flux[at] = (forward * side[p] + backward * side[q])[both]
         return energy
 
-    def _choosing_links(self, part: slice) -> tuple[Any, Bools | None]:
-        """Links of one axis with an end that chooses, and which of them have both; None where all pixels choose."""
-        if self.choosing.all():
-            return part, None
+    def _choosing_links(self, part: slice) -> tuple[NDArray[np.intp], Bools]:
+        """Links of one axis with an end that chooses, and which of them have two."""
         p, q = self.choosing[self.grid.p[part]], self.choosing[self.grid.q[part]]
         chosen = np.flatnonzero(p | q)
         return chosen + (part.start or 0), (p & q)[chosen]

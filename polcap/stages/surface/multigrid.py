@@ -101,41 +101,19 @@ def _links(first: NDArray[np.int32], second: NDArray[np.int32]) -> tuple[Any, An
 
 
 def conjugate_gradients(
-    matrix: Any, right: Floats, start: Floats, precondition: Any, tolerance: float, most: int
+    matrix: Any, right: Floats, start: Floats, precondition: Callable[[Floats], Floats], tolerance: float, most: int
 ) -> tuple[Floats, int]:
-    """Solve A x = b by preconditioned conjugate gradients; returns x (N,) and the iterations.
+    """Solve A x = b for a symmetric, positive definite A by conjugate gradients; returns x (N,) and the iterations.
 
-    Parameters
-    ----------
-    matrix
-        A (N, N), symmetric and positive definite; anything with `@`.
-    right, start
-        b and the first x, (N,).
-    precondition
-        From a residual (N,) to an estimate of A⁻¹ times it.
-    tolerance
-        Ends at |b − A x| ≤ tolerance |b|, or after `most` iterations.
-
-    References
-    ----------
-    Saad, Iterative Methods for Sparse Linear Systems, 2003, algorithm 9.1.
+    `precondition` maps a residual (N,) to an estimate of A⁻¹ times the residual. The iterations end at
+    |b − A x| ≤ tolerance |b|, or after `most`.
     """
-    x = start
-    residual = right - matrix @ x
-    goal = tolerance * float(np.linalg.norm(right))
-    direction = preconditioned = precondition(residual)
-    product = float(residual @ preconditioned)
-    for count in range(most):
-        if float(np.linalg.norm(residual)) <= goal or product <= 0:
-            return x, count
-        image = matrix @ direction
-        length = product / float(direction @ image)
-        x = x + length * direction
-        residual = residual - length * image
-        preconditioned = precondition(residual)
-        product, before = float(residual @ preconditioned), product
-        direction = preconditioned + product / before * direction
-    return x, most
+    from scipy.sparse.linalg import LinearOperator, cg
+
+    operator = LinearOperator(matrix.shape, precondition, dtype=np.float64)
+    steps: list[None] = []
+    x, _ = cg(matrix, right, start, rtol=tolerance, maxiter=most, M=operator, callback=lambda _: steps.append(None))
+    return np.asarray(x), len(steps)
 
 
 @dataclass(frozen=True)
@@ -249,4 +227,4 @@ class TwoGrid:
         x = step * right
         left = np.asarray(np.bincount(self.block, right - self.matrix @ x, self.count), dtype=np.float64)
         x = x + self.coarse(left).astype(np.float32)[self.block]
-        return np.asarray(x + step * (right - self.matrix @ x))
+        return np.asarray(x + step * (right - self.matrix @ x), dtype=np.float64)
