@@ -157,14 +157,19 @@ def read(folder: Path) -> StoredMaps:
 
 
 def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
-    """Note in maps.json the content of the export in the result's folder `where`.
+    """Note in maps.json the content of the export in the result's folder `where`, merged with earlier notes on it.
 
     Raises StorageError: the file cannot be written.
     """
     file = folder / "maps.json"
     known = text_file.read_json(file)
-    earlier = known.get("exports")
-    known["exports"] = dict(sorted({**(earlier if isinstance(earlier, dict) else {}), where: about}.items()))
+    exports = known.get("exports", {})
+    earlier = exports.get(where, {})
+    note = {
+        key: {**earlier.get(key, {}), **value} if isinstance(value, dict) and key != "mesh" else value
+        for key, value in about.items()
+    }
+    known["exports"] = dict(sorted({**exports, where: note}.items()))
     _write_json(file, known)
 
 
