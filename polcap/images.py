@@ -401,6 +401,7 @@ class ChartLight:
     normal: Floats  # (3,) unit, towards the camera
     flash: Floats  # (3,) position right of and above the lens; exponent of the cosine of its angular falloff
     covariance: Floats  # (5, 5) of these three and of the chart's rotations about x and y [rad]
+    uneven: float = 0.0  # relative 1σ of the light's level from a slope of the light that the flash does not cause
 
     @property
     def tilt(self) -> float:
@@ -566,6 +567,7 @@ class Cues:
     mask: NDArray[np.bool_]  # (H, W)
     quality: Bits  # (H, W)
     view: View
+    scale_sigma: float | None = None  # relative 1σ of the light on the chart against that on the object; None: no chart
     body: Floats | None = None  # (H, W, 3) radiance of the diffuse reflection only, from a crossed shot
     body_known: NDArray[np.bool_] | None = None  # (H, W) where the crossed shot is valid
 
@@ -600,6 +602,7 @@ class SurfaceMaps:
     mask: NDArray[np.bool_]  # (H, W)
     view: View
     estimator: str
+    albedo_sigma: float | None = None  # relative 1σ of the scale of all albedos; None: unknown, albedos are relative
 
 
 @dataclass(frozen=True)
@@ -630,6 +633,7 @@ class Asset:
     specular_color: NDArray[np.uint8]  # (H, W, 3) sRGB, to be multiplied by the factor
     specular_factor: tuple[float, float, float]  # KHR_materials_specular specularColorFactor
     ior: float
+    albedo_sigma: float | None = None  # as in `SurfaceMaps`
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from polcap.formats.maps import maps_folder, png
 from polcap.formats.raw import frame_decoder
 from polcap.images import Capture, Decode, Frame, SensorImage
 from polcap.pipeline import asset_export, result_folder
-from polcap.pipeline.asset_export import ExportRequest
+from polcap.pipeline.asset_export import DetailLevel, ExportRequest
 from polcap.pipeline.cache import ArchiveCache, DryRunCache, Progress, StageCache, contents, silent
 from polcap.pipeline.path import STAGES, UserInput, path
 from polcap.report import animation
@@ -81,7 +81,7 @@ def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -
     )
     parallel.both(
         partial(report.write, out, about, results),
-        partial(asset_export.write, out, about, ExportRequest(), results.asset),
+        partial(asset_export.write, out, about, ExportRequest(), [DetailLevel(results.asset)]),
     )
     if results.color.source in ("chart", "corners"):
         calibrations.write_profile(out / PROFILE, results.color)
@@ -110,19 +110,21 @@ def plan(capture: Capture, supplied: UserInput, config: Config, out: Path, force
     return cache.states
 
 
-def export(out: Path, wanted: ExportRequest) -> list[Path]:
-    """Write the asset again, from maps/ and report.json alone; returns the files.
+def export(out: Path, *wanted: ExportRequest) -> list[Path]:
+    """Write the asset again for each request, from maps/ and report.json alone; returns the files.
 
     Raises
     ------
     SettingError
         A preset or color space does not exist, or a package or encoder is missing.
     """
-    asset_export.check(wanted)
+    for one in wanted:
+        asset_export.check(one)
     about = report.read(out)
     with result_folder.locked(out):
-        whole, levels = asset_export.from_maps(out / "maps", restored(about, out / "report.json"), wanted)
-        return asset_export.write(out, about, wanted, whole, levels)
+        source = asset_export.read(out / "maps", restored(about, out / "report.json"))
+        exports = (asset_export.write(out, about, one, asset_export.levels(source, one)) for one in wanted)
+        return [file for files in exports for file in files]
 
 
 def reopen(out: Path, until: str = "surface") -> tuple[Results, dict[str, Any]]:

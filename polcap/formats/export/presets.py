@@ -7,6 +7,7 @@ from typing import Literal
 
 from polcap.formats.export import texture_set
 from polcap.formats.export.encoders import Kind
+from polcap.formats.export.glb_geometry import Geometry
 from polcap.formats.export.texture_set import Texture
 from polcap.images import Asset
 
@@ -22,6 +23,8 @@ class ExportPreset:
     description: str
     name: str = "{}"  # of the asset itself
     images: Kind = "png"  # inside the GLB
+    geometry: Geometry = "float"  # inside the GLB
+    triangles: int | None = None  # at most; by default those of the full mesh
     textures: Mapping[str, Callable[[Asset], Texture]] = field(default_factory=dict)  # PNG files next to the asset
 
 
@@ -53,8 +56,10 @@ PRESETS: Mapping[str, ExportPreset] = {
     ),
     "web": ExportPreset(
         formats=("gltf",),
-        description="one small GLB; colours lossy, data lossless WebP (EXT_texture_webp); normals +Y",
+        description="one small GLB: quantized mesh; colours lossy, data lossless WebP (EXT_texture_webp); normals +Y",
         images="webp",
+        geometry="quantized",
+        triangles=50_000,
     ),
     "archive": ExportPreset(
         formats=FORMATS,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from polcap import __version__
-from polcap.formats import atomic
+from polcap.formats import atomic, text_file
 from polcap.formats.raw import file_bytes
 
 _PARTS = (
@@ -52,8 +52,20 @@ def words(facts: Mapping[str, Any]) -> dict[str, str]:
 
 
 def write(path: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> None:
-    """Write the sidecar: the record, and the digest of every file of the export; StorageError."""
-    text = json.dumps({**facts, "files": dict(sorted(digests.items()))}, indent=1, ensure_ascii=False)
+    """Write the sidecar: the record, and the digest of every file of the export.
+
+    The sidecar of an earlier export with the same record also listed its files; those that exist stay in the list.
+
+    Raises StorageError: the file cannot be written.
+    """
+    earlier: dict[str, Any] = {}
+    with suppress(OSError, ValueError):
+        earlier = text_file.read_json(path)
+    files = earlier.pop("files", {})
+    if earlier != json.loads(json.dumps(facts)):
+        files = {}
+    files = {name: known for name, known in files.items() if (path.parent / name).exists()} | dict(digests)
+    text = json.dumps({**facts, "files": dict(sorted(files.items()))}, indent=1, ensure_ascii=False)
     atomic.write(path, text + "\n")
 
 

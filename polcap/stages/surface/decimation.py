@@ -27,8 +27,8 @@ class DecimatedMesh:
     error_px: float  # the same in px of the maps, at the object's median depth
 
 
-def decimate(mesh: Mesh, view: View, share: float, back: Back) -> DecimatedMesh:
-    """The mesh in about `share` of its triangles; textures stay where they are, as the camera sees them.
+def decimate(mesh: Mesh, view: View, count: int, back: Back) -> DecimatedMesh:
+    """The mesh in about `count` triangles; textures stay where they are, as the camera sees them.
 
     `back` is the setting the mesh was made with: triangles that turn away from the camera are left out of an open one.
 
@@ -39,11 +39,8 @@ def decimate(mesh: Mesh, view: View, share: float, back: Back) -> DecimatedMesh:
     """
     import fast_simplification  # here: its 0.25 s are for exports with levels of detail alone
 
-    count = round(share * len(mesh.faces))
     if count < _FEWEST:
-        raise ObjectError(
-            f"{len(mesh.faces)} triangles × {share:g} leave {count}, under {_FEWEST}; ask for fewer levels"
-        )
+        raise ObjectError(f"a mesh of {count} triangles is under {_FEWEST}; ask for more triangles or fewer levels")
     points, faces = fast_simplification.simplify(  # which takes no read-only arrays
         np.array(mesh.vertices, np.float32), np.array(mesh.faces, np.int32), target_count=count
     )
@@ -53,6 +50,8 @@ def decimate(mesh: Mesh, view: View, share: float, back: Back) -> DecimatedMesh:
     faces = np.asarray(faces, dtype=np.int32)
     if back == "open":
         faces = faces[face_areas(uv, faces) > 0]  # the others were folded over by a collapse
+    used, faces = np.unique(faces, return_inverse=True)
+    vertices, uv, faces = vertices[used], uv[used], faces.reshape(-1, 3).astype(np.int32)
     normals, tangents = vertex_frames(vertices, uv, faces)
     coarser = replace(
         mesh,

@@ -65,7 +65,7 @@ class WhitebalanceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     patch_share: Annotated[float, Meta(ge=0.2, le=0.95, description="sampled share of each patch's side")] = 0.6
 
 
-@stage(version=9)
+@stage(version=10)
 def measure(
     radiance: AngleStack, reference: ChartReference, request: ChartRequest, settings: WhitebalanceSettings
 ) -> ColorCalibration:
